@@ -1,0 +1,16 @@
+"""Numbers that more than one room needs, each with its reason."""
+
+import math
+
+SPEED_OF_LIGHT = 299_792_458.0  # [m/s] exact, by definition of the metre
+ALPHA_MAX = 0.99  # keeps 1 / (1 - alpha) in the backward pass below 100
+ALPHA_MIN = 1.0 / 255.0  # a fainter splat moves an 8-bit colour by less than a step; phasors weigh it less still
+TRANSMITTANCE_MIN = 1e-4  # a pixel stops here: what lies behind can add 1e-4 of a distance and 1e-8 of a quad
+LOW_PASS = 0.3  # [px^2] added to a projected covariance, so that a splat covers about a pixel (EWA filter)
+GUARD = 1.3  # the projection is linearised inside this multiple of the half field of view, clamped outside
+SH_COEFFICIENTS = 16  # K = (degree + 1)^2 for degree 3
+SH_Y0 = 0.28209479177387814  # 1 / (2 sqrt(pi)), the constant harmonic
+SH_BIAS = 0.5  # an all-zero coefficient vector means mid grey, as in published Gaussian splats
+FRAMES_PER_QUARTET = 4  # raw frames of one depth image; frame n = 4 i + k is slot k of quartet i
+FRAME_RATE_HZ = 120.0  # [Hz] raw frames per second of the F-ToeRF recordings
+CANONICAL_SHIFTS = (0.0, math.pi, math.pi / 2, 3 * math.pi / 2)  # [rad] order in memory: +cos, -cos, +sin, -sin

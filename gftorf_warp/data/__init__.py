@@ -1,0 +1,1 @@
+"""Sequences on disk, and what they are in memory."""

@@ -1,0 +1,105 @@
+"""A recorded sequence in memory: raw frames with their shift, time and pose, calibration, and where each value is from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ..constants import FRAMES_PER_QUARTET
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Sequence:
+    """F raw frames of one C-ToF camera. Nothing here is truth: see :class:`Truth`."""
+
+    quads: Float[np.ndarray, "F H W"]
+    """What each raw frame recorded, float32, in the units of the file; rows that were not measured are zero."""
+    measured: Bool[np.ndarray, "F"]
+    """Whether a raw frame exists; an absent one is 'not measured', never zero light."""
+    shifts: Float[np.ndarray, "F"]
+    """Phase shift of each raw frame [rad]."""
+    times: Float[np.ndarray, "F"]
+    """Time of each raw frame since the first [s]."""
+    f_mod_hz: float
+    """Modulation frequency [Hz]."""
+    phase_offset: float = 0.0
+    """Measured minus true phase [rad]."""
+    dc_offset: float = 0.0
+    """Constant part of a quad as a multiple of its amplitude [1]."""
+    fx: float
+    """Focal length, x [px]."""
+    fy: float
+    """Focal length, y [px]."""
+    cx: float
+    """Principal point, x [px], in the convention of the program: pixel centres at i + 0.5."""
+    cy: float
+    """Principal point, y [px], likewise."""
+    camera_from_world: Float[np.ndarray, "F 4 4"]
+    """Pose of each raw frame, world to camera [m]."""
+    quad_scale: float | None = None
+    """The file's own factor for the quads; None if it states none. Never applied by a reader."""
+    colour: dict[int, Float[np.ndarray, "h w 3"]] = field(default_factory=dict)
+    """Colour images by raw frame, linear, float32; empty if there are none."""
+    forward_flow: dict[int, Float[np.ndarray, "2 H W"]] = field(default_factory=dict)
+    """Optical flow (dx, dy) [px] by raw frame n, from n to n + 4; NaN: unknown pixel."""
+    backward_flow: dict[int, Float[np.ndarray, "2 H W"]] = field(default_factory=dict)
+    """Optical flow (dx, dy) [px] by raw frame n, from n to n - 4; NaN: unknown pixel."""
+    sources: dict[str, str] = field(default_factory=dict)
+    """Where each value is from, by field name: 'file ...', 'default ...', 'inferred ...' or 'setting ...'."""
+    path: Path | None = None
+    """The folder this was read from; None for a sequence that lives in memory only."""
+
+    @property
+    def frames(self) -> int:
+        """Number F of raw frames, measured or not."""
+        return len(self.measured)
+
+    @property
+    def height(self) -> int:
+        """Rows H."""
+        return self.quads.shape[1]
+
+    @property
+    def width(self) -> int:
+        """Columns W."""
+        return self.quads.shape[2]
+
+    @property
+    def complete_quartets(self) -> list[int]:
+        """Indices i of the quartets whose four raw frames 4i .. 4i + 3 were all measured."""
+        step = FRAMES_PER_QUARTET
+        return [i for i in range(self.frames // step) if self.measured[step * i : step * (i + 1)].all()]
+
+    @classmethod
+    def open(cls, path: str | Path, *, frame_rate_hz: float | None = None) -> Sequence:
+        """Read a sequence from a folder.
+
+        Args:
+            path: An F-ToeRF folder.
+            frame_rate_hz: Raw frames per second; overrides what the folder says or the default of 120.
+
+        Raises:
+            InputError: If the folder or a file in it is not what data_specs/ describes.
+        """
+        from . import ftorf
+
+        return ftorf.read(path, frame_rate_hz=frame_rate_hz)
+
+    def truth(self) -> Truth | None:
+        """Ground truth stored beside the sequence, read now; None if there is none."""
+        from . import ftorf
+
+        return None if self.path is None else ftorf.read_truth(self.path, frames=self.frames)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Truth:
+    """What the scene really was. Only simulation knows it, and only evaluation may read it."""
+
+    distance: Float[np.ndarray, "F H W"]
+    """Distance along the ray through each pixel centre at each raw frame [m], float32; NaN: unknown."""
+    known: Bool[np.ndarray, "F"]
+    """Whether a raw frame has a distance at all."""

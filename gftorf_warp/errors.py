@@ -1,0 +1,55 @@
+"""Errors a user can cause: each says what is wrong, where, why, and what to do. The command line turns them into exit codes."""
+
+
+class GftorfError(Exception):
+    """Base of all errors that end a command without a traceback.
+
+    Args:
+        what: What is wrong, in a few words.
+        where: File, field or option it concerns.
+        why: What was expected and what was found.
+        fix: What the user can do about it.
+    """
+
+    exit_code = 1
+
+    def __init__(self, what: str, *, where: object, why: str, fix: str):
+        self.what, self.where, self.why, self.fix = what, str(where), why, fix
+        super().__init__(f"{what} - {self.where}\n  why: {why}\n  fix: {fix}")
+
+    def __reduce__(self):
+        return _rebuild, (type(self), self.what, self.where, self.why, self.fix)
+
+
+class UsageError(GftorfError):
+    """The options cannot be meant that way."""
+
+    exit_code = 2
+
+
+class InputError(GftorfError):
+    """A file or folder is not what it has to be."""
+
+    exit_code = 3
+
+
+class DivergedError(GftorfError):
+    """The optimisation left the numbers; the last good checkpoint is kept."""
+
+    exit_code = 4
+
+
+class ResourceError(GftorfError):
+    """Not enough disk, memory or GPU."""
+
+    exit_code = 5
+
+
+class BusyError(GftorfError):
+    """Another process works on the same run."""
+
+    exit_code = 6
+
+
+def _rebuild(kind: type[GftorfError], what: str, where: str, why: str, fix: str) -> GftorfError:
+    return kind(what, where=where, why=why, fix=fix)

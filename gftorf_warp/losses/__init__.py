@@ -1,0 +1,1 @@
+"""Tensors in, unreduced maps out."""

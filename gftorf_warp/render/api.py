@@ -1,0 +1,90 @@
+"""Public entry point of the renderer: documented, validated once, then handed to the bridge."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from jaxtyping import Float
+from torch import Tensor
+
+from ..scene.camera import Camera
+from ..scene.gaussians import GaussianField
+from ..scene.sensor import Sensor
+from .buffers import RenderSettings
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Background:
+    """Light from behind everything, added as T_e * background; a missing field is black.
+
+    Each field is broadcast to its image, so a number, [C, 1, 1] or [C, H, W] all work; all are differentiable.
+    """
+
+    quads: Tensor | None = None
+    """[Q, H, W] in quad units."""
+    phasor: Tensor | None = None
+    """[3, H, W] in quad units."""
+    colour: Tensor | None = None
+    """[3, H, W] linear RGB."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Rendering:
+    """What a pixel sees. With w = alpha T, and T_e the transmittance behind the last splat:"""
+
+    quads: Float[Tensor, "Q H W"]
+    """Sum of w T a (cos(psi - shift) + b), plus T_e times the background."""
+    phasor: Float[Tensor, "3 H W"]
+    """(re, im, amplitude): sum of w T 2a (cos psi, sin psi, 1), plus T_e times the background."""
+    colour: Float[Tensor, "3 H W"] | None
+    """Sum of w c, plus T_e times the background; None if the field has no colour."""
+    distance: Float[Tensor, "H W"]
+    """Sum of w d [m], *not* divided by the opacity."""
+    opacity: Float[Tensor, "H W"]
+    """Sum of w = 1 - T_e [1]."""
+    distortion: Float[Tensor, "H W"]
+    """Sum over all pairs of w_k w_l (d_k - d_l)^2 [m^2], or as the settings say."""
+    extra: Float[Tensor, "D H W"] | None
+    """Sum of w times the extra channels; no background."""
+    screen: ScreenGradient | None
+    """Filled by the backward pass if it was asked for."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ScreenGradient:
+    """What densification looks at; zero until the backward pass has run, not differentiable."""
+
+    gradient: Float[Tensor, "N 2"]
+    """Derivative of the loss by the image position of each Gaussian [1/px]."""
+    pixels: Float[Tensor, "N"]
+    """Number of pixels each Gaussian contributed to."""
+
+
+def rasterize(
+    field: GaussianField,
+    camera: Camera,
+    sensor: Sensor,
+    settings: RenderSettings = RenderSettings(),
+    *,
+    background: Background | None = None,
+    extra: Float[Tensor, "N D"] | None = None,
+    screen_gradient: bool = False,
+) -> Rendering:
+    """Render Gaussians into everything a C-ToF pixel could record (paper, equations 3-5).
+
+    Runs on the device of the field. Differentiable in every tensor of the field except its layer, in ``background``,
+    ``extra`` and the 0-d tensors of the sensor.
+
+    Args:
+        field: N Gaussians, float32.
+        camera: Where from; light and camera coincide.
+        sensor: Its modulation, offsets and shifts; noise is not applied here.
+        settings: How.
+        background: Light from behind everything; None is black.
+        extra: D more channels per Gaussian, composited like colour, for example 3D motion [m].
+        screen_gradient: Whether ``Rendering.screen`` is wanted.
+
+    Raises:
+        ValueError: If a tensor is not float32 or lives elsewhere than the field.
+    """
+    raise ValueError("under construction")

@@ -1,0 +1,1 @@
+"""What is optimised, and who looks: Gaussians, motion, camera, sensor."""

@@ -1,0 +1,91 @@
+"""The pinhole camera: intrinsics of the stored resolution, and one pose."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Camera:
+    """A pinhole camera with axes x right, y down, z forward; the centre of pixel [0, 0] is at (0.5, 0.5)."""
+
+    width: int
+    """Columns W of the image."""
+    height: int
+    """Rows H of the image."""
+    fx: float
+    """Focal length along x [px]."""
+    fy: float
+    """Focal length along y [px]."""
+    cx: float
+    """Principal point, x [px]; W/2 is the middle of the image."""
+    cy: float
+    """Principal point, y [px]."""
+    camera_from_world: np.ndarray = field(default_factory=lambda: np.eye(4))
+    """Pose, 4x4 on column vectors, world to camera [m]."""
+
+    def __post_init__(self):
+        pose = np.asarray(self.camera_from_world, dtype=np.float64)
+        if pose.shape != (4, 4):
+            raise ValueError(f"camera_from_world {pose.shape} must be (4, 4)")
+        rotation = pose[:3, :3]
+        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4) or np.linalg.det(rotation) < 0:
+            raise ValueError(f"camera_from_world: its upper left 3x3 is not a rotation: {rotation.tolist()}")
+        if self.width < 1 or self.height < 1 or not (self.fx > 0 and self.fy > 0):
+            raise ValueError(
+                f"a camera needs pixels and focal lengths above 0, got {self.width}x{self.height}, "
+                f"fx {self.fx}, fy {self.fy}"
+            )
+        object.__setattr__(self, "camera_from_world", pose)
+
+    @classmethod
+    def from_fov(cls, width: int, height: int, horizontal_fov_deg: float, **pose: np.ndarray) -> Camera:
+        """A camera with square pixels, a centred principal point and a horizontal field of view [deg]."""
+        focal = 0.5 * width / math.tan(math.radians(horizontal_fov_deg) / 2)
+        return cls(width=width, height=height, fx=focal, fy=focal, cx=width / 2, cy=height / 2, **pose)
+
+    @property
+    def centre(self) -> np.ndarray:
+        """Position of the camera [3] in the world [m]."""
+        pose = self.camera_from_world
+        return -pose[:3, :3].T @ pose[:3, 3]
+
+    def at(self, camera_from_world: np.ndarray) -> Camera:
+        """The same camera at another pose."""
+        return replace(self, camera_from_world=camera_from_world)
+
+    def resized(self, width: int, height: int) -> Camera:
+        """The same view at another resolution: intrinsics scale with the image."""
+        sx, sy = width / self.width, height / self.height
+        return replace(
+            self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy
+        )
+
+    def rays(self, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32) -> Float[Tensor, "H W 3"]:
+        """Unit vectors through the pixel centres, in world axes: point = centre + distance * ray."""
+        x = (torch.arange(self.width, dtype=torch.float64) + 0.5 - self.cx) / self.fx
+        y = (torch.arange(self.height, dtype=torch.float64) + 0.5 - self.cy) / self.fy
+        directions = torch.stack(
+            [
+                x.expand(self.height, -1),
+                y[:, None].expand(-1, self.width),
+                torch.ones(self.height, self.width, dtype=torch.float64),
+            ],
+            dim=-1,
+        )
+        directions = directions / directions.norm(dim=-1, keepdim=True)
+        world_from_camera = torch.from_numpy(self.camera_from_world[:3, :3].T.copy())
+        return (directions @ world_from_camera.T).to(device=device, dtype=dtype)
+
+    def project(self, point: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 2"]:
+        """Image position (x, y) [px] of points in the world [m]; meaningless for points behind the camera."""
+        pose = torch.from_numpy(self.camera_from_world).to(point)
+        local = point @ pose[:3, :3].T + pose[:3, 3]
+        focal = local.new_tensor([self.fx, self.fy])
+        return local[..., :2] / local[..., 2:] * focal + local.new_tensor([self.cx, self.cy])

@@ -1,0 +1,88 @@
+"""The scene: Gaussians as raw tensors by name, their activations as properties."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from ..constants import SH_BIAS, SH_COEFFICIENTS, SH_Y0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class GaussianField:
+    """N Gaussians. All tensors share a device and float32 (float64 is for the oracle)."""
+
+    mean: Float[Tensor, "N 3"]
+    """Centre in the world [m]."""
+    log_scale: Float[Tensor, "N 3"]
+    """Natural logarithm of the standard deviations along the own axes [log m]."""
+    quaternion: Float[Tensor, "N 4"]
+    """Orientation, wxyz; any length but zero."""
+    opacity_logit: Float[Tensor, "N"]
+    """Opacity before the sigmoid [1]."""
+    reflectivity_sh: Float[Tensor, "N 16"]
+    """Harmonics of the reflectivity seen from a direction [m^2 in quad units]; see :meth:`constant_sh`."""
+    colour_sh: Float[Tensor, "N 16 3"] | None = None
+    """Harmonics of linear RGB; None if there is no colour."""
+    layer: Int[Tensor, "N"] | None = None
+    """Label of the motion layer a Gaussian belongs to (0: static); carried along, never optimised."""
+
+    def __post_init__(self):
+        n = len(self.mean)
+        want = {
+            "mean": (n, 3),
+            "log_scale": (n, 3),
+            "quaternion": (n, 4),
+            "opacity_logit": (n,),
+            "reflectivity_sh": (n, SH_COEFFICIENTS),
+            "colour_sh": (n, SH_COEFFICIENTS, 3),
+            "layer": (n,),
+        }
+        for name, shape in want.items():
+            value = getattr(self, name)
+            if value is not None and tuple(value.shape) != shape:
+                raise ValueError(f"{name} {tuple(value.shape)} must be {shape} for N = {n}, the length of mean")
+
+    def __len__(self) -> int:
+        return len(self.mean)
+
+    @property
+    def scale(self) -> Float[Tensor, "N 3"]:
+        """Standard deviations along the own axes [m]."""
+        return self.log_scale.exp()
+
+    @property
+    def opacity(self) -> Float[Tensor, "N"]:
+        """Opacity at the peak [1]."""
+        return self.opacity_logit.sigmoid()
+
+    @property
+    def device(self) -> torch.device:
+        """Where the tensors live."""
+        return self.mean.device
+
+    def tensors(self) -> dict[str, Tensor]:
+        """All tensors that are present, by name, the layer included."""
+        return {f.name: getattr(self, f.name) for f in fields(self) if getattr(self, f.name) is not None}
+
+    def parameters(self) -> dict[str, Tensor]:
+        """The tensors that can be optimised, by name."""
+        return {name: value for name, value in self.tensors().items() if name != "layer"}
+
+    def map(self, function) -> GaussianField:
+        """A field with ``function`` applied to every tensor: selection, device, detaching."""
+        return replace(self, **{name: function(value) for name, value in self.tensors().items()})
+
+    def moved(self, displacement: Float[Tensor, "N 3"]) -> GaussianField:
+        """The field with every centre displaced [m]; nothing else moves (method, section 4)."""
+        return replace(self, mean=self.mean + displacement)
+
+
+def constant_sh(value: Float[Tensor, "*n"]) -> Float[Tensor, "*n 16"]:
+    """Harmonics that give ``value`` in every direction: h_0 = (value - 0.5) / Y_0, the rest zero."""
+    coefficients = torch.zeros(*value.shape, SH_COEFFICIENTS, dtype=value.dtype, device=value.device)
+    coefficients[..., 0] = (value - SH_BIAS) / SH_Y0
+    return coefficients
