@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from ..scene.camera import Camera
 from ..scene.gaussians import GaussianField
 from ..scene.sensor import Sensor
+from .bridge import IMAGES, INPUTS, Rasterize
 from .buffers import RenderSettings
 
 
@@ -87,4 +90,53 @@ def rasterize(
     Raises:
         ValueError: If a tensor is not float32 or lives elsewhere than the field.
     """
-    raise ValueError("under construction")
+    count, size = len(field), (camera.height, camera.width)
+    tensors: dict[str, Tensor | None] = dict.fromkeys(INPUTS)
+    tensors |= field.parameters()
+    if extra is not None:
+        if extra.ndim != 2 or len(extra) != count:
+            raise ValueError(f"extra {tuple(extra.shape)} must be (N, D) with N = {count}, the length of the field")
+        tensors["extra"] = extra if extra.shape[1] else None
+    background = background or Background()
+    channels = {"quads": len(sensor.shifts), "phasor": 3, "colour": 3}
+    for name, number in channels.items():
+        value = getattr(background, name)
+        if value is not None and not (name == "colour" and field.colour_sh is None):
+            tensors[f"background_{name}"] = _spread(f"background.{name}", value, (number, *size), field)
+    tensors["calibration"] = _calibration(sensor, field)
+    for name, tensor in tensors.items():
+        if tensor is not None and (tensor.dtype != torch.float32 or tensor.device != field.device):
+            want = f"float32 on {field.device}, where the field is"
+            raise ValueError(f"{name} is {tensor.dtype} on {tensor.device}, must be {want}")
+    screen = torch.zeros(count, 3, device=field.device) if screen_gradient else None
+    ordered = [None if t is None else t.contiguous() for t in (tensors[name] for name in INPUTS)]
+    shifts = tuple(float(shift) for shift in sensor.shifts)
+    images = dict(zip(IMAGES, Rasterize.apply(camera, shifts, settings, screen, *ordered), strict=True))
+    if extra is not None and images["extra"] is None:
+        images["extra"] = extra.new_zeros(0, *size)
+    return Rendering(
+        **images, screen=None if screen is None else ScreenGradient(gradient=screen[:, :2], pixels=screen[:, 2])
+    )
+
+
+def _spread(name: str, value: Tensor | float, shape: tuple[int, ...], field: GaussianField) -> Tensor:
+    """A background as [C, H, W]."""
+    tensor = torch.as_tensor(value, dtype=torch.float32, device=field.device)
+    try:
+        return tensor.expand(shape)
+    except RuntimeError:
+        raise ValueError(f"{name} {tuple(tensor.shape)} cannot be broadcast to {shape}") from None
+
+
+def _calibration(sensor: Sensor, field: GaussianField) -> Tensor:
+    """[4] phase slope [rad/m], phase offset [rad], source intensity, DC offset; numbers are uploaded once."""
+    values = sensor.phase_slope, sensor.phase_offset, sensor.source_intensity, sensor.dc_offset
+    if any(isinstance(value, Tensor) for value in values):
+        like = {"dtype": torch.float32, "device": field.device}
+        return torch.stack([torch.as_tensor(value, **like) for value in values])
+    return _uploaded(values, field.device)
+
+
+@functools.lru_cache(maxsize=64)
+def _uploaded(values: tuple[float, ...], device: torch.device) -> Tensor:
+    return torch.tensor(values, dtype=torch.float32, device=device)

@@ -2,8 +2,18 @@
 
 from __future__ import annotations
 
+import math
+import os
 from dataclasses import dataclass
 from enum import StrEnum
+
+import warp as wp
+
+from ..kernels.composite import CHANNEL_PLANES, LIGHT_PLANES, make_pixels
+from ..kernels.composite_backward import GRAD_LIGHT_PLANES
+from ..kernels.lanes import make_lanes
+from ..kernels.resolve import Tiling
+from ..kernels.splat import Splat
 
 
 class Support(StrEnum):
@@ -74,3 +84,74 @@ class RenderSettings:
             raise ValueError(f"sh_degree must be 0, 1, 2 or 3, got {self.sh_degree}")
         if self.threads is not None and self.threads < 1:
             raise ValueError(f"threads must be at least 1, got {self.threads}")
+
+
+def available_threads() -> int:
+    """CPU threads this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+class Frame:
+    """The arrays of one rendering: what forward leaves for backward. Nothing is shared between two frames."""
+
+    def __init__(self, count: int, width: int, height: int, extra: int, settings: RenderSettings, device: wp.Device):
+        """Reserve memory for ``count`` Gaussians, an image of ``width`` x ``height`` and ``extra`` channels."""
+        self.count, self.width, self.height, self.extra = count, width, height, extra
+        self.settings, self.device = settings, device
+        # a CPU thread works on 16 pixels of a row at once; on CUDA a tile belongs to one warp (design/tiles.md)
+        self.K, self.tile_width, self.tile_height = (16, 16, 4) if device.is_cpu else (1, 8, 4)
+        self.tiles_x = math.ceil(width / self.tile_width)
+        self.tiles_y = math.ceil(height / self.tile_height)
+        self.tiles = self.tiles_x * self.tiles_y
+        self.lanes = make_pixels(self.K, self.tile_width, self.tile_height).lanes
+        self.threads = (settings.threads or available_threads()) if device.is_cpu else 1
+        self.tiling = Tiling()
+        self.tiling.width, self.tiling.height, self.tiling.count_x = self.tile_width, self.tile_height, self.tiles_x
+
+        self.splats = self.array(count, Splat)
+        self.square_px = self.array(count, wp.vec4i)
+        self.depth_key, self.order = self.array(2 * count), self.array(2 * count)  # the radix sort wants twice the room
+        self.counts, self.offsets, self.total = self.array(count), self.array(count), self.array(1)
+        self.first = self.array(self.tiles + 1)
+        self.keys = self.ids = self.array(0)
+        self.sums = self.planes(LIGHT_PLANES)
+        self.channels: list[Planes] = []
+        self.extra_splats: list[wp.array] = []
+
+    def array(self, shape, dtype=wp.int32) -> wp.array:
+        """Uninitialised memory on the device of this frame."""
+        return wp.empty(shape, dtype=dtype, device=self.device)
+
+    def reserve_pairs(self, capacity: int) -> None:
+        """Make room for ``capacity`` (tile, splat) pairs, and as much again for the sort."""
+        self.keys, self.ids = self.array(2 * capacity), self.array(2 * capacity)
+
+    def planes(self, count: int) -> Planes:
+        """``count`` image planes in tile order."""
+        return Planes(self, count)
+
+    def light_gradients(self) -> Planes:
+        """Zeroed planes for the gradients of light, geometry and transmittance."""
+        planes = self.planes(GRAD_LIGHT_PLANES)
+        planes.flat.zero_()
+        return planes
+
+    def channel_planes(self) -> Planes:
+        """Planes for three T-weighted channels."""
+        return self.planes(CHANNEL_PLANES)
+
+
+class Planes:
+    """Image planes in tile order, seen twice: ``lanes`` for the compositor, ``flat`` for everything per pixel."""
+
+    def __init__(self, frame: Frame, count: int):
+        # One tile of padding: 320 x 240 floats are exactly 75 pages, and a loop that touches the same pixel of nine such
+        # planes would keep evicting its own cache lines.
+        tile = frame.lanes * frame.K
+        self.flat = frame.array((count, (frame.tiles + 1) * tile), wp.float32)
+        self.lanes = wp.array(
+            ptr=self.flat.ptr,
+            dtype=make_lanes(frame.K).V,
+            shape=(count, frame.tiles + 1, frame.lanes),
+            device=frame.device,
+        )  # a view: ``flat`` owns the memory, and lives as long as this object

@@ -1,0 +1,58 @@
+"""Rotations, the camera as kernels see it, and the linearised projection of a covariance."""
+
+import warp as wp
+
+from ..constants import GUARD, LOW_PASS
+
+
+@wp.struct
+class CameraView:
+    """A pinhole camera; the centre of pixel [0, 0] is at (0.5, 0.5)."""
+
+    rotation: wp.mat33  # camera_from_world, upper left
+    translation: wp.vec3  # camera_from_world, last column [m]
+    centre: wp.vec3  # position in the world [m]
+    fx: float  # focal length [px]
+    fy: float  # focal length [px]
+    cx: float  # principal point [px]
+    cy: float  # principal point [px]
+    width: int  # columns [px]
+    height: int  # rows [px]
+    near: float  # smallest z-depth [m]
+    far: float  # largest z-depth [m]
+
+
+@wp.func
+def rotation_of(wxyz: wp.vec4) -> wp.mat33:
+    """Rotation matrix of a quaternion in the order of the program; it need not have unit length."""
+    q = wp.normalize(wxyz)
+    w = q[0]
+    x = q[1]
+    y = q[2]
+    z = q[3]
+    return wp.mat33(
+        1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y),
+        2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x),
+        2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y),
+    )  # fmt: skip
+
+
+@wp.func
+def screen_covariance(view: CameraView, local: wp.vec3, wxyz: wp.vec4, scale: wp.vec3) -> wp.vec3:
+    """Covariance (xx, xy, yy) [px^2] of a Gaussian on the image: J R Sigma R^T J^T plus the low-pass filter.
+
+    The Jacobian J of the projection is taken at the centre ``local`` [m, camera axes], but no farther out than 1.3 half
+    fields of view, since beyond that the linearisation explodes (method, section 2.2).
+    """
+    axes = wp.transpose(view.rotation * rotation_of(wxyz) * wp.diag(scale))  # rows: own axes, in camera axes
+    inverse_z = 1.0 / local[2]
+    limit_x = 0.5 * GUARD * float(view.width) / view.fx
+    limit_y = 0.5 * GUARD * float(view.height) / view.fy
+    slope_x = wp.clamp(local[0] * inverse_z, -limit_x, limit_x)
+    slope_y = wp.clamp(local[1] * inverse_z, -limit_y, limit_y)
+    along_x = axes * wp.vec3(view.fx * inverse_z, 0.0, -view.fx * inverse_z * slope_x)
+    along_y = axes * wp.vec3(0.0, view.fy * inverse_z, -view.fy * inverse_z * slope_y)
+    xx = wp.dot(along_x, along_x) + LOW_PASS
+    xy = wp.dot(along_x, along_y)
+    yy = wp.dot(along_y, along_y) + LOW_PASS
+    return wp.vec3(xx, xy, yy)

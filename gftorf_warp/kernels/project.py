@@ -1,0 +1,134 @@
+"""Gaussians to splats: activation, projection, reflectivity and light of each, and its place in the depth order.
+
+There is no loop that carries a value, so Warp's own adjoint of this kernel is exact (method, sections 3.3-3.5).
+"""
+
+import functools
+
+import warp as wp
+
+from ..constants import ALPHA_MIN, SH_BIAS
+from .correlation import PHASE_OFFSET, PHASE_SLOPE, SOURCE_INTENSITY, light_of
+from .geometry import CameraView, screen_covariance
+from .harmonics import harmonics
+from .splat import Splat
+
+CULLED = wp.constant(wp.int32(0x7FFFFFFF))  # depth key behind every positive float
+
+
+@wp.func
+def extent_of(opacity: float, cov_yy: float) -> wp.vec2:
+    """(cutoff, reach_y) of a record. A little wide: they decide what is visited, not what it is worth."""
+    cutoff = 2.0 * wp.log(opacity / ALPHA_MIN) + 1.0e-5
+    return wp.vec2(cutoff, wp.sqrt(wp.max(cutoff, 0.0) * cov_yy) * 1.0001 + 1.0e-3)
+
+
+@wp.func_grad(extent_of)
+def adj_extent_of(opacity: float, cov_yy: float, adj_ret: wp.vec2):  # noqa: ARG001 - Warp dictates the parameters
+    """No derivative: slot 6 of a gradient record is free to count pixels."""
+
+
+@wp.func
+def square_of(view: CameraView, x: float, y: float, cov: wp.vec3) -> wp.vec4i:
+    """Pixels [x0, y0, x1, y1) of the 3-sigma square rounded out to 16-pixel tiles, as the released code has it."""
+    middle = 0.5 * (cov[0] + cov[2])
+    determinant = cov[0] * cov[2] - cov[1] * cov[1]
+    radius = wp.ceil(3.0 * wp.sqrt(middle + wp.sqrt(wp.max(0.1, middle * middle - determinant))))
+    tiles_x = (view.width + 15) // 16
+    tiles_y = (view.height + 15) // 16
+    x0 = wp.clamp(int(wp.floor((x - radius) / 16.0)), 0, tiles_x)
+    y0 = wp.clamp(int(wp.floor((y - radius) / 16.0)), 0, tiles_y)
+    x1 = wp.clamp(int(wp.floor((x + radius + 15.0) / 16.0)), 0, tiles_x)
+    y1 = wp.clamp(int(wp.floor((y + radius + 15.0) / 16.0)), 0, tiles_y)
+    return wp.vec4i(16 * x0, 16 * y0, 16 * x1, 16 * y1)
+
+
+@functools.cache
+def make_project(colour: bool, square: bool, metric: bool):
+    """The kernel for a field with or without colour.
+
+    Args:
+        colour: Whether slots 8-10 hold colour, from its own harmonics.
+        square: Whether splats are cut by the 3-sigma square (parity with the released code).
+        metric: Whether distortion is measured in metres (paper) or on the released mapping of the distance.
+    """
+
+    @wp.kernel(module="unique", module_options={"fast_math": False})  # __sinf would lose the phase beyond +-pi
+    def project(
+        # In:
+        view: CameraView,  # the camera [m, px]
+        calibration: wp.array[float],  # [4] phase slope [rad/m], phase offset [rad], source intensity [1], DC offset
+        degree: int,  # harmonics above it are ignored [0..3]
+        mean: wp.array[wp.vec3],  # [N] centre in the world [m]
+        log_scale: wp.array[wp.vec3],  # [N] log of the standard deviations [log m]
+        quaternion: wp.array[wp.vec4],  # [N] orientation, wxyz
+        opacity_logit: wp.array[float],  # [N] opacity before the sigmoid
+        reflectivity_sh: wp.array2d[float],  # [N, 16] harmonics of the reflectivity
+        colour_sh: wp.array2d[wp.vec3],  # [N, 16] harmonics of RGB; [0, 0] without colour
+        # Out:
+        splats: wp.array[Splat],  # [N] records, see splat.py; undefined where culled
+        square_px: wp.array[wp.vec4i],  # [N] x0, y0, x1, y1 of the pixels a splat may touch [px]; x1 = 0: culled
+        depth_key: wp.array[wp.int32],  # [>= N] bits of the z-depth, which order like the float
+        order: wp.array[wp.int32],  # [>= N] 0, 1, 2, ...
+    ):
+        """One thread per Gaussian."""
+        n = wp.tid()
+        order[n] = n
+        depth_key[n] = CULLED
+        square_px[n] = wp.vec4i(0, 0, 0, 0)
+        opacity = 1.0 / (1.0 + wp.exp(-opacity_logit[n]))
+        local = view.rotation * mean[n] + view.translation
+        if local[2] < view.near or local[2] > view.far or opacity < ALPHA_MIN:
+            return
+        log_sizes = log_scale[n]
+        scale = wp.vec3(wp.exp(log_sizes[0]), wp.exp(log_sizes[1]), wp.exp(log_sizes[2]))
+        cov = screen_covariance(view, local, quaternion[n], scale)
+        determinant = cov[0] * cov[2] - cov[1] * cov[1]
+        if determinant <= 0.0:
+            return
+        x = view.fx * local[0] / local[2] + view.cx
+        y = view.fy * local[1] / local[2] + view.cy
+        if wp.static(square):
+            box = square_of(view, x, y, cov)
+            if box[2] <= box[0] or box[3] <= box[1]:
+                return
+            square_px[n] = box
+        else:
+            square_px[n] = wp.vec4i(0, 0, view.width, view.height)
+        depth_key[n] = wp.cast(local[2], wp.int32)
+
+        distance = wp.length(local)
+        direction = (mean[n] - view.centre) / distance
+        basis = harmonics(direction)
+        active = (degree + 1) * (degree + 1)
+        reflectivity = float(SH_BIAS)
+        for h in range(16):
+            reflectivity += wp.where(h < active, basis[h] * reflectivity_sh[n, h], 0.0)
+        reflectivity = wp.max(reflectivity, 0.0)
+        light = light_of(
+            distance,
+            reflectivity,
+            calibration[wp.static(PHASE_SLOPE)],
+            calibration[wp.static(PHASE_OFFSET)],
+            calibration[wp.static(SOURCE_INTENSITY)],
+        )
+        red = float(0.0)
+        green = float(0.0)
+        blue = float(0.0)
+        if wp.static(colour):
+            rgb = wp.vec3(SH_BIAS, SH_BIAS, SH_BIAS)
+            for h in range(16):
+                rgb += wp.where(h < active, basis[h], 0.0) * colour_sh[n, h]
+            red = wp.max(rgb[0], 0.0)
+            green = wp.max(rgb[1], 0.0)
+            blue = wp.max(rgb[2], 0.0)
+        zeta = distance
+        if wp.static(not metric):
+            zeta = view.far / (view.far - view.near) * (1.0 - view.near / distance)
+        extent = extent_of(opacity, cov[2])
+        splats[n] = Splat(
+            x, y, cov[2] / determinant, -cov[1] / determinant, cov[0] / determinant, opacity, extent[0], extent[1],
+            red, green, blue, light[0], light[1], light[2], distance, zeta,
+        )  # fmt: skip
+
+    return project

@@ -1,0 +1,107 @@
+"""The record of a projected Gaussian, and how a compositor reads one and adds to the gradient of one.
+
+Sixteen floats, one 64-byte line, the same slots for values and for gradients:
+
+    0 x   1 y        image position of the centre [px]
+    2 A   3 B   4 C  conic: power = -(A dx^2 + C dy^2) / 2 - B dx dy [1/px^2]
+    5 opacity        at the peak [1]
+    6 cutoff         2 ln(255 opacity): below it alpha >= 1/255; in a gradient record the number of pixels reached
+    7 reach_y        bound of abs(dy) on the ellipse alpha = 1/255 [px]; no gradient
+    8 9 10           three channels weighed by T, for example colour
+    11 12 13         a cos psi, a sin psi, a: what quads and phasor are made of, weighed by T^2
+    14 distance      along the ray [m]
+    15 zeta          what distortion is measured on: the distance, or its released mapping
+"""
+
+import warp as wp
+
+Splat = wp.types.vector(length=16, dtype=wp.float32)
+CHANNEL = wp.constant(8)  # first slot of the T-weighted channels
+
+_LOAD = """
+#if defined(__CUDA_ARCH__)  // component-wise reads would be sixteen; a record is aligned, so four of 16 bytes do
+    const float4* line = reinterpret_cast<const float4*>(splats.data + i);
+    wp::vec_t<16, float> record;
+    for (int part = 0; part < 4; ++part) {
+        const float4 four = __ldg(line + part);
+        record[4 * part] = four.x; record[4 * part + 1] = four.y;
+        record[4 * part + 2] = four.z; record[4 * part + 3] = four.w;
+    }
+    return record;
+#else
+    return splats.data[i];
+#endif
+"""
+
+# A CPU thread owns one row of a tile, so a cheap test skips most rows. A warp owns all rows of a tile that is known to
+# be touched: there the test would hardly ever hold for all lanes.
+_ROW_MISSED = """
+#if defined(__CUDA_ARCH__)
+    return false;
+#else
+    return __builtin_fabsf(dy) > splats.data[i].c[7];
+#endif
+"""
+
+
+@wp.func_native(_LOAD)
+def load_splat(splats: wp.array[Splat], i: int) -> Splat: ...
+@wp.func_native("return splats.data[i].c[1] - y;")
+def row_offset(splats: wp.array[Splat], i: int, y: float) -> float: ...
+@wp.func_native(_ROW_MISSED)
+def row_missed(splats: wp.array[Splat], i: int, dy: float) -> bool: ...
+
+
+@wp.kernel(enable_backward=False)
+def set_channels(
+    # In:
+    source: wp.array[Splat],  # [N] records of the main pass
+    values: wp.array2d[float],  # [N, D] extra channels
+    start: int,  # first of the three channels to take [index]
+    # Out:
+    target: wp.array[Splat],  # [N] the same records with slots 8-10 replaced; may be ``source``
+):
+    """One thread per Gaussian; channels past D are zero."""
+    n = wp.tid()
+    record = source[n]
+    for c in range(3):
+        value = float(0.0)
+        if start + c < values.shape[1]:
+            value = values[n, start + c]
+        record[CHANNEL + c] = value
+    target[n] = record
+
+
+@wp.kernel(enable_backward=False)
+def take_channels(
+    # In:
+    grad_splats: wp.array[Splat],  # [N] gradient records whose slots 8-10 belong to extra channels
+    start: int,  # first of the three channels [index]
+    # Out:
+    grad_values: wp.array2d[float],  # [N, D] added to
+):
+    """Adjoint of :func:`set_channels`; one thread per Gaussian."""
+    n = wp.tid()
+    for c in range(3):
+        if start + c < grad_values.shape[1]:
+            grad_values[n, start + c] = grad_values[n, start + c] + grad_splats[n][CHANNEL + c]
+
+
+@wp.kernel(enable_backward=False)
+def add_records(
+    # In:
+    part: wp.array[Splat],  # [N] gradient records of one CPU thread or one pass
+    geometry_only: int,  # 1: only slots 0-5, what passes of further channels share with the main pass [flag]
+    # Out:
+    total: wp.array[Splat],  # [N] added to
+):
+    """One thread per Gaussian."""
+    n = wp.tid()
+    if geometry_only == 1:
+        record = total[n]
+        other = part[n]
+        for slot in range(6):
+            record[slot] = record[slot] + other[slot]
+        total[n] = record
+    else:
+        total[n] = total[n] + part[n]
