@@ -1,4 +1,4 @@
-"""Errors a user can cause: each says what is wrong, where, why, and what to do. The command line turns them into exit codes."""
+"""Errors a user can cause: each says what is wrong, where, why, and what to do; the command line adds exit codes."""
 
 
 class GftorfError(Exception):

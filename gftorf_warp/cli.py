@@ -1,0 +1,261 @@
+"""The command ``gftorf``: verbs to functions, options to arguments, exceptions to messages and exit codes.
+
+No command has logic of its own, and nothing heavy is imported before a command needs it: ``gftorf --help`` is instant.
+This is the only file that names a device.
+"""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from . import __version__
+from .errors import ResourceError, UsageError
+from .options import nearest, parse
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run one command.
+
+    Args:
+        arguments: What follows ``gftorf``; None takes the process's own.
+
+    Returns:
+        Exit code: 0 ok, 1 a bug or a failed self-test, 2 usage, 3 bad input, 4 diverged, 5 resources, 6 busy, 130
+        interrupted.
+    """
+    from .terminal import logging_to_stderr, print_error
+
+    given = sys.argv[1:] if arguments is None else list(arguments)
+    debug = "--debug" in given
+    try:
+        options = parse(given)
+        with logging_to_stderr(_level(options)), _cpus(getattr(options, "threads", None)):
+            return COMMANDS[options.command](options)
+    except SystemExit as stop:  # --help and --version
+        return int(stop.code or 0)
+    except BrokenPipeError:  # the reader of our output has left, as `head` does
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except (Exception, KeyboardInterrupt) as error:
+        return print_error(error, debug=debug)
+
+
+def choose_device(name: str) -> tuple[str, str]:
+    """Device for torch and Warp, and why it was taken.
+
+    Args:
+        name: "auto", "cpu", "cuda" or "cuda:N".
+
+    Raises:
+        ResourceError: If CUDA was asked for and cannot be had.
+    """
+    import torch
+    import warp as wp
+
+    if name == "cpu":
+        return "cpu", "as asked"
+    if not torch.cuda.is_available():
+        build = "this torch is a CPU build" if torch.version.cuda is None else "no CUDA driver or GPU found"
+        reason = "no CUDA driver found" if wp.get_cuda_driver_version() is None else build
+    elif not wp.is_cuda_available():
+        reason = "Warp cannot use the CUDA driver"
+    else:
+        index = int(name.partition(":")[2] or 0)
+        if index < torch.cuda.device_count():
+            return f"cuda:{index}", torch.cuda.get_device_name(index)
+        reason = f"there are {torch.cuda.device_count()} GPUs, counted from 0"
+    if name == "auto":
+        return "cpu", f"{reason}: fine, only slower"
+    raise ResourceError(f"no device {name}", where="--device", why=reason, fix="leave --device out, or --device cpu")
+
+
+def start(options: argparse.Namespace) -> str:
+    """Start torch and Warp, say on what, compile the kernels if none are cached, and return the device."""
+    import torch
+
+    from . import terminal
+    from .doctor import compile_kernels
+
+    terminal.start_warp()
+    device, reason = choose_device(getattr(options, "device", "cpu"))
+    threads = min(torch.get_num_threads(), _available_cpus())
+    cache = terminal.home_as_tilde(terminal.kernel_cache())
+    line = f"gftorf_warp {__version__} - device {device} ({threads} threads; {reason}) - kernels cached in {cache}"
+    terminal.LOG.info(line)
+    if not terminal.kernels_are_cached():
+        terminal.LOG.info("  compiling kernels (first run only) ...")
+        terminal.LOG.info("  compiling kernels (first run only) ... %.1f s", compile_kernels(device))
+    return device
+
+
+def _demo(options: argparse.Namespace) -> int:
+    from .demo import demo
+
+    device = start(options)
+    lines = demo(
+        options.out,
+        device=device,
+        seed=options.seed,
+        size=options.size,
+        frames=options.frames,
+        images=options.images,
+        fresh=options.fresh,
+        progress=_progress(options),
+    )
+    print("\n".join(lines))
+    return 0
+
+
+def _simulate(options: argparse.Namespace) -> int:
+    from .sim.scenes import SCENES
+
+    if options.list:
+        print("\n".join(f"{name:<12} {summary(scene)}" for name, scene in SCENES.items()))
+        return 0
+    if options.scene is None or options.out is None:
+        missing = "SCENE" if options.scene is None else "--out SEQ"
+        fix = f"for example `gftorf simulate {next(iter(SCENES))} --out sequence`; `gftorf simulate --list`"
+        raise UsageError(f"{missing} is missing", where="gftorf simulate", why="both are needed", fix=fix)
+    if options.scene not in SCENES:
+        hint = nearest(options.scene, list(SCENES), "`gftorf simulate --list` names them")
+        why = f"there are {', '.join(SCENES)}"
+        raise UsageError(f"unknown scene {options.scene}", where="gftorf simulate", why=why, fix=hint)
+    from .sim.simulate import simulate
+
+    start(options)
+    path = simulate(
+        options.scene,
+        options.out,
+        frames=options.frames,
+        size=options.size,
+        seed=options.seed,
+        sync=options.sync,
+        noise=not options.no_noise,
+        format=options.format,
+        fresh=options.fresh,
+        progress=_progress(options)("simulate"),
+    )
+    print(path)
+    return 0
+
+
+def _reconstruct(options: argparse.Namespace) -> int:
+    from .data.sequence import Sequence
+
+    sequence = Sequence.open(options.sequence, frame_rate_hz=options.frame_rate)
+    device = start(options)
+    from .recon.train import reconstruct
+
+    run = reconstruct(
+        sequence,
+        options.out,
+        options.preset,
+        images=options.images,
+        seed=options.seed,
+        device=device,
+        fresh=options.fresh,
+        progress=_progress(options)("reconstruct"),
+    )
+    print(run.path)
+    return 0
+
+
+def _render(options: argparse.Namespace) -> int:
+    device = start(options)
+    from .evaluate.views import render_to_folder
+    from .recon.run import Run
+
+    written = render_to_folder(
+        Run.open(options.run_folder, device), options.out, what=options.what, times=options.times
+    )
+    print("\n".join(map(str, written)))
+    return 0
+
+
+def _compare(options: argparse.Namespace) -> int:
+    import json
+
+    device = start(options)
+    from .evaluate.compare import compare
+    from .recon.run import Run
+
+    metrics = compare(Run.open(options.run_folder, device), truth=options.truth, frames=options.frames)
+    print(json.dumps(metrics, indent=2) if options.json else table(metrics))
+    return 0
+
+
+def _check(options: argparse.Namespace) -> int:
+    from .data.check import check
+
+    print(check(options.sequence))
+    return 0
+
+
+def _doctor(options: argparse.Namespace) -> int:
+    from .doctor import doctor
+
+    device = start(options)
+    passed, lines = doctor(device)
+    print("\n".join(lines))
+    return 0 if passed else 1
+
+
+COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
+    "demo": _demo,
+    "simulate": _simulate,
+    "reconstruct": _reconstruct,
+    "render": _render,
+    "compare": _compare,
+    "check": _check,
+    "doctor": _doctor,
+}
+
+
+def table(metrics: dict) -> str:
+    """The errors of metrics.json as lines of text, MSE x100 [m^2]: closed form against ours."""
+    lines = [f"{'MSE x100 [m^2]':<16}{'closed form':>12}{'d':>10}{'d / opacity':>13}{'d_ToF':>10}"]
+    keys = ("closed_form_mse_x100", "d_mse_x100", "d_normalised_mse_x100", "d_tof_mse_x100")
+    for name, row in (("all", metrics), ("moving", metrics["moving"]), ("static", metrics["static"])):
+        cells = ["-" if row is None or row[key] is None else f"{row[key]:.4g}" for key in keys]
+        lines.append(f"{name:<16}{cells[0]:>12}{cells[1]:>10}{cells[2]:>13}{cells[3]:>10}")
+    psnr = metrics["quad_psnr_db"]
+    quality = "-" if psnr is None else f"{psnr:.2f} dB"
+    return "\n".join([*lines, f"{metrics['frames']} raw frames ({metrics['protocol']}), quad PSNR {quality}"])
+
+
+def summary(thing: object) -> str:
+    """First line of a docstring."""
+    return (thing.__doc__ or "").strip().partition("\n")[0]
+
+
+def _level(options: argparse.Namespace) -> int:
+    return logging.WARNING if options.quiet else logging.DEBUG if options.verbose else logging.INFO
+
+
+def _progress(options: argparse.Namespace) -> Callable[[str], Callable[..., None]]:
+    from .terminal import Progress
+
+    return lambda label: Progress(label, quiet=options.quiet)
+
+
+def _available_cpus() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@contextmanager
+def _cpus(threads: int | None) -> Iterator[None]:
+    """Restrict this process to so many CPUs, which torch, OpenCV and the renderer all follow."""
+    if threads is None or not hasattr(os, "sched_setaffinity"):
+        yield
+        return
+    before = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, set(sorted(before)[:threads]))
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, before)

@@ -1,0 +1,156 @@
+"""``gftorf demo``: simulate a moving scene, check it, reconstruct it, compare. Only their order is decided here."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from . import __version__
+from .errors import UsageError
+from .terminal import LOG
+
+SCENE = "demo"
+PRESET = "demo"
+SETTINGS = "demo.json"
+OURS = (SETTINGS, "seq", "run", "metrics.json", "report.html")
+
+
+def demo(
+    out: str | Path,
+    *,
+    device: str = "cpu",
+    seed: int = 0,
+    size: tuple[int, int] | None = None,
+    frames: int | None = None,
+    images: int | None = None,
+    fresh: bool = False,
+    progress: Callable[[str], Callable[..., None]] | None = None,
+) -> list[str]:
+    """Run the four steps in one folder; steps that were finished there with the same settings are not repeated.
+
+    Args:
+        out: Folder to write: ``seq``, ``run``, ``metrics.json``, ``report.html``.
+        device: Where to reconstruct.
+        seed: Of the sensor's noise and of the optimiser.
+        size: (width, height) [px]; None is the scene's own.
+        frames: Raw frames; None is the scene's own number.
+        images: Raw frames to optimise; None is the preset's own number.
+        fresh: Start over; what an earlier demo left in ``out`` is moved to ``out/old-1``, ``old-2``, ...
+        progress: Called with the name of a step; returns what that step calls with (done, total).
+
+    Returns:
+        What to tell the user at the end: errors on moving and on static pixels, and where the report is.
+
+    Raises:
+        UsageError: If ``out`` holds something else, and ``fresh`` is not set.
+    """
+    from .data.check import check
+    from .data.sequence import Sequence
+    from .evaluate.compare import compare
+    from .recon.train import reconstruct
+    from .sim.simulate import simulate
+
+    out = Path(out)
+    prepare(out, {"version": __version__, "seed": seed, "size": size, "frames": frames, "images": images}, fresh=fresh)
+    report = progress or (lambda _: None)
+
+    with _Step("[1/4] simulate   ") as step:
+        if not (out / "seq").exists():  # it appears only when it is complete
+            simulate(SCENE, out / "seq", frames=frames, size=size, seed=seed, progress=report("simulate"))
+        sequence = Sequence.open(out / "seq")
+        step.says = f"{SCENE} {sequence.width}x{sequence.height}, {sequence.frames} raw frames -> {out / 'seq'}"
+    with _Step("[2/4] check      ") as step:
+        lines = str(check(out / "seq")).splitlines()
+        for line in lines:
+            LOG.debug("      %s", line)
+        step.says = (
+            f"{len(sequence.complete_quartets)} complete quartets, {sum('warning' in x for x in lines)} warnings"
+        )
+    with _Step("[3/4] reconstruct") as step:
+        run = reconstruct(
+            sequence, out / "run", PRESET, images=images, seed=seed, device=device, progress=report("reconstruct")
+        )
+        step.says = f"{run.gaussians} Gaussians -> {out / 'run'}"
+    with _Step("[4/4] compare    ") as step:
+        metrics = compare(run)
+        for name in ("metrics.json", "report.html"):
+            shutil.copyfile(run.path / name, out / name)
+        step.says = (
+            f"{metrics['frames']} raw frames, quad PSNR {metrics['quad_psnr_db']:.2f} dB -> {out / 'metrics.json'}"
+        )
+    return [*summary(metrics), f"open {out / 'report.html'} (one file, works offline)"]
+
+
+def prepare(out: Path, settings: dict, *, fresh: bool) -> None:
+    """Make sure that ``out`` is empty or holds a demo with these settings.
+
+    Raises:
+        UsageError: Otherwise, unless ``fresh`` is set.
+    """
+    wanted = json.loads(json.dumps(settings))  # tuples become lists, as they are on disk
+    if fresh:
+        set_aside(out)
+    elif out.exists() and (not out.is_dir() or any(out.iterdir())):
+        found = _read(out / SETTINGS)
+        if found != wanted:
+            differ = sorted(key for key in wanted if found is None or found.get(key) != wanted[key])
+            why = (
+                "it holds files that no demo wrote"
+                if found is None
+                else f"it was made with another {', '.join(differ)}"
+            )
+            fix = "--fresh starts over and keeps what is there under old-1; or choose another --out"
+            raise UsageError("the folder is not empty", where=out, why=why, fix=fix)
+    out.mkdir(parents=True, exist_ok=True)
+    (out / SETTINGS).write_text(json.dumps(wanted, indent=2) + "\n")
+
+
+def set_aside(out: Path) -> None:
+    """Move what a demo wrote, and nothing else, to the first free ``out/old-N``."""
+    ours = [out / name for name in OURS if (out / name).exists()]
+    if not ours:
+        return
+    number = next(n for n in range(1, 10**6) if not (out / f"old-{n}").exists())
+    (out / f"old-{number}").mkdir()
+    for path in ours:
+        path.rename(out / f"old-{number}" / path.name)
+    LOG.info("what was there is now in %s", out / f"old-{number}")
+
+
+def summary(metrics: dict) -> list[str]:
+    """Errors of the closed form and of ours, from metrics.json, on moving and on static pixels."""
+    lines = []
+    for name in ("moving", "static"):
+        row = metrics[name]
+        if row is None or row["d_mse_x100"] is None:
+            lines.append(f"{name} pixels: none in this scene")
+            continue
+        closed_form, ours = row["closed_form_mse_x100"], row["d_mse_x100"]
+        lines.append(
+            f"{name} pixels: closed form {closed_form:.3f} -> ours {ours:.3f} "
+            f"(distance error, MSE x100 [m^2]; {ours / closed_form:.2f} of it)"
+        )
+    return lines
+
+
+class _Step:
+    """Times one of the four steps and says at its end what came out."""
+
+    def __init__(self, name: str):
+        self.name, self.says = name, ""
+
+    def __enter__(self) -> _Step:
+        self.begun = time.monotonic()
+        LOG.info(self.name)
+        return self
+
+    def __exit__(self, kind, *_) -> None:
+        if kind is None:
+            LOG.info("%s %s   %.1f s", self.name, self.says, time.monotonic() - self.begun)
+
+
+def _read(path: Path) -> dict | None:
+    return json.loads(path.read_text()) if path.is_file() else None

@@ -1,0 +1,228 @@
+"""What may be typed after ``gftorf``: commands, options, their values, and a hint where a name is nearly right."""
+
+from __future__ import annotations
+
+import argparse
+import difflib
+import re
+from collections.abc import Callable
+from typing import NoReturn
+
+from . import __version__
+from .errors import UsageError
+
+WHAT = ("distance", "quads", "phasor", "colour")
+PRESETS = ("demo",)
+FORMATS = ("ftorf",)
+PROTOCOLS = ("all", "ftorf13")
+
+
+class Parser(argparse.ArgumentParser):
+    """An argparse parser whose mistakes are :class:`UsageError`, with the nearest option as a hint."""
+
+    def error(self, message: str) -> NoReturn:
+        """Raise instead of leaving the process."""
+        raise UsageError("these options do not fit", where=self.prog, why=message, fix=f"see `{self.prog} --help`")
+
+    def parse(self, arguments: list[str]) -> argparse.Namespace:
+        """Parse everything, or name what is unknown and what is nearest to it."""
+        values, unknown = self.parse_known_args(arguments)
+        if unknown:
+            name = unknown[0].partition("=")[0]
+            kind = "option" if name.startswith("-") else "argument"
+            raise UsageError(
+                f"unknown {kind} {name}",
+                where=self.prog,
+                why=f"`{self.prog}` has no such {kind}",
+                fix=nearest(name, list(self._option_string_actions), f"see `{self.prog} --help`"),
+            )
+        return values
+
+
+def parse(arguments: list[str]) -> argparse.Namespace:
+    """Options of one command as attributes; ``command`` is its name.
+
+    Raises:
+        UsageError: If the command or an option is unknown, or a value cannot be meant.
+    """
+    command = next((a for a in arguments if not a.startswith("-")), None)
+    parsers = command_parsers()
+    if command is None:
+        top_parser(parsers).parse(arguments)
+        raise UsageError(
+            "no command", where="gftorf", why=f"one of {', '.join(parsers)} is needed", fix="gftorf --help"
+        )
+    if command not in parsers:
+        hint = nearest(command, list(parsers), "see `gftorf --help`")
+        raise UsageError(f"unknown command {command}", where="gftorf", why=f"there are {', '.join(parsers)}", fix=hint)
+    rest = list(arguments)
+    rest.remove(command)
+    return parsers[command].parse(rest)
+
+
+def top_parser(parsers: dict[str, Parser]) -> Parser:
+    """What ``gftorf --help`` prints."""
+    width = max(map(len, parsers))
+    rows = "\n".join(f"  {name:<{width}}  {parser.description}" for name, parser in parsers.items())
+    parser = Parser(
+        prog="gftorf",
+        usage="gftorf COMMAND [options]",
+        description="Simulate and reconstruct scenes seen by a continuous-wave time-of-flight camera.",
+        epilog=f"commands:\n{rows}\n\n`gftorf COMMAND --help` lists the options of one. Start with `gftorf demo`.",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    parser.add_argument("--version", action="version", version=f"gftorf_warp {__version__}")
+    return parser
+
+
+def command_parsers() -> dict[str, Parser]:
+    """One parser per command, by name."""
+    demo = _command("demo", "simulate a moving scene, reconstruct it, and compare the two in a report")
+    demo.add_argument("--out", metavar="DIR", default="gftorf-demo", help="folder to write (gftorf-demo)")
+    _device_options(demo)
+    _seed_option(demo, "seed of the noise and of the optimiser (0)")
+    demo.add_argument("--size", metavar="WxH", type=_size, help="image size in pixels (the scene's own)")
+    demo.add_argument("--frames", metavar="N", type=_positive, help="raw frames, four to a quartet (the scene's own)")
+    demo.add_argument("--images", metavar="N", type=_positive, help="raw frames to optimise (the preset's own)")
+    _fresh_option(demo)
+
+    simulate = _command("simulate", "write a sequence of asynchronous quads with its true distance")
+    simulate.add_argument("scene", metavar="SCENE", nargs="?", help="name of a scene; --list shows them")
+    simulate.add_argument("--list", action="store_true", help="list the scenes and stop")
+    simulate.add_argument("--out", metavar="SEQ", help="folder to write")
+    simulate.add_argument("--frames", metavar="N", type=_positive, help="raw frames (the scene's own number)")
+    simulate.add_argument("--size", metavar="WxH", type=_size, help="image size in pixels (the scene's own)")
+    _seed_option(simulate, "seed of the noise (0)")
+    simulate.add_argument("--format", metavar="ftorf", type=_one_of(FORMATS), default="ftorf", help="folder layout")
+    simulate.add_argument("--sync", action="store_true", help="all four quads of a quartet at one instant")
+    simulate.add_argument("--no-noise", action="store_true", help="an ideal sensor")
+    _fresh_option(simulate)
+    _threads_option(simulate)
+
+    reconstruct = _command("reconstruct", "fit moving Gaussians to the raw quads of a sequence")
+    reconstruct.add_argument("sequence", metavar="SEQ", help="folder of the sequence")
+    reconstruct.add_argument("--out", metavar="RUN", required=True, help="folder to write; goes on where it stopped")
+    reconstruct.add_argument("--preset", metavar="demo", type=_one_of(PRESETS), default="demo", help="settings")
+    reconstruct.add_argument("--images", metavar="N", type=_positive, help="raw frames to optimise (the preset's own)")
+    _seed_option(reconstruct, "seed of the optimiser (0)")
+    _frame_rate_option(reconstruct)
+    _device_options(reconstruct)
+    _fresh_option(reconstruct)
+
+    render = _command("render", "write images of a reconstruction at any time")
+    render.add_argument("run_folder", metavar="RUN", help="folder of the reconstruction")
+    render.add_argument("--out", metavar="DIR", required=True, help="folder to write")
+    render.add_argument(
+        "--what", metavar="A,B", type=_list_of(_one_of(WHAT)), default=["distance"], help=",".join(WHAT)
+    )
+    render.add_argument(
+        "--times", metavar="A,B", type=_list_of(_number), help="seconds since raw frame 0 (every frame)"
+    )
+    _device_options(render)
+
+    compare = _command("compare", "score a reconstruction against the truth and write a report")
+    compare.add_argument("run_folder", metavar="RUN", help="folder of the reconstruction")
+    compare.add_argument("--truth", metavar="SEQ", help="sequence whose true distance counts (the one reconstructed)")
+    compare.add_argument("--json", action="store_true", help="print metrics.json instead of a table")
+    compare.add_argument("--frames", metavar="all", type=_one_of(PROTOCOLS), default="all", help="|".join(PROTOCOLS))
+    _device_options(compare)
+
+    check = _command("check", "read a sequence, list what was found and assumed, warn about what looks wrong")
+    check.add_argument("sequence", metavar="SEQ", help="folder of the sequence")
+
+    doctor = _command("doctor", "print versions and devices, and test the renderer on this machine")
+    _device_options(doctor)
+
+    parsers = (demo, simulate, reconstruct, render, compare, check, doctor)
+    return {parser.prog.split()[-1]: parser for parser in parsers}
+
+
+def _command(name: str, what: str) -> Parser:
+    """A parser with the options that every command has."""
+    parser = Parser(prog=f"gftorf {name}", description=what, allow_abbrev=False)
+    parser.set_defaults(command=name)
+    loudness = parser.add_mutually_exclusive_group()
+    loudness.add_argument("-q", "--quiet", action="store_true", help="only results, warnings and errors")
+    loudness.add_argument("-v", "--verbose", action="store_true", help="also what Warp compiles and loads")
+    parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
+    return parser
+
+
+def _device_options(parser: Parser) -> None:
+    text = "auto (default), cpu, or cuda; cuda:1 is the second GPU"
+    parser.add_argument("--device", metavar="auto|cpu|cuda", type=_device, default="auto", help=text)
+    _threads_option(parser)
+
+
+def _threads_option(parser: Parser) -> None:
+    parser.add_argument("--threads", metavar="N", type=_positive, help="CPU threads (as many as may be used)")
+
+
+def _seed_option(parser: Parser, text: str) -> None:
+    parser.add_argument("--seed", metavar="S", type=_whole, default=0, help=text)
+
+
+def _fresh_option(parser: Parser) -> None:
+    parser.add_argument("--fresh", action="store_true", help="start over in a folder that is not empty")
+
+
+def _frame_rate_option(parser: Parser) -> None:
+    parser.add_argument("--frame-rate", metavar="HZ", type=_rate, help="raw frames per second (the file's, or 120)")
+
+
+def _device(text: str) -> str:
+    if not re.fullmatch(r"auto|cpu|cuda(:\d+)?", text):
+        raise argparse.ArgumentTypeError(f"{text!r} is not auto, cpu, cuda or cuda:N")
+    return text
+
+
+def _size(text: str) -> tuple[int, int]:
+    match = re.fullmatch(r"([1-9]\d{0,3})x([1-9]\d{0,3})", text)
+    if match is None:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a width and a height in pixels, such as 96x72")
+    return int(match[1]), int(match[2])
+
+
+def _whole(text: str) -> int:
+    if not re.fullmatch(r"\d{1,18}", text):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number of at least 0")
+    return int(text)
+
+
+def _positive(text: str) -> int:
+    if not re.fullmatch(r"\d{1,18}", text) or int(text) == 0:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number of at least 1")
+    return int(text)
+
+
+def _number(text: str) -> float:
+    if not re.fullmatch(r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?", text.strip(), re.IGNORECASE):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number")
+    return float(text)
+
+
+def _rate(text: str) -> float:
+    if not _number(text) > 0:
+        raise argparse.ArgumentTypeError(f"{text!r} is not above 0")
+    return _number(text)
+
+
+def _one_of(names: tuple[str, ...]) -> Callable[[str], str]:
+    def choice(text: str) -> str:
+        if text not in names:
+            hint = nearest(text, list(names), f"there is {', '.join(names)}")
+            raise argparse.ArgumentTypeError(f"{text!r} is unknown; {hint}")
+        return text
+
+    return choice
+
+
+def _list_of(item: Callable[[str], object]) -> Callable[[str], list]:
+    return lambda text: [item(part) for part in text.split(",")]
+
+
+def nearest(name: str, names: list[str], otherwise: str) -> str:
+    """A hint: the name that looks most like ``name``, or something else to say."""
+    close = difflib.get_close_matches(name, names, n=1)
+    return f"did you mean {close[0]}?" if close else otherwise

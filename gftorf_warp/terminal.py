@@ -1,0 +1,205 @@
+"""What a person at the terminal sees: progress with the time left, log lines, Warp's messages in our words, errors."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import sys
+import tempfile
+import time
+import traceback
+from collections.abc import Iterator
+from pathlib import Path
+
+from .errors import GftorfError, InputError, ResourceError
+
+LOG = logging.getLogger("gftorf_warp")
+PLAIN_EVERY_S = 10.0  # [s] between two progress lines where the output is not a terminal
+LIVE_EVERY_S = 0.2  # [s] between two redraws where it is
+NO_DRIVER = (
+    "Could not find or load the NVIDIA CUDA driver"  # Warp writes it past its own logger; our first line says it
+)
+
+
+class Progress:
+    """Prints how far a loop is: one line that is redrawn on a terminal, one plain line per ten seconds elsewhere.
+
+    Call it as ``progress(done, total, name=value, ...)``; the values are shown as they are.
+    """
+
+    def __init__(self, label: str, *, quiet: bool = False):
+        """Start the clock.
+
+        Args:
+            label: What is being done.
+            quiet: Whether to print nothing at all.
+        """
+        self.label, self.quiet = label, quiet
+        self.live = sys.stderr.isatty()
+        self.start = self.shown = time.monotonic()
+        self.width = 0
+        self.first: int | None = None
+
+    def __call__(self, done: int, total: int, **values: object) -> None:
+        """Show that ``done`` of ``total`` steps are behind us."""
+        now = time.monotonic()
+        if self.first is None:  # a resumed loop does not start at zero, and its speed must not count what was there
+            self.first, self.start = done, now
+        every = LIVE_EVERY_S if self.live else PLAIN_EVERY_S
+        if self.quiet or (now - self.shown < every and done < total):
+            return
+        self.shown = now
+        line = progress_line(self.label, done, total, self.first, now - self.start, values)
+        if self.live:
+            print(f"\r{line:<{self.width}}", end="\n" if done >= total else "", file=sys.stderr, flush=True)
+            self.width = 0 if done >= total else len(line)
+        else:
+            print(line, file=sys.stderr, flush=True)
+
+
+def progress_line(label: str, done: int, total: int, first: int, elapsed_s: float, values: dict[str, object]) -> str:
+    """One line of progress; the time left [s] follows from the speed since step ``first``."""
+    shown = [f"{name} {value:.4g}" if isinstance(value, float) else f"{name} {value}" for name, value in values.items()]
+    if done >= total:
+        shown.append(f"{elapsed_s:.1f} s")
+    elif done > first:
+        shown.append(f"{(total - done) * elapsed_s / (done - first):.0f} s left")
+    return f"  {label} {done}/{total}  " + "  ".join(shown)
+
+
+class WarpLog:
+    """Warp's messages in our log: a compilation is news, a kernel found in the cache is not."""
+
+    def debug(self, message: str) -> None:
+        """Pass on at the lowest level."""
+        LOG.debug("warp: %s", message)
+
+    def info(self, message: str) -> None:
+        """Announce what was compiled, keep the rest for -v."""
+        if message.rstrip().endswith("(compiled)"):
+            LOG.debug("  compiled %s", message.strip().removeprefix("Module ").removesuffix("(compiled)").strip())
+        else:
+            self.debug(message)
+
+    def warning(self, message: str, category: type[Warning] | None = None, stacklevel: int = 1) -> None:  # noqa: ARG002
+        """Pass on as a warning."""
+        LOG.warning("warp: %s", message)
+
+    def error(self, message: str) -> None:
+        """Pass on as an error."""
+        LOG.error("warp: %s", message)
+
+
+def start_warp() -> None:
+    """Initialise Warp with its messages in our log, except that no CUDA driver was found: our first line says that."""
+    import warp as wp
+
+    wp.set_logger(WarpLog())
+    with _native_stderr() as lines:
+        wp.init()
+    for line in lines:
+        if NO_DRIVER not in line:
+            LOG.warning("warp: %s", line)
+
+
+def kernel_cache() -> Path:
+    """Folder in which Warp keeps what it compiled."""
+    import warp as wp
+
+    return Path(wp.config.kernel_cache_dir)
+
+
+def kernels_are_cached() -> bool:
+    """Whether kernels of this package were compiled before, in any version."""
+    return any(kernel_cache().glob("wp_gftorf_warp*"))
+
+
+def home_as_tilde(path: Path) -> str:
+    """A path as people write it."""
+    with contextlib.suppress(ValueError, RuntimeError):
+        return f"~/{path.relative_to(Path.home())}"
+    return str(path)
+
+
+@contextlib.contextmanager
+def logging_to_stderr(level: int) -> Iterator[None]:
+    """Send the package's log to stderr while a command runs: plain lines, warnings marked."""
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(_Plain())
+    before = LOG.level, LOG.propagate
+    LOG.addHandler(handler)
+    LOG.setLevel(level)
+    LOG.propagate = False
+    try:
+        yield
+    finally:
+        LOG.removeHandler(handler)
+        LOG.level, LOG.propagate = before
+
+
+def as_known_error(error: BaseException) -> GftorfError | None:
+    """The error in our own words if a user can do something about it; None for a bug."""
+    if isinstance(error, GftorfError):
+        return error
+    text = str(error)
+    if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError" or "can't allocate memory" in text:
+        return ResourceError(
+            "out of memory",
+            where=text.splitlines()[0][:120] if text else "this process",
+            why="the arrays of this command do not fit",
+            fix="use a smaller --size or fewer --frames, or --device cpu if the GPU is full",
+        )
+    if not isinstance(error, OSError):
+        return None
+    import errno
+
+    where, why = error.filename or "a file", error.strerror or text
+    if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+        return ResourceError("no space left", where=where, why=why, fix="free disk space, or choose another --out")
+    return InputError("cannot read or write", where=where, why=why, fix="check the path and its permissions")
+
+
+def print_error(error: BaseException, *, debug: bool) -> int:
+    """Print an error to stderr, three lines if a user can cause it, and return the exit code.
+
+    Args:
+        error: What ended the command.
+        debug: Whether the traceback is wanted too.
+    """
+    if debug:
+        traceback.print_exception(error)
+    known = as_known_error(error)
+    if known is not None:
+        print(f"error: {known}", file=sys.stderr)
+        return known.exit_code
+    if isinstance(error, KeyboardInterrupt):
+        print("interrupted: what was finished is kept; the same command goes on from there", file=sys.stderr)
+        return 130
+    summary = (str(error).splitlines() or [""])[0]
+    hint = "" if debug else "; --debug shows where"
+    print(f"error: unexpected {type(error).__name__}: {summary}{hint}", file=sys.stderr)
+    return 1
+
+
+class _Plain(logging.Formatter):
+    def format(self, record: logging.LogRecord) -> str:
+        message = record.getMessage()
+        return f"{record.levelname.lower()}: {message}" if record.levelno >= logging.WARNING else message
+
+
+@contextlib.contextmanager
+def _native_stderr() -> Iterator[list[str]]:
+    """Collect what libraries write to file descriptor 2 themselves."""
+    lines: list[str] = []
+    sys.stderr.flush()
+    saved = os.dup(2)
+    with tempfile.TemporaryFile() as sink:
+        os.dup2(sink.fileno(), 2)
+        try:
+            yield lines
+        finally:
+            os.dup2(saved, 2)
+            os.close(saved)
+            sink.seek(0)
+            lines.extend(line for line in sink.read().decode(errors="replace").splitlines() if line.strip())
