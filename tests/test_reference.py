@@ -130,18 +130,14 @@ def test_one_range_farther_is_dimmer_but_in_phase():
 def test_opposite_quads_cancel_but_for_the_constant_part():
     """Q(0) + Q(pi) is twice the DC offset times the amplitude; Q(0) - Q(pi) is the phasor's real part."""
     case = CASES["translucent"]()
-    image = case.render(reference.rasterize, replace_background(case).inputs(torch.float64))
+    case = replace(case, background=None)
+    image = case.render(reference.rasterize, case.inputs(torch.float64))
     b = float(torch.tensor(case.sensor.dc_offset))
     for i in (0, 2):
         assert_close(image.quads[i] + image.quads[i + 1], b * image.phasor[2], rtol=1e-9, atol=1e-12)
         assert_close(image.quads[i] - image.quads[i + 1], image.phasor[i // 2], rtol=1e-9, atol=1e-12)
     assert image.phasor[2].max() > 0.1
     assert (image.phasor[2] - image.phasor[:2].norm(dim=0)).min() > -1e-12, "the amplitude is at least the length"
-
-
-def replace_background(case: Case) -> Case:
-    """The case in front of nothing."""
-    return replace(case, background=None)
 
 
 def test_harmonics_are_orthonormal():
