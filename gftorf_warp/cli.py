@@ -15,7 +15,7 @@ from contextlib import contextmanager
 
 from . import __version__
 from .errors import ResourceError, UsageError
-from .options import nearest, parse
+from .options import parse
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -74,7 +74,7 @@ def choose_device(name: str) -> tuple[str, str]:
     raise ResourceError(f"no device {name}", where="--device", why=reason, fix="leave --device out, or --device cpu")
 
 
-def start(options: argparse.Namespace) -> str:
+def start(options: argparse.Namespace, *, compile_first: bool = True) -> str:
     """Start torch and Warp, say on what, compile the kernels if none are cached, and return the device."""
     import torch
 
@@ -87,7 +87,7 @@ def start(options: argparse.Namespace) -> str:
     cache = terminal.home_as_tilde(terminal.kernel_cache())
     line = f"gftorf_warp {__version__} - device {device} ({threads} threads; {reason}) - kernels cached in {cache}"
     terminal.LOG.info(line)
-    if not terminal.kernels_are_cached():
+    if compile_first and not terminal.kernels_are_cached():
         terminal.LOG.info("  compiling kernels (first run only) ...")
         terminal.LOG.info("  compiling kernels (first run only) ... %.1f s", compile_kernels(device))
     return device
@@ -115,16 +115,12 @@ def _simulate(options: argparse.Namespace) -> int:
     from .sim.scenes import SCENES
 
     if options.list:
-        print("\n".join(f"{name:<12} {summary(scene)}" for name, scene in SCENES.items()))
+        print("\n".join(f"{name:<12}{scene.motion:<24}{scene.description}" for name, scene in SCENES.items()))
         return 0
     if options.scene is None or options.out is None:
         missing = "SCENE" if options.scene is None else "--out SEQ"
         fix = f"for example `gftorf simulate {next(iter(SCENES))} --out sequence`; `gftorf simulate --list`"
         raise UsageError(f"{missing} is missing", where="gftorf simulate", why="both are needed", fix=fix)
-    if options.scene not in SCENES:
-        hint = nearest(options.scene, list(SCENES), "`gftorf simulate --list` names them")
-        why = f"there are {', '.join(SCENES)}"
-        raise UsageError(f"unknown scene {options.scene}", where="gftorf simulate", why=why, fix=hint)
     from .sim.simulate import simulate
 
     start(options)
@@ -170,10 +166,9 @@ def _render(options: argparse.Namespace) -> int:
     from .evaluate.views import render_to_folder
     from .recon.run import Run
 
-    written = render_to_folder(
-        Run.open(options.run_folder, device), options.out, what=options.what, times=options.times
-    )
-    print("\n".join(map(str, written)))
+    run = Run.open(options.run_folder, device)
+    progress = _progress(options)("render")
+    print(render_to_folder(run, options.out, what=options.what, times=options.times, progress=progress))
     return 0
 
 
@@ -184,7 +179,8 @@ def _compare(options: argparse.Namespace) -> int:
     from .evaluate.compare import compare
     from .recon.run import Run
 
-    metrics = compare(Run.open(options.run_folder, device), truth=options.truth, frames=options.frames)
+    run, progress = Run.open(options.run_folder, device), _progress(options)("compare")
+    metrics = compare(run, truth=options.truth, frames=options.frames, progress=progress)
     print(json.dumps(metrics, indent=2) if options.json else table(metrics))
     return 0
 
@@ -199,7 +195,7 @@ def _check(options: argparse.Namespace) -> int:
 def _doctor(options: argparse.Namespace) -> int:
     from .doctor import doctor
 
-    device = start(options)
+    device = start(options, compile_first=False)
     passed, lines = doctor(device)
     print("\n".join(lines))
     return 0 if passed else 1
@@ -226,11 +222,6 @@ def table(metrics: dict) -> str:
     psnr = metrics["quad_psnr_db"]
     quality = "-" if psnr is None else f"{psnr:.2f} dB"
     return "\n".join([*lines, f"{metrics['frames']} raw frames ({metrics['protocol']}), quad PSNR {quality}"])
-
-
-def summary(thing: object) -> str:
-    """First line of a docstring."""
-    return (thing.__doc__ or "").strip().partition("\n")[0]
 
 
 def _level(options: argparse.Namespace) -> int:

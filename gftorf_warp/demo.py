@@ -63,24 +63,19 @@ def demo(
         sequence = Sequence.open(out / "seq")
         step.says = f"{SCENE} {sequence.width}x{sequence.height}, {sequence.frames} raw frames -> {out / 'seq'}"
     with _Step("[2/4] check      ") as step:
-        lines = str(check(out / "seq")).splitlines()
-        for line in lines:
+        for line in str(check(out / "seq")).splitlines():
             LOG.debug("      %s", line)
-        step.says = (
-            f"{len(sequence.complete_quartets)} complete quartets, {sum('warning' in x for x in lines)} warnings"
-        )
+        step.says = f"{len(sequence.complete_quartets)} complete quartets at {sequence.f_mod_hz / 1e6:.2f} MHz"
     with _Step("[3/4] reconstruct") as step:
         run = reconstruct(
             sequence, out / "run", PRESET, images=images, seed=seed, device=device, progress=report("reconstruct")
         )
         step.says = f"{run.gaussians} Gaussians -> {out / 'run'}"
     with _Step("[4/4] compare    ") as step:
-        metrics = compare(run)
+        metrics = compare(run, progress=report("compare"))
         for name in ("metrics.json", "report.html"):
             shutil.copyfile(run.path / name, out / name)
-        step.says = (
-            f"{metrics['frames']} raw frames, quad PSNR {metrics['quad_psnr_db']:.2f} dB -> {out / 'metrics.json'}"
-        )
+        step.says = f"{metrics['frames']} raw frames scored -> {out / 'metrics.json'}"
     return [*summary(metrics), f"open {out / 'report.html'} (one file, works offline)"]
 
 
@@ -97,11 +92,7 @@ def prepare(out: Path, settings: dict, *, fresh: bool) -> None:
         found = _read(out / SETTINGS)
         if found != wanted:
             differ = sorted(key for key in wanted if found is None or found.get(key) != wanted[key])
-            why = (
-                "it holds files that no demo wrote"
-                if found is None
-                else f"it was made with another {', '.join(differ)}"
-            )
+            why = "no demo has begun in it" if found is None else f"it was made with another {', '.join(differ)}"
             fix = "--fresh starts over and keeps what is there under old-1; or choose another --out"
             raise UsageError("the folder is not empty", where=out, why=why, fix=fix)
     out.mkdir(parents=True, exist_ok=True)

@@ -95,9 +95,11 @@ def start_warp() -> None:
     """Initialise Warp with its messages in our log, except that no CUDA driver was found: our first line says that."""
     import warp as wp
 
-    wp.set_logger(WarpLog())
+    wp.config.log_level = wp.LOG_WARNING
     with _native_stderr() as lines:
         wp.init()
+    wp.config.log_level = wp.LOG_INFO
+    wp.set_logger(WarpLog())
     for line in lines:
         if NO_DRIVER not in line:
             LOG.warning("warp: %s", line)

@@ -1,0 +1,242 @@
+"""The import table of ARCHITECTURE.md and the reading rules of CONTRIBUTING.md, enforced on the source text."""
+
+import ast
+import importlib
+import inspect
+import re
+import sys
+from pathlib import Path
+
+import pytest
+
+from gftorf_warp.render import api, reference
+
+REPOSITORY = Path(__file__).parents[1]
+ROOT = REPOSITORY / "gftorf_warp"
+FILES = sorted(ROOT.rglob("*.py"))
+MAX_LINES = 400
+LONG: dict[str, str] = {}  # file: why it may be longer
+TORCH = {"jaxtyping", "numpy", "torch"}
+INSIDE_FUNCTIONS = {"OpenEXR", "cv2", "matplotlib", "rawpy", "scipy"}  # slow to import, or not needed by every command
+TABLE = {  # room: (rooms it may import besides itself, packages it may import); constants and errors are free to all
+    "constants.py": (set(), set()),
+    "errors.py": (set(), set()),
+    "kernels": (set(), {"warp"}),
+    "data": (set(), {"OpenEXR", "cv2", "jaxtyping", "numpy", "rawpy", "scipy"}),
+    "scene": ({"data"}, TORCH),
+    "render": ({"kernels", "scene"}, TORCH | {"warp"}),
+    "losses": ({"render"}, TORCH),
+    "sim": ({"data", "kernels", "render", "scene"}, TORCH),
+    "recon": ({"data", "losses", "render", "scene"}, TORCH | {"cv2", "scipy", "tqdm"}),
+    "evaluate": ({"data", "losses", "recon", "render", "scene"}, TORCH | {"cv2", "matplotlib"}),
+}
+FREE = {"constants", "errors", "__version__"}
+HAS_BOTH = "render/bridge.py"  # the only module that may know torch and Warp together
+HOMELESS = {"utils", "util", "common", "misc", "types", "helpers"}
+
+
+def name_of(path):
+    """A file of the package as people write it: room/file."""
+    return str(path.relative_to(ROOT))
+
+
+def room_of(path):
+    """The folder of a module inside the package, or its file name at the top level."""
+    return path.relative_to(ROOT).parts[0]
+
+
+def imports(tree, path):
+    """Yield every absolute dotted name that the statements below ``tree`` import."""
+    package = ["gftorf_warp", *path.relative_to(ROOT).parts[:-1]]
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (a.name for a in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = package[: len(package) - node.level + 1] if node.level else []
+            yield from (".".join([*base, *filter(None, [node.module]), a.name]) for a in node.names)
+
+
+def module_level_imports(tree, path):
+    """Yield what is imported as soon as the module is: outside functions and outside ``if TYPE_CHECKING``."""
+    for node in tree.body:
+        if not isinstance(node, ast.FunctionDef | ast.ClassDef | ast.If):
+            yield from imports(node, path)
+
+
+@pytest.mark.parametrize("path", FILES, ids=name_of)
+def test_module_imports_what_its_room_may(path):
+    """No upward import, no package the room does not need, nothing heavy before a function needs it."""
+    room, tree = room_of(path), ast.parse(path.read_text())
+    top_level = path.parent == ROOT
+    assert room in TABLE or top_level, f"{room}/ is not in the table: say what it may import"
+    rooms, packages = TABLE.get(room, (TABLE.keys(), TORCH | {"warp"}))  # cli.py and its like see every room
+    names = list(imports(tree, path))
+    for top, *rest in (name.split(".") for name in names):
+        if top != "gftorf_warp":
+            assert top in packages | set(sys.stdlib_module_names), f"{room} must not import {top}"
+        elif rest and not top_level:
+            assert rest[0] in {*rooms, room, *FREE}, f"{room} must not import {rest[0]}"
+    for top, *rest in (name.split(".") for name in module_level_imports(tree, path)):
+        assert top not in INSIDE_FUNCTIONS, f"import {top} inside the functions that use it"
+        if top_level and top == "gftorf_warp" and rest:
+            assert rest[0] not in TABLE or rest[0] in FREE, f"import {rest[0]} inside functions: --help stays instant"
+        assert not top_level or top == "gftorf_warp" or top in sys.stdlib_module_names, f"import {top} inside functions"
+    if name_of(path) != HAS_BOTH and not top_level:
+        assert not {"torch", "warp"} <= {n.partition(".")[0] for n in names}, f"only {HAS_BOTH} knows torch and Warp"
+
+
+@pytest.mark.parametrize("path", FILES, ids=name_of)
+def test_module_names_no_device_and_launches_nowhere_else(path):
+    """Devices are named by the command line; kernels are launched by render/launch.py; streams are the bridge's."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if path.parent != ROOT:
+            named = getattr(node, "attr", None) == "cuda" and name_of(path) != HAS_BOTH
+            assert not named, f"line {node.lineno}: follow the device of the input"
+            text = node.value if isinstance(node, ast.Constant) else None
+            assert not (isinstance(text, str) and re.fullmatch(r"cuda(:\d+)?", text)), f"line {node.lineno}: {text}"
+        if name_of(path) != "render/launch.py":
+            assert getattr(node, "attr", None) not in {"launch", "launch_tiled"}, f"line {node.lineno}: a launch"
+
+
+@pytest.mark.parametrize("path", FILES, ids=name_of)
+def test_file_is_a_page_or_a_few(path):
+    """A file is one idea, and has a name that says which."""
+    assert path.stem not in HOMELESS, "a function without a home is a concept without a name"
+    lines = len(path.read_text().splitlines())
+    assert lines <= MAX_LINES or name_of(path) in LONG, f"{lines} lines: more than one idea?"
+
+
+@pytest.mark.parametrize("path", FILES, ids=name_of)
+def test_everything_public_says_what_it_is(path):
+    """Modules, public classes, their public methods and public functions have docstrings; so has each setting."""
+    tree = ast.parse(path.read_text())
+    assert ast.get_docstring(tree), "say what the module is"
+    for holder in [tree, *(n for n in tree.body if isinstance(n, ast.ClassDef) and not n.name.startswith("_"))]:
+        for node in holder.body:
+            if isinstance(node, ast.FunctionDef | ast.ClassDef) and not node.name.startswith("_"):
+                native = ast.unparse(node.body[-1]) == "..."  # declares a function whose text is C++
+                assert native or ast.get_docstring(node), f"line {node.lineno}: {node.name} says nothing"
+        if isinstance(holder, ast.ClassDef) and any("frozen" in ast.unparse(d) for d in holder.decorator_list):
+            for node, after in zip(holder.body, [*holder.body[1:], None], strict=True):
+                if isinstance(node, ast.AnnAssign):
+                    assert isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant), (
+                        f"line {node.lineno}: {ast.unparse(node.target)} needs a docstring under it, with its unit"
+                    )
+
+
+def kernels():
+    """Yield every @wp.kernel of the package, also those that a factory makes."""
+    for path in FILES:
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.FunctionDef) and any("kernel" in ast.unparse(d) for d in node.decorator_list):
+                yield pytest.param(path, node, id=f"{path.stem}.{node.name}")
+
+
+@pytest.mark.parametrize(("path", "node"), list(kernels()))
+def test_kernel_signature_is_readable(path, node):
+    """Kernels live in kernels/, list inputs then outputs, type every parameter and say its [shape] or [unit]."""
+    assert room_of(path) == "kernels"
+    source = path.read_text().splitlines()
+    signature = [line.strip() for line in source[node.lineno : node.body[0].lineno - 1]]
+    assert [line for line in signature if line.startswith("#")] == ["# In:", "# Out:"]
+    for arg in node.args.args:
+        assert arg.annotation is not None, f"{arg.arg}: state its type"
+        assert "[" in source[arg.lineno - 1].partition("#")[2], f"{arg.arg}: say its shape or unit in brackets"
+    assert ast.get_docstring(node), "say what one thread does"
+
+
+def test_there_are_kernels_to_look_at():
+    """The test above is parametrised by what it finds; finding nothing must not pass."""
+    assert len(list(kernels())) >= 8
+
+
+def operators(module):
+    """Public functions that a module defines, by name."""
+    found = inspect.getmembers(module, inspect.isfunction)
+    return {name: f for name, f in found if f.__module__ == module.__name__ and not name.startswith("_")}
+
+
+def test_every_operator_has_an_oracle():
+    """A public operator and its plain-torch twin take the same arguments, so that a test can call both alike."""
+    assert "rasterize" in operators(api)
+    for name, operator in operators(api).items():
+        twin = getattr(reference, name, None)
+        assert twin is not None, f"render/reference.py lacks {name}"
+        got, want = inspect.signature(twin).parameters, inspect.signature(operator).parameters
+        assert [*got] == [*want], name
+        assert [p.kind for p in got.values()] == [p.kind for p in want.values()], name
+
+
+def test_the_package_keeps_its_promises_at_the_top():
+    """Every public name exists where the package says, and has a docstring."""
+    package = importlib.import_module("gftorf_warp")
+    for name in package.__all__:
+        thing = getattr(package, name)
+        assert name == "__version__" or inspect.getdoc(thing), name
+
+
+def texts():
+    """Every text file that belongs to the repository, whether or not git is at hand."""
+    folders = [REPOSITORY / name for name in (".ci", "benchmarks", "data_specs", "design", "examples", "tests")]
+    found = [path for folder in [ROOT, *folders] for path in folder.rglob("*")]
+    found += [path for path in REPOSITORY.iterdir() if path.suffix in {".md", ".toml", ".txt"}]
+    binary = {".pyc", ".npy", ".png", ".exr", ".jpg"}
+    return [p for p in found if p.is_file() and p.suffix not in binary and "__pycache__" not in p.parts]
+
+
+def test_no_path_of_any_machine():
+    """What runs here must run elsewhere: no absolute path of a developer's machine."""
+    folders = "|".join(("work", "root", "farm", "home", "Users"))
+    machine = re.compile(rf"(^|[^A-Za-z0-9_./~-])/({folders})/")
+    assert machine.search("see /" + "work/shared")
+    for path in texts():
+        for number, line in enumerate(path.read_text(errors="replace").splitlines(), start=1):
+            assert not machine.search(line), f"{path.relative_to(REPOSITORY)}:{number}: {line.strip()}"
+
+
+def test_the_documents_know_the_rooms():
+    """ARCHITECTURE.md names every room with what it may import; a new room cannot be forgotten there."""
+    text = (REPOSITORY / "ARCHITECTURE.md").read_text()
+    rows = {cells[1].strip(" `*"): cells for cells in (line.split("|") for line in text.splitlines()) if len(cells) == 6}
+    for room, (rooms, packages) in TABLE.items():
+        if room.endswith(".py"):
+            continue
+        assert room in rows, f"ARCHITECTURE.md has no row for {room}"
+        words = {word for cell in rows[room][2:4] for word in re.findall(r"\w+", cell)}
+        assert rooms <= words, f"{room}: ARCHITECTURE.md does not list {rooms - words}"
+        assert packages <= words, f"{room}: ARCHITECTURE.md does not list {packages - words}"
+
+
+def test_the_readme_shows_its_commands():
+    """Two commands start from nothing, and every command of the program is in the table."""
+    from gftorf_warp.options import command_parsers
+
+    text = (REPOSITORY / "README.md").read_text()
+    assert "pip install -c constraints.txt ." in text
+    assert "pip install -c constraints.txt '.[test]'" in text
+    assert "pytest" in text
+    for command in command_parsers():
+        assert f"`gftorf {command}" in text, command
+
+
+def test_every_pinned_version_is_exact_and_ordinary():
+    """constraints.txt pins every direct dependency, without local builds or files."""
+    import tomllib
+
+    pins = {}
+    for line in (REPOSITORY / "constraints.txt").read_text().splitlines():
+        if line and not line.startswith("#"):
+            match = re.fullmatch(r"([A-Za-z0-9_.-]+)==([0-9][0-9a-z.]*)", line)
+            assert match, f"not NAME==VERSION: {line}"
+            pins[normal(match[1])] = match[2]
+    project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())
+    direct = [*project["project"]["dependencies"], *project["build-system"]["requires"]]
+    direct += [name for extra in project["project"]["optional-dependencies"].values() for name in extra]
+    for requirement in direct:
+        name = normal(re.match(r"[A-Za-z0-9_.-]+", requirement)[0])
+        assert name == "gftorf-warp" or name in pins, f"{requirement} is not pinned"
+
+
+def normal(name):
+    """The name of a package as indexes compare it."""
+    return re.sub(r"[-_.]+", "-", name).lower()
