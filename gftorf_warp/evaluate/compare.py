@@ -1,0 +1,162 @@
+"""``gftorf compare``: a run against ground truth and against the closed form, as numbers and as an offline page."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from .. import __version__
+from ..data.files import atomic_write, write_json
+from ..data.sequence import Sequence, Truth
+from ..errors import InputError
+from . import metrics as measure
+from . import views
+from .panels import Findings
+
+if TYPE_CHECKING:
+    from ..recon.run import Run
+
+FACTS = ("seconds_reconstruct", "images_optimised", "device", "seed", "preset", "flow_source", "init")
+
+
+def compare(
+    run: Run | str | Path,
+    *,
+    truth: str | Path | None = None,
+    frames: str = "all",
+    report: bool = True,
+    progress: Callable[[int, int], None] | None = None,
+) -> dict[str, object]:
+    """Score a run and write ``RUN/metrics.json`` and ``RUN/report.html``.
+
+    Rendered at the time and pose of every scored raw frame, at the sequence's own resolution, before black. Errors are
+    mean squared errors of the distance along the ray [m^2], times 100.
+
+    Args:
+        run: A finished reconstruction, or its folder.
+        truth: A sequence whose ground truth to use; None: that of the sequence the run was made from.
+        frames: Which raw frames are scored: ``all``, or ``ftorf13`` as in the published tables.
+        report: Whether the page is written as well.
+        progress: Called with (frames done, frames in all).
+
+    Returns:
+        The content of metrics.json; None where there is no truth or no such pixel.
+
+    Raises:
+        InputError: If the run or a sequence cannot be read, the truth does not fit, or no quartet is complete.
+        UsageError: If ``frames`` is unknown or leaves nothing.
+        DivergedError: If a rendering is not finite.
+    """
+    if isinstance(run, (str, Path)):
+        from ..recon.run import Run
+
+        run = Run.open(run)
+    sequence = run.sequence()
+    known = fitting_truth(sequence, truth)
+    scored = measure.scored_frames(sequence, frames)
+    found = findings(sequence, views.gather(run, sequence, known, scored, progress=progress), known)
+    result = summary(run, found, protocol=frames)
+    write_json(run.path / "metrics.json", result)
+    if report:
+        write_report(run, result, found)
+    return result
+
+
+def fitting_truth(sequence: Sequence, path: str | Path | None = None) -> Truth | None:
+    """Ground truth of a sequence, or of the one at ``path``, of the same frames and size; None if nothing is known.
+
+    Raises:
+        InputError: If ``path`` holds no ground truth, or frames or size differ.
+    """
+    found = sequence.truth() if path is None else Sequence.open(path).truth()
+    if found is None or not found.known.any():
+        if path is None:
+            return None
+        raise InputError(
+            "no ground truth",
+            where=path,
+            why="--truth was given, but this sequence stores no true distance",
+            fix="leave --truth out, or name a sequence with synthetic_depth/",
+        )
+    if found.distance.shape != sequence.quads.shape:
+        expected, got = ("x".join(map(str, shape)) for shape in (sequence.quads.shape, found.distance.shape))
+        raise InputError(
+            "the truth does not fit the run",
+            where=path or sequence.path or "sequence",
+            why=f"expected frames x rows x columns {expected}, found {got}",
+            fix="name the sequence that the run was reconstructed from, at the same size",
+        )
+    return found
+
+
+def findings(sequence: Sequence, gathered: views.Views, truth: Truth | None) -> Findings:
+    """Squared errors and masks of gathered views."""
+    if truth is None:
+        return Findings(sequence=sequence, views=gathered, errors=None, moving=None, static=None)
+    errors = {name: measure.squared_error(image, gathered.truth) for name, image in gathered.distances.items()}
+    moving, static = measure.moving_and_static(measure.known_distance(truth), gathered.frames)
+    return Findings(sequence=sequence, views=gathered, errors=errors, moving=moving, static=static)
+
+
+def summary(run: Run, found: Findings, *, protocol: str) -> dict[str, object]:
+    """The content of metrics.json, in numbers, texts and None only."""
+    everywhere = None if found.errors is None else np.ones_like(found.moving)
+    groups = {"moving": (found.moving, found.static), "static": (found.static, found.moving)}
+    return {
+        "frames": len(found.views.frames),
+        "protocol": protocol,
+        **measure.distance_errors(found.errors, everywhere, measure.mean_over_frames),
+        **{
+            name: measure.distance_errors(found.errors, mask)
+            | {"share": None if mask is None else measure.share(mask, rest)}
+            for name, (mask, rest) in groups.items()
+        },
+        "quad_psnr_db": measure.quad_psnr_db(
+            found.views.quad_rendered,
+            found.views.quad_measured,
+            peak=float(np.abs(found.sequence.quads[found.sequence.measured]).max()),
+        ),
+        "gaussians": run.gaussians,
+        **{name: run.config[name] for name in FACTS},
+        "version": __version__,
+    }
+
+
+def write_report(run: Run, result: dict[str, object], found: Findings) -> Path:
+    """Write ``RUN/report.html``."""
+    from . import report
+
+    path = run.path / "report.html"
+    page = report.report(
+        title=found.sequence.path.name if found.sequence.path is not None else run.path.name,
+        metrics=result,
+        config=run.config,
+        log=training_log(run.path / "metrics.jsonl"),
+        found=found,
+        data_card=truth_statement(found.sequence.path),
+    )
+    atomic_write(path, page.encode("utf-8"))
+    return path
+
+
+def training_log(path: Path) -> list[dict[str, float]]:
+    """The steps of a run's metrics.jsonl; a last line that was cut off by an interruption is no step."""
+    if not path.exists():
+        return []
+    return [
+        json.loads(line) for line in path.read_text(encoding="utf-8").splitlines(keepends=True) if line.endswith("\n")
+    ]
+
+
+def truth_statement(path: Path | None) -> str | None:
+    """What the README.md of a sequence says about its ground truth, in its own words; None if nothing."""
+    card = None if path is None else path / "README.md"
+    if card is None or not card.is_file():
+        return None
+    paragraphs = card.read_text(encoding="utf-8", errors="replace").split("\n\n")
+    about = [" ".join(text.split()) for text in paragraphs if text.lower().startswith("ground truth")]
+    return " ".join(about) or None

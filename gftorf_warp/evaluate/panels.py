@@ -1,0 +1,219 @@
+"""The pictures of a report: which frames and pixels to look at, and what is shown on one common scale."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ..constants import FRAMES_PER_QUARTET
+from ..data.decode import quartet_phasor
+from ..data.sequence import Sequence
+from . import page, pictures
+from .views import Views
+
+STRIP_FRAMES = 5  # columns of the strip over time
+STRIP_SIZE_MAX = 160  # [px]
+ANIMATION_FRAMES_MAX = 48
+ANIMATION_PERIOD_S = 0.25  # [s] slow enough to compare panels
+CLOSE_UP_MIN = 24  # [px] smallest side of a close-up
+CLOSE_UP_MARGIN = 0.25  # around the moving pixels, as a fraction of their extent
+CLOSE_UP_SHARE_MAX = 0.6  # a larger close-up would repeat the whole picture
+QUARTET_TEXT = (
+    "Each raw frame shows another instant: what moves has moved on from the first to the last. The closed form takes "
+    "the four for one instant, hence the false distances along moving outlines."
+)
+TITLES = {"closed_form": "closed form", "d": "ours, d", "d_tof": "ours, d_ToF"}
+
+Window = tuple[slice, slice]
+WHOLE: Window = (slice(None), slice(None))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Findings:
+    """What a comparison found, in arrays; a report draws it and computes nothing new."""
+
+    sequence: Sequence
+    """What was measured."""
+    views: Views
+    """What was rendered, decoded and known."""
+    errors: Mapping[str, Float[np.ndarray, "S H W"]] | None
+    """Squared errors [m^2] by name, NaN where the truth is unknown; None without ground truth."""
+    moving: Bool[np.ndarray, "S H W"] | None
+    """Pixels that move within their quartet; None without ground truth."""
+    static: Bool[np.ndarray, "S H W"] | None
+    """Pixels that rest; None without ground truth."""
+
+
+def telling_row(found: Findings) -> int:
+    """The row of the frame to show: in the middle half, the one where most pixels move.
+
+    Without ground truth, a pixel's change between quads of one shift stands for its motion.
+    """
+    count = len(found.views.frames)
+    middle = range(count // 4, max(count // 4 + 1, -(-3 * count // 4)))
+
+    def telling(s: int) -> tuple[float, float]:
+        changed = _change(found.sequence, found.views.frames[s]) if found.moving is None else found.moving[s].sum()
+        return float(changed), -abs(s - count / 2)  # of equals, the one nearest to the middle
+
+    return max(middle, key=telling)
+
+
+def common_distance_scale(found: Findings) -> pictures.Scale:
+    """One scale for every distance in the report: the truth's, else that of the closed form and of ours."""
+    views = found.views
+    return pictures.distance_scale([views.closed_form, views.d] if views.truth is None else [views.truth])
+
+
+def measured_quartet(found: Findings, s: int) -> str:
+    """The four quads of the quartet, one after the other, and what they decode to."""
+    sequence, frame = found.sequence, found.views.frames[s]
+    quartet = frame // FRAMES_PER_QUARTET
+    raw = range(FRAMES_PER_QUARTET * quartet, FRAMES_PER_QUARTET * (quartet + 1))
+    scale = pictures.signed_scale([sequence.quads[n] for n in raw])
+    quads = [
+        page.picture(
+            sequence.quads[n],
+            scale,
+            f"raw frame {n}",
+            f"shift {np.degrees(sequence.shifts[n]):.0f}°, {1e3 * sequence.times[n]:.1f} ms",
+        )
+        for n in raw
+    ]
+    re, im = quartet_phasor(sequence, quartet)
+    phase, amplitude = np.arctan2(im, re) % (2.0 * np.pi), np.hypot(re, im)
+    decoded = [
+        page.picture(phase, pictures.phase_scale(), "measured phase", "mod 2π"),
+        page.picture(amplitude, pictures.amplitude_scale([amplitude]), "measured amplitude", "of the phasor"),
+        page.picture(found.views.closed_form[s], common_distance_scale(found), "closed form", "phase as distance"),
+    ]
+    return page.row(quads) + page.row([*decoded, f'<p class="soft">{QUARTET_TEXT}</p>'])
+
+
+def distances(found: Findings, s: int, window: Window = WHOLE) -> str:
+    """Closed form, ours and truth on one scale."""
+    scale = common_distance_scale(found)
+    return page.row([page.picture(image[window], scale, title) for title, image in _distances(found, s).items()])
+
+
+def error_maps(found: Findings, s: int, window: Window = WHOLE) -> str:
+    """Absolute errors on one scale, under the distances that they belong to; under the truth, what moves."""
+    scale = pictures.error_scale([_errors_that_matter(found, s)])
+    figures = [
+        page.picture(np.sqrt(found.errors[name][s][window]), scale, f"error of {title}")
+        for name, title in TITLES.items()
+    ]
+    moves = found.moving[s][window].astype(np.float32)
+    return page.row([*figures, page.picture(moves, _share_scale(1.0), "moving pixels")])
+
+
+def close_up(found: Findings, s: int) -> str:
+    """The surroundings of the moving pixels, enlarged: distances and errors; empty if that is most of the image."""
+    if found.moving is None or not found.moving[s].any():
+        return ""
+    window = _window(found.moving[s])
+    if found.moving[s][window].size > CLOSE_UP_SHARE_MAX * found.moving[s].size:
+        return ""
+    return distances(found, s, window) + error_maps(found, s, window)
+
+
+def quad_residual(found: Findings, s: int) -> str:
+    """The quad of the frame as measured, as rendered, and what is left."""
+    measured, rendered = found.views.quad_measured[s], found.views.quad_rendered[s]
+    scale = pictures.signed_scale([measured])
+    residual, left = measured - rendered, 1.0 - found.views.opacity[s]
+    figures = [
+        page.picture(measured, scale, "measured quad", f"raw frame {found.views.frames[s]}"),
+        page.picture(rendered, scale, "rendered quad", "same time and shift"),
+        page.picture(residual, pictures.signed_scale([residual]), "measured minus rendered", "its own scale"),
+        page.picture(left, _share_scale(max(0.01, float(left.max()))), "light let through", "1 \N{MINUS SIGN} opacity"),
+    ]
+    return page.row(figures)
+
+
+def strip_over_time(found: Findings) -> str:
+    """Distances at a few frames, one row each, on one scale."""
+    count = len(found.views.frames)
+    chosen = sorted({round(x) for x in np.linspace(0, count - 1, STRIP_FRAMES)})
+    scale = common_distance_scale(found)
+    rows = []
+    for title in (name for name in _distances(found, 0) if name != TITLES["d_tof"]):
+        figures = [
+            page.plain_picture(
+                pictures.colour_mapped(pictures.thinned(_distances(found, s)[title], STRIP_SIZE_MAX), scale),
+                title,
+                f"frame {found.views.frames[s]}",
+            )
+            for s in chosen
+        ]
+        rows.append(page.row(figures))
+    return "".join(rows) + f'<div class="wide">{page.colour_bar(scale)}</div>'
+
+
+def animation(found: Findings) -> str:
+    """Quartet starts one after the other: measured quad, rendered quad, closed form, ours."""
+    starts = [s for s, n in enumerate(found.views.frames) if n % FRAMES_PER_QUARTET == 0]
+    starts = starts[:: -(-len(starts) // ANIMATION_FRAMES_MAX)]
+    if len(starts) < 2:
+        return ""
+    views, quad, metres = found.views, pictures.signed_scale([found.views.quad_measured]), common_distance_scale(found)
+
+    def frame(s: int) -> np.ndarray:
+        panels = [
+            (views.quad_measured, quad),
+            (views.quad_rendered, quad),
+            (views.closed_form, metres),
+            (views.d, metres),
+        ]
+        return pictures.side_by_side(
+            [pictures.colour_mapped(pictures.thinned(image[s], STRIP_SIZE_MAX), scale) for image, scale in panels]
+        )
+
+    data = pictures.animated_webp([frame(s) for s in starts], ANIMATION_PERIOD_S)
+    source = pictures.data_uri(data, "image/webp")
+    titles = ("measured quad", "rendered quad", "closed form", "ours, d")
+    captions = "".join(f"<figcaption>{title}</figcaption>" for title in titles)
+    return (
+        f'<div class="row" style="--columns: 4">{captions}</div>'
+        f'<img class="picture" src="{source}" alt="animation: {", ".join(titles)}">'
+        f'<div class="row" style="--columns: 2">{page.colour_bar(quad)}{page.colour_bar(metres)}</div>'
+    )
+
+
+def _distances(found: Findings, s: int) -> dict[str, np.ndarray]:
+    """Images [m] by title: closed form, ours, and truth if it is known."""
+    views = found.views
+    images = {TITLES["closed_form"]: views.closed_form[s], TITLES["d"]: views.d[s], TITLES["d_tof"]: views.d_tof[s]}
+    return images if views.truth is None else images | {"truth": views.truth[s]}
+
+
+def _errors_that_matter(found: Findings, s: int) -> np.ndarray:
+    """Absolute errors [m] of the closed form, on moving pixels if there are any: they set the scale for all."""
+    error = np.sqrt(found.errors["closed_form"][s])
+    return error[found.moving[s]] if found.moving[s].any() else error
+
+
+def _share_scale(high: float) -> pictures.Scale:
+    return pictures.Scale(low=0.0, high=high, colours="gray", unit="")
+
+
+def _change(sequence: Sequence, n: int) -> float:
+    """Mean change [quad units] to the quads of the same shift one quartet earlier and later."""
+    near = [m for m in (n - FRAMES_PER_QUARTET, n + FRAMES_PER_QUARTET) if 0 <= m < sequence.frames]
+    changes = [float(np.abs(sequence.quads[m] - sequence.quads[n]).mean()) for m in near if sequence.measured[m]]
+    return max(changes, default=0.0)
+
+
+def _window(mask: Bool[np.ndarray, "H W"]) -> Window:
+    """The rectangle around a mask, with a margin."""
+    return tuple(_widened(np.flatnonzero(mask.any(axis=axis)), mask.shape[1 - axis]) for axis in (1, 0))
+
+
+def _widened(indices: np.ndarray, size: int) -> slice:
+    low, high = int(indices[0]), int(indices[-1]) + 1
+    wanted = max(CLOSE_UP_MIN, round((1.0 + 2.0 * CLOSE_UP_MARGIN) * (high - low)))
+    start = max(0, min((low + high - wanted) // 2, size - wanted))
+    return slice(start, min(size, start + wanted))

@@ -1,0 +1,132 @@
+"""Arrays to coloured pictures: one scale and one colour map for pictures that are to be compared."""
+
+from __future__ import annotations
+
+import base64
+import functools
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+UNKNOWN_GREY = 128  # colour of pixels without a value: none of the colour maps below contains this grey
+WEBP_LOSSLESS = 101  # OpenCV: a WebP quality above 100 means lossless
+TICKS = 256  # colours of a map
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scale:
+    """What the colours of a picture mean."""
+
+    low: float
+    """Value of the first colour."""
+    high: float
+    """Value of the last colour."""
+    colours: str
+    """Name of a matplotlib colour map."""
+    unit: str
+    """Unit of both values."""
+
+    def __post_init__(self):
+        if not self.low < self.high:
+            raise ValueError(f"a scale needs low < high, got {self.low} and {self.high}")
+
+
+def distance_scale(images: Iterable[Float[np.ndarray, "*n"]]) -> Scale:
+    """A scale [m] that holds all but the extreme hundredths of some distances."""
+    low, high = _range(images, 0.5, 99.5)
+    return Scale(low=low, high=max(high, low + 1e-3), colours="viridis", unit="m")
+
+
+def error_scale(images: Iterable[Float[np.ndarray, "*n"]]) -> Scale:
+    """A scale [m] from 0 to nearly the largest of some errors, at least a millimetre."""
+    return Scale(low=0.0, high=max(_range(images, 0.0, 98.0)[1], 1e-3), colours="magma", unit="m")
+
+
+def amplitude_scale(images: Iterable[Float[np.ndarray, "*n"]]) -> Scale:
+    """A scale [quad units] from 0 to nearly the largest of some amplitudes."""
+    high = _range(images, 0.0, 99.5)[1]
+    return Scale(low=0.0, high=high if high > 0 else 1.0, colours="gray", unit="quad units")
+
+
+def signed_scale(images: Iterable[Float[np.ndarray, "*n"]]) -> Scale:
+    """A scale [quad units] symmetric about zero, for values of either sign."""
+    high = _range((np.abs(image) for image in images), 0.0, 99.5)[1]
+    high = high if high > 0 else 1.0
+    return Scale(low=-high, high=high, colours="RdBu_r", unit="quad units")
+
+
+def phase_scale() -> Scale:
+    """One turn [rad]; the first and the last colour are the same."""
+    return Scale(low=0.0, high=2.0 * np.pi, colours="twilight", unit="rad")
+
+
+def colour_mapped(image: Float[np.ndarray, "H W"], scale: Scale) -> UInt8[np.ndarray, "H W 3"]:
+    """RGB of an image on a scale; values beyond its ends take the end's colour, NaN is grey."""
+    unknown = np.isnan(image)
+    level = (np.where(unknown, scale.low, image) - scale.low) / (scale.high - scale.low)
+    rgb = _colours(scale.colours)[np.clip(level * TICKS, 0, TICKS - 1).astype(np.uint8)]
+    rgb[unknown] = UNKNOWN_GREY
+    return rgb
+
+
+def side_by_side(pictures: list[UInt8[np.ndarray, "H w 3"]], gap: int = 2) -> UInt8[np.ndarray, "H W 3"]:
+    """Pictures of one height in a row, ``gap`` white pixels between them."""
+    white = np.full((pictures[0].shape[0], gap, 3), 255, dtype=np.uint8)
+    row = [part for picture in pictures for part in (white, picture)]
+    return np.concatenate(row[1:], axis=1)
+
+
+def thinned(image: np.ndarray, size_max: int) -> np.ndarray:
+    """Every k-th row and column, with the smallest k for sides of at most ``size_max``: no value is invented."""
+    step = -(-max(image.shape[:2]) // size_max)
+    return image[::step, ::step]
+
+
+def webp(rgb: UInt8[np.ndarray, "H W 3"]) -> bytes:
+    """A lossless WebP file."""
+    import cv2
+
+    ok, data = cv2.imencode(".webp", np.ascontiguousarray(rgb[..., ::-1]), [cv2.IMWRITE_WEBP_QUALITY, WEBP_LOSSLESS])
+    if not ok:
+        raise ValueError(f"OpenCV could not encode a picture of shape {rgb.shape} as WebP")
+    return data.tobytes()
+
+
+def animated_webp(pictures: list[UInt8[np.ndarray, "H W 3"]], period_s: float, quality: int = 80) -> bytes:
+    """An endless WebP animation that shows each picture for ``period_s`` [s]; ``quality`` as in JPEG, 1..100."""
+    import cv2
+
+    animation = cv2.Animation()
+    animation.frames = [np.ascontiguousarray(picture[..., ::-1]) for picture in pictures]
+    animation.durations = [round(1000 * period_s)] * len(pictures)
+    ok, data = cv2.imencodeanimation(".webp", animation, [cv2.IMWRITE_WEBP_QUALITY, quality])
+    if not ok:
+        raise ValueError(f"OpenCV could not encode {len(pictures)} pictures as an animated WebP")
+    return np.asarray(data).tobytes()
+
+
+def data_uri(data: bytes, kind: str) -> str:
+    """A file as an address that holds it, for example of kind ``image/webp``."""
+    return f"data:{kind};base64,{base64.b64encode(data).decode('ascii')}"
+
+
+def bar(scale: Scale) -> UInt8[np.ndarray, "1 T 3"]:
+    """The colours of a scale from low to high."""
+    return _colours(scale.colours)[None].copy()
+
+
+@functools.cache
+def _colours(name: str) -> UInt8[np.ndarray, "T 3"]:
+    import matplotlib
+
+    return np.round(255 * matplotlib.colormaps[name](np.arange(TICKS) / (TICKS - 1))[:, :3]).astype(np.uint8)
+
+
+def _range(images: Iterable[np.ndarray], low: float, high: float) -> tuple[float, float]:
+    """Percentiles of all finite values; (0, 0) if there are none."""
+    values = np.concatenate([np.asarray(image)[np.isfinite(image)].ravel() for image in images])
+    if not values.size:
+        return 0.0, 0.0
+    return tuple(float(v) for v in np.percentile(values, [low, high]))

@@ -1,0 +1,108 @@
+"""What ``gftorf render`` writes: per time one EXR with the values and one PNG to look at, for each thing asked for."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from ..errors import UsageError
+from ..render.api import Rendering
+from ..scene.sensor import Sensor
+from . import pictures
+
+WHAT = ("distance", "quads", "phasor", "colour")
+Channels = dict[str, Float[np.ndarray, "H W"]]
+
+
+def checked(what: str | Sequence[str]) -> tuple[str, ...]:
+    """The names of what is to be rendered, each once.
+
+    Args:
+        what: Names out of distance, quads, phasor, colour; or one text with commas between them.
+
+    Raises:
+        UsageError: If a name is unknown, or there is none.
+    """
+    names = what.split(",") if isinstance(what, str) else what
+    names = tuple(dict.fromkeys(name.strip() for name in names if name.strip()))
+    unknown = [name for name in names if name not in WHAT]
+    if unknown or not names:
+        raise UsageError(
+            f"cannot render {', '.join(map(repr, unknown)) or 'nothing'}",
+            where="--what",
+            why=f"expected names out of {', '.join(WHAT)}, separated by commas",
+            fix="use, for example, --what distance,quads",
+        )
+    return names
+
+
+def channels(name: str, rendering: Rendering, sensor: Sensor) -> Channels:
+    """The images of one thing by channel name: what its EXR holds.
+
+    distance: ``distance`` [m], not divided by ``opacity`` [1]. quads: ``quad_<shift in degrees>`` [file units]. phasor:
+    ``re``, ``im``, ``amplitude`` [file units]. colour: ``R``, ``G``, ``B``, linear [1].
+
+    Raises:
+        UsageError: If colour is asked for and the field has none.
+    """
+    if name == "distance":
+        images = {"distance": rendering.distance, "opacity": rendering.opacity}
+    elif name == "quads":
+        images = {f"quad_{math.degrees(s):03.0f}": quad for s, quad in zip(sensor.shifts, rendering.quads, strict=True)}
+    elif name == "phasor":
+        images = dict(zip(("re", "im", "amplitude"), rendering.phasor, strict=True))
+    elif rendering.colour is None:
+        raise UsageError(
+            "no colour to render",
+            where="--what colour",
+            why="this run was reconstructed from quads alone",
+            fix="leave colour out of --what",
+        )
+    else:
+        images = dict(zip("RGB", rendering.colour, strict=True))
+    return {key: image.detach().cpu().numpy().astype(np.float32) for key, image in images.items()}
+
+
+def preview_scale(name: str, samples: Iterable[Channels]) -> pictures.Scale:
+    """One scale for the previews of all times, from a few of them; for a phasor it is that of the amplitude."""
+    samples = list(samples)
+    if name == "distance":
+        return pictures.distance_scale([sample["distance"] for sample in samples])
+    if name == "quads":
+        return pictures.signed_scale([image for sample in samples for image in sample.values()])
+    if name == "phasor":
+        return pictures.amplitude_scale([sample["amplitude"] for sample in samples])
+    return pictures.Scale(low=0.0, high=1.0, colours="gray", unit="1")
+
+
+def preview(name: str, images: Channels, scale: pictures.Scale) -> UInt8[np.ndarray, "H w 3"]:
+    """A picture of one thing: distance; the quads in a row; phase and amplitude in a row; or sRGB."""
+    if name == "distance":
+        return pictures.colour_mapped(images["distance"], scale)
+    if name == "quads":
+        return pictures.side_by_side([pictures.colour_mapped(image, scale) for image in images.values()])
+    if name == "phasor":
+        phase = np.arctan2(images["im"], images["re"]) % (2.0 * np.pi)
+        return pictures.side_by_side(
+            [
+                pictures.colour_mapped(phase, pictures.phase_scale()),
+                pictures.colour_mapped(images["amplitude"], scale),
+            ]
+        )
+    return _srgb(np.stack(list(images.values()), axis=-1))
+
+
+def paths(out: Path, name: str, index: int) -> tuple[Path, Path]:
+    """Where the EXR and the PNG of one thing at the index-th time belong."""
+    return out / name / f"{index:06d}.exr", out / name / f"{index:06d}.png"
+
+
+def _srgb(linear: Float[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
+    """8-bit sRGB of linear RGB (IEC 61966-2-1)."""
+    linear = np.clip(linear, 0.0, 1.0)
+    encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1.0 / 2.4) - 0.055)
+    return np.round(255.0 * encoded).astype(np.uint8)

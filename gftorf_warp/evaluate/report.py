@@ -1,0 +1,262 @@
+"""One offline page: what was found, in pictures and numbers, how it was made, and how to read it. Renders nothing."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from . import figures, page, panels
+from .metrics import DISTANCES, MOVING_M, per_frame_mean
+from .panels import Findings
+
+ROWS = {
+    "closed_form": ("closed form", "atan2 of the four raw quads of a quartet"),
+    "d": ("ours, d", "rendered mean distance, not divided by opacity"),
+    "d_normalised": ("ours, d / opacity", "the same, divided"),
+    "d_tof": ("ours, d_ToF", "decoded from the four quads rendered at one instant"),
+}
+PIXELS = {"": "all pixels", "moving.": "moving pixels", "static.": "static pixels"}
+INIT_WORDS = {
+    "phase": "phase: Gaussians start on surfaces decoded from the measured quads",
+    "random": "random: Gaussians start anywhere in view",
+}
+FLOW_WORDS = {
+    "file": "file: optical flow that came with the sequence",
+    "computed": "computed: optical flow by OpenCV, between quads of one shift",
+    "none": "none",
+}
+TO_READ = f"""
+<dl>
+<dt>distance</dt><dd>Length from the camera to the surface along the ray of a pixel, in metres. It is not the
+z-depth.</dd>
+<dt>closed form</dt><dd>What a camera computes by itself: four raw quads give a phase, the phase a distance. The quads
+are taken one after the other, so whatever moved in between gets a distance that nothing in the scene has.</dd>
+<dt>d</dt><dd>Mean distance of the reconstructed Gaussians at the time of one raw frame. It is not divided by
+opacity: where Gaussians let light through, the missing part counts as error.</dd>
+<dt>d_ToF</dt><dd>All four quads rendered at the time of one raw frame and decoded as the closed form. Like it, it lies
+within one unambiguous range, c / 2f.</dd>
+<dt>moving pixels</dt><dd>Pixels whose true distance changes by more than {MOVING_M} m within the four raw frames of
+their quartet: mostly the outline of what moves, and the object itself if it moves fast in depth.</dd>
+<dt>errors</dt><dd>Mean squared error in square metres times 100, then its root in centimetres. <em>All pixels</em> is
+the mean over frames of each frame's mean; <em>moving</em> and <em>static</em> pool the pixels of all frames. The closed
+form of a raw frame is the one image of its quartet, against the truth of that frame.</dd>
+<dt>quad PSNR</dt><dd>How well rendered quads match the measured ones, in the slot that each frame measured. It needs no
+ground truth, and noise in the measurement bounds it.</dd>
+<dt>grey pixels</dt><dd>Unknown: nothing is scored there.</dd>
+</dl>"""
+
+
+def report(
+    *,
+    title: str,
+    metrics: Mapping[str, object],
+    config: Mapping[str, object],
+    log: Sequence[Mapping[str, float]],
+    found: Findings,
+    data_card: str | None = None,
+) -> str:
+    """The page.
+
+    Args:
+        title: Name of the sequence.
+        metrics: Content of metrics.json: every number that the page prints about the result is one of these.
+        config: Content of the run's config.json.
+        log: Steps of the run's metrics.jsonl.
+        found: Arrays behind the pictures.
+        data_card: What the sequence's README says about its truth; None if it has none.
+    """
+    s = panels.telling_row(found)
+    sections = [
+        f"<h1>{page.escape(title)}</h1>"
+        f'<div class="soft">gftorf compare, version {page.number(metrics, "version", "text")}</div>'
+        f'<p class="verdict">{verdict(metrics)}</p>',
+        _section("Errors", _table(metrics) + _facts(metrics)),
+        _section("Distance", _distance_text(found, s) + _distance_pictures(found, s)),
+        _section("What was measured", _measured_text(found, s) + panels.measured_quartet(found, s)),
+        _section("Quads", _quad_text(found, s) + panels.quad_residual(found, s)),
+        _section("Over time", _time_pictures(found)),
+        _section("Curves", _curves(found, log)),
+        _section("How it was made", _how(config, data_card)),
+        _section("How to read it", TO_READ),
+    ]
+    return page.document(f"{title} - gftorf compare", "".join(sections))
+
+
+def verdict(metrics: Mapping[str, object]) -> str:
+    """The result in one or two sentences of HTML, with the numbers of metrics.json."""
+    if page.look_up(metrics, "d_mse_x100") is None:
+        return (
+            "There is no ground truth, so no distance error is known. Rendered quads match the measured ones to "
+            f'<span class="ours">{page.number(metrics, "quad_psnr_db", "decibel")}</span>.'
+        )
+    group = "moving." if page.look_up(metrics, "moving.d_mse_x100") is not None else ""
+    naive, ours = f"{group}closed_form_mse_x100", f"{group}d_mse_x100"
+    pixels = (
+        f"On moving pixels ({page.number(metrics, 'moving.share', 'percent')} of all)" if group else "Over all pixels"
+    )
+    text = (
+        f'{pixels}, the <span class="naive">closed form is off by {page.number(metrics, naive, "rms_cm")}</span>'
+        f' and <span class="ours">ours by {page.number(metrics, ours, "rms_cm")}</span> (root mean square): '
+        f"{_comparison(metrics, naive, ours)}."
+    )
+    if group and page.look_up(metrics, "static.d_mse_x100") is not None:
+        text += (
+            f" On static pixels, it is {page.number(metrics, 'static.closed_form_mse_x100', 'rms_cm')} against"
+            f" {page.number(metrics, 'static.d_mse_x100', 'rms_cm')}."
+        )
+    return text
+
+
+def _comparison(metrics: Mapping[str, object], naive: str, ours: str) -> str:
+    """Ours against the closed form in words."""
+    was, now = page.look_up(metrics, naive), page.look_up(metrics, ours)
+    values = f"{page.number(metrics, naive, 'error')} against {page.number(metrics, ours, 'error')} m² &times; 100"
+    if not (was > 0 and now > 0):
+        return f"a squared error of {values}"
+    if now <= was:
+        return f"{page.ratio(metrics, naive, ours)} times less squared error, {values}"
+    return f"{page.ratio(metrics, ours, naive)} times <em>more</em> squared error, {values}"
+
+
+def _section(title: str, body: str) -> str:
+    return f"<section><h2>{title}</h2>{body}</section>"
+
+
+def _table(metrics: Mapping[str, object]) -> str:
+    if page.look_up(metrics, "d_mse_x100") is None:
+        return '<p class="soft">No ground truth: distance errors are not known.</p>'
+    head = "".join(f"<th>{name}<span class='soft'>{_share(metrics, key)}</span></th>" for key, name in PIXELS.items())
+    rows = []
+    for name in DISTANCES:
+        title, note = ROWS[name]
+        cells = "".join(f"<td>{_cell(metrics, f'{group}{name}_mse_x100')}</td>" for group in PIXELS)
+        mark = ' class="ours"' if name == "d" else ""
+        rows.append(f'<tr{mark}><td><b>{title}</b> <span class="soft">{note}</span></td>{cells}</tr>')
+    return (
+        '<p class="soft">Mean squared error of the distance, m² &times; 100, and its root.</p>'
+        f"<table><thead><tr><th></th>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
+    )
+
+
+def _share(metrics: Mapping[str, object], group: str) -> str:
+    return f"{page.number(metrics, f'{group}share', 'percent')} of all" if group else "&nbsp;"
+
+
+def _cell(metrics: Mapping[str, object], key: str) -> str:
+    if page.look_up(metrics, key) is None:
+        return page.number(metrics, key, "error")
+    return f'{page.number(metrics, key, "error")} <span class="soft">{page.number(metrics, key, "rms_cm")}</span>'
+
+
+def _facts(metrics: Mapping[str, object]) -> str:
+    facts = {
+        "quad PSNR": page.number(metrics, "quad_psnr_db", "decibel"),
+        "raw frames scored": page.number(metrics, "frames", "count"),
+        "protocol": page.number(metrics, "protocol", "text"),
+        "Gaussians": page.number(metrics, "gaussians", "count"),
+        "optimised images": page.number(metrics, "images_optimised", "count"),
+        "reconstruction, wall clock": page.number(metrics, "seconds_reconstruct", "seconds"),
+        "device": page.number(metrics, "device", "text"),
+        "seed": page.number(metrics, "seed", "text"),
+    }
+    items = "".join(f"<li><b>{value}</b>{name}</li>" for name, value in facts.items())
+    return f'<ul class="facts">{items}</ul>'
+
+
+def _distance_text(found: Findings, s: int) -> str:
+    reason = "most pixels move" if found.moving is not None else "quads change most"
+    scale = "on the truth's scale" if found.views.truth is not None else "on one scale"
+    return (
+        f'<p class="caption">Distance along the ray, all {scale}. Shown is raw frame {found.views.frames[s]}: in the '
+        f"middle half of the sequence, the one where {reason}.</p>"
+    )
+
+
+def _measured_text(found: Findings, s: int) -> str:
+    return (
+        f'<p class="caption">The quartet of raw frame {found.views.frames[s]}: four raw frames, each with its own '
+        "phase shift and its own time. Red is positive, blue negative.</p>"
+    )
+
+
+def _distance_pictures(found: Findings, s: int) -> str:
+    html = panels.distances(found, s)
+    if found.errors is None:
+        return html
+    html += (
+        "<h3>Absolute error</h3>"
+        f"{panels.error_maps(found, s)}"
+        '<p class="caption">One scale for all three, set by the errors of the closed form where things move; '
+        "what exceeds it has the brightest colour.</p>"
+    )
+    close_up = panels.close_up(found, s)
+    return html + (f"<h3>Close-up of what moves</h3>{close_up}" if close_up else "")
+
+
+def _quad_text(found: Findings, s: int) -> str:
+    return (
+        f'<p class="caption">Raw frame {found.views.frames[s]} measured one of the four quads. Rendered from the same '
+        "pose at the same time before a black background; the difference should look like noise.</p>"
+    )
+
+
+def _time_pictures(found: Findings) -> str:
+    moving = panels.animation(found)
+    return panels.strip_over_time(found) + (f"<h3>Quartet by quartet, slowed down</h3>{moving}" if moving else "")
+
+
+def _curves(found: Findings, log: Sequence[Mapping[str, float]]) -> str:
+    charts = []
+    training = figures.training_curves(log)
+    if training is not None:
+        charts.append(("During optimisation", training))
+    if found.errors is not None:
+        errors = {name: found.errors[name] for name in panels.TITLES}
+        groups = {
+            "all pixels": np.ones_like(found.moving),
+            "moving pixels": found.moving,
+            "static pixels": found.static,
+        }
+        groups = {name: mask for name, mask in groups.items() if mask.any()}
+        per_frame = {
+            group: {name: [_x100(v) for v in per_frame_mean(error, mask)] for name, error in errors.items()}
+            for group, mask in groups.items()
+        }
+        charts.append(("Error of every raw frame", figures.error_over_frames(found.views.frames, per_frame)))
+        charts.append(
+            (
+                "How large the errors are (the first bin holds all below a millimetre)",
+                figures.error_histogram(errors, groups),
+            )
+        )
+    return "".join(f"<h3>{title}</h3>{page.chart(svg, title)}" for title, svg in charts)
+
+
+def _x100(value: float | None) -> float | None:
+    return None if value is None else 100.0 * value
+
+
+def _how(config: Mapping[str, object], data_card: str | None) -> str:
+    facts = {
+        "sequence": config.get("sequence"),
+        "preset": config.get("preset"),
+        "initialisation": INIT_WORDS.get(str(config.get("init")), config.get("init")),
+        "motion": config.get("motion"),
+        "optical flow": FLOW_WORDS.get(str(config.get("flow_source")), config.get("flow_source")),
+        "seed": config.get("seed"),
+        "device": f"{config.get('device')}, {config.get('threads')} threads",
+        "version of the reconstruction": config.get("version"),
+        "ground truth": data_card,
+    }
+    rows = "".join(f"<dt>{k}</dt><dd>{page.escape(v)}</dd>" for k, v in facts.items() if v is not None)
+    command = (
+        f"gftorf reconstruct {config.get('sequence')} --out RUN --preset {config.get('preset')} "
+        f"--images {config.get('images')} --seed {config.get('seed')}\ngftorf compare RUN"
+    )
+    everything = json.dumps(config, indent=2, sort_keys=True, default=str)
+    return (
+        f"<dl>{rows}</dl><h3>Again</h3><pre>{page.escape(command)}</pre>"
+        f"<details><summary>config.json</summary><pre>{page.escape(everything)}</pre></details>"
+    )

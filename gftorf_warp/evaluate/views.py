@@ -1,0 +1,199 @@
+"""A finished run as arrays: what is scored, frame by frame, and what ``gftorf render`` puts on disk."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from ..constants import FRAMES_PER_QUARTET
+from ..data.decode import closed_form_distance
+from ..data.files import write_json
+from ..data.images import write_exr, write_png
+from ..data.sequence import Sequence, Truth
+from ..errors import DivergedError, UsageError
+from ..render.api import Rendering
+from ..scene.camera import Camera
+from ..scene.sensor import Sensor
+from . import renders
+from .metrics import distance_from_quads, known_distance, normalised
+
+if TYPE_CHECKING:
+    from ..recon.run import Run
+
+SHIFT_TOLERANCE = 1e-5  # [rad] shifts are stored as float32 at worst
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Views:
+    """Everything that compare shows, for the S scored raw frames, at the sequence's own resolution, float32."""
+
+    frames: list[int]
+    """The scored raw frames n."""
+    d: Float[np.ndarray, "S H W"]
+    """Rendered mean distance, not divided by opacity [m]."""
+    opacity: Float[np.ndarray, "S H W"]
+    """Rendered opacity [1]."""
+    d_tof: Float[np.ndarray, "S H W"]
+    """Distance decoded from the four quads rendered at the time of the frame, in [0, c/2f) [m]."""
+    closed_form: Float[np.ndarray, "S H W"]
+    """Distance decoded from the measured quartet that the frame belongs to, in [0, c/2f) [m]."""
+    quad_rendered: Float[np.ndarray, "S H W"]
+    """The slot that was measured, as rendered [file units]."""
+    quad_measured: Float[np.ndarray, "S H W"]
+    """What was recorded there [file units]."""
+    truth: Float[np.ndarray, "S H W"] | None
+    """True distance [m], NaN where unknown; None without ground truth."""
+
+    @property
+    def d_normalised(self) -> Float[np.ndarray, "S H W"]:
+        """Mean distance divided by opacity [m]."""
+        return normalised(self.d, self.opacity)
+
+    @property
+    def distances(self) -> dict[str, Float[np.ndarray, "S H W"]]:
+        """Every kind of distance [m], by the name it has in metrics.json."""
+        return {"closed_form": self.closed_form, "d": self.d, "d_normalised": self.d_normalised, "d_tof": self.d_tof}
+
+
+def gather(
+    run: Run,
+    sequence: Sequence,
+    truth: Truth | None,
+    frames: list[int],
+    *,
+    progress: Callable[[int, int], None] | None = None,
+) -> Views:
+    """Render every scored frame at its own time and pose, before a black background.
+
+    Args:
+        run: A finished reconstruction.
+        sequence: What it was made from.
+        truth: Ground truth at the same frames and size.
+        frames: The raw frames n to render.
+        progress: Called with (frames done, frames in all).
+
+    Raises:
+        DivergedError: If a rendering is not finite.
+    """
+    closed_forms = {i: closed_form_distance(sequence, i) for i in sorted({n // FRAMES_PER_QUARTET for n in frames})}
+    rows: dict[str, list[np.ndarray]] = {"d": [], "opacity": [], "d_tof": [], "quad_rendered": []}
+    for count, n in enumerate(frames, start=1):
+        rendering = render_frame(run, sequence, n)
+        d_tof = distance_from_quads(rendering.quads, run.sensor)
+        slot = channel_of_shift(run.sensor, float(sequence.shifts[n]))
+        images = {
+            "d": rendering.distance,
+            "opacity": rendering.opacity,
+            "d_tof": d_tof,
+            "quad_rendered": rendering.quads[slot],
+        }
+        for name, image in images.items():
+            rows[name].append(_finite(image, f"{name} of raw frame {n}", run))
+        if progress is not None:
+            progress(count, len(frames))
+    return Views(
+        frames=frames,
+        closed_form=np.stack([closed_forms[n // FRAMES_PER_QUARTET] for n in frames]).astype(np.float32),
+        quad_measured=sequence.quads[frames],
+        truth=None if truth is None else known_distance(truth)[frames],
+        **{name: np.stack(images) for name, images in rows.items()},
+    )
+
+
+def render_frame(run: Run, sequence: Sequence, n: int) -> Rendering:
+    """The field at the time and from the pose of raw frame n."""
+    return run.render(float(sequence.times[n]), camera_at(run, sequence, float(sequence.times[n])))
+
+
+def camera_at(run: Run, sequence: Sequence, time: float) -> Camera:
+    """The camera at the pose of the raw frame nearest to ``time`` [s]."""
+    nearest = int(np.abs(sequence.times - time).argmin())
+    return run.camera.at(sequence.camera_from_world[nearest])
+
+
+def channel_of_shift(sensor: Sensor, shift: float) -> int:
+    """Index of the quad that the sensor renders for a phase shift [rad].
+
+    Raises:
+        ValueError: If the sensor does not render that shift.
+    """
+    turns = (np.asarray(sensor.shifts) - shift + np.pi) % (2.0 * np.pi) - np.pi
+    channel = int(np.abs(turns).argmin())
+    if abs(turns[channel]) > SHIFT_TOLERANCE:
+        raise ValueError(f"shift {shift} rad is not among those the sensor renders, {sensor.shifts}")
+    return channel
+
+
+def _finite(image: torch.Tensor, name: str, run: Run) -> Float[np.ndarray, "H W"]:
+    array = image.detach().cpu().numpy().astype(np.float32)
+    if not np.isfinite(array).all():
+        raise DivergedError(
+            f"{name} is not finite",
+            where=run.path,
+            why=f"{int((~np.isfinite(array)).sum())} of {array.size} rendered pixels are NaN or infinite",
+            fix="reconstruct again with another --seed or preset",
+        )
+    return array
+
+
+def render_to_folder(
+    run: Run,
+    out: str | Path,
+    what: str | Collection[str] = ("distance", "quads"),
+    times: Collection[float] | None = None,
+    *,
+    progress: Callable[[int, int], None] | None = None,
+) -> Path:
+    """Write what the run looks like at some times: ``OUT/<what>/<index>.exr`` (float32) and ``.png`` to look at.
+
+    ``OUT/renders.json`` lists the times [s], the channels with their units and the scale of the previews. Between raw
+    frames, the pose is that of the nearest one.
+
+    Args:
+        run: A finished reconstruction.
+        out: Folder, made if absent; files of the same name are replaced.
+        what: Names out of distance, quads, phasor, colour.
+        times: Seconds since raw frame 0; None: the times of all raw frames, truncated quartets included.
+        progress: Called with (times done, times in all).
+
+    Raises:
+        UsageError: If a name in ``what`` is unknown, or the run has no colour.
+    """
+    names = renders.checked(what)
+    sequence = run.sequence()
+    seconds = [float(t) for t in (sequence.times if times is None else times)]
+    if not seconds:
+        raise UsageError("no time to render", where="--times", why="the list is empty", fix="leave --times out")
+
+    def images_at(time: float) -> dict[str, renders.Channels]:
+        rendering = run.render(time, camera_at(run, sequence, time))
+        return {name: renders.channels(name, rendering, run.sensor) for name in names}
+
+    samples = [images_at(seconds[i]) for i in sorted({0, len(seconds) // 2, len(seconds) - 1})]
+    scales = {name: renders.preview_scale(name, (sample[name] for sample in samples)) for name in names}
+    out = Path(out)
+    for name in names:
+        (out / name).mkdir(parents=True, exist_ok=True)
+    for index, time in enumerate(seconds):
+        for name, images in images_at(time).items():
+            exr, png = renders.paths(out, name, index)
+            write_exr(exr, images)
+            write_png(png, renders.preview(name, images, scales[name]))
+        if progress is not None:
+            progress(index + 1, len(seconds))
+    write_json(
+        out / "renders.json",
+        {
+            "run": str(run.path),
+            "times_s": seconds,
+            "channels": {name: list(samples[0][name]) for name in names},
+            "preview": {name: asdict(scale) for name, scale in scales.items()},
+        },
+    )
+    return out

@@ -1,0 +1,121 @@
+"""A finished run whose errors are known beforehand: a box slides past a wall, and both are rendered a little wrong."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from gftorf_warp.constants import CANONICAL_SHIFTS, FRAME_RATE_HZ
+from gftorf_warp.data import ftorf
+from gftorf_warp.data.sequence import Sequence, Truth
+from gftorf_warp.render.api import Rendering
+from gftorf_warp.scene.camera import Camera
+from gftorf_warp.scene.sensor import Sensor
+
+HEIGHT, WIDTH, FRAMES = 12, 20, 14  # three complete quartets, and a truncated one
+WALL, BOX = 4.0, 2.5  # [m]
+WALL_ERROR, BOX_ERROR, QUAD_ERROR = 0.02, -0.1, 0.03  # [m] of the mean distance, and of what the quads encode
+OPACITY = 0.98
+PHASE_SLOPE = float(Sensor().phase_slope)
+
+
+def box_at(n):
+    """[H, W] whether a pixel sees the box: rows 3..8, four columns that move on by one each raw frame."""
+    seen = np.zeros((HEIGHT, WIDTH), dtype=bool)
+    seen[3:9, 2 + n : 6 + n] = True
+    return seen
+
+
+def true_distance(n):
+    """[H, W] distance at raw frame n [m]."""
+    return np.where(box_at(n), BOX, WALL)
+
+
+def quad(distance, shift, amplitude_distance=None):
+    """Quad of surfaces at a distance [m], with the falloff of another one if given."""
+    falloff = distance if amplitude_distance is None else amplitude_distance
+    return np.cos(PHASE_SLOPE * distance - shift) / falloff**2
+
+
+def sequence(frames=FRAMES):
+    """The measured quads, exact and asynchronous, in memory."""
+    shifts = np.array([CANONICAL_SHIFTS[n % 4] for n in range(frames)])
+    return Sequence(
+        quads=np.stack([quad(true_distance(n), shifts[n]) for n in range(frames)]).astype(np.float32),
+        measured=np.ones(frames, dtype=bool),
+        shifts=shifts,
+        times=np.arange(frames) / FRAME_RATE_HZ,
+        f_mod_hz=Sensor().f_mod_hz,
+        fx=20.0,
+        fy=20.0,
+        cx=WIDTH / 2,
+        cy=HEIGHT / 2,
+        camera_from_world=np.tile(np.eye(4), (frames, 1, 1)),
+    )
+
+
+def truth(frames=FRAMES):
+    """The true distance of every raw frame."""
+    distance = np.stack([true_distance(n) for n in range(frames)]).astype(np.float32)
+    return Truth(distance=distance, known=np.ones(frames, dtype=bool))
+
+
+class AnalyticRun:
+    """Looks like a finished run; what it renders is the truth plus the errors above."""
+
+    def __init__(self, folder, *, with_truth=True):
+        self.path = Path(folder) / "run"
+        self.path.mkdir(parents=True)
+        where = Path(folder) / "sliding-box"
+        ftorf.write(where, sequence(), truth() if with_truth else None)
+        self.camera = Camera(width=WIDTH, height=HEIGHT, fx=20.0, fy=20.0, cx=WIDTH / 2, cy=HEIGHT / 2)
+        self.sensor = Sensor()
+        self.quad_scale = 1.0
+        self.gaussians = 1234
+        self.cameras = []  # every camera that was rendered from
+        self.config = {
+            "version": "0.0.9",
+            "preset": "demo",
+            "seed": 7,
+            "images": 3000,
+            "images_optimised": 2988,
+            "device": "cpu",
+            "threads": 2,
+            "sequence": str(where),
+            "flow_source": "computed",
+            "init": "phase",
+            "motion": "nodes",
+            "seconds_reconstruct": 41.25,
+        }
+        steps = [{"images": 100 * i, "seconds": 1.0 * i, "loss": 1.0 / i, "quads": 0.8 / i} for i in range(1, 6)]
+        lines = [json.dumps(step | {"gaussians": 1200 + i, "quad_psnr_db": 20.0 + i}) for i, step in enumerate(steps)]
+        (self.path / "metrics.jsonl").write_text("\n".join(lines) + "\n")
+
+    def sequence(self):
+        """The sequence this run pretends to be made from."""
+        return Sequence.open(self.config["sequence"])
+
+    def render(self, time, camera=None, *, extra=None):
+        """Truth and its quads at the nearest raw frame, plus the known errors."""
+        assert extra is None
+        self.cameras.append(camera)
+        n = round(time * FRAME_RATE_HZ)
+        right = true_distance(n)
+        distance = OPACITY * (right + np.where(box_at(n), BOX_ERROR, WALL_ERROR))
+        quads = np.stack([quad(right + QUAD_ERROR, shift, right) for shift in self.sensor.shifts])
+        phasor = np.stack([quads[0] - quads[1], quads[2] - quads[3], 2.0 / right**2])
+
+        def tensor(image):
+            return torch.tensor(image, dtype=torch.float32)
+
+        return Rendering(
+            quads=tensor(quads),
+            phasor=tensor(phasor),
+            colour=None,
+            distance=tensor(distance),
+            opacity=tensor(np.full_like(distance, OPACITY)),
+            distortion=tensor(np.zeros_like(distance)),
+            extra=None,
+            screen=None,
+        )

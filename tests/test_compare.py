@@ -1,0 +1,212 @@
+"""Comparing a run whose errors are known beforehand: every number of metrics.json worked out by hand."""
+
+import json
+import math
+from dataclasses import replace
+
+import analytic_run
+import numpy as np
+import pytest
+import torch
+from analytic_run import BOX, PHASE_SLOPE, WALL, AnalyticRun, box_at, quad, true_distance
+
+from gftorf_warp import __version__
+from gftorf_warp.constants import CANONICAL_SHIFTS
+from gftorf_warp.data import ftorf
+from gftorf_warp.data.sequence import Truth
+from gftorf_warp.errors import DivergedError, InputError, UsageError
+from gftorf_warp.evaluate.compare import compare, training_log, truth_statement
+
+PIXELS, BOX_PIXELS = 12 * 20, 6 * 4
+MOVING, MOVING_BOX = 6 * 6, 6 * 3  # seven columns see the box within a quartet, one of them all the time
+KEYS = {
+    "frames",
+    "protocol",
+    "closed_form_mse_x100",
+    "d_mse_x100",
+    "d_normalised_mse_x100",
+    "d_tof_mse_x100",
+    "moving",
+    "static",
+    "quad_psnr_db",
+    "gaussians",
+    "seconds_reconstruct",
+    "images_optimised",
+    "device",
+    "seed",
+    "preset",
+    "flow_source",
+    "init",
+    "version",
+}
+
+
+def mixed(box, wall, boxes, pixels):
+    """Mean of a squared error over pixels, some of which see the box."""
+    return (boxes * box**2 + (pixels - boxes) * wall**2) / pixels
+
+
+def closed_form(quartet):
+    """[H, W] distance decoded from four quads of four instants, with complex numbers."""
+    q = [quad(true_distance(4 * quartet + k), CANONICAL_SHIFTS[k]) for k in range(4)]
+    return np.angle((q[0] - q[1]) + 1j * (q[2] - q[3])) % (2 * np.pi) / PHASE_SLOPE
+
+
+@pytest.fixture
+def run(tmp_path):
+    """A run with a truth."""
+    return AnalyticRun(tmp_path)
+
+
+def test_every_number_by_hand(run):
+    """Errors of d, d / opacity, d_ToF and the closed form on all, moving and static pixels, and what was copied."""
+    got = compare(run, report=False)
+    assert set(got) == KEYS
+    assert (got["frames"], got["protocol"], got["version"]) == (12, "all", __version__)
+    assert got["moving"]["share"] == pytest.approx(MOVING / PIXELS)
+    assert got["static"]["share"] == pytest.approx(1 - MOVING / PIXELS)
+    groups = {
+        "moving": (got["moving"], MOVING_BOX, MOVING),
+        "static": (got["static"], BOX_PIXELS - MOVING_BOX, PIXELS - MOVING),
+        "all": (got, BOX_PIXELS, PIXELS),
+    }
+    box, wall = 0.98 * (BOX - 0.1) - BOX, 0.98 * (WALL + 0.02) - WALL
+    for row, boxes, pixels in groups.values():
+        assert row["d_mse_x100"] == pytest.approx(100 * mixed(box, wall, boxes, pixels), rel=1e-4)
+        assert row["d_normalised_mse_x100"] == pytest.approx(100 * mixed(-0.1, 0.02, boxes, pixels), rel=1e-4)
+        assert row["d_tof_mse_x100"] == pytest.approx(100 * 0.03**2, rel=1e-4)
+    assert got["static"]["closed_form_mse_x100"] == pytest.approx(0.0, abs=1e-8)
+    squared = [(closed_form(n // 4) - true_distance(n)) ** 2 for n in range(12)]
+    assert got["closed_form_mse_x100"] == pytest.approx(100 * np.mean(squared), rel=1e-4)
+    assert got["moving"]["closed_form_mse_x100"] == pytest.approx(100 * np.mean(squared) * PIXELS / MOVING, rel=1e-4)
+    assert got["moving"]["closed_form_mse_x100"] > 10.0, "an exact closed form would test nothing"
+    for name, value in {"gaussians": 1234, "images_optimised": 2988, "seconds_reconstruct": 41.25, "seed": 7}.items():
+        assert got[name] == value
+    assert [got[name] for name in ("device", "preset", "flow_source", "init")] == ["cpu", "demo", "computed", "phase"]
+
+
+def test_quad_psnr_pools_the_measured_slots(run):
+    """The peak over the root of the mean squared difference, in dB; slots that were not measured do not count."""
+    shifts = [CANONICAL_SHIFTS[n % 4] for n in range(14)]
+    measured = [quad(true_distance(n), shifts[n]) for n in range(14)]
+    rendered = [quad(true_distance(n) + 0.03, shifts[n], true_distance(n)) for n in range(12)]
+    mse = np.mean([(r - m) ** 2 for r, m in zip(rendered, measured, strict=False)])
+    want = 10 * math.log10(np.abs(measured).max() ** 2 / mse)
+    assert compare(run, report=False)["quad_psnr_db"] == pytest.approx(want, abs=1e-3)
+
+
+def test_what_is_returned_is_what_is_written(run):
+    """metrics.json is plain JSON without NaN; the page is written beside it unless it is not wanted."""
+    got = compare(run, report=False)
+
+    def refuse(name):
+        raise AssertionError(f"{name} is no JSON")
+
+    assert json.loads((run.path / "metrics.json").read_text(), parse_constant=refuse) == got
+    assert not (run.path / "report.html").exists()
+    compare(run)
+    assert (run.path / "report.html").read_text().startswith("<!doctype html>")
+
+
+def test_published_protocol(run):
+    """Of three quartets only the start of the middle one is left."""
+    got = compare(run, frames="ftorf13", report=False)
+    assert (got["frames"], got["protocol"]) == (1, "ftorf13")
+    error = (closed_form(1) - true_distance(4)) ** 2
+    assert got["closed_form_mse_x100"] == pytest.approx(100 * error.mean(), rel=1e-4)
+
+
+def test_every_frame_is_rendered_at_its_own_pose(tmp_path):
+    """A camera that moves on by a centimetre each raw frame."""
+    run = AnalyticRun(tmp_path)
+    poses = np.tile(np.eye(4), (14, 1, 1))
+    poses[:, 0, 3] = 0.01 * np.arange(14)
+    original = run.sequence
+    run.sequence = lambda: replace(original(), camera_from_world=poses)
+    compare(run, report=False)
+    np.testing.assert_allclose([camera.camera_from_world[0, 3] for camera in run.cameras], poses[:12, 0, 3])
+
+
+def test_without_truth_errors_are_null(tmp_path):
+    """The quads can still be compared, and the page is still written."""
+    run = AnalyticRun(tmp_path, with_truth=False)
+    got = compare(run)
+    assert got["d_mse_x100"] is None
+    assert got["closed_form_mse_x100"] is None
+    assert set(got["moving"].values()) == set(got["static"].values()) == {None}
+    assert got["quad_psnr_db"] > 10.0
+    assert (run.path / "report.html").exists()
+
+
+def test_truth_of_another_folder(tmp_path):
+    """The errors are those of the sequence's own truth, and of no other."""
+    run = AnalyticRun(tmp_path, with_truth=False)
+    truth = analytic_run.truth()
+    shifted = Truth(distance=truth.distance + np.float32(0.5), known=truth.known)
+    ftorf.write(tmp_path / "other", analytic_run.sequence(), shifted)
+    got = compare(run, truth=tmp_path / "other", report=False)
+    assert got["d_tof_mse_x100"] == pytest.approx(100 * (0.5 - 0.03) ** 2, rel=1e-4)
+
+
+def test_a_still_scene_has_no_moving_pixels(tmp_path):
+    """Null where no pixel is, with a share of zero, and the page says it for all pixels."""
+    run = AnalyticRun(tmp_path)
+    still = np.tile(true_distance(0), (14, 1, 1)).astype(np.float32)
+    ftorf.write(tmp_path / "still", analytic_run.sequence(), Truth(distance=still, known=np.ones(14, dtype=bool)))
+    got = compare(run, truth=tmp_path / "still")
+    assert got["moving"] == {**dict.fromkeys(k for k in KEYS if k.endswith("_mse_x100")), "share": 0.0}
+    assert got["static"]["d_mse_x100"] == pytest.approx(got["d_mse_x100"])
+    assert "Over all pixels" in (run.path / "report.html").read_text()
+
+
+def test_a_truth_that_does_not_fit_is_named(tmp_path):
+    """Another number of frames, or no truth at all, where one was asked for."""
+    run = AnalyticRun(tmp_path)
+    ftorf.write(tmp_path / "short", analytic_run.sequence(8), analytic_run.truth(8))
+    with pytest.raises(InputError, match=r"expected frames x rows x columns 14x12x20, found 8x12x20") as error:
+        compare(run, truth=tmp_path / "short")
+    assert error.value.where == str(tmp_path / "short")
+    ftorf.write(tmp_path / "blind", analytic_run.sequence())
+    with pytest.raises(InputError, match="no ground truth"):
+        compare(run, truth=tmp_path / "blind")
+    with pytest.raises(UsageError, match="unknown protocol"):
+        compare(run, frames="some")
+    assert not (run.path / "metrics.json").exists()
+
+
+def test_a_rendering_that_is_not_finite_ends_the_comparison(run):
+    """NaN would otherwise vanish in a mean, or stand in metrics.json."""
+    render = run.render
+
+    def broken(time, camera=None):
+        rendering = render(time, camera)
+        rendering.distance[2, 3] = torch.nan
+        return rendering
+
+    run.render = broken
+    with pytest.raises(DivergedError, match="1 of 240"):
+        compare(run)
+    assert not (run.path / "metrics.json").exists()
+
+
+def test_box_and_mask_of_the_analytic_run():
+    """Seven columns of a quartet see the box at some time, and one always: six move."""
+    seen = np.stack([box_at(n) for n in range(4)])
+    assert (seen.any(0) & ~seen.all(0)).sum() == MOVING
+    assert seen[0].sum() == BOX_PIXELS
+
+
+def test_training_log_stops_before_a_torn_line(tmp_path):
+    """A killed run may leave half a line."""
+    path = tmp_path / "metrics.jsonl"
+    assert training_log(path) == []
+    path.write_text('{"images": 4, "loss": 1.0}\n{"images": 8, "lo')
+    assert training_log(path) == [{"images": 4, "loss": 1.0}]
+
+
+def test_truth_statement_is_the_paragraph_of_the_data_card(tmp_path):
+    """The paragraph about ground truth, on one line; nothing without a data card."""
+    assert truth_statement(None) is None
+    assert truth_statement(tmp_path) is None
+    (tmp_path / "README.md").write_text("# box\n\nGround truth is the analytic hit,\nnot a rendering.\n\nMore.\n")
+    assert truth_statement(tmp_path) == "Ground truth is the analytic hit, not a rendering."

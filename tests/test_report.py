@@ -1,0 +1,289 @@
+"""The page: every printed number is one of metrics.json, every picture shows its array, and nothing in it can run."""
+
+import base64
+import json
+import math
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import analytic_run
+import cv2
+import numpy as np
+import pytest
+from analytic_run import AnalyticRun
+
+from gftorf_warp.constants import CANONICAL_SHIFTS
+from gftorf_warp.data.sequence import Sequence, Truth
+from gftorf_warp.evaluate import figures, page, panels, pictures
+from gftorf_warp.evaluate.compare import compare, findings, summary
+from gftorf_warp.evaluate.metrics import scored_frames
+from gftorf_warp.evaluate.report import report, verdict
+from gftorf_warp.evaluate.views import Views, gather
+
+VOID = {"img", "meta", "br"}
+HOSTILE = "<script>alert(1)</script>"
+PRINTED = {  # how the page prints a value of metrics.json, written a second time
+    "error": lambda value: f"{value:.3f}",
+    "rms_cm": lambda value: f"{math.sqrt(value / 100) * 100:.1f} cm",
+    "percent": lambda value: f"{value * 100:.1f} %",
+    "decibel": lambda value: f"{value:.2f} dB",
+    "count": lambda value: f"{value:,d}",
+    "seconds": lambda value: f"{value:.1f} s",
+    "text": str,
+}
+
+
+class Page(HTMLParser):
+    """What a browser would see: tags, texts, marked numbers, embedded images by their alternative text."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.tags, self.attributes, self.numbers, self.ratios, self.images = [], [], [], [], {}
+        self.texts = {}  # section title: text outside marked numbers
+        self.open, self.section, self.title, self.headline = [], "top", "", ""
+        self.feed(text)
+        self.close()
+        assert not self.open, f"never closed: {self.open}"
+
+    def handle_starttag(self, tag, attrs):
+        """Count a tag, and remember where we are."""
+        attributes = dict(attrs)
+        self.tags.append(tag)
+        self.attributes += [(tag, name, value) for name, value in attrs]
+        if tag == "img":
+            self.images.setdefault(attributes["alt"], []).append(attributes["src"])
+        if tag == "h2":
+            self.section = ""
+        if tag not in VOID:
+            self.open.append((tag, attributes))
+
+    def handle_endtag(self, tag):
+        """Tags must close in order."""
+        assert self.open.pop()[0] == tag
+
+    def handle_data(self, data):
+        """A text belongs to the innermost tag."""
+        if not self.open:
+            return
+        tag, attributes = self.open[-1]
+        if tag == "h2":
+            self.section += data
+        elif tag == "title":
+            self.title += data
+        elif tag == "h1":
+            self.headline += data
+        elif "data-key" in attributes:
+            self.numbers.append((attributes["data-key"], attributes["data-form"], data))
+        elif "data-above" in attributes:
+            self.ratios.append((attributes["data-above"], attributes["data-below"], data))
+        elif tag != "style":
+            self.texts[self.section] = self.texts.get(self.section, "") + " " + data
+
+
+def picture(source):
+    """RGB of an embedded image."""
+    kind, _, data = source.partition(",")
+    assert kind == "data:image/webp;base64"
+    return cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+
+
+def look_up(metrics, key):
+    """A value by its dotted key."""
+    for part in key.split("."):
+        metrics = metrics[part]
+    return metrics
+
+
+@pytest.fixture(scope="module")
+def compared(tmp_path_factory):
+    """(folder of the run, metrics.json, page, findings) of the analytic run."""
+    run = AnalyticRun(tmp_path_factory.mktemp("compared"))
+    compare(run)
+    sequence = run.sequence()
+    truth = sequence.truth()
+    found = findings(sequence, gather(run, sequence, truth, scored_frames(sequence)), truth)
+    metrics = json.loads((run.path / "metrics.json").read_text())
+    return run, metrics, Page((run.path / "report.html").read_text()), found
+
+
+def test_every_printed_number_is_in_metrics(compared):
+    """Each marked number, printed again from metrics.json; the results hold no digit besides."""
+    _, metrics, html, _ = compared
+    for key, form, text in html.numbers:
+        value = look_up(metrics, key)
+        assert text == ("not known" if value is None else PRINTED[form](value)), key
+    for above, below, text in html.ratios:
+        assert text == f"{look_up(metrics, above) / look_up(metrics, below):.1f}"
+    printed = {key for key, _, _ in html.numbers}
+    wanted = {
+        f"{group}{name}_mse_x100" for group in ("", "moving.", "static.") for name in ("closed_form", "d", "d_tof")
+    }
+    assert wanted | {"moving.share", "static.share", "quad_psnr_db", "gaussians", "frames", "seed"} <= printed
+    assert len(html.ratios) == 1
+    for section in ("top", "Errors"):
+        left = html.texts[section].replace("m² \N{MULTIPLICATION SIGN} 100", "").replace("atan2", "")
+        assert not re.search(r"\d", left), left
+
+
+def test_nothing_runs_and_nothing_is_loaded(compared):
+    """No script, no handler, no form, no address but embedded data; the policy forbids the rest."""
+    run, _, html, _ = compared
+    assert not {"script", "iframe", "object", "embed", "link", "form", "base", "svg", "a"} & set(html.tags)
+    for tag, name, value in html.attributes:
+        assert not name.startswith("on"), f"{tag} {name}"
+        if name in {"src", "href", "srcset", "action", "data"}:
+            assert value.startswith("data:image/"), f"{tag} {name}"
+    text = (run.path / "report.html").read_text()
+    assert not re.search(r"https?:|//[a-z]|url\(|@import|javascript:", re.sub(r"base64,[A-Za-z0-9+/=]*", "", text))
+    policies = [value for tag, name, value in html.attributes if tag == "meta" and value and "default-src" in value]
+    assert policies == ["default-src 'none'; img-src data:; style-src 'unsafe-inline'"]
+
+
+def test_a_hostile_name_stays_a_name(compared):
+    """Text from folders, configuration and data cards is shown, never obeyed."""
+    run, metrics, _, found = compared
+    config = {name: HOSTILE if isinstance(value, str) else value for name, value in run.config.items()}
+    hostile = {name: HOSTILE if isinstance(value, str) else value for name, value in metrics.items()}
+    log = [{"images": i, "loss": 1.0, HOSTILE: 0.5, "gaussians": 3, "quad_psnr_db": None} for i in (1, 2)]
+    text = report(title=HOSTILE, metrics=hostile, config=config, log=log, found=found, data_card=HOSTILE)
+    html = Page(text)
+    assert "script" not in html.tags
+    assert html.headline == HOSTILE
+    assert html.title.startswith(HOSTILE)
+    assert html.texts["How it was made"].count(HOSTILE) >= 5
+
+
+def test_pictures_show_their_arrays(compared):
+    """Distances, errors, quads and masks, decoded from the page and compared with the arrays on the stated scale."""
+    _, _, html, found = compared
+    s = panels.telling_row(found)
+    metres = panels.common_distance_scale(found)
+    assert (metres.low, metres.high) == (2.5, 4.0)
+    quads = pictures.signed_scale([found.sequence.quads[n] for n in range(4, 8)])
+    errors = pictures.error_scale([np.sqrt(found.errors["closed_form"][s])[found.moving[s]]])
+    want = {
+        "closed form": (found.views.closed_form[s], metres),
+        "ours, d": (found.views.d[s], metres),
+        "ours, d_ToF": (found.views.d_tof[s], metres),
+        "truth": (analytic_run.true_distance(found.views.frames[s]), metres),
+        "error of closed form": (np.abs(found.views.closed_form[s] - found.views.truth[s]), errors),
+        "error of ours, d": (np.abs(found.views.d[s] - found.views.truth[s]), errors),
+        "moving pixels": (found.moving[s].astype(float), pictures.Scale(low=0, high=1, colours="gray", unit="")),
+        **{f"raw frame {n}": (found.sequence.quads[n], quads) for n in range(4, 8)},
+    }
+    assert found.views.frames[s] // 4 == 1
+    for title, (image, scale) in want.items():
+        np.testing.assert_array_equal(picture(html.images[title][0]), pictures.colour_mapped(image, scale), title)
+        assert len(np.unique(picture(html.images[title][0]).reshape(-1, 3), axis=0)) > 1, f"{title} is one colour"
+
+
+def test_phase_and_amplitude_are_those_of_the_quartet(compared):
+    """The wall, untouched by the box, has one phase and one amplitude: the expected ones."""
+    _, _, html, _ = compared
+    phase = picture(html.images["measured phase"][0])[0, 0]
+    psi = analytic_run.PHASE_SLOPE * analytic_run.WALL
+    np.testing.assert_array_equal(phase, pictures.colour_mapped(np.array([[psi]]), pictures.phase_scale())[0, 0])
+    amplitude = picture(html.images["measured amplitude"][0])
+    assert amplitude[0, 0, 0] < amplitude[5, 8, 0], "the box is nearer, so brighter"
+
+
+def test_animation_has_a_picture_for_every_quartet_start(compared):
+    """Three quartets, four panels of 20 pixels with gaps between them."""
+    _, _, html, _ = compared
+    (source,) = (sources[0] for title, sources in html.images.items() if title.startswith("animation"))
+    ok, animation = cv2.imdecodeanimation(np.frombuffer(base64.b64decode(source.partition(",")[2]), np.uint8))
+    assert ok
+    assert len(animation.frames) == 3
+    assert animation.frames[0].shape[:2] == (12, 4 * 20 + 3 * 2)
+    assert np.abs(animation.frames[0].astype(int) - animation.frames[1]).max() > 50, "nothing moves"
+
+
+def test_the_same_comparison_gives_the_same_bytes(compared):
+    """Two reports of one run, drawings included."""
+    run, _, _, _ = compared
+    before = (run.path / "report.html").read_bytes()
+    compare(run)
+    assert (run.path / "report.html").read_bytes() == before
+
+
+def test_curves_are_drawn_from_the_log(compared):
+    """One line per loss term, and none without a log."""
+    _, _, html, _ = compared
+    assert {"During optimisation", "Error of every raw frame"} <= set(html.images)
+    log = [{"images": i, "seconds": 1.0, "loss": 1.0 / i, "quads": 0.5 / i, "gaussians": 9} for i in (1, 2, 3)]
+    both, one = (
+        figures.training_curves(log),
+        figures.training_curves([{k: s[k] for k in s if k != "quads"} for s in log]),
+    )
+    assert both.count(b"<path") > one.count(b"<path")
+    assert figures.training_curves([]) is None
+
+
+def test_verdict_says_which_is_better():
+    """Ours better, ours worse, and unknown."""
+    rows = {"closed_form_mse_x100": 100.0, "d_mse_x100": 4.0, "share": 0.125}
+    good = {"moving": rows, "static": rows, "d_mse_x100": 1.0}
+    text = re.sub(r"<[^>]*>", "", verdict(good))
+    assert "moving pixels (12.5 % of all), the closed form is off by 100.0 cm and ours by 20.0 cm" in text
+    assert "25.0 times less squared error" in text
+    bad = {"moving": {**rows, "closed_form_mse_x100": 2.0}, "static": rows, "d_mse_x100": 1.0}
+    assert "2.0 times more squared error" in re.sub(r"<[^>]*>", "", verdict(bad))
+    assert "no ground truth" in verdict({"d_mse_x100": None, "quad_psnr_db": 31.0})
+
+
+def test_without_truth_the_page_still_shows_pictures(compared):
+    """No errors, no truth, no claim; distances and quads remain."""
+    run, metrics, _, found = compared
+    blind = replace(found, views=replace(found.views, truth=None), errors=None, moving=None, static=None)
+    unknown = summary(run, blind, protocol="all")
+    html = Page(report(title="blind", metrics=unknown, config=run.config, log=[], found=blind))
+    assert {"closed form", "ours, d", "measured quad", "rendered quad"} <= set(html.images)
+    assert not [title for title in html.images if "truth" in title or title.startswith("error")]
+    assert "not known" in html.texts["Errors"]
+    assert unknown["quad_psnr_db"] == metrics["quad_psnr_db"]
+
+
+def test_the_frame_shown_is_the_one_that_moves_most(compared):
+    """In the middle half of the frames; without truth the change of the quads decides."""
+    _, _, _, found = compared
+    moving = np.zeros_like(found.moving)
+    moving[7, :3] = moving[4, :1] = moving[11] = True
+    assert panels.telling_row(replace(found, moving=moving)) == 7
+    quads = np.zeros_like(found.sequence.quads)
+    quads[9] = 1.0  # against frames 5 and 13; the first of the two in the middle half is shown
+    blind = replace(found, moving=None, sequence=replace(found.sequence, quads=quads))
+    assert found.views.frames[panels.telling_row(blind)] == 5
+
+
+def test_pages_of_large_noisy_images_stay_below_four_megabytes(compared):
+    """Noise is what images compress worst; 60 raw frames of 320x240."""
+    generator = np.random.default_rng(0)
+    frames, height, width = 60, 240, 320
+    noise = generator.uniform(2.0, 6.0, (frames, height, width)).astype(np.float32)
+    sequence = Sequence(
+        quads=noise - 4.0,
+        measured=np.ones(frames, dtype=bool),
+        shifts=np.resize(CANONICAL_SHIFTS, frames),
+        times=np.arange(frames) / 120.0,
+        f_mod_hz=20e6,
+        fx=200.0,
+        fy=200.0,
+        cx=160.0,
+        cy=120.0,
+        camera_from_world=np.tile(np.eye(4), (frames, 1, 1)),
+    )
+    views = Views(
+        frames=list(range(frames)),
+        d=noise,
+        opacity=noise / 6.0,
+        d_tof=noise,
+        closed_form=noise[::-1],
+        quad_rendered=noise - 4.0,
+        quad_measured=noise[::-1] - 4.0,
+        truth=noise[:, ::-1],
+    )
+    found = findings(sequence, views, Truth(distance=views.truth, known=np.ones(frames, dtype=bool)))
+    text = report(title="noise", metrics=compared[1], config={}, log=[], found=found)
+    assert 1_000_000 < len(text) < 4_000_000
+    assert page.thinned(np.zeros((240, 641))).shape == (80, 214)

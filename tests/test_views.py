@@ -1,0 +1,157 @@
+"""What ``gftorf render`` writes, and colours that mean what their scale says."""
+
+import json
+
+import analytic_run
+import numpy as np
+import pytest
+import torch
+from analytic_run import FRAMES, HEIGHT, WIDTH, AnalyticRun, true_distance
+
+from gftorf_warp.data.images import read_exr
+from gftorf_warp.errors import UsageError
+from gftorf_warp.evaluate import pictures, renders
+from gftorf_warp.evaluate.views import channel_of_shift, render_to_folder
+from gftorf_warp.scene.sensor import Sensor
+
+
+@pytest.fixture
+def run(tmp_path):
+    """A finished run."""
+    return AnalyticRun(tmp_path)
+
+
+def test_every_raw_frame_is_rendered_by_default(run, tmp_path):
+    """Values in float32 as rendered, the truncated quartet included; a preview each, and a list of what is where."""
+    out = render_to_folder(run, tmp_path / "out")
+    assert sorted(path.name for path in out.iterdir()) == ["distance", "quads", "renders.json"]
+    for n in (0, 5, FRAMES - 1):
+        rendering = run.render(n / 120)
+        images = read_exr(out / "distance" / f"{n:06d}.exr")
+        np.testing.assert_array_equal(images["distance"], rendering.distance.numpy())
+        np.testing.assert_array_equal(images["opacity"], rendering.opacity.numpy())
+        quads = read_exr(out / "quads" / f"{n:06d}.exr")
+        assert set(quads) == {"quad_000", "quad_180", "quad_090", "quad_270"}
+        np.testing.assert_array_equal(quads["quad_180"], rendering.quads[1].numpy())
+    assert len(list((out / "distance").glob("*.exr"))) == len(list((out / "distance").glob("*.png"))) == FRAMES
+    listed = json.loads((out / "renders.json").read_text())
+    assert listed["times_s"] == pytest.approx([n / 120 for n in range(FRAMES)])
+    assert listed["channels"]["distance"] == ["distance", "opacity"]
+    assert listed["preview"]["distance"]["unit"] == "m"
+
+
+def test_previews_of_all_times_share_a_scale(run, tmp_path):
+    """The wall has one colour in every picture, and the picture is that of the values."""
+    import cv2
+
+    out = render_to_folder(run, tmp_path / "out", what="distance")
+    scale = pictures.Scale(**json.loads((out / "renders.json").read_text())["preview"]["distance"])
+    for n in range(FRAMES):
+        rgb = cv2.imread(str(out / "distance" / f"{n:06d}.png"))[..., ::-1]
+        images = read_exr(out / "distance" / f"{n:06d}.exr")
+        np.testing.assert_array_equal(rgb, pictures.colour_mapped(images["distance"], scale))
+    assert len(np.unique(rgb.reshape(-1, 3), axis=0)) == 2
+
+
+def test_chosen_times_and_things(run, tmp_path):
+    """Phasors at two times, at the pose of the nearest raw frame; previews show phase and amplitude."""
+    import cv2
+
+    poses = np.tile(np.eye(4), (FRAMES, 1, 1))
+    poses[:, 1, 3] = np.arange(FRAMES)
+    sequence = run.sequence()
+    object.__setattr__(sequence, "camera_from_world", poses)
+    run.sequence = lambda: sequence
+    out = render_to_folder(run, tmp_path / "out", what=["phasor", "phasor"], times=[3.4 / 120, 8 / 120])
+    assert {camera.camera_from_world[1, 3] for camera in run.cameras} == {3.0, 8.0}
+    images = read_exr(out / "phasor" / "000001.exr")
+    np.testing.assert_allclose(np.hypot(images["re"], images["im"]), images["amplitude"], rtol=1e-5)
+    np.testing.assert_allclose(images["amplitude"], 2.0 / true_distance(8) ** 2, rtol=1e-5)
+    assert cv2.imread(str(out / "phasor" / "000000.png")).shape == (HEIGHT, 2 * WIDTH + 2, 3)
+    assert len(list((out / "phasor").iterdir())) == 4
+
+
+@pytest.mark.parametrize(
+    ("what", "times", "text"),
+    [
+        (("distance", "depth"), None, "'depth'"),
+        ("", None, "nothing"),
+        ("colour", None, "no colour"),
+        ("distance", [], "no time"),
+    ],
+)
+def test_what_cannot_be_rendered_is_named(run, tmp_path, what, times, text):
+    """Nothing is written then."""
+    with pytest.raises(UsageError, match=text):
+        render_to_folder(run, tmp_path / "out", what=what, times=times)
+    assert not (tmp_path / "out").exists()
+
+
+def test_colour_is_written_linear_and_shown_as_srgb(run):
+    """Linear 0.5 is 188 in 8-bit sRGB; what is brighter than white stays white."""
+    rendering = run.render(0.0)
+    colour = torch.stack([torch.full((HEIGHT, WIDTH), value) for value in (0.5, 0.0, 7.0)])
+    object.__setattr__(rendering, "colour", colour)
+    images = renders.channels("colour", rendering, run.sensor)
+    assert list(images) == ["R", "G", "B"]
+    assert images["B"].max() == 7.0
+    assert renders.preview("colour", images, renders.preview_scale("colour", [images]))[0, 0].tolist() == [188, 0, 255]
+
+
+def test_a_shift_finds_its_channel():
+    """A turn more or less is the same shift; one that is not rendered is an error."""
+    sensor = Sensor()
+    assert [channel_of_shift(sensor, shift) for shift in (0.0, np.pi, np.pi / 2, -np.pi / 2, 2 * np.pi)] == [
+        0,
+        1,
+        2,
+        3,
+        0,
+    ]
+    with pytest.raises(ValueError, match="not among"):
+        channel_of_shift(sensor, 0.3)
+
+
+def test_colours_run_from_low_to_high_and_grey_is_unknown():
+    """The ends of the map at and beyond the ends of the scale."""
+    scale = pictures.Scale(low=1.0, high=2.0, colours="viridis", unit="m")
+    bar = pictures.bar(scale)[0]
+    rgb = pictures.colour_mapped(np.array([[0.0, 1.0, 1.5, 2.0, 9.0, np.nan]]), scale)[0]
+    np.testing.assert_array_equal(rgb[:5], bar[[0, 0, 128, 255, 255]])
+    assert rgb[5].tolist() == [128, 128, 128]
+    for colours in ("viridis", "magma", "twilight", "RdBu_r"):
+        assert not (pictures.bar(pictures.Scale(low=0, high=1, colours=colours, unit="m")) == 128).all(axis=-1).any()
+    with pytest.raises(ValueError, match="low < high"):
+        pictures.Scale(low=1.0, high=1.0, colours="viridis", unit="m")
+
+
+def test_scales():
+    """Symmetric for quads, from zero for errors, cyclic for phase, and never empty."""
+    values = [np.linspace(-1.0, 3.0, 1001), np.array([np.nan])]
+    signed = pictures.signed_scale(values)
+    assert signed.low == -signed.high
+    assert signed.high == pytest.approx(3.0, abs=0.05)
+    assert pictures.error_scale([np.zeros(3)]).low == 0.0
+    first, last = pictures.bar(pictures.phase_scale())[0, [0, -1]].astype(int)
+    assert np.abs(first - last).max() < 8
+    dark = [np.zeros(4)]
+    for scale in (pictures.distance_scale, pictures.error_scale, pictures.amplitude_scale, pictures.signed_scale):
+        assert scale(dark).low < scale(dark).high
+        assert scale([np.full(4, np.nan)]).high > scale([np.full(4, np.nan)]).low
+
+
+def test_pictures_are_lossless():
+    """An image comes back as it was, with red first."""
+    import cv2
+
+    rgb = np.random.default_rng(0).integers(0, 256, (7, 9, 3), dtype=np.uint8)
+    back = cv2.imdecode(np.frombuffer(pictures.webp(rgb), np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+    np.testing.assert_array_equal(back, rgb)
+
+
+def test_the_analytic_run_renders_what_it_says():
+    """Opposite quads cancel, and the mean distance is 2 % short of a slightly wrong one."""
+    distance = analytic_run.true_distance(3)
+    assert sorted(np.unique(distance)) == [2.5, 4.0]
+    quads = [analytic_run.quad(distance, shift) for shift in Sensor().shifts]
+    np.testing.assert_allclose(quads[0] + quads[1], 0.0, atol=1e-12)
