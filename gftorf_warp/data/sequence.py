@@ -1,4 +1,4 @@
-"""A recorded sequence in memory: raw frames with their shift, time and pose, calibration, and where each value is from."""
+"""A recorded sequence in memory: raw frames with shift, time and pose, calibration, and where each value is from."""
 
 from __future__ import annotations
 

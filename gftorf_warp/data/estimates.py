@@ -1,0 +1,183 @@
+"""What a recording says about itself: estimates that a wrong order, offset or scale would betray (``gftorf check``)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..constants import FRAMES_PER_QUARTET, SPEED_OF_LIGHT
+from .decode import quartet_phasor
+from .flow import warp_back
+from .sequence import Sequence, Truth
+
+PAIRINGS = (((0, 1), (2, 3)), ((0, 2), (1, 3)), ((0, 3), (1, 2)))  # of the four slots: the three ways to pair them
+STATIC_QUANTILE = 0.5  # the half of the pixels that changes least over time counts as static
+BRIGHT_QUANTILE = 0.5  # and of those the brighter half, where noise does not decide
+STILL_M = 1e-3  # [m] truth that changes less within a quartet is static
+MOVING_PX = 0.5  # [px] flow above this is motion
+FLAT_GRADIENT = 2  # pixels next to a depth edge mix two distances: left out by this many pixels
+
+
+def steady_pixels(sequence: Sequence) -> np.ndarray:
+    """Bright pixels [H, W] whose quads of one slot change least over the sequence, relative to their amplitude."""
+    change = np.zeros(sequence.quads.shape[1:])
+    for slot in range(FRAMES_PER_QUARTET):
+        frames = np.flatnonzero(sequence.measured[slot::FRAMES_PER_QUARTET]) * FRAMES_PER_QUARTET + slot
+        if len(frames):
+            change = np.maximum(change, np.ptp(sequence.quads[frames].astype(np.float64), axis=0))
+    amplitude = np.mean([np.hypot(*quartet_phasor(sequence, i)) for i in sequence.complete_quartets], axis=0)
+    relative = change / np.maximum(amplitude, np.finfo(np.float64).tiny)
+    steady = relative <= np.quantile(relative, STATIC_QUANTILE)
+    return steady & (amplitude >= np.quantile(amplitude[steady], BRIGHT_QUANTILE)) & (amplitude > 0)
+
+
+def dc_offset(sequence: Sequence) -> float:
+    """Constant part of the quads as a multiple of their amplitude: mean(Q0 + Q1 + Q2 + Q3) / (4 mean a)."""
+    total = amplitude = 0.0
+    for i in sequence.complete_quartets:
+        frames = slice(FRAMES_PER_QUARTET * i, FRAMES_PER_QUARTET * (i + 1))
+        total += float(sequence.quads[frames].mean(dtype=np.float64))
+        amplitude += float(np.hypot(*quartet_phasor(sequence, i)).mean()) / 2.0
+    return total / amplitude
+
+
+def pairings(sequence: Sequence) -> tuple[int | None, list[float]]:
+    """How well each way of pairing the slots fits: of two opposite pairs both have the same sum.
+
+    Returns:
+        Which of ``PAIRINGS`` the shifts state (None if they have no opposite pairs), and for each the share of steady
+        pixels where its two sums differ least. Reversing a pair, or swapping the pairs, cannot be seen this way.
+    """
+    quartets = [sequence.quads[4 * i : 4 * i + 4].astype(np.float64) for i in sequence.complete_quartets]
+    gaps = np.stack(
+        [np.abs(np.median([q[a] + q[b] - q[c] - q[d] for q in quartets], axis=0)) for (a, b), (c, d) in PAIRINGS]
+    )
+    best = gaps.argmin(axis=0)[steady_pixels(sequence)]
+    shares = [float((best == p).mean()) for p in range(len(PAIRINGS))]
+    first = FRAMES_PER_QUARTET * sequence.complete_quartets[0]
+    shift = sequence.shifts[first : first + FRAMES_PER_QUARTET]
+    opposite = [all(math.cos(shift[a] - shift[b]) < -0.99 for a, b in pairs) for pairs in PAIRINGS]
+    return (opposite.index(True) if any(opposite) else None), shares
+
+
+@dataclass(frozen=True, kw_only=True)
+class PhasorMatch:
+    """How stored phasors relate to those of the quads."""
+
+    correlation: float
+    """Length of the complex correlation over steady pixels, 0..1."""
+    angle: float
+    """Its angle [rad]: 0 if both mean the same phase."""
+    conjugate: float
+    """Length of the correlation with the mirrored phase; near 1 if the sign of the phase is swapped."""
+    factor: float
+    """Stored length / length of the quads' phasor."""
+
+
+def phasor_match(sequence: Sequence, stored: dict[int, np.ndarray]) -> PhasorMatch | None:
+    """Compare stored phasors [H, W, 3], by quartet start, with the quads on steady pixels; None if they never meet."""
+    steady = steady_pixels(sequence)
+    common = [i for i in sequence.complete_quartets if FRAMES_PER_QUARTET * i in stored]
+    if not common:
+        return None
+    ours = np.stack([quartet_phasor(sequence, i)[:, steady] for i in common], axis=1)
+    theirs = np.stack([stored[FRAMES_PER_QUARTET * i][steady, :2].T for i in common], axis=1).astype(np.float64)
+    a, b = ours[0] + 1j * ours[1], theirs[0] + 1j * theirs[1]
+    length_a, length_b = np.sqrt((np.abs(a) ** 2).sum()), np.sqrt((np.abs(b) ** 2).sum())
+    if not length_b > 0:
+        return PhasorMatch(correlation=0.0, angle=0.0, conjugate=0.0, factor=0.0)
+    correlation = np.vdot(a, b) / (length_a * length_b)
+    conjugate = np.vdot(a.conj(), b) / (length_a * length_b)
+    return PhasorMatch(
+        correlation=float(abs(correlation)),
+        angle=float(np.angle(correlation)),
+        conjugate=float(abs(conjugate)),
+        factor=float(length_b / length_a),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class PhaseFit:
+    """Straight line of measured phase against true distance on static pixels."""
+
+    depth_range: float
+    """From the slope [m]."""
+    phase_offset: float
+    """From the intercept [rad], in (-pi, pi]."""
+    rms_m: float
+    """Root mean square of what is left, as a distance [m]."""
+    pixels: int
+    """How many pixels took part."""
+
+
+def phase_fit(sequence: Sequence, truth: Truth) -> PhaseFit | None:
+    """Fit psi = 4 pi d / depth_range + phase_offset to static pixels; None if fewer than a hundred are static."""
+    phases, distances = [], []
+    kappa = 4.0 * math.pi * sequence.f_mod_hz / SPEED_OF_LIGHT
+    for i in sequence.complete_quartets:
+        frames = slice(FRAMES_PER_QUARTET * i, FRAMES_PER_QUARTET * (i + 1))
+        if not truth.known[frames].all():
+            continue
+        distance = truth.distance[frames].astype(np.float64)
+        still = np.isfinite(distance).all(axis=0) & (np.ptp(np.nan_to_num(distance), axis=0) < STILL_M)
+        still &= _flat(distance[0])
+        re, im = quartet_phasor(sequence, i)
+        amplitude = np.hypot(re, im)
+        still &= amplitude >= np.quantile(amplitude, 1.0 - BRIGHT_QUANTILE)
+        phases.append(np.arctan2(im, re)[still])
+        distances.append(distance[0][still])
+    if sum(map(len, phases)) < 100:
+        return None
+    psi, d = np.concatenate(phases), np.concatenate(distances)
+    centre = np.angle(
+        np.exp(1j * (psi - kappa * d)).mean()
+    )  # offset before the line is fitted, so that it unwraps right
+    unwrapped = kappa * d + centre + np.angle(np.exp(1j * (psi - kappa * d - centre)))
+    kept = np.ones(len(d), dtype=bool)
+    for _ in range(3):  # mixed pixels are few and far off
+        slope, offset = np.polyfit(d[kept], unwrapped[kept], 1) if np.ptp(d[kept]) > STILL_M else (kappa, centre)
+        left = np.abs(unwrapped - slope * d - offset)
+        kept = left <= 4.0 * np.median(left) + 1e-9
+    return PhaseFit(
+        depth_range=4.0 * math.pi / float(slope),
+        phase_offset=float(np.angle(np.exp(1j * offset))),
+        rms_m=float(np.sqrt((left[kept] ** 2).mean()) / kappa),
+        pixels=int(kept.sum()),
+    )
+
+
+def flow_match(sequence: Sequence, flow: dict[int, np.ndarray], step: int) -> tuple[float, float, float, float] | None:
+    """Whether flow explains motion: mean |difference| of quads n and n + step where it moves.
+
+    Returns:
+        Unwarped, warped by the flow, warped by the flow with its sign flipped, and with dx and dy swapped, in quad
+        units; None if nothing moves.
+    """
+    sums, count = np.zeros(4), 0
+    for n, image in flow.items():
+        target = n + step
+        if not (0 <= target < sequence.frames and sequence.measured[n] and sequence.measured[target]):
+            continue
+        moving = np.isfinite(image).all(axis=0) & (np.hypot(*np.nan_to_num(image)) > MOVING_PX)
+        known = np.nan_to_num(image)
+        for k, tried in enumerate((np.zeros_like(known), known, -known, known[::-1])):
+            sums[k] += np.abs(warp_back(sequence.quads[target], tried) - sequence.quads[n])[moving].sum()
+        count += int(moving.sum())
+    if not count:
+        return None
+    unwarped, warped, flipped, swapped = (float(value) for value in sums / count)
+    return unwarped, warped, flipped, swapped
+
+
+def _flat(distance: np.ndarray) -> np.ndarray:
+    """Pixels away from depth edges."""
+    edge = np.zeros(distance.shape, dtype=bool)
+    for axis in (0, 1):
+        jump = (
+            np.abs(np.diff(np.nan_to_num(distance), axis=axis, append=np.nan_to_num(distance).take([-1], axis))) > 0.1
+        )
+        for shift in range(-FLAT_GRADIENT, FLAT_GRADIENT + 1):
+            edge |= np.roll(jump, shift, axis)
+    return ~edge

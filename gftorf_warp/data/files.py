@@ -1,0 +1,214 @@
+"""Writing that leaves either the old content or the new one, never half of it.
+
+A file is written under a temporary name in its own folder, flushed to the disk, and renamed; a folder of many files is
+filled under a temporary name beside its target and renamed as a whole. Temporary names are ``.NAME.tmp-PID-COUNT``, so
+that what a killed process left can be told from what a living one is writing, and swept.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import itertools
+import json
+import os
+import re
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import GftorfError, ResourceError, UsageError
+
+_COUNT = itertools.count()
+_NO_SPACE = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
+
+
+def atomic_write(path: str | Path, data: bytes) -> None:
+    """Replace the content of a file, all at once.
+
+    Args:
+        path: The file; its folder must exist.
+        data: The whole new content.
+
+    Raises:
+        ResourceError: If the disk is full.
+        UsageError: If the place cannot be written to.
+    """
+    with atomic_path(path) as temporary:
+        write_through(temporary, data)
+
+
+@contextlib.contextmanager
+def atomic_path(path: str | Path) -> Iterator[Path]:
+    """Let a library write a file that replaces ``path`` only when it is complete.
+
+    Yields a temporary name in the same folder. At a normal end that file is flushed and renamed to ``path``; at an
+    exception it is removed and the old content stays.
+
+    Args:
+        path: The file; its folder must exist.
+
+    Raises:
+        ResourceError: If the disk is full.
+        UsageError: If the place cannot be written to.
+    """
+    path = Path(path)
+    sweep(path)
+    temporary = _temporary(path)
+    with _as_errors(path):
+        try:
+            yield temporary
+            with open(temporary, "rb+") as file:
+                os.fsync(file.fileno())
+            os.replace(temporary, path)
+        except BaseException:
+            temporary.unlink(missing_ok=True)
+            raise
+        flush_folder(path.parent)
+
+
+def write_json(path: str | Path, content: object) -> None:
+    """Write an object as JSON, atomically.
+
+    Args:
+        path: The file; its folder must exist.
+        content: What ``json`` can hold; numpy numbers and arrays and paths are converted.
+
+    Raises:
+        ValueError: If it holds NaN or infinity, which JSON cannot express: use None.
+    """
+    atomic_write(path, (json.dumps(content, indent=2, allow_nan=False, default=_plain) + "\n").encode())
+
+
+@contextlib.contextmanager
+def atomic_folder(path: str | Path) -> Iterator[Path]:
+    """Fill a folder that appears under its name only when it is complete.
+
+    Yields a temporary folder beside the target, in which the caller writes. At a normal end everything in it is flushed
+    and the folder is renamed to ``path``; at an exception it is removed and nothing remains.
+
+    Args:
+        path: The folder to create; missing parents are created, an existing one must be empty.
+
+    Raises:
+        UsageError: If the target exists and is not an empty folder, or the place cannot be written to.
+        ResourceError: If the disk is full.
+    """
+    path = Path(path)
+    with _as_errors(path):
+        if path.is_symlink() or (path.exists() and not path.is_dir()):
+            raise UsageError(
+                "not a folder",
+                where=path,
+                why="expected a new or empty folder to write to, found something else",
+                fix="choose another path",
+            )
+        if path.is_dir() and any(path.iterdir()):
+            raise UsageError(
+                "folder is not empty",
+                where=path,
+                why=f"expected a new or empty folder to write to, found {len(list(path.iterdir()))} entries",
+                fix="choose another path, or remove the folder first",
+            )
+        made = [parent for parent in reversed(path.absolute().parents) if not parent.exists()]
+        path.parent.mkdir(parents=True, exist_ok=True)
+        sweep(path)
+        temporary = _temporary(path)
+        try:
+            temporary.mkdir()
+            yield temporary
+            for folder, _, _ in os.walk(temporary, topdown=False):
+                flush_folder(folder)
+            if path.exists():
+                path.rmdir()  # it is empty; Windows cannot rename over it
+            os.rename(temporary, path)
+        except BaseException:
+            shutil.rmtree(temporary, ignore_errors=True)
+            for parent in reversed(made):
+                with contextlib.suppress(OSError):
+                    parent.rmdir()
+            raise
+        flush_folder(path.parent)
+
+
+def write_through(path: Path, data: bytes) -> None:
+    """Create a file, flush it to the disk and check its size.
+
+    Raises:
+        OSError: If it exists, or could not be written in full.
+    """
+    with open(path, "xb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+    if path.stat().st_size != len(data):
+        raise OSError(errno.ENOSPC, f"{path.stat().st_size} of {len(data)} bytes were written", str(path))
+
+
+def flush_folder(path: str | Path) -> None:
+    """Flush the names in a folder to the disk, where the system can."""
+    if os.name == "nt":
+        return
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def sweep(path: str | Path) -> None:
+    """Remove what killed processes left of earlier attempts to write ``path``; living ones keep theirs."""
+    path = Path(path)
+    pattern = re.compile(rf"\.{re.escape(path.name)}\.tmp-(\d+)-\d+")
+    with contextlib.suppress(OSError):  # another process may sweep at the same time
+        for entry in path.absolute().parent.iterdir():
+            match = pattern.fullmatch(entry.name)
+            if match and not _alive(int(match[1])):
+                if entry.is_dir():
+                    shutil.rmtree(entry, ignore_errors=True)
+                else:
+                    entry.unlink(missing_ok=True)
+
+
+def _temporary(path: Path) -> Path:
+    return path.absolute().parent / f".{path.name}.tmp-{os.getpid()}-{next(_COUNT)}"
+
+
+def _alive(pid: int) -> bool:
+    """Whether a process runs; where the system cannot say, yes."""
+    if os.name == "nt" or pid <= 0:
+        return True  # on Windows os.kill would end the process instead of asking
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except (PermissionError, OverflowError):
+        return True
+    return True
+
+
+@contextlib.contextmanager
+def _as_errors(path: Path) -> Iterator[None]:
+    """Turn what the system says about writing into errors a user can act on."""
+    try:
+        yield
+    except GftorfError:
+        raise
+    except OSError as error:
+        if error.errno in _NO_SPACE:
+            raise ResourceError(
+                "no space left", where=path, why=str(error), fix="free disk space, or write to another disk"
+            ) from error
+        raise UsageError("cannot write", where=path, why=str(error), fix="choose a place you may write to") from error
+
+
+def _plain(value: object) -> object:
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    if isinstance(value, Path):
+        return str(value)
+    raise TypeError(f"JSON cannot hold {type(value).__name__}: {value!r}")

@@ -1,0 +1,105 @@
+"""Pictures on disk: float32 OpenEXR for numbers, PNG for eyes. Every file is read back or checked before it counts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import InputError, ResourceError
+from .arrays import SIDE_MAX
+from .files import atomic_path, atomic_write
+
+CHANNELS_MAX = 256  # a rendering has a few dozen; a forged header may claim millions
+
+
+def write_exr(path: str | Path, channels: Mapping[str, np.ndarray]) -> None:
+    """Write named float32 images of one size as an OpenEXR file, losslessly compressed, atomically.
+
+    Args:
+        path: The file; its folder must exist.
+        channels: Images [H, W] by name, for example ``{"distance": ..., "quads.0": ...}``; any real type that float32
+            holds. Viewers show the names R, G, B as colour. NaN is kept.
+
+    Raises:
+        ValueError: If there are no channels, or their shapes differ or are not [H, W].
+        UsageError, ResourceError: If the file cannot be written.
+    """
+    import OpenEXR
+
+    # a slice, a flip or Fortran order is written with wrong pixels and no error
+    images = {name: np.ascontiguousarray(image, dtype=np.float32) for name, image in channels.items()}
+    shapes = {image.shape for image in images.values()}
+    if len(shapes) != 1 or len(next(iter(shapes))) != 2:
+        found = ", ".join(f"{name} {image.shape}" for name, image in images.items()) or "none"
+        raise ValueError(f"channels must be images [H, W] of one shape, got {found}")
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    with atomic_path(path) as temporary:
+        with OpenEXR.File(header, images) as file:
+            file.write(str(temporary))
+        back = read_exr(temporary)
+        if back.keys() != images.keys() or any(back[n].tobytes() != image.tobytes() for n, image in images.items()):
+            raise ResourceError(
+                "picture damaged while writing",
+                where=path,
+                why="reading it back gave other pixels",
+                fix="check the disk",
+            )
+
+
+def read_exr(path: str | Path) -> dict[str, np.ndarray]:
+    """Read the images [H, W] of a single-part OpenEXR file by channel name.
+
+    Raises:
+        InputError: If it is missing, damaged, truncated, too large, or has subsampled channels.
+    """
+    import OpenEXR
+
+    path = Path(path)
+    if not path.is_file():
+        raise InputError("no such picture", where=path, why="expected an OpenEXR file", fix="check the path")
+    try:
+        with OpenEXR.File(str(path), separate_channels=True, header_only=True) as file:
+            header = file.header()
+            low, high = header["dataWindow"]
+            width, height = (int(b) - int(a) + 1 for a, b in zip(low, high, strict=True))
+            parts, names = len(file.parts), {channel.name for channel in header["channels"]}
+            sampled = any(channel.xSampling != 1 or channel.ySampling != 1 for channel in header["channels"])
+        if not (1 <= width <= SIDE_MAX and 1 <= height <= SIDE_MAX and parts == 1 and len(names) <= CHANNELS_MAX):
+            raise ValueError(f"{parts} parts of {width}x{height} with {len(names)} channels")
+        if sampled:
+            raise ValueError("subsampled channels")
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            images = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
+        if images.keys() != names or any(image.shape != (height, width) for image in images.values()):
+            raise ValueError(f"{len(images)} of {len(names)} channels could be read")
+    except Exception as error:  # the library turns whatever it meets into whatever it likes
+        raise InputError(
+            "unreadable picture",
+            where=path,
+            why=f"expected one whole OpenEXR part of at most {SIDE_MAX}x{SIDE_MAX}, found {error}",
+            fix="copy or export the file again",
+        ) from error
+    return images
+
+
+def write_png(path: str | Path, rgb: np.ndarray) -> None:
+    """Write an 8-bit colour image as PNG, atomically.
+
+    Args:
+        path: The file; its folder must exist.
+        rgb: Image [H, W, 3], uint8, red first.
+
+    Raises:
+        ValueError: If it is another type or shape.
+        UsageError, ResourceError: If the file cannot be written.
+    """
+    import cv2
+
+    if rgb.dtype != np.uint8 or rgb.ndim != 3 or rgb.shape[2] != 3:
+        raise ValueError(f"rgb {rgb.dtype} {rgb.shape} must be uint8 [H, W, 3]")
+    done, data = cv2.imencode(".png", np.ascontiguousarray(rgb[..., ::-1]))  # OpenCV keeps blue first
+    if not done:
+        raise ValueError(f"rgb {rgb.shape} could not be encoded")
+    atomic_write(path, data.tobytes())  # cv2.imwrite would not notice a full disk

@@ -1,0 +1,50 @@
+"""Collecting what is wrong with a folder, so that one pass names all of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import ParamSpec, TypeVar
+
+from ..errors import InputError
+
+SHOWN = 20  # one broken export repeats itself in every file
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+class Problems:
+    """A list of input errors that is raised at the end, as one."""
+
+    def __init__(self) -> None:
+        self.errors: list[InputError] = []
+
+    def attempt(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T | None:
+        """Call a function; an input error is kept and None returned."""
+        try:
+            return function(*args, **kwargs)
+        except InputError as error:
+            self.errors.append(error)
+            return None
+
+    def raise_if_any(self, where: object) -> None:
+        """Raise the only error as it is, or several as one that lists them.
+
+        Args:
+            where: The folder they were found in.
+
+        Raises:
+            InputError: If anything was collected.
+        """
+        if not self.errors:
+            return
+        if len(self.errors) == 1:
+            raise self.errors[0]
+        lines = [f"{error.where}: {error.what}: {error.why}" for error in self.errors[:SHOWN]]
+        if len(self.errors) > SHOWN:
+            lines.append(f"and {len(self.errors) - SHOWN} more")
+        raise InputError(
+            f"{len(self.errors)} problems",
+            where=where,
+            why="\n       ".join(lines),
+            fix="\n       ".join(dict.fromkeys(error.fix for error in self.errors)),
+        )

@@ -1,0 +1,71 @@
+"""The description of a format in data_specs/, as values: what readers check against and writers follow."""
+
+from __future__ import annotations
+
+import functools
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+INSTALLED = Path(__file__).parent / "specs"  # an installed package carries a copy, see pyproject.toml
+CHECKED_OUT = Path(__file__).parents[2] / "data_specs"
+
+Size = int | str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Field:
+    """One field of a format; the comments on top of data_specs/ftorf.toml explain each entry."""
+
+    name: str
+    """What errors and reports call it."""
+    paths: tuple[str, ...]
+    """Where it lies in the folder, best first, with {slot} and {id} open."""
+    kind: str
+    """array, choice or other."""
+    role: str
+    """measurement, calibration, truth, check or unused."""
+    unit: str
+    """Unit of the stored numbers."""
+    meaning: str
+    """What it is, in sentences."""
+    written: str
+    """What our writer stores."""
+    required: bool
+    """Whether a folder without it is no sequence."""
+    fills: tuple[str, ...] = ()
+    """Fields of Sequence or Truth that it becomes."""
+    shapes: tuple[tuple[Size, ...], ...] = ()
+    """Allowed shapes, numbers or letters; () is any array of one number."""
+    dtypes: str = ""
+    """Allowed numpy kinds."""
+    nan: str = "error"
+    """error or unknown: what a NaN means."""
+    default: float | tuple[int, ...] | None = None
+    """The value where the file is missing."""
+    mat_key: str | None = None
+    """The one variable that is read from a .mat file."""
+    key: str = ""
+    """The one key of a choice."""
+    choices: tuple[str, ...] = ()
+    """Its allowed values."""
+
+
+@functools.cache
+def fields(name: str) -> dict[str, Field]:
+    """Fields of a format by name, in the order of its file.
+
+    Args:
+        name: Name of a file in data_specs/ without its ending, for example ``ftorf``.
+    """
+    folder = INSTALLED if INSTALLED.is_dir() else CHECKED_OUT
+    content = tomllib.loads((folder / f"{name}.toml").read_text(encoding="utf-8"))
+    return {entry["name"]: Field(**{key: _frozen(value) for key, value in entry.items()}) for entry in content["field"]}
+
+
+def _frozen(value: Any) -> Any:
+    """Lists as tuples, all the way down; text without the line breaks of its file."""
+    if isinstance(value, list):
+        return tuple(_frozen(item) for item in value)
+    return " ".join(value.split()) if isinstance(value, str) else value
