@@ -16,7 +16,7 @@ import warp as wp
 
 from ..constants import ALPHA_MAX, ALPHA_MIN
 from .composite import LAST, SUM_ZETA, SUM_ZETA2, TRANSMITTANCE, make_pixels, options
-from .lanes import make_lanes, sums_of, warp_any, warp_max
+from .lanes import make_lanes, sums_of, types_of, warp_any, warp_max
 from .splat import Splat, load_splat, row_missed, row_offset
 
 # planes of ``grad_sums``, each [tiles, lanes] of V: gradients of the first five planes of the forward pass, and of T_e
@@ -24,38 +24,82 @@ GRAD_TRANSMITTANCE = 5
 GRAD_LIGHT_PLANES = 6
 
 
-def _add_record(K: int, light: bool, channels: bool) -> str:
-    """C++ that adds the gradient of one splat from the K pixels of a thread, or of a warp on CUDA, to its record.
+def _add_moments(K: int, light: bool, channels: bool) -> str:
+    """C++ that adds what the K pixels of a thread, or of a warp on CUDA, say about one splat to its record.
 
-    m0, m1, m2 are the sums of dL/dpower / opacity times 1, dx, dx^2. dy is the same for all pixels of a thread, so these
-    moments give all six derivatives of the ellipse. On CUDA 16 values of 32 lanes are summed in 16 shuffles: each step
-    halves the values a lane carries and doubles the lanes it stands for; then 16 lanes add one 64-byte line.
+    dy is the same for all pixels of a thread, so the sums of v times 1, dx, dx^2 give all six moments. On the CPU one
+    permutation and one product bring the sums into the order of the record. On CUDA 16 values of 32 lanes are summed in
+    16 shuffles, each of which halves the values a lane carries; then 16 lanes add one 64-byte line.
     """
-    vectors = ["m0", "m1", "m2", "count"]
-    slots = dict.fromkeys(range(16), "0.0f")
-    slots |= {0: "-A * gx - B * gy", 1: "-C * gy - B * gx", 2: "-0.5f * o * s[2]", 3: "-dy * gx"}
-    slots |= {4: "-0.5f * dy * gy", 5: "s[0]", 6: "s[3]"}
-    wanted = {8: "c0", 9: "c1", 10: "c2"} if channels else {}
-    wanted |= {11: "p0", 12: "p1", 13: "p2", 14: "dist", 15: "z"} if light else {}
-    for slot, name in wanted.items():
-        slots[slot] = f"s[{len(vectors)}]"
-        vectors.append(name)
-    return f"""{sums_of(K, vectors)}
-    const float gx = o * s[1], gy = o * s[0] * dy;
-    float v[16] = {{{", ".join(slots[slot] for slot in range(16))}}};
+    names = ["v", "dx", "alpha", "w", "w2", "g0", "g1", "g2", "g_re", "g_im", "g_amplitude", "g_distance", "g_zeta"]
+    loads = " ".join(f"const F {name}_ = load({name});" for name in names)
+    values = {"v": "v_", "v dx": "v_ * dx_", "v dx2": "v_ * dx_ * dx_"}
+    values["count"] = "alpha_ > 0.0f ? (F)(1.0f) : (F)(0.0f)"
+    if channels:
+        values |= {"c0": "w_ * g0_", "c1": "w_ * g1_", "c2": "w_ * g2_"}
+    if light:
+        values |= {"re": "w2_ * g_re_", "im": "w2_ * g_im_", "amplitude": "w2_ * g_amplitude_"}
+        values |= {"distance": "w_ * g_distance_", "zeta": "w_ * g_zeta_"}
+    slots = ["v dx", "v", "v dx2", "v dx", "v", "v", "count", "", "c0", "c1", "c2", "re", "im", "amplitude", "distance"]
+    slots.append("zeta")
+    sums, lanes = sums_of(K, values)
+    if K == 1:
+        factor = {1: "dy", 3: "dy", 4: "dy * dy"}
+        entries = [
+            f"s[{lanes.index(of)}] * ({factor.get(n, '1.0f')})" if of in lanes else "0.0f" for n, of in enumerate(slots)
+        ]
+        return f"""{types_of(K)}
+    {loads}
+    {sums}
+    float record[16] = {{{", ".join(entries)}}};
 #if defined(__CUDA_ARCH__)
     const unsigned lane = threadIdx.x & 31u;
     #define FOLD(BIT, HALF) {{ const bool up = (lane >> BIT) & 1u; _Pragma("unroll") for (int j = 0; j < HALF; ++j) {{ \\
-        const float send = up ? v[j] : v[j + HALF], keep = up ? v[j + HALF] : v[j]; \\
-        v[j] = keep + __shfl_xor_sync(0xffffffffu, send, 1 << BIT); }} }}
+        const float send = up ? record[j] : record[j + HALF], keep = up ? record[j + HALF] : record[j]; \\
+        record[j] = keep + __shfl_xor_sync(0xffffffffu, send, 1 << BIT); }} }}
     FOLD(4, 8) FOLD(3, 4) FOLD(2, 2) FOLD(1, 1)
     #undef FOLD
-    v[0] += __shfl_xor_sync(0xffffffffu, v[0], 1);
-    if (!(lane & 1u)) atomicAdd(reinterpret_cast<float*>(grads.data + i) + (lane >> 1), v[0]);
+    record[0] += __shfl_xor_sync(0xffffffffu, record[0], 1);
+    if (!(lane & 1u)) atomicAdd(reinterpret_cast<float*>(grads.data + i) + (lane >> 1), record[0]);
 #else
-    for (int j = 0; j < 16; ++j) grads.data[i].c[j] += v[j];  // not atomic: every CPU thread has its own records
+    for (int j = 0; j < 16; ++j) grads.data[i].c[j] += record[j];
 #endif
 """
+    order = ", ".join(str(lanes.index(of)) if of in lanes and of else "16" for of in slots)  # 16: a zero
+    once, twice = [", ".join("1.0f" if n in where else "0.0f" for n in range(16)) for where in ((1, 3), (4,))]
+    rest = ", ".join("0.0f" if n in (1, 3, 4) else "1.0f" for n in range(16))
+    return f"""{types_of(K)}
+    {loads}
+    {sums}
+    const F once = {{{once}}}, twice = {{{twice}}}, rest = {{{rest}}};
+    F record;  // not atomic: every CPU thread has records of its own
+    __builtin_memcpy(&record, &grads.data[i], sizeof(record));
+    record += __builtin_shufflevector(total, (F)(0.0f), {order}) * (once * dy + (twice * (dy * dy) + rest));
+    __builtin_memcpy(&grads.data[i], &record, sizeof(record));
+"""
+
+
+@wp.kernel(enable_backward=False)
+def finish_moments(
+    # In:
+    splats: wp.array[Splat],  # [N] records, see splat.py
+    # Out:
+    grad_splats: wp.array[Splat],  # [N] moments in slots 0-5, replaced by gradients of the same slots
+):
+    """One thread per splat: with v = dL/dpower, moments of v to gradients of centre, conic and opacity."""
+    n = wp.tid()
+    q = splats[n]
+    g = grad_splats[n]
+    if g[6] > 0.0:  # a record that no pixel reached is zero, and its splat may be undefined
+        x = g[0]
+        y = g[1]
+        g[0] = -q[2] * x - q[3] * y
+        g[1] = -q[4] * y - q[3] * x
+        g[2] = -0.5 * g[2]
+        g[3] = -g[3]
+        g[4] = -0.5 * g[4]
+        g[5] = g[5] / q[5]
+        grad_splats[n] = g
 
 
 @functools.cache
@@ -72,15 +116,14 @@ def make_composite_backward(K: int, tile_width: int, tile_height: int, light: bo
     """
     ops, pixels = make_lanes(K), make_pixels(K, tile_width, tile_height)
     V, fill, affine, mul, axpy, fma, fnma = ops.V, ops.fill, ops.affine, ops.mul, ops.axpy, ops.fma, ops.fnma
-    above, keep_between, inverse = ops.above, ops.keep_between, ops.inverse
+    above, add, keep_below, inverse, at_least = ops.above, ops.add, ops.keep_below, ops.inverse, ops.at_least
     response, alpha_of, nonzero, largest_of = ops.response, ops.alpha_of, ops.nonzero, ops.largest_of
     pixel_x, pixel_y = pixels.pixel_x, pixels.pixel_y
-    clamped_from = 2.0 if clamp_passes else ALPHA_MAX
 
-    @wp.func_native(_add_record(K, light, channels))
-    def add_gradient(
-        grads: wp.array[Splat], i: int, A: float, B: float, C: float, o: float, dy: float,
-        m0: V, m1: V, m2: V, count: V, c0: V, c1: V, c2: V, p0: V, p1: V, p2: V, dist: V, z: V,
+    @wp.func_native(_add_moments(K, light, channels))
+    def add_moments(
+        grads: wp.array[Splat], i: int, dy: float, v: V, dx: V, alpha: V, w: V, w2: V,
+        g0: V, g1: V, g2: V, g_re: V, g_im: V, g_amplitude: V, g_distance: V, g_zeta: V,
     ): ...  # fmt: skip
 
     @wp.kernel(**options(K))
@@ -95,7 +138,7 @@ def make_composite_backward(K: int, tile_width: int, tile_height: int, light: bo
         grad_sums: wp.array3d[V],  # [6, tiles, lanes] gradients of RE .. DISTORTION and of T_e
         grad_channel: wp.array3d[V],  # [3, tiles, lanes] gradients of the three channels
         # Out:
-        grad_splats: wp.array[Splat],  # [N] added to; slot 6 counts pixels
+        grad_splats: wp.array[Splat],  # [N] added to: moments in slots 0-5, pixels in slot 6, gradients in 8-15
     ):
         """One thread per K pixels of a row; visits exactly the contributors of the forward pass, last one first."""
         t, lane = wp.tid()
@@ -106,6 +149,15 @@ def make_composite_backward(K: int, tile_width: int, tile_height: int, light: bo
         T = sums[wp.static(TRANSMITTANCE), tile, lane]
         zero = fill(0.0)
         E = fill(0.0)
+        if wp.static(not channels):
+            g0 = zero
+            g1 = zero
+            g2 = zero
+        if wp.static(not light):
+            g_re = zero
+            g_im = zero
+            g_amplitude = zero
+            g_distance = zero
         if wp.static(light):
             g_re = grad_sums[0, tile, lane]
             g_im = grad_sums[1, tile, lane]
@@ -136,7 +188,7 @@ def make_composite_backward(K: int, tile_width: int, tile_height: int, light: bo
             dx = affine(x, -1.0, q[0])
             g = response(dx, -0.5 * q[2], q[3] * dy, 0.5 * q[4] * dy * dy, -0.5 * q[6])
             alpha = alpha_of(g, gate, q[5], ALPHA_MAX, ALPHA_MIN)
-            if not warp_any(nonzero(alpha)):  # uniform: all lanes of a warp reach `add_gradient`, or none
+            if not warp_any(nonzero(alpha)):  # uniform: all lanes of a warp reach `add_moments`, or none
                 continue
             restored = inverse(affine(alpha, -1.0, 1.0))
             T = mul(T, restored)
@@ -144,32 +196,25 @@ def make_composite_backward(K: int, tile_width: int, tile_height: int, light: bo
             tau = zero
             if wp.static(channels):
                 tau = axpy(axpy(affine(g0, q[8], 0.0), g1, q[9]), g2, q[10])
+            sigma_T = zero
+            g_zeta = zero
+            w2 = zero
             if wp.static(light):
                 zeta = q[15] - zeta0
                 spread = axpy(affine(weight, zeta, 0.0), sum_zeta, -1.0)  # zeta A - M
                 tau = axpy(tau, g_distance, q[14])
                 tau = fma(tau, g_distortion, axpy(axpy(sum_zeta2, sum_zeta, -zeta), spread, zeta))
-                sigma = axpy(axpy(affine(g_re, q[11], 0.0), g_im, q[12]), g_amplitude, q[13])
-                sigma_T = mul(sigma, T)
-                grad_alpha = fnma(mul(T, axpy(tau, sigma_T, 1.0)), E, restored)
-                E = fma(E, w, axpy(tau, sigma_T, 2.0))
-            else:
-                grad_alpha = fnma(mul(T, tau), E, restored)
-                E = fma(E, w, tau)
-            m0 = mul(g, keep_between(grad_alpha, alpha, wp.static(clamped_from)))
-            m1 = mul(m0, dx)
-            if wp.static(light and channels):
+                sigma_T = mul(axpy(axpy(affine(g_re, q[11], 0.0), g_im, q[12]), g_amplitude, q[13]), T)
+                g_zeta = affine(mul(g_distortion, spread), 2.0, 0.0)
                 w2 = mul(w, T)
-                add_gradient(grad_splats, i, q[2], q[3], q[4], q[5], dy, m0, m1, mul(m1, dx), above(alpha, 0.0),
-                             mul(w, g0), mul(w, g1), mul(w, g2), mul(w2, g_re), mul(w2, g_im), mul(w2, g_amplitude),
-                             mul(w, g_distance), mul(affine(w, 2.0, 0.0), mul(g_distortion, spread)))  # fmt: skip
-            elif wp.static(light):
-                w2 = mul(w, T)
-                add_gradient(grad_splats, i, q[2], q[3], q[4], q[5], dy, m0, m1, mul(m1, dx), above(alpha, 0.0),
-                             zero, zero, zero, mul(w2, g_re), mul(w2, g_im), mul(w2, g_amplitude),
-                             mul(w, g_distance), mul(affine(w, 2.0, 0.0), mul(g_distortion, spread)))  # fmt: skip
+            tau = add(tau, sigma_T)
+            v = fnma(mul(w, tau), E, mul(alpha, restored))  # alpha dL/dalpha
+            E = fma(E, w, add(tau, sigma_T))
+            if wp.static(clamp_passes):
+                v = fma(zero, v, mul(affine(g, q[5], 0.0), inverse(at_least(alpha, ALPHA_MIN))))  # o G / alpha
             else:
-                add_gradient(grad_splats, i, q[2], q[3], q[4], q[5], dy, m0, m1, mul(m1, dx), above(alpha, 0.0),
-                             mul(w, g0), mul(w, g1), mul(w, g2), zero, zero, zero, zero, zero)  # fmt: skip
+                v = keep_below(v, alpha, ALPHA_MAX)
+            add_moments(grad_splats, i, dy, v, dx, alpha, w, w2, g0, g1, g2, g_re, g_im, g_amplitude, g_distance,
+                        g_zeta)  # fmt: skip
 
     return composite_backward

@@ -10,22 +10,35 @@ from types import SimpleNamespace
 
 import warp as wp
 
-# e^x for x <= 0. libm would be called once per lane (3.6 times slower in the forward pass): 2^n times a minimax
-# polynomial of 2^f with f in [-1/2, 1/2], relative error 2.4e-7.
+# e^x for -87 < x <= 0 without libm, which would be called once per lane (3.6 times slower in the forward pass): 2^n times
+# a minimax polynomial of 2^f with f in [-1/2, 1/2], relative error 2.4e-7. Adding 1.5 * 2^23 rounds to an integer and
+# leaves it in the low bits, from where a shift takes it to the exponent.
 _EXP = """
-#if defined(__CUDA_ARCH__)
-    auto exp_ = [](F x) -> F { return __expf(x); };
-#else
     auto exp_ = [](F x) -> F {
-        const F y = __builtin_elementwise_max(x, (F)(-87.0f)) * 1.44269504f;
-        const F n = __builtin_elementwise_floor(y + 0.5f), f = y - n;
+        const F y = x * 1.44269504f, shifted = y + 12582912.0f, f = y - (shifted - 12582912.0f);
         F p = f * 1.327647199e-3f + 9.675541334e-3f;
         p = p * f + 5.550713273e-2f;
         p = p * f + 2.402211972e-1f;
         p = p * f + 6.931469671e-1f;
         p = p * f + 1.0f;
-        return p * (F)((__builtin_convertvector(n, I) + 127) << 23);
+        I bits, n;
+        __builtin_memcpy(&bits, &p, sizeof(p));
+        __builtin_memcpy(&n, &shifted, sizeof(p));
+        bits += n << 23;
+        __builtin_memcpy(&p, &bits, sizeof(p));
+        return p;
     };
+"""
+
+# 1 / x by the processor's 14-bit estimate and one Newton step, 2 ulp; a 16-lane division takes four times as long
+_INVERSE = """
+#if defined(__AVX512F__)
+    auto inverse_ = [](F x) -> F {
+        F r = (F)__builtin_ia32_rcp14ps512_mask(x, (F)(0.0f), (unsigned short)-1);
+        return r * (2.0f - x * r);
+    };
+#else
+    auto inverse_ = [](F x) -> F { return 1.0f / x; };
 #endif
 """
 
@@ -53,16 +66,15 @@ def warp_max(x: int) -> int: ...
 
 
 def types_of(K: int) -> str:
-    """C++ that defines ``F``, what an operation works on, and on the CPU ``load``, a Warp vector as an ``F``."""
-    return f"""
-#if defined(__CUDA_ARCH__)
+    """C++ that defines ``F``, what an operation works on, and ``load``, a Warp vector as an ``F``."""
+    if K == 1:
+        return """
     typedef float F;
-#else
+    auto load = [](const wp::vec_t<1, float>& v) -> F { return v[0]; };"""
+    return f"""
     typedef float F __attribute__((ext_vector_type({K})));
     typedef int I __attribute__((ext_vector_type({K})));
-    auto load = [](const wp::vec_t<{K}, float>& v) -> F {{ F x; __builtin_memcpy(&x, &v, sizeof(x)); return x; }};
-#endif
-"""
+    auto load = [](const wp::vec_t<{K}, float>& v) -> F {{ F x; __builtin_memcpy(&x, &v, sizeof(x)); return x; }};"""
 
 
 def _elementwise(K: int, vectors: str, expression: str, prelude: str = "") -> str:
@@ -71,28 +83,18 @@ def _elementwise(K: int, vectors: str, expression: str, prelude: str = "") -> st
     body = expression if "return" in expression else f"return {expression};"
     return f"""{types_of(K)}{prelude}
     auto op = [&]({", ".join("F " + v for v in names)}) -> F {{ {body} }};
-    wp::vec_t<{K}, float> result;
-#if defined(__CUDA_ARCH__)
-    for (int lane = 0; lane < {K}; ++lane) result[lane] = op({", ".join(v + "[lane]" for v in names)});
-#else
     const F value = op({", ".join(f"load({v})" for v in names)});
+    wp::vec_t<{K}, float> result;
     __builtin_memcpy(&result, &value, sizeof(value));
-#endif
     return result;
 """
 
 
-def _reduction(K: int, cpu: str, start: str, step: str) -> str:
-    """C++ body of a reduction of ``a`` to a scalar: ``cpu`` on the vector ``v``, or ``step`` over lanes into ``s``."""
+def _reduction(K: int, scalar: str, vector: str) -> str:
+    """C++ body of a reduction of ``a``: of its only value ``v``, or of the clang vector ``v``."""
     return f"""{types_of(K)}
-#if defined(__CUDA_ARCH__)
-    auto s = {start};
-    for (int lane = 0; lane < {K}; ++lane) {{ {step} }}
-    return s;
-#else
     const F v = load(a);
-    {cpu}
-#endif
+    {scalar if K == 1 else vector}
 """
 
 
@@ -102,8 +104,8 @@ def make_lanes(K: int) -> SimpleNamespace:
 
     Plain Warp arithmetic on 16-vectors is right too, but keeps LLVM busy for a minute and runs slower.
     """
-    if K < 1 or K & (K - 1):
-        raise ValueError(f"K must be a power of two, got {K}")
+    if K not in (1, 16):
+        raise ValueError(f"K must be 1 (CUDA) or 16 (CPU), got {K}")
     V = wp.types.vector(length=K, dtype=wp.float32)
 
     @wp.func_native(_elementwise(K, "", "(F)(x)"))
@@ -114,30 +116,32 @@ def make_lanes(K: int) -> SimpleNamespace:
     def affine(a: V, s: float, t: float) -> V: ...
     @wp.func_native(_elementwise(K, "a b", "a * b"))
     def mul(a: V, b: V) -> V: ...
+    @wp.func_native(_elementwise(K, "a b", "a + b"))
+    def add(a: V, b: V) -> V: ...
+    @wp.func_native(_elementwise(K, "a", "a < x ? (F)(x) : a"))
+    def at_least(a: V, x: float) -> V: ...
     @wp.func_native(_elementwise(K, "a b", "a + b * s"))
     def axpy(a: V, b: V, s: float) -> V: ...
     @wp.func_native(_elementwise(K, "a b c", "a + b * c"))
     def fma(a: V, b: V, c: V) -> V: ...
     @wp.func_native(_elementwise(K, "a b c", "a - b * c"))
     def fnma(a: V, b: V, c: V) -> V: ...
-    @wp.func_native(_elementwise(K, "a", "1.0f / a"))
+    @wp.func_native(_elementwise(K, "a", "1.0f / a" if K == 1 else "inverse_(a)", "" if K == 1 else _INVERSE))
     def inverse(a: V) -> V: ...
     @wp.func_native(_elementwise(K, "a", "a > x ? (F)(1.0f) : (F)(0.0f)"))
     def above(a: V, x: float) -> V: ...
     @wp.func_native(_elementwise(K, "a b", "b < x ? (F)(0.0f) : a"))
     def drop_below(a: V, b: V, x: float) -> V: ...
-    @wp.func_native(_elementwise(K, "a mask", "mask > 0.0f ? a : (F)(0.0f)"))
-    def keep_where(a: V, mask: V) -> V: ...
-    @wp.func_native(_elementwise(K, "a mask", "((mask > 0.0f) & (mask < x)) ? a : (F)(0.0f)"))
-    def keep_between(a: V, mask: V, x: float) -> V: ...
+    @wp.func_native(_elementwise(K, "a b", "b < x ? a : (F)(0.0f)"))
+    def keep_below(a: V, b: V, x: float) -> V: ...
     @wp.func_native(_elementwise(K, "a mask", "mask > 0.0f ? (F)(x) : a"))
     def set_where(a: V, mask: V, x: float) -> V: ...
-    @wp.func_native(  # exp(power) with power = half_a dx^2 - b_dy dx - c_dy; 0 where power is below ``low`` or above 0
+    @wp.func_native(  # exp(power) with power = half_a dx^2 - b_dy dx - c_dy, 0 where power is below ``low``
         _elementwise(
             K,
             "dx",
-            "const F p = half_a * dx * dx - b_dy * dx - c_dy; return ((p >= low) & (p <= 0.0f)) ? exp_(p) : (F)(0.0f);",
-            _EXP,
+            "const F p = half_a * dx * dx - b_dy * dx - c_dy; return p >= low ? exp_(p) : (F)(0.0f);",
+            "auto exp_ = [](F x) -> F { return expf(x); };" if K == 1 else _EXP,
         )
     )
     def response(dx: V, half_a: float, b_dy: float, c_dy: float, low: float) -> V: ...
@@ -145,49 +149,61 @@ def make_lanes(K: int) -> SimpleNamespace:
         _elementwise(
             K,
             "g gate",
-            "const F x = o * g, a = (x < largest ? x : (F)(largest)) * gate; return a >= smallest ? a : (F)(0.0f);",
+            "const F x = o * g, a = x < largest ? x : (F)(largest);"
+            " return gate > 0.0f ? (a >= smallest ? a : (F)(0.0f)) : (F)(0.0f);",
         )
     )
     def alpha_of(g: V, gate: V, o: float, largest: float, smallest: float) -> V: ...
-    @wp.func_native(_reduction(K, "return __builtin_reduce_or((I)v) != 0;", "false", "s |= a[lane] != 0.0f;"))
+    @wp.func_native(_reduction(K, "return v != 0.0f;", "return __builtin_reduce_or((I)v) != 0;"))
     def nonzero(a: V) -> bool: ...
-    @wp.func_native(_reduction(K, "return __builtin_reduce_max(v);", "a[0]", "s = a[lane] > s ? a[lane] : s;"))
+    @wp.func_native(_reduction(K, "return v;", "return __builtin_reduce_max(v);"))
     def largest_of(a: V) -> float: ...
 
     operations = {name: value for name, value in locals().items() if isinstance(value, wp.Function)}
     return SimpleNamespace(K=K, V=V, **operations)
 
 
-def sums_of(K: int, vectors: list[str]) -> str:
-    """C++ statements that define ``float s[..]``, the sum of each of ``vectors`` over the K pixels of a thread.
+def sums_of(K: int, values: dict[str, str]) -> tuple[str, list[str]]:
+    """C++ that sums ``values``, expressions of type ``F`` by name, over the K pixels of a thread, and where the sums are.
 
-    On the CPU two vectors are folded into one, halves onto halves, until every lane is a finished sum: nine vectors of
-    sixteen lanes take 18 shuffles instead of 36 dependent ones.
+    On CUDA they are ``float s[..]`` in order. On the CPU they end up in the lanes of one vector ``F total``, in the order
+    returned ('' is an empty lane): two vectors are folded into one, halves onto halves, until every lane is a finished
+    sum. Expressions are evaluated just before they are folded, which keeps them in registers.
     """
-    steps, names, group = [], [f"load({v})" for v in vectors], K
-    while group > 1:
+    if K == 1:
+        return f"const float s[{len(values)}] = {{{', '.join(values.values())}}};", list(values)
+    if len(values) > K:
+        raise ValueError(f"{len(values)} sums do not fit into {K} lanes")
+    names, owners = list(values.values()), [[name] * K for name in values]
+
+    def fold(a: str, b: str, owner_a: list[str], owner_b: list[str], group: int) -> tuple[str, list[str], str]:
+        """The statement that folds two vectors, the lanes of the result, and its name."""
         half = group // 2
-        if len(names) % 2:
-            names.append("(F)(0.0f)")
-        low = ", ".join(str(g + j) for g in range(0, 2 * K, group) for j in range(half))
-        high = ", ".join(str(g + half + j) for g in range(0, 2 * K, group) for j in range(half))
-        folded = []
-        for n, (a, b) in enumerate(zip(names[::2], names[1::2], strict=True)):
-            x = f"x{group}_{n}"
-            steps.append(
-                f"const F a{x} = {a}, b{x} = {b}, {x} = __builtin_shufflevector(a{x}, b{x}, {low})"
-                f" + __builtin_shufflevector(a{x}, b{x}, {high});"
-            )
-            folded.append(x)
-        names, group = folded, half
-    store = [f"{{ const F r = {x}; __builtin_memcpy(s + {n * K}, &r, sizeof(r)); }}" for n, x in enumerate(names)]
-    loops = [f"s[{n}] = 0.0f; for (int c = 0; c < {K}; ++c) s[{n}] += {v}[c];" for n, v in enumerate(vectors)]
-    newline = "\n    "
-    return f"""{types_of(K)}
-    float s[{len(vectors) + 2 * K}];
-#if defined(__CUDA_ARCH__)
-    {newline.join(loops)}
-#else
-    {newline.join(steps + store)}
-#endif
-"""
+        stay = [lane if lane % group < half else K + lane for lane in range(K)]
+        move = [lane + half if lane % group < half else K + lane - half for lane in range(K)]
+        name = f"x{len(lines)}"
+        parts = [f"__builtin_shufflevector(a{name}, b{name}, {', '.join(map(str, way))})" for way in (stay, move)]
+        statement = f"const F a{name} = {a}, b{name} = {b}, {name} = {parts[0]} + {parts[1]};"
+        return statement, [owner_a[lane] if lane % group < half else owner_b[lane] for lane in range(K)], name
+
+    lines: list[str] = []
+    waiting: dict[int, tuple[str, list[str]]] = {}  # group size -> a vector that waits for its partner
+
+    def push(name: str, owner: list[str], group: int) -> None:
+        """Fold a vector with the one that waits at its level, and the result one level up, as long as there is one."""
+        if group > 1 and group not in waiting:
+            waiting[group] = name, owner
+        elif group > 1:
+            other, other_owner = waiting.pop(group)
+            statement, lanes, folded = fold(other, name, other_owner, owner, group)
+            lines.append(statement)
+            push(folded, lanes, group // 2)
+        else:
+            waiting[1] = name, owner
+
+    for name, owner in zip(names, owners, strict=True):
+        push(name, owner, K)
+    while list(waiting) != [1]:
+        push("(F)(0.0f)", [""] * K, max(group for group in waiting if group > 1))
+    total, lanes = waiting[1]
+    return "\n    ".join([*lines, f"const F total = {total};"]), lanes

@@ -9,8 +9,7 @@ from enum import StrEnum
 
 import warp as wp
 
-from ..kernels.composite import CHANNEL_PLANES, LIGHT_PLANES, make_pixels
-from ..kernels.composite_backward import GRAD_LIGHT_PLANES
+from ..kernels.composite import LIGHT_PLANES, make_pixels
 from ..kernels.lanes import make_lanes
 from ..kernels.resolve import Tiling
 from ..kernels.splat import Splat
@@ -130,15 +129,11 @@ class Frame:
         """``count`` image planes in tile order."""
         return Planes(self, count)
 
-    def light_gradients(self) -> Planes:
-        """Zeroed planes for the gradients of light, geometry and transmittance."""
-        planes = self.planes(GRAD_LIGHT_PLANES)
+    def gradient_planes(self, count: int) -> Planes:
+        """Zeroed planes: pixels of a tile that lie outside the image are never written, and must not hold a NaN."""
+        planes = self.planes(count)
         planes.flat.zero_()
         return planes
-
-    def channel_planes(self) -> Planes:
-        """Planes for three T-weighted channels."""
-        return self.planes(CHANNEL_PLANES)
 
 
 class Planes:

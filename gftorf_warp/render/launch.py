@@ -22,8 +22,8 @@ import numpy as np
 import warp as wp
 
 from ..kernels import resolve, splat, tiles
-from ..kernels.composite import make_composite
-from ..kernels.composite_backward import GRAD_TRANSMITTANCE, make_composite_backward
+from ..kernels.composite import CHANNEL_PLANES, make_composite
+from ..kernels.composite_backward import GRAD_LIGHT_PLANES, GRAD_TRANSMITTANCE, finish_moments, make_composite_backward
 from ..kernels.geometry import CameraView
 from ..kernels.project import make_project
 from ..scene.camera import Camera
@@ -99,13 +99,13 @@ def render(inputs: Inputs, view: CameraView, shifts: tuple[float, ...], frame: F
 def forward(inputs: Inputs, view: CameraView, shifts: tuple[float, ...], frame: Frame, images: Images) -> None:
     """Project, sort, composite, resolve."""
     if frame.count:
-        _launch(_project(inputs, frame), frame.count, _project_inputs(inputs, view, frame), _project_outputs(frame))
-        _sort_by_depth(frame)
-        _sort_by_tile(frame)
+        project(inputs, view, frame)
+        sort_by_depth(frame)
+        sort_by_tile(frame)
     else:
         frame.first.zero_()
     groups = _channel_groups(inputs)
-    frame.channels = [frame.channel_planes() for _ in groups]
+    frame.channels = [frame.planes(CHANNEL_PLANES) for _ in groups]
     frame.extra_splats = []
     for number, (name, start) in enumerate(groups or [("", 0)]):
         splats = frame.splats
@@ -114,8 +114,8 @@ def forward(inputs: Inputs, view: CameraView, shifts: tuple[float, ...], frame: 
                 splats = frame.array(frame.count, splat.Splat)
                 frame.extra_splats.append(splats)
             _launch(splat.set_channels, frame.count, [frame.splats, inputs.extra, start], [splats])
-        _composite(frame, view, splats, number)
-    _resolve(inputs, shifts, frame, images, groups)
+        composite(frame, view, splats, number)
+    resolve_images(inputs, shifts, frame, images, groups)
 
 
 def backward(
@@ -127,7 +127,7 @@ def backward(
         [N] gradient records of the splats: slots 0 and 1 are the screen gradient, slot 6 the number of pixels.
     """
     groups = _channel_groups(inputs)
-    grad_light, grad_channels = _fold(inputs, shifts, frame, cotangents, wanted, groups)
+    grad_light, grad_channels = fold_images(inputs, shifts, frame, cotangents, wanted, groups)
     grad_splats = wp.zeros(frame.count, dtype=splat.Splat, device=frame.device)
     if not frame.count:
         return grad_splats
@@ -140,22 +140,13 @@ def backward(
         splats = frame.splats if light else next(extra_splats)
         records = grad_splats if light else wp.zeros_like(grad_splats)
         channel = grad_channels[number] if groups else None
-        _composite_backward(frame, splats, light, grad_light, channel, records)
+        composite_backward(frame, splats, light, grad_light, channel, records)
         if name == "extra" and channel is not None and wanted.extra is not None:
             _launch(splat.take_channels, frame.count, [records, start], [wanted.extra])
         if not light:
             _launch(splat.add_records, frame.count, [records, 1], [grad_splats])
-    adjoint = [getattr(wanted, name) for name in _PROJECTED]
-    if any(array is not None for array in [*adjoint, wanted.calibration]):
-        _launch(
-            _project(inputs, frame),
-            frame.count,
-            _project_inputs(inputs, view, frame),
-            _project_outputs(frame),
-            adjoint=True,
-            adj_inputs=[CameraView(), wanted.calibration, None, *adjoint],
-            adj_outputs=[grad_splats, None, None, None],
-        )
+    _launch(finish_moments, frame.count, [frame.splats], [grad_splats])
+    project_backward(inputs, view, frame, grad_splats, wanted)
     return grad_splats
 
 
@@ -164,7 +155,27 @@ def backward(
 _PROJECTED = ("mean", "log_scale", "quaternion", "opacity_logit", "reflectivity_sh", "colour_sh")
 
 
-def _project(inputs: Inputs, frame: Frame):
+def project(inputs: Inputs, view: CameraView, frame: Frame) -> None:
+    """Gaussians to splats, depth keys and image regions."""
+    _launch(_project_kernel(inputs, frame), frame.count, _project_inputs(inputs, view, frame), _project_outputs(frame))
+
+
+def project_backward(inputs: Inputs, view: CameraView, frame: Frame, grad_splats: wp.array, wanted: Inputs) -> None:
+    """Gradient records of splats to gradients of Gaussians and calibration: Warp's adjoint of the same kernel."""
+    adjoint = [getattr(wanted, name) for name in _PROJECTED]
+    if any(array is not None for array in [*adjoint, wanted.calibration]):
+        _launch(
+            _project_kernel(inputs, frame),
+            frame.count,
+            _project_inputs(inputs, view, frame),
+            _project_outputs(frame),
+            adjoint=True,
+            adj_inputs=[CameraView(), wanted.calibration, None, *adjoint],
+            adj_outputs=[grad_splats, None, None, None],
+        )
+
+
+def _project_kernel(inputs: Inputs, frame: Frame):
     settings = frame.settings
     metric = settings.distortion == Distortion.PAPER
     return make_project(inputs.colour_sh is not None, settings.support == Support.SIGMA3_TILE16, metric)
@@ -180,11 +191,12 @@ def _project_outputs(frame: Frame) -> list:
     return [frame.splats, frame.square_px, frame.depth_key, frame.order]
 
 
-def _sort_by_depth(frame: Frame) -> None:
+def sort_by_depth(frame: Frame) -> None:
+    """Order the splats near to far, ties by index."""
     wp.utils.radix_sort_pairs(frame.depth_key, frame.order, frame.count, end_bit=31)
 
 
-def _sort_by_tile(frame: Frame) -> None:
+def sort_by_tile(frame: Frame) -> None:
     """Count, emit and sort the (tile, splat) pairs."""
     lists = [frame.order, frame.splats, frame.square_px, frame.tile_width, frame.tile_height]
     lists += [frame.tiles_x, frame.tiles_y]
@@ -205,7 +217,7 @@ def _sort_by_tile(frame: Frame) -> None:
     _launch(tiles.tile_starts, frame.tiles + 1, [frame.keys, capacity], [frame.first])
 
 
-def _composite(frame: Frame, view: CameraView, splats: wp.array, number: int) -> None:
+def composite(frame: Frame, view: CameraView, splats: wp.array, number: int) -> None:
     """Blend all tiles: light with the first group of channels, every further group by itself."""
     light, channels = number == 0, bool(frame.channels)
     shape = frame.K, frame.tile_width, frame.tile_height
@@ -220,7 +232,7 @@ def _composite(frame: Frame, view: CameraView, splats: wp.array, number: int) ->
     _over_tiles(frame, kernel, edges, arguments)
 
 
-def _composite_backward(frame: Frame, splats, light: bool, grad_light, channel, records) -> None:
+def composite_backward(frame: Frame, splats, light: bool, grad_light, channel, records) -> None:
     """Add the gradient of one pass to ``records``; CPU threads add to their own, which are then summed in order."""
     shape = frame.K, frame.tile_width, frame.tile_height
     passes = frame.settings.clamp_gradient == ClampGradient.STRAIGHT
@@ -238,7 +250,7 @@ def _composite_backward(frame: Frame, splats, light: bool, grad_light, channel, 
         _launch(splat.add_records, frame.count, [part, 0], [records])
 
 
-def _resolve(inputs: Inputs, shifts, frame: Frame, images: Images, groups: list) -> None:
+def resolve_images(inputs: Inputs, shifts, frame: Frame, images: Images, groups: list) -> None:
     """Planes to images."""
     pixels, sums, tiling = (frame.height, frame.width), frame.sums.flat, frame.tiling
     if shifts:
@@ -256,10 +268,10 @@ def _resolve(inputs: Inputs, shifts, frame: Frame, images: Images, groups: list)
         _launch(resolve.resolve_channels, pixels, rest, [getattr(images, name)])
 
 
-def _fold(inputs: Inputs, shifts, frame: Frame, cotangents: Images, wanted: Inputs, groups: list):
-    """Images to planes: the adjoint of :func:`_resolve`. Channels without a gradient are None."""
+def fold_images(inputs: Inputs, shifts, frame: Frame, cotangents: Images, wanted: Inputs, groups: list):
+    """Images to planes: the adjoint of :func:`resolve_images`. Channels without a gradient are None."""
     pixels, sums, tiling = (frame.height, frame.width), frame.sums.flat, frame.tiling
-    planes = frame.light_gradients()
+    planes = frame.gradient_planes(GRAD_LIGHT_PLANES)
     target = planes.flat
     if cotangents.quads is not None and shifts:
         vectors = shift_vectors(shifts, str(frame.device))
@@ -287,7 +299,7 @@ def _fold(inputs: Inputs, shifts, frame: Frame, cotangents: Images, wanted: Inpu
         if cotangent is None:
             channels.append(None)
             continue
-        grad = frame.channel_planes()
+        grad = frame.gradient_planes(CHANNEL_PLANES)
         colour = name == "colour"
         background = _or_nothing(frame, inputs.background_colour if colour else None)
         grad_background = _or_nothing(frame, wanted.background_colour if colour else None)

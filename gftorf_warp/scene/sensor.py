@@ -64,8 +64,9 @@ class Sensor:
             value = getattr(self, name)
             if isinstance(value, Tensor) and value.ndim != 0:
                 raise ValueError(f"{name} must be a number or a 0-d tensor, got shape {tuple(value.shape)}")
-        if not float(self.f_mod_hz) > 0:
-            raise ValueError(f"f_mod_hz must be above 0, got {float(self.f_mod_hz)}")
+        # numbers are checked; tensors belong to an optimiser, and looking into one could make a GPU wait
+        if not isinstance(self.f_mod_hz, Tensor) and not self.f_mod_hz > 0:
+            raise ValueError(f"f_mod_hz must be above 0, got {self.f_mod_hz}")
         if len(self.shifts) < 1:
             raise ValueError("shifts: a sensor needs at least one phase shift")
         for name in ("frame_period_s", "exposure_s", "electrons_per_unit", "electrons_per_code", "full_well_electrons"):
@@ -78,10 +79,8 @@ class Sensor:
             raise ValueError(f"contrast must be in (0, 1], got {self.contrast}")
         if self.adc_bits is not None and not 1 <= self.adc_bits <= 24:
             raise ValueError(f"adc_bits must be in 1..24 or None, got {self.adc_bits}")
-        if self.unipolar and float(self.dc_offset) < 1.0:
-            raise ValueError(
-                f"a unipolar tap cannot hold negative light: dc_offset >= 1 needed, got {float(self.dc_offset)}"
-            )
+        if self.unipolar and not isinstance(self.dc_offset, Tensor) and self.dc_offset < 1.0:
+            raise ValueError(f"a unipolar tap cannot hold negative light: dc_offset >= 1 needed, got {self.dc_offset}")
 
     @property
     def phase_slope(self) -> Scalar:
@@ -91,7 +90,8 @@ class Sensor:
     @property
     def unambiguous_range(self) -> float:
         """Range c / 2f [m]: distances are known modulo this."""
-        return SPEED_OF_LIGHT / (2.0 * float(self.f_mod_hz))
+        f_mod_hz = self.f_mod_hz.detach() if isinstance(self.f_mod_hz, Tensor) else self.f_mod_hz
+        return SPEED_OF_LIGHT / (2.0 * float(f_mod_hz))
 
     def with_shifts(self, shifts: tuple[float, ...]) -> Sensor:
         """The same sensor reading other phase shifts [rad]."""

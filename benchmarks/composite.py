@@ -1,0 +1,188 @@
+"""What compositing costs: our kernels, the naive ones, and a prototype if its folder is named.
+
+    python benchmarks/composite.py [--prototype FOLDER] [--device cpu|cuda] [--json FILE]
+
+Scene: isotropic Gaussians on a wavy surface 1-5 m away, 320x240, the same positions, sizes and opacities for all. All
+rows of one table come from one process, alternating, so that a busy machine slows them alike. Ratios matter, not times.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import statistics
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+import warp as wp
+
+import naive
+from gftorf_warp.kernels.composite import CHANNEL_PLANES
+from gftorf_warp.kernels.composite_backward import GRAD_LIGHT_PLANES, finish_moments
+from gftorf_warp.kernels.splat import Splat
+from gftorf_warp.render import launch
+from gftorf_warp.render.buffers import Frame, RenderSettings
+from gftorf_warp.render.launch import Inputs
+from gftorf_warp.scene.camera import Camera
+from gftorf_warp.scene.gaussians import constant_sh
+
+WIDTH, HEIGHT, FOCAL = 320, 240, 280.0
+NEAR, FAR = 0.135, 7.425  # [m]
+
+
+def surface(count: int, scale: float, opacity: float) -> dict[str, np.ndarray]:
+    """Gaussians of one size [m] and opacity on a wavy surface 1-5 m away."""
+    rng = np.random.default_rng(0)
+    u = rng.random((count, 3))
+    z = 3 + 2 * np.sin(6 * u[:, 0]) * np.cos(5 * u[:, 1]) + 0.02 * u[:, 2]
+    quaternion = rng.normal(size=(count, 4))
+    x, y = (u[:, 0] - 0.5) * WIDTH / FOCAL * z, (u[:, 1] - 0.5) * HEIGHT / FOCAL * z
+    return {
+        "mean": np.stack([x, y, z], 1),
+        "log_scale": np.full((count, 3), math.log(scale)),
+        "quaternion": quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True),
+        "opacity_logit": np.full(count, math.log(opacity / (1 - opacity))),
+        "colour": rng.random((count, 3)),
+        "reflectivity": 0.5 + 0.1 * rng.random(count),
+    }
+
+
+class Ours:
+    """Our stages on the scene."""
+
+    def __init__(self, scene: dict, device: str, threads: int):
+        colour_sh = constant_sh(torch.tensor(scene["colour"].T, dtype=torch.float32)).permute(1, 2, 0).numpy()
+        reflectivity_sh = constant_sh(torch.tensor(scene["reflectivity"], dtype=torch.float32)).numpy()
+
+        def array(value, dtype):
+            return wp.array(np.ascontiguousarray(value, np.float32), dtype=dtype, device=device)
+
+        self.inputs = Inputs(
+            mean=array(scene["mean"], wp.vec3),
+            log_scale=array(scene["log_scale"], wp.vec3),
+            quaternion=array(scene["quaternion"], wp.vec4),
+            opacity_logit=array(scene["opacity_logit"], float),
+            reflectivity_sh=array(reflectivity_sh, float),
+            colour_sh=array(colour_sh, wp.vec3),
+            calibration=array([4 * math.pi / 15, 0.0, 1.0, 0.0], float),
+        )
+        settings = RenderSettings(near=NEAR, far=FAR, threads=threads)
+        self.camera = Camera(width=WIDTH, height=HEIGHT, fx=FOCAL, fy=FOCAL, cx=WIDTH / 2, cy=HEIGHT / 2)
+        self.frame = Frame(len(scene["mean"]), WIDTH, HEIGHT, 0, settings, wp.get_device(device))
+        self.view = launch.view_of(self.camera, settings)
+        launch.project(self.inputs, self.view, self.frame)
+        launch.sort_by_depth(self.frame)
+        launch.sort_by_tile(self.frame)
+        self.frame.channels = [self.frame.planes(CHANNEL_PLANES)]
+        self.grad_light, self.grad_channel = (
+            self.frame.gradient_planes(GRAD_LIGHT_PLANES),
+            self.frame.gradient_planes(CHANNEL_PLANES),
+        )
+        rng = np.random.default_rng(1)
+        for planes in (self.grad_light, self.grad_channel):
+            planes.flat.assign(rng.normal(size=planes.flat.shape).astype(np.float32))
+        self.records = wp.zeros(self.frame.count, dtype=Splat, device=device)
+
+    def forward(self) -> None:
+        """Blend."""
+        launch.composite(self.frame, self.view, self.frame.splats, 0)
+
+    def backward(self) -> None:
+        """Blend backward, gradient records zeroed."""
+        self.records.zero_()
+        launch.composite_backward(self.frame, self.frame.splats, True, self.grad_light, self.grad_channel, self.records)
+        launch._launch(finish_moments, self.frame.count, [self.frame.splats], [self.records])
+
+
+class Naive:
+    """One thread per pixel, on the splats and lists of ours."""
+
+    def __init__(self, ours: Ours):
+        frame = ours.frame
+        self.lists = [frame.first, frame.ids, frame.splats, frame.tile_width, frame.tile_height, frame.tiles_x]
+        self.sums = wp.zeros((12, HEIGHT, WIDTH), dtype=float, device=frame.device)
+        grad = np.random.default_rng(1).normal(size=(9, HEIGHT, WIDTH))
+        self.grad = wp.array(grad, dtype=float, device=frame.device)
+        self.records = wp.zeros(frame.count, dtype=Splat, device=frame.device)
+
+    def forward(self) -> None:
+        """Blend."""
+        wp.launch(naive.forward, (HEIGHT, WIDTH), self.lists, [self.sums], device=self.sums.device)
+
+    def backward(self) -> None:
+        """Blend backward, gradient records zeroed."""
+        self.records.zero_()
+        inputs = [*self.lists, self.sums, self.grad]
+        wp.launch(naive.backward, (HEIGHT, WIDTH), inputs, [self.records], device=self.sums.device)
+
+
+class Prototype:
+    """The stages of a prototype folder with bench.py and pipeline.py."""
+
+    def __init__(self, folder: Path, scene: tuple, device: str, threads: int):
+        sys.path.insert(0, str(folder))
+        import bench
+        import pipeline
+
+        shape = (16, 16, 4) if device == "cpu" else (1, 8, 4)
+        made = bench.make_scene("surface", *scene, wp.get_device(device))
+        self.raster = pipeline.Rasterizer(made, *shape, threads=threads)
+        self.raster.grad_image.assign(np.random.default_rng(1).normal(size=self.raster.image.shape))
+        self.raster.forward()
+        self.raster.fold()
+        self.forward, self.backward = self.raster.blend, self.raster.blend_backward
+
+
+def medians(rows: dict[str, object], repeats: int) -> dict[str, dict[str, float]]:
+    """Median milliseconds of both stages of each row, rows taking turns; the first turn is thrown away."""
+    times: dict[str, dict[str, list[float]]] = {name: {"forward": [], "backward": []} for name in rows}
+    for _ in range(repeats + 1):
+        for name, row in rows.items():
+            for stage in ("forward", "backward"):
+                wp.synchronize()
+                start = time.perf_counter()
+                getattr(row, stage)()
+                wp.synchronize()
+                times[name][stage].append(1e3 * (time.perf_counter() - start))
+    return {name: {s: statistics.median(t[1:]) for s, t in both.items()} for name, both in times.items()}
+
+
+def main() -> None:
+    """Print the table, write the JSON."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--prototype", type=Path, help="folder of a prototype to compare with")
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--scene", nargs=3, default=["20000", "0.03", "0.6"], metavar=("N", "SCALE", "OPACITY"))
+    parser.add_argument("--repeats", type=int, default=7)
+    parser.add_argument("--json", type=Path)
+    a = parser.parse_args()
+    wp.config.log_level = wp.LOG_ERROR
+    numbers = int(a.scene[0]), float(a.scene[1]), float(a.scene[2])
+    scene = surface(*numbers)
+    rows: dict[str, object] = {"ours, 1 thread": Ours(scene, a.device, 1)}
+    if a.device == "cpu":
+        rows["ours, 2 threads"] = Ours(scene, a.device, 2)
+    rows["naive, 1 thread"] = Naive(rows["ours, 1 thread"])
+    if a.prototype:
+        rows["prototype, 1 thread"] = Prototype(a.prototype, numbers, a.device, 1)
+    table = medians(rows, a.repeats)
+    table.setdefault("prototype, 1 thread", {"forward": math.nan, "backward": math.nan})
+    base = table["ours, 1 thread"]
+    print(f"surface {' '.join(a.scene)}, {WIDTH}x{HEIGHT}, {a.device}, medians of {a.repeats}, Warp {wp.__version__}")
+    for name, both in table.items():
+        cells = [
+            "not measured" if math.isnan(t) else f"{t:8.2f} ms  {t / base[stage]:6.2f} x ours"
+            for stage, t in both.items()
+        ]
+        print(f"  {name:<20} forward {cells[0]:<26} backward {cells[1]}")
+    if a.json:
+        clean = {name: {s: None if math.isnan(t) else t for s, t in both.items()} for name, both in table.items()}
+        a.json.write_text(json.dumps({"scene": a.scene, "device": a.device, "ms": clean}, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
