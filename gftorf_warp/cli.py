@@ -46,7 +46,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def choose_device(name: str) -> tuple[str, str]:
-    """Device for torch and Warp, and why it was taken.
+    """Device for torch and Warp, and why it was taken, or which it is.
 
     Args:
         name: "auto", "cpu", "cuda" or "cuda:N".
@@ -58,7 +58,7 @@ def choose_device(name: str) -> tuple[str, str]:
     import warp as wp
 
     if name == "cpu":
-        return "cpu", "as asked"
+        return "cpu", ""
     if not torch.cuda.is_available():
         build = "this torch is a CPU build" if torch.version.cuda is None else "no CUDA driver or GPU found"
         reason = "no CUDA driver found" if wp.get_cuda_driver_version() is None else build
@@ -85,8 +85,8 @@ def start(options: argparse.Namespace, *, compile_first: bool = True) -> str:
     device, reason = choose_device(getattr(options, "device", "cpu"))
     threads = min(torch.get_num_threads(), _available_cpus())
     cache = terminal.home_as_tilde(terminal.kernel_cache())
-    line = f"gftorf_warp {__version__} - device {device} ({threads} threads; {reason}) - kernels cached in {cache}"
-    terminal.LOG.info(line)
+    details = "; ".join(filter(None, [f"{threads} threads", reason]))
+    terminal.LOG.info("gftorf_warp %s - device %s (%s) - kernels cached in %s", __version__, device, details, cache)
     if compile_first and not terminal.kernels_are_cached():
         terminal.LOG.info("  compiling kernels (first run only) ...")
         terminal.LOG.info("  compiling kernels (first run only) ... %.1f s", compile_kernels(device))

@@ -55,7 +55,9 @@ def demo(
 
     out = Path(out)
     prepare(out, {"version": __version__, "seed": seed, "size": size, "frames": frames, "images": images}, fresh=fresh)
-    report = progress or (lambda _: None)
+
+    def report(label: str) -> Callable[..., None] | None:
+        return None if progress is None else progress(label)
 
     with _Step("[1/4] simulate   ") as step:
         if not (out / "seq").exists():  # it appears only when it is complete
