@@ -148,6 +148,21 @@ def test_truth_of_another_folder(tmp_path):
     assert got["d_tof_mse_x100"] == pytest.approx(100 * (0.5 - 0.03) ** 2, rel=1e-4)
 
 
+def test_unknown_truth_is_not_scored(tmp_path):
+    """One frame known in its first row only, another not at all: each known frame weighs alike in the mean."""
+    run = AnalyticRun(tmp_path, with_truth=False)
+    truth = analytic_run.truth()
+    truth.distance[2, 1:] = np.nan  # all that is left is wall
+    truth.known[5] = False
+    ftorf.write(tmp_path / "partly", analytic_run.sequence(), truth)
+    got = compare(run, truth=tmp_path / "partly")
+    box, wall = 100 * 0.1**2, 100 * 0.02**2
+    whole = (BOX_PIXELS * box + (PIXELS - BOX_PIXELS) * wall) / PIXELS
+    assert got["frames"] == 12
+    assert got["d_normalised_mse_x100"] == pytest.approx((wall + 10 * whole) / 11, rel=1e-4)
+    assert got["moving"]["share"] + got["static"]["share"] == pytest.approx(1.0)
+
+
 def test_a_still_scene_has_no_moving_pixels(tmp_path):
     """Null where no pixel is, with a share of zero, and the page says it for all pixels."""
     run = AnalyticRun(tmp_path)

@@ -61,8 +61,8 @@ def test_nothing_to_score_is_an_error(given, protocol, error, text):
 def test_moving_is_a_change_of_more_than_five_centimetres_within_the_quartet():
     """Four pixels over two quartets; the jump between quartets is no motion, and the unknown is neither."""
     distance = np.full((8, 1, 4), 3.0)
-    distance[:4, 0, 0] += [0.0, 0.02, 0.04, 0.06]  # 6 cm: moves
-    distance[:4, 0, 1] += [0.0, 0.04, 0.04, 0.04]  # 4 cm: rests
+    distance[:4, 0, 0] += [0.0, 0.02, 0.051, 0.04]  # 5.1 cm: moves
+    distance[:4, 0, 1] += [0.0, 0.049, 0.04, 0.04]  # 4.9 cm: rests
     distance[4:, 0, 1] += 1.0  # between two quartets
     distance[2, 0, 2] = NAN  # unknown, so it may have moved
     distance[:3, 0, 3] = [3.0, NAN, 3.5]  # unknown for a while, but it certainly moved
@@ -127,7 +127,7 @@ def test_quad_psnr():
 
 
 def test_errors_are_printed_times_100_or_as_unknown():
-    """One row of the table, and the same row without truth."""
+    """One row of the table, and the same row where no pixel counts."""
     errors = {name: np.full((1, 1, 2), value) for name, value in zip(metrics.DISTANCES, (4, 3, 2, 1), strict=True)}
     row = metrics.distance_errors(errors, np.ones((1, 1, 2), dtype=bool))
     assert row == {
@@ -136,7 +136,7 @@ def test_errors_are_printed_times_100_or_as_unknown():
         "d_normalised_mse_x100": 200.0,
         "d_tof_mse_x100": 100.0,
     }
-    assert set(metrics.distance_errors(None, None).values()) == {None}
+    assert set(metrics.distance_errors(errors, np.zeros((1, 1, 2), dtype=bool)).values()) == {None}
 
 
 def test_the_analytic_sequence_has_a_truncated_quartet():

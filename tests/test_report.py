@@ -102,7 +102,7 @@ def compared(tmp_path_factory):
     compare(run)
     sequence = run.sequence()
     truth = sequence.truth()
-    found = findings(sequence, gather(run, sequence, truth, scored_frames(sequence)), truth)
+    found = findings(sequence, gather(run, sequence, scored_frames(sequence)), truth)
     metrics = json.loads((run.path / "metrics.json").read_text())
     return run, metrics, Page((run.path / "report.html").read_text()), found
 
@@ -161,15 +161,18 @@ def test_pictures_show_their_arrays(compared):
     metres = panels.common_distance_scale(found)
     assert (metres.low, metres.high) == (2.5, 4.0)
     quads = pictures.signed_scale([found.sequence.quads[n] for n in range(4, 8)])
-    errors = pictures.error_scale([np.sqrt(found.errors["closed_form"][s])[found.moving[s]]])
+    errors = pictures.error_scale([np.sqrt(found.judgement.errors["closed_form"][s])[found.judgement.moving[s]]])
     want = {
         "closed form": (found.views.closed_form[s], metres),
         "ours, d": (found.views.d[s], metres),
         "ours, d_ToF": (found.views.d_tof[s], metres),
         "truth": (analytic_run.true_distance(found.views.frames[s]), metres),
-        "error of closed form": (np.abs(found.views.closed_form[s] - found.views.truth[s]), errors),
-        "error of ours, d": (np.abs(found.views.d[s] - found.views.truth[s]), errors),
-        "moving pixels": (found.moving[s].astype(float), pictures.Scale(low=0, high=1, colours="gray", unit="")),
+        "error of closed form": (np.abs(found.views.closed_form[s] - found.judgement.truth[s]), errors),
+        "error of ours, d": (np.abs(found.views.d[s] - found.judgement.truth[s]), errors),
+        "moving pixels": (
+            found.judgement.moving[s].astype(float),
+            pictures.Scale(low=0, high=1, colours="gray", unit=""),
+        ),
         **{f"raw frame {n}": (found.sequence.quads[n], quads) for n in range(4, 8)},
     }
     assert found.views.frames[s] // 4 == 1
@@ -235,7 +238,7 @@ def test_verdict_says_which_is_better():
 def test_without_truth_the_page_still_shows_pictures(compared):
     """No errors, no truth, no claim; distances and quads remain."""
     run, metrics, _, found = compared
-    blind = replace(found, views=replace(found.views, truth=None), errors=None, moving=None, static=None)
+    blind = replace(found, judgement=None)
     unknown = summary(run, blind, protocol="all")
     html = Page(report(title="blind", metrics=unknown, config=run.config, log=[], found=blind))
     assert {"closed form", "ours, d", "measured quad", "rendered quad"} <= set(html.images)
@@ -247,12 +250,12 @@ def test_without_truth_the_page_still_shows_pictures(compared):
 def test_the_frame_shown_is_the_one_that_moves_most(compared):
     """In the middle half of the frames; without truth the change of the quads decides."""
     _, _, _, found = compared
-    moving = np.zeros_like(found.moving)
+    moving = np.zeros_like(found.judgement.moving)
     moving[7, :3] = moving[4, :1] = moving[11] = True
-    assert panels.telling_row(replace(found, moving=moving)) == 7
+    assert panels.telling_row(replace(found, judgement=replace(found.judgement, moving=moving))) == 7
     quads = np.zeros_like(found.sequence.quads)
     quads[9] = 1.0  # against frames 5 and 13; the first of the two in the middle half is shown
-    blind = replace(found, moving=None, sequence=replace(found.sequence, quads=quads))
+    blind = replace(found, judgement=None, sequence=replace(found.sequence, quads=quads))
     assert found.views.frames[panels.telling_row(blind)] == 5
 
 
@@ -281,9 +284,8 @@ def test_pages_of_large_noisy_images_stay_below_four_megabytes(compared):
         closed_form=noise[::-1],
         quad_rendered=noise - 4.0,
         quad_measured=noise[::-1] - 4.0,
-        truth=noise[:, ::-1],
     )
-    found = findings(sequence, views, Truth(distance=views.truth, known=np.ones(frames, dtype=bool)))
+    found = findings(sequence, views, Truth(distance=noise[:, ::-1], known=np.ones(frames, dtype=bool)))
     text = report(title="noise", metrics=compared[1], config={}, log=[], found=found)
     assert 1_000_000 < len(text) < 4_000_000
     assert page.thinned(np.zeros((240, 641))).shape == (80, 214)

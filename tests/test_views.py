@@ -1,6 +1,7 @@
 """What ``gftorf render`` writes, and colours that mean what their scale says."""
 
 import json
+from dataclasses import replace
 
 import analytic_run
 import numpy as np
@@ -59,8 +60,7 @@ def test_chosen_times_and_things(run, tmp_path):
 
     poses = np.tile(np.eye(4), (FRAMES, 1, 1))
     poses[:, 1, 3] = np.arange(FRAMES)
-    sequence = run.sequence()
-    object.__setattr__(sequence, "camera_from_world", poses)
+    sequence = replace(run.sequence(), camera_from_world=poses)
     run.sequence = lambda: sequence
     out = render_to_folder(run, tmp_path / "out", what=["phasor", "phasor"], times=[3.4 / 120, 8 / 120])
     assert {camera.camera_from_world[1, 3] for camera in run.cameras} == {3.0, 8.0}
@@ -89,10 +89,8 @@ def test_what_cannot_be_rendered_is_named(run, tmp_path, what, times, text):
 
 def test_colour_is_written_linear_and_shown_as_srgb(run):
     """Linear 0.5 is 188 in 8-bit sRGB; what is brighter than white stays white."""
-    rendering = run.render(0.0)
     colour = torch.stack([torch.full((HEIGHT, WIDTH), value) for value in (0.5, 0.0, 7.0)])
-    object.__setattr__(rendering, "colour", colour)
-    images = renders.channels("colour", rendering, run.sensor)
+    images = renders.channels("colour", replace(run.render(0.0), colour=colour), run.sensor)
     assert list(images) == ["R", "G", "B"]
     assert images["B"].max() == 7.0
     assert renders.preview("colour", images, renders.preview_scale("colour", [images]))[0, 0].tolist() == [188, 0, 255]

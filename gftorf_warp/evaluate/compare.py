@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from ..data.sequence import Sequence, Truth
 from ..errors import InputError
 from . import metrics as measure
 from . import views
-from .panels import Findings
+from .panels import Findings, Judgement
 
 if TYPE_CHECKING:
     from ..recon.run import Run
@@ -30,7 +30,7 @@ def compare(
     frames: str = "all",
     report: bool = True,
     progress: Callable[[int, int], None] | None = None,
-) -> dict[str, object]:
+) -> dict[str, Any]:
     """Score a run and write ``RUN/metrics.json`` and ``RUN/report.html``.
 
     Rendered at the time and pose of every scored raw frame, at the sequence's own resolution, before black. Errors are
@@ -58,7 +58,7 @@ def compare(
     sequence = run.sequence()
     known = fitting_truth(sequence, truth)
     scored = measure.scored_frames(sequence, frames)
-    found = findings(sequence, views.gather(run, sequence, known, scored, progress=progress), known)
+    found = findings(sequence, views.gather(run, sequence, scored, progress=progress), known)
     result = summary(run, found, protocol=frames)
     write_json(run.path / "metrics.json", result)
     if report:
@@ -94,27 +94,23 @@ def fitting_truth(sequence: Sequence, path: str | Path | None = None) -> Truth |
 
 
 def findings(sequence: Sequence, gathered: views.Views, truth: Truth | None) -> Findings:
-    """Squared errors and masks of gathered views."""
+    """Gathered views, judged by the truth if there is any."""
     if truth is None:
-        return Findings(sequence=sequence, views=gathered, errors=None, moving=None, static=None)
-    errors = {name: measure.squared_error(image, gathered.truth) for name, image in gathered.distances.items()}
-    moving, static = measure.moving_and_static(measure.known_distance(truth), gathered.frames)
-    return Findings(sequence=sequence, views=gathered, errors=errors, moving=moving, static=static)
+        return Findings(sequence=sequence, views=gathered, judgement=None)
+    distance = measure.known_distance(truth)
+    moving, static = measure.moving_and_static(distance, gathered.frames)
+    scored = distance[gathered.frames]
+    errors = {name: measure.squared_error(image, scored) for name, image in gathered.distances.items()}
+    judgement = Judgement(truth=scored, errors=errors, moving=moving, static=static)
+    return Findings(sequence=sequence, views=gathered, judgement=judgement)
 
 
-def summary(run: Run, found: Findings, *, protocol: str) -> dict[str, object]:
+def summary(run: Run, found: Findings, *, protocol: str) -> dict[str, Any]:
     """The content of metrics.json, in numbers, texts and None only."""
-    everywhere = None if found.errors is None else np.ones_like(found.moving)
-    groups = {"moving": (found.moving, found.static), "static": (found.static, found.moving)}
     return {
         "frames": len(found.views.frames),
         "protocol": protocol,
-        **measure.distance_errors(found.errors, everywhere, measure.mean_over_frames),
-        **{
-            name: measure.distance_errors(found.errors, mask)
-            | {"share": None if mask is None else measure.share(mask, rest)}
-            for name, (mask, rest) in groups.items()
-        },
+        **_errors(found.judgement),
         "quad_psnr_db": measure.quad_psnr_db(
             found.views.quad_rendered,
             found.views.quad_measured,
@@ -126,7 +122,20 @@ def summary(run: Run, found: Findings, *, protocol: str) -> dict[str, object]:
     }
 
 
-def write_report(run: Run, result: dict[str, object], found: Findings) -> Path:
+def _errors(judgement: Judgement | None) -> dict[str, object]:
+    """The errors of metrics.json on all, moving and static pixels; all None without ground truth."""
+    if judgement is None:
+        unknown: dict[str, None] = {f"{name}_mse_x100": None for name in measure.DISTANCES}
+        return {**unknown, "moving": {**unknown, "share": None}, "static": {**unknown, "share": None}}
+    moving, static, errors = judgement.moving, judgement.static, judgement.errors
+    return {
+        **measure.distance_errors(errors, np.ones_like(moving), measure.mean_over_frames),
+        "moving": {**measure.distance_errors(errors, moving), "share": measure.share(moving, static)},
+        "static": {**measure.distance_errors(errors, static), "share": measure.share(static, moving)},
+    }
+
+
+def write_report(run: Run, result: dict[str, Any], found: Findings) -> Path:
     """Write ``RUN/report.html``."""
     from . import report
 

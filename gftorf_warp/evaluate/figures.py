@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -14,7 +15,7 @@ NOT_LOSSES = {"images", "seconds", "gaussians", "quad_psnr_db"}  # what else a l
 LOG_SPAN = 20.0  # values that span more than this factor are drawn on a logarithmic axis
 FLOOR_M = 1e-3  # [m] smaller errors fall into the first bin of the histogram
 BINS = 60
-STYLE = {
+STYLE: dict[Any, Any] = {
     "svg.hashsalt": "gftorf_warp",  # element ids would be random without
     "font.size": 9.0,
     "axes.spines.top": False,

@@ -120,14 +120,14 @@ def per_frame_mean(error: Float[np.ndarray, "S H W"], mask: Bool[np.ndarray, "S 
 
 
 def distance_errors(
-    errors: Mapping[str, Float[np.ndarray, "S H W"]] | None,
-    mask: Bool[np.ndarray, "S H W"] | None,
+    errors: Mapping[str, Float[np.ndarray, "S H W"]],
+    mask: Bool[np.ndarray, "S H W"],
     reduce: Callable[[np.ndarray, np.ndarray], float | None] = pooled,
 ) -> dict[str, float | None]:
-    """The keys ``<name>_mse_x100`` [m^2 x 100] of every kind of distance; None where there is no truth or no pixel."""
+    """The keys ``<name>_mse_x100`` [m^2 x 100] of every kind of distance; None where there is no pixel."""
     table: dict[str, float | None] = {}
     for name in DISTANCES:
-        value = None if errors is None or mask is None else reduce(errors[name], mask)
+        value = reduce(errors[name], mask)
         table[f"{name}_mse_x100"] = None if value is None else ERROR_UNIT * value
     return table
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import html
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -60,7 +61,7 @@ code { font-size: 13px; overflow-wrap: anywhere; }
 @media (max-width: 700px) { .row { grid-template-columns: repeat(2, minmax(0, 1fr)); } }
 """
 
-FORMATS = {  # how a value of metrics.json is printed, by name
+FORMATS: dict[str, Callable[[Any], str]] = {  # how a value of metrics.json is printed, by name
     "error": lambda value: f"{value:.3f}",  # [m^2 x 100]
     "rms_cm": lambda value: f"{10.0 * math.sqrt(value):.1f} cm",  # root of a mean squared error given in m^2 x 100
     "percent": lambda value: f"{100.0 * value:.1f} %",
@@ -76,22 +77,22 @@ def escape(text: object) -> str:
     return html.escape(str(text), quote=True)
 
 
-def look_up(metrics: Mapping[str, object], key: str) -> object:
+def look_up(metrics: Mapping[str, Any], key: str) -> Any:
     """The value of a key; ``moving.share`` is the share inside moving."""
-    value: object = metrics
+    value: Any = metrics
     for part in key.split("."):
         value = value[part] if isinstance(value, Mapping) else None
     return value
 
 
-def number(metrics: Mapping[str, object], key: str, form: str) -> str:
+def number(metrics: Mapping[str, Any], key: str, form: str) -> str:
     """A value of metrics.json, marked with where it is from, so that a test can compare each printed number."""
     value = look_up(metrics, key)
     text = "not known" if value is None else FORMATS[form](value)
     return f'<span data-key="{escape(key)}" data-form="{escape(form)}">{escape(text)}</span>'
 
 
-def ratio(metrics: Mapping[str, object], above: str, below: str) -> str:
+def ratio(metrics: Mapping[str, Any], above: str, below: str) -> str:
     """One value of metrics.json over another, likewise marked; both must be known and above zero."""
     value = look_up(metrics, above) / look_up(metrics, below)
     return f'<span data-above="{escape(above)}" data-below="{escape(below)}">{value:.1f}</span>'

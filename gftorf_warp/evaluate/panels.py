@@ -32,19 +32,29 @@ WHOLE: Window = (slice(None), slice(None))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class Judgement:
+    """The S scored frames against ground truth."""
+
+    truth: Float[np.ndarray, "S H W"]
+    """True distance [m], NaN where unknown."""
+    errors: Mapping[str, Float[np.ndarray, "S H W"]]
+    """Squared errors [m^2] by the name of the distance, NaN where the truth is unknown."""
+    moving: Bool[np.ndarray, "S H W"]
+    """Pixels that move within their quartet."""
+    static: Bool[np.ndarray, "S H W"]
+    """Pixels that rest."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Findings:
     """What a comparison found, in arrays; a report draws it and computes nothing new."""
 
     sequence: Sequence
     """What was measured."""
     views: Views
-    """What was rendered, decoded and known."""
-    errors: Mapping[str, Float[np.ndarray, "S H W"]] | None
-    """Squared errors [m^2] by name, NaN where the truth is unknown; None without ground truth."""
-    moving: Bool[np.ndarray, "S H W"] | None
-    """Pixels that move within their quartet; None without ground truth."""
-    static: Bool[np.ndarray, "S H W"] | None
-    """Pixels that rest; None without ground truth."""
+    """What was rendered and decoded."""
+    judgement: Judgement | None
+    """What ground truth says about it; None without."""
 
 
 def telling_row(found: Findings) -> int:
@@ -56,16 +66,17 @@ def telling_row(found: Findings) -> int:
     middle = range(count // 4, max(count // 4 + 1, -(-3 * count // 4)))
 
     def telling(s: int) -> tuple[float, float]:
-        changed = _change(found.sequence, found.views.frames[s]) if found.moving is None else found.moving[s].sum()
-        return float(changed), -abs(s - count / 2)  # of equals, the one nearest to the middle
+        judged = found.judgement
+        changed = _change(found.sequence, found.views.frames[s]) if judged is None else float(judged.moving[s].sum())
+        return changed, -abs(s - count / 2)  # of equals, the one nearest to the middle
 
     return max(middle, key=telling)
 
 
 def common_distance_scale(found: Findings) -> pictures.Scale:
     """One scale for every distance in the report: the truth's, else that of the closed form and of ours."""
-    views = found.views
-    return pictures.distance_scale([views.closed_form, views.d] if views.truth is None else [views.truth])
+    views, judged = found.views, found.judgement
+    return pictures.distance_scale([views.closed_form, views.d] if judged is None else [judged.truth])
 
 
 def measured_quartet(found: Findings, s: int) -> str:
@@ -99,25 +110,26 @@ def distances(found: Findings, s: int, window: Window = WHOLE) -> str:
     return page.row([page.picture(image[window], scale, title) for title, image in _distances(found, s).items()])
 
 
-def error_maps(found: Findings, s: int, window: Window = WHOLE) -> str:
+def error_maps(judged: Judgement, s: int, window: Window = WHOLE) -> str:
     """Absolute errors on one scale, under the distances that they belong to; under the truth, what moves."""
-    scale = pictures.error_scale([_errors_that_matter(found, s)])
+    scale = pictures.error_scale([_errors_that_matter(judged, s)])
     figures = [
-        page.picture(np.sqrt(found.errors[name][s][window]), scale, f"error of {title}")
+        page.picture(np.sqrt(judged.errors[name][s][window]), scale, f"error of {title}")
         for name, title in TITLES.items()
     ]
-    moves = found.moving[s][window].astype(np.float32)
+    moves = judged.moving[s][window].astype(np.float32)
     return page.row([*figures, page.picture(moves, _share_scale(1.0), "moving pixels")])
 
 
-def close_up(found: Findings, s: int) -> str:
+def close_up(found: Findings, judged: Judgement, s: int) -> str:
     """The surroundings of the moving pixels, enlarged: distances and errors; empty if that is most of the image."""
-    if found.moving is None or not found.moving[s].any():
+    moving = judged.moving[s]
+    if not moving.any():
         return ""
-    window = _window(found.moving[s])
-    if found.moving[s][window].size > CLOSE_UP_SHARE_MAX * found.moving[s].size:
+    window = _window(moving)
+    if moving[window].size > CLOSE_UP_SHARE_MAX * moving.size:
         return ""
-    return distances(found, s, window) + error_maps(found, s, window)
+    return distances(found, s, window) + error_maps(judged, s, window)
 
 
 def quad_residual(found: Findings, s: int) -> str:
@@ -185,15 +197,15 @@ def animation(found: Findings) -> str:
 
 def _distances(found: Findings, s: int) -> dict[str, np.ndarray]:
     """Images [m] by title: closed form, ours, and truth if it is known."""
-    views = found.views
+    views, judged = found.views, found.judgement
     images = {TITLES["closed_form"]: views.closed_form[s], TITLES["d"]: views.d[s], TITLES["d_tof"]: views.d_tof[s]}
-    return images if views.truth is None else images | {"truth": views.truth[s]}
+    return images if judged is None else images | {"truth": judged.truth[s]}
 
 
-def _errors_that_matter(found: Findings, s: int) -> np.ndarray:
+def _errors_that_matter(judged: Judgement, s: int) -> np.ndarray:
     """Absolute errors [m] of the closed form, on moving pixels if there are any: they set the scale for all."""
-    error = np.sqrt(found.errors["closed_form"][s])
-    return error[found.moving[s]] if found.moving[s].any() else error
+    error = np.sqrt(judged.errors["closed_form"][s])
+    return error[judged.moving[s]] if judged.moving[s].any() else error
 
 
 def _share_scale(high: float) -> pictures.Scale:
@@ -209,7 +221,8 @@ def _change(sequence: Sequence, n: int) -> float:
 
 def _window(mask: Bool[np.ndarray, "H W"]) -> Window:
     """The rectangle around a mask, with a margin."""
-    return tuple(_widened(np.flatnonzero(mask.any(axis=axis)), mask.shape[1 - axis]) for axis in (1, 0))
+    rows, columns = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
+    return _widened(rows, mask.shape[0]), _widened(columns, mask.shape[1])
 
 
 def _widened(indices: np.ndarray, size: int) -> slice:

@@ -129,4 +129,4 @@ def _range(images: Iterable[np.ndarray], low: float, high: float) -> tuple[float
     values = np.concatenate([np.asarray(image)[np.isfinite(image)].ravel() for image in images])
     if not values.size:
         return 0.0, 0.0
-    return tuple(float(v) for v in np.percentile(values, [low, high]))
+    return float(np.percentile(values, low)), float(np.percentile(values, high))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +18,7 @@ WHAT = ("distance", "quads", "phasor", "colour")
 Channels = dict[str, Float[np.ndarray, "H W"]]
 
 
-def checked(what: str | Sequence[str]) -> tuple[str, ...]:
+def checked(what: str | Iterable[str]) -> tuple[str, ...]:
     """The names of what is to be rendered, each once.
 
     Args:

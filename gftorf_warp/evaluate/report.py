@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -51,8 +52,8 @@ ground truth, and noise in the measurement bounds it.</dd>
 def report(
     *,
     title: str,
-    metrics: Mapping[str, object],
-    config: Mapping[str, object],
+    metrics: Mapping[str, Any],
+    config: Mapping[str, Any],
     log: Sequence[Mapping[str, float]],
     found: Findings,
     data_card: str | None = None,
@@ -84,7 +85,7 @@ def report(
     return page.document(f"{title} - gftorf compare", "".join(sections))
 
 
-def verdict(metrics: Mapping[str, object]) -> str:
+def verdict(metrics: Mapping[str, Any]) -> str:
     """The result in one or two sentences of HTML, with the numbers of metrics.json."""
     if page.look_up(metrics, "d_mse_x100") is None:
         return (
@@ -109,7 +110,7 @@ def verdict(metrics: Mapping[str, object]) -> str:
     return text
 
 
-def _comparison(metrics: Mapping[str, object], naive: str, ours: str) -> str:
+def _comparison(metrics: Mapping[str, Any], naive: str, ours: str) -> str:
     """Ours against the closed form in words."""
     was, now = page.look_up(metrics, naive), page.look_up(metrics, ours)
     values = f"{page.number(metrics, naive, 'error')} against {page.number(metrics, ours, 'error')} m² &times; 100"
@@ -124,7 +125,7 @@ def _section(title: str, body: str) -> str:
     return f"<section><h2>{title}</h2>{body}</section>"
 
 
-def _table(metrics: Mapping[str, object]) -> str:
+def _table(metrics: Mapping[str, Any]) -> str:
     if page.look_up(metrics, "d_mse_x100") is None:
         return '<p class="soft">No ground truth: distance errors are not known.</p>'
     head = "".join(f"<th>{name}<span class='soft'>{_share(metrics, key)}</span></th>" for key, name in PIXELS.items())
@@ -140,17 +141,17 @@ def _table(metrics: Mapping[str, object]) -> str:
     )
 
 
-def _share(metrics: Mapping[str, object], group: str) -> str:
+def _share(metrics: Mapping[str, Any], group: str) -> str:
     return f"{page.number(metrics, f'{group}share', 'percent')} of all" if group else "&nbsp;"
 
 
-def _cell(metrics: Mapping[str, object], key: str) -> str:
+def _cell(metrics: Mapping[str, Any], key: str) -> str:
     if page.look_up(metrics, key) is None:
         return page.number(metrics, key, "error")
     return f'{page.number(metrics, key, "error")} <span class="soft">{page.number(metrics, key, "rms_cm")}</span>'
 
 
-def _facts(metrics: Mapping[str, object]) -> str:
+def _facts(metrics: Mapping[str, Any]) -> str:
     facts = {
         "quad PSNR": page.number(metrics, "quad_psnr_db", "decibel"),
         "raw frames scored": page.number(metrics, "frames", "count"),
@@ -166,8 +167,8 @@ def _facts(metrics: Mapping[str, object]) -> str:
 
 
 def _distance_text(found: Findings, s: int) -> str:
-    reason = "most pixels move" if found.moving is not None else "quads change most"
-    scale = "on the truth's scale" if found.views.truth is not None else "on one scale"
+    reason = "most pixels move" if found.judgement is not None else "quads change most"
+    scale = "on the truth's scale" if found.judgement is not None else "on one scale"
     return (
         f'<p class="caption">Distance along the ray, all {scale}. Shown is raw frame {found.views.frames[s]}: in the '
         f"middle half of the sequence, the one where {reason}.</p>"
@@ -183,15 +184,15 @@ def _measured_text(found: Findings, s: int) -> str:
 
 def _distance_pictures(found: Findings, s: int) -> str:
     html = panels.distances(found, s)
-    if found.errors is None:
+    if found.judgement is None:
         return html
     html += (
         "<h3>Absolute error</h3>"
-        f"{panels.error_maps(found, s)}"
+        f"{panels.error_maps(found.judgement, s)}"
         '<p class="caption">One scale for all three, set by the errors of the closed form where things move; '
         "what exceeds it has the brightest colour.</p>"
     )
-    close_up = panels.close_up(found, s)
+    close_up = panels.close_up(found, found.judgement, s)
     return html + (f"<h3>Close-up of what moves</h3>{close_up}" if close_up else "")
 
 
@@ -212,13 +213,11 @@ def _curves(found: Findings, log: Sequence[Mapping[str, float]]) -> str:
     training = figures.training_curves(log)
     if training is not None:
         charts.append(("During optimisation", training))
-    if found.errors is not None:
-        errors = {name: found.errors[name] for name in panels.TITLES}
-        groups = {
-            "all pixels": np.ones_like(found.moving),
-            "moving pixels": found.moving,
-            "static pixels": found.static,
-        }
+    judged = found.judgement
+    if judged is not None:
+        errors = {name: judged.errors[name] for name in panels.TITLES}
+        everywhere = np.ones_like(judged.moving)
+        groups = {"all pixels": everywhere, "moving pixels": judged.moving, "static pixels": judged.static}
         groups = {name: mask for name, mask in groups.items() if mask.any()}
         per_frame = {
             group: {name: [_x100(v) for v in per_frame_mean(error, mask)] for name, error in errors.items()}
@@ -238,7 +237,7 @@ def _x100(value: float | None) -> float | None:
     return None if value is None else 100.0 * value
 
 
-def _how(config: Mapping[str, object], data_card: str | None) -> str:
+def _how(config: Mapping[str, Any], data_card: str | None) -> str:
     facts = {
         "sequence": config.get("sequence"),
         "preset": config.get("preset"),

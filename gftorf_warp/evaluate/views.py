@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,13 +15,13 @@ from ..constants import FRAMES_PER_QUARTET
 from ..data.decode import closed_form_distance
 from ..data.files import write_json
 from ..data.images import write_exr, write_png
-from ..data.sequence import Sequence, Truth
+from ..data.sequence import Sequence
 from ..errors import DivergedError, UsageError
 from ..render.api import Rendering
 from ..scene.camera import Camera
 from ..scene.sensor import Sensor
 from . import renders
-from .metrics import distance_from_quads, known_distance, normalised
+from .metrics import distance_from_quads, normalised
 
 if TYPE_CHECKING:
     from ..recon.run import Run
@@ -47,8 +47,6 @@ class Views:
     """The slot that was measured, as rendered [file units]."""
     quad_measured: Float[np.ndarray, "S H W"]
     """What was recorded there [file units]."""
-    truth: Float[np.ndarray, "S H W"] | None
-    """True distance [m], NaN where unknown; None without ground truth."""
 
     @property
     def d_normalised(self) -> Float[np.ndarray, "S H W"]:
@@ -64,7 +62,6 @@ class Views:
 def gather(
     run: Run,
     sequence: Sequence,
-    truth: Truth | None,
     frames: list[int],
     *,
     progress: Callable[[int, int], None] | None = None,
@@ -74,7 +71,6 @@ def gather(
     Args:
         run: A finished reconstruction.
         sequence: What it was made from.
-        truth: Ground truth at the same frames and size.
         frames: The raw frames n to render.
         progress: Called with (frames done, frames in all).
 
@@ -101,7 +97,6 @@ def gather(
         frames=frames,
         closed_form=np.stack([closed_forms[n // FRAMES_PER_QUARTET] for n in frames]).astype(np.float32),
         quad_measured=sequence.quads[frames],
-        truth=None if truth is None else known_distance(truth)[frames],
         **{name: np.stack(images) for name, images in rows.items()},
     )
 
@@ -145,8 +140,8 @@ def _finite(image: torch.Tensor, name: str, run: Run) -> Float[np.ndarray, "H W"
 def render_to_folder(
     run: Run,
     out: str | Path,
-    what: str | Collection[str] = ("distance", "quads"),
-    times: Collection[float] | None = None,
+    what: str | Iterable[str] = ("distance", "quads"),
+    times: Iterable[float] | None = None,
     *,
     progress: Callable[[int, int], None] | None = None,
 ) -> Path:
