@@ -1,0 +1,89 @@
+"""The README.md of a simulated sequence: what it shows, how to make it again, and every number of the sensor."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Mapping
+
+from .. import __version__
+from .readout import contrast, electron_gain
+from .record import Recording
+from .scenes import SCENES, Scene
+
+
+def settings_card(scene: Scene, options: Mapping) -> str:
+    """The part that follows from the settings alone, so that equal text means equal settings.
+
+    Args:
+        scene: What was recorded.
+        options: Keyword arguments of :func:`gftorf_warp.sim.record.record` by name, all resolved.
+    """
+    sensor, noisy = scene.sensor, options["noise"] and scene.sensor.noise
+    width, height = options["size"]
+    rows = {
+        "modulation frequency": f"{float(sensor.f_mod_hz) / 1e6:.9g} MHz, unambiguous to "
+        f"{sensor.unambiguous_range:.4f} m",
+        "shifts in time order": ", ".join(f"{math.degrees(shift):.0f}" for shift in sensor.shifts) + " deg",
+        "raw frames": f"{1 / sensor.frame_period_s:.6g} per second, "
+        + ("all four of a quartet at the time of its first" if options["sync"] else "each at its own time"),
+        "exposure": f"{1e3 * sensor.exposure_s:g} ms, "
+        + (f"mean of {n} instants" if (n := options["exposure_samples"]) > 1 else "taken as one instant"),
+        "taps": "one, unipolar" if sensor.unipolar else "two, differential",
+        "source intensity": f"{float(sensor.source_intensity):g}",
+        "phase offset": f"{float(sensor.phase_offset):g} rad",
+        "DC offset": f"{float(sensor.dc_offset):g} amplitudes",
+        "noise": "shot, read, full well, ADC" if noisy else "none: quads are exact means",
+    }
+    if noisy:
+        rows |= {
+            "electrons per unit of amplitude": f"{electron_gain(sensor):.4g} in one exposure, both taps together",
+            "contrast": f"{contrast(sensor):g}",
+            "ambient": f"{sensor.ambient_electrons:g} electrons per exposure",
+            "dark current": f"{sensor.dark_electrons_per_s:g} electrons per second and tap",
+            "read noise": f"{sensor.read_noise_electrons:g} electrons per tap",
+            "full well": f"{sensor.full_well_electrons:g} electrons per tap",
+            "ADC": f"{sensor.adc_bits or 'no'} bits, {sensor.electrons_per_code:g} electrons per code",
+        }
+    table = "\n".join(f"| {name} | {value} |" for name, value in rows.items())
+    return f"""# {scene.name}: simulated C-ToF sequence
+
+{scene.description[:1].upper() + scene.description[1:]}. Motion: {scene.motion}.
+{options["frames"]} raw frames of {width}x{height} pixels, {scene.horizontal_fov_deg:g} deg wide. \
+Light and camera coincide; direct light only.
+
+    {_command(scene, options)}
+
+Made by gftorf-warp {__version__}, scene {hashlib.sha256(repr(scene).encode()).hexdigest()[:16]}. \
+This data may be used under the licence of that program, Apache-2.0.
+
+| sensor | |
+|---|---|
+{table}
+
+Quads are in relative units: reflectance rho met at angle i and distance d gives the amplitude rho cos(i) / d^2.
+The scene is covered by Gaussians and rendered with {scene.subsamples}x{scene.subsamples} rays per pixel, averaged.
+Ground truth is the analytic first hit of the shapes along the ray through each pixel's centre at the time of each raw
+frame, not a rendering.
+"""
+
+
+def outcome_card(recording: Recording) -> str:
+    """The part that is known only afterwards: how far the rendering is from the truth, and what saturated."""
+    agreement = "no such pixel" if recording.gap is None else str(recording.gap)
+    return f"""
+Rendered mean distance against that truth, on interior pixels of still surfaces in all raw frames: {agreement}.
+Saturated: {100 * recording.saturated:.3g} % of all pixels and raw frames.
+"""
+
+
+def _command(scene: Scene, options: Mapping) -> str:
+    """What makes the same sequence again: a command line if there is one for it, else a call."""
+    if SCENES.get(scene.name) != scene or options["flow"] or options["exposure_samples"] > 1:
+        return (
+            f"gftorf_warp.simulate({scene.name}, ..., {', '.join(f'{key}={value}' for key, value in options.items())})"
+        )
+    width, height = options["size"]
+    command = f"gftorf simulate {scene.name} --out SEQ --frames {options['frames']} --size {width}x{height}"
+    command += f" --seed {options['seed']}"
+    return command + (" --sync" if options["sync"] else "") + ("" if options["noise"] else " --no-noise")

@@ -1,0 +1,100 @@
+"""Rigid paths: where a body is, and how it is turned, at any time.
+
+A path is a pure function of seconds, so every raw frame sees the body at its own instant and flow is exact.
+"""
+
+from __future__ import annotations
+
+import abc
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+Vector = tuple[float, float, float]
+
+
+def rotation_matrix(turn_deg: Vector) -> Float[np.ndarray, "3 3"]:
+    """Rotation of a rotation vector [deg]: its direction is the axis, its length the angle (Rodrigues)."""
+    vector = np.radians(np.asarray(turn_deg, dtype=np.float64))
+    angle = float(np.linalg.norm(vector))
+    if angle == 0.0:
+        return np.eye(3)
+    x, y, z = vector / angle
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.eye(3) + math.sin(angle) * cross + (1.0 - math.cos(angle)) * cross @ cross
+
+
+def rigid(rotation: Float[np.ndarray, "3 3"], position: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
+    """The 4x4 matrix that turns by ``rotation`` and then shifts by ``position`` [m]."""
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, position
+    return pose
+
+
+class Path(abc.ABC):
+    """A rigid motion. Final classes: Still, Line, Arc."""
+
+    @abc.abstractmethod
+    def world_from_body(self, time: float) -> Float[np.ndarray, "4 4"]:
+        """Pose at ``time`` [s]: takes points in the body's own axes to the world [m]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Still(Path):
+    """A body that does not move."""
+
+    position: Vector = (0.0, 0.0, 0.0)
+    """Origin of the body's axes in the world [m]."""
+    turn_deg: Vector = (0.0, 0.0, 0.0)
+    """Orientation as a rotation vector [deg]."""
+
+    def world_from_body(self, time: float) -> Float[np.ndarray, "4 4"]:
+        """The one pose, whatever the ``time`` [s]."""
+        del time
+        return rigid(rotation_matrix(self.turn_deg), np.asarray(self.position, dtype=np.float64))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Line(Path):
+    """Constant velocity, and optionally a constant spin about the body's origin: sliding, axial, or both at once."""
+
+    position: Vector
+    """Origin of the body's axes at ``passing_s`` [m]."""
+    velocity: Vector
+    """Velocity [m/s]."""
+    passing_s: float = 0.0
+    """When the body is at ``position`` with orientation ``turn_deg`` [s]."""
+    turn_deg: Vector = (0.0, 0.0, 0.0)
+    """Orientation at ``passing_s``, as a rotation vector [deg]."""
+    spin_deg_per_s: Vector = (0.0, 0.0, 0.0)
+    """Angular velocity in world axes, as a rotation vector [deg/s]."""
+
+    def world_from_body(self, time: float) -> Float[np.ndarray, "4 4"]:
+        """Pose at ``time`` [s]."""
+        elapsed = time - self.passing_s
+        x, y, z = self.spin_deg_per_s
+        spin = rotation_matrix((x * elapsed, y * elapsed, z * elapsed))
+        return rigid(spin @ rotation_matrix(self.turn_deg), np.add(self.position, np.multiply(self.velocity, elapsed)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Arc(Path):
+    """A horizontal circle at constant rate; the body turns with it, so that one face always points outwards."""
+
+    centre: Vector
+    """Centre of the circle in the world [m]."""
+    radius: float
+    """Radius [m]."""
+    start_deg: float
+    """Angle at time 0 [deg]: 0 is to the right of the centre (+x), 90 behind it (+z), -90 between it and the camera."""
+    rate_deg_per_s: float
+    """Angular rate [deg/s]."""
+
+    def world_from_body(self, time: float) -> Float[np.ndarray, "4 4"]:
+        """Pose at ``time`` [s]."""
+        degrees = self.start_deg + self.rate_deg_per_s * time
+        angle = math.radians(degrees)
+        offset = self.radius * np.array([math.cos(angle), 0.0, math.sin(angle)])
+        return rigid(rotation_matrix((0.0, -degrees, 0.0)), np.add(self.centre, offset))

@@ -1,0 +1,167 @@
+"""A named scene to a sequence on disk, with its ground truth and a data card."""
+
+from __future__ import annotations
+
+import difflib
+import math
+from pathlib import Path
+from typing import Any
+
+from ..constants import CANONICAL_SHIFTS
+from ..errors import UsageError
+from ..scene.sensor import Sensor
+from .card import outcome_card, settings_card
+from .readout import contrast
+from .record import Progress, record
+from .scenes import SCENES, Scene
+
+FORMATS = ("ftorf",)
+CARD = "README.md"
+MARKS = ("cams/depth_range.npy", "tofType0")  # what every F-ToeRF folder holds
+
+
+def simulate(
+    scene: str | Scene,
+    out: str | Path,
+    *,
+    frames: int | None = None,
+    size: tuple[int, int] | None = None,
+    seed: int = 0,
+    sync: bool = False,
+    noise: bool = True,
+    flow: bool = False,
+    exposure_samples: int = 1,
+    format: str = "ftorf",
+    fresh: bool = False,
+    progress: Progress | None = None,
+) -> Path:
+    """Record a moving scene with an asynchronous C-ToF sensor and write it as a sequence.
+
+    Raw frame n is a rendering of the scene at its own time, of which only the quad of slot n % 4 is kept and read out.
+    Beside it stands the analytic distance along each pixel's centre ray at that very time. The folder appears only when
+    it is complete; if it is already there and was made with the same settings, it is left as it is.
+
+    Args:
+        scene: Name of a scene, see ``SCENES``, or a scene.
+        out: Folder to write.
+        frames: Number of raw frames; None is the scene's own. A last quartet may be incomplete.
+        size: (width, height) of the image [px]; None is the scene's own.
+        seed: Of the noise. The same seed gives the same bytes; frame n does not depend on the number of frames.
+        sync: Control mode: all raw frames of a quartet are taken at the time of its first.
+        noise: False switches shot and read noise, full well and ADC off.
+        flow: Whether exact optical flow at quartet starts is stored beside the quads.
+        exposure_samples: Instants that a raw frame averages over the exposure, centred on its time; 1: no motion blur.
+        format: Layout on disk: 'ftorf'.
+        fresh: Whether another sequence in ``out`` is moved aside, to ``out-old-1``, instead of being an error.
+        progress: Called with (raw frames done, raw frames in all).
+
+    Returns:
+        The folder.
+
+    Raises:
+        UsageError: If an option cannot be meant that way, the format cannot express the sensor, or ``out`` holds
+            something else.
+    """
+    from ..data import ftorf
+
+    found = _scene(scene)
+    _check_options(found, frames, size, seed, exposure_samples, format)
+    _check_sensor(found.sensor)
+    options: dict[str, Any] = {
+        "frames": found.frames if frames is None else frames,
+        "size": (found.width, found.height) if size is None else tuple(size),
+        "seed": seed,
+        "sync": sync,
+        "noise": noise,
+        "flow": flow,
+        "exposure_samples": exposure_samples,
+    }
+    card = settings_card(found, options)
+    out = Path(out).absolute() if fresh else Path(out)
+    if not _check_folder(out, card, fresh=fresh):
+        return out
+    recording = record(found, **options, progress=progress)
+    if fresh:
+        _set_aside(out)
+    ftorf.write(out, recording.sequence, recording.truth, readme=card + outcome_card(recording))
+    return out
+
+
+def _scene(scene: str | Scene) -> Scene:
+    if isinstance(scene, Scene):
+        return scene
+    if scene not in SCENES:
+        close = difflib.get_close_matches(scene, SCENES, n=1, cutoff=0.5)
+        raise UsageError(
+            f"there is no scene named {scene!r}",
+            where="SCENE",
+            why=f"the named scenes are {', '.join(SCENES)}",
+            fix=f"did you mean {close[0]!r}?" if close else "take one of these, `--list` describes them",
+        )
+    return SCENES[scene]
+
+
+def _check_options(scene: Scene, frames, size, seed: int, exposure_samples: int, layout: str) -> None:
+    wanted = {
+        "--frames": (frames is None or frames >= 1, f"{frames}", f"at least 1, for example {scene.frames}"),
+        "--size": (
+            size is None or (len(size) == 2 and min(size) >= 1),
+            "x".join(map(str, size or ())),
+            f"WIDTHxHEIGHT, both at least 1, for example {scene.width}x{scene.height}",
+        ),
+        "--seed": (seed >= 0, f"{seed}", "0 or more"),
+        "exposure_samples": (exposure_samples >= 1, f"{exposure_samples}", "at least 1"),
+        "--format": (layout in FORMATS, repr(layout), f"one of {', '.join(FORMATS)}"),
+    }
+    for where, (good, got, want) in wanted.items():
+        if not good:
+            raise UsageError(f"cannot simulate with {got}", where=where, why=f"expected {want}", fix="change it")
+
+
+def _check_sensor(sensor: Sensor) -> None:
+    turns = sorted(round(math.degrees(shift), 4) % 360.0 for shift in sensor.shifts)
+    if turns != sorted(math.degrees(shift) for shift in CANONICAL_SHIFTS):
+        raise UsageError(
+            "an F-ToeRF folder cannot express this sensor",
+            where="sensor.shifts",
+            why=f"it holds the four shifts 0, 90, 180 and 270 deg in some order, not {turns} deg",
+            fix="use those four shifts",
+        )
+    if sensor.noise and not sensor.unipolar and contrast(sensor) * (1 + abs(float(sensor.dc_offset))) > 1:
+        raise UsageError(
+            "a tap of this sensor would hold negative light",
+            where="sensor.dc_offset",
+            why=f"differential taps allow contrast (1 + |dc_offset|) <= 1, not {contrast(sensor):g} (1 + "
+            f"{abs(float(sensor.dc_offset)):g})",
+            fix="lower the contrast or the DC offset, or make the sensor unipolar",
+        )
+
+
+def _check_folder(out: Path, card: str, *, fresh: bool) -> bool:
+    """Whether there is anything to do: False if ``out`` holds what these settings give.
+
+    Raises:
+        UsageError: If ``out`` holds anything else that may not be moved aside.
+    """
+    if not out.exists() or (out.is_dir() and not any(out.iterdir())):
+        return True
+    sequence = out.is_dir() and all((out / mark).exists() for mark in MARKS)
+    if not fresh and sequence and (out / CARD).is_file() and (out / CARD).read_text(errors="replace").startswith(card):
+        return False
+    if fresh and sequence:
+        return True
+    raise UsageError(
+        "the folder is not empty" if out.is_dir() else "not a folder",
+        where=out,
+        why="it holds a sequence made with other settings" if sequence else "it holds something that is no sequence",
+        fix="choose another --out" + (", or move this one aside with --fresh" if sequence else ""),
+    )
+
+
+def _set_aside(out: Path) -> None:
+    """Rename a folder with content to the first free ``out-old-N``."""
+    if out.exists() and any(out.iterdir()):
+        number = 1
+        while out.with_name(f"{out.name}-old-{number}").exists():
+            number += 1
+        out.rename(out.with_name(f"{out.name}-old-{number}"))

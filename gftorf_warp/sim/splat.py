@@ -1,0 +1,237 @@
+"""Shapes covered by flat Gaussians, dense enough that a rendering of them is the surface.
+
+A splat seen by a pixel has the profile exp(-r^2 / 2v), v = its own variance on the image plus the renderer's low-pass.
+Neighbours overlap, and those nearer to the camera come first, so a cover differs from the surface it stands for in
+three known ways, computed by :func:`overlap` and :func:`spread` from the compositing rule itself:
+
+* it returns only the share  sum alpha T^2 < 1  of the light, hence reflectivity = rho cos(incidence) / share;
+* it reaches beyond its outermost centres by ``spread`` pixels, hence grids stay that far inside what may be an outline;
+* on a slanted surface the near side of the footprint counts more, so the mean distance falls short by ``lead`` pixels
+  of slope. Splats of still bodies are set back along their rays by that much; on bodies that move it is left in,
+  since their covers are rigid and the view of them changes.
+
+Still bodies are covered where the rays of the (still) camera meet them, one splat a pixel: no splat is wasted and no
+beat with the pixel grid appears. Bodies that move get a regular grid on each face, fine enough for their nearest point.
+Reflectivity is the same in every direction of view, and shading by the angle of incidence is evaluated anew for every
+instant: what the sensor measures obeys Lambert's law, not the model that is fitted to it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from ..constants import ALPHA_MAX, ALPHA_MIN, LOW_PASS
+from ..scene.camera import Camera
+from ..scene.gaussians import GaussianField, constant_sh
+from .world import Body, first_hit
+
+RADIUS = 0.2  # [px] of a splat before the low-pass: small, because every pixel of overlap blurs the surface
+SPACING = 0.8  # [px] of the grid on moving bodies; the renderer's low-pass closes the gaps up to about 1 px
+MARGIN = 3  # [px] of cover beyond the image, more than a splat reaches
+OPACITY_LOGIT = 9.0  # opacity 0.9999, above the clamp of alpha
+THICKNESS = 1e-4  # [m] of the discs
+COSINE_MIN = 0.1  # splats grow no longer than this on surfaces met at a glancing angle
+
+
+@cache
+def overlap(spacing: float, variance: float, aligned: bool) -> tuple[float, float]:
+    """What a cover does at a pixel: (share of the light returned [1], lead of the near side [px]).
+
+    Args:
+        spacing: Distance between splats [px].
+        variance: Variance v of a splat on the image [px^2].
+        aligned: Whether every pixel centre sees a splat centre; otherwise both are averaged over all alignments.
+    """
+    index = np.arange(-8, 9) * spacing
+    x, y = (axis.ravel() for axis in np.meshgrid(index, index, indexing="ij"))  # x: from near to far
+    phases = [0.0] if aligned else (np.arange(6) / 6 * spacing).tolist()
+    shares, leads = [], []
+    for dx in phases:
+        for dy in phases:
+            alpha = np.minimum(ALPHA_MAX, np.exp(-((x + dx) ** 2 + (y + dy) ** 2) / (2 * variance)))
+            alpha[alpha < ALPHA_MIN] = 0.0
+            before = np.concatenate([[1.0], np.cumprod(1.0 - alpha)[:-1]])
+            shares.append(np.sum(alpha * before**2))
+            leads.append(-np.sum(alpha * before * (x + dx)) / np.sum(alpha * before))
+    return float(np.mean(shares)), float(np.mean(leads))
+
+
+@cache
+def spread(spacing: float, variance: float) -> float:
+    """How far a cover that ends at a straight row of splats reaches beyond that row [px], judged by the light it stops.
+
+    The opaque half-plane of equal coverage ends there. ``spacing`` [px] and ``variance`` [px^2] as in :func:`overlap`.
+    """
+    rows, columns = np.meshgrid(-np.arange(12) * spacing, np.arange(-12, 13) * spacing)
+    step = 0.05
+    x = np.arange(-4.0, 4.0, step)[:, None, None, None] + step / 2
+    y = np.arange(4)[None, :, None, None] / 4 * spacing
+    alpha = np.minimum(ALPHA_MAX, np.exp(-((x - rows) ** 2 + (y - columns) ** 2) / (2 * variance)))
+    alpha[alpha < ALPHA_MIN] = 0.0
+    covered = 1.0 - np.prod(1.0 - alpha, axis=(2, 3)).mean(1)
+    return float(covered.sum() * step) - 4.0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Cover:
+    """The splats of one body, or of all still bodies together (then its axes are the world's)."""
+
+    point: Float[np.ndarray, "N 3"]
+    """Centres in the axes of the body [m]."""
+    normal: Float[np.ndarray, "N 3"]
+    """Unit normals, likewise."""
+    other: Float[np.ndarray, "N 3"]
+    """At an edge, normals of the other face: the splat shows only if both faces do, since elsewhere it is outline."""
+    limb: float
+    """A splat shows only if the cosine of its incidence exceeds this [1]."""
+    frame: Float[np.ndarray, "N 3 3"]
+    """Orientation of each disc, likewise: columns are its two axes and its normal."""
+    scale: Float[np.ndarray, "N 3"]
+    """Standard deviations along those axes [m]."""
+    reflectance: Float[np.ndarray, "N"]
+    """Reflectance rho over the share of the light that the cover returns [1]."""
+    body: Body | None
+    """Whose path moves it; None for the cover of the still bodies."""
+
+    def __len__(self) -> int:
+        return len(self.point)
+
+    def seen(self, centre: Float[np.ndarray, "3"], time: float) -> GaussianField:
+        """The splats that face a camera at ``centre`` [m] at ``time`` [s], in world axes, shaded by their incidence.
+
+        Splats that face away are left out: their own body hides them.
+        """
+        pose = np.eye(4) if self.body is None else self.body.path.world_from_body(time)
+        rotation = pose[:3, :3]
+        mean = self.point @ rotation.T + pose[:3, 3]
+        ray = mean - centre
+        length = np.linalg.norm(ray, axis=1)
+        cosine, cosine_other = (
+            -np.sum(normal @ rotation.T * ray, axis=1) / length for normal in (self.normal, self.other)
+        )
+        facing = (cosine > self.limb) & (cosine_other > self.limb)
+        cosine = 0.5 * (cosine + cosine_other)
+        count = int(facing.sum())
+        return GaussianField(
+            mean=_tensor(mean[facing]),
+            log_scale=_tensor(np.log(self.scale[facing])),
+            quaternion=_tensor(_quaternion(rotation @ self.frame[facing])),
+            opacity_logit=torch.full((count,), OPACITY_LOGIT),
+            reflectivity_sh=constant_sh(_tensor(self.reflectance[facing] * cosine[facing])),
+        )
+
+
+def cover_still(bodies: tuple[Body, ...], camera: Camera) -> Cover:
+    """One splat on the ray of every pixel of ``camera`` (and a margin around the image) that meets a still body.
+
+    Each is a disc in the surface, stretched along the slope so that it looks round, and set back as described above.
+    """
+    wide = Camera(
+        width=camera.width + 2 * MARGIN,
+        height=camera.height + 2 * MARGIN,
+        fx=camera.fx,
+        fy=camera.fy,
+        cx=camera.cx + MARGIN,
+        cy=camera.cy + MARGIN,
+        camera_from_world=camera.camera_from_world,
+    )
+    hits = first_hit(bodies, wide, 0.0)
+    hit = np.isfinite(hits.distance)
+    normal, distance = hits.normal[hit], hits.distance[hit]
+    ray = wide.rays(dtype=torch.float64).numpy()[hit]
+    cosine = np.clip(-np.sum(normal * ray, axis=1), COSINE_MIN, 1.0)
+    share, lead = overlap(1.0, LOW_PASS + RADIUS**2, True)
+
+    across = np.cross(normal, ray)  # the axis of the disc that is not foreshortened; any, where it is met head-on
+    level = np.linalg.norm(across, axis=1) < 1e-9
+    across[level] = np.cross(normal[level], [1.0, 0.0, 0.0])
+    across[level & (np.linalg.norm(across, axis=1) < 1e-9)] = [0.0, 1.0, 0.0]
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    footprint = RADIUS * distance / camera.fx
+    return Cover(
+        point=hits.point[hit] + ray * (lead * _slope(normal, distance, ray, wide))[:, None],
+        normal=normal,
+        other=normal,
+        limb=0.0,
+        frame=np.stack([across, np.cross(normal, across), normal], axis=2),
+        scale=np.stack([footprint, footprint / cosine, np.full(len(distance), THICKNESS)], axis=1),
+        reflectance=hits.reflectance[hit] / share,
+        body=None,
+    )
+
+
+def cover_moving(body: Body, camera: Camera, times: Float[np.ndarray, "F"]) -> Cover:
+    """A regular grid of discs on each face, ``SPACING`` pixels apart where the body is nearest at ``times`` [s]."""
+    centres = np.array([body.path.world_from_body(float(t))[:3, 3] for t in times])
+    distances = np.maximum(np.linalg.norm(centres - camera.centre, axis=1) - body.shape.reach, 0.1 * body.shape.reach)
+    nearest, typical = distances.min(), distances.mean()
+    spacing, variance = SPACING * nearest / camera.fx, LOW_PASS + RADIUS**2
+    inset = spread(SPACING * nearest / typical, variance) * typical / camera.fx - spacing / 2
+    point, normal, other, limb = body.shape.grid(spacing, inset)
+    helper = np.where(np.abs(normal[:, :1]) < 0.7, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
+    across = np.cross(normal, helper)
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    radius = RADIUS / SPACING * spacing
+    share, _ = overlap(SPACING, variance, False)
+    return Cover(
+        point=point,
+        normal=normal,
+        other=other,
+        limb=limb,
+        frame=np.stack([across, np.cross(normal, across), normal], axis=2),
+        scale=np.tile([radius, radius, THICKNESS], (len(point), 1)),
+        reflectance=body.texture(point) / share,
+        body=body,
+    )
+
+
+def merge(fields: list[GaussianField]) -> GaussianField:
+    """One field of several, in their order."""
+    parts = [field.parameters() for field in fields]
+    return GaussianField(**{name: torch.cat([part[name] for part in parts]) for name in parts[0]})
+
+
+def _slope(normal, distance, ray, camera: Camera) -> Float[np.ndarray, "N"]:
+    """Growth of distance [m/px] on the tangent plane, where on the image z-depth, which orders splats, grows fastest.
+
+    With the normal n, the direction f = (x/z, y/z, 1) and n . f z constant, grad z = -z n / (n . f) / focal length and
+    d = z |f|. Zero where z-depth is level: then ties are broken by index and no side leads.
+    """
+    camera_from_world = camera.camera_from_world[:3, :3]
+    local_ray, local_normal = ray @ camera_from_world.T, normal @ camera_from_world.T
+    flat = local_ray / local_ray[:, 2:]  # (x/z, y/z, 1)
+    along = np.sum(local_normal * flat, axis=1)
+    z = distance * local_ray[:, 2]
+    gradient_z = -z[:, None] * local_normal[:, :2] / along[:, None] / [camera.fx, camera.fy]
+    length = np.linalg.norm(flat, axis=1)
+    gradient = gradient_z * length[:, None] + z[:, None] * flat[:, :2] / length[:, None] / [camera.fx, camera.fy]
+    steepness = np.linalg.norm(gradient_z, axis=1)
+    slanted = steepness > 1e-5 * z
+    slope = np.sum(gradient * gradient_z, axis=1) / np.where(slanted, steepness, 1.0)
+    limit = distance / camera.fx / COSINE_MIN
+    return np.where(slanted, np.clip(slope, -limit, limit), 0.0)
+
+
+def _tensor(array: np.ndarray) -> torch.Tensor:
+    return torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))
+
+
+def _quaternion(rotation: Float[np.ndarray, "N 3 3"]) -> Float[np.ndarray, "N 4"]:
+    """Unit quaternions (wxyz) of rotations, from the largest of the four components, which never vanishes."""
+    r = rotation
+    trace = np.trace(r, axis1=1, axis2=2)
+    squares = np.stack([trace, r[:, 0, 0], r[:, 1, 1], r[:, 2, 2]], axis=1)
+    squares[:, 1:] = 2.0 * squares[:, 1:] - trace[:, None]  # now (4 component^2 - 1)
+    products = np.empty((len(r), 4, 4))  # 4 times the products of components
+    products[:, range(4), range(4)] = squares + 1.0
+    for i, (j, k) in enumerate(((2, 1), (0, 2), (1, 0)), start=1):
+        products[:, 0, i] = products[:, i, 0] = r[:, j, k] - r[:, k, j]
+    for i, j in ((0, 1), (0, 2), (1, 2)):
+        products[:, i + 1, j + 1] = products[:, j + 1, i + 1] = r[:, i, j] + r[:, j, i]
+    row = products[np.arange(len(r)), squares.argmax(axis=1)]
+    return row / np.linalg.norm(row, axis=1, keepdims=True)

@@ -1,0 +1,279 @@
+"""Shapes with reflectance, moved along rigid paths, and the exact first hit of every pixel's centre ray.
+
+The hits are the ground truth: closed forms in float64 that share no step with the renderer. Light and camera coincide:
+a surface of reflectance rho met under the angle of incidence i has the amplitude rho cos(i) / d^2 (sensor notes, 2.2).
+"""
+
+from __future__ import annotations
+
+import abc
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+
+from ..scene.camera import Camera
+from .paths import Path, Still
+
+TEXTURE_ORIGIN = 37.0001  # [m] keeps cell numbers positive and cell borders off the faces, which lie at round numbers
+GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))  # [rad] between neighbours of a spiral that covers a sphere evenly
+
+
+@dataclass(frozen=True, kw_only=True)
+class Texture:
+    """Reflectance in hashed cells of a 3-D grid in the body's axes (sensor notes, 4.1); ``low == high`` is plain."""
+
+    low: float
+    """Smallest reflectance [1]."""
+    high: float
+    """Largest reflectance [1]."""
+    cell: float = 0.3
+    """Edge of a cell [m]."""
+
+    def __call__(self, point: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P"]:
+        """Reflectance [1] at points in the body's axes [m]."""
+        x, y, z = np.floor((point.T + TEXTURE_ORIGIN) / self.cell).astype(np.int64)
+        cell = (x * 73856093) ^ (y * 19349663) ^ (z * 83492791)
+        return self.low + (self.high - self.low) * ((cell * 2654435761) & 0xFFFF) / 65535.0
+
+
+class Grid(NamedTuple):
+    """Points that cover a surface."""
+
+    point: Float[np.ndarray, "N 3"]
+    """Positions in the axes of the shape [m]."""
+    normal: Float[np.ndarray, "N 3"]
+    """Unit normals."""
+    other: Float[np.ndarray, "N 3"]
+    """Normal of the other face at an edge, the same normal elsewhere: a point shows only if both face the viewer."""
+    limb: float
+    """A point shows only if the cosine of its incidence is above this [1]: keeps round shapes off their outline."""
+
+
+class Shape(abc.ABC):
+    """A surface in its own axes, seen from one side. Final classes: Box, Plane, Sphere."""
+
+    @abc.abstractmethod
+    def hit(
+        self, origin: Float[np.ndarray, "3"], ray: Float[np.ndarray, "P 3"]
+    ) -> tuple[Float[np.ndarray, "P"], Int[np.ndarray, "P"]]:
+        """Distance along unit rays to the first hit [m], infinite where there is none, and the number of the face."""
+
+    @abc.abstractmethod
+    def normal(self, point: Float[np.ndarray, "P 3"], face: Int[np.ndarray, "P"]) -> Float[np.ndarray, "P 3"]:
+        """Unit normals at points of the surface, towards the side from which it is seen."""
+
+    @abc.abstractmethod
+    def grid(self, spacing: float, inset: float) -> Grid:
+        """Points about ``spacing`` [m] apart on the surface, ``inset`` [m] away from what may become its outline."""
+
+    @property
+    @abc.abstractmethod
+    def reach(self) -> float:
+        """Largest distance of the surface from the origin of its axes [m]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Box(Shape):
+    """A box about its origin; ``inside`` makes it a room, seen from within."""
+
+    size: tuple[float, float, float]
+    """Full edge lengths along x, y, z [m]."""
+    inside: bool = False
+    """False: a solid. True: a room."""
+
+    def hit(self, origin, ray):
+        """Slab method; faces are numbered 2 axis + (1 on the positive side)."""
+        half = np.asarray(self.size) / 2
+        with np.errstate(divide="ignore", invalid="ignore"):
+            a, b = (-half - origin) / ray, (half - origin) / ray
+        enter, leave = np.minimum(a, b), np.maximum(a, b)
+        near, far = enter.max(1), leave.min(1)
+        distance, axis = (far, leave.argmin(1)) if self.inside else (near, enter.argmax(1))
+        along = np.take_along_axis(ray, axis[:, None], 1)[:, 0]
+        positive = (along > 0) if self.inside else (along < 0)
+        return np.where((near < far) & (distance > 0), distance, np.inf), 2 * axis + positive
+
+    def normal(self, point, face):
+        """Along the axis of the face: outwards, or inwards in a room."""
+        normal = np.zeros_like(point)
+        outwards = np.where(face % 2, 1.0, -1.0)
+        np.put_along_axis(normal, face[:, None] // 2, (-outwards if self.inside else outwards)[:, None], 1)
+        return normal
+
+    def grid(self, spacing, inset):
+        """A regular grid on each of the six faces, and a row along each of the twelve edges."""
+        half = np.asarray(self.size) / 2
+        turned = -1.0 if self.inside else 1.0
+        points, normals, others = [], [], []
+        for axis, u, v in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+            flat = _grid(self.size[u] - 2 * inset, self.size[v] - 2 * inset, spacing)
+            row = _grid(self.size[axis] - 2 * inset, spacing, spacing)[:, 0]
+            for side in (-1.0, 1.0):
+                face = np.empty((len(flat), 3))
+                face[:, axis], face[:, u], face[:, v] = side * half[axis], flat[:, 0], flat[:, 1]
+                points.append(face)
+                normals.append(np.tile(turned * side * np.eye(3)[axis], (len(flat), 1)))
+                others.append(normals[-1])
+                for across in (
+                    -1.0,
+                    1.0,
+                ):  # the edge along ``axis`` between the faces ``side`` of u and ``across`` of v
+                    edge = np.empty((len(row), 3))
+                    edge[:, axis], edge[:, u], edge[:, v] = row, side * half[u], across * half[v]
+                    points.append(edge)
+                    normals.append(np.tile(turned * side * np.eye(3)[u], (len(row), 1)))
+                    others.append(np.tile(turned * across * np.eye(3)[v], (len(row), 1)))
+        return Grid(np.concatenate(points), np.concatenate(normals), np.concatenate(others), 0.0)
+
+    @property
+    def reach(self) -> float:
+        """Half the diagonal [m]."""
+        return float(np.linalg.norm(self.size)) / 2
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plane(Shape):
+    """A rectangle in the plane z = 0, seen from its -z side: unturned, it faces a camera that looks along +z."""
+
+    size: tuple[float, float]
+    """Edge lengths along x and y [m]."""
+
+    def hit(self, origin, ray):
+        """Where z = 0, if the ray comes from -z and meets the rectangle."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            distance = -origin[2] / ray[:, 2]
+        seen = (ray[:, 2] > 0) & (distance > 0)
+        point = origin + ray * np.where(seen, distance, 0.0)[:, None]
+        seen &= (np.abs(point[:, :2]) <= np.asarray(self.size) / 2).all(1)
+        return np.where(seen, distance, np.inf), np.zeros(len(ray), dtype=np.int64)
+
+    def normal(self, point, face):
+        """-z everywhere."""
+        del face
+        return np.broadcast_to([0.0, 0.0, -1.0], point.shape).copy()
+
+    def grid(self, spacing, inset):
+        """A regular grid."""
+        flat = _grid(self.size[0] - 2 * inset, self.size[1] - 2 * inset, spacing)
+        point = np.concatenate([flat, np.zeros((len(flat), 1))], axis=1)
+        normal = self.normal(point, np.zeros(len(point), dtype=np.int64))
+        return Grid(point, normal, normal, 0.0)
+
+    @property
+    def reach(self) -> float:
+        """Half the diagonal [m]."""
+        return float(np.linalg.norm(self.size)) / 2
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sphere(Shape):
+    """A ball about its origin, seen from outside."""
+
+    radius: float
+    """Radius [m]."""
+
+    def hit(self, origin, ray):
+        """The nearer root of |origin + t ray| = radius."""
+        along = -ray @ origin
+        discriminant = along**2 - (origin @ origin - self.radius**2)
+        distance = along - np.sqrt(np.maximum(discriminant, 0.0))
+        return np.where((discriminant > 0) & (distance > 0), distance, np.inf), np.zeros(len(ray), dtype=np.int64)
+
+    def normal(self, point, face):
+        """Away from the centre."""
+        del face
+        return point / np.linalg.norm(point, axis=1, keepdims=True)
+
+    def grid(self, spacing, inset):
+        """A golden-angle spiral, the most even cover of a sphere that a formula gives."""
+        count = max(8, int(np.ceil(4 * np.pi * self.radius**2 / spacing**2)))
+        z = 1.0 - (2.0 * np.arange(count) + 1.0) / count
+        around = np.sqrt(1.0 - z**2)
+        angle = GOLDEN_ANGLE * np.arange(count)
+        normal = np.stack([around * np.cos(angle), around * np.sin(angle), z], axis=1)
+        limb = np.sqrt(min(0.5, 2.0 * inset / self.radius))  # radius (1 - sin) = inset where the cosine is small
+        return Grid(self.radius * normal, normal, normal, float(limb))
+
+    @property
+    def reach(self) -> float:
+        """The radius [m]."""
+        return self.radius
+
+
+def _grid(width: float, height: float, spacing: float) -> Float[np.ndarray, "N 2"]:
+    """Centres of a grid of cells no larger than ``spacing`` that fill a rectangle about the origin."""
+    columns, rows = (max(1, int(np.ceil(length / spacing))) for length in (width, height))
+    x = ((np.arange(columns) + 0.5) / columns - 0.5) * max(width, 0.0)
+    y = ((np.arange(rows) + 0.5) / rows - 0.5) * max(height, 0.0)
+    return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Body:
+    """A shape of one texture on one path."""
+
+    shape: Shape
+    """Its surface."""
+    texture: Texture
+    """Its reflectance."""
+    path: Path
+    """Its motion."""
+
+    @property
+    def moves(self) -> bool:
+        """Whether the path is anything but :class:`Still`."""
+        return not isinstance(self.path, Still)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Hits:
+    """The first surface on the centre ray of every pixel at one instant."""
+
+    distance: Float[np.ndarray, "H W"]
+    """Distance along the ray [m]; NaN where nothing is hit."""
+    body: Int[np.ndarray, "H W"]
+    """Index of the body; -1 where nothing is hit."""
+    face: Int[np.ndarray, "H W"]
+    """Number of its face."""
+    point: Float[np.ndarray, "H W 3"]
+    """The hit in the world [m]; NaN where there is none."""
+    normal: Float[np.ndarray, "H W 3"]
+    """Unit normal in the world, towards the camera; NaN where there is none."""
+    reflectance: Float[np.ndarray, "H W"]
+    """Reflectance rho [1]; 0 where nothing is hit."""
+    amplitude: Float[np.ndarray, "H W"]
+    """rho cos(incidence) / d^2 for a source intensity of 1 [relative units]; 0 where nothing is hit."""
+
+
+def first_hit(bodies: tuple[Body, ...], camera: Camera, time: float) -> Hits:
+    """First hit of every pixel's centre ray with all ``bodies`` as they are at ``time`` [s], in float64."""
+    shape = (camera.height, camera.width)
+    ray = camera.rays(dtype=torch.float64).numpy().reshape(-1, 3)
+    centre = camera.centre
+    distance = np.full(len(ray), np.inf)
+    body, face = np.full(len(ray), -1), np.zeros(len(ray), dtype=np.int64)
+    normal, reflectance = np.full((len(ray), 3), np.nan), np.zeros(len(ray))
+    for index, candidate in enumerate(bodies):
+        pose = candidate.path.world_from_body(time)
+        rotation, position = pose[:3, :3], pose[:3, 3]
+        origin, local = rotation.T @ (centre - position), ray @ rotation
+        reached, side = candidate.shape.hit(origin, local)
+        nearer = reached < distance
+        point = origin + local[nearer] * reached[nearer, None]
+        distance[nearer], body[nearer], face[nearer] = reached[nearer], index, side[nearer]
+        normal[nearer] = candidate.shape.normal(point, side[nearer]) @ rotation.T
+        reflectance[nearer] = candidate.texture(point)
+    distance = np.where(body < 0, np.nan, distance)
+    cosine = np.abs((normal * ray).sum(1))
+    return Hits(
+        distance=distance.reshape(shape),
+        body=body.reshape(shape),
+        face=face.reshape(shape),
+        point=(centre + ray * distance[:, None]).reshape(*shape, 3),
+        normal=normal.reshape(*shape, 3),
+        reflectance=reflectance.reshape(shape),
+        amplitude=np.where(body < 0, 0.0, reflectance * cosine / distance**2).reshape(shape),
+    )
