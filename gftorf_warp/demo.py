@@ -65,8 +65,11 @@ def demo(
         sequence = Sequence.open(out / "seq")
         step.says = f"{SCENE} {sequence.width}x{sequence.height}, {sequence.frames} raw frames -> {out / 'seq'}"
     with _Step("[2/4] check      ") as step:
-        for line in str(check(out / "seq")).splitlines():
+        found = check(out / "seq")
+        for line in found.lines:
             LOG.debug("      %s", line)
+        for line in found.warnings:
+            LOG.warning(line)
         step.says = f"{len(sequence.complete_quartets)} complete quartets at {sequence.f_mod_hz / 1e6:.2f} MHz"
     with _Step("[3/4] reconstruct") as step:
         run = reconstruct(

@@ -60,7 +60,8 @@ class Progress:
 
 def progress_line(label: str, done: int, total: int, first: int, elapsed_s: float, values: dict[str, object]) -> str:
     """One line of progress; the time left [s] follows from the speed since step ``first``."""
-    shown = [f"{name} {value:.4g}" if isinstance(value, float) else f"{name} {value}" for name, value in values.items()]
+    given = {name: value for name, value in values.items() if value is not None}
+    shown = [f"{name} {value:.4g}" if isinstance(value, float) else f"{name} {value}" for name, value in given.items()]
     if done >= total:
         shown.append(f"{elapsed_s:.1f} s")
     elif done > first:

@@ -119,9 +119,9 @@ def test_everything_public_says_what_it_is(path):
         if isinstance(holder, ast.ClassDef) and any("frozen" in ast.unparse(d) for d in holder.decorator_list):
             for node, after in zip(holder.body, [*holder.body[1:], None], strict=True):
                 if isinstance(node, ast.AnnAssign):
-                    assert isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant), (
-                        f"line {node.lineno}: {ast.unparse(node.target)} needs a docstring under it, with its unit"
-                    )
+                    text = after.value if isinstance(after, ast.Expr) else None
+                    where = f"line {node.lineno}: {ast.unparse(node.target)}"
+                    assert isinstance(text, ast.Constant), f"{where} needs a docstring under it, with its unit"
 
 
 def kernels():
@@ -196,8 +196,8 @@ def test_no_path_of_any_machine():
 
 def test_the_documents_know_the_rooms():
     """ARCHITECTURE.md names every room with what it may import; a new room cannot be forgotten there."""
-    text = (REPOSITORY / "ARCHITECTURE.md").read_text()
-    rows = {cells[1].strip(" `*"): cells for cells in (line.split("|") for line in text.splitlines()) if len(cells) == 6}
+    lines = (REPOSITORY / "ARCHITECTURE.md").read_text().splitlines()
+    rows = {cells[1].strip(" `*"): cells for cells in (line.split("|") for line in lines) if len(cells) == 6}
     for room, (rooms, packages) in TABLE.items():
         if room.endswith(".py"):
             continue

@@ -47,7 +47,8 @@ def test_reconstruction_from_python(tmp_path):
     """All steps by function calls; the quality is the demo's business, not this test's."""
     metrics = load("05_reconstruct").main(tmp_path, images=80)
     assert metrics["frames"] == 12
-    assert metrics["d_mse_x100"] > 0 and metrics["closed_form_mse_x100"] > 0
+    assert metrics["d_mse_x100"] > 0
+    assert metrics["closed_form_mse_x100"] > 0
 
 
 def test_no_example_is_forgotten():
