@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import json
+import platform
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -146,10 +148,18 @@ def write_report(run: Run, result: dict[str, Any], found: Findings) -> Path:
         config=run.config,
         log=training_log(run.path / "metrics.jsonl"),
         found=found,
+        installed=installed_versions(),
         data_card=truth_statement(found.sequence.path),
     )
     atomic_write(path, page.encode("utf-8"))
     return path
+
+
+def installed_versions() -> str:
+    """This program, what it computes with, and on what, in words."""
+    packages = ("torch", "warp-lang", "numpy")
+    versions = ", ".join(f"{name} {importlib.metadata.version(name)}" for name in packages)
+    return f"gftorf-warp {__version__}, {versions}, Python {platform.python_version()}, {platform.system()}"
 
 
 def training_log(path: Path) -> list[dict[str, float]]:

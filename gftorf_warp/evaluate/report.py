@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -20,8 +21,12 @@ ROWS = {
 }
 PIXELS = {"": "all pixels", "moving.": "moving pixels", "static.": "static pixels"}
 INIT_WORDS = {
-    "phase": "phase: Gaussians start on surfaces decoded from the measured quads",
+    "phase": "phase: Gaussians start on surfaces decoded from the measured quads, not at random",
     "random": "random: Gaussians start anywhere in view",
+}
+MOTION_WORDS = {
+    "nodes": "nodes: Gaussians follow a few moving nodes with one offset per quartet, linear in between; no network",
+    "still": "still: nothing moves, a control",
 }
 FLOW_WORDS = {
     "file": "file: optical flow that came with the sequence",
@@ -56,6 +61,7 @@ def report(
     config: Mapping[str, Any],
     log: Sequence[Mapping[str, float]],
     found: Findings,
+    installed: str = "",
     data_card: str | None = None,
 ) -> str:
     """The page.
@@ -66,6 +72,7 @@ def report(
         config: Content of the run's config.json.
         log: Steps of the run's metrics.jsonl.
         found: Arrays behind the pictures.
+        installed: Versions of the programs that compared.
         data_card: What the sequence's README says about its truth; None if it has none.
     """
     s = panels.telling_row(found)
@@ -79,7 +86,7 @@ def report(
         _section("Quads", _quad_text(found, s) + panels.quad_residual(found, s)),
         _section("Over time", _time_pictures(found)),
         _section("Curves", _curves(found, log)),
-        _section("How it was made", _how(config, data_card)),
+        _section("How it was made", _how(config, data_card, installed)),
         _section("How to read it", TO_READ),
     ]
     return page.document(f"{title} - gftorf compare", "".join(sections))
@@ -237,22 +244,44 @@ def _x100(value: float | None) -> float | None:
     return None if value is None else 100.0 * value
 
 
-def _how(config: Mapping[str, Any], data_card: str | None) -> str:
+def _in_words(words: Mapping[str, str], name: object) -> object:
+    return words.get(str(name), name)
+
+
+def _times(size: Sequence[int] | None, text: str) -> str | None:
+    return None if size is None else f"{size[0]}x{size[1]} {text}"
+
+
+def _with_source(value: float | None, source: str | None) -> str | None:
+    return None if value is None else f"{value:.6g} ({source})"
+
+
+def _with_threads(device: str | None, threads: int | None) -> str | None:
+    return device if threads is None else f"{device}, {threads} threads"
+
+
+def _how(config: Mapping[str, Any], data_card: str | None, installed: str) -> str:
     facts = {
         "sequence": config.get("sequence"),
         "preset": config.get("preset"),
-        "initialisation": INIT_WORDS.get(str(config.get("init")), config.get("init")),
-        "motion": config.get("motion"),
-        "optical flow": FLOW_WORDS.get(str(config.get("flow_source")), config.get("flow_source")),
-        "seed": config.get("seed"),
-        "device": f"{config.get('device')}, {config.get('threads')} threads",
-        "version of the reconstruction": config.get("version"),
+        "initialisation": _in_words(INIT_WORDS, config.get("init")),
+        "motion": _in_words(MOTION_WORDS, config.get("motion")),
+        "optical flow": _in_words(FLOW_WORDS, config.get("flow_source")),
+        "optimised at": _times(config.get("size_optimised"), "pixels; scored at the sequence's own resolution"),
+        "quad scale": _with_source(config.get("quad_scale"), config.get("quad_scale_source")),
+        "images, seed": f"{config.get('images')}, {config.get('seed')}",
+        "device": _with_threads(config.get("device"), config.get("threads")),
+        "reconstructed by": f"gftorf-warp {config.get('version')}",
+        "compared by": installed,
         "ground truth": data_card,
     }
-    rows = "".join(f"<dt>{k}</dt><dd>{page.escape(v)}</dd>" for k, v in facts.items() if v is not None)
+    rows = "".join(
+        f"<dt>{name}</dt><dd>{page.escape(value)}</dd>" for name, value in facts.items() if value is not None
+    )
     command = (
-        f"gftorf reconstruct {config.get('sequence')} --out RUN --preset {config.get('preset')} "
-        f"--images {config.get('images')} --seed {config.get('seed')}\ngftorf compare RUN"
+        f"gftorf reconstruct {shlex.quote(str(config.get('sequence')))} --out RUN --preset {config.get('preset')}"
+        f" --images {config.get('images')} --seed {config.get('seed')} --device {config.get('device')}\n"
+        "gftorf compare RUN"
     )
     everything = json.dumps(config, indent=2, sort_keys=True, default=str)
     return (
