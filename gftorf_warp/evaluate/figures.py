@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 
 COLOURS = {"closed_form": "#d55e00", "d": "#0072b2", "d_normalised": "#56b4e9", "d_tof": "#009e73"}  # Okabe and Ito
 NAMES = {"closed_form": "closed form", "d": "d", "d_normalised": "d / opacity", "d_tof": "d_ToF"}
-NOT_LOSSES = {"images", "seconds", "gaussians", "quad_psnr_db"}  # what else a log step holds
+NOT_LOSSES = {"images", "seconds", "gaussians", "quad_psnr_db", "opacity"}  # what else a log step holds
 LOG_SPAN = 20.0  # values that span more than this factor are drawn on a logarithmic axis
 FLOOR_M = 1e-3  # [m] smaller errors fall into the first bin of the histogram
 BINS = 60
@@ -71,7 +71,7 @@ def error_over_frames(frames: Sequence[int], groups: Mapping[str, Mapping[str, S
                 plot.plot(frames, row, ".-", color=COLOURS[name], label=NAMES[name], linewidth=1.2, markersize=4)
             _choose_axis(plot, np.concatenate(list(rows.values())))
             plot.set(title=group, xlabel="raw frame n", ylabel=r"mean squared error [m$^2$ $\times$ 100]")
-        plot.legend(fontsize=8)
+        _legend(figure, plot)
 
     return _svg(draw, 11.0, 3.0)
 
@@ -96,7 +96,7 @@ def error_histogram(
                 plot.stairs(counts / size.size, edges, color=COLOURS[name], label=NAMES[name], linewidth=1.4)
             plot.set_xscale("log")
             plot.set(title=group, xlabel="absolute error [m]", ylabel="share of these pixels")
-        plot.legend(fontsize=8)
+        _legend(figure, plot)
 
     return _svg(draw, 11.0, 2.8)
 
@@ -113,6 +113,11 @@ def _choose_axis(plot, values: np.ndarray) -> None:
         plot.set_yscale("log")
     else:
         plot.set_ylim(0, None)
+
+
+def _legend(figure, plot) -> None:
+    """One legend for all plots, beside them: it hides nothing."""
+    figure.legend(*plot.get_legend_handles_labels(), loc="outside right upper", fontsize=8)
 
 
 def _svg(draw, width: float, height: float) -> bytes:

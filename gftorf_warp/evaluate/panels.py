@@ -187,7 +187,7 @@ def animation(found: Findings) -> str:
     data = pictures.animated_webp([frame(s) for s in starts], ANIMATION_PERIOD_S)
     source = pictures.data_uri(data, "image/webp")
     titles = ("measured quad", "rendered quad", "closed form", "ours, d")
-    captions = "".join(f"<figcaption>{title}</figcaption>" for title in titles)
+    captions = "".join(f'<b class="caption">{title}</b>' for title in titles)
     return (
         f'<div class="row" style="--columns: 4">{captions}</div>'
         f'<img class="picture" src="{source}" alt="animation: {", ".join(titles)}">'
