@@ -16,11 +16,11 @@ import sys
 import time
 from pathlib import Path
 
+import naive
 import numpy as np
 import torch
 import warp as wp
 
-import naive
 from gftorf_warp.kernels.composite import CHANNEL_PLANES
 from gftorf_warp.kernels.composite_backward import GRAD_LIGHT_PLANES, finish_moments
 from gftorf_warp.kernels.splat import Splat

@@ -16,7 +16,7 @@ import warp as wp
 
 from ..constants import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 from .lanes import make_lanes, warp_any
-from .splat import Splat, load_splat, row_missed, row_offset
+from .splat import Splat, block_missed, load_splat
 
 # planes of ``light``, each [tiles, lanes] of V
 RE, IM, AMPLITUDE, DISTANCE, DISTORTION, SUM_ZETA, SUM_ZETA2, TRANSMITTANCE, LAST = range(9)
@@ -43,44 +43,63 @@ def options(K: int) -> dict:
 
 @functools.cache
 def make_pixels(K: int, tile_width: int, tile_height: int) -> SimpleNamespace:
-    """Where the K pixels of a lane lie in a tile of ``tile_width`` x ``tile_height`` [px]."""
-    if tile_width % K:
-        raise ValueError(f"K = {K} must divide the tile width {tile_width}")
-    ops = make_lanes(K)
-    lanes_x = tile_width // K
+    """Where the block of K pixels of a lane lies in a tile of ``tile_width`` x ``tile_height`` [px]."""
+    side = make_lanes(K).side
+    if tile_width % side or tile_height % side:
+        raise ValueError(f"blocks of {side} x {side} pixels must fill a tile, got {tile_width} x {tile_height}")
+    lanes_x = tile_width // side
 
     @wp.func
-    def pixel_x(tile: int, lane: int, tiles_x: int) -> ops.V:
-        """Centres of the pixels of a lane, x [px]."""
-        return wp.static(ops.ramp)(
-            float((tile % tiles_x) * wp.static(tile_width) + (lane % wp.static(lanes_x)) * wp.static(K)) + 0.5
-        )
+    def block_x(tile: int, lane: int, tiles_x: int) -> float:
+        """Centre of the first pixel of a block, x [px]."""
+        column = (tile % tiles_x) * wp.static(tile_width) + (lane % wp.static(lanes_x)) * wp.static(side)
+        return float(column) + 0.5
 
     @wp.func
-    def pixel_y(tile: int, lane: int, tiles_x: int) -> float:
-        """Centres of the pixels of a lane, y [px]."""
-        return float((tile // tiles_x) * wp.static(tile_height) + lane // wp.static(lanes_x)) + 0.5
+    def block_y(tile: int, lane: int, tiles_x: int) -> float:
+        """Centre of the first pixel of a block, y [px]."""
+        row = (tile // tiles_x) * wp.static(tile_height) + (lane // wp.static(lanes_x)) * wp.static(side)
+        return float(row) + 0.5
 
-    return SimpleNamespace(pixel_x=pixel_x, pixel_y=pixel_y, lanes=lanes_x * tile_height)
+    return SimpleNamespace(block_x=block_x, block_y=block_y, lanes=lanes_x * (tile_height // side), side=side)
 
 
 @functools.cache
-def make_composite(K: int, tile_width: int, tile_height: int, light: bool, channels: bool, inclusive: bool):
+def make_zeta(metric: bool):
+    """What distortion is measured on: the distance [m], or the released mapping of it to [0, 1]."""
+
+    @wp.func
+    def zeta_of(distance: float, mapping: wp.vec2) -> float:
+        if wp.static(metric):
+            return distance
+        return mapping[0] - mapping[1] / distance
+
+    return zeta_of
+
+
+@functools.cache
+def make_composite(
+    K: int, tile_width: int, tile_height: int, light: bool, channels: bool, inclusive: bool, metric: bool
+):
     """The kernel for one tile shape and one set of outputs.
 
     Args:
-        K: Pixels per thread, a power of two that divides the tile width.
+        K: Pixels per thread: 16, or 1 on CUDA.
         tile_width: Columns of a tile [px].
-        tile_height: Rows of a tile [px]; on CUDA ``tile_width / K * tile_height`` must be 32, one warp per tile.
+        tile_height: Rows of a tile [px]; on CUDA a tile must have 32 pixels, one warp per tile.
         light: Whether light, distance and distortion are summed.
         channels: Whether the three channels are summed.
         inclusive: Whether the splat that ends a pixel is still added.
+        metric: Whether distortion is measured on the distance itself, or on the released mapping of it.
     """
     ops, pixels = make_lanes(K), make_pixels(K, tile_width, tile_height)
     V, fill, affine, mul, axpy, fma, fnma = ops.V, ops.fill, ops.affine, ops.mul, ops.axpy, ops.fma, ops.fnma
     above, drop_below, set_where = ops.above, ops.drop_below, ops.set_where
     response, alpha_of, nonzero = ops.response, ops.alpha_of, ops.nonzero
-    pixel_x, pixel_y = pixels.pixel_x, pixels.pixel_y
+    block_x, block_y, columns, rows = pixels.block_x, pixels.block_y, ops.columns, ops.rows
+    half = 0.5 * (pixels.side - 1)  # from the first to the middle of a block [px]
+
+    zeta_of = make_zeta(metric)
 
     @wp.kernel(**options(K))
     def composite(
@@ -92,18 +111,20 @@ def make_composite(K: int, tile_width: int, tile_height: int, light: bool, chann
         width: int,  # columns of the image [px]
         height: int,  # rows of the image [px]
         tile0: int,  # first tile of this launch [index]
+        mapping: wp.vec2,  # released zeta = mapping[0] - mapping[1] / distance [1, m]
         # Out:
         sums: wp.array3d[V],  # [9, tiles, lanes] planes RE .. LAST of ``light``
         channel: wp.array3d[V],  # [3, tiles, lanes] the three channels
     ):
-        """One thread per K pixels of a row; on CUDA one warp per tile, so all control is uniform over 32 lanes."""
+        """One thread per block of K pixels; on CUDA one warp per tile, so all control is uniform over 32 lanes."""
         t, lane = wp.tid()
         tile = tile0 + t
-        x = pixel_x(tile, lane, tiles_x)
-        y = pixel_y(tile, lane, tiles_x)
-        live = above(affine(x, -1.0, float(width)), 0.0)  # pixels right of or below the image never start
-        if y > float(height):
-            live = fill(0.0)
+        x0 = block_x(tile, lane, tiles_x)
+        y0 = block_y(tile, lane, tiles_x)
+        x = columns(x0)
+        y = rows(y0)
+        # pixels right of or below the image never start
+        live = mul(above(affine(x, -1.0, float(width)), 0.0), above(affine(y, -1.0, float(height)), 0.0))
         T = fill(1.0)
         last = fill(0.0)
         if wp.static(light):
@@ -122,19 +143,17 @@ def make_composite(K: int, tile_width: int, tile_height: int, light: bool, chann
         end = first[tile + 1]
         zeta0 = float(0.0)  # distortion is blind to a common shift; near the surface its sums keep their digits
         if begin < end:
-            zeta0 = splats[ids[begin]][15]
+            zeta0 = zeta_of(splats[ids[begin]][14], mapping)
         k = int(begin)
         # `continue` instead of nested `if`s: after an `if` Warp selects between the old and the new value of everything
         # assigned inside, here a dozen vectors per splat
         while k < end and warp_any(nonzero(live)):  # the same trip count for all lanes of a warp
             i = ids[k]
             k += 1
-            dy = row_offset(splats, i, y)
-            if row_missed(splats, i, dy):
+            if block_missed(splats, i, x0 + wp.static(half), y0 + wp.static(half), wp.static(half)):
                 continue
             q = load_splat(splats, i)
-            dx = affine(x, -1.0, q[0])
-            g = response(dx, -0.5 * q[2], q[3] * dy, 0.5 * q[4] * dy * dy, -0.5 * q[6])
+            g = response(affine(x, -1.0, q[0]), affine(y, -1.0, q[1]), -0.5 * q[2], q[3], -0.5 * q[4], -0.5 * q[6])
             alpha = alpha_of(g, live, q[5], ALPHA_MAX, ALPHA_MIN)
             if not nonzero(alpha):
                 continue
@@ -148,7 +167,7 @@ def make_composite(K: int, tile_width: int, tile_height: int, light: bool, chann
                 im = axpy(im, w2, q[12])
                 amplitude = axpy(amplitude, w2, q[13])
                 distance = axpy(distance, w, q[14])
-                zeta = q[15] - zeta0
+                zeta = zeta_of(q[14], mapping) - zeta0
                 # sum over pairs, one splat at a time: w (zeta^2 A - 2 zeta M + V) with A = 1 - T the weight so far
                 spread = axpy(axpy(affine(T, -zeta * zeta, zeta * zeta), sum_zeta, -2.0 * zeta), sum_zeta2, 1.0)
                 distortion = fma(distortion, w, spread)

@@ -3,7 +3,7 @@
 With tau = the gradient of all T-weighted outputs times the values of splat k, sigma = the same for the T^2-weighted
 ones, and T_e, E = T_e dL/dT_e behind the last splat (method, section 3.1):
 
-    T <- T / (1 - alpha);   dL/dalpha = tau T + sigma T^2 - E / (1 - alpha);   E <- E + w (tau + 2 sigma T),   w = alpha T
+    T <- T / (1 - alpha);  dL/dalpha = tau T + sigma T^2 - E / (1 - alpha);  E <- E + w (tau + 2 sigma T),  w = alpha T
 
 E is what the loss gains from all that lies behind. Walked back to front it keeps its digits; front to back it is a
 difference of sums that turns to noise behind a surface. The distortion is quadratic in w: its tau uses the final sums.
@@ -15,9 +15,9 @@ import functools
 import warp as wp
 
 from ..constants import ALPHA_MAX, ALPHA_MIN
-from .composite import LAST, SUM_ZETA, SUM_ZETA2, TRANSMITTANCE, make_pixels, options
+from .composite import LAST, SUM_ZETA, SUM_ZETA2, TRANSMITTANCE, make_pixels, make_zeta, options
 from .lanes import make_lanes, sums_of, types_of, warp_any, warp_max
-from .splat import Splat, load_splat, row_missed, row_offset
+from .splat import Splat, block_missed, load_splat
 
 # planes of ``grad_sums``, each [tiles, lanes] of V: gradients of the first five planes of the forward pass, and of T_e
 GRAD_TRANSMITTANCE = 5
@@ -27,34 +27,47 @@ GRAD_LIGHT_PLANES = 6
 def _add_moments(K: int, light: bool, channels: bool) -> str:
     """C++ that adds what the K pixels of a thread, or of a warp on CUDA, say about one splat to its record.
 
-    dy is the same for all pixels of a thread, so the sums of v times 1, dx, dx^2 give all six moments. On the CPU one
-    permutation and one product bring the sums into the order of the record. On CUDA 16 values of 32 lanes are summed in
+    On the CPU one permutation brings the sums into the order of the record. On CUDA 16 values of 32 lanes are summed in
     16 shuffles, each of which halves the values a lane carries; then 16 lanes add one 64-byte line.
     """
-    names = ["v", "dx", "alpha", "w", "w2", "g0", "g1", "g2", "g_re", "g_im", "g_amplitude", "g_distance", "g_zeta"]
+    names = ["v", "dx", "dy", "alpha", "w", "w2", "g0", "g1", "g2", "g_re", "g_im", "g_amplitude", "g_distance"]
     loads = " ".join(f"const F {name}_ = load({name});" for name in names)
-    values = {"v": "v_", "v dx": "v_ * dx_", "v dx2": "v_ * dx_ * dx_"}
-    values["count"] = "alpha_ > 0.0f ? (F)(1.0f) : (F)(0.0f)"
+    values = {"v": "v_", "dx": "v_ * dx_", "dx2": "v_ * dx_ * dx_", "dxdy": "v_ * dx_ * dy_"}
+    values |= {"dy": "v_ * dy_", "dy2": "v_ * dy_ * dy_", "count": "alpha_ > 0.0f ? (F)(1.0f) : (F)(0.0f)"}
     if channels:
         values |= {"c0": "w_ * g0_", "c1": "w_ * g1_", "c2": "w_ * g2_"}
     if light:
         values |= {"re": "w2_ * g_re_", "im": "w2_ * g_im_", "amplitude": "w2_ * g_amplitude_"}
-        values |= {"distance": "w_ * g_distance_", "zeta": "w_ * g_zeta_"}
-    slots = ["v dx", "v", "v dx2", "v dx", "v", "v", "count", "", "c0", "c1", "c2", "re", "im", "amplitude", "distance"]
-    slots.append("zeta")
+        values |= {"distance": "w_ * g_distance_"}
+    slots = [
+        "dx",
+        "dy",
+        "dx2",
+        "dxdy",
+        "dy2",
+        "v",
+        "count",
+        "",
+        "c0",
+        "c1",
+        "c2",
+        "re",
+        "im",
+        "amplitude",
+        "distance",
+        "",
+    ]
     sums, lanes = sums_of(K, values)
     if K == 1:
-        factor = {1: "dy", 3: "dy", 4: "dy * dy"}
-        entries = [
-            f"s[{lanes.index(of)}] * ({factor.get(n, '1.0f')})" if of in lanes else "0.0f" for n, of in enumerate(slots)
-        ]
+        entries = [f"s[{lanes.index(of)}]" if of in lanes else "0.0f" for of in slots]
         return f"""{types_of(K)}
     {loads}
     {sums}
     float record[16] = {{{", ".join(entries)}}};
 #if defined(__CUDA_ARCH__)
     const unsigned lane = threadIdx.x & 31u;
-    #define FOLD(BIT, HALF) {{ const bool up = (lane >> BIT) & 1u; _Pragma("unroll") for (int j = 0; j < HALF; ++j) {{ \\
+    #define FOLD(BIT, HALF) {{ const bool up = (lane >> BIT) & 1u; \\
+        _Pragma("unroll") for (int j = 0; j < HALF; ++j) {{ \\
         const float send = up ? record[j] : record[j + HALF], keep = up ? record[j + HALF] : record[j]; \\
         record[j] = keep + __shfl_xor_sync(0xffffffffu, send, 1 << BIT); }} }}
     FOLD(4, 8) FOLD(3, 4) FOLD(2, 2) FOLD(1, 1)
@@ -66,15 +79,12 @@ def _add_moments(K: int, light: bool, channels: bool) -> str:
 #endif
 """
     order = ", ".join(str(lanes.index(of)) if of in lanes and of else "16" for of in slots)  # 16: a zero
-    once, twice = [", ".join("1.0f" if n in where else "0.0f" for n in range(16)) for where in ((1, 3), (4,))]
-    rest = ", ".join("0.0f" if n in (1, 3, 4) else "1.0f" for n in range(16))
     return f"""{types_of(K)}
     {loads}
     {sums}
-    const F once = {{{once}}}, twice = {{{twice}}}, rest = {{{rest}}};
     F record;  // not atomic: every CPU thread has records of its own
     __builtin_memcpy(&record, &grads.data[i], sizeof(record));
-    record += __builtin_shufflevector(total, (F)(0.0f), {order}) * (once * dy + (twice * (dy * dy) + rest));
+    record += __builtin_shufflevector(total, (F)(0.0f), {order});
     __builtin_memcpy(&grads.data[i], &record, sizeof(record));
 """
 
@@ -103,7 +113,9 @@ def finish_moments(
 
 
 @functools.cache
-def make_composite_backward(K: int, tile_width: int, tile_height: int, light: bool, channels: bool, clamp_passes: bool):
+def make_composite_backward(
+    K: int, tile_width: int, tile_height: int, light: bool, channels: bool, clamp_passes: bool, metric: bool
+):
     """The adjoint kernel for one tile shape and one set of outputs; arguments as in ``make_composite``.
 
     Args:
@@ -113,17 +125,19 @@ def make_composite_backward(K: int, tile_width: int, tile_height: int, light: bo
         light: Whether light, distance and distortion have gradients.
         channels: Whether the three channels have gradients.
         clamp_passes: Whether a clamped alpha passes its gradient on, as the released code does.
+        metric: As in ``make_composite``.
     """
     ops, pixels = make_lanes(K), make_pixels(K, tile_width, tile_height)
     V, fill, affine, mul, axpy, fma, fnma = ops.V, ops.fill, ops.affine, ops.mul, ops.axpy, ops.fma, ops.fnma
     above, add, keep_below, inverse, at_least = ops.above, ops.add, ops.keep_below, ops.inverse, ops.at_least
     response, alpha_of, nonzero, largest_of = ops.response, ops.alpha_of, ops.nonzero, ops.largest_of
-    pixel_x, pixel_y = pixels.pixel_x, pixels.pixel_y
+    block_x, block_y, columns, rows = pixels.block_x, pixels.block_y, ops.columns, ops.rows
+    half, zeta_of = 0.5 * (pixels.side - 1), make_zeta(metric)
 
     @wp.func_native(_add_moments(K, light, channels))
     def add_moments(
-        grads: wp.array[Splat], i: int, dy: float, v: V, dx: V, alpha: V, w: V, w2: V,
-        g0: V, g1: V, g2: V, g_re: V, g_im: V, g_amplitude: V, g_distance: V, g_zeta: V,
+        grads: wp.array[Splat], i: int, v: V, dx: V, dy: V, alpha: V, w: V, w2: V,
+        g0: V, g1: V, g2: V, g_re: V, g_im: V, g_amplitude: V, g_distance: V,
     ): ...  # fmt: skip
 
     @wp.kernel(**options(K))
@@ -134,17 +148,20 @@ def make_composite_backward(K: int, tile_width: int, tile_height: int, light: bo
         splats: wp.array[Splat],  # [N] records, see splat.py
         tiles_x: int,  # tiles per row [1]
         tile0: int,  # first tile of this launch [index]
+        mapping: wp.vec2,  # released zeta = mapping[0] - mapping[1] / distance [1, m]
         sums: wp.array3d[V],  # [9, tiles, lanes] planes of the forward pass
         grad_sums: wp.array3d[V],  # [6, tiles, lanes] gradients of RE .. DISTORTION and of T_e
         grad_channel: wp.array3d[V],  # [3, tiles, lanes] gradients of the three channels
         # Out:
         grad_splats: wp.array[Splat],  # [N] added to: moments in slots 0-5, pixels in slot 6, gradients in 8-15
     ):
-        """One thread per K pixels of a row; visits exactly the contributors of the forward pass, last one first."""
+        """One thread per block of K pixels; visits exactly the contributors of the forward pass, last one first."""
         t, lane = wp.tid()
         tile = tile0 + t
-        x = pixel_x(tile, lane, tiles_x)
-        y = pixel_y(tile, lane, tiles_x)
+        x0 = block_x(tile, lane, tiles_x)
+        y0 = block_y(tile, lane, tiles_x)
+        x = columns(x0)
+        y = rows(y0)
         last = sums[wp.static(LAST), tile, lane]
         T = sums[wp.static(TRANSMITTANCE), tile, lane]
         zero = fill(0.0)
@@ -157,7 +174,6 @@ def make_composite_backward(K: int, tile_width: int, tile_height: int, light: bo
             g_re = zero
             g_im = zero
             g_amplitude = zero
-            g_distance = zero
         if wp.static(light):
             g_re = grad_sums[0, tile, lane]
             g_im = grad_sums[1, tile, lane]
@@ -176,17 +192,17 @@ def make_composite_backward(K: int, tile_width: int, tile_height: int, light: bo
         k = begin + warp_max(int(largest_of(last)))
         zeta0 = float(0.0)
         if begin < k:
-            zeta0 = splats[ids[begin]][15]
+            zeta0 = zeta_of(splats[ids[begin]][14], mapping)
         while k > begin:
             k -= 1
             i = ids[k]
-            dy = row_offset(splats, i, y)
-            if row_missed(splats, i, dy):
+            if block_missed(splats, i, x0 + wp.static(half), y0 + wp.static(half), wp.static(half)):
                 continue
             gate = above(last, float(k - begin))  # only what this pixel composited
             q = load_splat(splats, i)
             dx = affine(x, -1.0, q[0])
-            g = response(dx, -0.5 * q[2], q[3] * dy, 0.5 * q[4] * dy * dy, -0.5 * q[6])
+            dy = affine(y, -1.0, q[1])
+            g = response(dx, dy, -0.5 * q[2], q[3], -0.5 * q[4], -0.5 * q[6])
             alpha = alpha_of(g, gate, q[5], ALPHA_MAX, ALPHA_MIN)
             if not warp_any(nonzero(alpha)):  # uniform: all lanes of a warp reach `add_moments`, or none
                 continue
@@ -197,15 +213,18 @@ def make_composite_backward(K: int, tile_width: int, tile_height: int, light: bo
             if wp.static(channels):
                 tau = axpy(axpy(affine(g0, q[8], 0.0), g1, q[9]), g2, q[10])
             sigma_T = zero
-            g_zeta = zero
             w2 = zero
+            g_d = zero
             if wp.static(light):
-                zeta = q[15] - zeta0
+                zeta = zeta_of(q[14], mapping) - zeta0
                 spread = axpy(affine(weight, zeta, 0.0), sum_zeta, -1.0)  # zeta A - M
                 tau = axpy(tau, g_distance, q[14])
                 tau = fma(tau, g_distortion, axpy(axpy(sum_zeta2, sum_zeta, -zeta), spread, zeta))
                 sigma_T = mul(axpy(axpy(affine(g_re, q[11], 0.0), g_im, q[12]), g_amplitude, q[13]), T)
-                g_zeta = affine(mul(g_distortion, spread), 2.0, 0.0)
+                slope = float(2.0)  # of the distortion by the distance, over w spread
+                if wp.static(not metric):
+                    slope = 2.0 * mapping[1] / (q[14] * q[14])
+                g_d = fma(g_distance, g_distortion, affine(spread, slope, 0.0))
                 w2 = mul(w, T)
             tau = add(tau, sigma_T)
             v = fnma(mul(w, tau), E, mul(alpha, restored))  # alpha dL/dalpha
@@ -214,7 +233,6 @@ def make_composite_backward(K: int, tile_width: int, tile_height: int, light: bo
                 v = fma(zero, v, mul(affine(g, q[5], 0.0), inverse(at_least(alpha, ALPHA_MIN))))  # o G / alpha
             else:
                 v = keep_below(v, alpha, ALPHA_MAX)
-            add_moments(grad_splats, i, dy, v, dx, alpha, w, w2, g0, g1, g2, g_re, g_im, g_amplitude, g_distance,
-                        g_zeta)  # fmt: skip
+            add_moments(grad_splats, i, v, dx, dy, alpha, w, w2, g0, g1, g2, g_re, g_im, g_amplitude, g_d)
 
     return composite_backward

@@ -3,7 +3,8 @@
     a = s r / d^2,   psi = kappa d + phase_offset,   light = (a cos psi, a sin psi, a)
     quad of shift theta = a (cos(psi - theta) + b) = light . (cos theta, sin theta, b)
 
-(paper, equations 1-3; method, section 2.4). Light is what is composited: quads of any number of shifts are linear in it.
+(paper, equations 1-3; method, section 2.4). Light is what is composited: quads of any number of shifts are
+linear in it.
 """
 
 import warp as wp

@@ -1,18 +1,19 @@
 """Arithmetic on the K pixels of a thread: one expression, a clang vector on the CPU, scalars on CUDA.
 
-A compositor thread owns K consecutive pixels of a row. On the CPU K = 16 and every operation below becomes one vector
-instruction, because Warp runs CPU threads one after the other and LLVM finds no parallelism by itself. On CUDA K = 1.
-Each operation is written once, as a C++ expression over a type ``F``; nothing outside this file asks for the device.
+A compositor thread owns a block of K pixels. On the CPU K = 16, a block of 4 x 4, and every operation below becomes one
+vector instruction, because Warp runs CPU threads one after the other and LLVM finds no parallelism by itself. On CUDA
+K = 1. Each operation is written once, as a C++ expression over a type ``F``.
 """
 
 import functools
+import math
 from types import SimpleNamespace
 
 import warp as wp
 
-# e^x for -87 < x <= 0 without libm, which would be called once per lane (3.6 times slower in the forward pass): 2^n times
-# a minimax polynomial of 2^f with f in [-1/2, 1/2], relative error 2.4e-7. Adding 1.5 * 2^23 rounds to an integer and
-# leaves it in the low bits, from where a shift takes it to the exponent.
+# e^x for -87 < x <= 0 without libm, which would be called once per lane (3.6 times slower in the forward pass): 2^n
+# times a minimax polynomial of 2^f with f in [-1/2, 1/2], relative error 2.4e-7. Adding 1.5 * 2^23 rounds to an integer
+# and leaves it in the low bits, from where a shift takes it to the exponent.
 _EXP = """
     auto exp_ = [](F x) -> F {
         const F y = x * 1.44269504f, shifted = y + 12582912.0f, f = y - (shifted - 12582912.0f);
@@ -60,21 +61,27 @@ WARP_MAX = """
 
 
 @wp.func_native(WARP_ANY)
-def warp_any(x: bool) -> bool: ...
+def warp_any(x: bool) -> bool:
+    """Whether ``x`` holds for any lane of the warp; on the CPU a thread is alone."""
+
+
 @wp.func_native(WARP_MAX)
-def warp_max(x: int) -> int: ...
+def warp_max(x: int) -> int:
+    """Largest ``x`` of the lanes of the warp; on the CPU a thread is alone."""
 
 
 def types_of(K: int) -> str:
-    """C++ that defines ``F``, what an operation works on, and ``load``, a Warp vector as an ``F``."""
+    """C++ that defines ``F``, what an operation works on, and ``load`` and ``store``, from and to a Warp vector."""
     if K == 1:
         return """
     typedef float F;
-    auto load = [](const wp::vec_t<1, float>& v) -> F { return v[0]; };"""
+    auto load = [](const wp::vec_t<1, float>& v) -> F { return v[0]; };
+    auto store = [](F x) { wp::vec_t<1, float> v; v[0] = x; return v; };"""
     return f"""
     typedef float F __attribute__((ext_vector_type({K})));
     typedef int I __attribute__((ext_vector_type({K})));
-    auto load = [](const wp::vec_t<{K}, float>& v) -> F {{ F x; __builtin_memcpy(&x, &v, sizeof(x)); return x; }};"""
+    auto load = [](const wp::vec_t<{K}, float>& v) -> F {{ F x; __builtin_memcpy(&x, &v, sizeof(x)); return x; }};
+    auto store = [](F x) {{ wp::vec_t<{K}, float> v; __builtin_memcpy(&v, &x, sizeof(x)); return v; }};"""
 
 
 def _elementwise(K: int, vectors: str, expression: str, prelude: str = "") -> str:
@@ -83,10 +90,7 @@ def _elementwise(K: int, vectors: str, expression: str, prelude: str = "") -> st
     body = expression if "return" in expression else f"return {expression};"
     return f"""{types_of(K)}{prelude}
     auto op = [&]({", ".join("F " + v for v in names)}) -> F {{ {body} }};
-    const F value = op({", ".join(f"load({v})" for v in names)});
-    wp::vec_t<{K}, float> result;
-    __builtin_memcpy(&result, &value, sizeof(value));
-    return result;
+    return store(op({", ".join(f"load({v})" for v in names)}));
 """
 
 
@@ -106,12 +110,14 @@ def make_lanes(K: int) -> SimpleNamespace:
     """
     if K not in (1, 16):
         raise ValueError(f"K must be 1 (CUDA) or 16 (CPU), got {K}")
-    V = wp.types.vector(length=K, dtype=wp.float32)
+    V, side = wp.types.vector(length=K, dtype=wp.float32), math.isqrt(K)
 
     @wp.func_native(_elementwise(K, "", "(F)(x)"))
     def fill(x: float) -> V: ...
-    @wp.func_native(f"wp::vec_t<{K}, float> r; for (int c = 0; c < {K}; ++c) r[c] = x + (float)c; return r;")
-    def ramp(x: float) -> V: ...
+    @wp.func_native(f"wp::vec_t<{K}, float> r; for (int c = 0; c < {K}; ++c) r[c] = x + (float)(c % {side}); return r;")
+    def columns(x: float) -> V: ...
+    @wp.func_native(f"wp::vec_t<{K}, float> r; for (int c = 0; c < {K}; ++c) r[c] = y + (float)(c / {side}); return r;")
+    def rows(y: float) -> V: ...
     @wp.func_native(_elementwise(K, "a", "a * s + t"))
     def affine(a: V, s: float, t: float) -> V: ...
     @wp.func_native(_elementwise(K, "a b", "a * b"))
@@ -136,15 +142,15 @@ def make_lanes(K: int) -> SimpleNamespace:
     def keep_below(a: V, b: V, x: float) -> V: ...
     @wp.func_native(_elementwise(K, "a mask", "mask > 0.0f ? (F)(x) : a"))
     def set_where(a: V, mask: V, x: float) -> V: ...
-    @wp.func_native(  # exp(power) with power = half_a dx^2 - b_dy dx - c_dy, 0 where power is below ``low``
+    @wp.func_native(  # exp(power) with power = half_a dx^2 - b dx dy + half_c dy^2, 0 where power is below ``low``
         _elementwise(
             K,
-            "dx",
-            "const F p = half_a * dx * dx - b_dy * dx - c_dy; return p >= low ? exp_(p) : (F)(0.0f);",
+            "dx dy",
+            "const F p = (half_a * dx - b * dy) * dx + (half_c * dy) * dy; return p >= low ? exp_(p) : (F)(0.0f);",
             "auto exp_ = [](F x) -> F { return expf(x); };" if K == 1 else _EXP,
         )
     )
-    def response(dx: V, half_a: float, b_dy: float, c_dy: float, low: float) -> V: ...
+    def response(dx: V, dy: V, half_a: float, b: float, half_c: float, low: float) -> V: ...
     @wp.func_native(  # min(largest, o g) where the gate is open and that is at least ``smallest``, else 0
         _elementwise(
             K,
@@ -160,15 +166,15 @@ def make_lanes(K: int) -> SimpleNamespace:
     def largest_of(a: V) -> float: ...
 
     operations = {name: value for name, value in locals().items() if isinstance(value, wp.Function)}
-    return SimpleNamespace(K=K, V=V, **operations)
+    return SimpleNamespace(K=K, V=V, side=side, **operations)
 
 
 def sums_of(K: int, values: dict[str, str]) -> tuple[str, list[str]]:
-    """C++ that sums ``values``, expressions of type ``F`` by name, over the K pixels of a thread, and where the sums are.
+    """C++ that sums ``values``, expressions of type ``F`` by name, over the K pixels, and where the sums are.
 
-    On CUDA they are ``float s[..]`` in order. On the CPU they end up in the lanes of one vector ``F total``, in the order
-    returned ('' is an empty lane): two vectors are folded into one, halves onto halves, until every lane is a finished
-    sum. Expressions are evaluated just before they are folded, which keeps them in registers.
+    On CUDA they are ``float s[..]`` in order. On the CPU they end up in the lanes of one vector ``F total``, in the
+    order returned ('' is an empty lane): two vectors are folded into one, halves onto halves, until every lane is a
+    finished sum. Expressions are evaluated just before they are folded, which keeps them in registers.
     """
     if K == 1:
         return f"const float s[{len(values)}] = {{{', '.join(values.values())}}};", list(values)

@@ -17,14 +17,16 @@ CULLED = wp.constant(wp.int32(0x7FFFFFFF))  # depth key behind every positive fl
 
 
 @wp.func
-def extent_of(opacity: float, cov_yy: float) -> wp.vec2:
-    """(cutoff, reach_y) of a record. A little wide: they decide what is visited, not what it is worth."""
+def extent_of(opacity: float, cov_xx: float, cov_yy: float) -> wp.vec3:
+    """(cutoff, reach_x, reach_y) of a record. A little wide: they decide what is visited, not what it is worth."""
     cutoff = 2.0 * wp.log(opacity / ALPHA_MIN) + 1.0e-5
-    return wp.vec2(cutoff, wp.sqrt(wp.max(cutoff, 0.0) * cov_yy) * 1.0001 + 1.0e-3)
+    reach_x = wp.sqrt(wp.max(cutoff, 0.0) * cov_xx) * 1.0001 + 1.0e-3
+    reach_y = wp.sqrt(wp.max(cutoff, 0.0) * cov_yy) * 1.0001 + 1.0e-3
+    return wp.vec3(cutoff, reach_x, reach_y)
 
 
 @wp.func_grad(extent_of)
-def adj_extent_of(opacity: float, cov_yy: float, adj_ret: wp.vec2):  # noqa: ARG001 - Warp dictates the parameters
+def adj_extent_of(opacity: float, cov_xx: float, cov_yy: float, adj_ret: wp.vec3):
     """No derivative: slot 6 of a gradient record is free to count pixels."""
 
 
@@ -44,13 +46,12 @@ def square_of(view: CameraView, x: float, y: float, cov: wp.vec3) -> wp.vec4i:
 
 
 @functools.cache
-def make_project(colour: bool, square: bool, metric: bool):
+def make_project(colour: bool, square: bool):
     """The kernel for a field with or without colour.
 
     Args:
         colour: Whether slots 8-10 hold colour, from its own harmonics.
         square: Whether splats are cut by the 3-sigma square (parity with the released code).
-        metric: Whether distortion is measured in metres (paper) or on the released mapping of the distance.
     """
 
     @wp.kernel(module="unique", module_options={"fast_math": False})  # __sinf would lose the phase beyond +-pi
@@ -122,13 +123,10 @@ def make_project(colour: bool, square: bool, metric: bool):
             red = wp.max(rgb[0], 0.0)
             green = wp.max(rgb[1], 0.0)
             blue = wp.max(rgb[2], 0.0)
-        zeta = distance
-        if wp.static(not metric):
-            zeta = view.far / (view.far - view.near) * (1.0 - view.near / distance)
-        extent = extent_of(opacity, cov[2])
+        extent = extent_of(opacity, cov[0], cov[2])
         splats[n] = Splat(
-            x, y, cov[2] / determinant, -cov[1] / determinant, cov[0] / determinant, opacity, extent[0], extent[1],
-            red, green, blue, light[0], light[1], light[2], distance, zeta,
+            x, y, cov[2] / determinant, -cov[1] / determinant, cov[0] / determinant, opacity, extent[0], extent[2],
+            red, green, blue, light[0], light[1], light[2], distance, extent[1],
         )  # fmt: skip
 
     return project

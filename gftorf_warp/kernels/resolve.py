@@ -3,8 +3,8 @@
     quad_q = light . (cos theta_q, sin theta_q, b) + T_e background,   phasor = eta light + T_e background
     colour = channels + T_e background,   opacity = 1 - T_e,   distortion = factor * (half sum)
 
-(method, section 2.6). Everything is linear in light and T_e: whatever the number of quads, the compositor gets back three
-gradients of the light and one of T_e per pixel. Each output has its own pair of kernels; the adjoints add up.
+(method, section 2.6). Everything is linear in light and T_e: whatever the number of quads, the compositor gets back
+three gradients of the light and one of T_e per pixel. Each output has its own pair of kernels; the adjoints add up.
 """
 
 import warp as wp
@@ -21,18 +21,26 @@ _DC = wp.constant(DC_OFFSET)
 
 @wp.struct
 class Tiling:
-    """How pixels lie in planes that are stored tile by tile: (tile, row, column)."""
+    """How pixels lie in planes that are stored by (tile, block, row, column); sides are powers of two."""
 
-    width: int  # columns of a tile [px]
-    height: int  # rows of a tile [px]
+    width_log2: int  # columns of a tile
+    height_log2: int  # rows of a tile
+    side_log2: int  # columns and rows of a block
     count_x: int  # tiles per row of the image
 
 
 @wp.func
 def slot(x: int, y: int, tiling: Tiling) -> int:
     """Place of pixel [y, x] in a plane."""
-    tile = (y // tiling.height) * tiling.count_x + x // tiling.width
-    return (tile * tiling.height + y % tiling.height) * tiling.width + x % tiling.width
+    tile = (y >> tiling.height_log2) * tiling.count_x + (x >> tiling.width_log2)
+    in_x = x & ((1 << tiling.width_log2) - 1)
+    in_y = y & ((1 << tiling.height_log2) - 1)
+    side = tiling.side_log2
+    block = ((in_y >> side) << (tiling.width_log2 - side)) + (in_x >> side)
+    mask = (1 << side) - 1
+    return (
+        (tile << (tiling.width_log2 + tiling.height_log2)) + (((block << side) + (in_y & mask)) << side) + (in_x & mask)
+    )
 
 
 @wp.func

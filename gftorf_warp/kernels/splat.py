@@ -10,7 +10,7 @@ Sixteen floats, one 64-byte line, the same slots for values and for gradients:
     8 9 10           three channels weighed by T, for example colour
     11 12 13         a cos psi, a sin psi, a: what quads and phasor are made of, weighed by T^2
     14 distance      along the ray [m]
-    15 zeta          what distortion is measured on: the distance, or its released mapping
+    15 reach_x       bound of abs(dx) on that ellipse [px]; no gradient
 """
 
 import warp as wp
@@ -33,23 +33,26 @@ _LOAD = """
 #endif
 """
 
-# A CPU thread owns one row of a tile, so a cheap test skips most rows. A warp owns all rows of a tile that is known to
-# be touched: there the test would hardly ever hold for all lanes.
-_ROW_MISSED = """
+# A CPU thread owns one block of a tile, so a cheap test skips many blocks. A warp owns all pixels of a tile that is
+# known to be touched: there the test would hardly ever hold for all lanes.
+_BLOCK_MISSED = """
 #if defined(__CUDA_ARCH__)
     return false;
 #else
-    return __builtin_fabsf(dy) > splats.data[i].c[7];
+    const float* q = &splats.data[i].c[0];
+    return (__builtin_fabsf(q[0] - x) > q[15] + half) | (__builtin_fabsf(q[1] - y) > q[7] + half);
 #endif
 """
 
 
 @wp.func_native(_LOAD)
-def load_splat(splats: wp.array[Splat], i: int) -> Splat: ...
-@wp.func_native("return splats.data[i].c[1] - y;")
-def row_offset(splats: wp.array[Splat], i: int, y: float) -> float: ...
-@wp.func_native(_ROW_MISSED)
-def row_missed(splats: wp.array[Splat], i: int, dy: float) -> bool: ...
+def load_splat(splats: wp.array[Splat], i: int) -> Splat:
+    """Record ``i``, in four loads."""
+
+
+@wp.func_native(_BLOCK_MISSED)
+def block_missed(splats: wp.array[Splat], i: int, x: float, y: float, half: float) -> bool:
+    """Whether splat ``i`` surely misses the block around (x, y) whose pixel centres are within ``half`` [px]."""
 
 
 @wp.kernel(enable_backward=False)

@@ -1,7 +1,7 @@
 """Which splats each tile has to look at: exact ellipse-tile tests, counts, keys, and where each tile's list begins.
 
-A tile lists a splat if the ellipse alpha >= 1/255 reaches the rectangle of its pixel centres. Splats are emitted near to
-far and sorted by tile with a stable sort, so that every list is in depth order.
+A tile lists a splat if the ellipse alpha >= 1/255 reaches the rectangle of its pixel centres. Splats are emitted near
+to far and sorted by tile with a stable sort, so that every list is in depth order.
 """
 
 import warp as wp
@@ -12,16 +12,13 @@ from .splat import Splat
 @wp.func
 def tile_range(q: Splat, box: wp.vec4i, tile_width: int, tile_height: int, tiles_x: int, tiles_y: int) -> wp.vec4i:
     """Tiles [x0, y0, x1, y1) that the bounding box of the ellipse, cut to ``box`` [px], can touch."""
-    determinant = q[2] * q[4] - q[3] * q[3]
-    reach_x = wp.sqrt(wp.max(q[6], 0.0) * q[4] / determinant) + 1.0e-3
-    reach_y = wp.sqrt(wp.max(q[6], 0.0) * q[2] / determinant) + 1.0e-3
     w = float(tile_width)
     h = float(tile_height)
     # clamped as floats first: an integer from a float that does not fit is undefined
-    x0 = int(wp.clamp(wp.floor((q[0] - reach_x) / w), 0.0, float(tiles_x)))
-    y0 = int(wp.clamp(wp.floor((q[1] - reach_y) / h), 0.0, float(tiles_y)))
-    x1 = int(wp.clamp(wp.floor((q[0] + reach_x) / w) + 1.0, 0.0, float(tiles_x)))
-    y1 = int(wp.clamp(wp.floor((q[1] + reach_y) / h) + 1.0, 0.0, float(tiles_y)))
+    x0 = int(wp.clamp(wp.floor((q[0] - q[15]) / w), 0.0, float(tiles_x)))
+    y0 = int(wp.clamp(wp.floor((q[1] - q[7]) / h), 0.0, float(tiles_y)))
+    x1 = int(wp.clamp(wp.floor((q[0] + q[15]) / w) + 1.0, 0.0, float(tiles_x)))
+    y1 = int(wp.clamp(wp.floor((q[1] + q[7]) / h) + 1.0, 0.0, float(tiles_y)))
     return wp.vec4i(
         wp.max(x0, box[0] // tile_width),
         wp.max(y0, box[1] // tile_height),

@@ -72,7 +72,11 @@ class RenderSettings:
     distortion: Distortion = Distortion.PAPER
     """Which distortion is returned."""
     pair_capacity: int | None = None
-    """(tile, splat) pairs to reserve; None reads their number back, the one host synchronisation of a rendering."""
+    """(tile, splat) pairs to reserve; None reads their number back, the one host synchronisation of a rendering.
+
+    With a number nothing is read back on CUDA: pairs that do not fit are dropped until ``Frame.check_capacity`` is asked.
+    On the CPU it is asked every time.
+    """
     threads: int | None = None
     """CPU threads of the blend; None: as many as this process may use. Another number changes sums by rounding only."""
 
@@ -83,6 +87,11 @@ class RenderSettings:
             raise ValueError(f"sh_degree must be 0, 1, 2 or 3, got {self.sh_degree}")
         if self.threads is not None and self.threads < 1:
             raise ValueError(f"threads must be at least 1, got {self.threads}")
+
+
+# pixels per thread, columns and rows of a tile: a CPU thread works on a block of 4 x 4 pixels at once, on CUDA a warp
+# owns a tile and every thread a pixel (design/tiles.md)
+TILE_SHAPES = {"cpu": (16, 8, 8), "cuda": (1, 8, 4)}
 
 
 def available_threads() -> int:
@@ -97,15 +106,19 @@ class Frame:
         """Reserve memory for ``count`` Gaussians, an image of ``width`` x ``height`` and ``extra`` channels."""
         self.count, self.width, self.height, self.extra = count, width, height, extra
         self.settings, self.device = settings, device
-        # a CPU thread works on 16 pixels of a row at once; on CUDA a tile belongs to one warp (design/tiles.md)
-        self.K, self.tile_width, self.tile_height = (16, 16, 4) if device.is_cpu else (1, 8, 4)
+        self.K, self.tile_width, self.tile_height = TILE_SHAPES["cpu" if device.is_cpu else "cuda"]
         self.tiles_x = math.ceil(width / self.tile_width)
         self.tiles_y = math.ceil(height / self.tile_height)
         self.tiles = self.tiles_x * self.tiles_y
-        self.lanes = make_pixels(self.K, self.tile_width, self.tile_height).lanes
+        pixels = make_pixels(self.K, self.tile_width, self.tile_height)
+        self.lanes = pixels.lanes
         self.threads = (settings.threads or available_threads()) if device.is_cpu else 1
         self.tiling = Tiling()
-        self.tiling.width, self.tiling.height, self.tiling.count_x = self.tile_width, self.tile_height, self.tiles_x
+        self.tiling.width_log2, self.tiling.height_log2 = (
+            self.tile_width.bit_length() - 1,
+            self.tile_height.bit_length() - 1,
+        )
+        self.tiling.side_log2, self.tiling.count_x = pixels.side.bit_length() - 1, self.tiles_x
 
         self.splats = self.array(count, Splat)
         self.square_px = self.array(count, wp.vec4i)
@@ -125,6 +138,16 @@ class Frame:
         """Make room for ``capacity`` (tile, splat) pairs, and as much again for the sort."""
         self.keys, self.ids = self.array(2 * capacity), self.array(2 * capacity)
 
+    def check_capacity(self) -> None:
+        """Raise if the reserve of pairs was too small, so that far splats are missing; waits for the device.
+
+        Raises:
+            ValueError: With the number of pairs that would have fitted.
+        """
+        capacity, needed = self.settings.pair_capacity, int(self.total.numpy()[0]) if self.count else 0
+        if capacity is not None and needed > capacity:
+            raise ValueError(f"pair_capacity = {capacity} is too small: this frame has {needed} (tile, splat) pairs")
+
     def planes(self, count: int) -> Planes:
         """``count`` image planes in tile order."""
         return Planes(self, count)
@@ -140,8 +163,8 @@ class Planes:
     """Image planes in tile order, seen twice: ``lanes`` for the compositor, ``flat`` for everything per pixel."""
 
     def __init__(self, frame: Frame, count: int):
-        # One tile of padding: 320 x 240 floats are exactly 75 pages, and a loop that touches the same pixel of nine such
-        # planes would keep evicting its own cache lines.
+        # One tile of padding: 320 x 240 floats are exactly 75 pages, and a loop that touches the same pixel of nine
+        # such planes would keep evicting its own cache lines.
         tile = frame.lanes * frame.K
         self.flat = frame.array((count, (frame.tiles + 1) * tile), wp.float32)
         self.lanes = wp.array(

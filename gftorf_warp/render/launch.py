@@ -177,8 +177,7 @@ def project_backward(inputs: Inputs, view: CameraView, frame: Frame, grad_splats
 
 def _project_kernel(inputs: Inputs, frame: Frame):
     settings = frame.settings
-    metric = settings.distortion == Distortion.PAPER
-    return make_project(inputs.colour_sh is not None, settings.support == Support.SIGMA3_TILE16, metric)
+    return make_project(inputs.colour_sh is not None, settings.support == Support.SIGMA3_TILE16)
 
 
 def _project_inputs(inputs: Inputs, view: CameraView, frame: Frame) -> list:
@@ -215,18 +214,21 @@ def sort_by_tile(frame: Frame) -> None:
     if capacity:
         wp.utils.radix_sort_pairs(frame.keys, frame.ids, capacity, end_bit=frame.tiles.bit_length())
     _launch(tiles.tile_starts, frame.tiles + 1, [frame.keys, capacity], [frame.first])
+    if frame.settings.pair_capacity is not None and frame.device.is_cpu:
+        frame.check_capacity()
 
 
 def composite(frame: Frame, view: CameraView, splats: wp.array, number: int) -> None:
     """Blend all tiles: light with the first group of channels, every further group by itself."""
     light, channels = number == 0, bool(frame.channels)
     shape = frame.K, frame.tile_width, frame.tile_height
-    kernel = make_composite(*shape, light, channels, frame.settings.stop == Stop.INCLUSIVE)
+    metric = frame.settings.distortion == Distortion.PAPER
+    kernel = make_composite(*shape, light, channels, frame.settings.stop == Stop.INCLUSIVE, metric)
     channel = frame.channels[number].lanes if channels else _nothing(frame, 3, frame.sums.lanes.dtype)
     edges = _tile_edges(frame, 2 * frame.threads)
 
     def arguments(tile0: int, _part: int) -> list:
-        ids = [frame.first, frame.ids, splats, frame.tiles_x, view.width, view.height, tile0]
+        ids = [frame.first, frame.ids, splats, frame.tiles_x, view.width, view.height, tile0, _mapping(frame)]
         return [*ids, frame.sums.lanes, channel]
 
     _over_tiles(frame, kernel, edges, arguments)
@@ -236,14 +238,15 @@ def composite_backward(frame: Frame, splats, light: bool, grad_light, channel, r
     """Add the gradient of one pass to ``records``; CPU threads add to their own, which are then summed in order."""
     shape = frame.K, frame.tile_width, frame.tile_height
     passes = frame.settings.clamp_gradient == ClampGradient.STRAIGHT
-    kernel = make_composite_backward(*shape, light, channel is not None, passes)
+    metric = frame.settings.distortion == Distortion.PAPER
+    kernel = make_composite_backward(*shape, light, channel is not None, passes, metric)
     grad_channel = channel.lanes if channel is not None else _nothing(frame, 3, frame.sums.lanes.dtype)
     edges = _tile_edges(frame, frame.threads)
     parts = [records] + [wp.zeros_like(records) for _ in range(len(edges) - 2)]
 
     def arguments(tile0: int, part: int) -> list:
         sums = [frame.sums.lanes, grad_light.lanes, grad_channel]
-        return [frame.first, frame.ids, splats, frame.tiles_x, tile0, *sums, parts[part]]
+        return [frame.first, frame.ids, splats, frame.tiles_x, tile0, _mapping(frame), *sums, parts[part]]
 
     _over_tiles(frame, kernel, edges, arguments)
     for part in parts[1:]:
@@ -322,6 +325,12 @@ def _channel_groups(inputs: Inputs) -> list[tuple[str, int]]:
 
 def _distortion_factor(frame: Frame) -> float:
     return 2.0 if frame.settings.distortion == Distortion.PAPER else 1.0
+
+
+def _mapping(frame: Frame) -> wp.vec2:
+    """Coefficients of the released zeta = far / (far - near) (1 - near / distance)."""
+    near, far = frame.settings.near, frame.settings.far
+    return wp.vec2(far / (far - near), far * near / (far - near))
 
 
 def _tile_edges(frame: Frame, parts: int) -> list[int]:

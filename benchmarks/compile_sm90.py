@@ -1,0 +1,106 @@
+"""Compile every kernel for a CUDA architecture, without a GPU or a driver, and print registers, stack and code size.
+
+    python benchmarks/compile_sm90.py [--arch 90] [--json FILE]
+
+Ends with exit code 1 if a kernel does not compile or keeps more than 32 bytes on the stack: a local array indexed at
+run time, or spilled registers, is how a fast kernel silently becomes a slow one (sinf and cosf own 32 bytes that are
+never touched).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import struct
+import sys
+import tempfile
+from pathlib import Path
+
+import warp as wp
+
+from gftorf_warp.kernels import composite, composite_backward, project, resolve, splat, tiles
+from gftorf_warp.render.buffers import TILE_SHAPES
+
+FRAME_SIZE, REGISTERS = 0x11, 0x2F  # attributes in the .nv.info section of a cubin
+ALLOWED_STACK = 32  # [B]
+
+
+def modules() -> dict[str, wp.Module]:
+    """Every module with CUDA code, in the variants that presets use."""
+    shape = TILE_SHAPES["cuda"]
+    found = {
+        "tiles": tiles.count_pairs.module,
+        "resolve": resolve.resolve_quads.module,
+        "splat": splat.add_records.module,
+    }
+    found["finish_moments"] = composite_backward.finish_moments.module
+    for colour in (False, True):
+        for square in (False, True):
+            kernel = project.make_project(colour, square)
+            found["project" + " colour" * colour + " square" * square] = kernel.module
+    for light, channels in ((True, False), (True, True), (False, True)):
+        what = " ".join(["light"] * light + ["channels"] * channels)
+        for metric in (True, False):
+            name = f"{what} {'paper' if metric else 'released'}"
+            forward = composite.make_composite(*shape, light, channels, metric, metric)
+            backward = composite_backward.make_composite_backward(*shape, light, channels, not metric, metric)
+            found[f"composite {name}"], found[f"composite_backward {name}"] = forward.module, backward.module
+    return found
+
+
+def kernels_in(cubin: Path) -> dict[str, tuple[int, int, int]]:
+    """{kernel: (registers, stack bytes, code bytes)} of a cubin, which is a 64-bit ELF file."""
+    data = cubin.read_bytes()
+    (table,) = struct.unpack_from("<Q", data, 0x28)
+    entry, count, names = struct.unpack_from("<HHH", data, 0x3A)
+    headers = [struct.unpack_from("<IIQQQQIIQQ", data, table + i * entry) for i in range(count)]
+
+    def text(at: int) -> str:
+        return data[at : data.index(b"\0", at)].decode()
+
+    sections = {text(headers[names][4] + h[0]): h for h in headers}  # name, type, flags, address, offset, size, ...
+    symbols, strings = sections[".symtab"][4], sections[".strtab"][4]
+    found: dict[str, dict[int, int]] = {}
+    at, end = sections[".nv.info"][4], sum(sections[".nv.info"][4:6])
+    while at < end:
+        form, attribute, size = struct.unpack_from("<BBH", data, at)
+        if form == 4 and size == 8 and attribute in (FRAME_SIZE, REGISTERS):
+            symbol, value = struct.unpack_from("<II", data, at + 4)
+            (name,) = struct.unpack_from("<I", data, symbols + 24 * symbol)
+            found.setdefault(text(strings + name), {})[attribute] = value
+        at += 4 + (size if form == 4 else 0)
+    return {
+        name: (value.get(REGISTERS, 0), value.get(FRAME_SIZE, 0), sections[".text." + name][5])
+        for name, value in found.items()
+        if ".text." + name in sections
+    }
+
+
+def main() -> int:
+    """Print the table, write the JSON, judge the stack."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--arch", type=int, default=90, help="compute capability, 90 is H100 and H200")
+    parser.add_argument("--json", type=Path)
+    a = parser.parse_args()
+    wp.config.log_level = wp.LOG_ERROR
+    wp.init()
+    rows, offenders = [], 0
+    for title, module in modules().items():
+        with tempfile.TemporaryDirectory() as folder:
+            paths = wp.compile_aot_module(module, arch=a.arch, module_dir=folder, use_ptx=False)
+            for path in paths:
+                for name, (registers, stack, code) in kernels_in(Path(path)).items():
+                    kernel, _, way = name.partition("_cuda_kernel_")
+                    kernel = kernel.rpartition("__locals__")[2].rpartition("_")[0]
+                    rows.append({"module": title, "kernel": f"{kernel} {way}", "registers": registers, "stack": stack})
+                    offenders += stack > ALLOWED_STACK
+                    use = f"{registers:4d} registers {stack:4d} B stack {code:6d} B code"
+                    print(f"sm_{a.arch} {title:<38} {kernel:<20} {way:<9}{use}")
+    if a.json:
+        a.json.write_text(json.dumps({"arch": a.arch, "warp": wp.__version__, "kernels": rows}, indent=1) + "\n")
+    print(f"{len(rows)} kernels, {offenders} with more than {ALLOWED_STACK} B of stack")
+    return int(offenders > 0 or not rows)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

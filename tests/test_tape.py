@@ -1,0 +1,122 @@
+"""The renderer from a Warp program: gradients through wp.Tape, and the CUDA mapping of the kernels run on the CPU."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+
+from gftorf_warp.render import buffers, launch
+from gftorf_warp.render.api import Background, rasterize
+from gftorf_warp.render.buffers import Frame, RenderSettings
+from gftorf_warp.render.launch import Images, Inputs
+from gftorf_warp.scene.camera import Camera
+from gftorf_warp.scene.gaussians import GaussianField, constant_sh
+from gftorf_warp.scene.sensor import Sensor
+
+DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
+COUNT, WIDTH, HEIGHT, EXTRA = 40, 29, 19, 4
+SHIFTS = (0.3, 2.0, 4.4)
+SETTINGS = RenderSettings(near=0.1, far=20.0)
+SENSOR = Sensor(shifts=SHIFTS, phase_offset=0.2, dc_offset=0.4, source_intensity=1.3)
+CAMERA = Camera.from_fov(WIDTH, HEIGHT, 60)
+VECTORS = {"mean": wp.vec3, "log_scale": wp.vec3, "quaternion": wp.vec4, "colour_sh": wp.vec3}
+
+
+def scene(device="cpu"):
+    """Return a field, extra channels and a background of noise."""
+    rng = torch.Generator().manual_seed(0)
+
+    def normal(*shape):
+        return torch.randn(*shape, generator=rng)
+
+    mean = torch.rand(COUNT, 3, generator=rng) * torch.tensor([2.0, 1.4, 2.0]) + torch.tensor([-1.0, -0.7, 1.5])
+    field = GaussianField(
+        mean=mean,
+        log_scale=math.log(0.1) + 0.4 * normal(COUNT, 3),
+        quaternion=normal(COUNT, 4),
+        opacity_logit=2.0 * normal(COUNT),
+        reflectivity_sh=constant_sh(torch.rand(COUNT, generator=rng)) + 0.05 * normal(COUNT, 16),
+        colour_sh=0.2 * normal(COUNT, 16, 3),
+    )
+    extra, background = normal(COUNT, EXTRA), normal(len(SHIFTS), HEIGHT, WIDTH)
+    return field.map(lambda t: t.to(device)), extra.to(device), background.to(device)
+
+
+def cotangents(device="cpu"):
+    """Return a random derivative of the loss by every image."""
+    rng = torch.Generator().manual_seed(1)
+    size = HEIGHT, WIDTH
+    shapes = {"quads": (len(SHIFTS), *size), "phasor": (3, *size), "colour": (3, *size), "extra": (EXTRA, *size)}
+    shapes |= dict.fromkeys(("distance", "opacity", "distortion"), size)
+    return {name: torch.randn(*shape, generator=rng).to(device) for name, shape in shapes.items()}
+
+
+def torch_gradients(device="cpu"):
+    """Return images and gradients by torch.autograd."""
+    field, extra, background = scene(device)
+    named = {**field.parameters(), "extra": extra, "background_quads": background}
+    for tensor in named.values():
+        tensor.requires_grad_()
+    rendering = rasterize(field, CAMERA, SENSOR, SETTINGS, extra=extra, background=Background(quads=background))
+    images = {name: getattr(rendering, name) for name in cotangents()}
+    outputs, grads = list(images.values()), [cotangents(device)[name] for name in images]
+    return images, dict(zip(named, torch.autograd.grad(outputs, list(named.values()), grads), strict=True))
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_tape_and_torch_agree_and_the_tape_accumulates(device):
+    """A Warp program that records a tape gets torch's gradients; a second backward adds the same again."""
+    wanted_images, wanted = torch_gradients(device)
+    field, extra, background = scene(device)
+    named = {**field.parameters(), "extra": extra, "background_quads": background}
+    arrays = {
+        name: wp.from_torch(t.clone(), dtype=VECTORS.get(name, wp.float32), requires_grad=True)
+        for name, t in named.items()
+    }
+    values = [float(v) for v in (SENSOR.phase_slope, SENSOR.phase_offset, SENSOR.source_intensity, SENSOR.dc_offset)]
+    wp_device = arrays["mean"].device
+    calibration = wp.array(values, dtype=float, device=wp_device, requires_grad=True)
+    shapes = {name: tuple(t.shape) for name, t in cotangents().items()}
+    images = Images(
+        **{name: wp.zeros(s, dtype=float, device=wp_device, requires_grad=True) for name, s in shapes.items()}
+    )
+    inputs = Inputs(**arrays, calibration=calibration)
+    frame = Frame(COUNT, WIDTH, HEIGHT, EXTRA, SETTINGS, wp_device)
+    with wp.Tape() as tape:
+        launch.render(inputs, launch.view_of(CAMERA, SETTINGS), SHIFTS, frame, images)
+    for name, image in wanted_images.items():
+        torch.testing.assert_close(wp.to_torch(getattr(images, name)), image.detach())
+
+    seeds = {getattr(images, name): wp.from_torch(t) for name, t in cotangents(device).items()}
+    tape.backward(grads=seeds)
+    once = {name: wp.to_torch(array.grad).clone() for name, array in arrays.items()}
+    for name, want in wanted.items():
+        assert want.abs().max() > 1e-3, name
+        torch.testing.assert_close(once[name].reshape(want.shape), want, rtol=1e-5, atol=1e-5, msg=name)
+    assert np.abs(calibration.grad.numpy()).min() > 1e-2
+    tape.backward(grads=seeds)
+    for name, array in arrays.items():
+        torch.testing.assert_close(wp.to_torch(array.grad), 2.0 * once[name], rtol=1e-5, atol=1e-5, msg=name)
+
+
+def test_one_thread_per_pixel_gives_the_same_on_the_cpu(monkeypatch):
+    """The instance that CUDA runs, one pixel per thread in tiles of 8 x 4, agrees with the 16-lane one."""
+    images, wanted = torch_gradients()
+    monkeypatch.setitem(buffers.TILE_SHAPES, "cpu", buffers.TILE_SHAPES["cuda"])
+    other_images, other = torch_gradients()
+    for name, image in images.items():
+        torch.testing.assert_close(other_images[name], image, rtol=1e-5, atol=2e-6, msg=name)
+    for name, want in wanted.items():
+        torch.testing.assert_close(other[name], want, rtol=1e-4, atol=2e-5 * float(want.abs().max()), msg=name)
+
+
+def test_a_fixed_capacity_gives_the_same_and_reports_what_did_not_fit():
+    """A reserve of pairs changes nothing as long as it suffices; one that does not is an error with both numbers."""
+    field, _, _ = scene()
+    free = rasterize(field, CAMERA, SENSOR, SETTINGS)
+    roomy = RenderSettings(near=0.1, far=20.0, pair_capacity=5000)
+    torch.testing.assert_close(rasterize(field, CAMERA, SENSOR, roomy).quads, free.quads, rtol=0, atol=0)
+    with pytest.raises(ValueError, match=r"pair_capacity = 10 is too small: this frame has \d+"):
+        rasterize(field, CAMERA, SENSOR, RenderSettings(near=0.1, far=20.0, pair_capacity=10))
