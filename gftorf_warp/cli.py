@@ -132,6 +132,8 @@ def _simulate(options: argparse.Namespace) -> int:
         seed=options.seed,
         sync=options.sync,
         noise=not options.no_noise,
+        flow=options.flow,
+        exposure_samples=options.exposure_samples,
         format=options.format,
         fresh=options.fresh,
         progress=_progress(options)("simulate"),

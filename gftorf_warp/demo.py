@@ -60,9 +60,8 @@ def demo(
         return None if progress is None else progress(label)
 
     with _Step("[1/4] simulate   ") as step:
-        if not (out / "seq").exists():  # it appears only when it is complete
-            simulate(SCENE, out / "seq", frames=frames, size=size, seed=seed, progress=report("simulate"))
-        sequence = Sequence.open(out / "seq")
+        path = simulate(SCENE, out / "seq", frames=frames, size=size, seed=seed, progress=report("simulate"))
+        sequence = Sequence.open(path)
         step.says = f"{SCENE} {sequence.width}x{sequence.height}, {sequence.frames} raw frames -> {out / 'seq'}"
     with _Step("[2/4] check      ") as step:
         found = check(out / "seq")

@@ -92,6 +92,9 @@ def command_parsers() -> dict[str, Parser]:
     simulate.add_argument("--format", metavar="ftorf", default="ftorf", help="folder layout")
     simulate.add_argument("--sync", action="store_true", help="all four quads of a quartet at one instant")
     simulate.add_argument("--no-noise", action="store_true", help="an ideal sensor")
+    simulate.add_argument("--flow", action="store_true", help="store exact optical flow too")
+    blur = "instants that one exposure averages (1: no motion blur)"
+    simulate.add_argument("--exposure-samples", metavar="N", type=_positive, default=1, help=blur)
     _fresh_option(simulate)
     _threads_option(simulate)
 
