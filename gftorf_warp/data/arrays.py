@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError
+from .matlab import read_matrix
 from .specs import Field
 
 SIDE_MAX = 8192  # [px] no C-ToF image is larger; a forged header would ask for terabytes
@@ -156,32 +157,17 @@ def _header(path: Path, field: Field, file: Any) -> tuple[tuple[int, ...], bool,
 
 
 def _read_mat(path: Path, field: Field) -> np.ndarray:
-    import io
-
-    import scipy.io  # type: ignore[import-untyped]
-
     data = _small_file(path, field)
+    assert field.mat_key is not None
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")
-            content = scipy.io.loadmat(io.BytesIO(data), variable_names=[field.mat_key])
-    except Exception as error:  # likewise: nothing but an error comes from a damaged file, of any type
+        return read_matrix(data, field.mat_key)
+    except ValueError as error:
         raise InputError(
-            f"{field.name}: not a MATLAB file",
+            f"{field.name}: no MATLAB matrix",
             where=path,
-            why=f"expected a MATLAB 5 file, found {_excerpt(path)} ({error})",
-            fix="save it again with save -v7, or as .npy",
+            why=f"expected a MATLAB 5 file with a real matrix {field.mat_key!r}, found {_excerpt(path)} ({error})",
+            fix=f"save the matrix under the name {field.mat_key!r} with save -v7, or as .npy",
         ) from error
-    array = content.get(field.mat_key)
-    if not isinstance(array, np.ndarray):
-        raise InputError(
-            f"{field.name}: variable missing",
-            where=path,
-            why=f"expected a variable {field.mat_key!r} that is a matrix, found "
-            f"{type(array).__name__ if array is not None else sorted(k for k in content if not k.startswith('_'))}",
-            fix=f"save the matrix under the name {field.mat_key!r}",
-        )
-    return array
 
 
 def _check(path: Path, field: Field, shape: tuple[int, ...], dtype: np.dtype, sizes: Mapping[str, int]) -> None:

@@ -36,8 +36,12 @@ def write_exr(path: str | Path, channels: Mapping[str, np.ndarray]) -> None:
         raise ValueError(f"channels must be images [H, W] of one shape, got {found}")
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     with atomic_path(path) as temporary:
-        with OpenEXR.File(header, images) as file:
-            file.write(str(temporary))
+        temporary.touch(exist_ok=False)  # so that a place that cannot be written to is told from a disk that is full
+        try:
+            with OpenEXR.File(header, dict(images)) as file:  # it puts its own channels into the dictionary
+                file.write(str(temporary))
+        except RuntimeError as error:
+            raise ResourceError("cannot write picture", where=path, why=str(error), fix="free disk space") from error
         back = read_exr(temporary)
         if back.keys() != images.keys() or any(back[n].tobytes() != image.tobytes() for n, image in images.items()):
             raise ResourceError(

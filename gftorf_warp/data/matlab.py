@@ -1,0 +1,99 @@
+"""One real matrix out of a MATLAB 5 file, and nothing else: no cells, structures, objects or code.
+
+A page of our own instead of ``scipy.io.loadmat``, which crashes the interpreter on damaged files. A file is 128 bytes
+of header and then elements: a tag (type, length) and the data, padded to eight bytes; four bytes or fewer fit into the
+tag. A matrix is an element of elements: flags with the class, size, name, values by column.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+import zlib
+from collections.abc import Iterator
+
+import numpy as np
+
+MATRIX, COMPRESSED = 14, 15
+NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}  # by stored type
+CLASSES = {6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4", 14: "i8", 15: "u8"}
+COMPLEX = 0x0800
+UNPACKED_MAX = 1 << 20  # [bytes] of a compressed matrix: calibration has a few hundred
+
+
+def read_matrix(data: bytes, name: str) -> np.ndarray:
+    """The matrix of one name.
+
+    Args:
+        data: The whole file.
+        name: Name of the variable.
+
+    Returns:
+        The matrix [rows, columns], in the type that its class states.
+
+    Raises:
+        ValueError: If the file is not of this kind, damaged, or has no such matrix of real numbers; says which.
+    """
+    if len(data) < 128 or data[126:128] not in (b"IM", b"MI"):
+        raise ValueError("no MATLAB 5 header")
+    order = "<" if data[126:128] == b"IM" else ">"
+    found = []
+    for element in _elements(data[128:], order):
+        packed = element[0] == COMPRESSED
+        kind, content = next(_elements(_unpacked(element[1]), order), (0, b"")) if packed else element
+        if kind == MATRIX:
+            parts = list(_elements(content, order))
+            found.append(_name(parts))
+            if found[-1] == name:
+                return _matrix(parts, order)
+    raise ValueError(f"no variable {name!r} but {found}")
+
+
+def _matrix(parts: list[tuple[int, bytes]], order: str) -> np.ndarray:
+    """Values of a matrix from its flags, size, name and real part."""
+    if len(parts) != 4 or [len(parts[0][1]), len(parts[1][1])] != [8, 8]:
+        raise ValueError("not a matrix of real numbers with rows and columns")
+    flags = struct.unpack(order + "I", parts[0][1][:4])[0]
+    shape = struct.unpack(order + "2i", parts[1][1])
+    kind, values = parts[3]
+    if flags & 0xFF not in CLASSES or flags & COMPLEX or kind not in NUMBERS or min(shape) < 1:
+        raise ValueError(f"class {flags & 0xFF}, type {kind}, size {shape} is no matrix of real numbers")
+    stored = np.dtype(order + NUMBERS[kind])
+    if len(values) != math.prod(shape) * stored.itemsize:
+        raise ValueError(f"{len(values)} bytes for {shape} numbers of {stored}")
+    with np.errstate(over="ignore", invalid="ignore"):
+        return np.frombuffer(values, stored).reshape(shape, order="F").astype(CLASSES[flags & 0xFF])
+
+
+def _name(parts: list[tuple[int, bytes]]) -> str:
+    return parts[2][1].decode("ascii", "replace") if len(parts) > 2 else ""
+
+
+def _unpacked(data: bytes) -> bytes:
+    unpacker = zlib.decompressobj()
+    try:
+        content = unpacker.decompress(data, UNPACKED_MAX)
+    except zlib.error as error:
+        raise ValueError(str(error)) from error
+    if not unpacker.eof:
+        raise ValueError(f"compressed data are truncated, or unpack to more than {UNPACKED_MAX} bytes")
+    return content
+
+
+def _elements(data: bytes, order: str) -> Iterator[tuple[int, bytes]]:
+    """Type and content of each element in turn."""
+    start = 0
+    while start < len(data):
+        if start + 8 > len(data):
+            raise ValueError("truncated")
+        kind, length = struct.unpack_from(order + "2I", data, start)
+        if kind >> 16:  # the small form: both halves in four bytes, content in the other four
+            kind, length, begin, step = kind & 0xFFFF, kind >> 16, start + 4, 8
+            if length > 4:
+                raise ValueError(f"a small element of {length} bytes")
+        else:
+            begin, step = start + 8, 8 + (length if kind == COMPRESSED else (length + 7) // 8 * 8)
+        if begin + length > len(data):
+            raise ValueError("truncated")
+        yield kind, data[begin : begin + length]
+        start += step
