@@ -15,7 +15,7 @@ from gftorf_warp.constants import CANONICAL_SHIFTS
 from gftorf_warp.data import ftorf
 from gftorf_warp.data.sequence import Truth
 from gftorf_warp.errors import DivergedError, InputError, UsageError
-from gftorf_warp.evaluate.compare import compare, training_log, truth_statement
+from gftorf_warp.evaluate.compare import compare, sequence_title, training_log, truth_statement
 
 PIXELS, BOX_PIXELS = 12 * 20, 6 * 4
 MOVING, MOVING_BOX = 6 * 6, 6 * 3  # seven columns see the box within a quartet, one of them all the time
@@ -217,6 +217,14 @@ def test_training_log_stops_before_a_torn_line(tmp_path):
     assert training_log(path) == []
     path.write_text('{"images": 4, "loss": 1.0}\n{"images": 8, "lo')
     assert training_log(path) == [{"images": 4, "loss": 1.0}]
+
+
+def test_a_sequence_is_called_by_its_heading(tmp_path):
+    """The heading of its data card, or its folder."""
+    assert sequence_title(None) is None
+    assert sequence_title(tmp_path) == tmp_path.name
+    (tmp_path / "README.md").write_text("# a box: simulated\n\nText.\n")
+    assert sequence_title(tmp_path) == "a box: simulated"
 
 
 def test_truth_statement_is_the_paragraph_of_the_data_card(tmp_path):

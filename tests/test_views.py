@@ -67,7 +67,11 @@ def test_chosen_times_and_things(run, tmp_path):
     images = read_exr(out / "phasor" / "000001.exr")
     np.testing.assert_allclose(np.hypot(images["re"], images["im"]), images["amplitude"], rtol=1e-5)
     np.testing.assert_allclose(images["amplitude"], 2.0 / true_distance(8) ** 2, rtol=1e-5)
-    assert cv2.imread(str(out / "phasor" / "000000.png")).shape == (HEIGHT, 2 * WIDTH + 2, 3)
+    rgb = cv2.imread(str(out / "phasor" / "000001.png"))[..., ::-1]
+    assert rgb.shape == (HEIGHT, 2 * WIDTH + 2, 3)
+    phase = analytic_run.PHASE_SLOPE * (true_distance(8) + analytic_run.QUAD_ERROR)
+    np.testing.assert_array_equal(rgb[:, :WIDTH], pictures.colour_mapped(phase, pictures.phase_scale()))
+    assert rgb[0, -1, 0] < rgb[4, WIDTH + 2 + 11, 0], "the box is nearer, so brighter"
     assert len(list((out / "phasor").iterdir())) == 4
 
 

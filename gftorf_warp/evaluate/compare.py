@@ -143,7 +143,7 @@ def write_report(run: Run, result: dict[str, Any], found: Findings) -> Path:
 
     path = run.path / "report.html"
     page = report.report(
-        title=found.sequence.path.name if found.sequence.path is not None else run.path.name,
+        title=sequence_title(found.sequence.path) or run.path.name,
         metrics=result,
         config=run.config,
         log=training_log(run.path / "metrics.jsonl"),
@@ -171,11 +171,21 @@ def training_log(path: Path) -> list[dict[str, float]]:
     ]
 
 
+def sequence_title(path: Path | None) -> str | None:
+    """What a sequence calls itself: the heading of its README.md, else the name of its folder."""
+    first = _data_card(path).partition("\n")[0]
+    if first.startswith("# "):
+        return first.removeprefix("# ").strip()
+    return None if path is None else path.name
+
+
 def truth_statement(path: Path | None) -> str | None:
     """What the README.md of a sequence says about its ground truth, in its own words; None if nothing."""
-    card = None if path is None else path / "README.md"
-    if card is None or not card.is_file():
-        return None
-    paragraphs = card.read_text(encoding="utf-8", errors="replace").split("\n\n")
+    paragraphs = _data_card(path).split("\n\n")
     about = [" ".join(text.split()) for text in paragraphs if text.lower().startswith("ground truth")]
     return " ".join(about) or None
+
+
+def _data_card(path: Path | None) -> str:
+    card = None if path is None else path / "README.md"
+    return card.read_text(encoding="utf-8", errors="replace") if card is not None and card.is_file() else ""
