@@ -243,8 +243,8 @@ def _shade(basis: Float[Tensor, "M K"], sh: Float[Tensor, "M KC"], channels: int
 
 def _correlate(
     d: Float[Tensor, "M"], reflectivity: Float[Tensor, "M 1"], sensor: Sensor, phasor_factor: float
-) -> Float[Tensor, "M Q+3"]:
-    """What a C-ToF pixel makes of each Gaussian alone: its quads, and its phasor (method, 2.4)."""
+) -> Float[Tensor, "M light"]:
+    """What a C-ToF pixel makes of each Gaussian alone: its Q quads, then its phasor (method, 2.4)."""
     f, phase_offset, dc_offset, source = (
         torch.as_tensor(value, dtype=d.dtype, device=d.device)
         for value in (sensor.f_mod_hz, sensor.phase_offset, sensor.dc_offset, sensor.source_intensity)
