@@ -22,12 +22,12 @@ TABLE = {  # room: (rooms it may import besides itself, packages it may import);
     "constants.py": (set(), set()),
     "errors.py": (set(), set()),
     "kernels": (set(), {"warp"}),
-    "data": (set(), {"OpenEXR", "cv2", "jaxtyping", "numpy", "scipy"}),
+    "data": (set(), {"OpenEXR", "cv2", "jaxtyping", "numpy"}),
     "scene": ({"data"}, TORCH),
     "render": ({"kernels", "scene"}, TORCH | {"warp"}),
     "losses": ({"render"}, TORCH),
     "sim": ({"data", "kernels", "render", "scene"}, TORCH),
-    "recon": ({"data", "losses", "render", "scene"}, TORCH | {"cv2", "scipy"}),
+    "recon": ({"data", "losses", "render", "scene"}, TORCH | {"cv2"}),
     "evaluate": ({"data", "losses", "recon", "render", "scene"}, TORCH | {"cv2", "matplotlib"}),
 }
 FREE = {"constants", "errors", "__version__"}
