@@ -32,6 +32,7 @@ TABLE = {  # room: (rooms it may import besides itself, packages it may import);
 }
 FREE = {"constants", "errors", "__version__"}
 HAS_BOTH = "render/bridge.py"  # the only module that may know torch and Warp together
+LAUNCHES = {"render/launch.py", "render/stages.py"}
 KNOWS_KINDS = {"render/buffers.py": "the shape of a tile depends on the kind of device, which is the input's"}
 HOMELESS = {"utils", "util", "common", "misc", "types", "helpers"}
 
@@ -88,14 +89,14 @@ def test_module_imports_what_its_room_may(path):
 
 @pytest.mark.parametrize("path", FILES, ids=name_of)
 def test_module_names_no_device_and_launches_nowhere_else(path):
-    """Devices are named by the command line; kernels are launched by render/launch.py; streams are the bridge's."""
+    """Devices are named by the command line; kernels are launched in two files of render; streams are the bridge's."""
     for node in ast.walk(ast.parse(path.read_text())):
         if path.parent != ROOT:
             named = getattr(node, "attr", None) == "cuda" and name_of(path) != HAS_BOTH
             assert not named, f"line {node.lineno}: follow the device of the input"
             text = node.value if isinstance(node, ast.Constant) and name_of(path) not in KNOWS_KINDS else None
             assert not (isinstance(text, str) and re.fullmatch(r"cuda(:\d+)?", text)), f"line {node.lineno}: {text}"
-        if name_of(path) != "render/launch.py":
+        if name_of(path) not in LAUNCHES:
             assert getattr(node, "attr", None) not in {"launch", "launch_tiled"}, f"line {node.lineno}: a launch"
 
 
