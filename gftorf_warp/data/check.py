@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,13 +19,15 @@ from .ftorf import numbered, read, read_truth
 from .sequence import Sequence, Truth
 
 DC_TOLERANCE = 0.1  # [1] real differential quads stay within a few hundredths of 0, unipolar ones are at 1
-SATURATED_SHARE = 1e-3  # of the pixels of a frame at its very extreme: light repeats itself only where it is cut off
+SATURATED_SHARE = 1e-3  # of the pixels of a frame at the very extreme: light repeats itself only where it is cut off
+SATURATED_PIXELS = 10  # and no fewer, so that the one brightest pixel of a small image is none
 NARROW_VIEW = 5.0  # focal length in image widths: a view below 11 degrees is more often a mistake in units
 MATCH_MIN = 0.9  # of the correlation of stored phasors with the quads: motion alone costs a few per cent
 RANGE_TOLERANCE = 0.02  # relative, of the depth_range that the truth implies
 OFFSET_TOLERANCE_RAD = 0.05  # [rad] 6 cm at 20 MHz
-DECODED_M = 1e-3  # [m] a "truth" this close to the decoded quads nearly everywhere was decoded from them
-DECODED_SHARE = 0.9
+DECODED_M = 1e-3  # [m] a "truth" this close to the decoded quads, where those change by more, was decoded from them
+DECODED_SHARE = 0.9  # of the changing pixels
+CHANGING_PIXELS = 100  # a static scene without noise is decoded to its truth, and nothing is wrong with that
 
 
 @dataclass(kw_only=True)
@@ -153,14 +156,13 @@ def _quads(sequence: Sequence, report: Report) -> None:
             f"{texts[best]} {shares[best]:.0%}; check tof_permutation.npy"
         )
     extremes = float(sequence.quads.min()), float(sequence.quads.max())
-    cut = [
-        n for n in np.flatnonzero(sequence.measured) if np.isin(sequence.quads[n], extremes).mean() > SATURATED_SHARE
-    ]
-    if cut:
-        worst = max(float(np.isin(sequence.quads[n], extremes).mean()) for n in cut)
+    pixels = sequence.height * sequence.width
+    at_extreme = np.isin(sequence.quads[sequence.measured], extremes).sum(axis=(1, 2))
+    cut = at_extreme[at_extreme >= max(SATURATED_PIXELS, SATURATED_SHARE * pixels)]
+    if len(cut):
         report.warnings.append(
-            f"saturation: up to {worst:.1%} of the pixels of {len(cut)} raw frames sit at the extreme values "
-            f"{extremes[0]:.4g} and {extremes[1]:.4g}, which biases phase"
+            f"saturation: up to {cut.max() / pixels:.1%} of the pixels of {len(cut)} raw frames sit at the extreme "
+            f"values {extremes[0]:.4g} and {extremes[1]:.4g}, which biases phase"
         )
 
 
@@ -202,7 +204,7 @@ def _truth(sequence: Sequence, report: Report) -> None:
         f"truth           {int(truth.known.sum())} frames in synthetic_depth"
         + (f", {seen.min():.4g} .. {seen.max():.4g} m" if len(seen) else ", no known pixel")
     )
-    if _decoded_share(sequence, truth) > DECODED_SHARE:
+    if _is_decoded(sequence, truth):
         report.warnings.append("synthetic_depth was decoded from these quads: it is no truth, do not compare with it")
         return
     if len(seen) and seen.max() > unambiguous:
@@ -224,13 +226,16 @@ def _truth(sequence: Sequence, report: Report) -> None:
         )
 
 
-def _decoded_share(sequence: Sequence, truth: Truth) -> float:
-    """Share of pixels at quartet starts where the stored distance is the decoded one."""
-    shares = [0.0]
-    for i in sequence.complete_quartets:
-        stored = truth.distance[FRAMES_PER_QUARTET * i]
-        shares.append(float((np.abs(stored - closed_form_distance(sequence, i)) < DECODED_M).mean()))
-    return float(np.median(shares[1:])) if len(shares) > 1 else 0.0
+def _is_decoded(sequence: Sequence, truth: Truth) -> bool:
+    """Whether the stored distance follows the decoded one even where noise and motion change it."""
+    quartets = sequence.complete_quartets
+    decoded = {i: closed_form_distance(sequence, i) for i in quartets}
+    changing = agreeing = 0
+    for before, i in itertools.pairwise(quartets):
+        changes = np.abs(decoded[i] - decoded[before]) > DECODED_M
+        changing += int(changes.sum())
+        agreeing += int((np.abs(truth.distance[FRAMES_PER_QUARTET * i] - decoded[i]) < DECODED_M)[changes].sum())
+    return changing >= CHANGING_PIXELS and agreeing > DECODED_SHARE * changing
 
 
 def _flow(sequence: Sequence, report: Report) -> None:

@@ -106,10 +106,10 @@ def _grey(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray
     """Two quads [H, W] as uint8 images with one scale for both, so that equal light stays equally bright."""
     import cv2
 
-    pair = np.stack([cv2.GaussianBlur(quad, (0, 0), BLUR_PX) for quad in (first, second)])
-    low, high = np.percentile(pair, [ROBUST_PERCENT, 100.0 - ROBUST_PERCENT])
+    low, high = np.percentile(np.stack([first, second]), [ROBUST_PERCENT, 100.0 - ROBUST_PERCENT])
     scale = 255.0 / (high - low) if high > low else 0.0
-    grey = np.clip(np.rint((pair - low) * scale), 0, 255).astype(np.uint8)
+    scaled = [np.clip((quad - low) * scale, 0.0, 255.0).astype(np.float32) for quad in (first, second)]
+    grey = [np.rint(cv2.GaussianBlur(quad, (0, 0), BLUR_PX)).astype(np.uint8) for quad in scaled]
     return grey[0], grey[1]
 
 
