@@ -63,6 +63,7 @@ This data may be used under the licence of that program, Apache-2.0.
 
 Quads are in relative units: reflectance rho met at angle i and distance d gives the amplitude rho cos(i) / d^2.
 The scene is covered by Gaussians and rendered with {scene.subsamples}x{scene.subsamples} rays per pixel, averaged.
+
 Ground truth is the analytic first hit of the shapes along the ray through each pixel's centre at the time of each raw
 frame, not a rendering.
 """
@@ -72,7 +73,9 @@ def outcome_card(recording: Recording) -> str:
     """The part that is known only afterwards: how far the rendering is from the truth, and what saturated."""
     agreement = "no such pixel" if recording.gap is None else str(recording.gap)
     return f"""
-Rendered mean distance against that truth, on interior pixels of still surfaces in all raw frames: {agreement}.
+Ground truth against rendered mean distance, on interior pixels of still surfaces in all raw frames:
+{agreement}.
+
 Saturated: {100 * recording.saturated:.3g} % of all pixels and raw frames.
 """
 

@@ -58,7 +58,7 @@ class Splatted:
     Args:
         scene: Bodies and their paths.
         camera: The camera at the resolution of the rays, pixels times ``scene.subsamples``.
-        times: All instants that will be rendered [s]; the covers are fine enough for the nearest approach.
+        times: Instants [s] at whose nearest approach the covers are still fine enough.
     """
 
     def __init__(self, scene: Scene, camera: Camera, times: Float[np.ndarray, "F"]):
@@ -103,7 +103,8 @@ def record(
     times = frame_times(sensor, frames, sync=sync)
     hits = [first_hit(scene.bodies, camera, float(time)) for time in times]
     interior = still_interior(scene, hits)
-    splatted = Splatted(scene, fine, times)
+    longest = frame_times(sensor, max(frames, scene.frames), sync=False)
+    splatted = Splatted(scene, fine, longest)  # the same covers for fewer frames, hence the same images
     shifts = np.array([sensor.shifts[n % len(sensor.shifts)] for n in range(frames)])
 
     quads = np.zeros((frames, camera.height, camera.width), dtype=np.float32)

@@ -7,16 +7,20 @@ import math
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ..constants import CANONICAL_SHIFTS
 from ..errors import UsageError
 from ..scene.sensor import Sensor
 from .card import outcome_card, settings_card
 from .readout import contrast
-from .record import Progress, record
+from .record import Progress, frame_times, record
 from .scenes import SCENES, Scene
+from .splat import clearance
 
 FORMATS = ("ftorf",)
 CARD = "README.md"
+CLEARANCE = 0.5  # [m] nearer bodies fill the image, and a cover of them would need millions of splats
 MARKS = ("cams/depth_range.npy", "tofType0")  # what every F-ToeRF folder holds
 
 
@@ -46,7 +50,7 @@ def simulate(
         out: Folder to write.
         frames: Number of raw frames; None is the scene's own. A last quartet may be incomplete.
         size: (width, height) of the image [px]; None is the scene's own.
-        seed: Of the noise. The same seed gives the same bytes; frame n does not depend on the number of frames.
+        seed: Of the noise. The same seed gives the same bytes, and frame n of a shorter recording is that of a longer.
         sync: Control mode: all raw frames of a quartet are taken at the time of its first.
         noise: False switches shot and read noise, full well and ADC off.
         flow: Whether exact optical flow at quartet starts is stored beside the quads.
@@ -67,6 +71,7 @@ def simulate(
     found = _scene(scene)
     _check_options(found, frames, size, seed, exposure_samples, format)
     _check_sensor(found.sensor)
+    _check_duration(found, frames)
     options: dict[str, Any] = {
         "frames": found.frames if frames is None else frames,
         "size": (found.width, found.height) if size is None else tuple(size),
@@ -135,6 +140,20 @@ def _check_sensor(sensor: Sensor) -> None:
             f"{abs(float(sensor.dc_offset)):g})",
             fix="lower the contrast or the DC offset, or make the sensor unipolar",
         )
+
+
+def _check_duration(scene: Scene, frames: int | None) -> None:
+    """Bodies go on along their paths for as long as is asked, but not through the camera."""
+    times = frame_times(scene.sensor, max(scene.frames, frames or 0), sync=False)
+    for body in (body for body in scene.bodies if body.moves):
+        near = np.flatnonzero(clearance(body, scene.camera(), times) < CLEARANCE)
+        if len(near):
+            raise UsageError(
+                f"something comes nearer to the camera than {CLEARANCE} m",
+                where="--frames",
+                why=f"scene {scene.name} is made for {scene.frames} raw frames, and it happens at frame {near[0]}",
+                fix=f"simulate at most {near[0]} raw frames",
+            )
 
 
 def _check_folder(out: Path, card: str, *, fresh: bool) -> bool:

@@ -167,9 +167,10 @@ def cover_still(bodies: tuple[Body, ...], camera: Camera) -> Cover:
 
 def cover_moving(body: Body, camera: Camera, times: Float[np.ndarray, "F"]) -> Cover:
     """A regular grid of discs on each face, ``SPACING`` pixels apart where the body is nearest at ``times`` [s]."""
-    centres = np.array([body.path.world_from_body(float(t))[:3, 3] for t in times])
-    distances = np.maximum(np.linalg.norm(centres - camera.centre, axis=1) - body.shape.reach, 0.1 * body.shape.reach)
-    nearest, typical = distances.min(), distances.mean()
+    distances = clearance(body, camera, times)
+    nearest, typical = distances.min(), distances.mean() + body.shape.reach
+    if nearest <= 0:
+        raise ValueError(f"a moving body reaches the camera: clearance {nearest:.3f} m must be above 0")
     spacing, variance = SPACING * nearest / camera.fx, LOW_PASS + RADIUS**2
     inset = spread(SPACING * nearest / typical, variance) * typical / camera.fx - spacing / 2
     point, normal, other, limb = body.shape.grid(spacing, inset)
@@ -188,6 +189,12 @@ def cover_moving(body: Body, camera: Camera, times: Float[np.ndarray, "F"]) -> C
         reflectance=body.texture(point) / share,
         body=body,
     )
+
+
+def clearance(body: Body, camera: Camera, times: Float[np.ndarray, "F"]) -> Float[np.ndarray, "F"]:
+    """Distance [m] between the camera and the smallest ball around a body, at ``times`` [s]; negative inside it."""
+    centres = np.array([body.path.world_from_body(float(t))[:3, 3] for t in times])
+    return np.linalg.norm(centres - camera.centre, axis=1) - body.shape.reach
 
 
 def merge(fields: list[GaussianField]) -> GaussianField:
