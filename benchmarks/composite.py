@@ -22,9 +22,9 @@ import torch
 import warp as wp
 
 from gftorf_warp.kernels.composite import CHANNEL_PLANES
-from gftorf_warp.kernels.composite_backward import GRAD_LIGHT_PLANES, finish_moments
+from gftorf_warp.kernels.composite_backward import GRAD_LIGHT_PLANES
 from gftorf_warp.kernels.splat import Splat
-from gftorf_warp.render import launch
+from gftorf_warp.render import launch, stages
 from gftorf_warp.render.buffers import Frame, RenderSettings
 from gftorf_warp.render.launch import Inputs
 from gftorf_warp.scene.camera import Camera
@@ -72,11 +72,12 @@ class Ours:
         )
         settings = RenderSettings(near=NEAR, far=FAR, threads=threads)
         self.camera = Camera(width=WIDTH, height=HEIGHT, fx=FOCAL, fy=FOCAL, cx=WIDTH / 2, cy=HEIGHT / 2)
-        self.frame = Frame(len(scene["mean"]), WIDTH, HEIGHT, 0, settings, wp.get_device(device))
+        self.frame = Frame(len(scene["mean"]), WIDTH, HEIGHT, settings, wp.get_device(device))
         self.view = launch.view_of(self.camera, settings)
-        launch.project(self.inputs, self.view, self.frame)
-        launch.sort_by_depth(self.frame)
-        launch.sort_by_tile(self.frame)
+        stages.project(self.inputs, self.view, self.frame)
+        stages.sort_by_depth(self.frame)
+        stages.sort_by_tile(self.frame)
+        self.frame.records = [self.frame.splats]
         self.frame.channels = [self.frame.planes(CHANNEL_PLANES)]
         self.grad_light, self.grad_channel = (
             self.frame.gradient_planes(GRAD_LIGHT_PLANES),
@@ -89,13 +90,13 @@ class Ours:
 
     def forward(self) -> None:
         """Blend."""
-        launch.composite(self.frame, self.view, self.frame.splats, 0)
+        stages.composite(self.frame, self.view, 0)
 
     def backward(self) -> None:
         """Blend backward, gradient records zeroed."""
         self.records.zero_()
-        launch.composite_backward(self.frame, self.frame.splats, True, self.grad_light, self.grad_channel, self.records)
-        launch._launch(finish_moments, self.frame.count, [self.frame.splats], [self.records])
+        stages.composite_backward(self.frame, 0, self.grad_light, self.grad_channel, self.records)
+        stages.finish(self.frame, self.records)
 
 
 class Naive:

@@ -83,7 +83,7 @@ def test_tape_and_torch_agree_and_the_tape_accumulates(device):
         **{name: wp.zeros(s, dtype=float, device=wp_device, requires_grad=True) for name, s in shapes.items()}
     )
     inputs = Inputs(**arrays, calibration=calibration)
-    frame = Frame(COUNT, WIDTH, HEIGHT, EXTRA, SETTINGS, wp_device)
+    frame = Frame(COUNT, WIDTH, HEIGHT, SETTINGS, wp_device)
     with wp.Tape() as tape:
         launch.render(inputs, launch.view_of(CAMERA, SETTINGS), SHIFTS, frame, images)
     for name, image in wanted_images.items():

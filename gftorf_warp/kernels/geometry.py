@@ -38,11 +38,12 @@ def rotation_of(wxyz: wp.vec4) -> wp.mat33:
 
 
 @wp.func
-def screen_covariance(view: CameraView, local: wp.vec3, wxyz: wp.vec4, scale: wp.vec3) -> wp.vec3:
-    """Covariance (xx, xy, yy) [px^2] of a Gaussian on the image: J R Sigma R^T J^T plus the low-pass filter.
+def screen_covariance(view: CameraView, local: wp.vec3, wxyz: wp.vec4, scale: wp.vec3) -> wp.vec4:
+    """Covariance (xx, xy, yy) [px^2] of a Gaussian on the image, J R Sigma R^T J^T plus low-pass, and its determinant.
 
     The Jacobian J of the projection is taken at the centre ``local`` [m, camera axes], but no farther out than 1.3 half
-    fields of view, since beyond that the linearisation explodes (method, section 2.2).
+    fields of view, since beyond that the linearisation explodes (method, section 2.2). The determinant is a sum of
+    squares: xx yy - xy^2 would lose as many digits as the ellipse is long.
     """
     axes = wp.transpose(view.rotation * rotation_of(wxyz) * wp.diag(scale))  # rows: own axes, in camera axes
     inverse_z = 1.0 / local[2]
@@ -55,4 +56,6 @@ def screen_covariance(view: CameraView, local: wp.vec3, wxyz: wp.vec4, scale: wp
     xx = wp.dot(along_x, along_x) + LOW_PASS
     xy = wp.dot(along_x, along_y)
     yy = wp.dot(along_y, along_y) + LOW_PASS
-    return wp.vec3(xx, xy, yy)
+    area = wp.length_sq(wp.cross(along_x, along_y))
+    determinant = area + LOW_PASS * (wp.dot(along_x, along_x) + wp.dot(along_y, along_y)) + LOW_PASS * LOW_PASS
+    return wp.vec4(xx, xy, yy, determinant)

@@ -31,10 +31,13 @@ def adj_extent_of(opacity: float, cov_xx: float, cov_yy: float, adj_ret: wp.vec3
 
 
 @wp.func
-def square_of(view: CameraView, x: float, y: float, cov: wp.vec3) -> wp.vec4i:
-    """Pixels [x0, y0, x1, y1) of the 3-sigma square rounded out to 16-pixel tiles, as the released code has it."""
+def square_of(view: CameraView, x: float, y: float, cov: wp.vec4) -> wp.vec4i:
+    """Pixels [x0, y0, x1, y1) of the 3-sigma square rounded out to 16-pixel tiles, as the released code has it.
+
+    That code counts from integer pixel centres, so ``x`` and ``y`` are image positions less half a pixel.
+    """
     middle = 0.5 * (cov[0] + cov[2])
-    determinant = cov[0] * cov[2] - cov[1] * cov[1]
+    determinant = cov[3]
     radius = wp.ceil(3.0 * wp.sqrt(middle + wp.sqrt(wp.max(0.1, middle * middle - determinant))))
     tiles_x = (view.width + 15) // 16
     tiles_y = (view.height + 15) // 16
@@ -84,13 +87,11 @@ def make_project(colour: bool, square: bool):
         log_sizes = log_scale[n]
         scale = wp.vec3(wp.exp(log_sizes[0]), wp.exp(log_sizes[1]), wp.exp(log_sizes[2]))
         cov = screen_covariance(view, local, quaternion[n], scale)
-        determinant = cov[0] * cov[2] - cov[1] * cov[1]
-        if determinant <= 0.0:
-            return
+        determinant = cov[3]
         x = view.fx * local[0] / local[2] + view.cx
         y = view.fy * local[1] / local[2] + view.cy
         if wp.static(square):
-            box = square_of(view, x, y, cov)
+            box = square_of(view, x - 0.5, y - 0.5, cov)
             if box[2] <= box[0] or box[3] <= box[1]:
                 return
             square_px[n] = box

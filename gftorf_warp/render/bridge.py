@@ -13,10 +13,10 @@ from torch.autograd.function import once_differentiable
 from ..scene.camera import Camera
 from . import launch
 from .buffers import Frame, RenderSettings
-from .launch import Images, Inputs
+from .inputs import Images, Inputs, names_of
 
-INPUTS = launch._names(Inputs)
-IMAGES = launch._names(Images)
+INPUTS = names_of(Inputs)
+IMAGES = names_of(Images)
 _VECTORS = {"mean": wp.vec3, "log_scale": wp.vec3, "quaternion": wp.vec4, "colour_sh": wp.vec3}
 
 
@@ -54,7 +54,7 @@ class Rasterize(torch.autograd.Function):
         images = {name: mean.new_empty(shapes[name]) for name in IMAGES if name in shapes}
         with _stream_of(mean):
             device = wp.device_from_torch(mean.device)
-            frame = Frame(len(mean), camera.width, camera.height, shapes.get("extra", (0,))[0], settings, device)
+            frame = Frame(len(mean), camera.width, camera.height, settings, device)
             view = launch.view_of(camera, settings)
             launch.forward(_inputs(named), view, shifts, frame, _images(images))
         ctx.save_for_backward(*tensors)
@@ -91,6 +91,9 @@ def _view(tensor: Tensor | None, dtype) -> wp.array | None:
     if tensor is None:
         return None
     wp.init()  # from_torch needs the runtime; does nothing after the first call
+    if tensor.numel() == 0:  # strides of an empty tensor say nothing, and from_torch believes them
+        shape = tensor.shape if dtype is wp.float32 else tensor.shape[:-1]
+        return wp.empty(tuple(shape), dtype=dtype, device=wp.device_from_torch(tensor.device))
     return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False)
 
 

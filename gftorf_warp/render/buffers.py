@@ -74,7 +74,7 @@ class RenderSettings:
     pair_capacity: int | None = None
     """(tile, splat) pairs to reserve; None reads their number back, the one host synchronisation of a rendering.
 
-    With a number nothing is read back on CUDA: pairs that do not fit are dropped until ``Frame.check_capacity`` is asked.
+    With a number nothing is read back on CUDA: pairs that do not fit are dropped, and ``Frame.check_capacity`` tells.
     On the CPU it is asked every time.
     """
     threads: int | None = None
@@ -102,9 +102,9 @@ def available_threads() -> int:
 class Frame:
     """The arrays of one rendering: what forward leaves for backward. Nothing is shared between two frames."""
 
-    def __init__(self, count: int, width: int, height: int, extra: int, settings: RenderSettings, device: wp.Device):
-        """Reserve memory for ``count`` Gaussians, an image of ``width`` x ``height`` and ``extra`` channels."""
-        self.count, self.width, self.height, self.extra = count, width, height, extra
+    def __init__(self, count: int, width: int, height: int, settings: RenderSettings, device: wp.Device):
+        """Reserve memory for ``count`` Gaussians and an image of ``width`` x ``height``."""
+        self.count, self.width, self.height = count, width, height
         self.settings, self.device = settings, device
         self.K, self.tile_width, self.tile_height = TILE_SHAPES["cpu" if device.is_cpu else "cuda"]
         self.tiles_x = math.ceil(width / self.tile_width)
@@ -128,7 +128,7 @@ class Frame:
         self.keys = self.ids = self.array(0)
         self.sums = self.planes(LIGHT_PLANES)
         self.channels: list[Planes] = []
-        self.extra_splats: list[wp.array] = []
+        self.records: list[wp.array] = []  # of each pass: ``splats``, and copies with other channels
 
     def array(self, shape, dtype=wp.int32) -> wp.array:
         """Uninitialised memory on the device of this frame."""
