@@ -1,0 +1,63 @@
+"""What a rendering reads and fills, as Warp arrays by name."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import warp as wp
+
+
+@dataclass(kw_only=True, eq=False)
+class Inputs:
+    """Everything a rendering is differentiable in, as Warp arrays of one device; None: absent.
+
+    A gradient set has the same fields: None there means 'not wanted'.
+    """
+
+    mean: wp.array | None  # [N] vec3
+    log_scale: wp.array | None  # [N] vec3
+    quaternion: wp.array | None  # [N] vec4
+    opacity_logit: wp.array | None  # [N]
+    reflectivity_sh: wp.array | None  # [N, 16]
+    colour_sh: wp.array | None = None  # [N, 16] vec3
+    calibration: wp.array | None  # [4] phase slope [rad/m], phase offset [rad], source intensity, DC offset
+    background_quads: wp.array | None = None  # [Q, H, W]
+    background_phasor: wp.array | None = None  # [3, H, W]
+    background_colour: wp.array | None = None  # [3, H, W]
+    extra: wp.array | None = None  # [N, D]
+
+
+@dataclass(kw_only=True, eq=False)
+class Images:
+    """Everything a rendering fills, row-major; a gradient set has the same fields, None meaning zero."""
+
+    quads: wp.array | None  # [Q, H, W]
+    phasor: wp.array | None  # [3, H, W]
+    colour: wp.array | None = None  # [3, H, W]
+    distance: wp.array | None  # [H, W]
+    opacity: wp.array | None  # [H, W]
+    distortion: wp.array | None  # [H, W]
+    extra: wp.array | None = None  # [D, H, W]
+
+
+def names_of(kind: type) -> list[str]:
+    """Names of the fields of :class:`Inputs` or :class:`Images`, in order."""
+    return [f.name for f in fields(kind)]
+
+
+def present_in(group: Inputs | Images) -> dict[str, wp.array]:
+    """The arrays that are there, by name."""
+    return {name: getattr(group, name) for name in names_of(type(group)) if getattr(group, name) is not None}
+
+
+def gradients_in(group: Inputs | Images) -> dict[str, wp.array]:
+    """The gradients of the arrays that have one, by name."""
+    return {name: array.grad for name, array in present_in(group).items() if array.requires_grad}
+
+
+def channel_groups(inputs: Inputs) -> list[tuple[str, int]]:
+    """(image, first channel) of each group of three T-weighted channels; the first rides along with the light."""
+    groups = [("colour", 0)] if inputs.colour_sh is not None else []
+    if inputs.extra is not None:
+        groups += [("extra", start) for start in range(0, inputs.extra.shape[1], 3)]
+    return groups

@@ -1,0 +1,281 @@
+"""The stages of a rendering, forward and backward: each a fixed list of launches on Warp arrays."""
+
+from __future__ import annotations
+
+import math
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from itertools import pairwise
+
+import numpy as np
+import warp as wp
+
+from ..kernels import resolve, splat, tiles
+from ..kernels.composite import CHANNEL_PLANES, make_composite
+from ..kernels.composite_backward import (
+    GRAD_LIGHT_PLANES,
+    GRAD_TRANSMITTANCE,
+    finish_moments,
+    make_composite_backward,
+)
+from ..kernels.geometry import CameraView
+from ..kernels.project import make_project
+from .buffers import ClampGradient, Distortion, Frame, Stop, Support
+from .inputs import Images, Inputs
+
+_PROJECTED = ("mean", "log_scale", "quaternion", "opacity_logit", "reflectivity_sh", "colour_sh")
+
+
+def project(inputs: Inputs, view: CameraView, frame: Frame) -> None:
+    """Gaussians to splats, depth keys and image regions."""
+    _launch(_project_kernel(inputs, frame), frame.count, _project_inputs(inputs, view, frame), _project_outputs(frame))
+
+
+def project_backward(inputs: Inputs, view: CameraView, frame: Frame, grad_splats: wp.array, wanted: Inputs) -> None:
+    """Gradient records of splats to gradients of Gaussians and calibration: Warp's adjoint of the same kernel."""
+    adjoint = [getattr(wanted, name) for name in _PROJECTED]
+    if any(array is not None for array in [*adjoint, wanted.calibration]):
+        _launch(
+            _project_kernel(inputs, frame),
+            frame.count,
+            _project_inputs(inputs, view, frame),
+            _project_outputs(frame),
+            adjoint=True,
+            adj_inputs=[CameraView(), wanted.calibration, None, *adjoint],
+            adj_outputs=[grad_splats, None, None, None],
+        )
+
+
+def _project_kernel(inputs: Inputs, frame: Frame):
+    settings = frame.settings
+    return make_project(inputs.colour_sh is not None, settings.support == Support.SIGMA3_TILE16)
+
+
+def _project_inputs(inputs: Inputs, view: CameraView, frame: Frame) -> list:
+    colour_sh = inputs.colour_sh if inputs.colour_sh is not None else _nothing(frame, 2, wp.vec3)
+    arrays = [getattr(inputs, name) for name in _PROJECTED[:-1]]
+    return [view, inputs.calibration, frame.settings.sh_degree, *arrays, colour_sh]
+
+
+def _project_outputs(frame: Frame) -> list:
+    return [frame.splats, frame.square_px, frame.depth_key, frame.order]
+
+
+def sort_by_depth(frame: Frame) -> None:
+    """Order the splats near to far, ties by index."""
+    wp.utils.radix_sort_pairs(frame.depth_key, frame.order, frame.count, end_bit=31)
+
+
+def sort_by_tile(frame: Frame) -> None:
+    """Count, emit and sort the (tile, splat) pairs."""
+    lists = [frame.order, frame.splats, frame.square_px, frame.tile_width, frame.tile_height]
+    lists += [frame.tiles_x, frame.tiles_y]
+    _launch(tiles.count_pairs, frame.count, lists, [frame.counts])
+    wp.utils.array_scan(frame.counts, frame.offsets, inclusive=False)
+    capacity = frame.settings.pair_capacity
+    if capacity is None:
+        # the declared host synchronisation: how many pairs there are decides how much memory they need
+        capacity = int(frame.offsets[-1:].numpy()[0]) + int(frame.counts[-1:].numpy()[0])
+        frame.reserve_pairs(capacity)
+    else:
+        frame.reserve_pairs(capacity)
+        frame.keys.fill_(frame.tiles)  # pairs that do not exist sort behind all tiles
+    outputs = [frame.keys, frame.ids, frame.total]
+    _launch(tiles.emit_pairs, frame.count, [*lists, frame.counts, frame.offsets, capacity], outputs)
+    if capacity:
+        wp.utils.radix_sort_pairs(frame.keys, frame.ids, capacity, end_bit=frame.tiles.bit_length())
+    _launch(tiles.tile_starts, frame.tiles + 1, [frame.keys, capacity], [frame.first])
+    if frame.settings.pair_capacity is not None and frame.device.is_cpu:
+        frame.check_capacity()
+
+
+def composite(frame: Frame, view: CameraView, number: int) -> None:
+    """Blend all tiles: light with the first group of channels, every further group by itself."""
+    light, channels = number == 0, bool(frame.channels)
+    shape = frame.K, frame.tile_width, frame.tile_height
+    metric = frame.settings.distortion == Distortion.PAPER
+    kernel = make_composite(*shape, light, channels, frame.settings.stop == Stop.INCLUSIVE, metric)
+    channel = frame.channels[number].lanes if channels else _nothing(frame, 3, frame.sums.lanes.dtype)
+    lists = [frame.first, frame.ids, frame.records[number], frame.tiles_x, view.width, view.height]
+
+    def arguments(tile0: int, _part: int) -> list:
+        return [*lists, tile0, _mapping(frame), frame.sums.lanes, channel]
+
+    _over_tiles(frame, kernel, _tile_edges(frame, 2 * frame.threads), arguments)
+
+
+def composite_backward(
+    frame: Frame, number: int, grad_light: Planes, grad_channel: Planes | None, records: wp.array
+) -> None:
+    """Add the gradient of one pass to ``records``; CPU threads add to their own, which are then summed in order."""
+    light, channels = number == 0, grad_channel is not None
+    shape = frame.K, frame.tile_width, frame.tile_height
+    passes = frame.settings.clamp_gradient == ClampGradient.STRAIGHT
+    metric = frame.settings.distortion == Distortion.PAPER
+    kernel = make_composite_backward(*shape, light, channels, passes, metric)
+    channel = grad_channel.lanes if grad_channel is not None else _nothing(frame, 3, frame.sums.lanes.dtype)
+    edges = _tile_edges(frame, frame.threads)
+    parts = [records] + [wp.zeros_like(records) for _ in range(len(edges) - 2)]
+    lists = [frame.first, frame.ids, frame.records[number], frame.tiles_x]
+
+    def arguments(tile0: int, part: int) -> list:
+        return [*lists, tile0, _mapping(frame), frame.sums.lanes, grad_light.lanes, channel, parts[part]]
+
+    _over_tiles(frame, kernel, edges, arguments)
+    for part in parts[1:]:
+        _launch(splat.add_records, frame.count, [part, 0], [records])
+
+
+def set_channels(frame: Frame, inputs: Inputs, start: int, splats: wp.array) -> None:
+    """Fill ``splats`` with the records of the frame, their channels replaced by three extra ones."""
+    if frame.count:
+        _launch(splat.set_channels, frame.count, [frame.splats, inputs.extra, start], [splats])
+
+
+def take_channels(records: wp.array, start: int, wanted: Inputs) -> None:
+    """Add the channel gradients of records to those of three extra channels."""
+    _launch(splat.take_channels, len(records), [records, start], [wanted.extra])
+
+
+def add_geometry(records: wp.array, total: wp.array) -> None:
+    """Add what a further pass says about centres, conics and opacities."""
+    _launch(splat.add_records, len(records), [records, 1], [total])
+
+
+def finish(frame: Frame, grad_splats: wp.array) -> None:
+    """Turn the moments in gradient records into gradients."""
+    _launch(finish_moments, frame.count, [frame.splats], [grad_splats])
+
+
+def resolve_images(inputs: Inputs, shifts, frame: Frame, images: Images, groups: list) -> None:
+    """Planes to images."""
+    pixels, sums, tiling = (frame.height, frame.width), frame.sums.flat, frame.tiling
+    if shifts:
+        vectors = _shift_vectors(shifts, str(frame.device))
+        lit = [sums, tiling, inputs.calibration, vectors, _or_nothing(frame, inputs.background_quads)]
+        _launch(resolve.resolve_quads, pixels, lit, [images.quads])
+    factor = frame.settings.phasor_factor
+    lit = [sums, tiling, factor, _or_nothing(frame, inputs.background_phasor)]
+    _launch(resolve.resolve_phasor, pixels, lit, [images.phasor])
+    outputs = [images.distance, images.opacity, images.distortion]
+    _launch(resolve.resolve_geometry, pixels, [sums, tiling, _distortion_factor(frame)], outputs)
+    for (name, start), planes in zip(groups, frame.channels, strict=True):
+        background = inputs.background_colour if name == "colour" else None
+        rest = [planes.flat, sums, tiling, _or_nothing(frame, background), start]
+        _launch(resolve.resolve_channels, pixels, rest, [getattr(images, name)])
+
+
+def fold_images(inputs: Inputs, shifts, frame: Frame, cotangents: Images, wanted: Inputs, groups: list):
+    """Images to planes: the adjoint of :func:`resolve_images`. Channels without a gradient are None."""
+    pixels, sums, tiling = (frame.height, frame.width), frame.sums.flat, frame.tiling
+    planes = frame.gradient_planes(GRAD_LIGHT_PLANES)
+    target = planes.flat
+    if cotangents.quads is not None and shifts:
+        vectors = _shift_vectors(shifts, str(frame.device))
+        lit = [sums, tiling, inputs.calibration, vectors, _or_nothing(frame, inputs.background_quads)]
+        outputs = [target, _or_nothing(frame, wanted.background_quads)]
+        _launch(resolve.fold_quads, pixels, [*lit, cotangents.quads], outputs)
+        if wanted.calibration is not None:
+            rows = frame.array(frame.height, wp.float64)
+            _launch(resolve.fold_dc_offset, frame.height, [sums, tiling, cotangents.quads], [rows])
+            _launch(resolve.add_dc_offset, 1, [rows], [wanted.calibration])
+    if cotangents.phasor is not None:
+        lit = [sums, tiling, frame.settings.phasor_factor, _or_nothing(frame, inputs.background_phasor)]
+        outputs = [target, _or_nothing(frame, wanted.background_phasor)]
+        _launch(resolve.fold_phasor, pixels, [*lit, cotangents.phasor], outputs)
+    for image, factor, plane in (
+        (cotangents.distance, 1.0, 3),
+        (cotangents.distortion, _distortion_factor(frame), 4),
+        (cotangents.opacity, -1.0, GRAD_TRANSMITTANCE),  # opacity = 1 - T_e
+    ):
+        if image is not None:
+            _launch(resolve.fold_plane, pixels, [image, tiling, factor, plane], [target])
+    channels = []
+    for name, start in groups:
+        cotangent = getattr(cotangents, name)
+        if cotangent is None:
+            channels.append(None)
+            continue
+        grad = frame.gradient_planes(CHANNEL_PLANES)
+        colour = name == "colour"
+        background = _or_nothing(frame, inputs.background_colour if colour else None)
+        grad_background = _or_nothing(frame, wanted.background_colour if colour else None)
+        inputs_ = [sums, tiling, background, start, cotangent]
+        _launch(resolve.fold_channels, pixels, inputs_, [grad.flat, target, grad_background])
+        channels.append(grad)
+    return planes, channels or [None]
+
+
+# -- helpers -----------------------------------------------------------------------------------------------------------
+
+
+@cache
+def _shift_vectors(shifts: tuple[float, ...], device: str) -> wp.array:
+    """(cos, sin) of phase shifts [rad], uploaded once."""
+    return wp.array([(math.cos(s), math.sin(s)) for s in shifts], dtype=wp.vec2, device=device)
+
+
+def _distortion_factor(frame: Frame) -> float:
+    return 2.0 if frame.settings.distortion == Distortion.PAPER else 1.0
+
+
+def _mapping(frame: Frame) -> wp.vec2:
+    """Coefficients of the released zeta = far / (far - near) (1 - near / distance)."""
+    near, far = frame.settings.near, frame.settings.far
+    return wp.vec2(far / (far - near), far * near / (far - near))
+
+
+def _tile_edges(frame: Frame, parts: int) -> list[int]:
+    """Edges of at most ``parts`` ranges of tiles with about equally many pairs; one range where one thread works."""
+    if frame.threads == 1:
+        return [0, frame.tiles]
+    first = frame.first.numpy()  # CPU only: a view, not a copy
+    work = first[:-1] + np.arange(frame.tiles)  # an empty tile costs about as much as a pair
+    targets = [(first[-1] + frame.tiles) * p / parts for p in range(1, parts)]
+    return sorted({0, *(int(e) for e in np.searchsorted(work, targets)), frame.tiles})
+
+
+@cache
+def _pool(threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(threads, thread_name_prefix="gftorf-tiles")
+
+
+def _over_tiles(frame: Frame, kernel, edges: list[int], arguments) -> None:
+    """Launch over ranges of tiles; CPU launches release the interpreter lock, so ranges run side by side."""
+    side_by_side = len(edges) > 2
+    commands = [
+        wp.launch(
+            kernel,
+            dim=(stop - start, frame.lanes),
+            inputs=arguments(start, part),
+            device=frame.device,
+            block_dim=128,
+            record_tape=False,
+            record_cmd=side_by_side,
+        )
+        for part, (start, stop) in enumerate(pairwise(edges))
+    ]
+    if side_by_side:
+        list(_pool(frame.threads).map(lambda command: command.launch(), commands))
+
+
+def _launch(kernel, dim, inputs: list, outputs: list, **adjoint) -> None:
+    wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=_device_of(outputs), record_tape=False, **adjoint)
+
+
+def _device_of(arrays: list) -> wp.Device:
+    return next(a.device for a in arrays if isinstance(a, wp.array))
+
+
+@cache
+def _empty(device: str, ndim: int, dtype) -> wp.array:
+    return wp.empty((0,) * ndim, dtype=dtype, device=device)
+
+
+def _nothing(frame: Frame, ndim: int, dtype) -> wp.array:
+    """An array without elements: 'absent', for kernels."""
+    return _empty(str(frame.device), ndim, dtype)
+
+
+def _or_nothing(frame: Frame, array: wp.array | None) -> wp.array:
+    return array if array is not None else _nothing(frame, 3, wp.float32)
