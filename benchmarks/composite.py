@@ -18,62 +18,24 @@ from pathlib import Path
 
 import naive
 import numpy as np
-import torch
 import warp as wp
+from surfaces import CAMERA, FAR, HEIGHT, NEAR, WIDTH, inputs_of, surface
 
 from gftorf_warp.kernels.composite import CHANNEL_PLANES
 from gftorf_warp.kernels.composite_backward import GRAD_LIGHT_PLANES
 from gftorf_warp.kernels.splat import Splat
 from gftorf_warp.render import launch, stages
 from gftorf_warp.render.buffers import Frame, RenderSettings
-from gftorf_warp.render.launch import Inputs
-from gftorf_warp.scene.camera import Camera
-from gftorf_warp.scene.gaussians import constant_sh
-
-WIDTH, HEIGHT, FOCAL = 320, 240, 280.0
-NEAR, FAR = 0.135, 7.425  # [m]
-
-
-def surface(count: int, scale: float, opacity: float) -> dict[str, np.ndarray]:
-    """Gaussians of one size [m] and opacity on a wavy surface 1-5 m away."""
-    rng = np.random.default_rng(0)
-    u = rng.random((count, 3))
-    z = 3 + 2 * np.sin(6 * u[:, 0]) * np.cos(5 * u[:, 1]) + 0.02 * u[:, 2]
-    quaternion = rng.normal(size=(count, 4))
-    x, y = (u[:, 0] - 0.5) * WIDTH / FOCAL * z, (u[:, 1] - 0.5) * HEIGHT / FOCAL * z
-    return {
-        "mean": np.stack([x, y, z], 1),
-        "log_scale": np.full((count, 3), math.log(scale)),
-        "quaternion": quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True),
-        "opacity_logit": np.full(count, math.log(opacity / (1 - opacity))),
-        "colour": rng.random((count, 3)),
-        "reflectivity": 0.5 + 0.1 * rng.random(count),
-    }
 
 
 class Ours:
     """Our stages on the scene."""
 
     def __init__(self, scene: dict, device: str, threads: int):
-        colour_sh = constant_sh(torch.tensor(scene["colour"].T, dtype=torch.float32)).permute(1, 2, 0).numpy()
-        reflectivity_sh = constant_sh(torch.tensor(scene["reflectivity"], dtype=torch.float32)).numpy()
-
-        def array(value, dtype):
-            return wp.array(np.ascontiguousarray(value, np.float32), dtype=dtype, device=device)
-
-        self.inputs = Inputs(
-            mean=array(scene["mean"], wp.vec3),
-            log_scale=array(scene["log_scale"], wp.vec3),
-            quaternion=array(scene["quaternion"], wp.vec4),
-            opacity_logit=array(scene["opacity_logit"], float),
-            reflectivity_sh=array(reflectivity_sh, float),
-            colour_sh=array(colour_sh, wp.vec3),
-            calibration=array([4 * math.pi / 15, 0.0, 1.0, 0.0], float),
-        )
+        self.inputs = inputs_of(scene, device)
         settings = RenderSettings(near=NEAR, far=FAR, threads=threads)
-        self.camera = Camera(width=WIDTH, height=HEIGHT, fx=FOCAL, fy=FOCAL, cx=WIDTH / 2, cy=HEIGHT / 2)
         self.frame = Frame(len(scene["mean"]), WIDTH, HEIGHT, settings, wp.get_device(device))
-        self.view = launch.view_of(self.camera, settings)
+        self.view = launch.view_of(CAMERA, settings)
         stages.project(self.inputs, self.view, self.frame)
         stages.sort_by_depth(self.frame)
         stages.sort_by_tile(self.frame)

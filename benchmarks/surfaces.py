@@ -1,0 +1,63 @@
+"""The scenes of the benchmarks, and what the renderer reads of them."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+import warp as wp
+
+from gftorf_warp.render.inputs import Inputs
+from gftorf_warp.scene.camera import Camera
+from gftorf_warp.scene.gaussians import constant_sh
+
+WIDTH, HEIGHT, FOCAL = 320, 240, 280.0
+NEAR, FAR = 0.135, 7.425  # [m]
+CAMERA = Camera(width=WIDTH, height=HEIGHT, fx=FOCAL, fy=FOCAL, cx=WIDTH / 2, cy=HEIGHT / 2)
+
+
+def surface(count: int, scale: float, opacity: float) -> dict[str, np.ndarray]:
+    """Gaussians of one size [m] and opacity on a wavy surface 1-5 m away."""
+    rng = np.random.default_rng(0)
+    u = rng.random((count, 3))
+    z = 3 + 2 * np.sin(6 * u[:, 0]) * np.cos(5 * u[:, 1]) + 0.02 * u[:, 2]
+    quaternion = rng.normal(size=(count, 4))
+    x, y = (u[:, 0] - 0.5) * WIDTH / FOCAL * z, (u[:, 1] - 0.5) * HEIGHT / FOCAL * z
+    return {
+        "mean": np.stack([x, y, z], 1),
+        "log_scale": np.full((count, 3), math.log(scale)),
+        "quaternion": quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True),
+        "opacity_logit": np.full(count, math.log(opacity / (1 - opacity))),
+        "colour": rng.random((count, 3)),
+        "reflectivity": 0.5 + 0.1 * rng.random(count),
+    }
+
+
+def volume(count: int, scale: float, opacity: float) -> dict[str, np.ndarray]:
+    """Gaussians of one size [m] and opacity that fill the frustum evenly."""
+    scene = surface(count, scale, opacity)
+    u = np.random.default_rng(0).random((count, 3))
+    z = NEAR + (FAR - NEAR) * u[:, 2] ** (1 / 3)
+    scene["mean"] = np.stack([(u[:, 0] - 0.5) * WIDTH / FOCAL * z, (u[:, 1] - 0.5) * HEIGHT / FOCAL * z, z], 1)
+    return scene
+
+
+def inputs_of(scene: dict[str, np.ndarray], device: str | wp.Device) -> Inputs:
+    """The scene as Warp arrays, seen by a sensor with depth_range 15 m."""
+    colour_sh = constant_sh(torch.tensor(scene["colour"].T, dtype=torch.float32)).permute(1, 2, 0).numpy()
+    reflectivity_sh = constant_sh(torch.tensor(scene["reflectivity"], dtype=torch.float32)).numpy()
+    return Inputs(
+        mean=array_of(scene["mean"], device, wp.vec3),
+        log_scale=array_of(scene["log_scale"], device, wp.vec3),
+        quaternion=array_of(scene["quaternion"], device, wp.vec4),
+        opacity_logit=array_of(scene["opacity_logit"], device),
+        reflectivity_sh=array_of(reflectivity_sh, device),
+        colour_sh=array_of(colour_sh, device, wp.vec3),
+        calibration=array_of([4 * math.pi / 15, 0.0, 1.0, 0.0], device),
+    )
+
+
+def array_of(value, device: str | wp.Device, dtype=float) -> wp.array:
+    """A float32 array on the device."""
+    return wp.array(np.ascontiguousarray(value, np.float32), dtype=dtype, device=device)
