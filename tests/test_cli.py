@@ -256,11 +256,13 @@ def test_simulate_writes_a_sequence_and_prints_where(sequence, tmp_path, capsys)
     out, err = lines_of(capsys)
     assert out == [str(tmp_path / "same")]
     assert err[0].startswith(f"gftorf_warp {__version__} - device cpu (")
-    assert cli.main([*arguments, str(tmp_path / "clean"), "-q", "--no-noise"]) == 0
+    assert cli.main([*arguments, str(tmp_path / "clean"), "-q", "--seed", "3", "--no-noise"]) == 0
     assert lines_of(capsys) == ([str(tmp_path / "clean")], [])
-    name = "tofType1/0005.npy"
-    assert (tmp_path / "same" / name).read_bytes() == (sequence / name).read_bytes()
-    assert (tmp_path / "clean" / name).read_bytes() != (sequence / name).read_bytes()
+    assert cli.main([*arguments, str(tmp_path / "other"), "-q", "--seed", "4"]) == 0
+    quads = {name: (tmp_path / name / "tofType1/0005.npy").read_bytes() for name in ("same", "clean", "other")}
+    measured = (sequence / "tofType1/0005.npy").read_bytes()
+    assert quads["same"] == measured
+    assert len({measured, quads["clean"], quads["other"]}) == 3
 
 
 def test_simulate_sync_takes_a_quartet_at_one_instant(tmp_path):
