@@ -132,8 +132,7 @@ def _calibration(sensor: Sensor, field: GaussianField) -> Tensor:
     """[4] phase slope [rad/m], phase offset [rad], source intensity, DC offset; numbers are uploaded once."""
     values = sensor.phase_slope, sensor.phase_offset, sensor.source_intensity, sensor.dc_offset
     if any(isinstance(value, Tensor) for value in values):
-        like = {"dtype": torch.float32, "device": field.device}
-        return torch.stack([torch.as_tensor(value, **like) for value in values])
+        return torch.stack([torch.as_tensor(value, dtype=torch.float32, device=field.device) for value in values])
     return _uploaded(values, field.device)
 
 

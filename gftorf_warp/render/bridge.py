@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -78,11 +79,11 @@ class Rasterize(torch.autograd.Function):
         return None, None, None, None, *(wanted.get(name) for name in INPUTS)
 
 
-def _inputs(named: dict[str, Tensor | None]) -> Inputs:
+def _inputs(named: Mapping[str, Tensor | None]) -> Inputs:
     return Inputs(**{name: _view(named.get(name), _VECTORS.get(name, wp.float32)) for name in INPUTS})
 
 
-def _images(named: dict[str, Tensor]) -> Images:
+def _images(named: Mapping[str, Tensor]) -> Images:
     return Images(**{name: _view(named.get(name), wp.float32) for name in IMAGES})
 
 

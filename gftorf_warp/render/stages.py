@@ -20,7 +20,7 @@ from ..kernels.composite_backward import (
 )
 from ..kernels.geometry import CameraView
 from ..kernels.project import make_project
-from .buffers import ClampGradient, Distortion, Frame, Stop, Support
+from .buffers import ClampGradient, Distortion, Frame, Planes, Stop, Support
 from .inputs import Images, Inputs
 
 _PROJECTED = ("mean", "log_scale", "quaternion", "opacity_logit", "reflectivity_sh", "colour_sh")
@@ -190,7 +190,7 @@ def fold_images(inputs: Inputs, shifts, frame: Frame, cotangents: Images, wanted
     ):
         if image is not None:
             _launch(resolve.fold_plane, pixels, [image, tiling, factor, plane], [target])
-    channels = []
+    channels: list[Planes | None] = []
     for name, start in groups:
         cotangent = getattr(cotangents, name)
         if cotangent is None:
