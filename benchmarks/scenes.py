@@ -3,8 +3,8 @@
     python benchmarks/scenes.py [--device cpu|cuda] [--all] [--json FILE]
 
 'surface': Gaussians on a wavy surface 1-5 m away; 'volume': filling the viewing frustum. 320x240, quads, phasor,
-colour, distance, opacity and distortion with a random derivative each. On CUDA everything is replayed from a graph and timed by
-events, on the CPU it is called; medians in milliseconds.
+colour, distance, opacity and distortion with a random derivative each. On CUDA everything is replayed from a graph and
+timed by events, on the CPU it is called; medians in milliseconds.
 """
 
 from __future__ import annotations
