@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from ftorf_folder import SAMPLE, scene
 
+from gftorf_warp.data import flow as flow_module
 from gftorf_warp.data.flow import compute_flow, warp_back
 from gftorf_warp.data.sequence import Sequence
 from gftorf_warp.errors import InputError
@@ -99,6 +100,21 @@ def test_frames_of_one_instant_are_read_where_they_are():
     assert inner_error(computed.forward[4], velocity)[0] < 0.1
     still = compute_flow(moving(velocity, times=np.zeros(12)))
     assert inner_error(still.forward[4], (0.0, 0.0))[0] < 0.01
+
+
+@pytest.mark.parametrize("step", [4, -4])
+def test_pairs_vote_where_the_surface_was_at_their_time(step):
+    """A window that moves by 2 px per frame over a still wall, with exact flow: all of it keeps its motion."""
+    x = np.indices((8, 60))[1]
+    sign = np.sign(step)
+    exact = {}
+    for n in range(4, 8):
+        inside = abs(x - 20 - 2 * n) < 7
+        exact[n] = np.stack([np.where(inside, 8.0 * sign, 0.0), np.zeros(x.shape)]).astype(np.float32)
+    got = flow_module._combined(4, exact, exact, np.arange(12) / 120.0, step)
+    window = exact[4][0] != 0
+    assert window.any()
+    np.testing.assert_array_equal(got[:, window], exact[4][:, window])
 
 
 def test_accelerated_motion_is_not_taken_for_its_later_speed():

@@ -17,7 +17,6 @@ STATIC_QUANTILE = 0.5  # the half of the pixels that changes least over time cou
 BRIGHT_QUANTILE = 0.5  # and of those the brighter half, where noise does not decide
 STILL_M = 1e-3  # [m] truth that changes less within a quartet is static
 MOVING_PX = 0.5  # [px] flow above this is motion
-FLAT_GRADIENT = 2  # pixels next to a depth edge mix two distances: left out by this many pixels
 
 
 def steady_pixels(sequence: Sequence) -> np.ndarray:
@@ -122,7 +121,6 @@ def phase_fit(sequence: Sequence, truth: Truth) -> PhaseFit | None:
             continue
         distance = truth.distance[frames].astype(np.float64)
         still = np.isfinite(distance).all(axis=0) & (np.ptp(np.nan_to_num(distance), axis=0) < STILL_M)
-        still &= _flat(distance[0])
         re, im = quartet_phasor(sequence, i)
         amplitude = np.hypot(re, im)
         still &= amplitude >= np.quantile(amplitude, 1.0 - BRIGHT_QUANTILE)
@@ -136,7 +134,7 @@ def phase_fit(sequence: Sequence, truth: Truth) -> PhaseFit | None:
     )  # offset before the line is fitted, so that it unwraps right
     unwrapped = kappa * d + centre + np.angle(np.exp(1j * (psi - kappa * d - centre)))
     kept = np.ones(len(d), dtype=bool)
-    for _ in range(3):  # mixed pixels are few and far off
+    for _ in range(3):  # pixels that mix two distances are few and far off
         slope, offset = np.polyfit(d[kept], unwrapped[kept], 1) if np.ptp(d[kept]) > STILL_M else (kappa, centre)
         left = np.abs(unwrapped - slope * d - offset)
         kept = left <= 4.0 * np.median(left) + 1e-9
@@ -169,15 +167,3 @@ def flow_match(sequence: Sequence, flow: dict[int, np.ndarray], step: int) -> tu
         return None
     unwarped, warped, flipped, swapped = (float(value) for value in sums / count)
     return unwarped, warped, flipped, swapped
-
-
-def _flat(distance: np.ndarray) -> np.ndarray:
-    """Pixels away from depth edges."""
-    edge = np.zeros(distance.shape, dtype=bool)
-    for axis in (0, 1):
-        jump = (
-            np.abs(np.diff(np.nan_to_num(distance), axis=axis, append=np.nan_to_num(distance).take([-1], axis))) > 0.1
-        )
-        for shift in range(-FLAT_GRADIENT, FLAT_GRADIENT + 1):
-            edge |= np.roll(jump, shift, axis)
-    return ~edge

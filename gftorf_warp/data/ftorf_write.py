@@ -22,7 +22,8 @@ SHIFT_TOLERANCE = 1e-6  # [rad] a shift is stored as one of four names; what dif
 def write(path: str | Path, sequence: Sequence, truth: Truth | None = None, *, readme: str | None = None) -> Path:
     """Write a sequence, and its truth if there is any, as an F-ToeRF folder that appears only when it is complete.
 
-    Reading it again gives the same sequence: float32 images and float64 calibration bit by bit.
+    Reading it again gives the same sequence: images bit by bit in float32, calibration in float64; only a frequency
+    that was not read from such a folder may change in its last bit, since its inverse is stored.
 
     Args:
         path: New or empty folder.
@@ -65,7 +66,7 @@ def _files(
     yield "cams/color_intrinsics.npy", _npy(_colour_intrinsics(sequence))
     yield "cams/color_extrinsics.npy", _npy(sequence.camera_from_world.astype(np.float64))
     yield "cams/frame_times.npy", _npy(sequence.times.astype(np.float64))
-    yield "cams/depth_range.npy", _npy(np.float64(_depth_range(sequence.f_mod_hz)))
+    yield "cams/depth_range.npy", _npy(np.float64(SPEED_OF_LIGHT / sequence.f_mod_hz))
     yield "cams/phase_offset.npy", _npy(np.float64(sequence.phase_offset))
     yield "cams/dc_offset.npy", _npy(np.float64(sequence.dc_offset))
     if sequence.quad_scale is not None:
@@ -103,13 +104,6 @@ def _permutation(sequence: Sequence) -> np.ndarray:
         )
     unused = iter(sorted(set(range(FRAMES_PER_QUARTET)) - set(used)))  # of a recording shorter than a quartet
     return np.argsort([next(iter(slot)) if slot else next(unused) for slot in slots])
-
-
-def _depth_range(f_mod_hz: float) -> float:
-    """depth_range [m] whose quotient gives exactly this frequency, where a float64 can."""
-    nearest = SPEED_OF_LIGHT / f_mod_hz
-    candidates = nearest, math.nextafter(nearest, 0), math.nextafter(nearest, math.inf)
-    return min(candidates, key=lambda value: abs(SPEED_OF_LIGHT / value - f_mod_hz))
 
 
 def _colour_intrinsics(sequence: Sequence) -> np.ndarray:
