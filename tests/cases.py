@@ -78,6 +78,8 @@ class Tolerance:
 
     image: float
     """Largest error of a pixel, as a part of the largest pixel of that image."""
+    image_floor: float
+    """Error of a pixel that is allowed in any image, of values of the order of 1."""
     distortion: float
     """Largest error of the distortion, as a part of the square of the largest distance (1 for the released one)."""
     gradient: float
@@ -92,16 +94,19 @@ class Tolerance:
 
 TOLERANCES = {
     # eps is 6e-8. A pixel sums tens of terms, and an exponent carries the rounding of an image position, 2e-6 of 50 px,
-    # times its slope, below 1 per px where there is light: some 1e-6. Distortion is the small difference A V - M^2 of
-    # numbers of the size of d^2, each good to eps. A gradient's weight T is restored back to front by dividing by
-    # 1 - alpha, which may be 0.01 and is good to eps: some 6e-6 for every clamped layer; a sum over hundreds of pixels
-    # of both signs costs another digit. A sensor scalar sums all pixels and all Gaussians; what is left can be a
-    # hundredth of the terms: yet another digit.
-    # The floor is eps times terms of the order of d^2 that cancel, in the gradient of a distortion near zero.
-    torch.float32: Tolerance(image=5e-6, distortion=2e-6, gradient=5e-5, gradient_norm=5e-5, scalar=5e-4, floor=3e-6),
+    # times its slope, below 1 per px where there is light: some 1e-6. A quad whose cosine is near zero has the error of
+    # a full one: its floor. Distortion is the small difference A V - M^2 of numbers of the size of d^2, good to eps.
+    # A gradient's weight T is restored back to front by dividing by 1 - alpha, which may be 0.01 and is good to eps:
+    # some 6e-6 for every clamped layer; a sum over hundreds of pixels of both signs costs another digit. Most gradients
+    # are good to 1e-6; the bounds are those of the worst of thousands of random scenes. A sensor scalar sums all pixels
+    # and all Gaussians; what is left can be a hundredth of the terms: yet another digit. The floor of gradients is eps
+    # times terms of the order of d^2 that cancel, in the gradient of a distortion near zero.
+    torch.float32: Tolerance(
+        image=5e-6, image_floor=1e-7, distortion=2e-6, gradient=1e-4, gradient_norm=1e-4, scalar=5e-4, floor=5e-6
+    ),
     # Another order of the same sums: eps is 1e-16, and the losses are the same.
     torch.float64: Tolerance(
-        image=1e-13, distortion=1e-13, gradient=1e-12, gradient_norm=1e-12, scalar=1e-11, floor=1e-13
+        image=1e-13, image_floor=1e-15, distortion=1e-13, gradient=1e-12, gradient_norm=1e-12, scalar=1e-11, floor=1e-13
     ),
 }
 UNDECIDED_SHARE = 0.02  # at most this share of the pixels may sit on a jump (undecided_pixels) and be left out
