@@ -52,8 +52,8 @@ def main() -> None:
     print(f"{sequence.width}x{sequence.height}, {sequence.frames} raw frames, {os.cpu_count()} CPUs")
     for method, row in rows.items():
         print(
-            f"{method:<9} moving {row['moving_px']:.3f} px (p99 {row['moving_p99_px']:.2f}, kept {row['moving_kept']:.1%})"
-            f"   static {row['static_px']:.3f} px (kept {row['static_kept']:.1%})"
+            f"{method:<9} moving {row['moving_px']:.3f} px (p99 {row['moving_p99_px']:.2f}, "
+            f"kept {row['moving_kept']:.1%})   static {row['static_px']:.3f} px (kept {row['static_kept']:.1%})"
             f"   {row['seconds']:.2f} s for {row['images']} images"
         )
     if a.json:
