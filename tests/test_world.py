@@ -114,6 +114,7 @@ def test_the_nearest_body_wins_and_what_is_not_there_is_unknown():
     away = Body(shape=Plane(size=(9.0, 9.0)), texture=GREY, path=Still(position=(0, 0, 1.0), turn_deg=(0, 180, 0)))
     behind = Body(shape=Sphere(radius=0.5), texture=GREY, path=Still(position=(0.0, 0.0, -2.0)))
     hit = first_hit((wall, away, ball, behind), CAMERA, 0.0)
+    np.testing.assert_array_equal(hit.distance, first_hit((behind, ball, away, wall), CAMERA, 0.0).distance)
     assert hit.body[12, 16] == 2
     assert hit.distance[12, 16] == pytest.approx(1.7, abs=5e-3)
     assert hit.body[12, 21] == 0
@@ -214,6 +215,20 @@ def test_quaternions_turn_like_their_matrices():
         axis=1,
     )
     np.testing.assert_allclose(got, matrices, atol=1e-12)
+
+
+def test_discs_lie_in_their_surface():
+    """Turned by their quaternions, the thin axes are the normals of a turned box at that time, and face the camera."""
+    path = Line(position=(0.1, 0.0, 2.3), velocity=(0.0, 0.0, -1.0), turn_deg=TURN, spin_deg_per_s=(0.0, 400.0, 0.0))
+    body = Body(shape=Box(size=(0.6, 0.6, 0.6)), texture=GREY, path=path)
+    field = splat.cover_moving(body, CAMERA, np.array([0.0, 0.1])).seen(CAMERA.centre, 0.07)
+    w, x, y, z = field.quaternion.double().numpy().T
+    thin = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=1)
+    assert (field.log_scale.argmin(1) == 2).all()
+    faces = path.world_from_body(0.07)[:3, :3].T  # rows: directions of the six faces, up to their sign
+    assert np.abs(thin @ faces.T).max(1).min() > 1 - 1e-6
+    assert (np.sum(thin * (CAMERA.centre - field.mean.numpy()), axis=1) > 0).all()
+    assert len(field) > 100
 
 
 @pytest.mark.parametrize(
