@@ -170,7 +170,8 @@ def _render(options: argparse.Namespace) -> int:
 
     run = Run.open(options.run_folder, device)
     progress = _progress(options)("render")
-    print(render_to_folder(run, options.out, what=options.what, times=options.times, progress=progress))
+    fresh, what, times = options.fresh, options.what, options.times
+    print(render_to_folder(run, options.out, what=what, times=times, fresh=fresh, progress=progress))
     return 0
 
 

@@ -45,7 +45,7 @@ def demo(
         What to tell the user at the end: errors on moving and on static pixels, and where the report is.
 
     Raises:
-        UsageError: If ``out`` holds something else, and ``fresh`` is not set.
+        UsageError: If ``out`` holds a demo with other settings, and ``fresh`` is not set, or anything else.
     """
     from .data.check import check
     from .data.sequence import Sequence
@@ -87,32 +87,24 @@ def prepare(out: Path, settings: dict, *, fresh: bool) -> None:
     """Make sure that ``out`` is empty or holds a demo with these settings.
 
     Raises:
-        UsageError: Otherwise, unless ``fresh`` is set.
+        UsageError: If it holds a demo with others, and ``fresh`` is not set, or anything else.
     """
+    from .recon.folder import set_aside
+
     wanted = json.loads(json.dumps(settings))  # tuples become lists, as they are on disk
-    if fresh:
-        set_aside(out)
-    elif out.exists() and (not out.is_dir() or any(out.iterdir())):
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
         found = _read(out / SETTINGS)
-        if found != wanted:
-            differ = sorted(key for key in wanted if found is None or found.get(key) != wanted[key])
-            why = "no demo has begun in it" if found is None else f"it was made with another {', '.join(differ)}"
-            fix = "--fresh starts over and keeps what is there under old-1; or choose another --out"
+        fix = "choose another --out, or --fresh, which keeps what is there under old-1"
+        if found is None:
+            why, fix = f"it has no {SETTINGS}: no demo has begun in it", "choose another --out"
             raise UsageError("the folder is not empty", where=out, why=why, fix=fix)
+        if fresh:
+            LOG.info("what was there is now in %s", set_aside(out, [out / n for n in OURS if (out / n).exists()]))
+        elif found != wanted:
+            differ = ", ".join(key for key in wanted if found.get(key) != wanted[key])
+            raise UsageError("the folder is not empty", where=out, why=f"it was made with another {differ}", fix=fix)
     out.mkdir(parents=True, exist_ok=True)
     (out / SETTINGS).write_text(json.dumps(wanted, indent=2) + "\n")
-
-
-def set_aside(out: Path) -> None:
-    """Move what a demo wrote, and nothing else, to the first free ``out/old-N``."""
-    ours = [out / name for name in OURS if (out / name).exists()]
-    if not ours:
-        return
-    number = next(n for n in range(1, 10**6) if not (out / f"old-{n}").exists())
-    (out / f"old-{number}").mkdir()
-    for path in ours:
-        path.rename(out / f"old-{number}" / path.name)
-    LOG.info("what was there is now in %s", out / f"old-{number}")
 
 
 def summary(metrics: dict) -> list[str]:

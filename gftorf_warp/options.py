@@ -115,6 +115,7 @@ def command_parsers() -> dict[str, Parser]:
     render.add_argument("--what", metavar="A,B", type=_list_of(str), default=["distance"], help=what)
     render.add_argument("--times", metavar="S,S", type=_list_of(_number), help="seconds since raw frame 0 (each frame)")
     _device_options(render)
+    _fresh_option(render)
 
     compare = _command("compare", "score a reconstruction against the truth and write a report")
     compare.add_argument("run_folder", metavar="RUN", help="folder of the reconstruction")

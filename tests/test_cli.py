@@ -310,6 +310,7 @@ def test_render_writes_what_was_asked_for(run, tmp_path, capsys):
     for what in ("distance", "quads"):
         assert len(list((out_folder / what).glob("*.exr"))) == 2
     assert not (out_folder / "phasor").exists()
+    fails(["render", str(run), "--out", str(out_folder), "--times", "0.5"], 2, capsys, str(out_folder), "--fresh")
 
 
 def test_compare_prints_a_table_or_json(run, sequence, capsys):

@@ -62,13 +62,12 @@ def test_demo_with_other_settings_names_fresh(folder, capsys):
 
 
 def test_demo_leaves_foreign_folders_alone(tmp_path):
-    """A folder with somebody's files is refused; with fresh they stay where they are."""
-    (tmp_path / "thesis.txt").write_text("precious")
-    with pytest.raises(UsageError) as caught:
-        demo.prepare(tmp_path, {"seed": 0}, fresh=False)
-    assert "--fresh" in caught.value.fix
-    demo.prepare(tmp_path, {"seed": 0}, fresh=True)
-    assert (tmp_path / "thesis.txt").read_text() == "precious"
+    """A folder with somebody's files is refused, with and without fresh."""
+    (tmp_path / "run").mkdir()
+    for fresh in (False, True):
+        with pytest.raises(UsageError, match="choose another"):
+            demo.prepare(tmp_path, {"seed": 0}, fresh=fresh)
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
 
 def test_fresh_moves_the_old_demo_aside(tmp_path):

@@ -91,6 +91,23 @@ def test_what_cannot_be_rendered_is_named(run, tmp_path, what, times, text):
     assert not (tmp_path / "out").exists()
 
 
+def test_a_folder_with_something_else_is_refused_or_moved_aside(run, tmp_path):
+    """The same images are written again; others need ``fresh``, and then nothing is lost."""
+    out = render_to_folder(run, tmp_path / "out", what="distance", times=[0.0])
+    before = (out / "distance" / "000000.exr").read_bytes()
+    (out / "distance" / "000000.exr").write_bytes(b"cut off")
+    render_to_folder(run, out, what="distance", times=[0.0])
+    assert (out / "distance" / "000000.exr").read_bytes() == before
+    with pytest.raises(UsageError, match="--fresh"):
+        render_to_folder(run, out, what="distance", times=[0.01])
+    assert (out / "distance" / "000000.exr").read_bytes() == before
+    render_to_folder(run, out, what="phasor", times=[0.01], fresh=True)
+    assert sorted(path.name for path in out.iterdir()) == ["old-1", "phasor", "renders.json"]
+    assert (out / "old-1" / "distance" / "000000.exr").read_bytes() == before
+    with pytest.raises(UsageError, match="no images"):
+        render_to_folder(run, out / "old-1" / "distance", fresh=True)
+
+
 def test_colour_is_written_linear_and_shown_as_srgb(run):
     """Linear 0.5 is 188 in 8-bit sRGB; what is brighter than white stays white."""
     colour = torch.stack([torch.full((HEIGHT, WIDTH), value) for value in (0.5, 0.0, 7.0)])

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from ..data.files import write_json
 from ..errors import UsageError
+from ..recon.folder import set_aside
 from ..render.api import Rendering
 from ..scene.sensor import Sensor
 from . import pictures
 
+LIST = "renders.json"
 WHAT = ("distance", "quads", "phasor", "colour")
 Channels = dict[str, Float[np.ndarray, "H W"]]
 
@@ -99,6 +103,45 @@ def preview(name: str, images: Channels, scale: pictures.Scale) -> UInt8[np.ndar
 def paths(out: Path, name: str, index: int) -> tuple[Path, Path]:
     """Where the EXR and the PNG of one thing at the index-th time belong."""
     return out / name / f"{index:06d}.exr", out / name / f"{index:06d}.png"
+
+
+def make_room(out: Path, listed: Mapping[str, object], *, fresh: bool) -> None:
+    """Make a folder ready for images and list them in its ``renders.json``.
+
+    Args:
+        out: New, empty, or one that holds images of the same run, times and channels, which are then written again.
+        listed: What will be in the folder.
+        fresh: Whether to move other images aside, to ``out/old-<k>``.
+
+    Raises:
+        UsageError: If it holds other images, and ``fresh`` is not set, or anything else.
+    """
+    if out.exists() and not out.is_dir():
+        raise UsageError("not a folder", where=out, why="--out names a file", fix="choose another --out")
+    held = [path for path in out.iterdir() if not path.name.startswith("old-")] if out.exists() else []
+    if held and not _same(out / LIST, listed):
+        ours = (out / LIST).is_file()
+        if not (fresh and ours):
+            raise UsageError(
+                "the folder is not empty",
+                where=out,
+                why="it holds images of another run or other times"
+                if ours
+                else f"it has no {LIST}: these are no images",
+                fix="choose another --out" + (", or --fresh, which moves what is there aside" if ours else ""),
+            )
+        set_aside(out, held)
+    out.mkdir(parents=True, exist_ok=True)
+    write_json(out / LIST, listed)
+
+
+def _same(path: Path, listed: Mapping[str, object]) -> bool:
+    """Whether an earlier list names the same run, times and channels."""
+    try:
+        found = json.loads(path.read_text())
+    except (OSError, ValueError):
+        return False
+    return isinstance(found, dict) and all(found.get(key) == listed[key] for key in ("run", "times_s", "channels"))
 
 
 def _srgb(linear: Float[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:

@@ -13,7 +13,6 @@ from jaxtyping import Float
 
 from ..constants import FRAMES_PER_QUARTET
 from ..data.decode import closed_form_distance
-from ..data.files import write_json
 from ..data.images import write_exr, write_png
 from ..data.sequence import Sequence
 from ..errors import DivergedError, UsageError
@@ -143,6 +142,7 @@ def render_to_folder(
     what: str | Iterable[str] = ("distance", "quads"),
     times: Iterable[float] | None = None,
     *,
+    fresh: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> Path:
     """Write what the run looks like at some times: ``OUT/<what>/<index>.exr`` (float32) and ``.png`` to look at.
@@ -152,13 +152,14 @@ def render_to_folder(
 
     Args:
         run: A finished reconstruction.
-        out: Folder, made if absent; files of the same name are replaced.
+        out: Folder, made if absent; one that holds these images is written again.
         what: Names out of distance, quads, phasor, colour.
         times: Seconds since raw frame 0; None: the times of all raw frames, truncated quartets included.
+        fresh: Whether to move what else ``out`` holds aside, to ``out/old-<k>``.
         progress: Called with (times done, times in all).
 
     Raises:
-        UsageError: If a name in ``what`` is unknown, or the run has no colour.
+        UsageError: If a name in ``what`` is unknown, the run has no colour, or ``out`` holds something else.
     """
     names = renders.checked(what)
     sequence = run.sequence()
@@ -173,8 +174,15 @@ def render_to_folder(
     samples = [images_at(seconds[i]) for i in sorted({0, len(seconds) // 2, len(seconds) - 1})]
     scales = {name: renders.preview_scale(name, (sample[name] for sample in samples)) for name in names}
     out = Path(out)
+    listed = {
+        "run": str(run.path),
+        "times_s": seconds,
+        "channels": {name: list(samples[0][name]) for name in names},
+        "preview": {name: asdict(scale) for name, scale in scales.items()},
+    }
+    renders.make_room(out, listed, fresh=fresh)
     for name in names:
-        (out / name).mkdir(parents=True, exist_ok=True)
+        (out / name).mkdir(exist_ok=True)
     for index, time in enumerate(seconds):
         for name, images in images_at(time).items():
             exr, png = renders.paths(out, name, index)
@@ -182,13 +190,4 @@ def render_to_folder(
             write_png(png, renders.preview(name, images, scales[name]))
         if progress is not None:
             progress(index + 1, len(seconds))
-    write_json(
-        out / "renders.json",
-        {
-            "run": str(run.path),
-            "times_s": seconds,
-            "channels": {name: list(samples[0][name]) for name in names},
-            "preview": {name: asdict(scale) for name, scale in scales.items()},
-        },
-    )
     return out
