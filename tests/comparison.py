@@ -39,7 +39,8 @@ class Comparison:
             bound = TOLERANCE.image * want.abs().max().item() + TOLERANCE.image_floor
             if name == "distortion":
                 metric = self.case.settings.distortion is Distortion.PAPER
-                bound = TOLERANCE.distortion * (self.want["distance"].max().item() ** 2 if metric else 1.0)
+                scale = self.want["distance"].max().item() ** 2 if metric else 1.0
+                bound = TOLERANCE.distortion * scale + TOLERANCE.image_floor
             assert torch.isfinite(got).all(), name
             assert ((got - want).abs() * self.decided).max() <= bound, name
 
