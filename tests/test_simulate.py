@@ -84,6 +84,14 @@ def test_rendered_and_true_distance_agree_on_still_surfaces(name):
     assert 0 < gap.mean < 0.003
 
 
+def test_any_size_and_length_will_do():
+    """One pixel, one raw frame; there is no interior to compare then."""
+    recording = record(SCENES["demo"], size=(1, 1), frames=1)
+    assert recording.sequence.quads.shape == (1, 1, 1)
+    assert recording.gap is None
+    assert record(SCENES["demo"], size=(9, 7), frames=5).truth.distance.shape == (5, 7, 9)
+
+
 def test_interior_pixels_keep_away_from_edges_and_motion():
     """Wherever they are, 5x5 neighbours see one face of something still, in all raw frames."""
     scene = slider()

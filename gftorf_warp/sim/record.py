@@ -159,7 +159,7 @@ def still_interior(scene: Scene, hits: list[Hits]) -> Bool[np.ndarray, "H W"]:
     """Pixels that see the same face of a still body, with all neighbours up to two pixels away, in every raw frame."""
     moves = np.array([*(body.moves for body in scene.bodies), False])  # the last stands for -1, nothing hit
     inside = np.ones(hits[0].body.shape, dtype=bool)
-    inside[[0, 1, -2, -1]] = inside[:, [0, 1, -2, -1]] = False
+    inside[:2] = inside[-2:] = inside[:, :2] = inside[:, -2:] = False
     for hit in hits:
         inside &= ~moves[hit.body] & (hit.body >= 0)
         surface = hit.body * 8 + hit.face  # a shape has fewer than 8 faces

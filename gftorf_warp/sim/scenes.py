@@ -135,7 +135,7 @@ def arc() -> Scene:
     picture = still(Plane(size=(0.9, 0.6)), (-1.1, -0.7, 4.1), 0.05, 0.95, 0.15)
     return Scene(
         name="arc",
-        description="a box swings on a horizontal circle towards the camera and away again, in front of a picture",
+        description="a box swings on a horizontal circle, towards the camera and away",
         motion="arc",
         bodies=(room(), picture, box),
         frames=48,
