@@ -99,8 +99,8 @@ TOLERANCES = {
     # a full one: its floor. Distortion is the small difference A V - M^2 of numbers of the size of d^2, good to eps.
     # A gradient's weight T is restored back to front by dividing by 1 - alpha, which may be 0.01 and is good to eps:
     # some 6e-6 for every clamped layer; a sum over hundreds of pixels of both signs costs another digit. Again
-    # most gradients are good to 1e-6. A sensor scalar sums all pixels and all Gaussians; what is left can be a hundredth
-    # of the terms: yet another digit. The floor of gradients is eps times terms of the order of d^2 that cancel, in the
+    # most gradients are good to 1e-6. A sensor scalar sums all pixels and all Gaussians; what is left can be 1 % of
+    # the terms: yet another digit. The floor of gradients is eps times terms of the order of d^2 that cancel, in the
     # gradient of a distortion near zero.
     torch.float32: Tolerance(
         image=2e-5, image_floor=1e-7, distortion=2e-6, gradient=1e-4, gradient_norm=1e-4, scalar=5e-4, floor=5e-6
