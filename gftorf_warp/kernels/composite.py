@@ -150,7 +150,7 @@ def make_composite(
         while k < end and warp_any(nonzero(live)):  # the same trip count for all lanes of a warp
             i = ids[k]
             k += 1
-            if block_missed(splats, i, x0 + wp.static(half), y0 + wp.static(half), wp.static(half)):
+            if block_missed(splats, i, x0 + wp.static(half), y0 + wp.static(half)):
                 continue
             q = load_splat(splats, i)
             g = response(affine(x, -1.0, q[0]), affine(y, -1.0, q[1]), -0.5 * q[2], q[3], -0.5 * q[4], -0.5 * q[6])

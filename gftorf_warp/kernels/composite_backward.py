@@ -196,7 +196,7 @@ def make_composite_backward(
         while k > begin:
             k -= 1
             i = ids[k]
-            if block_missed(splats, i, x0 + wp.static(half), y0 + wp.static(half), wp.static(half)):
+            if block_missed(splats, i, x0 + wp.static(half), y0 + wp.static(half)):
                 continue
             gate = above(last, float(k - begin))  # only what this pixel composited
             q = load_splat(splats, i)

@@ -13,21 +13,44 @@ from .geometry import CameraView, screen_covariance
 from .harmonics import harmonics
 from .splat import Splat
 
+BLOCK_RADIUS = wp.constant(
+    2.1214
+)  # [px] from the middle of a block of 4 x 4 pixels to its farthest centre, 1.5 sqrt(2)
 CULLED = wp.constant(wp.int32(0x7FFFFFFF))  # depth key behind every positive float
 
 
 @wp.func
-def extent_of(opacity: float, cov_xx: float, cov_yy: float) -> wp.vec3:
-    """(cutoff, reach_x, reach_y) of a record. A little wide: they decide what is visited, not what it is worth."""
+def visit_of(opacity: float, cov: wp.vec4) -> wp.vec2:
+    """(cutoff, limit) of a record. A little wide: they decide what is visited, not what it is worth.
+
+    With K the conic, sqrt(v K v) is a norm: it changes by at most sqrt(largest eigenvalue) times the distance. So where
+    it exceeds sqrt(cutoff) by that much at the middle of a block, no pixel centre of the block lies inside the ellipse.
+    """
     cutoff = 2.0 * wp.log(opacity / ALPHA_MIN) + 1.0e-5
-    reach_x = wp.sqrt(wp.max(cutoff, 0.0) * cov_xx) * 1.0001 + 1.0e-3
-    reach_y = wp.sqrt(wp.max(cutoff, 0.0) * cov_yy) * 1.0001 + 1.0e-3
-    return wp.vec3(cutoff, reach_x, reach_y)
+    middle = 0.5 * (cov[0] + cov[2])
+    smallest = cov[3] / (middle + wp.sqrt(wp.max(middle * middle - cov[3], 0.0)))  # variance of the narrow axis
+    reach = wp.sqrt(wp.max(cutoff, 0.0)) + BLOCK_RADIUS / wp.sqrt(smallest)
+    return wp.vec2(cutoff, 1.0001 * reach * reach + 1.0e-3)
 
 
-@wp.func_grad(extent_of)
-def adj_extent_of(opacity: float, cov_xx: float, cov_yy: float, adj_ret: wp.vec3):
+@wp.func_grad(visit_of)
+def adj_visit_of(opacity: float, cov: wp.vec4, adj_ret: wp.vec2):
     """No derivative: slot 6 of a gradient record is free to count pixels."""
+
+
+@wp.func
+def box_of(view: CameraView, x: float, y: float, cov: wp.vec4, cutoff: float) -> wp.vec4i:
+    """Pixels [x0, y0, x1, y1) of the image whose centres lie in the bounding box of the ellipse alpha >= 1/255."""
+    reach_x = wp.sqrt(wp.max(cutoff, 0.0) * cov[0]) * 1.0001 + 1.0e-3
+    reach_y = wp.sqrt(wp.max(cutoff, 0.0) * cov[2]) * 1.0001 + 1.0e-3
+    w = float(view.width)
+    h = float(view.height)
+    # clamped as floats: an integer from a float that does not fit is undefined
+    x0 = int(wp.clamp(wp.ceil(x - reach_x - 0.5), 0.0, w))
+    y0 = int(wp.clamp(wp.ceil(y - reach_y - 0.5), 0.0, h))
+    x1 = int(wp.clamp(wp.floor(x + reach_x - 0.5) + 1.0, 0.0, w))
+    y1 = int(wp.clamp(wp.floor(y + reach_y - 0.5) + 1.0, 0.0, h))
+    return wp.vec4i(x0, y0, x1, y1)
 
 
 @wp.func
@@ -71,7 +94,7 @@ def make_project(colour: bool, square: bool):
         colour_sh: wp.array2d[wp.vec3],  # [N, 16] harmonics of RGB; [0, 0] without colour
         # Out:
         splats: wp.array[Splat],  # [N] records, see splat.py; undefined where culled
-        square_px: wp.array[wp.vec4i],  # [N] x0, y0, x1, y1 of the pixels a splat may touch [px]; x1 = 0: culled
+        box_px: wp.array[wp.vec4i],  # [N] x0, y0, x1, y1 of the pixels a splat may touch [px]; x1 = 0: culled
         depth_key: wp.array[wp.int32],  # [>= N] bits of the z-depth, which order like the float
         order: wp.array[wp.int32],  # [>= N] 0, 1, 2, ...
     ):
@@ -79,7 +102,7 @@ def make_project(colour: bool, square: bool):
         n = wp.tid()
         order[n] = n
         depth_key[n] = CULLED
-        square_px[n] = wp.vec4i(0, 0, 0, 0)
+        box_px[n] = wp.vec4i(0, 0, 0, 0)
         opacity = 1.0 / (1.0 + wp.exp(-opacity_logit[n]))
         local = view.rotation * mean[n] + view.translation
         if local[2] < view.near or local[2] > view.far or opacity < ALPHA_MIN:
@@ -90,13 +113,16 @@ def make_project(colour: bool, square: bool):
         determinant = cov[3]
         x = view.fx * local[0] / local[2] + view.cx
         y = view.fy * local[1] / local[2] + view.cy
+        visit = visit_of(opacity, cov)
+        box = box_of(view, x, y, cov, visit[0])
         if wp.static(square):
-            box = square_of(view, x - 0.5, y - 0.5, cov)
-            if box[2] <= box[0] or box[3] <= box[1]:
-                return
-            square_px[n] = box
-        else:
-            square_px[n] = wp.vec4i(0, 0, view.width, view.height)
+            outer = square_of(view, x - 0.5, y - 0.5, cov)
+            box = wp.vec4i(
+                wp.max(box[0], outer[0]), wp.max(box[1], outer[1]), wp.min(box[2], outer[2]), wp.min(box[3], outer[3])
+            )
+        if box[2] <= box[0] or box[3] <= box[1]:
+            return
+        box_px[n] = box
         depth_key[n] = wp.cast(local[2], wp.int32)
 
         distance = wp.length(local)
@@ -124,10 +150,9 @@ def make_project(colour: bool, square: bool):
             red = wp.max(rgb[0], 0.0)
             green = wp.max(rgb[1], 0.0)
             blue = wp.max(rgb[2], 0.0)
-        extent = extent_of(opacity, cov[0], cov[2])
         splats[n] = Splat(
-            x, y, cov[2] / determinant, -cov[1] / determinant, cov[0] / determinant, opacity, extent[0], extent[2],
-            red, green, blue, light[0], light[1], light[2], distance, extent[1],
+            x, y, cov[2] / determinant, -cov[1] / determinant, cov[0] / determinant, opacity, visit[0], visit[1],
+            red, green, blue, light[0], light[1], light[2], distance, 0.0,
         )  # fmt: skip
 
     return project

@@ -6,11 +6,11 @@ Sixteen floats, one 64-byte line, the same slots for values and for gradients:
     2 A   3 B   4 C  conic: power = -(A dx^2 + C dy^2) / 2 - B dx dy [1/px^2]
     5 opacity        at the peak [1]
     6 cutoff         2 ln(255 opacity): below it alpha >= 1/255; in a gradient record the number of pixels reached
-    7 reach_y        bound of abs(dy) on the ellipse alpha = 1/255 [px]; no gradient
+    7 limit          the quadratic form at the middle of a block exceeds it: the splat misses the block [1]; no gradient
     8 9 10           three channels weighed by T, for example colour
     11 12 13         a cos psi, a sin psi, a: what quads and phasor are made of, weighed by T^2
     14 distance      along the ray [m]
-    15 reach_x       bound of abs(dx) on that ellipse [px]; no gradient
+    15               free
 """
 
 import warp as wp
@@ -40,7 +40,8 @@ _BLOCK_MISSED = """
     return false;
 #else
     const float* q = &splats.data[i].c[0];
-    return (__builtin_fabsf(q[0] - x) > q[15] + half) | (__builtin_fabsf(q[1] - y) > q[7] + half);
+    const float dx = q[0] - x, dy = q[1] - y;
+    return q[2] * dx * dx + (2.0f * q[3] * dx + q[4] * dy) * dy > q[7];
 #endif
 """
 
@@ -51,8 +52,8 @@ def load_splat(splats: wp.array[Splat], i: int) -> Splat:
 
 
 @wp.func_native(_BLOCK_MISSED)
-def block_missed(splats: wp.array[Splat], i: int, x: float, y: float, half: float) -> bool:
-    """Whether splat ``i`` surely misses the block around (x, y) whose pixel centres are within ``half`` [px]."""
+def block_missed(splats: wp.array[Splat], i: int, x: float, y: float) -> bool:
+    """Whether splat ``i`` surely misses the block of 4 x 4 pixels around (x, y) [px]."""
 
 
 @wp.kernel(enable_backward=False)

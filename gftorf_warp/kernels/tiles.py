@@ -10,20 +10,13 @@ from .splat import Splat
 
 
 @wp.func
-def tile_range(q: Splat, box: wp.vec4i, tile_width: int, tile_height: int, tiles_x: int, tiles_y: int) -> wp.vec4i:
-    """Tiles [x0, y0, x1, y1) that the bounding box of the ellipse, cut to ``box`` [px], can touch."""
-    w = float(tile_width)
-    h = float(tile_height)
-    # clamped as floats first: an integer from a float that does not fit is undefined
-    x0 = int(wp.clamp(wp.floor((q[0] - q[15]) / w), 0.0, float(tiles_x)))
-    y0 = int(wp.clamp(wp.floor((q[1] - q[7]) / h), 0.0, float(tiles_y)))
-    x1 = int(wp.clamp(wp.floor((q[0] + q[15]) / w) + 1.0, 0.0, float(tiles_x)))
-    y1 = int(wp.clamp(wp.floor((q[1] + q[7]) / h) + 1.0, 0.0, float(tiles_y)))
+def tile_range(box: wp.vec4i, tile_width: int, tile_height: int) -> wp.vec4i:
+    """Tiles [x0, y0, x1, y1) that the pixels [x0, y0, x1, y1) of ``box`` lie in."""
     return wp.vec4i(
-        wp.max(x0, box[0] // tile_width),
-        wp.max(y0, box[1] // tile_height),
-        wp.min(x1, (box[2] + tile_width - 1) // tile_width),
-        wp.min(y1, (box[3] + tile_height - 1) // tile_height),
+        box[0] // tile_width,
+        box[1] // tile_height,
+        (box[2] + tile_width - 1) // tile_width,
+        (box[3] + tile_height - 1) // tile_height,
     )
 
 
@@ -49,11 +42,9 @@ def count_pairs(
     # In:
     order: wp.array[wp.int32],  # [>= N] splats near to far
     splats: wp.array[Splat],  # [N] records
-    square_px: wp.array[wp.vec4i],  # [N] pixels a splat may touch [px]
+    box_px: wp.array[wp.vec4i],  # [N] pixels a splat may touch [px]
     tile_width: int,  # columns of a tile [px]
     tile_height: int,  # rows of a tile [px]
-    tiles_x: int,  # tiles per row [1]
-    tiles_y: int,  # rows of tiles [1]
     # Out:
     counts: wp.array[int],  # [N] tiles each splat touches, in depth order
 ):
@@ -61,9 +52,9 @@ def count_pairs(
     rank = wp.tid()
     i = order[rank]
     touched = int(0)
-    if square_px[i][2] > 0:
+    if box_px[i][2] > 0:
         q = splats[i]
-        b = tile_range(q, square_px[i], tile_width, tile_height, tiles_x, tiles_y)
+        b = tile_range(box_px[i], tile_width, tile_height)
         w = float(tile_width)
         h = float(tile_height)
         for y in range(b[1], b[3]):
@@ -78,11 +69,10 @@ def emit_pairs(
     # In:
     order: wp.array[wp.int32],  # [>= N] splats near to far
     splats: wp.array[Splat],  # [N] records
-    square_px: wp.array[wp.vec4i],  # [N] pixels a splat may touch [px]
+    box_px: wp.array[wp.vec4i],  # [N] pixels a splat may touch [px]
     tile_width: int,  # columns of a tile [px]
     tile_height: int,  # rows of a tile [px]
     tiles_x: int,  # tiles per row [1]
-    tiles_y: int,  # rows of tiles [1]
     counts: wp.array[int],  # [N] tiles each splat touches, in depth order
     offsets: wp.array[int],  # [N] exclusive sums of ``counts``
     capacity: int,  # pairs that fit [1]
@@ -100,7 +90,7 @@ def emit_pairs(
         total[0] = k + touched
     if touched > 0 and k + touched <= capacity:
         q = splats[i]
-        b = tile_range(q, square_px[i], tile_width, tile_height, tiles_x, tiles_y)
+        b = tile_range(box_px[i], tile_width, tile_height)
         w = float(tile_width)
         h = float(tile_height)
         for y in range(b[1], b[3]):

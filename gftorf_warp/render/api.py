@@ -55,7 +55,7 @@ class Rendering:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ScreenGradient:
-    """What densification looks at; zero until the backward pass has run, not differentiable."""
+    """What densification looks at: zero until a backward pass has run, then what the last one said."""
 
     gradient: Float[Tensor, "N 2"]
     """Derivative of the loss by the image position of each Gaussian [1/px]."""

@@ -121,7 +121,7 @@ class Frame:
         self.tiling.side_log2, self.tiling.count_x = pixels.side.bit_length() - 1, self.tiles_x
 
         self.splats = self.array(count, Splat)
-        self.square_px = self.array(count, wp.vec4i)
+        self.box_px = self.array(count, wp.vec4i)
         self.depth_key, self.order = self.array(2 * count), self.array(2 * count)  # the radix sort wants twice the room
         self.counts, self.offsets, self.total = self.array(count), self.array(count), self.array(1)
         self.first = self.array(self.tiles + 1)

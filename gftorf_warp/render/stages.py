@@ -58,7 +58,7 @@ def _project_inputs(inputs: Inputs, view: CameraView, frame: Frame) -> list:
 
 
 def _project_outputs(frame: Frame) -> list:
-    return [frame.splats, frame.square_px, frame.depth_key, frame.order]
+    return [frame.splats, frame.box_px, frame.depth_key, frame.order]
 
 
 def sort_by_depth(frame: Frame) -> None:
@@ -68,8 +68,7 @@ def sort_by_depth(frame: Frame) -> None:
 
 def sort_by_tile(frame: Frame) -> None:
     """Count, emit and sort the (tile, splat) pairs."""
-    lists = [frame.order, frame.splats, frame.square_px, frame.tile_width, frame.tile_height]
-    lists += [frame.tiles_x, frame.tiles_y]
+    lists = [frame.order, frame.splats, frame.box_px, frame.tile_width, frame.tile_height]
     _launch(tiles.count_pairs, frame.count, lists, [frame.counts])
     wp.utils.array_scan(frame.counts, frame.offsets, inclusive=False)
     capacity = frame.settings.pair_capacity
@@ -81,7 +80,7 @@ def sort_by_tile(frame: Frame) -> None:
         frame.reserve_pairs(capacity)
         frame.keys.fill_(frame.tiles)  # pairs that do not exist sort behind all tiles
     outputs = [frame.keys, frame.ids, frame.total]
-    _launch(tiles.emit_pairs, frame.count, [*lists, frame.counts, frame.offsets, capacity], outputs)
+    _launch(tiles.emit_pairs, frame.count, [*lists, frame.tiles_x, frame.counts, frame.offsets, capacity], outputs)
     if capacity:
         wp.utils.radix_sort_pairs(frame.keys, frame.ids, capacity, end_bit=frame.tiles.bit_length())
     _launch(tiles.tile_starts, frame.tiles + 1, [frame.keys, capacity], [frame.first])
