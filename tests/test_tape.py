@@ -120,3 +120,53 @@ def test_a_fixed_capacity_gives_the_same_and_reports_what_did_not_fit():
     torch.testing.assert_close(rasterize(field, CAMERA, SENSOR, roomy).quads, free.quads, rtol=0, atol=0)
     with pytest.raises(ValueError, match=r"pair_capacity = 10 is too small: this frame has \d+"):
         rasterize(field, CAMERA, SENSOR, RenderSettings(near=0.1, far=20.0, pair_capacity=10))
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_a_reserved_rendering_never_waits_for_the_host():
+    """With a reserve of pairs, forward and backward can be captured in a CUDA graph, and its replay sees new inputs."""
+    field, _, _ = scene("cuda")
+    settings = RenderSettings(near=0.1, far=20.0, pair_capacity=20_000)
+    view, device = launch.view_of(CAMERA, settings), wp.get_device("cuda:0")
+    tensors = {name: t.clone() for name, t in field.parameters().items()}
+    arrays = {name: wp.from_torch(t, dtype=VECTORS.get(name, wp.float32)) for name, t in tensors.items()}
+    values = [float(v) for v in (SENSOR.phase_slope, SENSOR.phase_offset, SENSOR.source_intensity, SENSOR.dc_offset)]
+    inputs = Inputs(**arrays, calibration=wp.array(values, dtype=float, device=device))
+    wanted = Inputs(**{name: wp.zeros_like(a) for name, a in arrays.items()}, calibration=None)
+    shapes = {name: tuple(t.shape) for name, t in cotangents().items() if name != "extra"}
+    images = Images(**{name: wp.zeros(shape, dtype=float, device=device) for name, shape in shapes.items()})
+    seeds = Images(**{name: wp.from_torch(cotangents("cuda")[name]) for name in shapes})
+    frame = Frame(COUNT, WIDTH, HEIGHT, settings, device)
+
+    def both():
+        launch.forward(inputs, view, SHIFTS, frame, images)
+        launch.backward(inputs, view, SHIFTS, frame, seeds, wanted)
+
+    both()
+    with wp.ScopedCapture(device=device) as capture:
+        both()
+    tensors["mean"] += 0.01
+    wanted.mean.zero_()
+    wp.capture_launch(capture.graph)
+    replayed, gradient = wp.to_torch(images.quads).clone(), wp.to_torch(wanted.mean).clone()
+    wanted.mean.zero_()
+    both()
+    frame.check_capacity()
+    torch.testing.assert_close(replayed, wp.to_torch(images.quads), rtol=0, atol=0)
+    torch.testing.assert_close(gradient, wp.to_torch(wanted.mean), rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_torch_does_not_wait_for_the_host_either():
+    """With a reserve of pairs, nothing that torch does around the kernels synchronises."""
+    field, extra, background = scene("cuda")
+    settings = RenderSettings(near=0.1, far=20.0, pair_capacity=20_000)
+    for tensor in field.parameters().values():
+        tensor.requires_grad_()
+    for mode in ("default", "error"):  # the first pass uploads calibration and loads kernels
+        torch.cuda.set_sync_debug_mode(mode)
+        try:
+            images = rasterize(field, CAMERA, SENSOR, settings, extra=extra, background=Background(quads=background))
+            (images.quads.square().sum() + images.distance.sum()).backward()
+        finally:
+            torch.cuda.set_sync_debug_mode("default")

@@ -121,7 +121,10 @@ def rasterize(
 
 def _spread(name: str, value: Tensor | float, shape: tuple[int, ...], field: GaussianField) -> Tensor:
     """A background as [C, H, W]."""
-    tensor = torch.as_tensor(value, dtype=torch.float32, device=field.device)
+    if isinstance(value, Tensor):
+        tensor = value.to(device=field.device, dtype=torch.float32)
+    else:  # filled where it is needed: an upload would make a GPU wait
+        tensor = torch.full((), float(value), dtype=torch.float32, device=field.device)
     try:
         return tensor.expand(shape)
     except RuntimeError:
