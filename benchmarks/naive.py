@@ -16,7 +16,7 @@ def alpha_at(q: Splat, x: float, y: float) -> wp.vec2:
     """(alpha, Gaussian value) of a splat at a pixel centre; alpha is 0 where the splat is too faint."""
     dx = q[0] - x
     dy = q[1] - y
-    power = -0.5 * (q[2] * dx * dx + q[4] * dy * dy) - q[3] * dx * dy
+    power = q[2] * dx * dx + q[3] * dx * dy + q[4] * dy * dy
     g = float(0.0)
     if power <= 0.0:
         g = wp.exp(power)
@@ -118,11 +118,11 @@ def backward(
             dx = q[0] - float(j) - 0.5
             dy = q[1] - float(i) - 0.5
             g_power = q[5] * pair[1] * grad_alpha
-            record[0] = -g_power * (q[2] * dx + q[3] * dy)
-            record[1] = -g_power * (q[4] * dy + q[3] * dx)
-            record[2] = -0.5 * g_power * dx * dx
-            record[3] = -g_power * dx * dy
-            record[4] = -0.5 * g_power * dy * dy
+            record[0] = g_power * (2.0 * q[2] * dx + q[3] * dy)
+            record[1] = g_power * (2.0 * q[4] * dy + q[3] * dx)
+            record[2] = g_power * dx * dx
+            record[3] = g_power * dx * dy
+            record[4] = g_power * dy * dy
             record[5] = pair[1] * grad_alpha
             record[6] = 1.0
             record[14] = w * grad[6, i, j]

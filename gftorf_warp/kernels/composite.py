@@ -153,7 +153,7 @@ def make_composite(
             if block_missed(splats, i, x0 + wp.static(half), y0 + wp.static(half)):
                 continue
             q = load_splat(splats, i)
-            g = response(affine(x, -1.0, q[0]), affine(y, -1.0, q[1]), -0.5 * q[2], q[3], -0.5 * q[4], -0.5 * q[6])
+            g = response(affine(x, -1.0, q[0]), affine(y, -1.0, q[1]), q[2], q[3], q[4], q[6])
             alpha = alpha_of(g, live, q[5], ALPHA_MAX, ALPHA_MIN)
             if not nonzero(alpha):
                 continue

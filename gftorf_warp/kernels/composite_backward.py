@@ -96,18 +96,15 @@ def finish_moments(
     # Out:
     grad_splats: wp.array[Splat],  # [N] moments in slots 0-5, replaced by gradients of the same slots
 ):
-    """One thread per splat: with v = dL/dpower, moments of v to gradients of centre, conic and opacity."""
+    """One thread per splat: with v = dL/dpower, moments of v to gradients of centre and opacity."""
     n = wp.tid()
     q = splats[n]
     g = grad_splats[n]
     if g[6] > 0.0:  # a record that no pixel reached is zero, and its splat may be undefined
         x = g[0]
         y = g[1]
-        g[0] = -q[2] * x - q[3] * y
-        g[1] = -q[4] * y - q[3] * x
-        g[2] = -0.5 * g[2]
-        g[3] = -g[3]
-        g[4] = -0.5 * g[4]
+        g[0] = 2.0 * q[2] * x + q[3] * y
+        g[1] = 2.0 * q[4] * y + q[3] * x
         g[5] = g[5] / q[5]
         grad_splats[n] = g
 
@@ -129,7 +126,8 @@ def make_composite_backward(
     """
     ops, pixels = make_lanes(K), make_pixels(K, tile_width, tile_height)
     V, fill, affine, mul, axpy, fma, fnma = ops.V, ops.fill, ops.affine, ops.mul, ops.axpy, ops.fma, ops.fnma
-    above, add, keep_below, inverse, at_least = ops.above, ops.add, ops.keep_below, ops.inverse, ops.at_least
+    add, scaled, exceeds, keep_below = ops.add, ops.scaled, ops.exceeds, ops.keep_below
+    inverse, at_least = ops.inverse, ops.at_least
     response, alpha_of, nonzero, largest_of = ops.response, ops.alpha_of, ops.nonzero, ops.largest_of
     block_x, block_y, columns, rows = pixels.block_x, pixels.block_y, ops.columns, ops.rows
     half, zeta_of = 0.5 * (pixels.side - 1), make_zeta(metric)
@@ -181,7 +179,8 @@ def make_composite_backward(
             g_distance = grad_sums[3, tile, lane]
             g_distortion = grad_sums[4, tile, lane]
             E = mul(T, grad_sums[wp.static(GRAD_TRANSMITTANCE), tile, lane])
-            sum_zeta = sums[wp.static(SUM_ZETA), tile, lane]
+            twice_g_distortion = add(g_distortion, g_distortion)
+            minus_sum = scaled(sums[wp.static(SUM_ZETA), tile, lane], -1.0)
             sum_zeta2 = sums[wp.static(SUM_ZETA2), tile, lane]
             weight = affine(T, -1.0, 1.0)  # A = 1 - T_e
         if wp.static(channels):
@@ -193,16 +192,18 @@ def make_composite_backward(
         zeta0 = float(0.0)
         if begin < k:
             zeta0 = zeta_of(splats[ids[begin]][14], mapping)
+        position = fill(float(k - begin))
         while k > begin:
             k -= 1
+            position = affine(position, 1.0, -1.0)
             i = ids[k]
             if block_missed(splats, i, x0 + wp.static(half), y0 + wp.static(half)):
                 continue
-            gate = above(last, float(k - begin))  # only what this pixel composited
+            gate = exceeds(last, position)  # only what this pixel composited
             q = load_splat(splats, i)
             dx = affine(x, -1.0, q[0])
             dy = affine(y, -1.0, q[1])
-            g = response(dx, dy, -0.5 * q[2], q[3], -0.5 * q[4], -0.5 * q[6])
+            g = response(dx, dy, q[2], q[3], q[4], q[6])
             alpha = alpha_of(g, gate, q[5], ALPHA_MAX, ALPHA_MIN)
             if not warp_any(nonzero(alpha)):  # uniform: all lanes of a warp reach `add_moments`, or none
                 continue
@@ -211,26 +212,25 @@ def make_composite_backward(
             w = mul(alpha, T)
             tau = zero
             if wp.static(channels):
-                tau = axpy(axpy(affine(g0, q[8], 0.0), g1, q[9]), g2, q[10])
+                tau = axpy(axpy(scaled(g0, q[8]), g1, q[9]), g2, q[10])
             sigma_T = zero
             w2 = zero
             g_d = zero
             if wp.static(light):
                 zeta = zeta_of(q[14], mapping) - zeta0
-                spread = axpy(affine(weight, zeta, 0.0), sum_zeta, -1.0)  # zeta A - M
+                spread = axpy(minus_sum, weight, zeta)  # zeta A - M
                 tau = axpy(tau, g_distance, q[14])
-                tau = fma(tau, g_distortion, axpy(axpy(sum_zeta2, sum_zeta, -zeta), spread, zeta))
-                sigma_T = mul(axpy(axpy(affine(g_re, q[11], 0.0), g_im, q[12]), g_amplitude, q[13]), T)
-                slope = float(2.0)  # of the distortion by the distance, over w spread
-                if wp.static(not metric):
-                    slope = 2.0 * mapping[1] / (q[14] * q[14])
-                g_d = fma(g_distance, g_distortion, affine(spread, slope, 0.0))
+                tau = fma(tau, g_distortion, axpy(sum_zeta2, add(spread, minus_sum), zeta))
+                sigma_T = mul(axpy(axpy(scaled(g_re, q[11]), g_im, q[12]), g_amplitude, q[13]), T)
+                g_d = fma(g_distance, twice_g_distortion, spread)
+                if wp.static(not metric):  # zeta changes with the distance by mapping[1] / distance^2
+                    g_d = fma(g_distance, scaled(twice_g_distortion, mapping[1] / (q[14] * q[14])), spread)
                 w2 = mul(w, T)
             tau = add(tau, sigma_T)
             v = fnma(mul(w, tau), E, mul(alpha, restored))  # alpha dL/dalpha
             E = fma(E, w, add(tau, sigma_T))
             if wp.static(clamp_passes):
-                v = fma(zero, v, mul(affine(g, q[5], 0.0), inverse(at_least(alpha, ALPHA_MIN))))  # o G / alpha
+                v = fma(zero, v, mul(scaled(g, q[5]), inverse(at_least(alpha, ALPHA_MIN))))  # o G / alpha
             else:
                 v = keep_below(v, alpha, ALPHA_MAX)
             add_moments(grad_splats, i, v, dx, dy, alpha, w, w2, g0, g1, g2, g_re, g_im, g_amplitude, g_d)

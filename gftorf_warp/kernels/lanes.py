@@ -120,6 +120,10 @@ def make_lanes(K: int) -> SimpleNamespace:
     def rows(y: float) -> V: ...
     @wp.func_native(_elementwise(K, "a", "a * s + t"))
     def affine(a: V, s: float, t: float) -> V: ...
+    @wp.func_native(_elementwise(K, "a", "a * s"))
+    def scaled(a: V, s: float) -> V: ...
+    @wp.func_native(_elementwise(K, "a b", "b < a ? (F)(1.0f) : (F)(0.0f)"))
+    def exceeds(a: V, b: V) -> V: ...
     @wp.func_native(_elementwise(K, "a b", "a * b"))
     def mul(a: V, b: V) -> V: ...
     @wp.func_native(_elementwise(K, "a b", "a + b"))
@@ -142,15 +146,15 @@ def make_lanes(K: int) -> SimpleNamespace:
     def keep_below(a: V, b: V, x: float) -> V: ...
     @wp.func_native(_elementwise(K, "a mask", "mask > 0.0f ? (F)(x) : a"))
     def set_where(a: V, mask: V, x: float) -> V: ...
-    @wp.func_native(  # exp(power) with power = half_a dx^2 - b dx dy + half_c dy^2, 0 where power is below ``low``
+    @wp.func_native(  # exp(power) with power = p dx^2 + q dx dy + r dy^2, 0 where the power is below ``low``
         _elementwise(
             K,
             "dx dy",
-            "const F p = (half_a * dx - b * dy) * dx + (half_c * dy) * dy; return p >= low ? exp_(p) : (F)(0.0f);",
+            "const F power = (dx * p + dy * q) * dx + (dy * r) * dy; return power >= low ? exp_(power) : (F)(0.0f);",
             "auto exp_ = [](F x) -> F { return expf(x); };" if K == 1 else _EXP,
         )
     )
-    def response(dx: V, dy: V, half_a: float, b: float, half_c: float, low: float) -> V: ...
+    def response(dx: V, dy: V, p: float, q: float, r: float, low: float) -> V: ...
     @wp.func_native(  # min(largest, o g) where the gate is open and that is at least ``smallest``, else 0
         _elementwise(
             K,

@@ -21,7 +21,7 @@ CULLED = wp.constant(wp.int32(0x7FFFFFFF))  # depth key behind every positive fl
 
 @wp.func
 def visit_of(opacity: float, cov: wp.vec4) -> wp.vec2:
-    """(cutoff, limit) of a record. A little wide: they decide what is visited, not what it is worth.
+    """(low, limit) of a record. A little wide: they decide what is visited, not what it is worth.
 
     With K the conic, sqrt(v K v) is a norm: it changes by at most sqrt(largest eigenvalue) times the distance. So where
     it exceeds sqrt(cutoff) by that much at the middle of a block, no pixel centre of the block lies inside the ellipse.
@@ -30,7 +30,7 @@ def visit_of(opacity: float, cov: wp.vec4) -> wp.vec2:
     middle = 0.5 * (cov[0] + cov[2])
     smallest = cov[3] / (middle + wp.sqrt(wp.max(middle * middle - cov[3], 0.0)))  # variance of the narrow axis
     reach = wp.sqrt(wp.max(cutoff, 0.0)) + BLOCK_RADIUS / wp.sqrt(smallest)
-    return wp.vec2(cutoff, 1.0001 * reach * reach + 1.0e-3)
+    return wp.vec2(-0.5 * cutoff, -0.50005 * reach * reach - 1.0e-3)
 
 
 @wp.func_grad(visit_of)
@@ -114,7 +114,7 @@ def make_project(colour: bool, square: bool):
         x = view.fx * local[0] / local[2] + view.cx
         y = view.fy * local[1] / local[2] + view.cy
         visit = visit_of(opacity, cov)
-        box = box_of(view, x, y, cov, visit[0])
+        box = box_of(view, x, y, cov, -2.0 * visit[0])
         if wp.static(square):
             outer = square_of(view, x - 0.5, y - 0.5, cov)
             box = wp.vec4i(
@@ -151,7 +151,8 @@ def make_project(colour: bool, square: bool):
             green = wp.max(rgb[1], 0.0)
             blue = wp.max(rgb[2], 0.0)
         splats[n] = Splat(
-            x, y, cov[2] / determinant, -cov[1] / determinant, cov[0] / determinant, opacity, visit[0], visit[1],
+            x, y, -0.5 * cov[2] / determinant, cov[1] / determinant, -0.5 * cov[0] / determinant,
+            opacity, visit[0], visit[1],
             red, green, blue, light[0], light[1], light[2], distance, 0.0,
         )  # fmt: skip
 

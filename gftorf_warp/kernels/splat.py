@@ -3,10 +3,10 @@
 Sixteen floats, one 64-byte line, the same slots for values and for gradients:
 
     0 x   1 y        image position of the centre [px]
-    2 A   3 B   4 C  conic: power = -(A dx^2 + C dy^2) / 2 - B dx dy [1/px^2]
+    2 P   3 Q   4 R  power = P dx^2 + Q dx dy + R dy^2, the logarithm of the Gaussian; minus half the conic [1/px^2]
     5 opacity        at the peak [1]
-    6 cutoff         2 ln(255 opacity): below it alpha >= 1/255; in a gradient record the number of pixels reached
-    7 limit          the quadratic form at the middle of a block exceeds it: the splat misses the block [1]; no gradient
+    6 low            -ln(255 opacity): where the power is below it, alpha < 1/255; of a gradient: pixels reached
+    7 limit          the power at the middle of a block is below it: the splat misses the block; no gradient
     8 9 10           three channels weighed by T, for example colour
     11 12 13         a cos psi, a sin psi, a: what quads and phasor are made of, weighed by T^2
     14 distance      along the ray [m]
@@ -41,7 +41,7 @@ _BLOCK_MISSED = """
 #else
     const float* q = &splats.data[i].c[0];
     const float dx = q[0] - x, dy = q[1] - y;
-    return q[2] * dx * dx + (2.0f * q[3] * dx + q[4] * dy) * dy > q[7];
+    return (q[2] * dx + q[3] * dy) * dx + q[4] * dy * dy < q[7];
 #endif
 """
 

@@ -22,19 +22,19 @@ def tile_range(box: wp.vec4i, tile_width: int, tile_height: int) -> wp.vec4i:
 
 @wp.func
 def touches(q: Splat, x: float, y: float, w: float, h: float) -> bool:
-    """Whether the quadratic form falls below the cutoff anywhere on the rectangle [x, x + w] x [y, y + h] [px]."""
+    """Whether the power reaches its lower bound anywhere on the rectangle [x, x + w] x [y, y + h] [px]."""
     dx = wp.clamp(q[0], x, x + w) - q[0]
     dy = wp.clamp(q[1], y, y + h) - q[1]
-    least = float(0.0)
-    if dx != 0.0 or dy != 0.0:  # centre outside: the minimum lies on an edge that faces it
-        least = float(1.0e30)
+    most = float(0.0)
+    if dx != 0.0 or dy != 0.0:  # centre outside: the maximum lies on an edge that faces it
+        most = float(-1.0e30)
         if dx != 0.0:
-            v = wp.clamp(-q[3] * dx / q[4], y - q[1], y + h - q[1])
-            least = q[2] * dx * dx + 2.0 * q[3] * dx * v + q[4] * v * v
+            v = wp.clamp(-0.5 * q[3] * dx / q[4], y - q[1], y + h - q[1])
+            most = (q[2] * dx + q[3] * v) * dx + q[4] * v * v
         if dy != 0.0:
-            u = wp.clamp(-q[3] * dy / q[2], x - q[0], x + w - q[0])
-            least = wp.min(least, q[2] * u * u + 2.0 * q[3] * u * dy + q[4] * dy * dy)
-    return least <= q[6] * 1.00001 + 1.0e-4
+            u = wp.clamp(-0.5 * q[3] * dy / q[2], x - q[0], x + w - q[0])
+            most = wp.max(most, (q[2] * u + q[3] * dy) * u + q[4] * dy * dy)
+    return most >= q[6] * 1.00001 - 5.0e-5
 
 
 @wp.kernel(enable_backward=False)
