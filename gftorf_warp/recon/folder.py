@@ -1,0 +1,160 @@
+"""The folder of a run: who may work in it, what it was made with, and whether a new call may go on there."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from ..data.files import write_json
+from ..errors import BusyError, InputError, UsageError
+
+CONFIG = "config.json"
+LOCK = ".lock"
+FRESH = "continue with the same settings, choose another --out, or start over with --fresh (the old run is kept aside)"
+IDENTITY = ("seed", "data_sha256")  # besides the settings: what has to agree for a run to go on
+
+
+def prepare(run: Path, config: dict[str, object], *, fresh: bool) -> bool:
+    """Make the folder ready for a run with this config.
+
+    Returns:
+        True if it already holds this run, so that it goes on; False if it is new.
+
+    Raises:
+        UsageError: If the folder holds something else, or the same run with other settings.
+    """
+    if run.exists() and not run.is_dir():
+        raise UsageError("not a folder", where=run, why="--out names a file", fix="choose another --out")
+    held = [path for path in run.iterdir() if not _aside(path) and path.name != LOCK] if run.exists() else []
+    if not held:
+        run.mkdir(parents=True, exist_ok=True)
+        return False
+    if not (run / CONFIG).is_file():
+        raise UsageError(
+            "the folder is not empty",
+            where=run,
+            why=f"it holds {len(held)} entries and no {CONFIG}: it is not a run",
+            fix="choose another --out",
+        )
+    if fresh:
+        set_aside(run, held)
+        return False
+    differing = differences(read_config(run), config)
+    if differing:
+        raise UsageError(
+            "the folder holds a run with other settings",
+            where=run,
+            why="; ".join(differing[:4]) + ("; ..." if len(differing) > 4 else ""),
+            fix=FRESH,
+        )
+    return True
+
+
+def differences(old: dict[str, object], new: dict[str, object]) -> list[str]:
+    """What keeps a run from going on under a new config, in words. A longer run is the same run."""
+    found = []
+    flat_old, flat_new = ({**_flat(c.get("settings", {})), **{k: c.get(k) for k in IDENTITY}} for c in (old, new))
+    for key in sorted({*flat_old, *flat_new}):
+        before, after = flat_old.get(key), flat_new.get(key)
+        if key == "schedule.images" and isinstance(before, int) and isinstance(after, int) and after >= before:
+            continue
+        if before != after and key not in ("render.threads", "schedule.checkpoint_every_s"):
+            found.append(f"{key} was {_short(before)}, now {_short(after)}")
+    return found
+
+
+def set_aside(run: Path, held: list[Path]) -> Path:
+    """Move an old run into ``RUN/old-<k>``, the first free number."""
+    number = 1
+    while (run / f"old-{number}").exists():
+        number += 1
+    place = run / f"old-{number}"
+    place.mkdir()
+    for path in held:
+        path.rename(place / path.name)
+    return place
+
+
+def read_config(run: Path) -> dict[str, Any]:
+    """Content of ``RUN/config.json``.
+
+    Raises:
+        InputError: If it is missing or no JSON object.
+    """
+    path = run / CONFIG
+    try:
+        config = json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise InputError(
+            "not a run",
+            where=path,
+            why=f"expected a JSON object written by `gftorf reconstruct`: {error}",
+            fix="name the --out folder of a reconstruction",
+        ) from error
+    if not isinstance(config, dict):
+        raise InputError("not a run", where=path, why="expected a JSON object", fix="name the --out folder of a run")
+    return config
+
+
+def write_config(run: Path, config: dict[str, object]) -> None:
+    """Replace ``RUN/config.json``."""
+    write_json(run / CONFIG, config)
+
+
+@contextmanager
+def locked(run: Path) -> Iterator[None]:
+    """Hold ``RUN/.lock``, which names process and host; the system releases it when the process ends, however it ends.
+
+    Raises:
+        BusyError: If another process, or another call in this one, holds it.
+    """
+    run.mkdir(parents=True, exist_ok=True)
+    with (run / LOCK).open("a+") as file:
+        if not _try_lock(file.fileno()):
+            file.seek(0)
+            raise BusyError(
+                "another process works on this run",
+                where=run,
+                why=f"its lock is held by {file.read().strip() or 'somebody'}",
+                fix="wait for it, stop it, or choose another --out",
+            )
+        file.truncate(0)
+        file.write(f"process {os.getpid()} on {socket.gethostname()}\n")
+        file.flush()
+        try:
+            yield
+        finally:
+            file.truncate(0)  # the file stays: removing it would let two others each lock a file of that name
+
+
+def _try_lock(descriptor: int) -> bool:
+    """Take the system's lock on an open file, without waiting; where the system has none, everybody gets it."""
+    try:
+        import fcntl
+    except ImportError:  # not a Unix
+        return True
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        return False
+    return True
+
+
+def _aside(path: Path) -> bool:
+    return path.name.startswith("old-") and path.is_dir()
+
+
+def _flat(value: object, prefix: str = "") -> dict[str, object]:
+    if not isinstance(value, dict):
+        return {prefix.rstrip("."): value}
+    return {key: leaf for name, part in value.items() for key, leaf in _flat(part, f"{prefix}{name}.").items()}
+
+
+def _short(value: object) -> str:
+    text = str(value)
+    return text if len(text) <= 20 else text[:12] + "..."

@@ -1,0 +1,123 @@
+"""Adam over Gaussians and motion; every rate is set here, by one schedule (method, section 6.5)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict
+
+import torch
+from jaxtyping import Bool, Int
+from torch import Tensor
+
+from ..scene.gaussians import GaussianField
+from ..scene.motion import Motion
+from .settings import ReconSettings
+
+BETAS = (0.9, 0.999)
+EPSILON = 1e-15  # far below any gradient here, so that a step depends on the direction of a gradient, not on its size
+
+
+def rates_at(settings: ReconSettings, images: int, factor: float = 1.0) -> dict[str, float]:
+    """Learning rate of every group after ``images`` optimised images.
+
+    Log-linear from the initial rate to ``decay`` times it at the end of the run; the motion rests during the warm-up.
+
+    Args:
+        settings: Rates and schedule.
+        images: Progress.
+        factor: Multiplies all rates; below 1 after the run had to go back to a checkpoint.
+    """
+    schedule = settings.schedule
+    decay = schedule.decay ** min(images / schedule.images, 1.0)
+    rates = {name: factor * decay * rate for name, rate in asdict(settings.rates).items()}
+    if images < schedule.warm_up:
+        rates["motion"] = 0.0
+    return rates
+
+
+class Optimiser:
+    """Adam with one group per tensor of the field and one for the motion."""
+
+    def __init__(self, field: GaussianField, motion: Motion, state: dict | None = None):
+        """Take copies of the tensors of a field, which become leaves, and the parameters of a motion.
+
+        Args:
+            field: The Gaussians.
+            motion: Their motion.
+            state: ``adam.state_dict()`` of an earlier optimiser of the same tensors; None starts at zero.
+        """
+        self.layer = field.layer
+        self.tensors = {name: value.detach().clone().requires_grad_() for name, value in field.parameters().items()}
+        self.motion = [parameter for parameter in motion.parameters() if parameter.numel()]
+        self.adam = torch.optim.Adam(
+            [{"name": name, "params": [value], "lr": 0.0} for name, value in self.tensors.items()]
+            + ([{"name": "motion", "params": self.motion, "lr": 0.0}] if self.motion else []),
+            betas=BETAS,
+            eps=EPSILON,
+            fused=True,
+        )
+        if state is not None:
+            self.adam.load_state_dict(state)
+
+    @property
+    def field(self) -> GaussianField:
+        """The Gaussians as they are; their tensors are the leaves."""
+        return GaussianField(**self.tensors, layer=self.layer)
+
+    @property
+    def leaves(self) -> list[Tensor]:
+        """Everything that is optimised: the tensors of the field, then the motion."""
+        return [*self.tensors.values(), *self.motion]
+
+    def step(self, gradients: list[Tensor | None], rates: dict[str, float], motion_gradient_max: float | None) -> None:
+        """One step of Adam.
+
+        Args:
+            gradients: Of ``leaves``; None is zero.
+            rates: From :func:`rates_at`. A group of rate 0 is left alone, its moments included.
+            motion_gradient_max: Longest gradient of the motion; a longer one is shortened. None: no limit.
+        """
+        for leaf, gradient in zip(self.leaves, gradients, strict=True):
+            leaf.grad = gradient
+        if self.motion and motion_gradient_max is not None:
+            torch.nn.utils.clip_grad_norm_(self.motion, motion_gradient_max)
+        for group in self.adam.param_groups:
+            group["lr"] = rates[group["name"]]
+            if group["lr"] == 0.0:
+                for leaf in group["params"]:
+                    leaf.grad = None
+        self.adam.step()
+        self.adam.zero_grad(set_to_none=True)
+
+    def replace(
+        self, rows: Int[Tensor, "M"], fresh: Bool[Tensor, "M"], change: Callable[[str, Tensor], Tensor]
+    ) -> None:
+        """Rebuild every tensor of the field from rows of the present one, moments alike.
+
+        Args:
+            rows: Which present Gaussian each new one comes from.
+            fresh: New Gaussians whose moments start at zero.
+            change: Given a name and the selected rows, returns the new values.
+        """
+        for group in self.adam.param_groups:
+            name = group["name"]
+            if name == "motion":
+                continue
+            old = self.tensors[name]
+            new = change(name, old.detach()[rows]).clone().requires_grad_()
+            state = self.adam.state.pop(old, {})
+            for key, value in state.items():
+                if key != "step":
+                    state[key] = torch.where(fresh.view(-1, *[1] * (value.ndim - 1)), 0.0, value[rows])
+            group["params"] = [new]
+            self.tensors[name] = new
+            if state:
+                self.adam.state[new] = state
+        if self.layer is not None:
+            self.layer = self.layer[rows]
+
+    def forget(self, name: str) -> None:
+        """Zero the moments of one tensor of the field."""
+        for key, value in self.adam.state.get(self.tensors[name], {}).items():
+            if key != "step":
+                value.zero_()

@@ -1,0 +1,146 @@
+"""A reconstruction to look at: its Gaussians and their motion at any time, in the units of the sequence."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ..constants import CANONICAL_SHIFTS, LOW_PASS
+from ..data.sequence import Sequence
+from ..errors import InputError
+from ..render.api import Rendering, rasterize
+from ..render.buffers import ClampGradient, Distortion, RenderSettings, Stop, Support
+from ..scene.camera import Camera
+from ..scene.gaussians import GaussianField
+from ..scene.motion import Motion
+from ..scene.sensor import Sensor
+from . import checkpoint
+from .folder import read_config
+from .state import field_and_motion
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Run:
+    """What :func:`gftorf_warp.reconstruct` returns, and what is found again in its folder."""
+
+    path: Path
+    """The folder of the run."""
+    config: dict
+    """Content of ``config.json``."""
+    camera: Camera
+    """The camera of raw frame 0 at the sequence's own resolution."""
+    sensor: Sensor
+    """The sensor, with the four canonical shifts."""
+    quad_scale: float
+    """The sequence's units times this are those of the optimisation."""
+    field: GaussianField
+    """The Gaussians where nothing has moved, in the units of the optimisation."""
+    motion: Motion
+    """Where they are at which time."""
+    attachment: Float[Tensor, "N M"] = dataclasses.field(repr=False)
+    """How each Gaussian hangs on the motion."""
+
+    @classmethod
+    def open(cls, path: str | Path, device: torch.device | str = "cpu") -> Run:
+        """Read a run from its folder: config and newest checkpoint.
+
+        Raises:
+            InputError: If the folder is no run, or holds no checkpoint that can be read.
+        """
+        path = Path(path)
+        config = read_config(path)
+        stored = checkpoint.last(path, device)
+        if stored is None:
+            raise InputError(
+                "the run has no checkpoint",
+                where=path,
+                why="nothing was reconstructed yet",
+                fix="run `gftorf reconstruct` with this --out first",
+            )
+        gaussians, motion, attachment = field_and_motion(stored, device)
+        return cls(
+            path=path,
+            config=config,
+            camera=Camera(**config["camera"]),
+            sensor=Sensor(**config["sensor"], shifts=CANONICAL_SHIFTS),
+            quad_scale=config["quad_scale"],
+            field=gaussians,
+            motion=motion,
+            attachment=attachment,
+        )
+
+    @property
+    def gaussians(self) -> int:
+        """Number N of Gaussians."""
+        return len(self.field)
+
+    @torch.no_grad()
+    def render(
+        self, time: float, camera: Camera | None = None, *, extra: Float[Tensor, "N D"] | None = None
+    ) -> Rendering:
+        """What the sensor would see at one instant, before black.
+
+        Quads (of the four canonical shifts) and phasor are in the units of the sequence, distances in metres. No
+        gradients. Before the first raw frame and beyond the last quartet everything stays as it was there.
+
+        Args:
+            time: Seconds since raw frame 0, any number.
+            camera: Where from, and how many pixels; None is the sequence's own.
+            extra: More channels per Gaussian, composited like colour.
+        """
+        camera = camera or self.camera
+        rendering = rasterize(
+            self.widened(self.field.moved(self.motion.displacement(self.attachment, time)), camera),
+            camera,
+            self.sensor,
+            self.render_settings,
+            extra=extra,
+        )
+        return replace(rendering, quads=rendering.quads / self.quad_scale, phasor=rendering.phasor / self.quad_scale)
+
+    def widened(self, field: GaussianField, camera: Camera) -> GaussianField:
+        """Gaussians as wide as they looked while they were optimised, for a camera that resolves more.
+
+        The renderer's low-pass filter widens every Gaussian on the image, by 0.3 px^2 at any resolution. One that was
+        fitted to smaller images would look thinner here by the difference, which is added to it as
+        0.3 ((z / f)^2 of the optimisation - (z / f)^2 of ``camera``) [m^2].
+        """
+        optimised = self.camera.resized(*self.config["size_optimised"])
+        footprint, footprint_here = (_footprint(field, view) for view in (optimised, camera))
+        missing = LOW_PASS * (footprint.square() - footprint_here.square()).clamp_min(0.0)
+        return replace(field, log_scale=0.5 * (field.scale.square() + missing[:, None]).log())
+
+    @property
+    def render_settings(self) -> RenderSettings:
+        """How the run was rendered while it was optimised."""
+        stored = dict(self.config["settings"]["render"])
+        kinds = {"support": Support, "stop": Stop, "clamp_gradient": ClampGradient, "distortion": Distortion}
+        return RenderSettings(**stored | {name: kind(stored[name]) for name, kind in kinds.items()})
+
+    def sequence(self) -> Sequence:
+        """The sequence it was made from, read again.
+
+        Raises:
+            InputError: If it was never on disk, or is gone.
+        """
+        source = self.config["sequence"]
+        if source is None:
+            raise InputError(
+                "the sequence is not on disk",
+                where=self.path,
+                why="the run was made from a sequence in memory",
+                fix="write the sequence with gftorf_warp.data.ftorf.write and reconstruct from the folder",
+            )
+        return Sequence.open(source, frame_rate_hz=self.config["frame_rate_hz"])
+
+
+def _footprint(field: GaussianField, camera: Camera) -> Float[Tensor, "N"]:
+    """Width of a pixel at each Gaussian [m]."""
+    pose = torch.as_tensor(camera.camera_from_world).to(field.mean)
+    return (field.mean @ pose[2, :3] + pose[2, 3]) / math.sqrt(camera.fx * camera.fy)

@@ -1,0 +1,176 @@
+"""Everything that decides how a sequence is reconstructed, as frozen values; presets.py names combinations.
+
+All intervals count optimised images: one raw frame compared once is one image, whatever the batch. Shares of the run
+and every decay follow ``Schedule.images``.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+from dataclasses import dataclass, field
+
+from ..render.buffers import RenderSettings
+from ..scene.initialise import InitSettings
+from ..scene.motion import MotionSettings
+
+
+class FlowSource(enum.StrEnum):
+    """Where optical flow between quartets comes from."""
+
+    AUTO = "auto"
+    """The sequence's own if it has any, otherwise computed by dense inverse search."""
+    FILE = "file"
+    """The sequence's own, or none."""
+    DIS = "dis"
+    """Computed from same-shift quads by dense inverse search."""
+    DEEPFLOW = "deepflow"
+    """Computed from same-shift quads by DeepFlow."""
+    NONE = "none"
+    """No flow: no flow loss, and motion starts at rest."""
+
+
+class Batch(enum.StrEnum):
+    """What one step of the optimiser compares."""
+
+    FRAME = "frame"
+    """One raw frame (method, section 5)."""
+    QUARTET = "quartet"
+    """The measured raw frames of one quartet: all slots pull at once."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rates:
+    """Initial learning rates of Adam: the size of one step, whatever the size of the gradient."""
+
+    mean: float = 1.6e-3
+    """Centres [m]."""
+    log_scale: float = 1e-3
+    """Scales [log m]."""
+    quaternion: float = 1e-3
+    """Orientations [1]."""
+    opacity_logit: float = 0.05
+    """Opacities before the sigmoid [1]."""
+    reflectivity_sh: float = 1.6e-4
+    """Harmonics of the reflectivity [m^2 in quad units]."""
+    motion: float = 8e-4
+    """Key offsets of the motion [m]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Weights:
+    """Weights of the terms of the loss; a term of weight 0 is not computed."""
+
+    quads: float = 1.0
+    """Quads: (1 - ssim) L2 + ssim (1 - SSIM) [1]."""
+    ssim: float = 0.2
+    """Share of the structural similarity in the quad loss [1]."""
+    distortion: float = 0.0
+    """Mean depth distortion [1/m^2]."""
+    flow: float = 0.0
+    """Squared difference to the optical flow, at quartet starts only [1/px^2]."""
+    motion_size: float = 0.0
+    """Mean length of the displacements [1/m]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Schedule:
+    """When what happens, in images and in shares of the run."""
+
+    images: int = 60_000
+    """Length of the run [images]."""
+    batch: Batch = Batch.QUARTET
+    """What one step compares."""
+    decay: float = 0.01
+    """Last learning rate as a multiple of the first; in between, the logarithm is linear [1]."""
+    warm_up: int = 0
+    """The motion stays at its start for so long [images]."""
+    flow_from: int = 0
+    """The flow loss begins here [images]."""
+    distortion_from: float = 0.0
+    """The depth distortion begins at this share of the run [1]."""
+    log_every: int = 100
+    """Between two rows of metrics.jsonl [images]."""
+    checkpoint_every_s: float = 60.0
+    """Between two checkpoints [s]; changes no result."""
+
+    def __post_init__(self):
+        if self.images < 1 or self.log_every < 1:
+            raise ValueError(f"images and log_every must be at least 1, got {self.images} and {self.log_every}")
+        if not 0 < self.decay <= 1:
+            raise ValueError(f"decay must be in (0, 1], got {self.decay}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class DensifySettings:
+    """When Gaussians are added, removed and dimmed (method, section 6.6)."""
+
+    every: int | None = None
+    """Between two rounds of cloning, splitting and pruning [images]; None: the set of Gaussians stays as it starts."""
+    start: int = 250
+    """The first round is later than this [images]."""
+    stop_share: float = 0.6
+    """No round and no reset after this share of the run [1]."""
+    gradient_min: float | None = 2e-4
+    """Gaussians whose mean screen gradient, in half image sizes, reaches this are cloned or split; None: none are."""
+    clone_scale_max: float = 0.08
+    """Up to this largest scale a Gaussian is cloned, above it is split [m]."""
+    opacity_min: float = 0.01
+    """Fainter Gaussians are removed [1]."""
+    scale_range: tuple[float, float] = (0.0, float("inf"))
+    """Gaussians whose largest scale is outside are removed, after the first reset if there are any [m]."""
+    reset_every: int | None = None
+    """Between two resets of all opacities to ``opacity_min`` [images]; None: never."""
+    gaussians_min: int = 16
+    """A round that would leave fewer removes none [Gaussians]."""
+    gaussians_max: int = 200_000
+    """A round never adds beyond this; the largest gradients go first [Gaussians]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReconSettings:
+    """How a sequence is reconstructed."""
+
+    preset: str
+    """Name of the preset these settings came from."""
+    width_max: int | None = None
+    """Wider images are reduced to this for the optimisation [px]; None keeps all pixels."""
+    flow: FlowSource = FlowSource.AUTO
+    """Where optical flow comes from."""
+    init: InitSettings = field(default_factory=InitSettings)
+    """The first Gaussians."""
+    motion: MotionSettings = field(default_factory=MotionSettings)
+    """The motion model."""
+    render: RenderSettings = field(default_factory=RenderSettings)
+    """The renderer, also of the finished run."""
+    rates: Rates = field(default_factory=Rates)
+    """Learning rates."""
+    weights: Weights = field(default_factory=Weights)
+    """Weights of the loss."""
+    schedule: Schedule = field(default_factory=Schedule)
+    """Lengths and intervals."""
+    densify: DensifySettings = field(default_factory=DensifySettings)
+    """The number of Gaussians."""
+    background: float = 1.0
+    """Amplitude B of the random background, uniform in [-B, B] per pixel and image [quad units]; 0 is black."""
+    motion_gradient_max: float | None = 1.0
+    """Longest gradient of the motion; a longer one is shortened [loss/m]. None: never."""
+    failures_max: int = 5
+    """So many steps without a finite loss and gradient in a row go back to the last checkpoint, with halved rates."""
+    rollbacks_max: int = 3
+    """After so many returns to a checkpoint without progress the run ends as diverged."""
+
+
+def plain(settings: ReconSettings) -> dict[str, object]:
+    """Settings as nested dictionaries of numbers, texts and None, as config.json holds them."""
+
+    def convert(value):
+        if isinstance(value, dict):
+            return {key: convert(item) for key, item in value.items()}
+        if isinstance(value, (list, tuple)):
+            return [convert(item) for item in value]
+        if isinstance(value, float) and value in (float("inf"), float("-inf")):
+            return str(value)
+        return str(value) if isinstance(value, enum.Enum) else value
+
+    return convert(dataclasses.asdict(settings))

@@ -1,0 +1,153 @@
+"""Everything an optimisation knows at one moment, as a value that can be stored and rebuilt."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ..scene.gaussians import GaussianField
+from ..scene.initialise import MOVING, Init, Start, from_phase, from_random
+from ..scene.measured import key_times
+from ..scene.motion import Motion, MotionKind, Nodes, Still, farthest_points
+from . import densify
+from .observations import Observations
+from .optimiser import Optimiser
+from .settings import ReconSettings
+
+FORMAT = 1  # of the stored form; a higher one is refused
+NODE_FELLOWS = 8  # points whose median displacement a node starts with
+
+
+@dataclass(kw_only=True, eq=False)
+class State:
+    """An optimisation between two steps."""
+
+    optimiser: Optimiser
+    """Gaussians and moments."""
+    motion: Motion
+    """Where they move."""
+    attachment: Float[Tensor, "N M"]
+    """How each Gaussian hangs on the motion."""
+    statistics: densify.Statistics
+    """What densification has seen since its last round."""
+    generator: torch.Generator
+    """On the CPU: the order of raw frames, and where halves of split Gaussians go."""
+    noise: torch.Generator
+    """On the device: random backgrounds."""
+    queue: list[int]
+    """Batches still to be drawn in this epoch."""
+    images: int
+    """Optimised images."""
+    seconds: float
+    """Wall clock spent so far [s]."""
+    sums: dict[str, Tensor]
+    """Loss terms and others, summed over the images since the last logged row."""
+    rate_factor: float = 1.0
+    """Multiplies all rates."""
+    skipped: int = 0
+    """Steps without a finite loss and gradient so far."""
+    rollbacks: int = 0
+    """Returns to a checkpoint so far."""
+    resets: int = 0
+    """Opacity resets so far."""
+
+
+def begin(observations: Observations, settings: ReconSettings, *, seed: int, device: torch.device | str) -> State:
+    """Gaussians and motion to start from.
+
+    Raises:
+        InputError: If the sequence does not allow this initialisation.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    sequence = observations.sequence
+    if settings.init.kind == Init.PHASE:
+        first = from_phase(sequence, settings.init)
+    else:
+        first = from_random(sequence, settings.init, generator)
+    motion = _motion(first, observations, settings).to(device)
+    field = first.field.map(lambda value: value.to(device))
+    return State(
+        optimiser=Optimiser(field, motion),
+        motion=motion,
+        attachment=motion.attach(field),
+        statistics=densify.start(field),
+        generator=generator,
+        noise=torch.Generator(device).manual_seed(seed),
+        queue=[],
+        images=0,
+        seconds=0.0,
+        sums={},
+    )
+
+
+def _motion(start: Start, observations: Observations, settings: ReconSettings) -> Motion:
+    times = key_times(observations.sequence)
+    if settings.motion.kind == MotionKind.STILL:
+        return Still(times)
+    moving = start.field.mean[start.field.layer == MOVING]
+    nodes = farthest_points(moving, settings.motion.nodes)
+    offset = None
+    if settings.motion.from_tracks and start.positions is not None and len(nodes):
+        near = torch.cdist(moving[nodes], moving).topk(min(NODE_FELLOWS, len(moving)), dim=1, largest=False).indices
+        offset = (start.positions - start.positions[start.quartet])[:, near].median(dim=2).values
+    layer = torch.full((len(nodes),), MOVING)
+    return Nodes(times, moving[nodes], layer, offset, neighbours=settings.motion.neighbours)
+
+
+def to_dict(state: State) -> dict[str, object]:
+    """Tensors, numbers, texts, lists and dictionaries only: what a safe loader reads back."""
+    motion: dict[str, object] = {"kind": str(MotionKind.STILL), "tensors": state.motion.state_dict()}
+    if isinstance(state.motion, Nodes):
+        motion |= {"kind": str(MotionKind.NODES), "neighbours": state.motion.neighbours}
+    return {
+        "format": FORMAT,
+        "field": {name: value.detach() for name, value in state.optimiser.field.tensors().items()},
+        "adam": state.optimiser.adam.state_dict(),
+        "motion": motion,
+        "attachment": state.attachment,
+        "statistics": {"gradient": state.statistics.gradient, "pixels": state.statistics.pixels},
+        "generator": state.generator.get_state(),
+        "noise": state.noise.get_state(),
+        "queue": list(state.queue),
+        "images": state.images,
+        "seconds": state.seconds,
+        "sums": dict(state.sums),
+        "rate_factor": state.rate_factor,
+        "skipped": state.skipped,
+        "rollbacks": state.rollbacks,
+        "resets": state.resets,
+    }
+
+
+def field_and_motion(stored: dict, device: torch.device | str) -> tuple[GaussianField, Motion, Tensor]:
+    """Gaussians, their motion and how they hang on it, from the stored form."""
+    field = GaussianField(**{name: value.to(device) for name, value in stored["field"].items()})
+    parts = stored["motion"]["tensors"]
+    if stored["motion"]["kind"] == MotionKind.STILL:
+        motion: Motion = Still(parts["key_times"])
+    else:
+        neighbours = stored["motion"]["neighbours"]
+        motion = Nodes(parts["key_times"], parts["node"], parts["layer"], parts["offset"], neighbours=neighbours)
+    return field, motion.to(device), stored["attachment"].to(device)
+
+
+def from_dict(stored: dict, device: torch.device | str) -> State:
+    """Rebuild a state from :func:`to_dict`; what follows is what would have followed, to the bit on a CPU."""
+    field, motion, attachment = field_and_motion(stored, device)
+    generator, noise = torch.Generator(), torch.Generator(device)
+    generator.set_state(stored["generator"].cpu())
+    noise.set_state(stored["noise"].cpu())
+    return State(
+        optimiser=Optimiser(field, motion, stored["adam"]),
+        motion=motion,
+        attachment=attachment,
+        statistics=densify.Statistics(**{name: value.to(device) for name, value in stored["statistics"].items()}),
+        generator=generator,
+        noise=noise,
+        queue=list(stored["queue"]),
+        sums={name: value.to(device) for name, value in stored["sums"].items()},
+        **{name: stored[name] for name in ("images", "seconds", "rate_factor", "skipped", "rollbacks", "resets")},
+    )

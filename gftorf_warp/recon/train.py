@@ -1,0 +1,296 @@
+"""Reconstruction: steps until the images are used up, in a folder that survives interruptions."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import math
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import torch
+
+from .. import __version__
+from ..data.sequence import Sequence
+from ..errors import DivergedError
+from ..render.buffers import available_threads
+from ..scene.measured import camera_of, frame_period, sensor_of
+from . import checkpoint, folder, presets
+from .observations import Observations, data_hash, observe
+from .optimiser import rates_at
+from .record import Metrics, log_to
+from .run import Run
+from .settings import ReconSettings, plain
+from .state import State, begin, from_dict, to_dict
+from .step import pool, step, threads_for
+
+LOG = logging.getLogger("gftorf_warp")
+Progress = Callable[..., None]
+
+
+def reconstruct(
+    sequence: Sequence | str | Path,
+    out: str | Path,
+    settings: ReconSettings | str = "demo",
+    *,
+    images: int | None = None,
+    seed: int = 0,
+    device: torch.device | str = "cpu",
+    fresh: bool = False,
+    progress: Progress | None = None,
+) -> Run:
+    """Fit moving Gaussians to the raw quads of a sequence.
+
+    Reads quads, calibration, poses and flow, and nothing else. A folder that holds the same run goes on where it
+    stopped, to the same bytes on a CPU as if it had never stopped; Ctrl-C and SIGTERM finish the step and store it.
+
+    Args:
+        sequence: What was recorded, or its folder.
+        out: Folder of the run: config.json, metrics.jsonl, run.log, ckpt/.
+        settings: How, or the name of a preset.
+        images: Raw frames to optimise, each as often as its turn comes; None: as the settings say.
+        seed: Of everything random.
+        device: Where to compute, 'cpu' or a CUDA device.
+        fresh: Whether to move what ``out`` holds aside, to ``out/old-<k>``, and start over.
+        progress: Called as ``progress(images, images_in_all, loss=, psnr_db=, gaussians=)`` now and then.
+
+    Returns:
+        The finished run.
+
+    Raises:
+        InputError: If the sequence cannot be read or cannot start a reconstruction.
+        UsageError: If ``out`` holds something else or other settings, or a preset is unknown.
+        BusyError: If another process works on ``out``.
+        DivergedError: If loss or gradient stay infinite; the last good checkpoint is kept.
+        KeyboardInterrupt: After a signal, when everything is stored.
+    """
+    begun = time.monotonic()
+    if isinstance(settings, str):
+        settings = presets.preset(settings)
+    if images is not None:
+        settings = replace(settings, schedule=replace(settings.schedule, images=images))
+    if not isinstance(sequence, Sequence):
+        sequence = Sequence.open(sequence)
+    out = Path(out)
+    config = _config(sequence, settings, seed=seed, device=device)
+    with folder.locked(out):
+        goes_on = folder.prepare(out, config, fresh=fresh)
+        with log_to(out / "run.log"):
+            _run(sequence, out, settings, config, seed, device, goes_on, begun, progress)
+        return Run.open(out, device)
+
+
+def _run(sequence, out, settings, config, seed, device, goes_on, begun, progress) -> None:
+    stored = checkpoint.last(out, device) if goes_on else None
+    total = settings.schedule.images
+    if stored is not None and stored["images"] >= total:
+        LOG.info("%s is finished: %d images", out, stored["images"])
+        return
+    observations = observe(sequence, settings, device)
+    state = from_dict(stored, device) if stored is not None else begin(observations, settings, seed=seed, device=device)
+    earlier = state.seconds
+    config |= {
+        "quad_scale": observations.quad_scale,
+        "quad_scale_source": observations.quad_scale_source,
+        "flow_source": observations.flow_source,
+        "size_optimised": [observations.sequence.width, observations.sequence.height],
+    }
+    folder.write_config(out, config)
+    metrics = Metrics(out / "metrics.jsonl")
+    metrics.rewind(state.images)
+    verb = "goes on at" if stored is not None else "starts at"
+    moving = int((state.optimiser.layer > 0).sum()) if state.optimiser.layer is not None else 0
+    count = len(state.optimiser.field)
+    LOG.info("%s %s image %d of %d, %d Gaussians, %d of them moving", out, verb, state.images, total, count, moving)
+
+    def clock() -> float:
+        return earlier + time.monotonic() - begun
+
+    loop = _Loop(observations, settings, out, device, metrics, clock, progress)
+    state = loop.until_done(state)
+    folder.write_config(
+        out, config | {"seconds_reconstruct": state.seconds, "images_optimised": state.images, "skipped": state.skipped}
+    )
+    LOG.info("%s is finished: %d images, %.1f s", out, state.images, state.seconds)
+
+
+class _Loop:
+    """Steps, rows of metrics, checkpoints, and the way back when numbers leave the finite."""
+
+    def __init__(
+        self,
+        observations: Observations,
+        settings: ReconSettings,
+        out: Path,
+        device: torch.device | str,
+        metrics: Metrics,
+        clock: Callable[[], float],
+        progress: Progress | None,
+    ):
+        self.observations, self.out, self.device = observations, out, device
+        self.settings, self.workers = threads_for(settings, device, available_threads())
+        self.metrics, self.clock, self.progress = metrics, clock, progress
+        self.saved_at = clock()
+
+    def until_done(self, state: State) -> State:
+        total, failures = self.settings.schedule.images, 0
+        if state.images == 0:
+            self.save(state)
+        with _one_torch_thread(self.device), pool(self.workers) as threads, _signals() as stop:
+            run_all: Callable = map  # the first step compiles kernels: one thread at a time
+            while state.images < total:
+                before = state.images
+                broken = step(state, self.observations, self.settings, run_all)
+                run_all = threads.map if self.workers > 1 else map
+                if broken is None:
+                    failures = 0
+                else:
+                    state.skipped, failures = state.skipped + 1, failures + 1
+                    LOG.warning("step at image %d skipped, not finite: %s", state.images, broken)
+                    if failures >= self.settings.failures_max:
+                        state, failures = self.go_back(state, broken), 0
+                        continue
+                every = self.settings.schedule.log_every
+                if state.images // every > before // every or state.images >= total:
+                    self.report(state)
+                if stop.is_set():
+                    self.save(state)
+                    LOG.info("interrupted at image %d of %d, stored", state.images, total)
+                    raise KeyboardInterrupt
+                if self.clock() - self.saved_at > self.settings.schedule.checkpoint_every_s and broken is None:
+                    self.save(state)
+        self.save(state)
+        return state
+
+    def save(self, state: State) -> None:
+        state.seconds = self.saved_at = self.clock()
+        checkpoint.save(self.out, to_dict(state))
+
+    def report(self, state: State) -> None:
+        """One row of metrics: means over the images since the last one."""
+        sums, state.sums = {name: float(value) for name, value in state.sums.items()}, {}
+        count = sums.pop("count", 0.0)
+        if not count:
+            return
+        means = {name: value / count for name, value in sums.items()}
+        mse = means.pop("quad_mse")
+        psnr = 10.0 * math.log10(self.peak**2 / mse) if mse > 0 else None
+        row: dict[str, float | int | None] = {"images": state.images, "seconds": self.clock()}
+        row |= {"loss": means.pop("loss"), **means}
+        row |= {"gaussians": len(state.optimiser.field), "quad_psnr_db": psnr}
+        self.metrics.add(row)
+        if self.progress is not None:
+            total, shown = self.settings.schedule.images, {"loss": row["loss"], "psnr_db": psnr}
+            self.progress(state.images, total, **shown, gaussians=row["gaussians"])
+
+    @property
+    def peak(self) -> float:
+        """Largest absolute quad, in the units of the optimisation."""
+        return float(self.observations.quads.abs().max())
+
+    def go_back(self, state: State, broken: dict[str, float]) -> State:
+        """The last good checkpoint, with halved rates.
+
+        Raises:
+            DivergedError: If that has been done too often.
+        """
+        if state.rollbacks >= self.settings.rollbacks_max:
+            raise DivergedError(
+                "the optimisation diverged",
+                where=f"{self.out}, image {state.images}",
+                why=f"{self.settings.failures_max} steps in a row were not finite after {state.rollbacks} returns to a "
+                f"checkpoint: {broken}, {len(state.optimiser.field)} Gaussians",
+                fix="check the sequence with `gftorf check`, or lower the learning rates",
+            )
+        stored = checkpoint.last(self.out, self.device)
+        assert stored is not None, "a checkpoint is written before the first step"
+        restored = from_dict(stored, self.device)
+        restored.rate_factor = 0.5 * state.rate_factor
+        restored.rollbacks, restored.skipped = state.rollbacks + 1, state.skipped
+        self.metrics.rewind(restored.images)
+        LOG.warning("back to image %d with rates times %g", restored.images, restored.rate_factor)
+        return restored
+
+
+def _config(sequence: Sequence, settings: ReconSettings, *, seed: int, device: torch.device | str) -> dict[str, object]:
+    """What is known before the first step; the rest of config.json follows."""
+    camera, sensor = camera_of(sequence, 0), sensor_of(sequence)
+    return {
+        "version": __version__,
+        "preset": settings.preset,
+        "seed": seed,
+        "images": settings.schedule.images,
+        "images_optimised": None,
+        "seconds_reconstruct": None,
+        "device": str(device),
+        "threads": available_threads() if torch.device(device).type == "cpu" else None,
+        "sequence": None if sequence.path is None else str(sequence.path.resolve()),
+        "data_sha256": data_hash(sequence),
+        "frames": sequence.frames,
+        "frame_rate_hz": 1.0 / frame_period(sequence),
+        "camera": {**asdict(camera), "camera_from_world": camera.camera_from_world.tolist()},
+        "sensor": {name: getattr(sensor, name) for name in ("f_mod_hz", "phase_offset", "dc_offset", "frame_period_s")},
+        "init": str(settings.init.kind),
+        "motion": str(settings.motion.kind),
+        "schedule": resolved(settings),
+        "settings": plain(settings),
+    }
+
+
+def resolved(settings: ReconSettings) -> dict[str, object]:
+    """What the schedule means in images and in rates, computed the way the loop computes it."""
+    schedule, options = settings.schedule, settings.densify
+    rounds = options.every is not None
+    return {
+        "images": schedule.images,
+        "batch": str(schedule.batch),
+        "rates_first": rates_at(settings, schedule.warm_up),
+        "rates_half_way": rates_at(settings, schedule.images // 2),
+        "rates_last": rates_at(settings, schedule.images),
+        "motion_from": schedule.warm_up,
+        "flow_from": schedule.flow_from,
+        "distortion_from": math.ceil(schedule.distortion_from * schedule.images),
+        "densify_every": options.every,
+        "densify_until": math.floor(options.stop_share * schedule.images) if rounds else None,
+        "opacity_reset_every": options.reset_every if rounds else None,
+    }
+
+
+@contextlib.contextmanager
+def _one_torch_thread(device: torch.device | str) -> Iterator[None]:
+    """Small tensors are fastest on one thread, and their sums do not depend on the number of cores then."""
+    before = torch.get_num_threads()
+    if torch.device(device).type == "cpu":
+        torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+@contextlib.contextmanager
+def _signals() -> Iterator[threading.Event]:
+    """An event that the first Ctrl-C or SIGTERM sets; the second one acts at once. Other threads get no signals."""
+    stop = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield stop
+        return
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = {number: signal.getsignal(number) for number in numbers}
+
+    def first(*_) -> None:
+        stop.set()
+        for number in numbers:
+            signal.signal(number, before[number])
+
+    for number in numbers:
+        signal.signal(number, first)
+    try:
+        yield stop
+    finally:
+        for number in numbers:
+            signal.signal(number, before[number])

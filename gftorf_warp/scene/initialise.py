@@ -1,0 +1,220 @@
+"""Gaussians and motion to start from: out of measured phase, or out of noise (the control).
+
+Phase: a static layer at the farthest distance where each pixel has rested, and a moving layer at what is nearer than
+that in the middle of the sequence. Reflectivity is amplitude times distance squared. Only measured quads and flow are
+read.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import StrEnum
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from ..constants import FRAMES_PER_QUARTET
+from ..data.sequence import Sequence
+from ..errors import InputError
+from .gaussians import GaussianField, constant_sh
+from .measured import (
+    Change,
+    FarLayer,
+    camera_of,
+    change_of,
+    decode_along_flow,
+    distance_noise,
+    far_layer,
+    flow_at,
+    sensor_of,
+)
+from .tracks import follow, unproject
+
+STATIC, MOVING = 0, 1  # labels of the two layers
+
+
+class Init(StrEnum):
+    """Where the first Gaussians come from."""
+
+    PHASE = "phase"
+    """Distance and amplitude decoded from measured quads."""
+    RANDOM = "random"
+    """Uniform in the frustum, all moving."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class InitSettings:
+    """How the first Gaussians are made."""
+
+    kind: Init = Init.PHASE
+    """Where they come from."""
+    opacity: float = 0.9
+    """Of every Gaussian [1]."""
+    static_spacing: float = 2.5
+    """Phase: distance between Gaussians of the static layer [px]."""
+    moving_spacing: float = 1.2
+    """Phase: distance between Gaussians of the moving layer [px]."""
+    footprint: float = 0.6
+    """Phase: standard deviation of a Gaussian as a multiple of the spacing [1]."""
+    nearer: float = 0.1
+    """Phase: what is at least this much nearer than the far layer belongs to the moving layer [m]."""
+    fellows: int = 16
+    """Phase: how many neighbouring points share one step along the flow."""
+    count: int = 3000
+    """Random: number of Gaussians."""
+    reflectivity: float = 0.1
+    """Random: of every Gaussian [m^2 in quad units]."""
+    range_share: tuple[float, float] = (0.02, 0.9)
+    """Random: nearest and farthest z-depth as shares of the unambiguous range [1]."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Start:
+    """What an optimisation starts from."""
+
+    field: GaussianField
+    """Gaussians of the static and the moving layer, where they are at the start of ``quartet``."""
+    positions: Float[Tensor, "T M 3"] | None
+    """Where the Gaussians of the moving layer, in their order, are at every key time [m]; None: not known."""
+    quartet: int
+    """The quartet at whose start the moving layer was seen."""
+
+
+def from_phase(sequence: Sequence, settings: InitSettings = InitSettings()) -> Start:
+    """A static and a moving layer from decoded quads.
+
+    Args:
+        sequence: A camera at rest, with at least one complete quartet; the quads are in the units of the optimisation.
+        settings: Spacing, opacity and sizes.
+
+    Raises:
+        InputError: If the camera moves or no quartet is complete.
+    """
+    if not len(sequence.complete_quartets):
+        raise InputError(
+            "no complete quartet",
+            where=sequence.path or "sequence",
+            why="phase initialisation decodes four raw frames of one quartet; every quartet lacks at least one",
+            fix="record more frames, or start from random Gaussians",
+        )
+    moved = abs(sequence.camera_from_world - sequence.camera_from_world[:1]).max()
+    if moved > 1e-6:
+        raise InputError(
+            "the camera moves",
+            where=f"{sequence.path or 'sequence'} (camera_from_world)",
+            why=f"phase initialisation compares pixels over time, but the poses differ by up to {moved:.3g}",
+            fix="start from random Gaussians",
+        )
+    change = change_of(sequence)
+    far = far_layer(sequence, change)
+    static = _static_layer(sequence, far, settings)
+    middle = min(change.quartets, key=lambda i: abs(FRAMES_PER_QUARTET * (i + 0.5) - sequence.frames / 2))
+    points, distance, amplitude = _nearer(sequence, middle, change, far, settings)
+    positions = follow(sequence, middle, points, distance, fellows=settings.fellows)
+    moving = _layer(
+        positions[middle], distance, amplitude, MOVING, settings.moving_spacing, camera_of(sequence, 0), settings
+    )
+    both = {name: torch.cat([value, moving.tensors()[name]]) for name, value in static.tensors().items()}
+    return Start(field=GaussianField(**both), positions=positions, quartet=middle)
+
+
+def from_random(sequence: Sequence, settings: InitSettings, generator: torch.Generator) -> Start:
+    """Gaussians spread evenly over the volume that the first camera sees, all of them moving (method, section 6.1).
+
+    The scale of each is the root mean square distance to its three nearest neighbours.
+    """
+    camera, sensor = camera_of(sequence, 0), sensor_of(sequence)
+    near, far = (share * sensor.unambiguous_range for share in settings.range_share)
+    u = torch.rand(settings.count, 3, generator=generator)
+    z = (near**3 + (far**3 - near**3) * u[:, 2]) ** (1.0 / 3.0)
+    points = u[:, :2] * torch.tensor([camera.width, camera.height])
+    ray = unproject(camera, points, torch.ones(settings.count)) - torch.as_tensor(camera.centre, dtype=torch.float32)
+    axis = torch.as_tensor(camera.camera_from_world[2, :3], dtype=torch.float32)
+    mean = torch.as_tensor(camera.centre, dtype=torch.float32) + ray * (z / (ray @ axis))[:, None]
+    apart = torch.cdist(mean, mean).topk(min(4, settings.count), dim=1, largest=False).values[:, 1:]
+    scale = apart.square().mean(dim=1).sqrt() if settings.count > 1 else torch.ones(1)
+    reflectivity = torch.full((settings.count,), settings.reflectivity)
+    return Start(field=_field(mean, scale, reflectivity, MOVING, settings.opacity), positions=None, quartet=0)
+
+
+def _static_layer(sequence: Sequence, far: FarLayer, settings: InitSettings) -> GaussianField:
+    """Gaussians on the far layer, one per cell of the static grid."""
+    grid = _grid(sequence.width, sequence.height, settings.static_spacing).flatten(0, 1)
+    x, y = grid.long().unbind(dim=1)
+    camera, distance = camera_of(sequence, 0), far.distance[y, x]
+    mean = unproject(camera, grid, distance)
+    return _layer(mean, distance, far.amplitude[y, x], STATIC, settings.static_spacing, camera, settings)
+
+
+def _nearer(
+    sequence: Sequence, quartet: int, change: Change, far: FarLayer, settings: InitSettings
+) -> tuple[Float[Tensor, "P 2"], Float[Tensor, "P"], Float[Tensor, "P"]]:
+    """Points [px], distances [m] and amplitudes of what is in front of the far layer at the start of a quartet.
+
+    A point has to be in front of it in the neighbouring quartets as well, where the flow takes it: what only appears to
+    be near because an outline passes within the quartet is not. Lonely points are dropped, and a distance far from the
+    median of its neighbourhood is replaced by it.
+    """
+    grid = _grid(sequence.width, sequence.height, settings.moving_spacing)
+    size = grid.shape[:2]
+    points = grid.flatten(0, 1)
+    near, distance, amplitude, noise = _in_front(sequence, quartet, points, change, far, settings)
+    for step in (-1, 1):
+        flow = flow_at(sequence, quartet, step, points)
+        if flow is not None and quartet + step in change.quartets:
+            there = points + flow.nan_to_num(0.0)
+            near &= _in_front(sequence, quartet + step, there, change, far, settings)[0]
+    near, distance, amplitude, noise = (value.view(size) for value in (near, distance, amplitude, noise))
+    near &= _windows(near.float()).mean(dim=0) > 0.5
+    median = _windows(torch.where(near, distance, torch.nan)).nanmedian(dim=0).values
+    distance = torch.where((distance - median).abs() > settings.nearer + 4.0 * noise, median, distance)
+    return grid[near], distance[near], amplitude[near]
+
+
+def _in_front(
+    sequence: Sequence,
+    quartet: int,
+    points: Float[Tensor, "P 2"],
+    change: Change,
+    far: FarLayer,
+    settings: InitSettings,
+) -> tuple[Bool[Tensor, "P"], Float[Tensor, "P"], Float[Tensor, "P"], Float[Tensor, "P"]]:
+    """Whether points are nearer than the far layer; their distance [m], amplitude, and noise of the distance [m]."""
+    ahead, behind = (flow_at(sequence, quartet, step, points) for step in (1, -1))
+    distance, amplitude = decode_along_flow(sequence, quartet, points, ahead, behind)
+    noise = distance_noise(amplitude, change.noise, sensor_of(sequence))
+    x, y = points[:, 0].long().clamp(0, sequence.width - 1), points[:, 1].long().clamp(0, sequence.height - 1)
+    nearer = distance < far.distance[y, x] - settings.nearer - 4.0 * noise
+    return nearer, distance, amplitude, noise
+
+
+def _windows(image: Float[Tensor, "H W"]) -> Float[Tensor, "25 H W"]:
+    """The 5x5 neighbourhood of every pixel; beyond the border, NaN for floats that have any and else zero."""
+    return torch.nn.functional.unfold(image[None, None], 5, padding=2).view(25, *image.shape)
+
+
+def _grid(width: int, height: int, spacing: float) -> Float[Tensor, "h w 2"]:
+    """Image positions (x, y) [px] about ``spacing`` apart, evenly spread from border to border."""
+    columns, rows = max(round(width / spacing), 1), max(round(height / spacing), 1)
+    x = (torch.arange(columns) + 0.5) * (width / columns)
+    y = (torch.arange(rows) + 0.5) * (height / rows)
+    return torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)
+
+
+def _layer(mean, distance, amplitude, label, spacing, camera, settings) -> GaussianField:
+    scale = settings.footprint * spacing * distance / math.sqrt(camera.fx * camera.fy)
+    return _field(mean, scale, amplitude * distance.square(), label, settings.opacity)
+
+
+def _field(mean: Tensor, scale: Tensor, reflectivity: Tensor, label: int, opacity: float) -> GaussianField:
+    n = len(mean)
+    return GaussianField(
+        mean=mean.float(),
+        log_scale=scale.clamp_min(1e-4).log()[:, None].repeat(1, 3),
+        quaternion=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
+        opacity_logit=torch.full((n,), math.log(opacity / (1.0 - opacity))),
+        reflectivity_sh=constant_sh(reflectivity),
+        layer=torch.full((n,), label),
+    )

@@ -1,0 +1,218 @@
+"""What can be read off raw quads before anything is fitted: distance along the flow, change over time, the far layer.
+
+Everything here decodes measured quads (method, section 2.9); nothing knows a truth.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from ..constants import FRAMES_PER_QUARTET
+from ..data.decode import quartet_phasor
+from ..data.sequence import Sequence
+from .camera import Camera
+from .sensor import Sensor, distance_from_phasor, phasor_from_quads
+
+CHANGED = 2.5  # a pixel changes if its quads, pooled over slots and 3x3 pixels, differ by so many noise deviations
+DISTANCE_TRUSTED = 0.15  # [m] a pixel whose distance is noisier than this is too dark to start from
+
+
+def sensor_of(sequence: Sequence) -> Sensor:
+    """The sensor that recorded a sequence; source intensity 1, since only its product with reflectivity is known."""
+    return Sensor(
+        f_mod_hz=sequence.f_mod_hz,
+        phase_offset=sequence.phase_offset,
+        dc_offset=sequence.dc_offset,
+        frame_period_s=frame_period(sequence),
+    )
+
+
+def camera_of(sequence: Sequence, frame: int) -> Camera:
+    """The camera of raw frame ``frame``."""
+    return Camera(
+        width=sequence.width,
+        height=sequence.height,
+        fx=sequence.fx,
+        fy=sequence.fy,
+        cx=sequence.cx,
+        cy=sequence.cy,
+        camera_from_world=sequence.camera_from_world[frame],
+    )
+
+
+def frame_period(sequence: Sequence) -> float:
+    """Mean time between raw frames [s]; that of a single frame is 1 s, where nothing can move anyway."""
+    return float(np.diff(sequence.times).mean()) if sequence.frames > 1 else 1.0
+
+
+def key_times(sequence: Sequence) -> Float[Tensor, "T"]:
+    """Start of every quartet, a truncated one included, and one quartet later [s]."""
+    starts = torch.as_tensor(sequence.times[::FRAMES_PER_QUARTET], dtype=torch.float64)
+    return torch.cat([starts, starts[-1:] + FRAMES_PER_QUARTET * frame_period(sequence)])
+
+
+def sample(image: Float[Tensor, "C H W"], points: Float[Tensor, "P 2"]) -> Float[Tensor, "C P"]:
+    """Values at image positions (x, y) [px], bilinear between pixel centres, repeated beyond the border."""
+    size = image.new_tensor([image.shape[2], image.shape[1]])
+    grid = (2.0 * points / size - 1.0)[None, None]
+    interpolate = torch.nn.functional.grid_sample
+    return interpolate(image[None], grid.to(image), padding_mode="border", align_corners=False)[0, :, 0]
+
+
+def flow_at(sequence: Sequence, quartet: int, step: int, points: Float[Tensor, "P 2"]) -> Float[Tensor, "P 2"] | None:
+    """Optical flow [px] of points from the start of ``quartet`` to that of ``quartet + step``; NaN: unknown.
+
+    Where the flow of this direction is absent, the reversed flow of the other direction at the same place stands in.
+    None if there is neither.
+
+    Args:
+        sequence: Its flow, from the file or computed.
+        quartet: Where the points are given.
+        step: 1 for the next quartet, -1 for the one before.
+        points: Image positions (x, y) [px].
+    """
+    same, other = (sequence.forward_flow, sequence.backward_flow)[:: 1 if step > 0 else -1]
+    frame = FRAMES_PER_QUARTET * quartet
+    if frame in same:
+        return sample(torch.tensor(same[frame]), points).T
+    if frame in other:
+        return -sample(torch.tensor(other[frame]), points).T
+    return None
+
+
+def decode_along_flow(
+    sequence: Sequence,
+    quartet: int,
+    points: Float[Tensor, "P 2"],
+    ahead: Float[Tensor, "P 2"] | None,
+    behind: Float[Tensor, "P 2"] | None,
+) -> tuple[Float[Tensor, "P"], Float[Tensor, "P"]]:
+    """Distance [m] and amplitude [quad units] of moving points at the start of a quartet.
+
+    Slot k was measured k raw frames later and, in the quartet before, 4 - k raw frames earlier. Both are read where the
+    flow takes the point, and the value at the start is interpolated between them: motion across the image and along the
+    ray leaves no artefact to first order. Without a measured quartet before, the one after serves to extrapolate, and
+    without either slot k is taken as it is.
+
+    Args:
+        sequence: Raw frames; the four of ``quartet`` must be measured.
+        quartet: Which quartet.
+        points: Image positions (x, y) at its start [px].
+        ahead: Their flow to the next quartet [px]; NaN counts as rest. None: unknown, everything rests.
+        behind: Their flow to the quartet before [px], likewise.
+    """
+    complete = set(sequence.complete_quartets)
+    ahead = torch.zeros_like(points) if ahead is None else ahead.nan_to_num(0.0)
+    behind = -ahead if behind is None else behind.nan_to_num(0.0)
+    quads = []
+    for k in range(FRAMES_PER_QUARTET):
+        share = k / FRAMES_PER_QUARTET
+        frame = FRAMES_PER_QUARTET * quartet + k
+        value = _quad_at(sequence, frame, points + share * ahead)
+        if quartet - 1 in complete:
+            earlier = _quad_at(sequence, frame - FRAMES_PER_QUARTET, points + (1.0 - share) * behind)
+            value = (1.0 - share) * value + share * earlier
+        elif quartet + 1 in complete:
+            later = _quad_at(sequence, frame + FRAMES_PER_QUARTET, points + (1.0 + share) * ahead)
+            value = (1.0 + share) * value - share * later
+        quads.append(value)
+    shifts = sequence.shifts[FRAMES_PER_QUARTET * quartet : FRAMES_PER_QUARTET * (quartet + 1)]
+    re, im = phasor_from_quads(torch.stack(quads), tuple(float(s) for s in shifts))
+    return distance_from_phasor(re, im, sensor_of(sequence)), 0.5 * torch.hypot(re, im)
+
+
+def _quad_at(sequence: Sequence, frame: int, points: Float[Tensor, "P 2"]) -> Float[Tensor, "P"]:
+    return sample(torch.tensor(sequence.quads[frame])[None], points)[0]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Change:
+    """Where same-shift quads of neighbouring quartets differ by more than noise."""
+
+    quartets: tuple[int, ...]
+    """The complete quartets."""
+    changed: Bool[Tensor, "I-1 H W"]
+    """Whether a pixel changes from one complete quartet to the next."""
+    noise: float
+    """Standard deviation of the noise of one quad, in quad units."""
+
+
+def change_of(sequence: Sequence) -> Change:
+    """Compare every complete quartet with the next one, slot by slot.
+
+    The noise is the median absolute difference: it is right as long as most pixels rest. Slots are matched by their
+    shift, so any order and any number of missing frames in between will do.
+    """
+    quartets = sequence.complete_quartets
+    step = FRAMES_PER_QUARTET
+    order = [np.argsort(sequence.shifts[step * i : step * (i + 1)], kind="stable") for i in quartets]
+    quads = torch.stack([torch.tensor(sequence.quads[step * i + o]) for i, o in zip(quartets, order, strict=True)])
+    difference = quads.diff(dim=0)
+    if difference.numel() == 0:
+        return Change(quartets=tuple(quartets), changed=difference.new_zeros(0, *quads.shape[2:]).bool(), noise=0.0)
+    deviation = max(float(1.4826 * difference.abs().median()), 1e-12)
+    pooled = torch.nn.functional.avg_pool2d(
+        difference.square().mean(dim=1), 3, stride=1, padding=1, count_include_pad=False
+    )
+    return Change(
+        quartets=tuple(quartets), changed=pooled.sqrt() > CHANGED * deviation, noise=deviation / float(np.sqrt(2.0))
+    )
+
+
+def distance_noise(amplitude: Tensor, noise: float, sensor: Sensor) -> Tensor:
+    """Standard deviation [m] of a decoded distance: noise / (sqrt(2) amplitude) radians of phase."""
+    return noise / (2.0**0.5 * amplitude.clamp_min(1e-12)) / sensor.phase_slope
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FarLayer:
+    """The farthest distance at which each pixel has rested: what is behind everything that moves."""
+
+    distance: Float[Tensor, "H W"]
+    """[m]; where unknown, that of the nearest known pixels."""
+    amplitude: Float[Tensor, "H W"]
+    """In quad units, likewise filled."""
+    known: Bool[Tensor, "H W"]
+    """Whether the pixel rested at least once and was bright enough."""
+
+
+def far_layer(sequence: Sequence, change: Change) -> FarLayer:
+    """Mean phasor of the quartets in which a pixel rests at its largest distance.
+
+    A quartet counts for a pixel that changes neither from the quartet before nor to the next one. Distances are
+    wrapped: a background beyond one unambiguous range comes out too near.
+    """
+    sensor = sensor_of(sequence)
+    still = torch.ones(len(change.quartets), *sequence.quads.shape[1:], dtype=torch.bool)
+    still[1:] &= ~change.changed
+    still[:-1] &= ~change.changed
+    phasors = torch.stack([torch.as_tensor(quartet_phasor(sequence, i), dtype=torch.float32) for i in change.quartets])
+    distance = distance_from_phasor(phasors[:, 0], phasors[:, 1], sensor)
+    amplitude = 0.5 * phasors.norm(dim=1)
+    tolerance = 4.0 * distance_noise(amplitude, change.noise, sensor)
+    still &= tolerance < 4.0 * DISTANCE_TRUSTED
+    reach = torch.where(still, distance, -1.0).amax(dim=0)
+    there = still & (distance > reach - 0.05 - tolerance)
+    count = there.sum(dim=0)
+    mean = (phasors * there[:, None]).sum(dim=0) / count.clamp_min(1)
+    known = count > 0
+    fields = torch.stack([distance_from_phasor(mean[0], mean[1], sensor), 0.5 * mean.norm(dim=0)])
+    filled = fill(fields, known)
+    return FarLayer(distance=filled[0], amplitude=filled[1], known=known)
+
+
+def fill(image: Float[Tensor, "C H W"], known: Bool[Tensor, "H W"]) -> Float[Tensor, "C H W"]:
+    """Replace unknown pixels by the mean of known neighbours, ring by ring; zero if nothing is known at all."""
+    weight = known.to(image)[None]
+    value = torch.where(known, image, 0.0)
+    while bool((weight == 0).any()) and bool((weight > 0).any()):
+        count = torch.nn.functional.avg_pool2d(weight, 3, stride=1, padding=1)
+        mean = torch.nn.functional.avg_pool2d(value, 3, stride=1, padding=1) / count.clamp_min(1e-6)
+        value = torch.where(weight > 0, value, torch.where(count > 0, mean, 0.0))
+        weight = ((weight > 0) | (count > 1e-6)).to(image)
+    return value

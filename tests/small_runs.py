@@ -1,0 +1,64 @@
+"""Small fields, sequences and runs that the tests of motion and of recon/ share."""
+
+import json
+from dataclasses import replace
+
+import torch
+from moving_box import recording
+
+from gftorf_warp.recon import checkpoint, presets
+from gftorf_warp.scene.gaussians import GaussianField, constant_sh
+
+KEYS = torch.arange(4, dtype=torch.float64) * (4 / 120)  # three quartets
+
+
+def field(mean, layer):
+    """Gaussians that differ in position and layer only."""
+    n = len(mean)
+    return GaussianField(
+        mean=mean,
+        log_scale=torch.full((n, 3), -3.0),
+        quaternion=torch.tensor([1.0, 0, 0, 0]).repeat(n, 1),
+        opacity_logit=torch.zeros(n),
+        reflectivity_sh=constant_sh(torch.ones(n)),
+        layer=layer,
+    )
+
+
+def random(*shape, seed=0):
+    """Seeded values in [0, 1)."""
+    return torch.rand(*shape, generator=torch.Generator().manual_seed(seed))
+
+
+def demo(**changes):
+    """The demo preset with other values; those of the schedule by their own names."""
+    settings = presets.demo()
+    schedule = {name: changes.pop(name) for name in ("images", "batch", "log_every", "warm_up") if name in changes}
+    return replace(settings, schedule=replace(settings.schedule, **schedule), **changes)
+
+
+def small():
+    """Twelve frames of a 48x36 recording."""
+    return recording(frames=12)[0]
+
+
+def stored(run):
+    """Everything in the newest checkpoint but the clock."""
+    return {name: value for name, value in checkpoint.last(run).items() if name != "seconds"}
+
+
+def rows(run):
+    """metrics.jsonl without the clock."""
+    lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+    return [{name: value for name, value in row.items() if name != "seconds"} for row in lines]
+
+
+def same(a, b):
+    """Two nested values agree to the bit."""
+    if isinstance(a, torch.Tensor):
+        return a.dtype == b.dtype and a.shape == b.shape and torch.equal(a, b)
+    if isinstance(a, dict):
+        return a.keys() == b.keys() and all(same(a[key], b[key]) for key in a)
+    if isinstance(a, (list, tuple)):
+        return len(a) == len(b) and all(same(x, y) for x, y in zip(a, b, strict=True))
+    return a == b

@@ -1,0 +1,114 @@
+"""Checkpoints: nothing is lost, nothing damaged is taken, nothing is run."""
+
+import hashlib
+import os
+import subprocess
+import sys
+
+import pytest
+import torch
+from small_runs import same
+
+from gftorf_warp.errors import InputError
+from gftorf_warp.recon import checkpoint
+
+STORED = {
+    "format": 1,
+    "images": 120,
+    "field": {"mean": torch.arange(6.0).view(2, 3)},
+    "queue": [3, 1],
+    "seconds": 1.5,
+    "sums": {},
+}
+
+
+def write(path, data):
+    """Put bytes where a checkpoint belongs, with the right SHA-256."""
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes(data)
+    path.with_suffix(".pt.sha256").write_text(hashlib.sha256(data).hexdigest() + "  " + path.name)
+
+
+def test_what_is_written_is_read(tmp_path):
+    """A stored state comes back to the bit; a run without checkpoints has none."""
+    path = checkpoint.save(tmp_path, STORED)
+    assert path.name == "0000000120.pt"
+    assert same(checkpoint.load(path), STORED)
+    assert same(checkpoint.last(tmp_path), STORED)
+    assert checkpoint.last(tmp_path / "elsewhere") is None
+
+
+def test_the_last_two_are_kept(tmp_path):
+    """Older ones go, and so do those that the run has gone back behind."""
+    for images in (20, 40, 1000):
+        checkpoint.save(tmp_path, STORED | {"images": images})
+    names = sorted(path.name for path in (tmp_path / "ckpt").iterdir())
+    assert names == ["0000000040.pt", "0000000040.pt.sha256", "0000001000.pt", "0000001000.pt.sha256"]
+    checkpoint.save(tmp_path, STORED | {"images": 60})
+    assert sorted(path.name for path in (tmp_path / "ckpt").glob("*.pt")) == ["0000000040.pt", "0000000060.pt"]
+
+
+@pytest.mark.parametrize("damage", ["flip", "cut", "empty", "no sidecar"])
+def test_a_damaged_checkpoint_is_refused_and_the_one_before_is_used(tmp_path, damage):
+    """Torch itself does not notice a flipped bit."""
+    checkpoint.save(tmp_path, STORED)
+    path = checkpoint.save(tmp_path, STORED | {"images": 240})
+    data = bytearray(path.read_bytes())
+    if damage == "flip":
+        data[len(data) // 2] ^= 1
+    path.write_bytes({"cut": bytes(data[:-100]), "empty": b""}.get(damage, bytes(data)))
+    if damage == "no sidecar":
+        path.with_suffix(".pt.sha256").unlink()
+    with pytest.raises(InputError, match=r"damaged checkpoint.*240"):
+        checkpoint.load(path)
+    assert checkpoint.last(tmp_path)["images"] == 120
+
+
+def test_if_all_are_damaged_that_is_an_error(tmp_path):
+    """Starting over silently would hide the loss."""
+    path = checkpoint.save(tmp_path, STORED)
+    path.write_bytes(b"nonsense")
+    with pytest.raises(InputError, match="damaged"):
+        checkpoint.last(tmp_path)
+
+
+class Gadget:
+    """Runs a command when it is unpickled by a careless loader."""
+
+    def __init__(self, command):
+        self.command = command
+
+    def __reduce__(self):
+        return os.system, (self.command,)
+
+
+def test_no_code_of_a_checkpoint_is_run(tmp_path):
+    """A pickle that would run a command is refused before it does."""
+    trace = tmp_path / "ran"
+    place = tmp_path / "ckpt" / "0000000007.pt"
+    place.parent.mkdir()
+    torch.save({"format": 1, "images": 7, "gadget": Gadget(f"touch {trace}")}, place)
+    write(place, place.read_bytes())
+    with pytest.raises(InputError, match="unsafe"):
+        checkpoint.load(place)
+    assert not trace.exists()
+
+
+def test_a_newer_format_is_refused(tmp_path):
+    """And the message says which formats this version reads."""
+    path = checkpoint.save(tmp_path, STORED | {"format": 2})
+    with pytest.raises(InputError, match="formats up to 1, found 2"):
+        checkpoint.load(path)
+
+
+def test_what_a_killed_process_left_is_swept(tmp_path):
+    """Temporary files of dead processes go, those of living ones stay."""
+    checkpoint.save(tmp_path, STORED)
+    process = subprocess.run([sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, check=True)
+    gone = tmp_path / "ckpt" / f".0000000999.pt.tmp-{int(process.stdout)}-0"
+    living = tmp_path / "ckpt" / f".0000000999.pt.tmp-{os.getpid()}-0"
+    for stray in (gone, living):
+        stray.write_bytes(b"half")
+    checkpoint.last(tmp_path)
+    assert not gone.exists()
+    assert living.exists()

@@ -1,0 +1,142 @@
+"""What is compared with what: terms of the loss, turns of the frames, preparation of a sequence."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from moving_box import recording
+from small_runs import demo, small
+
+from gftorf_warp.errors import InputError
+from gftorf_warp.recon import objective, step
+from gftorf_warp.recon.observations import data_hash, observe, reduced
+from gftorf_warp.recon.settings import Batch, Weights
+from gftorf_warp.recon.state import begin
+from gftorf_warp.scene.gaussians import constant_sh
+
+
+def test_flow_loss_is_small_for_the_true_motion_and_pulls_only_at_keys():
+    """And its gradient is that of finite differences."""
+    settings = demo()
+    observations = observe(small(), settings, "cpu")
+    state = begin(observations, settings, seed=0, device="cpu")
+    field = state.optimiser.field
+
+    def loss():
+        return objective.flow_loss(field, state.motion, state.attachment, observations, 4, settings)
+
+    true = loss()
+    assert torch.autograd.grad(loss(), state.optimiser.leaves[:-1], allow_unused=True) == (None,) * 5
+    with torch.no_grad():
+        state.motion.offset[2] *= 0.0
+    wrong = loss()
+    assert float(wrong.detach()) > 3 * float(true.detach())
+    (gradient,) = torch.autograd.grad(wrong, state.motion.offset)
+    assert gradient[:3].abs().amax(dim=(1, 2)).min() > 1e-4
+    assert gradient[3].abs().max() == 0
+    direction = gradient / gradient.norm()
+    h = 1e-3
+    with torch.no_grad():
+        state.motion.offset += h * direction
+        up = float(loss())
+        state.motion.offset -= 2 * h * direction
+        down = float(loss())
+    assert (up - down) / (2 * h) == pytest.approx(float(gradient.norm()), rel=0.05)
+    assert (
+        objective.flow_loss(field, state.motion, state.attachment, replace(observations, flow={}), 4, settings) is None
+    )
+
+
+def test_terms_of_weight_zero_are_left_out_and_others_begin_when_the_schedule_says():
+    """Flow at quartet starts only."""
+    settings = demo(weights=Weights(distortion=2.0, flow=3.0, motion_size=4.0, ssim=0.2))
+    schedule = replace(settings.schedule, images=1000, distortion_from=0.4, flow_from=200)
+    settings = replace(settings, schedule=schedule)
+    early, middle, late = (objective.weights_at(settings, images) for images in (199, 200, 400))
+    assert (early.flow, middle.flow) == (0.0, 3.0)
+    assert (middle.distortion, late.distortion) == (0.0, 2.0)
+    observations = observe(small(), settings, "cpu")
+    state = begin(observations, settings, seed=0, device="cpu")
+    fixed = (state.optimiser.field, state.motion, state.attachment, observations)
+    for frame, weights, names in (
+        (8, late, {"quads", "distortion", "flow", "motion_size"}),
+        (9, late, {"quads", "distortion", "motion_size"}),
+        (9, Weights(), {"quads"}),
+    ):
+        found, _ = objective.terms(*fixed, frame, settings, weights, None)
+        assert found.keys() == names
+        assert all(value > 0 for value in found.values())
+
+
+def test_the_measured_slot_is_compared_at_its_own_time_and_shift():
+    """Frame n of a recording rendered from itself: only the right shift and time fit."""
+    settings = demo()
+    observations = observe(small(), settings, "cpu")
+    state = begin(observations, settings, seed=0, device="cpu")
+    fixed = (state.optimiser.field, state.motion, state.attachment)
+    right = objective.terms(*fixed, observations, 6, settings, Weights(ssim=0.0), None)[0]["quads"]
+    shifted = replace(observations.sequence, shifts=np.roll(observations.sequence.shifts, 1))
+    late = replace(observations.sequence, times=observations.sequence.times + 8 / 120)
+    for sequence in (shifted, late):
+        wrong = objective.terms(*fixed, replace(observations, sequence=sequence), 6, settings, Weights(ssim=0.0), None)
+        assert wrong[0]["quads"] > 1.5 * right
+
+
+def test_every_measured_frame_has_its_turn_once_per_epoch():
+    """Missing ones never."""
+    measured = np.ones(12, dtype=bool)
+    measured[[2, 7]] = False
+    sequence = recording(frames=12, measured=measured)[0]
+    for batch, size in ((Batch.FRAME, 1), (Batch.QUARTET, 4)):
+        settings = demo(batch=batch, images=1000)
+        observations = observe(sequence, settings, "cpu")
+        state = begin(observations, settings, seed=0, device="cpu")
+        epochs = []
+        for _ in range(2):
+            drawn = [step.draw(state, observations, settings) for _ in observations.batches]
+            assert max(map(len, drawn)) == size
+            epochs.append([n for batch_of in drawn for n in batch_of])
+        assert sorted(epochs[0]) == sorted(epochs[1]) == [n for n in range(12) if n not in (2, 7)]
+        assert epochs[0] != epochs[1]
+    state.images = 998
+    assert len(step.draw(state, observations, settings)) == 2, "a run of 1000 images ends at 1000"
+
+
+def test_reduced_keeps_the_view():
+    """Intrinsics and flow shrink with the image."""
+    sequence = small()
+    half = reduced(sequence, 24)
+    assert (half.width, half.height, half.fx, half.cx, half.cy) == (24, 18, 21.0, 12.0, 9.0)
+    want = sequence.quads[3].reshape(18, 2, 24, 2).mean(axis=(1, 3))
+    np.testing.assert_allclose(half.quads[3], want, atol=1e-6)
+    np.testing.assert_allclose(half.forward_flow[4].max(), 0.5 * sequence.forward_flow[4].max(), rtol=0.05)
+    assert reduced(sequence, 48) is sequence
+    assert reduced(sequence, None) is sequence
+
+
+def test_the_hash_sees_what_is_read():
+    """Quads, intrinsics and flow."""
+    sequence = small()
+    assert data_hash(sequence) == data_hash(small())
+    quads = sequence.quads.copy()
+    quads[3, 4, 5] += 1e-6
+    others = [replace(sequence, quads=quads), replace(sequence, fx=43.0), replace(sequence, backward_flow={})]
+    assert len({data_hash(other) for other in (sequence, *others)}) == 4
+
+
+def test_an_empty_recording_is_refused():
+    """Before anything is written."""
+    with pytest.raises(InputError, match="nothing was measured"):
+        observe(replace(small(), measured=np.zeros(12, dtype=bool)), demo(), "cpu")
+
+
+def test_reflectivity_can_start_clamped_and_recover():
+    """A Gaussian whose reflectivity is below zero everywhere has no gradient of its own; the run must not break."""
+    settings = demo(images=8)
+    observations = observe(small(), settings, "cpu")
+    state = begin(observations, settings, seed=0, device="cpu")
+    with torch.no_grad():
+        state.optimiser.tensors["reflectivity_sh"][::2] = constant_sh(torch.tensor(-1.0))
+    assert step.step(state, observations, settings) is None
+    assert all(leaf.isfinite().all() for leaf in state.optimiser.leaves)
