@@ -7,6 +7,7 @@ import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -67,7 +68,7 @@ class Run:
         return cls(
             path=path,
             config=config,
-            camera=Camera(**config["camera"]),
+            camera=Camera(**config["camera"] | {"camera_from_world": np.array(config["camera"]["camera_from_world"])}),
             sensor=Sensor(**config["sensor"], shifts=CANONICAL_SHIFTS),
             quad_scale=config["quad_scale"],
             field=gaussians,

@@ -136,8 +136,8 @@ class Change:
 
     quartets: tuple[int, ...]
     """The complete quartets."""
-    changed: Bool[Tensor, "I-1 H W"]
-    """Whether a pixel changes from one complete quartet to the next."""
+    changed: Bool[Tensor, "J H W"]
+    """Whether a pixel changes from one complete quartet to the next; one image less than there are quartets."""
     noise: float
     """Standard deviation of the noise of one quad, in quad units."""
 

@@ -43,7 +43,7 @@ class Sensor:
     noise: bool = False
     """Whether shot noise, read noise, full well and ADC apply; without, quads are exact."""
     electrons_per_unit: float = 3.144e5
-    """Modulated electrons, both taps together, of one relative unit (r = 1 at d = 1 m) in 2.34 ms [e-]; OPT8241-like."""
+    """Modulated electrons, both taps together, of one unit (r = 1 at d = 1 m) in 2.34 ms [e-]; OPT8241-like."""
     contrast: float = 0.45
     """Demodulation contrast C of a differential sensor [1]; a unipolar one has 1 / dc_offset."""
     ambient_electrons: float = 0.0
