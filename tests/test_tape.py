@@ -156,6 +156,7 @@ def test_a_reserved_rendering_never_waits_for_the_host():
     torch.testing.assert_close(gradient, wp.to_torch(wanted.mean), rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.filterwarnings("ignore:Synchronization debug mode is a prototype")
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 def test_torch_does_not_wait_for_the_host_either():
     """With a reserve of pairs, nothing that torch does around the kernels synchronises."""
