@@ -30,7 +30,8 @@ def options(K: int) -> dict:
     Contraction to fused multiply-adds gives the CPU 10-20 %; fast_math concerns CUDA only; without a grid-stride loop
     eight registers are saved.
     """
-    flags = (wp.config.cpu_compiler_flags or "-march=native") + " -ffp-contract=fast"
+    flags = "-march=native" if wp.config.cpu_compiler_flags is None else wp.config.cpu_compiler_flags
+    flags += " -ffp-contract=fast"
     module_options = {"fast_math": True, "cpu_compiler_flags": flags} if K > 1 else {"fast_math": True}
     return {
         "enable_backward": False,
