@@ -131,7 +131,7 @@ class _Step:
 
     def __enter__(self) -> _Step:
         self.begun = time.monotonic()
-        LOG.info(self.name)
+        LOG.info(self.name.rstrip())
         return self
 
     def __exit__(self, kind, *_) -> None:
