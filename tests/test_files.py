@@ -58,7 +58,8 @@ def test_a_full_disk_is_an_error_with_exit_code_5(tmp_path, write):
         "try:\n    {write}\n"
         "except ResourceError as error:\n    sys.exit(error.exit_code)\n"
     ).replace("{write}", write)
-    done = subprocess.run([sys.executable, "-c", program, str(tmp_path / "a.bin")], check=False, capture_output=True)
+    command = [sys.executable, "-B", "-c", program, str(tmp_path / "a.bin")]  # -B: no bytecode cut off by the limit
+    done = subprocess.run(command, check=False, capture_output=True)
     assert done.returncode == 5, done.stderr
     assert names(tmp_path) == []
 
