@@ -40,13 +40,18 @@ def flow(n, frames):
     return np.where(seen(n)[2], uv, 0.0).astype(np.float32)
 
 
-def recording(*, frames=FRAMES, order=(0, 1, 2, 3), phase_offset=0.0, noise=NOISE, with_flow=True, **changes):
+def recording(
+    *, frames=FRAMES, order=(0, 1, 2, 3), phase_offset=0.0, dc_offset=0.0, noise=NOISE, with_flow=True, **changes
+):
     """The sequence and its truth; slot k shows canonical shift ``order[k]``."""
     shifts = np.array(CANONICAL_SHIFTS)[np.array(order)[np.arange(frames) % 4]]
     slope = 4.0 * np.pi / 15.0
     images = [seen(n) for n in range(frames)]
     quads = np.stack(
-        [r / d**2 * np.cos(slope * d + phase_offset - s) for (d, r, _), s in zip(images, shifts, strict=True)]
+        [
+            r / d**2 * (np.cos(slope * d + phase_offset - s) + dc_offset)
+            for (d, r, _), s in zip(images, shifts, strict=True)
+        ]
     )
     quads += noise * np.random.default_rng(0).standard_normal(quads.shape)
     starts = range(0, frames, 4)
@@ -57,6 +62,7 @@ def recording(*, frames=FRAMES, order=(0, 1, 2, 3), phase_offset=0.0, noise=NOIS
         "times": np.arange(frames) / FRAME_RATE_HZ,
         "f_mod_hz": SPEED_OF_LIGHT / 15.0,
         "phase_offset": phase_offset,
+        "dc_offset": dc_offset,
         "fx": FOCAL,
         "fy": FOCAL,
         "cx": WIDTH / 2,

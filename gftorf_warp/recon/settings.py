@@ -158,7 +158,7 @@ class ReconSettings:
     failures_max: int = 5
     """So many steps without a finite loss and gradient in a row go back to the last checkpoint, with halved rates."""
     rollbacks_max: int = 3
-    """After so many returns to a checkpoint without progress the run ends as diverged."""
+    """After so many returns to a checkpoint in all, the next one ends the run as diverged."""
 
 
 def plain(settings: ReconSettings) -> dict[str, object]:

@@ -16,7 +16,7 @@ import torch
 
 from .. import __version__
 from ..data.sequence import Sequence
-from ..errors import DivergedError
+from ..errors import DivergedError, UsageError
 from ..render.buffers import available_threads
 from ..scene.measured import camera_of, frame_period, sensor_of
 from . import checkpoint, folder, presets
@@ -24,7 +24,7 @@ from .observations import Observations, data_hash, observe
 from .optimiser import rates_at
 from .record import Metrics, log_to
 from .run import Run
-from .settings import ReconSettings, plain
+from .settings import FlowSource, ReconSettings, plain
 from .state import State, begin, from_dict, to_dict
 from .step import pool, step, threads_for
 
@@ -38,6 +38,7 @@ def reconstruct(
     settings: ReconSettings | str = "demo",
     *,
     images: int | None = None,
+    flow: FlowSource | str | None = None,
     seed: int = 0,
     device: torch.device | str = "cpu",
     fresh: bool = False,
@@ -53,6 +54,7 @@ def reconstruct(
         out: Folder of the run: config.json, metrics.jsonl, run.log, ckpt/.
         settings: How, or the name of a preset.
         images: Raw frames to optimise, each as often as its turn comes; None: as the settings say.
+        flow: Where optical flow comes from: auto, file, dis, deepflow or none; None: as the settings say.
         seed: Of everything random.
         device: Where to compute, 'cpu' or a CUDA device.
         fresh: Whether to move what ``out`` holds aside, to ``out/old-<k>``, and start over.
@@ -63,7 +65,7 @@ def reconstruct(
 
     Raises:
         InputError: If the sequence cannot be read or cannot start a reconstruction.
-        UsageError: If ``out`` holds something else or other settings, or a preset is unknown.
+        UsageError: If ``out`` holds something else or other settings, or a preset or source of flow is unknown.
         BusyError: If another process works on ``out``.
         DivergedError: If loss or gradient stay infinite; the last good checkpoint is kept.
         KeyboardInterrupt: After a signal, when everything is stored.
@@ -73,6 +75,8 @@ def reconstruct(
         settings = presets.preset(settings)
     if images is not None:
         settings = replace(settings, schedule=replace(settings.schedule, images=images))
+    if flow is not None:
+        settings = replace(settings, flow=_flow_source(flow))
     if not isinstance(sequence, Sequence):
         sequence = Sequence.open(sequence)
     out = Path(out)
@@ -82,6 +86,13 @@ def reconstruct(
         with log_to(out / "run.log"):
             _run(sequence, out, settings, config, seed, device, goes_on, begun, progress)
         return Run.open(out, device)
+
+
+def _flow_source(name: str) -> FlowSource:
+    if name not in list(FlowSource):
+        known = ", ".join(FlowSource)
+        raise UsageError(f"unknown flow {name}", where="--flow", why=f"there are {known}", fix="use --flow auto")
+    return FlowSource(name)
 
 
 def _run(sequence, out, settings, config, seed, device, goes_on, begun, progress) -> None:
@@ -231,7 +242,7 @@ def _config(sequence: Sequence, settings: ReconSettings, *, seed: int, device: t
         "sequence": None if sequence.path is None else str(sequence.path.resolve()),
         "data_sha256": data_hash(sequence),
         "frames": sequence.frames,
-        "frame_rate_hz": 1.0 / frame_period(sequence),
+        "frame_rate_hz": round(1.0 / frame_period(sequence), 9),  # of a time in seconds, which is no exact decimal
         "camera": {**asdict(camera), "camera_from_world": camera.camera_from_world.tolist()},
         "sensor": {name: getattr(sensor, name) for name in ("f_mod_hz", "phase_offset", "dc_offset", "frame_period_s")},
         "init": str(settings.init.kind),
