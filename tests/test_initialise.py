@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from moving_box import FOCAL, FRAMES, HEIGHT, NOISE, STEP, WIDTH, flow, recording, seen
+from moving_box import FOCAL, FRAMES, HEIGHT, NOISE, STEP, WIDTH, flow, ray_slopes, recording, seen
 
 from gftorf_warp.data.decode import closed_form_distance
 from gftorf_warp.errors import InputError
@@ -30,11 +30,30 @@ def test_the_far_layer_is_the_wall_wherever_it_was_ever_seen(order):
     assert np.sqrt((error**2).mean()) < 0.03
 
 
+def test_what_rests_in_front_and_leaves_is_not_the_far_layer():
+    """A box that stands still for two quartets, and is gone in the next two."""
+    sequence, _ = recording(noise=0.0)
+    box, wall = sequence.quads[:4], sequence.quads[8:12].copy()
+    slope, shifts = 4.0 * np.pi / 15.0, sequence.shifts[:4, None, None]
+    distance = 3.6 * np.sqrt(1.0 + sum(slope_of**2 for slope_of in ray_slopes()))
+    wall[:] = 0.5 / distance**2 * np.cos(slope * distance - shifts)
+    noise = NOISE * np.random.default_rng(6).standard_normal(sequence.quads.shape)
+    quads = np.concatenate([box, box, wall, wall]) + noise
+    left, _ = recording(quads=quads.astype(np.float32))
+    far = measured.far_layer(left, measured.change_of(left))
+    assert far.known.float().mean() > 0.99
+    assert np.abs(far.distance.numpy() - distance).max() < 0.2
+
+
 def test_noise_is_measured_and_most_of_the_wall_rests():
     """And the box, seen to be elsewhere, does not."""
     sequence, _ = recording()
     change = measured.change_of(sequence)
     assert change.noise == pytest.approx(NOISE, rel=0.25)
+    noise = NOISE * np.random.default_rng(5).standard_normal(sequence.quads.shape)
+    resting = measured.change_of(recording(quads=(sequence.quads[:1] + noise).astype(np.float32))[0])
+    assert resting.noise == pytest.approx(NOISE, rel=0.03)
+    assert resting.changed.float().mean() < 0.001
     boxes = np.stack([seen(n)[2] for n in range(FRAMES)]).any(axis=0)
     assert change.changed.any(dim=0).numpy()[~boxes].mean() < 0.1
     inside = seen(8)[2] & seen(4)[2]

@@ -58,6 +58,11 @@ def test_nearer_nodes_count_more():
     weights = motion.attach(field(torch.tensor([[0.0, 0, 0], [0.4, 0, 0], [0.5, 0, 0]]), torch.ones(3, dtype=int)))
     assert weights[0, 0] > weights[1, 0] > 0.5
     torch.testing.assert_close(weights[2], torch.tensor([0.5, 0.5]))
+    points = random(20, 3)
+    alone = Nodes(KEYS, random(6, 3, seed=1), torch.ones(6, dtype=torch.long), neighbours=1)
+    nearest = torch.cdist(points, alone.node).argmin(dim=1)
+    want = torch.nn.functional.one_hot(nearest, 6).float()
+    torch.testing.assert_close(alone.attach(field(points, torch.ones(20, dtype=torch.long))), want)
 
 
 def test_gradient_reaches_the_two_keys_around_a_time_only(nodes, gaussians):

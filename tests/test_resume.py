@@ -24,7 +24,7 @@ KILLED = """
 import os, signal
 from small_runs import demo, small
 from gftorf_warp.recon.train import reconstruct
-settings = demo(images=40, log_every=4)
+settings = demo(images=40, log_every=8)
 from dataclasses import replace
 settings = replace(settings, schedule=replace(settings.schedule, checkpoint_every_s=0.0))
 kill = lambda n, *_, **__: os.kill(os.getpid(), signal.SIGKILL) if n == 24 else None
@@ -67,7 +67,7 @@ def test_a_killed_run_goes_on_to_the_same_bytes(tmp_path):
     assert done.returncode == -signal.SIGKILL, done.stderr.decode()
     assert checkpoint.last(run)["images"] == 20
     assert rows(run)[-1]["images"] == 24
-    settings = demo(images=40, log_every=4)
+    settings = demo(images=40, log_every=8)
     reconstruct(small(), run, settings)
     whole = reconstruct(small(), tmp_path / "whole", settings).path
     assert same(stored(run), stored(whole))

@@ -37,8 +37,7 @@ def flow_error(
     Unknown pixels (NaN in either component of ``measured``) have error 0 and pass no gradient.
     """
     known = measured.isfinite().all(dim=0)
-    difference = rendered - torch.where(known, measured, 0.0)
-    return torch.where(known, difference, 0.0).square(), known
+    return torch.where(known, rendered - measured, 0.0).square(), known
 
 
 def motion_size(displacement: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
