@@ -14,6 +14,7 @@ import math
 import statistics
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import naive
@@ -114,6 +115,19 @@ def medians(rows: dict[str, object], repeats: int) -> dict[str, dict[str, float]
     return {name: {s: statistics.median(t[1:]) for s, t in both.items()} for name, both in times.items()}
 
 
+def side_by_side(scene: dict[str, np.ndarray]) -> float:
+    """What the machine gives two threads at the moment: time of two renderings at once over that of one."""
+    copies = [Ours(scene, "cpu", 1) for _ in range(2)]
+    times: dict[int, list[float]] = {1: [], 2: []}
+    with ThreadPoolExecutor(2) as pool:
+        for _ in range(12):
+            for count, record in times.items():
+                start = time.perf_counter()
+                list(pool.map(lambda copy: copy.forward(), copies[:count]))
+                record.append(time.perf_counter() - start)
+    return statistics.median(times[2][2:]) / statistics.median(times[1][2:])
+
+
 def main() -> None:
     """Print the table, write the JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -135,6 +149,9 @@ def main() -> None:
     table = medians(rows, a.repeats)
     table.setdefault("prototype, 1 thread", {"forward": math.nan, "backward": math.nan})
     base = table["ours, 1 thread"]
+    if a.device == "cpu":
+        shared = side_by_side(scene)
+        print(f"two independent copies side by side take {shared:.2f} times one: 1 means two whole cores, 2 only one")
     print(f"surface {' '.join(a.scene)}, {WIDTH}x{HEIGHT}, {a.device}, medians of {a.repeats}, Warp {wp.__version__}")
     for name, both in table.items():
         cells = [

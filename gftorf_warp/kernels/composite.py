@@ -16,7 +16,7 @@ import warp as wp
 
 from ..constants import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 from .lanes import make_lanes, warp_any
-from .splat import Splat, block_missed, load_splat
+from .splat import AHEAD, Splat, block_missed, load_splat, prefetch
 
 # planes of ``light``, each [tiles, lanes] of V
 RE, IM, AMPLITUDE, DISTANCE, DISTORTION, SUM_ZETA, SUM_ZETA2, TRANSMITTANCE, LAST = range(9)
@@ -151,6 +151,8 @@ def make_composite(
         while k < end and warp_any(nonzero(live)):  # the same trip count for all lanes of a warp
             i = ids[k]
             k += 1
+            if wp.static(K > 1):
+                prefetch(splats, ids[wp.min(k + AHEAD, end - 1)])
             if block_missed(splats, i, x0 + wp.static(half), y0 + wp.static(half)):
                 continue
             q = load_splat(splats, i)

@@ -17,7 +17,7 @@ import warp as wp
 from ..constants import ALPHA_MAX, ALPHA_MIN
 from .composite import LAST, SUM_ZETA, SUM_ZETA2, TRANSMITTANCE, make_pixels, make_zeta, options
 from .lanes import make_lanes, sums_of, types_of, warp_any, warp_max
-from .splat import Splat, block_missed, load_splat
+from .splat import AHEAD, Splat, block_missed, load_splat, prefetch
 
 # planes of ``grad_sums``, each [tiles, lanes] of V: gradients of the first five planes of the forward pass, and of T_e
 GRAD_TRANSMITTANCE = 5
@@ -197,6 +197,10 @@ def make_composite_backward(
             k -= 1
             position = affine(position, 1.0, -1.0)
             i = ids[k]
+            if wp.static(K > 1):
+                ahead = ids[wp.max(k - AHEAD, begin)]
+                prefetch(splats, ahead)
+                prefetch(grad_splats, ahead)
             if block_missed(splats, i, x0 + wp.static(half), y0 + wp.static(half)):
                 continue
             gate = exceeds(last, position)  # only what this pixel composited

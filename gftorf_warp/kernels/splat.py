@@ -17,6 +17,7 @@ import warp as wp
 
 Splat = wp.types.vector(length=16, dtype=wp.float32)
 CHANNEL = wp.constant(8)  # first slot of the T-weighted channels
+AHEAD = wp.constant(4)  # records a CPU thread asks for in advance: they lie scattered, and waiting costs a tenth
 
 _LOAD = """
 #if defined(__CUDA_ARCH__)  // component-wise reads would be sixteen; a record is aligned, so four of 16 bytes do
@@ -54,6 +55,11 @@ def load_splat(splats: wp.array[Splat], i: int) -> Splat:
 @wp.func_native(_BLOCK_MISSED)
 def block_missed(splats: wp.array[Splat], i: int, x: float, y: float) -> bool:
     """Whether splat ``i`` surely misses the block of 4 x 4 pixels around (x, y) [px]."""
+
+
+@wp.func_native("__builtin_prefetch(splats.data + i, 0, 3);")
+def prefetch(splats: wp.array[Splat], i: int):
+    """Ask for record ``i`` before it is needed; only a CPU has the instruction."""
 
 
 @wp.kernel(enable_backward=False)
