@@ -100,7 +100,7 @@ def composite(frame: Frame, view: CameraView, number: int) -> None:
     def arguments(tile0: int, _part: int) -> list:
         return [*lists, tile0, _mapping(frame), frame.sums.lanes, channel]
 
-    _over_tiles(frame, kernel, _tile_edges(frame, 2 * frame.threads), arguments)
+    _over_tiles(frame, kernel, _tile_edges(frame, frame.threads), arguments)
 
 
 def composite_backward(
@@ -255,7 +255,11 @@ def _over_tiles(frame: Frame, kernel, edges: list[int], arguments) -> None:
         for part, (start, stop) in enumerate(pairwise(edges))
     ]
     if side_by_side:
-        list(_pool(frame.threads).map(lambda command: command.launch(), commands))
+        # this thread works, too: a pool that has slept would wake on its processor, and both would share it for a while
+        others = [_pool(frame.threads - 1).submit(command.launch) for command in commands[1:]]
+        commands[0].launch()
+        for other in others:
+            other.result()
 
 
 def _launch(kernel, dim, inputs: list, outputs: list, **adjoint) -> None:
