@@ -154,6 +154,7 @@ def _reconstruct(options: argparse.Namespace) -> int:
         options.out,
         options.preset,
         images=options.images,
+        flow=options.flow,
         seed=options.seed,
         device=device,
         fresh=options.fresh,

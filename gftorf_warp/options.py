@@ -103,6 +103,8 @@ def command_parsers() -> dict[str, Parser]:
     reconstruct.add_argument("--out", metavar="RUN", required=True, help="folder to write; goes on where it stopped")
     reconstruct.add_argument("--preset", metavar="demo", default="demo", help="settings (demo)")
     reconstruct.add_argument("--images", metavar="N", type=_positive, help="raw frames to optimise (the preset's own)")
+    flows = "the folder's, computed, or none; auto: the folder's if it has any, else dis"
+    reconstruct.add_argument("--flow", metavar="KIND", help=f"auto, file, dis, deepflow or none: optical flow, {flows}")
     _seed_option(reconstruct, "seed of the optimiser (0)")
     _frame_rate_option(reconstruct)
     _device_options(reconstruct)

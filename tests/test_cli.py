@@ -98,6 +98,7 @@ def test_module_and_script_are_the_same():
         ("simulate S --out Q --sync --no-noise --flow --exposure-samples 3 --fresh", "exposure_samples", 3),
         ("reconstruct SEQ --out RUN --preset demo --images 100 --seed 2 --device cpu --fresh", "images", 100),
         ("reconstruct SEQ --out RUN --frame-rate 60", "frame_rate", 60.0),
+        ("reconstruct SEQ --out RUN --flow dis", "flow", "dis"),
         ("render RUN --out DIR --what distance,quads,phasor,colour", "what", ["distance", "quads", "phasor", "colour"]),
         ("render RUN --out DIR --times 0.1,0.2", "times", [0.1, 0.2]),
         ("render RUN --out DIR", "times", None),
@@ -233,6 +234,7 @@ def test_names_that_a_room_does_not_know(run, sequence, tmp_path, capsys):
     fails(["simulate", "slidin", "--out", out], 2, capsys, "slidin", "sliding")
     fails(["simulate", "demo", "--out", out, "--format", "capture"], 2, capsys, "capture", "ftorf")
     fails(["reconstruct", str(sequence), "--out", out, "--preset", "dmeo"], 2, capsys, "dmeo", "demo")
+    fails(["reconstruct", str(sequence), "--out", out, "--flow", "raft"], 2, capsys, "raft", "deepflow")
     fails(["render", str(run), "--out", out, "--what", "distance,quad"], 2, capsys, "quad", "quads")
     fails(["compare", str(run), "--frames", "some"], 2, capsys, "some", "ftorf13")
     assert not (tmp_path / "x").exists()
