@@ -108,8 +108,7 @@ class Frame:
         self.settings, self.device = settings, device
         self.K, self.tile_width, self.tile_height = TILE_SHAPES["cpu" if device.is_cpu else "cuda"]
         self.tiles_x = math.ceil(width / self.tile_width)
-        self.tiles_y = math.ceil(height / self.tile_height)
-        self.tiles = self.tiles_x * self.tiles_y
+        self.tiles = self.tiles_x * math.ceil(height / self.tile_height)
         pixels = make_pixels(self.K, self.tile_width, self.tile_height)
         self.lanes = pixels.lanes
         self.threads = (settings.threads or available_threads()) if device.is_cpu else 1
