@@ -41,8 +41,17 @@ class Sequence:
     """Pose of each raw frame, world to camera [m]."""
     quad_scale: float | None = None
     """The file's own factor for the quads; None if it states none. Never applied by a reader."""
+    from_phasors: bool = False
+    """Whether the camera delivered phasors, each as if taken at one instant: the four raw frames of a quartet are then
+    re/2, -re/2, im/2, -im/2 of one phasor, with one time and one pose."""
     colour: dict[int, Float[np.ndarray, "h w 3"]] = field(default_factory=dict)
     """Colour images by raw frame, linear, float32; empty if there are none."""
+    colour_intrinsics: tuple[float, float, float, float] | None = None
+    """fx, fy, cx, cy of the colour images [px], pixel centres at i + 0.5; None: the colour camera is not known."""
+    colour_from_world: Float[np.ndarray, "F 4 4"] | None = None
+    """Pose of the colour camera at each raw frame, world to camera [m]; None: the colour camera is not known."""
+    novel_from_world: Float[np.ndarray, "M 4 4"] | None = None
+    """Poses of views that nobody took, world to camera [m], to be rendered for looking at; None if there are none."""
     forward_flow: dict[int, Float[np.ndarray, "2 H W"]] = field(default_factory=dict)
     """Optical flow (dx, dy) [px] by raw frame n, from n to n + 4; NaN: unknown pixel."""
     backward_flow: dict[int, Float[np.ndarray, "2 H W"]] = field(default_factory=dict)

@@ -45,6 +45,16 @@ def camera_of(sequence: Sequence, frame: int) -> Camera:
     )
 
 
+def colour_camera_of(sequence: Sequence, frame: int) -> Camera | None:
+    """The colour camera at raw frame ``frame``, at the size of the colour images; None if it is not known."""
+    if not sequence.colour or sequence.colour_intrinsics is None or sequence.colour_from_world is None:
+        return None
+    height, width = next(iter(sequence.colour.values())).shape[:2]
+    fx, fy, cx, cy = sequence.colour_intrinsics
+    pose = sequence.colour_from_world[frame]
+    return Camera(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, camera_from_world=pose)
+
+
 def frame_period(sequence: Sequence) -> float:
     """Mean time between raw frames [s]; that of a single frame is 1 s, where nothing can move anyway."""
     return float(np.diff(sequence.times).mean()) if sequence.frames > 1 else 1.0
