@@ -9,6 +9,7 @@ from analytic_run import sequence
 
 from gftorf_warp.constants import CANONICAL_SHIFTS
 from gftorf_warp.data.sequence import Sequence, Truth
+from gftorf_warp.data.truth import known_distance, moving_and_static
 from gftorf_warp.errors import InputError, UsageError
 from gftorf_warp.evaluate import metrics
 from gftorf_warp.scene.sensor import Sensor
@@ -66,7 +67,7 @@ def test_moving_is_a_change_of_more_than_five_centimetres_within_the_quartet():
     distance[4:, 0, 1] += 1.0  # between two quartets
     distance[2, 0, 2] = NAN  # unknown, so it may have moved
     distance[:3, 0, 3] = [3.0, NAN, 3.5]  # unknown for a while, but it certainly moved
-    moving, static = metrics.moving_and_static(distance, [1, 2, 4])
+    moving, static = moving_and_static(distance, [1, 2, 4])
     assert moving[:, 0].tolist() == [[True, False, False, True]] * 2 + [[False] * 4]
     assert static[:, 0].tolist() == [[False, True, False, False]] * 2 + [[True] * 4]
     assert metrics.share(moving, static) == 4 / 10
@@ -99,7 +100,7 @@ def test_unknown_truth_hides_a_pixel_but_never_a_broken_distance():
 def test_a_frame_without_truth_is_unknown_everywhere():
     """What stands in the array of an unknown frame does not count."""
     truth = Truth(distance=np.ones((2, 1, 1), dtype=np.float32), known=np.array([True, False]))
-    assert np.isnan(metrics.known_distance(truth)).ravel().tolist() == [False, True]
+    assert np.isnan(known_distance(truth)).ravel().tolist() == [False, True]
 
 
 def test_distance_from_quads_wraps_and_removes_the_phase_offset():

@@ -6,6 +6,7 @@ import importlib.metadata
 import json
 import platform
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,15 +15,28 @@ import numpy as np
 from .. import __version__
 from ..data.files import atomic_write, write_json
 from ..data.sequence import Sequence, Truth
+from ..data.truth import known_distance, moving_and_static
 from ..errors import InputError
+from . import gallery, views
 from . import metrics as measure
-from . import views
 from .panels import Findings, Judgement
+from .provenance import fact, method_of
 
 if TYPE_CHECKING:
     from ..recon.run import Run
 
-FACTS = ("seconds_reconstruct", "images_optimised", "device", "seed", "preset", "flow_source", "init")
+FACTS = (
+    "seconds_reconstruct",
+    "images_optimised",
+    "device",
+    "seed",
+    "preset",
+    "ablation",
+    "input",
+    "flow_source",
+    "init",
+    "motion",
+)
 
 
 def compare(
@@ -60,7 +74,12 @@ def compare(
     sequence = run.sequence()
     known = fitting_truth(sequence, truth)
     scored = measure.scored_frames(sequence, frames)
-    found = findings(sequence, views.gather(run, sequence, scored, progress=progress), known)
+    gathered = views.gather(run, sequence, scored, progress=progress)
+    found = replace(
+        findings(sequence, gathered, known),
+        colour=gallery.colour_views(run, sequence, scored),
+        novel=gallery.novel_views(run, sequence) if report else None,
+    )
     result = summary(run, found, protocol=frames)
     write_json(run.path / "metrics.json", result)
     if report:
@@ -99,8 +118,8 @@ def findings(sequence: Sequence, gathered: views.Views, truth: Truth | None) -> 
     """Gathered views, judged by the truth if there is any."""
     if truth is None:
         return Findings(sequence=sequence, views=gathered, judgement=None)
-    distance = measure.known_distance(truth)
-    moving, static = measure.moving_and_static(distance, gathered.frames)
+    distance = known_distance(truth)
+    moving, static = moving_and_static(distance, gathered.frames, from_phasors=sequence.from_phasors)
     scored = distance[gathered.frames]
     errors = {name: measure.squared_error(image, scored) for name, image in gathered.distances.items()}
     judgement = Judgement(truth=scored, errors=errors, moving=moving, static=static)
@@ -118,8 +137,13 @@ def summary(run: Run, found: Findings, *, protocol: str) -> dict[str, Any]:
             found.views.quad_measured,
             peak=float(np.abs(found.sequence.quads[found.sequence.measured]).max()),
         ),
+        "colour_psnr_db": None
+        if found.colour is None
+        else measure.colour_psnr_db(found.colour.rendered, found.colour.measured),
         "gaussians": run.gaussians,
-        **{name: run.config[name] for name in FACTS},
+        "diagnostics": measure.along_run(rows_of(run.path / "diagnostics.jsonl")),
+        **{name: fact(run.config, name) for name in FACTS},
+        "method": method_of(run.config),
         "version": __version__,
     }
 
@@ -146,7 +170,8 @@ def write_report(run: Run, result: dict[str, Any], found: Findings) -> Path:
         title=sequence_title(found.sequence.path) or run.path.name,
         metrics=result,
         config=run.config,
-        log=training_log(run.path / "metrics.jsonl"),
+        log=rows_of(run.path / "metrics.jsonl"),
+        diagnostics=rows_of(run.path / "diagnostics.jsonl"),
         found=found,
         installed=installed_versions(),
         data_card=truth_statement(found.sequence.path),
@@ -162,8 +187,11 @@ def installed_versions() -> str:
     return f"gftorf-warp {__version__}, {versions}, Python {platform.python_version()}, {platform.system()}"
 
 
-def training_log(path: Path) -> list[dict[str, float]]:
-    """The steps of a run's metrics.jsonl; a last line that was cut off by an interruption is no step."""
+def rows_of(path: Path) -> list[dict[str, float]]:
+    """The rows of a run's metrics.jsonl or diagnostics.jsonl; none if there is no such file.
+
+    A last line that was cut off by an interruption is no row.
+    """
     if not path.exists():
         return []
     return [

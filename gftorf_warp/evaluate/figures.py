@@ -15,6 +15,11 @@ NOT_LOSSES = {"images", "seconds", "gaussians", "quad_psnr_db", "opacity"}  # wh
 LOG_SPAN = 20.0  # values that span more than this factor are drawn on a logarithmic axis
 FLOOR_M = 1e-3  # [m] smaller errors fall into the first bin of the histogram
 BINS = 60
+ALONG_COLUMNS = 3
+STATIC_CURVES = {  # key of a row of diagnostics: label, line, colour
+    "d_minus_dtof_static_m": (r"|d $-$ d_ToF|", "-", COLOURS["d"]),
+    "offset_static_m": ("length of the displacement", "--", COLOURS["d_normalised"]),
+}
 STYLE: dict[Any, Any] = {
     "svg.hashsalt": "gftorf_warp",  # element ids would be random without
     "font.size": 9.0,
@@ -54,6 +59,46 @@ def training_curves(log: Sequence[Mapping[str, float]]) -> bytes | None:
         count.set(title="Gaussians", xlabel="optimised images", ylabel="number N", ylim=(0, None))
 
     return _svg(draw, 11.0, 2.9)
+
+
+def along_run(rows: Sequence[Mapping[str, float]]) -> bytes | None:
+    """What diagnostics saw over optimised images: errors if truth is known, agreement, opacity, number of Gaussians.
+
+    Args:
+        rows: Those of ``diagnostics.jsonl``, see recon/diagnostics.py.
+    """
+    if not rows:
+        return None
+    errors = ("d", "d_tof")
+    plots = [(f"Error of {NAMES[name]}", r"m$^2$ $\times$ 100", _error_curves(name)) for name in errors]
+    plots.append(("On static pixels", "m", STATIC_CURVES))
+    plots.append(("Light let through", "1", {"transmittance": (r"T$_e$, mean", "-", COLOURS["d"])}))
+    plots.append(("Depth distortion", "m$^2$", {"distortion": ("mean", "-", COLOURS["d"])}))
+    plots.append(("Gaussians", "number N", {"gaussians": ("N", "-", COLOURS["d"])}))
+    plots = [plot for plot in plots if any(row.get(key) is not None for row in rows for key in plot[2])]
+
+    def draw(figure):
+        axes = np.ravel(figure.subplots(-(-len(plots) // ALONG_COLUMNS), ALONG_COLUMNS))
+        for unused in axes[len(plots) :]:
+            unused.set_visible(False)
+        for plot, (title, unit, curves) in zip(axes, plots, strict=False):
+            drawn = []
+            for key, (label, line, colour) in curves.items():
+                x, y = _curve(rows, key)
+                if len(x):
+                    plot.plot(x, y, line, color=colour, label=label, linewidth=1.4)
+                    drawn.append(y)
+            _choose_axis(plot, np.concatenate(drawn))
+            plot.set(title=title, xlabel="optimised images", ylabel=unit)
+            if len(drawn) > 1:
+                plot.legend(fontsize=8)
+
+    return _svg(draw, 11.0, 2.7 * -(-len(plots) // ALONG_COLUMNS))
+
+
+def _error_curves(name: str) -> dict[str, tuple[str, str, str]]:
+    groups = {"": ("all pixels", "-"), "moving.": ("moving pixels", "--"), "static.": ("static pixels", ":")}
+    return {f"{prefix}{name}_mse_x100": (label, line, COLOURS[name]) for prefix, (label, line) in groups.items()}
 
 
 def error_over_frames(frames: Sequence[int], groups: Mapping[str, Mapping[str, Sequence[float | None]]]) -> bytes:

@@ -14,13 +14,13 @@ import torch
 from jaxtyping import Bool, Float
 
 from ..constants import FRAMES_PER_QUARTET
-from ..data.sequence import Sequence, Truth
+from ..data.sequence import Sequence
 from ..errors import InputError, UsageError
 from ..scene.sensor import Sensor, distance_from_phasor, phasor_from_quads
 
 PROTOCOLS = ("all", "ftorf13")
-MOVING_M = 0.05  # [m] twice the noise of a distance decoded from typical quads, a fraction of any object
 ERROR_UNIT = 100.0  # errors are printed times 100, as in the published tables
+CRITERION = "d_minus_dtof_static_m"  # of a row of diagnostics: tells a good moment of a run without truth
 DISTANCES = ("closed_form", "d", "d_normalised", "d_tof")
 
 
@@ -29,8 +29,9 @@ def scored_frames(sequence: Sequence, protocol: str = "all") -> list[int]:
 
     Args:
         sequence: What was measured.
-        protocol: ``all``: every raw frame of a complete quartet. ``ftorf13``: the first frame of every complete quartet
-            but the first and the last, as in the published tables (13 of 60 frames).
+        protocol: ``all``: every raw frame of a complete quartet, of a phasor only the first: its four raw frames are
+            one image of one instant. ``ftorf13``: the first frame of every complete quartet but the first and the last,
+            as in the published tables (13 of 60 frames).
 
     Raises:
         UsageError: If the protocol is unknown, or leaves nothing.
@@ -52,7 +53,8 @@ def scored_frames(sequence: Sequence, protocol: str = "all") -> list[int]:
             fix="check the sequence with `gftorf check`, or record longer",
         )
     if protocol == "all":
-        return [FRAMES_PER_QUARTET * i + k for i in quartets for k in range(FRAMES_PER_QUARTET)]
+        slots = range(1 if sequence.from_phasors else FRAMES_PER_QUARTET)
+        return [FRAMES_PER_QUARTET * i + k for i in quartets for k in slots]
     if len(quartets) < 3:
         raise UsageError(
             "protocol ftorf13 leaves no frame",
@@ -61,34 +63,6 @@ def scored_frames(sequence: Sequence, protocol: str = "all") -> list[int]:
             fix="use --frames all",
         )
     return [FRAMES_PER_QUARTET * i for i in quartets[1:-1]]
-
-
-def known_distance(truth: Truth) -> Float[np.ndarray, "F H W"]:
-    """True distance of every raw frame [m], NaN wherever it is unknown."""
-    return np.where(truth.known[:, None, None], truth.distance, np.nan)
-
-
-def moving_and_static(
-    distance_truth: Float[np.ndarray, "F H W"], frames: list[int]
-) -> tuple[Bool[np.ndarray, "S H W"], Bool[np.ndarray, "S H W"]]:
-    """Which pixels of the S scored frames move, and which rest.
-
-    A pixel moves if its true distance has max - min > 0.05 m within the four raw frames of the quartet. It rests if all
-    four are known and it does not move; with unknown truth [NaN] it may be neither.
-
-    Args:
-        distance_truth: True distance of every raw frame [m]; NaN: unknown.
-        frames: The scored raw frames n.
-    """
-    moving, static = {}, {}
-    for quartet in {n // FRAMES_PER_QUARTET for n in frames}:
-        four = distance_truth[FRAMES_PER_QUARTET * quartet : FRAMES_PER_QUARTET * (quartet + 1)]
-        unknown = np.isnan(four)
-        low, high = np.where(unknown, np.inf, four).min(axis=0), np.where(unknown, -np.inf, four).max(axis=0)
-        moving[quartet] = high - low > MOVING_M
-        static[quartet] = ~moving[quartet] & ~unknown.any(axis=0)
-    rows = [n // FRAMES_PER_QUARTET for n in frames]
-    return np.stack([moving[i] for i in rows]), np.stack([static[i] for i in rows])
 
 
 def squared_error(
@@ -158,5 +132,41 @@ def quad_psnr_db(
         measured: What was recorded there [file units].
         peak: Largest measured |quad| [file units].
     """
+    return _psnr_db(rendered, measured, peak)
+
+
+def colour_psnr_db(rendered: Float[np.ndarray, "C h w 3"], measured: Float[np.ndarray, "C h w 3"]) -> float | None:
+    """The same for linear RGB [dB], the peak being the largest measured value; None where it is not a number."""
+    return _psnr_db(rendered, measured, float(measured.max()))
+
+
+def along_run(rows: list[dict[str, float]]) -> dict[str, float | int | None] | None:
+    """What the rows of ``diagnostics.jsonl`` say in a few numbers; None if there are none.
+
+    Returns:
+        rows: their number. d_mse_x100_least, images_at_least: the least error of d along the run [m^2 x 100], and after
+        how many images; None without truth. criterion_m_least, images_at_criterion, d_mse_x100_at_criterion: the least
+        |d - d_ToF| on static pixels [m], which needs no truth, after how many images, and the error of d there.
+    """
+    if not rows:
+        return None
+    best, calm = _least(rows, "d_mse_x100"), _least(rows, CRITERION)
+    return {
+        "rows": len(rows),
+        "d_mse_x100_least": best.get("d_mse_x100"),
+        "images_at_least": best.get("images"),
+        "criterion_m_least": calm.get(CRITERION),
+        "images_at_criterion": calm.get("images"),
+        "d_mse_x100_at_criterion": calm.get("d_mse_x100"),
+    }
+
+
+def _least(rows: list[dict[str, float]], name: str) -> dict[str, float]:
+    """The first row with the least value of a name; empty if no row has it."""
+    known = [row for row in rows if row.get(name) is not None]
+    return min(known, key=lambda row: row[name], default={})
+
+
+def _psnr_db(rendered: np.ndarray, measured: np.ndarray, peak: float) -> float | None:
     mse = float(np.square(rendered - measured, dtype=np.float64).mean())
     return 10.0 * math.log10(peak**2 / mse) if mse > 0 and peak > 0 else None

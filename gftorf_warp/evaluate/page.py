@@ -64,6 +64,7 @@ code { font-size: 13px; overflow-wrap: anywhere; }
 FORMATS: dict[str, Callable[[Any], str]] = {  # how a value of metrics.json is printed, by name
     "error": lambda value: f"{value:.3f}",  # [m^2 x 100]
     "rms_cm": lambda value: f"{10.0 * math.sqrt(value):.1f} cm",  # root of a mean squared error given in m^2 x 100
+    "length_cm": lambda value: f"{100.0 * value:.2f} cm",  # of a length given in m
     "percent": lambda value: f"{100.0 * value:.1f} %",
     "decibel": lambda value: f"{value:.2f} dB",
     "count": lambda value: f"{value:,}",

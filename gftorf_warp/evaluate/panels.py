@@ -12,6 +12,7 @@ from ..constants import FRAMES_PER_QUARTET
 from ..data.decode import quartet_phasor
 from ..data.sequence import Sequence
 from . import page, pictures
+from .gallery import Colour, Novel
 from .views import Views
 
 STRIP_FRAMES = 5  # columns of the strip over time
@@ -21,6 +22,7 @@ ANIMATION_PERIOD_S = 0.25  # [s] slow enough to compare panels
 CLOSE_UP_MIN = 24  # [px] smallest side of a close-up
 CLOSE_UP_MARGIN = 0.25  # around the moving pixels, as a fraction of their extent
 CLOSE_UP_SHARE_MAX = 0.6  # a larger close-up would repeat the whole picture
+PHASOR_TEXT = "The camera delivered real and imaginary part, taken here as one instant."
 QUARTET_TEXT = (
     "Each raw frame shows another instant: what moves has moved on from the first to the last. The closed form takes "
     "the four for one instant, hence the false distances along moving outlines."
@@ -55,6 +57,10 @@ class Findings:
     """What was rendered and decoded."""
     judgement: Judgement | None
     """What ground truth says about it; None without."""
+    colour: Colour | None = None
+    """Colour images beside what the run shows in their place; None if one of both has no colour."""
+    novel: Novel | None = None
+    """Views from poses that no raw frame has; None if the sequence names none."""
 
 
 def telling_row(found: Findings) -> int:
@@ -80,28 +86,35 @@ def common_distance_scale(found: Findings) -> pictures.Scale:
 
 
 def measured_quartet(found: Findings, s: int) -> str:
-    """The four quads of the quartet, one after the other, and what they decode to."""
+    """The four quads of the quartet, one after the other, or the phasor; and what they decode to."""
     sequence, frame = found.sequence, found.views.frames[s]
     quartet = frame // FRAMES_PER_QUARTET
-    raw = range(FRAMES_PER_QUARTET * quartet, FRAMES_PER_QUARTET * (quartet + 1))
-    scale = pictures.signed_scale([sequence.quads[n] for n in raw])
-    quads = [
-        page.picture(
-            sequence.quads[n],
-            scale,
-            f"raw frame {n}",
-            f"shift {np.degrees(sequence.shifts[n]):.0f}°, {1e3 * sequence.times[n]:.1f} ms",
-        )
-        for n in raw
-    ]
     re, im = quartet_phasor(sequence, quartet)
+    if sequence.from_phasors:
+        scale = pictures.signed_scale([re, im])
+        note = f"{1e3 * sequence.times[frame]:.1f} ms"
+        parts = {"real part": re, "imaginary part": im}
+        measured = [page.picture(image, scale, title, note) for title, image in parts.items()]
+    else:
+        raw = range(FRAMES_PER_QUARTET * quartet, FRAMES_PER_QUARTET * (quartet + 1))
+        scale = pictures.signed_scale([sequence.quads[n] for n in raw])
+        measured = [
+            page.picture(
+                sequence.quads[n],
+                scale,
+                f"raw frame {n}",
+                f"shift {np.degrees(sequence.shifts[n]):.0f}°, {1e3 * sequence.times[n]:.1f} ms",
+            )
+            for n in raw
+        ]
     phase, amplitude = np.arctan2(im, re) % (2.0 * np.pi), np.hypot(re, im)
     decoded = [
         page.picture(phase, pictures.phase_scale(), "measured phase", "mod 2π"),
         page.picture(amplitude, pictures.amplitude_scale([amplitude]), "measured amplitude", "of the phasor"),
         page.picture(found.views.closed_form[s], common_distance_scale(found), "closed form", "phase as distance"),
     ]
-    return page.row(quads) + page.row([*decoded, f'<p class="soft">{QUARTET_TEXT}</p>'])
+    text = f'<p class="soft">{PHASOR_TEXT if sequence.from_phasors else QUARTET_TEXT}</p>'
+    return page.row(measured, columns=4) + page.row([*decoded, text])
 
 
 def distances(found: Findings, s: int, window: Window = WHOLE) -> str:

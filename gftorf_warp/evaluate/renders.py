@@ -18,6 +18,7 @@ from ..scene.sensor import Sensor
 from . import pictures
 
 LIST = "renders.json"
+LISTED = ("run", "times_s", "camera_from_world", "channels")  # its keys that say which images these are
 WHAT = ("distance", "quads", "phasor", "colour")
 Channels = dict[str, Float[np.ndarray, "H W"]]
 
@@ -97,7 +98,7 @@ def preview(name: str, images: Channels, scale: pictures.Scale) -> UInt8[np.ndar
                 pictures.colour_mapped(images["amplitude"], scale),
             ]
         )
-    return _srgb(np.stack(list(images.values()), axis=-1))
+    return srgb(np.stack(list(images.values()), axis=-1))
 
 
 def paths(out: Path, name: str, index: int) -> tuple[Path, Path]:
@@ -109,7 +110,7 @@ def make_room(out: Path, listed: Mapping[str, object], *, fresh: bool) -> None:
     """Make a folder ready for images and list them in its ``renders.json``.
 
     Args:
-        out: New, empty, or one that holds images of the same run, times and channels, which are then written again.
+        out: New, empty, or one that holds images of the same run, times, poses and channels, which are written again.
         listed: What will be in the folder.
         fresh: Whether to move other images aside, to ``out/old-<k>``.
 
@@ -125,7 +126,7 @@ def make_room(out: Path, listed: Mapping[str, object], *, fresh: bool) -> None:
             raise UsageError(
                 "the folder is not empty",
                 where=out,
-                why="it holds images of another run or other times"
+                why="it holds images of another run, or other times or poses"
                 if ours
                 else f"it has no {LIST}: these are no images",
                 fix="choose another --out" + (", or --fresh, which moves what is there aside" if ours else ""),
@@ -136,15 +137,15 @@ def make_room(out: Path, listed: Mapping[str, object], *, fresh: bool) -> None:
 
 
 def _same(path: Path, listed: Mapping[str, object]) -> bool:
-    """Whether an earlier list names the same run, times and channels."""
+    """Whether an earlier list names the same run, times, poses and channels."""
     try:
         found = json.loads(path.read_text())
     except (OSError, ValueError):
         return False
-    return isinstance(found, dict) and all(found.get(key) == listed[key] for key in ("run", "times_s", "channels"))
+    return isinstance(found, dict) and all(found.get(key) == listed.get(key) for key in LISTED)
 
 
-def _srgb(linear: Float[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
+def srgb(linear: Float[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
     """8-bit sRGB of linear RGB (IEC 61966-2-1)."""
     linear = np.clip(linear, 0.0, 1.0)
     encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1.0 / 2.4) - 0.055)

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import json
-import shlex
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from . import figures, page, panels
-from .metrics import DISTANCES, MOVING_M, per_frame_mean
+from ..data.truth import MOVING_M
+from . import figures, gallery, page, panels, provenance
+from .metrics import DISTANCES, per_frame_mean
 from .panels import Findings
 
 ROWS = {
@@ -20,19 +19,6 @@ ROWS = {
     "d_tof": ("ours, d_ToF", "decoded from the four quads rendered at one instant"),
 }
 PIXELS = {"": "all pixels", "moving.": "moving pixels", "static.": "static pixels"}
-INIT_WORDS = {
-    "phase": "phase: Gaussians start on surfaces decoded from the measured quads, not at random",
-    "random": "random: Gaussians start anywhere in view",
-}
-MOTION_WORDS = {
-    "nodes": "nodes: Gaussians follow a few moving nodes with one offset per quartet, linear in between; no network",
-    "still": "still: nothing moves, a control",
-}
-FLOW_WORDS = {
-    "file": "file: optical flow that came with the sequence",
-    "computed": "computed: optical flow by OpenCV, between quads of one shift",
-    "none": "none",
-}
 TO_READ = f"""
 <dl>
 <dt>distance</dt><dd>Length from the camera to the surface along the ray of a pixel, in metres. It is not the
@@ -54,6 +40,16 @@ ground truth, and noise in the measurement bounds it.</dd>
 </dl>"""
 
 
+PHASORS_TO_READ = f"""
+<p class="soft">This camera delivered phasors. The four raw frames of a quartet are one image of one instant, so each
+quartet is scored once, and pixels move if their true distance changes by more than {MOVING_M} m from one phasor to the
+next.</p>"""
+ALONG_TEXT = (
+    "Rendered at a few fixed raw frames, from black, at the size of the optimisation; nothing of it reached the "
+    "optimisation. Where d and d_ToF part on pixels that rest, light is explained by layers instead of surfaces."
+)
+
+
 def report(
     *,
     title: str,
@@ -61,6 +57,7 @@ def report(
     config: Mapping[str, Any],
     log: Sequence[Mapping[str, float]],
     found: Findings,
+    diagnostics: Sequence[Mapping[str, float]] = (),
     installed: str = "",
     data_card: str | None = None,
 ) -> str:
@@ -72,6 +69,7 @@ def report(
         config: Content of the run's config.json.
         log: Steps of the run's metrics.jsonl.
         found: Arrays behind the pictures.
+        diagnostics: Rows of the run's diagnostics.jsonl.
         installed: Versions of the programs that compared.
         data_card: What the sequence's README says about its truth; None if it has none.
     """
@@ -85,9 +83,11 @@ def report(
         _section("What was measured", _measured_text(found, s) + panels.measured_quartet(found, s)),
         _section("Quads", _quad_text(found, s) + panels.quad_residual(found, s)),
         _section("Over time", _time_pictures(found)),
+        *_beyond(metrics, found),
+        *_along(metrics, diagnostics),
         _section("Curves", _curves(found, log)),
-        _section("How it was made", _how(config, data_card, installed)),
-        _section("How to read it", TO_READ),
+        _section("How it was made", provenance.how(config, data_card, installed)),
+        _section("How to read it", TO_READ + (PHASORS_TO_READ if found.sequence.from_phasors else "")),
     ]
     return page.document(f"{title} - gftorf compare", "".join(sections))
 
@@ -100,6 +100,12 @@ def verdict(metrics: Mapping[str, Any]) -> str:
             f'<span class="ours">{page.number(metrics, "quad_psnr_db", "decibel")}</span>.'
         )
     group = "moving." if page.look_up(metrics, "moving.d_mse_x100") is not None else ""
+    if metrics.get("method") == "ctof":
+        where = "on moving pixels" if group else "over all pixels"
+        return (
+            f"This run is the closed form itself: nothing was optimised. It is off by "
+            f"{page.number(metrics, f'{group}d_mse_x100', 'rms_cm')} {where} (root mean square)."
+        )
     naive, ours = f"{group}closed_form_mse_x100", f"{group}d_mse_x100"
     pixels = (
         f"On moving pixels ({page.number(metrics, 'moving.share', 'percent')} of all)" if group else "Over all pixels"
@@ -159,8 +165,11 @@ def _cell(metrics: Mapping[str, Any], key: str) -> str:
 
 
 def _facts(metrics: Mapping[str, Any]) -> str:
+    known = page.look_up(metrics, "colour_psnr_db") is not None
+    colour = {"colour PSNR": page.number(metrics, "colour_psnr_db", "decibel")} if known else {}
     facts = {
         "quad PSNR": page.number(metrics, "quad_psnr_db", "decibel"),
+        **colour,
         "raw frames scored": page.number(metrics, "frames", "count"),
         "protocol": page.number(metrics, "protocol", "text"),
         "Gaussians": page.number(metrics, "gaussians", "count"),
@@ -183,6 +192,10 @@ def _distance_text(found: Findings, s: int) -> str:
 
 
 def _measured_text(found: Findings, s: int) -> str:
+    if found.sequence.from_phasors:
+        return (
+            f'<p class="caption">The phasor of raw frame {found.views.frames[s]}. Red is positive, blue negative.</p>'
+        )
     return (
         f'<p class="caption">The quartet of raw frame {found.views.frames[s]}: four raw frames, each with its own '
         "phase shift and its own time. Red is positive, blue negative.</p>"
@@ -204,6 +217,11 @@ def _distance_pictures(found: Findings, s: int) -> str:
 
 
 def _quad_text(found: Findings, s: int) -> str:
+    if found.sequence.from_phasors:
+        return (
+            '<p class="caption">As a quad of shift zero, which is half the real part of the phasor. Rendered from the '
+            "same pose at the same time before a black background; the difference should look like noise.</p>"
+        )
     return (
         f'<p class="caption">Raw frame {found.views.frames[s]} measured one of the four quads. Rendered from the same '
         "pose at the same time before a black background; the difference should look like noise.</p>"
@@ -213,6 +231,48 @@ def _quad_text(found: Findings, s: int) -> str:
 def _time_pictures(found: Findings) -> str:
     moving = panels.animation(found)
     return panels.strip_over_time(found) + (f"<h3>Quartet by quartet, slowed down</h3>{moving}" if moving else "")
+
+
+def _beyond(metrics: Mapping[str, Any], found: Findings) -> list[str]:
+    """Sections of what no ToF pixel took: colour, and novel views; those that there are."""
+    sections = []
+    if found.colour is not None:
+        text = (
+            '<p class="caption">From the colour camera, at the time of the raw frame. '
+            f"Rendered colour matches to {page.number(metrics, 'colour_psnr_db', 'decibel')}.</p>"
+        )
+        sections.append(_section("Colour", text + gallery.colour_strip(found.colour)))
+    if found.novel is not None:
+        text = (
+            '<p class="caption">The reconstruction in the middle of the sequence, from poses that the sequence names '
+            "and no raw frame has. Grey: half of the light or more would pass.</p>"
+        )
+        strip = gallery.novel_strip(found.novel, panels.common_distance_scale(found))
+        sections.append(_section("Views that nobody took", text + strip))
+    return sections
+
+
+def _along(metrics: Mapping[str, Any], rows: Sequence[Mapping[str, float]]) -> list[str]:
+    """The section of diagnostics; none if there were none."""
+    drawing = figures.along_run(rows)
+    if drawing is None:
+        return []
+    text = ALONG_TEXT
+    key = "diagnostics.criterion_m_least"
+    if page.look_up(metrics, key) is not None:
+        text += (
+            f" That is least, {page.number(metrics, key, 'length_cm')}, after"
+            f" {page.number(metrics, 'diagnostics.images_at_criterion', 'count')} images"
+        )
+        if page.look_up(metrics, "diagnostics.d_mse_x100_at_criterion") is not None:
+            text += f", where the error of d is {page.number(metrics, 'diagnostics.d_mse_x100_at_criterion', 'error')}"
+        text += "."
+    if page.look_up(metrics, "diagnostics.d_mse_x100_least") is not None:
+        text += (
+            f" The error of d is least, {page.number(metrics, 'diagnostics.d_mse_x100_least', 'error')}, after"
+            f" {page.number(metrics, 'diagnostics.images_at_least', 'count')} images."
+        )
+    return [_section("Along the run", f'<p class="caption">{text}</p>{page.chart(drawing, "Along the run")}')]
 
 
 def _curves(found: Findings, log: Sequence[Mapping[str, float]]) -> str:
@@ -242,49 +302,3 @@ def _curves(found: Findings, log: Sequence[Mapping[str, float]]) -> str:
 
 def _x100(value: float | None) -> float | None:
     return None if value is None else 100.0 * value
-
-
-def _in_words(words: Mapping[str, str], name: object) -> object:
-    return words.get(str(name), name)
-
-
-def _times(size: Sequence[int] | None, text: str) -> str | None:
-    return None if size is None else f"{size[0]}x{size[1]} {text}"
-
-
-def _with_source(value: float | None, source: str | None) -> str | None:
-    return None if value is None else f"{value:.6g} ({source})"
-
-
-def _with_threads(device: str | None, threads: int | None) -> str | None:
-    return device if threads is None else f"{device}, {threads} threads"
-
-
-def _how(config: Mapping[str, Any], data_card: str | None, installed: str) -> str:
-    facts = {
-        "sequence": config.get("sequence"),
-        "preset": config.get("preset"),
-        "initialisation": _in_words(INIT_WORDS, config.get("init")),
-        "motion": _in_words(MOTION_WORDS, config.get("motion")),
-        "optical flow": _in_words(FLOW_WORDS, config.get("flow_source")),
-        "optimised at": _times(config.get("size_optimised"), "pixels; scored at the sequence's own resolution"),
-        "quad scale": _with_source(config.get("quad_scale"), config.get("quad_scale_source")),
-        "images, seed": f"{config.get('images')}, {config.get('seed')}",
-        "device": _with_threads(config.get("device"), config.get("threads")),
-        "reconstructed by": f"gftorf-warp {config.get('version')}",
-        "compared by": installed,
-        "ground truth": data_card,
-    }
-    rows = "".join(
-        f"<dt>{name}</dt><dd>{page.escape(value)}</dd>" for name, value in facts.items() if value is not None
-    )
-    command = (
-        f"gftorf reconstruct {shlex.quote(str(config.get('sequence')))} --out RUN --preset {config.get('preset')}"
-        f" --images {config.get('images')} --seed {config.get('seed')} --device {config.get('device')}\n"
-        "gftorf compare RUN"
-    )
-    everything = json.dumps(config, indent=2, sort_keys=True, default=str)
-    return (
-        f"<dl>{rows}</dl><h3>Again</h3><pre>{page.escape(command)}</pre>"
-        f"<details><summary>config.json</summary><pre>{page.escape(everything)}</pre></details>"
-    )

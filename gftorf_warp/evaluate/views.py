@@ -21,6 +21,8 @@ from ..scene.camera import Camera
 from ..scene.sensor import Sensor
 from . import renders
 from .metrics import distance_from_quads, normalised
+from .poses import middle
+from .poses import read as read_poses
 
 if TYPE_CHECKING:
     from ..recon.run import Run
@@ -142,52 +144,73 @@ def render_to_folder(
     what: str | Iterable[str] = ("distance", "quads"),
     times: Iterable[float] | None = None,
     *,
+    poses: str | Path | None = None,
     fresh: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> Path:
     """Write what the run looks like at some times: ``OUT/<what>/<index>.exr`` (float32) and ``.png`` to look at.
 
-    ``OUT/renders.json`` lists the times [s], the channels with their units and the scale of the previews. Between raw
-    frames, the pose is that of the nearest one.
+    ``OUT/renders.json`` lists the times [s], the channels with their units and the scale of the previews; poses, if any
+    were given. Otherwise the pose is that of the raw frame nearest to each time.
 
     Args:
         run: A finished reconstruction.
         out: Folder, made if absent; one that holds these images is written again.
         what: Names out of distance, quads, phasor, colour.
-        times: Seconds since raw frame 0; None: the times of all raw frames, truncated quartets included.
+        times: Seconds since raw frame 0; None: the times of all raw frames, truncated quartets included; with poses,
+            the middle of the sequence.
+        poses: A .npy file of world-to-camera matrices [M, 4, 4] or [M, 3, 4], or ``novel``, those that the sequence
+            carries. Image k is taken from pose k at time k; the shorter list starts over.
         fresh: Whether to move what else ``out`` holds aside, to ``out/old-<k>``.
         progress: Called with (times done, times in all).
 
     Raises:
-        UsageError: If a name in ``what`` is unknown, the run has no colour, or ``out`` holds something else.
+        UsageError: If a name in ``what`` is unknown, the run has no colour, there are no such poses or the run has one
+            view only, or ``out`` holds something else.
+        InputError: If the poses cannot be read.
     """
     names = renders.checked(what)
     sequence = run.sequence()
-    seconds = [float(t) for t in (sequence.times if times is None else times)]
-    if not seconds:
-        raise UsageError("no time to render", where="--times", why="the list is empty", fix="leave --times out")
+    seconds, cameras = views_to_take(run, sequence, times, poses)
 
-    def images_at(time: float) -> dict[str, renders.Channels]:
-        rendering = run.render(time, camera_at(run, sequence, time))
+    def images_at(index: int) -> dict[str, renders.Channels]:
+        rendering = run.render(seconds[index], cameras[index])
         return {name: renders.channels(name, rendering, run.sensor) for name in names}
 
-    samples = [images_at(seconds[i]) for i in sorted({0, len(seconds) // 2, len(seconds) - 1})]
+    samples = [images_at(i) for i in sorted({0, len(seconds) // 2, len(seconds) - 1})]
     scales = {name: renders.preview_scale(name, (sample[name] for sample in samples)) for name in names}
     out = Path(out)
     listed = {
         "run": str(run.path),
         "times_s": seconds,
+        "camera_from_world": None if poses is None else [camera.camera_from_world.tolist() for camera in cameras],
         "channels": {name: list(samples[0][name]) for name in names},
         "preview": {name: asdict(scale) for name, scale in scales.items()},
     }
     renders.make_room(out, listed, fresh=fresh)
     for name in names:
         (out / name).mkdir(exist_ok=True)
-    for index, time in enumerate(seconds):
-        for name, images in images_at(time).items():
+    for index in range(len(seconds)):
+        for name, images in images_at(index).items():
             exr, png = renders.paths(out, name, index)
             write_exr(exr, images)
             write_png(png, renders.preview(name, images, scales[name]))
         if progress is not None:
             progress(index + 1, len(seconds))
     return out
+
+
+def views_to_take(
+    run: Run, sequence: Sequence, times: Iterable[float] | None, poses: str | Path | None
+) -> tuple[list[float], list[Camera]]:
+    """Time [s] and camera of every image of :func:`render_to_folder`, whose arguments these are."""
+    found = None if poses is None else read_poses(poses, sequence)
+    default = sequence.times if found is None else [middle(sequence)]
+    seconds = [float(t) for t in (default if times is None else times)]
+    if not seconds:
+        raise UsageError("no time to render", where="--times", why="the list is empty", fix="leave --times out")
+    if found is None:
+        return seconds, [camera_at(run, sequence, time) for time in seconds]
+    count = max(len(seconds), len(found))
+    cameras = [run.camera.at(pose) for pose in found]
+    return [seconds[k % len(seconds)] for k in range(count)], [cameras[k % len(found)] for k in range(count)]

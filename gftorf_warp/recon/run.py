@@ -23,6 +23,7 @@ from ..scene.motion import Motion
 from ..scene.sensor import Sensor
 from . import checkpoint
 from .folder import read_config
+from .settings import Method
 from .state import field_and_motion
 
 
@@ -49,13 +50,19 @@ class Run:
 
     @classmethod
     def open(cls, path: str | Path, device: torch.device | str = "cpu") -> Run:
-        """Read a run from its folder: config and newest checkpoint.
+        """Read a run from its folder: config and newest checkpoint. A run of the method ``ctof`` needs no checkpoint.
 
         Raises:
             InputError: If the folder is no run, or holds no checkpoint that can be read.
         """
         path = Path(path)
         config = read_config(path)
+        camera = Camera(**config["camera"] | {"camera_from_world": np.array(config["camera"]["camera_from_world"])})
+        sensor = Sensor(**config["sensor"], shifts=CANONICAL_SHIFTS)
+        if config["settings"].get("method") == Method.CTOF:
+            from .closed_form import ClosedForm
+
+            return ClosedForm.of(path, config, camera, sensor, device)
         stored = checkpoint.last(path, device)
         if stored is None:
             raise InputError(
@@ -68,8 +75,8 @@ class Run:
         return cls(
             path=path,
             config=config,
-            camera=Camera(**config["camera"] | {"camera_from_world": np.array(config["camera"]["camera_from_world"])}),
-            sensor=Sensor(**config["sensor"], shifts=CANONICAL_SHIFTS),
+            camera=camera,
+            sensor=sensor,
             quad_scale=config["quad_scale"],
             field=gaussians,
             motion=motion,
@@ -81,14 +88,20 @@ class Run:
         """Number N of Gaussians."""
         return len(self.field)
 
+    @property
+    def colour_scale(self) -> float:
+        """The units of the sequence's colour images times this are those of the optimisation."""
+        return float(self.config.get("colour_scale") or 1.0)
+
     @torch.no_grad()
     def render(
         self, time: float, camera: Camera | None = None, *, extra: Float[Tensor, "N D"] | None = None
     ) -> Rendering:
         """What the sensor would see at one instant, before black.
 
-        Quads (of the four canonical shifts) and phasor are in the units of the sequence, distances in metres. No
-        gradients. Before the first raw frame and beyond the last quartet everything stays as it was there.
+        Quads (of the four canonical shifts) and phasor are in the units of the sequence, colour in those of its colour
+        images, distances in metres. No gradients. Before the first raw frame and beyond the last quartet everything
+        stays as it was there.
 
         Args:
             time: Seconds since raw frame 0, any number.
@@ -103,7 +116,12 @@ class Run:
             self.render_settings,
             extra=extra,
         )
-        return replace(rendering, quads=rendering.quads / self.quad_scale, phasor=rendering.phasor / self.quad_scale)
+        return replace(
+            rendering,
+            quads=rendering.quads / self.quad_scale,
+            phasor=rendering.phasor / self.quad_scale,
+            colour=None if rendering.colour is None else rendering.colour / self.colour_scale,
+        )
 
     def widened(self, field: GaussianField, camera: Camera) -> GaussianField:
         """Gaussians as wide as they looked while they were optimised, for a camera that resolves more.

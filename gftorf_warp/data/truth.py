@@ -1,0 +1,53 @@
+"""What ground truth says about pixels: how far they are, which of them move. For evaluation and diagnostics only."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ..constants import FRAMES_PER_QUARTET
+from .sequence import Truth
+
+MOVING_M = 0.05  # [m] twice the noise of a distance decoded from typical quads, a fraction of any object
+
+
+def known_distance(truth: Truth) -> Float[np.ndarray, "F H W"]:
+    """True distance of every raw frame [m], NaN wherever it is unknown."""
+    return np.where(truth.known[:, None, None], truth.distance, np.nan)
+
+
+def moving_and_static(
+    distance_truth: Float[np.ndarray, "F H W"], frames: list[int], *, from_phasors: bool = False
+) -> tuple[Bool[np.ndarray, "S H W"], Bool[np.ndarray, "S H W"]]:
+    """Which pixels of the S scored frames move, and which rest.
+
+    A pixel moves if its true distance has max - min > 0.05 m within the four raw frames of the quartet. It rests if all
+    four are known and it does not move; with unknown truth [NaN] it may be neither. The raw frames of a phasor are one
+    instant, so there a pixel moves if its distance differs that much from one phasor to the next (the last: from the
+    one before).
+
+    Args:
+        distance_truth: True distance of every raw frame [m]; NaN: unknown.
+        frames: The scored raw frames n.
+        from_phasors: Whether the camera delivered phasors.
+    """
+    step = FRAMES_PER_QUARTET
+    moving, static = {}, {}
+    for quartet in {n // step for n in frames}:
+        seen = distance_truth[step * quartet : step * (quartet + 1)]
+        if from_phasors:
+            neighbour = quartet + 1 if step * (quartet + 1) < len(distance_truth) else max(quartet - 1, 0)
+            seen = distance_truth[[step * quartet, step * neighbour]]
+        unknown = np.isnan(seen)
+        low, high = np.where(unknown, np.inf, seen).min(axis=0), np.where(unknown, -np.inf, seen).max(axis=0)
+        moving[quartet] = high - low > MOVING_M
+        static[quartet] = ~moving[quartet] & ~unknown.any(axis=0)
+    rows = [n // step for n in frames]
+    return np.stack([moving[i] for i in rows]), np.stack([static[i] for i in rows])
+
+
+def nearest(images: Float[np.ndarray, "F H W"], height: int, width: int) -> Float[np.ndarray, "F h w"]:
+    """Images at another size: of each new pixel's centre the pixel that holds it. Distances must not be averaged."""
+    rows = ((np.arange(height) + 0.5) * images.shape[1] / height).astype(int)
+    columns = ((np.arange(width) + 0.5) * images.shape[2] / width).astype(int)
+    return images[:, rows[:, None], columns]

@@ -1,0 +1,143 @@
+"""Pictures that no ToF pixel took: views from novel poses, and colour as the colour camera would have seen it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from ..data.sequence import Sequence
+from ..errors import DivergedError
+from ..scene.measured import colour_camera_of
+from . import page, pictures
+from .poses import middle
+from .renders import srgb
+
+if TYPE_CHECKING:
+    from ..recon.run import Run
+
+STRIP_VIEWS = 5  # columns of a strip
+STRIP_SIZE_MAX = 240  # [px]
+NORMALISED_MIN = 0.5  # [1] a novel view shows distance / opacity where at least half of the light was stopped
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Novel:
+    """M views that nobody took, all at one time."""
+
+    poses: list[int]
+    """Their indices among those of the sequence."""
+    time: float
+    """When [s]."""
+    distance: Float[np.ndarray, "M H W"]
+    """Mean distance divided by opacity [m]; NaN where less than half of the light was stopped."""
+    colour: Float[np.ndarray, "M H W 3"] | None
+    """Linear RGB in the units of the sequence's colour images; None if the run has no colour."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Colour:
+    """Colour images of some raw frames, linear RGB in the units of the sequence's."""
+
+    frames: list[int]
+    """The raw frames n."""
+    measured: Float[np.ndarray, "C h w 3"]
+    """What the colour camera recorded."""
+    rendered: Float[np.ndarray, "C h w 3"]
+    """What the run shows from there, at the same time."""
+
+
+def novel_views(run: Run, sequence: Sequence, count: int = STRIP_VIEWS) -> Novel | None:
+    """Views from up to ``count`` of the novel poses of a sequence, in the middle of it.
+
+    None if it carries none, or if the run has no Gaussians and so no other view than its own.
+    """
+    if sequence.novel_from_world is None or not len(sequence.novel_from_world) or not run.gaussians:
+        return None
+    total = len(sequence.novel_from_world)
+    chosen = np.linspace(0, total - 1, min(count, total)).round().astype(int).tolist()
+    time = middle(sequence)
+    distances, colours = [], []
+    for m in chosen:
+        rendering = run.render(time, run.camera.at(sequence.novel_from_world[m]))
+        opacity = rendering.opacity.detach().cpu().numpy()
+        distance = rendering.distance.detach().cpu().numpy() / np.maximum(opacity, NORMALISED_MIN)
+        distances.append(np.where(opacity >= NORMALISED_MIN, distance, np.nan))
+        if rendering.colour is not None:
+            colours.append(rendering.colour.detach().cpu().numpy().transpose(1, 2, 0))
+    return Novel(
+        poses=chosen,
+        time=time,
+        distance=np.stack(distances).astype(np.float32),
+        colour=np.stack(colours).astype(np.float32) if colours else None,
+    )
+
+
+def colour_views(run: Run, sequence: Sequence, frames: list[int]) -> Colour | None:
+    """Colour images of the raw frames that have one, rendered from the colour camera.
+
+    None if the sequence has no calibrated colour camera, none of the frames has an image, or the run has no colour.
+
+    Raises:
+        DivergedError: If a rendering is not finite.
+    """
+    found = []
+    for n in (n for n in frames if n in sequence.colour):
+        camera = colour_camera_of(sequence, n)
+        rendered = None if camera is None else run.render(float(sequence.times[n]), camera).colour
+        if rendered is None:
+            return None
+        image = rendered.detach().cpu().numpy().astype(np.float32).transpose(1, 2, 0)
+        if not np.isfinite(image).all():
+            raise DivergedError(
+                f"colour of raw frame {n} is not finite",
+                where=run.path,
+                why=f"{int((~np.isfinite(image)).sum())} of {image.size} rendered values are NaN or infinite",
+                fix="reconstruct again with another --seed or preset",
+            )
+        found.append((n, sequence.colour[n], image))
+    if not found:
+        return None
+    chosen, measured, images = zip(*found, strict=True)
+    return Colour(frames=list(chosen), measured=np.stack(measured), rendered=np.stack(images))
+
+
+def novel_strip(novel: Novel, scale: pictures.Scale) -> str:
+    """Distance, and colour if there is any, of the novel views as HTML."""
+    notes = [f"pose {m}" for m in novel.poses]
+    rows = [
+        [
+            page.plain_picture(pictures.colour_mapped(_thinned(image), scale), "distance / opacity", note)
+            for image, note in zip(novel.distance, notes, strict=True)
+        ]
+    ]
+    if novel.colour is not None:
+        white = float(np.percentile(novel.colour, 99.5))
+        rows.append(
+            [
+                page.plain_picture(_shown(image, white), "colour", note)
+                for image, note in zip(novel.colour, notes, strict=True)
+            ]
+        )
+    bar = f'<div class="wide">{page.colour_bar(scale)}</div>'
+    return page.row(rows[0]) + bar + "".join(page.row(row) for row in rows[1:])
+
+
+def colour_strip(colour: Colour) -> str:
+    """Measured above rendered colour at a few frames, on one brightness, as HTML."""
+    chosen = sorted({round(x) for x in np.linspace(0, len(colour.frames) - 1, STRIP_VIEWS)})
+    white = float(np.percentile(colour.measured, 99.5))
+    return "".join(
+        page.row([page.plain_picture(_shown(images[c], white), title, f"frame {colour.frames[c]}") for c in chosen])
+        for title, images in (("measured colour", colour.measured), ("rendered colour", colour.rendered))
+    )
+
+
+def _shown(linear: Float[np.ndarray, "H W 3"], white: float) -> UInt8[np.ndarray, "h w 3"]:
+    return srgb(_thinned(linear) / (white if white > 0 else 1.0))
+
+
+def _thinned(image: np.ndarray) -> np.ndarray:
+    return pictures.thinned(image, STRIP_SIZE_MAX)

@@ -1,0 +1,171 @@
+"""What an optimisation looks like on its way: a row of ``diagnostics.jsonl`` now and then, which changes no byte of it.
+
+d and d_ToF drift apart where quads leave the distance open (method, sections 2.5 and 9), and static matter is pushed
+along rays: neither shows in the loss. So a few fixed raw frames are rendered before black, at the poses and the size of
+the optimisation, without gradients and without random numbers. This is the only place of the room that sees truth, and
+nothing that it says is read again before the run is compared.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from ..constants import FRAMES_PER_QUARTET
+from ..data.estimates import steady_pixels
+from ..data.sequence import Sequence, Truth
+from ..data.truth import known_distance, moving_and_static, nearest
+from ..render.api import rasterize
+from ..render.buffers import Distortion
+from ..scene.sensor import distance_from_phasor, phasor_from_quads
+from .observations import Observations
+from .record import Metrics
+from .settings import ReconSettings
+from .state import State
+
+ROWS = 40  # along a run, besides its first image
+FRAMES = 4  # that are looked at: with these, looking costs about a hundredth of a run of some thousand images
+STILL_M = 1e-6  # [m], [1] poses that differ less are one pose
+Row = dict[str, float | int | None]
+
+
+class Watch:
+    """Looks at an optimisation and writes down what it sees."""
+
+    def __init__(self, observations: Observations, truth: Truth | None, path: Path):
+        """Choose the raw frames and the pixels to look at.
+
+        Args:
+            observations: What is being fitted.
+            truth: Of the sequence, at its own resolution; None: unknown.
+            path: The file of rows, ``RUN/diagnostics.jsonl``.
+        """
+        sequence = observations.sequence
+        self.observations = observations
+        self.rows = Metrics(path)
+        known = None if truth is None or not truth.known.any() else truth
+        self.frames = watched_frames(sequence, known)
+        self.truth: Tensor | None = None
+        self.moving: Tensor | None = None
+        self.static: Tensor | None = None
+        device = observations.quads.device
+        if known is not None:
+            if len(known.distance) != sequence.frames:
+                raise ValueError(f"truth of {len(known.distance)} raw frames for a sequence of {sequence.frames}")
+            distance = nearest(known_distance(known), sequence.height, sequence.width)
+            masks = moving_and_static(distance, self.frames, from_phasors=sequence.from_phasors)
+            self.moving, self.static = (torch.tensor(mask, device=device) for mask in masks)
+            self.truth = torch.tensor(distance[self.frames], dtype=torch.float32, device=device)
+        elif (steady := measured_static(sequence)) is not None:
+            self.static = torch.tensor(steady, device=device).expand(len(self.frames), -1, -1)
+
+    def due(self, before: int, after: int, total: int) -> bool:
+        """Whether a row is due between two numbers of optimised images.
+
+        Rows lie where images / total = (k / 40)^2, so denser at the start, and at the end; depends on nothing else.
+
+        Args:
+            before: Optimised images after the step before; below zero: there was none yet.
+            after: Optimised images now.
+            total: Of the whole run.
+        """
+        if before < 0 or after >= total:
+            return True
+        return _mark(after, total) > _mark(before, total)
+
+    def rewind(self, images: int) -> None:
+        """Drop rows beyond ``images``: the run goes on from there."""
+        self.rows.rewind(images)
+
+    @torch.no_grad()
+    def look(self, state: State, settings: ReconSettings) -> Row:
+        """Append one row to the file, and return it.
+
+        Errors are means over all known pixels of the watched frames; what is unknown or not finite is None. The keys:
+        images, gaussians; d_mse_x100 and d_tof_mse_x100, also as ``moving.`` and ``static.`` [m^2 x 100];
+        transmittance T_e [1]; distortion, the sum over all pairs [m^2]; offset_static_m, the length of the displacement
+        of what static pixels see; d_minus_dtof_static_m, |d - d_ToF| there up to a whole unambiguous range.
+        """
+        field, seen = state.optimiser.field, self.observations
+        attachment = state.motion.attach(field) if state.motion.follows_means else state.attachment
+        bare = replace(field, colour_sh=None)
+        kept = replace(settings.render, distortion=Distortion.PAPER)
+        images: dict[str, list[Tensor]] = {name: [] for name in ("d", "d_tof", "opacity", "distortion", "offset")}
+        for frame in self.frames:
+            displacement = state.motion.displacement(attachment, float(seen.sequence.times[frame]))
+            if state.images < settings.schedule.warm_up:
+                displacement = torch.zeros_like(displacement)
+            length = displacement.norm(dim=1, keepdim=True)
+            rendering = rasterize(bare.moved(displacement), seen.cameras[frame], seen.sensor, kept, extra=length)
+            assert rendering.extra is not None
+            images["d"].append(rendering.distance)
+            images["d_tof"].append(
+                distance_from_phasor(*phasor_from_quads(rendering.quads, seen.sensor.shifts), seen.sensor)
+            )
+            images["opacity"].append(rendering.opacity)
+            images["distortion"].append(rendering.distortion)
+            images["offset"].append(rendering.extra[0] / rendering.opacity.clamp_min(1e-6))
+        row: Row = {"images": state.images, "gaussians": len(field)}
+        row |= self._judge({name: torch.stack(parts) for name, parts in images.items()})
+        self.rows.add(row)
+        return row
+
+    def _judge(self, images: dict[str, Tensor]) -> Row:
+        """Images [S, H, W] as the numbers of a row."""
+        everywhere = torch.ones_like(images["d"], dtype=torch.bool)
+        groups = {"": everywhere, "moving.": self.moving, "static.": self.static}
+        row: Row = {}
+        for prefix, mask in groups.items():
+            for name in ("d", "d_tof"):
+                value = None
+                if self.truth is not None and mask is not None:
+                    value = _mean((images[name] - self.truth).square(), mask & ~self.truth.isnan())
+                row[f"{prefix}{name}_mse_x100"] = None if value is None else 100.0 * value
+        row["transmittance"] = _mean(1.0 - images["opacity"], everywhere)
+        row["distortion"] = _mean(images["distortion"], everywhere)
+        period = self.observations.sensor.unambiguous_range
+        apart = torch.remainder(images["d"] - images["d_tof"] + 0.5 * period, period) - 0.5 * period
+        row["offset_static_m"] = _mean(images["offset"], self.static)
+        row["d_minus_dtof_static_m"] = _mean(apart.abs(), self.static)
+        return row
+
+
+def watched_frames(sequence: Sequence, truth: Truth | None) -> list[int]:
+    """At most four starts of quartets, spread over the sequence, neither the first nor the last if there are others.
+
+    With a truth, quartets that it knows nothing of do not count.
+    """
+    every = range(0, sequence.frames, FRAMES_PER_QUARTET)
+    starts = [n for n in every if truth is None or truth.known[n]] or [*every]
+    inner = starts[1:-1] or starts
+    chosen = np.linspace(0, len(inner) - 1, min(FRAMES, len(inner))).round().astype(int)
+    return [inner[k] for k in chosen]
+
+
+def measured_static(sequence: Sequence) -> Bool[np.ndarray, "H W"] | None:
+    """Pixels that rest as far as can be measured: bright ones of the half that changes least.
+
+    None where the camera moves, so that no pixel rests, or where no quartet is complete.
+    """
+    if not sequence.complete_quartets or float(np.ptp(sequence.camera_from_world, axis=0).max()) > STILL_M:
+        return None
+    return steady_pixels(sequence)
+
+
+def _mark(images: int, total: int) -> int:
+    """Number of marks (k / 40)^2 at or before images / total, in whole numbers."""
+    return math.isqrt(ROWS * ROWS * images // total)
+
+
+def _mean(image: Tensor, mask: Tensor | None) -> float | None:
+    """Mean over a mask in double precision; None without a mask, without a pixel, or if it is not finite."""
+    if mask is None or not bool(mask.any()):
+        return None
+    value = float(image[mask].double().mean())
+    return value if math.isfinite(value) else None
