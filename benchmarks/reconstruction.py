@@ -41,10 +41,16 @@ def variants() -> dict[str, ReconSettings]:
         "no depth distortion": replace(s, weights=replace(s.weights, distortion=0.0)),
         "no SSIM": replace(s, weights=replace(s.weights, ssim=0.0, distortion=0.01 * s.weights.distortion)),
         "flow loss 0.001": replace(s, weights=replace(s.weights, flow=1e-3)),
-        "reflectivity 10x slower": replace(s, rates=replace(s.rates, reflectivity_sh=0.1 * s.rates.reflectivity_sh)),
-        "decay to 0.01": replace(s, schedule=replace(s.schedule, decay=0.01)),
+        "reflectivity 10x slower": slow(s),
+        "decay to 0.01": replace(s, rates_last=s.rates.times(0.01)),
         "half the width": replace(s, width_max=80),
     }
+
+
+def slow(s: ReconSettings) -> ReconSettings:
+    """With a tenth of the rate of the reflectivity."""
+    first, last = (replace(r, reflectivity_sh=0.1 * r.reflectivity_sh) for r in (s.rates, s.rates_last))
+    return replace(s, rates=first, rates_last=last)
 
 
 def row_of(sequence: Path, settings: ReconSettings, images: int | None, seed: int, device: str) -> dict[str, object]:

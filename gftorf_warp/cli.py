@@ -154,6 +154,8 @@ def _reconstruct(options: argparse.Namespace) -> int:
         options.out,
         options.preset,
         images=options.images,
+        input=options.input,
+        ablation=options.ablation,
         flow=options.flow,
         seed=options.seed,
         device=device,
@@ -171,8 +173,8 @@ def _render(options: argparse.Namespace) -> int:
 
     run = Run.open(options.run_folder, device)
     progress = _progress(options)("render")
-    fresh, what, times = options.fresh, options.what, options.times
-    print(render_to_folder(run, options.out, what=what, times=times, fresh=fresh, progress=progress))
+    chosen = {name: getattr(options, name) for name in ("what", "times", "poses", "fresh")}
+    print(render_to_folder(run, options.out, **chosen, progress=progress))
     return 0
 
 

@@ -89,7 +89,8 @@ def command_parsers() -> dict[str, Parser]:
     simulate.add_argument("--frames", metavar="N", type=_positive, help="raw frames (the scene's own number)")
     simulate.add_argument("--size", metavar="WxH", type=_size, help="image size in pixels (the scene's own)")
     _seed_option(simulate, "seed of the noise (0)")
-    simulate.add_argument("--format", metavar="ftorf", default="ftorf", help="folder layout")
+    layouts = "folder layout (ftorf): raw quads, or one phasor per quartet"
+    simulate.add_argument("--format", metavar="ftorf|torf", default="ftorf", help=layouts)
     simulate.add_argument("--sync", action="store_true", help="all four quads of a quartet at one instant")
     simulate.add_argument("--no-noise", action="store_true", help="an ideal sensor")
     simulate.add_argument("--flow", action="store_true", help="store exact optical flow too")
@@ -101,7 +102,12 @@ def command_parsers() -> dict[str, Parser]:
     reconstruct = _command("reconstruct", "fit moving Gaussians to the raw quads of a sequence")
     reconstruct.add_argument("sequence", metavar="SEQ", help="folder of the sequence")
     reconstruct.add_argument("--out", metavar="RUN", required=True, help="folder to write; goes on where it stopped")
-    reconstruct.add_argument("--preset", metavar="demo", default="demo", help="settings (demo)")
+    presets = "settings: demo, paper, released, dgs, dgs_depth or ctof, the closed form (demo)"
+    reconstruct.add_argument("--preset", metavar="NAME", default="demo", help=presets)
+    inputs = "what is compared: quads, phasor, or auto: what the camera delivered (auto)"
+    reconstruct.add_argument("--input", metavar="KIND", default="auto", help=inputs)
+    rows = "apply a row of the ablation table: nobias, dd, h1, h1h2 or h1h2dd"
+    reconstruct.add_argument("--ablation", metavar="ROW", help=rows)
     reconstruct.add_argument("--images", metavar="N", type=_positive, help="raw frames to optimise (the preset's own)")
     flows = "the folder's, computed, or none; auto: the folder's if it has any, else dis"
     reconstruct.add_argument("--flow", metavar="KIND", help=f"auto, file, dis, deepflow or none: optical flow, {flows}")
@@ -116,6 +122,8 @@ def command_parsers() -> dict[str, Parser]:
     what = "any of distance,quads,phasor,colour (distance)"
     render.add_argument("--what", metavar="A,B", type=_list_of(str), default=["distance"], help=what)
     render.add_argument("--times", metavar="S,S", type=_list_of(_number), help="seconds since raw frame 0 (each frame)")
+    poses = "world-to-camera matrices in a .npy file, or the sequence's novel views (each frame's own pose)"
+    render.add_argument("--poses", metavar="FILE|novel", help=poses)
     _device_options(render)
     _fresh_option(render)
 

@@ -23,7 +23,7 @@ TABLE = {  # room: (rooms it may import besides itself, packages it may import);
     "errors.py": (set(), set()),
     "kernels": (set(), {"warp"}),
     "data": (set(), {"OpenEXR", "cv2", "jaxtyping", "numpy"}),
-    "scene": ({"data"}, TORCH),
+    "scene": ({"data"}, TORCH | {"cv2"}),
     "render": ({"kernels", "scene"}, TORCH | {"warp"}),
     "losses": ({"render"}, TORCH),
     "sim": ({"data", "kernels", "render", "scene"}, TORCH),

@@ -11,6 +11,7 @@ from small_runs import same
 
 from gftorf_warp.errors import InputError
 from gftorf_warp.recon import checkpoint
+from gftorf_warp.recon.state import FORMAT
 
 STORED = {
     "format": 1,
@@ -96,8 +97,8 @@ def test_no_code_of_a_checkpoint_is_run(tmp_path):
 
 def test_a_newer_format_is_refused(tmp_path):
     """And the message says which formats this version reads."""
-    path = checkpoint.save(tmp_path, STORED | {"format": 2})
-    with pytest.raises(InputError, match="formats up to 1, found 2"):
+    path = checkpoint.save(tmp_path, STORED | {"format": FORMAT + 1})
+    with pytest.raises(InputError, match=f"formats up to {FORMAT}, found {FORMAT + 1}"):
         checkpoint.load(path)
 
 

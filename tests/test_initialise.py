@@ -202,7 +202,7 @@ def test_random_gaussians_fill_what_the_camera_sees():
     start = from_random(sequence, settings, torch.Generator().manual_seed(3))
     uv, z = measured.camera_of(sequence, 0).project(start.field.mean), start.field.mean[:, 2]
     assert ((uv >= 0) & (uv <= torch.tensor([WIDTH, HEIGHT]))).all()
-    near, far = (share * 7.5 for share in settings.range_share)
+    near, far = settings.bounds
     assert z.min() >= near * 0.999
     assert z.max() <= far * 1.001
     assert (z < 0.5 * (near**3 + far**3) ** (1 / 3)).float().mean() == pytest.approx(0.125, abs=0.05)  # even in volume

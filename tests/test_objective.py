@@ -24,7 +24,7 @@ def test_flow_loss_is_small_for_the_true_motion_and_pulls_only_at_keys():
     field = state.optimiser.field
 
     def loss():
-        return objective.flow_loss(field, state.motion, state.attachment, observations, 4, settings)
+        return objective.flow_loss(field, state.motion, state.attachment, observations, 4, settings.render)
 
     true = loss()
     assert torch.autograd.grad(loss(), state.optimiser.leaves[:-1], allow_unused=True) == (None,) * 5
@@ -43,9 +43,8 @@ def test_flow_loss_is_small_for_the_true_motion_and_pulls_only_at_keys():
         state.motion.offset -= 2 * h * direction
         down = float(loss())
     assert (up - down) / (2 * h) == pytest.approx(float(gradient.norm()), rel=0.05)
-    assert (
-        objective.flow_loss(field, state.motion, state.attachment, replace(observations, flow={}), 4, settings) is None
-    )
+    without = replace(observations, flow={})
+    assert objective.flow_loss(field, state.motion, state.attachment, without, 4, settings.render) is None
 
 
 def test_terms_of_weight_zero_are_left_out_and_others_begin_when_the_schedule_says():
@@ -64,7 +63,7 @@ def test_terms_of_weight_zero_are_left_out_and_others_begin_when_the_schedule_sa
         (9, late, {"quads", "distortion", "motion_size"}),
         (9, Weights(), {"quads"}),
     ):
-        found, _ = objective.terms(*fixed, frame, settings, weights, None)
+        found, _ = objective.terms(*fixed, frame, settings, weights)
         assert found.keys() == names
         assert all(value > 0 for value in found.values())
 
@@ -75,11 +74,11 @@ def test_the_measured_slot_is_compared_at_its_own_time_and_shift():
     observations = observe(small(), settings, "cpu")
     state = begin(observations, settings, seed=0, device="cpu")
     fixed = (state.optimiser.field, state.motion, state.attachment)
-    right = objective.terms(*fixed, observations, 6, settings, Weights(ssim=0.0), None)[0]["quads"]
+    right = objective.terms(*fixed, observations, 6, settings, Weights(ssim=0.0))[0]["quads"]
     shifted = replace(observations.sequence, shifts=np.roll(observations.sequence.shifts, 1))
     late = replace(observations.sequence, times=observations.sequence.times + 8 / 120)
     for sequence in (shifted, late):
-        wrong = objective.terms(*fixed, replace(observations, sequence=sequence), 6, settings, Weights(ssim=0.0), None)
+        wrong = objective.terms(*fixed, replace(observations, sequence=sequence), 6, settings, Weights(ssim=0.0))
         assert wrong[0]["quads"] > 1.5 * right
 
 

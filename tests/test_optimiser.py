@@ -11,7 +11,9 @@ from gftorf_warp.recon.settings import Rates, ReconSettings, Schedule
 from gftorf_warp.scene.motion import Nodes, Still
 
 RATES = Rates(mean=1e-2, log_scale=2e-2, quaternion=3e-2, opacity_logit=4e-2, reflectivity_sh=5e-2, motion=6e-2)
-SETTINGS = ReconSettings(preset="test", rates=RATES, schedule=Schedule(images=1000, decay=0.01, warm_up=100))
+SETTINGS = ReconSettings(
+    preset="test", rates=RATES, rates_last=RATES.times(0.01), schedule=Schedule(images=1000, warm_up=100)
+)
 
 
 def optimiser():

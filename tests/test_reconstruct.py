@@ -174,8 +174,8 @@ def test_config_and_metrics_say_what_happened(tmp_path):
     )
     assert config["quad_scale"] == pytest.approx(1 / largest, rel=1e-5)
     assert "inferred" in config["quad_scale_source"]
-    decay = config["settings"]["schedule"]["decay"]
-    assert config["schedule"]["rates_last"]["mean"] == pytest.approx(decay * config["settings"]["rates"]["mean"])
+    assert config["schedule"]["rates_first"] == config["settings"]["rates"]
+    assert config["schedule"]["rates_last"] == pytest.approx(config["settings"]["rates_last"])
     found = rows(run.path)
     assert [row["images"] for row in found] == [8, 16, 24]
     assert all(row["loss"] == pytest.approx(row["quads"] + row["distortion"], rel=1e-4) for row in found)
@@ -229,10 +229,10 @@ def test_random_start_and_still_motion_run_too(tmp_path):
 
 
 def test_presets_have_names():
-    """Those of later versions say so."""
+    """And an unknown one is told those that exist."""
     assert presets.preset("demo") == presets.demo()
-    for name in ("paper", "released", "dmeo"):
-        with pytest.raises(UsageError, match="demo") as caught:
-            presets.preset(name)
-        assert ("not available in this version" in str(caught.value)) == (name != "dmeo")
+    assert [presets.preset(name).preset for name in presets.PRESETS] == list(presets.PRESETS)
+    with pytest.raises(UsageError, match="unknown preset dmeo") as caught:
+        presets.preset("dmeo")
+    assert "demo, paper, released" in str(caught.value)
     assert json.loads(json.dumps(plain(presets.demo())))["schedule"]["images"] == presets.demo().schedule.images

@@ -16,17 +16,19 @@ def image_motion(
     surface: Float[Tensor, "H W 3"],
     displacement: Float[Tensor, "3 H W"],
     project: Callable[[Tensor], Tensor],
+    project_later: Callable[[Tensor], Tensor] | None = None,
 ) -> Float[Tensor, "2 H W"]:
-    """Optical flow F2 = project(P + F3) - project(P) [px] that a moving surface causes (method, section 5).
+    """Optical flow F2 = project_later(P + F3) - project(P) [px] that a moving surface causes (method, section 5).
 
     Args:
         surface: Points P seen by the pixels [m]; gradients through them are cut.
         displacement: Composited motion F3 of the scene [m], not divided by the opacity.
         project: World points [..., 3] to image positions [..., 2] in px, for example ``Camera.project``.
+        project_later: The same for the camera at the end of the flow; None: it has not moved.
     """
     start = surface.detach()
     end = start + displacement.permute(1, 2, 0)
-    return (project(end) - project(start)).permute(2, 0, 1)
+    return ((project_later or project)(end) - project(start)).permute(2, 0, 1)
 
 
 def flow_error(

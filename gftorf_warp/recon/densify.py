@@ -61,7 +61,15 @@ def round_is_due(before: int, after: int, settings: DensifySettings, schedule: S
 def reset_is_due(before: int, after: int, settings: DensifySettings, schedule: Schedule) -> bool:
     """Whether a step from ``before`` to ``after`` images ends with an opacity reset."""
     end = (1.0 - RESET_QUIET_SHARE) * settings.stop_share * schedule.images
-    return settings.every is not None and after < end and crossed(before, after, settings.reset_every)
+    every = settings.reset_every
+    if settings.reset_faster is not None and after >= settings.reset_faster[0]:
+        every = settings.reset_faster[1]
+    return settings.every is not None and after < end and crossed(before, after, every)
+
+
+def resets(settings: DensifySettings, schedule: Schedule) -> list[int]:
+    """At which images a run that counts every image resets the opacities."""
+    return [n for n in range(1, schedule.images + 1) if reset_is_due(n - 1, n, settings, schedule)]
 
 
 def round_of(

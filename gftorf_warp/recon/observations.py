@@ -11,15 +11,17 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..constants import FRAMES_PER_QUARTET
+from ..data.decode import closed_form_distance, quad_scale, quartet_phasor
 from ..data.sequence import Sequence
 from ..errors import InputError
 from ..scene.camera import Camera
-from ..scene.measured import camera_of, sensor_of
+from ..scene.initialise import Init
+from ..scene.measured import camera_of, colour_camera_of, sensor_of
 from ..scene.sensor import Sensor
-from .settings import Batch, FlowSource, ReconSettings
+from .settings import Batch, FlowSource, Input, ReconSettings
 
-HASHED = ("quads", "measured", "shifts", "times", "camera_from_world")
-HASHED_NUMBERS = ("f_mod_hz", "phase_offset", "dc_offset", "fx", "fy", "cx", "cy", "quad_scale")
+HASHED = ("quads", "measured", "shifts", "times", "camera_from_world", "colour_from_world")
+HASHED_NUMBERS = ("f_mod_hz", "phase_offset", "dc_offset", "fx", "fy", "cx", "cy", "quad_scale", "colour_intrinsics")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -30,6 +32,14 @@ class Observations:
     """The prepared sequence: quads multiplied by ``quad_scale``, reduced images, flow filled in."""
     quads: Float[Tensor, "F H W"]
     """Its quads on the device; rows that were not measured are never read."""
+    phasors: dict[int, Float[Tensor, "2 H W"]]
+    """Phasors (re, im) by the raw frame that stands for the quartet; empty if quads are compared."""
+    colour: dict[int, Float[Tensor, "3 h w"]]
+    """Colour images by raw frame, divided by the largest value of all; empty if colour is not compared."""
+    colour_scale: float | None
+    """The file's units of colour times this are those of the optimisation; None if colour is not compared."""
+    closed_form: dict[int, Float[Tensor, "H W"]]
+    """Closed-form distances [m] by quartet; empty if they are not compared."""
     cameras: list[Camera]
     """The camera of every raw frame."""
     sensor: Sensor
@@ -49,15 +59,32 @@ class Observations:
         """The sensor reading only the shift of one raw frame."""
         return self.sensor.with_shifts((float(self.sequence.shifts[frame]),))
 
+    def time_at(self, frame: int) -> float:
+        """When raw frame ``frame`` was taken [s]; if phasors are compared, the middle of its quartet."""
+        if self.phasors:
+            return float(self.sequence.times[quartet_frames(frame)].mean())
+        return float(self.sequence.times[frame])
+
+
+def quartet_frames(frame: int) -> slice:
+    """The raw frames of the quartet of one of them."""
+    start = frame - frame % FRAMES_PER_QUARTET
+    return slice(start, start + FRAMES_PER_QUARTET)
+
+
+def input_of(sequence: Sequence, wanted: Input) -> Input:
+    """What is compared with the sensor: quads or phasors, never 'auto'."""
+    if wanted != Input.AUTO:
+        return wanted
+    return Input.PHASOR if sequence.from_phasors else Input.QUADS
+
 
 def observe(sequence: Sequence, settings: ReconSettings, device: torch.device | str) -> Observations:
     """Prepare a sequence.
 
     Raises:
-        InputError: If no raw frame was measured or all quads are zero.
+        InputError: If no raw frame was measured, all quads are zero, or what is to be compared does not exist.
     """
-    from ..data.decode import quad_scale
-
     if not sequence.measured.any() or not np.abs(sequence.quads[sequence.measured]).max() > 0:
         raise InputError(
             "nothing was measured",
@@ -65,25 +92,38 @@ def observe(sequence: Sequence, settings: ReconSettings, device: torch.device | 
             why="no raw frame exists, or all of them are zero",
             fix="check the folder with `gftorf check`",
         )
-    scale, scale_source = quad_scale(sequence)
-    prepared = reduced(sequence, settings.width_max)
-    prepared, flow_source = with_flow(prepared, settings.flow)
-    prepared = replace(prepared, quads=(prepared.quads * np.float32(scale)).astype(np.float32))
-    measured = [n for n in range(prepared.frames) if prepared.measured[n]]
-    if settings.schedule.batch == Batch.FRAME:
-        batches = [[n] for n in measured]
+    if settings.quad_scale is None:
+        scale, scale_source = quad_scale(sequence)
     else:
-        quartets = sorted({n // FRAMES_PER_QUARTET for n in measured})
-        batches = [[n for n in measured if n // FRAMES_PER_QUARTET == i] for i in quartets]
+        scale, scale_source = settings.quad_scale, "setting"
+    prepared = reduced(sequence, settings.width_max)
+    prepared, flow_source = with_flow(prepared, settings.flow if reads_flow(settings) else FlowSource.NONE)
+    prepared = replace(prepared, quads=(prepared.quads * np.float32(scale)).astype(np.float32))
+
+    def on_device(array: np.ndarray) -> Tensor:
+        return torch.tensor(array, dtype=torch.float32, device=device)
+
+    phasors, closed_form = {}, {}
+    if input_of(sequence, settings.input) == Input.PHASOR and settings.weights.quads > 0:
+        phasors = {FRAMES_PER_QUARTET * i: on_device(quartet_phasor(prepared, i)) for i in prepared.complete_quartets}
+        if not phasors:
+            raise _nothing_to_compare(sequence, "no complete quartet", "a phasor needs four raw frames of one quartet")
+    if settings.weights.depth > 0:
+        closed_form = {i: on_device(closed_form_distance(prepared, i)) for i in prepared.complete_quartets}
+    colour, colour_scale = _colour(prepared, settings)
     steps = {1: prepared.forward_flow, -1: prepared.backward_flow}
     return Observations(
         sequence=prepared,
         quads=torch.tensor(prepared.quads, device=device),
+        phasors=phasors,
+        colour={n: on_device(np.moveaxis(image, -1, 0)) for n, image in colour.items()},
+        colour_scale=colour_scale,
+        closed_form=closed_form,
         cameras=[camera_of(prepared, n) for n in range(prepared.frames)],
         sensor=sensor_of(prepared),
-        batches=batches,
+        batches=_batches(prepared, settings, phasors, colour),
         flow={
-            (n // FRAMES_PER_QUARTET, step): torch.tensor(flow, dtype=torch.float32, device=device)
+            (n // FRAMES_PER_QUARTET, step): on_device(flow)
             for step, flows in steps.items()
             for n, flow in flows.items()
         },
@@ -93,10 +133,47 @@ def observe(sequence: Sequence, settings: ReconSettings, device: torch.device | 
     )
 
 
+def reads_flow(settings: ReconSettings) -> bool:
+    """Whether a reconstruction looks at optical flow at all: for its loss, or to start from phase."""
+    return settings.weights.flow > 0 or settings.init.kind == Init.PHASE
+
+
+def _batches(sequence: Sequence, settings: ReconSettings, phasors: dict, colour: dict) -> list[list[int]]:
+    """The raw frames of every possible step: a phasor, or an image where only colour counts, is a step of its own."""
+    if phasors:
+        return [[n] for n in phasors]
+    if settings.weights.quads == 0:
+        return [[n] for n in colour]
+    measured = [n for n in range(sequence.frames) if sequence.measured[n]]
+    if settings.schedule.batch == Batch.FRAME:
+        return [[n] for n in measured]
+    quartets = sorted({n // FRAMES_PER_QUARTET for n in measured})
+    return [[n for n in measured if n // FRAMES_PER_QUARTET == i] for i in quartets]
+
+
+def _colour(sequence: Sequence, settings: ReconSettings) -> tuple[dict[int, np.ndarray], float | None]:
+    """Colour images in the units of the optimisation, and the factor that brought them there."""
+    if settings.weights.colour == 0:
+        return {}, None
+    if colour_camera_of(sequence, 0) is None:
+        if settings.weights.quads > 0:  # colour is an addition: a recording without it is compared without it
+            return {}, None
+        raise _nothing_to_compare(sequence, "no colour", "this preset compares colour images and nothing else")
+    largest = max(float(np.abs(image).max()) for image in sequence.colour.values())
+    if not largest > 0:
+        raise _nothing_to_compare(sequence, "colour is black", "all colour images are zero")
+    return {n: image / np.float32(largest) for n, image in sequence.colour.items()}, 1.0 / largest
+
+
+def _nothing_to_compare(sequence: Sequence, what: str, why: str) -> InputError:
+    return InputError(what, where=sequence.path or "sequence", why=why, fix="check the folder with `gftorf check`")
+
+
 def reduced(sequence: Sequence, width_max: int | None) -> Sequence:
     """The sequence with images of at most ``width_max`` columns, every new pixel the mean of what it covers.
 
-    Sides shrink to whole numbers of pixels, intrinsics and flow with them. Smaller images stay as they are.
+    Sides shrink to whole numbers of pixels, intrinsics and flow with them. Smaller images stay as they are, and so do
+    colour images, which another camera took.
     """
     if width_max is None or sequence.width <= width_max:
         return sequence
@@ -139,13 +216,15 @@ def with_flow(sequence: Sequence, source: FlowSource) -> tuple[Sequence, str]:
 
 
 def data_hash(sequence: Sequence) -> str:
-    """SHA-256 of everything a reconstruction reads from a sequence: frames, calibration, poses and flow."""
+    """SHA-256 of everything a reconstruction reads from a sequence: frames, calibration, poses, flow and colour."""
     digest = hashlib.sha256()
     for name in HASHED:
-        digest.update(f"{name} {getattr(sequence, name).shape}".encode())
-        digest.update(np.ascontiguousarray(getattr(sequence, name)).tobytes())
+        array = getattr(sequence, name)
+        if array is not None:
+            digest.update(f"{name} {array.shape}".encode())
+            digest.update(np.ascontiguousarray(array).tobytes())
     digest.update(repr([getattr(sequence, name) for name in HASHED_NUMBERS]).encode())
-    for name in ("forward_flow", "backward_flow"):
-        for frame, flow in sorted(getattr(sequence, name).items()):
-            digest.update(f"{name} {frame}".encode() + np.ascontiguousarray(flow).tobytes())
+    for name in ("forward_flow", "backward_flow", "colour"):
+        for frame, image in sorted(getattr(sequence, name).items()):
+            digest.update(f"{name} {frame}".encode() + np.ascontiguousarray(image).tobytes())
     return digest.hexdigest()

@@ -17,26 +17,51 @@ BETAS = (0.9, 0.999)
 EPSILON = 1e-15  # far below any gradient here, so that a step depends on the direction of a gradient, not on its size
 
 
-def rates_at(settings: ReconSettings, images: int, factor: float = 1.0) -> dict[str, float]:
-    """Learning rate of every group after ``images`` optimised images.
+def rates_at(
+    settings: ReconSettings, images: int, factor: float = 1.0, *, reset_at: int | None = None
+) -> dict[str, float]:
+    """Learning rate of every group after ``images`` optimised images; 0 where a group rests.
 
-    Log-linear from the initial rate to ``decay`` times it at the end of the run; the motion rests during the warm-up.
+    Log-linear from ``rates`` to ``rates_last`` at the end of the run. The motion rests during the warm-up and for a
+    while after a reset of the opacities; the Gaussians rest once they are frozen.
 
     Args:
         settings: Rates and schedule.
         images: Progress.
         factor: Multiplies all rates; below 1 after the run had to go back to a checkpoint.
+        reset_at: Progress at the last reset of the opacities; None: there was none.
     """
     schedule = settings.schedule
-    decay = schedule.decay ** min(images / schedule.images, 1.0)
-    rates = {name: factor * decay * rate for name, rate in asdict(settings.rates).items()}
-    if images < schedule.warm_up:
+    first, last = asdict(settings.rates), asdict(settings.rates_last)
+    share = min(images / schedule.images, 1.0)
+    begin = schedule.motion_decay_from
+    shares = dict.fromkeys(first, share)
+    shares["motion"] = min(max(images - begin, 0) / max(schedule.images - begin, 1), 1.0)
+    rates = {name: factor * _between(first[name], last[name], shares[name]) for name in first}
+    paused = reset_at is not None and images < reset_at + schedule.pause_after_reset
+    if images < schedule.warm_up or paused:
         rates["motion"] = 0.0
+    if frozen(settings, images):
+        rates = {name: rate if name == "motion" else 0.0 for name, rate in rates.items()}
     return rates
 
 
+def frozen(settings: ReconSettings, images: int) -> bool:
+    """Whether only the motion is optimised after ``images`` optimised images."""
+    schedule = settings.schedule
+    return schedule.freeze_from is not None and images >= schedule.freeze_from * schedule.images
+
+
+def _between(first: float, last: float, share: float) -> float:
+    """Log-linear between two rates; a rate of 0 at either end is 0 all along."""
+    return first * (last / first) ** share if first > 0 and last > 0 else 0.0
+
+
 class Optimiser:
-    """Adam with one group per tensor of the field and one for the motion."""
+    """Adam with one group per tensor of the field and one for the motion.
+
+    The harmonics of the colour are two tensors, ``colour_constant`` and ``colour_rest``, since their rates differ.
+    """
 
     def __init__(self, field: GaussianField, motion: Motion, state: dict | None = None):
         """Take copies of the tensors of a field, which become leaves, and the parameters of a motion.
@@ -47,7 +72,11 @@ class Optimiser:
             state: ``adam.state_dict()`` of an earlier optimiser of the same tensors; None starts at zero.
         """
         self.layer = field.layer
-        self.tensors = {name: value.detach().clone().requires_grad_() for name, value in field.parameters().items()}
+        parts = field.parameters()
+        colour = parts.pop("colour_sh", None)
+        if colour is not None:
+            parts |= {"colour_constant": colour[:, :1], "colour_rest": colour[:, 1:]}
+        self.tensors = {name: value.detach().clone().requires_grad_() for name, value in parts.items()}
         self.motion = [parameter for parameter in motion.parameters() if parameter.numel()]
         self.adam = torch.optim.Adam(
             [{"name": name, "params": [value], "lr": 0.0} for name, value in self.tensors.items()]
@@ -61,8 +90,11 @@ class Optimiser:
 
     @property
     def field(self) -> GaussianField:
-        """The Gaussians as they are; their tensors are the leaves."""
-        return GaussianField(**self.tensors, layer=self.layer)
+        """The Gaussians as they are; their tensors are the leaves, those of the colour joined."""
+        parts = dict(self.tensors)
+        if "colour_rest" in parts:
+            parts["colour_sh"] = torch.cat([parts.pop("colour_constant"), parts.pop("colour_rest")], dim=1)
+        return GaussianField(**parts, layer=self.layer)
 
     @property
     def leaves(self) -> list[Tensor]:

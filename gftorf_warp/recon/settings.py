@@ -15,6 +15,35 @@ from ..scene.initialise import InitSettings
 from ..scene.motion import MotionSettings
 
 
+class Method(enum.StrEnum):
+    """What kind of reconstruction a run is."""
+
+    GAUSSIANS = "gaussians"
+    """Moving Gaussians, fitted by gradient descent."""
+    CTOF = "ctof"
+    """The closed form on every quartet: nothing is fitted (method, section 7)."""
+
+
+class Input(enum.StrEnum):
+    """What is compared with the sensor."""
+
+    AUTO = "auto"
+    """Phasors if the camera delivered phasors, else quads."""
+    QUADS = "quads"
+    """Every raw frame at its own time, in the one slot that it measured."""
+    PHASOR = "phasor"
+    """The phasor of every quartet, as if its four raw frames had been taken at once, in the middle."""
+
+
+class Norm(enum.StrEnum):
+    """How differences of colours are punished."""
+
+    L1 = "l1"
+    """Their absolute value."""
+    L2 = "l2"
+    """Their square."""
+
+
 class FlowSource(enum.StrEnum):
     """Where optical flow between quartets comes from."""
 
@@ -41,7 +70,7 @@ class Batch(enum.StrEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class Rates:
-    """Initial learning rates of Adam: the size of one step, whatever the size of the gradient."""
+    """Learning rates of Adam: the size of one step, whatever the size of the gradient (method, section 6.5)."""
 
     mean: float = 1.6e-3
     """Centres [m]."""
@@ -52,19 +81,33 @@ class Rates:
     opacity_logit: float = 0.05
     """Opacities before the sigmoid [1]."""
     reflectivity_sh: float = 1.6e-4
-    """Harmonics of the reflectivity [m^2 in quad units]."""
+    """All 16 harmonics of the reflectivity [m^2 in quad units]; heuristic H1 is to keep this low."""
+    colour_constant: float = 2.5e-3
+    """The constant harmonic of the colour [1]."""
+    colour_rest: float = 1.25e-4
+    """The 15 other harmonics of the colour [1]."""
     motion: float = 8e-4
-    """Key offsets of the motion [m]."""
+    """Key offsets of the nodes [m], or weights of the network [1]."""
+
+    def times(self, factor: float) -> Rates:
+        """All of them multiplied."""
+        return Rates(**{name: factor * rate for name, rate in dataclasses.asdict(self).items()})
 
 
 @dataclass(frozen=True, kw_only=True)
 class Weights:
-    """Weights of the terms of the loss; a term of weight 0 is not computed."""
+    """Weights of the terms of the loss; a term of weight 0 is not computed (method, section 5)."""
 
     quads: float = 1.0
-    """Quads: (1 - ssim) L2 + ssim (1 - SSIM) [1]."""
+    """Quads, or the phasor: (1 - ssim) L2 + ssim (1 - SSIM) [1]."""
     ssim: float = 0.2
-    """Share of the structural similarity in the quad loss [1]."""
+    """Share of the structural similarity in the terms of images [1]."""
+    colour: float = 0.0
+    """Colour: (1 - ssim) times the norm of the difference + ssim (1 - SSIM) [1]; needs a calibrated colour camera."""
+    colour_norm: Norm = Norm.L2
+    """Norm of that difference."""
+    depth: float = 0.0
+    """Rendered against closed-form distance: (1 - ssim) L1 + ssim (1 - SSIM) [1/m]; for DeformableGS with C-ToF."""
     distortion: float = 0.0
     """Mean depth distortion [1/m^2]."""
     flow: float = 0.0
@@ -80,15 +123,23 @@ class Schedule:
     images: int = 60_000
     """Length of the run [images]."""
     batch: Batch = Batch.QUARTET
-    """What one step compares."""
-    decay: float = 0.01
-    """Last learning rate as a multiple of the first; in between, the logarithm is linear [1]."""
+    """What one step compares; a phasor is one image."""
     warm_up: int = 0
-    """The motion stays at its start for so long [images]."""
+    """Nothing moves for so long, and the motion learns nothing [images]."""
+    motion_decay_from: int = 0
+    """The rate of the motion stays at its first value for so long and reaches its last at the end [images]."""
+    pause_after_reset: int = 0
+    """The motion learns nothing for so long after every reset of the opacities [images]."""
+    freeze_from: float | None = None
+    """From this share of the run on only the motion is optimised [1]; None: everything is, to the end."""
+    colour_from: int = 0
+    """The colour loss begins here [images]."""
     flow_from: int = 0
     """The flow loss begins here [images]."""
     distortion_from: float = 0.0
     """The depth distortion begins at this share of the run [1]."""
+    sh_degree_every: int | None = None
+    """Harmonics begin at degree 0 and gain one after so many [images], up to that of ``render``; None: all at once."""
     log_every: int = 100
     """Between two rows of metrics.jsonl [images]."""
     checkpoint_every_s: float = 60.0
@@ -97,8 +148,8 @@ class Schedule:
     def __post_init__(self):
         if self.images < 1 or self.log_every < 1:
             raise ValueError(f"images and log_every must be at least 1, got {self.images} and {self.log_every}")
-        if not 0 < self.decay <= 1:
-            raise ValueError(f"decay must be in (0, 1], got {self.decay}")
+        if self.sh_degree_every is not None and self.sh_degree_every < 1:
+            raise ValueError(f"sh_degree_every must be at least 1 or None, got {self.sh_degree_every}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,9 +169,15 @@ class DensifySettings:
     opacity_min: float = 0.01
     """Fainter Gaussians are removed [1]."""
     scale_range: tuple[float, float] = (0.0, float("inf"))
-    """Gaussians whose largest scale is outside are removed, after the first reset if there are any [m]."""
+    """Gaussians whose largest scale is outside are removed [m]."""
+    scale_from: int = 3000
+    """That is judged later than this [images]."""
     reset_every: int | None = None
     """Between two resets of all opacities to ``opacity_min`` [images]; None: never."""
+    reset_faster: tuple[int, int] | None = None
+    """From the first of these [images] on, resets are the second apart [images]; None: always the same."""
+    loses_step: bool = False
+    """Whether a step that ends with a round changes no Gaussian otherwise, as in the published code."""
     gaussians_min: int = 16
     """A round that would leave fewer removes none [Gaussians]."""
     gaussians_max: int = 200_000
@@ -133,6 +190,14 @@ class ReconSettings:
 
     preset: str
     """Name of the preset these settings came from."""
+    ablation: str | None = None
+    """Row of the ablation table that was applied to it; None: none."""
+    method: Method = Method.GAUSSIANS
+    """What kind of reconstruction this is."""
+    input: Input = Input.AUTO
+    """What is compared with the sensor."""
+    quad_scale: float | None = None
+    """Multiplies quads and phasors first [1]; None: as the sequence says, or to a largest phasor of 1."""
     width_max: int | None = None
     """Wider images are reduced to this for the optimisation [px]; None keeps all pixels."""
     flow: FlowSource = FlowSource.AUTO
@@ -144,7 +209,9 @@ class ReconSettings:
     render: RenderSettings = field(default_factory=RenderSettings)
     """The renderer, also of the finished run."""
     rates: Rates = field(default_factory=Rates)
-    """Learning rates."""
+    """Learning rates at the start."""
+    rates_last: Rates = field(default_factory=lambda: Rates().times(0.01))
+    """Learning rates at the end; in between, the logarithm is linear."""
     weights: Weights = field(default_factory=Weights)
     """Weights of the loss."""
     schedule: Schedule = field(default_factory=Schedule)
@@ -152,9 +219,9 @@ class ReconSettings:
     densify: DensifySettings = field(default_factory=DensifySettings)
     """The number of Gaussians."""
     background: float = 1.0
-    """Amplitude B of the random background, uniform in [-B, B] per pixel and image [quad units]; 0 is black."""
+    """Amplitude B of the random background, uniform in [-B, B] per pixel, channel and image; 0 is black."""
     motion_gradient_max: float | None = 1.0
-    """Longest gradient of the motion; a longer one is shortened [loss/m]. None: never."""
+    """Longest gradient of the motion; a longer one is shortened [1/m for nodes, 1 for a network]. None: never."""
     failures_max: int = 5
     """So many steps without a finite loss and gradient in a row go back to the last checkpoint, with halved rates."""
     rollbacks_max: int = 3

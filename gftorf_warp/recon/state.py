@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ..constants import SH_COEFFICIENTS
 from ..scene.gaussians import GaussianField
 from ..scene.initialise import MOVING, Init, Start, from_phase, from_random
 from ..scene.measured import key_times
-from ..scene.motion import Motion, MotionKind, Nodes, Still, farthest_points
+from ..scene.motion import Motion, MotionKind, MotionSettings, Nodes, Still, farthest_points
+from ..scene.network import Network
 from . import densify
 from .observations import Observations
 from .optimiser import Optimiser
 from .settings import ReconSettings
 
-FORMAT = 1  # of the stored form; a higher one is refused
+FORMAT = 2  # of the stored form; a higher one is refused
 NODE_FELLOWS = 8  # points whose median displacement a node starts with
 
 
@@ -51,8 +53,8 @@ class State:
     """Steps without a finite loss and gradient so far."""
     rollbacks: int = 0
     """Returns to a checkpoint so far."""
-    resets: int = 0
-    """Opacity resets so far."""
+    reset_at: int | None = None
+    """Optimised images at the last reset of the opacities; None: there was none."""
 
 
 def begin(observations: Observations, settings: ReconSettings, *, seed: int, device: torch.device | str) -> State:
@@ -67,8 +69,10 @@ def begin(observations: Observations, settings: ReconSettings, *, seed: int, dev
         first = from_phase(sequence, settings.init)
     else:
         first = from_random(sequence, settings.init, generator)
-    motion = _motion(first, observations, settings).to(device)
+    motion = _motion(first, observations, settings, generator).to(device)
     field = first.field.map(lambda value: value.to(device))
+    if settings.weights.colour > 0:
+        field = replace(field, colour_sh=torch.zeros(len(field), SH_COEFFICIENTS, 3, device=device))
     return State(
         optimiser=Optimiser(field, motion),
         motion=motion,
@@ -83,10 +87,15 @@ def begin(observations: Observations, settings: ReconSettings, *, seed: int, dev
     )
 
 
-def _motion(start: Start, observations: Observations, settings: ReconSettings) -> Motion:
-    times = key_times(observations.sequence)
+def _motion(start: Start, observations: Observations, settings: ReconSettings, generator: torch.Generator) -> Motion:
+    sequence = observations.sequence
+    times = key_times(sequence)
     if settings.motion.kind == MotionKind.STILL:
         return Still(times)
+    if settings.motion.kind == MotionKind.NETWORK:
+        duration = float(sequence.times[-1] - sequence.times[0]) or 1.0  # one instant: nothing can move
+        length = settings.motion.input_scale * observations.sensor.unambiguous_range
+        return Network(times, settings.motion, duration=duration, length=length, generator=generator)
     moving = start.field.mean[start.field.layer == MOVING]
     nodes = farthest_points(moving, settings.motion.nodes)
     offset = None
@@ -99,14 +108,11 @@ def _motion(start: Start, observations: Observations, settings: ReconSettings) -
 
 def to_dict(state: State) -> dict[str, object]:
     """Tensors, numbers, texts, lists and dictionaries only: what a safe loader reads back."""
-    motion: dict[str, object] = {"kind": str(MotionKind.STILL), "tensors": state.motion.state_dict()}
-    if isinstance(state.motion, Nodes):
-        motion |= {"kind": str(MotionKind.NODES), "neighbours": state.motion.neighbours}
     return {
         "format": FORMAT,
         "field": {name: value.detach() for name, value in state.optimiser.field.tensors().items()},
         "adam": state.optimiser.adam.state_dict(),
-        "motion": motion,
+        "motion": _motion_to_dict(state.motion),
         "attachment": state.attachment,
         "statistics": {"gradient": state.statistics.gradient, "pixels": state.statistics.pixels},
         "generator": state.generator.get_state(),
@@ -118,20 +124,41 @@ def to_dict(state: State) -> dict[str, object]:
         "rate_factor": state.rate_factor,
         "skipped": state.skipped,
         "rollbacks": state.rollbacks,
-        "resets": state.resets,
+        "reset_at": state.reset_at,
     }
+
+
+def _motion_to_dict(motion: Motion) -> dict[str, object]:
+    stored: dict[str, object] = {"kind": str(MotionKind.STILL), "tensors": motion.state_dict()}
+    if isinstance(motion, Nodes):
+        stored |= {"kind": str(MotionKind.NODES), "neighbours": motion.neighbours}
+    elif isinstance(motion, Network):
+        shape = asdict(motion.settings) | {"kind": str(MotionKind.NETWORK)}
+        stored |= {"kind": str(MotionKind.NETWORK), "shape": shape}
+        stored |= {"duration": motion.duration, "length": motion.length}
+    return stored
+
+
+def _motion_from_dict(stored: dict) -> Motion:
+    kind, tensors = stored["kind"], stored["tensors"]
+    times = tensors["key_times"]
+    if kind == MotionKind.STILL:
+        return Still(times)
+    if kind == MotionKind.NODES:
+        parts = (tensors[name] for name in ("node", "layer", "offset"))
+        return Nodes(times, *parts, neighbours=stored["neighbours"])
+    shape = MotionSettings(**stored["shape"] | {"kind": MotionKind.NETWORK})
+    network = Network(times, shape, duration=stored["duration"], length=stored["length"])
+    network.load_state_dict(tensors)
+    return network
 
 
 def field_and_motion(stored: dict, device: torch.device | str) -> tuple[GaussianField, Motion, Tensor]:
     """Gaussians, their motion and how they hang on it, from the stored form."""
     field = GaussianField(**{name: value.to(device) for name, value in stored["field"].items()})
-    parts = stored["motion"]["tensors"]
-    if stored["motion"]["kind"] == MotionKind.STILL:
-        motion: Motion = Still(parts["key_times"])
-    else:
-        neighbours = stored["motion"]["neighbours"]
-        motion = Nodes(parts["key_times"], parts["node"], parts["layer"], parts["offset"], neighbours=neighbours)
-    return field, motion.to(device), stored["attachment"].to(device)
+    motion = _motion_from_dict(stored["motion"]).to(device)
+    attachment = motion.attach(field) if motion.follows_means else stored["attachment"].to(device)
+    return field, motion, attachment
 
 
 def from_dict(stored: dict, device: torch.device | str) -> State:
@@ -149,5 +176,6 @@ def from_dict(stored: dict, device: torch.device | str) -> State:
         noise=noise,
         queue=list(stored["queue"]),
         sums={name: value.to(device) for name, value in stored["sums"].items()},
-        **{name: stored[name] for name in ("images", "seconds", "rate_factor", "skipped", "rollbacks", "resets")},
+        reset_at=stored.get("reset_at"),  # format 1 had none
+        **{name: stored[name] for name in ("images", "seconds", "rate_factor", "skipped", "rollbacks")},
     )

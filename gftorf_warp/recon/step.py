@@ -9,13 +9,12 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from ..losses.tof import quad_error
-from ..render.api import Rendering
+from ..scene.measured import colour_camera_of
 from . import densify
-from .objective import terms, weights_at
+from .objective import Seen, render_settings_at, terms, weights_at
 from .observations import Observations
-from .optimiser import rates_at
-from .settings import ReconSettings
+from .optimiser import frozen, rates_at
+from .settings import ReconSettings, Weights
 from .state import State
 
 Map = Callable[[Callable, Iterable], Iterable]
@@ -47,27 +46,50 @@ def step(
         None, or, if the loss or the gradient was not finite, the terms of the loss [1]: the step was skipped then.
     """
     frames = draw(state, observations, settings)
-    field, leaves = state.optimiser.field, state.optimiser.leaves
-    weights = weights_at(settings, state.images)
-    backgrounds = [_background(state, observations, settings) for _ in frames]
+    leaves = state.optimiser.leaves
+    moves = state.images >= settings.schedule.warm_up
+    if state.motion.follows_means:
+        state.attachment = state.motion.attach(state.optimiser.field)
+    weights, render = weights_at(settings, state.images), render_settings_at(settings, state.images)
+    rests = frozen(settings, state.images)
+    wanted = [n for n, leaf in enumerate(leaves) if not rests or any(leaf is other for other in state.optimiser.motion)]
+    backgrounds = [_backgrounds(state, observations, frame, settings, weights) for frame in frames]
 
-    def one(frame: int, background: Tensor | None) -> tuple[dict[str, Tensor], Rendering, list[Tensor | None]]:
-        found, rendering = terms(
-            field, state.motion, state.attachment, observations, frame, settings, weights, background
+    def one(frame: int, lights: dict[str, Tensor]) -> tuple[dict[str, Tensor], Seen, list[Tensor | None]]:
+        field = state.optimiser.field
+        found, seen = terms(
+            field.map(torch.Tensor.detach) if rests else field,
+            state.motion if moves else None,
+            state.attachment,
+            observations,
+            frame,
+            settings,
+            weights,
+            lights,
+            render,
         )
-        gradients = torch.autograd.grad(torch.stack([*found.values()]).sum(), leaves, allow_unused=True)
-        return {name: value.detach() for name, value in found.items()}, rendering, list(gradients)
+        gradients: list[Tensor | None] = [None] * len(leaves)
+        loss = torch.stack([*found.values()]).sum() if found else None
+        if loss is not None and loss.requires_grad:
+            asked = [leaves[n] for n in wanted]
+            for n, gradient in zip(wanted, torch.autograd.grad(loss, asked, allow_unused=True), strict=True):
+                gradients[n] = gradient
+        return {name: value.detach() for name, value in found.items()}, seen, gradients
 
     results = list(run_all(lambda pair: one(*pair), zip(frames, backgrounds, strict=True)))
     gradients = [_mean([gradients[n] for _, _, gradients in results]) for n in range(len(leaves))]
     before, state.images = state.images, state.images + len(frames)
     checked = [value for found, _, _ in results for value in found.values()]
     checked += [gradient.square().sum() for gradient in gradients if gradient is not None]
-    if not bool(torch.stack(checked).sum().isfinite()):
+    if checked and not bool(torch.stack(checked).sum().isfinite()):
         return {name: float(sum(found.get(name, 0.0) for found, _, _ in results)) for name in results[0][0]}
-    for frame, (found, rendering, _) in zip(frames, results, strict=True):
-        _account(state, observations, frame, found, rendering)
-    rates = rates_at(settings, before, state.rate_factor)
+    for frame, (found, seen, _) in zip(frames, results, strict=True):
+        _account(state, observations, frame, found, seen)
+    rates = rates_at(settings, before, state.rate_factor, reset_at=state.reset_at)
+    options = settings.densify
+    due = densify.round_is_due(before, state.images, options, settings.schedule)
+    if due and options.loses_step:
+        rates = {name: rate if name == "motion" else 0.0 for name, rate in rates.items()}
     state.optimiser.step(gradients, rates, settings.motion_gradient_max)
     _densify(state, before, settings)
     return None
@@ -89,13 +111,24 @@ def pool(workers: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(workers, thread_name_prefix="gftorf-images")
 
 
-def _background(state: State, observations: Observations, settings: ReconSettings) -> Tensor | None:
-    """Uniform in [-B, B] per pixel."""
+def _backgrounds(
+    state: State, observations: Observations, frame: int, settings: ReconSettings, weights: Weights
+) -> dict[str, Tensor]:
+    """Uniform in [-B, B] per pixel and channel, for every image that will be compared."""
     if settings.background == 0.0:
-        return None
-    shape = (1, *observations.quads.shape[1:])
-    uniform = torch.rand(shape, generator=state.noise, device=observations.quads.device)
-    return settings.background * (2.0 * uniform - 1.0)
+        return {}
+    size = observations.quads.shape[1:]
+    shapes: dict[str, tuple[int, ...]] = {}
+    if weights.quads > 0:
+        shapes = {"phasor": (3, *size)} if observations.phasors else {"quads": (1, *size)}
+    if weights.colour > 0 and frame in observations.colour:
+        shapes["colour"] = tuple(observations.colour[frame].shape)
+
+    def uniform(shape: tuple[int, ...]) -> Tensor:
+        drawn = torch.rand(shape, generator=state.noise, device=observations.quads.device)
+        return settings.background * (2.0 * drawn - 1.0)
+
+    return {name: uniform(shape) for name, shape in shapes.items()}
 
 
 def _mean(gradients: list[Tensor | None]) -> Tensor | None:
@@ -104,28 +137,32 @@ def _mean(gradients: list[Tensor | None]) -> Tensor | None:
     return torch.stack(present).sum(dim=0) / len(gradients) if present else None
 
 
-def _account(state: State, observations: Observations, frame: int, found: dict[str, Tensor], rendering: Rendering):
+def _account(state: State, observations: Observations, frame: int, found: dict[str, Tensor], seen: Seen) -> None:
     """Add an image to the sums of the log and to the statistics of densification."""
+    rendering = seen.tof or seen.colour
+    if rendering is None:  # nothing of this frame is compared
+        return
     with torch.no_grad():
-        squared = quad_error(rendering.quads.detach(), observations.quads[frame][None]).mean()
-        values = {**found, "loss": torch.stack([*found.values()]).sum(), "quad_mse": squared}
+        values = {**found, "loss": torch.stack([*found.values()]).sum(), "quad_mse": seen.squared}
         values["opacity"] = rendering.opacity.detach().mean()
-        values["count"] = torch.ones_like(squared)
+        values["count"] = torch.ones_like(seen.squared)
         for name, value in values.items():
             state.sums[name] = state.sums[name] + value if name in state.sums else value.clone()
         if rendering.screen is not None:
-            state.statistics = densify.observe(state.statistics, rendering.screen, observations.cameras[frame])
+            camera = observations.cameras[frame] if seen.tof else colour_camera_of(observations.sequence, frame)
+            assert camera is not None
+            state.statistics = densify.observe(state.statistics, rendering.screen, camera)
 
 
 def _densify(state: State, before: int, settings: ReconSettings) -> None:
     """Rounds and resets that are due after a step."""
     options, schedule = settings.densify, settings.schedule
     if densify.round_is_due(before, state.images, options, schedule):
-        judge = options.reset_every is None or state.resets > 0
+        judge = state.images > options.scale_from
         densify.round_of(state.optimiser, state.statistics, options, state.generator, judge_scale=judge)
         field = state.optimiser.field
         state.attachment = state.motion.attach(field)
         state.statistics = densify.start(field)
     if densify.reset_is_due(before, state.images, options, schedule):
         densify.reset_opacity(state.optimiser, options)
-        state.resets += 1
+        state.reset_at = state.images

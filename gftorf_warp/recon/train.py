@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import enum
+import functools
 import logging
 import math
 import signal
@@ -11,6 +13,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import TypeVar
 
 import torch
 
@@ -19,17 +22,18 @@ from ..data.sequence import Sequence
 from ..errors import DivergedError, UsageError
 from ..render.buffers import available_threads
 from ..scene.measured import camera_of, frame_period, sensor_of
-from . import checkpoint, folder, presets
-from .observations import Observations, data_hash, observe
+from . import checkpoint, densify, folder, presets
+from .observations import Observations, data_hash, input_of, observe
 from .optimiser import rates_at
 from .record import Metrics, log_to
 from .run import Run
-from .settings import FlowSource, ReconSettings, plain
+from .settings import FlowSource, Input, Method, ReconSettings, plain
 from .state import State, begin, from_dict, to_dict
 from .step import pool, step, threads_for
 
 LOG = logging.getLogger("gftorf_warp")
 Progress = Callable[..., None]
+Choice = TypeVar("Choice", bound=enum.StrEnum)
 
 
 def reconstruct(
@@ -38,6 +42,8 @@ def reconstruct(
     settings: ReconSettings | str = "demo",
     *,
     images: int | None = None,
+    input: Input | str = Input.AUTO,
+    ablation: str | None = None,
     flow: FlowSource | str | None = None,
     seed: int = 0,
     device: torch.device | str = "cpu",
@@ -46,7 +52,8 @@ def reconstruct(
 ) -> Run:
     """Fit moving Gaussians to the raw quads of a sequence.
 
-    Reads quads, calibration, poses and flow, and nothing else. A folder that holds the same run goes on where it
+    Reads quads, calibration, poses, flow and colour. Truth, where a sequence has it, is read only to be written beside
+    the run, in diagnostics.jsonl: it changes nothing. A folder that holds the same run goes on where it
     stopped, to the same bytes on a CPU as if it had never stopped; Ctrl-C and SIGTERM finish the step and store it.
 
     Args:
@@ -54,6 +61,8 @@ def reconstruct(
         out: Folder of the run: config.json, metrics.jsonl, run.log, ckpt/.
         settings: How, or the name of a preset.
         images: Raw frames to optimise, each as often as its turn comes; None: as the settings say.
+        input: What is compared with the sensor: auto, quads or phasor; counts where ``settings`` is a name.
+        ablation: Row of the ablation table to apply: nobias, dd, h1, h1h2 or h1h2dd; None: none.
         flow: Where optical flow comes from: auto, file, dis, deepflow or none; None: as the settings say.
         seed: Of everything random.
         device: Where to compute, 'cpu' or a CUDA device.
@@ -71,14 +80,18 @@ def reconstruct(
         KeyboardInterrupt: After a signal, when everything is stored.
     """
     begun = time.monotonic()
-    if isinstance(settings, str):
-        settings = presets.preset(settings)
-    if images is not None:
-        settings = replace(settings, schedule=replace(settings.schedule, images=images))
-    if flow is not None:
-        settings = replace(settings, flow=_flow_source(flow))
     if not isinstance(sequence, Sequence):
         sequence = Sequence.open(sequence)
+    if isinstance(settings, str):
+        found = input_of(sequence, _choice(Input, input, "--input"))
+        recorded = presets.Recorded(input=found, unambiguous_range=sensor_of(sequence).unambiguous_range)
+        settings = presets.preset(settings, recorded)
+    if ablation is not None:
+        settings = presets.ablated(settings, ablation)
+    if images is not None and settings.method == Method.GAUSSIANS:
+        settings = replace(settings, schedule=replace(settings.schedule, images=images))
+    if flow is not None:
+        settings = replace(settings, flow=_choice(FlowSource, flow, "--flow"))
     out = Path(out)
     config = _config(sequence, settings, seed=seed, device=device)
     with folder.locked(out):
@@ -88,14 +101,27 @@ def reconstruct(
         return Run.open(out, device)
 
 
-def _flow_source(name: str) -> FlowSource:
-    if name not in list(FlowSource):
-        known = ", ".join(FlowSource)
-        raise UsageError(f"unknown flow {name}", where="--flow", why=f"there are {known}", fix="use --flow auto")
-    return FlowSource(name)
+def _choice(kind: type[Choice], name: str, option: str) -> Choice:
+    """The member of an enumeration that a user named.
+
+    Raises:
+        UsageError: If there is none.
+    """
+    known = [str(member) for member in kind]
+    if name not in known:
+        what = option.lstrip("-")
+        why = f"there are {', '.join(known)}"
+        raise UsageError(f"unknown {what} {name}", where=option, why=why, fix=f"use {option} {known[0]}")
+    return kind(name)
 
 
 def _run(sequence, out, settings, config, seed, device, goes_on, begun, progress) -> None:
+    if settings.method == Method.CTOF:
+        scale = {"quad_scale": 1.0, "quad_scale_source": "nothing is scaled", "flow_source": "none"}
+        size = {"size_optimised": [sequence.width, sequence.height], "input": str(input_of(sequence, settings.input))}
+        folder.write_config(out, config | scale | size | {"seconds_reconstruct": 0.0, "images_optimised": 0})
+        LOG.info("%s is finished: the closed form needs no image", out)
+        return
     stored = checkpoint.last(out, device) if goes_on else None
     total = settings.schedule.images
     if stored is not None and stored["images"] >= total:
@@ -108,6 +134,8 @@ def _run(sequence, out, settings, config, seed, device, goes_on, begun, progress
         "quad_scale": observations.quad_scale,
         "quad_scale_source": observations.quad_scale_source,
         "flow_source": observations.flow_source,
+        "input": str(Input.PHASOR if observations.phasors else Input.QUADS),
+        "colour_scale": observations.colour_scale,
         "size_optimised": [observations.sequence.width, observations.sequence.height],
     }
     folder.write_config(out, config)
@@ -117,6 +145,8 @@ def _run(sequence, out, settings, config, seed, device, goes_on, begun, progress
     moving = int((state.optimiser.layer > 0).sum()) if state.optimiser.layer is not None else 0
     count = len(state.optimiser.field)
     LOG.info("%s %s image %d of %d, %d Gaussians, %d of them moving", out, verb, state.images, total, count, moving)
+    if total <= settings.schedule.warm_up:
+        LOG.warning("nothing will move: the warm-up takes %d images, the run %d", settings.schedule.warm_up, total)
 
     def clock() -> float:
         return earlier + time.monotonic() - begun
@@ -198,10 +228,12 @@ class _Loop:
             total, shown = self.settings.schedule.images, {"loss": row["loss"], "psnr_db": psnr}
             self.progress(state.images, total, **shown, gaussians=row["gaussians"])
 
-    @property
+    @functools.cached_property
     def peak(self) -> float:
-        """Largest absolute quad, in the units of the optimisation."""
-        return float(self.observations.quads.abs().max())
+        """Largest absolute value of what is compared, in the units of the optimisation."""
+        shown = self.observations
+        images = shown.phasors or ({0: shown.quads} if self.settings.weights.quads > 0 else shown.colour)
+        return max(float(image.abs().max()) for image in images.values())
 
     def go_back(self, state: State, broken: dict[str, float]) -> State:
         """The last good checkpoint, with halved rates.
@@ -256,18 +288,24 @@ def resolved(settings: ReconSettings) -> dict[str, object]:
     """What the schedule means in images and in rates, computed the way the loop computes it."""
     schedule, options = settings.schedule, settings.densify
     rounds = options.every is not None
+    opacity_resets = densify.resets(options, schedule)
+    instants = {"first": 0, "after_warm_up": schedule.warm_up, "half_way": schedule.images // 2}
+    freeze = schedule.freeze_from
     return {
         "images": schedule.images,
         "batch": str(schedule.batch),
-        "rates_first": rates_at(settings, schedule.warm_up),
-        "rates_half_way": rates_at(settings, schedule.images // 2),
+        **{f"rates_{name}": rates_at(settings, images) for name, images in instants.items()},
         "rates_last": rates_at(settings, schedule.images),
         "motion_from": schedule.warm_up,
-        "flow_from": schedule.flow_from,
+        "colour_from": schedule.colour_from if settings.weights.colour > 0 else None,
+        "flow_from": schedule.flow_from if settings.weights.flow > 0 else None,
         "distortion_from": math.ceil(schedule.distortion_from * schedule.images),
+        "sh_degree_every": schedule.sh_degree_every,
         "densify_every": options.every,
         "densify_until": math.floor(options.stop_share * schedule.images) if rounds else None,
-        "opacity_reset_every": options.reset_every if rounds else None,
+        "opacity_resets": opacity_resets,
+        "motion_rests_after_reset": schedule.pause_after_reset if opacity_resets else None,
+        "gaussians_frozen_from": None if freeze is None else math.ceil(freeze * schedule.images),
     }
 
 

@@ -11,6 +11,7 @@ import math
 from dataclasses import dataclass
 from enum import StrEnum
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -18,6 +19,7 @@ from torch import Tensor
 from ..constants import FRAMES_PER_QUARTET
 from ..data.sequence import Sequence
 from ..errors import InputError
+from .camera import Camera
 from .gaussians import GaussianField, constant_sh
 from .measured import (
     Change,
@@ -33,6 +35,7 @@ from .measured import (
 from .tracks import follow, unproject
 
 STATIC, MOVING = 0, 1  # labels of the two layers
+EXACT_TREE = 4  # OpenCV's name for a k-d tree that misses no neighbour
 
 
 class Init(StrEnum):
@@ -66,8 +69,8 @@ class InitSettings:
     """Random: number of Gaussians."""
     reflectivity: float = 0.1
     """Random: of every Gaussian [m^2 in quad units]."""
-    range_share: tuple[float, float] = (0.02, 0.9)
-    """Random: nearest and farthest z-depth as shares of the unambiguous range [1]."""
+    bounds: tuple[float, float] = (0.15, 6.75)
+    """Random: nearest and farthest z-depth [m]."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -105,7 +108,7 @@ def from_phase(sequence: Sequence, settings: InitSettings = InitSettings()) -> S
             "the camera moves",
             where=f"{sequence.path or 'sequence'} (camera_from_world)",
             why=f"phase initialisation compares pixels over time, but the poses differ by up to {moved:.3g}",
-            fix="start from random Gaussians",
+            fix="start from random Gaussians: --preset paper or released",
         )
     change = change_of(sequence)
     far = far_layer(sequence, change)
@@ -121,22 +124,65 @@ def from_phase(sequence: Sequence, settings: InitSettings = InitSettings()) -> S
 
 
 def from_random(sequence: Sequence, settings: InitSettings, generator: torch.Generator) -> Start:
-    """Gaussians spread evenly over the volume that the first camera sees, all of them moving (method, section 6.1).
+    """Gaussians spread evenly over all the volume that any camera sees, all of them moving (method, section 6.1).
 
     The scale of each is the root mean square distance to its three nearest neighbours.
     """
-    camera, sensor = camera_of(sequence, 0), sensor_of(sequence)
-    near, far = (share * sensor.unambiguous_range for share in settings.range_share)
-    u = torch.rand(settings.count, 3, generator=generator)
-    z = (near**3 + (far**3 - near**3) * u[:, 2]) ** (1.0 / 3.0)
-    points = u[:, :2] * torch.tensor([camera.width, camera.height])
-    ray = unproject(camera, points, torch.ones(settings.count)) - torch.as_tensor(camera.centre, dtype=torch.float32)
-    axis = torch.as_tensor(camera.camera_from_world[2, :3], dtype=torch.float32)
-    mean = torch.as_tensor(camera.centre, dtype=torch.float32) + ray * (z / (ray @ axis))[:, None]
-    apart = torch.cdist(mean, mean).topk(min(4, settings.count), dim=1, largest=False).values[:, 1:]
-    scale = apart.square().mean(dim=1).sqrt() if settings.count > 1 else torch.ones(1)
+    mean = _in_frusta(_distinct_cameras(sequence), settings, generator)
     reflectivity = torch.full((settings.count,), settings.reflectivity)
-    return Start(field=_field(mean, scale, reflectivity, MOVING, settings.opacity), positions=None, quartet=0)
+    return Start(field=_field(mean, _spacing(mean), reflectivity, MOVING, settings.opacity), positions=None, quartet=0)
+
+
+def _distinct_cameras(sequence: Sequence) -> list[Camera]:
+    """The cameras of all raw frames, each pose once."""
+    _, first = np.unique(sequence.camera_from_world, axis=0, return_index=True)
+    return [camera_of(sequence, int(n)) for n in np.sort(first)]
+
+
+def _in_frusta(cameras: list[Camera], settings: InitSettings, generator: torch.Generator) -> Float[Tensor, "N 3"]:
+    """Points spread evenly over the union of the cameras' frusta between two z-depths.
+
+    Drawn in the frustum of a random camera and kept once in as many times as there are frusta that hold it.
+    """
+    near, far = settings.bounds
+    kept: list[Tensor] = []
+    missing = settings.count
+    while missing > 0:
+        u = torch.rand(missing, 5, generator=generator)
+        which = (u[:, 4] * len(cameras)).long().clamp_max(len(cameras) - 1)
+        z = (near**3 + (far**3 - near**3) * u[:, 2]) ** (1.0 / 3.0)
+        points = torch.empty(missing, 3)
+        for number in which.unique().tolist():
+            rows, camera = which == number, cameras[number]
+            place = u[rows, :2] * torch.tensor([camera.width, camera.height])
+            slopes = (place - torch.tensor([camera.cx, camera.cy])) / torch.tensor([camera.fx, camera.fy])
+            pose = torch.as_tensor(camera.camera_from_world, dtype=torch.float32)
+            local = torch.cat([slopes, torch.ones(len(slopes), 1)], dim=1) * z[rows, None]
+            points[rows] = (local - pose[:3, 3]) @ pose[:3, :3]
+        holders = torch.stack([_holds(camera, points, near, far) for camera in cameras]).sum(dim=0).clamp_min(1)
+        kept.append(points[u[:, 3] * holders < 1.0])
+        missing = settings.count - sum(map(len, kept))
+    return torch.cat(kept)
+
+
+def _holds(camera: Camera, points: Float[Tensor, "N 3"], near: float, far: float) -> Bool[Tensor, "N"]:
+    """Which points lie in the frustum of a camera."""
+    pose = torch.as_tensor(camera.camera_from_world, dtype=torch.float32)
+    z = points @ pose[2, :3] + pose[2, 3]
+    x, y = camera.project(points).unbind(dim=1)
+    return (z >= near) & (z <= far) & (x >= 0) & (x <= camera.width) & (y >= 0) & (y <= camera.height)
+
+
+def _spacing(points: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
+    """Root mean square distance of every point to its three nearest neighbours [m]; 1 for a point alone."""
+    if len(points) < 2:
+        return torch.ones(len(points))
+    import cv2
+
+    neighbours = min(4, len(points))
+    tree = cv2.flann.Index(points.contiguous().numpy(), {"algorithm": EXACT_TREE, "leaf_max_size": 10})
+    _, squared = tree.knnSearch(points.contiguous().numpy(), neighbours, params={"checks": -1})
+    return torch.from_numpy(squared[:, 1:]).mean(dim=1).sqrt()  # the nearest of all is the point itself
 
 
 def _static_layer(sequence: Sequence, far: FarLayer, settings: InitSettings) -> GaussianField:

@@ -7,8 +7,7 @@ Keys lie at the start of every quartet, one more after the last frame. Inside qu
 so a trajectory is continuous, and this file is the only place that interpolates. Before the first key and after the
 last a Gaussian stays where the nearest key has put it. Only positions move: shape, opacity and reflectivity stay.
 
-A network that predicts offsets is a third final class beside :class:`Still` and :class:`Nodes`: its ``attach`` returns
-the positions it is queried at, its ``key_offset`` the prediction for one key.
+A third final class beside :class:`Still` and :class:`Nodes` is in network.py.
 """
 
 from __future__ import annotations
@@ -33,6 +32,8 @@ class MotionKind(StrEnum):
     """Nothing moves: the control."""
     NODES = "nodes"
     """Key offsets on nodes."""
+    NETWORK = "network"
+    """Key offsets from a network of position and time, as published."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,11 +47,33 @@ class MotionSettings:
     neighbours: int = 4
     """Nodes that a Gaussian follows at most."""
     from_tracks: bool = True
-    """Whether keys start where optical flow and decoded distance lead; otherwise at rest."""
+    """Nodes: whether keys start where optical flow and decoded distance lead; otherwise at rest."""
+    layers: int = 8
+    """Network: layers before the head."""
+    width: int = 256
+    """Network: width of every layer."""
+    skip_after: int = 5
+    """Network: the input is joined to the output of this layer."""
+    position_frequencies: int = 10
+    """Network: frequencies of the encoded position."""
+    time_frequencies: int = 10
+    """Network: frequencies of the encoded time."""
+    input_scale: float = 1.0
+    """Network: positions are divided by this many unambiguous ranges [1]."""
+
+    def __post_init__(self):
+        for name in ("layers", "width", "skip_after"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        if not self.input_scale > 0:
+            raise ValueError(f"input_scale must be above 0, got {self.input_scale}")
 
 
 class Motion(torch.nn.Module, abc.ABC):
-    """Displacements of Gaussians over time. Final classes: :class:`Still`, :class:`Nodes`."""
+    """Displacements of Gaussians over time. Final classes: :class:`Still`, :class:`Nodes`, network.Network."""
+
+    follows_means = False
+    """Whether ``attach`` depends on where Gaussians are now, so that it has to be asked again after every step."""
 
     def __init__(self, key_times: Float[Tensor, "T"]):
         super().__init__()
@@ -65,16 +88,20 @@ class Motion(torch.nn.Module, abc.ABC):
         """What the motion needs to know of each Gaussian; computed anew whenever Gaussians come or go, else kept."""
 
     @abc.abstractmethod
+    def key_offsets(self, attachment: Float[Tensor, "N M"], keys: list[int]) -> Float[Tensor, "k N 3"]:
+        """Displacements [m] of every Gaussian at the key times of these numbers."""
+
     def key_offset(self, attachment: Float[Tensor, "N M"], key: int) -> Float[Tensor, "N 3"]:
         """Displacement [m] of every Gaussian at key time number ``key``."""
+        return self.key_offsets(attachment, [key])[0]
 
     def displacement(self, attachment: Float[Tensor, "N M"], time: float) -> Float[Tensor, "N 3"]:
         """Displacement [m] of every Gaussian at ``time`` [s], any number; held constant outside the keys."""
         key, share = self.position(time)
-        start = self.key_offset(attachment, key)
         if share == 0.0:
-            return start
-        return (1.0 - share) * start + share * self.key_offset(attachment, key + 1)
+            return self.key_offset(attachment, key)
+        start, end = self.key_offsets(attachment, [key, key + 1])
+        return (1.0 - share) * start + share * end
 
     def position(self, time: float) -> tuple[int, float]:
         """The key i at or before ``time`` [s] and the share j - i of the way to the next one, in [0, 1)."""
@@ -92,9 +119,9 @@ class Still(Motion):
         """Nothing is needed."""
         return field.mean.new_zeros(len(field), 0)
 
-    def key_offset(self, attachment: Float[Tensor, "N 0"], key: int) -> Float[Tensor, "N 3"]:  # noqa: ARG002
+    def key_offsets(self, attachment: Float[Tensor, "N 0"], keys: list[int]) -> Float[Tensor, "k N 3"]:
         """Zero."""
-        return attachment.new_zeros(len(attachment), 3)
+        return attachment.new_zeros(len(keys), len(attachment), 3)
 
 
 class Nodes(Motion):
@@ -161,9 +188,9 @@ class Nodes(Motion):
             weight[rows[:, None], columns[index]] = share
         return weight
 
-    def key_offset(self, attachment: Float[Tensor, "N M"], key: int) -> Float[Tensor, "N 3"]:
-        """Weighted mean of the node offsets."""
-        return attachment @ self.offset[key]
+    def key_offsets(self, attachment: Float[Tensor, "N M"], keys: list[int]) -> Float[Tensor, "k N 3"]:
+        """Weighted means of the node offsets."""
+        return torch.stack([attachment @ self.offset[key] for key in keys])
 
 
 def farthest_points(points: Float[Tensor, "N 3"], count: int) -> Int[Tensor, "M"]:

@@ -1,0 +1,107 @@
+"""Motion as a network of position and time: one multi-layer perceptron gives the offset of every Gaussian at every key.
+
+    delta(x, t) = head(layers([gamma(x), gamma(t)])),   gamma(v) = [v, sin 2^0 v, cos 2^0 v, .., sin 2^9 v, cos 2^9 v]
+
+Layers end in a ReLU (method, section 4). Positions are divided by a length and enter without gradient; t runs from 0 at
+the first raw frame to 1 at the last. The encoded input is joined to the output of the fifth layer again.
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from .gaussians import GaussianField
+from .motion import Motion, MotionSettings
+
+HEAD_DEVIATION = 1e-5  # of the weights of the last layer: motion starts at rest, to a hundredth of a millimetre
+
+
+class Network(Motion):
+    """Key offsets from a perceptron that knows nothing of single Gaussians: whoever is at a place moves with it."""
+
+    follows_means = True
+
+    def __init__(
+        self,
+        key_times: Float[Tensor, "T"],
+        settings: MotionSettings,
+        *,
+        duration: float,
+        length: float,
+        generator: torch.Generator | None = None,
+    ):
+        """Draw the weights.
+
+        Args:
+            key_times: Start of every quartet and the time one quartet after the last start [s].
+            settings: Layers, width and frequencies.
+            duration: Time from the first raw frame to the last [s]; key times divided by it enter the network.
+            length: Positions divided by this enter the network [m].
+            generator: For the weights, on the CPU.
+
+        Raises:
+            ValueError: If duration or length is not above 0.
+        """
+        super().__init__(key_times)
+        if not (duration > 0 and length > 0):
+            raise ValueError(f"duration and length must be above 0, got {duration} s and {length} m")
+        self.settings, self.duration, self.length = settings, float(duration), float(length)
+        self._inputs = (_encoded_size(3, settings.position_frequencies), _encoded_size(1, settings.time_frequencies))
+        joined, width = sum(self._inputs), settings.width
+        sizes = [joined] + [width] * (settings.layers - 1)
+        if settings.skip_after < settings.layers:
+            sizes[settings.skip_after] += joined
+        self._layers = [torch.nn.Linear(size, width) for size in sizes]
+        self.layers = torch.nn.ModuleList(self._layers)
+        self.head = torch.nn.Linear(width, 3)
+        with torch.no_grad():
+            for layer in self._layers:
+                torch.nn.init.xavier_normal_(layer.weight, generator=generator)
+                layer.bias.zero_()
+            self.head.weight.normal_(0.0, HEAD_DEVIATION, generator=generator)
+            self.head.bias.zero_()
+
+    def attach(self, field: GaussianField) -> Float[Tensor, "N 3"]:
+        """The positions at which it is asked, without gradient [m]."""
+        return field.mean.detach()
+
+    def key_offsets(self, attachment: Float[Tensor, "N 3"], keys: list[int]) -> Float[Tensor, "k N 3"]:
+        """Displacements [m] at several keys.
+
+        A layer is linear, so what it makes of positions is computed once for all keys, and what it makes of a time is
+        one vector, added like a bias.
+        """
+        place = encoded(attachment / self.length, self.settings.position_frequencies)
+        seconds = attachment.new_tensor([self._times[key] for key in keys])[:, None]
+        moment = encoded(seconds / self.duration, self.settings.time_frequencies)
+        hidden = self._joined(self._layers[0], None, place, moment)
+        for number, layer in enumerate(self._layers[1:], start=1):
+            hidden = torch.relu(hidden)
+            skip = number == self.settings.skip_after
+            hidden = self._joined(layer, hidden, place, moment) if skip else layer(hidden)
+        return self.head(torch.relu(hidden))
+
+    def _joined(
+        self, layer: torch.nn.Linear, hidden: Tensor | None, place: Float[Tensor, "N p"], moment: Float[Tensor, "k t"]
+    ) -> Float[Tensor, "k N width"]:
+        """A layer of [hidden, gamma(x), gamma(t)] without building that."""
+        weight, first = layer.weight, 0 if hidden is None else self.settings.width
+        at_place, at_moment = weight[:, first:].split(self._inputs, dim=1)
+        shared = place @ at_place.T
+        own = moment @ at_moment.T + layer.bias
+        out = shared + own[:, None]
+        return out if hidden is None else out + hidden @ weight[:, :first].T
+
+
+def encoded(value: Float[Tensor, "*n d"], frequencies: int) -> Float[Tensor, "*n e"]:
+    """gamma(v): the values themselves, then sine and cosine of 2^0 v, 2^1 v, .., without a factor pi."""
+    powers = 2.0 ** torch.arange(frequencies, dtype=value.dtype, device=value.device)
+    angles = value[..., None, :] * powers[:, None]
+    waves = torch.stack([angles.sin(), angles.cos()], dim=-2)
+    return torch.cat([value, waves.flatten(start_dim=-3)], dim=-1)
+
+
+def _encoded_size(dimensions: int, frequencies: int) -> int:
+    return dimensions * (1 + 2 * frequencies)
