@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from cases import POSED, SMALL, Case, gaussians
+from cases import POSED, SMALL, Case, gaussians, pose
 from mistakes import centres, dots, surface
 from torch.testing import assert_close
 
@@ -20,6 +20,7 @@ from gftorf_warp.render import api, reference
 from gftorf_warp.render.api import Background, rasterize
 from gftorf_warp.render.buffers import RenderSettings
 from gftorf_warp.scene.camera import Camera
+from gftorf_warp.scene.motion import Nodes
 from gftorf_warp.scene.sensor import Sensor, distance_from_phasor, phasor_from_quads
 from gftorf_warp.scene.tracks import unproject
 
@@ -98,22 +99,11 @@ def test_mistake_08_pixel_centres_are_the_same_for_renderer_rays_and_back_projec
     assert row[0] > 0.1
 
 
-class Approaching:
-    """A motion of everything at once, known at two keys."""
-
-    def __init__(self, step):
-        self.step = torch.tensor(step, dtype=torch.float32, requires_grad=True)
-
-    def key_offset(self, attachment, key):
-        """Rest at key 0, one step later at key 1."""
-        return key * self.step.expand(len(attachment), 3)
-
-
 class Measured:
-    """Observations of flow, and of nothing else."""
+    """Observations of flow from one quartet to the next, and of nothing else."""
 
-    def __init__(self, camera, flow):
-        self.cameras, self.flow = [camera], {(0, 1): flow}
+    def __init__(self, cameras, flow):
+        self.cameras, self.flow = cameras, {(0, 1): flow}
 
     def sensor_at(self, _):
         """The sensor."""
@@ -129,15 +119,17 @@ def wall_flow(camera, step, half=0.0):
     return torch.stack([u, v])
 
 
-def flow_loss_of(camera, step, flow):
-    """Flow loss [px^2] of a wall at z = 2 m in camera axes that moves by ``step`` in camera axes."""
+def flow_loss_of(camera, step, flow, later=None):
+    """Flow loss [px^2] of a wall at z = 2 m that moves by ``step``, in camera axes, while the camera may move, too."""
     x, y = ((centres(camera) - torch.tensor([camera.cx, camera.cy])) / torch.tensor([camera.fx, camera.fy])).unbind(-1)
     field = surface(camera, 2.0 * (1.0 + x.square() + y.square()).sqrt(), opacity=0.98)
-    world = camera.camera_from_world[:3, :3].T @ np.array(step)
-    settings = objective.ReconSettings(preset="test")
-    motion, nothing = Approaching(world.tolist()), torch.zeros(len(field), 0)
-    loss = objective.flow_loss(field, motion, nothing, Measured(camera, flow), 0, settings)
-    (gradient,) = torch.autograd.grad(loss, motion.step)
+    field = replace(field, layer=torch.ones(len(field), dtype=torch.long))
+    world = torch.from_numpy(camera.camera_from_world[:3, :3].T @ np.array(step)).float()
+    offset = torch.stack([torch.zeros(1, 3), world[None]])
+    motion = Nodes(torch.tensor([0.0, 1.0]), torch.zeros(1, 3), torch.ones(1, dtype=torch.long), offset)
+    measured = Measured([camera] * 4 + [later or camera], flow)
+    loss = objective.flow_loss(field, motion, motion.attach(field), measured, 0, RenderSettings())
+    (gradient,) = torch.autograd.grad(loss, motion.offset)
     assert gradient.isfinite().all()
     return float(loss.detach())
 
@@ -158,6 +150,21 @@ def test_mistake_20_flow_and_surface_use_the_pose_and_not_its_inverse():
     still = flow_loss_of(camera, step, torch.zeros(2, 18, 25))
     assert still > 1.0
     assert flow_loss_of(camera, step, wall_flow(camera, step)) < 0.01 * still
+
+
+def test_mistake_20_a_moving_camera_moves_the_image_the_other_way():
+    """Flow of a wall at rest between two poses: what the second camera sees where, and not the inverse of that."""
+    camera = POSED.resized(25, 18)
+    moved = pose((0.2, 1.0, 0.1), 0.04, (0.05, -0.08, 0.1))
+    flows = []
+    for later_from_camera in (moved, np.linalg.inv(moved)):
+        x, y = centres(camera).unbind(-1)
+        local = torch.stack([(x - camera.cx) / camera.fx * 2.0, (y - camera.cy) / camera.fy * 2.0, 0 * x + 2.0], -1)
+        flows.append((camera.at(later_from_camera).project(local) - centres(camera)).permute(2, 0, 1))
+    later = camera.at(moved @ camera.camera_from_world)
+    right, wrong = (flow_loss_of(camera, (0.0, 0.0, 0.0), flow, later) for flow in flows)
+    assert wrong > 1.0
+    assert right < 0.01 * wrong
 
 
 def test_mistake_20_back_projection_is_the_inverse_of_rendering():
