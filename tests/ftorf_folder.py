@@ -47,6 +47,15 @@ def scene(
     return Sequence(**fields | changes), truth
 
 
+def random_poses(frames, generator):
+    """Rigid motions that nothing relates."""
+    poses = np.tile(np.eye(4), (frames, 1, 1))
+    poses[:, :3, :3] = np.linalg.qr(generator.normal(size=(frames, 3, 3)))[0]
+    poses[:, :3, 0] *= np.linalg.det(poses[:, :3, :3])[:, None]
+    poses[:, :3, 3] = generator.normal(size=(frames, 3))
+    return poses
+
+
 def assert_same(got, want):
     """Two sequences hold the same bits, apart from where they are from."""
     for field in dataclasses.fields(Sequence):

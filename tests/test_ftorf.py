@@ -9,7 +9,7 @@ from unittest import mock
 
 import numpy as np
 import pytest
-from ftorf_folder import REAL_ORDER, SAMPLE, assert_same, assert_same_bits, fingerprint, scene
+from ftorf_folder import REAL_ORDER, SAMPLE, assert_same, assert_same_bits, fingerprint, random_poses, scene
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -229,6 +229,54 @@ def test_poses_count_only_where_the_folder_says_so(folder):
     assert "other poses" in got.sources["camera_from_world"]
 
 
+def colour_at(height, width):
+    """One random colour image."""
+    return {0: np.random.default_rng(0).random((height, width, 3)).astype(np.float32)}
+
+
+def test_the_colour_camera_is_that_of_the_files(folder):
+    """Intrinsics in the pixel centres of the folder; poses only where the folder says that poses count."""
+    (folder / "color").mkdir()
+    np.save(folder / "color/0000.npy", colour_at(12, 16)[0])
+    np.save(folder / "cams/color_intrinsics.npy", np.array([[20.0, 0, 7.0], [0, 21.0, 5.0], [0, 0, 1]]))
+    poses = np.tile(np.eye(4), (8, 1, 1))
+    poses[:, 0, 3] = 0.05
+    np.save(folder / "cams/color_extrinsics.npy", poses)
+    got = ftorf.read(folder)
+    assert got.colour_intrinsics == (20.0, 21.0, 7.5, 5.5)
+    np.testing.assert_array_equal(got.colour_from_world, poses)
+    (folder / "cams/pixel_centre.json").write_text('{"pixel_centre": "half"}')
+    assert ftorf.read(folder).colour_intrinsics == (20.0, 21.0, 7.0, 5.0)
+    (folder / "cams/poses.json").unlink()
+    np.testing.assert_array_equal(ftorf.read(folder).colour_from_world, np.tile(np.eye(4), (8, 1, 1)))
+
+
+def test_without_its_files_the_colour_camera_is_the_tof_camera(folder):
+    """Intrinsics scaled to the colour image and flagged, poses those of the ToF camera; none without colour."""
+    assert (ftorf.read(folder).colour_intrinsics, ftorf.read(folder).colour_from_world) == (None, None)
+    (folder / "color").mkdir()
+    np.save(folder / "color/0000.npy", colour_at(12, 24)[0])
+    for name in ("color_intrinsics", "color_extrinsics"):
+        (folder / f"cams/{name}.npy").unlink()
+    poses = np.tile(np.eye(4), (8, 1, 1))
+    poses[:, 1, 3] = np.arange(8)
+    np.save(folder / "cams/tof_extrinsics.npy", poses)
+    got = ftorf.read(folder)
+    assert got.colour_intrinsics == (3 * got.fx, 2 * got.fy, 3 * got.cx, 2 * got.cy)
+    assert got.sources["colour_intrinsics"].startswith("inferred")
+    np.testing.assert_array_equal(got.colour_from_world, poses)
+
+
+@pytest.mark.parametrize("shape", [(3, 4), (4, 4), (3, 5), (4, 5)])
+def test_novel_views_are_read_in_every_shape(folder, shape):
+    """Rows and columns beyond the rotation and the translation are left out or made up."""
+    want = random_poses(5, np.random.default_rng(1))
+    np.save(
+        folder / "test_poses.npy", np.concatenate([want, np.full((5, 4, 1), 7.0)], axis=2)[:, : shape[0], : shape[1]]
+    )
+    np.testing.assert_array_equal(ftorf.read(folder).novel_from_world, want)
+
+
 def test_truth_masks_what_nobody_knows(folder):
     """Frames without a file are unknown, and so are pixels of NaN or 0; frames after the sequence are not read."""
     image = np.full((6, 8), 2.0, np.float32)
@@ -267,10 +315,7 @@ def sequences(draw):
     measured[draw(st.integers(0, frames - 1))] = True
     quads = (generator.normal(size=(frames, height, width)) * 10.0 ** draw(st.integers(-30, 30))).astype(np.float32)
     quads[~measured] = 0.0
-    poses = np.tile(np.eye(4), (frames, 1, 1))
-    poses[:, :3, :3] = np.linalg.qr(generator.normal(size=(frames, 3, 3)))[0]
-    poses[:, :3, 0] *= np.linalg.det(poses[:, :3, :3])[:, None]
-    poses[:, :3, 3] = generator.normal(size=(frames, 3))
+    poses = random_poses(frames, generator)
     steps = generator.random(frames - 1) * (generator.random(frames - 1) < 0.5)
 
     def images(*shape, unknown):
@@ -281,6 +326,7 @@ def sequences(draw):
             result[n] = np.where(generator.random(shape) < 0.2, np.float32(np.nan), image) if unknown else image
         return dict(sorted(result.items()))
 
+    colour = images(draw(st.integers(1, 3)), draw(st.integers(1, 3)), 3, unknown=False)
     sequence = Sequence(
         quads=quads,
         measured=measured,
@@ -295,7 +341,10 @@ def sequences(draw):
         cy=draw(st.integers(-64, 64)) / 8,
         camera_from_world=poses,
         quad_scale=draw(st.none() | st.floats(1e-3, 1e3)),
-        colour=images(draw(st.integers(1, 3)), draw(st.integers(1, 3)), 3, unknown=False),
+        colour=colour,
+        colour_intrinsics=(draw(st.floats(0.5, 50.0)), 3.0, 1.25, -0.5) if colour else None,
+        colour_from_world=random_poses(frames, generator) if colour else None,
+        novel_from_world=random_poses(3, generator) if draw(st.booleans()) else None,
         forward_flow=images(2, height, width, unknown=True),
         backward_flow=images(2, height, width, unknown=True),
     )
@@ -374,7 +423,8 @@ def test_the_page_beside_the_descriptions_names_every_field():
     for field in specs.fields("ftorf").values():
         assert all(f"`{path}`" in page for path in field.paths), field.name
     included = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["hatch"]["build"]["targets"]["wheel"]
-    assert included["force-include"] == {"data_specs/ftorf.toml": "gftorf_warp/data/specs/ftorf.toml"}
+    names = [path.name for path in (ROOT / "data_specs").glob("*.toml")]
+    assert included["force-include"] == {f"data_specs/{name}": f"gftorf_warp/data/specs/{name}" for name in names}
     assert (specs.INSTALLED / "ftorf.toml").parts[-4:] == ("gftorf_warp", "data", "specs", "ftorf.toml")
 
 
@@ -402,6 +452,10 @@ def poses_with(**changes):
         ({"camera_from_world": poses_with(row=0, column=0, value=-1.0)}, "camera_from_world"),
         ({"camera_from_world": poses_with(row=3, column=0, value=1.0)}, "camera_from_world"),
         ({"colour": {0: np.full((2, 2, 3), np.inf)}}, "colour"),
+        ({"colour_intrinsics": (0.01, 9.0, 4.0, 3.0)}, "colour_intrinsics"),
+        ({"colour_intrinsics": (9.0, 9.0, 4.0, np.nan)}, "colour_intrinsics"),
+        ({"colour_from_world": poses_with(row=0, column=0, value=-1.0)}, "colour_from_world"),
+        ({"novel_from_world": 2.0 * np.eye(4)[None]}, "novel_from_world"),
         ({"forward_flow": {0: np.full((2, 6, 8), np.inf)}}, "flow"),
     ],
 )
@@ -433,6 +487,10 @@ def test_truth_that_is_no_distance_is_refused(tmp_path, value):
         {"forward_flow": {0: np.zeros((6, 8, 2))}},
         {"backward_flow": {8: np.zeros((2, 6, 8))}},
         {"colour": {0: np.zeros((6, 8, 3)), 1: np.zeros((6, 9, 3))}},
+        {"colour_from_world": np.eye(4)},
+        {"colour_intrinsics": (9.0, 9.0, 4.0)},
+        {"novel_from_world": np.eye(4)},
+        {"from_phasors": True},
     ],
 )
 def test_parts_that_do_not_fit_together_are_a_programming_mistake(tmp_path, changes):

@@ -100,7 +100,12 @@ def test_a_folder_of_phasors_is_told_from_one_of_quads(folder):
     Sequence.open(folder)
     for slot in range(4):
         shutil.rmtree(folder / f"tofType{slot}")
-    assert "phasors" in refused(folder).what
+    assert "no phasors" in refused(folder).what
+    np.save(folder / "tof/0000.npy", np.ones((6, 8, 3)))
+    for name in ("frame_times", "tof_extrinsics", "color_extrinsics"):
+        (folder / f"cams/{name}.npy").unlink()
+    assert Sequence.open(folder).from_phasors
+    assert_names(refused(folder, read=ftorf.read), "seq", "not an F-ToeRF folder", "tofType0")
 
 
 def test_no_frame_of_its_own_slot_is_no_raw_frame(folder):
@@ -151,6 +156,11 @@ def test_no_frame_of_its_own_slot_is_no_raw_frame(folder):
         ("cams/tof_extrinsics.npy", np.tile(2 * np.eye(4), (8, 1, 1)), ["tof_extrinsics", "rotations", "2.0"]),
         ("cams/tof_extrinsics.npy", np.tile(np.diag([1.0, 1, -1, 1]), (8, 1, 1)), ["tof_extrinsics", "determinant"]),
         ("cams/tof_extrinsics.npy", np.full((8, 4, 4), 1e200), ["tof_extrinsics", "rotations"]),
+        ("cams/color_extrinsics.npy", np.tile(np.eye(4), (7, 1, 1)), ["color_extrinsics", "8", "7"]),
+        ("cams/color_extrinsics.npy", np.tile(2 * np.eye(4), (8, 1, 1)), ["color_extrinsics", "rotations"]),
+        ("cams/color_intrinsics.npy", np.diag([0.2, 0.2, 1.0]), ["implausible intrinsics", "0.2"]),
+        ("test_poses.npy", np.tile(2 * np.eye(4), (2, 1, 1)), ["test_poses", "rotations"]),
+        ("test_poses.npy", np.eye(4), ["test_poses", "(M, 3, 4)", "(4, 4)"]),
         ("cams/frame_times.npy", np.arange(7.0), ["frame_times", "8", "7"]),
         ("cams/frame_times.npy", np.arange(8.0) + 1, ["frame_times", "start at 0"]),
         ("cams/frame_times.npy", np.array([0, 1, 2, 3, 2.5, 5, 6, 7]), ["frame_times", "after frame 3"]),
@@ -158,7 +168,7 @@ def test_no_frame_of_its_own_slot_is_no_raw_frame(folder):
 )
 def test_a_wrong_array_is_named_with_field_expected_and_found(folder, name, array, words):
     """One file is broken, and the message is about that file."""
-    (folder / name).unlink()
+    (folder / name).unlink(missing_ok=True)
     np.save(folder / name, array)
     assert_names(refused(folder), name, *words)
 

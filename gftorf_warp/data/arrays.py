@@ -16,7 +16,7 @@ from .matlab import read_matrix
 from .specs import Field
 
 SIDE_MAX = 8192  # [px] no C-ToF image is larger; a forged header would ask for terabytes
-LIMITS = {"H": SIDE_MAX, "W": SIDE_MAX, "h": SIDE_MAX, "w": SIDE_MAX, "F": 1_000_000, "P": 1_000_000}
+LIMITS = {"H": SIDE_MAX, "W": SIDE_MAX, "h": SIDE_MAX, "w": SIDE_MAX} | dict.fromkeys("FPM", 1_000_000)
 SMALL_FILE_BYTES = 65_536  # .json and .mat calibration files hold a few numbers; a larger one is something else
 KINDS = {"f": "floating point", "i": "integer", "u": "unsigned integer"}
 

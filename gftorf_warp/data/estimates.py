@@ -16,6 +16,7 @@ PAIRINGS = (((0, 1), (2, 3)), ((0, 2), (1, 3)), ((0, 3), (1, 2)))  # of the four
 STATIC_QUANTILE = 0.5  # the half of the pixels that changes least over time counts as static
 BRIGHT_QUANTILE = 0.5  # and of those the brighter half, where noise does not decide
 STILL_M = 1e-3  # [m] truth that changes less within a quartet is static
+CHANGED = 0.25  # of the amplitude: more than noise on bright pixels
 MOVING_PX = 0.5  # [px] flow above this is motion
 
 
@@ -30,6 +31,21 @@ def steady_pixels(sequence: Sequence) -> np.ndarray:
     relative = change / np.maximum(amplitude, np.finfo(np.float64).tiny)
     steady = relative <= np.quantile(relative, STATIC_QUANTILE)
     return steady & (amplitude >= np.quantile(amplitude[steady], BRIGHT_QUANTILE)) & (amplitude > 0)
+
+
+def changed_share(sequence: Sequence) -> float:
+    """Share of bright pixels whose phasor changes from the first complete quartet to the last."""
+    first, last = (quartet_phasor(sequence, sequence.complete_quartets[at]) for at in (0, -1))
+    amplitude = np.hypot(*first)
+    bright = amplitude >= np.quantile(amplitude, BRIGHT_QUANTILE)
+    return float((np.hypot(*(last - first)) > CHANGED * amplitude)[bright].mean())
+
+
+def distance_of_z(sequence: Sequence, truth: Truth) -> np.ndarray:
+    """Distances [F, H, W] [m] if the numbers of the truth were z-depths."""
+    y, x = np.mgrid[0 : sequence.height, 0 : sequence.width] + 0.5
+    slopes = (x - sequence.cx) / sequence.fx, (y - sequence.cy) / sequence.fy
+    return (truth.distance * np.sqrt(1.0 + slopes[0] ** 2 + slopes[1] ** 2)).astype(np.float32)
 
 
 def dc_offset(sequence: Sequence) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -87,21 +88,25 @@ class Sequence:
         """Read a sequence from a folder.
 
         Args:
-            path: An F-ToeRF folder.
-            frame_rate_hz: Raw frames per second; overrides what the folder says or the default of 120.
+            path: An F-ToeRF folder of raw quads, or a ToeRF folder of phasors.
+            frame_rate_hz: Raw frames per second, or phasors per second of a ToeRF folder; overrides what the folder
+                says or the default of 120, or 30.
 
         Raises:
             InputError: If the folder or a file in it is not what data_specs/ describes.
         """
-        from . import ftorf
-
-        return ftorf.read(path, frame_rate_hz=frame_rate_hz)
+        return _reader(path).read(path, frame_rate_hz=frame_rate_hz)
 
     def truth(self) -> Truth | None:
         """Ground truth stored beside the sequence, read now; None if there is none."""
-        from . import ftorf
+        return None if self.path is None else _reader(self.path).read_truth(self.path, frames=self.frames)
 
-        return None if self.path is None else ftorf.read_truth(self.path, frames=self.frames)
+
+def _reader(path: str | Path) -> ModuleType:
+    """The module that reads a folder."""
+    from . import folder, ftorf, torf
+
+    return {"ftorf": ftorf, "torf": torf}[folder.format_of(Path(path))]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

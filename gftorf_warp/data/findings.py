@@ -1,0 +1,234 @@
+"""What ``gftorf check`` finds in the images of a sequence: order, scale, truth, flow, a camera that moved."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from ..constants import FRAMES_PER_QUARTET, SPEED_OF_LIGHT
+from ..errors import InputError
+from . import estimates, specs, torf
+from .arrays import as_float32, read_array
+from .decode import closed_form_distance, largest_amplitude, quad_scale
+from .folder import numbered
+from .sequence import Sequence, Truth
+
+NAMES = {"ftorf": "F-ToeRF", "torf": "ToeRF"}
+DC_TOLERANCE = 0.1  # [1] real differential quads stay within a few hundredths of 0, unipolar ones are at 1
+SATURATED_SHARE = 1e-3  # of the pixels of a frame at the very extreme: light repeats itself only where it is cut off
+SATURATED_PIXELS = 10  # and no fewer, so that the one brightest pixel of a small image is none
+MATCH_MIN = 0.9  # of the correlation of stored phasors with the quads: motion alone costs a few per cent
+RANGE_TOLERANCE = 0.02  # relative, of the depth_range that the truth implies
+OFFSET_TOLERANCE_RAD = 0.05  # [rad] 6 cm at 20 MHz
+DECODED_M = 1e-3  # [m] a "truth" this close to the decoded quads, where those change by more, was decoded from them
+DECODED_SHARE = 0.9  # of the changing pixels
+CHANGING_PIXELS = 100  # a static scene without noise is decoded to its truth, and nothing is wrong with that
+THIRD_MATCH_MIN = 0.9  # of the correlation of the third channel with the length of (re, im), where it is an amplitude
+MOVED_SHARE = 0.5  # of the bright pixels: an object alone rarely covers as much
+BASELINE_MAX_M = 1.0  # [m] two cameras of one housing are centimetres apart
+Z_FITS = 0.8  # of the residual as distance: below, the stored numbers are z-depth
+FITTED_M = 1e-3  # [m] a residual below this needs no other explanation
+
+
+@dataclass(kw_only=True)
+class Report:
+    """Outcome of a check; ``str`` of it is what is printed."""
+
+    path: Path
+    """The sequence."""
+    form: str
+    """Its format, ``ftorf`` or ``torf``."""
+    lines: list[str] = field(default_factory=list)
+    """Facts, one a line."""
+    warnings: list[str] = field(default_factory=list)
+    """What looks wrong, or was assumed."""
+
+    def __str__(self) -> str:
+        flags = [f"warning: {text}" for text in self.warnings] or ["no warnings"]
+        return "\n".join([f"{self.path}: {NAMES[self.form]} sequence", *(f"  {line}" for line in self.lines), *flags])
+
+
+def light(sequence: Sequence, report: Report) -> None:
+    """Amplitude and saturation."""
+    factor, source = quad_scale(sequence)
+    report.lines.append(
+        f"amplitude       largest phasor {largest_amplitude(sequence):.6g}; quads times {factor:.6g}; {source}"
+    )
+    extremes = float(sequence.quads.min()), float(sequence.quads.max())
+    pixels = sequence.height * sequence.width
+    at_extreme = np.isin(sequence.quads[sequence.measured], extremes).sum(axis=(1, 2))
+    cut = at_extreme[at_extreme >= max(SATURATED_PIXELS, SATURATED_SHARE * pixels)]
+    if len(cut):
+        report.warnings.append(
+            f"saturation: up to {cut.max() / pixels:.1%} of the pixels of {len(cut)} raw frames sit at the extreme "
+            f"values {extremes[0]:.4g} and {extremes[1]:.4g}, which biases phase"
+        )
+
+
+def order(sequence: Sequence, report: Report) -> None:
+    """Constant part and order of raw quads."""
+    estimate = estimates.dc_offset(sequence)
+    report.lines.append(
+        f"dc estimate     {estimate:.4f} = mean(Q0 + Q1 + Q2 + Q3) / (4 mean a), {sequence.dc_offset:g} in use"
+    )
+    if abs(estimate - sequence.dc_offset) > DC_TOLERANCE:
+        report.warnings.append(f"dc_offset {sequence.dc_offset:g} is in use, but the quads say {estimate:.3f}")
+    stated, shares = estimates.pairings(sequence)
+    texts = ["".join(f"(q{a},q{b})" for a, b in pairs) for pairs in estimates.PAIRINGS]
+    found = ", ".join(f"{text} on {share:.0%}" for text, share in zip(texts, shares, strict=True))
+    report.lines.append(f"order           opposite pairs fit best: {found} of bright static pixels")
+    if stated is not None and shares[stated] < max(shares):
+        best = int(np.argmax(shares))
+        report.warnings.append(
+            f"quad order doubtful: stored pairing {texts[stated]} fits {shares[stated]:.0%} of static pixels, "
+            f"{texts[best]} {shares[best]:.0%}; check tof_permutation.npy"
+        )
+
+
+def third_channel(sequence: Sequence, report: Report) -> None:
+    """Third channel of stored phasors against the length of the first two."""
+    assert sequence.path is not None
+    spec = specs.fields(report.form)["phasor"]
+    files, _ = torf.phasor_files(sequence.path)
+    stored = np.stack([as_float32(f, spec, read_array(f, spec))[0] for f in files.values()]).astype(np.float64)
+    length, third = np.hypot(stored[..., 0], stored[..., 1]), stored[..., 2]
+    scale = math.sqrt(float((length**2).sum()) * float((third**2).sum()))
+    correlation = float((length * third).sum()) / scale if scale > 0 else 0.0
+    ratio = float((length * third).sum() / (length**2).sum())
+    report.lines.append(f"third channel   {ratio:.4g} times the length of (re, im), correlation {correlation:.4f}")
+    if correlation < THIRD_MATCH_MIN:
+        report.warnings.append("third channel: not the amplitude of (re, im); it is not used")
+
+
+def camera(sequence: Sequence, report: Report) -> None:
+    """A camera that moved without poses, and a colour camera that is implausibly far off."""
+    if np.array_equal(sequence.camera_from_world, np.broadcast_to(np.eye(4), sequence.camera_from_world.shape)):
+        share = estimates.changed_share(sequence)
+        report.lines.append(f"change          {share:.0%} of bright pixels from the first to the last quartet")
+        if share > MOVED_SHARE:
+            report.warnings.append(
+                f"poses: all are identity, but {share:.0%} of bright pixels change: if the camera moved, "
+                "store its poses in cams/tof_extrinsics.npy"
+            )
+    if sequence.colour_from_world is not None:
+        relative = sequence.camera_from_world @ np.linalg.inv(sequence.colour_from_world)
+        baseline = float(np.linalg.norm(relative[:, :3, 3], axis=1).max())
+        report.lines.append(f"baseline        {baseline:.4g} m from the colour camera to the ToF camera")
+        if baseline > BASELINE_MAX_M:
+            report.warnings.append(f"the colour camera stands {baseline:.4g} m off: millimetres, or another world?")
+
+
+def phasors(sequence: Sequence, report: Report) -> None:
+    """Stored phasors against those of the quads."""
+    assert sequence.path is not None
+    spec = specs.fields(report.form)["phasor"]
+    size = {"H": sequence.height, "W": sequence.width}
+    for pattern in spec.paths:
+        files = {n: f for n, f in numbered(sequence.path, pattern).items() if n % FRAMES_PER_QUARTET == 0}
+        stored = {n: as_float32(f, spec, read_array(f, spec, size))[0] for n, f in files.items() if n < sequence.frames}
+        match = estimates.phasor_match(sequence, stored) if stored else None
+        if match is None:
+            continue
+        folder = pattern.partition("/")[0]
+        report.lines.append(
+            f"phasors         {folder}: correlation {match.correlation:.4f} at {math.degrees(match.angle):+.2f} "
+            f"degrees with the quads, {match.factor:.4g} times their length"
+        )
+        if match.correlation < MATCH_MIN or abs(match.angle) > OFFSET_TOLERANCE_RAD:
+            mirrored = "; mirrored phase fits better" if match.conjugate > match.correlation else ""
+            report.warnings.append(f"quads and {folder} disagree: wrong order, sign or offset{mirrored}")
+
+
+def truth(sequence: Sequence, report: Report) -> None:
+    """Decoded static pixels against the stored distance."""
+    assert sequence.path is not None
+    patterns = specs.fields(report.form)["distance"].paths
+    folder = next((p for p in patterns if numbered(sequence.path, p)), patterns[0]).partition("/")[0]
+    try:
+        truth = sequence.truth()
+    except InputError as error:
+        report.warnings.append(f"{folder} cannot be read: {error.where}: {error.what}, {error.why}")
+        return
+    if truth is None:
+        report.lines.append("truth           none")
+        return
+    seen = truth.distance[np.isfinite(truth.distance)]
+    unambiguous = SPEED_OF_LIGHT / (2 * sequence.f_mod_hz)
+    frames = int(truth.known.sum()) // (FRAMES_PER_QUARTET if sequence.from_phasors else 1)
+    report.lines.append(
+        f"truth           {frames} frames in {folder}"
+        + (f", {seen.min():.4g} .. {seen.max():.4g} m" if len(seen) else ", no known pixel")
+    )
+    if _is_decoded(sequence, truth):
+        if sequence.from_phasors:
+            decoded = "decoded from these phasors, or they are without noise: doubtful as truth"
+        else:
+            decoded = "decoded from these quads: it is no truth, do not compare with it"
+        report.warnings.append(f"{folder} was {decoded}")
+        return
+    if len(seen) and seen.max() > unambiguous:
+        report.warnings.append(f"range wraps: distances to {seen.max():.4g} m, unambiguous to {unambiguous:.4g} m")
+    poses = sequence.camera_from_world
+    if not sequence.from_phasors and not np.array_equal(poses, np.broadcast_to(poses[0], poses.shape)):
+        report.lines.append("phase fit       none: the camera moves between the raw frames of a quartet")
+        return
+    _fit(sequence, truth, folder, report)
+
+
+def _fit(sequence: Sequence, truth: Truth, folder: str, report: Report) -> None:
+    """Range and offset that the truth implies, and whether it is distance at all."""
+    fit = estimates.phase_fit(sequence, truth)
+    if fit is None:
+        report.lines.append("phase fit       too few static pixels")
+        return
+    report.lines.append(
+        f"phase fit       depth_range {fit.depth_range:.5g} m, phase_offset {fit.phase_offset:+.4f} rad, "
+        f"rms {fit.rms_m * 1e3:.1f} mm on {fit.pixels} static pixels"
+    )
+    as_z = estimates.phase_fit(sequence, Truth(distance=estimates.distance_of_z(sequence, truth), known=truth.known))
+    if as_z is not None and fit.rms_m > FITTED_M and as_z.rms_m < Z_FITS * fit.rms_m:
+        report.warnings.append(
+            f"{folder} fits the phase better as z-depth, rms {as_z.rms_m * 1e3:.1f} mm against "
+            f"{fit.rms_m * 1e3:.1f} mm: it is read as distance along the ray, convert it"
+        )
+        return
+    used = SPEED_OF_LIGHT / sequence.f_mod_hz
+    offset = abs(np.angle(np.exp(1j * (fit.phase_offset - sequence.phase_offset))))
+    if abs(fit.depth_range / used - 1) > RANGE_TOLERANCE or offset > OFFSET_TOLERANCE_RAD:
+        report.warnings.append(
+            f"truth implies depth_range {fit.depth_range:.4g} m and phase_offset {fit.phase_offset:+.3f} rad, "
+            f"in use are {used:.4g} m and {sequence.phase_offset:+.3f} rad"
+        )
+
+
+def _is_decoded(sequence: Sequence, truth: Truth) -> bool:
+    """Whether the stored distance follows the decoded one even where noise and motion change it."""
+    quartets = sequence.complete_quartets
+    decoded = {i: closed_form_distance(sequence, i) for i in quartets}
+    changing = agreeing = 0
+    for before, i in itertools.pairwise(quartets):
+        changes = np.abs(decoded[i] - decoded[before]) > DECODED_M
+        changing += int(changes.sum())
+        agreeing += int((np.abs(truth.distance[FRAMES_PER_QUARTET * i] - decoded[i]) < DECODED_M)[changes].sum())
+    return changing >= CHANGING_PIXELS and agreeing > DECODED_SHARE * changing
+
+
+def flow(sequence: Sequence, report: Report) -> None:
+    """Whether given flow explains the motion between frames of one shift."""
+    for name, images, step in (
+        ("forward", sequence.forward_flow, FRAMES_PER_QUARTET),
+        ("backward", sequence.backward_flow, -FRAMES_PER_QUARTET),
+    ):
+        match = estimates.flow_match(sequence, images, step)
+        if match is None:
+            continue
+        report.lines.append(
+            f"{name + ' flow':<15} mean difference where it moves: unwarped {match[0]:.4g}, warped {match[1]:.4g}, "
+            f"sign flipped {match[2]:.4g}, dx and dy swapped {match[3]:.4g}"
+        )
+        if match[1] > min(match):
+            report.warnings.append(f"{name} flow does not explain the motion: check its sign, channels and frame step")

@@ -1,0 +1,172 @@
+"""Sequence folders: which format one has, which numbered files it holds, and the images in them."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from ..constants import FRAMES_PER_QUARTET
+from ..errors import InputError, ResourceError
+from . import specs
+from .arrays import as_float32, read_array, read_shape
+from .problems import Problems
+
+SLOT_FOLDERS = tuple(f"tofType{slot}" for slot in range(FRAMES_PER_QUARTET))
+PHASOR_FOLDER = "tof"
+EXPECTED = "expected a folder with tofType0 .. tofType3 and cams (F-ToeRF: raw quads), or tof and cams (ToeRF: phasors)"
+FRAMES_MAX = 1_000_000  # over two hours at 120 Hz: a higher id is a typing error
+
+
+def format_of(path: Path) -> str:
+    """Format of a sequence folder: ``ftorf`` with raw quads, else ``torf`` with phasors.
+
+    Folders with raw quads may hold phasors too, so quads are looked for first.
+
+    Raises:
+        InputError: If it is neither; points to a sequence one level up or down, if there is one.
+    """
+    if not path.is_dir():
+        raise InputError(
+            "no such folder" if not path.exists() else "not a folder",
+            where=path,
+            why=f"{EXPECTED}, found {'a file' if path.exists() else 'nothing'}",
+            fix="check the path",
+        )
+    found = _resembled(path)
+    if found is not None:
+        return found
+    for other in [path.absolute().parent, *sorted(entry for entry in path.iterdir() if entry.is_dir())]:
+        if _resembled(other) is not None:
+            raise InputError("one level off", where=path, why=f"{EXPECTED}, found one at {other}", fix=f"use {other}")
+    raise InputError("not a sequence folder", where=path, why=f"{EXPECTED}, found neither", fix="check the path")
+
+
+def _resembled(path: Path) -> str | None:
+    if any((path / name).is_dir() for name in SLOT_FOLDERS):
+        return "ftorf"
+    return "torf" if (path / PHASOR_FOLDER).is_dir() else None
+
+
+def numbered(root: Path, pattern: str) -> dict[int, Path]:
+    """Files of a folder by the number in their name, in order; other names are left alone.
+
+    Args:
+        root: The sequence.
+        pattern: Where they lie, for example ``forward_flow/flow_{id}.npy``.
+    """
+    folder, _, name = pattern.rpartition("/")
+    before, _, after = name.partition("{id}")
+    matcher = re.compile(rf"{re.escape(before)}(\d{{4}}|[1-9]\d{{4,8}}){re.escape(after)}")
+    if not (root / folder).is_dir():
+        return {}
+    found = ((matcher.fullmatch(entry.name), entry) for entry in (root / folder).iterdir())
+    return dict(sorted((int(match[1]), entry) for match, entry in found if match))
+
+
+def refuse_absurd_ids(files: dict[int, Path]) -> None:
+    """Whether the ids are numbers of frames: memory is asked for in proportion.
+
+    Raises:
+        InputError: If not.
+    """
+    if max(files) >= FRAMES_MAX:
+        raise InputError(
+            "frame id too large",
+            where=files[max(files)],
+            why=f"expected ids below {FRAMES_MAX}, found {max(files)}",
+            fix="count frames from 0000",
+        )
+
+
+def first_size(files: dict[int, Path], spec: specs.Field, problems: Problems) -> dict[str, int]:
+    """Rows H and columns W that the first readable header states; empty if none is, and then ``problems`` says why."""
+    unread = Problems()
+    for file in files.values():
+        shape = unread.attempt(read_shape, file, spec)
+        if shape is not None:
+            return {"H": shape[0], "W": shape[1]}
+    problems.errors += unread.errors
+    return {}
+
+
+def read_field(
+    root: Path, spec: specs.Field, frames: int, size: dict[str, int], problems: Problems, first_id: int = 0
+) -> tuple[dict[int, np.ndarray], str]:
+    """Images of one field from the best folder that has any, by frame below ``frames``, and their source.
+
+    Args:
+        root: The sequence.
+        spec: The field.
+        frames: Number of frames; files of later ones are not opened.
+        size: Rows H and columns W, where they are known.
+        problems: Takes what is wrong.
+        first_id: Id of frame 0.
+    """
+    for pattern in spec.paths:
+        files = {n - first_id: file for n, file in numbered(root, pattern).items()}
+        if files:
+            used = {n: file for n, file in files.items() if 0 <= n < frames}
+            images, source = load(root, spec, used, size, problems)
+            other = f"; {len(files) - len(used)} of later frames ignored" if len(used) < len(files) else ""
+            return images, f"{source}, {len(used)} images{other}"
+    return {}, "default none"
+
+
+def load(
+    root: Path, spec: specs.Field, files: dict[int, Path], size: dict[str, int], problems: Problems
+) -> tuple[dict[int, np.ndarray], str]:
+    """Read image files as float32; what the first one leaves open of their shape binds the others."""
+    images: dict[int, np.ndarray] = {}
+    rounded: str | None = None
+    bound = dict(size)
+    for n, file in files.items():
+        array = problems.attempt(read_array, file, spec, bound)
+        if array is None:
+            continue
+        bound = dict(zip((s for s in spec.shapes[0] if isinstance(s, str)), _free(array, spec), strict=True)) | size
+        image = problems.attempt(as_float32, file, spec, array)
+        if image is not None:
+            images[n], lossy = image
+            rounded = str(array.dtype) if lossy else rounded
+    folder = next(iter(files.values())).parent.relative_to(root) if files else ""
+    where = f"{SLOT_FOLDERS[0]} .. {SLOT_FOLDERS[-1]}" if str(folder) in SLOT_FOLDERS else folder
+    return images, f"file {where}" + (f", {rounded} rounded to float32" if rounded else "")
+
+
+def read_distances(
+    root: Path, spec: specs.Field, frames: int, size: dict[str, int], problems: Problems, first_id: int = 0
+) -> dict[int, np.ndarray]:
+    """True distances [m] by frame, NaN where the file has NaN or 0; arguments as for :func:`read_field`."""
+    images, _ = read_field(root, spec, frames, size, problems, first_id)
+    folder = next((p for p in spec.paths if numbered(root, p)), spec.paths[0])
+    for n, image in images.items():
+        if (image < 0).any():
+            error = InputError(
+                "distance: negative",
+                where=root / folder.replace("{id}", f"{n + first_id:04d}"),
+                why=f"expected metres along the ray, NaN where unknown, found {np.nanmin(image):g}",
+                fix="store NaN where the distance is unknown",
+            )
+            problems.errors.append(error)
+    return {n: np.where(image == 0, np.float32(np.nan), image) for n, image in images.items()}
+
+
+def empty_quads(root: Path, frames: int, size: dict[str, int]) -> np.ndarray:
+    """Zeros [F, H, W], or an error that says why not.
+
+    Raises:
+        ResourceError: If they do not fit into memory.
+    """
+    try:
+        return np.zeros((frames, size.get("H", 1), size.get("W", 1)), dtype=np.float32)
+    except MemoryError as error:
+        raise ResourceError(
+            "not enough memory", where=root, why=f"{frames} frames of {size} do not fit", fix="use a shorter recording"
+        ) from error
+
+
+def _free(array: np.ndarray, spec: specs.Field) -> list[int]:
+    """Lengths of the axes that the field names by a letter."""
+    return [n for n, letter in zip(array.shape, spec.shapes[0], strict=True) if isinstance(letter, str)]

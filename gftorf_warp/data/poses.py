@@ -1,0 +1,174 @@
+"""Where the cameras of a folder stood: poses of the ToF camera, of the colour camera, and of views nobody took."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import InputError
+from . import specs
+from .arrays import read_array, read_choice
+
+ROTATION_TOLERANCE = 1e-4  # float32 poses are off by 1e-7, mixed-up or scaled matrices by much more
+SAME_POSE = 1e-9  # float64 products of poses differ by 1e-15, other poses by much more; metres, and 1 for rotations
+
+
+def rigid(poses: np.ndarray) -> np.ndarray:
+    """Whether each of the matrices [F, 4, 4] is a rotation and a translation [F]."""
+    rotation = np.asarray(poses, dtype=np.float64)[:, :3, :3]
+    with np.errstate(over="ignore", invalid="ignore"):
+        defect = np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+        proper = np.linalg.det(rotation) > 0
+    last_row = np.abs(poses[:, 3] - [0, 0, 0, 1]).max(axis=1)
+    return (
+        (defect <= ROTATION_TOLERANCE) & proper & (last_row <= ROTATION_TOLERANCE) & np.isfinite(poses).all(axis=(1, 2))
+    )
+
+
+def read_static_poses(root: Path, frames: int, sources: dict[str, str]) -> tuple[np.ndarray, bool]:
+    """F-ToeRF: camera_from_world of each raw frame [F, 4, 4] [m], and whether poses of this folder count.
+
+    They are identity, unless cams/poses.json says that the file counts.
+
+    Raises:
+        InputError: If poses that count are too few, too many, or no rigid motions.
+    """
+    fields = specs.fields("ftorf")
+    spec, marker = fields["tof_extrinsics"], fields["poses"]
+    path = root / spec.paths[0]
+    counts = (root / marker.paths[0]).exists() and bool(read_choice(root / marker.paths[0], marker))
+    if counts:
+        sources["camera_from_world"] = f"file {spec.paths[0]}"
+        advice = f"complete the poses, or remove {marker.paths[0]} for a static camera"
+        return _motions(root, spec, frames, "raw frames", advice), True
+    stored = read_array(path, spec) if path.exists() else None
+    still = stored is None or np.array_equal(stored, np.broadcast_to(np.eye(4), stored.shape))
+    sources["camera_from_world"] = "default identity" + (
+        ": the camera of this format stands still"
+        if still
+        else f": {spec.paths[0]} holds other poses, which this format's loaders ignore"
+    )
+    return _identity(frames), False
+
+
+def read_static_colour_poses(root: Path, poses: np.ndarray, counts: bool, sources: dict[str, str]) -> np.ndarray:
+    """F-ToeRF: pose of the colour camera at each raw frame [F, 4, 4] [m]; that of the ToF camera unless poses count.
+
+    Raises:
+        InputError: If poses that count are too few, too many, or no rigid motions.
+    """
+    spec = specs.fields("ftorf")["color_extrinsics"]
+    if counts and (root / spec.paths[0]).exists():
+        sources["colour_from_world"] = f"file {spec.paths[0]}"
+        return _motions(root, spec, len(poses), "raw frames", "complete the poses, or remove the file")
+    sources["colour_from_world"] = "default as the ToF camera"
+    return poses.copy()
+
+
+def read_moving_poses(root: Path, frames: int, sources: dict[str, str]) -> np.ndarray:
+    """ToeRF: camera_from_world of each phasor [N, 4, 4] [m]; identity if there is no file.
+
+    Raises:
+        InputError: If there are too few or too many, or they are no rigid motions.
+    """
+    spec = specs.fields("torf")["tof_extrinsics"]
+    if not (root / spec.paths[0]).exists():
+        sources["camera_from_world"] = f"default identity: no {spec.paths[0]}"
+        return _identity(frames)
+    sources["camera_from_world"] = f"file {spec.paths[0]}"
+    advice = "store one world-to-camera pose per phasor, or state the number of phasors by cams/frame_times.npy"
+    return _motions(root, spec, frames, "phasors", advice)
+
+
+def read_moving_colour_poses(root: Path, poses: np.ndarray, sources: dict[str, str]) -> np.ndarray:
+    """ToeRF: pose of the colour camera at each phasor [N, 4, 4] [m], from the best file there is.
+
+    A relative pose E takes colour-camera to ToF-camera coordinates, so colour_from_world = inv(E) @ camera_from_world.
+    In order: cams/relative_pose.npy; cams/color_extrinsics.npy, also where it says the same as the first, since it
+    needs no product; cams/relative_R.mat and relative_T.mat as E = [R | -T]; the pose of the ToF camera.
+
+    Raises:
+        InputError: If a file is not what data_specs/torf.toml describes.
+    """
+    fields = specs.fields("torf")
+    spec, absolute = fields["relative_pose"], fields["color_extrinsics"]
+    halves = [fields["relative_R"], fields["relative_T"]]
+    stored = None
+    if (root / spec.paths[0]).exists():
+        relative = read_array(root / spec.paths[0], spec).astype(np.float64).reshape(1, 4, 4)
+        _refuse_others(root / spec.paths[0], spec.name, relative)
+        product = np.linalg.inv(relative[0]) @ poses
+        sources["colour_from_world"] = f"file {spec.paths[0]}"
+        if (root / absolute.paths[0]).exists():
+            stored = read_array(root / absolute.paths[0], absolute).astype(np.float64)
+            if stored.shape == product.shape and np.abs(stored - product).max() <= SAME_POSE:
+                sources["colour_from_world"] = f"file {absolute.paths[0]}, as {spec.paths[0]} says"
+                return stored
+            sources["colour_from_world"] += f"; {absolute.paths[0]} holds other poses, which it replaces"
+        return product
+    if (root / absolute.paths[0]).exists():
+        stored = _motions(root, absolute, len(poses), "phasors", "complete the poses, or remove the file")
+    inferable = all((root / half.paths[0]).exists() for half in halves)
+    if stored is not None and not (inferable and np.array_equal(stored, _identity(len(poses)))):
+        sources["colour_from_world"] = f"file {absolute.paths[0]}"
+        return stored
+    if inferable:
+        rotation, translation = (read_array(root / half.paths[0], half).astype(np.float64) for half in halves)
+        relative = _identity(1)
+        relative[0, :3, :3], relative[0, :3, 3] = rotation, -translation.reshape(3)
+        _refuse_others(root / halves[0].paths[0], halves[0].name, relative)
+        sources["colour_from_world"] = "inferred from cams/relative_R.mat and relative_T.mat as E = [R | -T]"
+        return np.linalg.inv(relative[0]) @ poses
+    sources["colour_from_world"] = f"inferred as the ToF camera: neither {spec.paths[0]} nor {absolute.paths[0]}"
+    return poses.copy()
+
+
+def read_novel(root: Path, form: str, sources: dict[str, str]) -> np.ndarray | None:
+    """Poses [M, 4, 4] [m] of views that nobody took; None if there is no file.
+
+    Raises:
+        InputError: If they are no rigid motions.
+    """
+    spec = specs.fields(form)["test_poses"]
+    path = root / spec.paths[0]
+    if not path.exists():
+        sources["novel_from_world"] = "default none"
+        return None
+    stored = read_array(path, spec)[:, :, :4].astype(np.float64)
+    poses = _identity(len(stored))
+    poses[:, : stored.shape[1]] = stored
+    _refuse_others(path, spec.name, poses)
+    sources["novel_from_world"] = f"file {spec.paths[0]}, {len(poses)} poses"
+    return poses
+
+
+def _identity(frames: int) -> np.ndarray:
+    return np.tile(np.eye(4), (frames, 1, 1))
+
+
+def _motions(root: Path, spec: specs.Field, frames: int, counted: str, advice: str) -> np.ndarray:
+    """Poses of one file [F, 4, 4], float64."""
+    stored = read_array(root / spec.paths[0], spec).astype(np.float64)
+    if len(stored) != frames:
+        raise InputError(
+            f"{spec.name}: wrong length",
+            where=root / spec.paths[0],
+            why=f"expected one pose for each of {frames} {counted}, found {len(stored)}",
+            fix=advice,
+        )
+    _refuse_others(root / spec.paths[0], spec.name, stored)
+    return stored
+
+
+def _refuse_others(path: Path, name: str, poses: np.ndarray) -> None:
+    fine = rigid(poses)
+    if not fine.all():
+        n = int(np.argmin(fine))
+        raise InputError(
+            f"{name}: {int((~fine).sum())} poses are no rigid motions",
+            where=path,
+            why=f"expected rotations of determinant +1 and a last row 0 0 0 1, found at pose {n} {poses[n].tolist()}",
+            fix="store matrices that take world to camera (relative_pose: colour to ToF camera), x right, y down, "
+            "z forward",
+        )

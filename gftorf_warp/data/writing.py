@@ -1,0 +1,222 @@
+"""What the writers of sequence folders share: which sequences they accept, and the files that both formats have."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import numpy as np
+
+from ..constants import CANONICAL_SHIFTS, FRAMES_PER_QUARTET, SPEED_OF_LIGHT
+from ..errors import UsageError
+from .calibration import DEPTH_RANGES_M, FOCAL_MIN
+from .files import atomic_folder, write_through
+from .poses import rigid
+from .sequence import Sequence, Truth
+
+
+def write_folder(path: str | Path, files: Iterable[tuple[str, bytes]], folders: Iterable[str] = ()) -> Path:
+    """Write files of a folder that appears only when it is complete.
+
+    Args:
+        path: New or empty folder.
+        files: Relative name, at most one level down, and content of each file.
+        folders: Folders that exist even if they hold nothing.
+
+    Raises:
+        UsageError: If the folder cannot be created.
+        ResourceError: If the disk is full.
+    """
+    with atomic_folder(path) as folder:
+        for name in folders:
+            (folder / name).mkdir()
+        for name, content in files:
+            (folder / name).parent.mkdir(exist_ok=True)
+            write_through(folder / name, content)
+    return Path(path)
+
+
+def calibration_files(
+    sequence: Sequence, times: np.ndarray, camera_from_world: np.ndarray
+) -> Iterator[tuple[str, bytes]]:
+    """The files that both formats have, by relative name, for frames of these times [s] and poses."""
+    yield "cams/tof_intrinsics.npy", npy(_pinhole(sequence.fx, sequence.fy, sequence.cx, sequence.cy))
+    yield "cams/color_intrinsics.npy", npy(_pinhole(*_colour_intrinsics(sequence)))
+    yield "cams/pixel_centre.json", json_bytes({"pixel_centre": "integer"})
+    yield "cams/tof_extrinsics.npy", npy(camera_from_world.astype(np.float64))
+    yield "cams/frame_times.npy", npy(times.astype(np.float64))
+    yield "cams/depth_range.npy", npy(np.float64(SPEED_OF_LIGHT / sequence.f_mod_hz))
+    yield "cams/phase_offset.npy", npy(np.float64(sequence.phase_offset))
+    if sequence.quad_scale is not None:
+        yield "cams/quad_values_scale_factor.npy", npy(np.float64(sequence.quad_scale))
+    if sequence.novel_from_world is not None:
+        yield "test_poses.npy", npy(sequence.novel_from_world.astype(np.float64))
+
+
+def validate(sequence: Sequence, truth: Truth | None) -> None:
+    """Whether the parts of a sequence fit together.
+
+    Raises:
+        ValueError: If not, which is a programming mistake.
+    """
+    frames, shape = sequence.frames, (sequence.frames, sequence.height, sequence.width)
+    lengths = {
+        "quads": (sequence.quads.shape, shape),
+        "shifts": (sequence.shifts.shape, (frames,)),
+        "times": (sequence.times.shape, (frames,)),
+        "camera_from_world": (sequence.camera_from_world.shape, (frames, 4, 4)),
+    }
+    if sequence.colour_from_world is not None:
+        lengths["colour_from_world"] = (sequence.colour_from_world.shape, (frames, 4, 4))
+    if sequence.colour_intrinsics is not None:
+        lengths["colour_intrinsics"] = ((len(sequence.colour_intrinsics),), (4,))
+    if sequence.novel_from_world is not None:
+        views = sequence.novel_from_world
+        lengths["novel_from_world"] = (views.shape, (max(1, len(views)), 4, 4))
+    for name in ("forward_flow", "backward_flow"):
+        lengths |= {f"{name}[{n}]": (flow.shape, (2, *shape[1:])) for n, flow in getattr(sequence, name).items()}
+    first = next((image.shape[:2] for image in sequence.colour.values()), ())
+    lengths |= {f"colour[{n}]": (image.shape, (*first, 3)) for n, image in sequence.colour.items()}
+    if truth is not None:
+        lengths |= {"truth.distance": (truth.distance.shape, shape), "truth.known": (truth.known.shape, (frames,))}
+    for name, (found, expected) in lengths.items():
+        if found != expected:
+            raise ValueError(f"{name} {found} must have shape {expected}")
+    for name in ("colour", "forward_flow", "backward_flow"):
+        outside = [n for n in getattr(sequence, name) if not 0 <= n < frames]
+        if outside:
+            raise ValueError(f"{name}: raw frames {outside} are not in 0..{frames - 1}")
+    if sequence.from_phasors:
+        _validate_phasors(sequence)
+
+
+def _validate_phasors(sequence: Sequence) -> None:
+    """Whether raw frames that say they are from phasors look like it."""
+    step = FRAMES_PER_QUARTET
+    if sequence.frames % step:
+        raise ValueError(f"from_phasors: {sequence.frames} raw frames must be a multiple of {step}")
+    quads = sequence.quads.reshape(-1, step, sequence.height, sequence.width)
+    rules = {
+        "shifts": np.array_equal(sequence.shifts, np.tile(CANONICAL_SHIFTS, len(quads))),
+        "quads": np.array_equal(quads[:, 0], -quads[:, 1]) and np.array_equal(quads[:, 2], -quads[:, 3]),
+        "dc_offset": sequence.dc_offset == 0,
+    }
+    for name in ("measured", "times", "camera_from_world", "colour_from_world"):
+        values = getattr(sequence, name)
+        rules[name] = values is None or np.array_equal(values, np.repeat(values[::step], step, axis=0))
+    for name, holds in rules.items():
+        if not holds:
+            raise ValueError(f"from_phasors: {name} must be those of re/2, -re/2, im/2, -im/2 at one instant")
+
+
+def refuse_inexpressible(form: str, sequence: Sequence, truth: Truth | None) -> None:
+    """Whether the reader would accept what is written: its limits are those of the format.
+
+    Raises:
+        UsageError: If not.
+    """
+    flows = [*sequence.forward_flow.values(), *sequence.backward_flow.values()]
+    times = sequence.times
+    distance = np.ones(1) if truth is None else truth.distance[truth.known]
+    numbers = (sequence.f_mod_hz, sequence.phase_offset, sequence.dc_offset, sequence.quad_scale or 1.0)
+    focal = sequence.fx, sequence.fy
+    colour, colour_width = _colour_intrinsics(sequence), _colour_size(sequence)[1]
+    rules = {  # what: (whether it holds, expected, found)
+        "an empty sequence": (sequence.measured.any(), "at least one measured raw frame", "none"),
+        "quads": (np.isfinite(sequence.quads[sequence.measured]).all(), "finite numbers", "NaN or infinity"),
+        "times": (
+            np.isfinite(times).all() and times[0] == 0 and (np.diff(times) >= 0).all(),
+            "seconds since the first raw frame, never decreasing",
+            f"{times[:8].tolist()} ..",
+        ),
+        "calibration": (np.isfinite(numbers).all(), "finite numbers", str(numbers)),
+        "f_mod_hz": (
+            DEPTH_RANGES_M[0] <= SPEED_OF_LIGHT / sequence.f_mod_hz <= DEPTH_RANGES_M[1],
+            f"speed of light / frequency between {DEPTH_RANGES_M[0]} and {DEPTH_RANGES_M[1]} m",
+            f"{sequence.f_mod_hz} Hz",
+        ),
+        "quad_scale": (sequence.quad_scale is None or sequence.quad_scale > 0, "above 0", str(sequence.quad_scale)),
+        "focal length": (
+            min(focal) >= FOCAL_MIN * sequence.width,
+            f"pixels, at least {FOCAL_MIN} of the width {sequence.width}",
+            str(focal),
+        ),
+        "colour_intrinsics": (
+            np.isfinite(colour).all() and min(colour[:2]) >= FOCAL_MIN * colour_width,
+            f"pixels, at least {FOCAL_MIN} of the width {colour_width}",
+            str(colour),
+        ),
+        "colour_from_world": (_rigid(sequence.colour_from_world), "rotations and translations", "other matrices"),
+        "novel_from_world": (_rigid(sequence.novel_from_world), "rotations and translations", "other matrices"),
+        "camera_from_world": (_rigid(sequence.camera_from_world), "rotations and translations", "other matrices"),
+        "colour": (all(np.isfinite(i).all() for i in sequence.colour.values()), "finite numbers", "NaN or infinity"),
+        "flow": (not any(np.isinf(flow).any() for flow in flows), "pixels, or NaN for unknown", "infinity"),
+        "truth": (
+            ((distance > 0) & (distance < np.inf) | np.isnan(distance)).all(),
+            "distances above 0 m, or NaN for unknown",
+            "zero, negative or infinite distances",
+        ),
+    }
+    for what, (holds, expected, found) in rules.items():
+        if not holds:
+            raise inexpressible(form, what, expected, found)
+
+
+def inexpressible(form: str, what: str, expected: str, found: str) -> UsageError:
+    """The error for what a format has no place for."""
+    return UsageError(
+        f"{what}: the {form} format cannot hold this",
+        where=f"format {form}",
+        why=f"expected {expected}, found {found}",
+        fix="change the sensor or the sequence",
+    )
+
+
+def _colour_size(sequence: Sequence) -> tuple[int, int]:
+    """Rows and columns of the colour images; without any, those of the quads."""
+    return next((image.shape[:2] for image in sequence.colour.values()), (sequence.height, sequence.width))
+
+
+def _colour_intrinsics(sequence: Sequence) -> tuple[float, float, float, float]:
+    """Those of the colour camera; public loaders want one, so without any it stands where the ToF camera stands."""
+    if sequence.colour_intrinsics is not None:
+        return sequence.colour_intrinsics
+    height, width = _colour_size(sequence)
+    sx, sy = width / sequence.width, height / sequence.height
+    return sequence.fx * sx, sequence.fy * sy, sequence.cx * sx, sequence.cy * sy
+
+
+def _rigid(poses: np.ndarray | None) -> bool:
+    return poses is None or bool(rigid(poses).all())
+
+
+def _pinhole(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
+    """Matrix for integer pixel centres, 3x3."""
+    return np.array([[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1]], dtype=np.float64)
+
+
+def float32(array: np.ndarray) -> np.ndarray:
+    """The array as contiguous float32."""
+    return np.ascontiguousarray(array, dtype=np.float32)
+
+
+def shortest(array: np.ndarray) -> np.ndarray:
+    """The array as float16 if every number survives that, else as it is."""
+    with np.errstate(over="ignore"):
+        half = array.astype(np.float16)
+    return half if np.array_equal(half.astype(np.float32), array) else array
+
+
+def npy(array: np.ndarray | np.floating) -> bytes:
+    """Bytes of a .npy file, little endian."""
+    buffer = io.BytesIO()
+    array = np.asarray(array)
+    np.lib.format.write_array(buffer, array.astype(array.dtype.newbyteorder("<")), version=(1, 0), allow_pickle=False)
+    return buffer.getvalue()
+
+
+def json_bytes(content: dict[str, str]) -> bytes:
+    """One line of JSON."""
+    return (json.dumps(content) + "\n").encode()
