@@ -161,8 +161,9 @@ def test_named_scenes_stay_in_range(name):
     """Nothing wraps, nothing is missing, something moves, and the name is its own."""
     scene = SCENES[name]
     assert scene.name == name
-    assert scene.motion in ("sliding", "axial", "arc", "sideways and in depth")
-    hits = [first_hit(scene.bodies, scene.camera(SMALL), n / 120) for n in (0, scene.frames // 2, scene.frames - 1)]
+    assert scene.motion in ("sliding", "axial", "arc", "sideways and in depth", "camera and ball on arcs")
+    times = [n / 120 for n in (0, scene.frames // 2, scene.frames - 1)]
+    hits = [first_hit(scene.bodies, scene.camera(SMALL, time), time) for time in times]
     distances = np.stack([hit.distance for hit in hits])
     assert np.isfinite(distances).all()
     assert distances.min() > 0.8
@@ -316,7 +317,7 @@ def test_a_finished_sequence_is_not_made_again(tmp_path):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"scene": "slidin"}, ("slidin", "did you mean 'sliding'", "demo, sliding, axial, arc")),
+        ({"scene": "slidin"}, ("slidin", "did you mean 'sliding'", "demo, sliding, axial, arc, tour")),
         ({"scene": "xyzzy"}, ("xyzzy", "take one of these")),
         ({"frames": 0}, ("--frames", "at least 1")),
         ({"frames": -4}, ("--frames", "-4")),

@@ -5,19 +5,22 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Mapping
+from dataclasses import fields
 
 from .. import __version__
+from .paths import Still
 from .readout import contrast, electron_gain
 from .record import Recording
 from .scenes import SCENES, Scene
 
 
-def settings_card(scene: Scene, options: Mapping) -> str:
+def settings_card(scene: Scene, options: Mapping, layout: str = "ftorf") -> str:
     """The part that follows from the settings alone, so that equal text means equal settings.
 
     Args:
         scene: What was recorded.
         options: Keyword arguments of :func:`gftorf_warp.sim.record.record` by name, all resolved.
+        layout: Layout on disk; 'torf' has one phasor per quartet.
     """
     sensor, noisy = scene.sensor, options["noise"] and scene.sensor.noise
     width, height = options["size"]
@@ -27,6 +30,7 @@ def settings_card(scene: Scene, options: Mapping) -> str:
         "shifts in time order": ", ".join(f"{math.degrees(shift):.0f}" for shift in sensor.shifts) + " deg",
         "raw frames": f"{1 / sensor.frame_period_s:.6g} per second, "
         + ("all four of a quartet at the time of its first" if options["sync"] else "each at its own time"),
+        **_camera_rows(scene, options),
         "exposure": f"{1e3 * sensor.exposure_s:g} ms, "
         + (f"mean of {n} instants" if (n := options["exposure_samples"]) > 1 else "taken as one instant"),
         "taps": "one, unipolar" if sensor.unipolar else "two, differential",
@@ -52,9 +56,9 @@ def settings_card(scene: Scene, options: Mapping) -> str:
 {options["frames"]} raw frames of {width}x{height} pixels, {scene.horizontal_fov_deg:g} deg wide. \
 Light and camera coincide; direct light only.
 
-    {_command(scene, options)}
+    {_command(scene, options, layout)}
 
-Made by gftorf-warp {__version__}, scene {hashlib.sha256(repr(scene).encode()).hexdigest()[:16]}. \
+Made by gftorf-warp {__version__}, scene {hashlib.sha256(_fingerprint(scene).encode()).hexdigest()[:16]}. \
 This data may be used under the licence of that program, Apache-2.0.
 
 | sensor | |
@@ -80,7 +84,28 @@ Saturated: {100 * recording.saturated:.3g} % of all pixels and raw frames.
 """
 
 
-def _command(scene: Scene, options: Mapping) -> str:
+def _camera_rows(scene: Scene, options: Mapping) -> dict[str, str]:
+    """How the cameras move and what the colour camera is; nothing for one ToF camera at rest at the origin."""
+    rows = {}
+    if scene.camera_path != Still():
+        rows["camera path"] = f"{scene.camera_path}" + (
+            "; every raw frame has the pose of its own time" if scene.camera_moves else ""
+        )
+    if scene.colour is not None:
+        camera = scene.colour_camera(options["size"])
+        position = ", ".join(f"{1e3 * x:g}" for x in scene.colour.position)
+        rows["colour camera"] = (
+            f"{camera.width}x{camera.height} pixels, {scene.colour.horizontal_fov_deg:g} deg wide, at ({position}) mm "
+            f"in the axes of the ToF camera, turned by {scene.colour.turn_deg} deg; an image at each quartet start; "
+            "linear RGB albedo: light from everywhere, no shading, no falloff; noise "
+            + (f"{scene.colour.noise:g}" if options["noise"] else "none")
+        )
+    if scene.novel_views:
+        rows["novel views"] = f"{len(scene.novel_views)} poses off the path, without images"
+    return rows
+
+
+def _command(scene: Scene, options: Mapping, layout: str) -> str:
     """What makes the same sequence again: a command line if there is one for it, else a call."""
     if SCENES.get(scene.name) != scene or options["flow"] or options["exposure_samples"] > 1:
         return (
@@ -88,5 +113,14 @@ def _command(scene: Scene, options: Mapping) -> str:
         )
     width, height = options["size"]
     command = f"gftorf simulate {scene.name} --out SEQ --frames {options['frames']} --size {width}x{height}"
-    command += f" --seed {options['seed']}"
+    command += f" --seed {options['seed']}" + (f" --format {layout}" if layout != "ftorf" else "")
     return command + (" --sync" if options["sync"] else "") + ("" if options["noise"] else " --no-noise")
+
+
+def _fingerprint(scene: Scene) -> str:
+    """Every setting of a scene as text; without the optional ones that it does not use, as if they did not exist."""
+    optional = {"camera_path": Still(), "colour": None, "novel_views": ()}
+    values = {f.name: getattr(scene, f.name) for f in fields(scene)}
+    used = {name: value for name, value in values.items() if name not in optional or value != optional[name]}
+    hues = "" if scene.colour is None else f", hues {[body.texture.hue for body in scene.bodies]}"
+    return f"Scene({', '.join(f'{name}={value!r}' for name, value in used.items())}){hues}"

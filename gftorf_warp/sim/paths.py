@@ -33,8 +33,28 @@ def rigid(rotation: Float[np.ndarray, "3 3"], position: Float[np.ndarray, "3"]) 
     return pose
 
 
+def inverse(pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
+    """The rigid motion that undoes ``pose``."""
+    rotation = pose[:3, :3].T
+    return rigid(rotation, 0.0 - rotation @ pose[:3, 3])  # a difference, so that the inverse of rest has no -0.0
+
+
+def looking_at(position: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
+    """World from camera at ``position`` [m] whose z axis points to ``target`` [m] and whose x axis is level.
+
+    Raises:
+        ValueError: If the view is straight up or down, where no x axis is more level than another.
+    """
+    ahead = np.subtract(target, position, dtype=np.float64)
+    right = np.cross([0.0, 1.0, 0.0], ahead)
+    if not np.linalg.norm(right) > 1e-9 * np.linalg.norm(ahead):
+        raise ValueError(f"a view from {tuple(position)} to {tuple(target)} is straight up or down: no axis is level")
+    ahead, right = ahead / np.linalg.norm(ahead), right / np.linalg.norm(right)
+    return rigid(np.stack([right, np.cross(ahead, right), ahead], axis=1), np.asarray(position, dtype=np.float64))
+
+
 class Path(abc.ABC):
-    """A rigid motion. Final classes: Still, Line, Arc."""
+    """A rigid motion. Final classes: Still, Line, Arc for bodies; Viewpoint, Sweep for cameras."""
 
     @abc.abstractmethod
     def world_from_body(self, time: float) -> Float[np.ndarray, "4 4"]:
@@ -98,3 +118,41 @@ class Arc(Path):
         angle = math.radians(degrees)
         offset = self.radius * np.array([math.cos(angle), 0.0, math.sin(angle)])
         return rigid(rotation_matrix((0.0, -degrees, 0.0)), np.add(self.centre, offset))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Viewpoint(Path):
+    """A camera at rest that looks at something."""
+
+    position: Vector
+    """Where it is in the world [m]."""
+    target: Vector
+    """What its z axis points to [m]."""
+
+    def world_from_body(self, time: float) -> Float[np.ndarray, "4 4"]:
+        """The one pose, whatever the ``time`` [s]."""
+        del time
+        return looking_at(np.asarray(self.position), np.asarray(self.target))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sweep(Path):
+    """A camera that swings to and fro on a horizontal arc about what it looks at, smoothly, as a hand would."""
+
+    middle: Vector
+    """Where it is halfway [m]."""
+    target: Vector
+    """Centre of the arc, to which its z axis points [m]."""
+    sweep_deg: float
+    """Angle from one end of the arc to the other, seen from the target [deg]; above 0 it starts at the left."""
+    period_s: float
+    """Time for one way there and back [s]."""
+    rise: float = 0.0
+    """How far it goes up halfway there, and down halfway back [m]."""
+
+    def world_from_body(self, time: float) -> Float[np.ndarray, "4 4"]:
+        """Pose at ``time`` [s]; at time 0 it rests at one end of the arc."""
+        phase = 2.0 * math.pi * time / self.period_s
+        turn = rotation_matrix((0.0, 0.5 * self.sweep_deg * math.cos(phase), 0.0))
+        position = np.add(self.target, turn @ np.subtract(self.middle, self.target))
+        return looking_at(position - [0.0, self.rise * math.sin(phase), 0.0], np.asarray(self.target))

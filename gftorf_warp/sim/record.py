@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,13 +12,12 @@ from jaxtyping import Bool, Float
 
 from ..constants import FRAMES_PER_QUARTET
 from ..data.sequence import Sequence, Truth
-from ..render.api import rasterize
 from ..scene.camera import Camera
-from ..scene.gaussians import GaussianField
 from ..scene.sensor import Sensor
+from .look import Splatted, look, look_colour
+from .paths import inverse
 from .readout import read_out
 from .scenes import Scene
-from .splat import Cover, cover_moving, cover_still, merge
 from .world import Hits, first_hit
 
 Progress = Callable[[int, int], None]
@@ -32,7 +32,7 @@ class Gap:
     max: float
     """Largest absolute difference [m]."""
     pixels: int
-    """Number of interior pixels in the image."""
+    """Number of interior pixels in the image; their mean over all raw frames if the camera moves."""
 
     def __str__(self) -> str:
         return f"mean {1e3 * self.mean:.1f} mm, max {1e3 * self.max:.1f} mm over {self.pixels} pixels"
@@ -50,27 +50,6 @@ class Recording:
     """Renderer against truth on still interior pixels; None if no such pixel exists."""
     saturated: float
     """Share of pixels and raw frames in which a tap or the ADC was full [1]."""
-
-
-class Splatted:
-    """A scene as Gaussians: one rigid cover per moving body and one for everything that stays.
-
-    Args:
-        scene: Bodies and their paths.
-        camera: The camera at the resolution of the rays, pixels times ``scene.subsamples``.
-        times: Instants [s] at whose nearest approach the covers are still fine enough.
-    """
-
-    def __init__(self, scene: Scene, camera: Camera, times: Float[np.ndarray, "F"]):
-        self._centre = camera.centre
-        static = tuple(body for body in scene.bodies if not body.moves)
-        self._static: GaussianField | None = cover_still(static, camera).seen(self._centre, 0.0) if static else None
-        self._moving: list[Cover] = [cover_moving(body, camera, times) for body in scene.bodies if body.moves]
-
-    def at(self, time: float) -> GaussianField:
-        """All Gaussians that face the camera at ``time`` [s]."""
-        moving = [cover.seen(self._centre, time) for cover in self._moving]
-        return merge([*([] if self._static is None else [self._static]), *moving])
 
 
 def frame_times(sensor: Sensor, frames: int, *, sync: bool) -> Float[np.ndarray, "F"]:
@@ -98,13 +77,12 @@ def record(
     """
     frames = scene.frames if frames is None else frames
     sensor = replace(scene.sensor, noise=noise and scene.sensor.noise)
-    camera = scene.camera(size)
-    fine = camera.resized(camera.width * scene.subsamples, camera.height * scene.subsamples)
     times = frame_times(sensor, frames, sync=sync)
-    hits = [first_hit(scene.bodies, camera, float(time)) for time in times]
-    interior = still_interior(scene, hits)
-    longest = frame_times(sensor, max(frames, scene.frames), sync=False)
-    splatted = Splatted(scene, fine, longest)  # the same covers for fewer frames, hence the same images
+    cameras = [scene.camera(size, float(time)) for time in times]
+    camera = cameras[0]
+    distances, interior = _truth(scene, cameras, times)
+    longest = frame_times(sensor, max(frames, scene.frames), sync=False)  # for fewer frames the same covers and images
+    splatted = Splatted(scene, lambda time: _fine(scene.camera(size, time), scene), longest)
     shifts = np.array([sensor.shifts[n % len(sensor.shifts)] for n in range(frames)])
 
     quads = np.zeros((frames, camera.height, camera.width), dtype=np.float32)
@@ -112,19 +90,19 @@ def record(
     for n in range(frames):
         offsets = ((np.arange(exposure_samples) + 0.5) / exposure_samples - 0.5) * sensor.exposure_s
         shot = sensor.with_shifts((float(shifts[n]),))
-        looks = [_look(splatted.at(float(times[n] + offset)), fine, shot, scene.subsamples) for offset in offsets]
+        looks = [look(splatted, float(times[n] + offset), shot, scene.subsamples) for offset in offsets]
         quad, amplitude, distance = (np.mean(image, axis=0) for image in zip(*looks, strict=True))
         reading = read_out(quad, amplitude, sensor, np.random.default_rng((seed, n)))  # frame n: whatever F is
         quads[n] = reading.quad
         full += int(reading.saturated.sum())
-        difference = np.abs(distance - hits[n].distance)[interior]
+        difference = np.abs(distance - distances[n])[interior[n]]
         total += float(difference.sum())
         largest = max(largest, float(difference.max(initial=0.0)))
         if progress is not None:
             progress(n + 1, frames)
 
     pixels = int(interior.sum())
-    forward, backward = _flows(scene, camera, hits, times) if flow else ({}, {})
+    forward, backward = _flows(scene, cameras, times) if flow else ({}, {})
     return Recording(
         sequence=Sequence(
             quads=quads,
@@ -138,14 +116,16 @@ def record(
             fy=camera.fy,
             cx=camera.cx,
             cy=camera.cy,
-            camera_from_world=np.tile(camera.camera_from_world, (frames, 1, 1)),
+            camera_from_world=np.stack([camera.camera_from_world for camera in cameras]),
+            novel_from_world=np.stack([inverse(view.world_from_body(0.0)) for view in scene.novel_views])
+            if scene.novel_views
+            else None,
             forward_flow=forward,
             backward_flow=backward,
+            **_colour(scene, size, times, longest, seed=seed, noise=noise),
         ),
-        truth=Truth(
-            distance=np.stack([hit.distance for hit in hits]).astype(np.float32), known=np.ones(frames, dtype=bool)
-        ),
-        gap=Gap(mean=total / (pixels * frames), max=largest, pixels=pixels) if pixels else None,
+        truth=Truth(distance=distances.astype(np.float32), known=np.ones(frames, dtype=bool)),
+        gap=Gap(mean=total / pixels, max=largest, pixels=round(pixels / frames)) if pixels else None,
         saturated=full / quads.size,
     )
 
@@ -169,40 +149,66 @@ def still_interior(scene: Scene, hits: list[Hits]) -> Bool[np.ndarray, "H W"]:
     return inside
 
 
-def _look(field: GaussianField, camera: Camera, sensor: Sensor, subsamples: int) -> tuple[np.ndarray, ...]:
-    """Mean quad, mean amplitude and mean distance over opacity of every pixel at one instant."""
-    with torch.no_grad():
-        rendering = rasterize(field, camera, sensor)
-    rows, columns = camera.height // subsamples, camera.width // subsamples
-
-    def pooled(image: torch.Tensor) -> np.ndarray:
-        return image.double().numpy().reshape(rows, subsamples, columns, subsamples).mean((1, 3))
-
-    return (
-        pooled(rendering.quads[0]),
-        pooled(rendering.phasor[2]) / 2,  # the third channel of a phasor is 2a
-        pooled(rendering.distance) / pooled(rendering.opacity),
-    )
+def _fine(camera: Camera, scene: Scene) -> Camera:
+    """The camera at the resolution of the rays."""
+    return camera.resized(camera.width * scene.subsamples, camera.height * scene.subsamples)
 
 
-def _flows(scene: Scene, camera: Camera, hits: list[Hits], times: Float[np.ndarray, "F"]) -> tuple[dict, dict]:
-    """Exact optical flow at quartet starts, from n to n + 4 and to n - 4; occlusion is not looked at."""
+def _truth(
+    scene: Scene, cameras: list[Camera], times: Float[np.ndarray, "F"]
+) -> tuple[Float[np.ndarray, "F H W"], Bool[np.ndarray, "F H W"]]:
+    """Distance [m] of every raw frame, and its still interior: the same for all raw frames of a camera at rest."""
+    distances, interior = [], []
+    for camera, time in zip(cameras, times, strict=True):
+        hit = first_hit(scene.bodies, camera, float(time))
+        distances.append(hit.distance)
+        interior.append(still_interior(scene, [hit]))
+    inside = np.stack(interior)
+    return np.stack(distances), inside if scene.camera_moves else np.broadcast_to(inside.all(axis=0), inside.shape)
+
+
+def _colour(scene: Scene, size, times, longest, *, seed: int, noise: bool) -> dict[str, Any]:
+    """The fields of a sequence that a colour camera fills: an image at every quartet start, and its poses."""
+    if scene.colour is None:
+        return {}
+    cameras = [scene.colour_camera(size, float(time)) for time in times]
+    splatted = Splatted(scene, lambda time: _fine(scene.colour_camera(size, time), scene), longest, colour=True)
+    images = {}
+    for n in range(0, len(times), FRAMES_PER_QUARTET):
+        image = look_colour(splatted, float(times[n]), scene.subsamples)
+        if noise:
+            image = image + np.random.default_rng((seed, n, 3)).normal(0.0, scene.colour.noise, image.shape)
+        images[n] = image.astype(np.float32)
+    first = cameras[0]
+    return {
+        "colour": images,
+        "colour_intrinsics": (first.fx, first.fy, first.cx, first.cy),
+        "colour_from_world": np.stack([camera.camera_from_world for camera in cameras]),
+    }
+
+
+def _flows(scene: Scene, cameras: list[Camera], times: Float[np.ndarray, "F"]) -> tuple[dict, dict]:
+    """Exact optical flow at quartet starts, from n to n + 4 and to n - 4; occlusion is not looked at.
+
+    It is what an estimate from images would give: motion of the scene and of the camera together.
+    """
     flows: tuple[dict, dict] = {}, {}
     starts = range(0, len(times), FRAMES_PER_QUARTET)
     for flow, step in zip(flows, (FRAMES_PER_QUARTET, -FRAMES_PER_QUARTET), strict=True):
         for n in starts:
             if 0 <= n + step < len(times):
-                flow[n] = _flow(scene, camera, hits[n], float(times[n]), float(times[n + step]))
+                flow[n] = _flow(scene, cameras[n], cameras[n + step], float(times[n]), float(times[n + step]))
     return flows
 
 
-def _flow(scene: Scene, camera: Camera, hit: Hits, time: float, later: float) -> Float[np.ndarray, "2 H W"]:
-    """Where what each pixel sees at ``time`` has gone in the image at ``later`` [px]; NaN where nothing is seen."""
+def _flow(scene: Scene, camera: Camera, other: Camera, time: float, later: float) -> Float[np.ndarray, "2 H W"]:
+    """Where what ``camera`` sees at ``time`` is in the image of ``other`` at ``later`` [px]; NaN: nothing is seen."""
+    hit = first_hit(scene.bodies, camera, time)
     moved = hit.point.copy()
     for index, body in enumerate(scene.bodies):
         if body.moves:
             seen = hit.body == index
             step = body.path.world_from_body(later) @ np.linalg.inv(body.path.world_from_body(time))
             moved[seen] = hit.point[seen] @ step[:3, :3].T + step[:3, 3]
-    here, there = (camera.project(torch.from_numpy(point)).numpy() for point in (hit.point, moved))
-    return np.moveaxis(there - here, -1, 0).astype(np.float32)
+    here, there = camera.project(torch.from_numpy(hit.point)), other.project(torch.from_numpy(moved))
+    return np.moveaxis((there - here).numpy(), -1, 0).astype(np.float32)

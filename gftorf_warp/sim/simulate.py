@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..constants import CANONICAL_SHIFTS
+from ..constants import CANONICAL_SHIFTS, FRAMES_PER_QUARTET
 from ..errors import UsageError
 from ..scene.sensor import Sensor
 from .card import outcome_card, settings_card
@@ -18,10 +18,12 @@ from .record import Progress, frame_times, record
 from .scenes import SCENES, Scene
 from .splat import clearance
 
-FORMATS = ("ftorf",)
 CARD = "README.md"
 CLEARANCE = 0.5  # [m] nearer bodies fill the image, and a cover of them would need millions of splats
-MARKS = ("cams/depth_range.npy", "tofType0")  # what every F-ToeRF folder holds
+FORMATS = {  # what every folder of a layout holds
+    "ftorf": ("cams/depth_range.npy", "tofType0"),
+    "torf": ("cams/depth_range.npy", "tof"),
+}
 
 
 def simulate(
@@ -55,7 +57,8 @@ def simulate(
         noise: False switches shot and read noise, full well and ADC off.
         flow: Whether exact optical flow at quartet starts is stored beside the quads.
         exposure_samples: Instants that a raw frame averages over the exposure, centred on its time; 1: no motion blur.
-        format: Layout on disk: 'ftorf'.
+        format: Layout on disk: 'ftorf', raw quads, or 'torf', one phasor per quartet with the time, pose and truth of
+            its first raw frame.
         fresh: Whether another sequence in ``out`` is moved aside, to ``out-old-1``, instead of being an error.
         progress: Called with (raw frames done, raw frames in all).
 
@@ -66,10 +69,15 @@ def simulate(
         UsageError: If an option cannot be meant that way, the format cannot express the sensor, or ``out`` holds
             something else.
     """
-    from ..data import ftorf
-
     found = _scene(scene)
     _check_options(found, frames, size, seed, exposure_samples, format)
+    if flow and format == "torf":
+        raise UsageError(
+            "a ToeRF folder has no place for optical flow",
+            where="--flow",
+            why="flow belongs to the raw quads of an F-ToeRF folder",
+            fix="leave --flow out, or --format ftorf",
+        )
     _check_sensor(found.sensor)
     _check_duration(found, frames)
     options: dict[str, Any] = {
@@ -81,14 +89,18 @@ def simulate(
         "flow": flow,
         "exposure_samples": exposure_samples,
     }
-    card = settings_card(found, options)
+    card = settings_card(found, options, format)
     out = Path(out).absolute() if fresh else Path(out)
-    if not _check_folder(out, card, fresh=fresh):
+    if not _check_folder(out, card, format, fresh=fresh):
         return out
+    if format == "torf":
+        from ..data.torf_write import write
+    else:
+        from ..data.ftorf_write import write
     recording = record(found, **options, progress=progress)
     if fresh:
         _set_aside(out)
-    ftorf.write(out, recording.sequence, recording.truth, readme=card + outcome_card(recording))
+    write(out, recording.sequence, recording.truth, readme=card + outcome_card(recording))
     return out
 
 
@@ -107,8 +119,9 @@ def _scene(scene: str | Scene) -> Scene:
 
 
 def _check_options(scene: Scene, frames, size, seed: int, exposure_samples: int, layout: str) -> None:
+    least = FRAMES_PER_QUARTET if layout == "torf" else 1  # a phasor needs a whole quartet
     wanted = {
-        "--frames": (frames is None or frames >= 1, f"{frames}", f"at least 1, for example {scene.frames}"),
+        "--frames": (frames is None or frames >= least, f"{frames}", f"at least {least}, for example {scene.frames}"),
         "--size": (
             size is None or (len(size) == 2 and min(size) >= 1),
             "x".join(map(str, size or ())),
@@ -145,8 +158,9 @@ def _check_sensor(sensor: Sensor) -> None:
 def _check_duration(scene: Scene, frames: int | None) -> None:
     """Bodies go on along their paths for as long as is asked, but not through the camera."""
     times = frame_times(scene.sensor, max(scene.frames, frames or 0), sync=False)
+    centres = np.array([scene.camera(time=float(time)).centre for time in times])
     for body in (body for body in scene.bodies if body.moves):
-        near = np.flatnonzero(clearance(body, scene.camera(), times) < CLEARANCE)
+        near = np.flatnonzero(clearance(body, centres, times) < CLEARANCE)
         if len(near):
             raise UsageError(
                 f"something comes nearer to the camera than {CLEARANCE} m",
@@ -156,16 +170,18 @@ def _check_duration(scene: Scene, frames: int | None) -> None:
             )
 
 
-def _check_folder(out: Path, card: str, *, fresh: bool) -> bool:
-    """Whether there is anything to do: False if ``out`` holds what these settings give.
+def _check_folder(out: Path, card: str, layout: str, *, fresh: bool) -> bool:
+    """Whether there is anything to do: False if ``out`` holds what these settings give, in this layout.
 
     Raises:
         UsageError: If ``out`` holds anything else that may not be moved aside.
     """
     if not out.exists() or (out.is_dir() and not any(out.iterdir())):
         return True
-    sequence = out.is_dir() and all((out / mark).exists() for mark in MARKS)
-    if not fresh and sequence and (out / CARD).is_file() and (out / CARD).read_text(errors="replace").startswith(card):
+    found = [name for name, marks in FORMATS.items() if all((out / mark).exists() for mark in marks)]
+    sequence = out.is_dir() and bool(found)
+    text = (out / CARD).read_text(errors="replace") if sequence and (out / CARD).is_file() else ""
+    if not fresh and layout in found and text.startswith(card):
         return False
     if fresh and sequence:
         return True

@@ -10,8 +10,9 @@ three known ways, computed by :func:`overlap` and :func:`spread` from the compos
   of slope. Splats of still bodies are set back along their rays by that much; on bodies that move it is left in,
   since their covers are rigid and the view of them changes.
 
-Still bodies are covered where the rays of the (still) camera meet them, one splat a pixel: no splat is wasted and no
-beat with the pixel grid appears. Bodies that move get a regular grid on each face, fine enough for their nearest point.
+Still bodies are covered where the rays of the camera meet them, one splat a pixel: no splat is wasted and no beat with
+the pixel grid appears. A camera that moves gets another such cover at every instant, of the same surfaces. Bodies that
+move get a regular grid on each face, fine enough for their nearest point as seen from wherever the camera is then.
 Reflectivity is the same in every direction of view, and shading by the angle of incidence is evaluated anew for every
 instant: what the sensor measures obeys Lambert's law, not the model that is fitted to it.
 """
@@ -28,7 +29,7 @@ from jaxtyping import Float
 from ..constants import ALPHA_MAX, ALPHA_MIN, LOW_PASS
 from ..scene.camera import Camera
 from ..scene.gaussians import GaussianField, constant_sh
-from .world import Body, first_hit
+from .world import Body, albedo, first_hit
 
 RADIUS = 0.2  # [px] of a splat before the low-pass: small, because every pixel of overlap blurs the surface
 SPACING = 0.8  # [px] of the grid on moving bodies; the renderer's low-pass closes the gaps up to about 1 px
@@ -95,16 +96,18 @@ class Cover:
     """Standard deviations along those axes [m]."""
     reflectance: Float[np.ndarray, "N"]
     """Reflectance rho over the share of the light that the cover returns [1]."""
+    albedo: Float[np.ndarray, "N 3"]
+    """Albedo in linear RGB [1]; as it is, since colour has the weights alpha T, whose sum is the opacity."""
     body: Body | None
     """Whose path moves it; None for the cover of the still bodies."""
 
     def __len__(self) -> int:
         return len(self.point)
 
-    def seen(self, centre: Float[np.ndarray, "3"], time: float) -> GaussianField:
+    def seen(self, centre: Float[np.ndarray, "3"], time: float, *, colour: bool = False) -> GaussianField:
         """The splats that face a camera at ``centre`` [m] at ``time`` [s], in world axes, shaded by their incidence.
 
-        Splats that face away are left out: their own body hides them.
+        Splats that face away are left out: their own body hides them. ``colour`` adds their albedo, which has no shade.
         """
         pose = np.eye(4) if self.body is None else self.body.path.world_from_body(time)
         rotation = pose[:3, :3]
@@ -123,6 +126,7 @@ class Cover:
             quaternion=_tensor(_quaternion(rotation @ self.frame[facing])),
             opacity_logit=torch.full((count,), OPACITY_LOGIT),
             reflectivity_sh=constant_sh(_tensor(self.reflectance[facing] * cosine[facing])),
+            colour_sh=constant_sh(_tensor(self.albedo[facing])).mT if colour else None,
         )
 
 
@@ -161,13 +165,19 @@ def cover_still(bodies: tuple[Body, ...], camera: Camera) -> Cover:
         frame=np.stack([across, np.cross(normal, across), normal], axis=2),
         scale=np.stack([footprint, footprint / cosine, np.full(len(distance), THICKNESS)], axis=1),
         reflectance=hits.reflectance[hit] / share,
+        albedo=albedo(bodies, hits, 0.0)[hit],
         body=None,
     )
 
 
-def cover_moving(body: Body, camera: Camera, times: Float[np.ndarray, "F"]) -> Cover:
-    """A regular grid of discs on each face, ``SPACING`` pixels apart where the body is nearest at ``times`` [s]."""
-    distances = clearance(body, camera, times)
+def cover_moving(
+    body: Body, camera: Camera, times: Float[np.ndarray, "F"], centres: Float[np.ndarray, "F 3"] | None = None
+) -> Cover:
+    """A regular grid of discs on each face, ``SPACING`` pixels apart where the body is nearest at ``times`` [s].
+
+    ``centres`` [m] says where the camera is at those times; None: where ``camera`` is.
+    """
+    distances = clearance(body, camera.centre if centres is None else centres, times)
     nearest, typical = distances.min(), distances.mean() + body.shape.reach
     if nearest <= 0:
         raise ValueError(f"a moving body reaches the camera: clearance {nearest:.3f} m must be above 0")
@@ -187,14 +197,20 @@ def cover_moving(body: Body, camera: Camera, times: Float[np.ndarray, "F"]) -> C
         frame=np.stack([across, np.cross(normal, across), normal], axis=2),
         scale=np.tile([radius, radius, THICKNESS], (len(point), 1)),
         reflectance=body.texture(point) / share,
+        albedo=body.texture.albedo(point),
         body=body,
     )
 
 
-def clearance(body: Body, camera: Camera, times: Float[np.ndarray, "F"]) -> Float[np.ndarray, "F"]:
-    """Distance [m] between the camera and the smallest ball around a body, at ``times`` [s]; negative inside it."""
+def clearance(
+    body: Body, camera: Float[np.ndarray, "*frames 3"], times: Float[np.ndarray, "F"]
+) -> Float[np.ndarray, "F"]:
+    """Distance [m] between a camera and the smallest ball around a body, at ``times`` [s]; negative inside it.
+
+    ``camera`` is its position [m], or one position for each of the times.
+    """
     centres = np.array([body.path.world_from_body(float(t))[:3, 3] for t in times])
-    return np.linalg.norm(centres - camera.centre, axis=1) - body.shape.reach
+    return np.linalg.norm(centres - camera, axis=1) - body.shape.reach
 
 
 def merge(fields: list[GaussianField]) -> GaussianField:

@@ -7,7 +7,7 @@ a surface of reflectance rho met under the angle of incidence i has the amplitud
 from __future__ import annotations
 
 import abc
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -15,15 +15,20 @@ import torch
 from jaxtyping import Float, Int
 
 from ..scene.camera import Camera
-from .paths import Path, Still
+from .paths import Path, Still, inverse
 
+SATURATION = 0.6  # [1] of the colours: no channel is less than 0.4 of the brightest
+HUE_SPREAD = 0.2  # [turns] from one end to the other of the hues of one texture, where it has a hue at all
 TEXTURE_ORIGIN = 37.0001  # [m] keeps cell numbers positive and cell borders off the faces, which lie at round numbers
 GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))  # [rad] between neighbours of a spiral that covers a sphere evenly
 
 
 @dataclass(frozen=True, kw_only=True)
 class Texture:
-    """Reflectance in hashed cells of a 3-D grid in the body's axes (sensor notes, 4.1); ``low == high`` is plain."""
+    """Reflectance in hashed cells of a 3-D grid in the body's axes (sensor notes, 4.1); ``low == high`` is plain.
+
+    In colour every cell has its own hue, hashed from other bits, and its brightest channel is its reflectance.
+    """
 
     low: float
     """Smallest reflectance [1]."""
@@ -31,12 +36,24 @@ class Texture:
     """Largest reflectance [1]."""
     cell: float = 0.3
     """Edge of a cell [m]."""
+    hue: float | None = field(default=None, repr=False)
+    """Middle of the cells' hues, in turns: 0 red, 1/3 green, 2/3 blue; None: they have all hues."""
 
     def __call__(self, point: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P"]:
         """Reflectance [1] at points in the body's axes [m]."""
+        return self.low + (self.high - self.low) * (self._hash(point) & 0xFFFF) / 65535.0
+
+    def albedo(self, point: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 3"]:
+        """Albedo in linear RGB [1] at points in the body's axes [m]."""
+        unit = ((self._hash(point) >> 16) & 0xFFFF) / 65536.0
+        hue = unit if self.hue is None else self.hue + HUE_SPREAD * (unit - 0.5)
+        ramp = np.abs((6.0 * hue[:, None] + [0.0, 4.0, 2.0]) % 6.0 - 3.0) - 1.0  # HSV to RGB, all sectors at once
+        return self(point)[:, None] * (1.0 - SATURATION * (1.0 - np.clip(ramp, 0.0, 1.0)))
+
+    def _hash(self, point: Float[np.ndarray, "P 3"]) -> Int[np.ndarray, "P"]:
+        """A number of each point's cell; the lower 32 bits are those of unbounded integers."""
         x, y, z = np.floor((point.T + TEXTURE_ORIGIN) / self.cell).astype(np.int64)
-        cell = (x * 73856093) ^ (y * 19349663) ^ (z * 83492791)
-        return self.low + (self.high - self.low) * ((cell * 2654435761) & 0xFFFF) / 65535.0
+        return ((x * 73856093) ^ (y * 19349663) ^ (z * 83492791)) * 2654435761
 
 
 class Grid(NamedTuple):
@@ -277,3 +294,13 @@ def first_hit(bodies: tuple[Body, ...], camera: Camera, time: float) -> Hits:
         reflectance=reflectance.reshape(shape),
         amplitude=np.where(body < 0, 0.0, reflectance * cosine / distance**2).reshape(shape),
     )
+
+
+def albedo(bodies: tuple[Body, ...], hits: Hits, time: float) -> Float[np.ndarray, "H W 3"]:
+    """Albedo in linear RGB [1] of what ``hits`` met at ``time`` [s]; 0 where nothing was hit."""
+    colour = np.zeros((*hits.body.shape, 3))
+    for index, body in enumerate(bodies):
+        seen = hits.body == index
+        body_from_world = inverse(body.path.world_from_body(time))
+        colour[seen] = body.texture.albedo(hits.point[seen] @ body_from_world[:3, :3].T + body_from_world[:3, 3])
+    return colour

@@ -1,0 +1,87 @@
+"""What a camera sees of a scene at one instant: the covers that face it, rendered at several rays per pixel."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from ..render.api import rasterize
+from ..scene.camera import Camera
+from ..scene.gaussians import GaussianField
+from ..scene.sensor import Sensor
+from .scenes import Scene
+from .splat import Cover, cover_moving, cover_still, merge
+
+OPAQUE = 0.5  # [1] a ray that covers stop to less than this passes beside them: that is where their outline is
+
+
+class Splatted:
+    """A scene as Gaussians for one camera: a rigid cover per moving body and one for everything that stays.
+
+    What stays is covered along the rays of the camera, so a camera that moves gets a new cover for every instant.
+
+    Args:
+        scene: Bodies and their paths.
+        camera_at: The camera at a time [s], at the resolution of the rays: pixels times ``scene.subsamples``.
+        times: Instants [s] at whose nearest approach the covers are still fine enough.
+        colour: Whether the Gaussians have colour.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        camera_at: Callable[[float], Camera],
+        times: Float[np.ndarray, "F"],
+        *,
+        colour: bool = False,
+    ):
+        self.camera_at = camera_at
+        self._colour, self._camera_moves = colour, scene.camera_moves
+        self._still = tuple(body for body in scene.bodies if not body.moves)
+        self._static = None if self._camera_moves else self._cover_still(0.0)
+        centres = np.array([camera_at(float(time)).centre for time in times])
+        self._moving: list[Cover] = [
+            cover_moving(body, camera_at(0.0), times, centres) for body in scene.bodies if body.moves
+        ]
+
+    def at(self, time: float) -> GaussianField:
+        """All Gaussians that face the camera at ``time`` [s]."""
+        centre = self.camera_at(time).centre
+        static = self._cover_still(time) if self._camera_moves else self._static
+        moving = [cover.seen(centre, time, colour=self._colour) for cover in self._moving]
+        return merge([*([] if static is None else [static]), *moving])
+
+    def _cover_still(self, time: float) -> GaussianField | None:
+        if not self._still:
+            return None
+        camera = self.camera_at(time)
+        return cover_still(self._still, camera).seen(camera.centre, 0.0, colour=self._colour)
+
+
+def look(splatted: Splatted, time: float, sensor: Sensor, subsamples: int) -> tuple[Float[np.ndarray, "H W"], ...]:
+    """Mean quad of the sensor's first shift, mean amplitude and mean distance over opacity [m] of every pixel."""
+    with torch.no_grad():
+        rendering = rasterize(splatted.at(time), splatted.camera_at(time), sensor)
+    return (
+        _pooled(rendering.quads[0], subsamples),
+        _pooled(rendering.phasor[2], subsamples) / 2,  # the third channel of a phasor is 2a
+        _pooled(rendering.distance, subsamples) / _pooled(rendering.opacity, subsamples),
+    )
+
+
+def look_colour(splatted: Splatted, time: float, subsamples: int) -> Float[np.ndarray, "H W 3"]:
+    """Mean albedo of every pixel in linear RGB [1]: colour over opacity where a ray meets anything, else black."""
+    with torch.no_grad():
+        rendering = rasterize(splatted.at(time), splatted.camera_at(time), Sensor())
+    assert rendering.colour is not None, "the splats of a colour camera have colour"
+    met = torch.where(rendering.opacity > OPAQUE, rendering.colour / rendering.opacity, 0.0)
+    return np.stack([_pooled(channel, subsamples) for channel in met], axis=-1)
+
+
+def _pooled(image: torch.Tensor, subsamples: int) -> Float[np.ndarray, "H W"]:
+    """Mean over the rays of each pixel, float64."""
+    rows, columns = (length // subsamples for length in image.shape)
+    return image.double().numpy().reshape(rows, subsamples, columns, subsamples).mean((1, 3))
