@@ -1,6 +1,7 @@
 """A finished run whose errors are known beforehand: a box slides past a wall, and both are rendered a little wrong."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +16,10 @@ from gftorf_warp.scene.sensor import Sensor
 
 HEIGHT, WIDTH, FRAMES = 12, 20, 14  # three complete quartets, and a truncated one
 WALL, BOX = 4.0, 2.5  # [m]
+COLOUR_ERROR = 0.05  # of every channel, in units of the colour images
 WALL_ERROR, BOX_ERROR, QUAD_ERROR = 0.02, -0.1, 0.03  # [m] of the mean distance, and of what the quads encode
 OPACITY = 0.98
+GROUPS = ("", "moving.", "static.")
 PHASE_SLOPE = float(Sensor().phase_slope)
 
 
@@ -36,6 +39,43 @@ def quad(distance, shift, amplitude_distance=None):
     """Quad of surfaces at a distance [m], with the falloff of another one if given."""
     falloff = distance if amplitude_distance is None else amplitude_distance
     return np.cos(PHASE_SLOPE * distance - shift) / falloff**2
+
+
+def in_colour(distance):
+    """[3, H, W] linear RGB of surfaces at a distance: a reddish wall, a bluish box."""
+    return np.where(distance == BOX, np.array([0.1, 0.2, 0.9])[:, None, None], np.array([0.8, 0.5, 0.1])[:, None, None])
+
+
+def with_colour(measured):
+    """A sequence with a colour image of every quartet's start, taken a decimetre aside, and three novel poses."""
+    beside = np.tile(np.eye(4), (measured.frames, 1, 1))
+    beside[:, 0, 3] = -0.1
+    novel = np.tile(np.eye(4), (3, 1, 1))
+    novel[:, 1, 3] = (0.5, 0.0, -0.5)
+    images = {n: in_colour(true_distance(n)).transpose(1, 2, 0) for n in range(0, measured.frames, 4)}
+    return replace(
+        measured,
+        colour={n: (2.0 * image).astype(np.float32) for n, image in images.items()},
+        colour_intrinsics=(20.0, 20.0, WIDTH / 2, HEIGHT / 2),
+        colour_from_world=beside,
+        novel_from_world=novel,
+    )
+
+
+def as_phasors(measured):
+    """The complete quartets as a camera gives them that delivers phasors, at the instants of their starts."""
+    starts = [4 * i for i in measured.complete_quartets]
+    phasors = [quad(true_distance(n), 0.0) * 2 + 2j * quad(true_distance(n), np.pi / 2) for n in starts]
+    quads = np.stack([part / 2 for p in phasors for part in (p.real, -p.real, p.imag, -p.imag)])
+    return replace(
+        measured,
+        quads=quads.astype(np.float32),
+        measured=np.ones(len(quads), dtype=bool),
+        shifts=measured.shifts[: len(quads)],
+        times=np.repeat(measured.times[starts], 4),
+        camera_from_world=np.repeat(measured.camera_from_world[starts], 4, axis=0),
+        from_phasors=True,
+    )
 
 
 def sequence(frames=FRAMES):
@@ -64,7 +104,7 @@ def truth(frames=FRAMES):
 class AnalyticRun:
     """Looks like a finished run; what it renders is the truth plus the errors above."""
 
-    def __init__(self, folder, *, with_truth=True):
+    def __init__(self, folder, *, with_truth=True, colour=False):
         self.path = Path(folder) / "run"
         self.path.mkdir(parents=True)
         where = Path(folder) / "sliding-box"
@@ -73,6 +113,7 @@ class AnalyticRun:
         self.sensor = Sensor()
         self.quad_scale = 1.0
         self.gaussians = 1234
+        self.colour = colour
         self.cameras = []  # every camera that was rendered from
         self.config = {
             "version": "0.0.9",
@@ -91,6 +132,18 @@ class AnalyticRun:
         steps = [{"images": 100 * i, "seconds": 1.0 * i, "loss": 1.0 / i, "quads": 0.8 / i} for i in range(1, 6)]
         lines = [json.dumps(step | {"gaussians": 1200 + i, "quad_psnr_db": 20.0 + i}) for i, step in enumerate(steps)]
         (self.path / "metrics.jsonl").write_text("\n".join(lines) + "\n")
+
+    def watched(self, *rows):
+        """Write rows of diagnostics, each (images, error of d, |d - d_ToF| on static pixels)."""
+        lines = [
+            json.dumps(
+                {"images": images, "gaussians": 1000 + images, "transmittance": 0.5 / images, "distortion": 0.02}
+                | {f"{group}{name}_mse_x100": error for group in GROUPS for name in ("d", "d_tof")}
+                | {"offset_static_m": 0.01, "d_minus_dtof_static_m": apart}
+            )
+            for images, error, apart in rows
+        ]
+        (self.path / "diagnostics.jsonl").write_text("\n".join(lines) + "\n")
 
     def sequence(self):
         """The sequence this run pretends to be made from."""
@@ -112,7 +165,7 @@ class AnalyticRun:
         return Rendering(
             quads=tensor(quads),
             phasor=tensor(phasor),
-            colour=None,
+            colour=tensor(2.0 * in_colour(right) + COLOUR_ERROR) if self.colour else None,
             distance=tensor(distance),
             opacity=tensor(np.full_like(distance, OPACITY)),
             distortion=tensor(np.zeros_like(distance)),

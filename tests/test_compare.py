@@ -8,14 +8,16 @@ import analytic_run
 import numpy as np
 import pytest
 import torch
-from analytic_run import BOX, PHASE_SLOPE, WALL, AnalyticRun, box_at, quad, true_distance
+from analytic_run import BOX, PHASE_SLOPE, WALL, AnalyticRun, as_phasors, box_at, quad, true_distance, with_colour
 
 from gftorf_warp import __version__
 from gftorf_warp.constants import CANONICAL_SHIFTS
 from gftorf_warp.data import ftorf
 from gftorf_warp.data.sequence import Truth
 from gftorf_warp.errors import DivergedError, InputError, UsageError
-from gftorf_warp.evaluate.compare import compare, sequence_title, training_log, truth_statement
+from gftorf_warp.evaluate.compare import compare, findings, rows_of, sequence_title, summary, truth_statement
+from gftorf_warp.evaluate.metrics import scored_frames
+from gftorf_warp.evaluate.views import gather
 
 PIXELS, BOX_PIXELS = 12 * 20, 6 * 4
 MOVING, MOVING_BOX = 6 * 6, 6 * 3  # seven columns see the box within a quartet, one of them all the time
@@ -29,14 +31,20 @@ KEYS = {
     "moving",
     "static",
     "quad_psnr_db",
+    "colour_psnr_db",
     "gaussians",
+    "diagnostics",
+    "method",
     "seconds_reconstruct",
     "images_optimised",
     "device",
     "seed",
     "preset",
+    "ablation",
+    "input",
     "flow_source",
     "init",
+    "motion",
     "version",
 }
 
@@ -82,7 +90,10 @@ def test_every_number_by_hand(run):
     assert got["moving"]["closed_form_mse_x100"] > 10.0, "an exact closed form would test nothing"
     for name, value in {"gaussians": 1234, "images_optimised": 2988, "seconds_reconstruct": 41.25, "seed": 7}.items():
         assert got[name] == value
-    assert [got[name] for name in ("device", "preset", "flow_source", "init")] == ["cpu", "demo", "computed", "phase"]
+    copied = {"device": "cpu", "preset": "demo", "flow_source": "computed", "init": "phase", "motion": "nodes"}
+    assert {name: got[name] for name in copied} == copied
+    assert got["method"] == "gaussians"
+    assert got["input"] is got["ablation"] is got["diagnostics"] is got["colour_psnr_db"] is None
 
 
 def test_quad_psnr_pools_the_measured_slots(run):
@@ -211,12 +222,12 @@ def test_box_and_mask_of_the_analytic_run():
     assert seen[0].sum() == BOX_PIXELS
 
 
-def test_training_log_stops_before_a_torn_line(tmp_path):
+def test_rows_of_stops_before_a_torn_line(tmp_path):
     """A killed run may leave half a line."""
     path = tmp_path / "metrics.jsonl"
-    assert training_log(path) == []
+    assert rows_of(path) == []
     path.write_text('{"images": 4, "loss": 1.0}\n{"images": 8, "lo')
-    assert training_log(path) == [{"images": 4, "loss": 1.0}]
+    assert rows_of(path) == [{"images": 4, "loss": 1.0}]
 
 
 def test_a_sequence_is_called_by_its_heading(tmp_path):
@@ -233,3 +244,67 @@ def test_truth_statement_is_the_paragraph_of_the_data_card(tmp_path):
     assert truth_statement(tmp_path) is None
     (tmp_path / "README.md").write_text("# box\n\nGround truth is the analytic hit,\nnot a rendering.\n\nMore.\n")
     assert truth_statement(tmp_path) == "Ground truth is the analytic hit, not a rendering."
+
+
+def test_settings_fill_in_what_the_config_does_not_say(run):
+    """The input is resolved in the config, the row of the ablation stands in its settings."""
+    run.config |= {"input": "quads", "settings": {"method": "gaussians", "input": "auto", "ablation": "h1"}}
+    got = compare(run, report=False)
+    assert (got["input"], got["ablation"], got["method"]) == ("quads", "h1", "gaussians")
+
+
+def test_phasors_are_scored_once(run):
+    """Four raw frames of one instant are one image; what moves is what changes to the next phasor."""
+    phasors = as_phasors(run.sequence())
+    run.sequence = lambda: phasors
+    known = analytic_run.truth().distance
+    still = Truth(distance=np.repeat(known[[0, 4, 8]], 4, axis=0), known=np.ones(12, dtype=bool))
+    found = findings(phasors, gather(run, phasors, scored_frames(phasors)), still)
+    assert found.views.frames == [0, 4, 8]
+    got = summary(run, found, protocol="all")
+    assert got["frames"] == 3
+    assert got["closed_form_mse_x100"] == pytest.approx(0.0, abs=1e-8)
+    assert got["d_tof_mse_x100"] == pytest.approx(100 * 0.03**2, rel=1e-4)
+    box, wall = 0.98 * (BOX - 0.1) - BOX, 0.98 * (WALL + 0.02) - WALL
+    assert got["moving"]["d_mse_x100"] == pytest.approx(100 * (box**2 + wall**2) / 2, rel=1e-4)
+    assert got["moving"]["share"] == pytest.approx(2 * BOX_PIXELS / PIXELS), "four columns appear, four disappear"
+
+
+def test_colour_is_compared_from_the_colour_camera(tmp_path):
+    """At the frames that have an image, from the pose of the colour camera, at its size; the peak is the largest."""
+    run = AnalyticRun(tmp_path, colour=True)
+    sequence = with_colour(run.sequence())
+    run.sequence = lambda: sequence
+    got = compare(run, report=False)
+    assert got["colour_psnr_db"] == pytest.approx(20 * math.log10(1.8 / 0.05), abs=1e-3)
+    taken = [camera for camera in run.cameras if camera.camera_from_world[0, 3] == -0.1]
+    assert len(taken) == 3
+    unknown = replace(sequence, colour_intrinsics=None)
+    run.sequence = lambda: unknown
+    assert compare(run, report=False)["colour_psnr_db"] is None
+    grey = AnalyticRun(tmp_path / "grey")
+    grey.sequence = lambda: sequence
+    assert compare(grey, report=False)["colour_psnr_db"] is None
+
+
+def test_diagnostics_in_a_few_numbers(run):
+    """The best moment by truth, and by the criterion that needs none; a torn line is no row."""
+    run.watched((10, 9.0, 0.4), (20, 3.0, 0.2), (30, 5.0, 0.1))
+    with (run.path / "diagnostics.jsonl").open("a") as file:
+        file.write('{"images": 40, "d_mse_x100": 0.')
+    assert compare(run, report=False)["diagnostics"] == {
+        "rows": 3,
+        "d_mse_x100_least": 3.0,
+        "images_at_least": 20,
+        "criterion_m_least": 0.1,
+        "images_at_criterion": 30,
+        "d_mse_x100_at_criterion": 5.0,
+    }
+    run.watched((10, None, None), (20, None, 0.2))
+    found = compare(run, report=False)["diagnostics"]
+    assert found == {
+        **dict.fromkeys(found),
+        "rows": 2,
+        "criterion_m_least": 0.2,
+        "images_at_criterion": 20,
+    }

@@ -1,6 +1,7 @@
 """Which frames and pixels are scored, and errors of small arrays, against numbers worked out by hand."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -38,6 +39,23 @@ def quartets(frames, missing=()):
 def test_all_takes_every_frame_of_complete_quartets():
     """Frame 5 is missing and frames 12, 13 end truncated: their quartets are left out."""
     assert metrics.scored_frames(quartets(14, missing=[5])) == [0, 1, 2, 3, 8, 9, 10, 11]
+
+
+def test_a_phasor_is_scored_once():
+    """Its four raw frames are one image; the published protocol is the same as ever."""
+    phasors = replace(quartets(16), from_phasors=True)
+    assert metrics.scored_frames(phasors) == [0, 4, 8, 12]
+    assert metrics.scored_frames(phasors, "ftorf13") == [4, 8]
+
+
+def test_between_phasors_is_where_things_move():
+    """From one phasor to the next, and from the one before at the end; within one there is nothing to see."""
+    distance = np.repeat([[2.0, 2.0, 2.0], [2.0, 2.1, 2.0], [2.0, 2.1, NAN]], 4, axis=0)[:, None]
+    assert not moving_and_static(distance, [0, 4])[0].any()
+    moving, static = moving_and_static(distance, [0, 4, 8], from_phasors=True)
+    assert moving[:, 0].tolist() == [[False, True, False], [False, False, False], [False, False, False]]
+    assert static[:, 0].tolist() == [[True, False, True], [True, True, False], [True, True, False]]
+    assert moving_and_static(distance[:4], [0], from_phasors=True)[1].all()
 
 
 def test_ftorf13_takes_thirteen_of_sixty_frames():

@@ -11,12 +11,13 @@ import analytic_run
 import cv2
 import numpy as np
 import pytest
-from analytic_run import AnalyticRun
+from analytic_run import AnalyticRun, as_phasors, with_colour
 
 from gftorf_warp.constants import CANONICAL_SHIFTS
 from gftorf_warp.data.sequence import Sequence, Truth
 from gftorf_warp.evaluate import figures, page, panels, pictures
-from gftorf_warp.evaluate.compare import compare, findings, summary
+from gftorf_warp.evaluate.compare import compare, findings, rows_of, summary
+from gftorf_warp.evaluate.gallery import colour_views, novel_views
 from gftorf_warp.evaluate.metrics import scored_frames
 from gftorf_warp.evaluate.report import report, verdict
 from gftorf_warp.evaluate.views import Views, gather
@@ -26,6 +27,7 @@ HOSTILE = "<script>alert(1)</script>"
 PRINTED = {  # how the page prints a value of metrics.json, written a second time
     "error": lambda value: f"{value:.3f}",
     "rms_cm": lambda value: f"{math.sqrt(value / 100) * 100:.1f} cm",
+    "length_cm": lambda value: f"{value * 100:.2f} cm",
     "percent": lambda value: f"{value * 100:.1f} %",
     "decibel": lambda value: f"{value:.2f} dB",
     "count": lambda value: f"{value:,d}",
@@ -98,11 +100,18 @@ def look_up(metrics, key):
 @pytest.fixture(scope="module")
 def compared(tmp_path_factory):
     """(folder of the run, metrics.json, page, findings) of the analytic run."""
-    run = AnalyticRun(tmp_path_factory.mktemp("compared"))
+    run = AnalyticRun(tmp_path_factory.mktemp("compared"), colour=True)
+    run.watched(*((100 * i, 9.0 / i, 0.1 / i) for i in range(1, 6)))
+    sequence = with_colour(run.sequence())
+    run.sequence = lambda: sequence
     compare(run)
-    sequence = run.sequence()
     truth = sequence.truth()
-    found = findings(sequence, gather(run, sequence, scored_frames(sequence)), truth)
+    frames = scored_frames(sequence)
+    found = replace(
+        findings(sequence, gather(run, sequence, frames), truth),
+        colour=colour_views(run, sequence, frames),
+        novel=novel_views(run, sequence),
+    )
     metrics = json.loads((run.path / "metrics.json").read_text())
     return run, metrics, Page((run.path / "report.html").read_text()), found
 
@@ -119,10 +128,13 @@ def test_every_printed_number_is_in_metrics(compared):
     wanted = {
         f"{group}{name}_mse_x100" for group in ("", "moving.", "static.") for name in ("closed_form", "d", "d_tof")
     }
-    assert wanted | {"moving.share", "static.share", "quad_psnr_db", "gaussians", "frames", "seed"} <= printed
+    wanted |= {"moving.share", "static.share", "quad_psnr_db", "colour_psnr_db", "gaussians", "frames", "seed"}
+    wanted |= {f"diagnostics.{name}" for name in metrics["diagnostics"] if name != "rows"}
+    assert wanted <= printed
     assert len(html.ratios) == 1
-    for section in ("top", "Errors"):
+    for section in ("top", "Errors", "Along the run", "Colour"):
         left = html.texts[section].replace("m² \N{MULTIPLICATION SIGN} 100", "").replace("atan2", "")
+        left = re.sub(r"\bframe \d+", "", left)  # which picture it is
         assert not re.search(r"\d", left), left
 
 
@@ -223,6 +235,82 @@ def test_curves_are_drawn_from_the_log(compared):
     assert figures.training_curves([]) is None
 
 
+def test_along_the_run_is_drawn_from_its_rows(compared):
+    """Six drawings with truth, fewer without, and no section where nothing was watched."""
+    run, metrics, html, found = compared
+    assert "Along the run" in html.images
+    assert "Along the run" in html.texts
+    rows = rows_of(run.path / "diagnostics.jsonl")
+    blind = [{name: None if "mse" in name else value for name, value in row.items()} for row in rows]
+    titles = [set(drawn_texts(figures.along_run(given))) for given in (rows, blind)]
+    assert titles[0] - titles[1] >= {"Error of d", "Error of d_ToF"}
+    for both in titles:
+        assert {"On static pixels", "Light let through", "Depth distortion", "Gaussians"} <= both
+    assert figures.along_run([]) is None
+    bare = Page(report(title="bare", metrics=metrics, config=run.config, log=[], found=found))
+    assert "Along the run" not in bare.texts
+    assert "Along the run" not in bare.images
+
+
+def drawn_texts(svg):
+    """Texts of a drawing, which are comments beside their outlines."""
+    return [text.strip() for text in re.findall(r"<!--(.*?)-->", svg.decode())]
+
+
+def test_views_that_nobody_took_are_shown(compared):
+    """Distance on the scale of all others and colour, from three poses; colour measured above rendered."""
+    _, _, html, found = compared
+    scale = panels.common_distance_scale(found)
+    assert found.novel.poses == [0, 1, 2]
+    assert found.novel.time == pytest.approx(6.5 / 120)
+    for m in range(3):
+        want = pictures.colour_mapped(found.novel.distance[m], scale)
+        np.testing.assert_array_equal(picture(html.images["distance / opacity"][m]), want)
+    right = analytic_run.true_distance(6)
+    wrong = np.where(right == analytic_run.BOX, analytic_run.BOX_ERROR, analytic_run.WALL_ERROR)
+    np.testing.assert_allclose(found.novel.distance[1], right + wrong, rtol=1e-5)
+    assert len(html.images["colour"]) == 3
+    measured, rendered = (picture(html.images[f"{kind} colour"][0]).astype(int) for kind in ("measured", "rendered"))
+    assert measured[0, 0].argmax() == 0, "the wall is reddish"
+    assert measured[5, 3].argmax() == 2, "the box is bluish"
+    assert 0 < np.abs(measured - rendered).max() < 60
+
+
+def test_mist_is_no_surface(compared):
+    """Grey where most of the light would pass."""
+    run, _, _, found = compared
+    render = run.render
+
+    def misty(time, camera=None):
+        rendering = render(time, camera)
+        rendering.opacity[:2] = 0.3
+        return rendering
+
+    run.render = misty
+    novel = novel_views(run, found.sequence)
+    del run.render
+    assert np.isnan(novel.distance[:, :2]).all()
+    assert np.isfinite(novel.distance[:, 2:]).all()
+    assert novel_views(run, replace(found.sequence, novel_from_world=None)) is None
+
+
+def test_a_page_about_phasors_shows_phasors(compared):
+    """Real and imaginary part instead of four quads, and no word about four instants."""
+    run, metrics, _, found = compared
+    phasors = as_phasors(found.sequence)
+    seen = findings(phasors, gather(run, phasors, scored_frames(phasors)), None)
+    config = run.config | {"input": "phasor", "motion": "network"}
+    html = Page(report(title="phasors", metrics=metrics, config=config, log=[], found=seen))
+    assert {"real part", "imaginary part", "measured phase"} <= set(html.images)
+    assert not [title for title in html.images if title.startswith("raw frame")]
+    text = " ".join(html.texts.values())
+    assert "each with its own" not in text
+    assert "each quartet is scored once" in " ".join(html.texts["How to read it"].split())
+    assert "phasor: real and imaginary part" in html.texts["How it was made"]
+    assert "an MLP of position and time" in html.texts["How it was made"]
+    assert "--input phasor" in html.texts["How it was made"]
+
+
 def test_verdict_says_which_is_better():
     """Ours better, ours worse, and unknown."""
     rows = {"closed_form_mse_x100": 100.0, "d_mse_x100": 4.0, "share": 0.125}
@@ -232,6 +320,7 @@ def test_verdict_says_which_is_better():
     assert "25.0 times less squared error" in text
     bad = {"moving": {**rows, "closed_form_mse_x100": 2.0}, "static": rows, "d_mse_x100": 1.0}
     assert "2.0 times more squared error" in re.sub(r"<[^>]*>", "", verdict(bad))
+    assert "closed form itself" in verdict(good | {"method": "ctof"})
     assert "no ground truth" in verdict({"d_mse_x100": None, "quad_psnr_db": 31.0})
 
 

@@ -1,16 +1,17 @@
 """What ``gftorf render`` writes, and colours that mean what their scale says."""
 
 import json
+import re
 from dataclasses import replace
 
 import analytic_run
 import numpy as np
 import pytest
 import torch
-from analytic_run import FRAMES, HEIGHT, WIDTH, AnalyticRun, true_distance
+from analytic_run import FRAMES, HEIGHT, WIDTH, AnalyticRun, true_distance, with_colour
 
 from gftorf_warp.data.images import read_exr
-from gftorf_warp.errors import UsageError
+from gftorf_warp.errors import InputError, UsageError
 from gftorf_warp.evaluate import pictures, renders
 from gftorf_warp.evaluate.views import channel_of_shift, render_to_folder
 from gftorf_warp.scene.sensor import Sensor
@@ -73,6 +74,89 @@ def test_chosen_times_and_things(run, tmp_path):
     np.testing.assert_array_equal(rgb[:, :WIDTH], pictures.colour_mapped(phase, pictures.phase_scale()))
     assert rgb[0, -1, 0] < rgb[4, WIDTH + 2 + 11, 0], "the box is nearer, so brighter"
     assert len(list((out / "phasor").iterdir())) == 4
+
+
+def taken(run):
+    """Height of every camera that something was rendered from, without the samples for the previews, and the times."""
+    return [float(camera.camera_from_world[1, 3]) for camera in run.cameras]
+
+
+@pytest.mark.parametrize("rows", [4, 3])
+def test_poses_from_a_file(run, tmp_path, rows):
+    """Pose k at time k, the shorter list starting over; without times in the middle of the sequence."""
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    poses[:, 1, 3] = (1.0, 2.0, 3.0)
+    path = tmp_path / "poses.npy"
+    np.save(path, poses[:, :rows])
+    out = render_to_folder(run, tmp_path / "middle", what="distance", poses=path)
+    listed = json.loads((out / "renders.json").read_text())
+    assert listed["times_s"] == pytest.approx([6.5 / 120] * 3)
+    np.testing.assert_array_equal(listed["camera_from_world"], poses)
+    assert taken(run)[-3:] == [1.0, 2.0, 3.0]
+    assert len(list((out / "distance").glob("*.exr"))) == 3
+    for times, want in (
+        ([0.0, 0.1], [(1, 0.0), (2, 0.1), (3, 0.0)]),
+        ([0.0, 0.01, 0.02, 0.03], [(1, 0.0), (2, 0.01), (3, 0.02), (1, 0.03)]),
+    ):
+        out = render_to_folder(run, tmp_path / str(len(times)), poses=path, times=times)
+        listed = json.loads((out / "renders.json").read_text())
+        found = [pose[1][3] for pose in listed["camera_from_world"]]
+        assert list(zip(found, listed["times_s"], strict=True)) == want
+        assert taken(run)[-len(want) :] == [height for height, _ in want]
+
+
+def test_other_poses_are_other_images(run, tmp_path):
+    """Of the same times and channels."""
+    for k in (0, 1):
+        pose = np.eye(4)[None].copy()
+        pose[0, 2, 3] = k
+        np.save(tmp_path / f"{k}.npy", pose)
+    out = render_to_folder(run, tmp_path / "out", poses=tmp_path / "0.npy", times=[0.0])
+    render_to_folder(run, out, poses=tmp_path / "0.npy", times=[0.0])
+    with pytest.raises(UsageError, match="other times or poses"):
+        render_to_folder(run, out, poses=tmp_path / "1.npy", times=[0.0])
+    with pytest.raises(UsageError, match="other times or poses"):
+        render_to_folder(run, out, times=[0.0])
+
+
+def test_novel_poses_are_those_of_the_sequence(run, tmp_path):
+    """Three of them; a sequence without any says so."""
+    with pytest.raises(UsageError, match="carries no poses"):
+        render_to_folder(run, tmp_path / "out", poses="novel")
+    sequence = with_colour(run.sequence())
+    run.sequence = lambda: sequence
+    render_to_folder(run, tmp_path / "out", poses="novel")
+    assert taken(run)[-3:] == [0.5, 0.0, -0.5]
+
+
+@pytest.mark.parametrize(
+    ("poses", "text"),
+    [
+        (np.eye(4), r"\(4, 4\)"),
+        (np.zeros((2, 4, 3)), r"\(2, 4, 3\)"),
+        (np.zeros((0, 4, 4)), r"\(0, 4, 4\)"),
+        (np.stack([np.eye(4), np.diag([1.0, 1.0, -1.0, 1.0])]), "1 of 2 are no rigid motions.*index 1"),
+        (2 * np.eye(4)[None], "no rigid"),
+        (np.full((1, 4, 4), np.nan), "not finite"),
+        (np.array([["a"]]), "wrong type"),
+    ],
+)
+def test_poses_that_are_none_are_refused(run, tmp_path, poses, text):
+    """Wrong shape, none at all, mirrored, scaled, unknown; nothing is written then."""
+    np.save(tmp_path / "poses.npy", poses)
+    with pytest.raises(InputError) as error:
+        render_to_folder(run, tmp_path / "out", poses=tmp_path / "poses.npy")
+    assert re.search(text, str(error.value), re.DOTALL), error.value
+    assert error.value.where == str(tmp_path / "poses.npy")
+    assert not (tmp_path / "out").exists()
+
+
+def test_poses_that_are_no_file_are_refused(run, tmp_path):
+    """A file that is missing, and one that is no .npy."""
+    with pytest.raises(InputError, match="poses"):
+        render_to_folder(run, tmp_path / "out", poses=tmp_path / "missing.npy")
+    with pytest.raises(UsageError, match=r"\.npy"):
+        render_to_folder(run, tmp_path / "out", poses="nvel")
 
 
 @pytest.mark.parametrize(

@@ -58,8 +58,6 @@ def read(poses: str | Path, sequence: Sequence) -> Float[np.ndarray, "M 4 4"]:
             fix="save the matrices with numpy.save",
         )
     stored = read_array(path, FIELD).astype(np.float64)
-    if not len(stored):
-        raise InputError("no pose", where=path, why="expected at least one matrix, found none", fix="store one")
     if stored.shape[1] == 3:
         last = np.broadcast_to([0.0, 0.0, 0.0, 1.0], (len(stored), 1, 4))
         stored = np.concatenate([stored, last], axis=1)
