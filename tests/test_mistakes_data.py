@@ -156,6 +156,9 @@ def test_mistake_16_the_factor_of_the_file_is_used_once_and_nothing_overrides_it
         prepared = observe(sequence, WITHOUT_FLOW, "cpu")
         assert prepared.quad_scale == pytest.approx(factor, rel=1e-6)
         np.testing.assert_allclose(prepared.quads.numpy(), sequence.quads * factor, rtol=1e-5)
+    assert [name for name, preset in presets.PRESETS.items() if preset().quad_scale is not None] == []
+    asked = observe(stated, replace(WITHOUT_FLOW, quad_scale=2.0), "cpu")
+    assert (asked.quad_scale, asked.quad_scale_source) == (2.0, "setting")
 
 
 @pytest.mark.parametrize("constant", [0.0, 1.0])
