@@ -5,6 +5,7 @@ import shutil
 
 import numpy as np
 import pytest
+import torf_folder
 from ftorf_folder import REAL_ORDER, SAMPLE, fingerprint, scene
 
 from gftorf_warp.constants import SPEED_OF_LIGHT
@@ -180,6 +181,111 @@ def test_wrapped_and_unreadable_truth_are_warned_of(tmp_path):
     assert not said(warnings, "truth implies")
     (folder / "synthetic_depth/0003.npy").write_text("text")
     assert said(check(folder).warnings, "synthetic_depth cannot be read", "0003.npy")
+
+
+def torf(tmp_path, count=3, **how):
+    """A TöRF folder large enough to estimate from, with some noise, that states everything."""
+    folder = torf_folder.build(tmp_path / "torf", count, height=HEIGHT, width=WIDTH, **{"noise": 2e-4} | how)
+    np.save(folder / "cams/frame_times.npy", np.arange(count) / 30)
+    (folder / "cams/pixel_centre.json").write_text('{"pixel_centre": "integer"}')
+    return folder
+
+
+def test_a_sound_phasor_folder_has_no_warnings(tmp_path):
+    """Numbers, sources and fits of a moving camera with colour, and nothing written."""
+    folder = torf(tmp_path, phase_offset=0.3)
+    before = fingerprint(folder)
+    report = check(folder)
+    assert fingerprint(folder) == before
+    assert report.warnings == []
+    assert str(report).startswith(f"{folder}: ToeRF sequence")
+    for words in (
+        ("raw frames", "12 of 12", "3 complete", "3 of 3 phasors, ids from 0000"),
+        ("times", "0.03333 to 0.03333 s apart", "file cams/frame_times.npy"),
+        ("f_mod_hz", "29.9792 MHz", "5 m", "depth_range 10 m"),
+        ("poses", "file cams/tof_extrinsics.npy"),
+        ("colour", "file color, 3 images, 16x12 pixels"),
+        ("colour camera", "file cams/color_intrinsics.npy", "file cams/relative_pose.npy"),
+        ("ids tof/{id}.npy", "3 from 0 to 2"),
+        ("third channel", "1 times", "correlation 1.0000"),
+        ("baseline", "0.05099 m"),
+        ("truth", "3 frames in distance"),
+        ("phase fit", "static pixels"),
+    ):
+        assert said(report.lines, *words), words
+    fit = next(line for line in report.lines if "phase fit" in line)
+    fitted = [float(fit.partition(f"{name} ")[2].split()[0]) for name in ("depth_range", "phase_offset")]
+    assert fitted == pytest.approx([10.0, 0.3], rel=0.01)
+    assert not said(report.lines, "order")
+
+
+def test_assumptions_of_a_phasor_folder_are_warned_of(tmp_path):
+    """Ids from 1 with a gap, default range and rate, identity poses while the picture moves, inferred colour camera."""
+    folder = torf(tmp_path, 4, first_id=1, speed=0.5)
+    (folder / "tof/0002.npy").unlink()
+    for path in (folder / "cams").iterdir():
+        if path.name != "tof_intrinsics.npy":
+            path.unlink()
+    report = check(folder)
+    assert said(report.warnings, "1 phasors were not measured: 1")
+    assert said(report.warnings, "frame rate assumed: 30 Hz")
+    assert said(report.warnings, "modulation frequency assumed")
+    assert said(report.warnings, "poses: all are identity", "camera moved")
+    assert said(report.warnings, "colour_intrinsics: inferred")
+    assert said(report.warnings, "colour_from_world: inferred")
+    assert said(report.lines, "ids tof/{id}.npy", "3 from 1 to 4", "1 (1x)", "2 (1x)")
+
+
+def test_identity_poses_of_a_resting_camera_are_fine(tmp_path):
+    """Nothing changes, so nothing speaks against them."""
+    folder = torf(tmp_path, speed=0.0)
+    assert not said(check(folder).warnings, "poses")
+
+
+@pytest.mark.parametrize(
+    ("name", "array", "words"),
+    [
+        ("cams/phase_offset.npy", np.float64(1.0), ("truth implies", "phase_offset", "in use are 10 m and +1.000")),
+        ("cams/depth_range.npy", np.float64(9.0), ("truth implies depth_range", "in use are 9 m")),
+        ("cams/relative_pose.npy", np.diag([1.0, 1, 1, 1]) + 35.0 * np.eye(4, k=3), ("stands 35 m off", "millimetres")),
+        ("cams/color_extrinsics.npy", torf_folder.poses(3), ("colour_from_world", "replaces")),
+        ("tof/0001.npy", np.random.default_rng(0).normal(size=(HEIGHT, WIDTH, 3)), ("third channel",)),
+    ],
+)
+def test_a_wrong_file_of_a_phasor_folder_is_noticed(tmp_path, name, array, words):
+    """The recording is sound but for one file."""
+    folder = torf(tmp_path)
+    np.save(folder / name, array)
+    assert said(check(folder).warnings, *words)
+
+
+@pytest.mark.parametrize("form", ["torf", "ftorf"])
+def test_z_depth_in_place_of_distance_is_noticed(tmp_path, form):
+    """The phase tells which of the two fits, in either format."""
+    matrix = torf_folder.intrinsics(HEIGHT, WIDTH)
+    y, x = np.mgrid[0:HEIGHT, 0:WIDTH].astype(float)
+    cosine = 1 / np.hypot(1, np.hypot((x - matrix[0, 2]) / matrix[0, 0], (y - matrix[1, 2]) / matrix[1, 1]))
+    folder = torf(tmp_path, truth="depth", speed=0.1)
+    if form == "ftorf":
+        sequence, truth = recording(fx=matrix[0, 0], fy=matrix[1, 1])
+        folder = ftorf.write(tmp_path / "seq", sequence, truth)
+    assert not said(check(folder).warnings, "z-depth")
+    for path in folder.glob("*depth/*.npy"):
+        np.save(path, np.load(path) * cosine)
+    assert said(check(folder).warnings, "depth fits the phase better as z-depth")
+
+
+def test_a_moving_camera_leaves_raw_quads_unfitted(tmp_path):
+    """Their four instants saw different places; phasors have one instant."""
+    poses = np.tile(np.eye(4), (8, 1, 1))
+    poses[:, 0, 3] = 0.01 * np.arange(8)
+    report = written(tmp_path, *[dataclasses.replace(recording()[0], camera_from_world=poses), recording()[1]])
+    assert said(report.lines, "phase fit", "camera moves")
+
+
+def test_distances_that_are_the_decoded_phasors_are_doubtful(tmp_path):
+    """Without noise that is what truth looks like; with noise it was decoded."""
+    assert said(check(torf(tmp_path, noise=0.0)).warnings, "distance was decoded", "without noise")
 
 
 def test_estimates_of_a_noisy_recording_are_close():
