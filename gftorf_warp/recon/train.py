@@ -18,11 +18,12 @@ from typing import TypeVar
 import torch
 
 from .. import __version__
-from ..data.sequence import Sequence
-from ..errors import DivergedError, UsageError
+from ..data.sequence import Sequence, Truth
+from ..errors import DivergedError, InputError, UsageError
 from ..render.buffers import available_threads
 from ..scene.measured import camera_of, frame_period, sensor_of
 from . import checkpoint, densify, folder, presets
+from .diagnostics import Watch
 from .observations import Observations, data_hash, input_of, observe
 from .optimiser import rates_at
 from .record import Metrics, log_to
@@ -58,7 +59,7 @@ def reconstruct(
 
     Args:
         sequence: What was recorded, or its folder.
-        out: Folder of the run: config.json, metrics.jsonl, run.log, ckpt/.
+        out: Folder of the run: config.json, metrics.jsonl, diagnostics.jsonl, run.log, ckpt/.
         settings: How, or the name of a preset.
         images: Raw frames to optimise, each as often as its turn comes; None: as the settings say.
         input: What is compared with the sensor: auto, quads or phasor; counts where ``settings`` is a name.
@@ -140,7 +141,9 @@ def _run(sequence, out, settings, config, seed, device, goes_on, begun, progress
     }
     folder.write_config(out, config)
     metrics = Metrics(out / "metrics.jsonl")
-    metrics.rewind(state.images)
+    watch = Watch(observations, _truth(sequence), out / "diagnostics.jsonl")
+    for record in (metrics, watch):
+        record.rewind(state.images)
     verb = "goes on at" if stored is not None else "starts at"
     moving = int((state.optimiser.layer > 0).sum()) if state.optimiser.layer is not None else 0
     count = len(state.optimiser.field)
@@ -151,12 +154,21 @@ def _run(sequence, out, settings, config, seed, device, goes_on, begun, progress
     def clock() -> float:
         return earlier + time.monotonic() - begun
 
-    loop = _Loop(observations, settings, out, device, metrics, clock, progress)
+    loop = _Loop(observations, settings, out, device, metrics, watch, clock, progress)
     state = loop.until_done(state)
     folder.write_config(
         out, config | {"seconds_reconstruct": state.seconds, "images_optimised": state.images, "skipped": state.skipped}
     )
     LOG.info("%s is finished: %d images, %.1f s", out, state.images, state.seconds)
+
+
+def _truth(sequence: Sequence) -> Truth | None:
+    """Ground truth for the diagnostics; None if there is none, or none that can be read, which stops no run."""
+    try:
+        return sequence.truth()
+    except InputError as error:
+        LOG.warning("diagnostics go without truth: %s: %s", error.where, error.what)
+        return None
 
 
 class _Loop:
@@ -169,18 +181,20 @@ class _Loop:
         out: Path,
         device: torch.device | str,
         metrics: Metrics,
+        watch: Watch,
         clock: Callable[[], float],
         progress: Progress | None,
     ):
         self.observations, self.out, self.device = observations, out, device
         self.settings, self.workers = threads_for(settings, device, available_threads())
-        self.metrics, self.clock, self.progress = metrics, clock, progress
+        self.metrics, self.watch, self.clock, self.progress = metrics, watch, clock, progress
         self.saved_at = clock()
 
     def until_done(self, state: State) -> State:
         total, failures = self.settings.schedule.images, 0
         if state.images == 0:
             self.save(state)
+            self.watch.look(state, self.settings)
         with _one_torch_thread(self.device), pool(self.workers) as threads, _signals() as stop:
             run_all: Callable = map  # the first step compiles kernels: one thread at a time
             while state.images < total:
@@ -198,6 +212,8 @@ class _Loop:
                 every = self.settings.schedule.log_every
                 if state.images // every > before // every or state.images >= total:
                     self.report(state)
+                if self.watch.due(before, state.images, total):
+                    self.watch.look(state, self.settings)
                 if stop.is_set():
                     self.save(state)
                     LOG.info("interrupted at image %d of %d, stored", state.images, total)
@@ -254,7 +270,8 @@ class _Loop:
         restored = from_dict(stored, self.device)
         restored.rate_factor = 0.5 * state.rate_factor
         restored.rollbacks, restored.skipped = state.rollbacks + 1, state.skipped
-        self.metrics.rewind(restored.images)
+        for record in (self.metrics, self.watch):
+            record.rewind(restored.images)
         LOG.warning("back to image %d with rates times %g", restored.images, restored.rate_factor)
         return restored
 

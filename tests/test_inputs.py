@@ -1,0 +1,275 @@
+"""What may be compared besides quads: phasors, colour from its own camera, closed-form distance; and moving cameras."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from moving_box import FOCAL, HEIGHT, WIDTH, recording
+from small_runs import demo, same, stored
+
+from gftorf_warp.constants import SH_COEFFICIENTS
+from gftorf_warp.errors import InputError, UsageError
+from gftorf_warp.recon import objective, presets, step
+from gftorf_warp.recon.observations import input_of, observe
+from gftorf_warp.recon.settings import Input, Norm, Weights
+from gftorf_warp.recon.state import begin
+from gftorf_warp.recon.train import reconstruct
+from gftorf_warp.render.api import rasterize
+from gftorf_warp.scene.initialise import Init, InitSettings, from_random
+from gftorf_warp.scene.measured import colour_camera_of, sensor_of
+
+BASELINE = 0.06  # [m] the colour camera stands to the right of the other
+
+
+def turned(degrees, position=(0.0, 0.0, 0.0)):
+    """World-to-camera pose of a camera at ``position`` turned about the vertical axis."""
+    a = np.radians(degrees)
+    pose = np.eye(4)
+    pose[:3, :3] = [[np.cos(a), 0, -np.sin(a)], [0, 1, 0], [np.sin(a), 0, np.cos(a)]]
+    pose[:3, 3] = -pose[:3, :3] @ position
+    return pose
+
+
+def with_colour(sequence, *, size=(2 * WIDTH, 2 * HEIGHT)):
+    """The sequence with smooth images of a colour camera of its own at quartet starts."""
+    width, height = size
+    y, x = np.mgrid[0:height, 0:width] / 20.0
+    image = 40.0 * np.stack([0.5 + 0.4 * np.sin(x), 0.5 + 0.4 * np.cos(y), 0.3 + 0.0 * x], axis=-1).astype(np.float32)
+    poses = sequence.camera_from_world.copy()
+    poses[:, 0, 3] -= BASELINE
+    zoom = width / WIDTH
+    return replace(
+        sequence,
+        colour=dict.fromkeys(range(0, sequence.frames, 4), image),
+        colour_intrinsics=(zoom * FOCAL, zoom * FOCAL, width / 2, height / 2),
+        colour_from_world=poses,
+    )
+
+
+def as_phasors(sequence):
+    """What a camera that combines quartets itself would have delivered."""
+    quads = sequence.quads.reshape(-1, 4, *sequence.quads.shape[1:])
+    re, im = quads[:, 0] - quads[:, 1], quads[:, 2] - quads[:, 3]
+    halves = np.stack([re, -re, im, -im], axis=1) / 2
+    times = sequence.times - (np.arange(sequence.frames) % 4) / 120
+    return replace(sequence, quads=halves.reshape(sequence.quads.shape), times=times, from_phasors=True)
+
+
+def test_auto_follows_the_camera():
+    """And a choice is a choice."""
+    sequence = recording(frames=8)[0]
+    assert input_of(sequence, Input.AUTO) == Input.QUADS
+    assert input_of(as_phasors(sequence), Input.AUTO) == Input.PHASOR
+    assert input_of(as_phasors(sequence), Input.QUADS) == Input.QUADS
+    assert input_of(sequence, Input.PHASOR) == Input.PHASOR
+
+
+def test_a_phasor_is_compared_once_per_quartet_in_its_middle():
+    """Rendered real and imaginary parts against the differences of opposite quads, of length 2a."""
+    sequence = recording(frames=12)[0]
+    settings = demo(input=Input.PHASOR, weights=Weights(ssim=0.0))
+    observations = observe(sequence, settings, "cpu")
+    assert observations.batches == [[0], [4], [8]]
+    assert observations.time_at(4) == pytest.approx(5.5 / 120)
+    q = observations.sequence.quads
+    want = torch.tensor(np.stack([q[4] - q[5], q[6] - q[7]]))
+    torch.testing.assert_close(observations.phasors[4], want, rtol=1e-4, atol=1e-5)
+    state = begin(observations, settings, seed=0, device="cpu")
+    fixed = (state.optimiser.field, state.motion, state.attachment)
+    found, seen = objective.terms(*fixed, observations, 4, settings, settings.weights)
+    torch.testing.assert_close(found["quads"], (seen.tof.phasor[:2] - want).square().mean(), rtol=1e-4, atol=1e-9)
+
+
+def test_phasor_and_quad_input_agree_on_a_static_scene(tmp_path):
+    """Within the noise: same start, as many images of each quartet."""
+    one = recording(frames=12)[0]
+    still = replace(one, quads=np.tile(one.quads[:4], (3, 1, 1)), forward_flow={}, backward_flow={})
+    distances = []
+    for kind, images in ((Input.QUADS, 480), (Input.PHASOR, 120)):
+        run = reconstruct(still, tmp_path / kind, replace(demo(input=kind, images=images)))
+        assert run.config["input"] == kind
+        distances.append(run.render(5 / 120).distance)
+    apart = (distances[0] - distances[1]).abs()
+    assert apart.mean() < 0.03
+    assert (distances[0] - distances[0].mean()).abs().mean() > 0.1, "a scene with structure"
+
+
+def test_colour_is_compared_from_its_own_camera():
+    """A Gaussian on the axis of the colour camera appears in the middle of its image, and only there."""
+    sequence = with_colour(recording(frames=8)[0])
+    camera = colour_camera_of(sequence, 4)
+    assert (camera.width, camera.height) == (2 * WIDTH, 2 * HEIGHT)
+    middle = camera.project(torch.tensor([[BASELINE, 0.0, 3.0]], dtype=torch.float64))[0].tolist()
+    assert middle == pytest.approx([WIDTH, HEIGHT])
+    settings = demo(weights=Weights(ssim=0.0, colour=2.0))
+    observations = observe(sequence, settings, "cpu")
+    assert observations.colour_scale == pytest.approx(1 / 36.0)
+    assert max(float(image.max()) for image in observations.colour.values()) == pytest.approx(1.0)
+    state = begin(observations, settings, seed=0, device="cpu")
+    field = state.optimiser.field
+    fixed = (field, state.motion, state.attachment)
+    found, seen = objective.terms(*fixed, observations, 4, settings, settings.weights)
+    moved = field.moved(state.motion.displacement(state.attachment, 4 / 120))
+    want = rasterize(moved, camera, sensor_of(sequence), settings.render).colour
+    error = 2.0 * (want - observations.colour[4]).square().mean()
+    torch.testing.assert_close(found["colour"], error)
+    wrong = rasterize(moved, observations.cameras[4].resized(*seen.colour.colour.shape[:0:-1]), sensor_of(sequence))
+    assert (wrong.colour - want).abs().max() > 0.05, "the other camera sees something else"
+    absolute = replace(settings.weights, colour_norm=Norm.L1)
+    found, _ = objective.terms(*fixed, observations, 4, settings, absolute)
+    torch.testing.assert_close(found["colour"], 2.0 * (want - observations.colour[4]).abs().mean())
+    assert "colour" not in objective.terms(*fixed, observations, 5, settings, settings.weights)[0], "no image there"
+
+
+def test_colour_of_weight_zero_is_never_rendered(monkeypatch):
+    """Neither tensors nor a pass."""
+    sequence = with_colour(recording(frames=8)[0])
+    calls = []
+    monkeypatch.setattr(objective, "rasterize", lambda field, *a, **k: calls.append(field) or rasterize(field, *a, **k))
+    for weight, colours in ((0.0, 0), (1.0, 1)):
+        settings = demo(weights=Weights(colour=weight), images=8)
+        observations = observe(sequence, settings, "cpu")
+        state = begin(observations, settings, seed=0, device="cpu")
+        assert bool(observations.colour) == (state.optimiser.field.colour_sh is not None) == bool(colours)
+        calls.clear()
+        step.step(state, observations, settings)
+        assert len(calls) == 4 + colours
+        assert sum(field.colour_sh is not None for field in calls) == colours
+
+
+def test_constant_and_other_harmonics_of_colour_have_rates_of_their_own():
+    """Adam's first step is the rate."""
+    settings = demo(weights=Weights(ssim=0.0, colour=1.0, distortion=0.0))
+    observations = observe(with_colour(recording(frames=8)[0]), settings, "cpu")
+    state = begin(observations, settings, seed=0, device="cpu")
+    before = state.optimiser.field.colour_sh.detach().clone()
+    assert before.shape == (len(before), SH_COEFFICIENTS, 3)
+    step.step(state, observations, settings)
+    change = (state.optimiser.field.colour_sh.detach() - before).abs().amax(dim=(0, 2))
+    assert change[0] == pytest.approx(settings.rates.colour_constant, rel=1e-3)
+    assert change[1:].max() == pytest.approx(settings.rates.colour_rest, rel=1e-3)
+
+
+def test_a_run_with_colour_goes_on_where_it_stopped(tmp_path):
+    """The split tensors come back as one and are split again, moments alike."""
+    sequence = with_colour(recording(frames=8)[0])
+    settings = demo(weights=Weights(colour=1.0), images=32)
+    whole = reconstruct(sequence, tmp_path / "whole", settings)
+    stopped = tmp_path / "stopped"
+
+    def stop(images, *_, **__):
+        if images >= 16:
+            raise KeyboardInterrupt
+
+    every = replace(settings, schedule=replace(settings.schedule, log_every=8, checkpoint_every_s=0.0))
+    with pytest.raises(KeyboardInterrupt):
+        reconstruct(sequence, stopped, every, progress=stop)
+    again = reconstruct(sequence, stopped, every)
+    assert same(stored(again.path)["field"], stored(whole.path)["field"])
+    assert same(stored(again.path)["adam"], stored(whole.path)["adam"])
+
+
+def test_without_colour_a_colour_preset_says_so_and_others_go_on():
+    """A preset that compares nothing else cannot, paper adds it where it is."""
+    sequence = recording(frames=8)[0]
+    with pytest.raises(InputError, match="no colour"):
+        observe(sequence, presets.dgs(), "cpu")
+    assert observe(sequence, demo(weights=Weights(colour=1.0)), "cpu").colour == {}
+    black = with_colour(sequence)
+    black = replace(black, colour={n: 0 * image for n, image in black.colour.items()})
+    with pytest.raises(InputError, match="black"):
+        observe(black, presets.dgs(), "cpu")
+
+
+def test_dgs_compares_colour_and_closed_form_distance_and_no_quads(monkeypatch):
+    """One query per image; the second term is as wrong as the camera."""
+    sequence = with_colour(recording(frames=8)[0])
+    quarter = InitSettings(kind=Init.RANDOM, count=200, opacity=0.3, bounds=(1.0, 5.0))
+    for made, names in ((presets.dgs(), {"colour"}), (presets.dgs_depth(), {"colour", "depth"})):
+        settings = replace(made, init=quarter, motion=replace(made.motion, layers=2, width=8))
+        observations = observe(sequence, settings, "cpu")
+        assert observations.batches == [[0], [4]]
+        state = begin(observations, settings, seed=0, device="cpu")
+        fixed = (state.optimiser.field, state.motion, state.attachment)
+        found, seen = objective.terms(*fixed, observations, 4, settings, settings.weights)
+        assert found.keys() == names
+        assert (seen.tof is None) == (names == {"colour"})
+        monkeypatch.undo()
+        assert step.step(state, observations, settings) is None
+    depth = replace(settings, weights=replace(settings.weights, ssim=0.0))
+    found, seen = objective.terms(*fixed, observations, 4, depth, depth.weights)
+    want = depth.weights.depth * (seen.tof.distance - observations.closed_form[1]).abs().mean()
+    torch.testing.assert_close(found["depth"], want)
+
+
+def test_every_raw_frame_is_rendered_from_its_own_pose():
+    """A camera that turns; the flow loss knows that it does."""
+    sequence = recording(frames=12)[0]
+    poses = np.stack([turned(0.5 * n, (0.01 * n, 0.0, 0.0)) for n in range(12)])
+    sequence = replace(sequence, camera_from_world=poses)
+    settings = demo(init=InitSettings(kind=Init.RANDOM, count=400, opacity=0.5, bounds=(2.0, 5.0)))
+    settings = replace(
+        settings, weights=Weights(ssim=0.0, flow=1.0), motion=replace(settings.motion, from_tracks=False)
+    )
+    observations = observe(sequence, settings, "cpu")
+    state = begin(observations, settings, seed=0, device="cpu")
+    field = state.optimiser.field
+    fixed = (field, None, state.attachment, observations)
+    for n in (1, 6):
+        _, seen = objective.terms(*fixed, n, settings, replace(settings.weights, flow=0.0))
+        want = rasterize(field, observations.cameras[n], observations.sensor_at(n), settings.render).quads
+        torch.testing.assert_close(seen.tof.quads, want)
+        other = rasterize(field, observations.cameras[0], observations.sensor_at(n), settings.render).quads
+        assert (other - want).abs().max() > 0.02 * want.abs().max()
+    # nothing moves: the flow of the camera alone has no error, that of a camera at rest has
+    still = replace(settings.motion, from_tracks=False)
+    motion = begin(observations, replace(settings, motion=still), seed=0, device="cpu").motion
+    seen = rasterize(field, observations.cameras[4], observations.sensor_at(4), settings.render)
+    ray = observations.cameras[4].rays()
+    centre = torch.as_tensor(observations.cameras[4].centre, dtype=torch.float32)
+    surface = (centre + ray * seen.distance[..., None]).detach()
+    here, *there = (observations.cameras[n].project(surface).movedim(2, 0) for n in (4, 8, 0))
+    flow = {(1, step): place - here for step, place in zip((1, -1), there, strict=True)}
+    attachment = motion.attach(field)
+    right = objective.flow_loss(field, motion, attachment, replace(observations, flow=flow), 4, settings.render)
+    zero = {key: torch.zeros_like(value) for key, value in flow.items()}
+    wrong = objective.flow_loss(field, motion, attachment, replace(observations, flow=zero), 4, settings.render)
+    assert float(wrong.detach()) > 0.1
+    assert float(right.detach()) < 1e-6 * float(wrong.detach())
+
+
+def test_random_gaussians_fill_what_all_cameras_see_evenly():
+    """Two frusta that overlap by half: as many points per volume in both as in one."""
+    sequence = recording(frames=8)[0]
+    poses = np.stack([turned(0.0)] * 4 + [turned(25.0)] * 4)
+    sequence = replace(sequence, camera_from_world=poses)
+    settings = InitSettings(kind=Init.RANDOM, count=6000, bounds=(1.0, 4.0))
+    start = from_random(sequence, settings, torch.Generator().manual_seed(0))
+    mean = start.field.mean
+    assert len(mean) == 6000
+    inside = []
+    for pose in (poses[0], poses[4]):
+        local = mean @ torch.tensor(pose[:3, :3].T, dtype=torch.float32)
+        x, y, z = local.unbind(dim=1)
+        u, v = FOCAL * x / z + WIDTH / 2, FOCAL * y / z + HEIGHT / 2
+        inside.append((z >= 1) & (z <= 4) & (u >= 0) & (u <= WIDTH) & (v >= 0) & (v <= HEIGHT))
+    assert (inside[0] | inside[1]).float().mean() > 0.99
+    both = inside[0] & inside[1]
+    assert 0.2 < both.sum() / inside[0].sum() < 0.8
+    assert inside[0].sum() == pytest.approx(int(inside[1].sum()), rel=0.08), "both cameras see as many"
+    # drawn twice where frusta overlap, the density there would be double: compare a band inside with one outside
+    near = (mean[:, 2] > 2.5) & (mean[:, 2] < 3.0) & (mean[:, 1].abs() < 0.5)
+    x = mean[near, 0]
+    overlap, alone = ((x > 0.3) & (x < 0.9)).sum(), ((x > -1.2) & (x < -0.6)).sum()
+    assert float(overlap) == pytest.approx(float(alone), rel=0.3)
+
+
+def test_names_of_choices_are_checked(tmp_path):
+    """Before anything is read or written."""
+    sequence = recording(frames=8)[0]
+    for option in ({"input": "raw"}, {"ablation": "h3"}, {"flow": "raft"}):
+        with pytest.raises(UsageError, match=r"unknown|no ablations") as caught:
+            reconstruct(sequence, tmp_path / "run", "paper", images=4, **option)
+        assert next(iter(option)) in str(caught.value)
+    assert not (tmp_path / "run").exists()
