@@ -240,7 +240,8 @@ def phasor_sequences(draw):
     generator = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     measured = np.array(draw(st.lists(st.booleans(), min_size=count, max_size=count)))
     measured[draw(st.integers(0, count - 1))] = True
-    phasors = (generator.normal(size=(count, 2, height, width)) * 10.0 ** draw(st.integers(-30, 30))).astype(np.float32)
+    powers = generator.integers(-8, 9, size=(count, 2, height, width)) + draw(st.integers(-24, 24))
+    phasors = (generator.normal(size=powers.shape) * 10.0**powers).astype(np.float32)
     phasors[~measured] = 0.0
     re, im = phasors[:, 0] / np.float32(2), phasors[:, 1] / np.float32(2)
     poses = random_poses(count, generator)
