@@ -72,7 +72,7 @@ def along_run(rows: Sequence[Mapping[str, float]]) -> bytes | None:
     errors = ("d", "d_tof")
     plots = [(f"Error of {NAMES[name]}", r"m$^2$ $\times$ 100", _error_curves(name)) for name in errors]
     plots.append(("On static pixels", "m", STATIC_CURVES))
-    plots.append(("Light let through", "1", {"transmittance": (r"T$_e$, mean", "-", COLOURS["d"])}))
+    plots.append(("Light let through", r"mean of 1 $-$ opacity", {"transmittance": ("T_e", "-", COLOURS["d"])}))
     plots.append(("Depth distortion", "m$^2$", {"distortion": ("mean", "-", COLOURS["d"])}))
     plots.append(("Gaussians", "number N", {"gaussians": ("N", "-", COLOURS["d"])}))
     plots = [plot for plot in plots if any(row.get(key) is not None for row in rows for key in plot[2])]

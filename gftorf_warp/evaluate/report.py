@@ -45,8 +45,8 @@ PHASORS_TO_READ = f"""
 quartet is scored once, and pixels move if their true distance changes by more than {MOVING_M} m from one phasor to the
 next.</p>"""
 ALONG_TEXT = (
-    "Rendered at a few fixed raw frames, from black, at the size of the optimisation; nothing of it reached the "
-    "optimisation. Where d and d_ToF part on pixels that rest, light is explained by layers instead of surfaces."
+    "Rendered before black at a few fixed raw frames, at the size of the optimisation, which learnt nothing of it. "
+    "Where d and d_ToF part on pixels that rest, light is explained by layers instead of surfaces"
 )
 
 
@@ -261,12 +261,12 @@ def _along(metrics: Mapping[str, Any], rows: Sequence[Mapping[str, float]]) -> l
     key = "diagnostics.criterion_m_least"
     if page.look_up(metrics, key) is not None:
         text += (
-            f" That is least, {page.number(metrics, key, 'length_cm')}, after"
+            f"; they are nearest to each other, {page.number(metrics, key, 'length_cm')} apart, after"
             f" {page.number(metrics, 'diagnostics.images_at_criterion', 'count')} images"
         )
         if page.look_up(metrics, "diagnostics.d_mse_x100_at_criterion") is not None:
             text += f", where the error of d is {page.number(metrics, 'diagnostics.d_mse_x100_at_criterion', 'error')}"
-        text += "."
+    text += "."
     if page.look_up(metrics, "diagnostics.d_mse_x100_least") is not None:
         text += (
             f" The error of d is least, {page.number(metrics, 'diagnostics.d_mse_x100_least', 'error')}, after"
