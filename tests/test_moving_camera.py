@@ -13,8 +13,8 @@ from gftorf_warp.render.api import rasterize
 from gftorf_warp.scene.measured import camera_of, colour_camera_of, sample
 from gftorf_warp.scene.sensor import Sensor
 from gftorf_warp.sim.look import Splatted, look_colour
-from gftorf_warp.sim.paths import Line, Still, Sweep, Viewpoint, inverse, looking_at
-from gftorf_warp.sim.record import record
+from gftorf_warp.sim.paths import Line, Still, Sweep, Viewpoint, inverse, looking_at, rotation_matrix
+from gftorf_warp.sim.record import record, still_interior
 from gftorf_warp.sim.scenes import SCENES, ColourCamera, Scene, room, still
 from gftorf_warp.sim.simulate import simulate
 from gftorf_warp.sim.world import Body, Box, Plane, Sphere, Texture, albedo, first_hit
@@ -146,9 +146,12 @@ def test_a_still_scene_decodes_from_a_moving_camera_only_if_a_quartet_is_taken_a
 def test_rendered_and_true_distance_agree_all_along_the_path():
     """The cover follows the camera: the card's bound holds at either end of the arc, near and far."""
     scene = carried(camera_path=dataclasses.replace(SWEEP, middle=(0.0, 0.0, 0.9), period_s=0.05), colour=None)
-    gap = record(scene, frames=6).gap
-    assert gap.pixels > 300
-    assert gap.max <= 0.01
+    recording = record(scene, frames=6)
+    cameras = [camera_of(recording.sequence, n) for n in range(6)]
+    hits = [first_hit(scene.bodies, camera, 0.0) for camera in cameras]
+    interiors = [still_interior(scene, [hit]).sum() for hit in hits]
+    assert recording.gap.pixels == round(np.mean(interiors)) > still_interior(scene, hits).sum() + 100
+    assert recording.gap.max <= 0.01
 
 
 def test_a_moving_body_is_covered_for_the_nearest_approach_of_the_camera():
@@ -168,6 +171,22 @@ def test_a_moving_body_is_covered_for_the_nearest_approach_of_the_camera():
     inside = mask & (hit.body == 0)
     assert inside.sum() > 300
     assert opacity[inside].min() > 0.9
+
+
+def test_a_moving_body_shows_the_faces_that_the_camera_faces_now():
+    """Passing a box from left to right, the camera first sees its left and then its right face."""
+    box = Body(
+        shape=Box(size=(0.8, 0.8, 0.8)),
+        texture=Texture(low=0.5, high=0.5),
+        path=Line(position=(0.0, 0.0, 3.0), velocity=(0.01, 0.0, 0.0)),
+    )
+    path = Line(position=(-2.0, 0.0, 0.0), velocity=(4.0, 0.0, 0.0))
+    scene = carried(bodies=(box,), camera_path=path, colour=None)
+    splatted = Splatted(scene, lambda t: scene.camera(time=t), np.array([0.0, 0.5, 1.0]))
+    for time, left, right in ((0.0, True, False), (1.0, False, True)):
+        x = splatted.at(time).mean[:, 0].numpy() - 0.01 * time
+        shown = [(side * x > 0.39).mean() > 0.1 for side in (-1.0, 1.0)]  # more than the rows along the edges
+        assert shown == [left, right]
 
 
 def test_flow_of_a_moving_camera_is_what_the_image_shows():
@@ -210,6 +229,16 @@ def test_a_colour_image_is_the_albedo_of_what_it_shows():
         assert error.mean() < 0.03
     assert np.abs(sequence.colour[4] - sequence.colour[0]).max() > 0.1
     assert 0.02 < sequence.colour[0].min() < sequence.colour[0].max() < 1.0
+
+
+def test_the_colour_camera_sits_where_it_is_put():
+    """Its position and turn are in the axes of the ToF camera, wherever that looks."""
+    scene = carried()
+    tof, colour = scene.camera(time=0.1), scene.colour_camera(time=0.1)
+    in_tof_axes = tof.camera_from_world @ [*colour.centre, 1.0]
+    np.testing.assert_allclose(in_tof_axes[:3], COLOUR.position, atol=1e-12)
+    axes = tof.camera_from_world[:3, :3] @ colour.camera_from_world[:3, :3].T
+    np.testing.assert_allclose(axes, rotation_matrix(COLOUR.turn_deg), atol=1e-12)
 
 
 def test_two_cameras_see_the_same_point():
@@ -326,11 +355,10 @@ def test_tour_is_read_back(tmp_path, layout):
     for i in range(2):
         np.testing.assert_allclose(closed_form_distance(got, i), closed_form_distance(want.sequence, i), atol=1e-4)
         np.testing.assert_allclose(got.colour[4 * i], want.sequence.colour[4 * i], atol=1e-6)
-    if layout == "torf":
-        camera, expected = colour_camera_of(got, 4), colour_camera_of(want.sequence, 4)
-        np.testing.assert_allclose(camera.camera_from_world, expected.camera_from_world, atol=1e-9)
-        assert (camera.fx, camera.cx, camera.width) == pytest.approx((expected.fx, expected.cx, expected.width))
-        np.testing.assert_allclose(got.novel_from_world, want.sequence.novel_from_world, atol=1e-9)
+    camera, expected = colour_camera_of(got, 4), colour_camera_of(want.sequence, 4)
+    np.testing.assert_allclose(camera.camera_from_world, expected.camera_from_world, atol=1e-9)
+    assert (camera.fx, camera.cx, camera.width) == pytest.approx((expected.fx, expected.cx, expected.width))
+    np.testing.assert_allclose(got.novel_from_world, want.sequence.novel_from_world, atol=1e-9)
     card = (path / "README.md").read_text()
     assert "Sweep(" in card
     assert "96x72 pixels, 60 deg wide, at (40, 0, 0) mm" in card
@@ -353,6 +381,8 @@ def test_a_layout_is_part_of_the_settings(tmp_path):
     make("ftorf")
     assert len(calls) == 8
     assert (tmp_path / "seq-old-1" / "tof").is_dir()
+    for folder, named in (("seq-old-1", True), ("seq", False)):
+        assert ("format='torf'" in (tmp_path / folder / "README.md").read_text()) == named
     for options, word in (({"frames": 3}, "at least 4"), ({"frames": 4, "flow": True}, "optical flow")):
         with pytest.raises(UsageError, match=word):
             simulate(carried(), tmp_path / "none", format="torf", **options)

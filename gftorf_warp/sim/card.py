@@ -30,6 +30,9 @@ def settings_card(scene: Scene, options: Mapping, layout: str = "ftorf") -> str:
         "shifts in time order": ", ".join(f"{math.degrees(shift):.0f}" for shift in sensor.shifts) + " deg",
         "raw frames": f"{1 / sensor.frame_period_s:.6g} per second, "
         + ("all four of a quartet at the time of its first" if options["sync"] else "each at its own time"),
+        **(
+            {"phasors": "one per quartet, with time, pose and truth of its first raw frame"} if layout == "torf" else {}
+        ),
         **_camera_rows(scene, options),
         "exposure": f"{1e3 * sensor.exposure_s:g} ms, "
         + (f"mean of {n} instants" if (n := options["exposure_samples"]) > 1 else "taken as one instant"),
@@ -108,9 +111,8 @@ def _camera_rows(scene: Scene, options: Mapping) -> dict[str, str]:
 def _command(scene: Scene, options: Mapping, layout: str) -> str:
     """What makes the same sequence again: a command line if there is one for it, else a call."""
     if SCENES.get(scene.name) != scene or options["flow"] or options["exposure_samples"] > 1:
-        return (
-            f"gftorf_warp.simulate({scene.name}, ..., {', '.join(f'{key}={value}' for key, value in options.items())})"
-        )
+        values = ", ".join(f"{key}={value}" for key, value in options.items())
+        return f"gftorf_warp.simulate({scene.name}, ..., {values}{f', format={layout!r}' if layout != 'ftorf' else ''})"
     width, height = options["size"]
     command = f"gftorf simulate {scene.name} --out SEQ --frames {options['frames']} --size {width}x{height}"
     command += f" --seed {options['seed']}" + (f" --format {layout}" if layout != "ftorf" else "")

@@ -44,8 +44,9 @@ def simulate(
     """Record a moving scene with an asynchronous C-ToF sensor and write it as a sequence.
 
     Raw frame n is a rendering of the scene at its own time, of which only the quad of slot n % 4 is kept and read out.
-    Beside it stands the analytic distance along each pixel's centre ray at that very time. The folder appears only when
-    it is complete; if it is already there and was made with the same settings, it is left as it is.
+    Beside it stands the analytic distance along each pixel's centre ray at that very time. A camera that moves has a
+    pose for each raw frame; a colour camera adds an image per quartet. The folder appears only when it is complete; if
+    it is already there and was made with the same settings, it is left as it is.
 
     Args:
         scene: Name of a scene, see ``SCENES``, or a scene.
@@ -55,7 +56,8 @@ def simulate(
         seed: Of the noise. The same seed gives the same bytes, and frame n of a shorter recording is that of a longer.
         sync: Control mode: all raw frames of a quartet are taken at the time of its first.
         noise: False switches shot and read noise, full well and ADC off.
-        flow: Whether exact optical flow at quartet starts is stored beside the quads.
+        flow: Whether exact optical flow at quartet starts is stored beside the quads: how images move, so that of a
+            camera that moves includes its own motion.
         exposure_samples: Instants that a raw frame averages over the exposure, centred on its time; 1: no motion blur.
         format: Layout on disk: 'ftorf', raw quads, or 'torf', one phasor per quartet with the time, pose and truth of
             its first raw frame.
@@ -91,7 +93,7 @@ def simulate(
     }
     card = settings_card(found, options, format)
     out = Path(out).absolute() if fresh else Path(out)
-    if not _check_folder(out, card, format, fresh=fresh):
+    if not _check_folder(out, card, fresh=fresh):
         return out
     if format == "torf":
         from ..data.torf_write import write
@@ -170,18 +172,17 @@ def _check_duration(scene: Scene, frames: int | None) -> None:
             )
 
 
-def _check_folder(out: Path, card: str, layout: str, *, fresh: bool) -> bool:
-    """Whether there is anything to do: False if ``out`` holds what these settings give, in this layout.
+def _check_folder(out: Path, card: str, *, fresh: bool) -> bool:
+    """Whether there is anything to do: False if ``out`` holds what these settings give.
 
     Raises:
         UsageError: If ``out`` holds anything else that may not be moved aside.
     """
     if not out.exists() or (out.is_dir() and not any(out.iterdir())):
         return True
-    found = [name for name, marks in FORMATS.items() if all((out / mark).exists() for mark in marks)]
-    sequence = out.is_dir() and bool(found)
+    sequence = any(all((out / mark).exists() for mark in marks) for marks in FORMATS.values())
     text = (out / CARD).read_text(errors="replace") if sequence and (out / CARD).is_file() else ""
-    if not fresh and layout in found and text.startswith(card):
+    if not fresh and text.startswith(card):
         return False
     if fresh and sequence:
         return True
