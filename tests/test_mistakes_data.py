@@ -22,7 +22,7 @@ from gftorf_warp.recon.observations import observe, reduced
 from gftorf_warp.recon.settings import FlowSource
 from gftorf_warp.render.api import rasterize
 from gftorf_warp.scene.initialise import MOVING, STATIC, InitSettings, from_phase
-from gftorf_warp.scene.measured import camera_of, key_times, sensor_of
+from gftorf_warp.scene.measured import camera_of, decode_along_flow, key_times, sensor_of
 
 SIZES = pytest.mark.parametrize(("height", "width"), [(12, 20), (20, 12)], ids=["wide", "tall"])
 WITHOUT_FLOW = replace(presets.demo(), flow=FlowSource.NONE)
@@ -105,7 +105,10 @@ def test_mistake_10_the_start_takes_half_a_phasor_for_the_amplitude():
     distance = ramp(12, 20)
     sequence = wall(distance, phase_offset=0.0, dc_offset=0.0)
     quads = 0.8 / distance**2 * np.cos(phase_of(distance) - sequence.shifts[:, None, None])
-    start = from_phase(replace(sequence, quads=quads.astype(np.float32)), EVERY_PIXEL).field
+    sequence = replace(sequence, quads=quads.astype(np.float32))
+    _, amplitude = decode_along_flow(sequence, 1, torch.tensor([[7.5, 2.5]]), None, None)
+    assert amplitude.item() == pytest.approx(0.8 / distance[2, 7] ** 2, rel=1e-4)
+    start = from_phase(sequence, EVERY_PIXEL).field
     got = start.reflectivity_sh[:, 0].numpy() * 0.28209479 + 0.5
     np.testing.assert_allclose(got, 0.8, rtol=1e-4)
 

@@ -1,4 +1,4 @@
-"""Known mistakes of reconstructions (method, section 10): starts, checkpoints, rates, resets, colour, comparisons.
+"""Known mistakes of reconstructions (method, section 10): starts, checkpoints, pruning, steps, gaps, colour, scores.
 
 Each test is named after the number of the mistake it would fail at; design/mistakes.md lists all of them.
 """
@@ -18,9 +18,9 @@ from gftorf_warp.constants import CANONICAL_SHIFTS, SH_Y0
 from gftorf_warp.data import ftorf
 from gftorf_warp.evaluate.compare import compare
 from gftorf_warp.evaluate.metrics import scored_frames
-from gftorf_warp.recon import checkpoint, densify, objective, presets, step
+from gftorf_warp.recon import checkpoint, densify, objective, step
 from gftorf_warp.recon.observations import observe
-from gftorf_warp.recon.optimiser import Optimiser, rates_at
+from gftorf_warp.recon.optimiser import Optimiser
 from gftorf_warp.recon.run import Run
 from gftorf_warp.recon.settings import Batch, DensifySettings, FlowSource, Input, Weights
 from gftorf_warp.recon.state import begin, from_dict, to_dict
@@ -33,8 +33,6 @@ from gftorf_warp.scene.motion import MotionKind, MotionSettings, Still
 
 RANDOM = InitSettings(kind=Init.RANDOM, count=300, opacity=0.3, bounds=(0.5, 4.0))
 NETWORK = MotionSettings(kind=MotionKind.NETWORK, width=16, layers=3, skip_after=1)
-RECORDED = [presets.Recorded(input=kind, unambiguous_range=d) for kind, d in ((Input.QUADS, 7.5), (Input.PHASOR, 5.0))]
-FITTED = [name for name in presets.PRESETS if name != "ctof"]
 
 
 def started(settings, sequence=None):
@@ -63,17 +61,21 @@ def test_mistake_01_random_centres_fill_what_any_pose_sees():
     poses = np.tile(np.eye(4), (8, 1, 1))
     poses[4:] = pose((0, 1, 0), -0.5, (0.3, 0.0, 0.2)) @ poses[4:]
     sequence = replace(wall(ramp(24, 32)), camera_from_world=poses)
-    mean = from_random(sequence, replace(RANDOM, count=4000), torch.Generator().manual_seed(0)).field.mean
-    seen = []
-    for frame in (0, 7):
-        x, y = camera_of(sequence, frame).project(mean).unbind(dim=1)
-        z = mean @ torch.tensor(poses[frame, 2, :3]).float() + float(poses[frame, 2, 3])
-        seen.append((z > 0.49) & (z < 4.01) & (x > -0.1) & (x < 32.1) & (y > -0.1) & (y < 24.1))
-    first, second = seen
+
+    def seen(of):
+        mean = from_random(of, replace(RANDOM, count=4000), torch.Generator().manual_seed(0)).field.mean
+        for frame in (0, 7):
+            x, y = camera_of(sequence, frame).project(mean).unbind(dim=1)
+            z = mean @ torch.tensor(poses[frame, 2, :3]).float() + float(poses[frame, 2, 3])
+            yield (z > 0.49) & (z < 4.01) & (x > -0.1) & (x < 32.1) & (y > -0.1) & (y < 24.1)
+
+    first, second = seen(sequence)
     assert (first | second).all()
-    share_of_overlap = (first & second).float().mean()
-    assert 0.05 < share_of_overlap < 0.95
-    assert abs(float(first.float().mean() - second.float().mean())) < 0.03, "equal frusta, equally full"
+    _, shared = seen(wall(ramp(24, 32)))
+    overlap = float(shared.float().mean())  # of the first frustum alone
+    assert 0.2 < overlap < 0.8
+    assert float((first & second).float().mean()) == pytest.approx(overlap / (2.0 - overlap), abs=0.03)
+    assert float(first.float().mean()) == pytest.approx(1.0 / (2.0 - overlap), abs=0.03), "equal frusta, equally full"
 
 
 def test_mistake_02_a_checkpoint_holds_the_network_and_its_moments(tmp_path):
@@ -96,53 +98,6 @@ def test_mistake_02_a_checkpoint_holds_the_network_and_its_moments(tmp_path):
     for s in (state, again):
         step.step(s, observations, settings)
     assert same(to_dict(again), to_dict(state))
-
-
-@pytest.mark.parametrize("recorded", RECORDED, ids=["quads", "phasor"])
-@pytest.mark.parametrize("name", FITTED)
-def test_mistake_03_both_ends_of_every_rate_are_stated(name, recorded):
-    """First and last rate of every group are fields, what is in force is log-linear between them, and nothing else."""
-    settings = presets.preset(name, recorded)
-    settings = replace(settings, schedule=replace(settings.schedule, pause_after_reset=0, freeze_from=None))
-    first, last = (dataclasses.asdict(rates) for rates in (settings.rates, settings.rates_last))
-    assert first.keys() == last.keys() == rates_at(settings, 0).keys()
-    total = settings.schedule.images
-    for group in first.keys() - {"motion"}:
-        got = [rates_at(settings, n)[group] for n in (0, total // 4, total // 2, total)]
-        ratio = last[group] / first[group]
-        assert got == pytest.approx([first[group] * ratio**share for share in (0, 0.25, 0.5, 1)]), group
-    begin_at = max(settings.schedule.warm_up, settings.schedule.motion_decay_from)
-    assert rates_at(settings, total)["motion"] == pytest.approx(last["motion"])
-    assert rates_at(settings, begin_at)["motion"] > last["motion"] or first["motion"] == last["motion"]
-
-
-def test_mistake_03_the_decay_of_the_published_code_is_spelled_out():
-    """Reflectivity: constant in the paper, 68 times down in the released code for quads and 30 times for phasors."""
-    quads, phasor = RECORDED
-    for recorded in RECORDED:
-        paper = presets.paper(recorded)
-        assert paper.rates.reflectivity_sh == paper.rates_last.reflectivity_sh == 1.6e-4
-    released = presets.released(quads)
-    assert released.rates.reflectivity_sh == pytest.approx(1.09e-3, rel=2e-3)
-    assert released.rates_last.reflectivity_sh == pytest.approx(1.6e-5)
-    settings = replace(released, schedule=replace(released.schedule, freeze_from=None))
-    assert rates_at(settings, released.schedule.images // 2)["reflectivity_sh"] == pytest.approx(1.32e-4, rel=5e-3)
-    released = presets.released(phasor)
-    assert released.rates.reflectivity_sh / released.rates_last.reflectivity_sh == pytest.approx(30.25)
-    assert released.rates.mean == pytest.approx(8.8e-4)
-    assert released.rates_last.mean == pytest.approx(8.8e-6)
-
-
-def test_mistake_09_lengths_follow_the_unambiguous_range():
-    """S is 1.1 of it, 8.25 m at depth_range 15; the network sees positions in units of 7.5 m, or 8.25 m."""
-    quads = RECORDED[0]
-    for name, unit in (("paper", 7.5), ("released", 8.25)):
-        settings = presets.preset(name, quads)
-        assert settings.rates.mean == pytest.approx(1.6e-4 * 8.25)
-        assert settings.densify.clone_scale_max == pytest.approx(0.0825)
-        assert settings.init.bounds == pytest.approx((0.135, 7.425))
-        small_one = replace(settings, init=RANDOM, motion=replace(NETWORK, input_scale=settings.motion.input_scale))
-        assert started(small_one)[1].motion.length == pytest.approx(unit, rel=1e-6)
 
 
 def test_mistake_10_phasors_and_quads_of_one_light_have_one_fit():
@@ -212,22 +167,6 @@ def test_mistake_11_nothing_claims_to_prune_by_size_on_the_screen():
     assert not [name for name in names if "screen" in name or "radius" in name or "footprint" in name]
 
 
-@pytest.mark.parametrize("recorded", RECORDED, ids=["quads", "phasor"])
-@pytest.mark.parametrize("images", [3000, 20_000, 30_000])
-@pytest.mark.parametrize("name", FITTED)
-def test_mistake_12_the_last_tenth_before_a_freeze_or_the_end_is_free_of_resets(name, images, recorded):
-    """At any length, also when the course is compressed; phasors would be reset at 19,500 of 20,000 otherwise."""
-    settings = presets.preset(name, recorded)
-    long = replace(settings, schedule=replace(settings.schedule, images=images))
-    for course in (long, presets.shortened(settings, images)):
-        freeze = course.schedule.freeze_from
-        end = images * min(course.densify.stop_share, 1.0 if freeze is None else freeze)
-        resets = densify.resets(course.densify, course.schedule)
-        assert all(n < 0.9 * end for n in resets)
-        if course.densify.every is not None and images >= 20_000:
-            assert resets, "there must be resets for this to mean something"
-
-
 @pytest.fixture(scope="module")
 def box(tmp_path_factory):
     """A recording of a moving box in a folder, and a few steps of a reconstruction that adds Gaussians."""
@@ -293,16 +232,6 @@ def test_mistake_14_all_harmonics_step_with_a_camera_at_rest():
     assert apparent.min() > 7.0
     assert apparent.max() < 15.0
     assert 9.0 < apparent.mean() < 14.0
-
-
-@pytest.mark.parametrize("name", FITTED)
-def test_mistake_14_every_preset_ends_with_all_harmonics(name):
-    """They may begin at degree 0, as published; they never end there because the camera rests."""
-    for recorded in RECORDED:
-        settings = presets.preset(name, recorded)
-        for course in (settings, presets.shortened(settings, 300)):
-            assert objective.render_settings_at(course, course.schedule.images // 2).sh_degree == 3
-        assert settings.render.sh_degree == 3
 
 
 def test_mistake_15_unknown_flow_and_untaken_frames_leave_a_run_finite(tmp_path):
