@@ -114,7 +114,8 @@ def measured_quartet(found: Findings, s: int) -> str:
         page.picture(found.views.closed_form[s], common_distance_scale(found), "closed form", "phase as distance"),
     ]
     text = f'<p class="soft">{PHASOR_TEXT if sequence.from_phasors else QUARTET_TEXT}</p>'
-    return page.row(measured, columns=4) + page.row([*decoded, text])
+    figures = [*measured, *decoded, text]
+    return page.row(figures[:4]) + page.row(figures[4:], columns=4)
 
 
 def distances(found: Findings, s: int, window: Window = WHOLE) -> str:
