@@ -156,7 +156,8 @@ class Run:
                 why="the run was made from a sequence in memory",
                 fix="write the sequence with gftorf_warp.data.ftorf.write and reconstruct from the folder",
             )
-        return Sequence.open(source, frame_rate_hz=self.config["frame_rate_hz"])
+        given = str(self.config.get("times") or "").startswith("setting")
+        return Sequence.open(source, frame_rate_hz=self.config["frame_rate_hz"] if given else None)
 
 
 def _footprint(field: GaussianField, camera: Camera) -> Float[Tensor, "N"]:

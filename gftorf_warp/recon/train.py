@@ -15,9 +15,11 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TypeVar
 
+import numpy as np
 import torch
 
 from .. import __version__
+from ..constants import FRAMES_PER_QUARTET
 from ..data.sequence import Sequence, Truth
 from ..errors import DivergedError, InputError, UsageError
 from ..render.buffers import available_threads
@@ -291,7 +293,8 @@ def _config(sequence: Sequence, settings: ReconSettings, *, seed: int, device: t
         "sequence": None if sequence.path is None else str(sequence.path.resolve()),
         "data_sha256": data_hash(sequence),
         "frames": sequence.frames,
-        "frame_rate_hz": round(1.0 / frame_period(sequence), 9),  # of a time in seconds, which is no exact decimal
+        "frame_rate_hz": _rate(sequence),
+        "times": sequence.sources.get("times"),
         "camera": {**asdict(camera), "camera_from_world": camera.camera_from_world.tolist()},
         "sensor": {name: getattr(sensor, name) for name in ("f_mod_hz", "phase_offset", "dc_offset", "frame_period_s")},
         "init": str(settings.init.kind),
@@ -299,6 +302,13 @@ def _config(sequence: Sequence, settings: ReconSettings, *, seed: int, device: t
         "schedule": resolved(settings),
         "settings": plain(settings),
     }
+
+
+def _rate(sequence: Sequence) -> float:
+    """Raw frames, or phasors, per second: what the reader of the sequence was or would be told."""
+    times = sequence.times[:: FRAMES_PER_QUARTET if sequence.from_phasors else 1]
+    period = float(np.diff(times).mean()) if len(times) > 1 else frame_period(sequence)
+    return round(1.0 / period, 9)  # of a time in seconds, which is no exact decimal
 
 
 def resolved(settings: ReconSettings) -> dict[str, object]:
