@@ -128,20 +128,21 @@ def test_mistake_15_a_pixel_of_unknown_flow_is_read_and_left_out(tmp_path):
     assert all(value.isfinite().all() for value in field.parameters().values())
 
 
-def test_mistake_15_a_quad_that_is_no_number_is_an_error_and_never_a_scale(tmp_path):
+@pytest.mark.parametrize("frame", [2, 6])
+def test_mistake_15_a_quad_that_is_no_number_is_an_error_and_never_a_scale(tmp_path, frame):
     """A plain maximum over the sequence would be NaN, or zero after a comparison; frames not taken do not count."""
     sequence = wall(ramp(6, 8))
     scale, _ = decode.quad_scale(sequence)
     broken = sequence.quads.copy()
-    broken[2, 3, 4] = np.nan
+    broken[frame, 3, 4] = np.nan
     with pytest.raises(InputError):
         observe(replace(sequence, quads=broken), WITHOUT_FLOW, "cpu")
     folder = ftorf.write(tmp_path / "seq", sequence)
-    np.save(folder / "tofType2/0002.npy", broken[2])
+    np.save(folder / f"tofType2/{frame:04d}.npy", broken[frame])
     with pytest.raises(InputError, match="nan"):
         Sequence.open(folder)
     taken = np.ones(8, dtype=bool)
-    taken[2] = False
+    taken[frame] = False
     partly = replace(sequence, quads=broken, measured=taken)
     got, _ = decode.quad_scale(partly)
     assert got == pytest.approx(scale, rel=1e-6)
