@@ -1,7 +1,7 @@
 """Whole reconstructions with the published presets, several at once; run it again to go on where the time was up.
 
     python benchmarks/published.py SEQUENCE... --out DIR [--preset released] [--images N] [--seeds S]
-        [--ablations ROW...] [--device cuda] [--together 3] [--limit SECONDS] [--json FILE]
+        [--ablations ROW...] [--set NAME=VALUE] [--device cuda] [--together 3] [--limit SECONDS] [--json FILE]
 
 Every reconstruction is a process of its own, `gftorf reconstruct`, which is told to stop (SIGTERM) when the time is up
 and goes on from its checkpoint the next time. Finished ones are scored like `gftorf compare`: mean squared errors of
@@ -28,6 +28,8 @@ def command(sequence: Path, out: Path, options: argparse.Namespace, seed: int, r
     words += ["--preset", options.preset, "--device", options.device, "--seed", str(seed)]
     if options.images:
         words += ["--images", str(options.images)]
+    for change in options.set:
+        words += ["--set", change]
     return words + (["--ablation", row] if row else [])
 
 
@@ -88,6 +90,7 @@ def main() -> None:
     parser.add_argument("--images", type=int)
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--ablations", nargs="*", default=[None])
+    parser.add_argument("--set", action="append", default=[], help="NAME=VALUE, passed on")
     parser.add_argument("--device", default="cuda")
     parser.add_argument("--together", type=int, default=3, help="processes that share the device")
     parser.add_argument("--limit", type=float, default=1e9, help="seconds after which all are told to stop")

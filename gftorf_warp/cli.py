@@ -156,6 +156,7 @@ def _reconstruct(options: argparse.Namespace) -> int:
         images=options.images,
         input=options.input,
         ablation=options.ablation,
+        changes=options.set,
         flow=options.flow,
         seed=options.seed,
         device=device,

@@ -108,6 +108,8 @@ def command_parsers() -> dict[str, Parser]:
     reconstruct.add_argument("--input", metavar="KIND", default="auto", help=inputs)
     rows = "apply a row of the ablation table: nobias, dd, h1, h1h2 or h1h2dd"
     reconstruct.add_argument("--ablation", metavar="ROW", help=rows)
+    single = "change one setting, for example init.reflectivity=0.5; config.json of a run names all (may be repeated)"
+    reconstruct.add_argument("--set", metavar="NAME=VALUE", action="append", default=[], help=single)
     reconstruct.add_argument("--images", metavar="N", type=_positive, help="raw frames to optimise (the preset's own)")
     flows = "the folder's, computed, or none; auto: the folder's if it has any, else dis"
     reconstruct.add_argument("--flow", metavar="KIND", help=f"auto, file, dis, deepflow or none: optical flow, {flows}")

@@ -16,6 +16,7 @@ from .optimiser import Optimiser
 from .settings import DensifySettings, Schedule
 
 SPLIT_SHRINK = 1.6  # the two halves of a split Gaussian are smaller by this
+RESET_MARGIN = 1e-5  # relative: a hundred roundings of a sigmoid in float32
 RESET_QUIET_SHARE = 0.1  # no reset in the last tenth before the rounds end: what it dims could not recover
 
 
@@ -136,8 +137,12 @@ def prune(optimiser: Optimiser, settings: DensifySettings, *, judge_scale: bool)
 
 
 def reset_opacity(optimiser: Optimiser, settings: DensifySettings) -> None:
-    """Dim every Gaussian to at most ``opacity_min`` and forget those moments: what is needed grows back."""
-    highest = math.log(settings.opacity_min / (1.0 - settings.opacity_min))
+    """Dim every Gaussian to just below ``opacity_min`` and forget those moments: what is needed grows back.
+
+    Just below, so that what no pixel has asked for by the next round is removed whichever way a sigmoid is rounded.
+    """
+    below = (1.0 - RESET_MARGIN) * settings.opacity_min
+    highest = math.log(below / (1.0 - below))
     with torch.no_grad():
         optimiser.tensors["opacity_logit"].clamp_(max=highest)
     optimiser.forget("opacity_logit")

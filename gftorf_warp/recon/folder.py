@@ -15,6 +15,7 @@ from ..errors import BusyError, InputError, UsageError
 
 CONFIG = "config.json"
 LOCK = ".lock"
+LOG = "run.log"  # a run that failed before its first step leaves this alone
 FRESH = "continue with the same settings, choose another --out, or start over with --fresh (the old run is kept aside)"
 IDENTITY = ("seed", "data_sha256")  # besides the settings: what has to agree for a run to go on
 
@@ -30,7 +31,7 @@ def prepare(run: Path, config: dict[str, object], *, fresh: bool) -> bool:
     """
     if run.exists() and not run.is_dir():
         raise UsageError("not a folder", where=run, why="--out names a file", fix="choose another --out")
-    held = [path for path in run.iterdir() if not _aside(path) and path.name != LOCK] if run.exists() else []
+    held = [path for path in run.iterdir() if not _aside(path) and path.name not in (LOCK, LOG)] if run.exists() else []
     if not held:
         run.mkdir(parents=True, exist_ok=True)
         return False

@@ -12,7 +12,7 @@ from ..constants import SH_COEFFICIENTS
 from ..scene.gaussians import GaussianField
 from ..scene.initialise import MOVING, Init, Start, from_phase, from_random
 from ..scene.measured import key_times
-from ..scene.motion import Motion, MotionKind, MotionSettings, Nodes, Still, farthest_points
+from ..scene.motion import Motion, MotionKind, MotionSettings, Nodes, Products, Still, farthest_points
 from ..scene.network import Network
 from . import densify
 from .observations import Observations
@@ -133,7 +133,7 @@ def _motion_to_dict(motion: Motion) -> dict[str, object]:
     if isinstance(motion, Nodes):
         stored |= {"kind": str(MotionKind.NODES), "neighbours": motion.neighbours}
     elif isinstance(motion, Network):
-        shape = asdict(motion.settings) | {"kind": str(MotionKind.NETWORK)}
+        shape = asdict(motion.settings) | {"kind": str(MotionKind.NETWORK), "products": str(motion.settings.products)}
         stored |= {"kind": str(MotionKind.NETWORK), "shape": shape}
         stored |= {"duration": motion.duration, "length": motion.length}
     return stored
@@ -147,7 +147,8 @@ def _motion_from_dict(stored: dict) -> Motion:
     if kind == MotionKind.NODES:
         parts = (tensors[name] for name in ("node", "layer", "offset"))
         return Nodes(times, *parts, neighbours=stored["neighbours"])
-    shape = MotionSettings(**stored["shape"] | {"kind": MotionKind.NETWORK})
+    products = Products(stored["shape"].get("products", Products.FLOAT32))
+    shape = MotionSettings(**stored["shape"] | {"kind": MotionKind.NETWORK, "products": products})
     network = Network(times, shape, duration=stored["duration"], length=stored["length"])
     network.load_state_dict(tensors)
     return network

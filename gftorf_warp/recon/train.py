@@ -10,7 +10,7 @@ import math
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TypeVar
@@ -25,6 +25,7 @@ from ..errors import DivergedError, InputError, UsageError
 from ..render.buffers import available_threads
 from ..scene.measured import camera_of, frame_period, sensor_of
 from . import checkpoint, densify, folder, presets
+from .changes import changed
 from .diagnostics import Watch
 from .observations import Observations, data_hash, input_of, observe
 from .optimiser import rates_at
@@ -48,6 +49,7 @@ def reconstruct(
     input: Input | str = Input.AUTO,
     ablation: str | None = None,
     flow: FlowSource | str | None = None,
+    changes: Iterable[str] = (),
     seed: int = 0,
     device: torch.device | str = "cpu",
     fresh: bool = False,
@@ -67,6 +69,7 @@ def reconstruct(
         input: What is compared with the sensor: auto, quads or phasor; counts where ``settings`` is a name.
         ablation: Row of the ablation table to apply: nobias, dd, h1, h1h2 or h1h2dd; None: none.
         flow: Where optical flow comes from: auto, file, dis, deepflow or none; None: as the settings say.
+        changes: Single settings to change, as texts like ``init.reflectivity=0.5``, after everything else.
         seed: Of everything random.
         device: Where to compute, 'cpu' or a CUDA device.
         fresh: Whether to move what ``out`` holds aside, to ``out/old-<k>``, and start over.
@@ -95,6 +98,7 @@ def reconstruct(
         settings = replace(settings, schedule=replace(settings.schedule, images=images))
     if flow is not None:
         settings = replace(settings, flow=_choice(FlowSource, flow, "--flow"))
+    settings = changed(settings, changes)
     out = Path(out)
     config = _config(sequence, settings, seed=seed, device=device)
     with folder.locked(out):

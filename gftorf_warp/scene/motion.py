@@ -25,6 +25,15 @@ from torch import Tensor
 from .gaussians import GaussianField
 
 
+class Products(StrEnum):
+    """How a network multiplies matrices on CUDA."""
+
+    FLOAT32 = "float32"
+    """As everywhere else."""
+    TF32 = "tf32"
+    """Factors rounded to 11 bits, sums in float32: a fraction of the time; offsets differ by a thousandth."""
+
+
 class MotionKind(StrEnum):
     """The motion models that exist."""
 
@@ -60,6 +69,8 @@ class MotionSettings:
     """Network: frequencies of the encoded time."""
     input_scale: float = 1.0
     """Network: positions are divided by this many unambiguous ranges [1]."""
+    products: Products = Products.FLOAT32
+    """Network: precision of its matrix products on CUDA."""
 
     def __post_init__(self):
         for name in ("layers", "width", "skip_after"):

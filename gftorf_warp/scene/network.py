@@ -8,12 +8,15 @@ the first raw frame to 1 at the last. The encoded input is joined to the output 
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from .gaussians import GaussianField
-from .motion import Motion, MotionSettings
+from .motion import Motion, MotionSettings, Products
 
 HEAD_DEVIATION = 1e-5  # of the weights of the last layer: motion starts at rest, to a hundredth of a millimetre
 
@@ -80,8 +83,17 @@ class Network(Motion):
         for number, layer in enumerate(self._layers[1:], start=1):
             hidden = torch.relu(hidden)
             skip = number == self.settings.skip_after
-            hidden = self._joined(layer, hidden, place, moment) if skip else layer(hidden)
-        return self.head(torch.relu(hidden))
+            if skip:
+                hidden = self._joined(layer, hidden, place, moment)
+            else:
+                hidden = self._product(hidden, layer.weight) + layer.bias
+        return self._product(torch.relu(hidden), self.head.weight) + self.head.bias
+
+    def _product(self, rows: Float[Tensor, "*n i"], weight: Float[Tensor, "o i"]) -> Float[Tensor, "*n o"]:
+        """Product of rows with the transposed weight."""
+        if self.settings.products == Products.TF32 and rows.is_cuda:
+            return Rounded.apply(rows, weight)
+        return rows @ weight.T
 
     def _joined(
         self, layer: torch.nn.Linear, hidden: Tensor | None, place: Float[Tensor, "N p"], moment: Float[Tensor, "k t"]
@@ -89,10 +101,42 @@ class Network(Motion):
         """A layer of [hidden, gamma(x), gamma(t)] without building that."""
         weight, first = layer.weight, 0 if hidden is None else self.settings.width
         at_place, at_moment = weight[:, first:].split(self._inputs, dim=1)
-        shared = place @ at_place.T
         own = moment @ at_moment.T + layer.bias
-        out = shared + own[:, None]
-        return out if hidden is None else out + hidden @ weight[:, :first].T
+        out = self._product(place, at_place) + own[:, None]
+        return out if hidden is None else out + self._product(hidden, weight[:, :first])
+
+
+class Rounded(torch.autograd.Function):
+    """rows weight^T with factors rounded to TF32 on CUDA, in the gradient as well."""
+
+    @staticmethod
+    def forward(context, rows: Tensor, weight: Tensor) -> Tensor:
+        """The product."""
+        context.save_for_backward(rows, weight)
+        with _tf32():
+            return rows @ weight.T
+
+    @staticmethod
+    def backward(context, gradient: Tensor) -> tuple[Tensor | None, Tensor | None]:
+        """Gradients of both factors, where they are wanted."""
+        rows, weight = context.saved_tensors
+        with _tf32():
+            of_rows = gradient @ weight if context.needs_input_grad[0] else None
+            of_weight = None
+            if context.needs_input_grad[1]:
+                of_weight = gradient.flatten(0, -2).T @ rows.flatten(0, -2)
+        return of_rows, of_weight
+
+
+@contextlib.contextmanager
+def _tf32() -> Iterator[None]:
+    """Lets torch round the factors of matrix products on CUDA; other code, the similarity above all, must not."""
+    before = torch.backends.cuda.matmul.allow_tf32
+    torch.backends.cuda.matmul.allow_tf32 = True
+    try:
+        yield
+    finally:
+        torch.backends.cuda.matmul.allow_tf32 = before
 
 
 def encoded(value: Float[Tensor, "*n d"], frequencies: int) -> Float[Tensor, "*n e"]:

@@ -1,0 +1,131 @@
+"""The ablation rows of the paper at a size for two CPU cores: each with several seeds, scored like `gftorf compare`.
+
+    python benchmarks/ablation.py SEQUENCE... [--seeds 3] [--images 4000] [--rows nobias dd h1 h1h2 h1h2dd]
+        [--together 2] [--device cpu] [--json FILE]
+
+Preset `paper` with 2,000 Gaussians at the start and 5,000 at most, images of 80 columns, a network of 4 layers of 64,
+and a course for 4,000 images: rates of centres and motion are twice and those of shape five times as large, because
+there are fifteen times fewer steps. Reflectivity keeps the published rates, which are what the rows are about.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import multiprocessing
+import os
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+from statistics import mean
+
+from gftorf_warp import __version__
+from gftorf_warp.recon import presets
+from gftorf_warp.recon.settings import ReconSettings
+
+KEYS = ("d", "d_tof")
+SHAPE_RATES = ("log_scale", "quaternion")
+
+
+def small(images: int, unambiguous_range: float) -> ReconSettings:
+    """The preset at that size."""
+    s = presets.paper(presets.Recorded(unambiguous_range=unambiguous_range))
+
+    def faster(rates):
+        shape = {name: 5.0 * getattr(rates, name) for name in SHAPE_RATES}
+        return replace(rates, mean=2.0 * rates.mean, motion=2.0 * rates.motion, **shape)
+
+    share = images / 4000
+    return replace(
+        s,
+        width_max=80,
+        init=replace(s.init, count=2000),
+        motion=replace(s.motion, layers=4, width=64, skip_after=3),
+        rates=faster(s.rates),
+        rates_last=faster(s.rates_last),
+        schedule=replace(
+            s.schedule,
+            images=images,
+            warm_up=round(500 * share),
+            flow_from=round(500 * share),
+            sh_degree_every=round(250 * share),
+        ),
+        densify=replace(
+            s.densify,
+            every=round(100 * share),
+            start=round(200 * share),
+            scale_from=round(1000 * share),
+            scale_range=(0.0, s.densify.scale_range[1]),
+            reset_every=round(1000 * share),
+            gaussians_max=5000,
+        ),
+    )
+
+
+def row_of(job: tuple[Path, str, int, int, str, float | None]) -> dict[str, object]:
+    """Reconstruct in a temporary folder, compare, and keep the numbers."""
+    from gftorf_warp.data.sequence import Sequence
+    from gftorf_warp.evaluate.compare import compare
+    from gftorf_warp.recon.train import reconstruct
+    from gftorf_warp.scene.measured import sensor_of
+
+    path, row, seed, images, device, distortion = job
+    logging.disable(logging.WARNING)
+    sequence = Sequence.open(path)
+    settings = presets.ablated(small(images, sensor_of(sequence).unambiguous_range), row)
+    if distortion is not None:
+        settings = replace(settings, weights=replace(settings.weights, distortion=distortion))
+    with tempfile.TemporaryDirectory() as folder:
+        run = reconstruct(sequence, Path(folder) / "run", settings, seed=seed, device=device)
+        found = compare(run, report=False)
+    groups = {"all": found, "moving": found["moving"], "static": found["static"]}
+    numbers = {group: {key: values[f"{key}_mse_x100"] for key in KEYS} for group, values in groups.items()}
+    facts = {"sequence": path.name, "row": row, "seed": seed, "distortion": settings.weights.distortion}
+    return {**facts, **numbers, "gaussians": found["gaussians"], "seconds": found["seconds_reconstruct"]}
+
+
+def line(name: str, rows: list[dict]) -> str:
+    """Means over the seeds of d and d_ToF on all, moving and static pixels, and the span of d over all."""
+    cells = [
+        " / ".join(f"{mean(row[group][key] for row in rows):8.3f}" for group in ("all", "moving", "static"))
+        for key in KEYS
+    ]
+    span = [row["all"]["d"] for row in rows]
+    seconds = mean(row["seconds"] for row in rows)
+    return f"{name:<26}{cells[0]}   {cells[1]}   d {min(span):.3f} .. {max(span):.3f}   {seconds:.0f} s"
+
+
+def main() -> None:
+    """Measure, print, and optionally store as JSON."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("sequences", type=Path, nargs="+")
+    parser.add_argument("--rows", nargs="+", default=list(presets.ABLATIONS))
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--images", type=int, default=4000)
+    parser.add_argument("--distortion", type=float, nargs="+", default=[None], help="other weights of it, for a sweep")
+    parser.add_argument("--together", type=int, default=len(os.sched_getaffinity(0)))
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--json", type=Path)
+    a = parser.parse_args()
+    jobs = [
+        (path, row, seed, a.images, a.device, weight)
+        for path in a.sequences
+        for row in a.rows
+        for weight in a.distortion
+        for seed in range(a.seeds)
+    ]
+    print(f"{'':<26}{'d: all / moving / static':<30}   d_ToF: all / moving / static", flush=True)
+    rows: list[dict] = []
+    with multiprocessing.get_context("spawn").Pool(a.together) as pool:
+        for row in pool.imap(row_of, jobs):
+            rows.append(row)
+            if len(rows) % a.seeds == 0:
+                weight = f" {row['distortion']:g}" if row["distortion"] else ""
+                print(line(f"{row['sequence'][:14]} {row['row']}{weight}", rows[-a.seeds :]), flush=True)
+            if a.json:
+                a.json.write_text(json.dumps({"version": __version__, "images": a.images, "rows": rows}, indent=2))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,71 @@
+"""Settings changed by name: what is parsed as what, and what a typing error is told."""
+
+import pytest
+from small_runs import small
+
+from gftorf_warp.errors import UsageError
+from gftorf_warp.recon import presets
+from gftorf_warp.recon.changes import changed, names
+from gftorf_warp.recon.settings import FlowSource
+from gftorf_warp.recon.train import reconstruct
+from gftorf_warp.scene.motion import Products
+
+
+def test_values_become_what_the_setting_holds():
+    """Numbers, names, pairs and nothing, in parts and at the top; the last one counts."""
+    base = presets.paper()
+    texts = ["weights.quads=5", "init.reflectivity = 0.5", "densify.gradient_min=none", "quad_scale=10"]
+    texts += ["init.bounds=0.2,6", "flow=dis", "motion.products=tf32", "densify.loses_step=TRUE", "init.count=7"]
+    found = changed(base, [*texts, "init.count=8"])
+    assert (found.weights.quads, found.init.reflectivity, found.densify.gradient_min) == (5.0, 0.5, None)
+    assert (found.quad_scale, found.init.bounds, found.init.count) == (10.0, (0.2, 6.0), 8)
+    assert isinstance(found.weights.quads, float)
+    assert (found.flow, found.motion.products, found.densify.loses_step) == (FlowSource.DIS, Products.TF32, True)
+    assert changed(base, []) == base
+
+
+def test_every_setting_has_a_name_and_can_be_set_to_what_it_is():
+    """Whatever kind it has."""
+    for made in presets.PRESETS.values():
+        base = made()
+        for name in names(base):
+            if name in ("preset", "ablation", "method"):
+                continue
+            value = base
+            for part in name.split("."):
+                value = getattr(value, part)
+            text = ",".join(map(str, value)) if isinstance(value, tuple) else str(value)
+            assert changed(base, [f"{name}={text}"]) == base, name
+
+
+@pytest.mark.parametrize(
+    ("text", "hint"),
+    [
+        ("weights.quad=5", "weights.quads"),
+        ("init.reflectivity", "NAME=VALUE"),
+        ("weights=5", "single setting"),
+        ("init.count=many", "whole number"),
+        ("init.count=1.5", "whole number"),
+        ("weights.quads=x", "a number"),
+        ("flow=raft", "deepflow"),
+        ("init.bounds=1", "2 values"),
+        ("densify.loses_step=maybe", "true or false"),
+        ("motion.width=0", "width must be at least 1"),
+        ("preset=paper", "no such setting"),
+        ("quad_scale.x=1", "single setting"),
+    ],
+)
+def test_mistakes_are_named(text, hint):
+    """With what would have been right."""
+    with pytest.raises(UsageError) as caught:
+        changed(presets.paper(), [text])
+    assert hint in str(caught.value) + str(caught.value.__dict__)
+    assert caught.value.where == "--set"
+
+
+def test_a_run_keeps_what_was_changed(tmp_path):
+    """In config.json; another value is another run."""
+    run = reconstruct(small(), tmp_path / "run", "demo", images=4, changes=["rates.mean=0.002"])
+    assert run.config["settings"]["rates"]["mean"] == 0.002
+    with pytest.raises(UsageError, match="other settings"):
+        reconstruct(small(), tmp_path / "run", "demo", images=4)
