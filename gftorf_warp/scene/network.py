@@ -131,12 +131,12 @@ class Rounded(torch.autograd.Function):
 @contextlib.contextmanager
 def _tf32() -> Iterator[None]:
     """Lets torch round the factors of matrix products on CUDA; other code, the similarity above all, must not."""
-    before = torch.backends.cuda.matmul.allow_tf32
-    torch.backends.cuda.matmul.allow_tf32 = True
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("high")
     try:
         yield
     finally:
-        torch.backends.cuda.matmul.allow_tf32 = before
+        torch.set_float32_matmul_precision(before)
 
 
 def encoded(value: Float[Tensor, "*n d"], frequencies: int) -> Float[Tensor, "*n e"]:
