@@ -51,6 +51,15 @@ def test_reconstruction_from_python(tmp_path):
     assert metrics["closed_form_mse_x100"] > 0
 
 
+def test_phasors_of_a_moving_camera_from_python(tmp_path):
+    """Every phasor is scored, colour too, and the course of the preset fits into few images."""
+    metrics = load("06_moving_camera").main(tmp_path, images=40)
+    assert metrics["frames"] == 4
+    assert metrics["images_optimised"] == 40
+    assert metrics["colour_psnr_db"] > 0
+    assert metrics["input"] == "phasor"
+
+
 def test_no_example_is_forgotten():
     """Each file in examples/ is run above."""
     source = Path(__file__).read_text()
