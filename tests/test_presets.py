@@ -8,13 +8,13 @@ from small_runs import demo, small
 
 from gftorf_warp.errors import UsageError
 from gftorf_warp.recon import densify, presets, step
+from gftorf_warp.recon.config import resolved
 from gftorf_warp.recon.objective import render_settings_at, weights_at
 from gftorf_warp.recon.observations import observe
 from gftorf_warp.recon.optimiser import frozen, rates_at
 from gftorf_warp.recon.presets import Recorded
 from gftorf_warp.recon.settings import Batch, Input, Norm, plain
 from gftorf_warp.recon.state import begin
-from gftorf_warp.recon.train import resolved
 from gftorf_warp.render.buffers import ClampGradient, Stop, Support
 from gftorf_warp.scene.initialise import Init, InitSettings
 from gftorf_warp.scene.motion import MotionKind, MotionSettings
@@ -58,6 +58,7 @@ def test_released_differs_where_the_tables_say():
     """Sections 6.3, 6.5 and 6.7, for quads."""
     s = presets.released()
     assert (s.schedule.images, s.init.reflectivity, s.motion.input_scale) == (20_000, 0.02, 1.1)
+    assert s.init.count == 0.19 * 100_000, "those that its cameras see"
     first, half = (rates_at(s, images) for images in (0, 10_000))
     assert first["reflectivity_sh"] == pytest.approx(1.09e-3, rel=2e-3)
     assert half["reflectivity_sh"] == pytest.approx(1.3e-4, rel=0.02)
@@ -69,7 +70,8 @@ def test_released_differs_where_the_tables_say():
     differing = {name for name, a, b in _leaves(shared, presets.paper()) if a != b}
     assert differing == {
         *("schedule.images", "schedule.motion_decay_from", "schedule.pause_after_reset", "schedule.freeze_from"),
-        *("init.reflectivity", "motion.input_scale", "rates.reflectivity_sh", "rates_last.reflectivity_sh"),
+        *("init.count", "init.reflectivity", "motion.input_scale"),
+        *("rates.reflectivity_sh", "rates_last.reflectivity_sh"),
         *("weights.colour_norm", "densify.loses_step"),
     }
 
@@ -226,7 +228,7 @@ def test_frozen_gaussians_stay_and_the_network_goes_on():
 def test_the_step_of_a_round_is_lost_only_where_the_preset_says_so():
     """No pruning, no splitting: then the round itself changes nothing."""
     for loses in (True, False):
-        options = replace(demo().densify, every=4, start=0, stop_share=1.0, gradient_min=None, opacity_min=0.0)
+        options = replace(demo().densify, every=4, start=0, stop_share=1.0, gradient_min=None)
         s = small_published(warm_up=0, images=100, densify=replace(options, loses_step=loses, scale_from=1000))
         observations = observe(small(), s, "cpu")
         state = begin(observations, s, seed=0, device="cpu")

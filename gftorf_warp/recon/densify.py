@@ -61,7 +61,8 @@ def round_is_due(before: int, after: int, settings: DensifySettings, schedule: S
 
 def reset_is_due(before: int, after: int, settings: DensifySettings, schedule: Schedule) -> bool:
     """Whether a step from ``before`` to ``after`` images ends with an opacity reset."""
-    end = (1.0 - RESET_QUIET_SHARE) * settings.stop_share * schedule.images
+    share = settings.stop_share if schedule.freeze_from is None else min(settings.stop_share, schedule.freeze_from)
+    end = (1.0 - RESET_QUIET_SHARE) * share * schedule.images
     every = settings.reset_every
     if settings.reset_faster is not None and after >= settings.reset_faster[0]:
         every = settings.reset_faster[1]

@@ -72,9 +72,10 @@ class Run:
                 fix="run `gftorf reconstruct` with this --out first",
             )
         gaussians, motion, attachment = field_and_motion(stored, device)
+        reached = {"images_optimised": stored["images"], "seconds_reconstruct": stored["seconds"]}
         return cls(
             path=path,
-            config=config,
+            config=config | reached,  # of an interrupted run, config.json does not say
             camera=camera,
             sensor=sensor,
             quad_scale=config["quad_scale"],

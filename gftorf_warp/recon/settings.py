@@ -183,6 +183,16 @@ class DensifySettings:
     gaussians_max: int = 200_000
     """A round never adds beyond this; the largest gradients go first [Gaussians]."""
 
+    def __post_init__(self):
+        for name in ("every", "reset_every"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise ValueError(f"{name} must be at least 1 or None, got {value}")
+        if self.reset_faster is not None and min(self.reset_faster) < 1:
+            raise ValueError(f"reset_faster must be two numbers of at least 1 or None, got {self.reset_faster}")
+        if not 0 < self.opacity_min < 1:
+            raise ValueError(f"opacity_min must be in (0, 1), got {self.opacity_min}")
+
 
 @dataclass(frozen=True, kw_only=True)
 class ReconSettings:

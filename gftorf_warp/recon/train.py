@@ -11,27 +11,26 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
-import numpy as np
 import torch
 
-from .. import __version__
-from ..constants import FRAMES_PER_QUARTET
+from ..data.estimates import dc_offset
+from ..data.findings import DC_TOLERANCE
 from ..data.sequence import Sequence, Truth
 from ..errors import DivergedError, InputError, UsageError
 from ..render.buffers import available_threads
-from ..scene.measured import camera_of, frame_period, sensor_of
-from . import checkpoint, densify, folder, presets
+from ..scene.measured import sensor_of
+from . import checkpoint, folder, presets
 from .changes import changed
+from .config import config_of
 from .diagnostics import Watch
-from .observations import Observations, data_hash, input_of, observe
-from .optimiser import rates_at
+from .observations import Observations, input_of, observe
 from .record import Metrics, log_to
 from .run import Run
-from .settings import FlowSource, Input, Method, ReconSettings, plain
+from .settings import FlowSource, Input, Method, ReconSettings
 from .state import State, begin, from_dict, to_dict
 from .step import pool, step, threads_for
 
@@ -100,7 +99,7 @@ def reconstruct(
         settings = replace(settings, flow=_choice(FlowSource, flow, "--flow"))
     settings = changed(settings, changes)
     out = Path(out)
-    config = _config(sequence, settings, seed=seed, device=device)
+    config = config_of(sequence, settings, seed=seed, device=device)
     with folder.locked(out):
         goes_on = folder.prepare(out, config, fresh=fresh)
         with log_to(out / "run.log"):
@@ -135,6 +134,7 @@ def _run(sequence, out, settings, config, seed, device, goes_on, begun, progress
         LOG.info("%s is finished: %d images", out, stored["images"])
         return
     observations = observe(sequence, settings, device)
+    _warn_of_constant_part(sequence)
     state = from_dict(stored, device) if stored is not None else begin(observations, settings, seed=seed, device=device)
     earlier = state.seconds
     config |= {
@@ -166,6 +166,16 @@ def _run(sequence, out, settings, config, seed, device, goes_on, begun, progress
         out, config | {"seconds_reconstruct": state.seconds, "images_optimised": state.images, "skipped": state.skipped}
     )
     LOG.info("%s is finished: %d images, %.1f s", out, state.images, state.seconds)
+
+
+def _warn_of_constant_part(sequence: Sequence) -> None:
+    """Quads that hold more or less constant light than calibration says cannot be fitted (method, mistake 17)."""
+    if sequence.from_phasors or not sequence.complete_quartets:
+        return
+    found = dc_offset(sequence)
+    if abs(found - sequence.dc_offset) > DC_TOLERANCE:
+        text = "the quads hold a constant part of %.2f amplitudes, the calibration says %.2f: see `gftorf check`"
+        LOG.warning(text, found, sequence.dc_offset)
 
 
 def _truth(sequence: Sequence) -> Truth | None:
@@ -254,7 +264,8 @@ class _Loop:
     def peak(self) -> float:
         """Largest absolute value of what is compared, in the units of the optimisation."""
         shown = self.observations
-        images = shown.phasors or ({0: shown.quads} if self.settings.weights.quads > 0 else shown.colour)
+        measured = {0: shown.quads[torch.as_tensor(shown.sequence.measured)]}
+        images = shown.phasors or (measured if self.settings.weights.quads > 0 else shown.colour)
         return max(float(image.abs().max()) for image in images.values())
 
     def go_back(self, state: State, broken: dict[str, float]) -> State:
@@ -280,64 +291,6 @@ class _Loop:
             record.rewind(restored.images)
         LOG.warning("back to image %d with rates times %g", restored.images, restored.rate_factor)
         return restored
-
-
-def _config(sequence: Sequence, settings: ReconSettings, *, seed: int, device: torch.device | str) -> dict[str, object]:
-    """What is known before the first step; the rest of config.json follows."""
-    camera, sensor = camera_of(sequence, 0), sensor_of(sequence)
-    return {
-        "version": __version__,
-        "preset": settings.preset,
-        "seed": seed,
-        "images": settings.schedule.images,
-        "images_optimised": None,
-        "seconds_reconstruct": None,
-        "device": str(device),
-        "threads": available_threads() if torch.device(device).type == "cpu" else None,
-        "sequence": None if sequence.path is None else str(sequence.path.resolve()),
-        "data_sha256": data_hash(sequence),
-        "frames": sequence.frames,
-        "frame_rate_hz": _rate(sequence),
-        "times": sequence.sources.get("times"),
-        "camera": {**asdict(camera), "camera_from_world": camera.camera_from_world.tolist()},
-        "sensor": {name: getattr(sensor, name) for name in ("f_mod_hz", "phase_offset", "dc_offset", "frame_period_s")},
-        "init": str(settings.init.kind),
-        "motion": str(settings.motion.kind),
-        "schedule": resolved(settings),
-        "settings": plain(settings),
-    }
-
-
-def _rate(sequence: Sequence) -> float:
-    """Raw frames, or phasors, per second: what the reader of the sequence was or would be told."""
-    times = sequence.times[:: FRAMES_PER_QUARTET if sequence.from_phasors else 1]
-    period = float(np.diff(times).mean()) if len(times) > 1 else frame_period(sequence)
-    return round(1.0 / period, 9)  # of a time in seconds, which is no exact decimal
-
-
-def resolved(settings: ReconSettings) -> dict[str, object]:
-    """What the schedule means in images and in rates, computed the way the loop computes it."""
-    schedule, options = settings.schedule, settings.densify
-    rounds = options.every is not None
-    opacity_resets = densify.resets(options, schedule)
-    instants = {"first": 0, "after_warm_up": schedule.warm_up, "half_way": schedule.images // 2}
-    freeze = schedule.freeze_from
-    return {
-        "images": schedule.images,
-        "batch": str(schedule.batch),
-        **{f"rates_{name}": rates_at(settings, images) for name, images in instants.items()},
-        "rates_last": rates_at(settings, schedule.images),
-        "motion_from": schedule.warm_up,
-        "colour_from": schedule.colour_from if settings.weights.colour > 0 else None,
-        "flow_from": schedule.flow_from if settings.weights.flow > 0 else None,
-        "distortion_from": math.ceil(schedule.distortion_from * schedule.images),
-        "sh_degree_every": schedule.sh_degree_every,
-        "densify_every": options.every,
-        "densify_until": math.floor(options.stop_share * schedule.images) if rounds else None,
-        "opacity_resets": opacity_resets,
-        "motion_rests_after_reset": schedule.pause_after_reset if opacity_resets else None,
-        "gaussians_frozen_from": None if freeze is None else math.ceil(freeze * schedule.images),
-    }
 
 
 @contextlib.contextmanager
