@@ -6,8 +6,8 @@ import pytest
 import torch
 from small_runs import KEYS, field, random
 
-from gftorf_warp.scene.motion import MotionSettings
-from gftorf_warp.scene.network import Network, encoded
+from gftorf_warp.scene.motion import MotionSettings, Products
+from gftorf_warp.scene.network import Network, Rounded, encoded
 
 
 def network(settings=MotionSettings(), *, seed=0, head=None):
@@ -107,3 +107,21 @@ def test_what_cannot_be_meant_is_refused():
         MotionSettings(width=0)
     with pytest.raises(ValueError, match="input_scale"):
         MotionSettings(input_scale=0.0)
+
+
+def test_rounded_products_have_the_right_gradients():
+    """In float64 nothing is rounded, so finite differences tell; afterwards torch multiplies as before."""
+    rows, weight = random(2, 5, 3).double().requires_grad_(), random(4, 3, seed=1).double().requires_grad_()
+    torch.testing.assert_close(Rounded.apply(rows, weight), rows @ weight.T)
+    assert torch.autograd.gradcheck(Rounded.apply, (rows, weight))
+    assert torch.get_float32_matmul_precision() == "highest"
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
+def test_rounded_products_change_offsets_by_a_thousandth_on_cuda():
+    """And do change them: otherwise the switch does nothing."""
+    position = (random(500, 3) * 6 - 3).to("cuda")
+    exact, rounded = (network(MotionSettings(products=kind), head=0.1).to("cuda") for kind in Products)
+    with torch.no_grad():
+        a, b = exact.key_offsets(position, [0, 2]), rounded.key_offsets(position, [0, 2])
+    assert 0 < (a - b).abs().max() < 5e-3 * a.abs().max()

@@ -50,7 +50,7 @@ def demo(recorded: Recorded = Recorded()) -> ReconSettings:
         width_max=160,
         rates=rates,
         rates_last=rates.times(0.3),
-        weights=Weights(ssim=0.2, distortion=0.1),
+        weights=Weights(ssim=0.2, distortion=0.1, colour=1.0 if recorded.input == Input.PHASOR else 0.0),
         schedule=Schedule(images=4000, batch=Batch.QUARTET),
         densify=DensifySettings(every=None),
     )
