@@ -78,7 +78,7 @@ def lines(name: str, row: dict) -> list[str]:
     cells = (" / ".join("-" if row[g][key] is None else f"{row[g][key]:.3f}" for g in GROUPS) for key in KEYS)
     along = ", ".join(f"{images}: {count}" for images, count in row["gaussians_along"].items())
     tail = f"N={row['gaussians']}  {row['seconds_reconstruct']:.0f} s  {row['images_optimised']} images"
-    return [f"{name:<28}" + "".join(f"{cell:>26}" for cell in cells) + f"   {tail}", f"    N(t) {along}"]
+    return [f"{name:<28}" + "".join(f"{cell:>30}" for cell in cells) + f"   {tail}", f"    N(t) {along}"]
 
 
 def main() -> None:
@@ -105,7 +105,7 @@ def main() -> None:
     commands = {out: command(job[0], out, options, *job[1:]) for out, job in jobs.items()}
     codes = run_all(commands, options.together, options.limit)
     rows = {}
-    print(f"{'':<28}" + "".join(f"{key + ': ' + ' / '.join(GROUPS):>26}" for key in KEYS))
+    print(f"MSE x100 [m^2]: {' / '.join(GROUPS)} pixels; seconds; images\n{'':<28}" + "".join(f"{k:>30}" for k in KEYS))
     for out, code in codes.items():
         if code == 0:
             rows[out.name] = scored(out, options.device)

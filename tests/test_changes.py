@@ -4,6 +4,7 @@ import pytest
 from small_runs import small
 
 from gftorf_warp.errors import UsageError
+from gftorf_warp.evaluate import provenance
 from gftorf_warp.recon import presets
 from gftorf_warp.recon.changes import changed, names
 from gftorf_warp.recon.settings import FlowSource
@@ -67,5 +68,7 @@ def test_a_run_keeps_what_was_changed(tmp_path):
     """In config.json; another value is another run."""
     run = reconstruct(small(), tmp_path / "run", "demo", images=4, changes=["rates.mean=0.002"])
     assert run.config["settings"]["rates"]["mean"] == 0.002
+    again = provenance.how(run.config, None, "")
+    assert "--set rates.mean=0.002" in again
     with pytest.raises(UsageError, match="other settings"):
         reconstruct(small(), tmp_path / "run", "demo", images=4)

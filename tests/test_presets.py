@@ -168,8 +168,9 @@ def test_ablations_change_reflectivity_and_distortion_and_nothing_else():
     assert [name for name, a, b in _leaves(presets.ablated(base, "h1h2"), base) if a != b] == ["ablation"]
     with pytest.raises(UsageError, match="unknown ablation h3"):
         presets.ablated(base, "h3")
-    with pytest.raises(UsageError, match="no ablations"):
-        presets.ablated(presets.demo(), "h1")
+    for other in (presets.demo(), presets.dgs_depth(), presets.ctof()):
+        with pytest.raises(UsageError, match="no ablations"):
+            presets.ablated(other, "h1")
 
 
 def test_shortened_keeps_the_course():

@@ -106,5 +106,8 @@ def _again(config: Mapping[str, Any]) -> str:
         options |= {name: fact(config, name) for name in ("ablation", "input") if fact(config, name) is not None}
     else:
         del options["images"], options["seed"]
-    typed = " ".join(f"--{name} {shlex.quote(str(value))}" for name, value in options.items())
+    words = list(options.items())
+    words += [("flow", config["flow"])] if config.get("flow") else []
+    words += [("set", change) for change in config.get("changes") or ()]
+    typed = " ".join(f"--{name} {shlex.quote(str(value))}" for name, value in words)
     return f"gftorf reconstruct {shlex.quote(str(config.get('sequence')))} --out RUN {typed}"

@@ -210,15 +210,18 @@ def ablated(settings: ReconSettings, row: str) -> ReconSettings:
     """Settings with the reflectivity and the depth distortion of a row of the ablation table (section 7).
 
     Raises:
-        UsageError: If there is no such row, or the settings do not start at random, where neither heuristic applies.
+        UsageError: If there is no such row, or neither heuristic applies.
     """
     if row not in ABLATIONS:
         raise _unknown("ablation", row, list(ABLATIONS))
-    if settings.init.kind != Init.RANDOM:
+    measured = settings.init.kind != Init.RANDOM
+    if measured or settings.weights.quads == 0:
         raise UsageError(
             f"preset {settings.preset} has no ablations",
             where="--ablation",
-            why="its reflectivities start where they were measured, so neither heuristic is in it",
+            why="its reflectivities start where they were measured, so neither heuristic is in it"
+            if measured
+            else "it compares nothing that depends on reflectivity",
             fix="use --preset paper or --preset released",
         )
     rate, reflectivity, distortion = ABLATIONS[row]

@@ -97,9 +97,11 @@ def reconstruct(
         settings = replace(settings, schedule=replace(settings.schedule, images=images))
     if flow is not None:
         settings = replace(settings, flow=_choice(FlowSource, flow, "--flow"))
+    changes = list(changes)
     settings = changed(settings, changes)
     out = Path(out)
     config = config_of(sequence, settings, seed=seed, device=device)
+    config |= {"flow": None if flow is None else str(flow), "changes": list(changes)}
     with folder.locked(out):
         goes_on = folder.prepare(out, config, fresh=fresh)
         with log_to(out / "run.log"):
