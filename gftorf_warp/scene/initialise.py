@@ -1,14 +1,14 @@
 """Gaussians and motion to start from: out of measured phase, or out of noise (the control).
 
 Phase: a static layer at the farthest distance where each pixel has rested, and a moving layer at what is nearer than
-that in the middle of the sequence. Reflectivity is amplitude times distance squared. Only measured quads and flow are
-read.
+that in the middle of the sequence; if the camera moves, what all its views agree on, and what they see through.
+Reflectivity is amplitude times distance squared. Only measured quads, poses and flow are read.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
@@ -20,6 +20,8 @@ from ..constants import FRAMES_PER_QUARTET
 from ..data.sequence import Sequence
 from ..errors import InputError
 from .camera import Camera
+from .clouds import cloud_of, follow_clouds, moving_layer, reference, windows
+from .fusion import static_layer, verdicts, views_of
 from .gaussians import GaussianField, constant_sh
 from .measured import (
     Change,
@@ -30,11 +32,13 @@ from .measured import (
     distance_noise,
     far_layer,
     flow_at,
+    key_times,
     sensor_of,
 )
 from .tracks import follow, unproject
 
 STATIC, MOVING = 0, 1  # labels of the two layers
+RESTS = 1e-6  # a camera rests if no element of its pose differs by more
 EXACT_TREE = 4  # OpenCV's name for a k-d tree that misses no neighbour
 
 
@@ -89,11 +93,11 @@ def from_phase(sequence: Sequence, settings: InitSettings = InitSettings()) -> S
     """A static and a moving layer from decoded quads.
 
     Args:
-        sequence: A camera at rest, with at least one complete quartet; the quads are in the units of the optimisation.
+        sequence: At least one complete quartet; the quads are in the units of the optimisation.
         settings: Spacing, opacity and sizes.
 
     Raises:
-        InputError: If the camera moves or no quartet is complete.
+        InputError: If no quartet is complete.
     """
     if not len(sequence.complete_quartets):
         raise InputError(
@@ -102,14 +106,8 @@ def from_phase(sequence: Sequence, settings: InitSettings = InitSettings()) -> S
             why="phase initialisation decodes four raw frames of one quartet; every quartet lacks at least one",
             fix="record more frames, or start from random Gaussians",
         )
-    moved = abs(sequence.camera_from_world - sequence.camera_from_world[:1]).max()
-    if moved > 1e-6:
-        raise InputError(
-            "the camera moves",
-            where=f"{sequence.path or 'sequence'} (camera_from_world)",
-            why=f"phase initialisation compares pixels over time, but the poses differ by up to {moved:.3g}",
-            fix="start from random Gaussians: --preset paper or released",
-        )
+    if abs(sequence.camera_from_world - sequence.camera_from_world[:1]).max() > RESTS:
+        return _from_views(sequence, settings)
     change = change_of(sequence)
     far = far_layer(sequence, change)
     static = _static_layer(sequence, far, settings)
@@ -119,8 +117,36 @@ def from_phase(sequence: Sequence, settings: InitSettings = InitSettings()) -> S
     moving = _layer(
         positions[middle], distance, amplitude, MOVING, settings.moving_spacing, camera_of(sequence, 0), settings
     )
+    return Start(field=_joined(static, moving), positions=positions, quartet=middle)
+
+
+def _from_views(sequence: Sequence, settings: InitSettings) -> Start:
+    """The same for a moving camera, whose views are compared in the world and not pixel by pixel."""
+    views = views_of(sequence, settings.nearer)
+    judged = list(verdicts(views))
+    size = (sequence.width, sequence.height)
+    still = static_layer(views, judged, _grid(*size, settings.static_spacing).flatten(0, 1), settings.static_spacing)
+    clouds = [cloud_of(views, view, verdict) for view, verdict in enumerate(judged)]
+    view = reference(clouds)
+    grid = _grid(*size, settings.moving_spacing)
+    near, objects = moving_layer(views, view, clouds[view], grid, settings.fellows)
+    keys = key_times(sequence)
+    positions = follow_clouds(views, clouds, view, near.mean, objects, keys, fellows=settings.fellows)
+    quartet, camera = views.quartets[view], views.cameras[view]
+    static, moving = (
+        _layer(part.mean, part.distance, part.amplitude, label, spacing, camera, settings)
+        for part, label, spacing in (
+            (still, STATIC, settings.static_spacing),
+            (replace(near, mean=positions[quartet]), MOVING, settings.moving_spacing),
+        )
+    )
+    return Start(field=_joined(static, moving), positions=positions, quartet=quartet)
+
+
+def _joined(static: GaussianField, moving: GaussianField) -> GaussianField:
+    """Both layers in one field, the static one first."""
     both = {name: torch.cat([value, moving.tensors()[name]]) for name, value in static.tensors().items()}
-    return Start(field=GaussianField(**both), positions=positions, quartet=middle)
+    return GaussianField(**both)
 
 
 def from_random(sequence: Sequence, settings: InitSettings, generator: torch.Generator) -> Start:
@@ -213,8 +239,8 @@ def _nearer(
             there = points + flow.nan_to_num(0.0)
             near &= _in_front(sequence, quartet + step, there, change, far, settings)[0]
     near, distance, amplitude, noise = (value.view(size) for value in (near, distance, amplitude, noise))
-    near &= _windows(near.float()).mean(dim=0) > 0.5
-    median = _windows(torch.where(near, distance, torch.nan)).nanmedian(dim=0).values
+    near &= windows(near.float()).mean(dim=0) > 0.5
+    median = windows(torch.where(near, distance, torch.nan)).nanmedian(dim=0).values
     distance = torch.where((distance - median).abs() > settings.nearer + 4.0 * noise, median, distance)
     return grid[near], distance[near], amplitude[near]
 
@@ -234,11 +260,6 @@ def _in_front(
     x, y = points[:, 0].long().clamp(0, sequence.width - 1), points[:, 1].long().clamp(0, sequence.height - 1)
     nearer = distance < far.distance[y, x] - settings.nearer - 4.0 * noise
     return nearer, distance, amplitude, noise
-
-
-def _windows(image: Float[Tensor, "H W"]) -> Float[Tensor, "25 H W"]:
-    """The 5x5 neighbourhood of every pixel; beyond the border, NaN for floats that have any and else zero."""
-    return torch.nn.functional.unfold(image[None, None], 5, padding=2).view(25, *image.shape)
 
 
 def _grid(width: int, height: int, spacing: float) -> Float[Tensor, "h w 2"]:

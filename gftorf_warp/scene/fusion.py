@@ -1,0 +1,274 @@
+"""What decoded quartets of a moving camera agree on: points that stay where they are, and points that do not.
+
+A point that one quartet sees is judged by the others, its witnesses. A witness that has it in view *supports* it if it
+decodes the same distance in that direction, and *sees through* it if everything around there is farther. If it decodes
+something nearer, the point is hidden, and it says nothing. Static is what is hardly ever seen through; what many see
+through was there for a while only, so it moves, or it never was: two surfaces mix in a pixel at an outline.
+
+Only measured quads and poses are read.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from ..constants import FRAMES_PER_QUARTET
+from ..data.decode import quartet_phasor
+from ..data.sequence import Sequence
+from .camera import Camera
+from .measured import DISTANCE_TRUSTED, camera_of, distance_noise, fill, sensor_of
+from .sensor import distance_from_phasor
+from .tracks import unproject
+
+WITNESSES = 32  # quartets that judge a point, spread evenly: more cost time and see little else
+SEEN_THROUGH = 0.3  # share of the witnesses with a say beyond which a point is not static
+CHUNK = 1 << 20  # points times witnesses judged at once: some ten megabytes per intermediate
+CLOSE = 0.02  # [m] z-depth below which nothing is projected
+COVERS = 0.75  # a point stands for what is so near [spacings]: half a diagonal is 0.71, and less adds mixed outlines
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Views:
+    """The complete quartets of a sequence, each decoded as if taken at once from where the camera was in its middle."""
+
+    quartets: list[int]
+    """Their numbers."""
+    times: list[float]
+    """When each was taken [s]."""
+    cameras: list[Camera]
+    """From where: the pose of the second of its raw frames."""
+    distance: Float[Tensor, "J H W"]
+    """[m], in [0, c/2f); in pixels too dark to tell, that of their neighbours."""
+    amplitude: Float[Tensor, "J H W"]
+    """In quad units."""
+    margin: Float[Tensor, "J H W"]
+    """Distances that differ by no more are the same [m]."""
+    unambiguous_range: float
+    """[m]."""
+
+    def points(self, view: int) -> Float[Tensor, "H W 3"]:
+        """What the pixels of a view see, in the world [m]."""
+        camera = self.cameras[view]
+        return torch.tensor(camera.centre, dtype=torch.float32) + self.distance[view, ..., None] * camera.rays()
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Verdict:
+    """What the witnesses say about the pixels of one view."""
+
+    supports: Int[Tensor, "H W"]
+    """How many see something at this place."""
+    through: Int[Tensor, "H W"]
+    """How many see something behind it only."""
+    distance: Float[Tensor, "H W"]
+    """Mean over the view and those that support it [m]."""
+    reflectivity: Float[Tensor, "H W"]
+    """Amplitude times distance squared, likewise [m^2 in quad units]."""
+
+    @property
+    def moving(self) -> Bool[Tensor, "H W"]:
+        """Seen through too often to be static."""
+        return self.through > SEEN_THROUGH * (self.supports + self.through)
+
+
+def views_of(sequence: Sequence, nearer: float) -> Views:
+    """Decode every complete quartet of a sequence.
+
+    The noise is the median difference between what neighbouring quartets decode in the same direction: it is right as
+    long as most of the scene rests.
+
+    Args:
+        sequence: Raw frames with poses; at least one quartet is complete.
+        nearer: The least difference of distances that means something, besides noise [m].
+    """
+    sensor = sensor_of(sequence)
+    quartets = sequence.complete_quartets
+    phasors = torch.as_tensor(np.stack([quartet_phasor(sequence, i) for i in quartets]), dtype=torch.float32)
+    amplitude = 0.5 * phasors.norm(dim=1)
+    frames = [FRAMES_PER_QUARTET * i + 1 for i in quartets]
+    views = Views(
+        quartets=quartets,
+        times=[float(sequence.times[n]) for n in frames],
+        cameras=[camera_of(sequence, n) for n in frames],
+        distance=distance_from_phasor(phasors[:, 0], phasors[:, 1], sensor),
+        amplitude=amplitude,
+        margin=torch.full_like(amplitude, nearer),
+        unambiguous_range=sensor.unambiguous_range,
+    )
+    deviation = distance_noise(amplitude, _noise(views, float(sensor.phase_slope)), sensor)
+    dark = deviation > DISTANCE_TRUSTED
+    views.margin.add_(4.0 * deviation)
+    for view in dark.any(dim=2).any(dim=1).nonzero()[:, 0].tolist():
+        views.distance[view] = fill(views.distance[view, None], ~dark[view])[0]
+    return views
+
+
+def _noise(views: Views, phase_slope: float) -> float:
+    """Standard deviation of the noise of one quad, from distances that neighbouring views see in the same direction."""
+    found = []
+    for view in range(len(views.quartets) - 1):
+        seen = _seen(views, views.points(view).flatten(0, 1), [view + 1])
+        apart = _wrapped(seen.decoded - seen.expected, views.unambiguous_range)[0]
+        weak = torch.minimum(views.amplitude[view].flatten(), seen.amplitude[0])
+        found.append((apart.abs() * weak)[seen.inside[0]])
+    values = torch.cat(found) if found else torch.zeros(0)
+    return 1.4826 * phase_slope * float(values.median()) if len(values) else 0.0  # both views: sqrt(2) / sqrt(2)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Seen:
+    """Points in the images of some views."""
+
+    inside: Bool[Tensor, "J P"]
+    pixel: Int[Tensor, "J P"]
+    expected: Float[Tensor, "J P"]
+    decoded: Float[Tensor, "J P"]
+    amplitude: Float[Tensor, "J P"]
+    margin: Float[Tensor, "J P"]
+
+
+def _seen(views: Views, points: Float[Tensor, "P 3"], of: list[int]) -> _Seen:
+    """Where points are in the images of the views ``of``, how far away they are, and what is decoded there."""
+    camera = views.cameras[0]
+    poses = torch.tensor(np.stack([views.cameras[j].camera_from_world for j in of]), dtype=torch.float32)
+    x, y, z = (torch.matmul(poses[:, :3, :3], points.T) + poses[:, :3, 3:]).unbind(dim=1)
+    ahead = z > CLOSE
+    column = (camera.fx * x / z + camera.cx).where(ahead, -torch.ones(())).floor()
+    row = (camera.fy * y / z + camera.cy).where(ahead, -torch.ones(())).floor()
+    inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+    pixel = torch.where(inside, row * camera.width + column, 0.0).long()
+    images = (views.distance, views.amplitude, views.margin)
+    decoded, amplitude, margin = (image[of].flatten(1).gather(1, pixel) for image in images)
+    return _Seen(
+        inside=inside,
+        pixel=pixel,
+        expected=(x.square() + y.square() + z.square()).sqrt(),
+        decoded=decoded,
+        amplitude=amplitude,
+        margin=margin,
+    )
+
+
+def _wrapped(difference: Tensor, unambiguous_range: float) -> Tensor:
+    """Differences of distances [m] in [-c/4f, c/4f)."""
+    half = 0.5 * unambiguous_range
+    return torch.remainder(difference + half, unambiguous_range) - half
+
+
+def verdicts(views: Views) -> Iterator[Verdict]:
+    """What the witnesses say about each view, in order."""
+    count = len(views.quartets)
+    spread = np.unique(np.linspace(0, count - 1, min(count, WITNESSES)).round().astype(int)).tolist()
+    nearest = -torch.nn.functional.max_pool2d(-views.distance[:, None], 3, stride=1, padding=1)[:, 0]
+    for view in range(count):
+        witnesses = [j for j in spread if j != view]
+        yield _verdict(views, view, witnesses, nearest)
+
+
+def _verdict(views: Views, view: int, witnesses: list[int], nearest: Float[Tensor, "J H W"]) -> Verdict:
+    size = views.distance.shape[1:]
+    margins, own = views.margin[view].flatten(), views.distance[view].flatten()
+    reflectivity = views.amplitude[view].flatten() * own.square()
+    parts = []
+    step = max(CHUNK // max(len(witnesses), 1), 1)
+    points = views.points(view).flatten(0, 1)
+    for start in range(0, len(points), step):
+        rows = slice(start, start + step)
+        supports = through = torch.zeros(len(own[rows]), dtype=torch.long)
+        apart = bright = torch.zeros(len(own[rows]))
+        if witnesses:
+            seen = _seen(views, points[rows], witnesses)
+            margin = torch.maximum(seen.margin, margins[rows])
+            difference = _wrapped(seen.decoded - seen.expected, views.unambiguous_range)
+            supporting = seen.inside & (difference.abs() <= margin)
+            behind = nearest[witnesses].flatten(1).gather(1, seen.pixel) > seen.expected + margin
+            supports, through = supporting.sum(dim=0), (seen.inside & behind & ~supporting).sum(dim=0)
+            apart = torch.where(supporting, difference, 0.0).sum(dim=0)
+            bright = torch.where(supporting, seen.amplitude * seen.decoded.square(), 0.0).sum(dim=0)
+        share = 1.0 / (1.0 + supports)
+        parts.append((supports, through, own[rows] + share * apart, share * (reflectivity[rows] + bright)))
+    supports, through, distance, reflectivity = (torch.cat(part).view(size) for part in zip(*parts, strict=True))
+    return Verdict(supports=supports, through=through, distance=distance, reflectivity=reflectivity)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Layer:
+    """Points that become Gaussians."""
+
+    mean: Float[Tensor, "P 3"]
+    """Where they are in the world [m]."""
+    distance: Float[Tensor, "P"]
+    """From the camera of the view that they were taken from [m]."""
+    amplitude: Float[Tensor, "P"]
+    """There, in quad units."""
+
+
+def static_layer(views: Views, judged: list[Verdict], grid: Float[Tensor, "P 2"], spacing: float) -> Layer:
+    """Points about ``spacing`` pixels apart on everything static that any view sees, each place once.
+
+    The views come in turn, the middle one first, and each adds the points of its grid that no point so far explains.
+
+    Args:
+        views: Decoded quartets.
+        judged: What is known about each of them.
+        grid: Image positions (x, y) [px].
+        spacing: Distance between them [px].
+    """
+    column, row = grid.long().unbind(dim=1)
+    layer = Layer(mean=torch.zeros(0, 3), distance=torch.zeros(0), amplitude=torch.zeros(0))
+    for view in _outwards(len(views.quartets)):
+        verdict = judged[view]
+        alone = verdict.supports + verdict.through == 0
+        there = torch.where(alone, ~outlying(views.distance[view], views.margin[view]), verdict.supports > 0)
+        wanted = (there & ~verdict.moving & ~_explained(views, view, layer, spacing))[row, column]
+        distance = verdict.distance[row, column][wanted]
+        amplitude = verdict.reflectivity[row, column][wanted] / distance.square().clamp_min(1e-12)
+        mean = unproject(views.cameras[view], grid[wanted], distance)
+        layer = Layer(
+            mean=torch.cat([layer.mean, mean]),
+            distance=torch.cat([layer.distance, distance]),
+            amplitude=torch.cat([layer.amplitude, amplitude]),
+        )
+    return layer
+
+
+def _outwards(count: int) -> list[int]:
+    """The middle of ``count`` views, both ends, then the middles of what lies between: early ones look elsewhere."""
+    order = [count // 2, 0, count - 1]
+    gaps = [(0, count // 2), (count // 2, count - 1)]
+    for start, end in gaps:  # grows
+        middle = (start + end) // 2
+        if start < middle:
+            order.append(middle)
+            gaps += [(start, middle), (middle, end)]
+    return list(dict.fromkeys(order))
+
+
+def _explained(views: Views, view: int, layer: Layer, spacing: float) -> Bool[Tensor, "H W"]:
+    """Which pixels of a view see a place that a point of the layer stands for, as large as the point is from here."""
+    height, width = views.distance.shape[1:]
+    explained = torch.zeros(height, width)
+    if not len(layer.mean):
+        return explained.bool()
+    seen = _seen(views, layer.mean, [view])
+    here = seen.inside[0] & (_wrapped(seen.decoded - seen.expected, views.unambiguous_range).abs() <= seen.margin)[0]
+    radius = (COVERS * spacing * layer.distance / seen.expected[0]).round().long().clamp(0, min(height, width) // 4)
+    for size in radius[here].unique().tolist():
+        marks = torch.zeros(height * width)
+        marks[seen.pixel[0][here & (radius == size)]] = 1.0
+        pooled = torch.nn.functional.max_pool2d(marks.view(1, height, width), 2 * size + 1, stride=1, padding=size)
+        explained = torch.maximum(explained, pooled[0])
+    return explained.bool()
+
+
+def outlying(distance: Float[Tensor, "H W"], margin: Float[Tensor, "H W"]) -> Bool[Tensor, "H W"]:
+    """Pixels whose distance differs from the median of their 3x3 neighbourhood: mixtures at outlines, and noise."""
+    padded = torch.nn.functional.pad(distance[None, None], (1, 1, 1, 1), mode="replicate")
+    median = torch.nn.functional.unfold(padded, 3).view(9, *distance.shape).median(dim=0).values
+    return (distance - median).abs() > margin
