@@ -200,27 +200,71 @@ def test_a_quartet_with_a_hole_is_not_read_and_the_keys_stay_whole():
     assert mean.norm(dim=1).max() < 0.06
 
 
-def test_two_objects_go_their_own_ways():
-    """Clouds of two patches, one moving right and one left, which are never taken for each other."""
-    sequence, _, _ = carried(quartets=5, shift=0.1)
+def followed(clouds, start):
+    """Points of the clouds' objects in the view ``start``, object of each, their shifts by view [m] and by view [px].
+
+    A cloud is a list of (first column, last column, distances [m]) in rows 8 to 17; the camera rests.
+    """
+    sequence, _, _ = carried(quartets=len(clouds), shift=0.1)
     views = views_of(sequence, 0.1)
-    clouds = []
-    for view in range(5):
-        mask = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
-        mask[5:15, 10 + view : 18 + view] = mask[20:30, 34 - view : 42 - view] = True
-        clouds.append(Cloud(mask=mask, distance=torch.where(mask, 2.0, 3.6)))
+    camera = views.cameras[start]
+    views = replace(views, cameras=[camera] * len(clouds))
+    found = []
+    for patches in clouds:
+        mask, distance = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool), torch.full((HEIGHT, WIDTH), 3.6)
+        for first, end, far in patches:
+            mask[8:18, first:end], distance[8:18, first:end] = True, far
+        found.append(Cloud(mask=mask, distance=distance))
     grid = torch.stack(torch.meshgrid(torch.arange(WIDTH) + 0.5, torch.arange(HEIGHT) + 0.5, indexing="xy"), dim=-1)
-    layer, objects = moving_layer(views, 2, clouds[2], grid, 16)
+    layer, objects = moving_layer(views, start, found[start], grid, 16)
+    times = torch.tensor(views.times, dtype=torch.float64)
+    positions = follow_clouds(views, found, start, layer.mean, objects, times, fellows=16)
+    dropped, _ = moving_layer(views, start, found[start], grid, 1 + int(objects.bincount().max()))
+    assert len(dropped.mean) == 0, "objects of fewer points than fellows are dropped"
+    return layer.mean, objects, positions - layer.mean, camera.project(positions) - camera.project(layer.mean)
+
+
+def test_two_objects_go_their_own_ways():
+    """One to the right and one to the left, which are never taken for each other."""
+    clouds = [[(10 + view, 18 + view, 2.0), (34 - view, 42 - view, 2.0)] for view in range(5)]
+    _, objects, _, pixels = followed(clouds, 2)
     assert objects.bincount().tolist() == [80, 80]
-    still = replace(views, cameras=[views.cameras[2]] * 5)
-    positions = follow_clouds(still, clouds, 2, layer.mean, objects, torch.tensor(views.times), fellows=16)
     for view in range(5):
-        x, y = (views.cameras[2].project(positions[view]) - views.cameras[2].project(layer.mean)).unbind(dim=1)
-        assert y.abs().max() < 0.3
+        assert pixels[view, :, 1].abs().max() < 0.3
         for number, direction in ((0, 1), (1, -1)):
-            assert float(x[objects == number].mean()) == pytest.approx(direction * (view - 2), abs=0.1)
-    one, _ = moving_layer(views, 2, clouds[2], grid, 81)
-    assert len(one.mean) == 0, "objects of fewer points than fellows are dropped"
+            assert float(pixels[view, objects == number, 0].mean()) == pytest.approx(direction * (view - 2), abs=0.1)
+
+
+def test_what_is_hidden_or_leaves_goes_on_as_before():
+    """Out of sight in one view, half hidden in two, and leaving in the last: three pixels per view all the while."""
+    first = [3 * view for view in range(15)]
+    clouds = [[(at, min(at + 10, WIDTH), 2.0)] for at in first]
+    clouds[6] = []
+    clouds[8], clouds[9] = [(first[8], first[8] + 5, 2.0)], [(first[9], first[9] + 4, 2.0)]
+    _, _, _, pixels = followed(clouds, 2)
+    want = 3.0 * (torch.arange(15.0) - 2)
+    assert (pixels[:, :, 0].mean(dim=1) - want).abs().max() < 0.6
+
+
+def test_what_comes_back_is_known_again_where_it_was_going():
+    """Out of sight for 20 pixels, and then it turns round: nothing but its speed tells where it will be."""
+    first = [2, 7, 12, None, None, None, 32, 28, 24]
+    clouds = [[] if at is None else [(at, at + 10, 2.0)] for at in first]
+    _, _, _, pixels = followed(clouds, 0)
+    for view, at in enumerate(first):
+        want = 5 * view if at is None else at - first[0]
+        assert float(pixels[view, :, 0].mean()) == pytest.approx(want, abs=1.0)
+
+
+def test_what_turns_turns_its_surface():
+    """A front whose left half comes nearer while its right half goes: each side follows its own."""
+    slant = torch.linspace(-1.0, 1.0, 20)
+    clouds = [[(14, 34, 2.0 + 0.03 * view * slant)] for view in range(5)]
+    points, _, shifts, _ = followed(clouds, 0)
+    left, right = points[:, 0] < points[:, 0].quantile(0.25), points[:, 0] > points[:, 0].quantile(0.75)
+    for view in (2, 4):
+        assert -0.03 * view < float(shifts[view, left, 2].mean()) < -0.4 * 0.03 * view
+        assert 0.4 * 0.03 * view < float(shifts[view, right, 2].mean()) < 0.03 * view
 
 
 def test_spacing_follows_the_settings():
