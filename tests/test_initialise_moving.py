@@ -124,7 +124,7 @@ def test_witnesses_take_the_noise_out():
     sequence, truth, _ = carried(step=np.zeros(3), noise=0.004)
     views = views_of(sequence, 0.1)
     verdict = list(verdicts(views))[6]
-    interior = ~outlying(torch.tensor(truth[6]), torch.tensor(0.05))[2:-2, 4:-4].numpy()
+    interior = ~outlying(torch.tensor(truth[6]), torch.full((HEIGHT, WIDTH), 0.05))[2:-2, 4:-4].numpy()
     alone, together = (
         np.abs(d.numpy() - truth[6])[2:-2, 4:-4][interior] for d in (views.distance[6], verdict.distance)
     )

@@ -5,7 +5,8 @@ decodes the same distance in that direction, and *sees through* it if everything
 something nearer, the point is hidden, and it says nothing. Static is what is hardly ever seen through; what many see
 through was there for a while only, so it moves, or it never was: two surfaces mix in a pixel at an outline.
 
-Only measured quads and poses are read.
+What moves by less than its own width is seen through along its outline only, and the rest of it counts as static. Only
+measured quads and poses are read.
 """
 
 from __future__ import annotations
