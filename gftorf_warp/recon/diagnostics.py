@@ -98,9 +98,9 @@ class Watch:
         kept = replace(settings.render, distortion=Distortion.PAPER)
         images: dict[str, list[Tensor]] = {name: [] for name in ("d", "d_tof", "opacity", "distortion", "offset")}
         for frame in self.frames:
-            displacement = state.motion.displacement(attachment, float(seen.sequence.times[frame]))
-            if state.images < settings.schedule.warm_up:
-                displacement = torch.zeros_like(displacement)
+            displacement = torch.zeros_like(field.mean)
+            if state.images >= settings.schedule.warm_up:  # before, nothing moves
+                displacement = state.motion.displacement(attachment, float(seen.sequence.times[frame]))
             length = displacement.norm(dim=1, keepdim=True)
             rendering = rasterize(bare.moved(displacement), seen.cameras[frame], seen.sensor, kept, extra=length)
             assert rendering.extra is not None
