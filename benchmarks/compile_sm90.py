@@ -18,7 +18,7 @@ from pathlib import Path
 
 import warp as wp
 
-from gftorf_warp.kernels import composite, composite_backward, project, resolve, splat, tiles
+from gftorf_warp.kernels import adam, composite, composite_backward, noise, project, resolve, similarity, splat, tiles
 from gftorf_warp.render.buffers import TILE_SHAPES
 
 FRAME_SIZE, REGISTERS = 0x11, 0x2F  # attributes in the .nv.info section of a cubin
@@ -32,7 +32,13 @@ def modules() -> dict[str, wp.Module]:
         "tiles": tiles.count_pairs.module,
         "resolve": resolve.resolve_quads.module,
         "splat": splat.add_records.module,
+        "noise": noise.uniform_noise.module,
+        "adam sizes": adam.adam_sizes.module,
+        "adam": adam.make_adam(1).module,
     }
+    window = similarity.make_similarity(1)
+    for name in ("columns_of_products", "compare_images", "columns_of_slopes", "gradient_of_image"):
+        found[name] = getattr(window, name).module
     found["finish_moments"] = composite_backward.finish_moments.module
     for colour in (False, True):
         for square in (False, True):

@@ -12,7 +12,8 @@ from torch import Tensor
 from ..constants import FRAMES_PER_QUARTET
 from ..losses.image import similarity
 from ..losses.prior import flow_error, image_motion, motion_size
-from ..losses.tof import phasor_error, quad_error
+from ..losses.tof import quad_error
+from ..render import fused
 from ..render.api import Background, Rendering, rasterize
 from ..render.buffers import RenderSettings
 from ..scene.camera import Camera
@@ -20,7 +21,7 @@ from ..scene.gaussians import GaussianField
 from ..scene.measured import colour_camera_of
 from ..scene.motion import Motion
 from .observations import Observations
-from .settings import Norm, ReconSettings, Weights
+from .settings import Kernels, Norm, ReconSettings, Weights
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -83,6 +84,7 @@ def terms(
         The weighted terms, whose sum is the loss, and what was rendered.
     """
     render = render or settings.render
+    kernel = settings.kernels != Kernels.NONE
     time = observations.time_at(frame)
     still = torch.zeros_like(field.mean)
     displacement = still if motion is None else motion.displacement(attachment, time)
@@ -92,11 +94,16 @@ def terms(
         moved = replace(field, colour_sh=None).moved(displacement)
         tof = _render(moved, observations.cameras[frame], observations, frame, settings, render, backgrounds)
     if tof is not None and weights.quads > 0:
-        loss, squared = _tof_loss(tof, observations, frame, weights.ssim)
+        if observations.phasors:  # an amplitude is not compared: re and im say it already
+            rendered, measured = tof.phasor[:2], observations.phasors[frame]
+        else:
+            rendered, measured = tof.quads, observations.quads[frame][None]
+        loss, squared = image_loss(rendered, measured, weights.ssim, kernel=kernel)
         result["quads"] = weights.quads * loss
     if tof is not None and weights.depth > 0 and frame // FRAMES_PER_QUARTET in observations.closed_form:
         measured = observations.closed_form[frame // FRAMES_PER_QUARTET][None]
-        result["depth"] = weights.depth * image_loss(tof.distance[None], measured, weights.ssim, Norm.L1)
+        loss, _ = image_loss(tof.distance[None], measured, weights.ssim, Norm.L1, kernel=kernel)
+        result["depth"] = weights.depth * loss
     if tof is not None and weights.distortion > 0:
         result["distortion"] = weights.distortion * tof.distortion.mean()
     if weights.colour > 0 and frame in observations.colour:
@@ -108,9 +115,9 @@ def terms(
         colour = _render(field.moved(displacement), camera, observations, frame, settings, render, backgrounds)
         assert colour.colour is not None
         measured = observations.colour[frame]
-        result["colour"] = weights.colour * image_loss(colour.colour, measured, weights.ssim, weights.colour_norm)
-        if squared is None:
-            squared = quad_error(colour.colour.detach(), measured).mean()
+        loss, of_colour = image_loss(colour.colour, measured, weights.ssim, weights.colour_norm, kernel=kernel)
+        result["colour"] = weights.colour * loss
+        squared = of_colour if squared is None else squared
     if motion is not None and weights.motion_size > 0:
         result["motion_size"] = weights.motion_size * motion_size(displacement).mean()
     if motion is not None and weights.flow > 0 and frame % FRAMES_PER_QUARTET == 0:
@@ -142,33 +149,34 @@ def _render(
     )
 
 
-def _tof_loss(tof: Rendering, observations: Observations, frame: int, ssim: float) -> tuple[Tensor, Tensor]:
-    """Loss of the quad or phasor, and its mean squared difference."""
-    if observations.phasors:
-        measured = observations.phasors[frame]
-        squared = phasor_error(tof.phasor, measured).mean()
-        return _mixed(squared, tof.phasor[:2], measured, ssim), squared.detach()
-    measured = observations.quads[frame][None]
-    squared = quad_error(tof.quads, measured).mean()
-    return _mixed(squared, tof.quads, measured, ssim), squared.detach()
-
-
 def image_loss(
-    rendered: Float[Tensor, "C H W"], measured: Float[Tensor, "C H W"], ssim: float, norm: Norm = Norm.L2
-) -> Tensor:
-    """(1 - ssim) times the mean L1 or L2 difference + ssim (1 - SSIM), means over pixels and channels.
+    rendered: Float[Tensor, "C H W"],
+    measured: Float[Tensor, "C H W"],
+    ssim: float,
+    norm: Norm = Norm.L2,
+    *,
+    kernel: bool = False,
+) -> tuple[Tensor, Tensor]:
+    """(1 - ssim) times the mean L1 or L2 difference + ssim (1 - SSIM), and the mean squared difference, detached.
+
+    Args:
+        rendered: What gradients reach.
+        measured: What they do not reach.
+        ssim: Share of the similarity.
+        norm: Of the difference.
+        kernel: Whether the hand-written kernels do it, in float32; without a similarity torch does.
 
     Raises:
         ValueError: If the shapes differ.
     """
-    squared = quad_error(rendered, measured)
-    difference = squared.mean() if norm == Norm.L2 else (rendered - measured).abs().mean()
-    return _mixed(difference, rendered, measured, ssim)
-
-
-def _mixed(difference: Tensor, rendered: Tensor, measured: Tensor, ssim: float) -> Tensor:
+    if kernel and ssim > 0:
+        return fused.image_loss(rendered, measured, ssim, absolute=norm == Norm.L1)
+    squared = quad_error(rendered, measured).mean()
+    difference = squared if norm == Norm.L2 else (rendered - measured).abs().mean()
     loss = (1.0 - ssim) * difference
-    return loss + ssim * (1.0 - similarity(rendered, measured).mean()) if ssim > 0 else loss
+    if ssim > 0:
+        loss = loss + ssim * (1.0 - similarity(rendered, measured).mean())
+    return loss, squared.detach()
 
 
 def flow_loss(

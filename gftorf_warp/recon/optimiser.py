@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
+from ..render import fused
 from ..scene.gaussians import GaussianField
 from ..scene.motion import Motion
 from .settings import ReconSettings
@@ -101,13 +102,22 @@ class Optimiser:
         """Everything that is optimised: the tensors of the field, then the motion."""
         return [*self.tensors.values(), *self.motion]
 
-    def step(self, gradients: list[Tensor | None], rates: dict[str, float], motion_gradient_max: float | None) -> None:
+    def step(
+        self,
+        gradients: list[Tensor | None],
+        rates: dict[str, float],
+        motion_gradient_max: float | None,
+        *,
+        sound: Bool[Tensor, ""] | None = None,
+    ) -> None:
         """One step of Adam.
 
         Args:
             gradients: Of ``leaves``; None is zero.
             rates: From :func:`rates_at`. A group of rate 0 is left alone, its moments included.
             motion_gradient_max: Longest gradient of the motion; a longer one is shortened. None: no limit.
+            sound: Whether anything may change, where the tensors are: the kernel of Adam asks, and no host waits for
+                the answer. None: everything may, and torch's Adam does it.
         """
         for leaf, gradient in zip(self.leaves, gradients, strict=True):
             leaf.grad = gradient
@@ -118,8 +128,32 @@ class Optimiser:
             if group["lr"] == 0.0:
                 for leaf in group["params"]:
                     leaf.grad = None
-        self.adam.step()
+        if sound is None:
+            self.adam.step()
+        else:
+            self._step_by_kernel(sound)
         self.adam.zero_grad(set_to_none=True)
+
+    def _step_by_kernel(self, sound: Bool[Tensor, ""]) -> None:
+        """All tensors in two launches, with the moments that torch's Adam keeps, and would begin with."""
+        moving = [(leaf, group["lr"]) for group in self.adam.param_groups for leaf in group["params"]]
+        moving = [(leaf, rate) for leaf, rate in moving if leaf.grad is not None]
+        moments = []
+        for leaf, _ in moving:
+            state = self.adam.state[leaf]
+            if not state:
+                state["step"] = torch.zeros((), device=leaf.device)
+                state |= {name: torch.zeros_like(leaf, requires_grad=False) for name in ("exp_avg", "exp_avg_sq")}
+            moments.append((state["step"], state["exp_avg"], state["exp_avg_sq"]))
+        fused.adam_step(
+            [leaf.detach() for leaf, _ in moving],
+            [leaf.grad for leaf, _ in moving],
+            moments,
+            torch.tensor([rate for _, rate in moving], device=sound.device),
+            sound.to(torch.int32).reshape(1),
+            betas=BETAS,
+            epsilon=EPSILON,
+        )
 
     def replace(
         self, rows: Int[Tensor, "M"], fresh: Bool[Tensor, "M"], change: Callable[[str, Tensor], Tensor]

@@ -68,6 +68,17 @@ class Batch(enum.StrEnum):
     """The measured raw frames of one quartet: all slots pull at once."""
 
 
+class Kernels(enum.StrEnum):
+    """How much of a step, beside the rendering, is done by kernels instead of torch: the same to rounding."""
+
+    NONE = "none"
+    """Nothing."""
+    LOSS = "loss"
+    """Losses of images that contain the similarity."""
+    STEP = "step"
+    """These, random backgrounds and Adam; the backgrounds are other draws of the same kind."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Rates:
     """Learning rates of Adam: the size of one step, whatever the size of the gradient (method, section 6.5)."""
@@ -232,6 +243,8 @@ class ReconSettings:
     """Amplitude B of the random background, uniform in [-B, B] per pixel, channel and image; 0 is black."""
     motion_gradient_max: float | None = 1.0
     """Longest gradient of the motion; a longer one is shortened [1/m for nodes, 1 for a network]. None: never."""
+    kernels: Kernels = Kernels.LOSS
+    """How much of a step is done by kernels instead of torch."""
     failures_max: int = 5
     """So many steps without a finite loss and gradient in a row go back to the last checkpoint, with halved rates."""
     rollbacks_max: int = 3

@@ -9,15 +9,17 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from ..render import fused
 from ..scene.measured import colour_camera_of
 from . import densify
 from .objective import Seen, render_settings_at, terms, weights_at
 from .observations import Observations
 from .optimiser import frozen, rates_at
-from .settings import ReconSettings, Weights
+from .settings import Kernels, ReconSettings, Weights
 from .state import State
 
 Map = Callable[[Callable, Iterable], Iterable]
+SEED_MASK = 0x7FFFFFFF  # a seed as a positive int32, for kernels
 
 
 def draw(state: State, observations: Observations, settings: ReconSettings) -> list[int]:
@@ -53,7 +55,9 @@ def step(
     weights, render = weights_at(settings, state.images), render_settings_at(settings, state.images)
     rests = frozen(settings, state.images)
     wanted = [n for n, leaf in enumerate(leaves) if not rests or any(leaf is other for other in state.optimiser.motion)]
-    backgrounds = [_backgrounds(state, observations, frame, settings, weights) for frame in frames]
+    numbers = range(state.images, state.images + len(frames))
+    pairs = zip(numbers, frames, strict=True)
+    backgrounds = [_backgrounds(state, observations, frame, settings, weights, number) for number, frame in pairs]
 
     def one(frame: int, lights: dict[str, Tensor]) -> tuple[dict[str, Tensor], Seen, list[Tensor | None]]:
         field = state.optimiser.field
@@ -81,16 +85,21 @@ def step(
     before, state.images = state.images, state.images + len(frames)
     checked = [value for found, _, _ in results for value in found.values()]
     checked += [gradient.square().sum() for gradient in gradients if gradient is not None]
-    if checked and not bool(torch.stack(checked).sum().isfinite()):
-        return {name: float(sum(found.get(name, 0.0) for found, _, _ in results)) for name in results[0][0]}
-    for frame, (found, seen, _) in zip(frames, results, strict=True):
-        _account(state, observations, frame, found, seen)
     rates = rates_at(settings, before, state.rate_factor, reset_at=state.reset_at)
     options = settings.densify
     due = densify.round_is_due(before, state.images, options, settings.schedule)
     if due and options.loses_step:
         rates = {name: rate if name == "motion" else 0.0 for name, rate in rates.items()}
-    state.optimiser.step(gradients, rates, settings.motion_gradient_max)
+    sound = torch.stack(checked).sum().isfinite() if checked else None
+    by_kernel = settings.kernels == Kernels.STEP and sound is not None
+    if by_kernel:  # asks by itself whether the step is sound, so that the device has work while the host asks, too
+        state.optimiser.step(gradients, rates, settings.motion_gradient_max, sound=sound)
+    if sound is not None and not bool(sound):
+        return {name: float(sum(found.get(name, 0.0) for found, _, _ in results)) for name in results[0][0]}
+    for frame, (found, seen, _) in zip(frames, results, strict=True):
+        _account(state, observations, frame, found, seen)
+    if not by_kernel:
+        state.optimiser.step(gradients, rates, settings.motion_gradient_max)
     _densify(state, before, settings)
     return None
 
@@ -112,9 +121,9 @@ def pool(workers: int) -> ThreadPoolExecutor:
 
 
 def _backgrounds(
-    state: State, observations: Observations, frame: int, settings: ReconSettings, weights: Weights
+    state: State, observations: Observations, frame: int, settings: ReconSettings, weights: Weights, number: int
 ) -> dict[str, Tensor]:
-    """Uniform in [-B, B] per pixel and channel, for every image that will be compared."""
+    """Uniform in [-B, B] per pixel and channel, for every image that will be compared; ``number`` counts images."""
     if settings.background == 0.0:
         return {}
     size = observations.quads.shape[1:]
@@ -124,8 +133,15 @@ def _backgrounds(
     if weights.colour > 0 and frame in observations.colour:
         shapes["colour"] = tuple(observations.colour[frame].shape)
 
+    device = observations.quads.device
+    if settings.kernels == Kernels.STEP:
+        seed = state.noise.initial_seed() & SEED_MASK
+        origin = torch.tensor([seed, number], dtype=torch.int32, device=device)
+        streams = enumerate(shapes.items())
+        return {name: fused.uniform(shape, origin, settings.background, stream=n) for n, (name, shape) in streams}
+
     def uniform(shape: tuple[int, ...]) -> Tensor:
-        drawn = torch.rand(shape, generator=state.noise, device=observations.quads.device)
+        drawn = torch.rand(shape, generator=state.noise, device=device)
         return settings.background * (2.0 * drawn - 1.0)
 
     return {name: uniform(shape) for name, shape in shapes.items()}

@@ -1,4 +1,4 @@
-"""The only module that knows torch and Warp together: shares memory, follows torch's stream, attaches gradients."""
+"""Where torch renders with Warp: shares memory, follows torch's stream, attaches gradients."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Rasterize(torch.autograd.Function):
         shapes |= {"colour": (3, *size)} if colour_sh is not None else {}
         shapes |= {"extra": (extra.shape[1], *size)} if extra is not None else {}
         images = {name: mean.new_empty(shapes[name]) for name in IMAGES if name in shapes}
-        with _stream_of(mean):
+        with stream_of(mean):
             device = wp.device_from_torch(mean.device)
             frame = Frame(len(mean), camera.width, camera.height, settings, device)
             view = launch.view_of(camera, settings)
@@ -72,7 +72,7 @@ class Rasterize(torch.autograd.Function):
         wanted = {name: torch.zeros_like(named[name]) for name in INPUTS if needed[name]}
         cotangents = {name: g.contiguous() for name, g in zip(IMAGES, grads, strict=True) if g is not None}
         if cotangents and wanted:
-            with _stream_of(named["mean"]):
+            with stream_of(named["mean"]):
                 records = launch.backward(_inputs(named), view, shifts, frame, _images(cotangents), _inputs(wanted))
                 if screen is not None and len(screen):
                     screen.copy_(wp.to_torch(records)[:, [0, 1, 6]])
@@ -80,14 +80,14 @@ class Rasterize(torch.autograd.Function):
 
 
 def _inputs(named: Mapping[str, Tensor | None]) -> Inputs:
-    return Inputs(**{name: _view(named.get(name), _VECTORS.get(name, wp.float32)) for name in INPUTS})
+    return Inputs(**{name: array_over(named.get(name), _VECTORS.get(name, wp.float32)) for name in INPUTS})
 
 
 def _images(named: Mapping[str, Tensor]) -> Images:
-    return Images(**{name: _view(named.get(name), wp.float32) for name in IMAGES})
+    return Images(**{name: array_over(named.get(name), wp.float32) for name in IMAGES})
 
 
-def _view(tensor: Tensor | None, dtype) -> wp.array | None:
+def array_over(tensor: Tensor | None, dtype=wp.float32) -> wp.array | None:
     """A Warp array over the memory of a tensor, without its history."""
     if tensor is None:
         return None
@@ -98,7 +98,7 @@ def _view(tensor: Tensor | None, dtype) -> wp.array | None:
     return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False)
 
 
-def _stream_of(tensor: Tensor):
+def stream_of(tensor: Tensor):
     """Order launches with the torch work around them; on the CPU there is nothing to order."""
     wp.init()
     if tensor.is_cuda:
