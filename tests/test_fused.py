@@ -164,7 +164,8 @@ def one_step(values, gradients, moments, rates, sound=1):
     """A step with everything in device memory."""
     flag = torch.tensor([sound], dtype=torch.int32, device=values[0].device)
     rates = torch.tensor(rates, device=values[0].device)
-    fused.adam_step(values, gradients, moments, rates, flag, betas=(0.9, 0.999), epsilon=1e-15)
+    table = fused.adam_table(values, gradients, moments)
+    fused.adam_step(table, rates, flag, betas=(0.9, 0.999), epsilon=1e-15)
 
 
 @pytest.mark.parametrize("block", [16, 1], ids=["vectors", "elements"])

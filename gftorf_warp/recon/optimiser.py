@@ -145,15 +145,12 @@ class Optimiser:
                 state["step"] = torch.zeros((), device=leaf.device)
                 state |= {name: torch.zeros_like(leaf, requires_grad=False) for name in ("exp_avg", "exp_avg_sq")}
             moments.append((state["step"], state["exp_avg"], state["exp_avg_sq"]))
-        fused.adam_step(
-            [leaf.detach() for leaf, _ in moving],
-            [leaf.grad for leaf, _ in moving],
-            moments,
-            torch.tensor([rate for _, rate in moving], device=sound.device),
-            sound.to(torch.int32).reshape(1),
-            betas=BETAS,
-            epsilon=EPSILON,
-        )
+        if not moving:
+            return
+        values, gradients = [leaf.detach() for leaf, _ in moving], [leaf.grad.contiguous() for leaf, _ in moving]
+        rates = torch.tensor([rate for _, rate in moving], device=sound.device)
+        table = fused.adam_table(values, gradients, moments)
+        fused.adam_step(table, rates, sound.to(torch.int32).reshape(1), betas=BETAS, epsilon=EPSILON)
 
     def replace(
         self, rows: Int[Tensor, "M"], fresh: Bool[Tensor, "M"], change: Callable[[str, Tensor], Tensor]

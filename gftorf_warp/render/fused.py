@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -93,50 +94,76 @@ def uniform(
     return image
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class AdamTable:
+    """Where the tensors of an Adam step lie. Good for as long as they do, so a captured graph may hold one."""
+
+    rows: Int[Tensor, "T 6"]
+    """Addresses and lengths, see ``kernels/adam.py``."""
+    first_block: Int[Tensor, "T"]
+    """Blocks of elements before those of a tensor."""
+    sizes: Float[Tensor, "T 2"]
+    """Scratch: what a step comes to."""
+    blocks: int
+    """Blocks in all."""
+    kept: tuple[Tensor, ...]
+    """The tensors themselves: an address keeps nothing alive."""
+
+
+def adam_table(
+    parameters: Sequence[Tensor], gradients: Sequence[Tensor], moments: Sequence[tuple[Tensor, Tensor, Tensor]]
+) -> AdamTable:
+    """Look up where T >= 1 tensors lie; an upload, so not for a stream that is being captured.
+
+    Args:
+        parameters: Float32, contiguous, on one device.
+        gradients: Of their shapes.
+        moments: (step, first moment, second moment) of each; the step is a float32 number on the same device.
+
+    Raises:
+        ValueError: If a tensor is not float32, not contiguous, elsewhere, or of another shape than its parameter.
+    """
+    device, rows = parameters[0].device, []
+    kept: list[Tensor] = []
+    for value, gradient, (step, first, second) in zip(parameters, gradients, moments, strict=True):
+        named = value, gradient, first, second, step
+        for tensor in named:
+            if tensor.dtype != torch.float32 or tensor.device != device or not tensor.is_contiguous():
+                raise ValueError(f"{tensor.dtype} on {tensor.device} must be contiguous float32 on {device}")
+            if tensor is not step and tensor.shape != value.shape:
+                raise ValueError(f"{tuple(tensor.shape)} must be {tuple(value.shape)}, the shape of the parameter")
+        rows.append([*(tensor.data_ptr() for tensor in named), value.numel()])
+        kept += named
+    with stream_of(parameters[0]):
+        width = training.adam_block(wp.device_from_torch(device))
+    ends = list(itertools.accumulate(-(-row[-1] // width) for row in rows))
+    return AdamTable(
+        rows=torch.tensor(rows, dtype=torch.int64, device=device),
+        first_block=torch.tensor([0, *ends[:-1]], dtype=torch.int32, device=device),
+        sizes=torch.empty(len(rows), 2, dtype=torch.float32, device=device),
+        blocks=ends[-1],
+        kept=tuple(kept),
+    )
+
+
 def adam_step(
-    parameters: Sequence[Tensor],
-    gradients: Sequence[Tensor],
-    moments: Sequence[tuple[Tensor, Tensor, Tensor]],
+    table: AdamTable,
     rates: Float[Tensor, "T"],
     sound: Int[Tensor, "1"],
     *,
     betas: tuple[float, float],
     epsilon: float,
 ) -> None:
-    """One step of Adam over T tensors, in place.
+    """One step of Adam over all tensors of a table, in place.
 
     Args:
-        parameters: Float32, contiguous, on one device.
-        gradients: Of their shapes.
-        moments: (step, first moment, second moment) of each; the step is a float32 number on the same device.
+        table: Which.
         rates: Learning rate of each; 0: the tensor is left alone, moments and step included.
-        sound: int32; 0: nothing changes. Read when the kernel runs.
+        sound: int32; 0: nothing changes. Read when the kernel runs, as the rates are.
         betas: Decays of the moments.
         epsilon: Added to the root of the second moment.
-
-    Raises:
-        ValueError: If a tensor is not float32, not contiguous, elsewhere, or of another shape than its parameter.
     """
-    if not parameters:
-        return
-    device = parameters[0].device
-    gradients = [gradient.contiguous() for gradient in gradients]  # addresses: they must live until the launch
-    rows = []
-    for value, gradient, (step, first, second) in zip(parameters, gradients, moments, strict=True):
-        for tensor in (value, gradient, first, second):
-            if tensor.dtype != torch.float32 or tensor.device != device or not tensor.is_contiguous():
-                raise ValueError(f"{tensor.dtype} on {tensor.device} must be contiguous float32 on {device}")
-            if tensor.shape != value.shape:
-                raise ValueError(f"{tuple(tensor.shape)} must be {tuple(value.shape)}, the shape of the parameter")
-        if step.dtype != torch.float32 or step.device != device:
-            raise ValueError(f"step is {step.dtype} on {step.device}, must be float32 on {device}")
-        rows.append([*(t.data_ptr() for t in (value, gradient, first, second, step)), value.numel()])
-    with stream_of(parameters[0]):
-        width = training.adam_block(wp.device_from_torch(device))
-        ends = list(itertools.accumulate(-(-row[-1] // width) for row in rows))
-        table = torch.tensor(rows, dtype=torch.int64, device=device)
-        first_block = torch.tensor([0, *ends[:-1]], dtype=torch.int32, device=device)
-        sizes = torch.empty(len(rows), 2, dtype=torch.float32, device=device)
-        arrays = array_over(table, wp.int64), array_over(first_block, wp.int32), ends[-1]
+    with stream_of(rates):
+        arrays = array_over(table.rows, wp.int64), array_over(table.first_block, wp.int32), table.blocks
         head = array_over(rates), array_over(sound, wp.int32)
-        training.adam_step(*arrays, *head, betas, epsilon, array_over(sizes))
+        training.adam_step(*arrays, *head, betas, epsilon, array_over(table.sizes))
