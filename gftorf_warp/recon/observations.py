@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 from dataclasses import dataclass, replace
 
@@ -58,6 +59,18 @@ class Observations:
     def sensor_at(self, frame: int) -> Sensor:
         """The sensor reading only the shift of one raw frame."""
         return self.sensor.with_shifts((float(self.sequence.shifts[frame]),))
+
+    def rays_at(self, frame: int) -> Float[Tensor, "H W 3"]:
+        """Unit vectors through the pixels of a raw frame, in world axes, on the device; computed once per pose."""
+        camera = self.cameras[frame]
+        key = camera.camera_from_world.tobytes()
+        if key not in self._rays:
+            self._rays[key] = camera.rays(device=self.quads.device)
+        return self._rays[key]
+
+    @functools.cached_property
+    def _rays(self) -> dict[bytes, Tensor]:
+        return {}
 
     def time_at(self, frame: int) -> float:
         """When raw frame ``frame`` was taken [s]; if phasors are compared, the middle of its quartet."""

@@ -77,7 +77,7 @@ class Network(Motion):
         one vector, added like a bias.
         """
         place = encoded(attachment / self.length, self.settings.position_frequencies)
-        seconds = attachment.new_tensor([self._times[key] for key in keys])[:, None]
+        seconds = torch.stack([self.key_times[key] for key in keys]).to(attachment)[:, None]  # no upload
         moment = encoded(seconds / self.duration, self.settings.time_frequencies)
         hidden = self._joined(self._layers[0], None, place, moment)
         for number, layer in enumerate(self._layers[1:], start=1):
