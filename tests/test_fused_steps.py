@@ -1,6 +1,7 @@
 """Steps with kernels and with torch: the same run to rounding, and the same guarantees."""
 
 import copy
+from dataclasses import replace
 
 import pytest
 import torch
@@ -11,6 +12,9 @@ from gftorf_warp.recon.observations import observe
 from gftorf_warp.recon.settings import DensifySettings, Kernels
 from gftorf_warp.recon.state import begin, from_dict, to_dict
 from gftorf_warp.recon.train import reconstruct
+from gftorf_warp.render import fused
+from gftorf_warp.render.api import rasterize
+from gftorf_warp.scene.gaussians import GaussianField
 
 SETTINGS = demo(images=48, log_every=8)
 
@@ -119,3 +123,30 @@ def test_every_image_of_a_run_has_a_background_of_its_own(monkeypatch):
     monkeypatch.setattr(step.fused, "uniform", uniform)
     after(demo(images=48, kernels=Kernels.STEP), 3)
     assert seen == [(3, n) for n in range(12)]
+
+
+def test_dead_gaussians_behind_the_living_change_nothing():
+    """What fills up a capacity: no pixel differs, no gradient reaches it, and Adam's step on it is zero."""
+    state, observations = after(SETTINGS, 0)
+    living, count = state.optimiser.field.map(torch.Tensor.detach), 37
+    dead = living.map(lambda value: torch.zeros_like(value[:count]))
+    dead.mean.copy_(living.mean[:count])  # in sight: it is the opacity that makes them nothing
+    dead.log_scale.fill_(-2.0)
+    dead.quaternion[:, 0] = 1.0
+    dead.opacity_logit.fill_(-30.0)
+    pairs = zip(living.tensors().items(), dead.tensors().values(), strict=True)
+    padded = GaussianField(**{name: torch.cat([value, filling]) for (name, value), filling in pairs})
+    images, gradients = [], []
+    for field in (living, padded):
+        leaves = {name: value.clone().requires_grad_() for name, value in field.parameters().items()}
+        seen = rasterize(replace(field, **leaves), observations.cameras[0], observations.sensor)
+        images.append(seen.quads.detach())
+        gradients.append(torch.autograd.grad((seen.quads.square() + seen.distance).sum(), [*leaves.values()]))
+    assert torch.equal(*images)
+    for short, long in zip(*gradients, strict=True):
+        torch.testing.assert_close(long[: len(short)], short, rtol=1e-5, atol=1e-6 * float(short.abs().max()))
+        assert torch.equal(long[len(short) :], torch.zeros_like(long[len(short) :]))
+    moments = [(torch.zeros(()), torch.zeros(count, 3), torch.zeros(count, 3))]
+    table = fused.adam_table([dead.mean], [torch.zeros(count, 3)], moments)
+    fused.adam_step(table, torch.ones(1), torch.ones(1, dtype=torch.int32), betas=(0.9, 0.999), epsilon=1e-15)
+    assert torch.equal(dead.mean, living.mean[:count])

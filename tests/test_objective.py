@@ -142,12 +142,16 @@ def test_reflectivity_can_start_clamped_and_recover():
 
 
 def test_rays_are_computed_once_per_pose():
-    """The same tensor for all frames of one pose, and those of its camera."""
+    """The same tensors for all frames of one pose, and those of its camera."""
     observations = observe(small(), demo(), "cpu")
-    ray = observations.rays_at(4)
+    centre, ray = observations.rays_at(4)
     assert torch.equal(ray, observations.cameras[4].rays())
-    assert observations.rays_at(8) is ray
-    turned = observations.cameras[5].at(np.diag([-1.0, 1.0, -1.0, 1.0]))
+    assert observations.rays_at(8)[1] is ray
+    pose = np.diag([-1.0, 1.0, -1.0, 1.0])
+    pose[0, 3] = 0.5
+    turned = observations.cameras[5].at(pose)
     moving = replace(observations, cameras=[*observations.cameras[:5], turned, *observations.cameras[6:]])
-    assert torch.equal(moving.rays_at(5), turned.rays())
-    assert not torch.equal(moving.rays_at(5), ray)
+    other_centre, other = moving.rays_at(5)
+    assert torch.equal(other, turned.rays())
+    assert not torch.equal(other, ray)
+    torch.testing.assert_close(other_centre - centre, torch.tensor([0.5, 0.0, 0.0]))

@@ -204,8 +204,8 @@ def flow_loss(
     still = replace(field, colour_sh=None).moved(here).map(torch.Tensor.detach)
     seen = rasterize(still, camera, observations.sensor_at(frame), render, extra=torch.cat(offsets, dim=1))
     assert seen.extra is not None
-    ray = observations.rays_at(frame)
-    surface = torch.as_tensor(camera.centre).to(ray) + ray * seen.distance.detach()[..., None]
+    centre, ray = observations.rays_at(frame)
+    surface = centre + ray * seen.distance.detach()[..., None]
     errors = []
     for n, step in enumerate(steps):
         later = cameras[min(frame + FRAMES_PER_QUARTET * step, len(cameras) - 1)]

@@ -60,16 +60,17 @@ class Observations:
         """The sensor reading only the shift of one raw frame."""
         return self.sensor.with_shifts((float(self.sequence.shifts[frame]),))
 
-    def rays_at(self, frame: int) -> Float[Tensor, "H W 3"]:
-        """Unit vectors through the pixels of a raw frame, in world axes, on the device; computed once per pose."""
+    def rays_at(self, frame: int) -> tuple[Float[Tensor, "3"], Float[Tensor, "H W 3"]]:
+        """Centre of the camera [m] and unit vectors through its pixels, in world axes; sent once per pose."""
         camera = self.cameras[frame]
         key = camera.camera_from_world.tobytes()
         if key not in self._rays:
-            self._rays[key] = camera.rays(device=self.quads.device)
+            ray = camera.rays(device=self.quads.device)
+            self._rays[key] = torch.as_tensor(camera.centre).to(ray), ray
         return self._rays[key]
 
     @functools.cached_property
-    def _rays(self) -> dict[bytes, Tensor]:
+    def _rays(self) -> dict[bytes, tuple[Tensor, Tensor]]:
         return {}
 
     def time_at(self, frame: int) -> float:

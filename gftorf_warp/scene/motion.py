@@ -83,6 +83,7 @@ class MotionSettings:
 class Motion(torch.nn.Module, abc.ABC):
     """Displacements of Gaussians over time. Final classes: :class:`Still`, :class:`Nodes`, network.Network."""
 
+    key_times: Tensor  # [T] float64 [s]
     follows_means = False
     """Whether ``attach`` depends on where Gaussians are now, so that it has to be asked again after every step."""
 
