@@ -84,7 +84,8 @@ def step(
     gradients = [_mean([gradients[n] for _, _, gradients in results]) for n in range(len(leaves))]
     before, state.images = state.images, state.images + len(frames)
     checked = [value for found, _, _ in results for value in found.values()]
-    checked += [gradient.square().sum() for gradient in gradients if gradient is not None]
+    present = [gradient for gradient in gradients if gradient is not None]
+    checked += [torch.nn.utils.get_total_norm(present)] if present else []
     rates = rates_at(settings, before, state.rate_factor, reset_at=state.reset_at)
     options = settings.densify
     due = densify.round_is_due(before, state.images, options, settings.schedule)
@@ -150,6 +151,8 @@ def _backgrounds(
 def _mean(gradients: list[Tensor | None]) -> Tensor | None:
     """Mean over the images of a batch; an image without a gradient counts as zero."""
     present = [gradient for gradient in gradients if gradient is not None]
+    if len(gradients) == 1:
+        return gradients[0]
     return torch.stack(present).sum(dim=0) / len(gradients) if present else None
 
 

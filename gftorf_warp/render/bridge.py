@@ -75,7 +75,8 @@ class Rasterize(torch.autograd.Function):
             with stream_of(named["mean"]):
                 records = launch.backward(_inputs(named), view, shifts, frame, _images(cotangents), _inputs(wanted))
                 if screen is not None and len(screen):
-                    screen.copy_(wp.to_torch(records)[:, [0, 1, 6]])
+                    found = wp.to_torch(records)  # a list of columns would be uploaded as an index
+                    screen[:, :2], screen[:, 2] = found[:, :2], found[:, 6]
         return None, None, None, None, *(wanted.get(name) for name in INPUTS)
 
 
