@@ -104,6 +104,8 @@ def main() -> int:
             parser.error(f"{a.run} holds no checkpoint")
     else:
         stored = to_dict(begin(observations, settings, seed=0, device=a.device))
+    if "shape" in stored["motion"]:  # precision is a matter of speed: that of the command line, not of the run
+        stored["motion"]["shape"]["products"] = str(settings.motion.products)
     if a.begin is not None:
         stored["images"] = a.begin
 
