@@ -49,6 +49,7 @@ class Level(Shape):
         Raises:
             ValueError: Always.
         """
+        del spacing, inset
         raise ValueError(f"{self} has no end, so nothing can cover it: let its path be Still")
 
     @property

@@ -83,7 +83,7 @@ def speed_test_chair() -> Scene:
         "speed_test_chair",
         "three chairs of thin bars slide at three speeds",
         "sideways, thin parts, 10 to 30 px",
-        0.690,
+        0.670,
         (*wall_and_floor(3.8, 1.0, around(0.5, 0.1, 0.3), around(0.4, 0.1, 0.3)), *chairs),
     )
 
@@ -128,14 +128,15 @@ def chair() -> Assembly:
     return Assembly(parts=tuple(Part(shape=Box(size=size), position=at) for size, at in boxes))
 
 
-def plain(reflectance: float) -> Texture:
-    """One reflectance [1] everywhere."""
-    return Texture(low=reflectance, high=reflectance)
+def plain(reflectance: float, hue: float | None = None) -> Texture:
+    """One reflectance [1] everywhere; ``hue`` in turns."""
+    return Texture(low=reflectance, high=reflectance, hue=hue)
 
 
-def around(reflectance: float, contrast: float, cell: float) -> Texture:
-    """Reflectance [1] that varies by ``contrast`` of itself from cell to cell of ``cell`` [m]."""
-    return Texture(low=reflectance * (1 - contrast), high=min(1.0, reflectance * (1 + contrast)), cell=cell)
+def around(reflectance: float, contrast: float, cell: float, hue: float | None = None) -> Texture:
+    """Reflectance [1] that varies by ``contrast`` of itself from cell to cell of ``cell`` [m]; ``hue`` in turns."""
+    low, high = reflectance * (1 - contrast), min(1.0, reflectance * (1 + contrast))
+    return Texture(low=low, high=high, cell=cell, hue=hue)
 
 
 def wall_and_floor(z: float, y: float, wall: Texture, floor: Texture) -> tuple[Body, Body]:

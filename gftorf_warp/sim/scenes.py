@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from ..constants import FRAME_RATE_HZ
 from .lookalikes import SYNTHETIC
+from .lookalikes_real import RECORDED
+from .lookalikes_torf import CARRIED
 from .paths import Arc, Line, Sweep, Viewpoint
 from .scene import ColourCamera, Scene, room, still
 from .world import Body, Box, Plane, Sphere, Texture
@@ -135,5 +137,7 @@ def tour() -> Scene:
 
 
 OURS = (demo, sliding, axial, arc, tour)
-SCENES: dict[str, Scene] = {scene.name: scene for scene in (make() for make in (*OURS, *SYNTHETIC))}
+SCENES: dict[str, Scene] = {
+    scene.name: scene for scene in (make() for make in (*OURS, *SYNTHETIC, *RECORDED, *CARRIED))
+}
 """All named scenes, the one of ``gftorf demo`` first."""
