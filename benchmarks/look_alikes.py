@@ -130,12 +130,13 @@ def errors(scene: Scene, group: Group, *, rays: int = 1) -> list[float]:
     times = frame_times(scene.sensor, scene.frames, sync=False)
     wanted = [n + k for n in group.frames for k in range(FRAMES_PER_QUARTET)]
     lights = {n: light_of(scene, float(times[n]), rays=rays) for n in wanted}
-    truths, found = {}, []
+    truths = {0.0: np.stack([lights[n].distance for n in group.frames])}
+    found = []
     for column in group.columns.values():
         sensor = replace(scene.sensor, dc_offset=column.dc, unipolar=column.dc >= 1, shifts=column.shifts)
         if column.delay not in truths:
-            later = [float(times[n]) + column.delay * sensor.frame_period_s for n in group.frames]
-            truths[column.delay] = np.stack([light_of(scene, time).distance for time in later])
+            later = [light_of(scene, float(times[n]) + column.delay * sensor.frame_period_s) for n in group.frames]
+            truths[column.delay] = np.stack([light.distance for light in later])
         true = truths[column.delay]
         sequence, _ = ideal_recording(scene, lights, sensor)
         decoded = np.stack([closed_form_distance(sequence, n // FRAMES_PER_QUARTET) for n in group.frames])

@@ -6,9 +6,10 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
+from jaxtyping import Float
 
 from .paths import Vector
-from .world import Grid, Shape
+from .world import Box, Grid, Shape
 
 FACES = 8  # numbers that the faces of one part may use; a box has 6
 
@@ -115,9 +116,21 @@ class Assembly(Shape):
         )
 
     @cached_property
-    def reach(self) -> float:  # type: ignore[override]
+    def reach(self) -> float:
         """Of the part that reaches farthest [m]."""
         return max(float(np.linalg.norm(part.position)) + part.shape.reach for part in self.parts)
+
+    def clearance(self, point: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P"]:
+        """How near the nearest part may be to points in its axes [m]: exact for boxes, to their balls for others."""
+        least = np.full(len(point), np.inf)
+        for part in self.parts:
+            local = point - part.position
+            if isinstance(part.shape, Box):
+                outside = np.maximum(np.abs(local) - np.asarray(part.shape.size) / 2, 0.0)
+                least = np.minimum(least, np.linalg.norm(outside, axis=1))
+            else:
+                least = np.minimum(least, np.linalg.norm(local, axis=1) - part.shape.reach)
+        return least
 
     @staticmethod
     def _passing(origin, ray, centre, radius: float):

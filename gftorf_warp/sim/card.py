@@ -124,5 +124,6 @@ def _fingerprint(scene: Scene) -> str:
     optional = {"camera_path": Still(), "colour": None, "novel_views": ()}
     values = {f.name: getattr(scene, f.name) for f in fields(scene)}
     used = {name: value for name, value in values.items() if name not in optional or value != optional[name]}
+    used.pop("closed_form")  # follows from the others
     hues = "" if scene.colour is None else f", hues {[body.texture.hue for body in scene.bodies]}"
     return f"Scene({', '.join(f'{name}={value!r}' for name, value in used.items())}){hues}"

@@ -78,7 +78,7 @@ class Scene:
     novel_views: tuple[Path, ...] = ()
     """Where nobody looked from: poses, at time 0, of views to be rendered for looking at."""
     closed_form: float | None = None
-    """Error of the closed form on ideal quads [m^2 x 100], as benchmarks/look_alikes.py measures it; None: unknown."""
+    """Error of the closed form on ideal quads [m^2 x 100], one ray per pixel; None: not measured."""
 
     @property
     def camera_moves(self) -> bool:
