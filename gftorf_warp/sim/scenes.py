@@ -6,6 +6,7 @@ All distances in our own stay inside the unambiguous range of 7.5 m.
 from __future__ import annotations
 
 from ..constants import FRAME_RATE_HZ
+from .calibration import CALIBRATION
 from .lookalikes import SYNTHETIC
 from .lookalikes_real import RECORDED
 from .lookalikes_torf import CARRIED
@@ -142,7 +143,6 @@ def tour() -> Scene:
 
 
 OURS = (demo, sliding, axial, arc, tour)
-SCENES: dict[str, Scene] = {
-    scene.name: scene for scene in (make() for make in (*OURS, *SYNTHETIC, *RECORDED, *CARRIED))
-}
-"""All named scenes, the one of ``gftorf demo`` first; those of our own are ``OURS``."""
+LOOK_ALIKES = (*SYNTHETIC, *RECORDED, *CARRIED)
+SCENES: dict[str, Scene] = {scene.name: scene for scene in (make() for make in (*OURS, *LOOK_ALIKES, *CALIBRATION))}
+"""All named scenes, the one of ``gftorf demo`` first, then the others of our own, ``OURS``."""
