@@ -138,6 +138,7 @@ def _simulate(options: argparse.Namespace) -> int:
         noise=not options.no_noise,
         flow=options.flow,
         exposure_samples=options.exposure_samples,
+        overrides=options.override,
         format=options.format,
         fresh=options.fresh,
         progress=_progress(options)("simulate"),

@@ -110,11 +110,13 @@ def _camera_rows(scene: Scene, options: Mapping) -> dict[str, str]:
 
 def _command(scene: Scene, options: Mapping, layout: str) -> str:
     """What makes the same sequence again: a command line if there is one for it, else a call."""
-    if SCENES.get(scene.name) != scene or options["flow"] or options["exposure_samples"] > 1:
+    known = scene.name in SCENES if scene.overrides else SCENES.get(scene.name) == scene
+    if not known or options["flow"] or options["exposure_samples"] > 1:
         values = ", ".join(f"{key}={value}" for key, value in options.items())
         return f"gftorf_warp.simulate({scene.name}, ..., {values}{f', format={layout!r}' if layout != 'ftorf' else ''})"
     width, height = options["size"]
-    command = f"gftorf simulate {scene.name} --out SEQ --frames {options['frames']} --size {width}x{height}"
+    command = f"gftorf simulate {scene.name} --out SEQ{''.join(f' --override {text}' for text in scene.overrides)}"
+    command += f" --frames {options['frames']} --size {width}x{height}"
     command += f" --seed {options['seed']}" + (f" --format {layout}" if layout != "ftorf" else "")
     return command + (" --sync" if options["sync"] else "") + ("" if options["noise"] else " --no-noise")
 
@@ -124,6 +126,6 @@ def _fingerprint(scene: Scene) -> str:
     optional = {"camera_path": Still(), "colour": None, "novel_views": ()}
     values = {f.name: getattr(scene, f.name) for f in fields(scene)}
     used = {name: value for name, value in values.items() if name not in optional or value != optional[name]}
-    used.pop("closed_form")  # follows from the others
+    del used["closed_form"], used["overrides"]  # follow from the others
     hues = "" if scene.colour is None else f", hues {[body.texture.hue for body in scene.bodies]}"
     return f"Scene({', '.join(f'{name}={value!r}' for name, value in used.items())}){hues}"

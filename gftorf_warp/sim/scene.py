@@ -79,6 +79,17 @@ class Scene:
     """Where nobody looked from: poses, at time 0, of views to be rendered for looking at."""
     closed_form: float | None = None
     """Error of the closed form on ideal quads [m^2 x 100], one ray per pixel; None: not measured."""
+    overrides: tuple[str, ...] = ()
+    """How it differs from the named scene, as texts ``name=value``; for the data card only."""
+
+    def __post_init__(self):
+        if not self.bodies:
+            raise ValueError("a scene needs at least one body")
+        for name in ("frames", "width", "height", "subsamples"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        if not 0 < self.horizontal_fov_deg < 180:
+            raise ValueError(f"horizontal_fov_deg must be between 0 and 180, got {self.horizontal_fov_deg}")
 
     @property
     def camera_moves(self) -> bool:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import difflib
 import math
+from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +13,7 @@ import numpy as np
 
 from ..constants import CANONICAL_SHIFTS, FRAMES_PER_QUARTET
 from ..errors import UsageError
+from ..scene.changes import Wording, changed
 from ..scene.sensor import Sensor
 from .card import outcome_card, settings_card
 from .readout import contrast
@@ -20,6 +23,12 @@ from .splat import clearance
 
 CARD = "README.md"
 CLEARANCE = 0.5  # [m] nearer bodies fill the image, and a cover of them would need millions of splats
+OVERRIDES = Wording(
+    option="--override",
+    example="sensor.f_mod_hz=30e6",
+    where="the fields of gftorf_warp.sim.scene.Scene",
+    fixed=("name", "closed_form", "overrides"),
+)
 FORMATS = {  # what every folder of a layout holds
     "ftorf": ("cams/depth_range.npy", "tofType0"),
     "torf": ("cams/depth_range.npy", "tof"),
@@ -37,6 +46,7 @@ def simulate(
     noise: bool = True,
     flow: bool = False,
     exposure_samples: int = 1,
+    overrides: Iterable[str] = (),
     format: str = "ftorf",
     fresh: bool = False,
     progress: Progress | None = None,
@@ -59,6 +69,8 @@ def simulate(
         flow: Whether exact optical flow at quartet starts is stored beside the quads: how images move, so that of a
             camera that moves includes its own motion.
         exposure_samples: Instants that a raw frame averages over the exposure, centred on its time; 1: no motion blur.
+        overrides: Single settings of the scene, its sensor and its bodies to change, as texts like
+            ``sensor.f_mod_hz=30e6`` or ``bodies.1.path.velocity=3,0,0``.
         format: Layout on disk: 'ftorf', raw quads, or 'torf', one phasor per quartet with the time, pose and truth of
             its first raw frame.
         fresh: Whether another sequence in ``out`` is moved aside, to ``out-old-1``, instead of being an error.
@@ -71,7 +83,7 @@ def simulate(
         UsageError: If an option cannot be meant that way, the format cannot express the sensor, or ``out`` holds
             something else.
     """
-    found = _scene(scene)
+    found = overridden(_scene(scene), overrides)
     _check_options(found, frames, size, seed, exposure_samples, format)
     if flow and format == "torf":
         raise UsageError(
@@ -118,6 +130,19 @@ def _scene(scene: str | Scene) -> Scene:
             fix=f"did you mean {close[0]!r}?" if close else "take one of these, `--list` describes them",
         )
     return SCENES[scene]
+
+
+def overridden(scene: Scene, overrides: Iterable[str]) -> Scene:
+    """A scene with single settings changed; it keeps its name and says on its data card what was changed.
+
+    Raises:
+        UsageError: If a name is unknown or a value cannot be meant.
+    """
+    texts = tuple(overrides)
+    if not texts:
+        return scene
+    other = changed(scene, texts, OVERRIDES)
+    return replace(other, closed_form=None, overrides=(*scene.overrides, *texts))
 
 
 def _check_options(scene: Scene, frames, size, seed: int, exposure_samples: int, layout: str) -> None:
