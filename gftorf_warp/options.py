@@ -83,7 +83,9 @@ def command_parsers() -> dict[str, Parser]:
     _fresh_option(demo)
 
     simulate = _command("simulate", "write a sequence of asynchronous quads with its true distance")
-    simulate.add_argument("scene", metavar="SCENE", nargs="?", help="name of a scene; --list shows them")
+    simulate.add_argument(
+        "scene", metavar="SCENE", nargs="?", help="name of a scene, --list shows them, or a .toml file of one"
+    )
     simulate.add_argument("--list", action="store_true", help="list the scenes and stop")
     simulate.add_argument("--out", metavar="SEQ", help="folder to write")
     simulate.add_argument("--frames", metavar="N", type=_positive, help="raw frames (the scene's own number)")

@@ -6,8 +6,9 @@ import pytest
 from gftorf_warp.data.sequence import Sequence
 from gftorf_warp.errors import UsageError
 from gftorf_warp.scene.changes import changed, names
+from gftorf_warp.sim.scene import OVERRIDES, overridden
 from gftorf_warp.sim.scenes import SCENES
-from gftorf_warp.sim.simulate import OVERRIDES, overridden, simulate
+from gftorf_warp.sim.simulate import simulate
 
 SMALL = {"frames": 4, "size": (24, 18)}
 

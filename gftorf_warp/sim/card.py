@@ -11,6 +11,7 @@ from .. import __version__
 from .paths import Still
 from .readout import contrast, electron_gain
 from .record import Recording
+from .scene import overridden
 from .scenes import SCENES, Scene
 
 
@@ -110,8 +111,13 @@ def _camera_rows(scene: Scene, options: Mapping) -> dict[str, str]:
 
 def _command(scene: Scene, options: Mapping, layout: str) -> str:
     """What makes the same sequence again: a command line if there is one for it, else a call."""
-    known = scene.name in SCENES if scene.overrides else SCENES.get(scene.name) == scene
-    if not known or options["flow"] or options["exposure_samples"] > 1:
+    named = SCENES.get(scene.name)
+    if (
+        named is None
+        or overridden(named, scene.overrides) != scene
+        or options["flow"]
+        or options["exposure_samples"] > 1
+    ):
         values = ", ".join(f"{key}={value}" for key, value in options.items())
         return f"gftorf_warp.simulate({scene.name}, ..., {values}{f', format={layout!r}' if layout != 'ftorf' else ''})"
     width, height = options["size"]

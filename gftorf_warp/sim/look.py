@@ -62,13 +62,17 @@ class Splatted:
 
 
 def look(splatted: Splatted, time: float, sensor: Sensor, subsamples: int) -> tuple[Float[np.ndarray, "H W"], ...]:
-    """Mean quad of the sensor's first shift, mean amplitude and mean distance over opacity [m] of every pixel."""
+    """Mean quad of the sensor's first shift, mean amplitude and mean distance over opacity [m] of every pixel.
+
+    The distance is NaN where a pixel meets nothing.
+    """
     with torch.no_grad():
         rendering = rasterize(splatted.at(time), splatted.camera_at(time), sensor)
+    opacity = _pooled(rendering.opacity, subsamples)
     return (
         _pooled(rendering.quads[0], subsamples),
         _pooled(rendering.phasor[2], subsamples) / 2,  # the third channel of a phasor is 2a
-        _pooled(rendering.distance, subsamples) / _pooled(rendering.opacity, subsamples),
+        _pooled(rendering.distance, subsamples) / np.where(opacity > 0, opacity, np.nan),
     )
 
 

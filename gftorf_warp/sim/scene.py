@@ -5,15 +5,25 @@ Axes: x right, y down, z forward; a camera that does not move is at the origin.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float
 
 from ..scene.camera import Camera
+from ..scene.changes import Wording, changed
 from ..scene.sensor import Sensor
 from .paths import Path, Still, Vector, Viewpoint, inverse, rigid, rotation_matrix
 from .world import Body, Box, Shape, Texture
+
+
+OVERRIDES = Wording(
+    option="--override",
+    example="sensor.f_mod_hz=30e6",
+    where="the fields of gftorf_warp.sim.scene.Scene",
+    fixed=("name", "closed_form", "overrides"),
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,6 +127,19 @@ class Scene:
             self.colour.horizontal_fov_deg,
             camera_from_world=pose,
         )
+
+
+def overridden(scene: Scene, overrides: Iterable[str]) -> Scene:
+    """A scene with single settings changed; it keeps its name and says on its data card what was changed.
+
+    Raises:
+        UsageError: If a name is unknown or a value cannot be meant.
+    """
+    texts = tuple(overrides)
+    if not texts:
+        return scene
+    other = changed(scene, texts, OVERRIDES)
+    return replace(other, closed_form=None, overrides=(*scene.overrides, *texts))
 
 
 def room(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import difflib
 import math
 from collections.abc import Iterable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,22 +12,17 @@ import numpy as np
 
 from ..constants import CANONICAL_SHIFTS, FRAMES_PER_QUARTET
 from ..errors import UsageError
-from ..scene.changes import Wording, changed
 from ..scene.sensor import Sensor
 from .card import outcome_card, settings_card
 from .readout import contrast
 from .record import Progress, frame_times, record
+from .scene import overridden
+from .scene_file import read_scene
 from .scenes import SCENES, Scene
 from .splat import clearance
 
 CARD = "README.md"
 CLEARANCE = 0.5  # [m] nearer bodies fill the image, and a cover of them would need millions of splats
-OVERRIDES = Wording(
-    option="--override",
-    example="sensor.f_mod_hz=30e6",
-    where="the fields of gftorf_warp.sim.scene.Scene",
-    fixed=("name", "closed_form", "overrides"),
-)
 FORMATS = {  # what every folder of a layout holds
     "ftorf": ("cams/depth_range.npy", "tofType0"),
     "torf": ("cams/depth_range.npy", "tof"),
@@ -59,7 +53,7 @@ def simulate(
     it is already there and was made with the same settings, it is left as it is.
 
     Args:
-        scene: Name of a scene, see ``SCENES``, or a scene.
+        scene: Name of a scene, see ``SCENES``, a TOML file of one, or a scene.
         out: Folder to write.
         frames: Number of raw frames; None is the scene's own. A last quartet may be incomplete.
         size: (width, height) of the image [px]; None is the scene's own.
@@ -82,6 +76,7 @@ def simulate(
     Raises:
         UsageError: If an option cannot be meant that way, the format cannot express the sensor, or ``out`` holds
             something else.
+        InputError: If a TOML file does not describe a scene.
     """
     found = overridden(_scene(scene), overrides)
     _check_options(found, frames, size, seed, exposure_samples, format)
@@ -121,28 +116,19 @@ def simulate(
 def _scene(scene: str | Scene) -> Scene:
     if isinstance(scene, Scene):
         return scene
+    if scene.endswith(".toml"):
+        return read_scene(scene)
     if scene not in SCENES:
         close = difflib.get_close_matches(scene, SCENES, n=1, cutoff=0.5)
         raise UsageError(
             f"there is no scene named {scene!r}",
             where="SCENE",
             why=f"the named scenes are {', '.join(SCENES)}",
-            fix=f"did you mean {close[0]!r}?" if close else "take one of these, `--list` describes them",
+            fix=f"did you mean {close[0]!r}?"
+            if close
+            else "take one of these, `--list` describes them, or a file that ends in .toml",
         )
     return SCENES[scene]
-
-
-def overridden(scene: Scene, overrides: Iterable[str]) -> Scene:
-    """A scene with single settings changed; it keeps its name and says on its data card what was changed.
-
-    Raises:
-        UsageError: If a name is unknown or a value cannot be meant.
-    """
-    texts = tuple(overrides)
-    if not texts:
-        return scene
-    other = changed(scene, texts, OVERRIDES)
-    return replace(other, closed_form=None, overrides=(*scene.overrides, *texts))
 
 
 def _check_options(scene: Scene, frames, size, seed: int, exposure_samples: int, layout: str) -> None:

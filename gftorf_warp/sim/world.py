@@ -259,6 +259,10 @@ class Body:
     path: Path
     """Its motion."""
 
+    def __post_init__(self):
+        if self.moves and not np.isfinite(self.shape.reach):
+            raise ValueError(f"{self.shape} has no end, so it cannot move: let its path be still")
+
     @property
     def moves(self) -> bool:
         """Whether the path is anything but :class:`Still`."""
