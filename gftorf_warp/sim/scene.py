@@ -17,7 +17,6 @@ from ..scene.sensor import Sensor
 from .paths import Path, Still, Vector, Viewpoint, inverse, rigid, rotation_matrix
 from .world import Body, Box, Shape, Texture
 
-
 OVERRIDES = Wording(
     option="--override",
     example="sensor.f_mod_hz=30e6",
