@@ -10,6 +10,8 @@ from gftorf_warp.scene.sensor import Sensor
 from gftorf_warp.sim.assembly import Assembly, Level, Part
 from gftorf_warp.sim.lookalikes import chair
 from gftorf_warp.sim.paths import Line, Still
+from gftorf_warp.sim.record import still_interior
+from gftorf_warp.sim.scene import Scene
 from gftorf_warp.sim.splat import clearance, cover_moving
 from gftorf_warp.sim.world import Body, Box, Plane, Sphere, Texture, first_hit
 
@@ -104,6 +106,24 @@ def test_a_cover_of_an_assembly_is_as_large_as_it_is():
     assert opacity[inner].min() > 0.9
     touched = (area > 0) & (area < 1)
     assert abs(opacity.sum() - area.sum()) < 0.4 * touched.sum()  # of a ray, as for single shapes
+
+
+def test_interior_pixels_know_the_parts_of_an_assembly():
+    """The front of the second part of one body and that of the next body have numbers of their own: no interior."""
+    parts = tuple(Part(shape=Box(size=(0.4, 3.0, 0.4)), position=(x, 0.0, 0.0)) for x in (-0.4, 0.0))
+    posts = (
+        posed(Assembly(parts=parts), (0.0, 0.0, 2.0), (0, 0, 0)),
+        posed(Box(size=(0.4, 3.0, 0.4)), (0.4, 0, 2.0), (0, 0, 0)),
+    )
+    scene = Scene(name="posts", description="", motion="", bodies=posts, frames=1, width=64, height=48)
+    hit = first_hit(posts, CAMERA, 0.0)
+    inside = still_interior(scene, [hit])
+    steps = np.flatnonzero(np.diff(hit.body[24] * 100 + hit.face[24]))
+    front = steps[(hit.face[24][steps] % 8 == 4) & (hit.face[24][steps + 1] % 8 == 4)]
+    assert len(front) == 2
+    for column in front:
+        assert not inside[:, column - 1 : column + 3].any()
+    assert inside.sum() > 100
 
 
 def test_what_cannot_be_is_refused():

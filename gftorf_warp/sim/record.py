@@ -142,7 +142,7 @@ def still_interior(scene: Scene, hits: list[Hits]) -> Bool[np.ndarray, "H W"]:
     inside[:2] = inside[-2:] = inside[:, :2] = inside[:, -2:] = False
     for hit in hits:
         inside &= ~moves[hit.body] & (hit.body >= 0)
-        surface = hit.body * 8 + hit.face  # a shape has fewer than 8 faces
+        surface = hit.body * (hit.face.max() + 1) + hit.face
         for dy in range(-2, 3):
             for dx in range(-2, 3):
                 inside &= np.roll(surface, (dy, dx), (0, 1)) == surface  # what wraps around the image is masked above
