@@ -135,6 +135,8 @@ def _simulate(options: argparse.Namespace) -> int:
         flow=options.flow,
         exposure_samples=options.exposure_samples,
         engine=options.engine,
+        bounces=options.bounces,
+        paths=options.paths,
         device=device,
         format=options.format,
         fresh=options.fresh,

@@ -105,6 +105,23 @@ def test_frames_do_not_depend_on_their_number_and_noise_belongs_to_the_seed():
     assert np.corrcoef((first - clean[0]).ravel(), (other - clean[0]).ravel())[0, 1] < 0.05
 
 
+def test_bounces_add_light_that_belongs_to_the_seed_and_the_frame():
+    """More light than direct light, with a grain of its own in every raw frame and for every seed, whatever F is."""
+    scene = slider(sensor=Sensor(dc_offset=1.0))
+    direct = record(scene, frames=3, engine="mesh").sequence.quads
+    settings = {"engine": "mesh", "bounces": 2, "paths": 16}
+    first, longer, other = (
+        record(scene, frames=n, seed=s, **settings).sequence.quads for n, s in [(3, 1), (5, 1), (3, 2)]
+    )
+    np.testing.assert_array_equal(first, longer[:3])
+    assert (first >= direct - 1e-6).all()  # with this offset every path adds at least nothing
+    assert 1.05 < first.mean() / direct.mean() < 3
+    assert (first != other).mean() > 0.9
+    assert first.mean() == pytest.approx(other.mean(), rel=0.02)
+    grain = first - other
+    assert abs(np.corrcoef(grain[0].ravel(), grain[1].ravel())[0, 1]) < 0.1
+
+
 # -- against gaussian --------------------------------------------------------------------------------------------------
 
 
@@ -178,6 +195,18 @@ def test_the_card_names_the_engine_and_how_to_make_it_again(tmp_path):
     assert "--engine" not in card
 
 
+def test_bounces_are_on_the_card(tmp_path):
+    """With the command that makes them again, and the beam."""
+    options = ["--frames", "4", "--size", "24x18", "--engine", "mesh", "--bounces", "2", "--paths", "4", "-q"]
+    assert cli.main(["simulate", "demo", "--out", str(tmp_path / "a"), *options]) == 0
+    card = (tmp_path / "a" / "README.md").read_text()
+    assert "direct light and up to 2 bounces, from 4 paths per pixel" in card
+    assert "--engine mesh --bounces 2 --paths 4" in card
+    scene = slider(beam_deg=(70.0, 50.0))
+    card = (simulate(scene, tmp_path / "b", frames=4, engine="mesh") / "README.md").read_text()
+    assert "it shines on 70 x 50 deg; direct light only" in card
+
+
 def test_light_beside_the_camera_is_on_the_card_and_needs_mesh(tmp_path):
     """An emitter off the lens is recorded by mesh, said on the card, and refused by gaussian however it is called."""
     scene = slider(emitter=(0.04, 0.0, 0.0))
@@ -186,8 +215,9 @@ def test_light_beside_the_camera_is_on_the_card_and_needs_mesh(tmp_path):
     assert "emitter" not in (simulate(slider(), tmp_path / "c", frames=4) / "README.md").read_text()
     with pytest.raises(UsageError, match="light is beside the camera"):
         simulate(scene, tmp_path / "g", frames=4)
-    with pytest.raises(ValueError, match="needs engine 'mesh'"):
-        record(scene, frames=4)
+    for more in ({"emitter": (0.04, 0.0, 0.0)}, {"beam_deg": (60.0, 40.0)}):
+        with pytest.raises(ValueError, match="need engine 'mesh'"):
+            record(slider(**more), frames=4)
     together, beside = (record(s, frames=1, noise=False, engine="mesh").sequence.quads for s in (slider(), scene))
     assert np.abs(together - beside).max() > 1e-3
     assert not (tmp_path / "g").exists()
@@ -199,6 +229,11 @@ def test_engines_and_devices_that_do_not_exist(tmp_path, capsys):
     assert "gaussian, mesh" in capsys.readouterr().err
     with pytest.raises(UsageError, match="--engine mesh"):
         simulate("demo", tmp_path / "x", device="elsewhere")
+    with pytest.raises(UsageError, match="bounces"):
+        simulate("demo", tmp_path / "x", bounces=1)
+    for wrong in ({"bounces": -1}, {"paths": 0}):
+        with pytest.raises(UsageError, match="cannot simulate with"):
+            simulate("demo", tmp_path / "x", engine="mesh", **wrong)
     with pytest.raises(ValueError, match="'rays' must be one of gaussian, mesh"):
         record(SCENES["demo"], engine="rays")
     assert not (tmp_path / "x").exists()

@@ -41,7 +41,7 @@ def scene_of(*bodies, subsamples=1, **more):
 
 
 def light(*bodies, camera=CAMERA, device="cpu", f_mod_hz=F_MOD_HZ, times=(0.0,), harmonics=(1,), **more):
-    """Light of bodies at one camera."""
+    """Direct light of bodies at one camera."""
     traced = Traced(scene_of(*bodies, **more), lambda _: camera, device=device, harmonics=harmonics)
     return traced.light(times, f_mod_hz)
 

@@ -1,4 +1,4 @@
-"""Tracing: rigid bodies as triangle meshes and balls, and the light that a C-ToF camera gets from them directly.
+"""Tracing: rigid bodies as triangle meshes and balls, and the light that a C-ToF camera gets from them.
 
 The second way from a scene to an image: no Gaussian, no sorting, no compositing, and no gradient. Each body has one
 mesh that is built once; poses move the rays. NumPy in, NumPy out, on the CPU or on CUDA from the same kernels.
@@ -6,6 +6,7 @@ mesh that is built once; poses move the rays. NumPy in, NumPy out, on the CPU or
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -59,6 +60,34 @@ class RigidBody:
     def reach(self) -> float:
         """Distance of the farthest point from the origin of the axes [m]."""
         return self.radius if self.points is None else float(np.linalg.norm(self.points, axis=1).max())
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lamp:
+    """A point that shines evenly into a pyramid about the z axis of the camera."""
+
+    position: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Place in camera axes [m]; away from the camera, bodies cast shadows that it sees."""
+    beam_deg: tuple[float, float] | None = None
+    """Full angles across and down that are lit, below 180 [deg]; None: all directions."""
+
+    def __post_init__(self):
+        if self.beam_deg is not None and not all(0 < angle < 180 for angle in self.beam_deg):
+            raise ValueError(f"beam_deg must be between 0 and 180, got {self.beam_deg}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bounces:
+    """Light that met more than one surface, by random paths."""
+
+    count: int = 0
+    """Surfaces after the first one that a path may meet; 0: direct light only."""
+    paths: int = 64
+    """Paths per pixel, rounded up to a multiple of the instants."""
+
+    def __post_init__(self):
+        if self.count < 0 or self.paths < 1:
+            raise ValueError(f"count {self.count} must not be negative, and paths {self.paths} at least 1")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -127,16 +156,20 @@ class Tracer:
         f_mod_hz: float,
         *,
         subsamples: int = 1,
-        emitter: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        lamp: Lamp = Lamp(),
+        bounces: Bounces = Bounces(),
+        seed: int = 0,
     ) -> Light:
-        """Direct light, averaged over ``subsamples`` x ``subsamples`` rays per pixel and over T instants.
+        """Light averaged over T instants: direct light over a grid of rays per pixel, the rest over random paths.
 
         Args:
             cameras: The camera at each instant; only its pose may change.
             world_from_body: Pose of each body at each instant [m].
             f_mod_hz: Modulation frequency [Hz].
-            subsamples: Rays per pixel and axis, on a regular grid.
-            emitter: Where the light is, in camera axes [m]. Away from the camera, bodies cast shadows.
+            subsamples: Rays per pixel and axis, on a regular grid: the same for every image.
+            lamp: Where the light is and where it shines.
+            bounces: How much of the light that met more than one surface is added.
+            seed: Of the random paths, 0 to 2^31 - 1; direct light has none.
 
         Raises:
             ValueError: If there is no instant, or sizes do not fit.
@@ -145,8 +178,11 @@ class Tracer:
             raise ValueError(f"subsamples {subsamples} must be at least 1 and f_mod_hz {f_mod_hz} above 0")
         view = self._view(cameras[0])
         poses = self._place(cameras, world_from_body)
-        inputs = [view, wp.vec3(*emitter), f_mod_hz / SPEED_OF_LIGHT, self._harmonics, self._solids, *poses, subsamples]
-        self._over_rows(trace.trace_light, inputs, self._light)
+        inputs = [view, _emitter(lamp, f_mod_hz), self._harmonics, self._solids, *poses]
+        self._over_rows(trace.trace_light, [*inputs, subsamples], self._light)
+        if bounces.count:
+            paths = -(-bounces.paths // len(cameras)) * len(cameras)
+            self._over_rows(trace.trace_bounces, [*inputs, bounces.count, paths, seed], self._light)
         light, amplitude = (array.numpy() for array in self._light)
         return Light(light=light[..., 0] + 1j * light[..., 1], amplitude=amplitude.copy())
 
@@ -209,6 +245,15 @@ def _mesh(body: RigidBody, device: wp.Device) -> wp.Mesh | None:
     points = wp.array(np.ascontiguousarray(body.points, dtype=np.float32), dtype=wp.vec3, device=device)
     indices = wp.array(np.ascontiguousarray(body.triangles, dtype=np.int32).ravel(), dtype=wp.int32, device=device)
     return wp.Mesh(points=points, indices=indices)
+
+
+def _emitter(lamp: Lamp, f_mod_hz: float) -> trace.Emitter:
+    emitter = trace.Emitter()
+    emitter.place = wp.vec3(*lamp.position)
+    across, down = lamp.beam_deg or (0.0, 0.0)
+    emitter.spread = wp.vec2(math.tan(math.radians(across) / 2), math.tan(math.radians(down) / 2))
+    emitter.cycles = f_mod_hz / SPEED_OF_LIGHT
+    return emitter
 
 
 def _solids(bodies: Sequence[RigidBody], meshes: Sequence[wp.Mesh | None], device: wp.Device) -> wp.array:

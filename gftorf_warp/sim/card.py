@@ -57,7 +57,7 @@ def settings_card(scene: Scene, options: Mapping, layout: str = "ftorf") -> str:
 
 {scene.description[:1].upper() + scene.description[1:]}. Motion: {scene.motion}.
 {options["frames"]} raw frames of {width}x{height} pixels, {scene.horizontal_fov_deg:g} deg wide. \
-{_light(scene)}; direct light only.
+{_light(scene, options)}.
 
     {_command(scene, options, layout)}
 
@@ -87,10 +87,16 @@ Saturated: {100 * recording.saturated:.3g} % of all pixels and raw frames.
 """
 
 
-def _light(scene: Scene) -> str:
-    if not any(scene.emitter):
-        return "Light and camera coincide"
-    return f"The light is at ({', '.join(f'{1e3 * x:g}' for x in scene.emitter)}) mm in camera axes and casts shadows"
+def _light(scene: Scene, options: Mapping) -> str:
+    lamp = "Light and camera coincide"
+    if any(scene.emitter):
+        place = ", ".join(f"{1e3 * x:g}" for x in scene.emitter)
+        lamp = f"The light is at ({place}) mm in camera axes and casts shadows"
+    if scene.beam_deg is not None:
+        lamp += f"; it shines on {scene.beam_deg[0]:g} x {scene.beam_deg[1]:g} deg"
+    if not options["bounces"]:
+        return f"{lamp}; direct light only"
+    return f"{lamp}; direct light and up to {options['bounces']} bounces, from {options['paths']} paths per pixel"
 
 
 def _engine(scene: Scene, options: Mapping) -> str:
@@ -129,13 +135,14 @@ def _command(scene: Scene, options: Mapping, layout: str) -> str:
     width, height = options["size"]
     command = f"gftorf simulate {scene.name} --out SEQ --frames {options['frames']} --size {width}x{height}"
     command += f" --engine {options['engine']}" if options["engine"] != "gaussian" else ""
+    command += f" --bounces {options['bounces']} --paths {options['paths']}" if options["bounces"] else ""
     command += f" --seed {options['seed']}" + (f" --format {layout}" if layout != "ftorf" else "")
     return command + (" --sync" if options["sync"] else "") + ("" if options["noise"] else " --no-noise")
 
 
 def _fingerprint(scene: Scene) -> str:
     """Every setting of a scene as text; without the optional ones that it does not use, as if they did not exist."""
-    optional = {"camera_path": Still(), "emitter": (0.0, 0.0, 0.0), "colour": None, "novel_views": ()}
+    optional = {"camera_path": Still(), "emitter": (0.0, 0.0, 0.0), "beam_deg": None, "colour": None, "novel_views": ()}
     values = {f.name: getattr(scene, f.name) for f in fields(scene)}
     used = {name: value for name, value in values.items() if name not in optional or value != optional[name]}
     hues = "" if scene.colour is None else f", hues {[body.texture.hue for body in scene.bodies]}"

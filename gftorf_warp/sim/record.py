@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float
 
 from ..constants import FRAMES_PER_QUARTET
 from ..data.sequence import Sequence, Truth
+from ..render.trace import Bounces
 from ..scene.camera import Camera
 from ..scene.sensor import Sensor
 from .look import Splatted, look, look_colour
@@ -26,6 +27,8 @@ Taken = tuple[Float[np.ndarray, "H W"], ...]  # mean quad, mean amplitude, dista
 
 ENGINES = ("gaussian", "mesh")
 """Ways from a scene to an image: splats that cover it, or rays through its surfaces."""
+
+PATHS = 7  # tells the random numbers of paths from those of the read-out and of the colour camera
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,6 +80,8 @@ def record(
     flow: bool = False,
     exposure_samples: int = 1,
     engine: str = "gaussian",
+    bounces: int = 0,
+    paths: int = 64,
     device: str = "cpu",
     progress: Progress | None = None,
 ) -> Recording:
@@ -84,7 +89,7 @@ def record(
 
     Raises:
         ValueError: If the sensor's contrast and DC offset contradict each other, see sim/readout.py; if there is no
-            such engine, or it cannot have the light beside the camera.
+            such engine, or it cannot make the light that is asked for.
     """
     frames = scene.frames if frames is None else frames
     sensor = replace(scene.sensor, noise=noise and scene.sensor.noise)
@@ -93,7 +98,7 @@ def record(
     camera = cameras[0]
     distances, interior = _truth(scene, cameras, times)
     longest = frame_times(sensor, max(frames, scene.frames), sync=False)  # for fewer frames the same covers and images
-    take = _engine(engine, scene, size, longest, device)
+    take = _engine(engine, scene, size, longest, Bounces(count=bounces, paths=paths), device, seed)
     shifts = np.array([sensor.shifts[n % len(sensor.shifts)] for n in range(frames)])
 
     quads = np.zeros((frames, camera.height, camera.width), dtype=np.float32)
@@ -101,7 +106,7 @@ def record(
     for n in range(frames):
         offsets = ((np.arange(exposure_samples) + 0.5) / exposure_samples - 0.5) * sensor.exposure_s
         shot = sensor.with_shifts((float(shifts[n]),))
-        quad, amplitude, distance = take(float(times[n]), [float(times[n] + offset) for offset in offsets], shot)
+        quad, amplitude, distance = take(n, [float(times[n] + offset) for offset in offsets], float(times[n]), shot)
         reading = read_out(quad, amplitude, sensor, np.random.default_rng((seed, n)))  # frame n: whatever F is
         quads[n] = reading.quad
         full += int(reading.saturated.sum())
@@ -141,23 +146,37 @@ def record(
 
 
 def _engine(
-    engine: str, scene: Scene, size: tuple[int, int] | None, longest: Float[np.ndarray, "F"], device: str
-) -> Callable[[float, list[float], Sensor], Taken]:
-    """What takes an image: a function of the time of a raw frame, the instants it averages, and the sensor."""
+    engine: str, scene: Scene, size, longest: Float[np.ndarray, "F"], bounces: Bounces, device: str, seed: int
+) -> Callable[[int, list[float], float, Sensor], Taken]:
+    """What takes an image: a function of a raw frame's number, the instants it averages, its time, and the sensor."""
     if engine not in ENGINES:
         raise ValueError(f"engine {engine!r} must be one of {', '.join(ENGINES)}")
     if engine == "mesh":
-        traced = Traced(scene, lambda time: scene.camera(size, time), device=device)
-        return lambda time, instants, sensor: (*traced.quad(instants, sensor), traced.first_hits(time).distance)
-    if any(scene.emitter):
-        raise ValueError(f"emitter {scene.emitter} beside the camera needs engine 'mesh', not {engine!r}")
+        traced = Traced(scene, lambda time: scene.camera(size, time), bounces=bounces, device=device)
+
+        def trace(n: int, instants: list[float], time: float, sensor: Sensor) -> Taken:
+            random = int(np.random.default_rng((seed, n, PATHS)).integers(2**31))  # frame n: whatever F is
+            return *traced.quad(instants, sensor, random), traced.first_hits(time).distance
+
+        return trace
+    if needs_mesh(scene, bounces.count):
+        raise ValueError(
+            f"emitter {scene.emitter}, beam_deg {scene.beam_deg} and {bounces.count} bounces need engine 'mesh': "
+            f"{engine!r} has direct light at the camera only"
+        )
     splatted = Splatted(scene, lambda time: _fine(scene.camera(size, time), scene), longest)
 
-    def take(_: float, instants: list[float], sensor: Sensor) -> Taken:
+    def render(n: int, instants: list[float], time: float, sensor: Sensor) -> Taken:
+        del n, time
         looks = [look(splatted, instant, sensor, scene.subsamples) for instant in instants]
         return tuple(np.mean(image, axis=0) for image in zip(*looks, strict=True))
 
-    return take
+    return render
+
+
+def needs_mesh(scene: Scene, bounces: int) -> bool:
+    """Whether the light is not the direct light of a lamp at the camera that shines everywhere."""
+    return any(scene.emitter) or scene.beam_deg is not None or bounces > 0
 
 
 def render_truth_gap(scene: Scene, *, frames: int = 1, size: tuple[int, int] | None = None) -> Gap | None:

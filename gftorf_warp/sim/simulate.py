@@ -14,7 +14,7 @@ from ..errors import UsageError
 from ..scene.sensor import Sensor
 from .card import outcome_card, settings_card
 from .readout import contrast
-from .record import ENGINES, Progress, frame_times, record
+from .record import ENGINES, Progress, frame_times, needs_mesh, record
 from .scenes import SCENES, Scene
 from .splat import clearance
 
@@ -38,6 +38,8 @@ def simulate(
     flow: bool = False,
     exposure_samples: int = 1,
     engine: str = "gaussian",
+    bounces: int = 0,
+    paths: int = 64,
     device: str = "cpu",
     format: str = "ftorf",
     fresh: bool = False,
@@ -62,7 +64,9 @@ def simulate(
             camera that moves includes its own motion.
         exposure_samples: Instants that a raw frame averages over the exposure, centred on its time; 1: no motion blur.
         engine: 'gaussian': splats cover the scene and are rendered. 'mesh': rays meet its surfaces; shares nothing with
-            the renderer that `reconstruct` uses, and can have the light beside the camera.
+            the renderer that `reconstruct` uses, and can have the light beside the camera, a beam, and bounces.
+        bounces: Surfaces that light may meet after the first one; 0: direct light only. More of them need 'mesh'.
+        paths: Random paths per pixel and raw frame for the light that bounces.
         device: Where engine 'mesh' traces; the other one renders on the CPU.
         format: Layout on disk: 'ftorf', raw quads, or 'torf', one phasor per quartet with the time, pose and truth of
             its first raw frame.
@@ -77,7 +81,8 @@ def simulate(
             something else.
     """
     found = _scene(scene)
-    _check_options(found, frames, size, seed, exposure_samples, engine, device, format)
+    _check_options(found, frames, size, seed, exposure_samples, format)
+    _check_engine(found, engine, bounces, paths, device)
     if flow and format == "torf":
         raise UsageError(
             "a ToeRF folder has no place for optical flow",
@@ -96,6 +101,8 @@ def simulate(
         "flow": flow,
         "exposure_samples": exposure_samples,
         "engine": engine,
+        "bounces": bounces,
+        "paths": paths,
     }
     card = settings_card(found, options, format)
     out = Path(out).absolute() if fresh else Path(out)
@@ -126,9 +133,7 @@ def _scene(scene: str | Scene) -> Scene:
     return SCENES[scene]
 
 
-def _check_options(
-    scene: Scene, frames, size, seed: int, exposure_samples: int, engine: str, device: str, layout: str
-) -> None:
+def _check_options(scene: Scene, frames, size, seed: int, exposure_samples: int, layout: str) -> None:
     least = FRAMES_PER_QUARTET if layout == "torf" else 1  # a phasor needs a whole quartet
     wanted = {
         "--frames": (frames is None or frames >= least, f"{frames}", f"at least {least}, for example {scene.frames}"),
@@ -139,14 +144,26 @@ def _check_options(
         ),
         "--seed": (seed >= 0, f"{seed}", "0 or more"),
         "exposure_samples": (exposure_samples >= 1, f"{exposure_samples}", "at least 1"),
-        "--engine": (
-            engine == "mesh" or (engine == "gaussian" and not any(scene.emitter)),
-            repr(engine),
-            "'mesh', since the light is beside the camera" if any(scene.emitter) else f"one of {', '.join(ENGINES)}",
-        ),
-        "--device": (engine == "mesh" or device == "cpu", f"{device} and engine {engine!r}", "cpu, or --engine mesh"),
         "--format": (layout in FORMATS, repr(layout), f"one of {', '.join(FORMATS)}"),
     }
+    _refuse(wanted)
+
+
+def _check_engine(scene: Scene, engine: str, bounces: int, paths: int, device: str) -> None:
+    wanted = {
+        "--engine": (engine in ENGINES, repr(engine), f"one of {', '.join(ENGINES)}"),
+        "--bounces": (bounces >= 0, f"{bounces}", "0 or more"),
+        "--paths": (paths >= 1, f"{paths}", "at least 1"),
+    }
+    _refuse(wanted)
+    if engine != "mesh":
+        light = "mesh: the light is beside the camera, has a beam or bounces"
+        _refuse({"--engine": (not needs_mesh(scene, bounces), repr(engine), light)})
+        _refuse({"--device": (device == "cpu", f"{device} and engine {engine!r}", "cpu, or --engine mesh")})
+
+
+def _refuse(wanted: dict[str, tuple[bool, str, str]]) -> None:
+    """Raise what is wrong with the first option of {option: (whether it is good, what it is, what is wanted)}."""
     for where, (good, got, want) in wanted.items():
         if not good:
             raise UsageError(f"cannot simulate with {got}", where=where, why=f"expected {want}", fix="change it")

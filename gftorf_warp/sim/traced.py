@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..render.trace import FirstHits, Light, RigidBody, Tracer
+from ..render.trace import Bounces, FirstHits, Lamp, Light, RigidBody, Tracer
 from ..scene.camera import Camera
 from ..scene.sensor import Sensor
 from .look import pooled
@@ -19,9 +19,10 @@ class Traced:
     """A scene as meshes for one camera.
 
     Args:
-        scene: Bodies and their paths, rays per pixel, place of the emitter.
+        scene: Bodies and their paths, rays per pixel, place and beam of the emitter.
         camera_at: The camera at a time [s].
         harmonics: Multiples of the modulation frequency at which light is wanted.
+        bounces: Light that met more than one surface.
         device: Name of the device that traces.
     """
 
@@ -31,29 +32,33 @@ class Traced:
         camera_at: Callable[[float], Camera],
         *,
         harmonics: tuple[int, ...] = (1,),
+        bounces: Bounces = Bounces(),
         device: str = "cpu",
     ):
-        self.scene, self.camera_at = scene, camera_at
+        self.scene, self.camera_at, self.bounces = scene, camera_at, bounces
+        self._lamp = Lamp(position=scene.emitter, beam_deg=scene.beam_deg)
         camera, bodies = camera_at(0.0), [rigid_body(body) for body in scene.bodies]
         self._tracer = Tracer(bodies, camera.width, camera.height, harmonics=harmonics, device=device)
 
-    def light(self, times: Sequence[float], f_mod_hz: float) -> Light:
-        """Mean light over instants [s] of an exposure, for a source intensity of 1."""
+    def light(self, times: Sequence[float], f_mod_hz: float, seed: int = 0) -> Light:
+        """Mean light over instants [s] of an exposure, for a source intensity of 1; ``seed`` is of the bounces."""
         return self._tracer.light(
             [self.camera_at(time) for time in times],
             np.stack([self._poses(time) for time in times]),
             f_mod_hz,
             subsamples=self.scene.subsamples,
-            emitter=self.scene.emitter,
+            lamp=self._lamp,
+            bounces=self.bounces,
+            seed=seed,
         )
 
     def first_hits(self, time: float) -> FirstHits:
         """Distance, z-depth, normal and body on the centre ray of every pixel at ``time`` [s]."""
         return self._tracer.first_hits(self.camera_at(time), self._poses(time))
 
-    def quad(self, times: Sequence[float], sensor: Sensor) -> tuple[Float[np.ndarray, "H W"], ...]:
+    def quad(self, times: Sequence[float], sensor: Sensor, seed: int = 0) -> tuple[Float[np.ndarray, "H W"], ...]:
         """Mean quad of the sensor's first shift, and mean amplitude, of every pixel over instants [s]."""
-        mean = self.light(times, float(sensor.f_mod_hz))
+        mean = self.light(times, float(sensor.f_mod_hz), seed)
         amplitude = float(sensor.source_intensity) * mean.amplitude.astype(np.float64)
         turned = mean.light[0] * np.exp(1j * (float(sensor.phase_offset) - sensor.shifts[0]))
         return float(sensor.source_intensity) * turned.real + float(sensor.dc_offset) * amplitude, amplitude
