@@ -123,7 +123,7 @@ def _simulate(options: argparse.Namespace) -> int:
         raise UsageError(f"{missing} is missing", where="gftorf simulate", why="both are needed", fix=fix)
     from .sim.simulate import simulate
 
-    start(options)
+    device = start(options)
     path = simulate(
         options.scene,
         options.out,
@@ -134,6 +134,10 @@ def _simulate(options: argparse.Namespace) -> int:
         noise=not options.no_noise,
         flow=options.flow,
         exposure_samples=options.exposure_samples,
+        engine=options.engine,
+        bounces=options.bounces,
+        paths=options.paths,
+        device=device,
         format=options.format,
         fresh=options.fresh,
         progress=_progress(options)("simulate"),

@@ -75,6 +75,10 @@ class Scene:
     """The sensor; raw frame n has the shift ``sensor.shifts[n % 4]``."""
     camera_path: Path = field(default_factory=Still)
     """How the ToF camera moves; the default is at rest at the origin, looking along +z."""
+    emitter: Vector = (0.0, 0.0, 0.0)
+    """Where the light is, in the axes of the ToF camera [m]; away from it only engine 'mesh' can see."""
+    beam_deg: tuple[float, float] | None = None
+    """What the light shines on: full angles across and down about the camera's z axis [deg]; None: all directions."""
     colour: ColourCamera | None = None
     """The colour camera, which moves with the ToF camera; None: there is none."""
     novel_views: tuple[Path, ...] = ()
