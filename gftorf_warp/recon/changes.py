@@ -79,7 +79,10 @@ def _parsed(text: str, kind: Any, name: str) -> Any:
             raise _refused(f"{name}={text}", "expected true or false", "choose one")
         return text.lower() == "true"
     try:
-        return kind(text)
+        value = kind(text)
+        if value != value:
+            raise ValueError("not a number")
+        return value
     except ValueError:
         wanted = ", ".join(kind) if isinstance(kind, enum.EnumMeta) else {"int": "a whole number"}.get(kind.__name__)
         raise _refused(f"{name}={text}", f"expected {wanted or 'a number'}", "choose another value") from None
