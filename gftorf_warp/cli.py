@@ -127,7 +127,7 @@ def _simulate(options: argparse.Namespace) -> int:
         raise UsageError(f"{missing} is missing", where="gftorf simulate", why="both are needed", fix=fix)
     from .sim.simulate import simulate
 
-    start(options)
+    device = start(options)
     path = simulate(
         options.scene,
         options.out,
@@ -139,6 +139,10 @@ def _simulate(options: argparse.Namespace) -> int:
         flow=options.flow,
         exposure_samples=options.exposure_samples,
         overrides=options.override,
+        engine=options.engine,
+        bounces=options.bounces,
+        paths=options.paths,
+        device=device,
         format=options.format,
         fresh=options.fresh,
         progress=_progress(options)("simulate"),

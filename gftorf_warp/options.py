@@ -93,6 +93,14 @@ def command_parsers() -> dict[str, Parser]:
     _seed_option(simulate, "seed of the noise (0)")
     layouts = "folder layout (ftorf): raw quads, or one phasor per quartet"
     simulate.add_argument("--format", metavar="ftorf|torf", default="ftorf", help=layouts)
+    engines = "gaussian: splats cover the scene; mesh: rays meet its surfaces (gaussian)"
+    simulate.add_argument("--engine", metavar="gaussian|mesh", default="gaussian", help=engines)
+    bounces = "surfaces that light may meet after the first, with engine mesh (0: direct light only)"
+    simulate.add_argument("--bounces", metavar="N", type=_whole, default=0, help=bounces)
+    paths = "random paths per pixel for the light that bounces (64)"
+    simulate.add_argument("--paths", metavar="N", type=_positive, default=64, help=paths)
+    device = "where engine mesh traces (cpu)"
+    simulate.add_argument("--device", metavar="auto|cpu|cuda", type=_device, default="cpu", help=device)
     simulate.add_argument("--sync", action="store_true", help="all four quads of a quartet at one instant")
     simulate.add_argument("--no-noise", action="store_true", help="an ideal sensor")
     simulate.add_argument("--flow", action="store_true", help="store exact optical flow too")

@@ -32,7 +32,11 @@ TABLE = {  # room: (rooms it may import besides itself, packages it may import);
 }
 FREE = {"constants", "errors", "__version__"}
 HAS_BOTH = "render/bridge.py"  # the only module that may know torch and Warp together
-LAUNCHES = {"render/launch.py", "render/stages.py"}
+LAUNCHES = {  # file: what it launches
+    "render/launch.py": "the order of a rendering",
+    "render/stages.py": "the stages of a rendering",
+    "render/trace.py": "rays through meshes, which share nothing with a rendering",
+}
 KNOWS_KINDS = {"render/buffers.py": "the shape of a tile depends on the kind of device, which is the input's"}
 HOMELESS = {"utils", "util", "common", "misc", "types", "helpers"}
 
@@ -89,7 +93,7 @@ def test_module_imports_what_its_room_may(path):
 
 @pytest.mark.parametrize("path", FILES, ids=name_of)
 def test_module_names_no_device_and_launches_nowhere_else(path):
-    """Devices are named by the command line; kernels are launched in two files of render; streams are the bridge's."""
+    """Devices are named by the command line; kernels are launched where ``LAUNCHES`` says; streams are the bridge's."""
     for node in ast.walk(ast.parse(path.read_text())):
         if path.parent != ROOT:
             named = getattr(node, "attr", None) == "cuda" and name_of(path) != HAS_BOTH

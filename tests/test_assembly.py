@@ -134,5 +134,7 @@ def test_what_cannot_be_is_refused():
         Assembly(parts=())
     with pytest.raises(ValueError, match="must have an end"):
         Part(shape=Level(axis=2, value=1.0))
+    with pytest.raises(ValueError, match="single shape"):
+        Part(shape=chair())
     with pytest.raises(ValueError, match="axis must be"):
         Level(axis=3, value=1.0)

@@ -54,6 +54,7 @@ def test_every_setting_has_a_name_and_can_be_set_to_what_it_is():
         ("init.count=many", "whole number"),
         ("init.count=1.5", "whole number"),
         ("weights.quads=x", "a number"),
+        ("weights.quads=nan", "a number"),
         ("flow=raft", "deepflow"),
         ("init.bounds=1", "2 values"),
         ("densify.loses_step=maybe", "true or false"),

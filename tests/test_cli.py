@@ -95,6 +95,7 @@ def test_module_and_script_are_the_same():
         ("simulate S --out Q --size 96x72", "size", (96, 72)),
         ("simulate S --out Q --frames 10 --seed 7 --format ftorf", "seed", 7),
         ("simulate --list", "list", True),
+        ("simulate S --out Q --engine mesh --bounces 2 --paths 8 --device cpu", "bounces", 2),
         ("simulate S --out Q --sync --no-noise --flow --exposure-samples 3 --fresh", "exposure_samples", 3),
         ("reconstruct SEQ --out RUN --preset demo --images 100 --seed 2 --device cpu --fresh", "images", 100),
         ("reconstruct SEQ --out RUN --frame-rate 60", "frame_rate", 60.0),

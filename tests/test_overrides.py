@@ -54,6 +54,9 @@ def test_every_setting_of_a_scene_has_a_name_and_can_be_set_to_what_it_is(name):
     [
         ("sensor.f_mod=1", "did you mean sensor.f_mod_hz?"),
         ("sensor.f_mod_hz=0", "f_mod_hz must be above 0"),
+        ("sensor.f_mod_hz=nan", "a number"),
+        ("emitter=inf,0,0", "emitter must be finite"),
+        ("beam_deg=60,180", "beam_deg must be between 0 and 180"),
         ("sensor.exposure_s=-1", "exposure_s must be above 0"),
         ("sensor.shifts=0", "four shifts"),
         ("frames=0", "frames must be at least 1"),

@@ -100,6 +100,7 @@ def test_a_file_is_simulated_like_a_name(tmp_path, capsys):
         ("sensor = { f_mod_hz = 0 }" + SHORT, "sensor", "f_mod_hz must be above 0"),
         ("sensor = { f_mod_hz = nan }" + SHORT, "sensor.f_mod_hz", "a finite number"),
         ("sensor = { exposure_s = -1 }" + SHORT, "sensor", "exposure_s must be above 0"),
+        ("beam_deg = [60, 0]" + SHORT, "scene", "beam_deg must be between 0 and 180"),
         ("sensor = { noise = 1 }" + SHORT, "sensor.noise", "true or false"),
         (SHORT.replace("sphere", "sphre"), "bodies[0].shape.kind", "found 'sphre'"),
         (SHORT.replace('kind = "line", ', ""), "bodies[0].path.kind", "found None"),

@@ -104,7 +104,7 @@ def reconstruct(
     settings = changed(settings, changes, CHANGES)
     out = Path(out)
     config = config_of(sequence, settings, seed=seed, device=device)
-    config |= {"flow": None if flow is None else str(flow), "changes": list(changes)}
+    config |= {"flow": None if flow is None else str(flow), "changes": changes}
     with folder.locked(out):
         goes_on = folder.prepare(out, config, fresh=fresh)
         with log_to(out / "run.log"):

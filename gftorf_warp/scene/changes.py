@@ -117,7 +117,10 @@ def _parsed(text: str, kind: Any, name: str, wording: Wording) -> Any:
     if is_dataclass(kind) or kind is None:
         raise _refused(f"{name}={text}", "it is made of parts, which a text cannot say", "write it in Python", wording)
     try:
-        return kind(text)
+        value = kind(text)
+        if value != value:
+            raise ValueError("not a number")
+        return value
     except ValueError:
         expected = ", ".join(kind) if isinstance(kind, enum.EnumMeta) else {"int": "a whole number"}.get(kind.__name__)
         why = f"expected {expected or 'a number'}"

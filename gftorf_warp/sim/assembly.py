@@ -71,6 +71,8 @@ class Part:
     def __post_init__(self):
         if not np.isfinite(self.shape.reach):
             raise ValueError(f"a part must have an end, {self.shape} has none")
+        if isinstance(self.shape, Assembly):
+            raise ValueError("a part must be a single shape: list the parts of all assemblies in one")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -82,6 +82,10 @@ class Scene:
     """The sensor; raw frame n has the shift ``sensor.shifts[n % 4]``."""
     camera_path: Path = field(default_factory=Still)
     """How the ToF camera moves; the default is at rest at the origin, looking along +z."""
+    emitter: Vector = (0.0, 0.0, 0.0)
+    """Where the light is, in the axes of the ToF camera [m]; away from it only engine 'mesh' can see."""
+    beam_deg: tuple[float, float] | None = None
+    """What the light shines on: full angles across and down about the camera's z axis [deg]; None: all directions."""
     colour: ColourCamera | None = None
     """The colour camera, which moves with the ToF camera; None: there is none."""
     novel_views: tuple[Path, ...] = ()
@@ -99,6 +103,10 @@ class Scene:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
         if not 0 < self.horizontal_fov_deg < 180:
             raise ValueError(f"horizontal_fov_deg must be between 0 and 180, got {self.horizontal_fov_deg}")
+        if not np.isfinite(self.emitter).all():
+            raise ValueError(f"emitter must be finite, got {self.emitter}")
+        if self.beam_deg is not None and not all(0 < angle < 180 for angle in self.beam_deg):
+            raise ValueError(f"beam_deg must be between 0 and 180, got {self.beam_deg}")
 
     @property
     def camera_moves(self) -> bool:
