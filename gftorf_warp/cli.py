@@ -115,7 +115,11 @@ def _simulate(options: argparse.Namespace) -> int:
     from .sim.scenes import SCENES
 
     if options.list:
-        print("\n".join(f"{name:<12}{scene.motion:<24}{scene.description}" for name, scene in SCENES.items()))
+        print(f"{'scene':<21}{'raw frames':>10}{'closed form':>13}  motion: description")
+        for name, scene in SCENES.items():
+            error = "-" if scene.closed_form is None else f"{scene.closed_form:.4g}"
+            print(f"{name:<21}{scene.frames:>10}{error:>13}  {scene.motion}: {scene.description}")
+        print("closed form: its mean squared error on ideal quads [m^2 x 100], see design/look-alikes.md")
         return 0
     if options.scene is None or options.out is None:
         missing = "SCENE" if options.scene is None else "--out SEQ"
@@ -123,7 +127,7 @@ def _simulate(options: argparse.Namespace) -> int:
         raise UsageError(f"{missing} is missing", where="gftorf simulate", why="both are needed", fix=fix)
     from .sim.simulate import simulate
 
-    start(options)
+    device = start(options)
     path = simulate(
         options.scene,
         options.out,
@@ -134,6 +138,11 @@ def _simulate(options: argparse.Namespace) -> int:
         noise=not options.no_noise,
         flow=options.flow,
         exposure_samples=options.exposure_samples,
+        overrides=options.override,
+        engine=options.engine,
+        bounces=options.bounces,
+        paths=options.paths,
+        device=device,
         format=options.format,
         fresh=options.fresh,
         progress=_progress(options)("simulate"),

@@ -83,7 +83,9 @@ def command_parsers() -> dict[str, Parser]:
     _fresh_option(demo)
 
     simulate = _command("simulate", "write a sequence of asynchronous quads with its true distance")
-    simulate.add_argument("scene", metavar="SCENE", nargs="?", help="name of a scene; --list shows them")
+    simulate.add_argument(
+        "scene", metavar="SCENE", nargs="?", help="name of a scene, --list shows them, or a .toml file of one"
+    )
     simulate.add_argument("--list", action="store_true", help="list the scenes and stop")
     simulate.add_argument("--out", metavar="SEQ", help="folder to write")
     simulate.add_argument("--frames", metavar="N", type=_positive, help="raw frames (the scene's own number)")
@@ -91,11 +93,21 @@ def command_parsers() -> dict[str, Parser]:
     _seed_option(simulate, "seed of the noise (0)")
     layouts = "folder layout (ftorf): raw quads, or one phasor per quartet"
     simulate.add_argument("--format", metavar="ftorf|torf", default="ftorf", help=layouts)
+    engines = "gaussian: splats cover the scene; mesh: rays meet its surfaces (gaussian)"
+    simulate.add_argument("--engine", metavar="gaussian|mesh", default="gaussian", help=engines)
+    bounces = "surfaces that light may meet after the first, with engine mesh (0: direct light only)"
+    simulate.add_argument("--bounces", metavar="N", type=_whole, default=0, help=bounces)
+    paths = "random paths per pixel for the light that bounces (64)"
+    simulate.add_argument("--paths", metavar="N", type=_positive, default=64, help=paths)
+    device = "where engine mesh traces (cpu)"
+    simulate.add_argument("--device", metavar="auto|cpu|cuda", type=_device, default="cpu", help=device)
     simulate.add_argument("--sync", action="store_true", help="all four quads of a quartet at one instant")
     simulate.add_argument("--no-noise", action="store_true", help="an ideal sensor")
     simulate.add_argument("--flow", action="store_true", help="store exact optical flow too")
     blur = "instants that one exposure averages (1: no motion blur)"
     simulate.add_argument("--exposure-samples", metavar="N", type=_positive, default=1, help=blur)
+    single = "change one setting, for example sensor.f_mod_hz=30e6 or bodies.1.path.velocity=3,0,0 (may be repeated)"
+    simulate.add_argument("--override", metavar="NAME=VALUE", action="append", default=[], help=single)
     _fresh_option(simulate)
     _threads_option(simulate)
 

@@ -35,10 +35,11 @@ HAS_BOTH = {  # the only modules that may know torch and Warp together
     "render/bridge.py": "a rendering, and its gradient",
     "render/fused.py": "what a step does beside rendering: other kernels and callers",
 }
-LAUNCHES = {
-    "render/launch.py": "a rendering, in order",
-    "render/stages.py": "its stages",
-    "render/training.py": "the launches behind fused.py",
+LAUNCHES = {  # file: what it launches
+    "render/launch.py": "the order of a rendering",
+    "render/stages.py": "the stages of a rendering",
+    "render/training.py": "what a step does beside rendering",
+    "render/trace.py": "rays through meshes, which share nothing with a rendering",
 }
 KNOWS_KINDS = {"render/buffers.py": "the shape of a tile depends on the kind of device, which is the input's"}
 HOMELESS = {"utils", "util", "common", "misc", "types", "helpers"}
@@ -96,7 +97,7 @@ def test_module_imports_what_its_room_may(path):
 
 @pytest.mark.parametrize("path", FILES, ids=name_of)
 def test_module_names_no_device_and_launches_nowhere_else(path):
-    """Devices are named by the command line, kernels launched in three files of render; streams are the bridge's."""
+    """Devices are named by the command line; kernels are launched where ``LAUNCHES`` says; streams are the bridge's."""
     for node in ast.walk(ast.parse(path.read_text())):
         if path.parent != ROOT:
             named = getattr(node, "attr", None) == "cuda" and name_of(path) != "render/bridge.py"

@@ -6,10 +6,16 @@ from small_runs import small
 from gftorf_warp.errors import UsageError
 from gftorf_warp.evaluate import provenance
 from gftorf_warp.recon import presets
-from gftorf_warp.recon.changes import changed, names
 from gftorf_warp.recon.settings import FlowSource
-from gftorf_warp.recon.train import reconstruct
+from gftorf_warp.recon.train import CHANGES, reconstruct
+from gftorf_warp.scene import changes
+from gftorf_warp.scene.changes import names
 from gftorf_warp.scene.motion import Products
+
+
+def changed(settings, texts):
+    """Settings of a reconstruction with changes."""
+    return changes.changed(settings, texts, CHANGES)
 
 
 def test_values_become_what_the_setting_holds():
@@ -48,6 +54,7 @@ def test_every_setting_has_a_name_and_can_be_set_to_what_it_is():
         ("init.count=many", "whole number"),
         ("init.count=1.5", "whole number"),
         ("weights.quads=x", "a number"),
+        ("weights.quads=nan", "a number"),
         ("flow=raft", "deepflow"),
         ("init.bounds=1", "2 values"),
         ("densify.loses_step=maybe", "true or false"),

@@ -95,6 +95,7 @@ def test_module_and_script_are_the_same():
         ("simulate S --out Q --size 96x72", "size", (96, 72)),
         ("simulate S --out Q --frames 10 --seed 7 --format ftorf", "seed", 7),
         ("simulate --list", "list", True),
+        ("simulate S --out Q --engine mesh --bounces 2 --paths 8 --device cpu", "bounces", 2),
         ("simulate S --out Q --sync --no-noise --flow --exposure-samples 3 --fresh", "exposure_samples", 3),
         ("reconstruct SEQ --out RUN --preset demo --images 100 --seed 2 --device cpu --fresh", "images", 100),
         ("reconstruct SEQ --out RUN --frame-rate 60", "frame_rate", 60.0),
@@ -244,11 +245,13 @@ def test_names_that_a_room_does_not_know(run, sequence, tmp_path, capsys):
 
 
 def test_scenes_are_listed(capsys):
-    """One line each, the demo's first."""
+    """One line each under their heads, the demo's first: name, frames, error of the closed form, what it is."""
     assert cli.main(["simulate", "--list"]) == 0
     out, _ = lines_of(capsys)
-    assert out[0].startswith("demo ")
-    assert {line.split()[0] for line in out} >= {"demo", "sliding", "axial", "arc"}
+    assert out[0].split()[0] == "scene"
+    assert out[1].split()[:3] == ["demo", "44", "13.02"]
+    assert {line.split()[0] for line in out} >= {"demo", "sliding", "axial", "arc", "arcing_cube", "fan", "cupboard"}
+    assert "a chequered board" in next(line for line in out if line.startswith("target "))
 
 
 def test_simulate_writes_a_sequence_and_prints_where(sequence, tmp_path, capsys):

@@ -12,10 +12,12 @@ from test_inputs import as_phasors, with_colour
 from gftorf_warp.data import ftorf
 from gftorf_warp.errors import InputError
 from gftorf_warp.evaluate.compare import compare
-from gftorf_warp.recon import presets
+from gftorf_warp.recon import presets, step
+from gftorf_warp.recon.observations import observe
 from gftorf_warp.recon.presets import Recorded
 from gftorf_warp.recon.run import Run
 from gftorf_warp.recon.settings import Input
+from gftorf_warp.recon.state import begin, from_dict, to_dict
 from gftorf_warp.recon.train import reconstruct
 from gftorf_warp.scene.initialise import Init
 
@@ -31,7 +33,9 @@ def small(name, images, **recorded):
     rates = replace(s.rates, mean=5e-3, reflectivity_sh=2e-3, log_scale=1e-2)
     schedule = replace(s.schedule, images=images, log_every=10, warm_up=warm_up, flow_from=warm_up, pause_after_reset=2)
     colour_from = warm_up if s.weights.quads > 0 else 0
-    densify = replace(s.densify, every=20, start=20, reset_every=max(images // 3, 1), reset_faster=None, gaussians_max=600)
+    densify = replace(
+        s.densify, every=20, start=20, reset_every=max(images // 3, 1), reset_faster=None, gaussians_max=600
+    )
     densify = replace(densify, scale_range=(0.0, 10.0), clone_scale_max=0.1)
     schedule = replace(schedule, colour_from=colour_from, motion_decay_from=0, sh_degree_every=10)
     last = replace(s.rates_last, reflectivity_sh=2e-3)
@@ -121,3 +125,14 @@ def test_too_short_a_run_is_warned_of(tmp_path, caplog):
     run = replace(settings, schedule=replace(settings.schedule, images=1, warm_up=2))
     reconstruct(recording(frames=12)[0], tmp_path / "run", run)
     assert "nothing will move" in caplog.text
+
+
+def test_a_run_goes_on_on_another_kind_of_device():
+    """Whose random generator has a state of another length: only the backgrounds become others."""
+    settings = small("paper", 8)
+    observations = observe(recording(frames=12)[0], settings, "cpu")
+    kept = to_dict(begin(observations, settings, seed=0, device="cpu"))
+    elsewhere = kept | {"noise": torch.zeros(16, dtype=torch.uint8)}
+    state = from_dict(elsewhere, "cpu")
+    assert step.step(state, observations, settings) is None
+    assert torch.equal(from_dict(kept, "cpu").noise.get_state(), kept["noise"])

@@ -9,11 +9,11 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from ..data.sequence import Sequence
-from ..errors import DivergedError
 from ..scene.measured import colour_camera_of
 from . import page, pictures
 from .poses import middle
 from .renders import srgb
+from .views import finite
 
 if TYPE_CHECKING:
     from ..recon.run import Run
@@ -53,6 +53,9 @@ def novel_views(run: Run, sequence: Sequence, count: int = STRIP_VIEWS) -> Novel
     """Views from up to ``count`` of the novel poses of a sequence, in the middle of it.
 
     None if it carries none, or if the run has no Gaussians and so no other view than its own.
+
+    Raises:
+        DivergedError: If a rendering is not finite.
     """
     if sequence.novel_from_world is None or not len(sequence.novel_from_world) or not run.gaussians:
         return None
@@ -62,16 +65,15 @@ def novel_views(run: Run, sequence: Sequence, count: int = STRIP_VIEWS) -> Novel
     distances, colours = [], []
     for m in chosen:
         rendering = run.render(time, run.camera.at(sequence.novel_from_world[m]))
-        opacity = rendering.opacity.detach().cpu().numpy()
-        distance = rendering.distance.detach().cpu().numpy() / np.maximum(opacity, NORMALISED_MIN)
-        distances.append(np.where(opacity >= NORMALISED_MIN, distance, np.nan))
+        opacity, distance = (finite(image, f"novel view {m}", run) for image in (rendering.opacity, rendering.distance))
+        distances.append(np.where(opacity >= NORMALISED_MIN, distance / np.maximum(opacity, NORMALISED_MIN), np.nan))
         if rendering.colour is not None:
-            colours.append(rendering.colour.detach().cpu().numpy().transpose(1, 2, 0))
+            colours.append(finite(rendering.colour, f"colour of novel view {m}", run).transpose(1, 2, 0))
     return Novel(
         poses=chosen,
         time=time,
-        distance=np.stack(distances).astype(np.float32),
-        colour=np.stack(colours).astype(np.float32) if colours else None,
+        distance=np.stack(distances),
+        colour=np.stack(colours) if colours else None,
     )
 
 
@@ -89,15 +91,8 @@ def colour_views(run: Run, sequence: Sequence, frames: list[int]) -> Colour | No
         rendered = None if camera is None else run.render(float(sequence.times[n]), camera).colour
         if rendered is None:
             return None
-        image = rendered.detach().cpu().numpy().astype(np.float32).transpose(1, 2, 0)
-        if not np.isfinite(image).all():
-            raise DivergedError(
-                f"colour of raw frame {n} is not finite",
-                where=run.path,
-                why=f"{int((~np.isfinite(image)).sum())} of {image.size} rendered values are NaN or infinite",
-                fix="reconstruct again with another --seed or preset",
-            )
-        found.append((n, sequence.colour[n], image))
+        image = finite(rendered, f"colour of raw frame {n}", run)
+        found.append((n, sequence.colour[n], image.transpose(1, 2, 0)))
     if not found:
         return None
     chosen, measured, images = zip(*found, strict=True)

@@ -18,7 +18,7 @@ from ..data.sequence import Sequence
 from ..errors import DivergedError, UsageError
 from ..render.api import Rendering
 from ..scene.camera import Camera
-from ..scene.sensor import Sensor
+from ..scene.sensor import Sensor, channel_of
 from . import renders
 from .metrics import distance_from_quads, normalised
 from .poses import middle
@@ -26,8 +26,6 @@ from .poses import read as read_poses
 
 if TYPE_CHECKING:
     from ..recon.run import Run
-
-SHIFT_TOLERANCE = 1e-5  # [rad] shifts are stored as float32 at worst
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -91,7 +89,7 @@ def gather(
             "quad_rendered": rendering.quads[slot],
         }
         for name, image in images.items():
-            rows[name].append(_finite(image, f"{name} of raw frame {n}", run))
+            rows[name].append(finite(image, f"{name} of raw frame {n}", run))
         if progress is not None:
             progress(count, len(frames))
     return Views(
@@ -119,20 +117,24 @@ def channel_of_shift(sensor: Sensor, shift: float) -> int:
     Raises:
         ValueError: If the sensor does not render that shift.
     """
-    turns = (np.asarray(sensor.shifts) - shift + np.pi) % (2.0 * np.pi) - np.pi
-    channel = int(np.abs(turns).argmin())
-    if abs(turns[channel]) > SHIFT_TOLERANCE:
+    channel = channel_of(sensor.shifts, shift)
+    if channel is None:
         raise ValueError(f"shift {shift} rad is not among those the sensor renders, {sensor.shifts}")
     return channel
 
 
-def _finite(image: torch.Tensor, name: str, run: Run) -> Float[np.ndarray, "H W"]:
+def finite(image: torch.Tensor, name: str, run: Run) -> Float[np.ndarray, "*image"]:
+    """A rendered image as float32.
+
+    Raises:
+        DivergedError: If it is not finite.
+    """
     array = image.detach().cpu().numpy().astype(np.float32)
     if not np.isfinite(array).all():
         raise DivergedError(
             f"{name} is not finite",
             where=run.path,
-            why=f"{int((~np.isfinite(array)).sum())} of {array.size} rendered pixels are NaN or infinite",
+            why=f"{int((~np.isfinite(array)).sum())} of {array.size} rendered values are NaN or infinite",
             fix="reconstruct again with another --seed or preset",
         )
     return array

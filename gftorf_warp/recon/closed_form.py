@@ -25,11 +25,10 @@ from ..render.api import Rendering
 from ..scene.camera import Camera
 from ..scene.gaussians import GaussianField, constant_sh
 from ..scene.motion import Still
-from ..scene.sensor import Sensor
+from ..scene.sensor import Sensor, channel_of
 from .run import Run
 
-SHIFT_TOLERANCE = 1e-5  # [rad] shifts are stored as float32 at worst
-POSE_TOLERANCE = 1e-6  # [m], [1] likewise
+POSE_TOLERANCE = 1e-6  # [m], [1] poses are stored as float32 at worst
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -151,9 +150,8 @@ def nearest_quartet(sequence: Sequence, time: float) -> int:
 def quad(sequence: Sequence, quartet: int, shift: float) -> Float[np.ndarray, "H W"]:
     """The raw frame of a quartet with a shift [rad]; if none has it, a cos(psi - shift) of the decoded phasor."""
     first = FRAMES_PER_QUARTET * quartet
-    shifts = sequence.shifts[first : first + FRAMES_PER_QUARTET]
-    apart = np.abs((shifts - shift + math.pi) % (2.0 * math.pi) - math.pi)
-    if apart.min() <= SHIFT_TOLERANCE:
-        return sequence.quads[first + int(apart.argmin())]
+    slot = channel_of(sequence.shifts[first : first + FRAMES_PER_QUARTET].tolist(), shift)
+    if slot is not None:
+        return sequence.quads[first + slot]
     re, im = quartet_phasor(sequence, quartet)
     return 0.5 * (re * math.cos(shift) + im * math.sin(shift))

@@ -18,7 +18,6 @@ from ..render.api import Background, Rendering, rasterize
 from ..render.buffers import RenderSettings
 from ..scene.camera import Camera
 from ..scene.gaussians import GaussianField
-from ..scene.measured import colour_camera_of
 from ..scene.motion import Motion
 from .observations import Observations
 from .settings import Kernels, Norm, ReconSettings, Weights
@@ -107,12 +106,11 @@ def terms(
     if tof is not None and weights.distortion > 0:
         result["distortion"] = weights.distortion * tof.distortion.mean()
     if weights.colour > 0 and frame in observations.colour:
-        taken = float(observations.sequence.times[frame])
+        taken, then = float(observations.sequence.times[frame]), displacement
         if motion is not None and taken != time:
-            displacement = motion.displacement(attachment, taken)
-        camera = colour_camera_of(observations.sequence, frame)
-        assert camera is not None, "observe() has seen to it"
-        colour = _render(field.moved(displacement), camera, observations, frame, settings, render, backgrounds)
+            then = motion.displacement(attachment, taken)
+        camera = observations.colour_cameras[frame]
+        colour = _render(field.moved(then), camera, observations, frame, settings, render, backgrounds)
         assert colour.colour is not None
         measured = observations.colour[frame]
         loss, of_colour = image_loss(colour.colour, measured, weights.ssim, weights.colour_norm, kernel=kernel)

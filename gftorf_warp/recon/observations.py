@@ -37,6 +37,8 @@ class Observations:
     """Phasors (re, im) by the raw frame that stands for the quartet; empty if quads are compared."""
     colour: dict[int, Float[Tensor, "3 h w"]]
     """Colour images by raw frame, divided by the largest value of all; empty if colour is not compared."""
+    colour_cameras: dict[int, Camera]
+    """The camera of every colour image, at its size."""
     colour_scale: float | None
     """The file's units of colour times this are those of the optimisation; None if colour is not compared."""
     closed_form: dict[int, Float[Tensor, "H W"]]
@@ -131,6 +133,7 @@ def observe(sequence: Sequence, settings: ReconSettings, device: torch.device | 
         quads=torch.tensor(prepared.quads, device=device),
         phasors=phasors,
         colour={n: on_device(np.moveaxis(image, -1, 0)) for n, image in colour.items()},
+        colour_cameras={n: camera for n in colour if (camera := colour_camera_of(prepared, n)) is not None},
         colour_scale=colour_scale,
         closed_form=closed_form,
         cameras=[camera_of(prepared, n) for n in range(prepared.frames)],

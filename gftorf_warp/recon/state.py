@@ -167,7 +167,11 @@ def from_dict(stored: dict, device: torch.device | str) -> State:
     field, motion, attachment = field_and_motion(stored, device)
     generator, noise = torch.Generator(), torch.Generator(device)
     generator.set_state(stored["generator"].cpu())
-    noise.set_state(stored["noise"].cpu())
+    drawn = stored["noise"].cpu()
+    if len(drawn) == len(noise.get_state()):
+        noise.set_state(drawn)
+    else:  # of another kind of device, whose generator is another: backgrounds go on with other numbers
+        noise.manual_seed(stored["images"])
     return State(
         optimiser=Optimiser(field, motion, stored["adam"]),
         motion=motion,

@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from ..render import fused
-from ..scene.measured import colour_camera_of
 from . import densify
 from .objective import Seen, render_settings_at, terms, weights_at
 from .observations import Observations
@@ -54,7 +53,7 @@ def step(
         state.attachment = state.motion.attach(state.optimiser.field)
     weights, render = weights_at(settings, state.images), render_settings_at(settings, state.images)
     rests = frozen(settings, state.images)
-    wanted = [n for n, leaf in enumerate(leaves) if not rests or any(leaf is other for other in state.optimiser.motion)]
+    first = len(state.optimiser.tensors) if rests else 0  # of the leaves that learn; those of the motion come last
     numbers = range(state.images, state.images + len(frames))
     pairs = zip(numbers, frames, strict=True)
     backgrounds = [_backgrounds(state, observations, frame, settings, weights, number) for number, frame in pairs]
@@ -75,9 +74,7 @@ def step(
         gradients: list[Tensor | None] = [None] * len(leaves)
         loss = torch.stack([*found.values()]).sum() if found else None
         if loss is not None and loss.requires_grad:
-            asked = [leaves[n] for n in wanted]
-            for n, gradient in zip(wanted, torch.autograd.grad(loss, asked, allow_unused=True), strict=True):
-                gradients[n] = gradient
+            gradients[first:] = torch.autograd.grad(loss, leaves[first:], allow_unused=True)
         return {name: value.detach() for name, value in found.items()}, seen, gradients
 
     results = list(run_all(lambda pair: one(*pair), zip(frames, backgrounds, strict=True)))
@@ -168,8 +165,7 @@ def _account(state: State, observations: Observations, frame: int, found: dict[s
         for name, value in values.items():
             state.sums[name] = state.sums[name] + value if name in state.sums else value.clone()
         if rendering.screen is not None:
-            camera = observations.cameras[frame] if seen.tof else colour_camera_of(observations.sequence, frame)
-            assert camera is not None
+            camera = (observations.cameras if seen.tof else observations.colour_cameras)[frame]
             state.statistics = densify.observe(state.statistics, rendering.screen, camera)
 
 

@@ -22,9 +22,9 @@ from ..data.findings import DC_TOLERANCE
 from ..data.sequence import Sequence, Truth
 from ..errors import DivergedError, InputError, UsageError
 from ..render.buffers import available_threads
+from ..scene.changes import Wording, changed
 from ..scene.measured import sensor_of
 from . import checkpoint, folder, presets
-from .changes import changed
 from .config import config_of
 from .diagnostics import Watch
 from .observations import Observations, input_of, observe
@@ -37,6 +37,9 @@ from .step import pool, step, threads_for
 LOG = logging.getLogger("gftorf_warp")
 Progress = Callable[..., None]
 Choice = TypeVar("Choice", bound=enum.StrEnum)
+CHANGES = Wording(
+    option="--set", example="init.reflectivity=0.5", where="config.json", fixed=("preset", "ablation", "method")
+)  # the last three have options of their own, or follow from one
 
 
 def reconstruct(
@@ -98,10 +101,10 @@ def reconstruct(
     if flow is not None:
         settings = replace(settings, flow=_choice(FlowSource, flow, "--flow"))
     changes = list(changes)
-    settings = changed(settings, changes)
+    settings = changed(settings, changes, CHANGES)
     out = Path(out)
     config = config_of(sequence, settings, seed=seed, device=device)
-    config |= {"flow": None if flow is None else str(flow), "changes": list(changes)}
+    config |= {"flow": None if flow is None else str(flow), "changes": changes}
     with folder.locked(out):
         goes_on = folder.prepare(out, config, fresh=fresh)
         with log_to(out / "run.log"):

@@ -255,11 +255,16 @@ def _over_tiles(frame: Frame, kernel, edges: list[int], arguments) -> None:
         for part, (start, stop) in enumerate(pairwise(edges))
     ]
     if side_by_side:
-        # this thread works, too: a pool that has slept would wake on its processor, and both would share it for a while
-        others = [_pool(frame.threads - 1).submit(command.launch) for command in commands[1:]]
-        commands[0].launch()
-        for other in others:
-            other.result()
+        run_side_by_side(commands, frame.threads)
+
+
+def run_side_by_side(commands: list, threads: int) -> None:
+    """Run at most ``threads`` recorded CPU launches, each in a thread of its own; they release the interpreter lock."""
+    # this thread works, too: a pool that has slept would wake on its processor, and both would share it for a while
+    others = [_pool(threads - 1).submit(command.launch) for command in commands[1:]]
+    commands[0].launch()
+    for other in others:
+        other.result()
 
 
 def _launch(kernel, dim, inputs: list, outputs: list, **adjoint) -> None:

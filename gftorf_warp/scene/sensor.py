@@ -10,6 +10,7 @@ in *relative units*. Section 2.4 of the sensor notes adds the electrons: the noi
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -18,6 +19,7 @@ from torch import Tensor
 from ..constants import CANONICAL_SHIFTS, FRAME_RATE_HZ, SPEED_OF_LIGHT
 
 Scalar = float | Tensor
+SHIFT_TOLERANCE = 1e-5  # [rad] shifts are stored as float32 at worst
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,6 +98,13 @@ class Sensor:
     def with_shifts(self, shifts: tuple[float, ...]) -> Sensor:
         """The same sensor reading other phase shifts [rad]."""
         return replace(self, shifts=tuple(float(s) for s in shifts))
+
+
+def channel_of(shifts: Sequence[float], shift: float) -> int | None:
+    """Index of a phase shift [rad] among others, whole turns aside; None if it is none of them."""
+    turns = [abs(math.remainder(other - shift, 2.0 * math.pi)) for other in shifts]
+    nearest = min(range(len(turns)), key=turns.__getitem__)
+    return nearest if turns[nearest] <= SHIFT_TOLERANCE else None
 
 
 def distance_from_phasor(re: Tensor, im: Tensor, sensor: Sensor) -> Tensor:

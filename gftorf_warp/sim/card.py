@@ -11,6 +11,7 @@ from .. import __version__
 from .paths import Still
 from .readout import contrast, electron_gain
 from .record import Recording
+from .scene import overridden
 from .scenes import SCENES, Scene
 
 
@@ -57,7 +58,7 @@ def settings_card(scene: Scene, options: Mapping, layout: str = "ftorf") -> str:
 
 {scene.description[:1].upper() + scene.description[1:]}. Motion: {scene.motion}.
 {options["frames"]} raw frames of {width}x{height} pixels, {scene.horizontal_fov_deg:g} deg wide. \
-Light and camera coincide; direct light only.
+{_light(scene, options)}.
 
     {_command(scene, options, layout)}
 
@@ -69,7 +70,7 @@ This data may be used under the licence of that program, Apache-2.0.
 {table}
 
 Quads are in relative units: reflectance rho met at angle i and distance d gives the amplitude rho cos(i) / d^2.
-The scene is covered by Gaussians and rendered with {scene.subsamples}x{scene.subsamples} rays per pixel, averaged.
+{_engine(scene, options)}
 
 Ground truth is the analytic first hit of the shapes along the ray through each pixel's centre at the time of each raw
 frame, not a rendering.
@@ -80,11 +81,30 @@ def outcome_card(recording: Recording) -> str:
     """The part that is known only afterwards: how far the rendering is from the truth, and what saturated."""
     agreement = "no such pixel" if recording.gap is None else str(recording.gap)
     return f"""
-Ground truth against rendered mean distance, on interior pixels of still surfaces in all raw frames:
+Ground truth against the distance that the engine sees, on interior pixels of still surfaces in all raw frames:
 {agreement}.
 
 Saturated: {100 * recording.saturated:.3g} % of all pixels and raw frames.
 """
+
+
+def _light(scene: Scene, options: Mapping) -> str:
+    lamp = "Light and camera coincide"
+    if any(scene.emitter):
+        place = ", ".join(f"{1e3 * x:g}" for x in scene.emitter)
+        lamp = f"The light is at ({place}) mm in camera axes and casts shadows"
+    if scene.beam_deg is not None:
+        lamp += f"; it shines on {scene.beam_deg[0]:g} x {scene.beam_deg[1]:g} deg"
+    if not options["bounces"]:
+        return f"{lamp}; direct light only"
+    return f"{lamp}; direct light and up to {options['bounces']} bounces, from {options['paths']} paths per pixel"
+
+
+def _engine(scene: Scene, options: Mapping) -> str:
+    rays = f"{scene.subsamples}x{scene.subsamples} rays per pixel, averaged"
+    if options["engine"] == "mesh":
+        return f"Engine mesh: rays meet the surfaces themselves, as triangles, balls and endless planes; {rays}."
+    return f"Engine gaussian: the scene is covered by Gaussians and rendered with {rays}."
 
 
 def _camera_rows(scene: Scene, options: Mapping) -> dict[str, str]:
@@ -110,19 +130,29 @@ def _camera_rows(scene: Scene, options: Mapping) -> dict[str, str]:
 
 def _command(scene: Scene, options: Mapping, layout: str) -> str:
     """What makes the same sequence again: a command line if there is one for it, else a call."""
-    if SCENES.get(scene.name) != scene or options["flow"] or options["exposure_samples"] > 1:
+    named = SCENES.get(scene.name)
+    if (
+        named is None
+        or overridden(named, scene.overrides) != scene
+        or options["flow"]
+        or options["exposure_samples"] > 1
+    ):
         values = ", ".join(f"{key}={value}" for key, value in options.items())
         return f"gftorf_warp.simulate({scene.name}, ..., {values}{f', format={layout!r}' if layout != 'ftorf' else ''})"
     width, height = options["size"]
-    command = f"gftorf simulate {scene.name} --out SEQ --frames {options['frames']} --size {width}x{height}"
+    command = f"gftorf simulate {scene.name} --out SEQ{''.join(f' --override {text}' for text in scene.overrides)}"
+    command += f" --frames {options['frames']} --size {width}x{height}"
+    command += f" --engine {options['engine']}" if options["engine"] != "gaussian" else ""
+    command += f" --bounces {options['bounces']} --paths {options['paths']}" if options["bounces"] else ""
     command += f" --seed {options['seed']}" + (f" --format {layout}" if layout != "ftorf" else "")
     return command + (" --sync" if options["sync"] else "") + ("" if options["noise"] else " --no-noise")
 
 
 def _fingerprint(scene: Scene) -> str:
     """Every setting of a scene as text; without the optional ones that it does not use, as if they did not exist."""
-    optional = {"camera_path": Still(), "colour": None, "novel_views": ()}
+    optional = {"camera_path": Still(), "emitter": (0.0, 0.0, 0.0), "beam_deg": None, "colour": None, "novel_views": ()}
     values = {f.name: getattr(scene, f.name) for f in fields(scene)}
     used = {name: value for name, value in values.items() if name not in optional or value != optional[name]}
+    del used["closed_form"], used["overrides"]  # follow from the others
     hues = "" if scene.colour is None else f", hues {[body.texture.hue for body in scene.bodies]}"
     return f"Scene({', '.join(f'{name}={value!r}' for name, value in used.items())}){hues}"

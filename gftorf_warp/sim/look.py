@@ -12,7 +12,7 @@ from ..render.api import rasterize
 from ..scene.camera import Camera
 from ..scene.gaussians import GaussianField
 from ..scene.sensor import Sensor
-from .scenes import Scene
+from .scene import Scene
 from .splat import Cover, cover_moving, cover_still, merge
 
 OPAQUE = 0.5  # [1] a ray that covers stop to less than this passes beside them: that is where their outline is
@@ -62,13 +62,17 @@ class Splatted:
 
 
 def look(splatted: Splatted, time: float, sensor: Sensor, subsamples: int) -> tuple[Float[np.ndarray, "H W"], ...]:
-    """Mean quad of the sensor's first shift, mean amplitude and mean distance over opacity [m] of every pixel."""
+    """Mean quad of the sensor's first shift, mean amplitude and mean distance over opacity [m] of every pixel.
+
+    The distance is NaN where a pixel meets nothing.
+    """
     with torch.no_grad():
         rendering = rasterize(splatted.at(time), splatted.camera_at(time), sensor)
+    opacity = pooled(rendering.opacity, subsamples)
     return (
-        _pooled(rendering.quads[0], subsamples),
-        _pooled(rendering.phasor[2], subsamples) / 2,  # the third channel of a phasor is 2a
-        _pooled(rendering.distance, subsamples) / _pooled(rendering.opacity, subsamples),
+        pooled(rendering.quads[0], subsamples),
+        pooled(rendering.phasor[2], subsamples) / 2,  # the third channel of a phasor is 2a
+        pooled(rendering.distance, subsamples) / np.where(opacity > 0, opacity, np.nan),
     )
 
 
@@ -78,10 +82,10 @@ def look_colour(splatted: Splatted, time: float, subsamples: int) -> Float[np.nd
         rendering = rasterize(splatted.at(time), splatted.camera_at(time), Sensor())
     assert rendering.colour is not None, "the splats of a colour camera have colour"
     met = torch.where(rendering.opacity > OPAQUE, rendering.colour / rendering.opacity, 0.0)
-    return np.stack([_pooled(channel, subsamples) for channel in met], axis=-1)
+    return np.stack([pooled(channel, subsamples) for channel in met], axis=-1)
 
 
-def _pooled(image: torch.Tensor, subsamples: int) -> Float[np.ndarray, "H W"]:
+def pooled(image: torch.Tensor | np.ndarray, subsamples: int) -> Float[np.ndarray, "H W"]:
     """Mean over the rays of each pixel, float64."""
     rows, columns = (length // subsamples for length in image.shape)
-    return image.double().numpy().reshape(rows, subsamples, columns, subsamples).mean((1, 3))
+    return np.asarray(image, dtype=np.float64).reshape(rows, subsamples, columns, subsamples).mean((1, 3))

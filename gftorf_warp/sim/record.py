@@ -1,4 +1,4 @@
-"""Point the camera at a scene: one rendering per raw frame, read out by the sensor; beside it the analytic truth."""
+"""Point the camera at a scene: one image per raw frame, read out by the sensor; beside it the analytic truth."""
 
 from __future__ import annotations
 
@@ -12,20 +12,31 @@ from jaxtyping import Bool, Float
 
 from ..constants import FRAMES_PER_QUARTET
 from ..data.sequence import Sequence, Truth
+from ..render.trace import Bounces
 from ..scene.camera import Camera
 from ..scene.sensor import Sensor
 from .look import Splatted, look, look_colour
 from .paths import inverse
 from .readout import read_out
-from .scenes import Scene
+from .scene import Scene
+from .traced import Traced, trace_colour
 from .world import Hits, first_hit
 
 Progress = Callable[[int, int], None]
+Taken = tuple[Float[np.ndarray, "H W"], ...]  # mean quad, mean amplitude, distance [m]
+
+ENGINES = ("gaussian", "mesh")
+"""Ways from a scene to an image: splats that cover it, or rays through its surfaces."""
+
+PATHS = 7  # tells the random numbers of paths from those of the read-out and of the colour camera
 
 
 @dataclass(frozen=True, kw_only=True)
 class Gap:
-    """Rendered mean distance (divided by opacity) against the analytic truth, over interior pixels of still bodies."""
+    """Distance as the engine sees it against the analytic truth, over interior pixels of still bodies.
+
+    Splats have a mean distance, divided by opacity; rays have a first hit.
+    """
 
     mean: float
     """Mean of the absolute difference [m]."""
@@ -47,7 +58,7 @@ class Recording:
     truth: Truth
     """Analytic distance along each pixel's centre ray at the time of each raw frame."""
     gap: Gap | None
-    """Renderer against truth on still interior pixels; None if no such pixel exists."""
+    """Engine against truth on still interior pixels; None if no such pixel exists."""
     saturated: float
     """Share of pixels and raw frames in which a tap or the ADC was full [1]."""
 
@@ -68,12 +79,17 @@ def record(
     noise: bool = True,
     flow: bool = False,
     exposure_samples: int = 1,
+    engine: str = "gaussian",
+    bounces: int = 0,
+    paths: int = 64,
+    device: str = "cpu",
     progress: Progress | None = None,
 ) -> Recording:
     """Record ``scene``, in memory. Arguments are those of :func:`gftorf_warp.sim.simulate.simulate`.
 
     Raises:
-        ValueError: If the sensor's contrast and DC offset contradict each other, see sim/readout.py.
+        ValueError: If the sensor's contrast and DC offset contradict each other, see sim/readout.py; if there is no
+            such engine, or it cannot make the light that is asked for.
     """
     frames = scene.frames if frames is None else frames
     sensor = replace(scene.sensor, noise=noise and scene.sensor.noise)
@@ -82,7 +98,7 @@ def record(
     camera = cameras[0]
     distances, interior = _truth(scene, cameras, times)
     longest = frame_times(sensor, max(frames, scene.frames), sync=False)  # for fewer frames the same covers and images
-    splatted = Splatted(scene, lambda time: _fine(scene.camera(size, time), scene), longest)
+    take = _engine(engine, scene, size, longest, Bounces(count=bounces, paths=paths), device, seed)
     shifts = np.array([sensor.shifts[n % len(sensor.shifts)] for n in range(frames)])
 
     quads = np.zeros((frames, camera.height, camera.width), dtype=np.float32)
@@ -90,8 +106,7 @@ def record(
     for n in range(frames):
         offsets = ((np.arange(exposure_samples) + 0.5) / exposure_samples - 0.5) * sensor.exposure_s
         shot = sensor.with_shifts((float(shifts[n]),))
-        looks = [look(splatted, float(times[n] + offset), shot, scene.subsamples) for offset in offsets]
-        quad, amplitude, distance = (np.mean(image, axis=0) for image in zip(*looks, strict=True))
+        quad, amplitude, distance = take(n, [float(times[n] + offset) for offset in offsets], float(times[n]), shot)
         reading = read_out(quad, amplitude, sensor, np.random.default_rng((seed, n)))  # frame n: whatever F is
         quads[n] = reading.quad
         full += int(reading.saturated.sum())
@@ -122,12 +137,46 @@ def record(
             else None,
             forward_flow=forward,
             backward_flow=backward,
-            **_colour(scene, size, times, longest, seed=seed, noise=noise),
+            **_colour(scene, size, times, longest, engine, seed=seed, noise=noise),
         ),
         truth=Truth(distance=distances.astype(np.float32), known=np.ones(frames, dtype=bool)),
         gap=Gap(mean=total / pixels, max=largest, pixels=round(pixels / frames)) if pixels else None,
         saturated=full / quads.size,
     )
+
+
+def _engine(
+    engine: str, scene: Scene, size, longest: Float[np.ndarray, "F"], bounces: Bounces, device: str, seed: int
+) -> Callable[[int, list[float], float, Sensor], Taken]:
+    """What takes an image: a function of a raw frame's number, the instants it averages, its time, and the sensor."""
+    if engine not in ENGINES:
+        raise ValueError(f"engine {engine!r} must be one of {', '.join(ENGINES)}")
+    if engine == "mesh":
+        traced = Traced(scene, lambda time: scene.camera(size, time), bounces=bounces, device=device)
+
+        def trace(n: int, instants: list[float], time: float, sensor: Sensor) -> Taken:
+            random = int(np.random.default_rng((seed, n, PATHS)).integers(2**31))  # frame n: whatever F is
+            return *traced.quad(instants, sensor, random), traced.first_hits(time).distance
+
+        return trace
+    if needs_mesh(scene, bounces.count):
+        raise ValueError(
+            f"emitter {scene.emitter}, beam_deg {scene.beam_deg} and {bounces.count} bounces need engine 'mesh': "
+            f"{engine!r} has direct light at the camera only"
+        )
+    splatted = Splatted(scene, lambda time: _fine(scene.camera(size, time), scene), longest)
+
+    def render(n: int, instants: list[float], time: float, sensor: Sensor) -> Taken:
+        del n, time
+        looks = [look(splatted, instant, sensor, scene.subsamples) for instant in instants]
+        return tuple(np.mean(image, axis=0) for image in zip(*looks, strict=True))
+
+    return render
+
+
+def needs_mesh(scene: Scene, bounces: int) -> bool:
+    """Whether the light is not the direct light of a lamp at the camera that shines everywhere."""
+    return any(scene.emitter) or scene.beam_deg is not None or bounces > 0
 
 
 def render_truth_gap(scene: Scene, *, frames: int = 1, size: tuple[int, int] | None = None) -> Gap | None:
@@ -142,7 +191,7 @@ def still_interior(scene: Scene, hits: list[Hits]) -> Bool[np.ndarray, "H W"]:
     inside[:2] = inside[-2:] = inside[:, :2] = inside[:, -2:] = False
     for hit in hits:
         inside &= ~moves[hit.body] & (hit.body >= 0)
-        surface = hit.body * 8 + hit.face  # a shape has fewer than 8 faces
+        surface = hit.body * (hit.face.max() + 1) + hit.face
         for dy in range(-2, 3):
             for dx in range(-2, 3):
                 inside &= np.roll(surface, (dy, dx), (0, 1)) == surface  # what wraps around the image is masked above
@@ -167,15 +216,19 @@ def _truth(
     return np.stack(distances), inside if scene.camera_moves else np.broadcast_to(inside.all(axis=0), inside.shape)
 
 
-def _colour(scene: Scene, size, times, longest, *, seed: int, noise: bool) -> dict[str, Any]:
+def _colour(scene: Scene, size, times, longest, engine: str, *, seed: int, noise: bool) -> dict[str, Any]:
     """The fields of a sequence that a colour camera fills: an image at every quartet start, and its poses."""
     if scene.colour is None:
         return {}
     cameras = [scene.colour_camera(size, float(time)) for time in times]
-    splatted = Splatted(scene, lambda time: _fine(scene.colour_camera(size, time), scene), longest, colour=True)
+    if engine == "gaussian":
+        splatted = Splatted(scene, lambda time: _fine(scene.colour_camera(size, time), scene), longest, colour=True)
     images = {}
     for n in range(0, len(times), FRAMES_PER_QUARTET):
-        image = look_colour(splatted, float(times[n]), scene.subsamples)
+        if engine == "gaussian":
+            image = look_colour(splatted, float(times[n]), scene.subsamples)
+        else:
+            image = trace_colour(scene, cameras[n], float(times[n]))
         if noise:
             image = image + np.random.default_rng((seed, n, 3)).normal(0.0, scene.colour.noise, image.shape)
         images[n] = image.astype(np.float32)

@@ -1,141 +1,18 @@
-"""Named scenes: a textured room, something that moves in it, and a sensor that looks on.
+"""All named scenes, and those of our own: a textured room, something that moves in it, and a sensor that looks on.
 
-All distances stay inside the unambiguous range of 7.5 m. Axes: x right, y down, z forward; a camera that does not move
-is at the origin.
+All distances in our own stay inside the unambiguous range of 7.5 m.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-
-import numpy as np
-from jaxtyping import Float
-
 from ..constants import FRAME_RATE_HZ
-from ..scene.camera import Camera
-from ..scene.sensor import Sensor
-from .paths import Arc, Line, Path, Still, Sweep, Vector, Viewpoint, inverse, rigid, rotation_matrix
-from .world import Body, Box, Plane, Shape, Sphere, Texture
-
-
-@dataclass(frozen=True, kw_only=True)
-class ColourCamera:
-    """A colour camera mounted beside the ToF camera; it takes an image at the start of every quartet.
-
-    Its light comes evenly from everywhere, so a Lambertian surface looks like its albedo from any side and at any
-    distance: linear RGB, no shadow, no falloff, black where there is nothing.
-    """
-
-    width: int
-    """Columns of the image, beside a ToF image of the scene's default size; both scale together."""
-    height: int
-    """Rows of the image, likewise."""
-    horizontal_fov_deg: float = 60.0
-    """Horizontal field of view [deg]; pixels are square."""
-    position: Vector = (0.0, 0.0, 0.0)
-    """Where it sits, in the axes of the ToF camera [m]."""
-    turn_deg: Vector = (0.0, 0.0, 0.0)
-    """How it is turned in those axes, as a rotation vector [deg]."""
-    noise: float = 0.0
-    """Standard deviation of each value [1]; the values of a white surface are 1."""
-
-    def __post_init__(self):
-        if not self.noise >= 0:
-            raise ValueError(f"noise must not be negative, got {self.noise}")
-
-    @property
-    def colour_from_tof(self) -> Float[np.ndarray, "4 4"]:
-        """Pose of the colour camera relative to the ToF camera [m]."""
-        return inverse(rigid(rotation_matrix(self.turn_deg), np.asarray(self.position, dtype=np.float64)))
-
-
-@dataclass(frozen=True, kw_only=True)
-class Scene:
-    """Bodies on their paths, a ToF camera, perhaps a colour camera beside it, and a sensor."""
-
-    name: str
-    """What the command line calls it."""
-    description: str
-    """One line for people."""
-    motion: str
-    """Kind of motion: 'sliding', 'axial', 'arc', 'sideways and in depth' or 'camera and ball on arcs'."""
-    bodies: tuple[Body, ...]
-    """What there is; bodies whose path is ``Still`` are static."""
-    frames: int
-    """Default number of raw frames."""
-    width: int
-    """Default columns of the image."""
-    height: int
-    """Default rows of the image."""
-    horizontal_fov_deg: float = 60.0
-    """Horizontal field of view [deg]; pixels are square."""
-    subsamples: int = 2
-    """Rays per pixel and axis that a quad averages: a pixel has an area, and at outlines it mixes what it sees."""
-    sensor: Sensor = field(default_factory=lambda: Sensor(noise=True))
-    """The sensor; raw frame n has the shift ``sensor.shifts[n % 4]``."""
-    camera_path: Path = field(default_factory=Still)
-    """How the ToF camera moves; the default is at rest at the origin, looking along +z."""
-    colour: ColourCamera | None = None
-    """The colour camera, which moves with the ToF camera; None: there is none."""
-    novel_views: tuple[Path, ...] = ()
-    """Where nobody looked from: poses, at time 0, of views to be rendered for looking at."""
-
-    @property
-    def camera_moves(self) -> bool:
-        """Whether the camera path is anything but a pose at rest."""
-        return not isinstance(self.camera_path, Still | Viewpoint)
-
-    def camera(self, size: tuple[int, int] | None = None, time: float = 0.0) -> Camera:
-        """The ToF camera at (width, height) ``size`` [px], or at the default size, as it is at ``time`` [s]."""
-        pose = inverse(self.camera_path.world_from_body(time))
-        return Camera.from_fov(*(size or (self.width, self.height)), self.horizontal_fov_deg, camera_from_world=pose)
-
-    def colour_camera(self, size: tuple[int, int] | None = None, time: float = 0.0) -> Camera:
-        """The colour camera beside a ToF image of ``size`` [px], or of the default size, as it is at ``time`` [s].
-
-        Raises:
-            ValueError: If the scene has none.
-        """
-        if self.colour is None:
-            raise ValueError(f"scene {self.name!r} has no colour camera: its field colour is None")
-        width, height = size or (self.width, self.height)
-        pose = self.colour.colour_from_tof @ inverse(self.camera_path.world_from_body(time))
-        return Camera.from_fov(
-            max(1, round(self.colour.width * width / self.width)),
-            max(1, round(self.colour.height * height / self.height)),
-            self.colour.horizontal_fov_deg,
-            camera_from_world=pose,
-        )
-
-
-def room(
-    *,
-    left: float = -2.1,
-    right: float = 2.1,
-    top: float = -1.6,
-    floor: float = 1.15,
-    back: float = 4.2,
-    hue: float | None = None,
-) -> Body:
-    """A textured room around the camera, walls at the given coordinates [m]; the wall behind the camera is at -0.5."""
-    front = -0.5
-    return Body(
-        shape=Box(size=(right - left, floor - top, back - front), inside=True),
-        texture=Texture(low=0.3, high=0.75, cell=0.3, hue=hue),
-        path=Still(position=((left + right) / 2, (top + floor) / 2, (front + back) / 2)),
-    )
-
-
-def still(
-    shape: Shape,
-    position: tuple[float, float, float],
-    low: float,
-    high: float,
-    cell: float,
-    hue: float | None = None,
-) -> Body:
-    """A body that stays at ``position`` [m], of reflectance ``low`` to ``high`` [1] in cells of ``cell`` [m]."""
-    return Body(shape=shape, texture=Texture(low=low, high=high, cell=cell, hue=hue), path=Still(position=position))
+from .calibration import CALIBRATION
+from .lookalikes import SYNTHETIC
+from .lookalikes_real import RECORDED
+from .lookalikes_torf import CARRIED
+from .paths import Arc, Line, Sweep, Viewpoint
+from .scene import ColourCamera, Scene, room, still
+from .world import Body, Box, Plane, Sphere, Texture
 
 
 def demo() -> Scene:
@@ -149,6 +26,7 @@ def demo() -> Scene:
     )
     return Scene(
         name="demo",
+        closed_form=13.02,
         description="a textured box crosses a textured room, coming nearer",
         motion="sideways and in depth",
         bodies=(room(), box),
@@ -170,6 +48,7 @@ def sliding() -> Scene:
     ball = still(Sphere(radius=0.35), (1.25, 0.8, 3.7), 0.5, 0.9, 0.2)
     return Scene(
         name="sliding",
+        closed_form=3.738,
         description="a box slides from left to right in front of the back wall, past a ball",
         motion="sliding",
         bodies=(room(), ball, box),
@@ -195,6 +74,7 @@ def axial() -> Scene:
     )
     return Scene(
         name="axial",
+        closed_form=2.637,
         description="a ball flies towards the camera while a box moves away from it",
         motion="axial",
         bodies=(room(), approach, retreat),
@@ -214,6 +94,7 @@ def arc() -> Scene:
     picture = still(Plane(size=(0.9, 0.6)), (-1.1, -0.7, 4.1), 0.05, 0.95, 0.15)
     return Scene(
         name="arc",
+        closed_form=6.471,
         description="a box swings on a horizontal circle, towards the camera and away",
         motion="arc",
         bodies=(room(), picture, box),
@@ -238,6 +119,7 @@ def tour() -> Scene:
     )
     return Scene(
         name="tour",
+        closed_form=2.488,
         description="a camera is carried past a desk over which a ball swings by; with a colour camera",
         motion="camera and ball on arcs",
         bodies=(room(hue=0.55), desk, chest, crate, globe, picture, ball),
@@ -260,5 +142,7 @@ def tour() -> Scene:
     )
 
 
-SCENES: dict[str, Scene] = {scene.name: scene for scene in (demo(), sliding(), axial(), arc(), tour())}
-"""All named scenes, the one of ``gftorf demo`` first."""
+OURS = (demo, sliding, axial, arc, tour)
+LOOK_ALIKES = (*SYNTHETIC, *RECORDED, *CARRIED)
+SCENES: dict[str, Scene] = {scene.name: scene for scene in (make() for make in (*OURS, *LOOK_ALIKES, *CALIBRATION))}
+"""All named scenes, the one of ``gftorf demo`` first, then the others of our own, ``OURS``."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import math
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,9 @@ from ..errors import UsageError
 from ..scene.sensor import Sensor
 from .card import outcome_card, settings_card
 from .readout import contrast
-from .record import Progress, frame_times, record
+from .record import ENGINES, Progress, frame_times, needs_mesh, record
+from .scene import overridden
+from .scene_file import read_scene
 from .scenes import SCENES, Scene
 from .splat import clearance
 
@@ -37,19 +40,24 @@ def simulate(
     noise: bool = True,
     flow: bool = False,
     exposure_samples: int = 1,
+    overrides: Iterable[str] = (),
+    engine: str = "gaussian",
+    bounces: int = 0,
+    paths: int = 64,
+    device: str = "cpu",
     format: str = "ftorf",
     fresh: bool = False,
     progress: Progress | None = None,
 ) -> Path:
     """Record a moving scene with an asynchronous C-ToF sensor and write it as a sequence.
 
-    Raw frame n is a rendering of the scene at its own time, of which only the quad of slot n % 4 is kept and read out.
+    Raw frame n is an image of the scene at its own time, of which only the quad of slot n % 4 is kept and read out.
     Beside it stands the analytic distance along each pixel's centre ray at that very time. A camera that moves has a
     pose for each raw frame; a colour camera adds an image per quartet. The folder appears only when it is complete; if
     it is already there and was made with the same settings, it is left as it is.
 
     Args:
-        scene: Name of a scene, see ``SCENES``, or a scene.
+        scene: Name of a scene, see ``SCENES``, a TOML file of one, or a scene.
         out: Folder to write.
         frames: Number of raw frames; None is the scene's own. A last quartet may be incomplete.
         size: (width, height) of the image [px]; None is the scene's own.
@@ -59,6 +67,13 @@ def simulate(
         flow: Whether exact optical flow at quartet starts is stored beside the quads: how images move, so that of a
             camera that moves includes its own motion.
         exposure_samples: Instants that a raw frame averages over the exposure, centred on its time; 1: no motion blur.
+        overrides: Single settings of the scene, its sensor and its bodies to change, as texts like
+            ``sensor.f_mod_hz=30e6`` or ``bodies.1.path.velocity=3,0,0``.
+        engine: 'gaussian': splats cover the scene and are rendered. 'mesh': rays meet its surfaces; shares nothing with
+            the renderer that `reconstruct` uses, and can have the light beside the camera, a beam, and bounces.
+        bounces: Surfaces that light may meet after the first one; 0: direct light only. More of them need 'mesh'.
+        paths: Random paths per pixel and raw frame for the light that bounces.
+        device: Where engine 'mesh' traces; the other one renders on the CPU.
         format: Layout on disk: 'ftorf', raw quads, or 'torf', one phasor per quartet with the time, pose and truth of
             its first raw frame.
         fresh: Whether another sequence in ``out`` is moved aside, to ``out-old-1``, instead of being an error.
@@ -70,9 +85,11 @@ def simulate(
     Raises:
         UsageError: If an option cannot be meant that way, the format cannot express the sensor, or ``out`` holds
             something else.
+        InputError: If a TOML file does not describe a scene.
     """
-    found = _scene(scene)
+    found = overridden(_scene(scene), overrides)
     _check_options(found, frames, size, seed, exposure_samples, format)
+    _check_engine(found, engine, bounces, paths, device)
     if flow and format == "torf":
         raise UsageError(
             "a ToeRF folder has no place for optical flow",
@@ -90,6 +107,9 @@ def simulate(
         "noise": noise,
         "flow": flow,
         "exposure_samples": exposure_samples,
+        "engine": engine,
+        "bounces": bounces,
+        "paths": paths,
     }
     card = settings_card(found, options, format)
     out = Path(out).absolute() if fresh else Path(out)
@@ -99,7 +119,7 @@ def simulate(
         from ..data.torf_write import write
     else:
         from ..data.ftorf_write import write
-    recording = record(found, **options, progress=progress)
+    recording = record(found, **options, device=device, progress=progress)
     if fresh:
         _set_aside(out)
     write(out, recording.sequence, recording.truth, readme=card + outcome_card(recording))
@@ -109,13 +129,17 @@ def simulate(
 def _scene(scene: str | Scene) -> Scene:
     if isinstance(scene, Scene):
         return scene
+    if scene.endswith(".toml"):
+        return read_scene(scene)
     if scene not in SCENES:
         close = difflib.get_close_matches(scene, SCENES, n=1, cutoff=0.5)
         raise UsageError(
             f"there is no scene named {scene!r}",
             where="SCENE",
             why=f"the named scenes are {', '.join(SCENES)}",
-            fix=f"did you mean {close[0]!r}?" if close else "take one of these, `--list` describes them",
+            fix=f"did you mean {close[0]!r}?"
+            if close
+            else "take one of these, `--list` describes them, or a file that ends in .toml",
         )
     return SCENES[scene]
 
@@ -133,6 +157,24 @@ def _check_options(scene: Scene, frames, size, seed: int, exposure_samples: int,
         "exposure_samples": (exposure_samples >= 1, f"{exposure_samples}", "at least 1"),
         "--format": (layout in FORMATS, repr(layout), f"one of {', '.join(FORMATS)}"),
     }
+    _refuse(wanted)
+
+
+def _check_engine(scene: Scene, engine: str, bounces: int, paths: int, device: str) -> None:
+    wanted = {
+        "--engine": (engine in ENGINES, repr(engine), f"one of {', '.join(ENGINES)}"),
+        "--bounces": (bounces >= 0, f"{bounces}", "0 or more"),
+        "--paths": (paths >= 1, f"{paths}", "at least 1"),
+    }
+    _refuse(wanted)
+    if engine != "mesh":
+        light = "mesh: the light is beside the camera, has a beam or bounces"
+        _refuse({"--engine": (not needs_mesh(scene, bounces), repr(engine), light)})
+        _refuse({"--device": (device == "cpu", f"{device} and engine {engine!r}", "cpu, or --engine mesh")})
+
+
+def _refuse(wanted: dict[str, tuple[bool, str, str]]) -> None:
+    """Raise what is wrong with the first option of {option: (whether it is good, what it is, what is wanted)}."""
     for where, (good, got, want) in wanted.items():
         if not good:
             raise UsageError(f"cannot simulate with {got}", where=where, why=f"expected {want}", fix="change it")

@@ -29,6 +29,7 @@ from jaxtyping import Float
 from ..constants import ALPHA_MAX, ALPHA_MIN, LOW_PASS
 from ..scene.camera import Camera
 from ..scene.gaussians import GaussianField, constant_sh
+from .assembly import Assembly
 from .world import Body, albedo, first_hit
 
 RADIUS = 0.2  # [px] of a splat before the low-pass: small, because every pixel of overlap blurs the surface
@@ -207,10 +208,13 @@ def clearance(
 ) -> Float[np.ndarray, "F"]:
     """Distance [m] between a camera and the smallest ball around a body, at ``times`` [s]; negative inside it.
 
-    ``camera`` is its position [m], or one position for each of the times.
+    ``camera`` is its position [m], or one position for each of the times. An assembly is no ball: doors are tall.
     """
-    centres = np.array([body.path.world_from_body(float(t))[:3, 3] for t in times])
-    return np.linalg.norm(centres - camera, axis=1) - body.shape.reach
+    poses = np.array([body.path.world_from_body(float(t)) for t in times])
+    if isinstance(body.shape, Assembly):
+        local = np.einsum("fji,fj->fi", poses[:, :3, :3], camera - poses[:, :3, 3])
+        return body.shape.clearance(local)
+    return np.linalg.norm(poses[:, :3, 3] - camera, axis=1) - body.shape.reach
 
 
 def merge(fields: list[GaussianField]) -> GaussianField:

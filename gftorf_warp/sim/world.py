@@ -39,6 +39,12 @@ class Texture:
     hue: float | None = field(default=None, repr=False)
     """Middle of the cells' hues, in turns: 0 red, 1/3 green, 2/3 blue; None: they have all hues."""
 
+    def __post_init__(self):
+        if not 0 <= self.low <= self.high:
+            raise ValueError(f"reflectances must be 0 <= low <= high, got low {self.low}, high {self.high}")
+        if not self.cell > 0:
+            raise ValueError(f"cell must be above 0, got {self.cell}")
+
     def __call__(self, point: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P"]:
         """Reflectance [1] at points in the body's axes [m]."""
         return self.low + (self.high - self.low) * (self._hash(point) & 0xFFFF) / 65535.0
@@ -101,6 +107,9 @@ class Box(Shape):
     inside: bool = False
     """False: a solid. True: a room."""
 
+    def __post_init__(self):
+        _check_lengths(self.size)
+
     def hit(self, origin, ray):
         """Slab method; faces are numbered 2 axis + (1 on the positive side)."""
         half = np.asarray(self.size) / 2
@@ -158,6 +167,9 @@ class Plane(Shape):
     size: tuple[float, float]
     """Edge lengths along x and y [m]."""
 
+    def __post_init__(self):
+        _check_lengths(self.size)
+
     def hit(self, origin, ray):
         """Where z = 0, if the ray comes from -z and meets the rectangle."""
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -192,6 +204,9 @@ class Sphere(Shape):
     radius: float
     """Radius [m]."""
 
+    def __post_init__(self):
+        _check_lengths((self.radius,))
+
     def hit(self, origin, ray):
         """The nearer root of |origin + t ray| = radius."""
         along = -ray @ origin
@@ -220,6 +235,11 @@ class Sphere(Shape):
         return self.radius
 
 
+def _check_lengths(lengths: tuple[float, ...]) -> None:
+    if not all(0 < length < np.inf for length in lengths):
+        raise ValueError(f"lengths must be above 0 and finite, got {lengths}")
+
+
 def _grid(width: float, height: float, spacing: float) -> Float[np.ndarray, "N 2"]:
     """Centres of a grid of cells no larger than ``spacing`` that fill a rectangle about the origin."""
     columns, rows = (max(1, int(np.ceil(length / spacing))) for length in (width, height))
@@ -238,6 +258,10 @@ class Body:
     """Its reflectance."""
     path: Path
     """Its motion."""
+
+    def __post_init__(self):
+        if self.moves and not np.isfinite(self.shape.reach):
+            raise ValueError(f"{self.shape} has no end, so it cannot move: let its path be still")
 
     @property
     def moves(self) -> bool:

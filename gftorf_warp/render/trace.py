@@ -1,0 +1,281 @@
+"""Tracing: rigid bodies as triangle meshes, balls and endless planes, and the light that a C-ToF camera gets from them.
+
+The second way from a scene to an image: no Gaussian, no sorting, no compositing, and no gradient. Each body has one
+mesh that is built once; poses move the rays. NumPy in, NumPy out, on the CPU or on CUDA from the same kernels.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+from jaxtyping import Complex, Float, Int
+
+from ..constants import SPEED_OF_LIGHT
+from ..kernels import trace
+from ..kernels.geometry import CameraView
+from ..scene.camera import Camera
+from .buffers import RenderSettings, available_threads
+from .launch import view_of
+from .stages import run_side_by_side
+
+ROWS_MIN = 8  # [px] per CPU thread: handing over fewer costs more than it saves
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RigidBody:
+    """A textured surface in its own axes: triangles, a ball, or an endless plane."""
+
+    points: Float[np.ndarray, "V 3"] | None = None
+    """Vertices [m]; None: no triangles."""
+    triangles: Int[np.ndarray, "T 3"] | None = None
+    """Three vertices each, counter-clockwise as seen from the side of the normal; None: no triangles."""
+    radius: float = 0.0
+    """Radius of a ball [m]; 0: no ball."""
+    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Centre of the ball [m]; the texture is that of the body's axes all the same."""
+    normal: tuple[float, float, float] | None = None
+    """Unit normal of an endless plane, which is seen from both sides; None: no plane."""
+    height: float = 0.0
+    """Coordinate of the plane along its normal [m]."""
+    low: float
+    """Smallest reflectance [1]."""
+    high: float
+    """Largest reflectance [1]."""
+    cell: float
+    """Edge of a texture cell [m]."""
+
+    def __post_init__(self):
+        if self.radius > 0 or self.normal is not None:
+            if self.points is not None or self.triangles is not None or (self.radius > 0) == (self.normal is not None):
+                raise ValueError(
+                    "a body is a ball, a plane or has triangles, one and not both: "
+                    f"radius {self.radius}, normal {self.normal}"
+                )
+            if not np.isfinite([*self.centre, self.height]).all():
+                raise ValueError(f"centre and height must be finite, got {self.centre} and {self.height}")
+            if self.normal is not None and abs(np.linalg.norm(self.normal) - 1) > 1e-6:
+                raise ValueError(f"normal must have length 1, got {self.normal}")
+            return
+        if self.points is None or self.triangles is None or len(self.triangles) == 0:
+            raise ValueError("a body without a radius or a normal needs points and at least one triangle")
+        if not np.isfinite(self.points).all():
+            raise ValueError("points must be finite")
+        if self.triangles.min() < 0 or self.triangles.max() >= len(self.points):
+            raise ValueError(
+                f"triangles name points {self.triangles.min()} to {self.triangles.max()} of {len(self.points)}"
+            )
+
+    @property
+    def reach(self) -> float:
+        """Distance of the farthest point from the centre [m]; 0 for a plane, which nobody asks."""
+        return self.radius if self.points is None else float(np.linalg.norm(self.points, axis=1).max())
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lamp:
+    """A point that shines evenly into a pyramid about the z axis of the camera."""
+
+    position: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Place in camera axes [m]; away from the camera, bodies cast shadows that it sees."""
+    beam_deg: tuple[float, float] | None = None
+    """Full angles across and down that are lit, below 180 [deg]; None: all directions."""
+
+    def __post_init__(self):
+        if self.beam_deg is not None and not all(0 < angle < 180 for angle in self.beam_deg):
+            raise ValueError(f"beam_deg must be between 0 and 180, got {self.beam_deg}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bounces:
+    """Light that met more than one surface, by random paths."""
+
+    count: int = 0
+    """Surfaces after the first one that a path may meet; 0: direct light only."""
+    paths: int = 64
+    """Paths per pixel, rounded up to a multiple of the instants."""
+
+    def __post_init__(self):
+        if self.count < 0 or self.paths < 1:
+            raise ValueError(f"count {self.count} must not be negative, and paths {self.paths} at least 1")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Light:
+    """Mean light of every pixel for a source intensity of 1, without the sensor's phase offset."""
+
+    light: Complex[np.ndarray, "h H W"]
+    """Sum of amplitude exp(i phase) at each harmonic of the modulation that was asked for [relative units]."""
+    amplitude: Float[np.ndarray, "H W"]
+    """Sum of the amplitudes [relative units]: at least the length of each ``light``."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FirstHits:
+    """The first surface on the ray through the centre of every pixel."""
+
+    distance: Float[np.ndarray, "H W"]
+    """Along the ray [m]; NaN where nothing is hit."""
+    z_depth: Float[np.ndarray, "H W"]
+    """Third camera coordinate [m]; NaN where nothing is hit."""
+    normal: Float[np.ndarray, "H W 3"]
+    """Unit normal in the world, towards the side that is seen; NaN where nothing is hit."""
+    body: Int[np.ndarray, "H W"]
+    """Index of the body; -1 where nothing is hit."""
+
+
+class Tracer:
+    """Bodies on one device, and the images of one size that are made of them; nothing is allocated between images.
+
+    Args:
+        bodies: What there is.
+        width: Columns of the images [px].
+        height: Rows of the images [px].
+        harmonics: Multiples of the modulation frequency at which light is wanted.
+        device: Name of the device.
+        threads: CPU threads; None: as many as this process may use. The images do not depend on it.
+    """
+
+    def __init__(
+        self,
+        bodies: Sequence[RigidBody],
+        width: int,
+        height: int,
+        *,
+        harmonics: tuple[int, ...] = (1,),
+        device: str = "cpu",
+        threads: int | None = None,
+    ):
+        wp.init()
+        self.device = wp.get_device(device)
+        self.width, self.height = width, height
+        self._meshes = [_mesh(body, self.device) for body in bodies]  # kept alive: kernels know their numbers only
+        self._solids = _solids(bodies, self._meshes, self.device)
+        self._poses: dict[int, tuple[wp.array, wp.array]] = {}
+        self._harmonics = wp.array(np.asarray(harmonics, dtype=np.int32), dtype=wp.int32, device=self.device)
+        wanted = (threads or available_threads()) if self.device.is_cpu else 1
+        self._parts = max(1, min(wanted, height // ROWS_MIN))
+        shape = (height, width)
+        self._light = [self._empty((len(harmonics), *shape), wp.vec2), self._empty(shape, wp.float32)]
+        self._hits = [self._empty(shape, dtype) for dtype in (wp.float32, wp.float32, wp.vec3, wp.int32)]
+
+    def light(
+        self,
+        cameras: Sequence[Camera],
+        world_from_body: Float[np.ndarray, "T B 4 4"],
+        f_mod_hz: float,
+        *,
+        subsamples: int = 1,
+        lamp: Lamp = Lamp(),
+        bounces: Bounces = Bounces(),
+        seed: int = 0,
+    ) -> Light:
+        """Light averaged over T instants: direct light over a grid of rays per pixel, the rest over random paths.
+
+        Args:
+            cameras: The camera at each instant; only its pose may change.
+            world_from_body: Pose of each body at each instant [m].
+            f_mod_hz: Modulation frequency [Hz].
+            subsamples: Rays per pixel and axis, on a regular grid: the same for every image.
+            lamp: Where the light is and where it shines.
+            bounces: How much of the light that met more than one surface is added.
+            seed: Of the random paths, 0 to 2^31 - 1; direct light has none.
+
+        Raises:
+            ValueError: If there is no instant, or sizes do not fit.
+        """
+        if subsamples < 1 or not f_mod_hz > 0:
+            raise ValueError(f"subsamples {subsamples} must be at least 1 and f_mod_hz {f_mod_hz} above 0")
+        view = self._view(cameras[0])
+        poses = self._place(cameras, world_from_body)
+        inputs = [view, _emitter(lamp, f_mod_hz), self._harmonics, self._solids, *poses]
+        self._over_rows(trace.trace_light, [*inputs, subsamples], self._light)
+        if bounces.count:
+            paths = -(-bounces.paths // len(cameras)) * len(cameras)
+            self._over_rows(trace.trace_bounces, [*inputs, bounces.count, paths, seed], self._light)
+        light, amplitude = (array.numpy() for array in self._light)
+        return Light(light=light[..., 0] + 1j * light[..., 1], amplitude=amplitude.copy())
+
+    def first_hits(self, camera: Camera, world_from_body: Float[np.ndarray, "B 4 4"]) -> FirstHits:
+        """What the centre ray of every pixel meets at one instant, with all bodies at these poses [m].
+
+        Raises:
+            ValueError: If sizes do not fit.
+        """
+        view = self._view(camera)
+        poses = self._place([camera], world_from_body[None])
+        self._over_rows(trace.trace_hits, [view, self._solids, *poses], self._hits)
+        distance, z_depth, normal, body = (array.numpy().copy() for array in self._hits)
+        return FirstHits(distance=distance, z_depth=z_depth, normal=normal, body=body)
+
+    def _view(self, camera: Camera) -> CameraView:
+        if (camera.width, camera.height) != (self.width, self.height):
+            raise ValueError(f"camera {camera.width}x{camera.height} must be {self.width}x{self.height}")
+        return view_of(camera, RenderSettings())
+
+    def _place(self, cameras: Sequence[Camera], world_from_body: np.ndarray) -> tuple[wp.array, wp.array]:
+        """Body from camera, composed in float64: what is far from the origin of the world loses no digits."""
+        want = (len(cameras), len(self._meshes), 4, 4)
+        if len(cameras) == 0 or world_from_body.shape != want:
+            raise ValueError(f"world_from_body {world_from_body.shape} must be {want}, with at least one instant")
+        world_from_camera = np.linalg.inv(np.stack([camera.camera_from_world for camera in cameras]))
+        body_from_camera = (np.linalg.inv(world_from_body) @ world_from_camera[:, None]).astype(np.float32)
+        rotation, translation = self._poses.setdefault(
+            len(cameras), tuple(self._empty(want[:2], dtype) for dtype in (wp.mat33, wp.vec3))
+        )
+        rotation.assign(np.ascontiguousarray(body_from_camera[..., :3, :3]))
+        translation.assign(np.ascontiguousarray(body_from_camera[..., :3, 3]))
+        return rotation, translation
+
+    def _over_rows(self, kernel, inputs: list, outputs: list[wp.array]) -> None:
+        """Launch over the rows, every n-th to a CPU thread of n, so that all have about the same to do."""
+        parts = self._parts
+        commands = [
+            wp.launch(
+                kernel,
+                dim=(len(range(part, self.height, parts)), self.width),
+                inputs=[*inputs, part, parts],
+                outputs=outputs,
+                device=self.device,
+                record_tape=False,
+                record_cmd=parts > 1,
+            )
+            for part in range(parts)
+        ]
+        if parts > 1:
+            run_side_by_side(commands, parts)
+
+    def _empty(self, shape: tuple[int, ...], dtype) -> wp.array:
+        return wp.empty(shape, dtype=dtype, device=self.device)
+
+
+def _mesh(body: RigidBody, device: wp.Device) -> wp.Mesh | None:
+    if body.points is None or body.triangles is None:
+        return None
+    points = wp.array(np.ascontiguousarray(body.points, dtype=np.float32), dtype=wp.vec3, device=device)
+    indices = wp.array(np.ascontiguousarray(body.triangles, dtype=np.int32).ravel(), dtype=wp.int32, device=device)
+    return wp.Mesh(points=points, indices=indices)
+
+
+def _emitter(lamp: Lamp, f_mod_hz: float) -> trace.Emitter:
+    emitter = trace.Emitter()
+    emitter.place = wp.vec3(*lamp.position)
+    across, down = lamp.beam_deg or (0.0, 0.0)
+    emitter.spread = wp.vec2(math.tan(math.radians(across) / 2), math.tan(math.radians(down) / 2))
+    emitter.cycles = f_mod_hz / SPEED_OF_LIGHT
+    return emitter
+
+
+def _solids(bodies: Sequence[RigidBody], meshes: Sequence[wp.Mesh | None], device: wp.Device) -> wp.array:
+    solids = []
+    for body, mesh in zip(bodies, meshes, strict=True):
+        solid = trace.Solid()
+        solid.mesh = mesh.id if mesh is not None else wp.uint64(0)
+        solid.radius, solid.centre, solid.reach = body.radius, wp.vec3(*body.centre), body.reach
+        solid.normal, solid.height = wp.vec3(*(body.normal or (0.0, 0.0, 0.0))), body.height
+        solid.low, solid.high, solid.cell = body.low, body.high, body.cell
+        solids.append(solid)
+    return wp.array(solids, dtype=trace.Solid, device=device)

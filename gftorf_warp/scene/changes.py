@@ -1,0 +1,131 @@
+"""Single settings changed by name, as people type them: ``init.reflectivity=0.5``, ``bodies.1.path.velocity=3,0,0``.
+
+Whatever is a frozen dataclass can be changed: parts by dots, members of a tuple of parts by their number.
+"""
+
+from __future__ import annotations
+
+import difflib
+import enum
+import types
+import typing
+from collections.abc import Iterable
+from dataclasses import dataclass, fields, is_dataclass, replace
+from typing import Any, TypeVar, Union
+
+from ..errors import UsageError
+
+Settings = TypeVar("Settings")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Wording:
+    """What a typing error is told."""
+
+    option: str
+    """The option that was typed."""
+    example: str
+    """A change that would be right."""
+    where: str
+    """What names all settings, as a hint when none is near."""
+    fixed: tuple[str, ...] = ()
+    """Settings that have options of their own, or cannot be changed."""
+
+
+def changed(settings: Settings, changes: Iterable[str], wording: Wording) -> Settings:
+    """Settings with some values replaced, in the order given.
+
+    Args:
+        settings: A frozen dataclass.
+        changes: Texts ``name=value``; dots join the parts of a name, commas the values of a tuple, None is ``none``.
+        wording: For messages.
+
+    Raises:
+        UsageError: If a text has no value, a name is unknown, or a value is not of the kind of the setting.
+    """
+    for text in changes:
+        name, sign, value = (part.strip() for part in text.partition("="))
+        if not sign or not value:
+            raise _refused(text, "expected NAME=VALUE", f"for example {wording.option} {wording.example}", wording)
+        settings = _with(settings, name.split("."), value, name, wording)
+    return settings
+
+
+def _with(settings: Any, path: list[str], value: str, name: str, wording: Wording) -> Any:
+    head, *rest = path
+    if isinstance(settings, tuple):
+        members = {str(i): part for i, part in enumerate(settings)}
+        kinds: dict[str, Any] = dict.fromkeys(members)
+    else:
+        members = {f.name: getattr(settings, f.name) for f in fields(settings)}
+        kinds = typing.get_type_hints(type(settings))
+    if head not in members or (head in wording.fixed and not rest):
+        before = name.removesuffix(".".join(path))
+        known = sorted(before + other for other in set(names(settings)) - set(wording.fixed))
+        close = difflib.get_close_matches(name, known, n=1, cutoff=0.4)
+        fix = f"did you mean {close[0]}?" if close else f"see {wording.where}"
+        raise _refused(name, "there is no such setting", fix, wording)
+    present = members[head]
+    if _has_parts(present) == (not rest):
+        inner = ", ".join(names(present)) if _has_parts(present) else "nothing"
+        raise _refused(name, f"{head} holds {inner}", "name a single setting", wording)
+    new = _with(present, rest, value, name, wording) if rest else _parsed(value, kinds[head], name, wording)
+    if isinstance(settings, tuple):
+        return tuple(new if key == head else part for key, part in members.items())
+    try:
+        return replace(settings, **{head: new})
+    except ValueError as error:
+        raise _refused(f"{name}={value}", str(error), "choose another value", wording) from error
+
+
+def names(settings: Any, prefix: str = "") -> list[str]:
+    """All settings, those of parts by dots."""
+    found = []
+    parts = enumerate(settings) if isinstance(settings, tuple) else _items(settings)
+    for name, value in parts:
+        found += names(value, f"{prefix}{name}.") if _has_parts(value) else [f"{prefix}{name}"]
+    return found
+
+
+def _items(settings: Any) -> list[tuple[str, Any]]:
+    return [(f.name, getattr(settings, f.name)) for f in fields(settings)]
+
+
+def _has_parts(value: Any) -> bool:
+    """Whether a value has settings of its own: a dataclass, or a tuple of such."""
+    return is_dataclass(value) or (isinstance(value, tuple) and bool(value) and all(map(is_dataclass, value)))
+
+
+def _parsed(text: str, kind: Any, name: str, wording: Wording) -> Any:
+    """A typed value as what the setting holds."""
+    if typing.get_origin(kind) in (Union, types.UnionType):
+        options = typing.get_args(kind)
+        if text.lower() == "none" and type(None) in options:
+            return None
+        kind = next(option for option in options if option is not type(None))
+    if typing.get_origin(kind) is tuple:
+        parts, wanted = text.split(","), typing.get_args(kind)
+        if wanted[1:] == (Ellipsis,):
+            wanted = wanted[:1] * len(parts)
+        if len(parts) != len(wanted):
+            raise _refused(f"{name}={text}", f"expected {len(wanted)} values", "separate them by commas", wording)
+        return tuple(_parsed(part.strip(), one, name, wording) for part, one in zip(parts, wanted, strict=True))
+    if kind is bool:
+        if text.lower() not in ("true", "false"):
+            raise _refused(f"{name}={text}", "expected true or false", "choose one", wording)
+        return text.lower() == "true"
+    if is_dataclass(kind) or kind is None:
+        raise _refused(f"{name}={text}", "it is made of parts, which a text cannot say", "write it in Python", wording)
+    try:
+        value = kind(text)
+        if value != value:
+            raise ValueError("not a number")
+        return value
+    except ValueError:
+        expected = ", ".join(kind) if isinstance(kind, enum.EnumMeta) else {"int": "a whole number"}.get(kind.__name__)
+        why = f"expected {expected or 'a number'}"
+        raise _refused(f"{name}={text}", why, "choose another value", wording) from None
+
+
+def _refused(what: str, why: str, fix: str, wording: Wording) -> UsageError:
+    return UsageError(f"cannot set {what}", where=wording.option, why=why, fix=fix)

@@ -1,0 +1,142 @@
+"""Shapes beyond the three primitives: planes without an end, and several shapes that move as one rigid body."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float
+
+from .paths import Vector
+from .world import Box, Grid, Shape
+
+FACES = 8  # numbers that the faces of one part may use; a box has 6
+
+
+@dataclass(frozen=True, kw_only=True)
+class Level(Shape):
+    """The infinite plane where one coordinate has a value, seen from both sides: a back wall, a floor.
+
+    Its axes are meant to be the world's, so that its texture is hashed from world coordinates. It cannot move, since no
+    number of splats covers it.
+    """
+
+    axis: int
+    """The coordinate: 0 is x, 1 is y, 2 is z."""
+    value: float
+    """What that coordinate is on the plane [m]."""
+
+    def __post_init__(self):
+        if self.axis not in (0, 1, 2):
+            raise ValueError(f"axis must be 0, 1 or 2, got {self.axis}")
+
+    def hit(self, origin, ray):
+        """Where the coordinate takes the value; face 1 is met by rays along which the coordinate grows, else 0."""
+        along = ray[:, self.axis]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            distance = (self.value - origin[self.axis]) / along
+        return np.where(distance > 0, distance, np.inf), (along > 0).astype(np.int64)
+
+    def normal(self, point, face):
+        """Along the axis, towards where the ray came from."""
+        normal = np.zeros_like(point)
+        normal[:, self.axis] = np.where(face > 0, -1.0, 1.0)
+        return normal
+
+    def grid(self, spacing, inset):
+        """There is none.
+
+        Raises:
+            ValueError: Always.
+        """
+        del spacing, inset
+        raise ValueError(f"{self} has no end, so nothing can cover it: let its path be Still")
+
+    @property
+    def reach(self) -> float:
+        """Infinite."""
+        return float("inf")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Part:
+    """One shape of an assembly."""
+
+    shape: Shape
+    """Its surface."""
+    position: Vector = (0.0, 0.0, 0.0)
+    """Origin of its axes in the axes of the assembly, which are parallel [m]."""
+
+    def __post_init__(self):
+        if not np.isfinite(self.shape.reach):
+            raise ValueError(f"a part must have an end, {self.shape} has none")
+        if isinstance(self.shape, Assembly):
+            raise ValueError("a part must be a single shape: list the parts of all assemblies in one")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Assembly(Shape):
+    """Shapes fixed to each other, of one texture, that move as one: a chair, the frame of a door."""
+
+    parts: tuple[Part, ...] = field(default_factory=tuple)
+    """What it is made of; parts may touch and overlap."""
+
+    def __post_init__(self):
+        if not self.parts:
+            raise ValueError("an assembly needs at least one part")
+
+    def hit(self, origin, ray):
+        """The nearest hit of any part; faces are numbered ``FACES`` times the part plus the face of the part."""
+        distance, face = np.full(len(ray), np.inf), np.zeros(len(ray), dtype=np.int64)
+        near = self._passing(origin, ray, np.zeros(3), self.reach)
+        for index, part in enumerate(self.parts):
+            position = np.asarray(part.position)
+            rays = near[self._passing(origin, ray[near], position, part.shape.reach)]
+            reached, side = part.shape.hit(origin - position, ray[rays])
+            nearer = reached < distance[rays]
+            chosen = rays[nearer]
+            distance[chosen], face[chosen] = reached[nearer], FACES * index + side[nearer]
+        return distance, face
+
+    def normal(self, point, face):
+        """That of the part that was hit."""
+        normal = np.zeros_like(point)
+        for index, part in enumerate(self.parts):
+            mine = face // FACES == index
+            normal[mine] = part.shape.normal(point[mine] - part.position, face[mine] % FACES)
+        return normal
+
+    def grid(self, spacing, inset):
+        """The grids of all parts, also where one part hides another."""
+        grids = [part.shape.grid(spacing, inset) for part in self.parts]
+        return Grid(
+            np.concatenate([g.point + part.position for g, part in zip(grids, self.parts, strict=True)]),
+            np.concatenate([g.normal for g in grids]),
+            np.concatenate([g.other for g in grids]),
+            max(g.limb for g in grids),
+        )
+
+    @cached_property
+    def reach(self) -> float:
+        """Of the part that reaches farthest [m]."""
+        return max(float(np.linalg.norm(part.position)) + part.shape.reach for part in self.parts)
+
+    def clearance(self, point: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P"]:
+        """How near the nearest part may be to points in its axes [m]: exact for boxes, to their balls for others."""
+        least = np.full(len(point), np.inf)
+        for part in self.parts:
+            local = point - part.position
+            if isinstance(part.shape, Box):
+                outside = np.maximum(np.abs(local) - np.asarray(part.shape.size) / 2, 0.0)
+                least = np.minimum(least, np.linalg.norm(outside, axis=1))
+            else:
+                least = np.minimum(least, np.linalg.norm(local, axis=1) - part.shape.reach)
+        return least
+
+    @staticmethod
+    def _passing(origin, ray, centre, radius: float):
+        """Indices of the rays that pass a ball; the others need not be asked."""
+        to = np.subtract(centre, origin)
+        along = ray @ to
+        return np.flatnonzero(to @ to - along**2 <= (radius * (1 + 1e-9)) ** 2)

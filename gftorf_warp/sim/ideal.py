@@ -1,0 +1,100 @@
+"""Quads without a renderer: the analytic first hit on a few rays per pixel, read by an ideal sensor.
+
+No noise, no blur, direct light only: what remains of the error of a closed form is motion, and the mixture of surfaces
+within a pixel if there is more than one ray. It is what the closed-form errors of the named scenes refer to. Light and
+sensor are two steps, so that one light can be read by many sensors of one modulation frequency.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Complex, Float
+
+from ..data.sequence import Sequence, Truth
+from ..scene.sensor import Sensor
+from .record import frame_times
+from .scene import Scene
+from .world import first_hit
+
+
+class Light(NamedTuple):
+    """What reaches the camera in one raw frame, whatever its shift."""
+
+    amplitude: Float[np.ndarray, "H W"]
+    """Mean amplitude a of each pixel for a source intensity of 1 [relative units]; 0 where nothing is hit."""
+    phasor: Complex[np.ndarray, "H W"]
+    """Mean of a exp(i kappa d), likewise."""
+    distance: Float[np.ndarray, "H W"]
+    """True distance along the ray through the pixel's centre [m]; NaN where nothing is hit."""
+
+
+def light_of(scene: Scene, time: float, *, rays: int = 1) -> Light:
+    """Light at an instant, for the modulation frequency of the scene's sensor.
+
+    Args:
+        scene: What is seen, at its own size.
+        time: When [s].
+        rays: Rays per pixel and axis that are averaged.
+
+    Raises:
+        ValueError: If ``rays`` is below 1.
+    """
+    if rays < 1:
+        raise ValueError(f"rays must be at least 1, got {rays}")
+    camera = scene.camera(time=time)
+    hit = first_hit(scene.bodies, camera.resized(camera.width * rays, camera.height * rays), time)
+    phase = float(scene.sensor.phase_slope) * np.where(hit.body < 0, 0.0, hit.distance)
+    amplitude, phasor = (
+        image.reshape(camera.height, rays, camera.width, rays).mean((1, 3))
+        for image in (hit.amplitude, hit.amplitude * np.exp(1j * phase))
+    )
+    true = hit.distance if rays == 1 else first_hit(scene.bodies, camera, time).distance
+    return Light(amplitude, phasor, true)
+
+
+def ideal_recording(
+    scene: Scene, lights: Mapping[int, Light] | None = None, sensor: Sensor | None = None
+) -> tuple[Sequence, Truth]:
+    """What an ideal sensor would have recorded of a scene at its own size, and the true distance.
+
+    Args:
+        scene: What is recorded; its own frames and times.
+        lights: Light by raw frame; the others are not measured and their truth is unknown. None: that of all frames.
+        sensor: Instead of the scene's; its noise is ignored, and its modulation frequency must be the same.
+
+    Raises:
+        ValueError: If the modulation frequencies differ.
+    """
+    sensor = replace(scene.sensor if sensor is None else sensor, noise=False)
+    if float(sensor.f_mod_hz) != float(scene.sensor.f_mod_hz):
+        raise ValueError(f"light of {float(scene.sensor.f_mod_hz)} Hz, read by a sensor of {float(sensor.f_mod_hz)} Hz")
+    times = frame_times(sensor, scene.frames, sync=False)
+    lights = {n: light_of(scene, float(times[n])) for n in range(scene.frames)} if lights is None else lights
+    shifts = np.array([sensor.shifts[n % len(sensor.shifts)] for n in range(scene.frames)])
+    quads = np.zeros((scene.frames, scene.height, scene.width), dtype=np.float32)
+    distance = np.full(quads.shape, np.nan, dtype=np.float32)
+    known = np.zeros(scene.frames, dtype=bool)
+    for n, light in lights.items():
+        turned = np.exp(1j * (float(sensor.phase_offset) - shifts[n]))
+        quad = (light.phasor * turned).real + float(sensor.dc_offset) * light.amplitude
+        quads[n], distance[n], known[n] = float(sensor.source_intensity) * quad, light.distance, True
+    camera = scene.camera()
+    sequence = Sequence(
+        quads=quads,
+        measured=known,
+        shifts=shifts,
+        times=times,
+        f_mod_hz=float(sensor.f_mod_hz),
+        phase_offset=float(sensor.phase_offset),
+        dc_offset=float(sensor.dc_offset),
+        fx=camera.fx,
+        fy=camera.fy,
+        cx=camera.cx,
+        cy=camera.cy,
+        camera_from_world=np.stack([scene.camera(time=float(time)).camera_from_world for time in times]),
+    )
+    return sequence, Truth(distance=distance, known=known)

@@ -1,0 +1,128 @@
+"""Scenes as TOML files of the user: the fields of :class:`gftorf_warp.sim.scene.Scene`, as tables.
+
+Every table is the settings of one dataclass. Where several kinds could stand, `kind` names one: a shape is "box",
+"plane", "sphere", "level" or "assembly", a path "still", "line", "arc", "guided", "viewpoint" or "sweep". What a table
+leaves out has its default. See examples/scene.toml.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+import tomllib
+import types
+import typing
+from dataclasses import MISSING, fields, is_dataclass
+from pathlib import Path as FilePath
+from typing import Any, Union
+
+from ..errors import InputError
+from . import assembly, guided, paths, world
+from .scene import Scene
+
+KINDS: dict[type, dict[str, type]] = {
+    world.Shape: {
+        kind.__name__.lower(): kind
+        for kind in (world.Box, world.Plane, world.Sphere, assembly.Level, assembly.Assembly)
+    },
+    paths.Path: {
+        kind.__name__.lower(): kind
+        for kind in (paths.Still, paths.Line, paths.Arc, guided.Guided, paths.Viewpoint, paths.Sweep)
+    },
+}
+NOT_THERE = ("closed_form", "overrides")  # fields of a scene that say something about it
+SIZES = {"frames": 48, "width": 160, "height": 120}  # where a file says nothing
+
+
+def read_scene(path: str | FilePath) -> Scene:
+    """The scene that a TOML file describes.
+
+    Raises:
+        InputError: If there is no such file, it is no TOML, or a table is not what its dataclass needs: which table,
+            which key, what was expected.
+    """
+    path = FilePath(path)
+    try:
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(
+            "cannot read the scene", where=path, why=error.strerror or str(error), fix="correct the path"
+        ) from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError("no TOML file", where=path, why=str(error), fix="correct that line") from error
+    texts = {"name": path.stem, "description": f"scene of {path.name}", "motion": "as its file says"}
+    for key in NOT_THERE:
+        if key in table:
+            raise _wrong(path, key, "it is no setting", "leave it out")
+    scene = _made(Scene, {**SIZES, **texts, **table}, path, "")
+    try:
+        scene.camera()
+    except ValueError as error:
+        raise _wrong(path, "camera_path", str(error), "choose another view") from error
+    return scene
+
+
+def _made(kind: type, table: Any, path: FilePath, where: str) -> Any:
+    """A dataclass of ``kind``, or of the kind that the table names."""
+    if not isinstance(table, dict):
+        raise _wrong(path, where, f"expected a table, found {table!r}", "write { ... } or [...]")
+    table = dict(table)
+    if kind in KINDS:
+        kinds, named = KINDS[kind], table.pop("kind", None)
+        if named not in kinds:
+            raise _wrong(path, _join(where, "kind"), f"expected one of {', '.join(kinds)}, found {named!r}", "name one")
+        kind = kinds[named]
+    known = {f.name: f for f in fields(kind)}
+    hints = typing.get_type_hints(kind)
+    for key in table:
+        if key not in known:
+            close = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
+            fix = f"did you mean {close[0]}?" if close else f"there are {', '.join(known)}"
+            raise _wrong(path, _join(where, key), f"a {kind.__name__} has no such setting", fix)
+    for name, f in known.items():
+        if name not in table and f.default is MISSING and f.default_factory is MISSING:
+            raise _wrong(path, _join(where, name), f"a {kind.__name__} needs it", "add it")
+    values = {key: _value(hints[key], value, path, _join(where, key)) for key, value in table.items()}
+    try:
+        return kind(**values)
+    except ValueError as error:
+        raise _wrong(path, where or "scene", str(error), "choose another value") from error
+
+
+def _value(kind: Any, value: Any, path: FilePath, where: str) -> Any:
+    """A value of TOML as what the field of a dataclass holds."""
+    if typing.get_origin(kind) in (Union, types.UnionType):
+        options = [option for option in typing.get_args(kind) if option is not type(None)]
+        table = isinstance(value, dict)
+        kind = next((option for option in options if _is_table(option) == table), options[0])
+    if _is_table(kind):
+        return _made(kind, value, path, where)
+    if typing.get_origin(kind) is tuple:
+        wanted = typing.get_args(kind)
+        if not isinstance(value, list):
+            raise _wrong(path, where, f"expected a list, found {value!r}", "write [ ... ]")
+        if wanted[1:] == (Ellipsis,):
+            wanted = wanted[:1] * len(value)
+        if len(value) != len(wanted):
+            raise _wrong(path, where, f"expected {len(wanted)} values, found {len(value)}", "correct the list")
+        return tuple(
+            _value(one, item, path, f"{where}[{i}]") for i, (one, item) in enumerate(zip(wanted, value, strict=True))
+        )
+    if kind is float and type(value) in (int, float) and math.isfinite(value):
+        return float(value)
+    if kind is not float and type(value) is kind:  # a bool is an int to isinstance
+        return value
+    names = {float: "a finite number", int: "a whole number", bool: "true or false", str: "a text"}
+    raise _wrong(path, where, f"expected {names.get(kind, kind)}, found {value!r}", "correct the value")
+
+
+def _is_table(kind: Any) -> bool:
+    return kind in KINDS or is_dataclass(kind)
+
+
+def _join(where: str, key: str) -> str:
+    return f"{where}.{key}" if where else key
+
+
+def _wrong(path: FilePath, where: str, why: str, fix: str) -> InputError:
+    return InputError("not a scene", where=f"{path}, {where}", why=why, fix=fix)
