@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -19,6 +19,7 @@ from ..render.buffers import RenderSettings
 from ..scene.camera import Camera
 from ..scene.gaussians import GaussianField
 from ..scene.motion import Motion
+from ..scene.sensor import Sensor
 from .observations import Observations
 from .settings import Kernels, Norm, ReconSettings, Weights
 
@@ -91,7 +92,8 @@ def terms(
     tof = colour = squared = None
     if weights.quads > 0 or weights.depth > 0 or weights.distortion > 0:
         moved = replace(field, colour_sh=None).moved(displacement)
-        tof = _render(moved, observations.cameras[frame], observations, frame, settings, render, backgrounds)
+        sensor = observations.sensor_at(frame)
+        tof = rendering_of(moved, observations.cameras[frame], sensor, settings, render, backgrounds)
     if tof is not None and weights.quads > 0:
         if observations.phasors:  # an amplitude is not compared: re and im say it already
             rendered, measured = tof.phasor[:2], observations.phasors[frame]
@@ -110,7 +112,8 @@ def terms(
         if motion is not None and taken != time:
             then = motion.displacement(attachment, taken)
         camera = observations.colour_cameras[frame]
-        colour = _render(field.moved(then), camera, observations, frame, settings, render, backgrounds)
+        sensor = observations.sensor_at(frame)
+        colour = rendering_of(field.moved(then), camera, sensor, settings, render, backgrounds)
         assert colour.colour is not None
         measured = observations.colour[frame]
         loss, of_colour = image_loss(colour.colour, measured, weights.ssim, weights.colour_norm, kernel=kernel)
@@ -125,22 +128,21 @@ def terms(
     return result, Seen(tof=tof, colour=colour, squared=still.new_zeros(()) if squared is None else squared)
 
 
-def _render(
+def rendering_of(
     field: GaussianField,
     camera: Camera,
-    observations: Observations,
-    frame: int,
+    sensor: Sensor,
     settings: ReconSettings,
     render: RenderSettings,
     backgrounds: Mapping[str, Tensor] | None,
 ) -> Rendering:
-    """One rendering; colour is part of it if the field has any."""
+    """One rendering before random light from behind; colour is part of it if the field has any."""
     wanted = ("colour",) if field.colour_sh is not None else ("quads", "phasor")
     lights = {name: light for name, light in (backgrounds or {}).items() if name in wanted}
     return rasterize(
         field,
         camera,
-        observations.sensor_at(frame),
+        sensor,
         render,
         background=Background(**lights),
         screen_gradient=settings.densify.every is not None,
@@ -195,18 +197,48 @@ def flow_loss(
     steps = [step for step in (1, -1) if (quartet, step) in observations.flow]
     if not steps:
         return None
-    cameras = observations.cameras
-    camera = cameras[frame]
     here, *there = motion.key_offsets(attachment, [quartet, *(quartet + step for step in steps)])
-    offsets = [offset - here for offset in there]
-    still = replace(field, colour_sh=None).moved(here).map(torch.Tensor.detach)
-    seen = rasterize(still, camera, observations.sensor_at(frame), render, extra=torch.cat(offsets, dim=1))
+    last = len(observations.cameras) - 1
+    return flow_of(
+        replace(field, colour_sh=None).moved(here),
+        [offset - here for offset in there],
+        [observations.flow[quartet, step] for step in steps],
+        observations.cameras[frame],
+        [observations.cameras[min(frame + FRAMES_PER_QUARTET * step, last)] for step in steps],
+        observations.sensor_at(frame),
+        observations.rays_at(frame),
+        render,
+    )
+
+
+def flow_of(
+    field: GaussianField,
+    offsets: Sequence[Float[Tensor, "N 3"]],
+    measured: Sequence[Float[Tensor, "2 H W"]],
+    camera: Camera,
+    later: Sequence[Camera],
+    sensor: Sensor,
+    rays: tuple[Float[Tensor, "3"], Float[Tensor, "H W 3"]],
+    render: RenderSettings,
+) -> Tensor:
+    """Sum over some flows of the mean squared difference [px^2] to what displacements would show.
+
+    Args:
+        field: Gaussians where they are; held fixed, with all weights.
+        offsets: Their displacement from here to the end of each flow [m].
+        measured: The flows; NaN: unknown.
+        camera: Where from.
+        later: The camera at the end of each flow.
+        sensor: Any; its light is not looked at.
+        rays: Centre of the camera [m] and unit vectors through its pixels, in world axes.
+        render: How to render.
+    """
+    seen = rasterize(field.map(torch.Tensor.detach), camera, sensor, render, extra=torch.cat(list(offsets), dim=1))
     assert seen.extra is not None
-    centre, ray = observations.rays_at(frame)
+    centre, ray = rays
     surface = centre + ray * seen.distance.detach()[..., None]
     errors = []
-    for n, step in enumerate(steps):
-        later = cameras[min(frame + FRAMES_PER_QUARTET * step, len(cameras) - 1)]
-        moved = image_motion(surface, seen.extra[3 * n : 3 * n + 3], camera.project, later.project)
-        errors.append(flow_error(moved, observations.flow[quartet, step])[0].mean())
+    for n, (flow, then) in enumerate(zip(measured, later, strict=True)):
+        moved = image_motion(surface, seen.extra[3 * n : 3 * n + 3], camera.project, then.project)
+        errors.append(flow_error(moved, flow)[0].mean())
     return torch.stack(errors).sum()

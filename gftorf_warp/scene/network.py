@@ -12,11 +12,11 @@ import contextlib
 from collections.abc import Iterator
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from .gaussians import GaussianField
-from .motion import Motion, MotionSettings, Products
+from .motion import Motion, MotionSettings, Products, rows_of
 
 HEAD_DEVIATION = 1e-5  # of the weights of the last layer: motion starts at rest, to a hundredth of a millimetre
 
@@ -70,14 +70,16 @@ class Network(Motion):
         """The positions at which it is asked, without gradient [m]."""
         return field.mean.detach()
 
-    def key_offsets(self, attachment: Float[Tensor, "N 3"], keys: list[int]) -> Float[Tensor, "k N 3"]:
+    def key_offsets(
+        self, attachment: Float[Tensor, "N 3"], keys: list[int] | Int[Tensor, "k"]
+    ) -> Float[Tensor, "k N 3"]:
         """Displacements [m] at several keys.
 
         A layer is linear, so what it makes of positions is computed once for all keys, and what it makes of a time is
         one vector, added like a bias.
         """
         place = encoded(attachment / self.length, self.settings.position_frequencies)
-        seconds = torch.stack([self.key_times[key] for key in keys]).to(attachment)[:, None]  # no upload
+        seconds = rows_of(self.key_times, keys).to(attachment)[:, None]
         moment = encoded(seconds / self.duration, self.settings.time_frequencies)
         hidden = self._joined(self._layers[0], None, place, moment)
         for number, layer in enumerate(self._layers[1:], start=1):
