@@ -23,6 +23,8 @@ from ..scene.sensor import Sensor
 from .observations import Observations
 from .settings import Kernels, Norm, ReconSettings, Weights
 
+NEAREST = 1e-6  # [m] of a surface: where nothing is seen nothing moves, wherever that is but at the camera itself
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Seen:
@@ -236,7 +238,7 @@ def flow_of(
     seen = rasterize(field.map(torch.Tensor.detach), camera, sensor, render, extra=torch.cat(list(offsets), dim=1))
     assert seen.extra is not None
     centre, ray = rays
-    surface = centre + ray * seen.distance.detach()[..., None]
+    surface = centre + ray * seen.distance.detach().clamp_min(NEAREST)[..., None]
     errors = []
     for n, (flow, then) in enumerate(zip(measured, later, strict=True)):
         moved = image_motion(surface, seen.extra[3 * n : 3 * n + 3], camera.project, then.project)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Mapping
+import functools
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -18,6 +19,7 @@ from .inputs import Images, Inputs, names_of
 
 INPUTS = names_of(Inputs)
 IMAGES = names_of(Images)
+SLOTS = 8  # steps that the host may be ahead of the device
 _VECTORS = {"mean": wp.vec3, "log_scale": wp.vec3, "quaternion": wp.vec4, "colour_sh": wp.vec3}
 
 
@@ -103,5 +105,64 @@ def stream_of(tensor: Tensor):
     """Order launches with the torch work around them; on the CPU there is nothing to order."""
     wp.init()
     if tensor.is_cuda:
-        return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(tensor.device)), sync_enter=False)
+        return wp.ScopedStream(known_stream(torch.cuda.current_stream(tensor.device)), sync_enter=False)
     return contextlib.nullcontext()
+
+
+@functools.cache
+def known_stream(stream: torch.cuda.Stream) -> wp.Stream:
+    """A stream of torch as Warp knows it, for good: Warp forgets captures and scratch memory of one that is dropped."""
+    return wp.stream_from_torch(stream)
+
+
+class Outbox:
+    """A few numbers that the host writes before every step and the device reads, without either waiting."""
+
+    def __init__(self, length: int, dtype: torch.dtype, device: torch.device):
+        self.there = torch.zeros(length, dtype=dtype, device=device)
+        """Where the device reads them."""
+        remote = device.type != "cpu"
+        self._slots = [torch.zeros(length, dtype=dtype, pin_memory=remote) for _ in range(SLOTS if remote else 1)]
+        self._sent: list[torch.cuda.Event | None] = [None] * len(self._slots)
+        self._next = 0
+
+    def send(self, numbers: Sequence[float]) -> None:
+        """Let the device see these from now on, in the order of the stream; a shorter list leaves the rest as it is."""
+        slot, event = self._slots[self._next], self._sent[self._next]
+        if event is not None:
+            event.synchronize()  # of a step long ago: the host is at most so many ahead
+        slot[: len(numbers)] = torch.tensor(numbers, dtype=slot.dtype)
+        self.there.copy_(slot, non_blocking=True)
+        if self.there.is_cuda:
+            self._sent[self._next] = event = event or torch.cuda.Event()
+            event.record()
+        self._next = (self._next + 1) % len(self._slots)
+
+
+class Captured:
+    """Work on one device as a CUDA graph: captured at the first call, replayed from then on; on a CPU it just runs.
+
+    What the work reads and writes must keep its addresses, and nothing of it may wait for the device. What it allocates
+    belongs to the graph; nobody else may look at it.
+    """
+
+    def __init__(self, work: Callable[[], None], device: torch.device):
+        self._work, self._device = work, device
+        self._graph: torch.cuda.CUDAGraph | None = None
+
+    def __call__(self) -> None:
+        """Do the work."""
+        if self._device.type == "cpu":
+            self._work()
+            return
+        if self._graph is None:
+            self._graph = self._capture()
+        self._graph.replay()
+
+    def _capture(self) -> torch.cuda.CUDAGraph:
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(graph, capture_error_mode="thread_local"):
+            stream = known_stream(torch.cuda.current_stream(self._device))
+            with wp.ScopedCapture(stream=stream, external=True):
+                self._work()
+        return graph

@@ -1,0 +1,306 @@
+"""A step as one graph: everything between 'which frames' and 'new parameters' is captured once, and then replayed.
+
+The host writes numbers of frames and keys, shares of the way between keys, and rates into two small tensors, and looks
+on: whether a step was finite, and how many (tile, splat) pairs there were, it learns when it asks. What a step computes
+is what recon/step.py computes (design/training-step.md); on a CPU it runs without a graph.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from ..constants import FRAMES_PER_QUARTET
+from ..losses.prior import motion_size
+from ..render import fused
+from ..render.api import Rendering
+from ..render.bridge import Captured, Outbox
+from ..scene.motion import Still
+from . import densify
+from .objective import flow_of, image_loss, render_settings_at, rendering_of, weights_at
+from .observations import Observations
+from .optimiser import BETAS, EPSILON, frozen, rates_at
+from .padded import Padded
+from .settings import ReconSettings, Weights
+from .state import State
+from .step import SEED_MASK, densify_after, draw
+
+LOG = logging.getLogger("gftorf_warp")
+HEAD = 4  # numbers before those of the images: this key, the next, the one before, the quartet
+PER_IMAGE = 3  # numbers of an image: raw frame, seed and number of its background
+ROOM = 1.5  # pairs that are reserved, over the most that were seen
+FULL, EMPTY = 0.85, 0.4  # shares of that reserve at which another one is made
+
+
+def unsuitable(observations: Observations, settings: ReconSettings, state: State) -> str | None:
+    """Why the steps of a run cannot be graphs, in words; None if they can."""
+    first = observations.cameras[0]
+    if observations.phasors or settings.weights.quads == 0:
+        return "phasors are compared, not quads"
+    if settings.weights.colour > 0 or settings.weights.depth > 0:
+        return "colour or closed-form distance is compared"
+    if any((camera.camera_from_world != first.camera_from_world).any() for camera in observations.cameras):
+        return "the camera moves"
+    if not isinstance(state.motion, Still) and any(
+        state.motion.position(observations.time_at(frame))[0] != frame // FRAMES_PER_QUARTET
+        for batch in observations.batches
+        for frame in batch
+    ):
+        return "raw frames lie outside the time of their quartet"
+    return None
+
+
+@dataclass(frozen=True)
+class Variant:
+    """What decides which operations a step consists of."""
+
+    shifts: tuple[float, ...]
+    """Phase shift of each image [rad]."""
+    moves: bool
+    """Whether Gaussians are displaced."""
+    flow: bool
+    """Whether the first image is compared with optical flow, too."""
+    rests: bool
+    """Whether the Gaussians are frozen."""
+    weights: Weights
+    """Of the terms."""
+    sh_degree: int
+    """Of the harmonics."""
+
+
+class Replay:
+    """The steps of one run. Between two steps the state is as single steps leave it, but for what is on its way."""
+
+    def __init__(self, state: State, observations: Observations, settings: ReconSettings):
+        self.observations, self.settings = observations, settings
+        device = observations.quads.device
+        self.state, self.padded = state, Padded()
+        self._graphs: dict[Variant, Callable[[], None]] = {}
+        self._capacity: int | None = None
+        self._sums: dict[str, Tensor] = {}
+        self._counts = torch.zeros(3, dtype=torch.int32, device=device)  # failed, in a row, most pairs of an image
+        longest = max(len(batch) for batch in observations.batches)
+        self._images = longest
+        self._numbers = Outbox(HEAD + PER_IMAGE * longest, torch.int32, device)
+        leaves = len(state.optimiser.leaves)
+        self._values = Outbox(leaves + longest, torch.float32, device)
+        self._groups = [*state.optimiser.tensors] + ["motion"] * len(state.optimiser.motion)
+        self._flow = self._resident_flow()
+        self._adopt()
+
+    def step(self) -> None:
+        """Advance the state by one batch; what is due after it is done, as after a single step."""
+        state, settings = self.state, self.settings
+        frames = draw(state, self.observations, settings)
+        before, state.images = state.images, state.images + len(frames)
+        variant = self._variant(frames, before)
+        rates = rates_at(settings, before, state.rate_factor, reset_at=state.reset_at)
+        due = densify.round_is_due(before, state.images, settings.densify, settings.schedule)
+        if due and settings.densify.loses_step:
+            rates = {name: rate if name == "motion" else 0.0 for name, rate in rates.items()}
+        self._write(frames, before, rates)
+        run = self._graphs.get(variant)
+        if run is None:  # the first one is done without a graph: libraries wake up, sizes become known
+            self._body(variant)
+            self._graphs[variant] = Captured(lambda: self._body(variant), self.observations.quads.device)
+        else:
+            run()
+        densify_after(state, before, settings)
+        if due or not self.padded.holds(state):
+            self._look()
+            self._adopt()
+
+    def collect(self) -> int:
+        """Bring sums and counts of the steps so far into the state; waits for the device.
+
+        Returns:
+            How many steps in a row, up to the last one, were not finite and changed nothing.
+        """
+        for name, room in self._sums.items():
+            value = self.state.sums.get(name)
+            self.state.sums[name] = room.clone() if value is None else value + room
+            room.zero_()
+        return self._look()
+
+    def _look(self) -> int:
+        """Steps in a row that failed; makes more or less room for pairs where that is due."""
+        failed, in_a_row, pairs = self._counts.tolist()
+        self.state.skipped += failed
+        if failed:
+            LOG.warning("%d steps before image %d skipped, not finite or of too many splats", failed, self.state.images)
+        self._counts[0] = 0
+        self._counts[2] = 0
+        if self._capacity is not None and pairs and not EMPTY < pairs / self._capacity < FULL:
+            self._capacity = round(ROOM * pairs)
+            self._graphs.clear()
+        return in_a_row
+
+    def _adopt(self) -> None:
+        if self.padded.adopt(self.state):
+            self._graphs.clear()
+
+    # -- what the host says --------------------------------------------------------------------------------------------
+
+    def _variant(self, frames: list[int], images: int) -> Variant:
+        weights = weights_at(self.settings, images)
+        moves = images >= self.settings.schedule.warm_up
+        return Variant(
+            shifts=tuple(float(self.observations.sequence.shifts[frame]) for frame in frames),
+            moves=moves,
+            flow=moves and weights.flow > 0 and self._flow is not None and frames[0] % FRAMES_PER_QUARTET == 0,
+            rests=frozen(self.settings, images),
+            weights=weights,
+            sh_degree=render_settings_at(self.settings, images).sh_degree,
+        )
+
+    def _write(self, frames: list[int], images: int, rates: dict[str, float]) -> None:
+        """Send what the next step has to know; the device need not be asked for anything."""
+        quartet = frames[0] // FRAMES_PER_QUARTET
+        numbers = [quartet, quartet + 1, max(quartet - 1, 0), quartet]
+        seed = self.state.noise.initial_seed() & SEED_MASK
+        for n, frame in enumerate(frames):
+            numbers += [frame, seed, images + n]
+        motion, times = self.state.motion, [self.observations.time_at(frame) for frame in frames]
+        shares = [0.0 if isinstance(motion, Still) else motion.position(time)[1] for time in times]
+        self._numbers.send(numbers)
+        self._values.send([rates[name] for name in self._groups] + shares)
+
+    # -- what the device does ------------------------------------------------------------------------------------------
+
+    def _body(self, variant: Variant) -> None:
+        """One step, from the numbers that were sent to new parameters; nothing is read back."""
+        settings, weights, padded = self.settings, variant.weights, self.padded
+        numbers, values, motion = self._numbers.there, self._values.there, self.state.motion
+        count = len(variant.shifts)
+        shares = values[len(self._groups) :]
+        field = padded.field
+        if variant.rests:
+            field = field.map(torch.Tensor.detach)
+        offsets: Tensor | None = None
+        if variant.moves:
+            attachment = motion.attach(field) if motion.follows_means else padded.attachment
+            offsets = motion.key_offsets(attachment, numbers[: 3 if variant.flow else 2])
+        render = replace(settings.render, sh_degree=variant.sh_degree, pair_capacity=self._capacity)
+        found: dict[str, Tensor] = {}
+        seen, squared, opacity = [], [], []
+        for n, shift in enumerate(variant.shifts):
+            row, background = numbers[HEAD + PER_IMAGE * n :][:PER_IMAGE].split([1, 2])
+            moved = field
+            displacement: Tensor | None = None
+            if offsets is not None:
+                displacement = torch.lerp(offsets[0], offsets[1], shares[n])
+                moved = field.moved(displacement)
+            lights = {}
+            if settings.background > 0:
+                shape = (1, *self.observations.quads.shape[1:])
+                lights["quads"] = fused.uniform(shape, background, settings.background)
+            sensor = self.observations.sensor.with_shifts((shift,))
+            tof = rendering_of(moved, self.observations.cameras[0], sensor, settings, render, lights)
+            measured = self.observations.quads.index_select(0, row)
+            loss, mean_square = image_loss(tof.quads, measured, weights.ssim, kernel=True)
+            _add(found, "quads", weights.quads * loss)
+            if weights.distortion > 0:
+                _add(found, "distortion", weights.distortion * tof.distortion.mean())
+            if weights.motion_size > 0 and displacement is not None:
+                _add(found, "motion_size", weights.motion_size * motion_size(displacement).mean())
+            seen.append(tof)
+            squared.append(mean_square)
+            opacity.append(tof.opacity.detach().mean())
+        if variant.flow and offsets is not None:
+            assert self._flow is not None
+            _add(found, "flow", weights.flow * self._flow_loss(field, offsets, numbers[3:4], variant, render))
+        loss = torch.stack([*found.values()]).sum()
+        first = len(padded.values) if variant.rests else 0
+        wanted = padded.leaves[first:]
+        gradients = torch.autograd.grad(loss, wanted, allow_unused=True) if loss.requires_grad else []
+        with torch.no_grad():
+            self._descend(gradients, loss.detach(), seen)
+            sound = self._counts[1:2] == 0
+            rows = {name: value.detach() for name, value in found.items()}
+            rows |= {"loss": loss.detach(), "quad_mse": torch.stack(squared).sum()}
+            rows |= {"opacity": torch.stack(opacity).sum(), "count": torch.full_like(loss, count)}
+            self._account(rows, sound)
+            for tof in seen:
+                if tof.screen is not None:
+                    self._observe(tof.screen, sound)
+
+    def _flow_loss(self, field, offsets: Tensor, quartet: Tensor, variant: Variant, render) -> Tensor:
+        """The flow loss of the first image, with both directions: what is unknown counts zero."""
+        assert self._flow is not None
+        measured = self._flow.index_select(0, quartet)[0]
+        camera = self.observations.cameras[0]
+        return flow_of(
+            replace(field, colour_sh=None).moved(offsets[0]),
+            [offset - offsets[0] for offset in offsets[1:]],
+            list(measured),
+            camera,
+            [camera, camera],
+            self.observations.sensor.with_shifts(variant.shifts[:1]),
+            self.observations.rays_at(0),
+            render,
+        )
+
+    def _descend(self, gradients, loss: Tensor, seen: list[Rendering]) -> None:
+        """Adam, if everything is finite and no pair was dropped; counts what happened."""
+        padded, settings = self.padded, self.settings
+        absent = padded.write_gradients(gradients)
+        if len(seen) > 1:  # not the loss: densification looks at the gradients of single images
+            torch._foreach_mul_(padded.gradients, 1.0 / len(seen))
+        norm = torch.nn.utils.get_total_norm(padded.gradients)
+        sound = (loss + norm).isfinite().reshape(1)
+        if self._capacity is not None:
+            most = torch.cat([tof.pairs for tof in seen]).amax().reshape(1)
+            sound &= most <= self._capacity
+            self._counts[2:] = torch.maximum(self._counts[2:], most)
+        failed = (~sound).to(torch.int32)
+        self._counts[:1] += failed
+        self._counts[1:2] = (self._counts[1:2] + 1) * failed
+        of_motion = padded.gradients[len(padded.values) :]
+        if of_motion and settings.motion_gradient_max is not None:
+            _shorten(of_motion, settings.motion_gradient_max)
+        rates = self._values.there[: len(self._groups)]
+        for n in absent:  # what has no gradient is left alone, as torch's Adam does
+            rates[n : n + 1].zero_()
+        assert padded.table is not None
+        fused.adam_step(padded.table, rates, sound.to(torch.int32), betas=BETAS, epsilon=EPSILON)
+
+    def _account(self, rows: dict[str, Tensor], sound: Tensor) -> None:
+        """Add to the sums of the log what a sound step found."""
+        for name in rows.keys() - self._sums.keys():
+            self._sums[name] = torch.zeros_like(rows[name])
+        names = list(rows)
+        values = torch.where(sound, torch.stack([rows[name] for name in names]), 0.0)
+        torch._foreach_add_([self._sums[name] for name in names], list(values.unbind()))
+
+    def _observe(self, screen, sound: Tensor) -> None:
+        """Add to what densification looks at."""
+        before = self.padded.statistics
+        after = densify.observe(before, screen, self.observations.cameras[0])
+        before.gradient.copy_(torch.where(sound, after.gradient, before.gradient))
+        before.pixels.copy_(torch.where(sound, after.pixels, before.pixels))
+
+    def _resident_flow(self) -> Tensor | None:
+        """[quartets, 2, 2, H, W] px to the next quartet and to the one before; NaN where there is none."""
+        flows = self.observations.flow
+        if not flows or self.settings.weights.flow == 0:
+            return None
+        quads = self.observations.quads
+        count = -(-len(quads) // FRAMES_PER_QUARTET)
+        room = torch.full((count, 2, 2, *quads.shape[1:]), float("nan"), device=quads.device)
+        for (quartet, step), flow in flows.items():
+            room[quartet, 0 if step == 1 else 1] = flow
+        return room
+
+
+def _add(found: dict[str, Tensor], name: str, value: Tensor) -> None:
+    found[name] = found[name] + value if name in found else value
+
+
+def _shorten(gradients: list[Tensor], longest: float) -> None:
+    """As torch.nn.utils.clip_grad_norm_ does it, on gradients themselves."""
+    norm = torch.nn.utils.get_total_norm(gradients)
+    torch._foreach_mul_(gradients, (longest / (norm + 1e-6)).clamp(max=1.0))
