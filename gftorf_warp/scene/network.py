@@ -17,6 +17,7 @@ from torch import Tensor
 
 from .gaussians import GaussianField
 from .motion import Motion, MotionSettings, Products
+from .perceptron import Form, Stacked
 
 HEAD_DEVIATION = 1e-5  # of the weights of the last layer: motion starts at rest, to a hundredth of a millimetre
 
@@ -54,8 +55,11 @@ class Network(Motion):
         self._inputs = (_encoded_size(3, settings.position_frequencies), _encoded_size(1, settings.time_frequencies))
         joined, width = sum(self._inputs), settings.width
         sizes = [joined] + [width] * (settings.layers - 1)
-        if settings.skip_after < settings.layers:
-            sizes[settings.skip_after] += joined
+        again = settings.skip_after if settings.skip_after < settings.layers else None
+        if again is not None:
+            sizes[again] += joined
+        place, moment = self._inputs
+        self._form = Form(place=place, moment=moment, width=width, joined=again, dtype=torch.float16)
         self._layers = [torch.nn.Linear(size, width) for size in sizes]
         self.layers = torch.nn.ModuleList(self._layers)
         self.head = torch.nn.Linear(width, 3)
@@ -66,25 +70,36 @@ class Network(Motion):
             self.head.weight.normal_(0.0, HEAD_DEVIATION, generator=generator)
             self.head.bias.zero_()
 
-    def attach(self, field: GaussianField) -> Float[Tensor, "N 3"]:
-        """The positions at which it is asked, without gradient [m]."""
-        return field.mean.detach()
+    def attach(self, field: GaussianField) -> Float[Tensor, "N p"]:
+        """gamma(x) of the positions at which it is asked, without gradient, in the precision of the products [1]."""
+        place = encoded(field.mean.detach() / self.length, self.settings.position_frequencies)
+        return self._form.padded(place) if self.settings.products == Products.HALF else place
 
-    def key_offsets(self, attachment: Float[Tensor, "N 3"], keys: list[int]) -> Float[Tensor, "k N 3"]:
-        """Displacements [m] at several keys.
+    def key_offsets(self, attachment: Float[Tensor, "N p"], keys: list[int]) -> Float[Tensor, "k N 3"]:
+        """Displacements [m] at several keys."""
+        seconds = torch.stack([self.key_times[key] for key in keys])  # no upload
+        return self.offsets(attachment, self.moment(seconds))
 
-        A layer is linear, so what it makes of positions is computed once for all keys, and what it makes of a time is
+    def moment(self, seconds: Float[Tensor, "k"]) -> Float[Tensor, "k t"]:
+        """gamma(t) of times [s], in the precision of the parameters."""
+        return encoded(seconds.to(self.head.weight)[:, None] / self.duration, self.settings.time_frequencies)
+
+    def offsets(self, attachment: Float[Tensor, "N p"], moment: Float[Tensor, "k t"]) -> Float[Tensor, "k N 3"]:
+        """Displacements [m] at several times, given as gamma(t), so that nobody has to know on the host which.
+
+        A layer is linear, so what it makes of positions is computed once for all times, and what it makes of a time is
         one vector, added like a bias.
         """
-        place = encoded(attachment / self.length, self.settings.position_frequencies)
-        seconds = torch.stack([self.key_times[key] for key in keys]).to(attachment)[:, None]  # no upload
-        moment = encoded(seconds / self.duration, self.settings.time_frequencies)
-        hidden = self._joined(self._layers[0], None, place, moment)
+        if self.settings.products == Products.HALF:
+            layers = [*self._layers, self.head]
+            parameters = [value for layer in layers for value in (layer.weight, layer.bias)]
+            return Stacked.apply(self._form, attachment, moment, *parameters)
+        hidden = self._joined(self._layers[0], None, attachment, moment)
         for number, layer in enumerate(self._layers[1:], start=1):
             hidden = torch.relu(hidden)
             skip = number == self.settings.skip_after
             if skip:
-                hidden = self._joined(layer, hidden, place, moment)
+                hidden = self._joined(layer, hidden, attachment, moment)
             else:
                 hidden = self._product(hidden, layer.weight) + layer.bias
         return self._product(torch.relu(hidden), self.head.weight) + self.head.bias
