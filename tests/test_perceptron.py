@@ -69,8 +69,8 @@ def test_finite_differences_agree_in_float64(shape):
     made = network(SHAPES[shape]).double()
     form = replace(made._form, dtype=torch.float64)
     gaussians = positions(7).map(torch.Tensor.double)
-    place = form.padded(encoded(gaussians.mean / made.length, made.settings.position_frequencies))
-    moment = made.moment(KEYS[[0, 2]])
+    place = encoded(gaussians.mean / made.length, made.settings.position_frequencies, columns=form.columns)
+    moment = made.moments[[0, 2]]
     layers = [*made.layers, made.head]
     parameters = [value.detach().requires_grad_() for layer in layers for value in (layer.weight, layer.bias)]
     found = Stacked.apply(form, place, moment, *parameters)
@@ -95,20 +95,43 @@ def test_in_float32_it_is_the_network(keys):
         assert distance(one, other) < 1e-5
 
 
+def on_the_same_side(made, gaussians, cotangent, keys):
+    """Gradients of the plain network in float64 whose units are at rest where those of the rounded one are."""
+    saved = made.key_offsets(made.attach(gaussians), keys).grad_fn.saved_tensors[-len(made.layers) :]
+    alive = [rows[:, : made.settings.width] > 0 for rows in saved]
+    twin = copy.deepcopy(made).double()
+    place = encoded(gaussians.mean.double() / made.length, made.settings.position_frequencies)
+    moment = made.moments[keys][:, None].expand(-1, len(place), -1)
+    inputs = torch.cat([place.expand(len(keys), -1, -1), moment], dim=2).flatten(0, 1)
+    hidden = inputs
+    for number, layer in enumerate(twin.layers):
+        hidden = torch.cat([hidden, inputs], dim=1) if number == made.settings.skip_after else hidden
+        hidden = layer(hidden) * alive[number]
+    found = twin.head(hidden).view_as(cotangent)
+    return torch.autograd.grad((found * cotangent.double()).sum(), list(twin.parameters()))
+
+
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("scale", [1.0, 1e-9, 1e9])
-def test_in_half_precision_every_gradient_is_right_to_a_hundredth(device, scale):
-    """However small or large the loss is: a mean over 76,800 pixels has gradients that no half can hold."""
+def test_in_half_precision_every_gradient_is_right_to_a_thousandth(device, scale):
+    """However small or large the loss is: a mean over 76,800 pixels has gradients that no half can hold.
+
+    One unit in ten thousand is at rest in one precision only, and has all of its gradient or none. That is no mistake
+    of the gradient: among equals it is right to 1e-3. If gradients of Gaussians point the same way, the rest cancels.
+    """
     made, gaussians = network(half()).to(device), positions(400).map(lambda value: value.to(device))
-    cotangent = (scale * (random(3, 400, 3, seed=5) - 0.5)).to(device)
-    found, got = gradients(made, gaussians, cotangent, [0, 1, 3])
-    want, wanted = exact(made, gaussians, cotangent, [0, 1, 3])
-    assert found.dtype == torch.float32
-    assert 1e-6 < distance(found, want) < 2e-3, "rounded, but not by much"
-    for one, other in zip(got, wanted, strict=True):
-        assert other.abs().max() > 1e-4 * scale
-        assert one.dtype == torch.float32
-        assert distance(one, other) < 1e-2
+    for offset, difference in ((0.0, 2e-2), (0.5, 8e-2)):
+        cotangent = (scale * (random(3, 400, 3, seed=5) - offset)).to(device)
+        found, got = gradients(made, gaussians, cotangent, [0, 1, 3])
+        want, wanted = exact(made, gaussians, cotangent, [0, 1, 3])
+        assert found.dtype == torch.float32
+        assert 1e-6 < distance(found, want) < 2e-3, "rounded, but not by much"
+        equals = on_the_same_side(made, gaussians, cotangent, [0, 1, 3])
+        for one, other, equal in zip(got, wanted, equals, strict=True):
+            assert other.abs().max() > 1e-4 * scale
+            assert one.dtype == torch.float32
+            assert distance(one, equal) < 2e-3
+            assert distance(one, other) < difference
 
 
 def test_the_first_steps_have_gradients_too():
@@ -116,14 +139,14 @@ def test_the_first_steps_have_gradients_too():
     made, gaussians = network(half(), head=1e-5), positions(200)
     cotangent = 1e-6 * (random(2, 200, 3, seed=5) - 0.5)
     _, got = gradients(made, gaussians, cotangent, [0, 1])
-    _, wanted = exact(made, gaussians, cotangent, [0, 1])
-    for one, other in zip(got, wanted, strict=True):
-        assert distance(one, other) < 3e-2
+    for one, equal in zip(got, on_the_same_side(made, gaussians, cotangent, [0, 1]), strict=True):
+        assert equal.abs().max() > 0
+        assert distance(one, equal) < 1e-2
 
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_offsets_of_a_trained_field_differ_by_less_than_a_millimetre(device):
-    """A field of half a metre and a second of turning, learnt in float32, asked in half precision."""
+    """A field that turns by decimetres, learnt in float32, asked in half precision."""
     made, gaussians = network(MotionSettings(), head=1e-2), positions(256)
     made, gaussians = made.to(device), gaussians.map(lambda value: value.to(device))
     place, keys = made.attach(gaussians), [0, 1, 2, 3]
@@ -140,7 +163,7 @@ def test_offsets_of_a_trained_field_differ_by_less_than_a_millimetre(device):
     quick.load_state_dict(made.state_dict())
     with torch.no_grad():
         error = (quick.key_offsets(quick.attach(gaussians), keys) - made.key_offsets(place, keys)).norm(dim=-1)
-    assert 0 < error.max() < 1e-3
+    assert 0 < error.max() < 1e-3, f"{error.max()} m"
 
 
 @pytest.mark.parametrize("device", DEVICES)
@@ -185,7 +208,7 @@ def test_a_replay_equals_a_call():
     """Captured with its gradient; also with other positions and times written in between."""
     made, gaussians = network(half()).to("cuda"), positions(2000).map(lambda value: value.to("cuda"))
     cotangent = random(2, 2000, 3).to("cuda")
-    place, moment = made.attach(gaussians), made.moment(made.key_times[:2])
+    place, moment = made.attach(gaussians), made.moments[:2].clone()
     parameters = list(made.parameters())
 
     def call():
@@ -201,7 +224,7 @@ def test_a_replay_equals_a_call():
     with torch.cuda.graph(graph):
         kept = call()
     place.mul_(0.5)
-    moment.copy_(made.moment(made.key_times[2:]))
+    moment.copy_(made.moments[2:])
     graph.replay()
     for one, other in zip(kept, call(), strict=True):
         assert torch.equal(one, other)

@@ -26,6 +26,7 @@ class Network(Motion):
     """Key offsets from a perceptron that knows nothing of single Gaussians: whoever is at a place moves with it."""
 
     follows_means = True
+    moments: Tensor  # [T, t] float64, gamma(t) of every key; of the key times, so it is not stored
 
     def __init__(
         self,
@@ -52,6 +53,8 @@ class Network(Motion):
         if not (duration > 0 and length > 0):
             raise ValueError(f"duration and length must be above 0, got {duration} s and {length} m")
         self.settings, self.duration, self.length = settings, float(duration), float(length)
+        times = encoded(self.key_times[:, None] / self.duration, settings.time_frequencies)
+        self.register_buffer("moments", times, persistent=False)
         self._inputs = (_encoded_size(3, settings.position_frequencies), _encoded_size(1, settings.time_frequencies))
         joined, width = sum(self._inputs), settings.width
         sizes = [joined] + [width] * (settings.layers - 1)
@@ -72,24 +75,22 @@ class Network(Motion):
 
     def attach(self, field: GaussianField) -> Float[Tensor, "N p"]:
         """gamma(x) of the positions at which it is asked, without gradient, in the precision of the products [1]."""
-        place = encoded(field.mean.detach() / self.length, self.settings.position_frequencies)
-        return self._form.padded(place) if self.settings.products == Products.HALF else place
+        place, form = field.mean.detach() / self.length, self._form
+        if self.settings.products == Products.HALF:
+            return encoded(place, self.settings.position_frequencies, columns=form.columns, dtype=form.dtype)
+        return encoded(place, self.settings.position_frequencies)
 
     def key_offsets(self, attachment: Float[Tensor, "N p"], keys: list[int]) -> Float[Tensor, "k N 3"]:
         """Displacements [m] at several keys."""
-        seconds = torch.stack([self.key_times[key] for key in keys])  # no upload
-        return self.offsets(attachment, self.moment(seconds))
-
-    def moment(self, seconds: Float[Tensor, "k"]) -> Float[Tensor, "k t"]:
-        """gamma(t) of times [s], in the precision of the parameters."""
-        return encoded(seconds.to(self.head.weight)[:, None] / self.duration, self.settings.time_frequencies)
+        return self.offsets(attachment, torch.stack([self.moments[key] for key in keys]))  # no upload
 
     def offsets(self, attachment: Float[Tensor, "N p"], moment: Float[Tensor, "k t"]) -> Float[Tensor, "k N 3"]:
-        """Displacements [m] at several times, given as gamma(t), so that nobody has to know on the host which.
+        """Displacements [m] at several times, given as gamma(t): rows of ``moments``, chosen on the host or the device.
 
         A layer is linear, so what it makes of positions is computed once for all times, and what it makes of a time is
         one vector, added like a bias.
         """
+        moment = moment.to(self.head.weight)
         if self.settings.products == Products.HALF:
             layers = [*self._layers, self.head]
             parameters = [value for layer in layers for value in (layer.weight, layer.bias)]
@@ -154,12 +155,27 @@ def _tf32() -> Iterator[None]:
         torch.set_float32_matmul_precision(before)
 
 
-def encoded(value: Float[Tensor, "*n d"], frequencies: int) -> Float[Tensor, "*n e"]:
-    """gamma(v): the values themselves, then sine and cosine of 2^0 v, 2^1 v, .., without a factor pi."""
+def encoded(
+    value: Float[Tensor, "*n d"], frequencies: int, *, columns: int | None = None, dtype: torch.dtype | None = None
+) -> Float[Tensor, "*n e"]:
+    """gamma(v): the values themselves, then sine and cosine of 2^0 v, 2^1 v, .., without a factor pi.
+
+    Args:
+        value: Without gradient.
+        frequencies: How many.
+        columns: Length of a row, zeros at its end; None: as many as there are.
+        dtype: Of the result, rounded at the end; None: that of the values.
+    """
+    size, dimensions = _encoded_size(value.shape[-1], frequencies), value.shape[-1]
     powers = 2.0 ** torch.arange(frequencies, dtype=value.dtype, device=value.device)
     angles = value[..., None, :] * powers[:, None]
-    waves = torch.stack([angles.sin(), angles.cos()], dim=-2)
-    return torch.cat([value, waves.flatten(start_dim=-3)], dim=-1)
+    made = torch.empty if columns in (None, size) else torch.zeros
+    rows = made(*value.shape[:-1], columns or size, dtype=dtype or value.dtype, device=value.device)
+    rows[..., :dimensions] = value
+    waves = rows[..., dimensions:size].unflatten(-1, (frequencies, 2, dimensions))
+    torch.sin(angles, out=waves[..., 0, :])
+    torch.cos(angles, out=waves[..., 1, :])
+    return rows
 
 
 def _encoded_size(dimensions: int, frequencies: int) -> int:

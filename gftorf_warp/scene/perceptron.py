@@ -4,8 +4,8 @@ With a = [gamma(x), gamma(t)] the layers are
 
     z_n = W_n h_(n-1) + b_n,   h_n = max(z_n, 0),   h_-1 = a;   before layer ``joined`` h becomes [h, a]
 
-What a layer makes of gamma(t) is one vector per key, so it is part of the bias: W a + b = W_x gamma(x) + (W_t gamma(t) + b).
-Backwards, with d_n the gradient at z_n: dW_n = d_n^T h_(n-1), db_n = sum of d_n, d_(n-1) = (d_n W_n) where h_(n-1) > 0.
+What a layer makes of gamma(t) is one vector per key, a part of the bias: W a + b = W_x gamma(x) + (W_t gamma(t) + b).
+Backwards, d_n being the gradient at z_n: dW_n = d_n^T h_(n-1), db_n = sum of d_n, d_(n-1) = d_n W_n where h_(n-1) > 0.
 
 Factors are halves; sums, weights, biases with a time in them, weight gradients and results are float32. A factor beyond
 65504 is infinite, and makes the gradient of a weight infinite or NaN: such a step is not sound. Positions have no
@@ -47,12 +47,6 @@ class Form:
         """Length of the rows that hold gamma(x): the next aligned one, if a weight is as wide."""
         return min(-(-self.place // ALIGNED) * ALIGNED, self.place + self.moment)
 
-    def padded(self, place: Float[Tensor, "N p"]) -> Float[Tensor, "N columns"]:
-        """gamma(x) in the precision of the factors, with zeros up to ``columns``."""
-        rows = place.new_zeros(len(place), self.columns, dtype=self.dtype)
-        rows[:, : self.place] = place
-        return rows
-
 
 class Stacked(torch.autograd.Function):
     """Offsets of all Gaussians at all keys, with a gradient for parameters only."""
@@ -66,7 +60,7 @@ class Stacked(torch.autograd.Function):
         Args:
             context: For the gradient.
             form: Sizes and precision.
-            place: From ``form.padded``.
+            place: gamma(x) in the precision of the factors, with zeros up to ``form.columns``.
             moment: gamma(t) of every key, in the precision of the parameters.
             parameters: Weight and bias of every layer, then of the head.
         """
@@ -139,7 +133,7 @@ def _rounded(form: Form, weights: tuple[Tensor, ...], biases: tuple[Tensor, ...]
     Where ``columns`` has more than gamma(x), a column of gamma(t) meets a column of zeros.
     """
     widths = [weight.shape[1] for weight in weights[:-1]]
-    for number in {0, form.joined} - {None}:
+    for number in [0] if form.joined is None else [0, form.joined]:
         widths[number] += form.columns - form.place - form.moment
     head = weights[-1].new_zeros(-(-len(weights[-1]) // ALIGNED) * ALIGNED, form.width, dtype=form.dtype)
     made = [head.new_empty(form.width, columns) for columns in widths]
