@@ -2,7 +2,7 @@
 
     python benchmarks/network.py [--device cpu|cuda] [--gaussians N ..] [--queries Q ..] [--repeats R] [--json FILE]
 
-A query is one key time; every timing holds one encoding of positions, as a step has it, and the gradient of all weights.
+A query is one key time; a timing holds one encoding of positions, as a step has it, and the gradient of all weights.
 On a GPU every row is timed twice: called from Python, and replayed as a CUDA graph, which must give what the call gave.
 Rows of one N and Q take turns. ``kernels`` counts what the device ran in one call, products included; ``error`` is the
 largest difference of an offset from that in float32, for weights whose offsets are a few decimetres.
