@@ -26,12 +26,14 @@ from .gaussians import GaussianField
 
 
 class Products(StrEnum):
-    """How a network multiplies matrices on CUDA."""
+    """How a network multiplies matrices."""
 
     FLOAT32 = "float32"
-    """As everywhere else."""
+    """As everywhere else: the reference."""
     TF32 = "tf32"
-    """Factors rounded to 11 bits, sums in float32: a fraction of the time; offsets differ by a thousandth."""
+    """On CUDA factors rounded to 11 bits, sums in float32: a fraction of the time; offsets differ by a thousandth."""
+    HALF = "half"
+    """Factors and activations in float16 on any device, sums and parameters in float32: the fastest on CUDA."""
 
 
 class MotionKind(StrEnum):
@@ -70,7 +72,7 @@ class MotionSettings:
     input_scale: float = 1.0
     """Network: positions are divided by this many unambiguous ranges [1]."""
     products: Products = Products.FLOAT32
-    """Network: precision of its matrix products on CUDA."""
+    """Network: precision of its matrix products."""
 
     def __post_init__(self):
         for name in ("layers", "width", "skip_after"):
