@@ -33,8 +33,9 @@ def outline_of(q: Splat, box: wp.vec4i) -> wp.vec4:
     """Outline (slope, width, narrowing, turn) of the ellipse power >= low, from its centre [px].
 
     At height v its edges are at slope v -+ sqrt(width - narrowing v^2); the right one is farthest out at v = turn, the
-    left one at -turn. A little wide: it decides what is visited, not what it is worth. Terms of the power at the pixels of ``box`` bound
-    what a pixel may round in its favour; the determinant of the conic is a difference, so it is taken in float64.
+    left one at -turn. A little wide: it decides what is visited, not what it is worth. Terms of the power at the pixels
+    of ``box`` bound what a pixel may round in its favour; the determinant of the conic is a difference, so it is taken
+    in float64.
     """
     x = wp.max(wp.abs(float(box[0]) + 0.5 - q[0]), wp.abs(float(box[2]) - 0.5 - q[0]))
     y = wp.max(wp.abs(float(box[1]) + 0.5 - q[1]), wp.abs(float(box[3]) - 0.5 - q[1]))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 from collections.abc import Mapping
 from typing import Any
 
@@ -103,5 +104,34 @@ def stream_of(tensor: Tensor):
     """Order launches with the torch work around them; on the CPU there is nothing to order."""
     wp.init()
     if tensor.is_cuda:
-        return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(tensor.device)), sync_enter=False)
+        return wp.ScopedStream(_warp_stream(torch.cuda.current_stream(tensor.device)), sync_enter=False)
     return contextlib.nullcontext()
+
+
+@functools.cache
+def _warp_stream(stream: torch.cuda.Stream) -> wp.Stream:
+    """The one Warp stream over a torch stream, kept for good.
+
+    Warp knows a stream by its handle and forgets it, scratch memory and a capture included, as soon as any of the
+    objects over that handle dies.
+    """
+    return wp.stream_from_torch(stream)
+
+
+@contextlib.contextmanager
+def captured(graph: torch.cuda.CUDAGraph, stream: torch.cuda.Stream | None = None):
+    """Capture what torch and Warp do inside the block, backward passes included, in a graph that torch replays.
+
+    The same must have run before on ``stream``: modules get loaded, constants uploaded and libraries started then. What
+    is rendered must have a reserve of pairs; with a ``Workspace`` nothing is allocated by a replay either. What the
+    graph reads and writes must live as long as it is replayed.
+
+    Args:
+        graph: An empty one.
+        stream: Where to capture, not the default stream; None: one of torch's own.
+    """
+    wp.init()
+    mode = "thread_local"  # what Warp takes for granted
+    with torch.cuda.graph(graph, stream=stream, capture_error_mode=mode):
+        with wp.ScopedCapture(stream=_warp_stream(torch.cuda.current_stream()), external=True):
+            yield
