@@ -105,14 +105,37 @@ def stream_of(tensor: Tensor):
     """Order launches with the torch work around them; on the CPU there is nothing to order."""
     wp.init()
     if tensor.is_cuda:
-        return wp.ScopedStream(known_stream(torch.cuda.current_stream(tensor.device)), sync_enter=False)
+        return wp.ScopedStream(_warp_stream(torch.cuda.current_stream(tensor.device)), sync_enter=False)
     return contextlib.nullcontext()
 
 
 @functools.cache
-def known_stream(stream: torch.cuda.Stream) -> wp.Stream:
-    """A stream of torch as Warp knows it, for good: Warp forgets captures and scratch memory of one that is dropped."""
+def _warp_stream(stream: torch.cuda.Stream) -> wp.Stream:
+    """The one Warp stream over a torch stream, kept for good.
+
+    Warp knows a stream by its handle and forgets it, scratch memory and a capture included, as soon as any of the
+    objects over that handle dies.
+    """
     return wp.stream_from_torch(stream)
+
+
+@contextlib.contextmanager
+def captured(graph: torch.cuda.CUDAGraph, stream: torch.cuda.Stream | None = None):
+    """Capture what torch and Warp do inside the block, backward passes included, in a graph that torch replays.
+
+    The same must have run before on ``stream``: modules get loaded, constants uploaded and libraries started then. What
+    is rendered must have a reserve of pairs; with a ``Workspace`` nothing is allocated by a replay either. What the
+    graph reads and writes must live as long as it is replayed.
+
+    Args:
+        graph: An empty one.
+        stream: Where to capture, not the default stream; None: one of torch's own.
+    """
+    wp.init()
+    mode = "thread_local"  # what Warp takes for granted
+    with torch.cuda.graph(graph, stream=stream, capture_error_mode=mode):
+        with wp.ScopedCapture(stream=_warp_stream(torch.cuda.current_stream()), external=True):
+            yield
 
 
 class Outbox:
@@ -161,8 +184,6 @@ class Captured:
 
     def _capture(self) -> torch.cuda.CUDAGraph:
         graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(graph, capture_error_mode="thread_local"):
-            stream = known_stream(torch.cuda.current_stream(self._device))
-            with wp.ScopedCapture(stream=stream, external=True):
-                self._work()
+        with captured(graph):
+            self._work()
         return graph

@@ -93,6 +93,10 @@ class RenderSettings:
 # owns a tile and every thread a pixel (design/tiles.md)
 TILE_SHAPES = {"cpu": (16, 8, 8), "cuda": (1, 8, 4)}
 
+# (tile, splat) pairs that one thread writes: finding the first one is a search, which a CPU should do rarely; eight
+# are one 32-byte sector of GPU memory
+PAIRS_PER_THREAD = {"cpu": 4096, "cuda": 8}
+
 
 def available_threads() -> int:
     """CPU threads this process may use."""
@@ -106,7 +110,9 @@ class Frame:
         """Reserve memory for ``count`` Gaussians and an image of ``width`` x ``height``."""
         self.count, self.width, self.height = count, width, height
         self.settings, self.device = settings, device
-        self.K, self.tile_width, self.tile_height = TILE_SHAPES["cpu" if device.is_cpu else "cuda"]
+        kind = "cpu" if device.is_cpu else "cuda"
+        self.K, self.tile_width, self.tile_height = TILE_SHAPES[kind]
+        self.share = PAIRS_PER_THREAD[kind]
         self.tiles_x = math.ceil(width / self.tile_width)
         self.tiles = self.tiles_x * math.ceil(height / self.tile_height)
         pixels = make_pixels(self.K, self.tile_width, self.tile_height)
@@ -122,7 +128,7 @@ class Frame:
         self.splats = self.array(count, Splat)
         self.box_px = self.array(count, wp.vec4i)
         self.depth_key, self.order = self.array(2 * count), self.array(2 * count)  # the radix sort wants twice the room
-        self.counts, self.offsets, self.total = self.array(count), self.array(count), self.array(1)
+        self.counts, self.ends, self.total = self.array(count), self.array(count), self.array(1)
         self.first = self.array(self.tiles + 1)
         self.keys = self.ids = self.array(0)
         self.sums = self.planes(LIGHT_PLANES)
