@@ -18,16 +18,17 @@ from ..constants import FRAMES_PER_QUARTET
 from ..losses.prior import motion_size
 from ..render import fused
 from ..render.api import Rendering
-from ..render.bridge import Captured, Outbox
+from ..render.bridge import Branches, Captured, Outbox
+from ..render.buffers import RenderSettings
 from ..scene.motion import Still
 from . import densify
 from .objective import flow_of, image_loss, render_settings_at, rendering_of, weights_at
 from .observations import Observations
 from .optimiser import BETAS, EPSILON, frozen, rates_at
 from .padded import Padded
-from .settings import ReconSettings, Weights
+from .settings import Kernels, ReconSettings, Weights
 from .state import State
-from .step import SEED_MASK, densify_after, draw
+from .step import SEED_MASK, Map, Singles, densify_after, draw
 
 LOG = logging.getLogger("gftorf_warp")
 HEAD = 4  # numbers before those of the images: this key, the next, the one before, the quartet
@@ -54,6 +55,16 @@ def unsuitable(observations: Observations, settings: ReconSettings, state: State
     return None
 
 
+def steps_of(state: State, observations: Observations, settings: ReconSettings, run_all: Map = map) -> Singles | Replay:
+    """The steps of a run, as its settings want them; ``run_all`` is for those that are no graphs."""
+    if settings.kernels == Kernels.GRAPH:
+        why = unsuitable(observations, settings, state)
+        if why is None:
+            return Replay(state, observations, settings)
+        LOG.info("steps are no graphs: %s", why)
+    return Singles(state, observations, settings, run_all)
+
+
 @dataclass(frozen=True)
 class Variant:
     """What decides which operations a step consists of."""
@@ -70,6 +81,20 @@ class Variant:
     """Of the terms."""
     sh_degree: int
     """Of the harmonics."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Image:
+    """One image of a batch."""
+
+    terms: dict[str, Tensor]
+    """Weighted terms of its loss."""
+    tof: Rendering
+    """What was compared."""
+    squared: Tensor
+    """Mean squared difference [squared quad units]."""
+    opacity: Tensor
+    """Mean opacity [1]."""
 
 
 class Replay:
@@ -90,6 +115,7 @@ class Replay:
         self._values = Outbox(leaves + longest, torch.float32, device)
         self._groups = [*state.optimiser.tensors] + ["motion"] * len(state.optimiser.motion)
         self._flow = self._resident_flow()
+        self._branches = Branches(longest, device)
         self._adopt()
 
     def step(self) -> None:
@@ -173,10 +199,8 @@ class Replay:
 
     def _body(self, variant: Variant) -> None:
         """One step, from the numbers that were sent to new parameters; nothing is read back."""
-        settings, weights, padded = self.settings, variant.weights, self.padded
-        numbers, values, motion = self._numbers.there, self._values.there, self.state.motion
-        count = len(variant.shifts)
-        shares = values[len(self._groups) :]
+        weights, padded = variant.weights, self.padded
+        numbers, motion, count = self._numbers.there, self.state.motion, len(variant.shifts)
         field = padded.field
         if variant.rests:
             field = field.map(torch.Tensor.detach)
@@ -184,49 +208,55 @@ class Replay:
         if variant.moves:
             attachment = motion.attach(field) if motion.follows_means else padded.attachment
             offsets = motion.key_offsets(attachment, numbers[: 3 if variant.flow else 2])
-        render = replace(settings.render, sh_degree=variant.sh_degree, pair_capacity=self._capacity)
+        render = replace(self.settings.render, sh_degree=variant.sh_degree, pair_capacity=self._capacity)
         found: dict[str, Tensor] = {}
-        seen, squared, opacity = [], [], []
-        for n, shift in enumerate(variant.shifts):
-            row, background = numbers[HEAD + PER_IMAGE * n :][:PER_IMAGE].split([1, 2])
-            moved = field
-            displacement: Tensor | None = None
-            if offsets is not None:
-                displacement = torch.lerp(offsets[0], offsets[1], shares[n])
-                moved = field.moved(displacement)
-            lights = {}
-            if settings.background > 0:
-                shape = (1, *self.observations.quads.shape[1:])
-                lights["quads"] = fused.uniform(shape, background, settings.background)
-            sensor = self.observations.sensor.with_shifts((shift,))
-            tof = rendering_of(moved, self.observations.cameras[0], sensor, settings, render, lights)
-            measured = self.observations.quads.index_select(0, row)
-            loss, mean_square = image_loss(tof.quads, measured, weights.ssim, kernel=True)
-            _add(found, "quads", weights.quads * loss)
-            if weights.distortion > 0:
-                _add(found, "distortion", weights.distortion * tof.distortion.mean())
-            if weights.motion_size > 0 and displacement is not None:
-                _add(found, "motion_size", weights.motion_size * motion_size(displacement).mean())
-            seen.append(tof)
-            squared.append(mean_square)
-            opacity.append(tof.opacity.detach().mean())
+        images = []
+        for n in range(count):
+            with self._branches.fork(n):
+                images.append(self._image(variant, n, field, offsets, render))
+        self._branches.join()
+        for image in images:
+            for name, value in image.terms.items():
+                found[name] = found[name] + value if name in found else value
         if variant.flow and offsets is not None:
             assert self._flow is not None
-            _add(found, "flow", weights.flow * self._flow_loss(field, offsets, numbers[3:4], variant, render))
+            found["flow"] = weights.flow * self._flow_loss(field, offsets, numbers[3:4], variant, render)
         loss = torch.stack([*found.values()]).sum()
         first = len(padded.values) if variant.rests else 0
         wanted = padded.leaves[first:]
         gradients = torch.autograd.grad(loss, wanted, allow_unused=True) if loss.requires_grad else []
         with torch.no_grad():
-            self._descend(gradients, loss.detach(), seen)
+            self._descend(gradients, loss.detach(), [image.tof for image in images])
             sound = self._counts[1:2] == 0
             rows = {name: value.detach() for name, value in found.items()}
-            rows |= {"loss": loss.detach(), "quad_mse": torch.stack(squared).sum()}
-            rows |= {"opacity": torch.stack(opacity).sum(), "count": torch.full_like(loss, count)}
-            self._account(rows, sound)
-            for tof in seen:
-                if tof.screen is not None:
-                    self._observe(tof.screen, sound)
+            rows |= {"loss": loss.detach(), "quad_mse": torch.stack([image.squared for image in images]).sum()}
+            opacity = torch.stack([image.opacity for image in images]).sum()
+            self._account(rows | {"opacity": opacity, "count": torch.full_like(loss, count)}, sound)
+            for image in images:
+                if image.tof.screen is not None:
+                    self._observe(image.tof.screen, sound)
+
+    def _image(self, variant: Variant, n: int, field, offsets: Tensor | None, render: RenderSettings) -> _Image:
+        """One image of the batch, compared."""
+        settings, weights = self.settings, variant.weights
+        numbers, share = self._numbers.there[HEAD + PER_IMAGE * n :], self._values.there[len(self._groups) + n]
+        moved, displacement, lights = field, None, {}
+        if offsets is not None:
+            displacement = torch.lerp(offsets[0], offsets[1], share)
+            moved = field.moved(displacement)
+        if settings.background > 0:
+            shape = (1, *self.observations.quads.shape[1:])
+            lights["quads"] = fused.uniform(shape, numbers[1:3], settings.background)
+        sensor = self.observations.sensor.with_shifts(variant.shifts[n : n + 1])
+        tof = rendering_of(moved, self.observations.cameras[0], sensor, settings, render, lights)
+        measured = self.observations.quads.index_select(0, numbers[:1])
+        loss, squared = image_loss(tof.quads, measured, weights.ssim, kernel=True)
+        terms = {"quads": weights.quads * loss}
+        if weights.distortion > 0:
+            terms["distortion"] = weights.distortion * tof.distortion.mean()
+        if weights.motion_size > 0 and displacement is not None:
+            terms["motion_size"] = weights.motion_size * motion_size(displacement).mean()
+        return _Image(terms=terms, tof=tof, squared=squared, opacity=tof.opacity.detach().mean())
 
     def _flow_loss(self, field, offsets: Tensor, quartet: Tensor, variant: Variant, render) -> Tensor:
         """The flow loss of the first image, with both directions: what is unknown counts zero."""
@@ -294,10 +324,6 @@ class Replay:
         for (quartet, step), flow in flows.items():
             room[quartet, 0 if step == 1 else 1] = flow
         return room
-
-
-def _add(found: dict[str, Tensor], name: str, value: Tensor) -> None:
-    found[name] = found[name] + value if name in found else value
 
 
 def _shorten(gradients: list[Tensor], longest: float) -> None:

@@ -29,11 +29,11 @@ from .config import config_of
 from .diagnostics import Watch
 from .observations import Observations, input_of, observe
 from .record import Metrics, log_to
-from .replay import Replay, unsuitable
+from .replay import steps_of
 from .run import Run
-from .settings import FlowSource, Input, Kernels, Method, ReconSettings
+from .settings import FlowSource, Input, Method, ReconSettings
 from .state import State, begin, from_dict, to_dict
-from .step import Map, Singles, pool, threads_for
+from .step import pool, threads_for
 
 LOG = logging.getLogger("gftorf_warp")
 Progress = Callable[..., None]
@@ -219,7 +219,7 @@ class _Loop:
             self.watch.look(state, self.settings)
         with _one_torch_thread(self.device), pool(self.workers) as threads, _signals() as stop:
             run_all = threads.map if self.workers > 1 else map
-            steps = self.steps_of(state, run_all)
+            steps = steps_of(state, self.observations, self.settings, run_all)
             while state.images < total:
                 before = state.images
                 broken = steps.step()
@@ -230,7 +230,7 @@ class _Loop:
                 failures = steps.collect()
                 if failures >= self.settings.failures_max:
                     state = self.go_back(state, broken)
-                    steps = self.steps_of(state, run_all)
+                    steps = steps_of(state, self.observations, self.settings, run_all)
                     continue
                 every = self.settings.schedule.log_every
                 if state.images // every > before // every or state.images >= total:
@@ -245,15 +245,6 @@ class _Loop:
                     self.save(state)
         self.save(state)
         return state
-
-    def steps_of(self, state: State, run_all: Map) -> Singles | Replay:
-        """How the steps of this state are done."""
-        if self.settings.kernels == Kernels.GRAPH:
-            why = unsuitable(self.observations, self.settings, state)
-            if why is None:
-                return Replay(state, self.observations, self.settings)
-            LOG.info("steps are no graphs: %s", why)
-        return Singles(state, self.observations, self.settings, run_all)
 
     def is_due(self, before: int, after: int) -> bool:
         """Whether there is anything to be done besides the next step."""
