@@ -15,7 +15,7 @@ from ..losses.prior import flow_error, image_motion, motion_size
 from ..losses.tof import quad_error
 from ..render import fused
 from ..render.api import Background, Rendering, rasterize
-from ..render.buffers import RenderSettings
+from ..render.buffers import RenderSettings, Workspace
 from ..scene.camera import Camera
 from ..scene.gaussians import GaussianField
 from ..scene.motion import Motion
@@ -137,6 +137,7 @@ def rendering_of(
     settings: ReconSettings,
     render: RenderSettings,
     backgrounds: Mapping[str, Tensor] | None,
+    workspace: Workspace | None = None,
 ) -> Rendering:
     """One rendering before random light from behind; colour is part of it if the field has any."""
     wanted = ("colour",) if field.colour_sh is not None else ("quads", "phasor")
@@ -148,6 +149,7 @@ def rendering_of(
         render,
         background=Background(**lights),
         screen_gradient=settings.densify.every is not None,
+        workspace=workspace,
     )
 
 
@@ -222,6 +224,7 @@ def flow_of(
     sensor: Sensor,
     rays: tuple[Float[Tensor, "3"], Float[Tensor, "H W 3"]],
     render: RenderSettings,
+    workspace: Workspace | None = None,
 ) -> Tensor:
     """Sum over some flows of the mean squared difference [px^2] to what displacements would show.
 
@@ -234,8 +237,10 @@ def flow_of(
         sensor: Any; its light is not looked at.
         rays: Centre of the camera [m] and unit vectors through its pixels, in world axes.
         render: How to render.
+        workspace: Where to render; None: in memory of its own.
     """
-    seen = rasterize(field.map(torch.Tensor.detach), camera, sensor, render, extra=torch.cat(list(offsets), dim=1))
+    still, channels = field.map(torch.Tensor.detach), torch.cat(list(offsets), dim=1)
+    seen = rasterize(still, camera, sensor, render, extra=channels, workspace=workspace)
     assert seen.extra is not None
     centre, ray = rays
     surface = centre + ray * seen.distance.detach().clamp_min(NEAREST)[..., None]

@@ -8,6 +8,7 @@ is what recon/step.py computes (design/training-step.md); on a CPU it runs witho
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -18,8 +19,8 @@ from ..constants import FRAMES_PER_QUARTET
 from ..losses.prior import motion_size
 from ..render import fused
 from ..render.api import Rendering
-from ..render.bridge import Branches, Captured, Outbox
-from ..render.buffers import RenderSettings
+from ..render.bridge import Branches, Captured, Outbox, pairs_of
+from ..render.buffers import RenderSettings, Workspace
 from ..scene.motion import Still
 from . import densify
 from .objective import flow_of, image_loss, render_settings_at, rendering_of, weights_at
@@ -34,6 +35,7 @@ LOG = logging.getLogger("gftorf_warp")
 HEAD = 4  # numbers before those of the images: this key, the next, the one before, the quartet
 PER_IMAGE = 3  # numbers of an image: raw frame, seed and number of its background
 ROOM = 1.5  # pairs that are reserved, over the most that were seen
+PAIRS = 1 << 16  # in such numbers
 FULL, EMPTY = 0.85, 0.4  # shares of that reserve at which another one is made
 
 
@@ -106,6 +108,7 @@ class Replay:
         self.state, self.padded = state, Padded()
         self._graphs: dict[Variant, Callable[[], None]] = {}
         self._capacity: int | None = None
+        self._reserves = device.type != "cpu"  # a CPU counts pairs first: nobody waits for anybody there
         self._sums: dict[str, Tensor] = {}
         self._counts = torch.zeros(3, dtype=torch.int32, device=device)  # failed, in a row, most pairs of an image
         longest = max(len(batch) for batch in observations.batches)
@@ -116,6 +119,7 @@ class Replay:
         self._groups = [*state.optimiser.tensors] + ["motion"] * len(state.optimiser.motion)
         self._flow = self._resident_flow()
         self._branches = Branches(longest, device)
+        self._workspaces = [Workspace() for _ in range(longest + 1)]  # one for each image, one for flow
         self._adopt()
 
     def step(self) -> None:
@@ -132,6 +136,8 @@ class Replay:
         run = self._graphs.get(variant)
         if run is None:  # the first one is done without a graph: libraries wake up, sizes become known
             self._body(variant)
+            if self._capacity is None:
+                self._look()
             self._graphs[variant] = Captured(lambda: self._body(variant), self.observations.quads.device)
         else:
             run()
@@ -160,8 +166,8 @@ class Replay:
             LOG.warning("%d steps before image %d skipped, not finite or of too many splats", failed, self.state.images)
         self._counts[0] = 0
         self._counts[2] = 0
-        if self._capacity is not None and pairs and not EMPTY < pairs / self._capacity < FULL:
-            self._capacity = round(ROOM * pairs)
+        if pairs and (self._capacity is None or not EMPTY < pairs / self._capacity < FULL):
+            self._capacity = math.ceil(ROOM * pairs / PAIRS) * PAIRS
             self._graphs.clear()
         return in_a_row
 
@@ -226,7 +232,7 @@ class Replay:
         wanted = padded.leaves[first:]
         gradients = torch.autograd.grad(loss, wanted, allow_unused=True) if loss.requires_grad else []
         with torch.no_grad():
-            self._descend(gradients, loss.detach(), [image.tof for image in images])
+            self._descend(gradients, loss.detach(), count)
             sound = self._counts[1:2] == 0
             rows = {name: value.detach() for name, value in found.items()}
             rows |= {"loss": loss.detach(), "quad_mse": torch.stack([image.squared for image in images]).sum()}
@@ -248,7 +254,8 @@ class Replay:
             shape = (1, *self.observations.quads.shape[1:])
             lights["quads"] = fused.uniform(shape, numbers[1:3], settings.background)
         sensor = self.observations.sensor.with_shifts(variant.shifts[n : n + 1])
-        tof = rendering_of(moved, self.observations.cameras[0], sensor, settings, render, lights)
+        workspace = self._workspaces[n]
+        tof = rendering_of(moved, self.observations.cameras[0], sensor, settings, render, lights, workspace)
         measured = self.observations.quads.index_select(0, numbers[:1])
         loss, squared = image_loss(tof.quads, measured, weights.ssim, kernel=True)
         terms = {"quads": weights.quads * loss}
@@ -272,20 +279,22 @@ class Replay:
             self.observations.sensor.with_shifts(variant.shifts[:1]),
             self.observations.rays_at(0),
             render,
+            self._workspaces[-1],
         )
 
-    def _descend(self, gradients, loss: Tensor, seen: list[Rendering]) -> None:
+    def _descend(self, gradients, loss: Tensor, images: int) -> None:
         """Adam, if everything is finite and no pair was dropped; counts what happened."""
         padded, settings = self.padded, self.settings
         absent = padded.write_gradients(gradients)
-        if len(seen) > 1:  # not the loss: densification looks at the gradients of single images
-            torch._foreach_mul_(padded.gradients, 1.0 / len(seen))
+        if images > 1:  # not the loss: densification looks at the gradients of single images
+            torch._foreach_mul_(padded.gradients, 1.0 / images)
         norm = torch.nn.utils.get_total_norm(padded.gradients)
         sound = (loss + norm).isfinite().reshape(1)
-        if self._capacity is not None:
-            most = torch.cat([tof.pairs for tof in seen]).amax().reshape(1)
-            sound &= most <= self._capacity
+        if self._reserves:
+            most = torch.cat([pairs_of(workspace) for workspace in self._workspaces[:images]]).amax().reshape(1)
             self._counts[2:] = torch.maximum(self._counts[2:], most)
+            if self._capacity is not None:
+                sound &= most <= self._capacity
         failed = (~sound).to(torch.int32)
         self._counts[:1] += failed
         self._counts[1:2] = (self._counts[1:2] + 1) * failed

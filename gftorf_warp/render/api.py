@@ -12,8 +12,8 @@ from torch import Tensor
 from ..scene.camera import Camera
 from ..scene.gaussians import GaussianField
 from ..scene.sensor import Sensor
-from .bridge import IMAGES, INPUTS, Rasterize
-from .buffers import RenderSettings
+from .bridge import IMAGES, INPUTS, Rasterize, Request
+from .buffers import RenderSettings, Workspace
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -72,6 +72,7 @@ def rasterize(
     background: Background | None = None,
     extra: Float[Tensor, "N D"] | None = None,
     screen_gradient: bool = False,
+    workspace: Workspace | None = None,
 ) -> Rendering:
     """Render Gaussians into everything a C-ToF pixel could record (paper, equations 3-5).
 
@@ -86,6 +87,7 @@ def rasterize(
         background: Light from behind everything; None is black.
         extra: D more channels per Gaussian, composited like colour, for example 3D motion [m].
         screen_gradient: Whether ``Rendering.screen`` is wanted.
+        workspace: Memory to render in, for whoever does so again and again; None: each rendering has its own.
 
     Raises:
         ValueError: If a tensor is not float32 or lives elsewhere than the field.
@@ -111,7 +113,8 @@ def rasterize(
     screen = torch.zeros(count, 3, device=field.device) if screen_gradient else None
     ordered = [None if t is None else t.contiguous() for t in (tensors[name] for name in INPUTS)]
     shifts = tuple(float(shift) for shift in sensor.shifts)
-    images = dict(zip(IMAGES, Rasterize.apply(camera, shifts, settings, screen, *ordered), strict=True))
+    request = Request(camera=camera, shifts=shifts, settings=settings, screen=screen, workspace=workspace)
+    images = dict(zip(IMAGES, Rasterize.apply(request, *ordered), strict=True))
     if extra is not None and images["extra"] is None:
         images["extra"] = extra.new_zeros(0, *size)
     return Rendering(

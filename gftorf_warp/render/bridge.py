@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import functools
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -14,7 +15,7 @@ from torch.autograd.function import once_differentiable
 
 from ..scene.camera import Camera
 from . import launch
-from .buffers import Frame, RenderSettings
+from .buffers import Frame, RenderSettings, Workspace
 from .inputs import Images, Inputs, names_of
 
 INPUTS = names_of(Inputs)
@@ -23,32 +24,43 @@ SLOTS = 8  # steps that the host may be ahead of the device
 _VECTORS = {"mean": wp.vec3, "log_scale": wp.vec3, "quaternion": wp.vec4, "colour_sh": wp.vec3}
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Request:
+    """What is rendered, and how, besides tensors with a derivative."""
+
+    camera: Camera
+    """Where from."""
+    shifts: tuple[float, ...]
+    """Phase shifts of the quads [rad]."""
+    settings: RenderSettings
+    """How."""
+    screen: Tensor | None = None
+    """[N, 3] that backward fills with the screen gradient and the number of pixels; None: not wanted."""
+    workspace: Workspace | None = None
+    """Where; None: in memory of its own."""
+
+
 class Rasterize(torch.autograd.Function):
-    """All images of one rendering from all inputs of one; each rendering has arrays of its own."""
+    """All images of one rendering from all inputs of one; without a workspace each has arrays of its own."""
 
     @staticmethod
     def forward(
         ctx: Any,
-        camera: Camera,
-        shifts: tuple[float, ...],
-        settings: RenderSettings,
-        screen: Tensor | None,
+        request: Request,
         *tensors: Tensor | None,
     ) -> tuple[Tensor | None, ...]:
         """Return the images in the order of ``IMAGES``, None where there is none.
 
         Args:
             ctx: Of autograd.
-            camera: Where from.
-            shifts: Phase shifts of the quads [rad].
-            settings: How.
-            screen: [N, 3] that backward fills with the screen gradient and the number of pixels; None: not wanted.
+            request: What and how.
             tensors: In the order of ``INPUTS``, float32, contiguous, None where there is none.
         """
         ctx.set_materialize_grads(False)
         named = dict(zip(INPUTS, tensors, strict=True))
         mean, extra, colour_sh = named["mean"], named["extra"], named["colour_sh"]
         assert mean is not None
+        camera, shifts = request.camera, request.shifts
         size = camera.height, camera.width
         shapes = {"quads": (len(shifts), *size), "phasor": (3, *size), "distance": size, "opacity": size}
         shapes |= {"distortion": size}
@@ -57,11 +69,12 @@ class Rasterize(torch.autograd.Function):
         images = {name: mean.new_empty(shapes[name]) for name in IMAGES if name in shapes}
         with stream_of(mean):
             device = wp.device_from_torch(mean.device)
-            frame = Frame(len(mean), camera.width, camera.height, settings, device)
-            view = launch.view_of(camera, settings)
+            kind = len(mean), camera.width, camera.height, request.settings, device
+            frame = Frame(*kind) if request.workspace is None else request.workspace.frame(*kind)
+            view = launch.view_of(camera, request.settings)
             launch.forward(_inputs(named), view, shifts, frame, _images(images))
         ctx.save_for_backward(*tensors)
-        ctx.state = view, shifts, frame, screen
+        ctx.state = request, view, frame, frame.turns
         return tuple(images.get(name) for name in IMAGES)
 
     @staticmethod
@@ -69,8 +82,11 @@ class Rasterize(torch.autograd.Function):
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
         """Launch the adjoints explicitly: no tape, no state outside ``ctx``; gradients into fresh tensors."""
         named = dict(zip(INPUTS, ctx.saved_tensors, strict=True))
-        view, shifts, frame, screen = ctx.state
-        needed = dict(zip(INPUTS, ctx.needs_input_grad[4:], strict=True))
+        request, view, frame, turn = ctx.state
+        if frame.turns != turn:
+            raise ValueError("its workspace has rendered again since: call backward before the next rendering with it")
+        shifts, screen = request.shifts, request.screen
+        needed = dict(zip(INPUTS, ctx.needs_input_grad[1:], strict=True))
         wanted = {name: torch.zeros_like(named[name]) for name in INPUTS if needed[name]}
         cotangents = {name: g.contiguous() for name, g in zip(IMAGES, grads, strict=True) if g is not None}
         if cotangents and wanted:
@@ -79,7 +95,7 @@ class Rasterize(torch.autograd.Function):
                 if screen is not None and len(screen):
                     found = wp.to_torch(records)  # a list of columns would be uploaded as an index
                     screen[:, :2], screen[:, 2] = found[:, :2], found[:, 6]
-        return None, None, None, None, *(wanted.get(name) for name in INPUTS)
+        return None, *(wanted.get(name) for name in INPUTS)
 
 
 def _inputs(named: Mapping[str, Tensor | None]) -> Inputs:
@@ -136,6 +152,15 @@ def captured(graph: torch.cuda.CUDAGraph, stream: torch.cuda.Stream | None = Non
     with torch.cuda.graph(graph, stream=stream, capture_error_mode=mode):
         with wp.ScopedCapture(stream=_warp_stream(torch.cuda.current_stream()), external=True):
             yield
+
+
+def pairs_of(workspace: Workspace) -> Tensor:
+    """[1] int32: (tile, splat) pairs of the last rendering, where it was made; more than the reserve if some were lost.
+
+    Raises:
+        ValueError: If nothing has been rendered there.
+    """
+    return wp.to_torch(workspace.last.total)
 
 
 class Outbox:

@@ -55,6 +55,7 @@ def render(inputs: Inputs, view: CameraView, shifts: tuple[float, ...], frame: F
 
 def forward(inputs: Inputs, view: CameraView, shifts: tuple[float, ...], frame: Frame, images: Images) -> None:
     """Project, sort, composite, resolve."""
+    frame.turns += 1
     if frame.count:
         stages.project(inputs, view, frame)
         stages.sort_by_depth(frame)
@@ -62,11 +63,11 @@ def forward(inputs: Inputs, view: CameraView, shifts: tuple[float, ...], frame: 
     else:
         frame.first.zero_()
     groups = channel_groups(inputs)
-    frame.channels = [frame.planes(CHANNEL_PLANES) for _ in groups]
+    frame.channels = [frame.planes(f"channels {number}", CHANNEL_PLANES) for number in range(len(groups))]
     frame.records = [frame.splats]
     for number, (name, start) in enumerate(groups):
         if number > 0:
-            frame.records.append(frame.array(frame.count, splat.Splat))
+            frame.records.append(frame.array(f"records {number}", frame.count, splat.Splat))
         if name == "extra":
             stages.set_channels(frame, inputs, start, frame.records[number])
     for number in range(len(frame.records)):
@@ -77,14 +78,15 @@ def forward(inputs: Inputs, view: CameraView, shifts: tuple[float, ...], frame: 
 def backward(
     inputs: Inputs, view: CameraView, shifts: tuple[float, ...], frame: Frame, cotangents: Images, wanted: Inputs
 ) -> wp.array:
-    """Add to the arrays of ``wanted`` what ``cotangents`` say; leaves the frame as it was.
+    """Add to the arrays of ``wanted`` what ``cotangents`` say; what forward left in the frame stays as it was.
 
     Returns:
         [N] gradient records of the splats: slots 0 and 1 are the screen gradient, slot 6 the number of pixels.
+        They belong to the frame.
     """
     groups = channel_groups(inputs)
     grad_light, grad_channels = stages.fold_images(inputs, shifts, frame, cotangents, wanted, groups)
-    grad_splats = wp.zeros(frame.count, dtype=splat.Splat, device=frame.device)
+    grad_splats = frame.zeros("gradient records", frame.count, splat.Splat)
     if not frame.count:
         return grad_splats
     stages.composite_backward(frame, 0, grad_light, grad_channels[0], grad_splats)
@@ -93,7 +95,7 @@ def backward(
             continue
         records = grad_splats
         if number > 0:  # a further pass shares centres, conics and opacities with the first
-            records = wp.zeros_like(grad_splats)
+            records = frame.zeros("gradient records of a further pass", frame.count, splat.Splat)
             stages.composite_backward(frame, number, grad_light, grad_channels[number], records)
             stages.add_geometry(records, grad_splats)
         if name == "extra" and wanted.extra is not None:

@@ -66,11 +66,12 @@ def rasterize(
     background: Background | None = None,
     extra: Float[Tensor, "N D"] | None = None,
     screen_gradient: bool = False,
+    workspace: Workspace | None = None,
 ) -> Rendering:
     """Oracle of :func:`gftorf_warp.render.api.rasterize`; computes in the dtype of the field.
 
     ``Rendering.screen`` is filled by ``backward()``, not by ``torch.autograd.grad`` with respect to tensors the image
-    positions do not depend on. ``pair_capacity`` and ``threads`` of the settings have no meaning here.
+    positions do not depend on. ``workspace``, and ``pair_capacity`` and ``threads`` of the settings, have no meaning here.
     """
     background = background or Background()
     height, width, q = camera.height, camera.width, len(sensor.shifts)

@@ -112,7 +112,7 @@ def composite_backward(
     kernel = make_composite_backward(*shape, light, channels, passes, metric)
     channel = grad_channel.lanes if grad_channel is not None else _nothing(frame, 3, frame.sums.lanes.dtype)
     edges = _tile_edges(frame, frame.threads)
-    parts = [records] + [wp.zeros_like(records) for _ in range(len(edges) - 2)]
+    parts = [records] + [frame.zeros(f"records of thread {n}", frame.count, splat.Splat) for n in range(len(edges) - 2)]
     lists = [frame.first, frame.ids, frame.records[number], frame.tiles_x]
 
     def arguments(tile0: int, part: int) -> list:
@@ -165,7 +165,7 @@ def resolve_images(inputs: Inputs, shifts, frame: Frame, images: Images, groups:
 def fold_images(inputs: Inputs, shifts, frame: Frame, cotangents: Images, wanted: Inputs, groups: list):
     """Images to planes: the adjoint of :func:`resolve_images`. Channels without a gradient are None."""
     pixels, sums, tiling = (frame.height, frame.width), frame.sums.flat, frame.tiling
-    planes = frame.gradient_planes(GRAD_LIGHT_PLANES)
+    planes = frame.gradient_planes("gradient of light", GRAD_LIGHT_PLANES)
     target = planes.flat
     if cotangents.quads is not None and shifts:
         vectors = _shift_vectors(shifts, str(frame.device))
@@ -173,7 +173,7 @@ def fold_images(inputs: Inputs, shifts, frame: Frame, cotangents: Images, wanted
         outputs = [target, _or_nothing(frame, wanted.background_quads)]
         _launch(resolve.fold_quads, pixels, [*lit, cotangents.quads], outputs)
         if wanted.calibration is not None:
-            rows = frame.array(frame.height, wp.float64)
+            rows = frame.array("rows", frame.height, wp.float64)
             _launch(resolve.fold_dc_offset, frame.height, [sums, tiling, cotangents.quads], [rows])
             _launch(resolve.add_dc_offset, 1, [rows], [wanted.calibration])
     if cotangents.phasor is not None:
@@ -188,12 +188,12 @@ def fold_images(inputs: Inputs, shifts, frame: Frame, cotangents: Images, wanted
         if image is not None:
             _launch(resolve.fold_plane, pixels, [image, tiling, factor, plane], [target])
     channels: list[Planes | None] = []
-    for name, start in groups:
+    for number, (name, start) in enumerate(groups):
         cotangent = getattr(cotangents, name)
         if cotangent is None:
             channels.append(None)
             continue
-        grad = frame.gradient_planes(CHANNEL_PLANES)
+        grad = frame.gradient_planes(f"gradient of channels {number}", CHANNEL_PLANES)
         colour = name == "colour"
         background = _or_nothing(frame, inputs.background_colour if colour else None)
         grad_background = _or_nothing(frame, wanted.background_colour if colour else None)
