@@ -29,6 +29,7 @@ TABLE = {  # room: (rooms it may import besides itself, packages it may import);
     "sim": ({"data", "kernels", "render", "scene"}, TORCH),
     "recon": ({"data", "losses", "render", "scene"}, TORCH | {"cv2"}),
     "evaluate": ({"data", "losses", "recon", "render", "scene"}, TORCH | {"cv2", "matplotlib"}),
+    "bench": ({"data", "evaluate", "recon", "render", "scene", "sim"}, TORCH | {"warp"}),
 }
 FREE = {"constants", "errors", "__version__"}
 HAS_BOTH = {  # the only modules that may know torch and Warp together
