@@ -20,8 +20,8 @@ from pathlib import Path
 import naive
 import numpy as np
 import warp as wp
-from surfaces import CAMERA, FAR, HEIGHT, NEAR, WIDTH, inputs_of, surface
 
+from gftorf_warp.bench.scenes import CAMERA, FAR, HEIGHT, NEAR, WIDTH, inputs_of, surface
 from gftorf_warp.kernels.composite import CHANNEL_PLANES
 from gftorf_warp.kernels.composite_backward import GRAD_LIGHT_PLANES
 from gftorf_warp.kernels.splat import Splat

@@ -154,7 +154,26 @@ def command_parsers() -> dict[str, Parser]:
     doctor = _command("doctor", "print versions and devices, and test the renderer on this machine")
     _device_options(doctor)
 
-    parsers = (demo, simulate, reconstruct, render, compare, check, doctor)
+    bench = _command("bench", "measure what things cost: tables, and JSON")
+    parts = "renderer, motion, step, reconstruction, render (all of them)"
+    bench.add_argument("parts", metavar="PART", nargs="*", help=parts)
+    bench.add_argument(
+        "--quick", action="store_true", help="small sizes, few runs: whether it works, not what it costs"
+    )
+    bench.add_argument("--json", metavar="FILE", help="file for everything that was measured")
+    bench.add_argument("--sequence", metavar="SEQ", help="folder of a sequence (a simulated scene that slides past)")
+    state = "run whose state is timed by step and render (one made from measured phase)"
+    bench.add_argument("--run", metavar="RUN", help=state)
+    lengths = "images of step, reconstruction and render (their own numbers)"
+    bench.add_argument("--images", metavar="N", type=_positive, help=lengths)
+    bench.add_argument(
+        "--preset", metavar="NAME", help="of step and reconstruction (released; on a CPU demo for the latter)"
+    )
+    single = "change one setting of step and reconstruction, as in reconstruct (may be repeated)"
+    bench.add_argument("--set", metavar="NAME=VALUE", action="append", default=[], help=single)
+    _device_options(bench)
+
+    parsers = (demo, simulate, reconstruct, render, compare, check, doctor, bench)
     return {parser.prog.split()[-1]: parser for parser in parsers}
 
 

@@ -29,16 +29,19 @@ TABLE = {  # room: (rooms it may import besides itself, packages it may import);
     "sim": ({"data", "kernels", "render", "scene"}, TORCH),
     "recon": ({"data", "losses", "render", "scene"}, TORCH | {"cv2"}),
     "evaluate": ({"data", "losses", "recon", "render", "scene"}, TORCH | {"cv2", "matplotlib"}),
+    "bench": ({"data", "evaluate", "recon", "render", "scene", "sim"}, TORCH | {"warp"}),
 }
 FREE = {"constants", "errors", "__version__"}
 HAS_BOTH = {  # the only modules that may know torch and Warp together
     "render/bridge.py": "a rendering, and its gradient",
     "render/fused.py": "what a step does beside rendering: other kernels and callers",
+    "render/replay.py": "renderings of a finished run: a field of torch, a graph of Warp",
 }
 LAUNCHES = {  # file: what it launches
     "render/launch.py": "the order of a rendering",
     "render/stages.py": "the stages of a rendering",
     "render/training.py": "what a step does beside rendering",
+    "render/replay.py": "Gaussians at a time, before they are rendered again",
     "render/trace.py": "rays through meshes, which share nothing with a rendering",
 }
 KNOWS_KINDS = {"render/buffers.py": "the shape of a tile depends on the kind of device, which is the input's"}

@@ -25,11 +25,11 @@ from ..render.buffers import available_threads
 from ..scene.changes import Wording, changed
 from ..scene.measured import sensor_of
 from . import checkpoint, folder, presets
+from .captured import steps_of
 from .config import config_of
 from .diagnostics import Watch
 from .observations import Observations, input_of, observe
 from .record import Metrics, log_to
-from .replay import steps_of
 from .run import Run
 from .settings import FlowSource, Input, Method, ReconSettings
 from .state import State, begin, from_dict, to_dict

@@ -1,20 +1,22 @@
-"""The scenes of the benchmarks, and what the renderer reads of them."""
+"""The two families of scenes on which the renderer is timed, and what it reads of them; Warp and NumPy only."""
 
 from __future__ import annotations
 
 import math
 
 import numpy as np
-import torch
 import warp as wp
+from jaxtyping import Float
 
-from gftorf_warp.render.inputs import Inputs
-from gftorf_warp.scene.camera import Camera
-from gftorf_warp.scene.gaussians import constant_sh
+from ..constants import SH_BIAS, SH_COEFFICIENTS, SH_Y0
+from ..render.inputs import Inputs
+from ..scene.camera import Camera
 
 WIDTH, HEIGHT, FOCAL = 320, 240, 280.0
 NEAR, FAR = 0.135, 7.425  # [m]
 CAMERA = Camera(width=WIDTH, height=HEIGHT, fx=FOCAL, fy=FOCAL, cx=WIDTH / 2, cy=HEIGHT / 2)
+CALIBRATION = (4 * math.pi / 15, 0.0, 1.0, 0.0)  # phase slope of depth_range 15 m [rad/m], offsets, intensity
+FAMILIES = (("surface", 0.015, 0.6), ("surface", 0.03, 0.6), ("volume", 0.03, 0.1))  # kind, scale [m], opacity
 
 
 def surface(count: int, scale: float, opacity: float) -> dict[str, np.ndarray]:
@@ -43,21 +45,39 @@ def volume(count: int, scale: float, opacity: float) -> dict[str, np.ndarray]:
     return scene
 
 
-def inputs_of(scene: dict[str, np.ndarray], device: str | wp.Device) -> Inputs:
-    """The scene as Warp arrays, seen by a sensor with depth_range 15 m."""
-    colour_sh = constant_sh(torch.tensor(scene["colour"].T, dtype=torch.float32)).permute(1, 2, 0).numpy()
-    reflectivity_sh = constant_sh(torch.tensor(scene["reflectivity"], dtype=torch.float32)).numpy()
+def scene_of(kind: str, count: int, scale: float, opacity: float) -> dict[str, np.ndarray]:
+    """A scene of one of the two families.
+
+    Args:
+        kind: "surface" or "volume".
+        count: Number N of Gaussians.
+        scale: Standard deviation of each [m].
+        opacity: Of each at its peak [1].
+    """
+    return {"surface": surface, "volume": volume}[kind](count, scale, opacity)
+
+
+def inputs_of(scene: dict[str, np.ndarray], device: str | wp.Device, *, colour: bool = True) -> Inputs:
+    """The scene as Warp arrays, seen by a sensor with depth_range 15 m, with or without colour."""
+    rgb = array_of(_constant(scene["colour"].T).transpose(1, 2, 0), device, wp.vec3) if colour else None
     return Inputs(
         mean=array_of(scene["mean"], device, wp.vec3),
         log_scale=array_of(scene["log_scale"], device, wp.vec3),
         quaternion=array_of(scene["quaternion"], device, wp.vec4),
         opacity_logit=array_of(scene["opacity_logit"], device),
-        reflectivity_sh=array_of(reflectivity_sh, device),
-        colour_sh=array_of(colour_sh, device, wp.vec3),
-        calibration=array_of([4 * math.pi / 15, 0.0, 1.0, 0.0], device),
+        reflectivity_sh=array_of(_constant(scene["reflectivity"]), device),
+        colour_sh=rgb,
+        calibration=array_of(CALIBRATION, device),
     )
 
 
 def array_of(value, device: str | wp.Device, dtype=float) -> wp.array:
     """A float32 array on the device."""
     return wp.array(np.ascontiguousarray(value, np.float32), dtype=dtype, device=device)
+
+
+def _constant(value: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n 16"]:
+    """Harmonics that give ``value`` in every direction."""
+    coefficients = np.zeros((*value.shape, SH_COEFFICIENTS), dtype=np.float32)
+    coefficients[..., 0] = (value.astype(np.float32) - SH_BIAS) / SH_Y0
+    return coefficients

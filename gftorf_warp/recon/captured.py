@@ -57,12 +57,14 @@ def unsuitable(observations: Observations, settings: ReconSettings, state: State
     return None
 
 
-def steps_of(state: State, observations: Observations, settings: ReconSettings, run_all: Map = map) -> Singles | Replay:
+def steps_of(
+    state: State, observations: Observations, settings: ReconSettings, run_all: Map = map
+) -> Singles | CapturedSteps:
     """The steps of a run, as its settings want them; ``run_all`` is for those that are no graphs."""
     if settings.kernels == Kernels.GRAPH:
         why = unsuitable(observations, settings, state)
         if why is None:
-            return Replay(state, observations, settings)
+            return CapturedSteps(state, observations, settings)
         LOG.info("steps are no graphs: %s", why)
     return Singles(state, observations, settings, run_all)
 
@@ -99,7 +101,7 @@ class _Image:
     """Mean opacity [1]."""
 
 
-class Replay:
+class CapturedSteps:
     """The steps of one run. Between two steps the state is as single steps leave it, but for what is on its way."""
 
     def __init__(self, state: State, observations: Observations, settings: ReconSettings):
