@@ -13,6 +13,9 @@ from gftorf_warp.recon.settings import Batch, Kernels
 from gftorf_warp.recon.state import begin
 
 
+DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA"))]
+
+
 def begun(settings, device="cpu"):
     """A state of Gaussians that are not round, and what it is fitted to."""
     observations = observe(small(), settings, device)
@@ -34,13 +37,14 @@ def published(**changes):
     return replace(settings, schedule=replace(settings.schedule, warm_up=6, flow_from=8, **schedule))
 
 
+@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("batch", [Batch.FRAME, Batch.QUARTET])
 @pytest.mark.parametrize("make", [published, lambda **c: demo(images=60, kernels=Kernels.STEP, **c)])
-def test_steps_are_single_steps(make, batch):
+def test_steps_are_single_steps(make, batch, device):
     """Every tensor, moment, sum and statistic after 40 images, with all that happens on the way."""
     settings = make(batch=batch)
-    single, observations = begun(settings)
-    whole, _ = begun(settings)
+    single, observations = begun(settings, device)
+    whole, _ = begun(settings, device)
     assert unsuitable(observations, settings, whole) is None
     replay = CapturedSteps(whole, observations, settings)
     while single.images < 40:
