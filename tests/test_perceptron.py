@@ -228,6 +228,7 @@ def test_a_replay_equals_a_call():
         return found, *torch.autograd.grad((found * cotangent).sum(), parameters)
 
     side = torch.cuda.Stream()
+    side.wait_stream(torch.cuda.current_stream())
     with torch.cuda.stream(side):
         for _ in range(3):
             call()
