@@ -24,11 +24,12 @@ import warp as wp
 
 from gftorf_warp.data.sequence import Sequence
 from gftorf_warp.recon import checkpoint, presets
-from gftorf_warp.recon.changes import changed
 from gftorf_warp.recon.observations import Observations, input_of, observe
 from gftorf_warp.recon.settings import Input, ReconSettings
 from gftorf_warp.recon.state import State, begin, from_dict, to_dict
 from gftorf_warp.recon.step import step, threads_for
+from gftorf_warp.recon.train import CHANGES
+from gftorf_warp.scene.changes import changed
 from gftorf_warp.scene.measured import sensor_of
 
 WARM_UP = 24  # images before anything is timed: kernels are loaded, moments exist
@@ -40,7 +41,7 @@ def settings_of(sequence: Sequence, options: argparse.Namespace) -> ReconSetting
     """A preset that neither adds nor removes nor dims Gaussians."""
     found = input_of(sequence, Input.AUTO)
     recorded = presets.Recorded(input=found, unambiguous_range=sensor_of(sequence).unambiguous_range)
-    settings = changed(presets.preset(options.preset, recorded), options.set)
+    settings = changed(presets.preset(options.preset, recorded), options.set, CHANGES)
     settings = replace(settings, densify=replace(settings.densify, stop_share=0.0))
     return threads_for(settings, options.device, 1)[0]
 
