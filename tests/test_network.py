@@ -122,11 +122,11 @@ def test_rounded_products_have_the_right_gradients():
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
 def test_rounded_products_change_offsets_by_a_thousandth_on_cuda():
     """And do change them: otherwise the switch does nothing."""
-    position = (random(500, 3) * 6 - 3).to("cuda")
+    gaussians = field(random(500, 3) * 6 - 3, None).map(lambda value: value.to("cuda"))
     exact, rounded = (
         network(MotionSettings(products=kind), head=0.1).to("cuda") for kind in (Products.FLOAT32, Products.TF32)
     )
     with torch.no_grad():
-        place = exact.attach(field(position, None))
+        place = exact.attach(gaussians)
         a, b = exact.key_offsets(place, [0, 2]), rounded.key_offsets(place, [0, 2])
     assert 0 < (a - b).abs().max() < 5e-3 * a.abs().max()

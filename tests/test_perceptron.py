@@ -134,6 +134,18 @@ def test_in_half_precision_every_gradient_is_right_to_a_thousandth(device, scale
             assert distance(one, other) < difference
 
 
+@pytest.mark.parametrize("device", DEVICES)
+def test_sums_over_many_gaussians_are_no_halves(device):
+    """What pulls all of them the same way is 10^5 in scaled units, beyond the largest half."""
+    made, gaussians = network(half()).to(device), positions(4000).map(lambda value: value.to(device))
+    cotangent = torch.ones(2, 4000, 3, device=device)
+    _, got = gradients(made, gaussians, cotangent, [0, 2])
+    _, wanted = exact(made, gaussians, cotangent, [0, 2])
+    assert 64 * wanted[-2].abs().max() > 1.5 * torch.finfo(torch.float16).max
+    for one, other in zip(got, wanted, strict=True):
+        assert distance(one, other) < 1e-2
+
+
 def test_the_first_steps_have_gradients_too():
     """The last layer begins at 1e-5, the others learn through it."""
     made, gaussians = network(half(), head=1e-5), positions(200)
@@ -216,6 +228,7 @@ def test_a_replay_equals_a_call():
         return found, *torch.autograd.grad((found * cotangent).sum(), parameters)
 
     side = torch.cuda.Stream()
+    side.wait_stream(torch.cuda.current_stream())
     with torch.cuda.stream(side):
         for _ in range(3):
             call()

@@ -77,7 +77,7 @@ class Stacked(torch.autograd.Function):
                 own = torch.addmm(biases[number], moment, at_moment.T).to(form.dtype)
                 if number:
                     hidden = torch.cat([hidden.view(keys, count, form.width), places], dim=2)
-                    inputs[-1] = hidden.view(keys * count, -1)
+                    inputs[-1] = hidden.flatten(0, 1)
                 rows = hidden if number else places
                 out = place.new_empty(keys, count, form.width)
                 for key in range(keys):
@@ -89,7 +89,7 @@ class Stacked(torch.autograd.Function):
         context.form = form
         context.save_for_backward(place, moment, *factors, *inputs)
         offsets = _product(hidden, factors[-1].T, moment.dtype)[:, : len(biases[-1])] + biases[-1]
-        return offsets.view(keys, count, -1)
+        return offsets.view(keys, count, len(biases[-1]))
 
     @staticmethod
     @once_differentiable
