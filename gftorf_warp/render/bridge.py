@@ -36,8 +36,12 @@ class Request:
     """How."""
     screen: Tensor | None = None
     """[N, 3] that backward fills with the screen gradient and the number of pixels; None: not wanted."""
+    images: frozenset[str]
+    """Names of what is wanted of quads, phasor, distance, opacity and distortion; colour and extra always are."""
     workspace: Workspace | None = None
     """Where; None: in memory of its own."""
+    extra_detached: bool = False
+    """Whether extra images hold the weights fixed."""
 
 
 class Rasterize(torch.autograd.Function):
@@ -64,6 +68,7 @@ class Rasterize(torch.autograd.Function):
         size = camera.height, camera.width
         shapes = {"quads": (len(shifts), *size), "phasor": (3, *size), "distance": size, "opacity": size}
         shapes |= {"distortion": size}
+        shapes = {name: shape for name, shape in shapes.items() if name in request.images}
         shapes |= {"colour": (3, *size)} if colour_sh is not None else {}
         shapes |= {"extra": (extra.shape[1], *size)} if extra is not None else {}
         images = {name: mean.new_empty(shapes[name]) for name in IMAGES if name in shapes}
@@ -91,7 +96,8 @@ class Rasterize(torch.autograd.Function):
         cotangents = {name: g.contiguous() for name, g in zip(IMAGES, grads, strict=True) if g is not None}
         if cotangents and wanted:
             with stream_of(named["mean"]):
-                records = launch.backward(_inputs(named), view, shifts, frame, _images(cotangents), _inputs(wanted))
+                arrays = _inputs(named), view, shifts, frame, _images(cotangents), _inputs(wanted)
+                records = launch.backward(*arrays, extra_detached=request.extra_detached)
                 if screen is not None and len(screen):
                     found = wp.to_torch(records)  # a list of columns would be uploaded as an index
                     screen[:, :2], screen[:, 2] = found[:, :2], found[:, 6]

@@ -39,7 +39,10 @@ def view_of(camera: Camera, settings: RenderSettings) -> CameraView:
 
 
 def render(inputs: Inputs, view: CameraView, shifts: tuple[float, ...], frame: Frame, images: Images) -> None:
-    """Fill ``images``; on an active ``wp.Tape`` also record the adjoint, which adds to the ``.grad`` of the inputs."""
+    """Fill those of ``images`` that are there.
+
+    On an active ``wp.Tape`` also record the adjoint, which adds to the ``.grad`` of the inputs.
+    """
     forward(inputs, view, shifts, frame, images)
     tape = wp._src.context.runtime.tape  # the public API has no name for the active tape
     if tape is not None:
@@ -54,7 +57,7 @@ def render(inputs: Inputs, view: CameraView, shifts: tuple[float, ...], frame: F
 
 
 def forward(inputs: Inputs, view: CameraView, shifts: tuple[float, ...], frame: Frame, images: Images) -> None:
-    """Project, sort, composite, resolve."""
+    """Project, sort, composite, resolve; images that are None cost nothing."""
     frame.turns += 1
     if frame.count:
         stages.project(inputs, view, frame)
@@ -71,14 +74,23 @@ def forward(inputs: Inputs, view: CameraView, shifts: tuple[float, ...], frame: 
         if name == "extra":
             stages.set_channels(frame, inputs, start, frame.records[number])
     for number in range(len(frame.records)):
-        stages.composite(frame, view, number)
+        stages.composite(frame, view, number, images.distortion is not None)
     stages.resolve_images(inputs, shifts, frame, images, groups)
 
 
 def backward(
-    inputs: Inputs, view: CameraView, shifts: tuple[float, ...], frame: Frame, cotangents: Images, wanted: Inputs
+    inputs: Inputs,
+    view: CameraView,
+    shifts: tuple[float, ...],
+    frame: Frame,
+    cotangents: Images,
+    wanted: Inputs,
+    *,
+    extra_detached: bool = False,
 ) -> wp.array:
     """Add to the arrays of ``wanted`` what ``cotangents`` say; what forward left in the frame stays as it was.
+
+    With ``extra_detached`` weights are held fixed under the extra images, so that only the extra channels learn.
 
     Returns:
         [N] gradient records of the splats: slots 0 and 1 are the screen gradient, slot 6 the number of pixels.
@@ -89,15 +101,18 @@ def backward(
     grad_splats = frame.zeros("gradient records", frame.count, splat.Splat)
     if not frame.count:
         return grad_splats
-    stages.composite_backward(frame, 0, grad_light, grad_channels[0], grad_splats)
+    distortion, fixed = cotangents.distortion is not None, [name == "extra" and extra_detached for name, _ in groups]
+    first = {"distortion": distortion, "fixed": bool(groups) and fixed[0]}
+    stages.composite_backward(frame, 0, grad_light, grad_channels[0], grad_splats, **first)
     for number, (name, start) in enumerate(groups):
         if grad_channels[number] is None:
             continue
         records = grad_splats
         if number > 0:  # a further pass shares centres, conics and opacities with the first
             records = frame.zeros("gradient records of a further pass", frame.count, splat.Splat)
-            stages.composite_backward(frame, number, grad_light, grad_channels[number], records)
-            stages.add_geometry(records, grad_splats)
+            stages.composite_backward(frame, number, grad_light, grad_channels[number], records, fixed=fixed[number])
+            if not fixed[number]:
+                stages.add_geometry(records, grad_splats)
         if name == "extra" and wanted.extra is not None:
             stages.take_channels(records, start, wanted)
     stages.finish(frame, grad_splats)
