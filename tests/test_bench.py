@@ -48,8 +48,16 @@ def test_quick_bench_writes_everything_it_prints(tmp_path, capsys):
     for row in found["parts"]["render"]["rows"]:
         assert row["images_per_s"] > 0
         assert f"{row['images_per_s']:.1f}" in printed
+    assert [row["way"] for row in found["parts"]["render"]["rows"]] == [
+        "render",
+        "renderer",
+        "unchecked",
+        "arrays",
+        "files",
+    ]
     ways = {(row["kernels"], row["batch"]) for row in found["parts"]["step"]["rows"]}
     assert ways == {(str(k), str(b)) for k in Kernels for b in Batch}
+    assert all(row["pairs"] > row["N"] > 0 for row in found["parts"]["step"]["rows"])
     assert all(row["not_sound"] == 0 for row in found["parts"]["step"]["rows"])
 
 
@@ -142,6 +150,7 @@ def test_what_cannot_be_captured_is_reported(caplog):
     found = timing.both_ways(lambda: None, Watch(), 2)
     assert found["graph"] is None
     assert found["graph_error"] == "operation not permitted"
+    assert timing.Timing.of([10.0]).over(5).median == 2.0
     assert "operation not permitted" in caplog.text
 
 

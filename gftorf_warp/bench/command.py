@@ -153,6 +153,8 @@ def bench(
     }
     if json is not None:
         _check_file(Path(json))
+    if wanted.device != "cpu":  # events and graphs are those of the current device
+        torch.get_device_module(torch.device(wanted.device)).set_device(wanted.device)
     say(" - ".join(str(found[name]) for name in ("device", "driver", "warp", "torch", "commit")))
     with _folder() as folder:
         shared = Shared(wanted, folder)

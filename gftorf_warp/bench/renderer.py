@@ -25,6 +25,7 @@ from .timing import Function, HostWatch, Report, Watch, both_ways, cell, lines_o
 COUNTS = (20_000, 50_000, 100_000, 200_000, 300_000)
 QUICK_COUNTS = (500,)
 FORMS = ("all", "training")
+WITHIN = 10  # repetitions of a stage in one graph
 ROOM = 1.3  # pairs that are reserved, over those that there are
 GAUSSIANS = ("mean", "log_scale", "quaternion", "opacity_logit", "reflectivity_sh", "colour_sh")
 
@@ -168,7 +169,7 @@ def measure(
         if device.is_cuda:  # nothing is read back then
             case.start(int(ROOM * case.pairs) + 1)
         forward, both = (both_ways(function, watch, runs) for function in (case.forward, case.both))
-        parts = {name: both_ways(function, watch, runs) for name, function in case.stages().items()}
+        parts = {name: both_ways(function, watch, runs, within=WITHIN) for name, function in case.stages().items()}
         case.frame.check_capacity()
         assert case.images.distance is not None
         row: dict[str, Any] = {"form": form, "scene": kind, "scale": scale, "opacity": opacity, "N": count}

@@ -17,9 +17,10 @@ from ..recon import checkpoint, folder, presets
 from ..recon.config import config_of
 from ..recon.observations import Observations, input_of, observe
 from ..recon.settings import Input, ReconSettings
-from ..recon.state import State, begin, to_dict
+from ..recon.state import State, begin, field_and_motion, to_dict
 from ..recon.step import threads_for
 from ..recon.train import CHANGES
+from ..render.replay import Replay
 from ..scene.changes import changed
 from ..scene.initialise import Init, InitSettings
 from ..scene.measured import sensor_of
@@ -115,6 +116,17 @@ def _fitted(observations: Observations, settings: ReconSettings, stored: dict, s
         sequence=sequence,
         flow_source=observations.flow_source,
     )
+
+
+def pairs_of(fitted: Fitted) -> int:
+    """(tile, splat) pairs of the state in the middle of the sequence, at the size of the optimisation."""
+    seen, device = fitted.observations, fitted.observations.quads.device
+    middle = seen.sequence.frames // 2
+    camera = seen.cameras[middle]
+    field, motion, attachment = field_and_motion(fitted.stored, device)
+    replay = Replay(field, motion, attachment, seen.sensor, fitted.settings.render, camera)
+    replay(seen.time_at(middle), camera)
+    return replay.largest
 
 
 def as_run(fitted: Fitted, path: Path, device: torch.device | str) -> Path:

@@ -21,7 +21,7 @@ from ..recon.settings import Batch, Kernels, ReconSettings
 from ..recon.state import State, from_dict
 from ..recon.step import Singles
 from ..scene.motion import MotionKind, Products
-from .states import Fitted
+from .states import Fitted, pairs_of
 from .timing import Report, Timing, lines_of, quietly, watch_of
 
 WARM_UP = 24  # images before anything is timed: kernels are loaded, moments exist
@@ -125,6 +125,7 @@ def rows_of(
         report: Called with (images done, images in all).
     """
     parts, rows, watch = max(images // part, 1), [], watch_of(device)
+    pairs = pairs_of(fitted)
     for number, settings in enumerate(chosen):
         observations = observe(fitted.sequence, settings, device)
         run = fresh(fitted, observations, settings, device, warm_up)
@@ -138,7 +139,12 @@ def rows_of(
             times.append(1e3 * (time.perf_counter() - begun) / (state.images - first))
             report((number * parts + done) * part, len(chosen) * parts * part, ms=times[-1])
         row: dict[str, Any] = {"kernels": str(settings.kernels), "batch": str(settings.schedule.batch)}
-        row |= {"products": str(settings.motion.products), "N": len(state.optimiser.field), "from": before}
+        row |= {
+            "products": str(settings.motion.products),
+            "N": len(state.optimiser.field),
+            "pairs": pairs,
+            "from": before,
+        }
         row |= {"images": state.images - before, "flow": fitted.flow_source, "not_sound": broken}
         row |= {"ms_per_image": statistics.mean(times), "parts": Timing.of(times).plain()}
         if torch.device(device).type != "cpu":
@@ -171,11 +177,12 @@ def profiled(run: Run, device: str) -> str:
 
 def table(rows: list[dict[str, Any]]) -> list[str]:
     """One line per way."""
-    heads = ["kernels, batch, products", "N", "images", "mean", "10 .. 90 % of parts", "waits per image"]
+    heads = ["kernels, batch, products", "N", "pairs", "images", "mean", "10 .. 90 % of parts", "waits per image"]
     cells = [
         [
             f"{row['kernels']}, {row['batch']}, {row['products']}",
             f"{row['N']:,}",
+            f"{row['pairs']:,}",
             str(row["images"]),
             f"{row['ms_per_image']:.3f}",
             f"{row['parts']['p10']:.3f} .. {row['parts']['p90']:.3f}",

@@ -23,7 +23,7 @@ from ..render.bridge import Branches, Captured, Outbox, pairs_of
 from ..render.buffers import RenderSettings, Workspace
 from ..scene.motion import Still
 from . import densify
-from .objective import flow_of, image_loss, render_settings_at, rendering_of, weights_at
+from .objective import flow_between, image_loss, render_settings_at, rendering_of, weights_at
 from .observations import Observations
 from .optimiser import BETAS, EPSILON, frozen, rates_at
 from .padded import Padded
@@ -121,7 +121,7 @@ class CapturedSteps:
         self._groups = [*state.optimiser.tensors] + ["motion"] * len(state.optimiser.motion)
         self._flow = self._resident_flow()
         self._branches = Branches(longest, device)
-        self._workspaces = [Workspace() for _ in range(longest + 1)]  # one for each image, one for flow
+        self._workspaces = [Workspace() for _ in range(longest)]
         self._adopt()
 
     def step(self) -> None:
@@ -226,9 +226,6 @@ class CapturedSteps:
         for image in images:
             for name, value in image.terms.items():
                 found[name] = found[name] + value if name in found else value
-        if variant.flow and offsets is not None:
-            assert self._flow is not None
-            found["flow"] = weights.flow * self._flow_loss(field, offsets, numbers[3:4], variant, render)
         loss = torch.stack([*found.values()]).sum()
         first = len(padded.values) if variant.rests else 0
         wanted = padded.leaves[first:]
@@ -256,8 +253,12 @@ class CapturedSteps:
             shape = (1, *self.observations.quads.shape[1:])
             lights["quads"] = fused.uniform(shape, numbers[1:3], settings.background)
         sensor = self.observations.sensor.with_shifts(variant.shifts[n : n + 1])
-        workspace = self._workspaces[n]
-        tof = rendering_of(moved, self.observations.cameras[0], sensor, settings, render, lights, workspace)
+        camera, flows = self.observations.cameras[0], []
+        if variant.flow and n == 0 and offsets is not None:
+            flows = [offset - offsets[0] for offset in offsets[1:]]
+        tof = rendering_of(
+            moved, camera, sensor, settings, render, weights, lights, flows=flows, workspace=self._workspaces[n]
+        )
         measured = self.observations.quads.index_select(0, numbers[:1])
         loss, squared = image_loss(tof.quads, measured, weights.ssim, kernel=True)
         terms = {"quads": weights.quads * loss}
@@ -265,24 +266,14 @@ class CapturedSteps:
             terms["distortion"] = weights.distortion * tof.distortion.mean()
         if weights.motion_size > 0 and displacement is not None:
             terms["motion_size"] = weights.motion_size * motion_size(displacement).mean()
+        if flows:  # both directions: what is unknown counts zero
+            assert self._flow is not None
+            assert tof.extra is not None
+            measured = self._flow.index_select(0, self._numbers.there[3:4])[0]
+            rays = self.observations.rays_at(0)
+            flow = flow_between(tof.distance, tof.extra, list(measured), camera, [camera, camera], rays)
+            terms["flow"] = weights.flow * flow
         return _Image(terms=terms, tof=tof, squared=squared, opacity=tof.opacity.detach().mean())
-
-    def _flow_loss(self, field, offsets: Tensor, quartet: Tensor, variant: Variant, render) -> Tensor:
-        """The flow loss of the first image, with both directions: what is unknown counts zero."""
-        assert self._flow is not None
-        measured = self._flow.index_select(0, quartet)[0]
-        camera = self.observations.cameras[0]
-        return flow_of(
-            replace(field, colour_sh=None).moved(offsets[0]),
-            [offset - offsets[0] for offset in offsets[1:]],
-            list(measured),
-            camera,
-            [camera, camera],
-            self.observations.sensor.with_shifts(variant.shifts[:1]),
-            self.observations.rays_at(0),
-            render,
-            self._workspaces[-1],
-        )
 
     def _descend(self, gradients, loss: Tensor, images: int) -> None:
         """Adam, if everything is finite and no pair was dropped; counts what happened."""

@@ -95,7 +95,8 @@ def terms(
     if weights.quads > 0 or weights.depth > 0 or weights.distortion > 0:
         moved = replace(field, colour_sh=None).moved(displacement)
         sensor = observations.sensor_at(frame)
-        tof = rendering_of(moved, observations.cameras[frame], sensor, settings, render, backgrounds)
+        camera, light = observations.cameras[frame], "phasor" if observations.phasors else "quads"
+        tof = rendering_of(moved, camera, sensor, settings, render, weights, backgrounds, light=light)
     if tof is not None and weights.quads > 0:
         if observations.phasors:  # an amplitude is not compared: re and im say it already
             rendered, measured = tof.phasor[:2], observations.phasors[frame]
@@ -115,7 +116,7 @@ def terms(
             then = motion.displacement(attachment, taken)
         camera = observations.colour_cameras[frame]
         sensor = observations.sensor_at(frame)
-        colour = rendering_of(field.moved(then), camera, sensor, settings, render, backgrounds)
+        colour = rendering_of(field.moved(then), camera, sensor, settings, render, weights, backgrounds)
         assert colour.colour is not None
         measured = observations.colour[frame]
         loss, of_colour = image_loss(colour.colour, measured, weights.ssim, weights.colour_norm, kernel=kernel)
@@ -136,12 +137,34 @@ def rendering_of(
     sensor: Sensor,
     settings: ReconSettings,
     render: RenderSettings,
+    weights: Weights,
     backgrounds: Mapping[str, Tensor] | None,
+    *,
+    light: str = "quads",
+    flows: Sequence[Float[Tensor, "N 3"]] = (),
     workspace: Workspace | None = None,
 ) -> Rendering:
-    """One rendering before random light from behind; colour is part of it if the field has any."""
+    """One rendering before random light from behind, of what the loss looks at; with colour if the field has any.
+
+    Args:
+        field: Gaussians where they are.
+        camera: Where from.
+        sensor: What quads are.
+        settings: What is compared.
+        render: How.
+        weights: Of the terms.
+        backgrounds: Random light, see :func:`terms`.
+        light: The image that is compared, quads or phasor.
+        flows: Displacements [m] that come along as extra channels; their gradient reaches them alone.
+        workspace: Where to render; None: in memory of its own.
+    """
     wanted = ("colour",) if field.colour_sh is not None else ("quads", "phasor")
     lights = {name: light for name, light in (backgrounds or {}).items() if name in wanted}
+    images = {"opacity", light}
+    if weights.distortion > 0:
+        images.add("distortion")
+    if weights.depth > 0 or flows:
+        images.add("distance")
     return rasterize(
         field,
         camera,
@@ -149,6 +172,9 @@ def rendering_of(
         render,
         background=Background(**lights),
         screen_gradient=settings.densify.every is not None,
+        images=images,
+        extra=torch.cat(list(flows), dim=1) if flows else None,
+        extra_detached=bool(flows),
         workspace=workspace,
     )
 
@@ -202,50 +228,39 @@ def flow_loss(
     if not steps:
         return None
     here, *there = motion.key_offsets(attachment, [quartet, *(quartet + step for step in steps)])
+    still = replace(field, colour_sh=None).moved(here).map(torch.Tensor.detach)
+    camera, sensor = observations.cameras[frame], observations.sensor_at(frame)
+    channels, wanted = torch.cat([offset - here for offset in there], dim=1), ("distance",)
+    seen = rasterize(still, camera, sensor, render, extra=channels, images=wanted)
+    assert seen.extra is not None
     last = len(observations.cameras) - 1
-    return flow_of(
-        replace(field, colour_sh=None).moved(here),
-        [offset - here for offset in there],
-        [observations.flow[quartet, step] for step in steps],
-        observations.cameras[frame],
-        [observations.cameras[min(frame + FRAMES_PER_QUARTET * step, last)] for step in steps],
-        observations.sensor_at(frame),
-        observations.rays_at(frame),
-        render,
-    )
+    later = [observations.cameras[min(frame + FRAMES_PER_QUARTET * step, last)] for step in steps]
+    measured = [observations.flow[quartet, step] for step in steps]
+    return flow_between(seen.distance, seen.extra, measured, camera, later, observations.rays_at(frame))
 
 
-def flow_of(
-    field: GaussianField,
-    offsets: Sequence[Float[Tensor, "N 3"]],
+def flow_between(
+    distance: Float[Tensor, "H W"],
+    displacement: Float[Tensor, "D H W"],
     measured: Sequence[Float[Tensor, "2 H W"]],
     camera: Camera,
     later: Sequence[Camera],
-    sensor: Sensor,
     rays: tuple[Float[Tensor, "3"], Float[Tensor, "H W 3"]],
-    render: RenderSettings,
-    workspace: Workspace | None = None,
 ) -> Tensor:
     """Sum over some flows of the mean squared difference [px^2] to what displacements would show.
 
     Args:
-        field: Gaussians where they are; held fixed, with all weights.
-        offsets: Their displacement from here to the end of each flow [m].
+        distance: Of the surface [m]; without gradient.
+        displacement: Composited displacements to the end of each flow [m], three channels each.
         measured: The flows; NaN: unknown.
         camera: Where from.
         later: The camera at the end of each flow.
-        sensor: Any; its light is not looked at.
         rays: Centre of the camera [m] and unit vectors through its pixels, in world axes.
-        render: How to render.
-        workspace: Where to render; None: in memory of its own.
     """
-    still, channels = field.map(torch.Tensor.detach), torch.cat(list(offsets), dim=1)
-    seen = rasterize(still, camera, sensor, render, extra=channels, workspace=workspace)
-    assert seen.extra is not None
     centre, ray = rays
-    surface = centre + ray * seen.distance.detach().clamp_min(NEAREST)[..., None]
+    surface = centre + ray * distance.detach().clamp_min(NEAREST)[..., None]
     errors = []
     for n, (flow, then) in enumerate(zip(measured, later, strict=True)):
-        moved = image_motion(surface, seen.extra[3 * n : 3 * n + 3], camera.project, then.project)
+        moved = image_motion(surface, displacement[3 * n : 3 * n + 3], camera.project, then.project)
         errors.append(flow_error(moved, flow)[0].mean())
     return torch.stack(errors).sum()
