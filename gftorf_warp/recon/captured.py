@@ -212,6 +212,7 @@ class CapturedSteps:
         field = padded.field
         if variant.rests:
             field = field.map(torch.Tensor.detach)
+        field = field.map(lambda tensor: tensor.view_as(tensor))  # gradients of all branches meet on this stream
         offsets: Tensor | None = None
         if variant.moves:
             attachment = motion.attach(field) if motion.follows_means else padded.attachment
