@@ -168,7 +168,7 @@ def profiled(run: Run, device: str) -> str:
     """Torch's table of the most expensive kernels and operators."""
     on_cpu = torch.device(device).type == "cpu"
     activity = torch.profiler.ProfilerActivity
-    with torch.profiler.profile(activities=[activity.CPU] if on_cpu else list(activity)) as profile:
+    with torch.profiler.profile(activities=[activity.CPU] if on_cpu else [activity.CPU, activity.CUDA]) as profile:
         advance(run, WATCHED)
         watch_of(device).synchronise()
     order = "self_cpu_time_total" if on_cpu else "self_device_time_total"
