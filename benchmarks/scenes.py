@@ -1,9 +1,11 @@
-"""A whole rendering, forward and backward, on seven scenes of two families.
+"""A whole rendering, forward and backward, on eight scenes of three families.
 
-    python benchmarks/scenes.py [--device cpu|cuda] [--all] [--json FILE]
+    python benchmarks/scenes.py [--device cpu|cuda] [--all] [--images all|training] [--json FILE]
 
-'surface': Gaussians on a wavy surface 1-5 m away; 'volume': filling the viewing frustum. 320x240, quads, phasor,
-colour, distance, opacity and distortion with a random derivative each. On CUDA everything is replayed from a graph and
+'surface': Gaussians on a wavy surface 1-5 m away; 'volume': filling the viewing frustum; 'grown': sizes over two
+decades on that surface, thirty of them as large as the image, as training from a random start has them. 320x240, quads,
+phasor, colour, distance, opacity and distortion with a random derivative each; 'training': one quad with a derivative
+and the opacity. On CUDA everything is replayed from a graph and
 timed by events, on the CPU it is called; medians in milliseconds.
 """
 
@@ -18,7 +20,7 @@ from pathlib import Path
 import numpy as np
 import torch
 import warp as wp
-from surfaces import CAMERA, FAR, HEIGHT, NEAR, WIDTH, array_of, inputs_of, surface, volume
+from surfaces import CAMERA, FAR, HEIGHT, NEAR, WIDTH, array_of, grown, inputs_of, surface, volume
 
 from gftorf_warp.constants import CANONICAL_SHIFTS
 from gftorf_warp.render import launch
@@ -26,6 +28,7 @@ from gftorf_warp.render.buffers import Frame, RenderSettings
 from gftorf_warp.render.inputs import Images, Inputs, names_of
 
 SCENES = [
+    ("grown", 20_000, 0.01, 0.6),
     ("surface", 20_000, 0.03, 0.6),
     ("surface", 50_000, 0.015, 0.6),
     ("volume", 100_000, 0.03, 0.1),
@@ -34,25 +37,33 @@ SCENES = [
     ("surface", 200_000, 0.015, 0.6),
     ("surface", 300_000, 0.015, 0.6),
 ]
+FAMILIES = {"surface": surface, "volume": volume, "grown": grown}
 
 
 class Case:
     """One scene, ready to be rendered and differentiated."""
 
-    def __init__(self, kind: str, count: int, scale: float, opacity: float, device: wp.Device):
-        scene = (surface if kind == "surface" else volume)(count, scale, opacity)
-        self.inputs = inputs_of(scene, device)
+    def __init__(self, kind: str, count: int, scale: float, opacity: float, device: wp.Device, few: bool = False):
+        self.inputs = inputs_of(FAMILIES[kind](count, scale, opacity), device)
+        self.shifts = CANONICAL_SHIFTS[:1] if few else CANONICAL_SHIFTS
         size = HEIGHT, WIDTH
         shapes = {"quads": (4, *size), "phasor": (3, *size), "colour": (3, *size)}
         shapes |= dict.fromkeys(("distance", "opacity", "distortion"), size)
+        names = ["mean", "log_scale", "quaternion", "opacity_logit", "reflectivity_sh", "colour_sh"]
+        if few:
+            self.inputs.colour_sh = None
+            names.remove("colour_sh")
+            shapes = {"quads": (1, *size), "opacity": size}
         rng = np.random.default_rng(1)
         empty = dict.fromkeys(names_of(Images))
         self.images = Images(**empty | {name: array_of(np.zeros(shape), device) for name, shape in shapes.items()})
         self.cotangents = Images(
             **empty | {name: array_of(rng.normal(size=shape), device) for name, shape in shapes.items()}
         )
+        if few:
+            self.cotangents.opacity = None
         self.wanted = Inputs(**dict.fromkeys(names_of(Inputs)))
-        for name in ("mean", "log_scale", "quaternion", "opacity_logit", "reflectivity_sh", "colour_sh"):
+        for name in names:
             setattr(self.wanted, name, wp.zeros_like(getattr(self.inputs, name)))
         self.count, self.device = count, device
         self.start(None)
@@ -67,11 +78,11 @@ class Case:
 
     def forward(self) -> None:
         """Render."""
-        launch.forward(self.inputs, self.view, CANONICAL_SHIFTS, self.frame, self.images)
+        launch.forward(self.inputs, self.view, self.shifts, self.frame, self.images)
 
     def backward(self) -> None:
         """Differentiate; the forward pass has run."""
-        launch.backward(self.inputs, self.view, CANONICAL_SHIFTS, self.frame, self.cotangents, self.wanted)
+        launch.backward(self.inputs, self.view, self.shifts, self.frame, self.cotangents, self.wanted)
 
 
 def both(case: Case) -> None:
@@ -105,7 +116,8 @@ def main() -> None:
     """Print the table, write the JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", default="cpu")
-    parser.add_argument("--all", action="store_true", help="all seven scenes instead of the first two")
+    parser.add_argument("--all", action="store_true", help="all eight scenes instead of the first two")
+    parser.add_argument("--images", choices=("all", "training"), default="all", help="which images, with derivatives")
     parser.add_argument("--repeats", type=int, default=None, help="30 on CUDA, 5 on the CPU")
     parser.add_argument("--json", type=Path)
     a = parser.parse_args()
@@ -116,22 +128,23 @@ def main() -> None:
     rows = []
     print(f"{device.name}, Warp {wp.__version__}, {WIDTH}x{HEIGHT}, medians of {repeats} [ms]")
     for kind, count, scale, opacity in SCENES if a.all else SCENES[:2]:
-        case = Case(kind, count, scale, opacity, device)
+        case = Case(kind, count, scale, opacity, device, a.images == "training")
         eager = timed_eager(case, repeats)
         if device.is_cuda:
             case.start(int(1.25 * case.pairs))
         forward = timed(case.forward, device, repeats)
         total = timed(lambda case=case: both(case), device, repeats)
-        distance = float(case.images.distance.numpy().mean())
+        checked = "opacity" if a.images == "training" else "distance"
+        mean = float(getattr(case.images, checked).numpy().mean())
         row = {"scene": kind, "N": count, "scale": scale, "opacity": opacity, "pairs": case.pairs, "forward": forward}
-        rows.append(row | {"both": total, "eager": eager, "mean_distance": distance})
+        rows.append(row | {"both": total, "eager": eager, f"mean_{checked}": mean})
         print(
             f"  {kind:<8} N {count:<7} pairs {case.pairs:<8} forward {forward:8.3f}  forward + backward {total:8.3f}"
-            f"  eager {eager:8.3f}  mean distance {distance:.3f} m",
+            f"  eager {eager:8.3f}  mean {checked} {mean:.3f}",
             flush=True,
         )
     if a.json:
-        about = {"device": device.name, "warp": wp.__version__, "torch": torch.__version__}
+        about = {"device": device.name, "warp": wp.__version__, "torch": torch.__version__, "images": a.images}
         a.json.write_text(json.dumps(about | {"rows": rows}, indent=1) + "\n")
 
 

@@ -43,6 +43,15 @@ def volume(count: int, scale: float, opacity: float) -> dict[str, np.ndarray]:
     return scene
 
 
+def grown(count: int, scale: float, opacity: float) -> dict[str, np.ndarray]:
+    """The surface with sizes over two decades about ``scale`` [m], thirty Gaussians of half a metre and more."""
+    scene = surface(count, scale, opacity)
+    rng = np.random.default_rng(3)
+    scene["log_scale"] = math.log(scale) + 1.2 * rng.normal(size=(count, 3))
+    scene["log_scale"][:30] = np.log(rng.uniform(0.5, 4.0, (30, 3)))
+    return scene
+
+
 def inputs_of(scene: dict[str, np.ndarray], device: str | wp.Device) -> Inputs:
     """The scene as Warp arrays, seen by a sensor with depth_range 15 m."""
     colour_sh = constant_sh(torch.tensor(scene["colour"].T, dtype=torch.float32)).permute(1, 2, 0).numpy()

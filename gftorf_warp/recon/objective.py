@@ -91,7 +91,9 @@ def terms(
     tof = colour = squared = None
     if weights.quads > 0 or weights.depth > 0 or weights.distortion > 0:
         moved = replace(field, colour_sh=None).moved(displacement)
-        tof = _render(moved, observations.cameras[frame], observations, frame, settings, render, backgrounds)
+        images = ["phasor" if observations.phasors else "quads", "opacity"]
+        images += ["distance"] * (weights.depth > 0) + ["distortion"] * (weights.distortion > 0)
+        tof = _render(moved, observations.cameras[frame], observations, frame, settings, render, backgrounds, images)
     if tof is not None and weights.quads > 0:
         if observations.phasors:  # an amplitude is not compared: re and im say it already
             rendered, measured = tof.phasor[:2], observations.phasors[frame]
@@ -110,7 +112,7 @@ def terms(
         if motion is not None and taken != time:
             then = motion.displacement(attachment, taken)
         camera = observations.colour_cameras[frame]
-        colour = _render(field.moved(then), camera, observations, frame, settings, render, backgrounds)
+        colour = _render(field.moved(then), camera, observations, frame, settings, render, backgrounds, ["opacity"])
         assert colour.colour is not None
         measured = observations.colour[frame]
         loss, of_colour = image_loss(colour.colour, measured, weights.ssim, weights.colour_norm, kernel=kernel)
@@ -133,8 +135,9 @@ def _render(
     settings: ReconSettings,
     render: RenderSettings,
     backgrounds: Mapping[str, Tensor] | None,
+    images: list[str],
 ) -> Rendering:
-    """One rendering; colour is part of it if the field has any."""
+    """One rendering of ``images``; colour is part of it if the field has any."""
     wanted = ("colour",) if field.colour_sh is not None else ("quads", "phasor")
     lights = {name: light for name, light in (backgrounds or {}).items() if name in wanted}
     return rasterize(
@@ -143,6 +146,7 @@ def _render(
         observations.sensor_at(frame),
         render,
         background=Background(**lights),
+        images=images,
         screen_gradient=settings.densify.every is not None,
     )
 
@@ -200,7 +204,8 @@ def flow_loss(
     here, *there = motion.key_offsets(attachment, [quartet, *(quartet + step for step in steps)])
     offsets = [offset - here for offset in there]
     still = replace(field, colour_sh=None).moved(here).map(torch.Tensor.detach)
-    seen = rasterize(still, camera, observations.sensor_at(frame), render, extra=torch.cat(offsets, dim=1))
+    sensor, moves = observations.sensor_at(frame), torch.cat(offsets, dim=1)
+    seen = rasterize(still, camera, sensor, render, extra=moves, images=["distance"])
     assert seen.extra is not None
     centre, ray = observations.rays_at(frame)
     surface = centre + ray * seen.distance.detach()[..., None]
