@@ -12,7 +12,6 @@ from gftorf_warp.recon.observations import observe
 from gftorf_warp.recon.settings import Batch, Kernels
 from gftorf_warp.recon.state import begin
 
-
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA"))]
 
 

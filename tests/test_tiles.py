@@ -155,3 +155,15 @@ def test_boxes_cut_lists():
     assert total > 100
     assert set(keys % columns) == {2, 3, 4, 5}
     assert set(keys // columns) == {4, 5, 6, 7}
+
+
+def test_a_needle_across_a_large_image_keeps_its_pixels(monkeypatch):
+    """Far from the centre of a needle float32 loses much of the power; what it decides in a pixel's favour counts."""
+    monkeypatch.setattr("test_tiles.WIDTH", 1280)
+    monkeypatch.setattr("test_tiles.HEIGHT", 640)
+    record, box = splats("needle", 120)
+    keys, ids, _ = lists(record, box, (8, 4))
+    needed = touched(record, box, (8, 4), np.float32, 0.0)
+    assert needed.sum() > 20_000
+    needed[keys, ids] = False
+    assert not needed.any()

@@ -45,16 +45,25 @@ def volume(count: int, scale: float, opacity: float) -> dict[str, np.ndarray]:
     return scene
 
 
+def grown(count: int, scale: float, opacity: float) -> dict[str, np.ndarray]:
+    """The surface with sizes over two decades about ``scale`` [m], thirty Gaussians of half a metre and more."""
+    scene = surface(count, scale, opacity)
+    rng = np.random.default_rng(3)
+    scene["log_scale"] = math.log(scale) + 1.2 * rng.normal(size=(count, 3))
+    scene["log_scale"][:30] = np.log(rng.uniform(0.5, 4.0, (30, 3)))
+    return scene
+
+
 def scene_of(kind: str, count: int, scale: float, opacity: float) -> dict[str, np.ndarray]:
-    """A scene of one of the two families.
+    """A scene of one of the families.
 
     Args:
-        kind: "surface" or "volume".
+        kind: "surface", "volume" or "grown".
         count: Number N of Gaussians.
         scale: Standard deviation of each [m].
         opacity: Of each at its peak [1].
     """
-    return {"surface": surface, "volume": volume}[kind](count, scale, opacity)
+    return {"surface": surface, "volume": volume, "grown": grown}[kind](count, scale, opacity)
 
 
 def inputs_of(scene: dict[str, np.ndarray], device: str | wp.Device, *, colour: bool = True) -> Inputs:

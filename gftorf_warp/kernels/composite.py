@@ -150,16 +150,26 @@ def make_composite(
             if begin < end:
                 zeta0 = zeta_of(splats[ids[begin]][14], mapping)
         k = int(begin)
+        if wp.static(K == 1):  # a record comes from afar: a warp asks for the next one while it works on this one
+            following = Splat()
+            after = int(0)
+            if begin < end:
+                following = load_splat(splats, ids[begin])
+                after = ids[wp.min(begin + 1, end - 1)]
         # `continue` instead of nested `if`s: after an `if` Warp selects between the old and the new value of everything
         # assigned inside, here a dozen vectors per splat
         while k < end and warp_any(nonzero(live)):  # the same trip count for all lanes of a warp
-            i = ids[k]
             k += 1
             if wp.static(K > 1):
+                i = ids[k - 1]
                 prefetch(splats, ids[wp.min(k + AHEAD, end - 1)])
-            if block_missed(splats, i, x0 + wp.static(half), y0 + wp.static(half)):
-                continue
-            q = load_splat(splats, i)
+                if block_missed(splats, i, x0 + wp.static(half), y0 + wp.static(half)):
+                    continue
+                q = load_splat(splats, i)
+            else:
+                q = following
+                following = load_splat(splats, after)
+                after = ids[wp.min(k + 1, end - 1)]
             g = response(affine(x, -1.0, q[0]), affine(y, -1.0, q[1]), q[2], q[3], q[4], q[6])
             alpha = alpha_of(g, live, q[5], ALPHA_MAX, ALPHA_MIN)
             if not nonzero(alpha):

@@ -206,6 +206,12 @@ def make_composite_backward(
             if begin < k:
                 zeta0 = zeta_of(splats[ids[begin]][14], mapping)
         position = fill(float(k - begin))
+        if wp.static(K == 1):  # as in the forward pass
+            following = Splat()
+            after = int(0)
+            if begin < k:
+                following = load_splat(splats, ids[k - 1])
+                after = ids[wp.max(k - 2, begin)]
         while k > begin:
             k -= 1
             position = affine(position, 1.0, -1.0)
@@ -214,10 +220,14 @@ def make_composite_backward(
                 ahead = ids[wp.max(k - AHEAD, begin)]
                 prefetch(splats, ahead)
                 prefetch(grad_splats, ahead)
-            if block_missed(splats, i, x0 + wp.static(half), y0 + wp.static(half)):
-                continue
+                if block_missed(splats, i, x0 + wp.static(half), y0 + wp.static(half)):
+                    continue
+                q = load_splat(splats, i)
+            else:
+                q = following
+                following = load_splat(splats, after)
+                after = ids[wp.max(k - 2, begin)]
             gate = exceeds(last, position)  # only what this pixel composited
-            q = load_splat(splats, i)
             dx = affine(x, -1.0, q[0])
             dy = affine(y, -1.0, q[1])
             g = response(dx, dy, q[2], q[3], q[4], q[6])
