@@ -109,6 +109,30 @@ def test_cameras_are_forgotten_when_there_are_many(run, monkeypatch):
     assert len(render._views) == 2
 
 
+@pytest.mark.parametrize("run", ["cpu"], indirect=True)
+def test_a_camera_is_captured_when_it_comes_again(run, monkeypatch):
+    """What becomes a graph, and when, with a list of drawings in place of graphs; images stay right throughout."""
+    captured, launched = [], []
+    monkeypatch.setattr(module.Replay, "_captured", lambda _, seen: captured.append(seen) or seen)
+    monkeypatch.setattr(module.Replay, "_launch", lambda self, seen: launched.append(seen) or self._draw(seen))
+    render = run.renderer(colour=False)
+    render.graphs = True
+    for number, (time, camera) in enumerate([(t, c) for t in TIMES for c in (CAMERA, aside(0.1))]):
+        got, want = render(time, camera), run.render(time, camera)
+        torch.testing.assert_close(got.distance, want.distance, rtol=1e-4, atol=1e-4)
+        assert render.fits()
+        if number == 0:
+            first = render._capacity
+            assert first == int(module.ROOM * render.largest) + 1
+    assert len(captured) == 2, "once per camera"
+    assert len(launched) == 2 * len(TIMES) - 3, "not the one that counts pairs, nor the first of each camera after it"
+    assert render._capacity == first, "pairs fitted"
+    render._largest.fill_(10 * first)
+    assert not render.fits()
+    render(0.01, CAMERA)
+    assert render._capacity == int(module.ROOM * 10 * first) + 1
+
+
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 @pytest.mark.parametrize("run", ["cuda"], indirect=True)
 def test_a_replay_is_a_call_to_the_bit(run):

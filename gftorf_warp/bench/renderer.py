@@ -39,7 +39,7 @@ class WarpWatch:
     def mark(self) -> wp.Event:
         """An event, recorded."""
         event = wp.Event(self.device, enable_timing=True)
-        wp.record_event(event)
+        self.device.stream.record_event(event)
         return event
 
     def between(self, start: wp.Event, stop: wp.Event) -> float:

@@ -2,9 +2,9 @@
 
 ``render`` is a Python loop over ``Run.render``, ``renderer`` one over ``Run.renderer``, which keeps arrays and on CUDA
 replays a graph; ``unchecked`` is the same without looking after every image whether all pairs fitted, ``launched``
-without graphs. ``arrays`` is what ``gftorf render`` does before it writes, so its images are NumPy arrays on the host;
-``files`` is that command, EXR and PNG included. Compilation, capture and the displacements at the first two keys are
-over when the clock starts, those at all later keys are part of the time.
+without graphs, pairs counted on the host. ``arrays`` is what ``gftorf render`` does before it writes, so its images are
+NumPy arrays on the host; ``files`` is that command, EXR and PNG included. Compilation, capture and the displacements at
+the first two keys are over when the clock starts, those at all later keys are part of the time.
 """
 
 from __future__ import annotations

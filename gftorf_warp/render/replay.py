@@ -146,22 +146,30 @@ class Replay:
                 self._known.add(number)
         seen = self._view(camera)
         if self.graphs and self._capacity is not None and seen.used and seen.graph is None:
-            with wp.ScopedCapture(device=self.device) as capture:
-                self._draw(seen)
-            seen.graph = capture.graph
+            seen.graph = self._captured(seen)
         with stream_of(self._mean):
             inputs = [*self._rest, key, share, self._optimised, seen.row]
             wp.launch(move.move_gaussians, self.count, inputs, self._moved, device=self.device, record_tape=False)
             if seen.graph is None:
                 self._draw(seen)
             else:
-                wp.capture_launch(seen.graph, stream=self.device.stream)
+                self._launch(seen.graph)
         seen.used += 1
         if self.graphs and self._capacity is None:
             self.grow()
         tensors = seen.target.tensors
         images = {name: tensors[name] for name in IMAGES if name in tensors and name != "colour"}
         return Rendering(**images, colour=tensors.get("colour"), extra=None, screen=None)
+
+    def _captured(self, seen: _View) -> wp.Graph:
+        """The rendering of a camera that was drawn before, on Warp's own stream: torch's default one cannot capture."""
+        with wp.ScopedCapture(device=self.device) as capture:
+            self._draw(seen)
+        return capture.graph
+
+    def _launch(self, graph: wp.Graph) -> None:
+        """Replay on the stream that is current, which is torch's."""
+        wp.capture_launch(graph, stream=self.device.stream)
 
     def _draw(self, seen: _View) -> None:
         """What a graph holds: a rendering, and the number of its pairs."""
