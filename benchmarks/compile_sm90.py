@@ -59,13 +59,18 @@ def modules() -> dict[str, wp.Module]:
         for square in (False, True):
             kernel = project.make_project(colour, square)
             found["project" + " colour" * colour + " square" * square] = kernel.module
-    for light, channels in ((True, False), (True, True), (False, True)):
-        what = " ".join(["light"] * light + ["channels"] * channels)
-        for metric in (True, False):
-            name = f"{what} {'paper' if metric else 'released'}"
-            forward = composite.make_composite(*shape, light, channels, metric, metric)
-            backward = composite_backward.make_composite_backward(*shape, light, channels, not metric, metric)
-            found[f"composite {name}"], found[f"composite_backward {name}"] = forward.module, backward.module
+    for light, channels, fixed in (
+        (True, False, False), (True, True, False), (True, True, True), (False, True, False), (False, True, True)
+    ):  # fmt: skip
+        what = " ".join(["light"] * light + ["channels"] * channels + ["fixed"] * fixed)
+        for metric in (True, False, None) if light else (None,):
+            name = f"{what} {'without' if metric is None else 'paper' if metric else 'released'}"
+            forward = composite.make_composite(*shape, light, channels, bool(metric), metric)
+            arguments = *shape, light, channels, not metric, metric, fixed
+            backward = composite_backward.make_composite_backward(*arguments)
+            if not fixed:
+                found[f"composite {name}"] = forward.module
+            found[f"composite_backward {name}"] = backward.module
     return found
 
 

@@ -44,7 +44,7 @@ def main() -> int:
     [row] = step.rows_of([settings], fitted, a.device, images=a.images)
     print("\n".join(step.table([row])))
     if a.profile:
-        print(step.profiled(step.fresh(fitted, fitted.observations, settings, a.device), fitted.observations, settings))
+        print(step.profiled(step.fresh(fitted, fitted.observations, settings, a.device), a.device))
     if a.json:
         about = {"device": torch.cuda.get_device_name(a.device) if a.device != "cpu" else "cpu"}
         about |= {"warp": wp.__version__, "torch": torch.__version__, "preset": a.preset, "set": a.set}

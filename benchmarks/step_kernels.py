@@ -22,6 +22,7 @@ import warp as wp
 from gftorf_warp.recon.objective import image_loss
 from gftorf_warp.recon.optimiser import BETAS, EPSILON
 from gftorf_warp.render import fused
+from gftorf_warp.render.bridge import captured
 
 IMAGES = {"1 x 120 x 160": (1, 120, 160), "1 x 240 x 320": (1, 240, 320), "4 x 240 x 320": (4, 240, 320)}
 NETWORK = [(256, 84), *[(256, 256)] * 4, (256, 340), *[(256, 256)] * 2, (3, 256), *[(256,)] * 8, (3,)]
@@ -76,7 +77,7 @@ def adam_rows(device: str, count: int) -> dict[str, Callable[[], torch.Tensor]]:
     return {f"Adam N = {count}, kernels": by_kernels, f"Adam N = {count}, torch": by_torch}
 
 
-def captured(run: Callable[[], torch.Tensor]) -> tuple[Callable[[], None], torch.Tensor]:
+def replay_of(run: Callable[[], torch.Tensor]) -> tuple[Callable[[], None], torch.Tensor]:
     """A graph of ``run`` on a stream of its own, and where its result is."""
     side = torch.cuda.Stream()
     side.wait_stream(torch.cuda.current_stream())
@@ -85,10 +86,8 @@ def captured(run: Callable[[], torch.Tensor]) -> tuple[Callable[[], None], torch
             run()
     torch.cuda.current_stream().wait_stream(side)
     graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph):
-        stream = wp.stream_from_torch(torch.cuda.current_stream())
-        with wp.ScopedCapture(stream=stream, external=True):
-            result = run()
+    with captured(graph, side):
+        result = run()
     return graph.replay, result
 
 
@@ -129,7 +128,7 @@ def main() -> int:
         replays, unequal = {}, []
         for name, run in rows.items():
             if name.endswith("kernels"):
-                replays[name], result = captured(run)
+                replays[name], result = replay_of(run)
                 if name.startswith("loss"):
                     replays[name]()
                     unequal += [] if torch.equal(result, run()) else [name]

@@ -11,14 +11,15 @@ import statistics
 import time
 import warnings
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 
+from ..recon.captured import CapturedSteps, steps_of
 from ..recon.observations import Observations, observe
 from ..recon.settings import Batch, Kernels, ReconSettings
 from ..recon.state import State, from_dict
-from ..recon.step import step
+from ..recon.step import Singles
 from ..scene.motion import MotionKind, Products
 from .states import Fitted, pairs_of
 from .timing import Report, Timing, lines_of, quietly, watch_of
@@ -52,23 +53,34 @@ def ways(settings: ReconSettings, changes: list[str], device: str) -> list[Recon
 
 def fresh(
     fitted: Fitted, observations: Observations, settings: ReconSettings, device: str, warm_up: int = WARM_UP
-) -> State:
-    """The state again, a few images later."""
+) -> Run:
+    """The state again, a few images later, and how its steps are done."""
     stored = copy.deepcopy(fitted.stored)
     if "shape" in stored["motion"]:  # precision is a matter of speed: that of the row, not of the checkpoint
         stored["motion"]["shape"]["products"] = str(settings.motion.products)
     stored["queue"] = []  # batches are numbered anew
     state = from_dict(stored, device)
-    advance(state, observations, settings, warm_up)
-    return state
+    run = Run(state, steps_of(state, observations, settings))
+    advance(run, warm_up)
+    return run
 
 
-def advance(state: State, observations: Observations, settings: ReconSettings, images: int) -> int:
+class Run(NamedTuple):
+    """A state on its way."""
+
+    state: State
+    """Changed by steps."""
+    steps: Singles | CapturedSteps
+    """How they are done."""
+
+
+def advance(run: Run, images: int) -> int:
     """Steps until so many more images are optimised; returns how many of the steps were not sound."""
-    end, broken = state.images + images, 0
-    while state.images < end:
-        broken += step(state, observations, settings) is not None
-    return broken
+    end, skipped = run.state.images + images, run.state.skipped
+    while run.state.images < end:
+        run.steps.step()
+    run.steps.collect()
+    return run.state.skipped - skipped
 
 
 def measure(
@@ -116,12 +128,13 @@ def rows_of(
     pairs = pairs_of(fitted)
     for number, settings in enumerate(chosen):
         observations = observe(fitted.sequence, settings, device)
-        state = fresh(fitted, observations, settings, device, warm_up)
+        run = fresh(fitted, observations, settings, device, warm_up)
+        state = run.state
         times, before, broken = [], state.images, 0
         for done in range(1, parts + 1):
             watch.synchronise()
             first, begun = state.images, time.perf_counter()
-            broken += advance(state, observations, settings, part)
+            broken += advance(run, part)
             watch.synchronise()
             times.append(1e3 * (time.perf_counter() - begun) / (state.images - first))
             report((number * parts + done) * part, len(chosen) * parts * part, ms=times[-1])
@@ -135,31 +148,29 @@ def rows_of(
         row |= {"images": state.images - before, "flow": fitted.flow_source, "not_sound": broken}
         row |= {"ms_per_image": statistics.mean(times), "parts": Timing.of(times).plain()}
         if torch.device(device).type != "cpu":
-            row["waits_per_image"] = waits(
-                fresh(fitted, observations, settings, device, warm_up), observations, settings
-            )
+            row["waits_per_image"] = waits(fresh(fitted, observations, settings, device, warm_up), device)
         rows.append(row)
     return rows
 
 
-def waits(state: State, observations: Observations, settings: ReconSettings) -> float:
+def waits(run: Run, device: str) -> float:
     """How often the host waits for the device in an image, as torch sees it; reads of Warp are not seen."""
-    module = torch.get_device_module(observations.quads.device)
+    module = torch.get_device_module(device)
     module.set_sync_debug_mode("warn")
     with warnings.catch_warnings(record=True) as seen:
         warnings.simplefilter("always")
-        advance(state, observations, settings, WATCHED)
+        advance(run, WATCHED)
     module.set_sync_debug_mode("default")
     return sum("synchroniz" in str(warning.message) for warning in seen) / WATCHED
 
 
-def profiled(state: State, observations: Observations, settings: ReconSettings) -> str:
+def profiled(run: Run, device: str) -> str:
     """Torch's table of the most expensive kernels and operators."""
-    on_cpu = observations.quads.device.type == "cpu"
+    on_cpu = torch.device(device).type == "cpu"
     activity = torch.profiler.ProfilerActivity
     with torch.profiler.profile(activities=[activity.CPU] if on_cpu else list(activity)) as profile:
-        advance(state, observations, settings, WATCHED)
-        watch_of(observations.quads.device).synchronise()
+        advance(run, WATCHED)
+        watch_of(device).synchronise()
     order = "self_cpu_time_total" if on_cpu else "self_device_time_total"
     return profile.key_averages().table(sort_by=order, row_limit=30)
 

@@ -80,7 +80,7 @@ def make_zeta(metric: bool):
 
 @functools.cache
 def make_composite(
-    K: int, tile_width: int, tile_height: int, light: bool, channels: bool, inclusive: bool, metric: bool
+    K: int, tile_width: int, tile_height: int, light: bool, channels: bool, inclusive: bool, metric: bool | None
 ):
     """The kernel for one tile shape and one set of outputs.
 
@@ -88,10 +88,11 @@ def make_composite(
         K: Pixels per thread: 16, or 1 on CUDA.
         tile_width: Columns of a tile [px].
         tile_height: Rows of a tile [px]; on CUDA a tile must have 32 pixels, one warp per tile.
-        light: Whether light, distance and distortion are summed.
+        light: Whether light and distance are summed.
         channels: Whether the three channels are summed.
         inclusive: Whether the splat that ends a pixel is still added.
-        metric: Whether distortion is measured on the distance itself, or on the released mapping of it.
+        metric: Whether distortion is measured on the distance itself, or on the released mapping of it; None: there is
+            no distortion, and its three planes are left alone.
     """
     ops, pixels = make_lanes(K), make_pixels(K, tile_width, tile_height)
     V, fill, affine, mul, axpy, fma, fnma = ops.V, ops.fill, ops.affine, ops.mul, ops.axpy, ops.fma, ops.fnma
@@ -100,7 +101,8 @@ def make_composite(
     block_x, block_y, columns, rows = pixels.block_x, pixels.block_y, ops.columns, ops.rows
     half = 0.5 * (pixels.side - 1)  # from the first to the middle of a block [px]
 
-    zeta_of = make_zeta(metric)
+    zeta_of = make_zeta(bool(metric))
+    spreads = light and metric is not None
 
     @wp.kernel(**options(K))
     def composite(
@@ -133,6 +135,7 @@ def make_composite(
             im = fill(0.0)
             amplitude = fill(0.0)
             distance = fill(0.0)
+        if wp.static(spreads):
             distortion = fill(0.0)
             sum_zeta = fill(0.0)
             sum_zeta2 = fill(0.0)
@@ -143,8 +146,9 @@ def make_composite(
         begin = first[tile]
         end = first[tile + 1]
         zeta0 = float(0.0)  # distortion is blind to a common shift; near the surface its sums keep their digits
-        if begin < end:
-            zeta0 = zeta_of(splats[ids[begin]][14], mapping)
+        if wp.static(spreads):
+            if begin < end:
+                zeta0 = zeta_of(splats[ids[begin]][14], mapping)
         k = int(begin)
         # `continue` instead of nested `if`s: after an `if` Warp selects between the old and the new value of everything
         # assigned inside, here a dozen vectors per splat
@@ -170,6 +174,7 @@ def make_composite(
                 im = axpy(im, w2, q[12])
                 amplitude = axpy(amplitude, w2, q[13])
                 distance = axpy(distance, w, q[14])
+            if wp.static(spreads):
                 zeta = zeta_of(q[14], mapping) - zeta0
                 # sum over pairs, one splat at a time: w (zeta^2 A - 2 zeta M + V) with A = 1 - T the weight so far
                 spread = axpy(axpy(affine(T, -zeta * zeta, zeta * zeta), sum_zeta, -2.0 * zeta), sum_zeta2, 1.0)
@@ -190,11 +195,12 @@ def make_composite(
             sums[wp.static(IM), tile, lane] = im
             sums[wp.static(AMPLITUDE), tile, lane] = amplitude
             sums[wp.static(DISTANCE), tile, lane] = distance
+            sums[wp.static(TRANSMITTANCE), tile, lane] = T
+            sums[wp.static(LAST), tile, lane] = last
+        if wp.static(spreads):
             sums[wp.static(DISTORTION), tile, lane] = distortion
             sums[wp.static(SUM_ZETA), tile, lane] = sum_zeta
             sums[wp.static(SUM_ZETA2), tile, lane] = sum_zeta2
-            sums[wp.static(TRANSMITTANCE), tile, lane] = T
-            sums[wp.static(LAST), tile, lane] = last
         if wp.static(channels):
             channel[0, tile, lane] = c0
             channel[1, tile, lane] = c1

@@ -24,7 +24,7 @@ GRAD_TRANSMITTANCE = 5
 GRAD_LIGHT_PLANES = 6
 
 
-def _add_moments(K: int, light: bool, channels: bool) -> str:
+def _add_moments(K: int, light: bool, channels: bool, geometry: bool) -> str:
     """C++ that adds what the K pixels of a thread, or of a warp on CUDA, say about one splat to its record.
 
     On the CPU one permutation brings the sums into the order of the record. On CUDA 16 values of 32 lanes are summed in
@@ -32,8 +32,10 @@ def _add_moments(K: int, light: bool, channels: bool) -> str:
     """
     names = ["v", "dx", "dy", "alpha", "w", "w2", "g0", "g1", "g2", "g_re", "g_im", "g_amplitude", "g_distance"]
     loads = " ".join(f"const F {name}_ = load({name});" for name in names)
-    values = {"v": "v_", "dx": "v_ * dx_", "dx2": "v_ * dx_ * dx_", "dxdy": "v_ * dx_ * dy_"}
-    values |= {"dy": "v_ * dy_", "dy2": "v_ * dy_ * dy_", "count": "alpha_ > 0.0f ? (F)(1.0f) : (F)(0.0f)"}
+    values = {}
+    if geometry:
+        values |= {"v": "v_", "dx": "v_ * dx_", "dx2": "v_ * dx_ * dx_", "dxdy": "v_ * dx_ * dy_"}
+        values |= {"dy": "v_ * dy_", "dy2": "v_ * dy_ * dy_", "count": "alpha_ > 0.0f ? (F)(1.0f) : (F)(0.0f)"}
     if channels:
         values |= {"c0": "w_ * g0_", "c1": "w_ * g1_", "c2": "w_ * g2_"}
     if light:
@@ -111,7 +113,14 @@ def finish_moments(
 
 @functools.cache
 def make_composite_backward(
-    K: int, tile_width: int, tile_height: int, light: bool, channels: bool, clamp_passes: bool, metric: bool
+    K: int,
+    tile_width: int,
+    tile_height: int,
+    light: bool,
+    channels: bool,
+    clamp_passes: bool,
+    metric: bool | None,
+    fixed: bool = False,
 ):
     """The adjoint kernel for one tile shape and one set of outputs; arguments as in ``make_composite``.
 
@@ -122,7 +131,8 @@ def make_composite_backward(
         light: Whether light, distance and distortion have gradients.
         channels: Whether the three channels have gradients.
         clamp_passes: Whether a clamped alpha passes its gradient on, as the released code does.
-        metric: As in ``make_composite``.
+        metric: As in ``make_composite``; None: the distortion has no gradient.
+        fixed: Whether weights are held fixed under the channels, so that only these have their gradient.
     """
     ops, pixels = make_lanes(K), make_pixels(K, tile_width, tile_height)
     V, fill, affine, mul, axpy, fma, fnma = ops.V, ops.fill, ops.affine, ops.mul, ops.axpy, ops.fma, ops.fnma
@@ -130,9 +140,10 @@ def make_composite_backward(
     inverse, at_least = ops.inverse, ops.at_least
     response, alpha_of, nonzero, largest_of = ops.response, ops.alpha_of, ops.nonzero, ops.largest_of
     block_x, block_y, columns, rows = pixels.block_x, pixels.block_y, ops.columns, ops.rows
-    half, zeta_of = 0.5 * (pixels.side - 1), make_zeta(metric)
+    half, zeta_of = 0.5 * (pixels.side - 1), make_zeta(bool(metric))
+    spreads = light and metric is not None
 
-    @wp.func_native(_add_moments(K, light, channels))
+    @wp.func_native(_add_moments(K, light, channels, light or not fixed))
     def add_moments(
         grads: wp.array[Splat], i: int, v: V, dx: V, dy: V, alpha: V, w: V, w2: V,
         g0: V, g1: V, g2: V, g_re: V, g_im: V, g_amplitude: V, g_distance: V,
@@ -177,8 +188,9 @@ def make_composite_backward(
             g_im = grad_sums[1, tile, lane]
             g_amplitude = grad_sums[2, tile, lane]
             g_distance = grad_sums[3, tile, lane]
-            g_distortion = grad_sums[4, tile, lane]
             E = mul(T, grad_sums[wp.static(GRAD_TRANSMITTANCE), tile, lane])
+        if wp.static(spreads):
+            g_distortion = grad_sums[4, tile, lane]
             twice_g_distortion = add(g_distortion, g_distortion)
             minus_sum = scaled(sums[wp.static(SUM_ZETA), tile, lane], -1.0)
             sum_zeta2 = sums[wp.static(SUM_ZETA2), tile, lane]
@@ -190,8 +202,9 @@ def make_composite_backward(
         begin = first[tile]
         k = begin + warp_max(int(largest_of(last)))
         zeta0 = float(0.0)
-        if begin < k:
-            zeta0 = zeta_of(splats[ids[begin]][14], mapping)
+        if wp.static(spreads):
+            if begin < k:
+                zeta0 = zeta_of(splats[ids[begin]][14], mapping)
         position = fill(float(k - begin))
         while k > begin:
             k -= 1
@@ -215,21 +228,24 @@ def make_composite_backward(
             T = mul(T, restored)
             w = mul(alpha, T)
             tau = zero
-            if wp.static(channels):
+            if wp.static(channels and not fixed):
                 tau = axpy(axpy(scaled(g0, q[8]), g1, q[9]), g2, q[10])
             sigma_T = zero
             w2 = zero
             g_d = zero
             if wp.static(light):
+                tau = axpy(tau, g_distance, q[14])
+                sigma_T = mul(axpy(axpy(scaled(g_re, q[11]), g_im, q[12]), g_amplitude, q[13]), T)
+                g_d = g_distance
+                w2 = mul(w, T)
+            if wp.static(spreads):
                 zeta = zeta_of(q[14], mapping) - zeta0
                 spread = axpy(minus_sum, weight, zeta)  # zeta A - M
-                tau = axpy(tau, g_distance, q[14])
                 tau = fma(tau, g_distortion, axpy(sum_zeta2, add(spread, minus_sum), zeta))
-                sigma_T = mul(axpy(axpy(scaled(g_re, q[11]), g_im, q[12]), g_amplitude, q[13]), T)
-                g_d = fma(g_distance, twice_g_distortion, spread)
-                if wp.static(not metric):  # zeta changes with the distance by mapping[1] / distance^2
+                if wp.static(bool(metric)):
+                    g_d = fma(g_distance, twice_g_distortion, spread)
+                else:  # zeta changes with the distance by mapping[1] / distance^2
                     g_d = fma(g_distance, scaled(twice_g_distortion, mapping[1] / (q[14] * q[14])), spread)
-                w2 = mul(w, T)
             tau = add(tau, sigma_T)
             v = fnma(mul(w, tau), E, mul(alpha, restored))  # alpha dL/dalpha
             E = fma(E, w, add(tau, sigma_T))

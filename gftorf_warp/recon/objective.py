@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -15,12 +15,15 @@ from ..losses.prior import flow_error, image_motion, motion_size
 from ..losses.tof import quad_error
 from ..render import fused
 from ..render.api import Background, Rendering, rasterize
-from ..render.buffers import RenderSettings
+from ..render.buffers import RenderSettings, Workspace
 from ..scene.camera import Camera
 from ..scene.gaussians import GaussianField
 from ..scene.motion import Motion
+from ..scene.sensor import Sensor
 from .observations import Observations
 from .settings import Kernels, Norm, ReconSettings, Weights
+
+NEAREST = 1e-6  # [m] of a surface: where nothing is seen nothing moves, wherever that is but at the camera itself
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -91,7 +94,9 @@ def terms(
     tof = colour = squared = None
     if weights.quads > 0 or weights.depth > 0 or weights.distortion > 0:
         moved = replace(field, colour_sh=None).moved(displacement)
-        tof = _render(moved, observations.cameras[frame], observations, frame, settings, render, backgrounds)
+        sensor = observations.sensor_at(frame)
+        camera, light = observations.cameras[frame], "phasor" if observations.phasors else "quads"
+        tof = rendering_of(moved, camera, sensor, settings, render, weights, backgrounds, light=light)
     if tof is not None and weights.quads > 0:
         if observations.phasors:  # an amplitude is not compared: re and im say it already
             rendered, measured = tof.phasor[:2], observations.phasors[frame]
@@ -110,7 +115,8 @@ def terms(
         if motion is not None and taken != time:
             then = motion.displacement(attachment, taken)
         camera = observations.colour_cameras[frame]
-        colour = _render(field.moved(then), camera, observations, frame, settings, render, backgrounds)
+        sensor = observations.sensor_at(frame)
+        colour = rendering_of(field.moved(then), camera, sensor, settings, render, weights, backgrounds)
         assert colour.colour is not None
         measured = observations.colour[frame]
         loss, of_colour = image_loss(colour.colour, measured, weights.ssim, weights.colour_norm, kernel=kernel)
@@ -125,25 +131,51 @@ def terms(
     return result, Seen(tof=tof, colour=colour, squared=still.new_zeros(()) if squared is None else squared)
 
 
-def _render(
+def rendering_of(
     field: GaussianField,
     camera: Camera,
-    observations: Observations,
-    frame: int,
+    sensor: Sensor,
     settings: ReconSettings,
     render: RenderSettings,
+    weights: Weights,
     backgrounds: Mapping[str, Tensor] | None,
+    *,
+    light: str = "quads",
+    flows: Sequence[Float[Tensor, "N 3"]] = (),
+    workspace: Workspace | None = None,
 ) -> Rendering:
-    """One rendering; colour is part of it if the field has any."""
+    """One rendering before random light from behind, of what the loss looks at; with colour if the field has any.
+
+    Args:
+        field: Gaussians where they are.
+        camera: Where from.
+        sensor: What quads are.
+        settings: What is compared.
+        render: How.
+        weights: Of the terms.
+        backgrounds: Random light, see :func:`terms`.
+        light: The image that is compared, quads or phasor.
+        flows: Displacements [m] that come along as extra channels; their gradient reaches them alone.
+        workspace: Where to render; None: in memory of its own.
+    """
     wanted = ("colour",) if field.colour_sh is not None else ("quads", "phasor")
     lights = {name: light for name, light in (backgrounds or {}).items() if name in wanted}
+    images = {"opacity", light}
+    if weights.distortion > 0:
+        images.add("distortion")
+    if weights.depth > 0 or flows:
+        images.add("distance")
     return rasterize(
         field,
         camera,
-        observations.sensor_at(frame),
+        sensor,
         render,
         background=Background(**lights),
         screen_gradient=settings.densify.every is not None,
+        images=images,
+        extra=torch.cat(list(flows), dim=1) if flows else None,
+        extra_detached=bool(flows),
+        workspace=workspace,
     )
 
 
@@ -195,18 +227,40 @@ def flow_loss(
     steps = [step for step in (1, -1) if (quartet, step) in observations.flow]
     if not steps:
         return None
-    cameras = observations.cameras
-    camera = cameras[frame]
     here, *there = motion.key_offsets(attachment, [quartet, *(quartet + step for step in steps)])
-    offsets = [offset - here for offset in there]
     still = replace(field, colour_sh=None).moved(here).map(torch.Tensor.detach)
-    seen = rasterize(still, camera, observations.sensor_at(frame), render, extra=torch.cat(offsets, dim=1))
+    camera, sensor = observations.cameras[frame], observations.sensor_at(frame)
+    channels, wanted = torch.cat([offset - here for offset in there], dim=1), ("distance",)
+    seen = rasterize(still, camera, sensor, render, extra=channels, images=wanted)
     assert seen.extra is not None
-    centre, ray = observations.rays_at(frame)
-    surface = centre + ray * seen.distance.detach()[..., None]
+    last = len(observations.cameras) - 1
+    later = [observations.cameras[min(frame + FRAMES_PER_QUARTET * step, last)] for step in steps]
+    measured = [observations.flow[quartet, step] for step in steps]
+    return flow_between(seen.distance, seen.extra, measured, camera, later, observations.rays_at(frame))
+
+
+def flow_between(
+    distance: Float[Tensor, "H W"],
+    displacement: Float[Tensor, "D H W"],
+    measured: Sequence[Float[Tensor, "2 H W"]],
+    camera: Camera,
+    later: Sequence[Camera],
+    rays: tuple[Float[Tensor, "3"], Float[Tensor, "H W 3"]],
+) -> Tensor:
+    """Sum over some flows of the mean squared difference [px^2] to what displacements would show.
+
+    Args:
+        distance: Of the surface [m]; without gradient.
+        displacement: Composited displacements to the end of each flow [m], three channels each.
+        measured: The flows; NaN: unknown.
+        camera: Where from.
+        later: The camera at the end of each flow.
+        rays: Centre of the camera [m] and unit vectors through its pixels, in world axes.
+    """
+    centre, ray = rays
+    surface = centre + ray * distance.detach().clamp_min(NEAREST)[..., None]
     errors = []
-    for n, step in enumerate(steps):
-        later = cameras[min(frame + FRAMES_PER_QUARTET * step, len(cameras) - 1)]
-        moved = image_motion(surface, seen.extra[3 * n : 3 * n + 3], camera.project, later.project)
-        errors.append(flow_error(moved, observations.flow[quartet, step])[0].mean())
+    for n, (flow, then) in enumerate(zip(measured, later, strict=True)):
+        moved = image_motion(surface, displacement[3 * n : 3 * n + 3], camera.project, then.project)
+        errors.append(flow_error(moved, flow)[0].mean())
     return torch.stack(errors).sum()

@@ -138,19 +138,30 @@ class Optimiser:
         """All tensors in two launches, with the moments that torch's Adam keeps, and would begin with."""
         moving = [(leaf, group["lr"]) for group in self.adam.param_groups for leaf in group["params"]]
         moving = [(leaf, rate) for leaf, rate in moving if leaf.grad is not None]
-        moments = []
-        for leaf, _ in moving:
-            state = self.adam.state[leaf]
-            if not state:
-                state["step"] = torch.zeros((), device=leaf.device)
-                state |= {name: torch.zeros_like(leaf, requires_grad=False) for name in ("exp_avg", "exp_avg_sq")}
-            moments.append((state["step"], state["exp_avg"], state["exp_avg_sq"]))
+        moments = [self.moments_of(leaf) for leaf, _ in moving]
         if not moving:
             return
         values, gradients = [leaf.detach() for leaf, _ in moving], [leaf.grad.contiguous() for leaf, _ in moving]
         rates = torch.tensor([rate for _, rate in moving], device=sound.device)
         table = fused.adam_table(values, gradients, moments)
         fused.adam_step(table, rates, sound.to(torch.int32).reshape(1), betas=BETAS, epsilon=EPSILON)
+
+    def moments_of(self, leaf: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """(step, first moment, second moment) of a leaf; zeros, as torch's Adam would begin, if it has none yet."""
+        state = self.adam.state[leaf]
+        if not state:
+            state["step"] = torch.zeros((), device=leaf.device)
+            state |= {name: torch.zeros_like(leaf, requires_grad=False) for name in ("exp_avg", "exp_avg_sq")}
+        return state["step"], state["exp_avg"], state["exp_avg_sq"]
+
+    def settle(self, name: str, value: Tensor, moments: tuple[Tensor, Tensor, Tensor]) -> None:
+        """Let one tensor of the field live elsewhere, with the moments that it has had so far."""
+        self.adam.state.pop(self.tensors[name], None)
+        self.tensors[name] = value
+        for group in self.adam.param_groups:
+            if group["name"] == name:
+                group["params"] = [value]
+        self.adam.state[value] = dict(zip(("step", "exp_avg", "exp_avg_sq"), moments, strict=True))
 
     def replace(
         self, rows: Int[Tensor, "M"], fresh: Bool[Tensor, "M"], change: Callable[[str, Tensor], Tensor]

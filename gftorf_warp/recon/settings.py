@@ -77,6 +77,8 @@ class Kernels(enum.StrEnum):
     """Losses of images that contain the similarity."""
     STEP = "step"
     """These, random backgrounds and Adam; the backgrounds are other draws of the same kind."""
+    GRAPH = "graph"
+    """The whole step, captured as one CUDA graph; on a CPU the same without one. What cannot be one is ``step``."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -113,7 +113,7 @@ def to_dict(state: State) -> dict[str, object]:
         "field": {name: value.detach() for name, value in state.optimiser.field.tensors().items()},
         "adam": state.optimiser.adam.state_dict(),
         "motion": _motion_to_dict(state.motion),
-        "attachment": state.attachment,
+        "attachment": state.optimiser.field.mean.detach() if state.motion.follows_means else state.attachment,
         "statistics": {"gradient": state.statistics.gradient, "pixels": state.statistics.pixels},
         "generator": state.generator.get_state(),
         "noise": state.noise.get_state(),

@@ -98,8 +98,28 @@ def step(
         _account(state, observations, frame, found, seen)
     if not by_kernel:
         state.optimiser.step(gradients, rates, settings.motion_gradient_max)
-    _densify(state, before, settings)
+    densify_after(state, before, settings)
     return None
+
+
+class Singles:
+    """The steps of one run, one after the other."""
+
+    def __init__(self, state: State, observations: Observations, settings: ReconSettings, run_all: Map = map):
+        self._state, self._observations, self._settings = state, observations, settings
+        self._run_all, self._first, self._failures = run_all, True, 0
+
+    def step(self) -> dict[str, float] | None:
+        """One step; what it returns is that of :func:`step`."""
+        run_all = map if self._first else self._run_all  # the first one compiles kernels: one thread at a time
+        broken, self._first = step(self._state, self._observations, self._settings, run_all), False
+        self._failures = 0 if broken is None else self._failures + 1
+        self._state.skipped += broken is not None
+        return broken
+
+    def collect(self) -> int:
+        """How many steps in a row, up to the last one, changed nothing because something was not finite."""
+        return self._failures
 
 
 def threads_for(settings: ReconSettings, device: torch.device | str, available: int) -> tuple[ReconSettings, int]:
@@ -169,8 +189,8 @@ def _account(state: State, observations: Observations, frame: int, found: dict[s
             state.statistics = densify.observe(state.statistics, rendering.screen, camera)
 
 
-def _densify(state: State, before: int, settings: ReconSettings) -> None:
-    """Rounds and resets that are due after a step."""
+def densify_after(state: State, before: int, settings: ReconSettings) -> None:
+    """Rounds and resets that are due after a step that began after ``before`` images."""
     options, schedule = settings.densify, settings.schedule
     if densify.round_is_due(before, state.images, options, schedule):
         judge = state.images > options.scale_from

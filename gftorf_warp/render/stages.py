@@ -70,17 +70,15 @@ def sort_by_tile(frame: Frame) -> None:
     """Count, emit and sort the (tile, splat) pairs."""
     lists = [frame.order, frame.splats, frame.box_px, frame.tile_width, frame.tile_height]
     _launch(tiles.count_pairs, frame.count, lists, [frame.counts])
-    wp.utils.array_scan(frame.counts, frame.offsets, inclusive=False)
+    wp.utils.array_scan(frame.counts, frame.ends, inclusive=True)
     capacity = frame.settings.pair_capacity
     if capacity is None:
         # the declared host synchronisation: how many pairs there are decides how much memory they need
-        capacity = int(frame.offsets[-1:].numpy()[0]) + int(frame.counts[-1:].numpy()[0])
-        frame.reserve_pairs(capacity)
-    else:
-        frame.reserve_pairs(capacity)
-        frame.keys.fill_(frame.tiles)  # pairs that do not exist sort behind all tiles
-    outputs = [frame.keys, frame.ids, frame.total]
-    _launch(tiles.emit_pairs, frame.count, [*lists, frame.tiles_x, frame.counts, frame.offsets, capacity], outputs)
+        capacity = int(frame.ends[-1:].numpy()[0])
+    frame.reserve_pairs(capacity)
+    threads = max(1, math.ceil(capacity / frame.share))
+    inputs = [*lists, frame.tiles_x, frame.tiles, frame.ends, frame.share, capacity]
+    _launch(tiles.emit_pairs, threads, inputs, [frame.keys, frame.ids, frame.total])
     if capacity:
         wp.utils.radix_sort_pairs(frame.keys, frame.ids, capacity, end_bit=frame.tiles.bit_length())
     _launch(tiles.tile_starts, frame.tiles + 1, [frame.keys, capacity], [frame.first])
@@ -88,11 +86,11 @@ def sort_by_tile(frame: Frame) -> None:
         frame.check_capacity()
 
 
-def composite(frame: Frame, view: CameraView, number: int) -> None:
+def composite(frame: Frame, view: CameraView, number: int, distortion: bool = True) -> None:
     """Blend all tiles: light with the first group of channels, every further group by itself."""
     light, channels = number == 0, bool(frame.channels)
     shape = frame.K, frame.tile_width, frame.tile_height
-    metric = frame.settings.distortion == Distortion.PAPER
+    metric = _metric(frame, light and distortion)
     kernel = make_composite(*shape, light, channels, frame.settings.stop == Stop.INCLUSIVE, metric)
     channel = frame.channels[number].lanes if channels else _nothing(frame, 3, frame.sums.lanes.dtype)
     lists = [frame.first, frame.ids, frame.records[number], frame.tiles_x, view.width, view.height]
@@ -104,17 +102,34 @@ def composite(frame: Frame, view: CameraView, number: int) -> None:
 
 
 def composite_backward(
-    frame: Frame, number: int, grad_light: Planes, grad_channel: Planes | None, records: wp.array
+    frame: Frame,
+    number: int,
+    grad_light: Planes,
+    grad_channel: Planes | None,
+    records: wp.array,
+    *,
+    distortion: bool = True,
+    fixed: bool = False,
 ) -> None:
-    """Add the gradient of one pass to ``records``; CPU threads add to their own, which are then summed in order."""
+    """Add the gradient of one pass to ``records``; CPU threads add to their own, which are then summed in order.
+
+    Args:
+        frame: After its forward pass.
+        number: Of the pass: 0 has the light.
+        grad_light: Of the planes of light.
+        grad_channel: Of the pass's channels; None: they have no gradient.
+        records: [N] added to.
+        distortion: Whether it has a gradient.
+        fixed: Whether weights are held fixed under the channels.
+    """
     light, channels = number == 0, grad_channel is not None
     shape = frame.K, frame.tile_width, frame.tile_height
     passes = frame.settings.clamp_gradient == ClampGradient.STRAIGHT
-    metric = frame.settings.distortion == Distortion.PAPER
-    kernel = make_composite_backward(*shape, light, channels, passes, metric)
+    metric = _metric(frame, light and distortion)
+    kernel = make_composite_backward(*shape, light, channels, passes, metric, fixed and channels)
     channel = grad_channel.lanes if grad_channel is not None else _nothing(frame, 3, frame.sums.lanes.dtype)
     edges = _tile_edges(frame, frame.threads)
-    parts = [records] + [wp.zeros_like(records) for _ in range(len(edges) - 2)]
+    parts = [records] + [frame.zeros(f"records of thread {n}", frame.count, splat.Splat) for n in range(len(edges) - 2)]
     lists = [frame.first, frame.ids, frame.records[number], frame.tiles_x]
 
     def arguments(tile0: int, part: int) -> list:
@@ -149,15 +164,17 @@ def finish(frame: Frame, grad_splats: wp.array) -> None:
 def resolve_images(inputs: Inputs, shifts, frame: Frame, images: Images, groups: list) -> None:
     """Planes to images."""
     pixels, sums, tiling = (frame.height, frame.width), frame.sums.flat, frame.tiling
-    if shifts:
+    if shifts and images.quads is not None:
         vectors = _shift_vectors(shifts, str(frame.device))
         lit = [sums, tiling, inputs.calibration, vectors, _or_nothing(frame, inputs.background_quads)]
         _launch(resolve.resolve_quads, pixels, lit, [images.quads])
-    factor = frame.settings.phasor_factor
-    lit = [sums, tiling, factor, _or_nothing(frame, inputs.background_phasor)]
-    _launch(resolve.resolve_phasor, pixels, lit, [images.phasor])
+    if images.phasor is not None:
+        lit = [sums, tiling, frame.settings.phasor_factor, _or_nothing(frame, inputs.background_phasor)]
+        _launch(resolve.resolve_phasor, pixels, lit, [images.phasor])
     outputs = [images.distance, images.opacity, images.distortion]
-    _launch(resolve.resolve_geometry, pixels, [sums, tiling, _distortion_factor(frame)], outputs)
+    if any(image is not None for image in outputs):
+        outputs = [_or_nothing(frame, image, 2) for image in outputs]
+        _launch(resolve.resolve_geometry, pixels, [sums, tiling, _distortion_factor(frame)], outputs)
     for (name, start), planes in zip(groups, frame.channels, strict=True):
         background = inputs.background_colour if name == "colour" else None
         rest = [planes.flat, sums, tiling, _or_nothing(frame, background), start]
@@ -167,7 +184,7 @@ def resolve_images(inputs: Inputs, shifts, frame: Frame, images: Images, groups:
 def fold_images(inputs: Inputs, shifts, frame: Frame, cotangents: Images, wanted: Inputs, groups: list):
     """Images to planes: the adjoint of :func:`resolve_images`. Channels without a gradient are None."""
     pixels, sums, tiling = (frame.height, frame.width), frame.sums.flat, frame.tiling
-    planes = frame.gradient_planes(GRAD_LIGHT_PLANES)
+    planes = frame.gradient_planes("gradient of light", GRAD_LIGHT_PLANES)
     target = planes.flat
     if cotangents.quads is not None and shifts:
         vectors = _shift_vectors(shifts, str(frame.device))
@@ -175,7 +192,7 @@ def fold_images(inputs: Inputs, shifts, frame: Frame, cotangents: Images, wanted
         outputs = [target, _or_nothing(frame, wanted.background_quads)]
         _launch(resolve.fold_quads, pixels, [*lit, cotangents.quads], outputs)
         if wanted.calibration is not None:
-            rows = frame.array(frame.height, wp.float64)
+            rows = frame.array("rows", frame.height, wp.float64)
             _launch(resolve.fold_dc_offset, frame.height, [sums, tiling, cotangents.quads], [rows])
             _launch(resolve.add_dc_offset, 1, [rows], [wanted.calibration])
     if cotangents.phasor is not None:
@@ -190,12 +207,12 @@ def fold_images(inputs: Inputs, shifts, frame: Frame, cotangents: Images, wanted
         if image is not None:
             _launch(resolve.fold_plane, pixels, [image, tiling, factor, plane], [target])
     channels: list[Planes | None] = []
-    for name, start in groups:
+    for number, (name, start) in enumerate(groups):
         cotangent = getattr(cotangents, name)
         if cotangent is None:
             channels.append(None)
             continue
-        grad = frame.gradient_planes(CHANNEL_PLANES)
+        grad = frame.gradient_planes(f"gradient of channels {number}", CHANNEL_PLANES)
         colour = name == "colour"
         background = _or_nothing(frame, inputs.background_colour if colour else None)
         grad_background = _or_nothing(frame, wanted.background_colour if colour else None)
@@ -212,6 +229,11 @@ def fold_images(inputs: Inputs, shifts, frame: Frame, cotangents: Images, wanted
 def _shift_vectors(shifts: tuple[float, ...], device: str) -> wp.array:
     """(cos, sin) of phase shifts [rad], uploaded once."""
     return wp.array([(math.cos(s), math.sin(s)) for s in shifts], dtype=wp.vec2, device=device)
+
+
+def _metric(frame: Frame, wanted: bool) -> bool | None:
+    """What distortion is measured on, as compositors have it; None where there is none."""
+    return frame.settings.distortion == Distortion.PAPER if wanted else None
 
 
 def _distortion_factor(frame: Frame) -> float:
@@ -285,5 +307,5 @@ def _nothing(frame: Frame, ndim: int, dtype) -> wp.array:
     return _empty(str(frame.device), ndim, dtype)
 
 
-def _or_nothing(frame: Frame, array: wp.array | None) -> wp.array:
-    return array if array is not None else _nothing(frame, 3, wp.float32)
+def _or_nothing(frame: Frame, array: wp.array | None, ndim: int = 3) -> wp.array:
+    return array if array is not None else _nothing(frame, ndim, wp.float32)
