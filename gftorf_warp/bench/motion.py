@@ -1,11 +1,14 @@
-"""The motion network: forward and backward for Q key times at once, per query."""
+"""The motion network: forward and backward for Q key times at once, per query; what it needs of places included."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
+from ..scene.gaussians import GaussianField, constant_sh
 from ..scene.motion import MotionKind, MotionSettings, Products
 from ..scene.network import Network
 from .timing import Report, both_ways, cell, lines_of, watch_of
@@ -36,17 +39,17 @@ def measure(device: str, *, quick: bool, runs: int, report: Report) -> list[dict
         times = torch.arange(KEYS, dtype=torch.float64) * PERIOD_S
         settings = MotionSettings(kind=MotionKind.NETWORK, products=products)
         network = Network(times, settings, duration=float(times[-1]), length=LENGTH_M, generator=generator).to(device)
-        place = (LENGTH_M * torch.rand(count, 3, generator=generator)).to(device)
+        field = points(LENGTH_M * torch.rand(count, 3, generator=generator)).map(lambda value: value.to(device))
         slope = torch.randn(queries, count, 3, generator=generator).to(device)
         weights = list(network.parameters())
         keys = list(range(4, 4 + queries))
 
-        def both(network=network, place=place, slope=slope, weights=weights, keys=keys) -> object:
-            return torch.autograd.grad(network.key_offsets(place, keys), weights, slope)
+        def both(network=network, field=field, slope=slope, weights=weights, keys=keys) -> object:
+            return torch.autograd.grad(network.key_offsets(network.attach(field), keys), weights, slope)
 
-        def forward(network=network, place=place, keys=keys) -> object:
+        def forward(network=network, field=field, keys=keys) -> object:
             with torch.no_grad():
-                return network.key_offsets(place, keys)
+                return network.key_offsets(network.attach(field), keys)
 
         found = both_ways(both, watch, runs)
         best = (found["graph"] or found["eager"])["median"]
@@ -54,6 +57,18 @@ def measure(device: str, *, quick: bool, runs: int, report: Report) -> list[dict
         rows.append(row | {"forward": both_ways(forward, watch, runs), "ms_per_query": best / queries})
         report(done, len(cases), N=count, ms=best)
     return rows
+
+
+def points(mean: Float[Tensor, "N 3"]) -> GaussianField:
+    """Gaussians of which only the places [m] matter."""
+    count = len(mean)
+    return GaussianField(
+        mean=mean,
+        log_scale=torch.zeros(count, 3),
+        quaternion=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
+        opacity_logit=torch.zeros(count),
+        reflectivity_sh=constant_sh(torch.ones(count)),
+    )
 
 
 def table(rows: list[dict[str, Any]]) -> list[str]:
