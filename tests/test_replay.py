@@ -19,6 +19,7 @@ DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 CAMERA = Camera.from_fov(40, 30, 60.0)
 NEAR = {"near": 0.1, "far": 20.0, "support": "alpha", "stop": "inclusive"}
 IMAGES = ("quads", "phasor", "colour", "distance", "opacity", "distortion")
+PLAIN = ("quads", "phasor", "distance", "opacity", "distortion")
 TIMES = (-1.0, 0.0, 0.011, 0.04, 0.0667, 0.5)  # before the first key, on keys, between them, behind the last
 
 
@@ -74,9 +75,17 @@ def test_images_are_those_of_render(run):
 
 def test_colour_only_where_it_is_wanted(run):
     """Without it the other images stay."""
-    got, want = run.renderer(colour=False)(0.02, CAMERA), run.render(0.02)
+    got, want = run.renderer(PLAIN)(0.02, CAMERA), run.render(0.02)
     assert got.colour is None
     torch.testing.assert_close(got.quads, want.quads, rtol=1e-4, atol=1e-5)
+
+
+def test_only_what_is_wanted(run):
+    """The rest is empty, and what is there is the same."""
+    got, want = run.renderer(("quads", "distance", "opacity"))(0.02, CAMERA), run.render(0.02)
+    assert got.phasor.numel() == got.distortion.numel() == 0
+    for name in ("quads", "distance", "opacity"):
+        torch.testing.assert_close(getattr(got, name), getattr(want, name), rtol=1e-4, atol=1e-4, msg=name)
 
 
 def test_every_key_is_computed_once(run, monkeypatch):
@@ -84,7 +93,7 @@ def test_every_key_is_computed_once(run, monkeypatch):
     asked = []
     right = run.motion.key_offset
     monkeypatch.setattr(run.motion, "key_offset", lambda a, key: asked.append(key) or right(a, key))
-    render = run.renderer(colour=False)
+    render = run.renderer(PLAIN)
     for time in np.linspace(0.0, 0.06, 20):
         render(float(time), CAMERA)
     assert sorted(asked) == [0, 1, 2]
@@ -102,7 +111,7 @@ def test_an_empty_field_renders_black(run):
 def test_cameras_are_forgotten_when_there_are_many(run, monkeypatch):
     """Images stay right."""
     monkeypatch.setattr(module, "CAMERAS_MAX", 2)
-    render = run.renderer(colour=False)
+    render = run.renderer(PLAIN)
     for x in (0.0, 0.1, 0.2, 0.0):
         got, want = render(0.02, aside(x)), run.render(0.02, aside(x))
         torch.testing.assert_close(got.distance, want.distance, rtol=1e-4, atol=1e-4)
@@ -115,7 +124,7 @@ def test_a_camera_is_captured_when_it_comes_again(run, monkeypatch):
     captured, launched = [], []
     monkeypatch.setattr(module.Replay, "_captured", lambda _, seen: captured.append(seen) or seen)
     monkeypatch.setattr(module.Replay, "_launch", lambda self, seen: launched.append(seen) or self._draw(seen))
-    render = run.renderer(colour=False)
+    render = run.renderer(PLAIN)
     render.graphs = True
     for number, (time, camera) in enumerate([(t, c) for t in TIMES for c in (CAMERA, aside(0.1))]):
         got, want = render(time, camera), run.render(time, camera)
@@ -137,7 +146,7 @@ def test_a_camera_is_captured_when_it_comes_again(run, monkeypatch):
 @pytest.mark.parametrize("run", ["cuda"], indirect=True)
 def test_a_replay_is_a_call_to_the_bit(run):
     """Graph and launches give the same images; the graph was used."""
-    graphs, calls = run.renderer(colour=False), run.renderer(colour=False)
+    graphs, calls = run.renderer(PLAIN), run.renderer(PLAIN)
     calls.graphs = False
     for time in (*TIMES, *TIMES):
         got, want = graphs(time, CAMERA), calls(time, CAMERA)
@@ -151,7 +160,7 @@ def test_a_replay_is_a_call_to_the_bit(run):
 @pytest.mark.parametrize("run", ["cuda"], indirect=True)
 def test_pairs_that_do_not_fit_are_rendered_again(run):
     """A checked image is whole whatever was reserved; an unchecked one is not, and the replay says so."""
-    render = run.renderer(colour=False)
+    render = run.renderer(PLAIN)
     render(0.0, CAMERA)
     render._capacity = 10
     render._views.clear()

@@ -34,7 +34,7 @@ Render = Callable[[float, Camera], Any]
 
 
 def _renderer(run: Run) -> Render:
-    return run.renderer(colour=False)
+    return run.renderer(("quads", "distance", "opacity"))
 
 
 def _unchecked(run: Run) -> Render | None:

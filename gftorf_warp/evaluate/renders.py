@@ -20,7 +20,13 @@ from . import pictures
 
 LIST = "renders.json"
 LISTED = ("run", "times_s", "camera_from_world", "channels")  # its keys that say which images these are
-WHAT = ("distance", "quads", "phasor", "colour")
+NEEDS = {  # what may be asked for: the images of a rendering that it consists of
+    "distance": ("distance", "opacity"),
+    "quads": ("quads",),
+    "phasor": ("phasor",),
+    "colour": ("colour",),
+}
+WHAT = tuple(NEEDS)
 Channels = dict[str, Float[np.ndarray, "H W"]]
 
 

@@ -180,7 +180,7 @@ def render_to_folder(
     sequence = run.sequence()
     seconds, cameras = views_to_take(run, sequence, times, poses)
 
-    render = run.renderer(colour="colour" in names)
+    render = run.renderer({image for name in names for image in renders.NEEDS[name]})
     images = images_of(render, run.sensor, names)
     samples = [images(seconds[i], cameras[i]) for i in sorted({0, len(seconds) // 2, len(seconds) - 1})]
     scales = {name: renders.preview_scale(name, (sample[name] for sample in samples)) for name in names}

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -107,7 +107,7 @@ class ClosedForm(Run):
             screen=None,
         )
 
-    def renderer(self, *, colour: bool = True) -> Callable[[float, Camera], Rendering]:  # noqa: ARG002
+    def renderer(self, images: Iterable[str] = ()) -> Callable[[float, Camera], Rendering]:  # noqa: ARG002
         """:meth:`render`: there is nothing that images share."""
         return self.render
 

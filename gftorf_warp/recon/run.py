@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -18,6 +18,7 @@ from ..data.sequence import Sequence
 from ..errors import InputError
 from ..render.api import Rendering, rasterize
 from ..render.buffers import ClampGradient, Distortion, RenderSettings, Stop, Support
+from ..render.inputs import CHOICES
 from ..render.replay import Replay
 from ..scene.camera import Camera
 from ..scene.gaussians import GaussianField
@@ -126,18 +127,20 @@ class Run:
             colour=None if rendering.colour is None else rendering.colour / self.colour_scale,
         )
 
-    def renderer(self, *, colour: bool = True) -> Callable[[float, Camera], Rendering]:
+    def renderer(self, images: Iterable[str] = (*CHOICES, "colour")) -> Callable[[float, Camera], Rendering]:
         """:meth:`render` for many images: a function of time [s] and camera, which keeps what images share.
 
         Its images differ from those of :meth:`render` by rounding only, and the next call overwrites them.
 
         Args:
-            colour: Whether colour is wanted, if the run has any.
+            images: Names of what is wanted of quads, phasor, colour, distance, opacity and distortion; others have no
+                elements and cost nothing.
         """
-        field = self.field if colour else replace(self.field, colour_sh=None)
+        names = frozenset(images)
+        field = self.field if "colour" in names else replace(self.field, colour_sh=None)
         sensor = replace(self.sensor, source_intensity=float(self.sensor.source_intensity) / self.quad_scale)
         optimised = self.camera.resized(*self.config["size_optimised"])
-        replay = Replay(field, self.motion, self.attachment, sensor, self.render_settings, optimised)
+        replay = Replay(field, self.motion, self.attachment, sensor, self.render_settings, optimised, names)
         if field.colour_sh is None:
             return replay
 

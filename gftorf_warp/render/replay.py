@@ -9,6 +9,7 @@ rendered again. A replay runs the very launches of a call, so it gives the same 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,9 +25,9 @@ from ..scene.motion import Motion
 from ..scene.sensor import Sensor
 from . import launch
 from .api import Rendering
-from .bridge import IMAGES, array_over, stream_of
+from .bridge import array_over, stream_of
 from .buffers import Frame, RenderSettings
-from .inputs import Images, Inputs
+from .inputs import CHOICES, Images, Inputs, names_of
 
 ROOM = 1.5  # pairs that are reserved, over the most that were needed so far
 CAMERAS_MAX = 16  # that are kept, with their graphs
@@ -66,6 +67,7 @@ class Replay:
         sensor: Sensor,
         settings: RenderSettings,
         optimised: Camera,
+        images: Iterable[str] = (*CHOICES, "colour"),
     ):
         """Take a copy of what changes, and share the rest.
 
@@ -76,10 +78,13 @@ class Replay:
             sensor: With the shifts of the quads.
             settings: How to render; pairs are reserved as needed.
             optimised: The camera at the size of the optimisation, whose low-pass filter widened the Gaussians.
+            images: Names of what is wanted of quads, phasor, colour, distance, opacity and distortion; others have no
+                elements and cost nothing.
         """
         wp.init()
         field = field.map(lambda tensor: tensor.detach().contiguous())
         self.motion, self.attachment, self.settings = motion, attachment, settings
+        self.names, self._nothing = frozenset(images), field.mean.new_empty(0)
         self.shifts = tuple(float(shift) for shift in sensor.shifts)
         self.device = wp.device_from_torch(field.device)
         self.graphs = self.device.is_cuda
@@ -158,7 +163,7 @@ class Replay:
         if self.graphs and self._capacity is None:
             self.grow()
         tensors = seen.target.tensors
-        images = {name: tensors[name] for name in IMAGES if name in tensors and name != "colour"}
+        images = {name: tensors.get(name, self._nothing) for name in CHOICES}
         return Rendering(**images, colour=tensors.get("colour"), extra=None, screen=None)
 
     def _captured(self, seen: _View) -> wp.Graph:
@@ -198,11 +203,12 @@ class Replay:
         shapes: dict[str, tuple[int, ...]] = {"quads": (len(self.shifts), *size), "phasor": (3, *size)}
         shapes |= {"colour": (3, *size)} if self._inputs.colour_sh is not None else {}
         shapes |= dict.fromkeys(("distance", "opacity", "distortion"), size)
+        shapes = {name: shape for name, shape in shapes.items() if name in self.names}
         tensors = {name: self._mean.new_empty(shape) for name, shape in shapes.items()}
         settings = replace(self.settings, pair_capacity=self._capacity)
         with stream_of(self._mean):
             frame = Frame(self.count, width, height, settings, self.device)
-        images = Images(**{name: array_over(tensors[name]) for name in shapes})
+        images = Images(**dict.fromkeys(names_of(Images)) | {name: array_over(tensors[name]) for name in shapes})
         return _Target(frame=frame, tensors=tensors, images=images)
 
 
