@@ -142,7 +142,9 @@ def _warp_stream(stream: torch.cuda.Stream) -> wp.Stream:
 
 
 @contextlib.contextmanager
-def captured(graph: torch.cuda.CUDAGraph, stream: torch.cuda.Stream | None = None):
+def captured(
+    graph: torch.cuda.CUDAGraph, stream: torch.cuda.Stream | None = None, pool: tuple[int, int] | None = None
+) -> Iterator[None]:
     """Capture what torch and Warp do inside the block, backward passes included, in a graph that torch replays.
 
     The same must have run before on ``stream``: modules get loaded, constants uploaded and libraries started then. What
@@ -152,10 +154,11 @@ def captured(graph: torch.cuda.CUDAGraph, stream: torch.cuda.Stream | None = Non
     Args:
         graph: An empty one.
         stream: Where to capture, not the default stream; None: one of torch's own.
+        pool: Memory that several graphs share, of which one runs after the other and none looks at what another made.
     """
     wp.init()
     mode = "thread_local"  # what Warp takes for granted
-    with torch.cuda.graph(graph, stream=stream, capture_error_mode=mode):
+    with torch.cuda.graph(graph, pool=pool, stream=stream, capture_error_mode=mode):
         with wp.ScopedCapture(stream=_warp_stream(torch.cuda.current_stream()), external=True):
             yield
 
@@ -200,8 +203,8 @@ class Captured:
     belongs to the graph; nobody else may look at it.
     """
 
-    def __init__(self, work: Callable[[], None], device: torch.device):
-        self._work, self._device = work, device
+    def __init__(self, work: Callable[[], None], device: torch.device, pool: tuple[int, int] | None = None):
+        self._work, self._device, self._pool = work, device, pool
         self._graph: torch.cuda.CUDAGraph | None = None
 
     def __call__(self) -> None:
@@ -215,9 +218,14 @@ class Captured:
 
     def _capture(self) -> torch.cuda.CUDAGraph:
         graph = torch.cuda.CUDAGraph()
-        with captured(graph):
+        with captured(graph, pool=self._pool):
             self._work()
         return graph
+
+
+def shared_pool(device: torch.device) -> tuple[int, int] | None:
+    """Memory for graphs that run one after the other; None on a CPU."""
+    return torch.cuda.graph_pool_handle() if device.type != "cpu" else None
 
 
 class Branches:
