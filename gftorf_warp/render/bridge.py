@@ -143,7 +143,7 @@ def _warp_stream(stream: torch.cuda.Stream) -> wp.Stream:
 
 @contextlib.contextmanager
 def captured(
-    graph: torch.cuda.CUDAGraph, stream: torch.cuda.Stream | None = None, pool: tuple[int, int] | None = None
+    graph: torch.cuda.CUDAGraph, stream: torch.cuda.Stream | None = None, pool: Any = None
 ) -> Iterator[None]:
     """Capture what torch and Warp do inside the block, backward passes included, in a graph that torch replays.
 
@@ -203,7 +203,7 @@ class Captured:
     belongs to the graph; nobody else may look at it.
     """
 
-    def __init__(self, work: Callable[[], None], device: torch.device, pool: tuple[int, int] | None = None):
+    def __init__(self, work: Callable[[], None], device: torch.device, pool: Any = None):
         self._work, self._device, self._pool = work, device, pool
         self._graph: torch.cuda.CUDAGraph | None = None
 
@@ -223,7 +223,7 @@ class Captured:
         return graph
 
 
-def shared_pool(device: torch.device) -> tuple[int, int] | None:
+def shared_pool(device: torch.device) -> Any:
     """Memory for graphs that run one after the other; None on a CPU."""
     return torch.cuda.graph_pool_handle() if device.type != "cpu" else None
 
