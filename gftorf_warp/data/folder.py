@@ -12,10 +12,12 @@ from ..errors import InputError, ResourceError
 from . import specs
 from .arrays import as_float32, read_array, read_shape
 from .problems import Problems
+from .sequence import Truth
 
 SLOT_FOLDERS = tuple(f"tofType{slot}" for slot in range(FRAMES_PER_QUARTET))
 PHASOR_FOLDER = "tof"
 EXPECTED = "expected a folder with tofType0 .. tofType3 and cams (F-ToeRF: raw quads), or tof and cams (ToeRF: phasors)"
+UNFINISHED = "unfinished.md"  # stands in the folder of a recording that is not complete
 FRAMES_MAX = 1_000_000  # over two hours at 120 Hz: a higher id is a typing error
 
 
@@ -34,16 +36,26 @@ def format_of(path: Path) -> str:
             why=f"{EXPECTED}, found {'a file' if path.exists() else 'nothing'}",
             fix="check the path",
         )
-    found = _resembled(path)
+    found = format_or_none(path)
     if found is not None:
         return found
+    if (path / UNFINISHED).is_file():
+        raise InputError(
+            "an unfinished recording",
+            where=path,
+            why=f"{EXPECTED}, found what an interrupted `gftorf simulate` left",
+            fix="give that command again, and it goes on",
+        )
     for other in [path.absolute().parent, *sorted(entry for entry in path.iterdir() if entry.is_dir())]:
-        if _resembled(other) is not None:
+        if format_or_none(other) is not None:
             raise InputError("one level off", where=path, why=f"{EXPECTED}, found one at {other}", fix=f"use {other}")
     raise InputError("not a sequence folder", where=path, why=f"{EXPECTED}, found neither", fix="check the path")
 
 
-def _resembled(path: Path) -> str | None:
+def format_or_none(path: Path) -> str | None:
+    """Format that a folder looks like, by what every folder of it holds; None: of none."""
+    if (path / UNFINISHED).is_file():
+        return None
     if any((path / name).is_dir() for name in SLOT_FOLDERS):
         return "ftorf"
     return "torf" if (path / PHASOR_FOLDER).is_dir() else None
@@ -151,6 +163,23 @@ def read_distances(
             )
             problems.errors.append(error)
     return {n: np.where(image == 0, np.float32(np.nan), image) for n, image in images.items()}
+
+
+def truth_of(
+    distances: dict[int, np.ndarray], phasor_distances: dict[int, np.ndarray], frames: int, step: int = 1
+) -> Truth | None:
+    """Truth of F raw frames from distances [m] by image, each of which counts for ``step`` raw frames; None if none."""
+    if not distances:
+        return None
+    shape = (frames, *next(iter(distances.values())).shape)
+    filled = []
+    for images in (distances, phasor_distances):
+        stack = np.full(shape, np.nan, dtype=np.float32)
+        for i, image in images.items():
+            stack[step * i : step * (i + 1)] = image
+        filled.append(stack)
+    known = np.isin(np.arange(frames) // step, list(distances))
+    return Truth(distance=filled[0], known=known, phasor_distance=filled[1] if phasor_distances else None)
 
 
 def empty_quads(root: Path, frames: int, size: dict[str, int]) -> np.ndarray:

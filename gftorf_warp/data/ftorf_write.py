@@ -16,6 +16,7 @@ from .writing import (
     inexpressible,
     json_bytes,
     npy,
+    one_frequency,
     refuse_inexpressible,
     shortest,
     validate,
@@ -49,6 +50,7 @@ def write(path: str | Path, sequence: Sequence, truth: Truth | None = None, *, r
     refuse_inexpressible("ftorf", sequence, truth)
     if sequence.from_phasors:
         raise inexpressible("ftorf", "phasors", "raw quads that were measured one by one", "phasors: write format torf")
+    one_frequency("ftorf", sequence)
     slots = [f"tofType{slot}" for slot in range(FRAMES_PER_QUARTET)]  # one without frames still belongs to the layout
     return write_folder(path, _files(sequence, truth, _permutation(sequence), readme), slots)
 
@@ -74,6 +76,8 @@ def _files(
     if truth is not None:
         for n in np.flatnonzero(truth.known).tolist():
             yield f"synthetic_depth/{n:04d}.npy", npy(float32(truth.distance[n]))
+            if truth.phasor_distance is not None:
+                yield f"phasor_distance/{n:04d}.npy", npy(float32(truth.phasor_distance[n]))
     if readme is not None:
         yield "README.md", readme.encode()
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from ..constants import FRAMES_PER_QUARTET
 
@@ -57,6 +58,12 @@ class Sequence:
     """Optical flow (dx, dy) [px] by raw frame n, from n to n + 4; NaN: unknown pixel."""
     backward_flow: dict[int, Float[np.ndarray, "2 H W"]] = field(default_factory=dict)
     """Optical flow (dx, dy) [px] by raw frame n, from n to n - 4; NaN: unknown pixel."""
+    frame_f_mod_hz: Float[np.ndarray, "F"] | None = None
+    """Modulation frequency of each raw frame [Hz], where there are several; None: all have ``f_mod_hz``."""
+    exposures: Float[np.ndarray, "F"] | None = None
+    """Length of each exposure [s]; None: not known."""
+    sensor: dict[str, Any] = field(default_factory=dict)
+    """Further settings of the sensor by name, numbers and texts, as the recording states them."""
     sources: dict[str, str] = field(default_factory=dict)
     """Where each value is from, by field name: 'file ...', 'default ...', 'inferred ...' or 'setting ...'."""
     path: Path | None = None
@@ -79,9 +86,15 @@ class Sequence:
 
     @property
     def complete_quartets(self) -> list[int]:
-        """Indices i of the quartets whose four raw frames 4i .. 4i + 3 were all measured."""
+        """Indices i of the quartets whose four raw frames 4i .. 4i + 3 were all measured, with one frequency."""
         step = FRAMES_PER_QUARTET
-        return [i for i in range(self.frames // step) if self.measured[step * i : step * (i + 1)].all()]
+        whole = [i for i in range(self.frames // step) if self.measured[step * i : step * (i + 1)].all()]
+        return [i for i in whole if len(set(self.frequencies[step * i : step * (i + 1)].tolist())) == 1]
+
+    @property
+    def frequencies(self) -> Float[np.ndarray, "F"]:
+        """Modulation frequency of each raw frame [Hz]."""
+        return np.full(self.frames, self.f_mod_hz) if self.frame_f_mod_hz is None else self.frame_f_mod_hz
 
     @classmethod
     def open(cls, path: str | Path, *, frame_rate_hz: float | None = None) -> Sequence:
@@ -117,3 +130,10 @@ class Truth:
     """Distance along the ray through each pixel centre at each raw frame [m], float32; NaN: unknown."""
     known: Bool[np.ndarray, "F"]
     """Whether a raw frame has a distance at all."""
+    phasor_distance: Float[np.ndarray, "F H W"] | None = None
+    """Static-phasor distance [m], float32, in [0, c/2f): what the closed form would decode if all four quads were taken
+    without noise at the very time of the raw frame, indirect light included; NaN: unknown. None: not stored."""
+    amplitude: Float[np.ndarray, "F H W"] | None = None
+    """Mean amplitude without noise [relative units], float32; None: not stored."""
+    body: Int[np.ndarray, "F H W"] | None = None
+    """Which object the ray through each pixel centre meets, counted from 0; -1: none. None: not stored."""

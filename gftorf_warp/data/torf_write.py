@@ -16,6 +16,7 @@ from .writing import (
     float32,
     inexpressible,
     npy,
+    one_frequency,
     refuse_inexpressible,
     shortest,
     validate,
@@ -50,6 +51,7 @@ def write(path: str | Path, sequence: Sequence, truth: Truth | None = None, *, r
     """
     validate(sequence, truth)
     refuse_inexpressible("torf", sequence, truth)
+    one_frequency("torf", sequence)
     largest = np.abs(sequence.quads).max()
     if not largest < QUAD_MAX:
         raise inexpressible("torf", "quads", f"numbers below {QUAD_MAX:.2g}", f"{largest:.2g}")
@@ -78,6 +80,8 @@ def _files(sequence: Sequence, truth: Truth | None, readme: str | None) -> Itera
             yield f"color/{i:04d}.npy", npy(shortest(float32(sequence.colour[step * i])))
         if truth is not None and truth.known[step * i]:
             yield f"distance/{i:04d}.npy", npy(float32(truth.distance[step * i]))
+            if truth.phasor_distance is not None:
+                yield f"phasor_distance/{i:04d}.npy", npy(float32(truth.phasor_distance[step * i]))
     if readme is not None:
         yield "README.md", readme.encode()
 

@@ -66,6 +66,7 @@ def validate(sequence: Sequence, truth: Truth | None) -> None:
         "quads": (sequence.quads.shape, shape),
         "shifts": (sequence.shifts.shape, (frames,)),
         "times": (sequence.times.shape, (frames,)),
+        "frame_f_mod_hz": (sequence.frequencies.shape, (frames,)),
         "camera_from_world": (sequence.camera_from_world.shape, (frames, 4, 4)),
     }
     if sequence.colour_from_world is not None:
@@ -81,6 +82,8 @@ def validate(sequence: Sequence, truth: Truth | None) -> None:
     lengths |= {f"colour[{n}]": (image.shape, (*first, 3)) for n, image in sequence.colour.items()}
     if truth is not None:
         lengths |= {"truth.distance": (truth.distance.shape, shape), "truth.known": (truth.known.shape, (frames,))}
+        more = {name: getattr(truth, name) for name in ("phasor_distance", "amplitude", "body")}
+        lengths |= {f"truth.{name}": (images.shape, shape) for name, images in more.items() if images is not None}
     for name, (found, expected) in lengths.items():
         if found != expected:
             raise ValueError(f"{name} {found} must have shape {expected}")
@@ -120,6 +123,7 @@ def refuse_inexpressible(form: str, sequence: Sequence, truth: Truth | None) -> 
     flows = [*sequence.forward_flow.values(), *sequence.backward_flow.values()]
     times = sequence.times
     distance = np.ones(1) if truth is None else truth.distance[truth.known]
+    static = np.zeros(1) if truth is None or truth.phasor_distance is None else truth.phasor_distance[truth.known]
     numbers = (sequence.f_mod_hz, sequence.phase_offset, sequence.dc_offset, sequence.quad_scale or 1.0)
     focal = sequence.fx, sequence.fy
     colour, colour_width = _colour_intrinsics(sequence), _colour_size(sequence)[1]
@@ -152,6 +156,7 @@ def refuse_inexpressible(form: str, sequence: Sequence, truth: Truth | None) -> 
         "novel_from_world": (_rigid(sequence.novel_from_world), "rotations and translations", "other matrices"),
         "camera_from_world": (_rigid(sequence.camera_from_world), "rotations and translations", "other matrices"),
         "colour": (all(np.isfinite(i).all() for i in sequence.colour.values()), "finite numbers", "NaN or infinity"),
+        "phasor_distance": (((static >= 0) & (static < np.inf) | np.isnan(static)).all(), "metres or NaN", "others"),
         "flow": (not any(np.isinf(flow).any() for flow in flows), "pixels, or NaN for unknown", "infinity"),
         "truth": (
             ((distance > 0) & (distance < np.inf) | np.isnan(distance)).all(),
@@ -172,6 +177,17 @@ def inexpressible(form: str, what: str, expected: str, found: str) -> UsageError
         why=f"expected {expected}, found {found}",
         fix="change the sensor or the sequence",
     )
+
+
+def one_frequency(form: str, sequence: Sequence) -> None:
+    """Refuse several modulation frequencies where a folder states only one.
+
+    Raises:
+        UsageError: If there are several.
+    """
+    found = sorted(set(sequence.frequencies.tolist()))
+    if found != [sequence.f_mod_hz]:
+        raise inexpressible(form, "modulation frequencies", "one for all raw frames", f"{found} Hz")
 
 
 def _colour_size(sequence: Sequence) -> tuple[int, int]:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Complex, Float
 
 from ..render.api import rasterize
 from ..scene.camera import Camera
@@ -61,18 +62,29 @@ class Splatted:
         return cover_still(self._still, camera).seen(camera.centre, 0.0, colour=self._colour)
 
 
-def look(splatted: Splatted, time: float, sensor: Sensor, subsamples: int) -> tuple[Float[np.ndarray, "H W"], ...]:
-    """Mean quad of the sensor's first shift, mean amplitude and mean distance over opacity [m] of every pixel.
+class Look(NamedTuple):
+    """What a sensor without noise gets of every pixel in one raw frame, whatever engine made it."""
 
-    The distance is NaN where a pixel meets nothing.
-    """
+    quad: Float[np.ndarray, "H W"]
+    """Mean quad of the raw frame's shift, DC offset included [relative units]."""
+    amplitude: Float[np.ndarray, "H W"]
+    """Mean amplitude a, source intensity included [relative units]."""
+    distance: Float[np.ndarray, "H W"]
+    """As the engine sees it [m]: mean of splats over their opacity, or first hit; NaN where a pixel meets nothing."""
+    phasor: Complex[np.ndarray, "H W"]
+    """Of four quads taken at once, the sensor's phase offset included, in any unit; 0 where there is no light."""
+
+
+def look(splatted: Splatted, time: float, sensor: Sensor, subsamples: int) -> Look:
+    """What splats show the sensor at an instant, for the first of its shifts."""
     with torch.no_grad():
         rendering = rasterize(splatted.at(time), splatted.camera_at(time), sensor)
     opacity = pooled(rendering.opacity, subsamples)
-    return (
-        pooled(rendering.quads[0], subsamples),
-        pooled(rendering.phasor[2], subsamples) / 2,  # the third channel of a phasor is 2a
-        pooled(rendering.distance, subsamples) / np.where(opacity > 0, opacity, np.nan),
+    return Look(
+        quad=pooled(rendering.quads[0], subsamples),
+        amplitude=pooled(rendering.phasor[2], subsamples) / 2,  # the third channel of a phasor is 2a
+        distance=pooled(rendering.distance, subsamples) / np.where(opacity > 0, opacity, np.nan),
+        phasor=pooled(rendering.phasor[0], subsamples) + 1j * pooled(rendering.phasor[1], subsamples),
     )
 
 

@@ -20,13 +20,10 @@ from .scene import overridden
 from .scene_file import read_scene
 from .scenes import SCENES, Scene
 from .splat import clearance
+from .unfinished import needs_recording, set_aside, unfinished
 
-CARD = "README.md"
 CLEARANCE = 0.5  # [m] nearer bodies fill the image, and a cover of them would need millions of splats
-FORMATS = {  # what every folder of a layout holds
-    "ftorf": ("cams/depth_range.npy", "tofType0"),
-    "torf": ("cams/depth_range.npy", "tof"),
-}
+FORMATS = ("ftorf", "torf")
 
 
 def simulate(
@@ -54,7 +51,8 @@ def simulate(
     Raw frame n is an image of the scene at its own time, of which only the quad of slot n % 4 is kept and read out.
     Beside it stands the analytic distance along each pixel's centre ray at that very time. A camera that moves has a
     pose for each raw frame; a colour camera adds an image per quartet. The folder appears only when it is complete; if
-    it is already there and was made with the same settings, it is left as it is.
+    it is already there and was made with the same settings, it is left as it is. After an interruption the same call
+    goes on at the next raw frame: what was finished waits in OUT.partial, and the bytes are the same in the end.
 
     Args:
         scene: Name of a scene, see ``SCENES``, a TOML file of one, or a scene.
@@ -76,15 +74,17 @@ def simulate(
         device: Where engine 'mesh' traces; the other one renders on the CPU.
         format: Layout on disk: 'ftorf', raw quads, or 'torf', one phasor per quartet with the time, pose and truth of
             its first raw frame.
-        fresh: Whether another sequence in ``out`` is moved aside, to ``out-old-1``, instead of being an error.
+        fresh: Whether another sequence in ``out`` is moved aside, to ``out-old-1``, instead of being an error, and an
+            unfinished one begun again.
         progress: Called with (raw frames done, raw frames in all).
 
     Returns:
         The folder.
 
     Raises:
-        UsageError: If an option cannot be meant that way, the format cannot express the sensor, or ``out`` holds
-            something else.
+        UsageError: If an option cannot be meant that way, the format cannot express the sensor, ``out`` or what is
+            unfinished beside it holds something else, or the place cannot be written to.
+        BusyError: If another process records the same sequence.
         InputError: If a TOML file does not describe a scene.
     """
     found = overridden(_scene(scene), overrides)
@@ -113,16 +113,17 @@ def simulate(
     }
     card = settings_card(found, options, format)
     out = Path(out).absolute() if fresh else Path(out)
-    if not _check_folder(out, card, fresh=fresh):
+    if not needs_recording(out, card, fresh=fresh):
         return out
     if format == "torf":
         from ..data.torf_write import write
     else:
         from ..data.ftorf_write import write
-    recording = record(found, **options, device=device, progress=progress)
-    if fresh:
-        _set_aside(out)
-    write(out, recording.sequence, recording.truth, readme=card + outcome_card(recording))
+    with unfinished(out, card, fresh=fresh) as keep:
+        recording = record(found, **options, device=device, progress=progress, keep=keep)
+        if fresh:
+            set_aside(out)
+        write(out, recording.sequence, recording.truth, readme=card + outcome_card(recording))
     return out
 
 
@@ -212,34 +213,3 @@ def _check_duration(scene: Scene, frames: int | None) -> None:
                 why=f"scene {scene.name} is made for {scene.frames} raw frames, and it happens at frame {near[0]}",
                 fix=f"simulate at most {near[0]} raw frames",
             )
-
-
-def _check_folder(out: Path, card: str, *, fresh: bool) -> bool:
-    """Whether there is anything to do: False if ``out`` holds what these settings give.
-
-    Raises:
-        UsageError: If ``out`` holds anything else that may not be moved aside.
-    """
-    if not out.exists() or (out.is_dir() and not any(out.iterdir())):
-        return True
-    sequence = any(all((out / mark).exists() for mark in marks) for marks in FORMATS.values())
-    text = (out / CARD).read_text(errors="replace") if sequence and (out / CARD).is_file() else ""
-    if not fresh and text.startswith(card):
-        return False
-    if fresh and sequence:
-        return True
-    raise UsageError(
-        "the folder is not empty" if out.is_dir() else "not a folder",
-        where=out,
-        why="it holds a sequence made with other settings" if sequence else "it holds something that is no sequence",
-        fix="choose another --out" + (", or move this one aside with --fresh" if sequence else ""),
-    )
-
-
-def _set_aside(out: Path) -> None:
-    """Rename a folder with content to the first free ``out-old-N``."""
-    if out.exists() and any(out.iterdir()):
-        number = 1
-        while out.with_name(f"{out.name}-old-{number}").exists():
-            number += 1
-        out.rename(out.with_name(f"{out.name}-old-{number}"))

@@ -64,16 +64,16 @@ class Traced:
         hits = self._tracer.first_hits(self.camera_at(time), self._poses(time))
         return replace(hits, body=np.where(hits.body < 0, hits.body, self._body[hits.body]))
 
-    def quad(self, times: Sequence[float], sensor: Sensor, seed: int = 0) -> tuple[Float[np.ndarray, "H W"], ...]:
-        """Mean quad of the sensor's first shift, and mean amplitude, of every pixel over instants [s]."""
-        mean = self.light(times, float(sensor.f_mod_hz), seed)
-        amplitude = float(sensor.source_intensity) * mean.amplitude.astype(np.float64)
-        turned = mean.light[0] * np.exp(1j * (float(sensor.phase_offset) - sensor.shifts[0]))
-        return float(sensor.source_intensity) * turned.real + float(sensor.dc_offset) * amplitude, amplitude
-
     def _poses(self, time: float) -> Float[np.ndarray, "P 4 4"]:
         """Pose of the body of each piece [m]."""
         return np.stack([body.path.world_from_body(time) for body in self.scene.bodies])[self._body]
+
+
+def quad_of(mean: Light, sensor: Sensor) -> tuple[Float[np.ndarray, "H W"], ...]:
+    """Quad of the sensor's first shift, and amplitude, of every pixel in this light."""
+    amplitude = float(sensor.source_intensity) * mean.amplitude.astype(np.float64)
+    turned = mean.light[0] * np.exp(1j * (float(sensor.phase_offset) - sensor.shifts[0]))
+    return float(sensor.source_intensity) * turned.real + float(sensor.dc_offset) * amplitude, amplitude
 
 
 def trace_colour(scene: Scene, camera: Camera, time: float) -> Float[np.ndarray, "H W 3"]:
