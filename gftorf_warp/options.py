@@ -92,7 +92,7 @@ def command_parsers() -> dict[str, Parser]:
     simulate.add_argument("--size", metavar="WxH", type=_size, help="image size in pixels (the scene's own)")
     _seed_option(simulate, "seed of the noise (0)")
     layouts = "folder layout (ftorf): raw quads, or one phasor per quartet"
-    simulate.add_argument("--format", metavar="ftorf|torf", default="ftorf", help=layouts)
+    simulate.add_argument("--format", metavar="ftorf|torf|capture", default="ftorf", help=layouts)
     engines = "gaussian: splats cover the scene; mesh: rays meet its surfaces (gaussian)"
     simulate.add_argument("--engine", metavar="gaussian|mesh", default="gaussian", help=engines)
     bounces = "surfaces that light may meet after the first, with engine mesh (0: direct light only)"

@@ -36,7 +36,7 @@ def quartet_phasor(sequence: Sequence, i: int) -> Float[np.ndarray, "2 H W"]:
             "phase shifts",
             where=f"{sequence.path or 'sequence'}, frames {frames.start} .. {frames.stop - 1}",
             why=f"expected at least three distinct shifts, found {np.degrees(shifts).tolist()} degrees",
-            fix="correct tof_permutation.npy",
+            fix="correct tof_permutation.npy, or the shifts in capture.json",
         )
     return np.tensordot(2.0 * np.linalg.pinv(model)[:2], sequence.quads[frames].astype(np.float64), axes=1)
 
@@ -49,14 +49,20 @@ def closed_form_distance(sequence: Sequence, i: int) -> Float[np.ndarray, "H W"]
         InputError: If its shifts do not determine a phase.
     """
     re, im = quartet_phasor(sequence, i)
-    return distance_from_phase(np.arctan2(im, re), sequence)
+    return distance_from_phase(np.arctan2(im, re), sequence, float(sequence.frequencies[FRAMES_PER_QUARTET * i]))
 
 
-def distance_from_phase(phase: np.ndarray, sequence: Sequence) -> np.ndarray:
-    """Distance [m] in [0, c/2f) of measured phases [rad], phase offset removed; same shape."""
+def distance_from_phase(phase: np.ndarray, sequence: Sequence, f_mod_hz: float | None = None) -> np.ndarray:
+    """Distance [m] in [0, c/2f) of measured phases [rad], phase offset removed; same shape.
+
+    Args:
+        phase: Measured phases [rad].
+        sequence: What they are of.
+        f_mod_hz: Modulation frequency [Hz]; None is that of the sequence.
+    """
     wrapped = np.mod(phase - sequence.phase_offset, 2.0 * math.pi)
     wrapped = np.where(wrapped < 2.0 * math.pi, wrapped, 0.0)  # the modulo of -1e-17 rounds up to 2 pi
-    return wrapped * (SPEED_OF_LIGHT / (4.0 * math.pi * sequence.f_mod_hz))
+    return wrapped * (SPEED_OF_LIGHT / (4.0 * math.pi * (f_mod_hz or sequence.f_mod_hz)))
 
 
 def largest_amplitude(sequence: Sequence) -> float:

@@ -16,15 +16,19 @@ from .sequence import Truth
 
 SLOT_FOLDERS = tuple(f"tofType{slot}" for slot in range(FRAMES_PER_QUARTET))
 PHASOR_FOLDER = "tof"
-EXPECTED = "expected a folder with tofType0 .. tofType3 and cams (F-ToeRF: raw quads), or tof and cams (ToeRF: phasors)"
+CAPTURE = "capture.json"
+EXPECTED = (
+    "expected a folder with capture.json (a capture), tofType0 .. tofType3 and cams (F-ToeRF: raw quads), or tof and "
+    "cams (ToeRF: phasors)"
+)
 UNFINISHED = "unfinished.md"  # stands in the folder of a recording that is not complete
 FRAMES_MAX = 1_000_000  # over two hours at 120 Hz: a higher id is a typing error
 
 
 def format_of(path: Path) -> str:
-    """Format of a sequence folder: ``ftorf`` with raw quads, else ``torf`` with phasors.
+    """Format of a sequence folder: ``capture`` with its own description, ``ftorf`` with raw quads, else ``torf``.
 
-    Folders with raw quads may hold phasors too, so quads are looked for first.
+    Folders with raw quads may hold phasors too, so quads are looked for first; captures have a folder tof as well.
 
     Raises:
         InputError: If it is neither; points to a sequence one level up or down, if there is one.
@@ -49,13 +53,15 @@ def format_of(path: Path) -> str:
     for other in [path.absolute().parent, *sorted(entry for entry in path.iterdir() if entry.is_dir())]:
         if format_or_none(other) is not None:
             raise InputError("one level off", where=path, why=f"{EXPECTED}, found one at {other}", fix=f"use {other}")
-    raise InputError("not a sequence folder", where=path, why=f"{EXPECTED}, found neither", fix="check the path")
+    raise InputError("not a sequence folder", where=path, why=f"{EXPECTED}, found none of them", fix="check the path")
 
 
 def format_or_none(path: Path) -> str | None:
     """Format that a folder looks like, by what every folder of it holds; None: of none."""
     if (path / UNFINISHED).is_file():
         return None
+    if (path / CAPTURE).is_file():
+        return "capture"
     if any((path / name).is_dir() for name in SLOT_FOLDERS):
         return "ftorf"
     return "torf" if (path / PHASOR_FOLDER).is_dir() else None
@@ -66,11 +72,13 @@ def numbered(root: Path, pattern: str) -> dict[int, Path]:
 
     Args:
         root: The sequence.
-        pattern: Where they lie, for example ``forward_flow/flow_{id}.npy``.
+        pattern: Where they lie, for example ``forward_flow/flow_{id}.npy``; numbers of .exr files have six digits,
+            others four or more.
     """
     folder, _, name = pattern.rpartition("/")
     before, _, after = name.partition("{id}")
-    matcher = re.compile(rf"{re.escape(before)}(\d{{4}}|[1-9]\d{{4,8}}){re.escape(after)}")
+    digits = r"\d{6}" if after == ".exr" else r"\d{4}|[1-9]\d{4,8}"
+    matcher = re.compile(rf"{re.escape(before)}({digits}){re.escape(after)}")
     if not (root / folder).is_dir():
         return {}
     found = ((matcher.fullmatch(entry.name), entry) for entry in (root / folder).iterdir())

@@ -101,9 +101,9 @@ class Sequence:
         """Read a sequence from a folder.
 
         Args:
-            path: An F-ToeRF folder of raw quads, or a ToeRF folder of phasors.
+            path: A capture, an F-ToeRF folder of raw quads, or a ToeRF folder of phasors.
             frame_rate_hz: Raw frames per second, or phasors per second of a ToeRF folder; overrides what the folder
-                says or the default of 120, or 30.
+                says or the default of 120, or 30. A capture has none: it states every time.
 
         Raises:
             InputError: If the folder or a file in it is not what data_specs/ describes.
@@ -117,9 +117,9 @@ class Sequence:
 
 def _reader(path: str | Path) -> ModuleType:
     """The module that reads a folder."""
-    from . import folder, ftorf, torf
+    from . import capture, folder, ftorf, torf
 
-    return {"ftorf": ftorf, "torf": torf}[folder.format_of(Path(path))]
+    return {"capture": capture, "ftorf": ftorf, "torf": torf}[folder.format_of(Path(path))]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

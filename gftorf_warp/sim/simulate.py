@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..constants import CANONICAL_SHIFTS, FRAMES_PER_QUARTET
+from ..data import capture_write, ftorf_write, torf_write
 from ..errors import UsageError
 from ..scene.sensor import Sensor
 from .card import outcome_card, settings_card
@@ -23,7 +24,7 @@ from .splat import clearance
 from .unfinished import needs_recording, set_aside, unfinished
 
 CLEARANCE = 0.5  # [m] nearer bodies fill the image, and a cover of them would need millions of splats
-FORMATS = ("ftorf", "torf")
+FORMATS = ("ftorf", "torf", "capture")
 
 
 def simulate(
@@ -72,8 +73,8 @@ def simulate(
         bounces: Surfaces that light may meet after the first one; 0: direct light only. More of them need 'mesh'.
         paths: Random paths per pixel and raw frame for the light that bounces.
         device: Where engine 'mesh' traces; the other one renders on the CPU.
-        format: Layout on disk: 'ftorf', raw quads, or 'torf', one phasor per quartet with the time, pose and truth of
-            its first raw frame.
+        format: Layout on disk: 'ftorf', raw quads; 'torf', one phasor per quartet with the time, pose and truth of its
+            first raw frame; 'capture', our own, which holds any shifts, exposures, amplitude and objects too.
         fresh: Whether another sequence in ``out`` is moved aside, to ``out-old-1``, instead of being an error, and an
             unfinished one begun again.
         progress: Called with (raw frames done, raw frames in all).
@@ -97,7 +98,7 @@ def simulate(
             why="flow belongs to the raw quads of an F-ToeRF folder",
             fix="leave --flow out, or --format ftorf",
         )
-    _check_sensor(found.sensor)
+    _check_sensor(found.sensor, format)
     _check_duration(found, frames)
     options: dict[str, Any] = {
         "frames": found.frames if frames is None else frames,
@@ -115,10 +116,7 @@ def simulate(
     out = Path(out).absolute() if fresh else Path(out)
     if not needs_recording(out, card, fresh=fresh):
         return out
-    if format == "torf":
-        from ..data.torf_write import write
-    else:
-        from ..data.ftorf_write import write
+    write = {"ftorf": ftorf_write, "torf": torf_write, "capture": capture_write}[format].write
     with unfinished(out, card, fresh=fresh) as keep:
         recording = record(found, **options, device=device, progress=progress, keep=keep)
         if fresh:
@@ -181,14 +179,14 @@ def _refuse(wanted: dict[str, tuple[bool, str, str]]) -> None:
             raise UsageError(f"cannot simulate with {got}", where=where, why=f"expected {want}", fix="change it")
 
 
-def _check_sensor(sensor: Sensor) -> None:
+def _check_sensor(sensor: Sensor, layout: str) -> None:
     turns = sorted(round(math.degrees(shift), 4) % 360.0 for shift in sensor.shifts)
-    if turns != sorted(math.degrees(shift) for shift in CANONICAL_SHIFTS):
+    if layout != "capture" and turns != sorted(math.degrees(shift) for shift in CANONICAL_SHIFTS):
         raise UsageError(
             "an F-ToeRF folder cannot express this sensor",
             where="sensor.shifts",
             why=f"it holds the four shifts 0, 90, 180 and 270 deg in some order, not {turns} deg",
-            fix="use those four shifts",
+            fix="use those four shifts, or --format capture",
         )
     if sensor.noise and not sensor.unipolar and contrast(sensor) * (1 + abs(float(sensor.dc_offset))) > 1:
         raise UsageError(

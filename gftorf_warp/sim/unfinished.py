@@ -133,8 +133,8 @@ def _kept(path: Path, make: Callable[[], Images]) -> tuple[Images, bool]:
         images = make()
     temporary = path.with_suffix(".tmp")
     with as_errors(path):
-        with temporary.open("wb") as file:
-            np.savez(file, allow_pickle=False, **images)
+        with temporary.open("wb") as target:
+            np.savez(target, allow_pickle=False, **images)
         os.replace(temporary, path)
     return images, True
 
