@@ -37,7 +37,7 @@ def recording(**changes):
         "shifts": np.array([0.1, 2.2, 4.3, 0.1, 2.2, 4.3, 6.1]),
         "times": np.array([0, 0, 0.01, 0.023, 0.03, 0.04, 1 / 3]),
         "f_mod_hz": 2e7,
-        "frame_f_mod_hz": np.array([2e7, 2e7, 2e7, 2e7, 6e7, 6e7, 6e7]),
+        "frequencies_hz": np.array([2e7, 2e7, 2e7, 2e7, 6e7, 6e7, 6e7]),
         "exposures": np.linspace(1e-3, 2e-3, FRAMES),
         "sensor": {"adc_bits": 12, "maker": "nobody", "shifts": [0.5, 1.0]},
         "phase_offset": 0.3,
@@ -134,7 +134,7 @@ def test_every_field_names_its_source_and_is_described(folder):
 def test_a_minimal_capture_has_no_more_than_it_needs(tmp_path):
     """Without colour, flow, truth, exposures: what is absent is absent again."""
     bare = {
-        "frame_f_mod_hz": None,
+        "frequencies_hz": None,
         "exposures": None,
         "sensor": {},
         "quad_scale": None,
@@ -271,7 +271,7 @@ def test_three_shifts_two_frequencies_and_no_frame_rate(tmp_path):
 def test_quartets_of_two_frequencies_are_not_complete(folder):
     """Raw frames 0 to 3 have one frequency, 4 to 7 do not exist whole."""
     assert Sequence.open(folder).complete_quartets == [0]
-    mixed = recording(frame_f_mod_hz=np.array([2e7, 2e7, 2e7, 6e7, 6e7, 6e7, 6e7]))[0]
+    mixed = recording(frequencies_hz=np.array([2e7, 2e7, 2e7, 6e7, 6e7, 6e7, 6e7]))[0]
     assert mixed.complete_quartets == []
 
 

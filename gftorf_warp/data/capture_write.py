@@ -136,7 +136,7 @@ def _frames(sequence: Sequence) -> list[dict[str, Any]]:
     columns: dict[str, Any] = {
         "id": list(range(sequence.frames)),
         "t": sequence.times.tolist(),
-        "f_mod_hz": sequence.frequencies.tolist(),
+        "f_mod_hz": sequence.frame_frequencies.tolist(),
         "shift_rad": sequence.shifts.tolist(),
         "measured": sequence.measured.tolist(),
         "camera_to_world": _inverse(sequence.camera_from_world),

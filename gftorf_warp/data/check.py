@@ -38,7 +38,7 @@ def check(path: str | Path) -> Report:
         if report.form == "ftorf":
             findings.phasors(sequence, report)
         findings.camera(sequence, report)
-        if sequence.frame_f_mod_hz is None:
+        if sequence.frequencies_hz is None:
             findings.truth(sequence, report)
     else:
         report.warnings.append("no complete quartet with light: nothing can be decoded or estimated")
@@ -83,9 +83,9 @@ def _facts(sequence: Sequence, report: Report) -> None:
         f"backward flow   {sources['backward_flow']}",
     ]
     assert sequence.path is not None
-    if sequence.frame_f_mod_hz is not None:
-        several = ", ".join(f"{f / 1e6:.6g}" for f in dict.fromkeys(sequence.frequencies.tolist()))
-        report.lines.append(f"frequencies     {several} MHz; {sources['frame_f_mod_hz']}")
+    if sequence.frequencies_hz is not None:
+        several = ", ".join(f"{f / 1e6:.6g}" for f in dict.fromkeys(sequence.frame_frequencies.tolist()))
+        report.lines.append(f"frequencies     {several} MHz; {sources['frequencies_hz']}")
     if sequence.exposures is not None:
         low, high = 1e3 * sequence.exposures.min(), 1e3 * sequence.exposures.max()
         report.lines.append(f"exposures       {low:.4g} .. {high:.4g} ms; {sources['exposures']}")

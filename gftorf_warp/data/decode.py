@@ -49,7 +49,7 @@ def closed_form_distance(sequence: Sequence, i: int) -> Float[np.ndarray, "H W"]
         InputError: If its shifts do not determine a phase.
     """
     re, im = quartet_phasor(sequence, i)
-    return distance_from_phase(np.arctan2(im, re), sequence, float(sequence.frequencies[FRAMES_PER_QUARTET * i]))
+    return distance_from_phase(np.arctan2(im, re), sequence, float(sequence.frame_frequencies[FRAMES_PER_QUARTET * i]))
 
 
 def distance_from_phase(phase: np.ndarray, sequence: Sequence, f_mod_hz: float | None = None) -> np.ndarray:

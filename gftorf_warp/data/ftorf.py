@@ -47,7 +47,7 @@ def read(path: str | Path, *, frame_rate_hz: float | None = None) -> Sequence:
     root, fields = _root(Path(path)), specs.fields(FORMAT)
     problems = Problems()
     sources = dict.fromkeys(
-        ("frame_f_mod_hz", "exposures", "sensor"), "default none"
+        ("frequencies_hz", "exposures", "sensor"), "default none"
     )  # the layout has no place for them
     sources["from_phasors"] = "file tofType0 .. tofType3: raw quads"
     frame_paths, copies = _measured_files(root)

@@ -58,7 +58,7 @@ class Sequence:
     """Optical flow (dx, dy) [px] by raw frame n, from n to n + 4; NaN: unknown pixel."""
     backward_flow: dict[int, Float[np.ndarray, "2 H W"]] = field(default_factory=dict)
     """Optical flow (dx, dy) [px] by raw frame n, from n to n - 4; NaN: unknown pixel."""
-    frame_f_mod_hz: Float[np.ndarray, "F"] | None = None
+    frequencies_hz: Float[np.ndarray, "F"] | None = None
     """Modulation frequency of each raw frame [Hz], where there are several; None: all have ``f_mod_hz``."""
     exposures: Float[np.ndarray, "F"] | None = None
     """Length of each exposure [s]; None: not known."""
@@ -89,12 +89,12 @@ class Sequence:
         """Indices i of the quartets whose four raw frames 4i .. 4i + 3 were all measured, with one frequency."""
         step = FRAMES_PER_QUARTET
         whole = [i for i in range(self.frames // step) if self.measured[step * i : step * (i + 1)].all()]
-        return [i for i in whole if len(set(self.frequencies[step * i : step * (i + 1)].tolist())) == 1]
+        return [i for i in whole if len(set(self.frame_frequencies[step * i : step * (i + 1)].tolist())) == 1]
 
     @property
-    def frequencies(self) -> Float[np.ndarray, "F"]:
+    def frame_frequencies(self) -> Float[np.ndarray, "F"]:
         """Modulation frequency of each raw frame [Hz]."""
-        return np.full(self.frames, self.f_mod_hz) if self.frame_f_mod_hz is None else self.frame_f_mod_hz
+        return np.full(self.frames, self.f_mod_hz) if self.frequencies_hz is None else self.frequencies_hz
 
     @classmethod
     def open(cls, path: str | Path, *, frame_rate_hz: float | None = None) -> Sequence:

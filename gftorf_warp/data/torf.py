@@ -53,7 +53,7 @@ def read(path: str | Path, *, frame_rate_hz: float | None = None) -> Sequence:
     root, fields, step = _root(Path(path)), specs.fields(FORMAT), FRAMES_PER_QUARTET
     problems = Problems()
     sources = dict.fromkeys(
-        ("frame_f_mod_hz", "exposures", "sensor"), "default none"
+        ("frequencies_hz", "exposures", "sensor"), "default none"
     )  # the layout has no place for them
     files, first_id = phasor_files(root)
     size = first_size(files, fields["phasor"], problems)

@@ -66,7 +66,7 @@ def validate(sequence: Sequence, truth: Truth | None) -> None:
         "quads": (sequence.quads.shape, shape),
         "shifts": (sequence.shifts.shape, (frames,)),
         "times": (sequence.times.shape, (frames,)),
-        "frame_f_mod_hz": (sequence.frequencies.shape, (frames,)),
+        "frequencies_hz": (sequence.frame_frequencies.shape, (frames,)),
         "camera_from_world": (sequence.camera_from_world.shape, (frames, 4, 4)),
     }
     if sequence.colour_from_world is not None:
@@ -185,7 +185,7 @@ def one_frequency(form: str, sequence: Sequence) -> None:
     Raises:
         UsageError: If there are several.
     """
-    found = sorted(set(sequence.frequencies.tolist()))
+    found = sorted(set(sequence.frame_frequencies.tolist()))
     if found != [sequence.f_mod_hz]:
         raise inexpressible(form, "modulation frequencies", "one for all raw frames", f"{found} Hz")
 
