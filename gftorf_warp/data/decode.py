@@ -28,6 +28,13 @@ def quartet_phasor(sequence: Sequence, i: int) -> Float[np.ndarray, "2 H W"]:
     """
     if i not in sequence.complete_quartets:
         raise ValueError(f"quartet {i} must be one of the complete ones, {sequence.complete_quartets}")
+    if sequence.frequencies_hz is not None and len(set(sequence.frequencies_hz.tolist())) > 1:
+        raise InputError(
+            "several modulation frequencies",
+            where=sequence.path or "sequence",
+            why=f"four raw frames give a distance at one, found {sorted(set(sequence.frequencies_hz.tolist()))} Hz",
+            fix="decode whole cycles, with gftorf_warp.scene.unwrap.cycle_distance",
+        )
     frames = slice(FRAMES_PER_QUARTET * i, FRAMES_PER_QUARTET * (i + 1))
     shifts = sequence.shifts[frames]
     model = np.stack([np.cos(shifts), np.sin(shifts), np.ones(len(shifts))], axis=1)

@@ -72,6 +72,8 @@ def validate(sequence: Sequence, truth: Truth | None) -> None:
         lengths["colour_from_world"] = (sequence.colour_from_world.shape, (frames, 4, 4))
     if sequence.colour_intrinsics is not None:
         lengths["colour_intrinsics"] = ((len(sequence.colour_intrinsics),), (4,))
+    if sequence.frequencies_hz is not None:
+        lengths["frequencies_hz"] = (sequence.frequencies_hz.shape, (frames,))
     if sequence.novel_from_world is not None:
         views = sequence.novel_from_world
         lengths["novel_from_world"] = (views.shape, (max(1, len(views)), 4, 4))
@@ -123,7 +125,14 @@ def refuse_inexpressible(form: str, sequence: Sequence, truth: Truth | None) -> 
     numbers = (sequence.f_mod_hz, sequence.phase_offset, sequence.dc_offset, sequence.quad_scale or 1.0)
     focal = sequence.fx, sequence.fy
     colour, colour_width = _colour_intrinsics(sequence), _colour_size(sequence)[1]
+    family = form in ("ftorf", "torf")  # these state one depth range and one matrix
     rules = {  # what: (whether it holds, expected, found)
+        "frequencies_hz": (
+            not family or sequence.frequencies_hz is None,
+            "one modulation frequency",
+            f"{sequence.frequencies_hz}",
+        ),
+        "distortion": (not family or sequence.distortion is None, "a pinhole", f"a lens with {sequence.distortion}"),
         "an empty sequence": (sequence.measured.any(), "at least one measured raw frame", "none"),
         "quads": (np.isfinite(sequence.quads[sequence.measured]).all(), "finite numbers", "NaN or infinity"),
         "times": (

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -54,7 +55,7 @@ class Camera:
             self.distortion.undo((x - self.cx) / self.fx, (y - self.cy) / self.fy)
 
     @classmethod
-    def from_fov(cls, width: int, height: int, horizontal_fov_deg: float, **pose: np.ndarray) -> Camera:
+    def from_fov(cls, width: int, height: int, horizontal_fov_deg: float, **pose: Any) -> Camera:
         """A camera with square pixels, a centred principal point and a horizontal field of view [deg]."""
         focal = 0.5 * width / math.tan(math.radians(horizontal_fov_deg) / 2)
         return cls(width=width, height=height, fx=focal, fy=focal, cx=width / 2, cy=height / 2, **pose)

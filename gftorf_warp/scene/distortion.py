@@ -13,10 +13,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import astuple, dataclass, fields
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Float
+from torch import Tensor
 
+Coordinate = TypeVar("Coordinate", np.ndarray, Tensor)
 STEPS_MAX = 30
 CONVERGED = 1e-12  # [1] of image coordinates, a billionth of a pixel
 SHRINK_MIN = 1e-3  # [1] area on the sensor per area of the pinhole's image; at 0 the lens folds the world over
@@ -46,10 +49,8 @@ class Distortion:
         """Whether there is any."""
         return any(astuple(self))
 
-    def apply(
-        self, x: Float[np.ndarray, "*n"], y: Float[np.ndarray, "*n"]
-    ) -> tuple[Float[np.ndarray, "*n"], Float[np.ndarray, "*n"]]:
-        """Where the lens images what a pinhole would have at (x, y) [1]; arrays or tensors."""
+    def apply(self, x: Coordinate, y: Coordinate) -> tuple[Coordinate, Coordinate]:
+        """Where the lens images what a pinhole would have at (x, y) [1]; arrays or tensors of any shape."""
         r2 = x * x + y * y
         radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
         return (

@@ -1,4 +1,4 @@
-"""How evenly light reaches the pixels: the fall-off of the lens and the beam of the emitter (sensor notes, 2.2 and 2.8).
+"""How evenly light reaches the pixels: fall-off of the lens, beam of the emitter (sensor notes, 2.2 and 2.8).
 
 With th the angle between a pixel's ray and the optical axis, a pixel gets
 
@@ -71,7 +71,22 @@ def shading(lens: Lens, camera: Camera) -> Shading | None:
         return None
     cosine = camera.directions()[..., 2].numpy()
     tangent = np.sqrt(np.maximum(1.0 / cosine**2 - 1.0, 0.0))
-    ambient = cosine**lens.cosine_power * lens._vignette((tangent / tangent.max()) ** 2 if tangent.max() > 0 else tangent)
+    ambient = cosine**lens.cosine_power * lens._vignette(
+        (tangent / tangent.max()) ** 2 if tangent.max() > 0 else tangent
+    )
     beam = cosine**lens.beam_power
     solid_angle = cosine**3  # of a pixel of a flat sensor, up to a factor
     return Shading(active=ambient * beam * (solid_angle.sum() / (solid_angle * beam).sum()), ambient=ambient)
+
+
+def lens_rows(lens: Lens) -> dict[str, str]:
+    """What of a lens and a beam goes beyond a pinhole and even light, for people; empty: nothing."""
+    rows = {}
+    if lens.distortion:
+        rows["distortion"] = f"{lens.distortion}, OpenCV's coefficients"
+    if lens.cosine_power or lens.vignetting:
+        more = "".join(f" {v:+g} r^{2 * i}" for i, v in enumerate(lens.vignetting, start=1))
+        rows["fall-off"] = f"cosine to the power {lens.cosine_power:g}, times 1{more} with r = 1 in the farthest corner"
+    if lens.beam_power:
+        rows["beam"] = f"cosine to the power {lens.beam_power:g}, mean 1 over the image"
+    return rows

@@ -2,7 +2,7 @@
 
     psi += p(u, v)        light times 1 + N(0, gain)        dark current times 1 + N(0, dark)
 
-They are drawn from a seed that belongs to the sensor, not to a recording: two recordings of one sensor have one pattern.
+They are drawn from a seed that belongs to the sensor, not to a recording: its recordings share one pattern.
 """
 
 from __future__ import annotations

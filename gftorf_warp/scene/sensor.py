@@ -4,9 +4,9 @@ A point at distance d that reflects r gives the quad of shift theta (method, sec
 
     a (cos(psi - theta) + b),   a = s r / d^2,   psi = kappa d + phase_offset,   kappa = 4 pi f / c
 
-in *relative units*. Sections 2.3 and 2.4 of the sensor notes add harmonics, electrons and patterns: fields that are off,
-or do nothing, unless they are set. Notes: the sensor notes of the project; OPT8241: its datasheet, SBAS704B; MLX75027:
-its datasheet, 1.0. *Assumed* values are published nowhere.
+in *relative units*. Sections 2.3 and 2.4 of the sensor notes add harmonics, electrons and patterns: fields that are
+off, or do nothing, unless they are set. OPT8241 stands for its datasheet, SBAS704B, MLX75027 for its datasheet, 1.0;
+*assumed* values are published nowhere.
 """
 
 from __future__ import annotations
@@ -128,7 +128,9 @@ class Sensor:
         if self.unipolar and not isinstance(self.dc_offset, Tensor) and self.dc_offset < 1.0:
             raise ValueError(f"a unipolar tap cannot hold negative light: dc_offset >= 1 needed, got {self.dc_offset}")
         if self.unipolar and self.contrast_cutoff_hz is not None:
-            raise ValueError("contrast_cutoff_hz: the contrast of a unipolar sensor is 1 / dc_offset at all frequencies")
+            raise ValueError(
+                "contrast_cutoff_hz: the contrast of a unipolar sensor is 1 / dc_offset at all frequencies"
+            )
 
     def __repr__(self) -> str:
         """As of any dataclass, but for effects that are off: data cards hash this text."""

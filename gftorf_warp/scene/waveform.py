@@ -1,6 +1,6 @@
 """Waves that are no sines: their harmonics, what a sensor correlates of them, and the error that remains of it.
 
-Light is emitted as 1 + sum_h s_h cos(h w t), and a tap opens as (1 + sum_h m_h cos(h (w t - shift))) / 2. A quad then has
+Light is emitted as 1 + sum_h s_h cos(h w t), a tap opens as (1 + sum_h m_h cos(h (w t - shift))) / 2, and a quad has
 
     sum_h C_h cos(h (psi - shift)),   C_h = s_h m_h / 2
 
@@ -42,10 +42,8 @@ def harmonics_of(wave: Waveform, count: int, duty: float = 0.5) -> tuple[float, 
     return tuple(2.0 * math.sin(math.pi * h * duty) / (math.pi * h * duty) for h in range(1, count + 1))
 
 
-def contrasts(
-    emission: Waveform, demodulation: Waveform, count: int, duty: float = 0.5
-) -> tuple[float, ...]:
-    """Contrast C_h of each harmonic h = 1 .. ``count`` [1]; ``duty`` is that of the emission, taps are open half the time.
+def contrasts(emission: Waveform, demodulation: Waveform, count: int, duty: float = 0.5) -> tuple[float, ...]:
+    """Contrast C_h of each harmonic h = 1 .. ``count`` [1]; ``duty`` is of the emission; taps are open half the time.
 
     Raises:
         ValueError: If the duty is not between 0 and 1, or there is no coefficient.
@@ -54,9 +52,7 @@ def contrasts(
     return tuple(0.5 * s * m for s, m in pairs)
 
 
-def contrast_ratios(
-    emission: Waveform, demodulation: Waveform, count: int, duty: float = 0.5
-) -> tuple[float, ...]:
+def contrast_ratios(emission: Waveform, demodulation: Waveform, count: int, duty: float = 0.5) -> tuple[float, ...]:
     """C_h / C_1 for h = 2 .. ``count`` [1], as :class:`Sensor` takes them; arguments as in :func:`contrasts`.
 
     Rounding of what is exactly 0, the even harmonics of a square wave, is removed, so that nobody renders them.
@@ -71,9 +67,7 @@ def peak(ratios: Sequence[float]) -> float:
     return float(np.abs(sum(r * np.cos(h * x) for h, r in enumerate((1.0, *ratios), start=1))).max())
 
 
-def wiggling(
-    phase: Float[np.ndarray, "*n"], ratios: Sequence[float], samples: int
-) -> Float[np.ndarray, "*n"]:
+def wiggling(phase: Float[np.ndarray, "*n"], ratios: Sequence[float], samples: int) -> Float[np.ndarray, "*n"]:
     """Decoded minus true phase [rad] of ``samples`` equally spaced shifts, to first order in C_h / C_1.
 
     A harmonic is seen as the fundamental if it is a neighbour of a multiple of the number of shifts, and not at all

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Complex, Float
 
 from ..render.api import rasterize
 from ..scene.camera import Camera
 from ..scene.gaussians import GaussianField
 from ..scene.sensor import Sensor
+from .readout import mean_quad
 from .scene import Scene
 from .splat import Cover, cover_moving, cover_still, merge
 
@@ -64,16 +66,32 @@ class Splatted:
 def look(splatted: Splatted, time: float, sensor: Sensor, subsamples: int) -> tuple[Float[np.ndarray, "H W"], ...]:
     """Mean quad of the sensor's first shift, mean amplitude and mean distance over opacity [m] of every pixel.
 
-    The distance is NaN where a pixel meets nothing.
+    A harmonic is a rendering of its own, at that multiple of the modulation frequency: exact for whatever mixes in a
+    pixel, where a closed form would know opaque surfaces only. The distance is NaN where a pixel meets nothing.
     """
+    field, camera = splatted.at(time), splatted.camera_at(time)
     with torch.no_grad():
-        rendering = rasterize(splatted.at(time), splatted.camera_at(time), sensor)
+        rendering = rasterize(field, camera, sensor)
+        harmonics = [_at_harmonic(field, camera, sensor, h, subsamples) for h in sensor.harmonics if h > 1]
     opacity = pooled(rendering.opacity, subsamples)
-    return (
-        pooled(rendering.quads[0], subsamples),
-        pooled(rendering.phasor[2], subsamples) / 2,  # the third channel of a phasor is 2a
-        pooled(rendering.distance, subsamples) / np.where(opacity > 0, opacity, np.nan),
+    distance = pooled(rendering.distance, subsamples) / np.where(opacity > 0, opacity, np.nan)
+    amplitude = pooled(rendering.phasor[2], subsamples) / 2  # the third channel of a phasor is 2a
+    if not harmonics and sensor.pattern.phase == 0.0:
+        return pooled(rendering.quads[0], subsamples), amplitude, distance
+    first = pooled(rendering.phasor[0], subsamples) / 2 + 0.5j * pooled(rendering.phasor[1], subsamples)
+    seen = replace(sensor, phase_offset=0.0, source_intensity=1.0)  # the renderings have both
+    return *mean_quad(np.stack([first, *harmonics]), amplitude, seen), distance
+
+
+def _at_harmonic(
+    field: GaussianField, camera: Camera, sensor: Sensor, harmonic: int, subsamples: int
+) -> Complex[np.ndarray, "H W"]:
+    """Light at a multiple of the modulation frequency, phase offset and source intensity included."""
+    multiple = replace(
+        sensor, f_mod_hz=harmonic * float(sensor.f_mod_hz), phase_offset=harmonic * float(sensor.phase_offset)
     )
+    phasor = rasterize(field, camera, multiple).phasor
+    return pooled(phasor[0], subsamples) / 2 + 0.5j * pooled(phasor[1], subsamples)
 
 
 def look_colour(splatted: Splatted, time: float, subsamples: int) -> Float[np.ndarray, "H W 3"]:

@@ -54,8 +54,8 @@ def why_impossible(sensor: Sensor) -> str | None:
     kind = "one tap allows" if sensor.unipolar else "differential taps allow"
     harmonics = f", peak {peak(sensor.harmonic_contrast):g} with its harmonics" if sensor.harmonic_contrast else ""
     return (
-        f"{kind} contrast (1 + |dc_offset|) <= 1, not {float(contrast(sensor)):g} (1 + {abs(float(sensor.dc_offset)):g})"
-        f"{harmonics}"
+        f"{kind} contrast (1 + |dc_offset|) <= 1, not {float(contrast(sensor)):g} "
+        f"(1 + {abs(float(sensor.dc_offset)):g}){harmonics}"
     )
 
 
@@ -142,7 +142,10 @@ def read_out(
         ValueError: If the sensor's contrast and DC offset contradict each other, see :func:`mean_taps`.
     """
     response = gain_map(sensor.pattern, *np.shape(quad))
-    for active, other in [*([] if shading is None else [shading]), *([] if response is None else [(response, response)])]:
+    for active, other in [
+        *([] if shading is None else [shading]),
+        *([] if response is None else [(response, response)]),
+    ]:
         quad, amplitude = quad * active, amplitude * active
         ambient = other if ambient is None else ambient * other
     if not sensor.noise:

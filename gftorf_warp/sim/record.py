@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,7 @@ from ..constants import FRAMES_PER_QUARTET
 from ..data.sequence import Sequence, Truth
 from ..render.trace import Bounces
 from ..scene.camera import Camera
+from ..scene.optics import shading
 from ..scene.sensor import Sensor
 from .look import Splatted, look, look_colour
 from .paths import inverse
@@ -64,9 +65,9 @@ class Recording:
 
 
 def frame_times(sensor: Sensor, frames: int, *, sync: bool) -> Float[np.ndarray, "F"]:
-    """Time of each raw frame [s]: n times the frame period, or, ``sync``, that of the first frame of its quartet."""
+    """Time of each raw frame [s]: n times the frame period, or, ``sync``, that of the first frame of its cycle."""
     frame = np.arange(frames)
-    return (frame - frame % FRAMES_PER_QUARTET if sync else frame) * sensor.frame_period_s
+    return (frame - frame % len(sensor.cycle) if sync else frame) * sensor.frame_period_s
 
 
 def record(
@@ -98,16 +99,17 @@ def record(
     camera = cameras[0]
     distances, interior = _truth(scene, cameras, times)
     longest = frame_times(sensor, max(frames, scene.frames), sync=False)  # for fewer frames the same covers and images
+    evenness = shading(scene.lens, camera)
     take = _engine(engine, scene, size, longest, Bounces(count=bounces, paths=paths), device, seed)
-    shifts = np.array([sensor.shifts[n % len(sensor.shifts)] for n in range(frames)])
+    shots = [sensor.at_frame(n) for n in range(frames)]
 
     quads = np.zeros((frames, camera.height, camera.width), dtype=np.float32)
     largest, total, full = 0.0, 0.0, 0
     for n in range(frames):
         offsets = ((np.arange(exposure_samples) + 0.5) / exposure_samples - 0.5) * sensor.exposure_s
-        shot = sensor.with_shifts((float(shifts[n]),))
-        quad, amplitude, distance = take(n, [float(times[n] + offset) for offset in offsets], float(times[n]), shot)
-        reading = read_out(quad, amplitude, sensor, np.random.default_rng((seed, n)))  # frame n: whatever F is
+        quad, amplitude, distance = take(n, [float(times[n] + offset) for offset in offsets], float(times[n]), shots[n])
+        random = np.random.default_rng((seed, n))  # frame n: whatever F is
+        reading = read_out(quad, amplitude, shots[n], random, shading=evenness)
         quads[n] = reading.quad
         full += int(reading.saturated.sum())
         difference = np.abs(distance - distances[n])[interior[n]]
@@ -122,15 +124,17 @@ def record(
         sequence=Sequence(
             quads=quads,
             measured=np.ones(frames, dtype=bool),
-            shifts=shifts,
+            shifts=np.array([shot.shifts[0] for shot in shots]),
             times=times,
             f_mod_hz=float(sensor.f_mod_hz),
+            frequencies_hz=np.array([float(shot.f_mod_hz) for shot in shots]) if sensor.further_hz else None,
             phase_offset=float(sensor.phase_offset),
             dc_offset=float(sensor.dc_offset),
             fx=camera.fx,
             fy=camera.fy,
             cx=camera.cx,
             cy=camera.cy,
+            distortion=astuple(camera.distortion) if camera.distortion else None,
             camera_from_world=np.stack([camera.camera_from_world for camera in cameras]),
             novel_from_world=np.stack([inverse(view.world_from_body(0.0)) for view in scene.novel_views])
             if scene.novel_views
@@ -151,8 +155,16 @@ def _engine(
     """What takes an image: a function of a raw frame's number, the instants it averages, its time, and the sensor."""
     if engine not in ENGINES:
         raise ValueError(f"engine {engine!r} must be one of {', '.join(ENGINES)}")
+    if scene.lens.beam_power and bounces.count:
+        raise ValueError("lens.beam_power is of direct light: with bounces, use beam_deg")
     if engine == "mesh":
-        traced = Traced(scene, lambda time: scene.camera(size, time), bounces=bounces, device=device)
+        traced = Traced(
+            scene,
+            lambda time: scene.camera(size, time),
+            harmonics=scene.sensor.harmonics,
+            bounces=bounces,
+            device=device,
+        )
 
         def trace(n: int, instants: list[float], time: float, sensor: Sensor) -> Taken:
             random = int(np.random.default_rng((seed, n, PATHS)).integers(2**31))  # frame n: whatever F is

@@ -14,6 +14,7 @@ from ..scene.camera import Camera
 from ..scene.sensor import Sensor
 from .assembly import Assembly, Level, Part
 from .look import pooled
+from .readout import mean_quad
 from .scene import Scene
 from .world import Body, Box, Plane, Shape, Sphere, albedo, first_hit
 
@@ -67,9 +68,7 @@ class Traced:
     def quad(self, times: Sequence[float], sensor: Sensor, seed: int = 0) -> tuple[Float[np.ndarray, "H W"], ...]:
         """Mean quad of the sensor's first shift, and mean amplitude, of every pixel over instants [s]."""
         mean = self.light(times, float(sensor.f_mod_hz), seed)
-        amplitude = float(sensor.source_intensity) * mean.amplitude.astype(np.float64)
-        turned = mean.light[0] * np.exp(1j * (float(sensor.phase_offset) - sensor.shifts[0]))
-        return float(sensor.source_intensity) * turned.real + float(sensor.dc_offset) * amplitude, amplitude
+        return mean_quad(mean.light, mean.amplitude, sensor)
 
     def _poses(self, time: float) -> Float[np.ndarray, "P 4 4"]:
         """Pose of the body of each piece [m]."""
