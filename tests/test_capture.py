@@ -46,6 +46,7 @@ def recording(**changes):
         "fy": 5.25,
         "cx": 3.1,
         "cy": 2.4,
+        "distortion": (0.1, -0.02, 0.001, 0.002, 0.0),
         "camera_from_world": random_poses(FRAMES, rng),
         "quad_scale": 4.0,
         "colour": {0: rng.random((4, 3, 3)).astype(np.float32)},
@@ -134,6 +135,7 @@ def test_every_field_names_its_source_and_is_described(folder):
 def test_a_minimal_capture_has_no_more_than_it_needs(tmp_path):
     """Without colour, flow, truth, exposures: what is absent is absent again."""
     bare = {
+        "distortion": None,
         "frequencies_hz": None,
         "exposures": None,
         "sensor": {},
@@ -279,7 +281,7 @@ def test_other_layouts_refuse_several_frequencies(tmp_path):
     """They have one place for it."""
     from gftorf_warp.data import ftorf
 
-    sequence = recording(shifts=np.array([0, np.pi, np.pi / 2, 3 * np.pi / 2, 0, np.pi, np.pi / 2]))[0]
-    with pytest.raises(UsageError, match="modulation frequencies"):
+    sequence = recording(distortion=None, shifts=np.array([0, np.pi, np.pi / 2, 3 * np.pi / 2, 0, np.pi, np.pi / 2]))[0]
+    with pytest.raises(UsageError, match="frequencies_hz"):
         ftorf.write(tmp_path / "seq", sequence)
     assert not any(tmp_path.iterdir())

@@ -56,7 +56,7 @@ def read(path: str | Path, *, frame_rate_hz: float | None = None) -> Sequence:
             fix = "complete the folder, or set measured to false"
             problems.errors.append(InputError("quads: no such file", where=root / "tof", why=why, fix=fix))
     quads = empty_quads(root, frames, {"H": height, "W": width})
-    images: dict[str, dict[int, np.ndarray]] = {"forward_flow": {}, "backward_flow": {}, "colour": {}}
+    images: dict[str, Any] = {"forward_flow": {}, "backward_flow": {}, "colour": {}}
     for n, file in files.items():
         parts = problems.attempt(_verified, root, file, digests)
         if parts is None or not measured[n]:
@@ -77,7 +77,7 @@ def read(path: str | Path, *, frame_rate_hz: float | None = None) -> Sequence:
     problems.raise_if_any(root)
     frequencies, several = values["f_mod_hz"], len(set(values["f_mod_hz"].tolist())) > 1
     fx, fy, cx, cy = _pinhole(values["intrinsics"])
-    colour = values.get("colour_intrinsics")
+    colour, lens = values.get("colour_intrinsics"), values["distortion"].tolist() if "distortion" in values else None
     return Sequence(
         quads=quads,
         measured=measured,
@@ -93,6 +93,7 @@ def read(path: str | Path, *, frame_rate_hz: float | None = None) -> Sequence:
         fy=fy,
         cx=cx,
         cy=cy,
+        distortion=None if lens is None else (lens[0], lens[1], lens[2], lens[3], lens[4]),
         camera_from_world=_inverse(values["pose"]),
         quad_scale=float(values["raw_scale"]) if "raw_scale" in values else None,
         from_phasors=values["kind"] == "phasor",

@@ -98,6 +98,8 @@ def _truth(truth: Truth, n: int) -> Parts:
 def _json(sequence: Sequence) -> bytes:
     """Everything but images; one value a line, one raw frame a line."""
     cameras = {"tof": _camera((sequence.width, sequence.height), sequence.fx, sequence.fy, sequence.cx, sequence.cy)}
+    if sequence.distortion is not None:
+        cameras["tof"]["distortion"] = [float(k) for k in sequence.distortion]
     colour = next(iter(sequence.colour.values()), None)
     if sequence.colour_intrinsics is not None:
         size = (sequence.width, sequence.height) if colour is None else colour.shape[1::-1]

@@ -29,7 +29,9 @@ def check(path: str | Path) -> Report:
     report = Report(path=Path(path), form=format_of(Path(path)))
     _facts(sequence, report)
     _assumptions(sequence, report)
-    if sequence.complete_quartets and np.abs(sequence.quads).max() > 0:
+    if sequence.frequencies_hz is not None:
+        report.lines.append("light           not looked at: there are several modulation frequencies")
+    elif sequence.complete_quartets and np.abs(sequence.quads).max() > 0:
         findings.light(sequence, report)
         if sequence.from_phasors and report.form == "torf":
             findings.third_channel(sequence, report)
@@ -38,8 +40,7 @@ def check(path: str | Path) -> Report:
         if report.form == "ftorf":
             findings.phasors(sequence, report)
         findings.camera(sequence, report)
-        if sequence.frequencies_hz is None:
-            findings.truth(sequence, report)
+        findings.truth(sequence, report)
     else:
         report.warnings.append("no complete quartet with light: nothing can be decoded or estimated")
     findings.flow(sequence, report)

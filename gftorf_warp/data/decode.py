@@ -26,6 +26,13 @@ def quartet_phasor(sequence: Sequence, i: int) -> Float[np.ndarray, "2 H W"]:
         ValueError: If a frame of the quartet was not measured.
         InputError: If its shifts do not determine a phase.
     """
+    if sequence.frequencies_hz is not None and len(set(sequence.frequencies_hz.tolist())) > 1:
+        raise InputError(
+            "several modulation frequencies",
+            where=sequence.path or "sequence",
+            why=f"four raw frames give a distance at one, found {sorted(set(sequence.frequencies_hz.tolist()))} Hz",
+            fix="decode whole cycles, with gftorf_warp.scene.unwrap.cycle_distance",
+        )
     if i not in sequence.complete_quartets:
         raise ValueError(f"quartet {i} must be one of the complete ones, {sequence.complete_quartets}")
     frames = slice(FRAMES_PER_QUARTET * i, FRAMES_PER_QUARTET * (i + 1))
@@ -49,20 +56,14 @@ def closed_form_distance(sequence: Sequence, i: int) -> Float[np.ndarray, "H W"]
         InputError: If its shifts do not determine a phase.
     """
     re, im = quartet_phasor(sequence, i)
-    return distance_from_phase(np.arctan2(im, re), sequence, float(sequence.frame_frequencies[FRAMES_PER_QUARTET * i]))
+    return distance_from_phase(np.arctan2(im, re), sequence)
 
 
-def distance_from_phase(phase: np.ndarray, sequence: Sequence, f_mod_hz: float | None = None) -> np.ndarray:
-    """Distance [m] in [0, c/2f) of measured phases [rad], phase offset removed; same shape.
-
-    Args:
-        phase: Measured phases [rad].
-        sequence: What they are of.
-        f_mod_hz: Modulation frequency [Hz]; None is that of the sequence.
-    """
+def distance_from_phase(phase: np.ndarray, sequence: Sequence) -> np.ndarray:
+    """Distance [m] in [0, c/2f) of measured phases [rad], phase offset removed; same shape."""
     wrapped = np.mod(phase - sequence.phase_offset, 2.0 * math.pi)
     wrapped = np.where(wrapped < 2.0 * math.pi, wrapped, 0.0)  # the modulo of -1e-17 rounds up to 2 pi
-    return wrapped * (SPEED_OF_LIGHT / (4.0 * math.pi * (f_mod_hz or sequence.f_mod_hz)))
+    return wrapped * (SPEED_OF_LIGHT / (4.0 * math.pi * sequence.f_mod_hz))
 
 
 def largest_amplitude(sequence: Sequence) -> float:

@@ -30,6 +30,7 @@ from .sequence import Sequence, Truth
 __all__ = ["read", "read_truth", "write"]
 
 FORMAT = "ftorf"
+NOT_HERE = ("frequencies_hz", "distortion", "exposures", "sensor")  # the layout has no place for them
 
 
 def read(path: str | Path, *, frame_rate_hz: float | None = None) -> Sequence:
@@ -46,9 +47,7 @@ def read(path: str | Path, *, frame_rate_hz: float | None = None) -> Sequence:
     """
     root, fields = _root(Path(path)), specs.fields(FORMAT)
     problems = Problems()
-    sources = dict.fromkeys(
-        ("frequencies_hz", "exposures", "sensor"), "default none"
-    )  # the layout has no place for them
+    sources = dict.fromkeys(NOT_HERE, "default none")
     sources["from_phasors"] = "file tofType0 .. tofType3: raw quads"
     frame_paths, copies = _measured_files(root)
     size = first_size(frame_paths, fields["quads"], problems)

@@ -16,7 +16,6 @@ from .writing import (
     inexpressible,
     json_bytes,
     npy,
-    one_frequency,
     refuse_inexpressible,
     shortest,
     validate,
@@ -50,7 +49,6 @@ def write(path: str | Path, sequence: Sequence, truth: Truth | None = None, *, r
     refuse_inexpressible("ftorf", sequence, truth)
     if sequence.from_phasors:
         raise inexpressible("ftorf", "phasors", "raw quads that were measured one by one", "phasors: write format torf")
-    one_frequency("ftorf", sequence)
     slots = [f"tofType{slot}" for slot in range(FRAMES_PER_QUARTET)]  # one without frames still belongs to the layout
     return write_folder(path, _files(sequence, truth, _permutation(sequence), readme), slots)
 

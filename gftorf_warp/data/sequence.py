@@ -26,7 +26,9 @@ class Sequence:
     times: Float[np.ndarray, "F"]
     """Time of each raw frame since the first [s]."""
     f_mod_hz: float
-    """Modulation frequency [Hz]."""
+    """Modulation frequency [Hz]; the first of the cycle if there are several."""
+    frequencies_hz: Float[np.ndarray, "F"] | None = None
+    """Modulation frequency of each raw frame [Hz]; None: ``f_mod_hz`` throughout."""
     phase_offset: float = 0.0
     """Measured minus true phase [rad]."""
     dc_offset: float = 0.0
@@ -39,6 +41,8 @@ class Sequence:
     """Principal point, x [px], in the convention of the program: pixel centres at i + 0.5."""
     cy: float
     """Principal point, y [px], likewise."""
+    distortion: tuple[float, float, float, float, float] | None = None
+    """k1, k2, p1, p2, k3 of the lens as OpenCV names them [1]; None: a pinhole."""
     camera_from_world: Float[np.ndarray, "F 4 4"]
     """Pose of each raw frame, world to camera [m]."""
     quad_scale: float | None = None
@@ -58,8 +62,6 @@ class Sequence:
     """Optical flow (dx, dy) [px] by raw frame n, from n to n + 4; NaN: unknown pixel."""
     backward_flow: dict[int, Float[np.ndarray, "2 H W"]] = field(default_factory=dict)
     """Optical flow (dx, dy) [px] by raw frame n, from n to n - 4; NaN: unknown pixel."""
-    frequencies_hz: Float[np.ndarray, "F"] | None = None
-    """Modulation frequency of each raw frame [Hz], where there are several; None: all have ``f_mod_hz``."""
     exposures: Float[np.ndarray, "F"] | None = None
     """Length of each exposure [s]; None: not known."""
     sensor: dict[str, Any] = field(default_factory=dict)

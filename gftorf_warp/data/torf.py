@@ -35,6 +35,7 @@ from .torf_write import write
 __all__ = ["phasor_files", "read", "read_truth", "write"]
 
 FORMAT = "torf"
+NOT_HERE = ("frequencies_hz", "distortion", "exposures", "sensor")  # the layout has no place for them
 PHASOR_RATE_HZ = FRAME_RATE_HZ / FRAMES_PER_QUARTET  # [Hz] the sensor is that of the F-ToeRF recordings
 
 
@@ -52,9 +53,7 @@ def read(path: str | Path, *, frame_rate_hz: float | None = None) -> Sequence:
     """
     root, fields, step = _root(Path(path)), specs.fields(FORMAT), FRAMES_PER_QUARTET
     problems = Problems()
-    sources = dict.fromkeys(
-        ("frequencies_hz", "exposures", "sensor"), "default none"
-    )  # the layout has no place for them
+    sources = dict.fromkeys(NOT_HERE, "default none")
     files, first_id = phasor_files(root)
     size = first_size(files, fields["phasor"], problems)
     if not (root / "cams").is_dir():

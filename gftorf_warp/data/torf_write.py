@@ -16,7 +16,6 @@ from .writing import (
     float32,
     inexpressible,
     npy,
-    one_frequency,
     refuse_inexpressible,
     shortest,
     validate,
@@ -51,7 +50,6 @@ def write(path: str | Path, sequence: Sequence, truth: Truth | None = None, *, r
     """
     validate(sequence, truth)
     refuse_inexpressible("torf", sequence, truth)
-    one_frequency("torf", sequence)
     largest = np.abs(sequence.quads).max()
     if not largest < QUAD_MAX:
         raise inexpressible("torf", "quads", f"numbers below {QUAD_MAX:.2g}", f"{largest:.2g}")

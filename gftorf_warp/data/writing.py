@@ -127,7 +127,14 @@ def refuse_inexpressible(form: str, sequence: Sequence, truth: Truth | None) -> 
     numbers = (sequence.f_mod_hz, sequence.phase_offset, sequence.dc_offset, sequence.quad_scale or 1.0)
     focal = sequence.fx, sequence.fy
     colour, colour_width = _colour_intrinsics(sequence), _colour_size(sequence)[1]
+    family = form in ("ftorf", "torf")  # these state one depth range and one matrix
     rules = {  # what: (whether it holds, expected, found)
+        "frequencies_hz": (
+            not family or sequence.frequencies_hz is None,
+            "one modulation frequency",
+            f"{sequence.frequencies_hz}",
+        ),
+        "distortion": (not family or sequence.distortion is None, "a pinhole", f"a lens with {sequence.distortion}"),
         "an empty sequence": (sequence.measured.any(), "at least one measured raw frame", "none"),
         "quads": (np.isfinite(sequence.quads[sequence.measured]).all(), "finite numbers", "NaN or infinity"),
         "times": (
@@ -177,17 +184,6 @@ def inexpressible(form: str, what: str, expected: str, found: str) -> UsageError
         why=f"expected {expected}, found {found}",
         fix="change the sensor or the sequence",
     )
-
-
-def one_frequency(form: str, sequence: Sequence) -> None:
-    """Refuse several modulation frequencies where a folder states only one.
-
-    Raises:
-        UsageError: If there are several.
-    """
-    found = sorted(set(sequence.frame_frequencies.tolist()))
-    if found != [sequence.f_mod_hz]:
-        raise inexpressible(form, "modulation frequencies", "one for all raw frames", f"{found} Hz")
 
 
 def _colour_size(sequence: Sequence) -> tuple[int, int]:

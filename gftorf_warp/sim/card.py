@@ -8,11 +8,13 @@ from collections.abc import Mapping
 from dataclasses import fields
 
 from .. import __version__
+from ..scene.optics import Lens, lens_rows
 from .paths import Still
 from .readout import contrast, electron_gain
 from .record import Recording
 from .scene import overridden
 from .scenes import SCENES, Scene
+from .sensors import effect_rows
 
 
 def settings_card(scene: Scene, options: Mapping, layout: str = "ftorf") -> str:
@@ -53,6 +55,7 @@ def settings_card(scene: Scene, options: Mapping, layout: str = "ftorf") -> str:
             "full well": f"{sensor.full_well_electrons:g} electrons per tap",
             "ADC": f"{sensor.adc_bits or 'no'} bits, {sensor.electrons_per_code:g} electrons per code",
         }
+    rows |= effect_rows(sensor) | lens_rows(scene.lens)
     table = "\n".join(f"| {name} | {value} |" for name, value in rows.items())
     return f"""# {scene.name}: simulated C-ToF sequence
 
@@ -151,6 +154,7 @@ def _command(scene: Scene, options: Mapping, layout: str) -> str:
 def _fingerprint(scene: Scene) -> str:
     """Every setting of a scene as text; without the optional ones that it does not use, as if they did not exist."""
     optional = {"camera_path": Still(), "emitter": (0.0, 0.0, 0.0), "beam_deg": None, "colour": None, "novel_views": ()}
+    optional |= {"lens": Lens()}
     values = {f.name: getattr(scene, f.name) for f in fields(scene)}
     used = {name: value for name, value in values.items() if name not in optional or value != optional[name]}
     del used["closed_form"], used["overrides"]  # follow from the others

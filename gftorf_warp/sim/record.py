@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import astuple, dataclass, fields, is_dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -15,12 +15,13 @@ from ..constants import FRAMES_PER_QUARTET
 from ..data.sequence import Sequence, Truth
 from ..render.trace import Bounces
 from ..scene.camera import Camera
+from ..scene.optics import shading
 from ..scene.sensor import Sensor, distance_from_phasor
 from .look import Look, Splatted, look, look_colour
 from .paths import inverse
-from .readout import read_out
+from .readout import mean_quad, read_out
 from .scene import Scene
-from .traced import Traced, quad_of, trace_colour
+from .traced import Traced, trace_colour
 from .world import Hits, first_hit
 
 Progress = Callable[[int, int], None]
@@ -68,9 +69,9 @@ class Recording:
 
 
 def frame_times(sensor: Sensor, frames: int, *, sync: bool) -> Float[np.ndarray, "F"]:
-    """Time of each raw frame [s]: n times the frame period, or, ``sync``, that of the first frame of its quartet."""
+    """Time of each raw frame [s]: n times the frame period, or, ``sync``, that of the first frame of its cycle."""
     frame = np.arange(frames)
-    return (frame - frame % FRAMES_PER_QUARTET if sync else frame) * sensor.frame_period_s
+    return (frame - frame % len(sensor.cycle) if sync else frame) * sensor.frame_period_s
 
 
 def record(
@@ -107,20 +108,21 @@ def record(
     camera = cameras[0]
     distances, bodies, interior = _truth(scene, cameras, times)
     longest = frame_times(sensor, max(frames, scene.frames), sync=False)  # for fewer frames the same covers and images
+    evenness = shading(scene.lens, camera)
     take = _engine(engine, scene, size, longest, Bounces(count=bounces, paths=paths), device, seed)
-    shifts = np.array([sensor.shifts[n % len(sensor.shifts)] for n in range(frames)])
+    shots = [sensor.at_frame(n) for n in range(frames)]
     offsets = ((np.arange(exposure_samples) + 0.5) / exposure_samples - 0.5) * sensor.exposure_s
 
     def expose(n: int) -> Images:
-        shot = sensor.with_shifts((float(shifts[n]),))
-        seen = take(n, [float(times[n] + offset) for offset in offsets], float(times[n]), shot)
-        reading = read_out(seen.quad, seen.amplitude, sensor, np.random.default_rng((seed, n)))  # n: whatever F is
+        seen = take(n, [float(times[n] + offset) for offset in offsets], float(times[n]), shots[n])
+        random = np.random.default_rng((seed, n))  # frame n: whatever F is
+        reading = read_out(seen.quad, seen.amplitude, shots[n], random, shading=evenness)
         return {
             "quad": reading.quad,
             "saturated": reading.saturated.sum(),
             "amplitude": seen.amplitude.astype(np.float32),
             "distance": seen.distance,
-            "phasor_distance": _static_distance(seen, sensor),
+            "phasor_distance": _static_distance(seen, shots[n]),
         }
 
     quads, phasor_distances, amplitudes = (np.zeros(distances.shape, dtype=np.float32) for _ in range(3))
@@ -141,15 +143,17 @@ def record(
         sequence=Sequence(
             quads=quads,
             measured=np.ones(frames, dtype=bool),
-            shifts=shifts,
+            shifts=np.array([shot.shifts[0] for shot in shots]),
             times=times,
             f_mod_hz=float(sensor.f_mod_hz),
+            frequencies_hz=np.array([float(shot.f_mod_hz) for shot in shots]) if sensor.further_hz else None,
             phase_offset=float(sensor.phase_offset),
             dc_offset=float(sensor.dc_offset),
             fx=camera.fx,
             fy=camera.fy,
             cx=camera.cx,
             cy=camera.cy,
+            distortion=astuple(camera.distortion) if camera.distortion else None,
             camera_from_world=np.stack([camera.camera_from_world for camera in cameras]),
             novel_from_world=np.stack([inverse(view.world_from_body(0.0)) for view in scene.novel_views])
             if scene.novel_views
@@ -178,14 +182,22 @@ def _engine(
     """What takes an image: a function of a raw frame's number, the instants it averages, its time, and the sensor."""
     if engine not in ENGINES:
         raise ValueError(f"engine {engine!r} must be one of {', '.join(ENGINES)}")
+    if scene.lens.beam_power and bounces.count:
+        raise ValueError("lens.beam_power is of direct light: with bounces, use beam_deg")
     if engine == "mesh":
-        traced = Traced(scene, lambda time: scene.camera(size, time), bounces=bounces, device=device)
+        traced = Traced(
+            scene,
+            lambda time: scene.camera(size, time),
+            harmonics=scene.sensor.harmonics,
+            bounces=bounces,
+            device=device,
+        )
 
         def trace(n: int, instants: list[float], time: float, sensor: Sensor) -> Look:
             random = int(np.random.default_rng((seed, n, PATHS)).integers(2**31))  # frame n: whatever F is
             mean = traced.light(instants, float(sensor.f_mod_hz), random)
             still = mean if instants == [time] else traced.light([time], float(sensor.f_mod_hz), random)
-            quad, amplitude = quad_of(mean, sensor)
+            quad, amplitude = mean_quad(mean.light, mean.amplitude, sensor)
             phasor = still.light[0] * np.exp(1j * float(sensor.phase_offset))
             return Look(quad, amplitude, traced.first_hits(time).distance, phasor)
 
@@ -224,11 +236,16 @@ def _static_distance(seen: Look, sensor: Sensor) -> Float[np.ndarray, "H W"]:
 
 def sensor_settings(sensor: Sensor) -> dict[str, Any]:
     """Every number of a sensor by name, for files: what a reader can check a result against."""
-    values = {f.name: getattr(sensor, f.name) for f in fields(sensor)}
-    return {
-        k: float(v) if isinstance(v, torch.Tensor) else list(v) if isinstance(v, tuple) else v
-        for k, v in values.items()
-    }
+    plain: dict[str, Any] = {}
+    for f in fields(sensor):
+        value = getattr(sensor, f.name)
+        if is_dataclass(value):
+            plain[f.name] = {part.name: getattr(value, part.name) for part in fields(value)}
+        elif isinstance(value, tuple):
+            plain[f.name] = [float(item) for item in value]
+        else:
+            plain[f.name] = value.item() if isinstance(value, torch.Tensor) else value
+    return plain
 
 
 def needs_mesh(scene: Scene, bounces: int) -> bool:

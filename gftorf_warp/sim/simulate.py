@@ -15,7 +15,7 @@ from ..data import capture_write, ftorf_write, torf_write
 from ..errors import UsageError
 from ..scene.sensor import Sensor
 from .card import outcome_card, settings_card
-from .readout import contrast
+from .readout import why_impossible
 from .record import ENGINES, Progress, frame_times, needs_mesh, record
 from .scene import overridden
 from .scene_file import read_scene
@@ -166,6 +166,15 @@ def _check_engine(scene: Scene, engine: str, bounces: int, paths: int, device: s
         "--paths": (paths >= 1, f"{paths}", "at least 1"),
     }
     _refuse(wanted)
+    if scene.lens.distortion:
+        raise UsageError(
+            "no engine renders through a lens that distorts",
+            where="lens.distortion",
+            why=f"both engines look along the rays of a pinhole, not {scene.lens.distortion}",
+            fix="leave lens.distortion out; gftorf_warp.sim.ideal makes ideal quads and truth through such a lens",
+        )
+    beam = "0 with bounces: it is of direct light; use beam_deg"
+    _refuse({"lens.beam_power": (not (scene.lens.beam_power and bounces), f"{scene.lens.beam_power:g}", beam)})
     if engine != "mesh":
         light = "mesh: the light is beside the camera, has a beam or bounces"
         _refuse({"--engine": (not needs_mesh(scene, bounces), repr(engine), light)})
@@ -188,12 +197,19 @@ def _check_sensor(sensor: Sensor, layout: str) -> None:
             why=f"it holds the four shifts 0, 90, 180 and 270 deg in some order, not {turns} deg",
             fix="use those four shifts, or --format capture",
         )
-    if sensor.noise and not sensor.unipolar and contrast(sensor) * (1 + abs(float(sensor.dc_offset))) > 1:
+    if sensor.further_hz and layout != "capture":
+        raise UsageError(
+            "an F-ToeRF folder cannot express this sensor",
+            where="sensor.further_hz",
+            why=f"it has one modulation frequency, not {1 + len(sensor.further_hz)}",
+            fix="leave sensor.further_hz out, or --format capture",
+        )
+    impossible = why_impossible(sensor) if sensor.noise else None
+    if impossible is not None:
         raise UsageError(
             "a tap of this sensor would hold negative light",
             where="sensor.dc_offset",
-            why=f"differential taps allow contrast (1 + |dc_offset|) <= 1, not {contrast(sensor):g} (1 + "
-            f"{abs(float(sensor.dc_offset)):g})",
+            why=impossible,
             fix="lower the contrast or the DC offset, or make the sensor unipolar",
         )
 

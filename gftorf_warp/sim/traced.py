@@ -11,7 +11,6 @@ from jaxtyping import Float, Int
 
 from ..render.trace import Bounces, FirstHits, Lamp, Light, RigidBody, Tracer
 from ..scene.camera import Camera
-from ..scene.sensor import Sensor
 from .assembly import Assembly, Level, Part
 from .look import pooled
 from .scene import Scene
@@ -67,13 +66,6 @@ class Traced:
     def _poses(self, time: float) -> Float[np.ndarray, "P 4 4"]:
         """Pose of the body of each piece [m]."""
         return np.stack([body.path.world_from_body(time) for body in self.scene.bodies])[self._body]
-
-
-def quad_of(mean: Light, sensor: Sensor) -> tuple[Float[np.ndarray, "H W"], ...]:
-    """Quad of the sensor's first shift, and amplitude, of every pixel in this light."""
-    amplitude = float(sensor.source_intensity) * mean.amplitude.astype(np.float64)
-    turned = mean.light[0] * np.exp(1j * (float(sensor.phase_offset) - sensor.shifts[0]))
-    return float(sensor.source_intensity) * turned.real + float(sensor.dc_offset) * amplitude, amplitude
 
 
 def trace_colour(scene: Scene, camera: Camera, time: float) -> Float[np.ndarray, "H W 3"]:
