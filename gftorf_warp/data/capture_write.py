@@ -14,11 +14,10 @@ from .capture_json import NAME
 from .exr import Parts, write_parts
 from .files import atomic_folder, write_through
 from .sequence import Sequence, Truth
-from .writing import float32, refuse_inexpressible, validate
+from .writing import float32, readme_and_sheet, refuse_inexpressible, validate
 
 VERSION = "1.0"
 MANIFEST = "MANIFEST.sha256"
-SHEET = "contact_sheet.png"
 
 
 def write(
@@ -66,10 +65,8 @@ def write(
                 write_parts(folder / f"truth/{n:06d}.exr", _truth(truth, n))
         names = sorted(file.relative_to(folder).as_posix() for file in folder.rglob("*") if file.is_file())
         digests = [f"{hashlib.sha256((folder / name).read_bytes()).hexdigest()}  {name}\n" for name in names]
-        if readme is not None:
-            write_through(folder / "README.md", readme.encode())
-        if sheet is not None:
-            write_through(folder / SHEET, sheet)
+        for name, content in readme_and_sheet(readme, sheet):
+            write_through(folder / name, content)
         write_through(folder / MANIFEST, "".join(digests).encode())
     return Path(path)
 

@@ -16,6 +16,8 @@ from .files import atomic_folder, write_through
 from .poses import rigid
 from .sequence import Sequence, Truth
 
+SHEET = "contact_sheet.png"  # in every simulated folder; no reader opens it
+
 
 def write_folder(path: str | Path, files: Iterable[tuple[str, bytes]], folders: Iterable[str] = ()) -> Path:
     """Write files of a folder that appears only when it is complete.
@@ -53,6 +55,14 @@ def calibration_files(
         yield "cams/quad_values_scale_factor.npy", npy(np.float64(sequence.quad_scale))
     if sequence.novel_from_world is not None:
         yield "test_poses.npy", npy(sequence.novel_from_world.astype(np.float64))
+
+
+def readme_and_sheet(readme: str | None, sheet: bytes | None) -> Iterator[tuple[str, bytes]]:
+    """What a folder holds for people, by relative name."""
+    if readme is not None:
+        yield "README.md", readme.encode()
+    if sheet is not None:
+        yield SHEET, sheet
 
 
 def validate(sequence: Sequence, truth: Truth | None) -> None:

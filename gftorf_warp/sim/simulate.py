@@ -12,9 +12,13 @@ import numpy as np
 
 from ..constants import CANONICAL_SHIFTS, FRAMES_PER_QUARTET
 from ..data import capture_write, ftorf_write, torf_write
+from ..data.contact_sheet import contact_sheet
+from ..data.files import atomic_write
+from ..data.sequence import Sequence
 from ..errors import UsageError
 from ..scene.sensor import Sensor
 from .card import outcome_card, settings_card
+from .ladder import NAMES, Errors, at_level, closed_form_errors, ladder_table
 from .readout import why_impossible
 from .record import ENGINES, Progress, frame_times, needs_mesh, record
 from .scene import overridden
@@ -44,6 +48,7 @@ def simulate(
     paths: int = 64,
     device: str = "cpu",
     format: str = "ftorf",
+    level: str | None = None,
     fresh: bool = False,
     progress: Progress | None = None,
 ) -> Path:
@@ -75,6 +80,8 @@ def simulate(
         device: Where engine 'mesh' traces; the other one renders on the CPU.
         format: Layout on disk: 'ftorf', raw quads; 'torf', one phasor per quartet with the time, pose and truth of its
             first raw frame; 'capture', our own, which holds any shifts, exposures, amplitude and objects too.
+        level: Step of the ladder from ideal to realistic, see ``LEVELS`` of sim/ladder.py; it decides about the engine,
+            bounces, blur, noise and what of the sensor is ideal. None: everything as it is asked for.
         fresh: Whether another sequence in ``out`` is moved aside, to ``out-old-1``, instead of being an error, and an
             unfinished one begun again.
         progress: Called with (raw frames done, raw frames in all).
@@ -88,21 +95,10 @@ def simulate(
         BusyError: If another process records the same sequence.
         InputError: If a TOML file does not describe a scene.
     """
-    found = overridden(_scene(scene), overrides)
-    _check_options(found, frames, size, seed, exposure_samples, format)
-    _check_engine(found, engine, bounces, paths, device)
-    if flow and format == "torf":
-        raise UsageError(
-            "a ToeRF folder has no place for optical flow",
-            where="--flow",
-            why="flow belongs to the raw quads of an F-ToeRF folder",
-            fix="leave --flow out, or --format ftorf",
-        )
-    _check_sensor(found.sensor, format)
-    _check_duration(found, frames)
+    own = overridden(_scene(scene), overrides)
     options: dict[str, Any] = {
-        "frames": found.frames if frames is None else frames,
-        "size": (found.width, found.height) if size is None else tuple(size),
+        "frames": own.frames if frames is None else frames,
+        "size": (own.width, own.height) if size is None else tuple(size),
         "seed": seed,
         "sync": sync,
         "noise": noise,
@@ -112,7 +108,19 @@ def simulate(
         "bounces": bounces,
         "paths": paths,
     }
-    card = settings_card(found, options, format)
+    found, options = (own, options) if level is None else at_level(own, level, options)
+    _check_options(found, options, format)
+    _check_engine(found, options["engine"], options["bounces"], options["paths"], device)
+    if flow and format == "torf":
+        raise UsageError(
+            "a ToeRF folder has no place for optical flow",
+            where="--flow",
+            why="flow belongs to raw quads",
+            fix="leave --flow out, or --format ftorf",
+        )
+    _check_sensor(found.sensor, format)
+    _check_duration(found, frames)
+    card = settings_card(found, options, format, own=own, level=level)
     out = Path(out).absolute() if fresh else Path(out)
     if not needs_recording(out, card, fresh=fresh):
         return out
@@ -121,8 +129,38 @@ def simulate(
         recording = record(found, **options, device=device, progress=progress, keep=keep)
         if fresh:
             set_aside(out)
-        write(out, recording.sequence, recording.truth, readme=card + outcome_card(recording))
+        sheet = contact_sheet(recording.sequence, recording.truth, card.partition("\n")[0].removeprefix("# "))
+        write(out, recording.sequence, recording.truth, readme=card + outcome_card(recording), sheet=sheet)
     return out
+
+
+def simulate_ladder(
+    scene: str | Scene, out: str | Path, *, progress: Progress | None = None, **options: Any
+) -> dict[str, Errors]:
+    """Record a scene at every level of the ladder, into OUT/sync, OUT/L0 and so on, and say what each level costs.
+
+    ``OUT/ladder.md`` holds the table. Levels that are there already with the same settings are left as they are.
+
+    Args:
+        scene: As for :func:`simulate`.
+        out: Folder of the folders.
+        progress: Called with (raw frames done, raw frames in all) of each level in turn.
+        options: Those of :func:`simulate`, but for ``level``.
+
+    Returns:
+        Errors of the closed form by name of the level.
+
+    Raises:
+        UsageError, InputError, BusyError: As :func:`simulate`.
+    """
+    out, rows = Path(out), {}
+    for name in NAMES:
+        sequence = Sequence.open(simulate(scene, out / name, level=name, progress=progress, **options))
+        rows[name] = closed_form_errors(sequence, sequence.truth())
+    title = scene if isinstance(scene, str) else scene.name
+    lines = "\n".join(f"    {line}" for line in ladder_table(rows))
+    atomic_write(out / "ladder.md", f"# {title}: what each level of the ladder costs\n\n{lines}\n".encode())
+    return rows
 
 
 def _scene(scene: str | Scene) -> Scene:
@@ -143,13 +181,14 @@ def _scene(scene: str | Scene) -> Scene:
     return SCENES[scene]
 
 
-def _check_options(scene: Scene, frames, size, seed: int, exposure_samples: int, layout: str) -> None:
+def _check_options(scene: Scene, options: dict[str, Any], layout: str) -> None:
     least = FRAMES_PER_QUARTET if layout == "torf" else 1  # a phasor needs a whole quartet
+    frames, size, seed, exposure_samples = (options[k] for k in ("frames", "size", "seed", "exposure_samples"))
     wanted = {
-        "--frames": (frames is None or frames >= least, f"{frames}", f"at least {least}, for example {scene.frames}"),
+        "--frames": (frames >= least, f"{frames}", f"at least {least}, for example {scene.frames}"),
         "--size": (
-            size is None or (len(size) == 2 and min(size) >= 1),
-            "x".join(map(str, size or ())),
+            len(size) == 2 and min(size) >= 1,
+            "x".join(map(str, size)),
             f"WIDTHxHEIGHT, both at least 1, for example {scene.width}x{scene.height}",
         ),
         "--seed": (seed >= 0, f"{seed}", "0 or more"),
