@@ -255,7 +255,7 @@ def table(metrics: dict) -> str:
         lines.append(f"{name:<16}{cells[0]:>12}{cells[1]:>10}{cells[2]:>13}{cells[3]:>10}")
     psnr = metrics["quad_psnr_db"]
     quality = "-" if psnr is None else f"{psnr:.2f} dB"
-    scored = f"{metrics['frames']} raw frames ({metrics['protocol']}), against {metrics['against']}"
+    scored = f"{metrics['frames']} raw frames ({metrics['protocol']}), against {metrics.get('against', 'geometry')}"
     return "\n".join([*lines, f"{scored}, quad PSNR {quality}"])
 
 

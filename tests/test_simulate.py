@@ -268,14 +268,14 @@ def test_a_sequence_is_read_back_as_recorded(tmp_path):
 
 
 def test_the_same_seed_writes_the_same_bytes(tmp_path):
-    """Another seed changes the quads and the card that names it, nothing else."""
+    """Another seed changes the quads, their picture and the card that names it, nothing else."""
     scene = slider(frames=5)
     folders = [simulate(scene, tmp_path / str(k), seed=seed) for k, seed in enumerate((7, 7, 8))]
     first, same, other = (contents(folder) for folder in folders)
     assert first == same
     assert first.keys() == other.keys()
     differ = {name for name in first if first[name] != other[name]}
-    assert differ == {name for name in first if name.startswith("tofType")} | {"README.md"}
+    assert differ == {name for name in first if name.startswith("tofType")} | {"README.md", "contact_sheet.png"}
 
 
 def test_the_card_says_how_to_make_it_again(tmp_path):

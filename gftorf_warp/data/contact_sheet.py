@@ -160,6 +160,7 @@ def _place(sheet: Picture, panel: Panel, x: int, y: int, height: int) -> None:
     size = max(1, round(w * factor)), max(1, round(h * factor))
     shrinks = cv2.INTER_AREA if factor < 1 else cv2.INTER_NEAREST
     sheet[top : top + size[1], x : x + size[0]] = cv2.resize(panel.image, size, interpolation=shrinks)
+    cv2.rectangle(sheet, (x - 1, top - 1), (x + size[0], top + size[1]), UNKNOWN, 1)  # white may be a value
     if panel.scale is None:
         return
     low, high, colours = panel.scale

@@ -60,8 +60,8 @@ def compare(
         run: A finished reconstruction, or its folder.
         truth: A sequence whose ground truth to use; None: that of the sequence the run was made from.
         frames: Which raw frames are scored: ``all``, or ``ftorf13`` as in the published tables.
-        against: Which distance is the true one: ``geometry``, or ``static-phasor``, what the closed form would decode if
-            nothing moved and nothing were noisy. Pixels that move are those of geometry in both cases.
+        against: Which distance is the true one: ``geometry``, or ``static-phasor``, what the closed form would decode
+            if nothing moved and nothing were noisy. Pixels that move are those of geometry in both cases.
         report: Whether the page is written as well.
         progress: Called with (frames done, frames in all).
 
