@@ -1,18 +1,22 @@
 """Lenses: distortion against OpenCV, its inverse, what it does to the truth; fall-off and beam on a frontal wall."""
 
 import math
+from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
 import torch
+from small_runs import small
 
-from gftorf_warp.errors import UsageError
+from gftorf_warp.errors import InputError, UsageError
+from gftorf_warp.recon.train import reconstruct
 from gftorf_warp.render.api import rasterize
 from gftorf_warp.render.trace import RigidBody, Tracer
 from gftorf_warp.scene.camera import Camera
 from gftorf_warp.scene.distortion import Distortion
 from gftorf_warp.scene.gaussians import GaussianField, constant_sh
+from gftorf_warp.scene.measured import camera_of
 from gftorf_warp.scene.optics import Lens, lens_rows, shading
 from gftorf_warp.scene.sensor import Sensor
 from gftorf_warp.sim.assembly import Level
@@ -75,7 +79,24 @@ def test_truth_and_ideal_quads_are_seen_through_the_lens():
     sequence, truth = ideal_recording(bent)
     np.testing.assert_allclose(truth.distance[0], 3.0 / cosine, rtol=1e-6)
     assert sequence.distortion == (BARREL.k1, BARREL.k2, BARREL.p1, BARREL.p2, BARREL.k3)
+    assert camera_of(sequence, 0).distortion == BARREL
     assert ideal_recording(scene())[0].distortion is None
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"distortion": (-0.2, 0.0, 0.0, 0.0, 0.0)}, "a pinhole, found a lens"),
+        (
+            {"frequencies_hz": np.repeat([20e6, 30e6], 6)},
+            r"one modulation frequency .* found \[20000000.0, 30000000.0\]",
+        ),
+    ],
+)
+def test_what_cannot_be_rendered_is_not_reconstructed(changes, says, tmp_path):
+    """A sequence through a lens, or of two frequencies, would be fitted wrong without a word."""
+    with pytest.raises(InputError, match=says):
+        reconstruct(replace(small(), **changes), tmp_path / "run", "demo", images=4)
 
 
 def test_lenses_that_cannot_be_undone_are_refused():

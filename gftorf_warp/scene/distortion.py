@@ -45,6 +45,15 @@ class Distortion:
             if not math.isfinite(getattr(self, f.name)):
                 raise ValueError(f"{f.name} must be finite, got {getattr(self, f.name)}")
 
+    @classmethod
+    def of(cls, coefficients: tuple[float, float, float, float, float] | None) -> Distortion:
+        """That of k1, k2, p1, p2, k3, OpenCV's order; None is a pinhole."""
+        return (
+            cls()
+            if coefficients is None
+            else cls(**dict(zip((f.name for f in fields(cls)), coefficients, strict=True)))
+        )
+
     def __bool__(self) -> bool:
         """Whether there is any."""
         return any(astuple(self))
