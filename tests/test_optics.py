@@ -120,9 +120,9 @@ def test_lenses_that_cannot_be_undone_are_refused():
         Camera.from_fov(33, 25, 60.0, distortion=fold)
     Camera.from_fov(33, 25, 10.0, distortion=fold)  # far inside its turn
     twice = Distortion(k1=-1.0, k2=0.3)  # turns, and turns back: what it images at .5 is behind both, at 1.546
-    np.testing.assert_allclose(twice.apply(np.array(1.54582907), np.array(0.0)), (0.5, 0.0), atol=1e-7)
+    np.testing.assert_allclose(twice.apply(np.array([1.54582907]), np.zeros(1)), [[0.5], [0.0]], atol=1e-7)
     with pytest.raises(ValueError, match="cannot be undone"):
-        twice.undo(np.array(0.5), np.array(0.0))
+        twice.undo(np.array([0.5]), np.zeros(1))
     with pytest.raises(ValueError, match="cannot be undone"):
         scene(lens=Lens(distortion=fold))
     with pytest.raises(ValueError, match="p2 must be finite"):

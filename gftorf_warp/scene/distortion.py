@@ -68,9 +68,9 @@ class Distortion:
         )
 
     def undo(
-        self, x: Float[np.ndarray, "*n"], y: Float[np.ndarray, "*n"]
+        self, x: Float[np.ndarray, "..."], y: Float[np.ndarray, "..."]
     ) -> tuple[Float[np.ndarray, "*n"], Float[np.ndarray, "*n"]]:
-        """Where a pinhole would have what the lens images at (x, y) [1].
+        """Where a pinhole would have what the lens images at (x, y) [1], which are broadcast.
 
         Raises:
             ValueError: If some place on the sensor sees nothing, or two things, through such a lens.
