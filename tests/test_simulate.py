@@ -326,7 +326,7 @@ def test_a_finished_sequence_is_not_made_again(tmp_path):
         ({"scene": "axial", "frames": 400}, ("--frames", "nearer to the camera", "simulate at most ")),
         ({"seed": -1}, ("--seed", "0 or more")),
         ({"exposure_samples": 0}, ("exposure_samples",)),
-        ({"format": "capture"}, ("--format", "capture", "ftorf")),
+        ({"format": "zip"}, ("--format", "zip", "ftorf", "capture")),
         ({"scene": slider(sensor=Sensor(shifts=(0.0, 2.0, 4.0)))}, ("F-ToeRF", "sensor.shifts", "four shifts")),
         ({"scene": slider(sensor=Sensor(shifts=(0.0, 1.0, 2.0, 3.0)))}, ("sensor.shifts",)),
         ({"scene": slider(sensor=Sensor(noise=True, contrast=0.9, dc_offset=0.5))}, ("dc_offset", "negative light")),
