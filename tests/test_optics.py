@@ -1,23 +1,30 @@
 """Lenses: distortion against OpenCV, its inverse, what it does to the truth; fall-off and beam on a frontal wall."""
 
 import math
+from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
 import torch
+from small_runs import small
 
-from gftorf_warp.errors import UsageError
+from gftorf_warp.errors import InputError, UsageError
+from gftorf_warp.recon.train import reconstruct
 from gftorf_warp.render.api import rasterize
 from gftorf_warp.render.trace import RigidBody, Tracer
 from gftorf_warp.scene.camera import Camera
 from gftorf_warp.scene.distortion import Distortion
+from gftorf_warp.scene.electrons import electron_gain
 from gftorf_warp.scene.gaussians import GaussianField, constant_sh
+from gftorf_warp.scene.measured import camera_of
 from gftorf_warp.scene.optics import Lens, lens_rows, shading
+from gftorf_warp.scene.pattern import Pattern, gain_map
 from gftorf_warp.scene.sensor import Sensor
 from gftorf_warp.sim.assembly import Level
 from gftorf_warp.sim.ideal import ideal_recording, light_of
 from gftorf_warp.sim.paths import Still
+from gftorf_warp.sim.readout import read_out
 from gftorf_warp.sim.record import record
 from gftorf_warp.sim.scene import Scene
 from gftorf_warp.sim.simulate import simulate
@@ -65,6 +72,17 @@ def test_rays_meet_the_pixel_centres(lens):
     assert bent.norm(dim=-1).max() < 1e-3  # sub-samples of the same lens surround the ray of the pixel
 
 
+def test_derivatives_of_a_lens():
+    """Against central differences: they decide where a lens folds."""
+    x, y = np.random.default_rng(0).uniform(-0.8, 0.8, (2, 50))
+    lens, step = Distortion(k1=-0.25, k2=0.3, p1=0.2, p2=-0.1, k3=0.4), 1e-6
+    by_x = (np.array(lens.apply(x + step, y)) - lens.apply(x - step, y)) / (2 * step)
+    by_y = (np.array(lens.apply(x, y + step)) - lens.apply(x, y - step)) / (2 * step)
+    xx, xy, yy = lens._slope(x, y)
+    np.testing.assert_allclose((xx, xy), by_x, atol=1e-8)
+    np.testing.assert_allclose((xy, yy), by_y, atol=1e-8)
+
+
 def test_truth_and_ideal_quads_are_seen_through_the_lens():
     """Distance of the wall along the bent rays; the sequence keeps the coefficients."""
     bent = scene(lens=Lens(distortion=BARREL))
@@ -75,7 +93,24 @@ def test_truth_and_ideal_quads_are_seen_through_the_lens():
     sequence, truth = ideal_recording(bent)
     np.testing.assert_allclose(truth.distance[0], 3.0 / cosine, rtol=1e-6)
     assert sequence.distortion == (BARREL.k1, BARREL.k2, BARREL.p1, BARREL.p2, BARREL.k3)
+    assert camera_of(sequence, 0).distortion == BARREL
     assert ideal_recording(scene())[0].distortion is None
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"distortion": (-0.2, 0.0, 0.0, 0.0, 0.0)}, "a pinhole, found a lens"),
+        (
+            {"frequencies_hz": np.repeat([20e6, 30e6], 6)},
+            r"one modulation frequency .* found \[20000000.0, 30000000.0\]",
+        ),
+    ],
+)
+def test_what_cannot_be_rendered_is_not_reconstructed(changes, says, tmp_path):
+    """A sequence through a lens, or of two frequencies, would be fitted wrong without a word."""
+    with pytest.raises(InputError, match=says):
+        reconstruct(replace(small(), **changes), tmp_path / "run", "demo", images=4)
 
 
 def test_lenses_that_cannot_be_undone_are_refused():
@@ -84,6 +119,10 @@ def test_lenses_that_cannot_be_undone_are_refused():
     with pytest.raises(ValueError, match=r"k1=-2\.0.* cannot be undone"):
         Camera.from_fov(33, 25, 60.0, distortion=fold)
     Camera.from_fov(33, 25, 10.0, distortion=fold)  # far inside its turn
+    twice = Distortion(k1=-1.0, k2=0.3)  # turns, and turns back: what it images at .5 is behind both, at 1.546
+    np.testing.assert_allclose(twice.apply(np.array([1.54582907]), np.zeros(1)), [[0.5], [0.0]], atol=1e-7)
+    with pytest.raises(ValueError, match="cannot be undone"):
+        twice.undo(np.array([0.5]), np.zeros(1))
     with pytest.raises(ValueError, match="cannot be undone"):
         scene(lens=Lens(distortion=fold))
     with pytest.raises(ValueError, match="p2 must be finite"):
@@ -147,6 +186,22 @@ def test_a_beam_keeps_its_power():
         assert (seen.active * cosine**3).sum() / (cosine**3).sum() == pytest.approx(1.0, rel=1e-12)
         np.testing.assert_array_equal(seen.ambient, np.ones((240, 320)))
     assert shading(Lens(distortion=BARREL), camera) is None
+
+
+def test_ambient_light_passes_the_lens_and_not_the_beam():
+    """What each pixel gets of the ambient electrons is its reflectance times the fall-off times its own response."""
+    sensor = Sensor(noise=True, ambient_electrons=4e4, pattern=Pattern(gain=0.2), dark_electrons_per_s=0.0)
+    sensor = replace(sensor, read_noise_electrons=0.0, adc_bits=None)
+    camera = Camera.from_fov(8, 6, 60.0)
+    seen, dark = shading(Lens(cosine_power=4.0, beam_power=8.0), camera), np.zeros((6, 8))
+    draws = [
+        read_out(dark, dark, sensor, np.random.default_rng(n), ambient=np.full((6, 8), 0.5), shading=seen).quad
+        for n in range(4000)
+    ]
+    want = 2e4 * seen.ambient * gain_map(sensor.pattern, 6, 8)  # the variance of a difference of two taps
+    got = np.var(draws, axis=0) * (sensor.contrast * electron_gain(sensor)) ** 2
+    np.testing.assert_allclose(got, want, rtol=5 * math.sqrt(2 / 4000))
+    assert np.ptp(want) > 0.5 * want.max()
 
 
 def test_vignetting_is_one_on_the_axis_and_its_polynomial_in_the_corner():

@@ -64,6 +64,11 @@ def test_the_phase_pattern_is_as_large_as_the_notes_say():
     assert centre == pytest.approx(-15.6 * CODE, abs=3 * CODE)
     assert corner == pytest.approx(bowl * CODE, abs=3 * CODE)
     np.testing.assert_allclose(phase_map(Pattern(phase=0.5), *SIZE), 0.5 * map_)
+    noise = (map_ - phase_map(Pattern(phase=1.0, seed=1), *SIZE)) / (math.sqrt(2) * CODE)  # two specimens, one bowl
+    for axis, deviation in ((0, 3.6), (1, 1.4)):  # of columns and of rows
+        want = math.hypot(deviation, 8.9 / math.sqrt(SIZE[axis]))
+        assert noise.mean(axis).std() == pytest.approx(want, rel=4 / math.sqrt(2 * SIZE[1 - axis]))
+    assert noise.std() == pytest.approx(math.sqrt(8.9**2 + 3.6**2 + 1.4**2), rel=0.03)
 
 
 @pytest.mark.parametrize(("make", "name", "deviation"), [(gain_map, "gain", 0.01), (dark_map, "dark", 0.2)])

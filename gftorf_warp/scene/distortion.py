@@ -45,6 +45,15 @@ class Distortion:
             if not math.isfinite(getattr(self, f.name)):
                 raise ValueError(f"{f.name} must be finite, got {getattr(self, f.name)}")
 
+    @classmethod
+    def of(cls, coefficients: tuple[float, float, float, float, float] | None) -> Distortion:
+        """That of k1, k2, p1, p2, k3, OpenCV's order; None is a pinhole."""
+        return (
+            cls()
+            if coefficients is None
+            else cls(**dict(zip((f.name for f in fields(cls)), coefficients, strict=True)))
+        )
+
     def __bool__(self) -> bool:
         """Whether there is any."""
         return any(astuple(self))
@@ -59,9 +68,9 @@ class Distortion:
         )
 
     def undo(
-        self, x: Float[np.ndarray, "*n"], y: Float[np.ndarray, "*n"]
+        self, x: Float[np.ndarray, "..."], y: Float[np.ndarray, "..."]
     ) -> tuple[Float[np.ndarray, "*n"], Float[np.ndarray, "*n"]]:
-        """Where a pinhole would have what the lens images at (x, y) [1].
+        """Where a pinhole would have what the lens images at (x, y) [1], which are broadcast.
 
         Raises:
             ValueError: If some place on the sensor sees nothing, or two things, through such a lens.
