@@ -54,7 +54,9 @@ def test_flow_is_shown_where_it_is(monkeypatch, recording):
     assert any("flow to raw frame 8" in title for title in titles(monkeypatch, longer, recording.truth))
 
 
-@pytest.mark.parametrize("kind", ["no truth", "no distance", "one frame", "two frequencies", "dark", "all still"])
+@pytest.mark.parametrize(
+    "kind", ["no truth", "no distance", "one frame", "two frequencies", "one shift", "dark", "all still"]
+)
 def test_any_sequence_has_one(monkeypatch, recording, kind):
     """What is missing is left out, and nothing warns."""
     sequence, truth = recording.sequence, recording.truth
@@ -66,6 +68,8 @@ def test_any_sequence_has_one(monkeypatch, recording, kind):
         sequence = replace(sequence, measured=np.arange(8) == 5)
     elif kind == "two frequencies":
         sequence = replace(sequence, frequencies_hz=np.where(np.arange(8) < 4, 2e7, 3e7))
+    elif kind == "one shift":
+        sequence = replace(sequence, shifts=np.zeros(8))
     elif kind == "dark":
         sequence = replace(sequence, quads=np.zeros_like(sequence.quads))
     else:

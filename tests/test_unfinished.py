@@ -9,6 +9,7 @@ import time
 import numpy as np
 import pytest
 
+from gftorf_warp.cli import main
 from gftorf_warp.data.sequence import Sequence
 from gftorf_warp.errors import BusyError, InputError, UsageError
 from gftorf_warp.sim import simulate as simulating
@@ -162,3 +163,24 @@ def test_a_signal_loses_no_finished_frame(tmp_path, kind):
     whole = simulate("demo", tmp_path / "whole", size=(160, 120), frames=40)
     assert contents(tmp_path / "seq") == contents(whole)
     np.testing.assert_array_equal(Sequence.open(whole).quads, Sequence.open(tmp_path / "seq").quads)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "word"),
+    [
+        (("demo", "--override", "sensor.f_mod_hz=0"), 2, "f_mod_hz"),
+        (("demo", "--override", "sensor.exposure_s=-1"), 2, "exposure_s"),
+        (("demo", "--override", "sensor.shifts=0,0,0,0"), 2, "shift"),
+        (("demo", "--override", "sensor.shifts=0", "--format", "capture"), 2, "shift"),
+        (("demo", "--frames", "0"), 2, "--frames"),
+        (("demo", "--level", "L9"), 2, "--level"),
+        (("demo", "--format", "zip"), 2, "--format"),
+        (("missing.toml",), 3, "missing.toml"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, tuple) else None,
+)
+def test_what_cannot_be_recorded_leaves_nothing(tmp_path, capsys, arguments, code, word):
+    """Named, with the exit code of its kind; neither a folder nor a part of one."""
+    assert main(["simulate", *arguments, "--size", "8x6", "--out", str(tmp_path / "seq")]) == code
+    assert word in capsys.readouterr().err
+    assert not any(tmp_path.iterdir())

@@ -24,6 +24,7 @@ HEAD = 70  # [px] height of the heading
 INK, SOFT, UNKNOWN = (32, 32, 32), (110, 110, 110), (200, 200, 200)
 CLIP = 99.5  # percentile of an error that is the end of its scale: one wrapped pixel must not darken all others
 COLUMNS = 4
+SHIFTS_MIN = 3  # different ones: cosine, sine and a constant
 PALETTE = ((230, 159, 0), (86, 180, 233), (0, 158, 115), (240, 228, 66), (0, 114, 178), (213, 94, 0), (204, 121, 167))
 
 Picture = UInt8[np.ndarray, "h w 3"]
@@ -52,7 +53,7 @@ def contact_sheet(sequence: Sequence, truth: Truth | None, title: str) -> bytes:
     """
     import cv2
 
-    quartets = [] if sequence.frequencies_hz is not None else sequence.complete_quartets
+    quartets = _decodable(sequence)
     n = FRAMES_PER_QUARTET * quartets[len(quartets) // 2] if quartets else int(np.flatnonzero(sequence.measured)[0])
     rows = [_raw(sequence, n), _decoded(sequence, truth, n, bool(quartets)), _more(sequence, truth, n)]
     panels = [row[i : i + COLUMNS] for row in rows for i in range(0, len(row), COLUMNS)]
@@ -75,6 +76,15 @@ def contact_sheet(sequence: Sequence, truth: Truth | None, title: str) -> bytes:
     if not done:
         raise ValueError(f"sheet {sheet.shape} could not be encoded")
     return data.tobytes()
+
+
+def _decodable(sequence: Sequence) -> list[int]:
+    """Quartets whose closed form there is: complete, of one frequency, of shifts that determine a phase."""
+    if sequence.frequencies_hz is not None:
+        return []
+    turns = np.round(np.exp(1j * sequence.shifts), 3)
+    quartets = [slice(FRAMES_PER_QUARTET * i, FRAMES_PER_QUARTET * (i + 1)) for i in sequence.complete_quartets]
+    return [q.start // FRAMES_PER_QUARTET for q in quartets if len(set(turns[q].tolist())) >= SHIFTS_MIN]
 
 
 def _raw(sequence: Sequence, n: int) -> list[Panel]:

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..constants import CANONICAL_SHIFTS, FRAMES_PER_QUARTET
 from ..data import capture_write, ftorf_write, torf_write
-from ..data.contact_sheet import contact_sheet
+from ..data.contact_sheet import SHIFTS_MIN, contact_sheet
 from ..data.files import atomic_write
 from ..data.sequence import Sequence
 from ..errors import UsageError
@@ -229,6 +229,13 @@ def _refuse(wanted: dict[str, tuple[bool, str, str]]) -> None:
 
 def _check_sensor(sensor: Sensor, layout: str) -> None:
     turns = sorted(round(math.degrees(shift), 4) % 360.0 for shift in sensor.shifts)
+    if layout == "capture" and len({turn % 360.0 for turn in turns}) < SHIFTS_MIN:
+        raise UsageError(
+            "this sensor cannot see a phase",
+            where="sensor.shifts",
+            why=f"a phase needs {SHIFTS_MIN} different shifts, found {turns} deg",
+            fix="give it more of them",
+        )
     if layout != "capture" and turns != sorted(math.degrees(shift) for shift in CANONICAL_SHIFTS):
         raise UsageError(
             "an F-ToeRF folder cannot express this sensor",
