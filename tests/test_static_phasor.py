@@ -27,8 +27,8 @@ def test_it_is_the_closed_form_of_one_instant(more):
     for i in (0, 1):
         difference = np.abs(closed_form_distance(sync, i) - truth.phasor_distance[4 * i])
         assert np.median(difference) < bound
-        assert np.quantile(difference, 0.9) < 5 * bound
-    assert np.abs(truth.phasor_distance[1] - truth.phasor_distance[0]).max() > 0.5, "nothing moved: any time would do"
+        assert np.quantile(difference, 0.9 if "bounces" in more else 1.0) < 5 * bound
+    assert np.abs(truth.phasor_distance[1] - truth.phasor_distance[0]).max() > 0.3, "nothing moved: any time would do"
 
 
 def test_light_that_bounces_makes_it_longer_and_geometry_does_not_know():
