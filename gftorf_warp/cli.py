@@ -126,30 +126,48 @@ def _simulate(options: argparse.Namespace) -> int:
         missing = "SCENE" if options.scene is None else "--out SEQ"
         fix = f"for example `gftorf simulate {next(iter(SCENES))} --out sequence`; `gftorf simulate --list`"
         raise UsageError(f"{missing} is missing", where="gftorf simulate", why="both are needed", fix=fix)
-    from .sim.simulate import simulate
+    from .sim.ladder import ladder_table
+    from .sim.simulate import simulate, simulate_ladder
 
     device = start(options)
-    path = simulate(
-        options.scene,
-        options.out,
-        frames=options.frames,
-        size=options.size,
-        seed=options.seed,
-        sync=options.sync,
-        noise=not options.no_noise,
-        flow=options.flow,
-        exposure_samples=options.exposure_samples,
-        overrides=options.override,
-        engine=options.engine,
-        bounces=options.bounces,
-        paths=options.paths,
-        device=device,
-        format=options.format,
-        fresh=options.fresh,
-        progress=_progress(options)("simulate"),
+    names = (
+        "frames",
+        "size",
+        "seed",
+        "sync",
+        "flow",
+        "exposure_samples",
+        "engine",
+        "bounces",
+        "paths",
+        "format",
+        "fresh",
     )
-    print(path)
+    chosen = {name: getattr(options, name) for name in names}
+    chosen |= {"noise": not options.no_noise, "overrides": options.override, "device": device}
+    if options.ladder:
+        if options.level is not None:
+            why = "--ladder records all of them"
+            raise UsageError("one level or all", where="--level", why=why, fix="leave one of the two out")
+        progress = _each_level(options)
+        print("\n".join(ladder_table(simulate_ladder(options.scene, options.out, progress=progress, **chosen))))
+        return 0
+    progress = _progress(options)("simulate")
+    print(simulate(options.scene, options.out, level=options.level, progress=progress, **chosen))
     return 0
+
+
+def _each_level(options: argparse.Namespace) -> Callable[[int, int], None]:
+    """Progress of recordings that follow each other: a clock of its own for each."""
+    clocks: list = []
+
+    def show(done: int, total: int) -> None:
+        if not clocks or clocks[-1][0] >= done:
+            clocks.append([done, _progress(options)("simulate")])
+        clocks[-1][0] = done
+        clocks[-1][1](done, total)
+
+    return show
 
 
 def _reconstruct(options: argparse.Namespace) -> int:
@@ -197,7 +215,7 @@ def _compare(options: argparse.Namespace) -> int:
     from .recon.run import Run
 
     run, progress = Run.open(options.run_folder, device), _progress(options)("compare")
-    metrics = compare(run, truth=options.truth, frames=options.frames, progress=progress)
+    metrics = compare(run, truth=options.truth, frames=options.frames, against=options.against, progress=progress)
     print(json.dumps(metrics, indent=2) if options.json else table(metrics))
     return 0
 
@@ -254,7 +272,8 @@ def table(metrics: dict) -> str:
         lines.append(f"{name:<16}{cells[0]:>12}{cells[1]:>10}{cells[2]:>13}{cells[3]:>10}")
     psnr = metrics["quad_psnr_db"]
     quality = "-" if psnr is None else f"{psnr:.2f} dB"
-    return "\n".join([*lines, f"{metrics['frames']} raw frames ({metrics['protocol']}), quad PSNR {quality}"])
+    scored = f"{metrics['frames']} raw frames ({metrics['protocol']}), against {metrics.get('against', 'geometry')}"
+    return "\n".join([*lines, f"{scored}, quad PSNR {quality}"])
 
 
 def _level(options: argparse.Namespace) -> int:

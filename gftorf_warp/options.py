@@ -91,8 +91,12 @@ def command_parsers() -> dict[str, Parser]:
     simulate.add_argument("--frames", metavar="N", type=_positive, help="raw frames (the scene's own number)")
     simulate.add_argument("--size", metavar="WxH", type=_size, help="image size in pixels (the scene's own)")
     _seed_option(simulate, "seed of the noise (0)")
-    layouts = "folder layout (ftorf): raw quads, or one phasor per quartet"
-    simulate.add_argument("--format", metavar="ftorf|torf", default="ftorf", help=layouts)
+    layouts = "folder layout (ftorf): raw quads, one phasor per quartet, or the layout of our own"
+    simulate.add_argument("--format", metavar="ftorf|torf|capture", default="ftorf", help=layouts)
+    levels = "step from ideal to realistic, sync, L0, L1, L2, L3 or L4: decides about engine, noise, blur and bounces"
+    simulate.add_argument("--level", metavar="NAME", help=levels)
+    ladder = "record all levels into SEQ/sync, SEQ/L0 .. SEQ/L4 and print what each costs the closed form"
+    simulate.add_argument("--ladder", action="store_true", help=ladder)
     engines = "gaussian: splats cover the scene; mesh: rays meet its surfaces (gaussian)"
     simulate.add_argument("--engine", metavar="gaussian|mesh", default="gaussian", help=engines)
     bounces = "surfaces that light may meet after the first, with engine mesh (0: direct light only)"
@@ -144,6 +148,10 @@ def command_parsers() -> dict[str, Parser]:
     compare = _command("compare", "score a reconstruction against the truth and write a report")
     compare.add_argument("run_folder", metavar="RUN", help="folder of the reconstruction")
     compare.add_argument("--truth", metavar="SEQ", help="sequence whose true distance counts (the one reconstructed)")
+    conventions = (
+        "geometry, or static-phasor: what the closed form would decode if nothing moved, without noise (geometry)"
+    )
+    compare.add_argument("--against", metavar="geometry|static-phasor", default="geometry", help=conventions)
     compare.add_argument("--json", action="store_true", help="print metrics.json instead of a table")
     compare.add_argument("--frames", metavar="all|ftorf13", default="all", help="which raw frames are scored (all)")
     _device_options(compare)

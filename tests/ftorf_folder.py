@@ -12,6 +12,14 @@ from gftorf_warp.data.sequence import Sequence, Truth
 SAMPLE = Path(__file__).parent / "data" / "ftorf_sample_box"
 REAL_ORDER = (2, 0, 1, 3)  # -cos, +sin, +cos, -sin in time
 IMAGES = ("colour", "forward_flow", "backward_flow")
+CAPTURE_ONLY = {
+    "frequencies_hz",
+    "distortion",
+    "exposures",
+    "sensor",
+    "amplitude",
+    "body",
+}  # what only format capture stores
 
 
 def scene(

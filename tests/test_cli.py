@@ -95,6 +95,9 @@ def test_module_and_script_are_the_same():
         ("simulate S --out Q --size 96x72", "size", (96, 72)),
         ("simulate S --out Q --frames 10 --seed 7 --format ftorf", "seed", 7),
         ("simulate --list", "list", True),
+        ("simulate S --out Q --level L2", "level", "L2"),
+        ("simulate S --out Q --ladder --format capture", "ladder", True),
+        ("compare R --against static-phasor", "against", "static-phasor"),
         ("simulate S --out Q --engine mesh --bounces 2 --paths 8 --device cpu", "bounces", 2),
         ("simulate S --out Q --sync --no-noise --flow --exposure-samples 3 --fresh", "exposure_samples", 3),
         ("reconstruct SEQ --out RUN --preset demo --images 100 --seed 2 --device cpu --fresh", "images", 100),
@@ -236,7 +239,7 @@ def test_names_that_a_room_does_not_know(run, sequence, tmp_path, capsys):
     """Scenes, formats, presets, images and protocols are named by their rooms, and so are the hints; all end with 2."""
     out = str(tmp_path / "x")
     fails(["simulate", "slidin", "--out", out], 2, capsys, "slidin", "sliding")
-    fails(["simulate", "demo", "--out", out, "--format", "capture"], 2, capsys, "capture", "ftorf")
+    fails(["simulate", "demo", "--out", out, "--format", "zip"], 2, capsys, "zip", "ftorf")
     fails(["reconstruct", str(sequence), "--out", out, "--preset", "dmeo"], 2, capsys, "dmeo", "demo")
     fails(["reconstruct", str(sequence), "--out", out, "--flow", "raft"], 2, capsys, "raft", "deepflow")
     fails(["render", str(run), "--out", out, "--what", "distance,quad"], 2, capsys, "quad", "quads")

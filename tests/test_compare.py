@@ -24,6 +24,7 @@ MOVING, MOVING_BOX = 6 * 6, 6 * 3  # seven columns see the box within a quartet,
 KEYS = {
     "frames",
     "protocol",
+    "against",
     "closed_form_mse_x100",
     "d_mse_x100",
     "d_normalised_mse_x100",
@@ -157,6 +158,24 @@ def test_truth_of_another_folder(tmp_path):
     ftorf.write(tmp_path / "other", analytic_run.sequence(), shifted)
     got = compare(run, truth=tmp_path / "other", report=False)
     assert got["d_tof_mse_x100"] == pytest.approx(100 * (0.5 - 0.03) ** 2, rel=1e-4)
+
+
+def test_either_distance_can_be_the_true_one(tmp_path):
+    """Against the static-phasor distance all errors are those to it; pixels that move are those of geometry."""
+    run = AnalyticRun(tmp_path)
+    truth = analytic_run.truth()
+    both = Truth(distance=truth.distance, known=truth.known, phasor_distance=truth.distance + np.float32(0.5))
+    ftorf.write(tmp_path / "both", analytic_run.sequence(), both)
+    geometry, static = (compare(run, truth=tmp_path / "both", against=a) for a in ("geometry", "static-phasor"))
+    assert (geometry["against"], static["against"]) == ("geometry", "static-phasor")
+    assert geometry["d_tof_mse_x100"] == compare(run, report=False)["d_tof_mse_x100"]
+    assert static["d_tof_mse_x100"] == pytest.approx(100 * (0.5 - 0.03) ** 2, rel=1e-4)
+    assert static["moving"]["share"] == geometry["moving"]["share"] > 0
+    assert "static-phasor" in (run.path / "report.html").read_text()
+    with pytest.raises(InputError, match="no static-phasor distance"):
+        compare(run, against="static-phasor")
+    with pytest.raises(UsageError, match="unknown truth 'phase'"):
+        compare(run, against="phase")
 
 
 def test_unknown_truth_is_not_scored(tmp_path):

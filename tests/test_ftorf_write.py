@@ -8,7 +8,7 @@ from unittest import mock
 
 import numpy as np
 import pytest
-from ftorf_folder import SAMPLE, assert_same, assert_same_bits, fingerprint, random_poses, scene
+from ftorf_folder import CAPTURE_ONLY, SAMPLE, assert_same, assert_same_bits, fingerprint, random_poses, scene
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -129,7 +129,7 @@ def test_descriptions_cover_the_sequence_and_the_truth():
     """Every field of Sequence and Truth is filled from a described one, and no description fills anything else."""
     filled = {name for field in specs.fields("ftorf").values() for name in field.fills}
     names = {f.name for kind in (Sequence, Truth) for f in dataclasses.fields(kind)}
-    assert filled == names - {"sources", "path"}
+    assert filled == names - {"sources", "path", *CAPTURE_ONLY}
     for field in specs.fields("ftorf").values():
         assert field.kind in {"array", "choice", "other"}, field.name
         assert field.role in {"measurement", "calibration", "truth", "check", "unused"}, field.name

@@ -12,7 +12,7 @@ import torch
 from gftorf_warp.scene.camera import Camera
 from gftorf_warp.scene.sensor import Sensor, distance_from_phasor, phasor_from_quads
 from gftorf_warp.sim.paths import Line, Still
-from gftorf_warp.sim.readout import contrast, electron_gain, mean_taps, quantise, read_out
+from gftorf_warp.sim.readout import contrast, electron_gain, mean_quad, mean_taps, quantise, read_out
 from gftorf_warp.sim.record import frame_times
 from gftorf_warp.sim.world import Body, Plane, Texture, first_hit
 
@@ -81,6 +81,58 @@ def test_sample_algebra():
     np.testing.assert_allclose(q[2] + q[3], 2 * 0.7 * 0.3)
     for shifts in (PAIRED, SEQUENTIAL, PALINDROMIC):
         np.testing.assert_allclose(wrapped(phase(quads(psi, 0.7, Sensor(shifts=shifts)), shifts) - psi), 0, atol=1e-9)
+
+
+@pytest.mark.parametrize("count", [3, 4, 5, 8])
+def test_any_order_of_a_static_cycle_is_one_phasor(count):
+    """T5: phase and amplitude of any number of shifts in any order, evenly spaced or not, 1e-6."""
+    random = np.random.default_rng(count)
+    psi = random.uniform(0, 2 * math.pi, 200)
+    for even in (True, False):
+        shifts = np.array(equally_spaced(count)) + 0.3
+        shifts = shifts if even else shifts + random.uniform(-0.3, 0.3, count)
+        for _ in range(6):
+            order = tuple(random.permutation(shifts).tolist())
+            samples = torch.from_numpy(quads(psi, 0.7, Sensor(shifts=order, dc_offset=0.4)))
+            re, im = phasor_from_quads(samples, order)
+            np.testing.assert_allclose(re, 1.4 * np.cos(psi), atol=1e-6)
+            np.testing.assert_allclose(im, 1.4 * np.sin(psi), atol=1e-6)
+
+
+def test_shifts_that_determine_no_phase_are_refused():
+    """Two shifts, or three of which two are one."""
+    for shifts in ((0.0, 1.0), (0.0, 1.0, 1.0), (0.0, math.pi, 2 * math.pi, 3 * math.pi)):
+        with pytest.raises(ValueError, match="shifts: a phase needs"):
+            phasor_from_quads(torch.zeros(len(shifts), 2), shifts)
+
+
+def test_light_adds_and_scales():
+    """T6: the mean quad is linear in the light, harmonics included, and in the source intensity."""
+    sensor = Sensor(shifts=(0.7,), phase_offset=0.2, dc_offset=0.5, harmonic_contrast=(0.1, -0.2))
+    random = np.random.default_rng(0)
+    one, two = (random.normal(size=(3, 4, 5)) + 1j * random.normal(size=(3, 4, 5)) for _ in range(2))
+    a, b = random.uniform(size=(2, 4, 5))
+    parts = [mean_quad(light, amplitude, sensor)[0] for light, amplitude in ((one, a), (two, b))]
+    np.testing.assert_allclose(mean_quad(one + two, a + b, sensor)[0], sum(parts), rtol=1e-6, atol=1e-12)
+    bright = Sensor(**{**vars(sensor), "source_intensity": 3.0})
+    np.testing.assert_allclose(mean_quad(one, a, bright), 3 * np.array(mean_quad(one, a, sensor)), rtol=1e-6)
+
+
+def test_two_paths():
+    """T7: 2 m and, .3 as strong, 3 m at 20 MHz: arg of the sum, 1e-6 rad; at worst an error of asin(.3)."""
+    sensor = Sensor(f_mod_hz=20e6)
+
+    def decoded(difference):
+        """Phase [rad] beyond that of the near path, the far one being ``difference`` [rad] later."""
+        psi = 2.0 * sensor.phase_slope
+        light = (np.exp(1j * psi) + 0.3 * np.exp(1j * (psi + difference)))[None, None]
+        samples = [mean_quad(light, np.full_like(difference[None], 1.3), sensor.at_frame(j))[0] for j in range(4)]
+        return wrapped(phase(samples, sensor.shifts) - psi)[0]
+
+    step = np.array([1.0 * sensor.phase_slope])
+    assert decoded(step)[0] == pytest.approx(math.atan2(0.3 * math.sin(step[0]), 1 + 0.3 * math.cos(step[0])), abs=1e-6)
+    worst = np.abs(decoded(np.linspace(0, 2 * math.pi, 20_001))).max()
+    assert worst == pytest.approx(math.asin(0.3), abs=1e-6)
 
 
 def test_taps_share_the_light():

@@ -268,14 +268,14 @@ def test_a_sequence_is_read_back_as_recorded(tmp_path):
 
 
 def test_the_same_seed_writes_the_same_bytes(tmp_path):
-    """Another seed changes the quads and the card that names it, nothing else."""
+    """Another seed changes the quads, their picture and the card that names it, nothing else."""
     scene = slider(frames=5)
     folders = [simulate(scene, tmp_path / str(k), seed=seed) for k, seed in enumerate((7, 7, 8))]
     first, same, other = (contents(folder) for folder in folders)
     assert first == same
     assert first.keys() == other.keys()
     differ = {name for name in first if first[name] != other[name]}
-    assert differ == {name for name in first if name.startswith("tofType")} | {"README.md"}
+    assert differ == {name for name in first if name.startswith("tofType")} | {"README.md", "contact_sheet.png"}
 
 
 def test_the_card_says_how_to_make_it_again(tmp_path):
@@ -326,7 +326,7 @@ def test_a_finished_sequence_is_not_made_again(tmp_path):
         ({"scene": "axial", "frames": 400}, ("--frames", "nearer to the camera", "simulate at most ")),
         ({"seed": -1}, ("--seed", "0 or more")),
         ({"exposure_samples": 0}, ("exposure_samples",)),
-        ({"format": "capture"}, ("--format", "capture", "ftorf")),
+        ({"format": "zip"}, ("--format", "zip", "ftorf", "capture")),
         ({"scene": slider(sensor=Sensor(shifts=(0.0, 2.0, 4.0)))}, ("F-ToeRF", "sensor.shifts", "four shifts")),
         ({"scene": slider(sensor=Sensor(shifts=(0.0, 1.0, 2.0, 3.0)))}, ("sensor.shifts",)),
         ({"scene": slider(sensor=Sensor(noise=True, contrast=0.9, dc_offset=0.5))}, ("dc_offset", "negative light")),

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..constants import FRAMES_PER_QUARTET, SPEED_OF_LIGHT
+from ..constants import CANONICAL_SHIFTS, FRAMES_PER_QUARTET, SPEED_OF_LIGHT
 from . import findings, specs
 from .findings import Report
 from .folder import format_of, numbered
@@ -29,12 +29,15 @@ def check(path: str | Path) -> Report:
     report = Report(path=Path(path), form=format_of(Path(path)))
     _facts(sequence, report)
     _assumptions(sequence, report)
-    if sequence.complete_quartets and np.abs(sequence.quads).max() > 0:
+    if sequence.frequencies_hz is not None:
+        report.lines.append("light           not looked at: there are several modulation frequencies")
+    elif sequence.complete_quartets and np.abs(sequence.quads).max() > 0:
         findings.light(sequence, report)
-        if sequence.from_phasors:
+        if sequence.from_phasors and report.form == "torf":
             findings.third_channel(sequence, report)
-        else:
+        elif not sequence.from_phasors and _canonical(sequence):
             findings.order(sequence, report)
+        if report.form == "ftorf":
             findings.phasors(sequence, report)
         findings.camera(sequence, report)
         findings.truth(sequence, report)
@@ -42,6 +45,12 @@ def check(path: str | Path) -> Report:
         report.warnings.append("no complete quartet with light: nothing can be decoded or estimated")
     findings.flow(sequence, report)
     return report
+
+
+def _canonical(sequence: Sequence) -> bool:
+    """Whether the quads of a quartet are two opposite pairs, a quarter turn apart."""
+    shifts = sequence.shifts[:FRAMES_PER_QUARTET, None]
+    return bool(np.isclose(np.sort(shifts, axis=0), np.sort(CANONICAL_SHIFTS)[:, None]).all())
 
 
 def _facts(sequence: Sequence, report: Report) -> None:
@@ -75,7 +84,14 @@ def _facts(sequence: Sequence, report: Report) -> None:
         f"backward flow   {sources['backward_flow']}",
     ]
     assert sequence.path is not None
-    for pattern in (p for f in specs.fields(report.form).values() for p in f.paths if "{id}" in p):
+    if sequence.frequencies_hz is not None:
+        several = ", ".join(f"{f / 1e6:.6g}" for f in dict.fromkeys(sequence.frame_frequencies.tolist()))
+        report.lines.append(f"frequencies     {several} MHz; {sources['frequencies_hz']}")
+    if sequence.exposures is not None:
+        low, high = 1e3 * sequence.exposures.min(), 1e3 * sequence.exposures.max()
+        report.lines.append(f"exposures       {low:.4g} .. {high:.4g} ms; {sources['exposures']}")
+    patterns = [p for f in specs.fields(report.form).values() for p in f.paths if "{id}" in p]
+    for pattern in dict.fromkeys(patterns):
         for slot in range(FRAMES_PER_QUARTET if "{slot}" in pattern else 1):
             name = pattern.replace("{slot}", str(slot))
             ids = list(numbered(sequence.path, name))

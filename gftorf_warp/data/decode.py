@@ -26,6 +26,13 @@ def quartet_phasor(sequence: Sequence, i: int) -> Float[np.ndarray, "2 H W"]:
         ValueError: If a frame of the quartet was not measured.
         InputError: If its shifts do not determine a phase.
     """
+    if sequence.frequencies_hz is not None and len(set(sequence.frequencies_hz.tolist())) > 1:
+        raise InputError(
+            "several modulation frequencies",
+            where=sequence.path or "sequence",
+            why=f"four raw frames give a distance at one, found {sorted(set(sequence.frequencies_hz.tolist()))} Hz",
+            fix="decode whole cycles, with gftorf_warp.scene.unwrap.cycle_distance",
+        )
     if i not in sequence.complete_quartets:
         raise ValueError(f"quartet {i} must be one of the complete ones, {sequence.complete_quartets}")
     frames = slice(FRAMES_PER_QUARTET * i, FRAMES_PER_QUARTET * (i + 1))
@@ -36,7 +43,7 @@ def quartet_phasor(sequence: Sequence, i: int) -> Float[np.ndarray, "2 H W"]:
             "phase shifts",
             where=f"{sequence.path or 'sequence'}, frames {frames.start} .. {frames.stop - 1}",
             why=f"expected at least three distinct shifts, found {np.degrees(shifts).tolist()} degrees",
-            fix="correct tof_permutation.npy",
+            fix="correct tof_permutation.npy, or the shifts in capture.json",
         )
     return np.tensordot(2.0 * np.linalg.pinv(model)[:2], sequence.quads[frames].astype(np.float64), axes=1)
 

@@ -57,7 +57,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     path = Path(path)
     sweep(path)
     temporary = _temporary(path)
-    with _as_errors(path):
+    with as_errors(path):
         try:
             yield temporary
             with open(temporary, "rb+") as file:
@@ -97,7 +97,7 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
         ResourceError: If the disk is full.
     """
     path = Path(path)
-    with _as_errors(path):
+    with as_errors(path):
         if path.is_symlink() or (path.exists() and not path.is_dir()):
             raise UsageError(
                 "not a folder",
@@ -190,8 +190,13 @@ def _alive(pid: int) -> bool:
 
 
 @contextlib.contextmanager
-def _as_errors(path: Path) -> Iterator[None]:
-    """Turn what the system says about writing into errors a user can act on."""
+def as_errors(path: Path) -> Iterator[None]:
+    """Turn what the system says about writing to ``path`` into errors a user can act on.
+
+    Raises:
+        ResourceError: If the disk is full.
+        UsageError: If the place cannot be written to.
+    """
     try:
         yield
     except GftorfError:

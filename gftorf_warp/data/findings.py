@@ -17,7 +17,7 @@ from .decode import closed_form_distance, largest_amplitude, quad_scale
 from .folder import numbered
 from .sequence import Sequence, Truth
 
-NAMES = {"ftorf": "F-ToeRF", "torf": "ToeRF"}
+NAMES = {"capture": "capture", "ftorf": "F-ToeRF", "torf": "ToeRF"}
 DC_TOLERANCE = 0.1  # [1] real differential quads stay within a few hundredths of 0, unipolar ones are at 1
 SATURATED_SHARE = 1e-3  # of the pixels of a frame at the very extreme: light repeats itself only where it is cut off
 SATURATED_PIXELS = 10  # and no fewer, so that the one brightest pixel of a small image is none

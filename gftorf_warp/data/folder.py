@@ -12,17 +12,23 @@ from ..errors import InputError, ResourceError
 from . import specs
 from .arrays import as_float32, read_array, read_shape
 from .problems import Problems
+from .sequence import Truth
 
 SLOT_FOLDERS = tuple(f"tofType{slot}" for slot in range(FRAMES_PER_QUARTET))
 PHASOR_FOLDER = "tof"
-EXPECTED = "expected a folder with tofType0 .. tofType3 and cams (F-ToeRF: raw quads), or tof and cams (ToeRF: phasors)"
+CAPTURE = "capture.json"
+EXPECTED = (
+    "expected a folder with capture.json (a capture), tofType0 .. tofType3 and cams (F-ToeRF: raw quads), or tof and "
+    "cams (ToeRF: phasors)"
+)
+UNFINISHED = "unfinished.md"  # stands in the folder of a recording that is not complete
 FRAMES_MAX = 1_000_000  # over two hours at 120 Hz: a higher id is a typing error
 
 
 def format_of(path: Path) -> str:
-    """Format of a sequence folder: ``ftorf`` with raw quads, else ``torf`` with phasors.
+    """Format of a sequence folder: ``capture`` with its own description, ``ftorf`` with raw quads, else ``torf``.
 
-    Folders with raw quads may hold phasors too, so quads are looked for first.
+    Folders with raw quads may hold phasors too, so quads are looked for first; captures have a folder tof as well.
 
     Raises:
         InputError: If it is neither; points to a sequence one level up or down, if there is one.
@@ -34,16 +40,28 @@ def format_of(path: Path) -> str:
             why=f"{EXPECTED}, found {'a file' if path.exists() else 'nothing'}",
             fix="check the path",
         )
-    found = _resembled(path)
+    found = format_or_none(path)
     if found is not None:
         return found
+    if (path / UNFINISHED).is_file():
+        raise InputError(
+            "an unfinished recording",
+            where=path,
+            why=f"{EXPECTED}, found what an interrupted `gftorf simulate` left",
+            fix="give that command again, and it goes on",
+        )
     for other in [path.absolute().parent, *sorted(entry for entry in path.iterdir() if entry.is_dir())]:
-        if _resembled(other) is not None:
+        if format_or_none(other) is not None:
             raise InputError("one level off", where=path, why=f"{EXPECTED}, found one at {other}", fix=f"use {other}")
-    raise InputError("not a sequence folder", where=path, why=f"{EXPECTED}, found neither", fix="check the path")
+    raise InputError("not a sequence folder", where=path, why=f"{EXPECTED}, found none of them", fix="check the path")
 
 
-def _resembled(path: Path) -> str | None:
+def format_or_none(path: Path) -> str | None:
+    """Format that a folder looks like, by what every folder of it holds; None: of none."""
+    if (path / UNFINISHED).is_file():
+        return None
+    if (path / CAPTURE).is_file():
+        return "capture"
     if any((path / name).is_dir() for name in SLOT_FOLDERS):
         return "ftorf"
     return "torf" if (path / PHASOR_FOLDER).is_dir() else None
@@ -54,11 +72,13 @@ def numbered(root: Path, pattern: str) -> dict[int, Path]:
 
     Args:
         root: The sequence.
-        pattern: Where they lie, for example ``forward_flow/flow_{id}.npy``.
+        pattern: Where they lie, for example ``forward_flow/flow_{id}.npy``; numbers of .exr files have six digits,
+            others four or more.
     """
     folder, _, name = pattern.rpartition("/")
     before, _, after = name.partition("{id}")
-    matcher = re.compile(rf"{re.escape(before)}(\d{{4}}|[1-9]\d{{4,8}}){re.escape(after)}")
+    digits = r"\d{6}" if after == ".exr" else r"\d{4}|[1-9]\d{4,8}"
+    matcher = re.compile(rf"{re.escape(before)}({digits}){re.escape(after)}")
     if not (root / folder).is_dir():
         return {}
     found = ((matcher.fullmatch(entry.name), entry) for entry in (root / folder).iterdir())
@@ -151,6 +171,23 @@ def read_distances(
             )
             problems.errors.append(error)
     return {n: np.where(image == 0, np.float32(np.nan), image) for n, image in images.items()}
+
+
+def truth_of(
+    distances: dict[int, np.ndarray], phasor_distances: dict[int, np.ndarray], frames: int, step: int = 1
+) -> Truth | None:
+    """Truth of F raw frames from distances [m] by image, each of which counts for ``step`` raw frames; None if none."""
+    if not distances:
+        return None
+    shape = (frames, *next(iter(distances.values())).shape)
+    filled = []
+    for images in (distances, phasor_distances):
+        stack = np.full(shape, np.nan, dtype=np.float32)
+        for i, image in images.items():
+            stack[step * i : step * (i + 1)] = image
+        filled.append(stack)
+    known = np.isin(np.arange(frames) // step, list(distances))
+    return Truth(distance=filled[0], known=known, phasor_distance=filled[1] if phasor_distances else None)
 
 
 def empty_quads(root: Path, frames: int, size: dict[str, int]) -> np.ndarray:

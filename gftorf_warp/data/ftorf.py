@@ -20,6 +20,7 @@ from .folder import (
     read_distances,
     read_field,
     refuse_absurd_ids,
+    truth_of,
 )
 from .ftorf_write import write
 from .poses import read_novel, read_static_colour_poses, read_static_poses
@@ -29,6 +30,7 @@ from .sequence import Sequence, Truth
 __all__ = ["read", "read_truth", "write"]
 
 FORMAT = "ftorf"
+NOT_HERE = ("frequencies_hz", "distortion", "exposures", "sensor")  # the layout has no place for them
 
 
 def read(path: str | Path, *, frame_rate_hz: float | None = None) -> Sequence:
@@ -45,7 +47,8 @@ def read(path: str | Path, *, frame_rate_hz: float | None = None) -> Sequence:
     """
     root, fields = _root(Path(path)), specs.fields(FORMAT)
     problems = Problems()
-    sources: dict[str, str] = {"from_phasors": "file tofType0 .. tofType3: raw quads"}
+    sources = dict.fromkeys(NOT_HERE, "default none")
+    sources["from_phasors"] = "file tofType0 .. tofType3: raw quads"
     frame_paths, copies = _measured_files(root)
     size = first_size(frame_paths, fields["quads"], problems)
     calibration = read_calibration(root, FORMAT, problems, size.get("W"))
@@ -124,14 +127,9 @@ def read_truth(path: str | Path, *, frames: int) -> Truth | None:
     root, problems, fields = _root(Path(path)), Problems(), specs.fields(FORMAT)
     size = first_size(_measured_files(root)[0], fields["quads"], problems)
     images = read_distances(root, fields["distance"], frames, size, problems)
+    static, _ = read_field(root, fields["phasor_distance"], frames, size, problems)
     problems.raise_if_any(root)
-    if not images:
-        return None
-    distance = np.full((frames, size["H"], size["W"]), np.nan, dtype=np.float32)
-    known = np.zeros(frames, dtype=bool)
-    for n, image in images.items():
-        distance[n], known[n] = image, True
-    return Truth(distance=distance, known=known)
+    return truth_of(images, static, frames)
 
 
 def _root(path: Path) -> Path:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +16,7 @@ from .writing import (
     inexpressible,
     json_bytes,
     npy,
+    readme_and_sheet,
     refuse_inexpressible,
     shortest,
     validate,
@@ -25,7 +26,14 @@ from .writing import (
 SHIFT_TOLERANCE = 1e-6  # [rad] a shift is stored as one of four names; what differs by more is another shift
 
 
-def write(path: str | Path, sequence: Sequence, truth: Truth | None = None, *, readme: str | None = None) -> Path:
+def write(
+    path: str | Path,
+    sequence: Sequence,
+    truth: Truth | None = None,
+    *,
+    readme: str | None = None,
+    sheet: bytes | None = None,
+) -> Path:
     """Write a sequence, and its truth if there is any, as an F-ToeRF folder that appears only when it is complete.
 
     Reading it again gives the same sequence: images bit by bit in float32, calibration in float64; only a frequency
@@ -36,6 +44,7 @@ def write(path: str | Path, sequence: Sequence, truth: Truth | None = None, *, r
         sequence: What to write; every slot needs one of the four canonical shifts, each slot another.
         truth: True distances [m] of the raw frames.
         readme: Text of a README.md in the folder.
+        sheet: A picture of it all, as PNG.
 
     Returns:
         The folder.
@@ -50,11 +59,11 @@ def write(path: str | Path, sequence: Sequence, truth: Truth | None = None, *, r
     if sequence.from_phasors:
         raise inexpressible("ftorf", "phasors", "raw quads that were measured one by one", "phasors: write format torf")
     slots = [f"tofType{slot}" for slot in range(FRAMES_PER_QUARTET)]  # one without frames still belongs to the layout
-    return write_folder(path, _files(sequence, truth, _permutation(sequence), readme), slots)
+    return write_folder(path, _files(sequence, truth, _permutation(sequence), readme_and_sheet(readme, sheet)), slots)
 
 
 def _files(
-    sequence: Sequence, truth: Truth | None, permutation: np.ndarray, readme: str | None
+    sequence: Sequence, truth: Truth | None, permutation: np.ndarray, for_people: Iterable[tuple[str, bytes]]
 ) -> Iterator[tuple[str, bytes]]:
     """Every file of the folder, by relative name."""
     poses = sequence.camera_from_world
@@ -74,8 +83,9 @@ def _files(
     if truth is not None:
         for n in np.flatnonzero(truth.known).tolist():
             yield f"synthetic_depth/{n:04d}.npy", npy(float32(truth.distance[n]))
-    if readme is not None:
-        yield "README.md", readme.encode()
+            if truth.phasor_distance is not None:
+                yield f"phasor_distance/{n:04d}.npy", npy(float32(truth.phasor_distance[n]))
+    yield from for_people
 
 
 def _permutation(sequence: Sequence) -> np.ndarray:

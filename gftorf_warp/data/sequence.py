@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from ..constants import FRAMES_PER_QUARTET
 
@@ -25,7 +26,9 @@ class Sequence:
     times: Float[np.ndarray, "F"]
     """Time of each raw frame since the first [s]."""
     f_mod_hz: float
-    """Modulation frequency [Hz]."""
+    """Modulation frequency [Hz]; the first of the cycle if there are several."""
+    frequencies_hz: Float[np.ndarray, "F"] | None = None
+    """Modulation frequency of each raw frame [Hz]; None: ``f_mod_hz`` throughout."""
     phase_offset: float = 0.0
     """Measured minus true phase [rad]."""
     dc_offset: float = 0.0
@@ -38,6 +41,8 @@ class Sequence:
     """Principal point, x [px], in the convention of the program: pixel centres at i + 0.5."""
     cy: float
     """Principal point, y [px], likewise."""
+    distortion: tuple[float, float, float, float, float] | None = None
+    """k1, k2, p1, p2, k3 of the lens as OpenCV names them [1]; None: a pinhole."""
     camera_from_world: Float[np.ndarray, "F 4 4"]
     """Pose of each raw frame, world to camera [m]."""
     quad_scale: float | None = None
@@ -57,6 +62,10 @@ class Sequence:
     """Optical flow (dx, dy) [px] by raw frame n, from n to n + 4; NaN: unknown pixel."""
     backward_flow: dict[int, Float[np.ndarray, "2 H W"]] = field(default_factory=dict)
     """Optical flow (dx, dy) [px] by raw frame n, from n to n - 4; NaN: unknown pixel."""
+    exposures: Float[np.ndarray, "F"] | None = None
+    """Length of each exposure [s]; None: not known."""
+    sensor: dict[str, Any] = field(default_factory=dict)
+    """Further settings of the sensor by name, numbers and texts, as the recording states them."""
     sources: dict[str, str] = field(default_factory=dict)
     """Where each value is from, by field name: 'file ...', 'default ...', 'inferred ...' or 'setting ...'."""
     path: Path | None = None
@@ -79,18 +88,24 @@ class Sequence:
 
     @property
     def complete_quartets(self) -> list[int]:
-        """Indices i of the quartets whose four raw frames 4i .. 4i + 3 were all measured."""
+        """Indices i of the quartets whose four raw frames 4i .. 4i + 3 were all measured, with one frequency."""
         step = FRAMES_PER_QUARTET
-        return [i for i in range(self.frames // step) if self.measured[step * i : step * (i + 1)].all()]
+        whole = [i for i in range(self.frames // step) if self.measured[step * i : step * (i + 1)].all()]
+        return [i for i in whole if len(set(self.frame_frequencies[step * i : step * (i + 1)].tolist())) == 1]
+
+    @property
+    def frame_frequencies(self) -> Float[np.ndarray, "F"]:
+        """Modulation frequency of each raw frame [Hz]."""
+        return np.full(self.frames, self.f_mod_hz) if self.frequencies_hz is None else self.frequencies_hz
 
     @classmethod
     def open(cls, path: str | Path, *, frame_rate_hz: float | None = None) -> Sequence:
         """Read a sequence from a folder.
 
         Args:
-            path: An F-ToeRF folder of raw quads, or a ToeRF folder of phasors.
+            path: A capture, an F-ToeRF folder of raw quads, or a ToeRF folder of phasors.
             frame_rate_hz: Raw frames per second, or phasors per second of a ToeRF folder; overrides what the folder
-                says or the default of 120, or 30.
+                says or the default of 120, or 30. A capture has none: it states every time.
 
         Raises:
             InputError: If the folder or a file in it is not what data_specs/ describes.
@@ -104,9 +119,9 @@ class Sequence:
 
 def _reader(path: str | Path) -> ModuleType:
     """The module that reads a folder."""
-    from . import folder, ftorf, torf
+    from . import capture, folder, ftorf, torf
 
-    return {"ftorf": ftorf, "torf": torf}[folder.format_of(Path(path))]
+    return {"capture": capture, "ftorf": ftorf, "torf": torf}[folder.format_of(Path(path))]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -117,3 +132,10 @@ class Truth:
     """Distance along the ray through each pixel centre at each raw frame [m], float32; NaN: unknown."""
     known: Bool[np.ndarray, "F"]
     """Whether a raw frame has a distance at all."""
+    phasor_distance: Float[np.ndarray, "F H W"] | None = None
+    """Static-phasor distance [m], float32, in [0, c/2f): what the closed form would decode if all four quads were taken
+    without noise at the very time of the raw frame, indirect light included; NaN: unknown. None: not stored."""
+    amplitude: Float[np.ndarray, "F H W"] | None = None
+    """Mean amplitude without noise [relative units], float32; None: not stored."""
+    body: Int[np.ndarray, "F H W"] | None = None
+    """Which object the ray through each pixel centre meets, counted from 0; -1: none. None: not stored."""

@@ -23,7 +23,7 @@ class Field:
     paths: tuple[str, ...]
     """Where it lies in the folder, best first, with {slot} and {id} open."""
     kind: str
-    """array, choice or other."""
+    """array, choice, json, exr or other."""
     role: str
     """measurement, calibration, truth, check or unused."""
     unit: str
@@ -47,9 +47,11 @@ class Field:
     mat_key: str | None = None
     """The one variable that is read from a .mat file."""
     key: str = ""
-    """The one key of a choice."""
+    """The one key of a choice; where a value stands in a JSON file; the part of an EXR file."""
     choices: tuple[str, ...] = ()
     """Its allowed values."""
+    channels: tuple[str, ...] = ()
+    """Channels of a part of an EXR file."""
 
 
 @functools.cache

@@ -25,6 +25,7 @@ from .folder import (
     read_distances,
     read_field,
     refuse_absurd_ids,
+    truth_of,
 )
 from .poses import read_moving_colour_poses, read_moving_poses, read_novel
 from .problems import Problems
@@ -34,6 +35,7 @@ from .torf_write import write
 __all__ = ["phasor_files", "read", "read_truth", "write"]
 
 FORMAT = "torf"
+NOT_HERE = ("frequencies_hz", "distortion", "exposures", "sensor")  # the layout has no place for them
 PHASOR_RATE_HZ = FRAME_RATE_HZ / FRAMES_PER_QUARTET  # [Hz] the sensor is that of the F-ToeRF recordings
 
 
@@ -51,7 +53,7 @@ def read(path: str | Path, *, frame_rate_hz: float | None = None) -> Sequence:
     """
     root, fields, step = _root(Path(path)), specs.fields(FORMAT), FRAMES_PER_QUARTET
     problems = Problems()
-    sources: dict[str, str] = {}
+    sources = dict.fromkeys(NOT_HERE, "default none")
     files, first_id = phasor_files(root)
     size = first_size(files, fields["phasor"], problems)
     if not (root / "cams").is_dir():
@@ -133,14 +135,9 @@ def read_truth(path: str | Path, *, frames: int) -> Truth | None:
     files, first_id = phasor_files(root)
     size = first_size(files, fields["phasor"], problems)
     images = read_distances(root, fields["distance"], frames // step, size, problems, first_id)
+    static, _ = read_field(root, fields["phasor_distance"], frames // step, size, problems, first_id)
     problems.raise_if_any(root)
-    if not images:
-        return None
-    distance = np.full((frames, size["H"], size["W"]), np.nan, dtype=np.float32)
-    known = np.zeros(frames, dtype=bool)
-    for i, image in images.items():
-        distance[step * i : step * (i + 1)], known[step * i : step * (i + 1)] = image, True
-    return Truth(distance=distance, known=known)
+    return truth_of(images, static, frames, step)
 
 
 def phasor_files(root: Path) -> tuple[dict[int, Path], int]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +16,7 @@ from .writing import (
     float32,
     inexpressible,
     npy,
+    readme_and_sheet,
     refuse_inexpressible,
     shortest,
     validate,
@@ -25,7 +26,14 @@ from .writing import (
 QUAD_MAX = float(np.finfo(np.float32).max) / 4.0  # the length of a phasor is up to 2 sqrt(2) times as large
 
 
-def write(path: str | Path, sequence: Sequence, truth: Truth | None = None, *, readme: str | None = None) -> Path:
+def write(
+    path: str | Path,
+    sequence: Sequence,
+    truth: Truth | None = None,
+    *,
+    readme: str | None = None,
+    sheet: bytes | None = None,
+) -> Path:
     """Write the complete quartets of a sequence as phasors, in a ToeRF folder that appears only when it is complete.
 
     A sequence of phasors is written so that reading it again gives the same one: images bit by bit in float32,
@@ -38,6 +46,7 @@ def write(path: str | Path, sequence: Sequence, truth: Truth | None = None, *, r
         sequence: Phasors, or raw quads of any shifts that determine a phase.
         truth: True distances [m] of the raw frames.
         readme: Text of a README.md in the folder.
+        sheet: A picture of it all, as PNG.
 
     Returns:
         The folder.
@@ -57,10 +66,12 @@ def write(path: str | Path, sequence: Sequence, truth: Truth | None = None, *, r
         raise inexpressible(
             "torf", "quartets", "one or more with all of their four raw frames", f"none in {sequence.frames} raw frames"
         )
-    return write_folder(path, _files(sequence, truth, readme))
+    return write_folder(path, _files(sequence, truth, readme_and_sheet(readme, sheet)))
 
 
-def _files(sequence: Sequence, truth: Truth | None, readme: str | None) -> Iterator[tuple[str, bytes]]:
+def _files(
+    sequence: Sequence, truth: Truth | None, for_people: Iterable[tuple[str, bytes]]
+) -> Iterator[tuple[str, bytes]]:
     """Every file of the folder, by relative name."""
     step = FRAMES_PER_QUARTET
     starts = slice(0, sequence.frames // step * step, step)
@@ -78,8 +89,9 @@ def _files(sequence: Sequence, truth: Truth | None, readme: str | None) -> Itera
             yield f"color/{i:04d}.npy", npy(shortest(float32(sequence.colour[step * i])))
         if truth is not None and truth.known[step * i]:
             yield f"distance/{i:04d}.npy", npy(float32(truth.distance[step * i]))
-    if readme is not None:
-        yield "README.md", readme.encode()
+            if truth.phasor_distance is not None:
+                yield f"phasor_distance/{i:04d}.npy", npy(float32(truth.phasor_distance[step * i]))
+    yield from for_people
 
 
 def _phasor(sequence: Sequence, i: int) -> np.ndarray:

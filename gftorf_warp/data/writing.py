@@ -16,6 +16,8 @@ from .files import atomic_folder, write_through
 from .poses import rigid
 from .sequence import Sequence, Truth
 
+SHEET = "contact_sheet.png"  # in every simulated folder; no reader opens it
+
 
 def write_folder(path: str | Path, files: Iterable[tuple[str, bytes]], folders: Iterable[str] = ()) -> Path:
     """Write files of a folder that appears only when it is complete.
@@ -55,6 +57,14 @@ def calibration_files(
         yield "test_poses.npy", npy(sequence.novel_from_world.astype(np.float64))
 
 
+def readme_and_sheet(readme: str | None, sheet: bytes | None) -> Iterator[tuple[str, bytes]]:
+    """What a folder holds for people, by relative name."""
+    if readme is not None:
+        yield "README.md", readme.encode()
+    if sheet is not None:
+        yield SHEET, sheet
+
+
 def validate(sequence: Sequence, truth: Truth | None) -> None:
     """Whether the parts of a sequence fit together.
 
@@ -66,6 +76,7 @@ def validate(sequence: Sequence, truth: Truth | None) -> None:
         "quads": (sequence.quads.shape, shape),
         "shifts": (sequence.shifts.shape, (frames,)),
         "times": (sequence.times.shape, (frames,)),
+        "frequencies_hz": (sequence.frame_frequencies.shape, (frames,)),
         "camera_from_world": (sequence.camera_from_world.shape, (frames, 4, 4)),
     }
     if sequence.colour_from_world is not None:
@@ -81,6 +92,8 @@ def validate(sequence: Sequence, truth: Truth | None) -> None:
     lengths |= {f"colour[{n}]": (image.shape, (*first, 3)) for n, image in sequence.colour.items()}
     if truth is not None:
         lengths |= {"truth.distance": (truth.distance.shape, shape), "truth.known": (truth.known.shape, (frames,))}
+        more = {name: getattr(truth, name) for name in ("phasor_distance", "amplitude", "body")}
+        lengths |= {f"truth.{name}": (images.shape, shape) for name, images in more.items() if images is not None}
     for name, (found, expected) in lengths.items():
         if found != expected:
             raise ValueError(f"{name} {found} must have shape {expected}")
@@ -120,10 +133,18 @@ def refuse_inexpressible(form: str, sequence: Sequence, truth: Truth | None) -> 
     flows = [*sequence.forward_flow.values(), *sequence.backward_flow.values()]
     times = sequence.times
     distance = np.ones(1) if truth is None else truth.distance[truth.known]
+    static = np.zeros(1) if truth is None or truth.phasor_distance is None else truth.phasor_distance[truth.known]
     numbers = (sequence.f_mod_hz, sequence.phase_offset, sequence.dc_offset, sequence.quad_scale or 1.0)
     focal = sequence.fx, sequence.fy
     colour, colour_width = _colour_intrinsics(sequence), _colour_size(sequence)[1]
+    family = form in ("ftorf", "torf")  # these state one depth range and one matrix
     rules = {  # what: (whether it holds, expected, found)
+        "frequencies_hz": (
+            not family or sequence.frequencies_hz is None,
+            "one modulation frequency",
+            f"{sequence.frequencies_hz}",
+        ),
+        "distortion": (not family or sequence.distortion is None, "a pinhole", f"a lens with {sequence.distortion}"),
         "an empty sequence": (sequence.measured.any(), "at least one measured raw frame", "none"),
         "quads": (np.isfinite(sequence.quads[sequence.measured]).all(), "finite numbers", "NaN or infinity"),
         "times": (
@@ -152,6 +173,7 @@ def refuse_inexpressible(form: str, sequence: Sequence, truth: Truth | None) -> 
         "novel_from_world": (_rigid(sequence.novel_from_world), "rotations and translations", "other matrices"),
         "camera_from_world": (_rigid(sequence.camera_from_world), "rotations and translations", "other matrices"),
         "colour": (all(np.isfinite(i).all() for i in sequence.colour.values()), "finite numbers", "NaN or infinity"),
+        "phasor_distance": (((static >= 0) & (static < np.inf) | np.isnan(static)).all(), "metres or NaN", "others"),
         "flow": (not any(np.isinf(flow).any() for flow in flows), "pixels, or NaN for unknown", "infinity"),
         "truth": (
             ((distance > 0) & (distance < np.inf) | np.isnan(distance)).all(),

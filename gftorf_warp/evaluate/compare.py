@@ -11,12 +11,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from jaxtyping import Float
 
 from .. import __version__
 from ..data.files import atomic_write, write_json
 from ..data.sequence import Sequence, Truth
 from ..data.truth import known_distance, moving_and_static
-from ..errors import InputError
+from ..errors import InputError, UsageError
 from . import gallery, views
 from . import metrics as measure
 from .panels import Findings, Judgement
@@ -25,6 +26,8 @@ from .provenance import fact, method_of
 if TYPE_CHECKING:
     from ..recon.run import Run
 
+AGAINST = ("geometry", "static-phasor")
+"""Distances that can be the true one; the first is the default."""
 FACTS = (
     "seconds_reconstruct",
     "images_optimised",
@@ -44,6 +47,7 @@ def compare(
     *,
     truth: str | Path | None = None,
     frames: str = "all",
+    against: str = "geometry",
     report: bool = True,
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]:
@@ -56,6 +60,8 @@ def compare(
         run: A finished reconstruction, or its folder.
         truth: A sequence whose ground truth to use; None: that of the sequence the run was made from.
         frames: Which raw frames are scored: ``all``, or ``ftorf13`` as in the published tables.
+        against: Which distance is the true one: ``geometry``, or ``static-phasor``, what the closed form would decode
+            if nothing moved and nothing were noisy. Pixels that move are those of geometry in both cases.
         report: Whether the page is written as well.
         progress: Called with (frames done, frames in all).
 
@@ -64,23 +70,26 @@ def compare(
 
     Raises:
         InputError: If the run or a sequence cannot be read, the truth does not fit, or no quartet is complete.
-        UsageError: If ``frames`` is unknown or leaves nothing.
+        UsageError: If ``frames`` is unknown or leaves nothing, or ``against`` is unknown.
         DivergedError: If a rendering is not finite.
     """
     if isinstance(run, (str, Path)):
         from ..recon.run import Run
 
         run = Run.open(run)
+    if against not in AGAINST:
+        why = f"expected one of {', '.join(AGAINST)}"
+        raise UsageError(f"unknown truth {against!r}", where="--against", why=why, fix="use --against geometry")
     sequence = run.sequence()
     known = fitting_truth(sequence, truth)
     scored = measure.scored_frames(sequence, frames)
     gathered = views.gather(run, sequence, scored, progress=progress)
     found = replace(
-        findings(sequence, gathered, known),
+        findings(sequence, gathered, known, against=against),
         colour=gallery.colour_views(run, sequence, scored),
         novel=gallery.novel_views(run, sequence) if report else None,
     )
-    result = summary(run, found, protocol=frames)
+    result = summary(run, found, protocol=frames, against=against)
     write_json(run.path / "metrics.json", result)
     if report:
         write_report(run, result, found)
@@ -114,23 +123,39 @@ def fitting_truth(sequence: Sequence, path: str | Path | None = None) -> Truth |
     return found
 
 
-def findings(sequence: Sequence, gathered: views.Views, truth: Truth | None) -> Findings:
-    """Gathered views, judged by the truth if there is any."""
+def findings(sequence: Sequence, gathered: views.Views, truth: Truth | None, *, against: str = AGAINST[0]) -> Findings:
+    """Gathered views, judged by the truth if there is any.
+
+    Raises:
+        InputError: If the static-phasor distance is asked for, and the truth does not have it.
+    """
     if truth is None:
         return Findings(sequence=sequence, views=gathered, judgement=None)
     distance = known_distance(truth)
     moving, static = moving_and_static(distance, gathered.frames, from_phasors=sequence.from_phasors)
-    scored = distance[gathered.frames]
+    scored = (distance if against == AGAINST[0] else _static_phasor(sequence, truth))[gathered.frames]
     errors = {name: measure.squared_error(image, scored) for name, image in gathered.distances.items()}
     judgement = Judgement(truth=scored, errors=errors, moving=moving, static=static)
     return Findings(sequence=sequence, views=gathered, judgement=judgement)
 
 
-def summary(run: Run, found: Findings, *, protocol: str) -> dict[str, Any]:
+def _static_phasor(sequence: Sequence, truth: Truth) -> Float[np.ndarray, "F H W"]:
+    if truth.phasor_distance is None:
+        raise InputError(
+            "no static-phasor distance",
+            where=sequence.path or "sequence",
+            why="--against static-phasor was given, but the truth is geometry only",
+            fix="leave --against out, or name a sequence that was simulated with it by --truth",
+        )
+    return np.where(truth.known[:, None, None], truth.phasor_distance, np.nan)
+
+
+def summary(run: Run, found: Findings, *, protocol: str, against: str = AGAINST[0]) -> dict[str, Any]:
     """The content of metrics.json, in numbers, texts and None only."""
     return {
         "frames": len(found.views.frames),
         "protocol": protocol,
+        "against": against,
         **_errors(found.judgement),
         "quad_psnr_db": measure.quad_psnr_db(
             found.views.quad_rendered,

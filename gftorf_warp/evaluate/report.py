@@ -167,11 +167,14 @@ def _cell(metrics: Mapping[str, Any], key: str) -> str:
 def _facts(metrics: Mapping[str, Any]) -> str:
     known = page.look_up(metrics, "colour_psnr_db") is not None
     colour = {"colour PSNR": page.number(metrics, "colour_psnr_db", "decibel")} if known else {}
+    stated = page.look_up(metrics, "against") is not None
+    against = {"true distance": page.number(metrics, "against", "text")} if stated else {}
     facts = {
         "quad PSNR": page.number(metrics, "quad_psnr_db", "decibel"),
         **colour,
         "raw frames scored": page.number(metrics, "frames", "count"),
         "protocol": page.number(metrics, "protocol", "text"),
+        **against,
         "Gaussians": page.number(metrics, "gaussians", "count"),
         "optimised images": page.number(metrics, "images_optimised", "count"),
         "reconstruction, wall clock": page.number(metrics, "seconds_reconstruct", "seconds"),

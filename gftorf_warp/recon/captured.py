@@ -207,7 +207,7 @@ class CapturedSteps:
 
     def _body(self, variant: Variant) -> None:
         """One step, from the numbers that were sent to new parameters; nothing is read back."""
-        weights, padded = variant.weights, self.padded
+        padded = self.padded
         numbers, motion, count = self._numbers.there, self.state.motion, len(variant.shifts)
         field = padded.field
         if variant.rests:

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import json
-import os
-import socket
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
+from ..data import lock
 from ..data.files import write_json
-from ..errors import BusyError, InputError, UsageError
+from ..errors import InputError, UsageError
 
 CONFIG = "config.json"
 LOCK = ".lock"
@@ -107,43 +105,9 @@ def write_config(run: Path, config: dict[str, object]) -> None:
     write_json(run / CONFIG, config)
 
 
-@contextmanager
-def locked(run: Path) -> Iterator[None]:
-    """Hold ``RUN/.lock``, which names process and host; the system releases it when the process ends, however it ends.
-
-    Raises:
-        BusyError: If another process, or another call in this one, holds it.
-    """
-    run.mkdir(parents=True, exist_ok=True)
-    with (run / LOCK).open("a+") as file:
-        if not _try_lock(file.fileno()):
-            file.seek(0)
-            raise BusyError(
-                "another process works on this run",
-                where=run,
-                why=f"its lock is held by {file.read().strip() or 'somebody'}",
-                fix="wait for it, stop it, or choose another --out",
-            )
-        file.truncate(0)
-        file.write(f"process {os.getpid()} on {socket.gethostname()}\n")
-        file.flush()
-        try:
-            yield
-        finally:
-            file.truncate(0)  # the file stays: removing it would let two others each lock a file of that name
-
-
-def _try_lock(descriptor: int) -> bool:
-    """Take the system's lock on an open file, without waiting; where the system has none, everybody gets it."""
-    try:
-        import fcntl
-    except ImportError:  # not a Unix
-        return True
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        return False
-    return True
+def locked(run: Path) -> AbstractContextManager[None]:
+    """Hold ``RUN/.lock`` as long as a process works on the run, see :func:`gftorf_warp.data.lock.locked`."""
+    return lock.locked(run, LOCK, "run")
 
 
 def _aside(path: Path) -> bool:

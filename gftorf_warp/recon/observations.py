@@ -99,7 +99,8 @@ def observe(sequence: Sequence, settings: ReconSettings, device: torch.device | 
     """Prepare a sequence.
 
     Raises:
-        InputError: If no raw frame was measured, all quads are zero, or what is to be compared does not exist.
+        InputError: If no raw frame was measured, all quads are zero, what is to be compared does not exist, or the
+            sensor is one that cannot be rendered: several modulation frequencies, or a lens that distorts.
     """
     if not sequence.measured.any() or not np.abs(sequence.quads[sequence.measured]).max() > 0:
         raise InputError(
@@ -108,6 +109,7 @@ def observe(sequence: Sequence, settings: ReconSettings, device: torch.device | 
             why="no raw frame exists, or all of them are zero",
             fix="check the folder with `gftorf check`",
         )
+    _demand_one_frequency_and_a_pinhole(sequence)
     if settings.quad_scale is None:
         scale, scale_source = quad_scale(sequence)
     else:
@@ -180,6 +182,19 @@ def _colour(sequence: Sequence, settings: ReconSettings) -> tuple[dict[int, np.n
     if not largest > 0:
         raise _nothing_to_compare(sequence, "colour is black", "all colour images are zero")
     return {n: image / np.float32(largest) for n, image in sequence.colour.items()}, 1.0 / largest
+
+
+def _demand_one_frequency_and_a_pinhole(sequence: Sequence) -> None:
+    frequencies = [] if sequence.frequencies_hz is None else sorted(set(sequence.frequencies_hz.tolist()))
+    lens = sequence.distortion is not None and any(sequence.distortion)
+    if len(frequencies) > 1 or lens:
+        raise InputError(
+            "a sensor that is not rendered",
+            where=sequence.path or "sequence",
+            why="expected one modulation frequency and a pinhole, found "
+            + (f"a lens with {sequence.distortion}" if lens else f"{frequencies} Hz"),
+            fix="record without the lens" if lens else "keep the raw frames of one frequency",
+        )
 
 
 def _nothing_to_compare(sequence: Sequence, what: str, why: str) -> InputError:

@@ -142,9 +142,7 @@ def _warp_stream(stream: torch.cuda.Stream) -> wp.Stream:
 
 
 @contextlib.contextmanager
-def captured(
-    graph: torch.cuda.CUDAGraph, stream: torch.cuda.Stream | None = None, pool: Any = None
-) -> Iterator[None]:
+def captured(graph: torch.cuda.CUDAGraph, stream: torch.cuda.Stream | None = None, pool: Any = None) -> Iterator[None]:
     """Capture what torch and Warp do inside the block, backward passes included, in a graph that torch replays.
 
     The same must have run before on ``stream``: modules get loaded, constants uploaded and libraries started then. What

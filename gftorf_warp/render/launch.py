@@ -27,7 +27,13 @@ __all__ = ["Images", "Inputs", "backward", "forward", "render", "view_of"]
 
 
 def view_of(camera: Camera, settings: RenderSettings) -> CameraView:
-    """The camera as kernels see it."""
+    """The camera as kernels see it.
+
+    Raises:
+        ValueError: If its lens distorts: kernels know pinholes only.
+    """
+    if camera.distortion:
+        raise ValueError(f"cannot render through a lens with {camera.distortion}: only a pinhole")
     view = CameraView()
     pose = camera.camera_from_world
     view.rotation = wp.mat33(pose[:3, :3].astype(np.float32))

@@ -1,20 +1,25 @@
-"""The pinhole camera: intrinsics of the stored resolution, and one pose."""
+"""The camera: intrinsics of the stored resolution, one pose, and a pinhole or a lens that distorts."""
 
 from __future__ import annotations
 
 import functools
 import math
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from .distortion import Distortion
+
+CHECKED = 33  # places per axis at which a lens is tried when a camera is made
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Camera:
-    """A pinhole camera with axes x right, y down, z forward; the centre of pixel [0, 0] is at (0.5, 0.5)."""
+    """A camera with axes x right, y down, z forward; the centre of pixel [0, 0] is at (0.5, 0.5)."""
 
     width: int
     """Columns W of the image."""
@@ -30,6 +35,8 @@ class Camera:
     """Principal point, y [px]."""
     camera_from_world: np.ndarray = field(default_factory=lambda: np.eye(4))
     """Pose, 4x4 on column vectors, world to camera [m]."""
+    distortion: Distortion = field(default_factory=Distortion)
+    """Of the lens; the default is a pinhole, the only camera that the engines know."""
 
     def __post_init__(self):
         pose = np.asarray(self.camera_from_world, dtype=np.float64)
@@ -44,9 +51,12 @@ class Camera:
                 f"fx {self.fx}, fy {self.fy}"
             )
         object.__setattr__(self, "camera_from_world", pose)
+        if self.distortion:  # a lens that cannot be undone inside the image is none: ValueError
+            x, y = np.linspace(0, self.width, CHECKED), np.linspace(0, self.height, CHECKED)[:, None]
+            self.distortion.undo((x - self.cx) / self.fx, (y - self.cy) / self.fy)
 
     @classmethod
-    def from_fov(cls, width: int, height: int, horizontal_fov_deg: float, **pose: np.ndarray) -> Camera:
+    def from_fov(cls, width: int, height: int, horizontal_fov_deg: float, **pose: Any) -> Camera:
         """A camera with square pixels, a centred principal point and a horizontal field of view [deg]."""
         focal = 0.5 * width / math.tan(math.radians(horizontal_fov_deg) / 2)
         return cls(width=width, height=height, fx=focal, fy=focal, cx=width / 2, cy=height / 2, **pose)
@@ -68,21 +78,24 @@ class Camera:
             self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy
         )
 
+    def directions(self) -> Float[Tensor, "H W 3"]:
+        """Unit vectors through the pixel centres, in camera axes, float64; a lens is undone.
+
+        What a tracer may look rays up in; that of sub-samples is the table of the camera ``resized`` to their number.
+        """
+        x = (np.arange(self.width) + 0.5 - self.cx) / self.fx
+        y = (np.arange(self.height)[:, None] + 0.5 - self.cy) / self.fy
+        if self.distortion:
+            x, y = self.distortion.undo(x, y)
+        shape = (self.height, self.width)
+        flat = [torch.from_numpy(np.broadcast_to(axis, shape).copy()) for axis in (x, y)]
+        directions = torch.stack([*flat, torch.ones(shape, dtype=torch.float64)], dim=-1)
+        return directions / directions.norm(dim=-1, keepdim=True)
+
     def rays(self, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32) -> Float[Tensor, "H W 3"]:
         """Unit vectors through the pixel centres, in world axes: point = centre + distance * ray."""
-        x = (torch.arange(self.width, dtype=torch.float64) + 0.5 - self.cx) / self.fx
-        y = (torch.arange(self.height, dtype=torch.float64) + 0.5 - self.cy) / self.fy
-        directions = torch.stack(
-            [
-                x.expand(self.height, -1),
-                y[:, None].expand(-1, self.width),
-                torch.ones(self.height, self.width, dtype=torch.float64),
-            ],
-            dim=-1,
-        )
-        directions = directions / directions.norm(dim=-1, keepdim=True)
         world_from_camera = torch.from_numpy(self.camera_from_world[:3, :3].T.copy())
-        return (directions @ world_from_camera.T).to(device=device, dtype=dtype)
+        return (self.directions() @ world_from_camera.T).to(device=device, dtype=dtype)
 
     def project(self, point: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 2"]:
         """Image position (x, y) [px] of points in the world [m]; meaningless for points behind the camera."""
@@ -92,7 +105,10 @@ class Camera:
             self._sent[kind] = tuple(torch.from_numpy(number).to(point) for number in numbers)
         pose, focal, principal = self._sent[kind]
         local = point @ pose[:3, :3].T + pose[:3, 3]
-        return local[..., :2] / local[..., 2:] * focal + principal
+        flat = local[..., :2] / local[..., 2:]
+        if self.distortion:
+            flat = torch.stack(self.distortion.apply(flat[..., 0], flat[..., 1]), dim=-1)
+        return flat * focal + principal
 
     @functools.cached_property
     def _sent(self) -> dict[tuple[torch.device, torch.dtype], tuple[Tensor, ...]]:

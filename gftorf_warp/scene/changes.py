@@ -9,8 +9,8 @@ import difflib
 import enum
 import types
 import typing
-from collections.abc import Iterable
-from dataclasses import dataclass, fields, is_dataclass, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any, TypeVar, Union
 
 from ..errors import UsageError
@@ -30,6 +30,8 @@ class Wording:
     """What names all settings, as a hint when none is near."""
     fixed: tuple[str, ...] = ()
     """Settings that have options of their own, or cannot be changed."""
+    named: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    """By the name of a part: what it can be as a whole, by name."""
 
 
 def changed(settings: Settings, changes: Iterable[str], wording: Wording) -> Settings:
@@ -66,6 +68,15 @@ def _with(settings: Any, path: list[str], value: str, name: str, wording: Wordin
         fix = f"did you mean {close[0]}?" if close else f"see {wording.where}"
         raise _refused(name, "there is no such setting", fix, wording)
     present = members[head]
+    if name in wording.named and not rest:
+        whole = wording.named[name]
+        if value in whole:
+            return replace(settings, **{head: whole[value]})
+        close = difflib.get_close_matches(value, whole, n=1, cutoff=0.4)
+        fix = (
+            f"did you mean {close[0]}?" if close else f"take one of {', '.join(whole)}, or name a single setting of it"
+        )
+        raise _refused(f"{name}={value}", f"there is no {head} of that name", fix, wording)
     if _has_parts(present) == (not rest):
         inner = ", ".join(names(present)) if _has_parts(present) else "nothing"
         raise _refused(name, f"{head} holds {inner}", "name a single setting", wording)

@@ -16,6 +16,7 @@ from ..constants import FRAMES_PER_QUARTET
 from ..data.decode import quartet_phasor
 from ..data.sequence import Sequence
 from .camera import Camera
+from .distortion import Distortion
 from .sensor import Sensor, distance_from_phasor, phasor_from_quads
 
 CHANGED = 2.5  # a pixel changes if its quads, pooled over slots and 3x3 pixels, differ by so many noise deviations
@@ -42,6 +43,7 @@ def camera_of(sequence: Sequence, frame: int) -> Camera:
         cx=sequence.cx,
         cy=sequence.cy,
         camera_from_world=sequence.camera_from_world[frame],
+        distortion=Distortion.of(sequence.distortion),
     )
 
 

@@ -4,32 +4,53 @@ A point at distance d that reflects r gives the quad of shift theta (method, sec
 
     a (cos(psi - theta) + b),   a = s r / d^2,   psi = kappa d + phase_offset,   kappa = 4 pi f / c
 
-in *relative units*. Section 2.4 of the sensor notes adds the electrons: the noise fields below.
+in *relative units*. Sections 2.3 and 2.4 of the sensor notes add harmonics, electrons and patterns: fields that are
+off, or do nothing, unless they are set. OPT8241 stands for its datasheet, SBAS704B, MLX75027 for its datasheet, 1.0;
+*assumed* values are published nowhere.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, fields, replace
+from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from ..constants import CANONICAL_SHIFTS, FRAME_RATE_HZ, SPEED_OF_LIGHT
+from .pattern import Pattern
+from .waveform import peak
 
 Scalar = float | Tensor
 SHIFT_TOLERANCE = 1e-5  # [rad] shifts are stored as float32 at worst
+EVEN = SHIFT_TOLERANCE  # [1] shifts are equally spaced if the means of exp(i theta) and exp(2 i theta) are below this
+RANK_MIN = 1e-3  # [1] smallest singular value of three unknowns, about 1; two shifts nearer than 0.1 degrees are one
+EFFECTS = ("further_hz", "harmonic_contrast", "contrast_cutoff_hz", "pattern", "row_time_s")  # off unless they are set
 
 
-@dataclass(frozen=True, kw_only=True)
+class RawFrame(NamedTuple):
+    """What is set for one raw frame."""
+
+    f_mod_hz: Scalar
+    """Modulation frequency [Hz]."""
+    shift: float
+    """Phase shift [rad]."""
+
+
+@dataclass(frozen=True, kw_only=True, repr=False)
 class Sensor:
     """One C-ToF sensor. The four ``Scalar`` fields accept 0-d tensors, which receive gradients from the renderer."""
 
     f_mod_hz: Scalar = SPEED_OF_LIGHT / 15.0
     """Modulation frequency [Hz]; the default, 19.986 MHz, is that of the public F-ToeRF files (depth_range 15 m)."""
     shifts: tuple[float, ...] = CANONICAL_SHIFTS
-    """Phase shifts of the quads that a rendering returns, in this order [rad]."""
+    """Phase shifts of the quads that a rendering returns, in this order [rad]: any number, in any order. A recording
+    takes them one after the other; a phase needs three different ones. Default: that of the synthetic F-ToeRF files."""
+    further_hz: tuple[float, ...] = ()
+    """Modulation frequencies that follow in every cycle [Hz], each with all shifts; default: ``f_mod_hz`` alone."""
     phase_offset: Scalar = 0.0
     """Measured minus true phase [rad]: rendering adds it, decoding subtracts it."""
     dc_offset: Scalar = 0.0
@@ -39,7 +60,9 @@ class Sensor:
     frame_period_s: float = 1.0 / FRAME_RATE_HZ
     """Time from one raw frame to the next [s]; frame n is taken at n times this."""
     exposure_s: float = 2.34e-3
-    """Length of one exposure [s]; OPT8241 at 18/64 duty. Scales the number of electrons."""
+    """Length of one exposure [s]; OPT8241 at 18/64 duty. Scales the number of electrons; 0 only without noise."""
+    row_time_s: float = 0.0
+    """Delay from one row to the next [s]; 0: global shutter, as both makers say. Nothing else is simulated."""
     unipolar: bool = False
     """False: difference of two taps, signed. True: one tap, never negative; needs dc_offset >= 1."""
     noise: bool = False
@@ -47,19 +70,27 @@ class Sensor:
     electrons_per_unit: float = 3.144e5
     """Modulated electrons, both taps together, of one unit (r = 1 at d = 1 m) in 2.34 ms [e-]; OPT8241-like."""
     contrast: float = 0.45
-    """Demodulation contrast C of a differential sensor [1]; a unipolar one has 1 / dc_offset."""
+    """Demodulation contrast C of a differential sensor [1]; OPT8241 at 50 MHz. A unipolar one has 1 / dc_offset."""
+    contrast_cutoff_hz: float | None = None
+    """Frequency f_c at which the contrast has halved [Hz], as C / (1 + (f / f_c)^2); None: it has one value. 303e6 fits
+    the MLX75027."""
+    harmonic_contrast: tuple[float, ...] = ()
+    """Contrast of harmonics 2, 3, ... as multiples of that of the first [1]; default: a sine. See scene/waveform.py."""
     ambient_electrons: float = 0.0
-    """Unmodulated electrons per exposure, both taps together [e-]."""
+    """Unmodulated electrons per exposure, both taps together [e-]; of a white surface, where an engine knows how much
+    even light each pixel reflects. A ninth of direct sunlight is 3.1e5 from reflectance .5 (notes, 3)."""
     dark_electrons_per_s: float = 5.0e4
     """Dark current per tap [e-/s]; assumed for the OPT8241."""
     read_noise_electrons: float = 80.0
     """Standard deviation of the read noise per tap [e-]; assumed for the OPT8241."""
     full_well_electrons: float = 1.0e5
-    """A tap holds no more than this [e-]: saturation; assumed for the OPT8241."""
+    """A tap holds no more than this [e-]: saturation; assumed for the OPT8241. inf: any number."""
     adc_bits: int | None = 12
-    """Bits of the signed ADC; None: no quantisation."""
+    """Bits of the signed ADC; OPT8241 and MLX75027 have 12. None: no quantisation."""
     electrons_per_code: float = 32.0
-    """Electrons per step of the ADC [e-/DN]."""
+    """Electrons per step of the ADC [e-/DN]; assumed for the OPT8241."""
+    pattern: Pattern = field(default_factory=Pattern)
+    """How much pixels differ: phase, response to light, dark current; default: not at all."""
 
     def __post_init__(self):
         for name in ("f_mod_hz", "phase_offset", "dc_offset", "source_intensity"):
@@ -67,22 +98,44 @@ class Sensor:
             if isinstance(value, Tensor) and value.ndim != 0:
                 raise ValueError(f"{name} must be a number or a 0-d tensor, got shape {tuple(value.shape)}")
         # numbers are checked; tensors belong to an optimiser, and looking into one could make a GPU wait
-        if not isinstance(self.f_mod_hz, Tensor) and not self.f_mod_hz > 0:
-            raise ValueError(f"f_mod_hz must be above 0, got {self.f_mod_hz}")
+        numbers = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "full_well_electrons"}
+        for name, value in numbers.items():
+            for one in value if isinstance(value, tuple) else (value,):
+                if isinstance(one, int | float) and not math.isfinite(one):
+                    raise ValueError(f"{name} must be finite, got {value}")
+        _demand(self, "above 0", lambda value: value > 0, "f_mod_hz", "frame_period_s", "electrons_per_unit")
+        _demand(self, "above 0", lambda value: value > 0, "electrons_per_code", "full_well_electrons")
+        _demand(self, "above 0", lambda value: value > 0, "contrast_cutoff_hz")
+        _demand(self, "0 or more", lambda value: value >= 0, "ambient_electrons", "dark_electrons_per_s")
+        _demand(self, "0 or more", lambda value: value >= 0, "read_noise_electrons", "source_intensity")
         if len(self.shifts) < 1:
             raise ValueError("shifts: a sensor needs at least one phase shift")
-        for name in ("frame_period_s", "exposure_s", "electrons_per_unit", "electrons_per_code", "full_well_electrons"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be above 0, got {getattr(self, name)}")
-        for name in ("ambient_electrons", "dark_electrons_per_s", "read_noise_electrons"):
-            if not getattr(self, name) >= 0:
-                raise ValueError(f"{name} must not be negative, got {getattr(self, name)}")
+        if not all(f > 0 for f in self.further_hz):
+            raise ValueError(f"further_hz must be above 0, got {self.further_hz}")
+        if self.exposure_s < 0 or (self.noise and self.exposure_s == 0):
+            raise ValueError(f"exposure_s must be above 0, or 0 without noise, got {self.exposure_s}")
+        if self.row_time_s != 0:
+            raise ValueError(f"row_time_s must be 0: a rolling shutter is not simulated, got {self.row_time_s}")
         if not 0 < self.contrast <= 1:
             raise ValueError(f"contrast must be in (0, 1], got {self.contrast}")
+        if self.harmonic_contrast and self.contrast * peak(self.harmonic_contrast) > 1 + 1e-6:
+            raise ValueError(
+                f"harmonic_contrast {self.harmonic_contrast} and contrast {self.contrast} make a wave with a peak of "
+                f"{self.contrast * peak(self.harmonic_contrast):.4g}, more than all light: at most 1"
+            )
         if self.adc_bits is not None and not 1 <= self.adc_bits <= 24:
             raise ValueError(f"adc_bits must be in 1..24 or None, got {self.adc_bits}")
         if self.unipolar and not isinstance(self.dc_offset, Tensor) and self.dc_offset < 1.0:
             raise ValueError(f"a unipolar tap cannot hold negative light: dc_offset >= 1 needed, got {self.dc_offset}")
+        if self.unipolar and self.contrast_cutoff_hz is not None:
+            raise ValueError(
+                "contrast_cutoff_hz: the contrast of a unipolar sensor is 1 / dc_offset at all frequencies"
+            )
+
+    def __repr__(self) -> str:
+        """As of any dataclass, but for effects that are off: data cards hash this text."""
+        shown = [f for f in fields(self) if f.name not in EFFECTS or getattr(self, f.name) != getattr(PLAIN, f.name)]
+        return f"Sensor({', '.join(f'{f.name}={getattr(self, f.name)!r}' for f in shown)})"
 
     @property
     def phase_slope(self) -> Scalar:
@@ -94,6 +147,25 @@ class Sensor:
         """Range c / 2f [m]: distances are known modulo this."""
         f_mod_hz = self.f_mod_hz.detach() if isinstance(self.f_mod_hz, Tensor) else self.f_mod_hz
         return SPEED_OF_LIGHT / (2.0 * float(f_mod_hz))
+
+    @property
+    def cycle(self) -> tuple[RawFrame, ...]:
+        """The raw frames of one cycle in time order: all shifts at the first frequency, then at each further one."""
+        return tuple(RawFrame(f, shift) for f in (self.f_mod_hz, *self.further_hz) for shift in self.shifts)
+
+    @property
+    def harmonics(self) -> tuple[int, ...]:
+        """Multiples of the modulation frequency that it sees: 1, and those with a contrast."""
+        return (1, *(h for h, ratio in enumerate(self.harmonic_contrast, start=2) if ratio != 0.0))
+
+    def contrast_ratio(self, harmonic: int) -> float:
+        """Contrast of a harmonic as a multiple of that of the first [1]."""
+        return 1.0 if harmonic == 1 else self.harmonic_contrast[harmonic - 2]
+
+    def at_frame(self, n: int) -> Sensor:
+        """The same sensor as raw frame ``n`` of a recording uses it: at one frequency and with one shift."""
+        frame = self.cycle[n % len(self.cycle)]
+        return replace(self, f_mod_hz=frame.f_mod_hz, shifts=(float(frame.shift),), further_hz=())
 
     def with_shifts(self, shifts: tuple[float, ...]) -> Sensor:
         """The same sensor reading other phase shifts [rad]."""
@@ -115,12 +187,44 @@ def distance_from_phasor(re: Tensor, im: Tensor, sensor: Sensor) -> Tensor:
 
 
 def phasor_from_quads(quads: Tensor, shifts: tuple[float, ...] | Tensor) -> tuple[Tensor, Tensor]:
-    """(re, im) of quads [Q, ...] by least squares over equally spaced shifts [rad]: 4/K sum_j Q_j exp(i theta_j).
+    """(re, im) of quads [Q, ...] by least squares over three or more shifts [rad], in any order.
 
-    For the four canonical shifts these are the differences of opposite quads, of length 2a.
+    For equally spaced ones that is 4/K sum_j Q_j exp(i theta_j); for the four canonical shifts, the differences of
+    opposite quads, of length 2a.
+
+    Raises:
+        ValueError: If the shifts do not determine a phase. Shifts in a tensor are taken to be equally spaced.
     """
     theta = torch.as_tensor(shifts, dtype=quads.dtype, device=quads.device).reshape(-1, *[1] * (quads.ndim - 1))
     if len(theta) < 3:
         raise ValueError(f"shifts: a phase needs at least 3 quads, got {len(theta)}")
+    if not isinstance(shifts, Tensor) and not _evenly(np.array(shifts, dtype=np.float64)):
+        rows = torch.as_tensor(_solution(shifts), dtype=quads.dtype, device=quads.device)
+        re, im = (rows @ quads.reshape(len(theta), -1)).reshape(2, *quads.shape[1:])
+        return re, im
     factor = 4.0 / len(theta)
     return factor * (quads * theta.cos()).sum(0), factor * (quads * theta.sin()).sum(0)
+
+
+def _evenly(shifts: np.ndarray) -> bool:
+    """Whether the plain sum over these shifts [rad] is the least-squares solution."""
+    return all(abs(np.exp(1j * turns * shifts).mean()) < EVEN for turns in (1, 2))
+
+
+def _solution(shifts: Sequence[float]) -> np.ndarray:
+    """Rows [2, Q] that take quads at any shifts [rad] to (re, im)."""
+    model = np.stack([np.cos(shifts), np.sin(shifts), np.ones(len(shifts))], axis=1)
+    if np.linalg.svd(model, compute_uv=False).min() < RANK_MIN:
+        raise ValueError(f"shifts: a phase needs three different ones, got {np.degrees(shifts).tolist()} degrees")
+    return 2.0 * np.linalg.pinv(model)[:2]
+
+
+def _demand(sensor: Sensor, what: str, holds: Callable[[float], bool], *names: str) -> None:
+    """Check the numbers among these fields."""
+    for name in names:
+        value = getattr(sensor, name)
+        if value is not None and not isinstance(value, Tensor) and not holds(value):
+            raise ValueError(f"{name} must be {what}, got {value}")
+
+
+PLAIN = Sensor()  # the default

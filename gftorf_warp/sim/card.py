@@ -8,20 +8,27 @@ from collections.abc import Mapping
 from dataclasses import fields
 
 from .. import __version__
+from ..scene.optics import Lens, lens_rows
+from .ladder import NAMES, adds_of
 from .paths import Still
 from .readout import contrast, electron_gain
 from .record import Recording
 from .scene import overridden
 from .scenes import SCENES, Scene
+from .sensors import effect_rows
 
 
-def settings_card(scene: Scene, options: Mapping, layout: str = "ftorf") -> str:
+def settings_card(
+    scene: Scene, options: Mapping, layout: str = "ftorf", *, own: Scene | None = None, level: str | None = None
+) -> str:
     """The part that follows from the settings alone, so that equal text means equal settings.
 
     Args:
         scene: What was recorded.
         options: Keyword arguments of :func:`gftorf_warp.sim.record.record` by name, all resolved.
         layout: Layout on disk; 'torf' has one phasor per quartet.
+        own: The scene that was asked for, if a level of the ladder made another of it.
+        level: That level.
     """
     sensor, noisy = scene.sensor, options["noise"] and scene.sensor.noise
     width, height = options["size"]
@@ -34,6 +41,7 @@ def settings_card(scene: Scene, options: Mapping, layout: str = "ftorf") -> str:
         **(
             {"phasors": "one per quartet, with time, pose and truth of its first raw frame"} if layout == "torf" else {}
         ),
+        **({} if level is None else {"ladder": f"level {level}: {adds_of(level)}"}),
         **_camera_rows(scene, options),
         "exposure": f"{1e3 * sensor.exposure_s:g} ms, "
         + (f"mean of {n} instants" if (n := options["exposure_samples"]) > 1 else "taken as one instant"),
@@ -53,6 +61,7 @@ def settings_card(scene: Scene, options: Mapping, layout: str = "ftorf") -> str:
             "full well": f"{sensor.full_well_electrons:g} electrons per tap",
             "ADC": f"{sensor.adc_bits or 'no'} bits, {sensor.electrons_per_code:g} electrons per code",
         }
+    rows |= effect_rows(sensor) | lens_rows(scene.lens)
     table = "\n".join(f"| {name} | {value} |" for name, value in rows.items())
     return f"""# {scene.name}: simulated C-ToF sequence
 
@@ -60,7 +69,7 @@ def settings_card(scene: Scene, options: Mapping, layout: str = "ftorf") -> str:
 {options["frames"]} raw frames of {width}x{height} pixels, {scene.horizontal_fov_deg:g} deg wide. \
 {_light(scene, options)}.
 
-    {_command(scene, options, layout)}
+    {_command(own or scene, options, layout, level)}
 
 Made by gftorf-warp {__version__}, scene {hashlib.sha256(_fingerprint(scene).encode()).hexdigest()[:16]}. \
 This data may be used under the licence of that program, Apache-2.0.
@@ -85,6 +94,9 @@ Ground truth against the distance that the engine sees, on interior pixels of st
 {agreement}.
 
 Saturated: {100 * recording.saturated:.3g} % of all pixels and raw frames.
+
+Beside the distance stands the static-phasor distance: what the closed form would decode from four quads taken without
+noise at the very time of a raw frame, all light included. contact_sheet.png is a picture for people.
 """
 
 
@@ -128,29 +140,31 @@ def _camera_rows(scene: Scene, options: Mapping) -> dict[str, str]:
     return rows
 
 
-def _command(scene: Scene, options: Mapping, layout: str) -> str:
+def _command(scene: Scene, options: Mapping, layout: str, level: str | None) -> str:
     """What makes the same sequence again: a command line if there is one for it, else a call."""
     named = SCENES.get(scene.name)
-    if (
-        named is None
-        or overridden(named, scene.overrides) != scene
-        or options["flow"]
-        or options["exposure_samples"] > 1
-    ):
+    if named is None or overridden(named, scene.overrides) != scene:
         values = ", ".join(f"{key}={value}" for key, value in options.items())
-        return f"gftorf_warp.simulate({scene.name}, ..., {values}{f', format={layout!r}' if layout != 'ftorf' else ''})"
+        more = f", format={layout!r}" if layout != "ftorf" else ""
+        return f"gftorf_warp.simulate({scene.name}, ..., {values}{more}{f', level={level!r}' if level else ''})"
     width, height = options["size"]
     command = f"gftorf simulate {scene.name} --out SEQ{''.join(f' --override {text}' for text in scene.overrides)}"
     command += f" --frames {options['frames']} --size {width}x{height}"
-    command += f" --engine {options['engine']}" if options["engine"] != "gaussian" else ""
-    command += f" --bounces {options['bounces']} --paths {options['paths']}" if options["bounces"] else ""
+    command += " --flow" if options["flow"] else ""
+    if level is None:
+        command += f" --engine {options['engine']}" if options["engine"] != "gaussian" else ""
+        command += f" --bounces {options['bounces']} --paths {options['paths']}" if options["bounces"] else ""
+        command += f" --exposure-samples {n}" if (n := options["exposure_samples"]) > 1 else ""
     command += f" --seed {options['seed']}" + (f" --format {layout}" if layout != "ftorf" else "")
+    if level is not None:
+        return command + f" --level {level}" + (" --sync" if options["sync"] and level != NAMES[0] else "")
     return command + (" --sync" if options["sync"] else "") + ("" if options["noise"] else " --no-noise")
 
 
 def _fingerprint(scene: Scene) -> str:
     """Every setting of a scene as text; without the optional ones that it does not use, as if they did not exist."""
     optional = {"camera_path": Still(), "emitter": (0.0, 0.0, 0.0), "beam_deg": None, "colour": None, "novel_views": ()}
+    optional |= {"lens": Lens()}
     values = {f.name: getattr(scene, f.name) for f in fields(scene)}
     used = {name: value for name, value in values.items() if name not in optional or value != optional[name]}
     del used["closed_form"], used["overrides"]  # follow from the others

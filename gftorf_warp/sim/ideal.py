@@ -8,7 +8,7 @@ sensor are two steps, so that one light can be read by many sensors of one modul
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import astuple, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -67,11 +67,13 @@ def ideal_recording(
         sensor: Instead of the scene's; its noise is ignored, and its modulation frequency must be the same.
 
     Raises:
-        ValueError: If the modulation frequencies differ.
+        ValueError: If the modulation frequencies differ, or there are several.
     """
     sensor = replace(scene.sensor if sensor is None else sensor, noise=False)
     if float(sensor.f_mod_hz) != float(scene.sensor.f_mod_hz):
         raise ValueError(f"light of {float(scene.sensor.f_mod_hz)} Hz, read by a sensor of {float(sensor.f_mod_hz)} Hz")
+    if sensor.further_hz:
+        raise ValueError(f"an ideal recording has one modulation frequency, not {1 + len(sensor.further_hz)}")
     times = frame_times(sensor, scene.frames, sync=False)
     lights = {n: light_of(scene, float(times[n])) for n in range(scene.frames)} if lights is None else lights
     shifts = np.array([sensor.shifts[n % len(sensor.shifts)] for n in range(scene.frames)])
@@ -95,6 +97,7 @@ def ideal_recording(
         fy=camera.fy,
         cx=camera.cx,
         cy=camera.cy,
+        distortion=astuple(camera.distortion) if camera.distortion else None,
         camera_from_world=np.stack([scene.camera(time=float(time)).camera_from_world for time in times]),
     )
     return sequence, Truth(distance=distance, known=known)

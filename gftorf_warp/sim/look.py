@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Complex, Float
 
 from ..render.api import rasterize
 from ..scene.camera import Camera
 from ..scene.gaussians import GaussianField
 from ..scene.sensor import Sensor
+from .readout import mean_quad
 from .scene import Scene
 from .splat import Cover, cover_moving, cover_still, merge
 
@@ -61,19 +64,49 @@ class Splatted:
         return cover_still(self._still, camera).seen(camera.centre, 0.0, colour=self._colour)
 
 
-def look(splatted: Splatted, time: float, sensor: Sensor, subsamples: int) -> tuple[Float[np.ndarray, "H W"], ...]:
-    """Mean quad of the sensor's first shift, mean amplitude and mean distance over opacity [m] of every pixel.
+class Look(NamedTuple):
+    """What a sensor without noise gets of every pixel in one raw frame, whatever engine made it."""
 
-    The distance is NaN where a pixel meets nothing.
+    quad: Float[np.ndarray, "H W"]
+    """Mean quad of the raw frame's shift, DC offset included [relative units]."""
+    amplitude: Float[np.ndarray, "H W"]
+    """Mean amplitude a, source intensity included [relative units]."""
+    distance: Float[np.ndarray, "H W"]
+    """As the engine sees it [m]: mean of splats over their opacity, or first hit; NaN where a pixel meets nothing."""
+    phasor: Complex[np.ndarray, "H W"]
+    """Light at the modulation frequency, the sensor's phase offset included, in any unit; 0 where there is none."""
+
+
+def look(splatted: Splatted, time: float, sensor: Sensor, subsamples: int) -> Look:
+    """What splats show the sensor at an instant, for the first of its shifts.
+
+    A harmonic is a rendering of its own, at that multiple of the modulation frequency: exact for whatever mixes in a
+    pixel, where a closed form would know opaque surfaces only.
     """
+    field, camera = splatted.at(time), splatted.camera_at(time)
     with torch.no_grad():
-        rendering = rasterize(splatted.at(time), splatted.camera_at(time), sensor)
+        rendering = rasterize(field, camera, sensor)
+        harmonics = [_at_harmonic(field, camera, sensor, h, subsamples) for h in sensor.harmonics if h > 1]
     opacity = pooled(rendering.opacity, subsamples)
-    return (
-        pooled(rendering.quads[0], subsamples),
-        pooled(rendering.phasor[2], subsamples) / 2,  # the third channel of a phasor is 2a
-        pooled(rendering.distance, subsamples) / np.where(opacity > 0, opacity, np.nan),
+    distance = pooled(rendering.distance, subsamples) / np.where(opacity > 0, opacity, np.nan)
+    amplitude = pooled(rendering.phasor[2], subsamples) / 2  # the third channel of a phasor is 2a
+    first = pooled(rendering.phasor[0], subsamples) / 2 + 0.5j * pooled(rendering.phasor[1], subsamples)
+    if not harmonics and sensor.pattern.phase == 0.0:
+        return Look(pooled(rendering.quads[0], subsamples), amplitude, distance, first)
+    seen = replace(sensor, phase_offset=0.0, source_intensity=1.0)  # the renderings have both
+    quad, amplitude = mean_quad(np.stack([first, *harmonics]), amplitude, seen)
+    return Look(quad, amplitude, distance, first)
+
+
+def _at_harmonic(
+    field: GaussianField, camera: Camera, sensor: Sensor, harmonic: int, subsamples: int
+) -> Complex[np.ndarray, "H W"]:
+    """Light at a multiple of the modulation frequency, phase offset and source intensity included."""
+    multiple = replace(
+        sensor, f_mod_hz=harmonic * float(sensor.f_mod_hz), phase_offset=harmonic * float(sensor.phase_offset)
     )
+    phasor = rasterize(field, camera, multiple).phasor
+    return pooled(phasor[0], subsamples) / 2 + 0.5j * pooled(phasor[1], subsamples)
 
 
 def look_colour(splatted: Splatted, time: float, subsamples: int) -> Float[np.ndarray, "H W 3"]:

@@ -1,6 +1,11 @@
 """From mean light to what a sensor writes down: taps, shot and read noise, full well, ADC (sensor notes, 2.3 to 2.5).
 
-With a the amplitude and q = a (cos(psi - shift) + b) the quad of a pixel in relative units, and G electrons per unit,
+With S_h the light of a pixel at harmonic h, a the amplitude, r_h the contrast of h relative to that of the first, and
+p the fixed phase pattern, the quad in relative units is
+
+    q = Re sum_h r_h S_h exp(i h (phase_offset + p - shift)) + a b
+
+With G electrons per unit,
 
     N_s = G a                                            modulated electrons, both taps together
     n_A, n_B = 1/2 [N_a + N_s +- C G q] + N_dark         mean electrons per tap; N_a ambient, C contrast
@@ -8,10 +13,10 @@ With a the amplitude and q = a (cos(psi - shift) + b) the quad of a pixel in rel
     differential   code = clip(round((n'_A - n'_B) / e))           signed;    quad = code e / (C G)
     unipolar       code = clip(round(n'_A / e) + pedestal)         unsigned;  quad = (n'_A - N_a/2 - N_dark) 2 / (C G)
 
-A unipolar sensor has C = 1 / b; the constant levels that it subtracts are known to it. The numbers written are in
-relative units again, and without clipping their mean is q. Their phase noise is that of section 2.5; for four shifts
-
-    sigma_psi = sqrt((N_s + N_a)/2 + N_dark + s_r^2) / (C N_s)     differential, b = 0
+A unipolar sensor has C = 1 / b. The constant levels that it subtracts are known to it: ambient light from a frame
+without its own light, dark current on average over the pixels. Pixels that respond differently multiply all light by
+their gain, and dark current by their own factor. The numbers written are in relative units again, and without clipping
+their mean is q times the gain. Their phase noise is that of scene/electrons.py.
 """
 
 from __future__ import annotations
@@ -19,11 +24,15 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Complex, Float
 
+from ..scene.electrons import contrast, dark_electrons, electron_gain
+from ..scene.optics import Shading
+from ..scene.pattern import dark_map, gain_map, phase_map
 from ..scene.sensor import Sensor
+from ..scene.waveform import peak
 
-REFERENCE_EXPOSURE_S = 2.34e-3  # the exposure that electrons_per_unit refers to
+Level = float | Float[np.ndarray, "H W"]
 
 
 class Reading(NamedTuple):
@@ -35,40 +44,76 @@ class Reading(NamedTuple):
     """Where a tap was full or the ADC at its end: the quad is then wrong, not only noisy."""
 
 
-def electron_gain(sensor: Sensor) -> float:
-    """Modulated electrons per exposure and relative unit of amplitude, G, both taps together [e-]."""
-    return sensor.electrons_per_unit * sensor.exposure_s / REFERENCE_EXPOSURE_S
+def why_impossible(sensor: Sensor) -> str | None:
+    """Why the taps of a sensor would hold negative light; None: they would not."""
+    modulated, constant = float(contrast(sensor)) * peak(sensor.harmonic_contrast), 0.0
+    if not sensor.unipolar:
+        constant = float(contrast(sensor)) * abs(float(sensor.dc_offset))
+    if modulated + constant <= 1.0 + 1e-6:
+        return None
+    kind = "one tap allows" if sensor.unipolar else "differential taps allow"
+    harmonics = f", peak {peak(sensor.harmonic_contrast):g} with its harmonics" if sensor.harmonic_contrast else ""
+    return (
+        f"{kind} contrast (1 + |dc_offset|) <= 1, not {float(contrast(sensor)):g} "
+        f"(1 + {abs(float(sensor.dc_offset)):g}){harmonics}"
+    )
 
 
-def contrast(sensor: Sensor) -> float:
-    """Demodulation contrast C [1]: a setting of a differential sensor, 1 / dc_offset of a unipolar one."""
-    return 1.0 / float(sensor.dc_offset) if sensor.unipolar else sensor.contrast
+def mean_quad(
+    light: Complex[np.ndarray, "h H W"], amplitude: Float[np.ndarray, "H W"], sensor: Sensor
+) -> tuple[Float[np.ndarray, "H W"], Float[np.ndarray, "H W"]]:
+    """Mean quad of the sensor's first shift, and mean amplitude, of every pixel.
+
+    Args:
+        light: Sum of amplitude exp(i h phase) for each h of ``sensor.harmonics``, for a source intensity of 1 and
+            without phase offset [relative units].
+        amplitude: Sum of the amplitudes, likewise.
+        sensor: Its offsets, harmonics and phase pattern.
+
+    Raises:
+        ValueError: If there is light at another number of harmonics.
+    """
+    if len(light) != len(sensor.harmonics):
+        raise ValueError(f"light {light.shape} must start with {len(sensor.harmonics)}, the number of harmonics")
+    intensity = float(sensor.source_intensity)
+    amplitude = intensity * amplitude.astype(np.float64)
+    pattern = phase_map(sensor.pattern, *amplitude.shape)
+    angle = float(sensor.phase_offset) - sensor.shifts[0] + (0.0 if pattern is None else pattern)
+    quad = intensity * (light[0] * np.exp(1j * angle)).real + float(sensor.dc_offset) * amplitude
+    for h, image in zip(sensor.harmonics[1:], light[1:], strict=True):
+        quad = quad + intensity * sensor.contrast_ratio(h) * (image * np.exp(1j * h * angle)).real
+    return quad, amplitude
 
 
 def mean_taps(
-    quad: Float[np.ndarray, "H W"], amplitude: Float[np.ndarray, "H W"], sensor: Sensor
+    quad: Float[np.ndarray, "H W"],
+    amplitude: Float[np.ndarray, "H W"],
+    sensor: Sensor,
+    ambient: Float[np.ndarray, "H W"] | None = None,
 ) -> tuple[Float[np.ndarray, "H W"], Float[np.ndarray, "H W"]]:
     """Mean electrons (n_A, n_B) of the two taps.
 
     Args:
         quad: Mean quad of the raw frame, DC offset included [relative units].
         amplitude: Mean amplitude a, source intensity included [relative units].
-        sensor: Gain, contrast, ambient and dark electrons.
+        sensor: Gain, contrast, ambient and dark electrons, pattern of the dark current.
+        ambient: Share of the sensor's ambient electrons that each pixel gets [1]; None: 1.
 
     Raises:
         ValueError: If a tap would hold a negative number of electrons: contrast and DC offset contradict each other.
     """
     gain = electron_gain(sensor)
-    signal = contrast(sensor) * gain * np.asarray(quad, dtype=np.float64)
+    signal = float(contrast(sensor)) * gain * np.asarray(quad, dtype=np.float64)
     if sensor.unipolar:  # the offset is the light itself, not a difference of the taps
         signal = signal - gain * np.asarray(amplitude, dtype=np.float64)
-    common = 0.5 * (sensor.ambient_electrons + gain * np.asarray(amplitude, dtype=np.float64))
-    dark = sensor.dark_electrons_per_s * sensor.exposure_s
+    common = 0.5 * (_ambient(sensor, ambient) + gain * np.asarray(amplitude, dtype=np.float64))
+    spread = dark_map(sensor.pattern, *common.shape)
+    dark = dark_electrons(sensor) if spread is None else dark_electrons(sensor) * spread
     taps = common + 0.5 * signal + dark, common - 0.5 * signal + dark
     least = min(tap.min() for tap in taps)
     if least < -1e-3:  # less than rounding of float32 quads can do
         raise ValueError(
-            f"a tap would hold {least:.3g} electrons: contrast {contrast(sensor):.3g} times (1 + |dc_offset|) "
+            f"a tap would hold {least:.3g} electrons: contrast {float(contrast(sensor)):.3g} times (1 + |dc_offset|) "
             f"{1 + abs(float(sensor.dc_offset)):.3g} must not exceed 1 for a differential sensor"
         )
     return np.maximum(taps[0], 0.0), np.maximum(taps[1], 0.0)
@@ -79,30 +124,42 @@ def read_out(
     amplitude: Float[np.ndarray, "H W"],
     sensor: Sensor,
     generator: np.random.Generator,
+    *,
+    ambient: Float[np.ndarray, "H W"] | None = None,
+    shading: Shading | None = None,
 ) -> Reading:
     """What ``sensor`` writes down for one raw frame.
 
     Args:
         quad: Mean quad, DC offset included [relative units].
         amplitude: Mean amplitude a, source intensity included [relative units].
-        sensor: Without ``noise`` the mean is returned as it is.
+        sensor: Without ``noise`` the mean is returned, as it is but for ``shading`` and the pattern of the gain.
         generator: Source of all randomness. The order of draws is fixed: shots A, shots B, reads A, reads B.
+        ambient: Share of even ambient light that each pixel sends back, its reflectance [1]; None: 1.
+        shading: What of the light reaches each pixel; None: all.
 
     Raises:
         ValueError: If the sensor's contrast and DC offset contradict each other, see :func:`mean_taps`.
     """
+    response = gain_map(sensor.pattern, *np.shape(quad))
+    for active, other in [
+        *([] if shading is None else [shading]),
+        *([] if response is None else [(response, response)]),
+    ]:
+        quad, amplitude = quad * active, amplitude * active
+        ambient = other if ambient is None else ambient * other
     if not sensor.noise:
         return Reading(np.asarray(quad, dtype=np.float32), np.zeros(np.shape(quad), dtype=bool))
-    mean_a, mean_b = mean_taps(quad, amplitude, sensor)
+    mean_a, mean_b = mean_taps(quad, amplitude, sensor, ambient)
     shots_a, shots_b = generator.poisson(mean_a), generator.poisson(mean_b)  # exact at any mean: no normal limit needed
     tap_a = shots_a + generator.normal(0.0, sensor.read_noise_electrons, mean_a.shape)
     tap_b = shots_b + generator.normal(0.0, sensor.read_noise_electrons, mean_b.shape)
     full_a, full_b = tap_a >= sensor.full_well_electrons, tap_b >= sensor.full_well_electrons
     tap_a, tap_b = (np.minimum(tap, sensor.full_well_electrons) for tap in (tap_a, tap_b))
-    unit = contrast(sensor) * electron_gain(sensor)
+    unit = float(contrast(sensor)) * electron_gain(sensor)
     if sensor.unipolar:
         electrons, clipped = quantise(tap_a, sensor)
-        level = 0.5 * sensor.ambient_electrons + sensor.dark_electrons_per_s * sensor.exposure_s
+        level = 0.5 * _ambient(sensor, ambient) + dark_electrons(sensor)
         return Reading((2.0 * (electrons - level) / unit).astype(np.float32), full_a | clipped)
     electrons, clipped = quantise(tap_a - tap_b, sensor)
     return Reading((electrons / unit).astype(np.float32), full_a | full_b | clipped)
@@ -123,3 +180,8 @@ def quantise(
     zero = low + codes // 64 if sensor.unipolar else 0
     code = np.round(electrons / sensor.electrons_per_code) + zero
     return (np.clip(code, low, high) - zero) * sensor.electrons_per_code, (code <= low) | (code >= high)
+
+
+def _ambient(sensor: Sensor, share: Float[np.ndarray, "H W"] | None) -> Level:
+    """Ambient electrons of a pixel, both taps together [e-]."""
+    return sensor.ambient_electrons if share is None else sensor.ambient_electrons * share

@@ -3,27 +3,31 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, fields, is_dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from ..constants import FRAMES_PER_QUARTET
 from ..data.sequence import Sequence, Truth
 from ..render.trace import Bounces
 from ..scene.camera import Camera
-from ..scene.sensor import Sensor
-from .look import Splatted, look, look_colour
+from ..scene.optics import shading
+from ..scene.sensor import Sensor, distance_from_phasor
+from .look import Look, Splatted, look, look_colour
 from .paths import inverse
-from .readout import read_out
+from .readout import mean_quad, read_out
 from .scene import Scene
 from .traced import Traced, trace_colour
 from .world import Hits, first_hit
 
 Progress = Callable[[int, int], None]
-Taken = tuple[Float[np.ndarray, "H W"], ...]  # mean quad, mean amplitude, distance [m]
+Images = dict[str, np.ndarray]
+Keep = Callable[[str, Callable[[], Images]], tuple[Images, bool]]
+"""Images of a name, made now or kept from an interrupted recording, and whether they were made now."""
 
 ENGINES = ("gaussian", "mesh")
 """Ways from a scene to an image: splats that cover it, or rays through its surfaces."""
@@ -56,7 +60,8 @@ class Recording:
     sequence: Sequence
     """As a camera would have recorded it."""
     truth: Truth
-    """Analytic distance along each pixel's centre ray at the time of each raw frame."""
+    """Analytic distance along each pixel's centre ray at the time of each raw frame; what a sensor without noise would
+    decode if nothing moved; amplitude; which body is seen."""
     gap: Gap | None
     """Engine against truth on still interior pixels; None if no such pixel exists."""
     saturated: float
@@ -64,9 +69,9 @@ class Recording:
 
 
 def frame_times(sensor: Sensor, frames: int, *, sync: bool) -> Float[np.ndarray, "F"]:
-    """Time of each raw frame [s]: n times the frame period, or, ``sync``, that of the first frame of its quartet."""
+    """Time of each raw frame [s]: n times the frame period, or, ``sync``, that of the first frame of its cycle."""
     frame = np.arange(frames)
-    return (frame - frame % FRAMES_PER_QUARTET if sync else frame) * sensor.frame_period_s
+    return (frame - frame % len(sensor.cycle) if sync else frame) * sensor.frame_period_s
 
 
 def record(
@@ -84,36 +89,52 @@ def record(
     paths: int = 64,
     device: str = "cpu",
     progress: Progress | None = None,
+    keep: Keep | None = None,
 ) -> Recording:
     """Record ``scene``, in memory. Arguments are those of :func:`gftorf_warp.sim.simulate.simulate`.
+
+    Every raw frame depends on its number and on the settings alone, so that it may as well come from an interrupted
+    recording: ``keep`` decides, see sim/unfinished.py; None makes all of them.
 
     Raises:
         ValueError: If the sensor's contrast and DC offset contradict each other, see sim/readout.py; if there is no
             such engine, or it cannot make the light that is asked for.
     """
     frames = scene.frames if frames is None else frames
+    keep = keep or _made_now
     sensor = replace(scene.sensor, noise=noise and scene.sensor.noise)
     times = frame_times(sensor, frames, sync=sync)
     cameras = [scene.camera(size, float(time)) for time in times]
     camera = cameras[0]
-    distances, interior = _truth(scene, cameras, times)
+    distances, bodies, interior = _truth(scene, cameras, times)
     longest = frame_times(sensor, max(frames, scene.frames), sync=False)  # for fewer frames the same covers and images
+    evenness = shading(scene.lens, camera)
     take = _engine(engine, scene, size, longest, Bounces(count=bounces, paths=paths), device, seed)
-    shifts = np.array([sensor.shifts[n % len(sensor.shifts)] for n in range(frames)])
+    shots = [sensor.at_frame(n) for n in range(frames)]
+    offsets = ((np.arange(exposure_samples) + 0.5) / exposure_samples - 0.5) * sensor.exposure_s
 
-    quads = np.zeros((frames, camera.height, camera.width), dtype=np.float32)
+    def expose(n: int) -> Images:
+        seen = take(n, [float(times[n] + offset) for offset in offsets], float(times[n]), shots[n])
+        random = np.random.default_rng((seed, n))  # frame n: whatever F is
+        reading = read_out(seen.quad, seen.amplitude, shots[n], random, shading=evenness)
+        return {
+            "quad": reading.quad,
+            "saturated": reading.saturated.sum(),
+            "amplitude": seen.amplitude.astype(np.float32),
+            "distance": seen.distance,
+            "phasor_distance": _static_distance(seen, shots[n]),
+        }
+
+    quads, phasor_distances, amplitudes = (np.zeros(distances.shape, dtype=np.float32) for _ in range(3))
     largest, total, full = 0.0, 0.0, 0
     for n in range(frames):
-        offsets = ((np.arange(exposure_samples) + 0.5) / exposure_samples - 0.5) * sensor.exposure_s
-        shot = sensor.with_shifts((float(shifts[n]),))
-        quad, amplitude, distance = take(n, [float(times[n] + offset) for offset in offsets], float(times[n]), shot)
-        reading = read_out(quad, amplitude, sensor, np.random.default_rng((seed, n)))  # frame n: whatever F is
-        quads[n] = reading.quad
-        full += int(reading.saturated.sum())
-        difference = np.abs(distance - distances[n])[interior[n]]
+        images, made = keep(f"frame-{n:06d}", partial(expose, n))
+        quads[n], amplitudes[n], phasor_distances[n] = (images[k] for k in ("quad", "amplitude", "phasor_distance"))
+        full += int(images["saturated"])
+        difference = np.abs(images["distance"] - distances[n])[interior[n]]
         total += float(difference.sum())
         largest = max(largest, float(difference.max(initial=0.0)))
-        if progress is not None:
+        if progress is not None and (made or n + 1 == frames):
             progress(n + 1, frames)
 
     pixels = int(interior.sum())
@@ -122,24 +143,34 @@ def record(
         sequence=Sequence(
             quads=quads,
             measured=np.ones(frames, dtype=bool),
-            shifts=shifts,
+            shifts=np.array([shot.shifts[0] for shot in shots]),
             times=times,
             f_mod_hz=float(sensor.f_mod_hz),
+            frequencies_hz=np.array([float(shot.f_mod_hz) for shot in shots]) if sensor.further_hz else None,
             phase_offset=float(sensor.phase_offset),
             dc_offset=float(sensor.dc_offset),
             fx=camera.fx,
             fy=camera.fy,
             cx=camera.cx,
             cy=camera.cy,
+            distortion=astuple(camera.distortion) if camera.distortion else None,
             camera_from_world=np.stack([camera.camera_from_world for camera in cameras]),
             novel_from_world=np.stack([inverse(view.world_from_body(0.0)) for view in scene.novel_views])
             if scene.novel_views
             else None,
             forward_flow=forward,
             backward_flow=backward,
-            **_colour(scene, size, times, longest, engine, seed=seed, noise=noise),
+            exposures=np.full(frames, sensor.exposure_s),
+            sensor=sensor_settings(sensor),
+            **_colour(scene, size, times, longest, engine, keep, seed=seed, noise=noise),
         ),
-        truth=Truth(distance=distances.astype(np.float32), known=np.ones(frames, dtype=bool)),
+        truth=Truth(
+            distance=distances.astype(np.float32),
+            known=np.ones(frames, dtype=bool),
+            phasor_distance=phasor_distances,
+            amplitude=amplitudes,
+            body=bodies,
+        ),
         gap=Gap(mean=total / pixels, max=largest, pixels=round(pixels / frames)) if pixels else None,
         saturated=full / quads.size,
     )
@@ -147,16 +178,28 @@ def record(
 
 def _engine(
     engine: str, scene: Scene, size, longest: Float[np.ndarray, "F"], bounces: Bounces, device: str, seed: int
-) -> Callable[[int, list[float], float, Sensor], Taken]:
+) -> Callable[[int, list[float], float, Sensor], Look]:
     """What takes an image: a function of a raw frame's number, the instants it averages, its time, and the sensor."""
     if engine not in ENGINES:
         raise ValueError(f"engine {engine!r} must be one of {', '.join(ENGINES)}")
+    if scene.lens.beam_power and bounces.count:
+        raise ValueError("lens.beam_power is of direct light: with bounces, use beam_deg")
     if engine == "mesh":
-        traced = Traced(scene, lambda time: scene.camera(size, time), bounces=bounces, device=device)
+        traced = Traced(
+            scene,
+            lambda time: scene.camera(size, time),
+            harmonics=scene.sensor.harmonics,
+            bounces=bounces,
+            device=device,
+        )
 
-        def trace(n: int, instants: list[float], time: float, sensor: Sensor) -> Taken:
+        def trace(n: int, instants: list[float], time: float, sensor: Sensor) -> Look:
             random = int(np.random.default_rng((seed, n, PATHS)).integers(2**31))  # frame n: whatever F is
-            return *traced.quad(instants, sensor, random), traced.first_hits(time).distance
+            mean = traced.light(instants, float(sensor.f_mod_hz), random)
+            still = mean if instants == [time] else traced.light([time], float(sensor.f_mod_hz), random)
+            quad, amplitude = mean_quad(mean.light, mean.amplitude, sensor)
+            phasor = still.light[0] * np.exp(1j * float(sensor.phase_offset))
+            return Look(quad, amplitude, traced.first_hits(time).distance, phasor)
 
         return trace
     if needs_mesh(scene, bounces.count):
@@ -166,12 +209,43 @@ def _engine(
         )
     splatted = Splatted(scene, lambda time: _fine(scene.camera(size, time), scene), longest)
 
-    def render(n: int, instants: list[float], time: float, sensor: Sensor) -> Taken:
-        del n, time
+    def render(n: int, instants: list[float], time: float, sensor: Sensor) -> Look:
+        del n
         looks = [look(splatted, instant, sensor, scene.subsamples) for instant in instants]
-        return tuple(np.mean(image, axis=0) for image in zip(*looks, strict=True))
+        still = looks[0] if instants == [time] else look(splatted, time, sensor, scene.subsamples)
+        quad, amplitude, distance = (np.mean(images, axis=0) for images in list(zip(*looks, strict=True))[:3])
+        return Look(quad, amplitude, distance, still.phasor)
 
     return render
+
+
+def _made_now(name: str, make: Callable[[], Images]) -> tuple[Images, bool]:
+    del name
+    return make(), True
+
+
+def _static_distance(seen: Look, sensor: Sensor) -> Float[np.ndarray, "H W"]:
+    """What a closed form decodes from four quads taken at once without noise [m], float32; NaN where there is no light.
+
+    In [0, c/2f): all light that reaches the pixel is in it, also what bounced. Harmonics of a sensor are not.
+    """
+    phasor = torch.from_numpy(np.asarray(seen.phasor, dtype=np.complex128))
+    distance = distance_from_phasor(phasor.real, phasor.imag, sensor).numpy()
+    return np.where(np.abs(seen.phasor) > 0, distance, np.nan).astype(np.float32)
+
+
+def sensor_settings(sensor: Sensor) -> dict[str, Any]:
+    """Every number of a sensor by name, for files: what a reader can check a result against."""
+    plain: dict[str, Any] = {}
+    for f in fields(sensor):
+        value = getattr(sensor, f.name)
+        if is_dataclass(value):
+            plain[f.name] = {part.name: getattr(value, part.name) for part in fields(value)}
+        elif isinstance(value, tuple):
+            plain[f.name] = [float(item) for item in value]
+        else:
+            plain[f.name] = value.item() if isinstance(value, torch.Tensor) else value
+    return plain
 
 
 def needs_mesh(scene: Scene, bounces: int) -> bool:
@@ -205,33 +279,39 @@ def _fine(camera: Camera, scene: Scene) -> Camera:
 
 def _truth(
     scene: Scene, cameras: list[Camera], times: Float[np.ndarray, "F"]
-) -> tuple[Float[np.ndarray, "F H W"], Bool[np.ndarray, "F H W"]]:
-    """Distance [m] of every raw frame, and its still interior: the same for all raw frames of a camera at rest."""
-    distances, interior = [], []
+) -> tuple[Float[np.ndarray, "F H W"], Int[np.ndarray, "F H W"], Bool[np.ndarray, "F H W"]]:
+    """Distance [m] and body of every raw frame, and its still interior: one for all raw frames of a camera at rest."""
+    distances, bodies, interior = [], [], []
     for camera, time in zip(cameras, times, strict=True):
         hit = first_hit(scene.bodies, camera, float(time))
         distances.append(hit.distance)
+        bodies.append(hit.body.astype(np.int16))
         interior.append(still_interior(scene, [hit]))
     inside = np.stack(interior)
-    return np.stack(distances), inside if scene.camera_moves else np.broadcast_to(inside.all(axis=0), inside.shape)
+    inside = inside if scene.camera_moves else np.broadcast_to(inside.all(axis=0), inside.shape)
+    return np.stack(distances), np.stack(bodies), inside
 
 
-def _colour(scene: Scene, size, times, longest, engine: str, *, seed: int, noise: bool) -> dict[str, Any]:
+def _colour(scene: Scene, size, times, longest, engine: str, keep: Keep, *, seed: int, noise: bool) -> dict[str, Any]:
     """The fields of a sequence that a colour camera fills: an image at every quartet start, and its poses."""
     if scene.colour is None:
         return {}
+    spread = scene.colour.noise
     cameras = [scene.colour_camera(size, float(time)) for time in times]
     if engine == "gaussian":
         splatted = Splatted(scene, lambda time: _fine(scene.colour_camera(size, time), scene), longest, colour=True)
-    images = {}
-    for n in range(0, len(times), FRAMES_PER_QUARTET):
+
+    def expose(n: int) -> Images:
         if engine == "gaussian":
             image = look_colour(splatted, float(times[n]), scene.subsamples)
         else:
             image = trace_colour(scene, cameras[n], float(times[n]))
         if noise:
-            image = image + np.random.default_rng((seed, n, 3)).normal(0.0, scene.colour.noise, image.shape)
-        images[n] = image.astype(np.float32)
+            image = image + np.random.default_rng((seed, n, 3)).normal(0.0, spread, image.shape)
+        return {"colour": image.astype(np.float32)}
+
+    starts = range(0, len(times), FRAMES_PER_QUARTET)
+    images = {n: keep(f"colour-{n:06d}", partial(expose, n))[0]["colour"] for n in starts}
     first = cameras[0]
     return {
         "colour": images,

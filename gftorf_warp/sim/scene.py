@@ -13,8 +13,10 @@ from jaxtyping import Float
 
 from ..scene.camera import Camera
 from ..scene.changes import Wording, changed
+from ..scene.optics import Lens
 from ..scene.sensor import Sensor
 from .paths import Path, Still, Vector, Viewpoint, inverse, rigid, rotation_matrix
+from .sensors import SENSORS
 from .world import Body, Box, Shape, Texture
 
 OVERRIDES = Wording(
@@ -22,6 +24,7 @@ OVERRIDES = Wording(
     example="sensor.f_mod_hz=30e6",
     where="the fields of gftorf_warp.sim.scene.Scene",
     fixed=("name", "closed_form", "overrides"),
+    named={"sensor": SENSORS},
 )
 
 
@@ -79,7 +82,9 @@ class Scene:
     subsamples: int = 2
     """Rays per pixel and axis that a quad averages: a pixel has an area, and at outlines it mixes what it sees."""
     sensor: Sensor = field(default_factory=lambda: Sensor(noise=True))
-    """The sensor; raw frame n has the shift ``sensor.shifts[n % 4]``."""
+    """The sensor; raw frame n is the one of number n in its cycle. By name, too: see sim/sensors.py."""
+    lens: Lens = field(default_factory=Lens)
+    """The lens of the ToF camera, and the beam of a light at the camera; the default is a pinhole, lit evenly."""
     camera_path: Path = field(default_factory=Still)
     """How the ToF camera moves; the default is at rest at the origin, looking along +z."""
     emitter: Vector = (0.0, 0.0, 0.0)
@@ -107,6 +112,10 @@ class Scene:
             raise ValueError(f"emitter must be finite, got {self.emitter}")
         if self.beam_deg is not None and not all(0 < angle < 180 for angle in self.beam_deg):
             raise ValueError(f"beam_deg must be between 0 and 180, got {self.beam_deg}")
+        if self.lens.beam_power and any(self.emitter):
+            raise ValueError(f"lens.beam_power is of a light at the camera; emitter is at {self.emitter}")
+        if self.lens.distortion:  # it must be one that can be undone
+            self.camera()
 
     @property
     def camera_moves(self) -> bool:
@@ -116,7 +125,8 @@ class Scene:
     def camera(self, size: tuple[int, int] | None = None, time: float = 0.0) -> Camera:
         """The ToF camera at (width, height) ``size`` [px], or at the default size, as it is at ``time`` [s]."""
         pose = inverse(self.camera_path.world_from_body(time))
-        return Camera.from_fov(*(size or (self.width, self.height)), self.horizontal_fov_deg, camera_from_world=pose)
+        camera = Camera.from_fov(*(size or (self.width, self.height)), self.horizontal_fov_deg, camera_from_world=pose)
+        return replace(camera, distortion=self.lens.distortion) if self.lens.distortion else camera
 
     def colour_camera(self, size: tuple[int, int] | None = None, time: float = 0.0) -> Camera:
         """The colour camera beside a ToF image of ``size`` [px], or of the default size, as it is at ``time`` [s].

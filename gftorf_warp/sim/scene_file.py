@@ -1,8 +1,9 @@
 """Scenes as TOML files of the user: the fields of :class:`gftorf_warp.sim.scene.Scene`, as tables.
 
 Every table is the settings of one dataclass. Where several kinds could stand, `kind` names one: a shape is "box",
-"plane", "sphere", "level" or "assembly", a path "still", "line", "arc", "guided", "viewpoint" or "sweep". What a table
-leaves out has its default. See examples/scene.toml.
+"plane", "sphere", "level" or "assembly", a path "still", "line", "arc", "guided", "viewpoint" or "sweep". A sensor may
+be a name of sim/sensors.py, or a table with that name as `preset`. What a table leaves out has its default. See
+examples/scene.toml.
 """
 
 from __future__ import annotations
@@ -12,13 +13,15 @@ import math
 import tomllib
 import types
 import typing
-from dataclasses import MISSING, fields, is_dataclass
+from dataclasses import MISSING, fields, is_dataclass, replace
 from pathlib import Path as FilePath
 from typing import Any, Union
 
 from ..errors import InputError
+from ..scene.sensor import Sensor
 from . import assembly, guided, paths, world
 from .scene import Scene
+from .sensors import SENSORS
 
 KINDS: dict[type, dict[str, type]] = {
     world.Shape: {
@@ -67,6 +70,7 @@ def _made(kind: type, table: Any, path: FilePath, where: str) -> Any:
     if not isinstance(table, dict):
         raise _wrong(path, where, f"expected a table, found {table!r}", "write { ... } or [...]")
     table = dict(table)
+    preset = _preset(table.pop("preset"), path, where) if kind is Sensor and "preset" in table else None
     if kind in KINDS:
         kinds, named = KINDS[kind], table.pop("kind", None)
         if named not in kinds:
@@ -84,7 +88,7 @@ def _made(kind: type, table: Any, path: FilePath, where: str) -> Any:
             raise _wrong(path, _join(where, name), f"a {kind.__name__} needs it", "add it")
     values = {key: _value(hints[key], value, path, _join(where, key)) for key, value in table.items()}
     try:
-        return kind(**values)
+        return kind(**values) if preset is None else replace(preset, **values)
     except ValueError as error:
         raise _wrong(path, where or "scene", str(error), "choose another value") from error
 
@@ -95,6 +99,8 @@ def _value(kind: Any, value: Any, path: FilePath, where: str) -> Any:
         options = [option for option in typing.get_args(kind) if option is not type(None)]
         table = isinstance(value, dict)
         kind = next((option for option in options if _is_table(option) == table), options[0])
+    if kind is Sensor and isinstance(value, str):
+        return _preset(value, path, where)
     if _is_table(kind):
         return _made(kind, value, path, where)
     if typing.get_origin(kind) is tuple:
@@ -114,6 +120,13 @@ def _value(kind: Any, value: Any, path: FilePath, where: str) -> Any:
         return value
     names = {float: "a finite number", int: "a whole number", bool: "true or false", str: "a text"}
     raise _wrong(path, where, f"expected {names.get(kind, kind)}, found {value!r}", "correct the value")
+
+
+def _preset(name: Any, path: FilePath, where: str) -> Sensor:
+    """A sensor by name."""
+    if name not in SENSORS:
+        raise _wrong(path, where, f"there is no sensor {name!r}", f"there are {', '.join(SENSORS)}")
+    return SENSORS[name]
 
 
 def _is_table(kind: Any) -> bool:

@@ -11,22 +11,24 @@ from typing import Any
 import numpy as np
 
 from ..constants import CANONICAL_SHIFTS, FRAMES_PER_QUARTET
+from ..data import capture_write, ftorf_write, torf_write
+from ..data.contact_sheet import SHIFTS_MIN, contact_sheet
+from ..data.files import atomic_write
+from ..data.sequence import Sequence
 from ..errors import UsageError
 from ..scene.sensor import Sensor
 from .card import outcome_card, settings_card
-from .readout import contrast
+from .ladder import NAMES, Errors, at_level, closed_form_errors, ladder_table
+from .readout import why_impossible
 from .record import ENGINES, Progress, frame_times, needs_mesh, record
 from .scene import overridden
 from .scene_file import read_scene
 from .scenes import SCENES, Scene
 from .splat import clearance
+from .unfinished import needs_recording, set_aside, unfinished
 
-CARD = "README.md"
 CLEARANCE = 0.5  # [m] nearer bodies fill the image, and a cover of them would need millions of splats
-FORMATS = {  # what every folder of a layout holds
-    "ftorf": ("cams/depth_range.npy", "tofType0"),
-    "torf": ("cams/depth_range.npy", "tof"),
-}
+FORMATS = ("ftorf", "torf", "capture")
 
 
 def simulate(
@@ -46,6 +48,7 @@ def simulate(
     paths: int = 64,
     device: str = "cpu",
     format: str = "ftorf",
+    level: str | None = None,
     fresh: bool = False,
     progress: Progress | None = None,
 ) -> Path:
@@ -54,7 +57,8 @@ def simulate(
     Raw frame n is an image of the scene at its own time, of which only the quad of slot n % 4 is kept and read out.
     Beside it stands the analytic distance along each pixel's centre ray at that very time. A camera that moves has a
     pose for each raw frame; a colour camera adds an image per quartet. The folder appears only when it is complete; if
-    it is already there and was made with the same settings, it is left as it is.
+    it is already there and was made with the same settings, it is left as it is. After an interruption the same call
+    goes on at the next raw frame: what was finished waits in OUT.partial, and the bytes are the same in the end.
 
     Args:
         scene: Name of a scene, see ``SCENES``, a TOML file of one, or a scene.
@@ -74,34 +78,27 @@ def simulate(
         bounces: Surfaces that light may meet after the first one; 0: direct light only. More of them need 'mesh'.
         paths: Random paths per pixel and raw frame for the light that bounces.
         device: Where engine 'mesh' traces; the other one renders on the CPU.
-        format: Layout on disk: 'ftorf', raw quads, or 'torf', one phasor per quartet with the time, pose and truth of
-            its first raw frame.
-        fresh: Whether another sequence in ``out`` is moved aside, to ``out-old-1``, instead of being an error.
+        format: Layout on disk: 'ftorf', raw quads; 'torf', one phasor per quartet with the time, pose and truth of its
+            first raw frame; 'capture', our own, which holds any shifts, exposures, amplitude and objects too.
+        level: Step of the ladder from ideal to realistic, see ``LEVELS`` of sim/ladder.py; it decides about the engine,
+            bounces, blur, noise and what of the sensor is ideal. None: everything as it is asked for.
+        fresh: Whether another sequence in ``out`` is moved aside, to ``out-old-1``, instead of being an error, and an
+            unfinished one begun again.
         progress: Called with (raw frames done, raw frames in all).
 
     Returns:
         The folder.
 
     Raises:
-        UsageError: If an option cannot be meant that way, the format cannot express the sensor, or ``out`` holds
-            something else.
+        UsageError: If an option cannot be meant that way, the format cannot express the sensor, ``out`` or what is
+            unfinished beside it holds something else, or the place cannot be written to.
+        BusyError: If another process records the same sequence.
         InputError: If a TOML file does not describe a scene.
     """
-    found = overridden(_scene(scene), overrides)
-    _check_options(found, frames, size, seed, exposure_samples, format)
-    _check_engine(found, engine, bounces, paths, device)
-    if flow and format == "torf":
-        raise UsageError(
-            "a ToeRF folder has no place for optical flow",
-            where="--flow",
-            why="flow belongs to the raw quads of an F-ToeRF folder",
-            fix="leave --flow out, or --format ftorf",
-        )
-    _check_sensor(found.sensor)
-    _check_duration(found, frames)
+    own = overridden(_scene(scene), overrides)
     options: dict[str, Any] = {
-        "frames": found.frames if frames is None else frames,
-        "size": (found.width, found.height) if size is None else tuple(size),
+        "frames": own.frames if frames is None else frames,
+        "size": (own.width, own.height) if size is None else tuple(size),
         "seed": seed,
         "sync": sync,
         "noise": noise,
@@ -111,19 +108,59 @@ def simulate(
         "bounces": bounces,
         "paths": paths,
     }
-    card = settings_card(found, options, format)
+    found, options = (own, options) if level is None else at_level(own, level, options)
+    _check_options(found, options, format)
+    _check_engine(found, options["engine"], options["bounces"], options["paths"], device)
+    if flow and format == "torf":
+        raise UsageError(
+            "a ToeRF folder has no place for optical flow",
+            where="--flow",
+            why="flow belongs to raw quads",
+            fix="leave --flow out, or --format ftorf",
+        )
+    _check_sensor(found.sensor, format)
+    _check_duration(found, frames)
+    card = settings_card(found, options, format, own=own, level=level)
     out = Path(out).absolute() if fresh else Path(out)
-    if not _check_folder(out, card, fresh=fresh):
+    if not needs_recording(out, card, fresh=fresh):
         return out
-    if format == "torf":
-        from ..data.torf_write import write
-    else:
-        from ..data.ftorf_write import write
-    recording = record(found, **options, device=device, progress=progress)
-    if fresh:
-        _set_aside(out)
-    write(out, recording.sequence, recording.truth, readme=card + outcome_card(recording))
+    write = {"ftorf": ftorf_write, "torf": torf_write, "capture": capture_write}[format].write
+    with unfinished(out, card, fresh=fresh) as keep:
+        recording = record(found, **options, device=device, progress=progress, keep=keep)
+        if fresh:
+            set_aside(out)
+        sheet = contact_sheet(recording.sequence, recording.truth, card.partition("\n")[0].removeprefix("# "))
+        write(out, recording.sequence, recording.truth, readme=card + outcome_card(recording), sheet=sheet)
     return out
+
+
+def simulate_ladder(
+    scene: str | Scene, out: str | Path, *, progress: Progress | None = None, **options: Any
+) -> dict[str, Errors]:
+    """Record a scene at every level of the ladder, into OUT/sync, OUT/L0 and so on, and say what each level costs.
+
+    ``OUT/ladder.md`` holds the table. Levels that are there already with the same settings are left as they are.
+
+    Args:
+        scene: As for :func:`simulate`.
+        out: Folder of the folders.
+        progress: Called with (raw frames done, raw frames in all) of each level in turn.
+        options: Those of :func:`simulate`, but for ``level``.
+
+    Returns:
+        Errors of the closed form by name of the level.
+
+    Raises:
+        UsageError, InputError, BusyError: As :func:`simulate`.
+    """
+    out, rows = Path(out), {}
+    for name in NAMES:
+        sequence = Sequence.open(simulate(scene, out / name, level=name, progress=progress, **options))
+        rows[name] = closed_form_errors(sequence, sequence.truth())
+    title = scene if isinstance(scene, str) else scene.name
+    lines = "\n".join(f"    {line}" for line in ladder_table(rows))
+    atomic_write(out / "ladder.md", f"# {title}: what each level of the ladder costs\n\n{lines}\n".encode())
+    return rows
 
 
 def _scene(scene: str | Scene) -> Scene:
@@ -144,13 +181,14 @@ def _scene(scene: str | Scene) -> Scene:
     return SCENES[scene]
 
 
-def _check_options(scene: Scene, frames, size, seed: int, exposure_samples: int, layout: str) -> None:
+def _check_options(scene: Scene, options: dict[str, Any], layout: str) -> None:
     least = FRAMES_PER_QUARTET if layout == "torf" else 1  # a phasor needs a whole quartet
+    frames, size, seed, exposure_samples = (options[k] for k in ("frames", "size", "seed", "exposure_samples"))
     wanted = {
-        "--frames": (frames is None or frames >= least, f"{frames}", f"at least {least}, for example {scene.frames}"),
+        "--frames": (frames >= least, f"{frames}", f"at least {least}, for example {scene.frames}"),
         "--size": (
-            size is None or (len(size) == 2 and min(size) >= 1),
-            "x".join(map(str, size or ())),
+            len(size) == 2 and min(size) >= 1,
+            "x".join(map(str, size)),
             f"WIDTHxHEIGHT, both at least 1, for example {scene.width}x{scene.height}",
         ),
         "--seed": (seed >= 0, f"{seed}", "0 or more"),
@@ -167,6 +205,15 @@ def _check_engine(scene: Scene, engine: str, bounces: int, paths: int, device: s
         "--paths": (paths >= 1, f"{paths}", "at least 1"),
     }
     _refuse(wanted)
+    if scene.lens.distortion:
+        raise UsageError(
+            "no engine renders through a lens that distorts",
+            where="lens.distortion",
+            why=f"both engines look along the rays of a pinhole, not {scene.lens.distortion}",
+            fix="leave lens.distortion out; gftorf_warp.sim.ideal makes ideal quads and truth through such a lens",
+        )
+    beam = "0 with bounces: it is of direct light; use beam_deg"
+    _refuse({"lens.beam_power": (not (scene.lens.beam_power and bounces), f"{scene.lens.beam_power:g}", beam)})
     if engine != "mesh":
         light = "mesh: the light is beside the camera, has a beam or bounces"
         _refuse({"--engine": (not needs_mesh(scene, bounces), repr(engine), light)})
@@ -180,21 +227,35 @@ def _refuse(wanted: dict[str, tuple[bool, str, str]]) -> None:
             raise UsageError(f"cannot simulate with {got}", where=where, why=f"expected {want}", fix="change it")
 
 
-def _check_sensor(sensor: Sensor) -> None:
+def _check_sensor(sensor: Sensor, layout: str) -> None:
     turns = sorted(round(math.degrees(shift), 4) % 360.0 for shift in sensor.shifts)
-    if turns != sorted(math.degrees(shift) for shift in CANONICAL_SHIFTS):
+    if layout == "capture" and len({turn % 360.0 for turn in turns}) < SHIFTS_MIN:
+        raise UsageError(
+            "this sensor cannot see a phase",
+            where="sensor.shifts",
+            why=f"a phase needs {SHIFTS_MIN} different shifts, found {turns} deg",
+            fix="give it more of them",
+        )
+    if layout != "capture" and turns != sorted(math.degrees(shift) for shift in CANONICAL_SHIFTS):
         raise UsageError(
             "an F-ToeRF folder cannot express this sensor",
             where="sensor.shifts",
             why=f"it holds the four shifts 0, 90, 180 and 270 deg in some order, not {turns} deg",
-            fix="use those four shifts",
+            fix="use those four shifts, or --format capture",
         )
-    if sensor.noise and not sensor.unipolar and contrast(sensor) * (1 + abs(float(sensor.dc_offset))) > 1:
+    if sensor.further_hz and layout != "capture":
+        raise UsageError(
+            "an F-ToeRF folder cannot express this sensor",
+            where="sensor.further_hz",
+            why=f"it has one modulation frequency, not {1 + len(sensor.further_hz)}",
+            fix="leave sensor.further_hz out, or --format capture",
+        )
+    impossible = why_impossible(sensor) if sensor.noise else None
+    if impossible is not None:
         raise UsageError(
             "a tap of this sensor would hold negative light",
             where="sensor.dc_offset",
-            why=f"differential taps allow contrast (1 + |dc_offset|) <= 1, not {contrast(sensor):g} (1 + "
-            f"{abs(float(sensor.dc_offset)):g})",
+            why=impossible,
             fix="lower the contrast or the DC offset, or make the sensor unipolar",
         )
 
@@ -212,34 +273,3 @@ def _check_duration(scene: Scene, frames: int | None) -> None:
                 why=f"scene {scene.name} is made for {scene.frames} raw frames, and it happens at frame {near[0]}",
                 fix=f"simulate at most {near[0]} raw frames",
             )
-
-
-def _check_folder(out: Path, card: str, *, fresh: bool) -> bool:
-    """Whether there is anything to do: False if ``out`` holds what these settings give.
-
-    Raises:
-        UsageError: If ``out`` holds anything else that may not be moved aside.
-    """
-    if not out.exists() or (out.is_dir() and not any(out.iterdir())):
-        return True
-    sequence = any(all((out / mark).exists() for mark in marks) for marks in FORMATS.values())
-    text = (out / CARD).read_text(errors="replace") if sequence and (out / CARD).is_file() else ""
-    if not fresh and text.startswith(card):
-        return False
-    if fresh and sequence:
-        return True
-    raise UsageError(
-        "the folder is not empty" if out.is_dir() else "not a folder",
-        where=out,
-        why="it holds a sequence made with other settings" if sequence else "it holds something that is no sequence",
-        fix="choose another --out" + (", or move this one aside with --fresh" if sequence else ""),
-    )
-
-
-def _set_aside(out: Path) -> None:
-    """Rename a folder with content to the first free ``out-old-N``."""
-    if out.exists() and any(out.iterdir()):
-        number = 1
-        while out.with_name(f"{out.name}-old-{number}").exists():
-            number += 1
-        out.rename(out.with_name(f"{out.name}-old-{number}"))

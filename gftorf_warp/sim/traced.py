@@ -11,7 +11,6 @@ from jaxtyping import Float, Int
 
 from ..render.trace import Bounces, FirstHits, Lamp, Light, RigidBody, Tracer
 from ..scene.camera import Camera
-from ..scene.sensor import Sensor
 from .assembly import Assembly, Level, Part
 from .look import pooled
 from .scene import Scene
@@ -63,13 +62,6 @@ class Traced:
         """Distance, z-depth, normal and body on the centre ray of every pixel at ``time`` [s]."""
         hits = self._tracer.first_hits(self.camera_at(time), self._poses(time))
         return replace(hits, body=np.where(hits.body < 0, hits.body, self._body[hits.body]))
-
-    def quad(self, times: Sequence[float], sensor: Sensor, seed: int = 0) -> tuple[Float[np.ndarray, "H W"], ...]:
-        """Mean quad of the sensor's first shift, and mean amplitude, of every pixel over instants [s]."""
-        mean = self.light(times, float(sensor.f_mod_hz), seed)
-        amplitude = float(sensor.source_intensity) * mean.amplitude.astype(np.float64)
-        turned = mean.light[0] * np.exp(1j * (float(sensor.phase_offset) - sensor.shifts[0]))
-        return float(sensor.source_intensity) * turned.real + float(sensor.dc_offset) * amplitude, amplitude
 
     def _poses(self, time: float) -> Float[np.ndarray, "P 4 4"]:
         """Pose of the body of each piece [m]."""

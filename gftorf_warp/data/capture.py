@@ -1,0 +1,291 @@
+"""Captures, our own sequences: the one place that knows their layout, which data_specs/capture.toml describes."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..constants import SPEED_OF_LIGHT
+from ..errors import InputError, UsageError
+from . import specs
+from .arrays import SIDE_MAX
+from .calibration import DEPTH_RANGES_M, FOCAL_MIN
+from .capture_json import FORMAT, NAME, json_fields, read_values
+from .capture_write import write
+from .exr import Parts, read_parts
+from .folder import FRAMES_MAX, empty_quads, format_of, numbered
+from .poses import rigid
+from .problems import Problems
+from .sequence import Sequence, Truth
+
+__all__ = ["read", "read_truth", "write"]
+
+MANIFEST = "MANIFEST.sha256"
+
+
+def read(path: str | Path, *, frame_rate_hz: float | None = None) -> Sequence:
+    """Read a capture: raw frames, calibration, colour, flow and novel views, never truth.
+
+    Args:
+        path: The folder.
+        frame_rate_hz: Must be None: a capture states the time of every raw frame.
+
+    Raises:
+        InputError: If the folder or a file in it is not what data_specs/capture.toml describes; names all of it.
+        UsageError: If a frame rate is given.
+        ResourceError: If it does not fit into memory.
+    """
+    if frame_rate_hz is not None:
+        why = "a capture states the time of every raw frame"
+        raise UsageError("frame rate", where="frame_rate_hz", why=why, fix="leave it out")
+    root = _root(Path(path))
+    values, problems = read_values(root), Problems()
+    _judge(root / NAME, values, problems)
+    problems.raise_if_any(root)
+    digests = _manifest(root)
+    width, height = (int(n) for n in values["size"])
+    measured, frames = values["measured"], len(values["id"])
+    files = _files(root, "tof", frames, problems)
+    for n in np.flatnonzero(measured).tolist():
+        if n not in files:
+            why = f"expected a file for every measured raw frame, found none for {n}"
+            fix = "complete the folder, or set measured to false"
+            problems.errors.append(InputError("quads: no such file", where=root / "tof", why=why, fix=fix))
+    quads = empty_quads(root, frames, {"H": height, "W": width})
+    images: dict[str, Any] = {"forward_flow": {}, "backward_flow": {}, "colour": {}}
+    for n, file in files.items():
+        parts = problems.attempt(_verified, root, file, digests)
+        if parts is None or not measured[n]:
+            continue
+        quad = problems.attempt(_image, file, parts, "quads", (height, width))
+        if quad is not None:
+            quads[n] = quad
+        for name in ("forward_flow", "backward_flow"):
+            flow = problems.attempt(_image, file, parts, name, (height, width))
+            if flow is not None:
+                images[name][n] = flow
+    colour_size = tuple(int(n) for n in values["colour_size"][::-1]) if "colour_size" in values else None
+    for n, file in _files(root, "colour", frames, problems).items():
+        parts = problems.attempt(_verified, root, file, digests)
+        image = None if parts is None else problems.attempt(_image, file, parts, "colour", colour_size)
+        if image is not None:
+            images["colour"][n] = image
+    problems.raise_if_any(root)
+    frequencies, several = values["f_mod_hz"], len(set(values["f_mod_hz"].tolist())) > 1
+    fx, fy, cx, cy = _pinhole(values["intrinsics"])
+    colour, lens = values.get("colour_intrinsics"), values["distortion"].tolist() if "distortion" in values else None
+    return Sequence(
+        quads=quads,
+        measured=measured,
+        shifts=values["shift"],
+        times=values["time"],
+        f_mod_hz=float(frequencies[0]),
+        frequencies_hz=frequencies if several else None,
+        exposures=values.get("exposure"),
+        sensor=values.get("sensor_settings", {}),
+        phase_offset=float(values["phase_offset"]),
+        dc_offset=float(values["dc_offset"]),
+        fx=fx,
+        fy=fy,
+        cx=cx,
+        cy=cy,
+        distortion=None if lens is None else (lens[0], lens[1], lens[2], lens[3], lens[4]),
+        camera_from_world=_inverse(values["pose"]),
+        quad_scale=float(values["raw_scale"]) if "raw_scale" in values else None,
+        from_phasors=values["kind"] == "phasor",
+        colour_intrinsics=None if colour is None else _pinhole(colour),
+        colour_from_world=_inverse(values["colour_pose"]) if "colour_pose" in values else None,
+        novel_from_world=_inverse(values["novel"]) if "novel" in values else None,
+        sources=_sources(values, images, int(measured.sum())),
+        path=root,
+        **images,
+    )
+
+
+def read_truth(path: str | Path, *, frames: int) -> Truth | None:
+    """Read what is known of the scene itself: both distances, amplitude and objects; None if nothing is.
+
+    Args:
+        path: The folder.
+        frames: Number F of raw frames of the sequence.
+
+    Raises:
+        InputError: If an image is not what data_specs/capture.toml describes.
+    """
+    root, problems = _root(Path(path)), Problems()
+    files = _files(root, "truth", frames, problems)
+    problems.raise_if_any(root)
+    if not files:
+        return None
+    digests, values = _manifest(root), read_values(root)
+    width, height = (int(n) for n in values["size"])
+    stacks: dict[str, np.ndarray] = {}
+    known = np.zeros(frames, dtype=bool)
+    for n, file in files.items():
+        parts = problems.attempt(_verified, root, file, digests)
+        if parts is None:
+            continue
+        for name in ("distance", "phasor_distance", "amplitude", "object"):
+            image = problems.attempt(_image, file, parts, name, (height, width))
+            if image is None:
+                continue
+            if name not in stacks:
+                stacks[name] = np.full((frames, height, width), 0 if name == "object" else np.nan, dtype=image.dtype)
+            if name != "object" and (image < 0).any():
+                why = f"expected 0 or more, or NaN where unknown, found {np.nanmin(image):g}"
+                fix = "store NaN where it is unknown"
+                problems.errors.append(InputError(f"{name}: negative", where=file, why=why, fix=fix))
+            stacks[name][n] = image
+            known[n] |= name == "distance"
+    problems.raise_if_any(root)
+    if "distance" not in stacks:
+        return None
+    distance = np.where(stacks["distance"] == 0, np.float32(np.nan), stacks["distance"])
+    body = stacks["object"].astype(np.int64) - 1 if "object" in stacks else None
+    more = {name: stacks.get(name) for name in ("phasor_distance", "amplitude")}
+    return Truth(distance=distance, known=known, body=None if body is None else body.astype(np.int32), **more)
+
+
+def _root(path: Path) -> Path:
+    """The folder, if it is one of this format."""
+    if format_of(path) != FORMAT:
+        why = f"expected a folder with {NAME}, found none"
+        raise InputError("not a capture", where=path, why=why, fix="read it as what it is")
+    return path
+
+
+def _files(root: Path, folder: str, frames: int, problems: Problems) -> dict[int, Path]:
+    """Files of raw frames in a folder; those of others are errors, and links may not lead out of it."""
+    found = numbered(root, f"{folder}/{{id}}.exr")
+    for n, file in found.items():
+        if n >= frames or not file.resolve().is_relative_to(root.resolve()):
+            why = f"expected files of raw frames below {frames}, in this folder; found {n}"
+            problems.errors.append(InputError("no raw frame", where=file, why=why, fix="remove it"))
+    return {n: file for n, file in found.items() if n < frames}
+
+
+def _manifest(root: Path) -> dict[str, str]:
+    """SHA-256 by relative name; empty if the folder has no manifest."""
+    path = root / MANIFEST
+    if not path.is_file():
+        return {}
+    digests = {}
+    for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), start=1):
+        match = re.fullmatch(r"([0-9a-f]{64})  (\S+)", line)
+        if match is None:
+            why = f"expected 64 hexadecimal digits, two blanks and a name, found {line[:80]!r} in line {number}"
+            raise InputError("no manifest", where=path, why=why, fix="copy it again, or remove it")
+        digests[match[2]] = match[1]
+    verify(root, root / NAME, digests)
+    return digests
+
+
+def verify(root: Path, file: Path, digests: dict[str, str]) -> None:
+    """Compare a file with the manifest, if there is one.
+
+    Raises:
+        InputError: If the file differs, or the manifest does not name it.
+    """
+    name = file.relative_to(root).as_posix()
+    if digests and hashlib.sha256(file.read_bytes()).hexdigest() != digests.get(name):
+        why = f"its SHA-256 is not that of {MANIFEST}" if name in digests else f"{MANIFEST} does not name it"
+        fix = f"restore it, or remove {MANIFEST} if the change was yours"
+        raise InputError("content changed", where=file, why=why, fix=fix)
+
+
+def _verified(root: Path, file: Path, digests: dict[str, str]) -> Parts:
+    verify(root, file, digests)
+    return read_parts(file)
+
+
+def _image(file: Path, parts: Parts, name: str, shape: tuple[int, ...] | None) -> np.ndarray | None:
+    """One field of a file, channels first if it has several, last if they are colours; None if it may be absent."""
+    field = specs.fields(FORMAT)[name]
+    if field.key not in parts:
+        if not field.required:
+            return None
+        why = f"expected a part {field.key!r}, found {', '.join(parts)}"
+        raise InputError(f"{name}: no such part", where=file, why=why, fix="export the file again")
+    channels = parts[field.key]
+    images = [channels[channel] for channel in field.channels if channel in channels]
+    kinds = {image.dtype.kind for image in images}
+    if len(images) != len(channels) or len(images) != len(field.channels) or kinds != {field.dtypes}:
+        why = f"expected channels {', '.join(field.channels)}, found {', '.join(channels)} of kinds {kinds}"
+        raise InputError(f"{name}: wrong channels", where=file, why=why, fix="export the file again")
+    if shape is None or images[0].shape != shape:
+        why = f"expected rows x columns {shape}, found {images[0].shape}"
+        raise InputError(f"{name}: wrong shape", where=file, why=why, fix=f"export that size, or correct {NAME}")
+    for image in images if field.dtypes == "f" else []:
+        if np.isinf(image).any() or (field.nan == "error" and np.isnan(image).any()):
+            why = f"expected finite numbers{' or NaN for unknown' if field.nan == 'unknown' else ''}, found others"
+            raise InputError(f"{name}: not finite", where=file, why=why, fix="export the file again")
+    return images[0] if len(images) == 1 else np.stack(images, axis=-1 if name == "colour" else 0)
+
+
+def _judge(path: Path, values: dict[str, Any], problems: Problems) -> None:
+    """What each value by itself cannot say: bounds, and what fits together."""
+    frames, width = len(values["id"]), float(values["size"][0])
+    times, frequencies = values["time"], values["f_mod_hz"]
+    poses = [values[name] for name in ("pose", "colour_pose", "novel") if name in values]
+    rules = {  # field: (whether it holds, what is expected)
+        "size": (((values["size"] >= 1) & (values["size"] <= SIDE_MAX)).all(), f"1 to {SIDE_MAX} pixels"),
+        "id": (
+            np.array_equal(values["id"], np.arange(frames)) and frames < FRAMES_MAX,
+            "0, 1, 2 and so on, one for each raw frame",
+        ),
+        "time": (times[0] == 0 and (np.diff(times) >= 0).all(), "seconds from 0 that never decrease"),
+        "f_mod_hz": (
+            ((frequencies > 0) & (frequencies * DEPTH_RANGES_M[0] <= SPEED_OF_LIGHT)).all()
+            and (frequencies * DEPTH_RANGES_M[1] >= SPEED_OF_LIGHT).all(),
+            f"{SPEED_OF_LIGHT / DEPTH_RANGES_M[1]:.3g} to {SPEED_OF_LIGHT / DEPTH_RANGES_M[0]:.3g} Hz",
+        ),
+        "exposure": ("exposure" not in values or (values["exposure"] > 0).all(), "seconds above 0"),
+        "measured": (values["measured"].any(), "at least one measured raw frame"),
+        "intrinsics": (_is_pinhole(values["intrinsics"], width), "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels"),
+        "colour_intrinsics": (
+            "colour_intrinsics" not in values
+            or ("colour_size" in values and _is_pinhole(values["colour_intrinsics"], float(values["colour_size"][0]))),
+            "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels, and a size",
+        ),
+        "raw_scale": ("raw_scale" not in values or values["raw_scale"] > 0, "more than 0"),
+        "pose": (all(rigid(matrices).all() for matrices in poses), "rotations and translations, camera to world"),
+    }
+    for name, (holds, expected) in rules.items():
+        if not holds:
+            key = json_fields()[name].key
+            error = InputError(f"{key}: implausible", where=path, why=f"expected {expected}", fix="correct the file")
+            problems.errors.append(error)
+
+
+def _is_pinhole(matrix: np.ndarray, width: float) -> bool:
+    expected = np.eye(3)
+    expected[0, 0], expected[1, 1], expected[:2, 2] = matrix[0, 0], matrix[1, 1], matrix[:2, 2]
+    return np.array_equal(matrix, expected) and min(matrix[0, 0], matrix[1, 1]) >= FOCAL_MIN * width
+
+
+def _pinhole(matrix: np.ndarray) -> tuple[float, float, float, float]:
+    return float(matrix[0, 0]), float(matrix[1, 1]), float(matrix[0, 2]), float(matrix[1, 2])
+
+
+def _inverse(poses: np.ndarray) -> np.ndarray:
+    return np.linalg.inv(poses) + 0.0  # no minus zeros
+
+
+def _sources(values: dict[str, Any], images: dict[str, dict[int, np.ndarray]], measured: int) -> dict[str, str]:
+    """Where each field of the sequence is from."""
+    sources = {}
+    for field in specs.fields(FORMAT).values():
+        for name in field.fills:
+            there = field.name in values if field.kind == "json" else bool(images.get(name, True))
+            place = f"{NAME} {field.key}" if field.kind == "json" else f"{field.paths[0].partition('/')[0]}"
+            if field.role != "truth":
+                sources[name] = f"file {place}" if there else "default none"
+    for name, found in images.items():
+        sources[name] += f", {len(found)} images" if found else ""
+    sources["measured"] += f": {measured} of {len(values['id'])} raw frames"
+    sources["pixel_centre"] = f"file {NAME} pixel_centre: half"
+    return sources

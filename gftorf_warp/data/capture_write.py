@@ -1,0 +1,156 @@
+"""Writing a sequence as a capture: the inverse of :func:`gftorf_warp.data.capture.read`."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .. import __version__
+from .capture_json import NAME
+from .exr import Parts, write_parts
+from .files import atomic_folder, write_through
+from .sequence import Sequence, Truth
+from .writing import float32, readme_and_sheet, refuse_inexpressible, validate
+
+VERSION = "1.0"
+MANIFEST = "MANIFEST.sha256"
+
+
+def write(
+    path: str | Path,
+    sequence: Sequence,
+    truth: Truth | None = None,
+    *,
+    readme: str | None = None,
+    sheet: bytes | None = None,
+) -> Path:
+    """Write a sequence, and its truth if there is any, as a capture that appears only when it is complete.
+
+    Reading it again gives the same sequence: images bit by bit in float32, numbers as they were, poses, which are
+    stored inverted, to the last digit or two.
+
+    Args:
+        path: New or empty folder.
+        sequence: What to write: any shifts, any frequencies, raw frames or phasors.
+        truth: True distances [m] of the raw frames, and whatever else of it is known.
+        readme: Text of a README.md in the folder.
+        sheet: A picture of it all, as PNG.
+
+    Returns:
+        The folder.
+
+    Raises:
+        UsageError: If the format cannot express the sequence, or the folder cannot be created.
+        ResourceError: If the disk is full.
+        ValueError: If shapes of the sequence or the truth contradict each other.
+    """
+    validate(sequence, truth)
+    refuse_inexpressible("capture", sequence, truth)
+    with atomic_folder(path) as folder:
+        write_through(folder / NAME, _json(sequence))
+        (folder / "tof").mkdir()
+        for n in np.flatnonzero(sequence.measured).tolist():
+            write_parts(folder / f"tof/{n:06d}.exr", _raw_frame(sequence, n))
+        for n, image in sequence.colour.items():
+            (folder / "colour").mkdir(exist_ok=True)
+            channels = dict(zip("RGB", np.moveaxis(float32(image), -1, 0), strict=True))
+            write_parts(folder / f"colour/{n:06d}.exr", {"colour": channels})
+        if truth is not None:
+            (folder / "truth").mkdir()
+            for n in np.flatnonzero(truth.known).tolist():
+                write_parts(folder / f"truth/{n:06d}.exr", _truth(truth, n))
+        names = sorted(file.relative_to(folder).as_posix() for file in folder.rglob("*") if file.is_file())
+        digests = [f"{hashlib.sha256((folder / name).read_bytes()).hexdigest()}  {name}\n" for name in names]
+        for name, content in readme_and_sheet(readme, sheet):
+            write_through(folder / name, content)
+        write_through(folder / MANIFEST, "".join(digests).encode())
+    return Path(path)
+
+
+def _raw_frame(sequence: Sequence, n: int) -> Parts:
+    """What the ToF camera recorded in one raw frame."""
+    parts: Parts = {"raw": {"q": float32(sequence.quads[n])}}
+    for name, images in (("flow.forward", sequence.forward_flow), ("flow.backward", sequence.backward_flow)):
+        if n in images:
+            parts[name] = dict(zip(("dx", "dy"), float32(images[n]), strict=True))
+    return parts
+
+
+def _truth(truth: Truth, n: int) -> Parts:
+    """What is known of the scene at the time of one raw frame."""
+    parts: Parts = {"distance": {"distance": float32(truth.distance[n])}}
+    if truth.phasor_distance is not None:
+        parts["phasor_distance"] = {"distance": float32(truth.phasor_distance[n])}
+    if truth.amplitude is not None:
+        parts["amplitude"] = {"amplitude": float32(truth.amplitude[n])}
+    if truth.body is not None:
+        parts["object"] = {"object": (truth.body[n].astype(np.int64) + 1).astype(np.uint32)}
+    return parts
+
+
+def _json(sequence: Sequence) -> bytes:
+    """Everything but images; one value a line, one raw frame a line."""
+    cameras = {"tof": _camera((sequence.width, sequence.height), sequence.fx, sequence.fy, sequence.cx, sequence.cy)}
+    if sequence.distortion is not None:
+        cameras["tof"]["distortion"] = [float(k) for k in sequence.distortion]
+    colour = next(iter(sequence.colour.values()), None)
+    if sequence.colour_intrinsics is not None:
+        size = (sequence.width, sequence.height) if colour is None else colour.shape[1::-1]
+        cameras["colour"] = _camera(size, *sequence.colour_intrinsics)
+    elif colour is not None:
+        cameras["colour"] = {"size": list(colour.shape[1::-1])}
+    sensor: dict[str, Any] = {
+        "phase_offset_rad": float(sequence.phase_offset),
+        "dc_offset": float(sequence.dc_offset),
+        "raw_unit": "relative",
+    }
+    if sequence.quad_scale is not None:
+        sensor["raw_scale"] = float(sequence.quad_scale)
+    if sequence.sensor:
+        sensor["settings"] = sequence.sensor
+    head: dict[str, Any] = {
+        "schema": "capture",
+        "version": VERSION,
+        "units": {"length": "m", "time": "s", "angle": "rad"},
+        "axes": "opencv",
+        "pixel_centre": "half",
+        "kind": "phasor" if sequence.from_phasors else "raw",
+        "cameras": cameras,
+        "sensor": sensor,
+        "provenance": {"writer": f"gftorf-warp {__version__}"},
+    }
+    if sequence.novel_from_world is not None:
+        head["novel_to_world"] = _inverse(sequence.novel_from_world)
+    lines = [json.dumps(frame, allow_nan=False) for frame in _frames(sequence)]
+    rows = [f" {json.dumps(key)}: {json.dumps(value, allow_nan=False)},\n" for key, value in head.items()]
+    return ("{\n" + "".join(rows) + ' "frames": [\n  ' + ",\n  ".join(lines) + "\n ]\n}\n").encode()
+
+
+def _frames(sequence: Sequence) -> list[dict[str, Any]]:
+    """One table for each raw frame."""
+    columns: dict[str, Any] = {
+        "id": list(range(sequence.frames)),
+        "t": sequence.times.tolist(),
+        "f_mod_hz": sequence.frame_frequencies.tolist(),
+        "shift_rad": sequence.shifts.tolist(),
+        "measured": sequence.measured.tolist(),
+        "camera_to_world": _inverse(sequence.camera_from_world),
+    }
+    if sequence.exposures is not None:
+        columns["exposure"] = sequence.exposures.tolist()
+    if sequence.colour_from_world is not None:
+        columns["colour_to_world"] = _inverse(sequence.colour_from_world)
+    return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+
+
+def _camera(size: tuple[int, ...], fx: float, fy: float, cx: float, cy: float) -> dict[str, Any]:
+    matrix = [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]
+    return {"size": [int(n) for n in size], "K": [[float(x) for x in row] for row in matrix]}
+
+
+def _inverse(poses: np.ndarray) -> list:
+    return (np.linalg.inv(poses) + 0.0).tolist()  # no minus zeros

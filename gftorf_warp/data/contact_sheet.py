@@ -1,0 +1,237 @@
+"""A picture of a sequence for people: raw quads of one quartet, amplitude, distances, errors, objects, flow, colour.
+
+It is drawn from numbers and never read back. No dependency beyond OpenCV, which encodes PNG and has a font.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from ..constants import FRAMES_PER_QUARTET
+from .decode import distance_from_phase, quartet_phasor
+from .sequence import Sequence, Truth
+from .truth import known_distance
+
+PANEL = 340  # [px] width of an image on the sheet
+BAR, BAR_GAP, BAR_TEXT = 12, 8, 70  # [px] width of a colour bar, its distance from the image, room for its numbers
+TITLE, GAP, MARGIN = 30, 18, 24  # [px] height of a title, space between panels, around all of them
+HEAD = 70  # [px] height of the heading
+INK, SOFT, UNKNOWN = (32, 32, 32), (110, 110, 110), (200, 200, 200)
+CLIP = 99.5  # percentile of an error that is the end of its scale: one wrapped pixel must not darken all others
+COLUMNS = 4
+SHIFTS_MIN = 3  # different ones: cosine, sine and a constant
+PALETTE = ((230, 159, 0), (86, 180, 233), (0, 158, 115), (240, 228, 66), (0, 114, 178), (213, 94, 0), (204, 121, 167))
+
+Picture = UInt8[np.ndarray, "h w 3"]
+Colours = Callable[[Float[np.ndarray, "H W"]], Picture]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Panel:
+    """One image with its title and its scale."""
+
+    title: str
+    """What it shows, with its unit."""
+    image: Picture
+    """Red, green, blue."""
+    scale: tuple[float, float, Colours] | None = None
+    """Lowest and highest value and the colours between; None: no colour bar."""
+
+
+def contact_sheet(sequence: Sequence, truth: Truth | None, title: str) -> bytes:
+    """PNG of the middle quartet of a sequence.
+
+    Args:
+        sequence: What was recorded.
+        truth: What the scene really was, if that is known.
+        title: Heading.
+    """
+    import cv2
+
+    quartets = _decodable(sequence)
+    n = FRAMES_PER_QUARTET * quartets[len(quartets) // 2] if quartets else int(np.flatnonzero(sequence.measured)[0])
+    rows = [_raw(sequence, n), _decoded(sequence, truth, n, bool(quartets)), _more(sequence, truth, n)]
+    panels = [row[i : i + COLUMNS] for row in rows for i in range(0, len(row), COLUMNS)]
+    height = round(PANEL * sequence.height / sequence.width)
+    cell = PANEL + BAR_GAP + BAR + BAR_TEXT
+    size = (2 * MARGIN + HEAD + len(panels) * (TITLE + height + GAP), 2 * MARGIN + COLUMNS * (cell + GAP) - GAP, 3)
+    sheet = np.full(size, 255, dtype=np.uint8)
+    _write(sheet, title, (MARGIN, MARGIN + 22), 24, INK, bold=True)
+    frequencies = ", ".join(f"{f / 1e6:.6g}" for f in dict.fromkeys(sequence.frame_frequencies.tolist()))
+    about = (
+        f"{int(sequence.measured.sum())} raw frames of {sequence.width}x{sequence.height} pixels, {frequencies} MHz, "
+        f"{sequence.times[-1]:.3g} s; shown: the quartet of raw frame {n}. A picture for people, no data."
+    )
+    _write(sheet, about, (MARGIN, MARGIN + 48), 15, SOFT)
+    for i, row in enumerate(panels):
+        for j, panel in enumerate(row):
+            x, y = MARGIN + j * (cell + GAP), MARGIN + HEAD + i * (TITLE + height + GAP)
+            _place(sheet, panel, x, y, height)
+    done, data = cv2.imencode(".png", np.ascontiguousarray(sheet[..., ::-1]))  # OpenCV keeps blue first
+    if not done:
+        raise ValueError(f"sheet {sheet.shape} could not be encoded")
+    return data.tobytes()
+
+
+def _decodable(sequence: Sequence) -> list[int]:
+    """Quartets whose closed form there is: complete, of one frequency, of shifts that determine a phase."""
+    if sequence.frequencies_hz is not None:
+        return []
+    turns = np.round(np.exp(1j * sequence.shifts), 3)
+    quartets = [slice(FRAMES_PER_QUARTET * i, FRAMES_PER_QUARTET * (i + 1)) for i in sequence.complete_quartets]
+    return [q.start // FRAMES_PER_QUARTET for q in quartets if len(set(turns[q].tolist())) >= SHIFTS_MIN]
+
+
+def _raw(sequence: Sequence, n: int) -> list[Panel]:
+    """The raw frames of a quartet on one scale."""
+    frames = [m for m in range(n, min(n + FRAMES_PER_QUARTET, sequence.frames)) if sequence.measured[m]]
+    end = float(np.percentile(np.abs(sequence.quads[frames]), CLIP)) or 1.0
+    panels = []
+    for m in frames:
+        name = f"raw frame {m}: {math.degrees(sequence.shifts[m]):.4g} deg, {1e3 * sequence.times[m]:.2f} ms"
+        panels.append(_scaled(name, sequence.quads[m], (-end, end), _diverging))
+    return panels
+
+
+def _decoded(sequence: Sequence, truth: Truth | None, n: int, whole: bool) -> list[Panel]:
+    """Amplitude, true distance, closed form and its error; what of it there is."""
+    panels = []
+    decoded = None
+    if whole:
+        re, im = quartet_phasor(sequence, n // FRAMES_PER_QUARTET)
+        decoded = distance_from_phase(np.arctan2(im, re), sequence)
+        amplitude = 0.5 * np.hypot(re, im)
+        panels.append(_scaled("amplitude of the closed form", amplitude, (0.0, _end(amplitude)), _gray))
+    elif truth is not None and truth.amplitude is not None:
+        amplitude = truth.amplitude[n].astype(np.float64)
+        panels.append(_scaled("amplitude without noise", amplitude, (0.0, _end(amplitude)), _gray))
+    if truth is None:
+        if decoded is not None:
+            panels.append(_scaled("closed form [m]", decoded, (decoded.min(), decoded.max()), _viridis))
+        return panels
+    true = known_distance(truth)[n]
+    if not np.isfinite(true).any():
+        return panels
+    ends = float(np.nanmin(true)), float(np.nanmax(true))
+    panels.append(_scaled("true distance [m]", true, ends, _viridis))
+    if decoded is not None:
+        error = np.abs(decoded - true)
+        panels.append(_scaled("closed form [m]", decoded, ends, _viridis))
+        panels.append(_scaled("error of the closed form [m]", error, (0.0, _end(error)), _inferno))
+    return panels
+
+
+def _more(sequence: Sequence, truth: Truth | None, n: int) -> list[Panel]:
+    """What the light alone does to the distance, objects, flow and colour; what of it there is."""
+    panels = []
+    if truth is not None and truth.phasor_distance is not None:
+        difference = truth.phasor_distance[n] - known_distance(truth)[n]
+        end = max(_end(np.abs(difference)), 1e-3)
+        panels.append(_scaled("static phasor - true distance [m]", difference, (-end, end), _diverging))
+    if truth is not None and truth.body is not None:
+        colours = np.array([(255, 255, 255), *PALETTE], dtype=np.uint8)
+        body = truth.body[n]
+        index = np.where(body < 0, 0, 1 + body % len(PALETTE))
+        panels.append(Panel(title=f"objects, {len(np.unique(body[body >= 0]))} in view", image=colours[index]))
+    flow = sequence.forward_flow.get(n)
+    if flow is not None:
+        length = np.hypot(*flow)
+        end = max(float(np.nanmax(length)) if np.isfinite(length).any() else 0.0, 1e-6)
+        panels.append(Panel(title=f"flow to raw frame {n + 4}, up to {end:.3g} px", image=_flow(flow, end)))
+    image = sequence.colour.get(n)
+    if image is not None:
+        top = float(np.percentile(image, CLIP)) or 1.0
+        panels.append(Panel(title=f"colour, raw frame {n}", image=_eight_bits(np.clip(image / top, 0, 1) ** (1 / 2.2))))
+    return panels
+
+
+def _scaled(title: str, image: np.ndarray, ends: tuple[float, float], colours: Colours) -> Panel:
+    low, high = ends if ends[1] > ends[0] else (ends[0] - 0.5, ends[0] + 0.5)
+    with np.errstate(invalid="ignore"):
+        share = np.clip((image - low) / (high - low), 0.0, 1.0)
+    painted = colours(np.nan_to_num(share, nan=0.0))
+    painted[np.isnan(image)] = UNKNOWN
+    return Panel(title=title, image=painted, scale=(low, high, colours))
+
+
+def _place(sheet: Picture, panel: Panel, x: int, y: int, height: int) -> None:
+    """Draw a panel with its upper left corner at x, y [px]."""
+    import cv2
+
+    _write(sheet, panel.title, (x, y + 20), 16, INK)
+    top = y + TITLE
+    h, w = panel.image.shape[:2]
+    factor = min(PANEL / w, height / h)
+    size = max(1, round(w * factor)), max(1, round(h * factor))
+    shrinks = cv2.INTER_AREA if factor < 1 else cv2.INTER_NEAREST
+    sheet[top : top + size[1], x : x + size[0]] = cv2.resize(panel.image, size, interpolation=shrinks)
+    cv2.rectangle(sheet, (x - 1, top - 1), (x + size[0], top + size[1]), UNKNOWN, 1)  # white may be a value
+    if panel.scale is None:
+        return
+    low, high, colours = panel.scale
+    left = x + PANEL + BAR_GAP
+    ramp = np.linspace(1.0, 0.0, height)[:, None]
+    sheet[top : top + height, left : left + BAR] = colours(np.repeat(ramp, BAR, axis=1))
+    for value, at in ((high, top + 12), ((low + high) / 2, top + height // 2 + 5), (low, top + height - 2)):
+        _write(sheet, f"{value:.3g}", (left + BAR + 6, at), 14, INK)
+
+
+def _write(sheet: Picture, text: str, at: tuple[int, int], size: int, colour, *, bold: bool = False) -> None:
+    """Text with the left end of its base line at a place [px]."""
+    import cv2
+
+    cv2.putText(sheet, text, at, colour, cv2.FontFace("sans"), size, 700 if bold else 400)
+
+
+def _end(image: np.ndarray) -> float:
+    """Where the scale of something that is never negative ends."""
+    known = image[np.isfinite(image)]
+    return float(np.percentile(known, CLIP)) if known.size else 1.0
+
+
+def _eight_bits(image: np.ndarray) -> Picture:
+    return np.round(255.0 * image).astype(np.uint8)
+
+
+def _gray(share: np.ndarray) -> Picture:
+    return _eight_bits(np.repeat(share[..., None], 3, axis=-1))
+
+
+def _mapped(share: np.ndarray, name: str) -> Picture:
+    import cv2
+
+    return np.ascontiguousarray(cv2.applyColorMap(_eight_bits(share), getattr(cv2, name))[..., ::-1])
+
+
+def _viridis(share: np.ndarray) -> Picture:
+    return _mapped(share, "COLORMAP_VIRIDIS")
+
+
+def _inferno(share: np.ndarray) -> Picture:
+    return _mapped(share, "COLORMAP_INFERNO")
+
+
+def _diverging(share: np.ndarray) -> Picture:
+    """Blue below the middle, white in it, red above."""
+    x = 2.0 * share[..., None] - 1.0
+    blue, red, white = (np.array(c) / 255.0 for c in ((33, 102, 172), (178, 24, 43), (255, 255, 255)))
+    return _eight_bits(white + np.abs(x) * (np.where(x < 0, blue, red) - white))
+
+
+def _flow(flow: np.ndarray, end: float) -> Picture:
+    """Direction as hue, length as saturation: white is at rest."""
+    import cv2
+
+    known = np.isfinite(flow).all(axis=0)
+    dx, dy = np.nan_to_num(flow)
+    hue = np.degrees(np.arctan2(dy, dx)) % 360.0 / 2.0
+    strength = np.clip(np.hypot(dx, dy) / end, 0.0, 1.0)
+    hsv = np.stack([hue, 255.0 * strength, np.full_like(hue, 255.0)], axis=-1).astype(np.uint8)
+    image = cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB)
+    image[~known] = UNKNOWN
+    return image

@@ -1,0 +1,55 @@
+"""One process at a time in a folder: a lock that the system releases when the process ends, however it ends."""
+
+from __future__ import annotations
+
+import os
+import socket
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from ..errors import BusyError
+
+
+@contextmanager
+def locked(folder: Path, name: str, what: str) -> Iterator[None]:
+    """Hold ``FOLDER/NAME``, which names process and host.
+
+    Args:
+        folder: It is made if it is missing.
+        name: File name of the lock; it stays.
+        what: What the folder holds, for the message.
+
+    Raises:
+        BusyError: If another process, or another call in this one, holds it.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / name).open("a+") as file:
+        if not _try_lock(file.fileno()):
+            file.seek(0)
+            raise BusyError(
+                f"another process works on this {what}",
+                where=folder,
+                why=f"its lock is held by {file.read().strip() or 'somebody'}",
+                fix="wait for it, stop it, or choose another --out",
+            )
+        file.truncate(0)
+        file.write(f"process {os.getpid()} on {socket.gethostname()}\n")
+        file.flush()
+        try:
+            yield
+        finally:
+            file.truncate(0)  # the file stays: removing it would let two others each lock a file of that name
+
+
+def _try_lock(descriptor: int) -> bool:
+    """Take the system's lock on an open file, without waiting; where the system has none, everybody gets it."""
+    try:
+        import fcntl
+    except ImportError:  # not a Unix
+        return True
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        return False
+    return True

@@ -1,0 +1,93 @@
+"""How many electrons a sensor counts, and how exactly it then knows a distance (sensor notes, 2.2 to 2.5).
+
+A tap holds B + A cos(..) electrons and adds read noise of deviation s_r. With K equally spaced shifts
+
+    sigma_psi = sqrt(2/K) sqrt(B + s_r^2) / A      one tap          sigma_d = c / (4 pi f) sigma_psi
+              = sqrt(1/K) sqrt(B + s_r^2) / A      two taps
+
+whatever the phase, but for three shifts of one tap. An ADC of e electrons per code adds e^2/12 to the variance of a
+quad: of one tap, or half of it to each of two. Tensors give tensors, with gradients: sensors can be designed with them.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from ..constants import SPEED_OF_LIGHT
+from .sensor import Scalar, Sensor
+
+REFERENCE_EXPOSURE_S = 2.34e-3  # the exposure that electrons_per_unit refers to
+
+
+def electron_gain(sensor: Sensor) -> float:
+    """Modulated electrons per exposure and relative unit of amplitude, G, both taps together [e-]."""
+    return sensor.electrons_per_unit * sensor.exposure_s / REFERENCE_EXPOSURE_S
+
+
+def contrast(sensor: Sensor) -> Scalar:
+    """Demodulation contrast C at the modulation frequency [1]; 1 / dc_offset of a unipolar sensor."""
+    if sensor.unipolar:
+        return 1.0 / sensor.dc_offset
+    if sensor.contrast_cutoff_hz is None:
+        return sensor.contrast
+    return sensor.contrast / (1.0 + (sensor.f_mod_hz / sensor.contrast_cutoff_hz) ** 2)
+
+
+def dark_electrons(sensor: Sensor) -> float:
+    """Mean dark electrons of a tap in one exposure, N_dark [e-]."""
+    return sensor.dark_electrons_per_s * sensor.exposure_s
+
+
+def phase_noise(
+    mean: Scalar, amplitude: Scalar, read: float, samples: int, *, taps: int = 2, phase: Scalar | None = None
+) -> Tensor:
+    """Standard deviation of a decoded phase [rad], where it is small against 1.
+
+    Args:
+        mean: Mean electrons B of a tap [e-]; number or tensor.
+        amplitude: Amplitude A of the electrons of a tap [e-]; likewise.
+        read: Standard deviation of what is added to a tap's count [e-].
+        samples: Number K of equally spaced shifts.
+        taps: 1, or 2 whose difference is taken.
+        phase: True phase [rad]; only K = 3 with one tap depends on it. None: the mean over all phases.
+
+    Raises:
+        ValueError: If there are fewer than three shifts, or another number of taps.
+    """
+    if samples < 3 or taps not in (1, 2):
+        raise ValueError(f"a phase needs at least 3 samples, got {samples}, of 1 or 2 taps, got {taps}")
+    mean, amplitude = torch.as_tensor(mean, dtype=torch.float64), torch.as_tensor(amplitude, dtype=torch.float64)
+    tap = mean + read**2
+    variance = 2.0 / (taps * samples) * tap / amplitude**2
+    if taps == 1 and samples == 3 and phase is not None:
+        variance = variance * (1.0 - amplitude * torch.cos(3.0 * torch.as_tensor(phase)) / (2.0 * tap))
+    return variance.sqrt()
+
+
+def predicted_phase_noise(amplitude: Scalar, sensor: Sensor) -> Tensor:
+    """Standard deviation [rad] of the phase that ``sensor`` decodes from one cycle at its first frequency, float64.
+
+    A plain sine, equally spaced shifts and nothing full are assumed; patterns are left out.
+
+    Args:
+        amplitude: Relative amplitude a = s r / d^2 of one surface [1]; number or tensor.
+        sensor: Electrons, contrast, taps, number of shifts.
+    """
+    active = electron_gain(sensor) * torch.as_tensor(amplitude, dtype=torch.float64)
+    taps = 1 if sensor.unipolar else 2
+    step = 0.0 if sensor.adc_bits is None else sensor.electrons_per_code
+    added = math.sqrt(sensor.read_noise_electrons**2 + step**2 / (12.0 * taps))
+    mean = 0.5 * (sensor.ambient_electrons + active) + dark_electrons(sensor)
+    return phase_noise(mean, 0.5 * contrast(sensor) * active, added, len(sensor.shifts), taps=taps)
+
+
+def predicted_distance_noise(amplitude: Scalar, sensor: Sensor) -> Tensor:
+    """Standard deviation [m] of the distance that ``sensor`` decodes; as :func:`predicted_phase_noise`.
+
+    Differentiable by ``f_mod_hz``: -sigma (1/f + C'/C). The modulation frequency with the least noise is the cutoff of
+    the contrast; long before, distances are no longer unambiguous.
+    """
+    return SPEED_OF_LIGHT / (4.0 * math.pi * sensor.f_mod_hz) * predicted_phase_noise(amplitude, sensor)

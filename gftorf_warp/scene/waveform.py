@@ -1,0 +1,87 @@
+"""Waves that are no sines: their harmonics, what a sensor correlates of them, and the error that remains of it.
+
+Light is emitted as 1 + sum_h s_h cos(h w t), a tap opens as (1 + sum_h m_h cos(h (w t - shift))) / 2, and a quad has
+
+    sum_h C_h cos(h (psi - shift)),   C_h = s_h m_h / 2
+
+(sensor notes, 2.3). Decoding takes that for a sine: the phase errs by an amount that depends on the phase, *wiggling*.
+"""
+
+from __future__ import annotations
+
+import enum
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+
+class Waveform(enum.StrEnum):
+    """The shape of one period."""
+
+    SINE = "sine"
+    SQUARE = "square"
+
+
+def harmonics_of(wave: Waveform, count: int, duty: float = 0.5) -> tuple[float, ...]:
+    """Cosine coefficients 1 .. ``count`` of a periodic wave whose mean is 1 [1].
+
+    Args:
+        wave: 'sine': 1 + cos. 'square': on for the share ``duty`` of a period, off otherwise.
+        count: How many.
+        duty: Share of the period that is on [1]; a short pulse has a larger first coefficient, 2 sin(pi D) / (pi D).
+
+    Raises:
+        ValueError: If the duty is not between 0 and 1, or there is no coefficient.
+    """
+    if not 0 < duty < 1 or count < 1:
+        raise ValueError(f"duty {duty} must be between 0 and 1, and count {count} at least 1")
+    if Waveform(wave) is Waveform.SINE:
+        return (1.0, *[0.0] * (count - 1))
+    return tuple(2.0 * math.sin(math.pi * h * duty) / (math.pi * h * duty) for h in range(1, count + 1))
+
+
+def contrasts(emission: Waveform, demodulation: Waveform, count: int, duty: float = 0.5) -> tuple[float, ...]:
+    """Contrast C_h of each harmonic h = 1 .. ``count`` [1]; ``duty`` is of the emission; taps are open half the time.
+
+    Raises:
+        ValueError: If the duty is not between 0 and 1, or there is no coefficient.
+    """
+    pairs = zip(harmonics_of(emission, count, duty), harmonics_of(demodulation, count), strict=True)
+    return tuple(0.5 * s * m for s, m in pairs)
+
+
+def contrast_ratios(emission: Waveform, demodulation: Waveform, count: int, duty: float = 0.5) -> tuple[float, ...]:
+    """C_h / C_1 for h = 2 .. ``count`` [1], as :class:`Sensor` takes them; arguments as in :func:`contrasts`.
+
+    Rounding of what is exactly 0, the even harmonics of a square wave, is removed, so that nobody renders them.
+    """
+    first, *others = contrasts(emission, demodulation, count, duty)
+    return tuple(0.0 if abs(other) < 1e-12 else other / first for other in others)
+
+
+def peak(ratios: Sequence[float]) -> float:
+    """Largest magnitude of cos x + sum_h r_h cos(h x) over a period [1]; ``ratios`` start at h = 2."""
+    x = np.linspace(0.0, 2.0 * math.pi, 256 * (len(ratios) + 1))  # 256 points in the shortest period
+    return float(np.abs(sum(r * np.cos(h * x) for h, r in enumerate((1.0, *ratios), start=1))).max())
+
+
+def wiggling(phase: Float[np.ndarray, "*n"], ratios: Sequence[float], samples: int) -> Float[np.ndarray, "*n"]:
+    """Decoded minus true phase [rad] of ``samples`` equally spaced shifts, to first order in C_h / C_1.
+
+    A harmonic is seen as the fundamental if it is a neighbour of a multiple of the number of shifts, and not at all
+    otherwise (sensor notes, 2.6).
+
+    Args:
+        phase: True phase [rad].
+        ratios: C_h / C_1 for h = 2, 3, ... [1].
+        samples: Number of shifts K.
+    """
+    error = np.zeros(np.shape(phase))
+    for h, ratio in enumerate(ratios, start=2):
+        if (h - 1) % samples == 0:
+            error = error + ratio * np.sin((h - 1) * np.asarray(phase))
+        if (h + 1) % samples == 0:
+            error = error - ratio * np.sin((h + 1) * np.asarray(phase))
+    return error

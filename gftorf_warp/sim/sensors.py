@@ -1,0 +1,113 @@
+"""Sensors by name: two products and three that public data sets were recorded with (sensor notes, section 3).
+
+    gftorf simulate occlusion --override sensor=mlx75027        or, in a scene file, sensor = "mlx75027"
+
+A name sets every field of the sensor; single ones can be changed after it. Products are *like* theirs: no unit was
+measured, and what makers do not publish is assumed, as said below. Lens, image size and field of view are the scene's.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+from ..constants import SPEED_OF_LIGHT
+from ..scene.pattern import Pattern
+from ..scene.sensor import Sensor
+
+PAIRED = tuple(math.radians(angle) for angle in (0, 180, 90, 270))  # the synthetic F-TöRF files
+PALINDROMIC = tuple(math.radians(angle) for angle in (180, 90, 0, 270))  # the real ones, -cos, +sin, +cos, -sin
+SEQUENTIAL = tuple(math.radians(angle) for angle in (0, 90, 180, 270))
+GAIN, DARK = 0.01, 0.2  # [1] PRNU and DSNU, assumed for both makers
+
+
+def ftorf_synthetic() -> Sensor:
+    """The synthetic F-TöRF sequences: one ideal tap, exact numbers, an instant; 19.986 MHz, from their depth_range."""
+    return Sensor(f_mod_hz=SPEED_OF_LIGHT / 15.0, shifts=PAIRED, dc_offset=1.0, unipolar=True, exposure_s=0.0)
+
+
+def ftorf_real() -> Sensor:
+    """The real F-TöRF captures: two taps at 120 raw frames a second, their order of shifts, electrons of an OPT8241.
+
+    The files say 19.986 MHz, the paper 30 MHz: ``sensor.f_mod_hz=29.979e6`` for the latter.
+    """
+    return Sensor(f_mod_hz=SPEED_OF_LIGHT / 15.0, shifts=PALINDROMIC, noise=True)
+
+
+def torf_real() -> Sensor:
+    """The TöRF captures: 29.979 MHz, to be written as phasors, 30 a second."""
+    return Sensor(f_mod_hz=SPEED_OF_LIGHT / 10.0, shifts=PALINDROMIC, noise=True)
+
+
+def opt8241_cdk() -> Sensor:
+    """Like a TI OPT8241 in its CDK-EVM kit, at 30 MHz.
+
+    From its datasheet: contrast, 12 bits; from its SDK: exposure at 18/64 duty, phase pattern. Assumed: read noise,
+    full well, dark current, electrons per code, PRNU, DSNU, and the f/1.2 lens behind the electrons per unit.
+    """
+    return Sensor(
+        f_mod_hz=30e6,
+        shifts=PALINDROMIC,
+        noise=True,
+        exposure_s=2.34e-3,
+        electrons_per_unit=3.144e5,
+        contrast=0.45,
+        dark_electrons_per_s=5.0e4,
+        read_noise_electrons=80.0,
+        full_well_electrons=1.0e5,
+        adc_bits=12,
+        electrons_per_code=32.0,
+        pattern=Pattern(phase=1.0, gain=GAIN, dark=DARK),
+    )
+
+
+def mlx75027() -> Sensor:
+    """Like a Melexis MLX75027 at 60 MHz, with the light, lens and exposure of the other.
+
+    From its datasheet 1.0: contrast .85 at 40 and .78 at 100 MHz, which a cutoff of 303 MHz fits; read noise, full well
+    and dark current at the middle temperature; 12 bits of 94.3 electrons. Electrons per unit are the other's times the
+    area of a pixel, (10 um / 15 um)^2, at the same efficiency of 51 %. Assumed: PRNU, DSNU.
+    """
+    return Sensor(
+        f_mod_hz=60e6,
+        shifts=SEQUENTIAL,
+        noise=True,
+        exposure_s=2.34e-3,
+        electrons_per_unit=3.144e5 * (10.0 / 15.0) ** 2,
+        contrast=0.865,
+        contrast_cutoff_hz=303e6,
+        dark_electrons_per_s=5.1e4,
+        read_noise_electrons=83.0,
+        full_well_electrons=1.06e5,
+        adc_bits=12,
+        electrons_per_code=1.0 / 0.0106,
+        pattern=Pattern(gain=GAIN, dark=DARK),
+    )
+
+
+SENSORS: Mapping[str, Sensor] = {
+    make.__name__: make() for make in (ftorf_synthetic, ftorf_real, torf_real, opt8241_cdk, mlx75027)
+}
+"""Every named sensor."""
+
+
+def effect_rows(sensor: Sensor) -> dict[str, str]:
+    """What of a sensor goes beyond one frequency, a sine and equal pixels, for people; empty: nothing."""
+    rows = {}
+    if sensor.further_hz:
+        listed = ", then at ".join(f"{float(f) / 1e6:.9g} MHz" for f in (sensor.f_mod_hz, *sensor.further_hz))
+        rows["cycle"] = f"{len(sensor.cycle)} raw frames: all shifts at {listed}"
+    if any(sensor.harmonic_contrast):
+        ratios = ", ".join(f"{sensor.contrast_ratio(h):.4g} at harmonic {h}" for h in sensor.harmonics[1:])
+        rows["contrast of harmonics"] = f"relative to the first: {ratios}"
+    if sensor.contrast_cutoff_hz is not None:
+        rows["cutoff of the contrast"] = (
+            f"{sensor.contrast_cutoff_hz / 1e6:g} MHz: it is that of 0 Hz, {sensor.contrast:g}, over 1 + (f / cutoff)^2"
+        )
+    if sensor.pattern != Pattern():
+        pattern = sensor.pattern
+        rows["fixed pattern"] = (
+            f"phase {pattern.phase:g} times that of an OPT8241 kit, response to light +-{100 * pattern.gain:g} %, dark "
+            f"current +-{100 * pattern.dark:g} %, specimen {pattern.seed}"
+        )
+    return rows

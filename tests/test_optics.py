@@ -1,0 +1,253 @@
+"""Lenses: distortion against OpenCV, its inverse, what it does to the truth; fall-off and beam on a frontal wall."""
+
+import math
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from small_runs import small
+
+from gftorf_warp.errors import InputError, UsageError
+from gftorf_warp.recon.train import reconstruct
+from gftorf_warp.render.api import rasterize
+from gftorf_warp.render.trace import RigidBody, Tracer
+from gftorf_warp.scene.camera import Camera
+from gftorf_warp.scene.distortion import Distortion
+from gftorf_warp.scene.electrons import electron_gain
+from gftorf_warp.scene.gaussians import GaussianField, constant_sh
+from gftorf_warp.scene.measured import camera_of
+from gftorf_warp.scene.optics import Lens, lens_rows, shading
+from gftorf_warp.scene.pattern import Pattern, gain_map
+from gftorf_warp.scene.sensor import Sensor
+from gftorf_warp.sim.assembly import Level
+from gftorf_warp.sim.ideal import ideal_recording, light_of
+from gftorf_warp.sim.paths import Still
+from gftorf_warp.sim.readout import read_out
+from gftorf_warp.sim.record import record
+from gftorf_warp.sim.scene import Scene
+from gftorf_warp.sim.simulate import simulate
+from gftorf_warp.sim.world import Body, Texture
+
+BARREL = Distortion(k1=-0.25, k2=0.08, p1=0.002, p2=-0.003, k3=-0.01)
+PINCUSHION = Distortion(k1=0.15, k2=-0.02)
+WALL = Body(shape=Level(axis=2, value=3.0), texture=Texture(low=0.5, high=0.5), path=Still(position=(0.0, 0.0, 0.0)))
+
+
+def scene(**settings):
+    """A grey wall at z = 3 m, with one pixel on the optical axis and one ray per pixel."""
+    sensor = Sensor(shifts=(0.0, math.pi), dc_offset=1.0, contrast=0.4)
+    texts = {"name": "wall", "description": "", "motion": ""}
+    size = {"frames": 2, "width": 33, "height": 25, "subsamples": 1}
+    return Scene(**{**texts, **size, "bodies": (WALL,), "sensor": sensor, **settings})
+
+
+@pytest.mark.parametrize("lens", [BARREL, PINCUSHION], ids=["barrel", "pincushion"])
+def test_distortion_is_opencv_s(lens):
+    """Where a lens images points, and back again."""
+    camera = Camera(width=320, height=240, fx=230.0, fy=228.0, cx=159.0, cy=119.0, distortion=lens)
+    points = np.random.default_rng(0).uniform([-1, -0.7, 1.5], [1, 0.7, 4.0], (200, 3))
+    matrix = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]])
+    coefficients = np.array([lens.k1, lens.k2, lens.p1, lens.p2, lens.k3])
+    want = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, coefficients)[0][:, 0]
+    np.testing.assert_allclose(camera.project(torch.from_numpy(points)).numpy(), want, atol=1e-8)
+    x, y = points[:, 0] / points[:, 2], points[:, 1] / points[:, 2]
+    np.testing.assert_allclose(lens.undo(*lens.apply(x, y)), (x, y), atol=1e-10)
+
+
+@pytest.mark.parametrize("lens", [BARREL, PINCUSHION], ids=["barrel", "pincushion"])
+def test_rays_meet_the_pixel_centres(lens):
+    """A point on the ray of a pixel is imaged at its centre; a pose turns the rays as it did before."""
+    pose = np.eye(4)
+    pose[:3, :3] = [[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]]
+    camera = Camera(width=40, height=30, fx=29.0, fy=28.0, cx=19.0, cy=16.0, camera_from_world=pose, distortion=lens)
+    rays = camera.rays(dtype=torch.float64)
+    seen = camera.project(torch.from_numpy(camera.centre) + 2.0 * rays).numpy()
+    y, x = np.mgrid[:30, :40] + 0.5
+    np.testing.assert_allclose(seen, np.stack([x, y], -1), atol=1e-8)
+    np.testing.assert_allclose(rays.norm(dim=-1).numpy(), 1.0)
+    fine = camera.resized(80, 60).directions().reshape(30, 2, 40, 2, 3).mean((1, 3))
+    bent = torch.nn.functional.normalize(fine, dim=-1) - camera.directions()
+    assert bent.norm(dim=-1).max() < 1e-3  # sub-samples of the same lens surround the ray of the pixel
+
+
+def test_derivatives_of_a_lens():
+    """Against central differences: they decide where a lens folds."""
+    x, y = np.random.default_rng(0).uniform(-0.8, 0.8, (2, 50))
+    lens, step = Distortion(k1=-0.25, k2=0.3, p1=0.2, p2=-0.1, k3=0.4), 1e-6
+    by_x = (np.array(lens.apply(x + step, y)) - lens.apply(x - step, y)) / (2 * step)
+    by_y = (np.array(lens.apply(x, y + step)) - lens.apply(x, y - step)) / (2 * step)
+    xx, xy, yy = lens._slope(x, y)
+    np.testing.assert_allclose((xx, xy), by_x, atol=1e-8)
+    np.testing.assert_allclose((xy, yy), by_y, atol=1e-8)
+
+
+def test_truth_and_ideal_quads_are_seen_through_the_lens():
+    """Distance of the wall along the bent rays; the sequence keeps the coefficients."""
+    bent = scene(lens=Lens(distortion=BARREL))
+    cosine = bent.camera().directions()[..., 2].numpy()
+    np.testing.assert_allclose(light_of(bent, 0.0).distance, 3.0 / cosine, rtol=1e-12)
+    straight = light_of(scene(), 0.0).distance
+    assert np.abs(straight - 3.0 / cosine)[0, 0] > 0.05
+    sequence, truth = ideal_recording(bent)
+    np.testing.assert_allclose(truth.distance[0], 3.0 / cosine, rtol=1e-6)
+    assert sequence.distortion == (BARREL.k1, BARREL.k2, BARREL.p1, BARREL.p2, BARREL.k3)
+    assert camera_of(sequence, 0).distortion == BARREL
+    assert ideal_recording(scene())[0].distortion is None
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"distortion": (-0.2, 0.0, 0.0, 0.0, 0.0)}, "a pinhole, found a lens"),
+        (
+            {"frequencies_hz": np.repeat([20e6, 30e6], 6)},
+            r"one modulation frequency .* found \[20000000.0, 30000000.0\]",
+        ),
+    ],
+)
+def test_what_cannot_be_rendered_is_not_reconstructed(changes, says, tmp_path):
+    """A sequence through a lens, or of two frequencies, would be fitted wrong without a word."""
+    with pytest.raises(InputError, match=says):
+        reconstruct(replace(small(), **changes), tmp_path / "run", "demo", images=4)
+
+
+def test_lenses_that_cannot_be_undone_are_refused():
+    """A fold inside the image, and coefficients that are no numbers; nothing is decided by luck of an iteration."""
+    fold = Distortion(k1=-2.0)  # r (1 - 2 r^2) turns at r = .41
+    with pytest.raises(ValueError, match=r"k1=-2\.0.* cannot be undone"):
+        Camera.from_fov(33, 25, 60.0, distortion=fold)
+    Camera.from_fov(33, 25, 10.0, distortion=fold)  # far inside its turn
+    twice = Distortion(k1=-1.0, k2=0.3)  # turns, and turns back: what it images at .5 is behind both, at 1.546
+    np.testing.assert_allclose(twice.apply(np.array([1.54582907]), np.zeros(1)), [[0.5], [0.0]], atol=1e-7)
+    with pytest.raises(ValueError, match="cannot be undone"):
+        twice.undo(np.array([0.5]), np.zeros(1))
+    with pytest.raises(ValueError, match="cannot be undone"):
+        scene(lens=Lens(distortion=fold))
+    with pytest.raises(ValueError, match="p2 must be finite"):
+        Distortion(p2=math.nan)
+
+
+def test_engines_refuse_a_lens_that_distorts(tmp_path):
+    """Before anything is written; the layers below refuse it too."""
+    for engine in ("gaussian", "mesh"):
+        with pytest.raises(UsageError, match="no engine renders through a lens") as caught:
+            simulate(scene(lens=Lens(distortion=BARREL)), tmp_path / "out", engine=engine)
+        assert caught.value.where == "lens.distortion"
+    with pytest.raises(UsageError, match="cannot be undone"):
+        simulate("demo", tmp_path / "out", overrides=["lens.distortion.k1=-2"])
+    assert not (tmp_path / "out").exists()
+    camera = scene(lens=Lens(distortion=BARREL)).camera()
+    one = torch.ones(1)
+    field = GaussianField(
+        mean=torch.tensor([[0.0, 0.0, 3.0]]),
+        log_scale=torch.zeros(1, 3),
+        quaternion=torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
+        opacity_logit=one,
+        reflectivity_sh=constant_sh(one),
+    )
+    with pytest.raises(ValueError, match="only a pinhole"):
+        rasterize(field, camera, Sensor())
+    with pytest.raises(ValueError, match="only a pinhole"):
+        Tracer([RigidBody(radius=1.0, low=0.5, high=0.5, cell=0.3)], 33, 25).first_hits(camera, np.eye(4)[None])
+
+
+@pytest.mark.parametrize(
+    ("lens", "power"),
+    [
+        (Lens(), 3),
+        (Lens(cosine_power=4.0), 7),
+        (Lens(cosine_power=4.0, beam_power=-3.0), 4),
+    ],
+)
+def test_fall_off_of_a_frontal_wall(lens, power):
+    """Sensor notes, T24: cos^3 of an isotropic emitter, cos^7 with the lens, cos^4 if the wall is lit evenly; 1e-5."""
+    image = record(scene(lens=lens), engine="mesh", noise=False).sequence.quads.astype(np.float64).mean(0)
+    cosine = scene().camera().directions()[..., 2].numpy()
+    assert cosine.min() < 0.83
+    np.testing.assert_allclose(image / image[12, 16], cosine**power, rtol=1e-5)
+
+
+def test_both_engines_are_shaded_alike():
+    """The shading is the sensor's, not an engine's: it multiplies what either of them gives."""
+    lens = Lens(cosine_power=4.0, vignetting=(-0.3, 0.05), beam_power=2.0)
+    for engine in ("gaussian", "mesh"):
+        plain, shaded = (record(scene(lens=one), engine=engine, noise=False).sequence.quads for one in (Lens(), lens))
+        np.testing.assert_allclose(shaded, plain * shading(lens, scene().camera()).active, rtol=1e-6)
+
+
+def test_a_beam_keeps_its_power():
+    """Sensor notes, T6: whatever its shape, its mean over the solid angle of the image is 1; ambient light has none."""
+    camera = Camera.from_fov(320, 240, 70.0)
+    cosine = camera.directions()[..., 2].numpy()
+    for power in (-3.0, 1.0, 8.0):
+        seen = shading(Lens(beam_power=power), camera)
+        assert (seen.active * cosine**3).sum() / (cosine**3).sum() == pytest.approx(1.0, rel=1e-12)
+        np.testing.assert_array_equal(seen.ambient, np.ones((240, 320)))
+    assert shading(Lens(distortion=BARREL), camera) is None
+
+
+def test_ambient_light_passes_the_lens_and_not_the_beam():
+    """What each pixel gets of the ambient electrons is its reflectance times the fall-off times its own response."""
+    sensor = Sensor(noise=True, ambient_electrons=4e4, pattern=Pattern(gain=0.2), dark_electrons_per_s=0.0)
+    sensor = replace(sensor, read_noise_electrons=0.0, adc_bits=None)
+    camera = Camera.from_fov(8, 6, 60.0)
+    seen, dark = shading(Lens(cosine_power=4.0, beam_power=8.0), camera), np.zeros((6, 8))
+    draws = [
+        read_out(dark, dark, sensor, np.random.default_rng(n), ambient=np.full((6, 8), 0.5), shading=seen).quad
+        for n in range(4000)
+    ]
+    want = 2e4 * seen.ambient * gain_map(sensor.pattern, 6, 8)  # the variance of a difference of two taps
+    got = np.var(draws, axis=0) * (sensor.contrast * electron_gain(sensor)) ** 2
+    np.testing.assert_allclose(got, want, rtol=5 * math.sqrt(2 / 4000))
+    assert np.ptp(want) > 0.5 * want.max()
+
+
+def test_vignetting_is_one_on_the_axis_and_its_polynomial_in_the_corner():
+    """The farthest pixel has r = 1; V multiplies all light."""
+    camera = Camera.from_fov(33, 25, 60.0)
+    seen = shading(Lens(vignetting=(-0.3, -0.1)), camera)
+    assert seen.ambient[12, 16] == 1.0
+    assert seen.ambient[0, 0] == pytest.approx(0.6)
+    np.testing.assert_array_equal(seen.active, seen.ambient)
+
+
+@pytest.mark.parametrize(
+    ("settings", "says"),
+    [
+        ({"cosine_power": math.nan}, "cosine_power must be finite"),
+        ({"beam_power": math.inf}, "beam_power must be finite"),
+        ({"vignetting": (-1.2,)}, "vignetting must keep V above 0"),
+        ({"vignetting": (0.4,)}, "not above 1"),
+    ],
+)
+def test_lenses_that_cannot_be(settings, says):
+    """The message names the setting."""
+    with pytest.raises(ValueError, match=says):
+        Lens(**settings)
+
+
+def test_a_beam_is_of_direct_light_at_the_camera(tmp_path):
+    """Elsewhere it would be another light; both ways to ask for it say so."""
+    with pytest.raises(ValueError, match="beam_power is of a light at the camera"):
+        scene(lens=Lens(beam_power=1.0), emitter=(0.04, 0.0, 0.0))
+    with pytest.raises(UsageError, match="bounces"):
+        simulate(scene(lens=Lens(beam_power=1.0)), tmp_path / "out", engine="mesh", bounces=1)
+    with pytest.raises(ValueError, match="bounces"):
+        record(scene(lens=Lens(beam_power=1.0)), engine="mesh", bounces=1)
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_card_names_what_a_lens_does(tmp_path):
+    """And nothing of a pinhole."""
+    assert lens_rows(Lens()) == {}
+    assert set(lens_rows(Lens(distortion=BARREL, vignetting=(-0.1,), beam_power=1.0))) == {
+        "distortion",
+        "fall-off",
+        "beam",
+    }
+    overrides = ["lens.cosine_power=4", "lens.vignetting=-0.2,0.05"]
+    path = simulate("demo", tmp_path / "out", frames=4, size=(24, 18), overrides=overrides)
+    card = (path / "README.md").read_text()
+    assert "| fall-off | cosine to the power 4, times 1 -0.2 r^2 +0.05 r^4 with r = 1 in the farthest corner |" in card
