@@ -198,13 +198,14 @@ def _copy(to: Tensor, rows: Tensor) -> None:
 def _choice(place: Float[Tensor, "N columns"], keys: int) -> tuple[Float[Tensor, "aligned r"], int]:
     """Zeros and ones that add up rows of each key by a product, and how many rows lie side by side in it.
 
-    A product of few rows with many columns fills a GPU without splitting its sum; what lies side by side is added later.
+    A product of few rows with many columns fills a GPU without splitting its sum; what lies side by side is added
+    later. Columns are what is contiguous: there are as many rows as 16 bytes hold.
     """
     fold = math.gcd(len(place), FOLD)
     each = len(place) // fold
-    choice = place.new_zeros(-(-keys // ALIGNED) * ALIGNED, keys * each)
-    choice[:keys].view(keys, keys, each).diagonal(dim1=0, dim2=1).fill_(1.0)
-    return choice, fold
+    choice = place.new_zeros(keys, each, -(-keys // ALIGNED) * ALIGNED)
+    choice.diagonal(dim1=0, dim2=2).fill_(1.0)
+    return choice.flatten(0, 1).T, fold
 
 
 def _largest(values: Float[Tensor, "rows v"]) -> Float[Tensor, ""]:
