@@ -6,8 +6,8 @@
 A query is one key time; a timing holds one encoding of positions, as a step has it, and the gradient of all weights.
 On a GPU every row is timed twice: called from Python, and replayed as a CUDA graph, which must give what the call gave.
 Rows of one N and Q take turns. ``kernels`` counts what the device ran in one call, products included; ``error`` is the
-largest difference of an offset from that in float32, for weights whose offsets are a few decimetres. ``--profile`` lists
-under every row what ran longest in it, replayed on a GPU: what the next saving is to be looked for in.
+largest difference of an offset from that in float32, for weights whose offsets are a few decimetres. With ``--profile``
+what ran longest in it is listed under every row, replayed on a GPU: where the next saving is to be looked for.
 """
 
 from __future__ import annotations
@@ -121,9 +121,9 @@ def longest(run: Callable[[], object], device: str) -> list[str]:
         event.key: (event.self_cpu_time_total if device == "cpu" else event.self_device_time_total, event.count)
         for event in profile.key_averages()
     }
-    lines = [f"    {sum(time for time, _ in times.values()):10.1f} us in all, gaps not counted"]
-    for name, (time, often) in sorted(times.items(), key=lambda item: -item[1][0])[:PROFILED]:
-        lines.append(f"    {time:10.1f} us {often:4d} x  {name[:NAME]}")
+    lines = [f"    {sum(spent for spent, _ in times.values()):10.1f} us in all, gaps not counted"]
+    for name, (spent, often) in sorted(times.items(), key=lambda item: -item[1][0])[:PROFILED]:
+        lines.append(f"    {spent:10.1f} us {often:4d} x  {name[:NAME]}")
     return lines
 
 
