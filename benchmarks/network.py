@@ -1,11 +1,13 @@
 """What the motion network costs: forward and backward, all queries of a step stacked, in each precision.
 
-    python benchmarks/network.py [--device cpu|cuda] [--gaussians N ..] [--queries Q ..] [--repeats R] [--json FILE]
+    python benchmarks/network.py [--device cpu|cuda] [--gaussians N ..] [--queries Q ..] [--repeats R]
+                                 [--profile] [--json FILE]
 
 A query is one key time; a timing holds one encoding of positions, as a step has it, and the gradient of all weights.
 On a GPU every row is timed twice: called from Python, and replayed as a CUDA graph, which must give what the call gave.
 Rows of one N and Q take turns. ``kernels`` counts what the device ran in one call, products included; ``error`` is the
-largest difference of an offset from that in float32, for weights whose offsets are a few decimetres.
+largest difference of an offset from that in float32, for weights whose offsets are a few decimetres. With ``--profile``
+what ran longest in it is listed under every row, replayed on a GPU: where the next saving is to be looked for.
 """
 
 from __future__ import annotations
@@ -29,6 +31,7 @@ from gftorf_warp.scene.network import Network
 KEYS = 16  # of 60 frames
 LENGTH = 7.5  # unambiguous range at 20 MHz [m]
 WARM_UP = 3  # calls before a capture or a timing
+PROFILED, NAME = 20, 160  # lines of a profile, characters of a name in it
 MEGAFLOP = 3.007  # per Gaussian and query, forward and backward
 
 Call = Callable[[], list[torch.Tensor]]
@@ -107,6 +110,23 @@ def kernels(call: Call) -> int:
     return sum(event.device_type == torch.autograd.DeviceType.CUDA for event in profile.events())
 
 
+def longest(run: Callable[[], object], device: str) -> list[str]:
+    """Lines of what takes the most time in one run: microseconds, how often, name."""
+    kinds = torch.profiler.ProfilerActivity
+    with torch.profiler.profile(activities=[kinds.CPU if device == "cpu" else kinds.CUDA]) as profile:
+        run()
+        if device != "cpu":
+            torch.cuda.synchronize()
+    times = {
+        event.key: (event.self_cpu_time_total if device == "cpu" else event.self_device_time_total, event.count)
+        for event in profile.key_averages()
+    }
+    lines = [f"    {sum(spent for spent, _ in times.values()):10.1f} us in all, gaps not counted"]
+    for name, (spent, often) in sorted(times.items(), key=lambda item: -item[1][0])[:PROFILED]:
+        lines.append(f"    {spent:10.1f} us {often:4d} x  {name[:NAME]}")
+    return lines
+
+
 def rows_of(count: int, queries: int, options: argparse.Namespace) -> list[dict[str, object]]:
     """One row per precision."""
     device, gaussians = options.device, field(count, options.device)
@@ -131,6 +151,9 @@ def rows_of(count: int, queries: int, options: argparse.Namespace) -> list[dict[
     for _ in range(options.repeats):
         for name, run in runs.items():
             times[name].append(once(run, device))
+    if options.profile:
+        for (kind, _), run in runs.items():  # replayed comes last
+            rows[kind]["profile"] = longest(run, device)
     for (kind, how), taken in times.items():
         tenths = statistics.quantiles(taken, n=10) if len(taken) > 1 else taken * 9
         best = statistics.median(taken)
@@ -158,6 +181,7 @@ def main() -> int:
     parser.add_argument("--queries", type=int, nargs="+", default=[1, 2, 3])
     parser.add_argument("--products", type=Products, nargs="+", default=[*Products])
     parser.add_argument("--repeats", type=int, default=50)
+    parser.add_argument("--profile", action="store_true")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
     found, rows = machine(options.device), []
@@ -173,7 +197,7 @@ def main() -> int:
                 texts = [row["gaussians"], row["queries"], row["products"], row.get("kernels", "-")]
                 texts += ["-" if number is None else f"{number:.3f}" for number in numbers]
                 texts += ["" if row.get("replay_equals_call", True) else " replay differs"]
-                print("".join(f"{text:>12}" for text in texts), flush=True)
+                print("\n".join(["".join(f"{text:>12}" for text in texts), *row.get("profile", [])]), flush=True)
     if options.json:
         options.json.write_text(json.dumps(found | {"command": " ".join(sys.argv), "rows": rows}, indent=1) + "\n")
     return 0

@@ -7,6 +7,7 @@ import pytest
 import torch
 from small_runs import KEYS, field, random
 
+from gftorf_warp.scene import perceptron
 from gftorf_warp.scene.motion import MotionSettings, Products
 from gftorf_warp.scene.network import Network, encoded
 from gftorf_warp.scene.perceptron import Form, Stacked
@@ -198,6 +199,30 @@ def test_overflow_ends_in_a_gradient_that_is_not_finite(device, where):
     found, got = gradients(made, gaussians, cotangent, [0, 1])
     assert found.isfinite().all() or where == "activation"
     assert not torch.nn.utils.get_total_norm(got).isfinite()
+
+
+def test_rows_may_go_through_the_layers_in_parts(monkeypatch):
+    """Of unequal length here, three to a key, and four rows side by side in sums; the results are the same."""
+    made, gaussians, cotangent = network(half()), positions(172), random(2, 172, 3)
+    whole = gradients(made, gaussians, cotangent, [0, 2])
+    monkeypatch.setattr(perceptron, "PIECE", 60)
+    assert [end - begin for _, begin, end in perceptron._pieces(2, 172)] == [57, 57, 58] * 2
+    parts = gradients(made, gaussians, cotangent, [0, 2])
+    for one, other in zip([parts[0], *parts[1]], [whole[0], *whole[1]], strict=True):
+        assert other.abs().max() > 0
+        assert distance(one, other) < 1e-3
+
+
+@pytest.mark.parametrize("keys", [1, 3, 9])
+@pytest.mark.parametrize("count", [5, 192])
+def test_sums_over_rows_are_those_of_their_key(keys, count):
+    """Also of more keys than 16 bytes hold, and of a number of rows that no power of two divides."""
+    rows = random(keys, count, 4).double()
+    choice, fold = perceptron._choice(rows[0], keys)
+    assert fold == (1 if count == 5 else 64)
+    sums = (choice @ rows.view(-1, fold * 4)).view(len(choice), fold, 4).sum(1)
+    torch.testing.assert_close(sums[:keys], rows.sum(1))
+    assert sums[keys:].abs().sum() == 0
 
 
 def test_a_loss_without_gradient_has_none():

@@ -27,6 +27,7 @@ class Network(Motion):
 
     follows_means = True
     moments: Tensor  # [T, t] float64, gamma(t) of every key; of the key times, so it is not stored
+    powers: Tensor  # [F] 2^0, 2^1, .. of the positions; not stored either
 
     def __init__(
         self,
@@ -55,6 +56,7 @@ class Network(Motion):
         self.settings, self.duration, self.length = settings, float(duration), float(length)
         times = encoded(self.key_times[:, None] / self.duration, settings.time_frequencies)
         self.register_buffer("moments", times, persistent=False)
+        self.register_buffer("powers", powers_of_two(settings.position_frequencies), persistent=False)
         self._inputs = (_encoded_size(3, settings.position_frequencies), _encoded_size(1, settings.time_frequencies))
         joined, width = sum(self._inputs), settings.width
         sizes = [joined] + [width] * (settings.layers - 1)
@@ -77,8 +79,8 @@ class Network(Motion):
         """gamma(x) of the positions at which it is asked, without gradient, in the precision of the products [1]."""
         place, form = field.mean.detach() / self.length, self._form
         if self.settings.products == Products.HALF:
-            return encoded(place, self.settings.position_frequencies, columns=form.columns, dtype=form.dtype)
-        return encoded(place, self.settings.position_frequencies)
+            return encoded(place, self.powers, columns=form.columns, dtype=form.dtype)
+        return encoded(place, self.powers)
 
     def key_offsets(
         self, attachment: Float[Tensor, "N p"], keys: list[int] | Int[Tensor, "k"]
@@ -157,24 +159,34 @@ def _tf32() -> Iterator[None]:
         torch.set_float32_matmul_precision(before)
 
 
+def powers_of_two(count: int) -> Float[Tensor, "f"]:
+    """2^0, 2^1, .., exact in any precision."""
+    return 2.0 ** torch.arange(count, dtype=torch.float32)
+
+
 def encoded(
-    value: Float[Tensor, "*n d"], frequencies: int, *, columns: int | None = None, dtype: torch.dtype | None = None
+    value: Float[Tensor, "*n d"],
+    frequencies: int | Float[Tensor, "f"],
+    *,
+    columns: int | None = None,
+    dtype: torch.dtype | None = None,
 ) -> Float[Tensor, "*n e"]:
     """gamma(v): the values themselves, then sine and cosine of 2^0 v, 2^1 v, .., without a factor pi.
 
     Args:
         value: Without gradient.
-        frequencies: How many.
+        frequencies: How many, or their ``powers_of_two``, which saves making them.
         columns: Length of a row, zeros at its end; None: as many as there are.
         dtype: Of the result, rounded at the end; None: that of the values.
     """
-    size, dimensions = _encoded_size(value.shape[-1], frequencies), value.shape[-1]
-    powers = 2.0 ** torch.arange(frequencies, dtype=value.dtype, device=value.device)
+    powers = (powers_of_two(frequencies) if isinstance(frequencies, int) else frequencies).to(value)
+    count, dimensions = len(powers), value.shape[-1]
+    size = _encoded_size(dimensions, count)
     angles = value[..., None, :] * powers[:, None]
     made = torch.empty if columns in (None, size) else torch.zeros
     rows = made(*value.shape[:-1], columns or size, dtype=dtype or value.dtype, device=value.device)
     rows[..., :dimensions] = value
-    waves = rows[..., dimensions:size].unflatten(-1, (frequencies, 2, dimensions))
+    waves = rows[..., dimensions:size].unflatten(-1, (count, 2, dimensions))
     torch.sin(angles, out=waves[..., 0, :])
     torch.cos(angles, out=waves[..., 1, :])
     return rows

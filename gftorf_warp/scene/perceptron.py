@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 
 import torch
 from jaxtyping import Float
@@ -25,6 +26,9 @@ from torch.autograd.function import once_differentiable
 ALIGNED = 8  # halves in 16 bytes: products whose rows begin at multiples of it are several times faster
 LARGEST = 64.0  # gradient of an offset, in scaled units: 10 bits below the largest half, 20 above the smallest normal
 SMALLEST = 1e-30  # below any gradient; keeps 0 / 0 away where there is none
+PIECE = 21_120  # rows of a product at most: two full waves of 128 x 160 results on 132 multiprocessors
+FOLD = 64  # rows side by side in a sum over rows, if they are so many times something
+BLOCKS = 8  # into which a weight is cut to be rounded
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,6 +51,11 @@ class Form:
         """Length of the rows that hold gamma(x): the next aligned one, if a weight is as wide."""
         return min(-(-self.place // ALIGNED) * ALIGNED, self.place + self.moment)
 
+    @property
+    def entries(self) -> list[int]:
+        """Numbers of the layers which gamma(x) and gamma(t) enter."""
+        return [0] if self.joined is None else [0, self.joined]
+
 
 class Stacked(torch.autograd.Function):
     """Offsets of all Gaussians at all keys, with a gradient for parameters only."""
@@ -66,30 +75,25 @@ class Stacked(torch.autograd.Function):
         """
         weights, biases = parameters[0::2], parameters[1::2]
         factors, shifts = _rounded(form, weights, biases)
-        keys, count = len(moment), len(place)
-        places = place.expand(keys, count, form.columns)
-        inputs: list[Tensor] = []  # of every layer behind the first, and of the head; rows of all keys
-        hidden = place
-        for number, weight in enumerate(weights[:-1]):
-            factor = factors[number].T
-            if number in (0, form.joined):
-                at_moment = weight[:, weight.shape[1] - form.moment :]
-                own = torch.addmm(biases[number], moment, at_moment.T).to(form.dtype)
-                if number:
-                    hidden = torch.cat([hidden.view(keys, count, form.width), places], dim=2)
-                    inputs[-1] = hidden.flatten(0, 1)
-                rows = hidden if number else places
-                out = place.new_empty(keys, count, form.width)
-                for key in range(keys):
-                    torch._addmm_activation(own[key], rows[key], factor, use_gelu=False, out=out[key])
-                hidden = out.view(keys * count, form.width)
-            else:
-                hidden = torch._addmm_activation(shifts[number], hidden, factor, use_gelu=False)
-            inputs.append(hidden)
+        keys, count, layers = len(moment), len(place), len(weights) - 1
+        own = _of_moments(form, moment, weights, biases)
+        outputs = list(place.new_empty(layers, keys * count, form.width).unbind())
+        again = _joined_room(form, place, keys)
+        for key, begin, end in _pieces(keys, count):
+            rows = slice(key * count + begin, key * count + end)
+            hidden = place[begin:end]
+            for number in range(layers):
+                if number == form.joined:
+                    _copy(again[rows, : form.width], hidden)
+                    hidden = again[rows]
+                shift = own[number][key] if number in own else shifts[number]
+                out = outputs[number][rows]
+                torch._addmm_activation(shift, hidden, factors[number].T, use_gelu=False, out=out)
+                hidden = out
         context.form = form
-        context.save_for_backward(place, moment, *factors, *inputs)
-        offsets = _product(hidden, factors[-1].T, moment.dtype)[:, : len(biases[-1])] + biases[-1]
-        return offsets.view(keys, count, len(biases[-1]))
+        context.save_for_backward(place, moment, again, *factors, *outputs)
+        found = _product(outputs[-1], factors[-1].T, moment.dtype)[:, : len(biases[-1])] + biases[-1]
+        return found.view(keys, count, len(biases[-1]))
 
     @staticmethod
     @once_differentiable
@@ -98,50 +102,140 @@ class Stacked(torch.autograd.Function):
 
         Scaled by the largest gradient of an offset, which no host knows; everything up to the weights is linear in it.
         """
-        form, (place, moment, *rest) = context.form, context.saved_tensors
+        form, (place, moment, again, *rest) = context.form, context.saved_tensors
         layers = len(rest) // 2
-        factors, inputs = rest[: layers + 1], [None, *rest[layers + 1 :]]
-        keys, count = len(moment), len(place)
-        unit = torch.linalg.vector_norm(gradient, math.inf).clamp_min(SMALLEST) / LARGEST
-        outputs = gradient.shape[-1]
+        factors, outputs = rest[: layers + 1], rest[layers + 1 :]
+        keys, count, values = len(moment), len(place), gradient.shape[-1]
+        found = _Gradients(form, moment, layers, len(factors[-1]), values)
+        flat = gradient.reshape(-1, values)
+        unit = _largest(flat).clamp_min(SMALLEST) / LARGEST
         slope = place.new_zeros(keys * count, len(factors[-1]))
-        torch.div(gradient.reshape(-1, outputs), unit, out=slope[:, :outputs])
-        found = [gradient.sum((0, 1)) / unit, _product(slope.T, inputs[layers], moment.dtype)[:outputs]]
+        torch.div(flat, unit, out=slope[:, :values])
+        _sum_rows(flat, out=found.head_bias)
+        _product(slope.T, outputs[-1], moment.dtype, out=found.weights[-1])
+        choice, fold = _choice(place, keys)
+        sums = moment.new_empty(layers, len(choice), fold, form.width)
+        rooms = place.new_empty(2, keys * count, form.width)
         for number in reversed(range(layers)):
-            slope = slope @ factors[number + 1][:, : form.width]
-            after = inputs[number + 1][:, : form.width]
-            torch.ops.aten.threshold_backward.grad_input(slope, after, 0.0, grad_input=slope)
-            if number in (0, form.joined):
-                slopes = slope.view(keys, count, form.width)
-                sums = slopes.sum(1, dtype=moment.dtype)
-                if number:
-                    at_rows = _product(slope.T, inputs[number], moment.dtype)
-                else:
-                    at_rows = _product(slopes[0].T, place, moment.dtype)
-                    for key in range(1, keys):
-                        at_rows += _product(slopes[key].T, place, moment.dtype)
-                known = at_rows.shape[1] - form.columns + form.place
-                found += [sums.sum(0), torch.cat([at_rows[:, :known], sums.T @ moment], dim=1)]
+            factor, after, before = factors[number + 1][:, : form.width], slope, outputs[number]
+            slope = rooms[number % 2]
+            for key, begin, end in _pieces(keys, count):
+                rows = slice(key * count + begin, key * count + end)
+                torch.mm(after[rows], factor, out=slope[rows])
+                torch.ops.aten.threshold_backward.grad_input(slope[rows], before[rows], 0.0, grad_input=slope[rows])
+            _product(choice, slope.view(-1, fold * form.width), moment.dtype, out=sums[number].flatten(1))
+            if number == 0:
+                inputs = again[:, again.shape[1] - form.columns :]
             else:
-                found += [slope.sum(0, dtype=moment.dtype), _product(slope.T, inputs[number], moment.dtype)]
-        return None, None, None, *reversed(torch._foreach_mul([value.contiguous() for value in found], unit))
+                inputs = again if number == form.joined else outputs[number - 1]
+            _product(slope.T, inputs, moment.dtype, out=found.weights[number][:, : inputs.shape[1]])
+        own = sums[:, :keys].sum(2)
+        torch.sum(own, 1, out=found.biases)
+        for number in form.entries:
+            weight = found.weights[number]
+            torch.mm(own[number].T, moment, out=weight[:, weight.shape[1] - form.moment :])
+        return None, None, None, *found.times(unit)
+
+
+class _Gradients:
+    """Room for the gradients of all parameters in one piece, so that one kernel multiplies them.
+
+    Biases stand behind weights, the head's last: it is summed before anything is scaled.
+    """
+
+    def __init__(self, form: Form, moment: Tensor, layers: int, rows: int, values: int):
+        wide = form.place + form.moment
+        columns = [wide] + [form.width + (wide if number == form.joined else 0) for number in range(1, layers)]
+        sizes = [form.width * column for column in columns] + [rows * form.width, layers * form.width, values]
+        self.scaled = moment.new_empty(sum(sizes))
+        *weights, head, biases, self.head_bias = self.scaled.split(sizes)
+        self.weights = [part.view(form.width, -1) for part in weights] + [head.view(rows, form.width)]
+        self.biases = biases.view(layers, form.width)
+
+    def times(self, unit: Tensor) -> list[Tensor]:
+        """Weight and bias of every layer, then of the head, in the unit of the loss."""
+        values = len(self.head_bias)
+        self.scaled[:-values].mul_(unit)
+        biases = [*self.biases, self.head_bias]
+        weights = [*self.weights[:-1], self.weights[-1][:values]]
+        return [value for pair in zip(weights, biases, strict=True) for value in pair]
+
+
+def _pieces(keys: int, count: int) -> list[tuple[int, int, int]]:
+    """Key, first and last row of the parts in which rows go through the layers: as equal as they can be."""
+    parts = max(-(-count // PIECE), 1)
+    ends = [count * part // parts for part in range(parts + 1)]
+    return [(key, *span) for key in range(keys) for span in pairwise(ends)]
+
+
+def _of_moments(
+    form: Form, moment: Tensor, weights: tuple[Tensor, ...], biases: tuple[Tensor, ...]
+) -> dict[int, Float[Tensor, "k width"]]:
+    """What every key adds in the layers which gamma(t) enters, bias included."""
+    own = moment.new_empty(len(form.entries), len(moment), form.width)
+    for room, number in zip(own, form.entries, strict=True):
+        at_moment = weights[number][:, weights[number].shape[1] - form.moment :]
+        torch.addmm(biases[number], moment, at_moment.T, out=room)
+    return dict(zip(form.entries, own.to(form.dtype), strict=True))
+
+
+def _joined_room(form: Form, place: Tensor, keys: int) -> Float[Tensor, "rows i"]:
+    """Room for the input of the layer that is joined, gamma(x) at its end for all keys; gamma(x) alone without one."""
+    width = 0 if form.joined is None else form.width
+    room = place.new_empty(keys * len(place), width + form.columns)
+    _copy(room.view(keys, len(place), -1)[..., width:], place.expand(keys, -1, -1))
+    return room
+
+
+def _copy(to: Tensor, rows: Tensor) -> None:
+    """Copy rows in units of 16 bytes, if both begin at multiples of it: a fraction of the time that halves take."""
+    step = 16 // to.element_size()
+    if all(n % step == 0 for one in (to, rows) for n in (one.shape[-1], one.storage_offset(), *one.stride()[:-1])):
+        to, rows = to.view(torch.complex128), rows.view(torch.complex128)
+    to.copy_(rows)
+
+
+def _choice(place: Float[Tensor, "N columns"], keys: int) -> tuple[Float[Tensor, "aligned r"], int]:
+    """Zeros and ones that add up rows of each key by a product, and how many rows lie side by side in it.
+
+    A product of few rows with many columns fills a GPU without splitting its sum; what lies side by side is added
+    later. Columns are what is contiguous: there are as many rows as 16 bytes hold.
+    """
+    fold = math.gcd(len(place), FOLD)
+    each = len(place) // fold
+    choice = place.new_zeros(keys, each, -(-keys // ALIGNED) * ALIGNED)
+    choice.diagonal(dim1=0, dim2=2).fill_(1.0)
+    return choice.flatten(0, 1).T, fold
+
+
+def _largest(values: Float[Tensor, "rows v"]) -> Float[Tensor, ""]:
+    """The largest magnitude, in two steps: one block of a GPU alone would look for long."""
+    parts = values.reshape(math.gcd(values.numel(), 16 * FOLD), -1)
+    return torch.linalg.vector_norm(torch.linalg.vector_norm(parts, math.inf, dim=1), math.inf)
+
+
+def _sum_rows(values: Float[Tensor, "rows v"], *, out: Float[Tensor, "v"]) -> None:
+    """The sum over rows, in two steps as well."""
+    fold = math.gcd(len(values), FOLD)
+    torch.sum(values.reshape(-1, fold * len(out)).sum(0).view(fold, len(out)), 0, out=out)
 
 
 def _rounded(form: Form, weights: tuple[Tensor, ...], biases: tuple[Tensor, ...]) -> tuple[list[Tensor], list[Tensor]]:
     """Copies of weights and biases as factors: without the columns of gamma(t), the head with rows of zeros below it.
 
-    Where ``columns`` has more than gamma(x), a column of gamma(t) meets a column of zeros.
+    Where ``columns`` has more than gamma(x), a column of gamma(t) meets a column of zeros. Whole ones are cut into
+    blocks of rows, since torch gives 65,536 values of a tensor to one block of threads.
     """
     widths = [weight.shape[1] for weight in weights[:-1]]
-    for number in [0] if form.joined is None else [0, form.joined]:
+    for number in form.entries:
         widths[number] += form.columns - form.place - form.moment
     head = weights[-1].new_zeros(-(-len(weights[-1]) // ALIGNED) * ALIGNED, form.width, dtype=form.dtype)
     made = [head.new_empty(form.width, columns) for columns in widths]
     shifts = [torch.empty_like(bias, dtype=form.dtype) for bias in biases[:-1]]
     whole = [number for number, weight in enumerate(weights[:-1]) if weight.shape == made[number].shape]
     torch._foreach_copy_(
-        [*(made[number] for number in whole), *shifts, head[: len(weights[-1])]],
-        [*(weights[number] for number in whole), *biases[:-1], weights[-1]],
+        [*(part for number in whole for part in made[number].chunk(BLOCKS)), *shifts, head[: len(weights[-1])]],
+        [*(part for number in whole for part in weights[number].chunk(BLOCKS)), *biases[:-1], weights[-1]],
     )
     for number, factor in enumerate(made):
         if number not in whole:
@@ -149,10 +243,12 @@ def _rounded(form: Form, weights: tuple[Tensor, ...], biases: tuple[Tensor, ...]
     return [*made, head], shifts
 
 
-def _product(left: Float[Tensor, "a b"], right: Float[Tensor, "b c"], dtype: torch.dtype) -> Float[Tensor, "a c"]:
+def _product(
+    left: Float[Tensor, "a b"], right: Float[Tensor, "b c"], dtype: torch.dtype, *, out: Tensor | None = None
+) -> Float[Tensor, "a c"]:
     """A product whose result is not rounded to its factors' precision."""
     if left.dtype == dtype:
-        return left @ right
+        return torch.mm(left, right, out=out)
     if left.is_cuda and hasattr(torch.ops.aten.mm, "dtype"):
-        return torch.mm(left, right, out_dtype=dtype)
-    return left.to(dtype) @ right.to(dtype)
+        return torch.mm(left, right, out_dtype=dtype, out=out)
+    return torch.mm(left.to(dtype), right.to(dtype), out=out)
