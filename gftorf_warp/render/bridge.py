@@ -200,8 +200,9 @@ class Captured:
     belongs to the graph; nobody else may look at it.
     """
 
-    def __init__(self, work: Callable[[], None], device: torch.device):
-        self._work, self._device = work, device
+    def __init__(self, work: Callable[[], None], device: torch.device, ready: Callable[[], None] | None = None):
+        """Wrap ``work``; ``ready`` is called once it is captured, before the first replay."""
+        self._work, self._device, self._ready = work, device, ready
         self._graph: torch.cuda.CUDAGraph | None = None
 
     def __call__(self) -> None:
@@ -211,6 +212,8 @@ class Captured:
             return
         if self._graph is None:
             self._graph = self._capture()
+            if self._ready is not None:
+                self._ready()
         self._graph.replay()
 
     def _capture(self) -> torch.cuda.CUDAGraph:
