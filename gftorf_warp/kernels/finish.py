@@ -12,9 +12,8 @@ from .sums import LANES, OVER_LANES
 PART = 1024  # elements of a gradient whose squares are added up at once
 JUDGES = 1024  # threads of the block that judges
 IMAGES = 4  # of a step, at most
-LOSS, SQUARED, OPACITY, FLOW, DISTORTION, MOTION_SIZE = range(6)  # what is found of an image
+LOSS, SQUARED, OPACITY, FLOW, DISTORTION, MOTION_SIZE = range(6)  # of an image; all but two are terms of its loss
 FOUND = 6
-TERMS = (LOSS, FLOW, DISTORTION, MOTION_SIZE)  # of the loss
 WHOLE, COUNT = FOUND, FOUND + 1  # of the sums, beside what was found: loss and images
 SUMS = FOUND + 2
 
@@ -44,65 +43,67 @@ _SQUARES = f"""{OVER_LANES}
 
 _JUDGE = f"""
 #if defined(__CUDA_ARCH__)
-    __shared__ double room[2][{JUDGES // LANES}];
-    __shared__ float control[3];
+#define SHARED __shared__
+#define TOGETHER __syncthreads()
     const int t = threadIdx.x, all = {JUDGES};
 #else
-    float control[3];
+#define SHARED
+#define TOGETHER
     const int t = 0, all = 1;
 #endif
+    SHARED double room[2][{JUDGES // LANES}];
+    SHARED float control[3], seen[{IMAGES * FOUND}], values[{SUMS}];
+    SHARED int most[{IMAGES}];
     double fixed = 0.0, moving = 0.0;
     for (int i = t; i < partials.shape[0]; i += all)
         if (i < motion_part) fixed += (double)partials.data[i]; else moving += (double)partials.data[i];
+    for (int i = t; i < {FOUND} * images; i += all) seen[i] = found.data[i];
+    for (int n = t; n < images; n += all)
+        if (capacity == 0) most[n] = 0;
+        else most[n] = *(n == 0 ? pairs0.data : n == 1 ? pairs1.data : n == 2 ? pairs2.data : pairs3.data);
 #if defined(__CUDA_ARCH__)
-    for (int o = {LANES // 2}; o > 0; o >>= 1) {{
-        fixed += __shfl_down_sync(0xffffffffu, fixed, o);
-        moving += __shfl_down_sync(0xffffffffu, moving, o);
-    }}
-    if ((t & {LANES - 1}) == 0) {{ room[0][t / {LANES}] = fixed; room[1][t / {LANES}] = moving; }}
-    __syncthreads();
-    if (t == 0) {{
-        fixed = moving = 0.0;
-        for (int k = 0; k < {JUDGES // LANES}; ++k) {{ fixed += room[0][k]; moving += room[1][k]; }}
-    }}
+    auto over_lanes = [](double v) -> double {{
+        for (int o = {LANES // 2}; o > 0; o >>= 1) v += __shfl_down_sync(0xffffffffu, v, o);
+        return v;
+    }};
+    fixed = over_lanes(fixed);
+    moving = over_lanes(moving);
+    if (t % {LANES} == 0) {{ room[0][t / {LANES}] = fixed; room[1][t / {LANES}] = moving; }}
+    TOGETHER;
+    if (t < {LANES}) {{ fixed = over_lanes(room[0][t]); moving = over_lanes(room[1][t]); }}
 #endif
     if (t == 0) {{
         const float largest = 3.402823466e38f;
-        auto sum_of = [&](int k) -> float {{
-            float s = 0.0f;
-            if (weights[k] != 0.0f) for (int n = 0; n < images; ++n) s += found.data[{FOUND} * n + k];
-            return weights[k] * s;
-        }};
-        const float loss = {" + ".join(f"sum_of({k})" for k in TERMS)};
-        const float norm = (float)(sqrt(fixed + moving) / images);
-        int most = 0;
-        for (int n = 0; n < images; ++n) {{
-            const int* total = n == 0 ? pairs0.data : n == 1 ? pairs1.data : n == 2 ? pairs2.data : pairs3.data;
-            if (capacity != 0) most = total[0] > most ? total[0] : most;
+        float loss = 0.0f;
+        for (int k = 0; k < {FOUND}; ++k) {{
+            float s = 0.0f;  // what has no weight was not found: whatever stands there is of another step
+            if (weights[k] != 0.0f) for (int n = 0; n < images; ++n) s += seen[{FOUND} * n + k];
+            values[k] = weights[k] * s;
+            if (k != {SQUARED} && k != {OPACITY}) loss += values[k];
         }}
-        const bool sound = fabsf(loss) <= largest && norm <= largest && (capacity < 1 || most <= capacity);
+        values[{WHOLE}] = loss;
+        values[{COUNT}] = (float)images;
+        int pairs = 0;
+        for (int n = 0; n < images; ++n) pairs = most[n] > pairs ? most[n] : pairs;
+        const float norm = (float)(sqrt(fixed + moving) / images), length = (float)(sqrt(moving) / images);
+        const bool sound = fabsf(loss) <= largest && norm <= largest && (capacity < 1 || pairs <= capacity);
+        const float left = longest / (length + 1e-6f);
+        control[0] = 1.0f / images;
+        control[1] = (longest > 0.0f && left < 1.0f ? left : 1.0f) / images;
+        control[2] = sound;
         counts.data[0] += !sound;
         counts.data[1] = sound ? 0 : counts.data[1] + 1;
-        counts.data[2] = most > counts.data[2] ? most : counts.data[2];
-        const float length = (float)(sqrt(moving) / images), room_left = longest / (length + 1e-6f);
-        control[0] = 1.0f / images;
-        control[1] = (longest > 0.0f && room_left < 1.0f ? room_left : 1.0f) / images;
-        control[2] = sound;
-        if (sound) {{
-            for (int k = 0; k < {FOUND}; ++k) sums.data[k] += sum_of(k);
-            sums.data[{WHOLE}] += loss;
-            sums.data[{COUNT}] += images;
-        }}
+        counts.data[2] = pairs > counts.data[2] ? pairs : counts.data[2];
     }}
-#if defined(__CUDA_ARCH__)
-    __syncthreads();
-#endif
+    TOGETHER;
+    const bool sound = control[2] != 0.0f;
+    for (int k = t; k < {SUMS}; k += all) if (sound) sums.data[k] += values[k];
     for (int tensor = t; tensor < table.shape[0]; tensor += all) {{
-        const float rate = rates.data[tensor];
-        const bool sound = control[2] != 0.0f;
-        const float factor = control[tensor < motion_from ? 0 : 1];
+        const float rate = rates.data[tensor], factor = control[tensor < motion_from ? 0 : 1];
         [&]() {{{ADVANCE}}}();
     }}
+#undef SHARED
+#undef TOGETHER
 """
 
 

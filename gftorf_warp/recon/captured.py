@@ -311,8 +311,10 @@ class CapturedSteps:
         """Of image ``n`` against the measured one in a row; with the mean squared difference and opacity beside it."""
         ssim, quads, found = self.settings.weights.ssim, self.observations.quads, self._ledger.found[n]
         if ssim > 0:
-            place = {"row": row, "opacity": tof.opacity, "scratch": self._scratch[n], "out": found[:3]}
-            return fused.image_loss(tof.quads, quads[:, None], ssim, **place)[0]
+            scratch, resident = self._scratch[n], quads[:, None]
+            return fused.image_loss(
+                tof.quads, resident, ssim, row=row, opacity=tof.opacity, scratch=scratch, out=found[:3]
+            )[0]
         loss, squared = image_loss(tof.quads, quads.index_select(0, row), ssim)
         found.data[:3] = torch.stack([loss.detach(), squared, tof.opacity.detach().mean()])
         return loss
