@@ -56,7 +56,7 @@ class AdamTable:
             for tensor in (value, first, second, step):
                 _check(tensor, device, None if tensor is step else value.shape)
             rows.append([value.data_ptr(), 0, *(t.data_ptr() for t in (first, second, step)), value.numel()])
-        self._host = torch.tensor(rows, dtype=torch.int64).view(len(rows), COLUMNS)
+        self._host = rows
         with stream_of(parameters[0]):
             width = training.adam_block(wp.device_from_torch(device))
         ends = list(itertools.accumulate(-(-row[-1] // width) for row in rows))
@@ -92,7 +92,7 @@ class AdamTable:
 
     def send(self) -> None:
         """Tell the device; waits for it."""
-        self.rows.copy_(self._host)
+        self.rows.copy_(torch.tensor(self._host, dtype=torch.int64))
 
     def release(self) -> None:
         """Let go of the gradients, whose memory belongs to a graph that was captured."""

@@ -185,9 +185,9 @@ class _FlowLoss(torch.autograd.Function):
         ctx: Any, displacement: Tensor, distance: Tensor, measured: Tensor, row: Tensor, views: Tensor, out: Tensor
     ) -> Tensor:
         with stream_of(distance):
-            images, rest = _flow_arrays(displacement, distance, measured, row, views)
-            partials = distance.new_empty(1, training.flow_parts(images[0]))
-            training.flow_loss(*images, *rest, array_over(partials), array_over(out))
+            arrays = _flow_arrays(displacement, distance, measured, row, views)
+            partials = distance.new_empty(1, training.flow_parts(arrays[0]))
+            training.flow_loss(*arrays, *(array_over(tensor) for tensor in (partials, out)))
         ctx.save_for_backward(displacement, distance, measured, row, views)
         return out[0]
 
@@ -196,14 +196,16 @@ class _FlowLoss(torch.autograd.Function):
     def backward(ctx: Any, grad_loss: Tensor) -> tuple[Tensor | None, ...]:
         grad = torch.empty_like(ctx.saved_tensors[0])
         with stream_of(grad):
-            images, rest = _flow_arrays(*ctx.saved_tensors)
-            training.flow_loss_backward(*images, *rest, array_over(grad_loss.reshape(1)), array_over(grad))
+            ends = grad_loss.reshape(1), grad
+            training.flow_loss_backward(*_flow_arrays(*ctx.saved_tensors), *(array_over(tensor) for tensor in ends))
         return grad, *[None] * 5
 
 
-def _flow_arrays(displacement: Tensor, distance: Tensor, measured: Tensor, row: Tensor, views: Tensor):
+def _flow_arrays(
+    displacement: Tensor, distance: Tensor, measured: Tensor, row: Tensor, views: Tensor
+) -> tuple[wp.array, wp.array, wp.array, wp.array, wp.array]:
     images = array_over(distance), array_over(displacement), array_over(measured)
-    return images, (array_over(row, wp.int32), array_over(views))
+    return *images, array_over(row, wp.int32), array_over(views)
 
 
 @functools.lru_cache(maxsize=4096)
