@@ -22,12 +22,16 @@ from gftorf_warp.kernels import (
     adam,
     composite,
     composite_backward,
+    displace,
+    finish,
+    flow,
     move,
     noise,
     project,
     resolve,
     similarity,
     splat,
+    sums,
     tiles,
     trace,
 )
@@ -49,6 +53,10 @@ def modules() -> dict[str, wp.Module]:
         "noise": noise.uniform_noise.module,
         "adam sizes": adam.adam_sizes.module,
         "adam": adam.make_adam(1).module,
+        "displace": displace.displace.module,
+        "finish": finish.judge.module,
+        "flow": flow.flow_errors.module,
+        "sums": sums.means.module,
         "trace": trace.trace_light.module,
     }
     window = similarity.make_similarity(1)

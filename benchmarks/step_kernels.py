@@ -21,7 +21,7 @@ import warp as wp
 
 from gftorf_warp.recon.objective import image_loss
 from gftorf_warp.recon.optimiser import BETAS, EPSILON
-from gftorf_warp.render import fused
+from gftorf_warp.render import descent, fused
 from gftorf_warp.render.bridge import captured
 
 IMAGES = {"1 x 120 x 160": (1, 120, 160), "1 x 240 x 320": (1, 240, 320), "4 x 240 x 320": (4, 240, 320)}
@@ -58,7 +58,7 @@ def adam_rows(device: str, count: int) -> dict[str, Callable[[], torch.Tensor]]:
     values = [torch.randn(shape, device=device) for shape in shapes]
     gradients = [torch.randn(shape, device=device) for shape in shapes]
     moments = [(torch.zeros((), device=device), torch.zeros_like(v), torch.zeros_like(v)) for v in values]
-    table = fused.adam_table(values, gradients, moments)
+    table = descent.AdamTable(values, gradients, moments)
     rates = torch.full((len(shapes),), 1e-3, device=device)
     sound = torch.ones(1, dtype=torch.int32, device=device)
     twins = [value.clone().requires_grad_() for value in values]
@@ -67,7 +67,7 @@ def adam_rows(device: str, count: int) -> dict[str, Callable[[], torch.Tensor]]:
     adam = torch.optim.Adam([{"params": [t], "lr": 1e-3} for t in twins], betas=BETAS, eps=EPSILON, fused=True)
 
     def by_kernels() -> torch.Tensor:
-        fused.adam_step(table, rates, sound, betas=BETAS, epsilon=EPSILON)
+        descent.adam_step(table, rates, sound, betas=BETAS, epsilon=EPSILON)
         return values[0]
 
     def by_torch() -> torch.Tensor:

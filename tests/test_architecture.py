@@ -35,6 +35,7 @@ FREE = {"constants", "errors", "__version__"}
 HAS_BOTH = {  # the only modules that may know torch and Warp together
     "render/bridge.py": "a rendering, and its gradient",
     "render/fused.py": "what a step does beside rendering: other kernels and callers",
+    "render/descent.py": "the end of a step: Adam and what judges it, of many tensors at once",
     "render/replay.py": "renderings of a finished run: a field of torch, a graph of Warp",
 }
 LAUNCHES = {  # file: what it launches

@@ -10,7 +10,7 @@ from comparison import DEVICES
 from gftorf_warp.losses.image import similarity
 from gftorf_warp.recon.objective import image_loss as torch_loss
 from gftorf_warp.recon.settings import Norm
-from gftorf_warp.render import fused, training
+from gftorf_warp.render import descent, fused, training
 
 SIZES = [(1, 120, 160), (3, 37, 53), (2, 9, 11), (1, 5, 16), (1, 12, 33)]  # shorter than a window, than a block, odd
 PHILOX_OF_ZERO = (0x6627E8D5, 0xE169C58D, 0xBC57AC4C, 0x9B00DBD8)  # Random123's known answer for key and counter 0
@@ -48,7 +48,7 @@ def test_loss_of_an_image_is_the_oracles(monkeypatch, device, shape, block, smoo
     """Value to 1e-5, gradient to 2e-6 of its largest, 3e-5 where variance cancels: in blocks and pixel by pixel."""
     monkeypatch.setattr(training, "BLOCK", block)
     rendered, measured = image(shape, 1, smooth).to(device).requires_grad_(), image(shape, 2, smooth).to(device)
-    loss, squared = fused.image_loss(rendered, measured, 0.2, absolute=norm == Norm.L1)
+    loss, squared, _ = fused.image_loss(rendered, measured, 0.2, absolute=norm == Norm.L1)
     (gradient,) = torch.autograd.grad(3.0 * loss, rendered)
     want, want_squared, want_gradient = oracle(rendered.detach(), measured, 0.2, norm)
     torch.testing.assert_close(loss.double(), want, rtol=1e-5, atol=0)
@@ -62,7 +62,7 @@ def test_loss_of_an_image_is_the_oracles(monkeypatch, device, shape, block, smoo
 def test_its_gradient_is_that_of_finite_differences(device):
     """Along a random direction and along the gradient itself, where it must be the square of its length."""
     rendered, measured = image((1, 24, 40), 1).to(device).requires_grad_(), image((1, 24, 40), 2).to(device)
-    loss, _ = fused.image_loss(rendered, measured, 0.6)
+    loss, *_ = fused.image_loss(rendered, measured, 0.6)
     (gradient,) = torch.autograd.grad(loss, rendered)
     assert gradient.norm() > 1e-3
     for direction in (gradient / gradient.abs().max(), image((1, 24, 40), 3).to(device)):
@@ -75,11 +75,11 @@ def test_its_gradient_is_that_of_finite_differences(device):
 def test_without_a_similarity_only_the_difference_is_left(device):
     """Share 0, in closed form: 2 (r - m) / n; share 1 of equal images: nothing is left at all."""
     rendered, measured = image((2, 20, 30), 1).to(device).requires_grad_(), image((2, 20, 30), 2).to(device)
-    loss, squared = fused.image_loss(rendered, measured, 0.0)
+    loss, squared, _ = fused.image_loss(rendered, measured, 0.0)
     (gradient,) = torch.autograd.grad(loss, rendered)
     torch.testing.assert_close(gradient, 2 * (rendered - measured).detach() / rendered.numel(), rtol=1e-5, atol=1e-9)
     torch.testing.assert_close(loss, squared)
-    loss, _ = fused.image_loss(measured.clone().requires_grad_(), measured, 1.0)
+    loss, *_ = fused.image_loss(measured.clone().requires_grad_(), measured, 1.0)
     assert abs(float(loss.detach())) < 1e-5
 
 
@@ -164,8 +164,8 @@ def one_step(values, gradients, moments, rates, sound=1):
     """A step with everything in device memory."""
     flag = torch.tensor([sound], dtype=torch.int32, device=values[0].device)
     rates = torch.tensor(rates, device=values[0].device)
-    table = fused.adam_table(values, gradients, moments)
-    fused.adam_step(table, rates, flag, betas=(0.9, 0.999), epsilon=1e-15)
+    table = descent.AdamTable(values, gradients, moments)
+    descent.adam_step(table, rates, flag, betas=(0.9, 0.999), epsilon=1e-15)
 
 
 @pytest.mark.parametrize("block", [16, 1], ids=["vectors", "elements"])

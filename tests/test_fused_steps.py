@@ -12,7 +12,7 @@ from gftorf_warp.recon.observations import observe
 from gftorf_warp.recon.settings import DensifySettings, Kernels
 from gftorf_warp.recon.state import begin, from_dict, to_dict
 from gftorf_warp.recon.train import reconstruct
-from gftorf_warp.render import fused
+from gftorf_warp.render import descent
 from gftorf_warp.render.api import rasterize
 from gftorf_warp.scene.gaussians import GaussianField
 
@@ -147,6 +147,6 @@ def test_dead_gaussians_behind_the_living_change_nothing():
         torch.testing.assert_close(long[: len(short)], short, rtol=1e-5, atol=1e-6 * float(short.abs().max()))
         assert torch.equal(long[len(short) :], torch.zeros_like(long[len(short) :]))
     moments = [(torch.zeros(()), torch.zeros(count, 3), torch.zeros(count, 3))]
-    table = fused.adam_table([dead.mean], [torch.zeros(count, 3)], moments)
-    fused.adam_step(table, torch.ones(1), torch.ones(1, dtype=torch.int32), betas=(0.9, 0.999), epsilon=1e-15)
+    table = descent.AdamTable([dead.mean], [torch.zeros(count, 3)], moments)
+    descent.adam_step(table, torch.ones(1), torch.ones(1, dtype=torch.int32), betas=(0.9, 0.999), epsilon=1e-15)
     assert torch.equal(dead.mean, living.mean[:count])

@@ -5,7 +5,8 @@
 (Kingma and Ba, 2015). Step t and rate are those of a tensor. A tensor of rate 0 is left alone, t included; so is
 everything if the step is not sound, which is how a gradient that is not finite is survived without asking the host.
 
-A table names the tensors by address: they are as many as a network has layers, and live wherever torch put them.
+A table names the tensors by address: they are as many as a network has layers, and live wherever torch put them. A
+gradient at address 0 is none: the tensor is left alone, too. Gradients are multiplied by a factor before anything else.
 """
 
 import functools
@@ -14,18 +15,21 @@ import warp as wp
 
 PARAMETER, GRADIENT, FIRST, SECOND, STEP, LENGTH = range(6)  # columns of the table
 COLUMNS = 6
+SIZES = 3  # what a step of a tensor comes to: see ``adam_sizes``
 
-_ADVANCE = f"""
+ADVANCE = f"""
     const long long* row = table.data + {COLUMNS} * tensor;
     float* step = reinterpret_cast<float*>(row[{STEP}]);
-    float* out = sizes.data + 2 * tensor;
+    float* out = sizes.data + {SIZES} * tensor;
     out[0] = 0.0f;
-    if (!sound || rate == 0.0f) return;
+    if (!sound || rate == 0.0f || row[{GRADIENT}] == 0) return;
     step[0] += 1.0f;
     const double first = 1.0 - pow((double)beta1, (double)step[0]), second = 1.0 - pow((double)beta2, (double)step[0]);
     out[0] = (float)((double)rate / first);
     out[1] = (float)(1.0 / sqrt(second));
+    out[2] = factor;
 """
+"""C++: count a step of a tensor, unless it rests, and write what the step comes to."""
 
 
 def _descend(K: int) -> str:
@@ -37,7 +41,8 @@ def _descend(K: int) -> str:
     return f"""
     {kind}
     const long long* row = table.data + {COLUMNS} * tensor;
-    const float size = sizes.data[2 * tensor], root_scale = sizes.data[2 * tensor + 1];
+    const float* sizes_ = sizes.data + {SIZES} * tensor;
+    const float size = sizes_[0], root_scale = sizes_[1];
     if (size == 0.0f) return;
     const long long begin = (long long)block * {K}, left = row[{LENGTH}] - begin;
     const unsigned long bytes = (left < {K} ? left : {K}) * sizeof(float);
@@ -46,7 +51,7 @@ def _descend(K: int) -> str:
     float* x_ = reinterpret_cast<float*>(row[{PARAMETER}]) + begin;
     float* m_ = reinterpret_cast<float*>(row[{FIRST}]) + begin;
     float* v_ = reinterpret_cast<float*>(row[{SECOND}]) + begin;
-    const F g = at(reinterpret_cast<const float*>(row[{GRADIENT}]) + begin);
+    const F g = sizes_[2] * at(reinterpret_cast<const float*>(row[{GRADIENT}]) + begin);
     F m = at(m_), v = at(v_);
     m += rest1 * (g - m);
     v += rest2 * (g * g - v);
@@ -56,7 +61,7 @@ def _descend(K: int) -> str:
 """
 
 
-@wp.func_native(_ADVANCE)
+@wp.func_native(ADVANCE)
 def advance(
     table: wp.array2d[wp.int64],
     tensor: int,
@@ -64,6 +69,7 @@ def advance(
     beta1: wp.float64,
     beta2: wp.float64,
     sound: bool,
+    factor: float,
     sizes: wp.array2d[float],
 ):
     """Count a step of a tensor, unless it rests, and write what the step comes to."""
@@ -78,11 +84,11 @@ def adam_sizes(
     beta1: wp.float64,  # decay of the first moment [1]
     beta2: wp.float64,  # decay of the second moment [1]
     # Out:
-    sizes: wp.array2d[float],  # [T, 2] rate / (1 - b1^t), 0: rests; 1 / sqrt(1 - b2^t)
+    sizes: wp.array2d[float],  # [T, 3] rate / (1 - b1^t), 0: rests; 1 / sqrt(1 - b2^t); factor of the gradient
 ):
     """One thread per tensor; counts its step."""
     tensor = wp.tid()
-    advance(table, tensor, rates[tensor], beta1, beta2, sound[0] != 0, sizes)
+    advance(table, tensor, rates[tensor], beta1, beta2, sound[0] != 0, 1.0, sizes)
 
 
 @functools.cache
@@ -109,7 +115,7 @@ def make_adam(K: int):
         rest2: float,  # 1 - b2 [1]
         epsilon: float,  # added to the root of the second moment [units of the gradient]
         # Out:
-        sizes: wp.array2d[float],  # [T, 2] from ``adam_sizes``; what changes are the tensors of the table, in place
+        sizes: wp.array2d[float],  # [T, 3] from ``adam_sizes``; what changes are the tensors of the table, in place
     ):
         """One thread per block of K elements; changes parameters and moments where they are."""
         block = wp.tid()

@@ -22,11 +22,12 @@ from types import SimpleNamespace
 import warp as wp
 
 from ..constants import STABILISE_MEAN, STABILISE_SPREAD, WINDOW, WINDOW_SIGMA
+from .sums import OVER_LANES
 
 REACH = WINDOW // 2  # [px] margin of the planes in between, left and right
 MOMENTS = 5  # planes of window means: r, m, r^2, m^2, r m
 SLOPES = 3  # planes of derivatives of S: by the means of r, r^2 and r m
-MAPS = 2  # planes that come out: loss, squared difference
+SUMS = 3  # that come out: loss, squared difference, another image
 
 
 def _prelude(K: int) -> str:
@@ -56,7 +57,7 @@ def _columns_of_products(K: int) -> str:
     return f"""{_prelude(K)}
     const int height = rendered.shape[1], width = rendered.shape[2], stride = width + {2 * REACH};
     const float* r_ = rendered.data + (c * height + y) * width + x;
-    const float* m_ = measured.data + (c * height + y) * width + x;
+    const float* m_ = measured.data + ((row * rendered.shape[0] + c) * height + y) * width + x;
     {_sums(MOMENTS, "(F)(0.0f)")}
     #pragma unroll
     for (int k = -{REACH}; k <= {REACH}; ++k) {{
@@ -78,7 +79,8 @@ def _rows(count: int, source: str) -> str:
     const int height = rendered.shape[1], width = rendered.shape[2], stride = width + {2 * REACH};
     const int plane = rendered.shape[0] * height * stride, pixel = (c * height + y) * width + x;
     const float* in = {source}.data + (c * height + y) * stride + x;
-    const F r = at(rendered.data + pixel), m = at(measured.data + pixel), d = r - m;
+    const F r = at(rendered.data + pixel);
+    const F m = at(measured.data + row * rendered.shape[0] * height * width + pixel), d = r - m;
     {_sums(count, "(F)(0.0f)")}
     #pragma unroll
     for (int k = 0; k < {WINDOW}; ++k) {{ const float w = taps[k]; {terms} }}
@@ -86,21 +88,34 @@ def _rows(count: int, source: str) -> str:
 
 
 def _compare(K: int) -> str:
-    """C++: loss, squared difference and the derivatives of S by window means."""
-    return f"""{_prelude(K)}{_rows(MOMENTS, "columns")}
-    const F cross = s0 * s1, own = s0 * s0 + s1 * s1;
-    const F means = 2.0f * cross + {STABILISE_MEAN}f, spreads = 2.0f * (s4 - cross) + {STABILISE_SPREAD}f;
-    const F mean_scale = 1.0f / (own + {STABILISE_MEAN}f), spread_scale = 1.0f / (s2 + s3 - own + {STABILISE_SPREAD}f);
-    const F luminance = means * mean_scale, structure = spreads * spread_scale, similarity = luminance * structure;
-    const F by_mean = 2.0f * (s1 * mean_scale * structure - s1 * luminance * spread_scale
-                              - s0 * similarity * mean_scale + s0 * similarity * spread_scale);
-    const int next = rendered.shape[0] * height * width;
-    const F squared = d * d, difference = absolute ? (d < 0.0f ? -d : d) : squared;
-    put(maps.data + pixel, (1.0f - share) * difference + share * (1.0f - similarity));
-    put(maps.data + pixel + next, squared);
-    float* out = slopes.data + (c * height + y) * stride + x + {REACH};
-    put(out, by_mean); put(out + plane, -similarity * spread_scale);
-    put(out + 2 * plane, 2.0f * luminance * spread_scale);
+    """C++: sums of loss, squared difference and another image, and the derivatives of S by window means."""
+    each = "" if K == 1 else "[n]"
+    return f"""{_prelude(K)}
+    const int across = (rendered.shape[2] + {K - 1}) / {K}, block = thread % across, line = thread / across;
+    const int y = line % rendered.shape[1], c = line / rendered.shape[1], end = rendered.shape[2] - {K};
+    const int x = block * {K} < end ? block * {K} : end, again = block * {K} - x;
+    float loss = 0.0f, square = 0.0f, other = 0.0f;
+    if (c < rendered.shape[0]) {{{_rows(MOMENTS, "columns")}
+        const F cross = s0 * s1, own = s0 * s0 + s1 * s1;
+        const F means = 2.0f * cross + {STABILISE_MEAN}f, spreads = 2.0f * (s4 - cross) + {STABILISE_SPREAD}f;
+        const F mean_scale = 1.0f / (own + {STABILISE_MEAN}f);
+        const F spread_scale = 1.0f / (s2 + s3 - own + {STABILISE_SPREAD}f);
+        const F luminance = means * mean_scale, structure = spreads * spread_scale, similarity = luminance * structure;
+        const F by_mean = 2.0f * (s1 * mean_scale * structure - s1 * luminance * spread_scale
+                                  - s0 * similarity * mean_scale + s0 * similarity * spread_scale);
+        const F squared = d * d, difference = absolute ? (d < 0.0f ? -d : d) : squared;
+        const F map = (1.0f - share) * difference + share * (1.0f - similarity);
+        float* out = slopes.data + (c * height + y) * stride + x + {REACH};
+        put(out, by_mean); put(out + plane, -similarity * spread_scale);
+        put(out + 2 * plane, 2.0f * luminance * spread_scale);
+        for (int n = again; n < {K}; ++n) {{ loss += map{each}; square += squared{each}; }}
+        if (pixel + {K} <= also.shape[0]) for (int n = again; n < {K}; ++n) other += also.data[pixel + n];
+    }}{OVER_LANES}
+    loss = over_lanes(loss); square = over_lanes(square); other = over_lanes(other);
+    if (writes) {{
+        const int parts = partials.shape[1];
+        partials.data[slot] = loss; partials.data[parts + slot] = square; partials.data[2 * parts + slot] = other;
+    }}
 """
 
 
@@ -145,6 +160,7 @@ def make_similarity(K: int) -> SimpleNamespace:
     def products_of(
         rendered: wp.array3d[float],
         measured: wp.array3d[float],
+        row: int,
         c: int,
         y: int,
         x: int,
@@ -155,12 +171,12 @@ def make_similarity(K: int) -> SimpleNamespace:
         columns: wp.array4d[float],
         rendered: wp.array3d[float],
         measured: wp.array3d[float],
+        row: int,
+        also: wp.array[float],
         share: float,
         absolute: bool,
-        c: int,
-        y: int,
-        x: int,
-        maps: wp.array4d[float],
+        thread: int,
+        partials: wp.array2d[float],
         slopes: wp.array4d[float],
     ): ...
     @wp.func_native(_columns_of_slopes(K))
@@ -170,6 +186,7 @@ def make_similarity(K: int) -> SimpleNamespace:
         columns: wp.array4d[float],
         rendered: wp.array3d[float],
         measured: wp.array3d[float],
+        row: int,
         share: float,
         absolute: bool,
         scale: float,
@@ -188,29 +205,31 @@ def make_similarity(K: int) -> SimpleNamespace:
     def columns_of_products(
         # In:
         rendered: wp.array3d[float],  # [C, H, W]
-        measured: wp.array3d[float],  # [C, H, W]
+        measured: wp.array3d[float],  # [R C, H, W]
+        row: wp.array[int],  # [1] which C of ``measured`` [index]
         # Out:
         columns: wp.array4d[float],  # [5, C, H, W + 10] window sums along columns of r, m, r^2, m^2, r m
     ):
         """One thread per block of K pixels."""
         c, y, block = wp.tid()
-        products_of(rendered, measured, c, y, begin(block, rendered.shape[2]), columns)
+        products_of(rendered, measured, row[0], c, y, begin(block, rendered.shape[2]), columns)
 
     @wp.kernel(**options)
     def compare_images(
         # In:
         columns: wp.array4d[float],  # [5, C, H, W + 10] from ``columns_of_products``, margins zero
         rendered: wp.array3d[float],  # [C, H, W]
-        measured: wp.array3d[float],  # [C, H, W]
+        measured: wp.array3d[float],  # [R C, H, W]
+        row: wp.array[int],  # [1] which C of ``measured`` [index]
+        also: wp.array[float],  # [H W] another image that is summed up, or nothing
         share: float,  # of the similarity, 0..1 [1]
         absolute: bool,  # whether p is 1 [flag]
         # Out:
-        maps: wp.array4d[float],  # [2, C, H, W] loss and squared difference
+        partials: wp.array2d[float],  # [3, P] sums over parts of loss, squared difference and the other image
         slopes: wp.array4d[float],  # [3, C, H, W + 10] derivatives of S by the means of r, r^2, r m
     ):
-        """One thread per block of K pixels."""
-        c, y, block = wp.tid()
-        compare(columns, rendered, measured, share, absolute, c, y, begin(block, rendered.shape[2]), maps, slopes)
+        """One thread per block of K pixels; on CUDA as many as fill the last warp."""
+        compare(columns, rendered, measured, row[0], also, share, absolute, wp.tid(), partials, slopes)
 
     @wp.kernel(**options)
     def columns_of_slopes(
@@ -228,7 +247,8 @@ def make_similarity(K: int) -> SimpleNamespace:
         # In:
         columns: wp.array4d[float],  # [3, C, H, W + 10] from ``columns_of_slopes``, margins zero
         rendered: wp.array3d[float],  # [C, H, W]
-        measured: wp.array3d[float],  # [C, H, W]
+        measured: wp.array3d[float],  # [R C, H, W]
+        row: wp.array[int],  # [1] which C of ``measured`` [index]
         share: float,  # of the similarity, 0..1 [1]
         absolute: bool,  # whether p is 1 [flag]
         factor: float,  # multiplies everything, for example one over the number of values [1]
@@ -239,7 +259,8 @@ def make_similarity(K: int) -> SimpleNamespace:
         """One thread per block of K pixels."""
         c, y, block = wp.tid()
         scale = factor * cotangent[0]
-        gradient_of(columns, rendered, measured, share, absolute, scale, c, y, begin(block, rendered.shape[2]), grad)
+        x = begin(block, rendered.shape[2])
+        gradient_of(columns, rendered, measured, row[0], share, absolute, scale, c, y, x, grad)
 
     return SimpleNamespace(
         K=K,

@@ -17,15 +17,15 @@ from torch import Tensor
 
 from ..constants import FRAMES_PER_QUARTET
 from ..losses.prior import motion_size
-from ..render import fused
+from ..render import descent, fused
 from ..render.api import Rendering
-from ..render.bridge import Branches, Captured, Outbox, pairs_of
+from ..render.bridge import Branches, Captured, Outbox, pairs_of, shared_pool
 from ..render.buffers import RenderSettings, Workspace
 from ..scene.motion import Still
 from . import densify
-from .objective import flow_between, image_loss, render_settings_at, rendering_of, weights_at
+from .objective import image_loss, render_settings_at, rendering_of, weights_at
 from .observations import Observations
-from .optimiser import BETAS, EPSILON, frozen, rates_at
+from .optimiser import EPSILON, frozen, rates_at
 from .padded import Padded
 from .settings import Kernels, ReconSettings, Weights
 from .state import State
@@ -36,6 +36,7 @@ HEAD = 4  # numbers before those of the images: this key, the next, the one befo
 PER_IMAGE = 3  # numbers of an image: raw frame, seed and number of its background
 ROOM = 1.5  # pairs that are reserved, over the most that were seen
 PAIRS = 1 << 16  # in such numbers
+ROW = {name: n for n, name in enumerate(descent.FOUND_NAMES)}
 FULL, EMPTY = 0.85, 0.4  # shares of that reserve at which another one is made
 
 
@@ -92,29 +93,37 @@ class _Image:
     """One image of a batch."""
 
     terms: dict[str, Tensor]
-    """Weighted terms of its loss."""
+    """Terms of its loss, without weights."""
     tof: Rendering
     """What was compared."""
-    squared: Tensor
-    """Mean squared difference [squared quad units]."""
-    opacity: Tensor
-    """Mean opacity [1]."""
 
 
 class CapturedSteps:
     """The steps of one run. Between two steps the state is as single steps leave it, but for what is on its way."""
 
-    def __init__(self, state: State, observations: Observations, settings: ReconSettings):
+    def __init__(self, state: State, observations: Observations, settings: ReconSettings, *, graphs: bool = True):
+        """Take over a state.
+
+        Args:
+            state: Advanced in place.
+            observations: What it is fitted to; see :func:`unsuitable`.
+            settings: How.
+            graphs: Whether steps are captured; otherwise a GPU does the same work operation by operation.
+        """
         self.observations, self.settings = observations, settings
         device = observations.quads.device
         self.state, self.padded = state, Padded()
         self._graphs: dict[Variant, Callable[[], None]] = {}
+        self._part: tuple | None = None  # of the run: what graphs that are kept have in common
+        self._pool = shared_pool(device)
         self._capacity: int | None = None
         self._reserves = device.type != "cpu"  # a CPU counts pairs first: nobody waits for anybody there
-        self._sums: dict[str, Tensor] = {}
-        self._counts = torch.zeros(3, dtype=torch.int32, device=device)  # failed, in a row, most pairs of an image
         longest = max(len(batch) for batch in observations.batches)
-        self._images = longest
+        self._graphs_wanted = graphs
+        self._ledger = descent.Ledger.empty(longest, device)
+        self._summed: set[str] = set()  # names of sums that a step has added to
+        self._ones: dict[float, Tensor] = {}
+        self._scratch = [fused.Scratch() for _ in range(longest)]
         self._numbers = Outbox(HEAD + PER_IMAGE * longest, torch.int32, device)
         leaves = len(state.optimiser.leaves)
         self._values = Outbox(leaves + longest, torch.float32, device)
@@ -130,6 +139,7 @@ class CapturedSteps:
         frames = draw(state, self.observations, settings)
         before, state.images = state.images, state.images + len(frames)
         variant = self._variant(frames, before)
+        self._enter(variant)
         rates = rates_at(settings, before, state.rate_factor, reset_at=state.reset_at)
         due = densify.round_is_due(before, state.images, settings.densify, settings.schedule)
         if due and settings.densify.loses_step:
@@ -137,10 +147,11 @@ class CapturedSteps:
         self._write(frames, before, rates)
         run = self._graphs.get(variant)
         if run is None:  # the first one is done without a graph: libraries wake up, sizes become known
-            self._body(variant)
+            table = self.padded.table()
+            self._body(variant, table, table.send)
             if self._capacity is None:
                 self._look()
-            self._graphs[variant] = Captured(lambda: self._body(variant), self.observations.quads.device)
+            self._graphs[variant] = self._captured(variant, table)
         else:
             run()
         densify_after(state, before, settings)
@@ -148,26 +159,60 @@ class CapturedSteps:
             self._look()
             self._adopt()
 
+    def _enter(self, variant: Variant) -> None:
+        """Let go of graphs of a part of the run that is over, and prepare what rests in the one that begins."""
+        part = variant.moves, variant.rests, variant.weights, variant.sh_degree
+        if part == self._part:
+            return
+        if self._graphs:
+            self._look()  # waits: memory of a graph must not be given to anybody before it has run
+            self._graphs.clear()
+        self._part = part
+        self._rest(variant.rests)
+
+    def _rest(self, rests: bool) -> None:
+        """Ask the motion once where Gaussians hang on it, if they will not move any more."""
+        motion, padded = self.state.motion, self.padded
+        if rests and motion.follows_means:
+            padded.attachment = motion.attach(padded.field.map(torch.Tensor.detach))
+
+    def _captured(self, variant: Variant, table: descent.AdamTable) -> Callable[[], None]:
+        """A step of this kind; its gradients lie where the capture puts them, which the table learns after it."""
+
+        def ready() -> None:
+            table.send()
+            table.release()
+
+        device = self.observations.quads.device
+        if device.type == "cpu" or not self._graphs_wanted:
+            return lambda: self._body(variant, table, table.send)
+        return Captured(lambda: self._body(variant, table, None), device, ready, self._pool)
+
     def collect(self) -> int:
         """Bring sums and counts of the steps so far into the state; waits for the device.
 
         Returns:
             How many steps in a row, up to the last one, were not finite and changed nothing.
         """
-        for name, room in self._sums.items():
-            value = self.state.sums.get(name)
-            self.state.sums[name] = room.clone() if value is None else value + room
-            room.zero_()
+        found = dict(zip(descent.SUM_NAMES, self._ledger.sums.clone(), strict=True))
+        for name in descent.SUM_NAMES:
+            if name in self._summed:
+                value = self.state.sums.get(name)
+                self.state.sums[name] = found[name] if value is None else value + found[name]
+        self._ledger.sums.zero_()
+        if self.state.motion.follows_means:
+            self.state.attachment = self.state.motion.attach(self.state.optimiser.field)
         return self._look()
 
     def _look(self) -> int:
         """Steps in a row that failed; makes more or less room for pairs where that is due."""
-        failed, in_a_row, pairs = self._counts.tolist()
+        counts = self._ledger.counts
+        failed, in_a_row, pairs = counts.tolist()
         self.state.skipped += failed
         if failed:
             LOG.warning("%d steps before image %d skipped, not finite or of too many splats", failed, self.state.images)
-        self._counts[0] = 0
-        self._counts[2] = 0
+        counts[0] = 0
+        counts[2] = 0
         if pairs and (self._capacity is None or not EMPTY < pairs / self._capacity < FULL):
             self._capacity = math.ceil(ROOM * pairs / PAIRS) * PAIRS
             self._graphs.clear()
@@ -176,6 +221,8 @@ class CapturedSteps:
     def _adopt(self) -> None:
         if self.padded.adopt(self.state):
             self._graphs.clear()
+        if self._part is not None:
+            self._rest(self._part[1])
 
     # -- what the host says --------------------------------------------------------------------------------------------
 
@@ -205,116 +252,123 @@ class CapturedSteps:
 
     # -- what the device does ------------------------------------------------------------------------------------------
 
-    def _body(self, variant: Variant) -> None:
-        """One step, from the numbers that were sent to new parameters; nothing is read back."""
-        padded = self.padded
-        numbers, motion, count = self._numbers.there, self.state.motion, len(variant.shifts)
+    def _body(self, variant: Variant, table: descent.AdamTable, send: Callable[[], None] | None) -> None:
+        """One step, from the numbers that were sent to new parameters; nothing is read back.
+
+        Args:
+            variant: Of which operations it consists.
+            table: Where its tensors lie; learns where its gradients do.
+            send: What tells the device so; None: that comes later.
+        """
+        padded, numbers, motion = self.padded, self._numbers.there, self.state.motion
         field = padded.field
         if variant.rests:
             field = field.map(torch.Tensor.detach)
         field = field.map(lambda tensor: tensor.view_as(tensor))  # gradients of all branches meet on this stream
         offsets: Tensor | None = None
         if variant.moves:
-            attachment = motion.attach(field) if motion.follows_means else padded.attachment
+            asked = motion.follows_means and not variant.rests
+            attachment = motion.attach(field) if asked else padded.attachment
             offsets = motion.key_offsets(attachment, numbers[: 3 if variant.flow else 2])
         render = replace(self.settings.render, sh_degree=variant.sh_degree, pair_capacity=self._capacity)
-        found: dict[str, Tensor] = {}
         images = []
-        for n in range(count):
+        for n in range(len(variant.shifts)):
             with self._branches.fork(n):
                 images.append(self._image(variant, n, field, offsets, render))
         self._branches.join()
-        for image in images:
-            for name, value in image.terms.items():
-                found[name] = found[name] + value if name in found else value
-        loss = torch.stack([*found.values()]).sum()
         first = len(padded.values) if variant.rests else 0
-        wanted = padded.leaves[first:]
-        gradients = torch.autograd.grad(loss, wanted, allow_unused=True) if loss.requires_grad else []
+        wanted, absent = padded.leaves[first:], [None] * first
+        terms = [(value, getattr(variant.weights, name)) for image in images for name, value in image.terms.items()]
+        terms = [(value, weight) for value, weight in terms if value.requires_grad]
+        gradients: list[Tensor | None] = [None] * len(wanted)
+        if terms:  # the loss is their sum, but nobody needs that number before the end
+            values, weights = zip(*terms, strict=True)
+            ones = [self._one_times(weight) for weight in weights]
+            gradients = [*torch.autograd.grad(values, wanted, ones, allow_unused=True)]
         with torch.no_grad():
-            self._descend(gradients, loss.detach(), count)
-            sound = self._counts[1:2] == 0
-            rows = {name: value.detach() for name, value in found.items()}
-            rows |= {"loss": loss.detach(), "quad_mse": torch.stack([image.squared for image in images]).sum()}
-            opacity = torch.stack([image.opacity for image in images]).sum()
-            self._account(rows | {"opacity": opacity, "count": torch.full_like(loss, count)}, sound)
-            for image in images:
-                if image.tof.screen is not None:
-                    self._observe(image.tof.screen, sound)
+            gradients = [None if gradient is None else gradient.contiguous() for gradient in gradients]
+            table.point([*absent, *gradients])
+            if send is not None:
+                send()
+            self._descend(variant, table, {name for image in images for name in image.terms})
+            screens = [image.tof.screen for image in images if image.tof.screen is not None]
+            if screens:
+                camera, statistics = self.observations.cameras[0], padded.statistics
+                size = camera.width, camera.height
+                descent.observe(screens, size, self._ledger, statistics.gradient, statistics.pixels)
 
     def _image(self, variant: Variant, n: int, field, offsets: Tensor | None, render: RenderSettings) -> _Image:
         """One image of the batch, compared."""
         settings, weights = self.settings, variant.weights
-        numbers, share = self._numbers.there[HEAD + PER_IMAGE * n :], self._values.there[len(self._groups) + n]
-        moved, displacement, lights = field, None, {}
+        numbers, first = self._numbers.there[HEAD + PER_IMAGE * n :], len(self._groups) + n
+        moved, flows, lights = field, None, {}
         if offsets is not None:
-            displacement = torch.lerp(offsets[0], offsets[1], share)
-            moved = field.moved(displacement)
+            share, flow = self._values.there[first : first + 1], variant.flow and n == 0
+            mean, flows = fused.displaced(field.mean, offsets, share, channels=flow)
+            moved = replace(field, mean=mean)
         if settings.background > 0:
             shape = (1, *self.observations.quads.shape[1:])
             lights["quads"] = fused.uniform(shape, numbers[1:3], settings.background)
         sensor = self.observations.sensor.with_shifts(variant.shifts[n : n + 1])
-        camera, flows = self.observations.cameras[0], []
-        if variant.flow and n == 0 and offsets is not None:
-            flows = [offset - offsets[0] for offset in offsets[1:]]
+        camera = self.observations.cameras[0]
         tof = rendering_of(
             moved, camera, sensor, settings, render, weights, lights, flows=flows, workspace=self._workspaces[n]
         )
-        measured = self.observations.quads.index_select(0, numbers[:1])
-        loss, squared = image_loss(tof.quads, measured, weights.ssim, kernel=True)
-        terms = {"quads": weights.quads * loss}
+        found = self._ledger.found[n]
+        terms = {"quads": self._quad_loss(tof, numbers[:1], n)}
         if weights.distortion > 0:
-            terms["distortion"] = weights.distortion * tof.distortion.mean()
-        if weights.motion_size > 0 and displacement is not None:
-            terms["motion_size"] = weights.motion_size * motion_size(displacement).mean()
-        if flows:  # both directions: what is unknown counts zero
+            terms["distortion"] = tof.distortion.mean()
+        if weights.motion_size > 0 and offsets is not None:
+            terms["motion_size"] = motion_size(moved.mean - field.mean).mean()
+        for name in ("distortion", "motion_size"):
+            if name in terms:
+                found.data[ROW[name]] = terms[name].detach()  # apart from the history of the other numbers
+        if flows is not None:  # both directions: what is unknown counts zero
             assert self._flow is not None
             assert tof.extra is not None
-            measured = self._flow.index_select(0, self._numbers.there[3:4])[0]
-            rays = self.observations.rays_at(0)
-            flow = flow_between(tof.distance, tof.extra, list(measured), camera, [camera, camera], rays)
-            terms["flow"] = weights.flow * flow
-        return _Image(terms=terms, tof=tof, squared=squared, opacity=tof.opacity.detach().mean())
+            row, out = self._numbers.there[3:4], found[ROW["flow"] : ROW["flow"] + 1]
+            terms["flow"] = fused.flow_loss(
+                tof.distance, tof.extra, self._flow, camera, [camera, camera], row=row, out=out
+            )
+        return _Image(terms=terms, tof=tof)
 
-    def _descend(self, gradients, loss: Tensor, images: int) -> None:
-        """Adam, if everything is finite and no pair was dropped; counts what happened."""
-        padded, settings = self.padded, self.settings
-        absent = padded.write_gradients(gradients)
-        if images > 1:  # not the loss: densification looks at the gradients of single images
-            torch._foreach_mul_(padded.gradients, 1.0 / images)
-        norm = torch.nn.utils.get_total_norm(padded.gradients)
-        sound = (loss + norm).isfinite().reshape(1)
-        if self._reserves:
-            most = torch.cat([pairs_of(workspace) for workspace in self._workspaces[:images]]).amax().reshape(1)
-            self._counts[2:] = torch.maximum(self._counts[2:], most)
-            if self._capacity is not None:
-                sound &= most <= self._capacity
-        failed = (~sound).to(torch.int32)
-        self._counts[:1] += failed
-        self._counts[1:2] = (self._counts[1:2] + 1) * failed
-        of_motion = padded.gradients[len(padded.values) :]
-        if of_motion and settings.motion_gradient_max is not None:
-            _shorten(of_motion, settings.motion_gradient_max)
-        rates = self._values.there[: len(self._groups)]
-        for n in absent:  # what has no gradient is left alone, as torch's Adam does
-            rates[n : n + 1].zero_()
-        assert padded.table is not None
-        fused.adam_step(padded.table, rates, sound.to(torch.int32), betas=BETAS, epsilon=EPSILON)
+    def _quad_loss(self, tof: Rendering, row: Tensor, n: int) -> Tensor:
+        """Of image ``n`` against the measured one in a row; with the mean squared difference and opacity beside it."""
+        ssim, quads, found = self.settings.weights.ssim, self.observations.quads, self._ledger.found[n]
+        if ssim > 0:
+            scratch, resident = self._scratch[n], quads[:, None]
+            return fused.image_loss(
+                tof.quads, resident, ssim, row=row, opacity=tof.opacity, scratch=scratch, out=found[:3]
+            )[0]
+        loss, squared = image_loss(tof.quads, quads.index_select(0, row), ssim)
+        found.data[:3] = torch.stack([loss.detach(), squared, tof.opacity.detach().mean()])
+        return loss
 
-    def _account(self, rows: dict[str, Tensor], sound: Tensor) -> None:
-        """Add to the sums of the log what a sound step found."""
-        for name in rows.keys() - self._sums.keys():
-            self._sums[name] = torch.zeros_like(rows[name])
-        names = list(rows)
-        values = torch.where(sound, torch.stack([rows[name] for name in names]), 0.0)
-        torch._foreach_add_([self._sums[name] for name in names], list(values.unbind()))
+    def _one_times(self, weight: float) -> Tensor:
+        """A number where the device reads it; made before any capture, since every step runs once without."""
+        if weight not in self._ones:
+            self._ones[weight] = torch.full((), weight, device=self.observations.quads.device)
+        return self._ones[weight]
 
-    def _observe(self, screen, sound: Tensor) -> None:
-        """Add to what densification looks at."""
-        before = self.padded.statistics
-        after = densify.observe(before, screen, self.observations.cameras[0])
-        before.gradient.copy_(torch.where(sound, after.gradient, before.gradient))
-        before.pixels.copy_(torch.where(sound, after.pixels, before.pixels))
+    def _descend(self, variant: Variant, table: descent.AdamTable, terms: set[str]) -> None:
+        """Adam, if everything is finite and no pair was dropped; counts and sums what happened."""
+        weights = dict.fromkeys(descent.FOUND_NAMES, 0.0) | {"quad_mse": 1.0, "opacity": 1.0}
+        weights |= {name: float(getattr(variant.weights, name)) for name in terms}
+        self._summed |= terms | {"quad_mse", "opacity", "loss", "count"}
+        used = self._workspaces[: len(variant.shifts)]
+        capacity = (-1 if self._capacity is None else self._capacity) if self._reserves else 0
+        descent.descend(
+            table,
+            self._values.there[: len(self._groups)],
+            self._ledger,
+            [weights[name] for name in descent.FOUND_NAMES],
+            motion_from=len(self.padded.values),
+            motion_gradient_max=self.settings.motion_gradient_max,
+            pairs=[pairs_of(workspace) for workspace in used],
+            capacity=capacity,
+            betas=self.state.optimiser.betas,
+            epsilon=EPSILON,
+        )
 
     def _resident_flow(self) -> Tensor | None:
         """[quartets, 2, 2, H, W] px to the next quartet and to the one before; NaN where there is none."""
@@ -327,9 +381,3 @@ class CapturedSteps:
         for (quartet, step), flow in flows.items():
             room[quartet, 0 if step == 1 else 1] = flow
         return room
-
-
-def _shorten(gradients: list[Tensor], longest: float) -> None:
-    """As torch.nn.utils.clip_grad_norm_ does it, on gradients themselves."""
-    norm = torch.nn.utils.get_total_norm(gradients)
-    torch._foreach_mul_(gradients, (longest / (norm + 1e-6)).clamp(max=1.0))

@@ -125,7 +125,7 @@ def terms(
     if motion is not None and weights.motion_size > 0:
         result["motion_size"] = weights.motion_size * motion_size(displacement).mean()
     if motion is not None and weights.flow > 0 and frame % FRAMES_PER_QUARTET == 0:
-        flow = flow_loss(field, motion, attachment, observations, frame, render)
+        flow = flow_loss(field, motion, attachment, observations, frame, render, kernel=kernel)
         if flow is not None:
             result["flow"] = weights.flow * flow
     return result, Seen(tof=tof, colour=colour, squared=still.new_zeros(()) if squared is None else squared)
@@ -141,7 +141,7 @@ def rendering_of(
     backgrounds: Mapping[str, Tensor] | None,
     *,
     light: str = "quads",
-    flows: Sequence[Float[Tensor, "N 3"]] = (),
+    flows: Float[Tensor, "N D"] | None = None,
     workspace: Workspace | None = None,
 ) -> Rendering:
     """One rendering before random light from behind, of what the loss looks at; with colour if the field has any.
@@ -155,7 +155,7 @@ def rendering_of(
         weights: Of the terms.
         backgrounds: Random light, see :func:`terms`.
         light: The image that is compared, quads or phasor.
-        flows: Displacements [m] that come along as extra channels; their gradient reaches them alone.
+        flows: Displacements [m], three each, that come along as extra channels; their gradient reaches them alone.
         workspace: Where to render; None: in memory of its own.
     """
     wanted = ("colour",) if field.colour_sh is not None else ("quads", "phasor")
@@ -163,7 +163,7 @@ def rendering_of(
     images = {"opacity", light}
     if weights.distortion > 0:
         images.add("distortion")
-    if weights.depth > 0 or flows:
+    if weights.depth > 0 or flows is not None:
         images.add("distance")
     return rasterize(
         field,
@@ -173,8 +173,8 @@ def rendering_of(
         background=Background(**lights),
         screen_gradient=settings.densify.every is not None,
         images=images,
-        extra=torch.cat(list(flows), dim=1) if flows else None,
-        extra_detached=bool(flows),
+        extra=flows,
+        extra_detached=flows is not None,
         workspace=workspace,
     )
 
@@ -200,7 +200,7 @@ def image_loss(
         ValueError: If the shapes differ.
     """
     if kernel and ssim > 0:
-        return fused.image_loss(rendered, measured, ssim, absolute=norm == Norm.L1)
+        return fused.image_loss(rendered, measured, ssim, absolute=norm == Norm.L1)[:2]
     squared = quad_error(rendered, measured).mean()
     difference = squared if norm == Norm.L2 else (rendered - measured).abs().mean()
     loss = (1.0 - ssim) * difference
@@ -216,12 +216,14 @@ def flow_loss(
     observations: Observations,
     frame: int,
     render: RenderSettings,
+    *,
+    kernel: bool = False,
 ) -> Tensor | None:
     """Squared difference of rendered and measured flow [px^2] from a quartet's start to both neighbours; None: no flow.
 
     The mean is over all pixels and both components, unknown ones counting zero. Gradients reach the motion through the
     displacement between keys only: the surface and all weights are held fixed (method, section 5). If the camera moves,
-    the flow of its own motion is part of both.
+    the flow of its own motion is part of both. ``kernel``: whether the hand-written kernels compare.
     """
     quartet = frame // FRAMES_PER_QUARTET
     steps = [step for step in (1, -1) if (quartet, step) in observations.flow]
@@ -236,6 +238,8 @@ def flow_loss(
     last = len(observations.cameras) - 1
     later = [observations.cameras[min(frame + FRAMES_PER_QUARTET * step, last)] for step in steps]
     measured = [observations.flow[quartet, step] for step in steps]
+    if kernel:
+        return fused.flow_loss(seen.distance, seen.extra, torch.stack(measured)[None], camera, later)
     return flow_between(seen.distance, seen.extra, measured, camera, later, observations.rays_at(frame))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import asdict
 
@@ -9,12 +10,13 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
-from ..render import fused
+from ..constants import FRAMES_PER_QUARTET
+from ..render import descent
 from ..scene.gaussians import GaussianField
 from ..scene.motion import Motion
-from .settings import ReconSettings
+from .settings import Batch, BatchRule, Input, ReconSettings
 
-BETAS = (0.9, 0.999)
+BETAS = (0.9, 0.999)  # of steps of one image
 EPSILON = 1e-15  # far below any gradient here, so that a step depends on the direction of a gradient, not on its size
 
 
@@ -38,6 +40,7 @@ def rates_at(
     begin = schedule.motion_decay_from
     shares = dict.fromkeys(first, share)
     shares["motion"] = min(max(images - begin, 0) / max(schedule.images - begin, 1), 1.0)
+    factor *= math.sqrt(_images(settings))
     rates = {name: factor * _between(first[name], last[name], shares[name]) for name in first}
     paused = reset_at is not None and images < reset_at + schedule.pause_after_reset
     if images < schedule.warm_up or paused:
@@ -45,6 +48,19 @@ def rates_at(
     if frozen(settings, images):
         rates = {name: rate if name == "motion" else 0.0 for name, rate in rates.items()}
     return rates
+
+
+def betas_of(settings: ReconSettings) -> tuple[float, float]:
+    """Decays of both moments per step: as much is forgotten per image, whatever the batch, if its rule says so."""
+    images = _images(settings)
+    return BETAS[0] ** images, BETAS[1] ** images
+
+
+def _images(settings: ReconSettings) -> int:
+    """Images of a step as far as Adam is concerned; a last batch that is cut short counts as a whole one."""
+    schedule = settings.schedule
+    joint = schedule.batch == Batch.QUARTET and settings.input != Input.PHASOR and settings.weights.quads > 0
+    return FRAMES_PER_QUARTET if joint and schedule.batch_rule == BatchRule.ROOT else 1
 
 
 def frozen(settings: ReconSettings, images: int) -> bool:
@@ -64,13 +80,22 @@ class Optimiser:
     The harmonics of the colour are two tensors, ``colour_constant`` and ``colour_rest``, since their rates differ.
     """
 
-    def __init__(self, field: GaussianField, motion: Motion, state: dict | None = None):
+    def __init__(
+        self,
+        field: GaussianField,
+        motion: Motion,
+        state: dict | None = None,
+        *,
+        betas: tuple[float, float] = BETAS,
+    ):
         """Take copies of the tensors of a field, which become leaves, and the parameters of a motion.
 
         Args:
             field: The Gaussians.
             motion: Their motion.
-            state: ``adam.state_dict()`` of an earlier optimiser of the same tensors; None starts at zero.
+            state: ``adam.state_dict()`` of an earlier optimiser of the same tensors, whose decays go on; None starts
+                at zero.
+            betas: Decays of both moments per step.
         """
         self.layer = field.layer
         parts = field.parameters()
@@ -82,7 +107,7 @@ class Optimiser:
         self.adam = torch.optim.Adam(
             [{"name": name, "params": [value], "lr": 0.0} for name, value in self.tensors.items()]
             + ([{"name": "motion", "params": self.motion, "lr": 0.0}] if self.motion else []),
-            betas=BETAS,
+            betas=betas,
             eps=EPSILON,
             fused=True,
         )
@@ -96,6 +121,12 @@ class Optimiser:
         if "colour_rest" in parts:
             parts["colour_sh"] = torch.cat([parts.pop("colour_constant"), parts.pop("colour_rest")], dim=1)
         return GaussianField(**parts, layer=self.layer)
+
+    @property
+    def betas(self) -> tuple[float, float]:
+        """Decays of both moments per step."""
+        first, second = self.adam.param_groups[0]["betas"]
+        return first, second
 
     @property
     def leaves(self) -> list[Tensor]:
@@ -143,8 +174,8 @@ class Optimiser:
             return
         values, gradients = [leaf.detach() for leaf, _ in moving], [leaf.grad.contiguous() for leaf, _ in moving]
         rates = torch.tensor([rate for _, rate in moving], device=sound.device)
-        table = fused.adam_table(values, gradients, moments)
-        fused.adam_step(table, rates, sound.to(torch.int32).reshape(1), betas=BETAS, epsilon=EPSILON)
+        table = descent.AdamTable(values, gradients, moments)
+        descent.adam_step(table, rates, sound.to(torch.int32).reshape(1), betas=self.betas, epsilon=EPSILON)
 
     def moments_of(self, leaf: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """(step, first moment, second moment) of a leaf; zeros, as torch's Adam would begin, if it has none yet."""

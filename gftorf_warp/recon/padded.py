@@ -6,12 +6,9 @@ moments of them are zero, leaves them where they are.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-
-import torch
 from torch import Tensor
 
-from ..render import fused
+from ..render import descent
 from ..scene.gaussians import GaussianField
 from .densify import Statistics
 from .state import State
@@ -21,7 +18,7 @@ DEAD = -30.0  # opacity logit of a row that nobody sees
 
 
 class Padded:
-    """Room for the Gaussians of one state, their moments, gradients and statistics.
+    """Room for the Gaussians of one state, their moments and statistics.
 
     :meth:`adopt` moves a state here; what the state holds then are views of the first N rows, so that densification,
     checkpoints and diagnostics know nothing of the room.
@@ -30,11 +27,10 @@ class Padded:
     def __init__(self) -> None:
         self.rows = 0
         self.values: dict[str, Tensor] = {}
-        self.gradients: list[Tensor] = []
         self._moments: dict[str, tuple[Tensor, Tensor, Tensor]] = {}
         self._views: dict[str, Tensor] = {}
         self._motion: list[Tensor] = []
-        self.table: fused.AdamTable | None = None
+        self._motion_moments: list[tuple[Tensor, Tensor, Tensor]] = []
 
     @property
     def leaves(self) -> list[Tensor]:
@@ -45,6 +41,11 @@ class Padded:
     def field(self) -> GaussianField:
         """All rows, the dead ones as well."""
         return GaussianField(**self.values, layer=self.layer)
+
+    def table(self) -> descent.AdamTable:
+        """Where all of these lie, for one step that is captured; there are no gradients yet."""
+        values = [leaf.detach() for leaf in self.leaves]
+        return descent.AdamTable(values, [None] * len(values), [*self._moments.values(), *self._motion_moments])
 
     def holds(self, state: State) -> bool:
         """Whether the tensors of a state are still those of this room."""
@@ -83,14 +84,11 @@ class Padded:
         self.values = {name: like(tensor).requires_grad_() for name, tensor in tensors.items()}
         self._moments = {name: (tensor.new_zeros(()), like(tensor), like(tensor)) for name, tensor in tensors.items()}
         self._motion = list(optimiser.motion)
-        self.gradients = [torch.zeros_like(leaf, requires_grad=False) for leaf in self.leaves]
         self.layer = None if optimiser.layer is None else like(optimiser.layer)
         self.attachment = like(state.attachment)
         zero = like(tensors["opacity_logit"])
         self.statistics = Statistics(gradient=zero, pixels=zero.clone())
-        moments = [*self._moments.values(), *(optimiser.moments_of(leaf) for leaf in self._motion)]
-        values = [leaf.detach() for leaf in self.leaves]
-        self.table = fused.adam_table(values, self.gradients, moments)
+        self._motion_moments = [optimiser.moments_of(leaf) for leaf in self._motion]
 
     def _take(self, state: State, name: str, tensor: Tensor, count: int) -> None:
         """One tensor of the field and its moments."""
@@ -112,17 +110,3 @@ class Padded:
         if room.data_ptr() != rows.data_ptr():
             room[: len(rows)] = rows
         room[len(rows) :] = 0
-
-    def write_gradients(self, found: Iterable[Tensor | None]) -> list[int]:
-        """Keep gradients of the last leaves, as many as there are; earlier ones and None are zero.
-
-        Returns:
-            Indices of the leaves that have none.
-        """
-        given = list(found)
-        listed: list[Tensor | None] = [*[None] * (len(self.gradients) - len(given)), *given]
-        pairs = [(room, value) for room, value in zip(self.gradients, listed, strict=True) if value is not None]
-        if pairs:
-            rooms, values = zip(*pairs, strict=True)
-            torch._foreach_copy_(list(rooms), list(values))
-        return [n for n, value in enumerate(listed) if value is None]

@@ -68,6 +68,15 @@ class Batch(enum.StrEnum):
     """The measured raw frames of one quartet: all slots pull at once."""
 
 
+class BatchRule(enum.StrEnum):
+    """What rates and moments of Adam become when a step compares several images, over those of single images."""
+
+    NONE = "none"
+    """The same."""
+    ROOT = "root"
+    """Of b images: rates times the root of b, both decays to the power of b, so that as much is forgotten per image."""
+
+
 class Kernels(enum.StrEnum):
     """How much of a step, beside the rendering, is done by kernels instead of torch: the same to rounding."""
 
@@ -137,6 +146,8 @@ class Schedule:
     """Length of the run [images]."""
     batch: Batch = Batch.QUARTET
     """What one step compares; a phasor is one image."""
+    batch_rule: BatchRule = BatchRule.NONE
+    """How Adam is told of larger batches."""
     warm_up: int = 0
     """Nothing moves for so long, and the motion learns nothing [images]."""
     motion_decay_from: int = 0

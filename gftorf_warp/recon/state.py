@@ -16,7 +16,7 @@ from ..scene.motion import Motion, MotionKind, MotionSettings, Nodes, Products, 
 from ..scene.network import Network
 from . import densify
 from .observations import Observations
-from .optimiser import Optimiser
+from .optimiser import Optimiser, betas_of
 from .settings import ReconSettings
 
 FORMAT = 2  # of the stored form; a higher one is refused
@@ -74,7 +74,7 @@ def begin(observations: Observations, settings: ReconSettings, *, seed: int, dev
     if settings.weights.colour > 0:
         field = replace(field, colour_sh=torch.zeros(len(field), SH_COEFFICIENTS, 3, device=device))
     return State(
-        optimiser=Optimiser(field, motion),
+        optimiser=Optimiser(field, motion, betas=betas_of(settings)),
         motion=motion,
         attachment=motion.attach(field),
         statistics=densify.start(field),

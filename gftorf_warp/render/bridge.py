@@ -20,6 +20,7 @@ from .inputs import Images, Inputs, names_of
 
 INPUTS = names_of(Inputs)
 IMAGES = names_of(Images)
+ALIGNED = 64  # [float32] to which parts of one memory are rounded
 SLOTS = 8  # steps that the host may be ahead of the device
 _VECTORS = {"mean": wp.vec3, "log_scale": wp.vec3, "quaternion": wp.vec4, "colour_sh": wp.vec3}
 
@@ -92,7 +93,7 @@ class Rasterize(torch.autograd.Function):
             raise ValueError("its workspace has rendered again since: call backward before the next rendering with it")
         shifts, screen = request.shifts, request.screen
         needed = dict(zip(INPUTS, ctx.needs_input_grad[1:], strict=True))
-        wanted = {name: torch.zeros_like(named[name]) for name in INPUTS if needed[name]}
+        wanted = _zeros_like({name: named[name] for name in INPUTS if needed[name]})
         cotangents = {name: g.contiguous() for name, g in zip(IMAGES, grads, strict=True) if g is not None}
         if cotangents and wanted:
             with stream_of(named["mean"]):
@@ -102,6 +103,16 @@ class Rasterize(torch.autograd.Function):
                     found = wp.to_torch(records)  # a list of columns would be uploaded as an index
                     screen[:, :2], screen[:, 2] = found[:, :2], found[:, 6]
         return None, *(wanted.get(name) for name in INPUTS)
+
+
+def _zeros_like(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Zeros of these shapes, cleared at once: parts of one memory, each with lines of cache of its own."""
+    if not tensors:
+        return {}
+    rooms = [-(-tensor.numel() // ALIGNED) * ALIGNED for tensor in tensors.values()]
+    first = next(iter(tensors.values()))
+    parts = first.new_zeros(sum(rooms)).split(rooms)
+    return {name: part[: t.numel()].view(t.shape) for part, (name, t) in zip(parts, tensors.items(), strict=True)}
 
 
 def _inputs(named: Mapping[str, Tensor | None]) -> Inputs:
@@ -201,8 +212,18 @@ class Captured:
     belongs to the graph; nobody else may look at it.
     """
 
-    def __init__(self, work: Callable[[], None], device: torch.device, pool: Any = None):
-        self._work, self._device, self._pool = work, device, pool
+    def __init__(
+        self, work: Callable[[], None], device: torch.device, ready: Callable[[], None] | None = None, pool: Any = None
+    ):
+        """Wrap ``work``.
+
+        Args:
+            work: What is captured.
+            device: Where it is done.
+            ready: Called once it is captured, before the first replay.
+            pool: Memory shared with other graphs, see :func:`captured`; None: its own.
+        """
+        self._work, self._device, self._ready, self._pool = work, device, ready, pool
         self._graph: torch.cuda.CUDAGraph | None = None
 
     def __call__(self) -> None:
@@ -212,6 +233,8 @@ class Captured:
             return
         if self._graph is None:
             self._graph = self._capture()
+            if self._ready is not None:
+                self._ready()
         self._graph.replay()
 
     def _capture(self) -> torch.cuda.CUDAGraph:
