@@ -15,6 +15,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from ..constants import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
+from .batches import ROUND, make_batches
 from .lanes import make_lanes, warp_any
 from .splat import AHEAD, Splat, block_missed, load_splat, prefetch
 
@@ -80,7 +81,14 @@ def make_zeta(metric: bool):
 
 @functools.cache
 def make_composite(
-    K: int, tile_width: int, tile_height: int, light: bool, channels: bool, inclusive: bool, metric: bool | None
+    K: int,
+    tile_width: int,
+    tile_height: int,
+    light: bool,
+    channels: bool,
+    inclusive: bool,
+    metric: bool | None,
+    cooperative: bool = False,
 ):
     """The kernel for one tile shape and one set of outputs.
 
@@ -93,6 +101,7 @@ def make_composite(
         inclusive: Whether the splat that ends a pixel is still added.
         metric: Whether distortion is measured on the distance itself, or on the released mapping of it; None: there is
             no distortion, and its three planes are left alone.
+        cooperative: Whether the lanes of a warp fetch records for each other (batches.py); K must be 1.
     """
     ops, pixels = make_lanes(K), make_pixels(K, tile_width, tile_height)
     V, fill, affine, mul, axpy, fma, fnma = ops.V, ops.fill, ops.affine, ops.mul, ops.axpy, ops.fma, ops.fnma
@@ -103,6 +112,15 @@ def make_composite(
 
     zeta_of = make_zeta(bool(metric))
     spreads = light and metric is not None
+    step = ROUND if cooperative else 1  # entries between two looks at whether a pixel is still alive
+    fetch = make_batches()
+    warp_memory, ask, arrive, entry, record_of = (
+        fetch.warp_memory,
+        fetch.ask,
+        fetch.arrive,
+        fetch.entry,
+        fetch.record_of,
+    )
 
     @wp.kernel(**options(K))
     def composite(
@@ -150,7 +168,14 @@ def make_composite(
             if begin < end:
                 zeta0 = zeta_of(splats[ids[begin]][14], mapping)
         k = int(begin)
-        if wp.static(K == 1):  # a record comes from afar: a warp asks for the next one while it works on this one
+        if wp.static(cooperative):
+            memory = warp_memory()
+            count = end - begin
+            coming = int(0)
+            if begin < end:
+                ask(memory, splats, entry(ids, begin, 1, 0, count), 0)
+                coming = entry(ids, begin, 1, wp.static(ROUND), count)
+        if wp.static(K == 1 and not cooperative):  # a record comes from afar: a warp asks for the next one while it works on this one
             following = Splat()
             after = int(0)
             if begin < end:
@@ -159,47 +184,59 @@ def make_composite(
         # `continue` instead of nested `if`s: after an `if` Warp selects between the old and the new value of everything
         # assigned inside, here a dozen vectors per splat
         while k < end and warp_any(nonzero(live)):  # the same trip count for all lanes of a warp
-            k += 1
-            if wp.static(K > 1):
-                i = ids[k - 1]
-                prefetch(splats, ids[wp.min(k + AHEAD, end - 1)])
-                if block_missed(splats, i, x0 + wp.static(half), y0 + wp.static(half)):
-                    continue
-                q = load_splat(splats, i)
-            else:
-                q = following
-                following = load_splat(splats, after)
-                after = ids[wp.min(k + 1, end - 1)]
-            g = response(affine(x, -1.0, q[0]), affine(y, -1.0, q[1]), q[2], q[3], q[4], q[6])
-            alpha = alpha_of(g, live, q[5], ALPHA_MAX, ALPHA_MIN)
-            if not nonzero(alpha):
-                continue
-            if wp.static(not inclusive):
-                live = drop_below(live, fnma(T, T, alpha), TRANSMITTANCE_MIN)
-                alpha = mul(alpha, live)
-            w = mul(alpha, T)
-            if wp.static(light):
-                w2 = mul(w, T)
-                re = axpy(re, w2, q[11])
-                im = axpy(im, w2, q[12])
-                amplitude = axpy(amplitude, w2, q[13])
-                distance = axpy(distance, w, q[14])
-            if wp.static(spreads):
-                zeta = zeta_of(q[14], mapping) - zeta0
-                # sum over pairs, one splat at a time: w (zeta^2 A - 2 zeta M + V) with A = 1 - T the weight so far
-                spread = axpy(axpy(affine(T, -zeta * zeta, zeta * zeta), sum_zeta, -2.0 * zeta), sum_zeta2, 1.0)
-                distortion = fma(distortion, w, spread)
-                sum_zeta = axpy(sum_zeta, w, zeta)
-                sum_zeta2 = axpy(sum_zeta2, w, zeta * zeta)
-            if wp.static(channels):
-                c0 = axpy(c0, w, q[8])
-                c1 = axpy(c1, w, q[9])
-                c2 = axpy(c2, w, q[10])
-            T = fnma(T, T, alpha)
-            if wp.static(light):
-                last = set_where(last, alpha, float(k - begin))
-            if wp.static(inclusive):
-                live = drop_below(live, T, TRANSMITTANCE_MIN)
+            stop = wp.min(k + wp.static(step), end)
+            if wp.static(cooperative):
+                arrive()
+                if stop < end:
+                    ask(memory, splats, coming, stop - begin)
+                    coming = entry(ids, begin, 1, stop - begin + wp.static(ROUND), count)
+            while k < stop:
+                k += 1
+                if wp.static(K > 1):
+                    i = ids[k - 1]
+                    prefetch(splats, ids[wp.min(k + AHEAD, end - 1)])
+                    if block_missed(splats, i, x0 + wp.static(half), y0 + wp.static(half)):
+                        continue
+                    q = load_splat(splats, i)
+                elif wp.static(cooperative):
+                    q = record_of(memory, k - 1 - begin, splats, ids, k - 1)
+                else:
+                    q = following
+                    following = load_splat(splats, after)
+                    after = ids[wp.min(k + 1, end - 1)]
+                g = response(affine(x, -1.0, q[0]), affine(y, -1.0, q[1]), q[2], q[3], q[4], q[6])
+                alpha = alpha_of(g, live, q[5], ALPHA_MAX, ALPHA_MIN)
+                if wp.static(not cooperative):  # with records at hand a miss costs less than a branch
+                    if not nonzero(alpha):
+                        continue
+                if wp.static(not inclusive):
+                    live = drop_below(live, fnma(T, T, alpha), TRANSMITTANCE_MIN)
+                    alpha = mul(alpha, live)
+                w = mul(alpha, T)
+                if wp.static(light):
+                    w2 = mul(w, T)
+                    re = axpy(re, w2, q[11])
+                    im = axpy(im, w2, q[12])
+                    amplitude = axpy(amplitude, w2, q[13])
+                    distance = axpy(distance, w, q[14])
+                if wp.static(spreads):
+                    zeta = zeta_of(q[14], mapping) - zeta0
+                    # sum over pairs, one splat at a time: w (zeta^2 A - 2 zeta M + V) with A = 1 - T the weight so far
+                    spread = axpy(axpy(affine(T, -zeta * zeta, zeta * zeta), sum_zeta, -2.0 * zeta), sum_zeta2, 1.0)
+                    distortion = fma(distortion, w, spread)
+                    sum_zeta = axpy(sum_zeta, w, zeta)
+                    sum_zeta2 = axpy(sum_zeta2, w, zeta * zeta)
+                if wp.static(channels):
+                    c0 = axpy(c0, w, q[8])
+                    c1 = axpy(c1, w, q[9])
+                    c2 = axpy(c2, w, q[10])
+                T = fnma(T, T, alpha)
+                if wp.static(light):
+                    last = set_where(last, alpha, float(k - begin))
+                if wp.static(inclusive):
+                    live = drop_below(live, T, TRANSMITTANCE_MIN)
+        if wp.static(cooperative):
+            arrive()  # records that nobody needs may still be on their way
         if wp.static(light):
             sums[wp.static(RE), tile, lane] = re
             sums[wp.static(IM), tile, lane] = im

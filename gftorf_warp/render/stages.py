@@ -10,7 +10,7 @@ from itertools import pairwise
 import numpy as np
 import warp as wp
 
-from ..kernels import resolve, splat, tiles
+from ..kernels import batches, resolve, splat, tiles
 from ..kernels.composite import CHANNEL_PLANES, make_composite
 from ..kernels.composite_backward import (
     GRAD_LIGHT_PLANES,
@@ -91,7 +91,7 @@ def composite(frame: Frame, view: CameraView, number: int, distortion: bool = Tr
     light, channels = number == 0, bool(frame.channels)
     shape = frame.K, frame.tile_width, frame.tile_height
     metric = _metric(frame, light and distortion)
-    kernel = make_composite(*shape, light, channels, frame.settings.stop == Stop.INCLUSIVE, metric)
+    kernel = make_composite(*shape, light, channels, frame.settings.stop == Stop.INCLUSIVE, metric, _cooperative(frame))
     channel = frame.channels[number].lanes if channels else _nothing(frame, 3, frame.sums.lanes.dtype)
     lists = [frame.first, frame.ids, frame.records[number], frame.tiles_x, view.width, view.height]
 
@@ -126,7 +126,7 @@ def composite_backward(
     shape = frame.K, frame.tile_width, frame.tile_height
     passes = frame.settings.clamp_gradient == ClampGradient.STRAIGHT
     metric = _metric(frame, light and distortion)
-    kernel = make_composite_backward(*shape, light, channels, passes, metric, fixed and channels)
+    kernel = make_composite_backward(*shape, light, channels, passes, metric, fixed and channels, _cooperative(frame))
     channel = grad_channel.lanes if grad_channel is not None else _nothing(frame, 3, frame.sums.lanes.dtype)
     edges = _tile_edges(frame, frame.threads)
     parts = [records] + [frame.zeros(f"records of thread {n}", frame.count, splat.Splat) for n in range(len(edges) - 2)]
@@ -231,6 +231,11 @@ def _shift_vectors(shifts: tuple[float, ...], device: str) -> wp.array:
     return wp.array([(math.cos(s), math.sin(s)) for s in shifts], dtype=wp.vec2, device=device)
 
 
+def _cooperative(frame: Frame) -> bool:
+    """Whether the lanes of a warp fetch records for each other, as they may where a warp owns a tile."""
+    return frame.K == 1 and batches.COOPERATIVE
+
+
 def _metric(frame: Frame, wanted: bool) -> bool | None:
     """What distortion is measured on, as compositors have it; None where there is none."""
     return frame.settings.distortion == Distortion.PAPER if wanted else None
@@ -270,7 +275,7 @@ def _over_tiles(frame: Frame, kernel, edges: list[int], arguments) -> None:
             dim=(stop - start, frame.lanes),
             inputs=arguments(start, part),
             device=frame.device,
-            block_dim=128,
+            block_dim=32 * batches.WARPS if _cooperative(frame) else 128,
             record_tape=False,
             record_cmd=side_by_side,
         )
