@@ -26,7 +26,7 @@ OUT_STRIDE = 20  # the same for gradient records
 PIXELS = 32  # of a tile
 
 _RECORDS = 2 * ROUND * 16  # two buffers [floats]
-_CHECK = f"static_assert({ROUND} == 16 && {PIXELS} == 32, \"two lanes per record, two halves of a tile\");"
+_CHECK = f'static_assert({ROUND} == 16 && {PIXELS} == 32, "two lanes per record, two halves of a tile");'
 
 
 def shared_floats(values: int, derivatives: int) -> int:
@@ -127,7 +127,9 @@ def record_of(memory: wp.uint64, at: int, splats: wp.array[Splat], ids: wp.array
 
 
 @functools.cache
-def make_gradient_rounds(tile_width: int, light: bool, channels: bool, geometry: bool, spreads: bool) -> SimpleNamespace:
+def make_gradient_rounds(
+    tile_width: int, light: bool, channels: bool, geometry: bool, spreads: bool
+) -> SimpleNamespace:
     """Functions that sum what pixels say about the entries of a round; 32 pixels of a tile, one per lane.
 
     Args:
@@ -182,10 +184,14 @@ def make_gradient_rounds(tile_width: int, light: bool, channels: bool, geometry:
         for n, name in enumerate(kept)
     )
     moments = "const float vx = v_[j] * dx[c]; row0 += v_[j]; row1 += vx; row2 += vx * dx[c];" if geometry else ""
-    end_of_row = """if (c == WIDTH - 1) {
+    end_of_row = (
+        """if (c == WIDTH - 1) {
                 sums[0] += row1; sums[1] += row0 * dy; sums[2] += row2; sums[3] += row1 * dy;
                 sums[4] += row0 * dy * dy; sums[5] += row0; row0 = row1 = row2 = 0.0f; dy -= 1.0f;
-            }""" if geometry else ""
+            }"""
+        if geometry
+        else ""
+    )
     lit = "const float4 g = pixel[4 * part + j];" if light else ""
     lit += " sums[11] += w2_[j] * g.x; sums[12] += w2_[j] * g.y; sums[13] += w2_[j] * g.z;" if light else ""
     lit += (" sums[14] += wd_[j];" if spreads else " sums[14] += w_[j] * g.w;") if light else ""

@@ -175,7 +175,9 @@ def make_composite(
             if begin < end:
                 ask(memory, splats, entry(ids, begin, 1, 0, count), 0)
                 coming = entry(ids, begin, 1, wp.static(ROUND), count)
-        if wp.static(K == 1 and not cooperative):  # a record comes from afar: a warp asks for the next one while it works on this one
+        if wp.static(
+            K == 1 and not cooperative
+        ):  # a record comes from afar: a warp asks for the next one while it works on this one
             following = Splat()
             after = int(0)
             if begin < end:

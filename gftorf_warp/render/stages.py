@@ -68,16 +68,16 @@ def sort_by_depth(frame: Frame) -> None:
 
 def sort_by_tile(frame: Frame) -> None:
     """Count, emit and sort the (tile, splat) pairs."""
-    lists = [frame.order, frame.splats, frame.box_px, frame.tile_width, frame.tile_height]
-    _launch(tiles.count_pairs, frame.count, lists, [frame.counts])
+    lists = [frame.order, frame.splats, frame.box_px, frame.tile_width, frame.tile_height, frame.lanes_per_splat]
+    threads = frame.count, frame.lanes_per_splat
+    _launch(tiles.count_pairs, threads, lists, [frame.counts])
     wp.utils.array_scan(frame.counts, frame.ends, inclusive=True)
     capacity = frame.settings.pair_capacity
     if capacity is None:
         # the declared host synchronisation: how many pairs there are decides how much memory they need
         capacity = int(frame.ends[-1:].numpy()[0])
     frame.reserve_pairs(capacity)
-    threads = max(1, math.ceil(capacity / frame.share))
-    inputs = [*lists, frame.tiles_x, frame.tiles, frame.ends, frame.share, capacity]
+    inputs = [*lists, frame.tiles_x, frame.tiles, frame.ends, capacity]
     _launch(tiles.emit_pairs, threads, inputs, [frame.keys, frame.ids, frame.total])
     if capacity:
         wp.utils.radix_sort_pairs(frame.keys, frame.ids, capacity, end_bit=frame.tiles.bit_length())
