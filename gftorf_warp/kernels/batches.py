@@ -3,11 +3,11 @@
 A list is walked in rounds of ``ROUND`` entries. While a warp works on one round, the records of the next one travel
 from global to shared memory without passing registers (cp.async), two lanes per record; then every lane reads the same
 record, a broadcast. On the way back each lane leaves what its pixel says about the records of a round in shared memory,
-and the sums over pixels are taken with other roles: a lane owns one record and one half of the tile, which costs a fifth
-of folding the sums across lanes record by record.
+and the sums over pixels are taken with other roles: a lane owns one record and one half of the tile. That costs a fifth
+of what folding sums across lanes costs record by record.
 
-The CPU, where a thread is alone, has no shared memory: there the functions read the list and do nothing else. All of
-them must be reached by all 32 lanes of a warp together.
+The CPU, where a thread is alone, has no shared memory: there a record is read where it lies, and nothing else happens.
+All functions must be reached by all 32 lanes of a warp together.
 """
 
 import functools
@@ -20,10 +20,11 @@ from .splat import Splat
 
 COOPERATIVE = True  # False: every lane reads every record itself, to compare with
 ROUND = 16  # entries of a list that are fetched, and whose gradients are summed, together
-WARPS = 2  # tiles of a block of threads
+WARPS = 1  # tiles of a block of threads: all blocks run at once, and the more there are, the more evenly they spread
 STRIDE = 36  # floats from the values of one entry to those of the next: 4-float reads of 8 lanes meet all 32 banks
 OUT_STRIDE = 20  # the same for gradient records
 PIXELS = 32  # of a tile
+HIT = 1.0e30  # times the smallest weight of a pixel that is reached, 4e-9, it is far above 1
 
 _RECORDS = 2 * ROUND * 16  # two buffers [floats]
 _CHECK = f'static_assert({ROUND} == 16 && {PIXELS} == 32, "two lanes per record, two halves of a tile");'
@@ -62,7 +63,7 @@ def make_batches(values: int = 0, derivatives: int = 0) -> SimpleNamespace:
     return SimpleNamespace(warp_memory=warp_memory, ask=ask, arrive=arrive, entry=entry, record_of=record_of)
 
 
-@wp.func_native(f"""
+@wp.func_native("""
 #if defined(__CUDA_ARCH__)
     const int n = at + (int)((threadIdx.x & 31u) >> 1);
     return ids.data[start + step * (n < count ? n : count - 1)];
@@ -169,7 +170,8 @@ def make_gradient_rounds(
 
     values_snippet = f"""
 #if defined(__CUDA_ARCH__)
-    float* const to = reinterpret_cast<float*>(memory) + {kept_at} + (at & {ROUND - 1}) * {STRIDE} + (threadIdx.x & 31u);
+    float* const kept = reinterpret_cast<float*>(memory) + {kept_at};
+    float* const to = kept + (at & {ROUND - 1}) * {STRIDE} + (threadIdx.x & 31u);
     {" ".join(stores)}
 #endif
 """
@@ -220,7 +222,7 @@ def make_gradient_rounds(
             const int c = (4 * part + j) % {tile_width};
             {moments}
             {end_of_row.replace("WIDTH", str(tile_width))}
-            {"sums[6] += w_[j] > 0.0f ? 1.0f : 0.0f;" if geometry else ""}
+            {f"sums[6] += __saturatef(w_[j] * {HIT}f);" if geometry else ""}
             {coloured}
             {lit}
         }}
