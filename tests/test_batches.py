@@ -62,9 +62,9 @@ template <class F> static void in_a_warp(F f) {
 WALK = """
 static double walk(int begin, int end, int step) {
     std::mt19937 random(end); std::normal_distribution<float> normal;
-    std::vector<Splat> splats(200), grads(200, Splat{});
+    std::vector<Splat> splats(200), grads(200, Splat{}), more(200, Splat{});
     std::vector<int> ids(300);
-    std::vector<float> values(300 * 32 * 4), derivatives(32 * 7);
+    std::vector<float> values(300 * 32 * 4), derivatives(32 * 10);
     for (auto& q : splats) for (float& x : q.c) x = 10 * normal(random);
     for (int& i : ids) i = random() % 200;
     for (float& x : values) x = normal(random);
@@ -73,15 +73,15 @@ static double walk(int begin, int end, int step) {
         const float hit = random() % 3 ? 1.0f : 0.0f;
         values[n] *= hit; values[n + 1] = std::fabs(values[n + 1]) * hit; values[n + 2] *= hit;
     }
-    const wp::array_t<Splat> S{splats.data()}, G{grads.data()}; const wp::array_t<int> I{ids.data()};
+    const wp::array_t<Splat> S{splats.data()}, G{grads.data()}, M{more.data()}; const wp::array_t<int> I{ids.data()};
     std::atomic<int> wrong(0);
     const int start = step > 0 ? begin : end - 1, count = end - begin;
     in_a_warp([&](int lane) {
         const wp::uint64 memory = warp_memory();
-        const float* d = &derivatives[7 * lane];
+        const float* d = &derivatives[10 * lane];
         int coming = 0;
         if (count > 0) {
-            keep_derivatives(memory, V{d[0]}, V{d[1]}, V{d[2]}, V{d[3]}, V{d[4]}, V{d[5]}, V{d[6]});
+            keep_derivatives(memory, V{d[0]}, V{d[1]}, V{d[2]}, V{d[3]}, V{d[4]}, V{d[5]}, V{d[6]}, V{d[7]}, V{d[8]}, V{d[9]});
             ask(memory, S, entry(I, start, step, 0, count), 0);
             coming = entry(I, start, step, 16, count);
         }
@@ -96,25 +96,27 @@ static double walk(int begin, int end, int step) {
                 const float* u = &values[(k * 32 + lane) * 4];
                 if (step < 0) keep_values(memory, n, V{u[0]}, V{u[1]}, V{u[2]}, V{u[3]});
             }
-            if (step < 0) add_round(memory, G, I, start, at, stop - at, V{40.5f + lane % 8}, V{20.5f + lane / 8});
+            if (step < 0) 
+                add_round(memory, G, M, I, start, at, stop - at, V{40.5f + lane % 8}, V{20.5f + lane / 8});
         }
         arrive();
     });
     if (wrong) return 1e9;
-    std::vector<double> want(200 * 16), size(200 * 16);
+    std::vector<double> want(200 * 32), size(200 * 32);
     for (int k = begin; step < 0 && k < end; ++k) for (int p = 0; p < 32; ++p) {
-        const float *u = &values[(k * 32 + p) * 4], *d = &derivatives[7 * p];
+        const float *u = &values[(k * 32 + p) * 4], *d = &derivatives[10 * p];
         const double dx = splats[ids[k]][0] - (40.5 + p % 8), dy = splats[ids[k]][1] - (20.5 + p / 8);
         const double v = GEOMETRY ? u[0] : 0, w = CHANNELS ? u[1] : 0, w2 = LIGHT ? u[2] : 0, wd = LIGHT ? u[1] : 0;
         const double all[16] = {v * dx, v * dy, v * dx * dx, v * dx * dy, v * dy * dy, v, double(GEOMETRY && u[1] > 0),
             0, w * d[0], w * d[1], w * d[2], w2 * d[3], w2 * d[4], w2 * d[5], wd * (SPREADS ? u[3] : d[6]), 0};
-        for (int j = 0; j < 16; ++j) {
-            want[ids[k] * 16 + j] += all[j]; size[ids[k] * 16 + j] += std::fabs(all[j]);
+        for (int j = 0; j < 32; ++j) {  // a record, and that of further channels
+            const double one = j < 16 ? all[j] : MORE && j >= 24 && j < 27 ? double(u[1]) * d[j - 17] : 0;
+            want[ids[k] * 32 + j] += one; size[ids[k] * 32 + j] += std::fabs(one);
         }
     }
     double worst = 0;
-    for (int n = 0; n < 200 * 16; ++n) {
-        const double error = std::fabs(want[n] - grads[n / 16][n % 16]);
+    for (int n = 0; n < 200 * 32; ++n) {
+        const double error = std::fabs(want[n] - (n % 32 < 16 ? grads : more)[n / 32][n % 16]);
         worst = std::max(worst, size[n] > 0 ? error / size[n] : error * 1e9);
     }
     return worst;
@@ -152,10 +154,10 @@ SIGNATURES = {
     "record_of": "Splat record_of(wp::uint64 memory, int at, wp::array_t<Splat> splats, wp::array_t<int> ids, int k)",
     "warp_memory": "wp::uint64 warp_memory()",
     "keep_derivatives": "void keep_derivatives(wp::uint64 memory, V g0, V g1, V g2, V g_re, V g_im, V g_amplitude, "
-    "V g_distance)",
+    "V g_distance, V g3, V g4, V g5)",
     "keep_values": "void keep_values(wp::uint64 memory, int at, V v, V w, V w2, V g_d)",
-    "add_round": "void add_round(wp::uint64 memory, wp::array_t<Splat> grads, wp::array_t<int> ids, int start, int at, "
-    "int n, V x, V y)",
+    "add_round": "void add_round(wp::uint64 memory, wp::array_t<Splat> grads, wp::array_t<Splat> more, wp::array_t<int> ids, "
+    "int start, int at, int n, V x, V y)",
     "sum_of_lanes": "int sum_of_lanes(int x)",
     "of_lane": "int of_lane(int x, int lane)",
     "lane_beyond": "int lane_beyond(int sums, int bound)",
@@ -174,14 +176,19 @@ def numbers_of(folder, functions, program):
 
 @pytest.mark.skipif(COMPILER is None, reason="needs a C++ compiler")
 @pytest.mark.parametrize(
-    "light, channels, geometry, spreads",
-    [(True, False, True, False), (True, True, True, True), (False, True, False, False)],
+    "light, channels, geometry, spreads, more",
+    [
+        (True, False, True, False, False),
+        (True, True, True, True, False),
+        (False, True, False, False, False),
+        (True, True, True, False, True),
+    ],
 )
-def test_rounds_read_every_record_and_sum_every_pixel(light, channels, geometry, spreads, tmp_path):
+def test_rounds_read_every_record_and_sum_every_pixel(light, channels, geometry, spreads, more, tmp_path):
     """Lists of no, one, 16 and many entries, in both directions; sums against float64."""
-    rounds = vars(batches.make_gradient_rounds(8, light, channels, geometry, spreads))
+    rounds = vars(batches.make_gradient_rounds(8, light, channels, geometry, spreads, more))
     functions = {name: rounds[name] for name in SIGNATURES if name in rounds}
-    values = {"LIGHT": light, "CHANNELS": channels, "GEOMETRY": geometry, "SPREADS": spreads}
+    values = {"LIGHT": light, "CHANNELS": channels, "GEOMETRY": geometry, "SPREADS": spreads, "MORE": more}
     constants = "".join(f"const bool {name} = {int(value)};\n" for name, value in values.items())
     errors = numbers_of(tmp_path, functions, constants + WALK)
     assert len(errors) == 14

@@ -26,7 +26,8 @@ OUT_STRIDE = 20  # the same for gradient records
 PIXELS = 32  # of a tile
 HIT = 1.0e30  # times the smallest weight of a pixel that is reached, 4e-9, it is far above 1
 
-_RECORDS = 2 * ROUND * 16  # two buffers [floats]
+_RECORDS = 2 * ROUND * 16  # two buffers of records [floats]
+_MORE = 2 * ROUND * 4  # two buffers of further channels [floats]
 _CHECK = f'static_assert({ROUND} == 16 && {PIXELS} == 32, "two lanes per record, two halves of a tile");'
 
 
@@ -42,9 +43,15 @@ def shared_floats(values: int, derivatives: int) -> int:
 
 
 @functools.cache
-def make_batches(values: int = 0, derivatives: int = 0) -> SimpleNamespace:
-    """Functions that fetch the records of a list; arguments as in :func:`shared_floats`."""
-    floats = shared_floats(values, derivatives)
+def make_batches(values: int = 0, derivatives: int = 0, more: bool = False) -> SimpleNamespace:
+    """Functions that fetch the records of a list.
+
+    Args:
+        values: As in :func:`shared_floats`.
+        derivatives: As in :func:`shared_floats`.
+        more: Whether there is room for three further channels, behind everything else that a forward pass needs.
+    """
+    floats = shared_floats(values, derivatives) + _MORE * more
 
     memory_snippet = f"""
 #if defined(__CUDA_ARCH__)
@@ -60,7 +67,15 @@ def make_batches(values: int = 0, derivatives: int = 0) -> SimpleNamespace:
     def warp_memory() -> wp.uint64:
         """Where the shared memory of this warp begins."""
 
-    return SimpleNamespace(warp_memory=warp_memory, ask=ask, arrive=arrive, entry=entry, record_of=record_of)
+    return SimpleNamespace(
+        warp_memory=warp_memory,
+        ask=ask,
+        arrive=arrive,
+        entry=entry,
+        record_of=record_of,
+        ask_more=ask_more,
+        more_of=more_of,
+    )
 
 
 @wp.func_native("""
@@ -97,6 +112,24 @@ def ask(memory: wp.uint64, splats: wp.array[Splat], i: int, at: int):
     """Send for the records of the round that begins at entry ``at``, of which ``i`` is this lane's."""
 
 
+@wp.func_native(f"""
+#if defined(__CUDA_ARCH__)
+    const unsigned lane = threadIdx.x & 31u;
+    if (lane & 1u) return;  // 16 bytes of a record, the channels, are one lane's work
+    const float4* from = reinterpret_cast<const float4*>(records.data + i) + 2;
+    float4* to = reinterpret_cast<float4*>(memory) + {_RECORDS // 4} + (at & {2 * ROUND - 1}) + (lane >> 1);
+#if __CUDA_ARCH__ >= 800
+    const unsigned target = (unsigned)__cvta_generic_to_shared(to);
+    asm volatile("cp.async.cg.shared.global [%0], [%1], 16;" :: "r"(target), "l"(from) : "memory");
+#else
+    to[0] = __ldg(from);
+#endif
+#endif
+""")
+def ask_more(memory: wp.uint64, records: wp.array[Splat], i: int, at: int):
+    """Send for three further channels, slots 8-10 of other records, as :func:`ask` does for the records."""
+
+
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
 #if __CUDA_ARCH__ >= 800
@@ -127,9 +160,24 @@ def record_of(memory: wp.uint64, at: int, splats: wp.array[Splat], ids: wp.array
     """The record of entry ``at`` of the walk, which is number ``k`` of the pairs."""
 
 
+@wp.func_native(
+    f"""
+#if defined(__CUDA_ARCH__)
+    const float4 four = (reinterpret_cast<const float4*>(memory) + {_RECORDS // 4})[at & {2 * ROUND - 1}];
+    return wp::vec_t<3, float>(four.x, four.y, four.z);
+#else
+    const Splat& q = records.data[ids.data[k]];
+    return wp::vec_t<3, float>(q[8], q[9], q[10]);
+#endif
+""".replace("Splat&", "wp::vec_t<16, float>&")
+)
+def more_of(memory: wp.uint64, at: int, records: wp.array[Splat], ids: wp.array[int], k: int) -> wp.vec3:
+    """The further channels of entry ``at`` of the walk, which is number ``k`` of the pairs."""
+
+
 @functools.cache
 def make_gradient_rounds(
-    tile_width: int, light: bool, channels: bool, geometry: bool, spreads: bool
+    tile_width: int, light: bool, channels: bool, geometry: bool, spreads: bool, more: bool = False
 ) -> SimpleNamespace:
     """Functions that sum what pixels say about the entries of a round; 32 pixels of a tile, one per lane.
 
@@ -139,13 +187,14 @@ def make_gradient_rounds(
         channels: Whether the three channels have.
         geometry: Whether centre, conic and opacity have.
         spreads: Whether the distortion has; then the derivative of the distance differs from entry to entry.
+        more: Whether three further channels have gradients, of their own records.
     """
     half = PIXELS // 2
     if half % tile_width:
         raise ValueError(f"half of a tile must be whole rows, got {tile_width} columns")
     V = make_lanes(1).V
     kept = ["w"] + ["v"] * geometry + ["w2"] * light + ["wd"] * spreads  # values a pixel keeps of an entry
-    derivatives = light + channels
+    derivatives = light + channels + more
     floats = shared_floats(len(kept), derivatives)
     kept_at = _RECORDS + 4 * PIXELS * derivatives
     places = f"""
@@ -158,11 +207,14 @@ def make_gradient_rounds(
     float4* const to = reinterpret_cast<float4*>(memory) + {_RECORDS // 4} + (threadIdx.x & 31u);
     {"to[0] = make_float4(g_re[0], g_im[0], g_amplitude[0], g_distance[0]);" if light else ""}
     {f"to[{PIXELS * light}] = make_float4(g0[0], g1[0], g2[0], 0.0f);" if channels else ""}
+    {f"to[{PIXELS * (light + channels)}] = make_float4(g3[0], g4[0], g5[0], 0.0f);" if more else ""}
 #endif
 """
 
     @wp.func_native(derivatives_snippet)
-    def keep_derivatives(memory: wp.uint64, g0: V, g1: V, g2: V, g_re: V, g_im: V, g_amplitude: V, g_distance: V):
+    def keep_derivatives(
+        memory: wp.uint64, g0: V, g1: V, g2: V, g_re: V, g_im: V, g_amplitude: V, g_distance: V, g3: V, g4: V, g5: V
+    ):
         """Leave what belongs to this lane's pixel alone; read after the next barrier."""
 
     stores = [f"to[{n * ROUND * STRIDE}] = {name}[0]{' * g_d[0]' * (name == 'wd')};" for n, name in enumerate(kept)]
@@ -199,7 +251,17 @@ def make_gradient_rounds(
     lit += (" sums[14] += wd_[j];" if spreads else " sums[14] += w_[j] * g.w;") if light else ""
     coloured = f"const float4 h = pixel[{PIXELS * light} + 4 * part + j];" if channels else ""
     coloured += " sums[8] += w_[j] * h.x; sums[9] += w_[j] * h.y; sums[10] += w_[j] * h.z;" if channels else ""
+    further = f"const float4 m = pixel[{PIXELS * (light + channels)} + 4 * part + j];" if more else ""
+    further += " more0 += w_[j] * m.x; more1 += w_[j] * m.y; more2 += w_[j] * m.z;" if more else ""
 
+    add_more = f"""
+    #pragma unroll
+    for (int c = 0; c < 3; ++c) {{
+        const float* const both = kept + s * {OUT_STRIDE} + 16 + c;
+        const float sum = both[0] + both[{ROUND * OUT_STRIDE}];
+        if (s < n && upper == (c & 1) && sum != 0.0f)
+            atomicAdd(reinterpret_cast<float*>(more.data + i) + 8 + c, sum);
+    }}"""
     round_snippet = f"""
 #if defined(__CUDA_ARCH__)
     {places}
@@ -211,7 +273,7 @@ def make_gradient_rounds(
     for (int c = 0; c < {tile_width}; ++c)
         dx[c] = q[0] - (x[0] - (float)(lane % {tile_width}) + (float)c);
     float dy = q[1] - (y[0] - (float)(lane / {tile_width}) + (float)(upper * {half // tile_width}));
-    float sums[16] = {{}}, row0 = 0.0f, row1 = 0.0f, row2 = 0.0f;
+    float sums[16] = {{}}, row0 = 0.0f, row1 = 0.0f, row2 = 0.0f, more0 = 0.0f, more1 = 0.0f, more2 = 0.0f;
     const float4* const from = reinterpret_cast<const float4*>(kept + s * {STRIDE} + upper * {half});
     const float4* const pixel = reinterpret_cast<const float4*>(mine) + {_RECORDS // 4} + upper * {half};
     #pragma unroll
@@ -224,6 +286,7 @@ def make_gradient_rounds(
             {end_of_row.replace("WIDTH", str(tile_width))}
             {f"sums[6] += __saturatef(w_[j] * {HIT}f);" if geometry else ""}
             {coloured}
+            {further}
             {lit}
         }}
     }}
@@ -232,6 +295,7 @@ def make_gradient_rounds(
     #pragma unroll
     for (int part = 0; part < 4; ++part)
         out[part] = make_float4(sums[4 * part], sums[4 * part + 1], sums[4 * part + 2], sums[4 * part + 3]);
+    {"out[4] = make_float4(more0, more1, more2, 0.0f);" if more else ""}
     __syncwarp();  // all sums are there; sixteen lanes add one 64-byte line
     #pragma unroll
     for (int pair = 0; pair < {ROUND // 2}; ++pair) {{
@@ -240,14 +304,16 @@ def make_gradient_rounds(
         const float sum = both[0] + both[{ROUND * OUT_STRIDE}];
         if (of < n && sum != 0.0f) atomicAdd(reinterpret_cast<float*>(grads.data + to) + s, sum);
     }}
+    {add_more if more else ""}
     __syncwarp();  // the next round may keep its values
 #endif
 """
 
     @wp.func_native(round_snippet)
     def add_round(
-        memory: wp.uint64, grads: wp.array[Splat], ids: wp.array[int], start: int, at: int, n: int, x: V, y: V
-    ):
+        memory: wp.uint64, grads: wp.array[Splat], more: wp.array[Splat], ids: wp.array[int], start: int, at: int,
+        n: int, x: V, y: V,
+    ):  # fmt: skip
         """Sum the ``n`` entries of the round that began at entry ``at`` over pixels, and add them to their records."""
 
     fetch = make_batches(len(kept), derivatives)

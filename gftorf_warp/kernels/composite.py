@@ -89,6 +89,7 @@ def make_composite(
     inclusive: bool,
     metric: bool | None,
     cooperative: bool = False,
+    more: bool = False,
 ):
     """The kernel for one tile shape and one set of outputs.
 
@@ -102,6 +103,7 @@ def make_composite(
         metric: Whether distortion is measured on the distance itself, or on the released mapping of it; None: there is
             no distortion, and its three planes are left alone.
         cooperative: Whether the lanes of a warp fetch records for each other (batches.py); K must be 1.
+        more: Whether three further channels are summed in the same pass; it must be cooperative.
     """
     ops, pixels = make_lanes(K), make_pixels(K, tile_width, tile_height)
     V, fill, affine, mul, axpy, fma, fnma = ops.V, ops.fill, ops.affine, ops.mul, ops.axpy, ops.fma, ops.fnma
@@ -113,7 +115,7 @@ def make_composite(
     zeta_of = make_zeta(bool(metric))
     spreads = light and metric is not None
     step = ROUND if cooperative else 1  # entries between two looks at whether a pixel is still alive
-    fetch = make_batches()
+    fetch = make_batches(more=more)
     warp_memory, ask, arrive, entry, record_of = (
         fetch.warp_memory,
         fetch.ask,
@@ -121,6 +123,7 @@ def make_composite(
         fetch.entry,
         fetch.record_of,
     )
+    ask_more, more_of = fetch.ask_more, fetch.more_of
 
     @wp.kernel(**options(K))
     def composite(
@@ -133,9 +136,11 @@ def make_composite(
         height: int,  # rows of the image [px]
         tile0: int,  # first tile of this launch [index]
         mapping: wp.vec2,  # released zeta = mapping[0] - mapping[1] / distance [1, m]
+        more_splats: wp.array[Splat],  # [N] records whose slots 8-10 are further channels
         # Out:
         sums: wp.array3d[V],  # [9, tiles, lanes] planes RE .. LAST of ``light``
         channel: wp.array3d[V],  # [3, tiles, lanes] the three channels
+        more_channel: wp.array3d[V],  # [3, tiles, lanes] the further channels
     ):
         """One thread per block of K pixels; on CUDA one warp per tile, so all control is uniform over 32 lanes."""
         t, lane = wp.tid()
@@ -161,6 +166,10 @@ def make_composite(
             c0 = fill(0.0)
             c1 = fill(0.0)
             c2 = fill(0.0)
+        if wp.static(more):
+            c3 = fill(0.0)
+            c4 = fill(0.0)
+            c5 = fill(0.0)
         begin = first[tile]
         end = first[tile + 1]
         zeta0 = float(0.0)  # distortion is blind to a common shift; near the surface its sums keep their digits
@@ -173,7 +182,10 @@ def make_composite(
             count = end - begin
             coming = int(0)
             if begin < end:
-                ask(memory, splats, entry(ids, begin, 1, 0, count), 0)
+                coming = entry(ids, begin, 1, 0, count)
+                ask(memory, splats, coming, 0)
+                if wp.static(more):
+                    ask_more(memory, more_splats, coming, 0)
                 coming = entry(ids, begin, 1, wp.static(ROUND), count)
         if wp.static(
             K == 1 and not cooperative
@@ -191,6 +203,8 @@ def make_composite(
                 arrive()
                 if stop < end:
                     ask(memory, splats, coming, stop - begin)
+                    if wp.static(more):
+                        ask_more(memory, more_splats, coming, stop - begin)
                     coming = entry(ids, begin, 1, stop - begin + wp.static(ROUND), count)
             while k < stop:
                 k += 1
@@ -232,6 +246,11 @@ def make_composite(
                     c0 = axpy(c0, w, q[8])
                     c1 = axpy(c1, w, q[9])
                     c2 = axpy(c2, w, q[10])
+                if wp.static(more):
+                    m = more_of(memory, k - 1 - begin, more_splats, ids, k - 1)
+                    c3 = axpy(c3, w, m[0])
+                    c4 = axpy(c4, w, m[1])
+                    c5 = axpy(c5, w, m[2])
                 T = fnma(T, T, alpha)
                 if wp.static(light):
                     last = set_where(last, alpha, float(k - begin))
@@ -254,5 +273,9 @@ def make_composite(
             channel[0, tile, lane] = c0
             channel[1, tile, lane] = c1
             channel[2, tile, lane] = c2
+        if wp.static(more):
+            more_channel[0, tile, lane] = c3
+            more_channel[1, tile, lane] = c4
+            more_channel[2, tile, lane] = c5
 
     return composite

@@ -23,6 +23,7 @@ from .splat import AHEAD, Splat, block_missed, load_splat, prefetch
 # planes of ``grad_sums``, each [tiles, lanes] of V: gradients of the first five planes of the forward pass, and of T_e
 GRAD_TRANSMITTANCE = 5
 GRAD_LIGHT_PLANES = 6
+V1 = make_lanes(1).V
 
 
 _FOLD = r"""    const unsigned lane = threadIdx.x & 31u;
@@ -117,6 +118,16 @@ def finish_moments(
         grad_splats[n] = g
 
 
+@wp.func_native("""
+#if !defined(__CUDA_ARCH__)
+    const wp::vec_t<1, float> gradients[3] = {g3, g4, g5};
+    for (int c = 0; c < 3; ++c) grads.data[i][8 + c] += w[0] * gradients[c][0];
+#endif
+""")
+def add_more(grads: wp.array[Splat], i: int, w: V1, g3: V1, g4: V1, g5: V1):
+    """Add the gradient of further channels on the CPU, where a thread is alone; on CUDA a round of a warp does."""
+
+
 @functools.cache
 def make_composite_backward(
     K: int,
@@ -128,6 +139,7 @@ def make_composite_backward(
     metric: bool | None,
     fixed: bool = False,
     cooperative: bool = False,
+    more: bool = False,
 ):
     """The adjoint kernel for one tile shape and one set of outputs; arguments as in ``make_composite``.
 
@@ -141,6 +153,7 @@ def make_composite_backward(
         metric: As in ``make_composite``; None: the distortion has no gradient.
         fixed: Whether weights are held fixed under the channels, so that only these have their gradient.
         cooperative: As in ``make_composite``.
+        more: Whether three further channels, under which weights are held fixed, have their gradient, too.
     """
     ops, pixels = make_lanes(K), make_pixels(K, tile_width, tile_height)
     V, fill, affine, mul, axpy, fma, fnma = ops.V, ops.fill, ops.affine, ops.mul, ops.axpy, ops.fma, ops.fnma
@@ -159,7 +172,7 @@ def make_composite_backward(
 
     step = ROUND if cooperative else 1
     if cooperative:
-        rounds = make_gradient_rounds(tile_width, light, channels, light or not fixed, spreads)
+        rounds = make_gradient_rounds(tile_width, light, channels, light or not fixed, spreads, more)
         warp_memory, ask, arrive, entry, record_of = (
             rounds.warp_memory,
             rounds.ask,
@@ -181,8 +194,10 @@ def make_composite_backward(
         sums: wp.array3d[V],  # [9, tiles, lanes] planes of the forward pass
         grad_sums: wp.array3d[V],  # [6, tiles, lanes] gradients of RE .. DISTORTION and of T_e
         grad_channel: wp.array3d[V],  # [3, tiles, lanes] gradients of the three channels
+        grad_more: wp.array3d[V],  # [3, tiles, lanes] gradients of the further channels
         # Out:
         grad_splats: wp.array[Splat],  # [N] added to: moments in slots 0-5, pixels in slot 6, gradients in 8-15
+        more_splats: wp.array[Splat],  # [N] added to: slots 8-10, gradients of the further channels
     ):
         """One thread per block of K pixels; visits exactly the contributors of the forward pass, last one first."""
         t, lane = wp.tid()
@@ -220,6 +235,13 @@ def make_composite_backward(
             g0 = grad_channel[0, tile, lane]
             g1 = grad_channel[1, tile, lane]
             g2 = grad_channel[2, tile, lane]
+        g3 = zero
+        g4 = zero
+        g5 = zero
+        if wp.static(more):
+            g3 = grad_more[0, tile, lane]
+            g4 = grad_more[1, tile, lane]
+            g5 = grad_more[2, tile, lane]
         begin = first[tile]
         k = begin + warp_max(int(largest_of(last)))
         zeta0 = float(0.0)
@@ -233,7 +255,7 @@ def make_composite_backward(
             count = k - begin
             coming = int(0)
             if begin < k:
-                keep_derivatives(memory, g0, g1, g2, g_re, g_im, g_amplitude, g_distance)
+                keep_derivatives(memory, g0, g1, g2, g_re, g_im, g_amplitude, g_distance, g3, g4, g5)
                 ask(memory, splats, entry(ids, top, -1, 0, count), 0)
                 coming = entry(ids, top, -1, wp.static(ROUND), count)
         if wp.static(K == 1 and not cooperative):  # as in the forward pass
@@ -308,8 +330,10 @@ def make_composite_backward(
                 if wp.static(cooperative):
                     i = ids[k]  # for the CPU; on CUDA nobody asks
                     keep_values(memory, top - k, v, w, w2, g_d)
+                    if wp.static(more):
+                        add_more(more_splats, i, w, g3, g4, g5)
                 add_moments(grad_splats, i, v, dx, dy, alpha, w, w2, g0, g1, g2, g_re, g_im, g_amplitude, g_d)
             if wp.static(cooperative):
-                add_round(memory, grad_splats, ids, top, at, top + 1 - stop - at, x, y)
+                add_round(memory, grad_splats, more_splats, ids, top, at, top + 1 - stop - at, x, y)
 
     return composite_backward
