@@ -73,12 +73,14 @@ def modules() -> dict[str, wp.Module]:
         what = " ".join(["light"] * light + ["channels"] * channels + ["fixed"] * fixed)
         for metric in (True, False, None) if light else (None,):
             name = f"{what} {'without' if metric is None else 'paper' if metric else 'released'}"
-            forward = composite.make_composite(*shape, light, channels, bool(metric), metric)
-            arguments = *shape, light, channels, not metric, metric, fixed
-            backward = composite_backward.make_composite_backward(*arguments)
-            if not fixed:
-                found[f"composite {name}"] = forward.module
-            found[f"composite_backward {name}"] = backward.module
+            for rounds in (True, False):
+                forward = composite.make_composite(*shape, light, channels, bool(metric), metric, rounds)
+                arguments = *shape, light, channels, not metric, metric, fixed, rounds
+                backward = composite_backward.make_composite_backward(*arguments)
+                way = "" if rounds else " by entries"
+                if not fixed:
+                    found[f"composite {name}{way}"] = forward.module
+                found[f"composite_backward {name}{way}"] = backward.module
     return found
 
 

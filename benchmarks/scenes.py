@@ -1,8 +1,9 @@
 """A whole rendering, forward and backward, with everything that comes out: ``gftorf bench renderer`` for one form.
 
-    python benchmarks/scenes.py [--device cpu|cuda] [--all] [--repeats N] [--json FILE]
+    python benchmarks/scenes.py [--device cpu|cuda] [--all] [--repeats N] [--walk rounds|entries|both] [--json FILE]
 
-On the CPU the first count of Gaussians only, unless --all. Scenes and stages are those of gftorf_warp/bench/.
+On the CPU the first count of Gaussians only, unless --all. Scenes and stages are those of gftorf_warp/bench/. On CUDA
+the lanes of a warp walk the list of a tile in rounds, or each of them by itself entry by entry (kernels/batches.py).
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import torch
 import warp as wp
 
 from gftorf_warp.bench import renderer
+from gftorf_warp.kernels import batches
 
 
 def main() -> None:
@@ -23,16 +25,22 @@ def main() -> None:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--all", action="store_true", help="every number of Gaussians instead of the first")
     parser.add_argument("--repeats", type=int, default=None, help="30 on CUDA, 5 on the CPU")
+    parser.add_argument("--walk", choices=("rounds", "entries", "both"), default="rounds")
+    parser.add_argument("--warps", type=int, default=batches.WARPS, help="tiles of a block of threads, CUDA, in rounds")
     parser.add_argument("--json", type=Path)
     a = parser.parse_args()
     wp.config.log_level = wp.LOG_ERROR
     wp.init()
     device = wp.get_device(a.device)
     counts = renderer.COUNTS if a.all else renderer.COUNTS[:1]
-    rows = renderer.measure(
-        device.alias, counts=counts, forms=("all",), runs=a.repeats or (30 if device.is_cuda else 5)
-    )
-    print("\n".join(renderer.table(rows)))
+    rows, batches.WARPS = [], a.warps  # before the first kernel is made
+    for walk in ("rounds", "entries") if a.walk == "both" else (a.walk,):
+        batches.COOPERATIVE = walk == "rounds"
+        found = renderer.measure(
+            device.alias, counts=counts, forms=("all",), runs=a.repeats or (30 if device.is_cuda else 5)
+        )
+        print("\n".join([f"lists walked in {walk}", *renderer.table(found)]))
+        rows += [row | {"walk": walk} for row in found]
     if a.json:
         about = {"device": device.name, "warp": wp.__version__, "torch": torch.__version__}
         a.json.write_text(json.dumps(about | {"rows": rows}, indent=1) + "\n")

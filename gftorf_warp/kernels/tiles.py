@@ -7,7 +7,8 @@ order of depth and sorted by tile with a stable sort, so that every list is in d
 
 import warp as wp
 
-from .splat import Splat
+from .lanes import lane_beyond, of_lane, sum_of_lanes
+from .splat import Splat, load_splat
 
 # `count_pairs` and `emit_pairs` must agree on every span to the last bit, and contraction to fused multiply-adds is the
 # compiler's choice in each kernel anew
@@ -71,7 +72,7 @@ def span_of(outline: wp.vec4, q: Splat, row: int, tiles: wp.vec4i, tile_width: i
     return wp.vec2i(x0, x1)
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel(enable_backward=False, grid_stride=False)
 def count_pairs(
     # In:
     order: wp.array[wp.int32],  # [>= N] splats near to far
@@ -79,24 +80,29 @@ def count_pairs(
     box_px: wp.array[wp.vec4i],  # [N] pixels a splat may touch [px]
     tile_width: int,  # columns of a tile [px]
     tile_height: int,  # rows of a tile [px]
+    lanes: int,  # threads per splat: 32 on CUDA, a warp, 1 on the CPU [1]
     # Out:
     counts: wp.array[int],  # [N] tiles each splat touches, in depth order
 ):
-    """One thread per splat."""
-    rank = wp.tid()
+    """One warp per splat, one lane per row of tiles."""
+    rank, lane = wp.tid()
     i = order[rank]
     touched = int(0)
     if box_px[i][2] > 0:
-        q = splats[i]
+        q = load_splat(splats, i)
         outline = outline_of(q, box_px[i])
         tiles = tile_range(box_px[i], tile_width, tile_height)
-        for row in range(tiles[1], tiles[3]):
+        row = tiles[1] + lane
+        while row < tiles[3]:
             span = span_of(outline, q, row, tiles, tile_width, tile_height)
             touched += span[1] - span[0]
-    counts[rank] = touched
+            row += lanes
+    sums = sum_of_lanes(touched)
+    if lane == lanes - 1:
+        counts[rank] = sums
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel(enable_backward=False, grid_stride=False)
 def emit_pairs(
     # In:
     order: wp.array[wp.int32],  # [>= N] splats near to far
@@ -104,63 +110,55 @@ def emit_pairs(
     box_px: wp.array[wp.vec4i],  # [N] pixels a splat may touch [px]
     tile_width: int,  # columns of a tile [px]
     tile_height: int,  # rows of a tile [px]
+    lanes: int,  # threads per splat: 32 on CUDA, a warp, 1 on the CPU [1]
     tiles_x: int,  # tiles per row [1]
     tile_count: int,  # tiles of the image: the key of a place that no pair takes [1]
     ends: wp.array[int],  # [N] sums of counts: where the pairs of each splat end, in depth order
-    share: int,  # pairs of a thread [1]
     capacity: int,  # pairs that fit [1]
     # Out:
     keys: wp.array[wp.int32],  # [>= capacity] tile of each pair
     ids: wp.array[wp.int32],  # [>= capacity] splat of each pair
     total: wp.array[int],  # [1] pairs there would be, whether they fit or not
 ):
-    """One thread per ``share`` neighbouring pairs, whoever they belong to: a splat over the whole image has thousands.
+    """One warp per splat: a lane finds the span of a row, then all lanes write neighbouring pairs, whatever their row.
 
     Pairs that do not fit are dropped, farthest first, and show in ``total``.
     """
-    thread = wp.tid()
+    rank, lane = wp.tid()
     known = ends[ends.shape[0] - 1]
-    if thread == 0:
+    if rank == 0 and lane == 0:
         total[0] = known
-    k = thread * share
-    stop = wp.min(k + share, capacity)
-    full = wp.min(stop, known)
-    rank = int(0)  # the splat of the first pair
-    high = ends.shape[0] - 1
-    while rank < high:
-        middle = (rank + high) // 2
-        if ends[middle] > k:
-            high = middle
-        else:
-            rank = middle + 1
-    skip = int(0)  # pairs of that splat which other threads write
+    free = known + rank * lanes + lane
+    while free < capacity:
+        keys[free] = tile_count
+        free += ends.shape[0] * lanes
+    i = order[rank]
+    at = int(0)  # the place of the first pair of these rows
     if rank > 0:
-        skip = k - ends[rank - 1]
-    else:
-        skip = k
-    while k < full:
-        end = wp.min(ends[rank], full)
-        i = order[rank]
-        rank += 1
-        if k < end:
-            q = splats[i]
-            outline = outline_of(q, box_px[i])
-            tiles = tile_range(box_px[i], tile_width, tile_height)
-            row = tiles[1]
-            while k < end and row < tiles[3]:
-                span = span_of(outline, q, row, tiles, tile_width, tile_height)
-                x = span[0] + skip
-                skip = wp.max(x - span[1], 0)
-                while k < end and x < span[1]:
-                    keys[k] = row * tiles_x + x
-                    ids[k] = i
-                    k += 1
-                    x += 1
-                row += 1
-            skip = 0
-    while k < stop:
-        keys[k] = tile_count
-        k += 1
+        at = ends[rank - 1]
+    if box_px[i][2] > 0:
+        q = load_splat(splats, i)
+        outline = outline_of(q, box_px[i])
+        tiles = tile_range(box_px[i], tile_width, tile_height)
+        top = tiles[1]
+        while top < tiles[3] and at < capacity:  # as all control here the same for all lanes of a warp
+            span = wp.vec2i(0, 0)
+            if top + lane < tiles[3]:
+                span = span_of(outline, q, top + lane, tiles, tile_width, tile_height)
+            sums = sum_of_lanes(span[1] - span[0])
+            count = of_lane(sums, lanes - 1)
+            shift = span[1] - sums  # from the number of a pair in these rows to its column
+            begin = int(0)
+            while begin < count:
+                pair = begin + lane
+                row = lane_beyond(sums, pair)
+                x = of_lane(shift, row) + pair
+                if pair < count and at + pair < capacity:
+                    keys[at + pair] = (top + row) * tiles_x + x
+                    ids[at + pair] = i
+                begin += lanes
+            at += count
+            top += lanes
 
 
 @wp.kernel(enable_backward=False)

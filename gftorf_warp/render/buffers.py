@@ -93,9 +93,7 @@ class RenderSettings:
 # owns a tile and every thread a pixel (design/tiles.md)
 TILE_SHAPES = {"cpu": (16, 8, 8), "cuda": (1, 8, 4)}
 
-# (tile, splat) pairs that one thread writes: finding the first one is a search, which a CPU should do rarely; eight
-# are one 32-byte sector of GPU memory
-PAIRS_PER_THREAD = {"cpu": 4096, "cuda": 8}
+LANES_PER_SPLAT = {"cpu": 1, "cuda": 32}  # threads that write the (tile, splat) pairs of a splat
 
 
 def available_threads() -> int:
@@ -116,7 +114,7 @@ class Frame:
         self.settings, self.device = settings, device
         kind = "cpu" if device.is_cpu else "cuda"
         self.K, self.tile_width, self.tile_height = TILE_SHAPES[kind]
-        self.share = PAIRS_PER_THREAD[kind]
+        self.lanes_per_splat = LANES_PER_SPLAT[kind]
         self.tiles_x = math.ceil(width / self.tile_width)
         self.tiles = self.tiles_x * math.ceil(height / self.tile_height)
         pixels = make_pixels(self.K, self.tile_width, self.tile_height)

@@ -79,7 +79,7 @@ def forward(inputs: Inputs, view: CameraView, shifts: tuple[float, ...], frame: 
             frame.records.append(frame.array(f"records {number}", frame.count, splat.Splat))
         if name == "extra":
             stages.set_channels(frame, inputs, start, frame.records[number])
-    for number in range(len(frame.records)):
+    for number in [0, *range(max(1, stages.in_first_pass(frame)), len(frame.records))]:
         stages.composite(frame, view, number, images.distortion is not None)
     stages.resolve_images(inputs, shifts, frame, images, groups)
 
@@ -109,12 +109,18 @@ def backward(
         return grad_splats
     distortion, fixed = cotangents.distortion is not None, [name == "extra" and extra_detached for name, _ in groups]
     first = {"distortion": distortion, "fixed": bool(groups) and fixed[0]}
+    together = stages.in_first_pass(frame) > 1 and fixed[1] and grad_channels[1] is not None
+    if together:
+        first["grad_more"] = grad_channels[1]
+        first["more_records"] = frame.zeros("gradient records of the second group", frame.count, splat.Splat)
     stages.composite_backward(frame, 0, grad_light, grad_channels[0], grad_splats, **first)
     for number, (name, start) in enumerate(groups):
         if grad_channels[number] is None:
             continue
         records = grad_splats
-        if number > 0:  # a further pass shares centres, conics and opacities with the first
+        if number == 1 and together:
+            records = first["more_records"]
+        elif number > 0:  # a further pass shares centres, conics and opacities with the first
             records = frame.zeros("gradient records of a further pass", frame.count, splat.Splat)
             stages.composite_backward(frame, number, grad_light, grad_channels[number], records, fixed=fixed[number])
             if not fixed[number]:

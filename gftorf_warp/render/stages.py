@@ -10,7 +10,7 @@ from itertools import pairwise
 import numpy as np
 import warp as wp
 
-from ..kernels import resolve, splat, tiles
+from ..kernels import batches, resolve, splat, tiles
 from ..kernels.composite import CHANNEL_PLANES, make_composite
 from ..kernels.composite_backward import (
     GRAD_LIGHT_PLANES,
@@ -68,16 +68,16 @@ def sort_by_depth(frame: Frame) -> None:
 
 def sort_by_tile(frame: Frame) -> None:
     """Count, emit and sort the (tile, splat) pairs."""
-    lists = [frame.order, frame.splats, frame.box_px, frame.tile_width, frame.tile_height]
-    _launch(tiles.count_pairs, frame.count, lists, [frame.counts])
+    lists = [frame.order, frame.splats, frame.box_px, frame.tile_width, frame.tile_height, frame.lanes_per_splat]
+    threads = frame.count, frame.lanes_per_splat
+    _launch(tiles.count_pairs, threads, lists, [frame.counts])
     wp.utils.array_scan(frame.counts, frame.ends, inclusive=True)
     capacity = frame.settings.pair_capacity
     if capacity is None:
         # the declared host synchronisation: how many pairs there are decides how much memory they need
         capacity = int(frame.ends[-1:].numpy()[0])
     frame.reserve_pairs(capacity)
-    threads = max(1, math.ceil(capacity / frame.share))
-    inputs = [*lists, frame.tiles_x, frame.tiles, frame.ends, frame.share, capacity]
+    inputs = [*lists, frame.tiles_x, frame.tiles, frame.ends, capacity]
     _launch(tiles.emit_pairs, threads, inputs, [frame.keys, frame.ids, frame.total])
     if capacity:
         wp.utils.radix_sort_pairs(frame.keys, frame.ids, capacity, end_bit=frame.tiles.bit_length())
@@ -87,16 +87,20 @@ def sort_by_tile(frame: Frame) -> None:
 
 
 def composite(frame: Frame, view: CameraView, number: int, distortion: bool = True) -> None:
-    """Blend all tiles: light with the first group of channels, every further group by itself."""
+    """Blend all tiles: light with the first group of channels, or the first two, every further group by itself."""
+    nothing, more = _nothing(frame, 3, frame.sums.lanes.dtype), number == 0 and in_first_pass(frame) > 1
     light, channels = number == 0, bool(frame.channels)
     shape = frame.K, frame.tile_width, frame.tile_height
     metric = _metric(frame, light and distortion)
-    kernel = make_composite(*shape, light, channels, frame.settings.stop == Stop.INCLUSIVE, metric)
-    channel = frame.channels[number].lanes if channels else _nothing(frame, 3, frame.sums.lanes.dtype)
+    kernel = make_composite(
+        *shape, light, channels, frame.settings.stop == Stop.INCLUSIVE, metric, _cooperative(frame), more
+    )
+    channel = frame.channels[number].lanes if channels else nothing
+    more_splats, more_channel = (frame.records[1], frame.channels[1].lanes) if more else (frame.records[0], nothing)
     lists = [frame.first, frame.ids, frame.records[number], frame.tiles_x, view.width, view.height]
 
     def arguments(tile0: int, _part: int) -> list:
-        return [*lists, tile0, _mapping(frame), frame.sums.lanes, channel]
+        return [*lists, tile0, _mapping(frame), more_splats, frame.sums.lanes, channel, more_channel]
 
     _over_tiles(frame, kernel, _tile_edges(frame, frame.threads), arguments)
 
@@ -110,6 +114,8 @@ def composite_backward(
     *,
     distortion: bool = True,
     fixed: bool = False,
+    grad_more: Planes | None = None,
+    more_records: wp.array | None = None,
 ) -> None:
     """Add the gradient of one pass to ``records``; CPU threads add to their own, which are then summed in order.
 
@@ -121,23 +127,44 @@ def composite_backward(
         records: [N] added to.
         distortion: Whether it has a gradient.
         fixed: Whether weights are held fixed under the channels.
+        grad_more: Of the second group, if this pass takes it along; weights are held fixed under it.
+        more_records: [N] what it adds to.
     """
     light, channels = number == 0, grad_channel is not None
     shape = frame.K, frame.tile_width, frame.tile_height
     passes = frame.settings.clamp_gradient == ClampGradient.STRAIGHT
     metric = _metric(frame, light and distortion)
-    kernel = make_composite_backward(*shape, light, channels, passes, metric, fixed and channels)
-    channel = grad_channel.lanes if grad_channel is not None else _nothing(frame, 3, frame.sums.lanes.dtype)
+    kernel = make_composite_backward(
+        *shape, light, channels, passes, metric, fixed and channels, _cooperative(frame), grad_more is not None
+    )
+    nothing = _nothing(frame, 3, frame.sums.lanes.dtype)
+    channel = grad_channel.lanes if grad_channel is not None else nothing
+    more = grad_more.lanes if grad_more is not None else nothing
     edges = _tile_edges(frame, frame.threads)
     parts = [records] + [frame.zeros(f"records of thread {n}", frame.count, splat.Splat) for n in range(len(edges) - 2)]
     lists = [frame.first, frame.ids, frame.records[number], frame.tiles_x]
 
     def arguments(tile0: int, part: int) -> list:
-        return [*lists, tile0, _mapping(frame), frame.sums.lanes, grad_light.lanes, channel, parts[part]]
+        return [
+            *lists,
+            tile0,
+            _mapping(frame),
+            frame.sums.lanes,
+            grad_light.lanes,
+            channel,
+            more,
+            parts[part],
+            more_records if more_records is not None else records,
+        ]
 
     _over_tiles(frame, kernel, edges, arguments)
     for part in parts[1:]:
         _launch(splat.add_records, frame.count, [part, 0], [records])
+
+
+def in_first_pass(frame: Frame) -> int:
+    """Groups of channels that are blended together with the light: two where a warp owns a tile, else one."""
+    return min(len(frame.channels), 2 if _cooperative(frame) and frame.threads == 1 else 1)
 
 
 def set_channels(frame: Frame, inputs: Inputs, start: int, splats: wp.array) -> None:
@@ -231,6 +258,11 @@ def _shift_vectors(shifts: tuple[float, ...], device: str) -> wp.array:
     return wp.array([(math.cos(s), math.sin(s)) for s in shifts], dtype=wp.vec2, device=device)
 
 
+def _cooperative(frame: Frame) -> bool:
+    """Whether the lanes of a warp fetch records for each other, as they may where a warp owns a tile."""
+    return frame.K == 1 and batches.COOPERATIVE
+
+
 def _metric(frame: Frame, wanted: bool) -> bool | None:
     """What distortion is measured on, as compositors have it; None where there is none."""
     return frame.settings.distortion == Distortion.PAPER if wanted else None
@@ -270,7 +302,7 @@ def _over_tiles(frame: Frame, kernel, edges: list[int], arguments) -> None:
             dim=(stop - start, frame.lanes),
             inputs=arguments(start, part),
             device=frame.device,
-            block_dim=128,
+            block_dim=32 * batches.WARPS if _cooperative(frame) else 128,
             record_tape=False,
             record_cmd=side_by_side,
         )
