@@ -174,7 +174,7 @@ class CapturedSteps:
         """Ask the motion once where Gaussians hang on it, if they will not move any more."""
         motion, padded = self.state.motion, self.padded
         if rests and motion.follows_means:
-            padded.attachment = motion.attach(padded.field.map(torch.Tensor.detach))
+            padded.attachment.copy_(motion.attach(padded.field.map(torch.Tensor.detach)))
 
     def _captured(self, variant: Variant, table: descent.AdamTable) -> Callable[[], None]:
         """A step of this kind; its gradients lie where the capture puts them, which the table learns after it."""
