@@ -166,9 +166,14 @@ class CapturedSteps:
             return
         if self._graphs:
             self._look()  # waits: memory of a graph must not be given to anybody before it has run
-            self._graphs.clear()
+            self._forget()
         self._part = part
         self._rest(variant.rests)
+
+    def _forget(self) -> None:
+        """Let go of all graphs, and of the memory that they shared: it is gone with the last of them."""
+        self._graphs.clear()
+        self._pool = shared_pool(self.observations.quads.device)
 
     def _rest(self, rests: bool) -> None:
         """Ask the motion once where Gaussians hang on it, if they will not move any more."""
@@ -215,12 +220,12 @@ class CapturedSteps:
         counts[2] = 0
         if pairs and (self._capacity is None or not EMPTY < pairs / self._capacity < FULL):
             self._capacity = math.ceil(ROOM * pairs / PAIRS) * PAIRS
-            self._graphs.clear()
+            self._forget()
         return in_a_row
 
     def _adopt(self) -> None:
         if self.padded.adopt(self.state):
-            self._graphs.clear()
+            self._forget()
         if self._part is not None:
             self._rest(self._part[1])
 
