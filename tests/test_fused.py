@@ -96,6 +96,27 @@ def test_bright_images_of_little_contrast_cancel_no_worse_than_in_torch(device, 
     assert errors[0] < 1e-3
 
 
+@pytest.mark.parametrize("shape", [(1, 37, 53), (2, 9, 11), (1, 12, 33)], ids=str)
+def test_a_row_of_many_images_is_compared_in_kept_memory(device, shape):
+    """As that row alone, to the bit, also in planes that a loss before has used; the opacity is summed up beside it."""
+    measured = torch.stack([image(shape, n) for n in range(2, 5)]).to(device)
+    rendered, opacity = image(shape, 1).to(device).requires_grad_(), image((1, *shape[1:]), 5)[0].to(device)
+    scratch, out = fused.Scratch(), torch.zeros(3, device=device)
+    for n in (2, 0):
+        row = torch.tensor([n], dtype=torch.int32, device=device)
+        place = {"row": row, "scratch": scratch, "out": out}
+        loss, squared, other = fused.image_loss(rendered, measured, 0.2, opacity=opacity, **place)
+        (gradient,) = torch.autograd.grad(loss, rendered)
+        want, want_squared, nothing = fused.image_loss(rendered, measured[n], 0.2)
+        (want_gradient,) = torch.autograd.grad(want, rendered)
+        assert torch.equal(gradient, want_gradient)
+        assert torch.equal(loss, want)
+        assert torch.equal(squared, want_squared)
+        assert out.tolist() == [float(value.detach()) for value in (loss, squared, other)]
+        torch.testing.assert_close(other, opacity.sum() / rendered.numel(), rtol=1e-5, atol=1e-6)
+        assert float(nothing) == 0
+
+
 def test_images_that_do_not_fit_are_refused():
     """Shape and precision are checked before any kernel reads them."""
     with pytest.raises(ValueError, match=r"\(1, 8, 9\).*\(1, 9, 8\)"):

@@ -93,13 +93,16 @@ def test_a_field_without_motion_has_no_motion_group():
 
 
 def test_quartets_may_have_rates_and_moments_of_their_own():
-    """The root rule: rates times two, decays to the power of four; only where a step compares four images."""
+    """Rates times two, or four, decays to the power of four; only where a step compares four images."""
     released = presets.released()
     quartet = replace(released, schedule=replace(released.schedule, batch=Batch.QUARTET))
     assert betas_of(quartet) == pytest.approx((0.6561, 0.996006), rel=1e-6)
     assert betas_of(released) == BETAS
     for name, rate in rates_at(released, 5000).items():
         assert rates_at(quartet, 5000)[name] == pytest.approx(2 * rate)
+    linear = replace(quartet, schedule=replace(quartet.schedule, batch_rule=BatchRule.LINEAR))
+    assert betas_of(linear) == betas_of(quartet)
+    assert rates_at(linear, 5000)["mean"] == pytest.approx(4 * rates_at(released, 5000)["mean"])
     without = replace(quartet, schedule=replace(quartet.schedule, batch_rule=BatchRule.NONE))
     phasors = presets.released(Recorded(input=Input.PHASOR))
     phasors = replace(phasors, schedule=replace(phasors.schedule, batch=Batch.QUARTET))

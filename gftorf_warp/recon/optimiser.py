@@ -40,7 +40,9 @@ def rates_at(
     begin = schedule.motion_decay_from
     shares = dict.fromkeys(first, share)
     shares["motion"] = min(max(images - begin, 0) / max(schedule.images - begin, 1), 1.0)
-    factor *= math.sqrt(_images(settings))
+    images_of_step = _images(settings)
+    linear = settings.schedule.batch_rule == BatchRule.LINEAR
+    factor *= images_of_step if linear else math.sqrt(images_of_step)
     rates = {name: factor * _between(first[name], last[name], shares[name]) for name in first}
     paused = reset_at is not None and images < reset_at + schedule.pause_after_reset
     if images < schedule.warm_up or paused:
@@ -60,7 +62,7 @@ def _images(settings: ReconSettings) -> int:
     """Images of a step as far as Adam is concerned; a last batch that is cut short counts as a whole one."""
     schedule = settings.schedule
     joint = schedule.batch == Batch.QUARTET and settings.input != Input.PHASOR and settings.weights.quads > 0
-    return FRAMES_PER_QUARTET if joint and schedule.batch_rule == BatchRule.ROOT else 1
+    return FRAMES_PER_QUARTET if joint and schedule.batch_rule != BatchRule.NONE else 1
 
 
 def frozen(settings: ReconSettings, images: int) -> bool:

@@ -75,6 +75,8 @@ class BatchRule(enum.StrEnum):
     """The same."""
     ROOT = "root"
     """Of b images: rates times the root of b, both decays to the power of b, so that as much is forgotten per image."""
+    LINEAR = "linear"
+    """As ``root`` with rates times b: as far per image where gradients agree, which short runs need."""
 
 
 class Kernels(enum.StrEnum):
