@@ -210,7 +210,7 @@ def test_adam_is_torchs_over_fifty_steps(monkeypatch, device, block):
         assert float(step) == 50
         scale = float(state["exp_avg"].abs().max())
         torch.testing.assert_close(first, state["exp_avg"], rtol=1e-5, atol=1e-6 * scale)
-        torch.testing.assert_close(second, state["exp_avg_sq"], rtol=1e-5, atol=1e-6 * scale**2)
+        torch.testing.assert_close(second, state["exp_avg_sq"], rtol=3e-5, atol=1e-6 * scale**2)
 
 
 def test_adam_rests_at_rate_zero_and_when_a_step_is_not_sound(device):

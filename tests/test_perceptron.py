@@ -98,7 +98,8 @@ def test_in_float32_it_is_the_network(keys):
 
 def on_the_same_side(made, gaussians, cotangent, keys):
     """Gradients of the plain network in float64 whose units are at rest where those of the rounded one are."""
-    saved = made.key_offsets(made.attach(gaussians), keys).grad_fn.saved_tensors[-len(made.layers) :]
+    offsets = made.key_offsets(made.attach(gaussians), keys)  # kept: what is saved may go with it
+    saved = offsets.grad_fn.saved_tensors[-len(made.layers) :]
     alive = [rows[:, : made.settings.width] > 0 for rows in saved]
     twin = copy.deepcopy(made).double()
     place = encoded(gaussians.mean.double() / made.length, made.settings.position_frequencies)
