@@ -168,7 +168,7 @@ def _check_engine(scene: Scene, engine: str, bounces: int, paths: int, device: s
     }
     _refuse(wanted)
     if engine != "mesh":
-        light = "mesh: the light is beside the camera, has a beam or bounces"
+        light = "mesh: the light is beside the camera, has a beam or bounces, or a body is glossy or a mesh that moves"
         _refuse({"--engine": (not needs_mesh(scene, bounces), repr(engine), light)})
         _refuse({"--device": (device == "cpu", f"{device} and engine {engine!r}", "cpu, or --engine mesh")})
 

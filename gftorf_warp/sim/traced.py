@@ -7,6 +7,7 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
+import torch
 from jaxtyping import Float, Int
 
 from ..render.trace import Bounces, FirstHits, Lamp, Light, RigidBody, Tracer
@@ -14,8 +15,9 @@ from ..scene.camera import Camera
 from ..scene.sensor import Sensor
 from .assembly import Assembly, Level, Part
 from .look import pooled
+from .meshes import Mesh
 from .scene import Scene
-from .world import Body, Box, Plane, Shape, Sphere, albedo, first_hit
+from .world import Body, Box, Plane, Shape, Sphere, albedo, carried, first_hit
 
 
 class Traced:
@@ -64,6 +66,19 @@ class Traced:
         hits = self._tracer.first_hits(self.camera_at(time), self._poses(time))
         return replace(hits, body=np.where(hits.body < 0, hits.body, self._body[hits.body]))
 
+    def flow(self, time: float, later: float) -> Float[np.ndarray, "2 H W"]:
+        """Where what is seen at ``time`` is in the image ``later`` [s], less where it was [px]; NaN: nothing is seen.
+
+        Surfaces are carried along with their bodies, and the camera moves, too; whether they are hidden then is not
+        looked at. Later may be earlier.
+        """
+        camera, other, hits = self.camera_at(time), self.camera_at(later), self.first_hits(time)
+        rays = camera.rays(dtype=torch.float64).numpy()
+        point = camera.centre + rays * hits.distance[..., None]
+        moved = carried(self.scene.bodies, point, hits.body, time, later)
+        here, there = camera.project(torch.from_numpy(point)), other.project(torch.from_numpy(moved))
+        return np.moveaxis((there - here).numpy(), -1, 0)
+
     def quad(self, times: Sequence[float], sensor: Sensor, seed: int = 0) -> tuple[Float[np.ndarray, "H W"], ...]:
         """Mean quad of the sensor's first shift, and mean amplitude, of every pixel over instants [s]."""
         mean = self.light(times, float(sensor.f_mod_hz), seed)
@@ -89,7 +104,7 @@ def rigid_bodies(body: Body) -> list[RigidBody]:
 
     The flat-sided parts of an assembly are one piece together; each of its balls is another.
     """
-    shape, made = body.shape, partial(RigidBody, low=body.texture.low, high=body.texture.high, cell=body.texture.cell)
+    shape, made = body.shape, partial(RigidBody, **body.texture.numbers)
     if isinstance(shape, Level):
         x, y, z = np.eye(3)[shape.axis].tolist()
         return [made(normal=(x, y, z), height=shape.value)]
@@ -109,8 +124,10 @@ def triangles_of(shape: Shape) -> tuple[Float[np.ndarray, "V 3"], Int[np.ndarray
     """Vertices [m] and triangles of a flat-sided shape, counter-clockwise as seen from its visible side.
 
     Raises:
-        ValueError: If the shape is neither a box nor a plane.
+        ValueError: If the shape is no box, plane or mesh.
     """
+    if isinstance(shape, Mesh):
+        return shape.surface
     if isinstance(shape, Plane):
         x, y = np.asarray(shape.size) / 2
         points = np.array([[-x, -y, 0.0], [x, -y, 0.0], [x, y, 0.0], [-x, y, 0.0]])
