@@ -76,7 +76,7 @@ def _loaded(file: Path) -> tuple[np.ndarray, np.ndarray]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)  # numbers that are none: looked at afterwards
-            mesh = trimesh.load(file, process=False, force="mesh", **options)
+            mesh: Any = trimesh.load(file, process=False, force="mesh", **options)
             return np.array(mesh.vertices, dtype=np.float64), np.array(mesh.faces, dtype=np.int64)
     except Exception as error:  # a reader of foreign files fails in many ways, and all of them mean this
         raise _wrong(file, f"it cannot be read: {type(error).__name__}, {error}", "export it again") from error

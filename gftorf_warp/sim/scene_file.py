@@ -1,8 +1,8 @@
 """Scenes as TOML files of the user: the fields of :class:`gftorf_warp.sim.scene.Scene`, as tables.
 
 Every table is the settings of one dataclass. Where several kinds could stand, `kind` names one: a shape is "box",
-"plane", "sphere", "level", "assembly" or "mesh", a path "still", "line", "arc", "guided", "viewpoint" or "sweep". What a
-table leaves out has its default. Paths of files are relative to the file that names them. See examples/scene.toml.
+"plane", "sphere", "level", "assembly" or "mesh", a path "still", "line", "arc", "guided", "viewpoint" or "sweep". What
+a table leaves out has its default. Paths of files are relative to the file that names them. See examples/scene.toml.
 """
 
 from __future__ import annotations

@@ -60,11 +60,6 @@ class Texture:
         ramp = np.abs((6.0 * hue[:, None] + [0.0, 4.0, 2.0]) % 6.0 - 3.0) - 1.0  # HSV to RGB, all sectors at once
         return self(point)[:, None] * (1.0 - SATURATION * (1.0 - np.clip(ramp, 0.0, 1.0)))
 
-    @property
-    def numbers(self) -> dict[str, float]:
-        """What light knows of it, by name: everything but the hue."""
-        return {name: getattr(self, name) for name in ("low", "high", "cell", "gloss", "shininess")}
-
     def shading(self, cosine: Float[np.ndarray, "P"]) -> Float[np.ndarray, "P"]:
         """Share of a reflectance of 1 that comes back to a camera at the light, met at this cosine of incidence [1]."""
         twice = np.maximum(2.0 * cosine**2 - 1.0, 0.0)  # cosine between the view and the mirrored light

@@ -104,7 +104,15 @@ def rigid_bodies(body: Body) -> list[RigidBody]:
 
     The flat-sided parts of an assembly are one piece together; each of its balls is another.
     """
-    shape, made = body.shape, partial(RigidBody, **body.texture.numbers)
+    shape, texture = body.shape, body.texture
+    made = partial(
+        RigidBody,
+        low=texture.low,
+        high=texture.high,
+        cell=texture.cell,
+        gloss=texture.gloss,
+        shininess=texture.shininess,
+    )
     if isinstance(shape, Level):
         x, y, z = np.eye(3)[shape.axis].tolist()
         return [made(normal=(x, y, z), height=shape.value)]
