@@ -17,7 +17,7 @@ from .assembly import Assembly, Level, Part
 from .look import pooled
 from .meshes import Mesh
 from .scene import Scene
-from .world import Body, Box, Plane, Shape, Sphere, albedo, carried, first_hit
+from .world import Body, Box, Plane, Shape, Sphere, albedo_seen, carried
 
 
 class Traced:
@@ -95,7 +95,7 @@ def trace_colour(scene: Scene, camera: Camera, time: float) -> Float[np.ndarray,
     """Mean albedo of every pixel in linear RGB [1] over its rays; black where they meet nothing."""
     n = scene.subsamples
     fine = camera.resized(camera.width * n, camera.height * n)
-    colour = albedo(scene.bodies, first_hit(scene.bodies, fine, time), time)
+    colour = albedo_seen(scene.bodies, fine, time)
     return np.stack([pooled(channel, n) for channel in np.moveaxis(colour, -1, 0)], axis=-1)
 
 

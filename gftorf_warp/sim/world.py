@@ -18,6 +18,7 @@ from ..scene.camera import Camera
 from .paths import Path, Still, inverse
 from .texture import Texture
 
+CHUNK = 1 << 14  # rays at a time: their numbers stay in the cache
 GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))  # [rad] between neighbours of a spiral that covers a sphere evenly
 
 
@@ -255,20 +256,11 @@ class Hits:
 
 def first_hit(bodies: tuple[Body, ...], camera: Camera, time: float) -> Hits:
     """First hit of every pixel's centre ray with all ``bodies`` as they are at ``time`` [s], in float64."""
-    shape = (camera.height, camera.width)
-    ray = camera.rays(dtype=torch.float64).numpy().reshape(-1, 3)
-    centre = camera.centre
-    distance = np.full(len(ray), np.inf)
-    body, face = np.full(len(ray), -1), np.zeros(len(ray), dtype=np.int64)
+    shape, centre = (camera.height, camera.width), camera.centre
+    poses = [candidate.path.world_from_body(time) for candidate in bodies]
+    ray, distance, body, face = _nearest(bodies, poses, camera)
     normal, reflectance = np.full((len(ray), 3), np.nan), np.zeros(len(ray))
     amplitude = np.zeros(len(ray))
-    poses = [candidate.path.world_from_body(time) for candidate in bodies]
-    for index, (candidate, pose) in enumerate(zip(bodies, poses, strict=True)):
-        rays = passing(centre, ray, pose[:3, 3], candidate.shape.reach)
-        reached, side = candidate.shape.hit(pose[:3, :3].T @ (centre - pose[:3, 3]), ray[rays] @ pose[:3, :3])
-        nearer = reached < distance[rays]
-        chosen = rays[nearer]
-        distance[chosen], body[chosen], face[chosen] = reached[nearer], index, side[nearer]
     for index, (candidate, pose) in enumerate(zip(bodies, poses, strict=True)):  # of what is seen only
         seen = np.flatnonzero(body == index)
         rotation, reached = pose[:3, :3], distance[seen, None]
@@ -287,6 +279,24 @@ def first_hit(bodies: tuple[Body, ...], camera: Camera, time: float) -> Hits:
         reflectance=reflectance.reshape(shape),
         amplitude=amplitude.reshape(shape),
     )
+
+
+def _nearest(bodies: tuple[Body, ...], poses: list[np.ndarray], camera: Camera) -> tuple[np.ndarray, ...]:
+    """Every pixel's ray, the distance [m] of its first hit, the body, -1 for none, and its face."""
+    ray, centre = camera.rays(dtype=torch.float64).numpy().reshape(-1, 3), camera.centre
+    distance = np.full(len(ray), np.inf)
+    body, face = np.full(len(ray), -1), np.zeros(len(ray), dtype=np.int64)
+    for start in range(0, len(ray), CHUNK):
+        part = slice(start, start + CHUNK)
+        for index, (candidate, pose) in enumerate(zip(bodies, poses, strict=True)):
+            rays = start + passing(centre, ray[part], pose[:3, 3], candidate.shape.reach)
+            if len(rays) == 0:
+                continue
+            reached, side = candidate.shape.hit(pose[:3, :3].T @ (centre - pose[:3, 3]), ray[rays] @ pose[:3, :3])
+            nearer = reached < distance[rays]
+            chosen = rays[nearer]
+            distance[chosen], body[chosen], face[chosen] = reached[nearer], index, side[nearer]
+    return ray, distance, body, face
 
 
 def passing(
@@ -322,9 +332,22 @@ def carried(
 
 def albedo(bodies: tuple[Body, ...], hits: Hits, time: float) -> Float[np.ndarray, "H W 3"]:
     """Albedo in linear RGB [1] of what ``hits`` met at ``time`` [s]; 0 where nothing was hit."""
-    colour = np.zeros((*hits.body.shape, 3))
-    for index, body in enumerate(bodies):
-        seen = hits.body == index
-        body_from_world = inverse(body.path.world_from_body(time))
-        colour[seen] = body.texture.albedo(hits.point[seen] @ body_from_world[:3, :3].T + body_from_world[:3, 3])
+    return _albedo(bodies, hits.body, hits.point, time)
+
+
+def albedo_seen(bodies: tuple[Body, ...], camera: Camera, time: float) -> Float[np.ndarray, "H W 3"]:
+    """Albedo in linear RGB [1] on every pixel's centre ray at ``time`` [s]; 0 where nothing is hit."""
+    poses = [candidate.path.world_from_body(time) for candidate in bodies]
+    ray, distance, body, _ = _nearest(bodies, poses, camera)
+    shape = (camera.height, camera.width)
+    point = camera.centre + ray * np.where(body < 0, np.nan, distance)[:, None]
+    return _albedo(bodies, body.reshape(shape), point.reshape(*shape, 3), time)
+
+
+def _albedo(bodies: tuple[Body, ...], body: np.ndarray, point: np.ndarray, time: float) -> np.ndarray:
+    colour = np.zeros((*body.shape, 3))
+    for index, candidate in enumerate(bodies):
+        seen = body == index
+        body_from_world = inverse(candidate.path.world_from_body(time))
+        colour[seen] = candidate.texture.albedo(point[seen] @ body_from_world[:3, :3].T + body_from_world[:3, 3])
     return colour
