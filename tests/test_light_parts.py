@@ -12,6 +12,7 @@ from test_trace import AHEAD, CAMERA, F_MOD_HZ, GREY, expected, light, plane, sc
 from gftorf_warp.constants import SPEED_OF_LIGHT
 from gftorf_warp.render.trace import Bounces, RigidBody, Tracer
 from gftorf_warp.scene.camera import Camera
+from gftorf_warp.scene.sensor import Sensor
 from gftorf_warp.sim.paths import Line, Still
 from gftorf_warp.sim.record import record
 from gftorf_warp.sim.scenes import SCENES, room
@@ -209,3 +210,38 @@ def test_boxes_are_hit_alike_whichever_way(device):
     want = first_hit(bodies, CAMERA, 0.0)
     np.testing.assert_array_equal(hits.body, want.body)
     np.testing.assert_allclose(hits.distance, want.distance, atol=2e-5)
+
+
+@pytest.mark.parametrize("dc", [0.0, 1.0])
+@pytest.mark.parametrize(
+    ("shifts", "wanted"),
+    [
+        (
+            (0, 1, 2, 3),
+            {0.0: (2.407, 2.103, 2.196, 2.196, 2.053, 2.331), 1.0: (1.700, 2.378, 1.799, 2.812, 2.005, 2.546)},
+        ),
+        (
+            (0, 2, 1, 3),
+            {0.0: (2.407, 2.103, 2.178, 2.204, 2.053, 2.331), 1.0: (1.700, 2.378, 2.178, 2.204, 2.005, 2.546)},
+        ),
+        (
+            (0, 1, 3, 2),
+            {0.0: (2.407, 2.103, 2.196, 2.196, 2.103, 2.407), 1.0: (1.700, 2.378, 1.799, 2.812, 1.803, 2.870)},
+        ),
+    ],
+)
+def test_a_sliding_edge_mixes_two_distances(shifts, wanted, dc, device):
+    """T15 by rays: a card at 2.0 m leaves or comes after 1, 2 or 3 of four raw frames; published distances, to 1 mm."""
+    shifts = np.array(shifts) * math.pi / 2
+    far = plane(2.6, texture=Texture(low=0.074 * 2.6**2, high=0.074 * 2.6**2))
+    got = []
+    for frames in (1, 2, 3):
+        for edge in (1.0, -1.0):
+            path = Line(position=(edge - 3.0 / 120 * (frames - 0.5), 0.0, 2.0), velocity=(3.0, 0.0, 0.0))
+            card = plane(2.0, size=(2.0, 2.0), texture=Texture(low=0.6, high=0.6))
+            traced = Traced(scene_of(far, replace(card, path=path)), lambda _: AHEAD, device=device)
+            sensor = Sensor(f_mod_hz=2e7, dc_offset=dc)
+            quads = [traced.quad([k / 120], sensor.with_shifts((float(s),)))[0].item() for k, s in enumerate(shifts)]
+            psi = np.angle(np.sum(quads * np.exp(1j * shifts))) % (2 * math.pi)
+            got.append(psi / sensor.phase_slope)
+    np.testing.assert_allclose(got, wanted[dc], atol=1e-3)
