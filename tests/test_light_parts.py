@@ -13,6 +13,7 @@ from gftorf_warp.constants import SPEED_OF_LIGHT
 from gftorf_warp.render.trace import Bounces, RigidBody, Tracer
 from gftorf_warp.scene.camera import Camera
 from gftorf_warp.scene.sensor import Sensor
+from gftorf_warp.sim.guided import Curve, Guided, Turn
 from gftorf_warp.sim.paths import Line, Still
 from gftorf_warp.sim.record import record
 from gftorf_warp.sim.scenes import SCENES, room
@@ -198,6 +199,19 @@ def test_flow_in_closed_form(device):
     np.testing.assert_allclose(got[1][hit], 0.0, atol=1e-4)
     assert np.isnan(got[:, ~hit]).all()
     assert (~hit).any()
+
+
+def test_flow_of_a_turn_in_closed_form(device):
+    """A card that turns by 90 deg/s about the optical axis takes its points around the middle of the image, x to y."""
+    path = Guided(z=2.0, turns=(Turn(axis="z", angle=Curve(rate=90.0)),))
+    card = replace(plane(2.0, size=(1.2, 1.2)), path=path)
+    got = Traced(scene_of(card), lambda _: CAMERA, device=device).flow(0.1, 0.3)
+    hit = first_hit((card,), CAMERA, 0.1).body == 0
+    y, x = np.mgrid[:24, :32] + 0.5
+    place = (x - CAMERA.cx) + 1j * (y - CAMERA.cy)
+    want = place * (np.exp(1j * math.radians(18.0)) - 1)
+    assert hit.sum() > 50
+    np.testing.assert_allclose((got[0] + 1j * got[1])[hit], want[hit], atol=1e-4)
 
 
 def test_boxes_are_hit_alike_whichever_way(device):
