@@ -18,12 +18,15 @@ from pathlib import Path
 
 import warp as wp
 
-from gftorf_warp.kernels import composite, composite_backward, project, resolve, splat, tiles, trace
+from gftorf_warp.kernels import composite, composite_backward, paths, project, resolve, splat, tiles, trace
 from gftorf_warp.render.buffers import TILE_SHAPES
 
 FRAME_SIZE, REGISTERS = 0x11, 0x2F  # attributes in the .nv.info section of a cubin
 ALLOWED_STACK = 32  # [B]
-WALKS = {"trace": 1024}  # [B] a query of a bounding volume hierarchy keeps the nodes to come on the stack
+WALKS = {
+    "trace": 1024,
+    "paths": 1024,
+}  # [B] a query of a bounding volume hierarchy keeps the nodes to come on the stack
 
 
 def modules() -> dict[str, wp.Module]:
@@ -33,7 +36,8 @@ def modules() -> dict[str, wp.Module]:
         "tiles": tiles.count_pairs.module,
         "resolve": resolve.resolve_quads.module,
         "splat": splat.add_records.module,
-        "trace": trace.trace_light.module,
+        "trace": trace.trace_hits.module,
+        "paths": paths.trace_light.module,
     }
     found["finish_moments"] = composite_backward.finish_moments.module
     for colour in (False, True):
@@ -89,8 +93,7 @@ def main() -> int:
     rows, offenders = [], 0
     for title, module in modules().items():
         with tempfile.TemporaryDirectory() as folder:
-            paths = wp.compile_aot_module(module, arch=a.arch, module_dir=folder, use_ptx=False)
-            for path in paths:
+            for path in wp.compile_aot_module(module, arch=a.arch, module_dir=folder, use_ptx=False):
                 for name, (registers, stack, code) in kernels_in(Path(path)).items():
                     kernel, _, way = name.partition("_cuda_kernel_")
                     kernel = kernel.rpartition("__locals__")[2].rpartition("_")[0]
