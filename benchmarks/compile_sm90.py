@@ -27,6 +27,7 @@ from gftorf_warp.kernels import (
     flow,
     move,
     noise,
+    paths,
     project,
     resolve,
     similarity,
@@ -39,7 +40,10 @@ from gftorf_warp.render.buffers import TILE_SHAPES
 
 FRAME_SIZE, REGISTERS = 0x11, 0x2F  # attributes in the .nv.info section of a cubin
 ALLOWED_STACK = 32  # [B]
-WALKS = {"trace": 1024}  # [B] a query of a bounding volume hierarchy keeps the nodes to come on the stack
+WALKS = {
+    "trace": 1024,
+    "paths": 1024,
+}  # [B] a query of a bounding volume hierarchy keeps the nodes to come on the stack
 
 
 def modules() -> dict[str, wp.Module]:
@@ -57,7 +61,8 @@ def modules() -> dict[str, wp.Module]:
         "finish": finish.judge.module,
         "flow": flow.flow_errors.module,
         "sums": sums.means.module,
-        "trace": trace.trace_light.module,
+        "trace": trace.trace_hits.module,
+        "paths": paths.trace_light.module,
     }
     window = similarity.make_similarity(1)
     for name in ("columns_of_products", "compare_images", "columns_of_slopes", "gradient_of_image"):
@@ -123,8 +128,7 @@ def main() -> int:
     rows, offenders = [], 0
     for title, module in modules().items():
         with tempfile.TemporaryDirectory() as folder:
-            paths = wp.compile_aot_module(module, arch=a.arch, module_dir=folder, use_ptx=False)
-            for path in paths:
+            for path in wp.compile_aot_module(module, arch=a.arch, module_dir=folder, use_ptx=False):
                 for name, (registers, stack, code) in kernels_in(Path(path)).items():
                     kernel, _, way = name.partition("_cuda_kernel_")
                     kernel = kernel.rpartition("__locals__")[2].rpartition("_")[0]

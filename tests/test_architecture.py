@@ -17,7 +17,13 @@ FILES = sorted(ROOT.rglob("*.py"))
 MAX_LINES = 400
 LONG: dict[str, str] = {}  # file: why it may be longer
 TORCH = {"jaxtyping", "numpy", "torch"}
-INSIDE_FUNCTIONS = {"OpenEXR", "cv2", "matplotlib", "scipy"}  # slow to import, or not needed by every command
+INSIDE_FUNCTIONS = {
+    "OpenEXR",
+    "cv2",
+    "matplotlib",
+    "scipy",
+    "trimesh",
+}  # slow to import, or not needed by every command
 TABLE = {  # room: (rooms it may import besides itself, packages it may import); constants and errors are free to all
     "constants.py": (set(), set()),
     "errors.py": (set(), set()),
@@ -26,7 +32,7 @@ TABLE = {  # room: (rooms it may import besides itself, packages it may import);
     "scene": ({"data"}, TORCH | {"cv2"}),
     "render": ({"kernels", "scene"}, TORCH | {"warp"}),
     "losses": ({"render"}, TORCH),
-    "sim": ({"data", "kernels", "render", "scene"}, TORCH),
+    "sim": ({"data", "kernels", "render", "scene"}, TORCH | {"trimesh"}),
     "recon": ({"data", "losses", "render", "scene"}, TORCH | {"cv2"}),
     "evaluate": ({"data", "losses", "recon", "render", "scene"}, TORCH | {"cv2", "matplotlib"}),
     "bench": ({"data", "evaluate", "recon", "render", "scene", "sim"}, TORCH | {"warp"}),

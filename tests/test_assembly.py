@@ -7,7 +7,7 @@ import torch
 from gftorf_warp.render.api import rasterize
 from gftorf_warp.scene.camera import Camera
 from gftorf_warp.scene.sensor import Sensor
-from gftorf_warp.sim.assembly import Assembly, Level, Part
+from gftorf_warp.sim.assembly import FACES, Assembly, Level, Part
 from gftorf_warp.sim.lookalikes import chair
 from gftorf_warp.sim.paths import Line, Still
 from gftorf_warp.sim.record import still_interior
@@ -67,8 +67,8 @@ def test_an_assembly_is_hit_where_its_parts_are():
     np.testing.assert_allclose(whole.normal, want.normal, atol=1e-12)
     np.testing.assert_allclose(whole.amplitude, want.amplitude, rtol=1e-9)
     seen = whole.body == 0
-    np.testing.assert_array_equal(whole.face[seen] // 8, want.body[seen])
-    np.testing.assert_array_equal(whole.face[seen] % 8, want.face[seen])
+    np.testing.assert_array_equal(whole.face[seen] // FACES, want.body[seen])
+    np.testing.assert_array_equal(whole.face[seen] % FACES, want.face[seen])
     assert set(np.unique(want.body)) == {-1, 0, 1, 2}
 
 

@@ -148,6 +148,9 @@ def test_wrap(device):
         for part in (0.01, 0.3, 0.99):
             got = light(plane((turns + part) * RANGE), camera=AHEAD, device=device)
             assert decoded(got).item() == pytest.approx(part * RANGE, abs=2e-5)
+    for turns in (1, 2, 3):  # on the wrap itself either end will do
+        whole = decoded(light(plane(turns * RANGE), camera=AHEAD, device=device)).item()
+        assert min(whole, RANGE - whole) < 2e-5
 
 
 def test_falloff_and_tilt(device):

@@ -1,14 +1,7 @@
-"""Rays through meshes, balls and endless planes: what a pixel sees first, and the light that comes back from there.
+"""Rays through meshes, balls and endless planes: what a ray meets first.
 
-With d the distance from the camera, d_e that from the emitter, and i the angle of incidence of the emitter's light,
-
-    amplitude = rho cos(i) / d_e^2          light_h = amplitude exp(i 2 pi h f (d + d_e) / c)
-
-averaged over the sub-samples of a pixel and the instants of an exposure (sensor notes, 1.4 and 2.2). Indirect light
-goes on from the first hit in directions of density cos / pi, which leaves the product of the reflectances as the weight
-of a path; every further surface adds what the emitter sends there, at the length of the whole path. The fraction of
-h f (d + d_e) / c is taken before it becomes an angle, so that float32 holds at any frequency. Nothing here is shared
-with the splats: another geometry, another order, other sums.
+Nothing here is shared with the splats: another geometry, another order, other sums. What comes back from there is in
+paths.py.
 
 Surfaces are seen, lit and in the way on the side of their normals only: a room can be looked into from outside. Endless
 planes have a normal on either side.
@@ -20,12 +13,11 @@ from .geometry import CameraView
 
 NOTHING = -1  # the body where a ray hits none
 FAR = wp.constant(1.0e6)  # [m] the end of the world
-SHADOW_GAP = wp.constant(2.0e-4)  # [1] of the emitter's distance: what is met this near to a point is the point itself
 ON_PLANE = wp.constant(1.0e-5)  # [1] of 1 m plus the origin's distance: a ray from so near to a plane starts on it
 STEP = wp.constant(1.0e-5)  # [m] beyond a face that is seen from behind
 SLACK = wp.constant(1.001)  # [1] on bounding balls: rounding must not cut a body
 HASH = wp.constant(2654435761 & 0xFFFF)  # the last factor of the hash, as far as it reaches the bits that count
-TEXTURE_ORIGIN = wp.constant(37.0001)  # [m] see sim/world.py, whose hash this is
+TEXTURE_ORIGIN = wp.constant(37.0001)  # [m] see sim/texture.py, whose hash this is
 _NOTHING = wp.constant(NOTHING)
 
 
@@ -42,6 +34,8 @@ class Solid:
     low: float  # smallest reflectance [1]
     high: float  # largest reflectance [1]
     cell: float  # edge of a texture cell [m]
+    gloss: float  # share of the reflectance that is mirrored into a lobe [1]
+    shininess: float  # exponent of that lobe [1]
 
 
 @wp.struct
@@ -149,141 +143,6 @@ def nearest(
 def ray_through(view: CameraView, x: float, y: float) -> wp.vec3:
     """Unit vector in camera axes through the image point (x, y) [px]."""
     return wp.normalize(wp.vec3((x - view.cx) / view.fx, (y - view.cy) / view.fy, 1.0))
-
-
-@wp.struct
-class Emitter:
-    """A point of light that shines evenly into a pyramid about the z axis of the camera."""
-
-    place: wp.vec3  # in camera axes [m]; zero: at the camera, where nothing that it sees can be in a shadow
-    spread: wp.vec2  # tangents of half the angles across and down [1]; 0: into all directions
-    cycles: float  # modulation frequency over the speed of light [1/m]
-
-
-@wp.func
-def received(
-    emitter: Emitter,
-    solids: wp.array[Solid],
-    rotation: wp.array2d[wp.mat33],
-    translation: wp.array2d[wp.vec3],
-    instant: int,
-    hit: Hit,
-    point: wp.vec3,  # the hit in camera axes [m]
-    may_be_hidden: bool,
-) -> wp.vec2:
-    """Amplitude that a surface returns of the emitter's light, and its distance from it [m], both at ``point``."""
-    towards = point - emitter.place
-    reach = wp.length(towards)
-    cosine = -wp.dot(rotation[instant, hit.body] * towards, hit.normal) / reach
-    across = emitter.spread[0] * towards[2]
-    down = emitter.spread[1] * towards[2]
-    if emitter.spread[0] > 0.0 and (wp.abs(towards[0]) > across or wp.abs(towards[1]) > down):
-        cosine = float(0.0)
-    if cosine > 0.0 and may_be_hidden:
-        limit = reach * (1.0 - SHADOW_GAP)
-        if nearest(solids, rotation, translation, instant, emitter.place, towards / reach, limit).body >= 0:
-            cosine = float(0.0)
-    if cosine > 0.0:
-        return wp.vec2(reflectance_of(solids[hit.body], hit.point) * cosine / (reach * reach), reach)
-    return wp.vec2(0.0, reach)
-
-
-@wp.func
-def turned(turns: float, weight: float) -> wp.vec2:
-    """A weight times exp(i 2 pi turns), of the fraction of the turns: a large angle would lose digits."""
-    phase = 6.283185307179586 * (turns - wp.floor(turns))
-    return weight * wp.vec2(wp.cos(phase), wp.sin(phase))
-
-
-@wp.kernel(enable_backward=False)
-def trace_light(
-    # In:
-    view: CameraView,  # intrinsics [px]
-    emitter: Emitter,  # [m]
-    harmonics: wp.array[int],  # [h] multiples of the modulation frequency
-    solids: wp.array[Solid],  # [B]
-    rotation: wp.array2d[wp.mat33],  # [T, B] body from camera
-    translation: wp.array2d[wp.vec3],  # [T, B] body from camera [m]
-    side: int,  # sub-samples per pixel and axis [1]
-    first: int,  # row of thread (0, x) [px]
-    stride: int,  # rows from one thread to the next [px]
-    # Out:
-    light: wp.array3d[wp.vec2],  # [h, H, W] (re, im) of the mean light
-    amplitude: wp.array2d[float],  # [H, W] mean amplitude
-):
-    """Mean light of one pixel over all sub-samples and instants, for a source intensity of 1."""
-    i, x = wp.tid()
-    y = first + stride * i
-    total = float(0.0)
-    for h in range(harmonics.shape[0]):
-        light[h, y, x] = wp.vec2(0.0, 0.0)
-    for t in range(rotation.shape[0]):
-        for k in range(side * side):
-            image_x = float(x) + (float(k % side) + 0.5) / float(side)
-            image_y = float(y) + (float(k // side) + 0.5) / float(side)
-            ray = ray_through(view, image_x, image_y)
-            hit = nearest(solids, rotation, translation, t, wp.vec3(0.0, 0.0, 0.0), ray, FAR)
-            if hit.body >= 0:
-                beside = wp.length_sq(emitter.place) > 0.0
-                got = received(emitter, solids, rotation, translation, t, hit, hit.distance * ray, beside)
-                total += got[0]
-                turns = emitter.cycles * (hit.distance + got[1])
-                for h in range(harmonics.shape[0]):
-                    light[h, y, x] += turned(float(harmonics[h]) * turns, got[0])
-    share = 1.0 / float(rotation.shape[0] * side * side)
-    amplitude[y, x] = share * total
-    for h in range(harmonics.shape[0]):
-        light[h, y, x] = share * light[h, y, x]
-
-
-@wp.kernel(enable_backward=False)
-def trace_bounces(
-    # In:
-    view: CameraView,  # intrinsics [px]
-    emitter: Emitter,  # [m]
-    harmonics: wp.array[int],  # [h] multiples of the modulation frequency
-    solids: wp.array[Solid],  # [B]
-    rotation: wp.array2d[wp.mat33],  # [T, B] body from camera
-    translation: wp.array2d[wp.vec3],  # [T, B] body from camera [m]
-    bounces: int,  # after the first surface [1]
-    paths: int,  # per pixel, shared out among the instants [1]
-    seed: int,  # of this image [1]
-    first: int,  # row of thread (0, x) [px]
-    stride: int,  # rows from one thread to the next [px]
-    # Out:
-    light: wp.array3d[wp.vec2],  # [h, H, W] (re, im), added to
-    amplitude: wp.array2d[float],  # [H, W] added to
-):
-    """Add the mean of random paths of one pixel: light that met more than one surface."""
-    i, x = wp.tid()
-    y = first + stride * i
-    random = wp.rand_init(seed, y * light.shape[2] + x)
-    share = 1.0 / float(paths)
-    total = float(0.0)
-    for p in range(paths):
-        t = p % rotation.shape[0]
-        image_x = float(x) + wp.randf(random)
-        image_y = float(y) + wp.randf(random)
-        ray = ray_through(view, image_x, image_y)
-        hit = nearest(solids, rotation, translation, t, wp.vec3(0.0, 0.0, 0.0), ray, FAR)
-        point = hit.distance * ray
-        length = hit.distance
-        weight = share
-        for _bounce in range(bounces):
-            if hit.body >= 0:
-                weight = weight * reflectance_of(solids[hit.body], hit.point)
-                normal = wp.transpose(rotation[t, hit.body]) * hit.normal
-                ray = wp.normalize(normal + wp.sample_unit_sphere_surface(random))
-                hit = nearest(solids, rotation, translation, t, point, ray, FAR)
-            if hit.body >= 0:
-                point = point + hit.distance * ray
-                length += hit.distance
-                got = received(emitter, solids, rotation, translation, t, hit, point, True)
-                total += weight * got[0]
-                turns = emitter.cycles * (length + got[1])
-                for h in range(harmonics.shape[0]):
-                    light[h, y, x] += turned(float(harmonics[h]) * turns, weight * got[0])
-    amplitude[y, x] += total
 
 
 @wp.kernel(enable_backward=False)

@@ -15,7 +15,7 @@ import warp as wp
 from jaxtyping import Complex, Float, Int
 
 from ..constants import SPEED_OF_LIGHT
-from ..kernels import trace
+from ..kernels import paths, trace
 from ..kernels.geometry import CameraView
 from ..scene.camera import Camera
 from .buffers import RenderSettings, available_threads
@@ -47,8 +47,16 @@ class RigidBody:
     """Largest reflectance [1]."""
     cell: float
     """Edge of a texture cell [m]."""
+    gloss: float = 0.0
+    """Share of the reflectance that is mirrored into a lobe, the rest is Lambert's [1]."""
+    shininess: float = 50.0
+    """Exponent of the lobe [1]: its half width is about 1.2 / sqrt(shininess) [rad]."""
 
     def __post_init__(self):
+        if not 0 <= self.gloss <= 1 or not 0 <= self.shininess < math.inf:
+            raise ValueError(
+                f"gloss must be 0 to 1, shininess 0 or more and finite, got {self.gloss} and {self.shininess}"
+            )
         if self.radius > 0 or self.normal is not None:
             if self.points is not None or self.triangles is not None or (self.radius > 0) == (self.normal is not None):
                 raise ValueError(
@@ -105,12 +113,25 @@ class Bounces:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Light:
-    """Mean light of every pixel for a source intensity of 1, without the sensor's phase offset."""
+    """Mean light of every pixel for a source intensity of 1, without the sensor's phase offset.
+
+    What met more than one surface is ``light - direct`` and ``amplitude - direct_amplitude``.
+    """
 
     light: Complex[np.ndarray, "h H W"]
     """Sum of amplitude exp(i phase) at each harmonic of the modulation that was asked for [relative units]."""
     amplitude: Float[np.ndarray, "H W"]
     """Sum of the amplitudes [relative units]: at least the length of each ``light``."""
+    direct: Complex[np.ndarray, "h H W"]
+    """The part of ``light`` that met one surface only; it has no random part."""
+    direct_amplitude: Float[np.ndarray, "H W"]
+    """The part of ``amplitude`` that met one surface only."""
+    ambient: Float[np.ndarray, "H W"]
+    """Mean reflectance of the rays [1], 0 for those that meet nothing: what comes back of light from everywhere."""
+    error: Float[np.ndarray, "H W"]
+    """Standard error of the first of the harmonics, real and imaginary part together, estimated from the spread of the
+    random paths [relative units]: over ``abs(light[0])`` it bounds that of the phase [rad]. 0 without bounces, NaN for
+    a single path."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -159,7 +180,9 @@ class Tracer:
         wanted = (threads or available_threads()) if self.device.is_cpu else 1
         self._parts = max(1, min(wanted, height // ROWS_MIN))
         shape = (height, width)
-        self._light = [self._empty((len(harmonics), *shape), wp.vec2), self._empty(shape, wp.float32)]
+        one, many = ((wp.float32, shape), (wp.vec2, (len(harmonics), *shape)))
+        self._direct = [self._empty(size, dtype) for dtype, size in (many, one, one)]
+        self._indirect = [self._empty(size, dtype) for dtype, size in (many, one, one)]
         self._hits = [self._empty(shape, dtype) for dtype in (wp.float32, wp.float32, wp.vec3, wp.int32)]
 
     def light(
@@ -192,12 +215,18 @@ class Tracer:
         view = self._view(cameras[0])
         poses = self._place(cameras, world_from_body)
         inputs = [view, _emitter(lamp, f_mod_hz), self._harmonics, self._solids, *poses]
-        self._over_rows(trace.trace_light, [*inputs, subsamples], self._light)
+        self._over_rows(paths.trace_light, [*inputs, subsamples], self._direct)
+        direct, amplitude, ambient = (array.numpy().copy() for array in self._direct)
+        total, error, direct = amplitude, np.zeros_like(amplitude), direct.view(np.complex64)[..., 0]
+        light = direct
         if bounces.count:
-            paths = -(-bounces.paths // len(cameras)) * len(cameras)
-            self._over_rows(trace.trace_bounces, [*inputs, bounces.count, paths, seed], self._light)
-        light, amplitude = (array.numpy() for array in self._light)
-        return Light(light=light[..., 0] + 1j * light[..., 1], amplitude=amplitude.copy())
+            count = -(-bounces.paths // len(cameras)) * len(cameras)
+            self._over_rows(paths.trace_bounces, [*inputs, bounces.count, count, seed], self._indirect)
+            more, indirect, error = (array.numpy().copy() for array in self._indirect)
+            light, total = direct + more.view(np.complex64)[..., 0], amplitude + indirect
+        return Light(
+            light=light, amplitude=total, direct=direct, direct_amplitude=amplitude, ambient=ambient, error=error
+        )
 
     def first_hits(self, camera: Camera, world_from_body: Float[np.ndarray, "B 4 4"]) -> FirstHits:
         """What the centre ray of every pixel meets at one instant, with all bodies at these poses [m].
@@ -260,8 +289,8 @@ def _mesh(body: RigidBody, device: wp.Device) -> wp.Mesh | None:
     return wp.Mesh(points=points, indices=indices)
 
 
-def _emitter(lamp: Lamp, f_mod_hz: float) -> trace.Emitter:
-    emitter = trace.Emitter()
+def _emitter(lamp: Lamp, f_mod_hz: float) -> paths.Emitter:
+    emitter = paths.Emitter()
     emitter.place = wp.vec3(*lamp.position)
     across, down = lamp.beam_deg or (0.0, 0.0)
     emitter.spread = wp.vec2(math.tan(math.radians(across) / 2), math.tan(math.radians(down) / 2))
@@ -277,5 +306,6 @@ def _solids(bodies: Sequence[RigidBody], meshes: Sequence[wp.Mesh | None], devic
         solid.radius, solid.centre, solid.reach = body.radius, wp.vec3(*body.centre), body.reach
         solid.normal, solid.height = wp.vec3(*(body.normal or (0.0, 0.0, 0.0))), body.height
         solid.low, solid.high, solid.cell = body.low, body.high, body.cell
+        solid.gloss, solid.shininess = body.gloss, body.shininess
         solids.append(solid)
     return wp.array(solids, dtype=trace.Solid, device=device)

@@ -8,10 +8,11 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float
 
+from .meshes import Mesh
 from .paths import Vector
-from .world import Box, Grid, Shape
+from .world import Box, Grid, Shape, passing
 
-FACES = 8  # numbers that the faces of one part may use; a box has 6
+FACES = 1 << 32  # numbers that the faces of one part may use; a box has 6, a mesh as many as triangles
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,10 +90,10 @@ class Assembly(Shape):
     def hit(self, origin, ray):
         """The nearest hit of any part; faces are numbered ``FACES`` times the part plus the face of the part."""
         distance, face = np.full(len(ray), np.inf), np.zeros(len(ray), dtype=np.int64)
-        near = self._passing(origin, ray, np.zeros(3), self.reach)
+        near = passing(origin, ray, np.zeros(3), self.reach)
         for index, part in enumerate(self.parts):
             position = np.asarray(part.position)
-            rays = near[self._passing(origin, ray[near], position, part.shape.reach)]
+            rays = near[passing(origin, ray[near], position, part.shape.reach)]
             reached, side = part.shape.hit(origin - position, ray[rays])
             nearer = reached < distance[rays]
             chosen = rays[nearer]
@@ -134,9 +135,9 @@ class Assembly(Shape):
                 least = np.minimum(least, np.linalg.norm(local, axis=1) - part.shape.reach)
         return least
 
-    @staticmethod
-    def _passing(origin, ray, centre, radius: float):
-        """Indices of the rays that pass a ball; the others need not be asked."""
-        to = np.subtract(centre, origin)
-        along = ray @ to
-        return np.flatnonzero(to @ to - along**2 <= (radius * (1 + 1e-9)) ** 2)
+
+def has_mesh(shape: Shape) -> bool:
+    """Whether a shape is a mesh, or an assembly with one among its parts."""
+    return isinstance(shape, Mesh) or (
+        isinstance(shape, Assembly) and any(has_mesh(part.shape) for part in shape.parts)
+    )

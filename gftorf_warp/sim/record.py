@@ -17,12 +17,13 @@ from ..render.trace import Bounces
 from ..scene.camera import Camera
 from ..scene.optics import shading
 from ..scene.sensor import Sensor, distance_from_phasor
+from .assembly import has_mesh
 from .look import Look, Splatted, look, look_colour
 from .paths import inverse
 from .readout import mean_quad, read_out
 from .scene import Scene
 from .traced import Traced, trace_colour
-from .world import Hits, first_hit
+from .world import Hits, carried, first_hit
 
 Progress = Callable[[int, int], None]
 Images = dict[str, np.ndarray]
@@ -205,7 +206,7 @@ def _engine(
     if needs_mesh(scene, bounces.count):
         raise ValueError(
             f"emitter {scene.emitter}, beam_deg {scene.beam_deg} and {bounces.count} bounces need engine 'mesh': "
-            f"{engine!r} has direct light at the camera only"
+            f"{engine!r} has direct light at the camera only, no gloss, and no mesh that moves"
         )
     splatted = Splatted(scene, lambda time: _fine(scene.camera(size, time), scene), longest)
 
@@ -249,8 +250,9 @@ def sensor_settings(sensor: Sensor) -> dict[str, Any]:
 
 
 def needs_mesh(scene: Scene, bounces: int) -> bool:
-    """Whether the light is not the direct light of a lamp at the camera that shines everywhere."""
-    return any(scene.emitter) or scene.beam_deg is not None or bounces > 0
+    """Whether splats cannot do it: a lamp away from the camera, a beam, bounces, gloss, a mesh that moves."""
+    bodies = any(body.texture.gloss > 0 or (body.moves and has_mesh(body.shape)) for body in scene.bodies)
+    return bodies or any(scene.emitter) or scene.beam_deg is not None or bounces > 0
 
 
 def render_truth_gap(scene: Scene, *, frames: int = 1, size: tuple[int, int] | None = None) -> Gap | None:
@@ -337,11 +339,6 @@ def _flows(scene: Scene, cameras: list[Camera], times: Float[np.ndarray, "F"]) -
 def _flow(scene: Scene, camera: Camera, other: Camera, time: float, later: float) -> Float[np.ndarray, "2 H W"]:
     """Where what ``camera`` sees at ``time`` is in the image of ``other`` at ``later`` [px]; NaN: nothing is seen."""
     hit = first_hit(scene.bodies, camera, time)
-    moved = hit.point.copy()
-    for index, body in enumerate(scene.bodies):
-        if body.moves:
-            seen = hit.body == index
-            step = body.path.world_from_body(later) @ np.linalg.inv(body.path.world_from_body(time))
-            moved[seen] = hit.point[seen] @ step[:3, :3].T + step[:3, 3]
+    moved = carried(scene.bodies, hit.point, hit.body, time, later)
     here, there = camera.project(torch.from_numpy(hit.point)), other.project(torch.from_numpy(moved))
     return np.moveaxis((there - here).numpy(), -1, 0).astype(np.float32)

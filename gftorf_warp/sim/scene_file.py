@@ -1,9 +1,9 @@
 """Scenes as TOML files of the user: the fields of :class:`gftorf_warp.sim.scene.Scene`, as tables.
 
 Every table is the settings of one dataclass. Where several kinds could stand, `kind` names one: a shape is "box",
-"plane", "sphere", "level" or "assembly", a path "still", "line", "arc", "guided", "viewpoint" or "sweep". A sensor may
-be a name of sim/sensors.py, or a table with that name as `preset`. What a table leaves out has its default. See
-examples/scene.toml.
+"plane", "sphere", "level", "assembly" or "mesh", a path "still", "line", "arc", "guided", "viewpoint" or "sweep". A
+sensor may be a name of sim/sensors.py, or a table with that name as `preset`. What a table leaves out has its default.
+Paths of files are relative to the file that names them. See examples/scene.toml.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from typing import Any, Union
 
 from ..errors import InputError
 from ..scene.sensor import Sensor
-from . import assembly, guided, paths, world
+from . import assembly, guided, meshes, paths, world
 from .scene import Scene
 from .sensors import SENSORS
 
 KINDS: dict[type, dict[str, type]] = {
     world.Shape: {
         kind.__name__.lower(): kind
-        for kind in (world.Box, world.Plane, world.Sphere, assembly.Level, assembly.Assembly)
+        for kind in (world.Box, world.Plane, world.Sphere, assembly.Level, assembly.Assembly, meshes.Mesh)
     },
     paths.Path: {
         kind.__name__.lower(): kind
@@ -114,11 +114,13 @@ def _value(kind: Any, value: Any, path: FilePath, where: str) -> Any:
         return tuple(
             _value(one, item, path, f"{where}[{i}]") for i, (one, item) in enumerate(zip(wanted, value, strict=True))
         )
+    if kind is FilePath and type(value) is str:
+        return path.parent / value
     if kind is float and type(value) in (int, float) and math.isfinite(value):
         return float(value)
     if kind is not float and type(value) is kind:  # a bool is an int to isinstance
         return value
-    names = {float: "a finite number", int: "a whole number", bool: "true or false", str: "a text"}
+    names = {float: "a finite number", int: "a whole number", bool: "true or false", str: "a text", FilePath: "a path"}
     raise _wrong(path, where, f"expected {names.get(kind, kind)}, found {value!r}", "correct the value")
 
 

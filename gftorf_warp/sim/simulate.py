@@ -215,7 +215,7 @@ def _check_engine(scene: Scene, engine: str, bounces: int, paths: int, device: s
     beam = "0 with bounces: it is of direct light; use beam_deg"
     _refuse({"lens.beam_power": (not (scene.lens.beam_power and bounces), f"{scene.lens.beam_power:g}", beam)})
     if engine != "mesh":
-        light = "mesh: the light is beside the camera, has a beam or bounces"
+        light = "mesh: the light is beside the camera, has a beam or bounces, or a body is glossy or a mesh that moves"
         _refuse({"--engine": (not needs_mesh(scene, bounces), repr(engine), light)})
         _refuse({"--device": (device == "cpu", f"{device} and engine {engine!r}", "cpu, or --engine mesh")})
 

@@ -7,14 +7,16 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
+import torch
 from jaxtyping import Float, Int
 
 from ..render.trace import Bounces, FirstHits, Lamp, Light, RigidBody, Tracer
 from ..scene.camera import Camera
 from .assembly import Assembly, Level, Part
 from .look import pooled
+from .meshes import Mesh
 from .scene import Scene
-from .world import Body, Box, Plane, Shape, Sphere, albedo, first_hit
+from .world import Body, Box, Plane, Shape, Sphere, albedo_seen, carried
 
 
 class Traced:
@@ -63,6 +65,19 @@ class Traced:
         hits = self._tracer.first_hits(self.camera_at(time), self._poses(time))
         return replace(hits, body=np.where(hits.body < 0, hits.body, self._body[hits.body]))
 
+    def flow(self, time: float, later: float) -> Float[np.ndarray, "2 H W"]:
+        """Where what is seen at ``time`` is in the image ``later`` [s], less where it was [px]; NaN: nothing is seen.
+
+        Surfaces are carried along with their bodies, and the camera moves, too; whether they are hidden then is not
+        looked at. Later may be earlier.
+        """
+        camera, other, hits = self.camera_at(time), self.camera_at(later), self.first_hits(time)
+        rays = camera.rays(dtype=torch.float64).numpy()
+        point = camera.centre + rays * hits.distance[..., None]
+        moved = carried(self.scene.bodies, point, hits.body, time, later)
+        here, there = camera.project(torch.from_numpy(point)), other.project(torch.from_numpy(moved))
+        return np.moveaxis((there - here).numpy(), -1, 0)
+
     def _poses(self, time: float) -> Float[np.ndarray, "P 4 4"]:
         """Pose of the body of each piece [m]."""
         return np.stack([body.path.world_from_body(time) for body in self.scene.bodies])[self._body]
@@ -72,7 +87,7 @@ def trace_colour(scene: Scene, camera: Camera, time: float) -> Float[np.ndarray,
     """Mean albedo of every pixel in linear RGB [1] over its rays; black where they meet nothing."""
     n = scene.subsamples
     fine = camera.resized(camera.width * n, camera.height * n)
-    colour = albedo(scene.bodies, first_hit(scene.bodies, fine, time), time)
+    colour = albedo_seen(scene.bodies, fine, time)
     return np.stack([pooled(channel, n) for channel in np.moveaxis(colour, -1, 0)], axis=-1)
 
 
@@ -81,7 +96,15 @@ def rigid_bodies(body: Body) -> list[RigidBody]:
 
     The flat-sided parts of an assembly are one piece together; each of its balls is another.
     """
-    shape, made = body.shape, partial(RigidBody, low=body.texture.low, high=body.texture.high, cell=body.texture.cell)
+    shape, texture = body.shape, body.texture
+    made = partial(
+        RigidBody,
+        low=texture.low,
+        high=texture.high,
+        cell=texture.cell,
+        gloss=texture.gloss,
+        shininess=texture.shininess,
+    )
     if isinstance(shape, Level):
         x, y, z = np.eye(3)[shape.axis].tolist()
         return [made(normal=(x, y, z), height=shape.value)]
@@ -101,8 +124,10 @@ def triangles_of(shape: Shape) -> tuple[Float[np.ndarray, "V 3"], Int[np.ndarray
     """Vertices [m] and triangles of a flat-sided shape, counter-clockwise as seen from its visible side.
 
     Raises:
-        ValueError: If the shape is neither a box nor a plane.
+        ValueError: If the shape is no box, plane or mesh.
     """
+    if isinstance(shape, Mesh):
+        return shape.surface
     if isinstance(shape, Plane):
         x, y = np.asarray(shape.size) / 2
         points = np.array([[-x, -y, 0.0], [x, -y, 0.0], [x, y, 0.0], [-x, y, 0.0]])

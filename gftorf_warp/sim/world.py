@@ -7,7 +7,7 @@ a surface of reflectance rho met under the angle of incidence i has the amplitud
 from __future__ import annotations
 
 import abc
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -16,50 +16,10 @@ from jaxtyping import Float, Int
 
 from ..scene.camera import Camera
 from .paths import Path, Still, inverse
+from .texture import Texture
 
-SATURATION = 0.6  # [1] of the colours: no channel is less than 0.4 of the brightest
-HUE_SPREAD = 0.2  # [turns] from one end to the other of the hues of one texture, where it has a hue at all
-TEXTURE_ORIGIN = 37.0001  # [m] keeps cell numbers positive and cell borders off the faces, which lie at round numbers
+CHUNK = 1 << 14  # rays at a time: their numbers stay in the cache
 GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))  # [rad] between neighbours of a spiral that covers a sphere evenly
-
-
-@dataclass(frozen=True, kw_only=True)
-class Texture:
-    """Reflectance in hashed cells of a 3-D grid in the body's axes (sensor notes, 4.1); ``low == high`` is plain.
-
-    In colour every cell has its own hue, hashed from other bits, and its brightest channel is its reflectance.
-    """
-
-    low: float
-    """Smallest reflectance [1]."""
-    high: float
-    """Largest reflectance [1]."""
-    cell: float = 0.3
-    """Edge of a cell [m]."""
-    hue: float | None = field(default=None, repr=False)
-    """Middle of the cells' hues, in turns: 0 red, 1/3 green, 2/3 blue; None: they have all hues."""
-
-    def __post_init__(self):
-        if not 0 <= self.low <= self.high:
-            raise ValueError(f"reflectances must be 0 <= low <= high, got low {self.low}, high {self.high}")
-        if not self.cell > 0:
-            raise ValueError(f"cell must be above 0, got {self.cell}")
-
-    def __call__(self, point: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P"]:
-        """Reflectance [1] at points in the body's axes [m]."""
-        return self.low + (self.high - self.low) * (self._hash(point) & 0xFFFF) / 65535.0
-
-    def albedo(self, point: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 3"]:
-        """Albedo in linear RGB [1] at points in the body's axes [m]."""
-        unit = ((self._hash(point) >> 16) & 0xFFFF) / 65536.0
-        hue = unit if self.hue is None else self.hue + HUE_SPREAD * (unit - 0.5)
-        ramp = np.abs((6.0 * hue[:, None] + [0.0, 4.0, 2.0]) % 6.0 - 3.0) - 1.0  # HSV to RGB, all sectors at once
-        return self(point)[:, None] * (1.0 - SATURATION * (1.0 - np.clip(ramp, 0.0, 1.0)))
-
-    def _hash(self, point: Float[np.ndarray, "P 3"]) -> Int[np.ndarray, "P"]:
-        """A number of each point's cell; the lower 32 bits are those of unbounded integers."""
-        x, y, z = np.floor((point.T + TEXTURE_ORIGIN) / self.cell).astype(np.int64)
-        return ((x * 73856093) ^ (y * 19349663) ^ (z * 83492791)) * 2654435761
 
 
 class Grid(NamedTuple):
@@ -112,15 +72,20 @@ class Box(Shape):
 
     def hit(self, origin, ray):
         """Slab method; faces are numbered 2 axis + (1 on the positive side)."""
-        half = np.asarray(self.size) / 2
-        with np.errstate(divide="ignore", invalid="ignore"):
-            a, b = (-half - origin) / ray, (half - origin) / ray
-        enter, leave = np.minimum(a, b), np.maximum(a, b)
-        near, far = enter.max(1), leave.min(1)
-        distance, axis = (far, leave.argmin(1)) if self.inside else (near, enter.argmax(1))
-        along = np.take_along_axis(ray, axis[:, None], 1)[:, 0]
-        positive = (along > 0) if self.inside else (along < 0)
-        return np.where((near < far) & (distance > 0), distance, np.inf), 2 * axis + positive
+        near, far = np.full(len(ray), -np.inf), np.full(len(ray), np.inf)
+        face = np.zeros(len(ray), dtype=np.int64)
+        for axis, along in enumerate(ray.T):  # one axis after the other: reductions over rows of three are slow
+            half = self.size[axis] / 2
+            with np.errstate(divide="ignore", invalid="ignore"):
+                a, b = (-half - origin[axis]) / along, (half - origin[axis]) / along
+            enter, leave = np.minimum(a, b), np.maximum(a, b)
+            decides = leave < far if self.inside else enter > near
+            side = (along > 0) if self.inside else (along < 0)
+            np.copyto(face, 2 * axis + side, where=decides)
+            np.maximum(near, enter, out=near)
+            np.minimum(far, leave, out=far)
+        distance = far if self.inside else near
+        return np.where((near < far) & (distance > 0), distance, np.inf), face
 
     def normal(self, point, face):
         """Along the axis of the face: outwards, or inwards in a room."""
@@ -286,29 +251,25 @@ class Hits:
     reflectance: Float[np.ndarray, "H W"]
     """Reflectance rho [1]; 0 where nothing is hit."""
     amplitude: Float[np.ndarray, "H W"]
-    """rho cos(incidence) / d^2 for a source intensity of 1 [relative units]; 0 where nothing is hit."""
+    """rho cos(incidence) / d^2 for a source intensity of 1, gloss included [relative units]; 0 where nothing is hit."""
 
 
 def first_hit(bodies: tuple[Body, ...], camera: Camera, time: float) -> Hits:
     """First hit of every pixel's centre ray with all ``bodies`` as they are at ``time`` [s], in float64."""
-    shape = (camera.height, camera.width)
-    ray = camera.rays(dtype=torch.float64).numpy().reshape(-1, 3)
-    centre = camera.centre
-    distance = np.full(len(ray), np.inf)
-    body, face = np.full(len(ray), -1), np.zeros(len(ray), dtype=np.int64)
+    shape, centre = (camera.height, camera.width), camera.centre
+    poses = [candidate.path.world_from_body(time) for candidate in bodies]
+    ray, distance, body, face = _nearest(bodies, poses, camera)
     normal, reflectance = np.full((len(ray), 3), np.nan), np.zeros(len(ray))
-    for index, candidate in enumerate(bodies):
-        pose = candidate.path.world_from_body(time)
-        rotation, position = pose[:3, :3], pose[:3, 3]
-        origin, local = rotation.T @ (centre - position), ray @ rotation
-        reached, side = candidate.shape.hit(origin, local)
-        nearer = reached < distance
-        point = origin + local[nearer] * reached[nearer, None]
-        distance[nearer], body[nearer], face[nearer] = reached[nearer], index, side[nearer]
-        normal[nearer] = candidate.shape.normal(point, side[nearer]) @ rotation.T
-        reflectance[nearer] = candidate.texture(point)
+    amplitude = np.zeros(len(ray))
+    for index, (candidate, pose) in enumerate(zip(bodies, poses, strict=True)):  # of what is seen only
+        seen = np.flatnonzero(body == index)
+        rotation, reached = pose[:3, :3], distance[seen, None]
+        point = rotation.T @ (centre - pose[:3, 3]) + (ray[seen] @ rotation) * reached
+        normal[seen] = candidate.shape.normal(point, face[seen]) @ rotation.T
+        reflectance[seen] = candidate.texture(point)
+        cosine = np.abs((normal[seen] * ray[seen]).sum(1))
+        amplitude[seen] = reflectance[seen] * candidate.texture.shading(cosine) / distance[seen] ** 2
     distance = np.where(body < 0, np.nan, distance)
-    cosine = np.abs((normal * ray).sum(1))
     return Hits(
         distance=distance.reshape(shape),
         body=body.reshape(shape),
@@ -316,15 +277,77 @@ def first_hit(bodies: tuple[Body, ...], camera: Camera, time: float) -> Hits:
         point=(centre + ray * distance[:, None]).reshape(*shape, 3),
         normal=normal.reshape(*shape, 3),
         reflectance=reflectance.reshape(shape),
-        amplitude=np.where(body < 0, 0.0, reflectance * cosine / distance**2).reshape(shape),
+        amplitude=amplitude.reshape(shape),
     )
+
+
+def _nearest(bodies: tuple[Body, ...], poses: list[np.ndarray], camera: Camera) -> tuple[np.ndarray, ...]:
+    """Every pixel's ray, the distance [m] of its first hit, the body, -1 for none, and its face."""
+    ray, centre = camera.rays(dtype=torch.float64).numpy().reshape(-1, 3), camera.centre
+    distance = np.full(len(ray), np.inf)
+    body, face = np.full(len(ray), -1), np.zeros(len(ray), dtype=np.int64)
+    for start in range(0, len(ray), CHUNK):
+        part = slice(start, start + CHUNK)
+        for index, (candidate, pose) in enumerate(zip(bodies, poses, strict=True)):
+            rays = start + passing(centre, ray[part], pose[:3, 3], candidate.shape.reach)
+            if len(rays) == 0:
+                continue
+            reached, side = candidate.shape.hit(pose[:3, :3].T @ (centre - pose[:3, 3]), ray[rays] @ pose[:3, :3])
+            nearer = reached < distance[rays]
+            chosen = rays[nearer]
+            distance[chosen], body[chosen], face[chosen] = reached[nearer], index, side[nearer]
+    return ray, distance, body, face
+
+
+def passing(
+    origin: Float[np.ndarray, "3"], ray: Float[np.ndarray, "P 3"], centre: Float[np.ndarray, "3"], radius: float
+) -> Int[np.ndarray, "R"]:
+    """Indices of the rays that pass a ball; what lies in it need not be asked for the others."""
+    if not np.isfinite(radius):
+        return np.arange(len(ray))
+    to = np.subtract(centre, origin)
+    outside = to @ to - radius**2
+    if outside < 0:
+        return np.arange(len(ray))
+    along = ray @ to
+    return np.flatnonzero((along > 0) & (to @ to - along**2 <= (radius * (1 + 1e-9)) ** 2))
+
+
+def carried(
+    bodies: tuple[Body, ...],
+    point: Float[np.ndarray, "H W 3"],
+    body: Int[np.ndarray, "H W"],
+    time: float,
+    later: float,
+) -> Float[np.ndarray, "H W 3"]:
+    """Where points of the bodies of these numbers, seen in the world [m] at ``time``, are ``later`` [s]."""
+    moved = point.copy()
+    for index, candidate in enumerate(bodies):
+        if candidate.moves:
+            seen = body == index
+            step = candidate.path.world_from_body(later) @ np.linalg.inv(candidate.path.world_from_body(time))
+            moved[seen] = point[seen] @ step[:3, :3].T + step[:3, 3]
+    return moved
 
 
 def albedo(bodies: tuple[Body, ...], hits: Hits, time: float) -> Float[np.ndarray, "H W 3"]:
     """Albedo in linear RGB [1] of what ``hits`` met at ``time`` [s]; 0 where nothing was hit."""
-    colour = np.zeros((*hits.body.shape, 3))
-    for index, body in enumerate(bodies):
-        seen = hits.body == index
-        body_from_world = inverse(body.path.world_from_body(time))
-        colour[seen] = body.texture.albedo(hits.point[seen] @ body_from_world[:3, :3].T + body_from_world[:3, 3])
+    return _albedo(bodies, hits.body, hits.point, time)
+
+
+def albedo_seen(bodies: tuple[Body, ...], camera: Camera, time: float) -> Float[np.ndarray, "H W 3"]:
+    """Albedo in linear RGB [1] on every pixel's centre ray at ``time`` [s]; 0 where nothing is hit."""
+    poses = [candidate.path.world_from_body(time) for candidate in bodies]
+    ray, distance, body, _ = _nearest(bodies, poses, camera)
+    shape = (camera.height, camera.width)
+    point = camera.centre + ray * np.where(body < 0, np.nan, distance)[:, None]
+    return _albedo(bodies, body.reshape(shape), point.reshape(*shape, 3), time)
+
+
+def _albedo(bodies: tuple[Body, ...], body: np.ndarray, point: np.ndarray, time: float) -> np.ndarray:
+    colour = np.zeros((*body.shape, 3))
+    for index, candidate in enumerate(bodies):
+        seen = body == index
+        body_from_world = inverse(candidate.path.world_from_body(time))
+        colour[seen] = candidate.texture.albedo(point[seen] @ body_from_world[:3, :3].T + body_from_world[:3, 3])
     return colour
