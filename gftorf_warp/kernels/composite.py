@@ -267,6 +267,8 @@ def make_composite(
                     last = set_where(last, alpha, float(k - begin))
                 if wp.static(inclusive):
                     live = drop_below(live, T, TRANSMITTANCE_MIN)
+            if wp.static(not cooperative):
+                k = end  # one round was all
         if wp.static(cooperative):
             arrive()  # records that nobody needs may still be on their way
         if wp.static(light):
