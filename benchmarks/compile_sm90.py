@@ -78,11 +78,13 @@ def modules() -> dict[str, wp.Module]:
         what = " ".join(["light"] * light + ["channels"] * channels + ["fixed"] * fixed)
         for metric in (True, False, None) if light else (None,):
             name = f"{what} {'without' if metric is None else 'paper' if metric else 'released'}"
-            for rounds in (True, False):
-                forward = composite.make_composite(*shape, light, channels, bool(metric), metric, rounds)
-                arguments = *shape, light, channels, not metric, metric, fixed, rounds
+            ways = {"": (True, False), " by entries": (False, False)}
+            if light and channels:
+                ways[" and three more"] = True, True
+            for way, (rounds, more) in ways.items():
+                forward = composite.make_composite(*shape, light, channels, bool(metric), metric, rounds, more)
+                arguments = *shape, light, channels, not metric, metric, fixed, rounds, more
                 backward = composite_backward.make_composite_backward(*arguments)
-                way = "" if rounds else " by entries"
                 if not fixed:
                     found[f"composite {name}{way}"] = forward.module
                 found[f"composite_backward {name}{way}"] = backward.module

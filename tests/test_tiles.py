@@ -2,10 +2,12 @@
 
 import numpy as np
 import pytest
+import torch
 import warp as wp
 
 from gftorf_warp.kernels import tiles
 from gftorf_warp.kernels.splat import Splat
+from gftorf_warp.render.buffers import LANES_PER_SPLAT
 
 WIDTH, HEIGHT = 150, 70  # neither is a multiple of a tile
 SHAPES = [(8, 8), (8, 4)]  # of the CPU and of CUDA [px]
@@ -44,19 +46,19 @@ def splats(kind, count=150):
     return record.astype(np.float32), box
 
 
-def lists(record, box, shape, capacity=None):
+def lists(record, box, shape, capacity=None, device="cpu"):
     """Return keys and ids of the pairs in the order they are emitted, and the number of pairs there would be."""
     order = np.random.default_rng(9).permutation(len(record)).astype(np.int32)
-    values = (order, int), (record, Splat), (box, wp.vec4i)
-    where = [*(wp.array(value, dtype=dtype, device="cpu") for value, dtype in values), *shape, 1]
-    counts, ends = (wp.zeros(len(record), dtype=int, device="cpu") for _ in range(2))
-    wp.launch(tiles.count_pairs, (len(record), 1), where, [counts], device="cpu")
+    values, threads = ((order, int), (record, Splat), (box, wp.vec4i)), LANES_PER_SPLAT[device]
+    where = [*(wp.array(value, dtype=dtype, device=device) for value, dtype in values), *shape, threads]
+    counts, ends = (wp.zeros(len(record), dtype=int, device=device) for _ in range(2))
+    wp.launch(tiles.count_pairs, (len(record), threads), where, [counts], device=device)
     wp.utils.array_scan(counts, ends, inclusive=True)
     room = int(ends.numpy()[-1]) if capacity is None else capacity
     columns, rows = -(-WIDTH // shape[0]), -(-HEIGHT // shape[1])
-    keys, ids, total = (wp.full(n, -1, dtype=int, device="cpu") for n in (room, room, 1))
+    keys, ids, total = (wp.full(n, -1, dtype=int, device=device) for n in (room, room, 1))
     inputs = [*where, columns, columns * rows, ends, room]
-    wp.launch(tiles.emit_pairs, (len(record), 1), inputs, [keys, ids, total], device="cpu")
+    wp.launch(tiles.emit_pairs, (len(record), threads), inputs, [keys, ids, total], device=device)
     return keys.numpy(), ids.numpy(), int(total.numpy()[0])
 
 
@@ -140,6 +142,16 @@ def test_a_capacity_keeps_the_nearest_pairs_and_marks_what_is_free(capacity):
     np.testing.assert_array_equal(got_keys[:kept], keys[:kept])
     np.testing.assert_array_equal(got_ids[:kept], ids[:kept])
     assert (got_keys[kept:] == 19 * 18).all()
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
+@pytest.mark.parametrize("capacity", [None, 500])
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_warp_writes_the_pairs_of_a_splat_as_one_thread_does(kind, capacity):
+    """On CUDA lists are those of the CPU, pair by pair: without contraction both round alike."""
+    record, box = splats(kind)
+    for got, want in zip(*(lists(record, box, (8, 4), capacity, device) for device in ("cuda", "cpu")), strict=True):
+        np.testing.assert_array_equal(got, want)
 
 
 def test_boxes_cut_lists():

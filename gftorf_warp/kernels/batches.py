@@ -19,7 +19,7 @@ from .lanes import make_lanes
 from .splat import Splat
 
 COOPERATIVE = True  # False: every lane reads every record itself, to compare with
-ROUND = 16  # entries of a list that are fetched, and whose gradients are summed, together
+ROUND = wp.constant(16)  # entries of a list that are fetched, and whose gradients are summed, together
 WARPS = 1  # tiles of a block of threads: all blocks run at once, and the more there are, the more evenly they spread
 STRIDE = 36  # floats from the values of one entry to those of the next: 4-float reads of 8 lanes meet all 32 banks
 OUT_STRIDE = 20  # the same for gradient records

@@ -114,7 +114,6 @@ def make_composite(
 
     zeta_of = make_zeta(bool(metric))
     spreads = light and metric is not None
-    step = ROUND if cooperative else 1  # entries between two looks at whether a pixel is still alive
     fetch = make_batches(more=more)
     warp_memory, ask, arrive, entry, record_of = (
         fetch.warp_memory,
@@ -124,6 +123,17 @@ def make_composite(
         fetch.record_of,
     )
     ask_more, more_of = fetch.ask_more, fetch.more_of
+
+    @wp.func
+    def asks(live: V) -> bool:
+        """Whether a pixel is still alive."""
+        return warp_any(nonzero(live))
+
+    @wp.func_native("return true;")
+    def trusts(live: V) -> bool:
+        """In the middle of a round nobody asks."""
+
+    goes_on = trusts if cooperative else asks
 
     @wp.kernel(**options(K))
     def composite(
@@ -197,16 +207,17 @@ def make_composite(
                 after = ids[wp.min(begin + 1, end - 1)]
         # `continue` instead of nested `if`s: after an `if` Warp selects between the old and the new value of everything
         # assigned inside, here a dozen vectors per splat
-        while k < end and warp_any(nonzero(live)):  # the same trip count for all lanes of a warp
-            stop = wp.min(k + wp.static(step), end)
+        while k < end and warp_any(nonzero(live)):
+            stop = end
             if wp.static(cooperative):
+                stop = wp.min(k + ROUND, end)
                 arrive()
                 if stop < end:
                     ask(memory, splats, coming, stop - begin)
                     if wp.static(more):
                         ask_more(memory, more_splats, coming, stop - begin)
                     coming = entry(ids, begin, 1, stop - begin + wp.static(ROUND), count)
-            while k < stop:
+            while k < stop and goes_on(live):  # the same trip count for all lanes of a warp
                 k += 1
                 if wp.static(K > 1):
                     i = ids[k - 1]
@@ -256,6 +267,8 @@ def make_composite(
                     last = set_where(last, alpha, float(k - begin))
                 if wp.static(inclusive):
                     live = drop_below(live, T, TRANSMITTANCE_MIN)
+            if wp.static(not cooperative):
+                k = end  # one round was all
         if wp.static(cooperative):
             arrive()  # records that nobody needs may still be on their way
         if wp.static(light):

@@ -170,7 +170,6 @@ def make_composite_backward(
         g0: V, g1: V, g2: V, g_re: V, g_im: V, g_amplitude: V, g_distance: V,
     ): ...  # fmt: skip
 
-    step = ROUND if cooperative else 1
     if cooperative:
         rounds = make_gradient_rounds(tile_width, light, channels, light or not fixed, spreads, more)
         warp_memory, ask, arrive, entry, record_of = (
@@ -265,8 +264,9 @@ def make_composite_backward(
                 following = load_splat(splats, ids[k - 1])
                 after = ids[wp.max(k - 2, begin)]
         while k > begin:
-            stop = wp.max(k - wp.static(step), begin)
+            stop = begin
             if wp.static(cooperative):
+                stop = wp.max(k - ROUND, begin)
                 at = top + 1 - k  # entries behind us
                 arrive()
                 if stop > begin:

@@ -9,6 +9,7 @@ from enum import StrEnum
 
 import warp as wp
 
+from ..kernels import batches
 from ..kernels.composite import LIGHT_PLANES, make_pixels
 from ..kernels.lanes import make_lanes
 from ..kernels.resolve import Tiling
@@ -140,6 +141,16 @@ class Frame:
         self.sums = self.planes("light", LIGHT_PLANES)
         self.channels: list[Planes] = []
         self.records: list[wp.array] = []  # of each pass: ``splats``, and copies with other channels
+
+    @property
+    def cooperative(self) -> bool:
+        """Whether the lanes of a warp fetch records for each other, as they may where a warp owns a tile."""
+        return self.K == 1 and batches.COOPERATIVE
+
+    @property
+    def groups_with_light(self) -> int:
+        """Groups of channels that are blended together with the light: two where a warp owns a tile, else one."""
+        return min(len(self.channels), 2 if self.cooperative and self.threads == 1 else 1)
 
     def array(self, name: str, shape: int | tuple[int, ...], dtype=wp.int32) -> wp.array:
         """Memory on the device of this frame, as whoever used it last under that name left it."""

@@ -12,6 +12,8 @@ and finds gradients added to the ``.grad`` of its inputs. torch programs come th
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import warp as wp
 
@@ -79,7 +81,7 @@ def forward(inputs: Inputs, view: CameraView, shifts: tuple[float, ...], frame: 
             frame.records.append(frame.array(f"records {number}", frame.count, splat.Splat))
         if name == "extra":
             stages.set_channels(frame, inputs, start, frame.records[number])
-    for number in [0, *range(max(1, stages.in_first_pass(frame)), len(frame.records))]:
+    for number in [0, *range(max(1, frame.groups_with_light), len(frame.records))]:
         stages.composite(frame, view, number, images.distortion is not None)
     stages.resolve_images(inputs, shifts, frame, images, groups)
 
@@ -108,8 +110,8 @@ def backward(
     if not frame.count:
         return grad_splats
     distortion, fixed = cotangents.distortion is not None, [name == "extra" and extra_detached for name, _ in groups]
-    first = {"distortion": distortion, "fixed": bool(groups) and fixed[0]}
-    together = stages.in_first_pass(frame) > 1 and fixed[1] and grad_channels[1] is not None
+    first: dict[str, Any] = {"distortion": distortion, "fixed": bool(groups) and fixed[0]}
+    together = frame.groups_with_light > 1 and fixed[1] and grad_channels[1] is not None
     if together:
         first["grad_more"] = grad_channels[1]
         first["more_records"] = frame.zeros("gradient records of the second group", frame.count, splat.Splat)

@@ -88,12 +88,12 @@ def sort_by_tile(frame: Frame) -> None:
 
 def composite(frame: Frame, view: CameraView, number: int, distortion: bool = True) -> None:
     """Blend all tiles: light with the first group of channels, or the first two, every further group by itself."""
-    nothing, more = _nothing(frame, 3, frame.sums.lanes.dtype), number == 0 and in_first_pass(frame) > 1
+    nothing, more = _nothing(frame, 3, frame.sums.lanes.dtype), number == 0 and frame.groups_with_light > 1
     light, channels = number == 0, bool(frame.channels)
     shape = frame.K, frame.tile_width, frame.tile_height
     metric = _metric(frame, light and distortion)
     kernel = make_composite(
-        *shape, light, channels, frame.settings.stop == Stop.INCLUSIVE, metric, _cooperative(frame), more
+        *shape, light, channels, frame.settings.stop == Stop.INCLUSIVE, metric, frame.cooperative, more
     )
     channel = frame.channels[number].lanes if channels else nothing
     more_splats, more_channel = (frame.records[1], frame.channels[1].lanes) if more else (frame.records[0], nothing)
@@ -135,7 +135,7 @@ def composite_backward(
     passes = frame.settings.clamp_gradient == ClampGradient.STRAIGHT
     metric = _metric(frame, light and distortion)
     kernel = make_composite_backward(
-        *shape, light, channels, passes, metric, fixed and channels, _cooperative(frame), grad_more is not None
+        *shape, light, channels, passes, metric, fixed and channels, frame.cooperative, grad_more is not None
     )
     nothing = _nothing(frame, 3, frame.sums.lanes.dtype)
     channel = grad_channel.lanes if grad_channel is not None else nothing
@@ -160,11 +160,6 @@ def composite_backward(
     _over_tiles(frame, kernel, edges, arguments)
     for part in parts[1:]:
         _launch(splat.add_records, frame.count, [part, 0], [records])
-
-
-def in_first_pass(frame: Frame) -> int:
-    """Groups of channels that are blended together with the light: two where a warp owns a tile, else one."""
-    return min(len(frame.channels), 2 if _cooperative(frame) and frame.threads == 1 else 1)
 
 
 def set_channels(frame: Frame, inputs: Inputs, start: int, splats: wp.array) -> None:
@@ -258,11 +253,6 @@ def _shift_vectors(shifts: tuple[float, ...], device: str) -> wp.array:
     return wp.array([(math.cos(s), math.sin(s)) for s in shifts], dtype=wp.vec2, device=device)
 
 
-def _cooperative(frame: Frame) -> bool:
-    """Whether the lanes of a warp fetch records for each other, as they may where a warp owns a tile."""
-    return frame.K == 1 and batches.COOPERATIVE
-
-
 def _metric(frame: Frame, wanted: bool) -> bool | None:
     """What distortion is measured on, as compositors have it; None where there is none."""
     return frame.settings.distortion == Distortion.PAPER if wanted else None
@@ -302,7 +292,7 @@ def _over_tiles(frame: Frame, kernel, edges: list[int], arguments) -> None:
             dim=(stop - start, frame.lanes),
             inputs=arguments(start, part),
             device=frame.device,
-            block_dim=32 * batches.WARPS if _cooperative(frame) else 128,
+            block_dim=32 * batches.WARPS if frame.cooperative else 128,
             record_tape=False,
             record_cmd=side_by_side,
         )
