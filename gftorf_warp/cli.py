@@ -177,6 +177,11 @@ def _reconstruct(options: argparse.Namespace) -> int:
     device = start(options)
     from .recon.train import reconstruct
 
+    changes = list(options.set)
+    if options.batch is not None:
+        changes.append("schedule.batch=" + {1: "frame", 4: "quartet"}[options.batch])
+    if options.deterministic:
+        changes.append("render.deterministic=true")
     run = reconstruct(
         sequence,
         options.out,
@@ -184,7 +189,7 @@ def _reconstruct(options: argparse.Namespace) -> int:
         images=options.images,
         input=options.input,
         ablation=options.ablation,
-        changes=options.set,
+        changes=changes,
         flow=options.flow,
         seed=options.seed,
         device=device,

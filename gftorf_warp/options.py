@@ -127,6 +127,10 @@ def command_parsers() -> dict[str, Parser]:
     single = "change one setting, for example init.reflectivity=0.5; config.json of a run names all (may be repeated)"
     reconstruct.add_argument("--set", metavar="NAME=VALUE", action="append", default=[], help=single)
     reconstruct.add_argument("--images", metavar="N", type=_positive, help="raw frames to optimise (the preset's own)")
+    batch = "raw frames of a step: 1, or 4 for those of a quartet (the preset's own)"
+    reconstruct.add_argument("--batch", metavar="N", type=int, choices=(1, 4), help=batch)
+    order = "sum gradients in one order on CUDA, too, so that equal runs give equal bytes; slower"
+    reconstruct.add_argument("--deterministic", action="store_true", help=order)
     flows = "the folder's, computed, or none; auto: the folder's if it has any, else dis"
     reconstruct.add_argument("--flow", metavar="KIND", help=f"auto, file, dis, deepflow or none: optical flow, {flows}")
     _seed_option(reconstruct, "seed of the optimiser (0)")

@@ -149,3 +149,31 @@ def test_detached_extra_leaves_screen_gradients_alone(coloured, device):
     assert screens[0].gradient.abs().max() > 1e-3
     assert_close(screens[1].gradient, screens[0].gradient, rtol=1e-5, atol=1e-5)
     assert_close(screens[1].pixels, screens[0].pixels, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("detached", [False, True])
+def test_ordered_sums_are_the_sums(detached, device):
+    """Pairs with records of their own give the same images and, to rounding, gradients; twice the same to the bit."""
+    case = with_extra(True)
+    inputs, images = rendered(case, device, extra_detached=detached)
+    want = gradients(inputs, images, names_in(images))
+    ordered = replace(case, settings=replace(case.settings, deterministic=True))
+    twice = []
+    for _ in range(2):
+        found, seen = rendered(ordered, device, extra_detached=detached)
+        for name, image in images.items():
+            assert_close(seen[name], image, rtol=0, atol=0, msg=name)
+        twice.append(gradients(found, seen, names_in(seen)))
+    check(twice[0], want)
+    for name, value in twice[0].items():
+        assert torch.equal(value, twice[1][name]), name
+
+
+def test_ordered_sums_need_no_count_of_pairs(device):
+    """With a reserve, as in a captured step: what lies behind the last pair is never read."""
+    case = with_extra(False)
+    inputs, images = rendered(case, device)
+    want = gradients(inputs, images, names_in(images))
+    reserved = replace(case.settings, deterministic=True, pair_capacity=60_000)
+    found, seen = rendered(replace(case, settings=reserved), device, workspace=buffers.Workspace())
+    check(gradients(found, seen, names_in(seen)), want)

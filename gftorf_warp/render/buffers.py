@@ -78,6 +78,11 @@ class RenderSettings:
     With a number nothing is read back on CUDA: pairs that do not fit are dropped, and ``Frame.check_capacity`` tells.
     On the CPU it is asked every time.
     """
+    deterministic: bool = False
+    """Whether gradients are summed in one order on CUDA, as on the CPU, so that equal work gives equal bytes.
+
+    Every (tile, splat) pair has 128 bytes of its own then.
+    """
     threads: int | None = None
     """CPU threads of the blend; None: as many as this process may use. Another number changes sums by rounding only."""
 
@@ -137,10 +142,15 @@ class Frame:
         self.order = self.array("order", 2 * count)
         self.counts, self.ends = self.array("counts", count), self.array("ends", count)
         self.total, self.first = self.array("total", 1), self.array("first", self.tiles + 1)
-        self.keys = self.ids = self.array("no pairs", 0)
+        self.keys = self.ids = self.owners = self.array("no pairs", 0)
         self.sums = self.planes("light", LIGHT_PLANES)
         self.channels: list[Planes] = []
         self.records: list[wp.array] = []  # of each pass: ``splats``, and copies with other channels
+
+    @property
+    def ordered(self) -> bool:
+        """Whether every pair has a record of its own: where warps add to records side by side, and order is wanted."""
+        return self.settings.deterministic and self.K == 1
 
     @property
     def cooperative(self) -> bool:

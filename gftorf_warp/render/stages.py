@@ -10,7 +10,7 @@ from itertools import pairwise
 import numpy as np
 import warp as wp
 
-from ..kernels import batches, resolve, splat, tiles
+from ..kernels import batches, ordered, resolve, splat, tiles
 from ..kernels.composite import CHANNEL_PLANES, make_composite
 from ..kernels.composite_backward import (
     GRAD_LIGHT_PLANES,
@@ -79,6 +79,9 @@ def sort_by_tile(frame: Frame) -> None:
     frame.reserve_pairs(capacity)
     inputs = [*lists, frame.tiles_x, frame.tiles, frame.ends, capacity]
     _launch(tiles.emit_pairs, threads, inputs, [frame.keys, frame.ids, frame.total])
+    if frame.ordered and capacity:
+        frame.owners = frame.array("owners", capacity)
+        _launch(ordered.number_pairs, capacity, [frame.total, capacity], [frame.ids, frame.owners])
     if capacity:
         wp.utils.radix_sort_pairs(frame.keys, frame.ids, capacity, end_bit=frame.tiles.bit_length())
     _launch(tiles.tile_starts, frame.tiles + 1, [frame.keys, capacity], [frame.first])
@@ -96,8 +99,9 @@ def composite(frame: Frame, view: CameraView, number: int, distortion: bool = Tr
         *shape, light, channels, frame.settings.stop == Stop.INCLUSIVE, metric, frame.cooperative, more
     )
     channel = frame.channels[number].lanes if channels else nothing
-    more_splats, more_channel = (frame.records[1], frame.channels[1].lanes) if more else (frame.records[0], nothing)
-    lists = [frame.first, frame.ids, frame.records[number], frame.tiles_x, view.width, view.height]
+    splats = _spread(frame, number)
+    more_splats, more_channel = (_spread(frame, 1), frame.channels[1].lanes) if more else (splats, nothing)
+    lists = [frame.first, frame.ids, splats, frame.tiles_x, view.width, view.height]
 
     def arguments(tile0: int, _part: int) -> list:
         return [*lists, tile0, _mapping(frame), more_splats, frame.sums.lanes, channel, more_channel]
@@ -140,9 +144,13 @@ def composite_backward(
     nothing = _nothing(frame, 3, frame.sums.lanes.dtype)
     channel = grad_channel.lanes if grad_channel is not None else nothing
     more = grad_more.lanes if grad_more is not None else nothing
-    edges = _tile_edges(frame, frame.threads)
-    parts = [records] + [frame.zeros(f"records of thread {n}", frame.count, splat.Splat) for n in range(len(edges) - 2)]
-    lists = [frame.first, frame.ids, frame.records[number], frame.tiles_x]
+    edges = [0, frame.tiles] if frame.ordered else _tile_edges(frame, frame.threads)
+    added, more_added = records, more_records
+    if frame.ordered:
+        added = frame.zeros("gradients of pairs", len(frame.owners), splat.Splat)
+        more_added = None if more_records is None else frame.zeros("more of pairs", len(frame.owners), splat.Splat)
+    parts = [added] + [frame.zeros(f"records of thread {n}", frame.count, splat.Splat) for n in range(len(edges) - 2)]
+    lists = [frame.first, frame.ids, _spread(frame, number, anew=False), frame.tiles_x]
 
     def arguments(tile0: int, part: int) -> list:
         return [
@@ -154,12 +162,17 @@ def composite_backward(
             channel,
             more,
             parts[part],
-            more_records if more_records is not None else records,
+            more_added if more_added is not None else added,
         ]
 
     _over_tiles(frame, kernel, edges, arguments)
     for part in parts[1:]:
         _launch(splat.add_records, frame.count, [part, 0], [records])
+    if frame.ordered:
+        for copies, total in ((added, records), (more_added, more_records)):
+            if copies is not None and total is not None:
+                of_pairs = [frame.order, frame.ends, copies, len(frame.owners)]
+                _launch(ordered.sum_copies, frame.count, of_pairs, [total])
 
 
 def set_channels(frame: Frame, inputs: Inputs, start: int, splats: wp.array) -> None:
@@ -260,6 +273,16 @@ def _metric(frame: Frame, wanted: bool) -> bool | None:
 
 def _distortion_factor(frame: Frame) -> float:
     return 2.0 if frame.settings.distortion == Distortion.PAPER else 1.0
+
+
+def _spread(frame: Frame, number: int, *, anew: bool = True) -> wp.array:
+    """Records of a pass as the compositor reads them: of splats, or, where order matters, a copy for each pair."""
+    if not frame.ordered:
+        return frame.records[number]
+    copies = frame.array(f"records of pairs {number}", len(frame.owners), splat.Splat)
+    if anew and len(frame.owners):
+        _launch(ordered.spread_records, len(frame.owners), [frame.records[number], frame.owners], [copies])
+    return copies
 
 
 def _mapping(frame: Frame) -> wp.vec2:
