@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from cases import CASES, cotangents
+from cases import CASES, SENSOR_SCALARS, cotangents
 from comparison import DEVICES
 from torch.testing import assert_close
 
@@ -166,7 +166,8 @@ def test_ordered_sums_are_the_sums(detached, device):
         twice.append(gradients(found, seen, names_in(seen)))
     check(twice[0], want)
     for name, value in twice[0].items():
-        assert torch.equal(value, twice[1][name]), name
+        if name not in SENSOR_SCALARS:  # those are sums over all Gaussians, by atomic additions
+            assert torch.equal(value, twice[1][name]), name
 
 
 def test_ordered_sums_need_no_count_of_pairs(device):

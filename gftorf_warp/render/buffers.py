@@ -81,7 +81,7 @@ class RenderSettings:
     deterministic: bool = False
     """Whether gradients are summed in one order on CUDA, as on the CPU, so that equal work gives equal bytes.
 
-    Every (tile, splat) pair has 128 bytes of its own then.
+    All but those of the sensor's numbers. Every (tile, splat) pair has 128 bytes of its own then.
     """
     threads: int | None = None
     """CPU threads of the blend; None: as many as this process may use. Another number changes sums by rounding only."""
