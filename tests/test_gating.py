@@ -52,9 +52,11 @@ def test_who_moves_asks(swaying):
     gate, motion, everybody = swaying
     with torch.no_grad():
         motion.far[100:112] = 0.4 * GATE
+    assert gate.counts is None
     assert gate.judge(everybody, COUNT), "nothing lay anywhere before"
     assert gate.awake.nonzero()[:, 0].tolist() == list(range(20))
     assert gate.active.tolist() == [*range(20), *range(100, 112)]
+    assert gate.counts == (20, 32)
     assert not gate.is_shut(8)
     assert gate.is_shut(9), "one in eight steps asks everybody"
     assert not gate.judge(everybody, COUNT), "and now everything lies where it did"

@@ -63,6 +63,11 @@ class Gate:
         """Whether in the step of this number some rows do not ask."""
         return self._judged and len(self.active) < len(self.awake) and step % self.settings.open_every != 0
 
+    @property
+    def counts(self) -> tuple[int, int] | None:
+        """Gaussians that are awake and rows that ask, which waits for the device; None: nobody was judged."""
+        return (int(self.awake.sum()), len(self.active)) if self._judged else None
+
     @torch.no_grad()
     def judge(self, field: GaussianField, count: int) -> bool:
         """Ask for everybody, and decide who rests; the host waits once.
