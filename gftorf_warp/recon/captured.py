@@ -23,6 +23,7 @@ from ..render.bridge import Branches, Captured, Outbox, pairs_of, shared_pool
 from ..render.buffers import RenderSettings, Workspace
 from ..scene.motion import Still
 from . import densify
+from .gating import Gate
 from .objective import image_loss, render_settings_at, rendering_of, weights_at
 from .observations import Observations
 from .optimiser import EPSILON, frozen, rates_at
@@ -67,6 +68,8 @@ def steps_of(
         if why is None:
             return CapturedSteps(state, observations, settings)
         LOG.info("steps are no graphs: %s", why)
+    if settings.gate.distance is not None:
+        LOG.info("every Gaussian asks for its motion: gate.distance is known to captured steps only, kernels=graph")
     return Singles(state, observations, settings, run_all)
 
 
@@ -86,6 +89,8 @@ class Variant:
     """Of the terms."""
     sh_degree: int
     """Of the harmonics."""
+    gated: bool
+    """Whether Gaussians at rest do not ask for their motion."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -131,6 +136,7 @@ class CapturedSteps:
         self._flow = self._resident_flow()
         self._branches = Branches(longest, device)
         self._workspaces = [Workspace() for _ in range(longest)]
+        self.gate = Gate(settings, state.motion)
         self._adopt()
 
     def step(self) -> None:
@@ -158,6 +164,8 @@ class CapturedSteps:
         if due or not self.padded.holds(state):
             self._look()
             self._adopt()
+        if self.gate.is_due(before, state.images) and self.gate.judge(self.padded.field, len(state.optimiser.field)):
+            self._forget()  # the host has waited for the judgement, so all graphs have run
 
     def _enter(self, variant: Variant) -> None:
         """Let go of graphs of a part of the run that is over, and prepare what rests in the one that begins."""
@@ -224,7 +232,9 @@ class CapturedSteps:
         return in_a_row
 
     def _adopt(self) -> None:
-        if self.padded.adopt(self.state):
+        optimiser, anew = self.state.optimiser, self.padded.adopt(self.state)
+        moved, optimiser.origin = self.gate.follow(optimiser.origin, self.padded.rows), None
+        if anew or moved:
             self._forget()
         if self._part is not None:
             self._rest(self._part[1])
@@ -241,6 +251,7 @@ class CapturedSteps:
             rests=frozen(self.settings, images),
             weights=weights,
             sh_degree=render_settings_at(self.settings, images).sh_degree,
+            gated=moves and self.gate.is_shut(images // len(frames)),
         )
 
     def _write(self, frames: list[int], images: int, rates: dict[str, float]) -> None:
@@ -272,9 +283,9 @@ class CapturedSteps:
         field = field.map(lambda tensor: tensor.view_as(tensor))  # gradients of all branches meet on this stream
         offsets: Tensor | None = None
         if variant.moves:
-            asked = motion.follows_means and not variant.rests
-            attachment = motion.attach(field) if asked else padded.attachment
-            offsets = motion.key_offsets(attachment, numbers[: 3 if variant.flow else 2])
+            keys = numbers[: 3 if variant.flow else 2]
+            attachment = None if motion.follows_means and not variant.rests else padded.attachment
+            offsets = self.gate.offsets(field, attachment, keys, gated=variant.gated)
         render = replace(self.settings.render, sh_degree=variant.sh_degree, pair_capacity=self._capacity)
         images = []
         for n in range(len(variant.shifts)):

@@ -77,7 +77,11 @@ class Network(Motion):
 
     def attach(self, field: GaussianField) -> Float[Tensor, "N p"]:
         """gamma(x) of the positions at which it is asked, without gradient, in the precision of the products [1]."""
-        place, form = field.mean.detach() / self.length, self._form
+        return self.attach_at(field.mean.detach())
+
+    def attach_at(self, mean: Float[Tensor, "N 3"]) -> Float[Tensor, "N p"]:
+        """The same of places [m] without gradient."""
+        place, form = mean / self.length, self._form
         if self.settings.products == Products.HALF:
             return encoded(place, self.powers, columns=form.columns, dtype=form.dtype)
         return encoded(place, self.powers)
