@@ -77,6 +77,8 @@ def test_rest_begins_at_half_and_ends_at_the_whole(swaying):
 def test_what_rests_is_kept_exactly_and_has_no_gradient(swaying):
     """Whatever the network has come to say in between; who is active follows it."""
     gate, motion, everybody = swaying
+    with torch.no_grad():
+        motion.far[100:112] = 0.4 * GATE
     gate.judge(everybody, COUNT)
     keys = torch.tensor([1, 2], dtype=torch.int32)
     kept = motion.key_offsets(motion.attach(everybody), keys).detach()
