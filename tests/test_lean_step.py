@@ -202,7 +202,7 @@ def test_a_descent_is_torchs_mean_clip_and_adam(device, images, longest):
     sums = dict(zip(descent.SUM_NAMES, case.ledger.sums.tolist(), strict=True))
     each = {"quads": 2.0, "flow": 2.0, "quad_mse": 0.25, "opacity": 0.5, "loss": 4.0, "count": 1.0}
     assert sums == {name: pytest.approx(10 * images * each.get(name, 0.0)) for name in sums}
-    assert case.ledger.counts.tolist() == [0, 0, 5]
+    assert case.ledger.counts.tolist() == [0, 0, 5, 0]
 
 
 @pytest.mark.parametrize("broken", ["gradient", "motion", "loss", "pairs"])
@@ -220,7 +220,7 @@ def test_a_step_that_is_not_sound_changes_nothing_but_counts(device, broken):
         case.step(bad, 1.0, (5, 10 if broken == "pairs" else 5), quads=quads)
     assert all(torch.equal(old, new) for old, new in zip(before, case.kept(), strict=True))
     assert torch.equal(case.ledger.sums, sums)
-    assert case.ledger.counts.tolist() == [2, 2, 10 if broken == "pairs" else 5]
+    assert case.ledger.counts.tolist() == ([2, 2, 10, 2] if broken == "pairs" else [2, 2, 5, 0])
     gradient = torch.zeros(20, device=device)
     screen = ScreenGradient(gradient=torch.ones(20, 2, device=device), pixels=torch.ones(20, device=device))
     descent.observe([screen], (8, 6), case.ledger, gradient, gradient.clone())

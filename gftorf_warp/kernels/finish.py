@@ -86,7 +86,8 @@ _JUDGE = f"""
         int pairs = 0;
         for (int n = 0; n < images; ++n) pairs = most[n] > pairs ? most[n] : pairs;
         const float norm = (float)(sqrt(fixed + moving) / images), length = (float)(sqrt(moving) / images);
-        const bool sound = fabsf(loss) <= largest && norm <= largest && (capacity < 1 || pairs <= capacity);
+        const bool fits = capacity < 1 || pairs <= capacity;
+        const bool sound = fabsf(loss) <= largest && norm <= largest && fits;
         const float left = longest / (length + 1e-6f);
         control[0] = 1.0f / images;
         control[1] = (longest > 0.0f && left < 1.0f ? left : 1.0f) / images;
@@ -94,6 +95,7 @@ _JUDGE = f"""
         counts.data[0] += !sound;
         counts.data[1] = sound ? 0 : counts.data[1] + 1;
         counts.data[2] = pairs > counts.data[2] ? pairs : counts.data[2];
+        counts.data[3] += !fits;
     }}
     TOGETHER;
     const bool sound = control[2] != 0.0f;
@@ -157,7 +159,7 @@ def observe(
     pixels3: wp.array[float],  # [N] of the fourth
     images: int,  # 1 to 4 [1]
     half: wp.vec2,  # half an image [px]
-    counts: wp.array[int],  # [3] the second is 0 if the step is sound [1]
+    counts: wp.array[int],  # [4] the second is 0 if the step is sound [1]
     # Out:
     gradient: wp.array[float],  # [N] sum of pixels times screen gradient, in half image sizes
     pixels: wp.array[float],  # [N] sum of pixels [1]
@@ -208,7 +210,7 @@ def judge(
     beta1: wp.float64,  # decay of the first moment [1]
     beta2: wp.float64,  # decay of the second moment [1]
     # Out:
-    counts: wp.array[int],  # [3] steps that failed, in a row, most pairs of an image so far
+    counts: wp.array[int],  # [4] steps that failed, in a row, most pairs of an image so far, steps of too many pairs
     sums: wp.array[float],  # [8] of what was found, times its weight, of the loss and of images
     sizes: wp.array2d[float],  # [T, 3] what Adam's step comes to
 ):

@@ -8,7 +8,6 @@ is what recon/step.py computes (design/training-step.md); on a CPU it runs witho
 from __future__ import annotations
 
 import logging
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -19,7 +18,7 @@ from ..constants import FRAMES_PER_QUARTET
 from ..losses.prior import motion_size
 from ..render import descent, fused
 from ..render.api import Rendering
-from ..render.bridge import Branches, Captured, Outbox, pairs_of, shared_pool
+from ..render.bridge import Branches, Captured, Inbox, Outbox, pairs_of, shared_pool
 from ..render.buffers import RenderSettings, Workspace
 from ..scene.motion import Still
 from . import densify
@@ -28,6 +27,7 @@ from .objective import image_loss, render_settings_at, rendering_of, weights_at
 from .observations import Observations
 from .optimiser import EPSILON, frozen, rates_at
 from .padded import Padded
+from .reserve import Reserve
 from .settings import Kernels, ReconSettings, Weights
 from .state import State
 from .step import SEED_MASK, Map, Singles, densify_after, draw
@@ -35,10 +35,7 @@ from .step import SEED_MASK, Map, Singles, densify_after, draw
 LOG = logging.getLogger("gftorf_warp")
 HEAD = 4  # numbers before those of the images: this key, the next, the one before, the quartet
 PER_IMAGE = 3  # numbers of an image: raw frame, seed and number of its background
-ROOM = 1.5  # pairs that are reserved, over the most that were seen
-PAIRS = 1 << 16  # in such numbers
 ROW = {name: n for n, name in enumerate(descent.FOUND_NAMES)}
-FULL, EMPTY = 0.85, 0.4  # shares of that reserve at which another one is made
 
 
 def unsuitable(observations: Observations, settings: ReconSettings, state: State) -> str | None:
@@ -121,11 +118,12 @@ class CapturedSteps:
         self._graphs: dict[Variant, Callable[[], None]] = {}
         self._part: tuple | None = None  # of the run: what graphs that are kept have in common
         self._pool = shared_pool(device)
-        self._capacity: int | None = None
+        self._reserve = Reserve()
         self._reserves = device.type != "cpu"  # a CPU counts pairs first: nobody waits for anybody there
         longest = max(len(batch) for batch in observations.batches)
         self._graphs_wanted = graphs
         self._ledger = descent.Ledger.empty(longest, device)
+        self._inbox = Inbox(self._ledger.counts)
         self._summed: set[str] = set()  # names of sums that a step has added to
         self._ones: dict[float, Tensor] = {}
         self._scratch = [fused.Scratch() for _ in range(longest)]
@@ -133,7 +131,7 @@ class CapturedSteps:
         leaves = len(state.optimiser.leaves)
         self._values = Outbox(leaves + longest, torch.float32, device)
         self._groups = [*state.optimiser.tensors] + ["motion"] * len(state.optimiser.motion)
-        self._flow = self._resident_flow()
+        self._flow = observations.flow_table() if settings.weights.flow > 0 else None
         self._branches = Branches(longest, device)
         self._workspaces = [Workspace() for _ in range(longest)]
         self.gate = Gate(settings, state.motion)
@@ -155,11 +153,12 @@ class CapturedSteps:
         if run is None:  # the first one is done without a graph: libraries wake up, sizes become known
             table = self.padded.table()
             self._body(variant, table, table.send)
-            if self._capacity is None:
+            if self._reserve.capacity is None:
                 self._look()
             self._graphs[variant] = self._captured(variant, table)
         else:
             run()
+            self._watch()
         densify_after(state, before, settings)
         if due or not self.padded.holds(state):
             self._look()
@@ -220,16 +219,22 @@ class CapturedSteps:
     def _look(self) -> int:
         """Steps in a row that failed; makes more or less room for pairs where that is due."""
         counts = self._ledger.counts
-        failed, in_a_row, pairs = counts.tolist()
+        failed, in_a_row, pairs, overfull = counts.tolist()
         self.state.skipped += failed
         if failed:
-            LOG.warning("%d steps before image %d skipped, not finite or of too many splats", failed, self.state.images)
+            text = "%d steps before image %d skipped: %d of too many (tile, splat) pairs, the others not finite"
+            LOG.warning(text, failed, self.state.images, overfull)
         counts[0] = 0
-        counts[2] = 0
-        if pairs and (self._capacity is None or not EMPTY < pairs / self._capacity < FULL):
-            self._capacity = math.ceil(ROOM * pairs / PAIRS) * PAIRS
+        counts[2:] = 0
+        if self._reserve.learn(pairs):
             self._forget()
-        return in_a_row
+        return 0 if overfull else in_a_row
+
+    def _watch(self) -> None:
+        """Make room for pairs before they need it: numbers of a few steps ago say so, and nobody waits for them."""
+        seen = self._inbox.ask()
+        if seen is not None and self._reserve.is_nearly_full(seen[2]):
+            self._look()
 
     def _adopt(self) -> None:
         optimiser, anew = self.state.optimiser, self.padded.adopt(self.state)
@@ -286,7 +291,7 @@ class CapturedSteps:
             keys = numbers[: 3 if variant.flow else 2]
             attachment = None if motion.follows_means and not variant.rests else padded.attachment
             offsets = self.gate.offsets(field, attachment, keys, gated=variant.gated)
-        render = replace(self.settings.render, sh_degree=variant.sh_degree, pair_capacity=self._capacity)
+        render = replace(self.settings.render, sh_degree=variant.sh_degree, pair_capacity=self._reserve.capacity)
         images = []
         for n in range(len(variant.shifts)):
             with self._branches.fork(n):
@@ -372,7 +377,7 @@ class CapturedSteps:
         weights |= {name: float(getattr(variant.weights, name)) for name in terms}
         self._summed |= terms | {"quad_mse", "opacity", "loss", "count"}
         used = self._workspaces[: len(variant.shifts)]
-        capacity = (-1 if self._capacity is None else self._capacity) if self._reserves else 0
+        capacity = (-1 if self._reserve.capacity is None else self._reserve.capacity) if self._reserves else 0
         descent.descend(
             table,
             self._values.there[: len(self._groups)],
@@ -385,15 +390,3 @@ class CapturedSteps:
             betas=self.state.optimiser.betas,
             epsilon=EPSILON,
         )
-
-    def _resident_flow(self) -> Tensor | None:
-        """[quartets, 2, 2, H, W] px to the next quartet and to the one before; NaN where there is none."""
-        flows = self.observations.flow
-        if not flows or self.settings.weights.flow == 0:
-            return None
-        quads = self.observations.quads
-        count = -(-len(quads) // FRAMES_PER_QUARTET)
-        room = torch.full((count, 2, 2, *quads.shape[1:]), float("nan"), device=quads.device)
-        for (quartet, step), flow in flows.items():
-            room[quartet, 0 if step == 1 else 1] = flow
-        return room

@@ -71,6 +71,16 @@ class Observations:
             self._rays[key] = torch.as_tensor(camera.centre).to(ray), ray
         return self._rays[key]
 
+    def flow_table(self) -> Float[Tensor, "Q 2 2 H W"] | None:
+        """Flow [px] of every quartet to the next one and to the one before, NaN where there is none; None: no flow."""
+        if not self.flow:
+            return None
+        count = -(-len(self.quads) // FRAMES_PER_QUARTET)
+        table = self.quads.new_full((count, 2, 2, *self.quads.shape[1:]), float("nan"))
+        for (quartet, step), flow in self.flow.items():
+            table[quartet, 0 if step == 1 else 1] = flow
+        return table
+
     @functools.cached_property
     def _rays(self) -> dict[bytes, tuple[Tensor, Tensor]]:
         return {}

@@ -205,6 +205,32 @@ class Outbox:
         self._next = (self._next + 1) % len(self._slots)
 
 
+class Inbox:
+    """A few numbers that the device has and the host would like to know, some steps late: neither waits."""
+
+    def __init__(self, there: Tensor):
+        self._there = there
+        self._slots = [torch.zeros_like(there, device="cpu", pin_memory=there.is_cuda) for _ in range(SLOTS)]
+        self._sent: list[torch.cuda.Event | None] = [None] * SLOTS
+        self._next = 0
+
+    def ask(self) -> list[int] | None:
+        """The newest numbers that have arrived since the last call, if any; sends for those of the work so far."""
+        if not self._there.is_cuda:
+            return self._there.tolist()
+        newest = None
+        for n in range(self._next, self._next + SLOTS):  # from the oldest to the newest
+            event = self._sent[n % SLOTS]
+            if event is not None and event.query():
+                newest, self._sent[n % SLOTS] = self._slots[n % SLOTS].tolist(), None
+        if self._sent[self._next] is None:  # otherwise all are on their way
+            self._slots[self._next].copy_(self._there, non_blocking=True)
+            self._sent[self._next] = event = torch.cuda.Event()
+            event.record()
+            self._next = (self._next + 1) % SLOTS
+        return newest
+
+
 class Captured:
     """Work on one device as a CUDA graph: captured at the first call, replayed from then on; on a CPU it just runs.
 

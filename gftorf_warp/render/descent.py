@@ -135,7 +135,7 @@ class Ledger:
 
     found: Float[Tensor, "B F"]
     """Of each image of a step, in the order of ``FOUND_NAMES``, without weights."""
-    counts: Int[Tensor, "3"]
+    counts: Int[Tensor, "4"]
     """Steps that failed, in a row, and the most pairs of an image."""
     sums: Float[Tensor, "S"]
     """Over images of sound steps, in the order of ``SUM_NAMES``, with weights."""
@@ -145,7 +145,7 @@ class Ledger:
         """Nothing happened yet; a step has up to so many images."""
         return cls(
             found=torch.zeros(images, FOUND, device=device),
-            counts=torch.zeros(3, dtype=torch.int32, device=device),
+            counts=torch.zeros(4, dtype=torch.int32, device=device),
             sums=torch.zeros(SUMS, device=device),
         )
 
