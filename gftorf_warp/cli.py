@@ -140,6 +140,7 @@ def _simulate(options: argparse.Namespace) -> int:
         "bounces",
         "paths",
         "format",
+        "truth",
         "fresh",
     )
     chosen = {name: getattr(options, name) for name in names}
