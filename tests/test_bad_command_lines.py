@@ -1,4 +1,4 @@
-"""Wrong `gftorf simulate` lines: scenes, sensors, meshes, sizes, folders, levels; three lines, a code, nothing written."""
+"""Wrong `gftorf simulate` lines: scenes, sensors, meshes, sizes, folders: three lines, a code, nothing written."""
 
 import pytest
 
