@@ -41,7 +41,7 @@ def two_walls(sensor):
 
 
 def test_dark_and_bright_walls_have_shot_noise_of_their_own():
-    """Variance of a quad: (ambient electrons times reflectance + own light + dark) and read noise; 4 sigma."""
+    """T8: variance of a quad is (ambient electrons times reflectance + own light + dark) and read noise; 4 sigma."""
     sensor = Sensor(noise=True, ambient_electrons=SUN, full_well_electrons=1e9, adc_bits=None)
     scene, unit = two_walls(sensor), sensor.contrast * electron_gain(sensor)
     clean, noisy = (record(scene, noise=noise, engine="mesh").sequence.quads for noise in (False, True))
