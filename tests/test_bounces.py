@@ -120,8 +120,10 @@ CORNER = {  # z [m]: bias [mm] at 20, 30 and 100 MHz, indirect over direct DC, g
 }
 
 
-@pytest.mark.parametrize("z", CORNER)
-def test_corner(z, device):
+@pytest.mark.parametrize(
+    ("z", "paths"), [*((z, 100) for z in CORNER), *(pytest.param(z, 2000, marks=pytest.mark.slow) for z in (0.5, 2.0))]
+)
+def test_corner(z, paths, device):
     """T19: one bounce in a corner of two walls: bias at three frequencies within 0.5 %, DC 0.3 %, plus 4 sigma."""
     far = 400.0
     wall = np.array([[0, -far, 0], [0, far, 0], [0, far, far], [0, -far, far]])  # x = 0, seen from +x
@@ -133,7 +135,7 @@ def test_corner(z, device):
     tracer, poses = Tracer(bodies, 64, 64, device=device), np.broadcast_to(np.eye(4), (1, 2, 4, 4))
     *biases, dc, gain = CORNER[z]
     for f_mod_hz, bias_mm in zip((2e7, 3e7, 1e8), biases, strict=True):
-        got = tracer.light([camera], poses, f_mod_hz, bounces=Bounces(count=1, paths=100))
+        got = tracer.light([camera], poses, f_mod_hz, bounces=Bounces(count=1, paths=paths))
         ratio = (got.light[0] / got.direct[0]).astype(np.complex128)
         sigma = shift_of(ratio / ratio.mean(), f_mod_hz).std() / 64
         assert 1e3 * shift_of(ratio.mean(), f_mod_hz) == pytest.approx(bias_mm, abs=0.005 * abs(bias_mm) + 4e3 * sigma)
