@@ -141,6 +141,7 @@ def _simulate(options: argparse.Namespace) -> int:
         "bounces",
         "paths",
         "format",
+        "truth",
         "fresh",
     )
     chosen = {name: getattr(options, name) for name in names}

@@ -93,6 +93,8 @@ def command_parsers() -> dict[str, Parser]:
     _seed_option(simulate, "seed of the noise (0)")
     layouts = "folder layout (ftorf): raw quads, one phasor per quartet, or the layout of our own"
     simulate.add_argument("--format", metavar="ftorf|torf|capture", default="ftorf", help=layouts)
+    amounts = "what a capture of engine mesh keeps of the truth: usual, or all: light by harmonic, z-depth, normals too"
+    simulate.add_argument("--truth", metavar="usual|all", default="usual", help=amounts)
     levels = "step from ideal to realistic, sync, L0, L1, L2, L3 or L4: decides about engine, noise, blur and bounces"
     simulate.add_argument("--level", metavar="NAME", help=levels)
     ladder = "record all levels into SEQ/sync, SEQ/L0 .. SEQ/L4 and print what each costs the closed form"

@@ -64,6 +64,11 @@ def recording(**changes):
         phasor_distance=distance + 0.1,
         amplitude=rng.random(shape).astype(np.float32),
         body=rng.integers(-1, 3, shape),
+        layers={
+            name: rng.normal(size=(FRAMES, channels, HEIGHT, WIDTH)).astype(np.float32)
+            for name, channels in (("ambient", 1), ("direct", 3), ("error", 1), ("phasor.1", 2), ("phasor.3", 2))
+        }
+        | {"z_depth": np.full((FRAMES, 1, HEIGHT, WIDTH), np.nan, np.float32), "normal": np.ones((7, 3, 5, 6), "f4")},
     )
     return Sequence(**{**fields, **changes}), truth
 
@@ -103,7 +108,12 @@ def test_writing_is_undone_by_reading(folder):
             assert other == one, field.name
     known = got.truth()
     for field in dataclasses.fields(Truth):
-        np.testing.assert_array_equal(getattr(known, field.name), getattr(truth, field.name), err_msg=field.name)
+        one, other = (
+            {"": v} if not isinstance(v, dict) else v for v in (getattr(t, field.name) for t in (truth, known))
+        )
+        assert one.keys() == other.keys(), field.name
+        for name in one:
+            np.testing.assert_array_equal(other[name], one[name], err_msg=f"{field.name} {name}")
     assert not list(folder.parent.glob(".*"))
 
 
@@ -128,8 +138,8 @@ def test_every_field_names_its_source_and_is_described(folder):
         for part, channels in read_parts(folder / f"{name}.exr").items()
     }
     described = {(f.paths[0].replace("{id}", "000000").removesuffix(".exr"), f.key): set(f.channels) for f in fields}
-    for key, channels in parts.items():
-        assert described[key] == set(channels), key
+    for (file, part), channels in parts.items():
+        assert described[file, re.sub("[0-9]+$", "{h}", part)] == set(channels), part
 
 
 def test_a_minimal_capture_has_no_more_than_it_needs(tmp_path):
@@ -241,6 +251,35 @@ def test_half_precision_and_missing_parts_are_refused(folder, tmp_path):
         write_parts(folder / "tof/000000.exr", parts)
         with pytest.raises(InputError, match=word):
             Sequence.open(folder)
+
+
+def test_layers_are_checked_too(folder, tmp_path):
+    """Wrong channels, sizes and numbers of a layer; what nobody describes is nobody's; names and shapes on writing."""
+    (folder / "MANIFEST.sha256").unlink()
+    path, image = folder / "truth/000002.exr", np.ones((HEIGHT, WIDTH), np.float32)
+    distance = {"distance": {"distance": image}}
+    for part, word in (
+        ({"normal": {"x": image, "y": image}}, "normal: wrong channels"),
+        ({"error": {"error": np.full_like(image, np.inf)}}, "error: not finite"),
+        ({"phasor.2": {"re": image, "im": np.full_like(image, np.nan)}}, "phasor.2: not finite"),
+        ({"ambient": {"reflectance": np.ones((2, 2), np.float32)}}, "ambient: wrong shape"),
+    ):
+        path.unlink()
+        write_parts(path, part)
+        with pytest.raises(InputError, match=word):
+            Sequence.open(folder).truth()
+    path.unlink()
+    write_parts(path, {**distance, "mine": {"a": image}, "phasor.0": {"re": image}})
+    got = Sequence.open(folder).truth().layers
+    assert set(got) == set(recording()[1].layers)
+    assert np.isnan(got["normal"][2]).all()
+    sequence, truth = recording()
+    for layers, word in (({"mine": image}, "no layer"), ({"normal": np.ones((FRAMES, 1, HEIGHT, WIDTH))}, "shape")):
+        with pytest.raises(ValueError, match=word):
+            capture.write(tmp_path / "other", sequence, dataclasses.replace(truth, layers=layers))
+    full = {"ambient": np.full((FRAMES, 1, HEIGHT, WIDTH), np.inf)}
+    with pytest.raises(UsageError, match="layers"):
+        capture.write(tmp_path / "other", sequence, dataclasses.replace(truth, layers=full))
 
 
 def test_a_link_out_of_the_folder_is_not_followed(folder, tmp_path):

@@ -92,7 +92,7 @@ def test_exposure_is_an_average_over_its_instants():
 
 
 def test_frames_do_not_depend_on_their_number_and_noise_belongs_to_the_seed():
-    """Frame n of a shorter recording is that of a longer; a seed gives its noise again, another seed another."""
+    """T33: frame n of a shorter recording is that of a longer; a seed gives its noise again, another seed another."""
     scene = slider()
     clean = [record(scene, frames=n, noise=False, engine="mesh").sequence.quads for n in (3, 8)]
     np.testing.assert_array_equal(clean[0], clean[1][:3])

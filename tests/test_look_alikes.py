@@ -39,7 +39,7 @@ ROWS = [
 
 @pytest.mark.parametrize(("group", "name"), ROWS)
 def test_the_closed_form_fails_as_much_as_the_recipe_says(group, name):
-    """Every column of the table within its tolerance, and the list of scenes says the first."""
+    """T32: every column of the table within its tolerance, and the list of scenes says the first."""
     found = TABLE.errors(SCENES[name], group)
     for error, want in zip(found, group.targets[name], strict=True):
         assert TABLE.accepted(error, want, group), (found, group.targets[name])
@@ -68,7 +68,7 @@ def test_tolerances_are_those_of_the_recipes():
 
 
 def test_the_stored_table_is_of_these_scenes():
-    """benchmarks/results/look_alikes.json has a row for every look-alike, all accepted."""
+    """T32: benchmarks/results/look_alikes.json has a row for every look-alike, all accepted."""
     stored = json.loads((REPOSITORY / "benchmarks" / "results" / "look_alikes.json").read_text())["scenes"]
     names = {name: group for group in TABLE.GROUPS.values() for name in group.targets}
     assert set(stored) == set(names) == {make.__name__ for make in LOOK_ALIKES}

@@ -268,7 +268,7 @@ def test_a_sequence_is_read_back_as_recorded(tmp_path):
 
 
 def test_the_same_seed_writes_the_same_bytes(tmp_path):
-    """Another seed changes the quads, their picture and the card that names it, nothing else."""
+    """T33: another seed changes the quads, their picture and the card that names it, nothing else."""
     scene = slider(frames=5)
     folders = [simulate(scene, tmp_path / str(k), seed=seed) for k, seed in enumerate((7, 7, 8))]
     first, same, other = (contents(folder) for folder in folders)

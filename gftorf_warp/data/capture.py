@@ -107,7 +107,9 @@ def read(path: str | Path, *, frame_rate_hz: float | None = None) -> Sequence:
 
 
 def read_truth(path: str | Path, *, frames: int) -> Truth | None:
-    """Read what is known of the scene itself: both distances, amplitude and objects; None if nothing is.
+    """Read what is known of the scene itself: both distances, amplitude, objects and layers; None if nothing is.
+
+    A layer is NaN in raw frames that do not have it. Parts of files that nobody describes are left out.
 
     Args:
         path: The folder.
@@ -124,6 +126,7 @@ def read_truth(path: str | Path, *, frames: int) -> Truth | None:
     digests, values = _manifest(root), read_values(root)
     width, height = (int(n) for n in values["size"])
     stacks: dict[str, np.ndarray] = {}
+    layers: dict[str, np.ndarray] = {}
     known = np.zeros(frames, dtype=bool)
     for n, file in files.items():
         parts = problems.attempt(_verified, root, file, digests)
@@ -141,13 +144,19 @@ def read_truth(path: str | Path, *, frames: int) -> Truth | None:
                 problems.errors.append(InputError(f"{name}: negative", where=file, why=why, fix=fix))
             stacks[name][n] = image
             known[n] |= name == "distance"
+        for name in parts:
+            image = problems.attempt(_layer, file, parts, name, (height, width))
+            if image is not None:
+                layers.setdefault(name, np.full((frames, *image.shape), np.nan, dtype=np.float32))[n] = image
     problems.raise_if_any(root)
     if "distance" not in stacks:
         return None
     distance = np.where(stacks["distance"] == 0, np.float32(np.nan), stacks["distance"])
     body = stacks["object"].astype(np.int64) - 1 if "object" in stacks else None
     more = {name: stacks.get(name) for name in ("phasor_distance", "amplitude")}
-    return Truth(distance=distance, known=known, body=None if body is None else body.astype(np.int32), **more)
+    return Truth(
+        distance=distance, known=known, body=None if body is None else body.astype(np.int32), layers=layers, **more
+    )
 
 
 def _root(path: Path) -> Path:
@@ -202,6 +211,15 @@ def _verified(root: Path, file: Path, digests: dict[str, str]) -> Parts:
     return read_parts(file)
 
 
+def _layer(file: Path, parts: Parts, name: str, shape: tuple[int, ...]) -> np.ndarray | None:
+    """One layer of the truth, channels first; None if this part is none."""
+    try:
+        field = specs.layer_field(name)
+    except ValueError:
+        return None
+    return np.stack(_channels(file, parts[name], name, field, shape))
+
+
 def _image(file: Path, parts: Parts, name: str, shape: tuple[int, ...] | None) -> np.ndarray | None:
     """One field of a file, channels first if it has several, last if they are colours; None if it may be absent."""
     field = specs.fields(FORMAT)[name]
@@ -210,7 +228,14 @@ def _image(file: Path, parts: Parts, name: str, shape: tuple[int, ...] | None) -
             return None
         why = f"expected a part {field.key!r}, found {', '.join(parts)}"
         raise InputError(f"{name}: no such part", where=file, why=why, fix="export the file again")
-    channels = parts[field.key]
+    images = _channels(file, parts[field.key], name, field, shape)
+    return images[0] if len(images) == 1 else np.stack(images, axis=-1 if name == "colour" else 0)
+
+
+def _channels(
+    file: Path, channels: dict[str, np.ndarray], name: str, field: specs.Field, shape: tuple[int, ...] | None
+) -> list[np.ndarray]:
+    """The channels of a part in the order of its description, checked."""
     images = [channels[channel] for channel in field.channels if channel in channels]
     kinds = {image.dtype.kind for image in images}
     if len(images) != len(channels) or len(images) != len(field.channels) or kinds != {field.dtypes}:
@@ -223,7 +248,7 @@ def _image(file: Path, parts: Parts, name: str, shape: tuple[int, ...] | None) -
         if np.isinf(image).any() or (field.nan == "error" and np.isnan(image).any()):
             why = f"expected finite numbers{' or NaN for unknown' if field.nan == 'unknown' else ''}, found others"
             raise InputError(f"{name}: not finite", where=file, why=why, fix="export the file again")
-    return images[0] if len(images) == 1 else np.stack(images, axis=-1 if name == "colour" else 0)
+    return images
 
 
 def _judge(path: Path, values: dict[str, Any], problems: Problems) -> None:

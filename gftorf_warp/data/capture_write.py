@@ -14,6 +14,7 @@ from .capture_json import NAME
 from .exr import Parts, write_parts
 from .files import atomic_folder, write_through
 from .sequence import Sequence, Truth
+from .specs import layer_field
 from .writing import float32, readme_and_sheet, refuse_inexpressible, validate
 
 VERSION = "1.0"
@@ -89,6 +90,8 @@ def _truth(truth: Truth, n: int) -> Parts:
         parts["amplitude"] = {"amplitude": float32(truth.amplitude[n])}
     if truth.body is not None:
         parts["object"] = {"object": (truth.body[n].astype(np.int64) + 1).astype(np.uint32)}
+    for name, images in truth.layers.items():
+        parts[name] = dict(zip(layer_field(name).channels, float32(images[n]), strict=True))
     return parts
 
 

@@ -139,3 +139,6 @@ class Truth:
     """Mean amplitude without noise [relative units], float32; None: not stored."""
     body: Int[np.ndarray, "F H W"] | None = None
     """Which object the ray through each pixel centre meets, counted from 0; -1: none. None: not stored."""
+    layers: dict[str, Float[np.ndarray, "F C H W"]] = field(default_factory=dict)
+    """Whatever else a simulator knows, float32, by the names and with the channels of data_specs/capture.toml: light by
+    harmonic, its direct part and standard error, ambient light, z-depth, normals. Only a capture has a place for it."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import re
 import tomllib
 from dataclasses import dataclass
 from pathlib import Path
@@ -64,6 +65,18 @@ def fields(name: str) -> dict[str, Field]:
     folder = INSTALLED if INSTALLED.is_dir() else CHECKED_OUT
     content = tomllib.loads((folder / f"{name}.toml").read_text(encoding="utf-8"))
     return {entry["name"]: Field(**{key: _frozen(value) for key, value in entry.items()}) for entry in content["field"]}
+
+
+def layer_field(name: str) -> Field:
+    """The field of data_specs/capture.toml that describes a layer of the truth: ``{h}`` stands for a harmonic.
+
+    Raises:
+        ValueError: If none does.
+    """
+    for field in fields("capture").values():
+        if "layers" in field.fills and re.fullmatch(re.escape(field.key).replace(r"\{h\}", "[1-9][0-9]?"), name):
+            return field
+    raise ValueError(f"no layer is named {name!r}")
 
 
 def _frozen(value: Any) -> Any:

@@ -15,6 +15,7 @@ from .calibration import DEPTH_RANGES_M, FOCAL_MIN
 from .files import atomic_folder, write_through
 from .poses import rigid
 from .sequence import Sequence, Truth
+from .specs import layer_field
 
 SHEET = "contact_sheet.png"  # in every simulated folder; no reader opens it
 
@@ -94,6 +95,8 @@ def validate(sequence: Sequence, truth: Truth | None) -> None:
         lengths |= {"truth.distance": (truth.distance.shape, shape), "truth.known": (truth.known.shape, (frames,))}
         more = {name: getattr(truth, name) for name in ("phasor_distance", "amplitude", "body")}
         lengths |= {f"truth.{name}": (images.shape, shape) for name, images in more.items() if images is not None}
+        for name, images in truth.layers.items():
+            lengths[f"truth.layers[{name}]"] = (images.shape, (frames, len(layer_field(name).channels), *shape[1:]))
     for name, (found, expected) in lengths.items():
         if found != expected:
             raise ValueError(f"{name} {found} must have shape {expected}")
@@ -174,6 +177,11 @@ def refuse_inexpressible(form: str, sequence: Sequence, truth: Truth | None) -> 
         "camera_from_world": (_rigid(sequence.camera_from_world), "rotations and translations", "other matrices"),
         "colour": (all(np.isfinite(i).all() for i in sequence.colour.values()), "finite numbers", "NaN or infinity"),
         "phasor_distance": (((static >= 0) & (static < np.inf) | np.isnan(static)).all(), "metres or NaN", "others"),
+        "layers": (
+            truth is None or not any(np.isinf(images).any() for images in truth.layers.values()),
+            "numbers, or NaN for unknown",
+            "infinity",
+        ),
         "flow": (not any(np.isinf(flow).any() for flow in flows), "pixels, or NaN for unknown", "infinity"),
         "truth": (
             ((distance > 0) & (distance < np.inf) | np.isnan(distance)).all(),

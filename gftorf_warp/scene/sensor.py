@@ -77,8 +77,9 @@ class Sensor:
     harmonic_contrast: tuple[float, ...] = ()
     """Contrast of harmonics 2, 3, ... as multiples of that of the first [1]; default: a sine. See scene/waveform.py."""
     ambient_electrons: float = 0.0
-    """Unmodulated electrons per exposure, both taps together [e-]; of a white surface, where an engine knows how much
-    even light each pixel reflects. A ninth of direct sunlight is 3.1e5 from reflectance .5 (notes, 3)."""
+    """Unmodulated electrons per exposure, both taps together [e-]. Engine mesh knows the reflectance of what each pixel
+    sees: there this is per unit of reflectance, what a white surface gives. Engine gaussian does not: there every pixel
+    gets this number. A ninth of direct sunlight is 3.1e5 from reflectance .5, 6.3e5 from white (notes, 3)."""
     dark_electrons_per_s: float = 5.0e4
     """Dark current per tap [e-/s]; assumed for the OPT8241."""
     read_noise_electrons: float = 80.0

@@ -10,6 +10,7 @@ from dataclasses import fields
 from .. import __version__
 from ..scene.optics import Lens, lens_rows
 from .ladder import NAMES, adds_of
+from .layers import TRUTHS
 from .paths import Still
 from .readout import contrast, electron_gain
 from .record import Recording
@@ -19,7 +20,13 @@ from .sensors import effect_rows
 
 
 def settings_card(
-    scene: Scene, options: Mapping, layout: str = "ftorf", *, own: Scene | None = None, level: str | None = None
+    scene: Scene,
+    options: Mapping,
+    layout: str = "ftorf",
+    *,
+    own: Scene | None = None,
+    level: str | None = None,
+    truth: str = TRUTHS[0],
 ) -> str:
     """The part that follows from the settings alone, so that equal text means equal settings.
 
@@ -29,6 +36,7 @@ def settings_card(
         layout: Layout on disk; 'torf' has one phasor per quartet.
         own: The scene that was asked for, if a level of the ladder made another of it.
         level: That level.
+        truth: How much of it is kept, see sim/layers.py.
     """
     sensor, noisy = scene.sensor, options["noise"] and scene.sensor.noise
     width, height = options["size"]
@@ -55,7 +63,8 @@ def settings_card(
         rows |= {
             "electrons per unit of amplitude": f"{electron_gain(sensor):.4g} in one exposure, both taps together",
             "contrast": f"{contrast(sensor):g}",
-            "ambient": f"{sensor.ambient_electrons:g} electrons per exposure",
+            "ambient": f"{sensor.ambient_electrons:g} electrons per exposure"
+            + (" from white" if sensor.ambient_electrons and options["engine"] == "mesh" else ""),
             "dark current": f"{sensor.dark_electrons_per_s:g} electrons per second and tap",
             "read noise": f"{sensor.read_noise_electrons:g} electrons per tap",
             "full well": f"{sensor.full_well_electrons:g} electrons per tap",
@@ -69,7 +78,7 @@ def settings_card(
 {options["frames"]} raw frames of {width}x{height} pixels, {scene.horizontal_fov_deg:g} deg wide. \
 {_light(scene, options)}.
 
-    {_command(own or scene, options, layout, level)}
+    {_command(own or scene, options, layout, level, truth)}
 
 Made by gftorf-warp {__version__}, scene {hashlib.sha256(_fingerprint(scene).encode()).hexdigest()[:16]}. \
 This data may be used under the licence of that program, Apache-2.0.
@@ -140,13 +149,15 @@ def _camera_rows(scene: Scene, options: Mapping) -> dict[str, str]:
     return rows
 
 
-def _command(scene: Scene, options: Mapping, layout: str, level: str | None) -> str:
+def _command(scene: Scene, options: Mapping, layout: str, level: str | None, truth: str) -> str:
     """What makes the same sequence again: a command line if there is one for it, else a call."""
     named = SCENES.get(scene.name)
     if named is None or overridden(named, scene.overrides) != scene:
         values = ", ".join(f"{key}={value}" for key, value in options.items())
         more = f", format={layout!r}" if layout != "ftorf" else ""
-        return f"gftorf_warp.simulate({scene.name}, ..., {values}{more}{f', level={level!r}' if level else ''})"
+        more += f", level={level!r}" if level else ""
+        more += f", truth={truth!r}" if truth != TRUTHS[0] else ""
+        return f"gftorf_warp.simulate({scene.name}, ..., {values}{more})"
     width, height = options["size"]
     command = f"gftorf simulate {scene.name} --out SEQ{''.join(f' --override {text}' for text in scene.overrides)}"
     command += f" --frames {options['frames']} --size {width}x{height}"
@@ -156,6 +167,7 @@ def _command(scene: Scene, options: Mapping, layout: str, level: str | None) -> 
         command += f" --bounces {options['bounces']} --paths {options['paths']}" if options["bounces"] else ""
         command += f" --exposure-samples {n}" if (n := options["exposure_samples"]) > 1 else ""
     command += f" --seed {options['seed']}" + (f" --format {layout}" if layout != "ftorf" else "")
+    command += f" --truth {truth}" if truth != TRUTHS[0] else ""
     if level is not None:
         return command + f" --level {level}" + (" --sync" if options["sync"] and level != NAMES[0] else "")
     return command + (" --sync" if options["sync"] else "") + ("" if options["noise"] else " --no-noise")

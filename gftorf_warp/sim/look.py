@@ -75,6 +75,11 @@ class Look(NamedTuple):
     """As the engine sees it [m]: mean of splats over their opacity, or first hit; NaN where a pixel meets nothing."""
     phasor: Complex[np.ndarray, "H W"]
     """Light at the modulation frequency, the sensor's phase offset included, in any unit; 0 where there is none."""
+    ambient: Float[np.ndarray, "H W"] | None = None
+    """Share of light from everywhere that comes back, the mean reflectance of a pixel's rays [1]; None: the engine does
+    not know it, and every pixel gets all of the sensor's ambient electrons."""
+    layers: dict[str, Float[np.ndarray, "C H W"]] | None = None
+    """What else the engine knows, by name, see sim/layers.py; None: nothing."""
 
 
 def look(splatted: Splatted, time: float, sensor: Sensor, subsamples: int) -> Look:

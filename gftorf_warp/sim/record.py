@@ -18,6 +18,7 @@ from ..scene.camera import Camera
 from ..scene.optics import shading
 from ..scene.sensor import Sensor, distance_from_phasor
 from .assembly import has_mesh
+from .layers import TRUTHS, layers
 from .look import Look, Splatted, look, look_colour
 from .paths import inverse
 from .readout import mean_quad, read_out
@@ -33,6 +34,7 @@ Keep = Callable[[str, Callable[[], Images]], tuple[Images, bool]]
 ENGINES = ("gaussian", "mesh")
 """Ways from a scene to an image: splats that cover it, or rays through its surfaces."""
 
+LAYER = "layer "  # begins the names of layers among the images of a raw frame
 PATHS = 7  # tells the random numbers of paths from those of the read-out and of the colour camera
 
 
@@ -89,10 +91,13 @@ def record(
     bounces: int = 0,
     paths: int = 64,
     device: str = "cpu",
+    truth: str | None = None,
     progress: Progress | None = None,
     keep: Keep | None = None,
 ) -> Recording:
     """Record ``scene``, in memory. Arguments are those of :func:`gftorf_warp.sim.simulate.simulate`.
+
+    ``truth`` None is neither of its amounts: no layers, for layouts that have no place for them.
 
     Every raw frame depends on its number and on the settings alone, so that it may as well come from an interrupted
     recording: ``keep`` decides, see sim/unfinished.py; None makes all of them.
@@ -110,27 +115,32 @@ def record(
     distances, bodies, interior = _truth(scene, cameras, times)
     longest = frame_times(sensor, max(frames, scene.frames), sync=False)  # for fewer frames the same covers and images
     evenness = shading(scene.lens, camera)
-    take = _engine(engine, scene, size, longest, Bounces(count=bounces, paths=paths), device, seed)
+    take = _engine(engine, scene, size, longest, Bounces(count=bounces, paths=paths), device, seed, truth)
     shots = [sensor.at_frame(n) for n in range(frames)]
     offsets = ((np.arange(exposure_samples) + 0.5) / exposure_samples - 0.5) * sensor.exposure_s
 
     def expose(n: int) -> Images:
         seen = take(n, [float(times[n] + offset) for offset in offsets], float(times[n]), shots[n])
         random = np.random.default_rng((seed, n))  # frame n: whatever F is
-        reading = read_out(seen.quad, seen.amplitude, shots[n], random, shading=evenness)
+        reading = read_out(seen.quad, seen.amplitude, shots[n], random, ambient=seen.ambient, shading=evenness)
         return {
             "quad": reading.quad,
             "saturated": reading.saturated.sum(),
             "amplitude": seen.amplitude.astype(np.float32),
             "distance": seen.distance,
             "phasor_distance": _static_distance(seen, shots[n]),
+            **{f"{LAYER}{name}": image for name, image in (seen.layers or {}).items()},
         }
 
     quads, phasor_distances, amplitudes = (np.zeros(distances.shape, dtype=np.float32) for _ in range(3))
+    more: dict[str, np.ndarray] = {}
     largest, total, full = 0.0, 0.0, 0
     for n in range(frames):
         images, made = keep(f"frame-{n:06d}", partial(expose, n))
         quads[n], amplitudes[n], phasor_distances[n] = (images[k] for k in ("quad", "amplitude", "phasor_distance"))
+        for name in (name for name in images if name.startswith(LAYER)):
+            stack = more.setdefault(name.removeprefix(LAYER), np.zeros((frames, *images[name].shape), np.float32))
+            stack[n] = images[name]
         full += int(images["saturated"])
         difference = np.abs(images["distance"] - distances[n])[interior[n]]
         total += float(difference.sum())
@@ -171,6 +181,7 @@ def record(
             phasor_distance=phasor_distances,
             amplitude=amplitudes,
             body=bodies,
+            layers=more,
         ),
         gap=Gap(mean=total / pixels, max=largest, pixels=round(pixels / frames)) if pixels else None,
         saturated=full / quads.size,
@@ -178,7 +189,14 @@ def record(
 
 
 def _engine(
-    engine: str, scene: Scene, size, longest: Float[np.ndarray, "F"], bounces: Bounces, device: str, seed: int
+    engine: str,
+    scene: Scene,
+    size,
+    longest: Float[np.ndarray, "F"],
+    bounces: Bounces,
+    device: str,
+    seed: int,
+    truth: str | None,
 ) -> Callable[[int, list[float], float, Sensor], Look]:
     """What takes an image: a function of a raw frame's number, the instants it averages, its time, and the sensor."""
     if engine not in ENGINES:
@@ -200,7 +218,9 @@ def _engine(
             still = mean if instants == [time] else traced.light([time], float(sensor.f_mod_hz), random)
             quad, amplitude = mean_quad(mean.light, mean.amplitude, sensor)
             phasor = still.light[0] * np.exp(1j * float(sensor.phase_offset))
-            return Look(quad, amplitude, traced.first_hits(time).distance, phasor)
+            hits = traced.first_hits(time)
+            known = None if truth is None else layers(mean, hits, sensor, truth, bounced=bounces.count > 0)
+            return Look(quad, amplitude, hits.distance, phasor, mean.ambient, known)
 
         return trace
     if needs_mesh(scene, bounces.count):
@@ -208,6 +228,8 @@ def _engine(
             f"emitter {scene.emitter}, beam_deg {scene.beam_deg} and {bounces.count} bounces need engine 'mesh': "
             f"{engine!r} has direct light at the camera only, no gloss, and no mesh that moves"
         )
+    if truth == TRUTHS[-1]:
+        raise ValueError(f"truth {truth!r} needs engine 'mesh': {engine!r} has no layers")
     splatted = Splatted(scene, lambda time: _fine(scene.camera(size, time), scene), longest)
 
     def render(n: int, instants: list[float], time: float, sensor: Sensor) -> Look:

@@ -19,6 +19,7 @@ from ..errors import UsageError
 from ..scene.sensor import Sensor
 from .card import outcome_card, settings_card
 from .ladder import NAMES, Errors, at_level, closed_form_errors, ladder_table
+from .layers import TRUTHS
 from .readout import why_impossible
 from .record import ENGINES, Progress, frame_times, needs_mesh, record
 from .scene import overridden
@@ -49,6 +50,7 @@ def simulate(
     device: str = "cpu",
     format: str = "ftorf",
     level: str | None = None,
+    truth: str = "usual",
     fresh: bool = False,
     progress: Progress | None = None,
 ) -> Path:
@@ -82,6 +84,8 @@ def simulate(
             first raw frame; 'capture', our own, which holds any shifts, exposures, amplitude and objects too.
         level: Step of the ladder from ideal to realistic, see ``LEVELS`` of sim/ladder.py; it decides about the engine,
             bounces, blur, noise and what of the sensor is ideal. None: everything as it is asked for.
+        truth: What a capture of engine mesh keeps beside distances, amplitude and objects: 'usual' or 'all', see
+            sim/layers.py; 'all' needs that engine and that format.
         fresh: Whether another sequence in ``out`` is moved aside, to ``out-old-1``, instead of being an error, and an
             unfinished one begun again.
         progress: Called with (raw frames done, raw frames in all).
@@ -111,6 +115,7 @@ def simulate(
     found, options = (own, options) if level is None else at_level(own, level, options)
     _check_options(found, options, format)
     _check_engine(found, options["engine"], options["bounces"], options["paths"], device)
+    _check_truth(truth, options["engine"], format)
     if flow and format == "torf":
         raise UsageError(
             "a ToeRF folder has no place for optical flow",
@@ -120,13 +125,14 @@ def simulate(
         )
     _check_sensor(found.sensor, format)
     _check_duration(found, frames)
-    card = settings_card(found, options, format, own=own, level=level)
+    card = settings_card(found, options, format, own=own, level=level, truth=truth)
     out = Path(out).absolute() if fresh else Path(out)
     if not needs_recording(out, card, fresh=fresh):
         return out
     write = {"ftorf": ftorf_write, "torf": torf_write, "capture": capture_write}[format].write
     with unfinished(out, card, fresh=fresh) as keep:
-        recording = record(found, **options, device=device, progress=progress, keep=keep)
+        kept = truth if format == "capture" else None
+        recording = record(found, **options, device=device, truth=kept, progress=progress, keep=keep)
         if fresh:
             set_aside(out)
         sheet = contact_sheet(recording.sequence, recording.truth, card.partition("\n")[0].removeprefix("# "))
@@ -218,6 +224,17 @@ def _check_engine(scene: Scene, engine: str, bounces: int, paths: int, device: s
         light = "mesh: the light is beside the camera, has a beam or bounces, or a body is glossy or a mesh that moves"
         _refuse({"--engine": (not needs_mesh(scene, bounces), repr(engine), light)})
         _refuse({"--device": (device == "cpu", f"{device} and engine {engine!r}", "cpu, or --engine mesh")})
+
+
+def _check_truth(truth: str, engine: str, layout: str) -> None:
+    _refuse({"--truth": (truth in TRUTHS, repr(truth), f"one of {', '.join(TRUTHS)}")})
+    if truth != TRUTHS[0] and (engine, layout) != ("mesh", "capture"):
+        raise UsageError(
+            f"cannot keep {truth} truth",
+            where="--truth",
+            why=f"engine {engine} and format {layout} have no layers; engine mesh knows them, a capture holds them",
+            fix="add --engine mesh --format capture",
+        )
 
 
 def _refuse(wanted: dict[str, tuple[bool, str, str]]) -> None:

@@ -1,0 +1,75 @@
+"""Every `gftorf simulate` line of the README is run at a tiny size; other commands are at least what may be typed."""
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+from gftorf_warp import cli, options
+from gftorf_warp.data.sequence import Sequence
+from gftorf_warp.sim.ladder import NAMES
+
+REPOSITORY = Path(__file__).parents[1]
+README = (REPOSITORY / "README.md").read_text(encoding="utf-8")
+LINES = sorted(
+    {line.partition("#")[0].strip() for line in re.findall(r"(?:^|`)(gftorf [^`\n]*)", README, re.MULTILINE)}
+)
+SIMULATE = [line for line in LINES if line.startswith("gftorf simulate ") and "--out" in line and "SCENE" not in line]
+
+
+@pytest.mark.parametrize("line", SIMULATE)
+def test_a_simulation_of_the_readme_runs(line, tmp_path, monkeypatch):
+    """As it is printed, but for size, number of raw frames and folder; truth lies beside."""
+    monkeypatch.chdir(REPOSITORY)
+    words = shlex.split(line)[1:]
+    words[words.index("--out") + 1] = out = str(tmp_path / "seq")
+    assert cli.main([*words, "--size", "24x18", "--frames", "8", "-q"]) == 0
+    folder = Path(out) / NAMES[-1] if "--ladder" in words else Path(out)
+    sequence = Sequence.open(folder)
+    assert sequence.quads.shape == (8, 18, 24)
+    assert sequence.truth() is not None
+    assert (folder / "contact_sheet.png").is_file()
+    if "--truth" in words:
+        assert {"phasor.1", "z_depth", "normal", "ambient"} <= set(sequence.truth().layers)
+    wanted = {
+        "--format capture": (folder / "capture.json").is_file(),
+        "--format torf": sequence.from_phasors,
+        "--flow": bool(sequence.forward_flow),
+    }
+    assert all(there for option, there in wanted.items() if option in line)
+
+
+def test_the_readme_tells_of_everything_there_is_to_simulate():
+    """Meshes, gloss, blur, bounces, sensors, levels, captures, phasors, resuming; every option of the command."""
+    for word in (
+        ".toml",
+        "--engine mesh",
+        "gloss",
+        "--exposure-samples",
+        "--bounces",
+        "sensor=",
+        "--level",
+        "--ladder",
+    ):
+        assert any(word in line for line in SIMULATE), word
+    for word in ("--format capture", "--format torf", "--truth all", "ambient", "--override emitter"):
+        assert any(word in line for line in SIMULATE), word
+    for word in ("--list", "seq.partial", "--fresh"):
+        assert word in README, word
+    from gftorf_warp.sim.sensors import SENSORS
+
+    assert all(f"`{name}`" in README for name in SENSORS)
+
+
+def test_what_the_readme_says_may_be_typed():
+    """Options that are printed exist."""
+    commands = options.command_parsers()
+    typed = [
+        line for line in LINES if "COMMAND" not in line and "SCENE" not in line and shlex.split(line)[1] in commands
+    ]
+    assert len(typed) > 20
+    for line in typed:
+        words = shlex.split(line)[1:]
+        if len(words) > 1 and not any(word.isupper() for word in words):
+            assert options.parse(words).command == words[0], line
