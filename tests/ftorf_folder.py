@@ -19,6 +19,7 @@ CAPTURE_ONLY = {
     "sensor",
     "amplitude",
     "body",
+    "layers",
 }  # what only format capture stores
 
 
