@@ -99,10 +99,10 @@ def test_quartets_may_have_rates_and_moments_of_their_own():
     assert betas_of(quartet) == pytest.approx((0.6561, 0.996006), rel=1e-6)
     assert betas_of(released) == BETAS
     for name, rate in rates_at(released, 5000).items():
-        assert rates_at(quartet, 5000)[name] == pytest.approx(2 * rate)
-    linear = replace(quartet, schedule=replace(quartet.schedule, batch_rule=BatchRule.LINEAR))
-    assert betas_of(linear) == betas_of(quartet)
-    assert rates_at(linear, 5000)["mean"] == pytest.approx(4 * rates_at(released, 5000)["mean"])
+        assert rates_at(quartet, 5000)[name] == pytest.approx(4 * rate)
+    root = replace(quartet, schedule=replace(quartet.schedule, batch_rule=BatchRule.ROOT))
+    assert betas_of(root) == betas_of(quartet)
+    assert rates_at(root, 5000)["mean"] == pytest.approx(2 * rates_at(released, 5000)["mean"])
     without = replace(quartet, schedule=replace(quartet.schedule, batch_rule=BatchRule.NONE))
     phasors = presets.released(Recorded(input=Input.PHASOR))
     phasors = replace(phasors, schedule=replace(phasors.schedule, batch=Batch.QUARTET))

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+import warp as wp
 
 from .. import __version__
 from ..data.files import write_json
@@ -186,8 +187,6 @@ def checked(parts: list[str]) -> list[str]:
 
 def about(device: str) -> dict[str, Any]:
     """The machine and the versions, as every result states them."""
-    import importlib.metadata
-
     on_cpu = device == "cpu"
     name = platform.processor() or platform.machine()
     return {
@@ -195,7 +194,7 @@ def about(device: str) -> dict[str, Any]:
         "cpus": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
         "driver": "no driver" if on_cpu else f"driver {_driver()}",
         "python": platform.python_version(),
-        "warp": f"Warp {importlib.metadata.version('warp-lang')}",
+        "warp": f"Warp {wp.__version__}",
         "torch": f"torch {torch.__version__}",
         "gftorf_warp": __version__,
         "commit": _commit(),

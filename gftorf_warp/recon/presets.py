@@ -143,7 +143,7 @@ def released(recorded: Recorded = Recorded()) -> ReconSettings:
         schedule=replace(
             base.schedule,
             images=20_000,
-            batch_rule=BatchRule.ROOT,  # of single frames, as published, it changes nothing
+            batch_rule=BatchRule.LINEAR,  # of single frames, as published, it changes nothing
             motion_decay_from=2000,
             pause_after_reset=200,
             freeze_from=base.densify.stop_share if base.densify.stop_share < 1.0 else None,
