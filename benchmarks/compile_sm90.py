@@ -18,7 +18,24 @@ from pathlib import Path
 
 import warp as wp
 
-from gftorf_warp.kernels import composite, composite_backward, paths, project, resolve, splat, tiles, trace
+from gftorf_warp.kernels import (
+    adam,
+    composite,
+    composite_backward,
+    displace,
+    finish,
+    flow,
+    move,
+    noise,
+    paths,
+    project,
+    resolve,
+    similarity,
+    splat,
+    sums,
+    tiles,
+    trace,
+)
 from gftorf_warp.render.buffers import TILE_SHAPES
 
 FRAME_SIZE, REGISTERS = 0x11, 0x2F  # attributes in the .nv.info section of a cubin
@@ -36,21 +53,41 @@ def modules() -> dict[str, wp.Module]:
         "tiles": tiles.count_pairs.module,
         "resolve": resolve.resolve_quads.module,
         "splat": splat.add_records.module,
+        "move": move.move_gaussians.module,
+        "noise": noise.uniform_noise.module,
+        "adam sizes": adam.adam_sizes.module,
+        "adam": adam.make_adam(1).module,
+        "displace": displace.displace.module,
+        "finish": finish.judge.module,
+        "flow": flow.flow_errors.module,
+        "sums": sums.means.module,
         "trace": trace.trace_hits.module,
         "paths": paths.trace_light.module,
     }
+    window = similarity.make_similarity(1)
+    for name in ("columns_of_products", "compare_images", "columns_of_slopes", "gradient_of_image"):
+        found[name] = getattr(window, name).module
     found["finish_moments"] = composite_backward.finish_moments.module
     for colour in (False, True):
         for square in (False, True):
             kernel = project.make_project(colour, square)
             found["project" + " colour" * colour + " square" * square] = kernel.module
-    for light, channels in ((True, False), (True, True), (False, True)):
-        what = " ".join(["light"] * light + ["channels"] * channels)
-        for metric in (True, False):
-            name = f"{what} {'paper' if metric else 'released'}"
-            forward = composite.make_composite(*shape, light, channels, metric, metric)
-            backward = composite_backward.make_composite_backward(*shape, light, channels, not metric, metric)
-            found[f"composite {name}"], found[f"composite_backward {name}"] = forward.module, backward.module
+    for light, channels, fixed in (
+        (True, False, False), (True, True, False), (True, True, True), (False, True, False), (False, True, True)
+    ):  # fmt: skip
+        what = " ".join(["light"] * light + ["channels"] * channels + ["fixed"] * fixed)
+        for metric in (True, False, None) if light else (None,):
+            name = f"{what} {'without' if metric is None else 'paper' if metric else 'released'}"
+            ways = {"": (True, False), " by entries": (False, False)}
+            if light and channels:
+                ways[" and three more"] = True, True
+            for way, (rounds, more) in ways.items():
+                forward = composite.make_composite(*shape, light, channels, bool(metric), metric, rounds, more)
+                arguments = *shape, light, channels, not metric, metric, fixed, rounds, more
+                backward = composite_backward.make_composite_backward(*arguments)
+                if not fixed:
+                    found[f"composite {name}{way}"] = forward.module
+                found[f"composite_backward {name}{way}"] = backward.module
     return found
 
 

@@ -20,8 +20,8 @@ from pathlib import Path
 import naive
 import numpy as np
 import warp as wp
-from surfaces import CAMERA, FAR, HEIGHT, NEAR, WIDTH, inputs_of, surface
 
+from gftorf_warp.bench.scenes import CAMERA, FAR, HEIGHT, NEAR, WIDTH, inputs_of, surface
 from gftorf_warp.kernels.composite import CHANNEL_PLANES
 from gftorf_warp.kernels.composite_backward import GRAD_LIGHT_PLANES
 from gftorf_warp.kernels.splat import Splat
@@ -41,10 +41,10 @@ class Ours:
         stages.sort_by_depth(self.frame)
         stages.sort_by_tile(self.frame)
         self.frame.records = [self.frame.splats]
-        self.frame.channels = [self.frame.planes(CHANNEL_PLANES)]
+        self.frame.channels = [self.frame.planes("channels 0", CHANNEL_PLANES)]
         self.grad_light, self.grad_channel = (
-            self.frame.gradient_planes(GRAD_LIGHT_PLANES),
-            self.frame.gradient_planes(CHANNEL_PLANES),
+            self.frame.gradient_planes("gradient of light", GRAD_LIGHT_PLANES),
+            self.frame.gradient_planes("gradient of channels 0", CHANNEL_PLANES),
         )
         rng = np.random.default_rng(1)
         for planes in (self.grad_light, self.grad_channel):

@@ -7,6 +7,7 @@ This is the only file that names a device.
 from __future__ import annotations
 
 import argparse
+import functools
 import logging
 import os
 import sys
@@ -177,6 +178,11 @@ def _reconstruct(options: argparse.Namespace) -> int:
     device = start(options)
     from .recon.train import reconstruct
 
+    changes = list(options.set)
+    if options.batch is not None:
+        changes.append("schedule.batch=" + {1: "frame", 4: "quartet"}[options.batch])
+    if options.deterministic:
+        changes.append("render.deterministic=true")
     run = reconstruct(
         sequence,
         options.out,
@@ -184,7 +190,7 @@ def _reconstruct(options: argparse.Namespace) -> int:
         images=options.images,
         input=options.input,
         ablation=options.ablation,
-        changes=options.set,
+        changes=changes,
         flow=options.flow,
         seed=options.seed,
         device=device,
@@ -236,6 +242,21 @@ def _doctor(options: argparse.Namespace) -> int:
     return 0 if passed else 1
 
 
+def _bench(options: argparse.Namespace) -> int:
+    from pathlib import Path
+
+    device = start(options)
+    from .bench.command import Wanted, bench
+
+    folders = {name: Path(getattr(options, name)) for name in ("sequence", "run") if getattr(options, name)}
+    chosen = {"quick": options.quick, "images": options.images, "preset": options.preset, **folders}
+    wanted = Wanted(device=device, changes=tuple(options.set), **chosen)
+    bench(
+        options.parts, wanted, json=options.json, progress=_progress(options), say=functools.partial(print, flush=True)
+    )
+    return 0
+
+
 COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
     "demo": _demo,
     "simulate": _simulate,
@@ -244,6 +265,7 @@ COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
     "compare": _compare,
     "check": _check,
     "doctor": _doctor,
+    "bench": _bench,
 }
 
 

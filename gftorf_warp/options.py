@@ -129,6 +129,10 @@ def command_parsers() -> dict[str, Parser]:
     single = "change one setting, for example init.reflectivity=0.5; config.json of a run names all (may be repeated)"
     reconstruct.add_argument("--set", metavar="NAME=VALUE", action="append", default=[], help=single)
     reconstruct.add_argument("--images", metavar="N", type=_positive, help="raw frames to optimise (the preset's own)")
+    batch = "raw frames of a step: 1, or 4 for those of a quartet (the preset's own)"
+    reconstruct.add_argument("--batch", metavar="N", type=int, choices=(1, 4), help=batch)
+    order = "sum gradients in one order on CUDA, too, so that equal runs give equal bytes; slower"
+    reconstruct.add_argument("--deterministic", action="store_true", help=order)
     flows = "the folder's, computed, or none; auto: the folder's if it has any, else dis"
     reconstruct.add_argument("--flow", metavar="KIND", help=f"auto, file, dis, deepflow or none: optical flow, {flows}")
     _seed_option(reconstruct, "seed of the optimiser (0)")
@@ -164,7 +168,26 @@ def command_parsers() -> dict[str, Parser]:
     doctor = _command("doctor", "print versions and devices, and test the renderer on this machine")
     _device_options(doctor)
 
-    parsers = (demo, simulate, reconstruct, render, compare, check, doctor)
+    bench = _command("bench", "measure what things cost: tables, and JSON")
+    parts = "renderer, motion, step, reconstruction, render (all of them)"
+    bench.add_argument("parts", metavar="PART", nargs="*", help=parts)
+    bench.add_argument(
+        "--quick", action="store_true", help="small sizes, few runs: whether it works, not what it costs"
+    )
+    bench.add_argument("--json", metavar="FILE", help="file for everything that was measured")
+    bench.add_argument("--sequence", metavar="SEQ", help="folder of a sequence (a simulated scene that slides past)")
+    state = "run whose state is timed by step and render (one made from measured phase)"
+    bench.add_argument("--run", metavar="RUN", help=state)
+    lengths = "images of step, reconstruction and render (their own numbers)"
+    bench.add_argument("--images", metavar="N", type=_positive, help=lengths)
+    bench.add_argument(
+        "--preset", metavar="NAME", help="of step and reconstruction (released; on a CPU demo for the latter)"
+    )
+    single = "change one setting of step and reconstruction, as in reconstruct (may be repeated)"
+    bench.add_argument("--set", metavar="NAME=VALUE", action="append", default=[], help=single)
+    _device_options(bench)
+
+    parsers = (demo, simulate, reconstruct, render, compare, check, doctor, bench)
     return {parser.prog.split()[-1]: parser for parser in parsers}
 
 

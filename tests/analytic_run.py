@@ -149,6 +149,10 @@ class AnalyticRun:
         """The sequence this run pretends to be made from."""
         return Sequence.open(self.config["sequence"])
 
+    def renderer(self, images=()):  # noqa: ARG002
+        """What ``gftorf render`` asks for every image."""
+        return self.render
+
     def render(self, time, camera=None, *, extra=None):
         """Truth and its quads at the nearest raw frame, plus the known errors."""
         assert extra is None

@@ -35,12 +35,20 @@ TABLE = {  # room: (rooms it may import besides itself, packages it may import);
     "sim": ({"data", "kernels", "render", "scene"}, TORCH | {"trimesh"}),
     "recon": ({"data", "losses", "render", "scene"}, TORCH | {"cv2"}),
     "evaluate": ({"data", "losses", "recon", "render", "scene"}, TORCH | {"cv2", "matplotlib"}),
+    "bench": ({"data", "evaluate", "recon", "render", "scene", "sim"}, TORCH | {"warp"}),
 }
 FREE = {"constants", "errors", "__version__"}
-HAS_BOTH = "render/bridge.py"  # the only module that may know torch and Warp together
+HAS_BOTH = {  # the only modules that may know torch and Warp together
+    "render/bridge.py": "a rendering, and its gradient",
+    "render/fused.py": "what a step does beside rendering: other kernels and callers",
+    "render/descent.py": "the end of a step: Adam and what judges it, of many tensors at once",
+    "render/replay.py": "renderings of a finished run: a field of torch, a graph of Warp",
+}
 LAUNCHES = {  # file: what it launches
     "render/launch.py": "the order of a rendering",
     "render/stages.py": "the stages of a rendering",
+    "render/training.py": "what a step does beside rendering",
+    "render/replay.py": "Gaussians at a time, before they are rendered again",
     "render/trace.py": "rays through meshes, which share nothing with a rendering",
 }
 KNOWS_KINDS = {"render/buffers.py": "the shape of a tile depends on the kind of device, which is the input's"}
@@ -93,8 +101,8 @@ def test_module_imports_what_its_room_may(path):
         if top_level and top == "gftorf_warp" and rest:
             assert rest[0] not in TABLE or rest[0] in FREE, f"import {rest[0]} inside functions: --help stays instant"
         assert not top_level or top == "gftorf_warp" or top in sys.stdlib_module_names, f"import {top} inside functions"
-    if name_of(path) != HAS_BOTH and not top_level:
-        assert not {"torch", "warp"} <= {n.partition(".")[0] for n in names}, f"only {HAS_BOTH} knows torch and Warp"
+    if name_of(path) not in HAS_BOTH and not top_level:
+        assert not {"torch", "warp"} <= {n.partition(".")[0] for n in names}, f"only {[*HAS_BOTH]} know torch and Warp"
 
 
 @pytest.mark.parametrize("path", FILES, ids=name_of)
@@ -102,7 +110,7 @@ def test_module_names_no_device_and_launches_nowhere_else(path):
     """Devices are named by the command line; kernels are launched where ``LAUNCHES`` says; streams are the bridge's."""
     for node in ast.walk(ast.parse(path.read_text())):
         if path.parent != ROOT:
-            named = getattr(node, "attr", None) == "cuda" and name_of(path) != HAS_BOTH
+            named = getattr(node, "attr", None) == "cuda" and name_of(path) != "render/bridge.py"
             assert not named, f"line {node.lineno}: follow the device of the input"
             text = node.value if isinstance(node, ast.Constant) and name_of(path) not in KNOWS_KINDS else None
             assert not (isinstance(text, str) and re.fullmatch(r"cuda(:\d+)?", text)), f"line {node.lineno}: {text}"

@@ -71,7 +71,7 @@ def test_help_names_every_command(capsys):
     """The top page lists what there is."""
     assert cli.main(["--help"]) == 0
     text = capsys.readouterr().out
-    for name in ("demo", "simulate", "reconstruct", "render", "compare", "check", "doctor"):
+    for name in ("demo", "simulate", "reconstruct", "render", "compare", "check", "doctor", "bench"):
         assert f"\n  {name} " in text
         assert name in cli.COMMANDS
     assert set(options.command_parsers()) == set(cli.COMMANDS)
@@ -110,6 +110,9 @@ def test_module_and_script_are_the_same():
         ("compare --json RUN", "run_folder", "RUN"),
         ("check SEQ", "sequence", "SEQ"),
         ("doctor", "command", "doctor"),
+        ("bench", "parts", []),
+        ("bench step render --quick --json FILE", "parts", ["step", "render"]),
+        ("bench --sequence SEQ --run RUN --images 8 --device cpu", "images", 8),
         ("-q check SEQ", "quiet", True),
     ],
 )

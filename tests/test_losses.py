@@ -75,12 +75,6 @@ def test_quad_error_compares_equal_shapes_only():
         tof.quad_error(a, b[:1])
 
 
-def test_phasor_error_does_not_look_at_the_amplitude():
-    """Re and im say it already."""
-    rendered, measured = draw(3, 4, 5), draw(2, 4, 5, seed=1)
-    torch.testing.assert_close(tof.phasor_error(rendered, measured), (rendered[:2] - measured) ** 2)
-
-
 CAMERA = Camera(width=6, height=4, fx=5.0, fy=6.0, cx=3.2, cy=1.9)
 
 

@@ -109,6 +109,10 @@ class Measured:
         """The sensor."""
         return SENSOR
 
+    def rays_at(self, frame):
+        """Centre and rays of the camera."""
+        return torch.tensor(self.cameras[frame].centre, dtype=torch.float32), self.cameras[frame].rays()
+
 
 def wall_flow(camera, step, half=0.0):
     """[2, H, W] flow of a wall at z = 2 m that moves by ``step`` in camera axes; pixel centres at i + 0.5 - half."""

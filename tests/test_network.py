@@ -52,12 +52,13 @@ def test_it_computes_what_the_method_says():
     position = random(40, 3) * 6 - 3
     for settings in (MotionSettings(), MotionSettings(layers=4, width=32)):
         made = network(settings, head=0.1)
-        found = made.key_offsets(position, [0, 2, 3])
+        place = made.attach(field(position, None))
+        found = made.key_offsets(place, [0, 2, 3])
         for row, key in zip(found, (0, 2, 3), strict=True):
             want = spelt_out(copy.deepcopy(made).double(), position, key)
             assert want.abs().max() > 0.01
             torch.testing.assert_close(row.double(), want, rtol=1e-4, atol=1e-5)
-            torch.testing.assert_close(made.key_offset(position, key), row, rtol=1e-4, atol=1e-6)
+            torch.testing.assert_close(made.key_offset(place, key), row, rtol=1e-4, atol=1e-6)
     assert (found[0] - found[1]).abs().max() > 1e-3, "it depends on time"
 
 
@@ -81,8 +82,9 @@ def test_gradients_reach_every_weight_and_no_position():
 def test_it_starts_at_rest_and_the_same_for_a_seed():
     """To a fraction of a millimetre."""
     position = random(200, 3) * 6 - 3
-    assert network().displacement(position, 0.05).abs().max() < 5e-4
-    assert network().displacement(position, 0.05).abs().max() > 0
+    made = network()
+    moved = made.displacement(made.attach(field(position, None)), 0.05).abs().max()
+    assert 0 < moved < 5e-4
     for one, other in zip(network(seed=3).parameters(), network(seed=3).parameters(), strict=True):
         assert torch.equal(one, other)
     assert not torch.equal(network(seed=3).head.weight, network(seed=4).head.weight)
@@ -120,8 +122,11 @@ def test_rounded_products_have_the_right_gradients():
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
 def test_rounded_products_change_offsets_by_a_thousandth_on_cuda():
     """And do change them: otherwise the switch does nothing."""
-    position = (random(500, 3) * 6 - 3).to("cuda")
-    exact, rounded = (network(MotionSettings(products=kind), head=0.1).to("cuda") for kind in Products)
+    gaussians = field(random(500, 3) * 6 - 3, None).map(lambda value: value.to("cuda"))
+    exact, rounded = (
+        network(MotionSettings(products=kind), head=0.1).to("cuda") for kind in (Products.FLOAT32, Products.TF32)
+    )
     with torch.no_grad():
-        a, b = exact.key_offsets(position, [0, 2]), rounded.key_offsets(position, [0, 2])
+        place = exact.attach(gaussians)
+        a, b = exact.key_offsets(place, [0, 2]), rounded.key_offsets(place, [0, 2])
     assert 0 < (a - b).abs().max() < 5e-3 * a.abs().max()

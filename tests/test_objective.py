@@ -139,3 +139,19 @@ def test_reflectivity_can_start_clamped_and_recover():
         state.optimiser.tensors["reflectivity_sh"][::2] = constant_sh(torch.tensor(-1.0))
     assert step.step(state, observations, settings) is None
     assert all(leaf.isfinite().all() for leaf in state.optimiser.leaves)
+
+
+def test_rays_are_computed_once_per_pose():
+    """The same tensors for all frames of one pose, and those of its camera."""
+    observations = observe(small(), demo(), "cpu")
+    centre, ray = observations.rays_at(4)
+    assert torch.equal(ray, observations.cameras[4].rays())
+    assert observations.rays_at(8)[1] is ray
+    pose = np.diag([-1.0, 1.0, -1.0, 1.0])
+    pose[0, 3] = 0.5
+    turned = observations.cameras[5].at(pose)
+    moving = replace(observations, cameras=[*observations.cameras[:5], turned, *observations.cameras[6:]])
+    other_centre, other = moving.rays_at(5)
+    assert torch.equal(other, turned.rays())
+    assert not torch.equal(other, ray)
+    torch.testing.assert_close(other_centre - centre, torch.tensor([0.5, 0.0, 0.0]))

@@ -1,13 +1,16 @@
 """Rates, Adam's first step, clipping, and groups that rest."""
 
 import dataclasses
+from dataclasses import replace
 
 import pytest
 import torch
 from small_runs import KEYS, field, random
 
-from gftorf_warp.recon.optimiser import Optimiser, rates_at
-from gftorf_warp.recon.settings import Rates, ReconSettings, Schedule
+from gftorf_warp.recon import presets
+from gftorf_warp.recon.optimiser import BETAS, Optimiser, betas_of, rates_at
+from gftorf_warp.recon.presets import Recorded
+from gftorf_warp.recon.settings import Batch, BatchRule, Input, Rates, ReconSettings, Schedule
 from gftorf_warp.scene.motion import Nodes, Still
 
 RATES = Rates(mean=1e-2, log_scale=2e-2, quaternion=3e-2, opacity_logit=4e-2, reflectivity_sh=5e-2, motion=6e-2)
@@ -87,3 +90,38 @@ def test_a_field_without_motion_has_no_motion_group():
     assert [group["name"] for group in adam.adam.param_groups] == list(adam.tensors)
     adam.step([torch.ones_like(leaf) for leaf in adam.leaves], rates_at(SETTINGS, 200), 1.0)
     assert adam.field.mean.isfinite().all()
+
+
+def test_quartets_may_have_rates_and_moments_of_their_own():
+    """Rates times two, or four, decays to the power of four; only where a step compares four images."""
+    released = presets.released()
+    quartet = replace(released, schedule=replace(released.schedule, batch=Batch.QUARTET))
+    assert betas_of(quartet) == pytest.approx((0.6561, 0.996006), rel=1e-6)
+    assert betas_of(released) == BETAS
+    for name, rate in rates_at(released, 5000).items():
+        assert rates_at(quartet, 5000)[name] == pytest.approx(4 * rate)
+    root = replace(quartet, schedule=replace(quartet.schedule, batch_rule=BatchRule.ROOT))
+    assert betas_of(root) == betas_of(quartet)
+    assert rates_at(root, 5000)["mean"] == pytest.approx(2 * rates_at(released, 5000)["mean"])
+    without = replace(quartet, schedule=replace(quartet.schedule, batch_rule=BatchRule.NONE))
+    phasors = presets.released(Recorded(input=Input.PHASOR))
+    phasors = replace(phasors, schedule=replace(phasors.schedule, batch=Batch.QUARTET))
+    for same, single in ((without, released), (phasors, presets.released(Recorded(input=Input.PHASOR)))):
+        assert betas_of(same) == BETAS
+        assert rates_at(same, 5000) == rates_at(single, 5000)
+    for settings in (presets.paper(), presets.demo()):
+        assert settings.schedule.batch_rule == BatchRule.NONE
+
+
+def test_decays_of_an_optimiser_are_stored_with_it():
+    """And are those of both its steps: four gradients are remembered as one of quartets is."""
+    adam, motion = optimiser()
+    own = Optimiser(adam.field, motion, betas=(0.6561, 0.996))
+    gradients = [torch.ones_like(leaf) for leaf in own.leaves]
+    for sound in (None, torch.tensor(True)):
+        for state in own.adam.state.values():
+            state["exp_avg"].zero_()
+        own.step(list(gradients), rates_at(SETTINGS, 200), None, sound=sound)
+        first = own.adam.state[own.tensors["mean"]]["exp_avg"]
+        torch.testing.assert_close(first, torch.full_like(first, 1 - 0.6561), rtol=1e-5, atol=0)
+    assert Optimiser(own.field, motion, own.adam.state_dict()).betas == (0.6561, 0.996)

@@ -20,6 +20,7 @@ from gftorf_warp.recon.settings import Input
 from gftorf_warp.recon.state import begin, from_dict, to_dict
 from gftorf_warp.recon.train import reconstruct
 from gftorf_warp.scene.initialise import Init
+from gftorf_warp.scene.motion import Products
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA"))]
 
@@ -77,11 +78,13 @@ def test_phasors_with_colour(tmp_path, name, device):
         assert "colour" not in found[0]
 
 
-def test_a_run_with_a_network_stops_and_goes_on_to_the_same_bytes(tmp_path):
+@pytest.mark.parametrize("products", [Products.FLOAT32, Products.HALF])
+def test_a_run_with_a_network_stops_and_goes_on_to_the_same_bytes(tmp_path, products):
     """Across a densification and a reset; scored in between, it says how far it was."""
     path = ftorf.write(tmp_path / "seq", *recording(frames=12))
     settings = small("released", 120)
     settings = replace(settings, schedule=replace(settings.schedule, checkpoint_every_s=0.0))
+    settings = replace(settings, motion=replace(settings.motion, products=products))
     whole = reconstruct(path, tmp_path / "whole", settings)
 
     def stop(images, *_, **__):
@@ -97,6 +100,31 @@ def test_a_run_with_a_network_stops_and_goes_on_to_the_same_bytes(tmp_path):
     assert same(stored(again.path), stored(whole.path))
     assert rows(again.path) == rows(whole.path)
     assert (again.path / "diagnostics.jsonl").read_text() == (whole.path / "diagnostics.jsonl").read_text()
+
+
+def test_a_step_beyond_the_range_of_halves_changes_nothing():
+    """And the next one, within it, does."""
+    settings = small("released", 80)
+    settings = replace(settings, motion=replace(settings.motion, products=Products.HALF))
+    settings = replace(settings, schedule=replace(settings.schedule, warm_up=0))
+    observations = observe(recording(frames=12)[0], settings, "cpu")
+    state = begin(observations, settings, seed=0, device="cpu")
+    weights = [layer.weight for layer in state.motion.layers]
+
+    def scaled(factor):
+        with torch.no_grad():
+            weights[0] *= factor
+            weights[1] /= factor
+        return [leaf.detach().clone() for leaf in state.optimiser.leaves]
+
+    before = scaled(2.0**20)
+    assert step.step(state, observations, settings) is not None
+    assert all(map(torch.equal, before, state.optimiser.leaves))
+    scaled(2.0**-20)
+    before = [weight.detach().clone() for weight in weights]
+    for _ in range(2):
+        assert step.step(state, observations, settings) is None
+    assert not any(map(torch.equal, before, weights))
 
 
 def test_a_run_that_could_not_start_can_be_started_again(tmp_path):

@@ -1,6 +1,7 @@
 """The renderer from a Warp program: gradients through wp.Tape, and the CUDA mapping of the kernels run on the CPU."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,7 +10,8 @@ import warp as wp
 
 from gftorf_warp.render import buffers, launch
 from gftorf_warp.render.api import Background, rasterize
-from gftorf_warp.render.buffers import Frame, RenderSettings
+from gftorf_warp.render.bridge import captured
+from gftorf_warp.render.buffers import Frame, RenderSettings, Workspace
 from gftorf_warp.render.launch import Images, Inputs
 from gftorf_warp.scene.camera import Camera
 from gftorf_warp.scene.gaussians import GaussianField, constant_sh
@@ -171,3 +173,81 @@ def test_torch_does_not_wait_for_the_host_either():
             (images.quads.square().sum() + images.distance.sum()).backward()
         finally:
             torch.cuda.set_sync_debug_mode("default")
+
+
+def rendered_in(workspace, device="cpu", shift=0.0):
+    """Return images and gradients of a rendering in ``workspace``, all with a random derivative."""
+    field, extra, background = scene(device)
+    field = field.map(lambda t: t.detach().requires_grad_())
+    moved = field.moved(torch.full((1, 3), shift, device=device))
+    backdrop = Background(quads=background)
+    rendering = rasterize(
+        moved, CAMERA, SENSOR, SETTINGS, extra=extra, background=backdrop, screen_gradient=True, workspace=workspace
+    )
+    seeds = cotangents(device)
+    images = {name: getattr(rendering, name) for name in seeds}
+    grads = torch.autograd.grad(list(images.values()), list(field.parameters().values()), list(seeds.values()))
+    return [*images.values(), *grads, rendering.screen.gradient]
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_workspace_changes_nothing_and_allocates_once(device):
+    """Renderings in one workspace equal those in memory of their own, and the second one finds all memory there."""
+    workspace = Workspace()
+    for shift in (0.0, 0.05, 0.0):
+        for got, want in zip(rendered_in(workspace, device, shift), rendered_in(None, device, shift), strict=True):
+            torch.testing.assert_close(
+                got, want, rtol=0 if device == "cpu" else 1e-4, atol=0 if device == "cpu" else 1e-4
+            )
+    kind = COUNT, WIDTH, HEIGHT, SETTINGS, wp.get_device(device)
+    frame = workspace.frame(*kind)
+    held = {name: array.ptr for name, array in frame._arrays.items() if name not in ("keys", "ids")}
+    assert len(held) > 12
+    rendered_in(workspace, device)
+    assert workspace.frame(*kind) is frame
+    assert {name: frame._arrays[name].ptr for name in held} == held
+    assert workspace.frame(COUNT + 1, *kind[1:]) is not frame
+
+
+def test_backward_after_the_next_rendering_in_a_workspace_is_an_error():
+    """Its memory holds the next rendering by then."""
+    field, _, _ = scene()
+    workspace = Workspace()
+    mean = field.mean.clone().requires_grad_()
+    first = rasterize(replace(field, mean=mean), CAMERA, SENSOR, SETTINGS, workspace=workspace)
+    rasterize(field, CAMERA, SENSOR, SETTINGS, workspace=workspace)
+    with pytest.raises(ValueError, match="rendered again since"):
+        first.quads.sum().backward()
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_torch_captures_a_rendering_and_its_backward_pass():
+    """A graph of torch holds both passes; its replay sees new inputs, and a stream survives all renderings on it."""
+    field, extra, background = scene("cuda")
+    settings, workspace = RenderSettings(near=0.1, far=20.0, pair_capacity=20_000), Workspace()
+    mean = field.mean.clone().requires_grad_()
+    grad = torch.zeros_like(mean)
+
+    def both():
+        moving, backdrop = replace(field, mean=mean), Background(quads=background)
+        rendering = rasterize(moving, CAMERA, SENSOR, settings, extra=extra, background=backdrop, workspace=workspace)
+        grad.copy_(torch.autograd.grad(rendering.quads.square().sum() + rendering.extra.sum(), mean)[0])
+        return rendering.quads
+
+    stream = torch.cuda.Stream()
+    stream.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(stream):
+        for _ in range(3):
+            both()
+    stream.synchronize()
+    graph = torch.cuda.CUDAGraph()
+    with captured(graph, stream):
+        quads = both()
+    with torch.no_grad():
+        mean += 0.01
+    graph.replay()
+    replayed = quads.clone(), grad.clone()
+    called = both()
+    workspace.check_capacity()
+    torch.testing.assert_close(replayed[0], called, rtol=0, atol=0)
+    torch.testing.assert_close(replayed[1], grad, rtol=1e-4, atol=1e-4)

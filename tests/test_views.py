@@ -11,8 +11,8 @@ import torch
 from analytic_run import FRAMES, HEIGHT, WIDTH, AnalyticRun, true_distance, with_colour
 
 from gftorf_warp.data.images import read_exr
-from gftorf_warp.errors import InputError, UsageError
-from gftorf_warp.evaluate import pictures, renders
+from gftorf_warp.errors import InputError, ResourceError, UsageError
+from gftorf_warp.evaluate import pictures, renders, views
 from gftorf_warp.evaluate.views import channel_of_shift, render_to_folder
 from gftorf_warp.scene.sensor import Sensor
 
@@ -74,6 +74,21 @@ def test_chosen_times_and_things(run, tmp_path):
     np.testing.assert_array_equal(rgb[:, :WIDTH], pictures.colour_mapped(phase, pictures.phase_scale()))
     assert rgb[0, -1, 0] < rgb[4, WIDTH + 2 + 11, 0], "the box is nearer, so brighter"
     assert len(list((out / "phasor").iterdir())) == 4
+
+
+def test_writing_reports_in_order_and_stops_at_the_first_error(run, tmp_path, monkeypatch):
+    """Files are written by threads: progress still counts up, and what stops one of them stops the command."""
+    seen = []
+    render_to_folder(run, tmp_path / "out", what="distance", progress=lambda *done: seen.append(done))
+    assert seen == [(k + 1, FRAMES) for k in range(FRAMES)]
+
+    def full(path, _):
+        if path.name == "000003.png":
+            raise ResourceError("no space left", where=path, why="full", fix="free some")
+
+    monkeypatch.setattr(views, "write_png", full)
+    with pytest.raises(ResourceError, match=r"000003\.png"):
+        render_to_folder(run, tmp_path / "other", what="distance")
 
 
 def taken(run):

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
+import torch
 from jaxtyping import Float, UInt8
 
 from ..data.files import write_json
@@ -19,7 +20,13 @@ from . import pictures
 
 LIST = "renders.json"
 LISTED = ("run", "times_s", "camera_from_world", "channels")  # its keys that say which images these are
-WHAT = ("distance", "quads", "phasor", "colour")
+NEEDS = {  # what may be asked for: the images of a rendering that it consists of
+    "distance": ("distance", "opacity"),
+    "quads": ("quads",),
+    "phasor": ("phasor",),
+    "colour": ("colour",),
+}
+WHAT = tuple(NEEDS)
 Channels = dict[str, Float[np.ndarray, "H W"]]
 
 
@@ -55,11 +62,11 @@ def channels(name: str, rendering: Rendering, sensor: Sensor) -> Channels:
         UsageError: If colour is asked for and the field has none.
     """
     if name == "distance":
-        images = {"distance": rendering.distance, "opacity": rendering.opacity}
+        names, images = ["distance", "opacity"], torch.stack([rendering.distance, rendering.opacity])
     elif name == "quads":
-        images = {f"quad_{math.degrees(s):03.0f}": quad for s, quad in zip(sensor.shifts, rendering.quads, strict=True)}
+        names, images = [f"quad_{math.degrees(shift):03.0f}" for shift in sensor.shifts], rendering.quads
     elif name == "phasor":
-        images = dict(zip(("re", "im", "amplitude"), rendering.phasor, strict=True))
+        names, images = ["re", "im", "amplitude"], rendering.phasor
     elif rendering.colour is None:
         raise UsageError(
             "no colour to render",
@@ -68,8 +75,9 @@ def channels(name: str, rendering: Rendering, sensor: Sensor) -> Channels:
             fix="leave colour out of --what",
         )
     else:
-        images = dict(zip("RGB", rendering.colour, strict=True))
-    return {key: image.detach().cpu().numpy().astype(np.float32) for key, image in images.items()}
+        names, images = [*"RGB"], rendering.colour
+    host = images.detach().cpu().numpy().astype(np.float32)  # one transfer, and memory of its own
+    return dict(zip(names, host, strict=True))
 
 
 def preview_scale(name: str, samples: Iterable[Channels]) -> pictures.Scale:

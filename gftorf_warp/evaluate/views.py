@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterable
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -26,6 +28,9 @@ from .poses import read as read_poses
 
 if TYPE_CHECKING:
     from ..recon.run import Run
+
+WRITERS = 4  # threads that compress and flush files while the next images are rendered
+WAITING = 16  # images at most that are rendered and not written: what memory holds
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -175,11 +180,9 @@ def render_to_folder(
     sequence = run.sequence()
     seconds, cameras = views_to_take(run, sequence, times, poses)
 
-    def images_at(index: int) -> dict[str, renders.Channels]:
-        rendering = run.render(seconds[index], cameras[index])
-        return {name: renders.channels(name, rendering, run.sensor) for name in names}
-
-    samples = [images_at(i) for i in sorted({0, len(seconds) // 2, len(seconds) - 1})]
+    render = run.renderer({image for name in names for image in renders.NEEDS[name]})
+    images = images_of(render, run.sensor, names)
+    samples = [images(seconds[i], cameras[i]) for i in sorted({0, len(seconds) // 2, len(seconds) - 1})]
     scales = {name: renders.preview_scale(name, (sample[name] for sample in samples)) for name in names}
     out = Path(out)
     listed = {
@@ -192,14 +195,36 @@ def render_to_folder(
     renders.make_room(out, listed, fresh=fresh)
     for name in names:
         (out / name).mkdir(exist_ok=True)
-    for index in range(len(seconds)):
-        for name, images in images_at(index).items():
+
+    def write(index: int, found: dict[str, renders.Channels]) -> None:
+        for name, channels in found.items():
             exr, png = renders.paths(out, name, index)
-            write_exr(exr, images)
-            write_png(png, renders.preview(name, images, scales[name]))
-        if progress is not None:
-            progress(index + 1, len(seconds))
+            write_exr(exr, channels)
+            write_png(png, renders.preview(name, channels, scales[name]))
+
+    with ThreadPoolExecutor(WRITERS, thread_name_prefix="gftorf-files") as threads:
+        waiting: deque[Future] = deque()
+        for index, (time, camera) in enumerate(zip(seconds, cameras, strict=True)):
+            waiting.append(threads.submit(write, index, images(time, camera)))
+            written = index + 1 - len(waiting)
+            while waiting and (len(waiting) > WAITING or waiting[0].done() or index + 1 == len(seconds)):
+                waiting.popleft().result()  # raises what stopped the writing
+                written += 1
+                if progress is not None:
+                    progress(written, len(seconds))
     return out
+
+
+def images_of(
+    render: Callable[[float, Camera], Rendering], sensor: Sensor, names: Iterable[str]
+) -> Callable[[float, Camera], dict[str, renders.Channels]]:
+    """What ``gftorf render`` writes of each image: arrays on the host, which no later call overwrites."""
+
+    def images(time: float, camera: Camera) -> dict[str, renders.Channels]:
+        rendering = render(time, camera)
+        return {name: renders.channels(name, rendering, sensor) for name in names}
+
+    return images
 
 
 def views_to_take(

@@ -15,6 +15,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from ..constants import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
+from .batches import ROUND, make_batches
 from .lanes import make_lanes, warp_any
 from .splat import AHEAD, Splat, block_missed, load_splat, prefetch
 
@@ -80,7 +81,15 @@ def make_zeta(metric: bool):
 
 @functools.cache
 def make_composite(
-    K: int, tile_width: int, tile_height: int, light: bool, channels: bool, inclusive: bool, metric: bool
+    K: int,
+    tile_width: int,
+    tile_height: int,
+    light: bool,
+    channels: bool,
+    inclusive: bool,
+    metric: bool | None,
+    cooperative: bool = False,
+    more: bool = False,
 ):
     """The kernel for one tile shape and one set of outputs.
 
@@ -88,10 +97,13 @@ def make_composite(
         K: Pixels per thread: 16, or 1 on CUDA.
         tile_width: Columns of a tile [px].
         tile_height: Rows of a tile [px]; on CUDA a tile must have 32 pixels, one warp per tile.
-        light: Whether light, distance and distortion are summed.
+        light: Whether light and distance are summed.
         channels: Whether the three channels are summed.
         inclusive: Whether the splat that ends a pixel is still added.
-        metric: Whether distortion is measured on the distance itself, or on the released mapping of it.
+        metric: Whether distortion is measured on the distance itself, or on the released mapping of it; None: there is
+            no distortion, and its three planes are left alone.
+        cooperative: Whether the lanes of a warp fetch records for each other (batches.py); K must be 1.
+        more: Whether three further channels are summed in the same pass; it must be cooperative.
     """
     ops, pixels = make_lanes(K), make_pixels(K, tile_width, tile_height)
     V, fill, affine, mul, axpy, fma, fnma = ops.V, ops.fill, ops.affine, ops.mul, ops.axpy, ops.fma, ops.fnma
@@ -100,7 +112,28 @@ def make_composite(
     block_x, block_y, columns, rows = pixels.block_x, pixels.block_y, ops.columns, ops.rows
     half = 0.5 * (pixels.side - 1)  # from the first to the middle of a block [px]
 
-    zeta_of = make_zeta(metric)
+    zeta_of = make_zeta(bool(metric))
+    spreads = light and metric is not None
+    fetch = make_batches(more=more)
+    warp_memory, ask, arrive, entry, record_of = (
+        fetch.warp_memory,
+        fetch.ask,
+        fetch.arrive,
+        fetch.entry,
+        fetch.record_of,
+    )
+    ask_more, more_of = fetch.ask_more, fetch.more_of
+
+    @wp.func
+    def asks(live: V) -> bool:
+        """Whether a pixel is still alive."""
+        return warp_any(nonzero(live))
+
+    @wp.func_native("return true;")
+    def trusts(live: V) -> bool:
+        """In the middle of a round nobody asks."""
+
+    goes_on = trusts if cooperative else asks
 
     @wp.kernel(**options(K))
     def composite(
@@ -113,9 +146,11 @@ def make_composite(
         height: int,  # rows of the image [px]
         tile0: int,  # first tile of this launch [index]
         mapping: wp.vec2,  # released zeta = mapping[0] - mapping[1] / distance [1, m]
+        more_splats: wp.array[Splat],  # [N] records whose slots 8-10 are further channels
         # Out:
         sums: wp.array3d[V],  # [9, tiles, lanes] planes RE .. LAST of ``light``
         channel: wp.array3d[V],  # [3, tiles, lanes] the three channels
+        more_channel: wp.array3d[V],  # [3, tiles, lanes] the further channels
     ):
         """One thread per block of K pixels; on CUDA one warp per tile, so all control is uniform over 32 lanes."""
         t, lane = wp.tid()
@@ -133,6 +168,7 @@ def make_composite(
             im = fill(0.0)
             amplitude = fill(0.0)
             distance = fill(0.0)
+        if wp.static(spreads):
             distortion = fill(0.0)
             sum_zeta = fill(0.0)
             sum_zeta2 = fill(0.0)
@@ -140,64 +176,119 @@ def make_composite(
             c0 = fill(0.0)
             c1 = fill(0.0)
             c2 = fill(0.0)
+        if wp.static(more):
+            c3 = fill(0.0)
+            c4 = fill(0.0)
+            c5 = fill(0.0)
         begin = first[tile]
         end = first[tile + 1]
         zeta0 = float(0.0)  # distortion is blind to a common shift; near the surface its sums keep their digits
-        if begin < end:
-            zeta0 = zeta_of(splats[ids[begin]][14], mapping)
+        if wp.static(spreads):
+            if begin < end:
+                zeta0 = zeta_of(splats[ids[begin]][14], mapping)
         k = int(begin)
+        if wp.static(cooperative):
+            memory = warp_memory()
+            count = end - begin
+            coming = int(0)
+            if begin < end:
+                coming = entry(ids, begin, 1, 0, count)
+                ask(memory, splats, coming, 0)
+                if wp.static(more):
+                    ask_more(memory, more_splats, coming, 0)
+                coming = entry(ids, begin, 1, wp.static(ROUND), count)
+        if wp.static(
+            K == 1 and not cooperative
+        ):  # a record comes from afar: a warp asks for the next one while it works on this one
+            following = Splat()
+            after = int(0)
+            if begin < end:
+                following = load_splat(splats, ids[begin])
+                after = ids[wp.min(begin + 1, end - 1)]
         # `continue` instead of nested `if`s: after an `if` Warp selects between the old and the new value of everything
         # assigned inside, here a dozen vectors per splat
-        while k < end and warp_any(nonzero(live)):  # the same trip count for all lanes of a warp
-            i = ids[k]
-            k += 1
-            if wp.static(K > 1):
-                prefetch(splats, ids[wp.min(k + AHEAD, end - 1)])
-            if block_missed(splats, i, x0 + wp.static(half), y0 + wp.static(half)):
-                continue
-            q = load_splat(splats, i)
-            g = response(affine(x, -1.0, q[0]), affine(y, -1.0, q[1]), q[2], q[3], q[4], q[6])
-            alpha = alpha_of(g, live, q[5], ALPHA_MAX, ALPHA_MIN)
-            if not nonzero(alpha):
-                continue
-            if wp.static(not inclusive):
-                live = drop_below(live, fnma(T, T, alpha), TRANSMITTANCE_MIN)
-                alpha = mul(alpha, live)
-            w = mul(alpha, T)
-            if wp.static(light):
-                w2 = mul(w, T)
-                re = axpy(re, w2, q[11])
-                im = axpy(im, w2, q[12])
-                amplitude = axpy(amplitude, w2, q[13])
-                distance = axpy(distance, w, q[14])
-                zeta = zeta_of(q[14], mapping) - zeta0
-                # sum over pairs, one splat at a time: w (zeta^2 A - 2 zeta M + V) with A = 1 - T the weight so far
-                spread = axpy(axpy(affine(T, -zeta * zeta, zeta * zeta), sum_zeta, -2.0 * zeta), sum_zeta2, 1.0)
-                distortion = fma(distortion, w, spread)
-                sum_zeta = axpy(sum_zeta, w, zeta)
-                sum_zeta2 = axpy(sum_zeta2, w, zeta * zeta)
-            if wp.static(channels):
-                c0 = axpy(c0, w, q[8])
-                c1 = axpy(c1, w, q[9])
-                c2 = axpy(c2, w, q[10])
-            T = fnma(T, T, alpha)
-            if wp.static(light):
-                last = set_where(last, alpha, float(k - begin))
-            if wp.static(inclusive):
-                live = drop_below(live, T, TRANSMITTANCE_MIN)
+        while k < end and warp_any(nonzero(live)):
+            stop = end
+            if wp.static(cooperative):
+                stop = wp.min(k + ROUND, end)
+                arrive()
+                if stop < end:
+                    ask(memory, splats, coming, stop - begin)
+                    if wp.static(more):
+                        ask_more(memory, more_splats, coming, stop - begin)
+                    coming = entry(ids, begin, 1, stop - begin + wp.static(ROUND), count)
+            while k < stop and goes_on(live):  # the same trip count for all lanes of a warp
+                k += 1
+                if wp.static(K > 1):
+                    i = ids[k - 1]
+                    prefetch(splats, ids[wp.min(k + AHEAD, end - 1)])
+                    if block_missed(splats, i, x0 + wp.static(half), y0 + wp.static(half)):
+                        continue
+                    q = load_splat(splats, i)
+                elif wp.static(cooperative):
+                    q = record_of(memory, k - 1 - begin, splats, ids, k - 1)
+                else:
+                    q = following
+                    following = load_splat(splats, after)
+                    after = ids[wp.min(k + 1, end - 1)]
+                g = response(affine(x, -1.0, q[0]), affine(y, -1.0, q[1]), q[2], q[3], q[4], q[6])
+                alpha = alpha_of(g, live, q[5], ALPHA_MAX, ALPHA_MIN)
+                if wp.static(not cooperative):  # with records at hand a miss costs less than a branch
+                    if not nonzero(alpha):
+                        continue
+                if wp.static(not inclusive):
+                    live = drop_below(live, fnma(T, T, alpha), TRANSMITTANCE_MIN)
+                    alpha = mul(alpha, live)
+                w = mul(alpha, T)
+                if wp.static(light):
+                    w2 = mul(w, T)
+                    re = axpy(re, w2, q[11])
+                    im = axpy(im, w2, q[12])
+                    amplitude = axpy(amplitude, w2, q[13])
+                    distance = axpy(distance, w, q[14])
+                if wp.static(spreads):
+                    zeta = zeta_of(q[14], mapping) - zeta0
+                    # sum over pairs, one splat at a time: w (zeta^2 A - 2 zeta M + V) with A = 1 - T the weight so far
+                    spread = axpy(axpy(affine(T, -zeta * zeta, zeta * zeta), sum_zeta, -2.0 * zeta), sum_zeta2, 1.0)
+                    distortion = fma(distortion, w, spread)
+                    sum_zeta = axpy(sum_zeta, w, zeta)
+                    sum_zeta2 = axpy(sum_zeta2, w, zeta * zeta)
+                if wp.static(channels):
+                    c0 = axpy(c0, w, q[8])
+                    c1 = axpy(c1, w, q[9])
+                    c2 = axpy(c2, w, q[10])
+                if wp.static(more):
+                    m = more_of(memory, k - 1 - begin, more_splats, ids, k - 1)
+                    c3 = axpy(c3, w, m[0])
+                    c4 = axpy(c4, w, m[1])
+                    c5 = axpy(c5, w, m[2])
+                T = fnma(T, T, alpha)
+                if wp.static(light):
+                    last = set_where(last, alpha, float(k - begin))
+                if wp.static(inclusive):
+                    live = drop_below(live, T, TRANSMITTANCE_MIN)
+            if wp.static(not cooperative):
+                k = end  # one round was all
+        if wp.static(cooperative):
+            arrive()  # records that nobody needs may still be on their way
         if wp.static(light):
             sums[wp.static(RE), tile, lane] = re
             sums[wp.static(IM), tile, lane] = im
             sums[wp.static(AMPLITUDE), tile, lane] = amplitude
             sums[wp.static(DISTANCE), tile, lane] = distance
+            sums[wp.static(TRANSMITTANCE), tile, lane] = T
+            sums[wp.static(LAST), tile, lane] = last
+        if wp.static(spreads):
             sums[wp.static(DISTORTION), tile, lane] = distortion
             sums[wp.static(SUM_ZETA), tile, lane] = sum_zeta
             sums[wp.static(SUM_ZETA2), tile, lane] = sum_zeta2
-            sums[wp.static(TRANSMITTANCE), tile, lane] = T
-            sums[wp.static(LAST), tile, lane] = last
         if wp.static(channels):
             channel[0, tile, lane] = c0
             channel[1, tile, lane] = c1
             channel[2, tile, lane] = c2
+        if wp.static(more):
+            more_channel[0, tile, lane] = c3
+            more_channel[1, tile, lane] = c4
+            more_channel[2, tile, lane] = c5
 
     return composite

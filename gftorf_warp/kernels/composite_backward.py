@@ -15,6 +15,7 @@ import functools
 import warp as wp
 
 from ..constants import ALPHA_MAX, ALPHA_MIN
+from .batches import ROUND, make_gradient_rounds
 from .composite import LAST, SUM_ZETA, SUM_ZETA2, TRANSMITTANCE, make_pixels, make_zeta, options
 from .lanes import make_lanes, sums_of, types_of, warp_any, warp_max
 from .splat import AHEAD, Splat, block_missed, load_splat, prefetch
@@ -22,18 +23,33 @@ from .splat import AHEAD, Splat, block_missed, load_splat, prefetch
 # planes of ``grad_sums``, each [tiles, lanes] of V: gradients of the first five planes of the forward pass, and of T_e
 GRAD_TRANSMITTANCE = 5
 GRAD_LIGHT_PLANES = 6
+V1 = make_lanes(1).V
 
 
-def _add_moments(K: int, light: bool, channels: bool) -> str:
+_FOLD = r"""    const unsigned lane = threadIdx.x & 31u;
+    #define FOLD(BIT, HALF) { const bool up = (lane >> BIT) & 1u; \
+        _Pragma("unroll") for (int j = 0; j < HALF; ++j) { \
+        const float send = up ? record[j] : record[j + HALF], keep = up ? record[j + HALF] : record[j]; \
+        record[j] = keep + __shfl_xor_sync(0xffffffffu, send, 1 << BIT); } }
+    FOLD(4, 8) FOLD(3, 4) FOLD(2, 2) FOLD(1, 1)
+    #undef FOLD
+    record[0] += __shfl_xor_sync(0xffffffffu, record[0], 1);
+    if (!(lane & 1u)) atomicAdd(reinterpret_cast<float*>(grads.data + i) + (lane >> 1), record[0]);"""
+
+
+def _add_moments(K: int, light: bool, channels: bool, geometry: bool, cooperative: bool) -> str:
     """C++ that adds what the K pixels of a thread, or of a warp on CUDA, say about one splat to its record.
 
     On the CPU one permutation brings the sums into the order of the record. On CUDA 16 values of 32 lanes are summed in
-    16 shuffles, each of which halves the values a lane carries; then 16 lanes add one 64-byte line.
+    16 shuffles, each of which halves the values a lane carries; then 16 lanes add one 64-byte line. Where warps work
+    together (batches.py) there is nothing to do on CUDA.
     """
     names = ["v", "dx", "dy", "alpha", "w", "w2", "g0", "g1", "g2", "g_re", "g_im", "g_amplitude", "g_distance"]
     loads = " ".join(f"const F {name}_ = load({name});" for name in names)
-    values = {"v": "v_", "dx": "v_ * dx_", "dx2": "v_ * dx_ * dx_", "dxdy": "v_ * dx_ * dy_"}
-    values |= {"dy": "v_ * dy_", "dy2": "v_ * dy_ * dy_", "count": "alpha_ > 0.0f ? (F)(1.0f) : (F)(0.0f)"}
+    values = {}
+    if geometry:
+        values |= {"v": "v_", "dx": "v_ * dx_", "dx2": "v_ * dx_ * dx_", "dxdy": "v_ * dx_ * dy_"}
+        values |= {"dy": "v_ * dy_", "dy2": "v_ * dy_ * dy_", "count": "alpha_ > 0.0f ? (F)(1.0f) : (F)(0.0f)"}
     if channels:
         values |= {"c0": "w_ * g0_", "c1": "w_ * g1_", "c2": "w_ * g2_"}
     if light:
@@ -59,21 +75,14 @@ def _add_moments(K: int, light: bool, channels: bool) -> str:
     ]
     sums, lanes = sums_of(K, values)
     if K == 1:
+        fold = "" if cooperative else _FOLD
         entries = [f"s[{lanes.index(of)}]" if of in lanes else "0.0f" for of in slots]
         return f"""{types_of(K)}
     {loads}
     {sums}
     float record[16] = {{{", ".join(entries)}}};
 #if defined(__CUDA_ARCH__)
-    const unsigned lane = threadIdx.x & 31u;
-    #define FOLD(BIT, HALF) {{ const bool up = (lane >> BIT) & 1u; \\
-        _Pragma("unroll") for (int j = 0; j < HALF; ++j) {{ \\
-        const float send = up ? record[j] : record[j + HALF], keep = up ? record[j + HALF] : record[j]; \\
-        record[j] = keep + __shfl_xor_sync(0xffffffffu, send, 1 << BIT); }} }}
-    FOLD(4, 8) FOLD(3, 4) FOLD(2, 2) FOLD(1, 1)
-    #undef FOLD
-    record[0] += __shfl_xor_sync(0xffffffffu, record[0], 1);
-    if (!(lane & 1u)) atomicAdd(reinterpret_cast<float*>(grads.data + i) + (lane >> 1), record[0]);
+    {fold}
 #else
     for (int j = 0; j < 16; ++j) grads.data[i].c[j] += record[j];
 #endif
@@ -109,9 +118,28 @@ def finish_moments(
         grad_splats[n] = g
 
 
+@wp.func_native("""
+#if !defined(__CUDA_ARCH__)
+    const wp::vec_t<1, float> gradients[3] = {g3, g4, g5};
+    for (int c = 0; c < 3; ++c) grads.data[i][8 + c] += w[0] * gradients[c][0];
+#endif
+""")
+def add_more(grads: wp.array[Splat], i: int, w: V1, g3: V1, g4: V1, g5: V1):
+    """Add the gradient of further channels on the CPU, where a thread is alone; on CUDA a round of a warp does."""
+
+
 @functools.cache
 def make_composite_backward(
-    K: int, tile_width: int, tile_height: int, light: bool, channels: bool, clamp_passes: bool, metric: bool
+    K: int,
+    tile_width: int,
+    tile_height: int,
+    light: bool,
+    channels: bool,
+    clamp_passes: bool,
+    metric: bool | None,
+    fixed: bool = False,
+    cooperative: bool = False,
+    more: bool = False,
 ):
     """The adjoint kernel for one tile shape and one set of outputs; arguments as in ``make_composite``.
 
@@ -122,7 +150,10 @@ def make_composite_backward(
         light: Whether light, distance and distortion have gradients.
         channels: Whether the three channels have gradients.
         clamp_passes: Whether a clamped alpha passes its gradient on, as the released code does.
-        metric: As in ``make_composite``.
+        metric: As in ``make_composite``; None: the distortion has no gradient.
+        fixed: Whether weights are held fixed under the channels, so that only these have their gradient.
+        cooperative: As in ``make_composite``.
+        more: Whether three further channels, under which weights are held fixed, have their gradient, too.
     """
     ops, pixels = make_lanes(K), make_pixels(K, tile_width, tile_height)
     V, fill, affine, mul, axpy, fma, fnma = ops.V, ops.fill, ops.affine, ops.mul, ops.axpy, ops.fma, ops.fnma
@@ -130,13 +161,25 @@ def make_composite_backward(
     inverse, at_least = ops.inverse, ops.at_least
     response, alpha_of, nonzero, largest_of = ops.response, ops.alpha_of, ops.nonzero, ops.largest_of
     block_x, block_y, columns, rows = pixels.block_x, pixels.block_y, ops.columns, ops.rows
-    half, zeta_of = 0.5 * (pixels.side - 1), make_zeta(metric)
+    half, zeta_of = 0.5 * (pixels.side - 1), make_zeta(bool(metric))
+    spreads = light and metric is not None
 
-    @wp.func_native(_add_moments(K, light, channels))
+    @wp.func_native(_add_moments(K, light, channels, light or not fixed, cooperative))
     def add_moments(
         grads: wp.array[Splat], i: int, v: V, dx: V, dy: V, alpha: V, w: V, w2: V,
         g0: V, g1: V, g2: V, g_re: V, g_im: V, g_amplitude: V, g_distance: V,
     ): ...  # fmt: skip
+
+    if cooperative:
+        rounds = make_gradient_rounds(tile_width, light, channels, light or not fixed, spreads, more)
+        warp_memory, ask, arrive, entry, record_of = (
+            rounds.warp_memory,
+            rounds.ask,
+            rounds.arrive,
+            rounds.entry,
+            rounds.record_of,
+        )
+        keep_derivatives, keep_values, add_round = rounds.keep_derivatives, rounds.keep_values, rounds.add_round
 
     @wp.kernel(**options(K))
     def composite_backward(
@@ -150,8 +193,10 @@ def make_composite_backward(
         sums: wp.array3d[V],  # [9, tiles, lanes] planes of the forward pass
         grad_sums: wp.array3d[V],  # [6, tiles, lanes] gradients of RE .. DISTORTION and of T_e
         grad_channel: wp.array3d[V],  # [3, tiles, lanes] gradients of the three channels
+        grad_more: wp.array3d[V],  # [3, tiles, lanes] gradients of the further channels
         # Out:
         grad_splats: wp.array[Splat],  # [N] added to: moments in slots 0-5, pixels in slot 6, gradients in 8-15
+        more_splats: wp.array[Splat],  # [N] added to: slots 8-10, gradients of the further channels
     ):
         """One thread per block of K pixels; visits exactly the contributors of the forward pass, last one first."""
         t, lane = wp.tid()
@@ -172,13 +217,15 @@ def make_composite_backward(
             g_re = zero
             g_im = zero
             g_amplitude = zero
+            g_distance = zero
         if wp.static(light):
             g_re = grad_sums[0, tile, lane]
             g_im = grad_sums[1, tile, lane]
             g_amplitude = grad_sums[2, tile, lane]
             g_distance = grad_sums[3, tile, lane]
-            g_distortion = grad_sums[4, tile, lane]
             E = mul(T, grad_sums[wp.static(GRAD_TRANSMITTANCE), tile, lane])
+        if wp.static(spreads):
+            g_distortion = grad_sums[4, tile, lane]
             twice_g_distortion = add(g_distortion, g_distortion)
             minus_sum = scaled(sums[wp.static(SUM_ZETA), tile, lane], -1.0)
             sum_zeta2 = sums[wp.static(SUM_ZETA2), tile, lane]
@@ -187,56 +234,106 @@ def make_composite_backward(
             g0 = grad_channel[0, tile, lane]
             g1 = grad_channel[1, tile, lane]
             g2 = grad_channel[2, tile, lane]
+        g3 = zero
+        g4 = zero
+        g5 = zero
+        if wp.static(more):
+            g3 = grad_more[0, tile, lane]
+            g4 = grad_more[1, tile, lane]
+            g5 = grad_more[2, tile, lane]
         begin = first[tile]
         k = begin + warp_max(int(largest_of(last)))
         zeta0 = float(0.0)
-        if begin < k:
-            zeta0 = zeta_of(splats[ids[begin]][14], mapping)
+        if wp.static(spreads):
+            if begin < k:
+                zeta0 = zeta_of(splats[ids[begin]][14], mapping)
         position = fill(float(k - begin))
+        if wp.static(cooperative):
+            memory = warp_memory()
+            top = k - 1
+            count = k - begin
+            coming = int(0)
+            if begin < k:
+                keep_derivatives(memory, g0, g1, g2, g_re, g_im, g_amplitude, g_distance, g3, g4, g5)
+                ask(memory, splats, entry(ids, top, -1, 0, count), 0)
+                coming = entry(ids, top, -1, wp.static(ROUND), count)
+        if wp.static(K == 1 and not cooperative):  # as in the forward pass
+            following = Splat()
+            after = int(0)
+            if begin < k:
+                following = load_splat(splats, ids[k - 1])
+                after = ids[wp.max(k - 2, begin)]
         while k > begin:
-            k -= 1
-            position = affine(position, 1.0, -1.0)
-            i = ids[k]
-            if wp.static(K > 1):
-                ahead = ids[wp.max(k - AHEAD, begin)]
-                prefetch(splats, ahead)
-                prefetch(grad_splats, ahead)
-            if block_missed(splats, i, x0 + wp.static(half), y0 + wp.static(half)):
-                continue
-            gate = exceeds(last, position)  # only what this pixel composited
-            q = load_splat(splats, i)
-            dx = affine(x, -1.0, q[0])
-            dy = affine(y, -1.0, q[1])
-            g = response(dx, dy, q[2], q[3], q[4], q[6])
-            alpha = alpha_of(g, gate, q[5], ALPHA_MAX, ALPHA_MIN)
-            if not warp_any(nonzero(alpha)):  # uniform: all lanes of a warp reach `add_moments`, or none
-                continue
-            restored = inverse(affine(alpha, -1.0, 1.0))
-            T = mul(T, restored)
-            w = mul(alpha, T)
-            tau = zero
-            if wp.static(channels):
-                tau = axpy(axpy(scaled(g0, q[8]), g1, q[9]), g2, q[10])
-            sigma_T = zero
-            w2 = zero
-            g_d = zero
-            if wp.static(light):
-                zeta = zeta_of(q[14], mapping) - zeta0
-                spread = axpy(minus_sum, weight, zeta)  # zeta A - M
-                tau = axpy(tau, g_distance, q[14])
-                tau = fma(tau, g_distortion, axpy(sum_zeta2, add(spread, minus_sum), zeta))
-                sigma_T = mul(axpy(axpy(scaled(g_re, q[11]), g_im, q[12]), g_amplitude, q[13]), T)
-                g_d = fma(g_distance, twice_g_distortion, spread)
-                if wp.static(not metric):  # zeta changes with the distance by mapping[1] / distance^2
-                    g_d = fma(g_distance, scaled(twice_g_distortion, mapping[1] / (q[14] * q[14])), spread)
-                w2 = mul(w, T)
-            tau = add(tau, sigma_T)
-            v = fnma(mul(w, tau), E, mul(alpha, restored))  # alpha dL/dalpha
-            E = fma(E, w, add(tau, sigma_T))
-            if wp.static(clamp_passes):
-                v = fma(zero, v, mul(scaled(g, q[5]), inverse(at_least(alpha, ALPHA_MIN))))  # o G / alpha
-            else:
-                v = keep_below(v, alpha, ALPHA_MAX)
-            add_moments(grad_splats, i, v, dx, dy, alpha, w, w2, g0, g1, g2, g_re, g_im, g_amplitude, g_d)
+            stop = begin
+            if wp.static(cooperative):
+                stop = wp.max(k - ROUND, begin)
+                at = top + 1 - k  # entries behind us
+                arrive()
+                if stop > begin:
+                    ask(memory, splats, coming, at + wp.static(ROUND))
+                    coming = entry(ids, top, -1, at + wp.static(2 * ROUND), count)
+            while k > stop:
+                k -= 1
+                position = affine(position, 1.0, -1.0)
+                if wp.static(K > 1):
+                    i = ids[k]
+                    ahead = ids[wp.max(k - AHEAD, begin)]
+                    prefetch(splats, ahead)
+                    prefetch(grad_splats, ahead)
+                    if block_missed(splats, i, x0 + wp.static(half), y0 + wp.static(half)):
+                        continue
+                    q = load_splat(splats, i)
+                elif wp.static(cooperative):
+                    q = record_of(memory, top - k, splats, ids, k)
+                else:
+                    i = ids[k]
+                    q = following
+                    following = load_splat(splats, after)
+                    after = ids[wp.max(k - 2, begin)]
+                gate = exceeds(last, position)  # only what this pixel composited
+                dx = affine(x, -1.0, q[0])
+                dy = affine(y, -1.0, q[1])
+                g = response(dx, dy, q[2], q[3], q[4], q[6])
+                alpha = alpha_of(g, gate, q[5], ALPHA_MAX, ALPHA_MIN)
+                if wp.static(not cooperative):
+                    if not warp_any(nonzero(alpha)):  # uniform: all lanes of a warp reach `add_moments`, or none
+                        continue
+                restored = inverse(affine(alpha, -1.0, 1.0))
+                T = mul(T, restored)
+                w = mul(alpha, T)
+                tau = zero
+                if wp.static(channels and not fixed):
+                    tau = axpy(axpy(scaled(g0, q[8]), g1, q[9]), g2, q[10])
+                sigma_T = zero
+                w2 = zero
+                g_d = zero
+                if wp.static(light):
+                    tau = axpy(tau, g_distance, q[14])
+                    sigma_T = mul(axpy(axpy(scaled(g_re, q[11]), g_im, q[12]), g_amplitude, q[13]), T)
+                    g_d = g_distance
+                    w2 = mul(w, T)
+                if wp.static(spreads):
+                    zeta = zeta_of(q[14], mapping) - zeta0
+                    spread = axpy(minus_sum, weight, zeta)  # zeta A - M
+                    tau = fma(tau, g_distortion, axpy(sum_zeta2, add(spread, minus_sum), zeta))
+                    if wp.static(bool(metric)):
+                        g_d = fma(g_distance, twice_g_distortion, spread)
+                    else:  # zeta changes with the distance by mapping[1] / distance^2
+                        g_d = fma(g_distance, scaled(twice_g_distortion, mapping[1] / (q[14] * q[14])), spread)
+                tau = add(tau, sigma_T)
+                v = fnma(mul(w, tau), E, mul(alpha, restored))  # alpha dL/dalpha
+                E = fma(E, w, add(tau, sigma_T))
+                if wp.static(clamp_passes):
+                    v = fma(zero, v, mul(scaled(g, q[5]), inverse(at_least(alpha, ALPHA_MIN))))  # o G / alpha
+                else:
+                    v = keep_below(v, alpha, ALPHA_MAX)
+                if wp.static(cooperative):
+                    i = ids[k]  # for the CPU; on CUDA nobody asks
+                    keep_values(memory, top - k, v, w, w2, g_d)
+                    if wp.static(more):
+                        add_more(more_splats, i, w, g3, g4, g5)
+                add_moments(grad_splats, i, v, dx, dy, alpha, w, w2, g0, g1, g2, g_re, g_im, g_amplitude, g_d)
+            if wp.static(cooperative):
+                add_round(memory, grad_splats, more_splats, ids, top, at, top + 1 - stop - at, x, y)
 
     return composite_backward

@@ -70,6 +70,49 @@ def warp_max(x: int) -> int:
     """Largest ``x`` of the lanes of the warp; on the CPU a thread is alone."""
 
 
+_SUM_OF_LANES = """
+#if defined(__CUDA_ARCH__)
+    for (int distance = 1; distance < 32; distance *= 2) {
+        const int other = __shfl_up_sync(0xffffffffu, x, distance);
+        if ((int)(threadIdx.x & 31u) >= distance) x += other;
+    }
+#endif
+    return x;
+"""
+
+_OF_LANE = """
+#if defined(__CUDA_ARCH__)
+    return __shfl_sync(0xffffffffu, x, lane);
+#else
+    return x;
+#endif
+"""
+
+_LANE_BEYOND = """
+    int low = 0;
+#if defined(__CUDA_ARCH__)
+    for (int half = 16; half > 0; half /= 2)
+        if (__shfl_sync(0xffffffffu, sums, low + half - 1) <= bound) low += half;
+#endif
+    return low;
+"""
+
+
+@wp.func_native(_SUM_OF_LANES)
+def sum_of_lanes(x: int) -> int:
+    """Sum of ``x`` of this lane and of all before it; on the CPU a thread is alone."""
+
+
+@wp.func_native(_OF_LANE)
+def of_lane(x: int, lane: int) -> int:
+    """What ``x`` is in another lane."""
+
+
+@wp.func_native(_LANE_BEYOND)
+def lane_beyond(sums: int, bound: int) -> int:
+    """The first lane whose ``sums``, which ascend with the lane, is greater than ``bound``; the last one if none is."""
+
+
 def types_of(K: int) -> str:
     """C++ that defines ``F``, what an operation works on, and ``load`` and ``store``, from and to a Warp vector."""
     if K == 1:

@@ -192,12 +192,15 @@ def resolve_geometry(
     opacity: wp.array2d[float],  # [H, W]
     distortion: wp.array2d[float],  # [H, W]
 ):
-    """One thread per pixel."""
+    """One thread per pixel; each image is [0, 0] where it is not wanted."""
     y, x = wp.tid()
     k = slot(x, y, tiling)
-    distance[y, x] = sums[_DISTANCE, k]
-    opacity[y, x] = 1.0 - sums[_TRANSMITTANCE, k]
-    distortion[y, x] = factor * sums[_DISTORTION, k]
+    if distance.shape[0] > 0:
+        distance[y, x] = sums[_DISTANCE, k]
+    if opacity.shape[0] > 0:
+        opacity[y, x] = 1.0 - sums[_TRANSMITTANCE, k]
+    if distortion.shape[0] > 0:
+        distortion[y, x] = factor * sums[_DISTORTION, k]
 
 
 @wp.kernel(enable_backward=False)

@@ -1,12 +1,21 @@
-"""Which splats each tile has to look at: exact ellipse-tile tests, counts, keys, and where each tile's list begins.
+"""Which splats each tile has to look at: where an ellipse crosses a row of tiles, counts, keys, and each tile's list.
 
-A tile lists a splat if the ellipse alpha >= 1/255 reaches the rectangle of its pixel centres. Splats are emitted near
-to far and sorted by tile with a stable sort, so that every list is in depth order.
+A tile lists a splat if the ellipse alpha >= 1/255 reaches the rectangle of its pixel centres. The tiles of one row that
+an ellipse reaches are neighbours, so a row is a span, and a splat costs as many steps as it has rows. Pairs are in the
+order of depth and sorted by tile with a stable sort, so that every list is in depth order.
 """
 
 import warp as wp
 
-from .splat import Splat
+from .lanes import lane_beyond, of_lane, sum_of_lanes
+from .splat import Splat, load_splat
+
+# `count_pairs` and `emit_pairs` must agree on every span to the last bit, and contraction to fused multiply-adds is the
+# compiler's choice in each kernel anew
+wp.set_module_options({"fuse_fp": False})
+
+_MARGIN = wp.constant(1.0e-6)  # of the largest terms of the power [1]: what float32 loses in it at a far pixel
+_FLATTEST = wp.constant(wp.float64(1.0e-7))  # smallest determinant over 4 P R [1]: below it is rounding
 
 
 @wp.func
@@ -21,23 +30,49 @@ def tile_range(box: wp.vec4i, tile_width: int, tile_height: int) -> wp.vec4i:
 
 
 @wp.func
-def touches(q: Splat, x: float, y: float, w: float, h: float) -> bool:
-    """Whether the power reaches its lower bound anywhere on the rectangle [x, x + w] x [y, y + h] [px]."""
-    dx = wp.clamp(q[0], x, x + w) - q[0]
-    dy = wp.clamp(q[1], y, y + h) - q[1]
-    most = float(0.0)
-    if dx != 0.0 or dy != 0.0:  # centre outside: the maximum lies on an edge that faces it
-        most = float(-1.0e30)
-        if dx != 0.0:
-            v = wp.clamp(-0.5 * q[3] * dx / q[4], y - q[1], y + h - q[1])
-            most = (q[2] * dx + q[3] * v) * dx + q[4] * v * v
-        if dy != 0.0:
-            u = wp.clamp(-0.5 * q[3] * dy / q[2], x - q[0], x + w - q[0])
-            most = wp.max(most, (q[2] * u + q[3] * dy) * u + q[4] * dy * dy)
-    return most >= q[6] * 1.00001 - 5.0e-5
+def outline_of(q: Splat, box: wp.vec4i) -> wp.vec4:
+    """Outline (slope, width, narrowing, turn) of the ellipse power >= low, from its centre [px].
+
+    At height v its edges are at slope v -+ sqrt(width - narrowing v^2); the right one is farthest out at v = turn, the
+    left one at -turn. A little wide: it decides what is visited, not what it is worth. Terms of the power at the pixels
+    of ``box`` bound what a pixel may round in its favour; the determinant of the conic is a difference, so it is taken
+    in float64.
+    """
+    x = wp.max(wp.abs(float(box[0]) + 0.5 - q[0]), wp.abs(float(box[2]) - 0.5 - q[0]))
+    y = wp.max(wp.abs(float(box[1]) + 0.5 - q[1]), wp.abs(float(box[3]) - 0.5 - q[1]))
+    terms = wp.abs(q[2]) * x * x + wp.abs(q[3]) * x * y + wp.abs(q[4]) * y * y
+    level = -1.00001 * q[6] + 5.0e-5 + _MARGIN * terms
+    product = wp.float64(4.0) * wp.float64(q[2]) * wp.float64(q[4])
+    determinant = wp.max(product - wp.float64(q[3]) * wp.float64(q[3]), _FLATTEST * product)
+    slope = -0.5 * q[3] / q[2]
+    width = -level / q[2]
+    narrowing = float(determinant / (wp.float64(4.0) * wp.float64(q[2]) * wp.float64(q[2])))
+    turn = slope * wp.sqrt(width / (narrowing * (narrowing + slope * slope)))
+    return wp.vec4(slope, width, narrowing, turn)
 
 
-@wp.kernel(enable_backward=False)
+@wp.func
+def span_of(outline: wp.vec4, q: Splat, row: int, tiles: wp.vec4i, tile_width: int, tile_height: int) -> wp.vec2i:
+    """Tiles [x0, x1) of a row, at most those of ``tiles``, whose pixel centres the ellipse reaches."""
+    low = float(row * tile_height) + 0.5 - q[1]  # first and last pixel centres of the row, from the centre [px]
+    high = low + float(tile_height - 1)
+    nearest = wp.clamp(0.0, low, high)
+    if outline[2] * nearest * nearest > outline[1]:
+        return wp.vec2i(0, 0)
+    right = wp.clamp(outline[3], low, high)
+    left = wp.clamp(-outline[3], low, high)
+    reach_right = wp.sqrt(wp.max(outline[1] - outline[2] * right * right, 0.0))
+    reach_left = wp.sqrt(wp.max(outline[1] - outline[2] * left * left, 0.0))
+    w = float(tile_width)
+    first = wp.ceil((q[0] + (outline[0] * left - reach_left) + 0.5) / w) - 1.0
+    last = wp.floor((q[0] + (outline[0] * right + reach_right) - 0.5) / w)
+    # clamped as floats, since an integer from a float that does not fit is undefined; and again, for NaN
+    x0 = wp.clamp(int(wp.clamp(first, float(tiles[0]), float(tiles[2]))), tiles[0], tiles[2])
+    x1 = wp.clamp(int(wp.clamp(last, -1.0, float(tiles[2]))) + 1, x0, tiles[2])
+    return wp.vec2i(x0, x1)
+
+
+@wp.kernel(enable_backward=False, grid_stride=False)
 def count_pairs(
     # In:
     order: wp.array[wp.int32],  # [>= N] splats near to far
@@ -45,26 +80,29 @@ def count_pairs(
     box_px: wp.array[wp.vec4i],  # [N] pixels a splat may touch [px]
     tile_width: int,  # columns of a tile [px]
     tile_height: int,  # rows of a tile [px]
+    lanes: int,  # threads per splat: 32 on CUDA, a warp, 1 on the CPU [1]
     # Out:
     counts: wp.array[int],  # [N] tiles each splat touches, in depth order
 ):
-    """One thread per splat."""
-    rank = wp.tid()
+    """One warp per splat, one lane per row of tiles."""
+    rank, lane = wp.tid()
     i = order[rank]
     touched = int(0)
     if box_px[i][2] > 0:
-        q = splats[i]
-        b = tile_range(box_px[i], tile_width, tile_height)
-        w = float(tile_width)
-        h = float(tile_height)
-        for y in range(b[1], b[3]):
-            for x in range(b[0], b[2]):
-                if touches(q, float(x) * w + 0.5, float(y) * h + 0.5, w - 1.0, h - 1.0):
-                    touched += 1
-    counts[rank] = touched
+        q = load_splat(splats, i)
+        outline = outline_of(q, box_px[i])
+        tiles = tile_range(box_px[i], tile_width, tile_height)
+        row = tiles[1] + lane
+        while row < tiles[3]:
+            span = span_of(outline, q, row, tiles, tile_width, tile_height)
+            touched += span[1] - span[0]
+            row += lanes
+    sums = sum_of_lanes(touched)
+    if lane == lanes - 1:
+        counts[rank] = sums
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel(enable_backward=False, grid_stride=False)
 def emit_pairs(
     # In:
     order: wp.array[wp.int32],  # [>= N] splats near to far
@@ -72,33 +110,55 @@ def emit_pairs(
     box_px: wp.array[wp.vec4i],  # [N] pixels a splat may touch [px]
     tile_width: int,  # columns of a tile [px]
     tile_height: int,  # rows of a tile [px]
+    lanes: int,  # threads per splat: 32 on CUDA, a warp, 1 on the CPU [1]
     tiles_x: int,  # tiles per row [1]
-    counts: wp.array[int],  # [N] tiles each splat touches, in depth order
-    offsets: wp.array[int],  # [N] exclusive sums of ``counts``
+    tile_count: int,  # tiles of the image: the key of a place that no pair takes [1]
+    ends: wp.array[int],  # [N] sums of counts: where the pairs of each splat end, in depth order
     capacity: int,  # pairs that fit [1]
     # Out:
     keys: wp.array[wp.int32],  # [>= capacity] tile of each pair
     ids: wp.array[wp.int32],  # [>= capacity] splat of each pair
     total: wp.array[int],  # [1] pairs there would be, whether they fit or not
 ):
-    """One thread per splat; one that does not fit is dropped and shows in ``total``."""
-    rank = wp.tid()
+    """One warp per splat: a lane finds the span of a row, then all lanes write neighbouring pairs, whatever their row.
+
+    Pairs that do not fit are dropped, farthest first, and show in ``total``.
+    """
+    rank, lane = wp.tid()
+    known = ends[ends.shape[0] - 1]
+    if rank == 0 and lane == 0:
+        total[0] = known
+    free = known + rank * lanes + lane
+    while free < capacity:
+        keys[free] = tile_count
+        free += ends.shape[0] * lanes
     i = order[rank]
-    touched = counts[rank]
-    k = offsets[rank]
-    if rank == counts.shape[0] - 1:
-        total[0] = k + touched
-    if touched > 0 and k + touched <= capacity:
-        q = splats[i]
-        b = tile_range(box_px[i], tile_width, tile_height)
-        w = float(tile_width)
-        h = float(tile_height)
-        for y in range(b[1], b[3]):
-            for x in range(b[0], b[2]):
-                if touches(q, float(x) * w + 0.5, float(y) * h + 0.5, w - 1.0, h - 1.0):
-                    keys[k] = y * tiles_x + x
-                    ids[k] = i
-                    k += 1
+    at = int(0)  # the place of the first pair of these rows
+    if rank > 0:
+        at = ends[rank - 1]
+    if box_px[i][2] > 0:
+        q = load_splat(splats, i)
+        outline = outline_of(q, box_px[i])
+        tiles = tile_range(box_px[i], tile_width, tile_height)
+        top = tiles[1]
+        while top < tiles[3] and at < capacity:  # as all control here the same for all lanes of a warp
+            span = wp.vec2i(0, 0)
+            if top + lane < tiles[3]:
+                span = span_of(outline, q, top + lane, tiles, tile_width, tile_height)
+            sums = sum_of_lanes(span[1] - span[0])
+            count = of_lane(sums, lanes - 1)
+            shift = span[1] - sums  # from the number of a pair in these rows to its column
+            begin = int(0)
+            while begin < count:
+                pair = begin + lane
+                row = lane_beyond(sums, pair)
+                x = of_lane(shift, row) + pair
+                if pair < count and at + pair < capacity:
+                    keys[at + pair] = (top + row) * tiles_x + x
+                    ids[at + pair] = i
+                begin += lanes
+            at += count
+            top += lanes
 
 
 @wp.kernel(enable_backward=False)

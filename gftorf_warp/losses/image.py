@@ -8,10 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-WINDOW = 11  # taps of the Gaussian window of the similarity, as published for images of 8 bits
-WINDOW_SIGMA = 1.5  # [px] standard deviation of that window
-STABILISE_MEAN = 1e-4  # (0.01 L)^2 for a range L = 1: keeps the comparison of means defined in the dark
-STABILISE_SPREAD = 9e-4  # (0.03 L)^2, the same for the comparison of contrasts
+from ..constants import STABILISE_MEAN, STABILISE_SPREAD, WINDOW, WINDOW_SIGMA
 
 
 def similarity(rendered: Float[Tensor, "*c H W"], measured: Float[Tensor, "*c H W"]) -> Float[Tensor, "*c H W"]:

@@ -1,4 +1,4 @@
-"""Errors of what a C-ToF pixel recorded: quads and phasors (method, section 5)."""
+"""Errors of what a C-ToF pixel recorded, quads or the two parts of a phasor (method, section 5)."""
 
 from __future__ import annotations
 
@@ -15,12 +15,3 @@ def quad_error(rendered: Float[Tensor, "*q H W"], measured: Float[Tensor, "*q H 
     if rendered.shape != measured.shape:
         raise ValueError(f"rendered {tuple(rendered.shape)} and measured {tuple(measured.shape)} must have one shape")
     return (rendered - measured).square()
-
-
-def phasor_error(rendered: Float[Tensor, "3 H W"], measured: Float[Tensor, "2 H W"]) -> Float[Tensor, "2 H W"]:
-    """Squared difference of the real and imaginary parts, in squared quad units; an amplitude is not compared.
-
-    Raises:
-        ValueError: If the images differ in size.
-    """
-    return quad_error(rendered[:2], measured[:2])

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -105,6 +106,10 @@ class ClosedForm(Run):
             extra=None if extra is None else tensor(np.zeros((extra.shape[1], *size))),
             screen=None,
         )
+
+    def renderer(self, images: Iterable[str] = ()) -> Callable[[float, Camera], Rendering]:  # noqa: ARG002
+        """:meth:`render`: there is nothing that images share."""
+        return self.render
 
     def _check(self, camera: Camera | None, sequence: Sequence, quartet: int, time: float) -> None:
         """Refuse every camera but the sequence's own."""

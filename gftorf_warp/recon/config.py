@@ -15,7 +15,7 @@ from ..render.buffers import available_threads
 from ..scene.measured import camera_of, frame_period, sensor_of
 from . import densify
 from .observations import data_hash
-from .optimiser import rates_at
+from .optimiser import betas_of, rates_at
 from .settings import ReconSettings, plain
 
 
@@ -67,6 +67,7 @@ def resolved(settings: ReconSettings) -> dict[str, object]:
     return {
         "images": schedule.images,
         "batch": str(schedule.batch),
+        "betas": list(betas_of(settings)),
         **{f"rates_{name}": rates_at(settings, images) for name, images in instants.items()},
         "rates_last": rates_at(settings, schedule.images),
         "motion_from": schedule.warm_up,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -12,14 +12,18 @@ from torch import Tensor
 from ..constants import FRAMES_PER_QUARTET
 from ..losses.image import similarity
 from ..losses.prior import flow_error, image_motion, motion_size
-from ..losses.tof import phasor_error, quad_error
+from ..losses.tof import quad_error
+from ..render import fused
 from ..render.api import Background, Rendering, rasterize
-from ..render.buffers import RenderSettings
+from ..render.buffers import RenderSettings, Workspace
 from ..scene.camera import Camera
 from ..scene.gaussians import GaussianField
 from ..scene.motion import Motion
+from ..scene.sensor import Sensor
 from .observations import Observations
-from .settings import Norm, ReconSettings, Weights
+from .settings import Kernels, Norm, ReconSettings, Weights
+
+NEAREST = 1e-6  # [m] of a surface: where nothing is seen nothing moves, wherever that is but at the camera itself
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -82,6 +86,7 @@ def terms(
         The weighted terms, whose sum is the loss, and what was rendered.
     """
     render = render or settings.render
+    kernel = settings.kernels != Kernels.NONE
     time = observations.time_at(frame)
     still = torch.zeros_like(field.mean)
     displacement = still if motion is None else motion.displacement(attachment, time)
@@ -89,13 +94,20 @@ def terms(
     tof = colour = squared = None
     if weights.quads > 0 or weights.depth > 0 or weights.distortion > 0:
         moved = replace(field, colour_sh=None).moved(displacement)
-        tof = _render(moved, observations.cameras[frame], observations, frame, settings, render, backgrounds)
+        sensor = observations.sensor_at(frame)
+        camera, light = observations.cameras[frame], "phasor" if observations.phasors else "quads"
+        tof = rendering_of(moved, camera, sensor, settings, render, weights, backgrounds, light=light)
     if tof is not None and weights.quads > 0:
-        loss, squared = _tof_loss(tof, observations, frame, weights.ssim)
+        if observations.phasors:  # an amplitude is not compared: re and im say it already
+            rendered, measured = tof.phasor[:2], observations.phasors[frame]
+        else:
+            rendered, measured = tof.quads, observations.quads[frame][None]
+        loss, squared = image_loss(rendered, measured, weights.ssim, kernel=kernel)
         result["quads"] = weights.quads * loss
     if tof is not None and weights.depth > 0 and frame // FRAMES_PER_QUARTET in observations.closed_form:
         measured = observations.closed_form[frame // FRAMES_PER_QUARTET][None]
-        result["depth"] = weights.depth * image_loss(tof.distance[None], measured, weights.ssim, Norm.L1)
+        loss, _ = image_loss(tof.distance[None], measured, weights.ssim, Norm.L1, kernel=kernel)
+        result["depth"] = weights.depth * loss
     if tof is not None and weights.distortion > 0:
         result["distortion"] = weights.distortion * tof.distortion.mean()
     if weights.colour > 0 and frame in observations.colour:
@@ -103,70 +115,98 @@ def terms(
         if motion is not None and taken != time:
             then = motion.displacement(attachment, taken)
         camera = observations.colour_cameras[frame]
-        colour = _render(field.moved(then), camera, observations, frame, settings, render, backgrounds)
+        sensor = observations.sensor_at(frame)
+        colour = rendering_of(field.moved(then), camera, sensor, settings, render, weights, backgrounds)
         assert colour.colour is not None
         measured = observations.colour[frame]
-        result["colour"] = weights.colour * image_loss(colour.colour, measured, weights.ssim, weights.colour_norm)
-        if squared is None:
-            squared = quad_error(colour.colour.detach(), measured).mean()
+        loss, of_colour = image_loss(colour.colour, measured, weights.ssim, weights.colour_norm, kernel=kernel)
+        result["colour"] = weights.colour * loss
+        squared = of_colour if squared is None else squared
     if motion is not None and weights.motion_size > 0:
         result["motion_size"] = weights.motion_size * motion_size(displacement).mean()
     if motion is not None and weights.flow > 0 and frame % FRAMES_PER_QUARTET == 0:
-        flow = flow_loss(field, motion, attachment, observations, frame, render)
+        flow = flow_loss(field, motion, attachment, observations, frame, render, kernel=kernel)
         if flow is not None:
             result["flow"] = weights.flow * flow
     return result, Seen(tof=tof, colour=colour, squared=still.new_zeros(()) if squared is None else squared)
 
 
-def _render(
+def rendering_of(
     field: GaussianField,
     camera: Camera,
-    observations: Observations,
-    frame: int,
+    sensor: Sensor,
     settings: ReconSettings,
     render: RenderSettings,
+    weights: Weights,
     backgrounds: Mapping[str, Tensor] | None,
+    *,
+    light: str = "quads",
+    flows: Float[Tensor, "N D"] | None = None,
+    workspace: Workspace | None = None,
 ) -> Rendering:
-    """One rendering; colour is part of it if the field has any."""
+    """One rendering before random light from behind, of what the loss looks at; with colour if the field has any.
+
+    Args:
+        field: Gaussians where they are.
+        camera: Where from.
+        sensor: What quads are.
+        settings: What is compared.
+        render: How.
+        weights: Of the terms.
+        backgrounds: Random light, see :func:`terms`.
+        light: The image that is compared, quads or phasor.
+        flows: Displacements [m], three each, that come along as extra channels; their gradient reaches them alone.
+        workspace: Where to render; None: in memory of its own.
+    """
     wanted = ("colour",) if field.colour_sh is not None else ("quads", "phasor")
     lights = {name: light for name, light in (backgrounds or {}).items() if name in wanted}
+    images = {"opacity", light}
+    if weights.distortion > 0:
+        images.add("distortion")
+    if weights.depth > 0 or flows is not None:
+        images.add("distance")
     return rasterize(
         field,
         camera,
-        observations.sensor_at(frame),
+        sensor,
         render,
         background=Background(**lights),
         screen_gradient=settings.densify.every is not None,
+        images=images,
+        extra=flows,
+        extra_detached=flows is not None,
+        workspace=workspace,
     )
 
 
-def _tof_loss(tof: Rendering, observations: Observations, frame: int, ssim: float) -> tuple[Tensor, Tensor]:
-    """Loss of the quad or phasor, and its mean squared difference."""
-    if observations.phasors:
-        measured = observations.phasors[frame]
-        squared = phasor_error(tof.phasor, measured).mean()
-        return _mixed(squared, tof.phasor[:2], measured, ssim), squared.detach()
-    measured = observations.quads[frame][None]
-    squared = quad_error(tof.quads, measured).mean()
-    return _mixed(squared, tof.quads, measured, ssim), squared.detach()
-
-
 def image_loss(
-    rendered: Float[Tensor, "C H W"], measured: Float[Tensor, "C H W"], ssim: float, norm: Norm = Norm.L2
-) -> Tensor:
-    """(1 - ssim) times the mean L1 or L2 difference + ssim (1 - SSIM), means over pixels and channels.
+    rendered: Float[Tensor, "C H W"],
+    measured: Float[Tensor, "C H W"],
+    ssim: float,
+    norm: Norm = Norm.L2,
+    *,
+    kernel: bool = False,
+) -> tuple[Tensor, Tensor]:
+    """(1 - ssim) times the mean L1 or L2 difference + ssim (1 - SSIM), and the mean squared difference, detached.
+
+    Args:
+        rendered: What gradients reach.
+        measured: What they do not reach.
+        ssim: Share of the similarity.
+        norm: Of the difference.
+        kernel: Whether the hand-written kernels do it, in float32; without a similarity torch does.
 
     Raises:
         ValueError: If the shapes differ.
     """
-    squared = quad_error(rendered, measured)
-    difference = squared.mean() if norm == Norm.L2 else (rendered - measured).abs().mean()
-    return _mixed(difference, rendered, measured, ssim)
-
-
-def _mixed(difference: Tensor, rendered: Tensor, measured: Tensor, ssim: float) -> Tensor:
+    if kernel and ssim > 0:
+        return fused.image_loss(rendered, measured, ssim, absolute=norm == Norm.L1)[:2]
+    squared = quad_error(rendered, measured).mean()
+    difference = squared if norm == Norm.L2 else (rendered - measured).abs().mean()
     loss = (1.0 - ssim) * difference
-    return loss + ssim * (1.0 - similarity(rendered, measured).mean()) if ssim > 0 else loss
+    if ssim > 0:
+        loss = loss + ssim * (1.0 - similarity(rendered, measured).mean())
+    return loss, squared.detach()
 
 
 def flow_loss(
@@ -176,29 +216,55 @@ def flow_loss(
     observations: Observations,
     frame: int,
     render: RenderSettings,
+    *,
+    kernel: bool = False,
 ) -> Tensor | None:
     """Squared difference of rendered and measured flow [px^2] from a quartet's start to both neighbours; None: no flow.
 
     The mean is over all pixels and both components, unknown ones counting zero. Gradients reach the motion through the
     displacement between keys only: the surface and all weights are held fixed (method, section 5). If the camera moves,
-    the flow of its own motion is part of both.
+    the flow of its own motion is part of both. ``kernel``: whether the hand-written kernels compare.
     """
     quartet = frame // FRAMES_PER_QUARTET
     steps = [step for step in (1, -1) if (quartet, step) in observations.flow]
     if not steps:
         return None
-    cameras = observations.cameras
-    camera = cameras[frame]
     here, *there = motion.key_offsets(attachment, [quartet, *(quartet + step for step in steps)])
-    offsets = [offset - here for offset in there]
     still = replace(field, colour_sh=None).moved(here).map(torch.Tensor.detach)
-    seen = rasterize(still, camera, observations.sensor_at(frame), render, extra=torch.cat(offsets, dim=1))
+    camera, sensor = observations.cameras[frame], observations.sensor_at(frame)
+    channels, wanted = torch.cat([offset - here for offset in there], dim=1), ("distance",)
+    seen = rasterize(still, camera, sensor, render, extra=channels, images=wanted)
     assert seen.extra is not None
-    ray = camera.rays(device=field.device)
-    surface = torch.as_tensor(camera.centre).to(ray) + ray * seen.distance.detach()[..., None]
+    last = len(observations.cameras) - 1
+    later = [observations.cameras[min(frame + FRAMES_PER_QUARTET * step, last)] for step in steps]
+    measured = [observations.flow[quartet, step] for step in steps]
+    if kernel:
+        return fused.flow_loss(seen.distance, seen.extra, torch.stack(measured)[None], camera, later)
+    return flow_between(seen.distance, seen.extra, measured, camera, later, observations.rays_at(frame))
+
+
+def flow_between(
+    distance: Float[Tensor, "H W"],
+    displacement: Float[Tensor, "D H W"],
+    measured: Sequence[Float[Tensor, "2 H W"]],
+    camera: Camera,
+    later: Sequence[Camera],
+    rays: tuple[Float[Tensor, "3"], Float[Tensor, "H W 3"]],
+) -> Tensor:
+    """Sum over some flows of the mean squared difference [px^2] to what displacements would show.
+
+    Args:
+        distance: Of the surface [m]; without gradient.
+        displacement: Composited displacements to the end of each flow [m], three channels each.
+        measured: The flows; NaN: unknown.
+        camera: Where from.
+        later: The camera at the end of each flow.
+        rays: Centre of the camera [m] and unit vectors through its pixels, in world axes.
+    """
+    centre, ray = rays
+    surface = centre + ray * distance.detach().clamp_min(NEAREST)[..., None]
     errors = []
-    for n, step in enumerate(steps):
-        later = cameras[min(frame + FRAMES_PER_QUARTET * step, len(cameras) - 1)]
-        moved = image_motion(surface, seen.extra[3 * n : 3 * n + 3], camera.project, later.project)
-        errors.append(flow_error(moved, observations.flow[quartet, step])[0].mean())
+    for n, (flow, then) in enumerate(zip(measured, later, strict=True)):
+        moved = image_motion(surface, displacement[3 * n : 3 * n + 3], camera.project, then.project)
+        errors.append(flow_error(moved, flow)[0].mean())
     return torch.stack(errors).sum()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 from dataclasses import dataclass, replace
 
@@ -60,6 +61,29 @@ class Observations:
     def sensor_at(self, frame: int) -> Sensor:
         """The sensor reading only the shift of one raw frame."""
         return self.sensor.with_shifts((float(self.sequence.shifts[frame]),))
+
+    def rays_at(self, frame: int) -> tuple[Float[Tensor, "3"], Float[Tensor, "H W 3"]]:
+        """Centre of the camera [m] and unit vectors through its pixels, in world axes; sent once per pose."""
+        camera = self.cameras[frame]
+        key = camera.camera_from_world.tobytes()
+        if key not in self._rays:
+            ray = camera.rays(device=self.quads.device)
+            self._rays[key] = torch.as_tensor(camera.centre).to(ray), ray
+        return self._rays[key]
+
+    def flow_table(self) -> Float[Tensor, "Q 2 2 H W"] | None:
+        """Flow [px] of every quartet to the next one and to the one before, NaN where there is none; None: no flow."""
+        if not self.flow:
+            return None
+        count = -(-len(self.quads) // FRAMES_PER_QUARTET)
+        table = self.quads.new_full((count, 2, 2, *self.quads.shape[1:]), float("nan"))
+        for (quartet, step), flow in self.flow.items():
+            table[quartet, 0 if step == 1 else 1] = flow
+        return table
+
+    @functools.cached_property
+    def _rays(self) -> dict[bytes, tuple[Tensor, Tensor]]:
+        return {}
 
     def time_at(self, frame: int) -> float:
         """When raw frame ``frame`` was taken [s]; if phasors are compared, the middle of its quartet."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import asdict
 
@@ -9,11 +10,13 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
+from ..constants import FRAMES_PER_QUARTET
+from ..render import descent
 from ..scene.gaussians import GaussianField
 from ..scene.motion import Motion
-from .settings import ReconSettings
+from .settings import Batch, BatchRule, Input, ReconSettings
 
-BETAS = (0.9, 0.999)
+BETAS = (0.9, 0.999)  # of steps of one image
 EPSILON = 1e-15  # far below any gradient here, so that a step depends on the direction of a gradient, not on its size
 
 
@@ -37,6 +40,9 @@ def rates_at(
     begin = schedule.motion_decay_from
     shares = dict.fromkeys(first, share)
     shares["motion"] = min(max(images - begin, 0) / max(schedule.images - begin, 1), 1.0)
+    images_of_step = _images(settings)
+    linear = settings.schedule.batch_rule == BatchRule.LINEAR
+    factor *= images_of_step if linear else math.sqrt(images_of_step)
     rates = {name: factor * _between(first[name], last[name], shares[name]) for name in first}
     paused = reset_at is not None and images < reset_at + schedule.pause_after_reset
     if images < schedule.warm_up or paused:
@@ -44,6 +50,19 @@ def rates_at(
     if frozen(settings, images):
         rates = {name: rate if name == "motion" else 0.0 for name, rate in rates.items()}
     return rates
+
+
+def betas_of(settings: ReconSettings) -> tuple[float, float]:
+    """Decays of both moments per step: as much is forgotten per image, whatever the batch, if its rule says so."""
+    images = _images(settings)
+    return BETAS[0] ** images, BETAS[1] ** images
+
+
+def _images(settings: ReconSettings) -> int:
+    """Images of a step as far as Adam is concerned; a last batch that is cut short counts as a whole one."""
+    schedule = settings.schedule
+    joint = schedule.batch == Batch.QUARTET and settings.input != Input.PHASOR and settings.weights.quads > 0
+    return FRAMES_PER_QUARTET if joint and schedule.batch_rule != BatchRule.NONE else 1
 
 
 def frozen(settings: ReconSettings, images: int) -> bool:
@@ -63,13 +82,22 @@ class Optimiser:
     The harmonics of the colour are two tensors, ``colour_constant`` and ``colour_rest``, since their rates differ.
     """
 
-    def __init__(self, field: GaussianField, motion: Motion, state: dict | None = None):
+    def __init__(
+        self,
+        field: GaussianField,
+        motion: Motion,
+        state: dict | None = None,
+        *,
+        betas: tuple[float, float] = BETAS,
+    ):
         """Take copies of the tensors of a field, which become leaves, and the parameters of a motion.
 
         Args:
             field: The Gaussians.
             motion: Their motion.
-            state: ``adam.state_dict()`` of an earlier optimiser of the same tensors; None starts at zero.
+            state: ``adam.state_dict()`` of an earlier optimiser of the same tensors, whose decays go on; None starts
+                at zero.
+            betas: Decays of both moments per step.
         """
         self.layer = field.layer
         parts = field.parameters()
@@ -77,11 +105,13 @@ class Optimiser:
         if colour is not None:
             parts |= {"colour_constant": colour[:, :1], "colour_rest": colour[:, 1:]}
         self.tensors = {name: value.detach().clone().requires_grad_() for name, value in parts.items()}
+        self.origin: Int[Tensor, "N"] | None = None
+        """The row that each Gaussian was when this was last set to None; None: the same."""
         self.motion = [parameter for parameter in motion.parameters() if parameter.numel()]
         self.adam = torch.optim.Adam(
             [{"name": name, "params": [value], "lr": 0.0} for name, value in self.tensors.items()]
             + ([{"name": "motion", "params": self.motion, "lr": 0.0}] if self.motion else []),
-            betas=BETAS,
+            betas=betas,
             eps=EPSILON,
             fused=True,
         )
@@ -97,17 +127,32 @@ class Optimiser:
         return GaussianField(**parts, layer=self.layer)
 
     @property
+    def betas(self) -> tuple[float, float]:
+        """Decays of both moments per step."""
+        first, second = self.adam.param_groups[0]["betas"]
+        return first, second
+
+    @property
     def leaves(self) -> list[Tensor]:
         """Everything that is optimised: the tensors of the field, then the motion."""
         return [*self.tensors.values(), *self.motion]
 
-    def step(self, gradients: list[Tensor | None], rates: dict[str, float], motion_gradient_max: float | None) -> None:
+    def step(
+        self,
+        gradients: list[Tensor | None],
+        rates: dict[str, float],
+        motion_gradient_max: float | None,
+        *,
+        sound: Bool[Tensor, ""] | None = None,
+    ) -> None:
         """One step of Adam.
 
         Args:
             gradients: Of ``leaves``; None is zero.
             rates: From :func:`rates_at`. A group of rate 0 is left alone, its moments included.
             motion_gradient_max: Longest gradient of the motion; a longer one is shortened. None: no limit.
+            sound: Whether anything may change, where the tensors are: the kernel of Adam asks, and no host waits for
+                the answer. None: everything may, and torch's Adam does it.
         """
         for leaf, gradient in zip(self.leaves, gradients, strict=True):
             leaf.grad = gradient
@@ -118,8 +163,40 @@ class Optimiser:
             if group["lr"] == 0.0:
                 for leaf in group["params"]:
                     leaf.grad = None
-        self.adam.step()
+        if sound is None:
+            self.adam.step()
+        else:
+            self._step_by_kernel(sound)
         self.adam.zero_grad(set_to_none=True)
+
+    def _step_by_kernel(self, sound: Bool[Tensor, ""]) -> None:
+        """All tensors in two launches, with the moments that torch's Adam keeps, and would begin with."""
+        moving = [(leaf, group["lr"]) for group in self.adam.param_groups for leaf in group["params"]]
+        moving = [(leaf, rate) for leaf, rate in moving if leaf.grad is not None]
+        moments = [self.moments_of(leaf) for leaf, _ in moving]
+        if not moving:
+            return
+        values, gradients = [leaf.detach() for leaf, _ in moving], [leaf.grad.contiguous() for leaf, _ in moving]
+        rates = torch.tensor([rate for _, rate in moving], device=sound.device)
+        table = descent.AdamTable(values, gradients, moments)
+        descent.adam_step(table, rates, sound.to(torch.int32).reshape(1), betas=self.betas, epsilon=EPSILON)
+
+    def moments_of(self, leaf: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """(step, first moment, second moment) of a leaf; zeros, as torch's Adam would begin, if it has none yet."""
+        state = self.adam.state[leaf]
+        if not state:
+            state["step"] = torch.zeros((), device=leaf.device)
+            state |= {name: torch.zeros_like(leaf, requires_grad=False) for name in ("exp_avg", "exp_avg_sq")}
+        return state["step"], state["exp_avg"], state["exp_avg_sq"]
+
+    def settle(self, name: str, value: Tensor, moments: tuple[Tensor, Tensor, Tensor]) -> None:
+        """Let one tensor of the field live elsewhere, with the moments that it has had so far."""
+        self.adam.state.pop(self.tensors[name], None)
+        self.tensors[name] = value
+        for group in self.adam.param_groups:
+            if group["name"] == name:
+                group["params"] = [value]
+        self.adam.state[value] = dict(zip(("step", "exp_avg", "exp_avg_sq"), moments, strict=True))
 
     def replace(
         self, rows: Int[Tensor, "M"], fresh: Bool[Tensor, "M"], change: Callable[[str, Tensor], Tensor]
@@ -145,6 +222,7 @@ class Optimiser:
             self.tensors[name] = new
             if state:
                 self.adam.state[new] = state
+        self.origin = rows if self.origin is None else self.origin[rows]
         if self.layer is not None:
             self.layer = self.layer[rows]
 

@@ -13,7 +13,7 @@ from ..errors import UsageError
 from ..render.buffers import ClampGradient, Distortion, RenderSettings, Stop, Support
 from ..scene.initialise import Init, InitSettings
 from ..scene.motion import MotionKind, MotionSettings
-from .settings import Batch, DensifySettings, Input, Method, Norm, Rates, ReconSettings, Schedule, Weights
+from .settings import Batch, BatchRule, DensifySettings, Input, Method, Norm, Rates, ReconSettings, Schedule, Weights
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,6 +143,7 @@ def released(recorded: Recorded = Recorded()) -> ReconSettings:
         schedule=replace(
             base.schedule,
             images=20_000,
+            batch_rule=BatchRule.LINEAR,  # of single frames, as published, it changes nothing
             motion_decay_from=2000,
             pause_after_reset=200,
             freeze_from=base.densify.stop_share if base.densify.stop_share < 1.0 else None,
@@ -270,6 +271,7 @@ def shortened(settings: ReconSettings, images: int) -> ReconSettings:
             reset_every=if_any(densify.reset_every),
             reset_faster=None if faster is None else (shorter(faster[0]), shorter(faster[1])),
         ),
+        gate=replace(settings.gate, every=shorter(settings.gate.every), after=shorter(settings.gate.after)),
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -17,6 +18,8 @@ from ..data.sequence import Sequence
 from ..errors import InputError
 from ..render.api import Rendering, rasterize
 from ..render.buffers import ClampGradient, Distortion, RenderSettings, Stop, Support
+from ..render.inputs import CHOICES
+from ..render.replay import Replay
 from ..scene.camera import Camera
 from ..scene.gaussians import GaussianField
 from ..scene.motion import Motion
@@ -123,6 +126,31 @@ class Run:
             phasor=rendering.phasor / self.quad_scale,
             colour=None if rendering.colour is None else rendering.colour / self.colour_scale,
         )
+
+    def renderer(self, images: Iterable[str] = (*CHOICES, "colour")) -> Callable[[float, Camera], Rendering]:
+        """:meth:`render` for many images: a function of time [s] and camera, which keeps what images share.
+
+        Its images differ from those of :meth:`render` by rounding only, and the next call overwrites them.
+
+        Args:
+            images: Names of what is wanted of quads, phasor, colour, distance, opacity and distortion; others have no
+                elements and cost nothing.
+        """
+        names = frozenset(images)
+        field = self.field if "colour" in names else replace(self.field, colour_sh=None)
+        sensor = replace(self.sensor, source_intensity=float(self.sensor.source_intensity) / self.quad_scale)
+        optimised = self.camera.resized(*self.config["size_optimised"])
+        replay = Replay(field, self.motion, self.attachment, sensor, self.render_settings, optimised, names)
+        if field.colour_sh is None:
+            return replay
+
+        def scaled(time: float, camera: Camera) -> Rendering:
+            rendering = replay(time, camera)
+            assert rendering.colour is not None
+            rendering.colour.div_(self.colour_scale)
+            return rendering
+
+        return scaled
 
     def widened(self, field: GaussianField, camera: Camera) -> GaussianField:
         """Gaussians as wide as they looked while they were optimised, for a camera that resolves more.

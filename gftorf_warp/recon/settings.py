@@ -68,6 +68,30 @@ class Batch(enum.StrEnum):
     """The measured raw frames of one quartet: all slots pull at once."""
 
 
+class BatchRule(enum.StrEnum):
+    """What rates and moments of Adam become when a step compares several images, over those of single images."""
+
+    NONE = "none"
+    """The same."""
+    ROOT = "root"
+    """Of b images: rates times the root of b, both decays to the power of b, so that as much is forgotten per image."""
+    LINEAR = "linear"
+    """As ``root`` with rates times b: as far per image where gradients agree, which short runs need."""
+
+
+class Kernels(enum.StrEnum):
+    """How much of a step, beside the rendering, is done by kernels instead of torch: the same to rounding."""
+
+    NONE = "none"
+    """Nothing."""
+    LOSS = "loss"
+    """Losses of images that contain the similarity."""
+    STEP = "step"
+    """These, random backgrounds and Adam; the backgrounds are other draws of the same kind."""
+    GRAPH = "graph"
+    """The whole step, captured as one CUDA graph; on a CPU the same without one. What cannot be one is ``step``."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Rates:
     """Learning rates of Adam: the size of one step, whatever the size of the gradient (method, section 6.5)."""
@@ -124,6 +148,8 @@ class Schedule:
     """Length of the run [images]."""
     batch: Batch = Batch.QUARTET
     """What one step compares; a phasor is one image."""
+    batch_rule: BatchRule = BatchRule.NONE
+    """How Adam is told of larger batches."""
     warm_up: int = 0
     """Nothing moves for so long, and the motion learns nothing [images]."""
     motion_decay_from: int = 0
@@ -195,6 +221,31 @@ class DensifySettings:
 
 
 @dataclass(frozen=True, kw_only=True)
+class GateSettings:
+    """An approximation: Gaussians at rest keep their displacements for a while instead of asking the network.
+
+    Only captured steps (``kernels=graph``) of a motion network know it; other steps say in the log that they ignore it.
+    Diagnostics, checkpoints and the finished run ask the network for everybody; a run that is resumed judges anew.
+    """
+
+    distance: float | None = None
+    """Displacements that stay within this of their mean over all keys are at rest [m]; None: everybody asks."""
+    every: int = 500
+    """Between two judgements of who is at rest [images]."""
+    after: int = 1000
+    """The first judgement is so long after the warm-up: the network has to learn first what moves [images]."""
+    open_every: int = 8
+    """In one of so many steps everybody asks and learns, so that the network goes on to hold still what rests [1]."""
+
+    def __post_init__(self):
+        if self.distance is not None and not self.distance > 0:
+            raise ValueError(f"distance must be above 0 or None, got {self.distance} m")
+        if self.every < 1 or self.open_every < 1 or self.after < 0:
+            counts = f"{self.every}, {self.open_every} and {self.after}"
+            raise ValueError(f"every and open_every must be at least 1 and after at least 0, got {counts}")
+
+
+@dataclass(frozen=True, kw_only=True)
 class ReconSettings:
     """How a sequence is reconstructed."""
 
@@ -216,6 +267,8 @@ class ReconSettings:
     """The first Gaussians."""
     motion: MotionSettings = field(default_factory=MotionSettings)
     """The motion model."""
+    gate: GateSettings = field(default_factory=GateSettings)
+    """Who asks it in a step."""
     render: RenderSettings = field(default_factory=RenderSettings)
     """The renderer, also of the finished run."""
     rates: Rates = field(default_factory=Rates)
@@ -232,6 +285,8 @@ class ReconSettings:
     """Amplitude B of the random background, uniform in [-B, B] per pixel, channel and image; 0 is black."""
     motion_gradient_max: float | None = 1.0
     """Longest gradient of the motion; a longer one is shortened [1/m for nodes, 1 for a network]. None: never."""
+    kernels: Kernels = Kernels.LOSS
+    """How much of a step is done by kernels instead of torch."""
     failures_max: int = 5
     """So many steps without a finite loss and gradient in a row go back to the last checkpoint, with halved rates."""
     rollbacks_max: int = 3

@@ -16,7 +16,7 @@ from ..scene.motion import Motion, MotionKind, MotionSettings, Nodes, Products, 
 from ..scene.network import Network
 from . import densify
 from .observations import Observations
-from .optimiser import Optimiser
+from .optimiser import Optimiser, betas_of
 from .settings import ReconSettings
 
 FORMAT = 2  # of the stored form; a higher one is refused
@@ -74,7 +74,7 @@ def begin(observations: Observations, settings: ReconSettings, *, seed: int, dev
     if settings.weights.colour > 0:
         field = replace(field, colour_sh=torch.zeros(len(field), SH_COEFFICIENTS, 3, device=device))
     return State(
-        optimiser=Optimiser(field, motion),
+        optimiser=Optimiser(field, motion, betas=betas_of(settings)),
         motion=motion,
         attachment=motion.attach(field),
         statistics=densify.start(field),
@@ -113,7 +113,7 @@ def to_dict(state: State) -> dict[str, object]:
         "field": {name: value.detach() for name, value in state.optimiser.field.tensors().items()},
         "adam": state.optimiser.adam.state_dict(),
         "motion": _motion_to_dict(state.motion),
-        "attachment": state.attachment,
+        "attachment": state.optimiser.field.mean.detach() if state.motion.follows_means else state.attachment,
         "statistics": {"gradient": state.statistics.gradient, "pixels": state.statistics.pixels},
         "generator": state.generator.get_state(),
         "noise": state.noise.get_state(),

@@ -9,14 +9,16 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from ..render import fused
 from . import densify
 from .objective import Seen, render_settings_at, terms, weights_at
 from .observations import Observations
 from .optimiser import frozen, rates_at
-from .settings import ReconSettings, Weights
+from .settings import Kernels, ReconSettings, Weights
 from .state import State
 
 Map = Callable[[Callable, Iterable], Iterable]
+SEED_MASK = 0x7FFFFFFF  # a seed as a positive int32, for kernels
 
 
 def draw(state: State, observations: Observations, settings: ReconSettings) -> list[int]:
@@ -52,7 +54,9 @@ def step(
     weights, render = weights_at(settings, state.images), render_settings_at(settings, state.images)
     rests = frozen(settings, state.images)
     first = len(state.optimiser.tensors) if rests else 0  # of the leaves that learn; those of the motion come last
-    backgrounds = [_backgrounds(state, observations, frame, settings, weights) for frame in frames]
+    numbers = range(state.images, state.images + len(frames))
+    pairs = zip(numbers, frames, strict=True)
+    backgrounds = [_backgrounds(state, observations, frame, settings, weights, number) for number, frame in pairs]
 
     def one(frame: int, lights: dict[str, Tensor]) -> tuple[dict[str, Tensor], Seen, list[Tensor | None]]:
         field = state.optimiser.field
@@ -77,19 +81,45 @@ def step(
     gradients = [_mean([gradients[n] for _, _, gradients in results]) for n in range(len(leaves))]
     before, state.images = state.images, state.images + len(frames)
     checked = [value for found, _, _ in results for value in found.values()]
-    checked += [gradient.square().sum() for gradient in gradients if gradient is not None]
-    if checked and not bool(torch.stack(checked).sum().isfinite()):
-        return {name: float(sum(found.get(name, 0.0) for found, _, _ in results)) for name in results[0][0]}
-    for frame, (found, seen, _) in zip(frames, results, strict=True):
-        _account(state, observations, frame, found, seen)
+    present = [gradient for gradient in gradients if gradient is not None]
+    checked += [torch.nn.utils.get_total_norm(present)] if present else []
     rates = rates_at(settings, before, state.rate_factor, reset_at=state.reset_at)
     options = settings.densify
     due = densify.round_is_due(before, state.images, options, settings.schedule)
     if due and options.loses_step:
         rates = {name: rate if name == "motion" else 0.0 for name, rate in rates.items()}
-    state.optimiser.step(gradients, rates, settings.motion_gradient_max)
-    _densify(state, before, settings)
+    sound = torch.stack(checked).sum().isfinite() if checked else None
+    by_kernel = settings.kernels == Kernels.STEP and sound is not None
+    if by_kernel:  # asks by itself whether the step is sound, so that the device has work while the host asks, too
+        state.optimiser.step(gradients, rates, settings.motion_gradient_max, sound=sound)
+    if sound is not None and not bool(sound):
+        return {name: float(sum(found.get(name, 0.0) for found, _, _ in results)) for name in results[0][0]}
+    for frame, (found, seen, _) in zip(frames, results, strict=True):
+        _account(state, observations, frame, found, seen)
+    if not by_kernel:
+        state.optimiser.step(gradients, rates, settings.motion_gradient_max)
+    densify_after(state, before, settings)
     return None
+
+
+class Singles:
+    """The steps of one run, one after the other."""
+
+    def __init__(self, state: State, observations: Observations, settings: ReconSettings, run_all: Map = map):
+        self._state, self._observations, self._settings = state, observations, settings
+        self._run_all, self._first, self._failures = run_all, True, 0
+
+    def step(self) -> dict[str, float] | None:
+        """One step; what it returns is that of :func:`step`."""
+        run_all = map if self._first else self._run_all  # the first one compiles kernels: one thread at a time
+        broken, self._first = step(self._state, self._observations, self._settings, run_all), False
+        self._failures = 0 if broken is None else self._failures + 1
+        self._state.skipped += broken is not None
+        return broken
+
+    def collect(self) -> int:
+        """How many steps in a row, up to the last one, changed nothing because something was not finite."""
+        return self._failures
 
 
 def threads_for(settings: ReconSettings, device: torch.device | str, available: int) -> tuple[ReconSettings, int]:
@@ -109,9 +139,9 @@ def pool(workers: int) -> ThreadPoolExecutor:
 
 
 def _backgrounds(
-    state: State, observations: Observations, frame: int, settings: ReconSettings, weights: Weights
+    state: State, observations: Observations, frame: int, settings: ReconSettings, weights: Weights, number: int
 ) -> dict[str, Tensor]:
-    """Uniform in [-B, B] per pixel and channel, for every image that will be compared."""
+    """Uniform in [-B, B] per pixel and channel, for every image that will be compared; ``number`` counts images."""
     if settings.background == 0.0:
         return {}
     size = observations.quads.shape[1:]
@@ -121,8 +151,15 @@ def _backgrounds(
     if weights.colour > 0 and frame in observations.colour:
         shapes["colour"] = tuple(observations.colour[frame].shape)
 
+    device = observations.quads.device
+    if settings.kernels == Kernels.STEP:
+        seed = state.noise.initial_seed() & SEED_MASK
+        origin = torch.tensor([seed, number], dtype=torch.int32, device=device)
+        streams = enumerate(shapes.items())
+        return {name: fused.uniform(shape, origin, settings.background, stream=n) for n, (name, shape) in streams}
+
     def uniform(shape: tuple[int, ...]) -> Tensor:
-        drawn = torch.rand(shape, generator=state.noise, device=observations.quads.device)
+        drawn = torch.rand(shape, generator=state.noise, device=device)
         return settings.background * (2.0 * drawn - 1.0)
 
     return {name: uniform(shape) for name, shape in shapes.items()}
@@ -131,6 +168,8 @@ def _backgrounds(
 def _mean(gradients: list[Tensor | None]) -> Tensor | None:
     """Mean over the images of a batch; an image without a gradient counts as zero."""
     present = [gradient for gradient in gradients if gradient is not None]
+    if len(gradients) == 1:
+        return gradients[0]
     return torch.stack(present).sum(dim=0) / len(gradients) if present else None
 
 
@@ -150,8 +189,8 @@ def _account(state: State, observations: Observations, frame: int, found: dict[s
             state.statistics = densify.observe(state.statistics, rendering.screen, camera)
 
 
-def _densify(state: State, before: int, settings: ReconSettings) -> None:
-    """Rounds and resets that are due after a step."""
+def densify_after(state: State, before: int, settings: ReconSettings) -> None:
+    """Rounds and resets that are due after a step that began after ``before`` images."""
     options, schedule = settings.densify, settings.schedule
     if densify.round_is_due(before, state.images, options, schedule):
         judge = state.images > options.scale_from

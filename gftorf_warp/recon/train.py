@@ -25,6 +25,7 @@ from ..render.buffers import available_threads
 from ..scene.changes import Wording, changed
 from ..scene.measured import sensor_of
 from . import checkpoint, folder, presets
+from .captured import steps_of
 from .config import config_of
 from .diagnostics import Watch
 from .observations import Observations, input_of, observe
@@ -32,7 +33,7 @@ from .record import Metrics, log_to
 from .run import Run
 from .settings import FlowSource, Input, Method, ReconSettings
 from .state import State, begin, from_dict, to_dict
-from .step import pool, step, threads_for
+from .step import pool, threads_for
 
 LOG = logging.getLogger("gftorf_warp")
 Progress = Callable[..., None]
@@ -212,24 +213,25 @@ class _Loop:
         self.saved_at = clock()
 
     def until_done(self, state: State) -> State:
-        total, failures = self.settings.schedule.images, 0
+        total = self.settings.schedule.images
         if state.images == 0:
             self.save(state)
             self.watch.look(state, self.settings)
         with _one_torch_thread(self.device), pool(self.workers) as threads, _signals() as stop:
-            run_all: Callable = map  # the first step compiles kernels: one thread at a time
+            run_all = threads.map if self.workers > 1 else map
+            steps = steps_of(state, self.observations, self.settings, run_all)
             while state.images < total:
                 before = state.images
-                broken = step(state, self.observations, self.settings, run_all)
-                run_all = threads.map if self.workers > 1 else map
-                if broken is None:
-                    failures = 0
-                else:
-                    state.skipped, failures = state.skipped + 1, failures + 1
+                broken = steps.step()
+                if broken is not None:
                     LOG.warning("step at image %d skipped, not finite: %s", state.images, broken)
-                    if failures >= self.settings.failures_max:
-                        state, failures = self.go_back(state, broken), 0
-                        continue
+                elif not (self.is_due(before, state.images) or stop.is_set()):
+                    continue
+                failures = steps.collect()
+                if failures >= self.settings.failures_max:
+                    state = self.go_back(state, broken)
+                    steps = steps_of(state, self.observations, self.settings, run_all)
+                    continue
                 every = self.settings.schedule.log_every
                 if state.images // every > before // every or state.images >= total:
                     self.report(state)
@@ -239,10 +241,20 @@ class _Loop:
                     self.save(state)
                     LOG.info("interrupted at image %d of %d, stored", state.images, total)
                     raise KeyboardInterrupt
-                if self.clock() - self.saved_at > self.settings.schedule.checkpoint_every_s and broken is None:
+                if self.saving_is_due and not failures:
                     self.save(state)
         self.save(state)
         return state
+
+    def is_due(self, before: int, after: int) -> bool:
+        """Whether there is anything to be done besides the next step."""
+        every, total = self.settings.schedule.log_every, self.settings.schedule.images
+        return after // every > before // every or self.watch.due(before, after, total) or self.saving_is_due
+
+    @property
+    def saving_is_due(self) -> bool:
+        """Whether the last checkpoint is old."""
+        return self.clock() - self.saved_at > self.settings.schedule.checkpoint_every_s
 
     def save(self, state: State) -> None:
         state.seconds = self.saved_at = self.clock()
@@ -273,7 +285,7 @@ class _Loop:
         images = shown.phasors or (measured if self.settings.weights.quads > 0 else shown.colour)
         return max(float(image.abs().max()) for image in images.values())
 
-    def go_back(self, state: State, broken: dict[str, float]) -> State:
+    def go_back(self, state: State, broken: dict[str, float] | None) -> State:
         """The last good checkpoint, with halved rates.
 
         Raises:
@@ -284,7 +296,7 @@ class _Loop:
                 "the optimisation diverged",
                 where=f"{self.out}, image {state.images}",
                 why=f"{self.settings.failures_max} steps in a row were not finite after {state.rollbacks} returns to a "
-                f"checkpoint: {broken}, {len(state.optimiser.field)} Gaussians",
+                f"checkpoint: {broken or 'found late'}, {len(state.optimiser.field)} Gaussians",
                 fix="check the sequence with `gftorf check`, or lower the learning rates",
             )
         stored = checkpoint.last(self.out, self.device)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import torch
@@ -12,8 +13,9 @@ from torch import Tensor
 from ..scene.camera import Camera
 from ..scene.gaussians import GaussianField
 from ..scene.sensor import Sensor
-from .bridge import IMAGES, INPUTS, Rasterize
-from .buffers import RenderSettings
+from .bridge import IMAGES, INPUTS, Rasterize, Request
+from .buffers import RenderSettings, Workspace
+from .inputs import CHOICES, wanted_images
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -33,7 +35,10 @@ class Background:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Rendering:
-    """What a pixel sees. With w = alpha T, and T_e the transmittance behind the last splat:"""
+    """What a pixel sees. With w = alpha T, and T_e the transmittance behind the last splat.
+
+    An image that was not asked for has no elements.
+    """
 
     quads: Float[Tensor, "Q H W"]
     """Sum of w T a (cos(psi - shift) + b), plus T_e times the background."""
@@ -71,7 +76,10 @@ def rasterize(
     *,
     background: Background | None = None,
     extra: Float[Tensor, "N D"] | None = None,
+    extra_detached: bool = False,
+    images: Collection[str] = CHOICES,
     screen_gradient: bool = False,
+    workspace: Workspace | None = None,
 ) -> Rendering:
     """Render Gaussians into everything a C-ToF pixel could record (paper, equations 3-5).
 
@@ -85,10 +93,15 @@ def rasterize(
         settings: How.
         background: Light from behind everything; None is black.
         extra: D more channels per Gaussian, composited like colour, for example 3D motion [m].
+        extra_detached: Whether gradients of the extra images reach ``extra`` only. All weights are held fixed under
+            them, as if a detached field were rendered a second time for them; other images are as they were.
+        images: Which of quads, phasor, distance, opacity and distortion are wanted; what is left out saves its time,
+            above all distortion.
         screen_gradient: Whether ``Rendering.screen`` is wanted.
+        workspace: Memory to render in, for whoever does so again and again; None: each rendering has its own.
 
     Raises:
-        ValueError: If a tensor is not float32 or lives elsewhere than the field.
+        ValueError: If a tensor is not float32 or lives elsewhere than the field, or there is no such image.
     """
     count, size = len(field), (camera.height, camera.width)
     tensors: dict[str, Tensor | None] = dict.fromkeys(INPUTS)
@@ -111,11 +124,23 @@ def rasterize(
     screen = torch.zeros(count, 3, device=field.device) if screen_gradient else None
     ordered = [None if t is None else t.contiguous() for t in (tensors[name] for name in INPUTS)]
     shifts = tuple(float(shift) for shift in sensor.shifts)
-    images = dict(zip(IMAGES, Rasterize.apply(camera, shifts, settings, screen, *ordered), strict=True))
-    if extra is not None and images["extra"] is None:
-        images["extra"] = extra.new_zeros(0, *size)
+    request = Request(
+        camera=camera,
+        shifts=shifts,
+        settings=settings,
+        screen=screen,
+        images=wanted_images(images),
+        workspace=workspace,
+        extra_detached=extra_detached,
+    )
+    found = dict(zip(IMAGES, Rasterize.apply(request, *ordered), strict=True))
+    for name in CHOICES:
+        if found[name] is None:
+            found[name] = field.mean.new_zeros(0, *(size if name in channels else size[1:]))
+    if extra is not None and found["extra"] is None:
+        found["extra"] = extra.new_zeros(0, *size)
     return Rendering(
-        **images, screen=None if screen is None else ScreenGradient(gradient=screen[:, :2], pixels=screen[:, 2])
+        **found, screen=None if screen is None else ScreenGradient(gradient=screen[:, :2], pixels=screen[:, 2])
     )
 
 

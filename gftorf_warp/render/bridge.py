@@ -1,9 +1,11 @@
-"""The only module that knows torch and Warp together: shares memory, follows torch's stream, attaches gradients."""
+"""Where torch renders with Warp: shares memory, follows torch's stream, attaches gradients."""
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Mapping
+import functools
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -13,53 +15,72 @@ from torch.autograd.function import once_differentiable
 
 from ..scene.camera import Camera
 from . import launch
-from .buffers import Frame, RenderSettings
+from .buffers import Frame, RenderSettings, Workspace
 from .inputs import Images, Inputs, names_of
 
 INPUTS = names_of(Inputs)
 IMAGES = names_of(Images)
+ALIGNED = 64  # [float32] to which parts of one memory are rounded
+SLOTS = 8  # steps that the host may be ahead of the device
 _VECTORS = {"mean": wp.vec3, "log_scale": wp.vec3, "quaternion": wp.vec4, "colour_sh": wp.vec3}
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Request:
+    """What is rendered, and how, besides tensors with a derivative."""
+
+    camera: Camera
+    """Where from."""
+    shifts: tuple[float, ...]
+    """Phase shifts of the quads [rad]."""
+    settings: RenderSettings
+    """How."""
+    screen: Tensor | None = None
+    """[N, 3] that backward fills with the screen gradient and the number of pixels; None: not wanted."""
+    images: frozenset[str]
+    """Names of what is wanted of quads, phasor, distance, opacity and distortion; colour and extra always are."""
+    workspace: Workspace | None = None
+    """Where; None: in memory of its own."""
+    extra_detached: bool = False
+    """Whether extra images hold the weights fixed."""
+
+
 class Rasterize(torch.autograd.Function):
-    """All images of one rendering from all inputs of one; each rendering has arrays of its own."""
+    """All images of one rendering from all inputs of one; without a workspace each has arrays of its own."""
 
     @staticmethod
     def forward(
         ctx: Any,
-        camera: Camera,
-        shifts: tuple[float, ...],
-        settings: RenderSettings,
-        screen: Tensor | None,
+        request: Request,
         *tensors: Tensor | None,
     ) -> tuple[Tensor | None, ...]:
         """Return the images in the order of ``IMAGES``, None where there is none.
 
         Args:
             ctx: Of autograd.
-            camera: Where from.
-            shifts: Phase shifts of the quads [rad].
-            settings: How.
-            screen: [N, 3] that backward fills with the screen gradient and the number of pixels; None: not wanted.
+            request: What and how.
             tensors: In the order of ``INPUTS``, float32, contiguous, None where there is none.
         """
         ctx.set_materialize_grads(False)
         named = dict(zip(INPUTS, tensors, strict=True))
         mean, extra, colour_sh = named["mean"], named["extra"], named["colour_sh"]
         assert mean is not None
+        camera, shifts = request.camera, request.shifts
         size = camera.height, camera.width
         shapes = {"quads": (len(shifts), *size), "phasor": (3, *size), "distance": size, "opacity": size}
         shapes |= {"distortion": size}
+        shapes = {name: shape for name, shape in shapes.items() if name in request.images}
         shapes |= {"colour": (3, *size)} if colour_sh is not None else {}
         shapes |= {"extra": (extra.shape[1], *size)} if extra is not None else {}
         images = {name: mean.new_empty(shapes[name]) for name in IMAGES if name in shapes}
-        with _stream_of(mean):
+        with stream_of(mean):
             device = wp.device_from_torch(mean.device)
-            frame = Frame(len(mean), camera.width, camera.height, settings, device)
-            view = launch.view_of(camera, settings)
+            kind = len(mean), camera.width, camera.height, request.settings, device
+            frame = Frame(*kind) if request.workspace is None else request.workspace.frame(*kind)
+            view = launch.view_of(camera, request.settings)
             launch.forward(_inputs(named), view, shifts, frame, _images(images))
         ctx.save_for_backward(*tensors)
-        ctx.state = view, shifts, frame, screen
+        ctx.state = request, view, frame, frame.turns
         return tuple(images.get(name) for name in IMAGES)
 
     @staticmethod
@@ -67,27 +88,42 @@ class Rasterize(torch.autograd.Function):
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
         """Launch the adjoints explicitly: no tape, no state outside ``ctx``; gradients into fresh tensors."""
         named = dict(zip(INPUTS, ctx.saved_tensors, strict=True))
-        view, shifts, frame, screen = ctx.state
-        needed = dict(zip(INPUTS, ctx.needs_input_grad[4:], strict=True))
-        wanted = {name: torch.zeros_like(named[name]) for name in INPUTS if needed[name]}
+        request, view, frame, turn = ctx.state
+        if frame.turns != turn:
+            raise ValueError("its workspace has rendered again since: call backward before the next rendering with it")
+        shifts, screen = request.shifts, request.screen
+        needed = dict(zip(INPUTS, ctx.needs_input_grad[1:], strict=True))
+        wanted = _zeros_like({name: named[name] for name in INPUTS if needed[name]})
         cotangents = {name: g.contiguous() for name, g in zip(IMAGES, grads, strict=True) if g is not None}
         if cotangents and wanted:
-            with _stream_of(named["mean"]):
-                records = launch.backward(_inputs(named), view, shifts, frame, _images(cotangents), _inputs(wanted))
+            with stream_of(named["mean"]):
+                arrays = _inputs(named), view, shifts, frame, _images(cotangents), _inputs(wanted)
+                records = launch.backward(*arrays, extra_detached=request.extra_detached)
                 if screen is not None and len(screen):
-                    screen.copy_(wp.to_torch(records)[:, [0, 1, 6]])
-        return None, None, None, None, *(wanted.get(name) for name in INPUTS)
+                    found = wp.to_torch(records)  # a list of columns would be uploaded as an index
+                    screen[:, :2], screen[:, 2] = found[:, :2], found[:, 6]
+        return None, *(wanted.get(name) for name in INPUTS)
+
+
+def _zeros_like(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Zeros of these shapes, cleared at once: parts of one memory, each with lines of cache of its own."""
+    if not tensors:
+        return {}
+    rooms = [-(-tensor.numel() // ALIGNED) * ALIGNED for tensor in tensors.values()]
+    first = next(iter(tensors.values()))
+    parts = first.new_zeros(sum(rooms)).split(rooms)
+    return {name: part[: t.numel()].view(t.shape) for part, (name, t) in zip(parts, tensors.items(), strict=True)}
 
 
 def _inputs(named: Mapping[str, Tensor | None]) -> Inputs:
-    return Inputs(**{name: _view(named.get(name), _VECTORS.get(name, wp.float32)) for name in INPUTS})
+    return Inputs(**{name: array_over(named.get(name), _VECTORS.get(name, wp.float32)) for name in INPUTS})
 
 
 def _images(named: Mapping[str, Tensor]) -> Images:
-    return Images(**{name: _view(named.get(name), wp.float32) for name in IMAGES})
+    return Images(**{name: array_over(named.get(name), wp.float32) for name in IMAGES})
 
 
-def _view(tensor: Tensor | None, dtype) -> wp.array | None:
+def array_over(tensor: Tensor | None, dtype=wp.float32) -> wp.array | None:
     """A Warp array over the memory of a tensor, without its history."""
     if tensor is None:
         return None
@@ -98,9 +134,173 @@ def _view(tensor: Tensor | None, dtype) -> wp.array | None:
     return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False)
 
 
-def _stream_of(tensor: Tensor):
+def stream_of(tensor: Tensor):
     """Order launches with the torch work around them; on the CPU there is nothing to order."""
     wp.init()
     if tensor.is_cuda:
-        return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(tensor.device)), sync_enter=False)
+        return wp.ScopedStream(_warp_stream(torch.cuda.current_stream(tensor.device)), sync_enter=False)
     return contextlib.nullcontext()
+
+
+@functools.cache
+def _warp_stream(stream: torch.cuda.Stream) -> wp.Stream:
+    """The one Warp stream over a torch stream, kept for good.
+
+    Warp knows a stream by its handle and forgets it, scratch memory and a capture included, as soon as any of the
+    objects over that handle dies.
+    """
+    return wp.stream_from_torch(stream)
+
+
+@contextlib.contextmanager
+def captured(graph: torch.cuda.CUDAGraph, stream: torch.cuda.Stream | None = None, pool: Any = None) -> Iterator[None]:
+    """Capture what torch and Warp do inside the block, backward passes included, in a graph that torch replays.
+
+    The same must have run before on ``stream``: modules get loaded, constants uploaded and libraries started then. What
+    is rendered must have a reserve of pairs; with a ``Workspace`` nothing is allocated by a replay either. What the
+    graph reads and writes must live as long as it is replayed.
+
+    Args:
+        graph: An empty one.
+        stream: Where to capture, not the default stream; None: one of torch's own.
+        pool: Memory that several graphs share, of which one runs after the other and none looks at what another made.
+    """
+    wp.init()
+    mode = "thread_local"  # what Warp takes for granted
+    with torch.cuda.graph(graph, pool=pool, stream=stream, capture_error_mode=mode):
+        with wp.ScopedCapture(stream=_warp_stream(torch.cuda.current_stream()), external=True):
+            yield
+
+
+def pairs_of(workspace: Workspace) -> Tensor:
+    """[1] int32: (tile, splat) pairs of the last rendering, where it was made; more than the reserve if some were lost.
+
+    Raises:
+        ValueError: If nothing has been rendered there.
+    """
+    return wp.to_torch(workspace.last.total)
+
+
+class Outbox:
+    """A few numbers that the host writes before every step and the device reads, without either waiting."""
+
+    def __init__(self, length: int, dtype: torch.dtype, device: torch.device):
+        self.there = torch.zeros(length, dtype=dtype, device=device)
+        """Where the device reads them."""
+        remote = device.type != "cpu"
+        self._slots = [torch.zeros(length, dtype=dtype, pin_memory=remote) for _ in range(SLOTS if remote else 1)]
+        self._sent: list[torch.cuda.Event | None] = [None] * len(self._slots)
+        self._next = 0
+
+    def send(self, numbers: Sequence[float]) -> None:
+        """Let the device see these from now on, in the order of the stream; a shorter list leaves the rest as it is."""
+        slot, event = self._slots[self._next], self._sent[self._next]
+        if event is not None:
+            event.synchronize()  # of a step long ago: the host is at most so many ahead
+        slot[: len(numbers)] = torch.tensor(numbers, dtype=slot.dtype)
+        self.there.copy_(slot, non_blocking=True)
+        if self.there.is_cuda:
+            self._sent[self._next] = event = event or torch.cuda.Event()
+            event.record()
+        self._next = (self._next + 1) % len(self._slots)
+
+
+class Inbox:
+    """A few numbers that the device has and the host would like to know, some steps late: neither waits."""
+
+    def __init__(self, there: Tensor):
+        self._there = there
+        self._slots = [torch.zeros_like(there, device="cpu", pin_memory=there.is_cuda) for _ in range(SLOTS)]
+        self._sent: list[torch.cuda.Event | None] = [None] * SLOTS
+        self._next = 0
+
+    def ask(self) -> list[int] | None:
+        """The newest numbers that have arrived since the last call, if any; sends for those of the work so far."""
+        if not self._there.is_cuda:
+            return self._there.tolist()
+        newest = None
+        for n in range(self._next, self._next + SLOTS):  # from the oldest to the newest
+            event = self._sent[n % SLOTS]
+            if event is not None and event.query():
+                newest, self._sent[n % SLOTS] = self._slots[n % SLOTS].tolist(), None
+        if self._sent[self._next] is None:  # otherwise all are on their way
+            self._slots[self._next].copy_(self._there, non_blocking=True)
+            self._sent[self._next] = event = torch.cuda.Event()
+            event.record()
+            self._next = (self._next + 1) % SLOTS
+        return newest
+
+
+class Captured:
+    """Work on one device as a CUDA graph: captured at the first call, replayed from then on; on a CPU it just runs.
+
+    What the work reads and writes must keep its addresses, and nothing of it may wait for the device. What it allocates
+    belongs to the graph; nobody else may look at it.
+    """
+
+    def __init__(
+        self, work: Callable[[], None], device: torch.device, ready: Callable[[], None] | None = None, pool: Any = None
+    ):
+        """Wrap ``work``.
+
+        Args:
+            work: What is captured.
+            device: Where it is done.
+            ready: Called once it is captured, before the first replay.
+            pool: Memory shared with other graphs, see :func:`captured`; None: its own.
+        """
+        self._work, self._device, self._ready, self._pool = work, device, ready, pool
+        self._graph: torch.cuda.CUDAGraph | None = None
+
+    def __call__(self) -> None:
+        """Do the work."""
+        if self._device.type == "cpu":
+            self._work()
+            return
+        if self._graph is None:
+            self._graph = self._capture()
+            if self._ready is not None:
+                self._ready()
+        self._graph.replay()
+
+    def _capture(self) -> torch.cuda.CUDAGraph:
+        graph = torch.cuda.CUDAGraph()
+        with captured(graph, pool=self._pool):
+            self._work()
+        return graph
+
+
+def shared_pool(device: torch.device) -> Any:
+    """Memory for graphs that run one after the other; None on a CPU."""
+    return torch.cuda.graph_pool_handle() if device.type != "cpu" else None
+
+
+class Branches:
+    """Streams that fork from torch's current one and join it again: what does not depend on each other may overlap.
+
+    A captured graph has as many branches then, and so has the gradient, which runs where its operation ran. On a CPU
+    there is one stream.
+    """
+
+    def __init__(self, count: int, device: torch.device):
+        self._device = device
+        self._streams = [torch.cuda.Stream(device) for _ in range(count)] if device.type != "cpu" and count > 1 else []
+        self._open: set[torch.cuda.Stream] = set()
+
+    @contextlib.contextmanager
+    def fork(self, number: int) -> Iterator[None]:
+        """Work on branch ``number`` from here on, behind everything before."""
+        if not self._streams:
+            yield
+            return
+        stream = self._streams[number]
+        self._open.add(stream)
+        stream.wait_stream(torch.cuda.current_stream(self._device))
+        with torch.cuda.stream(stream):
+            yield
+
+    def join(self) -> None:
+        """Wait, on the current stream, for all branches that were forked."""
+        for stream in self._open:
+            torch.cuda.current_stream(self._device).wait_stream(stream)
+        self._open.clear()

@@ -9,6 +9,7 @@ from enum import StrEnum
 
 import warp as wp
 
+from ..kernels import batches
 from ..kernels.composite import LIGHT_PLANES, make_pixels
 from ..kernels.lanes import make_lanes
 from ..kernels.resolve import Tiling
@@ -77,6 +78,11 @@ class RenderSettings:
     With a number nothing is read back on CUDA: pairs that do not fit are dropped, and ``Frame.check_capacity`` tells.
     On the CPU it is asked every time.
     """
+    deterministic: bool = False
+    """Whether gradients are summed in one order on CUDA, as on the CPU, so that equal work gives equal bytes.
+
+    All but those of the sensor's numbers. Every (tile, splat) pair has 128 bytes of its own then.
+    """
     threads: int | None = None
     """CPU threads of the blend; None: as many as this process may use. Another number changes sums by rounding only."""
 
@@ -93,6 +99,8 @@ class RenderSettings:
 # owns a tile and every thread a pixel (design/tiles.md)
 TILE_SHAPES = {"cpu": (16, 8, 8), "cuda": (1, 8, 4)}
 
+LANES_PER_SPLAT = {"cpu": 1, "cuda": 32}  # threads that write the (tile, splat) pairs of a splat
+
 
 def available_threads() -> int:
     """CPU threads this process may use."""
@@ -100,13 +108,19 @@ def available_threads() -> int:
 
 
 class Frame:
-    """The arrays of one rendering: what forward leaves for backward. Nothing is shared between two frames."""
+    """The arrays of one rendering: what forward leaves for backward. Nothing is shared between two frames.
+
+    A frame may render again: then it is the same memory, every array of it by its name, and backward belongs to the
+    last rendering.
+    """
 
     def __init__(self, count: int, width: int, height: int, settings: RenderSettings, device: wp.Device):
         """Reserve memory for ``count`` Gaussians and an image of ``width`` x ``height``."""
         self.count, self.width, self.height = count, width, height
         self.settings, self.device = settings, device
-        self.K, self.tile_width, self.tile_height = TILE_SHAPES["cpu" if device.is_cpu else "cuda"]
+        kind = "cpu" if device.is_cpu else "cuda"
+        self.K, self.tile_width, self.tile_height = TILE_SHAPES[kind]
+        self.lanes_per_splat = LANES_PER_SPLAT[kind]
         self.tiles_x = math.ceil(width / self.tile_width)
         self.tiles = self.tiles_x * math.ceil(height / self.tile_height)
         pixels = make_pixels(self.K, self.tile_width, self.tile_height)
@@ -119,23 +133,52 @@ class Frame:
         )
         self.tiling.side_log2, self.tiling.count_x = pixels.side.bit_length() - 1, self.tiles_x
 
-        self.splats = self.array(count, Splat)
-        self.box_px = self.array(count, wp.vec4i)
-        self.depth_key, self.order = self.array(2 * count), self.array(2 * count)  # the radix sort wants twice the room
-        self.counts, self.offsets, self.total = self.array(count), self.array(count), self.array(1)
-        self.first = self.array(self.tiles + 1)
-        self.keys = self.ids = self.array(0)
-        self.sums = self.planes(LIGHT_PLANES)
+        self._arrays: dict[str, wp.array] = {}
+        self._planes: dict[str, Planes] = {}
+        self.turns = 0  # renderings so far
+        self.splats = self.array("splats", count, Splat)
+        self.box_px = self.array("boxes", count, wp.vec4i)
+        self.depth_key = self.array("depth keys", 2 * count)  # the radix sort wants twice the room
+        self.order = self.array("order", 2 * count)
+        self.counts, self.ends = self.array("counts", count), self.array("ends", count)
+        self.total, self.first = self.array("total", 1), self.array("first", self.tiles + 1)
+        self.keys = self.ids = self.owners = self.array("no pairs", 0)
+        self.sums = self.planes("light", LIGHT_PLANES)
         self.channels: list[Planes] = []
         self.records: list[wp.array] = []  # of each pass: ``splats``, and copies with other channels
 
-    def array(self, shape, dtype=wp.int32) -> wp.array:
-        """Uninitialised memory on the device of this frame."""
-        return wp.empty(shape, dtype=dtype, device=self.device)
+    @property
+    def ordered(self) -> bool:
+        """Whether every pair has a record of its own: where warps add to records side by side, and order is wanted."""
+        return self.settings.deterministic and self.K == 1
+
+    @property
+    def cooperative(self) -> bool:
+        """Whether the lanes of a warp fetch records for each other, as they may where a warp owns a tile."""
+        return self.K == 1 and batches.COOPERATIVE
+
+    @property
+    def groups_with_light(self) -> int:
+        """Groups of channels that are blended together with the light: two where a warp owns a tile, else one."""
+        return min(len(self.channels), 2 if self.cooperative and self.threads == 1 else 1)
+
+    def array(self, name: str, shape: int | tuple[int, ...], dtype=wp.int32) -> wp.array:
+        """Memory on the device of this frame, as whoever used it last under that name left it."""
+        wanted = (shape,) if isinstance(shape, int) else shape
+        if name not in self._arrays or self._arrays[name].shape != wanted:
+            self._arrays[name] = wp.empty(wanted, dtype=dtype, device=self.device)
+        return self._arrays[name]
+
+    def zeros(self, name: str, shape: int | tuple[int, ...], dtype=wp.int32) -> wp.array:
+        """As :meth:`array`, zeroed."""
+        array = self.array(name, shape, dtype)
+        array.zero_()
+        return array
 
     def reserve_pairs(self, capacity: int) -> None:
         """Make room for ``capacity`` (tile, splat) pairs, and as much again for the sort."""
-        self.keys, self.ids = self.array(2 * capacity), self.array(2 * capacity)
+        if len(self.keys) < 2 * capacity:
+            self.keys, self.ids = self.array("keys", 2 * capacity), self.array("ids", 2 * capacity)
 
     def check_capacity(self) -> None:
         """Raise if the reserve of pairs was too small, so that far splats are missing; waits for the device.
@@ -147,13 +190,15 @@ class Frame:
         if capacity is not None and needed > capacity:
             raise ValueError(f"pair_capacity = {capacity} is too small: this frame has {needed} (tile, splat) pairs")
 
-    def planes(self, count: int) -> Planes:
+    def planes(self, name: str, count: int) -> Planes:
         """``count`` image planes in tile order."""
-        return Planes(self, count)
+        if name not in self._planes:
+            self._planes[name] = Planes(self.array(name, Planes.shape_of(self, count), wp.float32), self)
+        return self._planes[name]
 
-    def gradient_planes(self, count: int) -> Planes:
+    def gradient_planes(self, name: str, count: int) -> Planes:
         """Zeroed planes: pixels of a tile that lie outside the image are never written, and must not hold a NaN."""
-        planes = self.planes(count)
+        planes = self.planes(name, count)
         planes.flat.zero_()
         return planes
 
@@ -161,14 +206,57 @@ class Frame:
 class Planes:
     """Image planes in tile order, seen twice: ``lanes`` for the compositor, ``flat`` for everything per pixel."""
 
-    def __init__(self, frame: Frame, count: int):
-        # One tile of padding: 320 x 240 floats are exactly 75 pages, and a loop that touches the same pixel of nine
-        # such planes would keep evicting its own cache lines.
-        tile = frame.lanes * frame.K
-        self.flat = frame.array((count, (frame.tiles + 1) * tile), wp.float32)
+    def __init__(self, flat: wp.array, frame: Frame):
+        self.flat = flat
         self.lanes = wp.array(
-            ptr=self.flat.ptr,
+            ptr=flat.ptr,
             dtype=make_lanes(frame.K).V,
-            shape=(count, frame.tiles + 1, frame.lanes),
+            shape=(flat.shape[0], frame.tiles + 1, frame.lanes),
             device=frame.device,
         )  # a view: ``flat`` owns the memory, and lives as long as this object
+
+    @staticmethod
+    def shape_of(frame: Frame, count: int) -> tuple[int, int]:
+        """Planes and their floats, with one tile of padding.
+
+        320 x 240 floats are exactly 75 pages, and a loop that touches the same pixel of nine such planes would keep
+        evicting its own cache lines.
+        """
+        return count, (frame.tiles + 1) * frame.lanes * frame.K
+
+
+class Workspace:
+    """Memory that renderings of one size share, one after the other.
+
+    Whoever renders the same number of Gaussians into the same image again and again hands the same workspace to
+    ``rasterize``: then nothing but the images and their gradients is allocated, and a CUDA graph replays into memory
+    that stays. Backward must come before the next rendering with it. Another size or another setting takes fresh
+    memory and lets go of the old, which a graph captured with the old one must not outlive.
+    """
+
+    def __init__(self) -> None:
+        self._key: tuple | None = None
+        self._frame: Frame | None = None
+
+    def frame(self, count: int, width: int, height: int, settings: RenderSettings, device: wp.Device) -> Frame:
+        """The frame of the last rendering if it was of this kind, otherwise a new one."""
+        key = count, width, height, settings, device
+        if self._frame is None or self._key != key:
+            self._key, self._frame = key, Frame(count, width, height, settings, device)
+        return self._frame
+
+    @property
+    def last(self) -> Frame:
+        """The frame of the last rendering.
+
+        Raises:
+            ValueError: If there was none.
+        """
+        if self._frame is None:
+            raise ValueError("nothing has been rendered in this workspace")
+        return self._frame
+
+    def check_capacity(self) -> None:
+        """As ``Frame.check_capacity``, for the last rendering."""
+        if self._frame is not None:
+            self._frame.check_capacity()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, fields
 
 import warp as wp
@@ -29,7 +30,7 @@ class Inputs:
 
 @dataclass(kw_only=True, eq=False)
 class Images:
-    """Everything a rendering fills, row-major; a gradient set has the same fields, None meaning zero."""
+    """Everything a rendering fills, row-major, None where it is not wanted; of a gradient set: where it is zero."""
 
     quads: wp.array | None  # [Q, H, W]
     phasor: wp.array | None  # [3, H, W]
@@ -38,6 +39,22 @@ class Images:
     opacity: wp.array | None  # [H, W]
     distortion: wp.array | None  # [H, W]
     extra: wp.array | None = None  # [D, H, W]
+
+
+CHOICES = ("quads", "phasor", "distance", "opacity", "distortion")
+"""Images that a rendering may do without; colour and extra depend on what there is to render."""
+
+
+def wanted_images(names: Collection[str]) -> frozenset[str]:
+    """The names of the images that are asked for.
+
+    Raises:
+        ValueError: If one is not in ``CHOICES``.
+    """
+    unknown = [name for name in names if name not in CHOICES]
+    if unknown:
+        raise ValueError(f"there is no image {unknown[0]!r} to ask for, only {', '.join(CHOICES)}")
+    return frozenset(names)
 
 
 def names_of(kind: type) -> list[str]:

@@ -12,6 +12,8 @@ and finds gradients added to the ``.grad`` of its inputs. torch programs come th
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import warp as wp
 
@@ -45,7 +47,10 @@ def view_of(camera: Camera, settings: RenderSettings) -> CameraView:
 
 
 def render(inputs: Inputs, view: CameraView, shifts: tuple[float, ...], frame: Frame, images: Images) -> None:
-    """Fill ``images``; on an active ``wp.Tape`` also record the adjoint, which adds to the ``.grad`` of the inputs."""
+    """Fill those of ``images`` that are there.
+
+    On an active ``wp.Tape`` also record the adjoint, which adds to the ``.grad`` of the inputs.
+    """
     forward(inputs, view, shifts, frame, images)
     tape = wp._src.context.runtime.tape  # the public API has no name for the active tape
     if tape is not None:
@@ -60,7 +65,8 @@ def render(inputs: Inputs, view: CameraView, shifts: tuple[float, ...], frame: F
 
 
 def forward(inputs: Inputs, view: CameraView, shifts: tuple[float, ...], frame: Frame, images: Images) -> None:
-    """Project, sort, composite, resolve."""
+    """Project, sort, composite, resolve; images that are None cost nothing."""
+    frame.turns += 1
     if frame.count:
         stages.project(inputs, view, frame)
         stages.sort_by_depth(frame)
@@ -68,40 +74,59 @@ def forward(inputs: Inputs, view: CameraView, shifts: tuple[float, ...], frame: 
     else:
         frame.first.zero_()
     groups = channel_groups(inputs)
-    frame.channels = [frame.planes(CHANNEL_PLANES) for _ in groups]
+    frame.channels = [frame.planes(f"channels {number}", CHANNEL_PLANES) for number in range(len(groups))]
     frame.records = [frame.splats]
     for number, (name, start) in enumerate(groups):
         if number > 0:
-            frame.records.append(frame.array(frame.count, splat.Splat))
+            frame.records.append(frame.array(f"records {number}", frame.count, splat.Splat))
         if name == "extra":
             stages.set_channels(frame, inputs, start, frame.records[number])
-    for number in range(len(frame.records)):
-        stages.composite(frame, view, number)
+    for number in [0, *range(max(1, frame.groups_with_light), len(frame.records))]:
+        stages.composite(frame, view, number, images.distortion is not None)
     stages.resolve_images(inputs, shifts, frame, images, groups)
 
 
 def backward(
-    inputs: Inputs, view: CameraView, shifts: tuple[float, ...], frame: Frame, cotangents: Images, wanted: Inputs
+    inputs: Inputs,
+    view: CameraView,
+    shifts: tuple[float, ...],
+    frame: Frame,
+    cotangents: Images,
+    wanted: Inputs,
+    *,
+    extra_detached: bool = False,
 ) -> wp.array:
-    """Add to the arrays of ``wanted`` what ``cotangents`` say; leaves the frame as it was.
+    """Add to the arrays of ``wanted`` what ``cotangents`` say; what forward left in the frame stays as it was.
+
+    With ``extra_detached`` weights are held fixed under the extra images, so that only the extra channels learn.
 
     Returns:
         [N] gradient records of the splats: slots 0 and 1 are the screen gradient, slot 6 the number of pixels.
+        They belong to the frame.
     """
     groups = channel_groups(inputs)
     grad_light, grad_channels = stages.fold_images(inputs, shifts, frame, cotangents, wanted, groups)
-    grad_splats = wp.zeros(frame.count, dtype=splat.Splat, device=frame.device)
+    grad_splats = frame.zeros("gradient records", frame.count, splat.Splat)
     if not frame.count:
         return grad_splats
-    stages.composite_backward(frame, 0, grad_light, grad_channels[0], grad_splats)
+    distortion, fixed = cotangents.distortion is not None, [name == "extra" and extra_detached for name, _ in groups]
+    first: dict[str, Any] = {"distortion": distortion, "fixed": bool(groups) and fixed[0]}
+    together = frame.groups_with_light > 1 and fixed[1] and grad_channels[1] is not None
+    if together:
+        first["grad_more"] = grad_channels[1]
+        first["more_records"] = frame.zeros("gradient records of the second group", frame.count, splat.Splat)
+    stages.composite_backward(frame, 0, grad_light, grad_channels[0], grad_splats, **first)
     for number, (name, start) in enumerate(groups):
         if grad_channels[number] is None:
             continue
         records = grad_splats
-        if number > 0:  # a further pass shares centres, conics and opacities with the first
-            records = wp.zeros_like(grad_splats)
-            stages.composite_backward(frame, number, grad_light, grad_channels[number], records)
-            stages.add_geometry(records, grad_splats)
+        if number == 1 and together:
+            records = first["more_records"]
+        elif number > 0:  # a further pass shares centres, conics and opacities with the first
+            records = frame.zeros("gradient records of a further pass", frame.count, splat.Splat)
+            stages.composite_backward(frame, number, grad_light, grad_channels[number], records, fixed=fixed[number])
+            if not fixed[number]:
+                stages.add_geometry(records, grad_splats)
         if name == "extra" and wanted.extra is not None:
             stages.take_channels(records, start, wanted)
     stages.finish(frame, grad_splats)

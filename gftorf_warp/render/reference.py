@@ -20,6 +20,7 @@ Cost grows with pixels times Gaussians: this is for tests and small images, the 
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import torch
@@ -31,7 +32,8 @@ from ..scene.camera import Camera
 from ..scene.gaussians import GaussianField
 from ..scene.sensor import Sensor
 from .api import Background, Rendering, ScreenGradient
-from .buffers import ClampGradient, Distortion, RenderSettings, Stop, Support
+from .buffers import ClampGradient, Distortion, RenderSettings, Stop, Support, Workspace
+from .inputs import CHOICES, wanted_images
 
 _PARITY_TILE = 16  # [px] side of the released code's tiles, to which Support.SIGMA3_TILE16 rounds out
 _BLOCK = 4_000_000  # (pixel, Gaussian) pairs worked on at once: bounds the memory of a forward pass
@@ -65,12 +67,15 @@ def rasterize(
     *,
     background: Background | None = None,
     extra: Float[Tensor, "N D"] | None = None,
+    extra_detached: bool = False,
+    images: Collection[str] = CHOICES,
     screen_gradient: bool = False,
+    workspace: Workspace | None = None,  # noqa: ARG001
 ) -> Rendering:
     """Oracle of :func:`gftorf_warp.render.api.rasterize`; computes in the dtype of the field.
 
     ``Rendering.screen`` is filled by ``backward()``, not by ``torch.autograd.grad`` with respect to tensors the image
-    positions do not depend on. ``pair_capacity`` and ``threads`` of the settings have no meaning here.
+    positions do not depend on. ``workspace``, and ``pair_capacity`` and ``threads`` of the settings, mean nothing here.
     """
     background = background or Background()
     height, width, q = camera.height, camera.width, len(sensor.shifts)
@@ -87,8 +92,7 @@ def rasterize(
     one_way = [d[:, None], torch.ones_like(d)[:, None]]
     if field.colour_sh is not None:
         one_way.append(_shade(basis, field.colour_sh[splats.index].flatten(1), channels=3))
-    if extra is not None:
-        one_way.append(extra[splats.index].to(d))
+    more = d.new_zeros(len(d), 0) if extra is None else extra[splats.index].to(d)
     two_way = _correlate(d, reflectivity, sensor, settings.phasor_factor)
     zeta = d if settings.distortion is Distortion.PAPER else _normalised(d, settings)
     carried = torch.cat(one_way, 1)
@@ -99,20 +103,25 @@ def rasterize(
         w, T, T_end = _weights(_alpha(block, splats, centre, settings), settings.stop)
         moments = [w @ torch.stack([zeta**n], 1) for n in (0, 1, 2)]  # A, M, V
         half_sum = moments[0] * moments[2] - moments[1] ** 2
-        blocks.append(torch.cat([w @ carried, (w * T) @ two_way, half_sum, T_end[:, None]], 1))
+        seen = (w.detach() if extra_detached else w) @ more
+        blocks.append(torch.cat([w @ carried, seen, (w * T) @ two_way, half_sum, T_end[:, None]], 1))
         hits += (w > 0).sum(0)
     image = torch.cat(blocks).T.reshape(-1, height, width)
 
     colours = 0 if field.colour_sh is None else 3
-    extras = 0 if extra is None else extra.shape[1]
-    distance, opacity, colour, more, quads, phasor, half_sum, T_end = image.split([1, 1, colours, extras, q, 3, 1, 1])
+    sizes = [1, 1, colours, more.shape[1], q, 3, 1, 1]
+    distance, opacity, colour, more, quads, phasor, half_sum, T_end = image.split(sizes)
+    found = {
+        "quads": quads + _behind(background.quads, T_end, q),
+        "phasor": phasor + _behind(background.phasor, T_end, 3),
+        "distance": distance[0],
+        "opacity": opacity[0],
+        "distortion": half_sum[0] * (2.0 if settings.distortion is Distortion.PAPER else 1.0),
+    }
+    wanted = wanted_images(images)
     return Rendering(
-        quads=quads + _behind(background.quads, T_end, q),
-        phasor=phasor + _behind(background.phasor, T_end, 3),
+        **{name: image if name in wanted else image[:0] for name, image in found.items()},
         colour=None if field.colour_sh is None else colour + _behind(background.colour, T_end, 3),
-        distance=distance[0],
-        opacity=opacity[0],
-        distortion=half_sum[0] * (2.0 if settings.distortion is Distortion.PAPER else 1.0),
         extra=None if extra is None else more,
         screen=screen,
     )

@@ -10,7 +10,7 @@ from itertools import pairwise
 import numpy as np
 import warp as wp
 
-from ..kernels import resolve, splat, tiles
+from ..kernels import batches, ordered, resolve, splat, tiles
 from ..kernels.composite import CHANNEL_PLANES, make_composite
 from ..kernels.composite_backward import (
     GRAD_LIGHT_PLANES,
@@ -68,19 +68,20 @@ def sort_by_depth(frame: Frame) -> None:
 
 def sort_by_tile(frame: Frame) -> None:
     """Count, emit and sort the (tile, splat) pairs."""
-    lists = [frame.order, frame.splats, frame.box_px, frame.tile_width, frame.tile_height]
-    _launch(tiles.count_pairs, frame.count, lists, [frame.counts])
-    wp.utils.array_scan(frame.counts, frame.offsets, inclusive=False)
+    lists = [frame.order, frame.splats, frame.box_px, frame.tile_width, frame.tile_height, frame.lanes_per_splat]
+    threads = frame.count, frame.lanes_per_splat
+    _launch(tiles.count_pairs, threads, lists, [frame.counts])
+    wp.utils.array_scan(frame.counts, frame.ends, inclusive=True)
     capacity = frame.settings.pair_capacity
     if capacity is None:
         # the declared host synchronisation: how many pairs there are decides how much memory they need
-        capacity = int(frame.offsets[-1:].numpy()[0]) + int(frame.counts[-1:].numpy()[0])
-        frame.reserve_pairs(capacity)
-    else:
-        frame.reserve_pairs(capacity)
-        frame.keys.fill_(frame.tiles)  # pairs that do not exist sort behind all tiles
-    outputs = [frame.keys, frame.ids, frame.total]
-    _launch(tiles.emit_pairs, frame.count, [*lists, frame.tiles_x, frame.counts, frame.offsets, capacity], outputs)
+        capacity = int(frame.ends[-1:].numpy()[0])
+    frame.reserve_pairs(capacity)
+    inputs = [*lists, frame.tiles_x, frame.tiles, frame.ends, capacity]
+    _launch(tiles.emit_pairs, threads, inputs, [frame.keys, frame.ids, frame.total])
+    if frame.ordered and capacity:
+        frame.owners = frame.array("owners", capacity)
+        _launch(ordered.number_pairs, capacity, [frame.total, capacity], [frame.ids, frame.owners])
     if capacity:
         wp.utils.radix_sort_pairs(frame.keys, frame.ids, capacity, end_bit=frame.tiles.bit_length())
     _launch(tiles.tile_starts, frame.tiles + 1, [frame.keys, capacity], [frame.first])
@@ -88,41 +89,90 @@ def sort_by_tile(frame: Frame) -> None:
         frame.check_capacity()
 
 
-def composite(frame: Frame, view: CameraView, number: int) -> None:
-    """Blend all tiles: light with the first group of channels, every further group by itself."""
+def composite(frame: Frame, view: CameraView, number: int, distortion: bool = True) -> None:
+    """Blend all tiles: light with the first group of channels, or the first two, every further group by itself."""
+    nothing, more = _nothing(frame, 3, frame.sums.lanes.dtype), number == 0 and frame.groups_with_light > 1
     light, channels = number == 0, bool(frame.channels)
     shape = frame.K, frame.tile_width, frame.tile_height
-    metric = frame.settings.distortion == Distortion.PAPER
-    kernel = make_composite(*shape, light, channels, frame.settings.stop == Stop.INCLUSIVE, metric)
-    channel = frame.channels[number].lanes if channels else _nothing(frame, 3, frame.sums.lanes.dtype)
-    lists = [frame.first, frame.ids, frame.records[number], frame.tiles_x, view.width, view.height]
+    metric = _metric(frame, light and distortion)
+    kernel = make_composite(
+        *shape, light, channels, frame.settings.stop == Stop.INCLUSIVE, metric, frame.cooperative, more
+    )
+    channel = frame.channels[number].lanes if channels else nothing
+    splats = _spread(frame, number)
+    more_splats, more_channel = (_spread(frame, 1), frame.channels[1].lanes) if more else (splats, nothing)
+    lists = [frame.first, frame.ids, splats, frame.tiles_x, view.width, view.height]
 
     def arguments(tile0: int, _part: int) -> list:
-        return [*lists, tile0, _mapping(frame), frame.sums.lanes, channel]
+        return [*lists, tile0, _mapping(frame), more_splats, frame.sums.lanes, channel, more_channel]
 
     _over_tiles(frame, kernel, _tile_edges(frame, frame.threads), arguments)
 
 
 def composite_backward(
-    frame: Frame, number: int, grad_light: Planes, grad_channel: Planes | None, records: wp.array
+    frame: Frame,
+    number: int,
+    grad_light: Planes,
+    grad_channel: Planes | None,
+    records: wp.array,
+    *,
+    distortion: bool = True,
+    fixed: bool = False,
+    grad_more: Planes | None = None,
+    more_records: wp.array | None = None,
 ) -> None:
-    """Add the gradient of one pass to ``records``; CPU threads add to their own, which are then summed in order."""
+    """Add the gradient of one pass to ``records``; CPU threads add to their own, which are then summed in order.
+
+    Args:
+        frame: After its forward pass.
+        number: Of the pass: 0 has the light.
+        grad_light: Of the planes of light.
+        grad_channel: Of the pass's channels; None: they have no gradient.
+        records: [N] added to.
+        distortion: Whether it has a gradient.
+        fixed: Whether weights are held fixed under the channels.
+        grad_more: Of the second group, if this pass takes it along; weights are held fixed under it.
+        more_records: [N] what it adds to.
+    """
     light, channels = number == 0, grad_channel is not None
     shape = frame.K, frame.tile_width, frame.tile_height
     passes = frame.settings.clamp_gradient == ClampGradient.STRAIGHT
-    metric = frame.settings.distortion == Distortion.PAPER
-    kernel = make_composite_backward(*shape, light, channels, passes, metric)
-    channel = grad_channel.lanes if grad_channel is not None else _nothing(frame, 3, frame.sums.lanes.dtype)
-    edges = _tile_edges(frame, frame.threads)
-    parts = [records] + [wp.zeros_like(records) for _ in range(len(edges) - 2)]
-    lists = [frame.first, frame.ids, frame.records[number], frame.tiles_x]
+    metric = _metric(frame, light and distortion)
+    kernel = make_composite_backward(
+        *shape, light, channels, passes, metric, fixed and channels, frame.cooperative, grad_more is not None
+    )
+    nothing = _nothing(frame, 3, frame.sums.lanes.dtype)
+    channel = grad_channel.lanes if grad_channel is not None else nothing
+    more = grad_more.lanes if grad_more is not None else nothing
+    edges = [0, frame.tiles] if frame.ordered else _tile_edges(frame, frame.threads)
+    added, more_added = records, more_records
+    if frame.ordered:
+        added = frame.zeros("gradients of pairs", len(frame.owners), splat.Splat)
+        more_added = None if more_records is None else frame.zeros("more of pairs", len(frame.owners), splat.Splat)
+    parts = [added] + [frame.zeros(f"records of thread {n}", frame.count, splat.Splat) for n in range(len(edges) - 2)]
+    lists = [frame.first, frame.ids, _spread(frame, number, anew=False), frame.tiles_x]
 
     def arguments(tile0: int, part: int) -> list:
-        return [*lists, tile0, _mapping(frame), frame.sums.lanes, grad_light.lanes, channel, parts[part]]
+        return [
+            *lists,
+            tile0,
+            _mapping(frame),
+            frame.sums.lanes,
+            grad_light.lanes,
+            channel,
+            more,
+            parts[part],
+            more_added if more_added is not None else added,
+        ]
 
     _over_tiles(frame, kernel, edges, arguments)
     for part in parts[1:]:
         _launch(splat.add_records, frame.count, [part, 0], [records])
+    if frame.ordered:
+        for copies, total in ((added, records), (more_added, more_records)):
+            if copies is not None and total is not None:
+                of_pairs = [frame.order, frame.ends, copies, len(frame.owners)]
+                _launch(ordered.sum_copies, frame.count, of_pairs, [total])
 
 
 def set_channels(frame: Frame, inputs: Inputs, start: int, splats: wp.array) -> None:
@@ -149,15 +199,17 @@ def finish(frame: Frame, grad_splats: wp.array) -> None:
 def resolve_images(inputs: Inputs, shifts, frame: Frame, images: Images, groups: list) -> None:
     """Planes to images."""
     pixels, sums, tiling = (frame.height, frame.width), frame.sums.flat, frame.tiling
-    if shifts:
+    if shifts and images.quads is not None:
         vectors = _shift_vectors(shifts, str(frame.device))
         lit = [sums, tiling, inputs.calibration, vectors, _or_nothing(frame, inputs.background_quads)]
         _launch(resolve.resolve_quads, pixels, lit, [images.quads])
-    factor = frame.settings.phasor_factor
-    lit = [sums, tiling, factor, _or_nothing(frame, inputs.background_phasor)]
-    _launch(resolve.resolve_phasor, pixels, lit, [images.phasor])
+    if images.phasor is not None:
+        lit = [sums, tiling, frame.settings.phasor_factor, _or_nothing(frame, inputs.background_phasor)]
+        _launch(resolve.resolve_phasor, pixels, lit, [images.phasor])
     outputs = [images.distance, images.opacity, images.distortion]
-    _launch(resolve.resolve_geometry, pixels, [sums, tiling, _distortion_factor(frame)], outputs)
+    if any(image is not None for image in outputs):
+        outputs = [_or_nothing(frame, image, 2) for image in outputs]
+        _launch(resolve.resolve_geometry, pixels, [sums, tiling, _distortion_factor(frame)], outputs)
     for (name, start), planes in zip(groups, frame.channels, strict=True):
         background = inputs.background_colour if name == "colour" else None
         rest = [planes.flat, sums, tiling, _or_nothing(frame, background), start]
@@ -167,7 +219,7 @@ def resolve_images(inputs: Inputs, shifts, frame: Frame, images: Images, groups:
 def fold_images(inputs: Inputs, shifts, frame: Frame, cotangents: Images, wanted: Inputs, groups: list):
     """Images to planes: the adjoint of :func:`resolve_images`. Channels without a gradient are None."""
     pixels, sums, tiling = (frame.height, frame.width), frame.sums.flat, frame.tiling
-    planes = frame.gradient_planes(GRAD_LIGHT_PLANES)
+    planes = frame.gradient_planes("gradient of light", GRAD_LIGHT_PLANES)
     target = planes.flat
     if cotangents.quads is not None and shifts:
         vectors = _shift_vectors(shifts, str(frame.device))
@@ -175,7 +227,7 @@ def fold_images(inputs: Inputs, shifts, frame: Frame, cotangents: Images, wanted
         outputs = [target, _or_nothing(frame, wanted.background_quads)]
         _launch(resolve.fold_quads, pixels, [*lit, cotangents.quads], outputs)
         if wanted.calibration is not None:
-            rows = frame.array(frame.height, wp.float64)
+            rows = frame.array("rows", frame.height, wp.float64)
             _launch(resolve.fold_dc_offset, frame.height, [sums, tiling, cotangents.quads], [rows])
             _launch(resolve.add_dc_offset, 1, [rows], [wanted.calibration])
     if cotangents.phasor is not None:
@@ -190,12 +242,12 @@ def fold_images(inputs: Inputs, shifts, frame: Frame, cotangents: Images, wanted
         if image is not None:
             _launch(resolve.fold_plane, pixels, [image, tiling, factor, plane], [target])
     channels: list[Planes | None] = []
-    for name, start in groups:
+    for number, (name, start) in enumerate(groups):
         cotangent = getattr(cotangents, name)
         if cotangent is None:
             channels.append(None)
             continue
-        grad = frame.gradient_planes(CHANNEL_PLANES)
+        grad = frame.gradient_planes(f"gradient of channels {number}", CHANNEL_PLANES)
         colour = name == "colour"
         background = _or_nothing(frame, inputs.background_colour if colour else None)
         grad_background = _or_nothing(frame, wanted.background_colour if colour else None)
@@ -214,8 +266,23 @@ def _shift_vectors(shifts: tuple[float, ...], device: str) -> wp.array:
     return wp.array([(math.cos(s), math.sin(s)) for s in shifts], dtype=wp.vec2, device=device)
 
 
+def _metric(frame: Frame, wanted: bool) -> bool | None:
+    """What distortion is measured on, as compositors have it; None where there is none."""
+    return frame.settings.distortion == Distortion.PAPER if wanted else None
+
+
 def _distortion_factor(frame: Frame) -> float:
     return 2.0 if frame.settings.distortion == Distortion.PAPER else 1.0
+
+
+def _spread(frame: Frame, number: int, *, anew: bool = True) -> wp.array:
+    """Records of a pass as the compositor reads them: of splats, or, where order matters, a copy for each pair."""
+    if not frame.ordered:
+        return frame.records[number]
+    copies = frame.array(f"records of pairs {number}", len(frame.owners), splat.Splat)
+    if anew and len(frame.owners):
+        _launch(ordered.spread_records, len(frame.owners), [frame.records[number], frame.owners], [copies])
+    return copies
 
 
 def _mapping(frame: Frame) -> wp.vec2:
@@ -248,7 +315,7 @@ def _over_tiles(frame: Frame, kernel, edges: list[int], arguments) -> None:
             dim=(stop - start, frame.lanes),
             inputs=arguments(start, part),
             device=frame.device,
-            block_dim=128,
+            block_dim=32 * batches.WARPS if frame.cooperative else 128,
             record_tape=False,
             record_cmd=side_by_side,
         )
@@ -285,5 +352,5 @@ def _nothing(frame: Frame, ndim: int, dtype) -> wp.array:
     return _empty(str(frame.device), ndim, dtype)
 
 
-def _or_nothing(frame: Frame, array: wp.array | None) -> wp.array:
-    return array if array is not None else _nothing(frame, 3, wp.float32)
+def _or_nothing(frame: Frame, array: wp.array | None, ndim: int = 3) -> wp.array:
+    return array if array is not None else _nothing(frame, ndim, wp.float32)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -98,10 +99,18 @@ class Camera:
 
     def project(self, point: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 2"]:
         """Image position (x, y) [px] of points in the world [m]; meaningless for points behind the camera."""
-        pose = torch.from_numpy(self.camera_from_world).to(point)
+        kind = point.device, point.dtype
+        if kind not in self._sent:
+            numbers = self.camera_from_world, np.array([self.fx, self.fy]), np.array([self.cx, self.cy])
+            self._sent[kind] = tuple(torch.from_numpy(number).to(point) for number in numbers)
+        pose, focal, principal = self._sent[kind]
         local = point @ pose[:3, :3].T + pose[:3, 3]
-        focal = local.new_tensor([self.fx, self.fy])
         flat = local[..., :2] / local[..., 2:]
         if self.distortion:
             flat = torch.stack(self.distortion.apply(flat[..., 0], flat[..., 1]), dim=-1)
-        return flat * focal + local.new_tensor([self.cx, self.cy])
+        return flat * focal + principal
+
+    @functools.cached_property
+    def _sent(self) -> dict[tuple[torch.device, torch.dtype], tuple[Tensor, ...]]:
+        """Pose, focal lengths and principal point where ``project`` was asked: an upload makes a GPU wait."""
+        return {}

@@ -26,12 +26,14 @@ from .gaussians import GaussianField
 
 
 class Products(StrEnum):
-    """How a network multiplies matrices on CUDA."""
+    """How a network multiplies matrices."""
 
     FLOAT32 = "float32"
-    """As everywhere else."""
+    """As everywhere else: the reference."""
     TF32 = "tf32"
-    """Factors rounded to 11 bits, sums in float32: a fraction of the time; offsets differ by a thousandth."""
+    """On CUDA factors rounded to 11 bits, sums in float32: a fraction of the time; offsets differ by a thousandth."""
+    HALF = "half"
+    """Factors and activations in float16 on any device, sums and parameters in float32: the fastest on CUDA."""
 
 
 class MotionKind(StrEnum):
@@ -70,7 +72,7 @@ class MotionSettings:
     input_scale: float = 1.0
     """Network: positions are divided by this many unambiguous ranges [1]."""
     products: Products = Products.FLOAT32
-    """Network: precision of its matrix products on CUDA."""
+    """Network: precision of its matrix products."""
 
     def __post_init__(self):
         for name in ("layers", "width", "skip_after"):
@@ -83,6 +85,7 @@ class MotionSettings:
 class Motion(torch.nn.Module, abc.ABC):
     """Displacements of Gaussians over time. Final classes: :class:`Still`, :class:`Nodes`, network.Network."""
 
+    key_times: Tensor  # [T] float64 [s]
     follows_means = False
     """Whether ``attach`` depends on where Gaussians are now, so that it has to be asked again after every step."""
 
@@ -99,8 +102,10 @@ class Motion(torch.nn.Module, abc.ABC):
         """What the motion needs to know of each Gaussian; computed anew whenever Gaussians come or go, else kept."""
 
     @abc.abstractmethod
-    def key_offsets(self, attachment: Float[Tensor, "N M"], keys: list[int]) -> Float[Tensor, "k N 3"]:
-        """Displacements [m] of every Gaussian at the key times of these numbers."""
+    def key_offsets(
+        self, attachment: Float[Tensor, "N M"], keys: list[int] | Int[Tensor, "k"]
+    ) -> Float[Tensor, "k N 3"]:
+        """Displacements [m] of every Gaussian at the key times of these numbers; a tensor is read on its device."""
 
     def key_offset(self, attachment: Float[Tensor, "N M"], key: int) -> Float[Tensor, "N 3"]:
         """Displacement [m] of every Gaussian at key time number ``key``."""
@@ -130,7 +135,9 @@ class Still(Motion):
         """Nothing is needed."""
         return field.mean.new_zeros(len(field), 0)
 
-    def key_offsets(self, attachment: Float[Tensor, "N 0"], keys: list[int]) -> Float[Tensor, "k N 3"]:
+    def key_offsets(
+        self, attachment: Float[Tensor, "N 0"], keys: list[int] | Int[Tensor, "k"]
+    ) -> Float[Tensor, "k N 3"]:
         """Zero."""
         return attachment.new_zeros(len(keys), len(attachment), 3)
 
@@ -199,9 +206,16 @@ class Nodes(Motion):
             weight[rows[:, None], columns[index]] = share
         return weight
 
-    def key_offsets(self, attachment: Float[Tensor, "N M"], keys: list[int]) -> Float[Tensor, "k N 3"]:
+    def key_offsets(
+        self, attachment: Float[Tensor, "N M"], keys: list[int] | Int[Tensor, "k"]
+    ) -> Float[Tensor, "k N 3"]:
         """Weighted means of the node offsets."""
-        return torch.stack([attachment @ self.offset[key] for key in keys])
+        return torch.stack([attachment @ offset for offset in rows_of(self.offset, keys)])
+
+
+def rows_of(table: Float[Tensor, "T *n"], keys: list[int] | Int[Tensor, "k"]) -> Float[Tensor, "k *n"]:
+    """Rows of a table by their numbers. The host neither reads a tensor of numbers nor uploads a list of them."""
+    return table.index_select(0, keys) if isinstance(keys, Tensor) else torch.stack([table[key] for key in keys])
 
 
 def farthest_points(points: Float[Tensor, "N 3"], count: int) -> Int[Tensor, "M"]:

@@ -12,11 +12,12 @@ import contextlib
 from collections.abc import Iterator
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from .gaussians import GaussianField
-from .motion import Motion, MotionSettings, Products
+from .motion import Motion, MotionSettings, Products, rows_of
+from .perceptron import Form, Stacked
 
 HEAD_DEVIATION = 1e-5  # of the weights of the last layer: motion starts at rest, to a hundredth of a millimetre
 
@@ -25,6 +26,8 @@ class Network(Motion):
     """Key offsets from a perceptron that knows nothing of single Gaussians: whoever is at a place moves with it."""
 
     follows_means = True
+    moments: Tensor  # [T, t] float64, gamma(t) of every key; of the key times, so it is not stored
+    powers: Tensor  # [F] 2^0, 2^1, .. of the positions; not stored either
 
     def __init__(
         self,
@@ -51,11 +54,17 @@ class Network(Motion):
         if not (duration > 0 and length > 0):
             raise ValueError(f"duration and length must be above 0, got {duration} s and {length} m")
         self.settings, self.duration, self.length = settings, float(duration), float(length)
+        times = encoded(self.key_times[:, None] / self.duration, settings.time_frequencies)
+        self.register_buffer("moments", times, persistent=False)
+        self.register_buffer("powers", powers_of_two(settings.position_frequencies), persistent=False)
         self._inputs = (_encoded_size(3, settings.position_frequencies), _encoded_size(1, settings.time_frequencies))
         joined, width = sum(self._inputs), settings.width
         sizes = [joined] + [width] * (settings.layers - 1)
-        if settings.skip_after < settings.layers:
-            sizes[settings.skip_after] += joined
+        again = settings.skip_after if settings.skip_after < settings.layers else None
+        if again is not None:
+            sizes[again] += joined
+        place, moment = self._inputs
+        self._form = Form(place=place, moment=moment, width=width, joined=again, dtype=torch.float16)
         self._layers = [torch.nn.Linear(size, width) for size in sizes]
         self.layers = torch.nn.ModuleList(self._layers)
         self.head = torch.nn.Linear(width, 3)
@@ -66,25 +75,40 @@ class Network(Motion):
             self.head.weight.normal_(0.0, HEAD_DEVIATION, generator=generator)
             self.head.bias.zero_()
 
-    def attach(self, field: GaussianField) -> Float[Tensor, "N 3"]:
-        """The positions at which it is asked, without gradient [m]."""
-        return field.mean.detach()
+    def attach(self, field: GaussianField) -> Float[Tensor, "N p"]:
+        """gamma(x) of the positions at which it is asked, without gradient, in the precision of the products [1]."""
+        return self.attach_at(field.mean.detach())
 
-    def key_offsets(self, attachment: Float[Tensor, "N 3"], keys: list[int]) -> Float[Tensor, "k N 3"]:
-        """Displacements [m] at several keys.
+    def attach_at(self, mean: Float[Tensor, "N 3"]) -> Float[Tensor, "N p"]:
+        """The same of places [m] without gradient."""
+        place, form = mean / self.length, self._form
+        if self.settings.products == Products.HALF:
+            return encoded(place, self.powers, columns=form.columns, dtype=form.dtype)
+        return encoded(place, self.powers)
 
-        A layer is linear, so what it makes of positions is computed once for all keys, and what it makes of a time is
+    def key_offsets(
+        self, attachment: Float[Tensor, "N p"], keys: list[int] | Int[Tensor, "k"]
+    ) -> Float[Tensor, "k N 3"]:
+        """Displacements [m] at several keys."""
+        return self.offsets(attachment, rows_of(self.moments, keys))
+
+    def offsets(self, attachment: Float[Tensor, "N p"], moment: Float[Tensor, "k t"]) -> Float[Tensor, "k N 3"]:
+        """Displacements [m] at several times, given as gamma(t): rows of ``moments``, chosen on the host or the device.
+
+        A layer is linear, so what it makes of positions is computed once for all times, and what it makes of a time is
         one vector, added like a bias.
         """
-        place = encoded(attachment / self.length, self.settings.position_frequencies)
-        seconds = attachment.new_tensor([self._times[key] for key in keys])[:, None]
-        moment = encoded(seconds / self.duration, self.settings.time_frequencies)
-        hidden = self._joined(self._layers[0], None, place, moment)
+        moment = moment.to(self.head.weight)
+        if self.settings.products == Products.HALF:
+            layers = [*self._layers, self.head]
+            parameters = [value for layer in layers for value in (layer.weight, layer.bias)]
+            return Stacked.apply(self._form, attachment, moment, *parameters)
+        hidden = self._joined(self._layers[0], None, attachment, moment)
         for number, layer in enumerate(self._layers[1:], start=1):
             hidden = torch.relu(hidden)
             skip = number == self.settings.skip_after
             if skip:
-                hidden = self._joined(layer, hidden, place, moment)
+                hidden = self._joined(layer, hidden, attachment, moment)
             else:
                 hidden = self._product(hidden, layer.weight) + layer.bias
         return self._product(torch.relu(hidden), self.head.weight) + self.head.bias
@@ -139,12 +163,37 @@ def _tf32() -> Iterator[None]:
         torch.set_float32_matmul_precision(before)
 
 
-def encoded(value: Float[Tensor, "*n d"], frequencies: int) -> Float[Tensor, "*n e"]:
-    """gamma(v): the values themselves, then sine and cosine of 2^0 v, 2^1 v, .., without a factor pi."""
-    powers = 2.0 ** torch.arange(frequencies, dtype=value.dtype, device=value.device)
+def powers_of_two(count: int) -> Float[Tensor, "f"]:
+    """2^0, 2^1, .., exact in any precision."""
+    return 2.0 ** torch.arange(count, dtype=torch.float32)
+
+
+def encoded(
+    value: Float[Tensor, "*n d"],
+    frequencies: int | Float[Tensor, "f"],
+    *,
+    columns: int | None = None,
+    dtype: torch.dtype | None = None,
+) -> Float[Tensor, "*n e"]:
+    """gamma(v): the values themselves, then sine and cosine of 2^0 v, 2^1 v, .., without a factor pi.
+
+    Args:
+        value: Without gradient.
+        frequencies: How many, or their ``powers_of_two``, which saves making them.
+        columns: Length of a row, zeros at its end; None: as many as there are.
+        dtype: Of the result, rounded at the end; None: that of the values.
+    """
+    powers = (powers_of_two(frequencies) if isinstance(frequencies, int) else frequencies).to(value)
+    count, dimensions = len(powers), value.shape[-1]
+    size = _encoded_size(dimensions, count)
     angles = value[..., None, :] * powers[:, None]
-    waves = torch.stack([angles.sin(), angles.cos()], dim=-2)
-    return torch.cat([value, waves.flatten(start_dim=-3)], dim=-1)
+    made = torch.empty if columns in (None, size) else torch.zeros
+    rows = made(*value.shape[:-1], columns or size, dtype=dtype or value.dtype, device=value.device)
+    rows[..., :dimensions] = value
+    waves = rows[..., dimensions:size].unflatten(-1, (count, 2, dimensions))
+    torch.sin(angles, out=waves[..., 0, :])
+    torch.cos(angles, out=waves[..., 1, :])
+    return rows
 
 
 def _encoded_size(dimensions: int, frequencies: int) -> int:

@@ -1,0 +1,90 @@
+"""The motion network: forward and backward for Q key times at once, per query; what it needs of places included."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ..scene.gaussians import GaussianField, constant_sh
+from ..scene.motion import MotionKind, MotionSettings, Products
+from ..scene.network import Network
+from .timing import Report, both_ways, cell, lines_of, watch_of
+
+COUNTS = (20_000, 100_000)
+QUICK_COUNTS = (100,)
+QUERIES = (1, 2, 3)
+KEYS, PERIOD_S, LENGTH_M = 16, 4 / 120, 7.5
+
+
+def measure(device: str, *, quick: bool, runs: int, report: Report) -> list[dict[str, Any]]:
+    """Rows of N, Q and precision: time of one forward and backward pass, and per query [ms].
+
+    The network is the published one, 8 layers of 256. On a CPU all precisions are one, so that one is timed.
+
+    Args:
+        device: Where.
+        quick: Small N.
+        runs: How often everything is done.
+        report: Called with (rows done, rows in all).
+    """
+    watch = watch_of(device)
+    precisions = [Products.FLOAT32] if torch.device(device).type == "cpu" else list(Products)
+    cases = [(n, q, p) for n in (QUICK_COUNTS if quick else COUNTS) for q in QUERIES for p in precisions]
+    rows = []
+    for done, (count, queries, products) in enumerate(cases, start=1):
+        generator = torch.Generator().manual_seed(0)
+        times = torch.arange(KEYS, dtype=torch.float64) * PERIOD_S
+        settings = MotionSettings(kind=MotionKind.NETWORK, products=products)
+        network = Network(times, settings, duration=float(times[-1]), length=LENGTH_M, generator=generator).to(device)
+        field = points(LENGTH_M * torch.rand(count, 3, generator=generator)).map(lambda value: value.to(device))
+        slope = torch.randn(queries, count, 3, generator=generator).to(device)
+        weights = list(network.parameters())
+        keys = list(range(4, 4 + queries))
+
+        def both(network=network, field=field, slope=slope, weights=weights, keys=keys) -> object:
+            return torch.autograd.grad(network.key_offsets(network.attach(field), keys), weights, slope)
+
+        def forward(network=network, field=field, keys=keys) -> object:
+            with torch.no_grad():
+                return network.key_offsets(network.attach(field), keys)
+
+        found = both_ways(both, watch, runs)
+        best = (found["graph"] or found["eager"])["median"]
+        row = {"N": count, "queries": queries, "products": str(products), "forward_backward": found}
+        rows.append(row | {"forward": both_ways(forward, watch, runs), "ms_per_query": best / queries})
+        report(done, len(cases), N=count, ms=best)
+    return rows
+
+
+def points(mean: Float[Tensor, "N 3"]) -> GaussianField:
+    """Gaussians of which only the places [m] matter."""
+    count = len(mean)
+    return GaussianField(
+        mean=mean,
+        log_scale=torch.zeros(count, 3),
+        quaternion=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
+        opacity_logit=torch.zeros(count),
+        reflectivity_sh=constant_sh(torch.ones(count)),
+    )
+
+
+def table(rows: list[dict[str, Any]]) -> list[str]:
+    """One line per row."""
+    heads = ["precision", "N", "queries", "forward, graph", "with backward", "called", "with backward", "per query"]
+    cells = [
+        [
+            row["products"],
+            f"{row['N']:,}",
+            str(row["queries"]),
+            cell(row["forward"]["graph"]),
+            cell(row["forward_backward"]["graph"]),
+            cell(row["forward"]["eager"]),
+            cell(row["forward_backward"]["eager"]),
+            f"{row['ms_per_query']:.3f}",
+        ]
+        for row in rows
+    ]
+    return lines_of("motion network, 8 layers of 256: median (10 .. 90 %) [ms]", heads, cells)

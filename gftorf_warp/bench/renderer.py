@@ -1,0 +1,225 @@
+"""The renderer: every stage by itself and forward and backward in all, on two families of scenes; Warp only.
+
+Two forms. *all*: quads, phasor, colour, distance, opacity and distortion, a random derivative of each. *training*: a
+field without colour, one quad of which a derivative is known, as in a step of the presets without colour. Stages are
+those that launch.py asks for, in its order, each repeated with the arguments it got there.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from ..constants import CANONICAL_SHIFTS
+from ..render import launch, stages
+from ..render.buffers import Frame, RenderSettings
+from ..render.inputs import Images, Inputs, names_of
+from .scenes import CAMERA, FAMILIES, FAR, HEIGHT, NEAR, WIDTH, array_of, inputs_of, scene_of
+from .timing import Function, HostWatch, Report, Watch, both_ways, cell, lines_of, quietly, timed
+
+COUNTS = (20_000, 50_000, 100_000, 200_000, 300_000)
+QUICK_COUNTS = (500,)
+FORMS = ("all", "training")
+WITHIN = 10  # repetitions of a stage in one graph
+ROOM = 1.3  # pairs that are reserved, over those that there are
+GAUSSIANS = ("mean", "log_scale", "quaternion", "opacity_logit", "reflectivity_sh", "colour_sh")
+
+
+class WarpWatch:
+    """Events of Warp on the stream of a device."""
+
+    def __init__(self, device: wp.Device):
+        self.device = device
+
+    def mark(self) -> wp.Event:
+        """An event, recorded."""
+        event = wp.Event(self.device, enable_timing=True)
+        self.device.stream.record_event(event)
+        return event
+
+    def between(self, start: wp.Event, stop: wp.Event) -> float:
+        """Milliseconds between two events."""
+        return wp.get_event_elapsed_time(start, stop)
+
+    def synchronise(self) -> None:
+        """Wait for the device."""
+        wp.synchronize_device(self.device)
+
+    def captured(self, function: Function) -> Function | None:
+        """A graph of the launches of a function, which has run before."""
+        with wp.ScopedCapture(device=self.device) as capture:
+            function()
+        return partial(wp.capture_launch, capture.graph)
+
+
+class Case:
+    """One scene in one form, ready to be rendered and differentiated."""
+
+    def __init__(self, kind: str, count: int, scale: float, opacity: float, form: str, device: wp.Device):
+        """Make everything but the frame's reserve of pairs, which needs a first rendering."""
+        if form not in FORMS:
+            raise ValueError(f"form {form!r} must be one of {FORMS}")
+        everything = form == "all"
+        self.shifts = CANONICAL_SHIFTS if everything else CANONICAL_SHIFTS[:1]
+        self.inputs = inputs_of(scene_of(kind, count, scale, opacity), device, colour=everything)
+        size = HEIGHT, WIDTH
+        shapes: dict[str, tuple[int, ...]] = {"quads": (len(self.shifts), *size), "phasor": (3, *size)}
+        shapes |= {"colour": (3, *size)} if everything else {}
+        shapes |= dict.fromkeys(("distance", "opacity", "distortion"), size)
+        rng = np.random.default_rng(1)
+        empty = dict.fromkeys(names_of(Images))
+        self.images = Images(**empty | {name: array_of(np.zeros(shape), device) for name, shape in shapes.items()})
+        known = shapes if everything else {"quads": shapes["quads"]}
+        self.cotangents = Images(
+            **empty | {name: array_of(rng.normal(size=shape), device) for name, shape in known.items()}
+        )
+        self.wanted = Inputs(**dict.fromkeys(names_of(Inputs)))
+        for name in GAUSSIANS:
+            value = getattr(self.inputs, name)
+            setattr(self.wanted, name, None if value is None else wp.zeros_like(value))
+        self.count, self.device = count, device
+        self.start(None)
+        self.forward()
+        self.pairs = int(self.frame.total.numpy()[0])
+
+    def start(self, capacity: int | None) -> None:
+        """A fresh frame with room for ``capacity`` pairs."""
+        settings = RenderSettings(near=NEAR, far=FAR, pair_capacity=capacity)
+        self.frame = Frame(self.count, WIDTH, HEIGHT, settings, self.device)
+        self.view = launch.view_of(CAMERA, settings)
+
+    def forward(self) -> None:
+        """Render."""
+        launch.forward(self.inputs, self.view, self.shifts, self.frame, self.images)
+
+    def backward(self) -> None:
+        """Differentiate; the forward pass has run."""
+        launch.backward(self.inputs, self.view, self.shifts, self.frame, self.cotangents, self.wanted)
+
+    def both(self) -> None:
+        """Forward and backward."""
+        self.forward()
+        self.backward()
+
+    def stages(self) -> dict[str, Function]:
+        """What one forward and backward pass asks of stages.py, by name and in its order, ready to be repeated."""
+        calls: dict[str, list[Function]] = {}
+        with _overheard(calls):
+            self.both()
+
+        def all_of(functions: list[Function]) -> Function:
+            return lambda: [function() for function in functions]
+
+        return {name: all_of(functions) for name, functions in calls.items()}
+
+
+@contextlib.contextmanager
+def _overheard(calls: dict[str, list[Function]]) -> Iterator[None]:
+    """Note what launch.py asks of the stages while it runs."""
+
+    class Overheard:
+        def __getattr__(self, name: str) -> Callable[..., Any]:
+            stage = getattr(stages, name)
+
+            def call(*arguments, **named):
+                calls.setdefault(name, []).append(partial(stage, *arguments, **named))
+                return stage(*arguments, **named)
+
+            return call
+
+    launch.stages = Overheard()  # type: ignore[assignment]
+    try:
+        yield
+    finally:
+        launch.stages = stages
+
+
+def measure(
+    device_name: str,
+    *,
+    runs: int,
+    quick: bool = False,
+    counts: tuple[int, ...] = COUNTS,
+    forms: tuple[str, ...] = FORMS,
+    report: Report = quietly,
+) -> list[dict[str, Any]]:
+    """Rows of N, family and form: pairs, stages, forward, and forward with backward [ms].
+
+    Args:
+        device_name: Of Warp and torch, for example "cpu".
+        runs: How often everything is done.
+        quick: Small N and one family.
+        counts: Numbers of Gaussians, unless ``quick``.
+        forms: Out of ``FORMS``.
+        report: Called with (rows done, rows in all).
+    """
+    device = wp.get_device(device_name)
+    watch: Watch = WarpWatch(device) if device.is_cuda else HostWatch()
+    families, counts = (FAMILIES[:1], QUICK_COUNTS) if quick else (FAMILIES, counts)
+    cases = [(*family, n, form) for form in forms for family in families for n in counts]
+    rows = []
+    for done, (kind, scale, opacity, count, form) in enumerate(cases, start=1):
+        case = Case(kind, count, scale, opacity, form, device)
+        free = timed_free(case, watch, runs)
+        if device.is_cuda:  # nothing is read back then
+            case.start(int(ROOM * case.pairs) + 1)
+        forward, both = (both_ways(function, watch, runs) for function in (case.forward, case.both))
+        parts = {name: both_ways(function, watch, runs, within=WITHIN) for name, function in case.stages().items()}
+        case.frame.check_capacity()
+        assert case.images.distance is not None
+        row: dict[str, Any] = {"form": form, "scene": kind, "scale": scale, "opacity": opacity, "N": count}
+        row |= {"pairs": case.pairs, "forward": forward, "forward_backward": both, "pairs_counted_on_host": free}
+        row |= {"stages": parts, "mean_distance": float(case.images.distance.numpy().mean())}
+        rows.append(row)
+        report(done, len(cases), N=count, ms=both["eager"]["median"])
+    return rows
+
+
+def timed_free(case: Case, watch: Watch, runs: int) -> dict[str, Any] | None:
+    """Forward and backward with the number of pairs read back, as without a reserve [ms]; on a CPU it always is."""
+    if not case.device.is_cuda:
+        return None
+    return timed(case.both, watch, runs).plain()
+
+
+def table(rows: list[dict[str, Any]]) -> list[str]:
+    """Totals, then stages."""
+    totals = [
+        [
+            f"{row['form']} {row['scene']} {row['scale']:g} {row['opacity']:g}",
+            f"{row['N']:,}",
+            f"{row['pairs']:,}",
+            cell(row["forward"]["graph"]),
+            cell(row["forward_backward"]["graph"]),
+            cell(row["forward"]["eager"]),
+            cell(row["forward_backward"]["eager"]),
+        ]
+        for row in rows
+    ]
+    heads = ["form, scene", "N", "pairs", "forward, graph", "with backward", "forward, called", "with backward"]
+    lines = lines_of(f"renderer, {WIDTH}x{HEIGHT}: median (10 .. 90 %) [ms]", heads, totals)
+    for form in dict.fromkeys(row["form"] for row in rows):
+        some = [row for row in rows if row["form"] == form]
+        names = list(dict.fromkeys(name for row in some for name in row["stages"]))
+        parts = [
+            [f"{row['scene']} {row['scale']:g} {row['opacity']:g}", f"{row['N']:,}"]
+            + [_stage(row["stages"].get(name)) for name in names]
+            for row in some
+        ]
+        words = [name.replace("_", " ") for name in names]
+        lines += [
+            "",
+            *lines_of(
+                f"stages, form {form}: median [ms], of a graph where there is one", ["scene", "N", *words], parts
+            ),
+        ]
+    return lines
+
+
+def _stage(timings: dict[str, Any] | None) -> str:
+    return "-" if timings is None else f"{(timings['graph'] or timings['eager'])['median']:.3f}"

@@ -1,0 +1,195 @@
+"""The training step: consecutive images of a fixed state, without rounds and resets, in every way that exists.
+
+Ways are every member of ``Kernels`` and ``Batch`` with the last of ``Products``, and every member of ``Products`` with
+the last of ``Kernels``: these enumerations list from plain to fast. Every way begins with the same state.
+"""
+
+from __future__ import annotations
+
+import copy
+import statistics
+import time
+import warnings
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import torch
+
+from ..recon.captured import CapturedSteps, steps_of
+from ..recon.observations import Observations, observe
+from ..recon.settings import Batch, Kernels, ReconSettings
+from ..recon.state import State, from_dict
+from ..recon.step import Singles
+from ..scene.motion import MotionKind, Products
+from .states import Fitted, pairs_of
+from .timing import Report, Timing, lines_of, quietly, watch_of
+
+WARM_UP = 24  # images before anything is timed: kernels are loaded, moments exist
+WATCHED = 16  # images in which waits are counted and profiled
+PART = 40  # images between two looks at the clock
+IMAGES = 400
+QUICK_IMAGES, QUICK_PART, QUICK_WARM_UP = 8, 4, 4
+
+
+def ways(settings: ReconSettings, changes: list[str], device: str) -> list[ReconSettings]:
+    """The settings of every row; what ``changes`` sets stays as it is."""
+    fixed = {change.partition("=")[0].strip() for change in changes}
+    moves = settings.motion.kind == MotionKind.NETWORK and torch.device(device).type != "cpu"
+    kernels = [settings.kernels] if "kernels" in fixed else list(Kernels)
+    batches = [settings.schedule.batch] if "schedule.batch" in fixed else list(Batch)
+    products = [settings.motion.products] if "motion.products" in fixed or not moves else list(Products)
+    pairs = [(kind, products[-1]) for kind in kernels] + [(kernels[-1], kind) for kind in products[:-1]]
+    return [
+        replace(
+            settings,
+            kernels=kind,
+            schedule=replace(settings.schedule, batch=batch),
+            motion=replace(settings.motion, products=precision),
+        )
+        for kind, precision in pairs
+        for batch in batches
+    ]
+
+
+def fresh(
+    fitted: Fitted, observations: Observations, settings: ReconSettings, device: str, warm_up: int = WARM_UP
+) -> Run:
+    """The state again, a few images later, and how its steps are done."""
+    stored = copy.deepcopy(fitted.stored)
+    if "shape" in stored["motion"]:  # precision is a matter of speed: that of the row, not of the checkpoint
+        stored["motion"]["shape"]["products"] = str(settings.motion.products)
+    stored["queue"] = []  # batches are numbered anew
+    state = from_dict(stored, device)
+    run = Run(state, steps_of(state, observations, settings))
+    advance(run, warm_up)
+    return run
+
+
+class Run(NamedTuple):
+    """A state on its way."""
+
+    state: State
+    """Changed by steps."""
+    steps: Singles | CapturedSteps
+    """How they are done."""
+
+
+def advance(run: Run, images: int) -> int:
+    """Steps until so many more images are optimised; returns how many of the steps were not sound."""
+    end, skipped = run.state.images + images, run.state.skipped
+    while run.state.images < end:
+        run.steps.step()
+    run.steps.collect()
+    return run.state.skipped - skipped
+
+
+def measure(
+    fitted: Fitted, device: str, *, changes: list[str], quick: bool, images: int | None, report: Report
+) -> list[dict[str, Any]]:
+    """Rows of all ways.
+
+    Args:
+        fitted: The state.
+        device: Where.
+        changes: Single settings that ``fitted`` was made with.
+        quick: A few images only.
+        images: How many; None: 400.
+        report: Called with (images done, images in all).
+    """
+    chosen = ways(fitted.settings, changes, device)
+    if quick:
+        short: dict[str, int] = {"images": images or QUICK_IMAGES, "part": QUICK_PART, "warm_up": QUICK_WARM_UP}
+        return rows_of(chosen, fitted, device, **short, report=report)
+    return rows_of(chosen, fitted, device, images=images or IMAGES, report=report)
+
+
+def rows_of(
+    chosen: list[ReconSettings],
+    fitted: Fitted,
+    device: str,
+    *,
+    images: int,
+    part: int = PART,
+    warm_up: int = WARM_UP,
+    report: Report = quietly,
+) -> list[dict[str, Any]]:
+    """Mean over consecutive images and the spread of its parts [ms per image], for every one of some settings.
+
+    Args:
+        chosen: The settings.
+        fitted: The state that each begins with.
+        device: Where.
+        images: How many; whole parts, at least one.
+        part: Images between two looks at the clock.
+        warm_up: Images before the first that counts.
+        report: Called with (images done, images in all).
+    """
+    parts, rows, watch = max(images // part, 1), [], watch_of(device)
+    pairs = pairs_of(fitted)
+    for number, settings in enumerate(chosen):
+        observations = observe(fitted.sequence, settings, device)
+        run = fresh(fitted, observations, settings, device, warm_up)
+        state = run.state
+        times, before, broken = [], state.images, 0
+        for done in range(1, parts + 1):
+            watch.synchronise()
+            first, begun = state.images, time.perf_counter()
+            broken += advance(run, part)
+            watch.synchronise()
+            times.append(1e3 * (time.perf_counter() - begun) / (state.images - first))
+            report((number * parts + done) * part, len(chosen) * parts * part, ms=times[-1])
+        row: dict[str, Any] = {"kernels": str(settings.kernels), "batch": str(settings.schedule.batch)}
+        row |= {
+            "products": str(settings.motion.products),
+            "N": len(state.optimiser.field),
+            "pairs": pairs,
+            "from": before,
+        }
+        row |= {"images": state.images - before, "flow": fitted.flow_source, "not_sound": broken}
+        row |= {"ms_per_image": statistics.mean(times), "parts": Timing.of(times).plain()}
+        if isinstance(run.steps, CapturedSteps) and run.steps.gate.counts is not None:
+            row["awake"], row["asking"] = run.steps.gate.counts
+        if torch.device(device).type != "cpu":
+            row["waits_per_image"] = waits(fresh(fitted, observations, settings, device, warm_up), device)
+        rows.append(row)
+    return rows
+
+
+def waits(run: Run, device: str) -> float:
+    """How often the host waits for the device in an image, as torch sees it; reads of Warp are not seen."""
+    module = torch.get_device_module(device)
+    module.set_sync_debug_mode("warn")
+    with warnings.catch_warnings(record=True) as seen:
+        warnings.simplefilter("always")
+        advance(run, WATCHED)
+    module.set_sync_debug_mode("default")
+    return sum("synchroniz" in str(warning.message) for warning in seen) / WATCHED
+
+
+def profiled(run: Run, device: str) -> str:
+    """Torch's table of the most expensive kernels and operators."""
+    on_cpu = torch.device(device).type == "cpu"
+    activity = torch.profiler.ProfilerActivity
+    with torch.profiler.profile(activities=[activity.CPU] if on_cpu else [activity.CPU, activity.CUDA]) as profile:
+        advance(run, WATCHED)
+        watch_of(device).synchronise()
+    order = "self_cpu_time_total" if on_cpu else "self_device_time_total"
+    return profile.key_averages().table(sort_by=order, row_limit=30)
+
+
+def table(rows: list[dict[str, Any]]) -> list[str]:
+    """One line per way."""
+    heads = ["kernels, batch, products", "N", "pairs", "images", "mean", "10 .. 90 % of parts", "waits per image"]
+    cells = [
+        [
+            f"{row['kernels']}, {row['batch']}, {row['products']}",
+            f"{row['N']:,}",
+            f"{row['pairs']:,}",
+            str(row["images"]),
+            f"{row['ms_per_image']:.3f}",
+            f"{row['parts']['p10']:.3f} .. {row['parts']['p90']:.3f}",
+            f"{row['waits_per_image']:.2f}" if "waits_per_image" in row else "-",
+        ]
+        for row in rows
+    ]
+    return lines_of("training step, no rounds, no resets [ms per image]", heads, cells)

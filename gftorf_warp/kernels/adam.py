@@ -1,0 +1,132 @@
+"""Adam over many tensors in one launch, with everything that changes from step to step in device memory.
+
+    m += (1 - b1) (g - m),   v += (1 - b2) (g^2 - v),   x -= rate / (1 - b1^t)  m / (sqrt(v / (1 - b2^t)) + eps)
+
+(Kingma and Ba, 2015). Step t and rate are those of a tensor. A tensor of rate 0 is left alone, t included; so is
+everything if the step is not sound, which is how a gradient that is not finite is survived without asking the host.
+
+A table names the tensors by address: they are as many as a network has layers, and live wherever torch put them. A
+gradient at address 0 is none: the tensor is left alone, too. Gradients are multiplied by a factor before anything else.
+"""
+
+import functools
+
+import warp as wp
+
+PARAMETER, GRADIENT, FIRST, SECOND, STEP, LENGTH = range(6)  # columns of the table
+COLUMNS = 6
+SIZES = 3  # what a step of a tensor comes to: see ``adam_sizes``
+
+ADVANCE = f"""
+    const long long* row = table.data + {COLUMNS} * tensor;
+    float* step = reinterpret_cast<float*>(row[{STEP}]);
+    float* out = sizes.data + {SIZES} * tensor;
+    out[0] = 0.0f;
+    if (!sound || rate == 0.0f || row[{GRADIENT}] == 0) return;
+    step[0] += 1.0f;
+    const double first = 1.0 - pow((double)beta1, (double)step[0]), second = 1.0 - pow((double)beta2, (double)step[0]);
+    out[0] = (float)((double)rate / first);
+    out[1] = (float)(1.0 / sqrt(second));
+    out[2] = factor;
+"""
+"""C++: count a step of a tensor, unless it rests, and write what the step comes to."""
+
+
+def _descend(K: int) -> str:
+    """C++: one block of K elements; what lies behind the end of a tensor is neither read nor written."""
+    kind = f"typedef float F __attribute__((ext_vector_type({K})));" if K > 1 else "typedef float F;"
+    root = "__builtin_elementwise_sqrt(v)" if K > 1 else "sqrtf(v)"
+    at = "F v = 0.0f; __builtin_memcpy(&v, p, bytes); return v;" if K > 1 else "return *p;"
+    put = "__builtin_memcpy(p, &v, bytes);" if K > 1 else "*p = v;"
+    return f"""
+    {kind}
+    const long long* row = table.data + {COLUMNS} * tensor;
+    const float* sizes_ = sizes.data + {SIZES} * tensor;
+    const float size = sizes_[0], root_scale = sizes_[1];
+    if (size == 0.0f) return;
+    const long long begin = (long long)block * {K}, left = row[{LENGTH}] - begin;
+    const unsigned long bytes = (left < {K} ? left : {K}) * sizeof(float);
+    auto at = [&](const float* p) -> F {{ {at} }};
+    auto put = [&](float* p, F v) {{ {put} }};
+    float* x_ = reinterpret_cast<float*>(row[{PARAMETER}]) + begin;
+    float* m_ = reinterpret_cast<float*>(row[{FIRST}]) + begin;
+    float* v_ = reinterpret_cast<float*>(row[{SECOND}]) + begin;
+    const F g = sizes_[2] * at(reinterpret_cast<const float*>(row[{GRADIENT}]) + begin);
+    F m = at(m_), v = at(v_);
+    m += rest1 * (g - m);
+    v += rest2 * (g * g - v);
+    put(m_, m);
+    put(v_, v);
+    put(x_, at(x_) - size * m / ({root} * root_scale + epsilon));
+"""
+
+
+@wp.func_native(ADVANCE)
+def advance(
+    table: wp.array2d[wp.int64],
+    tensor: int,
+    rate: float,
+    beta1: wp.float64,
+    beta2: wp.float64,
+    sound: bool,
+    factor: float,
+    sizes: wp.array2d[float],
+):
+    """Count a step of a tensor, unless it rests, and write what the step comes to."""
+
+
+@wp.kernel(enable_backward=False)
+def adam_sizes(
+    # In:
+    table: wp.array2d[wp.int64],  # [T, 6] addresses of parameter, gradient, both moments and step; length [1]
+    rates: wp.array[float],  # [T] learning rates, 0: the tensor rests [1]
+    sound: wp.array[int],  # [1] 0: nothing changes in this step [flag]
+    beta1: wp.float64,  # decay of the first moment [1]
+    beta2: wp.float64,  # decay of the second moment [1]
+    # Out:
+    sizes: wp.array2d[float],  # [T, 3] rate / (1 - b1^t), 0: rests; 1 / sqrt(1 - b2^t); factor of the gradient
+):
+    """One thread per tensor; counts its step."""
+    tensor = wp.tid()
+    advance(table, tensor, rates[tensor], beta1, beta2, sound[0] != 0, 1.0, sizes)
+
+
+@functools.cache
+def make_adam(K: int):
+    """The kernel that works on K elements per thread: 1 on CUDA, 16 on the CPU."""
+
+    @wp.func_native(_descend(K))
+    def descend(
+        table: wp.array2d[wp.int64],
+        tensor: int,
+        block: int,
+        sizes: wp.array2d[float],
+        rest1: float,
+        rest2: float,
+        epsilon: float,
+    ): ...
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def adam(
+        # In:
+        table: wp.array2d[wp.int64],  # [T, 6] addresses of parameter, gradient, both moments and step; length [1]
+        first_block: wp.array[int],  # [T] blocks before those of a tensor [1]
+        rest1: float,  # 1 - b1 [1]
+        rest2: float,  # 1 - b2 [1]
+        epsilon: float,  # added to the root of the second moment [units of the gradient]
+        # Out:
+        sizes: wp.array2d[float],  # [T, 3] from ``adam_sizes``; what changes are the tensors of the table, in place
+    ):
+        """One thread per block of K elements; changes parameters and moments where they are."""
+        block = wp.tid()
+        low = int(0)
+        high = int(first_block.shape[0])
+        while high - low > 1:  # the last tensor that begins at this block or before
+            middle = (low + high) // 2
+            if first_block[middle] <= block:
+                low = middle
+            else:
+                high = middle
+        descend(table, low, block - first_block[low], sizes, rest1, rest2, epsilon)
+
+    return adam

@@ -1,0 +1,322 @@
+"""How a warp reads a tile's list, and adds to gradient records, sixteen entries at a time through shared memory.
+
+A list is walked in rounds of ``ROUND`` entries. While a warp works on one round, the records of the next one travel
+from global to shared memory without passing registers (cp.async), two lanes per record; then every lane reads the same
+record, a broadcast. On the way back each lane leaves what its pixel says about the records of a round in shared memory,
+and the sums over pixels are taken with other roles: a lane owns one record and one half of the tile. That costs a fifth
+of what folding sums across lanes costs record by record.
+
+The CPU, where a thread is alone, has no shared memory: there a record is read where it lies, and nothing else happens.
+All functions must be reached by all 32 lanes of a warp together.
+"""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from .lanes import make_lanes
+from .splat import Splat
+
+COOPERATIVE = True  # False: every lane reads every record itself, to compare with
+ROUND = wp.constant(16)  # entries of a list that are fetched, and whose gradients are summed, together
+WARPS = 1  # tiles of a block of threads: all blocks run at once, and the more there are, the more evenly they spread
+STRIDE = 36  # floats from the values of one entry to those of the next: 4-float reads of 8 lanes meet all 32 banks
+OUT_STRIDE = 20  # the same for gradient records
+PIXELS = 32  # of a tile
+HIT = 1.0e30  # times the smallest weight of a pixel that is reached, 4e-9, it is far above 1
+
+_RECORDS = 2 * ROUND * 16  # two buffers of records [floats]
+_MORE = 2 * ROUND * 4  # two buffers of further channels [floats]
+_CHECK = f'static_assert({ROUND} == 16 && {PIXELS} == 32, "two lanes per record, two halves of a tile");'
+
+
+def shared_floats(values: int, derivatives: int) -> int:
+    """Floats of shared memory of a warp: two buffers of records, and what backward keeps.
+
+    Args:
+        values: Values a pixel keeps of each entry of a round.
+        derivatives: Groups of four derivatives that belong to a pixel.
+    """
+    kept = max(values * ROUND * STRIDE, 2 * ROUND * OUT_STRIDE) if values else 0
+    return _RECORDS + 4 * PIXELS * derivatives + kept
+
+
+@functools.cache
+def make_batches(values: int = 0, derivatives: int = 0, more: bool = False) -> SimpleNamespace:
+    """Functions that fetch the records of a list.
+
+    Args:
+        values: As in :func:`shared_floats`.
+        derivatives: As in :func:`shared_floats`.
+        more: Whether there is room for three further channels, behind everything else that a forward pass needs.
+    """
+    floats = shared_floats(values, derivatives) + _MORE * more
+
+    memory_snippet = f"""
+#if defined(__CUDA_ARCH__)
+    {_CHECK}
+    __shared__ __align__(16) float memory[{WARPS} * {floats}];
+    return (wp::uint64)(memory + (threadIdx.x >> 5) * {floats});
+#else
+    return 0;
+#endif
+"""
+
+    @wp.func_native(memory_snippet)
+    def warp_memory() -> wp.uint64:
+        """Where the shared memory of this warp begins."""
+
+    return SimpleNamespace(
+        warp_memory=warp_memory,
+        ask=ask,
+        arrive=arrive,
+        entry=entry,
+        record_of=record_of,
+        ask_more=ask_more,
+        more_of=more_of,
+    )
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    const int n = at + (int)((threadIdx.x & 31u) >> 1);
+    return ids.data[start + step * (n < count ? n : count - 1)];
+#else
+    return 0;
+#endif
+""")
+def entry(ids: wp.array[int], start: int, step: int, at: int, count: int) -> int:
+    """The splat whose record this lane fetches for the round that begins at entry ``at`` of ``count``.
+
+    Past the end of the list it is the last one again.
+    """
+
+
+@wp.func_native(f"""
+#if defined(__CUDA_ARCH__)
+    const unsigned lane = threadIdx.x & 31u;  // a pair of lanes fetches a record, 32 bytes each
+    const float4* from = reinterpret_cast<const float4*>(splats.data + i) + 2 * (lane & 1u);
+    float4* to = reinterpret_cast<float4*>(memory) + (at / {ROUND} & 1) * {4 * ROUND} + 2 * lane;
+#if __CUDA_ARCH__ >= 800
+    const unsigned target = (unsigned)__cvta_generic_to_shared(to);
+    asm volatile("cp.async.cg.shared.global [%0], [%1], 16;" :: "r"(target), "l"(from) : "memory");
+    asm volatile("cp.async.cg.shared.global [%0], [%1], 16;" :: "r"(target + 16), "l"(from + 1) : "memory");
+#else
+    to[0] = __ldg(from);
+    to[1] = __ldg(from + 1);
+#endif
+#endif
+""")
+def ask(memory: wp.uint64, splats: wp.array[Splat], i: int, at: int):
+    """Send for the records of the round that begins at entry ``at``, of which ``i`` is this lane's."""
+
+
+@wp.func_native(f"""
+#if defined(__CUDA_ARCH__)
+    const unsigned lane = threadIdx.x & 31u;
+    if (lane & 1u) return;  // 16 bytes of a record, the channels, are one lane's work
+    const float4* from = reinterpret_cast<const float4*>(records.data + i) + 2;
+    float4* to = reinterpret_cast<float4*>(memory) + {_RECORDS // 4} + (at & {2 * ROUND - 1}) + (lane >> 1);
+#if __CUDA_ARCH__ >= 800
+    const unsigned target = (unsigned)__cvta_generic_to_shared(to);
+    asm volatile("cp.async.cg.shared.global [%0], [%1], 16;" :: "r"(target), "l"(from) : "memory");
+#else
+    to[0] = __ldg(from);
+#endif
+#endif
+""")
+def ask_more(memory: wp.uint64, records: wp.array[Splat], i: int, at: int):
+    """Send for three further channels, slots 8-10 of other records, as :func:`ask` does for the records."""
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+#if __CUDA_ARCH__ >= 800
+    asm volatile("cp.async.wait_all;" ::: "memory");
+#endif
+    __syncwarp();  // the records of all lanes are there, and no lane reads the round before any more
+#endif
+""")
+def arrive():
+    """Wait for the records that were sent for."""
+
+
+@wp.func_native(f"""
+#if defined(__CUDA_ARCH__)
+    const float4* line = reinterpret_cast<const float4*>(memory) + (at & {2 * ROUND - 1}) * 4;
+    wp::vec_t<16, float> record;
+    for (int part = 0; part < 4; ++part) {{
+        const float4 four = line[part];
+        record[4 * part] = four.x; record[4 * part + 1] = four.y;
+        record[4 * part + 2] = four.z; record[4 * part + 3] = four.w;
+    }}
+    return record;
+#else
+    return splats.data[ids.data[k]];
+#endif
+""")
+def record_of(memory: wp.uint64, at: int, splats: wp.array[Splat], ids: wp.array[int], k: int) -> Splat:
+    """The record of entry ``at`` of the walk, which is number ``k`` of the pairs."""
+
+
+@wp.func_native(
+    f"""
+#if defined(__CUDA_ARCH__)
+    const float4 four = (reinterpret_cast<const float4*>(memory) + {_RECORDS // 4})[at & {2 * ROUND - 1}];
+    return wp::vec_t<3, float>(four.x, four.y, four.z);
+#else
+    const Splat& q = records.data[ids.data[k]];
+    return wp::vec_t<3, float>(q[8], q[9], q[10]);
+#endif
+""".replace("Splat&", "wp::vec_t<16, float>&")
+)
+def more_of(memory: wp.uint64, at: int, records: wp.array[Splat], ids: wp.array[int], k: int) -> wp.vec3:
+    """The further channels of entry ``at`` of the walk, which is number ``k`` of the pairs."""
+
+
+@functools.cache
+def make_gradient_rounds(
+    tile_width: int, light: bool, channels: bool, geometry: bool, spreads: bool, more: bool = False
+) -> SimpleNamespace:
+    """Functions that sum what pixels say about the entries of a round; 32 pixels of a tile, one per lane.
+
+    Args:
+        tile_width: Columns of a tile [px]; each half of its 32 pixels is whole rows.
+        light: Whether the light has gradients.
+        channels: Whether the three channels have.
+        geometry: Whether centre, conic and opacity have.
+        spreads: Whether the distortion has; then the derivative of the distance differs from entry to entry.
+        more: Whether three further channels have gradients, of their own records.
+    """
+    half = PIXELS // 2
+    if half % tile_width:
+        raise ValueError(f"half of a tile must be whole rows, got {tile_width} columns")
+    V = make_lanes(1).V
+    kept = ["w"] + ["v"] * geometry + ["w2"] * light + ["wd"] * spreads  # values a pixel keeps of an entry
+    derivatives = light + channels + more
+    floats = shared_floats(len(kept), derivatives)
+    kept_at = _RECORDS + 4 * PIXELS * derivatives
+    places = f"""
+    float* const mine = reinterpret_cast<float*>(memory);
+    float* const kept = mine + {kept_at};
+    const int lane = (int)(threadIdx.x & 31u);"""
+
+    derivatives_snippet = f"""
+#if defined(__CUDA_ARCH__)
+    float4* const to = reinterpret_cast<float4*>(memory) + {_RECORDS // 4} + (threadIdx.x & 31u);
+    {"to[0] = make_float4(g_re[0], g_im[0], g_amplitude[0], g_distance[0]);" if light else ""}
+    {f"to[{PIXELS * light}] = make_float4(g0[0], g1[0], g2[0], 0.0f);" if channels else ""}
+    {f"to[{PIXELS * (light + channels)}] = make_float4(g3[0], g4[0], g5[0], 0.0f);" if more else ""}
+#endif
+"""
+
+    @wp.func_native(derivatives_snippet)
+    def keep_derivatives(
+        memory: wp.uint64, g0: V, g1: V, g2: V, g_re: V, g_im: V, g_amplitude: V, g_distance: V, g3: V, g4: V, g5: V
+    ):
+        """Leave what belongs to this lane's pixel alone; read after the next barrier."""
+
+    stores = [f"to[{n * ROUND * STRIDE}] = {name}[0]{' * g_d[0]' * (name == 'wd')};" for n, name in enumerate(kept)]
+    stores = [store.replace("wd[0]", "w[0]") for store in stores]
+
+    values_snippet = f"""
+#if defined(__CUDA_ARCH__)
+    float* const kept = reinterpret_cast<float*>(memory) + {kept_at};
+    float* const to = kept + (at & {ROUND - 1}) * {STRIDE} + (threadIdx.x & 31u);
+    {" ".join(stores)}
+#endif
+"""
+
+    @wp.func_native(values_snippet)
+    def keep_values(memory: wp.uint64, at: int, v: V, w: V, w2: V, g_d: V):
+        """Leave what this lane's pixel says about entry ``at``."""
+
+    take = "\n        ".join(
+        f"const float4 {name}4 = from[{(n * ROUND * STRIDE) // 4} + part];"
+        f" const float {name}_[4] = {{{name}4.x, {name}4.y, {name}4.z, {name}4.w}};"
+        for n, name in enumerate(kept)
+    )
+    moments = "const float vx = v_[j] * dx[c]; row0 += v_[j]; row1 += vx; row2 += vx * dx[c];" if geometry else ""
+    end_of_row = (
+        """if (c == WIDTH - 1) {
+                sums[0] += row1; sums[1] += row0 * dy; sums[2] += row2; sums[3] += row1 * dy;
+                sums[4] += row0 * dy * dy; sums[5] += row0; row0 = row1 = row2 = 0.0f; dy -= 1.0f;
+            }"""
+        if geometry
+        else ""
+    )
+    lit = "const float4 g = pixel[4 * part + j];" if light else ""
+    lit += " sums[11] += w2_[j] * g.x; sums[12] += w2_[j] * g.y; sums[13] += w2_[j] * g.z;" if light else ""
+    lit += (" sums[14] += wd_[j];" if spreads else " sums[14] += w_[j] * g.w;") if light else ""
+    coloured = f"const float4 h = pixel[{PIXELS * light} + 4 * part + j];" if channels else ""
+    coloured += " sums[8] += w_[j] * h.x; sums[9] += w_[j] * h.y; sums[10] += w_[j] * h.z;" if channels else ""
+    further = f"const float4 m = pixel[{PIXELS * (light + channels)} + 4 * part + j];" if more else ""
+    further += " more0 += w_[j] * m.x; more1 += w_[j] * m.y; more2 += w_[j] * m.z;" if more else ""
+
+    add_more = f"""
+    #pragma unroll
+    for (int c = 0; c < 3; ++c) {{
+        const float* const both = kept + s * {OUT_STRIDE} + 16 + c;
+        const float sum = both[0] + both[{ROUND * OUT_STRIDE}];
+        if (s < n && upper == (c & 1) && sum != 0.0f)
+            atomicAdd(reinterpret_cast<float*>(more.data + i) + 8 + c, sum);
+    }}"""
+    round_snippet = f"""
+#if defined(__CUDA_ARCH__)
+    {places}
+    const int s = lane & 15, upper = lane >> 4;  // this lane owns entry s of the round, and one half of the tile
+    const int i = ids.data[start - at - (s < n ? s : n - 1)];
+    __syncwarp();  // what all lanes kept is there
+    const float* const q = mine + ((at + s) & {2 * ROUND - 1}) * 16;
+    float dx[{tile_width}];
+    for (int c = 0; c < {tile_width}; ++c)
+        dx[c] = q[0] - (x[0] - (float)(lane % {tile_width}) + (float)c);
+    float dy = q[1] - (y[0] - (float)(lane / {tile_width}) + (float)(upper * {half // tile_width}));
+    float sums[16] = {{}}, row0 = 0.0f, row1 = 0.0f, row2 = 0.0f, more0 = 0.0f, more1 = 0.0f, more2 = 0.0f;
+    const float4* const from = reinterpret_cast<const float4*>(kept + s * {STRIDE} + upper * {half});
+    const float4* const pixel = reinterpret_cast<const float4*>(mine) + {_RECORDS // 4} + upper * {half};
+    #pragma unroll
+    for (int part = 0; part < {half // 4}; ++part) {{
+        {take}
+        #pragma unroll
+        for (int j = 0; j < 4; ++j) {{
+            const int c = (4 * part + j) % {tile_width};
+            {moments}
+            {end_of_row.replace("WIDTH", str(tile_width))}
+            {f"sums[6] += __saturatef(w_[j] * {HIT}f);" if geometry else ""}
+            {coloured}
+            {further}
+            {lit}
+        }}
+    }}
+    __syncwarp();  // everything kept has been read: its place takes the sums of both halves
+    float4* const out = reinterpret_cast<float4*>(kept + (upper * {ROUND} + s) * {OUT_STRIDE});
+    #pragma unroll
+    for (int part = 0; part < 4; ++part)
+        out[part] = make_float4(sums[4 * part], sums[4 * part + 1], sums[4 * part + 2], sums[4 * part + 3]);
+    {"out[4] = make_float4(more0, more1, more2, 0.0f);" if more else ""}
+    __syncwarp();  // all sums are there; sixteen lanes add one 64-byte line
+    #pragma unroll
+    for (int pair = 0; pair < {ROUND // 2}; ++pair) {{
+        const int of = 2 * pair + upper, to = __shfl_sync(0xffffffffu, i, of);
+        const float* const both = kept + of * {OUT_STRIDE} + s;
+        const float sum = both[0] + both[{ROUND * OUT_STRIDE}];
+        if (of < n && sum != 0.0f) atomicAdd(reinterpret_cast<float*>(grads.data + to) + s, sum);
+    }}
+    {add_more if more else ""}
+    __syncwarp();  // the next round may keep its values
+#endif
+"""
+
+    @wp.func_native(round_snippet)
+    def add_round(
+        memory: wp.uint64, grads: wp.array[Splat], more: wp.array[Splat], ids: wp.array[int], start: int, at: int,
+        n: int, x: V, y: V,
+    ):  # fmt: skip
+        """Sum the ``n`` entries of the round that began at entry ``at`` over pixels, and add them to their records."""
+
+    fetch = make_batches(len(kept), derivatives)
+    return SimpleNamespace(
+        **vars(fetch), keep_derivatives=keep_derivatives, keep_values=keep_values, add_round=add_round, floats=floats
+    )

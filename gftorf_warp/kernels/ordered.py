@@ -1,0 +1,62 @@
+"""Every (tile, splat) pair with a record of its own, so that gradients are summed in one order and no other.
+
+The adjoint of the compositor adds to the record of a splat from many tiles, in whatever order they come. Where each
+pair has a copy of the record, nobody shares; what the copies of a splat have got is then summed in the order in which
+its pairs were written, which depends on the splats alone.
+"""
+
+import warp as wp
+
+from .splat import Splat
+
+
+@wp.kernel(enable_backward=False)
+def number_pairs(
+    # In:
+    total: wp.array[int],  # [1] pairs there are, whether they fit or not
+    capacity: int,  # pairs that fit [1]
+    # Out:
+    ids: wp.array[wp.int32],  # [>= capacity] splat of each pair as written; replaced by the number of the pair
+    owners: wp.array[wp.int32],  # [capacity] splat of each pair; 0 where there is none
+):
+    """One thread per pair that fits."""
+    k = wp.tid()
+    owner = int(0)
+    if k < wp.min(total[0], capacity):
+        owner = ids[k]
+    owners[k] = owner
+    ids[k] = k
+
+
+@wp.kernel(enable_backward=False)
+def spread_records(
+    # In:
+    splats: wp.array[Splat],  # [N] records
+    owners: wp.array[wp.int32],  # [capacity] splat of each pair
+    # Out:
+    copies: wp.array[Splat],  # [capacity] the record of each pair
+):
+    """One thread per pair that fits."""
+    k = wp.tid()
+    copies[k] = splats[owners[k]]
+
+
+@wp.kernel(enable_backward=False)
+def sum_copies(
+    # In:
+    order: wp.array[wp.int32],  # [>= N] splats near to far
+    ends: wp.array[int],  # [N] sums of counts: where the pairs of each splat end, in depth order
+    copies: wp.array[Splat],  # [capacity] gradient record of each pair
+    capacity: int,  # pairs that fit [1]
+    # Out:
+    records: wp.array[Splat],  # [N] added to
+):
+    """One thread per splat: its pairs in the order in which they were written."""
+    rank = wp.tid()
+    begin = int(0)
+    if rank > 0:
+        begin = ends[rank - 1]
+    record = records[order[rank]]
+    for k in range(begin, wp.min(ends[rank], capacity)):
+        record = record + copies[k]
+    records[order[rank]] = record

@@ -1,0 +1,65 @@
+"""Sums whose order is fixed, so that they are the same to the bit however threads are scheduled.
+
+A kernel leaves one partial sum per warp, on the CPU one per thread; :data:`means` adds them up, a block per row.
+"""
+
+import warp as wp
+
+LANES = 32  # threads of a CUDA warp
+THREADS = 256  # of the block that adds up a row
+
+OVER_LANES = """
+#if defined(__CUDA_ARCH__)
+    auto over_lanes = [](float v) -> float {
+        for (int o = 16; o > 0; o >>= 1) v += __shfl_down_sync(0xffffffffu, v, o);
+        return v;
+    };
+    const int slot = thread / 32;
+    const bool writes = (thread & 31) == 0;
+#else
+    auto over_lanes = [](float v) -> float { return v; };
+    const int slot = thread;
+    const bool writes = true;
+#endif
+"""
+"""C++: the sum of a value over the lanes of a warp, which lane 0 gets, and where it goes. Every lane must take part."""
+
+_ROW = f"""
+    const float* in = partials.data + row * partials.shape[1];
+    const int count = partials.shape[1];
+#if defined(__CUDA_ARCH__)
+    __shared__ double room[{THREADS // LANES}];
+    double s = 0.0;
+    for (int i = threadIdx.x; i < count; i += {THREADS}) s += (double)in[i];
+    for (int o = 16; o > 0; o >>= 1) s += __shfl_down_sync(0xffffffffu, s, o);
+    if ((threadIdx.x & 31) == 0) room[threadIdx.x / 32] = s;
+    __syncthreads();
+    if (threadIdx.x == 0) {{
+        double total = 0.0;
+        for (int k = 0; k < {THREADS // LANES}; ++k) total += room[k];
+        out.data[row] = (float)(total * (double)scale);
+    }}
+#else
+    double total = 0.0;
+    for (int i = 0; i < count; ++i) total += (double)in[i];
+    out.data[row] = (float)(total * (double)scale);
+#endif
+"""
+
+
+@wp.func_native(_ROW)
+def mean_of_row(partials: wp.array2d[float], row: int, scale: float, out: wp.array[float]):
+    """Add up one row."""
+
+
+@wp.kernel(enable_backward=False, grid_stride=False)
+def means(
+    # In:
+    partials: wp.array2d[float],  # [M, P] sums over parts [1]
+    threads: int,  # of a row: THREADS on CUDA, 1 on the CPU [1]
+    scale: float,  # one over the number of values [1]
+    # Out:
+    out: wp.array[float],  # [M or more] first M filled
+):
+    """One block per row."""
+    mean_of_row(partials, wp.tid() // threads, scale, out)

@@ -1,0 +1,286 @@
+"""What a training step does beside rendering, as a few kernels behind torch functions: the second file that knows both.
+
+losses/ and recon/ hold the same in plain torch, in any precision: the oracle of these functions, and what runs where
+settings do not ask for kernels. The end of a step, behind its gradients, is descent.py.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+import warp as wp
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from ..kernels.similarity import MOMENTS, REACH, SLOPES, SUMS
+from ..scene.camera import Camera
+from . import training
+from .bridge import array_over, stream_of
+
+
+class Scratch:
+    """Planes that image losses of one size work in, one after the other; backward comes before the next loss.
+
+    Nobody writes their margins, which are zero. Without one every loss has planes of its own, zeroed each time.
+    """
+
+    def __init__(self) -> None:
+        self._planes: dict[str, Tensor] = {}
+
+    def planes(self, name: str, image: Tensor, count: int) -> Tensor:
+        """[count, C, H, W + 10] zeroed when they are made."""
+        channels, height, width = image.shape
+        shape = count, channels, height, width + 2 * REACH
+        found = self._planes.get(name)
+        if found is None or found.shape != shape or found.device != image.device:
+            self._planes[name] = found = image.new_zeros(shape)
+        return found
+
+
+def image_loss(
+    rendered: Float[Tensor, "C H W"],
+    measured: Float[Tensor, "#R C H W"],
+    ssim: float,
+    *,
+    absolute: bool = False,
+    row: Int[Tensor, "1"] | None = None,
+    opacity: Float[Tensor, "H W"] | None = None,
+    scratch: Scratch | None = None,
+    out: Float[Tensor, "3"] | None = None,
+) -> tuple[Float[Tensor, ""], Float[Tensor, ""], Float[Tensor, ""]]:
+    """(1 - ssim) times the mean squared or absolute difference + ssim (1 - SSIM), and the mean squared difference.
+
+    Differentiable once, in ``rendered`` and through the first result only. Float32: where a window is nearly constant
+    its variance is a difference of close numbers, as it is in losses/image.py.
+
+    Args:
+        rendered: What gradients reach.
+        measured: What they do not reach; [R, C, H, W] or, without ``row``, [C, H, W].
+        ssim: Share of the similarity.
+        absolute: Whether the difference is its absolute value, not its square.
+        row: int32, which image of ``measured``; read when the kernels run. None: the first.
+        opacity: Of which the sum over C H W comes along, without a derivative; None: zero.
+        scratch: Where to work; None: in memory of its own.
+        out: Where results go; None: into memory of their own.
+
+    Returns:
+        The loss, the mean squared difference, and the sum of the opacity over C H W.
+
+    Raises:
+        ValueError: If the shapes differ or an image is not float32.
+    """
+    if rendered.shape != measured.shape[measured.ndim - 3 :]:
+        shape = tuple(measured.shape[measured.ndim - 3 :])
+        raise ValueError(f"rendered {tuple(rendered.shape)} and measured {shape} must have one shape")
+    for name, image in (("rendered", rendered), ("measured", measured)):
+        if image.dtype != torch.float32 or image.device != rendered.device:
+            want = f"float32 on {rendered.device}"
+            raise ValueError(f"{name} is {image.dtype} on {image.device}, must be {want}")
+    rows = measured.detach().contiguous().flatten(0, measured.ndim - 3)
+    also = rendered.new_empty(0) if opacity is None else opacity.detach().contiguous().flatten()
+    row = _first(rendered.device) if row is None else row
+    out = rendered.new_empty(SUMS) if out is None else out
+    return _ImageLoss.apply(rendered.contiguous(), rows, row, also, float(ssim), absolute, scratch or Scratch(), out)
+
+
+@functools.cache
+def _first(device: torch.device) -> Tensor:
+    """Row 0: an upload makes a GPU wait."""
+    return torch.zeros(1, dtype=torch.int32, device=device)
+
+
+class _ImageLoss(torch.autograd.Function):
+    """Three launches forward, two backward; the order of all sums is fixed."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        rendered: Tensor,
+        measured: Tensor,
+        row: Tensor,
+        also: Tensor,
+        ssim: float,
+        absolute: bool,
+        scratch: Scratch,
+        out: Tensor,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        ctx.set_materialize_grads(False)
+        columns, slopes = scratch.planes("columns", rendered, MOMENTS), scratch.planes("slopes", rendered, SLOPES)
+        with stream_of(rendered):
+            images = array_over(rendered), array_over(measured), array_over(row, wp.int32)
+            partials = rendered.new_empty(SUMS, training.loss_parts(images[0]))
+            arrays = (array_over(tensor) for tensor in (columns, partials, slopes, out))
+            training.image_loss(*images, array_over(also), ssim, absolute, *arrays)
+        loss, squared, other = out.unbind()
+        ctx.save_for_backward(rendered, measured, row)
+        ctx.options = ssim, absolute, slopes, columns[:SLOPES]
+        ctx.mark_non_differentiable(squared, other)
+        return loss, squared, other
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad_loss: Tensor | None, *_: Tensor | None) -> tuple[Tensor | None, ...]:
+        rendered, measured, row = ctx.saved_tensors
+        if grad_loss is None:
+            return (None,) * 8
+        grad = torch.empty_like(rendered)
+        ssim, absolute, slopes, columns = ctx.options
+        with stream_of(rendered):
+            images = array_over(rendered), array_over(measured), array_over(row, wp.int32)
+            rest = array_over(slopes), array_over(grad_loss.reshape(1)), array_over(columns), array_over(grad)
+            training.image_loss_backward(*images, ssim, absolute, *rest)
+        return grad, *[None] * 7
+
+
+def flow_loss(
+    distance: Float[Tensor, "H W"],
+    displacement: Float[Tensor, "D H W"],
+    measured: Float[Tensor, "R F 2 H W"],
+    camera: Camera,
+    later: Sequence[Camera],
+    *,
+    row: Int[Tensor, "1"] | None = None,
+    out: Float[Tensor, "1"] | None = None,
+) -> Float[Tensor, ""]:
+    """Sum over F flows of the mean squared difference [px^2] to what composited displacements would show.
+
+    Differentiable once, in ``displacement``. The mean is over all pixels and both components; unknown ones count zero.
+
+    Args:
+        distance: Of the surface [m], where there is none at least a micrometre.
+        displacement: To the end of each flow [m], D = 3F channels in world axes.
+        measured: The flows [px]; NaN: unknown.
+        camera: Where from.
+        later: The camera at the end of each flow.
+        row: int32, which F flows; read when the kernels run. None: the first.
+        out: Where the result goes; None: into memory of its own.
+
+    Raises:
+        ValueError: If shapes do not fit or something is not float32.
+    """
+    flows, size = len(later), tuple(distance.shape)
+    if tuple(displacement.shape) != (3 * flows, *size) or tuple(measured.shape[1:]) != (flows, 2, *size):
+        shapes = f"displacement {tuple(displacement.shape)} and measured {tuple(measured.shape)}"
+        raise ValueError(f"{shapes} must be {(3 * flows, *size)} and (R, {flows}, 2, H, W) for {flows} flows of {size}")
+    tensors = distance, displacement, measured
+    if any(tensor.dtype != torch.float32 or tensor.device != distance.device for tensor in tensors):
+        raise ValueError(f"distance, displacement and measured must be float32 on {distance.device}")
+    views = _views(camera, tuple(later), distance.device)
+    row = _first(distance.device) if row is None else row
+    out = distance.new_empty(1) if out is None else out
+    known = distance.detach().contiguous(), measured.detach().contiguous().flatten(0, 1), row, views
+    return _FlowLoss.apply(displacement.contiguous(), *known, out)
+
+
+class _FlowLoss(torch.autograd.Function):
+    """Two launches forward, one backward."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, displacement: Tensor, distance: Tensor, measured: Tensor, row: Tensor, views: Tensor, out: Tensor
+    ) -> Tensor:
+        with stream_of(distance):
+            arrays = _flow_arrays(displacement, distance, measured, row, views)
+            partials = distance.new_empty(1, training.flow_parts(arrays[0]))
+            training.flow_loss(*arrays, *(array_over(tensor) for tensor in (partials, out)))
+        ctx.save_for_backward(displacement, distance, measured, row, views)
+        return out[0]
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad_loss: Tensor) -> tuple[Tensor | None, ...]:
+        grad = torch.empty_like(ctx.saved_tensors[0])
+        with stream_of(grad):
+            ends = grad_loss.reshape(1), grad
+            training.flow_loss_backward(*_flow_arrays(*ctx.saved_tensors), *(array_over(tensor) for tensor in ends))
+        return grad, *[None] * 5
+
+
+def _flow_arrays(
+    displacement: Tensor, distance: Tensor, measured: Tensor, row: Tensor, views: Tensor
+) -> tuple[wp.array, wp.array, wp.array, wp.array, wp.array]:
+    images = array_over(distance), array_over(displacement), array_over(measured)
+    return *images, array_over(row, wp.int32), array_over(views)
+
+
+@functools.lru_cache(maxsize=4096)
+def _views(camera: Camera, later: tuple[Camera, ...], device: torch.device) -> Tensor:
+    """[F, 29] what the kernels know of cameras, computed in float64 and uploaded once."""
+    here, rows = camera.camera_from_world, []
+    for then in later:
+        there = then.camera_from_world
+        between = there @ np.linalg.inv(here)
+        own = [camera.fx, camera.fy, camera.cx, camera.cy, then.fx, then.fy, then.cx, then.cy]
+        rows.append([*own, *between[:3, :3].flatten(), *between[:3, 3], *there[:3, :3].flatten()])
+    return torch.tensor(np.array(rows), dtype=torch.float32, device=device)
+
+
+def displaced(
+    mean: Float[Tensor, "N 3"], offsets: Float[Tensor, "K N 3"], share: Float[Tensor, "1"], *, channels: bool
+) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N D"] | None]:
+    """Centres between the first two keys, and the way from the first key to every other one.
+
+    Differentiable once, in ``mean`` and ``offsets``.
+
+    Args:
+        mean: Where nothing has moved [m].
+        offsets: Displacements [m] at K = 2 or 3 keys.
+        share: Of the way from the first key to the second; read when the kernel runs.
+        channels: Whether the second result is wanted, D = 3 (K - 1).
+    """
+    moved, ways = _Displaced.apply(mean.contiguous(), offsets.contiguous(), share, channels)
+    return moved, ways if channels else None
+
+
+class _Displaced(torch.autograd.Function):
+    """One launch forward, one backward."""
+
+    @staticmethod
+    def forward(ctx: Any, mean: Tensor, offsets: Tensor, share: Tensor, channels: bool) -> tuple[Tensor, Tensor]:
+        ctx.set_materialize_grads(False)
+        keys, count, _ = offsets.shape
+        moved, ways = torch.empty_like(mean), mean.new_empty(count if channels else 0, keys - 1, 3)
+        with stream_of(mean):
+            arrays = array_over(mean, wp.vec3), array_over(offsets, wp.vec3), array_over(share)
+            training.displaced(*arrays, array_over(moved, wp.vec3), array_over(ways, wp.vec3))
+        ctx.save_for_backward(share)
+        ctx.shape = offsets.shape
+        return moved, ways.flatten(1)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, by_moved: Tensor | None, by_ways: Tensor | None) -> tuple[Tensor | None, ...]:
+        (share,) = ctx.saved_tensors
+        given = by_moved if by_moved is not None else by_ways
+        if given is None or not ctx.needs_input_grad[1]:
+            return by_moved, None, None, None
+        grad, (keys, count, _) = given.new_empty(ctx.shape), ctx.shape
+        none = given.new_empty(0, 3)
+        moved = none if by_moved is None else by_moved.contiguous()
+        ways = none[:, None] if by_ways is None else by_ways.contiguous().view(count, keys - 1, 3)
+        with stream_of(grad):
+            cotangents = array_over(moved, wp.vec3), array_over(ways, wp.vec3)
+            training.displaced_backward(array_over(share), *cotangents, array_over(grad, wp.vec3))
+        return by_moved, grad, None, None
+
+
+def uniform(
+    shape: tuple[int, ...], origin: Int[Tensor, "2"], amplitude: float, *, stream: int = 0
+) -> Float[Tensor, "C H W"]:
+    """Random light, evenly in (-amplitude, amplitude), that is a function of its arguments and of nothing else.
+
+    Args:
+        shape: (C, H, W).
+        origin: Seed and number of the image, int32, where the light is wanted; read when the kernel runs.
+        amplitude: Largest absolute value [quad units].
+        stream: Tells several images of one number apart.
+    """
+    image = torch.empty(shape, dtype=torch.float32, device=origin.device)
+    with stream_of(origin):
+        training.uniform(array_over(origin, wp.int32), stream, amplitude, array_over(image.flatten(1)))
+    return image

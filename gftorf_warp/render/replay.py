@@ -1,0 +1,218 @@
+"""Moving Gaussians that are rendered again and again: nothing is allocated, looked up or read back twice.
+
+Displacements are computed once per key time and interpolated on the device. Cameras, calibration and the arrays of a
+rendering are kept. On CUDA a camera that is used a second time has its rendering captured as a graph, so that an image
+costs the host two launches, and the number of pairs is not read back but reserved; images that would need more are
+rendered again. A replay runs the very launches of a call, so it gives the same bits.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+import warp as wp
+from torch import Tensor
+
+from ..kernels import move
+from ..kernels.geometry import CameraView
+from ..scene.camera import Camera
+from ..scene.gaussians import GaussianField
+from ..scene.motion import Motion
+from ..scene.sensor import Sensor
+from . import launch
+from .api import Rendering
+from .bridge import array_over, stream_of
+from .buffers import Frame, RenderSettings
+from .inputs import CHOICES, Images, Inputs, names_of
+
+ROOM = 1.5  # pairs that are reserved, over the most that were needed so far
+CAMERAS_MAX = 16  # that are kept, with their graphs
+
+
+@dataclass(kw_only=True, eq=False)
+class _Target:
+    """The arrays of all renderings of one size."""
+
+    frame: Frame
+    tensors: dict[str, Tensor]
+    images: Images
+
+
+@dataclass(kw_only=True, eq=False)
+class _View:
+    """A camera that was used before."""
+
+    view: CameraView
+    row: wp.vec4
+    target: _Target
+    used: int = 0
+    graph: wp.Graph | None = None
+
+
+class Replay:
+    """A field and its motion, ready to be rendered at any time from any camera; without gradients.
+
+    ``replay(time, camera)`` returns images that the next call overwrites.
+    """
+
+    def __init__(
+        self,
+        field: GaussianField,
+        motion: Motion,
+        attachment: Tensor,
+        sensor: Sensor,
+        settings: RenderSettings,
+        optimised: Camera,
+        images: Iterable[str] = (*CHOICES, "colour"),
+    ):
+        """Take a copy of what changes, and share the rest.
+
+        Args:
+            field: The Gaussians where nothing has moved, float32.
+            motion: Where they are at which time.
+            attachment: How they hang on it.
+            sensor: With the shifts of the quads.
+            settings: How to render; pairs are reserved as needed.
+            optimised: The camera at the size of the optimisation, whose low-pass filter widened the Gaussians.
+            images: Names of what is wanted of quads, phasor, colour, distance, opacity and distortion; others have no
+                elements and cost nothing.
+        """
+        wp.init()
+        field = field.map(lambda tensor: tensor.detach().contiguous())
+        self.motion, self.attachment, self.settings = motion, attachment, settings
+        self.names, self._nothing = frozenset(images), field.mean.new_empty(0)
+        self.shifts = tuple(float(shift) for shift in sensor.shifts)
+        self.device = wp.device_from_torch(field.device)
+        self.graphs = self.device.is_cuda
+        self.count, self._field = len(field), field
+        self._offset = field.mean.new_zeros(len(motion.key_times), len(field), 3)
+        self._known: set[int] = set()
+        self._mean, self._log_scale = torch.empty_like(field.mean), torch.empty_like(field.log_scale)
+        values = sensor.phase_slope, sensor.phase_offset, sensor.source_intensity, sensor.dc_offset
+        self._calibration = torch.tensor([float(v) for v in values], dtype=torch.float32, device=field.device)
+        self._inputs = Inputs(
+            mean=array_over(self._mean, wp.vec3),
+            log_scale=array_over(self._log_scale, wp.vec3),
+            quaternion=array_over(field.quaternion, wp.vec4),
+            opacity_logit=array_over(field.opacity_logit),
+            reflectivity_sh=array_over(field.reflectivity_sh),
+            colour_sh=array_over(field.colour_sh, wp.vec3),
+            calibration=array_over(self._calibration),
+        )
+        rest = [array_over(tensor, wp.vec3) for tensor in (field.mean, field.log_scale, self._offset)]
+        self._rest, self._optimised = rest, _row(optimised)
+        self._moved = [self._inputs.mean, self._inputs.log_scale]
+        self._views: dict[tuple, _View] = {}
+        self._targets: dict[tuple[int, int], _Target] = {}
+        self._largest = wp.zeros(1, dtype=wp.int32, device=self.device)
+        self._capacity: int | None = None  # of pairs; None: they are counted on the host, and on a CPU they always are
+
+    @torch.no_grad()
+    def __call__(self, time: float, camera: Camera, *, checked: bool = True) -> Rendering:
+        """The images at one instant, in memory that the next call overwrites.
+
+        Args:
+            time: Seconds since raw frame 0, any number; held constant outside the keys.
+            camera: Where from, and how many pixels.
+            checked: Whether to wait for the device and see that all pairs fitted. Without, ask :meth:`fits` later: far
+                splats are missing in images for which the reserve was too small.
+        """
+        rendering = self._rendered(time, camera)
+        if checked and not self.fits():
+            self.grow()
+            rendering = self._rendered(time, camera)
+        return rendering
+
+    def fits(self) -> bool:
+        """Whether the reserve of pairs sufficed since it was made; waits for the device."""
+        return self._capacity is None or self.largest <= self._capacity
+
+    def grow(self) -> None:
+        """Reserve more than the largest number of pairs so far; graphs are captured anew."""
+        self._views.clear()
+        self._targets.clear()
+        self._capacity = int(ROOM * self.largest) + 1 if self.graphs else None
+
+    @property
+    def largest(self) -> int:
+        """The largest number of (tile, splat) pairs of a rendering so far; waits for the device."""
+        with stream_of(self._mean):
+            return int(self._largest.numpy()[0])
+
+    def _rendered(self, time: float, camera: Camera) -> Rendering:
+        key, share = self.motion.position(time)
+        for number in (key, key + 1) if share > 0.0 else (key,):
+            if number not in self._known:
+                self._offset[number] = self.motion.key_offset(self.attachment, number)
+                self._known.add(number)
+        seen = self._view(camera)
+        if self.graphs and self._capacity is not None and seen.used and seen.graph is None:
+            seen.graph = self._captured(seen)
+        with stream_of(self._mean):
+            inputs = [*self._rest, key, share, self._optimised, seen.row]
+            wp.launch(move.move_gaussians, self.count, inputs, self._moved, device=self.device, record_tape=False)
+            if seen.graph is None:
+                self._draw(seen)
+            else:
+                self._launch(seen.graph)
+        seen.used += 1
+        if self.graphs and self._capacity is None:
+            self.grow()
+        tensors = seen.target.tensors
+        images = {name: tensors.get(name, self._nothing) for name in CHOICES}
+        return Rendering(**images, colour=tensors.get("colour"), extra=None, screen=None)
+
+    def _captured(self, seen: _View) -> wp.Graph:
+        """The rendering of a camera that was drawn before, on Warp's own stream: torch's default one cannot capture."""
+        with wp.ScopedCapture(device=self.device) as capture:
+            self._draw(seen)
+        return capture.graph
+
+    def _launch(self, graph: wp.Graph) -> None:
+        """Replay on the stream that is current, which is torch's."""
+        wp.capture_launch(graph, stream=self.device.stream)
+
+    def _draw(self, seen: _View) -> None:
+        """What a graph holds: a rendering, and the number of its pairs."""
+        frame = seen.target.frame
+        launch.forward(self._inputs, seen.view, self.shifts, frame, seen.target.images)
+        if self.count:
+            wp.launch(move.note_largest, 1, [frame.total], [self._largest], device=self.device, record_tape=False)
+
+    def _view(self, camera: Camera) -> _View:
+        """What is kept for a camera; the one that came first leaves when there are too many."""
+        lens = camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy
+        name = (*lens, camera.camera_from_world.tobytes())
+        if name not in self._views:
+            if len(self._views) >= CAMERAS_MAX:
+                wp.synchronize_device(self.device)  # its graph may be at work
+                self._views.pop(next(iter(self._views)))
+            size = camera.height, camera.width
+            if size not in self._targets:
+                self._targets[size] = self._target(*size)
+            view = launch.view_of(camera, self.settings)
+            self._views[name] = _View(view=view, row=_row(camera), target=self._targets[size])
+        return self._views[name]
+
+    def _target(self, height: int, width: int) -> _Target:
+        size = height, width
+        shapes: dict[str, tuple[int, ...]] = {"quads": (len(self.shifts), *size), "phasor": (3, *size)}
+        shapes |= {"colour": (3, *size)} if self._inputs.colour_sh is not None else {}
+        shapes |= dict.fromkeys(("distance", "opacity", "distortion"), size)
+        shapes = {name: shape for name, shape in shapes.items() if name in self.names}
+        tensors = {name: self._mean.new_empty(shape) for name, shape in shapes.items()}
+        settings = replace(self.settings, pair_capacity=self._capacity)
+        with stream_of(self._mean):
+            frame = Frame(self.count, width, height, settings, self.device)
+        images = Images(**dict.fromkeys(names_of(Images)) | {name: array_over(tensors[name]) for name in shapes})
+        return _Target(frame=frame, tensors=tensors, images=images)
+
+
+def _row(camera: Camera) -> wp.vec4:
+    """The row of a pose that gives z-depth, divided by the focal length: the width of a pixel at a point [m]."""
+    row = np.asarray(camera.camera_from_world[2], dtype=np.float64) / math.sqrt(camera.fx * camera.fy)
+    return wp.vec4(*(float(value) for value in row))

@@ -1,0 +1,257 @@
+"""Launches of a training step that are no rendering. Warp arrays in, Warp arrays filled; knows no torch."""
+
+from __future__ import annotations
+
+import warp as wp
+
+from ..kernels import adam, displace, finish, flow, noise, similarity, sums
+
+BLOCK = 16  # pixels of a row, or elements of a tensor, that one CPU thread works on
+
+
+def image_loss(
+    rendered: wp.array,
+    measured: wp.array,
+    row: wp.array,
+    also: wp.array,
+    share: float,
+    absolute: bool,
+    columns: wp.array,
+    partials: wp.array,
+    slopes: wp.array,
+    out: wp.array,
+) -> None:
+    """Fill ``out`` [3] with the means of loss, squared difference and another image, ``slopes`` for the gradient.
+
+    Args:
+        rendered: [C, H, W].
+        measured: [R C, H, W].
+        row: [1] which C of them.
+        also: [H W], or empty; the mean is over the number of values of ``rendered``.
+        share: Of the similarity, 0..1.
+        absolute: Whether the other part is the absolute difference, otherwise its square.
+        columns: [5, C, H, W + 10], margins zero; scratch.
+        partials: [3, ``loss_parts(rendered)``]; scratch.
+        slopes: [3, C, H, W + 10], margins zero; filled.
+        out: Filled.
+    """
+    kernels, dim = _of(rendered)
+    _launch(kernels.columns_of_products, dim, [rendered, measured, row], [columns])
+    inputs = [columns, rendered, measured, row, also, share, absolute]
+    _launch(kernels.compare_images, _whole_warps(dim[0] * dim[1] * dim[2], rendered.device), inputs, [partials, slopes])
+    _means(partials, 1.0 / rendered.size, out)
+
+
+def loss_parts(rendered: wp.array) -> int:
+    """Partial sums of an image [C, H, W]."""
+    _, (channels, height, blocks) = _of(rendered)
+    return _parts(channels * height * blocks, rendered.device)
+
+
+def image_loss_backward(
+    rendered: wp.array,
+    measured: wp.array,
+    row: wp.array,
+    share: float,
+    absolute: bool,
+    slopes: wp.array,
+    cotangent: wp.array,
+    columns: wp.array,
+    grad: wp.array,
+) -> None:
+    """Fill ``grad`` [C, H, W] with the gradient of the mean loss times ``cotangent`` [1]; ``columns`` is scratch."""
+    kernels, dim = _of(rendered)
+    _launch(kernels.columns_of_slopes, dim, [slopes], [columns])
+    inputs = [columns, rendered, measured, row, share, absolute, 1.0 / rendered.size, cotangent]
+    _launch(kernels.gradient_of_image, dim, inputs, [grad])
+
+
+def flow_loss(
+    distance: wp.array,
+    displacement: wp.array,
+    measured: wp.array,
+    row: wp.array,
+    views: wp.array,
+    partials: wp.array,
+    out: wp.array,
+) -> None:
+    """Fill ``out`` [1] with the sum over F flows of the mean squared difference; see ``kernels/flow.py``.
+
+    Args:
+        distance: [H, W].
+        displacement: [3F, H, W].
+        measured: [R F, 2, H, W].
+        row: [1] which F of them.
+        views: [F, 29] cameras.
+        partials: [1, ``flow_parts(distance)``]; scratch.
+        out: Filled.
+    """
+    inputs = [distance, displacement, measured, row, views]
+    _launch(flow.flow_errors, _whole_warps(distance.size, distance.device), inputs, [partials])
+    _means(partials, 0.5 / distance.size, out)
+
+
+def flow_parts(distance: wp.array) -> int:
+    """Partial sums of an image [H, W]."""
+    return _parts(distance.size, distance.device)
+
+
+def flow_loss_backward(
+    distance: wp.array,
+    displacement: wp.array,
+    measured: wp.array,
+    row: wp.array,
+    views: wp.array,
+    cotangent: wp.array,
+    grad: wp.array,
+) -> None:
+    """Fill ``grad`` [3F, H, W] with the gradient by ``displacement`` times ``cotangent`` [1]."""
+    inputs = [distance, displacement, measured, row, views, 0.5 / distance.size, cotangent]
+    _launch(flow.flow_gradient, (views.shape[0], distance.size), inputs, [grad])
+
+
+def displaced(mean: wp.array, offsets: wp.array, share: wp.array, moved: wp.array, channels: wp.array) -> None:
+    """Fill ``moved`` [N] and ``channels`` [N, K - 1] from offsets [K, N]; see ``kernels/displace.py``."""
+    _launch(displace.displace, len(mean), [mean, offsets, share], [moved, channels])
+
+
+def displaced_backward(share: wp.array, by_moved: wp.array, by_channels: wp.array, grad: wp.array) -> None:
+    """Fill ``grad`` [K, N] by the offsets; an empty cotangent is zero."""
+    _launch(displace.displace_backward, grad.shape[1], [share, by_moved, by_channels], [grad])
+
+
+def _means(partials: wp.array, scale: float, out: wp.array) -> None:
+    """Rows of partial sums, added up and scaled."""
+    threads = 1 if partials.device.is_cpu else sums.THREADS
+    dim = partials.shape[0] * threads
+    _launch(sums.means, dim, [partials, threads, scale], [out], block_dim=sums.THREADS)
+
+
+def _whole_warps(count: int, device: wp.Device) -> int:
+    """Threads for ``count`` elements, all lanes of the last warp included."""
+    return count if device.is_cpu else -(-count // sums.LANES) * sums.LANES
+
+
+def _parts(count: int, device: wp.Device) -> int:
+    """Partial sums of so many threads: one per warp, on the CPU one per thread."""
+    return count if device.is_cpu else -(-count // sums.LANES)
+
+
+def _of(image: wp.array):
+    """Kernels for an image [C, H, W], and how many threads they want."""
+    channels, height, width = image.shape
+    block = BLOCK if image.device.is_cpu and width >= BLOCK else 1
+    return similarity.make_similarity(block), (channels, height, -(-width // block))
+
+
+def uniform(origin: wp.array, stream: int, amplitude: float, image: wp.array) -> None:
+    """Fill ``image`` [C, pixels] with values in (-amplitude, amplitude) for ``origin`` [2], seed and image number."""
+    channels, pixels = image.shape
+    dim = channels, -(-pixels // noise.PER_THREAD)
+    inputs = [origin, stream, amplitude]
+    _launch(noise.uniform_noise, dim, inputs, [image])
+
+
+def adam_step(
+    table: wp.array,
+    first_block: wp.array,
+    blocks: int,
+    rates: wp.array,
+    sound: wp.array,
+    betas: tuple[float, float],
+    epsilon: float,
+    sizes: wp.array,
+) -> None:
+    """One step of Adam over the tensors of a table, in place; ``sizes`` [T, 3] is scratch.
+
+    Args:
+        table: [T, 6] addresses and lengths, see ``kernels/adam.py``.
+        first_block: [T] blocks before those of a tensor.
+        blocks: In all, each of ``adam_block`` elements.
+        rates: [T] 0: the tensor rests.
+        sound: [1] 0: nothing changes.
+        betas: Decays of the moments.
+        epsilon: Added to the root of the second moment.
+        sizes: Scratch.
+    """
+    head = [table, rates, sound, *(wp.float64(beta) for beta in betas)]
+    _launch(adam.adam_sizes, table.shape[0], head, [sizes])
+    adam_descend(table, first_block, blocks, betas, epsilon, sizes)
+
+
+def adam_descend(
+    table: wp.array, first_block: wp.array, blocks: int, betas: tuple[float, float], epsilon: float, sizes: wp.array
+) -> None:
+    """The second half of :func:`adam_step`, once ``sizes`` is known."""
+    rest = [table, first_block, 1.0 - betas[0], 1.0 - betas[1], epsilon]
+    _launch(adam.make_adam(adam_block(table.device)), blocks, rest, [sizes])
+
+
+def judge(
+    table: wp.array,
+    first_part: wp.array,
+    partials: wp.array,
+    motion: tuple[int, int],
+    longest: float,
+    found: wp.array,
+    weights: tuple[float, ...],
+    pairs: list[wp.array],
+    capacity: int,
+    rates: wp.array,
+    betas: tuple[float, float],
+    counts: wp.array,
+    running: wp.array,
+    sizes: wp.array,
+) -> None:
+    """Squares of all gradients, and what they mean for the step; see ``kernels/finish.py``.
+
+    Args:
+        table: [T, 6] of Adam.
+        first_part: [T] parts before those of a tensor.
+        partials: [P] scratch.
+        motion: Parts and tensors before those of the motion.
+        longest: Gradient of the motion; 0: any.
+        found: [images or more, 6].
+        weights: Six, see the kernel.
+        pairs: [1] of each image.
+        capacity: Pairs that are reserved; -1: not known; 0: nobody counts.
+        rates: [T].
+        betas: Decays of the moments.
+        counts: [3] changed.
+        running: [8] sums, changed.
+        sizes: [T, 3] filled.
+    """
+    cpu = table.device.is_cpu
+    dim = len(partials) * (1 if cpu else sums.LANES)
+    _launch(finish.gradient_squares, dim, [table, first_part], [partials])
+    head = [partials, *motion, longest, found, finish.Weights(*weights), len(pairs), *_four(pairs), capacity, table]
+    rest = [rates, *(wp.float64(beta) for beta in betas)]
+    judges = 1 if cpu else finish.JUDGES
+    _launch(finish.judge, judges, head + rest, [counts, running, sizes], block_dim=finish.JUDGES)
+
+
+def observe(
+    seen: list[tuple[wp.array, wp.array]],
+    half: tuple[float, float],
+    counts: wp.array,
+    gradient: wp.array,
+    pixels: wp.array,
+) -> None:
+    """Add screen gradients [N, 2] and pixels [N] of one to four images to sums over images, if ``counts[1]`` is 0."""
+    gradients, numbers = zip(*seen, strict=True)
+    inputs = [*_four(list(gradients)), *_four(list(numbers)), len(seen), wp.vec2(*half), counts]
+    _launch(finish.observe, len(gradient), inputs, [gradient, pixels])
+
+
+def _four(arrays: list[wp.array]) -> list[wp.array]:
+    return arrays + [arrays[0]] * (finish.IMAGES - len(arrays))
+
+
+def adam_block(device: wp.Device) -> int:
+    """Elements that one thread of Adam works on."""
+    return BLOCK if device.is_cpu else 1
+
+
+def _launch(kernel, dim, inputs: list, outputs: list[wp.array], block_dim: int = 256) -> None:
+    device = outputs[0].device
+    wp.launch(kernel, dim, inputs, outputs, device=device, record_tape=False, block_dim=block_dim)

@@ -1,0 +1,254 @@
+"""The network's products in half precision: all keys stacked, bias and ReLU in the product, gradients by hand.
+
+With a = [gamma(x), gamma(t)] the layers are
+
+    z_n = W_n h_(n-1) + b_n,   h_n = max(z_n, 0),   h_-1 = a;   before layer ``joined`` h becomes [h, a]
+
+What a layer makes of gamma(t) is one vector per key, a part of the bias: W a + b = W_x gamma(x) + (W_t gamma(t) + b).
+Backwards, d_n being the gradient at z_n: dW_n = d_n^T h_(n-1), db_n = sum of d_n, d_(n-1) = d_n W_n where h_(n-1) > 0.
+
+Factors are halves; sums, weights, biases with a time in them, weight gradients and results are float32. A factor beyond
+65504 is infinite, and makes the gradient of a weight infinite or NaN: such a step is not sound. Positions have no
+gradient. Nothing here asks the device. design/network.md has the reasons.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+ALIGNED = 8  # halves in 16 bytes: products whose rows begin at multiples of it are several times faster
+LARGEST = 64.0  # gradient of an offset, in scaled units: 10 bits below the largest half, 20 above the smallest normal
+SMALLEST = 1e-30  # below any gradient; keeps 0 / 0 away where there is none
+PIECE = 21_120  # rows of a product at most: two full waves of 128 x 160 results on 132 multiprocessors
+FOLD = 64  # rows side by side in a sum over rows, if they are so many times something
+BLOCKS = 8  # into which a weight is cut to be rounded
+
+
+@dataclass(frozen=True, kw_only=True)
+class Form:
+    """What the parameters do not say by themselves."""
+
+    place: int
+    """Values in gamma(x)."""
+    moment: int
+    """Values in gamma(t)."""
+    width: int
+    """Values in the output of a layer."""
+    joined: int | None
+    """Number of the layer whose input is joined by gamma(x) and gamma(t) again; None: there is none."""
+    dtype: torch.dtype
+    """Of the factors: float16, or that of the parameters, where the same code is exact."""
+
+    @property
+    def columns(self) -> int:
+        """Length of the rows that hold gamma(x): the next aligned one, if a weight is as wide."""
+        return min(-(-self.place // ALIGNED) * ALIGNED, self.place + self.moment)
+
+    @property
+    def entries(self) -> list[int]:
+        """Numbers of the layers which gamma(x) and gamma(t) enter."""
+        return [0] if self.joined is None else [0, self.joined]
+
+
+class Stacked(torch.autograd.Function):
+    """Offsets of all Gaussians at all keys, with a gradient for parameters only."""
+
+    @staticmethod
+    def forward(
+        context, form: Form, place: Float[Tensor, "N columns"], moment: Float[Tensor, "k t"], *parameters: Tensor
+    ) -> Float[Tensor, "k N 3"]:
+        """Offsets [m].
+
+        Args:
+            context: For the gradient.
+            form: Sizes and precision.
+            place: gamma(x) in the precision of the factors, with zeros up to ``form.columns``.
+            moment: gamma(t) of every key, in the precision of the parameters.
+            parameters: Weight and bias of every layer, then of the head.
+        """
+        weights, biases = parameters[0::2], parameters[1::2]
+        factors, shifts = _rounded(form, weights, biases)
+        keys, count, layers = len(moment), len(place), len(weights) - 1
+        own = _of_moments(form, moment, weights, biases)
+        outputs = list(place.new_empty(layers, keys * count, form.width).unbind())
+        again = _joined_room(form, place, keys)
+        for key, begin, end in _pieces(keys, count):
+            rows = slice(key * count + begin, key * count + end)
+            hidden = place[begin:end]
+            for number in range(layers):
+                if number == form.joined:
+                    _copy(again[rows, : form.width], hidden)
+                    hidden = again[rows]
+                shift = own[number][key] if number in own else shifts[number]
+                out = outputs[number][rows]
+                torch._addmm_activation(shift, hidden, factors[number].T, use_gelu=False, out=out)
+                hidden = out
+        context.form = form
+        context.save_for_backward(place, moment, again, *factors, *outputs)
+        found = _product(outputs[-1], factors[-1].T, moment.dtype)[:, : len(biases[-1])] + biases[-1]
+        return found.view(keys, count, len(biases[-1]))
+
+    @staticmethod
+    @once_differentiable
+    def backward(context, gradient: Float[Tensor, "k N 3"]) -> tuple[Tensor | None, ...]:
+        """Gradients of all parameters, in their own precision.
+
+        Scaled by the largest gradient of an offset, which no host knows; everything up to the weights is linear in it.
+        """
+        form, (place, moment, again, *rest) = context.form, context.saved_tensors
+        layers = len(rest) // 2
+        factors, outputs = rest[: layers + 1], rest[layers + 1 :]
+        keys, count, values = len(moment), len(place), gradient.shape[-1]
+        found = _Gradients(form, moment, layers, len(factors[-1]), values)
+        flat = gradient.reshape(-1, values)
+        unit = _largest(flat).clamp_min(SMALLEST) / LARGEST
+        slope = place.new_zeros(keys * count, len(factors[-1]))
+        torch.div(flat, unit, out=slope[:, :values])
+        _sum_rows(flat, out=found.head_bias)
+        _product(slope.T, outputs[-1], moment.dtype, out=found.weights[-1])
+        choice, fold = _choice(place, keys)
+        sums = moment.new_empty(layers, len(choice), fold, form.width)
+        rooms = place.new_empty(2, keys * count, form.width)
+        for number in reversed(range(layers)):
+            factor, after, before = factors[number + 1][:, : form.width], slope, outputs[number]
+            slope = rooms[number % 2]
+            for key, begin, end in _pieces(keys, count):
+                rows = slice(key * count + begin, key * count + end)
+                torch.mm(after[rows], factor, out=slope[rows])
+                torch.ops.aten.threshold_backward.grad_input(slope[rows], before[rows], 0.0, grad_input=slope[rows])
+            _product(choice, slope.view(-1, fold * form.width), moment.dtype, out=sums[number].flatten(1))
+            if number == 0:
+                inputs = again[:, again.shape[1] - form.columns :]
+            else:
+                inputs = again if number == form.joined else outputs[number - 1]
+            _product(slope.T, inputs, moment.dtype, out=found.weights[number][:, : inputs.shape[1]])
+        own = sums[:, :keys].sum(2)
+        torch.sum(own, 1, out=found.biases)
+        for number in form.entries:
+            weight = found.weights[number]
+            torch.mm(own[number].T, moment, out=weight[:, weight.shape[1] - form.moment :])
+        return None, None, None, *found.times(unit)
+
+
+class _Gradients:
+    """Room for the gradients of all parameters in one piece, so that one kernel multiplies them.
+
+    Biases stand behind weights, the head's last: it is summed before anything is scaled.
+    """
+
+    def __init__(self, form: Form, moment: Tensor, layers: int, rows: int, values: int):
+        wide = form.place + form.moment
+        columns = [wide] + [form.width + (wide if number == form.joined else 0) for number in range(1, layers)]
+        sizes = [form.width * column for column in columns] + [rows * form.width, layers * form.width, values]
+        self.scaled = moment.new_empty(sum(sizes))
+        *weights, head, biases, self.head_bias = self.scaled.split(sizes)
+        self.weights = [part.view(form.width, -1) for part in weights] + [head.view(rows, form.width)]
+        self.biases = biases.view(layers, form.width)
+
+    def times(self, unit: Tensor) -> list[Tensor]:
+        """Weight and bias of every layer, then of the head, in the unit of the loss."""
+        values = len(self.head_bias)
+        self.scaled[:-values].mul_(unit)
+        biases = [*self.biases, self.head_bias]
+        weights = [*self.weights[:-1], self.weights[-1][:values]]
+        return [value for pair in zip(weights, biases, strict=True) for value in pair]
+
+
+def _pieces(keys: int, count: int) -> list[tuple[int, int, int]]:
+    """Key, first and last row of the parts in which rows go through the layers: as equal as they can be."""
+    parts = max(-(-count // PIECE), 1)
+    ends = [count * part // parts for part in range(parts + 1)]
+    return [(key, *span) for key in range(keys) for span in pairwise(ends)]
+
+
+def _of_moments(
+    form: Form, moment: Tensor, weights: tuple[Tensor, ...], biases: tuple[Tensor, ...]
+) -> dict[int, Float[Tensor, "k width"]]:
+    """What every key adds in the layers which gamma(t) enters, bias included."""
+    own = moment.new_empty(len(form.entries), len(moment), form.width)
+    for room, number in zip(own, form.entries, strict=True):
+        at_moment = weights[number][:, weights[number].shape[1] - form.moment :]
+        torch.addmm(biases[number], moment, at_moment.T, out=room)
+    return dict(zip(form.entries, own.to(form.dtype), strict=True))
+
+
+def _joined_room(form: Form, place: Tensor, keys: int) -> Float[Tensor, "rows i"]:
+    """Room for the input of the layer that is joined, gamma(x) at its end for all keys; gamma(x) alone without one."""
+    width = 0 if form.joined is None else form.width
+    room = place.new_empty(keys * len(place), width + form.columns)
+    _copy(room.view(keys, len(place), -1)[..., width:], place.expand(keys, -1, -1))
+    return room
+
+
+def _copy(to: Tensor, rows: Tensor) -> None:
+    """Copy rows in units of 16 bytes, if both begin at multiples of it: a fraction of the time that halves take."""
+    step = 16 // to.element_size()
+    if all(n % step == 0 for one in (to, rows) for n in (one.shape[-1], one.storage_offset(), *one.stride()[:-1])):
+        to, rows = to.view(torch.complex128), rows.view(torch.complex128)
+    to.copy_(rows)
+
+
+def _choice(place: Float[Tensor, "N columns"], keys: int) -> tuple[Float[Tensor, "aligned r"], int]:
+    """Zeros and ones that add up rows of each key by a product, and how many rows lie side by side in it.
+
+    A product of few rows with many columns fills a GPU without splitting its sum; what lies side by side is added
+    later. Columns are what is contiguous: there are as many rows as 16 bytes hold.
+    """
+    fold = math.gcd(len(place), FOLD)
+    each = len(place) // fold
+    choice = place.new_zeros(keys, each, -(-keys // ALIGNED) * ALIGNED)
+    choice.diagonal(dim1=0, dim2=2).fill_(1.0)
+    return choice.flatten(0, 1).T, fold
+
+
+def _largest(values: Float[Tensor, "rows v"]) -> Float[Tensor, ""]:
+    """The largest magnitude, in two steps: one block of a GPU alone would look for long."""
+    parts = values.reshape(math.gcd(values.numel(), 16 * FOLD), -1)
+    return torch.linalg.vector_norm(torch.linalg.vector_norm(parts, math.inf, dim=1), math.inf)
+
+
+def _sum_rows(values: Float[Tensor, "rows v"], *, out: Float[Tensor, "v"]) -> None:
+    """The sum over rows, in two steps as well."""
+    fold = math.gcd(len(values), FOLD)
+    torch.sum(values.reshape(-1, fold * len(out)).sum(0).view(fold, len(out)), 0, out=out)
+
+
+def _rounded(form: Form, weights: tuple[Tensor, ...], biases: tuple[Tensor, ...]) -> tuple[list[Tensor], list[Tensor]]:
+    """Copies of weights and biases as factors: without the columns of gamma(t), the head with rows of zeros below it.
+
+    Where ``columns`` has more than gamma(x), a column of gamma(t) meets a column of zeros. Whole ones are cut into
+    blocks of rows, since torch gives 65,536 values of a tensor to one block of threads.
+    """
+    widths = [weight.shape[1] for weight in weights[:-1]]
+    for number in form.entries:
+        widths[number] += form.columns - form.place - form.moment
+    head = weights[-1].new_zeros(-(-len(weights[-1]) // ALIGNED) * ALIGNED, form.width, dtype=form.dtype)
+    made = [head.new_empty(form.width, columns) for columns in widths]
+    shifts = [torch.empty_like(bias, dtype=form.dtype) for bias in biases[:-1]]
+    whole = [number for number, weight in enumerate(weights[:-1]) if weight.shape == made[number].shape]
+    torch._foreach_copy_(
+        [*(part for number in whole for part in made[number].chunk(BLOCKS)), *shifts, head[: len(weights[-1])]],
+        [*(part for number in whole for part in weights[number].chunk(BLOCKS)), *biases[:-1], weights[-1]],
+    )
+    for number, factor in enumerate(made):
+        if number not in whole:
+            factor.copy_(weights[number][:, : factor.shape[1]])
+    return [*made, head], shifts
+
+
+def _product(
+    left: Float[Tensor, "a b"], right: Float[Tensor, "b c"], dtype: torch.dtype, *, out: Tensor | None = None
+) -> Float[Tensor, "a c"]:
+    """A product whose result is not rounded to its factors' precision."""
+    if left.dtype == dtype:
+        return torch.mm(left, right, out=out)
+    if left.is_cuda and hasattr(torch.ops.aten.mm, "dtype"):
+        return torch.mm(left, right, out_dtype=dtype, out=out)
+    return torch.mm(left.to(dtype), right.to(dtype), out=out)

@@ -1,0 +1,227 @@
+"""Rounds of a warp: what CUDA executes, by 32 threads of the CPU; and on CUDA, that rounds change nothing."""
+
+import shutil
+import subprocess
+
+import pytest
+import torch
+from cases import CASES, cotangents
+from torch.testing import assert_close
+
+from gftorf_warp.kernels import batches, lanes
+from gftorf_warp.render import api
+
+COMPILER = shutil.which("c++") or shutil.which("g++")
+
+# a warp of CPU threads: a barrier for every synchronisation, so that shared memory is only as ordered as on CUDA
+WARP = """
+#include <algorithm>
+#include <atomic>
+#include <barrier>
+#include <cmath>
+#include <cstdint>
+#include <cstdio>
+#include <cstring>
+#include <random>
+#include <thread>
+#include <vector>
+#define __CUDA_ARCH__ 750
+#define __align__(n) __attribute__((aligned(n)))
+#define __shared__ static
+struct float4 { float x, y, z, w; };
+static float4 make_float4(float a, float b, float c, float d) { return {a, b, c, d}; }
+static float4 __ldg(const float4* p) { return *p; }
+static float __saturatef(float x) { return std::min(std::max(x, 0.0f), 1.0f); }
+struct Index { unsigned x; };
+static thread_local Index threadIdx;
+static std::barrier<> meeting(32);
+static int told[32];
+static void __syncwarp() { meeting.arrive_and_wait(); }
+static int __shfl_sync(unsigned, int x, int lane) {
+    told[threadIdx.x] = x; __syncwarp(); const int heard = told[lane]; __syncwarp(); return heard;
+}
+static int __shfl_up_sync(unsigned all, int x, int by) {
+    const int lane = threadIdx.x; return __shfl_sync(all, x, lane < by ? lane : lane - by);
+}
+static void atomicAdd(float* to, float x) { std::atomic_ref<float>(*to).fetch_add(x); }
+namespace wp {
+typedef uint64_t uint64;
+template <int N, class T> struct vec_t { T c[N]; T& operator[](int i) { return c[i]; } };
+template <class T> struct array_t { T* data; };
+}
+typedef wp::vec_t<16, float> Splat;
+typedef wp::vec_t<1, float> V;
+template <class F> static void in_a_warp(F f) {
+    std::vector<std::thread> threads;
+    for (unsigned n = 0; n < 32; ++n) threads.emplace_back([=] { threadIdx.x = n; f((int)n); });
+    for (auto& thread : threads) thread.join();
+}
+"""
+
+# walk [begin, end) in both directions; print the largest error of a sum, over the sum of magnitudes
+WALK = """
+static double walk(int begin, int end, int step) {
+    std::mt19937 random(end); std::normal_distribution<float> normal;
+    std::vector<Splat> splats(200), grads(200, Splat{}), more(200, Splat{});
+    std::vector<int> ids(300);
+    std::vector<float> values(300 * 32 * 4), derivatives(32 * 10);
+    for (auto& q : splats) for (float& x : q.c) x = 10 * normal(random);
+    for (int k = 0; k < 300; ++k) ids[k] = k >= begin && k < end ? random() % 200 : 1 << 28;  // another tile's: far off
+    for (float& x : values) x = normal(random);
+    for (float& x : derivatives) x = normal(random);
+    for (size_t n = 0; n < values.size(); n += 4) {  // v, w, w2, g_d: a third of the pixels is missed
+        const float hit = random() % 3 ? 1.0f : 0.0f;
+        values[n] *= hit; values[n + 1] = std::fabs(values[n + 1]) * hit; values[n + 2] *= hit;
+    }
+    const wp::array_t<Splat> S{splats.data()}, G{grads.data()}, M{more.data()}; const wp::array_t<int> I{ids.data()};
+    std::atomic<int> wrong(0);
+    const int start = step > 0 ? begin : end - 1, count = end - begin;
+    in_a_warp([&](int lane) {
+        const wp::uint64 memory = warp_memory();
+        const float* d = &derivatives[10 * lane];
+        int coming = 0;
+        if (count > 0) {
+            keep_derivatives(memory, V{d[0]}, V{d[1]}, V{d[2]}, V{d[3]}, V{d[4]}, V{d[5]}, V{d[6]},
+                             V{d[7]}, V{d[8]}, V{d[9]});
+            ask(memory, S, entry(I, start, step, 0, count), 0);
+            coming = entry(I, start, step, 16, count);
+        }
+        for (int at = 0; at < count; at += 16) {
+            const int stop = std::min(at + 16, count);
+            arrive();
+            if (stop < count) { ask(memory, S, coming, stop); coming = entry(I, start, step, stop + 16, count); }
+            for (int n = at; n < stop; ++n) {
+                const int k = start + step * n;
+                const Splat q = record_of(memory, n, S, I, k);
+                wrong += std::memcmp(&q, &splats[ids[k]], 64) != 0;
+                const float* u = &values[(k * 32 + lane) * 4];
+                if (step < 0) keep_values(memory, n, V{u[0]}, V{u[1]}, V{u[2]}, V{u[3]});
+            }
+            if (step < 0)
+                add_round(memory, G, M, I, start, at, stop - at, V{40.5f + lane % 8}, V{20.5f + lane / 8});
+        }
+        arrive();
+    });
+    if (wrong) return 1e9;
+    std::vector<double> want(200 * 32), size(200 * 32);
+    for (int k = begin; step < 0 && k < end; ++k) for (int p = 0; p < 32; ++p) {
+        const float *u = &values[(k * 32 + p) * 4], *d = &derivatives[10 * p];
+        const double dx = splats[ids[k]][0] - (40.5 + p % 8), dy = splats[ids[k]][1] - (20.5 + p / 8);
+        const double v = GEOMETRY ? u[0] : 0, w = CHANNELS ? u[1] : 0, w2 = LIGHT ? u[2] : 0, wd = LIGHT ? u[1] : 0;
+        const double all[16] = {v * dx, v * dy, v * dx * dx, v * dx * dy, v * dy * dy, v, double(GEOMETRY && u[1] > 0),
+            0, w * d[0], w * d[1], w * d[2], w2 * d[3], w2 * d[4], w2 * d[5], wd * (SPREADS ? u[3] : d[6]), 0};
+        for (int j = 0; j < 32; ++j) {  // a record, and that of further channels
+            const double one = j < 16 ? all[j] : MORE && j >= 24 && j < 27 ? double(u[1]) * d[j - 17] : 0;
+            want[ids[k] * 32 + j] += one; size[ids[k] * 32 + j] += std::fabs(one);
+        }
+    }
+    double worst = 0;
+    for (int n = 0; n < 200 * 32; ++n) {
+        const double error = std::fabs(want[n] - (n % 32 < 16 ? grads : more)[n / 32][n % 16]);
+        worst = std::max(worst, size[n] > 0 ? error / size[n] : error * 1e9);
+    }
+    return worst;
+}
+int main() {
+    const int ends[][2] = {{0, 0}, {5, 6}, {3, 19}, {0, 16}, {7, 40}, {2, 130}, {100, 277}};
+    for (auto& e : ends) for (int step : {1, -1}) std::printf("%g\\n", walk(e[0], e[1], step));
+}
+"""
+
+LANES = """
+int main() {
+    std::atomic<int> wrong(0);
+    for (int turn = 0; turn < 20; ++turn) in_a_warp([&](int lane) {
+        auto width = [=](int n) { return n < turn ? (n * 7 + turn * 5) % 11 : 0; };  // rows behind the last are empty
+        int before = 0, total = 0;
+        for (int n = 0; n < 32; ++n) { before += n < lane ? width(n) : 0; total += width(n); }
+        const int sums = sum_of_lanes(width(lane));
+        wrong += sums != before + width(lane);
+        wrong += of_lane(sums, 31) != total;
+        for (int begin = 0; begin < total; begin += 32) {
+            int row = 0, behind = width(0);
+            while (row < 31 && behind <= begin + lane) behind += width(++row);
+            wrong += lane_beyond(sums, begin + lane) != row;
+        }
+    });
+    std::printf("%d\\n", (int)wrong);
+}
+"""
+
+SIGNATURES = {
+    "entry": "int entry(wp::array_t<int> ids, int start, int step, int at, int count)",
+    "ask": "void ask(wp::uint64 memory, wp::array_t<Splat> splats, int i, int at)",
+    "arrive": "void arrive()",
+    "record_of": "Splat record_of(wp::uint64 memory, int at, wp::array_t<Splat> splats, wp::array_t<int> ids, int k)",
+    "warp_memory": "wp::uint64 warp_memory()",
+    "keep_derivatives": "void keep_derivatives(wp::uint64 memory, V g0, V g1, V g2, V g_re, V g_im, V g_amplitude, "
+    "V g_distance, V g3, V g4, V g5)",
+    "keep_values": "void keep_values(wp::uint64 memory, int at, V v, V w, V w2, V g_d)",
+    "add_round": "void add_round(wp::uint64 memory, wp::array_t<Splat> grads, wp::array_t<Splat> more, "
+    "wp::array_t<int> ids, int start, int at, int n, V x, V y)",
+    "sum_of_lanes": "int sum_of_lanes(int x)",
+    "of_lane": "int of_lane(int x, int lane)",
+    "lane_beyond": "int lane_beyond(int sums, int bound)",
+}
+
+
+def numbers_of(folder, functions, program):
+    """Compile native functions as CUDA would see them, run ``program`` on them, and return what it printed."""
+    parts = [f"static {SIGNATURES[name]} {{ {function.native_snippet} }}" for name, function in functions.items()]
+    (folder / "warp.cpp").write_text("\n".join([WARP, *parts, program]))
+    command = [COMPILER, "-std=c++20", "-O1", "-w", "-pthread", "warp.cpp", "-o", "warp"]
+    subprocess.run(command, cwd=folder, check=True, timeout=120)
+    done = subprocess.run([folder / "warp"], check=True, timeout=120, capture_output=True, text=True)
+    return [float(line) for line in done.stdout.split()]
+
+
+@pytest.mark.skipif(COMPILER is None, reason="needs a C++ compiler")
+@pytest.mark.parametrize(
+    ("light", "channels", "geometry", "spreads", "more"),
+    [
+        (True, False, True, False, False),
+        (True, True, True, True, False),
+        (False, True, False, False, False),
+        (True, True, True, False, True),
+    ],
+)
+def test_rounds_read_every_record_and_sum_every_pixel(light, channels, geometry, spreads, more, tmp_path):
+    """Lists of no, one, 16 and many entries, in both directions; sums against float64."""
+    rounds = vars(batches.make_gradient_rounds(8, light, channels, geometry, spreads, more))
+    functions = {name: rounds[name] for name in SIGNATURES if name in rounds}
+    values = {"LIGHT": light, "CHANNELS": channels, "GEOMETRY": geometry, "SPREADS": spreads, "MORE": more}
+    constants = "".join(f"const bool {name} = {int(value)};\n" for name, value in values.items())
+    errors = numbers_of(tmp_path, functions, constants + WALK)
+    assert len(errors) == 14
+    assert max(errors) < 1e-6
+    assert max(errors[-1:]) > 1e-9, "nothing was added"
+
+
+@pytest.mark.skipif(COMPILER is None, reason="needs a C++ compiler")
+def test_lanes_find_their_row(tmp_path):
+    """Sums over lanes, and the lane that a pair of a row of tiles belongs to."""
+    functions = {name: getattr(lanes, name) for name in ("sum_of_lanes", "of_lane", "lane_beyond")}
+    assert numbers_of(tmp_path, functions, LANES) == [0.0]
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
+@pytest.mark.parametrize("name", CASES)
+def test_rounds_change_no_image_and_no_gradient(name, monkeypatch):
+    """Walking in rounds and walking entry by entry give the same images and, to rounding, the same gradients."""
+    found = []
+    for rounds in (True, False):
+        monkeypatch.setattr(batches, "COOPERATIVE", rounds)
+        case = CASES[name]()
+        inputs = case.inputs(torch.float32, "cuda")
+        images = case.outputs(api.rasterize, inputs)
+        nothing = torch.zeros(next(iter(images.values())).shape[-2:], dtype=torch.bool)
+        seeds = cotangents(images, nothing, 0)
+        total = sum((images[key] * seeds[key].to(images[key])).sum() for key in images)
+        gradients = torch.autograd.grad(total, list(inputs.values()), allow_unused=True, materialize_grads=True)
+        found.append((images, dict(zip(inputs, gradients, strict=True))))
+    (images, gradients), (wanted_images, wanted) = found
+    for key, image in wanted_images.items():
+        assert_close(images[key], image, rtol=1e-6, atol=1e-6, msg=key)
+    for key, gradient in wanted.items():
+        scale = float(gradient.abs().max()) if gradient.numel() else 0.0
+        assert_close(gradients[key], gradient, rtol=0, atol=2e-5 * scale + 1e-7, msg=key)

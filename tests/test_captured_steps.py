@@ -1,0 +1,114 @@
+"""Steps as one graph: on a CPU the same work without a graph, against single steps."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from small_runs import demo, random, small
+
+from gftorf_warp.recon import presets, step
+from gftorf_warp.recon.captured import CapturedSteps, unsuitable
+from gftorf_warp.recon.observations import observe
+from gftorf_warp.recon.settings import Batch, Kernels
+from gftorf_warp.recon.state import begin
+
+DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA"))]
+
+
+def begun(settings, device="cpu"):
+    """A state of Gaussians that are not round, and what it is fitted to."""
+    observations = observe(small(), settings, device)
+    state = begin(observations, settings, seed=3, device=device)
+    with torch.no_grad():
+        scale = state.optimiser.tensors["log_scale"]
+        scale += 0.5 * random(*scale.shape).to(device)
+    return state, observations
+
+
+def published(**changes):
+    """A short run of the published preset, small enough for a test: warm-up, network, flow, rounds and a reset."""
+    settings = presets.shortened(presets.preset("released"), 60)
+    motion = replace(settings.motion, layers=3, width=16, skip_after=1, position_frequencies=3, time_frequencies=2)
+    init = replace(settings.init, count=300)
+    densify = replace(settings.densify, every=8, start=12, reset_every=20, gradient_min=1e-6, loses_step=False)
+    schedule = {name: changes.pop(name) for name in ("batch",) if name in changes}
+    settings = replace(settings, motion=motion, init=init, densify=densify, kernels=Kernels.STEP, **changes)
+    return replace(settings, schedule=replace(settings.schedule, warm_up=6, flow_from=8, **schedule))
+
+
+def alike(one, other):
+    """Two states after the same images: to rounding on a CPU, but for a few elements on a GPU.
+
+    Atomic additions of the blend's backward pass happen there in any order, so gradients differ by a rounding, graph or
+    not. Adam, whose epsilon is far below any gradient, makes whole steps of gradients that are nothing but rounding: a
+    few elements may be a few steps apart, which is no error.
+    """
+    few = 0.01 if one.optimiser.leaves[0].is_cuda else 0.0
+    assert len(one.optimiser.field) == len(other.optimiser.field)
+    for leaf, twin in zip(one.optimiser.leaves, other.optimiser.leaves, strict=True):
+        apart = ~torch.isclose(leaf, twin, rtol=1e-3, atol=2e-5)
+        assert apart.float().mean() <= few
+        torch.testing.assert_close(leaf, twin, rtol=1e-3, atol=2e-2 if few else 2e-5)
+    assert one.sums.keys() == other.sums.keys()
+    for name in one.sums:
+        torch.testing.assert_close(one.sums[name], other.sums[name], rtol=1e-3, atol=1e-6)
+    torch.testing.assert_close(one.statistics.pixels, other.statistics.pixels, rtol=1e-3 if few else 0, atol=4 * few)
+    torch.testing.assert_close(one.statistics.gradient, other.statistics.gradient, rtol=1e-2, atol=1e-6 + 1e-2 * few)
+
+
+SETTINGS = [published, lambda **c: demo(images=60, kernels=Kernels.STEP, **c)]
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("batch", [Batch.FRAME, Batch.QUARTET])
+@pytest.mark.parametrize("make", SETTINGS, ids=["published", "demo"])
+def test_steps_are_single_steps(make, batch, device):
+    """Every tensor, sum and statistic after 40 images, with all that happens on the way."""
+    settings = make(batch=batch)
+    single, observations = begun(settings, device)
+    whole, _ = begun(settings, device)
+    assert unsuitable(observations, settings, whole) is None
+    replay = CapturedSteps(whole, observations, settings)
+    while single.images < 40:
+        assert step.step(single, observations, settings) is None
+        replay.step()
+        assert single.images == whole.images
+    assert replay.collect() == 0
+    alike(single, whole)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("batch", [Batch.FRAME, Batch.QUARTET])
+def test_a_replay_is_the_same_work_without_a_graph(batch, device):
+    """The same kernels in the same order; what differs on a GPU is the order of atomic additions, see ``alike``."""
+    settings = published(batch=batch)
+    states = []
+    for graphs in (False, True):
+        state, observations = begun(settings, device)
+        steps = CapturedSteps(state, observations, settings, graphs=graphs)
+        while state.images < 40:
+            steps.step()
+        assert steps.collect() == 0
+        states.append(state)
+    alike(*states)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_step_that_is_not_finite_is_counted_and_changes_nothing(device):
+    """One quad of one frame is not a number: its steps do nothing, the others go on."""
+    settings = published(batch=Batch.FRAME)
+    state, observations = begun(settings, device)
+    observations.quads[observations.batches[0][0]] = float("nan")
+    steps = CapturedSteps(state, observations, settings)
+    for _ in observations.batches:
+        before = [leaf.detach().clone() for leaf in state.optimiser.leaves]
+        skipped = state.skipped
+        steps.step()
+        in_a_row = steps.collect()
+        assert in_a_row == state.skipped - skipped
+        if in_a_row:
+            pairs = zip(before, state.optimiser.leaves, strict=True)
+            assert all(old.shape != new.shape or torch.equal(old, new) for old, new in pairs)
+    assert state.skipped == 1
+    assert int(state.sums["count"]) == len(observations.batches) - 1
+    assert all(leaf.isfinite().all() for leaf in state.optimiser.leaves)
