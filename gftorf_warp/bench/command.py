@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import importlib.metadata
 import os
 import platform
 import subprocess
@@ -15,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import warp as wp
 
 from .. import __version__
 from ..data.files import write_json
@@ -185,6 +185,14 @@ def checked(parts: list[str]) -> list[str]:
     return [name for name in PARTS if name in parts or not parts]
 
 
+def _version_of(package: str) -> str:
+    """As installed; a folder on the path may have none."""
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return "of unknown version"
+
+
 def about(device: str) -> dict[str, Any]:
     """The machine and the versions, as every result states them."""
     on_cpu = device == "cpu"
@@ -194,7 +202,7 @@ def about(device: str) -> dict[str, Any]:
         "cpus": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
         "driver": "no driver" if on_cpu else f"driver {_driver()}",
         "python": platform.python_version(),
-        "warp": f"Warp {wp.__version__}",
+        "warp": f"Warp {_version_of('warp-lang')}",
         "torch": f"torch {torch.__version__}",
         "gftorf_warp": __version__,
         "commit": _commit(),
