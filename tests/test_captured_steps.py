@@ -2,15 +2,17 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from small_runs import demo, random, small
 
 from gftorf_warp.recon import presets, step
-from gftorf_warp.recon.captured import CapturedSteps, unsuitable
+from gftorf_warp.recon.captured import CapturedSteps, steps_of, unsuitable
 from gftorf_warp.recon.observations import observe
 from gftorf_warp.recon.settings import Batch, Kernels
 from gftorf_warp.recon.state import begin
+from gftorf_warp.recon.step import Singles
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA"))]
 
@@ -112,3 +114,21 @@ def test_a_step_that_is_not_finite_is_counted_and_changes_nothing(device):
     assert state.skipped == 1
     assert int(state.sums["count"]) == len(observations.batches) - 1
     assert all(leaf.isfinite().all() for leaf in state.optimiser.leaves)
+
+
+def test_a_run_is_captured_where_that_pays():
+    """By default on a GPU only; on a CPU it costs time and changes nothing but roundings."""
+    settings = demo(images=8)
+    assert settings.kernels == Kernels.AUTO
+    state, observations = begun(settings)
+    assert isinstance(steps_of(state, observations, settings), Singles)
+    wanted = replace(settings, kernels=Kernels.GRAPH)
+    assert isinstance(steps_of(state, observations, wanted), CapturedSteps)
+    elsewhere = replace(observations, quads=observations.quads.to("meta"))
+    assert elsewhere.quads.device.type != "cpu"
+    away = np.eye(4)
+    away[0, 3] = 0.1
+    moving = [*observations.cameras[:-1], observations.cameras[-1].at(away)]
+    for which in (Kernels.AUTO, Kernels.GRAPH):  # a camera that moves is no constant of a graph
+        seen = replace(elsewhere, cameras=moving)
+        assert isinstance(steps_of(state, seen, replace(settings, kernels=which)), Singles)

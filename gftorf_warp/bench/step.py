@@ -35,7 +35,7 @@ def ways(settings: ReconSettings, changes: list[str], device: str) -> list[Recon
     """The settings of every row; what ``changes`` sets stays as it is."""
     fixed = {change.partition("=")[0].strip() for change in changes}
     moves = settings.motion.kind == MotionKind.NETWORK and torch.device(device).type != "cpu"
-    kernels = [settings.kernels] if "kernels" in fixed else list(Kernels)
+    kernels = [settings.kernels] if "kernels" in fixed else [kind for kind in Kernels if kind != Kernels.AUTO]
     batches = [settings.schedule.batch] if "schedule.batch" in fixed else list(Batch)
     products = [settings.motion.products] if "motion.products" in fixed or not moves else list(Products)
     pairs = [(kind, products[-1]) for kind in kernels] + [(kernels[-1], kind) for kind in products[:-1]]

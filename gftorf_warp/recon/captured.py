@@ -60,7 +60,8 @@ def steps_of(
     state: State, observations: Observations, settings: ReconSettings, run_all: Map = map
 ) -> Singles | CapturedSteps:
     """The steps of a run, as its settings want them; ``run_all`` is for those that are no graphs."""
-    if settings.kernels == Kernels.GRAPH:
+    on_gpu = observations.quads.device.type != "cpu"
+    if settings.kernels == Kernels.GRAPH or (settings.kernels == Kernels.AUTO and on_gpu):
         why = unsuitable(observations, settings, state)
         if why is None:
             return CapturedSteps(state, observations, settings)

@@ -82,6 +82,8 @@ class BatchRule(enum.StrEnum):
 class Kernels(enum.StrEnum):
     """How much of a step, beside the rendering, is done by kernels instead of torch: the same to rounding."""
 
+    AUTO = "auto"
+    """``graph`` on CUDA, ``loss`` on a CPU."""
     NONE = "none"
     """Nothing."""
     LOSS = "loss"
@@ -89,7 +91,7 @@ class Kernels(enum.StrEnum):
     STEP = "step"
     """These, random backgrounds and Adam; the backgrounds are other draws of the same kind."""
     GRAPH = "graph"
-    """The whole step, captured as one CUDA graph; on a CPU the same without one. What cannot be one is ``step``."""
+    """The whole step, captured as one CUDA graph; on a CPU the same without one. What cannot be one is ``loss``."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -285,7 +287,7 @@ class ReconSettings:
     """Amplitude B of the random background, uniform in [-B, B] per pixel, channel and image; 0 is black."""
     motion_gradient_max: float | None = 1.0
     """Longest gradient of the motion; a longer one is shortened [1/m for nodes, 1 for a network]. None: never."""
-    kernels: Kernels = Kernels.LOSS
+    kernels: Kernels = Kernels.AUTO
     """How much of a step is done by kernels instead of torch."""
     failures_max: int = 5
     """So many steps without a finite loss and gradient in a row go back to the last checkpoint, with halved rates."""
