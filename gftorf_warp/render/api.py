@@ -42,15 +42,15 @@ class Rendering:
 
     quads: Float[Tensor, "Q H W"]
     """Sum of w T a (cos(psi - shift) + b), plus T_e times the background."""
-    phasor: Float[Tensor, "3 H W"]
+    phasor: Float[Tensor, "3 H W"] | Float[Tensor, "0 H W"]
     """(re, im, amplitude): sum of w T 2a (cos psi, sin psi, 1), plus T_e times the background."""
     colour: Float[Tensor, "3 H W"] | None
     """Sum of w c, plus T_e times the background; None if the field has no colour."""
-    distance: Float[Tensor, "H W"]
+    distance: Float[Tensor, "H W"] | Float[Tensor, "0 W"]
     """Sum of w d [m], *not* divided by the opacity."""
-    opacity: Float[Tensor, "H W"]
+    opacity: Float[Tensor, "H W"] | Float[Tensor, "0 W"]
     """Sum of w = 1 - T_e [1]."""
-    distortion: Float[Tensor, "H W"]
+    distortion: Float[Tensor, "H W"] | Float[Tensor, "0 W"]
     """Sum over all pairs of w_k w_l (d_k - d_l)^2 [m^2], or as the settings say."""
     extra: Float[Tensor, "D H W"] | None
     """Sum of w times the extra channels; no background."""
