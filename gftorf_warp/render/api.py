@@ -13,7 +13,7 @@ from torch import Tensor
 from ..scene.camera import Camera
 from ..scene.gaussians import GaussianField
 from ..scene.sensor import Sensor
-from .bridge import IMAGES, INPUTS, Rasterize, Request
+from .bridge import IMAGES, INPUTS, Rasterize, Request, left_out
 from .buffers import RenderSettings, Workspace
 from .inputs import CHOICES, wanted_images
 
@@ -136,7 +136,7 @@ def rasterize(
     found = dict(zip(IMAGES, Rasterize.apply(request, *ordered), strict=True))
     for name in CHOICES:
         if found[name] is None:
-            found[name] = field.mean.new_zeros(0, *(size if name in channels else size[1:]))
+            found[name] = left_out(name, field.mean, *size)
     if extra is not None and found["extra"] is None:
         found["extra"] = extra.new_zeros(0, *size)
     return Rendering(

@@ -123,6 +123,11 @@ def _images(named: Mapping[str, Tensor]) -> Images:
     return Images(**{name: array_over(named.get(name), wp.float32) for name in IMAGES})
 
 
+def left_out(name: str, like: Tensor, height: int, width: int) -> Tensor:
+    """What stands for an image that nobody asked for: no elements, where ``like`` is."""
+    return like.new_empty(0, height, width) if name in ("quads", "phasor") else like.new_empty(0, width)
+
+
 def array_over(tensor: Tensor | None, dtype=wp.float32) -> wp.array | None:
     """A Warp array over the memory of a tensor, without its history."""
     if tensor is None:

@@ -25,7 +25,7 @@ from ..scene.motion import Motion
 from ..scene.sensor import Sensor
 from . import launch
 from .api import Rendering
-from .bridge import array_over, stream_of
+from .bridge import array_over, left_out, stream_of
 from .buffers import Frame, RenderSettings
 from .inputs import CHOICES, Images, Inputs, names_of
 
@@ -84,7 +84,7 @@ class Replay:
         wp.init()
         field = field.map(lambda tensor: tensor.detach().contiguous())
         self.motion, self.attachment, self.settings = motion, attachment, settings
-        self.names, self._nothing = frozenset(images), field.mean.new_empty(0)
+        self.names, self._like = frozenset(images), field.mean
         self.shifts = tuple(float(shift) for shift in sensor.shifts)
         self.device = wp.device_from_torch(field.device)
         self.graphs = self.device.is_cuda
@@ -163,8 +163,11 @@ class Replay:
         if self.graphs and self._capacity is None:
             self.grow()
         tensors = seen.target.tensors
-        images = {name: tensors.get(name, self._nothing) for name in CHOICES}
+        images = {name: tensors[name] if name in tensors else self._left_out(name, camera) for name in CHOICES}
         return Rendering(**images, colour=tensors.get("colour"), extra=None, screen=None)
+
+    def _left_out(self, name: str, camera: Camera) -> Tensor:
+        return left_out(name, self._like, camera.height, camera.width)
 
     def _captured(self, seen: _View) -> wp.Graph:
         """The rendering of a camera that was drawn before, on Warp's own stream: torch's default one cannot capture."""
