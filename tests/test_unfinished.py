@@ -17,7 +17,9 @@ from gftorf_warp.sim.simulate import simulate
 from gftorf_warp.sim.unfinished import partial_of
 
 OPTIONS = {"size": (24, 18), "frames": 8, "seed": 3}
-COMMAND = "import sys; from gftorf_warp.cli import main; sys.exit(main())"
+# in a shell's background job SIGINT is ignored, and children inherit that
+HEARS = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
+COMMAND = HEARS + "import sys; from gftorf_warp.cli import main; sys.exit(main())"
 
 
 def contents(folder):
