@@ -12,13 +12,14 @@ import argparse
 import json
 import statistics
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 
 import torch
 import warp as wp
 
+from gftorf_warp.bench.command import about
+from gftorf_warp.bench.timing import WARM_UP, watch_of
 from gftorf_warp.recon.objective import image_loss
 from gftorf_warp.recon.optimiser import BETAS, EPSILON
 from gftorf_warp.render import descent, fused
@@ -82,7 +83,7 @@ def replay_of(run: Callable[[], torch.Tensor]) -> tuple[Callable[[], None], torc
     side = torch.cuda.Stream()
     side.wait_stream(torch.cuda.current_stream())
     with torch.cuda.stream(side):
-        for _ in range(3):
+        for _ in range(WARM_UP):
             run()
     torch.cuda.current_stream().wait_stream(side)
     graph = torch.cuda.CUDAGraph()
@@ -93,21 +94,14 @@ def replay_of(run: Callable[[], torch.Tensor]) -> tuple[Callable[[], None], torc
 
 def timed(runs: dict[str, Callable], repeats: int, device: str) -> dict[str, float]:
     """Median milliseconds of every row, taken in turns."""
+    watch = watch_of(device)
     spent: dict[str, list[float]] = {name: [] for name in runs}
-    for n in range(repeats + 3):
+    for n in range(repeats + WARM_UP):
         for name, run in runs.items():
-            if device == "cpu":
-                begun = time.perf_counter()
-                run()
-                spent[name].append(1e3 * (time.perf_counter() - begun))
-            else:
-                ends = [torch.cuda.Event(enable_timing=True) for _ in range(2)]
-                ends[0].record()
-                run()
-                ends[1].record()
-                ends[1].synchronize()
-                spent[name].append(ends[0].elapsed_time(ends[1]))
-            if n < 3:  # warming up
+            begun = watch.mark()
+            run()
+            spent[name].append(watch.between(begun, watch.mark()))
+            if n < WARM_UP:
                 spent[name].clear()
     return {name: statistics.median(values) for name, values in spent.items()}
 
@@ -138,10 +132,7 @@ def main() -> int:
         times = "  ".join(f"{how} {values[name]:8.3f} ms" for how, values in found.items() if name in values)
         print(f"{name:<40} {times}")
     if a.json:
-        about = {"device": a.device, "warp": wp.__version__, "torch": torch.__version__}
-        if a.device != "cpu":
-            about["device"] = torch.cuda.get_device_name(a.device)
-        a.json.write_text(json.dumps(about | {"repeats": a.repeats, "milliseconds": found}, indent=1) + "\n")
+        a.json.write_text(json.dumps(about(a.device) | {"repeats": a.repeats, "milliseconds": found}, indent=1) + "\n")
     return 0
 
 
