@@ -53,24 +53,26 @@ def noise_rows(device: str) -> dict[str, Callable[[], torch.Tensor]]:
 
 
 def adam_rows(device: str, count: int) -> dict[str, Callable[[], torch.Tensor]]:
-    """All tensors of ``count`` Gaussians and of the published network."""
+    """Whether the gradients are finite, and Adam: all tensors of ``count`` Gaussians and of the published network."""
     shapes = [(count, 3), (count, 3), (count, 4), (count,), (count, 16), *NETWORK]
     values = [torch.randn(shape, device=device) for shape in shapes]
     gradients = [torch.randn(shape, device=device) for shape in shapes]
     moments = [(torch.zeros((), device=device), torch.zeros_like(v), torch.zeros_like(v)) for v in values]
     table = descent.AdamTable(values, gradients, moments)
     rates = torch.full((len(shapes),), 1e-3, device=device)
-    sound = torch.ones(1, dtype=torch.int32, device=device)
+    ledger, none = descent.Ledger.empty(1, torch.device(device)), torch.zeros(1, dtype=torch.int32, device=device)
     twins = [value.clone().requires_grad_() for value in values]
     for twin, gradient in zip(twins, gradients, strict=True):
         twin.grad = gradient
     adam = torch.optim.Adam([{"params": [t], "lr": 1e-3} for t in twins], betas=BETAS, eps=EPSILON, fused=True)
 
     def by_kernels() -> torch.Tensor:
-        descent.adam_step(table, rates, sound, betas=BETAS, epsilon=EPSILON)
+        rest = {"motion_gradient_max": None, "pairs": [none], "capacity": 0, "betas": BETAS, "epsilon": EPSILON}
+        descent.descend(table, rates, ledger, [0.0] * len(descent.FOUND_NAMES), motion_from=len(values), **rest)
         return values[0]
 
     def by_torch() -> torch.Tensor:
+        torch.nn.utils.get_total_norm(gradients).isfinite()
         adam.step()
         return twins[0]
 
