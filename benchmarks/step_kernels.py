@@ -22,8 +22,8 @@ from gftorf_warp.bench.command import about
 from gftorf_warp.bench.timing import WARM_UP, watch_of
 from gftorf_warp.recon.objective import image_loss
 from gftorf_warp.recon.optimiser import BETAS, EPSILON
-from gftorf_warp.render import descent, fused
-from gftorf_warp.render.bridge import captured
+from gftorf_warp.render import descent, fused, training
+from gftorf_warp.render.bridge import array_over, captured, stream_of
 
 IMAGES = {"1 x 120 x 160": (1, 120, 160), "1 x 240 x 320": (1, 240, 320), "4 x 240 x 320": (4, 240, 320)}
 NETWORK = [(256, 84), *[(256, 256)] * 4, (256, 340), *[(256, 256)] * 2, (3, 256), *[(256,)] * 8, (3,)]
@@ -54,21 +54,26 @@ def noise_rows(device: str) -> dict[str, Callable[[], torch.Tensor]]:
 
 
 def adam_rows(device: str, count: int) -> dict[str, Callable[[], torch.Tensor]]:
-    """All tensors of ``count`` Gaussians and of the published network."""
+    """All tensors of ``count`` Gaussians and of the published network; what a step comes to was judged before."""
     shapes = [(count, 3), (count, 3), (count, 4), (count,), (count, 16), *NETWORK]
     values = [torch.randn(shape, device=device) for shape in shapes]
     gradients = [torch.randn(shape, device=device) for shape in shapes]
     moments = [(torch.zeros((), device=device), torch.zeros_like(v), torch.zeros_like(v)) for v in values]
     table = descent.AdamTable(values, gradients, moments)
     rates = torch.full((len(shapes),), 1e-3, device=device)
-    sound = torch.ones(1, dtype=torch.int32, device=device)
+    ledger, none = descent.Ledger.empty(1, torch.device(device)), torch.zeros(1, dtype=torch.int32, device=device)
+    rest = {"motion_gradient_max": None, "pairs": [none], "capacity": 0, "betas": BETAS, "epsilon": EPSILON}
+    descent.descend(table, rates, ledger, [0.0] * len(descent.FOUND_NAMES), motion_from=len(values), **rest)
+    tables = array_over(table.rows, wp.int64), array_over(table.first_block, wp.int32)
+    sizes = array_over(table.sizes)
     twins = [value.clone().requires_grad_() for value in values]
     for twin, gradient in zip(twins, gradients, strict=True):
         twin.grad = gradient
     adam = torch.optim.Adam([{"params": [t], "lr": 1e-3} for t in twins], betas=BETAS, eps=EPSILON, fused=True)
 
     def by_kernels() -> torch.Tensor:
-        descent.adam_step(table, rates, sound, betas=BETAS, epsilon=EPSILON)
+        with stream_of(rates):
+            training.adam_step(*tables, table.blocks, BETAS, EPSILON, sizes)
         return values[0]
 
     def by_torch() -> torch.Tensor:
