@@ -21,6 +21,7 @@ from ..render.api import Rendering
 from ..render.bridge import Branches, Captured, Inbox, Outbox, pairs_of, shared_pool
 from ..render.buffers import RenderSettings, Workspace
 from ..scene.motion import Still
+from ..scene.network import Network
 from . import densify
 from .gating import Gate
 from .objective import image_loss, render_settings_at, rendering_of, weights_at
@@ -136,6 +137,9 @@ class CapturedSteps:
         self._branches = Branches(longest, device)
         self._workspaces = [Workspace() for _ in range(longest)]
         self.gate = Gate(settings, state.motion)
+        if isinstance(state.motion, Network) and device.type != "cpu":
+            fits = fused.masks(settings.motion.width, torch.float16)
+            state.motion.mask_by(fused.masked if fits else None)
         self._adopt()
 
     def step(self) -> None:

@@ -15,6 +15,7 @@ gradient. Nothing here asks the device. design/network.md has the reasons.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -28,7 +29,11 @@ LARGEST = 64.0  # gradient of an offset, in scaled units: 10 bits below the larg
 SMALLEST = 1e-30  # below any gradient; keeps 0 / 0 away where there is none
 PIECE = 21_120  # rows of a product at most: two full waves of 128 x 160 results on 132 multiprocessors
 FOLD = 64  # rows side by side in a sum over rows, if they are so many times something
+SUMMED = 128  # rows to a sum of ``Form.masked``: all its blocks of threads together fill a GPU, at 20,000 rows as well
 BLOCKS = 8  # into which a weight is cut to be rounded
+
+Masked = Callable[[Tensor, Tensor, Tensor], None]
+"""Of gradients [r, width] and what a ReLU left: clear where it left 0, fill sums [p, width] over parts of the rows."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,6 +50,8 @@ class Form:
     """Number of the layer whose input is joined by gamma(x) and gamma(t) again; None: there is none."""
     dtype: torch.dtype
     """Of the factors: float16, or that of the parameters, where the same code is exact."""
+    masked: Masked | None = None
+    """What masks and sums gradients in one pass, sums in the precision of parameters; None: torch, one by one."""
 
     @property
     def columns(self) -> int:
@@ -77,7 +84,7 @@ class Stacked(torch.autograd.Function):
         factors, shifts = _rounded(form, weights, biases)
         keys, count, layers = len(moment), len(place), len(weights) - 1
         own = _of_moments(form, moment, weights, biases)
-        outputs = list(place.new_empty(layers, keys * count, form.width).unbind())
+        outputs = place.new_empty(layers, keys * count, form.width)
         again = _joined_room(form, place, keys)
         for key, begin, end in _pieces(keys, count):
             rows = slice(key * count + begin, key * count + end)
@@ -91,7 +98,7 @@ class Stacked(torch.autograd.Function):
                 torch._addmm_activation(shift, hidden, factors[number].T, use_gelu=False, out=out)
                 hidden = out
         context.form = form
-        context.save_for_backward(place, moment, again, *factors, *outputs)
+        context.save_for_backward(place, moment, again, *factors, outputs)
         found = _product(outputs[-1], factors[-1].T, moment.dtype)[:, : len(biases[-1])] + biases[-1]
         return found.view(keys, count, len(biases[-1]))
 
@@ -102,55 +109,60 @@ class Stacked(torch.autograd.Function):
 
         Scaled by the largest gradient of an offset, which no host knows; everything up to the weights is linear in it.
         """
-        form, (place, moment, again, *rest) = context.form, context.saved_tensors
-        layers = len(rest) // 2
-        factors, outputs = rest[: layers + 1], rest[layers + 1 :]
-        keys, count, values = len(moment), len(place), gradient.shape[-1]
+        form, (place, moment, again, *factors, outputs) = context.form, context.saved_tensors
+        layers, values = len(outputs), gradient.shape[-1]
+        keys, count = len(moment), len(place)
         found = _Gradients(form, moment, layers, len(factors[-1]), values)
         flat = gradient.reshape(-1, values)
         unit = _largest(flat).clamp_min(SMALLEST) / LARGEST
-        slope = place.new_zeros(keys * count, len(factors[-1]))
-        torch.div(flat, unit, out=slope[:, :values])
+        after = place.new_zeros(keys * count, len(factors[-1]))
+        torch.div(flat, unit, out=after[:, :values])
         _sum_rows(flat, out=found.head_bias)
-        _product(slope.T, outputs[-1], moment.dtype, out=found.weights[-1])
-        choice, fold = _choice(place, keys)
-        sums = moment.new_empty(layers, len(choice), fold, form.width)
-        rooms = place.new_empty(2, keys * count, form.width)
+        _product(after.T, outputs[-1], moment.dtype, out=found.weights[-1])
+        slopes, pieces = torch.empty_like(outputs), _pieces(keys, count)
+        longest = max(end - begin for _, begin, end in pieces)
+        sums = moment.new_empty(layers, len(pieces), -(-longest // SUMMED), form.width)
         for number in reversed(range(layers)):
-            factor, after, before = factors[number + 1][:, : form.width], slope, outputs[number]
-            slope = rooms[number % 2]
-            for key, begin, end in _pieces(keys, count):
+            factor, slope, before = factors[number + 1][:, : form.width], slopes[number], outputs[number]
+            for part, (key, begin, end) in enumerate(pieces):
                 rows = slice(key * count + begin, key * count + end)
                 torch.mm(after[rows], factor, out=slope[rows])
-                torch.ops.aten.threshold_backward.grad_input(slope[rows], before[rows], 0.0, grad_input=slope[rows])
-            _product(choice, slope.view(-1, fold * form.width), moment.dtype, out=sums[number].flatten(1))
-            if number == 0:
-                inputs = again[:, again.shape[1] - form.columns :]
-            else:
-                inputs = again if number == form.joined else outputs[number - 1]
-            _product(slope.T, inputs, moment.dtype, out=found.weights[number][:, : inputs.shape[1]])
-        own = sums[:, :keys].sum(2)
+                if form.masked is not None:
+                    form.masked(slope[rows], before[rows], sums[number, part])
+                else:
+                    torch.ops.aten.threshold_backward.grad_input(slope[rows], before[rows], 0.0, grad_input=slope[rows])
+            after = slope
+        own = sums.view(layers, keys, -1, form.width).sum(2) if form.masked else _sums(slopes, keys, moment.dtype)
         torch.sum(own, 1, out=found.biases)
+        _products(slopes[1:].mT, outputs[:-1], out=found.square)
         for number in form.entries:
-            weight = found.weights[number]
+            weight, first = found.weights[number], form.width if number else 0
+            end = first + form.columns
+            _product(slopes[number].T, again[:, -form.columns :], moment.dtype, out=weight[:, first:end])
             torch.mm(own[number].T, moment, out=weight[:, weight.shape[1] - form.moment :])
+            if number:
+                weight[:, :first] = found.square[number - 1]
         return None, None, None, *found.times(unit)
 
 
 class _Gradients:
     """Room for the gradients of all parameters in one piece, so that one kernel multiplies them.
 
-    Biases stand behind weights, the head's last: it is summed before anything is scaled.
+    Parts of weights that meet outputs of layers come first, for one product; that of the joined layer, whose rows go
+    on, is copied. Biases stand behind weights, the head's last: it is summed before anything is scaled.
     """
 
     def __init__(self, form: Form, moment: Tensor, layers: int, rows: int, values: int):
-        wide = form.place + form.moment
-        columns = [wide] + [form.width + (wide if number == form.joined else 0) for number in range(1, layers)]
-        sizes = [form.width * column for column in columns] + [rows * form.width, layers * form.width, values]
+        width, wide = form.width, form.place + form.moment
+        columns = [wide + (width if number else 0) for number in form.entries]
+        sizes = [(layers - 1) * width * width, *(width * own for own in columns), rows * width, layers * width, values]
         self.scaled = moment.new_empty(sum(sizes))
-        *weights, head, biases, self.head_bias = self.scaled.split(sizes)
-        self.weights = [part.view(form.width, -1) for part in weights] + [head.view(rows, form.width)]
-        self.biases = biases.view(layers, form.width)
+        square, *entries, head, biases, self.head_bias = self.scaled.split(sizes)
+        self.square = square.view(layers - 1, width, width)
+        self.weights = [square, *self.square, head.view(rows, width)]
+        for number, part in zip(form.entries, entries, strict=True):
+            self.weights[number] = part.view(width, -1)
+        self.biases = biases.view(layers, width)
 
     def times(self, unit: Tensor) -> list[Tensor]:
         """Weight and bias of every layer, then of the head, in the unit of the loss."""
@@ -195,17 +207,19 @@ def _copy(to: Tensor, rows: Tensor) -> None:
     to.copy_(rows)
 
 
-def _choice(place: Float[Tensor, "N columns"], keys: int) -> tuple[Float[Tensor, "aligned r"], int]:
-    """Zeros and ones that add up rows of each key by a product, and how many rows lie side by side in it.
+def _sums(slopes: Float[Tensor, "layers rows width"], keys: int, dtype: torch.dtype) -> Float[Tensor, "layers k width"]:
+    """Sums over the rows of each key, by products with zeros and ones.
 
     A product of few rows with many columns fills a GPU without splitting its sum; what lies side by side is added
     later. Columns are what is contiguous: there are as many rows as 16 bytes hold.
     """
-    fold = math.gcd(len(place), FOLD)
-    each = len(place) // fold
-    choice = place.new_zeros(keys, each, -(-keys // ALIGNED) * ALIGNED)
+    layers, rows, width = slopes.shape
+    fold = math.gcd(rows // keys, FOLD)
+    choice = slopes.new_zeros(keys, rows // keys // fold, -(-keys // ALIGNED) * ALIGNED)
     choice.diagonal(dim1=0, dim2=2).fill_(1.0)
-    return choice.flatten(0, 1).T, fold
+    sums = slopes.new_empty(layers, choice.shape[2], fold * width, dtype=dtype)
+    _products(choice.flatten(0, 1).T.expand(layers, -1, -1), slopes.view(layers, -1, fold * width), out=sums)
+    return sums.view(layers, -1, fold, width)[:, :keys].sum(2)
 
 
 def _largest(values: Float[Tensor, "rows v"]) -> Float[Tensor, ""]:
@@ -252,3 +266,12 @@ def _product(
     if left.is_cuda and hasattr(torch.ops.aten.mm, "dtype"):
         return torch.mm(left, right, out_dtype=dtype, out=out)
     return torch.mm(left.to(dtype), right.to(dtype), out=out)
+
+
+def _products(left: Float[Tensor, "n a b"], right: Float[Tensor, "n b c"], *, out: Float[Tensor, "n a c"]) -> None:
+    """Several products that fill a GPU together; one after the other where their results would be rounded."""
+    if left.is_cuda and left.dtype != out.dtype and hasattr(torch.ops.aten.bmm, "dtype_out"):
+        torch.bmm(left, right, out_dtype=out.dtype, out=out)
+        return
+    for one, other, result in zip(left, right, out, strict=True):
+        _product(one, other, out.dtype, out=result)
