@@ -12,6 +12,8 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 
+from ..render.bridge import captured
+
 LOG = logging.getLogger("gftorf_warp")
 WARM_UP = 3  # runs before the first that counts: kernels are loaded, memory is found
 Function = Callable[[], object]
@@ -111,7 +113,7 @@ class TorchWatch:
                 function()
         self.module.current_stream().wait_stream(side)
         graph = self.module.CUDAGraph()
-        with self.module.graph(graph):
+        with captured(graph, side):
             kept = function()  # results live in the graph's memory as long as the function that replays it
 
         def replay() -> object:
