@@ -78,7 +78,7 @@ def test_derivatives_of_a_lens():
     lens, step = Distortion(k1=-0.25, k2=0.3, p1=0.2, p2=-0.1, k3=0.4), 1e-6
     by_x = (np.array(lens.apply(x + step, y)) - lens.apply(x - step, y)) / (2 * step)
     by_y = (np.array(lens.apply(x, y + step)) - lens.apply(x, y - step)) / (2 * step)
-    xx, xy, yy = lens._slope(x, y)
+    xx, xy, yy = lens.slope(x, y)
     np.testing.assert_allclose((xx, xy), by_x, atol=1e-8)
     np.testing.assert_allclose((xy, yy), by_y, atol=1e-8)
 
