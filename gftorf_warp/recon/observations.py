@@ -110,7 +110,7 @@ def observe(sequence: Sequence, settings: ReconSettings, device: torch.device | 
 
     Raises:
         InputError: If no raw frame was measured, all quads are zero, what is to be compared does not exist, or the
-            sensor is one that cannot be rendered: several modulation frequencies, or a lens that distorts.
+            sensor is one that cannot be rendered: several modulation frequencies.
     """
     if not sequence.measured.any() or not np.abs(sequence.quads[sequence.measured]).max() > 0:
         raise InputError(
@@ -119,7 +119,7 @@ def observe(sequence: Sequence, settings: ReconSettings, device: torch.device | 
             why="no raw frame exists, or all of them are zero",
             fix="check the folder with `gftorf check`",
         )
-    _demand_one_frequency_and_a_pinhole(sequence)
+    _demand_one_frequency(sequence)
     if settings.quad_scale is None:
         scale, scale_source = quad_scale(sequence)
     else:
@@ -194,16 +194,14 @@ def _colour(sequence: Sequence, settings: ReconSettings) -> tuple[dict[int, np.n
     return {n: image / np.float32(largest) for n, image in sequence.colour.items()}, 1.0 / largest
 
 
-def _demand_one_frequency_and_a_pinhole(sequence: Sequence) -> None:
+def _demand_one_frequency(sequence: Sequence) -> None:
     frequencies = [] if sequence.frequencies_hz is None else sorted(set(sequence.frequencies_hz.tolist()))
-    lens = sequence.distortion is not None and any(sequence.distortion)
-    if len(frequencies) > 1 or lens:
+    if len(frequencies) > 1:
         raise InputError(
             "a sensor that is not rendered",
             where=sequence.path or "sequence",
-            why="expected one modulation frequency and a pinhole, found "
-            + (f"a lens with {sequence.distortion}" if lens else f"{frequencies} Hz"),
-            fix="record without the lens" if lens else "keep the raw frames of one frequency",
+            why=f"expected one modulation frequency, found {frequencies} Hz",
+            fix="keep the raw frames of one frequency",
         )
 
 
@@ -266,6 +264,8 @@ def data_hash(sequence: Sequence) -> str:
             digest.update(f"{name} {array.shape}".encode())
             digest.update(np.ascontiguousarray(array).tobytes())
     digest.update(repr([getattr(sequence, name) for name in HASHED_NUMBERS]).encode())
+    if sequence.distortion is not None:
+        digest.update(repr(sequence.distortion).encode())
     for name in ("forward_flow", "backward_flow", "colour"):
         for frame, image in sorted(getattr(sequence, name).items()):
             digest.update(f"{name} {frame}".encode() + np.ascontiguousarray(image).tobytes())

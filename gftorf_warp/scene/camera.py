@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..constants import GUARD
-from .distortion import Distortion
+from .distortion import Distortion, inside
 
 CHECKED = 33  # places per axis at which a lens is tried when a camera is made
 
@@ -94,6 +94,15 @@ class Camera:
         return replace(
             self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy
         )
+
+    def area(self, point: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n"]:
+        """Area on the sensor over that of a pinhole's image [1], of something small at points in the world [m]."""
+        if not self.distortion:
+            return torch.ones_like(point[..., 0])
+        pose = torch.from_numpy(self.camera_from_world).to(point)
+        x, y, z = (point @ pose[:3, :3].T + pose[:3, 3]).unbind(-1)
+        xx, xy, yy = self.distortion.slope(*inside(x / z, y / z, self.guard.radius))
+        return xx * yy - xy * xy
 
     def slopes(self, points: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n 2"]:
         """x/z and y/z [1] of what is seen at image positions (x, y) [px], in their dtype; a lens is undone.

@@ -25,7 +25,7 @@ from .record import ENGINES, Progress, frame_times, needs_mesh, record
 from .scene import overridden
 from .scene_file import read_scene
 from .scenes import SCENES, Scene
-from .splat import clearance
+from .splat import clearance, wider
 from .unfinished import needs_recording, set_aside, unfinished
 
 CLEARANCE = 0.5  # [m] nearer bodies fill the image, and a cover of them would need millions of splats
@@ -124,6 +124,7 @@ def simulate(
             fix="leave --flow out, or --format ftorf",
         )
     _check_sensor(found.sensor, format)
+    _check_lens(found, options["size"], options["engine"], format)
     _check_duration(found, frames)
     card = settings_card(found, options, format, own=own, level=level, truth=truth)
     out = Path(out).absolute() if fresh else Path(out)
@@ -211,13 +212,6 @@ def _check_engine(scene: Scene, engine: str, bounces: int, paths: int, device: s
         "--paths": (paths >= 1, f"{paths}", "at least 1"),
     }
     _refuse(wanted)
-    if scene.lens.distortion:
-        raise UsageError(
-            "no engine renders through a lens that distorts",
-            where="lens.distortion",
-            why=f"both engines look along the rays of a pinhole, not {scene.lens.distortion}",
-            fix="leave lens.distortion out; gftorf_warp.sim.ideal makes ideal quads and truth through such a lens",
-        )
     beam = "0 with bounces: it is of direct light; use beam_deg"
     _refuse({"lens.beam_power": (not (scene.lens.beam_power and bounces), f"{scene.lens.beam_power:g}", beam)})
     if engine != "mesh":
@@ -275,6 +269,28 @@ def _check_sensor(sensor: Sensor, layout: str) -> None:
             why=impossible,
             fix="lower the contrast or the DC offset, or make the sensor unipolar",
         )
+
+
+def _check_lens(scene: Scene, size: tuple[int, int], engine: str, layout: str) -> None:
+    if not scene.lens.distortion:
+        return
+    if layout != "capture":
+        raise UsageError(
+            "an F-ToeRF folder cannot express this lens",
+            where="lens.distortion",
+            why=f"it holds the matrix of a pinhole, not {scene.lens.distortion}",
+            fix="leave lens.distortion out, or --format capture",
+        )
+    try:
+        camera = scene.camera(size)
+        _ = camera if engine == "mesh" else wider(camera)
+    except ValueError as error:
+        raise UsageError(
+            "this lens sees too much",
+            where="lens.distortion",
+            why=str(error),
+            fix="make its coefficients or horizontal_fov_deg smaller, or, if the fold is outside the image, --engine mesh",
+        ) from error
 
 
 def _check_duration(scene: Scene, frames: int | None) -> None:
