@@ -11,12 +11,9 @@ from small_runs import small
 
 from gftorf_warp.errors import InputError, UsageError
 from gftorf_warp.recon.train import reconstruct
-from gftorf_warp.render.api import rasterize
-from gftorf_warp.render.trace import RigidBody, Tracer
 from gftorf_warp.scene.camera import Camera
 from gftorf_warp.scene.distortion import Distortion
 from gftorf_warp.scene.electrons import electron_gain
-from gftorf_warp.scene.gaussians import GaussianField, constant_sh
 from gftorf_warp.scene.measured import camera_of
 from gftorf_warp.scene.optics import Lens, lens_rows, shading
 from gftorf_warp.scene.pattern import Pattern, gain_map
@@ -100,7 +97,6 @@ def test_truth_and_ideal_quads_are_seen_through_the_lens():
 @pytest.mark.parametrize(
     ("changes", "says"),
     [
-        ({"distortion": (-0.2, 0.0, 0.0, 0.0, 0.0)}, "a pinhole, found a lens"),
         (
             {"frequencies_hz": np.repeat([20e6, 30e6], 6)},
             r"one modulation frequency .* found \[20000000.0, 30000000.0\]",
@@ -108,7 +104,7 @@ def test_truth_and_ideal_quads_are_seen_through_the_lens():
     ],
 )
 def test_what_cannot_be_rendered_is_not_reconstructed(changes, says, tmp_path):
-    """A sequence through a lens, or of two frequencies, would be fitted wrong without a word."""
+    """A sequence of two frequencies would be fitted wrong without a word."""
     with pytest.raises(InputError, match=says):
         reconstruct(replace(small(), **changes), tmp_path / "run", "demo", images=4)
 
@@ -129,28 +125,11 @@ def test_lenses_that_cannot_be_undone_are_refused():
         Distortion(p2=math.nan)
 
 
-def test_engines_refuse_a_lens_that_distorts(tmp_path):
-    """Before anything is written; the layers below refuse it too."""
-    for engine in ("gaussian", "mesh"):
-        with pytest.raises(UsageError, match="no engine renders through a lens") as caught:
-            simulate(scene(lens=Lens(distortion=BARREL)), tmp_path / "out", engine=engine)
-        assert caught.value.where == "lens.distortion"
+def test_a_lens_that_cannot_be_undone_is_an_error_of_the_user(tmp_path):
+    """Before anything is written."""
     with pytest.raises(UsageError, match="cannot be undone"):
         simulate("demo", tmp_path / "out", overrides=["lens.distortion.k1=-2"])
     assert not (tmp_path / "out").exists()
-    camera = scene(lens=Lens(distortion=BARREL)).camera()
-    one = torch.ones(1)
-    field = GaussianField(
-        mean=torch.tensor([[0.0, 0.0, 3.0]]),
-        log_scale=torch.zeros(1, 3),
-        quaternion=torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
-        opacity_logit=one,
-        reflectivity_sh=constant_sh(one),
-    )
-    with pytest.raises(ValueError, match="only a pinhole"):
-        rasterize(field, camera, Sensor())
-    with pytest.raises(ValueError, match="only a pinhole"):
-        Tracer([RigidBody(radius=1.0, low=0.5, high=0.5, cell=0.3)], 33, 25).first_hits(camera, np.eye(4)[None])
 
 
 @pytest.mark.parametrize(
