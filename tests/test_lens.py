@@ -1,4 +1,4 @@
-"""A lens that distorts, in both engines and in a reconstruction: rays, splats, what lies outside, and what comes of it."""
+"""A lens that distorts, in both engines and in a reconstruction: rays, splats, what lies outside, what comes of it."""
 
 import logging
 from dataclasses import replace
@@ -87,7 +87,7 @@ def test_rays_of_kernels_are_those_of_the_camera_and_of_opencv(lens):
 
 @LENSES
 def test_what_is_far_outside_stays_outside(lens):
-    """Where the polynomial would turn back, its tangent goes on: outwards, alike in kernels and camera, and invertible."""
+    """Where the polynomial would turn back, its tangent goes on: outwards, alike in kernels and camera."""
     camera = wide(lens)
     radius = camera.guard.radius
     angle, far = np.meshgrid(np.linspace(0, 2 * np.pi, 41), np.linspace(0.2, 6.0, 400))
@@ -181,7 +181,8 @@ def test_random_points_are_as_dense_everywhere_in_what_a_lens_sees():
     points = _in_frusta([camera], settings, torch.Generator().manual_seed(0)).double()
     assert len(points) == 40000
     seen = camera.project(points)
-    assert (seen >= -1e-3).all() and (seen <= torch.tensor([320.001, 240.001])).all()
+    assert (seen >= -1e-3).all()
+    assert (seen <= torch.tensor([320.001, 240.001])).all()
     radius = (points[:, :2] / points[:, 2:]).norm(dim=1)
     counts = [int((radius < r).sum()) for r in (0.25, 0.5)]
     assert counts[1] / counts[0] == pytest.approx(4.0, rel=4 / counts[0] ** 0.5)

@@ -5,9 +5,9 @@ is at Q = M P + m + R D of the later camera, with [M m] from one camera to the o
 
     F = f Q_xy / Q_z + c - x,   e = |F - F_measured|^2,   dF/dQ = f / Q_z (1, 0, -Q_x / Q_z), ..
 
-(method, section 5). A lens that distorts is undone to get the ray, and images Q_xy / Q_z elsewhere, with a derivative of
-its own (scene/distortion.py); a pinhole does not come that way. The distance has no derivative. A measured flow that is
-not finite is unknown: no error there.
+(method, section 5). A lens that distorts is undone to get the ray, and images Q_xy / Q_z elsewhere, with a derivative
+of its own (scene/distortion.py); a pinhole does not come that way. The distance has no derivative. A measured flow that
+is not finite is unknown: no error there.
 """
 
 import warp as wp

@@ -3,7 +3,7 @@
 Here a physicist checks the model (method, section 2). Gaussian k, its centre X in the world, the pose (Rc, t):
 
     camera axes      X_c = Rc X + t = (x, y, z),  distance d = |X_c|,  direction n = (X - camera centre) / d
-    image            u = fx x / z + cx,  v = fy y / z + cy;  a lens images (x / z, y / z) elsewhere, with its own Jacobian
+    image            u = fx x / z + cx,  v = fy y / z + cy;  a lens images (x / z, y / z) elsewhere and has its own J
     footprint        cov2D = U Sigma U^T + 0.3 I,  U = J Rc,  Sigma = Gamma Gamma^T,  Gamma = R(quaternion) diag(scale)
     response         G = exp(-1/2 (k1 dx^2 + k3 dy^2) - k2 dx dy),  [[k1, k2], [k2, k3]] = cov2D^-1
     alpha            alpha = min(0.99, o G), none below 1/255,  T_k = prod_{l < k} (1 - alpha_l),  w_k = alpha_k T_k

@@ -113,7 +113,8 @@ class Camera:
         flat = (points - points.new_tensor([self.cx, self.cy])) / points.new_tensor([self.fx, self.fy])
         if not self.distortion:
             return flat
-        x, y = self.distortion.undo(*flat.detach().double().cpu().numpy().reshape(-1, 2).T, self.guard.radius)
+        x, y = flat.detach().double().cpu().numpy().reshape(-1, 2).T
+        x, y = self.distortion.undo(x, y, self.guard.radius)
         return torch.from_numpy(np.stack([x, y], axis=-1)).to(points).reshape(points.shape)
 
     def directions(self) -> Float[Tensor, "H W 3"]:

@@ -8,7 +8,7 @@ With x = X/Z, y = Y/Z and r^2 = x^2 + y^2, a lens images what a pinhole would ha
 Rays are looked up by the inverse, found by Newton's iteration. Raw frames are never resampled to undo a distortion:
 interpolation mixes surfaces as motion does.
 
-A polynomial that was fitted inside an image may turn back outside of it, and would fold what nobody sees into the image.
+A polynomial that was fitted inside an image may turn back outside of it, and would fold what nobody sees into it.
 Within a disc of radius R about the axis it does not, and what is outside is imaged as the tangent there goes on:
 
     p = min(1, R / r) (x, y),   (x', y')  becomes  D(p) + J(p) ((x, y) - p)

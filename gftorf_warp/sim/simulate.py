@@ -212,8 +212,6 @@ def _check_engine(scene: Scene, engine: str, bounces: int, paths: int, device: s
         "--paths": (paths >= 1, f"{paths}", "at least 1"),
     }
     _refuse(wanted)
-    beam = "0 with bounces: it is of direct light; use beam_deg"
-    _refuse({"lens.beam_power": (not (scene.lens.beam_power and bounces), f"{scene.lens.beam_power:g}", beam)})
     if engine != "mesh":
         light = "mesh: the light is beside the camera, has a beam or bounces, or a body is glossy or a mesh that moves"
         _refuse({"--engine": (not needs_mesh(scene, bounces), repr(engine), light)})
@@ -289,7 +287,7 @@ def _check_lens(scene: Scene, size: tuple[int, int], engine: str, layout: str) -
             "this lens sees too much",
             where="lens.distortion",
             why=str(error),
-            fix="make its coefficients or horizontal_fov_deg smaller, or, if the fold is outside the image, --engine mesh",
+            fix="make its coefficients or horizontal_fov_deg smaller; or --engine mesh, which needs no margin",
         ) from error
 
 
