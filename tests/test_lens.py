@@ -31,6 +31,7 @@ from gftorf_warp.scene.distortion import Distortion
 from gftorf_warp.scene.initialise import InitSettings, _in_frusta
 from gftorf_warp.scene.optics import Lens
 from gftorf_warp.scene.sensor import Sensor
+from gftorf_warp.sim import splat
 from gftorf_warp.sim.assembly import Level
 from gftorf_warp.sim.paths import Line, Still
 from gftorf_warp.sim.record import record
@@ -152,8 +153,38 @@ def test_engines_agree_through_a_lens(lens):
     assert np.abs(distance[still]).mean() < 2e-3
     assert np.abs(amplitude[still]).max() < 0.07
     assert np.abs(amplitude[still]).mean() < 0.015
+    assert -0.010 < amplitude[still].mean() < -0.006, "splats as round and as large on the image as a pinhole's"
     assert np.abs(distance[moving]).max() < 5e-3
     assert -0.12 < amplitude[moving].min() <= amplitude[moving].max() < -0.05
+
+
+def test_covers_know_how_a_lens_stretches():
+    """Growth of distance per pixel towards where z-depth grows fastest, and the largest stretch, by differences."""
+    camera, rng = wide(BARREL), np.random.default_rng(0)
+    points = rng.uniform([20, 20], [300, 220], (100, 2))
+    normal = rng.normal(size=(100, 3)) * [0.4, 0.4, 0.1] - [0, 0, 1.0]
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    distance = rng.uniform(2.0, 4.0, 100)
+
+    def plane(at):
+        """Distance and z-depth of the tangent planes at image points."""
+        ray = np.concatenate([camera.slopes(torch.from_numpy(at)).numpy(), np.ones((100, 1))], 1)
+        ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+        centre = camera.slopes(torch.from_numpy(points)).numpy()
+        first = np.concatenate([centre, np.ones((100, 1))], 1)
+        first /= np.linalg.norm(first, axis=1, keepdims=True)
+        along = distance * np.sum(first * normal, 1) / np.sum(ray * normal, 1)
+        return along, along * ray[:, 2], first
+
+    h = np.array([[1e-3, 0.0], [0.0, 1e-3]])
+    by_d, by_z = (
+        np.stack([(plane(points + step)[k] - plane(points - step)[k]) / 2e-3 for step in h], 1) for k in (0, 1)
+    )
+    want = np.sum(by_d * by_z, 1) / np.linalg.norm(by_z, axis=1)
+    assert np.abs(want).max() > 5e-3
+    np.testing.assert_allclose(splat._slope(normal, distance, plane(points)[2], camera), want, atol=1e-7)
+    corner = float(wide(PINCUSHION).slopes(torch.tensor([[0.5, 239.5]], dtype=torch.float64)).norm())
+    assert splat._magnification(wide(PINCUSHION)) == pytest.approx(1 + 3 * 0.15 * corner**2 - 5 * 0.02 * corner**4)
 
 
 def test_flow_is_between_places_on_the_sensor():

@@ -4,9 +4,9 @@ With th the angle between a pixel's ray and the optical axis, a pixel gets
 
     of its own light       beam(th) cos^n(th) V(r) M       of any light      cos^n(th) V(r) M
 
-times what it would get otherwise. r is 1 in the farthest corner of the image, M is a map that was measured. On a frontal
-wall an isotropic emitter gives cos^3; with a lens of n = 4 cos^7; and with it and a beam of power -3, which lights the
-wall evenly, cos^4.
+times what it would get otherwise. r is 1 in the farthest corner of the image, M is a map that was measured. On a
+frontal wall an isotropic emitter gives cos^3; with a lens of n = 4 cos^7; and with it and a beam of power -3, which
+lights the wall evenly, cos^4.
 """
 
 from __future__ import annotations
