@@ -274,16 +274,29 @@ def test_a_reconstruction_through_a_lens_is_the_scene(captured, tmp_path, kernel
 
 
 def test_layouts_without_a_lens_refuse_it(tmp_path):
-    """Before anything is recorded; so does engine gaussian a fold in the margin that its splats need."""
+    """Before anything is recorded; so is an image in which it folds at the size that is asked for."""
     for layout in ("ftorf", "torf"):
         with pytest.raises(UsageError, match="cannot express this lens") as caught:
             simulate("demo", tmp_path / "out", format=layout, overrides=["lens.distortion.k1=-0.1"])
         assert caught.value.where == "lens.distortion"
-    edge = {"format": "capture", "size": (32, 24), "frames": 4, "overrides": ["lens.distortion.k1=-0.27"]}
+    edge = {"format": "capture", "frames": 4, "overrides": ["lens.distortion.k1=-0.27"]}
     with pytest.raises(UsageError, match="sees too much"):
-        simulate("demo", tmp_path / "out", **edge)
+        simulate("demo", tmp_path / "out", size=(16, 48), **edge)
     assert not (tmp_path / "out").exists()
-    assert simulate("demo", tmp_path / "mesh", engine="mesh", **edge).exists()
+    assert not list(tmp_path.iterdir())
+
+
+def test_covers_reach_into_a_margin_where_the_lens_folds():
+    """Three pixels of 24 beside the image: there the polynomial has an end, and the cover goes on."""
+    scene = replace(SCENES["demo"], lens=Lens(distortion=Distortion(k1=-0.27)))
+    camera = scene.camera((24, 18))
+    with pytest.raises(ValueError, match="cannot be undone"):
+        replace(camera, width=30, height=24, cx=camera.cx + 3, cy=camera.cy + 3)
+    gaussian, mesh = (record(scene, frames=1, size=(24, 18), noise=False, engine=e) for e in ("gaussian", "mesh"))
+    border = np.ones((18, 24), dtype=bool)
+    border[1:-1, 1:-1] = False
+    light = [recording.truth.amplitude[0][border].mean() for recording in (gaussian, mesh)]
+    assert light[0] == pytest.approx(light[1], rel=0.05)
 
 
 def test_zero_coefficients_are_a_pinhole():

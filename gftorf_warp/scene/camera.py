@@ -125,7 +125,7 @@ class Camera:
         x = (np.arange(self.width) + 0.5 - self.cx) / self.fx
         y = (np.arange(self.height)[:, None] + 0.5 - self.cy) / self.fy
         if self.distortion:
-            x, y = self.distortion.undo(x, y)
+            x, y = self.distortion.undo(x, y, self.guard.radius)
         shape = (self.height, self.width)
         flat = [torch.from_numpy(np.broadcast_to(axis, shape).copy()) for axis in (x, y)]
         directions = torch.stack([*flat, torch.ones(shape, dtype=torch.float64)], dim=-1)

@@ -25,7 +25,7 @@ from .record import ENGINES, Progress, frame_times, needs_mesh, record
 from .scene import overridden
 from .scene_file import read_scene
 from .scenes import SCENES, Scene
-from .splat import clearance, wider
+from .splat import clearance
 from .unfinished import needs_recording, set_aside, unfinished
 
 CLEARANCE = 0.5  # [m] nearer bodies fill the image, and a cover of them would need millions of splats
@@ -124,7 +124,7 @@ def simulate(
             fix="leave --flow out, or --format ftorf",
         )
     _check_sensor(found.sensor, format)
-    _check_lens(found, options["size"], options["engine"], format)
+    _check_lens(found, options["size"], format)
     _check_duration(found, frames)
     card = settings_card(found, options, format, own=own, level=level, truth=truth)
     out = Path(out).absolute() if fresh else Path(out)
@@ -269,7 +269,7 @@ def _check_sensor(sensor: Sensor, layout: str) -> None:
         )
 
 
-def _check_lens(scene: Scene, size: tuple[int, int], engine: str, layout: str) -> None:
+def _check_lens(scene: Scene, size: tuple[int, int], layout: str) -> None:
     if not scene.lens.distortion:
         return
     if layout != "capture":
@@ -280,14 +280,13 @@ def _check_lens(scene: Scene, size: tuple[int, int], engine: str, layout: str) -
             fix="leave lens.distortion out, or --format capture",
         )
     try:
-        camera = scene.camera(size)
-        _ = camera if engine == "mesh" else wider(camera)
+        scene.camera(size)
     except ValueError as error:
         raise UsageError(
             "this lens sees too much",
             where="lens.distortion",
             why=str(error),
-            fix="make its coefficients or horizontal_fov_deg smaller; or --engine mesh, which needs no margin",
+            fix="make its coefficients or horizontal_fov_deg smaller, or the image less high",
         ) from error
 
 

@@ -19,7 +19,7 @@ instant: what the sensor measures obeys Lambert's law, not the model that is fit
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
@@ -27,7 +27,8 @@ import torch
 from jaxtyping import Float
 
 from ..constants import ALPHA_MAX, ALPHA_MIN, LOW_PASS
-from ..scene.camera import Camera
+from ..scene.camera import Camera, Guard
+from ..scene.distortion import inside
 from ..scene.gaussians import GaussianField, constant_sh
 from .assembly import Assembly
 from .world import Body, albedo, first_hit
@@ -136,7 +137,7 @@ def cover_still(bodies: tuple[Body, ...], camera: Camera) -> Cover:
 
     Each is a disc in the surface, stretched along the slope so that it looks round, and set back as described above.
     """
-    wide = wider(camera)
+    wide = _wider(camera)
     hits = first_hit(bodies, wide, 0.0)
     hit = np.isfinite(hits.distance)
     normal, distance = hits.normal[hit], hits.distance[hit]
@@ -165,18 +166,30 @@ def cover_still(bodies: tuple[Body, ...], camera: Camera) -> Cover:
     )
 
 
-def wider(camera: Camera) -> Camera:
-    """The same camera with a margin around its image, as wide as a splat reaches.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Wide(Camera):
+    """A camera with a margin around its image, into which its lens goes on as it does for the renderer."""
 
-    Raises:
-        ValueError: If its lens folds the world over in that margin.
-    """
-    return replace(
-        camera,
+    inner: Camera
+
+    @property
+    def guard(self) -> Guard:
+        """That of the image alone: in the margin a lens may fold."""
+        return self.inner.guard
+
+
+def _wider(camera: Camera) -> Camera:
+    """The same camera with a margin as wide as a splat reaches."""
+    return _Wide(
         width=camera.width + 2 * MARGIN,
         height=camera.height + 2 * MARGIN,
+        fx=camera.fx,
+        fy=camera.fy,
         cx=camera.cx + MARGIN,
         cy=camera.cy + MARGIN,
+        camera_from_world=camera.camera_from_world,
+        distortion=camera.distortion,
+        inner=camera,
     )
 
 
@@ -259,7 +272,7 @@ def _slope(normal, distance, ray, camera: Camera) -> Float[np.ndarray, "N"]:
 
 def _per_pixel(gradient, flat, camera: Camera) -> Float[np.ndarray, "N 2"]:
     """A gradient by pixels of a pinhole as one by pixels of a lens, whose derivative is symmetric."""
-    xx, xy, yy = camera.distortion.slope(flat[:, 0], flat[:, 1])
+    xx, xy, yy = camera.distortion.slope(*inside(flat[:, 0], flat[:, 1], camera.guard.radius))
     focal = np.array([camera.fx, camera.fy])
     x, y = (gradient * focal).T
     return np.stack([x * yy - y * xy, y * xx - x * xy], axis=1) / (xx * yy - xy * xy)[:, None] / focal
