@@ -1,0 +1,138 @@
+"""Which pixels of a camera at rest never change, by the evidence of raw quads alone.
+
+Values of one phase shift in one pixel are compared with each other: the same shift of the same matter is the same value
+up to noise, whatever its phase wraps to and whatever light there is besides. So the mean over some cycles in a row must
+be the mean over all cycles. A test that fails anywhere in time makes a pixel one that changes.
+"""
+
+from __future__ import annotations
+
+import math
+from statistics import NormalDist
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from ..data.sequence import Sequence
+from .camera import Camera
+from .gaussians import GaussianField
+
+SMOOTHED = 3  # [px] side of the window whose mean is compared: small, since motion at its edge wakes all of it
+FALSE_ALARMS = 0.1  # pixels of a whole sequence at rest that are expected to be taken for changing ones
+LEVELS = 16  # classes of brightness in which noise is estimated
+FLOOR = 1e-4  # of the largest quad: less noise than this is not believed, rounding is as large
+MAD = 1.4826  # standard deviation of a normal distribution over its median absolute value
+SIGMAS = 3.0  # radius of a Gaussian's footprint
+
+
+def still_pixels(sequence: Sequence, margin: int = 1) -> Bool[Tensor, "H W"]:
+    """Pixels in whose neighbourhood no quad changes over all measured raw frames.
+
+    For each phase shift, means over windows of 1, 2, 4, .. cycles up to half of all, every start, differ from the mean
+    over all n cycles by noise of standard deviation s sqrt(1/w - 1/n). The threshold is where a normal distribution
+    leaves FALSE_ALARMS in all tests together, which overstates their number: windows overlap.
+
+    Args:
+        sequence: Of a camera at rest; phasors count as the quads that they are.
+        margin: Pixels within so many rows and columns of one that changes are not still either [px].
+
+    Returns:
+        On the CPU. All False if no shift was measured twice: then nothing is known.
+    """
+    groups = [_smooth(group) for group in _by_shift(sequence)]
+    height, width = sequence.quads.shape[1:]
+    if not groups:
+        return torch.zeros(height, width, dtype=torch.bool)
+    noise = noise_of(groups) / _whole(height, width).sqrt()
+    windows = [(group, w) for group in groups for w in _lengths(len(group))]
+    tests = height * width * sum(len(group) - w + 1 for group, w in windows)
+    limit = NormalDist().inv_cdf(1.0 - 0.5 * FALSE_ALARMS / tests)
+    changed = torch.zeros(height, width, dtype=torch.bool)
+    for group, w in windows:
+        apart = torch.nn.functional.avg_pool1d(group.flatten(1).T, w, stride=1) - group.mean(dim=0).flatten()[:, None]
+        largest = apart.abs().amax(dim=1).view(height, width)
+        changed |= ~(largest <= limit * noise * math.sqrt(1.0 / w - 1.0 / len(group)))
+    return ~_grown(changed, margin)
+
+
+def noise_of(groups: list[Float[Tensor, "n H W"]]) -> Float[Tensor, "H W"]:
+    """Standard deviation of a value in each pixel, from differences in time: variance = a + b level, a and b >= 0.
+
+    The level is the mean absolute value of a pixel. In each class of brightness the variance is from the median
+    absolute difference of neighbouring cycles; the line through the classes is by medians, too, so that a class which
+    a moving object fills does not decide.
+
+    Args:
+        groups: Values of each shift, at least two each.
+    """
+    everything = torch.cat(groups)
+    difference = torch.cat([group.diff(dim=0) for group in groups]).flatten(1).abs() / math.sqrt(2.0)
+    level = everything.abs().mean(dim=0)
+    classes = [part for part in level.flatten().argsort().tensor_split(LEVELS) if len(part)]
+    at = torch.stack([level.flatten()[part].mean() for part in classes])
+    variance = torch.stack([(MAD * difference[:, part].median()).square() for part in classes])
+    one, other = torch.triu_indices(len(classes), len(classes), offset=1)
+    slopes = (variance[other] - variance[one]) / (at[other] - at[one]).clamp_min(1e-12)
+    slope = slopes.median().clamp_min(0.0) if len(slopes) else level.new_zeros(())
+    constant = (variance - slope * at).median().clamp_min(0.0)
+    floor = FLOOR * float(everything.abs().max())
+    return (constant + slope * level).sqrt().clamp_min(floor)
+
+
+def rests(field: GaussianField, still: Bool[Tensor, "H W"], camera: Camera) -> Bool[Tensor, "N"]:
+    """Gaussians that only still pixels see: centre in the image, and nothing else within three sigma of the footprint.
+
+    The square around a disc of the largest scale is looked at; what of it lies outside of the image is not.
+
+    Args:
+        field: Where they are.
+        still: From :func:`still_pixels`.
+        camera: Of these pixels.
+    """
+    height, width = still.shape
+    pose = torch.as_tensor(camera.camera_from_world).to(field.mean)
+    mean = field.mean.detach()
+    z = mean @ pose[2, :3] + pose[2, 3]
+    place = camera.project(mean)
+    radius = SIGMAS * math.sqrt(camera.fx * camera.fy) * field.scale.detach().amax(dim=1) / z
+    size = place.new_tensor([width, height])
+    seen = (z > 0) & ((place >= 0) & (place < size)).all(dim=1) & radius.isfinite()
+    radius = torch.where(seen, radius, 0.0)[:, None]
+    place = torch.where(seen[:, None], place, 0.0)
+    last = size - 1.0
+    first, end = ((place + sign * radius).floor().clamp_min(0.0).minimum(last).long() for sign in (-1.0, 1.0))
+    sums = torch.zeros(height + 1, width + 1, dtype=torch.int64, device=still.device)
+    sums[1:, 1:] = (~still).long().cumsum(dim=0).cumsum(dim=1)
+    (x0, y0), (x1, y1) = first.unbind(dim=1), (end + 1).unbind(dim=1)
+    return seen & (sums[y1, x1] - sums[y0, x1] - sums[y1, x0] + sums[y0, x0] == 0)
+
+
+def _by_shift(sequence: Sequence) -> list[Float[Tensor, "n H W"]]:
+    """Measured quads of each shift, in their order, of those shifts that were measured at least twice."""
+    shifts = np.round(np.mod(sequence.shifts, 2.0 * math.pi), 6)
+    rows = [np.flatnonzero(sequence.measured & (shifts == shift)) for shift in np.unique(shifts)]
+    return [torch.tensor(sequence.quads[row], dtype=torch.float64) for row in rows if len(row) > 1]
+
+
+def _lengths(count: int) -> list[int]:
+    """1, 2, 4, .. up to half of ``count``."""
+    return [1 << n for n in range(max(count // 2, 1).bit_length())]
+
+
+def _smooth(images: Float[Tensor, "n H W"]) -> Float[Tensor, "n H W"]:
+    """Means over small windows; at the border over what there is of them."""
+    half = SMOOTHED // 2
+    return torch.nn.functional.avg_pool2d(images[:, None], SMOOTHED, 1, half, count_include_pad=False)[:, 0]
+
+
+def _whole(height: int, width: int) -> Float[Tensor, "H W"]:
+    """Share of the window of each pixel that lies in the image [1]: the mean of fewer pixels is noisier."""
+    ones = torch.ones(1, height, width, dtype=torch.float64)
+    return torch.nn.functional.avg_pool2d(ones, SMOOTHED, 1, SMOOTHED // 2)[0]
+
+
+def _grown(mask: Bool[Tensor, "H W"], margin: int) -> Bool[Tensor, "H W"]:
+    """A mask and all within ``margin`` rows and columns of it."""
+    return torch.nn.functional.max_pool2d(mask.float()[None, None], 2 * margin + 1, 1, margin)[0, 0] > 0
