@@ -24,6 +24,7 @@ FALSE_ALARMS = 0.1  # pixels of a whole sequence at rest that are expected to be
 LEVELS = 16  # classes of brightness in which noise is estimated
 FLOOR = 1e-4  # of the largest quad: less noise than this is not believed, rounding is as large
 MAD = 1.4826  # standard deviation of a normal distribution over its median absolute value
+NEGATIVE = 0.02  # share of all light that may be below zero where quads are counts: noise around none
 SIGMAS = 3.0  # radius of a Gaussian's footprint
 
 
@@ -45,40 +46,48 @@ def still_pixels(sequence: Sequence, margin: int = 1) -> Bool[Tensor, "H W"]:
     height, width = sequence.quads.shape[1:]
     if not groups:
         return torch.zeros(height, width, dtype=torch.bool)
-    noise = noise_of(groups) / _whole(height, width).sqrt()
-    windows = [(group, w) for group in groups for w in _lengths(len(group))]
-    tests = height * width * sum(len(group) - w + 1 for group, w in windows)
+    border = 1.0 / _whole(height, width).sqrt()
+    windows = [(group, noise, w) for group, noise in zip(groups, noise_of(groups), strict=True) for w in _lengths(len(group))]
+    tests = height * width * sum(len(group) - w + 1 for group, _, w in windows)
     limit = NormalDist().inv_cdf(1.0 - 0.5 * FALSE_ALARMS / tests)
     changed = torch.zeros(height, width, dtype=torch.bool)
-    for group, w in windows:
+    for group, noise, w in windows:
         apart = torch.nn.functional.avg_pool1d(group.flatten(1).T, w, stride=1) - group.mean(dim=0).flatten()[:, None]
         largest = apart.abs().amax(dim=1).view(height, width)
-        changed |= ~(largest <= limit * noise * math.sqrt(1.0 / w - 1.0 / len(group)))
+        changed |= ~(largest <= limit * border * noise * math.sqrt(1.0 / w - 1.0 / len(group)))
     return ~_grown(changed, margin)
 
 
-def noise_of(groups: list[Float[Tensor, "n H W"]]) -> Float[Tensor, "H W"]:
+def noise_of(groups: list[Float[Tensor, "n H W"]]) -> list[Float[Tensor, "H W"]]:
     """Standard deviation of a value in each pixel, from differences in time: variance = a + b level, a and b >= 0.
 
-    The level is the mean absolute value of a pixel. In each class of brightness the variance is from the median
-    absolute difference of neighbouring cycles; the line through the classes is by medians, too, so that a class which
-    a moving object fills does not decide.
+    The noise of counts grows with the count, that of differences of counts with all light: the level is the mean of
+    one shift where nothing is negative, else the mean absolute value over all shifts. In each class of brightness the
+    variance is from the median absolute difference of neighbouring cycles; the line through the classes is by medians,
+    too, so that a class which a moving object fills does not decide.
 
     Args:
         groups: Values of each shift, at least two each.
     """
-    everything = torch.cat(groups)
-    difference = torch.cat([group.diff(dim=0) for group in groups]).flatten(1).abs() / math.sqrt(2.0)
-    level = everything.abs().mean(dim=0)
-    classes = [part for part in level.flatten().argsort().tensor_split(LEVELS) if len(part)]
-    at = torch.stack([level.flatten()[part].mean() for part in classes])
-    variance = torch.stack([(MAD * difference[:, part].median()).square() for part in classes])
+    size = groups[0].shape[1:]
+    means = torch.stack([group.mean(dim=0) for group in groups]).flatten(1)
+    counts = means.clamp_max(0.0).sum() >= -NEGATIVE * means.abs().sum()
+    level = means.clamp_min(0.0) if counts else means.abs().mean(dim=0).expand_as(means)
+    differences = [group.diff(dim=0).flatten(1).abs() / math.sqrt(2.0) for group in groups]
+    rank = level.flatten().argsort().argsort().view(level.shape) * LEVELS // level.numel()
+    classes = rank.unique().tolist()
+    at = torch.stack([level[rank == c].mean() for c in classes])
+    medians = [
+        torch.cat([apart[:, row == c].flatten() for apart, row in zip(differences, rank, strict=True)]).median()
+        for c in classes
+    ]
+    variance = (MAD * torch.stack(medians)).square()
     one, other = torch.triu_indices(len(classes), len(classes), offset=1)
     slopes = (variance[other] - variance[one]) / (at[other] - at[one]).clamp_min(1e-12)
-    slope = slopes.median().clamp_min(0.0) if len(slopes) else level.new_zeros(())
+    slope = slopes.median().clamp_min(0.0) if len(slopes) else at.new_zeros(())
     constant = (variance - slope * at).median().clamp_min(0.0)
-    floor = FLOOR * float(everything.abs().max())
-    return (constant + slope * level).sqrt().clamp_min(floor)
+    floor = FLOOR * max(float(group.abs().max()) for group in groups)
+    return [(constant + slope * row).sqrt().clamp_min(floor).view(size) for row in level]
 
 
 def rests(field: GaussianField, still: Bool[Tensor, "H W"], camera: Camera) -> Bool[Tensor, "N"]:
