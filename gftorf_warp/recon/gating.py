@@ -56,7 +56,7 @@ def judge_after(state: State, before: int, observations: Observations, settings:
         settings: When.
 
     Returns:
-        Whether there was one.
+        Whether anybody fell asleep or woke up.
     """
     if observations.still is None or not is_due(before, state.images, settings):
         return False
@@ -68,9 +68,12 @@ def judge_after(state: State, before: int, observations: Observations, settings:
         keys = list(range(len(state.motion.key_times)))
         off = torch.stack([state.motion.key_offset(state.motion.attach(field), k) for k in keys]).mean(dim=0)
         optimiser.tensors["mean"].data += off * new[:, None]
-    optimiser.layer = torch.where(asleep, -layer, layer)
+    layer = torch.where(asleep, -layer, layer)
+    if field.layer is not None and torch.equal(layer, field.layer):
+        return False  # nodes stay attached as they are
+    optimiser.layer = layer
     state.attachment = state.motion.attach(optimiser.field)
-    LOG.debug("%d of %d Gaussians are awake at image %d", int((optimiser.layer > 0).sum()), len(field), state.images)
+    LOG.debug("%d of %d Gaussians are awake at image %d", int((layer > 0).sum()), len(layer), state.images)
     return True
 
 

@@ -7,7 +7,7 @@ be the mean over all cycles. A test that fails anywhere in time makes a pixel on
 
 from __future__ import annotations
 
-import math
+import math, os
 from statistics import NormalDist
 
 import numpy as np
@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from ..constants import LOW_PASS
 from ..data.sequence import Sequence
 from .camera import Camera
 from .gaussians import GaussianField
@@ -25,7 +26,7 @@ LEVELS = 16  # classes of brightness in which noise is estimated
 FLOOR = 1e-4  # of the largest quad: less noise than this is not believed, rounding is as large
 MAD = 1.4826  # standard deviation of a normal distribution over its median absolute value
 NEGATIVE = 0.02  # share of all light that may be below zero where quads are counts: noise around none
-SIGMAS = 3.0  # radius of a Gaussian's footprint
+SIGMAS = float(os.environ.get('SIG','3'))  # of a splat make up its footprint
 
 
 def still_pixels(sequence: Sequence, margin: int = 1) -> Bool[Tensor, "H W"]:
@@ -52,8 +53,8 @@ def still_pixels(sequence: Sequence, margin: int = 1) -> Bool[Tensor, "H W"]:
     limit = NormalDist().inv_cdf(1.0 - 0.5 * FALSE_ALARMS / tests)
     changed = torch.zeros(height, width, dtype=torch.bool)
     for group, noise, w in windows:
-        apart = torch.nn.functional.avg_pool1d(group.flatten(1).T, w, stride=1) - group.mean(dim=0).flatten()[:, None]
-        largest = apart.abs().amax(dim=1).view(height, width)
+        sums = torch.cat([torch.zeros_like(group[:1]), (group - group.mean(dim=0)).cumsum(dim=0)])
+        largest = ((sums[w:] - sums[:-w]) / w).abs().amax(dim=0)
         changed |= ~(largest <= limit * border * noise * math.sqrt(1.0 / w - 1.0 / len(group)))
     return ~_grown(changed, margin)
 
@@ -91,9 +92,10 @@ def noise_of(groups: list[Float[Tensor, "n H W"]]) -> list[Float[Tensor, "H W"]]
 
 
 def rests(field: GaussianField, still: Bool[Tensor, "H W"], camera: Camera) -> Bool[Tensor, "N"]:
-    """Gaussians that only still pixels see: centre in the image, and nothing else within three sigma of the footprint.
+    """Gaussians that only still pixels see: centre in the image, and nothing that changes within their footprint.
 
-    The square around a disc of the largest scale is looked at; what of it lies outside of the image is not.
+    That is the box around SIGMAS standard deviations of the splat; what of it lies outside of the image is not looked
+    at.
 
     Args:
         field: Where they are.
@@ -101,21 +103,34 @@ def rests(field: GaussianField, still: Bool[Tensor, "H W"], camera: Camera) -> B
         camera: Of these pixels.
     """
     height, width = still.shape
-    pose = torch.as_tensor(camera.camera_from_world).to(field.mean)
     mean = field.mean.detach()
-    z = mean @ pose[2, :3] + pose[2, 3]
-    place = camera.project(mean)
-    radius = SIGMAS * math.sqrt(camera.fx * camera.fy) * field.scale.detach().amax(dim=1) / z
+    place, reach = camera.project(mean), SIGMAS * _deviations(field, camera)
+    pose = torch.as_tensor(camera.camera_from_world).to(mean)
     size = place.new_tensor([width, height])
-    seen = (z > 0) & ((place >= 0) & (place < size)).all(dim=1) & radius.isfinite()
-    radius = torch.where(seen, radius, 0.0)[:, None]
-    place = torch.where(seen[:, None], place, 0.0)
-    last = size - 1.0
-    first, end = ((place + sign * radius).floor().clamp_min(0.0).minimum(last).long() for sign in (-1.0, 1.0))
+    seen = (mean @ pose[2, :3] + pose[2, 3] > 0) & ((place >= 0) & (place < size)).all(dim=1)
+    seen &= reach.isfinite().all(dim=1)
+    place, reach = (torch.where(seen[:, None], value, 0.0) for value in (place, reach))
+    first, end = (
+        (place + sign * reach).floor().clamp_min(0.0).minimum(size - 1.0).long() + step for sign, step in ((-1, 0), (1, 1))
+    )
     sums = torch.zeros(height + 1, width + 1, dtype=torch.int64, device=still.device)
     sums[1:, 1:] = (~still).long().cumsum(dim=0).cumsum(dim=1)
-    (x0, y0), (x1, y1) = first.unbind(dim=1), (end + 1).unbind(dim=1)
+    (x0, y0), (x1, y1) = first.unbind(dim=1), end.unbind(dim=1)
     return seen & (sums[y1, x1] - sums[y0, x1] - sums[y1, x0] + sums[y0, x0] == 0)
+
+
+def _deviations(field: GaussianField, camera: Camera) -> Float[Tensor, "N 2"]:
+    """Standard deviations of the splats along columns and rows [px], as they are rendered."""
+    field = field.map(torch.Tensor.detach)
+    pose = torch.as_tensor(camera.camera_from_world).to(field.mean)
+    local = field.mean @ pose[:3, :3].T + pose[:3, 3]
+    z, focal = local[:, 2:], local.new_tensor([camera.fx, camera.fy])
+    slope = (pose[:2, :3] - (local[:, :2] / z)[..., None] * pose[2, :3]) * (focal / z)[..., None]  # [N, 2, 3] in the world
+    wxyz = torch.nn.functional.normalize(field.quaternion, dim=1)[:, None]
+    w, axis = wxyz[..., :1], -wxyz[..., 1:].expand_as(slope)  # the other way round: from the world to the own axes
+    turn = 2.0 * torch.linalg.cross(axis, slope)
+    own = slope + w * turn + torch.linalg.cross(axis, turn)
+    return ((own * field.scale[:, None]).square().sum(dim=2) + LOW_PASS).sqrt()
 
 
 def _by_shift(sequence: Sequence) -> list[Float[Tensor, "n H W"]]:
