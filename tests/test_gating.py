@@ -253,7 +253,7 @@ def test_a_moving_camera_has_no_still_pixels():
     sequence = small()
     poses = sequence.camera_from_world.copy()
     poses[:, 0, 3] += 1e-3 * np.arange(sequence.frames)
-    with pytest.raises(InputError, match="gate.still_pixels") as error:
+    with pytest.raises(InputError, match=r"gate\.still_pixels") as error:
         observe(replace(sequence, camera_from_world=poses), gated(), "cpu")
     assert "leave gate.still_pixels=true out" in error.value.fix
 

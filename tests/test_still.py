@@ -157,4 +157,7 @@ def test_nothing_is_nothing():
     """No Gaussian, no answer; not a number rests nowhere."""
     still_here = torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
     assert not len(rests(field(torch.zeros(0, 3), None), still_here, CAMERA))
-    assert rests(field(torch.tensor([[float("nan")] * 3, at(5, 5)]), None), still_here, CAMERA).tolist() == [False, True]
+    assert rests(field(torch.tensor([[float("nan")] * 3, at(5, 5)]), None), still_here, CAMERA).tolist() == [
+        False,
+        True,
+    ]

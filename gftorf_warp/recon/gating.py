@@ -7,7 +7,6 @@ run; its displacement is exactly zero, in a step and ever after (design/training
 from __future__ import annotations
 
 import logging
-import os
 
 import torch
 from jaxtyping import Float, Int
@@ -26,7 +25,6 @@ from .state import State
 
 LOG = logging.getLogger("gftorf_warp")
 BUCKET = 2048  # rows that ask come in such numbers
-MODE = os.environ.get("STILL_MODE", "jump")
 
 
 def is_due(before: int, after: int, settings: ReconSettings) -> bool:
@@ -37,12 +35,9 @@ def is_due(before: int, after: int, settings: ReconSettings) -> bool:
     warm_up = settings.schedule.warm_up
     if not settings.gate.still_pixels or after < warm_up or frozen(settings, before):
         return False
-    first = before < max(warm_up, 1)
-    if MODE == "early" and not first:
-        return round_is_due(before, after, settings.densify, settings.schedule)
-    return first or crossed(before, after, settings.gate.every) or round_is_due(
-        before, after, settings.densify, settings.schedule
-    )
+    if before < max(warm_up, 1) or crossed(before, after, settings.gate.every):
+        return True
+    return round_is_due(before, after, settings.densify, settings.schedule)
 
 
 @torch.no_grad()
@@ -63,11 +58,6 @@ def judge_after(state: State, before: int, observations: Observations, settings:
     optimiser, field = state.optimiser, state.optimiser.field
     layer = torch.full_like(field.mean[:, 0], MOVING, dtype=torch.int64) if field.layer is None else field.layer.abs()
     asleep = rests(field, observations.still, observations.cameras[0])
-    if MODE == "mean" and field.layer is not None:
-        new = asleep & (field.layer > 0)
-        keys = list(range(len(state.motion.key_times)))
-        off = torch.stack([state.motion.key_offset(state.motion.attach(field), k) for k in keys]).mean(dim=0)
-        optimiser.tensors["mean"].data += off * new[:, None]
     layer = torch.where(asleep, -layer, layer)
     if field.layer is not None and torch.equal(layer, field.layer):
         return False  # nodes stay attached as they are
@@ -92,13 +82,12 @@ class Asking:
             gated: Whether anybody may be at rest.
         """
         self._motion, self._gated = motion, gated and isinstance(motion, Network)
-        self._rows: Int[Tensor, "A"] | None = None
-        self._awake: Float[Tensor, "A 1"] | None = None
+        self._asked: tuple[Int[Tensor, "A"], Float[Tensor, "A 1"]] | None = None  # rows, and 1 for who is awake
 
     @property
     def counts(self) -> tuple[int, int] | None:
         """Gaussians that are awake and rows that ask, which waits for the device; None: everybody asks."""
-        return None if self._rows is None else (int(self._awake.sum()), len(self._rows))
+        return None if self._asked is None else (int(self._asked[1].sum()), len(self._asked[0]))
 
     def follow(self, layer: Int[Tensor, "rows"] | None) -> bool:
         """Gaussians came, went, woke up or fell asleep; the host waits once.
@@ -113,16 +102,16 @@ class Asking:
             return False
         awake = layer > 0
         wanted = max(-(-int(awake.sum()) // BUCKET), 1) * BUCKET
-        if self._rows is not None and 0 <= len(self._rows) - wanted <= BUCKET:  # one too many does no harm
-            wanted = len(self._rows)
+        if self._asked is not None and 0 <= len(self._asked[0]) - wanted <= BUCKET:  # one too many does no harm
+            wanted = len(self._asked[0])
         rows = awake.int().argsort(descending=True, stable=True)[:wanted].sort().values
-        chosen = awake[rows, None].to(torch.float32)
-        if self._rows is not None and len(rows) == len(self._rows):
-            self._rows.copy_(rows)
-            self._awake.copy_(chosen)
-            return False
-        self._rows, self._awake = rows, chosen
-        return True
+        asked = rows, awake[rows, None].to(torch.float32)
+        if self._asked is None or len(rows) != len(self._asked[0]):
+            self._asked = asked
+            return True
+        for place, value in zip(self._asked, asked, strict=True):
+            place.copy_(value)
+        return False
 
     def offsets(
         self, field: GaussianField, attachment: Float[Tensor, "rows M"] | None, keys: Int[Tensor, "k"]
@@ -134,14 +123,15 @@ class Asking:
             attachment: How they hang on the motion; None: that is found out, for those who ask.
             keys: Numbers of keys, read on their device.
         """
-        motion, rows = self._motion, self._rows
+        motion = self._motion
         if not isinstance(motion, Network):
             return motion.key_offsets(motion.attach(field) if attachment is None else attachment, keys)
-        if rows is None:  # nobody is at rest: not even that is asked
+        if self._asked is None:  # everybody is awake
             return motion.asked(motion.attach_at(field.mean.detach()) if attachment is None else attachment, keys)
+        rows, awake = self._asked
         if attachment is None:
             place = motion.attach_at(field.mean.detach().index_select(0, rows))
         else:
             place = attachment.index_select(0, rows)
-        told = motion.asked(place, keys) * self._awake
+        told = motion.asked(place, keys) * awake
         return told.new_zeros(len(keys), len(field), 3).index_copy(1, rows, told)

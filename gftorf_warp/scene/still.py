@@ -7,7 +7,7 @@ be the mean over all cycles. A test that fails anywhere in time makes a pixel on
 
 from __future__ import annotations
 
-import math, os
+import math
 from statistics import NormalDist
 
 import numpy as np
@@ -26,7 +26,7 @@ LEVELS = 16  # classes of brightness in which noise is estimated
 FLOOR = 1e-4  # of the largest quad: less noise than this is not believed, rounding is as large
 MAD = 1.4826  # standard deviation of a normal distribution over its median absolute value
 NEGATIVE = 0.02  # share of all light that may be below zero where quads are counts: noise around none
-SIGMAS = float(os.environ.get('SIG','3'))  # of a splat make up its footprint
+SIGMAS = 3.0  # of a splat make up its footprint
 
 
 def still_pixels(sequence: Sequence, margin: int = 1) -> Bool[Tensor, "H W"]:
@@ -48,7 +48,9 @@ def still_pixels(sequence: Sequence, margin: int = 1) -> Bool[Tensor, "H W"]:
     if not groups:
         return torch.zeros(height, width, dtype=torch.bool)
     border = 1.0 / _whole(height, width).sqrt()
-    windows = [(group, noise, w) for group, noise in zip(groups, noise_of(groups), strict=True) for w in _lengths(len(group))]
+    windows = [
+        (group, noise, w) for group, noise in zip(groups, noise_of(groups), strict=True) for w in _lengths(len(group))
+    ]
     tests = height * width * sum(len(group) - w + 1 for group, _, w in windows)
     limit = NormalDist().inv_cdf(1.0 - 0.5 * FALSE_ALARMS / tests)
     changed = torch.zeros(height, width, dtype=torch.bool)
@@ -111,7 +113,8 @@ def rests(field: GaussianField, still: Bool[Tensor, "H W"], camera: Camera) -> B
     seen &= reach.isfinite().all(dim=1)
     place, reach = (torch.where(seen[:, None], value, 0.0) for value in (place, reach))
     first, end = (
-        (place + sign * reach).floor().clamp_min(0.0).minimum(size - 1.0).long() + step for sign, step in ((-1, 0), (1, 1))
+        (place + sign * reach).floor().clamp_min(0.0).minimum(size - 1.0).long() + step
+        for sign, step in ((-1, 0), (1, 1))
     )
     sums = torch.zeros(height + 1, width + 1, dtype=torch.int64, device=still.device)
     sums[1:, 1:] = (~still).long().cumsum(dim=0).cumsum(dim=1)
@@ -125,7 +128,9 @@ def _deviations(field: GaussianField, camera: Camera) -> Float[Tensor, "N 2"]:
     pose = torch.as_tensor(camera.camera_from_world).to(field.mean)
     local = field.mean @ pose[:3, :3].T + pose[:3, 3]
     z, focal = local[:, 2:], local.new_tensor([camera.fx, camera.fy])
-    slope = (pose[:2, :3] - (local[:, :2] / z)[..., None] * pose[2, :3]) * (focal / z)[..., None]  # [N, 2, 3] in the world
+    slope = (pose[:2, :3] - (local[:, :2] / z)[..., None] * pose[2, :3]) * (focal / z)[
+        ..., None
+    ]  # [N, 2, 3] in the world
     wxyz = torch.nn.functional.normalize(field.quaternion, dim=1)[:, None]
     w, axis = wxyz[..., :1], -wxyz[..., 1:].expand_as(slope)  # the other way round: from the world to the own axes
     turn = 2.0 * torch.linalg.cross(axis, slope)
