@@ -248,6 +248,13 @@ def test_what_an_older_version_stored_asks_for_everybody(tmp_path):
     assert not opened.motion.key_offset(opened.attachment, 1).any()
 
 
+def test_a_network_is_asked_for_everybody_who_is_not_at_rest():
+    """A start from measured phase knows a static layer: nodes pin it, a network decides for itself."""
+    state, _ = begun(replace(published(), init=demo().init))
+    assert (state.optimiser.layer == 1).all()
+    assert state.motion.key_offset(state.attachment, 1).any(dim=1).all()
+
+
 def test_a_moving_camera_has_no_still_pixels():
     """Said before anything is written."""
     sequence = small()
