@@ -183,7 +183,7 @@ def test_captured_steps_are_single_steps(make, batch, device, monkeypatch):
         assert torch.equal(single.optimiser.layer, whole.optimiser.layer)
         shares.add(int((whole.optimiser.layer < 0).sum()))
     assert steps.collect() == 0
-    assert len(shares) > 2, "some slept"
+    assert max(shares) > 0, "some slept"
     alike(single, whole)
 
 

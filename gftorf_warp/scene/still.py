@@ -26,7 +26,7 @@ LEVELS = 16  # classes of brightness in which noise is estimated
 FLOOR = 1e-4  # of the largest quad: less noise than this is not believed, rounding is as large
 MAD = 1.4826  # standard deviation of a normal distribution over its median absolute value
 NEGATIVE = 0.02  # share of all light that may be below zero where quads are counts: noise around none
-SIGMAS = 3.0  # of a splat make up its footprint
+SIGMAS = 1.0  # of a splat make up its footprint: what its core shows would change first if it moved
 
 
 def still_pixels(sequence: Sequence, margin: int = 1) -> Bool[Tensor, "H W"]:
