@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..constants import FRAMES_PER_QUARTET
@@ -16,9 +16,10 @@ from ..data.decode import closed_form_distance, quad_scale, quartet_phasor
 from ..data.sequence import Sequence
 from ..errors import InputError
 from ..scene.camera import Camera
-from ..scene.initialise import Init
+from ..scene.initialise import RESTS, Init
 from ..scene.measured import camera_of, colour_camera_of, sensor_of
 from ..scene.sensor import Sensor
+from ..scene.still import still_pixels
 from .settings import Batch, FlowSource, Input, ReconSettings
 
 HASHED = ("quads", "measured", "shifts", "times", "camera_from_world", "colour_from_world")
@@ -57,6 +58,8 @@ class Observations:
     """Where that number is from."""
     flow_source: str
     """'file', 'computed' or 'none'."""
+    still: Bool[Tensor, "H W"] | None = None
+    """Pixels whose quads never change; None: nobody asked for them."""
 
     def sensor_at(self, frame: int) -> Sensor:
         """The sensor reading only the shift of one raw frame."""
@@ -159,7 +162,19 @@ def observe(sequence: Sequence, settings: ReconSettings, device: torch.device | 
         quad_scale=float(scale),
         quad_scale_source=scale_source,
         flow_source=flow_source,
+        still=_still(prepared, settings.gate.margin).to(device) if settings.gate.still_pixels else None,
     )
+
+
+def _still(sequence: Sequence, margin: int) -> Bool[Tensor, "H W"]:
+    if np.ptp(sequence.camera_from_world, axis=0).max() > RESTS:
+        raise InputError(
+            "no pixel is still for a camera that moves",
+            where=f"{sequence.path or 'sequence'}, gate.still_pixels",
+            why="Gaussians are held still where raw quads of a camera at rest never change, and its poses differ",
+            fix="leave gate.still_pixels=true out",
+        )
+    return still_pixels(sequence, margin)
 
 
 def reads_flow(settings: ReconSettings) -> bool:
