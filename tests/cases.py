@@ -17,6 +17,7 @@ from gftorf_warp.render import reference
 from gftorf_warp.render.api import Background, Rendering
 from gftorf_warp.render.buffers import ClampGradient, Distortion, RenderSettings, Stop, Support
 from gftorf_warp.scene.camera import Camera
+from gftorf_warp.scene.distortion import Distortion as Lens
 from gftorf_warp.scene.gaussians import GaussianField, constant_sh
 from gftorf_warp.scene.sensor import Sensor
 
@@ -261,6 +262,15 @@ def posed() -> Case:
     return Case(field=field, camera=POSED, sensor=sensor, background=background, extra=channels(field, 7))
 
 
+BENT = replace(POSED, distortion=Lens(k1=-0.25, k2=0.08, p1=0.02, p2=-0.03, k3=-0.01))
+
+
+def distorted() -> Case:
+    """A lens that bends by up to five pixels, also far outside of what it sees, where its tangent goes on."""
+    field = gaussians(80, BENT, seed=16, z=(0.8, 3.0), scale=(0.2, 1.0), spread=4.0)
+    return Case(field=field, camera=BENT, background=light(BENT, 4, seed=16), extra=channels(field, 2))
+
+
 def three_shifts() -> Case:
     """Three taps at 30 MHz, 33x9 pixels, numbers as background, extra with no channel at all."""
     camera = Camera.from_fov(33, 9, 70.0)
@@ -340,6 +350,7 @@ CASES: dict[str, Callable[[], Case]] = {
         outside,
         dark,
         posed,
+        distorted,
         three_shifts,
         needles,
         coplanar,

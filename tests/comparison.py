@@ -12,7 +12,7 @@ DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 
 TOLERANCE = TOLERANCES[torch.float32]
 
-FULL = ("translucent", "posed", "outside")  # cases in which every output and every input exists
+FULL = ("translucent", "posed", "outside", "distorted")  # cases in which every output and every input exists
 
 
 class Comparison:

@@ -68,7 +68,7 @@ BAD = [  # what follows `gftorf simulate`, exit code, a word of the answer; {sce
     ("demo --override sensor.f_mod=2e7", 2, "did you mean sensor.f_mod_hz?"),
     ("demo --override bodies.7.path.velocity=1,0,0", 2, "no such setting"),
     ("demo --override lens.distortion=0.1,0,0,0,0 --engine mesh", 2, "lens"),
-    ("demo --override lens.beam_power=2 --engine mesh --bounces 1", 2, "beam"),
+    ("demo --override lens.falloff=nowhere.png", 3, "there is no such file"),
     ("demo --size 0x4", 2, "width and a height"),
     ("demo --size 12", 2, "96x72"),
     ("demo --frames -3", 2, "at least 1"),

@@ -1,208 +1,280 @@
-"""Gaussians at rest that do not ask the motion network: who they are, what they take, and that they wake up."""
+"""Gaussians at rest: who they are, that they stay, wake up and are stored, in single and in captured steps."""
 
+import copy
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
-from small_runs import KEYS, field, random
+from small_runs import KEYS, demo, field, random, same, small, stored
 from test_captured_steps import DEVICES, alike, begun, published
 
-from gftorf_warp.recon import gating, presets, step
-from gftorf_warp.recon.captured import CapturedSteps, steps_of
-from gftorf_warp.recon.gating import Gate
+from gftorf_warp.errors import InputError
+from gftorf_warp.recon import checkpoint, gating, presets, step
+from gftorf_warp.recon.captured import CapturedSteps
+from gftorf_warp.recon.gating import Asking, is_due, judge_after
+from gftorf_warp.recon.observations import observe
+from gftorf_warp.recon.run import Run
 from gftorf_warp.recon.settings import Batch, GateSettings, Kernels
+from gftorf_warp.recon.state import from_dict, to_dict
+from gftorf_warp.recon.train import reconstruct
 from gftorf_warp.scene.motion import MotionSettings
 from gftorf_warp.scene.network import Network
+from gftorf_warp.scene.still import rests
 
-GATE = 1e-3  # [m]
-ROWS, COUNT = 256, 200
-
-
-class Swaying(Network):
-    """Each Gaussian goes to and fro as far as it says."""
-
-    def __init__(self, far):
-        super().__init__(KEYS, MotionSettings(layers=1, width=8), duration=1.0, length=1.0)
-        self.far = torch.nn.Parameter(far)
-
-    def attach_at(self, mean):
-        """The number of a Gaussian is its place."""
-        return mean[:, :1]
-
-    def key_offsets(self, attachment, keys):
-        """Minus or plus so far, by turns."""
-        sides = torch.tensor([-1.0, 1.0, -1.0, 1.0])[keys.long()]
-        away = sides[:, None] * self.far[attachment[:, 0].long()]
-        return torch.stack([away, torch.ones_like(away), torch.ones_like(away)], dim=2)  # a constant is rest
+ON = GateSettings(still_pixels=True, margin=0, every=10)
 
 
-@pytest.fixture
-def swaying(monkeypatch):
-    """A gate in front of 200 Gaussians, and rows behind them; the first twenty move by ten gates."""
+def gated(make=published, **changes):
+    """A short run with a gate, with Gaussians so small that some of them are at rest."""
+    settings = make(**changes)
+    return replace(settings, gate=ON, rates=settings.rates.times(0.1), init=replace(settings.init, count=600))
+
+
+def begun_small(settings, device="cpu"):
+    """As ``begun``, at a tenth of the size."""
+    state, observations = begun(settings, device)
+    with torch.no_grad():
+        state.optimiser.tensors["log_scale"] -= 2.5 if settings.preset == "released" else 0.5
+    return state, observations
+
+
+def swaying(motion):
+    """Let a network say something: far from rest, other at every place."""
+    with torch.no_grad():
+        weight = motion.head.weight
+        weight += (3e-3 * random(*weight.shape)).to(weight)
+
+
+def demo_gated(**changes):
+    """The demo preset, whose motion is that of nodes."""
+    return gated(lambda **more: demo(images=60, kernels=Kernels.STEP, **more), **changes)
+
+
+def test_who_only_still_pixels_see_sleeps_and_wakes_up():
+    """A judgement is about where Gaussians are, whatever they were; the layer they belong to is not forgotten."""
+    settings = gated()
+    state, observations = begun_small(settings)
+    assert (state.optimiser.layer == 1).all()
+    state.images = 6
+    assert judge_after(state, 4, observations, settings)
+    asleep = rests(state.optimiser.field, observations.still, observations.cameras[0])
+    assert 0.1 < asleep.float().mean() < 0.9
+    assert torch.equal(state.optimiser.layer, 1 - 2 * asleep.long())
+    moved = (state.motion.key_offset(state.attachment, 1) != 0).any(dim=1)
+    assert torch.equal(moved, ~asleep)
+    observations = replace(observations, still=~observations.still)
+    state.images = 10
+    assert judge_after(state, 9, observations, settings)
+    assert (state.optimiser.layer[asleep] == 1).all()
+    assert not judge_after(state, 10, observations, settings)
+
+
+def test_what_never_moved_goes_on_so():
+    """The static layer of a start from phase is nobody's to wake up, nodes or not."""
+    settings = demo_gated()
+    state, observations = begun_small(settings)
+    static = state.optimiser.layer == 0
+    assert 0 < static.sum() < len(static)
+    state.images = 4
+    attached = state.attachment
+    changing = replace(observations, still=torch.zeros_like(observations.still))
+    assert not judge_after(state, 0, changing, settings)
+    assert torch.equal(state.optimiser.layer, (~static).long())
+    assert state.attachment is attached, "nodes stay attached as they were"
+    assert judge_after(state, 0, replace(observations, still=torch.ones_like(observations.still)), settings)
+    assert torch.equal(state.optimiser.layer[static], torch.zeros(int(static.sum()), dtype=torch.long))
+    assert (state.optimiser.layer[~static] == -1).any()
+    assert not state.motion.key_offset(state.attachment, 1)[state.optimiser.layer < 0].any()
+
+
+def test_judgements_come_at_the_end_of_the_warm_up_after_rounds_and_regularly():
+    """Warm-up is 6 images here, rounds come every 8 from 16 to 32; frozen Gaussians stay where they are."""
+    frozen = gated()
+    frozen = replace(frozen, schedule=replace(frozen.schedule, freeze_from=0.5))
+    settings = replace(frozen, schedule=replace(frozen.schedule, freeze_from=None))
+    assert [n for n in range(1, 60) if is_due(n - 1, n, settings)] == [6, 10, 16, 20, 24, 30, 32, 40, 50]
+    assert [n for n in range(1, 60) if is_due(n - 1, n, frozen)] == [6, 10, 16, 20, 24, 30]
+    at_once = replace(settings, schedule=replace(settings.schedule, warm_up=0))
+    assert [n for n in range(4, 13, 4) if is_due(n - 4, n, at_once)] == [4, 12]
+    off = replace(settings, gate=GateSettings(every=1))
+    assert not any(is_due(n - 1, n, off) for n in range(60))
+
+
+class Counting(Network):
+    """A network that remembers how many asked."""
+
+    def __init__(self):
+        settings = MotionSettings(layers=1, width=8)
+        super().__init__(KEYS, settings, duration=1.0, length=1.0, generator=torch.Generator().manual_seed(0))
+        self.told = []
+
+    def offsets(self, attachment, moment):
+        """As a network, and counted."""
+        self.told.append(len(attachment))
+        return super().offsets(attachment, moment)
+
+
+def test_whole_buckets_ask_and_only_who_is_awake_is_moved(monkeypatch):
+    """20 awake of 200 and 56 dead rows: two buckets of 16 ask, with a gradient of those 20 alone."""
     monkeypatch.setattr(gating, "BUCKET", 16)
-    far = torch.where(torch.arange(ROWS) < 20, 10 * GATE, 0.3 * GATE)
-    motion = Swaying(far)
-    settings = replace(published(), gate=GateSettings(distance=GATE, after=4, every=10))
-    places = torch.arange(ROWS)[:, None].float().repeat(1, 3)
-    return Gate(settings, motion), motion, field(places, None)
-
-
-def test_who_moves_asks(swaying):
-    """Twenty are awake, two buckets ask; those beside them are the first that follow."""
-    gate, motion, everybody = swaying
-    with torch.no_grad():
-        motion.far[100:112] = 0.4 * GATE
-    assert gate.counts is None
-    assert gate.judge(everybody, COUNT), "nothing lay anywhere before"
-    assert gate.awake.nonzero()[:, 0].tolist() == list(range(20))
-    assert gate.active.tolist() == [*range(20), *range(100, 112)]
-    assert gate.counts == (20, 32)
-    assert not gate.is_shut(8)
-    assert gate.is_shut(9), "one in eight steps asks everybody"
-    assert not gate.judge(everybody, COUNT), "and now everything lies where it did"
-
-
-def test_rest_begins_at_half_and_ends_at_the_whole(swaying):
-    """In between a Gaussian stays as it is."""
-    gate, motion, everybody = swaying
-    course = [(0.7, True), (0.4, False), (0.7, False), (1.1, True), (0.7, True), (0.4, False)]
-    for share, awake in course:
-        with torch.no_grad():
-            motion.far[50] = share * GATE
-        gate.judge(everybody, COUNT)
-        assert bool(gate.awake[50]) is awake, share
-    assert not gate.awake[COUNT:].any()
-
-
-def test_what_rests_is_kept_exactly_and_has_no_gradient(swaying):
-    """Whatever the network has come to say in between; who is active follows it."""
-    gate, motion, everybody = swaying
-    with torch.no_grad():
-        motion.far[100:112] = 0.4 * GATE
-    gate.judge(everybody, COUNT)
+    motion = Counting()
+    swaying(motion)
+    layer = torch.full((256,), -1)
+    layer[30:50] = 1
+    layer[200:] = 0
+    everybody = field(random(256, 3), layer)
+    asking = Asking(motion, gated=True)
+    assert asking.counts is None
+    assert asking.follow(layer), "nothing lay anywhere before"
+    assert asking.counts == (20, 32)
     keys = torch.tensor([1, 2], dtype=torch.int32)
-    kept = motion.key_offsets(motion.attach(everybody), keys).detach()
-    with torch.no_grad():
-        motion.far += 0.25
-    found = gate.offsets(everybody, None, keys, gated=True)
-    assert torch.equal(found, gate.offsets(everybody, motion.attach(everybody), keys, gated=True))
-    rests = torch.ones(ROWS, dtype=torch.bool)
-    rests[gate.active] = False
-    assert torch.equal(found[:, rests], kept[:, rests])
-    now = gate.offsets(everybody, None, keys, gated=False)
-    assert torch.equal(found[:, ~rests], now[:, ~rests])
-    found[:, :, 0].abs().sum().backward()
-    assert torch.equal(motion.far.grad != 0, ~rests)
+    motion.told.clear()
+    found = asking.offsets(everybody, None, keys)
+    attached = asking.offsets(everybody, motion.attach_at(everybody.mean), keys)
+    want = motion.key_offsets(motion.attach(everybody), [1, 2])
+    assert motion.told == [32, 32, 20]
+    torch.testing.assert_close(found, want)
+    assert torch.equal(found, attached)
+    assert torch.equal((found != 0).any(dim=2).all(dim=0), layer > 0)
+    parameters = list(motion.parameters())
+    cotangent = random(2, 256, 3, seed=1)
+    gradients = [torch.autograd.grad((offsets * cotangent).sum(), parameters) for offsets in (found, want)]
+    for got, expected in zip(*gradients, strict=True):
+        assert expected.abs().max() > 0
+        torch.testing.assert_close(got, expected)
+    assert not asking.follow(torch.where(torch.arange(256) < 30, 1, 0)), "as many buckets as before"
+    assert asking.counts == (30, 32)
+    assert asking.follow(torch.where(torch.arange(256) < 40, 1, 0)), "more of them"
+    assert asking.counts == (40, 48)
+    assert asking.follow(torch.zeros(256, dtype=torch.long))
+    assert not asking.offsets(everybody, None, keys).any()
+    assert not Asking(motion, gated=False).follow(layer)
 
 
-def test_who_rests_wakes_up(swaying):
-    """If it moves, or if the network has come to hold it elsewhere: another constant is no motion, but no rest."""
-    gate, motion, everybody = swaying
-    gate.judge(everybody, COUNT)
-    assert not gate.awake[60:62].any()
-    with torch.no_grad():
-        motion.far[60] = 5 * GATE
-    gate.table[:, 61] += 2 * GATE
-    gate.judge(everybody, COUNT)
-    assert gate.awake[60:62].all()
-    assert int(gate.awake.sum()) == 22
-    assert {60, 61} <= set(gate.active.tolist())
-
-
-def test_copies_are_taken_for_what_they_come_from(swaying):
-    """After a round: rows removed, one copied; tables and lists go along, and more rows are more buckets."""
-    gate, _, everybody = swaying
-    gate.judge(everybody, COUNT)
-    table = gate.table.clone()
-    origin = torch.cat([torch.arange(10, COUNT), torch.tensor([10, 150])])
-    assert not gate.follow(origin, ROWS), "as many buckets as before"
-    assert gate.awake.nonzero()[:, 0].tolist() == [*range(10), 190]
-    assert torch.equal(gate.table[:, : len(origin)], table[:, origin])
-    assert not gate.follow(None, ROWS)
-    assert gate.follow(torch.arange(10).repeat(30), 320), "elsewhere, since all of these move"
-    assert len(gate.active) == 304
-    assert gate.awake[:300].all()
-    assert not gate.awake[300:].any()
-
-
-def test_judgements_begin_late_and_come_regularly(swaying):
-    """Warm-up is 6 images here, and then 4 more; the first one is not missed by whoever begins later."""
-    gate, _, everybody = swaying
-    assert [n for n in range(1, 30) if gate.is_due(n - 1, n)] == list(range(10, 30))
-    gate.judge(everybody, COUNT)
-    assert [n for n in range(1, 45) if gate.is_due(n - 1, n)] == [10, 20, 30, 40]
+def test_nobody_at_all_is_awake():
+    """Nobody asks, nothing is moved, and there is nothing to learn."""
+    motion = Counting()
+    everybody = field(random(5, 3), torch.full((5,), -1))
+    found = motion.key_offsets(motion.attach(everybody), [0, 1])
+    assert found.shape == (2, 5, 3)
+    assert not found.any()
+    assert motion.told == []
 
 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("batch", [Batch.FRAME, Batch.QUARTET])
+@pytest.mark.parametrize("make", [gated, demo_gated], ids=["network", "nodes"])
+def test_captured_steps_are_single_steps(make, batch, device, monkeypatch):
+    """With some at rest and some awake, through judgements, rounds and a reset."""
+    monkeypatch.setattr(gating, "BUCKET", 64)
+    settings = make(batch=batch)
+    single, observations = begun_small(settings, device)
+    whole, _ = begun_small(settings, device)
+    right = torch.arange(observations.still.shape[1], device=device) >= 20  # of the sliding box, some
+    observations = replace(observations, still=right.expand_as(observations.still))
+    if make is gated:
+        swaying(single.motion)
+        swaying(whole.motion)
+    steps, shares = CapturedSteps(whole, observations, settings), set()
+    while single.images < 40:
+        assert step.step(single, observations, settings) is None
+        steps.step()
+        assert torch.equal(single.optimiser.layer, whole.optimiser.layer)
+        shares.add(int((whole.optimiser.layer < 0).sum()))
+    assert steps.collect() == 0
+    assert max(shares) > 0, "some slept"
+    alike(single, whole)
+
+
 @pytest.mark.parametrize("freeze", [None, 0.5])
-def test_steps_whose_gaussians_are_all_awake_are_steps_without_a_gate(batch, device, freeze):
-    """With a gate of nothing, rounds and a reset included; half of the rows are dead, and do not ask."""
-    settings = published(batch=batch)
+def test_steps_whose_gaussians_are_all_awake_are_steps_without_a_gate(freeze):
+    """Where no pixel is still."""
+    settings = gated()
     settings = replace(settings, schedule=replace(settings.schedule, freeze_from=freeze))
-    gated = replace(settings, gate=GateSettings(distance=1e-12, after=2, every=5, open_every=3))
-    whole, observations = begun(settings, device)
-    some, _ = begun(settings, device)
-    steps, other = CapturedSteps(whole, observations, settings), CapturedSteps(some, observations, gated)
-    shut = 0
+    some, observations = begun(settings)
+    whole, _ = begun(settings)
+    observations = replace(observations, still=torch.zeros_like(observations.still))
+    steps = CapturedSteps(some, observations, settings)
+    other = CapturedSteps(whole, observations, replace(settings, gate=GateSettings()))
     while whole.images < 40:
         steps.step()
-        shut += other.gate.is_shut(some.images // (1 if batch == Batch.FRAME else 4))
         other.step()
-    assert shut >= 4
-    assert len(other.gate.active) < other.padded.rows
-    assert int(other.gate.awake.sum()) == len(some.optimiser.field)
+    assert steps.asking.counts[0] == len(some.optimiser.field)
+    assert other.asking.counts is None
     assert steps.collect() == other.collect() == 0
     alike(whole, some)
 
 
-@pytest.mark.parametrize("device", DEVICES)
-def test_a_gate_stays_at_the_right_rows_through_a_run(device, monkeypatch):
-    """Rounds come and go between judgements: nobody is lost, and steps are sound."""
-    monkeypatch.setattr(gating, "BUCKET", 16)
-    settings = published(batch=Batch.FRAME)
-    settings = replace(settings, rates=settings.rates.times(0.1), gate=GateSettings(distance=4.4e-3, after=2, every=20))
-    state, observations = begun(settings, device)
-    with torch.no_grad():  # far from rest, so that some move by more than others
-        head = state.motion.head.weight
-        head += (4e-3 * random(*head.shape)).to(device)
-    steps, counts = CapturedSteps(state, observations, settings), set()
-    while state.images < 50:
-        steps.step()
-        if state.images < 9:
-            continue
-        gate, count = steps.gate, len(state.optimiser.field)
-        counts.add(count)
-        active = torch.zeros(steps.padded.rows, dtype=torch.bool, device=device)
-        active[gate.active] = True
-        assert active[gate.awake].all(), "whoever is awake asks"
-        assert len(gate.awake) == steps.padded.rows
-        assert not gate.awake[count:].any()
-        assert 0 < int(gate.awake.sum()) < count
-        assert len(gate.active) < count
-    assert len(counts) > 1, "rounds did change something"
-    assert steps.collect() == 0
-    assert all(leaf.isfinite().all() for leaf in state.optimiser.leaves)
+@pytest.mark.parametrize("kernels", [Kernels.LOSS, Kernels.GRAPH])
+def test_a_finished_run_moves_who_was_awake_and_an_interrupted_one_goes_on(tmp_path, kernels):
+    """What is stored is what training saw, to the bit."""
+    settings = replace(gated(), kernels=kernels)
+    run = reconstruct(small(), tmp_path / "whole", settings, images=60)
+    layer = run.field.layer
+    assert 0 < (layer < 0).sum() < len(layer)
+    offsets = run.motion.key_offsets(run.attachment, [0, 1, 2])
+    assert torch.equal((offsets != 0).any(dim=2).all(dim=0), layer > 0)
+    kept = checkpoint.last(run.path)
+    half = from_dict(kept, "cpu")
+    assert torch.equal(half.attachment, run.attachment)
+    images = run.renderer(["quads"])(0.05, run.camera).quads
+    torch.testing.assert_close(images, run.render(0.05).quads, rtol=1e-5, atol=1e-6)
+    everybody = replace(run, attachment=run.motion.attach(replace(run.field, layer=None)))
+    assert not torch.equal(everybody.render(0.05).quads, run.render(0.05).quads)
+    state, observations = begun(settings)
+    single = step.Singles(state, observations, settings)
+    while state.images < 24:
+        single.step()
+    again = from_dict(copy.deepcopy(to_dict(state)), "cpu")
+    other = step.Singles(again, observations, settings)
+    while state.images < 40:
+        single.step()
+        other.step()
+    assert same(*({**to_dict(one), "seconds": 0} for one in (state, again)))
+
+
+def test_what_an_older_version_stored_asks_for_everybody(tmp_path):
+    """Its layers said nothing to a network, static ones included."""
+    run = reconstruct(small(), tmp_path / "run", published(batch=Batch.QUARTET), images=8)
+    old = stored(run.path) | {"seconds": 0.0, "format": 2}
+    old["field"]["layer"] = torch.zeros_like(old["field"]["layer"])
+    checkpoint.save(run.path, old)
+    opened = Run.open(run.path)
+    assert opened.motion.key_offset(opened.attachment, 1).any(dim=1).all()
+    old["format"] = 3
+    checkpoint.save(run.path, old)
+    opened = Run.open(run.path)
+    assert not opened.motion.key_offset(opened.attachment, 1).any()
+
+
+def test_a_network_is_asked_for_everybody_who_is_not_at_rest():
+    """A start from measured phase knows a static layer: nodes pin it, a network decides for itself."""
+    state, _ = begun(replace(published(), init=demo().init))
+    assert (state.optimiser.layer == 1).all()
+    assert state.motion.key_offset(state.attachment, 1).any(dim=1).all()
+
+
+def test_a_moving_camera_has_no_still_pixels():
+    """Said before anything is written."""
+    sequence = small()
+    poses = sequence.camera_from_world.copy()
+    poses[:, 0, 3] += 1e-3 * np.arange(sequence.frames)
+    with pytest.raises(InputError, match=r"gate\.still_pixels") as error:
+        observe(replace(sequence, camera_from_world=poses), gated(), "cpu")
+    assert "leave gate.still_pixels=true out" in error.value.fix
 
 
 def test_no_preset_has_a_gate_and_a_short_run_has_short_intervals():
     """Every approximation is asked for by name."""
-    assert all(presets.preset(name).gate.distance is None for name in presets.PRESETS)
+    assert not any(presets.preset(name).gate.still_pixels for name in presets.PRESETS)
+    assert observe(small(), demo(), "cpu").still is None
     whole = presets.preset("released")
-    short = presets.shortened(replace(whole, gate=GateSettings(distance=GATE)), whole.schedule.images // 10)
-    assert short.gate == GateSettings(distance=GATE, every=50, after=100)
+    short = presets.shortened(replace(whole, gate=GateSettings(still_pixels=True)), whole.schedule.images // 10)
+    assert short.gate == GateSettings(still_pixels=True, every=50)
 
 
-def test_single_steps_say_that_they_have_no_gate(caplog):
-    """They ignore it, aloud."""
-    settings = replace(published(), kernels=Kernels.LOSS, gate=GateSettings(distance=GATE))
-    state, observations = begun(settings)
-    with caplog.at_level("INFO", "gftorf_warp"):
-        assert isinstance(steps_of(state, observations, settings), step.Singles)
-    assert "gate.distance is known to captured steps only" in caplog.text
-
-
-@pytest.mark.parametrize("wrong", [{"distance": 0.0}, {"every": 0}, {"after": -1}, {"open_every": 0}])
+@pytest.mark.parametrize("wrong", [{"every": 0}, {"margin": -1}])
 def test_settings_that_make_no_sense(wrong):
     """Refused where they are made."""
     with pytest.raises(ValueError, match="must be"):

@@ -1,6 +1,7 @@
 """Flow loss, displacements and the end of a step as kernels, against plain torch in float64 and torch's Adam."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from gftorf_warp.recon.objective import flow_between
 from gftorf_warp.render import descent, fused
 from gftorf_warp.render.api import ScreenGradient
 from gftorf_warp.scene.camera import Camera
+from gftorf_warp.scene.distortion import Distortion
 
 SIZES = [(36, 48), (7, 5), (33, 31)]  # whole warps, less than one, a last one that is not full
 
@@ -38,6 +40,10 @@ def cameras(size, kind):
     first = Camera.from_fov(width, height, 60.0, camera_from_world=pose(0.3, [0.1, -0.2, 0.5]))
     if kind == "rest":
         return first, [first, first]
+    if kind == "bent":  # both through one lens, or the later one without
+        first = replace(first, distortion=Distortion(k1=-0.12, k2=0.05, p1=0.02, p2=-0.03, k3=-0.01))
+        turned = first.at(pose(0.9, [0.15, -0.2, 0.55]))
+        return first, [turned, replace(turned, distortion=Distortion())]
     turned = first.at(pose(0.36, [0.15, -0.2, 0.55]))
     lens = {"fx": 1.3 * first.fx, "fy": 0.9 * first.fy, "cx": 0.4 * width, "cy": 0.6 * height}
     other = Camera(width=width, height=height, camera_from_world=pose(0.27, [0.0, -0.1, 0.4]), **lens)
@@ -58,7 +64,7 @@ def flow_case(size, device):
     return distance.to(device), displacement.to(device), measured.to(device)
 
 
-@pytest.mark.parametrize("kind", ["rest", "moving"])
+@pytest.mark.parametrize("kind", ["rest", "moving", "bent"])
 @pytest.mark.parametrize("size", SIZES, ids=str)
 def test_loss_of_flow_is_the_oracles(device, size, kind):
     """Value and gradient to 2e-5 of their size, the row read from memory, unknown pixels without a gradient."""

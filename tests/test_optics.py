@@ -9,14 +9,12 @@ import pytest
 import torch
 from small_runs import small
 
+from gftorf_warp.data.images import write_exr
 from gftorf_warp.errors import InputError, UsageError
 from gftorf_warp.recon.train import reconstruct
-from gftorf_warp.render.api import rasterize
-from gftorf_warp.render.trace import RigidBody, Tracer
 from gftorf_warp.scene.camera import Camera
 from gftorf_warp.scene.distortion import Distortion
 from gftorf_warp.scene.electrons import electron_gain
-from gftorf_warp.scene.gaussians import GaussianField, constant_sh
 from gftorf_warp.scene.measured import camera_of
 from gftorf_warp.scene.optics import Lens, lens_rows, shading
 from gftorf_warp.scene.pattern import Pattern, gain_map
@@ -27,8 +25,9 @@ from gftorf_warp.sim.paths import Still
 from gftorf_warp.sim.readout import read_out
 from gftorf_warp.sim.record import record
 from gftorf_warp.sim.scene import Scene
+from gftorf_warp.sim.scene_file import read_scene
 from gftorf_warp.sim.simulate import simulate
-from gftorf_warp.sim.world import Body, Texture
+from gftorf_warp.sim.world import Body, Box, Texture
 
 BARREL = Distortion(k1=-0.25, k2=0.08, p1=0.002, p2=-0.003, k3=-0.01)
 PINCUSHION = Distortion(k1=0.15, k2=-0.02)
@@ -78,7 +77,7 @@ def test_derivatives_of_a_lens():
     lens, step = Distortion(k1=-0.25, k2=0.3, p1=0.2, p2=-0.1, k3=0.4), 1e-6
     by_x = (np.array(lens.apply(x + step, y)) - lens.apply(x - step, y)) / (2 * step)
     by_y = (np.array(lens.apply(x, y + step)) - lens.apply(x, y - step)) / (2 * step)
-    xx, xy, yy = lens._slope(x, y)
+    xx, xy, yy = lens.slope(x, y)
     np.testing.assert_allclose((xx, xy), by_x, atol=1e-8)
     np.testing.assert_allclose((xy, yy), by_y, atol=1e-8)
 
@@ -100,15 +99,14 @@ def test_truth_and_ideal_quads_are_seen_through_the_lens():
 @pytest.mark.parametrize(
     ("changes", "says"),
     [
-        ({"distortion": (-0.2, 0.0, 0.0, 0.0, 0.0)}, "a pinhole, found a lens"),
         (
             {"frequencies_hz": np.repeat([20e6, 30e6], 6)},
-            r"one modulation frequency .* found \[20000000.0, 30000000.0\]",
+            r"one modulation frequency, found \[20000000.0, 30000000.0\]",
         ),
     ],
 )
 def test_what_cannot_be_rendered_is_not_reconstructed(changes, says, tmp_path):
-    """A sequence through a lens, or of two frequencies, would be fitted wrong without a word."""
+    """A sequence of two frequencies would be fitted wrong without a word."""
     with pytest.raises(InputError, match=says):
         reconstruct(replace(small(), **changes), tmp_path / "run", "demo", images=4)
 
@@ -129,28 +127,11 @@ def test_lenses_that_cannot_be_undone_are_refused():
         Distortion(p2=math.nan)
 
 
-def test_engines_refuse_a_lens_that_distorts(tmp_path):
-    """Before anything is written; the layers below refuse it too."""
-    for engine in ("gaussian", "mesh"):
-        with pytest.raises(UsageError, match="no engine renders through a lens") as caught:
-            simulate(scene(lens=Lens(distortion=BARREL)), tmp_path / "out", engine=engine)
-        assert caught.value.where == "lens.distortion"
+def test_a_lens_that_cannot_be_undone_is_an_error_of_the_user(tmp_path):
+    """Before anything is written."""
     with pytest.raises(UsageError, match="cannot be undone"):
         simulate("demo", tmp_path / "out", overrides=["lens.distortion.k1=-2"])
     assert not (tmp_path / "out").exists()
-    camera = scene(lens=Lens(distortion=BARREL)).camera()
-    one = torch.ones(1)
-    field = GaussianField(
-        mean=torch.tensor([[0.0, 0.0, 3.0]]),
-        log_scale=torch.zeros(1, 3),
-        quaternion=torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
-        opacity_logit=one,
-        reflectivity_sh=constant_sh(one),
-    )
-    with pytest.raises(ValueError, match="only a pinhole"):
-        rasterize(field, camera, Sensor())
-    with pytest.raises(ValueError, match="only a pinhole"):
-        Tracer([RigidBody(radius=1.0, low=0.5, high=0.5, cell=0.3)], 33, 25).first_hits(camera, np.eye(4)[None])
 
 
 @pytest.mark.parametrize(
@@ -228,14 +209,94 @@ def test_lenses_that_cannot_be(settings, says):
         Lens(**settings)
 
 
-def test_a_beam_is_of_direct_light_at_the_camera(tmp_path):
-    """Elsewhere it would be another light; both ways to ask for it say so."""
-    with pytest.raises(ValueError, match="beam_power is of a light at the camera"):
-        scene(lens=Lens(beam_power=1.0), emitter=(0.04, 0.0, 0.0))
-    with pytest.raises(UsageError, match="bounces"):
-        simulate(scene(lens=Lens(beam_power=1.0)), tmp_path / "out", engine="mesh", bounces=1)
-    with pytest.raises(ValueError, match="bounces"):
-        record(scene(lens=Lens(beam_power=1.0)), engine="mesh", bounces=1)
+@pytest.mark.parametrize("power", [-3.0, 4.0])
+def test_a_beam_beside_the_camera_is_seen_from_there(power):
+    """On a frontal wall: the angle is the emitter's, the mean over the image the camera's; 2e-5."""
+    lens, place = Lens(beam_power=power), np.array([0.4, -0.1, 0.0])
+    bent = scene(lens=lens, emitter=tuple(place))
+    image = record(bent, engine="mesh", noise=False).sequence.quads.astype(np.float64).mean(0)
+    rays = bent.camera().directions().numpy()
+    towards = 3.0 * rays / rays[..., 2:] - place
+    reach = np.linalg.norm(towards, axis=-1)
+    cosine, own = towards[..., 2] / reach, rays[..., 2]
+    factor = (own**3).sum() / (own**3 * own**power).sum()
+    shape = np.maximum(cosine, own.min() if power < 0 else 0.0) ** power
+    np.testing.assert_allclose(image, 0.5 * cosine / reach**2 * factor * shape, rtol=2e-5)
+    assert power > 0 or (cosine < own.min()).any()
+
+
+def test_a_beam_bounces():
+    """Direct light has the beam of the pixels, as without bounces; what bounces comes of what the beam lights."""
+    box = replace(WALL, shape=Box(size=(4.0, 3.0, 5.0), inside=True), path=Still(position=(0.0, 0.0, 1.0)))
+    options = {"engine": "mesh", "noise": False, "bounces": 1, "paths": 256, "frames": 1, "truth": "usual"}
+    plain, beam = (
+        record(scene(bodies=(box,), lens=lens), **options).truth.layers for lens in (Lens(), Lens(beam_power=8.0))
+    )
+    active = shading(Lens(beam_power=8.0), scene().camera()).active
+    np.testing.assert_allclose(beam["direct"][0, 2], plain["direct"][0, 2] * active, rtol=2e-5)
+    assert active[12, 16] > 1.3
+    both = [record(scene(bodies=(box,), lens=lens), **options).truth for lens in (Lens(), Lens(beam_power=8.0))]
+    bounced = [truth.amplitude[0] - truth.layers["direct"][0, 2] for truth in both]
+    assert bounced[0].min() > 0
+    assert 0 < bounced[1].mean() < 0.6 * bounced[0].mean(), "what shines to the side and back comes by more walls"
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".exr", ".png"])
+def test_a_measured_map_multiplies_all_light(tmp_path, suffix):
+    """Of any size, over its largest value; it counts by content, and a scene file names it beside itself."""
+    y, x = np.mgrid[:50, :66] / 66.0
+    image = (40000 * (1.0 - 0.5 * x - 0.2 * y)).astype(np.uint16)
+    file = tmp_path / f"map{suffix}"
+    if suffix == ".npy":
+        np.save(file, image.astype(np.float32))
+    elif suffix == ".exr":
+        write_exr(file, {"Y": image.astype(np.float32)})
+    else:
+        assert cv2.imwrite(str(file), image)
+    lens, camera = Lens(falloff=file, cosine_power=2.0), scene().camera()
+    want = image.reshape(25, 2, 33, 2).mean((1, 3)) / image.max()
+    seen = shading(lens, camera)
+    np.testing.assert_allclose(seen.ambient, want * camera.directions()[..., 2].numpy() ** 2, rtol=1e-6)
+    np.testing.assert_array_equal(seen.active, seen.ambient)
+    coarse = shading(Lens(falloff=file), Camera.from_fov(132, 100, 60.0)).ambient
+    assert 0 < np.abs(np.diff(coarse, axis=1)).max() < 0.01, "linear in between"
+    file.with_name(f"other{suffix}").write_bytes(file.read_bytes())
+    assert repr(Lens(falloff=file)) == repr(Lens(falloff=file.with_name(f"other{suffix}"))) != repr(Lens())
+    assert "falloff" not in repr(Lens(cosine_power=1.0))
+    assert f"map{suffix}, 66x50" in lens_rows(lens)["fall-off map"]
+    table = tmp_path / "scene.toml"
+    body = '[[bodies]]\nshape = { kind = "sphere", radius = 0.5 }\npath = { kind = "still", position = [0, 0, 2] }\n'
+    body += "texture = { low = 0.5, high = 0.5 }\n"
+    table.write_text(f'[lens]\nfalloff = "map{suffix}"\n{body}')
+    np.testing.assert_array_equal(read_scene(table).lens.map, lens.map)
+    shaded, plain = (
+        record(scene(lens=one), engine="mesh", noise=False).sequence.quads for one in (Lens(falloff=file), Lens())
+    )
+    np.testing.assert_allclose(shaded, plain * want, rtol=1e-5)
+
+
+def test_maps_that_cannot_be(tmp_path):
+    """Each is named, with what is wrong."""
+    good = np.ones((4, 5), dtype=np.float32)
+    wrong = {"zero.npy": (good * [1, 1, 0, 1, 1], "above 0"), "three.npy": (np.ones((4, 5, 3)), "rows and columns")}
+    for name, (image, says) in wrong.items():
+        np.save(tmp_path / name, image)
+        with pytest.raises(InputError, match=says):
+            Lens(falloff=tmp_path / name)
+    (tmp_path / "broken.png").write_bytes(b"no picture")
+    (tmp_path / "broken.npy").write_bytes(b"")
+    write_exr(tmp_path / "two.exr", {"A": good, "B": good})
+    for name, says in (
+        ("broken.png", "decoded"),
+        ("broken.npy", "no fall-off map"),
+        ("two.exr", "one channel"),
+        ("gone.npy", "no such file"),
+        ("map.tif", r"\.png, found '\.tif'"),
+    ):
+        with pytest.raises(InputError, match=says):
+            Lens(falloff=tmp_path / name)
+    with pytest.raises(InputError, match="no such file"):
+        simulate("demo", tmp_path / "out", overrides=[f"lens.falloff={tmp_path / 'gone.npy'}"])
     assert not (tmp_path / "out").exists()
 
 

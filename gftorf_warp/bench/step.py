@@ -147,8 +147,8 @@ def rows_of(
         }
         row |= {"images": state.images - before, "flow": observations.flow_source, "not_sound": broken}
         row |= {"ms_per_image": statistics.mean(times), "parts": Timing.of(times).plain()}
-        if isinstance(run.steps, CapturedSteps) and run.steps.gate.counts is not None:
-            row["awake"], row["asking"] = run.steps.gate.counts
+        if isinstance(run.steps, CapturedSteps) and run.steps.asking.counts is not None:
+            row["awake"], row["asking"] = run.steps.asking.counts
         if torch.device(device).type != "cpu":
             row["waits_per_image"] = waits(fresh(fitted, observations, settings, device, warm_up), device)
         rows.append(row)

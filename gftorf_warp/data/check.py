@@ -87,6 +87,10 @@ def _facts(sequence: Sequence, report: Report) -> None:
     if sequence.frequencies_hz is not None:
         several = ", ".join(f"{f / 1e6:.6g}" for f in dict.fromkeys(sequence.frame_frequencies.tolist()))
         report.lines.append(f"frequencies     {several} MHz; {sources['frequencies_hz']}")
+    if sequence.distortion is not None:
+        names = zip(("k1", "k2", "p1", "p2", "k3"), sequence.distortion, strict=True)
+        lens = ", ".join(f"{name} {value:.4g}" for name, value in names)
+        report.lines.append(f"lens            {lens}; {sources['distortion']}")
     if sequence.exposures is not None:
         low, high = 1e3 * sequence.exposures.min(), 1e3 * sequence.exposures.max()
         report.lines.append(f"exposures       {low:.4g} .. {high:.4g} ms; {sources['exposures']}")

@@ -5,7 +5,9 @@ is at Q = M P + m + R D of the later camera, with [M m] from one camera to the o
 
     F = f Q_xy / Q_z + c - x,   e = |F - F_measured|^2,   dF/dQ = f / Q_z (1, 0, -Q_x / Q_z), ..
 
-(method, section 5). The distance has no derivative. A measured flow that is not finite is unknown: no error there.
+(method, section 5). A lens that distorts is undone to get the ray, and images Q_xy / Q_z elsewhere, with a derivative
+of its own (scene/distortion.py); a pinhole does not come that way. The distance has no derivative. A measured flow that
+is not finite is unknown: no error there.
 """
 
 import warp as wp
@@ -13,13 +15,49 @@ import warp as wp
 from .sums import OVER_LANES
 
 NUMBERS = 29  # of two cameras: f and c of the first and of the later one, M, m, R
+LENSES = 11  # more, where there is one: k1, k2, p1, p2, k3 of the first camera, and of the later one with its radius
+STEPS = 20  # of Newton; a lens that the host could undo needs a handful
 NEAREST = 1e-6  # [m] of a surface
 
-_PIXEL = f"""
-    const float* k = views.data + flow * {NUMBERS};
+_LENS = """
+    auto image = [](const float* c, float a, float b, float* at) {  // and what the lens does to small steps there
+        const float r2 = a * a + b * b, radial = 1.0f + r2 * (c[0] + r2 * (c[1] + r2 * c[4]));
+        const float bend = 2.0f * (c[0] + r2 * (2.0f * c[1] + 3.0f * c[4] * r2));
+        at[0] = a * radial + 2.0f * c[2] * a * b + c[3] * (r2 + 2.0f * a * a);
+        at[1] = b * radial + c[2] * (r2 + 2.0f * b * b) + 2.0f * c[3] * a * b;
+        at[2] = radial + bend * a * a + 2.0f * c[2] * b + 6.0f * c[3] * a;
+        at[3] = bend * a * b + 2.0f * c[2] * a + 2.0f * c[3] * b;
+        at[4] = radial + bend * b * b + 6.0f * c[2] * b + 2.0f * c[3] * a;
+    };
+    auto turn = [](const float* c, float a, float b, float p, float q, float by, float* J) {  // of a tangent far out
+        const float r2 = a * a + b * b, more = 2.0f * (a * p + b * q);  // derivatives along (p, q) of those above
+        const float bend = 2.0f * (c[0] + r2 * (2.0f * c[1] + 3.0f * c[4] * r2));
+        const float bent = 2.0f * (2.0f * c[1] + 6.0f * c[4] * r2) * more, both = 0.5f * bend * more;
+        const float xx = both + bent * a * a + 2.0f * bend * a * p + 2.0f * c[2] * q + 6.0f * c[3] * p;
+        const float xy = bent * a * b + bend * (p * b + a * q) + 2.0f * c[2] * p + 2.0f * c[3] * q;
+        const float yy = both + bent * b * b + 2.0f * bend * b * q + 6.0f * c[2] * q + 2.0f * c[3] * p;
+        const float to_x = by * (xy * p - xx * q), to_y = by * (yy * p - xy * q);
+        J[0] -= to_x * q; J[1] += to_x * p; J[2] -= to_y * q; J[3] += to_y * p;
+    };
+"""
+
+_PIXEL = f"""{_LENS}
+    const bool lens = views.shape[1] > {NUMBERS};
+    const float* k = views.data + flow * views.shape[1];
     const int width = distance.shape[1], plane = distance.shape[0] * width;
     const float x = (float)(pixel % width) + 0.5f, y = (float)(pixel / width) + 0.5f;
-    const float u = (x - k[2]) / k[0], v = (y - k[3]) / k[1];
+    float u = (x - k[2]) / k[0], v = (y - k[3]) / k[1], at[5] = {{0.0f, 0.0f, 1.0f, 0.0f, 1.0f}};
+    if (lens) {{
+        const float u_ = u, v_ = v;
+        float missing = 1.0f;
+        for (int n = 0; n < {STEPS} && missing > 1e-7f; ++n) {{
+            image(k + {NUMBERS}, u, v, at);
+            const float du = u_ - at[0], dv = v_ - at[1], area = at[2] * at[4] - at[3] * at[3];
+            u += (du * at[4] - dv * at[3]) / area;
+            v += (dv * at[2] - du * at[3]) / area;
+            missing = fabsf(du) > fabsf(dv) ? fabsf(du) : fabsf(dv);
+        }}
+    }}
     const float seen = distance.data[pixel], d = (seen < {NEAREST}f ? {NEAREST}f : seen) / sqrtf(u * u + v * v + 1.0f);
     const float* D = displacement.data + 3 * flow * plane + pixel;
     const float* F = measured.data + ((long long)row * views.shape[0] + flow) * 2 * plane + pixel;
@@ -29,7 +67,18 @@ _PIXEL = f"""
     const float qz = d * (k[14] * u + k[15] * v + k[16]) + k[19] + (k[26] * dx + k[27] * dy + k[28] * dz);
     const float a = qx / qz, b = qy / qz, largest = 3.402823466e38f;
     const bool known = fabsf(fx) <= largest && fabsf(fy) <= largest;
-    const float ex = known ? k[4] * a + (k[6] - x) - fx : 0.0f, ey = known ? k[5] * b + (k[7] - y) - fy : 0.0f;
+    float a_ = a, b_ = b, J[4] = {{1.0f, 0.0f, 0.0f, 1.0f}};
+    if (lens) {{
+        const float* c = k + {NUMBERS} + 5;
+        const float r = sqrtf(a * a + b * b), edge = r > c[5] ? c[5] / r : 1.0f;
+        const float na = edge * a, nb = edge * b, da = a - na, db = b - nb;
+        image(c, na, nb, at);
+        a_ = at[0] + (at[2] * da + at[3] * db);
+        b_ = at[1] + (at[3] * da + at[4] * db);
+        J[0] = at[2]; J[1] = J[2] = at[3]; J[3] = at[4];
+        if (edge < 1.0f) turn(c, na, nb, a / r, b / r, (r - c[5]) * edge, J);
+    }}
+    const float ex = known ? k[4] * a_ + (k[6] - x) - fx : 0.0f, ey = known ? k[5] * b_ + (k[7] - y) - fy : 0.0f;
 """
 
 _ERROR = f"""
@@ -47,7 +96,13 @@ _ERROR = f"""
 _GRADIENT = f"""{_PIXEL}
     float gx = 0.0f, gy = 0.0f, gz = 0.0f;
     if (known) {{
-        const float bx = 2.0f * scale * ex * k[4] / qz, by = 2.0f * scale * ey * k[5] / qz, bz = -(bx * a + by * b);
+        float bx = 2.0f * scale * ex * k[4] / qz, by = 2.0f * scale * ey * k[5] / qz;
+        if (lens) {{
+            const float cx = bx, cy = by;
+            bx = cx * J[0] + cy * J[2];
+            by = cx * J[1] + cy * J[3];
+        }}
+        const float bz = -(bx * a + by * b);
         gx = k[20] * bx + k[23] * by + k[26] * bz;
         gy = k[21] * bx + k[24] * by + k[27] * bz;
         gz = k[22] * bx + k[25] * by + k[28] * bz;
@@ -92,7 +147,7 @@ def flow_errors(
     displacement: wp.array3d[float],  # [3F, H, W] to the end of each flow, world axes [m]
     measured: wp.array4d[float],  # [R F, 2, H, W] flows, NaN: unknown [px]
     row: wp.array[int],  # [1] which F of ``measured`` [index]
-    views: wp.array2d[float],  # [F, 29] f, c, later f, c, M, m, R [px, 1, m]
+    views: wp.array2d[float],  # [F, 29] f, c, later f, c, M, m, R [px, 1, m]; [F, 40] lenses, too
     # Out:
     partials: wp.array2d[float],  # [1, P] sums of squared differences over parts of the image [px^2]
 ):

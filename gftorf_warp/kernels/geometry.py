@@ -7,7 +7,7 @@ from ..constants import GUARD, LOW_PASS
 
 @wp.struct
 class CameraView:
-    """A pinhole camera; the centre of pixel [0, 0] is at (0.5, 0.5)."""
+    """A camera; the centre of pixel [0, 0] is at (0.5, 0.5)."""
 
     rotation: wp.mat33  # camera_from_world, upper left
     translation: wp.vec3  # camera_from_world, last column [m]
@@ -20,6 +20,14 @@ class CameraView:
     height: int  # rows [px]
     near: float  # smallest z-depth [m]
     far: float  # largest z-depth [m]
+    radius: float  # of the disc about the axis in which a lens distorts as its polynomial says [1]; 0: a pinhole
+    guard_x: float  # largest slope x/z at which such a lens has its derivative taken [1]
+    guard_y: float  # largest slope y/z likewise [1]
+    k1: float  # of the lens, as OpenCV names them [1]
+    k2: float  # likewise
+    p1: float  # likewise
+    p2: float  # likewise
+    k3: float  # likewise
 
 
 @wp.func
@@ -53,6 +61,12 @@ def screen_covariance(view: CameraView, local: wp.vec3, wxyz: wp.vec4, scale: wp
     slope_y = wp.clamp(local[1] * inverse_z, -limit_y, limit_y)
     along_x = axes * wp.vec3(view.fx * inverse_z, 0.0, -view.fx * inverse_z * slope_x)
     along_y = axes * wp.vec3(0.0, view.fy * inverse_z, -view.fy * inverse_z * slope_y)
+    return ellipse_of(along_x, along_y)
+
+
+@wp.func
+def ellipse_of(along_x: wp.vec3, along_y: wp.vec3) -> wp.vec4:
+    """Covariance (xx, xy, yy) [px^2] and its determinant, of how far each own axis reaches along x and y [px]."""
     xx = wp.dot(along_x, along_x) + LOW_PASS
     xy = wp.dot(along_x, along_y)
     yy = wp.dot(along_y, along_y) + LOW_PASS

@@ -28,11 +28,14 @@ ONE_PATH = wp.constant(float("nan"))  # the standard error of a single path
 
 @wp.struct
 class Emitter:
-    """A point of light that shines evenly into a pyramid about the z axis of the camera."""
+    """A point of light that shines into a pyramid about the z axis of the camera."""
 
     place: wp.vec3  # in camera axes [m]; zero: at the camera, where nothing that it sees can be in a shadow
     spread: wp.vec2  # tangents of half the angles across and down [1]; 0: into all directions
     cycles: float  # modulation frequency over the speed of light [1/m]
+    power: float  # of the cosine of the angle to the z axis by which it shines less to the side [1]; 0: evenly
+    factor: float  # of its light along the axis [1]; unused where it shines evenly
+    least: float  # cosine beyond which the beam stays as it is [1]; likewise
 
 
 @wp.func
@@ -90,6 +93,12 @@ def received(
     if cosine > 0.0 and may_be_hidden:
         limit = reach * (1.0 - SHADOW_GAP)
         if nearest(solids, rotation, translation, instant, emitter.place, towards / reach, limit).body >= 0:
+            cosine = float(0.0)
+    if cosine > 0.0 and emitter.power != 0.0:
+        straight = towards[2] / reach
+        if straight > 0.0:
+            cosine *= emitter.factor * wp.pow(wp.max(straight, emitter.least), emitter.power)
+        else:
             cosine = float(0.0)
     if cosine > 0.0:
         factor = shine(solids[body], turn * view, turn * towards / reach, normal)

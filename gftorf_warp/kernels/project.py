@@ -11,6 +11,7 @@ from ..constants import ALPHA_MIN, SH_BIAS
 from .correlation import PHASE_OFFSET, PHASE_SLOPE, SOURCE_INTENSITY, light_of
 from .geometry import CameraView, screen_covariance
 from .harmonics import harmonics
+from .lens import bent_covariance, distorted
 from .splat import Splat
 
 BLOCK_RADIUS = wp.constant(
@@ -72,12 +73,13 @@ def square_of(view: CameraView, x: float, y: float, cov: wp.vec4) -> wp.vec4i:
 
 
 @functools.cache
-def make_project(colour: bool, square: bool):
+def make_project(colour: bool, square: bool, lens: bool = False):
     """The kernel for a field with or without colour.
 
     Args:
         colour: Whether slots 8-10 hold colour, from its own harmonics.
         square: Whether splats are cut by the 3-sigma square (parity with the released code).
+        lens: Whether the camera is no pinhole.
     """
 
     @wp.kernel(module="unique", module_options={"fast_math": False})  # __sinf would lose the phase beyond +-pi
@@ -109,10 +111,16 @@ def make_project(colour: bool, square: bool):
             return
         log_sizes = log_scale[n]
         scale = wp.vec3(wp.exp(log_sizes[0]), wp.exp(log_sizes[1]), wp.exp(log_sizes[2]))
-        cov = screen_covariance(view, local, quaternion[n], scale)
+        if wp.static(lens):
+            cov = bent_covariance(view, local, quaternion[n], scale)
+            place = distorted(view, local[0] / local[2], local[1] / local[2])
+            x = view.fx * place[0] + view.cx
+            y = view.fy * place[1] + view.cy
+        else:
+            cov = screen_covariance(view, local, quaternion[n], scale)
+            x = view.fx * local[0] / local[2] + view.cx
+            y = view.fy * local[1] / local[2] + view.cy
         determinant = cov[3]
-        x = view.fx * local[0] / local[2] + view.cx
-        y = view.fy * local[1] / local[2] + view.cy
         visit = visit_of(opacity, cov)
         box = box_of(view, x, y, cov, -2.0 * visit[0])
         if wp.static(square):

@@ -10,6 +10,7 @@ planes have a normal on either side.
 import warp as wp
 
 from .geometry import CameraView
+from .lens import undistorted
 
 NOTHING = -1  # the body where a ray hits none
 FAR = wp.constant(1.0e6)  # [m] the end of the world
@@ -141,8 +142,11 @@ def nearest(
 
 @wp.func
 def ray_through(view: CameraView, x: float, y: float) -> wp.vec3:
-    """Unit vector in camera axes through the image point (x, y) [px]."""
-    return wp.normalize(wp.vec3((x - view.cx) / view.fx, (y - view.cy) / view.fy, 1.0))
+    """Unit vector in camera axes through the image point (x, y) [px]; a lens is undone."""
+    slope = wp.vec2((x - view.cx) / view.fx, (y - view.cy) / view.fy)
+    if view.radius > 0.0:
+        slope = undistorted(view, slope[0], slope[1])
+    return wp.normalize(wp.vec3(slope[0], slope[1], 1.0))
 
 
 @wp.kernel(enable_backward=False)

@@ -21,9 +21,8 @@ from ..render.api import Rendering
 from ..render.bridge import Branches, Captured, Inbox, Outbox, pairs_of, shared_pool
 from ..render.buffers import RenderSettings, Workspace
 from ..scene.motion import Still
-from ..scene.network import Network
 from . import densify
-from .gating import Gate
+from .gating import Asking, judge_after
 from .objective import image_loss, render_settings_at, rendering_of, weights_at
 from .observations import Observations
 from .optimiser import EPSILON, frozen, rates_at
@@ -67,8 +66,6 @@ def steps_of(
         if why is None:
             return CapturedSteps(state, observations, settings)
         LOG.info("steps are no graphs: %s", why)
-    if settings.gate.distance is not None:
-        LOG.info("every Gaussian asks for its motion: gate.distance is known to captured steps only, kernels=graph")
     return Singles(state, observations, settings, run_all)
 
 
@@ -88,8 +85,6 @@ class Variant:
     """Of the terms."""
     sh_degree: int
     """Of the harmonics."""
-    gated: bool
-    """Whether Gaussians at rest do not ask for their motion."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -136,10 +131,7 @@ class CapturedSteps:
         self._flow = observations.flow_table() if settings.weights.flow > 0 else None
         self._branches = Branches(longest, device)
         self._workspaces = [Workspace() for _ in range(longest)]
-        self.gate = Gate(settings, state.motion)
-        if isinstance(state.motion, Network) and device.type != "cpu":
-            fits = fused.masks(settings.motion.width, torch.float16)
-            state.motion.mask_by(fused.masked if fits else None)
+        self.asking = Asking(state.motion, gated=settings.gate.still_pixels)
         self._adopt()
 
     def step(self) -> None:
@@ -165,11 +157,10 @@ class CapturedSteps:
             run()
             self._watch()
         densify_after(state, before, settings)
-        if due or not self.padded.holds(state):
+        judged = judge_after(state, before, self.observations, settings)
+        if due or judged or not self.padded.holds(state):
             self._look()
             self._adopt()
-        if self.gate.is_due(before, state.images) and self.gate.judge(self.padded.field, len(state.optimiser.field)):
-            self._forget()  # the host has waited for the judgement, so all graphs have run
 
     def _enter(self, variant: Variant) -> None:
         """Let go of graphs of a part of the run that is over, and prepare what rests in the one that begins."""
@@ -241,9 +232,8 @@ class CapturedSteps:
             self._look()
 
     def _adopt(self) -> None:
-        optimiser, anew = self.state.optimiser, self.padded.adopt(self.state)
-        moved, optimiser.origin = self.gate.follow(optimiser.origin, self.padded.rows), None
-        if anew or moved:
+        anew = self.padded.adopt(self.state)
+        if self.asking.follow(self.padded.layer) or anew:
             self._forget()
         if self._part is not None:
             self._rest(self._part[1])
@@ -260,7 +250,6 @@ class CapturedSteps:
             rests=frozen(self.settings, images),
             weights=weights,
             sh_degree=render_settings_at(self.settings, images).sh_degree,
-            gated=moves and self.gate.is_shut(images // len(frames)),
         )
 
     def _write(self, frames: list[int], images: int, rates: dict[str, float]) -> None:
@@ -294,7 +283,7 @@ class CapturedSteps:
         if variant.moves:
             keys = numbers[: 3 if variant.flow else 2]
             attachment = None if motion.follows_means and not variant.rests else padded.attachment
-            offsets = self.gate.offsets(field, attachment, keys, gated=variant.gated)
+            offsets = self.asking.offsets(field, attachment, keys)
         render = replace(self.settings.render, sh_degree=variant.sh_degree, pair_capacity=self._reserve.capacity)
         images = []
         for n in range(len(variant.shifts)):

@@ -38,8 +38,8 @@ def config_of(
         "frames": sequence.frames,
         "frame_rate_hz": _rate(sequence),
         "times": sequence.sources.get("times"),
-        "camera": {  # a pinhole: nothing else is reconstructed from
-            **{name: value for name, value in asdict(camera).items() if name != "distortion"},
+        "camera": {
+            **{name: value for name, value in asdict(camera).items() if name != "distortion" or camera.distortion},
             "camera_from_world": camera.camera_from_world.tolist(),
         },
         "sensor": {name: getattr(sensor, name) for name in ("f_mod_hz", "phase_offset", "dc_offset", "frame_period_s")},

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..constants import FRAMES_PER_QUARTET
@@ -16,9 +16,10 @@ from ..data.decode import closed_form_distance, quad_scale, quartet_phasor
 from ..data.sequence import Sequence
 from ..errors import InputError
 from ..scene.camera import Camera
-from ..scene.initialise import Init
+from ..scene.initialise import RESTS, Init
 from ..scene.measured import camera_of, colour_camera_of, sensor_of
 from ..scene.sensor import Sensor
+from ..scene.still import still_pixels
 from .settings import Batch, FlowSource, Input, ReconSettings
 
 HASHED = ("quads", "measured", "shifts", "times", "camera_from_world", "colour_from_world")
@@ -57,6 +58,8 @@ class Observations:
     """Where that number is from."""
     flow_source: str
     """'file', 'computed' or 'none'."""
+    still: Bool[Tensor, "H W"] | None = None
+    """Pixels whose quads never change; None: nobody asked for them."""
 
     def sensor_at(self, frame: int) -> Sensor:
         """The sensor reading only the shift of one raw frame."""
@@ -110,7 +113,7 @@ def observe(sequence: Sequence, settings: ReconSettings, device: torch.device | 
 
     Raises:
         InputError: If no raw frame was measured, all quads are zero, what is to be compared does not exist, or the
-            sensor is one that cannot be rendered: several modulation frequencies, or a lens that distorts.
+            sensor is one that cannot be rendered: several modulation frequencies.
     """
     if not sequence.measured.any() or not np.abs(sequence.quads[sequence.measured]).max() > 0:
         raise InputError(
@@ -119,7 +122,7 @@ def observe(sequence: Sequence, settings: ReconSettings, device: torch.device | 
             why="no raw frame exists, or all of them are zero",
             fix="check the folder with `gftorf check`",
         )
-    _demand_one_frequency_and_a_pinhole(sequence)
+    _demand_one_frequency(sequence)
     if settings.quad_scale is None:
         scale, scale_source = quad_scale(sequence)
     else:
@@ -159,7 +162,19 @@ def observe(sequence: Sequence, settings: ReconSettings, device: torch.device | 
         quad_scale=float(scale),
         quad_scale_source=scale_source,
         flow_source=flow_source,
+        still=_still(prepared, settings.gate.margin).to(device) if settings.gate.still_pixels else None,
     )
+
+
+def _still(sequence: Sequence, margin: int) -> Bool[Tensor, "H W"]:
+    if np.ptp(sequence.camera_from_world, axis=0).max() > RESTS:
+        raise InputError(
+            "no pixel is still for a camera that moves",
+            where=f"{sequence.path or 'sequence'}, gate.still_pixels",
+            why="Gaussians are held still where raw quads of a camera at rest never change, and its poses differ",
+            fix="leave gate.still_pixels=true out",
+        )
+    return still_pixels(sequence, margin)
 
 
 def reads_flow(settings: ReconSettings) -> bool:
@@ -194,16 +209,14 @@ def _colour(sequence: Sequence, settings: ReconSettings) -> tuple[dict[int, np.n
     return {n: image / np.float32(largest) for n, image in sequence.colour.items()}, 1.0 / largest
 
 
-def _demand_one_frequency_and_a_pinhole(sequence: Sequence) -> None:
+def _demand_one_frequency(sequence: Sequence) -> None:
     frequencies = [] if sequence.frequencies_hz is None else sorted(set(sequence.frequencies_hz.tolist()))
-    lens = sequence.distortion is not None and any(sequence.distortion)
-    if len(frequencies) > 1 or lens:
+    if len(frequencies) > 1:
         raise InputError(
             "a sensor that is not rendered",
             where=sequence.path or "sequence",
-            why="expected one modulation frequency and a pinhole, found "
-            + (f"a lens with {sequence.distortion}" if lens else f"{frequencies} Hz"),
-            fix="record without the lens" if lens else "keep the raw frames of one frequency",
+            why=f"expected one modulation frequency, found {frequencies} Hz",
+            fix="keep the raw frames of one frequency",
         )
 
 
@@ -266,6 +279,8 @@ def data_hash(sequence: Sequence) -> str:
             digest.update(f"{name} {array.shape}".encode())
             digest.update(np.ascontiguousarray(array).tobytes())
     digest.update(repr([getattr(sequence, name) for name in HASHED_NUMBERS]).encode())
+    if sequence.distortion is not None:
+        digest.update(repr(sequence.distortion).encode())
     for name in ("forward_flow", "backward_flow", "colour"):
         for frame, image in sorted(getattr(sequence, name).items()):
             digest.update(f"{name} {frame}".encode() + np.ascontiguousarray(image).tobytes())

@@ -104,8 +104,6 @@ class Optimiser:
         if colour is not None:
             parts |= {"colour_constant": colour[:, :1], "colour_rest": colour[:, 1:]}
         self.tensors = {name: value.detach().clone().requires_grad_() for name, value in parts.items()}
-        self.origin: Int[Tensor, "N"] | None = None
-        """The row that each Gaussian was when this was last set to None; None: the same."""
         self.motion = [parameter for parameter in motion.parameters() if parameter.numel()]
         self.adam = torch.optim.Adam(
             [{"name": name, "params": [value], "lr": 0.0} for name, value in self.tensors.items()]
@@ -197,7 +195,6 @@ class Optimiser:
             self.tensors[name] = new
             if state:
                 self.adam.state[new] = state
-        self.origin = rows if self.origin is None else self.origin[rows]
         if self.layer is not None:
             self.layer = self.layer[rows]
 

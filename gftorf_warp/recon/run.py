@@ -21,6 +21,7 @@ from ..render.buffers import ClampGradient, Distortion, RenderSettings, Stop, Su
 from ..render.inputs import CHOICES
 from ..render.replay import Replay
 from ..scene.camera import Camera
+from ..scene.distortion import Distortion as Lens
 from ..scene.gaussians import GaussianField
 from ..scene.motion import Motion
 from ..scene.sensor import Sensor
@@ -60,7 +61,7 @@ class Run:
         """
         path = Path(path)
         config = read_config(path)
-        camera = Camera(**config["camera"] | {"camera_from_world": np.array(config["camera"]["camera_from_world"])})
+        camera = _camera(config["camera"])
         sensor = Sensor(**config["sensor"], shifts=CANONICAL_SHIFTS)
         if config["settings"].get("method") == Method.CTOF:
             from .closed_form import ClosedForm
@@ -187,6 +188,13 @@ class Run:
             )
         given = str(self.config.get("times") or "").startswith("setting")
         return Sequence.open(source, frame_rate_hz=self.config["frame_rate_hz"] if given else None)
+
+
+def _camera(stored: dict) -> Camera:
+    """The camera that ``config.json`` describes."""
+    lens = Lens(**stored.get("distortion", {}))
+    pose = np.array(stored["camera_from_world"])
+    return Camera(**stored | {"camera_from_world": pose, "distortion": lens})
 
 
 def _footprint(field: GaussianField, camera: Camera) -> Float[Tensor, "N"]:

@@ -224,27 +224,21 @@ class DensifySettings:
 
 @dataclass(frozen=True, kw_only=True)
 class GateSettings:
-    """An approximation: Gaussians at rest keep their displacements for a while instead of asking the network.
+    """An approximation: a Gaussian that only still pixels see is at rest; its displacement is zero, whatever moves.
 
-    Only captured steps (``kernels=graph``) of a motion network know it; other steps say in the log that they ignore it.
-    Diagnostics, checkpoints and the finished run ask the network for everybody; a run that is resumed judges anew.
+    For a camera at rest. Judged at the end of the warm-up, after every round, and now and then.
     """
 
-    distance: float | None = None
-    """Displacements that stay within this of their mean over all keys are at rest [m]; None: everybody asks."""
+    still_pixels: bool = False
+    """Whether pixels whose raw quads never change hold still what they see (scene/still.py)."""
+    margin: int = 1
+    """Pixels so near to one that changes are not still either [px]."""
     every: int = 500
-    """Between two judgements of who is at rest [images]."""
-    after: int = 1000
-    """The first judgement is so long after the warm-up: the network has to learn first what moves [images]."""
-    open_every: int = 8
-    """In one of so many steps everybody asks and learns, so that the network goes on to hold still what rests [1]."""
+    """Between two judgements [images]."""
 
     def __post_init__(self):
-        if self.distance is not None and not self.distance > 0:
-            raise ValueError(f"distance must be above 0 or None, got {self.distance} m")
-        if self.every < 1 or self.open_every < 1 or self.after < 0:
-            counts = f"{self.every}, {self.open_every} and {self.after}"
-            raise ValueError(f"every and open_every must be at least 1 and after at least 0, got {counts}")
+        if self.every < 1 or self.margin < 0:
+            raise ValueError(f"every must be at least 1 and margin at least 0, got {self.every} and {self.margin}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -270,7 +264,7 @@ class ReconSettings:
     motion: MotionSettings = field(default_factory=MotionSettings)
     """The motion model."""
     gate: GateSettings = field(default_factory=GateSettings)
-    """Who asks it in a step."""
+    """Who is held still."""
     render: RenderSettings = field(default_factory=RenderSettings)
     """The renderer, also of the finished run."""
     rates: Rates = field(default_factory=Rates)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
+from dataclasses import astuple
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,8 @@ from ..kernels.similarity import MOMENTS, REACH, SLOPES, SUMS
 from ..scene.camera import Camera
 from . import training
 from .bridge import array_over, stream_of
+
+LARGEST = 1e18  # radius of a lens that is none: its square is a float32, too
 
 
 class Scratch:
@@ -211,13 +214,17 @@ def _flow_arrays(
 
 @functools.lru_cache(maxsize=4096)
 def _views(camera: Camera, later: tuple[Camera, ...], device: torch.device) -> Tensor:
-    """[F, 29] what the kernels know of cameras, computed in float64 and uploaded once."""
+    """[F, 29 or, with a lens, 40] what the kernels know of cameras, computed in float64 and uploaded once."""
+    lens = any(one.distortion for one in (camera, *later))
     here, rows = camera.camera_from_world, []
     for then in later:
         there = then.camera_from_world
         between = there @ np.linalg.inv(here)
         own = [camera.fx, camera.fy, camera.cx, camera.cy, then.fx, then.fy, then.cx, then.cy]
         rows.append([*own, *between[:3, :3].flatten(), *between[:3, 3], *there[:3, :3].flatten()])
+        if lens:
+            radius = min(then.guard.radius, LARGEST)
+            rows[-1] += [*astuple(camera.distortion), *astuple(then.distortion), radius]
     return torch.tensor(np.array(rows), dtype=torch.float32, device=device)
 
 

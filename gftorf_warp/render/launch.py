@@ -12,6 +12,7 @@ and finds gradients added to the ``.grad`` of its inputs. torch programs come th
 
 from __future__ import annotations
 
+from dataclasses import astuple
 from typing import Any
 
 import numpy as np
@@ -29,13 +30,7 @@ __all__ = ["Images", "Inputs", "backward", "forward", "render", "view_of"]
 
 
 def view_of(camera: Camera, settings: RenderSettings) -> CameraView:
-    """The camera as kernels see it.
-
-    Raises:
-        ValueError: If its lens distorts: kernels know pinholes only.
-    """
-    if camera.distortion:
-        raise ValueError(f"cannot render through a lens with {camera.distortion}: only a pinhole")
+    """The camera as kernels see it."""
     view = CameraView()
     pose = camera.camera_from_world
     view.rotation = wp.mat33(pose[:3, :3].astype(np.float32))
@@ -43,6 +38,9 @@ def view_of(camera: Camera, settings: RenderSettings) -> CameraView:
     view.centre = wp.vec3(*camera.centre)
     view.fx, view.fy, view.cx, view.cy = camera.fx, camera.fy, camera.cx, camera.cy
     view.width, view.height, view.near, view.far = camera.width, camera.height, settings.near, settings.far
+    if camera.distortion:
+        view.guard_x, view.guard_y, view.radius = camera.guard
+        view.k1, view.k2, view.p1, view.p2, view.k3 = astuple(camera.distortion)
     return view
 
 

@@ -3,7 +3,7 @@
 Here a physicist checks the model (method, section 2). Gaussian k, its centre X in the world, the pose (Rc, t):
 
     camera axes      X_c = Rc X + t = (x, y, z),  distance d = |X_c|,  direction n = (X - camera centre) / d
-    image            u = fx x / z + cx,  v = fy y / z + cy
+    image            u = fx x / z + cx,  v = fy y / z + cy;  a lens images (x / z, y / z) elsewhere and has its own J
     footprint        cov2D = U Sigma U^T + 0.3 I,  U = J Rc,  Sigma = Gamma Gamma^T,  Gamma = R(quaternion) diag(scale)
     response         G = exp(-1/2 (k1 dx^2 + k3 dy^2) - k2 dx dy),  [[k1, k2], [k2, k3]] = cov2D^-1
     alpha            alpha = min(0.99, o G), none below 1/255,  T_k = prod_{l < k} (1 - alpha_l),  w_k = alpha_k T_k
@@ -27,8 +27,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ..constants import ALPHA_MAX, ALPHA_MIN, GUARD, LOW_PASS, SH_BIAS, SPEED_OF_LIGHT, TRANSMITTANCE_MIN
+from ..constants import ALPHA_MAX, ALPHA_MIN, LOW_PASS, SH_BIAS, SPEED_OF_LIGHT, TRANSMITTANCE_MIN
 from ..scene.camera import Camera
+from ..scene.distortion import inside
 from ..scene.gaussians import GaussianField
 from ..scene.sensor import Sensor
 from .api import Background, Rendering, ScreenGradient
@@ -182,7 +183,7 @@ def _project(field: GaussianField, camera: Camera, settings: RenderSettings) -> 
     point = field.mean[index] @ rotation.T + translation
     x, y, z = point.unbind(1)
     distance = point.norm(dim=1)
-    limit_x, limit_y = (GUARD * size / (2.0 * f) for size, f in ((camera.width, camera.fx), (camera.height, camera.fy)))
+    limit_x, limit_y, radius = camera.guard
     x_guarded, y_guarded = z * (x / z).clamp(-limit_x, limit_x), z * (y / z).clamp(-limit_y, limit_y)
     zero = torch.zeros_like(z)
     jacobian = torch.stack(
@@ -192,6 +193,13 @@ def _project(field: GaussianField, camera: Camera, settings: RenderSettings) -> 
         ],
         1,
     )
+    flat = x / z, y / z
+    if camera.distortion:
+        near = inside(x_guarded / z, y_guarded / z, radius)
+        xx, xy, yy = camera.distortion.slope(*near)
+        aspect = camera.fx / camera.fy
+        bend = torch.stack([torch.stack([xx, xy * aspect], 1), torch.stack([xy / aspect, yy], 1)], 1)
+        jacobian, flat = bend @ jacobian, camera.distortion.apply(*flat, radius)
     axes = _rotation(field.quaternion[index]) * field.scale[index][:, None, :]  # Gamma, columns in metres
     projected = jacobian @ rotation @ axes  # [M, 2, 3]
     cov = projected @ projected.mT + LOW_PASS * torch.eye(2, dtype=z.dtype, device=z.device)
@@ -200,7 +208,7 @@ def _project(field: GaussianField, camera: Camera, settings: RenderSettings) -> 
         z_depth=z,
         distance=distance,
         direction=point @ rotation / distance[:, None],  # Rc^T X_c = X - camera centre
-        centre=torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], 1),
+        centre=torch.stack([camera.fx * flat[0] + camera.cx, camera.fy * flat[1] + camera.cy], 1),
         covariance=torch.stack([cov[:, 0, 0], cov[:, 0, 1], cov[:, 1, 1]], 1),
         opacity=field.opacity[index],
     )

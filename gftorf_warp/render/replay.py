@@ -192,7 +192,7 @@ class Replay:
 
     def _view(self, camera: Camera) -> _View:
         """What is kept for a camera; the one that came first leaves when there are too many."""
-        lens = camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy
+        lens = camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, camera.distortion
         name = (*lens, camera.camera_from_world.tobytes())
         if name not in self._views:
             if len(self._views) >= CAMERAS_MAX:

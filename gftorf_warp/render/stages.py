@@ -28,7 +28,8 @@ _PROJECTED = ("mean", "log_scale", "quaternion", "opacity_logit", "reflectivity_
 
 def project(inputs: Inputs, view: CameraView, frame: Frame) -> None:
     """Gaussians to splats, depth keys and image regions."""
-    _launch(_project_kernel(inputs, frame), frame.count, _project_inputs(inputs, view, frame), _project_outputs(frame))
+    kernel = _project_kernel(inputs, view, frame)
+    _launch(kernel, frame.count, _project_inputs(inputs, view, frame), _project_outputs(frame))
 
 
 def project_backward(inputs: Inputs, view: CameraView, frame: Frame, grad_splats: wp.array, wanted: Inputs) -> None:
@@ -36,7 +37,7 @@ def project_backward(inputs: Inputs, view: CameraView, frame: Frame, grad_splats
     adjoint = [getattr(wanted, name) for name in _PROJECTED]
     if any(array is not None for array in [*adjoint, wanted.calibration]):
         _launch(
-            _project_kernel(inputs, frame),
+            _project_kernel(inputs, view, frame),
             frame.count,
             _project_inputs(inputs, view, frame),
             _project_outputs(frame),
@@ -46,9 +47,9 @@ def project_backward(inputs: Inputs, view: CameraView, frame: Frame, grad_splats
         )
 
 
-def _project_kernel(inputs: Inputs, frame: Frame):
+def _project_kernel(inputs: Inputs, view: CameraView, frame: Frame):
     settings = frame.settings
-    return make_project(inputs.colour_sh is not None, settings.support == Support.SIGMA3_TILE16)
+    return make_project(inputs.colour_sh is not None, settings.support == Support.SIGMA3_TILE16, view.radius > 0.0)
 
 
 def _project_inputs(inputs: Inputs, view: CameraView, frame: Frame) -> list:

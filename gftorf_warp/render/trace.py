@@ -18,6 +18,7 @@ from ..constants import SPEED_OF_LIGHT
 from ..kernels import paths, trace
 from ..kernels.geometry import CameraView
 from ..scene.camera import Camera
+from ..scene.optics import Beam
 from .buffers import RenderSettings, available_threads
 from .launch import view_of
 from .stages import run_side_by_side
@@ -85,12 +86,14 @@ class RigidBody:
 
 @dataclass(frozen=True, kw_only=True)
 class Lamp:
-    """A point that shines evenly into a pyramid about the z axis of the camera."""
+    """A point that shines into a pyramid about the z axis of the camera."""
 
     position: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Place in camera axes [m]; away from the camera, bodies cast shadows that it sees."""
     beam_deg: tuple[float, float] | None = None
     """Full angles across and down that are lit, below 180 [deg]; None: all directions."""
+    beam: Beam | None = None
+    """How it shines to the side, and then not backwards; None: evenly."""
 
     def __post_init__(self):
         if self.beam_deg is not None and not all(0 < angle < 180 for angle in self.beam_deg):
@@ -295,6 +298,8 @@ def _emitter(lamp: Lamp, f_mod_hz: float) -> paths.Emitter:
     across, down = lamp.beam_deg or (0.0, 0.0)
     emitter.spread = wp.vec2(math.tan(math.radians(across) / 2), math.tan(math.radians(down) / 2))
     emitter.cycles = f_mod_hz / SPEED_OF_LIGHT
+    if lamp.beam is not None:
+        emitter.power, emitter.factor, emitter.least = lamp.beam
     return emitter
 
 

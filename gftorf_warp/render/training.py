@@ -82,7 +82,7 @@ def flow_loss(
         displacement: [3F, H, W].
         measured: [R F, 2, H, W].
         row: [1] which F of them.
-        views: [F, 29] cameras.
+        views: [F, 29 or 40] cameras.
         partials: [1, ``flow_parts(distance)``]; scratch.
         out: Filled.
     """

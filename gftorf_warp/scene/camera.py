@@ -5,16 +5,28 @@ from __future__ import annotations
 import functools
 import math
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from .distortion import Distortion
+from ..constants import GUARD
+from .distortion import Distortion, inside
 
 CHECKED = 33  # places per axis at which a lens is tried when a camera is made
+
+
+class Guard(NamedTuple):
+    """Up to where a projection is what it says [1], as slopes x/z and y/z of what is seen."""
+
+    x: float
+    """Half the width of the view times 1.3: no derivative of the projection is taken farther out (method, 2.2)."""
+    y: float
+    """Likewise of its height."""
+    radius: float
+    """Beyond it a lens that distorts goes on as its tangent."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -36,7 +48,7 @@ class Camera:
     camera_from_world: np.ndarray = field(default_factory=lambda: np.eye(4))
     """Pose, 4x4 on column vectors, world to camera [m]."""
     distortion: Distortion = field(default_factory=Distortion)
-    """Of the lens; the default is a pinhole, the only camera that the engines know."""
+    """Of the lens; the default is a pinhole."""
 
     def __post_init__(self):
         pose = np.asarray(self.camera_from_world, dtype=np.float64)
@@ -51,9 +63,7 @@ class Camera:
                 f"fx {self.fx}, fy {self.fy}"
             )
         object.__setattr__(self, "camera_from_world", pose)
-        if self.distortion:  # a lens that cannot be undone inside the image is none: ValueError
-            x, y = np.linspace(0, self.width, CHECKED), np.linspace(0, self.height, CHECKED)[:, None]
-            self.distortion.undo((x - self.cx) / self.fx, (y - self.cy) / self.fy)
+        _ = self.guard  # a lens that cannot be undone inside the image is none: ValueError
 
     @classmethod
     def from_fov(cls, width: int, height: int, horizontal_fov_deg: float, **pose: Any) -> Camera:
@@ -67,6 +77,13 @@ class Camera:
         pose = self.camera_from_world
         return -pose[:3, :3].T @ pose[:3, 3]
 
+    @functools.cached_property
+    def guard(self) -> Guard:
+        """Where derivatives of the projection stop to change, and where the polynomial of a lens ends."""
+        if not self.distortion:
+            return Guard(0.5 * GUARD * self.width / self.fx, 0.5 * GUARD * self.height / self.fy, math.inf)
+        return _guard(self.distortion, self.width, self.height, self.fx, self.fy, self.cx, self.cy)
+
     def at(self, camera_from_world: np.ndarray) -> Camera:
         """The same camera at another pose."""
         return replace(self, camera_from_world=camera_from_world)
@@ -78,6 +95,28 @@ class Camera:
             self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy
         )
 
+    def area(self, point: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n"]:
+        """Area on the sensor over that of a pinhole's image [1], of something small at points in the world [m]."""
+        if not self.distortion:
+            return torch.ones_like(point[..., 0])
+        pose = torch.from_numpy(self.camera_from_world).to(point)
+        x, y, z = (point @ pose[:3, :3].T + pose[:3, 3]).unbind(-1)
+        xx, xy, yy = self.distortion.slope(*inside(x / z, y / z, self.guard.radius))
+        return xx * yy - xy * xy
+
+    def slopes(self, points: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n 2"]:
+        """x/z and y/z [1] of what is seen at image positions (x, y) [px], in their dtype; a lens is undone.
+
+        Raises:
+            ValueError: If positions lie so far outside the image that the lens cannot be undone there.
+        """
+        flat = (points - points.new_tensor([self.cx, self.cy])) / points.new_tensor([self.fx, self.fy])
+        if not self.distortion:
+            return flat
+        x, y = flat.detach().double().cpu().numpy().reshape(-1, 2).T
+        x, y = self.distortion.undo(x, y, self.guard.radius)
+        return torch.from_numpy(np.stack([x, y], axis=-1)).to(points).reshape(points.shape)
+
     def directions(self) -> Float[Tensor, "H W 3"]:
         """Unit vectors through the pixel centres, in camera axes, float64; a lens is undone.
 
@@ -86,7 +125,7 @@ class Camera:
         x = (np.arange(self.width) + 0.5 - self.cx) / self.fx
         y = (np.arange(self.height)[:, None] + 0.5 - self.cy) / self.fy
         if self.distortion:
-            x, y = self.distortion.undo(x, y)
+            x, y = self.distortion.undo(x, y, self.guard.radius)
         shape = (self.height, self.width)
         flat = [torch.from_numpy(np.broadcast_to(axis, shape).copy()) for axis in (x, y)]
         directions = torch.stack([*flat, torch.ones(shape, dtype=torch.float64)], dim=-1)
@@ -107,10 +146,20 @@ class Camera:
         local = point @ pose[:3, :3].T + pose[:3, 3]
         flat = local[..., :2] / local[..., 2:]
         if self.distortion:
-            flat = torch.stack(self.distortion.apply(flat[..., 0], flat[..., 1]), dim=-1)
+            flat = torch.stack(self.distortion.apply(flat[..., 0], flat[..., 1], self.guard.radius), dim=-1)
         return flat * focal + principal
 
     @functools.cached_property
     def _sent(self) -> dict[tuple[torch.device, torch.dtype], tuple[Tensor, ...]]:
         """Pose, focal lengths and principal point where ``project`` was asked: an upload makes a GPU wait."""
         return {}
+
+
+@functools.lru_cache(maxsize=256)
+def _guard(lens: Distortion, width: int, height: int, fx: float, fy: float, cx: float, cy: float) -> Guard:
+    """That of a lens: of all poses of one camera."""
+    x, y = np.linspace(0, width, CHECKED), np.linspace(0, height, CHECKED)[:, None]
+    x, y = lens.undo((x - cx) / fx, (y - cy) / fy)
+    seen = float(np.hypot(x, y).max())
+    radius = lens.radius(seen, GUARD * seen)
+    return Guard(0.5 * GUARD * float(np.ptp(x)), 0.5 * GUARD * float(np.ptp(y)), radius)

@@ -5,8 +5,15 @@ With x = X/Z, y = Y/Z and r^2 = x^2 + y^2, a lens images what a pinhole would ha
     x' = x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2)
     y' = y (1 + k1 r^2 + k2 r^4 + k3 r^6) + p1 (r^2 + 2 y^2) + 2 p2 x y
 
-Rays are looked up by the inverse, found once per pixel by Newton's iteration. Raw frames are never resampled to undo a
-distortion: interpolation mixes surfaces as motion does.
+Rays are looked up by the inverse, found by Newton's iteration. Raw frames are never resampled to undo a distortion:
+interpolation mixes surfaces as motion does.
+
+A polynomial that was fitted inside an image may turn back outside of it, and would fold what nobody sees into it.
+Within a disc of radius R about the axis it does not, and what is outside is imaged as the tangent there goes on:
+
+    p = min(1, R / r) (x, y),   (x', y')  becomes  D(p) + J(p) ((x, y) - p)
+
+J is symmetric, and positive definite in the disc, so that (x', y') moves outwards along every ray from the axis.
 """
 
 from __future__ import annotations
@@ -22,7 +29,14 @@ from torch import Tensor
 Coordinate = TypeVar("Coordinate", np.ndarray, Tensor)
 STEPS_MAX = 30
 CONVERGED = 1e-12  # [1] of image coordinates, a billionth of a pixel
+ANGLES, RADII = 64, 512  # around the axis and away from it, where a lens is tried for folds
 SHRINK_MIN = 1e-3  # [1] area on the sensor per area of the pinhole's image; at 0 the lens folds the world over
+
+
+def inside(x: Coordinate, y: Coordinate, radius: float) -> tuple[Coordinate, Coordinate]:
+    """The place (x, y) [1], or, of what is farther than ``radius`` [1] from the axis, the place there on its way."""
+    share = (radius**2 / (x * x + y * y).clip(radius**2)) ** 0.5
+    return share * x, share * y
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,8 +72,17 @@ class Distortion:
         """Whether there is any."""
         return any(astuple(self))
 
-    def apply(self, x: Coordinate, y: Coordinate) -> tuple[Coordinate, Coordinate]:
-        """Where the lens images what a pinhole would have at (x, y) [1]; arrays or tensors of any shape."""
+    def apply(self, x: Coordinate, y: Coordinate, radius: float = math.inf) -> tuple[Coordinate, Coordinate]:
+        """Where the lens images what a pinhole would have at (x, y) [1]; arrays or tensors of any shape.
+
+        Beyond ``radius`` [1] from the axis the tangent goes on; without one, the polynomial.
+        """
+        if math.isfinite(radius):
+            near_x, near_y = inside(x, y, radius)
+            xx, xy, yy = self.slope(near_x, near_y)
+            dx, dy = x - near_x, y - near_y
+            x, y = self.apply(near_x, near_y)
+            return x + (xx * dx + xy * dy), y + (xy * dx + yy * dy)
         r2 = x * x + y * y
         radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
         return (
@@ -68,9 +91,9 @@ class Distortion:
         )
 
     def undo(
-        self, x: Float[np.ndarray, "..."], y: Float[np.ndarray, "..."]
+        self, x: Float[np.ndarray, "..."], y: Float[np.ndarray, "..."], radius: float = math.inf
     ) -> tuple[Float[np.ndarray, "*n"], Float[np.ndarray, "*n"]]:
-        """Where a pinhole would have what the lens images at (x, y) [1], which are broadcast.
+        """Where a pinhole would have what the lens images at (x, y) [1], which are broadcast; ``radius`` as in apply.
 
         Raises:
             ValueError: If some place on the sensor sees nothing, or two things, through such a lens.
@@ -79,16 +102,16 @@ class Distortion:
         u, v = (axis.copy() for axis in wanted)
         with np.errstate(all="ignore"):  # what runs away is found below
             for _ in range(STEPS_MAX):
-                got = self.apply(u, v)
+                got = self.apply(u, v, radius)
                 dx, dy = wanted[0] - got[0], wanted[1] - got[1]
-                xx, xy, yy = self._slope(u, v)
-                area = xx * yy - xy * xy
-                u, v = u + (dx * yy - dy * xy) / area, v + (dy * xx - dx * xy) / area
-                if np.abs(dx).max() < CONVERGED and np.abs(dy).max() < CONVERGED:
+                xx, xy, yx, yy = self._derivative(u, v, radius)
+                area = xx * yy - xy * yx
+                u, v = u + (dx * yy - dy * xy) / area, v + (dy * xx - dx * yx) / area
+                if max(np.abs(dx).max(initial=0.0), np.abs(dy).max(initial=0.0)) < CONVERGED:
                     break
-            got = self.apply(u, v)
+            got = self.apply(u, v, radius)
             error = np.maximum(np.abs(wanted[0] - got[0]), np.abs(wanted[1] - got[1]))
-            good = (error < 1e3 * CONVERGED) & self._unfolded(u, v)
+            good = (error < 1e3 * CONVERGED * np.maximum(1.0, np.hypot(*wanted))) & self._unfolded(u, v, radius)
         if not good.all():
             worst = np.unravel_index(np.argmin(good), good.shape)
             raise ValueError(
@@ -97,8 +120,22 @@ class Distortion:
             )
         return u, v
 
-    def _slope(self, x, y):
-        """Derivatives of what the lens images: d x'/dx, d x'/dy = d y'/dx, d y'/dy."""
+    def _derivative(self, x, y, radius):
+        """All four derivatives of ``apply``; the tangent turns with the place where it begins."""
+        if not math.isfinite(radius):
+            xx, xy, yy = self.slope(x, y)
+            return xx, xy, xy, yy
+        near_x, near_y = inside(x, y, radius)
+        xx, xy, yy = self.slope(near_x, near_y)
+        r = np.maximum(np.hypot(x, y), radius)
+        cosine, sine, step = x / r, y / r, 1e-4 * radius
+        ends = [self.slope(near_x + side * cosine, near_y + side * sine) for side in (step, -step)]
+        bend = [(there - here) / (2 * step) * (r - radius) * radius / r for there, here in zip(*ends, strict=True)]
+        to_x, to_y = bend[1] * cosine - bend[0] * sine, bend[2] * cosine - bend[1] * sine  # along (-sine, cosine)
+        return xx - to_x * sine, xy + to_x * cosine, xy - to_y * sine, yy + to_y * cosine
+
+    def slope(self, x: Coordinate, y: Coordinate) -> tuple[Coordinate, Coordinate, Coordinate]:
+        """Derivatives [1] of what the lens images: d x'/dx, d x'/dy = d y'/dx, d y'/dy."""
         r2 = x * x + y * y
         radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
         bend = 2 * (self.k1 + r2 * (2 * self.k2 + 3 * self.k3 * r2))
@@ -108,10 +145,31 @@ class Distortion:
             radial + bend * y * y + 6 * self.p1 * y + 2 * self.p2 * x,
         )
 
-    def _unfolded(self, x, y):
+    def radius(self, seen: float, most: float) -> float:
+        """Radius R of a disc about the axis in which the lens does not fold [1]: ``most``, or as much as there is.
+
+        Raises:
+            ValueError: If it folds nearer than ``seen`` [1], somewhere around the axis.
+        """
+        angle = np.linspace(0.0, 2.0 * math.pi, ANGLES, endpoint=False)
+        part = np.linspace(0.0, most, RADII + 1)[1:, None]
+        x, y = part * np.cos(angle), part * np.sin(angle)
+        xx, xy, yy = self.slope(x, y)
+        good = ((xx * yy - xy * xy > SHRINK_MIN) & (xx > 0)).all(axis=1)
+        found = most if good.all() else most * int(good.argmin()) / RADII
+        if found < seen:
+            raise ValueError(
+                f"a lens with {self} folds the world over {found:.3g} focal lengths from the principal point, and the "
+                f"image reaches to {seen:.3g}"
+            )
+        return found
+
+    def _unfolded(self, x, y, radius):
         """Whether the lens images everything between the axis and (x, y) the right way round."""
+        if math.isfinite(radius):
+            x, y = inside(x, y, radius)
         good = np.ones(np.shape(x), dtype=bool)
         for part in np.linspace(0.1, 1.0, 10):
-            xx, xy, yy = self._slope(part * x, part * y)
+            xx, xy, yy = self.slope(part * x, part * y)
             good &= (xx * yy - xy * xy > SHRINK_MIN) & (xx > 0)
         return good

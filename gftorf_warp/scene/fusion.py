@@ -140,8 +140,12 @@ def _seen(views: Views, points: Float[Tensor, "P 3"], of: list[int]) -> _Seen:
     poses = torch.tensor(np.stack([views.cameras[j].camera_from_world for j in of]), dtype=torch.float32)
     x, y, z = (torch.matmul(poses[:, :3, :3], points.T) + poses[:, :3, 3:]).unbind(dim=1)
     ahead = z > CLOSE
-    column = (camera.fx * x / z + camera.cx).where(ahead, -torch.ones(())).floor()
-    row = (camera.fy * y / z + camera.cy).where(ahead, -torch.ones(())).floor()
+    across, down = camera.fx * x / z, camera.fy * y / z
+    if camera.distortion:
+        across, down = camera.distortion.apply(x / z, y / z, camera.guard.radius)
+        across, down = camera.fx * across, camera.fy * down
+    column = (across + camera.cx).where(ahead, -torch.ones(())).floor()
+    row = (down + camera.cy).where(ahead, -torch.ones(())).floor()
     inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
     pixel = torch.where(inside, row * camera.width + column, 0.0).long()
     images = (views.distance, views.amplitude, views.margin)

@@ -19,7 +19,7 @@ from torch import Tensor
 from ..constants import FRAMES_PER_QUARTET
 from ..data.sequence import Sequence
 from ..errors import InputError
-from .camera import Camera
+from .camera import CHECKED, Camera
 from .clouds import cloud_of, follow_clouds, moving_layer, reference, windows
 from .fusion import static_layer, verdicts, views_of
 from .gaussians import GaussianField, constant_sh
@@ -181,14 +181,25 @@ def _in_frusta(cameras: list[Camera], settings: InitSettings, generator: torch.G
         for number in which.unique().tolist():
             rows, camera = which == number, cameras[number]
             place = u[rows, :2] * torch.tensor([camera.width, camera.height])
-            slopes = (place - torch.tensor([camera.cx, camera.cy])) / torch.tensor([camera.fx, camera.fy])
+            slopes = camera.slopes(place)
             pose = torch.as_tensor(camera.camera_from_world, dtype=torch.float32)
             local = torch.cat([slopes, torch.ones(len(slopes), 1)], dim=1) * z[rows, None]
             points[rows] = (local - pose[:3, 3]) @ pose[:3, :3]
         holders = torch.stack([_holds(camera, points, near, far) for camera in cameras]).sum(dim=0).clamp_min(1)
+        if cameras[0].distortion:  # points were drawn on the sensor: more of them where the lens magnifies
+            drawn = [_holds(camera, points, near, far) * camera.area(points) for camera in cameras]
+            holders = torch.stack(drawn).sum(dim=0) / _least_area(cameras[0])
         kept.append(points[u[:, 3] * holders < 1.0])
         missing = settings.count - sum(map(len, kept))
     return torch.cat(kept)
+
+
+def _least_area(camera: Camera) -> float:
+    """Smallest area on the sensor over that of a pinhole's image, over the image [1]."""
+    axes = (torch.linspace(0, size, CHECKED, dtype=torch.float64) for size in (camera.width, camera.height))
+    slopes = camera.slopes(torch.cartesian_prod(*axes))
+    xx, xy, yy = camera.distortion.slope(*slopes.unbind(dim=1))
+    return float((xx * yy - xy * xy).min())
 
 
 def _holds(camera: Camera, points: Float[Tensor, "N 3"], near: float, far: float) -> Bool[Tensor, "N"]:
@@ -272,6 +283,8 @@ def _grid(width: int, height: int, spacing: float) -> Float[Tensor, "h w 2"]:
 
 def _layer(mean, distance, amplitude, label, spacing, camera, settings) -> GaussianField:
     scale = settings.footprint * spacing * distance / math.sqrt(camera.fx * camera.fy)
+    if camera.distortion:
+        scale = scale / camera.area(mean).sqrt()
     return _field(mean, scale, amplitude * distance.square(), label, settings.opacity)
 
 

@@ -58,6 +58,8 @@ def unproject(camera: Camera, points: Float[Tensor, "*n 2"], distance: Float[Ten
     """Points in the world [m] at image positions (x, y) [px] and distances along the ray [m]."""
     x = (points[..., 0] - camera.cx) / camera.fx
     y = (points[..., 1] - camera.cy) / camera.fy
+    if camera.distortion:
+        x, y = camera.slopes(points).unbind(-1)
     ray = torch.stack([x, y, torch.ones_like(x)], dim=-1)
     pose = torch.as_tensor(camera.camera_from_world).to(ray)
     return (ray / ray.norm(dim=-1, keepdim=True) * distance[..., None] - pose[:3, 3]) @ pose[:3, :3]

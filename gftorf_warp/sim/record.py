@@ -23,7 +23,7 @@ from .look import Look, Splatted, look, look_colour
 from .paths import inverse
 from .readout import mean_quad, read_out
 from .scene import Scene
-from .traced import Traced, trace_colour
+from .traced import Traced, lights_itself, trace_colour
 from .world import Hits, first_hit, flow_of
 
 Progress = Callable[[int, int], None]
@@ -124,7 +124,7 @@ def record(
     camera = cameras[0]
     distances, bodies, interior = _truth(scene, cameras, times)
     longest = frame_times(sensor, max(frames, scene.frames), sync=False)  # for fewer frames the same covers and images
-    evenness = shading(scene.lens, camera)
+    evenness = shading(scene.lens, camera, beam=not lights_itself(scene, bounces))
     take = _engine(engine, scene, size, longest, Bounces(count=bounces, paths=paths), device, seed, truth)
     shots = [sensor.at_frame(n) for n in range(frames)]
     offsets = ((np.arange(exposure_samples) + 0.5) / exposure_samples - 0.5) * sensor.exposure_s
@@ -206,8 +206,6 @@ def _engine(
     """What takes an image: a function of a raw frame's number, the instants it averages, its time, and the sensor."""
     if engine not in ENGINES:
         raise ValueError(f"engine {engine!r} must be one of {', '.join(ENGINES)}")
-    if scene.lens.beam_power and bounces.count:
-        raise ValueError("lens.beam_power is of direct light: with bounces, use beam_deg")
     if engine == "mesh":
         traced = Traced(
             scene,

@@ -84,7 +84,7 @@ class Scene:
     sensor: Sensor = field(default_factory=lambda: Sensor(noise=True))
     """The sensor; raw frame n is the one of number n in its cycle. By name, too: see sim/sensors.py."""
     lens: Lens = field(default_factory=Lens)
-    """The lens of the ToF camera, and the beam of a light at the camera; the default is a pinhole, lit evenly."""
+    """The lens of the ToF camera, and the beam of its light; the default is a pinhole, lit evenly."""
     camera_path: Path = field(default_factory=Still)
     """How the ToF camera moves; the default is at rest at the origin, looking along +z."""
     emitter: Vector = (0.0, 0.0, 0.0)
@@ -112,8 +112,6 @@ class Scene:
             raise ValueError(f"emitter must be finite, got {self.emitter}")
         if self.beam_deg is not None and not all(0 < angle < 180 for angle in self.beam_deg):
             raise ValueError(f"beam_deg must be between 0 and 180, got {self.beam_deg}")
-        if self.lens.beam_power and any(self.emitter):
-            raise ValueError(f"lens.beam_power is of a light at the camera; emitter is at {self.emitter}")
         if self.lens.distortion:  # it must be one that can be undone
             self.camera()
 

@@ -124,6 +124,7 @@ def simulate(
             fix="leave --flow out, or --format ftorf",
         )
     _check_sensor(found.sensor, format)
+    _check_lens(found, options["size"], format)
     _check_duration(found, frames)
     card = settings_card(found, options, format, own=own, level=level, truth=truth)
     out = Path(out).absolute() if fresh else Path(out)
@@ -211,15 +212,6 @@ def _check_engine(scene: Scene, engine: str, bounces: int, paths: int, device: s
         "--paths": (paths >= 1, f"{paths}", "at least 1"),
     }
     _refuse(wanted)
-    if scene.lens.distortion:
-        raise UsageError(
-            "no engine renders through a lens that distorts",
-            where="lens.distortion",
-            why=f"both engines look along the rays of a pinhole, not {scene.lens.distortion}",
-            fix="leave lens.distortion out; gftorf_warp.sim.ideal makes ideal quads and truth through such a lens",
-        )
-    beam = "0 with bounces: it is of direct light; use beam_deg"
-    _refuse({"lens.beam_power": (not (scene.lens.beam_power and bounces), f"{scene.lens.beam_power:g}", beam)})
     if engine != "mesh":
         light = "mesh: the light is beside the camera, has a beam or bounces, or a body is glossy or a mesh that moves"
         _refuse({"--engine": (not needs_mesh(scene, bounces), repr(engine), light)})
@@ -275,6 +267,27 @@ def _check_sensor(sensor: Sensor, layout: str) -> None:
             why=impossible,
             fix="lower the contrast or the DC offset, or make the sensor unipolar",
         )
+
+
+def _check_lens(scene: Scene, size: tuple[int, int], layout: str) -> None:
+    if not scene.lens.distortion:
+        return
+    if layout != "capture":
+        raise UsageError(
+            "an F-ToeRF folder cannot express this lens",
+            where="lens.distortion",
+            why=f"it holds the matrix of a pinhole, not {scene.lens.distortion}",
+            fix="leave lens.distortion out, or --format capture",
+        )
+    try:
+        scene.camera(size)
+    except ValueError as error:
+        raise UsageError(
+            "this lens sees too much",
+            where="lens.distortion",
+            why=str(error),
+            fix="make its coefficients or horizontal_fov_deg smaller, or the image less high",
+        ) from error
 
 
 def _check_duration(scene: Scene, frames: int | None) -> None:

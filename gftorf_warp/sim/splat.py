@@ -27,7 +27,8 @@ import torch
 from jaxtyping import Float
 
 from ..constants import ALPHA_MAX, ALPHA_MIN, LOW_PASS
-from ..scene.camera import Camera
+from ..scene.camera import Camera, Guard
+from ..scene.distortion import inside
 from ..scene.gaussians import GaussianField, constant_sh
 from .assembly import Assembly
 from .world import Body, albedo, first_hit
@@ -136,15 +137,7 @@ def cover_still(bodies: tuple[Body, ...], camera: Camera) -> Cover:
 
     Each is a disc in the surface, stretched along the slope so that it looks round, and set back as described above.
     """
-    wide = Camera(
-        width=camera.width + 2 * MARGIN,
-        height=camera.height + 2 * MARGIN,
-        fx=camera.fx,
-        fy=camera.fy,
-        cx=camera.cx + MARGIN,
-        cy=camera.cy + MARGIN,
-        camera_from_world=camera.camera_from_world,
-    )
+    wide = _wider(camera)
     hits = first_hit(bodies, wide, 0.0)
     hit = np.isfinite(hits.distance)
     normal, distance = hits.normal[hit], hits.distance[hit]
@@ -158,6 +151,8 @@ def cover_still(bodies: tuple[Body, ...], camera: Camera) -> Cover:
     across[level & (np.linalg.norm(across, axis=1) < 1e-9)] = [0.0, 1.0, 0.0]
     across /= np.linalg.norm(across, axis=1, keepdims=True)
     footprint = RADIUS * distance / camera.fx
+    if camera.distortion:
+        footprint /= np.sqrt(wide.area(torch.from_numpy(hits.point[hit])).numpy())
     return Cover(
         point=hits.point[hit] + ray * (lead * _slope(normal, distance, ray, wide))[:, None],
         normal=normal,
@@ -168,6 +163,33 @@ def cover_still(bodies: tuple[Body, ...], camera: Camera) -> Cover:
         reflectance=hits.reflectance[hit] / share,
         albedo=albedo(bodies, hits, 0.0)[hit],
         body=None,
+    )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Wide(Camera):
+    """A camera with a margin around its image, into which its lens goes on as it does for the renderer."""
+
+    inner: Camera
+
+    @property
+    def guard(self) -> Guard:
+        """That of the image alone: in the margin a lens may fold."""
+        return self.inner.guard
+
+
+def _wider(camera: Camera) -> Camera:
+    """The same camera with a margin as wide as a splat reaches."""
+    return _Wide(
+        width=camera.width + 2 * MARGIN,
+        height=camera.height + 2 * MARGIN,
+        fx=camera.fx,
+        fy=camera.fy,
+        cx=camera.cx + MARGIN,
+        cy=camera.cy + MARGIN,
+        camera_from_world=camera.camera_from_world,
+        distortion=camera.distortion,
+        inner=camera,
     )
 
 
@@ -182,8 +204,9 @@ def cover_moving(
     nearest, typical = distances.min(), distances.mean() + body.shape.reach
     if nearest <= 0:
         raise ValueError(f"a moving body reaches the camera: clearance {nearest:.3f} m must be above 0")
-    spacing, variance = SPACING * nearest / camera.fx, LOW_PASS + RADIUS**2
-    inset = spread(SPACING * nearest / typical, variance) * typical / camera.fx - spacing / 2
+    focal = camera.fx * _magnification(camera)
+    spacing, variance = SPACING * nearest / focal, LOW_PASS + RADIUS**2
+    inset = spread(SPACING * nearest / typical, variance) * typical / focal - spacing / 2
     point, normal, other, limb = body.shape.grid(spacing, inset)
     helper = np.where(np.abs(normal[:, :1]) < 0.7, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
     across = np.cross(normal, helper)
@@ -236,12 +259,32 @@ def _slope(normal, distance, ray, camera: Camera) -> Float[np.ndarray, "N"]:
     z = distance * local_ray[:, 2]
     gradient_z = -z[:, None] * local_normal[:, :2] / along[:, None] / [camera.fx, camera.fy]
     length = np.linalg.norm(flat, axis=1)
-    gradient = gradient_z * length[:, None] + z[:, None] * flat[:, :2] / length[:, None] / [camera.fx, camera.fy]
+    gradient_length = flat[:, :2] / length[:, None] / [camera.fx, camera.fy]
+    if camera.distortion:  # a pixel is less or more of a slope than that of a pinhole
+        gradient_z, gradient_length = (_per_pixel(each, flat, camera) for each in (gradient_z, gradient_length))
+    gradient = gradient_z * length[:, None] + z[:, None] * gradient_length
     steepness = np.linalg.norm(gradient_z, axis=1)
     slanted = steepness > 1e-5 * z
     slope = np.sum(gradient * gradient_z, axis=1) / np.where(slanted, steepness, 1.0)
     limit = distance / camera.fx / COSINE_MIN
     return np.where(slanted, np.clip(slope, -limit, limit), 0.0)
+
+
+def _per_pixel(gradient, flat, camera: Camera) -> Float[np.ndarray, "N 2"]:
+    """A gradient by pixels of a pinhole as one by pixels of a lens, whose derivative is symmetric."""
+    xx, xy, yy = camera.distortion.slope(*inside(flat[:, 0], flat[:, 1], camera.guard.radius))
+    focal = np.array([camera.fx, camera.fy])
+    x, y = (gradient * focal).T
+    return np.stack([x * yy - y * xy, y * xx - x * xy], axis=1) / (xx * yy - xy * xy)[:, None] / focal
+
+
+def _magnification(camera: Camera) -> float:
+    """The most by which a lens stretches anything in the image, over a pinhole [1]."""
+    if not camera.distortion:
+        return 1.0
+    flat = camera.directions().flatten(0, 1).numpy()
+    xx, xy, yy = camera.distortion.slope(*(flat[:, :2] / flat[:, 2:]).T)
+    return float((0.5 * (xx + yy) + np.hypot(0.5 * (xx - yy), xy)).max())
 
 
 def _tensor(array: np.ndarray) -> torch.Tensor:

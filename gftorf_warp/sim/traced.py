@@ -12,6 +12,7 @@ from jaxtyping import Float, Int
 
 from ..render.trace import Bounces, FirstHits, Lamp, Light, RigidBody, Tracer
 from ..scene.camera import Camera
+from ..scene.optics import beam_of
 from .assembly import Assembly, Level, Part
 from .look import pooled
 from .meshes import Mesh
@@ -40,10 +41,11 @@ class Traced:
         device: str = "cpu",
     ):
         self.scene, self.camera_at, self.bounces = scene, camera_at, bounces
-        self._lamp = Lamp(position=scene.emitter, beam_deg=scene.beam_deg)
         pieces = [(index, piece) for index, body in enumerate(scene.bodies) for piece in rigid_bodies(body)]
         self._body = np.array([index for index, _ in pieces], dtype=np.int32)  # of each piece
         camera = camera_at(0.0)
+        beam = beam_of(scene.lens, camera) if lights_itself(scene, bounces.count) else None
+        self._lamp = Lamp(position=scene.emitter, beam_deg=scene.beam_deg, beam=beam)
         self._tracer = Tracer(
             [piece for _, piece in pieces], camera.width, camera.height, harmonics=harmonics, device=device
         )
@@ -75,6 +77,14 @@ class Traced:
     def _poses(self, time: float) -> Float[np.ndarray, "P 4 4"]:
         """Pose of the body of each piece [m]."""
         return np.stack([body.path.world_from_body(time) for body in self.scene.bodies])[self._body]
+
+
+def lights_itself(scene: Scene, bounces: int) -> bool:
+    """Whether a beam is part of the light that is traced: of a lamp at the camera it can be multiplied afterwards.
+
+    That is so unless light comes from elsewhere or bounces.
+    """
+    return bounces > 0 or any(scene.emitter)
 
 
 def trace_colour(scene: Scene, camera: Camera, time: float) -> Float[np.ndarray, "H W 3"]:

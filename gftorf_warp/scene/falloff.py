@@ -1,0 +1,67 @@
+"""A measured map of how a lens darkens towards its edge: a picture or an array of any size."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from ..data.images import read_exr
+from ..errors import InputError
+
+SUFFIXES = (".npy", ".exr", ".png")
+
+
+def read_falloff(path: Path) -> Float[np.ndarray, "h w"]:
+    """The map in a file, over its largest value: above 0, and 1 where the lens lets most light through.
+
+    A PNG is taken as linear, an OpenEXR file must have one channel.
+
+    Raises:
+        InputError: If there is no such file, it cannot be read, or it is no image of numbers above 0.
+    """
+    if path.suffix.lower() not in SUFFIXES:
+        raise _wrong(path, f"expected one of {', '.join(SUFFIXES)}, found {path.suffix!r}")
+    if not path.is_file():
+        raise _wrong(path, "there is no such file")
+    image = np.asarray(_image(path))
+    if image.ndim != 2 or image.size == 0 or image.dtype.kind not in "uif":
+        raise _wrong(path, f"expected numbers in rows and columns, found {image.dtype} {image.shape}")
+    image = image.astype(np.float64)
+    if not np.isfinite(image).all() or image.min() <= 0:
+        raise _wrong(path, f"expected finite numbers above 0, found {image.min()} to {image.max()}")
+    return image / image.max()
+
+
+def resized(image: Float[np.ndarray, "h w"], height: int, width: int) -> Float[np.ndarray, "H W"]:
+    """The map at the pixels of an image: means of what they cover, or, of a coarser map, linear in between."""
+    import cv2
+
+    if image.shape == (height, width):
+        return image
+    finer = image.shape[0] >= height and image.shape[1] >= width
+    return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA if finer else cv2.INTER_LINEAR)
+
+
+def _image(path: Path) -> np.ndarray:
+    if path.suffix.lower() == ".exr":
+        channels = read_exr(path)
+        if len(channels) != 1:
+            raise _wrong(path, f"expected one channel, found {', '.join(sorted(channels))}")
+        return next(iter(channels.values()))
+    if path.suffix.lower() == ".npy":
+        try:
+            return np.load(path, allow_pickle=False)
+        except (OSError, ValueError, EOFError) as error:
+            raise _wrong(path, str(error)) from error
+    import cv2
+
+    image = cv2.imdecode(np.frombuffer(path.read_bytes() or b"\0", np.uint8), cv2.IMREAD_UNCHANGED)
+    if image is None:
+        raise _wrong(path, "it is no picture that can be decoded")
+    return image
+
+
+def _wrong(path: Path, why: str) -> InputError:
+    return InputError("no fall-off map", where=path, why=why, fix="give an array [H, W] or a grey picture, linear")
