@@ -1,14 +1,13 @@
 """What the motion network costs: forward and backward, all queries of a step stacked, in each precision.
 
     python benchmarks/network.py [--device cpu|cuda] [--gaussians N ..] [--queries Q ..] [--repeats R]
-                                 [--products P ..] [--masks kernel|torch ..] [--profile] [--json FILE]
+                                 [--products P ..] [--profile] [--json FILE]
 
 A query is one key time; a timing holds one encoding of positions, as a step has it, and the gradient of all weights.
 On a GPU every row is timed twice: called from Python, and replayed as a CUDA graph, which must give what the call gave.
 Rows of one N and Q take turns. ``kernels`` counts what the device ran in one call, products included; ``error`` is the
 largest difference of an offset from that in float32, for weights whose offsets are a few decimetres. With ``--profile``
 what ran longest in it is listed under every row, replayed on a GPU: where the next saving is to be looked for.
-``--masks`` says who masks gradients of products in half precision and sums them; both make two rows that take turns.
 """
 
 from __future__ import annotations
@@ -26,7 +25,6 @@ import torch
 from gftorf_warp.bench.command import about
 from gftorf_warp.bench.motion import points
 from gftorf_warp.bench.timing import WARM_UP, Watch, watch_of
-from gftorf_warp.render import fused
 from gftorf_warp.scene.gaussians import GaussianField
 from gftorf_warp.scene.motion import MotionSettings, Products
 from gftorf_warp.scene.network import Network
@@ -45,7 +43,7 @@ def field(count: int, device: str) -> GaussianField:
     return points(mean).map(lambda value: value.to(device))
 
 
-def network(products: Products, device: str, masks: str = "torch") -> Network:
+def network(products: Products, device: str) -> Network:
     """The published network, moving."""
     generator = torch.Generator().manual_seed(0)
     times = torch.arange(KEYS, dtype=torch.float64) * (4 / 120)
@@ -53,7 +51,6 @@ def network(products: Products, device: str, masks: str = "torch") -> Network:
     made = Network(times, settings, duration=float(times[-1]), length=LENGTH, generator=generator)
     with torch.no_grad():
         made.head.weight.normal_(0.0, 0.05, generator=generator)
-    made.mask_by(fused.masked if masks == "kernel" else None)
     return made.to(device)
 
 
@@ -105,17 +102,14 @@ def longest(run: Callable[[], object], device: str) -> list[str]:
 def rows_of(count: int, queries: int, options: argparse.Namespace) -> list[dict[str, object]]:
     """One row per precision."""
     device, watch, gaussians = options.device, watch_of(options.device), field(count, options.device)
-    kinds = [
-        (kind, masks) for kind in options.products for masks in (options.masks if kind == Products.HALF else ["torch"])
-    ]
-    calls = {kind: call_of(network(kind[0], device, kind[1]), gaussians, queries) for kind in kinds}
+    calls = {kind: call_of(network(kind, device), gaussians, queries) for kind in options.products}
     exact = call_of(network(Products.FLOAT32, device), gaussians, queries)()[0]
-    rows: dict[tuple[Products, str], dict[str, object]] = {}
-    runs: dict[tuple[tuple[Products, str], str], Callable[[], object]] = {}
+    rows: dict[Products, dict[str, object]] = {}
+    runs: dict[tuple[Products, str], Callable[[], object]] = {}
     for kind, call in calls.items():
         for _ in range(WARM_UP):
             found = call()
-        row: dict[str, object] = {"gaussians": count, "queries": queries, "products": str(kind[0]), "masks": kind[1]}
+        row: dict[str, object] = {"gaussians": count, "queries": queries, "products": str(kind)}
         row["error_mm"] = 1e3 * float((found[0] - exact).norm(dim=-1).max())
         runs[kind, "called"] = call
         replay = watch.captured(call)
@@ -124,7 +118,7 @@ def rows_of(count: int, queries: int, options: argparse.Namespace) -> list[dict[
             row["kernels"] = kernels(call)
             runs[kind, "replayed"] = replay
         rows[kind] = row
-    times: dict[tuple[tuple[Products, str], str], list[float]] = {name: [] for name in runs}
+    times: dict[tuple[Products, str], list[float]] = {name: [] for name in runs}
     for _ in range(options.repeats):
         for name, run in runs.items():
             times[name].append(once(run, watch))
@@ -147,26 +141,13 @@ def main() -> int:
     parser.add_argument("--gaussians", type=int, nargs="+", default=[20_000, 100_000])
     parser.add_argument("--queries", type=int, nargs="+", default=[1, 2, 3])
     parser.add_argument("--products", type=Products, nargs="+", default=[*Products])
-    parser.add_argument("--masks", choices=["kernel", "torch"], nargs="+", default=["kernel"])
     parser.add_argument("--repeats", type=int, default=50)
     parser.add_argument("--profile", action="store_true")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
     found, rows = about(options.device), []
     print(" - ".join(map(str, found.values())))
-    head = [
-        "N",
-        "Q",
-        "products",
-        "masks",
-        "kernels",
-        "called",
-        "per query",
-        "replayed",
-        "per query",
-        "TFLOP/s",
-        "error [mm]",
-    ]
+    head = ["N", "Q", "products", "kernels", "called", "per query", "replayed", "per query", "TFLOP/s", "error [mm]"]
     print("".join(f"{name:>12}" for name in head), flush=True)
     for count in options.gaussians:
         for queries in options.queries:
@@ -174,7 +155,7 @@ def main() -> int:
                 rows.append(row)
                 names = ["called_ms", "called_per_query_ms", "replayed_ms", "replayed_per_query_ms"]
                 numbers = [row.get(name) for name in [*names, "replayed_tflops", "error_mm"]]
-                texts = [row["gaussians"], row["queries"], row["products"], row["masks"], row.get("kernels", "-")]
+                texts = [row["gaussians"], row["queries"], row["products"], row.get("kernels", "-")]
                 texts += ["-" if number is None else f"{number:.3f}" for number in numbers]
                 texts += ["" if row.get("replay_equals_call", True) else " replay differs"]
                 print("\n".join(["".join(f"{text:>12}" for text in texts), *row.get("profile", [])]), flush=True)

@@ -13,8 +13,6 @@ from gftorf_warp.recon.observations import observe
 from gftorf_warp.recon.settings import Batch, Kernels
 from gftorf_warp.recon.state import begin
 from gftorf_warp.recon.step import Singles
-from gftorf_warp.render import fused
-from gftorf_warp.scene.motion import Products
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA"))]
 
@@ -93,27 +91,6 @@ def test_a_replay_is_the_same_work_without_a_graph(batch, device):
         while state.images < 40:
             steps.step()
         assert steps.collect() == 0
-        states.append(state)
-    alike(*states)
-
-
-@pytest.mark.parametrize("device", DEVICES)
-def test_gradients_masked_by_a_kernel_make_the_same_steps(device, monkeypatch):
-    """Of a network in half precision; a GPU takes the kernel by itself, torch where it knows no such rows."""
-    settings = published()
-    settings = replace(settings, motion=replace(settings.motion, products=Products.HALF))
-    states, used, masked = [], [], fused.masked
-    for kernel in (False, True):
-        state, observations = begun(settings, device)
-        monkeypatch.setattr(fused, "masks", lambda *_, kernel=kernel: kernel)
-        monkeypatch.setattr(fused, "masked", lambda *rows: used.append(rows) or masked(*rows))
-        steps = CapturedSteps(state, observations, settings)
-        if kernel and device == "cpu":
-            state.motion.mask_by(fused.masked)
-        while state.images < 24:
-            steps.step()
-        assert steps.collect() == 0
-        assert bool(used) == kernel
         states.append(state)
     alike(*states)
 

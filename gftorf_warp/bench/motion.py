@@ -8,7 +8,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..render import fused
 from ..scene.gaussians import GaussianField, constant_sh
 from ..scene.motion import MotionKind, MotionSettings, Products
 from ..scene.network import Network
@@ -40,8 +39,6 @@ def measure(device: str, *, quick: bool, runs: int, report: Report) -> list[dict
         times = torch.arange(KEYS, dtype=torch.float64) * PERIOD_S
         settings = MotionSettings(kind=MotionKind.NETWORK, products=products)
         network = Network(times, settings, duration=float(times[-1]), length=LENGTH_M, generator=generator).to(device)
-        if torch.device(device).type != "cpu":
-            network.mask_by(fused.masked)  # as captured steps do
         field = points(LENGTH_M * torch.rand(count, 3, generator=generator)).map(lambda value: value.to(device))
         slope = torch.randn(queries, count, 3, generator=generator).to(device)
         weights = list(network.parameters())

@@ -12,8 +12,6 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 
-from ..render.bridge import captured
-
 LOG = logging.getLogger("gftorf_warp")
 WARM_UP = 3  # runs before the first that counts: kernels are loaded, memory is found
 Function = Callable[[], object]
@@ -113,7 +111,7 @@ class TorchWatch:
                 function()
         self.module.current_stream().wait_stream(side)
         graph = self.module.CUDAGraph()
-        with captured(graph, side):
+        with self.module.graph(graph):
             kept = function()  # results live in the graph's memory as long as the function that replays it
 
         def replay() -> object:

@@ -18,7 +18,6 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from ..kernels.mask import BYTES, THREADS
 from ..kernels.similarity import MOMENTS, REACH, SLOPES, SUMS
 from ..scene.camera import Camera
 from . import training
@@ -275,42 +274,6 @@ class _Displaced(torch.autograd.Function):
             cotangents = array_over(moved, wp.vec3), array_over(ways, wp.vec3)
             training.displaced_backward(array_over(share), *cotangents, array_over(grad, wp.vec3))
         return by_moved, grad, None, None
-
-
-_ROWS = {torch.float16: wp.float16, torch.float32: wp.float32}
-
-
-def masks(width: int, dtype: torch.dtype) -> bool:
-    """Whether :func:`masked` knows rows of so many values."""
-    size = width * dtype.itemsize
-    return dtype in _ROWS and size % BYTES == 0 and 0 < size <= THREADS * BYTES
-
-
-def masked(slope: Float[Tensor, "r w"], before: Float[Tensor, "r w"], out: Float[Tensor, "p w"]) -> None:
-    """What scene/perceptron.py does by torch between two layers of a gradient, in one pass over memory.
-
-    Args:
-        slope: Gradient by what a ReLU left; afterwards by what it was given, zero where ``before`` is at most 0.
-        before: What the ReLU left, half or float32 like ``slope``.
-        out: float32, filled with sums of ``slope`` over p parts of the rows, each of ceil(r / p) while there are any.
-
-    Raises:
-        ValueError: If shapes, precisions or devices differ, rows are not those of :func:`masks`, or lie apart.
-    """
-    rows = slope, before
-    if slope.shape != before.shape or slope.shape[1:] != out.shape[1:] or not masks(slope.shape[1], slope.dtype):
-        shapes = f"{tuple(slope.shape)}, {tuple(before.shape)} and {tuple(out.shape)}"
-        raise ValueError(f"rows of {slope.dtype} that are whole {BYTES} bytes are masked and summed, got {shapes}")
-    if slope.dtype != before.dtype or out.dtype != torch.float32 or len({slope.device, before.device, out.device}) > 1:
-        raise ValueError(f"before must be {slope.dtype} and out float32, all on {slope.device}")
-    if any(not one.is_contiguous() or one.data_ptr() % BYTES for one in rows) or not out.is_contiguous():
-        raise ValueError(f"rows and sums must be contiguous, rows must begin at whole {BYTES} bytes")
-    if out.numel() == 0 or slope.numel() == 0:
-        out.zero_()
-        return
-    kind = _ROWS[slope.dtype]
-    with stream_of(slope):
-        training.masked(array_over(slope, kind), array_over(before, kind), array_over(out))
 
 
 def uniform(

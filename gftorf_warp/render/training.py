@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from ..kernels import adam, displace, finish, flow, mask, noise, similarity, sums
+from ..kernels import adam, displace, finish, flow, noise, similarity, sums
 
 BLOCK = 16  # pixels of a row, or elements of a tensor, that one CPU thread works on
 
@@ -118,13 +118,6 @@ def displaced(mean: wp.array, offsets: wp.array, share: wp.array, moved: wp.arra
 def displaced_backward(share: wp.array, by_moved: wp.array, by_channels: wp.array, grad: wp.array) -> None:
     """Fill ``grad`` [K, N] by the offsets; an empty cotangent is zero."""
     _launch(displace.displace_backward, grad.shape[1], [share, by_moved, by_channels], [grad])
-
-
-def masked(slope: wp.array, before: wp.array, out: wp.array) -> None:
-    """Clear ``slope`` [rows, width] where ``before`` is not above 0, and fill ``out`` [parts, width] with its sums."""
-    threads = 1 if slope.device.is_cpu else mask.THREADS
-    dim = len(out) * threads
-    _launch(mask.make_mask(slope.dtype), dim, [before, threads], [slope, out], block_dim=mask.THREADS)
 
 
 def _means(partials: wp.array, scale: float, out: wp.array) -> None:

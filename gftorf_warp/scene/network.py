@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator
-from dataclasses import replace
 
 import torch
 from jaxtyping import Float, Int
@@ -18,7 +17,7 @@ from torch import Tensor
 
 from .gaussians import GaussianField
 from .motion import Motion, MotionSettings, Products, rows_of
-from .perceptron import Form, Masked, Stacked
+from .perceptron import Form, Stacked
 
 HEAD_DEVIATION = 1e-5  # of the weights of the last layer: motion starts at rest, to a hundredth of a millimetre
 
@@ -90,10 +89,6 @@ class Network(Motion):
         if self.settings.products == Products.HALF:
             return encoded(place, self.powers, columns=form.columns, dtype=form.dtype)
         return encoded(place, self.powers)
-
-    def mask_by(self, masked: Masked | None) -> None:
-        """Let somebody else mask and sum gradients between layers, where products are halves; None: torch does."""
-        self._form = replace(self._form, masked=masked)
 
     def key_offsets(
         self, attachment: Float[Tensor, "N p"], keys: list[int] | Int[Tensor, "k"]

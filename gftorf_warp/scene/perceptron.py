@@ -15,7 +15,6 @@ gradient. Nothing here asks the device. design/network.md has the reasons.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -29,11 +28,7 @@ LARGEST = 64.0  # gradient of an offset, in scaled units: 10 bits below the larg
 SMALLEST = 1e-30  # below any gradient; keeps 0 / 0 away where there is none
 PIECE = 21_120  # rows of a product at most: two full waves of 128 x 160 results on 132 multiprocessors
 FOLD = 64  # rows side by side in a sum over rows, if they are so many times something
-SUMMED = 128  # rows to a sum of ``Form.masked``: all its blocks of threads together fill a GPU, at 20,000 rows as well
 BLOCKS = 8  # into which a weight is cut to be rounded
-
-Masked = Callable[[Tensor, Tensor, Tensor], None]
-"""Of gradients [r, width] and what a ReLU left: clear where it left 0, fill sums [p, width] over parts of the rows."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,8 +45,6 @@ class Form:
     """Number of the layer whose input is joined by gamma(x) and gamma(t) again; None: there is none."""
     dtype: torch.dtype
     """Of the factors: float16, or that of the parameters, where the same code is exact."""
-    masked: Masked | None = None
-    """What masks and sums gradients in one pass, sums in the precision of parameters; None: torch, one by one."""
 
     @property
     def columns(self) -> int:
@@ -119,20 +112,15 @@ class Stacked(torch.autograd.Function):
         torch.div(flat, unit, out=after[:, :values])
         _sum_rows(flat, out=found.head_bias)
         _product(after.T, outputs[-1], moment.dtype, out=found.weights[-1])
-        slopes, pieces = torch.empty_like(outputs), _pieces(keys, count)
-        longest = max(end - begin for _, begin, end in pieces)
-        sums = moment.new_empty(layers, len(pieces), -(-longest // SUMMED), form.width)
+        slopes = torch.empty_like(outputs)
         for number in reversed(range(layers)):
             factor, slope, before = factors[number + 1][:, : form.width], slopes[number], outputs[number]
-            for part, (key, begin, end) in enumerate(pieces):
+            for key, begin, end in _pieces(keys, count):
                 rows = slice(key * count + begin, key * count + end)
                 torch.mm(after[rows], factor, out=slope[rows])
-                if form.masked is not None:
-                    form.masked(slope[rows], before[rows], sums[number, part])
-                else:
-                    torch.ops.aten.threshold_backward.grad_input(slope[rows], before[rows], 0.0, grad_input=slope[rows])
+                torch.ops.aten.threshold_backward.grad_input(slope[rows], before[rows], 0.0, grad_input=slope[rows])
             after = slope
-        own = sums.view(layers, keys, -1, form.width).sum(2) if form.masked else _sums(slopes, keys, moment.dtype)
+        own = _sums(slopes, keys, moment.dtype)
         torch.sum(own, 1, out=found.biases)
         _products(slopes[1:].mT, outputs[:-1], out=found.square)
         for number in form.entries:
