@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..constants import FRAMES_PER_QUARTET
 from ..data.decode import closed_form_distance
 from ..data.sequence import Sequence, Truth
 from ..data.truth import known_distance, moving_and_static
@@ -154,14 +153,17 @@ def closed_form_errors(sequence: Sequence, truth: Truth | None) -> Errors:
             "nothing to compare",
             where=sequence.path or "sequence",
             why=f"expected truth and a complete quartet, found {'no ' if truth is None else ''}truth and {quartets}",
-            fix="simulate at least four raw frames",
+            fix=f"simulate at least the {sequence.cycle} raw frames of a cycle",
         )
-    frames = [FRAMES_PER_QUARTET * i for i in quartets]
+    frames = [sequence.cycle * i for i in quartets]
     decoded = np.stack([closed_form_distance(sequence, i) for i in quartets])
     distance = known_distance(truth)
     squares = 100.0 * (decoded - distance[frames]) ** 2
-    moving, static = moving_and_static(distance, frames, from_phasors=sequence.from_phasors)
-    by_phasor = None if truth.phasor_distance is None else 100.0 * (decoded - truth.phasor_distance[frames]) ** 2
+    moving, static = moving_and_static(distance, frames, from_phasors=sequence.from_phasors, cycle=sequence.cycle)
+    one = len(sequence.frequencies) == 1  # a static-phasor distance is that of one frequency, and wraps with it
+    by_phasor = (
+        None if truth.phasor_distance is None or not one else 100.0 * (decoded - truth.phasor_distance[frames]) ** 2
+    )
     return Errors(
         all=_mean(squares),
         moving=_mean(squares[moving]),

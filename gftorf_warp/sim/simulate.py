@@ -56,11 +56,12 @@ def simulate(
 ) -> Path:
     """Record a moving scene with an asynchronous C-ToF sensor and write it as a sequence.
 
-    Raw frame n is an image of the scene at its own time, of which only the quad of slot n % 4 is kept and read out.
-    Beside it stands the analytic distance along each pixel's centre ray at that very time. A camera that moves has a
-    pose for each raw frame; a colour camera adds an image per quartet. The folder appears only when it is complete; if
-    it is already there and was made with the same settings, it is left as it is. After an interruption the same call
-    goes on at the next raw frame: what was finished waits in OUT.partial, and the bytes are the same in the end.
+    Raw frame n is an image of the scene at its own time, of which only the quad of its own shift and frequency is kept
+    and read out. Beside it stands the analytic distance along each pixel's centre ray at that very time. A camera that
+    moves has a pose for each raw frame; a colour camera adds an image per quartet. The folder appears only when it is
+    complete; if it is already there and was made with the same settings, it is left as it is. After an interruption the
+    same call goes on at the next raw frame: what was finished waits in OUT.partial, and the bytes are the same in the
+    end.
 
     Args:
         scene: Name of a scene, see ``SCENES``, a TOML file of one, or a scene.
