@@ -46,11 +46,7 @@ def settings_card(
         f"{sensor.unambiguous_range:.4f} m",
         "shifts in time order": ", ".join(f"{math.degrees(shift):.0f}" for shift in sensor.shifts) + " deg",
         "raw frames": f"{1 / sensor.frame_period_s:.6g} per second, "
-        + (
-             (f"{_all(len(sensor.cycle))} of a quartet at the time of its first"
-            if options["sync"]
-            else "each at its own time"
-        ),
+        + (_together(len(sensor.cycle)) if options["sync"] else "each at its own time"),
         **(
             {"phasors": "one per quartet, with time, pose and truth of its first raw frame"} if layout == "torf" else {}
         ),
@@ -100,8 +96,8 @@ frame, not a rendering.
 """
 
 
-def _all(count: int) -> str:
-    return "all four" if count == FRAMES_PER_QUARTET else f"all {count}"
+def _together(count: int) -> str:
+    return f"all {'four' if count == FRAMES_PER_QUARTET else count} of a quartet at the time of its first"
 
 
 def outcome_card(recording: Recording) -> str:
