@@ -279,7 +279,12 @@ def table(metrics: dict) -> str:
     psnr = metrics["quad_psnr_db"]
     quality = "-" if psnr is None else f"{psnr:.2f} dB"
     scored = f"{metrics['frames']} raw frames ({metrics['protocol']}), against {metrics.get('against', 'geometry')}"
-    return "\n".join([*lines, f"{scored}, quad PSNR {quality}"])
+    lines.append(f"{scored}, quad PSNR {quality}")
+    share = metrics.get("ambiguous_share")
+    if share is not None:
+        reach = f"{metrics['unambiguous_range_m']:.4g} m by several frequencies together"
+        lines.append(f"unambiguous to {reach}; {share:.1%} of the closed form ambiguous")
+    return "\n".join(lines)
 
 
 def _level(options: argparse.Namespace) -> int:

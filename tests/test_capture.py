@@ -315,9 +315,9 @@ def test_a_cycle_is_complete_if_all_of_its_frequencies_are(folder):
     read = Sequence.open(folder)
     assert (read.cycle, read.frequencies, read.complete_quartets) == (7, (2e7, 6e7), [])
     whole = np.ones(FRAMES, dtype=bool)
-    assert replace(read, measured=whole).complete_quartets == [0]
-    assert replace(read, cycle_length=4).complete_quartets == [0]
-    assert replace(read, measured=whole, cycle_length=None).cycle == 7
+    assert dataclasses.replace(read, measured=whole).complete_quartets == [0]
+    assert dataclasses.replace(read, cycle_length=4).complete_quartets == [0]
+    assert dataclasses.replace(read, measured=whole, cycle_length=None).cycle == 7
     mixed = recording(frequencies_hz=np.array([2e7, 2e7, 2e7, 6e7, 6e7, 6e7, 6e7]), cycle_length=4)[0]
     assert mixed.complete_quartets == []
 

@@ -8,7 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from ..constants import CANONICAL_SHIFTS, FRAMES_PER_QUARTET, SPEED_OF_LIGHT
+from ..errors import InputError
 from . import findings, specs
+from .decode import unambiguous_range
 from .findings import Report
 from .folder import format_of, numbered
 from .sequence import Sequence
@@ -29,7 +31,8 @@ def check(path: str | Path) -> Report:
     report = Report(path=Path(path), form=format_of(Path(path)))
     _facts(sequence, report)
     _assumptions(sequence, report)
-    if sequence.complete_quartets and np.abs(sequence.quads).max() > 0:
+    reach = _range(sequence, report)
+    if reach is not None and sequence.complete_quartets and np.abs(sequence.quads).max() > 0:
         findings.light(sequence, report)
         findings.frequencies(sequence, report)
         if sequence.from_phasors and report.form == "torf":
@@ -42,10 +45,19 @@ def check(path: str | Path) -> Report:
             findings.phasors(sequence, report)
         findings.camera(sequence, report)
         findings.truth(sequence, report)
-    else:
+    elif reach is not None:
         report.warnings.append("no complete quartet with light: nothing can be decoded or estimated")
     findings.flow(sequence, report)
     return report
+
+
+def _range(sequence: Sequence, report: Report) -> float | None:
+    """The unambiguous range of all frequencies [m]; None, with a warning, if they have none together."""
+    try:
+        return unambiguous_range(sequence)
+    except InputError as error:
+        report.warnings.append(f"{error.what}: {error.why}; nothing is decoded")
+        return None
 
 
 def _canonical(sequence: Sequence) -> bool:

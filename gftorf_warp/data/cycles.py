@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from ..constants import FRAMES_PER_QUARTET
+from ..constants import CANONICAL_SHIFTS, FRAMES_PER_QUARTET
 
 QUADS_MIN = 3  # of a phasor: cosine, sine and a constant
 SAME_RAD = 1e-5  # [rad] shifts are stored as float32 at worst
@@ -15,17 +15,30 @@ RANK_TOLERANCE = 1e-3  # singular values of three unknowns are about 1; two shif
 def find_cycle(shifts: Float[np.ndarray, "F"], frequencies: Float[np.ndarray, "F"]) -> int:
     """Raw frames of a cycle of a recording that does not state it.
 
-    The shortest period of shifts [rad] and frequencies [Hz] that determines a phase at each of them. Without a period,
-    four raw frames at one frequency, in whatever order; of several frequencies, everything that there is.
+    The shortest period of shifts [rad] and frequencies [Hz] that determines a phase at each of them; it is seen twice,
+    or has no raw frame twice. Without a period it is everything, if that is one cycle: several frequencies, or no shift
+    twice. Else four raw frames, in whatever order, of which a recording may have measured fewer.
     """
     count = len(shifts)
     waves = np.exp(1j * np.asarray(shifts, dtype=np.float64))
     for step in range(QUADS_MIN, count):
         again = np.abs(waves[step:] - waves[:-step]).max() < SAME_RAD
         if again and np.array_equal(frequencies[step:], frequencies[:-step]):
-            if _determined(shifts[:step], frequencies[:step]):
+            sure = 2 * step <= count or _distinct(waves[:step], frequencies[:step])
+            if sure and _determined(shifts[:step], frequencies[:step]):
                 return step
-    return count if len(set(frequencies.tolist())) > 1 else FRAMES_PER_QUARTET
+    if len(set(frequencies.tolist())) > 1:
+        return count
+    canonical = np.exp(1j * np.asarray(CANONICAL_SHIFTS))
+    begun = count < FRAMES_PER_QUARTET and bool((np.abs(waves[:, None] - canonical).min(axis=1) < SAME_RAD).all())
+    whole = not begun and _distinct(waves, frequencies) and _determined(shifts, frequencies)
+    return count if whole else FRAMES_PER_QUARTET
+
+
+def _distinct(waves: np.ndarray, frequencies: np.ndarray) -> bool:
+    """Whether no raw frame has shift and frequency of another."""
+    same = (np.abs(waves[:, None] - waves) < SAME_RAD) & (frequencies[:, None] == frequencies)
+    return int(same.sum()) == len(waves)
 
 
 def frequencies_by_order(frequencies: Float[np.ndarray, "F"]) -> tuple[float, ...]:

@@ -91,9 +91,7 @@ def frequencies(sequence: Sequence, report: Report) -> None:
 def constant_part(sequence: Sequence, report: Report) -> None:
     """Constant part of raw quads."""
     estimate = estimates.dc_offset(sequence)
-    report.lines.append(
-        f"dc estimate     {estimate:.4f} = mean(Q0 + Q1 + Q2 + Q3) / (4 mean a), {sequence.dc_offset:g} in use"
-    )
+    report.lines.append(f"dc estimate     {estimate:.4f} of the amplitude, {sequence.dc_offset:g} in use")
     if abs(estimate - sequence.dc_offset) > DC_TOLERANCE:
         report.warnings.append(f"dc_offset {sequence.dc_offset:g} is in use, but the quads say {estimate:.3f}")
 
