@@ -75,7 +75,8 @@ def test_a_shift_that_nobody_measured_is_computed(run):
     constant = 0.5 * 0.2 * np.hypot(re, im)
     np.testing.assert_allclose(between, (re + im) / np.sqrt(8) + constant, rtol=1e-6)
     np.testing.assert_allclose(zero, 0.5 * re + constant, rtol=1e-6)
-    np.testing.assert_array_equal(quads_of(sequence, 1, [2 * np.pi])[0], sequence.quads[4 + REAL_ORDER.index(0)])
+    turned = quads_of(sequence, 1, [2 * np.pi, np.pi, np.pi / 2, -np.pi / 2])
+    np.testing.assert_array_equal(turned[0], sequence.quads[4 + REAL_ORDER.index(0)])
 
 
 @pytest.mark.parametrize("change", ["pose", "size", "focal length"])

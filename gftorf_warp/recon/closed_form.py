@@ -164,13 +164,13 @@ def quads_of(
 ) -> Float[np.ndarray, "Q H W"]:
     """The raw frames of a quartet with these shifts [rad], at one of its frequencies.
 
-    If one of them was not measured, all are a (cos(psi - shift) + dc_offset) of the decoded phasor: a measured one has
-    another constant part in it, and would not fit the others.
+    If these are not all that was measured there, they are a (cos(psi - shift) + dc_offset) of the decoded phasor:
+    some of the measured ones decode to another phase than all of them.
     """
     frames, (re, im) = quartet_phasors(sequence, quartet)[frequency]
     shifts = list(shifts)
     slots = [channel_of(sequence.shifts[frames].tolist(), shift) for shift in shifts]
-    if any(slot is None for slot in slots):
+    if any(slot is None for slot in slots) or len(frames) != len(slots):
         constant = sequence.dc_offset * np.hypot(re, im)
         return np.stack([0.5 * (re * math.cos(shift) + im * math.sin(shift) + constant) for shift in shifts])
     return np.stack([sequence.quads[frames[slot]] for slot in slots if slot is not None])
