@@ -94,8 +94,11 @@ def test_two_frequencies_see_beyond_the_range_of_each(engine, tmp_path):
     np.testing.assert_allclose(closed_form_distance(sequence, 0), got, atol=1e-6)
     with pytest.raises(UsageError, match="frequencies_hz"):
         write(tmp_path / "out", replace(sequence, shifts=np.resize([0, math.pi, math.pi / 2, 1.5 * math.pi], 6)))
-    with pytest.raises(ValueError, match="one modulation frequency, not 2"):
-        ideal_recording(wall(sensor))
+    ideal = ideal_recording(wall(sensor))[0]
+    assert (ideal.cycle, ideal.frequencies) == (6, (60e6, 40e6))
+    np.testing.assert_allclose(closed_form_distance(ideal, 0), distance, atol=1e-4)
+    with pytest.raises(ValueError, match="read by a sensor of"):
+        ideal_recording(wall(sensor), sensor=replace(sensor, further_hz=()))
 
 
 @pytest.mark.parametrize(

@@ -100,7 +100,7 @@ def simulate(
         BusyError: If another process records the same sequence.
         InputError: If a TOML file does not describe a scene.
     """
-    own = overridden(_scene(scene), overrides)
+    own = scene_of(scene, overrides)
     options: dict[str, Any] = {
         "frames": own.frames if frames is None else frames,
         "size": (own.width, own.height) if size is None else tuple(size),
@@ -168,6 +168,16 @@ def simulate_ladder(
     lines = "\n".join(f"    {line}" for line in ladder_table(rows))
     atomic_write(out / "ladder.md", f"# {title}: what each level of the ladder costs\n\n{lines}\n".encode())
     return rows
+
+
+def scene_of(scene: str | Scene, overrides: Iterable[str] = ()) -> Scene:
+    """A scene by its name or file, with single settings changed; as for :func:`simulate`.
+
+    Raises:
+        UsageError: If there is no such scene, or a setting cannot be changed so.
+        InputError: If a TOML file does not describe a scene.
+    """
+    return overridden(_scene(scene), overrides)
 
 
 def _scene(scene: str | Scene) -> Scene:
