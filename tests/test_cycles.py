@@ -223,7 +223,7 @@ def test_a_capture_keeps_the_cycle_and_says_what_is_wrong(tmp_path):
     ):
         assert line in text
     assert quad_scale(read)[0] == pytest.approx(1 / 1.4, rel=1e-3)
-    with pytest.raises(UsageError, match="a cycle: the ftorf format"):
+    with pytest.raises(UsageError, match="shifts: the ftorf format"):
         write_ftorf(tmp_path / "other", still(distance, evenly(8), cycles=2))
     path = tmp_path / "stated" / "capture.json"
     (tmp_path / "stated" / "MANIFEST.sha256").unlink()

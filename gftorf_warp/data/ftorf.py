@@ -30,7 +30,7 @@ from .sequence import Sequence, Truth
 __all__ = ["read", "read_truth", "write"]
 
 FORMAT = "ftorf"
-NOT_HERE = ("frequencies_hz", "distortion", "exposures", "sensor")  # the layout has no place for them
+NOT_HERE = ("frequencies_hz", "cycle_length", "distortion", "exposures", "sensor")  # the layout has no place for them
 
 
 def read(path: str | Path, *, frame_rate_hz: float | None = None) -> Sequence:

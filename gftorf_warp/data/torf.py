@@ -35,7 +35,7 @@ from .torf_write import write
 __all__ = ["phasor_files", "read", "read_truth", "write"]
 
 FORMAT = "torf"
-NOT_HERE = ("frequencies_hz", "distortion", "exposures", "sensor")  # the layout has no place for them
+NOT_HERE = ("frequencies_hz", "cycle_length", "distortion", "exposures", "sensor")  # the layout has no place for them
 PHASOR_RATE_HZ = FRAME_RATE_HZ / FRAMES_PER_QUARTET  # [Hz] the sensor is that of the F-ToeRF recordings
 
 

@@ -147,7 +147,7 @@ def refuse_inexpressible(form: str, sequence: Sequence, truth: Truth | None) -> 
             "one modulation frequency",
             f"{sequence.frequencies_hz}",
         ),
-        "a cycle": (
+        "shifts": (
             not family or sequence.cycle == FRAMES_PER_QUARTET,
             f"cycles of {FRAMES_PER_QUARTET} raw frames",
             f"of {sequence.cycle}",
