@@ -86,7 +86,7 @@ def command_parsers() -> dict[str, Parser]:
     simulate.add_argument(
         "scene", metavar="SCENE", nargs="?", help="name of a scene, --list shows them, or a .toml file of one"
     )
-    simulate.add_argument("--list", action="store_true", help="list the scenes, or SCENE as its overrides make it, and stop")
+    simulate.add_argument("--list", action="store_true", help="list the scenes, or SCENE with its overrides")
     simulate.add_argument("--out", metavar="SEQ", help="folder to write")
     simulate.add_argument("--frames", metavar="N", type=_positive, help="raw frames (the scene's own number)")
     simulate.add_argument("--size", metavar="WxH", type=_size, help="image size in pixels (the scene's own)")
