@@ -21,10 +21,11 @@ from pathlib import Path
 import numpy as np
 
 from gftorf_warp import __version__
-from gftorf_warp.constants import CANONICAL_SHIFTS, FRAMES_PER_QUARTET
+from gftorf_warp.constants import FRAMES_PER_QUARTET
 from gftorf_warp.data.ftorf_write import write
 from gftorf_warp.data.sequence import Truth
 from gftorf_warp.evaluate.compare import compare
+from gftorf_warp.evaluate.views import channel_of_shift
 from gftorf_warp.recon.run import Run
 from gftorf_warp.recon.train import reconstruct
 from gftorf_warp.sim.simulate import simulate
@@ -47,8 +48,7 @@ def own_model(run: Run, out: Path) -> Path:
     quads, distances = np.empty_like(sequence.quads), np.empty_like(sequence.quads)
     for n, time in enumerate(sequence.times):
         rendering = run.render(float(time))
-        slot = int(np.argmin(np.abs(np.exp(1j * np.asarray(CANONICAL_SHIFTS)) - np.exp(1j * sequence.shifts[n]))))
-        quads[n] = rendering.quads[slot].numpy()
+        quads[n] = rendering.quads[channel_of_shift(run.sensor, sequence.shifts[n])].numpy()
         distances[n] = (rendering.distance / rendering.opacity.clamp_min(1e-6)).numpy()
     known = np.ones(len(quads), dtype=bool)
     assert len(quads) % FRAMES_PER_QUARTET == 0

@@ -55,7 +55,6 @@ def modules() -> dict[str, wp.Module]:
         "splat": splat.add_records.module,
         "move": move.move_gaussians.module,
         "noise": noise.uniform_noise.module,
-        "adam sizes": adam.adam_sizes.module,
         "adam": adam.make_adam(1).module,
         "displace": displace.displace.module,
         "finish": finish.judge.module,

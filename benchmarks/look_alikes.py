@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -30,11 +29,11 @@ from gftorf_warp.sim.ideal import ideal_recording, light_of
 from gftorf_warp.sim.record import frame_times
 from gftorf_warp.sim.scene import Scene
 from gftorf_warp.sim.scenes import SCENES
+from gftorf_warp.sim.sensors import PALINDROMIC, SEQUENTIAL
 
 RELATIVE, ABSOLUTE = 0.03, 0.002
 TORF_ABSOLUTE = 0.005
-PAIRED, IN_TURN = CANONICAL_SHIFTS, (0.0, math.pi / 2, math.pi, 3 * math.pi / 2)
-REAL = (math.pi, math.pi / 2, 0.0, 3 * math.pi / 2)
+PAIRED, IN_TURN, REAL = CANONICAL_SHIFTS, SEQUENTIAL, PALINDROMIC
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,22 +15,22 @@ from __future__ import annotations
 import argparse
 import json
 import statistics
-import subprocess
 import sys
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import torch
 
-from gftorf_warp.scene.gaussians import GaussianField, constant_sh
+from gftorf_warp.bench.command import about
+from gftorf_warp.bench.motion import points
+from gftorf_warp.bench.timing import WARM_UP, Watch, watch_of
+from gftorf_warp.scene.gaussians import GaussianField
 from gftorf_warp.scene.motion import MotionSettings, Products
 from gftorf_warp.scene.network import Network
 
 KEYS = 16  # of 60 frames
 LENGTH = 7.5  # unambiguous range at 20 MHz [m]
-WARM_UP = 3  # calls before a capture or a timing
 PROFILED, NAME = 20, 160  # lines of a profile, characters of a name in it
 MEGAFLOP = 3.007  # per Gaussian and query, forward and backward
 
@@ -40,14 +40,7 @@ Call = Callable[[], list[torch.Tensor]]
 def field(count: int, device: str) -> GaussianField:
     """Gaussians in a box of six metres."""
     mean = torch.rand(count, 3, generator=torch.Generator().manual_seed(1)) * 6 - 3
-    parts = {
-        "mean": mean,
-        "log_scale": torch.full((count, 3), -3.0),
-        "quaternion": torch.tensor([1.0, 0, 0, 0]).repeat(count, 1),
-        "opacity_logit": torch.zeros(count),
-        "reflectivity_sh": constant_sh(torch.ones(count)),
-    }
-    return GaussianField(**{name: value.to(device) for name, value in parts.items()})
+    return points(mean).map(lambda value: value.to(device))
 
 
 def network(products: Products, device: str) -> Network:
@@ -74,32 +67,11 @@ def call_of(made: Network, gaussians: GaussianField, queries: int) -> Call:
     return call
 
 
-def captured(call: Call) -> tuple[torch.cuda.CUDAGraph, list[torch.Tensor]]:
-    """A graph of a call, and where its results will be."""
-    side = torch.cuda.Stream()
-    side.wait_stream(torch.cuda.current_stream())
-    with torch.cuda.stream(side):
-        for _ in range(WARM_UP):
-            call()
-    torch.cuda.current_stream().wait_stream(side)
-    graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph):
-        kept = call()
-    return graph, kept
-
-
-def once(run: Callable[[], object], device: str) -> float:
-    """Time of one run [ms]: between events on a GPU, by the clock elsewhere."""
-    if device == "cpu":
-        begun = time.perf_counter()
-        run()
-        return 1e3 * (time.perf_counter() - begun)
-    begin, end = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
-    begin.record()
+def once(run: Callable[[], object], watch: Watch) -> float:
+    """Time of one run [ms]."""
+    begun = watch.mark()
     run()
-    end.record()
-    end.synchronize()
-    return begin.elapsed_time(end)
+    return watch.between(begun, watch.mark())
 
 
 def kernels(call: Call) -> int:
@@ -129,7 +101,7 @@ def longest(run: Callable[[], object], device: str) -> list[str]:
 
 def rows_of(count: int, queries: int, options: argparse.Namespace) -> list[dict[str, object]]:
     """One row per precision."""
-    device, gaussians = options.device, field(count, options.device)
+    device, watch, gaussians = options.device, watch_of(options.device), field(count, options.device)
     calls = {kind: call_of(network(kind, device), gaussians, queries) for kind in options.products}
     exact = call_of(network(Products.FLOAT32, device), gaussians, queries)()[0]
     rows: dict[Products, dict[str, object]] = {}
@@ -140,17 +112,16 @@ def rows_of(count: int, queries: int, options: argparse.Namespace) -> list[dict[
         row: dict[str, object] = {"gaussians": count, "queries": queries, "products": str(kind)}
         row["error_mm"] = 1e3 * float((found[0] - exact).norm(dim=-1).max())
         runs[kind, "called"] = call
-        if device != "cpu":
-            graph, kept = captured(call)
-            graph.replay()
-            row["replay_equals_call"] = all(map(torch.equal, kept, call()))
+        replay = watch.captured(call)
+        if replay is not None:
+            row["replay_equals_call"] = all(map(torch.equal, replay(), call()))
             row["kernels"] = kernels(call)
-            runs[kind, "replayed"] = graph.replay
+            runs[kind, "replayed"] = replay
         rows[kind] = row
     times: dict[tuple[Products, str], list[float]] = {name: [] for name in runs}
     for _ in range(options.repeats):
         for name, run in runs.items():
-            times[name].append(once(run, device))
+            times[name].append(once(run, watch))
     if options.profile:
         for (kind, _), run in runs.items():  # replayed comes last
             rows[kind]["profile"] = longest(run, device)
@@ -161,16 +132,6 @@ def rows_of(count: int, queries: int, options: argparse.Namespace) -> list[dict[
         rows[kind] |= {f"{how}_per_query_ms": best / queries}
         rows[kind] |= {f"{how}_tflops": MEGAFLOP * 1e-6 * count * queries / (1e-3 * best)}
     return list(rows.values())
-
-
-def machine(device: str) -> dict[str, object]:
-    """What the numbers are of."""
-    found: dict[str, object] = {"device": "cpu", "torch": torch.__version__, "threads": torch.get_num_threads()}
-    if device != "cpu":
-        asked = ["nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader"]
-        driver = subprocess.run(asked, capture_output=True, text=True, check=True).stdout.split()[0]
-        found |= {"device": torch.cuda.get_device_name(device), "cuda": torch.version.cuda, "driver": driver}
-    return found
 
 
 def main() -> int:
@@ -184,8 +145,8 @@ def main() -> int:
     parser.add_argument("--profile", action="store_true")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
-    found, rows = machine(options.device), []
-    print("  ".join(f"{name} {value}" for name, value in found.items()))
+    found, rows = about(options.device), []
+    print(" - ".join(map(str, found.values())))
     head = ["N", "Q", "products", "kernels", "called", "per query", "replayed", "per query", "TFLOP/s", "error [mm]"]
     print("".join(f"{name:>12}" for name in head), flush=True)
     for count in options.gaussians:

@@ -12,10 +12,10 @@ import argparse
 import json
 from pathlib import Path
 
-import torch
 import warp as wp
 
 from gftorf_warp.bench import renderer
+from gftorf_warp.bench.command import about
 from gftorf_warp.kernels import batches
 
 
@@ -42,8 +42,7 @@ def main() -> None:
         print("\n".join([f"lists walked in {walk}", *renderer.table(found)]))
         rows += [row | {"walk": walk} for row in found]
     if a.json:
-        about = {"device": device.name, "warp": wp.__version__, "torch": torch.__version__}
-        a.json.write_text(json.dumps(about | {"rows": rows}, indent=1) + "\n")
+        a.json.write_text(json.dumps(about(device.alias) | {"rows": rows}, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -18,6 +18,7 @@ import torch
 import warp as wp
 
 from gftorf_warp.bench import states, step
+from gftorf_warp.bench.command import about
 from gftorf_warp.data.sequence import Sequence
 
 
@@ -46,9 +47,8 @@ def main() -> int:
     if a.profile:
         print(step.profiled(step.fresh(fitted, fitted.observations, settings, a.device), a.device))
     if a.json:
-        about = {"device": torch.cuda.get_device_name(a.device) if a.device != "cpu" else "cpu"}
-        about |= {"warp": wp.__version__, "torch": torch.__version__, "preset": a.preset, "set": a.set}
-        a.json.write_text(json.dumps(about | row, indent=1) + "\n")
+        what = {"preset": a.preset, "set": a.set}
+        a.json.write_text(json.dumps(about(a.device) | what | row, indent=1) + "\n")
     return 0
 
 

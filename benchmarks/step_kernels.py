@@ -12,17 +12,18 @@ import argparse
 import json
 import statistics
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 
 import torch
 import warp as wp
 
+from gftorf_warp.bench.command import about
+from gftorf_warp.bench.timing import WARM_UP, watch_of
 from gftorf_warp.recon.objective import image_loss
 from gftorf_warp.recon.optimiser import BETAS, EPSILON
-from gftorf_warp.render import descent, fused
-from gftorf_warp.render.bridge import captured
+from gftorf_warp.render import descent, fused, training
+from gftorf_warp.render.bridge import array_over, captured, stream_of
 
 IMAGES = {"1 x 120 x 160": (1, 120, 160), "1 x 240 x 320": (1, 240, 320), "4 x 240 x 320": (4, 240, 320)}
 NETWORK = [(256, 84), *[(256, 256)] * 4, (256, 340), *[(256, 256)] * 2, (3, 256), *[(256,)] * 8, (3,)]
@@ -53,21 +54,26 @@ def noise_rows(device: str) -> dict[str, Callable[[], torch.Tensor]]:
 
 
 def adam_rows(device: str, count: int) -> dict[str, Callable[[], torch.Tensor]]:
-    """All tensors of ``count`` Gaussians and of the published network."""
+    """All tensors of ``count`` Gaussians and of the published network; what a step comes to was judged before."""
     shapes = [(count, 3), (count, 3), (count, 4), (count,), (count, 16), *NETWORK]
     values = [torch.randn(shape, device=device) for shape in shapes]
     gradients = [torch.randn(shape, device=device) for shape in shapes]
     moments = [(torch.zeros((), device=device), torch.zeros_like(v), torch.zeros_like(v)) for v in values]
     table = descent.AdamTable(values, gradients, moments)
     rates = torch.full((len(shapes),), 1e-3, device=device)
-    sound = torch.ones(1, dtype=torch.int32, device=device)
+    ledger, none = descent.Ledger.empty(1, torch.device(device)), torch.zeros(1, dtype=torch.int32, device=device)
+    rest = {"motion_gradient_max": None, "pairs": [none], "capacity": 0, "betas": BETAS, "epsilon": EPSILON}
+    descent.descend(table, rates, ledger, [0.0] * len(descent.FOUND_NAMES), motion_from=len(values), **rest)
+    tables = array_over(table.rows, wp.int64), array_over(table.first_block, wp.int32)
+    sizes = array_over(table.sizes)
     twins = [value.clone().requires_grad_() for value in values]
     for twin, gradient in zip(twins, gradients, strict=True):
         twin.grad = gradient
     adam = torch.optim.Adam([{"params": [t], "lr": 1e-3} for t in twins], betas=BETAS, eps=EPSILON, fused=True)
 
     def by_kernels() -> torch.Tensor:
-        descent.adam_step(table, rates, sound, betas=BETAS, epsilon=EPSILON)
+        with stream_of(rates):
+            training.adam_step(*tables, table.blocks, BETAS, EPSILON, sizes)
         return values[0]
 
     def by_torch() -> torch.Tensor:
@@ -82,7 +88,7 @@ def replay_of(run: Callable[[], torch.Tensor]) -> tuple[Callable[[], None], torc
     side = torch.cuda.Stream()
     side.wait_stream(torch.cuda.current_stream())
     with torch.cuda.stream(side):
-        for _ in range(3):
+        for _ in range(WARM_UP):
             run()
     torch.cuda.current_stream().wait_stream(side)
     graph = torch.cuda.CUDAGraph()
@@ -93,21 +99,14 @@ def replay_of(run: Callable[[], torch.Tensor]) -> tuple[Callable[[], None], torc
 
 def timed(runs: dict[str, Callable], repeats: int, device: str) -> dict[str, float]:
     """Median milliseconds of every row, taken in turns."""
+    watch = watch_of(device)
     spent: dict[str, list[float]] = {name: [] for name in runs}
-    for n in range(repeats + 3):
+    for n in range(repeats + WARM_UP):
         for name, run in runs.items():
-            if device == "cpu":
-                begun = time.perf_counter()
-                run()
-                spent[name].append(1e3 * (time.perf_counter() - begun))
-            else:
-                ends = [torch.cuda.Event(enable_timing=True) for _ in range(2)]
-                ends[0].record()
-                run()
-                ends[1].record()
-                ends[1].synchronize()
-                spent[name].append(ends[0].elapsed_time(ends[1]))
-            if n < 3:  # warming up
+            begun = watch.mark()
+            run()
+            spent[name].append(watch.between(begun, watch.mark()))
+            if n < WARM_UP:
                 spent[name].clear()
     return {name: statistics.median(values) for name, values in spent.items()}
 
@@ -138,10 +137,7 @@ def main() -> int:
         times = "  ".join(f"{how} {values[name]:8.3f} ms" for how, values in found.items() if name in values)
         print(f"{name:<40} {times}")
     if a.json:
-        about = {"device": a.device, "warp": wp.__version__, "torch": torch.__version__}
-        if a.device != "cpu":
-            about["device"] = torch.cuda.get_device_name(a.device)
-        a.json.write_text(json.dumps(about | {"repeats": a.repeats, "milliseconds": found}, indent=1) + "\n")
+        a.json.write_text(json.dumps(about(a.device) | {"repeats": a.repeats, "milliseconds": found}, indent=1) + "\n")
     return 0
 
 

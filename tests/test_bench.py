@@ -20,10 +20,15 @@ KINDS = set(Kernels) - {Kernels.AUTO}  # which is one of the others
 
 
 @pytest.fixture(scope="module")
-def fitted(tmp_path_factory):
-    """The quick state, its sequence in a folder."""
-    path = states.simulated(tmp_path_factory.mktemp("bench") / "sequence", quick=True)
-    sequence = Sequence.open(path)
+def recorded(tmp_path_factory):
+    """The quick sequence in a folder."""
+    return states.simulated(tmp_path_factory.mktemp("bench") / "sequence", quick=True)
+
+
+@pytest.fixture(scope="module")
+def fitted(recorded):
+    """The quick state."""
+    sequence = Sequence.open(recorded)
     settings = states.settings_of(sequence, "released", [], DEVICE)
     return states.from_phase(sequence, settings, DEVICE, quick=True)
 
@@ -83,10 +88,9 @@ def test_reconstruction_with_both_kernel_caches(tmp_path, monkeypatch):
     assert json.loads(path.read_text())["parts"].keys() == found["parts"].keys()
 
 
-def test_a_reconstruction_that_fails_says_why(tmp_path):
+def test_a_reconstruction_that_fails_says_why(recorded):
     """The exit code of the other process decides the error; its words are in it."""
-    path = states.simulated(tmp_path / "sequence", quick=True)
-    wanted = command.Wanted(device="cpu", quick=True, sequence=path, changes=("no.such=1",))
+    wanted = command.Wanted(device="cpu", quick=True, sequence=recorded, changes=("no.such=1",))
     with pytest.raises(UsageError, match=r"no\.such"):
         command.bench(["reconstruction"], wanted, say=lambda _: None)
 

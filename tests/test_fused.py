@@ -181,12 +181,23 @@ def moments_of(values):
     return [(torch.zeros((), device=x.device), torch.zeros_like(x), torch.zeros_like(x)) for x in values]
 
 
-def one_step(values, gradients, moments, rates, sound=1):
-    """A step with everything in device memory."""
-    flag = torch.tensor([sound], dtype=torch.int32, device=values[0].device)
-    rates = torch.tensor(rates, device=values[0].device)
-    table = descent.AdamTable(values, gradients, moments)
-    descent.adam_step(table, rates, flag, betas=(0.9, 0.999), epsilon=1e-15)
+def one_step(values, gradients, moments, rates):
+    """A step with everything in device memory, after one image whose loss is zero; whether it was sound."""
+    device = values[0].device
+    ledger, none = descent.Ledger.empty(1, device), torch.zeros(1, dtype=torch.int32, device=device)
+    descent.descend(
+        descent.AdamTable(values, gradients, moments),
+        torch.tensor(rates, device=device),
+        ledger,
+        [0.0] * len(descent.FOUND_NAMES),
+        motion_from=len(values),
+        motion_gradient_max=None,
+        pairs=[none],
+        capacity=0,
+        betas=(0.9, 0.999),
+        epsilon=1e-15,
+    )
+    return ledger.counts[0].item() == 0
 
 
 @pytest.mark.parametrize("block", [16, 1], ids=["vectors", "elements"])
@@ -203,7 +214,7 @@ def test_adam_is_torchs_over_fifty_steps(monkeypatch, device, block):
         for twin, gradient in zip(twins, drawn, strict=True):
             twin.grad = gradient.clone()
         adam.step()
-        one_step(values, drawn, moments, rates)
+        assert one_step(values, drawn, moments, rates)
     for value, twin, (step, first, second) in zip(values, twins, moments, strict=True):
         torch.testing.assert_close(value, twin.detach(), rtol=1e-6, atol=1e-6)
         state = adam.state[twin]
@@ -217,12 +228,12 @@ def test_adam_rests_at_rate_zero_and_when_a_step_is_not_sound(device):
     """To the bit, moments and step included; and the other tensors go on."""
     values, rates, gradients = adam_case(device)
     moments = moments_of(values)
-    one_step(values, gradients(), moments, rates)
+    assert one_step(values, gradients(), moments, rates)
     before = [[x.clone() for x in (value, *kept)] for value, kept in zip(values, moments, strict=True)]
-    one_step(values, [g * math.nan for g in gradients()], moments, rates, sound=0)
+    assert not one_step(values, [g * math.nan for g in gradients()], moments, rates)
     for old, value, kept in zip(before, values, moments, strict=True):
         assert all(torch.equal(x, y) for x, y in zip(old, (value, *kept), strict=True))
-    one_step(values, gradients(), moments, [0.0, *rates[1:]])
+    assert one_step(values, gradients(), moments, [0.0, *rates[1:]])
     for n, (old, value, kept) in enumerate(zip(before, values, moments, strict=True)):
         assert all(torch.equal(x, y) == (n == 0) for x, y in zip(old, (value, *kept), strict=True))
 

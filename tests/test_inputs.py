@@ -123,10 +123,16 @@ def test_colour_is_compared_from_its_own_camera():
 
 
 def test_colour_of_weight_zero_is_never_rendered(monkeypatch):
-    """Neither tensors nor a pass."""
+    """Neither tensors nor a pass; and a pass for colour makes no image that only the other camera is asked for."""
     sequence = with_colour(recording(frames=8)[0])
-    calls = []
-    monkeypatch.setattr(objective, "rasterize", lambda field, *a, **k: calls.append(field) or rasterize(field, *a, **k))
+    calls, asked = [], []
+
+    def noted(field, *arguments, images, **more):
+        calls.append(field)
+        asked.append(images if field.colour_sh is not None else {"opacity"})
+        return rasterize(field, *arguments, images=images, **more)
+
+    monkeypatch.setattr(objective, "rasterize", noted)
     for weight, colours in ((0.0, 0), (1.0, 1)):
         settings = demo(weights=Weights(colour=weight), images=8)
         observations = observe(sequence, settings, "cpu")
@@ -136,6 +142,7 @@ def test_colour_of_weight_zero_is_never_rendered(monkeypatch):
         step.step(state, observations, settings)
         assert len(calls) == 4 + colours
         assert sum(field.colour_sh is not None for field in calls) == colours
+    assert all(images == {"opacity"} for images in asked)
 
 
 def test_constant_and_other_harmonics_of_colour_have_rates_of_their_own():

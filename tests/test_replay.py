@@ -86,6 +86,8 @@ def test_only_what_is_wanted(run):
     assert got.phasor.numel() == got.distortion.numel() == 0
     for name in ("quads", "distance", "opacity"):
         torch.testing.assert_close(getattr(got, name), getattr(want, name), rtol=1e-4, atol=1e-4, msg=name)
+    with pytest.raises(ValueError, match="no image 'depth'"):
+        run.renderer(("quads", "depth"))
 
 
 def test_every_key_is_computed_once(run, monkeypatch):

@@ -104,6 +104,7 @@ def test_a_file_is_simulated_like_a_name(tmp_path, capsys):
         ("sensor = { noise = 1 }" + SHORT, "sensor.noise", "true or false"),
         (SHORT.replace("sphere", "sphre"), "bodies[0].shape.kind", "found 'sphre'"),
         (SHORT.replace('kind = "line", ', ""), "bodies[0].path.kind", "found None"),
+        (SHORT.replace('kind = "sphere"', 'kind = ["sphere"]'), "bodies[0].shape.kind", "found ['sphere']"),
         (SHORT.replace("0.4", "-0.4"), "bodies[0].shape", "above 0"),
         (SHORT.replace("0.4", '"big"'), "bodies[0].shape.radius", "found 'big'"),
         (SHORT.replace("[1, 0, -0.5]", "[1, 0]"), "bodies[0].path.velocity", "expected 3 values, found 2"),

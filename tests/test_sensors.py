@@ -67,7 +67,12 @@ def test_a_scene_file_takes_a_name_too(tmp_path):
     assert read_scene(path).sensor == want
     path.write_text("lens = { cosine_power = 4, distortion = { k1 = -0.2 } }\n" + BALL)
     assert read_scene(path).lens.distortion.k1 == -0.2
-    for text in ('sensor = "kinect"\n', 'sensor = { preset = "kinect" }\n', "sensor = { preset = 5 }\n"):
+    for text in (
+        'sensor = "kinect"\n',
+        'sensor = { preset = "kinect" }\n',
+        "sensor = { preset = 5 }\n",
+        "sensor = { preset = [] }\n",
+    ):
         path.write_text(text + BALL)
         with pytest.raises(InputError, match=r"there is no sensor.*\n.*ftorf_synthetic"):
             read_scene(path)

@@ -20,7 +20,7 @@ SIZE = (32, 24)
 def test_it_is_the_closed_form_of_one_instant(more):
     """At quartet starts the noise-free closed form of simultaneous quads, whatever noise, blur and motion did."""
     scene = replace(SCENES["demo"], sensor=Sensor(noise=True, phase_offset=0.7, dc_offset=0.1))
-    truth = record(scene, size=SIZE, frames=8, **more).truth
+    truth = record(scene, size=SIZE, frames=5, **more).truth
     still = {**more, "exposure_samples": 1}
     sync = record(scene, size=SIZE, frames=8, sync=True, noise=False, **still).sequence
     bound = 0.03 if "bounces" in more else 1e-4  # every raw frame has other random paths

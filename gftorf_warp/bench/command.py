@@ -22,7 +22,7 @@ from ..data.files import write_json
 from ..data.sequence import Sequence
 from ..errors import UsageError
 from . import motion, reconstruction, renderer, rendering, states, step
-from .timing import Report
+from .timing import Report, quietly
 
 RUNS, QUICK_RUNS = 30, 5
 PRESETS = {"cpu": "demo", "other": "released"}  # of whole reconstructions; a step is always of the second
@@ -162,7 +162,7 @@ def bench(
         for name in chosen:
             measure, table = PARTS[name]
             begun = time.perf_counter()
-            rows = measure(shared, (lambda *_, **__: None) if progress is None else progress(name))
+            rows = measure(shared, quietly if progress is None else progress(name))
             found["parts"][name] = {"seconds": time.perf_counter() - begun, "rows": rows}
             if json is not None:
                 write_json(json, found)

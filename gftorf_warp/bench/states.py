@@ -47,8 +47,6 @@ class Fitted:
     """The state, as a checkpoint holds it, on the device."""
     sequence: Sequence
     """As it was read."""
-    flow_source: str
-    """Where optical flow is from."""
 
     @property
     def gaussians(self) -> int:
@@ -85,7 +83,7 @@ def from_run(run: Path | None, sequence: Sequence, settings: ReconSettings, devi
         raise InputError("the run has no checkpoint", where=run, why="nothing was reconstructed yet", fix=fix)
     if stored is None:
         stored = to_dict(begin(observations, settings, seed=0, device=device))
-    return _fitted(observations, settings, stored, sequence)
+    return Fitted(observations=observations, settings=settings, stored=stored, sequence=sequence)
 
 
 def from_phase(sequence: Sequence, settings: ReconSettings, device: str, *, quick: bool) -> Fitted:
@@ -105,17 +103,7 @@ def from_phase(sequence: Sequence, settings: ReconSettings, device: str, *, quic
     assert state is not None
     stored = to_dict(state)
     stored["images"] = min(REACHED, settings.schedule.images // 4)
-    return _fitted(observations, settings, stored, sequence)
-
-
-def _fitted(observations: Observations, settings: ReconSettings, stored: dict, sequence: Sequence) -> Fitted:
-    return Fitted(
-        observations=observations,
-        settings=settings,
-        stored=stored,
-        sequence=sequence,
-        flow_source=observations.flow_source,
-    )
+    return Fitted(observations=observations, settings=settings, stored=stored, sequence=sequence)
 
 
 def pairs_of(fitted: Fitted) -> int:

@@ -145,7 +145,7 @@ def rows_of(
             "pairs": pairs,
             "from": before,
         }
-        row |= {"images": state.images - before, "flow": fitted.flow_source, "not_sound": broken}
+        row |= {"images": state.images - before, "flow": observations.flow_source, "not_sound": broken}
         row |= {"ms_per_image": statistics.mean(times), "parts": Timing.of(times).plain()}
         if isinstance(run.steps, CapturedSteps) and run.steps.gate.counts is not None:
             row["awake"], row["asking"] = run.steps.gate.counts

@@ -15,7 +15,7 @@ from . import specs
 from .arrays import SIDE_MAX
 from .calibration import DEPTH_RANGES_M, FOCAL_MIN
 from .capture_json import FORMAT, NAME, json_fields, read_values
-from .capture_write import write
+from .capture_write import MANIFEST, inverse, write
 from .cycles import QUADS_MIN
 from .exr import Parts, read_parts
 from .folder import FRAMES_MAX, empty_quads, format_of, numbered
@@ -24,8 +24,6 @@ from .problems import Problems
 from .sequence import Sequence, Truth
 
 __all__ = ["read", "read_truth", "write"]
-
-MANIFEST = "MANIFEST.sha256"
 
 
 def read(path: str | Path, *, frame_rate_hz: float | None = None) -> Sequence:
@@ -96,12 +94,12 @@ def read(path: str | Path, *, frame_rate_hz: float | None = None) -> Sequence:
         cx=cx,
         cy=cy,
         distortion=None if lens is None else (lens[0], lens[1], lens[2], lens[3], lens[4]),
-        camera_from_world=_inverse(values["pose"]),
+        camera_from_world=inverse(values["pose"]),
         quad_scale=float(values["raw_scale"]) if "raw_scale" in values else None,
         from_phasors=values["kind"] == "phasor",
         colour_intrinsics=None if colour is None else _pinhole(colour),
-        colour_from_world=_inverse(values["colour_pose"]) if "colour_pose" in values else None,
-        novel_from_world=_inverse(values["novel"]) if "novel" in values else None,
+        colour_from_world=inverse(values["colour_pose"]) if "colour_pose" in values else None,
+        novel_from_world=inverse(values["novel"]) if "novel" in values else None,
         sources=_sources(values, images, int(measured.sum())),
         path=root,
         **images,
@@ -309,17 +307,13 @@ def _pinhole(matrix: np.ndarray) -> tuple[float, float, float, float]:
     return float(matrix[0, 0]), float(matrix[1, 1]), float(matrix[0, 2]), float(matrix[1, 2])
 
 
-def _inverse(poses: np.ndarray) -> np.ndarray:
-    return np.linalg.inv(poses) + 0.0  # no minus zeros
-
-
 def _sources(values: dict[str, Any], images: dict[str, dict[int, np.ndarray]], measured: int) -> dict[str, str]:
     """Where each field of the sequence is from."""
     sources = {}
     for field in specs.fields(FORMAT).values():
         for name in field.fills:
             there = field.name in values if field.kind == "json" else bool(images.get(name, True))
-            place = f"{NAME} {field.key}" if field.kind == "json" else f"{field.paths[0].partition('/')[0]}"
+            place = f"{NAME} {field.key}" if field.kind == "json" else field.paths[0].partition("/")[0]
             if field.role != "truth":
                 sources[name] = f"file {place}" if there else "default none"
     for name, found in images.items():

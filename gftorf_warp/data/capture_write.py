@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from .. import __version__
 from .capture_json import NAME
@@ -129,7 +130,7 @@ def _json(sequence: Sequence) -> bytes:
         "provenance": {"writer": f"gftorf-warp {__version__}"},
     }
     if sequence.novel_from_world is not None:
-        head["novel_to_world"] = _inverse(sequence.novel_from_world)
+        head["novel_to_world"] = inverse(sequence.novel_from_world).tolist()
     lines = [json.dumps(frame, allow_nan=False) for frame in _frames(sequence)]
     rows = [f" {json.dumps(key)}: {json.dumps(value, allow_nan=False)},\n" for key, value in head.items()]
     return ("{\n" + "".join(rows) + ' "frames": [\n  ' + ",\n  ".join(lines) + "\n ]\n}\n").encode()
@@ -143,12 +144,12 @@ def _frames(sequence: Sequence) -> list[dict[str, Any]]:
         "f_mod_hz": sequence.frame_frequencies.tolist(),
         "shift_rad": sequence.shifts.tolist(),
         "measured": sequence.measured.tolist(),
-        "camera_to_world": _inverse(sequence.camera_from_world),
+        "camera_to_world": inverse(sequence.camera_from_world).tolist(),
     }
     if sequence.exposures is not None:
         columns["exposure"] = sequence.exposures.tolist()
     if sequence.colour_from_world is not None:
-        columns["colour_to_world"] = _inverse(sequence.colour_from_world)
+        columns["colour_to_world"] = inverse(sequence.colour_from_world).tolist()
     return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
 
@@ -157,5 +158,6 @@ def _camera(size: tuple[int, ...], fx: float, fy: float, cx: float, cy: float) -
     return {"size": [int(n) for n in size], "K": [[float(x) for x in row] for row in matrix]}
 
 
-def _inverse(poses: np.ndarray) -> list:
-    return (np.linalg.inv(poses) + 0.0).tolist()  # no minus zeros
+def inverse(poses: Float[np.ndarray, "F 4 4"]) -> Float[np.ndarray, "F 4 4"]:
+    """Poses the other way round, as they are stored, or as they are read; without minus zeros."""
+    return np.linalg.inv(poses) + 0.0

@@ -16,6 +16,7 @@ from ..constants import SPEED_OF_LIGHT
 from ..errors import InputError
 from .cycles import solution
 from .decode import Decoded, decode_quartet, unambiguous_range
+from .images import png_bytes
 from .sequence import Sequence, Truth
 from .truth import known_distance
 
@@ -53,8 +54,6 @@ def contact_sheet(sequence: Sequence, truth: Truth | None, title: str) -> bytes:
         truth: What the scene really was, if that is known.
         title: Heading.
     """
-    import cv2
-
     quartets = _decodable(sequence)
     n = sequence.cycle * quartets[len(quartets) // 2] if quartets else int(np.flatnonzero(sequence.measured)[0])
     rows = [_raw(sequence, n), _decoded(sequence, truth, n, bool(quartets)), _more(sequence, truth, n)]
@@ -74,10 +73,7 @@ def contact_sheet(sequence: Sequence, truth: Truth | None, title: str) -> bytes:
         for j, panel in enumerate(row):
             x, y = MARGIN + j * (cell + GAP), MARGIN + HEAD + i * (TITLE + height + GAP)
             _place(sheet, panel, x, y, height)
-    done, data = cv2.imencode(".png", np.ascontiguousarray(sheet[..., ::-1]))  # OpenCV keeps blue first
-    if not done:
-        raise ValueError(f"sheet {sheet.shape} could not be encoded")
-    return data.tobytes()
+    return png_bytes(sheet)
 
 
 def _decodable(sequence: Sequence) -> list[int]:

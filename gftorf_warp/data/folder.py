@@ -11,12 +11,13 @@ from ..constants import FRAMES_PER_QUARTET
 from ..errors import InputError, ResourceError
 from . import specs
 from .arrays import as_float32, read_array, read_shape
+from .capture_json import NAME as CAPTURE
 from .problems import Problems
 from .sequence import Truth
 
 SLOT_FOLDERS = tuple(f"tofType{slot}" for slot in range(FRAMES_PER_QUARTET))
 PHASOR_FOLDER = "tof"
-CAPTURE = "capture.json"
+NOT_IN_FAMILY = ("frequencies_hz", "cycle_length", "distortion", "exposures", "sensor")  # only a capture holds these
 EXPECTED = (
     "expected a folder with capture.json (a capture), tofType0 .. tofType3 and cams (F-ToeRF: raw quads), or tof and "
     "cams (ToeRF: phasors)"

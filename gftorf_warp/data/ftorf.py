@@ -11,6 +11,7 @@ from ..errors import InputError
 from . import specs
 from .calibration import read_calibration, read_colour_intrinsics, read_shifts, read_times
 from .folder import (
+    NOT_IN_FAMILY,
     SLOT_FOLDERS,
     empty_quads,
     first_size,
@@ -30,7 +31,6 @@ from .sequence import Sequence, Truth
 __all__ = ["read", "read_truth", "write"]
 
 FORMAT = "ftorf"
-NOT_HERE = ("frequencies_hz", "cycle_length", "distortion", "exposures", "sensor")  # the layout has no place for them
 
 
 def read(path: str | Path, *, frame_rate_hz: float | None = None) -> Sequence:
@@ -47,7 +47,7 @@ def read(path: str | Path, *, frame_rate_hz: float | None = None) -> Sequence:
     """
     root, fields = _root(Path(path)), specs.fields(FORMAT)
     problems = Problems()
-    sources = dict.fromkeys(NOT_HERE, "default none")
+    sources = dict.fromkeys(NOT_IN_FAMILY, "default none")
     sources["from_phasors"] = "file tofType0 .. tofType3: raw quads"
     frame_paths, copies = _measured_files(root)
     size = first_size(frame_paths, fields["quads"], problems)

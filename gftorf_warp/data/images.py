@@ -99,6 +99,15 @@ def write_png(path: str | Path, rgb: np.ndarray) -> None:
         ValueError: If it is another type or shape.
         UsageError, ResourceError: If the file cannot be written.
     """
+    atomic_write(path, png_bytes(rgb))  # cv2.imwrite would not notice a full disk
+
+
+def png_bytes(rgb: np.ndarray) -> bytes:
+    """An 8-bit colour image [H, W, 3], uint8, red first, as the content of a PNG file.
+
+    Raises:
+        ValueError: If it is another type or shape.
+    """
     import cv2
 
     if rgb.dtype != np.uint8 or rgb.ndim != 3 or rgb.shape[2] != 3:
@@ -106,4 +115,4 @@ def write_png(path: str | Path, rgb: np.ndarray) -> None:
     done, data = cv2.imencode(".png", np.ascontiguousarray(rgb[..., ::-1]))  # OpenCV keeps blue first
     if not done:
         raise ValueError(f"rgb {rgb.shape} could not be encoded")
-    atomic_write(path, data.tobytes())  # cv2.imwrite would not notice a full disk
+    return data.tobytes()

@@ -16,6 +16,7 @@ from . import specs
 from .arrays import read_shape
 from .calibration import read_calibration, read_colour_intrinsics, read_times
 from .folder import (
+    NOT_IN_FAMILY,
     SLOT_FOLDERS,
     empty_quads,
     first_size,
@@ -35,7 +36,6 @@ from .torf_write import write
 __all__ = ["phasor_files", "read", "read_truth", "write"]
 
 FORMAT = "torf"
-NOT_HERE = ("frequencies_hz", "cycle_length", "distortion", "exposures", "sensor")  # the layout has no place for them
 PHASOR_RATE_HZ = FRAME_RATE_HZ / FRAMES_PER_QUARTET  # [Hz] the sensor is that of the F-ToeRF recordings
 
 
@@ -53,7 +53,7 @@ def read(path: str | Path, *, frame_rate_hz: float | None = None) -> Sequence:
     """
     root, fields, step = _root(Path(path)), specs.fields(FORMAT), FRAMES_PER_QUARTET
     problems = Problems()
-    sources = dict.fromkeys(NOT_HERE, "default none")
+    sources = dict.fromkeys(NOT_IN_FAMILY, "default none")
     files, first_id = phasor_files(root)
     size = first_size(files, fields["phasor"], problems)
     if not (root / "cams").is_dir():

@@ -15,7 +15,7 @@ import warp as wp
 
 PARAMETER, GRADIENT, FIRST, SECOND, STEP, LENGTH = range(6)  # columns of the table
 COLUMNS = 6
-SIZES = 3  # what a step of a tensor comes to: see ``adam_sizes``
+SIZES = 3  # what a step of a tensor comes to: see ``ADVANCE``
 
 ADVANCE = f"""
     const long long* row = table.data + {COLUMNS} * tensor;
@@ -29,7 +29,7 @@ ADVANCE = f"""
     out[1] = (float)(1.0 / sqrt(second));
     out[2] = factor;
 """
-"""C++: count a step of a tensor, unless it rests, and write what the step comes to."""
+"""C++ of ``finish.judge``: count a step of a tensor, unless it rests, and write what the step comes to."""
 
 
 def _descend(K: int) -> str:
@@ -61,36 +61,6 @@ def _descend(K: int) -> str:
 """
 
 
-@wp.func_native(ADVANCE)
-def advance(
-    table: wp.array2d[wp.int64],
-    tensor: int,
-    rate: float,
-    beta1: wp.float64,
-    beta2: wp.float64,
-    sound: bool,
-    factor: float,
-    sizes: wp.array2d[float],
-):
-    """Count a step of a tensor, unless it rests, and write what the step comes to."""
-
-
-@wp.kernel(enable_backward=False)
-def adam_sizes(
-    # In:
-    table: wp.array2d[wp.int64],  # [T, 6] addresses of parameter, gradient, both moments and step; length [1]
-    rates: wp.array[float],  # [T] learning rates, 0: the tensor rests [1]
-    sound: wp.array[int],  # [1] 0: nothing changes in this step [flag]
-    beta1: wp.float64,  # decay of the first moment [1]
-    beta2: wp.float64,  # decay of the second moment [1]
-    # Out:
-    sizes: wp.array2d[float],  # [T, 3] rate / (1 - b1^t), 0: rests; 1 / sqrt(1 - b2^t); factor of the gradient
-):
-    """One thread per tensor; counts its step."""
-    tensor = wp.tid()
-    advance(table, tensor, rates[tensor], beta1, beta2, sound[0] != 0, 1.0, sizes)
-
-
 @functools.cache
 def make_adam(K: int):
     """The kernel that works on K elements per thread: 1 on CUDA, 16 on the CPU."""
@@ -115,7 +85,7 @@ def make_adam(K: int):
         rest2: float,  # 1 - b2 [1]
         epsilon: float,  # added to the root of the second moment [units of the gradient]
         # Out:
-        sizes: wp.array2d[float],  # [T, 3] from ``adam_sizes``; what changes are the tensors of the table, in place
+        sizes: wp.array2d[float],  # [T, 3] from ``finish.judge``; what changes are the tensors of the table, in place
     ):
         """One thread per block of K elements; changes parameters and moments where they are."""
         block = wp.tid()

@@ -216,8 +216,6 @@ class CapturedSteps:
                 value = self.state.sums.get(name)
                 self.state.sums[name] = found[name] if value is None else value + found[name]
         self._ledger.sums.zero_()
-        if self.state.motion.follows_means:
-            self.state.attachment = self.state.motion.attach(self.state.optimiser.field)
         return self._look()
 
     def _look(self) -> int:

@@ -160,11 +160,10 @@ def rendering_of(
     """
     wanted = ("colour",) if field.colour_sh is not None else ("quads", "phasor")
     lights = {name: light for name, light in (backgrounds or {}).items() if name in wanted}
-    images = {"opacity", light}
-    if weights.distortion > 0:
-        images.add("distortion")
-    if weights.depth > 0 or flows is not None:
-        images.add("distance")
+    images = {"opacity"}
+    if field.colour_sh is None:  # otherwise colour is what is compared, which comes by itself
+        images |= {light, *(["distortion"] if weights.distortion > 0 else [])}
+        images |= {"distance"} if weights.depth > 0 or flows is not None else set()
     return rasterize(
         field,
         camera,

@@ -10,7 +10,6 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
-from ..render import descent
 from ..scene.gaussians import GaussianField
 from ..scene.motion import Motion
 from .settings import Batch, BatchRule, Input, ReconSettings
@@ -136,22 +135,13 @@ class Optimiser:
         """Everything that is optimised: the tensors of the field, then the motion."""
         return [*self.tensors.values(), *self.motion]
 
-    def step(
-        self,
-        gradients: list[Tensor | None],
-        rates: dict[str, float],
-        motion_gradient_max: float | None,
-        *,
-        sound: Bool[Tensor, ""] | None = None,
-    ) -> None:
+    def step(self, gradients: list[Tensor | None], rates: dict[str, float], motion_gradient_max: float | None) -> None:
         """One step of Adam.
 
         Args:
             gradients: Of ``leaves``; None is zero.
             rates: From :func:`rates_at`. A group of rate 0 is left alone, its moments included.
             motion_gradient_max: Longest gradient of the motion; a longer one is shortened. None: no limit.
-            sound: Whether anything may change, where the tensors are: the kernel of Adam asks, and no host waits for
-                the answer. None: everything may, and torch's Adam does it.
         """
         for leaf, gradient in zip(self.leaves, gradients, strict=True):
             leaf.grad = gradient
@@ -162,23 +152,8 @@ class Optimiser:
             if group["lr"] == 0.0:
                 for leaf in group["params"]:
                     leaf.grad = None
-        if sound is None:
-            self.adam.step()
-        else:
-            self._step_by_kernel(sound)
+        self.adam.step()
         self.adam.zero_grad(set_to_none=True)
-
-    def _step_by_kernel(self, sound: Bool[Tensor, ""]) -> None:
-        """All tensors in two launches, with the moments that torch's Adam keeps, and would begin with."""
-        moving = [(leaf, group["lr"]) for group in self.adam.param_groups for leaf in group["params"]]
-        moving = [(leaf, rate) for leaf, rate in moving if leaf.grad is not None]
-        moments = [self.moments_of(leaf) for leaf, _ in moving]
-        if not moving:
-            return
-        values, gradients = [leaf.detach() for leaf, _ in moving], [leaf.grad.contiguous() for leaf, _ in moving]
-        rates = torch.tensor([rate for _, rate in moving], device=sound.device)
-        table = descent.AdamTable(values, gradients, moments)
-        descent.adam_step(table, rates, sound.to(torch.int32).reshape(1), betas=self.betas, epsilon=EPSILON)
 
     def moments_of(self, leaf: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """(step, first moment, second moment) of a leaf; zeros, as torch's Adam would begin, if it has none yet."""

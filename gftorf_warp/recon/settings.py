@@ -90,7 +90,7 @@ class Kernels(enum.StrEnum):
     LOSS = "loss"
     """Losses of images that contain the similarity."""
     STEP = "step"
-    """These, random backgrounds and Adam; the backgrounds are other draws of the same kind."""
+    """These and random backgrounds, which are other draws of the same kind: single steps to compare ``graph`` with."""
     GRAPH = "graph"
     """The whole step, captured as one CUDA graph; on a CPU the same without one. What cannot be one is ``loss``."""
 

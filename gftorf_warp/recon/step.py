@@ -89,15 +89,11 @@ def step(
     if due and options.loses_step:
         rates = {name: rate if name == "motion" else 0.0 for name, rate in rates.items()}
     sound = torch.stack(checked).sum().isfinite() if checked else None
-    by_kernel = settings.kernels == Kernels.STEP and sound is not None
-    if by_kernel:  # asks by itself whether the step is sound, so that the device has work while the host asks, too
-        state.optimiser.step(gradients, rates, settings.motion_gradient_max, sound=sound)
     if sound is not None and not bool(sound):
         return {name: float(sum(found.get(name, 0.0) for found, _, _ in results)) for name in results[0][0]}
     for frame, (found, seen, _) in zip(frames, results, strict=True):
         _account(state, observations, frame, found, seen)
-    if not by_kernel:
-        state.optimiser.step(gradients, rates, settings.motion_gradient_max)
+    state.optimiser.step(gradients, rates, settings.motion_gradient_max)
     densify_after(state, before, settings)
     return None
 

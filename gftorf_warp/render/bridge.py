@@ -16,7 +16,7 @@ from torch.autograd.function import once_differentiable
 from ..scene.camera import Camera
 from . import launch
 from .buffers import Frame, RenderSettings, Workspace
-from .inputs import Images, Inputs, names_of
+from .inputs import Images, Inputs, names_of, shapes_of
 
 INPUTS = names_of(Inputs)
 IMAGES = names_of(Images)
@@ -66,13 +66,9 @@ class Rasterize(torch.autograd.Function):
         mean, extra, colour_sh = named["mean"], named["extra"], named["colour_sh"]
         assert mean is not None
         camera, shifts = request.camera, request.shifts
-        size = camera.height, camera.width
-        shapes = {"quads": (len(shifts), *size), "phasor": (3, *size), "distance": size, "opacity": size}
-        shapes |= {"distortion": size}
-        shapes = {name: shape for name, shape in shapes.items() if name in request.images}
-        shapes |= {"colour": (3, *size)} if colour_sh is not None else {}
-        shapes |= {"extra": (extra.shape[1], *size)} if extra is not None else {}
-        images = {name: mean.new_empty(shapes[name]) for name in IMAGES if name in shapes}
+        shapes = shapes_of(len(shifts), camera.height, camera.width, 0 if extra is None else extra.shape[1])
+        made = request.images | {name for name, of in (("colour", colour_sh), ("extra", extra)) if of is not None}
+        images = {name: mean.new_empty(shapes[name]) for name in IMAGES if name in made}
         with stream_of(mean):
             device = wp.device_from_torch(mean.device)
             kind = len(mean), camera.width, camera.height, request.settings, device
@@ -125,7 +121,7 @@ def _images(named: Mapping[str, Tensor]) -> Images:
 
 def left_out(name: str, like: Tensor, height: int, width: int) -> Tensor:
     """What stands for an image that nobody asked for: no elements, where ``like`` is."""
-    return like.new_empty(0, height, width) if name in ("quads", "phasor") else like.new_empty(0, width)
+    return like.new_empty(0, *shapes_of(0, height, width)[name][1:])
 
 
 def array_over(tensor: Tensor | None, dtype=wp.float32) -> wp.array | None:

@@ -106,29 +106,6 @@ def _check(tensor: Tensor, device: torch.device, shape: torch.Size | None) -> No
         raise ValueError(f"{tuple(tensor.shape)} must be {tuple(shape)}, the shape of the parameter")
 
 
-def adam_step(
-    table: AdamTable,
-    rates: Float[Tensor, "T"],
-    sound: Int[Tensor, "1"],
-    *,
-    betas: tuple[float, float],
-    epsilon: float,
-) -> None:
-    """One step of Adam over all tensors of a table, in place.
-
-    Args:
-        table: Which.
-        rates: Learning rate of each; 0: the tensor is left alone, moments and step included.
-        sound: int32; 0: nothing changes. Read when the kernel runs, as the rates are.
-        betas: Decays of the moments.
-        epsilon: Added to the root of the second moment.
-    """
-    with stream_of(rates):
-        arrays = array_over(table.rows, wp.int64), array_over(table.first_block, wp.int32), table.blocks
-        head = array_over(rates), array_over(sound, wp.int32)
-        training.adam_step(*arrays, *head, betas, epsilon, array_over(table.sizes))
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Ledger:
     """What one run counts and sums up on its device."""
@@ -198,7 +175,7 @@ def descend(
             array_over(ledger.sums),
             sizes,
         )
-        training.adam_descend(rows, array_over(table.first_block, wp.int32), table.blocks, betas, epsilon, sizes)
+        training.adam_step(rows, array_over(table.first_block, wp.int32), table.blocks, betas, epsilon, sizes)
 
 
 def observe(

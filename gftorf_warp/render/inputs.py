@@ -45,6 +45,12 @@ CHOICES = ("quads", "phasor", "distance", "opacity", "distortion")
 """Images that a rendering may do without; colour and extra depend on what there is to render."""
 
 
+def shapes_of(quads: int, height: int, width: int, extra: int = 0) -> dict[str, tuple[int, ...]]:
+    """Shape of every image by name, of so many quads and extra channels."""
+    planes = {"quads": quads, "phasor": 3, "colour": 3, "extra": extra}
+    return dict.fromkeys(CHOICES, (height, width)) | {name: (n, height, width) for name, n in planes.items()}
+
+
 def wanted_images(names: Collection[str]) -> frozenset[str]:
     """The names of the images that are asked for.
 

@@ -27,7 +27,7 @@ from . import launch
 from .api import Rendering
 from .bridge import array_over, left_out, stream_of
 from .buffers import Frame, RenderSettings
-from .inputs import CHOICES, Images, Inputs, names_of
+from .inputs import CHOICES, Images, Inputs, names_of, shapes_of, wanted_images
 
 ROOM = 1.5  # pairs that are reserved, over the most that were needed so far
 CAMERAS_MAX = 16  # that are kept, with their graphs
@@ -80,11 +80,15 @@ class Replay:
             optimised: The camera at the size of the optimisation, whose low-pass filter widened the Gaussians.
             images: Names of what is wanted of quads, phasor, colour, distance, opacity and distortion; others have no
                 elements and cost nothing.
+
+        Raises:
+            ValueError: If there is no such image.
         """
         wp.init()
         field = field.map(lambda tensor: tensor.detach().contiguous())
         self.motion, self.attachment, self.settings = motion, attachment, settings
-        self.names, self._like = frozenset(images), field.mean
+        colour = {"colour"} & set(images) if field.colour_sh is not None else set()
+        self.names, self._like = wanted_images(set(images) - {"colour"}) | colour, field.mean
         self.shifts = tuple(float(shift) for shift in sensor.shifts)
         self.device = wp.device_from_torch(field.device)
         self.graphs = self.device.is_cuda
@@ -202,16 +206,12 @@ class Replay:
         return self._views[name]
 
     def _target(self, height: int, width: int) -> _Target:
-        size = height, width
-        shapes: dict[str, tuple[int, ...]] = {"quads": (len(self.shifts), *size), "phasor": (3, *size)}
-        shapes |= {"colour": (3, *size)} if self._inputs.colour_sh is not None else {}
-        shapes |= dict.fromkeys(("distance", "opacity", "distortion"), size)
-        shapes = {name: shape for name, shape in shapes.items() if name in self.names}
-        tensors = {name: self._mean.new_empty(shape) for name, shape in shapes.items()}
+        shapes = shapes_of(len(self.shifts), height, width)
+        tensors = {name: self._mean.new_empty(shapes[name]) for name in shapes if name in self.names}
         settings = replace(self.settings, pair_capacity=self._capacity)
         with stream_of(self._mean):
             frame = Frame(self.count, width, height, settings, self.device)
-        images = Images(**dict.fromkeys(names_of(Images)) | {name: array_over(tensors[name]) for name in shapes})
+        images = Images(**dict.fromkeys(names_of(Images)) | {name: array_over(tensors[name]) for name in tensors})
         return _Target(frame=frame, tensors=tensors, images=images)
 
 

@@ -153,36 +153,18 @@ def uniform(origin: wp.array, stream: int, amplitude: float, image: wp.array) ->
 
 
 def adam_step(
-    table: wp.array,
-    first_block: wp.array,
-    blocks: int,
-    rates: wp.array,
-    sound: wp.array,
-    betas: tuple[float, float],
-    epsilon: float,
-    sizes: wp.array,
+    table: wp.array, first_block: wp.array, blocks: int, betas: tuple[float, float], epsilon: float, sizes: wp.array
 ) -> None:
-    """One step of Adam over the tensors of a table, in place; ``sizes`` [T, 3] is scratch.
+    """One step of Adam over the tensors of a table, in place.
 
     Args:
         table: [T, 6] addresses and lengths, see ``kernels/adam.py``.
         first_block: [T] blocks before those of a tensor.
         blocks: In all, each of ``adam_block`` elements.
-        rates: [T] 0: the tensor rests.
-        sound: [1] 0: nothing changes.
         betas: Decays of the moments.
         epsilon: Added to the root of the second moment.
-        sizes: Scratch.
+        sizes: [T, 3] what the step comes to, from :func:`judge`.
     """
-    head = [table, rates, sound, *(wp.float64(beta) for beta in betas)]
-    _launch(adam.adam_sizes, table.shape[0], head, [sizes])
-    adam_descend(table, first_block, blocks, betas, epsilon, sizes)
-
-
-def adam_descend(
-    table: wp.array, first_block: wp.array, blocks: int, betas: tuple[float, float], epsilon: float, sizes: wp.array
-) -> None:
-    """The second half of :func:`adam_step`, once ``sizes`` is known."""
     rest = [table, first_block, 1.0 - betas[0], 1.0 - betas[1], epsilon]
     _launch(adam.make_adam(adam_block(table.device)), blocks, rest, [sizes])
 
@@ -217,7 +199,7 @@ def judge(
         capacity: Pairs that are reserved; -1: not known; 0: nobody counts.
         rates: [T].
         betas: Decays of the moments.
-        counts: [3] changed.
+        counts: [4] changed.
         running: [8] sums, changed.
         sizes: [T, 3] filled.
     """

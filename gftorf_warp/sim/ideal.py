@@ -8,7 +8,7 @@ sensor are two steps, so that one light can be read by many sensors of the same 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import astuple, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -18,7 +18,7 @@ from ..constants import FRAMES_PER_QUARTET
 from ..data.sequence import Sequence, Truth
 from ..scene.sensor import Sensor
 from ..scene.unwrap import frequencies_of
-from .record import frame_times
+from .record import frame_times, seen_by
 from .scene import Scene
 from .world import first_hit
 
@@ -90,7 +90,6 @@ def ideal_recording(
         turned = np.exp(1j * (float(sensor.phase_offset) - shifts[n]))
         quad = (light.phasor * turned).real + float(sensor.dc_offset) * light.amplitude
         quads[n], distance[n], known[n] = float(sensor.source_intensity) * quad, light.distance, True
-    camera = scene.camera()
     sequence = Sequence(
         quads=quads,
         measured=known,
@@ -101,11 +100,6 @@ def ideal_recording(
         cycle_length=None if len(sensor.cycle) == FRAMES_PER_QUARTET else len(sensor.cycle),
         phase_offset=float(sensor.phase_offset),
         dc_offset=float(sensor.dc_offset),
-        fx=camera.fx,
-        fy=camera.fy,
-        cx=camera.cx,
-        cy=camera.cy,
-        distortion=astuple(camera.distortion) if camera.distortion else None,
-        camera_from_world=np.stack([scene.camera(time=float(time)).camera_from_world for time in times]),
+        **seen_by([scene.camera(time=float(time)) for time in times]),
     )
     return sequence, Truth(distance=distance, known=known)

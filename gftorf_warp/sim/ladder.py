@@ -7,7 +7,6 @@ mesh, since light beside the camera and light that bounces need it.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
@@ -212,5 +211,4 @@ def _changed(sensor: Sensor, settings: Mapping[str, Any]) -> Sensor:
 
 def _mean(values: np.ndarray) -> float | None:
     found = values[np.isfinite(values)]
-    mean = float(found.mean()) if found.size else math.nan
-    return None if math.isnan(mean) else mean
+    return float(found.mean()) if found.size else None

@@ -7,6 +7,9 @@ knobs each, turned until the error of the closed form was near the published one
 
 from __future__ import annotations
 
+from functools import partial
+from typing import Any
+
 from ..constants import FRAME_RATE_HZ
 from ..scene.sensor import Sensor
 from .assembly import Assembly, Level, Part
@@ -164,20 +167,34 @@ def _way(start: Vector, end: Vector) -> Line:
     return Line(position=start, velocity=(x, y, z))
 
 
-def _synthetic(name: str, description: str, motion: str, closed_form: float, bodies: tuple[Body, ...]) -> Scene:
-    """320x240 pixels, 60 deg wide, 60 raw frames, an ideal sensor of one tap."""
+def look_alike(
+    name: str,
+    description: str,
+    motion: str,
+    closed_form: float,
+    bodies: tuple[Body, ...],
+    *,
+    sensor: Sensor,
+    frames: int = FRAMES,
+    **others: Any,
+) -> Scene:
+    """A scene of 320x240 pixels; ``others`` are further fields of it."""
     return Scene(
         name=name,
         description=description,
         motion=motion,
         closed_form=closed_form,
         bodies=bodies,
-        frames=FRAMES,
+        frames=frames,
         width=320,
         height=240,
-        sensor=SENSOR,
+        sensor=sensor,
+        **others,
     )
 
+
+_synthetic = partial(look_alike, sensor=SENSOR)
+"""60 deg wide, 60 raw frames, an ideal sensor of one tap."""
 
 SYNTHETIC = (
     sliding_cube,

@@ -7,17 +7,18 @@ Colours are free choices.
 from __future__ import annotations
 
 import math
+from functools import partial
 
 from ..scene.sensor import Sensor
 from .guided import Curve, Guided, Turn
-from .lookalikes import MIDDLE, around, plain, wall_and_floor
+from .lookalikes import MIDDLE, around, look_alike, plain, wall_and_floor
 from .paths import Path, Still, Vector
 from .scene import Scene
+from .sensors import PALINDROMIC
 from .world import Body, Box, Sphere, Texture
 
-SHIFTS = (math.pi, math.pi / 2, 0.0, 3 * math.pi / 2)  # [rad] in time order, as recorded
 FIELD_OF_VIEW_DEG = math.degrees(2 * math.atan(160 / 230))  # [deg] 320 pixels at the focal length of 230 of the OPT8241
-SENSOR = Sensor(f_mod_hz=20e6, shifts=SHIFTS, noise=True)
+SENSOR = Sensor(f_mod_hz=20e6, shifts=PALINDROMIC, noise=True)
 GRAVITY = 9.81  # [m/s^2]
 RPM = 550.0  # [1/min] of the fan; at 600 three blades take each other's places in every quartet
 
@@ -142,23 +143,8 @@ def box(size: Vector, position: Vector, texture: Texture, turn_deg: Vector = (0.
     return Body(shape=Box(size=size), texture=texture, path=Still(position=position, turn_deg=turn_deg))
 
 
-def _recorded(
-    name: str, description: str, motion: str, closed_form: float, bodies: tuple[Body, ...], *, frames: int = 60
-) -> Scene:
-    """320x240 pixels of a sensor like the OPT8241, with noise."""
-    return Scene(
-        name=name,
-        description=description,
-        motion=motion,
-        closed_form=closed_form,
-        bodies=bodies,
-        frames=frames,
-        width=320,
-        height=240,
-        horizontal_fov_deg=FIELD_OF_VIEW_DEG,
-        sensor=SENSOR,
-    )
-
+_recorded = partial(look_alike, sensor=SENSOR, horizontal_fov_deg=FIELD_OF_VIEW_DEG)
+"""A sensor like the OPT8241, with noise."""
 
 RECORDED = (pillow, baseball, jacks, target, fan)
 """All five."""

@@ -10,18 +10,16 @@ import math
 
 import numpy as np
 
-from ..constants import SPEED_OF_LIGHT
-from ..scene.sensor import Sensor
 from .assembly import Assembly, Part
 from .guided import Curve, Guided, Turn
-from .lookalikes import around, plain, wall_and_floor
-from .lookalikes_real import FIELD_OF_VIEW_DEG, SHIFTS, box
+from .lookalikes import around, look_alike, plain, wall_and_floor
+from .lookalikes_real import FIELD_OF_VIEW_DEG, box
 from .paths import Path, Still, Vector, rotation_matrix
 from .scene import ColourCamera, Scene
+from .sensors import torf_real
 from .world import Body, Box, Sphere, Texture
 
 FRAMES = 120  # one second
-SENSOR = Sensor(f_mod_hz=SPEED_OF_LIGHT / 10.0, shifts=SHIFTS, noise=True)  # unambiguous to 5 m
 COLOUR = ColourCamera(
     width=640,
     height=480,
@@ -227,18 +225,16 @@ def _carried(
     yaw_deg_per_s: float,
     pitch_deg: float = 0.0,
 ) -> Scene:
-    """320x240 pixels of ToF and 640x480 of colour, from a camera carried for one second."""
-    return Scene(
-        name=name,
-        description=description,
-        motion=motion,
-        closed_form=closed_form,
-        bodies=bodies,
+    """With 640x480 pixels of colour, from a camera carried for one second."""
+    return look_alike(
+        name,
+        description,
+        motion,
+        closed_form,
+        bodies,
+        sensor=torf_real(),
         frames=FRAMES,
-        width=320,
-        height=240,
         horizontal_fov_deg=FIELD_OF_VIEW_DEG,
-        sensor=SENSOR,
         camera_path=carried_camera(centre, yaw_deg_per_s, pitch_deg),
         colour=COLOUR,
     )

@@ -24,7 +24,7 @@ from .paths import inverse
 from .readout import mean_quad, read_out
 from .scene import Scene
 from .traced import Traced, trace_colour
-from .world import Hits, carried, first_hit
+from .world import Hits, first_hit, flow_of
 
 Progress = Callable[[int, int], None]
 Images = dict[str, np.ndarray]
@@ -75,6 +75,16 @@ def frame_times(sensor: Sensor, frames: int, *, sync: bool) -> Float[np.ndarray,
     """Time of each raw frame [s]: n times the frame period, or, ``sync``, that of the first frame of its cycle."""
     frame = np.arange(frames)
     return (frame - frame % len(sensor.cycle) if sync else frame) * sensor.frame_period_s
+
+
+def seen_by(cameras: list[Camera]) -> dict[str, Any]:
+    """The fields of a sequence that say how its ToF camera looks, the same in all raw frames, and where it is."""
+    camera = cameras[0]
+    return {
+        **{name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy")},
+        "distortion": astuple(camera.distortion) if camera.distortion else None,
+        "camera_from_world": np.stack([camera.camera_from_world for camera in cameras]),
+    }
 
 
 def record(
@@ -161,12 +171,7 @@ def record(
             cycle_length=None if len(sensor.cycle) == FRAMES_PER_QUARTET else len(sensor.cycle),
             phase_offset=float(sensor.phase_offset),
             dc_offset=float(sensor.dc_offset),
-            fx=camera.fx,
-            fy=camera.fy,
-            cx=camera.cx,
-            cy=camera.cy,
-            distortion=astuple(camera.distortion) if camera.distortion else None,
-            camera_from_world=np.stack([camera.camera_from_world for camera in cameras]),
+            **seen_by(cameras),
             novel_from_world=np.stack([inverse(view.world_from_body(0.0)) for view in scene.novel_views])
             if scene.novel_views
             else None,
@@ -363,6 +368,4 @@ def _flows(scene: Scene, cameras: list[Camera], times: Float[np.ndarray, "F"]) -
 def _flow(scene: Scene, camera: Camera, other: Camera, time: float, later: float) -> Float[np.ndarray, "2 H W"]:
     """Where what ``camera`` sees at ``time`` is in the image of ``other`` at ``later`` [px]; NaN: nothing is seen."""
     hit = first_hit(scene.bodies, camera, time)
-    moved = carried(scene.bodies, hit.point, hit.body, time, later)
-    here, there = camera.project(torch.from_numpy(hit.point)), other.project(torch.from_numpy(moved))
-    return np.moveaxis((there - here).numpy(), -1, 0).astype(np.float32)
+    return flow_of(scene.bodies, hit.point, hit.body, (camera, other), (time, later)).astype(np.float32)

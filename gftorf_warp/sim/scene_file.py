@@ -73,7 +73,7 @@ def _made(kind: type, table: Any, path: FilePath, where: str) -> Any:
     preset = _preset(table.pop("preset"), path, where) if kind is Sensor and "preset" in table else None
     if kind in KINDS:
         kinds, named = KINDS[kind], table.pop("kind", None)
-        if named not in kinds:
+        if not isinstance(named, str) or named not in kinds:
             raise _wrong(path, _join(where, "kind"), f"expected one of {', '.join(kinds)}, found {named!r}", "name one")
         kind = kinds[named]
     known = {f.name: f for f in fields(kind)}
@@ -126,7 +126,7 @@ def _value(kind: Any, value: Any, path: FilePath, where: str) -> Any:
 
 def _preset(name: Any, path: FilePath, where: str) -> Sensor:
     """A sensor by name."""
-    if name not in SENSORS:
+    if not isinstance(name, str) or name not in SENSORS:
         raise _wrong(path, where, f"there is no sensor {name!r}", f"there are {', '.join(SENSORS)}")
     return SENSORS[name]
 

@@ -11,19 +11,18 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from ..constants import SPEED_OF_LIGHT
+from ..constants import CANONICAL_SHIFTS, SPEED_OF_LIGHT
 from ..scene.pattern import Pattern
 from ..scene.sensor import Sensor
 
-PAIRED = tuple(math.radians(angle) for angle in (0, 180, 90, 270))  # the synthetic F-TöRF files
-PALINDROMIC = tuple(math.radians(angle) for angle in (180, 90, 0, 270))  # the real ones, -cos, +sin, +cos, -sin
+PALINDROMIC = tuple(math.radians(angle) for angle in (180, 90, 0, 270))  # real F-TöRF files: -cos, +sin, +cos, -sin
 SEQUENTIAL = tuple(math.radians(angle) for angle in (0, 90, 180, 270))
 GAIN, DARK = 0.01, 0.2  # [1] PRNU and DSNU, assumed for both makers
 
 
 def ftorf_synthetic() -> Sensor:
     """The synthetic F-TöRF sequences: one ideal tap, exact numbers, an instant; 19.986 MHz, from their depth_range."""
-    return Sensor(f_mod_hz=SPEED_OF_LIGHT / 15.0, shifts=PAIRED, dc_offset=1.0, unipolar=True, exposure_s=0.0)
+    return Sensor(f_mod_hz=SPEED_OF_LIGHT / 15.0, shifts=CANONICAL_SHIFTS, dc_offset=1.0, unipolar=True, exposure_s=0.0)
 
 
 def ftorf_real() -> Sensor:
@@ -35,7 +34,7 @@ def ftorf_real() -> Sensor:
 
 
 def torf_real() -> Sensor:
-    """The TöRF captures: 29.979 MHz, to be written as phasors, 30 a second."""
+    """The TöRF captures: 29.979 MHz, unambiguous to 5 m, to be written as phasors, 30 a second."""
     return Sensor(f_mod_hz=SPEED_OF_LIGHT / 10.0, shifts=PALINDROMIC, noise=True)
 
 

@@ -257,7 +257,7 @@ def _refuse(wanted: dict[str, tuple[bool, str, str]]) -> None:
 
 def _check_sensor(sensor: Sensor, layout: str) -> None:
     turns = sorted(round(math.degrees(shift), 4) % 360.0 for shift in sensor.shifts)
-    if layout == "capture" and len({turn % 360.0 for turn in turns}) < SHIFTS_MIN:
+    if layout == "capture" and len(set(turns)) < SHIFTS_MIN:
         raise UsageError(
             "this sensor cannot see a phase",
             where="sensor.shifts",

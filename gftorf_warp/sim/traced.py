@@ -16,7 +16,7 @@ from .assembly import Assembly, Level, Part
 from .look import pooled
 from .meshes import Mesh
 from .scene import Scene
-from .world import Body, Box, Plane, Shape, Sphere, albedo_seen, carried
+from .world import Body, Box, Plane, Shape, Sphere, albedo_seen, flow_of
 
 
 class Traced:
@@ -66,17 +66,11 @@ class Traced:
         return replace(hits, body=np.where(hits.body < 0, hits.body, self._body[hits.body]))
 
     def flow(self, time: float, later: float) -> Float[np.ndarray, "2 H W"]:
-        """Where what is seen at ``time`` is in the image ``later`` [s], less where it was [px]; NaN: nothing is seen.
-
-        Surfaces are carried along with their bodies, and the camera moves, too; whether they are hidden then is not
-        looked at. Later may be earlier.
-        """
-        camera, other, hits = self.camera_at(time), self.camera_at(later), self.first_hits(time)
+        """How what is seen at ``time`` moves until ``later`` [px], see world.py; NaN: nothing is seen."""
+        camera, hits = self.camera_at(time), self.first_hits(time)
         rays = camera.rays(dtype=torch.float64).numpy()
         point = camera.centre + rays * hits.distance[..., None]
-        moved = carried(self.scene.bodies, point, hits.body, time, later)
-        here, there = camera.project(torch.from_numpy(point)), other.project(torch.from_numpy(moved))
-        return np.moveaxis((there - here).numpy(), -1, 0)
+        return flow_of(self.scene.bodies, point, hits.body, (camera, self.camera_at(later)), (time, later))
 
     def _poses(self, time: float) -> Float[np.ndarray, "P 4 4"]:
         """Pose of the body of each piece [m]."""

@@ -36,7 +36,7 @@ class Grid(NamedTuple):
 
 
 class Shape(abc.ABC):
-    """A surface in its own axes, seen from one side. Final classes: Box, Plane, Sphere."""
+    """A surface in its own axes, seen from one side. Further classes: sim/assembly.py, sim/meshes.py."""
 
     @abc.abstractmethod
     def hit(
@@ -328,6 +328,23 @@ def carried(
             step = candidate.path.world_from_body(later) @ np.linalg.inv(candidate.path.world_from_body(time))
             moved[seen] = point[seen] @ step[:3, :3].T + step[:3, 3]
     return moved
+
+
+def flow_of(
+    bodies: tuple[Body, ...],
+    point: Float[np.ndarray, "H W 3"],
+    body: Int[np.ndarray, "H W"],
+    cameras: tuple[Camera, Camera],
+    times: tuple[float, float],
+) -> Float[np.ndarray, "2 H W"]:
+    """Where what is seen at the first of two times [s] is in the image of the second, less where it was [px].
+
+    Surfaces are carried along with their bodies, and the camera moves, too; whether they are hidden then is not looked
+    at. The second time may be the earlier one. Arguments as for :func:`carried`; NaN where ``point`` is.
+    """
+    here = cameras[0].project(torch.from_numpy(point))
+    there = cameras[1].project(torch.from_numpy(carried(bodies, point, body, *times)))
+    return np.moveaxis((there - here).numpy(), -1, 0)
 
 
 def albedo(bodies: tuple[Body, ...], hits: Hits, time: float) -> Float[np.ndarray, "H W 3"]:
