@@ -11,12 +11,16 @@ import functools
 import logging
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
 from . import __version__
 from .errors import ResourceError, UsageError
 from .options import parse
+
+if TYPE_CHECKING:
+    from .sim.scene import Scene
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -117,9 +121,9 @@ def _simulate(options: argparse.Namespace) -> int:
 
     if options.list:
         print(f"{'scene':<21}{'raw frames':>10}{'closed form':>13}  motion: description")
-        for name, scene in SCENES.items():
+        for scene in _listed(options, SCENES):
             error = "-" if scene.closed_form is None else f"{scene.closed_form:.4g}"
-            print(f"{name:<21}{scene.frames:>10}{error:>13}  {scene.motion}: {scene.description}")
+            print(f"{scene.name:<21}{scene.frames:>10}{error:>13}  {scene.motion}: {scene.description}")
         print("closed form: its mean squared error on ideal quads [m^2 x 100], see design/look-alikes.md")
         return 0
     if options.scene is None or options.out is None:
@@ -156,6 +160,16 @@ def _simulate(options: argparse.Namespace) -> int:
     progress = _progress(options)("simulate")
     print(simulate(options.scene, options.out, level=options.level, progress=progress, **chosen))
     return 0
+
+
+def _listed(options: argparse.Namespace, scenes: Mapping[str, Scene]) -> list[Scene]:
+    """The scenes that ``--list`` describes: all, or the one that was named, as its overrides make it."""
+    if options.scene is None:
+        return list(scenes.values())
+    from .sim.ladder import with_closed_form
+    from .sim.simulate import scene_of
+
+    return [with_closed_form(scene_of(options.scene, options.override))]
 
 
 def _each_level(options: argparse.Namespace) -> Callable[[int, int], None]:
@@ -279,7 +293,12 @@ def table(metrics: dict) -> str:
     psnr = metrics["quad_psnr_db"]
     quality = "-" if psnr is None else f"{psnr:.2f} dB"
     scored = f"{metrics['frames']} raw frames ({metrics['protocol']}), against {metrics.get('against', 'geometry')}"
-    return "\n".join([*lines, f"{scored}, quad PSNR {quality}"])
+    lines.append(f"{scored}, quad PSNR {quality}")
+    share = metrics.get("ambiguous_share")
+    if share is not None:
+        reach = f"{metrics['unambiguous_range_m']:.4g} m by several frequencies together"
+        lines.append(f"unambiguous to {reach}; {share:.1%} of the closed form ambiguous")
+    return "\n".join(lines)
 
 
 def _level(options: argparse.Namespace) -> int:

@@ -11,7 +11,7 @@ GUARD = 1.3  # the projection is linearised inside this multiple of the half fie
 SH_COEFFICIENTS = 16  # K = (degree + 1)^2 for degree 3
 SH_Y0 = 0.28209479177387814  # 1 / (2 sqrt(pi)), the constant harmonic
 SH_BIAS = 0.5  # an all-zero coefficient vector means mid grey, as in published Gaussian splats
-FRAMES_PER_QUARTET = 4  # raw frames of one depth image; frame n = 4 i + k is slot k of quartet i
+FRAMES_PER_QUARTET = 4  # raw frames of one depth image, unless a recording says otherwise, see Sequence.cycle
 FRAME_RATE_HZ = 120.0  # [Hz] raw frames per second of the F-ToeRF recordings
 CANONICAL_SHIFTS = (0.0, math.pi, math.pi / 2, 3 * math.pi / 2)  # [rad] order in memory: +cos, -cos, +sin, -sin
 WINDOW = 11  # taps of the Gaussian window of the similarity, as published for images of 8 bits

@@ -86,7 +86,7 @@ def command_parsers() -> dict[str, Parser]:
     simulate.add_argument(
         "scene", metavar="SCENE", nargs="?", help="name of a scene, --list shows them, or a .toml file of one"
     )
-    simulate.add_argument("--list", action="store_true", help="list the scenes and stop")
+    simulate.add_argument("--list", action="store_true", help="list the scenes, or SCENE with its overrides")
     simulate.add_argument("--out", metavar="SEQ", help="folder to write")
     simulate.add_argument("--frames", metavar="N", type=_positive, help="raw frames (the scene's own number)")
     simulate.add_argument("--size", metavar="WxH", type=_size, help="image size in pixels (the scene's own)")
@@ -107,7 +107,7 @@ def command_parsers() -> dict[str, Parser]:
     simulate.add_argument("--paths", metavar="N", type=_positive, default=64, help=paths)
     device = "where engine mesh traces (cpu)"
     simulate.add_argument("--device", metavar="auto|cpu|cuda", type=_device, default="cpu", help=device)
-    simulate.add_argument("--sync", action="store_true", help="all four quads of a quartet at one instant")
+    simulate.add_argument("--sync", action="store_true", help="all quads of a quartet at one instant")
     simulate.add_argument("--no-noise", action="store_true", help="an ideal sensor")
     simulate.add_argument("--flow", action="store_true", help="store exact optical flow too")
     blur = "instants that one exposure averages (1: no motion blur)"
@@ -129,7 +129,7 @@ def command_parsers() -> dict[str, Parser]:
     single = "change one setting, for example init.reflectivity=0.5; config.json of a run names all (may be repeated)"
     reconstruct.add_argument("--set", metavar="NAME=VALUE", action="append", default=[], help=single)
     reconstruct.add_argument("--images", metavar="N", type=_positive, help="raw frames to optimise (the preset's own)")
-    batch = "raw frames of a step: 1, or 4 for those of a quartet (the preset's own)"
+    batch = "raw frames of a step: 1, or 4 for those of a quartet, however many (the preset's own)"
     reconstruct.add_argument("--batch", metavar="N", type=int, choices=(1, 4), help=batch)
     order = "sum gradients in one order on CUDA, too, so that equal runs give equal bytes; slower"
     reconstruct.add_argument("--deterministic", action="store_true", help=order)

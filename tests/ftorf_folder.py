@@ -14,6 +14,7 @@ REAL_ORDER = (2, 0, 1, 3)  # -cos, +sin, +cos, -sin in time
 IMAGES = ("colour", "forward_flow", "backward_flow")
 CAPTURE_ONLY = {
     "frequencies_hz",
+    "cycle_length",
     "distortion",
     "exposures",
     "sensor",

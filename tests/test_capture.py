@@ -38,6 +38,7 @@ def recording(**changes):
         "times": np.array([0, 0, 0.01, 0.023, 0.03, 0.04, 1 / 3]),
         "f_mod_hz": 2e7,
         "frequencies_hz": np.array([2e7, 2e7, 2e7, 2e7, 6e7, 6e7, 6e7]),
+        "cycle_length": 7,
         "exposures": np.linspace(1e-3, 2e-3, FRAMES),
         "sensor": {"adc_bits": 12, "maker": "nobody", "shifts": [0.5, 1.0]},
         "phase_offset": 0.3,
@@ -309,10 +310,15 @@ def test_three_shifts_two_frequencies_and_no_frame_rate(tmp_path):
         Sequence.open(path, frame_rate_hz=120.0)
 
 
-def test_quartets_of_two_frequencies_are_not_complete(folder):
-    """Raw frames 0 to 3 have one frequency, 4 to 7 do not exist whole."""
-    assert Sequence.open(folder).complete_quartets == [0]
-    mixed = recording(frequencies_hz=np.array([2e7, 2e7, 2e7, 6e7, 6e7, 6e7, 6e7]))[0]
+def test_a_cycle_is_complete_if_all_of_its_frequencies_are(folder):
+    """Seven raw frames of two frequencies, one of them missing; read as quartets, the first has one frequency."""
+    read = Sequence.open(folder)
+    assert (read.cycle, read.frequencies, read.complete_quartets) == (7, (2e7, 6e7), [])
+    whole = np.ones(FRAMES, dtype=bool)
+    assert dataclasses.replace(read, measured=whole).complete_quartets == [0]
+    assert dataclasses.replace(read, cycle_length=4).complete_quartets == [0]
+    assert dataclasses.replace(read, measured=whole, cycle_length=None).cycle == 7
+    mixed = recording(frequencies_hz=np.array([2e7, 2e7, 2e7, 6e7, 6e7, 6e7, 6e7]), cycle_length=4)[0]
     assert mixed.complete_quartets == []
 
 

@@ -13,7 +13,7 @@ from gftorf_warp.data.sequence import Sequence
 from gftorf_warp.errors import InputError, UsageError
 from gftorf_warp.evaluate.compare import compare
 from gftorf_warp.evaluate.views import render_to_folder
-from gftorf_warp.recon.closed_form import ClosedForm, nearest_quartet, quad
+from gftorf_warp.recon.closed_form import ClosedForm, nearest_quartet, quads_of
 from gftorf_warp.recon.run import Run
 from gftorf_warp.recon.train import reconstruct
 from gftorf_warp.scene.sensor import distance_from_phasor, phasor_from_quads
@@ -68,11 +68,15 @@ def test_times_outside_go_to_the_nearest_complete_quartet(run):
 
 
 def test_a_shift_that_nobody_measured_is_computed(run):
-    """The quads of a phasor at eighths of a turn lie between those of quarters."""
+    """The quads of a phasor at eighths of a turn lie between those of quarters, with the same constant part."""
     sequence = run.sequence()
     re, im = quartet_phasor(sequence, 1)
-    np.testing.assert_allclose(quad(sequence, 1, np.pi / 4), (re + im) / np.sqrt(8), rtol=1e-6)
-    np.testing.assert_array_equal(quad(sequence, 1, 2 * np.pi), sequence.quads[4 + REAL_ORDER.index(0)])
+    between, zero = quads_of(sequence, 1, [np.pi / 4, 0.0])
+    constant = 0.5 * 0.2 * np.hypot(re, im)
+    np.testing.assert_allclose(between, (re + im) / np.sqrt(8) + constant, rtol=1e-6)
+    np.testing.assert_allclose(zero, 0.5 * re + constant, rtol=1e-6)
+    turned = quads_of(sequence, 1, [2 * np.pi, np.pi, np.pi / 2, -np.pi / 2])
+    np.testing.assert_array_equal(turned[0], sequence.quads[4 + REAL_ORDER.index(0)])
 
 
 @pytest.mark.parametrize("change", ["pose", "size", "focal length"])

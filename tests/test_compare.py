@@ -31,6 +31,8 @@ KEYS = {
     "d_tof_mse_x100",
     "moving",
     "static",
+    "unambiguous_range_m",
+    "ambiguous_share",
     "quad_psnr_db",
     "colour_psnr_db",
     "gaussians",
@@ -71,6 +73,8 @@ def test_every_number_by_hand(run):
     """Errors of d, d / opacity, d_ToF and the closed form on all, moving and static pixels, and what was copied."""
     got = compare(run, report=False)
     assert set(got) == KEYS
+    assert got["unambiguous_range_m"] == pytest.approx(7.5)
+    assert got["ambiguous_share"] is None, "one frequency chooses nothing"
     assert (got["frames"], got["protocol"], got["version"]) == (12, "all", __version__)
     assert got["moving"]["share"] == pytest.approx(MOVING / PIXELS)
     assert got["static"]["share"] == pytest.approx(1 - MOVING / PIXELS)

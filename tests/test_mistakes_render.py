@@ -5,6 +5,7 @@ Each test is named after the number of the mistake it would fail at; design/mist
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -104,6 +105,7 @@ class Measured:
 
     def __init__(self, cameras, flow):
         self.cameras, self.flow = cameras, {(0, 1): flow}
+        self.sequence = SimpleNamespace(cycle=4)
 
     def sensor_at(self, _):
         """The sensor."""

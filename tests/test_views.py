@@ -13,7 +13,7 @@ from analytic_run import FRAMES, HEIGHT, WIDTH, AnalyticRun, true_distance, with
 from gftorf_warp.data.images import read_exr
 from gftorf_warp.errors import InputError, ResourceError, UsageError
 from gftorf_warp.evaluate import pictures, renders, views
-from gftorf_warp.evaluate.views import channel_of_shift, render_to_folder
+from gftorf_warp.evaluate.views import quad_of_shift, render_to_folder
 from gftorf_warp.scene.sensor import Sensor
 
 
@@ -216,18 +216,14 @@ def test_colour_is_written_linear_and_shown_as_srgb(run):
     assert renders.preview("colour", images, renders.preview_scale("colour", [images]))[0, 0].tolist() == [188, 0, 255]
 
 
-def test_a_shift_finds_its_channel():
-    """A turn more or less is the same shift; one that is not rendered is an error."""
-    sensor = Sensor()
-    assert [channel_of_shift(sensor, shift) for shift in (0.0, np.pi, np.pi / 2, -np.pi / 2, 2 * np.pi)] == [
-        0,
-        1,
-        2,
-        3,
-        0,
-    ]
-    with pytest.raises(ValueError, match="not among"):
-        channel_of_shift(sensor, 0.3)
+def test_a_shift_finds_its_quad(run):
+    """A turn more or less is the same shift; one that is not rendered follows from the phasor, constant part too."""
+    rendering, sensor = run.render(0.02), Sensor()
+    for shift, channel in ((0.0, 0), (np.pi, 1), (np.pi / 2, 2), (-np.pi / 2, 3), (2 * np.pi, 0)):
+        torch.testing.assert_close(quad_of_shift(rendering, sensor, shift), rendering.quads[channel], rtol=0, atol=0)
+    phasor = torch.tensor([3.0, 4.0, 6.0])[:, None, None]
+    got = quad_of_shift(replace(rendering, phasor=phasor), replace(sensor, dc_offset=0.5), 0.3)
+    assert float(got) == pytest.approx(1.5 * np.cos(0.3) + 2.0 * np.sin(0.3) + 1.5)
 
 
 def test_colours_run_from_low_to_high_and_grey_is_unknown():

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import torch
 
+from ..data.decode import unambiguous_range
 from ..data.sequence import Sequence
 from ..errors import InputError
 from ..recon import checkpoint, folder, presets
@@ -23,7 +24,6 @@ from ..recon.train import CHANGES
 from ..render.replay import Replay
 from ..scene.changes import changed
 from ..scene.initialise import Init, InitSettings
-from ..scene.measured import sensor_of
 from ..sim.simulate import simulate
 
 SCENE = "sliding"
@@ -64,7 +64,7 @@ def simulated(path: Path, *, quick: bool) -> Path:
 def settings_of(sequence: Sequence, preset: str, changes: list[str], device: str) -> ReconSettings:
     """A preset, changed, that neither adds nor removes nor dims Gaussians."""
     found = input_of(sequence, Input.AUTO)
-    recorded = presets.Recorded(input=found, unambiguous_range=sensor_of(sequence).unambiguous_range)
+    recorded = presets.Recorded(input=found, unambiguous_range=unambiguous_range(sequence))
     settings = changed(presets.preset(preset, recorded), changes, CHANGES)
     settings = replace(settings, densify=replace(settings.densify, stop_share=0.0))
     return threads_for(settings, device, 1)[0]

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import torch
 
 from ..recon.captured import CapturedSteps, steps_of
+from ..recon.gating import judge_after
 from ..recon.observations import Observations, observe
 from ..recon.settings import Batch, Kernels, ReconSettings
 from ..recon.state import State, from_dict
@@ -60,6 +61,7 @@ def fresh(
         stored["motion"]["shape"]["products"] = str(settings.motion.products)
     stored["queue"] = []  # batches are numbered anew
     state = from_dict(stored, device)
+    judge_after(state, 0, observations, settings)  # as at the end of the warm-up, whoever rested in the checkpoint
     run = Run(state, steps_of(state, observations, settings))
     advance(run, warm_up)
     return run
@@ -183,7 +185,7 @@ def table(rows: list[dict[str, Any]]) -> list[str]:
     cells = [
         [
             f"{row['kernels']}, {row['batch']}, {row['products']}",
-            f"{row['N']:,}",
+            f"{row['N']:,}" + (f", {row['asking']:,} ask" if "asking" in row else ""),
             f"{row['pairs']:,}",
             str(row["images"]),
             f"{row['ms_per_image']:.3f}",

@@ -9,13 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from ..constants import SPEED_OF_LIGHT
+from ..constants import FRAMES_PER_QUARTET, SPEED_OF_LIGHT
 from ..errors import InputError, UsageError
 from . import specs
 from .arrays import SIDE_MAX
 from .calibration import DEPTH_RANGES_M, FOCAL_MIN
 from .capture_json import FORMAT, NAME, json_fields, read_values
 from .capture_write import MANIFEST, inverse, write
+from .cycles import QUADS_MIN
 from .exr import Parts, read_parts
 from .folder import FRAMES_MAX, empty_quads, format_of, numbered
 from .poses import rigid
@@ -83,6 +84,7 @@ def read(path: str | Path, *, frame_rate_hz: float | None = None) -> Sequence:
         times=values["time"],
         f_mod_hz=float(frequencies[0]),
         frequencies_hz=frequencies if several else None,
+        cycle_length=int(values["cycle"]) if "cycle" in values else None,
         exposures=values.get("exposure"),
         sensor=values.get("sensor_settings", {}),
         phase_offset=float(values["phase_offset"]),
@@ -274,6 +276,7 @@ def _judge(path: Path, values: dict[str, Any], problems: Problems) -> None:
             or ("colour_size" in values and _is_pinhole(values["colour_intrinsics"], float(values["colour_size"][0]))),
             "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels, and a size",
         ),
+        "cycle": (_is_cycle(values), "raw frames of a cycle: three or more shifts at each of its frequencies"),
         "raw_scale": ("raw_scale" not in values or values["raw_scale"] > 0, "more than 0"),
         "pose": (all(rigid(matrices).all() for matrices in poses), "rotations and translations, camera to world"),
     }
@@ -282,6 +285,16 @@ def _judge(path: Path, values: dict[str, Any], problems: Problems) -> None:
             key = json_fields()[name].key
             error = InputError(f"{key}: implausible", where=path, why=f"expected {expected}", fix="correct the file")
             problems.errors.append(error)
+
+
+def _is_cycle(values: dict[str, Any]) -> bool:
+    """Whether a stated cycle, as far as it was recorded, has three raw frames or more at each of its frequencies."""
+    if "cycle" not in values:
+        return True
+    length, frequencies = int(values["cycle"]), values["f_mod_hz"]
+    if length < QUADS_MIN or (values["kind"] == "phasor" and length != FRAMES_PER_QUARTET):
+        return False
+    return length > len(frequencies) or int(np.unique(frequencies[:length], return_counts=True)[1].min()) >= QUADS_MIN
 
 
 def _is_pinhole(matrix: np.ndarray, width: float) -> bool:

@@ -114,6 +114,8 @@ def _json(sequence: Sequence) -> bytes:
     }
     if sequence.quad_scale is not None:
         sensor["raw_scale"] = float(sequence.quad_scale)
+    if sequence.cycle_length is not None:
+        sensor["cycle_frames"] = int(sequence.cycle_length)
     if sequence.sensor:
         sensor["settings"] = sequence.sensor
     head: dict[str, Any] = {

@@ -8,7 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from ..constants import CANONICAL_SHIFTS, FRAMES_PER_QUARTET, SPEED_OF_LIGHT
+from ..errors import InputError
 from . import findings, specs
+from .decode import unambiguous_range
 from .findings import Report
 from .folder import format_of, numbered
 from .sequence import Sequence
@@ -29,39 +31,59 @@ def check(path: str | Path) -> Report:
     report = Report(path=Path(path), form=format_of(Path(path)))
     _facts(sequence, report)
     _assumptions(sequence, report)
-    if sequence.frequencies_hz is not None:
-        report.lines.append("light           not looked at: there are several modulation frequencies")
-    elif sequence.complete_quartets and np.abs(sequence.quads).max() > 0:
+    reach = _range(sequence, report)
+    if reach is not None and sequence.complete_quartets and np.abs(sequence.quads).max() > 0:
         findings.light(sequence, report)
+        findings.frequencies(sequence, report)
         if sequence.from_phasors and report.form == "torf":
             findings.third_channel(sequence, report)
-        elif not sequence.from_phasors and _canonical(sequence):
-            findings.order(sequence, report)
+        elif not sequence.from_phasors:
+            findings.constant_part(sequence, report)
+            if _canonical(sequence):
+                findings.order(sequence, report)
         if report.form == "ftorf":
             findings.phasors(sequence, report)
         findings.camera(sequence, report)
         findings.truth(sequence, report)
-    else:
+    elif reach is not None:
         report.warnings.append("no complete quartet with light: nothing can be decoded or estimated")
     findings.flow(sequence, report)
     return report
 
 
+def _range(sequence: Sequence, report: Report) -> float | None:
+    """The unambiguous range of all frequencies [m]; None, with a warning, if they have none together."""
+    try:
+        return unambiguous_range(sequence)
+    except InputError as error:
+        report.warnings.append(f"{error.what}: {error.why}; nothing is decoded")
+        return None
+
+
 def _canonical(sequence: Sequence) -> bool:
     """Whether the quads of a quartet are two opposite pairs, a quarter turn apart."""
-    shifts = sequence.shifts[:FRAMES_PER_QUARTET, None]
-    return bool(np.isclose(np.sort(shifts, axis=0), np.sort(CANONICAL_SHIFTS)[:, None]).all())
+    shifts = sequence.shifts[: sequence.cycle, None]
+    return len(shifts) == FRAMES_PER_QUARTET and bool(
+        np.isclose(np.sort(shifts, axis=0), np.sort(CANONICAL_SHIFTS)[:, None]).all()
+    )
+
+
+def _cycle_source(sequence: Sequence) -> str:
+    if sequence.cycle_length is not None:
+        return sequence.sources.get("cycle_length", "setting of the sequence")
+    return "inferred from shifts and frequencies"
 
 
 def _facts(sequence: Sequence, report: Report) -> None:
     """Counts and values, each with its source."""
     measured, sources = int(sequence.measured.sum()), sequence.sources
     colour, poses = next(iter(sequence.colour.values()), None), sources["camera_from_world"]
-    degrees = np.round(np.degrees(sequence.shifts[:FRAMES_PER_QUARTET])).astype(int).tolist()
-    period = np.diff(sequence.times[:: FRAMES_PER_QUARTET if sequence.from_phasors else 1])
+    degrees = np.round(np.degrees(sequence.shifts[: sequence.cycle])).astype(int).tolist()
+    period = np.diff(sequence.times[:: sequence.cycle if sequence.from_phasors else 1])
     report.lines += [
         f"raw frames      {measured} of {sequence.frames} measured, {len(sequence.complete_quartets)} complete "
         f"quartets, {sequence.width}x{sequence.height} pixels; {sources['measured']}",
+        f"cycle           {sequence.cycle} raw frames; {_cycle_source(sequence)}",
         f"quads           {sequence.quads.min():.4g} .. {sequence.quads.max():.4g}; {sources['quads']}",
         f"shifts          {', '.join(map(str, degrees))} degrees in time; {sources['shifts']}",
         f"times           0 .. {sequence.times[-1]:.4g} s"
@@ -86,7 +108,10 @@ def _facts(sequence: Sequence, report: Report) -> None:
     assert sequence.path is not None
     if sequence.frequencies_hz is not None:
         several = ", ".join(f"{f / 1e6:.6g}" for f in dict.fromkeys(sequence.frame_frequencies.tolist()))
-        report.lines.append(f"frequencies     {several} MHz; {sources['frequencies_hz']}")
+        alone = ", ".join(f"{SPEED_OF_LIGHT / (2 * f):.4g}" for f in sequence.frequencies)
+        report.lines.append(
+            f"frequencies     {several} MHz, unambiguous to {alone} m alone; {sources['frequencies_hz']}"
+        )
     if sequence.distortion is not None:
         names = zip(("k1", "k2", "p1", "p2", "k3"), sequence.distortion, strict=True)
         lens = ", ".join(f"{name} {value:.4g}" for name, value in names)
@@ -110,11 +135,11 @@ def _assumptions(sequence: Sequence, report: Report) -> None:
     if len(missing):
         kind = "raw frames"
         if sequence.from_phasors:
-            kind, missing = "phasors", missing[::FRAMES_PER_QUARTET] // FRAMES_PER_QUARTET
+            kind, missing = "phasors", missing[:: sequence.cycle] // sequence.cycle
         shown = ", ".join(f"{n}" for n in missing[:10]) + (" .." if len(missing) > 10 else "")
         report.warnings.append(f"{len(missing)} {kind} were not measured: {shown}")
-    if sequence.frames % FRAMES_PER_QUARTET:
-        report.warnings.append(f"the last quartet is truncated after {sequence.frames % FRAMES_PER_QUARTET} frames")
+    if sequence.frames % sequence.cycle:
+        report.warnings.append(f"the last quartet is truncated after {sequence.frames % sequence.cycle} frames")
     if sources["times"].startswith("default"):
         report.warnings.append(f"frame rate assumed: {sources['times'][8:]}; cams/frame_times.npy states another")
     if sources["f_mod_hz"].startswith("default"):

@@ -12,8 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from ..constants import FRAMES_PER_QUARTET
-from .decode import distance_from_phase, quartet_phasor
+from ..constants import SPEED_OF_LIGHT
+from ..errors import InputError
+from .cycles import solution
+from .decode import Decoded, decode_quartet, unambiguous_range
 from .images import png_bytes
 from .sequence import Sequence, Truth
 from .truth import known_distance
@@ -53,7 +55,7 @@ def contact_sheet(sequence: Sequence, truth: Truth | None, title: str) -> bytes:
         title: Heading.
     """
     quartets = _decodable(sequence)
-    n = FRAMES_PER_QUARTET * quartets[len(quartets) // 2] if quartets else int(np.flatnonzero(sequence.measured)[0])
+    n = sequence.cycle * quartets[len(quartets) // 2] if quartets else int(np.flatnonzero(sequence.measured)[0])
     rows = [_raw(sequence, n), _decoded(sequence, truth, n, bool(quartets)), _more(sequence, truth, n)]
     panels = [row[i : i + COLUMNS] for row in rows for i in range(0, len(row), COLUMNS)]
     height = round(PANEL * sequence.height / sequence.width)
@@ -75,33 +77,40 @@ def contact_sheet(sequence: Sequence, truth: Truth | None, title: str) -> bytes:
 
 
 def _decodable(sequence: Sequence) -> list[int]:
-    """Quartets whose closed form there is: complete, of one frequency, of shifts that determine a phase."""
-    if sequence.frequencies_hz is not None:
+    """Quartets whose closed form there is: complete, with shifts that determine a phase at every frequency."""
+    try:
+        unambiguous_range(sequence)
+    except InputError:  # its frequencies have nothing in common
         return []
-    turns = np.round(np.exp(1j * sequence.shifts), 3)
-    quartets = [slice(FRAMES_PER_QUARTET * i, FRAMES_PER_QUARTET * (i + 1)) for i in sequence.complete_quartets]
-    return [q.start // FRAMES_PER_QUARTET for q in quartets if len(set(turns[q].tolist())) >= SHIFTS_MIN]
+
+    def decodable(i: int) -> bool:
+        frames = sequence.quartet_frames(i)
+        shifts, found = sequence.shifts[frames], sequence.frame_frequencies[frames]
+        return all(solution(shifts[found == f]) is not None for f in sequence.frequencies)
+
+    return [i for i in sequence.complete_quartets if decodable(i)]
 
 
 def _raw(sequence: Sequence, n: int) -> list[Panel]:
     """The raw frames of a quartet on one scale."""
-    frames = [m for m in range(n, min(n + FRAMES_PER_QUARTET, sequence.frames)) if sequence.measured[m]]
+    frames = [m for m in range(n, min(n + sequence.cycle, sequence.frames)) if sequence.measured[m]]
     end = float(np.percentile(np.abs(sequence.quads[frames]), CLIP)) or 1.0
-    panels = []
+    several, panels = len(sequence.frequencies) > 1, []
     for m in frames:
         name = f"raw frame {m}: {math.degrees(sequence.shifts[m]):.4g} deg, {1e3 * sequence.times[m]:.2f} ms"
+        name += f", {sequence.frame_frequencies[m] / 1e6:.4g} MHz" if several else ""
         panels.append(_scaled(name, sequence.quads[m], (-end, end), _diverging))
     return panels
 
 
 def _decoded(sequence: Sequence, truth: Truth | None, n: int, whole: bool) -> list[Panel]:
-    """Amplitude, true distance, closed form and its error; what of it there is."""
+    """Amplitude, true distance, closed form and its error, each frequency by itself; what of it there is."""
     panels = []
     decoded = None
     if whole:
-        re, im = quartet_phasor(sequence, n // FRAMES_PER_QUARTET)
-        decoded = distance_from_phase(np.arctan2(im, re), sequence)
-        amplitude = 0.5 * np.hypot(re, im)
+        quartet = decode_quartet(sequence, n // sequence.cycle)
+        decoded = quartet.distance
+        amplitude = 0.5 * np.hypot(*quartet.phasors[0])
         panels.append(_scaled("amplitude of the closed form", amplitude, (0.0, _end(amplitude)), _gray))
     elif truth is not None and truth.amplitude is not None:
         amplitude = truth.amplitude[n].astype(np.float64)
@@ -109,6 +118,7 @@ def _decoded(sequence: Sequence, truth: Truth | None, n: int, whole: bool) -> li
     if truth is None:
         if decoded is not None:
             panels.append(_scaled("closed form [m]", decoded, (decoded.min(), decoded.max()), _viridis))
+            panels += _by_frequency(sequence, quartet)
         return panels
     true = known_distance(truth)[n]
     if not np.isfinite(true).any():
@@ -119,7 +129,20 @@ def _decoded(sequence: Sequence, truth: Truth | None, n: int, whole: bool) -> li
         error = np.abs(decoded - true)
         panels.append(_scaled("closed form [m]", decoded, ends, _viridis))
         panels.append(_scaled("error of the closed form [m]", error, (0.0, _end(error)), _inferno))
+        panels += _by_frequency(sequence, quartet)
     return panels
+
+
+def _by_frequency(sequence: Sequence, quartet: Decoded) -> list[Panel]:
+    """What each of several frequencies decodes to by itself, and how far they agree."""
+    if quartet.confidence is None:
+        return []
+    panels = []
+    for f, image in zip(sequence.frequencies, quartet.single, strict=True):
+        ends = 0.0, SPEED_OF_LIGHT / (2.0 * f)
+        panels.append(_scaled(f"{f / 1e6:.4g} MHz alone, to {ends[1]:.3g} m [m]", image, ends, _viridis))
+    title = f"confidence, {100 * float(quartet.ambiguous.mean()):.3g} % ambiguous"
+    return [*panels, _scaled(title, quartet.confidence, (0.0, 1.0), _gray)]
 
 
 def _more(sequence: Sequence, truth: Truth | None, n: int) -> list[Panel]:
@@ -127,6 +150,9 @@ def _more(sequence: Sequence, truth: Truth | None, n: int) -> list[Panel]:
     panels = []
     if truth is not None and truth.phasor_distance is not None:
         difference = truth.phasor_distance[n] - known_distance(truth)[n]
+        if len(sequence.frequencies) > 1:  # it is that of one frequency, and wraps sooner than the scene ends
+            alone = SPEED_OF_LIGHT / (2.0 * sequence.frame_frequencies[n])
+            difference = np.mod(difference + 0.5 * alone, alone) - 0.5 * alone
         end = max(_end(np.abs(difference)), 1e-3)
         panels.append(_scaled("static phasor - true distance [m]", difference, (-end, end), _diverging))
     if truth is not None and truth.body is not None:
@@ -138,7 +164,9 @@ def _more(sequence: Sequence, truth: Truth | None, n: int) -> list[Panel]:
     if flow is not None:
         length = np.hypot(*flow)
         end = max(float(np.nanmax(length)) if np.isfinite(length).any() else 0.0, 1e-6)
-        panels.append(Panel(title=f"flow to raw frame {n + 4}, up to {end:.3g} px", image=_flow(flow, end)))
+        panels.append(
+            Panel(title=f"flow to raw frame {n + sequence.cycle}, up to {end:.3g} px", image=_flow(flow, end))
+        )
     image = sequence.colour.get(n)
     if image is not None:
         top = float(np.percentile(image, CLIP)) or 1.0

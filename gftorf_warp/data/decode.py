@@ -1,85 +1,165 @@
-"""Closed-form distance of a quartet, as if its four raw frames had been taken at once: the C-ToF baseline.
+"""Closed-form distance of a quartet, as if its raw frames had been taken at once: the C-ToF baseline.
 
 A quad of shift theta is a (cos(psi - theta) + b) = (a cos psi) cos theta + (a sin psi) sin theta + a b, linear in three
-unknowns: least squares over the quads of a quartet gives the phasor 2a (cos psi, sin psi), for the four canonical
-shifts the differences of opposite quads, and d = ((atan2(im, re) - phase_offset) mod 2 pi) c / 4 pi f.
+unknowns: least squares over the quads of one frequency gives the phasor 2a (cos psi, sin psi), for the four canonical
+shifts the differences of opposite quads, and d = ((atan2(im, re) - phase_offset) mod 2 pi) c / 4 pi f. Where a cycle
+has several frequencies, their phases together choose the turn of the first, see unwrap.py.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
-from ..constants import FRAMES_PER_QUARTET, SPEED_OF_LIGHT
+from ..constants import SPEED_OF_LIGHT
 from ..errors import InputError
+from .cycles import solution
 from .sequence import Sequence
+from .unwrap import CONFIDENT, choose, common_range, multiples, wrapped
 
-RANK_TOLERANCE = 1e-3  # singular values of three unknowns are about 1; two shifts closer than 0.1 degrees are one
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Decoded:
+    """One quartet as a sensor would decode it, float64."""
+
+    phasors: Float[np.ndarray, "f 2 H W"]
+    """(re, im) = 2a (cos psi, sin psi) at each frequency, in the order of ``Sequence.frequencies`` [quad units]."""
+    single: Float[np.ndarray, "f H W"]
+    """Distance that each frequency gives by itself [m], in [0, c/2f)."""
+    distance: Float[np.ndarray, "H W"]
+    """Distance of all together [m], in [0, range)."""
+    range: float
+    """What distances are known modulo [m]: c / 2 f_0, or c/2f of a single frequency."""
+    confidence: Float[np.ndarray, "H W"] | None
+    """How far one distance explains the phases better than any other [1], see unwrap.py, 0 where there is no light;
+    None if there is one frequency, which chooses nothing."""
+
+    @property
+    def ambiguous(self) -> Bool[np.ndarray, "H W"]:
+        """Where another distance, some whole turns away, would explain the phases nearly as well."""
+        if self.confidence is None:
+            return np.zeros(self.distance.shape, dtype=bool)
+        return self.confidence < CONFIDENT
+
+
+def decode_quartet(sequence: Sequence, i: int) -> Decoded:
+    """Phasors and distances of quartet i, decoded as if its raw frames had been taken at once.
+
+    Any three or more shifts at each frequency will do, evenly spaced or not, in any order.
+
+    Raises:
+        ValueError: If a frame of the quartet was not measured.
+        InputError: If its shifts do not determine a phase, or its frequencies have no common range.
+    """
+    phasors = np.stack([phasor for _, phasor in quartet_phasors(sequence, i)])
+    frequencies = sequence.frequencies
+    phases = np.arctan2(phasors[:, 1], phasors[:, 0])
+    single = np.stack([distance_from_phase(p, sequence, f) for p, f in zip(phases, frequencies, strict=True)])
+    if len(frequencies) == 1:
+        reach = unambiguous_range(sequence)
+        return Decoded(phasors=phasors, single=single, distance=single[0], range=reach, confidence=None)
+    reach = unambiguous_range(sequence)
+    ms, _ = multiples(frequencies)
+    chosen = choose(phases - sequence.phase_offset, ms)
+    distance = single[0] + chosen.turns * (SPEED_OF_LIGHT / (2.0 * frequencies[0]))
+    lit = np.hypot(phasors[:, 0], phasors[:, 1]).min(axis=0) > 0
+    return Decoded(
+        phasors=phasors,
+        single=single,
+        distance=distance,
+        range=reach,
+        confidence=np.where(lit, chosen.confidence, 0.0),
+    )
+
+
+def quartet_phasors(sequence: Sequence, i: int) -> list[tuple[list[int], Float[np.ndarray, "2 H W"]]]:
+    """Raw frames and phasor of quartet i at each of its frequencies, in the order of ``Sequence.frequencies``.
+
+    Raises:
+        ValueError: If a frame of the quartet was not measured.
+        InputError: If its shifts do not determine a phase.
+    """
+    if i not in sequence.complete_quartets:
+        raise ValueError(f"quartet {i} must be one of the complete ones, {sequence.complete_quartets}")
+    frames = np.arange(sequence.frames)[sequence.quartet_frames(i)]
+    found = []
+    for f in sequence.frequencies:
+        own = frames[sequence.frame_frequencies[frames] == f]
+        shifts = sequence.shifts[own]
+        rows = solution(shifts)
+        if rows is None:
+            raise InputError(
+                "phase shifts",
+                where=f"{sequence.path or 'sequence'}, frames {frames[0]} .. {frames[-1]}",
+                why=f"expected at least three distinct shifts, found {np.degrees(shifts).tolist()} degrees",
+                fix="correct tof_permutation.npy, or the shifts in capture.json",
+            )
+        found.append((own.tolist(), np.tensordot(rows, sequence.quads[own].astype(np.float64), axes=1)))
+    return found
 
 
 def quartet_phasor(sequence: Sequence, i: int) -> Float[np.ndarray, "2 H W"]:
-    """Phasor (re, im) = 2a (cos psi, sin psi) of quartet i from raw frames 4i .. 4i + 3, float64, in quad units.
+    """Phasor (re, im) = 2a (cos psi, sin psi) of quartet i at its first frequency, float64, in quad units.
 
     Raises:
         ValueError: If a frame of the quartet was not measured.
         InputError: If its shifts do not determine a phase.
     """
-    if sequence.frequencies_hz is not None and len(set(sequence.frequencies_hz.tolist())) > 1:
-        raise InputError(
-            "several modulation frequencies",
-            where=sequence.path or "sequence",
-            why=f"four raw frames give a distance at one, found {sorted(set(sequence.frequencies_hz.tolist()))} Hz",
-            fix="decode whole cycles, with gftorf_warp.scene.unwrap.cycle_distance",
-        )
-    if i not in sequence.complete_quartets:
-        raise ValueError(f"quartet {i} must be one of the complete ones, {sequence.complete_quartets}")
-    frames = slice(FRAMES_PER_QUARTET * i, FRAMES_PER_QUARTET * (i + 1))
-    shifts = sequence.shifts[frames]
-    model = np.stack([np.cos(shifts), np.sin(shifts), np.ones(len(shifts))], axis=1)
-    if np.linalg.svd(model, compute_uv=False).min() < RANK_TOLERANCE:
-        raise InputError(
-            "phase shifts",
-            where=f"{sequence.path or 'sequence'}, frames {frames.start} .. {frames.stop - 1}",
-            why=f"expected at least three distinct shifts, found {np.degrees(shifts).tolist()} degrees",
-            fix="correct tof_permutation.npy, or the shifts in capture.json",
-        )
-    return np.tensordot(2.0 * np.linalg.pinv(model)[:2], sequence.quads[frames].astype(np.float64), axes=1)
+    return quartet_phasors(sequence, i)[0][1]
 
 
 def closed_form_distance(sequence: Sequence, i: int) -> Float[np.ndarray, "H W"]:
-    """Distance [m] of quartet i in [0, c/2f), decoded from raw frames 4i .. 4i + 3 as if simultaneous; float64.
+    """Distance [m] of quartet i in [0, c/2f), or [0, c / 2 f_0) of several frequencies; float64.
 
     Raises:
         ValueError: If a frame of the quartet was not measured.
-        InputError: If its shifts do not determine a phase.
+        InputError: If its shifts do not determine a phase, or its frequencies have no common range.
     """
-    re, im = quartet_phasor(sequence, i)
-    return distance_from_phase(np.arctan2(im, re), sequence)
+    return decode_quartet(sequence, i).distance
 
 
-def distance_from_phase(phase: np.ndarray, sequence: Sequence) -> np.ndarray:
-    """Distance [m] in [0, c/2f) of measured phases [rad], phase offset removed; same shape."""
-    wrapped = np.mod(phase - sequence.phase_offset, 2.0 * math.pi)
-    wrapped = np.where(wrapped < 2.0 * math.pi, wrapped, 0.0)  # the modulo of -1e-17 rounds up to 2 pi
-    return wrapped * (SPEED_OF_LIGHT / (4.0 * math.pi * sequence.f_mod_hz))
+def distance_from_phase(phase: np.ndarray, sequence: Sequence, f_mod_hz: float | None = None) -> np.ndarray:
+    """Distance [m] in [0, c/2f) of measured phases [rad], phase offset removed; same shape.
+
+    ``f_mod_hz`` is the modulation frequency [Hz]; None: the first of the sequence.
+    """
+    f_mod_hz = sequence.f_mod_hz if f_mod_hz is None else f_mod_hz
+    return wrapped(phase - sequence.phase_offset) * (SPEED_OF_LIGHT / (4.0 * math.pi * f_mod_hz))
+
+
+def unambiguous_range(sequence: Sequence) -> float:
+    """What the distances of a sequence are known modulo [m]: c/2f, or c / 2 f_0 of all its frequencies together.
+
+    Raises:
+        InputError: If its frequencies are no small multiples of one.
+    """
+    try:
+        return common_range(sequence.frequencies)
+    except ValueError as error:
+        raise InputError(
+            "frequencies without a common range",
+            where=sequence.path or "sequence",
+            why=str(error),
+            fix="record at frequencies like 60 and 40 MHz, or keep the raw frames of one of them",
+        ) from error
 
 
 def largest_amplitude(sequence: Sequence) -> float:
-    """Largest length of a quartet's phasor over all pixels and complete quartets, twice the amplitude of a quad.
+    """Largest length of a quartet's phasors over all pixels and complete quartets, twice the amplitude of a quad.
 
     Raises:
         InputError: If no quartet is complete, or all of them are dark.
     """
-    largest = max(
-        (float(np.hypot(*quartet_phasor(sequence, i)).max()) for i in sequence.complete_quartets), default=0.0
-    )
+    found = (phasor for i in sequence.complete_quartets for _, phasor in quartet_phasors(sequence, i))
+    largest = max((float(np.hypot(*phasor).max()) for phasor in found), default=0.0)
     if not largest > 0.0:
         raise InputError(
             "no light" if sequence.complete_quartets else "no complete quartet",
             where=sequence.path or "sequence",
-            why="expected four consecutive raw frames 4i .. 4i + 3 with light, found "
+            why="expected all raw frames of a cycle, with light, found "
             f"{len(sequence.complete_quartets)} complete quartets, largest amplitude {largest:g}",
             fix="complete the recording",
         )

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..constants import FRAMES_PER_QUARTET, SPEED_OF_LIGHT
-from .decode import quartet_phasor
+from ..constants import SPEED_OF_LIGHT
+from .decode import quartet_phasor, quartet_phasors
 from .flow import warp_back
 from .sequence import Sequence, Truth
 
@@ -23,8 +23,8 @@ MOVING_PX = 0.5  # [px] flow above this is motion
 def steady_pixels(sequence: Sequence) -> np.ndarray:
     """Bright pixels [H, W] whose quads of one slot change least over the sequence, relative to their amplitude."""
     change = np.zeros(sequence.quads.shape[1:])
-    for slot in range(FRAMES_PER_QUARTET):
-        frames = np.flatnonzero(sequence.measured[slot::FRAMES_PER_QUARTET]) * FRAMES_PER_QUARTET + slot
+    for slot in range(step := sequence.cycle):
+        frames = np.flatnonzero(sequence.measured[slot::step]) * step + slot
         if len(frames):
             change = np.maximum(change, np.ptp(sequence.quads[frames].astype(np.float64), axis=0))
     amplitude = np.mean([np.hypot(*quartet_phasor(sequence, i)) for i in sequence.complete_quartets], axis=0)
@@ -49,30 +49,35 @@ def distance_of_z(sequence: Sequence, truth: Truth) -> np.ndarray:
 
 
 def dc_offset(sequence: Sequence) -> float:
-    """Constant part of the quads as a multiple of their amplitude: mean(Q0 + Q1 + Q2 + Q3) / (4 mean a)."""
+    """Constant part of the quads as a multiple of their amplitude, mean(Q0 + Q1 + Q2 + Q3) / (4 mean a) of four.
+
+    What is left of the quads of any shifts without the wave of their phasor is constant.
+    """
     total = amplitude = 0.0
     for i in sequence.complete_quartets:
-        frames = slice(FRAMES_PER_QUARTET * i, FRAMES_PER_QUARTET * (i + 1))
-        total += float(sequence.quads[frames].mean(dtype=np.float64))
-        amplitude += float(np.hypot(*quartet_phasor(sequence, i)).mean()) / 2.0
+        for frames, (re, im) in quartet_phasors(sequence, i):
+            shifts = sequence.shifts[frames]
+            wave = 0.5 * (re.mean() * np.cos(shifts).mean() + im.mean() * np.sin(shifts).mean())
+            total += float(sequence.quads[frames].mean(dtype=np.float64)) - float(wave)
+            amplitude += float(np.hypot(re, im).mean()) / 2.0
     return total / amplitude
 
 
 def pairings(sequence: Sequence) -> tuple[int | None, list[float]]:
-    """How well each way of pairing the slots fits: of two opposite pairs both have the same sum.
+    """How well each way of pairing the slots of four-shift quartets fits: two opposite pairs have the same sum.
 
     Returns:
         Which of ``PAIRINGS`` the shifts state (None if they have no opposite pairs), and for each the share of steady
         pixels where its two sums differ least. Reversing a pair, or swapping the pairs, cannot be seen this way.
     """
-    quartets = [sequence.quads[4 * i : 4 * i + 4].astype(np.float64) for i in sequence.complete_quartets]
+    frames = [sequence.quartet_frames(i) for i in sequence.complete_quartets]
+    quartets = [sequence.quads[own].astype(np.float64) for own in frames]
     gaps = np.stack(
         [np.abs(np.median([q[a] + q[b] - q[c] - q[d] for q in quartets], axis=0)) for (a, b), (c, d) in PAIRINGS]
     )
     best = gaps.argmin(axis=0)[steady_pixels(sequence)]
     shares = [float((best == p).mean()) for p in range(len(PAIRINGS))]
-    first = FRAMES_PER_QUARTET * sequence.complete_quartets[0]
-    shift = sequence.shifts[first : first + FRAMES_PER_QUARTET]
+    shift = sequence.shifts[frames[0]]
     opposite = [all(math.cos(shift[a] - shift[b]) < -0.99 for a, b in pairs) for pairs in PAIRINGS]
     return (opposite.index(True) if any(opposite) else None), shares
 
@@ -94,11 +99,11 @@ class PhasorMatch:
 def phasor_match(sequence: Sequence, stored: dict[int, np.ndarray]) -> PhasorMatch | None:
     """Compare stored phasors [H, W, 3], by quartet start, with the quads on steady pixels; None if they never meet."""
     steady = steady_pixels(sequence)
-    common = [i for i in sequence.complete_quartets if FRAMES_PER_QUARTET * i in stored]
+    common = [i for i in sequence.complete_quartets if sequence.cycle * i in stored]
     if not common:
         return None
     ours = np.stack([quartet_phasor(sequence, i)[:, steady] for i in common], axis=1)
-    theirs = np.stack([stored[FRAMES_PER_QUARTET * i][steady, :2].T for i in common], axis=1).astype(np.float64)
+    theirs = np.stack([stored[sequence.cycle * i][steady, :2].T for i in common], axis=1).astype(np.float64)
     a, b = ours[0] + 1j * ours[1], theirs[0] + 1j * theirs[1]
     length_a, length_b = np.sqrt((np.abs(a) ** 2).sum()), np.sqrt((np.abs(b) ** 2).sum())
     if not length_b > 0:
@@ -132,7 +137,7 @@ def phase_fit(sequence: Sequence, truth: Truth) -> PhaseFit | None:
     phases, distances = [], []
     kappa = 4.0 * math.pi * sequence.f_mod_hz / SPEED_OF_LIGHT
     for i in sequence.complete_quartets:
-        frames = slice(FRAMES_PER_QUARTET * i, FRAMES_PER_QUARTET * (i + 1))
+        frames = sequence.quartet_frames(i)
         if not truth.known[frames].all():
             continue
         distance = truth.distance[frames].astype(np.float64)

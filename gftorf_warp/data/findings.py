@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from ..constants import FRAMES_PER_QUARTET, SPEED_OF_LIGHT
+from ..constants import SPEED_OF_LIGHT
 from ..errors import InputError
 from . import estimates, specs, torf
 from .arrays import as_float32, read_array
-from .decode import closed_form_distance, largest_amplitude, quad_scale
+from .decode import closed_form_distance, decode_quartet, largest_amplitude, quad_scale, unambiguous_range
 from .folder import numbered
 from .sequence import Sequence, Truth
 
@@ -28,6 +28,7 @@ DECODED_M = 1e-3  # [m] a "truth" this close to the decoded quads, where those c
 DECODED_SHARE = 0.9  # of the changing pixels
 CHANGING_PIXELS = 100  # a static scene without noise is decoded to its truth, and nothing is wrong with that
 THIRD_MATCH_MIN = 0.9  # of the correlation of the third channel with the length of (re, im), where it is an amplitude
+AMBIGUOUS_SHARE = 0.1  # of the pixels: outlines of what moves and dark corners are fewer
 MOVED_SHARE = 0.5  # of the bright pixels: an object alone rarely covers as much
 BASELINE_MAX_M = 1.0  # [m] two cameras of one housing are centimetres apart
 Z_FITS = 0.8  # of the residual as distance: below, the stored numbers are z-depth
@@ -69,14 +70,34 @@ def light(sequence: Sequence, report: Report) -> None:
         )
 
 
-def order(sequence: Sequence, report: Report) -> None:
-    """Constant part and order of raw quads."""
-    estimate = estimates.dc_offset(sequence)
+def frequencies(sequence: Sequence, report: Report) -> None:
+    """How far several modulation frequencies agree on one distance."""
+    if len(sequence.frequencies) < 2:
+        return
+    decoded = [decode_quartet(sequence, i) for i in sequence.complete_quartets]
+    confidence = [d.confidence[np.hypot(*d.phasors[0]) > 0] for d in decoded if d.confidence is not None]
+    ambiguous = float(np.mean([d.ambiguous.mean() for d in decoded]))
     report.lines.append(
-        f"dc estimate     {estimate:.4f} = mean(Q0 + Q1 + Q2 + Q3) / (4 mean a), {sequence.dc_offset:g} in use"
+        f"unwrapping      {decoded[0].range:.4g} m together; median confidence "
+        f"{float(np.median(np.concatenate(confidence))):.2f}, {ambiguous:.1%} of the pixels ambiguous"
     )
+    if ambiguous > AMBIGUOUS_SHARE:
+        report.warnings.append(
+            f"frequencies disagree: {ambiguous:.0%} of the pixels could as well be another distance; noise, motion "
+            "within a cycle, or another phase offset at each frequency"
+        )
+
+
+def constant_part(sequence: Sequence, report: Report) -> None:
+    """Constant part of raw quads."""
+    estimate = estimates.dc_offset(sequence)
+    report.lines.append(f"dc estimate     {estimate:.4f} of the amplitude, {sequence.dc_offset:g} in use")
     if abs(estimate - sequence.dc_offset) > DC_TOLERANCE:
         report.warnings.append(f"dc_offset {sequence.dc_offset:g} is in use, but the quads say {estimate:.3f}")
+
+
+def order(sequence: Sequence, report: Report) -> None:
+    """Order of raw quads of the four canonical shifts."""
     stated, shares = estimates.pairings(sequence)
     texts = ["".join(f"(q{a},q{b})" for a, b in pairs) for pairs in estimates.PAIRINGS]
     found = ", ".join(f"{text} on {share:.0%}" for text, share in zip(texts, shares, strict=True))
@@ -128,7 +149,7 @@ def phasors(sequence: Sequence, report: Report) -> None:
     spec = specs.fields(report.form)["phasor"]
     size = {"H": sequence.height, "W": sequence.width}
     for pattern in spec.paths:
-        files = {n: f for n, f in numbered(sequence.path, pattern).items() if n % FRAMES_PER_QUARTET == 0}
+        files = {n: f for n, f in numbered(sequence.path, pattern).items() if n % sequence.cycle == 0}
         stored = {n: as_float32(f, spec, read_array(f, spec, size))[0] for n, f in files.items() if n < sequence.frames}
         match = estimates.phasor_match(sequence, stored) if stored else None
         if match is None:
@@ -157,8 +178,8 @@ def truth(sequence: Sequence, report: Report) -> None:
         report.lines.append("truth           none")
         return
     seen = truth.distance[np.isfinite(truth.distance)]
-    unambiguous = SPEED_OF_LIGHT / (2 * sequence.f_mod_hz)
-    frames = int(truth.known.sum()) // (FRAMES_PER_QUARTET if sequence.from_phasors else 1)
+    unambiguous = unambiguous_range(sequence)
+    frames = int(truth.known.sum()) // (sequence.cycle if sequence.from_phasors else 1)
     report.lines.append(
         f"truth           {frames} frames in {folder}"
         + (f", {seen.min():.4g} .. {seen.max():.4g} m" if len(seen) else ", no known pixel")
@@ -213,15 +234,15 @@ def _is_decoded(sequence: Sequence, truth: Truth) -> bool:
     for before, i in itertools.pairwise(quartets):
         changes = np.abs(decoded[i] - decoded[before]) > DECODED_M
         changing += int(changes.sum())
-        agreeing += int((np.abs(truth.distance[FRAMES_PER_QUARTET * i] - decoded[i]) < DECODED_M)[changes].sum())
+        agreeing += int((np.abs(truth.distance[sequence.cycle * i] - decoded[i]) < DECODED_M)[changes].sum())
     return changing >= CHANGING_PIXELS and agreeing > DECODED_SHARE * changing
 
 
 def flow(sequence: Sequence, report: Report) -> None:
     """Whether given flow explains the motion between frames of one shift."""
     for name, images, step in (
-        ("forward", sequence.forward_flow, FRAMES_PER_QUARTET),
-        ("backward", sequence.backward_flow, -FRAMES_PER_QUARTET),
+        ("forward", sequence.forward_flow, sequence.cycle),
+        ("backward", sequence.backward_flow, -sequence.cycle),
     ):
         match = estimates.flow_match(sequence, images, step)
         if match is None:

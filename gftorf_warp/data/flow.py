@@ -1,9 +1,10 @@
-"""Optical flow from raw frames, where a recording brings none: between frames of one shift, four frames apart.
+"""Optical flow from raw frames, where a recording brings none: between frames of one shift, a cycle apart.
 
-Frames n and n + 4 have the same shift, so a moving surface looks nearly alike in both. The flow of quartet start n is
-the median over the pairs n + j that start at most half of the four frames away: pair n + j saw the surface a little
-earlier or later, at x + s F(x), s being its time from n in units of the pair's length. Pairs of different shifts have
-their weak contrast at different distances, and their noise is independent.
+Frames n and n + K have the same shift and frequency, K being the raw frames of a cycle, so a moving surface looks
+nearly alike in both. The flow of quartet start n is the median over the pairs n + j that start at most half a cycle
+away: pair n + j saw the surface a little earlier or later, at x + s F(x), s being its time from n in units of the
+pair's length. Pairs of different shifts have their weak contrast at different distances, and their noise is
+independent.
 """
 
 from __future__ import annotations
@@ -14,13 +15,12 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ..constants import FRAMES_PER_QUARTET
 from ..errors import InputError
 from .sequence import Sequence
 
 Method = Literal["dis", "deepflow"]
 
-APART_MAX = 0.5  # of the four frames: pairs that start farther from n see another motion where paths are curved
+APART_MAX = 0.5  # of a cycle: pairs that start farther from n see another motion where paths are curved
 CONSISTENCY_PX = (
     1.0  # [px] forward and backward may disagree by this much; occluded pixels disagree by the motion itself
 )
@@ -33,18 +33,18 @@ class Flow(NamedTuple):
     """Optical flow of quartet starts, shaped like the fields of a sequence."""
 
     forward: dict[int, Float[np.ndarray, "2 H W"]]
-    """(dx, dy) [px] by raw frame n, from n to n + 4; NaN: unreliable pixel."""
+    """(dx, dy) [px] by raw frame n, from n to n + K; NaN: unreliable pixel."""
     backward: dict[int, Float[np.ndarray, "2 H W"]]
-    """(dx, dy) [px] by raw frame n, from n to n - 4; NaN: unreliable pixel."""
+    """(dx, dy) [px] by raw frame n, from n to n - K; NaN: unreliable pixel."""
 
 
 def compute_flow(sequence: Sequence, *, method: Method = "dis") -> Flow:
-    """Compute the optical flow of every quartet start whose partner four frames away was measured too.
+    """Compute the optical flow of every quartet start whose partner a cycle away was measured too.
 
     Args:
         sequence: Its quads; flow it brings itself is not looked at.
         method: ``dis`` is fast and follows large motion; ``deepflow`` is smoother where motion stays below about two
-            pixels in four frames, and loses what moves farther.
+            pixels in a cycle, and loses what moves farther.
 
     Returns:
         Forward and backward flow, float32. Pixels whose forward and backward flow disagree in most pairs are NaN.
@@ -63,7 +63,7 @@ def compute_flow(sequence: Sequence, *, method: Method = "dis") -> Flow:
             fix="bring the flow as files, or use larger images",
         )
     match = _matcher(method)
-    step = FRAMES_PER_QUARTET
+    step = sequence.cycle
     forward: dict[int, np.ndarray] = {}
     backward: dict[int, np.ndarray] = {}
     for n in range(sequence.frames - step):

@@ -17,7 +17,7 @@ from .sequence import Truth
 
 SLOT_FOLDERS = tuple(f"tofType{slot}" for slot in range(FRAMES_PER_QUARTET))
 PHASOR_FOLDER = "tof"
-NOT_IN_FAMILY = ("frequencies_hz", "distortion", "exposures", "sensor")  # fields that only a capture has a place for
+NOT_IN_FAMILY = ("frequencies_hz", "cycle_length", "distortion", "exposures", "sensor")  # only a capture holds these
 EXPECTED = (
     "expected a folder with capture.json (a capture), tofType0 .. tofType3 and cams (F-ToeRF: raw quads), or tof and "
     "cams (ToeRF: phasors)"

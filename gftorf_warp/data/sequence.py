@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
@@ -10,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ..constants import FRAMES_PER_QUARTET
+from .cycles import find_cycle, frequencies_by_order, frequencies_decoded
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -29,6 +30,8 @@ class Sequence:
     """Modulation frequency [Hz]; the first of the cycle if there are several."""
     frequencies_hz: Float[np.ndarray, "F"] | None = None
     """Modulation frequency of each raw frame [Hz]; None: ``f_mod_hz`` throughout."""
+    cycle_length: int | None = None
+    """Raw frames K of a cycle, if the recording states it; None: see :attr:`cycle`."""
     phase_offset: float = 0.0
     """Measured minus true phase [rad]."""
     dc_offset: float = 0.0
@@ -59,9 +62,9 @@ class Sequence:
     novel_from_world: Float[np.ndarray, "M 4 4"] | None = None
     """Poses of views that nobody took, world to camera [m], to be rendered for looking at; None if there are none."""
     forward_flow: dict[int, Float[np.ndarray, "2 H W"]] = field(default_factory=dict)
-    """Optical flow (dx, dy) [px] by raw frame n, from n to n + 4; NaN: unknown pixel."""
+    """Optical flow (dx, dy) [px] by raw frame n, from n to n + K; NaN: unknown pixel."""
     backward_flow: dict[int, Float[np.ndarray, "2 H W"]] = field(default_factory=dict)
-    """Optical flow (dx, dy) [px] by raw frame n, from n to n - 4; NaN: unknown pixel."""
+    """Optical flow (dx, dy) [px] by raw frame n, from n to n - K; NaN: unknown pixel."""
     exposures: Float[np.ndarray, "F"] | None = None
     """Length of each exposure [s]; None: not known."""
     sensor: dict[str, Any] = field(default_factory=dict)
@@ -86,12 +89,34 @@ class Sequence:
         """Columns W."""
         return self.quads.shape[2]
 
+    @functools.cached_property
+    def cycle(self) -> int:
+        """Raw frames K of a cycle, after which the sensor begins anew: quartet i is raw frames K i .. K (i + 1) - 1.
+
+        As stated, else the period of shifts and frequencies: four for a sensor of four shifts at one frequency.
+        """
+        return self.cycle_length or find_cycle(self.shifts, self.frame_frequencies)
+
+    @functools.cached_property
+    def frequencies(self) -> tuple[float, ...]:
+        """The modulation frequencies of a cycle [Hz], in the order in which it has them."""
+        return frequencies_by_order(self.frame_frequencies[: self.cycle])
+
+    @functools.cached_property
+    def quads_per_phasor(self) -> int:
+        """How many raw frames of a cycle have its first frequency."""
+        return int((self.frame_frequencies[: self.cycle] == self.frequencies[0]).sum())
+
     @property
     def complete_quartets(self) -> list[int]:
-        """Indices i of the quartets whose four raw frames 4i .. 4i + 3 were all measured, with one frequency."""
-        step = FRAMES_PER_QUARTET
+        """Indices i of the quartets whose raw frames K i .. K (i + 1) - 1 were all measured, at three or more each."""
+        step, frequencies = self.cycle, self.frame_frequencies
         whole = [i for i in range(self.frames // step) if self.measured[step * i : step * (i + 1)].all()]
-        return [i for i in whole if len(set(self.frame_frequencies[step * i : step * (i + 1)].tolist())) == 1]
+        return [i for i in whole if frequencies_decoded(frequencies[step * i : step * (i + 1)], self.frequencies)]
+
+    def quartet_frames(self, quartet: int) -> slice:
+        """The raw frames of a quartet."""
+        return slice(self.cycle * quartet, self.cycle * (quartet + 1))
 
     @property
     def frame_frequencies(self) -> Float[np.ndarray, "F"]:
@@ -133,8 +158,9 @@ class Truth:
     known: Bool[np.ndarray, "F"]
     """Whether a raw frame has a distance at all."""
     phasor_distance: Float[np.ndarray, "F H W"] | None = None
-    """Static-phasor distance [m], float32, in [0, c/2f): what the closed form would decode if all four quads were taken
-    without noise at the very time of the raw frame, indirect light included; NaN: unknown. None: not stored."""
+    """Static-phasor distance [m], float32, in [0, c/2f) of the raw frame's frequency: what the closed form would decode
+    if all quads at it were taken without noise at the very time of the raw frame, indirect light included; NaN:
+    unknown. None: not stored."""
     amplitude: Float[np.ndarray, "F H W"] | None = None
     """Mean amplitude without noise [relative units], float32; None: not stored."""
     body: Int[np.ndarray, "F H W"] | None = None

@@ -17,12 +17,16 @@ def known_distance(truth: Truth) -> Float[np.ndarray, "F H W"]:
 
 
 def moving_and_static(
-    distance_truth: Float[np.ndarray, "F H W"], frames: list[int], *, from_phasors: bool = False
+    distance_truth: Float[np.ndarray, "F H W"],
+    frames: list[int],
+    *,
+    from_phasors: bool = False,
+    cycle: int = FRAMES_PER_QUARTET,
 ) -> tuple[Bool[np.ndarray, "S H W"], Bool[np.ndarray, "S H W"]]:
     """Which pixels of the S scored frames move, and which rest.
 
-    A pixel moves if its true distance has max - min > 0.05 m within the four raw frames of the quartet. It rests if all
-    four are known and it does not move; with unknown truth [NaN] it may be neither. The raw frames of a phasor are one
+    A pixel moves if its true distance has max - min > 0.05 m within the raw frames of its quartet. It rests if all of
+    them are known and it does not move; with unknown truth [NaN] it may be neither. The raw frames of a phasor are one
     instant, so there a pixel moves if its distance differs that much from one phasor to the next (the last: from the
     one before).
 
@@ -30,8 +34,9 @@ def moving_and_static(
         distance_truth: True distance of every raw frame [m]; NaN: unknown.
         frames: The scored raw frames n.
         from_phasors: Whether the camera delivered phasors.
+        cycle: Raw frames of a quartet.
     """
-    step = FRAMES_PER_QUARTET
+    step = cycle
     moving, static = {}, {}
     for quartet in {n // step for n in frames}:
         seen = distance_truth[step * quartet : step * (quartet + 1)]

@@ -147,6 +147,11 @@ def refuse_inexpressible(form: str, sequence: Sequence, truth: Truth | None) -> 
             "one modulation frequency",
             f"{sequence.frequencies_hz}",
         ),
+        "shifts": (
+            not family or sequence.cycle == FRAMES_PER_QUARTET,
+            f"cycles of {FRAMES_PER_QUARTET} raw frames",
+            f"of {sequence.cycle}",
+        ),
         "distortion": (not family or sequence.distortion is None, "a pinhole", f"a lens with {sequence.distortion}"),
         "an empty sequence": (sequence.measured.any(), "at least one measured raw frame", "none"),
         "quads": (np.isfinite(sequence.quads[sequence.measured]).all(), "finite numbers", "NaN or infinity"),

@@ -14,9 +14,11 @@ import numpy as np
 from jaxtyping import Float
 
 from .. import __version__
+from ..data.decode import unambiguous_range
 from ..data.files import atomic_write, write_json
 from ..data.sequence import Sequence, Truth
 from ..data.truth import known_distance, moving_and_static
+from ..data.unwrap import CONFIDENT
 from ..errors import InputError, UsageError
 from . import gallery, views
 from . import metrics as measure
@@ -132,7 +134,9 @@ def findings(sequence: Sequence, gathered: views.Views, truth: Truth | None, *, 
     if truth is None:
         return Findings(sequence=sequence, views=gathered, judgement=None)
     distance = known_distance(truth)
-    moving, static = moving_and_static(distance, gathered.frames, from_phasors=sequence.from_phasors)
+    moving, static = moving_and_static(
+        distance, gathered.frames, from_phasors=sequence.from_phasors, cycle=sequence.cycle
+    )
     scored = (distance if against == AGAINST[0] else _static_phasor(sequence, truth))[gathered.frames]
     errors = {name: measure.squared_error(image, scored) for name, image in gathered.distances.items()}
     judgement = Judgement(truth=scored, errors=errors, moving=moving, static=static)
@@ -147,16 +151,26 @@ def _static_phasor(sequence: Sequence, truth: Truth) -> Float[np.ndarray, "F H W
             why="--against static-phasor was given, but the truth is geometry only",
             fix="leave --against out, or name a sequence that was simulated with it by --truth",
         )
+    if len(sequence.frequencies) > 1:
+        raise InputError(
+            "a static-phasor distance of one frequency",
+            where=sequence.path or "sequence",
+            why=f"--against static-phasor was given, and here are {len(sequence.frequencies)}, unwrapped together",
+            fix="leave --against out",
+        )
     return np.where(truth.known[:, None, None], truth.phasor_distance, np.nan)
 
 
 def summary(run: Run, found: Findings, *, protocol: str, against: str = AGAINST[0]) -> dict[str, Any]:
     """The content of metrics.json, in numbers, texts and None only."""
+    confidence = found.views.confidence
     return {
         "frames": len(found.views.frames),
         "protocol": protocol,
         "against": against,
         **_errors(found.judgement),
+        "unambiguous_range_m": unambiguous_range(found.sequence),
+        "ambiguous_share": None if confidence is None else float((confidence < CONFIDENT).mean()),
         "quad_psnr_db": measure.quad_psnr_db(
             found.views.quad_rendered,
             found.views.quad_measured,

@@ -13,10 +13,10 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 
-from ..constants import FRAMES_PER_QUARTET
 from ..data.sequence import Sequence
 from ..errors import InputError, UsageError
-from ..scene.sensor import Sensor, distance_from_phasor, phasor_from_quads
+from ..scene.sensor import Sensor, phasor_from_quads
+from ..scene.unwrap import distance_from_phasors
 
 PROTOCOLS = ("all", "ftorf13")
 ERROR_UNIT = 100.0  # errors are printed times 100, as in the published tables
@@ -29,8 +29,8 @@ def scored_frames(sequence: Sequence, protocol: str = "all") -> list[int]:
 
     Args:
         sequence: What was measured.
-        protocol: ``all``: every raw frame of a complete quartet, of a phasor only the first: its four raw frames are
-            one image of one instant. ``ftorf13``: the first frame of every complete quartet but the first and the last,
+        protocol: ``all``: every raw frame of a complete quartet, of a phasor only the first: its raw frames are one
+            image of one instant. ``ftorf13``: the first frame of every complete quartet but the first and the last,
             as in the published tables (13 of 60 frames).
 
     Raises:
@@ -49,12 +49,12 @@ def scored_frames(sequence: Sequence, protocol: str = "all") -> list[int]:
         raise InputError(
             "no complete quartet, nothing to score",
             where=sequence.path or "sequence",
-            why=f"a closed form needs four measured raw frames in a row; none among {sequence.frames} raw frames",
+            why=f"a closed form needs all raw frames of a cycle in a row; none among {sequence.frames} raw frames",
             fix="check the sequence with `gftorf check`, or record longer",
         )
     if protocol == "all":
-        slots = range(1 if sequence.from_phasors else FRAMES_PER_QUARTET)
-        return [FRAMES_PER_QUARTET * i + k for i in quartets for k in slots]
+        slots = range(1 if sequence.from_phasors else sequence.cycle)
+        return [sequence.cycle * i + k for i in quartets for k in slots]
     if len(quartets) < 3:
         raise UsageError(
             "protocol ftorf13 leaves no frame",
@@ -62,7 +62,7 @@ def scored_frames(sequence: Sequence, protocol: str = "all") -> list[int]:
             why=f"it drops the first and the last quartet, and the sequence has {len(quartets)}",
             fix="use --frames all",
         )
-    return [FRAMES_PER_QUARTET * i for i in quartets[1:-1]]
+    return [sequence.cycle * i for i in quartets[1:-1]]
 
 
 def squared_error(
@@ -112,9 +112,12 @@ def share(mask: Bool[np.ndarray, "S H W"], *others: Bool[np.ndarray, "S H W"]) -
     return int(mask.sum()) / total if total else None
 
 
-def distance_from_quads(quads: torch.Tensor, sensor: Sensor) -> torch.Tensor:
-    """d_ToF: the distance [m] in [0, c/2f) that a camera decodes from quads [Q, H, W] of one instant."""
-    return distance_from_phasor(*phasor_from_quads(quads, sensor.shifts), sensor)
+def distance_from_quads(quads: torch.Tensor, sensor: Sensor, *further: torch.Tensor) -> torch.Tensor:
+    """d_ToF: the distance [m] that a camera decodes from quads [Q, H, W] of one instant.
+
+    In [0, c/2f), or, with ``further`` quads for each of ``sensor.further_hz``, in [0, c / 2 f_0).
+    """
+    return distance_from_phasors([phasor_from_quads(one, sensor.shifts) for one in (quads, *further)], sensor)
 
 
 def normalised(distance: Float[np.ndarray, "*n"], opacity: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ..constants import FRAMES_PER_QUARTET
+from ..constants import SPEED_OF_LIGHT
 from ..data.decode import quartet_phasor
 from ..data.sequence import Sequence
+from ..data.unwrap import CONFIDENT
 from . import page, pictures
 from .gallery import Colour, Novel
 from .views import Views
@@ -25,7 +26,7 @@ CLOSE_UP_SHARE_MAX = 0.6  # a larger close-up would repeat the whole picture
 PHASOR_TEXT = "The camera delivered real and imaginary part, taken here as one instant."
 QUARTET_TEXT = (
     "Each raw frame shows another instant: what moves has moved on from the first to the last. The closed form takes "
-    "the four for one instant, hence the false distances along moving outlines."
+    "them for one instant, hence the false distances along moving outlines."
 )
 TITLES = {"closed_form": "closed form", "d": "ours, d", "d_tof": "ours, d_ToF"}
 
@@ -86,9 +87,9 @@ def common_distance_scale(found: Findings) -> pictures.Scale:
 
 
 def measured_quartet(found: Findings, s: int) -> str:
-    """The four quads of the quartet, one after the other, or the phasor; and what they decode to."""
+    """The quads of the quartet, one after the other, or the phasor; and what they decode to."""
     sequence, frame = found.sequence, found.views.frames[s]
-    quartet = frame // FRAMES_PER_QUARTET
+    quartet = frame // sequence.cycle
     re, im = quartet_phasor(sequence, quartet)
     if sequence.from_phasors:
         scale = pictures.signed_scale([re, im])
@@ -96,14 +97,15 @@ def measured_quartet(found: Findings, s: int) -> str:
         parts = {"real part": re, "imaginary part": im}
         measured = [page.picture(image, scale, title, note) for title, image in parts.items()]
     else:
-        raw = range(FRAMES_PER_QUARTET * quartet, FRAMES_PER_QUARTET * (quartet + 1))
+        raw = range(sequence.cycle * quartet, sequence.cycle * (quartet + 1))
         scale = pictures.signed_scale([sequence.quads[n] for n in raw])
         measured = [
             page.picture(
                 sequence.quads[n],
                 scale,
                 f"raw frame {n}",
-                f"shift {np.degrees(sequence.shifts[n]):.0f}°, {1e3 * sequence.times[n]:.1f} ms",
+                f"shift {np.degrees(sequence.shifts[n]):.0f}°, {1e3 * sequence.times[n]:.1f} ms"
+                + (f", {sequence.frame_frequencies[n] / 1e6:.4g} MHz" if len(sequence.frequencies) > 1 else ""),
             )
             for n in raw
         ]
@@ -114,8 +116,22 @@ def measured_quartet(found: Findings, s: int) -> str:
         page.picture(found.views.closed_form[s], common_distance_scale(found), "closed form", "phase as distance"),
     ]
     text = f'<p class="soft">{PHASOR_TEXT if sequence.from_phasors else QUARTET_TEXT}</p>'
-    figures = [*measured, *decoded, text]
-    return page.row(figures[:4]) + page.row(figures[4:], columns=4)
+    figures = [*measured, *decoded, *_by_frequency(found, s), text]
+    return "".join(page.row(figures[k : k + 4], columns=4) for k in range(0, len(figures), 4))
+
+
+def _by_frequency(found: Findings, s: int) -> list[str]:
+    """What each of several frequencies decodes to by itself, and how far they agree; nothing of one."""
+    views = found.views
+    if views.single is None or views.confidence is None:
+        return []
+    pictures_of = []
+    for f, image in zip(found.sequence.frequencies, views.single[s], strict=True):
+        scale = pictures.Scale(low=0.0, high=SPEED_OF_LIGHT / (2.0 * f), colours="viridis", unit="m")
+        pictures_of.append(page.picture(image, scale, f"{f / 1e6:.4g} MHz alone", f"wraps at {scale.high:.3g} m"))
+    share = float((views.confidence[s] < CONFIDENT).mean())
+    note = f"{100.0 * share:.2g} % ambiguous"
+    return [*pictures_of, page.picture(views.confidence[s], _share_scale(1.0), "confidence of the turn", note)]
 
 
 def distances(found: Findings, s: int, window: Window = WHOLE) -> str:
@@ -181,7 +197,7 @@ def strip_over_time(found: Findings) -> str:
 
 def animation(found: Findings) -> str:
     """Quartet starts one after the other: measured quad, rendered quad, closed form, ours."""
-    starts = [s for s, n in enumerate(found.views.frames) if n % FRAMES_PER_QUARTET == 0]
+    starts = [s for s, n in enumerate(found.views.frames) if n % found.sequence.cycle == 0]
     starts = starts[:: -(-len(starts) // ANIMATION_FRAMES_MAX)]
     if len(starts) < 2:
         return ""
@@ -228,7 +244,7 @@ def _share_scale(high: float) -> pictures.Scale:
 
 def _change(sequence: Sequence, n: int) -> float:
     """Mean change [quad units] to the quads of the same shift one quartet earlier and later."""
-    near = [m for m in (n - FRAMES_PER_QUARTET, n + FRAMES_PER_QUARTET) if 0 <= m < sequence.frames]
+    near = [m for m in (n - sequence.cycle, n + sequence.cycle) if 0 <= m < sequence.frames]
     changes = [float(np.abs(sequence.quads[m] - sequence.quads[n]).mean()) for m in near if sequence.measured[m]]
     return max(changes, default=0.0)
 

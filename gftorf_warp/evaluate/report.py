@@ -7,30 +7,33 @@ from typing import Any
 
 import numpy as np
 
+from ..data.decode import unambiguous_range
 from ..data.truth import MOVING_M
 from . import figures, gallery, page, panels, provenance
 from .metrics import DISTANCES, per_frame_mean
 from .panels import Findings
 
 ROWS = {
-    "closed_form": ("closed form", "atan2 of the four raw quads of a quartet"),
+    "closed_form": ("closed form", "decoded from the raw quads of a quartet"),
     "d": ("ours, d", "rendered mean distance, not divided by opacity"),
     "d_normalised": ("ours, d / opacity", "the same, divided"),
-    "d_tof": ("ours, d_ToF", "decoded from the four quads rendered at one instant"),
+    "d_tof": ("ours, d_ToF", "decoded from quads rendered at one instant"),
 }
+COUNTED = {3: "three", 4: "four", 5: "five", 6: "six", 8: "eight"}
 PIXELS = {"": "all pixels", "moving.": "moving pixels", "static.": "static pixels"}
 TO_READ = f"""
 <dl>
 <dt>distance</dt><dd>Length from the camera to the surface along the ray of a pixel, in metres. It is not the
 z-depth.</dd>
-<dt>closed form</dt><dd>What a camera computes by itself: four raw quads give a phase, the phase a distance. The quads
-are taken one after the other, so whatever moved in between gets a distance that nothing in the scene has.</dd>
+<dt>closed form</dt><dd>What a camera computes by itself: raw quads give a phase, the phase a distance; where there
+are several modulation frequencies, their phases together say how many whole turns to add. The quads are taken one after
+the other, so whatever moved in between gets a distance that nothing in the scene has.</dd>
 <dt>d</dt><dd>Mean distance of the reconstructed Gaussians at the time of one raw frame. It is not divided by
 opacity: where Gaussians let light through, the missing part counts as error.</dd>
-<dt>d_ToF</dt><dd>All four quads rendered at the time of one raw frame and decoded as the closed form. Like it, it lies
-within one unambiguous range, c / 2f.</dd>
-<dt>moving pixels</dt><dd>Pixels whose true distance changes by more than {MOVING_M} m within the four raw frames of
-their quartet: mostly the outline of what moves, and the object itself if it moves fast in depth.</dd>
+<dt>d_ToF</dt><dd>Quads rendered at the time of one raw frame and decoded as the closed form. Like it, it lies within
+the unambiguous range: c / 2f, or that of all frequencies together.</dd>
+<dt>moving pixels</dt><dd>Pixels whose true distance changes by more than {MOVING_M} m within the raw frames of their
+quartet: mostly the outline of what moves, and the object itself if it moves fast in depth.</dd>
 <dt>errors</dt><dd>Mean squared error in square metres times 100, then its root in centimetres. <em>All pixels</em> is
 the mean over frames of each frame's mean; <em>moving</em> and <em>static</em> pool the pixels of all frames. The closed
 form of a raw frame is the one image of its quartet, against the truth of that frame.</dd>
@@ -199,9 +202,11 @@ def _measured_text(found: Findings, s: int) -> str:
         return (
             f'<p class="caption">The phasor of raw frame {found.views.frames[s]}. Red is positive, blue negative.</p>'
         )
+    count = COUNTED.get(found.sequence.cycle, str(found.sequence.cycle))
     return (
-        f'<p class="caption">The quartet of raw frame {found.views.frames[s]}: four raw frames, each with its own '
-        "phase shift and its own time. Red is positive, blue negative.</p>"
+        f'<p class="caption">The quartet of raw frame {found.views.frames[s]}: {count} raw frames, each with its own '
+        f"{'phase shift' if len(found.sequence.frequencies) == 1 else 'phase shift, frequency'} and its own time. "
+        f"Distances are known modulo {unambiguous_range(found.sequence):.4g} m. Red is positive, blue negative.</p>"
     )
 
 
@@ -226,7 +231,7 @@ def _quad_text(found: Findings, s: int) -> str:
             "same pose at the same time before a black background; the difference should look like noise.</p>"
         )
     return (
-        f'<p class="caption">Raw frame {found.views.frames[s]} measured one of the four quads. Rendered from the same '
+        f'<p class="caption">Raw frame {found.views.frames[s]} measured one of the quads. Rendered from the same '
         "pose at the same time before a black background; the difference should look like noise.</p>"
     )
 

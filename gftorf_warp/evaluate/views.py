@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from jaxtyping import Float
 
-from ..constants import FRAMES_PER_QUARTET
-from ..data.decode import closed_form_distance
+from ..data.decode import Decoded, decode_quartet
 from ..data.images import write_exr, write_png
 from ..data.sequence import Sequence
 from ..errors import DivergedError, UsageError
@@ -44,13 +44,17 @@ class Views:
     opacity: Float[np.ndarray, "S H W"]
     """Rendered opacity [1]."""
     d_tof: Float[np.ndarray, "S H W"]
-    """Distance decoded from the four quads rendered at the time of the frame, in [0, c/2f) [m]."""
+    """Distance decoded from quads rendered at the time of the frame, at every frequency, in [0, range) [m]."""
     closed_form: Float[np.ndarray, "S H W"]
-    """Distance decoded from the measured quartet that the frame belongs to, in [0, c/2f) [m]."""
+    """Distance decoded from the measured quartet that the frame belongs to, in [0, range) [m]."""
     quad_rendered: Float[np.ndarray, "S H W"]
     """The slot that was measured, as rendered [file units]."""
     quad_measured: Float[np.ndarray, "S H W"]
     """What was recorded there [file units]."""
+    single: Float[np.ndarray, "S f H W"] | None = None
+    """What each of several frequencies by itself decodes to in that quartet [m]; None: there is one."""
+    confidence: Float[np.ndarray, "S H W"] | None = None
+    """How far they agree on the closed form [1], see data/unwrap.py; None: there is one frequency."""
 
     @property
     def d_normalised(self) -> Float[np.ndarray, "S H W"]:
@@ -81,17 +85,21 @@ def gather(
     Raises:
         DivergedError: If a rendering is not finite.
     """
-    closed_forms = {i: closed_form_distance(sequence, i) for i in sorted({n // FRAMES_PER_QUARTET for n in frames})}
+    decoded = {i: decode_quartet(sequence, i) for i in sorted({n // sequence.cycle for n in frames})}
+    quartets = [decoded[n // sequence.cycle] for n in frames]
     rows: dict[str, list[np.ndarray]] = {"d": [], "opacity": [], "d_tof": [], "quad_rendered": []}
     for count, n in enumerate(frames, start=1):
         rendering = render_frame(run, sequence, n)
-        d_tof = distance_from_quads(rendering.quads, run.sensor)
-        slot = channel_of_shift(run.sensor, float(sequence.shifts[n]))
+        light = {sequence.frequencies[0]: rendering}
+        for f in sequence.frequencies[1:]:
+            light[f] = render_frame(run, sequence, n, f_mod_hz=f)
+        d_tof = distance_from_quads(rendering.quads, run.sensor, *(light[f].quads for f in sequence.frequencies[1:]))
+        own = light[float(sequence.frame_frequencies[n])]
         images = {
             "d": rendering.distance,
             "opacity": rendering.opacity,
             "d_tof": d_tof,
-            "quad_rendered": rendering.quads[slot],
+            "quad_rendered": quad_of_shift(own, run.sensor, float(sequence.shifts[n])),
         }
         for name, image in images.items():
             rows[name].append(finite(image, f"{name} of raw frame {n}", run))
@@ -99,15 +107,28 @@ def gather(
             progress(count, len(frames))
     return Views(
         frames=frames,
-        closed_form=np.stack([closed_forms[n // FRAMES_PER_QUARTET] for n in frames]).astype(np.float32),
+        closed_form=np.stack([one.distance for one in quartets]).astype(np.float32),
         quad_measured=sequence.quads[frames],
+        **_agreement(quartets),
         **{name: np.stack(images) for name, images in rows.items()},
     )
 
 
-def render_frame(run: Run, sequence: Sequence, n: int) -> Rendering:
-    """The field at the time and from the pose of raw frame n."""
-    return run.render(float(sequence.times[n]), camera_at(run, sequence, float(sequence.times[n])))
+def _agreement(quartets: list[Decoded]) -> dict[str, Any]:
+    """What several frequencies say by themselves, and how far they agree; empty of one."""
+    confidence = [one.confidence for one in quartets if one.confidence is not None]
+    if len(confidence) < len(quartets):
+        return {}
+    single = np.stack([one.single for one in quartets]).astype(np.float32)
+    return {"single": single, "confidence": np.stack(confidence).astype(np.float32)}
+
+
+def render_frame(run: Run, sequence: Sequence, n: int, *, f_mod_hz: float | None = None) -> Rendering:
+    """The field at the time and from the pose of raw frame n; quads at ``f_mod_hz``, None: the first frequency."""
+    time = float(sequence.times[n])
+    if f_mod_hz is None:
+        return run.render(time, camera_at(run, sequence, time))
+    return run.render(time, camera_at(run, sequence, time), f_mod_hz=f_mod_hz)
 
 
 def camera_at(run: Run, sequence: Sequence, time: float) -> Camera:
@@ -116,16 +137,16 @@ def camera_at(run: Run, sequence: Sequence, time: float) -> Camera:
     return run.camera.at(sequence.camera_from_world[nearest])
 
 
-def channel_of_shift(sensor: Sensor, shift: float) -> int:
-    """Index of the quad that the sensor renders for a phase shift [rad].
+def quad_of_shift(rendering: Rendering, sensor: Sensor, shift: float) -> torch.Tensor:
+    """The quad [H, W] of any phase shift [rad], of a rendering with those of the sensor's.
 
-    Raises:
-        ValueError: If the sensor does not render that shift.
+    Where it was not rendered it follows from the phasor, (re cos shift + im sin shift + dc_offset |amplitude|) / 2.
     """
     channel = channel_of(sensor.shifts, shift)
-    if channel is None:
-        raise ValueError(f"shift {shift} rad is not among those the sensor renders, {sensor.shifts}")
-    return channel
+    if channel is not None:
+        return rendering.quads[channel]
+    re, im, amplitude = rendering.phasor
+    return 0.5 * (re * math.cos(shift) + im * math.sin(shift) + sensor.dc_offset * amplitude)
 
 
 def finite(image: torch.Tensor, name: str, run: Run) -> Float[np.ndarray, "*image"]:

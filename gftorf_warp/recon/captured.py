@@ -43,6 +43,9 @@ def unsuitable(observations: Observations, settings: ReconSettings, state: State
     first = observations.cameras[0]
     if observations.phasors or settings.weights.quads == 0:
         return "phasors are compared, not quads"
+    sequence = observations.sequence
+    if sequence.cycle != FRAMES_PER_QUARTET or len(sequence.frequencies) > 1:
+        return f"a cycle has {sequence.cycle} raw frames at {len(sequence.frequencies)} modulation frequencies"
     if settings.weights.colour > 0 or settings.weights.depth > 0:
         return "colour or closed-form distance is compared"
     if any((camera.camera_from_world != first.camera_from_world).any() for camera in observations.cameras):

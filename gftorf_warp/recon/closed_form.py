@@ -1,6 +1,6 @@
 """The closed form as a method: what a camera computes by itself, behind the interface of a reconstruction.
 
-Every quartet is decoded as if its four raw frames had been taken at once (method, sections 2.9 and 7, row ``ctof``).
+Every quartet is decoded as if its raw frames had been taken at once (method, sections 2.9 and 7, row ``ctof``).
 Nothing was fitted, so there is one distance per quartet and one place to look from.
 """
 
@@ -18,8 +18,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..constants import FRAMES_PER_QUARTET
-from ..data.decode import distance_from_phase, quartet_phasor
+from ..data.decode import decode_quartet, quartet_phasors
 from ..data.sequence import Sequence
 from ..errors import InputError, UsageError
 from ..render.api import Rendering
@@ -70,17 +69,24 @@ class ClosedForm(Run):
         )
 
     def render(
-        self, time: float, camera: Camera | None = None, *, extra: Float[Tensor, "0 D"] | None = None
+        self,
+        time: float,
+        camera: Camera | None = None,
+        *,
+        extra: Float[Tensor, "0 D"] | None = None,
+        f_mod_hz: float | None = None,
     ) -> Rendering:
         """The measured quartet nearest to a time, as if it had been taken at that instant.
 
-        Quads are the measured ones in canonical order, the distance is what they decode to, and nothing is transparent.
-        There is no colour and no distortion, and extra channels are zero.
+        Quads are the measured ones in canonical order, computed from the phasor where the sensor has another shift; the
+        distance is what all frequencies together decode to, and nothing is transparent. There is no colour and no
+        distortion, and extra channels are zero.
 
         Args:
             time: Seconds since raw frame 0, any number; during a quartet its own, else the nearest complete one.
             camera: None, or the sequence's own at the time.
             extra: Channels per Gaussian, of which there are none.
+            f_mod_hz: Modulation frequency of quads and phasor [Hz]; None: the first of the sensor.
 
         Raises:
             InputError: If the sequence cannot be read again, or none of its quartets is complete.
@@ -89,18 +95,19 @@ class ClosedForm(Run):
         sequence = self._measured
         quartet = nearest_quartet(sequence, time)
         self._check(camera, sequence, quartet, time)
-        re, im = quartet_phasor(sequence, quartet)
-        distance = distance_from_phase(np.arctan2(im, re), sequence)
+        decoded = decode_quartet(sequence, quartet)
+        which = 0 if f_mod_hz is None else sequence.frequencies.index(f_mod_hz)
+        re, im = decoded.phasors[which]
         size = (sequence.height, sequence.width)
 
         def tensor(image: np.ndarray) -> Tensor:
             return torch.tensor(image, dtype=torch.float32, device=self.field.device)
 
         return Rendering(
-            quads=tensor(np.stack([quad(sequence, quartet, shift) for shift in self.sensor.shifts])),
+            quads=tensor(quads_of(sequence, quartet, self.sensor.shifts, which)),
             phasor=tensor(np.stack([re, im, np.hypot(re, im)])),
             colour=None,
-            distance=tensor(distance),
+            distance=tensor(decoded.distance),
             opacity=tensor(np.ones(size)),
             distortion=tensor(np.zeros(size)),
             extra=None if extra is None else tensor(np.zeros((extra.shape[1], *size))),
@@ -115,7 +122,7 @@ class ClosedForm(Run):
         """Refuse every camera but the sequence's own."""
         if camera is None:
             return
-        frames = [*range(FRAMES_PER_QUARTET * quartet, FRAMES_PER_QUARTET * (quartet + 1))]
+        frames = [*range(sequence.cycle * quartet, sequence.cycle * (quartet + 1))]
         frames.append(int(np.abs(sequence.times - time).argmin()))
         apart = np.abs(sequence.camera_from_world[frames] - camera.camera_from_world).max(axis=(1, 2)).min()
         names = ("width", "height", "fx", "fy", "cx", "cy")
@@ -135,7 +142,7 @@ class ClosedForm(Run):
             raise InputError(
                 "no complete quartet",
                 where=sequence.path or "sequence",
-                why="a closed form needs four measured raw frames in a row",
+                why="a closed form needs all raw frames of a cycle in a row",
                 fix="check the sequence with `gftorf check`, or record longer",
             )
         return sequence
@@ -145,18 +152,25 @@ def nearest_quartet(sequence: Sequence, time: float) -> int:
     """The complete quartet during which ``time`` [s] lies, else the one that ends or begins nearest to it."""
 
     def away(quartet: int) -> float:
-        first = FRAMES_PER_QUARTET * quartet
-        start, end = sequence.times[first], sequence.times[first + FRAMES_PER_QUARTET - 1]
+        first = sequence.cycle * quartet
+        start, end = sequence.times[first], sequence.times[first + sequence.cycle - 1]
         return max(float(start - time), float(time - end), 0.0)
 
     return min(sequence.complete_quartets, key=away)
 
 
-def quad(sequence: Sequence, quartet: int, shift: float) -> Float[np.ndarray, "H W"]:
-    """The raw frame of a quartet with a shift [rad]; if none has it, a cos(psi - shift) of the decoded phasor."""
-    first = FRAMES_PER_QUARTET * quartet
-    slot = channel_of(sequence.shifts[first : first + FRAMES_PER_QUARTET].tolist(), shift)
-    if slot is not None:
-        return sequence.quads[first + slot]
-    re, im = quartet_phasor(sequence, quartet)
-    return 0.5 * (re * math.cos(shift) + im * math.sin(shift))
+def quads_of(
+    sequence: Sequence, quartet: int, shifts: Iterable[float], frequency: int = 0
+) -> Float[np.ndarray, "Q H W"]:
+    """The raw frames of a quartet with these shifts [rad], at one of its frequencies.
+
+    If these are not all that was measured there, they are a (cos(psi - shift) + dc_offset) of the decoded phasor:
+    some of the measured ones decode to another phase than all of them.
+    """
+    frames, (re, im) = quartet_phasors(sequence, quartet)[frequency]
+    shifts = list(shifts)
+    slots = [channel_of(sequence.shifts[frames].tolist(), shift) for shift in shifts]
+    if any(slot is None for slot in slots) or len(frames) != len(slots):
+        constant = sequence.dc_offset * np.hypot(re, im)
+        return np.stack([0.5 * (re * math.cos(shift) + im * math.sin(shift) + constant) for shift in shifts])
+    return np.stack([sequence.quads[frames[slot]] for slot in slots if slot is not None])

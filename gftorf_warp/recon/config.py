@@ -9,7 +9,6 @@ import numpy as np
 import torch
 
 from .. import __version__
-from ..constants import FRAMES_PER_QUARTET
 from ..data.sequence import Sequence
 from ..render.buffers import available_threads
 from ..scene.measured import camera_of, frame_period, sensor_of
@@ -42,7 +41,8 @@ def config_of(
             **{name: value for name, value in asdict(camera).items() if name != "distortion" or camera.distortion},
             "camera_from_world": camera.camera_from_world.tolist(),
         },
-        "sensor": {name: getattr(sensor, name) for name in ("f_mod_hz", "phase_offset", "dc_offset", "frame_period_s")},
+        "sensor": {name: getattr(sensor, name) for name in ("f_mod_hz", "phase_offset", "dc_offset", "frame_period_s")}
+        | ({"further_hz": list(sensor.further_hz)} if sensor.further_hz else {}),
         "init": str(settings.init.kind),
         "motion": str(settings.motion.kind),
         "schedule": resolved(settings),
@@ -52,7 +52,7 @@ def config_of(
 
 def _rate(sequence: Sequence) -> float:
     """Raw frames, or phasors, per second: what the reader of the sequence was or would be told."""
-    times = sequence.times[:: FRAMES_PER_QUARTET if sequence.from_phasors else 1]
+    times = sequence.times[:: sequence.cycle if sequence.from_phasors else 1]
     period = float(np.diff(times).mean()) if len(times) > 1 else frame_period(sequence)
     return round(1.0 / period, 9)  # of a time in seconds, which is no exact decimal
 

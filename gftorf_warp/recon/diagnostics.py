@@ -17,13 +17,13 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from ..constants import FRAMES_PER_QUARTET
 from ..data.estimates import steady_pixels
 from ..data.sequence import Sequence, Truth
 from ..data.truth import known_distance, moving_and_static, nearest
 from ..render.api import rasterize
 from ..render.buffers import Distortion
-from ..scene.sensor import distance_from_phasor, phasor_from_quads
+from ..scene.sensor import phasor_from_quads
+from ..scene.unwrap import common_range, distance_from_phasors
 from .observations import Observations
 from .record import Metrics
 from .settings import ReconSettings
@@ -59,7 +59,7 @@ class Watch:
             if len(known.distance) != sequence.frames:
                 raise ValueError(f"truth of {len(known.distance)} raw frames for a sequence of {sequence.frames}")
             distance = nearest(known_distance(known), sequence.height, sequence.width)
-            masks = moving_and_static(distance, self.frames, from_phasors=sequence.from_phasors)
+            masks = moving_and_static(distance, self.frames, from_phasors=sequence.from_phasors, cycle=sequence.cycle)
             self.moving, self.static = (torch.tensor(mask, device=device) for mask in masks)
             self.truth = torch.tensor(distance[self.frames], dtype=torch.float32, device=device)
         elif (steady := measured_static(sequence)) is not None:
@@ -105,9 +105,12 @@ class Watch:
             rendering = rasterize(bare.moved(displacement), seen.cameras[frame], seen.sensor, kept, extra=length)
             assert rendering.extra is not None
             images["d"].append(rendering.distance)
-            images["d_tof"].append(
-                distance_from_phasor(*phasor_from_quads(rendering.quads, seen.sensor.shifts), seen.sensor)
-            )
+            light = [rendering.quads]
+            for f in seen.sensor.further_hz:
+                other, moved = replace(seen.sensor, f_mod_hz=f, further_hz=()), bare.moved(displacement)
+                light.append(rasterize(moved, seen.cameras[frame], other, kept, images=("quads",)).quads)
+            phasors = [phasor_from_quads(quads, seen.sensor.shifts) for quads in light]
+            images["d_tof"].append(distance_from_phasors(phasors, seen.sensor))
             images["opacity"].append(rendering.opacity)
             images["distortion"].append(rendering.distortion)
             images["offset"].append(rendering.extra[0] / rendering.opacity.clamp_min(1e-6))
@@ -129,7 +132,7 @@ class Watch:
                 row[f"{prefix}{name}_mse_x100"] = None if value is None else 100.0 * value
         row["transmittance"] = _mean(1.0 - images["opacity"], everywhere)
         row["distortion"] = _mean(images["distortion"], everywhere)
-        period = self.observations.sensor.unambiguous_range
+        period = common_range(self.observations.sensor)
         apart = torch.remainder(images["d"] - images["d_tof"] + 0.5 * period, period) - 0.5 * period
         row["offset_static_m"] = _mean(images["offset"], self.static)
         row["d_minus_dtof_static_m"] = _mean(apart.abs(), self.static)
@@ -141,7 +144,7 @@ def watched_frames(sequence: Sequence, truth: Truth | None) -> list[int]:
 
     With a truth, quartets that it knows nothing of do not count.
     """
-    every = range(0, sequence.frames, FRAMES_PER_QUARTET)
+    every = range(0, sequence.frames, sequence.cycle)
     starts = [n for n in every if truth is None or truth.known[n]] or [*every]
     inner = starts[1:-1] or starts
     chosen = np.linspace(0, len(inner) - 1, min(FRAMES, len(inner))).round().astype(int)

@@ -9,7 +9,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..constants import FRAMES_PER_QUARTET
 from ..losses.image import similarity
 from ..losses.prior import flow_error, image_motion, motion_size
 from ..losses.tof import quad_error
@@ -104,8 +103,9 @@ def terms(
             rendered, measured = tof.quads, observations.quads[frame][None]
         loss, squared = image_loss(rendered, measured, weights.ssim, kernel=kernel)
         result["quads"] = weights.quads * loss
-    if tof is not None and weights.depth > 0 and frame // FRAMES_PER_QUARTET in observations.closed_form:
-        measured = observations.closed_form[frame // FRAMES_PER_QUARTET][None]
+    cycle = observations.sequence.cycle
+    if tof is not None and weights.depth > 0 and frame // cycle in observations.closed_form:
+        measured = observations.closed_form[frame // cycle][None]
         loss, _ = image_loss(tof.distance[None], measured, weights.ssim, Norm.L1, kernel=kernel)
         result["depth"] = weights.depth * loss
     if tof is not None and weights.distortion > 0:
@@ -124,7 +124,7 @@ def terms(
         squared = of_colour if squared is None else squared
     if motion is not None and weights.motion_size > 0:
         result["motion_size"] = weights.motion_size * motion_size(displacement).mean()
-    if motion is not None and weights.flow > 0 and frame % FRAMES_PER_QUARTET == 0:
+    if motion is not None and weights.flow > 0 and frame % cycle == 0:
         flow = flow_loss(field, motion, attachment, observations, frame, render, kernel=kernel)
         if flow is not None:
             result["flow"] = weights.flow * flow
@@ -224,7 +224,8 @@ def flow_loss(
     displacement between keys only: the surface and all weights are held fixed (method, section 5). If the camera moves,
     the flow of its own motion is part of both. ``kernel``: whether the hand-written kernels compare.
     """
-    quartet = frame // FRAMES_PER_QUARTET
+    cycle = observations.sequence.cycle
+    quartet = frame // cycle
     steps = [step for step in (1, -1) if (quartet, step) in observations.flow]
     if not steps:
         return None
@@ -235,7 +236,7 @@ def flow_loss(
     seen = rasterize(still, camera, sensor, render, extra=channels, images=wanted)
     assert seen.extra is not None
     last = len(observations.cameras) - 1
-    later = [observations.cameras[min(frame + FRAMES_PER_QUARTET * step, last)] for step in steps]
+    later = [observations.cameras[min(frame + cycle * step, last)] for step in steps]
     measured = [observations.flow[quartet, step] for step in steps]
     if kernel:
         return fused.flow_loss(seen.distance, seen.extra, torch.stack(measured)[None], camera, later)

@@ -11,8 +11,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ..constants import FRAMES_PER_QUARTET
-from ..data.decode import closed_form_distance, quad_scale, quartet_phasor
+from ..data.decode import closed_form_distance, quad_scale, quartet_phasors
 from ..data.sequence import Sequence
 from ..errors import InputError
 from ..scene.camera import Camera
@@ -22,7 +21,7 @@ from ..scene.sensor import Sensor
 from ..scene.still import still_pixels
 from .settings import Batch, FlowSource, Input, ReconSettings
 
-HASHED = ("quads", "measured", "shifts", "times", "camera_from_world", "colour_from_world")
+HASHED = ("quads", "measured", "shifts", "times", "frequencies_hz", "camera_from_world", "colour_from_world")
 HASHED_NUMBERS = ("f_mod_hz", "phase_offset", "dc_offset", "fx", "fy", "cx", "cy", "quad_scale", "colour_intrinsics")
 
 
@@ -35,7 +34,8 @@ class Observations:
     quads: Float[Tensor, "F H W"]
     """Its quads on the device; rows that were not measured are never read."""
     phasors: dict[int, Float[Tensor, "2 H W"]]
-    """Phasors (re, im) by the raw frame that stands for the quartet; empty if quads are compared."""
+    """Phasors (re, im) by the raw frame that stands for them, the first of their frequency in the quartet; empty if
+    quads are compared."""
     colour: dict[int, Float[Tensor, "3 h w"]]
     """Colour images by raw frame, divided by the largest value of all; empty if colour is not compared."""
     colour_cameras: dict[int, Camera]
@@ -47,7 +47,7 @@ class Observations:
     cameras: list[Camera]
     """The camera of every raw frame."""
     sensor: Sensor
-    """The sensor, with the canonical shifts."""
+    """The sensor, with the canonical shifts, at all frequencies."""
     batches: list[list[int]]
     """The raw frames of every possible step; each measured frame is in one of them."""
     flow: dict[tuple[int, int], Float[Tensor, "2 H W"]]
@@ -62,8 +62,11 @@ class Observations:
     """Pixels whose quads never change; None: nobody asked for them."""
 
     def sensor_at(self, frame: int) -> Sensor:
-        """The sensor reading only the shift of one raw frame."""
-        return self.sensor.with_shifts((float(self.sequence.shifts[frame]),))
+        """The sensor as one raw frame used it: at its frequency, reading its shift only."""
+        alone = self.sensor.with_shifts((float(self.sequence.shifts[frame]),))
+        if not self.sensor.further_hz:
+            return alone
+        return replace(alone, f_mod_hz=float(self.sequence.frame_frequencies[frame]), further_hz=())
 
     def rays_at(self, frame: int) -> tuple[Float[Tensor, "3"], Float[Tensor, "H W 3"]]:
         """Centre of the camera [m] and unit vectors through its pixels, in world axes; sent once per pose."""
@@ -78,7 +81,7 @@ class Observations:
         """Flow [px] of every quartet to the next one and to the one before, NaN where there is none; None: no flow."""
         if not self.flow:
             return None
-        count = -(-len(self.quads) // FRAMES_PER_QUARTET)
+        count = -(-len(self.quads) // self.sequence.cycle)
         table = self.quads.new_full((count, 2, 2, *self.quads.shape[1:]), float("nan"))
         for (quartet, step), flow in self.flow.items():
             table[quartet, 0 if step == 1 else 1] = flow
@@ -89,16 +92,12 @@ class Observations:
         return {}
 
     def time_at(self, frame: int) -> float:
-        """When raw frame ``frame`` was taken [s]; if phasors are compared, the middle of its quartet."""
+        """When raw frame ``frame`` was taken [s]; if phasors are compared, the mean time of those that made its own."""
         if self.phasors:
-            return float(self.sequence.times[quartet_frames(frame)].mean())
+            frames = self.sequence.quartet_frames(frame // self.sequence.cycle)
+            frequencies = self.sequence.frame_frequencies
+            return float(self.sequence.times[frames][frequencies[frames] == frequencies[frame]].mean())
         return float(self.sequence.times[frame])
-
-
-def quartet_frames(frame: int) -> slice:
-    """The raw frames of the quartet of one of them."""
-    start = frame - frame % FRAMES_PER_QUARTET
-    return slice(start, start + FRAMES_PER_QUARTET)
 
 
 def input_of(sequence: Sequence, wanted: Input) -> Input:
@@ -113,7 +112,7 @@ def observe(sequence: Sequence, settings: ReconSettings, device: torch.device | 
 
     Raises:
         InputError: If no raw frame was measured, all quads are zero, what is to be compared does not exist, or the
-            sensor is one that cannot be rendered: several modulation frequencies.
+            sensor is one that cannot be rendered: frequencies without a common range.
     """
     if not sequence.measured.any() or not np.abs(sequence.quads[sequence.measured]).max() > 0:
         raise InputError(
@@ -122,7 +121,6 @@ def observe(sequence: Sequence, settings: ReconSettings, device: torch.device | 
             why="no raw frame exists, or all of them are zero",
             fix="check the folder with `gftorf check`",
         )
-    _demand_one_frequency(sequence)
     if settings.quad_scale is None:
         scale, scale_source = quad_scale(sequence)
     else:
@@ -136,9 +134,10 @@ def observe(sequence: Sequence, settings: ReconSettings, device: torch.device | 
 
     phasors, closed_form = {}, {}
     if input_of(sequence, settings.input) == Input.PHASOR and settings.weights.quads > 0:
-        phasors = {FRAMES_PER_QUARTET * i: on_device(quartet_phasor(prepared, i)) for i in prepared.complete_quartets}
+        decoded = [found for i in prepared.complete_quartets for found in quartet_phasors(prepared, i)]
+        phasors = {frames[0]: on_device(phasor) for frames, phasor in decoded}
         if not phasors:
-            raise _nothing_to_compare(sequence, "no complete quartet", "a phasor needs four raw frames of one quartet")
+            raise _nothing_to_compare(sequence, "no complete quartet", "a phasor needs all raw frames of one quartet")
     if settings.weights.depth > 0:
         closed_form = {i: on_device(closed_form_distance(prepared, i)) for i in prepared.complete_quartets}
     colour, colour_scale = _colour(prepared, settings)
@@ -155,9 +154,7 @@ def observe(sequence: Sequence, settings: ReconSettings, device: torch.device | 
         sensor=sensor_of(prepared),
         batches=_batches(prepared, settings, phasors, colour),
         flow={
-            (n // FRAMES_PER_QUARTET, step): on_device(flow)
-            for step, flows in steps.items()
-            for n, flow in flows.items()
+            (n // prepared.cycle, step): on_device(flow) for step, flows in steps.items() for n, flow in flows.items()
         },
         quad_scale=float(scale),
         quad_scale_source=scale_source,
@@ -191,8 +188,8 @@ def _batches(sequence: Sequence, settings: ReconSettings, phasors: dict, colour:
     measured = [n for n in range(sequence.frames) if sequence.measured[n]]
     if settings.schedule.batch == Batch.FRAME:
         return [[n] for n in measured]
-    quartets = sorted({n // FRAMES_PER_QUARTET for n in measured})
-    return [[n for n in measured if n // FRAMES_PER_QUARTET == i] for i in quartets]
+    quartets = sorted({n // sequence.cycle for n in measured})
+    return [[n for n in measured if n // sequence.cycle == i] for i in quartets]
 
 
 def _colour(sequence: Sequence, settings: ReconSettings) -> tuple[dict[int, np.ndarray], float | None]:
@@ -207,17 +204,6 @@ def _colour(sequence: Sequence, settings: ReconSettings) -> tuple[dict[int, np.n
     if not largest > 0:
         raise _nothing_to_compare(sequence, "colour is black", "all colour images are zero")
     return {n: image / np.float32(largest) for n, image in sequence.colour.items()}, 1.0 / largest
-
-
-def _demand_one_frequency(sequence: Sequence) -> None:
-    frequencies = [] if sequence.frequencies_hz is None else sorted(set(sequence.frequencies_hz.tolist()))
-    if len(frequencies) > 1:
-        raise InputError(
-            "a sensor that is not rendered",
-            where=sequence.path or "sequence",
-            why=f"expected one modulation frequency, found {frequencies} Hz",
-            fix="keep the raw frames of one frequency",
-        )
 
 
 def _nothing_to_compare(sequence: Sequence, what: str, why: str) -> InputError:

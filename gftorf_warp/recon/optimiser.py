@@ -10,7 +10,6 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
-from ..constants import FRAMES_PER_QUARTET
 from ..scene.gaussians import GaussianField
 from ..scene.motion import Motion
 from .settings import Batch, BatchRule, Input, ReconSettings
@@ -61,7 +60,7 @@ def _images(settings: ReconSettings) -> int:
     """Images of a step as far as Adam is concerned; a last batch that is cut short counts as a whole one."""
     schedule = settings.schedule
     joint = schedule.batch == Batch.QUARTET and settings.input != Input.PHASOR and settings.weights.quads > 0
-    return FRAMES_PER_QUARTET if joint and schedule.batch_rule != BatchRule.NONE else 1
+    return settings.cycle if joint and schedule.batch_rule != BatchRule.NONE else 1
 
 
 def frozen(settings: ReconSettings, images: int) -> bool:

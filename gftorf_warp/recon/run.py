@@ -42,7 +42,7 @@ class Run:
     camera: Camera
     """The camera of raw frame 0 at the sequence's own resolution."""
     sensor: Sensor
-    """The sensor, with the four canonical shifts."""
+    """The sensor, with the four canonical shifts, at all its frequencies."""
     quad_scale: float
     """The sequence's units times this are those of the optimisation."""
     field: GaussianField
@@ -62,7 +62,9 @@ class Run:
         path = Path(path)
         config = read_config(path)
         camera = _camera(config["camera"])
-        sensor = Sensor(**config["sensor"], shifts=CANONICAL_SHIFTS)
+        stored = config["sensor"]
+        further = tuple(stored.get("further_hz", ()))
+        sensor = Sensor(**stored | {"further_hz": further}, shifts=CANONICAL_SHIFTS)
         if config["settings"].get("method") == Method.CTOF:
             from .closed_form import ClosedForm
 
@@ -100,7 +102,12 @@ class Run:
 
     @torch.no_grad()
     def render(
-        self, time: float, camera: Camera | None = None, *, extra: Float[Tensor, "N D"] | None = None
+        self,
+        time: float,
+        camera: Camera | None = None,
+        *,
+        extra: Float[Tensor, "N D"] | None = None,
+        f_mod_hz: float | None = None,
     ) -> Rendering:
         """What the sensor would see at one instant, before black.
 
@@ -112,12 +119,14 @@ class Run:
             time: Seconds since raw frame 0, any number.
             camera: Where from, and how many pixels; None is the sequence's own.
             extra: More channels per Gaussian, composited like colour.
+            f_mod_hz: Modulation frequency of quads and phasor [Hz]; None: the first of the sensor.
         """
         camera = camera or self.camera
+        sensor = self.sensor if f_mod_hz is None else replace(self.sensor, f_mod_hz=f_mod_hz, further_hz=())
         rendering = rasterize(
             self.widened(self.field.moved(self.motion.displacement(self.attachment, time)), camera),
             camera,
-            self.sensor,
+            sensor,
             self.render_settings,
             extra=extra,
         )

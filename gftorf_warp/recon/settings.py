@@ -10,6 +10,7 @@ import dataclasses
 import enum
 from dataclasses import dataclass, field
 
+from ..constants import FRAMES_PER_QUARTET
 from ..render.buffers import RenderSettings
 from ..scene.initialise import InitSettings
 from ..scene.motion import MotionSettings
@@ -253,6 +254,9 @@ class ReconSettings:
     """What kind of reconstruction this is."""
     input: Input = Input.AUTO
     """What is compared with the sensor."""
+    cycle: int = FRAMES_PER_QUARTET
+    """Raw frames of a quartet, which is that of the sequence: a step of so many images learns as much as the preset
+    says for four of them, see ``schedule.batch_rule``."""
     quad_scale: float | None = None
     """Multiplies quads and phasors first [1]; None: as the sequence says, or to a largest phasor of 1."""
     width_max: int | None = None

@@ -14,6 +14,7 @@ from ..scene.initialise import MOVING, Init, Start, from_phase, from_random
 from ..scene.measured import key_times
 from ..scene.motion import Motion, MotionKind, MotionSettings, Nodes, Products, Still, farthest_points
 from ..scene.network import Network
+from ..scene.unwrap import common_range
 from . import densify
 from .observations import Observations
 from .optimiser import Optimiser, betas_of
@@ -101,7 +102,7 @@ def _motion(start: Start, observations: Observations, settings: ReconSettings, g
         return Still(times)
     if settings.motion.kind == MotionKind.NETWORK:
         duration = float(sequence.times[-1] - sequence.times[0]) or 1.0  # one instant: nothing can move
-        length = settings.motion.input_scale * observations.sensor.unambiguous_range
+        length = settings.motion.input_scale * common_range(observations.sensor)
         return Network(times, settings.motion, duration=duration, length=length, generator=generator)
     moving = start.field.mean[start.field.layer == MOVING]
     nodes = farthest_points(moving, settings.motion.nodes)

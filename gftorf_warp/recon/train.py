@@ -17,13 +17,13 @@ from typing import TypeVar
 
 import torch
 
+from ..data.decode import unambiguous_range
 from ..data.estimates import dc_offset
 from ..data.findings import DC_TOLERANCE
 from ..data.sequence import Sequence, Truth
 from ..errors import DivergedError, InputError, UsageError
 from ..render.buffers import available_threads
 from ..scene.changes import Wording, changed
-from ..scene.measured import sensor_of
 from . import checkpoint, folder, presets
 from .captured import steps_of
 from .config import config_of
@@ -39,8 +39,11 @@ LOG = logging.getLogger("gftorf_warp")
 Progress = Callable[..., None]
 Choice = TypeVar("Choice", bound=enum.StrEnum)
 CHANGES = Wording(
-    option="--set", example="init.reflectivity=0.5", where="config.json", fixed=("preset", "ablation", "method")
-)  # the last three have options of their own, or follow from one
+    option="--set",
+    example="init.reflectivity=0.5",
+    where="config.json",
+    fixed=("preset", "ablation", "method", "cycle"),
+)  # these have options of their own, or follow from one
 
 
 def reconstruct(
@@ -93,7 +96,7 @@ def reconstruct(
         sequence = Sequence.open(sequence)
     if isinstance(settings, str):
         found = input_of(sequence, _choice(Input, input, "--input"))
-        recorded = presets.Recorded(input=found, unambiguous_range=sensor_of(sequence).unambiguous_range)
+        recorded = presets.Recorded(input=found, unambiguous_range=unambiguous_range(sequence))
         settings = presets.preset(settings, recorded)
     if ablation is not None:
         settings = presets.ablated(settings, ablation)
@@ -103,6 +106,7 @@ def reconstruct(
         settings = replace(settings, flow=_choice(FlowSource, flow, "--flow"))
     changes = list(changes)
     settings = changed(settings, changes, CHANGES)
+    settings = replace(settings, cycle=sequence.cycle)
     out = Path(out)
     config = config_of(sequence, settings, seed=seed, device=device)
     config |= {"flow": None if flow is None else str(flow), "changes": changes}

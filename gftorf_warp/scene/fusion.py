@@ -19,13 +19,12 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ..constants import FRAMES_PER_QUARTET
-from ..data.decode import quartet_phasor
+from ..data.decode import unambiguous_range
 from ..data.sequence import Sequence
 from .camera import Camera
-from .measured import DISTANCE_TRUSTED, camera_of, distance_noise, fill, sensor_of
-from .sensor import distance_from_phasor
+from .measured import DISTANCE_TRUSTED, camera_of, decoded_phasors, distance_noise, fill, quads_gain, sensor_of
 from .tracks import unproject
+from .unwrap import distance_from_phasors
 
 WITNESSES = 32  # quartets that judge a point, spread evenly: more cost time and see little else
 SEEN_THROUGH = 0.3  # share of the witnesses with a say beyond which a point is not static
@@ -90,19 +89,19 @@ def views_of(sequence: Sequence, nearer: float) -> Views:
     """
     sensor = sensor_of(sequence)
     quartets = sequence.complete_quartets
-    phasors = torch.as_tensor(np.stack([quartet_phasor(sequence, i) for i in quartets]), dtype=torch.float32)
-    amplitude = 0.5 * phasors.norm(dim=1)
-    frames = [FRAMES_PER_QUARTET * i + 1 for i in quartets]
+    phasors = decoded_phasors(sequence, quartets)
+    amplitude = 0.5 * phasors[0].norm(dim=1)
+    frames = [sequence.cycle * i + (sequence.cycle - 1) // 2 for i in quartets]
     views = Views(
         quartets=quartets,
         times=[float(sequence.times[n]) for n in frames],
         cameras=[camera_of(sequence, n) for n in frames],
-        distance=distance_from_phasor(phasors[:, 0], phasors[:, 1], sensor),
+        distance=distance_from_phasors([(p[:, 0], p[:, 1]) for p in phasors], sensor),
         amplitude=amplitude,
         margin=torch.full_like(amplitude, nearer),
-        unambiguous_range=sensor.unambiguous_range,
+        unambiguous_range=unambiguous_range(sequence),
     )
-    deviation = distance_noise(amplitude, _noise(views, float(sensor.phase_slope)), sensor)
+    deviation = distance_noise(amplitude, _noise(views, float(sensor.phase_slope), quads_gain(sequence)), sequence)
     dark = deviation > DISTANCE_TRUSTED
     views.margin.add_(4.0 * deviation)
     for view in dark.any(dim=2).any(dim=1).nonzero()[:, 0].tolist():
@@ -110,7 +109,7 @@ def views_of(sequence: Sequence, nearer: float) -> Views:
     return views
 
 
-def _noise(views: Views, phase_slope: float) -> float:
+def _noise(views: Views, phase_slope: float, gain: float) -> float:
     """Standard deviation of the noise of one quad, from distances that neighbouring views see in the same direction."""
     found = []
     for view in range(len(views.quartets) - 1):
@@ -119,7 +118,8 @@ def _noise(views: Views, phase_slope: float) -> float:
         weak = torch.minimum(views.amplitude[view].flatten(), seen.amplitude[0])
         found.append((apart.abs() * weak)[seen.inside[0]])
     values = torch.cat(found) if found else torch.zeros(0)
-    return 1.4826 * phase_slope * float(values.median()) if len(values) else 0.0  # both views: sqrt(2) / sqrt(2)
+    one = gain / 2.0**0.5  # both views are noisy; for four quads this is 1
+    return one * 1.4826 * phase_slope * float(values.median()) if len(values) else 0.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

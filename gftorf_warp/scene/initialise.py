@@ -16,7 +16,6 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ..constants import FRAMES_PER_QUARTET
 from ..data.sequence import Sequence
 from ..errors import InputError
 from .camera import CHECKED, Camera
@@ -33,7 +32,6 @@ from .measured import (
     far_layer,
     flow_at,
     key_times,
-    sensor_of,
 )
 from .tracks import follow, unproject
 
@@ -103,7 +101,7 @@ def from_phase(sequence: Sequence, settings: InitSettings = InitSettings()) -> S
         raise InputError(
             "no complete quartet",
             where=sequence.path or "sequence",
-            why="phase initialisation decodes four raw frames of one quartet; every quartet lacks at least one",
+            why="phase initialisation decodes the raw frames of one quartet; every quartet lacks at least one",
             fix="record more frames, or start from random Gaussians",
         )
     if abs(sequence.camera_from_world - sequence.camera_from_world[:1]).max() > RESTS:
@@ -111,7 +109,7 @@ def from_phase(sequence: Sequence, settings: InitSettings = InitSettings()) -> S
     change = change_of(sequence)
     far = far_layer(sequence, change)
     static = _static_layer(sequence, far, settings)
-    middle = min(change.quartets, key=lambda i: abs(FRAMES_PER_QUARTET * (i + 0.5) - sequence.frames / 2))
+    middle = min(change.quartets, key=lambda i: abs(sequence.cycle * (i + 0.5) - sequence.frames / 2))
     points, distance, amplitude = _nearer(sequence, middle, change, far, settings)
     positions = follow(sequence, middle, points, distance, fellows=settings.fellows)
     moving = _layer(
@@ -267,7 +265,7 @@ def _in_front(
     """Whether points are nearer than the far layer; their distance [m], amplitude, and noise of the distance [m]."""
     ahead, behind = (flow_at(sequence, quartet, step, points) for step in (1, -1))
     distance, amplitude = decode_along_flow(sequence, quartet, points, ahead, behind)
-    noise = distance_noise(amplitude, change.noise, sensor_of(sequence))
+    noise = distance_noise(amplitude, change.noise, sequence)
     x, y = points[:, 0].long().clamp(0, sequence.width - 1), points[:, 1].long().clamp(0, sequence.height - 1)
     nearer = distance < far.distance[y, x] - settings.nearer - 4.0 * noise
     return nearer, distance, amplitude, noise

@@ -5,6 +5,7 @@ Everything here decodes measured quads (method, section 2.9); nothing knows a tr
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,21 +13,30 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ..constants import FRAMES_PER_QUARTET
-from ..data.decode import quartet_phasor
+from ..data.cycles import phase_noise
+from ..data.decode import quartet_phasors, unambiguous_range
 from ..data.sequence import Sequence
 from .camera import Camera
 from .distortion import Distortion
-from .sensor import Sensor, distance_from_phasor, phasor_from_quads
+from .sensor import Sensor, phasor_from_quads
+from .unwrap import distance_from_phasors
 
 CHANGED = 2.5  # a pixel changes if its quads, pooled over slots and 3x3 pixels, differ by so many noise deviations
 DISTANCE_TRUSTED = 0.15  # [m] a pixel whose distance is noisier than this is too dark to start from
 
 
 def sensor_of(sequence: Sequence) -> Sensor:
-    """The sensor that recorded a sequence; source intensity 1, since only its product with reflectivity is known."""
+    """The sensor that recorded a sequence, with the canonical shifts, at all its frequencies.
+
+    Source intensity 1, since only its product with reflectivity is known.
+
+    Raises:
+        InputError: If its frequencies have no common range.
+    """
+    unambiguous_range(sequence)
     return Sensor(
-        f_mod_hz=sequence.f_mod_hz,
+        f_mod_hz=sequence.frequencies[0],
+        further_hz=sequence.frequencies[1:],
         phase_offset=sequence.phase_offset,
         dc_offset=sequence.dc_offset,
         frame_period_s=frame_period(sequence),
@@ -64,8 +74,8 @@ def frame_period(sequence: Sequence) -> float:
 
 def key_times(sequence: Sequence) -> Float[Tensor, "T"]:
     """Start of every quartet, a truncated one included, and one quartet later [s]."""
-    starts = torch.as_tensor(sequence.times[::FRAMES_PER_QUARTET], dtype=torch.float64)
-    return torch.cat([starts, starts[-1:] + FRAMES_PER_QUARTET * frame_period(sequence)])
+    starts = torch.as_tensor(sequence.times[:: sequence.cycle], dtype=torch.float64)
+    return torch.cat([starts, starts[-1:] + sequence.cycle * frame_period(sequence)])
 
 
 def sample(image: Float[Tensor, "C H W"], points: Float[Tensor, "P 2"]) -> Float[Tensor, "C P"]:
@@ -89,7 +99,7 @@ def flow_at(sequence: Sequence, quartet: int, step: int, points: Float[Tensor, "
         points: Image positions (x, y) [px].
     """
     same, other = (sequence.forward_flow, sequence.backward_flow)[:: 1 if step > 0 else -1]
-    frame = FRAMES_PER_QUARTET * quartet
+    frame = sequence.cycle * quartet
     if frame in same:
         return sample(torch.tensor(same[frame]), points).T
     if frame in other:
@@ -106,13 +116,13 @@ def decode_along_flow(
 ) -> tuple[Float[Tensor, "P"], Float[Tensor, "P"]]:
     """Distance [m] and amplitude [quad units] of moving points at the start of a quartet.
 
-    Slot k was measured k raw frames later and, in the quartet before, 4 - k raw frames earlier. Both are read where the
+    Slot k was measured k raw frames later and, in the quartet before, K - k raw frames earlier. Both are read where the
     flow takes the point, and the value at the start is interpolated between them: motion across the image and along the
     ray leaves no artefact to first order. Without a measured quartet before, the one after serves to extrapolate, and
     without either slot k is taken as it is.
 
     Args:
-        sequence: Raw frames; the four of ``quartet`` must be measured.
+        sequence: Raw frames; those of ``quartet`` must be measured.
         quartet: Which quartet.
         points: Image positions (x, y) at its start [px].
         ahead: Their flow to the next quartet [px]; NaN counts as rest. None: unknown, everything rests.
@@ -121,21 +131,24 @@ def decode_along_flow(
     complete = set(sequence.complete_quartets)
     ahead = torch.zeros_like(points) if ahead is None else ahead.nan_to_num(0.0)
     behind = -ahead if behind is None else behind.nan_to_num(0.0)
-    quads = []
-    for k in range(FRAMES_PER_QUARTET):
-        share = k / FRAMES_PER_QUARTET
-        frame = FRAMES_PER_QUARTET * quartet + k
+    quads, step = [], sequence.cycle
+    for k in range(step):
+        share = k / step
+        frame = step * quartet + k
         value = _quad_at(sequence, frame, points + share * ahead)
         if quartet - 1 in complete:
-            earlier = _quad_at(sequence, frame - FRAMES_PER_QUARTET, points + (1.0 - share) * behind)
+            earlier = _quad_at(sequence, frame - step, points + (1.0 - share) * behind)
             value = (1.0 - share) * value + share * earlier
         elif quartet + 1 in complete:
-            later = _quad_at(sequence, frame + FRAMES_PER_QUARTET, points + (1.0 + share) * ahead)
+            later = _quad_at(sequence, frame + step, points + (1.0 + share) * ahead)
             value = (1.0 + share) * value - share * later
         quads.append(value)
-    shifts = sequence.shifts[FRAMES_PER_QUARTET * quartet : FRAMES_PER_QUARTET * (quartet + 1)]
-    re, im = phasor_from_quads(torch.stack(quads), tuple(float(s) for s in shifts))
-    return distance_from_phasor(re, im, sensor_of(sequence)), 0.5 * torch.hypot(re, im)
+    frames, stack, phasors = sequence.quartet_frames(quartet), torch.stack(quads), []
+    shifts, frequencies = sequence.shifts[frames], sequence.frame_frequencies[frames]
+    for f in sequence.frequencies:
+        own = frequencies == f
+        phasors.append(phasor_from_quads(stack[torch.as_tensor(own)], tuple(float(s) for s in shifts[own])))
+    return distance_from_phasors(phasors, sensor_of(sequence)), 0.5 * torch.hypot(*phasors[0])
 
 
 def _quad_at(sequence: Sequence, frame: int, points: Float[Tensor, "P 2"]) -> Float[Tensor, "P"]:
@@ -157,12 +170,13 @@ class Change:
 def change_of(sequence: Sequence) -> Change:
     """Compare every complete quartet with the next one, slot by slot.
 
-    The noise is the median absolute difference: it is right as long as most pixels rest. Slots are matched by their
-    shift, so any order and any number of missing frames in between will do.
+    The noise is the median absolute difference: it is right as long as most pixels rest. Slots are matched by
+    frequency and shift, so any order and any number of missing frames in between will do.
     """
     quartets = sequence.complete_quartets
-    step = FRAMES_PER_QUARTET
-    order = [np.argsort(sequence.shifts[step * i : step * (i + 1)], kind="stable") for i in quartets]
+    step = sequence.cycle
+    keys = [sequence.quartet_frames(i) for i in quartets]
+    order = [np.lexsort((sequence.shifts[own], sequence.frame_frequencies[own])) for own in keys]
     quads = torch.stack([torch.tensor(sequence.quads[step * i + o]) for i, o in zip(quartets, order, strict=True)])
     difference = quads.diff(dim=0)
     if difference.numel() == 0:
@@ -176,9 +190,21 @@ def change_of(sequence: Sequence) -> Change:
     )
 
 
-def distance_noise(amplitude: Tensor, noise: float, sensor: Sensor) -> Tensor:
-    """Standard deviation [m] of a decoded distance: noise / (sqrt(2) amplitude) radians of phase."""
-    return noise / (2.0**0.5 * amplitude.clamp_min(1e-12)) / sensor.phase_slope
+def distance_noise(amplitude: Tensor, noise: float, sequence: Sequence) -> Tensor:
+    """Standard deviation [m] of a decoded distance: noise / (sqrt(K / 2) amplitude) radians of the first phase.
+
+    That is of K equally spaced quads, sqrt(2) for four; for others see :func:`gftorf_warp.data.cycles.phase_noise`.
+    """
+    return noise / (quads_gain(sequence) * amplitude.clamp_min(1e-12)) / sensor_of(sequence).phase_slope
+
+
+def quads_gain(sequence: Sequence) -> float:
+    """Amplitude over noise of a quad, times this, is one over the noise of the first phase of a quartet [1]."""
+    frames = slice(0, sequence.cycle)
+    shifts = sequence.shifts[frames][sequence.frame_frequencies[frames] == sequence.frequencies[0]]
+    gain = 1.0 / phase_noise(shifts)
+    even = (0.5 * len(shifts)) ** 0.5
+    return even if abs(gain - even) < 1e-9 * even else gain
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -194,28 +220,35 @@ class FarLayer:
 
 
 def far_layer(sequence: Sequence, change: Change) -> FarLayer:
-    """Mean phasor of the quartets in which a pixel rests at its largest distance.
+    """Mean phasors of the quartets in which a pixel rests at its largest distance.
 
     A quartet counts for a pixel that changes neither from the quartet before nor to the next one. Distances are
-    wrapped: a background beyond one unambiguous range comes out too near.
+    wrapped: a background beyond the range of all frequencies together comes out too near.
     """
     sensor = sensor_of(sequence)
     still = torch.ones(len(change.quartets), *sequence.quads.shape[1:], dtype=torch.bool)
     still[1:] &= ~change.changed
     still[:-1] &= ~change.changed
-    phasors = torch.stack([torch.as_tensor(quartet_phasor(sequence, i), dtype=torch.float32) for i in change.quartets])
-    distance = distance_from_phasor(phasors[:, 0], phasors[:, 1], sensor)
-    amplitude = 0.5 * phasors.norm(dim=1)
-    tolerance = 4.0 * distance_noise(amplitude, change.noise, sensor)
+    phasors = decoded_phasors(sequence, change.quartets)
+    distance = distance_from_phasors([(p[:, 0], p[:, 1]) for p in phasors], sensor)
+    amplitude = 0.5 * phasors[0].norm(dim=1)
+    tolerance = 4.0 * distance_noise(amplitude, change.noise, sequence)
     still &= tolerance < 4.0 * DISTANCE_TRUSTED
     reach = torch.where(still, distance, -1.0).amax(dim=0)
     there = still & (distance > reach - 0.05 - tolerance)
     count = there.sum(dim=0)
-    mean = (phasors * there[:, None]).sum(dim=0) / count.clamp_min(1)
+    means = (phasors * there[:, None]).sum(dim=1) / count.clamp_min(1)
     known = count > 0
-    fields = torch.stack([distance_from_phasor(mean[0], mean[1], sensor), 0.5 * mean.norm(dim=0)])
+    together = distance_from_phasors([(mean[0], mean[1]) for mean in means], sensor)
+    fields = torch.stack([together, 0.5 * means[0].norm(dim=0)])
     filled = fill(fields, known)
     return FarLayer(distance=filled[0], amplitude=filled[1], known=known)
+
+
+def decoded_phasors(sequence: Sequence, quartets: Iterable[int]) -> Float[Tensor, "f J 2 H W"]:
+    """Phasors of some complete quartets, at each frequency, float32 [quad units]."""
+    found = [[phasor for _, phasor in quartet_phasors(sequence, i)] for i in quartets]
+    return torch.as_tensor(np.stack(found, axis=1), dtype=torch.float32)
 
 
 def fill(image: Float[Tensor, "C H W"], known: Bool[Tensor, "H W"]) -> Float[Tensor, "C H W"]:

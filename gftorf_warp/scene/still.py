@@ -123,7 +123,7 @@ def rests(field: GaussianField, still: Bool[Tensor, "H W"], camera: Camera) -> B
 
 
 def _deviations(field: GaussianField, camera: Camera) -> Float[Tensor, "N 2"]:
-    """Standard deviations of the splats along columns and rows [px], as they are rendered."""
+    """Standard deviations of the splats along columns and rows [px], as they are rendered by a pinhole."""
     field = field.map(torch.Tensor.detach)
     pose = torch.as_tensor(camera.camera_from_world).to(field.mean)
     local = field.mean @ pose[:3, :3].T + pose[:3, 3]
@@ -139,9 +139,9 @@ def _deviations(field: GaussianField, camera: Camera) -> Float[Tensor, "N 2"]:
 
 
 def _by_shift(sequence: Sequence) -> list[Float[Tensor, "n H W"]]:
-    """Measured quads of each shift, in their order, of those shifts that were measured at least twice."""
-    shifts = np.round(np.mod(sequence.shifts, 2.0 * math.pi), 6)
-    rows = [np.flatnonzero(sequence.measured & (shifts == shift)) for shift in np.unique(shifts)]
+    """Measured quads of each shift at each frequency, in their order, of those that were measured at least twice."""
+    kinds = np.stack([np.round(np.mod(sequence.shifts, 2.0 * math.pi), 6), sequence.frame_frequencies])
+    rows = [np.flatnonzero(sequence.measured & (kinds.T == kind).all(axis=1)) for kind in np.unique(kinds, axis=1).T]
     return [torch.tensor(sequence.quads[row], dtype=torch.float64) for row in rows if len(row) > 1]
 
 

@@ -10,7 +10,6 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from ..constants import FRAMES_PER_QUARTET
 from ..data.sequence import Sequence
 from .camera import Camera
 from .measured import camera_of, decode_along_flow, flow_at, key_times
@@ -25,7 +24,7 @@ def follow(
 
     Args:
         sequence: Raw frames and optical flow of a camera at rest; without flow the points stay.
-        quartet: Where the points are given; its four raw frames are measured.
+        quartet: Where the points are given; all of its raw frames are measured.
         points: Image positions (x, y) at its start [px].
         distance: Distances decoded there [m].
         fellows: How many nearest points share a step.
@@ -33,11 +32,11 @@ def follow(
     times = key_times(sequence)
     if not len(points):
         return torch.zeros(len(times), 0, 3)
-    camera = camera_of(sequence, FRAMES_PER_QUARTET * quartet)
+    camera = camera_of(sequence, sequence.cycle * quartet)
     group = _nearest(unproject(camera, points, distance), fellows)
     places, distances = {quartet: points}, {quartet: distance}
     complete = set(sequence.complete_quartets)
-    last = (sequence.frames - 1) // FRAMES_PER_QUARTET
+    last = (sequence.frames - 1) // sequence.cycle
     for step in (1, -1):
         i, here, far = quartet, points, distance
         while 0 <= i + step <= last and (flow := flow_at(sequence, i, step, here)) is not None:

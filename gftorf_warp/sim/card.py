@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from dataclasses import fields
 
 from .. import __version__
+from ..constants import FRAMES_PER_QUARTET
 from ..scene.optics import Lens, lens_rows
 from .ladder import NAMES, adds_of
 from .layers import TRUTHS
@@ -45,7 +46,7 @@ def settings_card(
         f"{sensor.unambiguous_range:.4f} m",
         "shifts in time order": ", ".join(f"{math.degrees(shift):.0f}" for shift in sensor.shifts) + " deg",
         "raw frames": f"{1 / sensor.frame_period_s:.6g} per second, "
-        + ("all four of a quartet at the time of its first" if options["sync"] else "each at its own time"),
+        + (_together(len(sensor.cycle)) if options["sync"] else "each at its own time"),
         **(
             {"phasors": "one per quartet, with time, pose and truth of its first raw frame"} if layout == "torf" else {}
         ),
@@ -93,6 +94,10 @@ Quads are in relative units: reflectance rho met at angle i and distance d gives
 Ground truth is the analytic first hit of the shapes along the ray through each pixel's centre at the time of each raw
 frame, not a rendering.
 """
+
+
+def _together(count: int) -> str:
+    return f"all {'four' if count == FRAMES_PER_QUARTET else count} of a quartet at the time of its first"
 
 
 def outcome_card(recording: Recording) -> str:

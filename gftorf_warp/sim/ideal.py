@@ -2,7 +2,7 @@
 
 No noise, no blur, direct light only: what remains of the error of a closed form is motion, and the mixture of surfaces
 within a pixel if there is more than one ray. It is what the closed-form errors of the named scenes refer to. Light and
-sensor are two steps, so that one light can be read by many sensors of one modulation frequency.
+sensor are two steps, so that one light can be read by many sensors of the same modulation frequencies.
 """
 
 from __future__ import annotations
@@ -14,8 +14,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float
 
+from ..constants import FRAMES_PER_QUARTET
 from ..data.sequence import Sequence, Truth
 from ..scene.sensor import Sensor
+from ..scene.unwrap import frequencies_of
 from .record import frame_times, seen_by
 from .scene import Scene
 from .world import first_hit
@@ -32,13 +34,14 @@ class Light(NamedTuple):
     """True distance along the ray through the pixel's centre [m]; NaN where nothing is hit."""
 
 
-def light_of(scene: Scene, time: float, *, rays: int = 1) -> Light:
-    """Light at an instant, for the modulation frequency of the scene's sensor.
+def light_of(scene: Scene, time: float, *, rays: int = 1, f_mod_hz: float | None = None) -> Light:
+    """Light at an instant.
 
     Args:
         scene: What is seen, at its own size.
         time: When [s].
         rays: Rays per pixel and axis that are averaged.
+        f_mod_hz: Modulation frequency [Hz]; None: the first of the scene's sensor.
 
     Raises:
         ValueError: If ``rays`` is below 1.
@@ -47,7 +50,8 @@ def light_of(scene: Scene, time: float, *, rays: int = 1) -> Light:
         raise ValueError(f"rays must be at least 1, got {rays}")
     camera = scene.camera(time=time)
     hit = first_hit(scene.bodies, camera.resized(camera.width * rays, camera.height * rays), time)
-    phase = float(scene.sensor.phase_slope) * np.where(hit.body < 0, 0.0, hit.distance)
+    sensor = scene.sensor if f_mod_hz is None else replace(scene.sensor, f_mod_hz=f_mod_hz)
+    phase = float(sensor.phase_slope) * np.where(hit.body < 0, 0.0, hit.distance)
     amplitude, phasor = (
         image.reshape(camera.height, rays, camera.width, rays).mean((1, 3))
         for image in (hit.amplitude, hit.amplitude * np.exp(1j * phase))
@@ -64,19 +68,21 @@ def ideal_recording(
     Args:
         scene: What is recorded; its own frames and times.
         lights: Light by raw frame; the others are not measured and their truth is unknown. None: that of all frames.
-        sensor: Instead of the scene's; its noise is ignored, and its modulation frequency must be the same.
+        sensor: Instead of the scene's; its noise is ignored, and its modulation frequencies must be the same.
 
     Raises:
-        ValueError: If the modulation frequencies differ, or there are several.
+        ValueError: If the modulation frequencies differ.
     """
     sensor = replace(scene.sensor if sensor is None else sensor, noise=False)
-    if float(sensor.f_mod_hz) != float(scene.sensor.f_mod_hz):
-        raise ValueError(f"light of {float(scene.sensor.f_mod_hz)} Hz, read by a sensor of {float(sensor.f_mod_hz)} Hz")
-    if sensor.further_hz:
-        raise ValueError(f"an ideal recording has one modulation frequency, not {1 + len(sensor.further_hz)}")
+    lit, read = frequencies_of(scene.sensor), frequencies_of(sensor)
+    if lit != read:
+        raise ValueError(f"light of {', '.join(map(str, lit))} Hz, read by a sensor of {', '.join(map(str, read))} Hz")
+    shots = [sensor.at_frame(n) for n in range(scene.frames)]
+    frequencies = np.array([float(shot.f_mod_hz) for shot in shots])
     times = frame_times(sensor, scene.frames, sync=False)
-    lights = {n: light_of(scene, float(times[n])) for n in range(scene.frames)} if lights is None else lights
-    shifts = np.array([sensor.shifts[n % len(sensor.shifts)] for n in range(scene.frames)])
+    if lights is None:
+        lights = {n: light_of(scene, float(times[n]), f_mod_hz=float(f)) for n, f in enumerate(frequencies)}
+    shifts = np.array([shot.shifts[0] for shot in shots])
     quads = np.zeros((scene.frames, scene.height, scene.width), dtype=np.float32)
     distance = np.full(quads.shape, np.nan, dtype=np.float32)
     known = np.zeros(scene.frames, dtype=bool)
@@ -90,6 +96,8 @@ def ideal_recording(
         shifts=shifts,
         times=times,
         f_mod_hz=float(sensor.f_mod_hz),
+        frequencies_hz=frequencies if sensor.further_hz else None,
+        cycle_length=None if len(sensor.cycle) == FRAMES_PER_QUARTET else len(sensor.cycle),
         phase_offset=float(sensor.phase_offset),
         dc_offset=float(sensor.dc_offset),
         **seen_by([scene.camera(time=float(time)) for time in times]),

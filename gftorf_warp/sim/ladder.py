@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..constants import FRAMES_PER_QUARTET
 from ..data.decode import closed_form_distance
 from ..data.sequence import Sequence, Truth
 from ..data.truth import known_distance, moving_and_static
@@ -21,6 +20,7 @@ from ..errors import InputError, UsageError
 from ..scene.pattern import Pattern
 from ..scene.sensor import Sensor
 from ..scene.waveform import Waveform, contrast_ratios, peak
+from .ideal import ideal_recording
 from .scene import Scene
 
 OWN = object()
@@ -153,20 +153,33 @@ def closed_form_errors(sequence: Sequence, truth: Truth | None) -> Errors:
             "nothing to compare",
             where=sequence.path or "sequence",
             why=f"expected truth and a complete quartet, found {'no ' if truth is None else ''}truth and {quartets}",
-            fix="simulate at least four raw frames",
+            fix=f"simulate at least the {sequence.cycle} raw frames of a cycle",
         )
-    frames = [FRAMES_PER_QUARTET * i for i in quartets]
+    frames = [sequence.cycle * i for i in quartets]
     decoded = np.stack([closed_form_distance(sequence, i) for i in quartets])
     distance = known_distance(truth)
     squares = 100.0 * (decoded - distance[frames]) ** 2
-    moving, static = moving_and_static(distance, frames, from_phasors=sequence.from_phasors)
-    by_phasor = None if truth.phasor_distance is None else 100.0 * (decoded - truth.phasor_distance[frames]) ** 2
+    moving, static = moving_and_static(distance, frames, from_phasors=sequence.from_phasors, cycle=sequence.cycle)
+    one = len(sequence.frequencies) == 1  # a static-phasor distance is that of one frequency, and wraps with it
+    by_phasor = (
+        None if truth.phasor_distance is None or not one else 100.0 * (decoded - truth.phasor_distance[frames]) ** 2
+    )
     return Errors(
         all=_mean(squares),
         moving=_mean(squares[moving]),
         static=_mean(squares[static]),
         static_phasor=None if by_phasor is None else _mean(by_phasor),
     )
+
+
+def with_closed_form(scene: Scene) -> Scene:
+    """A scene that knows the error of its closed form: mean over ideal quads of its own sensor [m^2 x 100].
+
+    A scene that knows it already is left alone; one that is too short for a cycle stays without.
+    """
+    if scene.closed_form is not None or scene.frames < len(scene.sensor.cycle):
+        return scene
+    return replace(scene, closed_form=closed_form_errors(*ideal_recording(scene)).all)
 
 
 def ladder_table(rows: Mapping[str, Errors]) -> list[str]:

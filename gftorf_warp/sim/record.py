@@ -168,6 +168,7 @@ def record(
             times=times,
             f_mod_hz=float(sensor.f_mod_hz),
             frequencies_hz=np.array([float(shot.f_mod_hz) for shot in shots]) if sensor.further_hz else None,
+            cycle_length=None if len(sensor.cycle) == FRAMES_PER_QUARTET else len(sensor.cycle),
             phase_offset=float(sensor.phase_offset),
             dc_offset=float(sensor.dc_offset),
             **seen_by(cameras),
@@ -337,7 +338,7 @@ def _colour(scene: Scene, size, times, longest, engine: str, keep: Keep, *, seed
             image = image + np.random.default_rng((seed, n, 3)).normal(0.0, spread, image.shape)
         return {"colour": image.astype(np.float32)}
 
-    starts = range(0, len(times), FRAMES_PER_QUARTET)
+    starts = range(0, len(times), len(scene.sensor.cycle))
     images = {n: keep(f"colour-{n:06d}", partial(expose, n))[0]["colour"] for n in starts}
     first = cameras[0]
     return {
@@ -348,13 +349,14 @@ def _colour(scene: Scene, size, times, longest, engine: str, keep: Keep, *, seed
 
 
 def _flows(scene: Scene, cameras: list[Camera], times: Float[np.ndarray, "F"]) -> tuple[dict, dict]:
-    """Exact optical flow at quartet starts, from n to n + 4 and to n - 4; occlusion is not looked at.
+    """Exact optical flow at quartet starts, from n to n + K and to n - K; occlusion is not looked at.
 
     It is what an estimate from images would give: motion of the scene and of the camera together.
     """
     flows: tuple[dict, dict] = {}, {}
-    starts = range(0, len(times), FRAMES_PER_QUARTET)
-    for flow, step in zip(flows, (FRAMES_PER_QUARTET, -FRAMES_PER_QUARTET), strict=True):
+    cycle = len(scene.sensor.cycle)
+    starts = range(0, len(times), cycle)
+    for flow, step in zip(flows, (cycle, -cycle), strict=True):
         for n in starts:
             if 0 <= n + step < len(times):
                 flow[n] = _flow(scene, cameras[n], cameras[n + step], float(times[n]), float(times[n + step]))

@@ -56,11 +56,12 @@ def simulate(
 ) -> Path:
     """Record a moving scene with an asynchronous C-ToF sensor and write it as a sequence.
 
-    Raw frame n is an image of the scene at its own time, of which only the quad of slot n % 4 is kept and read out.
-    Beside it stands the analytic distance along each pixel's centre ray at that very time. A camera that moves has a
-    pose for each raw frame; a colour camera adds an image per quartet. The folder appears only when it is complete; if
-    it is already there and was made with the same settings, it is left as it is. After an interruption the same call
-    goes on at the next raw frame: what was finished waits in OUT.partial, and the bytes are the same in the end.
+    Raw frame n is an image of the scene at its own time, of which only the quad of its own shift and frequency is kept
+    and read out. Beside it stands the analytic distance along each pixel's centre ray at that very time. A camera that
+    moves has a pose for each raw frame; a colour camera adds an image per quartet. The folder appears only when it is
+    complete; if it is already there and was made with the same settings, it is left as it is. After an interruption the
+    same call goes on at the next raw frame: what was finished waits in OUT.partial, and the bytes are the same in the
+    end.
 
     Args:
         scene: Name of a scene, see ``SCENES``, a TOML file of one, or a scene.
@@ -99,7 +100,7 @@ def simulate(
         BusyError: If another process records the same sequence.
         InputError: If a TOML file does not describe a scene.
     """
-    own = overridden(_scene(scene), overrides)
+    own = scene_of(scene, overrides)
     options: dict[str, Any] = {
         "frames": own.frames if frames is None else frames,
         "size": (own.width, own.height) if size is None else tuple(size),
@@ -168,6 +169,16 @@ def simulate_ladder(
     lines = "\n".join(f"    {line}" for line in ladder_table(rows))
     atomic_write(out / "ladder.md", f"# {title}: what each level of the ladder costs\n\n{lines}\n".encode())
     return rows
+
+
+def scene_of(scene: str | Scene, overrides: Iterable[str] = ()) -> Scene:
+    """A scene by its name or file, with single settings changed; as for :func:`simulate`.
+
+    Raises:
+        UsageError: If there is no such scene, or a setting cannot be changed so.
+        InputError: If a TOML file does not describe a scene.
+    """
+    return overridden(_scene(scene), overrides)
 
 
 def _scene(scene: str | Scene) -> Scene:
