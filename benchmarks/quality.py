@@ -1,6 +1,6 @@
 """What speed costs in quality: one preset, twice, with other settings, on several sequences with several seeds.
 
-    python benchmarks/quality.py SEQUENCE... --out DIR [--preset released] [--images 5000] [--seeds 3] [--device cuda]
+    python benchmarks/quality.py SEQUENCE... --out DIR [--preset released] [--images 5000] [--seeds 0 1 2] [--device cuda]
         [--reference NAME=VALUE...] [--fast NAME=VALUE...] [--limit SECONDS] [--json FILE]
 
 Every run is ``presets.shortened`` to --images, so that warm-up, rounds and resets have their places in it. Errors are
@@ -71,7 +71,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--preset", default="released")
     parser.add_argument("--images", type=int, default=5000)
-    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--device", default="cuda")
     parser.add_argument("--reference", nargs="+", default=REFERENCE, metavar="NAME=VALUE")
     parser.add_argument("--fast", nargs="+", default=FAST, metavar="NAME=VALUE")
@@ -84,7 +84,7 @@ def main() -> None:
     rows: dict[str, dict[str, dict]] = {"fast": {}, "reference": {}}
     sequences = [Sequence.open(path) for path in a.sequences]
     flown = [with_flow(sequence, FlowSource.AUTO)[0] for sequence in sequences]
-    for seed in range(a.seeds):
+    for seed in a.seeds:
         for way, changes in (("fast", a.fast), ("reference", a.reference)):
             for path, sequence in zip(a.sequences, flown, strict=True):
                 if time.monotonic() - begun > a.limit:
