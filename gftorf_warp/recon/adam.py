@@ -1,6 +1,6 @@
 """Adam for named groups of tensors: what ``torch.optim.Adam(fused=True)`` computes and stores, without that class.
 
-The first use of the class imports torch's compiler, which nobody here asks for and which takes longer than many a step
+The first use of the class imports torch's compiler, which takes seconds and compiles nothing here
 (design/reconstruction.md). The arithmetic is torch's own function.
 """
 
