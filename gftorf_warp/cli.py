@@ -7,7 +7,9 @@ This is the only file that names a device.
 from __future__ import annotations
 
 import argparse
+import atexit
 import functools
+import gc
 import logging
 import os
 import sys
@@ -37,6 +39,8 @@ def main(arguments: list[str] | None = None) -> int:
 
     given = sys.argv[1:] if arguments is None else list(arguments)
     debug = "--debug" in given
+    if arguments is None:  # the process ends with the command, and garbage with it
+        atexit.register(gc.freeze)
     try:
         options = parse(given)
         with logging_to_stderr(_level(options)), _cpus(getattr(options, "threads", None)):
@@ -48,6 +52,9 @@ def main(arguments: list[str] | None = None) -> int:
         return 1
     except (Exception, KeyboardInterrupt) as error:
         return print_error(error, debug=debug)
+    finally:
+        if arguments is not None:  # the process goes on, with a collector as it was
+            gc.unfreeze()
 
 
 def choose_device(name: str) -> tuple[str, str]:
@@ -81,12 +88,13 @@ def choose_device(name: str) -> tuple[str, str]:
 
 def start(options: argparse.Namespace, *, compile_first: bool = True) -> str:
     """Start torch and Warp, say on what, compile the kernels if none are cached, and return the device."""
-    import torch
+    with _here_to_stay():
+        import torch
 
-    from . import terminal
-    from .doctor import compile_kernels
+        from . import terminal
+        from .doctor import compile_kernels
 
-    terminal.start_warp()
+        terminal.start_warp()
     device, reason = choose_device(getattr(options, "device", "cpu"))
     threads = min(torch.get_num_threads(), _available_cpus())
     cache = terminal.home_as_tilde(terminal.kernel_cache())
@@ -313,6 +321,19 @@ def _progress(options: argparse.Namespace) -> Callable[[str], Callable[..., None
 
 def _available_cpus() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@contextmanager
+def _here_to_stay() -> Iterator[None]:
+    """Keep Python from searching the objects that modules bring along, 240,000, for garbage: now, and ever after."""
+    before = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if before:
+            gc.enable()
+        gc.freeze()
 
 
 @contextmanager

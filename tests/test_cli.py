@@ -1,6 +1,8 @@
 """What the command line accepts, prints and returns. Quality is not its business: everything runs at tiny size."""
 
+import argparse
 import errno
+import gc
 import json
 import logging
 import subprocess
@@ -65,6 +67,18 @@ def test_help_imports_nothing_heavy(arguments):
     assert code == "0"
     assert "gftorf_warp.options" in modules
     assert not {name.partition(".")[0] for name in modules} & set(HEAVY)
+
+
+def test_what_was_loaded_is_not_searched_for_garbage():
+    """Not while a command runs; who called it from Python has the collector as before."""
+    enabled = gc.isenabled()
+    try:
+        cli.start(argparse.Namespace(device="cpu"), compile_first=False)
+        assert gc.isenabled() == enabled
+        assert gc.get_freeze_count() > 10_000
+    finally:
+        cli.main(["--version"])
+    assert gc.get_freeze_count() < 10_000
 
 
 def test_help_names_every_command(capsys):

@@ -12,10 +12,12 @@ from torch import Tensor
 
 from ..scene.gaussians import GaussianField
 from ..scene.motion import Motion
+from .adam import MOMENTS, Adam
 from .settings import Batch, BatchRule, Input, ReconSettings
 
 BETAS = (0.9, 0.999)  # of steps of one image
 EPSILON = 1e-15  # far below any gradient here, so that a step depends on the direction of a gradient, not on its size
+MOTION = "motion"  # the group of everything that is not of the field
 
 
 def rates_at(
@@ -102,22 +104,26 @@ class Optimiser:
         colour = parts.pop("colour_sh", None)
         if colour is not None:
             parts |= {"colour_constant": colour[:, :1], "colour_rest": colour[:, 1:]}
-        self.tensors = {name: value.detach().clone().requires_grad_() for name, value in parts.items()}
-        self.motion = [parameter for parameter in motion.parameters() if parameter.numel()]
-        self.adam = torch.optim.Adam(
-            [{"name": name, "params": [value], "lr": 0.0} for name, value in self.tensors.items()]
-            + ([{"name": "motion", "params": self.motion, "lr": 0.0}] if self.motion else []),
-            betas=betas,
-            eps=EPSILON,
-            fused=True,
-        )
+        groups = {name: [value.detach().clone().requires_grad_()] for name, value in parts.items()}
+        movable = [parameter for parameter in motion.parameters() if parameter.numel()]
+        self.adam = Adam(groups | ({MOTION: movable} if movable else {}), betas, EPSILON)
         if state is not None:
             self.adam.load_state_dict(state)
 
     @property
+    def tensors(self) -> dict[str, Tensor]:
+        """The tensors of the field by name of their group."""
+        return {name: group[0] for name, group in self.adam.groups.items() if name != MOTION}
+
+    @property
+    def motion(self) -> list[Tensor]:
+        """The parameters of the motion."""
+        return self.adam.groups.get(MOTION, [])
+
+    @property
     def field(self) -> GaussianField:
         """The Gaussians as they are; their tensors are the leaves, those of the colour joined."""
-        parts = dict(self.tensors)
+        parts = self.tensors
         if "colour_rest" in parts:
             parts["colour_sh"] = torch.cat([parts.pop("colour_constant"), parts.pop("colour_rest")], dim=1)
         return GaussianField(**parts, layer=self.layer)
@@ -125,13 +131,12 @@ class Optimiser:
     @property
     def betas(self) -> tuple[float, float]:
         """Decays of both moments per step."""
-        first, second = self.adam.param_groups[0]["betas"]
-        return first, second
+        return self.adam.betas
 
     @property
     def leaves(self) -> list[Tensor]:
         """Everything that is optimised: the tensors of the field, then the motion."""
-        return [*self.tensors.values(), *self.motion]
+        return self.adam.tensors
 
     def step(self, gradients: list[Tensor | None], rates: dict[str, float], motion_gradient_max: float | None) -> None:
         """One step of Adam.
@@ -141,34 +146,19 @@ class Optimiser:
             rates: From :func:`rates_at`. A group of rate 0 is left alone, its moments included.
             motion_gradient_max: Longest gradient of the motion; a longer one is shortened. None: no limit.
         """
-        for leaf, gradient in zip(self.leaves, gradients, strict=True):
-            leaf.grad = gradient
-        if self.motion and motion_gradient_max is not None:
-            torch.nn.utils.clip_grad_norm_(self.motion, motion_gradient_max)
-        for group in self.adam.param_groups:
-            group["lr"] = rates[group["name"]]
-            if group["lr"] == 0.0:
-                for leaf in group["params"]:
-                    leaf.grad = None
-        self.adam.step()
-        self.adam.zero_grad(set_to_none=True)
+        of_motion = [gradient for gradient in gradients[len(self.tensors) :] if gradient is not None]
+        if of_motion and motion_gradient_max is not None:
+            _shorten(of_motion, motion_gradient_max)
+        self.adam.step(gradients, rates)
 
     def moments_of(self, leaf: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """(step, first moment, second moment) of a leaf; zeros, as torch's Adam would begin, if it has none yet."""
-        state = self.adam.state[leaf]
-        if not state:
-            state["step"] = torch.zeros((), device=leaf.device)
-            state |= {name: torch.zeros_like(leaf, requires_grad=False) for name in ("exp_avg", "exp_avg_sq")}
+        state = self.adam.remembered(leaf)
         return state["step"], state["exp_avg"], state["exp_avg_sq"]
 
     def settle(self, name: str, value: Tensor, moments: tuple[Tensor, Tensor, Tensor]) -> None:
         """Let one tensor of the field live elsewhere, with the moments that it has had so far."""
-        self.adam.state.pop(self.tensors[name], None)
-        self.tensors[name] = value
-        for group in self.adam.param_groups:
-            if group["name"] == name:
-                group["params"] = [value]
-        self.adam.state[value] = dict(zip(("step", "exp_avg", "exp_avg_sq"), moments, strict=True))
+        self.adam.put(name, value, dict(zip(("step", *MOMENTS), moments, strict=True)))
 
     def replace(
         self, rows: Int[Tensor, "M"], fresh: Bool[Tensor, "M"], change: Callable[[str, Tensor], Tensor]
@@ -180,25 +170,27 @@ class Optimiser:
             fresh: New Gaussians whose moments start at zero.
             change: Given a name and the selected rows, returns the new values.
         """
-        for group in self.adam.param_groups:
-            name = group["name"]
-            if name == "motion":
-                continue
-            old = self.tensors[name]
+        for name, old in self.tensors.items():
             new = change(name, old.detach()[rows]).clone().requires_grad_()
-            state = self.adam.state.pop(old, {})
-            for key, value in state.items():
-                if key != "step":
-                    state[key] = torch.where(fresh.view(-1, *[1] * (value.ndim - 1)), 0.0, value[rows])
-            group["params"] = [new]
-            self.tensors[name] = new
-            if state:
-                self.adam.state[new] = state
+            state = self.adam.state.get(old)
+            if state is not None:
+                for moment in MOMENTS:
+                    value = state[moment]
+                    state[moment] = torch.where(fresh.view(-1, *[1] * (value.ndim - 1)), 0.0, value[rows])
+            self.adam.put(name, new, state)
         if self.layer is not None:
             self.layer = self.layer[rows]
 
     def forget(self, name: str) -> None:
         """Zero the moments of one tensor of the field."""
         for key, value in self.adam.state.get(self.tensors[name], {}).items():
-            if key != "step":
+            if key in MOMENTS:
                 value.zero_()
+
+
+def _shorten(gradients: list[Tensor], longest: float) -> None:
+    """Scale gradients together, in place, so that they are at most as long as ``longest``."""
+    length = torch.nn.utils.get_total_norm(gradients)
+    share = (longest / (length + 1e-6)).clamp(max=1.0)  # the device need not be asked
+    for gradient in gradients:
+        gradient.mul_(share)
