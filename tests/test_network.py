@@ -100,6 +100,14 @@ def test_encoding_has_no_factor_pi():
     assert encoded(torch.zeros(4, 1), 10).shape == (4, 21)
 
 
+def test_layers_say_nothing_to_a_network():
+    """Nodes pin the static layer; a network decides for itself who moves."""
+    made, position = network(head=0.1), random(30, 3)
+    static = made.key_offset(made.attach(field(position, torch.zeros(30, dtype=torch.long))), 1)
+    assert static.any(dim=1).all()
+    assert torch.equal(static, made.key_offset(made.attach(field(position, None)), 1))
+
+
 @pytest.mark.contract
 def test_what_cannot_be_meant_is_refused():
     """No time, no length, no layer."""

@@ -16,7 +16,6 @@ from typing import Any, NamedTuple
 import torch
 
 from ..recon.captured import CapturedSteps, steps_of
-from ..recon.gating import judge_after
 from ..recon.observations import Observations, observe
 from ..recon.settings import Batch, Kernels, ReconSettings
 from ..recon.state import State, from_dict
@@ -61,7 +60,6 @@ def fresh(
         stored["motion"]["shape"]["products"] = str(settings.motion.products)
     stored["queue"] = []  # batches are numbered anew
     state = from_dict(stored, device)
-    judge_after(state, 0, observations, settings)  # as at the end of the warm-up, whoever rested in the checkpoint
     run = Run(state, steps_of(state, observations, settings))
     advance(run, warm_up)
     return run
@@ -149,8 +147,6 @@ def rows_of(
         }
         row |= {"images": state.images - before, "flow": observations.flow_source, "not_sound": broken}
         row |= {"ms_per_image": statistics.mean(times), "parts": Timing.of(times).plain()}
-        if isinstance(run.steps, CapturedSteps) and run.steps.asking.counts is not None:
-            row["awake"], row["asking"] = run.steps.asking.counts
         if torch.device(device).type != "cpu":
             row["waits_per_image"] = waits(fresh(fitted, observations, settings, device, warm_up), device)
         rows.append(row)
@@ -185,7 +181,7 @@ def table(rows: list[dict[str, Any]]) -> list[str]:
     cells = [
         [
             f"{row['kernels']}, {row['batch']}, {row['products']}",
-            f"{row['N']:,}" + (f", {row['asking']:,} ask" if "asking" in row else ""),
+            f"{row['N']:,}",
             f"{row['pairs']:,}",
             str(row["images"]),
             f"{row['ms_per_image']:.3f}",

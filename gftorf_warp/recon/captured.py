@@ -22,7 +22,6 @@ from ..render.bridge import Branches, Captured, Inbox, Outbox, pairs_of, shared_
 from ..render.buffers import RenderSettings, Workspace
 from ..scene.motion import Still
 from . import densify
-from .gating import Asking, judge_after
 from .objective import image_loss, render_settings_at, rendering_of, weights_at
 from .observations import Observations
 from .optimiser import EPSILON, frozen, rates_at
@@ -134,7 +133,6 @@ class CapturedSteps:
         self._flow = observations.flow_table() if settings.weights.flow > 0 else None
         self._branches = Branches(longest, device)
         self._workspaces = [Workspace() for _ in range(longest)]
-        self.asking = Asking(state.motion, gated=settings.gate.still_pixels)
         self._adopt()
 
     def step(self) -> None:
@@ -160,8 +158,7 @@ class CapturedSteps:
             run()
             self._watch()
         densify_after(state, before, settings)
-        judged = judge_after(state, before, self.observations, settings)
-        if due or judged or not self.padded.holds(state):
+        if due or not self.padded.holds(state):
             self._look()
             self._adopt()
 
@@ -235,8 +232,7 @@ class CapturedSteps:
             self._look()
 
     def _adopt(self) -> None:
-        anew = self.padded.adopt(self.state)
-        if self.asking.follow(self.padded.layer) or anew:
+        if self.padded.adopt(self.state):
             self._forget()
         if self._part is not None:
             self._rest(self._part[1])
@@ -284,9 +280,9 @@ class CapturedSteps:
         field = field.map(lambda tensor: tensor.view_as(tensor))  # gradients of all branches meet on this stream
         offsets: Tensor | None = None
         if variant.moves:
-            keys = numbers[: 3 if variant.flow else 2]
-            attachment = None if motion.follows_means and not variant.rests else padded.attachment
-            offsets = self.asking.offsets(field, attachment, keys)
+            asked = motion.follows_means and not variant.rests
+            attachment = motion.attach(field) if asked else padded.attachment
+            offsets = motion.key_offsets(attachment, numbers[: 3 if variant.flow else 2])
         render = replace(self.settings.render, sh_degree=variant.sh_degree, pair_capacity=self._reserve.capacity)
         images = []
         for n in range(len(variant.shifts)):

@@ -8,17 +8,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from ..data.decode import closed_form_distance, quad_scale, quartet_phasors
 from ..data.sequence import Sequence
 from ..errors import InputError
 from ..scene.camera import Camera
-from ..scene.initialise import RESTS, Init
+from ..scene.initialise import Init
 from ..scene.measured import camera_of, colour_camera_of, sensor_of
 from ..scene.sensor import Sensor
-from ..scene.still import still_pixels
 from .settings import Batch, FlowSource, Input, ReconSettings
 
 HASHED = ("quads", "measured", "shifts", "times", "frequencies_hz", "camera_from_world", "colour_from_world")
@@ -58,8 +57,6 @@ class Observations:
     """Where that number is from."""
     flow_source: str
     """'file', 'computed' or 'none'."""
-    still: Bool[Tensor, "H W"] | None = None
-    """Pixels whose quads never change; None: nobody asked for them."""
 
     def sensor_at(self, frame: int) -> Sensor:
         """The sensor as one raw frame used it: at its frequency, reading its shift only."""
@@ -159,19 +156,7 @@ def observe(sequence: Sequence, settings: ReconSettings, device: torch.device | 
         quad_scale=float(scale),
         quad_scale_source=scale_source,
         flow_source=flow_source,
-        still=_still(prepared, settings.gate.margin).to(device) if settings.gate.still_pixels else None,
     )
-
-
-def _still(sequence: Sequence, margin: int) -> Bool[Tensor, "H W"]:
-    if np.ptp(sequence.camera_from_world, axis=0).max() > RESTS:
-        raise InputError(
-            "no pixel is still for a camera that moves",
-            where=f"{sequence.path or 'sequence'}, gate.still_pixels",
-            why="Gaussians are held still where raw quads of a camera at rest never change, and its poses differ",
-            fix="leave gate.still_pixels=true out",
-        )
-    return still_pixels(sequence, margin)
 
 
 def reads_flow(settings: ReconSettings) -> bool:

@@ -271,7 +271,6 @@ def shortened(settings: ReconSettings, images: int) -> ReconSettings:
             reset_every=if_any(densify.reset_every),
             reset_faster=None if faster is None else (shorter(faster[0]), shorter(faster[1])),
         ),
-        gate=replace(settings.gate, every=shorter(settings.gate.every)),
     )
 
 

@@ -224,25 +224,6 @@ class DensifySettings:
 
 
 @dataclass(frozen=True, kw_only=True)
-class GateSettings:
-    """An approximation: a Gaussian that only still pixels see is at rest; its displacement is zero, whatever moves.
-
-    For a camera at rest. Judged at the end of the warm-up, after every round, and now and then.
-    """
-
-    still_pixels: bool = False
-    """Whether pixels whose raw quads never change hold still what they see (scene/still.py)."""
-    margin: int = 1
-    """Pixels so near to one that changes are not still either [px]."""
-    every: int = 500
-    """Between two judgements [images]."""
-
-    def __post_init__(self):
-        if self.every < 1 or self.margin < 0:
-            raise ValueError(f"every must be at least 1 and margin at least 0, got {self.every} and {self.margin}")
-
-
-@dataclass(frozen=True, kw_only=True)
 class ReconSettings:
     """How a sequence is reconstructed."""
 
@@ -267,8 +248,6 @@ class ReconSettings:
     """The first Gaussians."""
     motion: MotionSettings = field(default_factory=MotionSettings)
     """The motion model."""
-    gate: GateSettings = field(default_factory=GateSettings)
-    """Who is held still."""
     render: RenderSettings = field(default_factory=RenderSettings)
     """The renderer, also of the finished run."""
     rates: Rates = field(default_factory=Rates)

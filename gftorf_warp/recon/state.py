@@ -20,7 +20,7 @@ from .observations import Observations
 from .optimiser import Optimiser, betas_of
 from .settings import ReconSettings
 
-FORMAT = 3  # of the stored form; a higher one is refused
+FORMAT = 2  # of the stored form; a higher one is refused
 NODE_FELLOWS = 8  # points whose median displacement a node starts with
 
 
@@ -72,7 +72,6 @@ def begin(observations: Observations, settings: ReconSettings, *, seed: int, dev
         first = from_random(sequence, settings.init, generator)
     motion = _motion(first, observations, settings, generator).to(device)
     field = first.field.map(lambda value: value.to(device))
-    field = _all_moving(field) if isinstance(motion, Network) else field
     if settings.weights.colour > 0:
         field = replace(field, colour_sh=torch.zeros(len(field), SH_COEFFICIENTS, 3, device=device))
     return State(
@@ -87,12 +86,6 @@ def begin(observations: Observations, settings: ReconSettings, *, seed: int, dev
         seconds=0.0,
         sums={},
     )
-
-
-def _all_moving(field: GaussianField) -> GaussianField:
-    """The field with everybody in the moving layer."""
-    layer = torch.full((len(field),), MOVING, device=field.device)
-    return replace(field, layer=layer)
 
 
 def _motion(start: Start, observations: Observations, settings: ReconSettings, generator: torch.Generator) -> Motion:
@@ -166,8 +159,6 @@ def field_and_motion(stored: dict, device: torch.device | str) -> tuple[Gaussian
     """Gaussians, their motion and how they hang on it, from the stored form."""
     field = GaussianField(**{name: value.to(device) for name, value in stored["field"].items()})
     motion = _motion_from_dict(stored["motion"]).to(device)
-    if stored["format"] < 3 and isinstance(motion, Network):  # which asked for everybody then
-        field = _all_moving(field)
     attachment = motion.attach(field) if motion.follows_means else stored["attachment"].to(device)
     return field, motion, attachment
 

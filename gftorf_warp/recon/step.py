@@ -11,7 +11,6 @@ from torch import Tensor
 
 from ..render import fused
 from . import densify
-from .gating import judge_after
 from .objective import Seen, render_settings_at, terms, weights_at
 from .observations import Observations
 from .optimiser import frozen, rates_at
@@ -96,7 +95,6 @@ def step(
         _account(state, observations, frame, found, seen)
     state.optimiser.step(gradients, rates, settings.motion_gradient_max)
     densify_after(state, before, settings)
-    judge_after(state, before, observations, settings)
     return None
 
 

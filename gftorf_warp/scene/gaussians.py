@@ -28,7 +28,7 @@ class GaussianField:
     colour_sh: Float[Tensor, "N 16 3"] | None = None
     """Harmonics of linear RGB; None if there is no colour."""
     layer: Int[Tensor, "N"] | None = None
-    """The motion layer a Gaussian belongs to, 0: static; negative: of layer -l, but at rest. Never optimised."""
+    """Label of the motion layer a Gaussian belongs to (0: static); carried along, never optimised."""
 
     def __post_init__(self):
         n = len(self.mean)

@@ -76,16 +76,8 @@ class Network(Motion):
             self.head.bias.zero_()
 
     def attach(self, field: GaussianField) -> Float[Tensor, "N p"]:
-        """gamma(x) of the positions at which it is asked, without gradient, in the precision of the products [1].
-
-        The row of who is at rest is zero, which no gamma is: its cosines cannot be zero together with its sines.
-        """
-        place = self.attach_at(field.mean.detach())
-        return place if field.layer is None else place.masked_fill_((field.layer <= 0)[:, None], 0.0)
-
-    def attach_at(self, mean: Float[Tensor, "N 3"]) -> Float[Tensor, "N p"]:
-        """The same of places [m] without gradient."""
-        place, form = mean / self.length, self._form
+        """gamma(x) of the positions at which it is asked, without gradient, in the precision of the products [1]."""
+        place, form = field.mean.detach() / self.length, self._form
         if self.settings.products == Products.HALF:
             return encoded(place, self.powers, columns=form.columns, dtype=form.dtype)
         return encoded(place, self.powers)
@@ -93,17 +85,7 @@ class Network(Motion):
     def key_offsets(
         self, attachment: Float[Tensor, "N p"], keys: list[int] | Int[Tensor, "k"]
     ) -> Float[Tensor, "k N 3"]:
-        """Displacements [m] at several keys; of who is at rest exactly zero, and on a CPU nobody asks for it."""
-        hangs = attachment.any(dim=1)
-        if attachment.is_cuda:  # asking for nothing costs less than a host that waits
-            return self.asked(attachment, keys) * hangs[:, None]
-        if bool(hangs.all()):
-            return self.asked(attachment, keys)
-        rows, rest = hangs.nonzero()[:, 0], self.head.weight.new_zeros(len(keys), len(attachment), 3)
-        return rest.index_copy(1, rows, self.asked(attachment[rows], keys)) if len(rows) else rest
-
-    def asked(self, attachment: Float[Tensor, "N p"], keys: list[int] | Int[Tensor, "k"]) -> Float[Tensor, "k N 3"]:
-        """What the network says [m], whoever asks."""
+        """Displacements [m] at several keys."""
         return self.offsets(attachment, rows_of(self.moments, keys))
 
     def offsets(self, attachment: Float[Tensor, "N p"], moment: Float[Tensor, "k t"]) -> Float[Tensor, "k N 3"]:
