@@ -1,7 +1,7 @@
 """What speed costs in quality: one preset, twice, with other settings, on several sequences with several seeds.
 
-    python benchmarks/quality.py SEQUENCE... --out DIR [--preset released] [--images 5000] [--seeds 0 1 2] [--device cuda]
-        [--reference NAME=VALUE...] [--fast NAME=VALUE...] [--limit SECONDS] [--json FILE]
+    python benchmarks/quality.py SEQUENCE... --out DIR [--preset released] [--images 5000] [--seeds 0 1 2]
+        [--device cuda] [--reference NAME=VALUE...] [--fast NAME=VALUE...] [--limit SECONDS] [--json FILE]
 
 Every run is ``presets.shortened`` to --images, so that warm-up, rounds and resets have their places in it. Errors are
 those of `gftorf compare`: mean squared errors of the distance times 100 [m^2], all raw frames, all pixels. The last
