@@ -26,6 +26,10 @@ class Metrics:
             kept = [line for line in kept if json.loads(line)["images"] <= images]
             atomic_write(self.path, "".join(kept).encode())
 
+    def rows(self) -> list[dict[str, float | int | None]]:
+        """All rows so far."""
+        return [json.loads(line) for line in self.path.read_text().splitlines()] if self.path.exists() else []
+
     def add(self, row: dict[str, float | int | None]) -> None:
         """Append one row."""
         with self.path.open("a") as file:

@@ -270,6 +270,8 @@ class ReconSettings:
     """So many steps without a finite loss and gradient in a row go back to the last checkpoint, with halved rates."""
     rollbacks_max: int = 3
     """After so many returns to a checkpoint in all, the next one ends the run as diverged."""
+    restarts_max: int = 3
+    """A random start that sees nothing but the dark begins again with another seed, so many times at most."""
 
 
 def plain(settings: ReconSettings) -> dict[str, object]:

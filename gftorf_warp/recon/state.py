@@ -54,6 +54,8 @@ class State:
     """Steps without a finite loss and gradient so far."""
     rollbacks: int = 0
     """Returns to a checkpoint so far."""
+    restarts: int = 0
+    """Random starts before this one, all in the dark."""
     reset_at: int | None = None
     """Optimised images at the last reset of the opacities; None: there was none."""
 
@@ -125,6 +127,7 @@ def to_dict(state: State) -> dict[str, object]:
         "rate_factor": state.rate_factor,
         "skipped": state.skipped,
         "rollbacks": state.rollbacks,
+        "restarts": state.restarts,
         "reset_at": state.reset_at,
     }
 
@@ -183,5 +186,6 @@ def from_dict(stored: dict, device: torch.device | str) -> State:
         queue=list(stored["queue"]),
         sums={name: value.to(device) for name, value in stored["sums"].items()},
         reset_at=stored.get("reset_at"),  # format 1 had none
+        restarts=stored.get("restarts", 0),  # neither had earlier runs
         **{name: stored[name] for name in ("images", "seconds", "rate_factor", "skipped", "rollbacks")},
     )

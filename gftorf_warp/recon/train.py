@@ -24,7 +24,7 @@ from ..data.sequence import Sequence, Truth
 from ..errors import DivergedError, InputError, UsageError
 from ..render.buffers import available_threads
 from ..scene.changes import Wording, changed
-from . import checkpoint, folder, presets
+from . import checkpoint, darkness, folder, presets
 from .captured import steps_of
 from .config import config_of
 from .diagnostics import Watch
@@ -36,6 +36,7 @@ from .state import State, begin, from_dict, to_dict
 from .step import pool, threads_for
 
 LOG = logging.getLogger("gftorf_warp")
+OTHER_SEED = 1_000_003  # between the seeds of one run, far from those that somebody counts up
 Progress = Callable[..., None]
 Choice = TypeVar("Choice", bound=enum.StrEnum)
 CHANGES = Wording(
@@ -170,10 +171,17 @@ def _run(sequence, out, settings, config, seed, device, goes_on, begun, progress
     def clock() -> float:
         return earlier + time.monotonic() - begun
 
-    loop = _Loop(observations, settings, out, device, metrics, watch, clock, progress)
+    loop = _Loop(observations, settings, seed, out, device, metrics, watch, clock, progress)
     state = loop.until_done(state)
     folder.write_config(
-        out, config | {"seconds_reconstruct": state.seconds, "images_optimised": state.images, "skipped": state.skipped}
+        out,
+        config
+        | {
+            "seconds_reconstruct": state.seconds,
+            "images_optimised": state.images,
+            "skipped": state.skipped,
+            "restarts": state.restarts,
+        },
     )
     LOG.info("%s is finished: %d images, %.1f s", out, state.images, state.seconds)
 
@@ -204,6 +212,7 @@ class _Loop:
         self,
         observations: Observations,
         settings: ReconSettings,
+        seed: int,
         out: Path,
         device: torch.device | str,
         metrics: Metrics,
@@ -211,9 +220,10 @@ class _Loop:
         clock: Callable[[], float],
         progress: Progress | None,
     ):
-        self.observations, self.out, self.device = observations, out, device
+        self.observations, self.seed, self.out, self.device = observations, seed, out, device
         self.settings, self.workers = threads_for(settings, device, available_threads())
         self.metrics, self.watch, self.clock, self.progress = metrics, watch, clock, progress
+        self.judged_at = darkness.judged_at(settings)
         self.saved_at = clock()
 
     def until_done(self, state: State) -> State:
@@ -239,6 +249,10 @@ class _Loop:
                 every = self.settings.schedule.log_every
                 if state.images // every > before // every or state.images >= total:
                     self.report(state)
+                if self.judged_at is not None and before < self.judged_at <= state.images and self.is_dark(state):
+                    state = self.begin_again(state)
+                    steps = steps_of(state, self.observations, self.settings, run_all)
+                    continue
                 if self.watch.due(before, state.images, total):
                     self.watch.look(state, self.settings)
                 if stop.is_set():
@@ -288,6 +302,27 @@ class _Loop:
         measured = {0: shown.quads[torch.as_tensor(shown.sequence.measured)]}
         images = shown.phasors or (measured if self.settings.weights.quads > 0 else shown.colour)
         return max(float(image.abs().max()) for image in images.values())
+
+    def is_dark(self, state: State) -> bool:
+        """Whether the run sees nothing and may begin again; if it may not, the log says so."""
+        losses = [row["quads"] for row in self.metrics.rows()]
+        if not darkness.is_dark(losses, self.observations, self.settings):
+            return False
+        again = state.restarts < self.settings.restarts_max
+        then = "begins again with another seed" if again else "goes on all the same"
+        LOG.warning("after %d images the loss is still that of black images: %s", state.images, then)
+        return again
+
+    def begin_again(self, state: State) -> State:
+        """Another random start, with the time and the failures of those before."""
+        number = state.restarts + 1
+        anew = begin(self.observations, self.settings, seed=self.seed + OTHER_SEED * number, device=self.device)
+        anew.restarts, anew.skipped, anew.rollbacks = number, state.skipped, state.rollbacks
+        for record in (self.metrics, self.watch):
+            record.rewind(-1)
+        self.save(anew)
+        self.watch.look(anew, self.settings)
+        return anew
 
     def go_back(self, state: State, broken: dict[str, float] | None) -> State:
         """The last good checkpoint, with halved rates.
