@@ -305,7 +305,7 @@ class _Loop:
 
     def is_dark(self, state: State) -> bool:
         """Whether the run sees nothing and may begin again; if it may not, the log says so."""
-        losses = [row["quads"] for row in self.metrics.rows()]
+        losses = [float(row["quads"] or 0.0) for row in self.metrics.rows()]
         if not darkness.is_dark(losses, self.observations, self.settings):
             return False
         again = state.restarts < self.settings.restarts_max
