@@ -1,4 +1,4 @@
-"""Files beside the rendering: by processes as by threads, whole or not there, and errors that say what happened."""
+"""Files beside the rendering: the same whoever writes them, whole or not there, and errors that say what happened."""
 
 import json
 import os
@@ -15,7 +15,7 @@ from test_replay import PLAIN, run  # noqa: F401
 
 from gftorf_warp.data.images import read_exr
 from gftorf_warp.errors import ResourceError, UsageError
-from gftorf_warp.evaluate import stored, views, writers
+from gftorf_warp.evaluate import previews, stored, views, writers
 from gftorf_warp.evaluate.views import render_to_folder
 
 WHAT = ("distance", "quads")
@@ -27,66 +27,72 @@ def analytic(tmp_path):
     return AnalyticRun(tmp_path)
 
 
-@pytest.fixture
-def many(monkeypatch):
-    """Three images are many, so that processes write them."""
-    monkeypatch.setattr(writers, "MANY", 3)
-    monkeypatch.setattr(writers, "available_cpus", lambda: 2)
-
-
 def files_in(folder):
     """Content of every file below a folder, by its name."""
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-def test_processes_write_what_threads_write(analytic, tmp_path, monkeypatch):
-    """Byte by byte, and progress counts up."""
-    threads = files_in(render_to_folder(analytic, tmp_path / "threads", WHAT))
-    monkeypatch.setattr(writers, "MANY", 3)
-    monkeypatch.setattr(writers, "available_cpus", lambda: 2)
-    seen, started, right = [], [], writers.Helper.__init__
-    monkeypatch.setattr(writers.Helper, "__init__", lambda self, *a: started.append(self) or right(self, *a))
-    out = render_to_folder(analytic, tmp_path / "processes", WHAT, progress=lambda *done: seen.append(done))
-    assert files_in(out) == threads
-    assert len(threads) == 1 + 4 * FRAMES
-    assert seen == [(k + 1, FRAMES) for k in range(FRAMES)]
-    assert [helper.process.returncode for helper in started] == [0, 0]
+def test_threads_write_what_one_call_after_the_other_does(analytic, tmp_path, monkeypatch):
+    """Byte by byte: more threads than images, or one; progress counts up."""
+    seen, found = [], {}
+    for threads in (1, 20):
+        monkeypatch.setattr(writers, "THREADS_MIN", threads)
+        monkeypatch.setattr(writers, "available_cpus", lambda threads=threads: threads)
+        out = render_to_folder(analytic, tmp_path / str(threads), WHAT, progress=lambda *done: seen.append(done))
+        found[threads] = files_in(out)
+    assert found[1] == found[20]
+    assert len(found[1]) == 1 + 4 * FRAMES
+    assert seen == 2 * [(k + 1, FRAMES) for k in range(FRAMES)]
+    scales, series = scales_and_series(analytic)
+    (tmp_path / "plain" / "distance").mkdir(parents=True)
+    for index, images in enumerate(series):
+        writers.write_images(tmp_path / "plain", scales, index, images)
+    assert {name: found[1][name] for name in files_in(tmp_path / "plain")} == files_in(tmp_path / "plain")
 
 
-@pytest.mark.usefixtures("many")
-def test_what_stops_a_process_is_the_error_of_the_command(analytic, tmp_path):
+def scales_and_series(of):
+    """What ``render_to_folder`` hands on."""
+    render, times = of.renderer(), [k / 120 for k in range(FRAMES)]
+    samples = [views.images_of(render, of.sensor, ("distance",))(times[k], of.camera) for k in (0, FRAMES // 2, -1)]
+    scales = {"distance": previews.preview_scale("distance", [sample["distance"] for sample in samples])}
+    return scales, views.series_of(render, [(time, of.camera) for time in times], of.sensor, ("distance",))
+
+
+def test_what_stops_a_thread_is_the_error_of_the_command(analytic, tmp_path):
     """A name that is taken by a folder; nothing is left half-written, and nothing runs on."""
-    out = tmp_path / "out"
-    (out / "distance" / "000005.png").mkdir(parents=True)
-    (out / "renders.json").write_text("{}")
+    (tmp_path / "distance" / "000005.png").mkdir(parents=True)
     with pytest.raises(UsageError, match=r"000005\.png"):
-        writers.write_all(out, *scales_and_series(analytic, views), FRAMES)
-    assert not list(out.rglob(".*"))
-    for path in (out / "distance").glob("*.exr"):
+        writers.write_all(tmp_path, *scales_and_series(analytic), FRAMES)
+    assert not list((tmp_path / "distance").glob(".*"))
+    for path in (tmp_path / "distance").glob("*.exr"):
         assert read_exr(path)["distance"].shape == (HEIGHT, WIDTH)
 
 
-def scales_and_series(of, module):
-    """What ``render_to_folder`` hands on."""
-    render, times = of.renderer(), [k / 120 for k in range(FRAMES)]
-    sample = module.images_of(render, of.sensor, ("distance",))(0.0, of.camera)
-    scales = {"distance": module.previews.preview_scale("distance", [sample["distance"]])}
-    return scales, module.series_of(render, [(time, of.camera) for time in times], of.sensor, ("distance",))
+def test_not_more_images_wait_than_memory_holds(analytic, tmp_path, monkeypatch):
+    """Rendering is faster than writing: it stops until something is written."""
+    (tmp_path / "distance").mkdir()
+    monkeypatch.setattr(writers, "THREADS_MIN", 1)
+    monkeypatch.setattr(writers, "available_cpus", lambda: 1)
+    rendered, written, ahead = [0], [0], []
+    scales, series = scales_and_series(analytic)
 
+    def counted():
+        for images in series:
+            rendered[0] += 1
+            ahead.append(rendered[0] - written[0])
+            yield images
 
-@pytest.mark.usefixtures("many")
-def test_a_process_that_is_killed_is_named(analytic, tmp_path, monkeypatch):
-    """As the system does when memory runs out."""
-    right = writers.Helper.__init__
+    right = writers.write_images
 
-    def doomed(self, *arguments):
-        right(self, *arguments)
-        self.process.kill()
-        self.process.wait()
+    def slow(*arguments):
+        time.sleep(0.02)
+        right(*arguments)
+        written[0] += 1
 
-    monkeypatch.setattr(writers.Helper, "__init__", doomed)
-    with pytest.raises(ResourceError, match="ended with code -9"):
-        render_to_folder(analytic, tmp_path / "out", WHAT)
+    monkeypatch.setattr(writers, "write_images", slow)
+    writers.write_all(tmp_path, scales, counted(), FRAMES)
+    assert 2 < max(ahead) <= writers.QUEUED + 2
+    assert written[0] == FRAMES
 
 
 def test_arrays_hold_what_pictures_hold(analytic, tmp_path):
@@ -188,14 +194,13 @@ def series():
         yield {"distance": {"distance": np.random.default_rng(k).random((240, 320), dtype=np.float32)}}
 
 
-writers.available_cpus = lambda: 2
 writers.write_all(Path(sys.argv[1]), scales, series(), 10000, lambda done, _: print(done, flush=True))
 """
 
 
 @pytest.mark.skipif(os.name == "nt", reason="sends a signal as a terminal does")
-def test_ctrl_c_ends_processes_between_images(tmp_path):
-    """A signal to the group of the command: no half of a file, no process that stays."""
+def test_ctrl_c_ends_threads_between_images(tmp_path):
+    """A signal as from a terminal, to a program: no half of a file, and an end."""
     (tmp_path / "distance").mkdir()
     command = [sys.executable, "-c", INTERRUPTED, str(tmp_path)]
     with subprocess.Popen(

@@ -5,8 +5,9 @@ replays a graph; ``unchecked`` is the same without looking after every image whe
 without graphs, pairs counted on the host. ``series`` is a loop over images that stay on the device and are looked after
 a few images later, ``host`` one over NumPy arrays that come to the host meanwhile, ``Run.images``; ``arrays`` waits for
 each of them. ``files`` is ``gftorf render``, EXR and PNG included, ``stored`` the same with ``--arrays``, until
-everything is on the disk. Compilation, capture and the displacements at the first two keys are over when the clock
-starts, those at all later keys are part of the time; the two commands start from nothing.
+everything is flushed to the disk; in brackets the rate before that. Compilation, capture and the displacements at the
+first two keys are over when the clock starts, those at all later keys are part of the time; the two commands start from
+nothing.
 """
 
 from __future__ import annotations
@@ -121,14 +122,14 @@ def measure(
 
 
 def _commanded(run: Run, out: Path, seconds: list[float], arrays: bool) -> dict[str, Any]:
-    """What ``gftorf render`` takes, all of it, and from the first progress to the last."""
+    """What ``gftorf render`` takes: all of it, and from the first to the last but one progress, before the flush."""
     seen: list[tuple[int, float]] = []
     begun = time.perf_counter()
     views.render_to_folder(
         run, out, WHAT, seconds, arrays=arrays, progress=lambda done, _: seen.append((done, time.perf_counter()))
     )
     spent = time.perf_counter() - begun
-    (first, early), (last, late) = seen[0], seen[-1]
+    (first, early), (last, late) = seen[0], seen[max(0, len(seen) - 2)]
     going = (last - first) / (late - early) if last > first else None
     return {"images": len(seconds), "images_per_s": len(seconds) / spent, "going_images_per_s": going, "ms": None}
 
@@ -145,8 +146,7 @@ def table(rows: list[dict[str, Any]]) -> list[str]:
         [
             row["way"],
             str(row["images"]),
-            f"{row['images_per_s']:.1f}"
-            + (f" ({going:.0f} going)" if (going := row.get("going_images_per_s")) else ""),
+            f"{row['images_per_s']:.1f}" + (f" ({going:.0f})" if (going := row.get("going_images_per_s")) else ""),
             "-" if row["ms"] is None else f"{row['ms']['median']:.3f}",
         ]
         for row in rows

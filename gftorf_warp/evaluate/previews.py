@@ -1,4 +1,4 @@
-"""Pictures of what ``gftorf render`` writes, one scale for all times. Needs no torch, so that writers start quickly."""
+"""Pictures of what ``gftorf render`` writes, one scale for all times of each thing."""
 
 from __future__ import annotations
 

@@ -181,8 +181,8 @@ def render_to_folder(
     ``OUT/renders.json`` lists the times [s], the channels with their units and the scale of the previews; poses, if any
     were given. Otherwise the pose is that of the raw frame nearest to each time.
 
-    Pictures are encoded by as many processes as there are CPUs where there are many. Arrays are only copied, and many
-    times as fast: ``OUT/<what>/<channel>.npy``, float32 [S, H, W] of all S times, with the values of the EXR files.
+    Pictures are encoded by as many threads as there are CPUs. Arrays are only copied, and many times as fast:
+    ``OUT/<what>/<channel>.npy``, float32 [S, H, W] of all S times, with the values of the EXR files.
 
     Args:
         run: A finished reconstruction.
@@ -200,7 +200,7 @@ def render_to_folder(
         UsageError: If a name in ``what`` is unknown, the run has no colour, there are no such poses or the run has one
             view only, or ``out`` holds something else.
         InputError: If the poses cannot be read.
-        ResourceError: If the disk is full, or a process that writes ends.
+        ResourceError: If the disk is full, or cannot hold the arrays.
     """
     names = renders.checked(what)
     sequence = run.sequence()
