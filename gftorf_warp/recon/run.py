@@ -167,7 +167,8 @@ class Run:
             cameras: Where from, one each.
             images: As in :meth:`renderer`.
         """
-        yield from on_host(self.renderer(images), zip(times, cameras, strict=True), images)
+        names = tuple(images)
+        yield from on_host(self.renderer(names), zip(times, cameras, strict=True), names)
 
     def widened(self, field: GaussianField, camera: Camera) -> GaussianField:
         """Gaussians as wide as they looked while they were optimised, for a camera that resolves more.

@@ -123,7 +123,6 @@ class Replay:
         self._largest = wp.zeros(1, dtype=wp.int32, device=self.device)
         self._capacity: int | None = None  # of pairs; None: they are counted on the host, and on a CPU they always are
 
-    @torch.no_grad()
     def __call__(self, time: float, camera: Camera, *, checked: bool = True) -> Rendering:
         """The images at one instant, in memory that the next call overwrites.
 
