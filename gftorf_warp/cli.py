@@ -229,8 +229,8 @@ def _render(options: argparse.Namespace) -> int:
     from .recon.run import Run
 
     run = Run.open(options.run_folder, device)
-    progress = _progress(options)("render")
-    chosen = {name: getattr(options, name) for name in ("what", "times", "poses", "fresh")}
+    progress = _progress(options)("render", unit="images")
+    chosen = {name: getattr(options, name) for name in ("what", "times", "poses", "fresh", "arrays")}
     print(render_to_folder(run, options.out, **chosen, progress=progress))
     return 0
 
@@ -313,10 +313,10 @@ def _level(options: argparse.Namespace) -> int:
     return logging.WARNING if options.quiet else logging.DEBUG if options.verbose else logging.INFO
 
 
-def _progress(options: argparse.Namespace) -> Callable[[str], Callable[..., None]]:
+def _progress(options: argparse.Namespace) -> Callable[..., Callable[..., None]]:
     from .terminal import Progress
 
-    return lambda label: Progress(label, quiet=options.quiet)
+    return functools.partial(Progress, quiet=options.quiet)
 
 
 def _available_cpus() -> int:

@@ -148,6 +148,8 @@ def command_parsers() -> dict[str, Parser]:
     render.add_argument("--times", metavar="S,S", type=_list_of(_number), help="seconds since raw frame 0 (each frame)")
     poses = "world-to-camera matrices in a .npy file, or the sequence's novel views (each frame's own pose)"
     render.add_argument("--poses", metavar="FILE|novel", help=poses)
+    arrays = "one .npy file per channel with all images, many times as fast as pictures"
+    render.add_argument("--arrays", action="store_true", help=arrays)
     _device_options(render)
     _fresh_option(render)
 

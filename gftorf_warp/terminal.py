@@ -28,14 +28,15 @@ class Progress:
     Call it as ``progress(done, total, name=value, ...)``; the values are shown as they are.
     """
 
-    def __init__(self, label: str, *, quiet: bool = False):
+    def __init__(self, label: str, *, quiet: bool = False, unit: str | None = None):
         """Start the clock.
 
         Args:
             label: What is being done.
             quiet: Whether to print nothing at all.
+            unit: What is counted, to show how many of them a second takes; None: not shown.
         """
-        self.label, self.quiet = label, quiet
+        self.label, self.quiet, self.unit = label, quiet, unit
         self.live = sys.stderr.isatty()
         self.start = self.shown = time.monotonic()
         self.width = 0
@@ -50,6 +51,8 @@ class Progress:
         if self.quiet or (now - self.shown < every and done < total):
             return
         self.shown = now
+        if self.unit and done > self.first and now > self.start:
+            values = {f"{self.unit}/s": (done - self.first) / (now - self.start), **values}
         line = progress_line(self.label, done, total, self.first, now - self.start, values)
         if self.live:
             print(f"\r{line:<{self.width}}", end="\n" if done >= total else "", file=sys.stderr, flush=True)

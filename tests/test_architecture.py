@@ -51,6 +51,10 @@ LAUNCHES = {  # file: what it launches
     "render/replay.py": "Gaussians at a time, before they are rendered again",
     "render/trace.py": "rays through meshes, which share nothing with a rendering",
 }
+KNOWS_STREAMS = {  # streams, events and graphs of torch
+    "render/bridge.py": "a step and its graphs",
+    "render/outgoing.py": "what leaves the device while it goes on",
+}
 KNOWS_KINDS = {"render/buffers.py": "the shape of a tile depends on the kind of device, which is the input's"}
 HOMELESS = {"utils", "util", "common", "misc", "types", "helpers"}
 
@@ -107,10 +111,10 @@ def test_module_imports_what_its_room_may(path):
 
 @pytest.mark.parametrize("path", FILES, ids=name_of)
 def test_module_names_no_device_and_launches_nowhere_else(path):
-    """Devices are named by the command line; kernels are launched where ``LAUNCHES`` says; streams are the bridge's."""
+    """Devices are named by the command line; kernels are launched where ``LAUNCHES`` says, streams likewise."""
     for node in ast.walk(ast.parse(path.read_text())):
         if path.parent != ROOT:
-            named = getattr(node, "attr", None) == "cuda" and name_of(path) != "render/bridge.py"
+            named = getattr(node, "attr", None) == "cuda" and name_of(path) not in KNOWS_STREAMS
             assert not named, f"line {node.lineno}: follow the device of the input"
             text = node.value if isinstance(node, ast.Constant) and name_of(path) not in KNOWS_KINDS else None
             assert not (isinstance(text, str) and re.fullmatch(r"cuda(:\d+)?", text)), f"line {node.lineno}: {text}"

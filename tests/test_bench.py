@@ -60,7 +60,10 @@ def test_quick_bench_writes_everything_it_prints(tmp_path, capsys):
         "renderer",
         "unchecked",
         "arrays",
+        "series",
+        "host",
         "files",
+        "stored",
     ]
     ways = {(row["kernels"], row["batch"]) for row in found["parts"]["step"]["rows"]}
     assert ways == {(str(k), str(b)) for k in KINDS for b in Batch}

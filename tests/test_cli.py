@@ -336,6 +336,9 @@ def test_render_writes_what_was_asked_for(run, tmp_path, capsys):
         assert len(list((out_folder / what).glob("*.exr"))) == 2
     assert not (out_folder / "phasor").exists()
     fails(["render", str(run), "--out", str(out_folder), "--times", "0.5"], 2, capsys, str(out_folder), "--fresh")
+    fails([*arguments, "--arrays"], 2, capsys, str(out_folder), "--fresh")
+    assert cli.main([*arguments, "--arrays", "--fresh"]) == 0
+    assert np.load(out_folder / "quads" / "quad_180.npy").shape[0] == 2
 
 
 def test_compare_prints_a_table_or_json(run, sequence, capsys):
@@ -417,6 +420,16 @@ def test_progress_is_plain_and_rare_without_a_terminal(capsys):
         for done in range(1, 6):
             progress(done, 5)
     assert [line.partition("  ")[2][:5] for line in capsys.readouterr().err.splitlines()] == ["x 5/5"]
+
+
+def test_progress_counts_per_second_what_has_a_unit(capsys, monkeypatch):
+    """From the first report on: eight images in four seconds."""
+    now = iter([0.0, 10.0, 14.0])
+    monkeypatch.setattr(terminal.time, "monotonic", lambda: next(now))
+    progress = terminal.Progress("render", unit="images")
+    progress(1, 9)
+    progress(9, 9)
+    assert capsys.readouterr().err.splitlines()[-1] == "  render 9/9  images/s 2  4.0 s"
 
 
 def test_warp_speaks_through_our_log(caplog):

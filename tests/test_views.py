@@ -12,7 +12,7 @@ from analytic_run import FRAMES, HEIGHT, WIDTH, AnalyticRun, true_distance, with
 
 from gftorf_warp.data.images import read_exr
 from gftorf_warp.errors import InputError, ResourceError, UsageError
-from gftorf_warp.evaluate import pictures, renders, views
+from gftorf_warp.evaluate import pictures, previews, renders, writers
 from gftorf_warp.evaluate.views import quad_of_shift, render_to_folder
 from gftorf_warp.scene.sensor import Sensor
 
@@ -86,7 +86,7 @@ def test_writing_reports_in_order_and_stops_at_the_first_error(run, tmp_path, mo
         if path.name == "000003.png":
             raise ResourceError("no space left", where=path, why="full", fix="free some")
 
-    monkeypatch.setattr(views, "write_png", full)
+    monkeypatch.setattr(writers, "write_png", full)
     with pytest.raises(ResourceError, match=r"000003\.png"):
         render_to_folder(run, tmp_path / "other", what="distance")
 
@@ -213,7 +213,11 @@ def test_colour_is_written_linear_and_shown_as_srgb(run):
     images = renders.channels("colour", replace(run.render(0.0), colour=colour), run.sensor)
     assert list(images) == ["R", "G", "B"]
     assert images["B"].max() == 7.0
-    assert renders.preview("colour", images, renders.preview_scale("colour", [images]))[0, 0].tolist() == [188, 0, 255]
+    assert previews.preview("colour", images, previews.preview_scale("colour", [images]))[0, 0].tolist() == [
+        188,
+        0,
+        255,
+    ]
 
 
 def test_a_shift_finds_its_quad(run):

@@ -2,17 +2,21 @@
 
 ``render`` is a Python loop over ``Run.render``, ``renderer`` one over ``Run.renderer``, which keeps arrays and on CUDA
 replays a graph; ``unchecked`` is the same without looking after every image whether all pairs fitted, ``launched``
-without graphs, pairs counted on the host. ``arrays`` is what ``gftorf render`` does before it writes, so its images are
-NumPy arrays on the host; ``files`` is that command, EXR and PNG included. Compilation, capture and the displacements at
-the first two keys are over when the clock starts, those at all later keys are part of the time.
+without graphs, pairs counted on the host. ``series`` is a loop over images that stay on the device and are looked after
+a few images later, ``host`` one over NumPy arrays that come to the host meanwhile, ``Run.images``; ``arrays`` waits for
+each of them. ``files`` is ``gftorf render``, EXR and PNG included, ``stored`` the same with ``--arrays``, until
+everything is flushed to the disk; in brackets the rate before that. Compilation, capture and the displacements at the
+first two keys are over when the clock starts, those at all later keys are part of the time; the two commands start from
+nothing.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
-from itertools import pairwise
+from itertools import islice, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -21,46 +25,44 @@ import numpy as np
 from ..evaluate import views
 from ..recon.run import Run
 from ..render.replay import Replay
+from ..render.series import Series, View
 from ..scene.camera import Camera
 from .timing import LOG, Report, Timing, lines_of, watch_of
 
 IMAGES = 600
 QUICK_IMAGES = 12
-FILES = 60  # images at most that are written
+STORED = 3000  # images that are written as arrays: 5 GB
 ROUNDS = 5  # over which a spread is taken
 WARM_UP = 4  # images of every way before the clock starts
 WHAT = ("distance", "quads")
+NEEDED = ("quads", "distance", "opacity")
 Render = Callable[[float, Camera], Any]
+Way = Callable[[Iterable[View]], Iterator[Any]]
 
 
-def _renderer(run: Run) -> Render:
-    return run.renderer(("quads", "distance", "opacity"))
+def _single(render: Render) -> Way:
+    return lambda taken: (render(*view) for view in taken)
 
 
-def _unchecked(run: Run) -> Render | None:
-    replay = _renderer(run)
-    return partial(replay, checked=False) if isinstance(replay, Replay) else None
-
-
-def _launched(run: Run) -> Render | None:
-    replay = _renderer(run)
-    if not (isinstance(replay, Replay) and replay.graphs):
+def _launched(_: Run, render: Render) -> Way | None:
+    if not (isinstance(render, Replay) and render.graphs):
         return None
-    replay.graphs = False
-    return replay
+    render.graphs = False
+    return _single(render)
 
 
-def _arrays(run: Run) -> Render:
-    return views.images_of(_renderer(run), run.sensor, WHAT)
-
-
-WAYS: dict[str, Callable[[Run], Render | None]] = {  # None: there is no such way for this run on this device
-    "render": lambda run: run.render,
-    "renderer": _renderer,
-    "unchecked": _unchecked,
+WAYS: dict[str, Callable[[Run, Render], Way | None]] = {  # of a run and a new renderer of it; None: there is none here
+    "render": lambda run, _: _single(run.render),
+    "renderer": lambda _, render: _single(render),
+    "unchecked": lambda _, render: _single(partial(render, checked=False)) if isinstance(render, Replay) else None,
     "launched": _launched,
-    "arrays": _arrays,
+    "arrays": lambda run, render: _single(views.images_of(render, run.sensor, WHAT)),
+    "series": lambda _, render: (
+        (lambda taken: Series(render, taken).on_device()) if isinstance(render, Replay) else None
+    ),
+    "host": lambda run, render: lambda taken: views.series_of(render, taken, run.sensor, WHAT),
 }
+COMMANDS = {"files": False, "stored": True}  # whether they write arrays
 
 
 def measure(
@@ -80,42 +82,61 @@ def measure(
     sequence = run.sequence()
     total = images or (QUICK_IMAGES if quick else IMAGES)
     seconds = [float(t) for t in np.linspace(sequence.times[0], sequence.times[-1], total)]
-    cameras = [views.camera_at(run, sequence, t) for t in seconds]
+    taken = [(t, views.camera_at(run, sequence, t)) for t in seconds]
 
     rows: list[dict[str, Any]] = []
     about: dict[str, Any] = {"N": run.gaussians, "width": run.camera.width, "height": run.camera.height}
-    shared = _renderer(run)
+    shared = run.renderer(NEEDED)
     if isinstance(shared, Replay):
-        shared(seconds[total // 2], cameras[total // 2])
+        shared(*taken[total // 2])
         about["pairs"] = shared.largest  # in the middle
-    for done, (name, way) in enumerate(WAYS.items(), start=1):
-        render = way(run)
-        if render is None:
+    steps = len(WAYS) + len(COMMANDS)
+    for done, (name, make) in enumerate(WAYS.items(), start=1):
+        render = run.renderer(NEEDED)
+        way = make(run, render)
+        if way is None:
             continue
-        for k in range(min(total, WARM_UP)):
-            render(seconds[k], cameras[k])
+        _exhaust(way(taken[:WARM_UP]))
+        images_left = way(taken)
         times, start = [], time.perf_counter()
         for first, last in pairwise(np.linspace(0, total, min(ROUNDS, total) + 1).astype(int).tolist()):
             watch.synchronise()
             begun = time.perf_counter()
-            for k in range(first, last):
-                render(seconds[k], cameras[k])
+            _exhaust(islice(images_left, last - first))
             watch.synchronise()
             times.append(1e3 * (time.perf_counter() - begun) / (last - first))
         rate = total / (time.perf_counter() - start)
-        fits = not isinstance(render, partial) or render.func.fits()  # type: ignore[attr-defined]
+        fits = not isinstance(render, Replay) or render.fits()
         if not fits:
             LOG.warning("%s: some images needed more pairs than were reserved, and lack far splats", name)
         row = about | {"way": name, "images": total, "images_per_s": rate, "ms": Timing.of(times).plain(), "fits": fits}
         rows.append(row)
-        report(done, len(WAYS) + 1, images_per_s=rate)
-    count = min(total, FILES)
-    begun = time.perf_counter()
-    views.render_to_folder(run, out, WHAT, seconds[:count])
-    spent = time.perf_counter() - begun
-    rows.append(about | {"way": "files", "images": count, "images_per_s": count / spent, "ms": None})
-    report(len(WAYS) + 1, len(WAYS) + 1, images_per_s=count / spent)
+        report(done, steps, images_per_s=rate)
+    for done, (name, arrays) in enumerate(COMMANDS.items(), start=len(WAYS) + 1):
+        many = STORED if arrays and not (quick or images) else total
+        seconds = [float(t) for t in np.linspace(sequence.times[0], sequence.times[-1], many)]
+        row = _commanded(run, out / name, seconds, arrays)
+        rows.append(about | {"way": name} | row)
+        report(done, steps, images_per_s=row["images_per_s"])
     return rows
+
+
+def _commanded(run: Run, out: Path, seconds: list[float], arrays: bool) -> dict[str, Any]:
+    """What ``gftorf render`` takes: all of it, and from the first to the last but one progress, before the flush."""
+    seen: list[tuple[int, float]] = []
+    begun = time.perf_counter()
+    views.render_to_folder(
+        run, out, WHAT, seconds, arrays=arrays, progress=lambda done, _: seen.append((done, time.perf_counter()))
+    )
+    spent = time.perf_counter() - begun
+    (first, early), (last, late) = seen[0], seen[max(0, len(seen) - 2)]
+    going = (last - first) / (late - early) if last > first else None
+    return {"images": len(seconds), "images_per_s": len(seconds) / spent, "going_images_per_s": going, "ms": None}
+
+
+def _exhaust(images: Iterator[Any]) -> None:
+    """Ask for all of them, and hold none."""
+    deque(images, maxlen=0)
 
 
 def table(rows: list[dict[str, Any]]) -> list[str]:
@@ -125,7 +146,7 @@ def table(rows: list[dict[str, Any]]) -> list[str]:
         [
             row["way"],
             str(row["images"]),
-            f"{row['images_per_s']:.1f}",
+            f"{row['images_per_s']:.1f}" + (f" ({going:.0f})" if (going := row.get("going_images_per_s")) else ""),
             "-" if row["ms"] is None else f"{row['ms']['median']:.3f}",
         ]
         for row in rows

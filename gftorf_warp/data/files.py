@@ -161,10 +161,11 @@ def flush_folder(path: str | Path) -> None:
 def sweep(path: str | Path) -> None:
     """Remove what killed processes left of earlier attempts to write ``path``; living ones keep theirs."""
     path = Path(path)
-    pattern = re.compile(rf"\.{re.escape(path.name)}\.tmp-(\d+)-\d+")
+    start = f".{path.name}.tmp-"
     with contextlib.suppress(OSError):  # another process may sweep at the same time
-        for entry in path.absolute().parent.iterdir():
-            match = pattern.fullmatch(entry.name)
+        folder = path.absolute().parent
+        for name in [name for name in os.listdir(folder) if name.startswith(start)]:  # few of perhaps many
+            match, entry = re.fullmatch(r"(\d+)-\d+", name.removeprefix(start)), folder / name
             if match and not _alive(int(match[1])):
                 if entry.is_dir():
                     shutil.rmtree(entry, ignore_errors=True)

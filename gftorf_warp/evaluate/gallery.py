@@ -12,7 +12,7 @@ from ..data.sequence import Sequence
 from ..scene.measured import colour_camera_of
 from . import page, pictures
 from .poses import middle
-from .renders import srgb
+from .previews import srgb
 from .views import finite
 
 if TYPE_CHECKING:

@@ -1,4 +1,4 @@
-"""What ``gftorf render`` writes: per time one EXR with the values and one PNG to look at, for each thing asked for."""
+"""What ``gftorf render`` may be asked for, which images that takes, and the folder it goes to."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 
 from ..data.files import write_json
 from ..errors import UsageError
 from ..recon.folder import set_aside
 from ..render.api import Rendering
 from ..scene.sensor import Sensor
-from . import pictures
+from .previews import Channels
 
 LIST = "renders.json"
-LISTED = ("run", "times_s", "camera_from_world", "channels")  # its keys that say which images these are
+LISTED = ("run", "times_s", "camera_from_world", "channels", "arrays")  # its keys that say which images these are
 NEEDS = {  # what may be asked for: the images of a rendering that it consists of
     "distance": ("distance", "opacity"),
     "quads": ("quads",),
@@ -27,7 +27,6 @@ NEEDS = {  # what may be asked for: the images of a rendering that it consists o
     "colour": ("colour",),
 }
 WHAT = tuple(NEEDS)
-Channels = dict[str, Float[np.ndarray, "H W"]]
 
 
 def checked(what: str | Iterable[str]) -> tuple[str, ...]:
@@ -53,65 +52,45 @@ def checked(what: str | Iterable[str]) -> tuple[str, ...]:
 
 
 def channels(name: str, rendering: Rendering, sensor: Sensor) -> Channels:
+    """The images of one thing by channel name, see :func:`named`, of a rendering wherever it is.
+
+    Raises:
+        UsageError: If colour is asked for and the field has none.
+    """
+    given = [getattr(rendering, image) for image in NEEDS[name]]
+    if given[0] is None:
+        return named(name, {}, sensor)
+    images = torch.stack(given) if len(given) > 1 else given[0]
+    host = images.detach().cpu().numpy().astype(np.float32)  # one transfer, and memory of its own
+    return named(name, dict(zip(NEEDS[name], host if len(given) > 1 else [host], strict=True)), sensor)
+
+
+def named(name: str, images: Mapping[str, Float[np.ndarray, "..."]], sensor: Sensor) -> Channels:
     """The images of one thing by channel name: what its EXR holds.
 
     distance: ``distance`` [m], not divided by ``opacity`` [1]. quads: ``quad_<shift in degrees>`` [file units]. phasor:
     ``re``, ``im``, ``amplitude`` [file units]. colour: ``R``, ``G``, ``B``, linear [1].
 
+    Args:
+        name: Of the thing.
+        images: What it consists of, by name, and perhaps more.
+        sensor: Whose shifts the quads have.
+
     Raises:
-        UsageError: If colour is asked for and the field has none.
+        UsageError: If colour is asked for and there is none.
     """
-    if name == "distance":
-        names, images = ["distance", "opacity"], torch.stack([rendering.distance, rendering.opacity])
-    elif name == "quads":
-        names, images = [f"quad_{math.degrees(shift):03.0f}" for shift in sensor.shifts], rendering.quads
-    elif name == "phasor":
-        names, images = ["re", "im", "amplitude"], rendering.phasor
-    elif rendering.colour is None:
+    if name == "colour" and "colour" not in images:
         raise UsageError(
             "no colour to render",
             where="--what colour",
             why="this run was reconstructed from quads alone",
             fix="leave colour out of --what",
         )
-    else:
-        names, images = [*"RGB"], rendering.colour
-    host = images.detach().cpu().numpy().astype(np.float32)  # one transfer, and memory of its own
-    return dict(zip(names, host, strict=True))
-
-
-def preview_scale(name: str, samples: Iterable[Channels]) -> pictures.Scale:
-    """One scale for the previews of all times, from a few of them; for a phasor it is that of the amplitude."""
-    samples = list(samples)
     if name == "distance":
-        return pictures.distance_scale([sample["distance"] for sample in samples])
-    if name == "quads":
-        return pictures.signed_scale([image for sample in samples for image in sample.values()])
-    if name == "phasor":
-        return pictures.amplitude_scale([sample["amplitude"] for sample in samples])
-    return pictures.Scale(low=0.0, high=1.0, colours="gray", unit="1")
-
-
-def preview(name: str, images: Channels, scale: pictures.Scale) -> UInt8[np.ndarray, "H w 3"]:
-    """A picture of one thing: distance; the quads in a row; phase and amplitude in a row; or sRGB."""
-    if name == "distance":
-        return pictures.colour_mapped(images["distance"], scale)
-    if name == "quads":
-        return pictures.side_by_side([pictures.colour_mapped(image, scale) for image in images.values()])
-    if name == "phasor":
-        phase = np.arctan2(images["im"], images["re"]) % (2.0 * np.pi)
-        return pictures.side_by_side(
-            [
-                pictures.colour_mapped(phase, pictures.phase_scale()),
-                pictures.colour_mapped(images["amplitude"], scale),
-            ]
-        )
-    return srgb(np.stack(list(images.values()), axis=-1))
-
-
-def paths(out: Path, name: str, index: int) -> tuple[Path, Path]:
-    """Where the EXR and the PNG of one thing at the index-th time belong."""
-    return out / name / f"{index:06d}.exr", out / name / f"{index:06d}.png"
+        return {image: images[image] for image in NEEDS[name]}
+    quads = [f"quad_{math.degrees(shift):03.0f}" for shift in sensor.shifts]
+    names = {"quads": quads, "phasor": ["re", "im", "amplitude"], "colour": [*"RGB"]}[name]
+    return dict(zip(names, images[name], strict=True))
 
 
 def make_room(out: Path, listed: Mapping[str, object], *, fresh: bool) -> None:
@@ -151,10 +130,3 @@ def _same(path: Path, listed: Mapping[str, object]) -> bool:
     except (OSError, ValueError):
         return False
     return isinstance(found, dict) and all(found.get(key) == listed.get(key) for key in LISTED)
-
-
-def srgb(linear: Float[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
-    """8-bit sRGB of linear RGB (IEC 61966-2-1)."""
-    linear = np.clip(linear, 0.0, 1.0)
-    encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1.0 / 2.4) - 0.055)
-    return np.round(255.0 * encoded).astype(np.uint8)

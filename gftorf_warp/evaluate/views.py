@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections import deque
-from collections.abc import Callable, Iterable
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,22 +13,19 @@ import torch
 from jaxtyping import Float
 
 from ..data.decode import Decoded, decode_quartet
-from ..data.images import write_exr, write_png
 from ..data.sequence import Sequence
 from ..errors import DivergedError, UsageError
 from ..render.api import Rendering
+from ..render.series import View, on_host
 from ..scene.camera import Camera
 from ..scene.sensor import Sensor, channel_of
-from . import renders
+from . import previews, renders, stored, writers
 from .metrics import distance_from_quads, normalised
 from .poses import middle
 from .poses import read as read_poses
 
 if TYPE_CHECKING:
     from ..recon.run import Run
-
-WRITERS = 4  # threads that compress and flush files while the next images are rendered
-WAITING = 16  # images at most that are rendered and not written: what memory holds
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -133,8 +128,12 @@ def render_frame(run: Run, sequence: Sequence, n: int, *, f_mod_hz: float | None
 
 def camera_at(run: Run, sequence: Sequence, time: float) -> Camera:
     """The camera at the pose of the raw frame nearest to ``time`` [s]."""
-    nearest = int(np.abs(sequence.times - time).argmin())
-    return run.camera.at(sequence.camera_from_world[nearest])
+    return run.camera.at(sequence.camera_from_world[nearest_frame(sequence, time)])
+
+
+def nearest_frame(sequence: Sequence, time: float) -> int:
+    """The raw frame nearest to ``time`` [s]."""
+    return int(np.abs(sequence.times - time).argmin())
 
 
 def quad_of_shift(rendering: Rendering, sensor: Sensor, shift: float) -> torch.Tensor:
@@ -174,12 +173,16 @@ def render_to_folder(
     *,
     poses: str | Path | None = None,
     fresh: bool = False,
+    arrays: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> Path:
     """Write what the run looks like at some times: ``OUT/<what>/<index>.exr`` (float32) and ``.png`` to look at.
 
     ``OUT/renders.json`` lists the times [s], the channels with their units and the scale of the previews; poses, if any
     were given. Otherwise the pose is that of the raw frame nearest to each time.
+
+    Pictures are encoded by as many threads as there are CPUs. Arrays are only copied, and many times as fast:
+    ``OUT/<what>/<channel>.npy``, float32 [S, H, W] of all S times, with the values of the EXR files.
 
     Args:
         run: A finished reconstruction.
@@ -190,58 +193,66 @@ def render_to_folder(
         poses: A .npy file of world-to-camera matrices [M, 4, 4] or [M, 3, 4], or ``novel``, those that the sequence
             carries. Image k is taken from pose k at time k; the shorter list starts over.
         fresh: Whether to move what else ``out`` holds aside, to ``out/old-<k>``.
+        arrays: Whether to write arrays, and no pictures.
         progress: Called with (times done, times in all).
 
     Raises:
         UsageError: If a name in ``what`` is unknown, the run has no colour, there are no such poses or the run has one
             view only, or ``out`` holds something else.
         InputError: If the poses cannot be read.
+        ResourceError: If the disk is full, or cannot hold the arrays.
     """
     names = renders.checked(what)
     sequence = run.sequence()
     seconds, cameras = views_to_take(run, sequence, times, poses)
 
-    render = run.renderer({image for name in names for image in renders.NEEDS[name]})
+    needed = {image for name in names for image in renders.NEEDS[name]}
+    render = run.renderer(needed)
     images = images_of(render, run.sensor, names)
     samples = [images(seconds[i], cameras[i]) for i in sorted({0, len(seconds) // 2, len(seconds) - 1})]
-    scales = {name: renders.preview_scale(name, (sample[name] for sample in samples)) for name in names}
-    out = Path(out)
-    listed = {
+    scales = {name: previews.preview_scale(name, (sample[name] for sample in samples)) for name in names}
+    out, channels = Path(out), {name: list(samples[0][name]) for name in names}
+    listed: dict[str, Any] = {
         "run": str(run.path),
         "times_s": seconds,
         "camera_from_world": None if poses is None else [camera.camera_from_world.tolist() for camera in cameras],
-        "channels": {name: list(samples[0][name]) for name in names},
-        "preview": {name: asdict(scale) for name, scale in scales.items()},
+        "channels": channels,
     }
+    if arrays:
+        listed["arrays"] = True
+    else:
+        listed["preview"] = {name: asdict(scale) for name, scale in scales.items()}
     renders.make_room(out, listed, fresh=fresh)
     for name in names:
         (out / name).mkdir(exist_ok=True)
-
-    def write(index: int, found: dict[str, renders.Channels]) -> None:
-        for name, channels in found.items():
-            exr, png = renders.paths(out, name, index)
-            write_exr(exr, channels)
-            write_png(png, renders.preview(name, channels, scales[name]))
-
-    with ThreadPoolExecutor(WRITERS, thread_name_prefix="gftorf-files") as threads:
-        waiting: deque[Future] = deque()
-        for index, (time, camera) in enumerate(zip(seconds, cameras, strict=True)):
-            waiting.append(threads.submit(write, index, images(time, camera)))
-            written = index + 1 - len(waiting)
-            while waiting and (len(waiting) > WAITING or waiting[0].done() or index + 1 == len(seconds)):
-                waiting.popleft().result()  # raises what stopped the writing
-                written += 1
-                if progress is not None:
-                    progress(written, len(seconds))
+    series = series_of(render, zip(seconds, cameras, strict=True), run.sensor, names)
+    if arrays:
+        shape = len(seconds), *next(iter(samples[0][names[0]].values())).shape
+        stored.store_all(out, channels, series, shape, progress)
+    else:
+        writers.write_all(out, scales, series, len(seconds), progress)
     return out
+
+
+def series_of(
+    render: Callable[[float, Camera], Rendering], views: Iterable[View], sensor: Sensor, names: Iterable[str]
+) -> Iterator[Mapping[str, previews.Channels]]:
+    """What ``gftorf render`` writes, image by image: arrays on the host, which stay as they are while they are held.
+
+    On CUDA the next images are rendered meanwhile, and none of them waits for the device.
+    """
+    names = list(names)
+    needed = sorted({image for name in names for image in renders.NEEDS[name]})
+    for found in on_host(render, views, needed):
+        yield {name: renders.named(name, found, sensor) for name in names}
 
 
 def images_of(
     render: Callable[[float, Camera], Rendering], sensor: Sensor, names: Iterable[str]
-) -> Callable[[float, Camera], dict[str, renders.Channels]]:
-    """What ``gftorf render`` writes of each image: arrays on the host, which no later call overwrites."""
+) -> Callable[[float, Camera], dict[str, previews.Channels]]:
+    """The same one by one, each time waiting for the device: arrays on the host, which no later call overwrites."""
 
-    def images(time: float, camera: Camera) -> dict[str, renders.Channels]:
+    def images(time: float, camera: Camera) -> dict[str, previews.Channels]:
         rendering = render(time, camera)
         return {name: renders.channels(name, rendering, sensor) for name in names}
 
@@ -258,7 +269,9 @@ def views_to_take(
     if not seconds:
         raise UsageError("no time to render", where="--times", why="the list is empty", fix="leave --times out")
     if found is None:
-        return seconds, [camera_at(run, sequence, time) for time in seconds]
+        nearest = [nearest_frame(sequence, time) for time in seconds]
+        known = {n: run.camera.at(sequence.camera_from_world[n]) for n in set(nearest)}
+        return seconds, [known[n] for n in nearest]
     count = max(len(seconds), len(found))
     cameras = [run.camera.at(pose) for pose in found]
     return [seconds[k % len(seconds)] for k in range(count)], [cameras[k % len(found)] for k in range(count)]

@@ -50,6 +50,8 @@ def note_largest(
     total: wp.array[int],  # [1] pairs of this rendering [1]
     # Out:
     largest: wp.array[int],  # [1] of all so far [1]
+    latest: wp.array[int],  # [1] the same, beside the images that it belongs to [1]
 ):
     """One thread."""
     largest[0] = wp.max(largest[0], total[0])
+    latest[0] = total[0]

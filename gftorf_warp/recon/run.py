@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -20,6 +20,7 @@ from ..render.api import Rendering, rasterize
 from ..render.buffers import ClampGradient, Distortion, RenderSettings, Stop, Support
 from ..render.inputs import CHOICES
 from ..render.replay import Replay
+from ..render.series import on_host
 from ..scene.camera import Camera
 from ..scene.distortion import Distortion as Lens
 from ..scene.gaussians import GaussianField
@@ -150,17 +151,24 @@ class Run:
         field = self.field if "colour" in names else replace(self.field, colour_sh=None)
         sensor = replace(self.sensor, source_intensity=float(self.sensor.source_intensity) / self.quad_scale)
         optimised = self.camera.resized(*self.config["size_optimised"])
-        replay = Replay(field, self.motion, self.attachment, sensor, self.render_settings, optimised, names)
-        if field.colour_sh is None:
-            return replay
+        known = field, self.motion, self.attachment, sensor, self.render_settings, optimised, names
+        return Replay(*known, colour_scale=self.colour_scale)
 
-        def scaled(time: float, camera: Camera) -> Rendering:
-            rendering = replay(time, camera)
-            assert rendering.colour is not None
-            rendering.colour.div_(self.colour_scale)
-            return rendering
+    def images(
+        self, times: Iterable[float], cameras: Iterable[Camera], images: Iterable[str] = (*CHOICES, "colour")
+    ) -> Iterator[dict[str, Float[np.ndarray, "..."]]]:
+        """:meth:`renderer` for a loop that wants arrays on the host: on CUDA, they come while the next are rendered.
 
-        return scaled
+        Every image is whole, in the order of ``times``: one that needs more memory than was reserved is rendered again.
+        Arrays stay valid for as long as anything refers to them, see :meth:`Series.on_host`.
+
+        Args:
+            times: Seconds since raw frame 0 of each image.
+            cameras: Where from, one each.
+            images: As in :meth:`renderer`.
+        """
+        names = tuple(images)
+        yield from on_host(self.renderer(names), zip(times, cameras, strict=True), names)
 
     def widened(self, field: GaussianField, camera: Camera) -> GaussianField:
         """Gaussians as wide as they looked while they were optimised, for a camera that resolves more.

@@ -9,8 +9,9 @@ rendered again. A replay runs the very launches of a call, so it gives the same 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -25,21 +26,25 @@ from ..scene.motion import Motion
 from ..scene.sensor import Sensor
 from . import launch
 from .api import Rendering
-from .bridge import array_over, left_out, stream_of
+from .bridge import ALIGNED, array_over, left_out, stream_of
 from .buffers import Frame, RenderSettings
 from .inputs import CHOICES, Images, Inputs, names_of, shapes_of, wanted_images
 
 ROOM = 1.5  # pairs that are reserved, over the most that were needed so far
 CAMERAS_MAX = 16  # that are kept, with their graphs
+Memory = TypeVar("Memory", Tensor, np.ndarray)
 
 
 @dataclass(kw_only=True, eq=False)
-class _Target:
+class Target:
     """The arrays of all renderings of one size."""
 
     frame: Frame
+    packed: Tensor  # [L] all images, one after the other, so that they move at once; last, as int32, their pairs
+    places: dict[str, tuple[int, tuple[int, ...]]]  # where in it each of them starts, and its shape
     tensors: dict[str, Tensor]
     images: Images
+    pairs: wp.array  # the last one of ``packed``
 
 
 @dataclass(kw_only=True, eq=False)
@@ -48,7 +53,7 @@ class _View:
 
     view: CameraView
     row: wp.vec4
-    target: _Target
+    target: Target
     used: int = 0
     graph: wp.Graph | None = None
 
@@ -68,6 +73,8 @@ class Replay:
         settings: RenderSettings,
         optimised: Camera,
         images: Iterable[str] = (*CHOICES, "colour"),
+        *,
+        colour_scale: float = 1.0,
     ):
         """Take a copy of what changes, and share the rest.
 
@@ -80,13 +87,14 @@ class Replay:
             optimised: The camera at the size of the optimisation, whose low-pass filter widened the Gaussians.
             images: Names of what is wanted of quads, phasor, colour, distance, opacity and distortion; others have no
                 elements and cost nothing.
+            colour_scale: What colour is divided by.
 
         Raises:
             ValueError: If there is no such image.
         """
         wp.init()
         field = field.map(lambda tensor: tensor.detach().contiguous())
-        self.motion, self.attachment, self.settings = motion, attachment, settings
+        self.motion, self.attachment, self.settings, self.colour_scale = motion, attachment, settings, colour_scale
         colour = {"colour"} & set(images) if field.colour_sh is not None else set()
         self.names, self._like = wanted_images(set(images) - {"colour"}) | colour, field.mean
         self.shifts = tuple(float(shift) for shift in sensor.shifts)
@@ -111,11 +119,10 @@ class Replay:
         self._rest, self._optimised = rest, _row(optimised)
         self._moved = [self._inputs.mean, self._inputs.log_scale]
         self._views: dict[tuple, _View] = {}
-        self._targets: dict[tuple[int, int], _Target] = {}
+        self._targets: dict[tuple[int, int], Target] = {}
         self._largest = wp.zeros(1, dtype=wp.int32, device=self.device)
         self._capacity: int | None = None  # of pairs; None: they are counted on the host, and on a CPU they always are
 
-    @torch.no_grad()
     def __call__(self, time: float, camera: Camera, *, checked: bool = True) -> Rendering:
         """The images at one instant, in memory that the next call overwrites.
 
@@ -125,11 +132,16 @@ class Replay:
             checked: Whether to wait for the device and see that all pairs fitted. Without, ask :meth:`fits` later: far
                 splats are missing in images for which the reserve was too small.
         """
-        rendering = self._rendered(time, camera)
+        target = self.draw(time, camera)
         if checked and not self.fits():
             self.grow()
-            rendering = self._rendered(time, camera)
-        return rendering
+            target = self.draw(time, camera)
+        return self.rendering(target.tensors, camera)
+
+    def rendering(self, tensors: Mapping[str, Tensor], camera: Camera) -> Rendering:
+        """Images by name as a rendering, without elements where there is none."""
+        images = {name: tensors[name] if name in tensors else self._left_out(name, camera) for name in CHOICES}
+        return Rendering(**images, colour=tensors.get("colour"), extra=None, screen=None)
 
     def fits(self) -> bool:
         """Whether the reserve of pairs sufficed since it was made; waits for the device."""
@@ -147,7 +159,9 @@ class Replay:
         with stream_of(self._mean):
             return int(self._largest.numpy()[0])
 
-    def _rendered(self, time: float, camera: Camera) -> Rendering:
+    @torch.no_grad()
+    def draw(self, time: float, camera: Camera) -> Target:
+        """The images at one instant, without a look at whether their pairs fitted; the next one overwrites them."""
         key, share = self.motion.position(time)
         for number in (key, key + 1) if share > 0.0 else (key,):
             if number not in self._known:
@@ -166,9 +180,9 @@ class Replay:
         seen.used += 1
         if self.graphs and self._capacity is None:
             self.grow()
-        tensors = seen.target.tensors
-        images = {name: tensors[name] if name in tensors else self._left_out(name, camera) for name in CHOICES}
-        return Rendering(**images, colour=tensors.get("colour"), extra=None, screen=None)
+        if "colour" in seen.target.tensors:
+            seen.target.tensors["colour"].div_(self.colour_scale)
+        return seen.target
 
     def _left_out(self, name: str, camera: Camera) -> Tensor:
         return left_out(name, self._like, camera.height, camera.width)
@@ -188,7 +202,8 @@ class Replay:
         frame = seen.target.frame
         launch.forward(self._inputs, seen.view, self.shifts, frame, seen.target.images)
         if self.count:
-            wp.launch(move.note_largest, 1, [frame.total], [self._largest], device=self.device, record_tape=False)
+            noted = [self._largest, seen.target.pairs]
+            wp.launch(move.note_largest, 1, [frame.total], noted, device=self.device, record_tape=False)
 
     def _view(self, camera: Camera) -> _View:
         """What is kept for a camera; the one that came first leaves when there are too many."""
@@ -196,8 +211,9 @@ class Replay:
         name = (*lens, camera.camera_from_world.tobytes())
         if name not in self._views:
             if len(self._views) >= CAMERAS_MAX:
-                wp.synchronize_device(self.device)  # its graph may be at work
-                self._views.pop(next(iter(self._views)))
+                if self._views[first := next(iter(self._views))].graph is not None:
+                    wp.synchronize_device(self.device)  # it may be at work
+                self._views.pop(first)
             size = camera.height, camera.width
             if size not in self._targets:
                 self._targets[size] = self._target(*size)
@@ -205,14 +221,25 @@ class Replay:
             self._views[name] = _View(view=view, row=_row(camera), target=self._targets[size])
         return self._views[name]
 
-    def _target(self, height: int, width: int) -> _Target:
+    def _target(self, height: int, width: int) -> Target:
         shapes = shapes_of(len(self.shifts), height, width)
-        tensors = {name: self._mean.new_empty(shapes[name]) for name in shapes if name in self.names}
+        places, length = {}, 0
+        for name in (name for name in shapes if name in self.names):
+            places[name] = length, shapes[name]
+            length += -(-math.prod(shapes[name]) // ALIGNED) * ALIGNED
+        packed = self._mean.new_zeros(length + ALIGNED)
+        tensors = {name: part(packed, *place) for name, place in places.items()}
         settings = replace(self.settings, pair_capacity=self._capacity)
         with stream_of(self._mean):
             frame = Frame(self.count, width, height, settings, self.device)
         images = Images(**dict.fromkeys(names_of(Images)) | {name: array_over(tensors[name]) for name in tensors})
-        return _Target(frame=frame, tensors=tensors, images=images)
+        pairs = array_over(packed[-1:].view(torch.int32), wp.int32)
+        return Target(frame=frame, packed=packed, places=places, tensors=tensors, images=images, pairs=pairs)
+
+
+def part(packed: Memory, start: int, shape: tuple[int, ...]) -> Memory:
+    """The image of a shape that starts at an element of a memory of many."""
+    return packed[start : start + math.prod(shape)].reshape(shape)
 
 
 def _row(camera: Camera) -> wp.vec4:

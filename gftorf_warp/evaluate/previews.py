@@ -1,0 +1,54 @@
+"""Pictures of what ``gftorf render`` writes, one scale for all times of each thing."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from . import pictures
+
+Channels = dict[str, Float[np.ndarray, "H W"]]
+
+
+def preview_scale(name: str, samples: Iterable[Channels]) -> pictures.Scale:
+    """One scale for the previews of all times, from a few of them; for a phasor it is that of the amplitude."""
+    samples = list(samples)
+    if name == "distance":
+        return pictures.distance_scale([sample["distance"] for sample in samples])
+    if name == "quads":
+        return pictures.signed_scale([image for sample in samples for image in sample.values()])
+    if name == "phasor":
+        return pictures.amplitude_scale([sample["amplitude"] for sample in samples])
+    return pictures.Scale(low=0.0, high=1.0, colours="gray", unit="1")
+
+
+def preview(name: str, images: Channels, scale: pictures.Scale) -> UInt8[np.ndarray, "H w 3"]:
+    """A picture of one thing: distance; the quads in a row; phase and amplitude in a row; or sRGB."""
+    if name == "distance":
+        return pictures.colour_mapped(images["distance"], scale)
+    if name == "quads":
+        return pictures.side_by_side([pictures.colour_mapped(image, scale) for image in images.values()])
+    if name == "phasor":
+        phase = np.arctan2(images["im"], images["re"]) % (2.0 * np.pi)
+        return pictures.side_by_side(
+            [
+                pictures.colour_mapped(phase, pictures.phase_scale()),
+                pictures.colour_mapped(images["amplitude"], scale),
+            ]
+        )
+    return srgb(np.stack(list(images.values()), axis=-1))
+
+
+def paths(out: Path, name: str, index: int) -> tuple[Path, Path]:
+    """Where the EXR and the PNG of one thing at the index-th time belong."""
+    return out / name / f"{index:06d}.exr", out / name / f"{index:06d}.png"
+
+
+def srgb(linear: Float[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
+    """8-bit sRGB of linear RGB (IEC 61966-2-1)."""
+    linear = np.clip(linear, 0.0, 1.0)
+    encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1.0 / 2.4) - 0.055)
+    return np.round(255.0 * encoded).astype(np.uint8)

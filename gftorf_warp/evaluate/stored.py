@@ -1,0 +1,148 @@
+"""Rendered images as arrays on disk: for each channel one .npy file [S, H, W] float32, filled while rendering goes on.
+
+Nothing is encoded, so what is left is to copy. Files are written and not mapped: a full disk is an error then and not a
+signal, and it took half the time. Each file is filled by one thread at a time, which is all that systems do in any
+case, so channels have files of their own.
+"""
+
+from __future__ import annotations
+
+import math
+import shutil
+import threading
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack
+from io import FileIO
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+from jaxtyping import Float
+
+from ..data.files import as_errors, atomic_path
+from ..errors import ResourceError
+from .previews import Channels
+from .writers import available_cpus
+
+BLOCK = 8  # images that one write holds
+BLOCKS = 3  # that wait to be written
+
+
+def path_of(out: Path, name: str, channel: str) -> Path:
+    """Where all images of one channel of one thing belong."""
+    return out / name / f"{channel}.npy"
+
+
+def store_all(
+    out: Path,
+    channels: Mapping[str, Iterable[str]],
+    series: Iterable[Mapping[str, Channels]],
+    shape: tuple[int, int, int],
+    progress: Callable[[int, int], None] | None = None,
+) -> None:
+    """Write a series of images as arrays, while it goes on; files appear when all images are in them.
+
+    Args:
+        out: Folder with a folder for each thing.
+        channels: Names of the channels of each thing.
+        series: Images in order.
+        shape: (S, H, W) of each channel.
+        progress: Called with (images written, images in all); the last time when everything is on the disk.
+
+    Raises:
+        ResourceError: If the disk is full, or cannot hold them.
+        UsageError: If the place cannot be written to.
+    """
+    paths = [path_of(out, name, channel) for name in channels for channel in channels[name]]
+    needed = 4 * math.prod(shape) * len(paths)
+    with as_errors(out):
+        free = shutil.disk_usage(out).free
+    if needed > free:
+        raise ResourceError(
+            "not enough space",
+            where=out,
+            why=f"the arrays take {needed / 1e9:.1f} GB, {free / 1e9:.1f} GB are free",
+            fix="render fewer --times, or write to another disk",
+        )
+    with ExitStack() as stack:
+        files = {path: stack.enter_context(Stored(path, shape)) for path in paths}
+        threads = ThreadPoolExecutor(min(len(files), available_cpus()), thread_name_prefix="gftorf-arrays")
+        stack.callback(threads.shutdown, wait=True, cancel_futures=True)  # before files are closed
+        waiting: deque[tuple[int, list[Future]]] = deque()
+
+        def collect(most: int) -> None:
+            while len(waiting) > most:
+                last, futures = waiting.popleft()
+                for future in futures:
+                    future.result()  # raises what stopped the writing
+                if progress is not None and last < shape[0]:
+                    progress(last, shape[0])
+
+        block: list[Mapping[str, Channels]] = []
+        for done, images in enumerate(series, start=1):
+            block.append(images)
+            del images  # the memory of what is written is used again
+            if len(block) == BLOCK or done == shape[0]:
+                waiting.append((done, _submit(threads, files, out, done - len(block), block)))
+                block = []
+                collect(BLOCKS)
+        collect(0)
+    if progress is not None:
+        progress(shape[0], shape[0])
+
+
+def _submit(
+    threads: ThreadPoolExecutor,
+    files: Mapping[Path, Stored],
+    out: Path,
+    first: int,
+    block: list[Mapping[str, Channels]],
+) -> list[Future]:
+    """Write some images, each channel by itself, some day."""
+    return [
+        threads.submit(files[path_of(out, name, channel)].write, first, [images[name][channel] for images in block])
+        for name, channels in block[0].items()
+        for channel in channels
+    ]
+
+
+class Stored:
+    """A .npy file [S, H, W] that is filled in any order, and appears under its name at the end of a ``with``."""
+
+    def __init__(self, path: Path, shape: tuple[int, int, int]):
+        """Take note of where and how large; nothing is written yet."""
+        self._path, self._shape = path, shape
+        self._lock, self._stack = threading.Lock(), ExitStack()
+        self._start = 0  # [bytes] of the header
+
+    def __enter__(self) -> Stored:
+        with ExitStack() as stack:
+            temporary = stack.enter_context(atomic_path(self._path))
+            self._file = stack.enter_context(FileIO(temporary, "x+"))
+            header = {"descr": "<f4", "fortran_order": False, "shape": self._shape}
+            np.lib.format.write_array_header_1_0(cast(Any, self._file), header)
+            self._start = self._file.tell()
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        self._stack.__exit__(*error)
+
+    def write(self, first: int, images: Iterable[Float[np.ndarray, "H W"]]) -> None:
+        """Write some consecutive images.
+
+        Args:
+            first: The number of the first of them.
+            images: Of the file's size.
+
+        Raises:
+            ResourceError: If the disk is full.
+        """
+        with as_errors(self._path), self._lock:
+            self._file.seek(self._start + 4 * first * math.prod(self._shape[1:]))
+            for image in images:
+                rest = np.ascontiguousarray(image, dtype="<f4").data.cast("B")
+                while rest:
+                    rest = rest[self._file.write(rest) :]

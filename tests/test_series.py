@@ -1,0 +1,159 @@
+"""Many images of a replay: whole, in order, and memory that is used again only when nobody looks at it."""
+
+import gc
+
+import numpy as np
+import pytest
+import torch
+from test_replay import CAMERA, DEVICES, IMAGES, PLAIN, aside, run  # noqa: F401
+
+from gftorf_warp.render import replay as replaying
+from gftorf_warp.render import series
+from gftorf_warp.render.outgoing import Outgoing
+from gftorf_warp.render.series import Series
+
+VIEWS = [
+    (float(time), camera)
+    for time in np.linspace(-0.01, 0.08, 9)
+    for camera in (CAMERA, aside(0.1), CAMERA.resized(20, 15))
+]
+
+
+def one_by_one(run, names=IMAGES):  # noqa: F811
+    """What a loop over checked calls gives."""
+    render = run.renderer(names)
+    return [{name: getattr(render(*view), name).cpu().numpy().copy() for name in names} for view in VIEWS]
+
+
+def assert_same(got, want):
+    """To the bit."""
+    assert len(got) == len(want)
+    for one, other in zip(got, want, strict=True):
+        assert one.keys() == other.keys()
+        for name in one:
+            np.testing.assert_array_equal(one[name], other[name], err_msg=name)
+
+
+@pytest.fixture(params=[0, 3])
+def ahead(request, monkeypatch):
+    """How many images are on their way; on a CPU it makes no difference to what comes out."""
+    right = Series.__init__
+
+    def started(self, *arguments):
+        right(self, *arguments)
+        self.ahead = request.param
+
+    monkeypatch.setattr(Series, "__init__", started)
+    return request.param
+
+
+def test_arrays_are_those_of_single_calls(run, ahead):  # noqa: F811, ARG001
+    """Of several cameras and sizes; all of them are held, so memory that was reserved does not suffice."""
+    want = one_by_one(run)
+    times, cameras = zip(*VIEWS, strict=True)
+    got = list(run.images(times, cameras))
+    assert_same(got, want)
+    assert float(np.abs(want[0]["distance"] - want[-3]["distance"]).max()) > 0.01
+
+
+def test_renderings_on_the_device_are_those_of_single_calls(run, ahead):  # noqa: F811, ARG001
+    """What is not wanted has no elements, as in a call."""
+    want = one_by_one(run, ("quads", "distance"))
+    rows = []
+    for rendering in Series(run.renderer(("quads", "distance")), VIEWS).on_device():
+        assert rendering.phasor.numel() == 0
+        rows.append({name: getattr(rendering, name).cpu().numpy().copy() for name in ("quads", "distance")})
+    assert_same(rows, want)
+
+
+@pytest.mark.parametrize("run", ["cpu"], indirect=True)
+@pytest.mark.parametrize("where", ["host", "device"])
+def test_images_that_overflowed_are_rendered_again(run, ahead, where, monkeypatch):  # noqa: F811
+    """A reserve of a tenth of what is needed: what is drawn with it is spoilt, and none of it is handed out."""
+    want = one_by_one(run, PLAIN)
+    render, right = run.renderer(PLAIN), replaying.Replay.draw
+    spoilt = []
+
+    def draw(self, time, camera):
+        """As on CUDA: pairs are reserved, and what does not fit is missing, unnoticed."""
+        target = right(self, time, camera)
+        needed = int(target.packed[-1:].view(torch.int32))
+        reserved = spoilt_below[0]
+        shown = replaying.replace(target.frame.settings, pair_capacity=reserved)
+        if needed > reserved:
+            target.packed[:-1] = float("nan")
+            spoilt.append((time, camera))
+        frame = type("Shown", (), {"settings": shown})
+        return replaying.replace(target, frame=frame)
+
+    def grow(self):
+        spoilt_below[0] = int(replaying.ROOM * self.largest) + 1
+
+    spoilt_below = [20]
+    monkeypatch.setattr(replaying.Replay, "draw", draw)
+    monkeypatch.setattr(replaying.Replay, "grow", grow)
+    monkeypatch.setattr(replaying.Replay, "fits", lambda self: self.largest <= spoilt_below[0])
+    one = Series(render, VIEWS)
+    if where == "host":
+        got = list(one.on_host())
+    else:
+        got = [{n: getattr(r, n).numpy().copy() for n in PLAIN} for r in one.on_device()]
+    assert_same(got, want)
+    assert 1 + ahead <= len(spoilt) < len(VIEWS), "those that were on their way as well; then there is room"
+    assert one.again == len(spoilt) or not ahead
+
+
+def test_memory_comes_back_when_nobody_looks_at_it():
+    """A part of an array keeps all of it; what is held beyond the reserve is a copy; nothing is ever overwritten."""
+    outgoing = Outgoing(torch.zeros(8), ahead=1, kept=2)
+    held = []
+    for number in range(6):
+        array = outgoing.keep(outgoing.send(torch.full((8,), float(number))))
+        held.append(array[2:6].reshape(2, 2)[1:])
+        del array
+    gc.collect()
+    assert [float(one[0, 0]) for one in held] == [0, 1, 2, 3, 4, 5]
+    assert [one.base.base is not None for one in held] == [True, True, False, False, False, False]
+    assert len(outgoing._free) == 2, "those under way need so many"
+    held.clear()
+    gc.collect()
+    assert len(outgoing._free) == 4
+    first = outgoing.keep(outgoing.send(torch.ones(8)))
+    address = first.ctypes.data
+    del first
+    gc.collect()
+    found = {outgoing.keep(outgoing.send(torch.ones(8))).ctypes.data for _ in range(8)}
+    assert address in found
+    assert len(found) == 4, "nothing was allocated"
+
+
+def test_a_loop_that_is_left_early_leaves_nothing_behind(run, ahead):  # noqa: F811, ARG001
+    """The replay goes on as if nothing had been."""
+    render = run.renderer(PLAIN)
+    for found in Series(render, VIEWS).on_host():
+        assert found["distance"].shape == (30, 40)
+        break
+    want = run.render(*VIEWS[3])
+    torch.testing.assert_close(render(*VIEWS[3]).distance, want.distance, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.skipif("cuda" not in DEVICES, reason="needs a GPU")
+@pytest.mark.parametrize("run", ["cuda"], indirect=True)
+def test_a_reserve_that_is_too_small_on_a_gpu(run):  # noqa: F811
+    """Ten pairs: every image is whole all the same, from graphs as well."""
+    want = one_by_one(run, PLAIN)
+    for way in ("host", "device"):
+        render = run.renderer(PLAIN)
+        render(*VIEWS[0])
+        render._capacity = 10
+        render._views.clear()
+        render._targets.clear()
+        one = Series(render, VIEWS)
+        assert one.ahead == series.AHEAD
+        if way == "host":
+            got = list(one.on_host())
+        else:
+            got = [{n: getattr(r, n).cpu().numpy().copy() for n in PLAIN} for r in one.on_device()]
+        assert_same(got, want)
+        assert 1 <= one.again < len(VIEWS)
+        assert any(view.graph is not None for view in render._views.values())

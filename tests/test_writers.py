@@ -1,0 +1,221 @@
+"""Files beside the rendering: the same whoever writes them, whole or not there, and errors that say what happened."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+
+import numpy as np
+import pytest
+from analytic_run import FRAMES, HEIGHT, WIDTH, AnalyticRun
+from test_replay import PLAIN, run  # noqa: F401
+
+from gftorf_warp.data.images import read_exr
+from gftorf_warp.errors import ResourceError, UsageError
+from gftorf_warp.evaluate import previews, stored, views, writers
+from gftorf_warp.evaluate.views import render_to_folder
+
+WHAT = ("distance", "quads")
+
+
+@pytest.fixture
+def analytic(tmp_path):
+    """A finished run that renders by itself."""
+    return AnalyticRun(tmp_path)
+
+
+def files_in(folder):
+    """Content of every file below a folder, by its name."""
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_threads_write_what_one_call_after_the_other_does(analytic, tmp_path, monkeypatch):
+    """Byte by byte: more threads than images, or one; progress counts up."""
+    seen, found = [], {}
+    for threads in (1, 20):
+        monkeypatch.setattr(writers, "THREADS_MIN", threads)
+        monkeypatch.setattr(writers, "available_cpus", lambda threads=threads: threads)
+        out = render_to_folder(analytic, tmp_path / str(threads), WHAT, progress=lambda *done: seen.append(done))
+        found[threads] = files_in(out)
+    assert found[1] == found[20]
+    assert len(found[1]) == 1 + 4 * FRAMES
+    assert seen == 2 * [(k + 1, FRAMES) for k in range(FRAMES)]
+    scales, series = scales_and_series(analytic)
+    (tmp_path / "plain" / "distance").mkdir(parents=True)
+    for index, images in enumerate(series):
+        writers.write_images(tmp_path / "plain", scales, index, images)
+    assert {name: found[1][name] for name in files_in(tmp_path / "plain")} == files_in(tmp_path / "plain")
+
+
+def scales_and_series(of):
+    """What ``render_to_folder`` hands on."""
+    render, times = of.renderer(), [k / 120 for k in range(FRAMES)]
+    samples = [views.images_of(render, of.sensor, ("distance",))(times[k], of.camera) for k in (0, FRAMES // 2, -1)]
+    scales = {"distance": previews.preview_scale("distance", [sample["distance"] for sample in samples])}
+    return scales, views.series_of(render, [(time, of.camera) for time in times], of.sensor, ("distance",))
+
+
+def test_what_stops_a_thread_is_the_error_of_the_command(analytic, tmp_path):
+    """A name that is taken by a folder; nothing is left half-written, and nothing runs on."""
+    (tmp_path / "distance" / "000005.png").mkdir(parents=True)
+    with pytest.raises(UsageError, match=r"000005\.png"):
+        writers.write_all(tmp_path, *scales_and_series(analytic), FRAMES)
+    assert not list((tmp_path / "distance").glob(".*"))
+    for path in (tmp_path / "distance").glob("*.exr"):
+        assert read_exr(path)["distance"].shape == (HEIGHT, WIDTH)
+
+
+def test_not_more_images_wait_than_memory_holds(analytic, tmp_path, monkeypatch):
+    """Rendering is faster than writing: it stops until something is written."""
+    (tmp_path / "distance").mkdir()
+    monkeypatch.setattr(writers, "THREADS_MIN", 1)
+    monkeypatch.setattr(writers, "available_cpus", lambda: 1)
+    rendered, written, ahead = [0], [0], []
+    scales, series = scales_and_series(analytic)
+
+    def counted():
+        for images in series:
+            rendered[0] += 1
+            ahead.append(rendered[0] - written[0])
+            yield images
+
+    right = writers.write_images
+
+    def slow(*arguments):
+        time.sleep(0.02)
+        right(*arguments)
+        written[0] += 1
+
+    monkeypatch.setattr(writers, "write_images", slow)
+    writers.write_all(tmp_path, scales, counted(), FRAMES)
+    assert 2 < max(ahead) <= writers.QUEUED + 2
+    assert written[0] == FRAMES
+
+
+def test_arrays_hold_what_pictures_hold(analytic, tmp_path):
+    """Every channel of every image, mapped or read; written again into the same folder, and not over pictures."""
+    pictures = render_to_folder(analytic, tmp_path / "pictures", WHAT)
+    seen = []
+    out = render_to_folder(analytic, tmp_path / "out", WHAT, arrays=True, progress=lambda *done: seen.append(done))
+    names = {f"quads/quad_{degrees}.npy" for degrees in ("000", "180", "090", "270")}
+    assert set(files_in(out)) == {"renders.json", "distance/distance.npy", "distance/opacity.npy"} | names
+    for name, channels in json.loads((out / "renders.json").read_text())["channels"].items():
+        for channel in channels:
+            array = np.load(out / name / f"{channel}.npy", mmap_mode="r")
+            assert (array.shape, array.dtype) == ((FRAMES, HEIGHT, WIDTH), np.dtype("<f4"))
+            for k in range(FRAMES):
+                np.testing.assert_array_equal(array[k], read_exr(pictures / name / f"{k:06d}.exr")[channel])
+    assert seen == [(stored.BLOCK, FRAMES), (FRAMES, FRAMES)]
+    before = files_in(out)
+    assert files_in(render_to_folder(analytic, out, WHAT, arrays=True)) == before
+    with pytest.raises(UsageError, match="other"):
+        render_to_folder(analytic, pictures, WHAT, arrays=True)
+    with pytest.raises(UsageError, match="other"):
+        render_to_folder(analytic, out, WHAT)
+
+
+def test_arrays_of_a_replay(run, tmp_path, monkeypatch):  # noqa: F811
+    """Through memory that is used again, of more images than are held at a time: those of single calls."""
+    monkeypatch.setattr(stored, "BLOCK", 3)
+    times = [float(time) for time in np.linspace(0.0, 0.07, 60)]
+    cameras = [run.camera] * len(times)
+    monkeypatch.setattr(views, "views_to_take", lambda *_: (times, cameras))
+    monkeypatch.setattr(type(run), "sequence", lambda _: None)
+    out = render_to_folder(run, tmp_path / "out", ("distance", "phasor", "colour"), times, arrays=True)
+    render = run.renderer((*PLAIN, "colour"))
+    found = {name: np.load(out / f"{name}.npy") for name in ("distance/distance", "phasor/im", "colour/B")}
+    for k, time_s in enumerate(times):
+        want = render(time_s, run.camera)
+        np.testing.assert_array_equal(found["distance/distance"][k], want.distance.cpu().numpy())
+        np.testing.assert_array_equal(found["phasor/im"][k], want.phasor[1].cpu().numpy())
+        np.testing.assert_array_equal(found["colour/B"][k], want.colour[2].cpu().numpy())
+
+
+@pytest.mark.parametrize("arrays", [True, False])
+def test_what_stops_the_rendering_leaves_nothing_half_written(analytic, tmp_path, arrays):
+    """Ctrl-C in the middle: whole pictures of some times, or no array at all."""
+    right, count = analytic.render, [0]
+
+    def render(time, camera):
+        count[0] += 1
+        if count[0] == 13:
+            raise KeyboardInterrupt
+        return right(time, camera)
+
+    analytic.renderer = lambda _: render
+    with pytest.raises(KeyboardInterrupt):
+        render_to_folder(analytic, tmp_path / "out", WHAT, arrays=arrays)
+    left = [path for path in (tmp_path / "out").rglob("*") if path.is_file() and path.name != "renders.json"]
+    assert not [path for path in left if path.name.startswith(".") or path.suffix == ".npy"]
+    for path in left:
+        if path.suffix == ".exr":
+            read_exr(path)
+    assert arrays == (not left)
+    assert not [one.name for one in threading.enumerate() if one.name.startswith(("gftorf-files", "gftorf-arrays"))]
+
+
+def test_a_disk_that_cannot_hold_the_arrays(analytic, tmp_path, monkeypatch):
+    """Said before anything is written; one that fills up on the way is an error of the file."""
+    usage = type("Usage", (), {"free": 10_000})
+    with monkeypatch.context() as patch:
+        patch.setattr(stored.shutil, "disk_usage", lambda _: usage)
+        with pytest.raises(ResourceError, match="not enough space"):
+            render_to_folder(analytic, tmp_path / "out", WHAT, arrays=True)
+
+    class Full(stored.FileIO):
+        def write(self, data):
+            if len(data) == 4 * WIDTH * HEIGHT:
+                raise OSError(28, "No space left on device")
+            return super().write(data)
+
+    monkeypatch.setattr(stored, "FileIO", Full)
+    with pytest.raises(ResourceError, match="no space left"):
+        render_to_folder(analytic, tmp_path / "out", WHAT, arrays=True)
+    assert not list((tmp_path / "out").rglob("*.npy*"))
+
+
+INTERRUPTED = """
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from gftorf_warp.evaluate import writers
+from gftorf_warp.evaluate.pictures import Scale
+
+scales = {"distance": Scale(low=0.0, high=1.0, colours="viridis", unit="m")}
+
+
+def series():
+    for k in range(10000):
+        yield {"distance": {"distance": np.random.default_rng(k).random((240, 320), dtype=np.float32)}}
+
+
+writers.write_all(Path(sys.argv[1]), scales, series(), 10000, lambda done, _: print(done, flush=True))
+"""
+
+
+@pytest.mark.skipif(os.name == "nt", reason="sends a signal as a terminal does")
+def test_ctrl_c_ends_threads_between_images(tmp_path):
+    """A signal as from a terminal, to a program: no half of a file, and an end."""
+    (tmp_path / "distance").mkdir()
+    command = [sys.executable, "-c", INTERRUPTED, str(tmp_path)]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, process_group=0
+    ) as process:
+        for line in process.stdout:
+            if int(line) >= 5:
+                break
+        os.killpg(process.pid, signal.SIGINT)
+        _, said = process.communicate(timeout=60)
+    assert process.returncode != 0
+    assert said.rstrip().endswith("KeyboardInterrupt")
+    left = sorted((tmp_path / "distance").iterdir())
+    assert len(left) < 10000
+    assert not [path.name for path in left if path.name.startswith(".")]
+    assert {path.with_suffix(".png") for path in left} == set(left) - {path for path in left if path.suffix == ".exr"}
+    time.sleep(0.2)
+    assert sorted((tmp_path / "distance").iterdir()) == left, "nobody writes any more"
