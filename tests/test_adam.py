@@ -118,3 +118,21 @@ def test_a_run_does_not_import_the_compiler_of_torch(tmp_path):
     done = subprocess.run(command, cwd=__file__.rpartition("/")[0], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines()[-1] == "imported:"
+
+
+def test_a_gradient_may_be_a_slice():
+    """The harmonics of the colour are two tensors, so their gradients are parts of one: the same step as of copies."""
+    whole = random(5, 16, 3, seed=3) - 0.5
+    parts = [whole[:, :1], whole[:, 1:]]
+    assert not any(part.is_contiguous() for part in parts)
+    own, other = ([torch.zeros(5, n, 3) for n in (1, 15)] for _ in range(2))
+    for tensors, gradients in (
+        (own, parts),
+        (other, [part.clone(memory_format=torch.contiguous_format) for part in parts]),
+    ):
+        adam = Adam({"constant": tensors[:1], "rest": tensors[1:]}, BETAS, EPSILON)
+        for _ in range(2):
+            adam.step(gradients, {"constant": 0.1, "rest": 0.2})
+    for one, two, part, rate in zip(own, other, parts, (0.1, 0.2), strict=True):
+        assert torch.equal(one, two)
+        torch.testing.assert_close(one, -2 * rate * part.sign(), rtol=1e-4, atol=1e-6)

@@ -44,8 +44,11 @@ class Adam:
         given = dict(zip(self.tensors, gradients, strict=True))
         for name, group in self.groups.items():
             self.rates[name] = rates[name]
-            present = [(tensor, gradient) for tensor in group if (gradient := given[tensor]) is not None]
-            if rates[name] == 0.0 or not present:
+            if rates[name] == 0.0:
+                continue
+            # torch's fused step reads a gradient as if it were contiguous, and a slice of another one is not
+            present = [(t, gradient.contiguous()) for t in group if (gradient := given[t]) is not None]
+            if not present:
                 continue
             states = [self.remembered(tensor) for tensor, _ in present]
             steps = [state["step"] for state in states]
