@@ -92,7 +92,7 @@ IMPOSSIBLE = [  # setting, what a person types, a word of the message
     ("exposure_s", "0", "exposure_s must be above 0"),
     ("exposure_s", "inf", "exposure_s must be finite"),
     ("frame_period_s", "0", "frame_period_s must be above 0"),
-    ("row_time_s", "1e-5", "a rolling shutter is not simulated"),
+    ("row_time_s", "-1e-5", "row_time_s must be 0 or more"),
     ("phase_offset", "inf", "phase_offset must be finite"),
     ("dc_offset", "-inf", "dc_offset must be finite"),
     ("dc_offset", "1.5", "negative light"),

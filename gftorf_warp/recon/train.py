@@ -146,6 +146,7 @@ def _run(sequence, out, settings, config, seed, device, goes_on, begun, progress
         return
     observations = observe(sequence, settings, device)
     _warn_of_constant_part(sequence)
+    _warn_of_rows(sequence)
     state = from_dict(stored, device) if stored is not None else begin(observations, settings, seed=seed, device=device)
     earlier = state.seconds
     config |= {
@@ -194,6 +195,14 @@ def _warn_of_constant_part(sequence: Sequence) -> None:
     if abs(found - sequence.dc_offset) > DC_TOLERANCE:
         text = "the quads hold a constant part of %.2f amplitudes, the calibration says %.2f: see `gftorf check`"
         LOG.warning(text, found, sequence.dc_offset)
+
+
+def _warn_of_rows(sequence: Sequence) -> None:
+    """A rolling shutter is fitted as a global one."""
+    delay = float(sequence.sensor.get("row_time_s", 0.0) or 0.0)
+    if delay > 0:
+        text = "a rolling shutter: the last row is %.3g ms later than the first, and fitted to its time all the same"
+        LOG.warning(text, 1e3 * delay * (sequence.height - 1))
 
 
 def _truth(sequence: Sequence) -> Truth | None:

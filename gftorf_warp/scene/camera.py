@@ -95,6 +95,10 @@ class Camera:
             self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy
         )
 
+    def row(self, number: int) -> Camera:
+        """What sees one row of the image, and nothing else."""
+        return replace(self, height=1, cy=self.cy - number)
+
     def area(self, point: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n"]:
         """Area on the sensor over that of a pinhole's image [1], of something small at points in the world [m]."""
         if not self.distortion:

@@ -62,7 +62,8 @@ class Sensor:
     exposure_s: float = 2.34e-3
     """Length of one exposure [s]; OPT8241 at 18/64 duty. Scales the number of electrons; 0 only without noise."""
     row_time_s: float = 0.0
-    """Delay from one row to the next [s]; 0: global shutter, as both makers say. Nothing else is simulated."""
+    """Delay from one row to the next [s]; 0: global shutter, as both makers say. A raw frame has the time of its first
+    row. Engine mesh simulates it; nothing is reconstructed row by row."""
     unipolar: bool = False
     """False: difference of two taps, signed. True: one tap, never negative; needs dc_offset >= 1."""
     noise: bool = False
@@ -115,8 +116,7 @@ class Sensor:
             raise ValueError(f"further_hz must be above 0, got {self.further_hz}")
         if self.exposure_s < 0 or (self.noise and self.exposure_s == 0):
             raise ValueError(f"exposure_s must be above 0, or 0 without noise, got {self.exposure_s}")
-        if self.row_time_s != 0:
-            raise ValueError(f"row_time_s must be 0: a rolling shutter is not simulated, got {self.row_time_s}")
+        _demand(self, "0 or more", lambda value: value >= 0, "row_time_s")
         if not 0 < self.contrast <= 1:
             raise ValueError(f"contrast must be in (0, 1], got {self.contrast}")
         if self.harmonic_contrast and self.contrast * peak(self.harmonic_contrast) > 1 + 1e-6:

@@ -22,6 +22,7 @@ from .layers import TRUTHS, layers
 from .look import Look, Splatted, look, look_colour
 from .paths import inverse
 from .readout import mean_quad, read_out
+from .rolling import rolling_hits, take_rolling
 from .scene import Scene
 from .traced import Traced, lights_itself, trace_colour
 from .world import Hits, first_hit, flow_of
@@ -122,7 +123,7 @@ def record(
     times = frame_times(sensor, frames, sync=sync)
     cameras = [scene.camera(size, float(time)) for time in times]
     camera = cameras[0]
-    distances, bodies, interior = _truth(scene, cameras, times)
+    distances, bodies, interior = _truth(scene, size, cameras, times)
     longest = frame_times(sensor, max(frames, scene.frames), sync=False)  # for fewer frames the same covers and images
     evenness = shading(scene.lens, camera, beam=not lights_itself(scene, bounces))
     take = _engine(engine, scene, size, longest, Bounces(count=bounces, paths=paths), device, seed, truth)
@@ -214,19 +215,25 @@ def _engine(
             harmonics=scene.sensor.harmonics,
             bounces=bounces,
             device=device,
+            rolls=scene.sensor.row_time_s > 0,
         )
 
-        def trace(n: int, instants: list[float], time: float, sensor: Sensor) -> Look:
-            random = int(np.random.default_rng((seed, n, PATHS)).integers(2**31))  # frame n: whatever F is
-            mean = traced.light(instants, float(sensor.f_mod_hz), random)
-            still = mean if instants == [time] else traced.light([time], float(sensor.f_mod_hz), random)
+        def trace(n: int, instants: list[float], time: float, sensor: Sensor, row: int | None = None) -> Look:
+            numbers = (seed, n, PATHS) if row is None else (seed, n, PATHS, row)  # frame n: whatever F is
+            random = int(np.random.default_rng(numbers).integers(2**31))
+            mean = traced.light(instants, float(sensor.f_mod_hz), random, row=row)
+            still = mean if instants == [time] else traced.light([time], float(sensor.f_mod_hz), random, row=row)
             quad, amplitude = mean_quad(mean.light, mean.amplitude, sensor)
             phasor = still.light[0] * np.exp(1j * float(sensor.phase_offset))
-            hits = traced.first_hits(time)
+            hits = traced.first_hits(time, row=row)
             known = None if truth is None else layers(mean, hits, sensor, truth, bounced=bounces.count > 0)
             return Look(quad, amplitude, hits.distance, phasor, mean.ambient, known)
 
+        if scene.sensor.row_time_s > 0:
+            return partial(take_rolling, trace, height=scene.camera(size, 0.0).height)
         return trace
+    if scene.sensor.row_time_s > 0:
+        raise ValueError(f"row_time_s {scene.sensor.row_time_s} needs engine 'mesh': {engine!r} has one time per image")
     if needs_mesh(scene, bounces.count):
         raise ValueError(
             f"emitter {scene.emitter}, beam_deg {scene.beam_deg} and {bounces.count} bounces need engine 'mesh': "
@@ -306,12 +313,16 @@ def _fine(camera: Camera, scene: Scene) -> Camera:
 
 
 def _truth(
-    scene: Scene, cameras: list[Camera], times: Float[np.ndarray, "F"]
+    scene: Scene, size, cameras: list[Camera], times: Float[np.ndarray, "F"]
 ) -> tuple[Float[np.ndarray, "F H W"], Int[np.ndarray, "F H W"], Bool[np.ndarray, "F H W"]]:
     """Distance [m] and body of every raw frame, and its still interior: one for all raw frames of a camera at rest."""
     distances, bodies, interior = [], [], []
     for camera, time in zip(cameras, times, strict=True):
-        hit = first_hit(scene.bodies, camera, float(time))
+        if scene.sensor.row_time_s > 0:
+            camera_at = partial(scene.camera, size)
+            hit = rolling_hits(scene.bodies, camera_at, float(time), scene.sensor, camera.height)
+        else:
+            hit = first_hit(scene.bodies, camera, float(time))
         distances.append(hit.distance)
         bodies.append(hit.body.astype(np.int16))
         interior.append(still_interior(scene, [hit]))

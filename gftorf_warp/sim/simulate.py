@@ -125,6 +125,7 @@ def simulate(
             fix="leave --flow out, or --format ftorf",
         )
     _check_sensor(found.sensor, format)
+    _check_rows(found.sensor, format, options["engine"], flow=flow)
     _check_lens(found, options["size"], format)
     _check_duration(found, frames)
     card = settings_card(found, options, format, own=own, level=level, truth=truth)
@@ -278,6 +279,19 @@ def _check_sensor(sensor: Sensor, layout: str) -> None:
             why=impossible,
             fix="lower the contrast or the DC offset, or make the sensor unipolar",
         )
+
+
+def _check_rows(sensor: Sensor, layout: str, engine: str, *, flow: bool) -> None:
+    if sensor.row_time_s == 0:
+        return
+    wrong = {
+        "an image of splats has one time": (engine != "mesh", "--engine mesh"),
+        "an F-ToeRF folder has no place for the times of rows": (layout != "capture", "--format capture"),
+        "flow is from one time to another, and rows have times of their own": (flow, "leave --flow out"),
+    }
+    for why, (found, fix) in wrong.items():
+        if found:
+            raise UsageError("a rolling shutter cannot be simulated so", where="sensor.row_time_s", why=why, fix=fix)
 
 
 def _check_lens(scene: Scene, size: tuple[int, int], layout: str) -> None:

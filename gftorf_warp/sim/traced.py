@@ -29,6 +29,7 @@ class Traced:
         harmonics: Multiples of the modulation frequency at which light is wanted.
         bounces: Light that met more than one surface.
         device: Name of the device that traces.
+        rolls: Whether rows are traced one by one, each with a ``row`` of its own.
     """
 
     def __init__(
@@ -39,6 +40,7 @@ class Traced:
         harmonics: tuple[int, ...] = (1,),
         bounces: Bounces = Bounces(),
         device: str = "cpu",
+        rolls: bool = False,
     ):
         self.scene, self.camera_at, self.bounces = scene, camera_at, bounces
         pieces = [(index, piece) for index, body in enumerate(scene.bodies) for piece in rigid_bodies(body)]
@@ -47,13 +49,17 @@ class Traced:
         beam = beam_of(scene.lens, camera) if lights_itself(scene, bounces.count) else None
         self._lamp = Lamp(position=scene.emitter, beam_deg=scene.beam_deg, beam=beam)
         self._tracer = Tracer(
-            [piece for _, piece in pieces], camera.width, camera.height, harmonics=harmonics, device=device
+            [piece for _, piece in pieces],
+            camera.width,
+            1 if rolls else camera.height,
+            harmonics=harmonics,
+            device=device,
         )
 
-    def light(self, times: Sequence[float], f_mod_hz: float, seed: int = 0) -> Light:
+    def light(self, times: Sequence[float], f_mod_hz: float, seed: int = 0, *, row: int | None = None) -> Light:
         """Mean light over instants [s] of an exposure, for a source intensity of 1; ``seed`` is of the bounces."""
         return self._tracer.light(
-            [self.camera_at(time) for time in times],
+            [self._camera(time, row) for time in times],
             np.stack([self._poses(time) for time in times]),
             f_mod_hz,
             subsamples=self.scene.subsamples,
@@ -62,9 +68,9 @@ class Traced:
             seed=seed,
         )
 
-    def first_hits(self, time: float) -> FirstHits:
+    def first_hits(self, time: float, *, row: int | None = None) -> FirstHits:
         """Distance, z-depth, normal and body on the centre ray of every pixel at ``time`` [s]."""
-        hits = self._tracer.first_hits(self.camera_at(time), self._poses(time))
+        hits = self._tracer.first_hits(self._camera(time, row), self._poses(time))
         return replace(hits, body=np.where(hits.body < 0, hits.body, self._body[hits.body]))
 
     def flow(self, time: float, later: float) -> Float[np.ndarray, "2 H W"]:
@@ -73,6 +79,9 @@ class Traced:
         rays = camera.rays(dtype=torch.float64).numpy()
         point = camera.centre + rays * hits.distance[..., None]
         return flow_of(self.scene.bodies, point, hits.body, (camera, self.camera_at(later)), (time, later))
+
+    def _camera(self, time: float, row: int | None) -> Camera:
+        return self.camera_at(time) if row is None else self.camera_at(time).row(row)
 
     def _poses(self, time: float) -> Float[np.ndarray, "P 4 4"]:
         """Pose of the body of each piece [m]."""
