@@ -225,9 +225,10 @@ def test_a_shift_finds_its_quad(run):
     rendering, sensor = run.render(0.02), Sensor()
     for shift, channel in ((0.0, 0), (np.pi, 1), (np.pi / 2, 2), (-np.pi / 2, 3), (2 * np.pi, 0)):
         torch.testing.assert_close(quad_of_shift(rendering, sensor, shift), rendering.quads[channel], rtol=0, atol=0)
-    phasor = torch.tensor([3.0, 4.0, 6.0])[:, None, None]
+    phasor = torch.tensor([3.0, 4.0, 6.0])[:, None, None].expand(-1, *rendering.distance.shape)
     got = quad_of_shift(replace(rendering, phasor=phasor), replace(sensor, dc_offset=0.5), 0.3)
-    assert float(got) == pytest.approx(1.5 * np.cos(0.3) + 2.0 * np.sin(0.3) + 1.5)
+    want = torch.full_like(rendering.distance, 1.5 * np.cos(0.3) + 2.0 * np.sin(0.3) + 1.5)
+    torch.testing.assert_close(got, want)
 
 
 def test_colours_run_from_low_to_high_and_grey_is_unknown():

@@ -178,6 +178,7 @@ def test_a_disk_that_cannot_hold_the_arrays(analytic, tmp_path, monkeypatch):
 
 
 INTERRUPTED = """
+import signal
 import sys
 from pathlib import Path
 
@@ -186,6 +187,7 @@ import numpy as np
 from gftorf_warp.evaluate import writers
 from gftorf_warp.evaluate.pictures import Scale
 
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores it, and so do children
 scales = {"distance": Scale(low=0.0, high=1.0, colours="viridis", unit="m")}
 
 
