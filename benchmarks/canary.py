@@ -25,7 +25,7 @@ from gftorf_warp.constants import FRAMES_PER_QUARTET
 from gftorf_warp.data.ftorf_write import write
 from gftorf_warp.data.sequence import Truth
 from gftorf_warp.evaluate.compare import compare
-from gftorf_warp.evaluate.views import channel_of_shift
+from gftorf_warp.evaluate.previews import channel_of_shift
 from gftorf_warp.recon.run import Run
 from gftorf_warp.recon.train import reconstruct
 from gftorf_warp.sim.simulate import simulate
