@@ -25,7 +25,7 @@ from gftorf_warp.constants import FRAMES_PER_QUARTET
 from gftorf_warp.data.ftorf_write import write
 from gftorf_warp.data.sequence import Truth
 from gftorf_warp.evaluate.compare import compare
-from gftorf_warp.evaluate.previews import channel_of_shift
+from gftorf_warp.evaluate.views import quad_of_shift
 from gftorf_warp.recon.run import Run
 from gftorf_warp.recon.train import reconstruct
 from gftorf_warp.sim.simulate import simulate
@@ -48,7 +48,7 @@ def own_model(run: Run, out: Path) -> Path:
     quads, distances = np.empty_like(sequence.quads), np.empty_like(sequence.quads)
     for n, time in enumerate(sequence.times):
         rendering = run.render(float(time))
-        quads[n] = rendering.quads[channel_of_shift(run.sensor, sequence.shifts[n])].numpy()
+        quads[n] = quad_of_shift(rendering, run.sensor, float(sequence.shifts[n])).numpy()
         distances[n] = (rendering.distance / rendering.opacity.clamp_min(1e-6)).numpy()
     known = np.ones(len(quads), dtype=bool)
     assert len(quads) % FRAMES_PER_QUARTET == 0
