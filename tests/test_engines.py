@@ -144,6 +144,16 @@ def test_engines_agree_on_a_wall(field_of_view):
     assert field_of_view > 30 or (distance.max() < 1e-3 and amplitude.max() < 0.01)
 
 
+def agree_on_the_demo(distance, amplitude, still, moving):
+    """The bounds that the next test explains."""
+    assert np.abs(distance[still]).max() < 10e-3
+    assert np.abs(distance[still]).mean() < 2e-3
+    assert np.abs(amplitude[still]).max() < 0.07
+    assert np.abs(amplitude[still]).mean() < 0.015
+    assert np.abs(distance[moving]).max() < 5e-3
+    assert -0.12 < amplitude[moving].min() <= amplitude[moving].max() < -0.05
+
+
 def test_engines_agree_on_the_demo_away_from_edges():
     """Two pixels inside one face and one texture cell, 192x144, simultaneous quads.
 
@@ -162,12 +172,7 @@ def test_engines_agree_on_the_demo_away_from_edges():
         still, moving = inside(hit, 0), inside(hit, 1)
         assert still.sum() > 5000
         assert moving.sum() > 200
-        assert np.abs(distance[still]).max() < 10e-3
-        assert np.abs(distance[still]).mean() < 2e-3
-        assert np.abs(amplitude[still]).max() < 0.07
-        assert np.abs(amplitude[still]).mean() < 0.015
-        assert np.abs(distance[moving]).max() < 5e-3
-        assert -0.12 < amplitude[moving].min() <= amplitude[moving].max() < -0.05
+        agree_on_the_demo(distance, amplitude, still, moving)
         rest = ~inside(hit, 0, 1) & ~inside(hit, 1, 1)
         assert np.abs(distance[rest]).max() > 0.1, "the engines share their edges, so they are not two"
 

@@ -11,6 +11,7 @@ from gftorf_warp.cli import main
 from gftorf_warp.data.sequence import Sequence
 from gftorf_warp.scene.camera import Camera
 from gftorf_warp.scene.distortion import Distortion
+from gftorf_warp.sim.ladder import NAMES, at_level
 from gftorf_warp.sim.record import record
 from gftorf_warp.sim.rolling import rolling_hits, row_delays
 from gftorf_warp.sim.scenes import SCENES
@@ -96,6 +97,12 @@ def test_a_capture_says_so_and_reconstruction_warns(tmp_path, capsys):
     assert Sequence.open(tmp_path / "seq").sensor["row_time_s"] == 1e-4
     assert main(["reconstruct", f"{tmp_path}/seq", "--images", "4", "--out", f"{tmp_path}/run"]) == 0
     assert "a rolling shutter: the last row is 1.7 ms later" in capsys.readouterr().err
+
+
+def test_rows_roll_on_the_ladder_as_soon_as_time_passes():
+    """All quads at one instant means all rows, too; from then on a sensor has its own rows."""
+    rows = {name: at_level(scene(), name, {})[0].sensor.row_time_s for name in NAMES}
+    assert rows == {"sync": 0.0} | dict.fromkeys(NAMES[1:], ROW_TIME)
 
 
 def test_splats_have_one_time():

@@ -2,8 +2,8 @@
 
 Fall-off makes a splat at a tenth of the distance a hundred times as bright, so that those which a random start puts
 right before the camera become black first; opaque they are worth as much as black images, and nothing behind them is
-seen any more. Resets of the opacities do not help: what is in front is opaque again first. One start in ten ends so
-(design/reconstruction.md). The loss tells: from then on it is that of black images.
+seen any more. Resets of the opacities do not help: what is in front is opaque again first. One of nine
+measured starts ended so (design/reconstruction.md). The loss tells: from then on it is that of black images.
 """
 
 from __future__ import annotations

@@ -21,13 +21,12 @@ import torch
 from torch import Tensor
 
 from ..constants import CANONICAL_SHIFTS, FRAME_RATE_HZ, SPEED_OF_LIGHT
+from ..data.cycles import SAME_RAD, solution
 from .pattern import Pattern
 from .waveform import peak
 
 Scalar = float | Tensor
-SHIFT_TOLERANCE = 1e-5  # [rad] shifts are stored as float32 at worst
-EVEN = SHIFT_TOLERANCE  # [1] shifts are equally spaced if the means of exp(i theta) and exp(2 i theta) are below this
-RANK_MIN = 1e-3  # [1] smallest singular value of three unknowns, about 1; two shifts nearer than 0.1 degrees are one
+EVEN = SAME_RAD  # [1] shifts are equally spaced if the means of exp(i theta) and exp(2 i theta) are below this
 EFFECTS = ("further_hz", "harmonic_contrast", "contrast_cutoff_hz", "pattern", "row_time_s")  # off unless they are set
 
 
@@ -177,7 +176,7 @@ def channel_of(shifts: Sequence[float], shift: float) -> int | None:
     """Index of a phase shift [rad] among others, whole turns aside; None if it is none of them."""
     turns = [abs(math.remainder(other - shift, 2.0 * math.pi)) for other in shifts]
     nearest = min(range(len(turns)), key=turns.__getitem__)
-    return nearest if turns[nearest] <= SHIFT_TOLERANCE else None
+    return nearest if turns[nearest] <= SAME_RAD else None
 
 
 def distance_from_phasor(re: Tensor, im: Tensor, sensor: Sensor) -> Tensor:
@@ -200,7 +199,10 @@ def phasor_from_quads(quads: Tensor, shifts: tuple[float, ...] | Tensor) -> tupl
     if len(theta) < 3:
         raise ValueError(f"shifts: a phase needs at least 3 quads, got {len(theta)}")
     if not isinstance(shifts, Tensor) and not _evenly(np.array(shifts, dtype=np.float64)):
-        rows = torch.as_tensor(_solution(shifts), dtype=quads.dtype, device=quads.device)
+        known = solution(np.array(shifts, dtype=np.float64))
+        if known is None:
+            raise ValueError(f"shifts: a phase needs three different ones, got {np.degrees(shifts).tolist()} degrees")
+        rows = torch.as_tensor(known, dtype=quads.dtype, device=quads.device)
         re, im = (rows @ quads.reshape(len(theta), -1)).reshape(2, *quads.shape[1:])
         return re, im
     factor = 4.0 / len(theta)
@@ -210,14 +212,6 @@ def phasor_from_quads(quads: Tensor, shifts: tuple[float, ...] | Tensor) -> tupl
 def _evenly(shifts: np.ndarray) -> bool:
     """Whether the plain sum over these shifts [rad] is the least-squares solution."""
     return all(abs(np.exp(1j * turns * shifts).mean()) < EVEN for turns in (1, 2))
-
-
-def _solution(shifts: Sequence[float]) -> np.ndarray:
-    """Rows [2, Q] that take quads at any shifts [rad] to (re, im)."""
-    model = np.stack([np.cos(shifts), np.sin(shifts), np.ones(len(shifts))], axis=1)
-    if np.linalg.svd(model, compute_uv=False).min() < RANK_MIN:
-        raise ValueError(f"shifts: a phase needs three different ones, got {np.degrees(shifts).tolist()} degrees")
-    return 2.0 * np.linalg.pinv(model)[:2]
 
 
 def _demand(sensor: Sensor, what: str, holds: Callable[[float], bool], *names: str) -> None:

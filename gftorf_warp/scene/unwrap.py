@@ -16,16 +16,6 @@ from ..data import unwrap as numbers
 from .sensor import Sensor, phasor_from_quads
 
 
-def multiples(first_hz: float, second_hz: float) -> tuple[int, int, float]:
-    """(m_1, m_2, f_0 [Hz]) of two modulation frequencies.
-
-    Raises:
-        ValueError: If they are equal, or no small multiples of one frequency.
-    """
-    (m1, m2), base = numbers.multiples((first_hz, second_hz))
-    return m1, m2, base
-
-
 def unwrap(phases: Sequence[Tensor], ms: Sequence[int]) -> Tensor:
     """Phase [rad] in [0, 2 pi) at the common frequency f_0, from wrapped phases at m_i f_0.
 
@@ -47,13 +37,8 @@ def unwrap(phases: Sequence[Tensor], ms: Sequence[int]) -> Tensor:
     return torch.where(base >= turn, torch.zeros_like(base), base)  # a remainder can round up to a whole turn
 
 
-def unwrap_pair(first: Tensor, second: Tensor, m1: int, m2: int) -> Tensor:
-    """:func:`unwrap` of two phases [rad], at m_1 f_0 and m_2 f_0."""
-    return unwrap((first, second), (m1, m2))
-
-
 def unwrap_failure(sigma: float, m1: int, m2: int) -> float:
-    """Probability that :func:`unwrap_pair` takes a wrong candidate, phase noise ``sigma`` [rad] on both."""
+    """Probability that :func:`unwrap` of two phases takes a wrong candidate, noise ``sigma`` [rad] on both."""
     return math.erfc(math.pi / (sigma * math.sqrt(2.0 * (m1**2 + m2**2))))
 
 

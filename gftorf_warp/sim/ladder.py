@@ -57,10 +57,11 @@ LEVELS = (
             "adc_bits": FINE_ADC_BITS,
             "harmonic_contrast": (),
             "pattern": Pattern(),
+            "row_time_s": 0.0,
         },
         options={"engine": "mesh", "bounces": 0, "exposure_samples": 1, "noise": False, "sync": True},
     ),
-    Level(name="L0", adds="one quad after the other", options={"sync": False}),
+    Level(name="L0", adds="one quad after the other", sensor={"row_time_s": OWN}, options={"sync": False}),
     Level(name="L1", adds="noise and ADC", sensor={"noise": True}, options={"noise": True}),
     Level(
         name="L2",
