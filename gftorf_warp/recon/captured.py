@@ -16,11 +16,12 @@ from torch import Tensor
 
 from ..constants import FRAMES_PER_QUARTET
 from ..losses.prior import motion_size
-from ..render import descent, fused
+from ..render import descent, fused, perceptron
 from ..render.api import Rendering
 from ..render.bridge import Branches, Captured, Inbox, Outbox, pairs_of, shared_pool
 from ..render.buffers import RenderSettings, Workspace
 from ..scene.motion import Still
+from ..scene.network import Network
 from . import densify
 from .objective import image_loss, render_settings_at, rendering_of, weights_at
 from .observations import Observations
@@ -133,6 +134,9 @@ class CapturedSteps:
         self._flow = observations.flow_table() if settings.weights.flow > 0 else None
         self._branches = Branches(longest, device)
         self._workspaces = [Workspace() for _ in range(longest)]
+        motion = state.motion
+        if isinstance(motion, Network) and perceptron.fits(motion.form, device):
+            motion.go_by(perceptron.TensorCores())
         self._adopt()
 
     def step(self) -> None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float, Int
@@ -17,7 +18,7 @@ from torch import Tensor
 
 from .gaussians import GaussianField
 from .motion import Motion, MotionSettings, Products, rows_of
-from .perceptron import Form, Stacked
+from .perceptron import Form, Passes, Stacked
 
 HEAD_DEVIATION = 1e-5  # of the weights of the last layer: motion starts at rest, to a hundredth of a millimetre
 
@@ -74,6 +75,15 @@ class Network(Motion):
                 layer.bias.zero_()
             self.head.weight.normal_(0.0, HEAD_DEVIATION, generator=generator)
             self.head.bias.zero_()
+
+    @property
+    def form(self) -> Form:
+        """Sizes of the perceptron in half precision."""
+        return self._form
+
+    def go_by(self, passes: Passes) -> None:
+        """Let somebody else take rows through the layers where products are of halves, to the same results."""
+        self._form = replace(self._form, passes=passes)
 
     def attach(self, field: GaussianField) -> Float[Tensor, "N p"]:
         """gamma(x) of the positions at which it is asked, without gradient, in the precision of the products [1]."""

@@ -17,6 +17,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Protocol
 
 import torch
 from jaxtyping import Float
@@ -45,6 +46,8 @@ class Form:
     """Number of the layer whose input is joined by gamma(x) and gamma(t) again; None: there is none."""
     dtype: torch.dtype
     """Of the factors: float16, or that of the parameters, where the same code is exact."""
+    passes: Passes | None = None
+    """Who takes rows through the layers; None: :class:`Products`."""
 
     @property
     def columns(self) -> int:
@@ -55,6 +58,88 @@ class Form:
     def entries(self) -> list[int]:
         """Numbers of the layers which gamma(x) and gamma(t) enter."""
         return [0] if self.joined is None else [0, self.joined]
+
+
+class Passes(Protocol):
+    """Takes rows through the layers, and gradients back."""
+
+    def forward(
+        self,
+        form: Form,
+        place: Float[Tensor, "N columns"],
+        moment: Float[Tensor, "k t"],
+        weights: tuple[Tensor, ...],
+        biases: tuple[Tensor, ...],
+    ) -> tuple[Float[Tensor, "layers rows width"], Float[Tensor, "h width"], tuple[Tensor, ...]]:
+        """Outputs of all layers, the weight of the head as a factor, and what ``backward`` wants of the parameters.
+
+        Args:
+            form: Sizes and precision.
+            place: gamma(x) in the precision of the factors, with zeros up to ``form.columns``.
+            moment: gamma(t) of every key, in the precision of the parameters.
+            weights: Of every layer and the head.
+            biases: The same.
+        """
+        ...
+
+    def backward(
+        self,
+        form: Form,
+        keys: int,
+        after: Float[Tensor, "rows h"],
+        outputs: Float[Tensor, "layers rows width"],
+        kept: tuple[Tensor, ...],
+    ) -> tuple[Float[Tensor, "layers rows width"], Float[Tensor, "layers k width"]]:
+        """Gradients before the ReLU of all layers, and their sums over the rows of each key.
+
+        Args:
+            form: Sizes and precision.
+            keys: Number k of keys.
+            after: Gradient at the output of the head, as a factor, with zeros up to its rows.
+            outputs: Of ``forward``.
+            kept: By ``forward``.
+        """
+        ...
+
+
+class Products:
+    """Passes as products of matrices, layer by layer."""
+
+    def forward(
+        self, form: Form, place: Tensor, moment: Tensor, weights: tuple[Tensor, ...], biases: tuple[Tensor, ...]
+    ) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
+        """As the protocol says."""
+        factors, shifts = _rounded(form, weights, biases)
+        keys, count, layers = len(moment), len(place), len(weights) - 1
+        own = _of_moments(form, moment, weights, biases)
+        outputs = place.new_empty(layers, keys * count, form.width)
+        again = None if form.joined is None else _joined_room(form, place, keys)
+        for key, begin, end in _pieces(keys, count):
+            rows = slice(key * count + begin, key * count + end)
+            hidden = place[begin:end]
+            for number in range(layers):
+                if again is not None and number == form.joined:
+                    _copy(again[rows, : form.width], hidden)
+                    hidden = again[rows]
+                shift = own[number][key] if number in own else shifts[number]
+                out = outputs[number][rows]
+                torch._addmm_activation(shift, hidden, factors[number].T, use_gelu=False, out=out)
+                hidden = out
+        return outputs, factors[-1], tuple(factors)
+
+    def backward(
+        self, form: Form, keys: int, after: Tensor, outputs: Tensor, kept: tuple[Tensor, ...]
+    ) -> tuple[Tensor, Tensor]:
+        """As the protocol says."""
+        slopes = torch.empty_like(outputs)
+        for number in reversed(range(len(outputs))):
+            factor, slope, before = kept[number + 1][:, : form.width], slopes[number], outputs[number]
+            for key, begin, end in _pieces(keys, len(after) // keys):
+                rows = slice(key * len(after) // keys + begin, key * len(after) // keys + end)
+                torch.mm(after[rows], factor, out=slope[rows])
+                torch.ops.aten.threshold_backward.grad_input(slope[rows], before[rows], 0.0, grad_input=slope[rows])
+            after = slope
+        return slopes, _sums(slopes, keys, torch.float32 if form.dtype == torch.float16 else form.dtype)
 
 
 class Stacked(torch.autograd.Function):
@@ -74,26 +159,11 @@ class Stacked(torch.autograd.Function):
             parameters: Weight and bias of every layer, then of the head.
         """
         weights, biases = parameters[0::2], parameters[1::2]
-        factors, shifts = _rounded(form, weights, biases)
-        keys, count, layers = len(moment), len(place), len(weights) - 1
-        own = _of_moments(form, moment, weights, biases)
-        outputs = place.new_empty(layers, keys * count, form.width)
-        again = _joined_room(form, place, keys)
-        for key, begin, end in _pieces(keys, count):
-            rows = slice(key * count + begin, key * count + end)
-            hidden = place[begin:end]
-            for number in range(layers):
-                if number == form.joined:
-                    _copy(again[rows, : form.width], hidden)
-                    hidden = again[rows]
-                shift = own[number][key] if number in own else shifts[number]
-                out = outputs[number][rows]
-                torch._addmm_activation(shift, hidden, factors[number].T, use_gelu=False, out=out)
-                hidden = out
-        context.form = form
-        context.save_for_backward(place, moment, again, *factors, outputs)
-        found = _product(outputs[-1], factors[-1].T, moment.dtype)[:, : len(biases[-1])] + biases[-1]
-        return found.view(keys, count, len(biases[-1]))
+        outputs, head, kept = (form.passes or Products()).forward(form, place, moment, weights, biases)
+        context.form, context.rows = form, len(head)
+        context.save_for_backward(place, moment, outputs, *kept)
+        found = _product(outputs[-1], head.T, moment.dtype)[:, : len(biases[-1])] + biases[-1]
+        return found.view(len(moment), len(place), len(biases[-1]))
 
     @staticmethod
     @once_differentiable
@@ -102,31 +172,24 @@ class Stacked(torch.autograd.Function):
 
         Scaled by the largest gradient of an offset, which no host knows; everything up to the weights is linear in it.
         """
-        form, (place, moment, again, *factors, outputs) = context.form, context.saved_tensors
+        form, (place, moment, outputs, *kept) = context.form, context.saved_tensors
         layers, values = len(outputs), gradient.shape[-1]
         keys, count = len(moment), len(place)
-        found = _Gradients(form, moment, layers, len(factors[-1]), values)
+        found = _Gradients(form, moment, layers, context.rows, values)
         flat = gradient.reshape(-1, values)
         unit = _largest(flat).clamp_min(SMALLEST) / LARGEST
-        after = place.new_zeros(keys * count, len(factors[-1]))
+        after = place.new_zeros(keys * count, context.rows)
         torch.div(flat, unit, out=after[:, :values])
         _sum_rows(flat, out=found.head_bias)
         _product(after.T, outputs[-1], moment.dtype, out=found.weights[-1])
-        slopes = torch.empty_like(outputs)
-        for number in reversed(range(layers)):
-            factor, slope, before = factors[number + 1][:, : form.width], slopes[number], outputs[number]
-            for key, begin, end in _pieces(keys, count):
-                rows = slice(key * count + begin, key * count + end)
-                torch.mm(after[rows], factor, out=slope[rows])
-                torch.ops.aten.threshold_backward.grad_input(slope[rows], before[rows], 0.0, grad_input=slope[rows])
-            after = slope
-        own = _sums(slopes, keys, moment.dtype)
+        slopes, own = (form.passes or Products()).backward(form, keys, after, outputs, tuple(kept))
         torch.sum(own, 1, out=found.biases)
         _products(slopes[1:].mT, outputs[:-1], out=found.square)
+        places = place.expand(keys, -1, -1).reshape(keys * count, -1)
         for number in form.entries:
             weight, first = found.weights[number], form.width if number else 0
             end = first + form.columns
-            _product(slopes[number].T, again[:, -form.columns :], moment.dtype, out=weight[:, first:end])
+            _product(slopes[number].T, places, moment.dtype, out=weight[:, first:end])
             torch.mm(own[number].T, moment, out=weight[:, weight.shape[1] - form.moment :])
             if number:
                 weight[:, :first] = found.square[number - 1]
@@ -180,10 +243,9 @@ def _of_moments(
 
 
 def _joined_room(form: Form, place: Tensor, keys: int) -> Float[Tensor, "rows i"]:
-    """Room for the input of the layer that is joined, gamma(x) at its end for all keys; gamma(x) alone without one."""
-    width = 0 if form.joined is None else form.width
-    room = place.new_empty(keys * len(place), width + form.columns)
-    _copy(room.view(keys, len(place), -1)[..., width:], place.expand(keys, -1, -1))
+    """Room for the input of the layer that is joined, gamma(x) at its end for all keys."""
+    room = place.new_empty(keys * len(place), form.width + form.columns)
+    _copy(room.view(keys, len(place), -1)[..., form.width :], place.expand(keys, -1, -1))
     return room
 
 

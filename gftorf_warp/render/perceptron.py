@@ -1,0 +1,99 @@
+"""The motion network on tensor cores: one launch forward, one backward, where torch would multiply layer by layer."""
+
+from __future__ import annotations
+
+import functools
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from ..kernels import perceptron as kernels
+from ..scene.perceptron import Form
+from .bridge import array_over, stream_of
+
+
+class TensorCores:
+    """Passes for layers of 256 halves, see ``scene.perceptron.Passes`` and ``kernels/perceptron.py``.
+
+    On a CPU they are slow, and there for tests.
+    """
+
+    def forward(
+        self, form: Form, place: Tensor, moment: Tensor, weights: tuple[Tensor, ...], biases: tuple[Tensor, ...]
+    ) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
+        """Outputs of all layers, and the head as halves; kept are weights for the way back, the head, and masks."""
+        keys, count, layers = len(moment), len(place), len(weights) - 1
+        parameters = torch.cat([value.reshape(-1) for pair in zip(weights, biases, strict=True) for value in pair])
+        square, entry = form.width * form.width, form.width * form.columns
+        sizes = [(layers - 1) * square + len(form.entries) * entry, (layers - 1) * square, kernels.HEAD * form.width]
+        packed = place.new_empty(sum(sizes)).split(sizes)
+        shifts = moment.new_empty(layers, keys, form.width)
+        outputs = place.new_empty(layers, keys * count, form.width)
+        masks = torch.empty(kernels.mask_words(layers, keys, count), dtype=torch.int32, device=place.device)
+        of, device = _layers(form, layers), _ready(place.device)
+        with stream_of(place):
+            flat, halves = array_over(parameters), [array_over(part, wp.float16) for part in packed]
+            _launch(kernels.pack, sum(sizes) // kernels.UNIT, [of, flat], halves, device)
+            dim, added = (layers, keys, form.width), array_over(shifts)
+            _launch(kernels.add_moments, dim, [of, flat, array_over(moment)], [added], device)
+            if count:
+                rows, found = [of, keys, array_over(place, wp.float16), halves[0], added], array_over(outputs, wp.float16)
+                _launch(kernels.forward, _threads(device), rows, [found, array_over(masks, wp.int32)], device)
+        return outputs, packed[2].view(kernels.HEAD, form.width), (packed[1], weights[-1], masks)
+
+    def backward(
+        self, form: Form, keys: int, after: Tensor, outputs: Tensor, kept: tuple[Tensor, ...]
+    ) -> tuple[Tensor, Tensor]:
+        """Slopes of all layers, and their sums over rows."""
+        back, head, masks = kept
+        device = _ready(outputs.device)
+        slopes, blocks = torch.empty_like(outputs), -(-_threads(device) // kernels.BLOCK)
+        partials = head.new_zeros(len(outputs), keys, kernels.GROUPS * blocks, form.width)
+        if len(after):
+            with stream_of(outputs):
+                halves = [array_over(tensor, wp.float16) for tensor in (after, back, outputs, slopes)]
+                rows = [_layers(form, len(outputs)), keys, halves[0], array_over(head), halves[1], halves[2]]
+                rows.append(array_over(masks, wp.int32))
+                _launch(kernels.backward, _threads(device), rows, [halves[3], array_over(partials)], device)
+        return slopes, partials.sum(2)
+
+
+def fits(form: Form, device: torch.device) -> bool:
+    """Whether a perceptron can go that way: its sizes, and a GPU that has such products."""
+    sizes = form.width == kernels.WIDTH and form.columns == kernels.COLUMNS
+    if not sizes or form.dtype != torch.float16 or device.type != "cuda":
+        return False
+    return torch.cuda.get_device_capability(device) == (kernels.ARCHITECTURE // 10, kernels.ARCHITECTURE % 10)
+
+
+@functools.cache
+def _ready(device: torch.device) -> wp.Device:
+    """The device, with kernels compiled for exactly its architecture: what they use is no part of any other."""
+    wp.init()
+    found = wp.get_device("cpu") if device.type == "cpu" else wp.device_from_torch(device)
+    if found.is_cuda:
+        before, wp.config.cuda_arch_suffix = wp.config.cuda_arch_suffix, "a"
+        try:
+            for kernel in (kernels.forward, kernels.backward):
+                kernel.module.load(found, kernels.BLOCK)
+        finally:
+            wp.config.cuda_arch_suffix = before
+    return found
+
+
+@functools.cache
+def _layers(form: Form, layers: int) -> kernels.Layers:
+    of = kernels.Layers()
+    of.layers, of.joined = layers, -1 if form.joined is None else form.joined
+    of.place, of.moment = form.place, form.moment
+    return of
+
+
+def _threads(device: wp.Device) -> int:
+    """One block on every multiprocessor, which is all that its registers hold."""
+    return 1 if device.is_cpu else device.sm_count * kernels.BLOCK
+
+
+def _launch(kernel: wp.Kernel, dim, inputs: list, outputs: list[wp.array], device: wp.Device) -> None:
+    wp.launch(kernel, dim, inputs, outputs, device=device, block_dim=kernels.BLOCK, record_tape=False)
