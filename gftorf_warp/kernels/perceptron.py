@@ -27,8 +27,8 @@ VALUES = 3
 ARCHITECTURE = 90  # that has these instructions; they are no part of later ones
 SLOTS = 6  # of the ring
 _PART = 64 * WIDTH  # halves of a block of weights
-_SHARED = SLOTS * 2 * _PART + GROUPS * 4 * WIDTH * 4 + 64 + 1024  # bytes: ring, sums, barriers, room to align
-_FLOATS = wp.constant(_SHARED // 4)
+_SHARED = SLOTS * 2 * _PART + GROUPS * 4 * WIDTH * 4 + 64 + 16 + 1024  # bytes: ring, sums, barriers, counters, to align
+_FOURS = wp.constant(_SHARED // 16)
 
 
 def mask_words(layers: int, keys: int, count: int) -> int:
@@ -176,6 +176,7 @@ _CUDA = f"""
     extern __shared__ char memory[];
     const unsigned begins = (unsigned)__cvta_generic_to_shared(memory), base = (begins + 1023u) & ~1023u;
     const unsigned barriers = base + {SLOTS * 2 * _PART + GROUPS * 4 * WIDTH * 4};
+    int* const released = reinterpret_cast<int*>(memory + (base - begins) + {SLOTS * 2 * _PART + GROUPS * 4 * WIDTH * 4 + 64});
     struct Starts {{ enum {{ H = 0, P = 1 }}; }};  // blocks of 64 inputs: of the layer before, of gamma(x)
     struct Goes {{ enum {{ H = 4, P = 0 }}; }};
     struct Joins {{ enum {{ H = 4, P = 1 }}; }};
@@ -243,13 +244,29 @@ _CUDA = f"""
         {_KEPT}
     }};
 
+    // this group has multiplied by ``blocks`` weights for the last time; the second group to say so sends for others
+    int done = 0, layers_done = 0;  // blocks of weights, and layers, that this group needs no more
+    auto release = [&](int blocks, const wp::half* packed, int of_round, int all) {{
+        const int sent = min(done + {SLOTS}, all);
+        done += blocks;
+        group_waits();
+        if ((threadIdx.x & 127) == 0) {{
+            __threadfence_block();
+            if (atomicAdd(released + (layers_done & 3), 1) & 1) {{
+                __threadfence_block();
+                for (int n = sent; n < min(done + {SLOTS}, all); ++n) fill(n, packed + (size_t)(n % of_round) * {_PART});
+            }}
+        }}
+        ++layers_done;
+    }};
+
+    if (threadIdx.x < 4) released[threadIdx.x] = 0;
     if (threadIdx.x == 0)
         for (int slot = 0; slot < {SLOTS}; ++slot)
             asm volatile("mbarrier.init.shared::cta.b64 [%0], 1;" :: "r"(barriers + 8 * slot) : "memory");
     asm volatile("fence.proxy.async;" ::: "memory");
     __syncthreads();
     if (group == 1) pass_on(0);
-    int begun = 0, done = 0;  // blocks of weights that were sent for, and that are not needed any more
 """
 
 _FORWARD = f"""
@@ -265,6 +282,7 @@ _FORWARD = f"""
             if (tile >= end) {{
                 turn(group);
                 pass_on(1 - group);
+                if (tile == begin + group) release(C, forth.data, parts, all);
                 break;
             }}
             float sums[128];
@@ -274,6 +292,7 @@ _FORWARD = f"""
             product(kind, done, rows, sums);
             pass_on(1 - group);
             multiplied(sums);
+            if (tile + {GROUPS} >= end) release(C, forth.data, parts, all);
             const int key = tile / of_key, row = (tile - key * of_key) * {TILE} + 16 * warp + g;
             const float4* from = reinterpret_cast<const float4*>(shifts.data + ((size_t)number * keys + key) * {WIDTH});
             wp::half* to = after + ((size_t)key * count + row) * {WIDTH} + 8 * t;
@@ -300,11 +319,9 @@ _FORWARD = f"""
             reinterpret_cast<uint4*>(masks.data)[((size_t)number * tiles + tile) * 128 + (threadIdx.x & 127)] =
                 make_uint4(alive[0], alive[1], alive[2], alive[3]);
         }}
-        __syncthreads();  // nobody multiplies by these weights any more
-        done += C;
-        if (threadIdx.x == 0) for (; begun < min(done + {SLOTS}, all); ++begun) fill(begun, forth.data + begun % parts * {_PART});
     }};
-    if (threadIdx.x == 0) for (; begun < min({SLOTS}, all); ++begun) fill(begun, forth.data + begun % parts * {_PART});
+    if (threadIdx.x == 0)
+        for (int n = 0; n < min({SLOTS}, all); ++n) fill(n, forth.data + (size_t)(n % parts) * {_PART});
     for (int begin = first; begin < last; begin += {ROUND}) {{
         const int end = min(begin + {ROUND}, last);
         for (int number = 0; number < form.layers; ++number) {{
@@ -444,6 +461,7 @@ _BACKWARD = f"""
             if (tile >= end) {{
                 turn(group);
                 pass_on(1 - group);
+                if (tile == begin + group) release(4, back.data, parts, all);
                 break;
             }}
             const int key = tile / of_key, low = (tile - key * of_key) * {TILE} + 16 * warp + g;
@@ -456,6 +474,7 @@ _BACKWARD = f"""
             pass_on(1 - group);
             alive_of(number - 1, tile, alive);
             multiplied(sums);
+            if (tile + {GROUPS} >= end) release(4, back.data, parts, all);
             float all_[64];
             #pragma unroll
             for (int q = 0; q < 8; ++q) {{
@@ -473,11 +492,9 @@ _BACKWARD = f"""
             fold(all_, own);
             if (passes(tile, end)) flush(number - 1, key, own);
         }}
-        __syncthreads();  // nobody multiplies by these weights any more
-        done += 4;
-        if (threadIdx.x == 0) for (; begun < min(done + {SLOTS}, all); ++begun) fill(begun, back.data + begun % parts * {_PART});
     }};
-    if (threadIdx.x == 0) for (; begun < min({SLOTS}, all); ++begun) fill(begun, back.data + begun % parts * {_PART});
+    if (threadIdx.x == 0)
+        for (int n = 0; n < min({SLOTS}, all); ++n) fill(n, back.data + (size_t)(n % parts) * {_PART});
     for (int begin = first; begin < last; begin += {ROUND}) {{
         const int end = min(begin + {ROUND}, last);
         top(begin, end);
@@ -557,7 +574,7 @@ def forward(
     masks: wp.array[wp.int32],  # bits of what is above 0, as lanes have it; ``mask_words``; filled on CUDA
 ):
     """From gamma(x) to the output of the last layer, at all keys."""
-    wp.tile_zeros(shape=(_FLOATS,), dtype=float, storage="shared")  # how Warp is told of shared memory
+    wp.tile_zeros(shape=(_FOURS,), dtype=wp.vec4, storage="shared")  # how Warp is told of shared memory
     rows_forward(form, keys, place.shape[0], place, forth, shifts, outputs, masks)
 
 
@@ -574,5 +591,5 @@ def backward(
     partials: wp.array4d[float],  # [layers, k, GROUPS blocks, WIDTH] added to: sums of slopes over rows
 ):
     """From the gradient at the head to those of all layers."""
-    wp.tile_zeros(shape=(_FLOATS,), dtype=float, storage="shared")
+    wp.tile_zeros(shape=(_FOURS,), dtype=wp.vec4, storage="shared")
     rows_backward(form, keys, outputs.shape[1] // keys, after, head, back, outputs, masks, slopes, partials)

@@ -9,7 +9,8 @@ import warp as wp
 from torch import Tensor
 
 from ..kernels import perceptron as kernels
-from ..scene.perceptron import Form
+from ..kernels import slopes as ends
+from ..scene.perceptron import LARGEST, SMALLEST, Form, Slopes
 from .bridge import array_over, stream_of
 
 
@@ -43,20 +44,30 @@ class TensorCores:
         return outputs, packed[2].view(kernels.HEAD, form.width), (packed[1], weights[-1], masks)
 
     def backward(
-        self, form: Form, keys: int, after: Tensor, outputs: Tensor, kept: tuple[Tensor, ...]
-    ) -> tuple[Tensor, Tensor]:
-        """Slopes of all layers, and their sums over rows."""
+        self, form: Form, keys: int, gradient: Tensor, outputs: Tensor, kept: tuple[Tensor, ...]
+    ) -> Slopes:
+        """What the gradient becomes on its way back."""
         back, head, masks = kept
-        device = _ready(outputs.device)
-        slopes, blocks = torch.empty_like(outputs), -(-_threads(device) // kernels.BLOCK)
-        partials = head.new_zeros(len(outputs), keys, kernels.GROUPS * blocks, form.width)
-        if len(after):
-            with stream_of(outputs):
-                halves = [array_over(tensor, wp.float16) for tensor in (after, back, outputs, slopes)]
-                rows = [_layers(form, len(outputs)), keys, halves[0], array_over(head), halves[1], halves[2]]
-                rows.append(array_over(masks, wp.int32))
-                _launch(kernels.backward, _threads(device), rows, [halves[3], array_over(partials)], device)
-        return slopes, partials.sum(2)
+        device, rows, layers = _ready(outputs.device), len(gradient), len(outputs)
+        after, slopes = outputs.new_empty(rows, kernels.HEAD), torch.empty_like(outputs)
+        unit, total, sums = gradient.new_empty(1), gradient.new_empty(3), gradient.new_empty(layers, keys, form.width)
+        blocks = kernels.GROUPS * (1 if device.is_cpu else device.sm_count)
+        partials = gradient.new_zeros(layers, keys, blocks, form.width)
+        lanes, block = (1, 1) if device.is_cpu else (ends.LANES, ends.BLOCK)
+        parts = gradient.new_empty(-(-rows // lanes), 4)
+        with stream_of(outputs):
+            given, found = array_over(gradient.contiguous()), array_over(parts)
+            halves = [array_over(tensor, wp.float16) for tensor in (after, back, outputs, slopes)]
+            _launch(ends.measure_rows, len(parts) * lanes, [given], [found], device)
+            scaled = [halves[0], array_over(unit), array_over(total)]
+            _launch(ends.scale_rows, max(-(-rows // block), 1) * block, [given, found, SMALLEST, LARGEST], scaled, device)
+            if rows:
+                passed = [_layers(form, layers), keys, halves[0], array_over(head), halves[1], halves[2]]
+                passed.append(array_over(masks, wp.int32))
+                _launch(kernels.backward, _threads(device), passed, [halves[3], array_over(partials)], device)
+            dim = layers * keys * (form.width // ends.COLUMNS) * block
+            _launch(ends.add_partials, dim, [block, array_over(partials)], [array_over(sums)], device)
+        return Slopes(unit, after, slopes, sums, total)
 
 
 def fits(form: Form, device: torch.device) -> bool:

@@ -17,7 +17,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import torch
 from jaxtyping import Float
@@ -60,6 +60,21 @@ class Form:
         return [0] if self.joined is None else [0, self.joined]
 
 
+class Slopes(NamedTuple):
+    """Gradients on their way back, as factors: all but the last are in units of ``unit``, which no host knows."""
+
+    unit: Float[Tensor, ""]
+    """Largest magnitude of a gradient of an offset over ``LARGEST``."""
+    head: Float[Tensor, "rows h"]
+    """At the output of the head, with zeros up to its rows."""
+    layers: Float[Tensor, "layers rows width"]
+    """Before the ReLU of every layer."""
+    sums: Float[Tensor, "layers k width"]
+    """These, summed over the rows of each key."""
+    head_sum: Float[Tensor, "3"]
+    """Gradients of the offsets, summed over all rows."""
+
+
 class Passes(Protocol):
     """Takes rows through the layers, and gradients back."""
 
@@ -86,16 +101,16 @@ class Passes(Protocol):
         self,
         form: Form,
         keys: int,
-        after: Float[Tensor, "rows h"],
+        gradient: Float[Tensor, "rows 3"],
         outputs: Float[Tensor, "layers rows width"],
         kept: tuple[Tensor, ...],
-    ) -> tuple[Float[Tensor, "layers rows width"], Float[Tensor, "layers k width"]]:
-        """Gradients before the ReLU of all layers, and their sums over the rows of each key.
+    ) -> Slopes:
+        """What the gradient of the offsets becomes on its way back.
 
         Args:
             form: Sizes and precision.
             keys: Number k of keys.
-            after: Gradient at the output of the head, as a factor, with zeros up to its rows.
+            gradient: Of the offsets, in the precision of the parameters.
             outputs: Of ``forward``.
             kept: By ``forward``.
         """
@@ -128,10 +143,13 @@ class Products:
         return outputs, factors[-1], tuple(factors)
 
     def backward(
-        self, form: Form, keys: int, after: Tensor, outputs: Tensor, kept: tuple[Tensor, ...]
-    ) -> tuple[Tensor, Tensor]:
+        self, form: Form, keys: int, gradient: Tensor, outputs: Tensor, kept: tuple[Tensor, ...]
+    ) -> Slopes:
         """As the protocol says."""
-        slopes = torch.empty_like(outputs)
+        unit = _largest(gradient).clamp_min(SMALLEST) / LARGEST
+        head = outputs.new_zeros(len(gradient), len(kept[-1]))
+        torch.div(gradient, unit, out=head[:, : gradient.shape[1]])
+        slopes, after = torch.empty_like(outputs), head
         for number in reversed(range(len(outputs))):
             factor, slope, before = kept[number + 1][:, : form.width], slopes[number], outputs[number]
             for key, begin, end in _pieces(keys, len(after) // keys):
@@ -139,7 +157,7 @@ class Products:
                 torch.mm(after[rows], factor, out=slope[rows])
                 torch.ops.aten.threshold_backward.grad_input(slope[rows], before[rows], 0.0, grad_input=slope[rows])
             after = slope
-        return slopes, _sums(slopes, keys, torch.float32 if form.dtype == torch.float16 else form.dtype)
+        return Slopes(unit, head, slopes, _sums(slopes, keys, gradient.dtype), _sum_rows(gradient))
 
 
 class Stacked(torch.autograd.Function):
@@ -161,7 +179,7 @@ class Stacked(torch.autograd.Function):
         weights, biases = parameters[0::2], parameters[1::2]
         outputs, head, kept = (form.passes or Products()).forward(form, place, moment, weights, biases)
         context.form, context.rows = form, len(head)
-        context.save_for_backward(place, moment, outputs, *kept)
+        context.save_for_backward(place, moment, *kept, outputs)
         found = _product(outputs[-1], head.T, moment.dtype)[:, : len(biases[-1])] + biases[-1]
         return found.view(len(moment), len(place), len(biases[-1]))
 
@@ -172,17 +190,15 @@ class Stacked(torch.autograd.Function):
 
         Scaled by the largest gradient of an offset, which no host knows; everything up to the weights is linear in it.
         """
-        form, (place, moment, outputs, *kept) = context.form, context.saved_tensors
+        form, (place, moment, *kept, outputs) = context.form, context.saved_tensors
         layers, values = len(outputs), gradient.shape[-1]
         keys, count = len(moment), len(place)
         found = _Gradients(form, moment, layers, context.rows, values)
-        flat = gradient.reshape(-1, values)
-        unit = _largest(flat).clamp_min(SMALLEST) / LARGEST
-        after = place.new_zeros(keys * count, context.rows)
-        torch.div(flat, unit, out=after[:, :values])
-        _sum_rows(flat, out=found.head_bias)
-        _product(after.T, outputs[-1], moment.dtype, out=found.weights[-1])
-        slopes, own = (form.passes or Products()).backward(form, keys, after, outputs, tuple(kept))
+        unit, head, slopes, own, head_sum = (form.passes or Products()).backward(
+            form, keys, gradient.reshape(-1, values), outputs, tuple(kept)
+        )
+        found.head_bias.copy_(head_sum)
+        _product(head.T, outputs[-1], moment.dtype, out=found.weights[-1])
         torch.sum(own, 1, out=found.biases)
         _products(slopes[1:].mT, outputs[:-1], out=found.square)
         places = place.expand(keys, -1, -1).reshape(keys * count, -1)
@@ -278,10 +294,10 @@ def _largest(values: Float[Tensor, "rows v"]) -> Float[Tensor, ""]:
     return torch.linalg.vector_norm(torch.linalg.vector_norm(parts, math.inf, dim=1), math.inf)
 
 
-def _sum_rows(values: Float[Tensor, "rows v"], *, out: Float[Tensor, "v"]) -> None:
+def _sum_rows(values: Float[Tensor, "rows v"]) -> Float[Tensor, "v"]:
     """The sum over rows, in two steps as well."""
-    fold = math.gcd(len(values), FOLD)
-    torch.sum(values.reshape(-1, fold * len(out)).sum(0).view(fold, len(out)), 0, out=out)
+    fold, width = math.gcd(len(values), FOLD), values.shape[1]
+    return values.reshape(-1, fold * width).sum(0).view(fold, width).sum(0)
 
 
 def _rounded(form: Form, weights: tuple[Tensor, ...], biases: tuple[Tensor, ...]) -> tuple[list[Tensor], list[Tensor]]:
