@@ -1,0 +1,148 @@
+"""Before and behind a perceptron's way back: gradients of offsets are scaled to halves, partial sums are added up.
+
+A kernel leaves one partial result per warp, on the CPU per row, and the next one adds them up in a fixed order.
+"""
+
+import warp as wp
+
+WIDTH = 256  # columns that are added up
+COLUMNS = 32  # of them by one block of threads
+BLOCK = 256  # threads
+SLICES = BLOCK // COLUMNS
+LANES = 32
+VALUES = 3  # of an offset
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    const float* const v = gradient.data + 3ll * (row < count ? row : 0);
+    float4 own = make_float4(0.0f, 0.0f, 0.0f, 0.0f);
+    if (row < count) own = make_float4(v[0], v[1], v[2], fmaxf(fabsf(v[0]), fmaxf(fabsf(v[1]), fabsf(v[2]))));
+    #pragma unroll
+    for (int over = 16; over > 0; over /= 2) {
+        own.x += __shfl_xor_sync(0xffffffffu, own.x, over);
+        own.y += __shfl_xor_sync(0xffffffffu, own.y, over);
+        own.z += __shfl_xor_sync(0xffffffffu, own.z, over);
+        own.w = fmaxf(own.w, __shfl_xor_sync(0xffffffffu, own.w, over));
+    }
+    if ((threadIdx.x & 31) == 0) reinterpret_cast<float4*>(partials.data)[row >> 5] = own;
+#else
+    float* const to = partials.data + 4ll * row;
+    to[3] = 0.0f;
+    for (int i = 0; i < 3; ++i) {
+        to[i] = gradient.data[3ll * row + i];
+        to[3] = wp::max(to[3], wp::abs(to[i]));
+    }
+#endif
+""")
+def leave_part(gradient: wp.array2d[float], count: int, row: int, partials: wp.array2d[float]):
+    """Sums over the rows of this warp, and the largest magnitude."""
+
+
+@wp.kernel(enable_backward=False, grid_stride=False)
+def measure_rows(gradient: wp.array2d[float], partials: wp.array2d[float]):
+    """Sums of the gradients of offsets [rows, 3], and their largest magnitude: [warps, 4], a whole number of warps."""
+    leave_part(gradient, gradient.shape[0], wp.tid(), partials)
+
+
+@wp.func_native("""
+    const int parts = partials.shape[0];
+    const float* const from = partials.data;
+    float sums[4] = {};
+#if defined(__CUDA_ARCH__)
+    __shared__ float shared[8][4];
+    for (int n = threadIdx.x; n < parts; n += 256) {
+        const float4 one = reinterpret_cast<const float4*>(from)[n];
+        sums[0] += one.x; sums[1] += one.y; sums[2] += one.z; sums[3] = fmaxf(sums[3], one.w);
+    }
+    #pragma unroll
+    for (int over = 16; over > 0; over /= 2)
+        for (int i = 0; i < 4; ++i) {
+            const float other = __shfl_xor_sync(0xffffffffu, sums[i], over);
+            sums[i] = i < 3 ? sums[i] + other : fmaxf(sums[i], other);
+        }
+    if ((threadIdx.x & 31) == 0) for (int i = 0; i < 4; ++i) shared[threadIdx.x >> 5][i] = sums[i];
+    __syncthreads();
+    for (int i = 0; i < 4; ++i) {
+        sums[i] = shared[0][i];
+        for (int warp = 1; warp < 8; ++warp) sums[i] = i < 3 ? sums[i] + shared[warp][i] : fmaxf(sums[i], shared[warp][i]);
+    }
+    const bool first = blockIdx.x == 0 && threadIdx.x == 0;
+#else
+    for (int n = 0; n < parts; ++n) {
+        for (int i = 0; i < 3; ++i) sums[i] += from[4 * n + i];
+        sums[3] = wp::max(sums[3], from[4 * n + 3]);
+    }
+    const bool first = row == 0;
+#endif
+    const float one = wp::max(sums[3], smallest) / largest;
+    if (first) {
+        unit.data[0] = one;
+        for (int i = 0; i < 3; ++i) total.data[i] = sums[i];
+    }
+    if (row < gradient.shape[0])
+        for (int i = 0; i < 8; ++i)
+            after.data[8ll * row + i] = wp::float_to_half(i < 3 ? gradient.data[3ll * row + i] / one : 0.0f);
+""")
+def scale_row(
+    gradient: wp.array2d[float],
+    partials: wp.array2d[float],
+    smallest: float,
+    largest: float,
+    row: int,
+    after: wp.array2d[wp.float16],
+    unit: wp.array[float],
+    total: wp.array[float],
+):
+    """One row; every block of threads finds the unit for itself."""
+
+
+@wp.kernel(enable_backward=False, grid_stride=False)
+def scale_rows(
+    gradient: wp.array2d[float],
+    partials: wp.array2d[float],
+    smallest: float,
+    largest: float,
+    after: wp.array2d[wp.float16],
+    unit: wp.array[float],
+    total: wp.array[float],
+):
+    """Gradients over a unit, so that the largest is ``largest``, as halves with zeros behind them: [rows, 8].
+
+    ``unit`` [1] is that unit, made with no less than ``smallest``; ``total`` [3] the sum over rows, not scaled.
+    """
+    scale_row(gradient, partials, smallest, largest, wp.tid(), after, unit, total)
+
+
+@wp.func_native(f"""
+    const int parts = partials.shape[2], of = block / {WIDTH // COLUMNS};
+#if defined(__CUDA_ARCH__)
+    __shared__ float shared[{SLICES}][{COLUMNS}];
+    const int slice = threadIdx.x / {COLUMNS}, lane = threadIdx.x % {COLUMNS};
+    const int column = block % {WIDTH // COLUMNS} * {COLUMNS} + lane;
+    const float* from = partials.data + (size_t)of * parts * {WIDTH} + column;
+    float sum = 0.0f;
+    #pragma unroll 8
+    for (int n = slice; n < parts; n += {SLICES}) sum += from[(size_t)n * {WIDTH}];
+    shared[slice][lane] = sum;
+    __syncthreads();
+    if (slice > 0) return;
+    for (int other = 1; other < {SLICES}; ++other) sum += shared[other][lane];
+    sums.data[of * {WIDTH} + column] = sum;
+#else
+    for (int n = 0; n < {COLUMNS}; ++n) {{
+        const int column = block % {WIDTH // COLUMNS} * {COLUMNS} + n;
+        float sum = 0.0f;
+        for (int part = 0; part < parts; ++part) sum += partials.data[((size_t)of * parts + part) * {WIDTH} + column];
+        sums.data[of * {WIDTH} + column] = sum;
+    }}
+#endif
+""")
+def add_columns(partials: wp.array4d[float], block: int, sums: wp.array3d[float]):
+    """32 columns of one layer and key."""
+
+
+@wp.kernel(enable_backward=False, grid_stride=False)
+def add_partials(threads: int, partials: wp.array4d[float], sums: wp.array3d[float]):
+    """Sums [layers, k, WIDTH] of partial ones [layers, k, parts, WIDTH]; ``threads`` of a block, one on a CPU."""
+    add_columns(partials, wp.tid() // threads, sums)
