@@ -26,6 +26,9 @@ HEAD = 8  # columns of the gradient at the head: 16 bytes, of which VALUES are u
 VALUES = 3
 ARCHITECTURE = 90  # that has these instructions; they are no part of later ones
 SLOTS = 6  # of the ring
+import os
+TURNS = os.environ.get("GF_TURNS", "1") == "1"
+AHEAD = os.environ.get("GF_AHEAD", "0") == "1"
 _PART = 64 * WIDTH  # halves of a block of weights
 _SHARED = SLOTS * 2 * _PART + GROUPS * 4 * WIDTH * 4 + 64 + 16 + 1024  # bytes: ring, sums, barriers, counters, to align
 _FOURS = wp.constant(_SHARED // 16)
@@ -195,8 +198,8 @@ _CUDA = f"""
             asm volatile("{{ .reg .pred p; mbarrier.try_wait.parity.shared::cta.b64 p, [%1], %2; selp.u32 %0, 1, 0, p; }}"
                          : "=r"(there) : "r"(barrier), "r"(parity) : "memory");
     }};
-    auto turn = [&](int of) {{ asm volatile("bar.sync %0, {BLOCK};" :: "r"(1 + of) : "memory"); }};
-    auto pass_on = [&](int to) {{ asm volatile("bar.arrive %0, {BLOCK};" :: "r"(1 + to) : "memory"); }};
+    auto turn = [&](int of) {{ if ({int(TURNS)}) asm volatile("bar.sync %0, {BLOCK};" :: "r"(1 + of) : "memory"); }};
+    auto pass_on = [&](int to) {{ if ({int(TURNS)}) asm volatile("bar.arrive %0, {BLOCK};" :: "r"(1 + to) : "memory"); }};
     auto group_waits = [&]() {{ asm volatile("bar.sync %0, 128;" :: "r"(3 + group) : "memory"); }};
 
     // the weights begin at 16 bytes times the low bits of ``matrix``
@@ -278,6 +281,8 @@ _FORWARD = f"""
         constexpr int C = decltype(kind)::H + decltype(kind)::P;
         const wp::half* before = outputs.data + (number ? number - 1 : 0) * of_layer;
         wp::half* after = outputs.data + number * of_layer;
+        unsigned rows[4 * C][4];
+        if ({int(AHEAD)} && begin + group < end) read(kind, before, place.data, begin + group, rows);
         for (int tile = begin + group; tile < end + group; tile += {GROUPS}) {{
             if (tile >= end) {{
                 turn(group);
@@ -286,13 +291,13 @@ _FORWARD = f"""
                 break;
             }}
             float sums[128];
-            unsigned rows[4 * C][4];
-            read(kind, before, place.data, tile, rows);
+            if (!{int(AHEAD)}) read(kind, before, place.data, tile, rows);
             turn(group);
             product(kind, done, rows, sums);
             pass_on(1 - group);
             multiplied(sums);
             if (tile + {GROUPS} >= end) release(C, forth.data, parts, all);
+            else if ({int(AHEAD)}) read(kind, before, place.data, tile + {GROUPS}, rows);
             const int key = tile / of_key, row = (tile - key * of_key) * {TILE} + 16 * warp + g;
             const float4* from = reinterpret_cast<const float4*>(shifts.data + ((size_t)number * keys + key) * {WIDTH});
             wp::half* to = after + ((size_t)key * count + row) * {WIDTH} + 8 * t;
@@ -457,6 +462,8 @@ _BACKWARD = f"""
     auto layer = [&](int number, int begin, int end) {{
         const wp::half* before = slopes.data + number * of_layer;
         float own[8] = {{}};
+        unsigned rows[16][4];
+        if ({int(AHEAD)} && begin + group < end) read(Goes{{}}, before, before, begin + group, rows);
         for (int tile = begin + group; tile < end + group; tile += {GROUPS}) {{
             if (tile >= end) {{
                 turn(group);
@@ -467,14 +474,15 @@ _BACKWARD = f"""
             const int key = tile / of_key, low = (tile - key * of_key) * {TILE} + 16 * warp + g;
             const size_t at = (number - 1) * of_layer + ((size_t)key * count + low) * {WIDTH} + 8 * t;
             float sums[128];
-            unsigned rows[16][4], alive[4];
-            read(Goes{{}}, before, before, tile, rows);
+            unsigned alive[4];
+            if (!{int(AHEAD)}) read(Goes{{}}, before, before, tile, rows);
             turn(group);
             product(Goes{{}}, done, rows, sums);
             pass_on(1 - group);
             alive_of(number - 1, tile, alive);
             multiplied(sums);
             if (tile + {GROUPS} >= end) release(4, back.data, parts, all);
+            else if ({int(AHEAD)}) read(Goes{{}}, before, before, tile + {GROUPS}, rows);
             float all_[64];
             #pragma unroll
             for (int q = 0; q < 8; ++q) {{
