@@ -65,7 +65,8 @@ def measure_rows(gradient: wp.array2d[float], partials: wp.array2d[float]):
     __syncthreads();
     for (int i = 0; i < 4; ++i) {
         sums[i] = shared[0][i];
-        for (int warp = 1; warp < 8; ++warp) sums[i] = i < 3 ? sums[i] + shared[warp][i] : fmaxf(sums[i], shared[warp][i]);
+        for (int warp = 1; warp < 8; ++warp)
+            sums[i] = i < 3 ? sums[i] + shared[warp][i] : fmaxf(sums[i], shared[warp][i]);
     }
     const bool first = blockIdx.x == 0 && threadIdx.x == 0;
 #else

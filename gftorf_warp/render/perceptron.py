@@ -10,6 +10,7 @@ from torch import Tensor
 
 from ..kernels import perceptron as kernels
 from ..kernels import slopes as ends
+from ..kernels import wgmma
 from ..scene.perceptron import LARGEST, SMALLEST, Form, Slopes
 from .bridge import array_over, stream_of
 
@@ -27,7 +28,7 @@ class TensorCores:
         keys, count, layers = len(moment), len(place), len(weights) - 1
         parameters = torch.cat([value.reshape(-1) for pair in zip(weights, biases, strict=True) for value in pair])
         square, entry = form.width * form.width, form.width * form.columns
-        sizes = [(layers - 1) * square + len(form.entries) * entry, (layers - 1) * square, kernels.HEAD * form.width]
+        sizes = [(layers - 1) * square + len(form.entries) * entry, (layers - 1) * square, wgmma.HEAD * form.width]
         packed = place.new_empty(sum(sizes)).split(sizes)
         shifts = moment.new_empty(layers, keys, form.width)
         outputs = place.new_empty(layers, keys * count, form.width)
@@ -39,19 +40,20 @@ class TensorCores:
             dim, added = (layers, keys, form.width), array_over(shifts)
             _launch(kernels.add_moments, dim, [of, flat, array_over(moment)], [added], device)
             if count:
-                rows, found = [of, keys, array_over(place, wp.float16), halves[0], added], array_over(outputs, wp.float16)
+                rows, found = (
+                    [of, keys, array_over(place, wp.float16), halves[0], added],
+                    array_over(outputs, wp.float16),
+                )
                 _launch(kernels.forward, _threads(device), rows, [found, array_over(masks, wp.int32)], device)
-        return outputs, packed[2].view(kernels.HEAD, form.width), (packed[1], weights[-1], masks)
+        return outputs, packed[2].view(wgmma.HEAD, form.width), (packed[1], weights[-1], masks)
 
-    def backward(
-        self, form: Form, keys: int, gradient: Tensor, outputs: Tensor, kept: tuple[Tensor, ...]
-    ) -> Slopes:
+    def backward(self, form: Form, keys: int, gradient: Tensor, outputs: Tensor, kept: tuple[Tensor, ...]) -> Slopes:
         """What the gradient becomes on its way back."""
         back, head, masks = kept
         device, rows, layers = _ready(outputs.device), len(gradient), len(outputs)
-        after, slopes = outputs.new_empty(rows, kernels.HEAD), torch.empty_like(outputs)
+        after, slopes = outputs.new_empty(rows, wgmma.HEAD), torch.empty_like(outputs)
         unit, total, sums = gradient.new_empty(1), gradient.new_empty(3), gradient.new_empty(layers, keys, form.width)
-        blocks = kernels.GROUPS * (1 if device.is_cpu else device.sm_count)
+        blocks = wgmma.GROUPS * (1 if device.is_cpu else device.sm_count)
         partials = gradient.new_zeros(layers, keys, blocks, form.width)
         lanes, block = (1, 1) if device.is_cpu else (ends.LANES, ends.BLOCK)
         parts = gradient.new_empty(-(-rows // lanes), 4)
@@ -60,7 +62,9 @@ class TensorCores:
             halves = [array_over(tensor, wp.float16) for tensor in (after, back, outputs, slopes)]
             _launch(ends.measure_rows, len(parts) * lanes, [given], [found], device)
             scaled = [halves[0], array_over(unit), array_over(total)]
-            _launch(ends.scale_rows, max(-(-rows // block), 1) * block, [given, found, SMALLEST, LARGEST], scaled, device)
+            _launch(
+                ends.scale_rows, max(-(-rows // block), 1) * block, [given, found, SMALLEST, LARGEST], scaled, device
+            )
             if rows:
                 passed = [_layers(form, layers), keys, halves[0], array_over(head), halves[1], halves[2]]
                 passed.append(array_over(masks, wp.int32))
@@ -72,10 +76,10 @@ class TensorCores:
 
 def fits(form: Form, device: torch.device) -> bool:
     """Whether a perceptron can go that way: its sizes, and a GPU that has such products."""
-    sizes = form.width == kernels.WIDTH and form.columns == kernels.COLUMNS
+    sizes = form.width == wgmma.WIDTH and form.columns == wgmma.COLUMNS
     if not sizes or form.dtype != torch.float16 or device.type != "cuda":
         return False
-    return torch.cuda.get_device_capability(device) == (kernels.ARCHITECTURE // 10, kernels.ARCHITECTURE % 10)
+    return torch.cuda.get_device_capability(device) == (wgmma.ARCHITECTURE // 10, wgmma.ARCHITECTURE % 10)
 
 
 @functools.cache
@@ -87,7 +91,7 @@ def _ready(device: torch.device) -> wp.Device:
         before, wp.config.cuda_arch_suffix = wp.config.cuda_arch_suffix, "a"
         try:
             for kernel in (kernels.forward, kernels.backward):
-                kernel.module.load(found, kernels.BLOCK)
+                kernel.module.load(found, wgmma.BLOCK)
         finally:
             wp.config.cuda_arch_suffix = before
     return found
@@ -103,8 +107,8 @@ def _layers(form: Form, layers: int) -> kernels.Layers:
 
 def _threads(device: wp.Device) -> int:
     """One block on every multiprocessor, which is all that its registers hold."""
-    return 1 if device.is_cpu else device.sm_count * kernels.BLOCK
+    return 1 if device.is_cpu else device.sm_count * wgmma.BLOCK
 
 
 def _launch(kernel: wp.Kernel, dim, inputs: list, outputs: list[wp.array], device: wp.Device) -> None:
-    wp.launch(kernel, dim, inputs, outputs, device=device, block_dim=kernels.BLOCK, record_tape=False)
+    wp.launch(kernel, dim, inputs, outputs, device=device, block_dim=wgmma.BLOCK, record_tape=False)

@@ -142,9 +142,7 @@ class Products:
                 hidden = out
         return outputs, factors[-1], tuple(factors)
 
-    def backward(
-        self, form: Form, keys: int, gradient: Tensor, outputs: Tensor, kept: tuple[Tensor, ...]
-    ) -> Slopes:
+    def backward(self, form: Form, keys: int, gradient: Tensor, outputs: Tensor, kept: tuple[Tensor, ...]) -> Slopes:
         """As the protocol says."""
         unit = _largest(gradient).clamp_min(SMALLEST) / LARGEST
         head = outputs.new_zeros(len(gradient), len(kept[-1]))
