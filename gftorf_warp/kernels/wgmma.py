@@ -52,6 +52,7 @@ _CUDA = f"""
     const size_t of_layer = (size_t)keys * count * {WIDTH};
     extern __shared__ char memory[];
     const unsigned begins = (unsigned)__cvta_generic_to_shared(memory), base = (begins + 1023u) & ~1023u;
+    float* const shared_sums = reinterpret_cast<float*>(memory + (base - begins) + {_RING}) + group * {4 * WIDTH};
     const unsigned barriers = base + {_RING + _SUMS_OF_GROUPS};
     int* const released = reinterpret_cast<int*>(memory + (base - begins) + {_RING + _SUMS_OF_GROUPS + _BARRIERS});
     struct Starts {{ enum {{ H = 0, P = 1 }}; }};  // blocks of 64 inputs: of the layer before, of gamma(x)
@@ -160,16 +161,21 @@ _FORWARD = f"""
             float sums[128];
             unsigned rows[4 * C][4];
             read(kind, before, place.data, tile, rows);
+            const int key = tile / of_key, row = (tile - key * of_key) * {TILE} + 16 * warp + g;
+            const float2 own = __ldg(reinterpret_cast<const float2*>(
+                shifts.data + ((size_t)number * keys + key) * {WIDTH}) + (threadIdx.x & 127));
             product(kind, done, rows, sums);
+            float* const added = shared_sums + ((tile - begin) / {GROUPS} & 1) * {WIDTH};
+            reinterpret_cast<float2*>(added)[threadIdx.x & 127] = own;
+            group_waits();  // nobody reads what was added two tiles ago any more, either
             multiplied(sums);
             if (tile + {GROUPS} >= end) release(C, forth.data, parts, all);
-            const int key = tile / of_key, row = (tile - key * of_key) * {TILE} + 16 * warp + g;
-            const float4* from = reinterpret_cast<const float4*>(shifts.data + ((size_t)number * keys + key) * {WIDTH});
             wp::half* to = after + ((size_t)key * count + row) * {WIDTH} + 8 * t;
             unsigned alive[4] = {{}};
             #pragma unroll
             for (int q = 0; q < 8; ++q) {{
-                const float4 one = __ldg(from + 8 * q + 2 * t), two = __ldg(from + 8 * q + 2 * t + 1);
+                const float4 one = reinterpret_cast<const float4*>(added)[8 * q + 2 * t];
+                const float4 two = reinterpret_cast<const float4*>(added)[8 * q + 2 * t + 1];
                 const float shift[8] = {{one.x, one.y, one.z, one.w, two.x, two.y, two.z, two.w}};
                 #pragma unroll
                 for (int half = 0; half < 2; ++half) {{
@@ -229,8 +235,6 @@ _BACKWARD = f"""
 #if defined(__CUDA_ARCH__)
     {_CUDA}
     const int parts = 4 * (layers - 1), all = parts * ((last - first + {ROUND - 1}) / {ROUND});
-    float* const shared_sums = reinterpret_cast<float*>(memory + (base - begins) + {_RING})
-                               + group * {4 * WIDTH};
     struct Of64 {{ enum {{ N = 32 }}; }};
     struct Of32 {{ enum {{ N = 16 }}; }};
     struct Of16 {{ enum {{ N = 8 }}; }};
