@@ -7,6 +7,7 @@ import os
 from dataclasses import dataclass
 from enum import StrEnum
 
+import numpy as np
 import warp as wp
 
 from ..kernels import batches
@@ -72,6 +73,14 @@ class RenderSettings:
     """The derivative of a clamped alpha."""
     distortion: Distortion = Distortion.PAPER
     """Which distortion is returned."""
+    depth_bits: int = 24
+    """Bits of the key that orders splats by z-depth, 24 or 16; on CUDA the sort takes a pass for every eight.
+
+    A key counts the floats from ``near`` on and drops the bits that do not fit, see ``depth_shift``: it is linear in z
+    between two powers of two, twice as wide beyond. Splats of one key keep their order in memory. From 0.135 to
+    7.425 m, the presets at 20 MHz, a key is 1 um wide at 3 m, at most 5e-7 of z; with 16 bits, an approximation,
+    0.24 mm and 1.2e-4.
+    """
     pair_capacity: int | None = None
     """(tile, splat) pairs to reserve; None reads their number back, the one host synchronisation of a rendering.
 
@@ -91,8 +100,25 @@ class RenderSettings:
             raise ValueError(f"near and far must satisfy 0 < near < far, got {self.near} and {self.far}")
         if self.sh_degree not in (0, 1, 2, 3):
             raise ValueError(f"sh_degree must be 0, 1, 2 or 3, got {self.sh_degree}")
+        if self.depth_bits not in (16, 24):
+            raise ValueError(f"depth_bits must be 16 or 24, got {self.depth_bits}")
         if self.threads is not None and self.threads < 1:
             raise ValueError(f"threads must be at least 1, got {self.threads}")
+
+    @property
+    def depth_shift(self) -> int:
+        """Lowest bits of a z-depth that its key leaves out: as few as make ``far`` nearer than ``depth_culled``."""
+        with np.errstate(over="ignore", under="ignore"):
+            near, far = (int(np.float32(z).view(np.int32)) for z in (self.near, self.far))
+        shift = 0
+        while (far - near) >> shift >= self.depth_culled:
+            shift += 1
+        return shift
+
+    @property
+    def depth_culled(self) -> int:
+        """Key of what is culled, behind all others."""
+        return (1 << self.depth_bits) - 1
 
 
 # pixels per thread, columns and rows of a tile: a CPU thread works on a block of 4 x 4 pixels at once, on CUDA a warp
@@ -138,6 +164,7 @@ class Frame:
         self.turns = 0  # renderings so far
         self.splats = self.array("splats", count, Splat)
         self.box_px = self.array("boxes", count, wp.vec4i)
+        self.depth_shift = settings.depth_shift
         self.depth_key = self.array("depth keys", 2 * count)  # the radix sort wants twice the room
         self.order = self.array("order", 2 * count)
         self.counts, self.ends = self.array("counts", count), self.array("ends", count)

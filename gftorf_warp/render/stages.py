@@ -42,7 +42,7 @@ def project_backward(inputs: Inputs, view: CameraView, frame: Frame, grad_splats
             _project_inputs(inputs, view, frame),
             _project_outputs(frame),
             adjoint=True,
-            adj_inputs=[CameraView(), wanted.calibration, None, *adjoint],
+            adj_inputs=[CameraView(), wanted.calibration, None, None, None, *adjoint],
             adj_outputs=[grad_splats, None, None, None],
         )
 
@@ -55,7 +55,9 @@ def _project_kernel(inputs: Inputs, view: CameraView, frame: Frame):
 def _project_inputs(inputs: Inputs, view: CameraView, frame: Frame) -> list:
     colour_sh = inputs.colour_sh if inputs.colour_sh is not None else _nothing(frame, 2, wp.vec3)
     arrays = [getattr(inputs, name) for name in _PROJECTED[:-1]]
-    return [view, inputs.calibration, frame.settings.sh_degree, *arrays, colour_sh]
+    settings = frame.settings
+    keys = [frame.depth_shift, settings.depth_culled]
+    return [view, inputs.calibration, settings.sh_degree, *keys, *arrays, colour_sh]
 
 
 def _project_outputs(frame: Frame) -> list:
@@ -63,8 +65,8 @@ def _project_outputs(frame: Frame) -> list:
 
 
 def sort_by_depth(frame: Frame) -> None:
-    """Order the splats near to far, ties by index."""
-    wp.utils.radix_sort_pairs(frame.depth_key, frame.order, frame.count, end_bit=31)
+    """Order the splats near to far, those of one key by index."""
+    wp.utils.radix_sort_pairs(frame.depth_key, frame.order, frame.count, end_bit=frame.settings.depth_bits)
 
 
 def sort_by_tile(frame: Frame) -> None:
