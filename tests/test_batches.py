@@ -43,6 +43,13 @@ static int __shfl_sync(unsigned, int x, int lane) {
 static int __shfl_up_sync(unsigned all, int x, int by) {
     const int lane = threadIdx.x; return __shfl_sync(all, x, lane < by ? lane : lane - by);
 }
+static int __popc(unsigned x) { return __builtin_popcount(x); }
+static unsigned __ballot_sync(unsigned all, bool x) {
+    unsigned found = 0;
+    told[threadIdx.x] = x; __syncwarp();
+    for (int n = 0; n < 32; ++n) found |= (unsigned)told[n] << n;
+    __syncwarp(); return found;
+}
 static void atomicAdd(float* to, float x) { std::atomic_ref<float>(*to).fetch_add(x); }
 namespace wp {
 typedef uint64_t uint64;
@@ -143,6 +150,17 @@ int main() {
             while (row < 31 && behind <= begin + lane) behind += width(++row);
             wrong += lane_beyond(sums, begin + lane) != row;
         }
+        const int count = 33 * turn;
+        for (int wanted : {0, count / 3, count - 1, count}) {
+            int low = 0, high = count;  // the first place not before ``wanted``, as in `tile_starts`
+            while (low < high) {
+                const int step = (high - low + 33) / 33, place = low + (lane + 1) * step - 1;
+                const int steps = lanes_with(place < high && place < wanted);
+                high = std::min(high, low + (steps + 1) * step - 1);
+                low += steps * step;
+            }
+            wrong += low != std::max(wanted, 0);
+        }
     });
     std::printf("%d\\n", (int)wrong);
 }
@@ -162,6 +180,7 @@ SIGNATURES = {
     "sum_of_lanes": "int sum_of_lanes(int x)",
     "of_lane": "int of_lane(int x, int lane)",
     "lane_beyond": "int lane_beyond(int sums, int bound)",
+    "lanes_with": "int lanes_with(bool x)",
 }
 
 
@@ -199,8 +218,8 @@ def test_rounds_read_every_record_and_sum_every_pixel(light, channels, geometry,
 
 @pytest.mark.skipif(COMPILER is None, reason="needs a C++ compiler")
 def test_lanes_find_their_row(tmp_path):
-    """Sums over lanes, and the lane that a pair of a row of tiles belongs to."""
-    functions = {name: getattr(lanes, name) for name in ("sum_of_lanes", "of_lane", "lane_beyond")}
+    """Sums over lanes, the lane that a pair of a row of tiles belongs to, and a search by all lanes together."""
+    functions = {name: getattr(lanes, name) for name in ("sum_of_lanes", "of_lane", "lane_beyond", "lanes_with")}
     assert numbers_of(tmp_path, functions, LANES) == [0.0]
 
 

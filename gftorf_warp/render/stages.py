@@ -87,7 +87,8 @@ def sort_by_tile(frame: Frame) -> None:
         _launch(ordered.number_pairs, capacity, [frame.total, capacity], [frame.ids, frame.owners])
     if capacity:
         wp.utils.radix_sort_pairs(frame.keys, frame.ids, capacity, end_bit=frame.tiles.bit_length())
-    _launch(tiles.tile_starts, frame.tiles + 1, [frame.keys, capacity], [frame.first])
+    starts = frame.tiles + 1, frame.lanes_per_splat
+    _launch(tiles.tile_starts, starts, [frame.keys, capacity, frame.lanes_per_splat], [frame.first])
     if frame.settings.pair_capacity is not None and frame.device.is_cpu:
         frame.check_capacity()
 
