@@ -9,8 +9,8 @@ import warp as wp
 
 from .lanes import of_lane, sum_of_lanes
 
-# tiles whose equal words are neighbours: a splat reaches neighbouring tiles, whose words then share a sector of 32 bytes;
-# the warps that read them are those of one block, so a sector comes to a multiprocessor once
+# tiles whose equal words are neighbours: a splat reaches neighbouring tiles, whose words then share a sector of 32
+# bytes; the warps that read them are those of one block, so a sector comes to a multiprocessor once
 GROUP = wp.constant(8)
 PART = wp.constant(256)  # words of a tile that a warp reads: 8,192 splats, so that many splats are many warps, too
 
@@ -28,22 +28,25 @@ def part_of_tile(warp: int, parts: int) -> wp.vec2i:
     return wp.vec2i(row // parts * GROUP + warp % GROUP, row % parts)
 
 
-@wp.func
-def two_words(bits: wp.array[wp.uint32], tile: int, word: int, words: int) -> wp.uint64:
-    """A word of a tile and the one behind it."""
-    place = place_of_word(tile, word, words)
-    return wp.uint64(bits[place]) | (wp.uint64(bits[place + GROUP]) << wp.uint64(32))
+@wp.func_native(f"return (wp::uint64)bits.data[place] | (wp::uint64)bits.data[place + {GROUP}] << 32;")
+def two_words(bits: wp.array[wp.uint32], place: int) -> wp.uint64:
+    """The word of a tile at a place of the matrix, and the one behind it."""
 
 
+# plain pointers: of Warp's way to an element, by strides and from the end, the loop would have twice the instructions
 @wp.func_native("""
+    const int* from = order.data + rank;
+    for (int k = place; found && k < capacity; found &= found - 1)
 #if defined(__CUDA_ARCH__)
-    return __ffsll((long long)x) - 1;
+        ids.data[k++] = from[__ffsll((long long)found) - 1];
 #else
-    return __builtin_ctzll(x);
+        ids.data[k++] = from[__builtin_ctzll(found)];
 #endif
 """)
-def lowest_bit(x: wp.uint64) -> int:
-    """Number of the lowest bit of ``x`` that is set; one is."""
+def write_ids(
+    found: wp.uint64, order: wp.array[wp.int32], rank: int, ids: wp.array[wp.int32], place: int, capacity: int
+):
+    """List the splats whose bits are set, from ``place`` on; the lowest bit is that of depth rank ``rank``."""
 
 
 @wp.kernel(enable_backward=False, grid_stride=False)
@@ -65,7 +68,7 @@ def count_bits(
         word = mine[1] * PART + 2 * lane
         end = wp.min(words, (mine[1] + 1) * PART)
         while word < end:
-            found += wp.bit_count(two_words(bits, mine[0], word, words))
+            found += wp.bit_count(two_words(bits, place_of_word(mine[0], word, words)))
             word += 2 * lanes
         sums = sum_of_lanes(found)
         if lane == lanes - 1:
@@ -106,18 +109,13 @@ def list_bits(
             first[mine[0]] = wp.min(at, capacity)
         end = wp.min(ends[number], capacity)
         word = mine[1] * PART
-        while at < end:  # as all control here but the innermost the same for all lanes of a warp
+        while at < end:  # the same for all lanes of a warp
             own = word + 2 * lane
             found = wp.uint64(0)
             if own < wp.min(words, (mine[1] + 1) * PART):
-                found = two_words(bits, mine[0], own, words)
+                found = two_words(bits, place_of_word(mine[0], own, words))
             count = wp.bit_count(found)
             sums = sum_of_lanes(count)
-            place = at + sums - count
-            while found != wp.uint64(0):
-                if place < capacity:
-                    ids[place] = order[32 * own + lowest_bit(found)]
-                place += 1
-                found = found & (found - wp.uint64(1))
+            write_ids(found, order, 32 * own, ids, at + sums - count, capacity)
             at += of_lane(sums, lanes - 1)
             word += 2 * lanes

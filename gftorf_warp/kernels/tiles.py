@@ -12,8 +12,8 @@ from .bits import place_of_word
 from .lanes import lane_beyond, lanes_with, of_lane, sum_of_lanes
 from .splat import Splat, load_splat
 
-# `mark_pairs`, `count_pairs` and `emit_pairs` must agree on every span to the last bit, and contraction to fused multiply-adds is the
-# compiler's choice in each kernel anew
+# `count_pairs` and `emit_pairs` must agree on every span to the last bit, and `mark_pairs` should; but contraction to
+# fused multiply-adds is the compiler's choice in each kernel anew
 wp.set_module_options({"fuse_fp": False})
 
 _MARGIN = wp.constant(1.0e-6)  # of the largest terms of the power [1]: what float32 loses in it at a far pixel
@@ -86,7 +86,7 @@ def mark_pairs(
     tiles_x: int,  # tiles per row [1]
     words: int,  # of a tile, a bit per splat [1]
     # Out:
-    bits: wp.array[wp.uint32],  # zeroed; which splats each tile lists
+    bits: wp.array[wp.uint32],  # [groups * words * GROUP] zeroed; which splats each tile lists
 ):
     """One warp per splat, as in :func:`emit_pairs`, but a pair is a bit, whose place depends on nobody else."""
     rank, lane = wp.tid()

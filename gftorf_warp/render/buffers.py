@@ -171,9 +171,9 @@ class Frame:
         self.depth_shift = settings.depth_shift
         self.depth_key = self.array("depth keys", 2 * count)  # the radix sort wants twice the room
         self.order = self.array("order", 2 * count)
-        self.words = 2 * math.ceil(count / 64)  # of a tile in a matrix with a bit per tile and splat, an even number
+        self.words = 2 * math.ceil(count / 64)  # of a tile in a matrix of a bit per tile and splat, an even number
         self.matrix = math.ceil(self.tiles / bits.GROUP) * bits.GROUP * self.words
-        self.marks = not self.ordered and self.matrix * 4 <= MATRIX_MAX  # whether such a matrix makes the lists of tiles
+        self.marks = not self.ordered and 4 * self.matrix <= MATRIX_MAX  # whether lists of tiles are made of it
         self.parts = math.ceil(self.words / bits.PART)
         entries = self.tiles * self.parts if self.marks else count
         self.counts, self.ends = self.array("counts", entries), self.array("ends", entries)
