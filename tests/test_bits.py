@@ -76,15 +76,18 @@ def test_lists_are_those_of_a_stable_sort(count, shape, device):
 
 
 @pytest.mark.parametrize("device", DEVICES)
-def test_a_tile_with_more_splats_than_a_warp_reads(device):
-    """Parts of a tile go behind each other; ones without a pair, also the last, change nothing."""
-    count = 32 * bits.PART * 3 + 5
+@pytest.mark.parametrize(("readers", "parts"), [(1, 1), (8192, 5), (1000, 3)])
+def test_several_warps_read_a_tile(readers, parts, device, monkeypatch):
+    """Parts go behind each other; ones without a pair, also the last, change nothing."""
+    monkeypatch.setattr(buffers, "READERS", readers)
+    monkeypatch.setitem(buffers.TILE_SHAPES, "cpu", buffers.TILE_SHAPES["cuda"])
+    count = 4 * 2048 + 5  # a warp reads 64 words, of 2,048 splats, at once
     record, box = (np.tile(value, (count // 150 + 1, 1))[:count] for value in splats("small"))
     order = np.random.default_rng(9).permutation(count)
-    box[order[32 * bits.PART : 64 * bits.PART]] = NONE
+    box[order[2048:4096]] = NONE
     box[order[-5:]] = NONE
     frame = frame_of(record, box, RenderSettings(), device)
-    assert frame.parts == 4
+    assert frame.parts == parts
     got = lists_of(frame)
     is_same(got, lists_of(frame_of(record, box, RenderSettings(), device, marks=False)))
     assert got[2] > count / 3

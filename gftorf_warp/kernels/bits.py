@@ -7,12 +7,11 @@ tiles.py writes the matrix.
 
 import warp as wp
 
-from .lanes import of_lane, sum_of_lanes
+from .lanes import of_lane, sum_of_lanes, warp_any
 
 # tiles whose equal words are neighbours: a splat reaches neighbouring tiles, whose words then share a sector of 32
 # bytes; the warps that read them are those of one block, so a sector comes to a multiprocessor once
 GROUP = wp.constant(8)
-PART = wp.constant(256)  # words of a tile that a warp reads: 8,192 splats, so that many splats are many warps, too
 
 
 @wp.func
@@ -55,7 +54,8 @@ def count_bits(
     bits: wp.array[wp.uint32],  # [groups * words * GROUP] which splats each tile lists
     words: int,  # of a tile, an even number [1]
     tiles: int,  # of the image [1]
-    parts: int,  # of a tile [1]
+    parts: int,  # of a tile: a warp reads one [1]
+    length: int,  # words of a part, a multiple of 64 [1]
     lanes: int,  # threads per part: 32 on CUDA, a warp, 1 on the CPU [1]
     # Out:
     counts: wp.array[int],  # [tiles * parts] splats in each part
@@ -65,8 +65,8 @@ def count_bits(
     mine = part_of_tile(warp, parts)
     if mine[0] < tiles:
         found = int(0)
-        word = mine[1] * PART + 2 * lane
-        end = wp.min(words, (mine[1] + 1) * PART)
+        word = mine[1] * length + 2 * lane
+        end = wp.min(words, (mine[1] + 1) * length)
         while word < end:
             found += wp.bit_count(two_words(bits, place_of_word(mine[0], word, words)))
             word += 2 * lanes
@@ -81,7 +81,8 @@ def list_bits(
     bits: wp.array[wp.uint32],  # [groups * words * GROUP] which splats each tile lists
     words: int,  # of a tile, an even number [1]
     tiles: int,  # of the image [1]
-    parts: int,  # of a tile [1]
+    parts: int,  # of a tile: a warp reads one [1]
+    length: int,  # words of a part, a multiple of 64 [1]
     lanes: int,  # threads per part: 32 on CUDA, a warp, 1 on the CPU [1]
     order: wp.array[wp.int32],  # [>= N] splats near to far
     ends: wp.array[int],  # [tiles * parts] sums of counts: where the splats of each part end
@@ -108,14 +109,15 @@ def list_bits(
         if mine[1] == 0 and lane == 0:
             first[mine[0]] = wp.min(at, capacity)
         end = wp.min(ends[number], capacity)
-        word = mine[1] * PART
-        while at < end:  # the same for all lanes of a warp
+        word = mine[1] * length
+        while at < end:  # as all control here the same for all lanes of a warp
             own = word + 2 * lane
             found = wp.uint64(0)
-            if own < wp.min(words, (mine[1] + 1) * PART):
+            if own < words:
                 found = two_words(bits, place_of_word(mine[0], own, words))
-            count = wp.bit_count(found)
-            sums = sum_of_lanes(count)
-            write_ids(found, order, 32 * own, ids, at + sums - count, capacity)
-            at += of_lane(sums, lanes - 1)
+            if warp_any(found != wp.uint64(0)):
+                count = wp.bit_count(found)
+                sums = sum_of_lanes(count)
+                write_ids(found, order, 32 * own, ids, at + sums - count, capacity)
+                at += of_lane(sums, lanes - 1)
             word += 2 * lanes

@@ -127,9 +127,10 @@ TILE_SHAPES = {"cpu": (16, 8, 8), "cuda": (1, 8, 4)}
 
 LANES_PER_SPLAT = {"cpu": 1, "cuda": 32}  # threads that write the (tile, splat) pairs of a splat
 
-# a bit per tile and splat is zeroed, counted and read whether it is set or not: that is three times these bytes, at
-# 3 TB/s 0.13 ms, about what a sort of the pairs of an ordinary image takes
+# a bit per tile and splat is zeroed, counted and read whether it is set or not: three times these bytes, which at
+# 4 TB/s are 0.1 ms, what a sort of the pairs takes that few tiles and few splats have
 MATRIX_MAX = 128 << 20  # [B]
+READERS = 8192  # warps that read it: about as many as 132 multiprocessors hold at once
 
 
 def available_threads() -> int:
@@ -171,10 +172,12 @@ class Frame:
         self.depth_shift = settings.depth_shift
         self.depth_key = self.array("depth keys", 2 * count)  # the radix sort wants twice the room
         self.order = self.array("order", 2 * count)
-        self.words = 2 * math.ceil(count / 64)  # of a tile in a matrix of a bit per tile and splat, an even number
+        self.words = 2 * math.ceil(count / 64)  # of a tile in a matrix of a bit per tile and splat
         self.matrix = math.ceil(self.tiles / bits.GROUP) * bits.GROUP * self.words
         self.marks = not self.ordered and 4 * self.matrix <= MATRIX_MAX  # whether lists of tiles are made of it
-        self.parts = math.ceil(self.words / bits.PART)
+        steps = math.ceil(self.words / 64) / math.ceil(READERS / self.tiles)  # of a warp, two words a lane
+        self.part = 64 * max(1, math.ceil(steps))  # words of a tile that a warp reads
+        self.parts = math.ceil(self.words / self.part)
         entries = self.tiles * self.parts if self.marks else count
         self.counts, self.ends = self.array("counts", entries), self.array("ends", entries)
         self.total, self.first = self.array("total", 1), self.array("first", self.tiles + 1)

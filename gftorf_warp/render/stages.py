@@ -84,7 +84,7 @@ def _mark_and_read(frame: Frame, lists: list) -> None:
     """Mark the pairs as bits; count and list those of each tile."""
     marked = frame.zeros("bits", frame.matrix, wp.uint32)
     _launch(tiles.mark_pairs, (frame.count, frame.lanes_per_splat), [*lists, frame.tiles_x, frame.words], [marked])
-    matrix = [marked, frame.words, frame.tiles, frame.parts, frame.lanes_per_splat]
+    matrix = [marked, frame.words, frame.tiles, frame.parts, frame.part, frame.lanes_per_splat]
     threads = frame.matrix // frame.words * frame.parts, frame.lanes_per_splat
     _launch(bits.count_bits, threads, matrix, [frame.counts])
     capacity = _sum_counts(frame)
