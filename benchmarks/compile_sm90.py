@@ -20,6 +20,7 @@ import warp as wp
 
 from gftorf_warp.kernels import (
     adam,
+    bits,
     composite,
     composite_backward,
     displace,
@@ -51,6 +52,7 @@ def modules() -> dict[str, wp.Module]:
     shape = TILE_SHAPES["cuda"]
     found = {
         "tiles": tiles.count_pairs.module,
+        "bits": bits.count_bits.module,
         "resolve": resolve.resolve_quads.module,
         "splat": splat.add_records.module,
         "move": move.move_gaussians.module,

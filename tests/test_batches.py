@@ -8,7 +8,7 @@ import torch
 from cases import CASES, cotangents
 from torch.testing import assert_close
 
-from gftorf_warp.kernels import batches, lanes
+from gftorf_warp.kernels import batches, bits, lanes
 from gftorf_warp.render import api
 
 COMPILER = shutil.which("c++") or shutil.which("g++")
@@ -42,6 +42,14 @@ static int __shfl_sync(unsigned, int x, int lane) {
 }
 static int __shfl_up_sync(unsigned all, int x, int by) {
     const int lane = threadIdx.x; return __shfl_sync(all, x, lane < by ? lane : lane - by);
+}
+static int __popc(unsigned x) { return __builtin_popcount(x); }
+static int __ffsll(long long x) { return __builtin_ffsll(x); }
+static unsigned __ballot_sync(unsigned all, bool x) {
+    unsigned found = 0;
+    told[threadIdx.x] = x; __syncwarp();
+    for (int n = 0; n < 32; ++n) found |= (unsigned)told[n] << n;
+    __syncwarp(); return found;
 }
 static void atomicAdd(float* to, float x) { std::atomic_ref<float>(*to).fetch_add(x); }
 namespace wp {
@@ -143,9 +151,52 @@ int main() {
             while (row < 31 && behind <= begin + lane) behind += width(++row);
             wrong += lane_beyond(sums, begin + lane) != row;
         }
+        const int count = 33 * turn;
+        for (int wanted : {0, count / 3, count - 1, count}) {
+            int low = 0, high = count;  // the first place not before ``wanted``, as in `tile_starts`
+            while (low < high) {
+                const int step = (high - low + 33) / 33, place = low + (lane + 1) * step - 1;
+                const int steps = lanes_with(place < high && place < wanted);
+                high = std::min(high, low + (steps + 1) * step - 1);
+                low += steps * step;
+            }
+            wrong += low != std::max(wanted, 0);
+        }
     });
     std::printf("%d\\n", (int)wrong);
 }
+"""
+
+# a tile's words to its list, as in `list_bits`: of no bits, of few, of all, with and without room for them
+LISTS = f"""
+static int list(int words, int share, int capacity) {{
+    std::mt19937 random(words + share); std::vector<unsigned> matrix(words * {bits.GROUP}, ~0u);
+    std::vector<int> ranks(32 * words), ids(32 * words + 1, -1), want(32 * words + 1, -1);
+    for (int n = 0; n < 32 * words; ++n) ranks[n] = random();
+    int total = 0;
+    for (int w = 0; w < words; ++w) {{
+        unsigned& word = matrix[w * {bits.GROUP} + 3] = 0;
+        for (int b = 0; b < 32; ++b) if (random() % 100 < share) {{
+            word |= 1u << b;
+            if (total++ < capacity) want[total - 1] = ranks[32 * w + b];
+        }}
+    }}
+    const wp::array_t<unsigned> M{{matrix.data()}}; const wp::array_t<int> R{{ranks.data()}}, I{{ids.data()}};
+    in_a_warp([&](int lane) {{
+        for (int at = 0, word = 0; at < std::min(total, capacity); word += 64) {{
+            const int own = word + 2 * lane;
+            const wp::uint64 found = own < words ? two_words(M, own * {bits.GROUP} + 3) : 0;
+            const int count = __builtin_popcountll(found), sums = sum_of_lanes(count);
+            write_ids(found, R, 32 * own, I, at + sums - count, capacity);
+            at += of_lane(sums, 31);
+        }}
+    }});
+    return ids != want;
+}}
+int main() {{
+    for (int words : {{2, 64, 66, 256}}) for (int share : {{0, 1, 30, 100}})
+        for (int capacity : {{0, 1, 100, 1 << 20}}) std::printf("%d\\n", list(words, share, capacity));
+}}
 """
 
 SIGNATURES = {
@@ -162,6 +213,10 @@ SIGNATURES = {
     "sum_of_lanes": "int sum_of_lanes(int x)",
     "of_lane": "int of_lane(int x, int lane)",
     "lane_beyond": "int lane_beyond(int sums, int bound)",
+    "lanes_with": "int lanes_with(bool x)",
+    "two_words": "wp::uint64 two_words(wp::array_t<unsigned> bits, int place)",
+    "write_ids": "void write_ids(wp::uint64 found, wp::array_t<int> order, int rank, wp::array_t<int> ids, int place, "
+    "int capacity)",
 }
 
 
@@ -199,9 +254,17 @@ def test_rounds_read_every_record_and_sum_every_pixel(light, channels, geometry,
 
 @pytest.mark.skipif(COMPILER is None, reason="needs a C++ compiler")
 def test_lanes_find_their_row(tmp_path):
-    """Sums over lanes, and the lane that a pair of a row of tiles belongs to."""
-    functions = {name: getattr(lanes, name) for name in ("sum_of_lanes", "of_lane", "lane_beyond")}
+    """Sums over lanes, the lane that a pair of a row of tiles belongs to, and a search by all lanes together."""
+    functions = {name: getattr(lanes, name) for name in ("sum_of_lanes", "of_lane", "lane_beyond", "lanes_with")}
     assert numbers_of(tmp_path, functions, LANES) == [0.0]
+
+
+@pytest.mark.skipif(COMPILER is None, reason="needs a C++ compiler")
+def test_lanes_list_bits(tmp_path):
+    """A warp writes the ranks of all bits that are set in order, and nothing behind what there is room for."""
+    homes = {"sum_of_lanes": lanes, "of_lane": lanes, "two_words": bits, "write_ids": bits}
+    functions = {name: getattr(home, name) for name, home in homes.items()}
+    assert numbers_of(tmp_path, functions, LISTS) == [0.0] * 64
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")

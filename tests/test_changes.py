@@ -59,6 +59,7 @@ def test_every_setting_has_a_name_and_can_be_set_to_what_it_is():
         ("init.bounds=1", "2 values"),
         ("densify.loses_step=maybe", "true or false"),
         ("motion.width=0", "width must be at least 1"),
+        ("render.depth_bits=20", "depth_bits must be 16 or 24"),
         ("preset=paper", "no such setting"),
         ("quad_scale.x=1", "single setting"),
     ],

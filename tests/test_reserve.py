@@ -17,6 +17,18 @@ def test_it_grows_before_it_is_full():
     assert reserve.capacity >= 1_950_000
 
 
+def test_what_grows_after_a_reset_never_fills_it():
+    """All opacities grow at once then, pairs by half within 30 steps, and numbers arrive up to eight steps late."""
+    for late in range(9):
+        reserve, pairs = Reserve(), [1_360_000]
+        reserve.learn(pairs[0])
+        for step in range(1, 60):
+            pairs.append(int(1_360_000 * 1.5 ** min(step / 30, 1)))
+            assert pairs[-1] <= reserve.capacity, (late, step)
+            if reserve.is_nearly_full(pairs[max(step - late, 0)]):
+                reserve.learn(pairs[-1])  # waits for the newest
+
+
 def test_it_shrinks_only_if_it_stays_empty():
     """A reset of the opacities leaves few pairs for some hundred images, and more than before after that."""
     reserve = Reserve()

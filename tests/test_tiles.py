@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
+from comparison import DEVICES
 
 from gftorf_warp.kernels import tiles
 from gftorf_warp.kernels.splat import Splat
@@ -142,6 +143,19 @@ def test_a_capacity_keeps_the_nearest_pairs_and_marks_what_is_free(capacity):
     np.testing.assert_array_equal(got_keys[:kept], keys[:kept])
     np.testing.assert_array_equal(got_ids[:kept], ids[:kept])
     assert (got_keys[kept:] == 19 * 18).all()
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("count", [0, 1, 2, 31, 32, 33, 34, 1089, 5000])
+def test_lists_begin_where_sorted_keys_do(count, device):
+    """Of every tile, also of those without a pair; behind the last one are the places that no pair takes."""
+    rng, columns = np.random.default_rng(count), 40
+    for used in (1, 5, columns + 1):  # the last one: some places are free
+        sorted_keys = np.sort(rng.choice(columns + 1, used, replace=False)[rng.integers(0, used, count)])
+        keys = wp.array(sorted_keys, dtype=wp.int32, device=device)
+        first, lanes = wp.full(columns + 1, -1, dtype=int, device=device), LANES_PER_SPLAT[device]
+        wp.launch(tiles.tile_starts, (columns + 1, lanes), [keys, count, lanes], [first], device=device)
+        np.testing.assert_array_equal(first.numpy(), np.searchsorted(sorted_keys, np.arange(columns + 1)))
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")

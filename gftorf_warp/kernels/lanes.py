@@ -88,6 +88,14 @@ _OF_LANE = """
 #endif
 """
 
+_LANES_WITH = """
+#if defined(__CUDA_ARCH__)
+    return __popc(__ballot_sync(0xffffffffu, x));
+#else
+    return x;
+#endif
+"""
+
 _LANE_BEYOND = """
     int low = 0;
 #if defined(__CUDA_ARCH__)
@@ -101,6 +109,11 @@ _LANE_BEYOND = """
 @wp.func_native(_SUM_OF_LANES)
 def sum_of_lanes(x: int) -> int:
     """Sum of ``x`` of this lane and of all before it; on the CPU a thread is alone."""
+
+
+@wp.func_native(_LANES_WITH)
+def lanes_with(x: bool) -> int:
+    """Number of lanes of the warp for which ``x`` holds; on the CPU a thread is alone."""
 
 
 @wp.func_native(_OF_LANE)

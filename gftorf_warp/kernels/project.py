@@ -17,7 +17,6 @@ from .splat import Splat
 BLOCK_RADIUS = wp.constant(
     2.1214
 )  # [px] from the middle of a block of 4 x 4 pixels to its farthest centre, 1.5 sqrt(2)
-CULLED = wp.constant(wp.int32(0x7FFFFFFF))  # depth key behind every positive float
 
 
 @wp.func
@@ -88,6 +87,8 @@ def make_project(colour: bool, square: bool, lens: bool = False):
         view: CameraView,  # the camera [m, px]
         calibration: wp.array[float],  # [4] phase slope [rad/m], phase offset [rad], source intensity [1], DC offset
         degree: int,  # harmonics above it are ignored [0..3]
+        depth_shift: int,  # lowest bits of a z-depth that its key leaves out [1]
+        depth_culled: int,  # depth key of what is culled, behind all others [1]
         mean: wp.array[wp.vec3],  # [N] centre in the world [m]
         log_scale: wp.array[wp.vec3],  # [N] log of the standard deviations [log m]
         quaternion: wp.array[wp.vec4],  # [N] orientation, wxyz
@@ -97,13 +98,13 @@ def make_project(colour: bool, square: bool, lens: bool = False):
         # Out:
         splats: wp.array[Splat],  # [N] records, see splat.py; undefined where culled
         box_px: wp.array[wp.vec4i],  # [N] x0, y0, x1, y1 of the pixels a splat may touch [px]; x1 = 0: culled
-        depth_key: wp.array[wp.int32],  # [>= N] bits of the z-depth, which order like the float
+        depth_key: wp.array[wp.int32],  # [>= N] floats from the nearest z-depth to this one, without the lowest bits
         order: wp.array[wp.int32],  # [>= N] 0, 1, 2, ...
     ):
         """One thread per Gaussian."""
         n = wp.tid()
         order[n] = n
-        depth_key[n] = CULLED
+        depth_key[n] = depth_culled
         box_px[n] = wp.vec4i(0, 0, 0, 0)
         opacity = 1.0 / (1.0 + wp.exp(-opacity_logit[n]))
         local = view.rotation * mean[n] + view.translation
@@ -131,7 +132,8 @@ def make_project(colour: bool, square: bool, lens: bool = False):
         if box[2] <= box[0] or box[3] <= box[1]:
             return
         box_px[n] = box
-        depth_key[n] = wp.cast(local[2], wp.int32)
+        # bits of positive floats order like the floats
+        depth_key[n] = (wp.cast(local[2], wp.int32) - wp.cast(view.near, wp.int32)) >> depth_shift
 
         distance = wp.length(local)
         direction = (mean[n] - view.centre) / distance

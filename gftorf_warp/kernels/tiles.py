@@ -1,17 +1,19 @@
 """Which splats each tile has to look at: where an ellipse crosses a row of tiles, counts, keys, and each tile's list.
 
 A tile lists a splat if the ellipse alpha >= 1/255 reaches the rectangle of its pixel centres. The tiles of one row that
-an ellipse reaches are neighbours, so a row is a span, and a splat costs as many steps as it has rows. Pairs are in the
-order of depth and sorted by tile with a stable sort, so that every list is in depth order.
+an ellipse reaches are neighbours, so a row is a span, and a splat costs as many steps as it has rows. Either each pair
+of a tile and a splat is marked in a matrix of bits, which bits.py reads; or pairs are written in the order of depth and
+sorted by tile with a stable sort. Both ways every list is in depth order, and the lists are the same.
 """
 
 import warp as wp
 
-from .lanes import lane_beyond, of_lane, sum_of_lanes
+from .bits import place_of_word
+from .lanes import lane_beyond, lanes_with, of_lane, sum_of_lanes
 from .splat import Splat, load_splat
 
-# `count_pairs` and `emit_pairs` must agree on every span to the last bit, and contraction to fused multiply-adds is the
-# compiler's choice in each kernel anew
+# `count_pairs` and `emit_pairs` must agree on every span to the last bit, and `mark_pairs` should; but contraction to
+# fused multiply-adds is the compiler's choice in each kernel anew
 wp.set_module_options({"fuse_fp": False})
 
 _MARGIN = wp.constant(1.0e-6)  # of the largest terms of the power [1]: what float32 loses in it at a far pixel
@@ -70,6 +72,47 @@ def span_of(outline: wp.vec4, q: Splat, row: int, tiles: wp.vec4i, tile_width: i
     x0 = wp.clamp(int(wp.clamp(first, float(tiles[0]), float(tiles[2]))), tiles[0], tiles[2])
     x1 = wp.clamp(int(wp.clamp(last, -1.0, float(tiles[2]))) + 1, x0, tiles[2])
     return wp.vec2i(x0, x1)
+
+
+@wp.kernel(enable_backward=False, grid_stride=False)
+def mark_pairs(
+    # In:
+    order: wp.array[wp.int32],  # [>= N] splats near to far
+    splats: wp.array[Splat],  # [N] records
+    box_px: wp.array[wp.vec4i],  # [N] pixels a splat may touch [px]
+    tile_width: int,  # columns of a tile [px]
+    tile_height: int,  # rows of a tile [px]
+    lanes: int,  # threads per splat: 32 on CUDA, a warp, 1 on the CPU [1]
+    tiles_x: int,  # tiles per row [1]
+    words: int,  # of a tile, a bit per splat [1]
+    # Out:
+    bits: wp.array[wp.uint32],  # [groups * words * GROUP] zeroed; which splats each tile lists
+):
+    """One warp per splat, as in :func:`emit_pairs`, but a pair is a bit, whose place depends on nobody else."""
+    rank, lane = wp.tid()
+    i = order[rank]
+    if box_px[i][2] > 0:
+        q = load_splat(splats, i)
+        outline = outline_of(q, box_px[i])
+        tiles = tile_range(box_px[i], tile_width, tile_height)
+        bit = wp.uint32(1) << wp.uint32(rank % 32)
+        top = tiles[1]
+        while top < tiles[3]:  # as all control here the same for all lanes of a warp
+            span = wp.vec2i(0, 0)
+            if top + lane < tiles[3]:
+                span = span_of(outline, q, top + lane, tiles, tile_width, tile_height)
+            sums = sum_of_lanes(span[1] - span[0])
+            count = of_lane(sums, lanes - 1)
+            shift = span[1] - sums  # from the number of a pair in these rows to its column
+            begin = int(0)
+            while begin < count:
+                pair = begin + lane
+                row = lane_beyond(sums, pair)
+                x = of_lane(shift, row) + pair
+                if pair < count:
+                    wp.atomic_or(bits, place_of_word((top + row) * tiles_x + x, rank // 32, words), bit)
+                begin += lanes
+            top += lanes
 
 
 @wp.kernel(enable_backward=False, grid_stride=False)
@@ -161,22 +204,27 @@ def emit_pairs(
             top += lanes
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel(enable_backward=False, grid_stride=False)
 def tile_starts(
     # In:
     keys: wp.array[wp.int32],  # [>= count] tile of each pair, ascending
     count: int,  # pairs [1]
+    lanes: int,  # threads per tile: 32 on CUDA, a warp, 1 on the CPU [1]
     # Out:
     first: wp.array[int],  # [tiles + 1] where the list of each tile begins; the last entry ends the last list
 ):
-    """One thread per tile: binary search (``wp.lower_bound`` never returns ``count`` itself)."""
-    tile = wp.tid()
+    """One warp per tile: a thread would halve the range 21 times, 32 lanes need five reads one after the other."""
+    tile, lane = wp.tid()
     low = int(0)
     high = int(count)
-    while low < high:
-        middle = (low + high) // 2
-        if keys[middle] < tile:
-            low = middle + 1
-        else:
-            high = middle
-    first[tile] = low
+    while low < high:  # the same for all lanes of a warp
+        step = (high - low + lanes + 1) // (lanes + 1)  # so that lanes + 1 steps go beyond the end
+        place = low + (lane + 1) * step - 1
+        before = bool(False)
+        if place < high:
+            before = keys[place] < tile
+        steps = lanes_with(before)
+        high = wp.min(high, low + (steps + 1) * step - 1)
+        low += steps * step
+    if lane == 0:
+        first[tile] = low

@@ -164,8 +164,11 @@ def _undecided(pixel: Tensor, splats: _Splats, settings: RenderSettings) -> Bool
     undecided = (jump & live).any(1)
 
     z = splats.z_depth
-    near_tie = ((z[:, None] - z).abs() < 1e-6 * z) & (z[:, None] != z)
-    for k, j in near_tie.triu(1).nonzero().tolist():
+    nearest, farthest = (_depth_key(z * (1.0 + rounding), settings)[:, None] for rounding in (-5e-7, 5e-7))
+    in_memory = splats.index[:, None] < splats.index
+    first = (farthest < nearest.T) | ((farthest <= nearest.T) & in_memory)  # [k, j]: k comes before j in any case
+    either = ~(first | first.T) & (z[:, None] != z)
+    for k, j in either.triu(1).nonzero().tolist():
         undecided |= hit[:, k] & hit[:, j] & live[:, k]
     return undecided
 
@@ -177,8 +180,8 @@ def _project(field: GaussianField, camera: Camera, settings: RenderSettings) -> 
     z_all = (field.mean @ rotation.T + translation)[:, 2]
     seen = (z_all >= settings.near) & (z_all <= settings.far) & (field.opacity >= ALPHA_MIN)
     index = seen.nonzero()[:, 0]
-    # The order is decided in float32, as in the kernels; equal depths keep their order in memory
-    index = index[z_all.detach()[index].float().sort(stable=True).indices]
+    # The order is decided by keys of float32, as in the kernels; equal ones keep their order in memory
+    index = index[_depth_key(z_all.detach()[index], settings).sort(stable=True).indices]
 
     point = field.mean[index] @ rotation.T + translation
     x, y, z = point.unbind(1)
@@ -212,6 +215,12 @@ def _project(field: GaussianField, camera: Camera, settings: RenderSettings) -> 
         covariance=torch.stack([cov[:, 0, 0], cov[:, 0, 1], cov[:, 1, 1]], 1),
         opacity=field.opacity[index],
     )
+
+
+def _depth_key(z: Float[Tensor, "M"], settings: RenderSettings) -> Int[Tensor, "M"]:
+    """Floats from ``near`` to each z-depth, without the lowest bits: what splats are ordered by."""
+    bits, near = (depth.float().view(torch.int32) for depth in (z, torch.tensor(settings.near)))
+    return (bits - near.to(bits.device)) >> settings.depth_shift
 
 
 def _rotation(wxyz: Float[Tensor, "M 4"]) -> Float[Tensor, "M 3 3"]:

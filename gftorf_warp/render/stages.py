@@ -10,7 +10,7 @@ from itertools import pairwise
 import numpy as np
 import warp as wp
 
-from ..kernels import batches, ordered, resolve, splat, tiles
+from ..kernels import batches, bits, ordered, resolve, splat, tiles
 from ..kernels.composite import CHANNEL_PLANES, make_composite
 from ..kernels.composite_backward import (
     GRAD_LIGHT_PLANES,
@@ -42,7 +42,7 @@ def project_backward(inputs: Inputs, view: CameraView, frame: Frame, grad_splats
             _project_inputs(inputs, view, frame),
             _project_outputs(frame),
             adjoint=True,
-            adj_inputs=[CameraView(), wanted.calibration, None, *adjoint],
+            adj_inputs=[CameraView(), wanted.calibration, None, None, None, *adjoint],
             adj_outputs=[grad_splats, None, None, None],
         )
 
@@ -55,7 +55,9 @@ def _project_kernel(inputs: Inputs, view: CameraView, frame: Frame):
 def _project_inputs(inputs: Inputs, view: CameraView, frame: Frame) -> list:
     colour_sh = inputs.colour_sh if inputs.colour_sh is not None else _nothing(frame, 2, wp.vec3)
     arrays = [getattr(inputs, name) for name in _PROJECTED[:-1]]
-    return [view, inputs.calibration, frame.settings.sh_degree, *arrays, colour_sh]
+    settings = frame.settings
+    keys = [frame.depth_shift, settings.depth_culled]
+    return [view, inputs.calibration, settings.sh_degree, *keys, *arrays, colour_sh]
 
 
 def _project_outputs(frame: Frame) -> list:
@@ -63,21 +65,38 @@ def _project_outputs(frame: Frame) -> list:
 
 
 def sort_by_depth(frame: Frame) -> None:
-    """Order the splats near to far, ties by index."""
-    wp.utils.radix_sort_pairs(frame.depth_key, frame.order, frame.count, end_bit=31)
+    """Order the splats near to far, those of one key by index."""
+    wp.utils.radix_sort_pairs(frame.depth_key, frame.order, frame.count, end_bit=frame.settings.depth_bits)
 
 
 def sort_by_tile(frame: Frame) -> None:
-    """Count, emit and sort the (tile, splat) pairs."""
+    """The list of each tile, near to far: read from a matrix of bits, or by a sort of (tile, splat) pairs."""
     lists = [frame.order, frame.splats, frame.box_px, frame.tile_width, frame.tile_height, frame.lanes_per_splat]
+    if frame.marks:
+        _mark_and_read(frame, lists)
+    else:
+        _count_and_sort(frame, lists)
+    if frame.settings.pair_capacity is not None and frame.device.is_cpu:
+        frame.check_capacity()
+
+
+def _mark_and_read(frame: Frame, lists: list) -> None:
+    """Mark the pairs as bits; count and list those of each tile."""
+    marked = frame.zeros("bits", frame.matrix, wp.uint32)
+    _launch(tiles.mark_pairs, (frame.count, frame.lanes_per_splat), [*lists, frame.tiles_x, frame.words], [marked])
+    matrix = [marked, frame.words, frame.tiles, frame.parts, frame.part, frame.lanes_per_splat]
+    threads = frame.matrix // frame.words * frame.parts, frame.lanes_per_splat
+    _launch(bits.count_bits, threads, matrix, [frame.counts])
+    capacity = _sum_counts(frame)
+    outputs = [frame.ids, frame.first, frame.total]
+    _launch(bits.list_bits, threads, [*matrix, frame.order, frame.ends, capacity], outputs)
+
+
+def _count_and_sort(frame: Frame, lists: list) -> None:
+    """Count, emit and sort the pairs."""
     threads = frame.count, frame.lanes_per_splat
     _launch(tiles.count_pairs, threads, lists, [frame.counts])
-    wp.utils.array_scan(frame.counts, frame.ends, inclusive=True)
-    capacity = frame.settings.pair_capacity
-    if capacity is None:
-        # the declared host synchronisation: how many pairs there are decides how much memory they need
-        capacity = int(frame.ends[-1:].numpy()[0])
-    frame.reserve_pairs(capacity)
+    capacity = _sum_counts(frame)
     inputs = [*lists, frame.tiles_x, frame.tiles, frame.ends, capacity]
     _launch(tiles.emit_pairs, threads, inputs, [frame.keys, frame.ids, frame.total])
     if frame.ordered and capacity:
@@ -85,9 +104,19 @@ def sort_by_tile(frame: Frame) -> None:
         _launch(ordered.number_pairs, capacity, [frame.total, capacity], [frame.ids, frame.owners])
     if capacity:
         wp.utils.radix_sort_pairs(frame.keys, frame.ids, capacity, end_bit=frame.tiles.bit_length())
-    _launch(tiles.tile_starts, frame.tiles + 1, [frame.keys, capacity], [frame.first])
-    if frame.settings.pair_capacity is not None and frame.device.is_cpu:
-        frame.check_capacity()
+    starts = frame.tiles + 1, frame.lanes_per_splat
+    _launch(tiles.tile_starts, starts, [frame.keys, capacity, frame.lanes_per_splat], [frame.first])
+
+
+def _sum_counts(frame: Frame) -> int:
+    """Counts of pairs to where those of each end, and room for them; returns how many fit."""
+    wp.utils.array_scan(frame.counts, frame.ends, inclusive=True)
+    capacity = frame.settings.pair_capacity
+    if capacity is None:
+        # the declared host synchronisation: how many pairs there are decides how much memory they need
+        capacity = int(frame.ends[-1:].numpy()[0])
+    frame.reserve_pairs(capacity)
+    return capacity
 
 
 def composite(frame: Frame, view: CameraView, number: int, distortion: bool = True) -> None:

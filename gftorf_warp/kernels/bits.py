@@ -1,0 +1,123 @@
+"""The list of each tile out of a matrix of bits, one per tile and splat: counted, then read in the order of depth.
+
+Bit r % 32 of word r / 32 of a tile says whether the tile lists the splat of depth rank r. Splats are in the order of
+depth already, so the bits of a tile in their order are its list, and nothing is left to sort. ``mark_pairs`` of
+tiles.py writes the matrix.
+"""
+
+import warp as wp
+
+from .lanes import of_lane, sum_of_lanes, warp_any
+
+# tiles whose equal words are neighbours: a splat reaches neighbouring tiles, whose words then share a sector of 32
+# bytes; the warps that read them are those of one block, so a sector comes to a multiprocessor once
+GROUP = wp.constant(8)
+
+
+@wp.func
+def place_of_word(tile: int, word: int, words: int) -> int:
+    """Where the matrix has a word of a tile."""
+    return (tile // GROUP * words + word) * GROUP + tile % GROUP
+
+
+@wp.func
+def part_of_tile(warp: int, parts: int) -> wp.vec2i:
+    """Tile and part of it that are a warp's: GROUP warps in a row have the same part of the tiles of one group."""
+    row = warp // GROUP
+    return wp.vec2i(row // parts * GROUP + warp % GROUP, row % parts)
+
+
+@wp.func_native(f"return (wp::uint64)bits.data[place] | (wp::uint64)bits.data[place + {GROUP}] << 32;")
+def two_words(bits: wp.array[wp.uint32], place: int) -> wp.uint64:
+    """The word of a tile at a place of the matrix, and the one behind it."""
+
+
+# plain pointers: of Warp's way to an element, by strides and from the end, the loop would have twice the instructions
+@wp.func_native("""
+    const int* from = order.data + rank;
+    for (int k = place; found && k < capacity; found &= found - 1)
+#if defined(__CUDA_ARCH__)
+        ids.data[k++] = from[__ffsll((long long)found) - 1];
+#else
+        ids.data[k++] = from[__builtin_ctzll(found)];
+#endif
+""")
+def write_ids(
+    found: wp.uint64, order: wp.array[wp.int32], rank: int, ids: wp.array[wp.int32], place: int, capacity: int
+):
+    """List the splats whose bits are set, from ``place`` on; the lowest bit is that of depth rank ``rank``."""
+
+
+@wp.kernel(enable_backward=False, grid_stride=False)
+def count_bits(
+    # In:
+    bits: wp.array[wp.uint32],  # [groups * words * GROUP] which splats each tile lists
+    words: int,  # of a tile, an even number [1]
+    tiles: int,  # of the image [1]
+    parts: int,  # of a tile: a warp reads one [1]
+    length: int,  # words of a part, a multiple of 64 [1]
+    lanes: int,  # threads per part: 32 on CUDA, a warp, 1 on the CPU [1]
+    # Out:
+    counts: wp.array[int],  # [tiles * parts] splats in each part
+):
+    """One warp per part of a tile, one lane per two words."""
+    warp, lane = wp.tid()
+    mine = part_of_tile(warp, parts)
+    if mine[0] < tiles:
+        found = int(0)
+        word = mine[1] * length + 2 * lane
+        end = wp.min(words, (mine[1] + 1) * length)
+        while word < end:
+            found += wp.bit_count(two_words(bits, place_of_word(mine[0], word, words)))
+            word += 2 * lanes
+        sums = sum_of_lanes(found)
+        if lane == lanes - 1:
+            counts[mine[0] * parts + mine[1]] = sums
+
+
+@wp.kernel(enable_backward=False, grid_stride=False)
+def list_bits(
+    # In:
+    bits: wp.array[wp.uint32],  # [groups * words * GROUP] which splats each tile lists
+    words: int,  # of a tile, an even number [1]
+    tiles: int,  # of the image [1]
+    parts: int,  # of a tile: a warp reads one [1]
+    length: int,  # words of a part, a multiple of 64 [1]
+    lanes: int,  # threads per part: 32 on CUDA, a warp, 1 on the CPU [1]
+    order: wp.array[wp.int32],  # [>= N] splats near to far
+    ends: wp.array[int],  # [tiles * parts] sums of counts: where the splats of each part end
+    capacity: int,  # pairs that fit [1]
+    # Out:
+    ids: wp.array[wp.int32],  # [>= capacity] splat of each pair
+    first: wp.array[int],  # [tiles + 1] where the list of each tile begins; the last entry ends the last list
+    total: wp.array[int],  # [1] pairs there would be, whether they fit or not
+):
+    """One warp per part of a tile: a sum over lanes tells each lane where the splats of its two words go.
+
+    Pairs that do not fit are dropped, those of the last tiles first, and show in ``total``.
+    """
+    warp, lane = wp.tid()
+    if warp == 0 and lane == 0:
+        total[0] = ends[tiles * parts - 1]
+        first[tiles] = wp.min(ends[tiles * parts - 1], capacity)
+    mine = part_of_tile(warp, parts)
+    if mine[0] < tiles:
+        number = mine[0] * parts + mine[1]
+        at = int(0)  # the place of the first splat of the next words
+        if number > 0:
+            at = ends[number - 1]
+        if mine[1] == 0 and lane == 0:
+            first[mine[0]] = wp.min(at, capacity)
+        end = wp.min(ends[number], capacity)
+        word = mine[1] * length
+        while at < end:  # as all control here the same for all lanes of a warp
+            own = word + 2 * lane
+            found = wp.uint64(0)
+            if own < words:
+                found = two_words(bits, place_of_word(mine[0], own, words))
+            if warp_any(found != wp.uint64(0)):
+                count = wp.bit_count(found)
+                sums = sum_of_lanes(count)
+                write_ids(found, order, 32 * own, ids, at + sums - count, capacity)
+                at += of_lane(sums, lanes - 1)
+            word += 2 * lanes
