@@ -149,7 +149,7 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
         made = [parent for parent in reversed(path.absolute().parents) if not parent.exists()]
         path.parent.mkdir(parents=True, exist_ok=True)
         sweep(path)
-        temporary = _temporary(path)
+        temporary = path.absolute().parent / _temporary(path).name
         try:
             temporary.mkdir()
             yield temporary
@@ -224,7 +224,7 @@ def _renamed_to(path: Path) -> Iterator[Path]:
 
 
 def _temporary(path: Path) -> Path:
-    return path.absolute().parent / f".{path.name}.tmp-{os.getpid()}-{next(_COUNT)}"
+    return path.parent / f".{path.name}.tmp-{os.getpid()}-{next(_COUNT)}"
 
 
 def _alive(pid: int) -> bool:

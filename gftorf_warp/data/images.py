@@ -7,6 +7,7 @@ takes memory that is not contiguous for something else, and a full disk for none
 
 from __future__ import annotations
 
+import functools
 import struct
 import zlib
 from collections.abc import Mapping
@@ -48,13 +49,11 @@ def exr_bytes(channels: Mapping[str, np.ndarray]) -> memoryview:
         found = ", ".join(f"{name} {image.shape}" for name, image in channels.items()) or "none"
         raise ValueError(f"channels must be images [H, W] of one shape, got {found}")
     (height, width), names = next(iter(shapes)), sorted(channels, key=str.encode)
-    header = _exr_header([name.encode() for name in names], height, width)
     row = 8 + 4 * width * len(names)  # [bytes] its number, how many bytes follow, and the channels' pixels
-    start = len(header) + 8 * height
-    content = np.empty(start + height * row, np.uint8)
-    content[: len(header)] = np.frombuffer(header, np.uint8)
-    content[len(header) : start] = (start + row * np.arange(height, dtype="<u8")).view(np.uint8)
-    rows = content[start:].reshape(height, row)
+    start = _exr_start(tuple(name.encode() for name in names), height, width, row)
+    content = np.empty(len(start) + height * row, np.uint8)
+    content[: len(start)] = np.frombuffer(start, np.uint8)
+    rows = content[len(start) :].reshape(height, row)
     rows[:, :4] = np.arange(height, dtype="<i4").view(np.uint8).reshape(height, 4)
     rows[:, 4:8] = np.frombuffer(struct.pack("<i", row - 8), np.uint8)
     pixels = rows[:, 8:].view("<f4").reshape(height, len(names), width)
@@ -63,8 +62,9 @@ def exr_bytes(channels: Mapping[str, np.ndarray]) -> memoryview:
     return content.data
 
 
-def _exr_header(names: list[bytes], height: int, width: int) -> bytes:
-    """What stands before the table of rows: single-part scan lines of float32, not compressed, as OpenEXR writes it."""
+@functools.lru_cache(maxsize=64)
+def _exr_start(names: tuple[bytes, ...], height: int, width: int, row: int) -> bytes:
+    """What stands before the rows, as OpenEXR writes it: one part, float32 scan lines; and where each begins."""
     window = struct.pack("<4i", 0, 0, width - 1, height - 1)
     of_channel = struct.pack("<iB3xii", 2, 0, 1, 1)  # float32, not for perception, every pixel
     attributes = [
@@ -80,7 +80,9 @@ def _exr_header(names: list[bytes], height: int, width: int) -> bytes:
     ]
     parts = [name + b"\0" + kind + b"\0" + struct.pack("<i", len(value)) + value for name, kind, value in attributes]
     version = 2 | (0x400 if max(map(len, names)) > _SHORT else 0)
-    return struct.pack("<2i", 20000630, version) + b"".join(parts) + b"\0"
+    header = struct.pack("<2i", 20000630, version) + b"".join(parts) + b"\0"
+    begin = len(header) + 8 * height
+    return header + (begin + row * np.arange(height, dtype="<u8")).tobytes()
 
 
 def read_exr(path: str | Path) -> dict[str, np.ndarray]:
@@ -117,20 +119,6 @@ def read_exr(path: str | Path) -> dict[str, np.ndarray]:
             fix="copy or export the file again",
         ) from error
     return images
-
-
-def write_png(path: str | Path, rgb: np.ndarray) -> None:
-    """Write an 8-bit colour image as PNG, atomically.
-
-    Args:
-        path: The file; its folder must exist.
-        rgb: Image [H, W, 3], uint8, red first.
-
-    Raises:
-        ValueError: If it is another type or shape.
-        UsageError, ResourceError: If the file cannot be written.
-    """
-    atomic_write(path, png_bytes(rgb))  # cv2.imwrite would not notice a full disk
 
 
 def png_bytes(rgb: np.ndarray) -> bytes:

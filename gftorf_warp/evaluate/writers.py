@@ -1,7 +1,7 @@
 """Pictures on disk while the next images are rendered: by as many threads as there are CPUs, in order of the images.
 
-Encoders work without Python's lock: of 48 ms that a 320x240 image with four quads and distance costs a CPU, it is held
-for less than 3. Processes gained nothing, and have to be sent the images.
+A 320x240 image with four quads and distance costs a CPU 4 ms, half of it the system's for two megabytes. For less than
+0.3 ms of it Python's lock is held: so much take images of 4x4 pixels. Processes would have to be sent the images.
 """
 
 from __future__ import annotations
