@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gftorf_warp.data.files import atomic_folder, atomic_write, write_json
-from gftorf_warp.data.images import read_exr, write_exr, write_png
+from gftorf_warp.data.images import exr_bytes, indexed_png_bytes, png_bytes, read_exr, write_exr
 from gftorf_warp.errors import InputError, ResourceError, UsageError
 
 
@@ -150,8 +150,20 @@ def test_exr_gives_back_every_bit(tmp_path_factory, height, width, count, seed):
         np.testing.assert_array_equal(back[name], image)
 
 
+@pytest.mark.parametrize("names", [["distance", "opacity"], ["quad_000", "B", "a.b", "é"], ["n" * 32, "n" * 31]])
+def test_exr_is_what_openexr_itself_writes(tmp_path, names):
+    """Byte by byte, names of any length and order included; so whatever reads that library's files reads ours."""
+    import OpenEXR
+
+    images = {name: np.random.default_rng(k).random((5, 7), dtype=np.float32) for k, name in enumerate(names)}
+    header = {"compression": OpenEXR.NO_COMPRESSION, "type": OpenEXR.scanlineimage}
+    with OpenEXR.File(header, dict(images)) as file:
+        file.write(str(tmp_path / "theirs.exr"))
+    assert bytes(exr_bytes(images)) == (tmp_path / "theirs.exr").read_bytes()
+
+
 def test_exr_of_slices_flips_and_fortran_order_holds_the_right_pixels(tmp_path):
-    """The library writes wrong pixels from memory that is not contiguous, and says nothing."""
+    """OpenEXR's own writer puts wrong pixels there, and says nothing."""
     whole = np.arange(48.0).reshape(6, 8)
     images = {"slice": whole[::2, 1::3], "flip": whole[2::-1, 2::-1], "fortran": np.asfortranarray(whole[:3, :3])}
     write_exr(tmp_path / "a.exr", images)
@@ -189,15 +201,46 @@ def test_missing_and_foreign_exr_files_are_refused(tmp_path):
         assert name in caught.value.where
 
 
-def test_png_keeps_red_red(tmp_path):
+def test_png_keeps_red_red():
     """OpenCV stores blue first; ours are red first."""
     import cv2
 
     rgb = np.zeros((2, 3, 3), np.uint8)
     rgb[0, 0] = 250, 120, 10
-    write_png(tmp_path / "a.png", rgb[:, ::-1])
-    assert cv2.imread(str(tmp_path / "a.png"))[0, 2].tolist() == [10, 120, 250]
+    content = np.frombuffer(png_bytes(rgb[:, ::-1]), np.uint8)
+    assert cv2.imdecode(content, cv2.IMREAD_COLOR)[0, 2].tolist() == [10, 120, 250]
     for bad in (rgb.astype(np.float32), rgb[..., 0]):
         with pytest.raises(ValueError, match="uint8"):
-            write_png(tmp_path / "b.png", bad)
-    assert names(tmp_path) == ["a.png"]
+            png_bytes(bad)
+
+
+@settings(max_examples=25, deadline=None, derandomize=True, database=None)
+@given(height=st.integers(1, 300), width=st.integers(1, 300), colours=st.integers(1, 256))
+def test_png_of_numbered_colours_is_that_picture(height, width, colours):
+    """Of any size, also past the 64 KiB that a block of it holds; by two readers."""
+    import io
+
+    import cv2
+    from matplotlib import image as mpl
+
+    generator = np.random.default_rng(height * width)
+    palette = generator.integers(0, 256, (colours, 3), dtype=np.uint8)
+    index = generator.integers(0, colours, (height, width), dtype=np.uint8)
+    content = indexed_png_bytes(index, palette)
+    np.testing.assert_array_equal(
+        cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)[..., ::-1], palette[index]
+    )
+    np.testing.assert_array_equal(np.round(255 * mpl.imread(io.BytesIO(content))[..., :3]), palette[index])
+
+
+def test_numbered_colours_are_bytes():
+    """Anything else is a programming mistake."""
+    good, palette = np.zeros((2, 3), np.uint8), np.zeros((4, 3), np.uint8)
+    for index, colours in (
+        (good.astype(int), palette),
+        (good[0], palette),
+        (good, palette[:, :2]),
+        (good, palette / 2),
+    ):
+        with pytest.raises(ValueError, match="uint8"):
+            indexed_png_bytes(index, colours)

@@ -55,6 +55,21 @@ def test_previews_of_all_times_share_a_scale(run, tmp_path):
     assert len(np.unique(rgb.reshape(-1, 3), axis=0)) == 2
 
 
+def test_previews_of_quads_are_in_a_row_with_white_between(run):
+    """Each pixel in the colour of its value, grey where there is none: what any reader makes of colours by number."""
+    import cv2
+
+    images = renders.channels("quads", run.render(0.02), run.sensor)
+    images["quad_180"][2, 3] = np.nan
+    scale = previews.preview_scale("quads", [images])
+    content = np.frombuffer(previews.preview("quads", images, scale), np.uint8)
+    rgb = cv2.imdecode(content, cv2.IMREAD_COLOR)[..., ::-1]
+    want = pictures.side_by_side([pictures.colour_mapped(image, scale) for image in images.values()])
+    np.testing.assert_array_equal(rgb, want)
+    assert (want[2, WIDTH + 2 + 3] == pictures.UNKNOWN_GREY).all()
+    assert (want[:, WIDTH : WIDTH + 2] == 255).all()
+
+
 def test_chosen_times_and_things(run, tmp_path):
     """Phasors at two times, at the pose of the nearest raw frame; previews show phase and amplitude."""
     import cv2
@@ -86,7 +101,7 @@ def test_writing_reports_in_order_and_stops_at_the_first_error(run, tmp_path, mo
         if path.name == "000003.png":
             raise ResourceError("no space left", where=path, why="full", fix="free some")
 
-    monkeypatch.setattr(writers, "write_png", full)
+    monkeypatch.setattr(writers, "write_one_of_many", full)
     with pytest.raises(ResourceError, match=r"000003\.png"):
         render_to_folder(run, tmp_path / "other", what="distance")
 
@@ -209,15 +224,14 @@ def test_a_folder_with_something_else_is_refused_or_moved_aside(run, tmp_path):
 
 def test_colour_is_written_linear_and_shown_as_srgb(run):
     """Linear 0.5 is 188 in 8-bit sRGB; what is brighter than white stays white."""
+    import cv2
+
     colour = torch.stack([torch.full((HEIGHT, WIDTH), value) for value in (0.5, 0.0, 7.0)])
     images = renders.channels("colour", replace(run.render(0.0), colour=colour), run.sensor)
     assert list(images) == ["R", "G", "B"]
     assert images["B"].max() == 7.0
-    assert previews.preview("colour", images, previews.preview_scale("colour", [images]))[0, 0].tolist() == [
-        188,
-        0,
-        255,
-    ]
+    content = previews.preview("colour", images, previews.preview_scale("colour", [images]))
+    assert cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)[0, 0].tolist() == [255, 0, 188]
 
 
 def test_a_shift_finds_its_quad(run):
@@ -236,7 +250,7 @@ def test_colours_run_from_low_to_high_and_grey_is_unknown():
     scale = pictures.Scale(low=1.0, high=2.0, colours="viridis", unit="m")
     bar = pictures.bar(scale)[0]
     rgb = pictures.colour_mapped(np.array([[0.0, 1.0, 1.5, 2.0, 9.0, np.nan]]), scale)[0]
-    np.testing.assert_array_equal(rgb[:5], bar[[0, 0, 128, 255, 255]])
+    np.testing.assert_array_equal(rgb[:5], bar[[0, 0, len(bar) // 2, -1, -1]])
     assert rgb[5].tolist() == [128, 128, 128]
     for colours in ("viridis", "magma", "twilight", "RdBu_r"):
         assert not (pictures.bar(pictures.Scale(low=0, high=1, colours=colours, unit="m")) == 128).all(axis=-1).any()

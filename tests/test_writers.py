@@ -7,12 +7,14 @@ import subprocess
 import sys
 import threading
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
 from analytic_run import FRAMES, HEIGHT, WIDTH, AnalyticRun
 from test_replay import PLAIN, run  # noqa: F401
 
+from gftorf_warp.data import files
 from gftorf_warp.data.images import read_exr
 from gftorf_warp.errors import ResourceError, UsageError
 from gftorf_warp.evaluate import previews, stored, views, writers
@@ -134,6 +136,43 @@ def test_arrays_of_a_replay(run, tmp_path, monkeypatch):  # noqa: F811
         np.testing.assert_array_equal(found["colour/B"][k], want.colour[2].cpu().numpy())
 
 
+@pytest.mark.parametrize("taken", [0, 1, 100, 4 * 35, 4 * 35 + 3, 8 * 35])
+def test_arrays_are_whole_where_the_system_takes_a_part(tmp_path, monkeypatch, taken):
+    """A call may write less than it is given, and some systems have no call for several images."""
+    images = np.random.default_rng(0).random((3, 5, 7), dtype=np.float32)
+    monkeypatch.setattr(os, "writev", lambda file, rows: os.write(file, b"".join(rows)[:taken]), raising=False)
+    if not taken:
+        monkeypatch.delattr(os, "writev")
+        monkeypatch.delattr(os, "posix_fadvise", raising=False)
+    with stored.Stored(tmp_path / "a.npy", images.shape) as file:
+        file.write(1, images[1:])
+        file.write(0, images[:1])
+    np.testing.assert_array_equal(np.load(tmp_path / "a.npy"), images)
+
+
+def test_the_cost_of_a_picture_does_not_grow_with_those_before_it(analytic, tmp_path, monkeypatch):
+    """A folder is listed and flushed once, however many files come into it; what a dead process left there goes."""
+    listed, flushed = [], []
+    right = os.listdir, files.flush_folder
+    monkeypatch.setattr(files.os, "listdir", lambda folder: listed.append(Path(folder).name) or right[0](folder))
+    monkeypatch.setattr(files, "flush_folder", lambda folder: flushed.append(Path(folder).name) or right[1](folder))
+    for name in WHAT:
+        (tmp_path / name).mkdir()
+    dead = subprocess.Popen([sys.executable, "-c", ""])
+    dead.wait()
+    (tmp_path / "quads" / f".000001.exr.tmp-{dead.pid}-0").write_bytes(b"cut off")
+    (tmp_path / "quads" / f".000002.exr.tmp-{os.getpid()}-999999").write_bytes(b"being written")
+    render, times = analytic.renderer(), [k / 120 for k in range(FRAMES)]
+    images = views.images_of(render, analytic.sensor, WHAT)(0.0, analytic.camera)
+    scales = {name: previews.preview_scale(name, [images[name]]) for name in WHAT}
+    views_taken = [(time, analytic.camera) for time in times]
+    writers.write_all(tmp_path, scales, views.series_of(render, views_taken, analytic.sensor, WHAT), FRAMES)
+    assert sorted(listed) == sorted(flushed) == sorted(WHAT)
+    assert len(list((tmp_path / "distance").iterdir())) == 2 * FRAMES
+    left = [path.name for path in (tmp_path / "quads").iterdir() if path.name.startswith(".")]
+    assert left == [f".000002.exr.tmp-{os.getpid()}-999999"]
+
+
 @pytest.mark.parametrize("arrays", [True, False])
 def test_what_stops_the_rendering_leaves_nothing_half_written(analytic, tmp_path, arrays):
     """Ctrl-C in the middle: whole pictures of some times, or no array at all."""
@@ -167,11 +206,12 @@ def test_a_disk_that_cannot_hold_the_arrays(analytic, tmp_path, monkeypatch):
 
     class Full(stored.FileIO):
         def write(self, data):
-            if len(data) == 4 * WIDTH * HEIGHT:
+            if len(data) == 4 * WIDTH * HEIGHT - 10:
                 raise OSError(28, "No space left on device")
             return super().write(data)
 
     monkeypatch.setattr(stored, "FileIO", Full)
+    monkeypatch.setattr(os, "writev", lambda file, rows: os.write(file, rows[0][:10]), raising=False)
     with pytest.raises(ResourceError, match="no space left"):
         render_to_folder(analytic, tmp_path / "out", WHAT, arrays=True)
     assert not list((tmp_path / "out").rglob("*.npy*"))

@@ -25,7 +25,7 @@ _COUNT = itertools.count()
 _NO_SPACE = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 
 
-def atomic_write(path: str | Path, data: bytes) -> None:
+def atomic_write(path: str | Path, data: bytes | memoryview) -> None:
     """Replace the content of a file, all at once.
 
     Args:
@@ -36,8 +36,11 @@ def atomic_write(path: str | Path, data: bytes) -> None:
         ResourceError: If the disk is full.
         UsageError: If the place cannot be written to.
     """
-    with atomic_path(path) as temporary:
-        write_through(temporary, data)
+    path = Path(path)
+    sweep(path)
+    write_one_of_many(path, data)
+    with as_errors(path):
+        flush_folder(path.parent)
 
 
 @contextlib.contextmanager
@@ -56,17 +59,48 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     """
     path = Path(path)
     sweep(path)
-    temporary = _temporary(path)
     with as_errors(path):
-        try:
+        with _renamed_to(path) as temporary:
             yield temporary
             with open(temporary, "rb+") as file:
                 os.fsync(file.fileno())
-            os.replace(temporary, path)
-        except BaseException:
-            temporary.unlink(missing_ok=True)
-            raise
         flush_folder(path.parent)
+
+
+@contextlib.contextmanager
+def many_files(folder: str | Path) -> Iterator[None]:
+    """Let :func:`write_one_of_many` fill a folder: what lies in it is looked at once, and its names are flushed once.
+
+    Doing so for every file makes each cost as much as there are files before it, and keeps threads waiting for Python's
+    lock meanwhile: listing a folder gives it back and asks for it again with every name.
+
+    Args:
+        folder: It must exist.
+
+    Raises:
+        ResourceError, UsageError: If it cannot be flushed.
+    """
+    folder = Path(folder)
+    _sweep(folder, ".")
+    try:
+        yield
+    finally:
+        with as_errors(folder):
+            flush_folder(folder)
+
+
+def write_one_of_many(path: Path, data: bytes | memoryview) -> None:
+    """Replace the content of a file, all at once, in a folder that :func:`many_files` looks after.
+
+    The content is on the disk before it has the name, as in :func:`atomic_write`; the name is on the disk later. So a
+    power failure costs names, never a part of a content.
+
+    Raises:
+        ResourceError: If the disk is full.
+        UsageError: If the place cannot be written to.
+    """
+    with as_errors(path), _renamed_to(path) as temporary:
+        write_through(temporary, data)
 
 
 def write_json(path: str | Path, content: object) -> None:
@@ -115,7 +149,7 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
         made = [parent for parent in reversed(path.absolute().parents) if not parent.exists()]
         path.parent.mkdir(parents=True, exist_ok=True)
         sweep(path)
-        temporary = _temporary(path)
+        temporary = path.absolute().parent / _temporary(path).name
         try:
             temporary.mkdir()
             yield temporary
@@ -133,7 +167,7 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
         flush_folder(path.parent)
 
 
-def write_through(path: Path, data: bytes) -> None:
+def write_through(path: Path, data: bytes | memoryview) -> None:
     """Create a file, flush it to the disk and check its size.
 
     Raises:
@@ -143,8 +177,9 @@ def write_through(path: Path, data: bytes) -> None:
         file.write(data)
         file.flush()
         os.fsync(file.fileno())
-    if path.stat().st_size != len(data):
-        raise OSError(errno.ENOSPC, f"{path.stat().st_size} of {len(data)} bytes were written", str(path))
+        size = os.fstat(file.fileno()).st_size
+    if size != len(data):
+        raise OSError(errno.ENOSPC, f"{size} of {len(data)} bytes were written", str(path))
 
 
 def flush_folder(path: str | Path) -> None:
@@ -161,11 +196,14 @@ def flush_folder(path: str | Path) -> None:
 def sweep(path: str | Path) -> None:
     """Remove what killed processes left of earlier attempts to write ``path``; living ones keep theirs."""
     path = Path(path)
-    start = f".{path.name}.tmp-"
+    _sweep(path.absolute().parent, f".{path.name}.tmp-")
+
+
+def _sweep(folder: Path, start: str) -> None:
+    """The same for all temporary names that start so."""
     with contextlib.suppress(OSError):  # another process may sweep at the same time
-        folder = path.absolute().parent
         for name in [name for name in os.listdir(folder) if name.startswith(start)]:  # few of perhaps many
-            match, entry = re.fullmatch(r"(\d+)-\d+", name.removeprefix(start)), folder / name
+            match, entry = re.fullmatch(r"\..+\.tmp-(\d+)-\d+", name), folder / name
             if match and not _alive(int(match[1])):
                 if entry.is_dir():
                     shutil.rmtree(entry, ignore_errors=True)
@@ -173,8 +211,20 @@ def sweep(path: str | Path) -> None:
                     entry.unlink(missing_ok=True)
 
 
+@contextlib.contextmanager
+def _renamed_to(path: Path) -> Iterator[Path]:
+    """A temporary name: at a normal end it becomes ``path``, at an exception what has it is removed."""
+    temporary = _temporary(path)
+    try:
+        yield temporary
+        os.replace(temporary, path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+
+
 def _temporary(path: Path) -> Path:
-    return path.absolute().parent / f".{path.name}.tmp-{os.getpid()}-{next(_COUNT)}"
+    return path.parent / f".{path.name}.tmp-{os.getpid()}-{next(_COUNT)}"
 
 
 def _alive(pid: int) -> bool:

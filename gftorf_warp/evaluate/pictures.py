@@ -11,8 +11,10 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 UNKNOWN_GREY = 128  # colour of pixels without a value: none of the colour maps below contains this grey
+WHITE = 255  # between pictures in a row
 WEBP_LOSSLESS = 101  # OpenCV: a WebP quality above 100 means lossless
-TICKS = 256  # colours of a map
+TICKS = 254  # colours of a map: with grey and white they are as many as a byte can name
+UNKNOWN, GAP = TICKS, TICKS + 1  # what a byte calls these two
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,17 +66,37 @@ def phase_scale() -> Scale:
 
 def colour_mapped(image: Float[np.ndarray, "H W"], scale: Scale) -> UInt8[np.ndarray, "H W 3"]:
     """RGB of an image on a scale; values beyond its ends take the end's colour, NaN is grey."""
-    unknown = np.isnan(image)
-    level = (np.where(unknown, scale.low, image) - scale.low) / (scale.high - scale.low)
-    rgb = _colours(scale.colours)[np.clip(level * TICKS, 0, TICKS - 1).astype(np.uint8)]
-    rgb[unknown] = UNKNOWN_GREY
-    return rgb
+    return palette(scale)[ticks(image, scale)]
+
+
+def ticks(image: Float[np.ndarray, "H W"], scale: Scale) -> UInt8[np.ndarray, "H W"]:
+    """Which colour of :func:`palette` each pixel of an image has on a scale."""
+    level = image - scale.low
+    level *= TICKS / (scale.high - scale.low)
+    np.clip(level, 0, TICKS - 1, out=level)
+    if np.isnan(level.min()):  # in one of them: it is asked before a mask is made
+        level[np.isnan(level)] = UNKNOWN
+    return level.astype(np.uint8)
+
+
+def palette(scale: Scale) -> UInt8[np.ndarray, "C 3"]:
+    """RGB of all that :func:`ticks` names, and white."""
+    return _palette(scale.colours)
 
 
 def side_by_side(pictures: list[UInt8[np.ndarray, "H w 3"]], gap: int = 2) -> UInt8[np.ndarray, "H W 3"]:
     """Pictures of one height in a row, ``gap`` white pixels between them."""
-    white = np.full((pictures[0].shape[0], gap, 3), 255, dtype=np.uint8)
-    row = [part for picture in pictures for part in (white, picture)]
+    return _row(pictures, gap, WHITE)
+
+
+def ticks_side_by_side(images: list[UInt8[np.ndarray, "H w"]], gap: int = 2) -> UInt8[np.ndarray, "H W"]:
+    """The same of pictures that are given by :func:`ticks`, on scales of one palette."""
+    return _row(images, gap, GAP)
+
+
+def _row(pictures: list[np.ndarray], gap: int, white: int) -> np.ndarray:
+    between = np.full((pictures[0].shape[0], gap, *pictures[0].shape[2:]), white, dtype=np.uint8)
+    row = [part for picture in pictures for part in (between, picture)]
     return np.concatenate(row[1:], axis=1)
 
 
@@ -122,6 +144,12 @@ def _colours(name: str) -> UInt8[np.ndarray, "T 3"]:
     import matplotlib
 
     return np.round(255 * matplotlib.colormaps[name](np.arange(TICKS) / (TICKS - 1))[:, :3]).astype(np.uint8)
+
+
+@functools.cache
+def _palette(name: str) -> UInt8[np.ndarray, "C 3"]:
+    grey, white = np.full((1, 3), UNKNOWN_GREY, np.uint8), np.full((1, 3), WHITE, np.uint8)
+    return np.concatenate([_colours(name), grey, white])
 
 
 def _range(images: Iterable[np.ndarray], low: float, high: float) -> tuple[float, float]:

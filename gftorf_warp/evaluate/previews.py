@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from ..data.images import indexed_png_bytes, png_bytes
 from . import pictures
 
 Channels = dict[str, Float[np.ndarray, "H W"]]
@@ -25,21 +26,21 @@ def preview_scale(name: str, samples: Iterable[Channels]) -> pictures.Scale:
     return pictures.Scale(low=0.0, high=1.0, colours="gray", unit="1")
 
 
-def preview(name: str, images: Channels, scale: pictures.Scale) -> UInt8[np.ndarray, "H w 3"]:
-    """A picture of one thing: distance; the quads in a row; phase and amplitude in a row; or sRGB."""
+def preview(name: str, images: Channels, scale: pictures.Scale) -> bytes:
+    """A picture of one thing as a PNG file: distance; the quads in a row; phase and amplitude in a row; or sRGB."""
     if name == "distance":
-        return pictures.colour_mapped(images["distance"], scale)
+        return indexed_png_bytes(pictures.ticks(images["distance"], scale), pictures.palette(scale))
     if name == "quads":
-        return pictures.side_by_side([pictures.colour_mapped(image, scale) for image in images.values()])
+        row = pictures.ticks_side_by_side([pictures.ticks(image, scale) for image in images.values()])
+        return indexed_png_bytes(row, pictures.palette(scale))
     if name == "phasor":
         phase = np.arctan2(images["im"], images["re"]) % (2.0 * np.pi)
-        return pictures.side_by_side(
-            [
-                pictures.colour_mapped(phase, pictures.phase_scale()),
-                pictures.colour_mapped(images["amplitude"], scale),
-            ]
-        )
-    return srgb(np.stack(list(images.values()), axis=-1))
+        pair = [
+            pictures.colour_mapped(phase, pictures.phase_scale()),
+            pictures.colour_mapped(images["amplitude"], scale),
+        ]
+        return png_bytes(pictures.side_by_side(pair))
+    return png_bytes(srgb(np.stack(list(images.values()), axis=-1)))
 
 
 def paths(out: Path, name: str, index: int) -> tuple[Path, Path]:
