@@ -14,7 +14,10 @@ gradient. Nothing here asks the device. design/network.md has the reasons.
 
 from __future__ import annotations
 
+import contextlib
+import functools
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple, Protocol
@@ -195,18 +198,21 @@ class Stacked(torch.autograd.Function):
         unit, head, slopes, own, head_sum = (form.passes or Products()).backward(
             form, keys, gradient.reshape(-1, values), outputs, tuple(kept)
         )
-        found.head_bias.copy_(head_sum)
-        _product(head.T, outputs[-1], moment.dtype, out=found.weights[-1])
-        torch.sum(own, 1, out=found.biases)
+        with _beside(place.device):  # small products, while one fills the device with blocks that end one by one
+            found.head_bias.copy_(head_sum)
+            _product(head.T, outputs[-1], moment.dtype, out=found.weights[-1])
+            torch.sum(own, 1, out=found.biases)
+            places = place.new_empty(keys, count, form.columns)
+            _copy(places, place.expand(keys, -1, -1))
+            for number in form.entries:
+                weight, first = found.weights[number], form.width if number else 0
+                rows = slice(first, first + form.columns)
+                _product(slopes[number].T, places.flatten(0, 1), moment.dtype, out=weight[:, rows])
+                torch.mm(own[number].T, moment, out=weight[:, weight.shape[1] - form.moment :])
         _products(slopes[1:].mT, outputs[:-1], out=found.square)
-        places = place.expand(keys, -1, -1).reshape(keys * count, -1)
-        for number in form.entries:
-            weight, first = found.weights[number], form.width if number else 0
-            end = first + form.columns
-            _product(slopes[number].T, places, moment.dtype, out=weight[:, first:end])
-            torch.mm(own[number].T, moment, out=weight[:, weight.shape[1] - form.moment :])
-            if number:
-                weight[:, :first] = found.square[number - 1]
+        _join(place.device)
+        if form.joined is not None:
+            found.weights[form.joined][:, : form.width] = found.square[form.joined - 1]
         return None, None, None, *found.times(unit)
 
 
@@ -236,6 +242,30 @@ class _Gradients:
         biases = [*self.biases, self.head_bias]
         weights = [*self.weights[:-1], self.weights[-1][:values]]
         return [value for pair in zip(weights, biases, strict=True) for value in pair]
+
+
+@functools.cache
+def _second(device: torch.device) -> torch.cuda.Stream:
+    """A stream for what may be done at the same time, always the same: products keep memory for every stream."""
+    return torch.cuda.Stream(device)
+
+
+@contextlib.contextmanager
+def _beside(device: torch.device) -> Iterator[None]:
+    """Work from here on is behind everything before, and beside what comes behind this block until :func:`_join`."""
+    if device.type == "cpu":
+        yield
+        return
+    stream = _second(device)
+    stream.wait_stream(torch.cuda.current_stream(device))
+    with torch.cuda.stream(stream):
+        yield
+
+
+def _join(device: torch.device) -> None:
+    """Wait for what is done beside, on the current stream."""
+    if device.type != "cpu":
+        torch.cuda.current_stream(device).wait_stream(_second(device))
 
 
 def _pieces(keys: int, count: int) -> list[tuple[int, int, int]]:
