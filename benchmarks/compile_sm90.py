@@ -30,6 +30,7 @@ from gftorf_warp.kernels import (
     noise,
     paths,
     project,
+    ranks,
     resolve,
     similarity,
     splat,
@@ -53,6 +54,7 @@ def modules() -> dict[str, wp.Module]:
     found = {
         "tiles": tiles.count_pairs.module,
         "bits": bits.count_bits.module,
+        "ranks": ranks.count_classes.module,
         "resolve": resolve.resolve_quads.module,
         "splat": splat.add_records.module,
         "move": move.move_gaussians.module,

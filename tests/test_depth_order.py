@@ -10,7 +10,7 @@ from cases import CASES, SMALL, Case, gaussians, light
 from comparison import DEVICES, Comparison
 
 from gftorf_warp.bench.scenes import inputs_of
-from gftorf_warp.render import launch, reference, stages
+from gftorf_warp.render import buffers, launch, reference, stages
 from gftorf_warp.render.buffers import Frame, RenderSettings
 
 NEXT = float(np.nextafter(np.float32(1.0), np.float32(2.0)))
@@ -163,3 +163,31 @@ def test_other_numbers_of_bits_are_named(bits):
     """With the number."""
     with pytest.raises(ValueError, match=f"depth_bits must be 16 or 24, got {bits}"):
         RenderSettings(depth_bits=bits)
+
+
+@pytest.mark.parametrize("bits", [24, 16])
+@pytest.mark.parametrize("kind", ["wide", "equal", "culled", "few"])
+@pytest.mark.parametrize("count", [1, 2, 31, 500, 5000])
+def test_classes_give_the_order_of_a_sort(count, kind, bits, device, monkeypatch):
+    """Spread keys, one for all, only culled ones, and few with ties; the culled come last, in any order."""
+    settings = RenderSettings(near=PRESETS[0], far=PRESETS[1], depth_bits=bits)
+    rng, culled = np.random.default_rng(count), settings.depth_culled
+    keys = {
+        "wide": rng.integers(0, culled, count),
+        "equal": np.full(count, 77),
+        "culled": np.full(count, culled),
+        "few": np.where(rng.random(count) < 0.3, culled, rng.integers(0, 5, count)),
+    }[kind]
+    found = []
+    for most in (0, 1 << 20):
+        monkeypatch.setitem(buffers.RANKED_MAX, "cpu" if device == "cpu" else "cuda", most)
+        frame = Frame(count, 64, 48, settings, wp.get_device(device))
+        assert frame.ranks == (most > 0)
+        frame.depth_key.assign(np.concatenate([keys, keys]).astype(np.int32))
+        frame.order.assign(np.concatenate([np.arange(count)] * 2).astype(np.int32))
+        stages.sort_by_depth(frame)
+        found.append(frame.order.numpy()[:count].copy())
+    seen = int((keys != culled).sum())
+    np.testing.assert_array_equal(found[0][:seen], np.argsort(keys, kind="stable")[:seen])
+    np.testing.assert_array_equal(found[1][:seen], found[0][:seen])
+    assert sorted(found[1]) == list(range(count))

@@ -133,6 +133,10 @@ MATRIX_MAX = 128 << 20  # [B]
 READERS = 8192  # warps that read it: about as many as 132 multiprocessors hold at once
 
 
+# splats that are ordered by classes of depth: if all of so many were in one, each would look at all, 0.1 ms
+RANKED_MAX = {"cpu": 0, "cuda": 32_768}
+
+
 def available_threads() -> int:
     """CPU threads this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -172,6 +176,7 @@ class Frame:
         self.depth_shift = settings.depth_shift
         self.depth_key = self.array("depth keys", 2 * count)  # the radix sort wants twice the room
         self.order = self.array("order", 2 * count)
+        self.ranks = 0 < count <= RANKED_MAX[kind] and not self.ordered  # whether no sort is needed for the order
         self.words = 2 * math.ceil(count / 64)  # of a tile in a matrix of a bit per tile and splat
         self.matrix = math.ceil(self.tiles / bits.GROUP) * bits.GROUP * self.words
         self.marks = not self.ordered and 4 * self.matrix <= MATRIX_MAX  # whether lists of tiles are made of it

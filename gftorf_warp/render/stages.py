@@ -10,7 +10,7 @@ from itertools import pairwise
 import numpy as np
 import warp as wp
 
-from ..kernels import batches, bits, ordered, resolve, splat, tiles
+from ..kernels import batches, bits, ordered, ranks, resolve, splat, tiles
 from ..kernels.composite import CHANNEL_PLANES, make_composite
 from ..kernels.composite_backward import (
     GRAD_LIGHT_PLANES,
@@ -65,8 +65,18 @@ def _project_outputs(frame: Frame) -> list:
 
 
 def sort_by_depth(frame: Frame) -> None:
-    """Order the splats near to far, those of one key by index."""
-    wp.utils.radix_sort_pairs(frame.depth_key, frame.order, frame.count, end_bit=frame.settings.depth_bits)
+    """Order the splats near to far, those of one key by index; what is culled comes last, in any order."""
+    if not frame.ranks:
+        wp.utils.radix_sort_pairs(frame.depth_key, frame.order, frame.count, end_bit=frame.settings.depth_bits)
+        return
+    counts, first = frame.zeros("counts of classes", ranks.COUNTS), frame.array("first of classes", ranks.COUNTS)
+    places, members = frame.array("places", frame.count), frame.array("members", (frame.count, 2))
+    shift = frame.settings.depth_bits - (ranks.CLASSES.bit_length() - 1)
+    keys = [frame.depth_key, frame.settings.depth_culled, shift]
+    _launch(ranks.count_classes, frame.count, keys, [counts, places])
+    wp.utils.array_scan(counts, first, inclusive=True)
+    _launch(ranks.fill_classes, frame.count, [*keys, first, places], [members])
+    _launch(ranks.order_classes, frame.count, [members, *keys[1:], first], [frame.order])
 
 
 def sort_by_tile(frame: Frame) -> None:
