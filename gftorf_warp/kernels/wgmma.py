@@ -156,11 +156,8 @@ _FORWARD = f"""
         constexpr int C = decltype(kind)::H + decltype(kind)::P;
         const wp::half* before = outputs.data + (number ? number - 1 : 0) * of_layer;
         wp::half* after = outputs.data + number * of_layer;
-        if (begin + group >= end) release(C, forth.data, parts, all);
-        for (int tile = begin + group; tile < end; tile += {GROUPS}) {{
+        auto through = [&](int tile, const auto& rows, auto next) {{  // ``next``: there are registers for the next rows
             float sums[128];
-            unsigned rows[4 * C][4];
-            read(kind, before, place.data, tile, rows);
             const int key = tile / of_key, row = (tile - key * of_key) * {TILE} + 16 * warp + g;
             const float2 own = __ldg(reinterpret_cast<const float2*>(
                 shifts.data + ((size_t)number * keys + key) * {WIDTH}) + (threadIdx.x & 127));
@@ -174,6 +171,7 @@ _FORWARD = f"""
             unsigned alive[4] = {{}};
             #pragma unroll
             for (int q = 0; q < 8; ++q) {{
+                if (q == 4) next();
                 const float4 one = reinterpret_cast<const float4*>(added)[8 * q + 2 * t];
                 const float4 two = reinterpret_cast<const float4*>(added)[8 * q + 2 * t + 1];
                 const float shift[8] = {{one.x, one.y, one.z, one.w, two.x, two.y, two.z, two.w}};
@@ -194,6 +192,22 @@ _FORWARD = f"""
             }}
             reinterpret_cast<uint4*>(masks.data)[((size_t)number * tiles + tile) * 128 + (threadIdx.x & 127)] =
                 make_uint4(alive[0], alive[1], alive[2], alive[3]);
+        }};
+        if (begin + group >= end) release(C, forth.data, parts, all);
+        if constexpr (C == 4) {{
+            if (begin + group >= end) return;
+            unsigned rows[16][4];
+            read(kind, before, place.data, begin + group, rows);
+            for (int tile = begin + group; tile < end; tile += {GROUPS})
+                through(tile, rows, [&]() {{
+                    if (tile + {GROUPS} < end) read(kind, before, place.data, tile + {GROUPS}, rows);
+                }});
+        }} else {{
+            for (int tile = begin + group; tile < end; tile += {GROUPS}) {{
+                unsigned rows[4 * C][4];
+                read(kind, before, place.data, tile, rows);
+                through(tile, rows, []() {{}});
+            }}
         }}
     }};
     if (threadIdx.x == 0)
