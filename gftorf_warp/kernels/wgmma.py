@@ -152,6 +152,7 @@ _FORWARD = f"""
     {_CUDA}
     const int parts = layers * 4 - 3 + (joined >= 0);
     const int all = parts * ((last - first + {ROUND - 1}) / {ROUND});
+    int passed = 0;  // tiles of this group in all layers so far: shifts have two places
     auto layer = [&](auto kind, int number, int begin, int end) {{
         constexpr int C = decltype(kind)::H + decltype(kind)::P;
         const wp::half* before = outputs.data + (number ? number - 1 : 0) * of_layer;
@@ -162,7 +163,7 @@ _FORWARD = f"""
             const float2 own = __ldg(reinterpret_cast<const float2*>(
                 shifts.data + ((size_t)number * keys + key) * {WIDTH}) + (threadIdx.x & 127));
             product(kind, done, rows, sums);
-            float* const added = shared_sums + ((tile - begin) / {GROUPS} & 1) * {WIDTH};
+            float* const added = shared_sums + (passed++ & 1) * {WIDTH};
             reinterpret_cast<float2*>(added)[threadIdx.x & 127] = own;
             group_waits();  // nobody reads what was added two tiles ago any more, either
             multiplied(sums);
