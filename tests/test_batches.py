@@ -187,8 +187,9 @@ static int list(int words, int share, int capacity) {{
             const int own = word + 2 * lane;
             const wp::uint64 found = own < words ? two_words(M, own * {bits.GROUP} + 3) : 0;
             const int count = __builtin_popcountll(found), sums = sum_of_lanes(count);
-            write_ids(found, R, 32 * own, I, at + sums - count, capacity);
-            at += of_lane(sums, 31);
+            const int until = at + of_lane(sums, 31);
+            write_ids(found, R, 32 * own, 32 * word, I, at + sums - count, at, until < capacity ? until : capacity);
+            at = until;
         }}
     }});
     return ids != want;
@@ -215,8 +216,8 @@ SIGNATURES = {
     "lane_beyond": "int lane_beyond(int sums, int bound)",
     "lanes_with": "int lanes_with(bool x)",
     "two_words": "wp::uint64 two_words(wp::array_t<unsigned> bits, int place)",
-    "write_ids": "void write_ids(wp::uint64 found, wp::array_t<int> order, int rank, wp::array_t<int> ids, int place, "
-    "int capacity)",
+    "write_ids": "void write_ids(wp::uint64 found, wp::array_t<int> order, int rank, int lowest, wp::array_t<int> ids, "
+    "int place, int begin, int end)",
 }
 
 

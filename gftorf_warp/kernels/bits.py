@@ -32,20 +32,40 @@ def two_words(bits: wp.array[wp.uint32], place: int) -> wp.uint64:
     """The word of a tile at a place of the matrix, and the one behind it."""
 
 
+STEP = wp.constant(2048)  # bits that a warp of CUDA reads at once, 64 a lane
+WARPS = 8  # of a block
+
+
 # plain pointers: of Warp's way to an element, by strides and from the end, the loop would have twice the instructions
-@wp.func_native("""
-    const int* from = order.data + rank;
-    for (int k = place; found && k < capacity; found &= found - 1)
+@wp.func_native(f"""
 #if defined(__CUDA_ARCH__)
-        ids.data[k++] = from[__ffsll((long long)found) - 1];
+    __shared__ unsigned short room[{WARPS}][{STEP}];
+    unsigned short* const ranks = room[threadIdx.x >> 5];
+    for (int k = place - begin; found; found &= found - 1)
+        ranks[k++] = (unsigned short)(rank - lowest + __ffsll((long long)found) - 1);
+    __syncwarp();
+    for (int k = begin + (int)(threadIdx.x & 31); k < end; k += 32) ids.data[k] = order.data[lowest + ranks[k - begin]];
+    __syncwarp();
 #else
-        ids.data[k++] = from[__builtin_ctzll(found)];
+    for (int k = place; found && k < end; found &= found - 1)
+        ids.data[k++] = order.data[rank + __builtin_ctzll(found)];
 #endif
 """)
 def write_ids(
-    found: wp.uint64, order: wp.array[wp.int32], rank: int, ids: wp.array[wp.int32], place: int, capacity: int
+    found: wp.uint64,
+    order: wp.array[wp.int32],
+    rank: int,
+    lowest: int,
+    ids: wp.array[wp.int32],
+    place: int,
+    begin: int,
+    end: int,
 ):
-    """List the splats whose bits are set, from ``place`` on; the lowest bit is that of depth rank ``rank``."""
+    """List the splats whose bits are set; the lowest bit is that of depth rank ``rank``, of this warp ``lowest``.
+
+    Those of this lane go to ``place`` and behind it, those of the warp to ``begin`` .. ``end`` - 1, neighbours by
+    neighbouring lanes: they find ranks in shared memory, where every lane has left its own.
+    """
 
 
 @wp.kernel(enable_backward=False, grid_stride=False)
@@ -118,6 +138,7 @@ def list_bits(
             if warp_any(found != wp.uint64(0)):
                 count = wp.bit_count(found)
                 sums = sum_of_lanes(count)
-                write_ids(found, order, 32 * own, ids, at + sums - count, capacity)
-                at += of_lane(sums, lanes - 1)
+                until = at + of_lane(sums, lanes - 1)
+                write_ids(found, order, 32 * own, 32 * word, ids, at + sums - count, at, wp.min(until, capacity))
+                at = until
             word += 2 * lanes
