@@ -77,9 +77,9 @@ class TensorCores:
 def fits(form: Form, device: torch.device) -> bool:
     """Whether a perceptron can go that way: its sizes, and a GPU that has such products."""
     sizes = form.width == wgmma.WIDTH and form.columns == wgmma.COLUMNS
-    if not sizes or form.dtype != torch.float16 or device.type != "cuda":
+    if not sizes or form.dtype != torch.float16 or device.type == "cpu":
         return False
-    return torch.cuda.get_device_capability(device) == (wgmma.ARCHITECTURE // 10, wgmma.ARCHITECTURE % 10)
+    return wp.device_from_torch(device).arch == wgmma.ARCHITECTURE
 
 
 @functools.cache
