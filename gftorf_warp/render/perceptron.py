@@ -71,7 +71,7 @@ class TensorCores:
                 _launch(kernels.backward, _threads(device), passed, [halves[3], array_over(partials)], device)
             dim = layers * keys * (form.width // ends.COLUMNS) * block
             _launch(ends.add_partials, dim, [block, array_over(partials)], [array_over(sums)], device)
-        return Slopes(unit, after, slopes, sums, total)
+        return Slopes(unit.view(()), after, slopes, sums, total)
 
 
 def fits(form: Form, device: torch.device) -> bool:
@@ -79,6 +79,7 @@ def fits(form: Form, device: torch.device) -> bool:
     sizes = form.width == wgmma.WIDTH and form.columns == wgmma.COLUMNS
     if not sizes or form.dtype != torch.float16 or device.type == "cpu":
         return False
+    wp.init()
     return wp.device_from_torch(device).arch == wgmma.ARCHITECTURE
 
 
