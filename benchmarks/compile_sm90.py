@@ -4,7 +4,7 @@
 
 Ends with exit code 1 if a kernel does not compile or keeps more than 32 bytes on the stack: a local array indexed at
 run time, or spilled registers, is how a fast kernel silently becomes a slow one (sinf and cosf own 32 bytes that are
-never touched). The motion network's passes are compiled for sm_90a, and for no other architecture: they exist there only.
+never touched). The motion network's passes are compiled for sm_90a, and left out for other architectures.
 """
 
 from __future__ import annotations
