@@ -72,7 +72,7 @@ def alike(made, twin, count, keys, *, device="cpu", scale=1.0):
         assert other.abs().max() > 1e-4 * scale, "a vanished gradient would pass any tolerance"
         assert one.dtype == torch.float32
         assert distance(one, equal) < 2e-3
-        assert distance(one, other) < 0.1, "a few units are at rest in one precision only"
+        assert distance(one, other) < (0.1 if count > 1 else 0.5), "some units are at rest in one precision only"
 
 
 def placed(form, layers, parameters, device="cpu"):
@@ -123,7 +123,7 @@ def unswizzled(packed):
 
 
 @pytest.mark.parametrize("device", DEVICES)
-@pytest.mark.parametrize(("count", "keys"), [(33, [0, 1, 3]), (70, [1]), (TILE, [0, 2])])
+@pytest.mark.parametrize(("count", "keys"), [(1, [3]), (33, [0, 1, 3]), (70, [1]), (TILE, [0, 2])])
 def test_it_is_torchs_product_and_float64(count, keys, device):
     """Fewer rows than a tile, a tile and a bit, just one; at the published size."""
     alike(*pair(device=device), count, keys, device=device)
