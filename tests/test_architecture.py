@@ -58,6 +58,7 @@ LAUNCHES = {  # file: what it launches
 KNOWS_STREAMS = {  # streams, events and graphs of torch
     "render/bridge.py": "a step and its graphs",
     "render/outgoing.py": "what leaves the device while it goes on",
+    "scene/perceptron.py": "products of one gradient that run at the same time",
 }
 KNOWS_KINDS = {"render/buffers.py": "the shape of a tile depends on the kind of device, which is the input's"}
 HOMELESS = {"utils", "util", "common", "misc", "types", "helpers"}

@@ -194,7 +194,7 @@ class Stacked(torch.autograd.Function):
         """
         form, (place, moment, *kept, outputs) = context.form, context.saved_tensors
         layers, values = len(outputs), gradient.shape[-1]
-        keys = len(moment)
+        keys, count = len(moment), len(place)
         found = _Gradients(form, moment, layers, context.rows, values)
         unit, head, slopes, own, head_sum = (form.passes or Products()).backward(
             form, keys, gradient.reshape(-1, values), outputs, tuple(kept)
