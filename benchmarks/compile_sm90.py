@@ -4,7 +4,7 @@
 
 Ends with exit code 1 if a kernel does not compile or keeps more than 32 bytes on the stack: a local array indexed at
 run time, or spilled registers, is how a fast kernel silently becomes a slow one (sinf and cosf own 32 bytes that are
-never touched).
+never touched). The motion network's passes are compiled for sm_90a, and left out for other architectures.
 """
 
 from __future__ import annotations
@@ -29,27 +29,31 @@ from gftorf_warp.kernels import (
     move,
     noise,
     paths,
+    perceptron,
     project,
     ranks,
     resolve,
     similarity,
+    slopes,
     splat,
     sums,
     tiles,
     trace,
+    wgmma,
 )
 from gftorf_warp.render.buffers import TILE_SHAPES
 
 FRAME_SIZE, REGISTERS = 0x11, 0x2F  # attributes in the .nv.info section of a cubin
 ALLOWED_STACK = 32  # [B]
+PASSES = "perceptron forward", "perceptron backward"  # for sm_90a
 WALKS = {
     "trace": 1024,
     "paths": 1024,
 }  # [B] a query of a bounding volume hierarchy keeps the nodes to come on the stack
 
 
-def modules() -> dict[str, wp.Module]:
-    """Every module with CUDA code, in the variants that presets use."""
+def modules(arch: int) -> dict[str, wp.Module]:
+    """Every module with CUDA code that an architecture has, in the variants that presets use."""
     shape = TILE_SHAPES["cuda"]
     found = {
         "tiles": tiles.count_pairs.module,
@@ -66,7 +70,11 @@ def modules() -> dict[str, wp.Module]:
         "sums": sums.means.module,
         "trace": trace.trace_hits.module,
         "paths": paths.trace_light.module,
+        "perceptron": perceptron.pack.module,
+        "slopes": slopes.add_partials.module,
     }
+    if arch == wgmma.ARCHITECTURE:
+        found |= {PASSES[0]: perceptron.forward.module, PASSES[1]: perceptron.backward.module}
     window = similarity.make_similarity(1)
     for name in ("columns_of_products", "compare_images", "columns_of_slopes", "gradient_of_image"):
         found[name] = getattr(window, name).module
@@ -92,6 +100,15 @@ def modules() -> dict[str, wp.Module]:
                     found[f"composite {name}{way}"] = forward.module
                 found[f"composite_backward {name}{way}"] = backward.module
     return found
+
+
+def compiled(title: str, module: wp.Module, arch: int, folder: str) -> list[Path]:
+    """Cubins of a module; those of ``PASSES`` with what only this architecture has."""
+    before, wp.config.cuda_arch_suffix = wp.config.cuda_arch_suffix, "a" if title in PASSES else None
+    try:
+        return [Path(path) for path in wp.compile_aot_module(module, arch=arch, module_dir=folder, use_ptx=False)]
+    finally:
+        wp.config.cuda_arch_suffix = before
 
 
 def kernels_in(cubin: Path) -> dict[str, tuple[int, int, int]]:
@@ -131,10 +148,10 @@ def main() -> int:
     wp.config.log_level = wp.LOG_ERROR
     wp.init()
     rows, offenders = [], 0
-    for title, module in modules().items():
+    for title, module in modules(a.arch).items():
         with tempfile.TemporaryDirectory() as folder:
-            for path in wp.compile_aot_module(module, arch=a.arch, module_dir=folder, use_ptx=False):
-                for name, (registers, stack, code) in kernels_in(Path(path)).items():
+            for path in compiled(title, module, a.arch, folder):
+                for name, (registers, stack, code) in kernels_in(path).items():
                     kernel, _, way = name.partition("_cuda_kernel_")
                     kernel = kernel.rpartition("__locals__")[2].rpartition("_")[0]
                     rows.append({"module": title, "kernel": f"{kernel} {way}", "registers": registers, "stack": stack})

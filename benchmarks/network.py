@@ -1,9 +1,10 @@
 """What the motion network costs: forward and backward, all queries of a step stacked, in each precision.
 
     python benchmarks/network.py [--device cpu|cuda] [--gaussians N ..] [--queries Q ..] [--repeats R]
-                                 [--products P ..] [--profile] [--json FILE]
+                                 [--products float32|tf32|half|'half by torch' ..] [--profile] [--json FILE]
 
 A query is one key time; a timing holds one encoding of positions, as a step has it, and the gradient of all weights.
+``half`` is what a captured step has, ``half by torch`` the same without kernels of ours, by default where they differ.
 On a GPU every row is timed twice: called from Python, and replayed as a CUDA graph, which must give what the call gave.
 Rows of one N and Q take turns. ``kernels`` counts what the device ran in one call, products included; ``error`` is the
 largest difference of an offset from that in float32, for weights whose offsets are a few decimetres. With ``--profile``
@@ -23,7 +24,7 @@ from pathlib import Path
 import torch
 
 from gftorf_warp.bench.command import about
-from gftorf_warp.bench.motion import points
+from gftorf_warp.bench.motion import BY_TORCH, go_by, kinds, points, products_of
 from gftorf_warp.bench.timing import WARM_UP, Watch, watch_of
 from gftorf_warp.scene.gaussians import GaussianField
 from gftorf_warp.scene.motion import MotionSettings, Products
@@ -43,15 +44,17 @@ def field(count: int, device: str) -> GaussianField:
     return points(mean).map(lambda value: value.to(device))
 
 
-def network(products: Products, device: str) -> Network:
-    """The published network, moving."""
+def network(kind: str, device: str) -> Network:
+    """The published network, moving, as one of ``kinds``."""
     generator = torch.Generator().manual_seed(0)
     times = torch.arange(KEYS, dtype=torch.float64) * (4 / 120)
-    settings = replace(MotionSettings(), products=products)
+    settings = replace(MotionSettings(), products=products_of(kind))
     made = Network(times, settings, duration=float(times[-1]), length=LENGTH, generator=generator)
     with torch.no_grad():
         made.head.weight.normal_(0.0, 0.05, generator=generator)
-    return made.to(device)
+    made = made.to(device)
+    go_by(made, kind)
+    return made
 
 
 def call_of(made: Network, gaussians: GaussianField, queries: int) -> Call:
@@ -102,14 +105,15 @@ def longest(run: Callable[[], object], device: str) -> list[str]:
 def rows_of(count: int, queries: int, options: argparse.Namespace) -> list[dict[str, object]]:
     """One row per precision."""
     device, watch, gaussians = options.device, watch_of(options.device), field(count, options.device)
-    calls = {kind: call_of(network(kind, device), gaussians, queries) for kind in options.products}
-    exact = call_of(network(Products.FLOAT32, device), gaussians, queries)()[0]
-    rows: dict[Products, dict[str, object]] = {}
-    runs: dict[tuple[Products, str], Callable[[], object]] = {}
+    wanted = options.products or kinds(device)
+    calls = {kind: call_of(network(kind, device), gaussians, queries) for kind in wanted}
+    exact = call_of(network(str(Products.FLOAT32), device), gaussians, queries)()[0]
+    rows: dict[str, dict[str, object]] = {}
+    runs: dict[tuple[str, str], Callable[[], object]] = {}
     for kind, call in calls.items():
         for _ in range(WARM_UP):
             found = call()
-        row: dict[str, object] = {"gaussians": count, "queries": queries, "products": str(kind)}
+        row: dict[str, object] = {"gaussians": count, "queries": queries, "products": kind}
         row["error_mm"] = 1e3 * float((found[0] - exact).norm(dim=-1).max())
         runs[kind, "called"] = call
         replay = watch.captured(call)
@@ -118,7 +122,7 @@ def rows_of(count: int, queries: int, options: argparse.Namespace) -> list[dict[
             row["kernels"] = kernels(call)
             runs[kind, "replayed"] = replay
         rows[kind] = row
-    times: dict[tuple[Products, str], list[float]] = {name: [] for name in runs}
+    times: dict[tuple[str, str], list[float]] = {name: [] for name in runs}
     for _ in range(options.repeats):
         for name, run in runs.items():
             times[name].append(once(run, watch))
@@ -140,7 +144,7 @@ def main() -> int:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--gaussians", type=int, nargs="+", default=[20_000, 100_000])
     parser.add_argument("--queries", type=int, nargs="+", default=[1, 2, 3])
-    parser.add_argument("--products", type=Products, nargs="+", default=[*Products])
+    parser.add_argument("--products", nargs="+", choices=[*map(str, Products), BY_TORCH])
     parser.add_argument("--repeats", type=int, default=50)
     parser.add_argument("--profile", action="store_true")
     parser.add_argument("--json", type=Path)
@@ -148,7 +152,7 @@ def main() -> int:
     found, rows = about(options.device), []
     print(" - ".join(map(str, found.values())))
     head = ["N", "Q", "products", "kernels", "called", "per query", "replayed", "per query", "TFLOP/s", "error [mm]"]
-    print("".join(f"{name:>12}" for name in head), flush=True)
+    print("".join(f"{name:>14}" for name in head), flush=True)
     for count in options.gaussians:
         for queries in options.queries:
             for row in rows_of(count, queries, options):
@@ -158,7 +162,7 @@ def main() -> int:
                 texts = [row["gaussians"], row["queries"], row["products"], row.get("kernels", "-")]
                 texts += ["-" if number is None else f"{number:.3f}" for number in numbers]
                 texts += ["" if row.get("replay_equals_call", True) else " replay differs"]
-                print("\n".join(["".join(f"{text:>12}" for text in texts), *row.get("profile", [])]), flush=True)
+                print("\n".join(["".join(f"{text:>14}" for text in texts), *row.get("profile", [])]), flush=True)
     if options.json:
         options.json.write_text(json.dumps(found | {"command": " ".join(sys.argv), "rows": rows}, indent=1) + "\n")
     return 0

@@ -15,7 +15,9 @@ REPOSITORY = Path(__file__).parents[1]
 ROOT = REPOSITORY / "gftorf_warp"
 FILES = sorted(ROOT.rglob("*.py"))
 MAX_LINES = 400
-LONG: dict[str, str] = {}  # file: why it may be longer
+LONG = {  # file: why it may be longer
+    "kernels/wgmma.py": "two passes over one ring of weights, each of them twice: for CUDA and for the CPU",
+}
 TORCH = {"jaxtyping", "numpy", "torch"}
 INSIDE_FUNCTIONS = {
     "OpenEXR",
@@ -43,17 +45,20 @@ HAS_BOTH = {  # the only modules that may know torch and Warp together
     "render/fused.py": "what a step does beside rendering: other kernels and callers",
     "render/descent.py": "the end of a step: Adam and what judges it, of many tensors at once",
     "render/replay.py": "renderings of a finished run: a field of torch, a graph of Warp",
+    "render/perceptron.py": "layers of a network: torch's function around them, Warp's kernels in them",
 }
 LAUNCHES = {  # file: what it launches
     "render/launch.py": "the order of a rendering",
     "render/stages.py": "the stages of a rendering",
     "render/training.py": "what a step does beside rendering",
+    "render/perceptron.py": "a network's layers, before anything is rendered",
     "render/replay.py": "Gaussians at a time, before they are rendered again",
     "render/trace.py": "rays through meshes, which share nothing with a rendering",
 }
 KNOWS_STREAMS = {  # streams, events and graphs of torch
     "render/bridge.py": "a step and its graphs",
     "render/outgoing.py": "what leaves the device while it goes on",
+    "scene/perceptron.py": "products of one gradient that run at the same time",
 }
 KNOWS_KINDS = {"render/buffers.py": "the shape of a tile depends on the kind of device, which is the input's"}
 HOMELESS = {"utils", "util", "common", "misc", "types", "helpers"}

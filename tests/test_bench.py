@@ -12,7 +12,8 @@ from gftorf_warp.errors import DivergedError, InputError, ResourceError, UsageEr
 from gftorf_warp.recon.run import Run
 from gftorf_warp.recon.settings import Batch, Kernels
 from gftorf_warp.render import launch, stages
-from gftorf_warp.scene.motion import Products
+from gftorf_warp.scene.motion import MotionSettings, Products
+from gftorf_warp.scene.network import Network
 
 DEVICE = "cuda:0" if torch.cuda.is_available() else "cpu"
 
@@ -232,3 +233,16 @@ def test_errors_of_another_process_keep_their_class():
 
     assert isinstance(_failed("", 4), DivergedError)
     assert isinstance(_failed("", -9), ResourceError)
+
+
+def test_half_precision_has_a_row_of_torch_where_steps_have_kernels(monkeypatch):
+    """There are two ways then; elsewhere a second row would measure the same again."""
+    assert motion.kinds("cpu") == [str(kind) for kind in Products]
+    monkeypatch.setattr(motion.perceptron, "fits", lambda form, device: (form.width, device.type) == (256, "cpu"))
+    assert motion.kinds("cpu") == [*map(str, Products), motion.BY_TORCH]
+    assert {motion.products_of(kind) for kind in motion.kinds("cpu")} == set(Products)
+    assert motion.products_of(motion.BY_TORCH) == Products.HALF
+    for kind, passes in ((str(Products.HALF), motion.perceptron.TensorCores), (motion.BY_TORCH, type(None))):
+        made = Network(torch.arange(3.0), MotionSettings(), duration=1.0, length=7.5)
+        motion.go_by(made, kind)
+        assert isinstance(made.form.passes, passes)

@@ -13,6 +13,8 @@ from gftorf_warp.recon.observations import observe
 from gftorf_warp.recon.settings import Batch, Kernels
 from gftorf_warp.recon.state import begin
 from gftorf_warp.recon.step import Singles
+from gftorf_warp.render import perceptron
+from gftorf_warp.scene.motion import MotionSettings, Products
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA"))]
 
@@ -114,6 +116,52 @@ def test_a_step_that_is_not_finite_is_counted_and_changes_nothing(device):
     assert state.skipped == 1
     assert int(state.sums["count"]) == len(observations.batches) - 1
     assert all(leaf.isfinite().all() for leaf in state.optimiser.leaves)
+
+
+def of_full_size(**changes):
+    """A short run with the published network, in half precision."""
+    full, settings = MotionSettings(), published(**changes)
+    sizes = {"layers": full.layers, "width": full.width, "skip_after": full.skip_after}
+    frequencies = {"position_frequencies": full.position_frequencies, "time_frequencies": full.time_frequencies}
+    return replace(settings, motion=replace(settings.motion, products=Products.HALF, **sizes, **frequencies))
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_the_network_goes_by_kernels_where_they_fit(device, monkeypatch):
+    """On Hopper those of the published network; other sizes never, nor on a CPU."""
+    for settings, size in ((of_full_size(), True), (published(), False)):
+        state, observations = begun(settings, device)
+        fitting = size and perceptron.fits(state.motion.form, observations.quads.device)
+        CapturedSteps(state, observations, settings)
+        assert isinstance(state.motion.form.passes, perceptron.TensorCores) == fitting
+    assert device != "cpu" or not fitting
+    asked = []
+    monkeypatch.setattr(perceptron, "fits", lambda *given: asked.append(given) or True)
+    state, observations = begun(settings, device)
+    form = state.motion.form
+    CapturedSteps(state, observations, settings)
+    assert isinstance(state.motion.form.passes, perceptron.TensorCores), "it is what decides"
+    assert asked == [(form, observations.quads.device)]
+
+
+@pytest.mark.skipif(
+    not torch.cuda.is_available() or torch.cuda.get_device_capability() != (9, 0), reason="needs CUDA with sm_90"
+)
+@pytest.mark.parametrize("batch", [Batch.FRAME, Batch.QUARTET])
+def test_steps_learn_by_tensor_cores(batch):
+    """In graphs: every step is sound, and every tensor of the network learns."""
+    settings = of_full_size(batch=batch)
+    state, observations = begun(settings, "cuda")
+    before = [value.detach().clone() for value in state.motion.parameters()]
+    steps = CapturedSteps(state, observations, settings)
+    assert isinstance(state.motion.form.passes, perceptron.TensorCores)
+    while state.images < 40:
+        steps.step()
+    assert steps.collect() == 0
+    assert state.skipped == 0
+    for old, new in zip(before, state.motion.parameters(), strict=True):
+        assert new.isfinite().all()
+        assert not torch.equal(old, new)
 
 
 def test_a_run_is_captured_where_that_pays():

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ..render import perceptron
 from ..scene.gaussians import GaussianField, constant_sh
 from ..scene.motion import MotionKind, MotionSettings, Products
 from ..scene.network import Network
@@ -17,12 +18,14 @@ COUNTS = (20_000, 100_000)
 QUICK_COUNTS = (100,)
 QUERIES = (1, 2, 3)
 KEYS, PERIOD_S, LENGTH_M = 16, 4 / 120, 7.5
+BY_TORCH = "half by torch"  # where captured steps have kernels of ours for it
 
 
 def measure(device: str, *, quick: bool, runs: int, report: Report) -> list[dict[str, Any]]:
     """Rows of N, Q and precision: time of one forward and backward pass, and per query [ms].
 
-    The network is the published one, 8 layers of 256. On a CPU all precisions are one, so that one is timed.
+    The network is the published one, 8 layers of 256. On a CPU all precisions are one, so that one is timed. Half
+    precision is what captured steps have; where those are kernels of ours, torch's products follow as ``BY_TORCH``.
 
     Args:
         device: Where.
@@ -31,14 +34,15 @@ def measure(device: str, *, quick: bool, runs: int, report: Report) -> list[dict
         report: Called with (rows done, rows in all).
     """
     watch = watch_of(device)
-    precisions = [Products.FLOAT32] if torch.device(device).type == "cpu" else list(Products)
+    precisions = [str(Products.FLOAT32)] if torch.device(device).type == "cpu" else kinds(device)
     cases = [(n, q, p) for n in (QUICK_COUNTS if quick else COUNTS) for q in QUERIES for p in precisions]
     rows = []
     for done, (count, queries, products) in enumerate(cases, start=1):
         generator = torch.Generator().manual_seed(0)
         times = torch.arange(KEYS, dtype=torch.float64) * PERIOD_S
-        settings = MotionSettings(kind=MotionKind.NETWORK, products=products)
+        settings = MotionSettings(kind=MotionKind.NETWORK, products=products_of(products))
         network = Network(times, settings, duration=float(times[-1]), length=LENGTH_M, generator=generator).to(device)
+        go_by(network, products)
         field = points(LENGTH_M * torch.rand(count, 3, generator=generator)).map(lambda value: value.to(device))
         slope = torch.randn(queries, count, 3, generator=generator).to(device)
         weights = list(network.parameters())
@@ -53,10 +57,29 @@ def measure(device: str, *, quick: bool, runs: int, report: Report) -> list[dict
 
         found = both_ways(both, watch, runs)
         best = (found["graph"] or found["eager"])["median"]
-        row = {"N": count, "queries": queries, "products": str(products), "forward_backward": found}
+        row = {"N": count, "queries": queries, "products": products, "forward_backward": found}
         rows.append(row | {"forward": both_ways(forward, watch, runs), "ms_per_query": best / queries})
         report(done, len(cases), N=count, ms=best)
     return rows
+
+
+def products_of(kind: str) -> Products:
+    """The setting behind a row."""
+    return Products.HALF if kind == BY_TORCH else Products(kind)
+
+
+def go_by(network: Network, kind: str) -> None:
+    """Let kernels take rows through the layers where captured steps do so, unless the row is about torch."""
+    if kind != BY_TORCH and perceptron.fits(network.form, network.head.weight.device):
+        network.go_by(perceptron.TensorCores())
+
+
+def kinds(device: str) -> list[str]:
+    """Rows of one case: every precision, and half precision by torch, if steps have something else on the device."""
+    times = torch.arange(KEYS, dtype=torch.float64) * PERIOD_S
+    form = Network(times, MotionSettings(), duration=1.0, length=LENGTH_M).form
+    own = perceptron.fits(form, torch.empty(0, device=device).device)
+    return [*map(str, Products), *[BY_TORCH] * own]
 
 
 def points(mean: Float[Tensor, "N 3"]) -> GaussianField:

@@ -57,10 +57,12 @@ def weight_of(form: Layers, number: int) -> int:
 
 @wp.kernel(enable_backward=False)
 def add_moments(
-    form: Layers,
-    parameters: wp.array[float],
+    # In:
+    form: Layers,  # sizes [1]
+    parameters: wp.array[float],  # [P] of all layers and the head
     moment: wp.array2d[float],  # [k, t] gamma(t)
-    shifts: wp.array3d[float],  # [layers, k, WIDTH] filled
+    # Out:
+    shifts: wp.array3d[float],  # [layers, k, WIDTH]
 ):
     """What is added to every row of a key in a layer: its bias, and what gamma(t) makes of the weight."""
     number, key, n = wp.tid()
@@ -76,11 +78,13 @@ def add_moments(
 
 @wp.kernel(enable_backward=False)
 def pack(
-    form: Layers,
-    parameters: wp.array[float],
-    forth: wp.array[wp.float16],  # of all layers, filled
-    back: wp.array[wp.float16],  # of all but the first, the last one first, transposed, without gamma(x); filled
-    head: wp.array[wp.float16],  # [HEAD WIDTH] of the head, row by row, zeros below; filled
+    # In:
+    form: Layers,  # sizes [1]
+    parameters: wp.array[float],  # [P] of all layers and the head
+    # Out:
+    forth: wp.array[wp.float16],  # [4 PART ..] of all layers
+    back: wp.array[wp.float16],  # [4 PART ..] of all but the first, last one first, transposed, without gamma(x)
+    head: wp.array[wp.float16],  # [HEAD WIDTH] of the head, row by row, zeros below
 ):
     """Round weights to halves, in the order in which tensor cores read them; a thread per 16 bytes.
 
@@ -136,13 +140,15 @@ def first_part(form: Layers, number: int) -> int:
 
 @wp.kernel(enable_backward=False, grid_stride=False, launch_bounds=(BLOCK, 1), module="unique")
 def forward(
-    form: Layers,
-    keys: int,
+    # In:
+    form: Layers,  # sizes [1]
+    keys: int,  # how many [1]
     place: wp.array2d[wp.float16],  # [N, COLUMNS] gamma(x)
-    forth: wp.array[wp.float16],
+    forth: wp.array[wp.float16],  # [4 PART ..] of ``pack``
     shifts: wp.array3d[float],  # [layers, k, WIDTH]
-    outputs: wp.array3d[wp.float16],  # [layers, k N, WIDTH] of every layer, filled
-    masks: wp.array[wp.int32],  # bits of what is above 0, as lanes have it; ``mask_words``; filled on CUDA
+    # Out:
+    outputs: wp.array3d[wp.float16],  # [layers, k N, WIDTH] of every layer
+    masks: wp.array[wp.int32],  # [``mask_words``] bits of what is above 0, as lanes have it; on CUDA
 ):
     """From gamma(x) to the output of the last layer, at all keys."""
     wp.tile_zeros(shape=(_FOURS,), dtype=wp.vec4, storage="shared")  # how Warp is told of shared memory
@@ -151,14 +157,16 @@ def forward(
 
 @wp.kernel(enable_backward=False, grid_stride=False, launch_bounds=(BLOCK, 1), module="unique")
 def backward(
-    form: Layers,
-    keys: int,
+    # In:
+    form: Layers,  # sizes [1]
+    keys: int,  # how many [1]
     after: wp.array2d[wp.float16],  # [k N, HEAD] gradient at the head
-    head: wp.array2d[float],  # [VALUES, WIDTH]
-    back: wp.array[wp.float16],
-    outputs: wp.array3d[wp.float16],  # [layers, k N, WIDTH]
-    masks: wp.array[wp.int32],
-    slopes: wp.array3d[wp.float16],  # [layers, k N, WIDTH] gradient before every ReLU, filled
+    head: wp.array2d[float],  # [VALUES, WIDTH] its weight
+    back: wp.array[wp.float16],  # [4 PART ..] of ``pack``
+    outputs: wp.array3d[wp.float16],  # [layers, k N, WIDTH] of ``forward``
+    masks: wp.array[wp.int32],  # [``mask_words``] of ``forward``
+    # Out:
+    slopes: wp.array3d[wp.float16],  # [layers, k N, WIDTH] gradient before every ReLU
     partials: wp.array4d[float],  # [layers, k, GROUPS blocks, WIDTH] added to: sums of slopes over rows
 ):
     """From the gradient at the head to those of all layers."""

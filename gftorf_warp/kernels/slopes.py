@@ -40,8 +40,13 @@ def leave_part(gradient: wp.array2d[float], count: int, row: int, partials: wp.a
 
 
 @wp.kernel(enable_backward=False, grid_stride=False)
-def measure_rows(gradient: wp.array2d[float], partials: wp.array2d[float]):
-    """Sums of the gradients of offsets [rows, 3], and their largest magnitude: [warps, 4], a whole number of warps."""
+def measure_rows(
+    # In:
+    gradient: wp.array2d[float],  # [rows, 3] of offsets
+    # Out:
+    partials: wp.array2d[float],  # [warps, 4] sums over rows of a warp, and their largest magnitude
+):
+    """One thread per row, a whole number of warps."""
     leave_part(gradient, gradient.shape[0], wp.tid(), partials)
 
 
@@ -100,18 +105,17 @@ def scale_row(
 
 @wp.kernel(enable_backward=False, grid_stride=False)
 def scale_rows(
-    gradient: wp.array2d[float],
-    partials: wp.array2d[float],
-    smallest: float,
-    largest: float,
-    after: wp.array2d[wp.float16],
-    unit: wp.array[float],
-    total: wp.array[float],
+    # In:
+    gradient: wp.array2d[float],  # [rows, 3] of offsets
+    partials: wp.array2d[float],  # [warps, 4] of ``measure_rows``
+    smallest: float,  # what the largest magnitude is at least [1]
+    largest: float,  # what it becomes [1]
+    # Out:
+    after: wp.array2d[wp.float16],  # [rows, 8] gradients over ``unit``, zeros behind them
+    unit: wp.array[float],  # [1] the largest magnitude over ``largest``
+    total: wp.array[float],  # [3] sum over rows, not scaled
 ):
-    """Gradients over a unit, so that the largest is ``largest``, as halves with zeros behind them: [rows, 8].
-
-    ``unit`` [1] is that unit, made with no less than ``smallest``; ``total`` [3] the sum over rows, not scaled.
-    """
+    """One thread per row; whole blocks, at least one."""
     scale_row(gradient, partials, smallest, largest, wp.tid(), after, unit, total)
 
 
@@ -144,6 +148,12 @@ def add_columns(partials: wp.array4d[float], block: int, sums: wp.array3d[float]
 
 
 @wp.kernel(enable_backward=False, grid_stride=False)
-def add_partials(threads: int, partials: wp.array4d[float], sums: wp.array3d[float]):
-    """Sums [layers, k, WIDTH] of partial ones [layers, k, parts, WIDTH]; ``threads`` of a block, one on a CPU."""
+def add_partials(
+    # In:
+    threads: int,  # of a block; one on a CPU [1]
+    partials: wp.array4d[float],  # [layers, k, parts, WIDTH]
+    # Out:
+    sums: wp.array3d[float],  # [layers, k, WIDTH]
+):
+    """One block for 32 columns of a layer and key."""
     add_columns(partials, wp.tid() // threads, sums)

@@ -130,7 +130,7 @@ def array_over(tensor: Tensor | None, dtype=wp.float32) -> wp.array | None:
         return None
     wp.init()  # from_torch needs the runtime; does nothing after the first call
     if tensor.numel() == 0:  # strides of an empty tensor say nothing, and from_torch believes them
-        shape = tensor.shape if dtype is wp.float32 else tensor.shape[:-1]
+        shape = tensor.shape[: tensor.ndim - len(getattr(dtype, "_shape_", ()))]
         return wp.empty(tuple(shape), dtype=dtype, device=wp.device_from_torch(tensor.device))
     return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False)
 

@@ -71,15 +71,16 @@ class TensorCores:
                 _launch(kernels.backward, _threads(device), passed, [halves[3], array_over(partials)], device)
             dim = layers * keys * (form.width // ends.COLUMNS) * block
             _launch(ends.add_partials, dim, [block, array_over(partials)], [array_over(sums)], device)
-        return Slopes(unit, after, slopes, sums, total)
+        return Slopes(unit.view(()), after, slopes, sums, total)
 
 
 def fits(form: Form, device: torch.device) -> bool:
     """Whether a perceptron can go that way: its sizes, and a GPU that has such products."""
     sizes = form.width == wgmma.WIDTH and form.columns == wgmma.COLUMNS
-    if not sizes or form.dtype != torch.float16 or device.type != "cuda":
+    if not sizes or form.dtype != torch.float16 or device.type == "cpu":
         return False
-    return torch.cuda.get_device_capability(device) == (wgmma.ARCHITECTURE // 10, wgmma.ARCHITECTURE % 10)
+    wp.init()
+    return wp.device_from_torch(device).arch == wgmma.ARCHITECTURE
 
 
 @functools.cache

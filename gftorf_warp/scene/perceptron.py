@@ -20,7 +20,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -78,6 +78,7 @@ class Slopes(NamedTuple):
     """Gradients of the offsets, summed over all rows."""
 
 
+@runtime_checkable
 class Passes(Protocol):
     """Takes rows through the layers, and gradients back."""
 
