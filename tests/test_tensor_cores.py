@@ -75,14 +75,16 @@ def alike(made, twin, count, keys, *, device="cpu", scale=1.0):
         assert distance(one, other) < (0.1 if count > 1 else 0.5), "some units are at rest in one precision only"
 
 
-def placed(form, layers, parameters, device="cpu"):
-    """What ``pack`` makes of parameters: halves of all layers, of the way back, of the head."""
+def placed(form, layers, parameters, moment, device="cpu"):
+    """What ``pack`` makes of parameters: halves of all layers, of the way back, of the head, and shifts."""
     square, entry = form.width * form.width, form.width * form.columns
     sizes = [(layers - 1) * square + len(form.entries) * entry, (layers - 1) * square, wgmma.HEAD * form.width]
     parts = [torch.full((size,), torch.nan, dtype=torch.float16, device=device) for size in sizes]
-    arrays = [array_over(part, wp.float16) for part in parts]
-    launched(kernels.pack, sum(sizes) // kernels.UNIT, [of(form, layers), array_over(parameters)], arrays, device)
-    return [part.cpu() for part in parts]
+    shifts = torch.full((layers, len(moment), form.width), torch.nan, device=device)
+    arrays = [*(array_over(part, wp.float16) for part in parts), array_over(shifts)]
+    given = [of(form, layers), array_over(parameters), array_over(moment)]
+    launched(kernels.pack, sum(sizes) // kernels.UNIT + shifts.numel(), given, arrays, device)
+    return [*(part.cpu() for part in parts), shifts]
 
 
 def of(form, layers):
@@ -276,7 +278,8 @@ def test_every_weight_is_packed_once(shape, device):
     biases = [layer.bias for layer in [*made.layers, made.head]]
     count = sum(value.numel() for value in [*weights, *biases])
     number = torch.arange(count, device=device)
-    low, high = (placed(form, layers, digit.float(), device) for digit in (number % 1024, number // 1024))
+    moment, digits = torch.zeros(1, form.moment, device=device), (number % 1024, number // 1024)
+    low, high = (placed(form, layers, digit.float(), moment, device)[:3] for digit in digits)
     forth, back, head = (1024 * two.long() + one.long() for one, two in zip(low, high, strict=True))
     inputs, outputs = shares()
     k = (32 * np.arange(2)[:, None] + inputs).ravel()
@@ -306,9 +309,7 @@ def test_what_a_time_adds(shape, device):
     form, _, moment, weights, biases = inputs_of(made, 1, 3)
     layers = len(made.layers)
     parameters = torch.cat([value.reshape(-1) for both in zip(weights, biases, strict=True) for value in both])
-    found = torch.full((layers, 3, WIDTH), torch.nan, device=device)
-    given = [of(form, layers), array_over(parameters), array_over(moment)]
-    launched(kernels.add_moments, found.shape, given, [array_over(found)], device)
+    found = placed(form, layers, parameters, moment, device)[-1]
     for number in range(layers):
         want = biases[number].expand(3, -1)
         if number in form.entries:

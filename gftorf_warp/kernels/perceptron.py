@@ -55,17 +55,11 @@ def weight_of(form: Layers, number: int) -> int:
     return at
 
 
-@wp.kernel(enable_backward=False)
-def add_moments(
-    # In:
-    form: Layers,  # sizes [1]
-    parameters: wp.array[float],  # [P] of all layers and the head
-    moment: wp.array2d[float],  # [k, t] gamma(t)
-    # Out:
-    shifts: wp.array3d[float],  # [layers, k, WIDTH]
-):
-    """What is added to every row of a key in a layer: its bias, and what gamma(t) makes of the weight."""
-    number, key, n = wp.tid()
+@wp.func
+def shift_of(
+    form: Layers, parameters: wp.array[float], moment: wp.array2d[float], number: int, key: int, n: int
+) -> float:
+    """What is added to output ``n`` of a layer at a key: its bias, and what gamma(t) makes of the weight."""
     inputs = inputs_of(form, number)
     at = weight_of(form, number)
     total = parameters[at + inputs * WIDTH + n]
@@ -73,7 +67,7 @@ def add_moments(
         row = at + (n + 1) * inputs - form.moment
         for k in range(form.moment):
             total += parameters[row + k] * moment[key, k]
-    shifts[number, key, n] = total
+    return total
 
 
 @wp.kernel(enable_backward=False)
@@ -81,17 +75,26 @@ def pack(
     # In:
     form: Layers,  # sizes [1]
     parameters: wp.array[float],  # [P] of all layers and the head
+    moment: wp.array2d[float],  # [k, t] gamma(t)
     # Out:
     forth: wp.array[wp.float16],  # [4 PART ..] of all layers
     back: wp.array[wp.float16],  # [4 PART ..] of all but the first, last one first, transposed, without gamma(x)
     head: wp.array[wp.float16],  # [HEAD WIDTH] of the head, row by row, zeros below
+    shifts: wp.array3d[float],  # [layers, k, WIDTH] what is added to every row of a key in a layer
 ):
-    """Round weights to halves, in the order in which tensor cores read them; a thread per 16 bytes.
+    """Round weights to halves, in the order in which tensor cores read them; a thread per 16 bytes, then per shift.
 
     A block of 64 inputs has a row of 128 bytes for every output, pieces of 16 bytes exchanged by the last three bits of
     its number. Outputs and inputs are numbered as the products number them; ``p`` and ``k`` are what they stand for.
     """
     at = wp.tid() * UNIT
+    if at >= forth.shape[0] + back.shape[0] + head.shape[0]:
+        own = (at - forth.shape[0] - back.shape[0] - head.shape[0]) // UNIT
+        n = own % WIDTH
+        key = own // WIDTH % moment.shape[0]
+        number = own // (WIDTH * moment.shape[0])
+        shifts[number, key, n] = shift_of(form, parameters, moment, number, key, n)
+        return
     if at >= forth.shape[0] + back.shape[0]:
         at -= forth.shape[0] + back.shape[0]
         begin = weight_of(form, form.layers)

@@ -25,8 +25,8 @@ def class_of(key: int, culled: int, shift: int) -> int:
 def count_classes(
     # In:
     keys: wp.array[wp.int32],  # [>= N] of each splat
-    culled: int,  # key of what is culled
-    shift: int,  # bits of a key that its class leaves out
+    culled: int,  # key of what is culled [1]
+    shift: int,  # bits of a key that its class leaves out [1]
     # Out:
     counts: wp.array[int],  # [COUNTS] splats of the class before, added to
     places: wp.array[wp.int32],  # [N] of each splat in its class, in the order of arrival
@@ -39,11 +39,11 @@ def count_classes(
 @wp.kernel(enable_backward=False)
 def fill_classes(
     # In:
-    keys: wp.array[wp.int32],
-    culled: int,
-    shift: int,
+    keys: wp.array[wp.int32],  # [>= N] of each splat
+    culled: int,  # key of what is culled [1]
+    shift: int,  # bits of a key that its class leaves out [1]
     first: wp.array[int],  # [COUNTS] where the splats of each class begin
-    places: wp.array[wp.int32],
+    places: wp.array[wp.int32],  # [N] of each splat in its class
     # Out:
     members: wp.array2d[wp.int32],  # [N, 2] key and index of every splat, class by class
 ):
@@ -57,10 +57,10 @@ def fill_classes(
 @wp.kernel(enable_backward=False)
 def order_classes(
     # In:
-    members: wp.array2d[wp.int32],
-    culled: int,
-    shift: int,
-    first: wp.array[int],
+    members: wp.array2d[wp.int32],  # [N, 2] key and index of every splat, class by class
+    culled: int,  # key of what is culled [1]
+    shift: int,  # bits of a key that its class leaves out [1]
+    first: wp.array[int],  # [COUNTS] where the splats of each class begin
     # Out:
     order: wp.array[wp.int32],  # [>= N] splats near to far
 ):

@@ -11,7 +11,7 @@ from torch import Tensor
 from ..kernels import perceptron as kernels
 from ..kernels import slopes as ends
 from ..kernels import wgmma
-from ..scene.perceptron import LARGEST, SMALLEST, Form, Slopes
+from ..scene.perceptron import LARGEST, SMALLEST, Form, Slopes, beside
 from .bridge import array_over, stream_of
 
 
@@ -36,9 +36,9 @@ class TensorCores:
         of, device = _layers(form, layers), _ready(place.device)
         with stream_of(place):
             flat, halves = array_over(parameters), [array_over(part, wp.float16) for part in packed]
-            _launch(kernels.pack, sum(sizes) // kernels.UNIT, [of, flat], halves, device)
-            dim, added = (layers, keys, form.width), array_over(shifts)
-            _launch(kernels.add_moments, dim, [of, flat, array_over(moment)], [added], device)
+            added = array_over(shifts)
+            units = sum(sizes) // kernels.UNIT + shifts.numel()
+            _launch(kernels.pack, units, [of, flat, array_over(moment)], [*halves, added], device)
             if count:
                 rows, found = (
                     [of, keys, array_over(place, wp.float16), halves[0], added],
@@ -69,6 +69,9 @@ class TensorCores:
                 passed = [_layers(form, layers), keys, halves[0], array_over(head), halves[1], halves[2]]
                 passed.append(array_over(masks, wp.int32))
                 _launch(kernels.backward, _threads(device), passed, [halves[3], array_over(partials)], device)
+        # nobody waits for these sums but small products, which run beside the large ones, too; what they are made of is
+        # given back before that, but nothing is asked for until both have joined
+        with beside(outputs.device), stream_of(outputs):
             dim = layers * keys * (form.width // ends.COLUMNS) * block
             _launch(ends.add_partials, dim, [block, array_over(partials)], [array_over(sums)], device)
         return Slopes(unit.view(()), after, slopes, sums, total)

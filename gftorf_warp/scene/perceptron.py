@@ -199,7 +199,7 @@ class Stacked(torch.autograd.Function):
         unit, head, slopes, own, head_sum = (form.passes or Products()).backward(
             form, keys, gradient.reshape(-1, values), outputs, tuple(kept)
         )
-        with _beside(place.device):  # small products, while one fills the device with blocks that end one by one
+        with beside(place.device):  # small products, while one fills the device with blocks that end one by one
             found.head_bias.copy_(head_sum)
             _product(head.T, outputs[-1], moment.dtype, out=found.weights[-1])
             torch.sum(own, 1, out=found.biases)
@@ -211,7 +211,7 @@ class Stacked(torch.autograd.Function):
                 _product(slopes[number].T, places.flatten(0, 1), moment.dtype, out=weight[:, rows])
                 torch.mm(own[number].T, moment, out=weight[:, weight.shape[1] - form.moment :])
         _products(slopes[1:].mT, outputs[:-1], out=found.square)
-        _join(place.device)
+        join(place.device)
         if form.joined is not None:
             found.weights[form.joined][:, : form.width] = found.square[form.joined - 1]
         return None, None, None, *found.times(unit)
@@ -252,8 +252,8 @@ def _second(device: torch.device) -> torch.cuda.Stream:
 
 
 @contextlib.contextmanager
-def _beside(device: torch.device) -> Iterator[None]:
-    """Work from here on is behind everything before, and beside what comes behind this block until :func:`_join`."""
+def beside(device: torch.device) -> Iterator[None]:
+    """Work from here on is behind everything before, and beside what comes behind this block until :func:`join`."""
     if device.type == "cpu":
         yield
         return
@@ -263,7 +263,7 @@ def _beside(device: torch.device) -> Iterator[None]:
         yield
 
 
-def _join(device: torch.device) -> None:
+def join(device: torch.device) -> None:
     """Wait for what is done beside, on the current stream."""
     if device.type != "cpu":
         torch.cuda.current_stream(device).wait_stream(_second(device))
