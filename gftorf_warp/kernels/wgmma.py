@@ -54,7 +54,7 @@ _CUDA = f"""
     const unsigned begins = (unsigned)__cvta_generic_to_shared(memory), base = (begins + 1023u) & ~1023u;
     float* const shared_sums = reinterpret_cast<float*>(memory + (base - begins) + {_RING}) + group * {4 * WIDTH};
     const unsigned barriers = base + {_RING + _SUMS_OF_GROUPS};
-    int* const released = reinterpret_cast<int*>(memory + (base - begins) + {_RING + _SUMS_OF_GROUPS + _BARRIERS});
+    unsigned* const released = reinterpret_cast<unsigned*>(memory + (base - begins) + {_RING + _SUMS_OF_GROUPS + _BARRIERS});
     struct Starts {{ enum {{ H = 0, P = 1 }}; }};  // blocks of 64 inputs: of the layer before, of gamma(x)
     struct Goes {{ enum {{ H = 4, P = 0 }}; }};
     struct Joins {{ enum {{ H = 4, P = 1 }}; }};
@@ -123,23 +123,27 @@ _CUDA = f"""
         {_KEPT}
     }};
 
-    // this group has multiplied by ``blocks`` weights for the last time; the second group to say so sends for others
+    // this group has multiplied by ``blocks`` weights for the last time; whoever is second to say so of a layer sends for
+    // others. A group without a tile says so of all layers at once, so each has a count of its own, half of one word: what
+    // an addition finds in the other half is the only order there is
     int done = 0, layers_done = 0;  // blocks of weights, and layers, that this group needs no more
     auto release = [&](int blocks, const wp::half* packed, int of_round, int all) {{
         const int sent = min(done + {SLOTS}, all);
         done += blocks;
+        ++layers_done;
         group_waits();
         if ((threadIdx.x & 127) == 0) {{
             __threadfence_block();
-            if (atomicAdd(released + (layers_done & 3), 1) & 1) {{
+            const unsigned counts = atomicAdd(released, group ? 65536u : 1u);
+            const int of_other = group ? counts & 65535u : counts >> 16;
+            if (of_other >= layers_done) {{
                 __threadfence_block();
                 for (int n = sent; n < min(done + {SLOTS}, all); ++n) fill(n, packed + (size_t)(n % of_round) * {PART});
             }}
         }}
-        ++layers_done;
     }};
 
-    if (threadIdx.x < 4) released[threadIdx.x] = 0;
+    if (threadIdx.x == 0) *released = 0;
     if (threadIdx.x == 0)
         for (int slot = 0; slot < {SLOTS}; ++slot)
             asm volatile("mbarrier.init.shared::cta.b64 [%0], 1;" :: "r"(barriers + 8 * slot) : "memory");
