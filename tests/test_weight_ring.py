@@ -26,6 +26,7 @@ class Ring:
         self.sent: list[int] = []
 
     def send(self, block):
+        """Ask for a block."""
         slot = block % SLOTS
         assert self.coming[slot] is None, "two blocks are on their way to one slot"
         assert all(other % SLOTS != slot for group in self.read for other in group), "weights in use are overwritten"
@@ -33,10 +34,12 @@ class Ring:
         self.sent.append(block)
 
     def arrive(self, slot):
+        """What was asked for is there."""
         self.content[slot], self.coming[slot] = self.coming[slot], None
         self.phases[slot] += 1
 
     def there(self, block):
+        """Whether a block has come, as far as one bit of its slot's phase tells."""
         return (self.phases[block % SLOTS] ^ block // SLOTS) & 1
 
 

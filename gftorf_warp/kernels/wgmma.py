@@ -54,7 +54,8 @@ _CUDA = f"""
     const unsigned begins = (unsigned)__cvta_generic_to_shared(memory), base = (begins + 1023u) & ~1023u;
     float* const shared_sums = reinterpret_cast<float*>(memory + (base - begins) + {_RING}) + group * {4 * WIDTH};
     const unsigned barriers = base + {_RING + _SUMS_OF_GROUPS};
-    unsigned* const released = reinterpret_cast<unsigned*>(memory + (base - begins) + {_RING + _SUMS_OF_GROUPS + _BARRIERS});
+    unsigned* const released =
+        reinterpret_cast<unsigned*>(memory + (base - begins) + {_RING + _SUMS_OF_GROUPS + _BARRIERS});
     struct Starts {{ enum {{ H = 0, P = 1 }}; }};  // blocks of 64 inputs: of the layer before, of gamma(x)
     struct Goes {{ enum {{ H = 4, P = 0 }}; }};
     struct Joins {{ enum {{ H = 4, P = 1 }}; }};
@@ -123,9 +124,9 @@ _CUDA = f"""
         {_KEPT}
     }};
 
-    // this group has multiplied by ``blocks`` weights for the last time; whoever is second to say so of a layer sends for
-    // others. A group without a tile says so of all layers at once, so each has a count of its own, half of one word: what
-    // an addition finds in the other half is the only order there is
+    // this group has multiplied by ``blocks`` weights for the last time; who says so of a layer as the second one sends
+    // for others. A group without a tile says so of all layers at once, so each has a count of its own, half of a word:
+    // what an addition finds in the other half is the only order there is
     int done = 0, layers_done = 0;  // blocks of weights, and layers, that this group needs no more
     auto release = [&](int blocks, const wp::half* packed, int of_round, int all) {{
         const int sent = min(done + {SLOTS}, all);
