@@ -64,6 +64,31 @@ def distance(one, other):
     return float((one.detach().double() - other.detach()).norm() / other.detach().norm())
 
 
+def compare_replay(made, gaussians, cotangent):
+    """Capture offsets and gradients at two keys; replay for other positions and times, and ask again."""
+    place, moment = made.attach(gaussians), made.moments[:2].clone()
+    parameters = list(made.parameters())
+
+    def call():
+        found = made.offsets(place, moment)
+        return found, *torch.autograd.grad((found * cotangent).sum(), parameters)
+
+    side = torch.cuda.Stream()
+    side.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(side):
+        for _ in range(3):
+            call()
+    torch.cuda.synchronize()
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        kept = call()
+    place.mul_(0.5)
+    moment.copy_(made.moments[2:])
+    graph.replay()
+    for one, other in zip(kept, call(), strict=True):
+        assert torch.equal(one, other)
+
+
 @pytest.mark.parametrize("shape", SHAPES)
 def test_finite_differences_agree_in_float64(shape):
     """Nothing is rounded there, so the derivative by hand is compared with the very function."""
@@ -241,28 +266,7 @@ def test_two_calls_agree_to_the_bit():
 def test_a_replay_equals_a_call():
     """Captured with its gradient; also with other positions and times written in between."""
     made, gaussians = network(half()).to("cuda"), positions(2000).map(lambda value: value.to("cuda"))
-    cotangent = random(2, 2000, 3).to("cuda")
-    place, moment = made.attach(gaussians), made.moments[:2].clone()
-    parameters = list(made.parameters())
-
-    def call():
-        found = made.offsets(place, moment)
-        return found, *torch.autograd.grad((found * cotangent).sum(), parameters)
-
-    side = torch.cuda.Stream()
-    side.wait_stream(torch.cuda.current_stream())
-    with torch.cuda.stream(side):
-        for _ in range(3):
-            call()
-    torch.cuda.synchronize()
-    graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph):
-        kept = call()
-    place.mul_(0.5)
-    moment.copy_(made.moments[2:])
-    graph.replay()
-    for one, other in zip(kept, call(), strict=True):
-        assert torch.equal(one, other)
+    compare_replay(made, gaussians, random(2, 2000, 3).to("cuda"))
 
 
 def test_attached_positions_are_aligned_halves():

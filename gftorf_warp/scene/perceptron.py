@@ -73,7 +73,7 @@ class Slopes(NamedTuple):
     layers: Float[Tensor, "layers rows width"]
     """Before the ReLU of every layer."""
     sums: Float[Tensor, "layers k width"]
-    """These, summed over the rows of each key."""
+    """These, summed over the rows of each key; perhaps :func:`beside`, so there behind it, or :func:`join` first."""
     head_sum: Float[Tensor, "3"]
     """Gradients of the offsets, summed over all rows."""
 
