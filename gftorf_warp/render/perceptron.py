@@ -40,11 +40,9 @@ class TensorCores:
             units = sum(sizes) // kernels.UNIT + shifts.numel()
             _launch(kernels.pack, units, [of, flat, array_over(moment)], [*halves, added], device)
             if count:
-                rows, found = (
-                    [of, keys, array_over(place, wp.float16), halves[0], added],
-                    array_over(outputs, wp.float16),
-                )
-                _launch(kernels.forward, _threads(device), rows, [found, array_over(masks, wp.int32)], device)
+                rows = [of, keys, array_over(place, wp.float16), halves[0], added]
+                found = [array_over(outputs, wp.float16), array_over(masks, wp.int32)]
+                _launch(kernels.forward, _threads(device), rows, found, device)
         return outputs, packed[2].view(wgmma.HEAD, form.width), (packed[1], weights[-1], masks)
 
     def backward(self, form: Form, keys: int, gradient: Tensor, outputs: Tensor, kept: tuple[Tensor, ...]) -> Slopes:
@@ -62,9 +60,8 @@ class TensorCores:
             halves = [array_over(tensor, wp.float16) for tensor in (after, back, outputs, slopes)]
             _launch(ends.measure_rows, len(parts) * lanes, [given], [found], device)
             scaled = [halves[0], array_over(unit), array_over(total)]
-            _launch(
-                ends.scale_rows, max(-(-rows // block), 1) * block, [given, found, SMALLEST, LARGEST], scaled, device
-            )
+            blocks_of_rows = max(-(-rows // block), 1)
+            _launch(ends.scale_rows, blocks_of_rows * block, [given, found, SMALLEST, LARGEST], scaled, device)
             if rows:
                 passed = [_layers(form, layers), keys, halves[0], array_over(head), halves[1], halves[2]]
                 passed.append(array_over(masks, wp.int32))
