@@ -1,0 +1,298 @@
+"""What kernels/wgmma.py has for CUDA, executed by 256 threads of the CPU: a block, its barriers and its tensor cores.
+
+Instructions of PTX are replaced by functions that do what they say; all else is the code that a GPU gets. A product sees
+fragments and swizzled weights as wgmma does (PTX, m64n256k16), copies arrive late, and barriers are barriers.
+"""
+
+import re
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+import torch
+from test_perceptron import half, network, positions
+
+from gftorf_warp.kernels import perceptron as kernels
+from gftorf_warp.kernels import wgmma
+from gftorf_warp.render.perceptron import TensorCores
+from gftorf_warp.scene.motion import MotionSettings
+
+COMPILER = shutil.which("c++") or shutil.which("g++")
+BLOCKS = 2
+WIDTH = wgmma.WIDTH
+
+DEVICE = """
+#include <algorithm>
+#include <atomic>
+#include <barrier>
+#include <cmath>
+#include <cstdint>
+#include <cstdio>
+#include <cstring>
+#include <memory>
+#include <mutex>
+#include <random>
+#include <string>
+#include <thread>
+#include <vector>
+#define __CUDA_ARCH__ 900
+using std::min;
+struct float2 { float x, y; };
+struct alignas(16) float4 { float x, y, z, w; };
+struct alignas(16) uint4 { unsigned x, y, z, w; };
+static uint4 make_uint4(unsigned a, unsigned b, unsigned c, unsigned d) { return {a, b, c, d}; }
+template <class T> static T __ldg(const T* p) { return *p; }
+struct Index { unsigned x; };
+static thread_local Index threadIdx;
+static Index blockIdx, gridDim;
+alignas(1024) static char block_memory[MEMORY];
+static size_t __cvta_generic_to_shared(const void*) { return 0; }
+static std::barrier<> whole(256), group_barrier[2]{std::barrier<>(128), std::barrier<>(128)};
+static std::unique_ptr<std::barrier<>> of_warp[8];
+static float told[256]; static unsigned fragments[256][4];
+static void __syncthreads() { whole.arrive_and_wait(); }
+static void named(int number) { group_barrier[number - 1].arrive_and_wait(); }
+static void meet() { of_warp[threadIdx.x >> 5]->arrive_and_wait(); }
+static void __threadfence_block() { std::atomic_thread_fence(std::memory_order_seq_cst); }
+static unsigned atomicAdd(unsigned* to, unsigned x) { return std::atomic_ref<unsigned>(*to).fetch_add(x); }
+static unsigned __shfl_sync(unsigned, unsigned x, int) { return x; }  // only asked for what is the same in a warp
+static float __shfl_xor_sync(unsigned, float x, int by) {
+    told[threadIdx.x] = x; meet(); const float heard = told[threadIdx.x ^ by]; meet(); return heard;
+}
+namespace wp {
+struct half { unsigned short u; };
+static float half_to_float(half h) {
+    const unsigned e = h.u >> 10 & 31, m = h.u & 1023;
+    const float size = e == 31 ? (m ? NAN : INFINITY) : e ? std::ldexp(1024.0f + m, (int)e - 25) : std::ldexp((float)m, -24);
+    return h.u & 0x8000 ? -size : size;
+}
+static half float_to_half(float x) {
+    const unsigned short sign = std::signbit(x) ? 0x8000 : 0;
+    const float size = std::fabs(x);
+    if (std::isnan(x)) return {0x7fff};
+    if (size >= 65520.0f) return {(unsigned short)(sign | 0x7c00)};
+    int e; std::frexp(size, &e);
+    e = std::max(e, -13);
+    const unsigned m = (unsigned)std::nearbyint(std::ldexp(size, 11 - e));  // may round up to the next power of two
+    return {(unsigned short)(sign | (m < 1024 ? m : ((e + 14) << 10) + (m - 1024)))};
+}
+template <class T> struct array_t { T* data; };
+}
+static unsigned packed(float high, float low) {
+    return (unsigned)wp::float_to_half(high).u << 16 | wp::float_to_half(low).u;
+}
+static unsigned packed_relu(float high, float low) { return packed(high > 0 ? high : 0, low > 0 ? low : 0); }
+
+struct Phase { std::atomic<unsigned> done{0}; unsigned awaited = 0; };
+static Phase phases[SLOTS];
+static std::vector<std::thread> copies;
+static std::mutex of_copies;
+static Phase& phase_at(unsigned address) { return phases[(address - BARRIERS) / 8]; }
+static void start_phases(unsigned address) { phase_at(address).done = 0; phase_at(address).awaited = 0; }
+static void expect(unsigned address, unsigned bytes) {
+    if (phase_at(address).awaited) { std::puts("a slot is filled twice"); std::_Exit(1); }
+    phase_at(address).awaited = bytes;
+}
+static void copy_late(unsigned to, const void* from, unsigned bytes, unsigned barrier) {
+    const std::lock_guard<std::mutex> lock(of_copies);
+    copies.emplace_back([=] {
+        static std::atomic<unsigned> number{0};
+        std::this_thread::sleep_for(std::chrono::microseconds(number.fetch_add(1) * 7919 % 3000));
+        std::memcpy(block_memory + to, from, bytes);
+        phase_at(barrier).awaited = 0;
+        phase_at(barrier).done.fetch_add(1);
+    });
+}
+static unsigned is_done(unsigned barrier, unsigned parity) {
+    if ((phase_at(barrier).done & 1) != parity) return 1;
+    std::this_thread::yield();
+    return 0;
+}
+// D[16 w + g (+ 8)][8 j + 2 t (+ 1)] of a group's 64 x 256, A 16 inputs of its rows, B at a descriptor of 128-byte rows
+template <class Sums, class A> static void tensor(Sums& sums, const A& a, unsigned long long matrix, bool add) {
+    for (int n = 0; n < 4; ++n) fragments[threadIdx.x][n] = a[n];
+    meet();
+    const unsigned lane = threadIdx.x & 31, g = lane >> 2, t = lane & 3, first = threadIdx.x - lane;
+    const unsigned begin = (matrix & 0x3fff) << 4, rows = begin & ~1023u, offset = begin & 127u;
+    if (matrix >> 62 != 1 || (matrix >> 32 & 0x3fff) != 64) { std::puts("another layout"); std::_Exit(1); }
+    auto of = [](unsigned two, int which) { return wp::half_to_float({(unsigned short)(which ? two >> 16 : two)}); };
+    float A_[2][16];
+    for (int k = 0; k < 16; ++k) for (int half = 0; half < 2; ++half)
+        A_[half][k] = of(fragments[first + 4 * g + k % 8 / 2][half + 2 * (k / 8)], k % 2);
+    for (int j = 0; j < 32; ++j) for (int e = 0; e < 2; ++e) {
+        const unsigned n = 8 * j + 2 * t + e;
+        float low = 0, high = 0;
+        for (int k = 0; k < 16; ++k) {
+            const unsigned byte = offset + 2 * k, piece = (byte >> 4) ^ (n & 7);
+            wp::half b;
+            std::memcpy(&b, block_memory + rows + 128 * n + 16 * piece + byte % 16, 2);
+            const float weight = wp::half_to_float(b);
+            low += A_[0][k] * weight; high += A_[1][k] * weight;
+        }
+        sums[4 * j + e] = (add ? sums[4 * j + e] : 0) + low;
+        sums[4 * j + 2 + e] = (add ? sums[4 * j + 2 + e] : 0) + high;
+    }
+    meet();
+}
+template <class T> static std::vector<T> loaded(const char* name) {
+    std::FILE* file = std::fopen(name, "rb");
+    std::fseek(file, 0, SEEK_END); std::vector<T> found(std::ftell(file) / sizeof(T)); std::rewind(file);
+    if (std::fread(found.data(), sizeof(T), found.size(), file) != found.size()) std::_Exit(2);
+    std::fclose(file); return found;
+}
+template <class T> static void stored(const char* name, const std::vector<T>& what) {
+    std::FILE* file = std::fopen(name, "wb");
+    std::fwrite(what.data(), sizeof(T), what.size(), file); std::fclose(file);
+}
+template <class F> static void on_blocks(unsigned blocks, F f) {
+    gridDim.x = blocks;
+    for (auto& barrier : of_warp) barrier = std::make_unique<std::barrier<>>(32);
+    for (blockIdx.x = 0; blockIdx.x < blocks; ++blockIdx.x) {
+        std::vector<std::thread> threads;
+        for (unsigned n = 0; n < 256; ++n) threads.emplace_back([=] { threadIdx.x = n; f(); });
+        for (auto& thread : threads) thread.join();
+        for (auto& copy : copies) copy.join();
+        copies.clear();
+    }
+}
+"""
+
+FORWARD = """
+static void rows_forward(int layers, int joined, int keys, int count, wp::array_t<wp::half> place,
+                         wp::array_t<wp::half> forth, wp::array_t<float> shifts, wp::array_t<wp::half> outputs,
+                         wp::array_t<int> masks) { CODE }
+int main(int, char** given) {
+    const int layers = std::stoi(given[1]), joined = std::stoi(given[2]), keys = std::stoi(given[3]);
+    const int count = std::stoi(given[4]);
+    auto place = loaded<wp::half>("place"), forth = loaded<wp::half>("forth"); auto shifts = loaded<float>("shifts");
+    std::vector<wp::half> outputs((size_t)layers * keys * count * 256);
+    std::vector<int> masks((size_t)layers * keys * ((count + 63) / 64) * 512);
+    on_blocks(BLOCKS, [&] {
+        rows_forward(layers, joined, keys, count, {place.data()}, {forth.data()}, {shifts.data()}, {outputs.data()},
+                     {masks.data()});
+    });
+    stored("outputs", outputs); stored("masks", masks);
+}
+"""
+
+BACKWARD = """
+static void rows_backward(int layers, int joined, int keys, int count, wp::array_t<wp::half> after,
+                          wp::array_t<float> head, wp::array_t<wp::half> back, wp::array_t<wp::half> outputs,
+                          wp::array_t<int> masks, wp::array_t<wp::half> slopes, wp::array_t<float> partials) { CODE }
+int main(int, char** given) {
+    const int layers = std::stoi(given[1]), joined = std::stoi(given[2]), keys = std::stoi(given[3]);
+    const int count = std::stoi(given[4]);
+    auto after = loaded<wp::half>("after"), back = loaded<wp::half>("back"), outputs = loaded<wp::half>("outputs");
+    auto head = loaded<float>("head"); auto masks = loaded<int>("masks");
+    std::vector<wp::half> slopes(outputs.size());
+    std::vector<float> partials((size_t)layers * keys * BLOCKS * 512);
+    on_blocks(BLOCKS, [&] {
+        rows_backward(layers, joined, keys, count, {after.data()}, {head.data()}, {back.data()}, {outputs.data()},
+                      {masks.data()}, {slopes.data()}, {partials.data()});
+    });
+    stored("slopes", slopes); stored("partials", partials);
+}
+"""
+
+
+def operands(statement):
+    """The C++ expressions of an asm statement, in order."""
+    found = []
+    for start in re.finditer(r'"[=+]?[rfl]"\(', statement):
+        depth, at = 1, start.end()
+        while depth:
+            depth += {"(": 1, ")": -1}.get(statement[at], 0)
+            at += 1
+        found.append(statement[start.end() : at - 1])
+    return found
+
+
+def for_threads(snippet):
+    """The snippet with functions in place of PTX."""
+
+    def function(match):
+        text = match.group(0)
+        given = operands(text)
+        if "wgmma.mma_async" in text:
+            add = re.search(r"setp\.ne\.b32 p, (\d), 0", text).group(1)
+            return f"tensor(sums, a, matrix, {add});"
+        for instruction, call in (
+            ("mbarrier.arrive.expect_tx", "expect({0}, {1});"),
+            ("cp.async.bulk", "copy_late({0}, {1}, {2}, {3});"),
+            ("mbarrier.try_wait", "{0} = is_done({1}, {2});"),
+            ("mbarrier.init", "start_phases({0});"),
+            ("bar.sync", "named({0});"),
+            ("cvt.rn.relu.f16x2", "{0} = packed_relu({1}, {2});"),
+            ("cvt.rn.f16x2", "{0} = packed({1}, {2});"),
+        ):
+            if instruction in text:
+                return call.format(*given)
+        assert re.search(r'asm volatile\("(wgmma\.(fence|commit|wait)|fence\.proxy|")', text), text
+        return ";"
+
+    code = re.sub(r"asm(?: volatile)?\(.*?\);", function, snippet, flags=re.DOTALL)
+    assert "asm" not in code
+    return code.replace("extern __shared__ char memory[];", "char* const memory = block_memory;")
+
+
+def run(folder, program, function, *numbers):
+    """Compile a snippet into a program of threads and run it in its folder."""
+    constants = {"MEMORY": wgmma.SHARED, "SLOTS": wgmma.SLOTS, "BARRIERS": wgmma._RING + wgmma._SUMS_OF_GROUPS}
+    defined = "".join(f"#define {name} {value}\n" for name, value in {**constants, "BLOCKS": BLOCKS}.items())
+    (folder / "block.cpp").write_text(defined + DEVICE + program.replace("CODE", for_threads(function.native_snippet)))
+    command = [COMPILER, "-std=c++20", "-O2", "-w", "-pthread", "block.cpp", "-o", "block"]
+    subprocess.run(command, cwd=folder, check=True, timeout=300)
+    subprocess.run([folder / "block", *map(str, numbers)], cwd=folder, check=True, timeout=300)
+
+
+def stored(folder, **arrays):
+    """Write arrays for a program."""
+    for name, array in arrays.items():
+        np.ascontiguousarray(array).tofile(folder / name)
+
+
+@pytest.mark.skipif(COMPILER is None, reason="needs a C++ compiler")
+@pytest.mark.parametrize(
+    ("layers", "skip_after", "count", "keys"),
+    [(8, 5, 33, 1), (3, 1, 70, 3), (2, 2, 64 * 2 * wgmma.ROUND + 65, 1)],
+    ids=["a tile", "tiles of several keys", "a tile more than a round"],
+)
+def test_a_block_of_threads_is_row_by_row(layers, skip_after, count, keys, tmp_path, monkeypatch):
+    """Outputs, masks, slopes and sums of two blocks are those of the CPU's own way; nobody waits for ever."""
+    settings = MotionSettings(layers=layers, skip_after=skip_after)
+    made = network(half(settings))
+    form, place = made.form, made.attach(positions(count))
+    moment = made.moments[:keys].float()
+    both = [(layer.weight.detach(), layer.bias.detach()) for layer in [*made.layers, made.head]]
+    weights, biases = (tuple(values) for values in zip(*both, strict=True))
+    given = {}
+
+    def launched(kernel, dim, inputs, outputs, device):
+        launch(kernel, dim, inputs, outputs, device)
+        given[kernel.key] = [*inputs, *outputs]
+
+    from gftorf_warp.render import perceptron  # noqa: PLC0415
+
+    launch = perceptron._launch
+    monkeypatch.setattr(perceptron, "_launch", launched)
+    outputs, _, kept = TensorCores().forward(form, place, moment, weights, biases)
+    packed = given[kernels.pack.key]
+    numbers = layers, -1 if form.joined is None else form.joined, keys, count
+    stored(tmp_path, place=place.numpy(), forth=packed[3].numpy(), shifts=packed[6].numpy())
+    run(tmp_path, FORWARD, wgmma.rows_forward, *numbers)
+    found = torch.from_numpy(np.fromfile(tmp_path / "outputs", np.float16)).view_as(outputs)
+    assert float(((found > 0) != (outputs > 0)).float().mean()) < 1e-3
+    torch.testing.assert_close(found, outputs, rtol=2e-3, atol=2e-3)
+
+    gradient = torch.randn(keys * count, 3, generator=torch.Generator().manual_seed(3))
+    slopes = TensorCores().backward(form, keys, gradient, found, kept)
+    stored(tmp_path, after=slopes.head.numpy(), head=weights[-1].numpy(), back=kept[0].numpy())
+    run(tmp_path, BACKWARD, wgmma.rows_backward, *numbers)
+    same = torch.from_numpy(np.fromfile(tmp_path / "slopes", np.float16)).view_as(slopes.layers)
+    torch.testing.assert_close(same, slopes.layers, rtol=5e-3, atol=2e-3)
+    partials = torch.from_numpy(np.fromfile(tmp_path / "partials", np.float32)).view(layers, keys, -1, WIDTH)
+    assert partials.shape[2] == BLOCKS * wgmma.GROUPS
+    scale = float(slopes.sums.abs().max())
+    torch.testing.assert_close(partials.sum(2), slopes.sums, rtol=2e-3, atol=2e-4 * scale)
+    assert float(slopes.layers.abs().max()) > 1
