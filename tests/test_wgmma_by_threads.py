@@ -255,7 +255,7 @@ def stored(folder, **arrays):
 @pytest.mark.skipif(COMPILER is None, reason="needs a C++ compiler")
 @pytest.mark.parametrize(
     ("layers", "skip_after", "count", "keys"),
-    [(8, 5, 33, 1), (3, 1, 70, 3), (2, 2, 64 * 2 * wgmma.ROUND + 65, 1)],
+    [(8, 5, 33, 1), (3, 1, 70, 3), (6, 3, 64 * 2 * wgmma.ROUND + 65, 1)],
     ids=["a tile", "tiles of several keys", "a tile more than a round"],
 )
 def test_a_block_of_threads_is_row_by_row(layers, skip_after, count, keys, tmp_path, monkeypatch):
