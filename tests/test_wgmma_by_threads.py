@@ -272,7 +272,7 @@ def test_a_block_of_threads_is_row_by_row(layers, skip_after, count, keys, tmp_p
         launch(kernel, dim, inputs, outputs, device)
         given[kernel.key] = [*inputs, *outputs]
 
-    from gftorf_warp.render import perceptron  # noqa: PLC0415
+    from gftorf_warp.render import perceptron
 
     launch = perceptron._launch
     monkeypatch.setattr(perceptron, "_launch", launched)
