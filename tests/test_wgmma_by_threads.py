@@ -1,7 +1,7 @@
 """What kernels/wgmma.py has for CUDA, executed by 256 threads of the CPU: a block, its barriers and its tensor cores.
 
-Instructions of PTX are replaced by functions that do what they say; all else is the code that a GPU gets. A product sees
-fragments and swizzled weights as wgmma does (PTX, m64n256k16), copies arrive late, and barriers are barriers.
+Instructions of PTX are replaced by functions that do what they say; all else is the code that a GPU gets. A product
+sees fragments and swizzled weights as wgmma does (PTX, m64n256k16), copies arrive late, and barriers are barriers.
 """
 
 import re
@@ -64,7 +64,8 @@ namespace wp {
 struct half { unsigned short u; };
 static float half_to_float(half h) {
     const unsigned e = h.u >> 10 & 31, m = h.u & 1023;
-    const float size = e == 31 ? (m ? NAN : INFINITY) : e ? std::ldexp(1024.0f + m, (int)e - 25) : std::ldexp((float)m, -24);
+    const float finite = e ? std::ldexp(1024.0f + m, (int)e - 25) : std::ldexp((float)m, -24);
+    const float size = e < 31 ? finite : m ? NAN : INFINITY;
     return h.u & 0x8000 ? -size : size;
 }
 static half float_to_half(float x) {
