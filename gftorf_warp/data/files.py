@@ -59,19 +59,19 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     """
     path = Path(path)
     sweep(path)
+    with one_of_many(path) as temporary:
+        yield temporary
     with as_errors(path):
-        with _renamed_to(path) as temporary:
-            yield temporary
-            with open(temporary, "rb+") as file:
-                os.fsync(file.fileno())
         flush_folder(path.parent)
 
 
 @contextlib.contextmanager
 def many_files(folder: str | Path) -> Iterator[None]:
-    """Let :func:`write_one_of_many` fill a folder: what lies in it is looked at once, and its names are flushed once.
+    """Let :func:`one_of_many` and :func:`write_one_of_many` fill a folder.
 
-    Doing so for every file makes each cost as much as there are files before it, and keeps threads waiting for Python's
+    What lies in it is looked at once, and its names are flushed once.
+
+    Doing both for every file makes each cost as much as there are files before it, and keeps threads waiting for Python's
     lock meanwhile: listing a folder gives it back and asks for it again with every name.
 
     Args:
@@ -87,6 +87,20 @@ def many_files(folder: str | Path) -> Iterator[None]:
     finally:
         with as_errors(folder):
             flush_folder(folder)
+
+
+@contextlib.contextmanager
+def one_of_many(path: Path) -> Iterator[Path]:
+    """A temporary name for a writer that wants one, in a folder that :func:`many_files` looks after.
+
+    Raises:
+        ResourceError: If the disk is full.
+        UsageError: If the place cannot be written to.
+    """
+    with as_errors(path), _renamed_to(path) as temporary:
+        yield temporary
+        with open(temporary, "rb+") as file:
+            os.fsync(file.fileno())
 
 
 def write_one_of_many(path: Path, data: bytes | memoryview) -> None:

@@ -1,13 +1,11 @@
-"""Pictures on disk: float32 OpenEXR for numbers, PNG for eyes.
+"""Pictures on disk: float32 OpenEXR for numbers, PNG for eyes. Every file is read back or checked before it counts.
 
-What ``gftorf render`` writes by the thousand is laid out here and not compressed. Compression takes 20 ms of a CPU for
-six 320x240 images and leaves four fifths of them, since the last bits of float32 are noise; and OpenEXR's own writer
-takes memory that is not contiguous for something else, and a full disk for none.
+Neither what is in EXR files nor previews of numbered colours are compressed: the last bits of float32 are noise, so
+that compressing takes 20 ms of a CPU for six 320x240 images and leaves four fifths of them.
 """
 
 from __future__ import annotations
 
-import functools
 import struct
 import zlib
 from collections.abc import Mapping
@@ -15,74 +13,50 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import InputError
+from ..errors import InputError, ResourceError
 from .arrays import SIDE_MAX
-from .files import atomic_write
+from .files import atomic_path, one_of_many
 
 CHANNELS_MAX = 256  # a rendering has a few dozen; a forged header may claim millions
-_SHORT = 31  # [bytes] of a channel's name; longer ones are announced in the version of the file
 
 
-def write_exr(path: str | Path, channels: Mapping[str, np.ndarray]) -> None:
+def write_exr(path: str | Path, channels: Mapping[str, np.ndarray], *, one_of: bool = False) -> None:
     """Write named float32 images of one size as an OpenEXR file, atomically.
 
     Args:
         path: The file; its folder must exist.
         channels: Images [H, W] by name, for example ``{"distance": ..., "quads.0": ...}``; any real type that float32
             holds. Viewers show the names R, G, B as colour. NaN is kept.
+        one_of: Whether it is one of many files, in a folder that ``files.many_files`` looks after.
 
     Raises:
         ValueError: If there are no channels, or their shapes differ or are not [H, W].
         UsageError, ResourceError: If the file cannot be written.
     """
-    atomic_write(path, exr_bytes(channels))
+    import OpenEXR
 
-
-def exr_bytes(channels: Mapping[str, np.ndarray]) -> memoryview:
-    """Named images of one size, see :func:`write_exr`, as the content of an OpenEXR file.
-
-    Raises:
-        ValueError: If there are no channels, or their shapes differ or are not [H, W].
-    """
-    shapes = {image.shape for image in channels.values()}
+    # a slice, a flip or Fortran order is written with wrong pixels and no error
+    images = {name: np.ascontiguousarray(image, dtype=np.float32) for name, image in channels.items()}
+    shapes = {image.shape for image in images.values()}
     if len(shapes) != 1 or len(next(iter(shapes))) != 2:
-        found = ", ".join(f"{name} {image.shape}" for name, image in channels.items()) or "none"
+        found = ", ".join(f"{name} {image.shape}" for name, image in images.items()) or "none"
         raise ValueError(f"channels must be images [H, W] of one shape, got {found}")
-    (height, width), names = next(iter(shapes)), sorted(channels, key=str.encode)
-    row = 8 + 4 * width * len(names)  # [bytes] its number, how many bytes follow, and the channels' pixels
-    start = _exr_start(tuple(name.encode() for name in names), height, width, row)
-    content = np.empty(len(start) + height * row, np.uint8)
-    content[: len(start)] = np.frombuffer(start, np.uint8)
-    rows = content[len(start) :].reshape(height, row)
-    rows[:, :4] = np.arange(height, dtype="<i4").view(np.uint8).reshape(height, 4)
-    rows[:, 4:8] = np.frombuffer(struct.pack("<i", row - 8), np.uint8)
-    pixels = rows[:, 8:].view("<f4").reshape(height, len(names), width)
-    for k, name in enumerate(names):
-        pixels[:, k] = channels[name]
-    return content.data
-
-
-@functools.lru_cache(maxsize=64)
-def _exr_start(names: tuple[bytes, ...], height: int, width: int, row: int) -> bytes:
-    """What stands before the rows, as OpenEXR writes it: one part, float32 scan lines; and where each begins."""
-    window = struct.pack("<4i", 0, 0, width - 1, height - 1)
-    of_channel = struct.pack("<iB3xii", 2, 0, 1, 1)  # float32, not for perception, every pixel
-    attributes = [
-        (b"channels", b"chlist", b"".join(name + b"\0" + of_channel for name in names) + b"\0"),
-        (b"compression", b"compression", b"\0"),
-        (b"dataWindow", b"box2i", window),
-        (b"displayWindow", b"box2i", window),
-        (b"lineOrder", b"lineOrder", b"\0"),
-        (b"pixelAspectRatio", b"float", struct.pack("<f", 1.0)),
-        (b"screenWindowCenter", b"v2f", struct.pack("<2f", 0.0, 0.0)),
-        (b"screenWindowWidth", b"float", struct.pack("<f", 1.0)),
-        (b"type", b"string", b"scanlineimage"),
-    ]
-    parts = [name + b"\0" + kind + b"\0" + struct.pack("<i", len(value)) + value for name, kind, value in attributes]
-    version = 2 | (0x400 if max(map(len, names)) > _SHORT else 0)
-    header = struct.pack("<2i", 20000630, version) + b"".join(parts) + b"\0"
-    begin = len(header) + 8 * height
-    return header + (begin + row * np.arange(height, dtype="<u8")).tobytes()
+    header = {"compression": OpenEXR.NO_COMPRESSION, "type": OpenEXR.scanlineimage}
+    with one_of_many(Path(path)) if one_of else atomic_path(path) as temporary:
+        temporary.touch(exist_ok=False)  # so that a place that cannot be written to is told from a disk that is full
+        try:
+            with OpenEXR.File(header, dict(images)) as file:  # it puts its own channels into the dictionary
+                file.write(str(temporary))
+        except RuntimeError as error:
+            raise ResourceError("cannot write picture", where=path, why=str(error), fix="free disk space") from error
+        back = read_exr(temporary)
+        if back.keys() != images.keys() or any(back[n].tobytes() != image.tobytes() for n, image in images.items()):
+            raise ResourceError(
+                "picture damaged while writing",
+                where=path,
+                why="reading it back gave other pixels",
+                fix="check the disk",
+            )
 
 
 def read_exr(path: str | Path) -> dict[str, np.ndarray]:

@@ -14,7 +14,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from ..data.files import many_files, write_one_of_many
-from ..data.images import exr_bytes
+from ..data.images import write_exr
 from . import previews
 from .pictures import Scale
 from .previews import Channels
@@ -75,7 +75,7 @@ def write_images(out: Path, scales: Mapping[str, Scale], index: int, images: Map
     """
     for name, channels in images.items():
         exr, png = previews.paths(out, name, index)
-        write_one_of_many(exr, exr_bytes(channels))
+        write_exr(exr, channels, one_of=True)
         write_one_of_many(png, previews.preview(name, channels, scales[name]))
 
 
