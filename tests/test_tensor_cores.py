@@ -14,6 +14,7 @@ from test_perceptron import compare_replay, distance, exact, gradients, half, ne
 from gftorf_warp.kernels import perceptron as kernels
 from gftorf_warp.kernels import slopes as ends
 from gftorf_warp.kernels import wgmma
+from gftorf_warp.kernels.sums import LANES
 from gftorf_warp.render import perceptron
 from gftorf_warp.render.bridge import array_over
 from gftorf_warp.render.perceptron import TensorCores, fits
@@ -314,7 +315,7 @@ def test_gradients_become_halves(count, device):
         count = min(count, 1_000)
     gradient = (1e-7 * (random(count, 3, seed=3) - 0.4)).to(device)
     gradient[count // 2, 1] = -3e-7
-    lanes, block = (1, 1) if device == "cpu" else (ends.LANES, ends.BLOCK)
+    lanes, block = (1, 1) if device == "cpu" else (LANES, ends.BLOCK)
     partials = torch.full((-(-count // lanes), 4), torch.nan, device=device)
     launched(ends.measure_rows, len(partials) * lanes, [array_over(gradient)], [array_over(partials)], device)
     torch.testing.assert_close(partials[:, :3].sum(0), gradient.sum(0), rtol=1e-5, atol=1e-12)

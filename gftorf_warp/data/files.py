@@ -71,8 +71,8 @@ def many_files(folder: str | Path) -> Iterator[None]:
 
     What lies in it is looked at once, and its names are flushed once.
 
-    Doing both for every file makes each cost as much as there are files before it, and keeps threads waiting for Python's
-    lock meanwhile: listing a folder gives it back and asks for it again with every name.
+    Doing both for every file makes each cost as much as there are files before it, and keeps threads waiting for
+    Python's lock meanwhile: listing a folder gives it back and asks for it again with every name.
 
     Args:
         folder: It must exist.

@@ -5,12 +5,11 @@ A kernel leaves one partial result per warp, on the CPU per row, and the next on
 
 import warp as wp
 
-WIDTH = 256  # columns that are added up
-COLUMNS = 32  # of them by one block of threads
+from .wgmma import WIDTH
+
+COLUMNS = 32  # that one block of threads adds up
 BLOCK = 256  # threads
 SLICES = BLOCK // COLUMNS
-LANES = 32
-VALUES = 3  # of an offset
 
 
 @wp.func_native("""

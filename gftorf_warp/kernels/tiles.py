@@ -74,6 +74,28 @@ def span_of(outline: wp.vec4, q: Splat, row: int, tiles: wp.vec4i, tile_width: i
     return wp.vec2i(x0, x1)
 
 
+@wp.func
+def rows_from(
+    outline: wp.vec4, q: Splat, top: int, lane: int, tiles: wp.vec4i, tile_width: int, tile_height: int
+) -> wp.vec2i:
+    """The rows of tiles from ``top`` on, one per lane: pairs up to this one's end; from a pair's number to its column.
+
+    Every lane must take part.
+    """
+    span = wp.vec2i(0, 0)
+    if top + lane < tiles[3]:
+        span = span_of(outline, q, top + lane, tiles, tile_width, tile_height)
+    sums = sum_of_lanes(span[1] - span[0])
+    return wp.vec2i(sums, span[1] - sums)
+
+
+@wp.func
+def tile_of(rows: wp.vec2i, pair: int, top: int, tiles_x: int) -> int:
+    """The tile of a pair by its number in the rows of :func:`rows_from`; every lane must ask, for one of its own."""
+    row = lane_beyond(rows[0], pair)
+    return (top + row) * tiles_x + of_lane(rows[1], row) + pair
+
+
 @wp.kernel(enable_backward=False, grid_stride=False)
 def mark_pairs(
     # In:
@@ -98,19 +120,14 @@ def mark_pairs(
         bit = wp.uint32(1) << wp.uint32(rank % 32)
         top = tiles[1]
         while top < tiles[3]:  # as all control here the same for all lanes of a warp
-            span = wp.vec2i(0, 0)
-            if top + lane < tiles[3]:
-                span = span_of(outline, q, top + lane, tiles, tile_width, tile_height)
-            sums = sum_of_lanes(span[1] - span[0])
-            count = of_lane(sums, lanes - 1)
-            shift = span[1] - sums  # from the number of a pair in these rows to its column
+            rows = rows_from(outline, q, top, lane, tiles, tile_width, tile_height)
+            count = of_lane(rows[0], lanes - 1)
             begin = int(0)
             while begin < count:
                 pair = begin + lane
-                row = lane_beyond(sums, pair)
-                x = of_lane(shift, row) + pair
+                tile = tile_of(rows, pair, top, tiles_x)
                 if pair < count:
-                    wp.atomic_or(bits, place_of_word((top + row) * tiles_x + x, rank // 32, words), bit)
+                    wp.atomic_or(bits, place_of_word(tile, rank // 32, words), bit)
                 begin += lanes
             top += lanes
 
@@ -185,19 +202,14 @@ def emit_pairs(
         tiles = tile_range(box_px[i], tile_width, tile_height)
         top = tiles[1]
         while top < tiles[3] and at < capacity:  # as all control here the same for all lanes of a warp
-            span = wp.vec2i(0, 0)
-            if top + lane < tiles[3]:
-                span = span_of(outline, q, top + lane, tiles, tile_width, tile_height)
-            sums = sum_of_lanes(span[1] - span[0])
-            count = of_lane(sums, lanes - 1)
-            shift = span[1] - sums  # from the number of a pair in these rows to its column
+            rows = rows_from(outline, q, top, lane, tiles, tile_width, tile_height)
+            count = of_lane(rows[0], lanes - 1)
             begin = int(0)
             while begin < count:
                 pair = begin + lane
-                row = lane_beyond(sums, pair)
-                x = of_lane(shift, row) + pair
+                tile = tile_of(rows, pair, top, tiles_x)
                 if pair < count and at + pair < capacity:
-                    keys[at + pair] = (top + row) * tiles_x + x
+                    keys[at + pair] = tile
                     ids[at + pair] = i
                 begin += lanes
             at += count

@@ -11,6 +11,7 @@ from torch import Tensor
 from ..kernels import perceptron as kernels
 from ..kernels import slopes as ends
 from ..kernels import wgmma
+from ..kernels.sums import LANES
 from ..scene.perceptron import LARGEST, SMALLEST, Form, Slopes, beside
 from .bridge import array_over, stream_of
 
@@ -53,7 +54,7 @@ class TensorCores:
         unit, total, sums = gradient.new_empty(1), gradient.new_empty(3), gradient.new_empty(layers, keys, form.width)
         blocks = wgmma.GROUPS * (1 if device.is_cpu else device.sm_count)
         partials = gradient.new_zeros(layers, keys, blocks, form.width)
-        lanes, block = (1, 1) if device.is_cpu else (ends.LANES, ends.BLOCK)
+        lanes, block = (1, 1) if device.is_cpu else (LANES, ends.BLOCK)
         parts = gradient.new_empty(-(-rows // lanes), 4)
         with stream_of(outputs):
             given, found = array_over(gradient.contiguous()), array_over(parts)
