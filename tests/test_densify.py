@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -10,6 +11,7 @@ from small_runs import KEYS, field, random
 from gftorf_warp.recon import densify
 from gftorf_warp.recon.optimiser import Optimiser, rates_at
 from gftorf_warp.recon.settings import DensifySettings, ReconSettings, Schedule
+from gftorf_warp.recon.step import unseen_are_due
 from gftorf_warp.render.api import ScreenGradient
 from gftorf_warp.scene.camera import Camera
 from gftorf_warp.scene.motion import Nodes
@@ -41,7 +43,8 @@ def moments(optimiser):
 
 def statistics(*gradient):
     """One pixel per Gaussian, with these gradients."""
-    return densify.Statistics(gradient=torch.tensor(gradient), pixels=torch.ones(len(gradient)))
+    zero = torch.zeros(len(gradient))
+    return densify.Statistics(gradient=torch.tensor(gradient), pixels=torch.ones(len(gradient)), earlier=zero)
 
 
 def generator():
@@ -62,7 +65,7 @@ def test_a_small_gaussian_is_cloned_with_fresh_moments():
     """The others keep their values and moments."""
     adam = optimiser()
     before, old = adam.field.map(torch.clone), moments(adam)
-    counts = densify.round_of(adam, statistics(0, 0, 1.0, 0, 0, 0), SETTINGS, generator(), judge_scale=False)
+    counts, _ = densify.round_of(adam, statistics(0, 0, 1.0, 0, 0, 0), SETTINGS, generator(), judge_scale=False)
     assert counts == {"cloned": 1, "split": 0, "pruned": 0}
     rows = torch.tensor([0, 1, 2, 3, 4, 5, 2])
     for name, value in adam.field.tensors().items():
@@ -83,7 +86,7 @@ def test_a_large_gaussian_is_split_in_two_smaller_ones_drawn_from_itself():
         half = math.sqrt(0.5)
         adam.tensors["quaternion"][1] = torch.tensor([half, 0.0, 0.0, half])  # turns its x axis to y
     before = adam.field.map(lambda t: t.detach().clone())
-    counts = densify.round_of(adam, statistics(0, 9.0, 0), SETTINGS, generator(), judge_scale=False)
+    counts, _ = densify.round_of(adam, statistics(0, 9.0, 0), SETTINGS, generator(), judge_scale=False)
     assert counts == {"cloned": 0, "split": 1, "pruned": 0}
     after = adam.field
     torch.testing.assert_close(after.mean.detach()[:2], before.mean[[0, 2]], rtol=0, atol=0)
@@ -124,12 +127,12 @@ def test_faint_gaussians_are_pruned_and_the_floor_holds():
         adam.tensors["opacity_logit"][[1, 4]] = -6.0
     kept = adam.tensors["mean"].detach()[[0, 2, 3, 5]].clone()
     old = moments(adam)
-    assert densify.prune(adam, SETTINGS, judge_scale=False) == 2
+    assert densify.prune(adam, SETTINGS, judge_scale=False).tolist() == [0, 2, 3, 5]
     torch.testing.assert_close(adam.tensors["mean"].detach(), kept, rtol=0, atol=0)
     torch.testing.assert_close(moments(adam)["mean"]["exp_avg"], old["mean"]["exp_avg"][[0, 2, 3, 5]])
     with torch.no_grad():
         adam.tensors["opacity_logit"][:3] = -6.0
-    assert densify.prune(adam, SETTINGS, judge_scale=False) == 0, "one would remain, the floor is two"
+    assert len(densify.prune(adam, SETTINGS, judge_scale=False)) == 4, "one would remain, the floor is two"
     assert len(adam.field) == 4
 
 
@@ -140,8 +143,40 @@ def test_sizes_are_judged_only_when_asked():
     with torch.no_grad():
         adam.tensors["log_scale"][0] = math.log(5.0)
         adam.tensors["log_scale"][1] = math.log(0.001)
-    assert densify.prune(adam, settings, judge_scale=False) == 0
-    assert densify.prune(adam, settings, judge_scale=True) == 2
+    assert len(densify.prune(adam, settings, judge_scale=False)) == 6
+    assert densify.prune(adam, settings, judge_scale=True).tolist() == [2, 3, 4, 5]
+
+
+def test_who_was_not_seen_goes_when_the_unseen_are_judged():
+    """What was seen before the last round counts as well, copies are as seen as what they come from."""
+    adam = optimiser()
+    before = adam.field.mean.detach().clone()
+    seen = statistics(0, 0, 1.0, 0, 0, 0)
+    seen.pixels[[1, 3, 4]] = 0.0
+    counts, seen = densify.round_of(adam, seen, SETTINGS, generator(), judge_scale=False)
+    assert counts == {"cloned": 1, "split": 0, "pruned": 0}, "nobody is judged"
+    assert seen.earlier.tolist() == [1, 0, 1, 0, 0, 1, 1]
+    assert seen.pixels.abs().sum() + seen.gradient.abs().sum() == 0
+    seen.pixels[3] = 2.0
+    with torch.no_grad():
+        adam.tensors["opacity_logit"][0] = -6.0
+    counts, seen = densify.round_of(adam, seen, SETTINGS, generator(), judge_scale=False, judge_unseen=True)
+    assert counts == {"cloned": 0, "split": 0, "pruned": 3}, "0 is faint, 1 and 4 are behind others"
+    torch.testing.assert_close(adam.field.mean.detach(), before[[2, 3, 5, 2]], rtol=0, atol=0)
+    assert seen.earlier.tolist() == [0, 0, 0, 0], "from here on it is judged anew"
+
+
+def test_the_unseen_are_due_when_every_raw_frame_was_compared():
+    """Rounds at 100, 200, .. of 60 raw frames: two epochs lie between judgements."""
+    observations = SimpleNamespace(batches=[[0] * 4] * 15)
+    state = SimpleNamespace(images=0, unseen_at=0)
+    due = []
+    for state.images in range(100, 1000, 100):
+        if unseen_are_due(state, observations, replace(SETTINGS, unseen_from=300)):
+            due.append(state.images)
+            state.unseen_at = state.images
+        assert not unseen_are_due(state, observations, SETTINGS)
+    assert due == [300, 500, 700, 900]
 
 
 def test_the_cap_lets_the_largest_gradients_through():

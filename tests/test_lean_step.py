@@ -245,7 +245,7 @@ def test_statistics_are_densifications(device, images):
     camera = Camera.from_fov(30, 20, 60.0)
     start = torch.rand(50, generator=generator).to(device)
     gradient, pixels = start.clone(), start.clone()
-    want = densify.Statistics(gradient=start.clone(), pixels=start.clone())
+    want = densify.Statistics(gradient=start.clone(), pixels=start.clone(), earlier=torch.zeros_like(start))
     for screen in screens:
         want = densify.observe(want, screen, camera)
     descent.observe(screens, (30, 20), descent.Ledger.empty(4, torch.device(device)), gradient, pixels)

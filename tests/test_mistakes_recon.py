@@ -144,10 +144,10 @@ def test_mistake_11_whatever_is_said_to_prune_does_so_in_a_round_that_also_adds(
     field = dots(np.random.default_rng(0).random((40, 3)) + np.array([0, 0, 2]), scale=0.05, opacity=0.5)
     field.opacity_logit[0], field.log_scale[1], field.log_scale[2] = -9.0, math.log(3.0), math.log(1e-4)
     settings = DensifySettings(every=100, gradient_min=1.0, scale_range=(1e-3, 0.5))
-    seen = densify.Statistics(gradient=torch.zeros(40), pixels=torch.ones(40))
+    seen = replace(densify.start(field), pixels=torch.ones(40))
     seen.gradient[10:14] = 2.0
     adam = Optimiser(field, Still(torch.tensor([0.0, 1.0])))
-    done = densify.round_of(adam, seen, settings, torch.Generator().manual_seed(0), judge_scale=True)
+    done, _ = densify.round_of(adam, seen, settings, torch.Generator().manual_seed(0), judge_scale=True)
     assert done == {"cloned": 4, "split": 0, "pruned": 3}
     left = adam.field
     assert left.opacity.min() > 0.4
@@ -160,7 +160,7 @@ def test_mistake_11_nothing_claims_to_prune_by_size_on_the_screen():
     field = dots([[0.0, 0.0, 0.5], *([[0.0, 0.0, 2.0]] * 20)], scale=[0.4] + [0.05] * 20)
     adam = Optimiser(field, Still(torch.tensor([0.0, 1.0])))
     settings = DensifySettings(every=100, gradient_min=None, scale_range=(1e-3, 0.5))
-    seen = densify.Statistics(gradient=torch.zeros(21), pixels=torch.full((21,), 1e5))
+    seen = replace(densify.start(field), pixels=torch.full((21,), 1e5))
     densify.round_of(adam, seen, settings, torch.Generator().manual_seed(0), judge_scale=True)
     assert len(adam.field) == 21
     names = {f.name for f in dataclasses.fields(DensifySettings)}

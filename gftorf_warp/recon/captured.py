@@ -146,7 +146,7 @@ class CapturedSteps:
         before, state.images = state.images, state.images + len(frames)
         variant = self._variant(frames, before)
         self._enter(variant)
-        rates = rates_at(settings, before, state.rate_factor, reset_at=state.reset_at)
+        rates = rates_at(settings, before, state.rate_factor, reset_at=state.reset_at, revived_at=state.revived_at)
         due = densify.round_is_due(before, state.images, settings.densify, settings.schedule)
         if due and settings.densify.loses_step:
             rates = {name: rate if name == "motion" else 0.0 for name, rate in rates.items()}
@@ -161,7 +161,7 @@ class CapturedSteps:
         else:
             run()
             self._watch()
-        densify_after(state, before, settings)
+        densify_after(state, self.observations, before, settings)
         if due or not self.padded.holds(state):
             self._look()
             self._adopt()

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ..render.api import ScreenGradient
@@ -28,6 +28,8 @@ class Statistics:
     """Sum of pixels times screen gradient, in half image sizes."""
     pixels: Float[Tensor, "N"]
     """Sum of the pixels each Gaussian contributed to."""
+    earlier: Float[Tensor, "N"]
+    """The same sum before that, back to when the unseen were last looked for."""
 
     @property
     def mean_gradient(self) -> Float[Tensor, "N"]:
@@ -35,17 +37,24 @@ class Statistics:
         return self.gradient / self.pixels.clamp_min(1.0)
 
 
+STATISTICS = [field.name for field in fields(Statistics)]
+
+
 def start(field: GaussianField) -> Statistics:
     """Nothing observed yet."""
     zero = field.opacity_logit.new_zeros(len(field))
-    return Statistics(gradient=zero, pixels=zero.clone())
+    return Statistics(gradient=zero, pixels=zero.clone(), earlier=zero.clone())
 
 
 def observe(statistics: Statistics, screen: ScreenGradient, camera: Camera) -> Statistics:
     """Add one image, after its backward pass."""
     x, y = screen.gradient.unbind(dim=1)  # two numbers as a tensor would be an upload, which makes a GPU wait
     length = torch.hypot(0.5 * camera.width * x, 0.5 * camera.height * y)
-    return Statistics(gradient=statistics.gradient + screen.pixels * length, pixels=statistics.pixels + screen.pixels)
+    return replace(
+        statistics,
+        gradient=statistics.gradient + screen.pixels * length,
+        pixels=statistics.pixels + screen.pixels,
+    )
 
 
 def crossed(before: int, after: int, every: int | None) -> bool:
@@ -81,7 +90,8 @@ def round_of(
     generator: torch.Generator,
     *,
     judge_scale: bool,
-) -> dict[str, int]:
+    judge_unseen: bool = False,
+) -> tuple[dict[str, int], Statistics]:
     """Clone small Gaussians and split large ones where the screen gradient is large, then prune.
 
     A split draws both halves from the Gaussian itself and replaces it. Copies keep opacity and layer, and their moments
@@ -93,15 +103,17 @@ def round_of(
         settings: Thresholds.
         generator: For the positions of halves.
         judge_scale: Whether too small and too large Gaussians are removed in this round.
+        judge_unseen: Whether those that no pixel has seen are; if so, the next time is judged from here on.
 
     Returns:
-        How many were cloned, split and pruned.
+        How many were cloned, split and pruned, and what is known of those that remain.
     """
     field = optimiser.field
     count = len(field)
     wanted = _wanted(field, statistics, settings)
     largest = field.scale.detach().amax(dim=1)
     clone, split = wanted & (largest <= settings.clone_scale_max), wanted & (largest > settings.clone_scale_max)
+    seen = statistics.earlier + statistics.pixels  # copies were seen as often as what they are copies of
     every = torch.arange(count, device=field.device)
     rows = torch.cat([every[~split], every[clone], every[split], every[split]])
     halves = torch.zeros(len(rows), dtype=torch.bool, device=field.device)
@@ -118,23 +130,34 @@ def round_of(
             return torch.where(halves[:, None], value - shrink, value) if name == "log_scale" else value
 
         optimiser.replace(rows, fresh, change)
-    pruned = prune(optimiser, settings, judge_scale=judge_scale)
-    return {"cloned": int(clone.sum()), "split": int(split.sum()), "pruned": pruned}
+        seen = seen[rows]
+    kept = prune(optimiser, settings, judge_scale=judge_scale, wanted=seen > 0.0 if judge_unseen else None)
+    counts = {"cloned": int(clone.sum()), "split": int(split.sum()), "pruned": len(rows) - len(kept)}
+    after = start(optimiser.field)
+    return counts, after if judge_unseen else replace(after, earlier=seen[kept])
 
 
-def prune(optimiser: Optimiser, settings: DensifySettings, *, judge_scale: bool) -> int:
-    """Remove faint Gaussians, and those of an unwanted size; none at all if too few would remain."""
+def prune(
+    optimiser: Optimiser, settings: DensifySettings, *, judge_scale: bool, wanted: Bool[Tensor, "N"] | None = None
+) -> Int[Tensor, "M"]:
+    """Remove faint Gaussians, those of an unwanted size and all but the ``wanted``; none if too few would remain.
+
+    Returns:
+        Numbers of those that were kept.
+    """
     field = optimiser.field
+    every = torch.arange(len(field), device=field.device)
     keep = field.opacity.detach() >= settings.opacity_min
     if judge_scale:
         largest = field.scale.detach().amax(dim=1)
         keep &= (largest >= settings.scale_range[0]) & (largest <= settings.scale_range[1])
-    remaining = int(keep.sum())
-    if remaining == len(field) or remaining < settings.gaussians_min:
-        return 0
-    rows = keep.nonzero()[:, 0]
+    if wanted is not None:
+        keep &= wanted
+    rows = every[keep]
+    if len(rows) == len(every) or len(rows) < settings.gaussians_min:
+        return every
     optimiser.replace(rows, torch.zeros_like(rows, dtype=torch.bool), lambda _, value: value)
-    return len(keep) - remaining
+    return rows
 
 
 def reset_opacity(optimiser: Optimiser, settings: DensifySettings) -> None:

@@ -21,18 +21,24 @@ MOTION = "motion"  # the group of everything that is not of the field
 
 
 def rates_at(
-    settings: ReconSettings, images: int, factor: float = 1.0, *, reset_at: int | None = None
+    settings: ReconSettings,
+    images: int,
+    factor: float = 1.0,
+    *,
+    reset_at: int | None = None,
+    revived_at: int | None = None,
 ) -> dict[str, float]:
     """Learning rate of every group after ``images`` optimised images; 0 where a group rests.
 
     Log-linear from ``rates`` to ``rates_last`` at the end of the run. The motion rests during the warm-up and for a
-    while after a reset of the opacities; the Gaussians rest once they are frozen.
+    while after a reset of the opacities; then its rate rises from none. The Gaussians rest once they are frozen.
 
     Args:
         settings: Rates and schedule.
         images: Progress.
         factor: Multiplies all rates; below 1 after the run had to go back to a checkpoint.
         reset_at: Progress at the last reset of the opacities; None: there was none.
+        revived_at: Progress when the motion was last drawn anew; None: it never was.
     """
     schedule = settings.schedule
     first, last = asdict(settings.rates), asdict(settings.rates_last)
@@ -47,6 +53,9 @@ def rates_at(
     paused = reset_at is not None and images < reset_at + schedule.pause_after_reset
     if images < schedule.warm_up or paused:
         rates["motion"] = 0.0
+    elif schedule.motion_ramp:
+        learnt = images - max(schedule.warm_up, revived_at or 0)
+        rates["motion"] *= min((learnt + images_of_step) / schedule.motion_ramp, 1.0)
     if frozen(settings, images):
         rates = {name: rate if name == "motion" else 0.0 for name, rate in rates.items()}
     return rates
@@ -185,6 +194,12 @@ class Optimiser:
         """Zero the moments of one tensor of the field."""
         for key, value in self.adam.state.get(self.tensors[name], {}).items():
             if key in MOMENTS:
+                value.zero_()
+
+    def forget_motion(self) -> None:
+        """Zero the moments of the motion and the number of its steps, as at the start."""
+        for leaf in self.motion:
+            for value in self.adam.state.get(leaf, {}).values():
                 value.zero_()
 
 

@@ -10,10 +10,10 @@ from torch import Tensor
 
 from ..render import descent
 from ..scene.gaussians import GaussianField
-from .densify import Statistics
+from .densify import STATISTICS, Statistics
 from .state import State
 
-BUCKET = 4096  # rows are added and taken away in such numbers
+BUCKET = 2048  # rows are added and taken away in such numbers
 DEAD = -30.0  # opacity logit of a row that nobody sees
 
 
@@ -68,9 +68,9 @@ class Padded:
         if self.layer is not None and state.optimiser.layer is not None:
             self._fill(self.layer, state.optimiser.layer)
         self._fill(self.attachment, state.attachment)
-        for name in ("gradient", "pixels"):
+        for name in STATISTICS:
             self._fill(getattr(self.statistics, name), getattr(state.statistics, name))
-        state.statistics = Statistics(gradient=self.statistics.gradient[:count], pixels=self.statistics.pixels[:count])
+        state.statistics = Statistics(**{name: getattr(self.statistics, name)[:count] for name in STATISTICS})
         return anew
 
     def _reserve(self, state: State, rows: int) -> None:
@@ -86,8 +86,7 @@ class Padded:
         self._motion = list(optimiser.motion)
         self.layer = None if optimiser.layer is None else like(optimiser.layer)
         self.attachment = like(state.attachment)
-        zero = like(tensors["opacity_logit"])
-        self.statistics = Statistics(gradient=zero, pixels=zero.clone())
+        self.statistics = Statistics(**{name: like(tensors["opacity_logit"]) for name in STATISTICS})
         self._motion_moments = [optimiser.moments_of(leaf) for leaf in self._motion]
 
     def _take(self, state: State, name: str, tensor: Tensor, count: int) -> None:

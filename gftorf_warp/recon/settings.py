@@ -157,6 +157,8 @@ class Schedule:
     """Nothing moves for so long, and the motion learns nothing [images]."""
     motion_decay_from: int = 0
     """The rate of the motion stays at its first value for so long and reaches its last at the end [images]."""
+    motion_ramp: int = 0
+    """The rate of the motion rises linearly over its first so many images [images]."""
     pause_after_reset: int = 0
     """The motion learns nothing for so long after every reset of the opacities [images]."""
     freeze_from: float | None = None
@@ -201,6 +203,9 @@ class DensifySettings:
     """Gaussians whose largest scale is outside are removed [m]."""
     scale_from: int = 3000
     """That is judged later than this [images]."""
+    unseen_from: int | None = None
+    """From here on rounds remove Gaussians that no pixel has seen while every raw frame was compared at least once
+    [images]; None: never. They are behind others in every image, so images stay as they are."""
     reset_every: int | None = None
     """Between two resets of all opacities to ``opacity_min`` [images]; None: never."""
     reset_faster: tuple[int, int] | None = None

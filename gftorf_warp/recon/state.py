@@ -58,6 +58,12 @@ class State:
     """Random starts before this one, all in the dark."""
     reset_at: int | None = None
     """Optimised images at the last reset of the opacities; None: there was none."""
+    revived_at: int | None = None
+    """Optimised images when the motion was last drawn anew; None: it never was."""
+    revivals: int = 0
+    """How often it was."""
+    unseen_at: int = 0
+    """Optimised images when Gaussians that nobody sees were last looked for."""
 
 
 def begin(observations: Observations, settings: ReconSettings, *, seed: int, device: torch.device | str) -> State:
@@ -117,7 +123,7 @@ def to_dict(state: State) -> dict[str, object]:
         "adam": state.optimiser.adam.state_dict(),
         "motion": _motion_to_dict(state.motion),
         "attachment": state.optimiser.field.mean.detach() if state.motion.follows_means else state.attachment,
-        "statistics": {"gradient": state.statistics.gradient, "pixels": state.statistics.pixels},
+        "statistics": {name: getattr(state.statistics, name) for name in densify.STATISTICS},
         "generator": state.generator.get_state(),
         "noise": state.noise.get_state(),
         "queue": list(state.queue),
@@ -129,6 +135,9 @@ def to_dict(state: State) -> dict[str, object]:
         "rollbacks": state.rollbacks,
         "restarts": state.restarts,
         "reset_at": state.reset_at,
+        "revived_at": state.revived_at,
+        "revivals": state.revivals,
+        "unseen_at": state.unseen_at,
     }
 
 
@@ -169,6 +178,7 @@ def field_and_motion(stored: dict, device: torch.device | str) -> tuple[Gaussian
 def from_dict(stored: dict, device: torch.device | str) -> State:
     """Rebuild a state from :func:`to_dict`; what follows is what would have followed, to the bit on a CPU."""
     field, motion, attachment = field_and_motion(stored, device)
+    seen: dict[str, Tensor] = stored["statistics"]  # earlier runs did not look for the unseen
     generator, noise = torch.Generator(), torch.Generator(device)
     generator.set_state(stored["generator"].cpu())
     drawn = stored["noise"].cpu()
@@ -180,12 +190,15 @@ def from_dict(stored: dict, device: torch.device | str) -> State:
         optimiser=Optimiser(field, motion, stored["adam"]),
         motion=motion,
         attachment=attachment,
-        statistics=densify.Statistics(**{name: value.to(device) for name, value in stored["statistics"].items()}),
+        statistics=replace(densify.start(field), **{name: value.to(device) for name, value in seen.items()}),
         generator=generator,
         noise=noise,
         queue=list(stored["queue"]),
         sums={name: value.to(device) for name, value in stored["sums"].items()},
         reset_at=stored.get("reset_at"),  # format 1 had none
         restarts=stored.get("restarts", 0),  # neither had earlier runs
+        revived_at=stored.get("revived_at"),
+        revivals=stored.get("revivals", 0),
+        unseen_at=stored.get("unseen_at", stored["images"]),
         **{name: stored[name] for name in ("images", "seconds", "rate_factor", "skipped", "rollbacks")},
     )

@@ -14,7 +14,7 @@ from . import densify
 from .objective import Seen, render_settings_at, terms, weights_at
 from .observations import Observations
 from .optimiser import frozen, rates_at
-from .settings import Kernels, ReconSettings, Weights
+from .settings import DensifySettings, Kernels, ReconSettings, Weights
 from .state import State
 
 Map = Callable[[Callable, Iterable], Iterable]
@@ -83,7 +83,7 @@ def step(
     checked = [value for found, _, _ in results for value in found.values()]
     present = [gradient for gradient in gradients if gradient is not None]
     checked += [torch.nn.utils.get_total_norm(present)] if present else []
-    rates = rates_at(settings, before, state.rate_factor, reset_at=state.reset_at)
+    rates = rates_at(settings, before, state.rate_factor, reset_at=state.reset_at, revived_at=state.revived_at)
     options = settings.densify
     due = densify.round_is_due(before, state.images, options, settings.schedule)
     if due and options.loses_step:
@@ -94,7 +94,7 @@ def step(
     for frame, (found, seen, _) in zip(frames, results, strict=True):
         _account(state, observations, frame, found, seen)
     state.optimiser.step(gradients, rates, settings.motion_gradient_max)
-    densify_after(state, before, settings)
+    densify_after(state, observations, before, settings)
     return None
 
 
@@ -185,15 +185,28 @@ def _account(state: State, observations: Observations, frame: int, found: dict[s
             state.statistics = densify.observe(state.statistics, rendering.screen, camera)
 
 
-def densify_after(state: State, before: int, settings: ReconSettings) -> None:
+def densify_after(state: State, observations: Observations, before: int, settings: ReconSettings) -> None:
     """Rounds and resets that are due after a step that began after ``before`` images."""
     options, schedule = settings.densify, settings.schedule
     if densify.round_is_due(before, state.images, options, schedule):
-        judge = state.images > options.scale_from
-        densify.round_of(state.optimiser, state.statistics, options, state.generator, judge_scale=judge)
-        field = state.optimiser.field
-        state.attachment = state.motion.attach(field)
-        state.statistics = densify.start(field)
+        unseen = unseen_are_due(state, observations, options)
+        _, state.statistics = densify.round_of(
+            state.optimiser,
+            state.statistics,
+            options,
+            state.generator,
+            judge_scale=state.images > options.scale_from,
+            judge_unseen=unseen,
+        )
+        if unseen:
+            state.unseen_at = state.images
+        state.attachment = state.motion.attach(state.optimiser.field)
     if densify.reset_is_due(before, state.images, options, schedule):
         densify.reset_opacity(state.optimiser, options)
         state.reset_at = state.images
+
+
+def unseen_are_due(state: State, observations: Observations, options: DensifySettings) -> bool:
+    """Whether a round removes who was not seen: two epochs since the last time contain every raw frame."""
+    frames = sum(len(batch) for batch in observations.batches)
+    return options.unseen_from is not None and state.images >= max(options.unseen_from, state.unseen_at + 2 * frames)

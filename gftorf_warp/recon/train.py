@@ -24,7 +24,7 @@ from ..data.sequence import Sequence, Truth
 from ..errors import DivergedError, InputError, UsageError
 from ..render.buffers import available_threads
 from ..scene.changes import Wording, changed
-from . import checkpoint, darkness, folder, presets
+from . import checkpoint, darkness, dead, folder, presets
 from .captured import steps_of
 from .config import config_of
 from .diagnostics import Watch
@@ -182,6 +182,7 @@ def _run(sequence, out, settings, config, seed, device, goes_on, begun, progress
             "images_optimised": state.images,
             "skipped": state.skipped,
             "restarts": state.restarts,
+            "revivals": state.revivals,
         },
     )
     LOG.info("%s is finished: %d images, %.1f s", out, state.images, state.seconds)
@@ -258,6 +259,8 @@ class _Loop:
                 every = self.settings.schedule.log_every
                 if state.images // every > before // every or state.images >= total:
                     self.report(state)
+                    if dead.is_dead(state, self.settings):
+                        dead.revive(state, self.settings)
                 if self.judged_at is not None and before < self.judged_at <= state.images and self.is_dark(state):
                     state = self.begin_again(state)
                     steps = steps_of(state, self.observations, self.settings, run_all)

@@ -69,12 +69,19 @@ class Network(Motion):
         self._layers = [torch.nn.Linear(size, width) for size in sizes]
         self.layers = torch.nn.ModuleList(self._layers)
         self.head = torch.nn.Linear(width, 3)
-        with torch.no_grad():
-            for layer in self._layers:
-                torch.nn.init.xavier_normal_(layer.weight, generator=generator)
-                layer.bias.zero_()
-            self.head.weight.normal_(0.0, HEAD_DEVIATION, generator=generator)
-            self.head.bias.zero_()
+        self.draw(generator)
+
+    @torch.no_grad()
+    def draw(self, generator: torch.Generator | None) -> None:
+        """Begin anew, in place: other weights, everything at rest."""
+        for layer in [*self._layers, self.head]:
+            drawn = torch.empty(layer.weight.shape)  # on the CPU, where the generator is
+            if layer is self.head:
+                drawn.normal_(0.0, HEAD_DEVIATION, generator=generator)
+            else:
+                torch.nn.init.xavier_normal_(drawn, generator=generator)
+            layer.weight.copy_(drawn)
+            layer.bias.zero_()
 
     @property
     def form(self) -> Form:
