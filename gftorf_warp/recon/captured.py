@@ -100,6 +100,25 @@ class _Image:
     """What was compared."""
 
 
+class _Sum(torch.autograd.Function):
+    """A sum of terms times weights of which only gradients are wanted: they cost nothing, and it has no value.
+
+    Not ``autograd.grad(terms, grad_outputs=weights)``: torch looks at shapes of gradients that it is given by means of
+    sympy, whose import takes longer than the first thousand steps.
+    """
+
+    @staticmethod
+    def forward(context, weights: list[Tensor], *terms: Tensor) -> Tensor:
+        """A number that means nothing."""
+        context.weights = weights
+        return torch.empty_like(terms[0])
+
+    @staticmethod
+    def backward(context, _: Tensor) -> tuple[Tensor | None, ...]:
+        """The weights, for a gradient of one."""
+        return None, *context.weights
+
+
 class CapturedSteps:
     """The steps of one run. Between two steps the state is as single steps leave it, but for what is on its way."""
 
@@ -168,7 +187,8 @@ class CapturedSteps:
 
     def _enter(self, variant: Variant) -> None:
         """Let go of graphs of a part of the run that is over, and prepare what rests in the one that begins."""
-        part = variant.moves, variant.rests, variant.weights, variant.sh_degree
+        others = replace(variant.weights, flow=0.0)  # flow comes and goes, ``Schedule.flow_every``
+        part = variant.moves, variant.rests, others, variant.sh_degree
         if part == self._part:
             return
         if self._graphs:
@@ -300,8 +320,8 @@ class CapturedSteps:
         gradients: list[Tensor | None] = [None] * len(wanted)
         if terms:  # the loss is their sum, but nobody needs that number before the end
             values, weights = zip(*terms, strict=True)
-            ones = [self._one_times(weight) for weight in weights]
-            gradients = [*torch.autograd.grad(values, wanted, ones, allow_unused=True)]
+            loss = _Sum.apply([self._one_times(weight) for weight in weights], *values)
+            gradients = [*torch.autograd.grad(loss, wanted, allow_unused=True)]
         with torch.no_grad():
             gradients = [None if gradient is None else gradient.contiguous() for gradient in gradients]
             table.point([*absent, *gradients])

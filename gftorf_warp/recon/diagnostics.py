@@ -123,20 +123,20 @@ class Watch:
         """Images [S, H, W] as the numbers of a row."""
         everywhere = torch.ones_like(images["d"], dtype=torch.bool)
         groups = {"": everywhere, "moving.": self.moving, "static.": self.static}
-        row: Row = {}
+        wanted: dict[str, tuple[Tensor | None, Tensor | None]] = {}
         for prefix, mask in groups.items():
             for name in ("d", "d_tof"):
-                value = None
+                wanted[f"{prefix}{name}_mse_x100"] = None, None
                 if self.truth is not None and mask is not None:
-                    value = _mean((images[name] - self.truth).square(), mask & ~self.truth.isnan())
-                row[f"{prefix}{name}_mse_x100"] = None if value is None else 100.0 * value
-        row["transmittance"] = _mean(1.0 - images["opacity"], everywhere)
-        row["distortion"] = _mean(images["distortion"], everywhere)
+                    error = 100.0 * (images[name] - self.truth).square()
+                    wanted[f"{prefix}{name}_mse_x100"] = error, mask & ~self.truth.isnan()
+        wanted["transmittance"] = 1.0 - images["opacity"], everywhere
+        wanted["distortion"] = images["distortion"], everywhere
         period = common_range(self.observations.sensor)
         apart = torch.remainder(images["d"] - images["d_tof"] + 0.5 * period, period) - 0.5 * period
-        row["offset_static_m"] = _mean(images["offset"], self.static)
-        row["d_minus_dtof_static_m"] = _mean(apart.abs(), self.static)
-        return row
+        wanted["offset_static_m"] = images["offset"], self.static
+        wanted["d_minus_dtof_static_m"] = apart.abs(), self.static
+        return _means(wanted)
 
 
 def watched_frames(sequence: Sequence, truth: Truth | None) -> list[int]:
@@ -166,9 +166,13 @@ def _mark(images: int, total: int) -> int:
     return math.isqrt(ROWS * ROWS * images // total)
 
 
-def _mean(image: Tensor, mask: Tensor | None) -> float | None:
-    """Mean over a mask in double precision; None without a mask, without a pixel, or if it is not finite."""
-    if mask is None or not bool(mask.any()):
-        return None
-    value = float(image[mask].double().mean())
-    return value if math.isfinite(value) else None
+def _means(images: dict[str, tuple[Tensor | None, Tensor | None]]) -> Row:
+    """Means over masks in double precision, None without a mask, without a pixel, or if not finite; one look at all."""
+    there = {name: (image, mask) for name, (image, mask) in images.items() if image is not None and mask is not None}
+    found = [(torch.where(mask, image, 0.0).double().sum(), mask.sum().double()) for image, mask in there.values()]
+    numbers = torch.stack([part for pair in found for part in pair]).view(-1, 2).tolist()
+    means: Row = dict.fromkeys(images)
+    for name, (total, count) in zip(there, numbers, strict=True):
+        if count and math.isfinite(total):
+            means[name] = total / count
+    return means

@@ -38,12 +38,17 @@ class Seen:
 
 
 def weights_at(settings: ReconSettings, images: int) -> Weights:
-    """The weights in force after ``images`` optimised images: terms that have not begun weigh nothing."""
+    """The weights in force after ``images`` optimised images: terms that have not begun weigh nothing.
+
+    Flow weighs ``flow_every`` times as much in one step of so many, counted as if all steps were quartets, and nothing
+    in the others: on average the same.
+    """
     schedule, weights = settings.schedule, settings.weights
+    flows = images >= schedule.flow_from and images // settings.cycle % schedule.flow_every == 0
     return replace(
         weights,
         distortion=weights.distortion if images >= schedule.distortion_from * schedule.images else 0.0,
-        flow=weights.flow if images >= schedule.flow_from else 0.0,
+        flow=schedule.flow_every * weights.flow if flows else 0.0,
         colour=weights.colour if images >= schedule.colour_from else 0.0,
     )
 

@@ -167,6 +167,8 @@ class Schedule:
     """The colour loss begins here [images]."""
     flow_from: int = 0
     """The flow loss begins here [images]."""
+    flow_every: int = 1
+    """It is part of one in so many steps only, and weighs so many times as much there."""
     distortion_from: float = 0.0
     """The depth distortion begins at this share of the run [1]."""
     sh_degree_every: int | None = None
@@ -177,8 +179,9 @@ class Schedule:
     """Between two checkpoints [s]; changes no result."""
 
     def __post_init__(self):
-        if self.images < 1 or self.log_every < 1:
-            raise ValueError(f"images and log_every must be at least 1, got {self.images} and {self.log_every}")
+        for name in ("images", "log_every", "flow_every"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
         if self.sh_degree_every is not None and self.sh_degree_every < 1:
             raise ValueError(f"sh_degree_every must be at least 1 or None, got {self.sh_degree_every}")
 
