@@ -44,7 +44,8 @@ def moments(optimiser):
 def statistics(*gradient):
     """One pixel per Gaussian, with these gradients."""
     zero = torch.zeros(len(gradient))
-    return densify.Statistics(gradient=torch.tensor(gradient), pixels=torch.ones(len(gradient)), earlier=zero)
+    one = torch.ones(len(gradient))
+    return densify.Statistics(gradient=torch.tensor(gradient), pixels=one, weight=0.25 * one, earlier=zero)
 
 
 def generator():
@@ -55,9 +56,9 @@ def generator():
 def test_the_statistic_is_the_pixel_weighted_mean_in_half_image_sizes():
     """Two images, worked out by hand."""
     seen = densify.start(field(random(2, 3), None))
-    for gradient, pixels in (([[0.3, 0.0], [0.0, 0.1]], [2.0, 0.0]), ([[0.0, 0.4], [0.0, 0.2]], [6.0, 5.0])):
-        screen = ScreenGradient(gradient=torch.tensor(gradient), pixels=torch.tensor(pixels))
-        seen = densify.observe(seen, screen, CAMERA)
+    for values in ([[0.3, 0, 2, 0.5], [0, 0.1, 0, 0]], [[0, 0.4, 6, 3], [0, 0.2, 5, 0.25]]):
+        seen = densify.observe(seen, ScreenGradient(values=torch.tensor(values)), CAMERA)
+    assert seen.weight.tolist() == [3.5, 0.25]
     torch.testing.assert_close(seen.mean_gradient, torch.tensor([(2 * 6.0 + 6 * 4.0) / 8, 2.0]))
 
 
@@ -152,15 +153,15 @@ def test_who_was_not_seen_goes_when_the_unseen_are_judged():
     adam = optimiser()
     before = adam.field.mean.detach().clone()
     seen = statistics(0, 0, 1.0, 0, 0, 0)
-    seen.pixels[[1, 3, 4]] = 0.0
+    seen.weight[[1, 3, 4]] = 0.0
     counts, seen = densify.round_of(adam, seen, SETTINGS, generator(), judge_scale=False)
     assert counts == {"cloned": 1, "split": 0, "pruned": 0}, "nobody is judged"
-    assert seen.earlier.tolist() == [1, 0, 1, 0, 0, 1, 1]
-    assert seen.pixels.abs().sum() + seen.gradient.abs().sum() == 0
-    seen.pixels[3] = 2.0
+    assert seen.earlier.tolist() == [0.25, 0, 0.25, 0, 0, 0.25, 0.25]
+    assert seen.weight.abs().sum() + seen.pixels.abs().sum() + seen.gradient.abs().sum() == 0
+    seen.weight[[3, 4]] = torch.tensor([2.0, 0.125])
     with torch.no_grad():
         adam.tensors["opacity_logit"][0] = -6.0
-    counts, seen = densify.round_of(adam, seen, SETTINGS, generator(), judge_scale=False, judge_unseen=True)
+    counts, seen = densify.round_of(adam, seen, SETTINGS, generator(), judge_scale=False, unseen_weight=0.125)
     assert counts == {"cloned": 0, "split": 0, "pruned": 3}, "0 is faint, 1 and 4 are behind others"
     torch.testing.assert_close(adam.field.mean.detach(), before[[2, 3, 5, 2]], rtol=0, atol=0)
     assert seen.earlier.tolist() == [0, 0, 0, 0], "from here on it is judged anew"

@@ -228,8 +228,8 @@ def test_a_step_that_is_not_sound_changes_nothing_but_counts(device, broken):
     assert torch.equal(case.ledger.sums, sums)
     assert case.ledger.counts.tolist() == ([2, 2, 10, 2] if broken == "pairs" else [2, 2, 5, 0])
     gradient = torch.zeros(20, device=device)
-    screen = ScreenGradient(gradient=torch.ones(20, 2, device=device), pixels=torch.ones(20, device=device))
-    descent.observe([screen], (8, 6), case.ledger, gradient, gradient.clone())
+    screen = ScreenGradient(values=torch.ones(20, 4, device=device))
+    descent.observe([screen], (8, 6), case.ledger, gradient, gradient.clone(), gradient.clone())
     assert not gradient.any()
     case.step(drawn, 1.0, quads=1.0)
     assert case.ledger.counts.tolist()[:2] == [2, 0]
@@ -238,16 +238,16 @@ def test_a_step_that_is_not_sound_changes_nothing_but_counts(device, broken):
 
 @pytest.mark.parametrize("images", [1, 2, 3, 4])
 def test_statistics_are_densifications(device, images):
-    """Views of a wider tensor, as a rendering fills it, of one to four images."""
+    """Of one to four images."""
     generator = torch.Generator().manual_seed(0)
-    wide = [torch.rand(50, 3, generator=generator).to(device) for _ in range(images)]
-    screens = [ScreenGradient(gradient=w[:, :2], pixels=w[:, 2]) for w in wide]
+    screens = [ScreenGradient(values=torch.rand(50, 4, generator=generator).to(device)) for _ in range(images)]
     camera = Camera.from_fov(30, 20, 60.0)
     start = torch.rand(50, generator=generator).to(device)
-    gradient, pixels = start.clone(), start.clone()
-    want = densify.Statistics(gradient=start.clone(), pixels=start.clone(), earlier=torch.zeros_like(start))
+    names = ["gradient", "pixels", "weight"]
+    sums = {name: start.clone() for name in names}
+    want = densify.Statistics(**{name: start.clone() for name in names}, earlier=torch.zeros_like(start))
     for screen in screens:
         want = densify.observe(want, screen, camera)
-    descent.observe(screens, (30, 20), descent.Ledger.empty(4, torch.device(device)), gradient, pixels)
-    torch.testing.assert_close(gradient, want.gradient, rtol=1e-5, atol=1e-6)
-    torch.testing.assert_close(pixels, want.pixels, rtol=1e-5, atol=1e-6)
+    descent.observe(screens, (30, 20), descent.Ledger.empty(4, torch.device(device)), **sums)
+    for name in names:
+        torch.testing.assert_close(sums[name], getattr(want, name), rtol=1e-5, atol=1e-6)

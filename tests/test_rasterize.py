@@ -230,3 +230,6 @@ def test_screen_gradients_and_pixel_counts(name, device):
     assert (got.gradient.cpu() - want.gradient).abs().max() <= TOLERANCE.gradient * scale
     assert want.pixels.max() > 20
     assert ((got.pixels.cpu() - want.pixels).abs() <= undecided.sum()).all()
+    assert want.weight.max() > 5
+    margin = 1e-4 * want.weight.max() + undecided.sum() / 255
+    assert ((got.weight.cpu() - want.weight).abs() <= margin).all()

@@ -284,7 +284,7 @@ def make_gradient_rounds(
             const int c = (4 * part + j) % {tile_width};
             {moments}
             {end_of_row.replace("WIDTH", str(tile_width))}
-            {f"sums[6] += __saturatef(w_[j] * {HIT}f);" if geometry else ""}
+            {f"sums[6] += __saturatef(w_[j] * {HIT}f); sums[7] += w_[j];" if geometry else ""}
             {coloured}
             {further}
             {lit}

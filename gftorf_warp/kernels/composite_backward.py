@@ -50,6 +50,7 @@ def _add_moments(K: int, light: bool, channels: bool, geometry: bool, cooperativ
     if geometry:
         values |= {"v": "v_", "dx": "v_ * dx_", "dx2": "v_ * dx_ * dx_", "dxdy": "v_ * dx_ * dy_"}
         values |= {"dy": "v_ * dy_", "dy2": "v_ * dy_ * dy_", "count": "alpha_ > 0.0f ? (F)(1.0f) : (F)(0.0f)"}
+        values |= {"weight": "w_"}
     if channels:
         values |= {"c0": "w_ * g0_", "c1": "w_ * g1_", "c2": "w_ * g2_"}
     if light:
@@ -63,7 +64,7 @@ def _add_moments(K: int, light: bool, channels: bool, geometry: bool, cooperativ
         "dy2",
         "v",
         "count",
-        "",
+        "weight",
         "c0",
         "c1",
         "c2",
@@ -195,7 +196,7 @@ def make_composite_backward(
         grad_channel: wp.array3d[V],  # [3, tiles, lanes] gradients of the three channels
         grad_more: wp.array3d[V],  # [3, tiles, lanes] gradients of the further channels
         # Out:
-        grad_splats: wp.array[Splat],  # [N] added to: moments in slots 0-5, pixels in slot 6, gradients in 8-15
+        grad_splats: wp.array[Splat],  # [N] added to: moments in 0-5, pixels in 6, weights in 7, gradients in 8-15
         more_splats: wp.array[Splat],  # [N] added to: slots 8-10, gradients of the further channels
     ):
         """One thread per block of K pixels; visits exactly the contributors of the forward pass, last one first."""

@@ -140,42 +140,40 @@ def judge_step(
 
 
 @wp.func
-def seen_of(gradient: wp.array2d[float], pixels: wp.array[float], half: wp.vec2, i: int) -> wp.vec2:
-    """What one image says of a Gaussian: pixels times screen gradient, and pixels."""
-    length = wp.length(wp.vec2(half[0] * gradient[i, 0], half[1] * gradient[i, 1]))
-    return wp.vec2(pixels[i] * length, pixels[i])
+def seen_of(screen: wp.array2d[float], half: wp.vec2, i: int) -> wp.vec3:
+    """What one image says of a Gaussian: pixels times screen gradient, pixels, and its weight in them."""
+    length = wp.length(wp.vec2(half[0] * screen[i, 0], half[1] * screen[i, 1]))
+    return wp.vec3(screen[i, 2] * length, screen[i, 2], screen[i, 3])
 
 
 @wp.kernel(enable_backward=False)
 def observe(
     # In:
-    gradient0: wp.array2d[float],  # [N, 2] derivative of the loss of the first image by the image position [1/px]
-    gradient1: wp.array2d[float],  # [N, 2] of the second; any other if there is none
-    gradient2: wp.array2d[float],  # [N, 2] of the third
-    gradient3: wp.array2d[float],  # [N, 2] of the fourth
-    pixels0: wp.array[float],  # [N] pixels of the first image [1]
-    pixels1: wp.array[float],  # [N] of the second; any other if there is none
-    pixels2: wp.array[float],  # [N] of the third
-    pixels3: wp.array[float],  # [N] of the fourth
+    screen0: wp.array2d[float],  # [N, 4] of the first image: derivative by the image position [1/px], pixels, weight
+    screen1: wp.array2d[float],  # [N, 4] of the second; any other if there is none
+    screen2: wp.array2d[float],  # [N, 4] of the third
+    screen3: wp.array2d[float],  # [N, 4] of the fourth
     images: int,  # 1 to 4 [1]
     half: wp.vec2,  # half an image [px]
     counts: wp.array[int],  # [4] the second is 0 if the step is sound [1]
     # Out:
     gradient: wp.array[float],  # [N] sum of pixels times screen gradient, in half image sizes
     pixels: wp.array[float],  # [N] sum of pixels [1]
+    weight: wp.array[float],  # [N] sum of weights [px]
 ):
     """One thread per Gaussian."""
     i = wp.tid()
     if counts[1] == 0:
-        seen = seen_of(gradient0, pixels0, half, i)
+        seen = seen_of(screen0, half, i)
         if images > 1:
-            seen = seen + seen_of(gradient1, pixels1, half, i)
+            seen = seen + seen_of(screen1, half, i)
         if images > 2:
-            seen = seen + seen_of(gradient2, pixels2, half, i)
+            seen = seen + seen_of(screen2, half, i)
         if images > 3:
-            seen = seen + seen_of(gradient3, pixels3, half, i)
+            seen = seen + seen_of(screen3, half, i)
         gradient[i] = gradient[i] + seen[0]
         pixels[i] = pixels[i] + seen[1]
+        weight[i] = weight[i] + seen[2]
 
 
 @wp.kernel(enable_backward=False, grid_stride=False)

@@ -35,7 +35,7 @@ def visit_of(opacity: float, cov: wp.vec4) -> wp.vec2:
 
 @wp.func_grad(visit_of)
 def adj_visit_of(opacity: float, cov: wp.vec4, adj_ret: wp.vec2):
-    """No derivative: slot 6 of a gradient record is free to count pixels."""
+    """No derivative: slots 6 and 7 of a gradient record are free to count pixels and to sum weights."""
 
 
 @wp.func

@@ -6,7 +6,8 @@ Sixteen floats, one 64-byte line, the same slots for values and for gradients:
     2 P   3 Q   4 R  power = P dx^2 + Q dx dy + R dy^2, the logarithm of the Gaussian; minus half the conic [1/px^2]
     5 opacity        at the peak [1]
     6 low            -ln(255 opacity): where the power is below it, alpha < 1/255; of a gradient: pixels reached
-    7 limit          the power at the middle of a block is below it: the splat misses the block; no gradient
+    7 limit          the power at the middle of a block is below it: the splat misses the block; of a gradient: weights
+                     w, summed over pixels
     8 9 10           three channels weighed by T, for example colour
     11 12 13         a cos psi, a sin psi, a: what quads and phasor are made of, weighed by T^2
     14 distance      along the ray [m]

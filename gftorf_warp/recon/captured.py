@@ -332,7 +332,8 @@ class CapturedSteps:
             if screens:
                 camera, statistics = self.observations.cameras[0], padded.statistics
                 size = camera.width, camera.height
-                descent.observe(screens, size, self._ledger, statistics.gradient, statistics.pixels)
+                sums = statistics.gradient, statistics.pixels, statistics.weight
+                descent.observe(screens, size, self._ledger, *sums)
 
     def _image(self, variant: Variant, n: int, field, offsets: Tensor | None, render: RenderSettings) -> _Image:
         """One image of the batch, compared."""

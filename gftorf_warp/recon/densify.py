@@ -28,8 +28,10 @@ class Statistics:
     """Sum of pixels times screen gradient, in half image sizes."""
     pixels: Float[Tensor, "N"]
     """Sum of the pixels each Gaussian contributed to."""
+    weight: Float[Tensor, "N"]
+    """Sum of the weights in these pixels [px]."""
     earlier: Float[Tensor, "N"]
-    """The same sum before that, back to when the unseen were last looked for."""
+    """The same sum before that, back to when the unseen were last looked for [px]."""
 
     @property
     def mean_gradient(self) -> Float[Tensor, "N"]:
@@ -43,7 +45,7 @@ STATISTICS = [field.name for field in fields(Statistics)]
 def start(field: GaussianField) -> Statistics:
     """Nothing observed yet."""
     zero = field.opacity_logit.new_zeros(len(field))
-    return Statistics(gradient=zero, pixels=zero.clone(), earlier=zero.clone())
+    return Statistics(gradient=zero, pixels=zero.clone(), weight=zero.clone(), earlier=zero.clone())
 
 
 def observe(statistics: Statistics, screen: ScreenGradient, camera: Camera) -> Statistics:
@@ -54,6 +56,7 @@ def observe(statistics: Statistics, screen: ScreenGradient, camera: Camera) -> S
         statistics,
         gradient=statistics.gradient + screen.pixels * length,
         pixels=statistics.pixels + screen.pixels,
+        weight=statistics.weight + screen.weight,
     )
 
 
@@ -90,7 +93,7 @@ def round_of(
     generator: torch.Generator,
     *,
     judge_scale: bool,
-    judge_unseen: bool = False,
+    unseen_weight: float | None = None,
 ) -> tuple[dict[str, int], Statistics]:
     """Clone small Gaussians and split large ones where the screen gradient is large, then prune.
 
@@ -103,7 +106,8 @@ def round_of(
         settings: Thresholds.
         generator: For the positions of halves.
         judge_scale: Whether too small and too large Gaussians are removed in this round.
-        judge_unseen: Whether those that no pixel has seen are; if so, the next time is judged from here on.
+        unseen_weight: Gaussians of at most so much weight since the last time are, too, and from here on it is summed
+            anew [px]; None: nobody is.
 
     Returns:
         How many were cloned, split and pruned, and what is known of those that remain.
@@ -113,7 +117,7 @@ def round_of(
     wanted = _wanted(field, statistics, settings)
     largest = field.scale.detach().amax(dim=1)
     clone, split = wanted & (largest <= settings.clone_scale_max), wanted & (largest > settings.clone_scale_max)
-    seen = statistics.earlier + statistics.pixels  # copies were seen as often as what they are copies of
+    seen = statistics.earlier + statistics.weight  # copies have been seen as much as what they are copies of
     every = torch.arange(count, device=field.device)
     rows = torch.cat([every[~split], every[clone], every[split], every[split]])
     halves = torch.zeros(len(rows), dtype=torch.bool, device=field.device)
@@ -131,10 +135,11 @@ def round_of(
 
         optimiser.replace(rows, fresh, change)
         seen = seen[rows]
-    kept = prune(optimiser, settings, judge_scale=judge_scale, wanted=seen > 0.0 if judge_unseen else None)
+    heavy = None if unseen_weight is None else seen > unseen_weight
+    kept = prune(optimiser, settings, judge_scale=judge_scale, wanted=heavy)
     counts = {"cloned": int(clone.sum()), "split": int(split.sum()), "pruned": len(rows) - len(kept)}
     after = start(optimiser.field)
-    return counts, after if judge_unseen else replace(after, earlier=seen[kept])
+    return counts, replace(after, earlier=seen[kept]) if unseen_weight is None else after
 
 
 def prune(

@@ -207,8 +207,10 @@ class DensifySettings:
     scale_from: int = 3000
     """That is judged later than this [images]."""
     unseen_from: int | None = None
-    """From here on rounds remove Gaussians that no pixel has seen while every raw frame was compared at least once
-    [images]; None: never. They are behind others in every image, so images stay as they are."""
+    """From here on rounds remove Gaussians that are behind others in every image [images]; None: never."""
+    unseen_weight: float = 0.0
+    """These are Gaussians whose weight in an image, summed over its pixels, is at most so much on average, over all
+    images since the last time, among which every raw frame is [px]. With 0 images stay as they are."""
     reset_every: int | None = None
     """Between two resets of all opacities to ``opacity_min`` [images]; None: never."""
     reset_faster: tuple[int, int] | None = None

@@ -189,16 +189,17 @@ def densify_after(state: State, observations: Observations, before: int, setting
     """Rounds and resets that are due after a step that began after ``before`` images."""
     options, schedule = settings.densify, settings.schedule
     if densify.round_is_due(before, state.images, options, schedule):
-        unseen = unseen_are_due(state, observations, options)
+        unseen = options.unseen_weight * (state.images - state.unseen_at)
+        looks = unseen_are_due(state, observations, options)
         _, state.statistics = densify.round_of(
             state.optimiser,
             state.statistics,
             options,
             state.generator,
             judge_scale=state.images > options.scale_from,
-            judge_unseen=unseen,
+            unseen_weight=unseen if looks else None,
         )
-        if unseen:
+        if looks:
             state.unseen_at = state.images
         state.attachment = state.motion.attach(state.optimiser.field)
     if densify.reset_is_due(before, state.images, options, schedule):

@@ -62,10 +62,23 @@ class Rendering:
 class ScreenGradient:
     """What densification looks at: zero until a backward pass has run, then what the last one said."""
 
-    gradient: Float[Tensor, "N 2"]
-    """Derivative of the loss by the image position of each Gaussian [1/px]."""
-    pixels: Float[Tensor, "N"]
-    """Number of pixels each Gaussian contributed to."""
+    values: Float[Tensor, "N 4"]
+    """All of it, side by side."""
+
+    @property
+    def gradient(self) -> Float[Tensor, "N 2"]:
+        """Derivative of the loss by the image position of each Gaussian [1/px]."""
+        return self.values[:, :2]
+
+    @property
+    def pixels(self) -> Float[Tensor, "N"]:
+        """Number of pixels each Gaussian contributed to."""
+        return self.values[:, 2]
+
+    @property
+    def weight(self) -> Float[Tensor, "N"]:
+        """Sum of its weights w = alpha T in them [px]: how much of the image it is."""
+        return self.values[:, 3]
 
 
 def rasterize(
@@ -121,7 +134,7 @@ def rasterize(
         if tensor is not None and (tensor.dtype != torch.float32 or tensor.device != field.device):
             want = f"float32 on {field.device}, where the field is"
             raise ValueError(f"{name} is {tensor.dtype} on {tensor.device}, must be {want}")
-    screen = torch.zeros(count, 3, device=field.device) if screen_gradient else None
+    screen = torch.zeros(count, 4, device=field.device) if screen_gradient else None
     ordered = [None if t is None else t.contiguous() for t in (tensors[name] for name in INPUTS)]
     shifts = tuple(float(shift) for shift in sensor.shifts)
     request = Request(
@@ -139,9 +152,7 @@ def rasterize(
             found[name] = left_out(name, field.mean, *size)
     if extra is not None and found["extra"] is None:
         found["extra"] = extra.new_zeros(0, *size)
-    return Rendering(
-        **found, screen=None if screen is None else ScreenGradient(gradient=screen[:, :2], pixels=screen[:, 2])
-    )
+    return Rendering(**found, screen=None if screen is None else ScreenGradient(values=screen))
 
 
 def _spread(name: str, value: Tensor | float, shape: tuple[int, ...], field: GaussianField) -> Tensor:

@@ -36,7 +36,7 @@ class Request:
     settings: RenderSettings
     """How."""
     screen: Tensor | None = None
-    """[N, 3] that backward fills with the screen gradient and the number of pixels; None: not wanted."""
+    """[N, 4] that backward fills with screen gradient, pixels and weight, ``api.ScreenGradient``; None: not wanted."""
     images: frozenset[str]
     """Names of what is wanted of quads, phasor, distance, opacity and distortion; colour and extra always are."""
     workspace: Workspace | None = None
@@ -97,7 +97,7 @@ class Rasterize(torch.autograd.Function):
                 records = launch.backward(*arrays, extra_detached=request.extra_detached)
                 if screen is not None and len(screen):
                     found = wp.to_torch(records)  # a list of columns would be uploaded as an index
-                    screen[:, :2], screen[:, 2] = found[:, :2], found[:, 6]
+                    screen[:, :2], screen[:, 2:] = found[:, :2], found[:, 6:8]
         return None, *(wanted.get(name) for name in INPUTS)
 
 

@@ -184,6 +184,7 @@ def observe(
     ledger: Ledger,
     gradient: Float[Tensor, "N"],
     pixels: Float[Tensor, "N"],
+    weight: Float[Tensor, "N"],
 ) -> None:
     """Add one to four images to what densification looks at, if the step was sound.
 
@@ -193,11 +194,12 @@ def observe(
         ledger: What says whether the step was sound.
         gradient: Sum of pixels times screen gradient, in half image sizes; changed.
         pixels: Sum of pixels; changed.
+        weight: Sum of weights in them; changed.
     """
     if not len(gradient):
         return
     with stream_of(gradient):
         half = 0.5 * size[0], 0.5 * size[1]
-        arrays = [(array_over(screen.gradient), array_over(screen.pixels)) for screen in screens]
+        arrays = [array_over(screen.values) for screen in screens]
         counts = array_over(ledger.counts, wp.int32)
-        training.observe(arrays, half, counts, array_over(gradient), array_over(pixels))
+        training.observe(arrays, half, counts, [array_over(sums) for sums in (gradient, pixels, weight)])

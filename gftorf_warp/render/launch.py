@@ -99,7 +99,7 @@ def backward(
     With ``extra_detached`` weights are held fixed under the extra images, so that only the extra channels learn.
 
     Returns:
-        [N] gradient records of the splats: slots 0 and 1 are the screen gradient, slot 6 the number of pixels.
+        [N] gradient records of the splats: slots 0 and 1 are the screen gradient, 6 the number of pixels, 7 the weight.
         They belong to the frame.
     """
     groups = channel_groups(inputs)

@@ -83,8 +83,8 @@ def rasterize(
     splats = _project(field, camera, settings)
     screen = None
     if screen_gradient:
-        screen = ScreenGradient(gradient=field.mean.new_zeros(len(field), 2), pixels=field.mean.new_zeros(len(field)))
-    centre, hits = _watched(splats, screen, [*field.parameters().values(), extra, *_tensors(background, sensor)])
+        screen = ScreenGradient(values=field.mean.new_zeros(len(field), 4))
+    centre, seen_of = _watched(splats, screen, [*field.parameters().values(), extra, *_tensors(background, sensor)])
 
     # What Gaussian k carries: columns weighted by T (colour, distance, 1, extra) and by T^2 (quads, phasor)
     basis = _harmonics(splats.direction, settings.sh_degree)  # [M, K]
@@ -106,7 +106,7 @@ def rasterize(
         half_sum = moments[0] * moments[2] - moments[1] ** 2
         seen = (w.detach() if extra_detached else w) @ more
         blocks.append(torch.cat([w @ carried, seen, (w * T) @ two_way, half_sum, T_end[:, None]], 1))
-        hits += (w > 0).sum(0)
+        seen_of += torch.stack([(w > 0).sum(0), w.detach().sum(0)], 1)
     image = torch.cat(blocks).T.reshape(-1, height, width)
 
     colours = 0 if field.colour_sh is None else 3
@@ -370,21 +370,21 @@ def _tensors(background: Background, sensor: Sensor) -> list[object]:
 
 def _watched(
     splats: _Splats, screen: ScreenGradient | None, inputs: list[object]
-) -> tuple[Float[Tensor, "M 2"], Int[Tensor, "M"]]:
-    """Image positions whose gradient is noted in ``screen``, and the pixel counts to be filled in by the caller.
+) -> tuple[Float[Tensor, "M 2"], Float[Tensor, "M 2"]]:
+    """Image positions whose gradient is noted in ``screen``; pixels and weights, to be filled in by the caller.
 
     A zero that needs a gradient is added, so that the note is taken even if the means are not optimised.
     """
-    hits = torch.zeros_like(splats.index)
+    seen = torch.zeros_like(splats.centre)
     centre = splats.centre
     if screen is None or not any(isinstance(value, Tensor) and value.requires_grad for value in inputs):
-        return centre, hits
+        return centre, seen
     if torch.is_grad_enabled():
         centre = centre + torch.zeros_like(centre).requires_grad_()
 
         def note(grad: Tensor) -> None:
             screen.gradient.index_add_(0, splats.index, grad)  # like a parameter's .grad, it adds up over passes
-            screen.pixels[splats.index] = hits.to(screen.pixels)
+            screen.values[splats.index, 2:] = seen
 
         centre.register_hook(note)
-    return centre, hits
+    return centre, seen

@@ -213,16 +213,13 @@ def judge(
 
 
 def observe(
-    seen: list[tuple[wp.array, wp.array]],
+    screens: list[wp.array],
     half: tuple[float, float],
     counts: wp.array,
-    gradient: wp.array,
-    pixels: wp.array,
+    sums: list[wp.array],
 ) -> None:
-    """Add screen gradients [N, 2] and pixels [N] of one to four images to sums over images, if ``counts[1]`` is 0."""
-    gradients, numbers = zip(*seen, strict=True)
-    inputs = [*_four(list(gradients)), *_four(list(numbers)), len(seen), wp.vec2(*half), counts]
-    _launch(finish.observe, len(gradient), inputs, [gradient, pixels])
+    """Add what one to four images say [N, 4] to gradients, pixels and weights [N], if ``counts[1]`` is 0."""
+    _launch(finish.observe, len(sums[0]), [*_four(screens), len(screens), wp.vec2(*half), counts], sums)
 
 
 def _four(arrays: list[wp.array]) -> list[wp.array]:
