@@ -127,6 +127,28 @@ def test_memory_comes_back_when_nobody_looks_at_it():
     assert len(found) == 4, "nothing was allocated"
 
 
+@pytest.mark.parametrize("length", [1, 1024, 1025])
+def test_memory_starts_where_pages_do(length):
+    """Every copy, so that a disk takes it as it is; none reaches into another."""
+    outgoing = Outgoing(torch.zeros(length), ahead=1, kept=3)
+    held = [outgoing.keep(outgoing.send(torch.full((length,), float(number)))) for number in range(3)]
+    assert [one.ctypes.data % 4096 for one in held] == [0, 0, 0]
+    assert [(one.shape, float(one.min()), float(one.max())) for one in held] == [((length,), k, k) for k in range(3)]
+
+
+@pytest.mark.parametrize("kept", [2, 20])
+def test_as_many_are_held_as_was_asked_for(run, kept, monkeypatch):  # noqa: F811
+    """Memory of one camera's images, all of which are held."""
+    made, right = [], Outgoing.__init__
+    monkeypatch.setattr(Outgoing, "__init__", lambda self, *a, **k: made.append(k["kept"]) or right(self, *a, **k))
+    one = Series(run.renderer(PLAIN), [(0.001 * k, CAMERA) for k in range(8)])
+    found = list(one.on_host(kept))
+    assert made == [kept]
+    starts = [min(array.ctypes.data for array in image.values()) for image in found]
+    assert len(set(starts)) == 8
+    assert all(start % 4096 == 0 for start in starts[:kept])
+
+
 def test_a_loop_that_is_left_early_leaves_nothing_behind(run, ahead):  # noqa: F811, ARG001
     """The replay goes on as if nothing had been."""
     render = run.renderer(PLAIN)

@@ -1,18 +1,26 @@
 """Files beside the rendering: the same whoever writes them, whole or not there, and errors that say what happened."""
 
+import errno
 import json
+import mmap
 import os
 import signal
 import subprocess
 import sys
 import threading
 import time
+import weakref
 from pathlib import Path
 
 import numpy as np
 import pytest
 from analytic_run import FRAMES, HEIGHT, WIDTH, AnalyticRun
 from test_replay import PLAIN, run  # noqa: F401
+
+try:
+    import fcntl
+except ImportError:  # not a Unix
+    fcntl = None
 
 from gftorf_warp.data import files
 from gftorf_warp.data.images import read_exr
@@ -97,8 +105,9 @@ def test_not_more_images_wait_than_memory_holds(analytic, tmp_path, monkeypatch)
     assert written[0] == FRAMES
 
 
-def test_arrays_hold_what_pictures_hold(analytic, tmp_path):
+def test_arrays_hold_what_pictures_hold(analytic, tmp_path, monkeypatch):
     """Every channel of every image, mapped or read; written again into the same folder, and not over pictures."""
+    monkeypatch.setattr(stored, "BLOCK", 8)
     pictures = render_to_folder(analytic, tmp_path / "pictures", WHAT)
     seen = []
     out = render_to_folder(analytic, tmp_path / "out", WHAT, arrays=True, progress=lambda *done: seen.append(done))
@@ -108,6 +117,7 @@ def test_arrays_hold_what_pictures_hold(analytic, tmp_path):
         for channel in channels:
             array = np.load(out / name / f"{channel}.npy", mmap_mode="r")
             assert (array.shape, array.dtype) == ((FRAMES, HEIGHT, WIDTH), np.dtype("<f4"))
+            assert array.offset == stored.HEADER
             for k in range(FRAMES):
                 np.testing.assert_array_equal(array[k], read_exr(pictures / name / f"{k:06d}.exr")[channel])
     assert seen == [(stored.BLOCK, FRAMES), (FRAMES, FRAMES)]
@@ -122,6 +132,7 @@ def test_arrays_hold_what_pictures_hold(analytic, tmp_path):
 def test_arrays_of_a_replay(run, tmp_path, monkeypatch):  # noqa: F811
     """Through memory that is used again, of more images than are held at a time: those of single calls."""
     monkeypatch.setattr(stored, "BLOCK", 3)
+    monkeypatch.setattr(stored, "HELD", 2 * 3 + 2)
     times = [float(time) for time in np.linspace(0.0, 0.07, 60)]
     cameras = [run.camera] * len(times)
     monkeypatch.setattr(views, "views_to_take", lambda *_: (times, cameras))
@@ -148,6 +159,101 @@ def test_arrays_are_whole_where_the_system_takes_a_part(tmp_path, monkeypatch, t
         file.write(1, images[1:])
         file.write(0, images[:1])
     np.testing.assert_array_equal(np.load(tmp_path / "a.npy"), images)
+
+
+def on_pages(count, height, width):
+    """Images that start where pages do, as those of a renderer: no two are the same."""
+    images = np.frombuffer(mmap.mmap(-1, 4 * count * height * width), dtype=np.float32).reshape(count, height, width)
+    images[:] = np.random.default_rng(1).random(images.shape, dtype=np.float32)
+    return images
+
+
+@pytest.mark.skipif(not stored.DIRECT, reason="no such writing on this system")
+@pytest.mark.parametrize("refused", [(), (0,), (1,), (0, 1, 2)])
+def test_arrays_past_the_systems_memory(tmp_path, monkeypatch, refused):
+    """What the disk does not take as it is, it gets as other programs write; the same file in any case."""
+    images, direct = on_pages(6, 32, 64), []
+    right = os.writev
+
+    def writev(file, rows):
+        direct.append(bool(fcntl.fcntl(file, fcntl.F_GETFL) & stored.DIRECT))
+        if direct[-1] and len(direct) - 2 in refused:
+            raise OSError(errno.EINVAL, "Invalid argument")
+        return right(file, rows)
+
+    monkeypatch.setattr(os, "writev", writev)
+    with stored.Stored(tmp_path / "a.npy", images.shape) as file:
+        for first in (0, 2, 4):
+            file.write(first, images[first : first + 2])
+    found = np.load(tmp_path / "a.npy", mmap_mode="r")
+    np.testing.assert_array_equal(found, images)
+    assert (tmp_path / "a.npy").stat().st_size == stored.HEADER + images.nbytes
+    assert direct[0] is False, "the header comes from anywhere"
+    if direct[1]:  # this file system has it
+        at = min(refused, default=None)
+        assert direct[1:] == ([True] * 3 if at is None else [True] * (at + 1) + [False] * (3 - at))
+
+
+def test_arrays_of_any_size_and_address(tmp_path):
+    """No multiple of what disks count in, in memory that starts anywhere."""
+    images = np.random.default_rng(2).random((5, 7, 9), dtype=np.float32)[:, :, 1:]
+    with stored.Stored(tmp_path / "a.npy", images.shape) as file:
+        file.write(0, images)
+    np.testing.assert_array_equal(np.load(tmp_path / "a.npy"), images)
+
+
+def test_an_error_of_the_disk_is_no_reason_to_try_again(tmp_path, monkeypatch):
+    """Only what the disk cannot take as it is is given to it in another way."""
+    calls = []
+
+    def writev(file, rows):
+        calls.append(len(rows))
+        if len(calls) > 1:
+            raise OSError(errno.EIO, "Input/output error")
+        return os.write(file, b"".join(rows))
+
+    monkeypatch.setattr(os, "writev", writev, raising=False)
+    with pytest.raises(UsageError, match="Input/output"), stored.Stored(tmp_path / "a.npy", (2, 4, 4)) as file:
+        file.write(0, np.zeros((2, 4, 4), dtype=np.float32))
+    assert calls == [1, 2]
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("limit", [stored.BLOCK_BYTES, 3 * 2 * 64])
+def test_of_arrays_two_blocks_are_held(tmp_path, monkeypatch, limit):
+    """One that is written and one that comes next, of fewer images where they are large: what a renderer reserves."""
+    monkeypatch.setattr(stored, "BLOCK", 4)
+    monkeypatch.setattr(stored, "BLOCK_BYTES", limit)
+    held, most, calls = weakref.WeakSet(), [], []
+    right = stored.Stored.write
+
+    def slow(file, first, images):
+        calls.append(len(images))
+        time.sleep(0.005)
+        right(file, first, images)
+
+    class Image(np.ndarray):
+        """One that can be told from others."""
+
+        __hash__ = object.__hash__
+
+    def series():
+        for k in range(30):
+            both = np.full((2, 4, 4), k, dtype=np.float32).view(Image)
+            held.add(both)
+            most.append(len(held))
+            yield {"distance": {"distance": both[0], "opacity": both[1]}}
+            del both
+
+    monkeypatch.setattr(stored.Stored, "write", slow)
+    (tmp_path / "distance").mkdir()
+    stored.store_all(tmp_path, {"distance": ("distance", "opacity")}, series(), (30, 4, 4))
+    block = 4 if limit > 1000 else 3
+    assert set(calls) <= {block, 30 % block}
+    assert len(calls) == 2 * -(-30 // block)
+    assert block < max(most) <= 2 * block + 1
+    found = np.load(tmp_path / "distance" / "opacity.npy")
+    np.testing.assert_array_equal(found, np.broadcast_to(np.arange(30)[:, None, None], found.shape))
 
 
 def test_the_cost_of_a_picture_does_not_grow_with_those_before_it(analytic, tmp_path, monkeypatch):

@@ -2,11 +2,18 @@
 
 Nothing is encoded, so what is left is to copy. Files are written and not mapped: a full disk is an error then and not a
 signal, and it took half the time. Each file is filled by one thread at a time, which is all that systems do in any
-case, so channels have files of their own. The disk begins with what it is given while more is rendered, not at the end.
+case, so channels have files of their own. Many images go into one call of the system, because each call gives Python's
+lock back and asks for it again, and the rendering waits for it each time.
+
+Where a disk takes them as they are, images go there past the memory in which systems keep files (``O_DIRECT``). Else it
+begins with what it is given while more is rendered, not at the end.
 """
 
 from __future__ import annotations
 
+import contextlib
+import errno
+import io
 import math
 import os
 import shutil
@@ -17,7 +24,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from io import FileIO
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -27,11 +34,11 @@ from ..errors import ResourceError
 from .previews import Channels
 from .writers import available_cpus
 
-BLOCK = 8  # images that a thread is given at a time
-TOGETHER = (
-    2  # of them that one call of the system writes: each asks for Python's lock; ext4 is slower with four and eight
-)
-BLOCKS = 3  # that wait to be written
+BLOCK = 32  # images that one call of the system writes, unless
+BLOCK_BYTES = 1 << 26  # they would take more: memory holds the block that is written and the one that comes next
+HELD = 2 * BLOCK + 2  # images at most that are held meanwhile
+HEADER = 4096  # [bytes] of a file: then images start where a page does, of files and of what maps them
+DIRECT = getattr(os, "O_DIRECT", 0)
 
 
 def path_of(out: Path, name: str, channel: str) -> Path:
@@ -84,14 +91,15 @@ def store_all(
                 if progress is not None and last < shape[0]:
                     progress(last, shape[0])
 
+        most = max(1, min(BLOCK, BLOCK_BYTES // (needed // shape[0])))
         block: list[Mapping[str, Channels]] = []
         for done, images in enumerate(series, start=1):
             block.append(images)
             del images  # the memory of what is written is used again
-            if len(block) == BLOCK or done == shape[0]:
+            if len(block) == most or done == shape[0]:
                 waiting.append((done, _submit(threads, files, out, done - len(block), block)))
                 block = []
-                collect(BLOCKS)
+                collect(1)
         collect(0)
     if progress is not None:
         progress(shape[0], shape[0])
@@ -106,10 +114,18 @@ def _submit(
 ) -> list[Future]:
     """Write some images, each channel by itself, some day."""
     return [
-        threads.submit(files[path_of(out, name, channel)].write, first, [images[name][channel] for images in block])
+        threads.submit(_fill, files[path_of(out, name, channel)], first, [images[name][channel] for images in block])
         for name, channels in block[0].items()
         for channel in channels
     ]
+
+
+def _fill(file: Stored, first: int, images: list[Float[np.ndarray, "H W"]]) -> None:
+    """Write some images of a channel, and let go of them before anybody hears of it: their memory is used again."""
+    try:
+        file.write(first, images)
+    finally:
+        images.clear()
 
 
 class Stored:
@@ -119,15 +135,14 @@ class Stored:
         """Take note of where and how large; nothing is written yet."""
         self._path, self._shape = path, shape
         self._lock, self._stack = threading.Lock(), ExitStack()
-        self._start = 0  # [bytes] of the header
+        self._direct = False  # whether it is written past the system's memory
 
     def __enter__(self) -> Stored:
         with ExitStack() as stack:
             temporary = stack.enter_context(atomic_path(self._path))
             self._file = stack.enter_context(FileIO(temporary, "x+"))
-            header = {"descr": "<f4", "fortran_order": False, "shape": self._shape}
-            np.lib.format.write_array_header_1_0(cast(Any, self._file), header)
-            self._start = self._file.tell()
+            _write(self._file, [memoryview(_header(self._shape))])
+            self._direct = _set_direct(self._file, True)
             self._stack = stack.pop_all()
         return self
 
@@ -146,11 +161,27 @@ class Stored:
         """
         with as_errors(self._path), self._lock:
             rows = [np.ascontiguousarray(image, dtype="<f4").data.cast("B") for image in images]
-            start = self._start + 4 * first * math.prod(self._shape[1:])
+            start = HEADER + 4 * first * math.prod(self._shape[1:])
             self._file.seek(start)
-            for k in range(0, len(rows), TOGETHER):
-                _write(self._file, rows[k : k + TOGETHER])
-            _begin_to_flush(self._file, start, sum(map(len, rows)))
+            try:
+                _write(self._file, rows)
+            except OSError as error:
+                if not (self._direct and error.errno == errno.EINVAL):
+                    raise
+                self._direct = _set_direct(self._file, False)  # sizes or addresses are not the disk's
+                self._file.seek(start)
+                _write(self._file, rows)
+            if not self._direct:
+                _begin_to_flush(self._file, start, sum(map(len, rows)))
+
+
+def _header(shape: tuple[int, int, int]) -> bytes:
+    """What a .npy file of float32 starts with, filled up with spaces as the format allows."""
+    file = io.BytesIO()
+    np.lib.format.write_array_header_1_0(file, {"descr": "<f4", "fortran_order": False, "shape": shape})
+    magic = np.lib.format.magic(1, 0)
+    text = file.getvalue()[len(magic) + 2 : -1].ljust(HEADER - len(magic) - 3) + b"\n"
+    return magic + len(text).to_bytes(2, "little") + text
 
 
 def _write(file: FileIO, rows: list[memoryview]) -> None:
@@ -161,6 +192,19 @@ def _write(file: FileIO, rows: list[memoryview]) -> None:
         rest, done = row[there:], done - there
         while rest:
             rest = rest[file.write(rest) :]
+
+
+def _set_direct(file: FileIO, wanted: bool) -> bool:
+    """Write past the system's memory from now on, or no more; whether it will be so."""
+    if not DIRECT:
+        return False
+    import fcntl
+
+    flags = fcntl.fcntl(file, fcntl.F_GETFL) & ~DIRECT
+    with contextlib.suppress(OSError):  # not every file system can
+        fcntl.fcntl(file, fcntl.F_SETFL, flags | (DIRECT if wanted else 0))
+        return wanted
+    return False
 
 
 def _begin_to_flush(file: FileIO, start: int, length: int) -> None:

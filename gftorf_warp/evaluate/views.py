@@ -16,7 +16,7 @@ from ..data.decode import Decoded, decode_quartet
 from ..data.sequence import Sequence
 from ..errors import DivergedError, UsageError
 from ..render.api import Rendering
-from ..render.series import View, on_host
+from ..render.series import KEPT, View, on_host
 from ..scene.camera import Camera
 from ..scene.sensor import Sensor, channel_of
 from . import previews, renders, stored, writers
@@ -210,7 +210,6 @@ def render_to_folder(
     render = run.renderer(needed)
     images = images_of(render, run.sensor, names)
     samples = [images(seconds[i], cameras[i]) for i in sorted({0, len(seconds) // 2, len(seconds) - 1})]
-    scales = {name: previews.preview_scale(name, (sample[name] for sample in samples)) for name in names}
     out, channels = Path(out), {name: list(samples[0][name]) for name in names}
     listed: dict[str, Any] = {
         "run": str(run.path),
@@ -221,21 +220,29 @@ def render_to_folder(
     if arrays:
         listed["arrays"] = True
     else:
+        scales = {name: previews.preview_scale(name, (sample[name] for sample in samples)) for name in names}
         listed["preview"] = {name: asdict(scale) for name, scale in scales.items()}
     renders.make_room(out, listed, fresh=fresh)
     for name in names:
         (out / name).mkdir(exist_ok=True)
-    series = series_of(render, zip(seconds, cameras, strict=True), run.sensor, names)
+    taken = list(zip(seconds, cameras, strict=True))
     if arrays:
+        series = series_of(render, taken, run.sensor, names, kept=min(stored.HELD, len(taken)))
         shape = len(seconds), *next(iter(samples[0][names[0]].values())).shape
         stored.store_all(out, channels, series, shape, progress)
     else:
+        series = series_of(render, taken, run.sensor, names)
         writers.write_all(out, scales, series, len(seconds), progress)
     return out
 
 
 def series_of(
-    render: Callable[[float, Camera], Rendering], views: Iterable[View], sensor: Sensor, names: Iterable[str]
+    render: Callable[[float, Camera], Rendering],
+    views: Iterable[View],
+    sensor: Sensor,
+    names: Iterable[str],
+    *,
+    kept: int = KEPT,
 ) -> Iterator[Mapping[str, previews.Channels]]:
     """What ``gftorf render`` writes, image by image: arrays on the host, which stay as they are while they are held.
 
@@ -243,7 +250,7 @@ def series_of(
     """
     names = list(names)
     needed = sorted({image for name in names for image in renders.NEEDS[name]})
-    for found in on_host(render, views, needed):
+    for found in on_host(render, views, needed, kept=kept):
         yield {name: renders.named(name, found, sensor) for name in names}
 
 

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 HOST_BYTES = 1 << 28  # of page-locked memory at most: the system cannot use it for anything else
+PAGE = 4096  # [bytes] copies start at such addresses on the host, of which a disk takes them as they are
 
 
 class Outgoing:
@@ -33,11 +34,13 @@ class Outgoing:
         near = like if self._remote or tail is not None else like[:0]
         self._near = [torch.empty_like(near) for _ in range(ahead + 2)]  # one is being looked at
         self._idle = deque(range(len(self._near)))
-        size = self._tail * like.element_size()
+        page = PAGE // like.element_size()
+        room = -(-self._tail // page) * page
         self._moving = ahead + 1
-        count = self._moving + min(kept, max(1, HOST_BYTES // size))
-        shape = count, self._tail
-        self._far = torch.empty(shape, dtype=like.dtype, pin_memory=self._remote)
+        count = self._moving + min(kept, max(1, HOST_BYTES // (room * like.element_size())))
+        far = torch.empty(count * room + page, dtype=like.dtype, pin_memory=self._remote)
+        start = -far.data_ptr() % PAGE // like.element_size()
+        self._far = far[start : start + count * room].view(count, room)[:, : self._tail]
         self._free = deque(range(count))  # of ``_far``; others may put back at any time, from any thread
         if self._remote:
             self._stream = torch.cuda.Stream(like.device)

@@ -49,15 +49,17 @@ class Series:
         self.ahead = AHEAD if replay.device.is_cuda else 0
         self.again = 0
         """Images so far that were rendered again, because they needed more pairs than were reserved."""
+        self._kept = KEPT
         self._outgoing: dict[int, Outgoing] = {}  # by the length of a packed image
 
-    def on_host(self) -> Iterator[dict[str, Float[np.ndarray, "..."]]]:
+    def on_host(self, kept: int = KEPT) -> Iterator[dict[str, Float[np.ndarray, "..."]]]:
         """Images by name as arrays on the host, float32: quads [4, H, W], distance [H, W] and so on.
 
         An array belongs to whoever has it, for as long as he wants: its memory is used again only when nothing refers
-        to it or a part of it. Of 40 images at a time that memory is reserved beforehand (of fewer, if they would take
-        more than 256 MiB); whoever holds more of them gets the rest as copies in ordinary memory.
+        to it or a part of it. Of ``kept`` images at a time that memory is reserved beforehand (of fewer, if they would
+        take more than 256 MiB); whoever holds more of them gets the rest as copies in ordinary memory.
         """
+        self._kept = kept
         for sent in self._whole(tail=False):
             packed = sent.outgoing.keep(sent.ticket)
             places = sent.target.places
@@ -92,7 +94,7 @@ class Series:
         target = self._replay.draw(*view)
         length = len(target.packed)
         if length not in self._outgoing:
-            few = {"kept": 1, "tail": 1} if tail else {"kept": KEPT}
+            few = {"kept": 1, "tail": 1} if tail else {"kept": self._kept}
             self._outgoing[length] = Outgoing(target.packed, ahead=self.ahead, **few)
         outgoing = self._outgoing[length]
         return _Sent(view=view, target=target, outgoing=outgoing, ticket=outgoing.send(target.packed))
@@ -115,7 +117,7 @@ class Series:
 
 
 def on_host(
-    render: Callable[[float, Camera], Rendering], views: Iterable[View], names: Iterable[str]
+    render: Callable[[float, Camera], Rendering], views: Iterable[View], names: Iterable[str], *, kept: int = KEPT
 ) -> Iterator[dict[str, Float[np.ndarray, "..."]]]:
     """Images by name as arrays that stay valid, of whatever renders: see :meth:`Series.on_host` for a replay.
 
@@ -123,9 +125,10 @@ def on_host(
         render: A :class:`Replay`, or any other function of time [s] and camera.
         views: Time [s] and camera of each image.
         names: Of what is wanted; an image that is not there, or has no elements, is left out.
+        kept: Images that the caller may hold without more of them being copied.
     """
     if isinstance(render, Replay):
-        yield from Series(render, views).on_host()
+        yield from Series(render, views).on_host(kept)
         return
     for time, camera in views:
         rendering = render(time, camera)
