@@ -46,8 +46,7 @@ def test_threads_write_what_one_call_after_the_other_does(analytic, tmp_path, mo
     """Byte by byte: more threads than images, or one; progress counts up."""
     seen, found = [], {}
     for threads in (1, 20):
-        monkeypatch.setattr(writers, "THREADS_MIN", threads)
-        monkeypatch.setattr(writers, "available_cpus", lambda threads=threads: threads)
+        monkeypatch.setattr(writers, "THREADS", threads)
         out = render_to_folder(analytic, tmp_path / str(threads), WHAT, progress=lambda *done: seen.append(done))
         found[threads] = files_in(out)
     assert found[1] == found[20]
@@ -81,8 +80,7 @@ def test_what_stops_a_thread_is_the_error_of_the_command(analytic, tmp_path):
 def test_not_more_images_wait_than_memory_holds(analytic, tmp_path, monkeypatch):
     """Rendering is faster than writing: it stops until something is written."""
     (tmp_path / "distance").mkdir()
-    monkeypatch.setattr(writers, "THREADS_MIN", 1)
-    monkeypatch.setattr(writers, "available_cpus", lambda: 1)
+    monkeypatch.setattr(writers, "THREADS", 1)
     rendered, written, ahead = [0], [0], []
     scales, series = scales_and_series(analytic)
 

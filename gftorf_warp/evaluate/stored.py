@@ -32,7 +32,6 @@ from jaxtyping import Float
 from ..data.files import as_errors, atomic_path
 from ..errors import ResourceError
 from .previews import Channels
-from .writers import available_cpus
 
 BLOCK = 32  # images that one call of the system writes, unless
 BLOCK_BYTES = 1 << 26  # they would take more: memory holds the block that is written and the one that comes next
@@ -79,7 +78,7 @@ def store_all(
         )
     with ExitStack() as stack:
         files = {path: stack.enter_context(Stored(path, shape)) for path in paths}
-        threads = ThreadPoolExecutor(min(len(files), available_cpus()), thread_name_prefix="gftorf-arrays")
+        threads = ThreadPoolExecutor(len(files), thread_name_prefix="gftorf-arrays")
         stack.callback(threads.shutdown, wait=True, cancel_futures=True)  # before files are closed
         waiting: deque[tuple[int, list[Future]]] = deque()
 

@@ -1,12 +1,11 @@
-"""Pictures on disk while the next images are rendered: by as many threads as there are CPUs, in order of the images.
+"""Pictures on disk while the next images are rendered: by a few threads, in order of the images.
 
-A 320x240 image with four quads and distance costs a CPU 4 ms, half of it the system's for two megabytes. For less than
-0.3 ms of it Python's lock is held: so much take images of 4x4 pixels. Processes would have to be sent the images.
+A 320x240 image with four quads and distance costs a CPU 5 ms. For half of it OpenEXR and others hold Python's lock, so
+more threads write no more.
 """
 
 from __future__ import annotations
 
-import os
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -19,7 +18,7 @@ from . import previews
 from .pictures import Scale
 from .previews import Channels
 
-THREADS_MIN = 4  # on fewer CPUs they wait for the disk in turns
+THREADS = 4  # they wait for the disk in turns; with more, for Python's lock, which OpenEXR holds
 QUEUED = 2  # images that wait for each thread, at most: what memory holds
 
 
@@ -44,7 +43,6 @@ def write_all(
     Raises:
         UsageError, ResourceError: If a file cannot be written.
     """
-    workers = max(THREADS_MIN, available_cpus())
     waiting: deque[Future] = deque()
     written = 0
 
@@ -59,12 +57,12 @@ def write_all(
     with ExitStack() as stack:
         for name in scales:
             stack.enter_context(many_files(out / name))
-        threads = ThreadPoolExecutor(workers, thread_name_prefix="gftorf-files")
+        threads = ThreadPoolExecutor(THREADS, thread_name_prefix="gftorf-files")
         stack.callback(threads.shutdown, wait=True, cancel_futures=True)
         for index, images in enumerate(series):
             waiting.append(threads.submit(write_images, out, scales, index, images))
             del images  # the memory of what is written is used again
-            collect(QUEUED * workers)
+            collect(QUEUED * THREADS)
         collect(0)
 
 
@@ -77,8 +75,3 @@ def write_images(out: Path, scales: Mapping[str, Scale], index: int, images: Map
         exr, png = previews.paths(out, name, index)
         write_exr(exr, channels, one_of=True)
         write_one_of_many(png, previews.preview(name, channels, scales[name]))
-
-
-def available_cpus() -> int:
-    """CPUs this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
