@@ -167,8 +167,9 @@ def on_pages(count, height, width):
 
 
 @pytest.mark.skipif(not stored.DIRECT, reason="no such writing on this system")
+@pytest.mark.parametrize("code", [errno.EINVAL, errno.EFAULT])
 @pytest.mark.parametrize("refused", [(), (0,), (1,), (0, 1, 2)])
-def test_arrays_past_the_systems_memory(tmp_path, monkeypatch, refused):
+def test_arrays_past_the_systems_memory(tmp_path, monkeypatch, refused, code):
     """What the disk does not take as it is, it gets as other programs write; the same file in any case."""
     images, direct = on_pages(6, 32, 64), []
     right = os.writev
@@ -176,7 +177,7 @@ def test_arrays_past_the_systems_memory(tmp_path, monkeypatch, refused):
     def writev(file, rows):
         direct.append(bool(fcntl.fcntl(file, fcntl.F_GETFL) & stored.DIRECT))
         if direct[-1] and len(direct) - 2 in refused:
-            raise OSError(errno.EINVAL, "Invalid argument")
+            raise OSError(code, os.strerror(code))
         return right(file, rows)
 
     monkeypatch.setattr(os, "writev", writev)

@@ -14,6 +14,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import io
+import logging
 import math
 import os
 import shutil
@@ -38,6 +39,8 @@ BLOCK_BYTES = 1 << 26  # they would take more: memory holds the block that is wr
 HELD = 2 * BLOCK + 2  # images at most that are held meanwhile
 HEADER = 4096  # [bytes] of a file: then images start where a page does, of files and of what maps them
 DIRECT = getattr(os, "O_DIRECT", 0)
+REFUSED = {errno.EINVAL, errno.EFAULT, errno.EOPNOTSUPP}  # a size, an address, a kind of memory, a kind of file
+LOG = logging.getLogger("gftorf_warp")
 
 
 def path_of(out: Path, name: str, channel: str) -> Path:
@@ -165,9 +168,10 @@ class Stored:
             try:
                 _write(self._file, rows)
             except OSError as error:
-                if not (self._direct and error.errno == errno.EINVAL):
+                if not (self._direct and error.errno in REFUSED):
                     raise
-                self._direct = _set_direct(self._file, False)  # sizes or addresses are not the disk's
+                LOG.debug("%s goes through the system's memory: %s", self._path, error)
+                self._direct = _set_direct(self._file, False)
                 self._file.seek(start)
                 _write(self._file, rows)
             if not self._direct:
