@@ -120,7 +120,7 @@ def command_parsers() -> dict[str, Parser]:
     reconstruct = _command("reconstruct", "fit moving Gaussians to the raw quads of a sequence")
     reconstruct.add_argument("sequence", metavar="SEQ", help="folder of the sequence")
     reconstruct.add_argument("--out", metavar="RUN", required=True, help="folder to write; goes on where it stopped")
-    presets = "settings: demo, paper, released, dgs, dgs_depth or ctof, the closed form (demo)"
+    presets = "settings: demo, paper, released, fast, dgs, dgs_depth or ctof, the closed form (demo)"
     reconstruct.add_argument("--preset", metavar="NAME", default="demo", help=presets)
     inputs = "what is compared: quads, phasor, or auto: what the camera delivered (auto)"
     reconstruct.add_argument("--input", metavar="KIND", default="auto", help=inputs)

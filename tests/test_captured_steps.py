@@ -40,14 +40,14 @@ def published(**changes):
     return replace(settings, schedule=replace(settings.schedule, warm_up=6, flow_from=8, **schedule))
 
 
-def alike(one, other):
-    """Two states after the same images: to rounding on a CPU, but for a few elements on a GPU.
+def alike(one, other, few=0.01):
+    """Two states after the same images: to rounding on a CPU, but for a share of ``few`` elements on a GPU.
 
     Atomic additions of the blend's backward pass happen there in any order, so gradients differ by a rounding, graph or
     not. Adam, whose epsilon is far below any gradient, makes whole steps of gradients that are nothing but rounding: a
     few elements may be a few steps apart, which is no error.
     """
-    few = 0.01 if one.optimiser.leaves[0].is_cuda else 0.0
+    few = few if one.optimiser.leaves[0].is_cuda else 0.0
     assert len(one.optimiser.field) == len(other.optimiser.field)
     for leaf, twin in zip(one.optimiser.leaves, other.optimiser.leaves, strict=True):
         apart = ~torch.isclose(leaf, twin, rtol=1e-3, atol=2e-5)
@@ -67,18 +67,23 @@ SETTINGS = [published, lambda **c: demo(images=60, kernels=Kernels.STEP, **c)]
 @pytest.mark.parametrize("batch", [Batch.FRAME, Batch.QUARTET])
 @pytest.mark.parametrize("make", SETTINGS, ids=["published", "demo"])
 def test_steps_are_single_steps(make, batch, device):
-    """Every tensor, sum and statistic after 40 images, with all that happens on the way."""
+    """Every tensor, sum and statistic after 20 images and after 40, with all that happens on the way.
+
+    On a GPU roundings grow: whether a pixel still takes a splat is decided otherwise somewhere in between, and those
+    who are behind it differ by a part of a step.
+    """
     settings = make(batch=batch)
     single, observations = begun(settings, device)
     whole, _ = begun(settings, device)
     assert unsuitable(observations, settings, whole) is None
     replay = CapturedSteps(whole, observations, settings)
-    while single.images < 40:
-        assert step.step(single, observations, settings) is None
-        replay.step()
-        assert single.images == whole.images
-    assert replay.collect() == 0
-    alike(single, whole)
+    for images, few in ((20, 0.01), (40, 0.06)):
+        while single.images < images:
+            assert step.step(single, observations, settings) is None
+            replay.step()
+            assert single.images == whole.images
+        assert replay.collect() == 0
+        alike(single, whole, few)
 
 
 @pytest.mark.parametrize("device", DEVICES)

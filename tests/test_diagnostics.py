@@ -125,7 +125,8 @@ def test_static_matter_that_was_pushed_is_seen(observations, tmp_path):
     watch = Watch(observations, TRUTH, tmp_path / "a")
     state = at_start(observations)
     calm = watch.look(state, SETTINGS)["offset_static_m"]
-    state.motion.displacement = lambda attachment, time: torch.full((len(attachment), 3), 0.3 / math.sqrt(3.0))  # noqa: ARG005
+    pushed = torch.full((len(state.attachment), 3), 0.3 / math.sqrt(3.0))
+        state.motion.displacements = lambda _, times: [pushed] * len(times)
     assert calm < 0.05
     assert watch.look(state, SETTINGS)["offset_static_m"] == pytest.approx(0.3, rel=1e-4)
     schedule = replace(SETTINGS.schedule, warm_up=1)

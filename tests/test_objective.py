@@ -9,7 +9,7 @@ from moving_box import recording
 from small_runs import demo, small
 
 from gftorf_warp.errors import InputError
-from gftorf_warp.recon import objective, step
+from gftorf_warp.recon import objective, presets, step
 from gftorf_warp.recon.observations import data_hash, observe, reduced
 from gftorf_warp.recon.settings import Batch, Weights
 from gftorf_warp.recon.state import begin
@@ -155,3 +155,14 @@ def test_rays_are_computed_once_per_pose():
     assert torch.equal(other, turned.rays())
     assert not torch.equal(other, ray)
     torch.testing.assert_close(other_centre - centre, torch.tensor([0.5, 0.0, 0.0]))
+
+
+def test_flow_may_come_now_and_then():
+    """In one of three quartets, and three times as heavy there."""
+    settings = presets.released()
+    settings = replace(settings, schedule=replace(settings.schedule, flow_every=3))
+    flows = [objective.weights_at(settings, images).flow for images in range(1992, 2028)]
+    assert flows[:8] == [0.0] * 8, "it has not begun"
+    want = 3 * settings.weights.flow
+    assert flows[8:] == [want if n // 4 % 3 == 0 else 0.0 for n in range(2000, 2028)]
+    assert 0 < flows.count(want) < 20

@@ -51,6 +51,22 @@ def test_motion_rests_during_the_warm_up():
     assert motion.offset not in adam.adam.state, "a resting group must not gather moments"
 
 
+def test_the_rate_of_the_motion_rises_from_none():
+    """Over its first images, after the warm-up or after it was drawn anew; other rates know nothing of it."""
+    settings = replace(SETTINGS, schedule=replace(SETTINGS.schedule, motion_ramp=50))
+    plain, ramped = ({n: rates_at(s, n) for n in range(90, 160)} for s in (SETTINGS, settings))
+    for images, share in ((99, 0.0), (100, 1 / 50), (124, 0.5), (149, 1.0), (159, 1.0)):
+        assert ramped[images]["motion"] == pytest.approx(share * plain[images]["motion"])
+        assert ramped[images]["mean"] == plain[images]["mean"]
+    assert rates_at(settings, 310, revived_at=300)["motion"] == pytest.approx(
+        11 / 50 * rates_at(SETTINGS, 310)["motion"]
+    )
+    quartets = replace(settings.schedule, batch=Batch.QUARTET, batch_rule=BatchRule.LINEAR)
+    fours = replace(settings, schedule=quartets)
+    settled = replace(fours, schedule=replace(quartets, motion_ramp=0))
+    assert rates_at(fours, 120)["motion"] == pytest.approx(24 / 50 * rates_at(settled, 120)["motion"])
+
+
 def test_the_first_step_is_the_rate_of_the_group_whatever_the_gradient():
     """Adam's first step is the rate times the sign."""
     adam, motion = optimiser()

@@ -17,7 +17,7 @@ from gftorf_warp.recon.settings import Batch, Input, Norm, plain
 from gftorf_warp.recon.state import begin
 from gftorf_warp.render.buffers import ClampGradient, Stop, Support
 from gftorf_warp.scene.initialise import Init, InitSettings
-from gftorf_warp.scene.motion import MotionKind, MotionSettings
+from gftorf_warp.scene.motion import MotionKind, MotionSettings, Products
 
 QUADS, PHASOR = Recorded(), Recorded(input=Input.PHASOR, unambiguous_range=5.0)  # F-ToeRF at 15 m, ToeRF at 10 m
 
@@ -75,6 +75,23 @@ def test_released_differs_where_the_tables_say():
         *("weights.colour_norm", "densify.loses_step"),
         "schedule.batch_rule",  # of no meaning to single frames, which both compare
     }
+
+
+def test_fast_is_released_but_for_what_makes_it_fast():
+    """Named settings only; for phasors, where quartets mean nothing and nothing freezes, it stays so."""
+    s = presets.fast()
+    differing = {name for name, a, b in _leaves(replace(s, preset="released"), presets.released()) if a != b}
+    assert differing == {
+        *("motion.products", "schedule.batch", "schedule.motion_ramp", "schedule.freeze_from"),
+        *("densify.unseen_from", "densify.unseen_weight"),
+    }
+    assert (s.motion.products, s.schedule.batch) == (Products.HALF, Batch.QUARTET)
+    assert (s.schedule.motion_ramp, s.schedule.freeze_from) == (1000, 0.8)
+    assert (s.densify.unseen_from, s.densify.unseen_weight) == (300, 0.03)
+    assert presets.fast(PHASOR).schedule.freeze_from is None
+    for made in (presets.demo, presets.paper, presets.released):
+        assert made().densify.unseen_from is None, "an approximation is asked for"
+        assert (made().schedule.motion_ramp, made().schedule.flow_every) == (0, 1)
 
 
 def test_released_for_phasors():

@@ -100,25 +100,6 @@ class _Image:
     """What was compared."""
 
 
-class _Sum(torch.autograd.Function):
-    """A sum of terms times weights of which only gradients are wanted: they cost nothing, and it has no value.
-
-    Not ``autograd.grad(terms, grad_outputs=weights)``: torch looks at shapes of gradients that it is given by means of
-    sympy, whose import takes longer than the first thousand steps.
-    """
-
-    @staticmethod
-    def forward(context, weights: list[Tensor], *terms: Tensor) -> Tensor:
-        """A number that means nothing."""
-        context.weights = weights
-        return torch.empty_like(terms[0])
-
-    @staticmethod
-    def backward(context, _: Tensor) -> tuple[Tensor | None, ...]:
-        """The weights, for a gradient of one."""
-        return None, *context.weights
-
-
 class CapturedSteps:
     """The steps of one run. Between two steps the state is as single steps leave it, but for what is on its way."""
 
@@ -320,7 +301,7 @@ class CapturedSteps:
         gradients: list[Tensor | None] = [None] * len(wanted)
         if terms:  # the loss is their sum, but nobody needs that number before the end
             values, weights = zip(*terms, strict=True)
-            loss = _Sum.apply([self._one_times(weight) for weight in weights], *values)
+            loss = fused.sum_for_gradients([self._one_times(weight) for weight in weights], values)
             gradients = [*torch.autograd.grad(loss, wanted, allow_unused=True)]
         with torch.no_grad():
             gradients = [None if gradient is None else gradient.contiguous() for gradient in gradients]

@@ -97,10 +97,11 @@ class Watch:
         bare = replace(field, colour_sh=None)
         kept = replace(settings.render, distortion=Distortion.PAPER)
         images: dict[str, list[Tensor]] = {name: [] for name in ("d", "d_tof", "opacity", "distortion", "offset")}
-        for frame in self.frames:
-            displacement = torch.zeros_like(field.mean)
-            if state.images >= settings.schedule.warm_up:  # before, nothing moves
-                displacement = state.motion.displacement(attachment, float(seen.sequence.times[frame]))
+        displacements = [torch.zeros_like(field.mean)] * len(self.frames)
+        if state.images >= settings.schedule.warm_up:  # before, nothing moves
+            times = [float(seen.sequence.times[frame]) for frame in self.frames]
+            displacements = state.motion.displacements(attachment, times)
+        for frame, displacement in zip(self.frames, displacements, strict=True):
             length = displacement.norm(dim=1, keepdim=True)
             rendering = rasterize(bare.moved(displacement), seen.cameras[frame], seen.sensor, kept, extra=length)
             assert rendering.extra is not None

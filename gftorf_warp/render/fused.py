@@ -291,3 +291,23 @@ def uniform(
     with stream_of(origin):
         training.uniform(array_over(origin, wp.int32), stream, amplitude, array_over(image.flatten(1)))
     return image
+
+
+def sum_for_gradients(weights: Sequence[Tensor], terms: Sequence[Tensor]) -> Float[Tensor, ""]:
+    """A sum of terms times weights of which only gradients are wanted: they cost nothing, and it has no value.
+
+    ``autograd.grad(terms, .., grad_outputs=weights)`` says the same, but torch looks at shapes of gradients that it is
+    given by means of sympy, whose import takes longer than the first thousand steps.
+    """
+    return _Sum.apply(list(weights), *terms)
+
+
+class _Sum(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, weights: list[Tensor], *terms: Tensor) -> Tensor:
+        ctx.weights = weights
+        return torch.empty_like(terms[0])
+
+    @staticmethod
+    def backward(ctx: Any, _: Tensor) -> tuple[Tensor | None, ...]:
+        return None, *ctx.weights

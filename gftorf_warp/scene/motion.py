@@ -113,11 +113,17 @@ class Motion(torch.nn.Module, abc.ABC):
 
     def displacement(self, attachment: Float[Tensor, "N M"], time: float) -> Float[Tensor, "N 3"]:
         """Displacement [m] of every Gaussian at ``time`` [s], any number; held constant outside the keys."""
-        key, share = self.position(time)
-        if share == 0.0:
-            return self.key_offset(attachment, key)
-        start, end = self.key_offsets(attachment, [key, key + 1])
-        return (1.0 - share) * start + share * end
+        return self.displacements(attachment, [time])[0]
+
+    def displacements(self, attachment: Float[Tensor, "N M"], times: list[float]) -> list[Float[Tensor, "N 3"]]:
+        """:meth:`displacement` at several times; all their keys are asked for at once."""
+        places = [self.position(time) for time in times]
+        keys = sorted({key + more for key, share in places for more in range(1 if share == 0.0 else 2)})
+        offsets = dict(zip(keys, self.key_offsets(attachment, keys), strict=True))
+        return [
+            offsets[key] if share == 0.0 else (1.0 - share) * offsets[key] + share * offsets[key + 1]
+            for key, share in places
+        ]
 
     def position(self, time: float) -> tuple[int, float]:
         """The key i at or before ``time`` [s] and the share j - i of the way to the next one, in [0, 1)."""
