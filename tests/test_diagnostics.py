@@ -126,7 +126,7 @@ def test_static_matter_that_was_pushed_is_seen(observations, tmp_path):
     state = at_start(observations)
     calm = watch.look(state, SETTINGS)["offset_static_m"]
     pushed = torch.full((len(state.attachment), 3), 0.3 / math.sqrt(3.0))
-        state.motion.displacements = lambda _, times: [pushed] * len(times)
+    state.motion.displacements = lambda _, times: [pushed] * len(times)
     assert calm < 0.05
     assert watch.look(state, SETTINGS)["offset_static_m"] == pytest.approx(0.3, rel=1e-4)
     schedule = replace(SETTINGS.schedule, warm_up=1)
