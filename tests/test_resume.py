@@ -1,10 +1,12 @@
 """Long runs: interrupted, killed, started twice, in the wrong folder, without numbers."""
 
+import copy
 import json
 import os
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,10 +15,10 @@ from moving_box import recording
 from small_runs import demo, rows, same, small, stored
 
 from gftorf_warp.errors import BusyError, DivergedError, UsageError
-from gftorf_warp.recon import checkpoint, folder, objective, step
+from gftorf_warp.recon import checkpoint, folder, objective, presets, step
 from gftorf_warp.recon.observations import observe
 from gftorf_warp.recon.run import Run
-from gftorf_warp.recon.settings import Batch, DensifySettings, Weights
+from gftorf_warp.recon.settings import Batch, DensifySettings, Weights, plain
 from gftorf_warp.recon.state import begin, from_dict, to_dict
 from gftorf_warp.recon.train import reconstruct
 
@@ -170,3 +172,13 @@ def test_a_state_survives_being_stored(tmp_path):
     step.step(state, observations, settings)
     step.step(again, observations, settings)
     assert same(to_dict(again), to_dict(state))
+
+
+def test_an_old_run_goes_on_under_settings_that_it_is_too_old_to_know():
+    """As if it had said their defaults; with any other value it is another run."""
+    new = {"seed": 1, "data_sha256": "x", "settings": plain(presets.released())}
+    old = copy.deepcopy(new)
+    del old["settings"]["densify"]["unseen_from"], old["settings"]["schedule"]["motion_ramp"]
+    assert folder.differences(old, new) == []
+    new["settings"] = plain(replace(presets.released(), densify=replace(presets.released().densify, unseen_from=300)))
+    assert folder.differences(old, new) == ["densify.unseen_from was None, now 300"]

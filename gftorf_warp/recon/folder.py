@@ -10,6 +10,7 @@ from typing import Any
 from ..data import lock
 from ..data.files import write_json
 from ..errors import InputError, UsageError
+from .settings import ReconSettings, plain
 
 CONFIG = "config.json"
 LOCK = ".lock"
@@ -55,9 +56,14 @@ def prepare(run: Path, config: dict[str, object], *, fresh: bool) -> bool:
 
 
 def differences(old: dict[str, object], new: dict[str, object]) -> list[str]:
-    """What keeps a run from going on under a new config, in words. A longer run is the same run."""
+    """What keeps a run from going on under a new config, in words. A longer run is the same run.
+
+    A setting that a run is too old to know has its default: what it says then is what was always done, or as good.
+    """
     found = []
     flat_old, flat_new = ({**_flat(c.get("settings", {})), **{k: c.get(k) for k in IDENTITY}} for c in (old, new))
+    if "settings" in old:
+        flat_old = {**_flat(plain(ReconSettings(preset=""))), **flat_old}
     for key in sorted({*flat_old, *flat_new}):
         before, after = flat_old.get(key), flat_new.get(key)
         if key == "schedule.images" and isinstance(before, int) and isinstance(after, int) and after >= before:
