@@ -29,6 +29,16 @@ def test_what_grows_after_a_reset_never_fills_it():
                 reserve.learn(pairs[-1])  # waits for the newest
 
 
+def test_room_that_costs_nothing_is_given_up_late():
+    """Three times as much, for as long as a twentieth of it is used."""
+    reserve = Reserve(scarce=False)
+    reserve.learn(1_000_000)
+    assert 3_000_000 <= reserve.capacity < 3_000_000 + PAIRS
+    assert not any(reserve.learn(pairs) for pairs in [2_300_000, *([160_000] * 20), 2_300_000])
+    assert reserve.learn(2_500_000)
+    assert [reserve.learn(1_000) for _ in range(PATIENCE + 1)] == [False] * PATIENCE + [True]
+
+
 def test_it_shrinks_only_if_it_stays_empty():
     """A reset of the opacities leaves few pairs for some hundred images, and more than before after that."""
     reserve = Reserve()

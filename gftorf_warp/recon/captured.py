@@ -118,7 +118,7 @@ class CapturedSteps:
         self._graphs: dict[Variant, Callable[[], None]] = {}
         self._part: tuple | None = None  # of the run: what graphs that are kept have in common
         self._pool = shared_pool(device)
-        self._reserve = Reserve()
+        self._reserve = Reserve(scarce=settings.render.deterministic)
         self._reserves = device.type != "cpu"  # a CPU counts pairs first: nobody waits for anybody there
         longest = max(len(batch) for batch in observations.batches)
         self._graphs_wanted = graphs
