@@ -1,12 +1,14 @@
-"""What speed costs in quality: one preset, twice, with other settings, on several sequences with several seeds.
+"""What speed costs in quality: two presets, or one with other settings, on several sequences with several seeds.
 
-    python benchmarks/quality.py SEQUENCE... --out DIR [--preset released] [--images 5000] [--seeds 0 1 2]
-        [--device cuda] [--reference NAME=VALUE...] [--fast NAME=VALUE...] [--limit SECONDS] [--json FILE]
+    python benchmarks/quality.py SEQUENCE... --out DIR [--preset released] [--fast-preset fast] [--images 5000]
+        [--seeds 0 1 2] [--device cuda] [--reference NAME=VALUE...] [--fast NAME=VALUE...] [--limit SECONDS]
+        [--known FILE] [--json FILE]
 
 Every run is ``presets.shortened`` to --images, so that warm-up, rounds and resets have their places in it. Errors are
 those of `gftorf compare`: mean squared errors of the distance times 100 [m^2], all raw frames, all pixels. The last
 lines are geometric means over sequences and seeds of fast over reference. A run that is there and finished is not
-repeated, so the same command goes on where the time was up.
+repeated, so the same command goes on where the time was up. --known is the JSON of an earlier call, whose reference
+runs are not repeated either.
 """
 
 from __future__ import annotations
@@ -33,7 +35,7 @@ from gftorf_warp.scene.changes import changed
 from gftorf_warp.scene.measured import sensor_of
 
 REFERENCE = ["kernels=graph", "schedule.batch=frame", "motion.products=float32"]
-FAST = ["kernels=graph", "schedule.batch=quartet", "motion.products=half"]
+FAST = ["kernels=graph"]
 KEYS = ("d", "d_tof")
 
 
@@ -70,11 +72,13 @@ def main() -> None:
     parser.add_argument("sequences", type=Path, nargs="+")
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--preset", default="released")
+    parser.add_argument("--fast-preset", default="fast")
     parser.add_argument("--images", type=int, default=5000)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--device", default="cuda")
     parser.add_argument("--reference", nargs="+", default=REFERENCE, metavar="NAME=VALUE")
     parser.add_argument("--fast", nargs="+", default=FAST, metavar="NAME=VALUE")
+    parser.add_argument("--known", type=Path)
     parser.add_argument("--limit", type=float, default=math.inf, help="no further run begins after so many seconds")
     parser.add_argument("--json", type=Path)
     a = parser.parse_args()
@@ -82,15 +86,19 @@ def main() -> None:
     torch.set_num_threads(1)
     begun, left = time.monotonic(), 0
     rows: dict[str, dict[str, dict]] = {"fast": {}, "reference": {}}
+    if a.known:
+        rows["reference"] = json.loads(a.known.read_text())["rows"]["reference"]
     sequences = [Sequence.open(path) for path in a.sequences]
     flown = [with_flow(sequence, FlowSource.AUTO)[0] for sequence in sequences]
     for seed in a.seeds:
-        for way, changes in (("fast", a.fast), ("reference", a.reference)):
+        for way, preset, changes in (("fast", a.fast_preset, a.fast), ("reference", a.preset, a.reference)):
             for path, sequence in zip(a.sequences, flown, strict=True):
+                if f"{path.name}-{seed}" in rows[way]:
+                    continue
                 if time.monotonic() - begun > a.limit:
                     left += 1
                     continue
-                settings = settings_of(sequence, a.preset, a.images, changes)
+                settings = settings_of(sequence, preset, a.images, changes)
                 settings = replace(settings, schedule=replace(settings.schedule, checkpoint_every_s=1e9))
                 name = f"{path.name}-{seed}"
                 rows[way][name] = run(sequence, a.out / f"{name}-{way}", settings, seed, a.device)
@@ -99,7 +107,8 @@ def main() -> None:
     if left:
         print(f"{left} runs are left: run this again to go on")
     if a.json:
-        what = {"preset": a.preset, "images": a.images, "reference": a.reference, "fast": a.fast}
+        what = {"preset": a.preset, "fast_preset": a.fast_preset, "images": a.images}
+        what |= {"reference": a.reference, "fast": a.fast}
         a.json.write_text(json.dumps(about(a.device) | what | {"ratios": means, "rows": rows}, indent=1) + "\n")
 
 
