@@ -67,7 +67,7 @@ def alike(made, twin, count, keys, *, device="cpu", scale=1.0):
     assert found.shape == (len(keys), count, 3)
     assert found.dtype == torch.float32
     assert 1e-6 < distance(found, want) < 1e-3, "rounded, but not by much"
-    assert distance(found, also) < 1e-3
+    assert distance(found, also) < 2e-3, "both are rounded"
     equals = on_the_same_side(made, gaussians, cotangent, keys)
     for one, other, equal in zip(got, wanted, equals, strict=True):
         assert other.abs().max() > 1e-4 * scale, "a vanished gradient would pass any tolerance"
