@@ -1,5 +1,6 @@
 """The renderer from a Warp program: gradients through wp.Tape, and the CUDA mapping of the kernels run on the CPU."""
 
+import gc
 import math
 from dataclasses import replace
 
@@ -10,7 +11,7 @@ import warp as wp
 
 from gftorf_warp.render import buffers, launch
 from gftorf_warp.render.api import Background, rasterize
-from gftorf_warp.render.bridge import captured
+from gftorf_warp.render.bridge import captured, without_garbage_collection
 from gftorf_warp.render.buffers import Frame, RenderSettings, Workspace
 from gftorf_warp.render.launch import Images, Inputs
 from gftorf_warp.scene.camera import Camera
@@ -251,3 +252,41 @@ def test_torch_captures_a_rendering_and_its_backward_pass():
     workspace.check_capacity()
     torch.testing.assert_close(replayed[0], called, rtol=0, atol=0)
     torch.testing.assert_close(replayed[1], grad, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("enabled", [True, False])
+def test_nothing_is_looked_for_during_a_capture(enabled):
+    """Whatever was the case before is so again, after an error too."""
+    before = gc.isenabled()
+    try:
+        (gc.enable if enabled else gc.disable)()
+        with pytest.raises(KeyError), without_garbage_collection():
+            assert not gc.isenabled()
+            raise KeyError
+        assert gc.isenabled() == enabled
+    finally:
+        (gc.enable if before else gc.disable)()
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
+def test_an_old_graph_in_a_cycle_breaks_no_capture():
+    """Its memory may only be given back when the new one is there."""
+
+    def graph_of(value):
+        made, there = torch.cuda.CUDAGraph(), torch.zeros(1 << 20, device="cuda")
+        there.add_(value)
+        torch.cuda.synchronize()
+        with captured(made):
+            holds = [made, there + value]
+            for _ in range(1000):
+                holds.append([holds])  # objects that the collector counts, in a cycle
+        return holds
+
+    threshold = gc.get_threshold()
+    try:
+        gc.set_threshold(1, 1, 1)
+        for value in range(4):
+            graph_of(value)[0].replay()
+        torch.cuda.synchronize()
+    finally:
+        gc.set_threshold(*threshold)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import gc
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -168,9 +169,24 @@ def captured(graph: torch.cuda.CUDAGraph, stream: torch.cuda.Stream | None = Non
     """
     wp.init()
     mode = "thread_local"  # what Warp takes for granted
-    with torch.cuda.graph(graph, pool=pool, stream=stream, capture_error_mode=mode):
+    with without_garbage_collection(), torch.cuda.graph(graph, pool=pool, stream=stream, capture_error_mode=mode):
         with wp.ScopedCapture(stream=_warp_stream(torch.cuda.current_stream()), external=True):
             yield
+
+
+@contextlib.contextmanager
+def without_garbage_collection() -> Iterator[None]:
+    """No cycle of references is looked for inside the block.
+
+    An older graph may hang on one, and to let go of its memory would break off a capture that is under way.
+    """
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
 
 
 def pairs_of(workspace: Workspace) -> Tensor:

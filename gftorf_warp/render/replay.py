@@ -26,7 +26,7 @@ from ..scene.motion import Motion
 from ..scene.sensor import Sensor
 from . import launch
 from .api import Rendering
-from .bridge import ALIGNED, array_over, left_out, stream_of
+from .bridge import ALIGNED, array_over, left_out, stream_of, without_garbage_collection
 from .buffers import Frame, RenderSettings
 from .inputs import CHOICES, Images, Inputs, names_of, shapes_of, wanted_images
 
@@ -189,7 +189,7 @@ class Replay:
 
     def _captured(self, seen: _View) -> wp.Graph:
         """The rendering of a camera that was drawn before, on Warp's own stream: torch's default one cannot capture."""
-        with wp.ScopedCapture(device=self.device) as capture:
+        with without_garbage_collection(), wp.ScopedCapture(device=self.device) as capture:
             self._draw(seen)
         return capture.graph
 
