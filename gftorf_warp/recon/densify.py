@@ -83,7 +83,9 @@ def reset_is_due(before: int, after: int, settings: DensifySettings, schedule: S
 
 def resets(settings: DensifySettings, schedule: Schedule) -> list[int]:
     """At which images a run that counts every image resets the opacities."""
-    return [n for n in range(1, schedule.images + 1) if reset_is_due(n - 1, n, settings, schedule)]
+    intervals = [settings.reset_every, None if settings.reset_faster is None else settings.reset_faster[1]]
+    multiples = {n for every in intervals if every for n in range(every, schedule.images + 1, every)}
+    return [n for n in sorted(multiples) if reset_is_due(n - 1, n, settings, schedule)]
 
 
 def round_of(
