@@ -9,6 +9,7 @@ from __future__ import annotations
 import struct
 import zlib
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -49,13 +50,15 @@ def write_exr(path: str | Path, channels: Mapping[str, np.ndarray], *, one_of: b
                 file.write(str(temporary))
         except RuntimeError as error:
             raise ResourceError("cannot write picture", where=path, why=str(error), fix="free disk space") from error
-        back = read_exr(temporary)
+        back: dict[str, np.ndarray] = {}
+        with suppress(InputError):  # the library does not notice a disk that is full at the end of a file
+            back = read_exr(temporary)
         if back.keys() != images.keys() or any(back[n].tobytes() != image.tobytes() for n, image in images.items()):
             raise ResourceError(
                 "picture damaged while writing",
                 where=path,
                 why="reading it back gave other pixels",
-                fix="check the disk",
+                fix="check the disk, and that it is not full",
             )
 
 

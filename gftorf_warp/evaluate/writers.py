@@ -1,7 +1,7 @@
-"""Pictures on disk while the next images are rendered: by a few threads, in order of the images.
+"""Pictures on disk while the next images are rendered: by a few threads, or of many images by processes.
 
 A 320x240 image with four quads and distance costs a CPU 5 ms. For half of it OpenEXR and others hold Python's lock, so
-more threads write no more.
+more threads write no more; what processes write is the same.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from pathlib import Path
 
 from ..data.files import many_files, write_one_of_many
 from ..data.images import write_exr
-from . import previews
+from . import previews, processes
 from .pictures import Scale
 from .previews import Channels
 
@@ -43,20 +43,39 @@ def write_all(
     Raises:
         UsageError, ResourceError: If a file cannot be written.
     """
-    waiting: deque[Future] = deque()
     written = 0
 
-    def collect(most: int) -> None:
+    def done(images: int) -> None:
         nonlocal written
-        while waiting and (len(waiting) > most or waiting[0].done()):
-            waiting.popleft().result()  # raises what stopped the writing
+        for _ in range(images):
             written += 1
             if progress is not None:
                 progress(written, total)
 
+    count = processes.useful(total)
     with ExitStack() as stack:
         for name in scales:
             stack.enter_context(many_files(out / name))
+        if count:
+            others = stack.enter_context(processes.writing(out, scales, count, done))
+            for index, images in enumerate(series):
+                others.write(index, images)
+        else:
+            _write_by_threads(out, scales, series, done)
+
+
+def _write_by_threads(
+    out: Path, scales: Mapping[str, Scale], series: Iterable[Mapping[str, Channels]], done: Callable[[int], None]
+) -> None:
+    """The same as processes do, in this one."""
+    waiting: deque[Future] = deque()
+
+    def collect(most: int) -> None:
+        while waiting and (len(waiting) > most or waiting[0].done()):
+            waiting.popleft().result()  # raises what stopped the writing
+            done(1)
+
+    with ExitStack() as stack:
         threads = ThreadPoolExecutor(THREADS, thread_name_prefix="gftorf-files")
         stack.callback(threads.shutdown, wait=True, cancel_futures=True)
         for index, images in enumerate(series):
