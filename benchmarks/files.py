@@ -1,6 +1,7 @@
-"""What limits ``gftorf render --arrays`` on a machine: its memory, its disk, the threads that write, or the rendering.
+"""What limits ``gftorf render`` on a machine: its memory, its disk, those that write, or the rendering.
 
     python benchmarks/files.py FOLDER .. [--images N ..] [--run RUN] [--device cpu|cuda] [--rounds R] [--no-warm]
+                               [--pictures P ..]
 
 Distance and four quads of 320x240, 1.84 MB per image, below each folder, which may be on a disk or in memory. Rows:
 ``pages`` are plain files of as many bytes from one thread for each of six files, flushed, then removed: the first round
@@ -8,6 +9,9 @@ of them takes memory that a virtual machine may never have used, which can cost 
 ``past memory`` is the same by O_DIRECT: what the disk does. ``written`` is what the command does with images that cost
 nothing, ``rendered`` the command itself with RUN, from the first block on, flush included, as its progress line has it;
 in brackets the rate of all of it, with what comes before. Pages are used just before every row, unless --no-warm.
+
+All this is of ``--arrays``. With --pictures it is of pictures, ``written`` and ``rendered`` by so many processes each,
+0: by threads. Files are 2.24 MB per image, GB/s are of what is rendered.
 """
 
 from __future__ import annotations
@@ -24,7 +28,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gftorf_warp.evaluate import stored, views
+from gftorf_warp.evaluate import previews, processes, stored, views, writers
 from gftorf_warp.recon.run import Run
 
 HEIGHT, WIDTH = 240, 320
@@ -72,15 +76,40 @@ def written(out: Path, images: int, ring: np.ndarray) -> None:
     stored.store_all(out, CHANNELS, series(images, ring), (images, HEIGHT, WIDTH))
 
 
-def rendered(out: Path, images: int, run: Run) -> float:
+def pictured(out: Path, images: int, ring: np.ndarray) -> float:
+    """The command without a renderer, of pictures."""
+    (first,), seen = series(1, ring), []
+    scales = {name: previews.preview_scale(name, [channels]) for name, channels in first.items()}
+    for name in CHANNELS:
+        (out / name).mkdir()
+    writers.write_all(out, scales, series(images, ring), images, lambda k, _: seen.append((k, time.perf_counter())))
+    return each_of(seen)
+
+
+def each_of(seen: list[tuple[int, float]]) -> float:
+    """Seconds per image from the first progress on."""
+    (first, early), (last, late) = seen[0], seen[-1]
+    return (late - early) / (last - first)
+
+
+def rendered(out: Path, images: int, run: Run, arrays: bool = True) -> float:
     """The command; seconds per image from the first progress on."""
     sequence, seen = run.sequence(), []
     seconds = [float(t) for t in np.linspace(sequence.times[0], sequence.times[-1], images)]
     views.render_to_folder(
-        run, out, tuple(CHANNELS), seconds, arrays=True, progress=lambda k, _: seen.append((k, time.perf_counter()))
+        run, out, tuple(CHANNELS), seconds, arrays=arrays, progress=lambda k, _: seen.append((k, time.perf_counter()))
     )
-    (first, early), (last, late) = seen[0], seen[-1]
-    return (late - early) / (last - first)
+    return each_of(seen)
+
+
+def by(count: int, way: Callable[[Path, int], float]) -> Callable[[Path, int], float]:
+    """A way in which so many processes write."""
+
+    def forced(out: Path, images: int) -> float:
+        processes.useful = lambda _: count
+        return way(out, images)
+
+    return forced
 
 
 def main() -> None:
@@ -91,6 +120,7 @@ def main() -> None:
     parser.add_argument("--run", type=Path)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--pictures", type=int, nargs="+")
     parser.add_argument("--no-warm", action="store_true")
     options = parser.parse_args()
     logging.basicConfig()
@@ -104,6 +134,10 @@ def main() -> None:
     }
     if run:
         ways["rendered"] = lambda out, n: rendered(out, n, run)
+    if options.pictures is not None:
+        ways = {f"written by {p}": by(p, lambda out, n: pictured(out, n, ring)) for p in options.pictures}
+        if run:
+            ways |= {f"rendered by {p}": by(p, lambda out, n: rendered(out, n, run, False)) for p in options.pictures}
     for folder in options.folder:
         for images in options.images:
             for name, way in ways.items():
@@ -114,9 +148,9 @@ def main() -> None:
                         plain(out, images, 0)
                         shutil.rmtree(out)
                     out.mkdir(parents=True)
-                    begun, cpu = time.perf_counter(), time.process_time()
+                    begun, cpu = time.perf_counter(), sum(os.times()[:4])
                     each = way(out, images)
-                    spent, cpu = time.perf_counter() - begun, time.process_time() - cpu
+                    spent, cpu = time.perf_counter() - begun, sum(os.times()[:4]) - cpu
                     shutil.rmtree(out)
                     rate = f"{1 / each:.0f} ({images / spent:.0f})" if each else f"{images / spent:.0f}"
                     print(

@@ -181,7 +181,7 @@ def render_to_folder(
     ``OUT/renders.json`` lists the times [s], the channels with their units and the scale of the previews; poses, if any
     were given. Otherwise the pose is that of the raw frame nearest to each time.
 
-    Pictures are encoded by a few threads. Arrays are only copied, and many times as fast:
+    Pictures are written by a few threads, or many of them by processes. Arrays are only copied, and many times as fast:
     ``OUT/<what>/<channel>.npy``, float32 [S, H, W] of all S times, with the values of the EXR files.
 
     Args:
