@@ -117,7 +117,8 @@ static double walk(int begin, int end, int step) {
         const double dx = splats[ids[k]][0] - (40.5 + p % 8), dy = splats[ids[k]][1] - (20.5 + p / 8);
         const double v = GEOMETRY ? u[0] : 0, w = CHANNELS ? u[1] : 0, w2 = LIGHT ? u[2] : 0, wd = LIGHT ? u[1] : 0;
         const double all[16] = {v * dx, v * dy, v * dx * dx, v * dx * dy, v * dy * dy, v, double(GEOMETRY && u[1] > 0),
-            GEOMETRY ? u[1] : 0, w * d[0], w * d[1], w * d[2], w2 * d[3], w2 * d[4], w2 * d[5], wd * (SPREADS ? u[3] : d[6]), 0};
+            GEOMETRY ? u[1] : 0, w * d[0], w * d[1], w * d[2], w2 * d[3], w2 * d[4], w2 * d[5],
+            wd * (SPREADS ? u[3] : d[6]), 0};
         for (int j = 0; j < 32; ++j) {  // a record, and that of further channels
             const double one = j < 16 ? all[j] : MORE && j >= 24 && j < 27 ? double(u[1]) * d[j - 17] : 0;
             want[ids[k] * 32 + j] += one; size[ids[k] * 32 + j] += std::fabs(one);

@@ -12,7 +12,7 @@ from mistakes import ramp, wall
 from gftorf_warp.recon import densify, objective, presets
 from gftorf_warp.recon.observations import observe
 from gftorf_warp.recon.optimiser import rates_at
-from gftorf_warp.recon.settings import FlowSource, Input
+from gftorf_warp.recon.settings import BatchRule, FlowSource, Input
 from gftorf_warp.recon.state import begin
 from gftorf_warp.scene.initialise import Init, InitSettings
 from gftorf_warp.scene.motion import MotionKind, MotionSettings
@@ -26,7 +26,8 @@ FITTED = [name for name in presets.PRESETS if name != "ctof"]
 def test_mistake_03_both_ends_of_every_rate_are_stated(name, recorded):
     """First and last rate of every group are fields, what is in force is log-linear between them, and nothing else."""
     settings = presets.preset(name, recorded)
-    settings = replace(settings, schedule=replace(settings.schedule, pause_after_reset=0, freeze_from=None))
+    plain = {"pause_after_reset": 0, "freeze_from": None, "motion_ramp": 0, "batch_rule": BatchRule.NONE}
+    settings = replace(settings, schedule=replace(settings.schedule, **plain))
     first, last = (dataclasses.asdict(rates) for rates in (settings.rates, settings.rates_last))
     assert first.keys() == last.keys() == rates_at(settings, 0).keys()
     total = settings.schedule.images
