@@ -259,14 +259,14 @@ class _Loop:
                 every = self.settings.schedule.log_every
                 if state.images // every > before // every or state.images >= total:
                     self.report(state)
-                    if dead.is_dead(state, self.settings):
-                        dead.revive(state, self.settings)
                 if self.judged_at is not None and before < self.judged_at <= state.images and self.is_dark(state):
                     state = self.begin_again(state)
                     steps = steps_of(state, self.observations, self.settings, run_all)
                     continue
                 if self.watch.due(before, state.images, total):
                     self.watch.look(state, self.settings)
+                    if state.images < total and dead.is_dead(state, self.settings):
+                        dead.revive(state, self.settings)
                 if stop.is_set():
                     self.save(state)
                     LOG.info("interrupted at image %d of %d, stored", state.images, total)
