@@ -50,6 +50,7 @@ HAS_BOTH = {  # the only modules that may know torch and Warp together
 LAUNCHES = {  # file: what it launches
     "render/launch.py": "the order of a rendering",
     "render/stages.py": "the stages of a rendering",
+    "render/side_by_side.py": "its launches over ranges of tiles",
     "render/training.py": "what a step does beside rendering",
     "render/perceptron.py": "a network's layers, before anything is rendered",
     "render/replay.py": "Gaussians at a time, before they are rendered again",

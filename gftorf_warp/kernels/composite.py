@@ -17,6 +17,7 @@ import warp as wp
 from ..constants import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 from .batches import ROUND, make_batches
 from .lanes import make_lanes, warp_any
+from .parts import PLANES, part_length
 from .splat import AHEAD, Splat, block_missed, load_splat, prefetch
 
 # planes of ``light``, each [tiles, lanes] of V
@@ -90,6 +91,7 @@ def make_composite(
     metric: bool | None,
     cooperative: bool = False,
     more: bool = False,
+    parts: int = 1,
 ):
     """The kernel for one tile shape and one set of outputs.
 
@@ -104,10 +106,15 @@ def make_composite(
             no distortion, and its three planes are left alone.
         cooperative: Whether the lanes of a warp fetch records for each other (batches.py); K must be 1.
         more: Whether three further channels are summed in the same pass; it must be cooperative.
+        parts: In which the list will be walked back (parts.py); if more than one, the pass must be cooperative, with
+            light and without distortion.
     """
+    parted = parts > 1
+    if parted and not (cooperative and light and metric is None):
+        raise ValueError("a list is walked back in parts with light, without distortion and by warps only")
     ops, pixels = make_lanes(K), make_pixels(K, tile_width, tile_height)
     V, fill, affine, mul, axpy, fma, fnma = ops.V, ops.fill, ops.affine, ops.mul, ops.axpy, ops.fma, ops.fnma
-    above, drop_below, set_where = ops.above, ops.drop_below, ops.set_where
+    above, add, drop_below, set_where = ops.above, ops.add, ops.drop_below, ops.set_where
     response, alpha_of, nonzero = ops.response, ops.alpha_of, ops.nonzero
     block_x, block_y, columns, rows = pixels.block_x, pixels.block_y, ops.columns, ops.rows
     half = 0.5 * (pixels.side - 1)  # from the first to the middle of a block [px]
@@ -135,6 +142,18 @@ def make_composite(
 
     goes_on = trusts if cooperative else asks
 
+    @wp.func
+    def leave(states: wp.array3d[V], part: int, tile: int, lane: int, T: V, re: V, im: V, amplitude: V, distance: V):
+        """What is known where a part ends: T, but of the last one, and what it has added, but of the first."""
+        if part < wp.static(parts - 1):
+            states[part * wp.static(PLANES), tile, lane] = T
+        if part > 0:
+            place = (part - 1) * wp.static(PLANES)
+            states[place + 1, tile, lane] = re
+            states[place + 2, tile, lane] = im
+            states[place + 3, tile, lane] = amplitude
+            states[place + 4, tile, lane] = distance
+
     @wp.kernel(**options(K))
     def composite(
         # In:
@@ -151,6 +170,7 @@ def make_composite(
         sums: wp.array3d[V],  # [9, tiles, lanes] planes RE .. LAST of ``light``
         channel: wp.array3d[V],  # [3, tiles, lanes] the three channels
         more_channel: wp.array3d[V],  # [3, tiles, lanes] the further channels
+        states: wp.array3d[V],  # [5 (parts - 1), tiles, lanes] where parts end, see parts.py
     ):
         """One thread per block of K pixels; on CUDA one warp per tile, so all control is uniform over 32 lanes."""
         t, lane = wp.tid()
@@ -168,6 +188,11 @@ def make_composite(
             im = fill(0.0)
             amplitude = fill(0.0)
             distance = fill(0.0)
+        if wp.static(parted):  # sums of the parts before this one
+            re_before = fill(0.0)
+            im_before = fill(0.0)
+            amplitude_before = fill(0.0)
+            distance_before = fill(0.0)
         if wp.static(spreads):
             distortion = fill(0.0)
             sum_zeta = fill(0.0)
@@ -182,6 +207,10 @@ def make_composite(
             c5 = fill(0.0)
         begin = first[tile]
         end = first[tile + 1]
+        part = int(0)
+        length = int(0)
+        if wp.static(parted):
+            length = part_length(end - begin, wp.static(parts))
         zeta0 = float(0.0)  # distortion is blind to a common shift; near the surface its sums keep their digits
         if wp.static(spreads):
             if begin < end:
@@ -209,6 +238,18 @@ def make_composite(
         # assigned inside, here a dozen vectors per splat
         while k < end and warp_any(nonzero(live)):
             stop = end
+            if wp.static(parted):
+                if k - begin == (part + 1) * length:  # a part begins, since it is whole rounds
+                    leave(states, part, tile, lane, T, re, im, amplitude, distance)
+                    part += 1
+                    re_before = add(re_before, re)
+                    im_before = add(im_before, im)
+                    amplitude_before = add(amplitude_before, amplitude)
+                    distance_before = add(distance_before, distance)
+                    re = fill(0.0)
+                    im = fill(0.0)
+                    amplitude = fill(0.0)
+                    distance = fill(0.0)
             if wp.static(cooperative):
                 stop = wp.min(k + ROUND, end)
                 arrive()
@@ -271,6 +312,15 @@ def make_composite(
                 k = end  # one round was all
         if wp.static(cooperative):
             arrive()  # records that nobody needs may still be on their way
+        if wp.static(parted):
+            leave(states, part, tile, lane, T, re, im, amplitude, distance)
+            nothing = fill(0.0)
+            for later in range(part + 1, wp.static(parts)):  # nobody walked there
+                leave(states, later, tile, lane, T, nothing, nothing, nothing, nothing)
+            re = add(re, re_before)
+            im = add(im, im_before)
+            amplitude = add(amplitude, amplitude_before)
+            distance = add(distance, distance_before)
         if wp.static(light):
             sums[wp.static(RE), tile, lane] = re
             sums[wp.static(IM), tile, lane] = im

@@ -18,6 +18,7 @@ from ..constants import ALPHA_MAX, ALPHA_MIN
 from .batches import ROUND, make_gradient_rounds
 from .composite import LAST, SUM_ZETA, SUM_ZETA2, TRANSMITTANCE, make_pixels, make_zeta, options
 from .lanes import make_lanes, sums_of, types_of, warp_any, warp_max
+from .parts import PLANES, part_length
 from .splat import AHEAD, Splat, block_missed, load_splat, prefetch
 
 # planes of ``grad_sums``, each [tiles, lanes] of V: gradients of the first five planes of the forward pass, and of T_e
@@ -141,6 +142,7 @@ def make_composite_backward(
     fixed: bool = False,
     cooperative: bool = False,
     more: bool = False,
+    parts: int = 1,
 ):
     """The adjoint kernel for one tile shape and one set of outputs; arguments as in ``make_composite``.
 
@@ -155,7 +157,12 @@ def make_composite_backward(
         fixed: Whether weights are held fixed under the channels, so that only these have their gradient.
         cooperative: As in ``make_composite``.
         more: Whether three further channels, under which weights are held fixed, have their gradient, too.
+        parts: Warps per tile, each with a part of its list (parts.py); if more than one, the forward pass must have
+            had as many, and weights be held fixed under all channels.
     """
+    parted = parts > 1
+    if parted and not (cooperative and light and metric is None and (fixed or not channels)):
+        raise ValueError("a list is walked back in parts with light, without distortion or colour, by warps only")
     ops, pixels = make_lanes(K), make_pixels(K, tile_width, tile_height)
     V, fill, affine, mul, axpy, fma, fnma = ops.V, ops.fill, ops.affine, ops.mul, ops.axpy, ops.fma, ops.fnma
     add, scaled, exceeds, keep_below = ops.add, ops.scaled, ops.exceeds, ops.keep_below
@@ -195,13 +202,17 @@ def make_composite_backward(
         grad_sums: wp.array3d[V],  # [6, tiles, lanes] gradients of RE .. DISTORTION and of T_e
         grad_channel: wp.array3d[V],  # [3, tiles, lanes] gradients of the three channels
         grad_more: wp.array3d[V],  # [3, tiles, lanes] gradients of the further channels
+        states: wp.array3d[V],  # [5 (parts - 1), tiles, lanes] where parts end, see parts.py
         # Out:
         grad_splats: wp.array[Splat],  # [N] added to: moments in 0-5, pixels in 6, weights in 7, gradients in 8-15
         more_splats: wp.array[Splat],  # [N] added to: slots 8-10, gradients of the further channels
     ):
-        """One thread per block of K pixels; visits exactly the contributors of the forward pass, last one first."""
+        """One thread per block of K pixels; visits exactly the contributors of the forward pass, last one first.
+
+        Where lists have parts, that many warps per tile, side by side.
+        """
         t, lane = wp.tid()
-        tile = tile0 + t
+        tile = tile0 + t // wp.static(parts)
         x0 = block_x(tile, lane, tiles_x)
         y0 = block_y(tile, lane, tiles_x)
         x = columns(x0)
@@ -244,11 +255,27 @@ def make_composite_backward(
             g5 = grad_more[2, tile, lane]
         begin = first[tile]
         k = begin + warp_max(int(largest_of(last)))
+        position = fill(float(k - begin))
+        if wp.static(parted):
+            part = t % wp.static(parts)
+            length = part_length(first[tile + 1] - begin, wp.static(parts))
+            stop_of_part = wp.min(k, begin + (part + 1) * length)
+            position = fill(float(stop_of_part - begin))
+            begin += part * length
+            k = wp.max(stop_of_part, begin)
+            for m in range(wp.static(parts - 1)):  # what later parts have added, the last one first
+                end_of = wp.static(parts - 2) - m
+                if end_of >= part:
+                    place = end_of * wp.static(PLANES)
+                    lit = mul(g_re, states[place + 1, tile, lane])
+                    lit = fma(lit, g_im, states[place + 2, tile, lane])
+                    lit = fma(lit, g_amplitude, states[place + 3, tile, lane])
+                    E = add(E, fma(add(lit, lit), g_distance, states[place + 4, tile, lane]))
+                    T = states[place, tile, lane]
         zeta0 = float(0.0)
         if wp.static(spreads):
             if begin < k:
                 zeta0 = zeta_of(splats[ids[begin]][14], mapping)
-        position = fill(float(k - begin))
         if wp.static(cooperative):
             memory = warp_memory()
             top = k - 1

@@ -62,8 +62,16 @@ def render(inputs: Inputs, view: CameraView, shifts: tuple[float, ...], frame: F
         tape.record_func(adjoint, arrays)
 
 
-def forward(inputs: Inputs, view: CameraView, shifts: tuple[float, ...], frame: Frame, images: Images) -> None:
-    """Project, sort, composite, resolve; images that are None cost nothing."""
+def forward(
+    inputs: Inputs,
+    view: CameraView,
+    shifts: tuple[float, ...],
+    frame: Frame,
+    images: Images,
+    *,
+    differentiable: bool = True,
+) -> None:
+    """Project, sort, composite, resolve; images that are None cost nothing, nor does what backward alone needs."""
     frame.turns += 1
     if frame.count:
         stages.project(inputs, view, frame)
@@ -80,7 +88,7 @@ def forward(inputs: Inputs, view: CameraView, shifts: tuple[float, ...], frame: 
         if name == "extra":
             stages.set_channels(frame, inputs, start, frame.records[number])
     for number in [0, *range(max(1, frame.groups_with_light), len(frame.records))]:
-        stages.composite(frame, view, number, images.distortion is not None)
+        stages.composite(frame, view, number, images.distortion is not None, differentiable=differentiable)
     stages.resolve_images(inputs, shifts, frame, images, groups)
 
 

@@ -200,7 +200,7 @@ class Replay:
     def _draw(self, seen: _View) -> None:
         """What a graph holds: a rendering, and the number of its pairs."""
         frame = seen.target.frame
-        launch.forward(self._inputs, seen.view, self.shifts, frame, seen.target.images)
+        launch.forward(self._inputs, seen.view, self.shifts, frame, seen.target.images, differentiable=False)
         if self.count:
             noted = [self._largest, seen.target.pairs]
             wp.launch(move.note_largest, 1, [frame.total], noted, device=self.device, record_tape=False)

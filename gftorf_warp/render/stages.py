@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import math
-from concurrent.futures import ThreadPoolExecutor
 from functools import cache
-from itertools import pairwise
 
-import numpy as np
 import warp as wp
 
-from ..kernels import batches, bits, ordered, ranks, resolve, splat, tiles
+from ..kernels import bits, ordered, ranks, resolve, splat, tiles
 from ..kernels.composite import CHANNEL_PLANES, make_composite
 from ..kernels.composite_backward import (
     GRAD_LIGHT_PLANES,
@@ -19,9 +16,11 @@ from ..kernels.composite_backward import (
     make_composite_backward,
 )
 from ..kernels.geometry import CameraView
+from ..kernels.parts import PLANES
 from ..kernels.project import make_project
 from .buffers import ClampGradient, Distortion, Frame, Planes, Stop, Support
 from .inputs import Images, Inputs
+from .side_by_side import over_tiles, tile_edges
 
 _PROJECTED = ("mean", "log_scale", "quaternion", "opacity_logit", "reflectivity_sh", "colour_sh")
 
@@ -129,14 +128,19 @@ def _sum_counts(frame: Frame) -> int:
     return capacity
 
 
-def composite(frame: Frame, view: CameraView, number: int, distortion: bool = True) -> None:
+def composite(
+    frame: Frame, view: CameraView, number: int, distortion: bool = True, *, differentiable: bool = True
+) -> None:
     """Blend all tiles: light with the first group of channels, or the first two, every further group by itself."""
     nothing, more = _nothing(frame, 3, frame.sums.lanes.dtype), number == 0 and frame.groups_with_light > 1
     light, channels = number == 0, bool(frame.channels)
     shape = frame.K, frame.tile_width, frame.tile_height
     metric = _metric(frame, light and distortion)
+    parts = frame.parts_wanted if light and metric is None and differentiable else 1
+    if light:
+        frame.parts = parts
     kernel = make_composite(
-        *shape, light, channels, frame.settings.stop == Stop.INCLUSIVE, metric, frame.cooperative, more
+        *shape, light, channels, frame.settings.stop == Stop.INCLUSIVE, metric, frame.cooperative, more, parts
     )
     channel = frame.channels[number].lanes if channels else nothing
     splats = _spread(frame, number)
@@ -144,9 +148,10 @@ def composite(frame: Frame, view: CameraView, number: int, distortion: bool = Tr
     lists = [frame.first, frame.ids, splats, frame.tiles_x, view.width, view.height]
 
     def arguments(tile0: int, _part: int) -> list:
-        return [*lists, tile0, _mapping(frame), more_splats, frame.sums.lanes, channel, more_channel]
+        outputs = [frame.sums.lanes, channel, more_channel, _states(frame, parts)]
+        return [*lists, tile0, _mapping(frame), more_splats, *outputs]
 
-    _over_tiles(frame, kernel, _tile_edges(frame, frame.threads), arguments)
+    over_tiles(frame, kernel, tile_edges(frame, frame.threads), arguments)
 
 
 def composite_backward(
@@ -178,18 +183,20 @@ def composite_backward(
     shape = frame.K, frame.tile_width, frame.tile_height
     passes = frame.settings.clamp_gradient == ClampGradient.STRAIGHT
     metric = _metric(frame, light and distortion)
+    parts = frame.parts if light and metric is None and (fixed or not channels) else 1
+    fixed = fixed and channels
     kernel = make_composite_backward(
-        *shape, light, channels, passes, metric, fixed and channels, frame.cooperative, grad_more is not None
+        *shape, light, channels, passes, metric, fixed, frame.cooperative, grad_more is not None, parts
     )
     nothing = _nothing(frame, 3, frame.sums.lanes.dtype)
     channel = grad_channel.lanes if grad_channel is not None else nothing
     more = grad_more.lanes if grad_more is not None else nothing
-    edges = [0, frame.tiles] if frame.ordered else _tile_edges(frame, frame.threads)
+    edges = [0, frame.tiles] if frame.ordered else tile_edges(frame, frame.threads)
     added, more_added = records, more_records
     if frame.ordered:
         added = frame.zeros("gradients of pairs", len(frame.owners), splat.Splat)
         more_added = None if more_records is None else frame.zeros("more of pairs", len(frame.owners), splat.Splat)
-    parts = [added] + [frame.zeros(f"records of thread {n}", frame.count, splat.Splat) for n in range(len(edges) - 2)]
+    targets = [added] + [frame.zeros(f"records of thread {n}", frame.count, splat.Splat) for n in range(len(edges) - 2)]
     lists = [frame.first, frame.ids, _spread(frame, number, anew=False), frame.tiles_x]
 
     def arguments(tile0: int, part: int) -> list:
@@ -201,13 +208,14 @@ def composite_backward(
             grad_light.lanes,
             channel,
             more,
-            parts[part],
+            _states(frame, parts),
+            targets[part],
             more_added if more_added is not None else added,
         ]
 
-    _over_tiles(frame, kernel, edges, arguments)
-    for part in parts[1:]:
-        _launch(splat.add_records, frame.count, [part, 0], [records])
+    over_tiles(frame, kernel, edges, arguments, parts)
+    for target in targets[1:]:
+        _launch(splat.add_records, frame.count, [target, 0], [records])
     if frame.ordered:
         for copies, total in ((added, records), (more_added, more_records)):
             if copies is not None and total is not None:
@@ -331,47 +339,11 @@ def _mapping(frame: Frame) -> wp.vec2:
     return wp.vec2(far / (far - near), far * near / (far - near))
 
 
-def _tile_edges(frame: Frame, parts: int) -> list[int]:
-    """Edges of at most ``parts`` ranges of tiles with about equally many pairs; one range where one thread works."""
-    if frame.threads == 1:
-        return [0, frame.tiles]
-    first = frame.first.numpy()  # CPU only: a view, not a copy
-    work = first[:-1] + np.arange(frame.tiles)  # an empty tile costs about as much as a pair
-    targets = [(first[-1] + frame.tiles) * p / parts for p in range(1, parts)]
-    return sorted({0, *(int(e) for e in np.searchsorted(work, targets)), frame.tiles})
-
-
-@cache
-def _pool(threads: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(threads, thread_name_prefix="gftorf-tiles")
-
-
-def _over_tiles(frame: Frame, kernel, edges: list[int], arguments) -> None:
-    """Launch over ranges of tiles; CPU launches release the interpreter lock, so ranges run side by side."""
-    side_by_side = len(edges) > 2
-    commands = [
-        wp.launch(
-            kernel,
-            dim=(stop - start, frame.lanes),
-            inputs=arguments(start, part),
-            device=frame.device,
-            block_dim=32 * batches.WARPS if frame.cooperative else 128,
-            record_tape=False,
-            record_cmd=side_by_side,
-        )
-        for part, (start, stop) in enumerate(pairwise(edges))
-    ]
-    if side_by_side:
-        run_side_by_side(commands, frame.threads)
-
-
-def run_side_by_side(commands: list, threads: int) -> None:
-    """Run at most ``threads`` recorded CPU launches, each in a thread of its own; they release the interpreter lock."""
-    # this thread works, too: a pool that has slept would wake on its processor, and both would share it for a while
-    others = [_pool(threads - 1).submit(command.launch) for command in commands[1:]]
-    commands[0].launch()
-    for other in others:
-        other.result()
+def _states(frame: Frame, parts: int) -> wp.array:
+    """What is known where parts of lists end."""
+    if parts == 1:
+        return _nothing(frame, 3, frame.sums.lanes.dtype)
+    return frame.planes(f"ends of {parts} parts", PLANES * (parts - 1)).lanes
 
 
 def _launch(kernel, dim, inputs: list, outputs: list, **adjoint) -> None:

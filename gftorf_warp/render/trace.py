@@ -21,7 +21,7 @@ from ..scene.camera import Camera
 from ..scene.optics import Beam
 from .buffers import RenderSettings, available_threads
 from .launch import view_of
-from .stages import run_side_by_side
+from .side_by_side import run_side_by_side
 
 ROWS_MIN = 8  # [px] per CPU thread: handing over fewer costs more than it saves
 

@@ -1,0 +1,56 @@
+"""Launches over ranges of tiles: one on CUDA, and on a CPU several side by side, each in a thread of its own."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from itertools import pairwise
+
+import numpy as np
+import warp as wp
+
+from ..kernels import batches
+from .buffers import Frame
+
+
+def tile_edges(frame: Frame, parts: int) -> list[int]:
+    """Edges of at most ``parts`` ranges of tiles with about equally many pairs; one range where one thread works."""
+    if frame.threads == 1:
+        return [0, frame.tiles]
+    first = frame.first.numpy()  # CPU only: a view, not a copy
+    work = first[:-1] + np.arange(frame.tiles)  # an empty tile costs about as much as a pair
+    targets = [(first[-1] + frame.tiles) * p / parts for p in range(1, parts)]
+    return sorted({0, *(int(e) for e in np.searchsorted(work, targets)), frame.tiles})
+
+
+@cache
+def _pool(threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(threads, thread_name_prefix="gftorf-tiles")
+
+
+def over_tiles(frame: Frame, kernel, edges: list[int], arguments, warps: int = 1) -> None:
+    """Launch over ranges of tiles, some warps each; CPU launches let others run, so ranges are done side by side."""
+    side_by_side = len(edges) > 2
+    commands = [
+        wp.launch(
+            kernel,
+            dim=((stop - start) * warps, frame.lanes),
+            inputs=arguments(start, part),
+            device=frame.device,
+            block_dim=32 * batches.WARPS if frame.cooperative else 128,
+            record_tape=False,
+            record_cmd=side_by_side,
+        )
+        for part, (start, stop) in enumerate(pairwise(edges))
+    ]
+    if side_by_side:
+        run_side_by_side(commands, frame.threads)
+
+
+def run_side_by_side(commands: list, threads: int) -> None:
+    """Run at most ``threads`` recorded CPU launches, each in a thread of its own; they release the interpreter lock."""
+    # this thread works, too: a pool that has slept would wake on its processor, and both would share it for a while
+    others = [_pool(threads - 1).submit(command.launch) for command in commands[1:]]
+    commands[0].launch()
+    for other in others:
+        other.result()
