@@ -86,10 +86,10 @@ def test_parts_are_one_walk(count, opacity, stop, device, monkeypatch):
     settings = RenderSettings(near=0.1, far=20.0, stop=stop)
     results = {}
     for wanted in (1, 4):
-        monkeypatch.setitem(buffers.PARTS, device, wanted)
+        monkeypatch.setitem(buffers.WALKS, device, wanted)
         field = scene(count, opacity, device)
         *results[wanted], workspace = outcome(api.rasterize, field, settings)
-        assert workspace.last.parts == wanted
+        assert workspace.last.walks == wanted
     exact = outcome(reference.rasterize, scene(count, opacity, "cpu", torch.float64), settings)
     for one, other, want in zip(results[4], results[1], exact, strict=False):
         for name, value in one.items():
@@ -105,7 +105,7 @@ def test_channels_with_fixed_weights_take_part(device, monkeypatch):
         extra = torch.rand(300, number, generator=torch.Generator().manual_seed(2))
         results = []
         for wanted in (1, 4):
-            monkeypatch.setitem(buffers.PARTS, device, wanted)
+            monkeypatch.setitem(buffers.WALKS, device, wanted)
             field = scene(300, 0.05, device)
             results.append(outcome(api.rasterize, field, settings, extra)[:2])
         for one, other in zip(*results, strict=True):
@@ -115,11 +115,11 @@ def test_channels_with_fixed_weights_take_part(device, monkeypatch):
 
 def test_what_cannot_be_split_is_not(device, monkeypatch):
     """Distortion is a sum over pairs of entries; colour has weights that learn."""
-    monkeypatch.setitem(buffers.PARTS, device, 4)
+    monkeypatch.setitem(buffers.WALKS, device, 4)
     for change, images in (({}, (*IMAGES, "distortion")), ({"colour_sh": torch.rand(100, 16, 3)}, IMAGES)):
         found = []
         for wanted in (1, 4):
-            monkeypatch.setitem(buffers.PARTS, device, wanted)
+            monkeypatch.setitem(buffers.WALKS, device, wanted)
             field, workspace = scene(100, 0.1, device), Workspace()
             field = replace(field, **{name: value.to(device).requires_grad_() for name, value in change.items()})
             rendering = api.rasterize(field, CAMERA, SENSOR, RenderSettings(), images=images, workspace=workspace)
@@ -128,6 +128,18 @@ def test_what_cannot_be_split_is_not(device, monkeypatch):
             sum(terms).backward()
             found.append(field.mean.grad.cpu())
         assert far(found[1], found[0]) < 1e-5
+
+
+@pytest.mark.parametrize("walks", [1, 4])
+def test_memory_is_used_again_where_lists_are_read_in_parts_too(walks, device, monkeypatch):
+    """Of so many Gaussians several warps read the list of a tile, whatever walks it back afterwards."""
+    monkeypatch.setitem(buffers.WALKS, device, walks)
+    field, workspace, seen = scene(20_000, 0.01, device).map(torch.Tensor.detach), Workspace(), []
+    for _ in range(2):
+        rendering = api.rasterize(field, CAMERA, SENSOR, RenderSettings(), images=IMAGES, workspace=workspace)
+        seen.append(rendering.distance.clone())
+    assert workspace.last.parts > 1
+    assert torch.equal(*seen)
 
 
 def test_parts_are_whole_rounds_and_hold_every_list():

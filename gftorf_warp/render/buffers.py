@@ -125,8 +125,8 @@ class RenderSettings:
 # owns a tile and every thread a pixel (design/tiles.md)
 TILE_SHAPES = {"cpu": (16, 8, 8), "cuda": (1, 8, 4)}
 
-# in which lists of tiles are walked back where warps own tiles (kernels/parts.py); 1 on CUDA until 4 is measured there
-PARTS = {"cpu": 1, "cuda": 1}
+# parts in which lists are walked back where warps own tiles (kernels/parts.py); 1 on CUDA until 4 is measured there
+WALKS = {"cpu": 1, "cuda": 1}
 LANES_PER_SPLAT = {"cpu": 1, "cuda": 32}  # threads that write the (tile, splat) pairs of a splat
 
 # a bit per tile and splat is zeroed, counted and read whether it is set or not: three times these bytes, which at
@@ -162,8 +162,8 @@ class Frame:
         self.tiles = self.tiles_x * math.ceil(height / self.tile_height)
         pixels = make_pixels(self.K, self.tile_width, self.tile_height)
         self.lanes = pixels.lanes
-        self.parts_wanted = PARTS[kind] if self.cooperative else 1
-        self.parts = 1  # in which the lists of the last rendering may be walked back
+        self.walks_wanted = WALKS[kind] if self.cooperative else 1
+        self.walks = 1  # parts in which the lists of the last rendering may be walked back
         self.threads = (settings.threads or available_threads()) if device.is_cpu else 1
         self.tiling = Tiling()
         self.tiling.width_log2, self.tiling.height_log2 = (

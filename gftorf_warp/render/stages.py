@@ -136,9 +136,9 @@ def composite(
     light, channels = number == 0, bool(frame.channels)
     shape = frame.K, frame.tile_width, frame.tile_height
     metric = _metric(frame, light and distortion)
-    parts = frame.parts_wanted if light and metric is None and differentiable else 1
+    parts = frame.walks_wanted if light and metric is None and differentiable else 1
     if light:
-        frame.parts = parts
+        frame.walks = parts
     kernel = make_composite(
         *shape, light, channels, frame.settings.stop == Stop.INCLUSIVE, metric, frame.cooperative, more, parts
     )
@@ -183,7 +183,7 @@ def composite_backward(
     shape = frame.K, frame.tile_width, frame.tile_height
     passes = frame.settings.clamp_gradient == ClampGradient.STRAIGHT
     metric = _metric(frame, light and distortion)
-    parts = frame.parts if light and metric is None and (fixed or not channels) else 1
+    parts = frame.walks if light and metric is None and (fixed or not channels) else 1
     fixed = fixed and channels
     kernel = make_composite_backward(
         *shape, light, channels, passes, metric, fixed, frame.cooperative, grad_more is not None, parts
