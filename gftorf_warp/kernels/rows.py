@@ -10,9 +10,8 @@ is infinite: with all rows 0 times that is no number and the step not sound, wit
 
 import warp as wp
 
-from .wgmma import TILE
+from .wgmma import BLOCK, TILE  # as many threads as rows in a block
 
-BLOCK = 256  # rows, and threads on CUDA
 NO_ROW = -1
 
 _HAS = """auto has = [&](int key, int low) {  // whether a row of a key is there, and has a gradient

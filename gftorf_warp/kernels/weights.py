@@ -13,23 +13,24 @@ same row by row, float32 on halves.
 import warp as wp
 
 from .rows import NO_ROW
-from .wgmma import COLUMNS, TILE, WIDTH
+from .wgmma import BLOCK, COLUMNS, TILE, WIDTH
 
 HALF = 128  # outputs of a block
 HALVES = WIDTH // HALF
-BLOCK = 256  # threads
+ALIGNED = 128  # bytes at multiples of which shared memory is used: all banks
 STAGES = 4  # tiles in shared memory: one is multiplied, the others come
 
 
 def shared(columns: int) -> int:
     """Bytes of shared memory for so many inputs."""
-    return STAGES * TILE * 2 * (HALF + columns)
+    return STAGES * TILE * 2 * (HALF + columns) + ALIGNED
 
 
 def _snippet(columns: int, layer: str, first: str, row: str) -> str:
     """C++: which layer's slopes a job is about, where its inputs begin, and which row of them a listed row has."""
     own = columns // 4  # inputs of a warp
     pieces = columns // 8  # of 16 bytes in a row
+    stage = TILE * 2 * (HALF + columns)  # bytes of a tile
     return f"""
     const int job = block % jobs, part = block / jobs, layer = {layer};
     const int tiles = begins.data[keys] / {TILE};
@@ -39,7 +40,7 @@ def _snippet(columns: int, layer: str, first: str, row: str) -> str:
     float* const to = partials.data + (size_t)block * {HALF * columns};
 #if defined(__CUDA_ARCH__)
     extern __shared__ char memory[];
-    const unsigned base = (unsigned)__cvta_generic_to_shared(memory);
+    const unsigned start = (unsigned)__cvta_generic_to_shared(memory), base = (start + {ALIGNED - 1}) & ~{ALIGNED - 1}u;
     const int lane = threadIdx.x & 31, warp = threadIdx.x >> 5;
     auto copy = [&](unsigned to, const wp::half* from, int bytes) {{  // zeros behind ``bytes`` of 16
         asm volatile("cp.async.cg.shared.global [%0], [%1], 16, %2;" :: "r"(to), "l"(from), "r"(bytes) : "memory");
@@ -50,7 +51,7 @@ def _snippet(columns: int, layer: str, first: str, row: str) -> str:
         return tile < end ? __ldg(listed.data + tile * {TILE} + warp + 8 * (lane & 7)) : {NO_ROW};
     }};
     auto fetch = [&](int tile, int known) {{
-        const unsigned stage = base + tile % {STAGES} * {shared(columns) // STAGES};
+        const unsigned stage = base + tile % {STAGES} * {stage};
         #pragma unroll
         for (int i = 0; i < {TILE * HALF // 8 // BLOCK}; ++i) {{
             const int n = i * {BLOCK} + (int)threadIdx.x, k = n / {HALF // 8}, piece = n % {HALF // 8};
@@ -93,7 +94,7 @@ def _snippet(columns: int, layer: str, first: str, row: str) -> str:
         if (tile + {STAGES - 1} < end) fetch(tile + {STAGES - 1}, known);
         commit();
         known = next;
-        const unsigned stage = base + tile % {STAGES} * {shared(columns) // STAGES};
+        const unsigned stage = base + tile % {STAGES} * {stage};
         #pragma unroll
         for (int k = 0; k < {TILE}; k += 16) {{
             unsigned a[4][4], b[{own // 16}][4];

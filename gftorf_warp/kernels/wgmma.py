@@ -443,10 +443,10 @@ _ALL = {  # rows in their order, key by key
 # as many rows as a list can have; all else lies as before
 _LISTED = {
     "SIZES": f"""const int in_key = (of_rows + {TILE - 1}) / {TILE};
-    const int keys = 1, of_key = of_keys * in_key, count = {TILE} * of_key, tiles = begins.data[of_keys] / {TILE};
+    const int keys = 1, of_key = of_keys * in_key, count = {TILE} * of_key, tiles = starts.data[of_keys] / {TILE};
     auto key_of = [&](int tile) {{
         int key = 0;
-        while (key + 1 < of_keys && {TILE} * tile >= __ldg(begins.data + key + 1)) ++key;
+        while (key + 1 < of_keys && {TILE} * tile >= __ldg(starts.data + key + 1)) ++key;
         return key;
     }};""",
     "KEYS": "of_keys",
@@ -462,7 +462,7 @@ _LISTED = {
         }}""",
     "ROWS": f"""const size_t of_layer = (size_t)of_keys * ((of_rows + {TILE - 1}) / {TILE}) * {TILE * WIDTH};
     for (int key = 0; key < of_keys; ++key)
-        for (int r = begins.data[key]; r < begins.data[key + 1]; ++r)""",
+        for (int r = starts.data[key]; r < starts.data[key + 1]; ++r)""",
     "FROM": "wp::max(listed.data[r], 0)",
     "THERE": "listed.data[r] >= 0",
 }
@@ -514,7 +514,7 @@ def listed_backward(
     of_keys: int,
     of_rows: int,
     listed: wp.array[wp.int32],
-    begins: wp.array[wp.int32],
+    starts: wp.array[wp.int32],
     after: wp.array2d[wp.float16],
     head: wp.array2d[float],
     back: wp.array[wp.float16],

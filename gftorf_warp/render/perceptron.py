@@ -118,8 +118,10 @@ def _list(gradient: Tensor, keys: int, device: wp.Device) -> tuple[Tensor, Tenso
     """Rows that have a gradient, key by key, and where the part of each key begins and ends."""
     count = len(gradient) // keys
     blocks, threads = keys * -(-count // lists.BLOCK), 1 if device.is_cpu else lists.BLOCK
-    integers = functools.partial(torch.zeros, dtype=torch.int32, device=gradient.device)
+    integers = functools.partial(torch.empty, dtype=torch.int32, device=gradient.device)
     counts, listed, begins = integers(blocks), integers(lists.capacity(keys, count)), integers(keys + 1)
+    if not count:
+        begins.zero_()
     with stream_of(gradient):
         given, found = array_over(gradient.contiguous()), array_over(counts, wp.int32)
         if count:
