@@ -206,6 +206,7 @@ def test_weight_gradients_by_blocks_of_threads(columns, keys, count, parts, tmp_
     """
     layers, joined = 3, 2
     gradient = hidden(random(keys * count, 3, seed=2) - 0.5, 0.3, keys)
+    gradient.view(keys, count, 3)[:, 0] = 0.0  # what is read in place of no row
     listed, begins = wanted(gradient, keys)
     capacity = lists.capacity(keys, count)
     slopes = torch.full((layers, capacity, WIDTH), torch.nan, dtype=torch.float16)
@@ -218,6 +219,7 @@ def test_weight_gradients_by_blocks_of_threads(columns, keys, count, parts, tmp_
         factors = [(slopes[n + 1], inputs[n].half()[at]) for n in range(layers - 1)]
     else:
         inputs, jobs, rows_of = random(count, columns, seed=6) - 0.3, 4, count
+        inputs[0] = torch.nan
         factors = [(slopes[n], inputs.half()[at % count]) for n in (0, joined)]
     stored(tmp_path, listed=np.pad(np.array(listed, np.int32), (0, capacity - len(listed)), constant_values=-7))
     stored(tmp_path, starts=np.array(begins, np.int32), slopes=slopes.numpy(), inputs=inputs.half().numpy())
