@@ -33,19 +33,21 @@ from gftorf_warp.kernels import (
     project,
     ranks,
     resolve,
+    rows,
     similarity,
     slopes,
     splat,
     sums,
     tiles,
     trace,
+    weights,
     wgmma,
 )
 from gftorf_warp.render.buffers import TILE_SHAPES
 
 FRAME_SIZE, REGISTERS = 0x11, 0x2F  # attributes in the .nv.info section of a cubin
 ALLOWED_STACK = 32  # [B]
-PASSES = "perceptron forward", "perceptron backward"  # for sm_90a
+PASSES = "perceptron forward", "perceptron backward", "perceptron backward, listed"  # for sm_90a
 WALKS = {
     "trace": 1024,
     "paths": 1024,
@@ -72,9 +74,14 @@ def modules(arch: int) -> dict[str, wp.Module]:
         "paths": paths.trace_light.module,
         "perceptron": perceptron.pack.module,
         "slopes": slopes.add_partials.module,
+        "rows": rows.list_rows.module,
+        "weights": weights.add_parts.module,
+        "weights of outputs": weights.multiply_outputs.module,
+        "weights of places": weights.multiply_places.module,
     }
     if arch == wgmma.ARCHITECTURE:
-        found |= {PASSES[0]: perceptron.forward.module, PASSES[1]: perceptron.backward.module}
+        passes = perceptron.forward, perceptron.backward, perceptron.backward_listed
+        found |= {title: kernel.module for title, kernel in zip(PASSES, passes, strict=True)}
     window = similarity.make_similarity(1)
     for name in ("columns_of_products", "compare_images", "columns_of_slopes", "gradient_of_image"):
         found[name] = getattr(window, name).module

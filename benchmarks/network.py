@@ -1,10 +1,13 @@
 """What the motion network costs: forward and backward, all queries of a step stacked, in each precision.
 
     python benchmarks/network.py [--device cpu|cuda] [--gaussians N ..] [--queries Q ..] [--repeats R]
-                                 [--products float32|tf32|half|'half by torch' ..] [--profile] [--json FILE]
+                                 [--products float32|tf32|half|'half by torch'|'half by list' ..]
+                                 [--hidden SHARE] [--profile] [--json FILE]
 
 A query is one key time; a timing holds one encoding of positions, as a step has it, and the gradient of all weights.
-``half`` is what a captured step has, ``half by torch`` the same without kernels of ours, by default where they differ.
+``half`` is what a captured step has, ``half by torch`` the same without kernels of ours, by default where they differ;
+``half by list`` leaves rows without gradient out of the way back. With ``--hidden`` that share of the Gaussians, drawn
+at random, has none. Behind ``half`` it says how far its gradients are from those, the largest distance of a tensor.
 On a GPU every row is timed twice: called from Python, and replayed as a CUDA graph, which must give what the call gave.
 Rows of one N and Q take turns. ``kernels`` counts what the device ran in one call, products included; ``error`` is the
 largest difference of an offset from that in float32, for weights whose offsets are a few decimetres. With ``--profile``
@@ -24,7 +27,7 @@ from pathlib import Path
 import torch
 
 from gftorf_warp.bench.command import about
-from gftorf_warp.bench.motion import BY_TORCH, go_by, kinds, points, products_of
+from gftorf_warp.bench.motion import BY_LIST, BY_TORCH, go_by, kinds, points, products_of
 from gftorf_warp.bench.timing import WARM_UP, Watch, watch_of
 from gftorf_warp.scene.gaussians import GaussianField
 from gftorf_warp.scene.motion import MotionSettings, Products
@@ -57,10 +60,11 @@ def network(kind: str, device: str) -> Network:
     return made
 
 
-def call_of(made: Network, gaussians: GaussianField, queries: int) -> Call:
-    """Offsets at the middle keys and the gradient of every parameter."""
+def call_of(made: Network, gaussians: GaussianField, queries: int, hidden: float) -> Call:
+    """Offsets at the middle keys and the gradient of every parameter; a share of the Gaussians has none of its own."""
     generator = torch.Generator().manual_seed(2)
     cotangent = torch.randn(queries, len(gaussians), 3, generator=generator).to(gaussians.mean) / 76_800
+    cotangent *= (torch.rand(len(gaussians), 1, generator=generator) >= hidden).to(cotangent)
     keys, parameters = list(range(7, 7 + queries)), list(made.parameters())
 
     def call() -> list[torch.Tensor]:
@@ -106,14 +110,19 @@ def rows_of(count: int, queries: int, options: argparse.Namespace) -> list[dict[
     """One row per precision."""
     device, watch, gaussians = options.device, watch_of(options.device), field(count, options.device)
     wanted = options.products or kinds(device)
-    calls = {kind: call_of(network(kind, device), gaussians, queries) for kind in wanted}
-    exact = call_of(network(str(Products.FLOAT32), device), gaussians, queries)()[0]
+    calls = {kind: call_of(network(kind, device), gaussians, queries, options.hidden) for kind in wanted}
+    exact = call_of(network(str(Products.FLOAT32), device), gaussians, queries, options.hidden)()[0]
     rows: dict[str, dict[str, object]] = {}
+    gradients: dict[str, list[torch.Tensor]] = {}
     runs: dict[tuple[str, str], Callable[[], object]] = {}
     for kind, call in calls.items():
         for _ in range(WARM_UP):
             found = call()
         row: dict[str, object] = {"gaussians": count, "queries": queries, "products": kind}
+        gradients[kind] = found[1:]
+        if kind == BY_LIST and str(Products.HALF) in gradients:
+            both = zip(found[1:], gradients[str(Products.HALF)], strict=True)
+            row["from_half"] = max(float((one - other).norm() / other.norm()) for one, other in both)
         row["error_mm"] = 1e3 * float((found[0] - exact).norm(dim=-1).max())
         runs[kind, "called"] = call
         replay = watch.captured(call)
@@ -144,7 +153,8 @@ def main() -> int:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--gaussians", type=int, nargs="+", default=[20_000, 100_000])
     parser.add_argument("--queries", type=int, nargs="+", default=[1, 2, 3])
-    parser.add_argument("--products", nargs="+", choices=[*map(str, Products), BY_TORCH])
+    parser.add_argument("--products", nargs="+", choices=[*map(str, Products), BY_TORCH, BY_LIST])
+    parser.add_argument("--hidden", type=float, default=0.0, help="share of Gaussians without gradient")
     parser.add_argument("--repeats", type=int, default=50)
     parser.add_argument("--profile", action="store_true")
     parser.add_argument("--json", type=Path)
@@ -162,6 +172,7 @@ def main() -> int:
                 texts = [row["gaussians"], row["queries"], row["products"], row.get("kernels", "-")]
                 texts += ["-" if number is None else f"{number:.3f}" for number in numbers]
                 texts += ["" if row.get("replay_equals_call", True) else " replay differs"]
+                texts += [f" {row['from_half']:.1e} from half"] if "from_half" in row else []
                 print("\n".join(["".join(f"{text:>14}" for text in texts), *row.get("profile", [])]), flush=True)
     if options.json:
         options.json.write_text(json.dumps(found | {"command": " ".join(sys.argv), "rows": rows}, indent=1) + "\n")

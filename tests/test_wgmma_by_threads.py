@@ -37,8 +37,11 @@ DEVICE = """
 #include <thread>
 #include <vector>
 #define __CUDA_ARCH__ 900
-using std::min;
+#define __shared__ static
+using std::max, std::min;
 struct float2 { float x, y; };
+struct uint2 { unsigned x, y; };
+static float2 make_float2(float x, float y) { return {x, y}; }
 struct alignas(16) float4 { float x, y, z, w; };
 struct alignas(16) uint4 { unsigned x, y, z, w; };
 static uint4 make_uint4(unsigned a, unsigned b, unsigned c, unsigned d) { return {a, b, c, d}; }
@@ -50,13 +53,30 @@ alignas(1024) static char block_memory[MEMORY];
 static size_t __cvta_generic_to_shared(const void*) { return 0; }
 static std::barrier<> whole(256), group_barrier[2]{std::barrier<>(128), std::barrier<>(128)};
 static std::unique_ptr<std::barrier<>> of_warp[8];
-static float told[256]; static unsigned fragments[256][4];
+static float told[256]; static unsigned words[256], fragments[256][4];
 static void __syncthreads() { whole.arrive_and_wait(); }
+static int __syncthreads_count(bool one) {
+    static std::atomic<int> sum;
+    if (threadIdx.x == 0) sum = 0;
+    __syncthreads(); sum += one; __syncthreads();
+    const int found = sum;
+    __syncthreads(); return found;
+}
 static void named(int number) { group_barrier[number - 1].arrive_and_wait(); }
 static void meet() { of_warp[threadIdx.x >> 5]->arrive_and_wait(); }
 static void __threadfence_block() { std::atomic_thread_fence(std::memory_order_seq_cst); }
 static unsigned atomicAdd(unsigned* to, unsigned x) { return std::atomic_ref<unsigned>(*to).fetch_add(x); }
-static unsigned __shfl_sync(unsigned, unsigned x, int) { return x; }  // only asked for what is the same in a warp
+static unsigned __shfl_sync(unsigned, unsigned x, int from) {
+    words[threadIdx.x] = x; meet(); const unsigned heard = words[threadIdx.x / 32 * 32 + from]; meet(); return heard;
+}
+static int __shfl_xor_sync(unsigned all, int x, int by) { return __shfl_sync(all, x, threadIdx.x % 32 ^ by); }
+static unsigned __ballot_sync(unsigned, bool one) {
+    words[threadIdx.x] = one; meet();
+    unsigned found = 0;
+    for (unsigned n = 0; n < 32; ++n) found |= words[threadIdx.x / 32 * 32 + n] << n;
+    meet(); return found;
+}
+static int __popc(unsigned x) { return __builtin_popcount(x); }
 static float __shfl_xor_sync(unsigned, float x, int by) {
     told[threadIdx.x] = x; meet(); const float heard = told[threadIdx.x ^ by]; meet(); return heard;
 }
@@ -133,6 +153,58 @@ template <class Sums, class A> static void tensor(Sums& sums, const A& a, unsign
         }
         sums[4 * j + e] = (add ? sums[4 * j + e] : 0) + low;
         sums[4 * j + 2 + e] = (add ? sums[4 * j + 2 + e] : 0) + high;
+    }
+    meet();
+}
+// copies of 16 bytes, zeros behind those asked for: some arrive at once, the others when somebody waits for their group
+struct Copy { unsigned to; const void* from; int bytes; };
+static thread_local std::vector<std::vector<Copy>> groups(1);  // the last one is open
+static void arrive(const Copy& copy) {
+    std::memset(block_memory + copy.to, 0, 16);
+    std::memcpy(block_memory + copy.to, copy.from, copy.bytes);
+}
+static void copy_16(unsigned to, const void* from, int bytes) {
+    if (to % 16 || (size_t)from % 16) { std::puts("not at 16 bytes"); std::_Exit(1); }
+    if (to / 16 * 2654435761u >> 31) arrive({to, from, bytes});
+    else groups.back().push_back({to, from, bytes});
+}
+static void commit_copies() { groups.emplace_back(); }
+static void wait_copies(unsigned pending) {
+    for (; groups.size() > pending + 1; groups.erase(groups.begin()))
+        for (const Copy& copy : groups.front()) arrive(copy);
+}
+// ldmatrix .m8n8.x4.trans: lane 8 i + r says where row r of matrix i begins; of each, a lane has column lane / 4, rows
+// 2 (lane % 4) and the one behind it
+static void load_turned(unsigned& a, unsigned& b, unsigned& c, unsigned& d, unsigned row) {
+    if (row % 16) { std::puts("a row not at 16 bytes"); std::_Exit(1); }
+    words[threadIdx.x] = row; meet();
+    const unsigned lane = threadIdx.x % 32;
+    unsigned* const to[4] = {&a, &b, &c, &d};
+    for (int i = 0; i < 4; ++i) {
+        unsigned short two[2];
+        for (int e = 0; e < 2; ++e) {
+            const unsigned begin = words[threadIdx.x - lane + 8 * i + 2 * (lane % 4) + e];
+            std::memcpy(&two[e], block_memory + begin + 2 * (lane / 4), 2);
+        }
+        *to[i] = (unsigned)two[1] << 16 | two[0];
+    }
+    meet();
+}
+// mma.m16n8k16 .row.col, g = lane / 4, t = lane % 4: A has rows g, g + 8, g, g + 8 at inputs 2 t, 2 t, 2 t + 8 and
+// 2 t + 8, each with the next one, B inputs 2 t and 2 t + 8 of column g, D rows g and g + 8 of columns 2 t and 2 t + 1
+static void mma_16816(float& c0, float& c1, float& c2, float& c3, unsigned a0, unsigned a1, unsigned a2, unsigned a3,
+                      unsigned b0, unsigned b1) {
+    static unsigned fragments_b[256][2];
+    const unsigned own[4] = {a0, a1, a2, a3}, lane = threadIdx.x % 32, first = threadIdx.x - lane;
+    for (int n = 0; n < 4; ++n) fragments[threadIdx.x][n] = own[n];
+    fragments_b[threadIdx.x][0] = b0; fragments_b[threadIdx.x][1] = b1;
+    meet();
+    auto of = [](unsigned two, int which) { return wp::half_to_float({(unsigned short)(which ? two >> 16 : two)}); };
+    float* const c[2][2] = {{&c0, &c1}, {&c2, &c3}};
+    for (int half = 0; half < 2; ++half) for (int e = 0; e < 2; ++e) for (int k = 0; k < 16; ++k) {
+        const unsigned t = k % 8 / 2, column = 2 * (lane % 4) + e;
+        *c[half][e] += of(fragments[first + lane / 4 * 4 + t][half + 2 * (k / 8)], k % 2)
+                     * of(fragments_b[first + 4 * column + t][k / 8], k % 2);
     }
     meet();
 }
@@ -218,12 +290,18 @@ def for_threads(snippet):
         if "wgmma.mma_async" in text:
             add = re.search(r"setp\.ne\.b32 p, (\d), 0", text).group(1)
             return f"tensor(sums, a, matrix, {add});"
+        if "cp.async.wait_group" in text:
+            return f"wait_copies({re.search('wait_group ([0-9]+);', text).group(1)});"
         for instruction, call in (
             ("mbarrier.arrive.expect_tx", "expect({0}, {1});"),
             ("cp.async.bulk", "copy_late({0}, {1}, {2}, {3});"),
             ("mbarrier.try_wait", "{0} = is_done({1}, {2});"),
             ("mbarrier.init", "start_phases({0});"),
             ("bar.sync", "named({0});"),
+            ("cp.async.cg", "copy_16({0}, {1}, {2});"),
+            ("cp.async.commit_group", "commit_copies();"),
+            ("ldmatrix.sync.aligned.m8n8.x4.trans", "load_turned({0}, {1}, {2}, {3}, {4});"),
+            ("mma.sync.aligned.m16n8k16.row.col", f"mma_16816({', '.join(f'{{{n}}}' for n in range(10))});"),
             ("cvt.rn.relu.f16x2", "{0} = packed_relu({1}, {2});"),
             ("cvt.rn.f16x2", "{0} = packed({1}, {2});"),
         ):

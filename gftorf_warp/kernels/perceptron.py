@@ -6,7 +6,7 @@ order in which tensor cores read them, what a layer makes of gamma(t) added to i
 
 import warp as wp
 
-from .wgmma import BLOCK, PART, SHARED, TILE, VALUES, WIDTH, rows_backward, rows_forward
+from .wgmma import BLOCK, PART, SHARED, TILE, VALUES, WIDTH, listed_backward, rows_backward, rows_forward
 
 UNIT = wp.constant(8)  # halves of 16 bytes
 _FOURS = wp.constant(SHARED // 16)
@@ -176,3 +176,27 @@ def backward(
     wp.tile_zeros(shape=(_FOURS,), dtype=wp.vec4, storage="shared")
     rows = outputs.shape[1] // keys
     rows_backward(form.layers, form.joined, keys, rows, after, head, back, outputs, masks, slopes, partials)
+
+
+@wp.kernel(enable_backward=False, grid_stride=False, launch_bounds=(BLOCK, 1), module="unique")
+def backward_listed(
+    # In:
+    form: Layers,  # sizes [1]
+    keys: int,  # how many [1]
+    listed: wp.array[wp.int32],  # [capacity] of ``rows.list_rows``
+    begins: wp.array[wp.int32],  # [k + 1] the same
+    after: wp.array2d[wp.float16],  # [k N, HEAD] gradient at the head
+    head: wp.array2d[float],  # [VALUES, WIDTH] its weight
+    back: wp.array[wp.float16],  # [4 PART ..] of ``pack``
+    outputs: wp.array3d[wp.float16],  # [layers, k N, WIDTH] of ``forward``
+    masks: wp.array[wp.int32],  # [``mask_words``] of ``forward``
+    # Out:
+    slopes: wp.array3d[wp.float16],  # [layers, capacity, WIDTH] of the listed rows, as they are listed; 0 for no row
+    partials: wp.array4d[float],  # [layers, k, GROUPS blocks, WIDTH] added to: sums of slopes over rows
+):
+    """As ``backward``, for listed rows; behind the last of them slopes are not written."""
+    wp.tile_zeros(shape=(_FOURS,), dtype=wp.vec4, storage="shared")
+    rows = outputs.shape[1] // keys
+    listed_backward(
+        form.layers, form.joined, keys, rows, listed, begins, after, head, back, outputs, masks, slopes, partials
+    )

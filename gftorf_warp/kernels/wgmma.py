@@ -46,7 +46,7 @@ _CUDA = f"""
     const int lane = threadIdx.x & 31, warp = threadIdx.x >> 5 & 3;
     const int group = __shfl_sync(0xffffffffu, threadIdx.x >> 7, 0);  // so that the compiler knows it is one per warp
     const int g = lane >> 2, t = lane & 3;
-    const int of_key = (count + {TILE - 1}) / {TILE}, tiles = keys * of_key;
+    SIZES
     const int first = (int)((long long)tiles * blockIdx.x / gridDim.x);
     const int last = (int)((long long)tiles * (blockIdx.x + 1) / gridDim.x);
     const size_t of_layer = (size_t)keys * count * {WIDTH};
@@ -270,11 +270,7 @@ _BACKWARD = f"""
         if (there) *reinterpret_cast<uint4*>(to) = make_uint4(out[0], out[1], out[2], out[3]);
     }};
     auto alive_of = [&](int number, int tile, auto& alive) {{  // nobody is where there is no row
-        const uint4 bits = reinterpret_cast<const uint4*>(masks.data)[
-            ((size_t)number * tiles + tile) * 128 + (threadIdx.x & 127)];
-        const int low = tile % of_key * {TILE} + 16 * warp + g;
-        alive[0] = low < count ? bits.x : 0u; alive[1] = low < count ? bits.y : 0u;
-        alive[2] = low + 8 < count ? bits.z : 0u; alive[3] = low + 8 < count ? bits.w : 0u;
+        ALIVE_OF
     }};
     auto halve = [&](auto kind, auto& value) {{
         constexpr int N = decltype(kind)::N;
@@ -301,7 +297,7 @@ _BACKWARD = f"""
             own[i] = 0.0f;
         }}
         group_waits();
-        const size_t part = ((size_t)number * keys + key) * {GROUPS} * gridDim.x + {GROUPS} * blockIdx.x + group;
+        const size_t part = ((size_t)number * KEYS + key) * {GROUPS} * gridDim.x + {GROUPS} * blockIdx.x + group;
         float* const to = partials.data + part * {WIDTH};
         const float* const of_warps = shared_sums;
         for (int n = threadIdx.x & 127; n < {WIDTH}; n += 128)
@@ -309,7 +305,7 @@ _BACKWARD = f"""
         group_waits();
     }};
     auto passes = [&](int tile, int end) {{  // whether this is the group's last tile of its key
-        return tile + {GROUPS} >= end || (tile + {GROUPS}) / of_key != tile / of_key;
+        return tile + {GROUPS} >= end || key_of(tile + {GROUPS}) != key_of(tile);
     }};
     auto top = [&](int begin, int end) {{
         const int number = layers - 1;
@@ -325,7 +321,7 @@ _BACKWARD = f"""
                 #pragma unroll
                 for (int v = 0; v < {VALUES}; ++v)
                     a[half][v] = wp::half_to_float(
-                        after.data[((size_t)key * count + min(low + 8 * half, count - 1)) * {HEAD} + v]);
+                        after.data[ROW_OF * {HEAD} + v]);
             #pragma unroll
             for (int q = 0; q < 8; ++q) {{
                 float value[2][8] = {{}};
@@ -345,7 +341,7 @@ _BACKWARD = f"""
                 for (int i = 0; i < 8; ++i) all_[8 * q + i] = value[0][i] + value[1][i];
             }}
             fold(all_, own);
-            if (passes(tile, end)) flush(number, key, own);
+            if (passes(tile, end)) flush(number, key_of(tile), own);
         }}
     }};
     auto layer = [&](int number, int begin, int end) {{
@@ -380,7 +376,7 @@ _BACKWARD = f"""
                 for (int i = 0; i < 8; ++i) all_[8 * q + i] = value[0][i] + value[1][i];
             }}
             fold(all_, own);
-            if (passes(tile, end)) flush(number - 1, key, own);
+            if (passes(tile, end)) flush(number - 1, key_of(tile), own);
         }}
     }};
     if (threadIdx.x == 0)
@@ -392,25 +388,28 @@ _BACKWARD = f"""
     }}
 #else
     PLACE_OF
-    const size_t of_layer = (size_t)keys * count * {WIDTH};
-    for (int key = 0; key < keys; ++key)
-        for (int row = 0; row < count; ++row)
+    ROWS {{
+            const int from = FROM;
+            const bool there = THERE;
             for (int number = layers - 1; number >= 0; --number) {{
-                const size_t r = (size_t)key * count + row, at = number * of_layer + r * {WIDTH};
+                const size_t at = number * of_layer + (size_t)r * {WIDTH};
                 for (int n = 0; n < {WIDTH}; ++n) {{
                     float sum = 0.0f;
                     if (number == layers - 1)
                         for (int v = 0; v < {VALUES}; ++v)
-                            sum += wp::half_to_float(after.data[{HEAD} * r + v]) * head.data[v * {WIDTH} + n];
+                            sum += wp::half_to_float(after.data[(size_t){HEAD} * from + v])
+                                 * head.data[v * {WIDTH} + n];
                     else
                         for (int k = 0; k < {WIDTH}; ++k)
                             sum += wp::half_to_float(slopes.data[at + of_layer + k]) * wp::half_to_float(
                                 back.data[(size_t)(layers - 2 - number) * {WIDTH * WIDTH} + place_of(k, n)]);
-                    if (!(wp::half_to_float(outputs.data[at + n]) > 0.0f)) sum = 0.0f;
-                    partials.data[((size_t)number * keys + key) * {GROUPS * WIDTH} + n] += sum;
+                    const size_t is = ((size_t)number * KEYS * of_rows + from) * {WIDTH} + n;
+                    if (!there || !(wp::half_to_float(outputs.data[is]) > 0.0f)) sum = 0.0f;
+                    partials.data[((size_t)number * KEYS + key) * {GROUPS * WIDTH} + n] += sum;
                     slopes.data[at + n] = wp::float_to_half(sum);
                 }}
             }}
+        }}
 #endif
 """
 
@@ -422,7 +421,61 @@ _PLACE_OF = f"""
     }};"""
 
 
-@wp.func_native(_FORWARD.replace("PLACE_OF", _PLACE_OF))
+_ALL = {  # rows in their order, key by key
+    "SIZES": f"""const int of_key = (count + {TILE - 1}) / {TILE}, tiles = keys * of_key;
+    auto key_of = [&](int tile) {{ return tile / of_key; }};""",
+    "KEYS": "keys",
+    "ROW_OF": "((size_t)key * count + min(low + 8 * half, count - 1))",
+    "ALIVE_OF": """const uint4 bits = reinterpret_cast<const uint4*>(masks.data)[
+            ((size_t)number * tiles + tile) * 128 + (threadIdx.x & 127)];
+        const int low = tile % of_key * 64 + 16 * warp + g;
+        alive[0] = low < count ? bits.x : 0u; alive[1] = low < count ? bits.y : 0u;
+        alive[2] = low + 8 < count ? bits.z : 0u; alive[3] = low + 8 < count ? bits.w : 0u;""",
+    "ROWS": f"""const int of_rows = count;
+    const size_t of_layer = (size_t)keys * count * {WIDTH};
+    for (int key = 0; key < keys; ++key)
+        for (int r = key * count; r < (key + 1) * count; ++r)""",
+    "FROM": "r",
+    "THERE": "true",
+}
+
+# Rows of a list, the parts of keys padded to whole tiles. Slopes lie as the list does, so they are those of one key of
+# as many rows as a list can have; all else lies as before
+_LISTED = {
+    "SIZES": f"""const int in_key = (of_rows + {TILE - 1}) / {TILE};
+    const int keys = 1, of_key = of_keys * in_key, count = {TILE} * of_key, tiles = starts.data[of_keys] / {TILE};
+    auto key_of = [&](int tile) {{
+        int key = 0;
+        while (key + 1 < of_keys && {TILE} * tile >= __ldg(starts.data + key + 1)) ++key;
+        return key;
+    }};""",
+    "KEYS": "of_keys",
+    "ROW_OF": "(size_t)max(__ldg(listed.data + low + 8 * half), 0)",
+    "ALIVE_OF": f"""#pragma unroll
+        for (int half = 0; half < 2; ++half) {{
+            const int row = __ldg(listed.data + tile * {TILE} + 16 * warp + g + 8 * half), key = max(row, 0) / of_rows;
+            const int low = max(row, 0) - key * of_rows, of = low / {TILE} + key * in_key, own = low % {TILE};
+            const int thread = own / 16 * 32 + own % 8 * 4 + t;  // who had it on the way there, in which half
+            const uint2 bits = reinterpret_cast<const uint2*>(masks.data)[
+                (((size_t)number * of_key + of) * 128 + thread) * 2 + own % 16 / 8];
+            alive[2 * half] = row < 0 ? 0u : bits.x; alive[2 * half + 1] = row < 0 ? 0u : bits.y;
+        }}""",
+    "ROWS": f"""const size_t of_layer = (size_t)of_keys * ((of_rows + {TILE - 1}) / {TILE}) * {TILE * WIDTH};
+    for (int key = 0; key < of_keys; ++key)
+        for (int r = starts.data[key]; r < starts.data[key + 1]; ++r)""",
+    "FROM": "wp::max(listed.data[r], 0)",
+    "THERE": "listed.data[r] >= 0",
+}
+
+
+def _filled(snippet: str, words: dict[str, str]) -> str:
+    """A snippet with what stands for its words in capitals."""
+    for word, text in {**words, "PLACE_OF": _PLACE_OF}.items():
+        snippet = snippet.replace(word, text)
+    return snippet
+
+
+@wp.func_native(_filled(_FORWARD, _ALL))
 def rows_forward(
     layers: int,
     joined: int,
@@ -437,7 +490,7 @@ def rows_forward(
     """All layers of all rows of this block."""
 
 
-@wp.func_native(_BACKWARD.replace("PLACE_OF", _PLACE_OF))
+@wp.func_native(_filled(_BACKWARD, _ALL))
 def rows_backward(
     layers: int,
     joined: int,
@@ -452,3 +505,22 @@ def rows_backward(
     partials: wp.array4d[float],
 ):
     """Slopes at all layers of all rows of this block, and their sums over the rows of each key."""
+
+
+@wp.func_native(_filled(_BACKWARD, _LISTED))
+def listed_backward(
+    layers: int,
+    joined: int,
+    of_keys: int,
+    of_rows: int,
+    listed: wp.array[wp.int32],
+    starts: wp.array[wp.int32],
+    after: wp.array2d[wp.float16],
+    head: wp.array2d[float],
+    back: wp.array[wp.float16],
+    outputs: wp.array3d[wp.float16],
+    masks: wp.array[wp.int32],
+    slopes: wp.array3d[wp.float16],
+    partials: wp.array4d[float],
+):
+    """The same for rows of a list, ``rows.list_rows``; slopes lie as the list does."""

@@ -23,7 +23,7 @@ from itertools import pairwise
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
@@ -71,11 +71,15 @@ class Slopes(NamedTuple):
     head: Float[Tensor, "rows h"]
     """At the output of the head, with zeros up to its rows."""
     layers: Float[Tensor, "layers rows width"]
-    """Before the ReLU of every layer."""
+    """Before the ReLU of every layer; of listed rows, where there is a list."""
     sums: Float[Tensor, "layers k width"]
     """These, summed over the rows of each key; perhaps :func:`beside`, so there behind it, or :func:`join` first."""
     head_sum: Float[Tensor, "3"]
     """Gradients of the offsets, summed over all rows."""
+    listed: Int[Tensor, "capacity"] | None = None
+    """Which row each of ``layers`` is of, or -1; None: all, in their order."""
+    begins: Int[Tensor, "ends"] | None = None
+    """Where the listed rows of each key begin, and the last one's end: behind it nothing is written."""
 
 
 @runtime_checkable
@@ -120,6 +124,18 @@ class Passes(Protocol):
         """
         ...
 
+    def weigh_outputs(
+        self, slopes: Slopes, outputs: Float[Tensor, "layers rows width"], *, out: Float[Tensor, "squares width width"]
+    ) -> None:
+        """Weight gradients d^T h of all layers but the first, of their inputs from the layer before."""
+        ...
+
+    def weigh_places(
+        self, form: Form, keys: int, slopes: Slopes, place: Float[Tensor, "N columns"], *, out: list[Tensor]
+    ) -> None:
+        """Weight gradients of the layers that gamma(x) enters, of those inputs; ``out`` has [width, columns] each."""
+        ...
+
 
 class Products:
     """Passes as products of matrices, layer by layer."""
@@ -161,6 +177,17 @@ class Products:
             after = slope
         return Slopes(unit, head, slopes, _sums(slopes, keys, gradient.dtype), _sum_rows(gradient))
 
+    def weigh_outputs(self, slopes: Slopes, outputs: Tensor, *, out: Tensor) -> None:
+        """As the protocol says."""
+        _products(slopes.layers[1:].mT, outputs[:-1], out=out)
+
+    def weigh_places(self, form: Form, keys: int, slopes: Slopes, place: Tensor, *, out: list[Tensor]) -> None:
+        """As the protocol says."""
+        places = place.new_empty(keys, len(place), form.columns)
+        _copy(places, place.expand(keys, -1, -1))
+        for number, weight in zip(form.entries, out, strict=True):
+            _product(slopes.layers[number].T, places.flatten(0, 1), weight.dtype, out=weight)
+
 
 class Stacked(torch.autograd.Function):
     """Offsets of all Gaussians at all keys, with a gradient for parameters only."""
@@ -194,27 +221,22 @@ class Stacked(torch.autograd.Function):
         """
         form, (place, moment, *kept, outputs) = context.form, context.saved_tensors
         layers, values = len(outputs), gradient.shape[-1]
-        keys, count = len(moment), len(place)
+        keys, passes = len(moment), form.passes or Products()
         found = _Gradients(form, moment, layers, context.rows, values)
-        unit, head, slopes, own, head_sum = (form.passes or Products()).backward(
-            form, keys, gradient.reshape(-1, values), outputs, tuple(kept)
-        )
+        slopes = passes.backward(form, keys, gradient.reshape(-1, values), outputs, tuple(kept))
         with beside(place.device):  # small products, while one fills the device with blocks that end one by one
-            found.head_bias.copy_(head_sum)
-            _product(head.T, outputs[-1], moment.dtype, out=found.weights[-1])
-            torch.sum(own, 1, out=found.biases)
-            places = place.new_empty(keys, count, form.columns)
-            _copy(places, place.expand(keys, -1, -1))
+            found.head_bias.copy_(slopes.head_sum)
+            _product(slopes.head.T, outputs[-1], moment.dtype, out=found.weights[-1])
+            torch.sum(slopes.sums, 1, out=found.biases)
+            passes.weigh_places(form, keys, slopes, place, out=found.of_places(form))
             for number in form.entries:
-                weight, first = found.weights[number], form.width if number else 0
-                rows = slice(first, first + form.columns)
-                _product(slopes[number].T, places.flatten(0, 1), moment.dtype, out=weight[:, rows])
-                torch.mm(own[number].T, moment, out=weight[:, weight.shape[1] - form.moment :])
-        _products(slopes[1:].mT, outputs[:-1], out=found.square)
+                weight = found.weights[number]
+                torch.mm(slopes.sums[number].T, moment, out=weight[:, weight.shape[1] - form.moment :])
+        passes.weigh_outputs(slopes, outputs, out=found.square)
         join(place.device)
         if form.joined is not None:
             found.weights[form.joined][:, : form.width] = found.square[form.joined - 1]
-        return None, None, None, *found.times(unit)
+        return None, None, None, *found.times(slopes.unit)
 
 
 class _Gradients:
@@ -235,6 +257,11 @@ class _Gradients:
         for number, part in zip(form.entries, entries, strict=True):
             self.weights[number] = part.view(width, -1)
         self.biases = biases.view(layers, width)
+
+    def of_places(self, form: Form) -> list[Tensor]:
+        """What gamma(x) meets of weights, with the first column of gamma(t) where rows of gamma(x) are longer."""
+        firsts = [form.width if number else 0 for number in form.entries]
+        return [self.weights[n][:, first : first + form.columns] for n, first in zip(form.entries, firsts, strict=True)]
 
     def times(self, unit: Tensor) -> list[Tensor]:
         """Weight and bias of every layer, then of the head, in the unit of the loss."""

@@ -1,0 +1,136 @@
+"""Which rows have a gradient: a list of them, made on the device, so that nobody walks the others.
+
+Rows of k keys lie one key after the other. The list has each key's in ascending order, ``NO_ROW`` behind them up to a
+multiple of ``TILE``, which is what kernels multiply at once. Blocks of rows are counted, then each block finds what is
+before it from all counts and writes its rows: the order is fixed, and launches have sizes that no host must ask for.
+
+A gradient that is no number counts as one. A row of zeros adds nothing to any weight's gradient, unless an output of it
+is infinite: with all rows 0 times that is no number and the step not sound, with a list only the head sees such a row.
+"""
+
+import warp as wp
+
+from .wgmma import BLOCK, TILE  # as many threads as rows in a block
+
+NO_ROW = -1
+
+_HAS = """auto has = [&](int key, int low) {  // whether a row of a key is there, and has a gradient
+        if (low >= count) return false;
+        const float* const v = gradient.data + 3ll * ((long long)key * count + low);
+        return !(v[0] == 0.0f && v[1] == 0.0f && v[2] == 0.0f);
+    };"""
+
+
+def capacity(keys: int, count: int) -> int:
+    """Rows of a list at most."""
+    return keys * -(-count // TILE) * TILE
+
+
+@wp.func_native(f"""
+    {_HAS}
+    const int blocks = (count + {BLOCK - 1}) / {BLOCK}, key = block / blocks, first = block % blocks * {BLOCK};
+#if defined(__CUDA_ARCH__)
+    const int found = __syncthreads_count(has(key, first + threadIdx.x));
+    if (threadIdx.x == 0) counts.data[block] = found;
+#else
+    int found = 0;
+    for (int n = 0; n < {BLOCK}; ++n) found += has(key, first + n);
+    counts.data[block] = found;
+#endif
+""")
+def count_block(gradient: wp.array2d[float], count: int, block: int, counts: wp.array[wp.int32]):
+    """Rows of a block that have a gradient."""
+
+
+@wp.func_native(f"""
+    {_HAS}
+    auto whole = [](int rows) {{ return (rows + {TILE - 1}) / {TILE} * {TILE}; }};
+    const int blocks = (count + {BLOCK - 1}) / {BLOCK}, key = block / blocks, own = block % blocks;
+    int begin = 0, before = 0;  // where the key begins, how many of its rows are in blocks before
+#if defined(__CUDA_ARCH__)
+    __shared__ int of_warps[{BLOCK // 32}];
+    const int lane = threadIdx.x & 31, warp = threadIdx.x >> 5;
+    auto over_block = [&](int value) {{  // for all threads
+        #pragma unroll
+        for (int over = 16; over > 0; over /= 2) value += __shfl_xor_sync(0xffffffffu, value, over);
+        __syncthreads();  // nobody reads what was there any more
+        if (lane == 0) of_warps[warp] = value;
+        __syncthreads();
+        int sum = 0;
+        for (int n = 0; n < {BLOCK // 32}; ++n) sum += of_warps[n];
+        return sum;
+    }};
+    for (int other = 0; other <= key; ++other) {{
+        int sum = 0;
+        for (int n = threadIdx.x; n < (other < key ? blocks : own); n += {BLOCK})
+            sum += counts.data[other * blocks + n];
+        sum = over_block(sum);
+        if (other < key) begin += whole(sum);
+        else before = sum;
+    }}
+    const int low = own * {BLOCK} + (int)threadIdx.x;
+    const bool listed_ = has(key, low);
+    const unsigned others = __ballot_sync(0xffffffffu, listed_);
+    over_block(lane == 0 ? __popc(others) : 0);
+    int place = begin + before + __popc(others & ((1u << lane) - 1u));
+    for (int n = 0; n < warp; ++n) place += of_warps[n];
+    if (listed_) listed.data[place] = key * count + low;
+    const bool writes_ends = own == blocks - 1;
+    const int thread = threadIdx.x, threads = {BLOCK};
+#else
+    for (int other = 0; other <= key; ++other) {{
+        int sum = 0;
+        for (int n = 0; n < (other < key ? blocks : own); ++n) sum += counts.data[other * blocks + n];
+        if (other < key) begin += whole(sum);
+        else before = sum;
+    }}
+    int place = begin + before;
+    for (int n = own * {BLOCK}; n < (own + 1) * {BLOCK}; ++n)
+        if (has(key, n)) listed.data[place++] = key * count + n;
+    const bool writes_ends = own == blocks - 1;
+    const int thread = 0, threads = 1;
+#endif
+    if (!writes_ends) return;
+    const int rows = before + counts.data[block];
+    for (int n = rows + thread; n < whole(rows); n += threads) listed.data[begin + n] = {NO_ROW};
+    if (thread > 0) return;
+    if (key == 0) begins.data[0] = 0;
+    begins.data[key + 1] = begin + whole(rows);
+""")
+def list_block(
+    gradient: wp.array2d[float],
+    counts: wp.array[wp.int32],
+    count: int,
+    block: int,
+    listed: wp.array[wp.int32],
+    begins: wp.array[wp.int32],
+):
+    """Rows of a block that have a gradient go to their places; behind a key's last ones there are none."""
+
+
+@wp.kernel(enable_backward=False, grid_stride=False)
+def count_rows(
+    # In:
+    threads: int,  # of a block; one on a CPU [1]
+    gradient: wp.array2d[float],  # [k N, 3] of offsets
+    count: int,  # N [1]
+    # Out:
+    counts: wp.array[wp.int32],  # [k blocks] rows with a gradient in ``BLOCK`` rows of a key
+):
+    """One block of threads for ``BLOCK`` rows of a key."""
+    count_block(gradient, count, wp.tid() // threads, counts)
+
+
+@wp.kernel(enable_backward=False, grid_stride=False)
+def list_rows(
+    # In:
+    threads: int,  # of a block; one on a CPU [1]
+    gradient: wp.array2d[float],  # [k N, 3] of offsets
+    counts: wp.array[wp.int32],  # [k blocks] of ``count_rows``
+    count: int,  # N [1]
+    # Out:
+    listed: wp.array[wp.int32],  # [``capacity``] rows with a gradient, key by key, each up to a whole tile
+    begins: wp.array[wp.int32],  # [k + 1] where the part of each key begins, and the end
+):
+    """One block of threads for ``BLOCK`` rows of a key."""
+    list_block(gradient, counts, count, wp.tid() // threads, listed, begins)

@@ -1,0 +1,324 @@
+"""Rows without gradient left out of a network's way back: the list, slopes and weight gradients by it, nothing else.
+
+What a GPU runs is executed by threads of a CPU, see test_wgmma_by_threads.py, and compared with the CPU's own way.
+"""
+
+import copy
+
+import numpy as np
+import pytest
+import torch
+from small_runs import random
+from test_perceptron import compare_replay, gradients, half, network
+from test_tensor_cores import DEVICES, FULL, ON_HOPPER, SHAPES, alike, inputs_of, pair, rows
+from test_wgmma_by_threads import BACKWARD, BLOCKS, COMPILER, FORWARD, run, stored
+
+from gftorf_warp.kernels import perceptron as kernels
+from gftorf_warp.kernels import rows as lists
+from gftorf_warp.kernels import weights, wgmma
+from gftorf_warp.render import perceptron
+from gftorf_warp.render.perceptron import TensorCores
+from gftorf_warp.scene.motion import MotionSettings
+from gftorf_warp.scene.perceptron import join
+
+WIDTH, TILE = wgmma.WIDTH, wgmma.TILE
+BY_THREADS = pytest.mark.skipif(COMPILER is None, reason="needs a C++ compiler")
+
+LIST = """
+static void count_block(wp::array_t<float> gradient, int count, int block, wp::array_t<int> counts) { COUNT }
+static void list_block(wp::array_t<float> gradient, wp::array_t<int> counts, int count, int block,
+                       wp::array_t<int> listed, wp::array_t<int> begins) { CODE }
+int main(int, char** given) {
+    const int keys = std::stoi(given[1]), count = std::stoi(given[2]);
+    auto gradient = loaded<float>("gradient");
+    const int blocks = keys * ((count + 255) / 256);
+    std::vector<int> counts(blocks, -9), listed(keys * ((count + 63) / 64) * 64, -9), begins(keys + 1, -9);
+    on_blocks(blocks, [&] { count_block({gradient.data()}, count, blockIdx.x, {counts.data()}); });
+    on_blocks(blocks, [&] {
+        list_block({gradient.data()}, {counts.data()}, count, blockIdx.x, {listed.data()}, {begins.data()});
+    });
+    stored("listed", listed); stored("begins", begins);
+}
+"""
+LISTED = BACKWARD.replace("int keys, int count, wp::array_t<wp::half> after", "SIGNATURE").replace(
+    "layers, joined, keys, count, {after", "layers, joined, keys, count, {listed.data()}, {starts.data()}, {after"
+)
+LISTED = (
+    LISTED.replace(
+        "SIGNATURE",
+        "int of_keys, int of_rows, wp::array_t<int> listed, wp::array_t<int> starts, wp::array_t<wp::half> after",
+    )
+    .replace(
+        'auto masks = loaded<int>("masks");',
+        "".join(f'auto {n} = loaded<int>("{n}");' for n in ("masks", "listed", "starts")),
+    )
+    .replace("slopes(outputs.size())", "slopes((size_t)layers * listed.size() * 256, wp::half{0x7e00})")
+)
+WEIGHTS = """
+static void multiply(int block, int jobs, int parts, int keys, int count, int capacity, int joined,
+                     wp::array_t<int> listed, wp::array_t<int> begins, wp::array_t<wp::half> slopes,
+                     wp::array_t<wp::half> inputs, wp::array_t<float> partials) { CODE }
+int main(int, char** given) {
+    const int jobs = std::stoi(given[1]), parts = std::stoi(given[2]), keys = std::stoi(given[3]);
+    const int count = std::stoi(given[4]), joined = std::stoi(given[5]), columns = std::stoi(given[6]);
+    auto listed = loaded<int>("listed"), begins = loaded<int>("starts");
+    // copies of 16 bytes are aligned as they are in the memory of a device
+    auto aligned = [](const std::vector<wp::half>& from) {
+        auto* const to = (wp::half*)std::aligned_alloc(64, (2 * from.size() + 63) / 64 * 64);
+        std::copy(from.begin(), from.end(), to); return to;
+    };
+    auto* const slopes = aligned(loaded<wp::half>("slopes"));
+    auto* const inputs = aligned(loaded<wp::half>("inputs"));
+    std::vector<float> partials((size_t)jobs * parts * 128 * columns, NAN);
+    on_blocks(jobs * parts, [&] {
+        multiply(blockIdx.x, jobs, parts, keys, count, listed.size(), joined, {listed.data()}, {begins.data()},
+                 {slopes}, {inputs}, {partials.data()});
+    });
+    stored("partials", partials);
+}
+"""
+
+
+def hidden(gradient, share, keys, *, seed=4):
+    """Zeros in a share of the rows, of each sign; of the first row of the last key only one value is left."""
+    found = gradient.clone()
+    drawn = random(len(gradient), 1, seed=seed).to(gradient.device)
+    found = torch.where(drawn < share, found.sign() * 0.0, found)
+    if 0 < share < 1:
+        found[(keys - 1) * len(found) // keys] = torch.tensor([0.0, -0.0, 1e-6])
+    return found
+
+
+def wanted(gradient, keys):
+    """The list, and where keys begin in it, by torch."""
+    listed, begins = [], [0]
+    for key, part in enumerate(gradient.cpu().view(keys, -1, 3)):
+        own = (part != 0).any(1).nonzero()[:, 0] + key * len(part)
+        listed += [*own.tolist(), *[-1] * (-len(own) % TILE)]
+        begins.append(len(listed))
+    return listed, begins
+
+
+def read(path, dtype):
+    """An array that a program wrote."""
+    return torch.from_numpy(np.fromfile(path, dtype))
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize(("keys", "count"), [(1, 1), (2, 33), (3, 64), (2, 300), (3, 1_000), (3, 20_480)])
+@pytest.mark.parametrize("share", [0.0, 0.6, 1.0])
+def test_a_list_is_in_order_and_whole_tiles(keys, count, share, device):
+    """Key by key; also where everybody has a gradient, or nobody."""
+    gradient = hidden(random(keys * count, 3, seed=2).to(device) - 0.5, share, keys)
+    listed, begins = perceptron._list(gradient, keys, perceptron._ready(gradient.device, True))
+    want, ends = wanted(gradient, keys)
+    assert begins.tolist() == ends
+    assert listed[: ends[-1]].tolist() == want
+    assert len(listed) == lists.capacity(keys, count) >= len(want)
+    assert share < 1 or ends[-1] == 0
+
+
+def test_what_is_no_number_has_a_gradient():
+    """So that the step is found not to be sound."""
+    gradient = torch.zeros(70, 3)
+    gradient[3, 1], gradient[66, 2] = torch.nan, -torch.inf
+    listed, _ = perceptron._list(gradient, 2, perceptron._ready(gradient.device, True))
+    assert listed[listed >= 0].tolist()[:2] == [3, 66]
+
+
+@BY_THREADS
+@pytest.mark.parametrize(("keys", "count"), [(1, 33), (3, 600)])
+def test_a_list_by_blocks_of_threads(keys, count, tmp_path):
+    """The code for CUDA, several blocks of rows and keys."""
+    gradient = hidden(random(keys * count, 3, seed=2) - 0.5, 0.6, keys)
+    stored(tmp_path, gradient=gradient.numpy())
+    run(tmp_path, LIST.replace("COUNT", lists.count_block.native_snippet), lists.list_block, keys, count)
+    want, ends = wanted(gradient, keys)
+    assert read(tmp_path / "begins", np.int32).tolist() == ends
+    assert read(tmp_path / "listed", np.int32)[: ends[-1]].tolist() == want
+
+
+@BY_THREADS
+@pytest.mark.parametrize(
+    ("layers", "skip_after", "count", "keys", "share"),
+    [(8, 5, 33, 1, 0.0), (3, 1, 200, 4, 0.3), (2, 1, 64 * 2 * wgmma.ROUND + 65, 1, 0.0)],
+    ids=["a tile", "keys", "a tile more than a round"],
+)
+def test_slopes_by_a_block_of_threads(layers, skip_after, count, keys, share, tmp_path):
+    """Slopes and sums of two blocks are the CPU's, by the masks that a GPU has; with all rows those without a list."""
+    made = network(half(MotionSettings(layers=layers, skip_after=skip_after)))
+    form, place, moment, all_weights, biases = inputs_of(made, count, keys)
+    given = launches(form, place, moment, all_weights, biases)
+    numbers = layers, -1 if form.joined is None else form.joined, keys, count
+    stored(tmp_path, place=place.numpy(), forth=given[3].numpy(), shifts=given[6].numpy())
+    run(tmp_path, FORWARD, wgmma.rows_forward, *numbers)
+    outputs = read(tmp_path / "outputs", np.float16).view(layers, keys * count, WIDTH)
+    gradient = hidden(random(keys * count, 3, seed=3) - 0.5, share, keys)
+    if keys > 2:  # a key without rows between two with some, in one block
+        gradient[count : 2 * count] = 0.0
+    kept = TensorCores().forward(form, place, moment, all_weights, biases)[2]
+    slopes = TensorCores(listed=True).backward(form, keys, gradient, outputs, kept)
+    end = int(slopes.begins[-1])
+    assert slopes.begins.tolist() == wanted(gradient, keys)[1]
+    stored(tmp_path, after=slopes.head.numpy(), head=all_weights[-1].numpy(), back=kept[0].numpy())
+    stored(tmp_path, listed=slopes.listed.numpy(), starts=slopes.begins.numpy())
+    run(tmp_path, LISTED, wgmma.listed_backward, *numbers)
+    same = read(tmp_path / "slopes", np.float16).view(layers, -1, WIDTH)
+    torch.testing.assert_close(same[:, :end], slopes.layers[:, :end], rtol=5e-3, atol=2e-3)
+    assert same[:, end:].isnan().all(), "nothing is written behind the last row"
+    nobody = slopes.listed[:end] < 0
+    assert nobody.any()
+    assert same[:, :end][:, nobody].abs().max() == 0
+    partials = read(tmp_path / "partials", np.float32).view(layers, keys, BLOCKS * wgmma.GROUPS, WIDTH)
+    scale = float(slopes.sums.abs().max())
+    torch.testing.assert_close(partials.sum(2), slopes.sums, rtol=2e-3, atol=2e-4 * scale)
+    assert float(slopes.layers[:, :end].abs().max()) > 1
+    if share == 0.0:
+        run(tmp_path, BACKWARD, wgmma.rows_backward, *numbers)
+        every = read(tmp_path / "slopes", np.float16).view(layers, -1, WIDTH)
+        assert torch.equal(every, same[:, :end][:, ~nobody])
+        assert torch.equal(read(tmp_path / "partials", np.float32), partials.flatten())
+
+
+def launches(form, place, moment, all_weights, biases):
+    """What ``pack`` was given and has made."""
+    given = {}
+
+    def launched(kernel, dim, inputs, outputs, device):
+        launch(kernel, dim, inputs, outputs, device)
+        given[kernel.key] = [*inputs, *outputs]
+
+    launch, perceptron._launch = perceptron._launch, launched
+    try:
+        TensorCores().forward(form, place, moment, all_weights, biases)
+    finally:
+        perceptron._launch = launch
+    return given[kernels.pack.key]
+
+
+@BY_THREADS
+@pytest.mark.parametrize("columns", [WIDTH, wgmma.COLUMNS])
+@pytest.mark.parametrize(("keys", "count", "parts"), [(2, 600, 3), (1, 40, 2)])
+def test_weight_gradients_by_blocks_of_threads(columns, keys, count, parts, tmp_path):
+    """Parts of a list longer than what shared memory holds, and an empty one: added up they are d^T h in float64.
+
+    What no row may be is no number here: outputs of rows that are not listed, and slopes behind the list.
+    """
+    layers, joined = 3, 2
+    gradient = hidden(random(keys * count, 3, seed=2) - 0.5, 0.3, keys)
+    gradient.view(keys, count, 3)[:, 0] = 0.0  # what is read in place of no row
+    listed, begins = wanted(gradient, keys)
+    capacity = lists.capacity(keys, count)
+    slopes = torch.full((layers, capacity, WIDTH), torch.nan, dtype=torch.float16)
+    slopes[:, : begins[-1]] = random(layers, begins[-1], WIDTH, seed=5) - 0.5
+    at = torch.tensor(listed)
+    slopes[:, : begins[-1]][:, at < 0] = 0.0
+    if columns == WIDTH:
+        inputs, jobs, rows_of = random(layers, keys * count, WIDTH, seed=6) - 0.3, 2 * (layers - 1), keys * count
+        inputs[:, (gradient == 0).all(1)] = torch.nan
+        factors = [(slopes[n + 1], inputs[n].half()[at]) for n in range(layers - 1)]
+    else:
+        inputs, jobs, rows_of = random(count, columns, seed=6) - 0.3, 4, count
+        inputs[0] = torch.nan
+        factors = [(slopes[n], inputs.half()[at % count]) for n in (0, joined)]
+    stored(tmp_path, listed=np.pad(np.array(listed, np.int32), (0, capacity - len(listed)), constant_values=-7))
+    stored(tmp_path, starts=np.array(begins, np.int32), slopes=slopes.numpy(), inputs=inputs.half().numpy())
+    way = weights.by_outputs if columns == WIDTH else weights.by_places
+    run(tmp_path, WEIGHTS, way, jobs, parts, keys, rows_of, joined, columns)
+    found = read(tmp_path / "partials", np.float32).view(parts, -1, WIDTH, columns)
+    for result, (left, right) in zip(found.sum(0), factors, strict=True):
+        there = at >= 0
+        want = left[: begins[-1]][there].double().T @ right[there].double()
+        torch.testing.assert_close(result.double(), want, rtol=1e-4, atol=1e-4)
+        assert float(want.abs().max()) > 1
+    tiles = begins[-1] // TILE
+    assert found[0].abs().max() > 0 or tiles < parts
+    assert tiles > parts * weights.STAGES or tiles == 1
+
+
+def test_shared_memory_is_enough():
+    """227 KB are all that a block can have."""
+    assert max(weights.shared(WIDTH), weights.shared(wgmma.COLUMNS), wgmma.SHARED) <= 227 * 1024
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("share", [0.0, 0.6])
+def test_gradients_are_those_of_all_rows(shape, share, device):
+    """Sums of slopes to the bit on a CPU, weights up to the order of their sums; whatever lies in memory."""
+    quick, _ = pair(SHAPES[shape], device)
+    short = copy.deepcopy(quick)
+    short.go_by(TensorCores(listed=True))
+    gaussians, cotangent = rows(70, 3, device)
+    cotangent = hidden(cotangent.view(-1, 3), share, 3).view(3, 70, 3)
+    found, got = gradients(short, gaussians, cotangent, [0, 1, 3])
+    same, want = gradients(quick, gaussians, cotangent, [0, 1, 3])
+    assert torch.equal(found, same)
+    for one, other in zip(got, want, strict=True):
+        assert other.abs().max() > 1e-4
+        torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-4 * float(other.abs().max()))
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_it_is_torchs_product_and_float64(device):
+    """As the way without a list."""
+    quick, plain = pair(device=device)
+    quick.go_by(TensorCores(listed=True))
+    alike(quick, plain, 33, [0, 3], device=device)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("count", [0, 9])
+def test_nobody_has_a_gradient(count, device):
+    """No rows, or no gradient in any of them: zeros."""
+    made, _ = pair(device=device)
+    made.go_by(TensorCores(listed=True))
+    gaussians, cotangent = rows(count, 2, device)
+    _, got = gradients(made, gaussians, 0 * cotangent, [0, 1])
+    assert all(torch.equal(one, torch.zeros_like(one)) for one in got)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("value", [torch.inf, torch.nan])
+def test_a_gradient_that_is_not_finite_is_not_lost(value, device):
+    """The step is not sound, though all other rows have none."""
+    made, _ = pair(device=device)
+    made.go_by(TensorCores(listed=True))
+    gaussians, cotangent = rows(30, 2, device)
+    cotangent *= 0
+    cotangent[1, 4, 2] = value
+    assert not torch.nn.utils.get_total_norm(gradients(made, gaussians, cotangent, [0, 1])[1]).isfinite()
+
+
+def test_all_rows_unless_told():
+    """Prepared, not measured: off."""
+    assert not TensorCores().listed
+    assert perceptron.LISTED is False
+
+
+@ON_HOPPER
+@pytest.mark.parametrize("share", [0.0, 0.6, 0.98])
+@pytest.mark.parametrize("count", [2_000, 20_289, 20_480])
+def test_many_rows(count, share):
+    """On a GPU: the same sums as with all rows, the same weights up to the order of their sums, twice the same bits."""
+    quick, _ = pair(FULL, "cuda")
+    short = copy.deepcopy(quick)
+    short.go_by(TensorCores(listed=True))
+    gaussians, cotangent = rows(count, 3, "cuda")
+    cotangent = hidden(cotangent.view(-1, 3), share, 3).view(3, count, 3)
+    _, got = gradients(short, gaussians, cotangent, [0, 1, 3])
+    _, again = gradients(short, gaussians, cotangent, [0, 1, 3])
+    _, want = gradients(quick, gaussians, cotangent, [0, 1, 3])
+    for one, other, twice in zip(got, want, again, strict=True):
+        assert torch.equal(one, twice)
+        assert float((one - other).norm() / other.norm()) < 1e-4
+
+
+@ON_HOPPER
+def test_a_replay_equals_a_call():
+    """Nothing asks the host, though the list is made anew."""
+    made, _ = pair(device="cuda")
+    made.go_by(TensorCores(listed=True))
+    gaussians, cotangent = rows(20_289, 2, "cuda")
+    compare_replay(made, gaussians, hidden(cotangent.view(-1, 3), 0.6, 2).view(2, 20_289, 3))
+    join(torch.device("cuda"))
