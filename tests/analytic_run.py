@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -176,3 +177,15 @@ class AnalyticRun:
             extra=None,
             screen=None,
         )
+
+
+def interrupt(run, number):
+    """Let the rendering of this number be Ctrl-C."""
+    right, numbers = run.render, count(1)
+
+    def render(time, camera):
+        if next(numbers) == number:
+            raise KeyboardInterrupt
+        return right(time, camera)
+
+    run.renderer = lambda _: render

@@ -70,7 +70,8 @@ def test_steps_are_single_steps(make, batch, device):
     """Every tensor, sum and statistic after 20 images and after 40, with all that happens on the way.
 
     On a GPU roundings grow: whether a pixel still takes a splat is decided otherwise somewhere in between, and those
-    who are behind it differ by a part of a step.
+    who are behind it differ by a part of a step. Measured on an H200 with quartets of ``demo``: 2e-6 at most after 20
+    images, after 40 4.5 % of the quaternions and 2.2 % of the harmonics, a third of a step at most.
     """
     settings = make(batch=batch)
     single, observations = begun(settings, device)

@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 
 import pytest
-from analytic_run import FRAMES, AnalyticRun
+from analytic_run import FRAMES, AnalyticRun, interrupt
 from test_writers import WHAT, files_in, scales_and_series
 
 from gftorf_warp.data.images import read_exr
@@ -159,15 +159,7 @@ def test_a_process_that_is_killed(analytic, tmp_path, started, at):
 @needs_memory
 def test_what_stops_the_rendering_stops_processes(analytic, tmp_path, started):
     """Whole pictures of some times."""
-    right, count = analytic.render, [0]
-
-    def render(time, camera):
-        count[0] += 1
-        if count[0] == 13:
-            raise KeyboardInterrupt
-        return right(time, camera)
-
-    analytic.renderer = lambda _: render
+    interrupt(analytic, 13)
     with pytest.raises(KeyboardInterrupt):
         render_to_folder(analytic, tmp_path / "out", WHAT)
     assert started

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from analytic_run import FRAMES, HEIGHT, WIDTH, AnalyticRun
+from analytic_run import FRAMES, HEIGHT, WIDTH, AnalyticRun, interrupt
 from test_replay import PLAIN, run  # noqa: F401
 
 try:
@@ -281,15 +281,7 @@ def test_the_cost_of_a_picture_does_not_grow_with_those_before_it(analytic, tmp_
 @pytest.mark.parametrize("arrays", [True, False])
 def test_what_stops_the_rendering_leaves_nothing_half_written(analytic, tmp_path, arrays):
     """Ctrl-C in the middle: whole pictures of some times, or no array at all."""
-    right, count = analytic.render, [0]
-
-    def render(time, camera):
-        count[0] += 1
-        if count[0] == 13:
-            raise KeyboardInterrupt
-        return right(time, camera)
-
-    analytic.renderer = lambda _: render
+    interrupt(analytic, 13)
     with pytest.raises(KeyboardInterrupt):
         render_to_folder(analytic, tmp_path / "out", WHAT, arrays=arrays)
     left = [path for path in (tmp_path / "out").rglob("*") if path.is_file() and path.name != "renders.json"]

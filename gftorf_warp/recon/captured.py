@@ -118,7 +118,7 @@ class CapturedSteps:
         self._graphs: dict[Variant, Callable[[], None]] = {}
         self._part: tuple | None = None  # of the run: what graphs that are kept have in common
         self._pool = shared_pool(device)
-        self._reserve = Reserve(scarce=settings.render.deterministic)
+        self._reserve = Reserve()
         self._reserves = device.type != "cpu"  # a CPU counts pairs first: nobody waits for anybody there
         longest = max(len(batch) for batch in observations.batches)
         self._graphs_wanted = graphs
@@ -225,7 +225,7 @@ class CapturedSteps:
             LOG.warning(text, failed, self.state.images, overfull)
         counts[0] = 0
         counts[2:] = 0
-        if self._reserve.learn(pairs):
+        if self._reserve.learn(pairs, scarce=pairs > 0 and not self._workspaces[0].last.marks):
             self._forget()
         return 0 if overfull else in_a_row
 
