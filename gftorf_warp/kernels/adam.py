@@ -7,14 +7,16 @@ everything if the step is not sound, which is how a gradient that is not finite 
 
 A table names the tensors by address: they are as many as a network has layers, and live wherever torch put them. A
 gradient at address 0 is none: the tensor is left alone, too. Gradients are multiplied by a factor before anything else.
+A tensor may have up to four gradients, of as many images, of which nobody wants the sum but here: first ones first.
 """
 
 import functools
 
 import warp as wp
 
-PARAMETER, GRADIENT, FIRST, SECOND, STEP, LENGTH = range(6)  # columns of the table
-COLUMNS = 6
+PARAMETER, GRADIENT, FIRST, SECOND, STEP, LENGTH, MORE = range(7)  # columns of the table
+GRADIENTS = 4  # of a tensor, of which the sum counts: one at ``GRADIENT``, others from ``MORE`` on
+COLUMNS = MORE + GRADIENTS - 1
 SIZES = 3  # what a step of a tensor comes to: see ``ADVANCE``
 
 ADVANCE = f"""
@@ -51,7 +53,9 @@ def _descend(K: int) -> str:
     float* x_ = reinterpret_cast<float*>(row[{PARAMETER}]) + begin;
     float* m_ = reinterpret_cast<float*>(row[{FIRST}]) + begin;
     float* v_ = reinterpret_cast<float*>(row[{SECOND}]) + begin;
-    const F g = sizes_[2] * at(reinterpret_cast<const float*>(row[{GRADIENT}]) + begin);
+    F g = at(reinterpret_cast<const float*>(row[{GRADIENT}]) + begin);
+    for (int n = {MORE}; n < {COLUMNS} && row[n] != 0; ++n) g += at(reinterpret_cast<const float*>(row[n]) + begin);
+    g *= sizes_[2];
     F m = at(m_), v = at(v_);
     m += rest1 * (g - m);
     v += rest2 * (g * g - v);
@@ -79,7 +83,7 @@ def make_adam(K: int):
     @wp.kernel(enable_backward=False, module="unique")
     def adam(
         # In:
-        table: wp.array2d[wp.int64],  # [T, 6] addresses of parameter, gradient, both moments and step; length [1]
+        table: wp.array2d[wp.int64],  # [T, 9] addresses of parameter, gradient, moments, step; length; gradients
         first_block: wp.array[int],  # [T] blocks before those of a tensor [1]
         rest1: float,  # 1 - b1 [1]
         rest2: float,  # 1 - b2 [1]

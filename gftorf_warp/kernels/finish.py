@@ -6,7 +6,7 @@ that is not changes no parameter, no moment, no sum and no statistic; it is coun
 
 import warp as wp
 
-from .adam import ADVANCE, COLUMNS, GRADIENT, LENGTH
+from .adam import ADVANCE, COLUMNS, GRADIENT, LENGTH, MORE
 from .sums import LANES, OVER_LANES
 
 PART = 1024  # elements of a gradient whose squares are added up at once
@@ -34,9 +34,13 @@ _SQUARES = f"""{OVER_LANES}
     const long long* row = table.data + {COLUMNS} * low;
     const long long begin = (long long)(slot - first_part.data[low]) * {PART}, left = row[{LENGTH}] - begin;
     const int count = left < {PART} ? (int)left : {PART};
-    const float* g = reinterpret_cast<const float*>(row[{GRADIENT}]);
+    auto gradient = [&](int column) {{ return reinterpret_cast<const float*>(row[column]) + begin; }};
     float s = 0.0f;
-    if (g != nullptr) for (int i = lane; i < count; i += lanes) s += g[begin + i] * g[begin + i];
+    if (row[{GRADIENT}] != 0) for (int i = lane; i < count; i += lanes) {{
+        float g = gradient({GRADIENT})[i];
+        for (int n = {MORE}; n < {COLUMNS} && row[n] != 0; ++n) g += gradient(n)[i];
+        s += g * g;
+    }}
     s = over_lanes(s);
     if (writes) partials.data[slot] = s;
 """

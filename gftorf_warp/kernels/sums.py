@@ -63,3 +63,26 @@ def means(
 ):
     """One block per row."""
     mean_of_row(partials, wp.tid() // threads, scale, out)
+
+
+@wp.kernel(enable_backward=False)
+def add_up(
+    # In:
+    one: wp.array[float],  # [L] four arrays, of which the first ``count`` are read
+    two: wp.array[float],  # [L]
+    three: wp.array[float],  # [L]
+    four: wp.array[float],  # [L]
+    count: int,  # 1 to 4 [1]
+    # Out:
+    total: wp.array[float],  # [L] their sum, in their order
+):
+    """A thread per element."""
+    i = wp.tid()
+    value = one[i]
+    if count > 1:
+        value += two[i]
+    if count > 2:
+        value += three[i]
+    if count > 3:
+        value += four[i]
+    total[i] = value

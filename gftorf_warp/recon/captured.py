@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -28,9 +28,10 @@ from .observations import Observations
 from .optimiser import EPSILON, frozen, rates_at
 from .padded import Padded
 from .reserve import Reserve
-from .settings import Kernels, ReconSettings, Weights
+from .settings import Kernels, ReconSettings
 from .state import State
 from .step import SEED_MASK, Map, Singles, densify_after, draw
+from .variant import Image, Variant
 
 LOG = logging.getLogger("gftorf_warp")
 HEAD = 4  # numbers before those of the images: this key, the next, the one before, the quartet
@@ -70,34 +71,6 @@ def steps_of(
             return CapturedSteps(state, observations, settings)
         LOG.info("steps are no graphs: %s", why)
     return Singles(state, observations, settings, run_all)
-
-
-@dataclass(frozen=True)
-class Variant:
-    """What decides which operations a step consists of."""
-
-    shifts: tuple[float, ...]
-    """Phase shift of each image [rad]."""
-    moves: bool
-    """Whether Gaussians are displaced."""
-    flow: bool
-    """Whether the first image is compared with optical flow, too."""
-    rests: bool
-    """Whether the Gaussians are frozen."""
-    weights: Weights
-    """Of the terms."""
-    sh_degree: int
-    """Of the harmonics."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Image:
-    """One image of a batch."""
-
-    terms: dict[str, Tensor]
-    """Terms of its loss, without weights."""
-    tof: Rendering
-    """What was compared."""
 
 
 class CapturedSteps:
@@ -280,9 +253,6 @@ class CapturedSteps:
         """
         padded, numbers, motion = self.padded, self._numbers.there, self.state.motion
         field = padded.field
-        if variant.rests:
-            field = field.map(torch.Tensor.detach)
-        field = field.map(lambda tensor: tensor.view_as(tensor))  # gradients of all branches meet on this stream
         offsets: Tensor | None = None
         if variant.moves:
             asked = motion.follows_means and not variant.rests
@@ -290,22 +260,21 @@ class CapturedSteps:
             offsets = motion.key_offsets(attachment, numbers[: 3 if variant.flow else 2])
         render = replace(self.settings.render, sh_degree=variant.sh_degree, pair_capacity=self._reserve.capacity)
         images = []
-        for n in range(len(variant.shifts)):
+        for n in range(len(variant.shifts)):  # none waits for another before all of them know their gradients
             with self._branches.fork(n):
-                images.append(self._image(variant, n, field, offsets, render))
+                images.append(self._image(variant, n, offsets, render))
         self._branches.join()
-        first = len(padded.values) if variant.rests else 0
-        wanted, absent = padded.leaves[first:], [None] * first
-        terms = [(value, getattr(variant.weights, name)) for image in images for name, value in image.terms.items()]
-        terms = [(value, weight) for value, weight in terms if value.requires_grad]
-        gradients: list[Tensor | None] = [None] * len(wanted)
-        if terms:  # the loss is their sum, but nobody needs that number before the end
-            values, weights = zip(*terms, strict=True)
-            loss = fused.sum_for_gradients([self._one_times(weight) for weight in weights], values)
-            gradients = [*torch.autograd.grad(loss, wanted, allow_unused=True)]
+        of_motion: list[Tensor | None] = [None] * (len(padded.leaves) - len(padded.values))
+        by_offsets = fused.added([image.gradients[-1] for image in images])
+        if by_offsets is not None and of_motion:
+            assert offsets is not None
+            loss = fused.sum_for_gradients([by_offsets], [offsets])
+            learning = padded.leaves[len(padded.values) :]
+            of_motion = [*torch.autograd.grad(loss, learning, allow_unused=True)]
         with torch.no_grad():
-            gradients = [None if gradient is None else gradient.contiguous() for gradient in gradients]
-            table.point([*absent, *gradients])
+            of_motion = [None if gradient is None else gradient.contiguous() for gradient in of_motion]
+            first, *others = [image.gradients[:-1] for image in images]
+            table.point([*first, *of_motion], *([*other, *(None for _ in of_motion)] for other in others))
             if send is not None:
                 send()
             self._descend(variant, table, {name for image in images for name in image.terms})
@@ -316,12 +285,15 @@ class CapturedSteps:
                 sums = statistics.gradient, statistics.pixels, statistics.weight
                 descent.observe(screens, size, self._ledger, *sums)
 
-    def _image(self, variant: Variant, n: int, field, offsets: Tensor | None, render: RenderSettings) -> _Image:
-        """One image of the batch, compared."""
+    def _image(self, variant: Variant, n: int, offsets: Tensor | None, render: RenderSettings) -> Image:
+        """One image of the batch, compared, and its gradients by copies of what all images share."""
         settings, weights = self.settings, variant.weights
         numbers, first = self._numbers.there[HEAD + PER_IMAGE * n :], len(self._groups) + n
+        field = self.padded.field.map(torch.Tensor.detach)
+        values = [getattr(field, name).requires_grad_(not variant.rests) for name in self.padded.values]
         moved, flows, lights = field, None, {}
         if offsets is not None:
+            offsets = offsets.detach().requires_grad_(offsets.requires_grad)
             share, flow = self._values.there[first : first + 1], variant.flow and n == 0
             mean, flows = fused.displaced(field.mean, offsets, share, channels=flow)
             moved = replace(field, mean=mean)
@@ -349,7 +321,21 @@ class CapturedSteps:
             terms["flow"] = fused.flow_loss(
                 tof.distance, tof.extra, self._flow, camera, [camera, camera], row=row, out=out
             )
-        return _Image(terms=terms, tof=tof)
+        return Image(terms=terms, tof=tof, gradients=self._gradients(variant, terms, [*values, offsets]))
+
+    def _gradients(
+        self, variant: Variant, terms: dict[str, Tensor], leaves: list[Tensor | None]
+    ) -> list[Tensor | None]:
+        """Of the weighted terms of one image by everything it was made of."""
+        weighed = [(value, getattr(variant.weights, name)) for name, value in terms.items() if value.requires_grad]
+        wanted = [leaf for leaf in leaves if leaf is not None and leaf.requires_grad]
+        if not weighed or not wanted:
+            return [None] * len(leaves)
+        values, weights = zip(*weighed, strict=True)
+        loss = fused.sum_for_gradients([self._one_times(weight) for weight in weights], values)
+        found = iter(torch.autograd.grad(loss, wanted, allow_unused=True))
+        gradients = [next(found) if leaf is not None and leaf.requires_grad else None for leaf in leaves]
+        return [None if gradient is None else gradient.contiguous() for gradient in gradients]
 
     def _quad_loss(self, tof: Rendering, row: Tensor, n: int) -> Tensor:
         """Of image ``n`` against the measured one in a row; with the mean squared difference and opacity beside it."""

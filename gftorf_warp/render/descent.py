@@ -14,7 +14,7 @@ import warp as wp
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from ..kernels.adam import COLUMNS, GRADIENT, SIZES
+from ..kernels.adam import COLUMNS, GRADIENT, GRADIENTS, LENGTH, MORE, SIZES
 from ..kernels.finish import FOUND, PART, SUMS
 from . import training
 from .api import ScreenGradient
@@ -55,14 +55,15 @@ class AdamTable:
         for value, (step, first, second) in zip(parameters, moments, strict=True):
             for tensor in (value, first, second, step):
                 _check(tensor, device, None if tensor is step else value.shape)
-            rows.append([value.data_ptr(), 0, *(t.data_ptr() for t in (first, second, step)), value.numel()])
+            none = [0] * (GRADIENTS - 1)
+            rows.append([value.data_ptr(), 0, *(t.data_ptr() for t in (first, second, step)), value.numel(), *none])
         self._host = rows
         with stream_of(parameters[0]):
             width = training.adam_block(wp.device_from_torch(device))
-        ends = list(itertools.accumulate(-(-row[-1] // width) for row in rows))
-        parts = list(itertools.accumulate(-(-row[-1] // PART) for row in rows))
+        ends = list(itertools.accumulate(-(-row[LENGTH] // width) for row in rows))
+        parts = list(itertools.accumulate(-(-row[LENGTH] // PART) for row in rows))
         self.rows = torch.empty(len(rows), COLUMNS, dtype=torch.int64, device=device)
-        """[T, 6] addresses and lengths, see ``kernels/adam.py``."""
+        """[T, 9] addresses and lengths, see ``kernels/adam.py``."""
         self.first_block = torch.tensor([0, *ends[:-1]], dtype=torch.int32, device=device)
         """[T] blocks of elements before those of a tensor."""
         self.sizes = torch.empty(len(rows), SIZES, dtype=torch.float32, device=device)
@@ -78,17 +79,19 @@ class AdamTable:
         self.point(gradients)
         self.send()
 
-    def point(self, gradients: Sequence[Tensor | None]) -> None:
-        """Note where gradients lie, without telling the device.
+    def point(self, *gradients: Sequence[Tensor | None]) -> None:
+        """Note where gradients lie, without telling the device: one to four lists of them, of which the sums count.
 
         Raises:
             ValueError: As above.
         """
-        for row, value, gradient in zip(self._host, self._parameters, gradients, strict=True):
-            if gradient is not None:
+        self._gradients = []
+        for row, value, *found in zip(self._host, self._parameters, *gradients, strict=True):
+            present = [gradient for gradient in found if gradient is not None]
+            for gradient in present:
                 _check(gradient, value.device, value.shape)
-            row[GRADIENT] = 0 if gradient is None else gradient.data_ptr()
-        self._gradients = list(gradients)  # an address keeps nothing alive
+            row[GRADIENT], *row[MORE:] = [g.data_ptr() for g in present] + [0] * (GRADIENTS - len(present))
+            self._gradients += present  # an address keeps nothing alive
 
     def send(self) -> None:
         """Tell the device; waits for it."""

@@ -296,6 +296,8 @@ def uniform(
 def sum_for_gradients(weights: Sequence[Tensor], terms: Sequence[Tensor]) -> Float[Tensor, ""]:
     """A sum of terms times weights of which only gradients are wanted: they cost nothing, and it has no value.
 
+    Terms are numbers or of any shape, each with a weight of its own shape.
+
     ``autograd.grad(terms, .., grad_outputs=weights)`` says the same, but torch looks at shapes of gradients that it is
     given by means of sympy, whose import takes longer than the first thousand steps.
     """
@@ -306,8 +308,22 @@ class _Sum(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, weights: list[Tensor], *terms: Tensor) -> Tensor:
         ctx.weights = weights
-        return torch.empty_like(terms[0])
+        return terms[0].new_empty(())
 
     @staticmethod
     def backward(ctx: Any, _: Tensor) -> tuple[Tensor | None, ...]:
         return None, *ctx.weights
+
+
+def added(tensors: Sequence[Tensor | None]) -> Tensor | None:
+    """The sum of one to four tensors of one shape, in their order, in one launch; None counts as zero.
+
+    Without a derivative. Of one tensor it is that tensor.
+    """
+    present = [tensor.detach().contiguous() for tensor in tensors if tensor is not None]
+    if len(present) < 2:
+        return present[0] if present else None
+    total = torch.empty_like(present[0])
+    with stream_of(total):
+        training.added([array_over(tensor.flatten()) for tensor in present], array_over(total.flatten()))
+    return total

@@ -152,13 +152,18 @@ def uniform(origin: wp.array, stream: int, amplitude: float, image: wp.array) ->
     _launch(noise.uniform_noise, dim, inputs, [image])
 
 
+def added(arrays: list[wp.array], total: wp.array) -> None:
+    """Fill ``total`` with the sum of one to four arrays, in their order."""
+    _launch(sums.add_up, len(total), [*_four(arrays), len(arrays)], [total])
+
+
 def adam_step(
     table: wp.array, first_block: wp.array, blocks: int, betas: tuple[float, float], epsilon: float, sizes: wp.array
 ) -> None:
     """One step of Adam over the tensors of a table, in place.
 
     Args:
-        table: [T, 6] addresses and lengths, see ``kernels/adam.py``.
+        table: [T, 9] addresses and lengths, see ``kernels/adam.py``.
         first_block: [T] blocks before those of a tensor.
         blocks: In all, each of ``adam_block`` elements.
         betas: Decays of the moments.
@@ -188,7 +193,7 @@ def judge(
     """Squares of all gradients, and what they mean for the step; see ``kernels/finish.py``.
 
     Args:
-        table: [T, 6] of Adam.
+        table: [T, 9] of Adam.
         first_part: [T] parts before those of a tensor.
         partials: [P] scratch.
         motion: Parts and tensors before those of the motion.
