@@ -97,8 +97,8 @@ class Rasterize(torch.autograd.Function):
                 arrays = _inputs(named), view, shifts, frame, _images(cotangents), _inputs(wanted)
                 records = launch.backward(*arrays, extra_detached=request.extra_detached)
                 if screen is not None and len(screen):
-                    found = wp.to_torch(records)  # a list of columns would be uploaded as an index
-                    screen[:, :2], screen[:, 2:] = found[:, :2], found[:, 6:8]
+                    pairs = wp.to_torch(records).unflatten(1, (-1, 2))  # of slots: the first and the fourth
+                    screen.view(-1, 2, 2).copy_(pairs[:, 0:4:3])
         return None, *(wanted.get(name) for name in INPUTS)
 
 
