@@ -98,12 +98,13 @@ static double walk(int begin, int end, int step) {
             const int stop = std::min(at + 16, count);
             arrive();
             if (stop < count) { ask(memory, S, coming, stop); coming = entry(I, start, step, stop + 16, count); }
-            for (int n = at; n < stop; ++n) {
-                const int k = start + step * n;
-                const Splat q = record_of(memory, n, S, I, k);
-                wrong += std::memcmp(&q, &splats[ids[k]], 64) != 0;
+            for (int n = at; n < at + 16; ++n) {
+                const int k = start + step * n, first = n / 4 * 4;
+                const Splat q = record_of(memory, first, n - first, S, I, k, n < count), none{};
+                wrong += std::memcmp(&q, n < count ? &splats[ids[k]] : &none, 64) != 0;
+                if (n >= count || step > 0) continue;
                 const float* u = &values[(k * 32 + lane) * 4];
-                if (step < 0) keep_values(memory, n, V{u[0]}, V{u[1]}, V{u[2]}, V{u[3]});
+                keep_values(memory, first, n - first, V{u[0]}, V{u[1]}, V{u[2]}, V{u[3]});
             }
             if (step < 0)
                 add_round(memory, G, M, I, start, at, stop - at, V{40.5f + lane % 8}, V{20.5f + lane / 8});
@@ -205,11 +206,12 @@ SIGNATURES = {
     "entry": "int entry(wp::array_t<int> ids, int start, int step, int at, int count)",
     "ask": "void ask(wp::uint64 memory, wp::array_t<Splat> splats, int i, int at)",
     "arrive": "void arrive()",
-    "record_of": "Splat record_of(wp::uint64 memory, int at, wp::array_t<Splat> splats, wp::array_t<int> ids, int k)",
+    "record_of": "Splat record_of(wp::uint64 memory, int first, int n, wp::array_t<Splat> splats, "
+    "wp::array_t<int> ids, int k, bool there)",
     "warp_memory": "wp::uint64 warp_memory()",
     "keep_derivatives": "void keep_derivatives(wp::uint64 memory, V g0, V g1, V g2, V g_re, V g_im, V g_amplitude, "
     "V g_distance, V g3, V g4, V g5)",
-    "keep_values": "void keep_values(wp::uint64 memory, int at, V v, V w, V w2, V g_d)",
+    "keep_values": "void keep_values(wp::uint64 memory, int first, int n, V v, V w, V w2, V g_d)",
     "add_round": "void add_round(wp::uint64 memory, wp::array_t<Splat> grads, wp::array_t<Splat> more, "
     "wp::array_t<int> ids, int start, int at, int n, V x, V y)",
     "sum_of_lanes": "int sum_of_lanes(int x)",

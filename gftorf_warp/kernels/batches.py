@@ -20,6 +20,7 @@ from .splat import Splat
 
 COOPERATIVE = True  # False: every lane reads every record itself, to compare with
 ROUND = wp.constant(16)  # entries of a list that are fetched, and whose gradients are summed, together
+GROUP = wp.constant(4)  # of a round that the compiler sees at once: it works on some while others wait for their turn
 WARPS = 1  # tiles of a block of threads: all blocks run at once, and the more there are, the more evenly they spread
 STRIDE = 36  # floats from the values of one entry to those of the next: 4-float reads of 8 lanes meet all 32 banks
 OUT_STRIDE = 20  # the same for gradient records
@@ -28,6 +29,16 @@ HIT = 1.0e30  # times the smallest weight of a pixel that is reached, 4e-9, it i
 
 _RECORDS = 2 * ROUND * 16  # two buffers of records [floats]
 _MORE = 2 * ROUND * 4  # two buffers of further channels [floats]
+# adds four floats where any is not zero; slot 11 of further channels gets 0.0, which changes nothing
+_ADD4 = """auto add4 = [](float* to, float4 v, bool wanted) {
+        if (!wanted || (v.x == 0.0f && v.y == 0.0f && v.z == 0.0f && v.w == 0.0f)) return;
+#if __CUDA_ARCH__ >= 900
+        asm volatile("red.global.add.v4.f32 [%0], {%1, %2, %3, %4};"
+                     :: "l"(to), "f"(v.x), "f"(v.y), "f"(v.z), "f"(v.w) : "memory");
+#else
+        atomicAdd(to, v.x); atomicAdd(to + 1, v.y); atomicAdd(to + 2, v.z); atomicAdd(to + 3, v.w);
+#endif
+    };"""
 _CHECK = f'static_assert({ROUND} == 16 && {PIXELS} == 32, "two lanes per record, two halves of a tile");'
 
 
@@ -81,42 +92,44 @@ def make_batches(values: int = 0, derivatives: int = 0, more: bool = False) -> S
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
     const int n = at + (int)((threadIdx.x & 31u) >> 1);
-    return ids.data[start + step * (n < count ? n : count - 1)];
+    return n < count ? ids.data[start + step * n] : -1;
 #else
     return 0;
 #endif
 """)
 def entry(ids: wp.array[int], start: int, step: int, at: int, count: int) -> int:
-    """The splat whose record this lane fetches for the round that begins at entry ``at`` of ``count``.
-
-    Past the end of the list it is the last one again.
-    """
+    """The splat whose record this lane fetches for the round that begins at entry ``at`` of ``count``; -1: none."""
 
 
 @wp.func_native(f"""
 #if defined(__CUDA_ARCH__)
     const unsigned lane = threadIdx.x & 31u;  // a pair of lanes fetches a record, 32 bytes each
-    const float4* from = reinterpret_cast<const float4*>(splats.data + i) + 2 * (lane & 1u);
+    const float4* from = reinterpret_cast<const float4*>(splats.data + (i < 0 ? 0 : i)) + 2 * (lane & 1u);
     float4* to = reinterpret_cast<float4*>(memory) + (at / {ROUND} & 1) * {4 * ROUND} + 2 * lane;
 #if __CUDA_ARCH__ >= 800
-    const unsigned target = (unsigned)__cvta_generic_to_shared(to);
-    asm volatile("cp.async.cg.shared.global [%0], [%1], 16;" :: "r"(target), "l"(from) : "memory");
-    asm volatile("cp.async.cg.shared.global [%0], [%1], 16;" :: "r"(target + 16), "l"(from + 1) : "memory");
+    const unsigned target = (unsigned)__cvta_generic_to_shared(to), bytes = i < 0 ? 0u : 16u;
+    asm volatile("cp.async.cg.shared.global [%0], [%1], 16, %2;" :: "r"(target), "l"(from), "r"(bytes) : "memory");
+    asm volatile("cp.async.cg.shared.global [%0], [%1], 16, %2;"
+                 :: "r"(target + 16), "l"(from + 1), "r"(bytes) : "memory");
 #else
-    to[0] = __ldg(from);
-    to[1] = __ldg(from + 1);
+    const float4 none = make_float4(0.0f, 0.0f, 0.0f, 0.0f);
+    to[0] = i < 0 ? none : __ldg(from);
+    to[1] = i < 0 ? none : __ldg(from + 1);
 #endif
 #endif
 """)
 def ask(memory: wp.uint64, splats: wp.array[Splat], i: int, at: int):
-    """Send for the records of the round that begins at entry ``at``, of which ``i`` is this lane's."""
+    """Send for the records of the round that begins at entry ``at``, of which ``i`` is this lane's.
+
+    Where there is none zeros come: a power is never above ``low`` then, and no pixel sees it.
+    """
 
 
 @wp.func_native(f"""
 #if defined(__CUDA_ARCH__)
     const unsigned lane = threadIdx.x & 31u;
     if (lane & 1u) return;  // 16 bytes of a record, the channels, are one lane's work
-    const float4* from = reinterpret_cast<const float4*>(records.data + i) + 2;
+    const float4* from = reinterpret_cast<const float4*>(records.data + (i < 0 ? 0 : i)) + 2;
     float4* to = reinterpret_cast<float4*>(memory) + {_RECORDS // 4} + (at & {2 * ROUND - 1}) + (lane >> 1);
 #if __CUDA_ARCH__ >= 800
     const unsigned target = (unsigned)__cvta_generic_to_shared(to);
@@ -144,7 +157,7 @@ def arrive():
 
 @wp.func_native(f"""
 #if defined(__CUDA_ARCH__)
-    const float4* line = reinterpret_cast<const float4*>(memory) + (at & {2 * ROUND - 1}) * 4;
+    const float4* line = reinterpret_cast<const float4*>(memory) + (first & {2 * ROUND - 1}) * 4 + n * 4;
     wp::vec_t<16, float> record;
     for (int part = 0; part < 4; ++part) {{
         const float4 four = line[part];
@@ -153,11 +166,13 @@ def arrive():
     }}
     return record;
 #else
-    return splats.data[ids.data[k]];
+    return there ? splats.data[ids.data[k]] : wp::vec_t<16, float>(0.0f);
 #endif
 """)
-def record_of(memory: wp.uint64, at: int, splats: wp.array[Splat], ids: wp.array[int], k: int) -> Splat:
-    """The record of entry ``at`` of the walk, which is number ``k`` of the pairs."""
+def record_of(
+    memory: wp.uint64, first: int, n: int, splats: wp.array[Splat], ids: wp.array[int], k: int, there: bool
+) -> Splat:
+    """The record of entry ``n`` of the group that begins at entry ``first``; number ``k`` of the pairs, if any."""
 
 
 @wp.func_native(
@@ -166,12 +181,13 @@ def record_of(memory: wp.uint64, at: int, splats: wp.array[Splat], ids: wp.array
     const float4 four = (reinterpret_cast<const float4*>(memory) + {_RECORDS // 4})[at & {2 * ROUND - 1}];
     return wp::vec_t<3, float>(four.x, four.y, four.z);
 #else
+    if (!there) return wp::vec_t<3, float>(0.0f);
     const Splat& q = records.data[ids.data[k]];
     return wp::vec_t<3, float>(q[8], q[9], q[10]);
 #endif
 """.replace("Splat&", "wp::vec_t<16, float>&")
 )
-def more_of(memory: wp.uint64, at: int, records: wp.array[Splat], ids: wp.array[int], k: int) -> wp.vec3:
+def more_of(memory: wp.uint64, at: int, records: wp.array[Splat], ids: wp.array[int], k: int, there: bool) -> wp.vec3:
     """The further channels of entry ``at`` of the walk, which is number ``k`` of the pairs."""
 
 
@@ -223,14 +239,14 @@ def make_gradient_rounds(
     values_snippet = f"""
 #if defined(__CUDA_ARCH__)
     float* const kept = reinterpret_cast<float*>(memory) + {kept_at};
-    float* const to = kept + (at & {ROUND - 1}) * {STRIDE} + (threadIdx.x & 31u);
+    float* const to = kept + ((first & {ROUND - 1}) + n) * {STRIDE} + (threadIdx.x & 31u);
     {" ".join(stores)}
 #endif
 """
 
     @wp.func_native(values_snippet)
-    def keep_values(memory: wp.uint64, at: int, v: V, w: V, w2: V, g_d: V):
-        """Leave what this lane's pixel says about entry ``at``."""
+    def keep_values(memory: wp.uint64, first: int, n: int, v: V, w: V, w2: V, g_d: V):
+        """Leave what this lane's pixel says about entry ``n`` of the group that begins at entry ``first``."""
 
     take = "\n        ".join(
         f"const float4 {name}4 = from[{(n * ROUND * STRIDE) // 4} + part];"
@@ -255,16 +271,15 @@ def make_gradient_rounds(
     further += " more0 += w_[j] * m.x; more1 += w_[j] * m.y; more2 += w_[j] * m.z;" if more else ""
 
     add_more = f"""
-    #pragma unroll
-    for (int c = 0; c < 3; ++c) {{
-        const float* const both = kept + s * {OUT_STRIDE} + 16 + c;
-        const float sum = both[0] + both[{ROUND * OUT_STRIDE}];
-        if (s < n && upper == (c & 1) && sum != 0.0f)
-            atomicAdd(reinterpret_cast<float*>(more.data + i) + 8 + c, sum);
-    }}"""
+    const float4 m0 = *reinterpret_cast<const float4*>(kept + s * {OUT_STRIDE} + 16);
+    const float4 m1 = *reinterpret_cast<const float4*>(kept + s * {OUT_STRIDE} + 16 + {ROUND * OUT_STRIDE});
+    add4(reinterpret_cast<float*>(more.data + i) + 8,
+         make_float4(m0.x + m1.x, m0.y + m1.y, m0.z + m1.z, 0.0f), upper == 0 && s < n);
+"""
     round_snippet = f"""
 #if defined(__CUDA_ARCH__)
     {places}
+    {_ADD4}
     const int s = lane & 15, upper = lane >> 4;  // this lane owns entry s of the round, and one half of the tile
     const int i = ids.data[start - at - (s < n ? s : n - 1)];
     __syncwarp();  // what all lanes kept is there
@@ -296,13 +311,14 @@ def make_gradient_rounds(
     for (int part = 0; part < 4; ++part)
         out[part] = make_float4(sums[4 * part], sums[4 * part + 1], sums[4 * part + 2], sums[4 * part + 3]);
     {"out[4] = make_float4(more0, more1, more2, 0.0f);" if more else ""}
-    __syncwarp();  // all sums are there; sixteen lanes add one 64-byte line
+    __syncwarp();  // all sums are there; four lanes add one 64-byte line
     #pragma unroll
-    for (int pair = 0; pair < {ROUND // 2}; ++pair) {{
-        const int of = 2 * pair + upper, to = __shfl_sync(0xffffffffu, i, of);
-        const float* const both = kept + of * {OUT_STRIDE} + s;
-        const float sum = both[0] + both[{ROUND * OUT_STRIDE}];
-        if (of < n && sum != 0.0f) atomicAdd(reinterpret_cast<float*>(grads.data + to) + s, sum);
+    for (int eighth = 0; eighth < 2; ++eighth) {{
+        const int of = 8 * eighth + (lane >> 2), quarter = lane & 3, to = __shfl_sync(0xffffffffu, i, of);
+        const float4* const both = reinterpret_cast<const float4*>(kept + of * {OUT_STRIDE}) + quarter;
+        const float4 a = both[0], b = both[{ROUND * OUT_STRIDE // 4}];
+        add4(reinterpret_cast<float*>(grads.data + to) + 4 * quarter,
+             make_float4(a.x + b.x, a.y + b.y, a.z + b.z, a.w + b.w), of < n);
     }}
     {add_more if more else ""}
     __syncwarp();  // the next round may keep its values

@@ -14,8 +14,8 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from ..constants import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
-from .batches import ROUND, make_batches
+from ..constants import ALPHA_MAX, TRANSMITTANCE_MIN
+from .batches import GROUP, ROUND, make_batches
 from .lanes import make_lanes, warp_any
 from .parts import PLANES, part_length
 from .splat import AHEAD, Splat, block_missed, load_splat, prefetch
@@ -23,6 +23,7 @@ from .splat import AHEAD, Splat, block_missed, load_splat, prefetch
 # planes of ``light``, each [tiles, lanes] of V
 RE, IM, AMPLITUDE, DISTANCE, DISTORTION, SUM_ZETA, SUM_ZETA2, TRANSMITTANCE, LAST = range(9)
 LIGHT_PLANES = 9
+NEAREST = 1e-6  # [m] of a splat: what stands for none has no distance, and no weight, which infinities would ignore
 CHANNEL_PLANES = 3  # planes of ``channel``
 
 
@@ -75,7 +76,7 @@ def make_zeta(metric: bool):
     def zeta_of(distance: float, mapping: wp.vec2) -> float:
         if wp.static(metric):
             return distance
-        return mapping[0] - mapping[1] / distance
+        return mapping[0] - mapping[1] / wp.max(distance, wp.static(NEAREST))
 
     return zeta_of
 
@@ -114,8 +115,8 @@ def make_composite(
         raise ValueError("a list is walked back in parts with light, without distortion and by warps only")
     ops, pixels = make_lanes(K), make_pixels(K, tile_width, tile_height)
     V, fill, affine, mul, axpy, fma, fnma = ops.V, ops.fill, ops.affine, ops.mul, ops.axpy, ops.fma, ops.fnma
-    above, add, drop_below, set_where = ops.above, ops.add, ops.drop_below, ops.set_where
-    response, alpha_of, nonzero = ops.response, ops.alpha_of, ops.nonzero
+    above, add, reaches, drop_below, set_where = ops.above, ops.add, ops.reaches, ops.drop_below, ops.set_where
+    power_of, hits, alpha_of, nonzero = ops.power_of, ops.hits, ops.alpha_of, ops.nonzero
     block_x, block_y, columns, rows = pixels.block_x, pixels.block_y, ops.columns, ops.rows
     half = 0.5 * (pixels.side - 1)  # from the first to the middle of a block [px]
 
@@ -182,6 +183,8 @@ def make_composite(
         # pixels right of or below the image never start
         live = mul(above(affine(x, -1.0, float(width)), 0.0), above(affine(y, -1.0, float(height)), 0.0))
         T = fill(1.0)
+        if wp.static(inclusive):
+            T = add(live, fill(0.0))  # says by itself who goes on; a variable of its own, for Warp
         last = fill(0.0)
         if wp.static(light):
             re = fill(0.0)
@@ -251,63 +254,70 @@ def make_composite(
                     amplitude = fill(0.0)
                     distance = fill(0.0)
             if wp.static(cooperative):
-                stop = wp.min(k + ROUND, end)
+                stop = k + ROUND  # behind the end of the list there are splats that nobody sees
                 arrive()
                 if stop < end:
                     ask(memory, splats, coming, stop - begin)
                     if wp.static(more):
                         ask_more(memory, more_splats, coming, stop - begin)
                     coming = entry(ids, begin, 1, stop - begin + wp.static(ROUND), count)
-            while k < stop and goes_on(live):  # the same trip count for all lanes of a warp
-                k += 1
-                if wp.static(K > 1):
-                    i = ids[k - 1]
-                    prefetch(splats, ids[wp.min(k + AHEAD, end - 1)])
-                    if block_missed(splats, i, x0 + wp.static(half), y0 + wp.static(half)):
-                        continue
-                    q = load_splat(splats, i)
-                elif wp.static(cooperative):
-                    q = record_of(memory, k - 1 - begin, splats, ids, k - 1)
-                else:
-                    q = following
-                    following = load_splat(splats, after)
-                    after = ids[wp.min(k + 1, end - 1)]
-                g = response(affine(x, -1.0, q[0]), affine(y, -1.0, q[1]), q[2], q[3], q[4], q[6])
-                alpha = alpha_of(g, live, q[5], ALPHA_MAX, ALPHA_MIN)
-                if wp.static(not cooperative):  # with records at hand a miss costs less than a branch
-                    if not nonzero(alpha):
-                        continue
-                if wp.static(not inclusive):
-                    live = drop_below(live, fnma(T, T, alpha), TRANSMITTANCE_MIN)
-                    alpha = mul(alpha, live)
-                w = mul(alpha, T)
-                if wp.static(light):
-                    w2 = mul(w, T)
-                    re = axpy(re, w2, q[11])
-                    im = axpy(im, w2, q[12])
-                    amplitude = axpy(amplitude, w2, q[13])
-                    distance = axpy(distance, w, q[14])
-                if wp.static(spreads):
-                    zeta = zeta_of(q[14], mapping) - zeta0
-                    # sum over pairs, one splat at a time: w (zeta^2 A - 2 zeta M + V) with A = 1 - T the weight so far
-                    spread = axpy(axpy(affine(T, -zeta * zeta, zeta * zeta), sum_zeta, -2.0 * zeta), sum_zeta2, 1.0)
-                    distortion = fma(distortion, w, spread)
-                    sum_zeta = axpy(sum_zeta, w, zeta)
-                    sum_zeta2 = axpy(sum_zeta2, w, zeta * zeta)
-                if wp.static(channels):
-                    c0 = axpy(c0, w, q[8])
-                    c1 = axpy(c1, w, q[9])
-                    c2 = axpy(c2, w, q[10])
-                if wp.static(more):
-                    m = more_of(memory, k - 1 - begin, more_splats, ids, k - 1)
-                    c3 = axpy(c3, w, m[0])
-                    c4 = axpy(c4, w, m[1])
-                    c5 = axpy(c5, w, m[2])
-                T = fnma(T, T, alpha)
-                if wp.static(light):
-                    last = set_where(last, alpha, float(k - begin))
-                if wp.static(inclusive):
-                    live = drop_below(live, T, TRANSMITTANCE_MIN)
+            while k < stop and goes_on(live):
+                group = stop
+                if wp.static(cooperative):
+                    group = k + GROUP
+                    start = int(k)
+                while k < group and goes_on(live):  # the same trip count for all lanes of a warp
+                    k += 1
+                    if wp.static(K > 1):
+                        i = ids[k - 1]
+                        prefetch(splats, ids[wp.min(k + AHEAD, end - 1)])
+                        if block_missed(splats, i, x0 + wp.static(half), y0 + wp.static(half)):
+                            continue
+                        q = load_splat(splats, i)
+                    elif wp.static(cooperative):
+                        q = record_of(memory, start - begin, k - 1 - start, splats, ids, k - 1, k <= end)
+                    else:
+                        q = following
+                        following = load_splat(splats, after)
+                        after = ids[wp.min(k + 1, end - 1)]
+                    power = power_of(affine(x, -1.0, q[0]), affine(y, -1.0, q[1]), q[2], q[3], q[4])
+                    hit = hits(power, live, q[6])
+                    alpha = alpha_of(power, hit, q[5], ALPHA_MAX)
+                    if wp.static(not cooperative):  # with records at hand a miss costs less than a branch
+                        if not nonzero(alpha):
+                            continue
+                    if wp.static(not inclusive):
+                        live = drop_below(live, fnma(T, T, alpha), TRANSMITTANCE_MIN)
+                        alpha = mul(alpha, live)
+                        hit = alpha
+                    w = mul(alpha, T)
+                    if wp.static(light):
+                        w2 = mul(w, T)
+                        re = axpy(re, w2, q[11])
+                        im = axpy(im, w2, q[12])
+                        amplitude = axpy(amplitude, w2, q[13])
+                        distance = axpy(distance, w, q[14])
+                    if wp.static(spreads):
+                        zeta = zeta_of(q[14], mapping) - zeta0
+                        # sum over pairs, one splat at a time: w (zeta^2 A - 2 zeta M + V), the weight so far A = 1 - T
+                        spread = axpy(axpy(affine(T, -zeta * zeta, zeta * zeta), sum_zeta, -2.0 * zeta), sum_zeta2, 1.0)
+                        distortion = fma(distortion, w, spread)
+                        sum_zeta = axpy(sum_zeta, w, zeta)
+                        sum_zeta2 = axpy(sum_zeta2, w, zeta * zeta)
+                    if wp.static(channels):
+                        c0 = axpy(c0, w, q[8])
+                        c1 = axpy(c1, w, q[9])
+                        c2 = axpy(c2, w, q[10])
+                    if wp.static(more):
+                        m = more_of(memory, k - 1 - begin, more_splats, ids, k - 1, k <= end)
+                        c3 = axpy(c3, w, m[0])
+                        c4 = axpy(c4, w, m[1])
+                        c5 = axpy(c5, w, m[2])
+                    T = fnma(T, T, alpha)
+                    if wp.static(light):
+                        last = set_where(last, hit, float(k - begin))
+                    if wp.static(inclusive):
+                        live = reaches(T, TRANSMITTANCE_MIN)
             if wp.static(not cooperative):
                 k = end  # one round was all
         if wp.static(cooperative):

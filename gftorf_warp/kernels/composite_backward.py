@@ -15,8 +15,8 @@ import functools
 import warp as wp
 
 from ..constants import ALPHA_MAX, ALPHA_MIN
-from .batches import ROUND, make_gradient_rounds
-from .composite import LAST, SUM_ZETA, SUM_ZETA2, TRANSMITTANCE, make_pixels, make_zeta, options
+from .batches import GROUP, ROUND, make_gradient_rounds
+from .composite import LAST, NEAREST, SUM_ZETA, SUM_ZETA2, TRANSMITTANCE, make_pixels, make_zeta, options
 from .lanes import make_lanes, sums_of, types_of, warp_any, warp_max
 from .parts import PLANES, part_length
 from .splat import AHEAD, Splat, block_missed, load_splat, prefetch
@@ -167,7 +167,8 @@ def make_composite_backward(
     V, fill, affine, mul, axpy, fma, fnma = ops.V, ops.fill, ops.affine, ops.mul, ops.axpy, ops.fma, ops.fnma
     add, scaled, exceeds, keep_below = ops.add, ops.scaled, ops.exceeds, ops.keep_below
     inverse, at_least = ops.inverse, ops.at_least
-    response, alpha_of, nonzero, largest_of = ops.response, ops.alpha_of, ops.nonzero, ops.largest_of
+    power_of, hits, response, alpha_of = ops.power_of, ops.hits, ops.response, ops.alpha_of
+    nonzero, largest_of = ops.nonzero, ops.largest_of
     block_x, block_y, columns, rows = pixels.block_x, pixels.block_y, ops.columns, ops.rows
     half, zeta_of = 0.5 * (pixels.side - 1), make_zeta(bool(metric))
     spreads = light and metric is not None
@@ -294,74 +295,84 @@ def make_composite_backward(
         while k > begin:
             stop = begin
             if wp.static(cooperative):
-                stop = wp.max(k - ROUND, begin)
+                stop = k - ROUND  # behind the last one there are splats that nobody sees
                 at = top + 1 - k  # entries behind us
                 arrive()
                 if stop > begin:
                     ask(memory, splats, coming, at + wp.static(ROUND))
                     coming = entry(ids, top, -1, at + wp.static(2 * ROUND), count)
             while k > stop:
-                k -= 1
-                position = affine(position, 1.0, -1.0)
-                if wp.static(K > 1):
-                    i = ids[k]
-                    ahead = ids[wp.max(k - AHEAD, begin)]
-                    prefetch(splats, ahead)
-                    prefetch(grad_splats, ahead)
-                    if block_missed(splats, i, x0 + wp.static(half), y0 + wp.static(half)):
-                        continue
-                    q = load_splat(splats, i)
-                elif wp.static(cooperative):
-                    q = record_of(memory, top - k, splats, ids, k)
-                else:
-                    i = ids[k]
-                    q = following
-                    following = load_splat(splats, after)
-                    after = ids[wp.max(k - 2, begin)]
-                gate = exceeds(last, position)  # only what this pixel composited
-                dx = affine(x, -1.0, q[0])
-                dy = affine(y, -1.0, q[1])
-                g = response(dx, dy, q[2], q[3], q[4], q[6])
-                alpha = alpha_of(g, gate, q[5], ALPHA_MAX, ALPHA_MIN)
-                if wp.static(not cooperative):
-                    if not warp_any(nonzero(alpha)):  # uniform: all lanes of a warp reach `add_moments`, or none
-                        continue
-                restored = inverse(affine(alpha, -1.0, 1.0))
-                T = mul(T, restored)
-                w = mul(alpha, T)
-                tau = zero
-                if wp.static(channels and not fixed):
-                    tau = axpy(axpy(scaled(g0, q[8]), g1, q[9]), g2, q[10])
-                sigma_T = zero
-                w2 = zero
-                g_d = zero
-                if wp.static(light):
-                    tau = axpy(tau, g_distance, q[14])
-                    sigma_T = mul(axpy(axpy(scaled(g_re, q[11]), g_im, q[12]), g_amplitude, q[13]), T)
-                    g_d = g_distance
-                    w2 = mul(w, T)
-                if wp.static(spreads):
-                    zeta = zeta_of(q[14], mapping) - zeta0
-                    spread = axpy(minus_sum, weight, zeta)  # zeta A - M
-                    tau = fma(tau, g_distortion, axpy(sum_zeta2, add(spread, minus_sum), zeta))
-                    if wp.static(bool(metric)):
-                        g_d = fma(g_distance, twice_g_distortion, spread)
-                    else:  # zeta changes with the distance by mapping[1] / distance^2
-                        g_d = fma(g_distance, scaled(twice_g_distortion, mapping[1] / (q[14] * q[14])), spread)
-                tau = add(tau, sigma_T)
-                v = fnma(mul(w, tau), E, mul(alpha, restored))  # alpha dL/dalpha
-                E = fma(E, w, add(tau, sigma_T))
-                if wp.static(clamp_passes):
-                    v = fma(zero, v, mul(scaled(g, q[5]), inverse(at_least(alpha, ALPHA_MIN))))  # o G / alpha
-                else:
-                    v = keep_below(v, alpha, ALPHA_MAX)
+                length_of_group = k - stop
                 if wp.static(cooperative):
-                    i = ids[k]  # for the CPU; on CUDA nobody asks
-                    keep_values(memory, top - k, v, w, w2, g_d)
-                    if wp.static(more):
-                        add_more(more_splats, i, w, g3, g4, g5)
-                add_moments(grad_splats, i, v, dx, dy, alpha, w, w2, g0, g1, g2, g_re, g_im, g_amplitude, g_d)
+                    length_of_group = GROUP
+                    behind = top + 1 - k
+                n = int(0)
+                while n < length_of_group:
+                    n += 1
+                    k -= 1
+                    position = affine(position, 1.0, -1.0)
+                    if wp.static(K > 1):
+                        i = ids[k]
+                        ahead = ids[wp.max(k - AHEAD, begin)]
+                        prefetch(splats, ahead)
+                        prefetch(grad_splats, ahead)
+                        if block_missed(splats, i, x0 + wp.static(half), y0 + wp.static(half)):
+                            continue
+                        q = load_splat(splats, i)
+                    elif wp.static(cooperative):
+                        q = record_of(memory, behind, n - 1, splats, ids, k, k >= begin)
+                    else:
+                        i = ids[k]
+                        q = following
+                        following = load_splat(splats, after)
+                        after = ids[wp.max(k - 2, begin)]
+                    gate = exceeds(last, position)  # only what this pixel composited
+                    dx = affine(x, -1.0, q[0])
+                    dy = affine(y, -1.0, q[1])
+                    power = power_of(dx, dy, q[2], q[3], q[4])
+                    hit = hits(power, gate, q[6])
+                    alpha = alpha_of(power, hit, q[5], ALPHA_MAX)
+                    if wp.static(not cooperative):
+                        if not warp_any(nonzero(alpha)):  # uniform: all lanes of a warp reach `add_moments`, or none
+                            continue
+                    restored = inverse(affine(alpha, -1.0, 1.0))
+                    T = mul(T, restored)
+                    w = mul(alpha, T)
+                    tau = zero
+                    if wp.static(channels and not fixed):
+                        tau = axpy(axpy(scaled(g0, q[8]), g1, q[9]), g2, q[10])
+                    sigma_T = zero
+                    w2 = zero
+                    g_d = zero
+                    if wp.static(light):
+                        tau = axpy(tau, g_distance, q[14])
+                        sigma_T = mul(axpy(axpy(scaled(g_re, q[11]), g_im, q[12]), g_amplitude, q[13]), T)
+                        g_d = g_distance
+                        w2 = mul(w, T)
+                    if wp.static(spreads):
+                        zeta = zeta_of(q[14], mapping) - zeta0
+                        spread = axpy(minus_sum, weight, zeta)  # zeta A - M
+                        tau = fma(tau, g_distortion, axpy(sum_zeta2, add(spread, minus_sum), zeta))
+                        if wp.static(bool(metric)):
+                            g_d = fma(g_distance, twice_g_distortion, spread)
+                        else:  # zeta changes with the distance by mapping[1] / distance^2
+                            far = wp.max(q[14], wp.static(NEAREST))
+                            g_d = fma(g_distance, scaled(twice_g_distortion, mapping[1] / (far * far)), spread)
+                    tau = add(tau, sigma_T)
+                    v = fnma(mul(w, tau), E, mul(alpha, restored))  # alpha dL/dalpha
+                    E = fma(E, w, add(tau, sigma_T))
+                    if wp.static(clamp_passes):
+                        raw = scaled(response(power, hit), q[5])
+                        v = fma(zero, v, mul(raw, inverse(at_least(alpha, ALPHA_MIN))))  # o G / alpha
+                    else:
+                        v = keep_below(v, alpha, ALPHA_MAX)
+                    if wp.static(cooperative):
+                        i = ids[wp.max(k, begin)]  # for the CPU; on CUDA nobody asks
+                        keep_values(memory, behind, n - 1, v, w, w2, g_d)
+                        if wp.static(more):
+                            add_more(more_splats, i, w, g3, g4, g5)
+                    add_moments(grad_splats, i, v, dx, dy, alpha, w, w2, g0, g1, g2, g_re, g_im, g_amplitude, g_d)
             if wp.static(cooperative):
-                add_round(memory, grad_splats, more_splats, ids, top, at, top + 1 - stop - at, x, y)
+                add_round(memory, grad_splats, more_splats, ids, top, at, wp.min(count - at, ROUND), x, y)
 
     return composite_backward

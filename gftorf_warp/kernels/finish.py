@@ -34,12 +34,19 @@ _SQUARES = f"""{OVER_LANES}
     const long long* row = table.data + {COLUMNS} * low;
     const long long begin = (long long)(slot - first_part.data[low]) * {PART}, left = row[{LENGTH}] - begin;
     const int count = left < {PART} ? (int)left : {PART};
-    auto gradient = [&](int column) {{ return reinterpret_cast<const float*>(row[column]) + begin; }};
+    auto gradient = [&](int column) {{ return reinterpret_cast<const float*>(row[column]); }};
+    const float *one = gradient({GRADIENT}), *two = gradient({MORE});
+    const float *three = gradient({MORE + 1}), *four = gradient({MORE + 2});
     float s = 0.0f;
-    if (row[{GRADIENT}] != 0) for (int i = lane; i < count; i += lanes) {{
-        float g = gradient({GRADIENT})[i];
-        for (int n = {MORE}; n < {COLUMNS} && row[n] != 0; ++n) g += gradient(n)[i];
-        s += g * g;
+    if (one != nullptr) {{
+        #pragma unroll 4
+        for (int i = lane; i < count; i += lanes) {{
+            float g = one[begin + i];
+            if (two != nullptr) g += two[begin + i];
+            if (three != nullptr) g += three[begin + i];
+            if (four != nullptr) g += four[begin + i];
+            s += g * g;
+        }}
     }}
     s = over_lanes(s);
     if (writes) partials.data[slot] = s;

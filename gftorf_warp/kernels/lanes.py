@@ -167,6 +167,7 @@ def make_lanes(K: int) -> SimpleNamespace:
     if K not in (1, 16):
         raise ValueError(f"K must be 1 (CUDA) or 16 (CPU), got {K}")
     V, side = wp.types.vector(length=K, dtype=wp.float32), math.isqrt(K)
+    exp = "auto exp_ = [](F x) -> F { return expf(x); };" if K == 1 else _EXP
 
     @wp.func_native(_elementwise(K, "", "(F)(x)"))
     def fill(x: float) -> V: ...
@@ -200,26 +201,25 @@ def make_lanes(K: int) -> SimpleNamespace:
     def drop_below(a: V, b: V, x: float) -> V: ...
     @wp.func_native(_elementwise(K, "a b", "b < x ? a : (F)(0.0f)"))
     def keep_below(a: V, b: V, x: float) -> V: ...
+    @wp.func_native(_elementwise(K, "a", "a >= x ? (F)(1.0f) : (F)(0.0f)"))
+    def reaches(a: V, x: float) -> V: ...
     @wp.func_native(_elementwise(K, "a mask", "mask > 0.0f ? (F)(x) : a"))
     def set_where(a: V, mask: V, x: float) -> V: ...
-    @wp.func_native(  # exp(power) with power = p dx^2 + q dx dy + r dy^2, 0 where the power is below ``low``
+    @wp.func_native(_elementwise(K, "dx dy", "(dx * p + dy * q) * dx + (dy * r) * dy"))
+    def power_of(dx: V, dy: V, p: float, q: float, r: float) -> V: ...
+    @wp.func_native(_elementwise(K, "power gate", "((power > low) & (gate > 0.0f)) ? (F)(1.0f) : (F)(0.0f)"))
+    def hits(power: V, gate: V, low: float) -> V: ...
+    @wp.func_native(_elementwise(K, "power hit", "hit > 0.0f ? exp_(power) : (F)(0.0f)", exp))
+    def response(power: V, hit: V) -> V: ...
+    @wp.func_native(  # min(largest, o e^power) where it hits, else 0
         _elementwise(
             K,
-            "dx dy",
-            "const F power = (dx * p + dy * q) * dx + (dy * r) * dy; return power >= low ? exp_(power) : (F)(0.0f);",
-            "auto exp_ = [](F x) -> F { return expf(x); };" if K == 1 else _EXP,
+            "power hit",
+            "const F x = o * exp_(power), a = x < largest ? x : (F)(largest); return hit > 0.0f ? a : (F)(0.0f);",
+            exp,
         )
     )
-    def response(dx: V, dy: V, p: float, q: float, r: float, low: float) -> V: ...
-    @wp.func_native(  # min(largest, o g) where the gate is open and that is at least ``smallest``, else 0
-        _elementwise(
-            K,
-            "g gate",
-            "const F x = o * g, a = x < largest ? x : (F)(largest);"
-            " return gate > 0.0f ? (a >= smallest ? a : (F)(0.0f)) : (F)(0.0f);",
-        )
-    )
-    def alpha_of(g: V, gate: V, o: float, largest: float, smallest: float) -> V: ...
+    def alpha_of(power: V, hit: V, o: float, largest: float) -> V: ...
     @wp.func_native(_reduction(K, "return v != 0.0f;", "return __builtin_reduce_or((I)v) != 0;"))
     def nonzero(a: V) -> bool: ...
     @wp.func_native(_reduction(K, "return v;", "return __builtin_reduce_max(v);"))

@@ -21,15 +21,15 @@ BLOCK_RADIUS = wp.constant(
 
 @wp.func
 def visit_of(opacity: float, cov: wp.vec4) -> wp.vec2:
-    """(low, limit) of a record. A little wide: they decide what is visited, not what it is worth.
+    """(low, limit) of a record: low decides what has an effect; limit, a little wide, which blocks are visited.
 
     With K the conic, sqrt(v K v) is a norm: it changes by at most sqrt(largest eigenvalue) times the distance. So where
     it exceeds sqrt(cutoff) by that much at the middle of a block, no pixel centre of the block lies inside the ellipse.
     """
-    cutoff = 2.0 * wp.log(opacity / ALPHA_MIN) + 1.0e-5
+    cutoff = 2.0 * wp.log(opacity / ALPHA_MIN)
     middle = 0.5 * (cov[0] + cov[2])
     smallest = cov[3] / (middle + wp.sqrt(wp.max(middle * middle - cov[3], 0.0)))  # variance of the narrow axis
-    reach = wp.sqrt(wp.max(cutoff, 0.0)) + BLOCK_RADIUS / wp.sqrt(smallest)
+    reach = wp.sqrt(wp.max(cutoff, 0.0) + 1.0e-5) + BLOCK_RADIUS / wp.sqrt(smallest)
     return wp.vec2(-0.5 * cutoff, -0.50005 * reach * reach - 1.0e-3)
 
 
