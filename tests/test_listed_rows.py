@@ -290,17 +290,22 @@ def test_a_gradient_that_is_not_finite_is_not_lost(value, device):
     assert not torch.nn.utils.get_total_norm(gradients(made, gaussians, cotangent, [0, 1])[1]).isfinite()
 
 
-def test_all_rows_unless_told():
-    """Prepared, not measured: off."""
-    assert not TensorCores().listed
-    assert perceptron.LISTED is False
+def test_rows_without_gradient_are_left_out_unless_told():
+    """As measured."""
+    assert perceptron.LISTED is True
+    assert TensorCores().listed
+    assert not TensorCores(listed=False).listed
 
 
 @ON_HOPPER
 @pytest.mark.parametrize("share", [0.0, 0.6, 0.98])
 @pytest.mark.parametrize("count", [2_000, 20_289, 20_480])
 def test_many_rows(count, share):
-    """On a GPU: the same sums as with all rows, the same weights up to the order of their sums, twice the same bits."""
+    """On a GPU: the same sums as with all rows, the same weights up to the order of their sums, twice the same bits.
+
+    Tensor cores cut digits off what they add up: one sum over 20,480 rows (torch) loses 1.1e-4, several over parts of
+    them (ours) less.
+    """
     quick, _ = pair(FULL, "cuda")
     short = copy.deepcopy(quick)
     short.go_by(TensorCores(listed=True))
@@ -311,7 +316,7 @@ def test_many_rows(count, share):
     _, want = gradients(quick, gaussians, cotangent, [0, 1, 3])
     for one, other, twice in zip(got, want, again, strict=True):
         assert torch.equal(one, twice)
-        assert float((one - other).norm() / other.norm()) < 1e-4
+        assert float((one - other).norm() / other.norm()) < 2e-4
 
 
 @ON_HOPPER

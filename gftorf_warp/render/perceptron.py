@@ -16,7 +16,7 @@ from ..kernels.sums import LANES
 from ..scene.perceptron import LARGEST, SMALLEST, Form, Products, Slopes, beside
 from .bridge import array_over, stream_of
 
-LISTED = False  # whether rows without gradient are left out of the way back: prepared, not measured, design/network.md
+LISTED = True  # whether rows without gradient are left out of the way back, which most are: design/network.md
 
 
 class TensorCores(Products):
