@@ -216,7 +216,7 @@ def launches(form, place, moment, all_weights, biases):
 
 @BY_THREADS
 @pytest.mark.parametrize("columns", [WIDTH, wgmma.COLUMNS])
-@pytest.mark.parametrize(("keys", "count", "parts"), [(2, 600, 3), (1, 40, 2)])
+@pytest.mark.parametrize(("keys", "count", "parts"), [(2, 600, 3), (2, 600, 1), (1, 40, 2)])
 def test_weight_gradients_by_blocks_of_threads(columns, keys, count, parts, tmp_path):
     """Parts of a list longer than what shared memory holds, and an empty one: added up they are d^T h in float64.
 
