@@ -26,6 +26,7 @@ from gftorf_warp.kernels import (
     displace,
     finish,
     flow,
+    gradients,
     move,
     noise,
     paths,
@@ -75,7 +76,7 @@ def modules(arch: int) -> dict[str, wp.Module]:
         "perceptron": perceptron.pack.module,
         "slopes": slopes.add_partials.module,
         "rows": rows.list_rows.module,
-        "weights": weights.add_parts.module,
+        "gradients": gradients.collect.module,
         "weights of outputs": weights.multiply_outputs.module,
         "weights of places": weights.multiply_places.module,
     }

@@ -1,13 +1,14 @@
 """What the motion network costs: forward and backward, all queries of a step stacked, in each precision.
 
     python benchmarks/network.py [--device cpu|cuda] [--gaussians N ..] [--queries Q ..] [--repeats R]
-                                 [--products float32|tf32|half|'half by torch'|'half by list' ..]
+                                 [--products float32|tf32|half|'half by torch'|'half, all rows' ..]
                                  [--hidden SHARE] [--profile] [--json FILE]
 
 A query is one key time; a timing holds one encoding of positions, as a step has it, and the gradient of all weights.
 ``half`` is what a captured step has, ``half by torch`` the same without kernels of ours, by default where they differ;
-``half by list`` leaves rows without gradient out of the way back. With ``--hidden`` that share of the Gaussians, drawn
-at random, has none. Behind ``half`` it says how far its gradients are from those, the largest distance of a tensor.
+``half, all rows`` has rows without gradient on the way back as well. With ``--hidden`` that share of the Gaussians,
+drawn at random, has none. Behind ``half`` it says how far its gradients are from those, the largest distance of a
+tensor.
 On a GPU every row is timed twice: called from Python, and replayed as a CUDA graph, which must give what the call gave.
 Rows of one N and Q take turns. ``kernels`` counts what the device ran in one call, products included; ``error`` is the
 largest difference of an offset from that in float32, for weights whose offsets are a few decimetres. With ``--profile``
@@ -27,7 +28,7 @@ from pathlib import Path
 import torch
 
 from gftorf_warp.bench.command import about
-from gftorf_warp.bench.motion import BY_LIST, BY_TORCH, go_by, kinds, points, products_of
+from gftorf_warp.bench.motion import ALL_ROWS, BY_TORCH, go_by, kinds, points, products_of
 from gftorf_warp.bench.timing import WARM_UP, Watch, watch_of
 from gftorf_warp.scene.gaussians import GaussianField
 from gftorf_warp.scene.motion import MotionSettings, Products
@@ -120,7 +121,7 @@ def rows_of(count: int, queries: int, options: argparse.Namespace) -> list[dict[
             found = call()
         row: dict[str, object] = {"gaussians": count, "queries": queries, "products": kind}
         gradients[kind] = found[1:]
-        if kind == BY_LIST and str(Products.HALF) in gradients:
+        if kind == ALL_ROWS and str(Products.HALF) in gradients:
             both = zip(found[1:], gradients[str(Products.HALF)], strict=True)
             row["from_half"] = max(float((one - other).norm() / other.norm()) for one, other in both)
         row["error_mm"] = 1e3 * float((found[0] - exact).norm(dim=-1).max())
@@ -153,7 +154,7 @@ def main() -> int:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--gaussians", type=int, nargs="+", default=[20_000, 100_000])
     parser.add_argument("--queries", type=int, nargs="+", default=[1, 2, 3])
-    parser.add_argument("--products", nargs="+", choices=[*map(str, Products), BY_TORCH, BY_LIST])
+    parser.add_argument("--products", nargs="+", choices=[*map(str, Products), BY_TORCH, ALL_ROWS])
     parser.add_argument("--hidden", type=float, default=0.0, help="share of Gaussians without gradient")
     parser.add_argument("--repeats", type=int, default=50)
     parser.add_argument("--profile", action="store_true")

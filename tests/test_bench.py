@@ -242,10 +242,10 @@ def test_half_precision_has_a_row_of_torch_where_steps_have_kernels(monkeypatch)
     assert motion.kinds("cpu") == [*map(str, Products), motion.BY_TORCH]
     assert {motion.products_of(kind) for kind in motion.kinds("cpu")} == set(Products)
     assert motion.products_of(motion.BY_TORCH) == Products.HALF
-    assert motion.products_of(motion.BY_LIST) == Products.HALF
+    assert motion.products_of(motion.ALL_ROWS) == Products.HALF
     ours = motion.perceptron.TensorCores
-    for kind, passes in ((str(Products.HALF), ours), (motion.BY_LIST, ours), (motion.BY_TORCH, type(None))):
+    for kind, passes in ((str(Products.HALF), ours), (motion.ALL_ROWS, ours), (motion.BY_TORCH, type(None))):
         made = Network(torch.arange(3.0), MotionSettings(), duration=1.0, length=7.5)
         motion.go_by(made, kind)
         assert isinstance(made.form.passes, passes)
-        assert getattr(made.form.passes, "listed", False) == (kind == motion.BY_LIST)
+        assert getattr(made.form.passes, "listed", False) == (kind == str(Products.HALF))

@@ -166,10 +166,13 @@ def test_other_numbers_of_bits_are_named(bits):
 
 
 @pytest.mark.parametrize("bits", [24, 16])
-@pytest.mark.parametrize("kind", ["wide", "equal", "culled", "few"])
+@pytest.mark.parametrize("kind", ["wide", "equal", "culled", "few", "wall", "last"])
 @pytest.mark.parametrize("count", [1, 2, 31, 500, 5000])
 def test_classes_give_the_order_of_a_sort(count, kind, bits, device, monkeypatch):
-    """Spread keys, one for all, only culled ones, and few with ties; the culled come last, in any order."""
+    """Spread keys, one for all, only culled ones, few with ties, two classes, and those beside the culled ones.
+
+    The culled come last, in any order.
+    """
     settings = RenderSettings(near=PRESETS[0], far=PRESETS[1], depth_bits=bits)
     rng, culled = np.random.default_rng(count), settings.depth_culled
     keys = {
@@ -177,6 +180,8 @@ def test_classes_give_the_order_of_a_sort(count, kind, bits, device, monkeypatch
         "equal": np.full(count, 77),
         "culled": np.full(count, culled),
         "few": np.where(rng.random(count) < 0.3, culled, rng.integers(0, 5, count)),
+        "wall": rng.integers(8 << 8, 10 << 8, count) if bits == 24 else rng.integers(8, 10, count),
+        "last": rng.integers(culled - 3, culled + 1, count),
     }[kind]
     found = []
     for most in (0, 1 << 20):

@@ -10,13 +10,15 @@ import pytest
 import torch
 from small_runs import random
 from test_perceptron import compare_replay, gradients, half, network
-from test_tensor_cores import DEVICES, FULL, ON_HOPPER, SHAPES, alike, inputs_of, pair, rows
+from test_tensor_cores import DEVICES, FULL, ON_HOPPER, SHAPES, alike, inputs_of, launched, pair, rows
 from test_wgmma_by_threads import BACKWARD, BLOCKS, COMPILER, FORWARD, run, stored
 
+from gftorf_warp.kernels import gradients as ends
 from gftorf_warp.kernels import perceptron as kernels
 from gftorf_warp.kernels import rows as lists
 from gftorf_warp.kernels import weights, wgmma
 from gftorf_warp.render import perceptron
+from gftorf_warp.render.bridge import array_over
 from gftorf_warp.render.perceptron import TensorCores
 from gftorf_warp.scene.motion import MotionSettings
 from gftorf_warp.scene.perceptron import join
@@ -73,6 +75,22 @@ int main(int, char** given) {
     on_blocks(jobs * parts, [&] {
         multiply(blockIdx.x, jobs, parts, keys, count, listed.size(), joined, {listed.data()}, {begins.data()},
                  {slopes}, {inputs}, {partials.data()});
+    });
+    stored("partials", partials);
+}
+"""
+HEADS = """
+static void multiply(int part, int parts, int keys, int layers, int rows, wp::array_t<int> listed,
+                     wp::array_t<int> begins, wp::array_t<wp::half> after, wp::array_t<wp::half> outputs,
+                     wp::array_t<float> partials) { CODE }
+int main(int, char** given) {
+    const int parts = std::stoi(given[1]), keys = std::stoi(given[2]), layers = std::stoi(given[3]);
+    auto listed = loaded<int>("listed"), begins = loaded<int>("starts");
+    auto after = loaded<wp::half>("after"), outputs = loaded<wp::half>("outputs");
+    std::vector<float> partials((size_t)parts * 768, NAN);
+    on_blocks(parts, [&] {
+        multiply(blockIdx.x, parts, keys, layers, after.size() / 8, {listed.data()}, {begins.data()}, {after.data()},
+                 {outputs.data()}, {partials.data()});
     });
     stored("partials", partials);
 }
@@ -198,7 +216,7 @@ def launches(form, place, moment, all_weights, biases):
 
 @BY_THREADS
 @pytest.mark.parametrize("columns", [WIDTH, wgmma.COLUMNS])
-@pytest.mark.parametrize(("keys", "count", "parts"), [(2, 600, 3), (1, 40, 2)])
+@pytest.mark.parametrize(("keys", "count", "parts"), [(2, 600, 3), (2, 600, 1), (1, 40, 2)])
 def test_weight_gradients_by_blocks_of_threads(columns, keys, count, parts, tmp_path):
     """Parts of a list longer than what shared memory holds, and an empty one: added up they are d^T h in float64.
 
@@ -236,9 +254,98 @@ def test_weight_gradients_by_blocks_of_threads(columns, keys, count, parts, tmp_
     assert tiles > parts * weights.STAGES or tiles == 1
 
 
+@BY_THREADS
+@pytest.mark.parametrize(("keys", "count", "parts"), [(2, 600, 3), (1, 40, 2)])
+def test_the_heads_weight_by_blocks_of_threads(keys, count, parts, tmp_path):
+    """The code for CUDA: parts added up are what float64 has of listed rows; nobody reads the others."""
+    gradient = hidden(random(keys * count, 3, seed=2) - 0.5, 0.3, keys)
+    listed, begins = wanted(gradient, keys)
+    there = (gradient != 0).any(1)
+    after = torch.zeros(keys * count, wgmma.HEAD)
+    after[:, :3] = gradient
+    after[~there] = torch.nan
+    outputs = random(2, keys * count, WIDTH, seed=6) - 0.3
+    outputs[0], outputs[1, ~there] = torch.nan, torch.inf
+    padded = np.pad(np.array(listed, np.int32), (0, lists.capacity(keys, count) - len(listed)), constant_values=-7)
+    stored(tmp_path, listed=padded, starts=np.array(begins, np.int32))
+    stored(tmp_path, after=after.half().numpy(), outputs=outputs.half().numpy())
+    run(tmp_path, HEADS, ends.by_head, parts, keys, 2)
+    found = read(tmp_path / "partials", np.float32).view(parts, 3, WIDTH)
+    want = after[there, :3].half().double().T @ outputs[1, there].half().double()
+    torch.testing.assert_close(found.double().sum(0), want, rtol=1e-5, atol=1e-5)
+    assert float(want.abs().min()) > 1e-4
+    assert found.abs().amax((1, 2)).count_nonzero() == min(parts, begins[-1] // TILE)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("shape", SHAPES)
+def test_nobody_reads_rows_that_are_not_listed(shape, device):
+    """Whatever is in them, in the last layer as well: the same weight gradients, to the bit."""
+    made, _ = pair(SHAPES[shape], device)
+    form, place, moment, all_weights, biases = inputs_of(made, 70, 3)
+    passes = TensorCores(listed=True)
+    gradient = hidden(random(210, 3, seed=3) - 0.5, 0.6, 3).to(device)
+    outputs, _, kept = passes.forward(form, place, moment, all_weights, biases)
+    slopes = passes.backward(form, 3, gradient, outputs, kept)
+    want = passes.weigh(form, place, moment, slopes, outputs)
+    outputs[:, (gradient == 0).all(1)] = torch.inf
+    found = passes.weigh(form, place, moment, slopes, outputs)
+    assert [value.shape for value in found] == [v.shape for both in zip(all_weights, biases, strict=True) for v in both]
+    assert all(map(torch.equal, found, want))
+    assert all(value.isfinite().all() and value.abs().max() > 0 for value in found)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize(("keys", "parts"), [(1, 1), (3, 4)])
+def test_parts_and_sums_become_gradients(shape, keys, parts, device):
+    """Every value has its place, its parts and the scale; the bias of the head has none."""
+    form = network(half(SHAPES[shape])).form
+    layers, halves, columns = SHAPES[shape].layers, weights.HALVES, wgmma.COLUMNS
+    drawn = [
+        (layers, keys, WIDTH), (3,), (keys, form.moment), (parts, halves * (layers - 1), weights.HALF * WIDTH),
+        (parts, halves * len(form.entries), weights.HALF * columns), (parts, 1, 3 * WIDTH),
+    ]  # fmt: skip
+    sums, total, moment, outputs, places, head = ((random(*size, seed=8) - 0.4).to(device) for size in drawn)
+    unit = torch.tensor([0.25], device=device)
+    shapes = perceptron._shapes(form, layers)
+    found = torch.full((sum(np.prod(size) for size in shapes),), torch.nan, device=device)
+    given = [array_over(value) for value in (unit, sums, total, moment, outputs, places, head)]
+    dim = layers * WIDTH + 3, WIDTH + form.place + form.moment + 1
+    launched(ends.collect, dim, [perceptron._layers(form, layers), *given], [array_over(found)], device)
+    square = outputs.sum(0).view(layers - 1, WIDTH, WIDTH)
+    entered = dict(zip(form.entries, places.sum(0).view(-1, WIDTH, columns)[:, :, : form.place], strict=True))
+    want = []
+    for number in range(layers):
+        pieces = [square[number - 1]] if number else []
+        if number in entered:
+            pieces += [entered[number], sums[number].T @ moment]
+        want += [0.25 * torch.cat(pieces, 1), 0.25 * sums[number].sum(0)]
+    want += [0.25 * head.sum(0).view(3, WIDTH), total]
+    assert [value.shape for value in want] == [torch.Size(size) for size in shapes]
+    torch.testing.assert_close(found, torch.cat([value.flatten() for value in want]), rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("multiprocessors", [16, 78, 114, 132])
+@pytest.mark.parametrize("layers", [1, 2, 3, 8])
+@pytest.mark.parametrize("entries", [1, 2])
+def test_all_blocks_run_at_once(multiprocessors, layers, entries):
+    """The products' blocks fit beside each other, few multiprocessors have nothing to do, and shares are as work is."""
+    own, others, left = weights.parts(multiprocessors, layers, entries)
+    jobs = weights.HALVES * (layers - 1)
+    assert own * jobs + left == multiprocessors
+    assert own >= 1
+    assert 0.7 * left < -(-others * weights.HALVES * entries // 2) <= left
+    read, also = jobs * (weights.HALF + WIDTH), weights.HALVES * entries * (weights.HALF + wgmma.COLUMNS)
+    assert (own + 1) * jobs > multiprocessors * read / (read + also) or not jobs
+    assert own == 1 or own * jobs <= multiprocessors * read / (read + also)
+    assert weights.parts(132, 8, 2) == (8, 10, 20)
+
+
 def test_shared_memory_is_enough():
-    """227 KB are all that a block can have."""
+    """227 KB are all that a block can have, and of a multiprocessor's 228 each block takes one more."""
     assert max(weights.shared(WIDTH), weights.shared(wgmma.COLUMNS), wgmma.SHARED) <= 227 * 1024
+    assert 2 * (weights.shared(wgmma.COLUMNS) + 1024) <= 228 * 1024
 
 
 @pytest.mark.parametrize("device", DEVICES)
@@ -290,17 +397,22 @@ def test_a_gradient_that_is_not_finite_is_not_lost(value, device):
     assert not torch.nn.utils.get_total_norm(gradients(made, gaussians, cotangent, [0, 1])[1]).isfinite()
 
 
-def test_all_rows_unless_told():
-    """Prepared, not measured: off."""
-    assert not TensorCores().listed
-    assert perceptron.LISTED is False
+def test_rows_without_gradient_are_left_out_unless_told():
+    """As measured."""
+    assert perceptron.LISTED is True
+    assert TensorCores().listed
+    assert not TensorCores(listed=False).listed
 
 
 @ON_HOPPER
 @pytest.mark.parametrize("share", [0.0, 0.6, 0.98])
 @pytest.mark.parametrize("count", [2_000, 20_289, 20_480])
 def test_many_rows(count, share):
-    """On a GPU: the same sums as with all rows, the same weights up to the order of their sums, twice the same bits."""
+    """On a GPU: the same sums as with all rows, the same weights up to the order of their sums, twice the same bits.
+
+    Tensor cores cut digits off what they add up: one sum over 20,480 rows (torch) loses 1.1e-4, several over parts of
+    them (ours) less.
+    """
     quick, _ = pair(FULL, "cuda")
     short = copy.deepcopy(quick)
     short.go_by(TensorCores(listed=True))
@@ -311,7 +423,7 @@ def test_many_rows(count, share):
     _, want = gradients(quick, gaussians, cotangent, [0, 1, 3])
     for one, other, twice in zip(got, want, again, strict=True):
         assert torch.equal(one, twice)
-        assert float((one - other).norm() / other.norm()) < 1e-4
+        assert float((one - other).norm() / other.norm()) < 2e-4
 
 
 @ON_HOPPER

@@ -19,7 +19,7 @@ QUICK_COUNTS = (100,)
 QUERIES = (1, 2, 3)
 KEYS, PERIOD_S, LENGTH_M = 16, 4 / 120, 7.5
 BY_TORCH = "half by torch"  # where captured steps have kernels of ours for it
-BY_LIST = "half by list"  # those kernels, for rows with a gradient only on the way back
+ALL_ROWS = "half, all rows"  # those kernels, and on the way back also rows without gradient
 
 
 def measure(device: str, *, quick: bool, runs: int, report: Report) -> list[dict[str, Any]]:
@@ -66,13 +66,13 @@ def measure(device: str, *, quick: bool, runs: int, report: Report) -> list[dict
 
 def products_of(kind: str) -> Products:
     """The setting behind a row."""
-    return Products.HALF if kind in {BY_TORCH, BY_LIST} else Products(kind)
+    return Products.HALF if kind in {BY_TORCH, ALL_ROWS} else Products(kind)
 
 
 def go_by(network: Network, kind: str) -> None:
     """Let kernels take rows through the layers where captured steps do so, unless the row is about torch."""
     if kind != BY_TORCH and perceptron.fits(network.form, network.head.weight.device):
-        network.go_by(perceptron.TensorCores(listed=True) if kind == BY_LIST else perceptron.TensorCores())
+        network.go_by(perceptron.TensorCores(listed=kind != ALL_ROWS))
 
 
 def kinds(device: str) -> list[str]:

@@ -5,7 +5,7 @@ multiple of ``TILE``, which is what kernels multiply at once. Blocks of rows are
 before it from all counts and writes its rows: the order is fixed, and launches have sizes that no host must ask for.
 
 A gradient that is no number counts as one. A row of zeros adds nothing to any weight's gradient, unless an output of it
-is infinite: with all rows 0 times that is no number and the step not sound, with a list only the head sees such a row.
+is infinite: with all rows 0 times that is no number and the step not sound, with a list nobody sees such a row.
 """
 
 import warp as wp

@@ -6,8 +6,8 @@ rows come into shared memory ahead, ``STAGES`` of them, pieces of 16 bytes excha
 so that eight rows never meet in a bank. ``ldmatrix`` turns both factors over on their way to ``mma.sync`` (PTX,
 m16n8k16).
 
-Parts are sums of their own, added up in a fixed order by ``add_parts``. On a CPU one thread does the
-same row by row, float32 on halves.
+Both kinds run at once: a block has a multiprocessor or half of one, and none waits for another. Parts are sums of their
+own, added up in a fixed order by ``gradients.py``. On a CPU one thread does the same row by row, float32 on halves.
 """
 
 import warp as wp
@@ -26,10 +26,24 @@ def shared(columns: int) -> int:
     return STAGES * TILE * 2 * (HALF + columns) + ALIGNED
 
 
+def parts(multiprocessors: int, layers: int, entries: int) -> tuple[int, int, int]:
+    """Parts of a list for products with outputs, for those with gamma(x), and the multiprocessors that are left.
+
+    All blocks run at once: one of the first kind has a multiprocessor for itself, two of the second share one that is
+    left. How many are left is decided by what both read of a row.
+    """
+    jobs, others = HALVES * (layers - 1), HALVES * entries
+    read, also = jobs * (HALF + WIDTH), others * (HALF + COLUMNS)
+    own = max(multiprocessors * read // ((read + also) * jobs), 1) if jobs else 1
+    left = max(multiprocessors - own * jobs, 1)
+    return own, max(2 * left // others, 1), left
+
+
 def _snippet(columns: int, layer: str, first: str, row: str) -> str:
     """C++: which layer's slopes a job is about, where its inputs begin, and which row of them a listed row has."""
     own = columns // 4  # inputs of a warp
     pieces = columns // 8  # of 16 bytes in a row
+    abreast = 32 // pieces  # rows that a warp copies at once
     stage = TILE * 2 * (HALF + columns)  # bytes of a tile
     return f"""
     const int job = block % jobs, part = block / jobs, layer = {layer};
@@ -46,11 +60,19 @@ def _snippet(columns: int, layer: str, first: str, row: str) -> str:
         asm volatile("cp.async.cg.shared.global [%0], [%1], 16, %2;" :: "r"(to), "l"(from), "r"(bytes) : "memory");
     }};
     auto commit = [&]() {{ asm volatile("cp.async.commit_group;" ::: "memory"); }};
-    // a warp reads rows of its number, and that plus 8, 16, ..: every lane knows one of them, a tile ahead
-    auto rows_of = [&](int tile) {{
-        return tile < end ? __ldg(listed.data + tile * {TILE} + warp + 8 * (lane & 7)) : {NO_ROW};
+    // a warp reads rows of its number, and that plus 8, 16, ..: every lane knows one of them, of four tiles
+    auto rows_from = [&](int first) {{
+        const int tile = first + lane / 8;
+        const int row = tile < end ? __ldg(listed.data + tile * {TILE} + warp + 8 * (lane & 7)) : {NO_ROW};
+        return row < 0 ? {NO_ROW} : {row};
     }};
-    auto fetch = [&](int tile, int known) {{
+    int known = rows_from(begin), next = rows_from(begin + 4);  // asked for long before it is needed
+    auto fetch = [&](int tile) {{
+        const int at = (tile - begin) % 4 * 8;
+        if (tile > begin && at == 0) {{
+            known = next;
+            next = rows_from(tile + 4);
+        }}
         const unsigned stage = base + tile % {STAGES} * {stage};
         #pragma unroll
         for (int i = 0; i < {TILE * HALF // 8 // BLOCK}; ++i) {{
@@ -59,11 +81,11 @@ def _snippet(columns: int, layer: str, first: str, row: str) -> str:
             copy(stage + k * {2 * HALF} + (piece ^ k & 7) * 16, from, 16);
         }}
         #pragma unroll
-        for (int i = 0; i < 8; ++i) {{
-            const int row = __shfl_sync(0xffffffffu, known, i), k = 8 * i + warp;
-            const wp::half* const from = right + (size_t)(row < 0 ? 0 : {row}) * {columns} + lane * 8;
-            const unsigned to = stage + {TILE * 2 * HALF} + k * {2 * columns} + (lane ^ k & 7) * 16;
-            if (lane < {pieces}) copy(to, from, row < 0 ? 0 : 16);
+        for (int i = 0; i < 8; i += {abreast}) {{
+            const int own = i + lane / {pieces}, piece = lane % {pieces}, k = 8 * own + warp;
+            const int row = __shfl_sync(0xffffffffu, known, at + own);
+            const wp::half* const from = right + (size_t)max(row, 0) * {columns} + piece * 8;
+            copy(stage + {TILE * 2 * HALF} + k * {2 * columns} + (piece ^ k & 7) * 16, from, row < 0 ? 0 : 16);
         }}
     }};
     // four blocks of 8 x 8 halves whose rows begin at what lanes 0 to 7, 8 to 15, .. say, turned over
@@ -80,20 +102,15 @@ def _snippet(columns: int, layer: str, first: str, row: str) -> str:
     const int m = warp / 4 * 64, n = warp % 4 * {own};  // outputs and inputs of this warp
     float sums[4][{own // 8}][4] = {{}};
     __syncthreads();  // whoever had this memory
-    int known = rows_of(begin);
     for (int tile = begin; tile < begin + {STAGES - 1}; ++tile) {{
-        const int next = rows_of(tile + 1);
-        if (tile < end) fetch(tile, known);
+        if (tile < end) fetch(tile);
         commit();  // also where nothing was asked for: groups are counted
-        known = next;
     }}
     for (int tile = begin; tile < end; ++tile) {{
         asm volatile("cp.async.wait_group {STAGES - 2};" ::: "memory");
         __syncthreads();  // everybody's copies are there, and nobody multiplies by the tile before any more
-        const int next = rows_of(tile + {STAGES});
-        if (tile + {STAGES - 1} < end) fetch(tile + {STAGES - 1}, known);
+        if (tile + {STAGES - 1} < end) fetch(tile + {STAGES - 1});
         commit();
-        known = next;
         const unsigned stage = base + tile % {STAGES} * {stage};
         #pragma unroll
         for (int k = 0; k < {TILE}; k += 16) {{
@@ -129,7 +146,7 @@ def _snippet(columns: int, layer: str, first: str, row: str) -> str:
         const int row = listed.data[at];
         if (row < 0) continue;
         float h[{columns}];
-        for (int n = 0; n < {columns}; ++n) h[n] = wp::half_to_float(right[(size_t){row} * {columns} + n]);
+        for (int n = 0; n < {columns}; ++n) h[n] = wp::half_to_float(right[(size_t)({row}) * {columns} + n]);
         for (int m = 0; m < {HALF}; ++m) {{
             const float d = wp::half_to_float(left[(size_t)at * {WIDTH} + m]);
             for (int n = 0; n < {columns}; ++n) to[m * {columns} + n] += d * h[n];
@@ -156,7 +173,7 @@ def by_outputs(
     """Slopes of half a layer times outputs of the layer before, over a part of the rows."""
 
 
-@wp.func_native(_snippet(COLUMNS, f"job / {HALVES} ? joined : 0", "0", "(row % count)"))
+@wp.func_native(_snippet(COLUMNS, f"job / {HALVES} ? joined : 0", "0", "row % count"))
 def by_places(
     block: int,
     jobs: int,
@@ -194,14 +211,14 @@ def multiply_outputs(
     by_outputs(block, jobs, partials.shape[0], keys, count, slopes.shape[1], listed, begins, slopes, outputs, partials)
 
 
-@wp.kernel(enable_backward=False, grid_stride=False, launch_bounds=(BLOCK, 1), module="unique")
+@wp.kernel(enable_backward=False, grid_stride=False, launch_bounds=(BLOCK, 2), module="unique")
 def multiply_places(
     # In:
     threads: int,  # of a block; one on a CPU [1]
     keys: int,  # how many [1]
-    joined: int,  # number of the layer that gamma(x) enters again [1]
     listed: wp.array[wp.int32],  # [capacity] of ``rows.list_rows``
     begins: wp.array[wp.int32],  # [k + 1] the same
+    joined: int,  # number of the layer that gamma(x) enters again [1]
     slopes: wp.array3d[wp.float16],  # [layers, capacity, WIDTH] of listed rows
     place: wp.array2d[wp.float16],  # [N, COLUMNS] gamma(x)
     # Out:
@@ -215,21 +232,3 @@ def multiply_places(
     by_places(
         block, jobs, partials.shape[0], keys, count, slopes.shape[1], joined, listed, begins, slopes, place, partials
     )
-
-
-@wp.kernel(enable_backward=False)
-def add_parts(
-    # In:
-    partials: wp.array3d[float],  # [parts, jobs, HALF columns]
-    first: int,  # job of the first row of the result [1]
-    # Out:
-    result: wp.array2d[float],  # [outputs, columns] weight gradients, perhaps among others in a row
-):
-    """A thread per result; parts are added in their order."""
-    row, column = wp.tid()
-    job = first + row // HALF
-    at = row % HALF * result.shape[1] + column
-    total = float(0.0)
-    for part in range(partials.shape[0]):
-        total += partials[part, job, at]
-    result[row, column] = total

@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import functools
+import math
 
 import torch
 import warp as wp
 from torch import Tensor
 
+from ..kernels import gradients, weights, wgmma
 from ..kernels import perceptron as kernels
 from ..kernels import rows as lists
 from ..kernels import slopes as ends
-from ..kernels import weights, wgmma
 from ..kernels.sums import LANES
-from ..scene.perceptron import LARGEST, SMALLEST, Form, Products, Slopes, beside
+from ..scene.perceptron import LARGEST, SMALLEST, Form, Products, Slopes, beside, join
 from .bridge import array_over, stream_of
 
-LISTED = False  # whether rows without gradient are left out of the way back: prepared, not measured, design/network.md
+LISTED = True  # whether rows without gradient are left out of the way back, which most are: design/network.md
 
 
 class TensorCores(Products):
@@ -81,28 +82,49 @@ class TensorCores(Products):
                 passed.append(array_over(masks, wp.int32))
                 way = kernels.backward_listed if chosen else kernels.backward
                 _launch(way, _threads(device), passed, [halves[3], array_over(partials)], device)
-        # nobody waits for these sums but small products, which run beside the large ones, too; what they are made of is
-        # given back before that, but nothing is asked for until both have joined
+        # nobody waits for these sums but what runs beside the large products, too
         with beside(outputs.device), stream_of(outputs):
             dim = layers * keys * (form.width // ends.COLUMNS) * block
             _launch(ends.add_partials, dim, [block, array_over(partials)], [array_over(sums)], device)
-        return Slopes(unit.view(()), after, slopes, sums, total, listed, begins)
+        return Slopes(unit.view(()), after, slopes, sums, total, listed, begins, partials)
 
-    def weigh_outputs(self, slopes: Slopes, outputs: Tensor, *, out: Tensor) -> None:
-        """As the protocol says."""
-        if slopes.listed is None:
-            super().weigh_outputs(slopes, outputs, out=out)
-        elif len(out):
-            results = [out.view(-1, out.shape[-1])]
-            _weigh(weights.multiply_outputs, slopes, array_over(outputs, wp.float16), [], results)
+    def weigh(self, form: Form, place: Tensor, moment: Tensor, slopes: Slopes, outputs: Tensor) -> list[Tensor]:
+        """As the protocol says; of listed rows by three products at the same time, and one launch that adds up parts.
 
-    def weigh_places(self, form: Form, keys: int, slopes: Slopes, place: Tensor, *, out: list[Tensor]) -> None:
-        """As the protocol says."""
+        The largest is asked for behind the smallest, so that its blocks find whole multiprocessors, and before the one
+        whose blocks share what is left. Memory is asked for before any of them.
+        """
         if slopes.listed is None:
-            super().weigh_places(form, keys, slopes, place, out=out)
-        else:
-            joined = -1 if form.joined is None else form.joined
-            _weigh(weights.multiply_places, slopes, array_over(place, wp.float16), [joined], out)
+            return super().weigh(form, place, moment, slopes, outputs)
+        assert slopes.begins is not None
+        device, layers, entries = _ready(place.device, True), len(outputs), len(form.entries)
+        threads = 1 if device.is_cpu else wgmma.BLOCK
+        of_outputs, of_places, left = (1, 1, 1) if device.is_cpu else weights.parts(device.sm_count, layers, entries)
+        shapes = _shapes(form, layers)
+        found = moment.new_empty(sum(map(math.prod, shapes)))
+        by_outputs = moment.new_empty(of_outputs, weights.HALVES * (layers - 1), weights.HALF * wgmma.WIDTH)
+        by_places = moment.new_empty(of_places, weights.HALVES * entries, weights.HALF * wgmma.COLUMNS)
+        by_head = moment.new_empty(gradients.HEAD_BLOCKS * left, 1, wgmma.VALUES * wgmma.WIDTH)
+        parts = [array_over(part) for part in (by_outputs, by_places, by_head)]
+        of, listed = _layers(form, layers), [array_over(part, wp.int32) for part in (slopes.listed, slopes.begins)]
+        given, back = [threads, len(moment), *listed], array_over(slopes.layers, wp.float16)
+        after, ahead = array_over(slopes.head, wp.float16), array_over(outputs, wp.float16)
+        with beside(place.device), stream_of(place):
+            _launch(gradients.multiply_head, len(by_head) * threads, [*given, after, ahead], parts[2:], device)
+        with stream_of(place):
+            if layers > 1:
+                blocks = by_outputs.shape[0] * by_outputs.shape[1]
+                _launch(weights.multiply_outputs, blocks * threads, [*given, back, ahead], parts[:1], device)
+        with beside(place.device, behind=False), stream_of(place):
+            more, blocks = [of.joined, back, array_over(place, wp.float16)], by_places.shape[0] * by_places.shape[1]
+            _launch(weights.multiply_places, blocks * threads, [*given, *more], parts[1:2], device)
+        join(place.device)
+        with stream_of(place):
+            made = [array_over(part) for part in (slopes.unit.view(1), slopes.sums, slopes.head_sum, moment)]
+            dim = layers * wgmma.WIDTH + wgmma.VALUES, wgmma.WIDTH + form.place + form.moment + 1
+            _launch(gradients.collect, dim, [of, *made, *parts], [array_over(found)], device)
+        values = found.split([*map(math.prod, shapes)])
+        return [value.view(shape) for value, shape in zip(values, shapes, strict=True)]
 
 
 def fits(form: Form, device: torch.device) -> bool:
@@ -131,22 +153,13 @@ def _list(gradient: Tensor, keys: int, device: wp.Device) -> tuple[Tensor, Tenso
     return listed, begins
 
 
-def _weigh(kernel: wp.Kernel, slopes: Slopes, inputs: wp.array, more: list[int], results: list[Tensor]) -> None:
-    """Weight gradients of listed rows: every multiprocessor has a part of them, then parts are added up."""
-    assert slopes.listed is not None
-    assert slopes.begins is not None
-    device = _ready(slopes.layers.device, True)
-    jobs = sum(map(len, results)) // weights.HALF
-    parts, threads = (1, 1) if device.is_cpu else (max(device.sm_count // jobs, 1), weights.BLOCK)
-    partials = results[0].new_empty(parts, jobs, weights.HALF * results[0].shape[1])
-    with stream_of(slopes.layers):
-        listed = [array_over(part, wp.int32) for part in (slopes.listed, slopes.begins)]
-        given = [threads, len(slopes.begins) - 1, *more, *listed, array_over(slopes.layers, wp.float16), inputs]
-        found = array_over(partials)
-        _launch(kernel, parts * jobs * threads, given, [found], device)
-        for number, result in enumerate(results):
-            first = number * len(result) // weights.HALF
-            _launch(weights.add_parts, result.shape, [found, first], [array_over(result)], device)
+def _shapes(form: Form, layers: int) -> list[tuple[int, ...]]:
+    """Of weight and bias of every layer, then of the head."""
+    inputs = [form.width * (number > 0) for number in range(layers)]
+    for number in form.entries:
+        inputs[number] += form.place + form.moment
+    sizes = [*((form.width, own) for own in inputs), (wgmma.VALUES, form.width)]
+    return [shape for size in sizes for shape in (size, size[:1])]
 
 
 @functools.cache

@@ -69,7 +69,7 @@ def sort_by_depth(frame: Frame) -> None:
         wp.utils.radix_sort_pairs(frame.depth_key, frame.order, frame.count, end_bit=frame.settings.depth_bits)
         return
     counts, first = frame.zeros("counts of classes", ranks.COUNTS), frame.array("first of classes", ranks.COUNTS)
-    places, members = frame.array("places", frame.count), frame.array("members", (frame.count, 2))
+    places, members = frame.array("places", frame.count), frame.array("members", frame.count, wp.int64)
     shift = frame.settings.depth_bits - (ranks.CLASSES.bit_length() - 1)
     keys = [frame.depth_key, frame.settings.depth_culled, shift]
     _launch(ranks.count_classes, frame.count, keys, [counts, places])

@@ -80,6 +80,8 @@ class Slopes(NamedTuple):
     """Which row each of ``layers`` is of, or -1; None: all, in their order."""
     begins: Int[Tensor, "ends"] | None = None
     """Where the listed rows of each key begin, and the last one's end: behind it nothing is written."""
+    partials: Float[Tensor, "layers k parts width"] | None = None
+    """What ``sums`` are made of, if that happens beside: kept until who asks for memory has joined."""
 
 
 @runtime_checkable
@@ -124,16 +126,15 @@ class Passes(Protocol):
         """
         ...
 
-    def weigh_outputs(
-        self, slopes: Slopes, outputs: Float[Tensor, "layers rows width"], *, out: Float[Tensor, "squares width width"]
-    ) -> None:
-        """Weight gradients d^T h of all layers but the first, of their inputs from the layer before."""
-        ...
-
-    def weigh_places(
-        self, form: Form, keys: int, slopes: Slopes, place: Float[Tensor, "N columns"], *, out: list[Tensor]
-    ) -> None:
-        """Weight gradients of the layers that gamma(x) enters, of those inputs; ``out`` has [width, columns] each."""
+    def weigh(
+        self,
+        form: Form,
+        place: Float[Tensor, "N columns"],
+        moment: Float[Tensor, "k t"],
+        slopes: Slopes,
+        outputs: Float[Tensor, "layers rows width"],
+    ) -> list[Tensor]:
+        """Gradients of weight and bias of every layer, then of the head, in the unit of the loss."""
         ...
 
 
@@ -177,16 +178,25 @@ class Products:
             after = slope
         return Slopes(unit, head, slopes, _sums(slopes, keys, gradient.dtype), _sum_rows(gradient))
 
-    def weigh_outputs(self, slopes: Slopes, outputs: Tensor, *, out: Tensor) -> None:
+    def weigh(self, form: Form, place: Tensor, moment: Tensor, slopes: Slopes, outputs: Tensor) -> list[Tensor]:
         """As the protocol says."""
-        _products(slopes.layers[1:].mT, outputs[:-1], out=out)
-
-    def weigh_places(self, form: Form, keys: int, slopes: Slopes, place: Tensor, *, out: list[Tensor]) -> None:
-        """As the protocol says."""
-        places = place.new_empty(keys, len(place), form.columns)
-        _copy(places, place.expand(keys, -1, -1))
-        for number, weight in zip(form.entries, out, strict=True):
-            _product(slopes.layers[number].T, places.flatten(0, 1), weight.dtype, out=weight)
+        keys, found = len(moment), _Gradients(form, moment, len(outputs), slopes)
+        with beside(place.device):  # small products, while one fills the device with blocks that end one by one
+            found.head_bias.copy_(slopes.head_sum)
+            _product(slopes.head.T, outputs[-1], moment.dtype, out=found.weights[-1])
+            torch.sum(slopes.sums, 1, out=found.biases)
+            places = place.new_empty(keys, len(place), form.columns)
+            _copy(places, place.expand(keys, -1, -1))
+            for number, weight in zip(form.entries, found.of_places(form), strict=True):
+                _product(slopes.layers[number].T, places.flatten(0, 1), weight.dtype, out=weight)
+            for number in form.entries:
+                weight = found.weights[number]
+                torch.mm(slopes.sums[number].T, moment, out=weight[:, weight.shape[1] - form.moment :])
+        _products(slopes.layers[1:].mT, outputs[:-1], out=found.square)
+        join(place.device)
+        if form.joined is not None:
+            found.weights[form.joined][:, : form.width] = found.square[form.joined - 1]
+        return found.times(slopes.unit)
 
 
 class Stacked(torch.autograd.Function):
@@ -207,7 +217,7 @@ class Stacked(torch.autograd.Function):
         """
         weights, biases = parameters[0::2], parameters[1::2]
         outputs, head, kept = (form.passes or Products()).forward(form, place, moment, weights, biases)
-        context.form, context.rows = form, len(head)
+        context.form = form
         context.save_for_backward(place, moment, *kept, outputs)
         found = _product(outputs[-1], head.T, moment.dtype)[:, : len(biases[-1])] + biases[-1]
         return found.view(len(moment), len(place), len(biases[-1]))
@@ -220,23 +230,9 @@ class Stacked(torch.autograd.Function):
         Scaled by the largest gradient of an offset, which no host knows; everything up to the weights is linear in it.
         """
         form, (place, moment, *kept, outputs) = context.form, context.saved_tensors
-        layers, values = len(outputs), gradient.shape[-1]
-        keys, passes = len(moment), form.passes or Products()
-        found = _Gradients(form, moment, layers, context.rows, values)
-        slopes = passes.backward(form, keys, gradient.reshape(-1, values), outputs, tuple(kept))
-        with beside(place.device):  # small products, while one fills the device with blocks that end one by one
-            found.head_bias.copy_(slopes.head_sum)
-            _product(slopes.head.T, outputs[-1], moment.dtype, out=found.weights[-1])
-            torch.sum(slopes.sums, 1, out=found.biases)
-            passes.weigh_places(form, keys, slopes, place, out=found.of_places(form))
-            for number in form.entries:
-                weight = found.weights[number]
-                torch.mm(slopes.sums[number].T, moment, out=weight[:, weight.shape[1] - form.moment :])
-        passes.weigh_outputs(slopes, outputs, out=found.square)
-        join(place.device)
-        if form.joined is not None:
-            found.weights[form.joined][:, : form.width] = found.square[form.joined - 1]
-        return None, None, None, *found.times(slopes.unit)
+        passes, rows = form.passes or Products(), gradient.reshape(-1, gradient.shape[-1])
+        slopes = passes.backward(form, len(moment), rows, outputs, tuple(kept))
+        return None, None, None, *passes.weigh(form, place, moment, slopes, outputs)
 
 
 class _Gradients:
@@ -246,8 +242,8 @@ class _Gradients:
     on, is copied. Biases stand behind weights, the head's last: it is summed before anything is scaled.
     """
 
-    def __init__(self, form: Form, moment: Tensor, layers: int, rows: int, values: int):
-        width, wide = form.width, form.place + form.moment
+    def __init__(self, form: Form, moment: Tensor, layers: int, slopes: Slopes):
+        width, wide, rows, values = form.width, form.place + form.moment, slopes.head.shape[1], len(slopes.head_sum)
         columns = [wide + (width if number else 0) for number in form.entries]
         sizes = [(layers - 1) * width * width, *(width * own for own in columns), rows * width, layers * width, values]
         self.scaled = moment.new_empty(sum(sizes))
@@ -279,13 +275,17 @@ def _second(device: torch.device) -> torch.cuda.Stream:
 
 
 @contextlib.contextmanager
-def beside(device: torch.device) -> Iterator[None]:
-    """Work from here on is behind everything before, and beside what comes behind this block until :func:`join`."""
+def beside(device: torch.device, *, behind: bool = True) -> Iterator[None]:
+    """Work from here on is beside what comes behind this block until :func:`join`, and behind what was beside already.
+
+    By default it is ``behind`` everything before as well.
+    """
     if device.type == "cpu":
         yield
         return
     stream = _second(device)
-    stream.wait_stream(torch.cuda.current_stream(device))
+    if behind:
+        stream.wait_stream(torch.cuda.current_stream(device))
     with torch.cuda.stream(stream):
         yield
 
