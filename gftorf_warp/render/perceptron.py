@@ -8,10 +8,10 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from ..kernels import encoding, weights, wgmma
 from ..kernels import perceptron as kernels
 from ..kernels import rows as lists
 from ..kernels import slopes as ends
-from ..kernels import weights, wgmma
 from ..kernels.sums import LANES
 from ..scene.perceptron import LARGEST, SMALLEST, Form, Products, Slopes, beside
 from .bridge import array_over, stream_of
@@ -20,7 +20,7 @@ LISTED = False  # whether rows without gradient are left out of the way back: pr
 
 
 class TensorCores(Products):
-    """Passes for layers of 256 halves, see ``scene.perceptron.Passes`` and ``kernels/perceptron.py``.
+    """Passes for layers of 256 halves, see ``scene.perceptron.Passes`` and ``kernels/perceptron.py``; an encoder, too.
 
     Weight gradients are torch's, unless rows without gradient are left out: then those are kernels, too. On a CPU they
     are slow, and there for tests.
@@ -31,6 +31,15 @@ class TensorCores(Products):
 
     def __init__(self, *, listed: bool = LISTED):
         self.listed = listed
+
+    def encode(self, mean: Tensor, length: float, powers: Tensor, *, columns: int, dtype: torch.dtype) -> Tensor:
+        """As ``scene.encoding.Encoder`` says, in one launch, of float32 to halves."""
+        place = torch.empty(len(mean), columns, dtype=dtype, device=mean.device)
+        if len(mean):
+            with stream_of(mean):
+                given, found = [array_over(mean), length, array_over(powers)], [array_over(place, wp.float16)]
+                _launch(encoding.encode, place.shape, given, found, wp.device_from_torch(mean.device))
+        return place
 
     def forward(
         self, form: Form, place: Tensor, moment: Tensor, weights: tuple[Tensor, ...], biases: tuple[Tensor, ...]
