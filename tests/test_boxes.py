@@ -131,7 +131,7 @@ def test_room_is_made_as_soon_as_an_answer_asks_for_it(monkeypatch):
     """In the very replay, on a CPU; without an answer nobody looks."""
     settings = published(batch=Batch.FRAME)
     steps, looked = CapturedSteps(*begun(settings), settings), []
-    monkeypatch.setattr(steps._reserve, "is_nearly_full", lambda pairs: True)
+    monkeypatch.setattr(steps._reserve, "is_nearly_full", lambda _: True)
     monkeypatch.setattr(steps, "_look", lambda: looked.append(steps._replays))
     for _ in range(3 * ASK_EVERY):
         steps._watch()

@@ -38,7 +38,8 @@ class TensorCores(Products):
         if len(mean):
             with stream_of(mean):
                 given, found = [array_over(mean), length, array_over(powers)], [array_over(place, wp.float16)]
-                _launch(encoding.encode, place.shape, given, found, wp.device_from_torch(mean.device))
+                dim = encoding.threads(len(mean), len(powers))
+                _launch(encoding.encode, dim, given, found, wp.device_from_torch(mean.device))
         return place
 
     def forward(
