@@ -6,8 +6,9 @@ import pytest
 import torch
 from small_runs import KEYS, field, random
 
+from gftorf_warp.scene.encoding import encoded
 from gftorf_warp.scene.motion import MotionSettings, Products
-from gftorf_warp.scene.network import Network, Rounded, encoded
+from gftorf_warp.scene.network import Network, Rounded
 
 
 def network(settings=MotionSettings(), *, seed=0, head=None):

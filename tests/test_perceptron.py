@@ -8,8 +8,9 @@ import torch
 from small_runs import KEYS, field, random
 
 from gftorf_warp.scene import perceptron
+from gftorf_warp.scene.encoding import encoded
 from gftorf_warp.scene.motion import MotionSettings, Products
-from gftorf_warp.scene.network import Network, encoded
+from gftorf_warp.scene.network import Network
 from gftorf_warp.scene.perceptron import Form, Stacked
 
 DEVICES = [

@@ -1,6 +1,7 @@
 """Room for pairs: enough before it is needed, and not given up for a moment."""
 
-from gftorf_warp.recon.reserve import PAIRS, PATIENCE, Reserve
+from gftorf_warp.recon.reserve import ASK_EVERY, FULL, PAIRS, PATIENCE, Reserve
+from gftorf_warp.render.bridge import SLOTS
 
 
 def test_it_grows_before_it_is_full():
@@ -18,8 +19,13 @@ def test_it_grows_before_it_is_full():
 
 
 def test_what_grows_after_a_reset_never_fills_it():
-    """All opacities grow at once then, pairs by half within 30 steps, and numbers arrive up to eight steps late."""
-    for late in range(9):
+    """All opacities grow at once then, pairs by half within 30 steps; numbers are up to sixteen steps old.
+
+    So many steps lie between two questions and between host and device, together. Growth that went on at this rate
+    would leave room for all of them, but not for a few more.
+    """
+    assert FULL * 1.5 ** ((ASK_EVERY + SLOTS) / 30) <= 1 < FULL * 1.5 ** ((ASK_EVERY + SLOTS + 1) / 30)
+    for late in range(ASK_EVERY + SLOTS + 1):
         reserve, pairs = Reserve(), [1_360_000]
         reserve.learn(pairs[0], scarce=True)
         for step in range(1, 60):

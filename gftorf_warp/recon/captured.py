@@ -27,7 +27,7 @@ from .objective import image_loss, render_settings_at, rendering_of, weights_at
 from .observations import Observations
 from .optimiser import EPSILON, frozen, rates_at
 from .padded import Padded
-from .reserve import Reserve
+from .reserve import ASK_EVERY, Reserve
 from .settings import Kernels, ReconSettings
 from .state import State
 from .step import SEED_MASK, Map, Singles, densify_after, draw
@@ -96,13 +96,13 @@ class CapturedSteps:
         longest = max(len(batch) for batch in observations.batches)
         self._graphs_wanted = graphs
         self._ledger = descent.Ledger.empty(longest, device)
-        self._inbox = Inbox(self._ledger.counts)
+        self._inbox, self._replays = Inbox(self._ledger.counts), 0
         self._summed: set[str] = set()  # names of sums that a step has added to
         self._ones: dict[float, Tensor] = {}
         self._scratch = [fused.Scratch() for _ in range(longest)]
-        self._numbers = Outbox(HEAD + PER_IMAGE * longest, torch.int32, device)
-        leaves = len(state.optimiser.leaves)
-        self._values = Outbox(leaves + longest, torch.float32, device)
+        numbers, values = HEAD + PER_IMAGE * longest, len(state.optimiser.leaves) + longest
+        self._outbox = Outbox([(numbers, torch.int32), (values, torch.float32)], device)
+        self._numbers, self._values = self._outbox.parts
         self._groups = [*state.optimiser.tensors] + ["motion"] * len(state.optimiser.motion)
         self._flow = observations.flow_table() if settings.weights.flow > 0 else None
         self._branches = Branches(longest, device)
@@ -204,8 +204,10 @@ class CapturedSteps:
 
     def _watch(self) -> None:
         """Make room for pairs before they need it: numbers of a few steps ago say so, and nobody waits for them."""
-        waits = self.settings.render.deterministic  # when numbers arrive depends on the machine
-        seen = self._ledger.counts.tolist() if waits else self._inbox.ask()
+        self._replays += 1
+        if self._replays % ASK_EVERY == 0:
+            self._inbox.ask()
+        seen = self._inbox.look(wait=self.settings.render.deterministic)  # when they arrive depends on the machine
         if seen is not None and self._reserve.is_nearly_full(seen[2]):
             self._look()
 
@@ -238,8 +240,7 @@ class CapturedSteps:
             numbers += [frame, seed, images + n]
         motion, times = self.state.motion, [self.observations.time_at(frame) for frame in frames]
         shares = [0.0 if isinstance(motion, Still) else motion.position(time)[1] for time in times]
-        self._numbers.send(numbers)
-        self._values.send([rates[name] for name in self._groups] + shares)
+        self._outbox.send(numbers, [rates[name] for name in self._groups] + shares)
 
     # -- what the device does ------------------------------------------------------------------------------------------
 

@@ -7,6 +7,7 @@ import math
 PAIRS = 1 << 16  # in such numbers
 SCARCE, PLENTY = (1.5, 0.4), (3.0, 0.05)  # room over the most that was seen; share below which less is made
 FULL = 0.8  # share of a reserve at which a larger one is made
+ASK_EVERY = 8  # steps: pairs that grow by half in 30 take 16 from FULL to the end, and the host may be 8 ahead
 PATIENCE = 5  # looks that must find it nearly empty in a row: a reset of the opacities empties it for a while
 
 

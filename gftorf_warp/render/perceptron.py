@@ -9,7 +9,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from ..kernels import gradients, weights, wgmma
+from ..kernels import encoding, gradients, weights, wgmma
 from ..kernels import perceptron as kernels
 from ..kernels import rows as lists
 from ..kernels import slopes as ends
@@ -21,7 +21,7 @@ LISTED = True  # whether rows without gradient are left out of the way back, whi
 
 
 class TensorCores(Products):
-    """Passes for layers of 256 halves, see ``scene.perceptron.Passes`` and ``kernels/perceptron.py``.
+    """Passes for layers of 256 halves, see ``scene.perceptron.Passes`` and ``kernels/perceptron.py``; an encoder, too.
 
     Weight gradients are torch's, unless rows without gradient are left out: then those are kernels, too. On a CPU they
     are slow, and there for tests.
@@ -32,6 +32,16 @@ class TensorCores(Products):
 
     def __init__(self, *, listed: bool = LISTED):
         self.listed = listed
+
+    def encode(self, mean: Tensor, length: float, powers: Tensor, *, columns: int, dtype: torch.dtype) -> Tensor:
+        """As ``scene.encoding.Encoder`` says, in one launch, of float32 to halves."""
+        place = torch.empty(len(mean), columns, dtype=dtype, device=mean.device)
+        if len(mean):
+            with stream_of(mean):
+                given, found = [array_over(mean), length, array_over(powers)], [array_over(place, wp.float16)]
+                dim = encoding.threads(len(mean), len(powers))
+                _launch(encoding.encode, dim, given, found, wp.device_from_torch(mean.device))
+        return place
 
     def forward(
         self, form: Form, place: Tensor, moment: Tensor, weights: tuple[Tensor, ...], biases: tuple[Tensor, ...]

@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from .encoding import Encoder, Waves, encoded, encoded_size, powers_of_two
 from .gaussians import GaussianField
 from .motion import Motion, MotionSettings, Products, rows_of
 from .perceptron import Form, Passes, Stacked
@@ -28,6 +29,7 @@ class Network(Motion):
 
     follows_means = True
     moments: Tensor  # [T, t] float64, gamma(t) of every key; of the key times, so it is not stored
+    rounded: Tensor  # [T, t] the same for parameters in float32, so that a step converts nothing; not stored either
     powers: Tensor  # [F] 2^0, 2^1, .. of the positions; not stored either
 
     def __init__(
@@ -57,8 +59,9 @@ class Network(Motion):
         self.settings, self.duration, self.length = settings, float(duration), float(length)
         times = encoded(self.key_times[:, None] / self.duration, settings.time_frequencies)
         self.register_buffer("moments", times, persistent=False)
+        self.register_buffer("rounded", times.float(), persistent=False)
         self.register_buffer("powers", powers_of_two(settings.position_frequencies), persistent=False)
-        self._inputs = (_encoded_size(3, settings.position_frequencies), _encoded_size(1, settings.time_frequencies))
+        self._inputs = (encoded_size(3, settings.position_frequencies), encoded_size(1, settings.time_frequencies))
         joined, width = sum(self._inputs), settings.width
         sizes = [joined] + [width] * (settings.layers - 1)
         again = settings.skip_after if settings.skip_after < settings.layers else None
@@ -66,6 +69,7 @@ class Network(Motion):
             sizes[again] += joined
         place, moment = self._inputs
         self._form = Form(place=place, moment=moment, width=width, joined=again, dtype=torch.float16)
+        self._encoder: Encoder = Waves()
         self._layers = [torch.nn.Linear(size, width) for size in sizes]
         self.layers = torch.nn.ModuleList(self._layers)
         self.head = torch.nn.Linear(width, 3)
@@ -89,21 +93,26 @@ class Network(Motion):
         return self._form
 
     def go_by(self, passes: Passes) -> None:
-        """Let somebody else take rows through the layers where products are of halves, to the same results."""
+        """Let somebody else take rows through the layers where products are of halves, to the same results.
+
+        Who is an :class:`Encoder` as well encodes the positions for them.
+        """
         self._form = replace(self._form, passes=passes)
+        self._encoder = passes if isinstance(passes, Encoder) else Waves()
 
     def attach(self, field: GaussianField) -> Float[Tensor, "N p"]:
         """gamma(x) of the positions at which it is asked, without gradient, in the precision of the products [1]."""
-        place, form = field.mean.detach() / self.length, self._form
-        if self.settings.products == Products.HALF:
-            return encoded(place, self.powers, columns=form.columns, dtype=form.dtype)
-        return encoded(place, self.powers)
+        mean, form = field.mean.detach(), self._form
+        if self.settings.products != Products.HALF:
+            return encoded(mean / self.length, self.powers)
+        return self._encoder.encode(mean, self.length, self.powers, columns=form.columns, dtype=form.dtype)
 
     def key_offsets(
         self, attachment: Float[Tensor, "N p"], keys: list[int] | Int[Tensor, "k"]
     ) -> Float[Tensor, "k N 3"]:
         """Displacements [m] at several keys."""
-        return self.offsets(attachment, rows_of(self.moments, keys))
+        moments = self.rounded if self.head.weight.dtype == self.rounded.dtype == torch.float32 else self.moments
+        return self.offsets(attachment, rows_of(moments, keys))
 
     def offsets(self, attachment: Float[Tensor, "N p"], moment: Float[Tensor, "k t"]) -> Float[Tensor, "k N 3"]:
         """Displacements [m] at several times, given as gamma(t): rows of ``moments``, chosen on the host or the device.
@@ -174,40 +183,3 @@ def _tf32() -> Iterator[None]:
         yield
     finally:
         torch.set_float32_matmul_precision(before)
-
-
-def powers_of_two(count: int) -> Float[Tensor, "f"]:
-    """2^0, 2^1, .., exact in any precision."""
-    return 2.0 ** torch.arange(count, dtype=torch.float32)
-
-
-def encoded(
-    value: Float[Tensor, "*n d"],
-    frequencies: int | Float[Tensor, "f"],
-    *,
-    columns: int | None = None,
-    dtype: torch.dtype | None = None,
-) -> Float[Tensor, "*n e"]:
-    """gamma(v): the values themselves, then sine and cosine of 2^0 v, 2^1 v, .., without a factor pi.
-
-    Args:
-        value: Without gradient.
-        frequencies: How many, or their ``powers_of_two``, which saves making them.
-        columns: Length of a row, zeros at its end; None: as many as there are.
-        dtype: Of the result, rounded at the end; None: that of the values.
-    """
-    powers = (powers_of_two(frequencies) if isinstance(frequencies, int) else frequencies).to(value)
-    count, dimensions = len(powers), value.shape[-1]
-    size = _encoded_size(dimensions, count)
-    angles = value[..., None, :] * powers[:, None]
-    made = torch.empty if columns in (None, size) else torch.zeros
-    rows = made(*value.shape[:-1], columns or size, dtype=dtype or value.dtype, device=value.device)
-    rows[..., :dimensions] = value
-    waves = rows[..., dimensions:size].unflatten(-1, (count, 2, dimensions))
-    torch.sin(angles, out=waves[..., 0, :])
-    torch.cos(angles, out=waves[..., 1, :])
-    return rows
-
-
-def _encoded_size(dimensions: int, frequencies: int) -> int:
-    return dimensions * (1 + 2 * frequencies)

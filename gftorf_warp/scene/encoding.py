@@ -1,0 +1,74 @@
+"""Positions and times as a network reads them: gamma(v) = [v, sin 2^0 v, cos 2^0 v, sin 2^1 v, cos 2^1 v, ..]."""
+
+from __future__ import annotations
+
+from typing import Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+@runtime_checkable
+class Encoder(Protocol):
+    """Encodes positions of Gaussians."""
+
+    def encode(
+        self, mean: Float[Tensor, "N 3"], length: float, powers: Float[Tensor, "f"], *, columns: int, dtype: torch.dtype
+    ) -> Float[Tensor, "N columns"]:
+        """gamma(x) of positions over a length, without gradient.
+
+        Args:
+            mean: Where Gaussians are [m].
+            length: What positions are divided by [m].
+            powers: 2^0, 2^1, ..
+            columns: Length of a row, zeros at its end.
+            dtype: Of the result; computed in the precision of the positions, and rounded at the end.
+        """
+        ...
+
+
+class Waves:
+    """Encodes as torch does, in several passes over memory."""
+
+    def encode(self, mean: Tensor, length: float, powers: Tensor, *, columns: int, dtype: torch.dtype) -> Tensor:
+        """As the protocol says."""
+        return encoded(mean.detach() / length, powers, columns=columns, dtype=dtype)
+
+
+def powers_of_two(count: int) -> Float[Tensor, "f"]:
+    """2^0, 2^1, .., exact in any precision."""
+    return 2.0 ** torch.arange(count, dtype=torch.float32)
+
+
+def encoded_size(dimensions: int, frequencies: int) -> int:
+    """How many values gamma(v) has."""
+    return dimensions * (1 + 2 * frequencies)
+
+
+def encoded(
+    value: Float[Tensor, "*n d"],
+    frequencies: int | Float[Tensor, "f"],
+    *,
+    columns: int | None = None,
+    dtype: torch.dtype | None = None,
+) -> Float[Tensor, "*n e"]:
+    """gamma(v): the values themselves, then sine and cosine of 2^0 v, 2^1 v, .., without a factor pi.
+
+    Args:
+        value: Without gradient.
+        frequencies: How many, or their ``powers_of_two``, which saves making them.
+        columns: Length of a row, zeros at its end; None: as many as there are.
+        dtype: Of the result, rounded at the end; None: that of the values.
+    """
+    powers = (powers_of_two(frequencies) if isinstance(frequencies, int) else frequencies).to(value)
+    count, dimensions = len(powers), value.shape[-1]
+    size = encoded_size(dimensions, count)
+    angles = value[..., None, :] * powers[:, None]
+    made = torch.empty if columns in (None, size) else torch.zeros
+    rows = made(*value.shape[:-1], columns or size, dtype=dtype or value.dtype, device=value.device)
+    rows[..., :dimensions] = value
+    waves = rows[..., dimensions:size].unflatten(-1, (count, 2, dimensions))
+    torch.sin(angles, out=waves[..., 0, :])
+    torch.cos(angles, out=waves[..., 1, :])
+    return rows

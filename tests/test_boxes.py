@@ -1,0 +1,138 @@
+"""Numbers between host and device: what was sent is what is read, in its order, and what is asked for is told once."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from test_captured_steps import begun, published
+
+from gftorf_warp.recon.captured import CapturedSteps
+from gftorf_warp.recon.reserve import ASK_EVERY
+from gftorf_warp.recon.settings import Batch
+from gftorf_warp.render.bridge import SLOTS, Inbox, Outbox
+
+DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA"))]
+INTEGERS = [0, -1, 2**31 - 1, -(2**31), 7]
+REALS = [0.1, -0.0, 1e-45, math.inf, -math.inf, math.nan, 3e38]
+
+
+def outbox(device):
+    """Room for both kinds of numbers, integers first."""
+    made = Outbox([(len(INTEGERS), torch.int32), (len(REALS), torch.float32)], torch.device(device))
+    return made, *(part.there for part in made.parts)
+
+
+def bits(tensor):
+    """Of numbers of 32 bits, on the CPU."""
+    return tensor.cpu().contiguous().view(torch.int32)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_both_kinds_arrive_to_the_bit(device):
+    """In one memory, each read as what it is; numbers that are none, too."""
+    made, integers, reals = outbox(device)
+    assert (integers.dtype, reals.dtype) == (torch.int32, torch.float32)
+    assert not integers.any()
+    assert not reals.any()
+    assert reals.data_ptr() == integers.data_ptr() + 4 * len(INTEGERS)
+    made.send(INTEGERS, REALS)
+    assert integers.tolist() == INTEGERS
+    assert torch.equal(bits(reals), bits(torch.tensor(REALS)))
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_shorter_list_says_nothing_of_the_rest(device):
+    """What is said arrives all the same; a kind that is left out is a mistake."""
+    made, integers, reals = outbox(device)
+    made.send([5], [0.5, 0.25])
+    assert (integers[0], reals[:2].tolist()) == (5, [0.5, 0.25])
+    made.send([], [1.5])
+    assert reals[0] == 1.5
+    with pytest.raises(ValueError, match="zip"):
+        made.send([5])
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_every_step_reads_its_own_numbers(device):
+    """Though the host is ahead, more often than there are slots; where they are read stays the same."""
+    made, integers, reals = outbox(device)
+    places = integers.data_ptr(), reals.data_ptr()
+    steps = 5 * SLOTS
+    found = torch.zeros(steps, 2, device=device)
+    for step in range(steps):
+        made.send([step] * len(INTEGERS), [step + 0.5])
+        found[step, 0] = integers[-1]
+        found[step, 1] = reals[0]
+    assert found[:, 0].tolist() == list(range(steps))
+    assert found[:, 1].tolist() == [step + 0.5 for step in range(steps)]
+    assert (integers.data_ptr(), reals.data_ptr()) == places
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_an_answer_is_that_of_the_question_and_told_once(device):
+    """Not of what came later; the newest where several have arrived; nothing where nobody asked."""
+    there = torch.tensor([1, 2], dtype=torch.int32, device=device)
+    inbox = Inbox(there)
+    assert inbox.look(wait=True) is None
+    inbox.ask()
+    there += 10
+    assert inbox.look(wait=True) == [1, 2]
+    assert inbox.look(wait=True) is None
+    for _ in range(3):
+        inbox.ask()
+        there += 10
+    assert inbox.look(wait=True) == [31, 32]
+    assert inbox.look() is None
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_who_asks_too_often_is_not_heard(device):
+    """As many answers as slots may be on their way; afterwards one may ask again."""
+    there = torch.zeros(1, dtype=torch.int32, device=device)
+    inbox = Inbox(there)
+    for _ in range(SLOTS + 3):
+        inbox.ask()
+        there += 1
+    assert inbox.look(wait=True) == [SLOTS - 1]
+    inbox.ask()
+    assert inbox.look(wait=True) == [SLOTS + 3]
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("deterministic", [False, True])
+def test_steps_ask_for_pairs_now_and_then(deterministic, device, monkeypatch):
+    """In every ``ASK_EVERY``-th replay; the same numbers at the same steps where a run is to be repeated."""
+    settings = published(batch=Batch.FRAME)
+    settings = replace(settings, render=replace(settings.render, deterministic=deterministic))
+    state, observations = begun(settings, device)
+    steps = CapturedSteps(state, observations, settings)
+    asked, told, ask, look = [], {}, Inbox.ask, Inbox.look
+
+    def kept(self, *, wait):
+        assert wait == deterministic
+        found = look(self, wait=wait)
+        if found is not None:
+            told[steps._replays] = found
+        return found
+
+    monkeypatch.setattr(Inbox, "ask", lambda self: asked.append(steps._replays) or ask(self))
+    monkeypatch.setattr(Inbox, "look", kept)
+    while state.images < 40:
+        steps.step()
+    assert asked == list(range(ASK_EVERY, steps._replays + 1, ASK_EVERY))
+    assert len(asked) >= 2
+    if deterministic or device == "cpu":
+        assert [*told] == asked, "nobody is told later"
+    assert all((pairs > 0) == (device != "cpu") for _, _, pairs, _ in told.values()), "a CPU counts before it reserves"
+
+
+def test_room_is_made_as_soon_as_an_answer_asks_for_it(monkeypatch):
+    """In the very replay, on a CPU; without an answer nobody looks."""
+    settings = published(batch=Batch.FRAME)
+    steps, looked = CapturedSteps(*begun(settings), settings), []
+    monkeypatch.setattr(steps._reserve, "is_nearly_full", lambda _: True)
+    monkeypatch.setattr(steps, "_look", lambda: looked.append(steps._replays))
+    for _ in range(3 * ASK_EVERY):
+        steps._watch()
+    assert looked == [ASK_EVERY, 2 * ASK_EVERY, 3 * ASK_EVERY]
