@@ -329,14 +329,14 @@ class Branches:
     """Streams that fork from torch's current one and join it again: what does not depend on each other may overlap.
 
     A captured graph has as many branches then, and so has the gradient, which runs where its operation ran. On a CPU
-    there is one stream. Blocks of the first branch go before those of the others wherever both wait: it should be the
-    longest one.
+    there is one stream. Where blocks of several branches wait, those of the earlier branch go first, so that branches do
+    different things at one time; the first should be the longest.
     """
 
     def __init__(self, count: int, device: torch.device):
         self._device, self._streams = device, []
         if device.type != "cpu" and count > 1:
-            self._streams = [torch.cuda.Stream(device, priority=-1 if n == 0 else 0) for n in range(count)]
+            self._streams = [torch.cuda.Stream(device, priority=n + 1 - count) for n in range(count)]
         self._open: set[torch.cuda.Stream] = set()
 
     @contextlib.contextmanager
