@@ -9,7 +9,7 @@ import warp as wp
 from .adam import ADVANCE, COLUMNS, GRADIENT, LENGTH, MORE
 from .sums import LANES, OVER_LANES
 
-PART = 1024  # elements of a gradient whose squares are added up at once
+PART = 256  # elements of a gradient whose squares are added up at once: few, since a warp waits for them one by one
 JUDGES = 1024  # threads of the block that judges
 IMAGES = 4  # of a step, at most
 LOSS, SQUARED, OPACITY, FLOW, DISTORTION, MOTION_SIZE = range(6)  # of an image; all but two are terms of its loss

@@ -329,7 +329,7 @@ class Branches:
     """Streams that fork from torch's current one and join it again: what does not depend on each other may overlap.
 
     A captured graph has as many branches then, and so has the gradient, which runs where its operation ran. On a CPU
-    there is one stream. Where blocks of several branches wait, those of the earlier branch go first, so that branches do
+    there is one stream. Where blocks of several branches wait, those of the earlier one go first, so that branches do
     different things at one time; the first should be the longest.
     """
 

@@ -126,7 +126,7 @@ class RenderSettings:
 TILE_SHAPES = {"cpu": (16, 8, 8), "cuda": (1, 8, 4)}
 
 # parts in which lists are walked back where warps own tiles (kernels/parts.py); 1 on CUDA until 4 is measured there
-WALKS = {"cpu": 1, "cuda": 1}
+WALKS = {"cpu": 1, "cuda": 4}
 LANES_PER_SPLAT = {"cpu": 1, "cuda": 32}  # threads that write the (tile, splat) pairs of a splat
 
 # a bit per tile and splat is zeroed, counted and read whether it is set or not: three times these bytes, which at
@@ -246,10 +246,15 @@ class Frame:
             self._planes[name] = Planes(self.array(name, Planes.shape_of(self, count), wp.float32), self)
         return self._planes[name]
 
-    def gradient_planes(self, name: str, count: int) -> Planes:
-        """Zeroed planes: pixels of a tile that lie outside the image are never written, and must not hold a NaN."""
+    def gradient_planes(self, name: str, count: int, *, added: bool) -> Planes:
+        """Zeroed planes: pixels of a tile that lie outside the image are never written, and must not hold a NaN.
+
+        Where all others are written and not ``added`` to, once is enough.
+        """
+        anew = name not in self._planes
         planes = self.planes(name, count)
-        planes.flat.zero_()
+        if anew or added:
+            planes.flat.zero_()
         return planes
 
 

@@ -73,20 +73,21 @@ def forward(
 ) -> None:
     """Project, sort, composite, resolve; images that are None cost nothing, nor does what backward alone needs."""
     frame.turns += 1
-    if frame.count:
-        stages.project(inputs, view, frame)
-        stages.sort_by_depth(frame)
-        stages.sort_by_tile(frame)
-    else:
-        frame.first.zero_()
     groups = channel_groups(inputs)
     frame.channels = [frame.planes(f"channels {number}", CHANNEL_PLANES) for number in range(len(groups))]
     frame.records = [frame.splats]
-    for number, (name, start) in enumerate(groups):
+    if frame.count:
+        stages.project(inputs, view, frame)
+    for number, (name, start) in enumerate(groups):  # before lists are made, which leaves most of a GPU idle
         if number > 0:
             frame.records.append(frame.array(f"records {number}", frame.count, splat.Splat))
         if name == "extra":
             stages.set_channels(frame, inputs, start, frame.records[number])
+    if frame.count:
+        stages.sort_by_depth(frame)
+        stages.sort_by_tile(frame)
+    else:
+        frame.first.zero_()
     for number in [0, *range(max(1, frame.groups_with_light), len(frame.records))]:
         stages.composite(frame, view, number, images.distortion is not None, differentiable=differentiable)
     stages.resolve_images(inputs, shifts, frame, images, groups)

@@ -267,7 +267,7 @@ def resolve_images(inputs: Inputs, shifts, frame: Frame, images: Images, groups:
 def fold_images(inputs: Inputs, shifts, frame: Frame, cotangents: Images, wanted: Inputs, groups: list):
     """Images to planes: the adjoint of :func:`resolve_images`. Channels without a gradient are None."""
     pixels, sums, tiling = (frame.height, frame.width), frame.sums.flat, frame.tiling
-    planes = frame.gradient_planes("gradient of light", GRAD_LIGHT_PLANES)
+    planes = frame.gradient_planes("gradient of light", GRAD_LIGHT_PLANES, added=True)
     target = planes.flat
     if cotangents.quads is not None and shifts:
         vectors = _shift_vectors(shifts, str(frame.device))
@@ -295,7 +295,7 @@ def fold_images(inputs: Inputs, shifts, frame: Frame, cotangents: Images, wanted
         if cotangent is None:
             channels.append(None)
             continue
-        grad = frame.gradient_planes(f"gradient of channels {number}", CHANNEL_PLANES)
+        grad = frame.gradient_planes(f"gradient of channels {number}", CHANNEL_PLANES, added=False)
         colour = name == "colour"
         background = _or_nothing(frame, inputs.background_colour if colour else None)
         grad_background = _or_nothing(frame, wanted.background_colour if colour else None)
