@@ -1,13 +1,11 @@
 """Rooms for Gaussians that come and go: what they hold, when there are others, and what moving there costs the host."""
 
-from collections import Counter
 from dataclasses import replace
 
 import pytest
 import torch
 from small_runs import demo, small
-from torch.overrides import TorchFunctionMode
-from torch.utils._python_dispatch import TorchDispatchMode
+from waits import WAITS, Operations, Reads
 
 from gftorf_warp.recon import densify
 from gftorf_warp.recon.observations import observe
@@ -15,36 +13,6 @@ from gftorf_warp.recon.padded import BUCKET, CAPTURE_S, DEAD, DEAD_ROW_S, LAST_B
 from gftorf_warp.recon.state import begin
 from gftorf_warp.recon.step import densify_after
 from gftorf_warp.scene.motion import MotionKind, MotionSettings
-
-VIEWS = {"view", "slice", "select", "unsqueeze", "detach", "alias", "expand", "split", "unbind"}
-READS = {torch.Tensor.tolist, torch.Tensor.item, torch.Tensor.numpy}
-READS |= {torch.Tensor.__bool__, torch.Tensor.__int__, torch.Tensor.__float__, torch.Tensor.__index__}
-
-
-class Operations(TorchDispatchMode):
-    """Counts operations by name; on a GPU each is a launch or more."""
-
-    def __init__(self):
-        super().__init__()
-        self.found = Counter()
-
-    def __torch_dispatch__(self, operation, types, args=(), kwargs=None):
-        name = operation.__name__.split(".")[0]
-        if name not in VIEWS:
-            masks = [index for index in args[1] if index is not None] if name in ("index", "index_put_") else []
-            self.found[f"{name} by mask" if any(index.dtype == torch.bool for index in masks) else name] += 1
-        return operation(*args, **(kwargs or {}))
-
-
-class Reads(TorchFunctionMode):
-    """Counts what makes the host wait for a GPU."""
-
-    found = 0
-
-    def __torch_function__(self, function, types, args=(), kwargs=None):
-        self.found += function in READS
-        return function(*args, **(kwargs or {}))
-
 
 NETWORK = MotionSettings(kind=MotionKind.NETWORK, layers=3, width=16, skip_after=1)
 
@@ -150,6 +118,5 @@ def test_a_round_waits_once(where):
             padded.adopt(state)
     assert len(state.optimiser.field) != before
     assert reads.found == 1
-    waits = {"nonzero", "masked_select", "_local_scalar_dense", "index by mask", "index_put_ by mask", "equal"}
-    assert not waits & set(operations.found)
+    assert not WAITS & set(operations.found)
     assert operations.found.total() <= (90 if where == "in rooms" else 80)
