@@ -17,7 +17,7 @@ from .state import State
 
 BUCKET, SPARE = 4096, 1.25  # rows are made in such numbers while Gaussians are added, for so many as there are
 LAST_BUCKET = 256  # afterwards
-CAPTURE_S = 0.04  # what other rooms cost: the graphs of a step are captured anew
+CAPTURE_S = 0.06  # what other rooms cost: a step without a graph, and its graph (design/whole-run.md)
 DEAD_ROW_S = 5e-9  # what a row that nobody needs costs a step
 DEAD = -30.0  # opacity logit of a row that nobody sees
 

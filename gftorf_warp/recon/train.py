@@ -253,6 +253,7 @@ class _Loop:
                     continue
                 looks = self.watch.due(before, state.images, total)
                 seen = self.watch.begin(state, self.settings) if looks else None  # before anybody waits for the steps
+                died = looks and state.images < total and dead.is_dead(state, self.settings)
                 failures = steps.collect()
                 if failures >= self.settings.failures_max:
                     state = self.go_back(state, broken)
@@ -267,7 +268,7 @@ class _Loop:
                     continue
                 if seen is not None:
                     self.watch.finish(seen, state, self.settings)
-                    if state.images < total and dead.is_dead(state, self.settings):
+                    if died:
                         dead.revive(state, self.settings)
                 if stop.is_set():
                     self.save(state)
