@@ -251,10 +251,9 @@ class _Loop:
                     LOG.warning("step at image %d skipped, not finite: %s", state.images, broken)
                 elif not (self.is_due(before, state.images) or stop.is_set()):
                     continue
-                looks = self.watch.due(before, state.images, total)
-                seen = self.watch.begin(state, self.settings) if looks else None  # before anybody waits for the steps
-                died = looks and state.images < total and dead.is_dead(state, self.settings)
-                failures = steps.collect()
+                seen = self.watch.begin(state, self.settings) if self.watch.due(before, state.images, total) else None
+                died = seen is not None and state.images < total and dead.is_dead(state, self.settings)
+                failures = steps.collect()  # waits for the steps
                 if failures >= self.settings.failures_max:
                     state = self.go_back(state, broken)
                     steps = steps_of(state, self.observations, self.settings, run_all)
