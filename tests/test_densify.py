@@ -108,7 +108,8 @@ def test_halves_have_the_spread_of_the_original():
     whole = replace(
         whole, log_scale=torch.tensor([0.3, 0.2, 0.1]).log().repeat(n, 1), quaternion=random(1, 4).repeat(n, 1)
     )
-    drawn = densify._draw(whole, torch.ones(n, dtype=torch.bool), generator())
+    local = torch.randn(1, n, 3, generator=generator()) * whole.scale
+    drawn = densify._turned(whole.quaternion, local)[0]
     w, x, y, z = torch.nn.functional.normalize(whole.quaternion[0], dim=0).tolist()
     rotation = torch.tensor(
         [
@@ -128,13 +129,14 @@ def test_faint_gaussians_are_pruned_and_the_floor_holds():
         adam.tensors["opacity_logit"][[1, 4]] = -6.0
     kept = adam.tensors["mean"].detach()[[0, 2, 3, 5]].clone()
     old = moments(adam)
-    assert densify.prune(adam, SETTINGS, judge_scale=False).tolist() == [0, 2, 3, 5]
+    counts, _ = densify.round_of(adam, statistics(*[0.0] * 6), SETTINGS, generator(), judge_scale=False)
+    assert counts == {"cloned": 0, "split": 0, "pruned": 2}
     torch.testing.assert_close(adam.tensors["mean"].detach(), kept, rtol=0, atol=0)
     torch.testing.assert_close(moments(adam)["mean"]["exp_avg"], old["mean"]["exp_avg"][[0, 2, 3, 5]])
     with torch.no_grad():
         adam.tensors["opacity_logit"][:3] = -6.0
-    assert len(densify.prune(adam, SETTINGS, judge_scale=False)) == 4, "one would remain, the floor is two"
-    assert len(adam.field) == 4
+    densify.round_of(adam, statistics(*[0.0] * 4), SETTINGS, generator(), judge_scale=False)
+    assert len(adam.field) == 4, "one would remain, the floor is two"
 
 
 def test_sizes_are_judged_only_when_asked():
@@ -144,8 +146,11 @@ def test_sizes_are_judged_only_when_asked():
     with torch.no_grad():
         adam.tensors["log_scale"][0] = math.log(5.0)
         adam.tensors["log_scale"][1] = math.log(0.001)
-    assert len(densify.prune(adam, settings, judge_scale=False)) == 6
-    assert densify.prune(adam, settings, judge_scale=True).tolist() == [2, 3, 4, 5]
+    before, nothing = adam.field.mean.detach().clone(), statistics(*[0.0] * 6)
+    densify.round_of(adam, nothing, settings, generator(), judge_scale=False)
+    assert len(adam.field) == 6
+    densify.round_of(adam, nothing, settings, generator(), judge_scale=True)
+    torch.testing.assert_close(adam.field.mean.detach(), before[2:], rtol=0, atol=0)
 
 
 def test_who_was_not_seen_goes_when_the_unseen_are_judged():

@@ -9,11 +9,12 @@ import pytest
 import torch
 from moving_box import recording
 from small_runs import demo, same
+from waits import WAITS, Operations, Reads
 
 from gftorf_warp.data.sequence import Truth
 from gftorf_warp.data.truth import moving_and_static, nearest
 from gftorf_warp.recon import diagnostics
-from gftorf_warp.recon.diagnostics import Watch, measured_static, watched_frames
+from gftorf_warp.recon.diagnostics import PAIRS, Watch, measured_static, watched_frames
 from gftorf_warp.recon.observations import observe
 from gftorf_warp.recon.state import begin, to_dict
 from gftorf_warp.recon.step import step
@@ -23,6 +24,7 @@ from gftorf_warp.scene.motion import MotionKind, MotionSettings
 
 SETTINGS = demo(images=64)
 TRUTH = recording()[1]
+DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA"))]
 
 
 @pytest.fixture(scope="module")
@@ -55,6 +57,25 @@ def test_a_run_is_the_same_with_and_without_a_look(observations, tmp_path):
         results.append(to_dict(state))
     assert same(results[0], results[2])
     assert same(results[1], results[2])
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_look_reads_once_and_at_its_end(device, tmp_path):
+    """What a GPU renders is not waited for before; if there were more pairs than fit, they are counted after all."""
+    observations = observe(recording()[0], SETTINGS, device)
+    state = begin(observations, SETTINGS, seed=0, device=device)
+    watch = Watch(observations, TRUTH, tmp_path / "a")
+    row = watch.look(state, SETTINGS)
+    with Operations() as operations, Reads() as reads:
+        seen = watch.begin(state, SETTINGS)
+    assert reads.found == 0
+    assert not WAITS & set(operations.found)
+    assert seen.counted == (device == "cpu")
+    with Reads() as reads:
+        assert watch.finish(seen, state, SETTINGS) == pytest.approx(row, rel=1e-5)
+    assert reads.found == 1 + (device != "cpu")
+    few = replace(seen, sums=dict.fromkeys(seen.sums), pairs=torch.full_like(seen.pairs, PAIRS + 1), counted=False)
+    assert watch.finish(few, state, SETTINGS) == pytest.approx(row, rel=1e-5)
 
 
 def test_a_row_by_hand(observations, tmp_path):

@@ -90,6 +90,7 @@ class CapturedSteps:
         self.state, self.padded = state, Padded()
         self._graphs: dict[Variant, Callable[[], None]] = {}
         self._part: tuple | None = None  # of the run: what graphs that are kept have in common
+        self._steps = 0  # since rooms were last looked at
         self._pool = shared_pool(device)
         self._reserve = Reserve()
         self._reserves = device.type != "cpu"  # a CPU counts pairs first: nobody waits for anybody there
@@ -134,6 +135,7 @@ class CapturedSteps:
         else:
             run()
             self._watch()
+        self._steps += 1
         densify_after(state, self.observations, before, settings)
         if due or not self.padded.holds(state):
             self._look()
@@ -149,7 +151,7 @@ class CapturedSteps:
             self._look()  # waits: memory of a graph must not be given to anybody before it has run
             self._forget()
         self._part = part
-        self._rest(variant.rests)
+        self._adopt(free=True)
 
     def _forget(self) -> None:
         """Let go of all graphs, and of the memory that they shared: it is gone with the last of them."""
@@ -211,9 +213,12 @@ class CapturedSteps:
         if seen is not None and self._reserve.is_nearly_full(seen[2]):
             self._look()
 
-    def _adopt(self) -> None:
-        if self.padded.adopt(self.state):
+    def _adopt(self, *, free: bool = False) -> None:
+        state, settings = self.state, self.settings
+        grows = densify.rounds_remain(state.images, settings.densify, settings.schedule)
+        if self.padded.adopt(state, steps=self._steps, free=free, grows=grows):
             self._forget()
+        self._steps = 0
         if self._part is not None:
             self._rest(self._part[1])
 

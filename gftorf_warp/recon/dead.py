@@ -11,6 +11,7 @@ from __future__ import annotations
 import logging
 
 import torch
+from torch import Tensor
 
 from ..scene.network import Network
 from .settings import ReconSettings
@@ -20,13 +21,16 @@ LOG = logging.getLogger("gftorf_warp")
 
 
 @torch.no_grad()
-def is_dead(state: State, settings: ReconSettings) -> bool:
-    """Whether the motion is a network that has learnt, and gives every Gaussian the same offset at all times."""
+def is_dead(state: State, settings: ReconSettings) -> bool | Tensor:
+    """Whether the motion is a network that has learnt, and gives every Gaussian the same offset at all times.
+
+    A tensor where the device has to be asked: whoever has time reads it later.
+    """
     if not isinstance(state.motion, Network) or state.images <= settings.schedule.warm_up:
         return False
     keys = [0, len(state.motion.key_times) // 2]
     offsets = state.motion.key_offsets(state.motion.attach(state.optimiser.field), keys)
-    return len(offsets[0]) > 1 and bool((offsets == offsets[:1, :1]).all())
+    return len(offsets[0]) > 1 and (offsets == offsets[:1, :1]).all()
 
 
 def revive(state: State, settings: ReconSettings) -> None:

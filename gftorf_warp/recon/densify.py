@@ -16,6 +16,7 @@ from .optimiser import Optimiser
 from .settings import DensifySettings, Schedule
 
 SPLIT_SHRINK = 1.6  # the two halves of a split Gaussian are smaller by this
+SHRINK = math.log(SPLIT_SHRINK)
 RESET_MARGIN = 1e-5  # relative: a hundred roundings of a sigmoid in float32
 RESET_QUIET_SHARE = 0.1  # no reset in the last tenth before the rounds end: what it dims could not recover
 
@@ -44,8 +45,8 @@ STATISTICS = [field.name for field in fields(Statistics)]
 
 def start(field: GaussianField) -> Statistics:
     """Nothing observed yet."""
-    zero = field.opacity_logit.new_zeros(len(field))
-    return Statistics(gradient=zero, pixels=zero.clone(), weight=zero.clone(), earlier=zero.clone())
+    zeros = field.opacity_logit.detach().new_zeros(len(STATISTICS), len(field)).unbind()
+    return Statistics(**dict(zip(STATISTICS, zeros, strict=True)))
 
 
 def observe(statistics: Statistics, screen: ScreenGradient, camera: Camera) -> Statistics:
@@ -69,6 +70,11 @@ def round_is_due(before: int, after: int, settings: DensifySettings, schedule: S
     """Whether a step from ``before`` to ``after`` images ends with a round."""
     inside = settings.start < after < settings.stop_share * schedule.images
     return inside and crossed(before, after, settings.every)
+
+
+def rounds_remain(images: int, settings: DensifySettings, schedule: Schedule) -> bool:
+    """Whether there may be a round after ``images`` images."""
+    return settings.every is not None and images < settings.stop_share * schedule.images
 
 
 def reset_is_due(before: int, after: int, settings: DensifySettings, schedule: Schedule) -> bool:
@@ -114,57 +120,86 @@ def round_of(
     Returns:
         How many were cloned, split and pruned, and what is known of those that remain.
     """
-    field = optimiser.field
-    count = len(field)
-    wanted = _wanted(field, statistics, settings)
-    largest = field.scale.detach().amax(dim=1)
-    clone, split = wanted & (largest <= settings.clone_scale_max), wanted & (largest > settings.clone_scale_max)
+    field = optimiser.field.map(torch.Tensor.detach)
+    count, scale = len(field), field.scale
+    largest = scale.amax(dim=1)
     seen = statistics.earlier + statistics.weight  # copies have been seen as much as what they are copies of
-    every = torch.arange(count, device=field.device)
-    rows = torch.cat([every[~split], every[clone], every[split], every[split]])
-    halves = torch.zeros(len(rows), dtype=torch.bool, device=field.device)
-    halves[len(rows) - 2 * int(split.sum()) :] = True
-    fresh = torch.zeros_like(halves)
-    fresh[count - int(split.sum()) :] = True
-    if len(rows) > count:
-        offset = _draw(field.map(lambda value: value.detach()[rows]), halves, generator)
-        shrink = math.log(SPLIT_SHRINK)
-
-        def change(name: str, value: Tensor) -> Tensor:
-            if name == "mean":
-                return value + offset
-            return torch.where(halves[:, None], value - shrink, value) if name == "log_scale" else value
-
-        optimiser.replace(rows, fresh, change)
-        seen = seen[rows]
-    heavy = None if unseen_weight is None else seen > unseen_weight
-    kept = prune(optimiser, settings, judge_scale=judge_scale, wanted=heavy)
-    counts = {"cloned": int(clone.sum()), "split": int(split.sum()), "pruned": len(rows) - len(kept)}
-    after = start(optimiser.field)
-    return counts, replace(after, earlier=seen[kept]) if unseen_weight is None else after
-
-
-def prune(
-    optimiser: Optimiser, settings: DensifySettings, *, judge_scale: bool, wanted: Bool[Tensor, "N"] | None = None
-) -> Int[Tensor, "M"]:
-    """Remove faint Gaussians, those of an unwanted size and all but the ``wanted``; none if too few would remain.
-
-    Returns:
-        Numbers of those that were kept.
-    """
-    field = optimiser.field
-    every = torch.arange(len(field), device=field.device)
-    keep = field.opacity.detach() >= settings.opacity_min
+    keeps = field.opacity >= settings.opacity_min
+    if unseen_weight is not None:
+        keeps = keeps & (seen > unseen_weight)
     if judge_scale:
-        largest = field.scale.detach().amax(dim=1)
-        keep &= (largest >= settings.scale_range[0]) & (largest <= settings.scale_range[1])
-    if wanted is not None:
-        keep &= wanted
-    rows = every[keep]
-    if len(rows) == len(every) or len(rows) < settings.gaussians_min:
-        return every
-    optimiser.replace(rows, torch.zeros_like(rows, dtype=torch.bool), lambda _, value: value)
-    return rows
+        shortest, longest = settings.scale_range
+        of_half = (field.log_scale - SHRINK).exp().amax(dim=1)
+        whole, half = (keeps & (size >= shortest) & (size <= longest) for size in (largest, of_half))
+        keeps = torch.stack([whole, whole, half, half])
+    wanted, room = _wanted(statistics, settings), max(settings.gaussians_max - count, 0)
+    plan = _plan(wanted, largest <= settings.clone_scale_max, largest > settings.clone_scale_max, keeps)
+    if plan.added > room:
+        order = torch.argsort(torch.where(wanted, statistics.mean_gradient, -1.0), descending=True, stable=True)
+        wanted = torch.zeros_like(wanted)
+        wanted[order[:room]] = True
+        plan = _plan(wanted, largest <= settings.clone_scale_max, largest > settings.clone_scale_max, keeps)
+    kept, order = plan.kept, plan.order
+    if sum(kept) < settings.gaussians_min:
+        kept, order = plan.offered, _first(plan.parts)
+    rows, old, (_, cloned, split, _) = order[: sum(kept)] % count, kept[0], plan.offered
+    drawn = torch.randn(2 * split, 3, generator=generator)
+    if plan.added or len(rows) < count:
+        halves = 2 * kept[2]
+        offset = None
+        if halves:
+            of = rows[len(rows) - kept[2] :]
+            quaternion, scale, rank = (value.index_select(0, of) for value in (field.quaternion, scale, plan.rank))
+            shares = drawn.to(field.device).view(2, split, 3).index_select(1, rank)
+            offset = _turned(quaternion, shares * scale).flatten(0, 1)
+
+        def change(name: str, value: Tensor) -> None:
+            if offset is not None and name == "mean":
+                value[-halves:] += offset
+            if offset is not None and name == "log_scale":
+                value[-halves:] -= SHRINK
+
+        optimiser.replace(rows, old, change)
+        seen = seen.index_select(0, rows)
+    counts = {"cloned": cloned, "split": split, "pruned": sum(plan.offered) - len(rows)}
+    after = start(optimiser.field)
+    return counts, replace(after, earlier=seen) if unseen_weight is None else after
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Plan:
+    """Who is there after a round, in four parts: those that are not split, copies, and both halves of the others."""
+
+    parts: Bool[Tensor, "4 N"]
+    """Of which Gaussian there is one before anybody is removed."""
+    order: Int[Tensor, "4*N"]
+    """Numbers in all parts: first those that are kept, as they follow each other."""
+    rank: Int[Tensor, "N"]
+    """How many are split up to this one, without it."""
+    offered: list[int]
+    """How many each part has."""
+    kept: list[int]
+    """How many of them are kept."""
+
+    @property
+    def added(self) -> int:
+        """How many more there are before anybody is removed."""
+        return self.offered[1] + self.offered[2]
+
+
+def _plan(wanted: Bool[Tensor, "N"], small: Bool[Tensor, "N"], large: Bool[Tensor, "N"], keeps: Tensor) -> _Plan:
+    """Clone and split whom ``wanted`` says, keep whom ``keeps`` says [N] or [4, N]; waits for the device, once."""
+    split = wanted & large
+    parts = torch.stack([~split, wanted & small, split, split])
+    kept = parts & keeps
+    order, rank = _first(kept), split.cumsum(dim=0) - 1  # whatever may be done before the device is waited for
+    offered, left = torch.stack([parts, kept]).sum(dim=2).tolist()
+    return _Plan(parts=parts, order=order, rank=rank, offered=offered, kept=left)
+
+
+def _first(mask: Bool[Tensor, "4 N"]) -> Int[Tensor, "4*N"]:
+    """Numbers of elements, those that are true first; unlike a list of them its length is known."""
+    return torch.argsort(mask.flatten().view(torch.uint8), descending=True, stable=True)
 
 
 def reset_opacity(optimiser: Optimiser, settings: DensifySettings) -> None:
@@ -179,26 +214,17 @@ def reset_opacity(optimiser: Optimiser, settings: DensifySettings) -> None:
     optimiser.forget("opacity_logit")
 
 
-def _wanted(field: GaussianField, statistics: Statistics, settings: DensifySettings) -> Bool[Tensor, "N"]:
-    """Gaussians to clone or split: each adds one, and those of the largest gradients come first if room is short."""
+def _wanted(statistics: Statistics, settings: DensifySettings) -> Bool[Tensor, "N"]:
+    """Gaussians to clone or split: each adds one."""
     gradient = statistics.mean_gradient
     if settings.gradient_min is None:
         return torch.zeros_like(gradient, dtype=torch.bool)
-    wanted = gradient >= settings.gradient_min
-    room = max(settings.gaussians_max - len(field), 0)
-    if int(wanted.sum()) > room:
-        order = torch.argsort(torch.where(wanted, gradient, -1.0), descending=True, stable=True)
-        wanted = torch.zeros_like(wanted)
-        wanted[order[:room]] = True
-    return wanted
+    return gradient >= settings.gradient_min
 
 
-def _draw(field: GaussianField, halves: Bool[Tensor, "N"], generator: torch.Generator) -> Float[Tensor, "N 3"]:
-    """A random vector [m] from each Gaussian that is a half, zero for the others."""
-    drawn = torch.randn(int(halves.sum()), 3, generator=generator).to(field.device)
-    offset = torch.zeros_like(field.mean)
-    wxyz = torch.nn.functional.normalize(field.quaternion[halves], dim=1)
-    w, axis, local = wxyz[:, :1], wxyz[:, 1:], drawn * field.scale[halves]
+def _turned(quaternion: Float[Tensor, "N 4"], local: Float[Tensor, "k N 3"]) -> Float[Tensor, "k N 3"]:
+    """Vectors along the own axes of Gaussians, as vectors in the world."""
+    wxyz = torch.nn.functional.normalize(quaternion, dim=1)[None]
+    w, axis = wxyz[..., :1], wxyz[..., 1:]
     turn = 2.0 * torch.linalg.cross(axis, local)
-    offset[halves] = local + w * turn + torch.linalg.cross(axis, turn)
-    return offset
+    return local + w * turn + torch.linalg.cross(axis, turn)

@@ -9,19 +9,20 @@ nothing that it says is read again before the run is compared.
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Int
 from torch import Tensor
 
 from ..data.estimates import steady_pixels
 from ..data.sequence import Sequence, Truth
 from ..data.truth import known_distance, moving_and_static, nearest
 from ..render.api import rasterize
-from ..render.buffers import Distortion
+from ..render.bridge import pairs_of
+from ..render.buffers import Distortion, Workspace
 from ..scene.sensor import phasor_from_quads
 from ..scene.unwrap import common_range, distance_from_phasors
 from .observations import Observations
@@ -32,7 +33,21 @@ from .state import State
 ROWS = 40  # along a run, besides its first image
 FRAMES = 4  # that are looked at: with these, looking costs about a hundredth of a run of some thousand images
 STILL_M = 1e-6  # [m], [1] poses that differ less are one pose
+PAIRS = 1 << 22  # (tile, splat) pairs that a GPU may list uncounted: 16 MB; the published runs have a tenth
 Row = dict[str, float | int | None]
+Wanted = dict[str, tuple[Tensor | None, Tensor | None]]  # image and mask by name
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Seen:
+    """What a look found, on the device: not read yet."""
+
+    sums: dict[str, Tensor | None]
+    """By name the sum over pixels and their number, float64."""
+    pairs: Int[Tensor, "S"]
+    """(tile, splat) pairs of every frame."""
+    counted: bool
+    """Whether there was room for all of them for certain."""
 
 
 class Watch:
@@ -54,6 +69,7 @@ class Watch:
         self.truth: Tensor | None = None
         self.moving: Tensor | None = None
         self.static: Tensor | None = None
+        self._workspace = Workspace()
         device = observations.quads.device
         if known is not None:
             if len(known.distance) != sequence.frames:
@@ -83,48 +99,69 @@ class Watch:
         """Drop rows beyond ``images``: the run goes on from there."""
         self.rows.rewind(images)
 
-    @torch.no_grad()
     def look(self, state: State, settings: ReconSettings) -> Row:
-        """Append one row to the file, and return it.
+        """Append one row to the file, and return it: :meth:`begin` and :meth:`finish`."""
+        return self.finish(self.begin(state, settings), state, settings)
 
-        Errors are means over all known pixels of the watched frames; what is unknown or not finite is None. The keys:
-        images, gaussians; d_mse_x100 and d_tof_mse_x100, also as ``moving.`` and ``static.`` [m^2 x 100];
-        transmittance T_e [1]; distortion, the sum over all pairs [m^2]; offset_static_m, the length of the displacement
-        of what static pixels see; d_minus_dtof_static_m, |d - d_ToF| there up to a whole unambiguous range.
+    @torch.no_grad()
+    def begin(self, state: State, settings: ReconSettings, *, counted: bool = False) -> Seen:
+        """Render what a row is made of, and add it up. No GPU is waited for, which may be busy with the steps before.
+
+        Args:
+            state: What is looked at.
+            settings: How it is optimised.
+            counted: Whether (tile, splat) pairs are counted before they are listed, which waits; a CPU always does.
         """
         field, seen = state.optimiser.field, self.observations
         attachment = state.motion.attach(field) if state.motion.follows_means else state.attachment
         bare = replace(field, colour_sh=None)
-        kept = replace(settings.render, distortion=Distortion.PAPER)
+        capacity = None if counted or field.device.type == "cpu" else PAIRS
+        kept = replace(settings.render, distortion=Distortion.PAPER, pair_capacity=capacity)
         images: dict[str, list[Tensor]] = {name: [] for name in ("d", "d_tof", "opacity", "distortion", "offset")}
+        pairs: list[Tensor] = []
         displacements = [torch.zeros_like(field.mean)] * len(self.frames)
         if state.images >= settings.schedule.warm_up:  # before, nothing moves
             times = [float(seen.sequence.times[frame]) for frame in self.frames]
             displacements = state.motion.displacements(attachment, times)
         for frame, displacement in zip(self.frames, displacements, strict=True):
             length = displacement.norm(dim=1, keepdim=True)
-            rendering = rasterize(bare.moved(displacement), seen.cameras[frame], seen.sensor, kept, extra=length)
+            moved, camera, where = bare.moved(displacement), seen.cameras[frame], self._workspace
+            rendering = rasterize(moved, camera, seen.sensor, kept, extra=length, workspace=where)
             assert rendering.extra is not None
+            pairs.append(pairs_of(where).clone())
             images["d"].append(rendering.distance)
             light = [rendering.quads]
             for f in seen.sensor.further_hz:
-                other, moved = replace(seen.sensor, f_mod_hz=f, further_hz=()), bare.moved(displacement)
-                light.append(rasterize(moved, seen.cameras[frame], other, kept, images=("quads",)).quads)
+                other = replace(seen.sensor, f_mod_hz=f, further_hz=())
+                light.append(rasterize(moved, camera, other, kept, images=("quads",), workspace=where).quads)
             phasors = [phasor_from_quads(quads, seen.sensor.shifts) for quads in light]
             images["d_tof"].append(distance_from_phasors(phasors, seen.sensor))
             images["opacity"].append(rendering.opacity)
             images["distortion"].append(rendering.distortion)
             images["offset"].append(rendering.extra[0] / rendering.opacity.clamp_min(1e-6))
-        row: Row = {"images": state.images, "gaussians": len(field)}
-        row |= self._judge({name: torch.stack(parts) for name, parts in images.items()})
+        wanted = self._judge({name: torch.stack(parts) for name, parts in images.items()})
+        return Seen(sums=_sums(wanted), pairs=torch.cat(pairs), counted=capacity is None)
+
+    def finish(self, seen: Seen, state: State, settings: ReconSettings) -> Row:
+        """Append the row of what was seen to the file, and return it; the state is still the same.
+
+        Errors are means over all known pixels of the watched frames; what is unknown or not finite is None. The keys:
+        images, gaussians; d_mse_x100 and d_tof_mse_x100, also as ``moving.`` and ``static.`` [m^2 x 100];
+        transmittance T_e [1]; distortion, the sum over all pairs [m^2]; offset_static_m, the length of the displacement
+        of what static pixels see; d_minus_dtof_static_m, |d - d_ToF| there up to a whole unambiguous range.
+        """
+        if not seen.counted and max(seen.pairs.tolist()) > PAIRS:
+            seen = self.begin(state, settings, counted=True)
+        row: Row = {"images": state.images, "gaussians": len(state.optimiser.field)}
+        row |= _means(seen.sums)
         self.rows.add(row)
         return row
 
-    def _judge(self, images: dict[str, Tensor]) -> Row:
-        """Images [S, H, W] as the numbers of a row."""
+    def _judge(self, images: dict[str, Tensor]) -> Wanted:
+        """What of images [S, H, W] the numbers of a row are means of, and where."""
         everywhere = torch.ones_like(images["d"], dtype=torch.bool)
         groups = {"": everywhere, "moving.": self.moving, "static.": self.static}
-        wanted: dict[str, tuple[Tensor | None, Tensor | None]] = {}
+        wanted: Wanted = {}
         for prefix, mask in groups.items():
             for name in ("d", "d_tof"):
                 wanted[f"{prefix}{name}_mse_x100"] = None, None
@@ -137,7 +174,7 @@ class Watch:
         apart = torch.remainder(images["d"] - images["d_tof"] + 0.5 * period, period) - 0.5 * period
         wanted["offset_static_m"] = images["offset"], self.static
         wanted["d_minus_dtof_static_m"] = apart.abs(), self.static
-        return _means(wanted)
+        return wanted
 
 
 def watched_frames(sequence: Sequence, truth: Truth | None) -> list[int]:
@@ -167,13 +204,20 @@ def _mark(images: int, total: int) -> int:
     return math.isqrt(ROWS * ROWS * images // total)
 
 
-def _means(images: dict[str, tuple[Tensor | None, Tensor | None]]) -> Row:
-    """Means over masks in double precision, None without a mask, without a pixel, or if not finite; one look at all."""
-    there = {name: (image, mask) for name, (image, mask) in images.items() if image is not None and mask is not None}
-    found = [(torch.where(mask, image, 0.0).double().sum(), mask.sum().double()) for image, mask in there.values()]
-    numbers = torch.stack([part for pair in found for part in pair]).view(-1, 2).tolist()
-    means: Row = dict.fromkeys(images)
-    for name, (total, count) in zip(there, numbers, strict=True):
+def _sums(images: Wanted) -> dict[str, Tensor | None]:
+    """Sums over masks and numbers of their pixels, in double precision; None without a mask."""
+    sums: dict[str, Tensor | None] = dict.fromkeys(images)
+    for name, (image, mask) in images.items():
+        if image is not None and mask is not None:
+            sums[name] = torch.stack([torch.where(mask, image, 0.0).double().sum(), mask.sum().double()])
+    return sums
+
+
+def _means(sums: dict[str, Tensor | None]) -> Row:
+    """Means, None without a pixel, or if not finite; one look at all."""
+    there = {name: pair for name, pair in sums.items() if pair is not None}
+    means: Row = dict.fromkeys(sums)
+    for name, (total, count) in zip(there, torch.stack([*there.values()]).tolist(), strict=True):
         if count and math.isfinite(total):
             means[name] = total / count
     return means

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import asdict
 
 import torch
-from jaxtyping import Bool, Int
+from jaxtyping import Int
 from torch import Tensor
 
 from ..scene.gaussians import GaussianField
@@ -169,26 +169,28 @@ class Optimiser:
         """Let one tensor of the field live elsewhere, with the moments that it has had so far."""
         self.adam.put(name, value, dict(zip(("step", *MOMENTS), moments, strict=True)))
 
-    def replace(
-        self, rows: Int[Tensor, "M"], fresh: Bool[Tensor, "M"], change: Callable[[str, Tensor], Tensor]
-    ) -> None:
+    def replace(self, rows: Int[Tensor, "M"], old: int, change: Callable[[str, Tensor], None]) -> None:
         """Rebuild every tensor of the field from rows of the present one, moments alike.
 
         Args:
             rows: Which present Gaussian each new one comes from.
-            fresh: New Gaussians whose moments start at zero.
-            change: Given a name and the selected rows, returns the new values.
+            old: So many, the first ones, go on; the moments of all others start at zero.
+            change: Given a name and the selected rows, makes them the new values, in place.
         """
-        for name, old in self.tensors.items():
-            new = change(name, old.detach()[rows]).clone().requires_grad_()
-            state = self.adam.state.get(old)
+        fresh = []
+        for name, before in self.tensors.items():
+            new = before.detach().index_select(0, rows)
+            change(name, new)
+            state = self.adam.state.get(before)
             if state is not None:
                 for moment in MOMENTS:
-                    value = state[moment]
-                    state[moment] = torch.where(fresh.view(-1, *[1] * (value.ndim - 1)), 0.0, value[rows])
-            self.adam.put(name, new, state)
+                    state[moment] = state[moment].index_select(0, rows)
+                    fresh.append(state[moment][old:])
+            self.adam.put(name, new.requires_grad_(), state)
+        if fresh and old < len(rows):
+            torch._foreach_zero_(fresh)
         if self.layer is not None:
-            self.layer = self.layer[rows]
+            self.layer = self.layer.index_select(0, rows)
 
     def forget(self, name: str) -> None:
         """Zero the moments of one tensor of the field."""

@@ -1,11 +1,13 @@
 """Tensors with room for more rows than the optimiser sees: addresses stay the same while Gaussians come and go.
 
 The rows behind the last Gaussian are dead: so faint that no pixel sees them, so they get no gradient, and Adam, whose
-moments of them are zero, leaves them where they are.
+moments of them are zero, leaves them where they are: at a finite place, that of the first Gaussian or of one that was
+there before.
 """
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
 from ..render import descent
@@ -13,7 +15,10 @@ from ..scene.gaussians import GaussianField
 from .densify import STATISTICS, Statistics
 from .state import State
 
-BUCKET = 2048  # rows are added and taken away in such numbers
+BUCKET, SPARE = 4096, 1.25  # rows are made in such numbers while Gaussians are added, for so many as there are
+LAST_BUCKET = 256  # afterwards
+CAPTURE_S = 0.06  # what other rooms cost: a step without a graph, and its graph (design/whole-run.md)
+DEAD_ROW_S = 5e-9  # what a row that nobody needs costs a step
 DEAD = -30.0  # opacity logit of a row that nobody sees
 
 
@@ -26,6 +31,7 @@ class Padded:
 
     def __init__(self) -> None:
         self.rows = 0
+        self._wasted = 0  # superfluous rows, summed over steps
         self.values: dict[str, Tensor] = {}
         self._moments: dict[str, tuple[Tensor, Tensor, Tensor]] = {}
         self._views: dict[str, Tensor] = {}
@@ -51,25 +57,36 @@ class Padded:
         """Whether the tensors of a state are still those of this room."""
         return all(self._views.get(name) is tensor for name, tensor in state.optimiser.tensors.items())
 
-    def adopt(self, state: State) -> bool:
+    def adopt(self, state: State, *, steps: int = 0, free: bool = False, grows: bool = True) -> bool:
         """Move a state here; nothing of its values changes.
+
+        Args:
+            state: Its tensors become views.
+            steps: That were made since the last time: superfluous rows go once they have cost as much as a capture.
+            free: Whether other rooms cost nothing, since everything that was captured is forgotten anyway.
+            grows: Whether Gaussians will still be added.
 
         Returns:
             Whether addresses changed, so that nothing that was captured with the old ones may run again.
         """
         tensors = state.optimiser.tensors
         count = len(tensors["mean"])
-        anew = set(tensors) != set(self.values) or not 0 <= self.rows - count <= 2 * BUCKET
+        rows = (int(SPARE * count) // BUCKET + 1) * BUCKET if grows else (count // LAST_BUCKET + 1) * LAST_BUCKET
+        self._wasted += steps * max(self.rows - rows, 0)
+        anew = set(tensors) != set(self.values) or count > self.rows or (free and rows != self.rows)
+        anew = anew or self._wasted * DEAD_ROW_S > CAPTURE_S
         anew = anew or any(a is not b for a, b in zip(self._motion, state.optimiser.motion, strict=False))
         if anew:
-            self._reserve(state, (count // BUCKET + 1) * BUCKET)
-        for name, tensor in tensors.items():
-            self._take(state, name, tensor, count)
+            self._reserve(state, rows)
+        pairs = [pair for name, tensor in tensors.items() for pair in self._take(state, name, tensor, count)]
+        pairs += [(getattr(self.statistics, name), getattr(state.statistics, name)) for name in STATISTICS]
+        _copy(pairs, count)
+        torch._foreach_zero_([room[count:] for room in (*self._moment_rooms, *vars(self.statistics).values())])
+        self.values["opacity_logit"].detach()[count:] = DEAD
         if self.layer is not None and state.optimiser.layer is not None:
-            self._fill(self.layer, state.optimiser.layer)
-        self._fill(self.attachment, state.attachment)
-        for name in STATISTICS:
-            self._fill(getattr(self.statistics, name), getattr(state.statistics, name))
+            _copy([(self.layer, state.optimiser.layer)], count)
+        if not state.motion.follows_means:  # others are asked in every step
+            _copy([(self.attachment, state.attachment)], count)
         state.statistics = Statistics(**{name: getattr(self.statistics, name)[:count] for name in STATISTICS})
         return anew
 
@@ -79,9 +96,12 @@ class Padded:
         def like(tensor: Tensor) -> Tensor:
             return tensor.new_zeros(rows, *tensor.shape[1:])
 
-        optimiser, self.rows, self._views = state.optimiser, rows, {}
+        optimiser, self.rows, self._wasted, self._views = state.optimiser, rows, 0, {}
         tensors = {name: tensor.detach() for name, tensor in optimiser.tensors.items()}
-        self.values = {name: like(tensor).requires_grad_() for name, tensor in tensors.items()}
+        self.values = {name: like(tensor) for name, tensor in tensors.items()}
+        for name, value in self.values.items():
+            value[:] = tensors[name][:1]
+            value.requires_grad_()
         self._moments = {name: (tensor.new_zeros(()), like(tensor), like(tensor)) for name, tensor in tensors.items()}
         self._motion = list(optimiser.motion)
         self.layer = None if optimiser.layer is None else like(optimiser.layer)
@@ -89,23 +109,27 @@ class Padded:
         self.statistics = Statistics(**{name: like(tensors["opacity_logit"]) for name in STATISTICS})
         self._motion_moments = [optimiser.moments_of(leaf) for leaf in self._motion]
 
-    def _take(self, state: State, name: str, tensor: Tensor, count: int) -> None:
-        """One tensor of the field and its moments."""
+    @property
+    def _moment_rooms(self) -> list[Tensor]:
+        return [room for _, first, second in self._moments.values() for room in (first, second)]
+
+    def _take(self, state: State, name: str, tensor: Tensor, count: int) -> list[tuple[Tensor, Tensor]]:
+        """Let the state see one tensor of the field and its moments here; returns rooms, and what belongs there."""
         value, (step, first, second) = self.values[name].detach(), self._moments[name]
         known = state.optimiser.moments_of(tensor)
+        found: list[tuple[Tensor, Tensor]] = []
         if self._views.get(name) is not tensor:
-            self._fill(value, tensor.detach())
-            value[count:] = DEAD if name == "opacity_logit" else value[:1]  # any finite place in front of the camera
-            step.copy_(known[0])
-            for moment, found in zip((first, second), known[1:], strict=True):
-                self._fill(moment, found)
+            found = [(value, tensor.detach()), (first, known[1]), (second, known[2])]
+            if known[0] is not step:
+                step.copy_(known[0])
         view = value[:count].requires_grad_()
         self._views[name] = view
         state.optimiser.settle(name, view, (step, first[:count], second[:count]))
+        return found
 
-    @staticmethod
-    def _fill(room: Tensor, rows: Tensor) -> None:
-        """The first rows, and zeros behind them; nothing is copied onto itself."""
-        if room.data_ptr() != rows.data_ptr():
-            room[: len(rows)] = rows
-        room[len(rows) :] = 0
+
+def _copy(pairs: list[tuple[Tensor, Tensor]], count: int) -> None:
+    """To the first rows of rooms of one type, at once; nothing is copied onto itself."""
+    moved = [(room[:count], rows) for room, rows in pairs if room.data_ptr() != rows.data_ptr()]
+    if moved:
+        torch._foreach_copy_([room for room, _ in moved], [rows for _, rows in moved])

@@ -201,7 +201,8 @@ def densify_after(state: State, observations: Observations, before: int, setting
         )
         if looks:
             state.unseen_at = state.images
-        state.attachment = state.motion.attach(state.optimiser.field)
+        if not state.motion.follows_means:  # others are asked in every step
+            state.attachment = state.motion.attach(state.optimiser.field)
     if densify.reset_is_due(before, state.images, options, schedule):
         densify.reset_opacity(state.optimiser, options)
         state.reset_at = state.images

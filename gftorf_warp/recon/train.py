@@ -251,7 +251,9 @@ class _Loop:
                     LOG.warning("step at image %d skipped, not finite: %s", state.images, broken)
                 elif not (self.is_due(before, state.images) or stop.is_set()):
                     continue
-                failures = steps.collect()
+                seen = self.watch.begin(state, self.settings) if self.watch.due(before, state.images, total) else None
+                died = seen is not None and state.images < total and dead.is_dead(state, self.settings)
+                failures = steps.collect()  # waits for the steps
                 if failures >= self.settings.failures_max:
                     state = self.go_back(state, broken)
                     steps = steps_of(state, self.observations, self.settings, run_all)
@@ -263,9 +265,9 @@ class _Loop:
                     state = self.begin_again(state)
                     steps = steps_of(state, self.observations, self.settings, run_all)
                     continue
-                if self.watch.due(before, state.images, total):
-                    self.watch.look(state, self.settings)
-                    if state.images < total and dead.is_dead(state, self.settings):
+                if seen is not None:
+                    self.watch.finish(seen, state, self.settings)
+                    if died:
                         dead.revive(state, self.settings)
                 if stop.is_set():
                     self.save(state)
@@ -292,7 +294,8 @@ class _Loop:
 
     def report(self, state: State) -> None:
         """One row of metrics: means over the images since the last one."""
-        sums, state.sums = {name: float(value) for name, value in state.sums.items()}, {}
+        read = torch.stack([*state.sums.values()]).tolist() if state.sums else []  # at once
+        sums, state.sums = dict(zip(state.sums, read, strict=True)), {}
         count = sums.pop("count", 0.0)
         if not count:
             return

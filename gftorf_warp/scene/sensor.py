@@ -11,6 +11,7 @@ off, or do nothing, unless they are set. OPT8241 stands for its datasheet, SBAS7
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -186,6 +187,12 @@ def distance_from_phasor(re: Tensor, im: Tensor, sensor: Sensor) -> Tensor:
     return wrapped / sensor.phase_slope
 
 
+@functools.lru_cache(maxsize=64)
+def _uploaded(values: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Numbers where they are needed, once: a GPU is waited for."""
+    return torch.tensor(values, dtype=dtype, device=device)
+
+
 def phasor_from_quads(quads: Tensor, shifts: tuple[float, ...] | Tensor) -> tuple[Tensor, Tensor]:
     """(re, im) of quads [Q, ...] by least squares over three or more shifts [rad], in any order.
 
@@ -195,14 +202,15 @@ def phasor_from_quads(quads: Tensor, shifts: tuple[float, ...] | Tensor) -> tupl
     Raises:
         ValueError: If the shifts do not determine a phase. Shifts in a tensor are taken to be equally spaced.
     """
-    theta = torch.as_tensor(shifts, dtype=quads.dtype, device=quads.device).reshape(-1, *[1] * (quads.ndim - 1))
+    known = shifts if isinstance(shifts, Tensor) else _uploaded(tuple(shifts), quads.dtype, quads.device)
+    theta = known.to(quads).reshape(-1, *[1] * (quads.ndim - 1))
     if len(theta) < 3:
         raise ValueError(f"shifts: a phase needs at least 3 quads, got {len(theta)}")
     if not isinstance(shifts, Tensor) and not _evenly(np.array(shifts, dtype=np.float64)):
-        known = solution(np.array(shifts, dtype=np.float64))
-        if known is None:
+        solved = solution(np.array(shifts, dtype=np.float64))
+        if solved is None:
             raise ValueError(f"shifts: a phase needs three different ones, got {np.degrees(shifts).tolist()} degrees")
-        rows = torch.as_tensor(known, dtype=quads.dtype, device=quads.device)
+        rows = torch.as_tensor(solved, dtype=quads.dtype, device=quads.device)
         re, im = (rows @ quads.reshape(len(theta), -1)).reshape(2, *quads.shape[1:])
         return re, im
     factor = 4.0 / len(theta)
