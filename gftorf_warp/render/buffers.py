@@ -125,7 +125,7 @@ class RenderSettings:
 # owns a tile and every thread a pixel (design/tiles.md)
 TILE_SHAPES = {"cpu": (16, 8, 8), "cuda": (1, 8, 4)}
 
-# parts in which lists are walked back where warps own tiles (kernels/parts.py); 1 on CUDA until 4 is measured there
+# parts in which lists are walked back where warps own tiles (kernels/parts.py, design/tiles.md)
 WALKS = {"cpu": 1, "cuda": 4}
 LANES_PER_SPLAT = {"cpu": 1, "cuda": 32}  # threads that write the (tile, splat) pairs of a splat
 
