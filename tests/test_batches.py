@@ -159,6 +159,7 @@ int main() {
         const int sums = sum_of_lanes(width(lane));
         wrong += sums != before + width(lane);
         wrong += of_lane(sums, 31) != total;
+        wrong += warp_max((lane * 7 + turn * 5) % 32 - 40) != -9;
         for (int begin = 0; begin < total; begin += 32) {
             int row = 0, behind = width(0);
             while (row < 31 && behind <= begin + lane) behind += width(++row);
@@ -230,6 +231,7 @@ SIGNATURES = {
     "wp::array_t<int> ids, int start, int at, int n, V x, V y)",
     "sum_of_lanes": "int sum_of_lanes(int x)",
     "of_lane": "int of_lane(int x, int lane)",
+    "warp_max": "int warp_max(int x)",
     "lane_beyond": "int lane_beyond(int sums, int bound)",
     "lanes_with": "int lanes_with(bool x)",
     "two_words": "wp::uint64 two_words(wp::array_t<unsigned> bits, int place)",
@@ -272,8 +274,9 @@ def test_rounds_read_every_record_and_sum_every_pixel(light, channels, geometry,
 
 @pytest.mark.skipif(COMPILER is None, reason="needs a C++ compiler")
 def test_lanes_find_their_row(tmp_path):
-    """Sums over lanes, the lane that a pair of a row of tiles belongs to, and a search by all lanes together."""
-    functions = {name: getattr(lanes, name) for name in ("sum_of_lanes", "of_lane", "lane_beyond", "lanes_with")}
+    """Sums and the largest over lanes, the lane that a pair of a row of tiles belongs to, and a search by all lanes together."""
+    names = "sum_of_lanes", "of_lane", "warp_max", "lane_beyond", "lanes_with"
+    functions = {name: getattr(lanes, name) for name in names}
     assert numbers_of(tmp_path, functions, LANES) == [0.0]
 
 
