@@ -76,7 +76,7 @@ static double walk(int begin, int end, int step) {
     std::vector<float> values(300 * 32 * 4), derivatives(32 * 10);
     for (auto& q : splats) for (float& x : q.c) x = 10 * normal(random);
     for (float& x : splats[0].c) x = NAN;  // no list has it, so it may be anything
-    for (int k = 0; k < 300; ++k) ids[k] = k >= begin && k < end ? 1 + random() % 199 : 1 << 28;  // another tile's: far off
+    for (int k = 0; k < 300; ++k) ids[k] = k >= begin && k < end ? 1 + random() % 199 : 1 << 28;  // another tile's
     for (float& x : values) x = normal(random);
     for (float& x : derivatives) x = normal(random);
     for (size_t n = 0; n < values.size(); n += 4) {  // v, w, w2, g_d: a third of the pixels is missed
@@ -274,7 +274,7 @@ def test_rounds_read_every_record_and_sum_every_pixel(light, channels, geometry,
 
 @pytest.mark.skipif(COMPILER is None, reason="needs a C++ compiler")
 def test_lanes_find_their_row(tmp_path):
-    """Sums and the largest over lanes, the lane that a pair of a row of tiles belongs to, and a search by all lanes together."""
+    """Sums and the largest over lanes, the lane that a pair of a row of tiles belongs to, and a search by all lanes."""
     names = "sum_of_lanes", "of_lane", "warp_max", "lane_beyond", "lanes_with"
     functions = {name: getattr(lanes, name) for name in names}
     assert numbers_of(tmp_path, functions, LANES) == [0.0]
