@@ -55,6 +55,7 @@ static void atomicAdd(float* to, float x) { std::atomic_ref<float>(*to).fetch_ad
 namespace wp {
 typedef uint64_t uint64;
 template <int N, class T> struct vec_t { T c[N]; T& operator[](int i) { return c[i]; } };
+template <> struct vec_t<3, float> { float c[3]; vec_t(float x, float y, float z) : c{x, y, z} {} };
 template <class T> struct array_t { T* data; };
 }
 typedef wp::vec_t<16, float> Splat;
@@ -74,7 +75,8 @@ static double walk(int begin, int end, int step) {
     std::vector<int> ids(300);
     std::vector<float> values(300 * 32 * 4), derivatives(32 * 10);
     for (auto& q : splats) for (float& x : q.c) x = 10 * normal(random);
-    for (int k = 0; k < 300; ++k) ids[k] = k >= begin && k < end ? random() % 200 : 1 << 28;  // another tile's: far off
+    for (float& x : splats[0].c) x = NAN;  // no list has it, so it may be anything
+    for (int k = 0; k < 300; ++k) ids[k] = k >= begin && k < end ? 1 + random() % 199 : 1 << 28;  // another tile's
     for (float& x : values) x = normal(random);
     for (float& x : derivatives) x = normal(random);
     for (size_t n = 0; n < values.size(); n += 4) {  // v, w, w2, g_d: a third of the pixels is missed
@@ -89,19 +91,28 @@ static double walk(int begin, int end, int step) {
         const float* d = &derivatives[10 * lane];
         int coming = 0;
         if (count > 0) {
-            keep_derivatives(memory, V{d[0]}, V{d[1]}, V{d[2]}, V{d[3]}, V{d[4]}, V{d[5]}, V{d[6]},
+            if (step < 0) keep_derivatives(memory, V{d[0]}, V{d[1]}, V{d[2]}, V{d[3]}, V{d[4]}, V{d[5]}, V{d[6]},
                              V{d[7]}, V{d[8]}, V{d[9]});
             ask(memory, S, entry(I, start, step, 0, count), 0);
+            if (step > 0) ask_more(memory, S, entry(I, start, step, 0, count), 0);
             coming = entry(I, start, step, 16, count);
         }
         for (int at = 0; at < count; at += 16) {
             const int stop = std::min(at + 16, count);
             arrive();
-            if (stop < count) { ask(memory, S, coming, stop); coming = entry(I, start, step, stop + 16, count); }
+            if (stop < count) {
+                ask(memory, S, coming, stop);
+                if (step > 0) ask_more(memory, S, coming, stop);
+                coming = entry(I, start, step, stop + 16, count);
+            }
             for (int n = at; n < at + 16; ++n) {
                 const int k = start + step * n, first = n / 4 * 4;
                 const Splat q = record_of(memory, first, n - first, S, I, k, n < count), none{};
                 wrong += std::memcmp(&q, n < count ? &splats[ids[k]] : &none, 64) != 0;
+                if (step > 0) {
+                    const auto m = more_of(memory, n, S, I, k, n < count);
+                    wrong += std::memcmp(&m, (n < count ? &splats[ids[k]] : &none)->c + 8, 12) != 0;
+                }
                 if (n >= count || step > 0) continue;
                 const float* u = &values[(k * 32 + lane) * 4];
                 keep_values(memory, first, n - first, V{u[0]}, V{u[1]}, V{u[2]}, V{u[3]});
@@ -148,6 +159,7 @@ int main() {
         const int sums = sum_of_lanes(width(lane));
         wrong += sums != before + width(lane);
         wrong += of_lane(sums, 31) != total;
+        wrong += warp_max((lane * 7 + turn * 5) % 32 - 40) != -9;
         for (int begin = 0; begin < total; begin += 32) {
             int row = 0, behind = width(0);
             while (row < 31 && behind <= begin + lane) behind += width(++row);
@@ -205,6 +217,9 @@ int main() {{
 SIGNATURES = {
     "entry": "int entry(wp::array_t<int> ids, int start, int step, int at, int count)",
     "ask": "void ask(wp::uint64 memory, wp::array_t<Splat> splats, int i, int at)",
+    "ask_more": "void ask_more(wp::uint64 memory, wp::array_t<Splat> records, int i, int at)",
+    "more_of": "wp::vec_t<3, float> more_of(wp::uint64 memory, int at, wp::array_t<Splat> records, "
+    "wp::array_t<int> ids, int k, bool there)",
     "arrive": "void arrive()",
     "record_of": "Splat record_of(wp::uint64 memory, int first, int n, wp::array_t<Splat> splats, "
     "wp::array_t<int> ids, int k, bool there)",
@@ -216,6 +231,7 @@ SIGNATURES = {
     "wp::array_t<int> ids, int start, int at, int n, V x, V y)",
     "sum_of_lanes": "int sum_of_lanes(int x)",
     "of_lane": "int of_lane(int x, int lane)",
+    "warp_max": "int warp_max(int x)",
     "lane_beyond": "int lane_beyond(int sums, int bound)",
     "lanes_with": "int lanes_with(bool x)",
     "two_words": "wp::uint64 two_words(wp::array_t<unsigned> bits, int place)",
@@ -258,8 +274,9 @@ def test_rounds_read_every_record_and_sum_every_pixel(light, channels, geometry,
 
 @pytest.mark.skipif(COMPILER is None, reason="needs a C++ compiler")
 def test_lanes_find_their_row(tmp_path):
-    """Sums over lanes, the lane that a pair of a row of tiles belongs to, and a search by all lanes together."""
-    functions = {name: getattr(lanes, name) for name in ("sum_of_lanes", "of_lane", "lane_beyond", "lanes_with")}
+    """Sums and the largest over lanes, the lane that a pair of a row of tiles belongs to, and a search by all lanes."""
+    names = "sum_of_lanes", "of_lane", "warp_max", "lane_beyond", "lanes_with"
+    functions = {name: getattr(lanes, name) for name in names}
     assert numbers_of(tmp_path, functions, LANES) == [0.0]
 
 

@@ -1,5 +1,6 @@
 """Steps as one graph: on a CPU the same work without a graph, against single steps."""
 
+import contextlib
 from dataclasses import replace
 
 import numpy as np
@@ -85,6 +86,44 @@ def test_steps_are_single_steps(make, batch, device):
             assert single.images == whole.images
         assert replay.collect() == 0
         alike(single, whole, few)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("make", SETTINGS, ids=["network", "nodes"])
+def test_rows_that_nobody_sees_are_in_no_mean(make, device):
+    """Dead rows are displaced like others, and there are ten times as many as Gaussians in ``published``."""
+    settings = make(batch=Batch.QUARTET)
+    settings = replace(settings, weights=replace(settings.weights, motion_size=0.5))
+    single, observations = begun(settings, device)
+    whole, _ = begun(settings, device)
+    steps = CapturedSteps(whole, observations, settings)
+    while single.images < 20:
+        assert step.step(single, observations, settings) is None
+        steps.step()
+    assert steps.collect() == 0
+    assert single.sums["motion_size"] > 0.01
+    for name, value in single.sums.items():  # no more: where little moves, the direction of its gradient is rounding
+        torch.testing.assert_close(whole.sums[name], value, rtol=2e-3, atol=1e-6)
+
+
+def test_branches_share_nothing_that_one_of_them_makes(monkeypatch):
+    """Weights are filled in before the first branch: another one does not know when it would be done."""
+    settings = published(batch=Batch.QUARTET)
+    steps = CapturedSteps(*begun(settings), settings)
+    counts, fork = [], steps._branches.fork
+
+    @contextlib.contextmanager
+    def watched(number):
+        before = len(steps._ones)
+        with fork(number):
+            yield
+        counts.append((before, len(steps._ones)))
+
+    monkeypatch.setattr(steps._branches, "fork", watched)
+    while steps.state.images < 20:
+        steps.step()
+    assert len(counts) == 20
+    assert all(before == after > 0 for before, after in counts)
 
 
 @pytest.mark.parametrize("device", DEVICES)

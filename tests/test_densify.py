@@ -172,6 +172,33 @@ def test_who_was_not_seen_goes_when_the_unseen_are_judged():
     assert seen.earlier.tolist() == [0, 0, 0, 0], "from here on it is judged anew"
 
 
+@pytest.mark.parametrize("floor", [2, 65])
+def test_a_round_is_as_if_it_first_added_and_then_removed(floor):
+    """All at once and one after the other, to the bit: rows, moments, random vectors, and the sizes of halves."""
+    settings = replace(SETTINGS, opacity_min=0.3, scale_range=(0.08, 0.4), gaussians_min=floor)
+    everybody = replace(settings, opacity_min=1e-6, scale_range=(1e-6, 1e6))
+    found = []
+    for rounds in ([settings], [everybody, replace(settings, gradient_min=None)]):
+        adam, known = optimiser(60), statistics(*random(60, seed=2).tolist())
+        with torch.no_grad():
+            adam.tensors["log_scale"].copy_(random(60, 3, seed=3) * 3.5 - 4.0)
+            adam.tensors["opacity_logit"].copy_(random(60, seed=4) * 6.0 - 3.0)
+        own, counts = generator(), dict.fromkeys(("cloned", "split", "pruned"), 0)
+        for one in rounds:
+            more, known = densify.round_of(adam, known, one, own, judge_scale=True)
+            counts = {name: counts[name] + number for name, number in more.items()}
+        found.append((counts, adam))
+    (counts, adam), (others, twin) = found
+    assert counts == others
+    assert counts["cloned"] > 5
+    assert counts["split"] > 5
+    assert (counts["pruned"] > 20) == (floor == 2)
+    for name, tensor in adam.tensors.items():
+        assert torch.equal(tensor, twin.tensors[name])
+        for one, other in zip(adam.moments_of(tensor), twin.moments_of(twin.tensors[name]), strict=True):
+            assert torch.equal(one, other)
+
+
 def test_the_unseen_are_due_when_every_raw_frame_was_compared():
     """Rounds at 100, 200, .. of 60 raw frames: two epochs lie between judgements."""
     observations = SimpleNamespace(batches=[[0] * 4] * 15)

@@ -181,18 +181,24 @@ def moments_of(values):
     return [(torch.zeros((), device=x.device), torch.zeros_like(x), torch.zeros_like(x)) for x in values]
 
 
-def one_step(values, gradients, moments, rates):
-    """A step with everything in device memory, after one image whose loss is zero; whether it was sound."""
+def one_step(values, gradients, moments, rates, images=1, motion_from=None, longest=None):
+    """A step with everything in device memory, after images whose loss is zero; whether it was sound.
+
+    ``gradients`` are one list or, as a tuple, several of which the sum counts.
+    """
     device = values[0].device
-    ledger, none = descent.Ledger.empty(1, device), torch.zeros(1, dtype=torch.int32, device=device)
+    ledger, none = descent.Ledger.empty(images, device), torch.zeros(1, dtype=torch.int32, device=device)
+    table = descent.AdamTable(values, [None] * len(values), moments)
+    table.point(*(gradients if isinstance(gradients, tuple) else (gradients,)))
+    table.send()
     descent.descend(
-        descent.AdamTable(values, gradients, moments),
+        table,
         torch.tensor(rates, device=device),
         ledger,
         [0.0] * len(descent.FOUND_NAMES),
-        motion_from=len(values),
-        motion_gradient_max=None,
-        pairs=[none],
+        motion_from=len(values) if motion_from is None else motion_from,
+        motion_gradient_max=longest,
+        pairs=[none] * images,
         capacity=0,
         betas=(0.9, 0.999),
         epsilon=1e-15,
@@ -222,6 +228,30 @@ def test_adam_is_torchs_over_fifty_steps(monkeypatch, device, block):
         scale = float(state["exp_avg"].abs().max())
         torch.testing.assert_close(first, state["exp_avg"], rtol=1e-5, atol=1e-6 * scale)
         torch.testing.assert_close(second, state["exp_avg_sq"], rtol=3e-5, atol=1e-6 * scale**2)
+
+
+@pytest.mark.parametrize("images", [1, 2, 3, 4])
+def test_gradients_of_several_images_count_as_their_sum(device, images):
+    """In Adam, in the length of what is shortened and in what is sound; whoever of them has none, the others count."""
+    values, rates, gradients = adam_case(device)
+    lists = tuple(gradients() for _ in range(images))
+    for n, found in enumerate(lists[:-1]):
+        found[n], found[4] = None, None  # one that another image has, and one that the last image alone has
+    sums = [sum(g for g in each if g is not None) for each in zip(*lists, strict=True)]
+    ends = []
+    for given in (lists, sums):
+        own = [value.clone() for value in values]
+        moments = moments_of(own)
+        for _ in range(2):  # all but the first are the motion's
+            assert one_step(own, given, moments, rates, images, motion_from=1, longest=1e-3)
+        ends.append([(value, *kept) for value, kept in zip(own, moments, strict=True)])
+    for one, other in zip(*ends, strict=True):
+        for x, y in zip(one, other, strict=True):
+            torch.testing.assert_close(x, y, rtol=1e-5, atol=1e-12)
+    moved = float(torch.cat([first.flatten() for _, _, first, _ in ends[0][1:]]).norm())
+    assert moved == pytest.approx(0.19 * 1e-3, rel=0.01), "the gradient was shortened by the length of the sum"
+    lists[-1][-1] = torch.full_like(values[-1], math.inf)
+    assert not one_step(values, lists, moments_of(values), rates, images)
 
 
 def test_adam_rests_at_rate_zero_and_when_a_step_is_not_sound(device):

@@ -78,6 +78,24 @@ def resized(state, count):
     state.statistics = densify.start(state.optimiser.field)
 
 
+def test_rows_that_somebody_has_left_are_dead():
+    """In the same rooms: nobody sees them, and neither moments nor statistics nor a share in means are left."""
+    state, _, _ = begun()
+    padded = Padded()
+    assert padded.adopt(state)
+    count = 100
+    resized(state, count)
+    assert not padded.adopt(state)
+    assert (padded.values["opacity_logit"][count:] == DEAD).all()
+    assert (state.optimiser.tensors["opacity_logit"] > DEAD).all()
+    for _, *moments in padded.table()._moments[: len(padded.values)]:
+        assert all(moment[:count].any() and not moment[count:].any() for moment in moments)
+    padded.statistics.weight[:] = 1.0
+    assert not padded.adopt(state)
+    assert padded.statistics.weight.tolist() == [1.0] * count + [0.0] * (padded.rows - count)
+    assert padded.share.tolist() == pytest.approx([1 / count] * count + [0.0] * (padded.rows - count))
+
+
 def test_rooms_last():
     """Captures follow from others: they are made for more than there are, and given up once that has cost as much."""
     state, _, _ = begun(3000)

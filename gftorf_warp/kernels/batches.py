@@ -132,15 +132,18 @@ def ask(memory: wp.uint64, splats: wp.array[Splat], i: int, at: int):
     const float4* from = reinterpret_cast<const float4*>(records.data + (i < 0 ? 0 : i)) + 2;
     float4* to = reinterpret_cast<float4*>(memory) + {_RECORDS // 4} + (at & {2 * ROUND - 1}) + (lane >> 1);
 #if __CUDA_ARCH__ >= 800
-    const unsigned target = (unsigned)__cvta_generic_to_shared(to);
-    asm volatile("cp.async.cg.shared.global [%0], [%1], 16;" :: "r"(target), "l"(from) : "memory");
+    const unsigned target = (unsigned)__cvta_generic_to_shared(to), bytes = i < 0 ? 0u : 16u;
+    asm volatile("cp.async.cg.shared.global [%0], [%1], 16, %2;" :: "r"(target), "l"(from), "r"(bytes) : "memory");
 #else
-    to[0] = __ldg(from);
+    to[0] = i < 0 ? make_float4(0.0f, 0.0f, 0.0f, 0.0f) : __ldg(from);
 #endif
 #endif
 """)
 def ask_more(memory: wp.uint64, records: wp.array[Splat], i: int, at: int):
-    """Send for three further channels, slots 8-10 of other records, as :func:`ask` does for the records."""
+    """Send for three further channels, slots 8-10 of other records, as :func:`ask` does for the records.
+
+    Zeros where there is none: what is not a number stays so, whatever its weight.
+    """
 
 
 @wp.func_native("""

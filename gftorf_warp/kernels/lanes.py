@@ -53,10 +53,16 @@ WARP_ANY = """
 
 WARP_MAX = """
 #if defined(__CUDA_ARCH__)
+#if __CUDA_ARCH__ >= 800
     return __reduce_max_sync(0xffffffffu, x);
 #else
-    return x;
+    for (int half = 16; half > 0; half /= 2) {
+        const int other = __shfl_sync(0xffffffffu, x, (int)(threadIdx.x & 31u) ^ half);
+        if (other > x) x = other;
+    }
 #endif
+#endif
+    return x;
 """
 
 

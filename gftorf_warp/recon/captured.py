@@ -265,6 +265,8 @@ class CapturedSteps:
             attachment = motion.attach(field) if asked else padded.attachment
             offsets = motion.key_offsets(attachment, numbers[: 3 if variant.flow else 2])
         render = replace(self.settings.render, sh_degree=variant.sh_degree, pair_capacity=self._reserve.capacity)
+        for name in descent.FOUND_NAMES:  # here, not on a branch, of which no other knows how far it is
+            self._one_times(getattr(variant.weights, name, 1.0))
         images = []
         for n in range(len(variant.shifts)):  # none waits for another before all of them know their gradients
             with self._branches.fork(n):
@@ -316,7 +318,7 @@ class CapturedSteps:
         if weights.distortion > 0:
             terms["distortion"] = tof.distortion.mean()
         if weights.motion_size > 0 and offsets is not None:
-            terms["motion_size"] = motion_size(moved.mean - field.mean).mean()
+            terms["motion_size"] = (motion_size(moved.mean - field.mean) * self.padded.share).sum()
         for name in ("distortion", "motion_size"):
             if name in terms:
                 found.data[ROW[name]] = terms[name].detach()  # apart from the history of the other numbers

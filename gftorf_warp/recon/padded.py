@@ -83,6 +83,8 @@ class Padded:
         _copy(pairs, count)
         torch._foreach_zero_([room[count:] for room in (*self._moment_rooms, *vars(self.statistics).values())])
         self.values["opacity_logit"].detach()[count:] = DEAD
+        self.share[:count] = 1.0 / max(count, 1)
+        self.share[count:] = 0.0
         if self.layer is not None and state.optimiser.layer is not None:
             _copy([(self.layer, state.optimiser.layer)], count)
         if not state.motion.follows_means:  # others are asked in every step
@@ -107,6 +109,7 @@ class Padded:
         self.layer = None if optimiser.layer is None else like(optimiser.layer)
         self.attachment = like(state.attachment)
         self.statistics = Statistics(**{name: like(tensors["opacity_logit"]) for name in STATISTICS})
+        self.share = like(tensors["opacity_logit"])  # of each row in a mean over Gaussians
         self._motion_moments = [optimiser.moments_of(leaf) for leaf in self._motion]
 
     @property
