@@ -116,7 +116,8 @@ class Watch:
         attachment = state.motion.attach(field) if state.motion.follows_means else state.attachment
         bare = replace(field, colour_sh=None)
         capacity = None if counted or field.device.type == "cpu" else PAIRS
-        kept = replace(settings.render, distortion=Distortion.PAPER, pair_capacity=capacity)
+        # only gradients depend on an order, and room to keep one would be 128 B of each pair
+        kept = replace(settings.render, distortion=Distortion.PAPER, pair_capacity=capacity, deterministic=False)
         images: dict[str, list[Tensor]] = {name: [] for name in ("d", "d_tof", "opacity", "distortion", "offset")}
         pairs: list[Tensor] = []
         displacements = [torch.zeros_like(field.mean)] * len(self.frames)
