@@ -60,7 +60,7 @@ class Outgoing:
         self._stream.wait_event(self._ready[near])
         with torch.cuda.stream(self._stream):
             there.copy_(here[-self._tail :], non_blocking=True)
-            self._done[near].record()
+        self._done[near].record(self._stream)
         return near, far
 
     def arrived(self, ticket: tuple[int, int]) -> np.ndarray:

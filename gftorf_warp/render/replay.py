@@ -32,6 +32,7 @@ from .inputs import CHOICES, Images, Inputs, names_of, shapes_of, wanted_images
 
 ROOM = 1.5  # pairs that are reserved, over the most that were needed so far
 CAMERAS_MAX = 16  # that are kept, with their graphs
+KEY, SHARE = 3, 4  # arguments of ``move_gaussians`` that say when
 Memory = TypeVar("Memory", Tensor, np.ndarray)
 
 
@@ -52,8 +53,8 @@ class _View:
     """A camera that was used before."""
 
     view: CameraView
-    row: wp.vec4
     target: Target
+    move: wp.Launch | None  # of the Gaussians, to a time that is filled in; None: there are none
     used: int = 0
     graph: wp.Graph | None = None
 
@@ -171,8 +172,10 @@ class Replay:
         if self.graphs and self._capacity is not None and seen.used and seen.graph is None:
             seen.graph = self._captured(seen)
         with stream_of(self._mean):
-            inputs = [*self._rest, key, share, self._optimised, seen.row]
-            wp.launch(move.move_gaussians, self.count, inputs, self._moved, device=self.device, record_tape=False)
+            if seen.move is not None:
+                seen.move.set_param_at_index(KEY, key)
+                seen.move.set_param_at_index(SHARE, share)
+                seen.move.launch()
             if seen.graph is None:
                 self._draw(seen)
             else:
@@ -218,7 +221,11 @@ class Replay:
             if size not in self._targets:
                 self._targets[size] = self._target(*size)
             view = launch.view_of(camera, self.settings)
-            self._views[name] = _View(view=view, row=_row(camera), target=self._targets[size])
+            inputs = [*self._rest, 0, 0.0, self._optimised, _row(camera)]
+            where = {"device": self.device, "record_tape": False}
+            # packed once: that is what a launch costs a host
+            moves = wp.launch(move.move_gaussians, self.count, inputs, self._moved, record_cmd=True, **where)
+            self._views[name] = _View(view=view, target=self._targets[size], move=moves)
         return self._views[name]
 
     def _target(self, height: int, width: int) -> Target:
