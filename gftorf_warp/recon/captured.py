@@ -272,15 +272,8 @@ class CapturedSteps:
             with self._branches.fork(n):
                 images.append(self._image(variant, n, offsets, render))
         self._branches.join()
-        of_motion: list[Tensor | None] = [None] * (len(padded.leaves) - len(padded.values))
-        by_offsets = fused.added([image.gradients[-1] for image in images])
-        if by_offsets is not None and of_motion:
-            assert offsets is not None
-            loss = fused.sum_for_gradients([by_offsets], [offsets])
-            learning = padded.leaves[len(padded.values) :]
-            of_motion = [*torch.autograd.grad(loss, learning, allow_unused=True)]
+        of_motion = self._motion_gradients(offsets, images)
         with torch.no_grad():
-            of_motion = [None if gradient is None else gradient.contiguous() for gradient in of_motion]
             first, *others = [image.gradients[:-1] for image in images]
             table.point([*first, *of_motion], *([*other, *(None for _ in of_motion)] for other in others))
             if send is not None:
@@ -330,6 +323,16 @@ class CapturedSteps:
                 tof.distance, tof.extra, self._flow, camera, [camera, camera], row=row, out=out
             )
         return Image(terms=terms, tof=tof, gradients=self._gradients(variant, terms, [*values, offsets]))
+
+    def _motion_gradients(self, offsets: Tensor | None, images: list[Image]) -> list[Tensor | None]:
+        """By the parameters of the motion: what all images say about the offsets goes back once."""
+        learning = self.padded.leaves[len(self.padded.values) :]
+        by_offsets = fused.added([image.gradients[-1] for image in images])
+        if by_offsets is None or offsets is None or not learning:
+            return [None] * len(learning)
+        loss = fused.sum_for_gradients([by_offsets], [offsets])
+        found = torch.autograd.grad(loss, learning, allow_unused=True)
+        return [None if gradient is None else gradient.contiguous() for gradient in found]
 
     def _gradients(
         self, variant: Variant, terms: dict[str, Tensor], leaves: list[Tensor | None]
