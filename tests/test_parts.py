@@ -130,14 +130,26 @@ def test_what_cannot_be_split_is_not(device, monkeypatch):
         assert far(found[1], found[0]) < 1e-5
 
 
+def test_what_nobody_differentiates_is_one_sum(device, monkeypatch):
+    """As a replay renders it, to the bit: what a way back would need is not left."""
+    settings, fields = RenderSettings(near=0.1, far=20.0), []
+    for wanted in (1, 4):
+        monkeypatch.setitem(buffers.WALKS, device, wanted)
+        field, workspace = scene(300, 0.05, device).map(torch.Tensor.detach), Workspace()
+        fields.append(api.rasterize(field, CAMERA, SENSOR, settings, images=IMAGES, workspace=workspace))
+        assert workspace.last.walks == 1
+    assert all(torch.equal(getattr(fields[0], name), getattr(fields[1], name)) for name in IMAGES)
+
+
 @pytest.mark.parametrize("walks", [1, 4])
 def test_memory_is_used_again_where_lists_are_read_in_parts_too(walks, device, monkeypatch):
     """Of so many Gaussians several warps read the list of a tile, whatever walks it back afterwards."""
     monkeypatch.setitem(buffers.WALKS, device, walks)
-    field, workspace, seen = scene(20_000, 0.01, device).map(torch.Tensor.detach), Workspace(), []
+    field, workspace, seen = scene(20_000, 0.01, device), Workspace(), []
     for _ in range(2):
         rendering = api.rasterize(field, CAMERA, SENSOR, RenderSettings(), images=IMAGES, workspace=workspace)
-        seen.append(rendering.distance.clone())
+        seen.append(rendering.distance.detach().clone())
+    assert workspace.last.walks == walks
     assert workspace.last.parts > 1
     assert torch.equal(*seen)
 

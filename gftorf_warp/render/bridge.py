@@ -75,7 +75,8 @@ class Rasterize(torch.autograd.Function):
             kind = len(mean), camera.width, camera.height, request.settings, device
             frame = Frame(*kind) if request.workspace is None else request.workspace.frame(*kind)
             view = launch.view_of(camera, request.settings)
-            launch.forward(_inputs(named), view, shifts, frame, _images(images))
+            learns = any(ctx.needs_input_grad)  # otherwise these are the launches of a replay
+            launch.forward(_inputs(named), view, shifts, frame, _images(images), differentiable=learns)
         ctx.save_for_backward(*tensors)
         ctx.state = request, view, frame, frame.turns
         return tuple(images.get(name) for name in IMAGES)

@@ -17,7 +17,7 @@ from ..kernels.sums import LANES
 from ..scene.perceptron import LARGEST, SMALLEST, Form, Products, Slopes, beside, join
 from .bridge import array_over, stream_of
 
-LISTED = True  # whether rows without gradient are left out of the way back, which most are: design/network.md
+LISTED = True  # whether rows without gradient are left out of the way back: design/network.md says what that brings
 
 
 class TensorCores(Products):
