@@ -1,10 +1,11 @@
 """What a training step costs on a sequence or run of your own, and with --profile where its time goes.
 
     python benchmarks/step.py SEQUENCE [--run RUN] [--preset released] [--from IMAGES] [--images N] [--set NAME=VALUE]
-        [--device cpu|cuda] [--profile] [--json FILE]
+        [--device cpu|cuda] [--profile] [--timeline FILE] [--json FILE]
 
 The same measurement as ``gftorf bench step``, for the one way that preset and --set name. The state is the last
-checkpoint of RUN or, without one, the first of the preset; every timing begins with it again.
+checkpoint of RUN or, without one, the first of the preset; every timing begins with it again. --timeline writes when
+each kernel of a few steps began, how long it took, and on which stream: what waits for what is seen there only.
 """
 
 from __future__ import annotations
@@ -33,8 +34,11 @@ def main() -> int:
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--profile", action="store_true")
+    parser.add_argument("--timeline", type=Path, help="of a GPU")
     parser.add_argument("--json", type=Path)
     a = parser.parse_args()
+    if a.timeline and torch.device(a.device).type == "cpu":
+        parser.error("--timeline is of kernels of a GPU: say --device cuda, or --profile for a CPU")
     wp.config.log_level = wp.LOG_ERROR
     torch.set_num_threads(1)
     sequence = Sequence.open(a.sequence)
@@ -46,6 +50,9 @@ def main() -> int:
     print("\n".join(step.table([row])))
     if a.profile:
         print(step.profiled(step.fresh(fitted, fitted.observations, settings, a.device), a.device))
+    if a.timeline:
+        seen = step.timeline(step.fresh(fitted, fitted.observations, settings, a.device), a.device)
+        a.timeline.write_text("\n".join(seen) + "\n")
     if a.json:
         what = {"preset": a.preset, "set": a.set}
         a.json.write_text(json.dumps(about(a.device) | what | row, indent=1) + "\n")

@@ -249,3 +249,18 @@ def test_half_precision_has_a_row_of_torch_where_steps_have_kernels(monkeypatch)
         motion.go_by(made, kind)
         assert isinstance(made.form.passes, passes)
         assert getattr(made.form.passes, "listed", False) == (kind == str(Products.HALF))
+
+
+def test_a_timeline_is_of_the_device_in_its_order():
+    """Times count from the first of what a GPU did, copies and zeros included; what the host did is no part of it."""
+    kernel = {"cat": "kernel", "ts": 1_012.5, "dur": 3.25, "name": "composite", "args": {"stream": 7}}
+    zeros = {"cat": "gpu_memset", "ts": 1_000.0, "dur": 1.0, "name": "Memset", "args": {"stream": 144}}
+    copy = {"cat": "gpu_memcpy", "ts": 1_020.0, "dur": 0.5, "name": "Memcpy HtoD", "args": {}}
+    host = {"cat": "cpu_op", "ts": 900.0, "dur": 200.0, "name": "aten::mm", "args": {}}
+    lines = [line.split() for line in step.lines_of_trace([kernel, copy, host, zeros])]
+    assert lines == [
+        ["0.0", "1.0", "144", "Memset"],
+        ["12.5", "3.2", "7", "composite"],
+        ["20.0", "0.5", "-", "Memcpy", "HtoD"],
+    ]
+    assert step.lines_of_trace([host]) == []

@@ -7,10 +7,13 @@ the last of ``Kernels``: these enumerations list from plain to fast. Every way b
 from __future__ import annotations
 
 import copy
+import json
 import statistics
+import tempfile
 import time
 import warnings
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
@@ -26,6 +29,7 @@ from .timing import Report, Timing, lines_of, quietly, watch_of
 
 WARM_UP = 24  # images before anything is timed: kernels are loaded, moments exist
 WATCHED = 16  # images in which waits are counted and profiled
+ON_DEVICE = {"kernel", "gpu_memset", "gpu_memcpy"}  # kinds of events of torch's profiler
 PART = 40  # images between two looks at the clock
 IMAGES = 400
 QUICK_IMAGES, QUICK_PART, QUICK_WARM_UP = 8, 4, 4
@@ -173,6 +177,24 @@ def profiled(run: Run, device: str) -> str:
         watch_of(device).synchronise()
     order = "self_cpu_time_total" if on_cpu else "self_device_time_total"
     return profile.key_averages().table(sort_by=order, row_limit=30)
+
+
+def timeline(run: Run, device: str) -> list[str]:
+    """Everything that a GPU did in a few steps, in its order: begin and length [us], stream, name."""
+    with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CUDA]) as profile:
+        advance(run, WATCHED)
+        watch_of(device).synchronise()
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "trace.json"
+        profile.export_chrome_trace(str(path))
+        return lines_of_trace(json.loads(path.read_text())["traceEvents"])
+
+
+def lines_of_trace(events: list[dict[str, Any]]) -> list[str]:
+    """Lines of :func:`timeline` from what torch exports; what a host did is left out."""
+    found = sorted((e for e in events if e.get("cat") in ON_DEVICE), key=lambda event: event["ts"])
+    rows = [(e["ts"] - found[0]["ts"], e["dur"], e["args"].get("stream", "-"), e["name"]) for e in found]
+    return [f"{begin:10.1f} {length:8.1f}  {stream!s:>4}  {name}" for begin, length, stream, name in rows]
 
 
 def table(rows: list[dict[str, Any]]) -> list[str]:
