@@ -18,33 +18,28 @@ from pathlib import Path
 
 import warp as wp
 
-from gftorf_warp.kernels import (
-    adam,
-    bits,
-    composite,
-    composite_backward,
-    displace,
+from gftorf_warp.kernels.motion import displace, move
+from gftorf_warp.kernels.network import (
     encoding,
-    finish,
-    flow,
-    gradients,
-    move,
-    noise,
-    paths,
+    gradient_rows,
+    gradient_scaling,
+    parameter_gradients,
     perceptron,
-    project,
-    ranks,
-    resolve,
-    rows,
-    similarity,
-    slopes,
-    splat,
-    sums,
-    tiles,
-    trace,
-    weights,
+    weight_gradients,
     wgmma,
 )
+from gftorf_warp.kernels.rasterise import (
+    composite,
+    composite_backward,
+    depth_bins,
+    planes_to_images,
+    project,
+    splat,
+    tile_bitmask,
+    tiles,
+)
+from gftorf_warp.kernels.tracing import light_paths, rays
+from gftorf_warp.kernels.training import adam, image_similarity, noise, optical_flow, ordered_sums, step_end
 from gftorf_warp.render.buffers import TILE_SHAPES, WALKS
 
 FRAME_SIZE, REGISTERS = 0x11, 0x2F  # attributes in the .nv.info section of a cubin
@@ -61,31 +56,31 @@ def modules(arch: int) -> dict[str, wp.Module]:
     shape = TILE_SHAPES["cuda"]
     found = {
         "tiles": tiles.count_pairs.module,
-        "bits": bits.count_bits.module,
-        "ranks": ranks.count_classes.module,
-        "resolve": resolve.resolve_quads.module,
+        "bits": tile_bitmask.count_bits.module,
+        "ranks": depth_bins.count_classes.module,
+        "resolve": planes_to_images.resolve_quads.module,
         "splat": splat.add_records.module,
         "move": move.move_gaussians.module,
         "noise": noise.uniform_noise.module,
         "adam": adam.make_adam(1).module,
         "displace": displace.displace.module,
         "encoding": encoding.encode.module,
-        "finish": finish.judge.module,
-        "flow": flow.flow_errors.module,
-        "sums": sums.means.module,
-        "trace": trace.trace_hits.module,
-        "paths": paths.trace_light.module,
+        "finish": step_end.judge.module,
+        "flow": optical_flow.flow_errors.module,
+        "sums": ordered_sums.means.module,
+        "trace": rays.trace_hits.module,
+        "paths": light_paths.trace_light.module,
         "perceptron": perceptron.pack.module,
-        "slopes": slopes.add_partials.module,
-        "rows": rows.list_rows.module,
-        "gradients": gradients.collect.module,
-        "weights of outputs": weights.multiply_outputs.module,
-        "weights of places": weights.multiply_places.module,
+        "slopes": gradient_scaling.add_partials.module,
+        "rows": gradient_rows.list_rows.module,
+        "gradients": parameter_gradients.collect.module,
+        "weights of outputs": weight_gradients.multiply_outputs.module,
+        "weights of places": weight_gradients.multiply_places.module,
     }
     if arch == wgmma.ARCHITECTURE:
         passes = perceptron.forward, perceptron.backward, perceptron.backward_listed
         found |= {title: kernel.module for title, kernel in zip(PASSES, passes, strict=True)}
-    window = similarity.make_similarity(1)
+    window = image_similarity.make_similarity(1)
     for name in ("columns_of_products", "compare_images", "columns_of_slopes", "gradient_of_image"):
         found[name] = getattr(window, name).module
     found["finish_moments"] = composite_backward.finish_moments.module

@@ -22,9 +22,9 @@ import numpy as np
 import warp as wp
 
 from gftorf_warp.bench.scenes import CAMERA, FAR, HEIGHT, NEAR, WIDTH, inputs_of, surface
-from gftorf_warp.kernels.composite import CHANNEL_PLANES
-from gftorf_warp.kernels.composite_backward import GRAD_LIGHT_PLANES
-from gftorf_warp.kernels.splat import Splat
+from gftorf_warp.kernels.rasterise.composite import CHANNEL_PLANES
+from gftorf_warp.kernels.rasterise.composite_backward import GRAD_LIGHT_PLANES
+from gftorf_warp.kernels.rasterise.splat import Splat
 from gftorf_warp.render import launch, stages
 from gftorf_warp.render.buffers import Frame, RenderSettings
 

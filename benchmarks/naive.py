@@ -6,7 +6,7 @@ Correct and obvious, with the same hand-written adjoint; what a first version of
 import warp as wp
 
 from gftorf_warp.constants import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
-from gftorf_warp.kernels.splat import Splat
+from gftorf_warp.kernels.rasterise.splat import Splat
 
 _OPTIONS = {"enable_backward": False}
 

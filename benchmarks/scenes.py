@@ -4,8 +4,8 @@
         [--walk rounds|entries|both] [--lists bits|sort|both]
 
 On the CPU the first count of Gaussians only, unless --all. Scenes and stages are those of gftorf_warp/bench/. On CUDA
-the lanes of a warp walk the list of a tile in rounds, or each of them by itself entry by entry (kernels/batches.py).
-Lists are read from a matrix of bits (kernels/bits.py), or come out of a sort of pairs.
+the lanes of a warp walk the list of a tile in rounds, or each of them by itself entry by entry (shared_batches.py).
+Lists are read from a bit matrix (tile_bitmask.py), or come out of a sort of pairs.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import warp as wp
 
 from gftorf_warp.bench import renderer
 from gftorf_warp.bench.command import about
-from gftorf_warp.kernels import batches
+from gftorf_warp.kernels.rasterise import shared_batches
 from gftorf_warp.render import buffers
 
 
@@ -31,18 +31,20 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=None, help="30 on CUDA, 5 on the CPU")
     parser.add_argument("--walk", choices=("rounds", "entries", "both"), default="rounds")
     parser.add_argument("--lists", choices=("bits", "sort", "both"), default="bits")
-    parser.add_argument("--warps", type=int, default=batches.WARPS, help="tiles of a block of threads, CUDA, in rounds")
+    parser.add_argument(
+        "--warps", type=int, default=shared_batches.WARPS, help="tiles of a block of threads, CUDA, in rounds"
+    )
     parser.add_argument("--json", type=Path)
     a = parser.parse_args()
     wp.config.log_level = wp.LOG_ERROR
     wp.init()
     device = wp.get_device(a.device)
     counts = renderer.COUNTS if a.all else renderer.COUNTS[:1]
-    rows, batches.WARPS = [], a.warps  # before the first kernel is made
+    rows, shared_batches.WARPS = [], a.warps  # before the first kernel is made
     walks = ("rounds", "entries") if a.walk == "both" else (a.walk,)
     ways, largest = ("bits", "sort") if a.lists == "both" else (a.lists,), buffers.MATRIX_MAX
     for walk, lists in product(walks, ways):
-        batches.COOPERATIVE = walk == "rounds"
+        shared_batches.COOPERATIVE = walk == "rounds"
         buffers.MATRIX_MAX = largest if lists == "bits" else 0
         found = renderer.measure(
             device.alias, counts=counts, forms=("all",), runs=a.repeats or (30 if device.is_cuda else 5)

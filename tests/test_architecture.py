@@ -16,7 +16,7 @@ ROOT = REPOSITORY / "gftorf_warp"
 FILES = sorted(ROOT.rglob("*.py"))
 MAX_LINES = 400
 LONG = {  # file: why it may be longer
-    "kernels/wgmma.py": "two passes over one ring of weights, each of them twice: for CUDA and for the CPU",
+    "kernels/network/wgmma.py": "two passes over one ring of weights, each of them twice: for CUDA and for the CPU",
 }
 TORCH = {"jaxtyping", "numpy", "torch"}
 INSIDE_FUNCTIONS = {

@@ -8,7 +8,7 @@ import torch
 from cases import CASES, cotangents
 from torch.testing import assert_close
 
-from gftorf_warp.kernels import batches, bits, lanes
+from gftorf_warp.kernels.rasterise import shared_batches, simd, tile_bitmask
 from gftorf_warp.render import api
 
 COMPILER = shutil.which("c++") or shutil.which("g++")
@@ -184,12 +184,12 @@ int main() {
 # a tile's words to its list, as in `list_bits`: of no bits, of few, of all, with and without room for them
 LISTS = f"""
 static int list(int words, int share, int capacity) {{
-    std::mt19937 random(words + share); std::vector<unsigned> matrix(words * {bits.GROUP}, ~0u);
+    std::mt19937 random(words + share); std::vector<unsigned> matrix(words * {tile_bitmask.GROUP}, ~0u);
     std::vector<int> ranks(32 * words), ids(32 * words + 1, -1), want(32 * words + 1, -1);
     for (int n = 0; n < 32 * words; ++n) ranks[n] = random();
     int total = 0;
     for (int w = 0; w < words; ++w) {{
-        unsigned& word = matrix[w * {bits.GROUP} + 3] = 0;
+        unsigned& word = matrix[w * {tile_bitmask.GROUP} + 3] = 0;
         for (int b = 0; b < 32; ++b) if (random() % 100 < share) {{
             word |= 1u << b;
             if (total++ < capacity) want[total - 1] = ranks[32 * w + b];
@@ -199,7 +199,7 @@ static int list(int words, int share, int capacity) {{
     in_a_warp([&](int lane) {{
         for (int at = 0, word = 0; at < std::min(total, capacity); word += 64) {{
             const int own = word + 2 * lane;
-            const wp::uint64 found = own < words ? two_words(M, own * {bits.GROUP} + 3) : 0;
+            const wp::uint64 found = own < words ? two_words(M, own * {tile_bitmask.GROUP} + 3) : 0;
             const int count = __builtin_popcountll(found), sums = sum_of_lanes(count);
             const int until = at + of_lane(sums, 31);
             write_ids(found, R, 32 * own, 32 * word, I, at + sums - count, at, until < capacity ? until : capacity);
@@ -262,7 +262,7 @@ def numbers_of(folder, functions, program):
 )
 def test_rounds_read_every_record_and_sum_every_pixel(light, channels, geometry, spreads, more, tmp_path):
     """Lists of no, one, 16 and many entries, in both directions; sums against float64."""
-    rounds = vars(batches.make_gradient_rounds(8, light, channels, geometry, spreads, more))
+    rounds = vars(shared_batches.make_gradient_rounds(8, light, channels, geometry, spreads, more))
     functions = {name: rounds[name] for name in SIGNATURES if name in rounds}
     values = {"LIGHT": light, "CHANNELS": channels, "GEOMETRY": geometry, "SPREADS": spreads, "MORE": more}
     constants = "".join(f"const bool {name} = {int(value)};\n" for name, value in values.items())
@@ -276,14 +276,14 @@ def test_rounds_read_every_record_and_sum_every_pixel(light, channels, geometry,
 def test_lanes_find_their_row(tmp_path):
     """Sums and the largest over lanes, the lane that a pair of a row of tiles belongs to, and a search by all lanes."""
     names = "sum_of_lanes", "of_lane", "warp_max", "lane_beyond", "lanes_with"
-    functions = {name: getattr(lanes, name) for name in names}
+    functions = {name: getattr(simd, name) for name in names}
     assert numbers_of(tmp_path, functions, LANES) == [0.0]
 
 
 @pytest.mark.skipif(COMPILER is None, reason="needs a C++ compiler")
 def test_lanes_list_bits(tmp_path):
     """A warp writes the ranks of all bits that are set in order, and nothing behind what there is room for."""
-    homes = {"sum_of_lanes": lanes, "of_lane": lanes, "two_words": bits, "write_ids": bits}
+    homes = {"sum_of_lanes": simd, "of_lane": simd, "two_words": tile_bitmask, "write_ids": tile_bitmask}
     functions = {name: getattr(home, name) for name, home in homes.items()}
     assert numbers_of(tmp_path, functions, LISTS) == [0.0] * 64
 
@@ -294,7 +294,7 @@ def test_rounds_change_no_image_and_no_gradient(name, monkeypatch):
     """Walking in rounds and walking entry by entry give the same images and, to rounding, the same gradients."""
     found = []
     for rounds in (True, False):
-        monkeypatch.setattr(batches, "COOPERATIVE", rounds)
+        monkeypatch.setattr(shared_batches, "COOPERATIVE", rounds)
         case = CASES[name]()
         inputs = case.inputs(torch.float32, "cuda")
         images = case.outputs(api.rasterize, inputs)

@@ -9,8 +9,8 @@ import warp as wp
 from comparison import DEVICES
 from test_tiles import HEIGHT, KINDS, WIDTH, splats
 
-from gftorf_warp.kernels import bits
-from gftorf_warp.kernels.splat import Splat
+from gftorf_warp.kernels.rasterise import tile_bitmask
+from gftorf_warp.kernels.rasterise.splat import Splat
 from gftorf_warp.render import buffers, stages
 from gftorf_warp.render.buffers import Frame, RenderSettings
 
@@ -169,7 +169,7 @@ def test_three_launches_and_no_sort(monkeypatch):
 def test_too_large_a_matrix_and_pairs_in_order_are_sorted(monkeypatch):
     """The bound is in bytes and counts words that only fill up; gradients in one order need pairs that are sorted."""
     monkeypatch.setitem(buffers.TILE_SHAPES, "cpu", (1, 8, 4))
-    tiles, words = -(-19 * 18 // bits.GROUP) * bits.GROUP, 10  # of 257 splats
+    tiles, words = -(-19 * 18 // tile_bitmask.GROUP) * tile_bitmask.GROUP, 10  # of 257 splats
 
     def marks(**settings):
         return Frame(257, WIDTH, HEIGHT, RenderSettings(**settings), wp.get_device("cpu")).marks

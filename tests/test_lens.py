@@ -20,7 +20,7 @@ from gftorf_warp.errors import UsageError
 from gftorf_warp.evaluate.compare import compare
 from gftorf_warp.kernels.geometry import CameraView
 from gftorf_warp.kernels.lens import distorted
-from gftorf_warp.kernels.trace import ray_through
+from gftorf_warp.kernels.tracing.rays import ray_through
 from gftorf_warp.recon.run import Run
 from gftorf_warp.recon.settings import Kernels
 from gftorf_warp.recon.train import reconstruct

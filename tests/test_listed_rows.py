@@ -13,10 +13,10 @@ from test_perceptron import compare_replay, gradients, half, network
 from test_tensor_cores import DEVICES, FULL, ON_HOPPER, SHAPES, alike, inputs_of, launched, pair, rows
 from test_wgmma_by_threads import BACKWARD, BLOCKS, COMPILER, FORWARD, run, stored
 
-from gftorf_warp.kernels import gradients as ends
-from gftorf_warp.kernels import perceptron as kernels
-from gftorf_warp.kernels import rows as lists
-from gftorf_warp.kernels import weights, wgmma
+from gftorf_warp.kernels.network import gradient_rows as lists
+from gftorf_warp.kernels.network import parameter_gradients as ends
+from gftorf_warp.kernels.network import perceptron as kernels
+from gftorf_warp.kernels.network import weight_gradients, wgmma
 from gftorf_warp.render import perceptron
 from gftorf_warp.render.bridge import array_over
 from gftorf_warp.render.perceptron import TensorCores
@@ -241,7 +241,7 @@ def test_weight_gradients_by_blocks_of_threads(columns, keys, count, parts, tmp_
         factors = [(slopes[n], inputs.half()[at % count]) for n in (0, joined)]
     stored(tmp_path, listed=np.pad(np.array(listed, np.int32), (0, capacity - len(listed)), constant_values=-7))
     stored(tmp_path, starts=np.array(begins, np.int32), slopes=slopes.numpy(), inputs=inputs.half().numpy())
-    way = weights.by_outputs if columns == WIDTH else weights.by_places
+    way = weight_gradients.by_outputs if columns == WIDTH else weight_gradients.by_places
     run(tmp_path, WEIGHTS, way, jobs, parts, keys, rows_of, joined, columns)
     found = read(tmp_path / "partials", np.float32).view(parts, -1, WIDTH, columns)
     for result, (left, right) in zip(found.sum(0), factors, strict=True):
@@ -251,7 +251,7 @@ def test_weight_gradients_by_blocks_of_threads(columns, keys, count, parts, tmp_
         assert float(want.abs().max()) > 1
     tiles = begins[-1] // TILE
     assert found[0].abs().max() > 0 or tiles < parts
-    assert tiles > parts * weights.STAGES or tiles == 1
+    assert tiles > parts * weight_gradients.STAGES or tiles == 1
 
 
 @BY_THREADS
@@ -301,10 +301,10 @@ def test_nobody_reads_rows_that_are_not_listed(shape, device):
 def test_parts_and_sums_become_gradients(shape, keys, parts, device):
     """Every value has its place, its parts and the scale; the bias of the head has none."""
     form = network(half(SHAPES[shape])).form
-    layers, halves, columns = SHAPES[shape].layers, weights.HALVES, wgmma.COLUMNS
+    layers, halves, columns = SHAPES[shape].layers, weight_gradients.HALVES, wgmma.COLUMNS
     drawn = [
-        (layers, keys, WIDTH), (3,), (keys, form.moment), (parts, halves * (layers - 1), weights.HALF * WIDTH),
-        (parts, halves * len(form.entries), weights.HALF * columns), (parts, 1, 3 * WIDTH),
+        (layers, keys, WIDTH), (3,), (keys, form.moment), (parts, halves * (layers - 1), weight_gradients.HALF * WIDTH),
+        (parts, halves * len(form.entries), weight_gradients.HALF * columns), (parts, 1, 3 * WIDTH),
     ]  # fmt: skip
     sums, total, moment, outputs, places, head = ((random(*size, seed=8) - 0.4).to(device) for size in drawn)
     unit = torch.tensor([0.25], device=device)
@@ -331,21 +331,24 @@ def test_parts_and_sums_become_gradients(shape, keys, parts, device):
 @pytest.mark.parametrize("entries", [1, 2])
 def test_all_blocks_run_at_once(multiprocessors, layers, entries):
     """The products' blocks fit beside each other, few multiprocessors have nothing to do, and shares are as work is."""
-    own, others, left = weights.parts(multiprocessors, layers, entries)
-    jobs = weights.HALVES * (layers - 1)
+    own, others, left = weight_gradients.parts(multiprocessors, layers, entries)
+    jobs = weight_gradients.HALVES * (layers - 1)
     assert own * jobs + left == multiprocessors
     assert own >= 1
-    assert 0.7 * left < -(-others * weights.HALVES * entries // 2) <= left
-    read, also = jobs * (weights.HALF + WIDTH), weights.HALVES * entries * (weights.HALF + wgmma.COLUMNS)
+    assert 0.7 * left < -(-others * weight_gradients.HALVES * entries // 2) <= left
+    read, also = (
+        jobs * (weight_gradients.HALF + WIDTH),
+        weight_gradients.HALVES * entries * (weight_gradients.HALF + wgmma.COLUMNS),
+    )
     assert (own + 1) * jobs > multiprocessors * read / (read + also) or not jobs
     assert own == 1 or own * jobs <= multiprocessors * read / (read + also)
-    assert weights.parts(132, 8, 2) == (8, 10, 20)
+    assert weight_gradients.parts(132, 8, 2) == (8, 10, 20)
 
 
 def test_shared_memory_is_enough():
     """227 KB are all that a block can have, and of a multiprocessor's 228 each block takes one more."""
-    assert max(weights.shared(WIDTH), weights.shared(wgmma.COLUMNS), wgmma.SHARED) <= 227 * 1024
-    assert 2 * (weights.shared(wgmma.COLUMNS) + 1024) <= 228 * 1024
+    assert max(weight_gradients.shared(WIDTH), weight_gradients.shared(wgmma.COLUMNS), wgmma.SHARED) <= 227 * 1024
+    assert 2 * (weight_gradients.shared(wgmma.COLUMNS) + 1024) <= 228 * 1024
 
 
 @pytest.mark.parametrize("device", DEVICES)

@@ -6,8 +6,8 @@ import pytest
 import torch
 from comparison import TOLERANCE
 
-from gftorf_warp.kernels import parts
-from gftorf_warp.kernels.batches import ROUND
+from gftorf_warp.kernels.rasterise import list_segments
+from gftorf_warp.kernels.rasterise.shared_batches import ROUND
 from gftorf_warp.render import api, buffers, reference
 from gftorf_warp.render.buffers import RenderSettings, Stop, Workspace
 from gftorf_warp.scene.camera import Camera
@@ -156,9 +156,9 @@ def test_memory_is_used_again_where_lists_are_read_in_parts_too(walks, device, m
 
 def test_parts_are_whole_rounds_and_hold_every_list():
     """Of any length."""
-    length = parts.part_length.func if hasattr(parts.part_length, "func") else parts.part_length
+    length = list_segments.part_length.func if hasattr(list_segments.part_length, "func") else list_segments.part_length
     for count in (0, 1, 15, 16, 64, 65, 255, 256, 257, 1000, 4469):
         found = length(count, 4)
         assert found % int(ROUND) == 0
         assert 4 * found >= count
-        assert found == int(parts.SHORTEST) or 4 * (found - int(ROUND)) < count
+        assert found == int(list_segments.SHORTEST) or 4 * (found - int(ROUND)) < count

@@ -11,10 +11,10 @@ import warp as wp
 from small_runs import random
 from test_perceptron import compare_replay, distance, exact, gradients, half, network, on_the_same_side, positions
 
-from gftorf_warp.kernels import perceptron as kernels
-from gftorf_warp.kernels import slopes as ends
-from gftorf_warp.kernels import wgmma
-from gftorf_warp.kernels.sums import LANES
+from gftorf_warp.kernels.network import gradient_scaling as ends
+from gftorf_warp.kernels.network import perceptron as kernels
+from gftorf_warp.kernels.network import wgmma
+from gftorf_warp.kernels.training.ordered_sums import LANES
 from gftorf_warp.render import perceptron
 from gftorf_warp.render.bridge import array_over
 from gftorf_warp.render.perceptron import TensorCores, fits

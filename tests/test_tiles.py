@@ -6,8 +6,8 @@ import torch
 import warp as wp
 from comparison import DEVICES
 
-from gftorf_warp.kernels import tiles
-from gftorf_warp.kernels.splat import Splat
+from gftorf_warp.kernels.rasterise import tiles
+from gftorf_warp.kernels.rasterise.splat import Splat
 from gftorf_warp.render.buffers import LANES_PER_SPLAT
 
 WIDTH, HEIGHT = 150, 70  # neither is a multiple of a tile

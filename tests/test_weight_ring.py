@@ -1,4 +1,4 @@
-"""Who may overwrite weights in the ring of kernels/wgmma.py: a model of its two groups, in any order of their steps.
+"""Who may overwrite weights in the ring of wgmma.py: a model of its two groups, in any order of their steps.
 
 Only a GPU runs the kernel; what this checks is the rule of ``release``: a group that has no tile says of all layers at
 once that it needs their weights no more, and must not be taken for the other one.
@@ -8,7 +8,7 @@ import random
 
 import pytest
 
-from gftorf_warp.kernels.wgmma import ROUND, SLOTS
+from gftorf_warp.kernels.network.wgmma import ROUND, SLOTS
 
 PUBLISHED = (1, 4, 4, 4, 4, 5, 4, 4)  # blocks of weights of each layer, forward
 BACK = (4,) * 7

@@ -1,4 +1,4 @@
-"""What kernels/wgmma.py has for CUDA, executed by 256 threads of the CPU: a block, its barriers and its tensor cores.
+"""What wgmma.py has for CUDA, executed by 256 threads of the CPU: a block, its barriers and its tensor cores.
 
 Instructions of PTX are replaced by functions that do what they say; all else is the code that a GPU gets. A product
 sees fragments and swizzled weights as wgmma does (PTX, m64n256k16), copies arrive late, and barriers are barriers.
@@ -13,8 +13,8 @@ import pytest
 import torch
 from test_perceptron import half, network, positions
 
-from gftorf_warp.kernels import perceptron as kernels
-from gftorf_warp.kernels import wgmma
+from gftorf_warp.kernels.network import perceptron as kernels
+from gftorf_warp.kernels.network import wgmma
 from gftorf_warp.render.perceptron import TensorCores
 from gftorf_warp.scene.motion import MotionSettings
 

@@ -10,11 +10,11 @@ from enum import StrEnum
 import numpy as np
 import warp as wp
 
-from ..kernels import batches, bits
-from ..kernels.composite import LIGHT_PLANES, make_pixels
-from ..kernels.lanes import make_lanes
-from ..kernels.resolve import Tiling
-from ..kernels.splat import Splat
+from ..kernels.rasterise import shared_batches, tile_bitmask
+from ..kernels.rasterise.composite import LIGHT_PLANES, make_pixels
+from ..kernels.rasterise.planes_to_images import Tiling
+from ..kernels.rasterise.simd import make_lanes
+from ..kernels.rasterise.splat import Splat
 
 
 class Support(StrEnum):
@@ -125,7 +125,7 @@ class RenderSettings:
 # owns a tile and every thread a pixel (design/tiles.md)
 TILE_SHAPES = {"cpu": (16, 8, 8), "cuda": (1, 8, 4)}
 
-# parts in which lists are walked back where warps own tiles (kernels/parts.py, design/tiles.md)
+# parts in which lists are walked back where warps own tiles (kernels/rasterise/list_segments.py, design/tiles.md)
 WALKS = {"cpu": 1, "cuda": 4}
 LANES_PER_SPLAT = {"cpu": 1, "cuda": 32}  # threads that write the (tile, splat) pairs of a splat
 
@@ -182,7 +182,7 @@ class Frame:
         self.order = self.array("order", 2 * count)
         self.ranks = 0 < count <= RANKED_MAX[kind] and not self.ordered  # whether no sort is needed for the order
         self.words = 2 * math.ceil(count / 64)  # of a tile in a matrix of a bit per tile and splat
-        self.matrix = math.ceil(self.tiles / bits.GROUP) * bits.GROUP * self.words
+        self.matrix = math.ceil(self.tiles / tile_bitmask.GROUP) * tile_bitmask.GROUP * self.words
         self.marks = not self.ordered and 4 * self.matrix <= MATRIX_MAX  # whether lists of tiles are made of it
         steps = math.ceil(self.words / 64) / math.ceil(READERS / self.tiles)  # of a warp, two words a lane
         self.part = 64 * max(1, math.ceil(steps))  # words of a tile that a warp reads
@@ -203,7 +203,7 @@ class Frame:
     @property
     def cooperative(self) -> bool:
         """Whether the lanes of a warp fetch records for each other, as they may where a warp owns a tile."""
-        return self.K == 1 and batches.COOPERATIVE
+        return self.K == 1 and shared_batches.COOPERATIVE
 
     @property
     def groups_with_light(self) -> int:

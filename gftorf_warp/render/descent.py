@@ -14,8 +14,8 @@ import warp as wp
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from ..kernels.adam import COLUMNS, GRADIENT, GRADIENTS, LENGTH, MORE, SIZES
-from ..kernels.finish import FOUND, PART, SUMS
+from ..kernels.training.adam import COLUMNS, GRADIENT, GRADIENTS, LENGTH, MORE, SIZES
+from ..kernels.training.step_end import FOUND, PART, SUMS
 from . import training
 from .api import ScreenGradient
 from .bridge import array_over, stream_of
@@ -63,7 +63,7 @@ class AdamTable:
         ends = list(itertools.accumulate(-(-row[LENGTH] // width) for row in rows))
         parts = list(itertools.accumulate(-(-row[LENGTH] // PART) for row in rows))
         self.rows = torch.empty(len(rows), COLUMNS, dtype=torch.int64, device=device)
-        """[T, 9] addresses and lengths, see ``kernels/adam.py``."""
+        """[T, 9] addresses and lengths, see ``kernels/training/adam.py``."""
         self.first_block = torch.tensor([0, *ends[:-1]], dtype=torch.int32, device=device)
         """[T] blocks of elements before those of a tensor."""
         self.sizes = torch.empty(len(rows), SIZES, dtype=torch.float32, device=device)

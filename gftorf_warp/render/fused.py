@@ -18,7 +18,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from ..kernels.similarity import MOMENTS, REACH, SLOPES, SUMS
+from ..kernels.training.image_similarity import MOMENTS, REACH, SLOPES, SUMS
 from ..scene.camera import Camera
 from . import training
 from .bridge import array_over, stream_of

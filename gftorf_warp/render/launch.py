@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from ..kernels import splat
-from ..kernels.composite import CHANNEL_PLANES
 from ..kernels.geometry import CameraView
+from ..kernels.rasterise import splat
+from ..kernels.rasterise.composite import CHANNEL_PLANES
 from ..scene.camera import Camera
 from . import stages
 from .buffers import Frame, RenderSettings

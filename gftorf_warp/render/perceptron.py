@@ -9,11 +9,11 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from ..kernels import encoding, gradients, weights, wgmma
-from ..kernels import perceptron as kernels
-from ..kernels import rows as lists
-from ..kernels import slopes as ends
-from ..kernels.sums import LANES
+from ..kernels.network import encoding, parameter_gradients, weight_gradients, wgmma
+from ..kernels.network import gradient_rows as lists
+from ..kernels.network import gradient_scaling as ends
+from ..kernels.network import perceptron as kernels
+from ..kernels.training.ordered_sums import LANES
 from ..scene.perceptron import LARGEST, SMALLEST, Form, Products, Slopes, beside, join
 from .bridge import array_over, stream_of
 
@@ -21,7 +21,7 @@ LISTED = True  # whether rows without gradient are left out of the way back: des
 
 
 class TensorCores(Products):
-    """Passes for layers of 256 halves, see ``scene.perceptron.Passes`` and ``kernels/perceptron.py``; an encoder, too.
+    """Passes for layers of 256 halves, see ``scene.perceptron.Passes``; an encoder, too.
 
     Weight gradients are torch's, unless rows without gradient are left out: then those are kernels, too. On a CPU they
     are slow, and there for tests.
@@ -109,30 +109,38 @@ class TensorCores(Products):
         assert slopes.begins is not None
         device, layers, entries = _ready(place.device, True), len(outputs), len(form.entries)
         threads = 1 if device.is_cpu else wgmma.BLOCK
-        of_outputs, of_places, left = (1, 1, 1) if device.is_cpu else weights.parts(device.sm_count, layers, entries)
+        of_outputs, of_places, left = (
+            (1, 1, 1) if device.is_cpu else weight_gradients.parts(device.sm_count, layers, entries)
+        )
         shapes = _shapes(form, layers)
         found = moment.new_empty(sum(map(math.prod, shapes)))
-        by_outputs = moment.new_empty(of_outputs, weights.HALVES * (layers - 1), weights.HALF * wgmma.WIDTH)
-        by_places = moment.new_empty(of_places, weights.HALVES * entries, weights.HALF * wgmma.COLUMNS)
-        by_head = moment.new_empty(gradients.HEAD_BLOCKS * left, 1, wgmma.VALUES * wgmma.WIDTH)
+        by_outputs = moment.new_empty(
+            of_outputs, weight_gradients.HALVES * (layers - 1), weight_gradients.HALF * wgmma.WIDTH
+        )
+        by_places = moment.new_empty(
+            of_places, weight_gradients.HALVES * entries, weight_gradients.HALF * wgmma.COLUMNS
+        )
+        by_head = moment.new_empty(parameter_gradients.HEAD_BLOCKS * left, 1, wgmma.VALUES * wgmma.WIDTH)
         parts = [array_over(part) for part in (by_outputs, by_places, by_head)]
         of, listed = _layers(form, layers), [array_over(part, wp.int32) for part in (slopes.listed, slopes.begins)]
         given, back = [threads, len(moment), *listed], array_over(slopes.layers, wp.float16)
         after, ahead = array_over(slopes.head, wp.float16), array_over(outputs, wp.float16)
         with beside(place.device), stream_of(place):
-            _launch(gradients.multiply_head, len(by_head) * threads, [*given, after, ahead], parts[2:], device)
+            _launch(
+                parameter_gradients.multiply_head, len(by_head) * threads, [*given, after, ahead], parts[2:], device
+            )
         with stream_of(place):
             if layers > 1:
                 blocks = by_outputs.shape[0] * by_outputs.shape[1]
-                _launch(weights.multiply_outputs, blocks * threads, [*given, back, ahead], parts[:1], device)
+                _launch(weight_gradients.multiply_outputs, blocks * threads, [*given, back, ahead], parts[:1], device)
         with beside(place.device, behind=False), stream_of(place):
             more, blocks = [of.joined, back, array_over(place, wp.float16)], by_places.shape[0] * by_places.shape[1]
-            _launch(weights.multiply_places, blocks * threads, [*given, *more], parts[1:2], device)
+            _launch(weight_gradients.multiply_places, blocks * threads, [*given, *more], parts[1:2], device)
         join(place.device)
         with stream_of(place):
             made = [array_over(part) for part in (slopes.unit.view(1), slopes.sums, slopes.head_sum, moment)]
             dim = layers * wgmma.WIDTH + wgmma.VALUES, wgmma.WIDTH + form.place + form.moment + 1
-            _launch(gradients.collect, dim, [of, *made, *parts], [array_over(found)], device)
+            _launch(parameter_gradients.collect, dim, [of, *made, *parts], [array_over(found)], device)
         values = found.split([*map(math.prod, shapes)])
         return [value.view(shape) for value, shape in zip(values, shapes, strict=True)]
 

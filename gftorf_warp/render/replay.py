@@ -18,8 +18,8 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from ..kernels import move
 from ..kernels.geometry import CameraView
+from ..kernels.motion import move
 from ..scene.camera import Camera
 from ..scene.gaussians import GaussianField
 from ..scene.motion import Motion

@@ -7,17 +7,17 @@ from functools import cache
 
 import warp as wp
 
-from ..kernels import bits, ordered, ranks, resolve, splat, tiles
-from ..kernels.composite import CHANNEL_PLANES, make_composite
-from ..kernels.composite_backward import (
+from ..kernels.geometry import CameraView
+from ..kernels.rasterise import depth_bins, deterministic_sums, planes_to_images, splat, tile_bitmask, tiles
+from ..kernels.rasterise.composite import CHANNEL_PLANES, make_composite
+from ..kernels.rasterise.composite_backward import (
     GRAD_LIGHT_PLANES,
     GRAD_TRANSMITTANCE,
     finish_moments,
     make_composite_backward,
 )
-from ..kernels.geometry import CameraView
-from ..kernels.parts import PLANES
-from ..kernels.project import make_project
+from ..kernels.rasterise.list_segments import PLANES
+from ..kernels.rasterise.project import make_project
 from .buffers import ClampGradient, Distortion, Frame, Planes, Stop, Support
 from .inputs import Images, Inputs
 from .side_by_side import over_tiles, tile_edges
@@ -68,14 +68,17 @@ def sort_by_depth(frame: Frame) -> None:
     if not frame.ranks:
         wp.utils.radix_sort_pairs(frame.depth_key, frame.order, frame.count, end_bit=frame.settings.depth_bits)
         return
-    counts, first = frame.zeros("counts of classes", ranks.COUNTS), frame.array("first of classes", ranks.COUNTS)
+    counts, first = (
+        frame.zeros("counts of classes", depth_bins.COUNTS),
+        frame.array("first of classes", depth_bins.COUNTS),
+    )
     places, members = frame.array("places", frame.count), frame.array("members", frame.count, wp.int64)
-    shift = frame.settings.depth_bits - (ranks.CLASSES.bit_length() - 1)
+    shift = frame.settings.depth_bits - (depth_bins.CLASSES.bit_length() - 1)
     keys = [frame.depth_key, frame.settings.depth_culled, shift]
-    _launch(ranks.count_classes, frame.count, keys, [counts, places])
+    _launch(depth_bins.count_classes, frame.count, keys, [counts, places])
     wp.utils.array_scan(counts, first, inclusive=True)
-    _launch(ranks.fill_classes, frame.count, [*keys, first, places], [members])
-    _launch(ranks.order_classes, frame.count, [members, *keys[1:], first], [frame.order])
+    _launch(depth_bins.fill_classes, frame.count, [*keys, first, places], [members])
+    _launch(depth_bins.order_classes, frame.count, [members, *keys[1:], first], [frame.order])
 
 
 def sort_by_tile(frame: Frame) -> None:
@@ -95,10 +98,10 @@ def _mark_and_read(frame: Frame, lists: list) -> None:
     _launch(tiles.mark_pairs, (frame.count, frame.lanes_per_splat), [*lists, frame.tiles_x, frame.words], [marked])
     matrix = [marked, frame.words, frame.tiles, frame.parts, frame.part, frame.lanes_per_splat]
     threads = frame.matrix // frame.words * frame.parts, frame.lanes_per_splat
-    _launch(bits.count_bits, threads, matrix, [frame.counts])
+    _launch(tile_bitmask.count_bits, threads, matrix, [frame.counts])
     capacity = _sum_counts(frame)
     outputs = [frame.ids, frame.first, frame.total]
-    _launch(bits.list_bits, threads, [*matrix, frame.order, frame.ends, capacity], outputs)
+    _launch(tile_bitmask.list_bits, threads, [*matrix, frame.order, frame.ends, capacity], outputs)
 
 
 def _count_and_sort(frame: Frame, lists: list) -> None:
@@ -110,7 +113,7 @@ def _count_and_sort(frame: Frame, lists: list) -> None:
     _launch(tiles.emit_pairs, threads, inputs, [frame.keys, frame.ids, frame.total])
     if frame.ordered and capacity:
         frame.owners = frame.array("owners", capacity)
-        _launch(ordered.number_pairs, capacity, [frame.total, capacity], [frame.ids, frame.owners])
+        _launch(deterministic_sums.number_pairs, capacity, [frame.total, capacity], [frame.ids, frame.owners])
     if capacity:
         wp.utils.radix_sort_pairs(frame.keys, frame.ids, capacity, end_bit=frame.tiles.bit_length())
     starts = frame.tiles + 1, frame.lanes_per_splat
@@ -220,7 +223,7 @@ def composite_backward(
         for copies, total in ((added, records), (more_added, more_records)):
             if copies is not None and total is not None:
                 of_pairs = [frame.order, frame.ends, copies, len(frame.owners)]
-                _launch(ordered.sum_copies, frame.count, of_pairs, [total])
+                _launch(deterministic_sums.sum_copies, frame.count, of_pairs, [total])
 
 
 def set_channels(frame: Frame, inputs: Inputs, start: int, splats: wp.array) -> None:
@@ -250,18 +253,18 @@ def resolve_images(inputs: Inputs, shifts, frame: Frame, images: Images, groups:
     if shifts and images.quads is not None:
         vectors = _shift_vectors(shifts, str(frame.device))
         lit = [sums, tiling, inputs.calibration, vectors, _or_nothing(frame, inputs.background_quads)]
-        _launch(resolve.resolve_quads, pixels, lit, [images.quads])
+        _launch(planes_to_images.resolve_quads, pixels, lit, [images.quads])
     if images.phasor is not None:
         lit = [sums, tiling, frame.settings.phasor_factor, _or_nothing(frame, inputs.background_phasor)]
-        _launch(resolve.resolve_phasor, pixels, lit, [images.phasor])
+        _launch(planes_to_images.resolve_phasor, pixels, lit, [images.phasor])
     outputs = [images.distance, images.opacity, images.distortion]
     if any(image is not None for image in outputs):
         outputs = [_or_nothing(frame, image, 2) for image in outputs]
-        _launch(resolve.resolve_geometry, pixels, [sums, tiling, _distortion_factor(frame)], outputs)
+        _launch(planes_to_images.resolve_geometry, pixels, [sums, tiling, _distortion_factor(frame)], outputs)
     for (name, start), planes in zip(groups, frame.channels, strict=True):
         background = inputs.background_colour if name == "colour" else None
         rest = [planes.flat, sums, tiling, _or_nothing(frame, background), start]
-        _launch(resolve.resolve_channels, pixels, rest, [getattr(images, name)])
+        _launch(planes_to_images.resolve_channels, pixels, rest, [getattr(images, name)])
 
 
 def fold_images(inputs: Inputs, shifts, frame: Frame, cotangents: Images, wanted: Inputs, groups: list):
@@ -273,22 +276,22 @@ def fold_images(inputs: Inputs, shifts, frame: Frame, cotangents: Images, wanted
         vectors = _shift_vectors(shifts, str(frame.device))
         lit = [sums, tiling, inputs.calibration, vectors, _or_nothing(frame, inputs.background_quads)]
         outputs = [target, _or_nothing(frame, wanted.background_quads)]
-        _launch(resolve.fold_quads, pixels, [*lit, cotangents.quads], outputs)
+        _launch(planes_to_images.fold_quads, pixels, [*lit, cotangents.quads], outputs)
         if wanted.calibration is not None:
             rows = frame.array("rows", frame.height, wp.float64)
-            _launch(resolve.fold_dc_offset, frame.height, [sums, tiling, cotangents.quads], [rows])
-            _launch(resolve.add_dc_offset, 1, [rows], [wanted.calibration])
+            _launch(planes_to_images.fold_dc_offset, frame.height, [sums, tiling, cotangents.quads], [rows])
+            _launch(planes_to_images.add_dc_offset, 1, [rows], [wanted.calibration])
     if cotangents.phasor is not None:
         lit = [sums, tiling, frame.settings.phasor_factor, _or_nothing(frame, inputs.background_phasor)]
         outputs = [target, _or_nothing(frame, wanted.background_phasor)]
-        _launch(resolve.fold_phasor, pixels, [*lit, cotangents.phasor], outputs)
+        _launch(planes_to_images.fold_phasor, pixels, [*lit, cotangents.phasor], outputs)
     for image, factor, plane in (
         (cotangents.distance, 1.0, 3),
         (cotangents.distortion, _distortion_factor(frame), 4),
         (cotangents.opacity, -1.0, GRAD_TRANSMITTANCE),  # opacity = 1 - T_e
     ):
         if image is not None:
-            _launch(resolve.fold_plane, pixels, [image, tiling, factor, plane], [target])
+            _launch(planes_to_images.fold_plane, pixels, [image, tiling, factor, plane], [target])
     channels: list[Planes | None] = []
     for number, (name, start) in enumerate(groups):
         cotangent = getattr(cotangents, name)
@@ -300,7 +303,7 @@ def fold_images(inputs: Inputs, shifts, frame: Frame, cotangents: Images, wanted
         background = _or_nothing(frame, inputs.background_colour if colour else None)
         grad_background = _or_nothing(frame, wanted.background_colour if colour else None)
         inputs_ = [sums, tiling, background, start, cotangent]
-        _launch(resolve.fold_channels, pixels, inputs_, [grad.flat, target, grad_background])
+        _launch(planes_to_images.fold_channels, pixels, inputs_, [grad.flat, target, grad_background])
         channels.append(grad)
     return planes, channels or [None]
 
@@ -329,7 +332,7 @@ def _spread(frame: Frame, number: int, *, anew: bool = True) -> wp.array:
         return frame.records[number]
     copies = frame.array(f"records of pairs {number}", len(frame.owners), splat.Splat)
     if anew and len(frame.owners):
-        _launch(ordered.spread_records, len(frame.owners), [frame.records[number], frame.owners], [copies])
+        _launch(deterministic_sums.spread_records, len(frame.owners), [frame.records[number], frame.owners], [copies])
     return copies
 
 

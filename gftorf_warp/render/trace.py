@@ -15,8 +15,8 @@ import warp as wp
 from jaxtyping import Complex, Float, Int
 
 from ..constants import SPEED_OF_LIGHT
-from ..kernels import paths, trace
 from ..kernels.geometry import CameraView
+from ..kernels.tracing import light_paths, rays
 from ..scene.camera import Camera
 from ..scene.optics import Beam
 from .buffers import RenderSettings, available_threads
@@ -218,13 +218,13 @@ class Tracer:
         view = self._view(cameras[0])
         poses = self._place(cameras, world_from_body)
         inputs = [view, _emitter(lamp, f_mod_hz), self._harmonics, self._solids, *poses]
-        self._over_rows(paths.trace_light, [*inputs, subsamples], self._direct)
+        self._over_rows(light_paths.trace_light, [*inputs, subsamples], self._direct)
         direct, amplitude, ambient = (array.numpy().copy() for array in self._direct)
         total, error, direct = amplitude, np.zeros_like(amplitude), direct.view(np.complex64)[..., 0]
         light = direct
         if bounces.count:
             count = -(-bounces.paths // len(cameras)) * len(cameras)
-            self._over_rows(paths.trace_bounces, [*inputs, bounces.count, count, seed], self._indirect)
+            self._over_rows(light_paths.trace_bounces, [*inputs, bounces.count, count, seed], self._indirect)
             more, indirect, error = (array.numpy().copy() for array in self._indirect)
             light, total = direct + more.view(np.complex64)[..., 0], amplitude + indirect
         return Light(
@@ -239,7 +239,7 @@ class Tracer:
         """
         view = self._view(camera)
         poses = self._place([camera], world_from_body[None])
-        self._over_rows(trace.trace_hits, [view, self._solids, *poses], self._hits)
+        self._over_rows(rays.trace_hits, [view, self._solids, *poses], self._hits)
         distance, z_depth, normal, body = (array.numpy().copy() for array in self._hits)
         return FirstHits(distance=distance, z_depth=z_depth, normal=normal, body=body)
 
@@ -292,8 +292,8 @@ def _mesh(body: RigidBody, device: wp.Device) -> wp.Mesh | None:
     return wp.Mesh(points=points, indices=indices)
 
 
-def _emitter(lamp: Lamp, f_mod_hz: float) -> paths.Emitter:
-    emitter = paths.Emitter()
+def _emitter(lamp: Lamp, f_mod_hz: float) -> light_paths.Emitter:
+    emitter = light_paths.Emitter()
     emitter.place = wp.vec3(*lamp.position)
     across, down = lamp.beam_deg or (0.0, 0.0)
     emitter.spread = wp.vec2(math.tan(math.radians(across) / 2), math.tan(math.radians(down) / 2))
@@ -306,11 +306,11 @@ def _emitter(lamp: Lamp, f_mod_hz: float) -> paths.Emitter:
 def _solids(bodies: Sequence[RigidBody], meshes: Sequence[wp.Mesh | None], device: wp.Device) -> wp.array:
     solids = []
     for body, mesh in zip(bodies, meshes, strict=True):
-        solid = trace.Solid()
+        solid = rays.Solid()
         solid.mesh = mesh.id if mesh is not None else wp.uint64(0)
         solid.radius, solid.centre, solid.reach = body.radius, wp.vec3(*body.centre), body.reach
         solid.normal, solid.height = wp.vec3(*(body.normal or (0.0, 0.0, 0.0))), body.height
         solid.low, solid.high, solid.cell = body.low, body.high, body.cell
         solid.gloss, solid.shininess = body.gloss, body.shininess
         solids.append(solid)
-    return wp.array(solids, dtype=trace.Solid, device=device)
+    return wp.array(solids, dtype=rays.Solid, device=device)

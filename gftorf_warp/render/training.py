@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import warp as wp
 
-from ..kernels import adam, displace, finish, flow, noise, similarity, sums
+from ..kernels.motion import displace
+from ..kernels.training import adam, image_similarity, noise, optical_flow, ordered_sums, step_end
 
 BLOCK = 16  # pixels of a row, or elements of a tensor, that one CPU thread works on
 
@@ -75,7 +76,7 @@ def flow_loss(
     partials: wp.array,
     out: wp.array,
 ) -> None:
-    """Fill ``out`` [1] with the sum over F flows of the mean squared difference; see ``kernels/flow.py``.
+    """Fill ``out`` [1] with the sum over F flows of the mean squared difference; see optical_flow.py.
 
     Args:
         distance: [H, W].
@@ -87,7 +88,7 @@ def flow_loss(
         out: Filled.
     """
     inputs = [distance, displacement, measured, row, views]
-    _launch(flow.flow_errors, _whole_warps(distance.size, distance.device), inputs, [partials])
+    _launch(optical_flow.flow_errors, _whole_warps(distance.size, distance.device), inputs, [partials])
     _means(partials, 0.5 / distance.size, out)
 
 
@@ -107,11 +108,11 @@ def flow_loss_backward(
 ) -> None:
     """Fill ``grad`` [3F, H, W] with the gradient by ``displacement`` times ``cotangent`` [1]."""
     inputs = [distance, displacement, measured, row, views, 0.5 / distance.size, cotangent]
-    _launch(flow.flow_gradient, (views.shape[0], distance.size), inputs, [grad])
+    _launch(optical_flow.flow_gradient, (views.shape[0], distance.size), inputs, [grad])
 
 
 def displaced(mean: wp.array, offsets: wp.array, share: wp.array, moved: wp.array, channels: wp.array) -> None:
-    """Fill ``moved`` [N] and ``channels`` [N, K - 1] from offsets [K, N]; see ``kernels/displace.py``."""
+    """Fill ``moved`` [N] and ``channels`` [N, K - 1] from offsets [K, N]; see ``kernels/motion/displace.py``."""
     _launch(displace.displace, len(mean), [mean, offsets, share], [moved, channels])
 
 
@@ -122,26 +123,26 @@ def displaced_backward(share: wp.array, by_moved: wp.array, by_channels: wp.arra
 
 def _means(partials: wp.array, scale: float, out: wp.array) -> None:
     """Rows of partial sums, added up and scaled."""
-    threads = 1 if partials.device.is_cpu else sums.THREADS
+    threads = 1 if partials.device.is_cpu else ordered_sums.THREADS
     dim = partials.shape[0] * threads
-    _launch(sums.means, dim, [partials, threads, scale], [out], block_dim=sums.THREADS)
+    _launch(ordered_sums.means, dim, [partials, threads, scale], [out], block_dim=ordered_sums.THREADS)
 
 
 def _whole_warps(count: int, device: wp.Device) -> int:
     """Threads for ``count`` elements, all lanes of the last warp included."""
-    return count if device.is_cpu else -(-count // sums.LANES) * sums.LANES
+    return count if device.is_cpu else -(-count // ordered_sums.LANES) * ordered_sums.LANES
 
 
 def _parts(count: int, device: wp.Device) -> int:
     """Partial sums of so many threads: one per warp, on the CPU one per thread."""
-    return count if device.is_cpu else -(-count // sums.LANES)
+    return count if device.is_cpu else -(-count // ordered_sums.LANES)
 
 
 def _of(image: wp.array):
     """Kernels for an image [C, H, W], and how many threads they want."""
     channels, height, width = image.shape
     block = BLOCK if image.device.is_cpu and width >= BLOCK else 1
-    return similarity.make_similarity(block), (channels, height, -(-width // block))
+    return image_similarity.make_similarity(block), (channels, height, -(-width // block))
 
 
 def uniform(origin: wp.array, stream: int, amplitude: float, image: wp.array) -> None:
@@ -154,7 +155,7 @@ def uniform(origin: wp.array, stream: int, amplitude: float, image: wp.array) ->
 
 def added(arrays: list[wp.array], total: wp.array) -> None:
     """Fill ``total`` with the sum of one to four arrays, in their order."""
-    _launch(sums.add_up, len(total), [*_four(arrays), len(arrays)], [total])
+    _launch(ordered_sums.add_up, len(total), [*_four(arrays), len(arrays)], [total])
 
 
 def adam_step(
@@ -163,7 +164,7 @@ def adam_step(
     """One step of Adam over the tensors of a table, in place.
 
     Args:
-        table: [T, 9] addresses and lengths, see ``kernels/adam.py``.
+        table: [T, 9] addresses and lengths, see ``kernels/training/adam.py``.
         first_block: [T] blocks before those of a tensor.
         blocks: In all, each of ``adam_block`` elements.
         betas: Decays of the moments.
@@ -190,7 +191,7 @@ def judge(
     running: wp.array,
     sizes: wp.array,
 ) -> None:
-    """Squares of all gradients, and what they mean for the step; see ``kernels/finish.py``.
+    """Squares of all gradients, and what they mean for the step; see ``kernels/training/step_end.py``.
 
     Args:
         table: [T, 9] of Adam.
@@ -209,12 +210,12 @@ def judge(
         sizes: [T, 3] filled.
     """
     cpu = table.device.is_cpu
-    dim = len(partials) * (1 if cpu else sums.LANES)
-    _launch(finish.gradient_squares, dim, [table, first_part], [partials])
-    head = [partials, *motion, longest, found, finish.Weights(*weights), len(pairs), *_four(pairs), capacity, table]
+    dim = len(partials) * (1 if cpu else ordered_sums.LANES)
+    _launch(step_end.gradient_squares, dim, [table, first_part], [partials])
+    head = [partials, *motion, longest, found, step_end.Weights(*weights), len(pairs), *_four(pairs), capacity, table]
     rest = [rates, *(wp.float64(beta) for beta in betas)]
-    judges = 1 if cpu else finish.JUDGES
-    _launch(finish.judge, judges, head + rest, [counts, running, sizes], block_dim=finish.JUDGES)
+    judges = 1 if cpu else step_end.JUDGES
+    _launch(step_end.judge, judges, head + rest, [counts, running, sizes], block_dim=step_end.JUDGES)
 
 
 def observe(
@@ -224,11 +225,11 @@ def observe(
     sums: list[wp.array],
 ) -> None:
     """Add what one to four images say [N, 4] to gradients, pixels and weights [N], if ``counts[1]`` is 0."""
-    _launch(finish.observe, len(sums[0]), [*_four(screens), len(screens), wp.vec2(*half), counts], sums)
+    _launch(step_end.observe, len(sums[0]), [*_four(screens), len(screens), wp.vec2(*half), counts], sums)
 
 
 def _four(arrays: list[wp.array]) -> list[wp.array]:
-    return arrays + [arrays[0]] * (finish.IMAGES - len(arrays))
+    return arrays + [arrays[0]] * (step_end.IMAGES - len(arrays))
 
 
 def adam_block(device: wp.Device) -> int:

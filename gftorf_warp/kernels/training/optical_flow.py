@@ -12,7 +12,7 @@ is not finite is unknown: no error there.
 
 import warp as wp
 
-from .sums import OVER_LANES
+from .ordered_sums import OVER_LANES
 
 NUMBERS = 29  # of two cameras: f and c of the first and of the later one, M, m, R
 LENSES = 11  # more, where there is one: k1, k2, p1, p2, k3 of the first camera, and of the later one with its radius

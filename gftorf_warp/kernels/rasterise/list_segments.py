@@ -10,7 +10,7 @@ behind a surface.
 
 import warp as wp
 
-from .batches import ROUND
+from .shared_batches import ROUND
 
 SHORTEST = wp.constant(64)  # entries of a part at least: the state of a pixel is read and written for each
 PLANES = 5  # of each end but the last: T there, and what the next part adds to RE, IM, AMPLITUDE and DISTANCE

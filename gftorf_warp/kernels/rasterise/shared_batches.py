@@ -15,7 +15,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from .lanes import make_lanes
+from .simd import make_lanes
 from .splat import Splat
 
 COOPERATIVE = True  # False: every lane reads every record itself, to compare with

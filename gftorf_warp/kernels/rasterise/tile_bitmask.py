@@ -7,7 +7,7 @@ tiles.py writes the matrix.
 
 import warp as wp
 
-from .lanes import of_lane, sum_of_lanes, warp_any
+from .simd import of_lane, sum_of_lanes, warp_any
 
 # tiles whose equal words are neighbours: a splat reaches neighbouring tiles, whose words then share a sector of 32
 # bytes; the warps that read them are those of one block, so a sector comes to a multiprocessor once

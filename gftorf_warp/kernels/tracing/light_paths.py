@@ -19,8 +19,8 @@ of h f (d + d_e) / c is taken before it becomes an angle, so that float32 holds 
 
 import warp as wp
 
-from .geometry import CameraView
-from .trace import FAR, Solid, nearest, ray_through, reflectance_of
+from ..geometry import CameraView
+from .rays import FAR, Solid, nearest, ray_through, reflectance_of
 
 SHADOW_GAP = wp.constant(2.0e-4)  # [1] of the emitter's distance: what is met this near to a point is the point itself
 ONE_PATH = wp.constant(float("nan"))  # the standard error of a single path

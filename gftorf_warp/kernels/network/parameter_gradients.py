@@ -8,9 +8,9 @@ parameter, which lie as ``perceptron.Layers`` says.
 
 import warp as wp
 
+from .gradient_rows import NO_ROW
 from .perceptron import Layers, inputs_of, weight_of
-from .rows import NO_ROW
-from .weights import HALF, HALVES
+from .weight_gradients import HALF, HALVES
 from .wgmma import BLOCK, COLUMNS, HEAD, TILE, VALUES, WIDTH
 
 WARPS = BLOCK // 32

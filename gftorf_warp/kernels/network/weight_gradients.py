@@ -7,12 +7,12 @@ so that eight rows never meet in a bank. ``ldmatrix`` turns both factors over on
 m16n8k16).
 
 Both kinds run at once: a block has a multiprocessor or half of one, and none waits for another. Parts are sums of their
-own, added up in a fixed order by ``gradients.py``. On a CPU one thread does the same row by row, float32 on halves.
+own, added up in a fixed order by parameter_gradients.py. On a CPU one thread does the same row by row in float32.
 """
 
 import warp as wp
 
-from .rows import NO_ROW
+from .gradient_rows import NO_ROW
 from .wgmma import BLOCK, COLUMNS, TILE, WIDTH
 
 HALF = 128  # outputs of a block

@@ -14,10 +14,10 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from ..constants import ALPHA_MAX, TRANSMITTANCE_MIN
-from .batches import GROUP, ROUND, make_batches
-from .lanes import make_lanes, warp_any
-from .parts import PLANES, part_length
+from ...constants import ALPHA_MAX, TRANSMITTANCE_MIN
+from .list_segments import PLANES, part_length
+from .shared_batches import GROUP, ROUND, make_batches
+from .simd import make_lanes, warp_any
 from .splat import AHEAD, Splat, block_missed, load_splat, prefetch
 
 # planes of ``light``, each [tiles, lanes] of V
@@ -105,9 +105,9 @@ def make_composite(
         inclusive: Whether the splat that ends a pixel is still added.
         metric: Whether distortion is measured on the distance itself, or on the released mapping of it; None: there is
             no distortion, and its three planes are left alone.
-        cooperative: Whether the lanes of a warp fetch records for each other (batches.py); K must be 1.
+        cooperative: Whether the lanes of a warp fetch records for each other (shared_batches.py); K must be 1.
         more: Whether three further channels are summed in the same pass; it must be cooperative.
-        parts: In which the list will be walked back (parts.py); if more than one, the pass must be cooperative, with
+        parts: In which the list will be walked back (list_segments.py); if > 1, the pass must be cooperative, with
             light and without distortion.
     """
     parted = parts > 1
@@ -171,7 +171,7 @@ def make_composite(
         sums: wp.array3d[V],  # [9, tiles, lanes] planes RE .. LAST of ``light``
         channel: wp.array3d[V],  # [3, tiles, lanes] the three channels
         more_channel: wp.array3d[V],  # [3, tiles, lanes] the further channels
-        states: wp.array3d[V],  # [5 (parts - 1), tiles, lanes] where parts end, see parts.py
+        states: wp.array3d[V],  # [5 (parts - 1), tiles, lanes] where parts end, see list_segments.py
     ):
         """One thread per block of K pixels; on CUDA one warp per tile, so all control is uniform over 32 lanes."""
         t, lane = wp.tid()

@@ -1,7 +1,7 @@
 """Rays through meshes, balls and endless planes: what a ray meets first.
 
 Nothing here is shared with the splats: another geometry, another order, other sums. What comes back from there is in
-paths.py.
+light_paths.py.
 
 Surfaces are seen, lit and in the way on the side of their normals only: a room can be looked into from outside. Endless
 planes have a normal on either side.
@@ -9,8 +9,8 @@ planes have a normal on either side.
 
 import warp as wp
 
-from .geometry import CameraView
-from .lens import undistorted
+from ..geometry import CameraView
+from ..lens import undistorted
 
 NOTHING = -1  # the body where a ray hits none
 FAR = wp.constant(1.0e6)  # [m] the end of the world

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from ..constants import LOW_PASS
+from ...constants import LOW_PASS
 
 LOW_PASS_PX2 = wp.constant(float(LOW_PASS))  # [px^2]
 

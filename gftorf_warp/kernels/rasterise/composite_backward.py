@@ -14,11 +14,11 @@ import functools
 
 import warp as wp
 
-from ..constants import ALPHA_MAX, ALPHA_MIN
-from .batches import GROUP, ROUND, make_gradient_rounds
+from ...constants import ALPHA_MAX, ALPHA_MIN
 from .composite import LAST, NEAREST, SUM_ZETA, SUM_ZETA2, TRANSMITTANCE, make_pixels, make_zeta, options
-from .lanes import make_lanes, sums_of, types_of, warp_any, warp_max
-from .parts import PLANES, part_length
+from .list_segments import PLANES, part_length
+from .shared_batches import GROUP, ROUND, make_gradient_rounds
+from .simd import make_lanes, sums_of, types_of, warp_any, warp_max
 from .splat import AHEAD, Splat, block_missed, load_splat, prefetch
 
 # planes of ``grad_sums``, each [tiles, lanes] of V: gradients of the first five planes of the forward pass, and of T_e
@@ -43,7 +43,7 @@ def _add_moments(K: int, light: bool, channels: bool, geometry: bool, cooperativ
 
     On the CPU one permutation brings the sums into the order of the record. On CUDA 16 values of 32 lanes are summed in
     16 shuffles, each of which halves the values a lane carries; then 16 lanes add one 64-byte line. Where warps work
-    together (batches.py) there is nothing to do on CUDA.
+    together (shared_batches.py) there is nothing to do on CUDA.
     """
     names = ["v", "dx", "dy", "alpha", "w", "w2", "g0", "g1", "g2", "g_re", "g_im", "g_amplitude", "g_distance"]
     loads = " ".join(f"const F {name}_ = load({name});" for name in names)
@@ -157,7 +157,7 @@ def make_composite_backward(
         fixed: Whether weights are held fixed under the channels, so that only these have their gradient.
         cooperative: As in ``make_composite``.
         more: Whether three further channels, under which weights are held fixed, have their gradient, too.
-        parts: Warps per tile, each with a part of its list (parts.py); if more than one, the forward pass must have
+        parts: Warps per tile, each with a part of its list (list_segments.py); if > 1, the forward pass must have
             had as many, and weights be held fixed under all channels.
     """
     parted = parts > 1
@@ -203,7 +203,7 @@ def make_composite_backward(
         grad_sums: wp.array3d[V],  # [6, tiles, lanes] gradients of RE .. DISTORTION and of T_e
         grad_channel: wp.array3d[V],  # [3, tiles, lanes] gradients of the three channels
         grad_more: wp.array3d[V],  # [3, tiles, lanes] gradients of the further channels
-        states: wp.array3d[V],  # [5 (parts - 1), tiles, lanes] where parts end, see parts.py
+        states: wp.array3d[V],  # [5 (parts - 1), tiles, lanes] where parts end, see list_segments.py
         # Out:
         grad_splats: wp.array[Splat],  # [N] added to: moments in 0-5, pixels in 6, weights in 7, gradients in 8-15
         more_splats: wp.array[Splat],  # [N] added to: slots 8-10, gradients of the further channels

@@ -2,15 +2,15 @@
 
 A tile lists a splat if the ellipse alpha >= 1/255 reaches the rectangle of its pixel centres. The tiles of one row that
 an ellipse reaches are neighbours, so a row is a span, and a splat costs as many steps as it has rows. Either each pair
-of a tile and a splat is marked in a matrix of bits, which bits.py reads; or pairs are written in the order of depth and
+of a tile and a splat is marked in a bit matrix, which tile_bitmask.py reads; or pairs are written in depth order and
 sorted by tile with a stable sort. Both ways every list is in depth order, and the lists are the same.
 """
 
 import warp as wp
 
-from .bits import place_of_word
-from .lanes import lane_beyond, lanes_with, of_lane, sum_of_lanes
+from .simd import lane_beyond, lanes_with, of_lane, sum_of_lanes
 from .splat import Splat, load_splat
+from .tile_bitmask import place_of_word
 
 # `count_pairs` and `emit_pairs` must agree on every span to the last bit, and `mark_pairs` should; but contraction to
 # fused multiply-adds is the compiler's choice in each kernel anew

@@ -7,11 +7,11 @@ import functools
 
 import warp as wp
 
-from ..constants import ALPHA_MIN, SH_BIAS
-from .correlation import PHASE_OFFSET, PHASE_SLOPE, SOURCE_INTENSITY, light_of
-from .geometry import CameraView, screen_covariance
-from .harmonics import harmonics
-from .lens import bent_covariance, distorted
+from ...constants import ALPHA_MIN, SH_BIAS
+from ..correlation import PHASE_OFFSET, PHASE_SLOPE, SOURCE_INTENSITY, light_of
+from ..geometry import CameraView, screen_covariance
+from ..harmonics import harmonics
+from ..lens import bent_covariance, distorted
 from .splat import Splat
 
 BLOCK_RADIUS = wp.constant(

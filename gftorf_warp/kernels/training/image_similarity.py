@@ -21,8 +21,8 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from ..constants import STABILISE_MEAN, STABILISE_SPREAD, WINDOW, WINDOW_SIGMA
-from .sums import OVER_LANES
+from ...constants import STABILISE_MEAN, STABILISE_SPREAD, WINDOW, WINDOW_SIGMA
+from .ordered_sums import OVER_LANES
 
 REACH = WINDOW // 2  # [px] margin of the planes in between, left and right
 MOMENTS = 5  # planes of window means: r, m, r^2, m^2, r m

@@ -7,7 +7,7 @@ that is not changes no parameter, no moment, no sum and no statistic; it is coun
 import warp as wp
 
 from .adam import ADVANCE, COLUMNS, GRADIENT, LENGTH, MORE
-from .sums import LANES, OVER_LANES
+from .ordered_sums import LANES, OVER_LANES
 
 PART = 256  # elements of a gradient whose squares are added up at once: few, since a warp waits for them one by one
 JUDGES = 1024  # threads of the block that judges

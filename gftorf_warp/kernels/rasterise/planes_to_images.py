@@ -9,9 +9,9 @@ three gradients of the light and one of T_e per pixel. Each output has its own p
 
 import warp as wp
 
+from ..correlation import DC_OFFSET, quad_of
 from .composite import AMPLITUDE, DISTANCE, DISTORTION, IM, RE, TRANSMITTANCE
 from .composite_backward import GRAD_TRANSMITTANCE
-from .correlation import DC_OFFSET, quad_of
 
 _RE, _IM, _AMPLITUDE = wp.constant(RE), wp.constant(IM), wp.constant(AMPLITUDE)
 _DISTANCE, _DISTORTION = wp.constant(DISTANCE), wp.constant(DISTORTION)
