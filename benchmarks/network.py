@@ -69,7 +69,7 @@ def call_of(made: Network, gaussians: GaussianField, queries: int, hidden: float
     keys, parameters = list(range(7, 7 + queries)), list(made.parameters())
 
     def call() -> list[torch.Tensor]:
-        offsets = made.key_offsets(made.attach(gaussians), keys)
+        offsets = made.at_keys(made.attach(gaussians), keys).offset
         return [offsets.detach(), *torch.autograd.grad(offsets, parameters, cotangent)]
 
     return call

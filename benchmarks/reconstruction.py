@@ -21,7 +21,7 @@ from gftorf_warp.recon.presets import demo
 from gftorf_warp.recon.settings import FlowSource, ReconSettings
 from gftorf_warp.recon.train import reconstruct
 from gftorf_warp.scene.initialise import Init
-from gftorf_warp.scene.motion import MotionKind
+from gftorf_warp.scene.motion import Still
 
 SAMPLE = Path(__file__).parents[1] / "tests" / "data" / "ftorf_sample_box"
 KEYS = ("d_mse_x100", "d_tof_mse_x100", "closed_form_mse_x100")
@@ -35,7 +35,7 @@ def variants() -> dict[str, ReconSettings]:
         "flow by DIS": replace(s, flow=FlowSource.DIS),
         "flow by DeepFlow": replace(s, flow=FlowSource.DEEPFLOW),
         "no flow: keys start at rest": replace(s, flow=FlowSource.NONE),
-        "motion off": replace(s, motion=replace(s.motion, kind=MotionKind.STILL)),
+        "motion off": replace(s, motion=replace(s.motion, kind=Still.kind)),
         "random start": replace(s, init=replace(s.init, kind=Init.RANDOM, opacity=0.3), schedule=late),
         "black background": replace(s, background=0.0),
         "no depth distortion": replace(s, weights=replace(s.weights, distortion=0.0)),

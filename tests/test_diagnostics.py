@@ -20,7 +20,7 @@ from gftorf_warp.recon.state import begin, to_dict
 from gftorf_warp.recon.step import step
 from gftorf_warp.render.api import Rendering, rasterize
 from gftorf_warp.render.buffers import Distortion
-from gftorf_warp.scene.motion import MotionKind, MotionSettings
+from gftorf_warp.scene.motion import Displacement, MotionSettings
 
 SETTINGS = demo(images=64)
 TRUTH = recording()[1]
@@ -92,7 +92,7 @@ def test_a_row_by_hand(observations, tmp_path):
     moving, static = moving_and_static(TRUTH.distance, frames)
     for s, n in enumerate(frames):
         with torch.no_grad():
-            delta = state.motion.displacement(state.attachment, n / 120)
+            delta = state.motion.at(state.attachment, n / 120).offset
             seen = rasterize(
                 field.moved(delta), observations.cameras[n], sensor, SETTINGS.render, extra=delta.norm(dim=1)[:, None]
             )
@@ -147,7 +147,7 @@ def test_static_matter_that_was_pushed_is_seen(observations, tmp_path):
     state = at_start(observations)
     calm = watch.look(state, SETTINGS)["offset_static_m"]
     pushed = torch.full((len(state.attachment), 3), 0.3 / math.sqrt(3.0))
-    state.motion.displacements = lambda _, times: [pushed] * len(times)
+    state.motion.at_times = lambda _, times: [Displacement(pushed, None)] * len(times)
     assert calm < 0.05
     assert watch.look(state, SETTINGS)["offset_static_m"] == pytest.approx(0.3, rel=1e-4)
     schedule = replace(SETTINGS.schedule, warm_up=1)
@@ -247,6 +247,6 @@ def test_truth_is_reduced_without_inventing_distances(tmp_path):
 
 def test_a_still_motion_is_looked_at_too(observations, tmp_path):
     """Nothing moves, so nothing was pushed."""
-    settings = replace(SETTINGS, motion=MotionSettings(kind=MotionKind.STILL))
+    settings = replace(SETTINGS, motion=MotionSettings(kind="still"))
     row = Watch(observations, TRUTH, tmp_path / "a").look(at_start(observations, settings), settings)
     assert row["offset_static_m"] == 0.0

@@ -114,13 +114,13 @@ def test_times_are_rounded_once_and_in_advance(settings, device):
     place = made.attach(gaussians)
     for keys in ([0, 2, 3], torch.tensor([3, 0], dtype=torch.int32, device=device)):
         want = made.offsets(place, made.moments[keys])
-        assert torch.equal(made.key_offsets(place, keys), want)
+        assert torch.equal(made.at_keys(place, keys).offset, want)
 
 
 def test_in_float64_times_are_not_rounded():
     """A network that became one of float64 reads the table of float64."""
     made, gaussians = network().double(), field(anywhere(20).double(), None)
     place, keys = made.attach(gaussians), [0, 2, 3]
-    found = made.key_offsets(place, keys)
+    found = made.at_keys(place, keys).offset
     assert torch.equal(found, made.offsets(place, made.moments[keys]))
     assert not torch.equal(found, made.offsets(place, made.rounded[keys]))

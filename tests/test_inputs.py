@@ -110,7 +110,7 @@ def test_colour_is_compared_from_its_own_camera():
     field = state.optimiser.field
     fixed = (field, state.motion, state.attachment)
     found, seen = objective.terms(*fixed, observations, 4, settings, settings.weights)
-    moved = field.moved(state.motion.displacement(state.attachment, 4 / 120))
+    moved = field.moved(*state.motion.at(state.attachment, 4 / 120))
     want = rasterize(moved, camera, sensor_of(sequence), settings.render).colour
     error = 2.0 * (want - observations.colour[4]).square().mean()
     torch.testing.assert_close(found["colour"], error)

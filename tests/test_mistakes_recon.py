@@ -29,10 +29,10 @@ from gftorf_warp.render import reference
 from gftorf_warp.render.api import rasterize
 from gftorf_warp.scene.initialise import Init, InitSettings, from_random
 from gftorf_warp.scene.measured import camera_of, sensor_of
-from gftorf_warp.scene.motion import MotionKind, MotionSettings, Still
+from gftorf_warp.scene.motion import MotionSettings, Still
 
 RANDOM = InitSettings(kind=Init.RANDOM, count=300, opacity=0.3, bounds=(0.5, 4.0))
-NETWORK = MotionSettings(kind=MotionKind.NETWORK, width=16, layers=3, skip_after=1)
+NETWORK = MotionSettings(kind="network", width=16, layers=3, skip_after=1)
 
 
 def started(settings, sequence=None):
@@ -92,7 +92,7 @@ def test_mistake_02_a_checkpoint_holds_the_network_and_its_moments(tmp_path):
         assert torch.equal(value, weights[name]), name
         assert again.optimiser.adam.state[value]["exp_avg"].abs().max() > 0, name
         assert again.optimiser.adam.state[value]["exp_avg_sq"].abs().max() > 0, name
-    moved = [s.motion.displacement(s.motion.attach(s.optimiser.field), 0.05) for s in (state, again)]
+    moved = [s.motion.at(s.motion.attach(s.optimiser.field), 0.05).offset for s in (state, again)]
     assert moved[0].abs().max() > 1e-4
     assert torch.equal(*moved)
     for s in (state, again):
@@ -210,7 +210,7 @@ def reflectivity_steps(settings):
 @pytest.mark.parametrize("factor", [1e-3, 30.0])
 def test_mistake_14_scaling_the_loss_changes_no_step(factor):
     """Under Adam a rate is a step size: only the rate implements H1."""
-    settings = demo(init=RANDOM, weights=Weights(quads=1.0), motion=MotionSettings(kind=MotionKind.STILL))
+    settings = demo(init=RANDOM, weights=Weights(quads=1.0), motion=MotionSettings(kind="still"))
     plain, _ = reflectivity_steps(settings)
     scaled, _ = reflectivity_steps(replace(settings, weights=Weights(quads=factor)))
     slower, _ = reflectivity_steps(replace(settings, rates=replace(settings.rates, reflectivity_sh=1e-3)))
@@ -223,7 +223,7 @@ def test_mistake_14_scaling_the_loss_changes_no_step(factor):
 
 def test_mistake_14_all_harmonics_step_with_a_camera_at_rest():
     """Seen from one side they act as one number, whose step is 8 to 14 times that of the constant harmonic alone."""
-    settings = demo(init=RANDOM, motion=MotionSettings(kind=MotionKind.STILL))
+    settings = demo(init=RANDOM, motion=MotionSettings(kind="still"))
     steps, field = reflectivity_steps(settings)
     seen = steps.abs().amin(dim=1) > 0.5 * settings.rates.reflectivity_sh
     assert seen.float().mean() > 0.3

@@ -15,7 +15,7 @@ from gftorf_warp.recon.optimiser import rates_at
 from gftorf_warp.recon.settings import BatchRule, FlowSource, Input
 from gftorf_warp.recon.state import begin
 from gftorf_warp.scene.initialise import Init, InitSettings
-from gftorf_warp.scene.motion import MotionKind, MotionSettings
+from gftorf_warp.scene.motion import MotionSettings
 
 RECORDED = [presets.Recorded(input=kind, unambiguous_range=d) for kind, d in ((Input.QUADS, 7.5), (Input.PHASOR, 5.0))]
 FITTED = [name for name in presets.PRESETS if name != "ctof"]
@@ -66,7 +66,7 @@ def test_mistake_09_lengths_follow_the_unambiguous_range():
         assert settings.densify.clone_scale_max == pytest.approx(0.0825)
         assert settings.init.bounds == pytest.approx((0.135, 7.425))
         motion = MotionSettings(
-            kind=MotionKind.NETWORK, width=16, layers=3, skip_after=1, input_scale=settings.motion.input_scale
+            kind="network", width=16, layers=3, skip_after=1, input_scale=settings.motion.input_scale
         )
         settings = replace(settings, init=InitSettings(kind=Init.RANDOM, count=50), motion=motion, flow=FlowSource.NONE)
         state = begin(observe(wall(ramp(12, 16)), settings, "cpu"), settings, seed=0, device="cpu")

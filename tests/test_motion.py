@@ -25,18 +25,19 @@ def test_inside_a_quartet_motion_is_linear(nodes, gaussians, frame):
     """x(j) = (i + 1 - j) x(i) + (j - i) x(i + 1), i = floor(j)."""
     attachment = nodes.attach(gaussians)
     i, j = frame // 4, frame / 4
-    want = (i + 1 - j) * nodes.key_offset(attachment, i) + (j - i) * nodes.key_offset(attachment, i + 1)
-    torch.testing.assert_close(nodes.displacement(attachment, frame / 120), want, rtol=1e-5, atol=1e-6)
+    start, end = nodes.at_keys(attachment, [i, i + 1]).offset
+    want = (i + 1 - j) * start + (j - i) * end
+    torch.testing.assert_close(nodes.at(attachment, frame / 120).offset, want, rtol=1e-5, atol=1e-6)
 
 
 def test_several_times_are_asked_for_at_once(nodes, gaussians, monkeypatch):
     """Beyond the ends, on a key and between keys; each key only once."""
     attachment, times = nodes.attach(gaussians), [-1.0, float(KEYS[1]), 0.5 * float(KEYS[1]), 9.0]
-    want = [nodes.displacement(attachment, time) for time in times]
-    asked, key_offsets = [], nodes.key_offsets
-    monkeypatch.setattr(nodes, "key_offsets", lambda of, keys: asked.append(keys) or key_offsets(of, keys))
-    for one, other in zip(nodes.displacements(attachment, times), want, strict=True):
-        torch.testing.assert_close(one, other, rtol=0, atol=0)
+    want = [nodes.at(attachment, time).offset for time in times]
+    asked, at_keys = [], nodes.at_keys
+    monkeypatch.setattr(nodes, "at_keys", lambda of, keys: asked.append(keys) or at_keys(of, keys))
+    for one, other in zip(nodes.at_times(attachment, times), want, strict=True):
+        torch.testing.assert_close(one.offset, other, rtol=0, atol=0)
     assert asked == [[0, 1, 3]]
 
 
@@ -44,11 +45,11 @@ def test_motion_is_continuous_at_keys_and_holds_beyond_the_ends(nodes, gaussians
     """Any time is allowed."""
     attachment = nodes.attach(gaussians)
     key = float(KEYS[1])
-    before, after = (nodes.displacement(attachment, key + dt) for dt in (-1e-7, 1e-7))
+    before, after = (nodes.at(attachment, key + dt).offset for dt in (-1e-7, 1e-7))
     torch.testing.assert_close(before, after, rtol=0, atol=1e-5)
-    torch.testing.assert_close(nodes.displacement(attachment, -5.0), nodes.key_offset(attachment, 0))
-    torch.testing.assert_close(nodes.displacement(attachment, 1e3), nodes.key_offset(attachment, 3))
-    assert (nodes.key_offset(attachment, 0) - nodes.key_offset(attachment, 3)).abs().max() > 0.05
+    torch.testing.assert_close(nodes.at(attachment, -5.0).offset, nodes.at_keys(attachment, [0]).offset[0])
+    torch.testing.assert_close(nodes.at(attachment, 1e3).offset, nodes.at_keys(attachment, [3]).offset[0])
+    assert (nodes.at_keys(attachment, [0]).offset[0] - nodes.at_keys(attachment, [3]).offset[0]).abs().max() > 0.05
 
 
 def test_gaussians_follow_nodes_of_their_own_layer_and_the_static_layer_is_pinned(nodes, gaussians):
@@ -59,7 +60,7 @@ def test_gaussians_follow_nodes_of_their_own_layer_and_the_static_layer_is_pinne
     for row, layer in zip(attachment, gaussians.layer, strict=True):
         assert (row[nodes.layer != layer] == 0).all()
         assert (row > 0).sum() <= 3
-    assert nodes.displacement(attachment, 0.05)[~moving].abs().max() == 0
+    assert nodes.at(attachment, 0.05).offset[~moving].abs().max() == 0
     assert nodes.attach(field(random(3, 3), None)).abs().max() == 0
 
 
@@ -80,7 +81,7 @@ def test_gradient_reaches_the_two_keys_around_a_time_only(nodes, gaussians):
     """With the weights of the interpolation."""
     attachment = nodes.attach(gaussians)
     cotangent = random(9, 3, seed=3)
-    (gradient,) = torch.autograd.grad((nodes.displacement(attachment, 5 / 120) * cotangent).sum(), nodes.offset)
+    (gradient,) = torch.autograd.grad((nodes.at(attachment, 5 / 120).offset * cotangent).sum(), nodes.offset)
     assert gradient[[0, 3]].abs().max() == 0
     torch.testing.assert_close(gradient[1], 0.75 * attachment.T @ cotangent, rtol=1e-4, atol=1e-6)
     torch.testing.assert_close(gradient[2], 0.25 * attachment.T @ cotangent, rtol=1e-4, atol=1e-6)
@@ -89,7 +90,7 @@ def test_gradient_reaches_the_two_keys_around_a_time_only(nodes, gaussians):
 def test_still_moves_nothing_and_has_nothing_to_learn(gaussians):
     """The control of all experiments on motion."""
     motion = Still(KEYS)
-    assert motion.displacement(motion.attach(gaussians), 0.07).abs().max() == 0
+    assert motion.at(motion.attach(gaussians), 0.07).offset.abs().max() == 0
     assert not list(motion.parameters())
 
 

@@ -12,9 +12,9 @@ from gftorf_warp.recon.observations import observe
 from gftorf_warp.recon.padded import BUCKET, CAPTURE_S, DEAD, DEAD_ROW_S, LAST_BUCKET, Padded
 from gftorf_warp.recon.state import begin
 from gftorf_warp.recon.step import densify_after
-from gftorf_warp.scene.motion import MotionKind, MotionSettings
+from gftorf_warp.scene.motion import MotionSettings
 
-NETWORK = MotionSettings(kind=MotionKind.NETWORK, layers=3, width=16, skip_after=1)
+NETWORK = MotionSettings(kind="network", layers=3, width=16, skip_after=1)
 
 
 def begun(count=300, motion=NETWORK):

@@ -49,7 +49,7 @@ def positions(count):
 
 def gradients(made, gaussians, cotangent, keys):
     """Offsets and the gradient of every parameter, by autograd through whatever the network does."""
-    found = made.key_offsets(made.attach(gaussians), keys)
+    found = made.at_keys(made.attach(gaussians), keys).offset
     return found, torch.autograd.grad((found * cotangent).sum(), list(made.parameters()))
 
 
@@ -125,7 +125,7 @@ def test_in_float32_it_is_the_network(keys):
 
 def on_the_same_side(made, gaussians, cotangent, keys):
     """Gradients of the plain network in float64 whose units are at rest where those of the rounded one are."""
-    offsets = made.key_offsets(made.attach(gaussians), keys)  # kept: what is saved may go with it
+    offsets = made.at_keys(made.attach(gaussians), keys).offset  # kept: what is saved may go with it
     saved = offsets.grad_fn.saved_tensors[-1]
     alive = [rows[:, : made.settings.width] > 0 for rows in saved]
     twin = copy.deepcopy(made).double()
@@ -196,14 +196,14 @@ def test_offsets_of_a_trained_field_differ_by_less_than_a_millimetre(device):
     adam = torch.optim.Adam(made.parameters(), lr=1e-3)
     for _ in range(40):
         adam.zero_grad()
-        loss = (made.key_offsets(place, keys) - target).square().mean()
+        loss = (made.at_keys(place, keys).offset - target).square().mean()
         loss.backward()
         adam.step()
     assert loss < 0.3 * target.square().mean(), "it has learnt something"
     quick = network(half()).to(device)
     quick.load_state_dict(made.state_dict())
     with torch.no_grad():
-        error = (quick.key_offsets(quick.attach(gaussians), keys) - made.key_offsets(place, keys)).norm(dim=-1)
+        error = (quick.at_keys(quick.attach(gaussians), keys).offset - made.at_keys(place, keys).offset).norm(dim=-1)
     assert 0 < error.max() < 1e-3, f"{error.max()} m"
 
 

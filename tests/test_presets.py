@@ -17,7 +17,7 @@ from gftorf_warp.recon.settings import Batch, Input, Norm, plain
 from gftorf_warp.recon.state import begin
 from gftorf_warp.render.buffers import ClampGradient, Stop, Support
 from gftorf_warp.scene.initialise import Init, InitSettings
-from gftorf_warp.scene.motion import MotionKind, MotionSettings, Products
+from gftorf_warp.scene.motion import MotionSettings, Products
 
 QUADS, PHASOR = Recorded(), Recorded(input=Input.PHASOR, unambiguous_range=5.0)  # F-ToeRF at 15 m, ToeRF at 10 m
 
@@ -29,7 +29,7 @@ def test_paper_is_what_the_paper_says():
     assert s.init.bounds == (s.render.near, s.render.far) == pytest.approx((0.135, 7.425))
     assert (s.schedule.images, s.schedule.warm_up, s.schedule.batch) == (60_000, 2000, Batch.FRAME)
     motion = s.motion
-    assert (motion.kind, motion.layers, motion.width, motion.skip_after) == (MotionKind.NETWORK, 8, 256, 5)
+    assert (motion.kind, motion.layers, motion.width, motion.skip_after) == ("network", 8, 256, 5)
     assert (motion.position_frequencies, motion.time_frequencies, motion.input_scale) == (10, 10, 1.0)
     assert (s.weights.quads, s.weights.ssim, s.weights.flow, s.weights.colour) == (1.0, 0.2, 8e-4, 0.0)
     assert (s.weights.distortion, s.weights.motion_size, s.background) == (0.0, 0.0, 1.0)
@@ -204,7 +204,7 @@ def small_published(**changes):
     """Paper's settings at a size for tests: twelve frames, 300 Gaussians, a narrow network."""
     s = presets.shortened(presets.paper(), changes.pop("images", 600))
     init = InitSettings(kind=Init.RANDOM, count=300, opacity=0.3, reflectivity=0.1, bounds=(1.0, 5.0))
-    motion = MotionSettings(kind=MotionKind.NETWORK, layers=3, width=16, skip_after=2)
+    motion = MotionSettings(kind="network", layers=3, width=16, skip_after=2)
     schedule = replace(
         s.schedule, **{name: changes.pop(name) for name in ("freeze_from", "warm_up") if name in changes}
     )

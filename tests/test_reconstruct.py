@@ -23,7 +23,7 @@ from gftorf_warp.recon.state import begin
 from gftorf_warp.recon.train import reconstruct
 from gftorf_warp.scene.camera import Camera
 from gftorf_warp.scene.initialise import Init, InitSettings
-from gftorf_warp.scene.motion import MotionKind, MotionSettings, Still
+from gftorf_warp.scene.motion import MotionSettings, Still
 from gftorf_warp.scene.sensor import Sensor
 
 SAMPLE = Path(__file__).parent / "data" / "ftorf_sample_box"
@@ -71,7 +71,7 @@ def test_half_the_resolution_and_computed_flow_come_close(tmp_path):
 
 def test_without_motion_it_is_much_worse(sample_scores, tmp_path):
     """The control: the rest of the machinery alone does not explain the result."""
-    still = scores(tmp_path / "run", demo(images=800, motion=MotionSettings(kind=MotionKind.STILL)))
+    still = scores(tmp_path / "run", demo(images=800, motion=MotionSettings(kind="still")))
     assert still["moving"]["d_mse_x100"] > 5 * sample_scores["moving"]["d_mse_x100"]
     assert still["moving"]["d_mse_x100"] > 0.4 * still["moving"]["closed_form_mse_x100"]
 

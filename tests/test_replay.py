@@ -11,7 +11,7 @@ from gftorf_warp.constants import CANONICAL_SHIFTS
 from gftorf_warp.recon.run import Run
 from gftorf_warp.render import replay as module
 from gftorf_warp.scene.camera import Camera
-from gftorf_warp.scene.motion import MotionKind, MotionSettings
+from gftorf_warp.scene.motion import MotionSettings
 from gftorf_warp.scene.network import Network
 from gftorf_warp.scene.sensor import Sensor
 
@@ -27,7 +27,7 @@ TIMES = (-1.0, 0.0, 0.011, 0.04, 0.0667, 0.5)  # before the first key, on keys, 
 def run(request, tmp_path):
     """A run whose network moves Gaussians by decimetres, optimised at half the size."""
     field = gaussians(60, CAMERA, seed=3).map(lambda tensor: tensor.to(request.param))
-    shape = MotionSettings(kind=MotionKind.NETWORK, layers=3, width=16, skip_after=2, position_frequencies=3)
+    shape = MotionSettings(kind="network", layers=3, width=16, skip_after=2, position_frequencies=3)
     keys = torch.arange(3, dtype=torch.float64) / 30
     motion = Network(keys, shape, duration=0.1, length=5.0, generator=torch.Generator().manual_seed(1))
     with torch.no_grad():
@@ -93,8 +93,8 @@ def test_only_what_is_wanted(run):
 def test_every_key_is_computed_once(run, monkeypatch):
     """However many images lie between them."""
     asked = []
-    right = run.motion.key_offset
-    monkeypatch.setattr(run.motion, "key_offset", lambda a, key: asked.append(key) or right(a, key))
+    right = run.motion.at_keys
+    monkeypatch.setattr(run.motion, "at_keys", lambda a, keys: asked.extend(keys) or right(a, keys))
     render = run.renderer(PLAIN)
     for time in np.linspace(0.0, 0.06, 20):
         render(float(time), CAMERA)

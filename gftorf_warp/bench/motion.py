@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ..render import perceptron
 from ..scene.gaussians import GaussianField, constant_sh
-from ..scene.motion import MotionKind, MotionSettings, Products
+from ..scene.motion import MotionSettings, Products
 from ..scene.network import Network
 from .timing import Report, both_ways, cell, lines_of, watch_of
 
@@ -41,7 +41,7 @@ def measure(device: str, *, quick: bool, runs: int, report: Report) -> list[dict
     for done, (count, queries, products) in enumerate(cases, start=1):
         generator = torch.Generator().manual_seed(0)
         times = torch.arange(KEYS, dtype=torch.float64) * PERIOD_S
-        settings = MotionSettings(kind=MotionKind.NETWORK, products=products_of(products))
+        settings = MotionSettings(kind=Network.kind, products=products_of(products))
         network = Network(times, settings, duration=float(times[-1]), length=LENGTH_M, generator=generator).to(device)
         go_by(network, products)
         field = points(LENGTH_M * torch.rand(count, 3, generator=generator)).map(lambda value: value.to(device))
@@ -50,11 +50,11 @@ def measure(device: str, *, quick: bool, runs: int, report: Report) -> list[dict
         keys = list(range(4, 4 + queries))
 
         def both(network=network, field=field, slope=slope, weights=weights, keys=keys) -> object:
-            return torch.autograd.grad(network.key_offsets(network.attach(field), keys), weights, slope)
+            return torch.autograd.grad(network.at_keys(network.attach(field), keys).offset, weights, slope)
 
         def forward(network=network, field=field, keys=keys) -> object:
             with torch.no_grad():
-                return network.key_offsets(network.attach(field), keys)
+                return network.at_keys(network.attach(field), keys).offset
 
         found = both_ways(both, watch, runs)
         best = (found["graph"] or found["eager"])["median"]

@@ -23,7 +23,8 @@ from ..recon.observations import Observations, observe
 from ..recon.settings import Batch, Kernels, ReconSettings
 from ..recon.state import State, from_dict
 from ..recon.step import Singles
-from ..scene.motion import MotionKind, Products
+from ..scene.motion import Products
+from ..scene.network import Network
 from .states import Fitted, pairs_of
 from .timing import Report, Timing, lines_of, quietly, watch_of
 
@@ -38,7 +39,7 @@ QUICK_IMAGES, QUICK_PART, QUICK_WARM_UP = 8, 4, 4
 def ways(settings: ReconSettings, changes: list[str], device: str) -> list[ReconSettings]:
     """The settings of every row; what ``changes`` sets stays as it is."""
     fixed = {change.partition("=")[0].strip() for change in changes}
-    moves = settings.motion.kind == MotionKind.NETWORK and torch.device(device).type != "cpu"
+    moves = settings.motion.kind == Network.kind and torch.device(device).type != "cpu"
     kernels = [settings.kernels] if "kernels" in fixed else [kind for kind in Kernels if kind != Kernels.AUTO]
     batches = [settings.schedule.batch] if "schedule.batch" in fixed else list(Batch)
     products = [settings.motion.products] if "motion.products" in fixed or not moves else list(Products)

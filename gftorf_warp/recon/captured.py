@@ -52,7 +52,7 @@ def unsuitable(observations: Observations, settings: ReconSettings, state: State
     if any((camera.camera_from_world != first.camera_from_world).any() for camera in observations.cameras):
         return "the camera moves"
     if not isinstance(state.motion, Still) and any(
-        state.motion.position(observations.time_at(frame))[0] != frame // FRAMES_PER_QUARTET
+        state.motion.interval(observations.time_at(frame))[0] != frame // FRAMES_PER_QUARTET
         for batch in observations.batches
         for frame in batch
     ):
@@ -244,7 +244,7 @@ class CapturedSteps:
         for n, frame in enumerate(frames):
             numbers += [frame, seed, images + n]
         motion, times = self.state.motion, [self.observations.time_at(frame) for frame in frames]
-        shares = [0.0 if isinstance(motion, Still) else motion.position(time)[1] for time in times]
+        shares = [0.0 if isinstance(motion, Still) else motion.interval(time)[1] for time in times]
         self._outbox.send(numbers, [rates[name] for name in self._groups] + shares)
 
     # -- what the device does ------------------------------------------------------------------------------------------
@@ -263,7 +263,7 @@ class CapturedSteps:
         if variant.moves:
             asked = motion.follows_means and not variant.rests
             attachment = motion.attach(field) if asked else padded.attachment
-            offsets = motion.key_offsets(attachment, numbers[: 3 if variant.flow else 2])
+            offsets = motion.at_keys(attachment, numbers[: 3 if variant.flow else 2]).offset
         render = replace(self.settings.render, sh_degree=variant.sh_degree, pair_capacity=self._reserve.capacity)
         for name in descent.FOUND_NAMES:  # here, not on a branch, of which no other knows how far it is
             self._one_times(getattr(variant.weights, name, 1.0))

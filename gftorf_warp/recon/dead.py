@@ -29,7 +29,7 @@ def is_dead(state: State, settings: ReconSettings) -> bool | Tensor:
     if not isinstance(state.motion, Network) or state.images <= settings.schedule.warm_up:
         return False
     keys = [0, len(state.motion.key_times) // 2]
-    offsets = state.motion.key_offsets(state.motion.attach(state.optimiser.field), keys)
+    offsets = state.motion.at_keys(state.motion.attach(state.optimiser.field), keys).offset
     return len(offsets[0]) > 1 and (offsets == offsets[:1, :1]).all()
 
 

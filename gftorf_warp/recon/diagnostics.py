@@ -23,6 +23,7 @@ from ..data.truth import known_distance, moving_and_static, nearest
 from ..render.api import rasterize
 from ..render.bridge import pairs_of
 from ..render.buffers import Distortion, Workspace
+from ..scene.motion import Displacement
 from ..scene.sensor import phasor_from_quads
 from ..scene.unwrap import common_range, distance_from_phasors
 from .observations import Observations
@@ -120,13 +121,13 @@ class Watch:
         kept = replace(settings.render, distortion=Distortion.PAPER, pair_capacity=capacity, deterministic=False)
         images: dict[str, list[Tensor]] = {name: [] for name in ("d", "d_tof", "opacity", "distortion", "offset")}
         pairs: list[Tensor] = []
-        displacements = [torch.zeros_like(field.mean)] * len(self.frames)
+        displacements = [Displacement(torch.zeros_like(field.mean), None)] * len(self.frames)
         if state.images >= settings.schedule.warm_up:  # before, nothing moves
             times = [float(seen.sequence.times[frame]) for frame in self.frames]
-            displacements = state.motion.displacements(attachment, times)
+            displacements = state.motion.at_times(attachment, times)
         for frame, displacement in zip(self.frames, displacements, strict=True):
-            length = displacement.norm(dim=1, keepdim=True)
-            moved, camera, where = bare.moved(displacement), seen.cameras[frame], self._workspace
+            length = displacement.offset.norm(dim=1, keepdim=True)
+            moved, camera, where = bare.moved(*displacement), seen.cameras[frame], self._workspace
             rendering = rasterize(moved, camera, seen.sensor, kept, extra=length, workspace=where)
             assert rendering.extra is not None
             pairs.append(pairs_of(where).clone())

@@ -17,7 +17,7 @@ from ..render.api import Background, Rendering, rasterize
 from ..render.buffers import RenderSettings, Workspace
 from ..scene.camera import Camera
 from ..scene.gaussians import GaussianField
-from ..scene.motion import Motion
+from ..scene.motion import Displacement, Motion
 from ..scene.sensor import Sensor
 from .observations import Observations
 from .settings import Kernels, Norm, ReconSettings, Weights
@@ -92,12 +92,12 @@ def terms(
     render = render or settings.render
     kernel = settings.kernels != Kernels.NONE
     time = observations.time_at(frame)
-    still = torch.zeros_like(field.mean)
-    displacement = still if motion is None else motion.displacement(attachment, time)
+    still = Displacement(torch.zeros_like(field.mean), None)
+    displacement = still if motion is None else motion.at(attachment, time)
     result: dict[str, Tensor] = {}
     tof = colour = squared = None
     if weights.quads > 0 or weights.depth > 0 or weights.distortion > 0:
-        moved = replace(field, colour_sh=None).moved(displacement)
+        moved = replace(field, colour_sh=None).moved(*displacement)
         sensor = observations.sensor_at(frame)
         camera, light = observations.cameras[frame], "phasor" if observations.phasors else "quads"
         tof = rendering_of(moved, camera, sensor, settings, render, weights, backgrounds, light=light)
@@ -118,22 +118,22 @@ def terms(
     if weights.colour > 0 and frame in observations.colour:
         taken, then = float(observations.sequence.times[frame]), displacement
         if motion is not None and taken != time:
-            then = motion.displacement(attachment, taken)
+            then = motion.at(attachment, taken)
         camera = observations.colour_cameras[frame]
         sensor = observations.sensor_at(frame)
-        colour = rendering_of(field.moved(then), camera, sensor, settings, render, weights, backgrounds)
+        colour = rendering_of(field.moved(*then), camera, sensor, settings, render, weights, backgrounds)
         assert colour.colour is not None
         measured = observations.colour[frame]
         loss, of_colour = image_loss(colour.colour, measured, weights.ssim, weights.colour_norm, kernel=kernel)
         result["colour"] = weights.colour * loss
         squared = of_colour if squared is None else squared
     if motion is not None and weights.motion_size > 0:
-        result["motion_size"] = weights.motion_size * motion_size(displacement).mean()
+        result["motion_size"] = weights.motion_size * motion_size(displacement.offset).mean()
     if motion is not None and weights.flow > 0 and frame % cycle == 0:
         flow = flow_loss(field, motion, attachment, observations, frame, render, kernel=kernel)
         if flow is not None:
             result["flow"] = weights.flow * flow
-    return result, Seen(tof=tof, colour=colour, squared=still.new_zeros(()) if squared is None else squared)
+    return result, Seen(tof=tof, colour=colour, squared=field.mean.new_zeros(()) if squared is None else squared)
 
 
 def rendering_of(
@@ -234,10 +234,11 @@ def flow_loss(
     steps = [step for step in (1, -1) if (quartet, step) in observations.flow]
     if not steps:
         return None
-    here, *there = motion.key_offsets(attachment, [quartet, *(quartet + step for step in steps)])
-    still = replace(field, colour_sh=None).moved(here).map(torch.Tensor.detach)
+    starts = [motion.times[quartet + step] for step in (0, *steps)]
+    here, *there = motion.at_times(attachment, starts)
+    still = replace(field, colour_sh=None).moved(*here).map(torch.Tensor.detach)
     camera, sensor = observations.cameras[frame], observations.sensor_at(frame)
-    channels, wanted = torch.cat([offset - here for offset in there], dim=1), ("distance",)
+    channels, wanted = torch.cat([end.offset - here.offset for end in there], dim=1), ("distance",)
     seen = rasterize(still, camera, sensor, render, extra=channels, images=wanted)
     assert seen.extra is not None
     last = len(observations.cameras) - 1

@@ -12,7 +12,8 @@ from dataclasses import dataclass, replace
 from ..errors import UsageError
 from ..render.buffers import ClampGradient, Distortion, RenderSettings, Stop, Support
 from ..scene.initialise import Init, InitSettings
-from ..scene.motion import MotionKind, MotionSettings, Products
+from ..scene.motion import MotionSettings, Products
+from ..scene.network import Network
 from .settings import Batch, BatchRule, DensifySettings, Input, Method, Norm, Rates, ReconSettings, Schedule, Weights
 
 
@@ -74,7 +75,7 @@ def paper(recorded: Recorded = Recorded()) -> ReconSettings:
         preset="paper",
         input=recorded.input,
         init=InitSettings(kind=Init.RANDOM, count=100_000, opacity=0.1, reflectivity=0.1, bounds=(near, far)),
-        motion=MotionSettings(kind=MotionKind.NETWORK, input_scale=1.0),
+        motion=MotionSettings(kind=Network.kind, input_scale=1.0),
         render=RenderSettings(near=near, far=far),
         rates=rates,
         rates_last=replace(rates, mean=1.6e-6 * scale, motion=1.6e-6),

@@ -125,7 +125,7 @@ class Run:
         camera = camera or self.camera
         sensor = self.sensor if f_mod_hz is None else replace(self.sensor, f_mod_hz=f_mod_hz, further_hz=())
         rendering = rasterize(
-            self.widened(self.field.moved(self.motion.displacement(self.attachment, time)), camera),
+            self.widened(self.field.moved(*self.motion.at(self.attachment, time)), camera),
             camera,
             sensor,
             self.render_settings,

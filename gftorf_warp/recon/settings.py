@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from ..constants import FRAMES_PER_QUARTET
 from ..render.buffers import RenderSettings
 from ..scene.initialise import InitSettings
+from ..scene.models import KINDS
 from ..scene.motion import MotionSettings
 
 
@@ -282,6 +283,10 @@ class ReconSettings:
     """After so many returns to a checkpoint in all, the next one ends the run as diverged."""
     restarts_max: int = 3
     """A random start that sees nothing but the dark begins again with another seed, so many times at most."""
+
+    def __post_init__(self):
+        if self.motion.kind not in KINDS:
+            raise ValueError(f"motion.kind must be one of {', '.join(KINDS)}, got {self.motion.kind!r}")
 
 
 def plain(settings: ReconSettings) -> dict[str, object]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -10,10 +10,10 @@ from torch import Tensor
 
 from ..constants import SH_COEFFICIENTS
 from ..scene.gaussians import GaussianField
-from ..scene.initialise import MOVING, Init, Start, from_phase, from_random
+from ..scene.initialise import Init, Start, from_phase, from_random
 from ..scene.measured import key_times
-from ..scene.motion import Motion, MotionKind, MotionSettings, Nodes, Products, Still, farthest_points
-from ..scene.network import Network
+from ..scene.models import KINDS, motion_from_dict
+from ..scene.motion import Motion, MotionStart
 from ..scene.unwrap import common_range
 from . import densify
 from .observations import Observations
@@ -21,7 +21,6 @@ from .optimiser import Optimiser, betas_of
 from .settings import ReconSettings
 
 FORMAT = 2  # of the stored form; a higher one is refused
-NODE_FELLOWS = 8  # points whose median displacement a node starts with
 
 
 @dataclass(kw_only=True, eq=False)
@@ -98,21 +97,15 @@ def begin(observations: Observations, settings: ReconSettings, *, seed: int, dev
 
 def _motion(start: Start, observations: Observations, settings: ReconSettings, generator: torch.Generator) -> Motion:
     sequence = observations.sequence
-    times = key_times(sequence)
-    if settings.motion.kind == MotionKind.STILL:
-        return Still(times)
-    if settings.motion.kind == MotionKind.NETWORK:
-        duration = float(sequence.times[-1] - sequence.times[0]) or 1.0  # one instant: nothing can move
-        length = settings.motion.input_scale * common_range(observations.sensor)
-        return Network(times, settings.motion, duration=duration, length=length, generator=generator)
-    moving = start.field.mean[start.field.layer == MOVING]
-    nodes = farthest_points(moving, settings.motion.nodes)
-    offset = None
-    if settings.motion.from_tracks and start.positions is not None and len(nodes):
-        near = torch.cdist(moving[nodes], moving).topk(min(NODE_FELLOWS, len(moving)), dim=1, largest=False).indices
-        offset = (start.positions - start.positions[start.quartet])[:, near].median(dim=2).values
-    layer = torch.full((len(nodes),), MOVING)
-    return Nodes(times, moving[nodes], layer, offset, neighbours=settings.motion.neighbours)
+    initial = MotionStart(
+        key_times=key_times(sequence),
+        field=start.field,
+        tracks=None if start.positions is None else start.positions - start.positions[start.quartet],
+        duration=float(sequence.times[-1] - sequence.times[0]),
+        unambiguous_range=common_range(observations.sensor),
+        generator=generator,
+    )
+    return KINDS[settings.motion.kind].start(settings.motion, initial)
 
 
 def to_dict(state: State) -> dict[str, object]:
@@ -121,7 +114,7 @@ def to_dict(state: State) -> dict[str, object]:
         "format": FORMAT,
         "field": {name: value.detach() for name, value in state.optimiser.field.tensors().items()},
         "adam": state.optimiser.adam.state_dict(),
-        "motion": _motion_to_dict(state.motion),
+        "motion": state.motion.to_dict(),
         "attachment": state.optimiser.field.mean.detach() if state.motion.follows_means else state.attachment,
         "statistics": {name: getattr(state.statistics, name) for name in densify.STATISTICS},
         "generator": state.generator.get_state(),
@@ -141,36 +134,10 @@ def to_dict(state: State) -> dict[str, object]:
     }
 
 
-def _motion_to_dict(motion: Motion) -> dict[str, object]:
-    stored: dict[str, object] = {"kind": str(MotionKind.STILL), "tensors": motion.state_dict()}
-    if isinstance(motion, Nodes):
-        stored |= {"kind": str(MotionKind.NODES), "neighbours": motion.neighbours}
-    elif isinstance(motion, Network):
-        shape = asdict(motion.settings) | {"kind": str(MotionKind.NETWORK), "products": str(motion.settings.products)}
-        stored |= {"kind": str(MotionKind.NETWORK), "shape": shape}
-        stored |= {"duration": motion.duration, "length": motion.length}
-    return stored
-
-
-def _motion_from_dict(stored: dict) -> Motion:
-    kind, tensors = stored["kind"], stored["tensors"]
-    times = tensors["key_times"]
-    if kind == MotionKind.STILL:
-        return Still(times)
-    if kind == MotionKind.NODES:
-        parts = (tensors[name] for name in ("node", "layer", "offset"))
-        return Nodes(times, *parts, neighbours=stored["neighbours"])
-    products = Products(stored["shape"].get("products", Products.FLOAT32))
-    shape = MotionSettings(**stored["shape"] | {"kind": MotionKind.NETWORK, "products": products})
-    network = Network(times, shape, duration=stored["duration"], length=stored["length"])
-    network.load_state_dict(tensors)
-    return network
-
-
 def field_and_motion(stored: dict, device: torch.device | str) -> tuple[GaussianField, Motion, Tensor]:
     """Gaussians, their motion and how they hang on it, from the stored form."""
     field = GaussianField(**{name: value.to(device) for name, value in stored["field"].items()})
-    motion = _motion_from_dict(stored["motion"]).to(device)
+    motion = motion_from_dict(stored["motion"]).to(device)
     attachment = motion.attach(field) if motion.follows_means else stored["attachment"].to(device)
     return field, motion, attachment
 

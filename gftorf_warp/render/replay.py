@@ -163,10 +163,10 @@ class Replay:
     @torch.no_grad()
     def draw(self, time: float, camera: Camera) -> Target:
         """The images at one instant, without a look at whether their pairs fitted; the next one overwrites them."""
-        key, share = self.motion.position(time)
+        key, share = self.motion.interval(time)
         for number in (key, key + 1) if share > 0.0 else (key,):
             if number not in self._known:
-                self._offset[number] = self.motion.key_offset(self.attachment, number)
+                self._offset[number] = self.motion.at_keys(self.attachment, [number]).offset[0]
                 self._known.add(number)
         seen = self._view(camera)
         if self.graphs and self._capacity is not None and seen.used and seen.graph is None:

@@ -76,9 +76,18 @@ class GaussianField:
         """A field with ``function`` applied to every tensor: selection, device, detaching."""
         return replace(self, **{name: function(value) for name, value in self.tensors().items()})
 
-    def moved(self, displacement: Float[Tensor, "N 3"]) -> GaussianField:
-        """The field with every centre displaced [m]; nothing else moves (method, section 4)."""
-        return replace(self, mean=self.mean + displacement)
+    def moved(self, offset: Float[Tensor, "N 3"], rotation: Float[Tensor, "N 4"] | None = None) -> GaussianField:
+        """The field with every centre displaced [m], and covariances rotated by quaternions wxyz of any length."""
+        quaternion = self.quaternion if rotation is None else product(rotation, self.quaternion)
+        return replace(self, mean=self.mean + offset, quaternion=quaternion)
+
+
+def product(a: Float[Tensor, "*n 4"], b: Float[Tensor, "*n 4"]) -> Float[Tensor, "*n 4"]:
+    """Product of quaternions wxyz, of which ``a`` is normalised first: rotate by ``b``, then by ``a``."""
+    w, u = (a / a.norm(dim=-1, keepdim=True)).split([1, 3], dim=-1)
+    v = b[..., 1:]
+    real = w * b[..., :1] - (u * v).sum(dim=-1, keepdim=True)
+    return torch.cat([real, w * v + b[..., :1] * u + torch.linalg.cross(u, v)], dim=-1)
 
 
 def constant_sh(value: Float[Tensor, "*n"]) -> Float[Tensor, "*n 16"]:

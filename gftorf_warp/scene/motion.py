@@ -1,22 +1,25 @@
-"""Where Gaussians have moved to at a time: one offset per key time, linear in between (method, section 4).
+"""Motion models: displacement and, for some models, rotation of every Gaussian at any time (method, section 4).
 
-Keys lie at the start of every quartet, one more after the last frame. Inside quartet i, at quartet time j in [i, i+1],
+A model has keys at the start of every quartet and one after the last. It computes displacements at keys, and
+``keys_at`` gives the keys that a time depends on with their interpolation weights w:
 
-    x(j) = (i + 1 - j) x(i) + (j - i) x(i + 1)
+    x(t) = x + sum_k w_k(t) o_k(x),   q(t) = normalise(sum_k w_k(t) r_k(x)) q
 
-so a trajectory is continuous, and this file is the only place that interpolates. Before the first key and after the
-last a Gaussian stays where the nearest key has put it. Only positions move: shape, opacity and reflectivity stay.
+Linear between two keys unless a model overrides ``keys_at``, constant before the first key and after the last. Training
+and rendering evaluate these sums with the same kernel (kernels/displace.py), ``Motion.at`` in torch.
 
-A third final class beside :class:`Still` and :class:`Nodes` is in network.py.
+scene/models.py lists all models.
 """
 
 from __future__ import annotations
 
 import abc
 import bisect
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from itertools import pairwise
+from typing import Any, ClassVar, NamedTuple, Self
 
 import torch
 from jaxtyping import Float, Int
@@ -24,47 +27,38 @@ from torch import Tensor
 
 from .gaussians import GaussianField
 
+NODE_FELLOWS = 8  # nearest points whose median displacement is the initial displacement of a node
+
 
 class Products(StrEnum):
-    """How a network multiplies matrices."""
+    """Precision of the matrix products of a network."""
 
     FLOAT32 = "float32"
-    """As everywhere else: the reference."""
+    """The reference."""
     TF32 = "tf32"
     """On CUDA factors rounded to 11 bits, sums in float32: a fraction of the time; offsets differ by a thousandth."""
     HALF = "half"
     """Factors and activations in float16 on any device, sums and parameters in float32: the fastest on CUDA."""
 
 
-class MotionKind(StrEnum):
-    """The motion models that exist."""
-
-    STILL = "still"
-    """Nothing moves: the control."""
-    NODES = "nodes"
-    """Key offsets on nodes."""
-    NETWORK = "network"
-    """Key offsets from a network of position and time, as published."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class MotionSettings:
-    """Which motion model, and how fine."""
+    """Which motion model, and its size."""
 
-    kind: MotionKind = MotionKind.NODES
-    """The model."""
+    kind: str = "nodes"
+    """Name of the model: still, nodes, network, spline or rigid_nodes."""
     nodes: int = 64
-    """Nodes at most, spread over the moving layer."""
+    """Nodes: largest number, spread over the moving layer."""
     neighbours: int = 4
-    """Nodes that a Gaussian follows at most."""
+    """Nodes: largest number that a Gaussian follows."""
     from_tracks: bool = True
-    """Nodes: whether keys start where optical flow and decoded distance lead; otherwise at rest."""
+    """Nodes: whether initial displacements follow optical flow and decoded distance; otherwise they are zero."""
     layers: int = 8
     """Network: layers before the head."""
     width: int = 256
     """Network: width of every layer."""
     skip_after: int = 5
-    """Network: the input is joined to the output of this layer."""
+    """Network: the input is concatenated to the output of this layer."""
     position_frequencies: int = 10
     """Network: frequencies of the encoded position."""
     time_frequencies: int = 10
@@ -82,12 +76,60 @@ class MotionSettings:
             raise ValueError(f"input_scale must be above 0, got {self.input_scale}")
 
 
-class Motion(torch.nn.Module, abc.ABC):
-    """Displacements of Gaussians over time. Final classes: :class:`Still`, :class:`Nodes`, network.Network."""
+@dataclass(frozen=True, kw_only=True, eq=False)
+class MotionStart:
+    """What a motion model may be initialised from."""
 
+    key_times: Float[Tensor, "T"]
+    """Start of every quartet, and one quartet after the last start [s]."""
+    field: GaussianField
+    """The initial Gaussians."""
+    tracks: Float[Tensor, "T P 3"] | None
+    """Displacements of the P Gaussians of the moving layer at every key [m]; None if nothing was tracked."""
+    duration: float
+    """Time from the first raw frame to the last [s]."""
+    unambiguous_range: float
+    """Of the sensor [m]."""
+    generator: torch.Generator
+    """For random weights, on the CPU."""
+
+
+class Keys(NamedTuple):
+    """The keys that a time depends on."""
+
+    index: tuple[int, ...]
+    weight: tuple[float, ...]
+
+
+class KeyMotion(NamedTuple):
+    """Motion of N Gaussians at K keys."""
+
+    offset: Float[Tensor, "K N 3"]
+    """Displacements [m]."""
+    rotation: Float[Tensor, "K N 4"] | None
+    """Quaternions wxyz that rotate the covariances; None: no rotation."""
+
+
+class Displacement(NamedTuple):
+    """Motion of N Gaussians at one time."""
+
+    offset: Float[Tensor, "N 3"]
+    """Displacements [m]."""
+    rotation: Float[Tensor, "N 4"] | None
+    """Quaternions wxyz, not normalised, that rotate the covariances; None: no rotation."""
+
+
+class Motion(torch.nn.Module, abc.ABC):
+    """A motion model: ``attach`` binds Gaussians to it, ``at_keys`` displaces them."""
+
+    kind: ClassVar[str]
+    """Name in settings and checkpoints."""
+    support: ClassVar[int] = 2
+    """Largest number of keys that a time depends on."""
+    follows_means: ClassVar[bool] = False
+    """Whether ``attach`` depends on the present means, so that it is evaluated in every step; it must then be
+    capturable in a CUDA graph."""
     key_times: Tensor  # [T] float64 [s]
-    follows_means = False
-    """Whether ``attach`` depends on where Gaussians are now, so that it has to be asked again after every step."""
 
     def __init__(self, key_times: Float[Tensor, "T"]):
         super().__init__()
@@ -95,64 +137,91 @@ class Motion(torch.nn.Module, abc.ABC):
         if len(times) < 2 or any(end <= start for start, end in pairwise(times)):
             raise ValueError(f"key_times must be at least two increasing times [s], got {times}")
         self.register_buffer("key_times", torch.tensor(times, dtype=torch.float64))
-        self._times = times
+        self.times = times
+        """Key times on the host [s]."""
+
+    @classmethod
+    @abc.abstractmethod
+    def start(cls, settings: MotionSettings, initial: MotionStart) -> Self:
+        """The model at the beginning of a run."""
 
     @abc.abstractmethod
     def attach(self, field: GaussianField) -> Float[Tensor, "N M"]:
-        """What the motion needs to know of each Gaussian; computed anew whenever Gaussians come or go, else kept."""
+        """What the model needs of each Gaussian; evaluated when Gaussians are added or removed, see ``follows_means``.
+
+        A model whose displacements depend on the means differentiably returns them with their gradient.
+        """
 
     @abc.abstractmethod
-    def key_offsets(
-        self, attachment: Float[Tensor, "N M"], keys: list[int] | Int[Tensor, "k"]
-    ) -> Float[Tensor, "k N 3"]:
-        """Displacements [m] of every Gaussian at the key times of these numbers; a tensor is read on its device."""
+    def at_keys(self, attachment: Float[Tensor, "N M"], keys: Sequence[int] | Int[Tensor, "K"]) -> KeyMotion:
+        """Motion at keys given by their indices; a tensor of indices is read on its device only."""
 
-    def key_offset(self, attachment: Float[Tensor, "N M"], key: int) -> Float[Tensor, "N 3"]:
-        """Displacement [m] of every Gaussian at key time number ``key``."""
-        return self.key_offsets(attachment, [key])[0]
+    def keys_at(self, time: float) -> Keys:
+        """Keys and interpolation weights of ``time`` [s], any number."""
+        key, share = self.interval(time)
+        return Keys((key,), (1.0,)) if share == 0.0 else Keys((key, key + 1), (1.0 - share, share))
 
-    def displacement(self, attachment: Float[Tensor, "N M"], time: float) -> Float[Tensor, "N 3"]:
-        """Displacement [m] of every Gaussian at ``time`` [s], any number; held constant outside the keys."""
-        return self.displacements(attachment, [time])[0]
-
-    def displacements(self, attachment: Float[Tensor, "N M"], times: list[float]) -> list[Float[Tensor, "N 3"]]:
-        """:meth:`displacement` at several times; all their keys are asked for at once."""
-        places = [self.position(time) for time in times]
-        keys = sorted({key + more for key, share in places for more in range(1 if share == 0.0 else 2)})
-        offsets = dict(zip(keys, self.key_offsets(attachment, keys), strict=True))
-        return [
-            offsets[key] if share == 0.0 else (1.0 - share) * offsets[key] + share * offsets[key + 1]
-            for key, share in places
-        ]
-
-    def position(self, time: float) -> tuple[int, float]:
-        """The key i at or before ``time`` [s] and the share j - i of the way to the next one, in [0, 1)."""
-        if time >= self._times[-1]:
-            return len(self._times) - 1, 0.0
-        key = max(bisect.bisect_right(self._times, time) - 1, 0)
-        start, end = self._times[key], self._times[key + 1]
+    def interval(self, time: float) -> tuple[int, float]:
+        """Index i of the key at or before ``time`` [s], and (time - t_i) / (t_{i+1} - t_i) in [0, 1), 0 outside."""
+        if time >= self.times[-1]:
+            return len(self.times) - 1, 0.0
+        key = max(bisect.bisect_right(self.times, time) - 1, 0)
+        start, end = self.times[key], self.times[key + 1]
         return key, max((time - start) / (end - start), 0.0)
+
+    def at(self, attachment: Float[Tensor, "N M"], time: float) -> Displacement:
+        """Motion at ``time`` [s], any number."""
+        return self.at_times(attachment, [time])[0]
+
+    def at_times(self, attachment: Float[Tensor, "N M"], times: Sequence[float]) -> list[Displacement]:
+        """:meth:`at` for several times, whose keys are evaluated together."""
+        needed = [self.keys_at(time) for time in times]
+        keys = sorted({key for one in needed for key in one.index})
+        motion = self.at_keys(attachment, keys)
+        row = {key: n for n, key in enumerate(keys)}
+        return [interpolated(motion, [row[key] for key in one.index], one.weight) for one in needed]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Tensors, numbers and strings only, for checkpoints."""
+        return {"kind": self.kind, "tensors": self.state_dict()}
+
+    @classmethod
+    @abc.abstractmethod
+    def from_dict(cls, stored: dict[str, Any]) -> Self:
+        """The inverse of :meth:`to_dict`."""
 
 
 class Still(Motion):
-    """Nothing moves."""
+    """No motion."""
+
+    kind = "still"
+
+    @classmethod
+    def start(cls, settings: MotionSettings, initial: MotionStart) -> Self:  # noqa: ARG003
+        """No parameters."""
+        return cls(initial.key_times)
 
     def attach(self, field: GaussianField) -> Float[Tensor, "N 0"]:
-        """Nothing is needed."""
+        """No columns."""
         return field.mean.new_zeros(len(field), 0)
 
-    def key_offsets(
-        self, attachment: Float[Tensor, "N 0"], keys: list[int] | Int[Tensor, "k"]
-    ) -> Float[Tensor, "k N 3"]:
+    def at_keys(self, attachment: Float[Tensor, "N 0"], keys: Sequence[int] | Int[Tensor, "K"]) -> KeyMotion:
         """Zero."""
-        return attachment.new_zeros(len(keys), len(attachment), 3)
+        return KeyMotion(attachment.new_zeros(len(keys), len(attachment), 3), None)
+
+    @classmethod
+    def from_dict(cls, stored: dict[str, Any]) -> Self:
+        """From its key times."""
+        return cls(stored["tensors"]["key_times"])
 
 
 class Nodes(Motion):
-    """M nodes in the moving layers with one offset per key; a Gaussian follows the nearest nodes of its own layer.
+    """M nodes with one displacement per key; a Gaussian follows the nearest nodes of its layer.
 
-    A Gaussian of the static layer 0 follows no node: it is pinned, whatever moves past it.
+    Nodes belong to moving layers, so Gaussians of the static layer 0 do not move.
     """
+
+    kind = "nodes"
 
     def __init__(
         self,
@@ -163,14 +232,14 @@ class Nodes(Motion):
         *,
         neighbours: int = 4,
     ):
-        """Place the nodes.
+        """Create the nodes.
 
         Args:
             key_times: Start of every quartet and the time one quartet after the last start [s].
-            position: Nodes in the world, where the field is described [m].
-            layer: The motion layer each node moves, 1 or more.
-            offset: Displacements to start from [m]; None is rest.
-            neighbours: How many nodes a Gaussian follows at most.
+            position: Of the nodes in the world, in the undeformed field [m].
+            layer: The motion layer of each node, 1 or more.
+            offset: Initial displacements [m]; None: zero.
+            neighbours: Largest number of nodes that a Gaussian follows.
 
         Raises:
             ValueError: If shapes disagree or a node belongs to the static layer.
@@ -194,40 +263,72 @@ class Nodes(Motion):
         self.offset = torch.nn.Parameter(start.detach().clone())
         """Displacement [T, M, 3] of every node at every key [m]."""
 
-    def attach(self, field: GaussianField) -> Float[Tensor, "N M"]:
-        """Weight of every node for every Gaussian: rows add up to 1, those of the static layer are zero.
-
-        The nearest nodes count like exp(-(distance / distance of the farthest of them)^2 * 2), so that the weights are
-        smooth in the position and need no length scale.
-        """
-        weight = field.mean.new_zeros(len(field), len(self.node))
+    @classmethod
+    def start(cls, settings: MotionSettings, initial: MotionStart) -> Self:
+        """Nodes spread over the moving layers; displacements are medians of tracks near each node, or zero."""
+        field = initial.field
         if field.layer is None:
+            raise ValueError("nodes need a field with layers")
+        moving = field.mean[field.layer > 0]
+        nodes = farthest_points(moving, settings.nodes)
+        offset = None
+        if settings.from_tracks and initial.tracks is not None and len(nodes):
+            near = torch.cdist(moving[nodes], moving).topk(min(NODE_FELLOWS, len(moving)), dim=1, largest=False).indices
+            offset = initial.tracks[:, near].median(dim=2).values
+        layer = field.layer[field.layer > 0][nodes]
+        return cls(initial.key_times, moving[nodes], layer, offset, neighbours=settings.neighbours)
+
+    def attach(self, field: GaussianField) -> Float[Tensor, "N M"]:
+        """Weight of every node for every Gaussian: rows sum to 1, those of the static layer are zero.
+
+        The nearest nodes are weighted by exp(-2 (distance / distance of the farthest of them)^2): smooth in the
+        position and without a length scale. No gradient.
+        """
+        count = min(self.neighbours, len(self.node))
+        weight = field.mean.new_zeros(len(field), len(self.node))
+        if field.layer is None or count == 0:
             return weight
-        for layer in self.layer.unique().tolist():
-            rows = (field.layer == layer).nonzero()[:, 0]
-            columns = (self.layer == layer).nonzero()[:, 0]
-            apart = torch.cdist(field.mean.detach()[rows], self.node[columns])
-            near, index = apart.topk(min(self.neighbours, len(columns)), dim=1, largest=False)
-            share = torch.softmax(-2.0 * (near / near[:, -1:].clamp_min(1e-9)).square(), dim=1)
-            weight[rows[:, None], columns[index]] = share
-        return weight
+        apart = torch.cdist(field.mean.detach(), self.node)
+        apart = apart.masked_fill(field.layer[:, None] != self.layer, torch.inf)
+        near, index = apart.topk(count, dim=1, largest=False)
+        farthest = near.masked_fill(near.isinf(), 0.0).amax(dim=1, keepdim=True)
+        share = torch.softmax(-2.0 * (near / farthest.clamp_min(1e-9)).square(), dim=1)
+        return weight.scatter(1, index, share.masked_fill(near.isinf(), 0.0))
 
-    def key_offsets(
-        self, attachment: Float[Tensor, "N M"], keys: list[int] | Int[Tensor, "k"]
-    ) -> Float[Tensor, "k N 3"]:
-        """Weighted means of the node offsets."""
-        return torch.stack([attachment @ offset for offset in rows_of(self.offset, keys)])
+    def at_keys(self, attachment: Float[Tensor, "N M"], keys: Sequence[int] | Int[Tensor, "K"]) -> KeyMotion:
+        """Weighted means of the displacements of nodes."""
+        return KeyMotion(torch.stack([attachment @ offset for offset in rows_of(self.offset, keys)]), None)
+
+    def to_dict(self) -> dict[str, Any]:
+        """With the number of neighbours."""
+        return super().to_dict() | {"neighbours": self.neighbours}
+
+    @classmethod
+    def from_dict(cls, stored: dict[str, Any]) -> Self:
+        """From its tensors and the number of neighbours."""
+        parts = (stored["tensors"][name] for name in ("key_times", "node", "layer", "offset"))
+        return cls(*parts, neighbours=stored["neighbours"])
 
 
-def rows_of(table: Float[Tensor, "T *n"], keys: list[int] | Int[Tensor, "k"]) -> Float[Tensor, "k *n"]:
-    """Rows of a table by their numbers. The host neither reads a tensor of numbers nor uploads a list of them."""
+def interpolated(motion: KeyMotion, rows: Sequence[int], weights: Sequence[float]) -> Displacement:
+    """Weighted sum of some rows of a motion at keys."""
+    offset, rotation = (
+        None if values is None else torch.stack([w * values[row] for row, w in zip(rows, weights, strict=True)]).sum(0)
+        for values in motion
+    )
+    assert offset is not None
+    return Displacement(offset, rotation)
+
+
+def rows_of(table: Float[Tensor, "T *n"], keys: Sequence[int] | Int[Tensor, "K"]) -> Float[Tensor, "K *n"]:
+    """Rows of a table by their indices, without a synchronisation or upload."""
     return table.index_select(0, keys) if isinstance(keys, Tensor) else torch.stack([table[key] for key in keys])
 
 
 def farthest_points(points: Float[Tensor, "N 3"], count: int) -> Int[Tensor, "M"]:
     """Indices of ``count`` points, each the farthest from those before it; all points if there are fewer.
 
-    The first is the one nearest to the centroid, so that the choice depends on nothing but the points.
+    The first is the one nearest to the centroid, so that the choice depends on the points only.
     """
     count = min(count, len(points))
     if count == 0:

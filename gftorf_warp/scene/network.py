@@ -9,8 +9,9 @@ the first raw frame to 1 at the last. The encoded input is joined to the output 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, replace
+from typing import Any, Self
 
 import torch
 from jaxtyping import Float, Int
@@ -18,7 +19,7 @@ from torch import Tensor
 
 from .encoding import Encoder, Waves, encoded, encoded_size, powers_of_two
 from .gaussians import GaussianField
-from .motion import Motion, MotionSettings, Products, rows_of
+from .motion import KeyMotion, Motion, MotionSettings, MotionStart, Products, rows_of
 from .perceptron import Form, Passes, Stacked
 
 HEAD_DEVIATION = 1e-5  # of the weights of the last layer: motion starts at rest, to a hundredth of a millimetre
@@ -27,6 +28,7 @@ HEAD_DEVIATION = 1e-5  # of the weights of the last layer: motion starts at rest
 class Network(Motion):
     """Key offsets from a perceptron that knows nothing of single Gaussians: whoever is at a place moves with it."""
 
+    kind = "network"
     follows_means = True
     moments: Tensor  # [T, t] float64, gamma(t) of every key; of the key times, so it is not stored
     rounded: Tensor  # [T, t] the same for parameters in float32, so that a step converts nothing; not stored either
@@ -75,6 +77,13 @@ class Network(Motion):
         self.head = torch.nn.Linear(width, 3)
         self.draw(generator)
 
+    @classmethod
+    def start(cls, settings: MotionSettings, initial: MotionStart) -> Self:
+        """With random weights."""
+        duration = initial.duration or 1.0  # a single instant: any duration serves
+        length = settings.input_scale * initial.unambiguous_range
+        return cls(initial.key_times, settings, duration=duration, length=length, generator=initial.generator)
+
     @torch.no_grad()
     def draw(self, generator: torch.Generator | None) -> None:
         """Begin anew, in place: other weights, everything at rest."""
@@ -107,12 +116,25 @@ class Network(Motion):
             return encoded(mean / self.length, self.powers)
         return self._encoder.encode(mean, self.length, self.powers, columns=form.columns, dtype=form.dtype)
 
-    def key_offsets(
-        self, attachment: Float[Tensor, "N p"], keys: list[int] | Int[Tensor, "k"]
-    ) -> Float[Tensor, "k N 3"]:
-        """Displacements [m] at several keys."""
+    def at_keys(self, attachment: Float[Tensor, "N p"], keys: Sequence[int] | Int[Tensor, "K"]) -> KeyMotion:
+        """Displacements, without rotation."""
         moments = self.rounded if self.head.weight.dtype == self.rounded.dtype == torch.float32 else self.moments
-        return self.offsets(attachment, rows_of(moments, keys))
+        return KeyMotion(self.offsets(attachment, rows_of(moments, keys)), None)
+
+    def to_dict(self) -> dict[str, Any]:
+        """With its shape, its duration and its length."""
+        shape = asdict(self.settings) | {"kind": self.kind, "products": str(self.settings.products)}
+        return super().to_dict() | {"shape": shape, "duration": self.duration, "length": self.length}
+
+    @classmethod
+    def from_dict(cls, stored: dict[str, Any]) -> Self:
+        """From its shape and its tensors."""
+        products = Products(stored["shape"].get("products", Products.FLOAT32))  # oldest checkpoints have none
+        settings = MotionSettings(**stored["shape"] | {"products": products})
+        tensors = stored["tensors"]
+        made = cls(tensors["key_times"], settings, duration=stored["duration"], length=stored["length"])
+        made.load_state_dict(tensors)
+        return made
 
     def offsets(self, attachment: Float[Tensor, "N p"], moment: Float[Tensor, "k t"]) -> Float[Tensor, "k N 3"]:
         """Displacements [m] at several times, given as gamma(t): rows of ``moments``, chosen on the host or the device.
