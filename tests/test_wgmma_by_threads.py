@@ -1,9 +1,14 @@
-"""What wgmma.py has for CUDA, executed by 256 threads of the CPU: a block, its barriers and its tensor cores.
+"""What wgmma.py has for CUDA, executed by 256 fibres of the CPU: a block, its barriers and its tensor cores.
 
 Instructions of PTX are replaced by functions that do what they say; all else is the code that a GPU gets. A product
-sees fragments and swizzled weights as wgmma does (PTX, m64n256k16), copies arrive late, and barriers are barriers.
+sees fragments and swizzled weights as wgmma does (PTX, m64n256k16), copies arrive late, and barriers are barriers. A
+fibre runs until it waits, those of a warp in random order, and a warp may rest for a while: what lacks a barrier reads
+what is not yet written, in the same way in every run.
 """
 
+import fcntl
+import hashlib
+import os
 import re
 import shutil
 import subprocess
@@ -25,16 +30,13 @@ WIDTH = wgmma.WIDTH
 DEVICE = """
 #include <algorithm>
 #include <atomic>
-#include <barrier>
 #include <cmath>
 #include <cstdint>
 #include <cstdio>
 #include <cstring>
-#include <memory>
-#include <mutex>
 #include <random>
 #include <string>
-#include <thread>
+#include <ucontext.h>
 #include <vector>
 #define __CUDA_ARCH__ 900
 #define __shared__ static
@@ -47,25 +49,36 @@ struct alignas(16) uint4 { unsigned x, y, z, w; };
 static uint4 make_uint4(unsigned a, unsigned b, unsigned c, unsigned d) { return {a, b, c, d}; }
 template <class T> static T __ldg(const T* p) { return *p; }
 struct Index { unsigned x; };
-static thread_local Index threadIdx;
-static Index blockIdx, gridDim;
+static Index threadIdx, blockIdx, gridDim;
+// fibres: one runs until it waits for others; turns in which nothing happened are counted
+static const unsigned FIBRES = 256;
+static ucontext_t scheduler, fibres[FIBRES];
+static unsigned turns, idle;
+static void next_fibre() { swapcontext(&fibres[threadIdx.x], &scheduler); }
+struct Barrier {
+    unsigned size, arrived = 0, round = 0;
+    void arrive_and_wait() {
+        const unsigned mine = round;
+        if (++arrived == size) { arrived = 0; ++round; idle = 0; }
+        while (round == mine) next_fibre();
+    }
+};
 alignas(1024) static char block_memory[MEMORY];
 static size_t __cvta_generic_to_shared(const void*) { return 0; }
-static std::barrier<> whole(256), group_barrier[2]{std::barrier<>(128), std::barrier<>(128)};
-static std::unique_ptr<std::barrier<>> of_warp[8];
+static Barrier whole{256}, group_barrier[2]{{128}, {128}}, of_warp[8]{{32}, {32}, {32}, {32}, {32}, {32}, {32}, {32}};
 static float told[256]; static unsigned words[256], fragments[256][4];
 static void __syncthreads() { whole.arrive_and_wait(); }
 static int __syncthreads_count(bool one) {
-    static std::atomic<int> sum;
+    static int sum;
     if (threadIdx.x == 0) sum = 0;
     __syncthreads(); sum += one; __syncthreads();
     const int found = sum;
     __syncthreads(); return found;
 }
 static void named(int number) { group_barrier[number - 1].arrive_and_wait(); }
-static void meet() { of_warp[threadIdx.x >> 5]->arrive_and_wait(); }
-static void __threadfence_block() { std::atomic_thread_fence(std::memory_order_seq_cst); }
-static unsigned atomicAdd(unsigned* to, unsigned x) { return std::atomic_ref<unsigned>(*to).fetch_add(x); }
+static void meet() { of_warp[threadIdx.x >> 5].arrive_and_wait(); }
+static void __threadfence_block() {}
+static unsigned atomicAdd(unsigned* to, unsigned x) { const unsigned old = *to; *to += x; return old; }
 static unsigned __shfl_sync(unsigned, unsigned x, int from) {
     words[threadIdx.x] = x; meet(); const unsigned heard = words[threadIdx.x / 32 * 32 + from]; meet(); return heard;
 }
@@ -82,12 +95,18 @@ static float __shfl_xor_sync(unsigned, float x, int by) {
 }
 namespace wp {
 struct half { unsigned short u; };
-static float half_to_float(half h) {
-    const unsigned e = h.u >> 10 & 31, m = h.u & 1023;
+static float of_bits(unsigned short u) {
+    const unsigned e = u >> 10 & 31, m = u & 1023;
     const float finite = e ? std::ldexp(1024.0f + m, (int)e - 25) : std::ldexp((float)m, -24);
     const float size = e < 31 ? finite : m ? NAN : INFINITY;
-    return h.u & 0x8000 ? -size : size;
+    return u & 0x8000 ? -size : size;
 }
+static const std::vector<float> halves = [] {
+    std::vector<float> all(1 << 16);
+    for (unsigned u = 0; u < all.size(); ++u) all[u] = of_bits(u);
+    return all;
+}();
+static float half_to_float(half h) { return halves[h.u]; }
 static half float_to_half(float x) {
     const unsigned short sign = std::signbit(x) ? 0x8000 : 0;
     const float size = std::fabs(x);
@@ -105,29 +124,34 @@ static unsigned packed(float high, float low) {
 }
 static unsigned packed_relu(float high, float low) { return packed(high > 0 ? high : 0, low > 0 ? low : 0); }
 
-struct Phase { std::atomic<unsigned> done{0}; unsigned awaited = 0; };
+struct Phase { unsigned done = 0, awaited = 0; };
 static Phase phases[SLOTS];
-static std::vector<std::thread> copies;
-static std::mutex of_copies;
+struct Late { unsigned turn, to; const void* from; unsigned bytes, barrier; };
+static std::vector<Late> late;
 static Phase& phase_at(unsigned address) { return phases[(address - BARRIERS) / 8]; }
-static void start_phases(unsigned address) { phase_at(address).done = 0; phase_at(address).awaited = 0; }
+static void start_phases(unsigned address) { phase_at(address) = {}; }
 static void expect(unsigned address, unsigned bytes) {
     if (phase_at(address).awaited) { std::puts("a slot is filled twice"); std::_Exit(1); }
     phase_at(address).awaited = bytes;
 }
 static void copy_late(unsigned to, const void* from, unsigned bytes, unsigned barrier) {
-    const std::lock_guard<std::mutex> lock(of_copies);
-    copies.emplace_back([=] {
-        static std::atomic<unsigned> number{0};
-        std::this_thread::sleep_for(std::chrono::microseconds(number.fetch_add(1) * 7919 % 3000));
-        std::memcpy(block_memory + to, from, bytes);
-        phase_at(barrier).awaited = 0;
-        phase_at(barrier).done.fetch_add(1);
-    });
+    static unsigned number = 0;
+    late.push_back({turns + number++ * 7919 % 97, to, from, bytes, barrier});
+}
+static void copies_arrive() {
+    for (size_t n = 0; n < late.size();) {
+        const Late copy = late[n];
+        if (copy.turn > turns) { ++n; continue; }
+        std::memcpy(block_memory + copy.to, copy.from, copy.bytes);
+        phase_at(copy.barrier).awaited = 0;
+        ++phase_at(copy.barrier).done;
+        late.erase(late.begin() + n);
+        idle = 0;
+    }
 }
 static unsigned is_done(unsigned barrier, unsigned parity) {
     if ((phase_at(barrier).done & 1) != parity) return 1;
-    std::this_thread::yield();
+    next_fibre();
     return 0;
 }
 // D[16 w + g (+ 8)][8 j + 2 t (+ 1)] of a group's 64 x 256, A 16 inputs of its rows, B at a descriptor of 128-byte rows
@@ -158,7 +182,7 @@ template <class Sums, class A> static void tensor(Sums& sums, const A& a, unsign
 }
 // copies of 16 bytes, zeros behind those asked for: some arrive at once, the others when somebody waits for their group
 struct Copy { unsigned to; const void* from; int bytes; };
-static thread_local std::vector<std::vector<Copy>> groups(1);  // the last one is open
+static std::vector<std::vector<Copy>> groups_of[FIBRES];  // the last one is open
 static void arrive(const Copy& copy) {
     std::memset(block_memory + copy.to, 0, 16);
     std::memcpy(block_memory + copy.to, copy.from, copy.bytes);
@@ -166,10 +190,11 @@ static void arrive(const Copy& copy) {
 static void copy_16(unsigned to, const void* from, int bytes) {
     if (to % 16 || (size_t)from % 16) { std::puts("not at 16 bytes"); std::_Exit(1); }
     if (to / 16 * 2654435761u >> 31) arrive({to, from, bytes});
-    else groups.back().push_back({to, from, bytes});
+    else groups_of[threadIdx.x].back().push_back({to, from, bytes});
 }
-static void commit_copies() { groups.emplace_back(); }
+static void commit_copies() { groups_of[threadIdx.x].emplace_back(); }
 static void wait_copies(unsigned pending) {
+    auto& groups = groups_of[threadIdx.x];
     for (; groups.size() > pending + 1; groups.erase(groups.begin()))
         for (const Copy& copy : groups.front()) arrive(copy);
 }
@@ -219,15 +244,30 @@ template <class T> static void stored(const char* name, const std::vector<T>& wh
     std::fwrite(what.data(), sizeof(T), what.size(), file); std::fclose(file);
 }
 template <class F> static void on_blocks(unsigned blocks, F f) {
-    gridDim.x = blocks;
-    for (auto& barrier : of_warp) barrier = std::make_unique<std::barrier<>>(32);
+    static F* code; static bool done[FIBRES];
+    static std::vector<char> stacks((size_t)FIBRES << 18);
+    std::mt19937 random(blocks);
+    code = &f; gridDim.x = blocks;
     for (blockIdx.x = 0; blockIdx.x < blocks; ++blockIdx.x) {
-        std::vector<std::thread> threads;
-        for (unsigned n = 0; n < 256; ++n) threads.emplace_back([=] { threadIdx.x = n; f(); });
-        for (auto& thread : threads) thread.join();
-        for (auto& copy : copies) copy.join();
-        copies.clear();
+        unsigned left = FIBRES, order[FIBRES], rest[FIBRES / 32] = {};
+        for (unsigned n = 0; n < FIBRES; ++n) {
+            order[n] = n; done[n] = false; groups_of[n].assign(1, {});
+            getcontext(&fibres[n]);
+            fibres[n].uc_stack.ss_sp = &stacks[(size_t)n << 18]; fibres[n].uc_stack.ss_size = 1 << 18;
+            fibres[n].uc_link = &scheduler;
+            makecontext(&fibres[n], (void (*)())+[] { (*code)(); done[threadIdx.x] = true; idle = 0; }, 0);
+        }
+        for (idle = 0; left; ++turns, ++idle) {
+            if (idle > 10000) { std::puts("everybody waits"); std::_Exit(1); }
+            copies_arrive();
+            for (unsigned& turn : rest) turn = turn ? turn - 1 : random() % 8 ? 0 : random() % 8;
+            for (unsigned n = FIBRES - 1; n; --n) std::swap(order[n], order[random() % (n + 1)]);
+            for (unsigned n : order) if (!done[n] && !rest[n / 32]) {
+                threadIdx.x = n; swapcontext(&scheduler, &fibres[n]); left -= done[n];
+            }
+        }
     }
+    while (!late.empty()) { ++turns; copies_arrive(); }
 }
 """
 
@@ -320,9 +360,20 @@ def run(folder, program, function, *numbers):
     constants = {"MEMORY": wgmma.SHARED, "SLOTS": wgmma.SLOTS, "BARRIERS": wgmma._RING + wgmma._SUMS_OF_GROUPS}
     defined = "".join(f"#define {name} {value}\n" for name, value in {**constants, "BLOCKS": BLOCKS}.items())
     (folder / "block.cpp").write_text(defined + DEVICE + program.replace("CODE", for_threads(function.native_snippet)))
-    command = [COMPILER, "-std=c++20", "-O2", "-w", "-pthread", "block.cpp", "-o", "block"]
-    subprocess.run(command, cwd=folder, check=True, timeout=300)
-    subprocess.run([folder / "block", *map(str, numbers)], cwd=folder, check=True, timeout=300)
+    subprocess.run([compiled(folder), *map(str, numbers)], cwd=folder, check=True, timeout=300)
+
+
+def compiled(folder):
+    """The program of a folder's block.cpp, which all tests and workers of a session compile once."""
+    session = folder.parent.parent if "PYTEST_XDIST_WORKER" in os.environ else folder.parent
+    program = session / f"block-{hashlib.sha256((folder / 'block.cpp').read_bytes()).hexdigest()[:16]}"
+    with (session / f"{program.name}.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not program.exists():
+            command = [COMPILER, "-std=c++20", "-O2", "-w", "block.cpp", "-o", "block"]
+            subprocess.run(command, cwd=folder, check=True, timeout=300)
+            (folder / "block").rename(program)
+    return program
 
 
 def stored(folder, **arrays):
