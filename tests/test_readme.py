@@ -1,4 +1,4 @@
-"""Every `gftorf simulate` line of the README is run at a tiny size; other commands are at least what may be typed."""
+"""Every `gftorf simulate` line of README.md and docs/simulate.md is run at a tiny size; other commands are parsed."""
 
 import re
 import shlex
@@ -11,16 +11,16 @@ from gftorf_warp.data.sequence import Sequence
 from gftorf_warp.sim.ladder import NAMES
 
 REPOSITORY = Path(__file__).parents[1]
-README = (REPOSITORY / "README.md").read_text(encoding="utf-8")
+README, PAGE = ((REPOSITORY / name).read_text(encoding="utf-8") for name in ("README.md", "docs/simulate.md"))
 LINES = sorted(
-    {line.partition("#")[0].strip() for line in re.findall(r"(?:^|`)(gftorf [^`\n]*)", README, re.MULTILINE)}
+    {line.partition("#")[0].strip() for line in re.findall(r"(?:^|`)(gftorf [^`\n]*)", README + PAGE, re.MULTILINE)}
 )
 SIMULATE = [line for line in LINES if line.startswith("gftorf simulate ") and "--out" in line and "SCENE" not in line]
 
 
 @pytest.mark.parametrize("line", SIMULATE)
-def test_a_simulation_of_the_readme_runs(line, tmp_path, monkeypatch):
-    """As it is printed, but for size, number of raw frames and folder; truth lies beside."""
+def test_a_simulation_of_the_pages_runs(line, tmp_path, monkeypatch):
+    """As it is printed, but for size, number of raw frames and folder; with its truth."""
     monkeypatch.chdir(REPOSITORY)
     words = shlex.split(line)[1:]
     words[words.index("--out") + 1] = out = str(tmp_path / "seq")
@@ -37,10 +37,10 @@ def test_a_simulation_of_the_readme_runs(line, tmp_path, monkeypatch):
         "--format torf": sequence.from_phasors,
         "--flow": bool(sequence.forward_flow),
     }
-    assert all(there for option, there in wanted.items() if option in line)
+    assert all(written for option, written in wanted.items() if option in line)
 
 
-def test_the_readme_tells_of_everything_there_is_to_simulate():
+def test_the_pages_show_everything_that_can_be_simulated():
     """Meshes, gloss, blur, bounces, sensors, levels, captures, phasors, resuming; every option of the command."""
     for word in (
         ".toml",
@@ -62,7 +62,7 @@ def test_the_readme_tells_of_everything_there_is_to_simulate():
     assert all(f"`{name}`" in README for name in SENSORS)
 
 
-def test_what_the_readme_says_may_be_typed():
+def test_printed_commands_can_be_parsed():
     """Options that are printed exist."""
     commands = options.command_parsers()
     typed = [
