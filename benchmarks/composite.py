@@ -36,7 +36,7 @@ class Ours:
         self.inputs = inputs_of(scene, device)
         settings = RenderSettings(near=NEAR, far=FAR, threads=threads)
         self.frame = Frame(len(scene["mean"]), WIDTH, HEIGHT, settings, wp.get_device(device))
-        self.view = launch.view_of(CAMERA, settings)
+        self.view = launch.uploaded(CAMERA, (), settings, self.frame.device)
         stages.project(self.inputs, self.view, self.frame)
         stages.sort_by_depth(self.frame)
         stages.sort_by_tile(self.frame)
@@ -53,7 +53,7 @@ class Ours:
 
     def forward(self) -> None:
         """Blend."""
-        stages.composite(self.frame, self.view, 0)
+        stages.composite(self.frame, 0)
 
     def backward(self) -> None:
         """Blend backward, gradient records zeroed."""

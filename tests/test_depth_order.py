@@ -47,7 +47,7 @@ def ordered(z, settings, device, opacity=0.5):
         "reflectivity": np.full(count, 0.5),
     }
     frame = Frame(count, SMALL.width, SMALL.height, settings, wp.get_device(device))
-    stages.project(inputs_of(scene, device), launch.view_of(SMALL, settings), frame)
+    stages.project(inputs_of(scene, device), launch.uploaded(SMALL, (), settings, frame.device), frame)
     keys = frame.depth_key.numpy()[:count].copy()
     stages.sort_by_depth(frame)
     return keys, frame.order.numpy()[:count]

@@ -88,7 +88,7 @@ def test_tape_and_torch_agree_and_the_tape_accumulates(device):
     inputs = Inputs(**arrays, calibration=calibration)
     frame = Frame(COUNT, WIDTH, HEIGHT, SETTINGS, wp_device)
     with wp.Tape() as tape:
-        launch.render(inputs, launch.view_of(CAMERA, SETTINGS), SHIFTS, frame, images)
+        launch.render(inputs, launch.uploaded(CAMERA, SHIFTS, SETTINGS, wp_device), frame, images)
     for name, image in wanted_images.items():
         torch.testing.assert_close(wp.to_torch(getattr(images, name)), image.detach())
 
@@ -130,7 +130,8 @@ def test_a_reserved_rendering_never_waits_for_the_host():
     """With a reserve of pairs, forward and backward can be captured in a CUDA graph, and its replay sees new inputs."""
     field, _, _ = scene("cuda")
     settings = RenderSettings(near=0.1, far=20.0, pair_capacity=20_000)
-    view, device = launch.view_of(CAMERA, settings), wp.get_device("cuda:0")
+    device = wp.get_device("cuda:0")
+    view = launch.uploaded(CAMERA, SHIFTS, settings, device)
     tensors = {name: t.clone() for name, t in field.parameters().items()}
     arrays = {name: wp.from_torch(t, dtype=VECTORS.get(name, wp.float32)) for name, t in tensors.items()}
     values = [float(v) for v in (SENSOR.phase_slope, SENSOR.phase_offset, SENSOR.source_intensity, SENSOR.dc_offset)]
@@ -142,8 +143,8 @@ def test_a_reserved_rendering_never_waits_for_the_host():
     frame = Frame(COUNT, WIDTH, HEIGHT, settings, device)
 
     def both():
-        launch.forward(inputs, view, SHIFTS, frame, images)
-        launch.backward(inputs, view, SHIFTS, frame, seeds, wanted)
+        launch.forward(inputs, view, frame, images)
+        launch.backward(inputs, view, frame, seeds, wanted)
 
     both()
     with wp.ScopedCapture(device=device) as capture:

@@ -91,15 +91,15 @@ class Case:
         """A fresh frame with room for ``capacity`` pairs."""
         settings = RenderSettings(near=NEAR, far=FAR, pair_capacity=capacity)
         self.frame = Frame(self.count, WIDTH, HEIGHT, settings, self.device)
-        self.view = launch.view_of(CAMERA, settings)
+        self.view = launch.uploaded(CAMERA, self.shifts, settings, self.device)
 
     def forward(self) -> None:
         """Render."""
-        launch.forward(self.inputs, self.view, self.shifts, self.frame, self.images)
+        launch.forward(self.inputs, self.view, self.frame, self.images)
 
     def backward(self) -> None:
         """Differentiate; the forward pass has run."""
-        launch.backward(self.inputs, self.view, self.shifts, self.frame, self.cotangents, self.wanted)
+        launch.backward(self.inputs, self.view, self.frame, self.cotangents, self.wanted)
 
     def both(self) -> None:
         """Forward and backward."""

@@ -31,6 +31,17 @@ class CameraView:
 
 
 @wp.func
+def camera_of(view: wp.array[CameraView]) -> CameraView:
+    """The one camera of an array."""
+    return view[0]
+
+
+@wp.func_grad(camera_of)
+def adj_camera_of(view: wp.array[CameraView], adj_ret: CameraView):
+    """No derivative: what the generated adjoint computes for the camera is dead code."""
+
+
+@wp.func
 def rotation_of(wxyz: wp.vec4) -> wp.mat33:
     """Rotation matrix of a quaternion in the order of the program; it need not have unit length."""
     q = wp.normalize(wxyz)

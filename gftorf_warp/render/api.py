@@ -15,6 +15,7 @@ from ..scene.gaussians import GaussianField
 from ..scene.sensor import Sensor
 from .bridge import IMAGES, INPUTS, Rasterize, Request, left_out
 from .buffers import RenderSettings, Workspace
+from .device_camera import DeviceCamera, check
 from .inputs import CHOICES, wanted_images
 
 
@@ -93,6 +94,7 @@ def rasterize(
     images: Collection[str] = CHOICES,
     screen_gradient: bool = False,
     workspace: Workspace | None = None,
+    control: DeviceCamera | None = None,
 ) -> Rendering:
     """Render Gaussians into everything a C-ToF pixel could record (paper, equations 3-5).
 
@@ -112,6 +114,8 @@ def rasterize(
             above all distortion.
         screen_gradient: Whether ``Rendering.screen`` is wanted.
         workspace: Memory to render in, for whoever does so again and again; None: each rendering has its own.
+        control: Pose, intrinsics, calibration and shifts in device memory, in place of those of ``camera`` and
+            ``sensor``, whose size, kind of lens and number of shifts still count; None: they are uploaded.
 
     Raises:
         ValueError: If a tensor is not float32 or lives elsewhere than the field, or there is no such image.
@@ -129,7 +133,9 @@ def rasterize(
         value = getattr(background, name)
         if value is not None and not (name == "colour" and field.colour_sh is None):
             tensors[f"background_{name}"] = _spread(f"background.{name}", value, (number, *size), field)
-    tensors["calibration"] = _calibration(sensor, field)
+    if control is not None:
+        check(control, len(sensor.shifts), field.device)
+    tensors["calibration"] = _calibration(sensor, field) if control is None else control.calibration
     for name, tensor in tensors.items():
         if tensor is not None and (tensor.dtype != torch.float32 or tensor.device != field.device):
             want = f"float32 on {field.device}, where the field is"
@@ -144,6 +150,7 @@ def rasterize(
         screen=screen,
         images=wanted_images(images),
         workspace=workspace,
+        control=control,
         extra_detached=extra_detached,
     )
     found = dict(zip(IMAGES, Rasterize.apply(request, *ordered), strict=True))

@@ -14,10 +14,12 @@ import warp as wp
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from ..kernels.geometry import CameraView
 from ..scene.camera import Camera
 from . import launch
 from .buffers import Frame, RenderSettings, Workspace
-from .inputs import Images, Inputs, names_of, shapes_of
+from .device_camera import DeviceCamera
+from .inputs import Images, Inputs, View, names_of, shapes_of
 
 INPUTS = names_of(Inputs)
 IMAGES = names_of(Images)
@@ -31,9 +33,11 @@ class Request:
     """What is rendered, and how, besides tensors with a derivative."""
 
     camera: Camera
-    """Where from."""
+    """Its size, and whether its lens distorts; without ``control`` all of it."""
     shifts: tuple[float, ...]
-    """Phase shifts of the quads [rad]."""
+    """Phase shifts of the quads [rad]; with ``control`` only their number counts."""
+    control: DeviceCamera | None = None
+    """Camera and shifts in device memory; None: uploaded from ``camera`` and ``shifts``."""
     settings: RenderSettings
     """How."""
     screen: Tensor | None = None
@@ -74,9 +78,9 @@ class Rasterize(torch.autograd.Function):
             device = wp.device_from_torch(mean.device)
             kind = len(mean), camera.width, camera.height, request.settings, device
             frame = Frame(*kind) if request.workspace is None else request.workspace.frame(*kind)
-            view = launch.view_of(camera, request.settings)
+            view = _view(request, device)
             learns = any(ctx.needs_input_grad)  # otherwise these are the launches of a replay
-            launch.forward(_inputs(named), view, shifts, frame, _images(images), differentiable=learns)
+            launch.forward(_inputs(named), view, frame, _images(images), differentiable=learns)
         ctx.save_for_backward(*tensors)
         ctx.state = request, view, frame, frame.turns
         return tuple(images.get(name) for name in IMAGES)
@@ -89,18 +93,28 @@ class Rasterize(torch.autograd.Function):
         request, view, frame, turn = ctx.state
         if frame.turns != turn:
             raise ValueError("its workspace has rendered again since: call backward before the next rendering with it")
-        shifts, screen = request.shifts, request.screen
+        screen = request.screen
         needed = dict(zip(INPUTS, ctx.needs_input_grad[1:], strict=True))
         wanted = _zeros_like({name: named[name] for name in INPUTS if needed[name]})
         cotangents = {name: g.contiguous() for name, g in zip(IMAGES, grads, strict=True) if g is not None}
         if cotangents and wanted:
             with stream_of(named["mean"]):
-                arrays = _inputs(named), view, shifts, frame, _images(cotangents), _inputs(wanted)
+                arrays = _inputs(named), view, frame, _images(cotangents), _inputs(wanted)
                 records = launch.backward(*arrays, extra_detached=request.extra_detached)
                 if screen is not None and len(screen):
                     pairs = wp.to_torch(records).unflatten(1, (-1, 2))  # of slots: the first and the fourth
                     screen.view(-1, 2, 2).copy_(pairs[:, 0:4:3])
         return None, *(wanted.get(name) for name in INPUTS)
+
+
+def _view(request: Request, device: wp.Device) -> View:
+    """Camera and shifts as kernels read them; arrays of ``control`` are those of its tensors."""
+    camera, control = request.camera, request.control
+    if control is None:
+        return launch.uploaded(camera, request.shifts, request.settings, device)
+    pointer = control.view.data_ptr()
+    view = wp.array(ptr=pointer, dtype=CameraView, shape=(1,), device=device)
+    return View(camera=view, shifts=array_over(control.shifts, wp.vec2), lens=bool(camera.distortion))
 
 
 def _zeros_like(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:

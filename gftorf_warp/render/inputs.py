@@ -28,6 +28,18 @@ class Inputs:
     extra: wp.array | None = None  # [N, D]
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class View:
+    """Camera and shifts of a rendering, read from device memory when its kernels run; without a derivative."""
+
+    camera: wp.array
+    """[1] CameraView."""
+    shifts: wp.array
+    """[Q] vec2, (cos, sin) of the phase shifts."""
+    lens: bool
+    """Whether the camera distorts: another kernel projects."""
+
+
 @dataclass(kw_only=True, eq=False)
 class Images:
     """Everything a rendering fills, row-major, None where it is not wanted; of a gradient set: where it is zero."""

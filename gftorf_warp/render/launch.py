@@ -4,7 +4,7 @@ A Warp program renders with
 
     frame = Frame(count, width, height, settings, device)
     with wp.Tape() as tape:
-        render(inputs, view, shifts, frame, images)
+        render(inputs, uploaded(camera, shifts, settings, device), frame, images)
     tape.backward(grads={images.quads: ...})
 
 and finds gradients added to the ``.grad`` of its inputs. torch programs come through bridge.py.
@@ -12,7 +12,10 @@ and finds gradients added to the ``.grad`` of its inputs. torch programs come th
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import astuple
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -24,9 +27,12 @@ from ..kernels.rasterise.composite import CHANNEL_PLANES
 from ..scene.camera import Camera
 from . import stages
 from .buffers import Frame, RenderSettings
-from .inputs import Images, Inputs, channel_groups, gradients_in, names_of, present_in
+from .inputs import Images, Inputs, View, channel_groups, gradients_in, names_of, present_in
 
-__all__ = ["Images", "Inputs", "backward", "forward", "render", "view_of"]
+__all__ = ["Images", "Inputs", "backward", "forward", "render", "uploaded", "view_bits", "view_of"]
+
+VIEW_DTYPE = np.dtype(CameraView.numpy_dtype())
+UPLOADED_MAX = 1024  # cameras that are kept on devices, some 150 bytes each
 
 
 def view_of(camera: Camera, settings: RenderSettings) -> CameraView:
@@ -44,12 +50,33 @@ def view_of(camera: Camera, settings: RenderSettings) -> CameraView:
     return view
 
 
-def render(inputs: Inputs, view: CameraView, shifts: tuple[float, ...], frame: Frame, images: Images) -> None:
+def view_bits(camera: Camera, settings: RenderSettings) -> np.ndarray:
+    """[1] the same as a record of NumPy, laid out as on a device."""
+    return np.array([view_of(camera, settings).numpy_value()], dtype=VIEW_DTYPE)
+
+
+def uploaded(camera: Camera, shifts: Sequence[float], settings: RenderSettings, device: wp.Device) -> View:
+    """Camera and shifts [rad] in device memory; copied once, however often they are rendered."""
+    return _uploaded(view_bits(camera, settings).tobytes(), tuple(shifts), bool(camera.distortion), str(device))
+
+
+@lru_cache(maxsize=UPLOADED_MAX)
+def _uploaded(bits: bytes, shifts: tuple[float, ...], lens: bool, device: str) -> View:
+    camera = np.frombuffer(bits, dtype=VIEW_DTYPE)
+    vectors = np.array([(math.cos(shift), math.sin(shift)) for shift in shifts], dtype=np.float32).reshape(-1, 2)
+    return View(
+        camera=wp.array(camera, dtype=CameraView, device=device),
+        shifts=wp.array(vectors, dtype=wp.vec2, device=device),
+        lens=lens,
+    )
+
+
+def render(inputs: Inputs, view: View, frame: Frame, images: Images) -> None:
     """Fill those of ``images`` that are there.
 
     On an active ``wp.Tape`` also record the adjoint, which adds to the ``.grad`` of the inputs.
     """
-    forward(inputs, view, shifts, frame, images)
+    forward(inputs, view, frame, images)
     tape = wp._src.context.runtime.tape  # the public API has no name for the active tape
     if tape is not None:
         arrays = [a for group in (inputs, images) for a in present_in(group).values() if a.requires_grad]
@@ -57,15 +84,14 @@ def render(inputs: Inputs, view: CameraView, shifts: tuple[float, ...], frame: F
         def adjoint():
             cotangents = Images(**dict.fromkeys(names_of(Images)) | gradients_in(images))
             wanted = Inputs(**dict.fromkeys(names_of(Inputs)) | gradients_in(inputs))
-            backward(inputs, view, shifts, frame, cotangents, wanted)
+            backward(inputs, view, frame, cotangents, wanted)
 
         tape.record_func(adjoint, arrays)
 
 
 def forward(
     inputs: Inputs,
-    view: CameraView,
-    shifts: tuple[float, ...],
+    view: View,
     frame: Frame,
     images: Images,
     *,
@@ -89,14 +115,13 @@ def forward(
     else:
         frame.first.zero_()
     for number in [0, *range(max(1, frame.groups_with_light), len(frame.records))]:
-        stages.composite(frame, view, number, images.distortion is not None, differentiable=differentiable)
-    stages.resolve_images(inputs, shifts, frame, images, groups)
+        stages.composite(frame, number, images.distortion is not None, differentiable=differentiable)
+    stages.resolve_images(inputs, view, frame, images, groups)
 
 
 def backward(
     inputs: Inputs,
-    view: CameraView,
-    shifts: tuple[float, ...],
+    view: View,
     frame: Frame,
     cotangents: Images,
     wanted: Inputs,
@@ -112,7 +137,7 @@ def backward(
         They belong to the frame.
     """
     groups = channel_groups(inputs)
-    grad_light, grad_channels = stages.fold_images(inputs, shifts, frame, cotangents, wanted, groups)
+    grad_light, grad_channels = stages.fold_images(inputs, view, frame, cotangents, wanted, groups)
     grad_splats = frame.zeros("gradient records", frame.count, splat.Splat)
     if not frame.count:
         return grad_splats

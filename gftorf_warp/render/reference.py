@@ -34,6 +34,7 @@ from ..scene.gaussians import GaussianField
 from ..scene.sensor import Sensor
 from .api import Background, Rendering, ScreenGradient
 from .buffers import ClampGradient, Distortion, RenderSettings, Stop, Support, Workspace
+from .device_camera import DeviceCamera
 from .inputs import CHOICES, wanted_images
 
 _PARITY_TILE = 16  # [px] side of the released code's tiles, to which Support.SIGMA3_TILE16 rounds out
@@ -72,11 +73,13 @@ def rasterize(
     images: Collection[str] = CHOICES,
     screen_gradient: bool = False,
     workspace: Workspace | None = None,  # noqa: ARG001
+    control: DeviceCamera | None = None,  # noqa: ARG001
 ) -> Rendering:
     """Oracle of :func:`gftorf_warp.render.api.rasterize`; computes in the dtype of the field.
 
     ``Rendering.screen`` is filled by ``backward()``, not by ``torch.autograd.grad`` with respect to tensors the image
-    positions do not depend on. ``workspace``, and ``pair_capacity`` and ``threads`` of the settings, mean nothing here.
+    positions do not depend on. ``workspace``, ``control``, and ``pair_capacity`` and ``threads`` of the settings are
+    ignored.
     """
     background = background or Background()
     height, width, q = camera.height, camera.width, len(sensor.shifts)

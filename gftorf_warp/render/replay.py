@@ -18,7 +18,6 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from ..kernels.geometry import CameraView
 from ..kernels.motion import move
 from ..scene.camera import Camera
 from ..scene.gaussians import GaussianField
@@ -28,7 +27,7 @@ from . import launch
 from .api import Rendering
 from .bridge import ALIGNED, array_over, left_out, stream_of, without_garbage_collection
 from .buffers import Frame, RenderSettings
-from .inputs import CHOICES, Images, Inputs, names_of, shapes_of, wanted_images
+from .inputs import CHOICES, Images, Inputs, View, names_of, shapes_of, wanted_images
 
 ROOM = 1.5  # pairs that are reserved, over the most that were needed so far
 CAMERAS_MAX = 16  # that are kept, with their graphs
@@ -52,7 +51,7 @@ class Target:
 class _View:
     """A camera that was used before."""
 
-    view: CameraView
+    view: View
     target: Target
     move: wp.Launch | None  # of the Gaussians, to a time that is filled in; None: there are none
     used: int = 0
@@ -203,7 +202,7 @@ class Replay:
     def _draw(self, seen: _View) -> None:
         """What a graph holds: a rendering, and the number of its pairs."""
         frame = seen.target.frame
-        launch.forward(self._inputs, seen.view, self.shifts, frame, seen.target.images, differentiable=False)
+        launch.forward(self._inputs, seen.view, frame, seen.target.images, differentiable=False)
         if self.count:
             noted = [self._largest, seen.target.pairs]
             wp.launch(move.note_largest, 1, [frame.total], noted, device=self.device, record_tape=False)
@@ -220,7 +219,7 @@ class Replay:
             size = camera.height, camera.width
             if size not in self._targets:
                 self._targets[size] = self._target(*size)
-            view = launch.view_of(camera, self.settings)
+            view = launch.uploaded(camera, self.shifts, self.settings, self.device)
             inputs = [*self._rest, 0, 0.0, self._optimised, _row(camera)]
             where = {"device": self.device, "record_tape": False}
             # packed once: that is what a launch costs a host

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from functools import cache
 
 import warp as wp
 
-from ..kernels.geometry import CameraView
 from ..kernels.rasterise import depth_bins, deterministic_sums, planes_to_images, splat, tile_bitmask, tiles
 from ..kernels.rasterise.composite import CHANNEL_PLANES, make_composite
 from ..kernels.rasterise.composite_backward import (
@@ -19,19 +17,19 @@ from ..kernels.rasterise.composite_backward import (
 from ..kernels.rasterise.list_segments import PLANES
 from ..kernels.rasterise.project import make_project
 from .buffers import ClampGradient, Distortion, Frame, Planes, Stop, Support
-from .inputs import Images, Inputs
+from .inputs import Images, Inputs, View
 from .side_by_side import over_tiles, tile_edges
 
 _PROJECTED = ("mean", "log_scale", "quaternion", "opacity_logit", "reflectivity_sh", "colour_sh")
 
 
-def project(inputs: Inputs, view: CameraView, frame: Frame) -> None:
+def project(inputs: Inputs, view: View, frame: Frame) -> None:
     """Gaussians to splats, depth keys and image regions."""
     kernel = _project_kernel(inputs, view, frame)
     _launch(kernel, frame.count, _project_inputs(inputs, view, frame), _project_outputs(frame))
 
 
-def project_backward(inputs: Inputs, view: CameraView, frame: Frame, grad_splats: wp.array, wanted: Inputs) -> None:
+def project_backward(inputs: Inputs, view: View, frame: Frame, grad_splats: wp.array, wanted: Inputs) -> None:
     """Gradient records of splats to gradients of Gaussians and calibration: Warp's adjoint of the same kernel."""
     adjoint = [getattr(wanted, name) for name in _PROJECTED]
     if any(array is not None for array in [*adjoint, wanted.calibration]):
@@ -41,22 +39,22 @@ def project_backward(inputs: Inputs, view: CameraView, frame: Frame, grad_splats
             _project_inputs(inputs, view, frame),
             _project_outputs(frame),
             adjoint=True,
-            adj_inputs=[CameraView(), wanted.calibration, None, None, None, *adjoint],
+            adj_inputs=[None, wanted.calibration, None, None, None, *adjoint],
             adj_outputs=[grad_splats, None, None, None],
         )
 
 
-def _project_kernel(inputs: Inputs, view: CameraView, frame: Frame):
-    settings = frame.settings
-    return make_project(inputs.colour_sh is not None, settings.support == Support.SIGMA3_TILE16, view.radius > 0.0)
+def _project_kernel(inputs: Inputs, view: View, frame: Frame):
+    square = frame.settings.support == Support.SIGMA3_TILE16
+    return make_project(inputs.colour_sh is not None, square, view.lens)
 
 
-def _project_inputs(inputs: Inputs, view: CameraView, frame: Frame) -> list:
+def _project_inputs(inputs: Inputs, view: View, frame: Frame) -> list:
     colour_sh = inputs.colour_sh if inputs.colour_sh is not None else _nothing(frame, 2, wp.vec3)
     arrays = [getattr(inputs, name) for name in _PROJECTED[:-1]]
     settings = frame.settings
     keys = [frame.depth_shift, settings.depth_culled]
-    return [view, inputs.calibration, settings.sh_degree, *keys, *arrays, colour_sh]
+    return [view.camera, inputs.calibration, settings.sh_degree, *keys, *arrays, colour_sh]
 
 
 def _project_outputs(frame: Frame) -> list:
@@ -131,9 +129,7 @@ def _sum_counts(frame: Frame) -> int:
     return capacity
 
 
-def composite(
-    frame: Frame, view: CameraView, number: int, distortion: bool = True, *, differentiable: bool = True
-) -> None:
+def composite(frame: Frame, number: int, distortion: bool = True, *, differentiable: bool = True) -> None:
     """Blend all tiles: light with the first group of channels, or the first two, every further group by itself."""
     nothing, more = _nothing(frame, 3, frame.sums.lanes.dtype), number == 0 and frame.groups_with_light > 1
     light, channels = number == 0, bool(frame.channels)
@@ -148,7 +144,7 @@ def composite(
     channel = frame.channels[number].lanes if channels else nothing
     splats = _spread(frame, number)
     more_splats, more_channel = (_spread(frame, 1), frame.channels[1].lanes) if more else (splats, nothing)
-    lists = [frame.first, frame.ids, splats, frame.tiles_x, view.width, view.height]
+    lists = [frame.first, frame.ids, splats, frame.tiles_x, frame.width, frame.height]
 
     def arguments(tile0: int, _part: int) -> list:
         outputs = [frame.sums.lanes, channel, more_channel, _states(frame, parts)]
@@ -247,12 +243,11 @@ def finish(frame: Frame, grad_splats: wp.array) -> None:
     _launch(finish_moments, frame.count, [frame.splats], [grad_splats])
 
 
-def resolve_images(inputs: Inputs, shifts, frame: Frame, images: Images, groups: list) -> None:
+def resolve_images(inputs: Inputs, view: View, frame: Frame, images: Images, groups: list) -> None:
     """Planes to images."""
     pixels, sums, tiling = (frame.height, frame.width), frame.sums.flat, frame.tiling
-    if shifts and images.quads is not None:
-        vectors = _shift_vectors(shifts, str(frame.device))
-        lit = [sums, tiling, inputs.calibration, vectors, _or_nothing(frame, inputs.background_quads)]
+    if len(view.shifts) and images.quads is not None:
+        lit = [sums, tiling, inputs.calibration, view.shifts, _or_nothing(frame, inputs.background_quads)]
         _launch(planes_to_images.resolve_quads, pixels, lit, [images.quads])
     if images.phasor is not None:
         lit = [sums, tiling, frame.settings.phasor_factor, _or_nothing(frame, inputs.background_phasor)]
@@ -267,14 +262,13 @@ def resolve_images(inputs: Inputs, shifts, frame: Frame, images: Images, groups:
         _launch(planes_to_images.resolve_channels, pixels, rest, [getattr(images, name)])
 
 
-def fold_images(inputs: Inputs, shifts, frame: Frame, cotangents: Images, wanted: Inputs, groups: list):
+def fold_images(inputs: Inputs, view: View, frame: Frame, cotangents: Images, wanted: Inputs, groups: list):
     """Images to planes: the adjoint of :func:`resolve_images`. Channels without a gradient are None."""
     pixels, sums, tiling = (frame.height, frame.width), frame.sums.flat, frame.tiling
     planes = frame.gradient_planes("gradient of light", GRAD_LIGHT_PLANES, added=True)
     target = planes.flat
-    if cotangents.quads is not None and shifts:
-        vectors = _shift_vectors(shifts, str(frame.device))
-        lit = [sums, tiling, inputs.calibration, vectors, _or_nothing(frame, inputs.background_quads)]
+    if cotangents.quads is not None and len(view.shifts):
+        lit = [sums, tiling, inputs.calibration, view.shifts, _or_nothing(frame, inputs.background_quads)]
         outputs = [target, _or_nothing(frame, wanted.background_quads)]
         _launch(planes_to_images.fold_quads, pixels, [*lit, cotangents.quads], outputs)
         if wanted.calibration is not None:
@@ -309,12 +303,6 @@ def fold_images(inputs: Inputs, shifts, frame: Frame, cotangents: Images, wanted
 
 
 # -- helpers -----------------------------------------------------------------------------------------------------------
-
-
-@cache
-def _shift_vectors(shifts: tuple[float, ...], device: str) -> wp.array:
-    """(cos, sin) of phase shifts [rad], uploaded once."""
-    return wp.array([(math.cos(s), math.sin(s)) for s in shifts], dtype=wp.vec2, device=device)
 
 
 def _metric(frame: Frame, wanted: bool) -> bool | None:

@@ -6,6 +6,5 @@
     gradient_scaling      loss scaling of the output gradients before they are rounded to half precision
     weight_gradients      weight gradients of the hidden layers over the listed rows
     parameter_gradients   weight gradient of the head, and all parameter gradients out of partial sums
-
-``wgmma`` has the C++ of the two passes.
+    wgmma                 C++ of the forward and backward pass; no kernel of its own
 """

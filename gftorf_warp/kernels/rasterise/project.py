@@ -9,7 +9,7 @@ import warp as wp
 
 from ...constants import ALPHA_MIN, SH_BIAS
 from ..correlation import PHASE_OFFSET, PHASE_SLOPE, SOURCE_INTENSITY, light_of
-from ..geometry import CameraView, screen_covariance
+from ..geometry import CameraView, camera_of, screen_covariance
 from ..harmonics import harmonics
 from ..lens import bent_covariance, distorted
 from .splat import Splat
@@ -84,7 +84,7 @@ def make_project(colour: bool, square: bool, lens: bool = False):
     @wp.kernel(module="unique", module_options={"fast_math": False})  # __sinf would lose the phase beyond +-pi
     def project(
         # In:
-        view: CameraView,  # the camera [m, px]
+        view: wp.array[CameraView],  # [1] the camera [m, px]
         calibration: wp.array[float],  # [4] phase slope [rad/m], phase offset [rad], source intensity [1], DC offset
         degree: int,  # harmonics above it are ignored [0..3]
         depth_shift: int,  # lowest bits of a z-depth that its key leaves out [1]
@@ -103,29 +103,30 @@ def make_project(colour: bool, square: bool, lens: bool = False):
     ):
         """One thread per Gaussian."""
         n = wp.tid()
+        camera = camera_of(view)
         order[n] = n
         depth_key[n] = depth_culled
         box_px[n] = wp.vec4i(0, 0, 0, 0)
         opacity = 1.0 / (1.0 + wp.exp(-opacity_logit[n]))
-        local = view.rotation * mean[n] + view.translation
-        if local[2] < view.near or local[2] > view.far or opacity < ALPHA_MIN:
+        local = camera.rotation * mean[n] + camera.translation
+        if local[2] < camera.near or local[2] > camera.far or opacity < ALPHA_MIN:
             return
         log_sizes = log_scale[n]
         scale = wp.vec3(wp.exp(log_sizes[0]), wp.exp(log_sizes[1]), wp.exp(log_sizes[2]))
         if wp.static(lens):
-            cov = bent_covariance(view, local, quaternion[n], scale)
-            place = distorted(view, local[0] / local[2], local[1] / local[2])
-            x = view.fx * place[0] + view.cx
-            y = view.fy * place[1] + view.cy
+            cov = bent_covariance(camera, local, quaternion[n], scale)
+            place = distorted(camera, local[0] / local[2], local[1] / local[2])
+            x = camera.fx * place[0] + camera.cx
+            y = camera.fy * place[1] + camera.cy
         else:
-            cov = screen_covariance(view, local, quaternion[n], scale)
-            x = view.fx * local[0] / local[2] + view.cx
-            y = view.fy * local[1] / local[2] + view.cy
+            cov = screen_covariance(camera, local, quaternion[n], scale)
+            x = camera.fx * local[0] / local[2] + camera.cx
+            y = camera.fy * local[1] / local[2] + camera.cy
         determinant = cov[3]
         visit = visit_of(opacity, cov)
-        box = box_of(view, x, y, cov, -2.0 * visit[0])
+        box = box_of(camera, x, y, cov, -2.0 * visit[0])
         if wp.static(square):
-            outer = square_of(view, x - 0.5, y - 0.5, cov)
+            outer = square_of(camera, x - 0.5, y - 0.5, cov)
             box = wp.vec4i(
                 wp.max(box[0], outer[0]), wp.max(box[1], outer[1]), wp.min(box[2], outer[2]), wp.min(box[3], outer[3])
             )
@@ -133,10 +134,10 @@ def make_project(colour: bool, square: bool, lens: bool = False):
             return
         box_px[n] = box
         # bits of positive floats order like the floats
-        depth_key[n] = (wp.cast(local[2], wp.int32) - wp.cast(view.near, wp.int32)) >> depth_shift
+        depth_key[n] = (wp.cast(local[2], wp.int32) - wp.cast(camera.near, wp.int32)) >> depth_shift
 
         distance = wp.length(local)
-        direction = (mean[n] - view.centre) / distance
+        direction = (mean[n] - camera.centre) / distance
         basis = harmonics(direction)
         active = (degree + 1) * (degree + 1)
         reflectivity = float(SH_BIAS)

@@ -5,6 +5,5 @@
     optical_flow       loss of the rendered optical flow, and its gradient
     step_end           whether a step counts, running sums, densification statistics
     adam               Adam for all tensors in one launch
-
-``ordered_sums`` has sums in a fixed order, which all of these use.
+    ordered_sums       sums in a fixed order, launched behind each of these
 """
