@@ -63,7 +63,6 @@ def modules(arch: int) -> dict[str, wp.Module]:
         "move": move.move_gaussians.module,
         "noise": noise.uniform_noise.module,
         "adam": adam.make_adam(1).module,
-        "displace": displace.displace.module,
         "encoding": encoding.encode.module,
         "finish": step_end.judge.module,
         "flow": optical_flow.flow_errors.module,
@@ -80,6 +79,9 @@ def modules(arch: int) -> dict[str, wp.Module]:
     if arch == wgmma.ARCHITECTURE:
         passes = perceptron.forward, perceptron.backward, perceptron.backward_listed
         found |= {title: kernel.module for title, kernel in zip(PASSES, passes, strict=True)}
+    for keys in (2, 3, 4):
+        for name, kernel in vars(displace.make_displace(keys)).items():
+            found[f"{name} {keys}"] = kernel.module
     window = image_similarity.make_similarity(1)
     for name in ("columns_of_products", "compare_images", "columns_of_slopes", "gradient_of_image"):
         found[name] = getattr(window, name).module

@@ -43,6 +43,7 @@ FREE = {"constants", "errors", "__version__"}
 HAS_BOTH = {  # the only modules that may know torch and Warp together
     "render/bridge.py": "a rendering, and its gradient",
     "render/fused.py": "what a step does beside rendering: other kernels and callers",
+    "render/displacement.py": "motion of torch, one kernel of Warp",
     "render/descent.py": "the end of a step: Adam and what judges it, of many tensors at once",
     "render/replay.py": "renderings of a finished run: a field of torch, a graph of Warp",
     "render/perceptron.py": "layers of a network: torch's function around them, Warp's kernels in them",
@@ -53,6 +54,7 @@ LAUNCHES = {  # file: what it launches
     "render/side_by_side.py": "its launches over ranges of tiles",
     "render/training.py": "what a step does beside rendering",
     "render/perceptron.py": "a network's layers, before anything is rendered",
+    "render/displacement.py": "Gaussians at a time, before they are rendered",
     "render/replay.py": "Gaussians at a time, before they are rendered again",
     "render/trace.py": "rays through meshes, which share nothing with a rendering",
 }

@@ -20,7 +20,8 @@ from torch.autograd.function import once_differentiable
 
 from ..kernels.training.image_similarity import MOMENTS, REACH, SLOPES, SUMS
 from ..scene.camera import Camera
-from . import training
+from ..scene.motion import KeyMotion
+from . import displacement, training
 from .bridge import array_over, stream_of
 
 LARGEST = 1e18  # radius of a lens that is none: its square is a float32, too
@@ -230,50 +231,12 @@ def _views(camera: Camera, later: tuple[Camera, ...], device: torch.device) -> T
 def displaced(
     mean: Float[Tensor, "N 3"], offsets: Float[Tensor, "K N 3"], share: Float[Tensor, "1"], *, channels: bool
 ) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N D"] | None]:
-    """Centres between the first two keys, and the way from the first key to every other one.
-
-    Differentiable once, in ``mean`` and ``offsets``.
-
-    Args:
-        mean: Where nothing has moved [m].
-        offsets: Displacements [m] at K = 2 or 3 keys.
-        share: Of the way from the first key to the second; read when the kernel runs.
-        channels: Whether the second result is wanted, D = 3 (K - 1).
-    """
-    moved, ways = _Displaced.apply(mean.contiguous(), offsets.contiguous(), share, channels)
-    return moved, ways if channels else None
-
-
-class _Displaced(torch.autograd.Function):
-    """One launch forward, one backward."""
-
-    @staticmethod
-    def forward(ctx: Any, mean: Tensor, offsets: Tensor, share: Tensor, channels: bool) -> tuple[Tensor, Tensor]:
-        ctx.set_materialize_grads(False)
-        keys, count, _ = offsets.shape
-        moved, ways = torch.empty_like(mean), mean.new_empty(count if channels else 0, keys - 1, 3)
-        with stream_of(mean):
-            arrays = array_over(mean, wp.vec3), array_over(offsets, wp.vec3), array_over(share)
-            training.displaced(*arrays, array_over(moved, wp.vec3), array_over(ways, wp.vec3))
-        ctx.save_for_backward(share)
-        ctx.shape = offsets.shape
-        return moved, ways.flatten(1)
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, by_moved: Tensor | None, by_ways: Tensor | None) -> tuple[Tensor | None, ...]:
-        (share,) = ctx.saved_tensors
-        given = by_moved if by_moved is not None else by_ways
-        if given is None or not ctx.needs_input_grad[1]:
-            return by_moved, None, None, None
-        grad, (keys, count, _) = given.new_empty(ctx.shape), ctx.shape
-        none = given.new_empty(0, 3)
-        moved = none if by_moved is None else by_moved.contiguous()
-        ways = none[:, None] if by_ways is None else by_ways.contiguous().view(count, keys - 1, 3)
-        with stream_of(grad):
-            cotangents = array_over(moved, wp.vec3), array_over(ways, wp.vec3)
-            training.displaced_backward(array_over(share), *cotangents, array_over(grad, wp.vec3))
-        return by_moved, grad, None, None
+    """Centres between the first two of K = 2 or 3 keys, and displacements from the first key to every other one."""
+    rest = share.new_zeros(len(offsets) - 2)
+    ways = torch.eye(len(offsets), device=share.device)[1:] - torch.eye(len(offsets), device=share.device)[:1]
+    weights = torch.cat([torch.cat([1.0 - share, share, rest])[None], ways])
+    moved, _, flows = displacement.displaced(mean, mean, KeyMotion(offsets, None), weights, channels=channels)
+    return moved, flows
 
 
 def uniform(

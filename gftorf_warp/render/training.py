@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import warp as wp
 
-from ..kernels.motion import displace
 from ..kernels.training import adam, image_similarity, noise, optical_flow, ordered_sums, step_end
 
 BLOCK = 16  # pixels of a row, or elements of a tensor, that one CPU thread works on
@@ -109,16 +108,6 @@ def flow_loss_backward(
     """Fill ``grad`` [3F, H, W] with the gradient by ``displacement`` times ``cotangent`` [1]."""
     inputs = [distance, displacement, measured, row, views, 0.5 / distance.size, cotangent]
     _launch(optical_flow.flow_gradient, (views.shape[0], distance.size), inputs, [grad])
-
-
-def displaced(mean: wp.array, offsets: wp.array, share: wp.array, moved: wp.array, channels: wp.array) -> None:
-    """Fill ``moved`` [N] and ``channels`` [N, K - 1] from offsets [K, N]; see ``kernels/motion/displace.py``."""
-    _launch(displace.displace, len(mean), [mean, offsets, share], [moved, channels])
-
-
-def displaced_backward(share: wp.array, by_moved: wp.array, by_channels: wp.array, grad: wp.array) -> None:
-    """Fill ``grad`` [K, N] by the offsets; an empty cotangent is zero."""
-    _launch(displace.displace_backward, grad.shape[1], [share, by_moved, by_channels], [grad])
 
 
 def _means(partials: wp.array, scale: float, out: wp.array) -> None:

@@ -94,11 +94,14 @@ class MotionStart:
     """For random weights, on the CPU."""
 
 
-class Keys(NamedTuple):
+@dataclass(frozen=True)
+class Keys:
     """The keys that a time depends on."""
 
     index: tuple[int, ...]
+    """Their numbers."""
     weight: tuple[float, ...]
+    """Their interpolation weights [1]."""
 
 
 class KeyMotion(NamedTuple):

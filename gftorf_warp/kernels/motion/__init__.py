@@ -1,5 +1,5 @@
 """Gaussians displaced to a time.
 
-displace   centres between two keys, and displacements between keys as channels
+displace   centres, orientations and channels as weighted sums over keys, and their adjoint
 move       Gaussians of a finished run at a time and for a camera
 """
