@@ -13,8 +13,9 @@ import gc
 import logging
 import os
 import sys
+import threading
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING
 
 from . import __version__
@@ -37,12 +38,15 @@ def main(arguments: list[str] | None = None) -> int:
     """
     from .terminal import logging_to_stderr, print_error
 
-    given = sys.argv[1:] if arguments is None else list(arguments)
-    debug = "--debug" in given
-    if arguments is None:  # the process ends with the command, and garbage with it
-        atexit.register(gc.freeze)
+    if arguments is None:
+        codes: list[int] = []
+        atexit.register(_exit_at_once, codes)  # before all others, so that it runs after them
+        codes.append(main(sys.argv[1:]))
+        return codes[0]
+    debug = "--debug" in arguments
     try:
-        options = parse(given)
+        options = parse(list(arguments))
+        _open_cuda(getattr(options, "device", "cpu"))
         with logging_to_stderr(_level(options)), _cpus(getattr(options, "threads", None)):
             return COMMANDS[options.command](options)
     except SystemExit as stop:  # --help and --version
@@ -53,8 +57,7 @@ def main(arguments: list[str] | None = None) -> int:
     except (Exception, KeyboardInterrupt) as error:
         return print_error(error, debug=debug)
     finally:
-        if arguments is not None:  # the process goes on, with a collector as it was
-            gc.unfreeze()
+        gc.unfreeze()
 
 
 def choose_device(name: str) -> tuple[str, str]:
@@ -84,6 +87,34 @@ def choose_device(name: str) -> tuple[str, str]:
     if name == "auto":
         return "cpu", f"{reason}: fine, only slower"
     raise ResourceError(f"no device {name}", where="--device", why=reason, fix="leave --device out, or --device cpu")
+
+
+def _open_cuda(device: str) -> None:
+    """Create the CUDA context that torch and Warp will share in a thread, while they are imported."""
+    if device == "cpu":
+        return
+    os.environ.setdefault("CUDA_MODULE_LOADING", "LAZY")  # as torch does before it initialises the driver
+
+    def create() -> None:
+        import ctypes
+
+        with suppress(OSError, AttributeError):  # no driver: `choose_device` reports it
+            driver = ctypes.CDLL("libcuda.so.1")
+            ordinal, context = ctypes.c_int(), ctypes.c_void_p()
+            index = int(device.partition(":")[2] or 0)
+            if driver.cuInit(0) == 0 and driver.cuDeviceGet(ctypes.byref(ordinal), index) == 0:
+                driver.cuDevicePrimaryCtxRetain(ctypes.byref(context), ordinal)
+
+    threading.Thread(target=create, name="gftorf-cuda", daemon=True).start()
+
+
+def _exit_at_once(codes: list[int]) -> None:
+    """End the process with the exit code of its command, and without freeing modules and CUDA objects one by one."""
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(OSError, ValueError):
+            stream.flush()
+    if codes:
+        os._exit(codes[0])
 
 
 def start(options: argparse.Namespace, *, compile_first: bool = True) -> str:

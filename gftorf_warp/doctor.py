@@ -12,7 +12,7 @@ from pathlib import Path
 
 from . import __version__, terminal
 
-PACKAGES = ("torch", "warp-lang", "numpy", "opencv-contrib-python-headless", "matplotlib", "OpenEXR")
+PACKAGES = ("torch", "warp-lang", "numpy", "opencv-contrib-python-headless", "OpenEXR")
 DISTANCE = 2.0  # [m] of the Gaussian that is tested; in the first unambiguous range, where 1 cm is 8 mrad
 REFLECTIVITY = 0.7
 OPACITY = 0.8  # below the clamp of 0.99, and far from 1/255

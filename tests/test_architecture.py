@@ -36,7 +36,7 @@ TABLE = {  # room: (rooms it may import besides itself, packages it may import);
     "losses": ({"render"}, TORCH),
     "sim": ({"data", "kernels", "render", "scene"}, TORCH | {"trimesh"}),
     "recon": ({"data", "losses", "render", "scene"}, TORCH | {"cv2"}),
-    "evaluate": ({"data", "losses", "recon", "render", "scene"}, TORCH | {"cv2", "matplotlib"}),
+    "evaluate": ({"data", "losses", "recon", "render", "scene"}, TORCH | {"cv2"}),
     "bench": ({"data", "evaluate", "recon", "render", "scene", "sim"}, TORCH | {"warp"}),
 }
 FREE = {"constants", "errors", "__version__"}

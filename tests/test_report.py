@@ -253,8 +253,8 @@ def test_along_the_run_is_drawn_from_its_rows(compared):
 
 
 def drawn_texts(svg):
-    """Texts of a drawing, which are comments beside their outlines."""
-    return [text.strip() for text in re.findall(r"<!--(.*?)-->", svg.decode())]
+    """Texts of a drawing."""
+    return re.findall(r"<text[^>]*>(.*?)</text>", svg.decode())
 
 
 def test_views_that_nobody_took_are_shown(compared):

@@ -10,6 +10,7 @@ independent.
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -62,21 +63,30 @@ def compute_flow(sequence: Sequence, *, method: Method = "dis") -> Flow:
             why=f"expected at least {SMALLEST_PX}x{SMALLEST_PX} pixels, found {sequence.width}x{sequence.height}",
             fix="bring the flow as files, or use larger images",
         )
-    match = _matcher(method)
-    step = sequence.cycle
-    forward: dict[int, np.ndarray] = {}
-    backward: dict[int, np.ndarray] = {}
-    for n in range(sequence.frames - step):
-        if sequence.measured[n] and sequence.measured[n + step]:
-            first, second = _grey(sequence.quads[n], sequence.quads[n + step])
-            forward[n], backward[n + step] = match(first, second), match(second, first)
-    reliable_forward = {n: _consistent(flow, backward[n + step]) for n, flow in forward.items()}
-    reliable_backward = {n: _consistent(flow, forward[n - step]) for n, flow in backward.items()}
-    starts = range(0, sequence.frames, step)
-    return Flow(
-        forward={n: _combined(n, forward, reliable_forward, sequence.times, step) for n in starts if n in forward},
-        backward={n: _combined(n, backward, reliable_backward, sequence.times, -step) for n in starts if n in backward},
-    )
+    step, times, quads = sequence.cycle, sequence.times, sequence.quads
+    pairs = [n for n in range(sequence.frames - step) if sequence.measured[n] and sequence.measured[n + step]]
+
+    def matched(n: int) -> tuple[np.ndarray, ...]:
+        """Flow from n to n + K and back; each again, with NaN where they disagree."""
+        match = _matcher(method)  # holds buffers: one for each call
+        first, second = _grey(quads[n], quads[n + step])
+        there, back = match(first, second), match(second, first)
+        return there, back, _consistent(there, back), _consistent(back, there)
+
+    with ThreadPoolExecutor(thread_name_prefix="gftorf-flow") as threads:  # OpenCV releases Python's lock
+        found = dict(zip(pairs, threads.map(matched, pairs), strict=True))
+        forward, reliable_forward = ({n: flows[k] for n, flows in found.items()} for k in (0, 2))
+        backward, reliable_backward = ({n + step: flows[k] for n, flows in found.items()} for k in (1, 3))
+
+        def combined(raw: dict[int, np.ndarray], reliable: dict[int, np.ndarray], step: int) -> dict[int, np.ndarray]:
+            starts = [n for n in range(0, sequence.frames, abs(step)) if n in raw]
+            flows = threads.map(lambda n: _combined(n, raw, reliable, times, step), starts)
+            return dict(zip(starts, flows, strict=True))
+
+        return Flow(
+            forward=combined(forward, reliable_forward, step),
+            backward=combined(backward, reliable_backward, -step),
+        )
 
 
 def warp_back(image: Float[np.ndarray, "H W"], flow: Float[np.ndarray, "2 H W"]) -> Float[np.ndarray, "H W"]:

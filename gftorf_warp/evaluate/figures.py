@@ -1,36 +1,28 @@
-"""Curves and histograms as SVG files, the same bytes every time."""
+"""The curves and histograms of a report, as SVG files."""
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
+from .plot import Curve, Plot, svg
+
 COLOURS = {"closed_form": "#d55e00", "d": "#0072b2", "d_normalised": "#56b4e9", "d_tof": "#009e73"}  # Okabe and Ito
 NAMES = {"closed_form": "closed form", "d": "d", "d_normalised": "d / opacity", "d_tof": "d_ToF"}
+TERM_COLOURS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00", "#8c6d31", "#666666")
 NOT_LOSSES = {"images", "seconds", "gaussians", "quad_psnr_db", "opacity"}  # what else a log step holds
-LOG_SPAN = 20.0  # values that span more than this factor are drawn on a logarithmic axis
 FLOOR_M = 1e-3  # [m] smaller errors fall into the first bin of the histogram
-BINS = 60
-ALONG_COLUMNS = 3
-STATIC_CURVES = {  # key of a row of diagnostics: label, line, colour
-    "d_minus_dtof_static_m": (r"|d $-$ d_ToF|", "-", COLOURS["d"]),
-    "offset_static_m": ("length of the displacement", "--", COLOURS["d_normalised"]),
-}
-STYLE: dict[Any, Any] = {
-    "svg.hashsalt": "gftorf_warp",  # element ids would be random without
-    "font.size": 9.0,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "grid.alpha": 0.25,
-    "axes.titlesize": 10.0,
-    "axes.titleweight": "bold",
-    "legend.frameon": False,
-    "figure.constrained_layout.use": True,
+BINS = 59
+IMAGES = "optimised images"
+SQUARED = "m\N{SUPERSCRIPT TWO} \N{MULTIPLICATION SIGN} 100"
+DASHED, DOTTED = "5 3", "1.5 2"
+GROUPS = {"": ("all pixels", ""), "moving.": ("moving pixels", DASHED), "static.": ("static pixels", DOTTED)}
+SINGLE = {  # title and unit of a plot of one curve: key of the rows of diagnostics
+    ("Light let through", "mean of 1 \N{MINUS SIGN} opacity"): "transmittance",
+    ("Depth distortion", "m\N{SUPERSCRIPT TWO}"): "distortion",
+    ("Gaussians", "number N"): "gaussians",
 }
 
 
@@ -43,62 +35,46 @@ def training_curves(log: Sequence[Mapping[str, float]]) -> bytes | None:
     if not log:
         return None
     terms = [name for name in dict.fromkeys(key for step in log for key in step) if name not in NOT_LOSSES]
-
-    def draw(figure):
-        loss, psnr, count = figure.subplots(1, 3)
-        for name in terms:
-            x, y = _curve(log, name)
-            if (y > 0).any():
-                loss.plot(x, np.where(y > 0, y, np.nan), label=name, linewidth=1.4)
-        loss.set_yscale("log")
-        loss.set(title="Loss and its weighted terms", xlabel="optimised images", ylabel="value")
-        loss.legend(fontsize=8)
-        psnr.plot(*_curve(log, "quad_psnr_db"), color=COLOURS["d"])
-        psnr.set(title="Quad PSNR", xlabel="optimised images", ylabel="dB")
-        count.plot(*_curve(log, "gaussians"), color=COLOURS["d"])
-        count.set(title="Gaussians", xlabel="optimised images", ylabel="number N", ylim=(0, None))
-
-    return _svg(draw, 11.0, 2.9)
+    losses = [_curve(log, name, TERM_COLOURS[k % len(TERM_COLOURS)], name) for k, name in enumerate(terms)]
+    losses = [curve for curve in losses if (curve.y > 0).any()]
+    psnr, count = (_curve(log, name, COLOURS["d"]) for name in ("quad_psnr_db", "gaussians"))
+    plots = [
+        Plot(title="Loss and its weighted terms", x=IMAGES, y="value", curves=losses, log_y=True),
+        Plot(title="Quad PSNR", x=IMAGES, y="dB", curves=[psnr], from_zero=False),
+        Plot(title="Gaussians", x=IMAGES, y="number N", curves=[count], log_y=False),
+    ]
+    return svg([plot for plot in plots if plot.curves], columns=3, height=209)
 
 
 def along_run(rows: Sequence[Mapping[str, float]]) -> bytes | None:
-    """What diagnostics saw over optimised images: errors if truth is known, agreement, opacity, number of Gaussians.
+    """Diagnostics over optimised images: errors if the truth is known, agreement, opacity, number of Gaussians.
 
     Args:
         rows: Those of ``diagnostics.jsonl``, see recon/diagnostics.py.
     """
     if not rows:
         return None
-    errors = ("d", "d_tof")
-    plots = [(f"Error of {NAMES[name]}", r"m$^2$ $\times$ 100", _error_curves(name)) for name in errors]
-    plots.append(("On static pixels", "m", STATIC_CURVES))
-    plots.append(("Light let through", r"mean of 1 $-$ opacity", {"transmittance": ("T_e", "-", COLOURS["d"])}))
-    plots.append(("Depth distortion", "m$^2$", {"distortion": ("mean", "-", COLOURS["d"])}))
-    plots.append(("Gaussians", "number N", {"gaussians": ("N", "-", COLOURS["d"])}))
-    plots = [plot for plot in plots if any(row.get(key) is not None for row in rows for key in plot[2])]
-
-    def draw(figure):
-        axes = np.ravel(figure.subplots(-(-len(plots) // ALONG_COLUMNS), ALONG_COLUMNS))
-        for unused in axes[len(plots) :]:
-            unused.set_visible(False)
-        for plot, (title, unit, curves) in zip(axes, plots, strict=False):
-            drawn = []
-            for key, (label, line, colour) in curves.items():
-                x, y = _curve(rows, key)
-                if len(x):
-                    plot.plot(x, y, line, color=colour, label=label, linewidth=1.4)
-                    drawn.append(y)
-            _choose_axis(plot, np.concatenate(drawn))
-            plot.set(title=title, xlabel="optimised images", ylabel=unit)
-            if len(drawn) > 1:
-                plot.legend(fontsize=8)
-
-    return _svg(draw, 11.0, 2.7 * -(-len(plots) // ALONG_COLUMNS))
-
-
-def _error_curves(name: str) -> dict[str, tuple[str, str, str]]:
-    groups = {"": ("all pixels", "-"), "moving.": ("moving pixels", "--"), "static.": ("static pixels", ":")}
-    return {f"{prefix}{name}_mse_x100": (label, line, COLOURS[name]) for prefix, (label, line) in groups.items()}
+    plots = [
+        Plot(
+            title=f"Error of {NAMES[name]}",
+            x=IMAGES,
+            y=SQUARED,
+            curves=[
+                _curve(rows, f"{group}{name}_mse_x100", COLOURS[name], label, dashes)
+                for group, (label, dashes) in GROUPS.items()
+            ],
+        )
+        for name in ("d", "d_tof")
+    ]
+    static = [
+        _curve(rows, "d_minus_dtof_static_m", COLOURS["d"], "|d \N{MINUS SIGN} d_ToF|"),
+        _curve(rows, "offset_static_m", COLOURS["d_normalised"], "length of the displacement", DASHED),
+    ]
+    plots.append(Plot(title="On static pixels", x=IMAGES, y="m", curves=static))
+    for (title, unit), key in SINGLE.items():
+        plots.append(Plot(title=title, x=IMAGES, y=unit, curves=[_curve(rows, key, COLOURS["d"])]))
+    plots = [plot for plot in plots if any(len(curve.x) for curve in plot.curves)]
+    return svg(plots, columns=3, height=209)
 
 
 def error_over_frames(frames: Sequence[int], groups: Mapping[str, Mapping[str, Sequence[float | None]]]) -> bytes:
@@ -108,73 +84,73 @@ def error_over_frames(frames: Sequence[int], groups: Mapping[str, Mapping[str, S
         frames: The scored raw frames n.
         groups: For each group of pixels the errors [m^2 x 100] by the name of the distance, None where there are none.
     """
-
-    def draw(figure):
-        for plot, (group, errors) in zip(np.ravel(figure.subplots(1, len(groups))), groups.items(), strict=True):
-            rows = {name: np.array([np.nan if v is None else v for v in row], float) for name, row in errors.items()}
-            for name, row in rows.items():
-                plot.plot(frames, row, ".-", color=COLOURS[name], label=NAMES[name], linewidth=1.2, markersize=4)
-            _choose_axis(plot, np.concatenate(list(rows.values())))
-            plot.set(title=group, xlabel="raw frame n", ylabel=r"mean squared error [m$^2$ $\times$ 100]")
-        _legend(figure, plot)
-
-    return _svg(draw, 11.0, 3.0)
+    x = np.asarray(frames, dtype=float)
+    return _groups(
+        {
+            group: {
+                name: (x, np.array([np.nan if v is None else v for v in row], float)) for name, row in errors.items()
+            }
+            for group, errors in groups.items()
+        },
+        x="raw frame n",
+        y=f"mean squared error [{SQUARED}]",
+        points=True,
+    )
 
 
 def error_histogram(
     errors: Mapping[str, Float[np.ndarray, "S H W"]], groups: Mapping[str, Bool[np.ndarray, "S H W"]]
 ) -> bytes:
-    """How large the errors are, one plot per group of pixels: share of pixels over error [m], both logarithmic.
+    """How large the errors are, one plot per group of pixels: share of pixels over error [m] on a logarithmic axis.
 
     Args:
         errors: Squared errors [m^2] by the name of the distance, NaN where unknown.
         groups: Pixels to count, by name; each not empty.
     """
     top = max(10.0 * FLOOR_M, *(float(np.sqrt(np.nanmax(error))) for error in errors.values()))
-    edges = np.geomspace(FLOOR_M, top * 1.001, BINS)
+    edges = np.geomspace(FLOOR_M, top * 1.001, BINS + 1)
+    stairs = np.repeat(edges, 2)
+    drawn: dict[str, dict[str, tuple[np.ndarray, np.ndarray]]] = {group: {} for group in groups}
+    for name, error in errors.items():
+        with np.errstate(divide="ignore"):
+            place = np.log(error) * (0.5 / np.log(edges[1] / edges[0])) - np.log(FLOOR_M) / np.log(edges[1] / edges[0])
+        known = ~np.isnan(place)
+        bins = np.where(known, np.clip(place, 0, BINS - 1), 0).astype(np.uint8)
+        for group, mask in groups.items():
+            counts = np.bincount(bins[mask & known], minlength=BINS)
+            drawn[group][name] = stairs, np.concatenate([[0.0], np.repeat(counts / max(counts.sum(), 1), 2), [0.0]])
+    return _groups(drawn, x="absolute error [m]", y="share of these pixels", log_x=True, log_y=False)
 
-    def draw(figure):
-        for plot, (group, mask) in zip(np.ravel(figure.subplots(1, len(groups))), groups.items(), strict=True):
-            for name, error in errors.items():
-                size = np.sqrt(error[mask & ~np.isnan(error)])
-                counts, _ = np.histogram(np.maximum(size, FLOOR_M), bins=edges)
-                plot.stairs(counts / size.size, edges, color=COLOURS[name], label=NAMES[name], linewidth=1.4)
-            plot.set_xscale("log")
-            plot.set(title=group, xlabel="absolute error [m]", ylabel="share of these pixels")
-        _legend(figure, plot)
 
-    return _svg(draw, 11.0, 2.8)
+def _groups(
+    drawn: Mapping[str, Mapping[str, tuple[np.ndarray, np.ndarray]]],
+    *,
+    x: str,
+    y: str,
+    log_x: bool = False,
+    log_y: bool | None = None,
+    points: bool = False,
+) -> bytes:
+    """One plot per group of pixels, with one curve (x, y) for each kind of distance."""
+    plots = [
+        Plot(
+            title=group,
+            x=x,
+            y=y,
+            log_x=log_x,
+            log_y=log_y,
+            curves=[
+                Curve(x=across, y=up, colour=COLOURS[name], label=NAMES[name], points=points)
+                for name, (across, up) in curves.items()
+            ],
+        )
+        for group, curves in drawn.items()
+    ]
+    return svg(plots, columns=len(plots), height=209)
 
 
-def _curve(log: Sequence[Mapping[str, float]], name: str) -> tuple[np.ndarray, np.ndarray]:
+def _curve(log: Sequence[Mapping[str, float]], name: str, colour: str, label: str = "", dashes: str = "") -> Curve:
+    """A number of a log over optimised images."""
     steps = [(step["images"], step[name]) for step in log if step.get(name) is not None]
     points = np.array(steps, dtype=float).reshape(-1, 2)
-    return points[:, 0], points[:, 1]
-
-
-def _choose_axis(plot, values: np.ndarray) -> None:
-    known = values[np.isfinite(values)]
-    if known.size and known.min() > 0 and known.max() > LOG_SPAN * known.min():
-        plot.set_yscale("log")
-    else:
-        plot.set_ylim(0, None)
-
-
-def _legend(figure, plot) -> None:
-    """One legend for all plots, beside them: it hides nothing."""
-    figure.legend(*plot.get_legend_handles_labels(), loc="outside right upper", fontsize=8)
-
-
-def _svg(draw, width: float, height: float) -> bytes:
-    """The SVG file of what ``draw(figure)`` draws; sizes in inches of 72 px."""
-    import matplotlib
-    from matplotlib.backends.backend_svg import FigureCanvasSVG
-    from matplotlib.figure import Figure
-
-    file = io.BytesIO()
-    with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(width, height))
-        FigureCanvasSVG(figure)
-        draw(figure)
-        figure.savefig(file, format="svg", metadata={"Date": None})
-    return file.getvalue()
+    return Curve(x=points[:, 0], y=points[:, 1], colour=colour, label=label, dashes=dashes)

@@ -14,6 +14,10 @@ UNKNOWN_GREY = 128  # colour of pixels without a value: none of the colour maps 
 WHITE = 255  # between pictures in a row
 WEBP_LOSSLESS = 101  # OpenCV: a WebP quality above 100 means lossless
 TICKS = 254  # colours of a map: with grey and white they are as many as a byte can name
+BLUE_TO_RED = (  # RdBu of ColorBrewer, reversed
+    (5, 48, 97), (33, 102, 172), (67, 147, 195), (146, 197, 222), (209, 229, 240), (247, 247, 247),
+    (253, 219, 199), (244, 165, 130), (214, 96, 77), (178, 24, 43), (103, 0, 31),
+)  # fmt: skip
 UNKNOWN, GAP = TICKS, TICKS + 1  # what a byte calls these two
 
 
@@ -26,7 +30,7 @@ class Scale:
     high: float
     """Value of the last colour."""
     colours: str
-    """Name of a matplotlib colour map."""
+    """Name of a colour map: viridis, magma, twilight, gray or RdBu_r."""
     unit: str
     """Unit of both values."""
 
@@ -141,9 +145,17 @@ def bar(scale: Scale) -> UInt8[np.ndarray, "1 T 3"]:
 
 @functools.cache
 def _colours(name: str) -> UInt8[np.ndarray, "T 3"]:
-    import matplotlib
+    import cv2
 
-    return np.round(255 * matplotlib.colormaps[name](np.arange(TICKS) / (TICKS - 1))[:, :3]).astype(np.uint8)
+    if name == "RdBu_r":
+        at = np.arange(TICKS) * (len(BLUE_TO_RED) - 1) / (TICKS - 1)
+        channels = [np.interp(at, range(len(BLUE_TO_RED)), channel) for channel in zip(*BLUE_TO_RED, strict=True)]
+        return np.round(np.stack(channels, axis=-1)).astype(np.uint8)
+    table = np.arange(256, dtype=np.uint8)
+    if name != "gray":
+        table = cv2.applyColorMap(table[:, None], getattr(cv2, f"COLORMAP_{name.upper()}"))[:, 0, ::-1]
+    nearest = np.minimum(np.arange(TICKS) * 256 // (TICKS - 1), 255)
+    return np.ascontiguousarray(np.broadcast_to(table[nearest].reshape(TICKS, -1), (TICKS, 3)))
 
 
 @functools.cache

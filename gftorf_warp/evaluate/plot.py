@@ -1,0 +1,215 @@
+"""Line plots as SVG, written directly: a report has fifteen of them, for which matplotlib takes two seconds."""
+
+from __future__ import annotations
+
+import html
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+WIDTH = 792  # [px] of a drawing
+LEFT, RIGHT, BELOW = 52, 14, 38  # [px] around the axes of a plot
+TITLE, LEGEND_ROW = 22, 13  # [px] above them
+FONT, SMALL = 9.5, 8.5  # [px]
+INK, GRID = "#262626", "#0001"
+LETTER = 0.54  # mean width of a letter, as a fraction of the size of its font
+LOG_SPAN = 20.0  # values that span more than this factor are drawn on a logarithmic axis
+MARGIN = 0.04  # of the span of an axis, beyond its values
+LABELS = 5  # of an axis, about
+SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Curve:
+    """One line; values that are not finite, or not positive on a logarithmic axis, interrupt it."""
+
+    x: Float[np.ndarray, "K"]
+    """Horizontal values."""
+    y: Float[np.ndarray, "K"]
+    """Vertical values."""
+    colour: str
+    """As in SVG."""
+    label: str = ""
+    """In the legend; empty: not listed there."""
+    dashes: str = ""
+    """As in SVG, for example ``5 3``; empty: a solid line."""
+    points: bool = False
+    """Whether every value is marked."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Plot:
+    """One pair of axes."""
+
+    title: str
+    """Above the axes."""
+    x: str
+    """Label of the horizontal axis."""
+    y: str
+    """Label of the vertical axis."""
+    curves: Sequence[Curve]
+    """Lines, later ones in front."""
+    log_x: bool = False
+    """Whether the horizontal axis is logarithmic."""
+    log_y: bool | None = None
+    """None: if all values are positive and span more than a factor of 20."""
+    from_zero: bool = True
+    """Whether a linear vertical axis starts at zero."""
+
+
+@dataclass(frozen=True)
+class _Axis:
+    """Maps values to pixels."""
+
+    low: float
+    """Value at ``start``."""
+    high: float
+    """Value at ``end``."""
+    log: bool
+    """Whether logarithmic."""
+    start: float
+    """[px]"""
+    end: float
+    """[px]"""
+
+    def __call__(self, values: Float[np.ndarray, "K"]) -> Float[np.ndarray, "K"]:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            values, low, high = (np.log10(v) if self.log else v for v in (values, self.low, self.high))
+        return self.start + (values - low) / (high - low) * (self.end - self.start)
+
+    def ticks(self) -> list[tuple[float, str]]:
+        """Values with a label, or without one."""
+        if not self.log:
+            step = _step((self.high - self.low) / LABELS)
+            first, last = math.ceil(self.low / step - 1e-9), math.floor(self.high / step + 1e-9)
+            return [(step * k, f"{step * k:.10g}") for k in range(first, last + 1)]
+        decades = range(math.floor(math.log10(self.low)), math.ceil(math.log10(self.high)) + 1)
+        every = -(-len(decades) // (LABELS + 2))
+        decimal = self.high / self.low < 100.0
+        labelled = (1, 2, 5) if self.high / self.low > 5.0 else range(1, 10)
+        found = []
+        for decade in decades:
+            power = f"10{str(decade).translate(SUPERSCRIPT)}" if decade % every == 0 else ""
+            for k in range(1, 10):
+                value = k * 10.0**decade
+                if decimal:
+                    found.append((value, f"{value:g}" if k in labelled else ""))
+                else:
+                    found.append((value, power if k == 1 else ""))
+        return [(value, label) for value, label in found if self.low <= value <= self.high]
+
+
+def svg(plots: Sequence[Plot], *, columns: int, height: int) -> bytes:
+    """A drawing of plots, row by row; a row is ``height`` [px] high. Plots of the same curves share one legend."""
+    legends = [_legend([curve for curve in plot.curves if curve.label], WIDTH / columns - 2 * RIGHT) for plot in plots]
+    shared = len(plots) > 1 and all(legend == legends[0] for legend in legends)
+    body, top = [], 0.0
+    if shared:
+        body, top = [_group(legends[0], LEFT, FONT)], float(LEGEND_ROW)
+    for first in range(0, len(plots), columns):
+        row = range(first, min(first + columns, len(plots)))
+        above = TITLE + (0 if shared else LEGEND_ROW * max(len(legends[k]) for k in row))
+        for k in row:
+            left = WIDTH / columns * (k - first)
+            body.append(_plot(plots[k], left, top, above, WIDTH / columns, height))
+            if not shared:
+                body.append(_group(legends[k], left + RIGHT, top + TITLE))
+        top += height
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" width="{WIDTH}" height="{top:g}" viewBox="0 0 {WIDTH} {top:g}" '
+        f'font-family="DejaVu Sans, Verdana, sans-serif" font-size="{FONT}" fill="{INK}">{"".join(body)}</svg>\n'
+    ).encode()
+
+
+def _plot(plot: Plot, left: float, top: float, above: float, width: float, height: float) -> str:
+    x0, x1, y0, y1 = left + LEFT, left + width - RIGHT, top + height - BELOW, top + above
+    xs = np.concatenate([np.asarray(curve.x, float) for curve in plot.curves])
+    ys = np.concatenate([np.asarray(curve.y, float) for curve in plot.curves])
+    x, y = _axis(xs, plot.log_x, x0, x1), _axis(ys, plot.log_y, y0, y1, from_zero=plot.from_zero)
+    parts = [_text(0.5 * (x0 + x1), top + 14, plot.title, 'text-anchor="middle" font-weight="bold" font-size="11"')]
+    for value, label in x.ticks():
+        at = float(x(np.array(value)))
+        parts += [_line(at, y0, at, y1, GRID)] if label else []
+        parts += [_line(at, y0, at, y0 + (3.5 if label else 2)), _text(at, y0 + 14, label, 'text-anchor="middle"')]
+    for value, label in y.ticks():
+        at = float(y(np.array(value)))
+        parts += [_line(x0, at, x1, at, GRID)] if label else []
+        parts += [_line(x0 - (3.5 if label else 2), at, x0, at), _text(x0 - 6, at + 3.3, label, 'text-anchor="end"')]
+    parts += [_line(x0, y0, x1, y0), _line(x0, y0, x0, y1)]
+    parts.append(_text(0.5 * (x0 + x1), y0 + 30, plot.x, 'text-anchor="middle"'))
+    middle = 0.5 * (y0 + y1)
+    turned = f'text-anchor="middle" transform="rotate(-90 {left + 11:.1f} {middle:.1f})"'
+    parts.append(_text(left + 11, middle, plot.y, turned))
+    return "".join(parts) + "".join(_curve(curve, x, y) for curve in plot.curves)
+
+
+def _curve(curve: Curve, x: _Axis, y: _Axis) -> str:
+    across, up = x(np.asarray(curve.x, float)), y(np.asarray(curve.y, float))
+    words, pen_down = [], False
+    for a, b in zip(across.tolist(), up.tolist(), strict=True):
+        known = math.isfinite(a) and math.isfinite(b)
+        if known:
+            words.append(f"{'L' if pen_down else 'M'}{a:.1f} {b:.1f}")
+        pen_down = known
+    dashes = f' stroke-dasharray="{curve.dashes}"' if curve.dashes else ""
+    path = f'<path d="{"".join(words)}" fill="none" stroke="{curve.colour}" stroke-width="1.4"{dashes}/>'
+    if not curve.points and len(words) > 1:
+        return path
+    marks = "".join(f"{word.replace('L', 'M')}h0" for word in words)  # a line without length and with round ends
+    return f'{path}<path d="{marks}" stroke="{curve.colour}" stroke-width="3.2" stroke-linecap="round"/>'
+
+
+def _axis(
+    values: Float[np.ndarray, "K"], log: bool | None, start: float, end: float, *, from_zero: bool = False
+) -> _Axis:
+    known = values[np.isfinite(values)]
+    if log is None:
+        log = bool(known.size and known.min() > 0 and known.max() > LOG_SPAN * known.min())
+    known = known[known > 0] if log else known
+    low, high = (float(known.min()), float(known.max())) if known.size else (0.1, 1.0)
+    if log:
+        factor = (high / low) ** MARGIN if high > 1.5 * low else 1.5
+        return _Axis(low / factor, high * factor, True, start, end)
+    low = min(low, 0.0) if from_zero else low
+    span = high - low or abs(high) or 1.0
+    return _Axis(low if from_zero and low == 0.0 else low - MARGIN * span, high + MARGIN * span, False, start, end)
+
+
+def _step(least: float) -> float:
+    """The smallest of 1, 2 and 5 times a power of ten that is at least ``least``."""
+    power = 10.0 ** math.floor(math.log10(least))
+    return next(k * power for k in (1, 2, 5, 10) if k * power >= least * (1 - 1e-9))
+
+
+def _legend(curves: Iterable[Curve], width: float) -> list[str]:
+    """Rows of a legend, each an SVG group whose origin is the row's left end; none for a single curve."""
+    rows: list[str] = []
+    at = width
+    curves = list(curves)
+    for curve in curves if len(curves) > 1 else ():
+        wide = 23 + LETTER * SMALL * len(curve.label)
+        if at + wide > width:
+            rows.append("")
+            at = 0.0
+        dashes = f'stroke-dasharray="{curve.dashes}" ' if curve.dashes else ""
+        line = f'<path d="M{at:.1f} 0h14" stroke="{curve.colour}" stroke-width="1.6" {dashes}/>'
+        rows[-1] += line + _text(at + 17, 3, curve.label, f'font-size="{SMALL}"')
+        at += wide
+    return rows
+
+
+def _group(rows: Sequence[str], left: float, top: float) -> str:
+    return "".join(
+        f'<g transform="translate({left:.1f} {top + LEGEND_ROW * k:.1f})">{row}</g>' for k, row in enumerate(rows)
+    )
+
+
+def _line(x0: float, y0: float, x1: float, y1: float, colour: str = INK) -> str:
+    return f'<path d="M{x0:.1f} {y0:.1f}L{x1:.1f} {y1:.1f}" stroke="{colour}" stroke-width="0.8"/>'
+
+
+def _text(x: float, y: float, text: str, how: str) -> str:
+    return f'<text x="{x:.1f}" y="{y:.1f}" {how}>{html.escape(text)}</text>' if text else ""
