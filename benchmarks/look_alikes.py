@@ -25,7 +25,7 @@ import numpy as np
 from gftorf_warp.constants import CANONICAL_SHIFTS, FRAMES_PER_QUARTET
 from gftorf_warp.data.decode import closed_form_distance
 from gftorf_warp.evaluate.metrics import ERROR_UNIT, mean_over_frames, squared_error
-from gftorf_warp.sim.ideal import ideal_recording, light_of
+from gftorf_warp.sim.ideal_sensor import ideal_recording, light_of
 from gftorf_warp.sim.record import frame_times
 from gftorf_warp.sim.scene import Scene
 from gftorf_warp.sim.scenes import SCENES

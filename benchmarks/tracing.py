@@ -19,9 +19,9 @@ from pathlib import Path
 import warp as wp
 
 from gftorf_warp.render.trace import Bounces
+from gftorf_warp.sim.mesh_engine import MeshEngine
 from gftorf_warp.sim.scenes import SCENES
 from gftorf_warp.sim.simulate import simulate
-from gftorf_warp.sim.traced import Traced
 
 SIZE = (320, 240)
 HERE, BESIDE = (0.0, 0.0, 0.0), (0.04, 0.0, 0.0)  # [m]
@@ -47,7 +47,7 @@ def row(
     """Seconds of ``frames`` raw frames."""
     world = replace(SCENES[scene], subsamples=side, emitter=emitter)
     more = Bounces(count=bounces[0], paths=max(bounces[1], 1))
-    traced = Traced(world, lambda time: world.camera(SIZE, time), device=device, bounces=more)
+    traced = MeshEngine(world, lambda time: world.camera(SIZE, time), device=device, bounces=more)
     traced.light([0.0] * instants, 2e7)  # compiles, and allocates what the rest uses
     begun, processor = time.perf_counter(), time.process_time()
     for n in range(frames):

@@ -169,35 +169,25 @@ def _simulate(options: argparse.Namespace) -> int:
         missing = "SCENE" if options.scene is None else "--out SEQ"
         fix = f"for example `gftorf simulate {next(iter(SCENES))} --out sequence`; `gftorf simulate --list`"
         raise UsageError(f"{missing} is missing", where="gftorf simulate", why="both are needed", fix=fix)
-    from .sim.ladder import ladder_table
+    from dataclasses import fields
+
+    from .sim.closed_form_errors import ladder_table
+    from .sim.settings import SimSettings
     from .sim.simulate import simulate, simulate_ladder
 
     device = start(options)
-    names = (
-        "frames",
-        "size",
-        "seed",
-        "sync",
-        "flow",
-        "exposure_samples",
-        "engine",
-        "bounces",
-        "paths",
-        "format",
-        "truth",
-        "fresh",
-    )
-    chosen = {name: getattr(options, name) for name in names}
-    chosen |= {"noise": not options.no_noise, "overrides": options.override, "device": device}
+    settings = SimSettings(**{f.name: getattr(options, f.name) for f in fields(SimSettings)})
+    how = {"device": device, "fresh": options.fresh}
     if options.ladder:
         if options.level is not None:
             why = "--ladder records all of them"
             raise UsageError("one level or all", where="--level", why=why, fix="leave one of the two out")
         progress = _each_level(options)
-        print("\n".join(ladder_table(simulate_ladder(options.scene, options.out, progress=progress, **chosen))))
+        rows = simulate_ladder(options.scene, options.out, settings, progress=progress, **how)
+        print("\n".join(ladder_table(rows)))
         return 0
     progress = _progress(options)("simulate")
-    print(simulate(options.scene, options.out, level=options.level, progress=progress, **chosen))
+    print(simulate(options.scene, options.out, settings, progress=progress, **how))
     return 0
 
 
@@ -205,10 +195,10 @@ def _listed(options: argparse.Namespace, scenes: Mapping[str, Scene]) -> list[Sc
     """The scenes that ``--list`` describes: all, or the one that was named, as its overrides make it."""
     if options.scene is None:
         return list(scenes.values())
-    from .sim.ladder import with_closed_form
+    from .sim.closed_form_errors import with_closed_form
     from .sim.simulate import scene_of
 
-    return [with_closed_form(scene_of(options.scene, options.override))]
+    return [with_closed_form(scene_of(options.scene, options.overrides))]
 
 
 def _each_level(options: argparse.Namespace) -> Callable[[int, int], None]:

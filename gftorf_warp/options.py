@@ -108,12 +108,14 @@ def command_parsers() -> dict[str, Parser]:
     device = "where engine mesh traces (cpu)"
     simulate.add_argument("--device", metavar="auto|cpu|cuda", type=_device, default="cpu", help=device)
     simulate.add_argument("--sync", action="store_true", help="all quads of a quartet at one instant")
-    simulate.add_argument("--no-noise", action="store_true", help="an ideal sensor")
+    simulate.add_argument("--no-noise", dest="noise", action="store_false", help="an ideal sensor")
     simulate.add_argument("--flow", action="store_true", help="store exact optical flow too")
     blur = "instants that one exposure averages (1: no motion blur)"
     simulate.add_argument("--exposure-samples", metavar="N", type=_positive, default=1, help=blur)
     single = "change one setting, for example sensor.f_mod_hz=30e6 or bodies.1.path.velocity=3,0,0 (may be repeated)"
-    simulate.add_argument("--override", metavar="NAME=VALUE", action="append", default=[], help=single)
+    simulate.add_argument(
+        "--override", dest="overrides", metavar="NAME=VALUE", action="append", default=[], help=single
+    )
     _fresh_option(simulate)
     _threads_option(simulate)
 

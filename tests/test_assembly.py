@@ -8,11 +8,11 @@ from gftorf_warp.render.api import rasterize
 from gftorf_warp.scene.camera import Camera
 from gftorf_warp.scene.sensor import Sensor
 from gftorf_warp.sim.assembly import FACES, Assembly, Level, Part
+from gftorf_warp.sim.gaussian_cover import clearance, cover_moving
 from gftorf_warp.sim.lookalikes import chair
 from gftorf_warp.sim.paths import Line, Still
 from gftorf_warp.sim.record import still_interior
 from gftorf_warp.sim.scene import Scene
-from gftorf_warp.sim.splat import clearance, cover_moving
 from gftorf_warp.sim.world import Body, Box, Plane, Sphere, Texture, first_hit
 
 GREY = Texture(low=0.5, high=0.5)

@@ -11,8 +11,8 @@ from comparison import DEVICES
 from gftorf_warp.constants import SPEED_OF_LIGHT
 from gftorf_warp.render.trace import Bounces, Lamp, RigidBody, Tracer
 from gftorf_warp.scene.camera import Camera
+from gftorf_warp.sim.mesh_engine import rigid_bodies
 from gftorf_warp.sim.paths import Still, inverse, looking_at, rigid
-from gftorf_warp.sim.traced import rigid_bodies
 from gftorf_warp.sim.world import Body, Box, Plane, Texture
 
 PLAIN = {"cell": 0.3}

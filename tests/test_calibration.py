@@ -8,7 +8,7 @@ import torch
 
 from gftorf_warp.data.decode import closed_form_distance
 from gftorf_warp.sim.calibration import CALIBRATION
-from gftorf_warp.sim.ideal import ideal_recording, light_of
+from gftorf_warp.sim.ideal_sensor import ideal_recording, light_of
 from gftorf_warp.sim.scenes import SCENES
 
 

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from gftorf_warp.sim.guided import Curve, Guided, Turn
+from gftorf_warp.sim.curves import Curve, Guided, Turn
 from gftorf_warp.sim.lookalikes_torf import carried_camera
 from gftorf_warp.sim.paths import Arc, Line
 

@@ -9,22 +9,24 @@ import pytest
 from gftorf_warp.cli import main
 from gftorf_warp.data.sequence import Sequence, Truth
 from gftorf_warp.errors import InputError, UsageError
-from gftorf_warp.sim.ladder import LEVELS, NAMES, at_level, closed_form_errors, ladder_table
+from gftorf_warp.sim.closed_form_errors import closed_form_errors, ladder_table
+from gftorf_warp.sim.ladder import LEVELS, NAMES, resolved
 from gftorf_warp.sim.record import record
 from gftorf_warp.sim.scenes import SCENES
+from gftorf_warp.sim.settings import SimSettings
 from gftorf_warp.sim.simulate import simulate, simulate_ladder
 
-OPTIONS = {"engine": "gaussian", "bounces": 0, "paths": 9, "exposure_samples": 1, "noise": True, "sync": False}
+SETTINGS = SimSettings(paths=9)
 SMALL = {"size": (32, 24), "frames": 16}
 
 
 def test_each_level_is_the_one_before_and_more():
     """Settings change where the level says so, and stay at all later ones but for what is the scene's own again."""
     demo = SCENES["demo"]
-    at = {name: at_level(demo, name, OPTIONS) for name in NAMES}
+    at = {name: resolved(demo, replace(SETTINGS, level=name)) for name in NAMES}
     assert [level.name for level in LEVELS] == ["sync", "L0", "L1", "L2", "L3", "L4"]
-    assert [at[name][1]["sync"] for name in NAMES] == [True, False, False, False, False, False]
-    assert [at[name][1]["noise"] and at[name][0].sensor.noise for name in NAMES] == [
+    assert [at[name][1].sync for name in NAMES] == [True, False, False, False, False, False]
+    assert [at[name][1].noise and at[name][0].sensor.noise for name in NAMES] == [
         False,
         False,
         True,
@@ -32,26 +34,26 @@ def test_each_level_is_the_one_before_and_more():
         True,
         True,
     ]
-    assert [at[name][1]["exposure_samples"] > 1 for name in NAMES] == [False, False, False, True, True, True]
+    assert [at[name][1].exposure_samples > 1 for name in NAMES] == [False, False, False, True, True, True]
     assert [any(at[name][0].emitter) for name in NAMES] == [False, False, False, True, True, True]
     assert [at[name][0].subsamples for name in NAMES] == [1, 1, 1, demo.subsamples, demo.subsamples, demo.subsamples]
-    assert [at[name][1]["bounces"] > 0 for name in NAMES] == [False, False, False, False, True, True]
+    assert [at[name][1].bounces > 0 for name in NAMES] == [False, False, False, False, True, True]
     assert [at[name][0].beam_deg is not None for name in NAMES] == [False, False, False, False, True, True]
     assert [at[name][0].sensor.full_well_electrons == demo.sensor.full_well_electrons for name in NAMES][-2:] == [
         False,
         True,
     ]
     assert [bool(at[name][0].sensor.harmonic_contrast) for name in NAMES][-2:] == [False, True]
-    assert {at[name][1]["engine"] for name in NAMES} == {"mesh"}
-    assert at_level(demo, "L2", {**OPTIONS, "sync": True})[1]["sync"], "--sync counts at every level"
+    assert {at[name][1].engine for name in NAMES} == {"mesh"}
+    assert resolved(demo, replace(SETTINGS, level="L2", sync=True))[1].sync, "--sync counts at every level"
 
 
 def test_what_a_scene_has_of_its_own_stays():
     """Its own place of the light, and a tap that cannot hold negative light."""
     own = replace(SCENES["demo"], emitter=(0.0, 0.1, 0.0), beam_deg=(50.0, 40.0))
-    assert at_level(own, "L4", OPTIONS)[0].emitter == (0.0, 0.1, 0.0)
-    assert at_level(own, "L4", OPTIONS)[0].beam_deg == (50.0, 40.0)
-    assert not any(at_level(own, "L1", OPTIONS)[0].emitter)
+    assert resolved(own, SimSettings(level="L4"))[0].emitter == (0.0, 0.1, 0.0)
+    assert resolved(own, SimSettings(level="L4"))[0].beam_deg == (50.0, 40.0)
+    assert not any(resolved(own, SimSettings(level="L1"))[0].emitter)
     unipolar = SCENES["sliding_cube"]
     assert unipolar.sensor.unipolar or float(unipolar.sensor.dc_offset) == 1.0
 
@@ -59,14 +61,14 @@ def test_what_a_scene_has_of_its_own_stays():
 @pytest.mark.parametrize("name", ["demo", "sliding_cube", "pillow", "photocopier"])
 def test_every_scene_can_be_recorded_at_the_last_level(name):
     """Differential or unipolar, still or carried: no level makes an impossible sensor."""
-    scene, options = at_level(SCENES[name], "L4", {**OPTIONS, "paths": 2})
-    recording = record(scene, **{**options, "paths": 2}, size=(16, 12), frames=4)
+    scene, settings = resolved(SCENES[name], SimSettings(level="L4"))
+    recording = record(scene, settings, paths=2, size=(16, 12), frames=4)
     assert np.isfinite(recording.sequence.quads).all()
 
 
 def test_the_ladder_attributes_an_error(tmp_path, capsys):
     """Nothing is wrong at one instant; asynchrony, noise and bounces each cost what they must, where they must."""
-    rows = simulate_ladder("demo", tmp_path / "ladder", **SMALL)
+    rows = simulate_ladder("demo", tmp_path / "ladder", SimSettings(**SMALL))
     assert [*rows] == [*NAMES]
     assert rows["sync"].all < 1e-6
     assert rows["L0"].moving > 20

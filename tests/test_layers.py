@@ -7,17 +7,15 @@ import pytest
 
 from gftorf_warp.data.sequence import Sequence
 from gftorf_warp.errors import UsageError
-from gftorf_warp.render.trace import Bounces
 from gftorf_warp.scene.electrons import electron_gain
 from gftorf_warp.scene.sensor import Sensor
 from gftorf_warp.sim.assembly import Level
-from gftorf_warp.sim.layers import layers
+from gftorf_warp.sim.mesh_engine import MeshEngine
 from gftorf_warp.sim.paths import Still
 from gftorf_warp.sim.record import record
 from gftorf_warp.sim.scene import Scene
 from gftorf_warp.sim.scenes import SCENES
 from gftorf_warp.sim.simulate import simulate
-from gftorf_warp.sim.traced import Traced
 from gftorf_warp.sim.world import Body, Box, Texture
 
 SMALL = {"frames": 5, "size": (24, 18), "engine": "mesh"}
@@ -78,7 +76,7 @@ def test_a_capture_keeps_the_ambient_image(tmp_path):
     assert set(truth.layers) == {"ambient"}
     scene = SCENES["demo"]
     for n in (0, 4):
-        want = Traced(scene, lambda time: scene.camera((24, 18), time)).light((n / 120,), 2e7).ambient
+        want = MeshEngine(scene, lambda time: scene.camera((24, 18), time)).light((n / 120,), 2e7).ambient
         np.testing.assert_array_equal(truth.layers["ambient"][n, 0], want)
     assert not Sequence.open(simulate("demo", tmp_path / "splats", frames=4, format="capture")).truth().layers
     assert not Sequence.open(simulate("demo", tmp_path / "ftorf", **SMALL)).truth().layers
@@ -139,11 +137,8 @@ def test_all_truth_needs_a_tracer_and_a_place(tmp_path):
             simulate("demo", tmp_path / "seq", truth="all", **options)
     with pytest.raises(UsageError, match="usual, all"):
         simulate("demo", tmp_path / "seq", truth="most", engine="mesh", format="capture")
-    with pytest.raises(ValueError, match="needs engine 'mesh'"):
+    with pytest.raises(UsageError, match="--engine mesh --format capture"):
         record(SCENES["demo"], frames=1, truth="all")
-    traced = Traced(SCENES["demo"], lambda _: SCENES["demo"].camera((4, 3)), bounces=Bounces())
-    with pytest.raises(ValueError, match="usual, all"):
-        layers(traced.light((0.0,), 2e7), traced.first_hits(0.0), Sensor(), "most", bounced=False)
     assert not any(tmp_path.iterdir())
     at_level = simulate("demo", tmp_path / "l0", level="L0", format="capture", truth="all", frames=4, size=(8, 6))
     assert "normal" in Sequence.open(at_level).truth().layers

@@ -31,7 +31,7 @@ from gftorf_warp.scene.distortion import Distortion
 from gftorf_warp.scene.initialise import InitSettings, _in_frusta
 from gftorf_warp.scene.optics import Lens
 from gftorf_warp.scene.sensor import Sensor
-from gftorf_warp.sim import splat
+from gftorf_warp.sim import gaussian_cover
 from gftorf_warp.sim.assembly import Level
 from gftorf_warp.sim.paths import Line, Still
 from gftorf_warp.sim.record import record
@@ -177,9 +177,11 @@ def test_covers_know_how_a_lens_stretches():
     )
     want = np.sum(by_d * by_z, 1) / np.linalg.norm(by_z, axis=1)
     assert np.abs(want).max() > 5e-3
-    np.testing.assert_allclose(splat._slope(normal, distance, plane(points)[2], camera), want, atol=1e-7)
+    np.testing.assert_allclose(gaussian_cover._slope(normal, distance, plane(points)[2], camera), want, atol=1e-7)
     corner = float(wide(PINCUSHION).slopes(torch.tensor([[0.5, 239.5]], dtype=torch.float64)).norm())
-    assert splat._magnification(wide(PINCUSHION)) == pytest.approx(1 + 3 * 0.15 * corner**2 - 5 * 0.02 * corner**4)
+    assert gaussian_cover._magnification(wide(PINCUSHION)) == pytest.approx(
+        1 + 3 * 0.15 * corner**2 - 5 * 0.02 * corner**4
+    )
 
 
 def test_flow_is_between_places_on_the_sensor():
@@ -275,7 +277,7 @@ def test_layouts_without_a_lens_refuse_it(tmp_path):
             simulate("demo", tmp_path / "out", format=layout, overrides=["lens.distortion.k1=-0.1"])
         assert caught.value.where == "lens.distortion"
     edge = {"format": "capture", "frames": 4, "overrides": ["lens.distortion.k1=-0.27"]}
-    with pytest.raises(UsageError, match="sees too much"):
+    with pytest.raises(UsageError, match="cannot be undone"):
         simulate("demo", tmp_path / "out", size=(16, 48), **edge)
     assert not (tmp_path / "out").exists()
     assert not list(tmp_path.iterdir())

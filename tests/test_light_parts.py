@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from comparison import DEVICES
 from test_bounces import HERE, PLAIN, ball_from_within
 from test_trace import AHEAD, CAMERA, F_MOD_HZ, GREY, expected, light, plane, scene_of
@@ -13,13 +14,13 @@ from gftorf_warp.constants import SPEED_OF_LIGHT
 from gftorf_warp.render.trace import Bounces, RigidBody, Tracer
 from gftorf_warp.scene.camera import Camera
 from gftorf_warp.scene.sensor import Sensor
-from gftorf_warp.sim.guided import Curve, Guided, Turn
+from gftorf_warp.sim.curves import Curve, Guided, Turn
+from gftorf_warp.sim.mesh_engine import MeshEngine
 from gftorf_warp.sim.paths import Line, Still
 from gftorf_warp.sim.readout import mean_quad
 from gftorf_warp.sim.record import record
 from gftorf_warp.sim.scenes import SCENES, room
-from gftorf_warp.sim.traced import Traced
-from gftorf_warp.sim.world import Body, Box, Sphere, Texture, first_hit
+from gftorf_warp.sim.world import Body, Box, Sphere, Texture, first_hit, flow_of
 
 SHINY = Texture(low=0.6, high=0.6, gloss=0.4, shininess=30.0)
 
@@ -34,8 +35,8 @@ def test_direct_light_is_a_part_of_the_light(device):
     """The direct part is that of a tracer without bounces, to the bit; the rest has longer paths and only adds."""
     bodies, settings = (room(), plane(2.0, size=(1.0, 1.0))), {"device": device, "harmonics": (1, 3)}
     scene = scene_of(*bodies, subsamples=2, emitter=(0.05, 0.0, 0.0))
-    alone = Traced(scene, lambda _: CAMERA, **settings).light((0.0,), F_MOD_HZ)
-    both = Traced(scene, lambda _: CAMERA, bounces=Bounces(count=2, paths=16), **settings).light((0.0,), F_MOD_HZ)
+    alone = MeshEngine(scene, lambda _: CAMERA, **settings).light((0.0,), F_MOD_HZ)
+    both = MeshEngine(scene, lambda _: CAMERA, bounces=Bounces(count=2, paths=16), **settings).light((0.0,), F_MOD_HZ)
     np.testing.assert_array_equal(both.direct, alone.light)
     np.testing.assert_array_equal(both.direct_amplitude, alone.amplitude)
     np.testing.assert_array_equal(alone.direct, alone.light)
@@ -62,13 +63,15 @@ def test_ambient_is_the_mean_reflectance_of_the_rays(device):
 def test_the_standard_error_is_that_of_repeated_images(device):
     """Mean square of the error over seeds equals that of the deviations from their mean, within 10 %."""
     scene = scene_of(room())
-    traced = Traced(scene, lambda _: CAMERA, bounces=Bounces(count=2, paths=32), device=device)
+    traced = MeshEngine(scene, lambda _: CAMERA, bounces=Bounces(count=2, paths=32), device=device)
     images = [traced.light((0.0,), F_MOD_HZ, seed=s) for s in range(24)]
     lights = np.stack([image.light[0] for image in images]).astype(np.complex128)
     spread = (np.abs(lights - lights.mean(0)) ** 2).sum(0).mean() / (len(images) - 1)
     told = np.mean([image.error.astype(np.float64) ** 2 for image in images])
     assert told / spread == pytest.approx(1.0, abs=0.1)
-    single = Traced(scene, lambda _: CAMERA, bounces=Bounces(count=2, paths=1), device=device).light((0.0,), F_MOD_HZ)
+    single = MeshEngine(scene, lambda _: CAMERA, bounces=Bounces(count=2, paths=1), device=device).light(
+        (0.0,), F_MOD_HZ
+    )
     assert np.isnan(single.error).all()
 
 
@@ -178,14 +181,21 @@ def test_lobes_that_cannot_be(wrong):
 # -- flow --------------------------------------------------------------------------------------------------------------
 
 
+def traced_flow(engine, time, later):
+    """Flow [px] from traced distances and bodies."""
+    camera, hits = engine.camera_at(time), engine.first_hits(time)
+    point = camera.centre + camera.rays(dtype=torch.float64).numpy() * hits.distance[..., None]
+    return flow_of(engine.scene.bodies, point, hits.body, (camera, engine.camera_at(later)), (time, later))
+
+
 @pytest.mark.parametrize("name", ["tour", "demo", "baseball"])
 def test_flow_is_where_bodies_go(name, device):
     """Against the recording's exact flow, forwards and backwards, for cameras and bodies that move; NaN for nothing."""
     scene, size = SCENES[name], (64, 48)
-    traced = Traced(scene, lambda time: scene.camera(size, time), device=device)
+    traced = MeshEngine(scene, lambda time: scene.camera(size, time), device=device)
     sequence = record(scene, frames=8, size=size, noise=False, flow=True, engine="mesh").sequence
     for flow, start, end in ((sequence.forward_flow[0], 0, 4), (sequence.backward_flow[4], 4, 0)):
-        got = traced.flow(float(sequence.times[start]), float(sequence.times[end]))
+        got = traced_flow(traced, float(sequence.times[start]), float(sequence.times[end]))
         off = np.abs(got - flow).max(0) > 1e-3
         assert off.mean() < 1e-3  # a ray that grazes an outline
         assert np.abs(flow).max() > 0.5
@@ -194,7 +204,7 @@ def test_flow_is_where_bodies_go(name, device):
 def test_flow_in_closed_form(device):
     """A card that moves by 0.1 m sideways at 2 m moves by fx 0.1 / 2; an empty ray has none."""
     card = replace(plane(2.0, size=(0.5, 0.5)), path=Line(position=(0.0, 0.0, 2.0), velocity=(1.0, 0.0, 0.0)))
-    got = Traced(scene_of(card), lambda _: CAMERA, device=device).flow(0.0, 0.1)
+    got = traced_flow(MeshEngine(scene_of(card), lambda _: CAMERA, device=device), 0.0, 0.1)
     hit = first_hit((card,), CAMERA, 0.0).body == 0
     np.testing.assert_allclose(got[0][hit], CAMERA.fx * 0.05, atol=1e-4)
     np.testing.assert_allclose(got[1][hit], 0.0, atol=1e-4)
@@ -206,7 +216,7 @@ def test_flow_of_a_turn_in_closed_form(device):
     """A card that turns by 90 deg/s about the optical axis takes its points around the middle of the image, x to y."""
     path = Guided(z=2.0, turns=(Turn(axis="z", angle=Curve(rate=90.0)),))
     card = replace(plane(2.0, size=(1.2, 1.2)), path=path)
-    got = Traced(scene_of(card), lambda _: CAMERA, device=device).flow(0.1, 0.3)
+    got = traced_flow(MeshEngine(scene_of(card), lambda _: CAMERA, device=device), 0.1, 0.3)
     hit = first_hit((card,), CAMERA, 0.1).body == 0
     y, x = np.mgrid[:24, :32] + 0.5
     place = (x - CAMERA.cx) + 1j * (y - CAMERA.cy)
@@ -221,7 +231,7 @@ def test_boxes_are_hit_alike_whichever_way(device):
         Body(shape=Box(size=(5, 4, 7), inside=True), texture=GREY, path=Still()),
         plane(2.0, size=(0.3, 0.4), x=0.5),
     )
-    hits = Traced(scene_of(*bodies), lambda _: CAMERA, device=device).first_hits(0.0)
+    hits = MeshEngine(scene_of(*bodies), lambda _: CAMERA, device=device).first_hits(0.0)
     want = first_hit(bodies, CAMERA, 0.0)
     np.testing.assert_array_equal(hits.body, want.body)
     np.testing.assert_allclose(hits.distance, want.distance, atol=2e-5)
@@ -254,7 +264,7 @@ def test_a_sliding_edge_mixes_two_distances(shifts, wanted, dc, device):
         for edge in (1.0, -1.0):
             path = Line(position=(edge - 3.0 / 120 * (frames - 0.5), 0.0, 2.0), velocity=(3.0, 0.0, 0.0))
             card = plane(2.0, size=(2.0, 2.0), texture=Texture(low=0.6, high=0.6))
-            traced = Traced(scene_of(far, replace(card, path=path)), lambda _: AHEAD, device=device)
+            traced = MeshEngine(scene_of(far, replace(card, path=path)), lambda _: AHEAD, device=device)
             sensor = Sensor(f_mod_hz=2e7, dc_offset=dc)
             seen = [traced.light([k / 120], sensor.f_mod_hz) for k in range(len(shifts))]
             quads = [

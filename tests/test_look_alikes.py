@@ -12,7 +12,7 @@ import pytest
 from gftorf_warp.data.decode import closed_form_distance
 from gftorf_warp.errors import UsageError
 from gftorf_warp.evaluate.metrics import scored_frames
-from gftorf_warp.sim.ideal import ideal_recording, light_of
+from gftorf_warp.sim.ideal_sensor import ideal_recording, light_of
 from gftorf_warp.sim.record import record
 from gftorf_warp.sim.scenes import LOOK_ALIKES, OURS, SCENES
 from gftorf_warp.sim.simulate import simulate

@@ -12,7 +12,7 @@ from gftorf_warp.errors import UsageError
 from gftorf_warp.render.api import rasterize
 from gftorf_warp.scene.measured import camera_of, colour_camera_of, sample
 from gftorf_warp.scene.sensor import Sensor
-from gftorf_warp.sim.look import Splatted, look_colour
+from gftorf_warp.sim.gaussian_engine import GaussianEngine
 from gftorf_warp.sim.paths import Line, Still, Sweep, Viewpoint, inverse, looking_at, rotation_matrix
 from gftorf_warp.sim.record import record, still_interior
 from gftorf_warp.sim.scenes import SCENES, ColourCamera, Scene, room, still
@@ -165,8 +165,8 @@ def test_a_moving_body_is_covered_for_the_nearest_approach_of_the_camera():
         bodies=(ball,), camera_path=Line(position=(0.0, 0.0, 0.0), velocity=(0.0, 0.0, 25.0)), colour=None, frames=9
     )
     time = 8 / 120
-    splatted = Splatted(scene, lambda t: scene.camera((96, 72), t), np.arange(9) / 120)
-    opacity = rasterize(splatted.at(time), scene.camera((96, 72), time), scene.sensor).opacity.numpy()
+    engine = GaussianEngine(scene, lambda t: scene.camera((96, 72), t), np.arange(9) / 120)
+    opacity = rasterize(engine.field_at(time), scene.camera((96, 72), time), scene.sensor).opacity.numpy()
     mask, hit = flat(scene, scene.camera((96, 72), time), time, pixels=4)
     inside = mask & (hit.body == 0)
     assert inside.sum() > 300
@@ -182,9 +182,9 @@ def test_a_moving_body_shows_the_faces_that_the_camera_faces_now():
     )
     path = Line(position=(-2.0, 0.0, 0.0), velocity=(4.0, 0.0, 0.0))
     scene = carried(bodies=(box,), camera_path=path, colour=None)
-    splatted = Splatted(scene, lambda t: scene.camera(time=t), np.array([0.0, 0.5, 1.0]))
+    engine = GaussianEngine(scene, lambda t: scene.camera(time=t), np.array([0.0, 0.5, 1.0]))
     for time, left, right in ((0.0, True, False), (1.0, False, True)):
-        x = splatted.at(time).mean[:, 0].numpy() - 0.01 * time
+        x = engine.field_at(time).mean[:, 0].numpy() - 0.01 * time
         shown = [(side * x > 0.39).mean() > 0.1 for side in (-1.0, 1.0)]  # more than the rows along the edges
         assert shown == [left, right]
 
@@ -268,8 +268,8 @@ def test_colour_is_black_where_nothing_is_and_unshaded_where_something_is():
         path=Still(position=(0.0, 0.0, 2.0), turn_deg=(0.0, 50.0, 0.0)),
     )
     scene = carried(bodies=(plane,))
-    splatted = Splatted(scene, lambda t: scene.colour_camera(None, t).resized(384, 288), np.zeros(1), colour=True)
-    image = look_colour(splatted, 0.0, 2)
+    engine = GaussianEngine(scene, lambda t: scene.colour_camera(None, t).resized(384, 288), np.zeros(1), colour=True)
+    image = engine.albedo(0.0)
     hit = first_hit(scene.bodies, scene.colour_camera(), 0.0)
     want = albedo(scene.bodies, hit, 0.0)
     assert want.max() == pytest.approx(0.8)

@@ -20,7 +20,7 @@ from gftorf_warp.scene.optics import Lens, lens_rows, shading
 from gftorf_warp.scene.pattern import Pattern, gain_map
 from gftorf_warp.scene.sensor import Sensor
 from gftorf_warp.sim.assembly import Level
-from gftorf_warp.sim.ideal import ideal_recording, light_of
+from gftorf_warp.sim.ideal_sensor import ideal_recording, light_of
 from gftorf_warp.sim.paths import Still
 from gftorf_warp.sim.readout import read_out
 from gftorf_warp.sim.record import record

@@ -9,13 +9,15 @@ import torch
 
 from gftorf_warp.cli import main
 from gftorf_warp.data.sequence import Sequence
+from gftorf_warp.errors import UsageError
 from gftorf_warp.scene.camera import Camera
 from gftorf_warp.scene.distortion import Distortion
-from gftorf_warp.sim.ladder import NAMES, at_level
+from gftorf_warp.sim.ladder import NAMES, resolved
+from gftorf_warp.sim.mesh_engine import MeshEngine
 from gftorf_warp.sim.record import record
 from gftorf_warp.sim.rolling import rolling_hits, row_delays
 from gftorf_warp.sim.scenes import SCENES
-from gftorf_warp.sim.traced import Traced
+from gftorf_warp.sim.settings import SimSettings
 from gftorf_warp.sim.world import first_hit
 
 SIZE = (32, 24)
@@ -44,7 +46,7 @@ def test_each_row_has_its_own_time(bounces):
     found = record(scene(), **options)
     times, delays = found.sequence.times, row_delays(scene().sensor, SIZE[1])
     camera_at = partial(scene().camera, SIZE)
-    traced = Traced(scene(row_time=0.0), camera_at)
+    traced = MeshEngine(scene(row_time=0.0), camera_at)
     for n in range(2):
         for row in (0, 9, 23):
             time = float(times[n] + delays[row])
@@ -101,11 +103,11 @@ def test_a_capture_says_so_and_reconstruction_warns(tmp_path, capsys):
 
 def test_rows_roll_on_the_ladder_as_soon_as_time_passes():
     """All quads at one instant means all rows, too; from then on a sensor has its own rows."""
-    rows = {name: at_level(scene(), name, {})[0].sensor.row_time_s for name in NAMES}
+    rows = {name: resolved(scene(), SimSettings(level=name))[0].sensor.row_time_s for name in NAMES}
     assert rows == {"sync": 0.0} | dict.fromkeys(NAMES[1:], ROW_TIME)
 
 
 def test_splats_have_one_time():
     """The other engine refuses."""
-    with pytest.raises(ValueError, match="needs engine 'mesh'"):
+    with pytest.raises(UsageError, match="--engine mesh"):
         record(scene(), frames=1, size=SIZE)

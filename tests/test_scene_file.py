@@ -9,7 +9,7 @@ from gftorf_warp import cli
 from gftorf_warp.data.sequence import Sequence
 from gftorf_warp.errors import InputError
 from gftorf_warp.sim.assembly import Assembly, Level, Part
-from gftorf_warp.sim.guided import Curve, Guided, Turn
+from gftorf_warp.sim.curves import Curve, Guided, Turn
 from gftorf_warp.sim.paths import Line, Still, Sweep
 from gftorf_warp.sim.scene import ColourCamera
 from gftorf_warp.sim.scene_file import read_scene

@@ -13,11 +13,12 @@ import pytest
 
 from gftorf_warp.recon.train import reconstruct
 from gftorf_warp.render.trace import Bounces
-from gftorf_warp.sim.ladder import LEVELS, at_level
+from gftorf_warp.sim.ladder import LEVELS, resolved
+from gftorf_warp.sim.mesh_engine import MeshEngine
 from gftorf_warp.sim.record import record
 from gftorf_warp.sim.scenes import SCENES
+from gftorf_warp.sim.settings import SimSettings
 from gftorf_warp.sim.simulate import simulate
-from gftorf_warp.sim.traced import Traced
 
 REPOSITORY = Path(__file__).parents[1]
 PAGE = (REPOSITORY / "design" / "sensor-checks.md").read_text(encoding="utf-8")
@@ -94,9 +95,8 @@ def test_one_seed_is_one_result_and_another_changes_noise_only(tmp_path):
             assert {name for name in changed if not name.startswith("truth/")} <= noise | people
         else:
             assert noise <= changed <= noise | people, level
-    scene, options = at_level(SCENES["demo"], "L2", {"frames": 4, "size": (16, 12)})
-    options |= {"noise": False}
-    one, two = (record(scene, **options, seed=seed) for seed in (1, 2))
+    scene, settings = resolved(SCENES["demo"], SimSettings(level="L2", frames=4, size=(16, 12)))
+    one, two = (record(scene, settings, noise=False, seed=seed) for seed in (1, 2))
     np.testing.assert_array_equal(one.sequence.quads, two.sequence.quads)
     np.testing.assert_array_equal(one.truth.distance, two.truth.distance)
 
@@ -107,7 +107,7 @@ def test_light_is_at_least_as_long_as_its_phasors():
     dim = [replace(body.texture, low=body.texture.low / 2, high=body.texture.high / 2) for body in scene.bodies]
     half = replace(scene, bodies=tuple(replace(b, texture=t) for b, t in zip(scene.bodies, dim, strict=True)))
     options = {"harmonics": (1, 2, 5), "bounces": Bounces(count=2, paths=8)}
-    light, less = (Traced(s, lambda _: scene.camera((32, 24)), **options).light((0.1,), 2e7) for s in (scene, half))
+    light, less = (MeshEngine(s, lambda _: scene.camera((32, 24)), **options).light((0.1,), 2e7) for s in (scene, half))
     for h in range(3):
         assert (np.abs(light.light[h]) <= light.amplitude * (1 + 1e-6)).all()
     np.testing.assert_allclose(2 * less.direct_amplitude, light.direct_amplitude, rtol=1e-6)

@@ -14,7 +14,7 @@ from gftorf_warp.scene.pattern import Pattern, phase_map
 from gftorf_warp.scene.sensor import Sensor, phasor_from_quads
 from gftorf_warp.scene.unwrap import common_range, cycle_distance
 from gftorf_warp.sim.assembly import Level
-from gftorf_warp.sim.ideal import ideal_recording
+from gftorf_warp.sim.ideal_sensor import ideal_recording
 from gftorf_warp.sim.paths import Still
 from gftorf_warp.sim.record import frame_times, record
 from gftorf_warp.sim.scene import Scene

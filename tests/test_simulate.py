@@ -11,7 +11,7 @@ from gftorf_warp.data.sequence import Sequence
 from gftorf_warp.errors import UsageError
 from gftorf_warp.scene.sensor import Sensor, distance_from_phasor, phasor_from_quads
 from gftorf_warp.sim.paths import Line
-from gftorf_warp.sim.record import record, render_truth_gap, still_interior
+from gftorf_warp.sim.record import record, still_interior
 from gftorf_warp.sim.scenes import OURS, SCENES, Scene, room
 from gftorf_warp.sim.simulate import simulate
 from gftorf_warp.sim.world import Body, Box, Texture, first_hit
@@ -78,7 +78,7 @@ def contents(folder):
 @pytest.mark.parametrize("name", sorted(make.__name__ for make in OURS))
 def test_rendered_and_true_distance_agree_on_still_surfaces(name):
     """Within 1 cm on every interior pixel of every scene of ours at its own size: the worlds are the same."""
-    gap = render_truth_gap(SCENES[name], frames=2)
+    gap = record(SCENES[name], frames=2, noise=False).gap
     assert gap.pixels > 1000
     assert gap.max <= 0.01
     assert 0 < gap.mean < 0.003

@@ -10,9 +10,9 @@ from comparison import DEVICES
 from gftorf_warp.constants import SPEED_OF_LIGHT
 from gftorf_warp.render.trace import RigidBody, Tracer
 from gftorf_warp.scene.camera import Camera
+from gftorf_warp.sim.mesh_engine import MeshEngine, rigid_bodies, triangles_of
 from gftorf_warp.sim.paths import Line, Still, inverse, rigid, rotation_matrix
 from gftorf_warp.sim.scenes import SCENES, Scene, room
-from gftorf_warp.sim.traced import Traced, rigid_bodies, triangles_of
 from gftorf_warp.sim.world import Body, Box, Plane, Sphere, Texture, first_hit
 
 GREY = Texture(low=0.5, high=0.5)
@@ -42,7 +42,7 @@ def scene_of(*bodies, subsamples=1, **more):
 
 def light(*bodies, camera=CAMERA, device="cpu", f_mod_hz=F_MOD_HZ, times=(0.0,), harmonics=(1,), **more):
     """Direct light of bodies at one camera."""
-    traced = Traced(scene_of(*bodies, **more), lambda _: camera, device=device, harmonics=harmonics)
+    traced = MeshEngine(scene_of(*bodies, **more), lambda _: camera, device=device, harmonics=harmonics)
     return traced.light(times, f_mod_hz)
 
 
@@ -69,7 +69,7 @@ def expected(bodies, camera, time=0.0, f_mod_hz=F_MOD_HZ, subsamples=1):
 def test_hits_are_the_analytic_ones(name, device):
     """Body, distance (2e-5 m), z-depth and normal of every named scene at two times, also of a camera that moves."""
     scene = SCENES[name]
-    traced = Traced(scene, lambda time: scene.camera((96, 72), time), device=device)
+    traced = MeshEngine(scene, lambda time: scene.camera((96, 72), time), device=device)
     for time in (0.0, 0.17):
         camera = scene.camera((96, 72), time)
         got, want = traced.first_hits(time), first_hit(scene.bodies, camera, time)
@@ -100,7 +100,7 @@ def test_nothing_is_hit_and_surfaces_have_one_side(device):
     away = Body(shape=Sphere(radius=0.5), texture=GREY, path=Still(position=(0.0, 0.0, -2.0)))
     outside = Body(shape=Box(size=(2.0, 2.0, 2.0), inside=True), texture=GREY, path=Still(position=(0.0, 0.0, 3.0)))
     bodies = (behind, around, away, outside)
-    got = Traced(scene_of(*bodies), lambda _: CAMERA, device=device).first_hits(0.0)
+    got = MeshEngine(scene_of(*bodies), lambda _: CAMERA, device=device).first_hits(0.0)
     want = first_hit(bodies, CAMERA, 0.0)
     np.testing.assert_array_equal(got.body, want.body)
     assert set(np.unique(got.body)) == {-1, 3}

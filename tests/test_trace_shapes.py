@@ -12,12 +12,12 @@ from gftorf_warp.data.sequence import Sequence
 from gftorf_warp.render.trace import Bounces
 from gftorf_warp.scene.camera import Camera
 from gftorf_warp.sim.assembly import Assembly, Level, Part
-from gftorf_warp.sim.ideal import light_of
+from gftorf_warp.sim.ideal_sensor import light_of
 from gftorf_warp.sim.lookalikes import chair
+from gftorf_warp.sim.mesh_engine import MeshEngine, rigid_bodies
 from gftorf_warp.sim.paths import Line, Still
 from gftorf_warp.sim.scene_file import read_scene
 from gftorf_warp.sim.scenes import SCENES
-from gftorf_warp.sim.traced import Traced, rigid_bodies
 from gftorf_warp.sim.world import Body, Box, Plane, Sphere, Texture, first_hit
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "scene.toml"
@@ -38,7 +38,9 @@ def level(axis, value, texture=GREY, turn=(0.0, 0.0, 0.0)):
 def bounced(*bodies, camera=CAMERA, paths=64):
     """Amplitude of the light that met more than one surface, and of direct light."""
     direct, total = (
-        Traced(scene_of(*bodies), lambda _: camera, bounces=Bounces(count=count, paths=paths)).light((0.0,), F_MOD_HZ)
+        MeshEngine(scene_of(*bodies), lambda _: camera, bounces=Bounces(count=count, paths=paths)).light(
+            (0.0,), F_MOD_HZ
+        )
         for count in (0, 3)
     )
     return total.amplitude.astype(np.float64) - direct.amplitude, direct.amplitude
@@ -74,7 +76,7 @@ def test_an_assembly_is_met_where_its_parts_are(shape):
     path = Line(position=(-0.2, 0.1, 1.6), velocity=(1.0, 0.0, -0.5), turn_deg=(15.0, 40.0, -10.0))
     bodies = (level(2, 3.0), Body(shape=shape, texture=PATTERN, path=path), plane(2.5, size=(0.5, 0.5), x=-0.6))
     camera = Camera.from_fov(96, 72, 60.0)
-    traced = Traced(scene_of(*bodies), lambda _: camera)
+    traced = MeshEngine(scene_of(*bodies), lambda _: camera)
     for time in (0.0, 0.3):
         got, want = traced.first_hits(time), first_hit(bodies, camera, time)
         same = got.body == want.body
@@ -106,7 +108,7 @@ def test_a_wall_without_end_is_seen_from_both_sides():
     for axis, value in ((1, 0.9), (1, -0.7), (2, 3.3), (0, 0.4)):
         for turn in ((0.0, 0.0, 0.0), (5.0, -20.0, 8.0)):
             bodies = (level(axis, value, Texture(low=0.1, high=0.9, cell=0.4), turn),)
-            got, want = Traced(scene_of(*bodies), lambda _: CAMERA).first_hits(0.0), first_hit(bodies, CAMERA, 0.0)
+            got, want = MeshEngine(scene_of(*bodies), lambda _: CAMERA).first_hits(0.0), first_hit(bodies, CAMERA, 0.0)
             np.testing.assert_array_equal(got.body, want.body)
             met = want.body == 0
             assert met.any()

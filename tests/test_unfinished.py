@@ -13,8 +13,8 @@ from gftorf_warp.cli import main
 from gftorf_warp.data.sequence import Sequence
 from gftorf_warp.errors import BusyError, InputError, UsageError
 from gftorf_warp.sim import simulate as simulating
+from gftorf_warp.sim.resume import partial_of
 from gftorf_warp.sim.simulate import simulate
-from gftorf_warp.sim.unfinished import partial_of
 
 OPTIONS = {"size": (24, 18), "frames": 8, "seed": 3}
 # in a shell's background job SIGINT is ignored, and children inherit that

@@ -10,7 +10,7 @@ from gftorf_warp.constants import ALPHA_MAX, LOW_PASS
 from gftorf_warp.render.api import rasterize
 from gftorf_warp.scene.camera import Camera
 from gftorf_warp.scene.sensor import Sensor, distance_from_phasor
-from gftorf_warp.sim import splat
+from gftorf_warp.sim import gaussian_cover
 from gftorf_warp.sim.paths import Arc, Line, Still, rotation_matrix
 from gftorf_warp.sim.scenes import room
 from gftorf_warp.sim.world import Body, Box, Plane, Sphere, Texture, first_hit
@@ -186,25 +186,25 @@ def test_edges_of_a_box_belong_to_two_faces():
 
 def test_overlap_and_spread_of_what_is_known():
     """A lone splat; one splat and its four neighbours by hand; a denser cover reaches farther."""
-    share, lead = splat.overlap(50.0, 0.34, True)
+    share, lead = gaussian_cover.overlap(50.0, 0.34, True)
     assert share == pytest.approx(ALPHA_MAX)
     assert lead == 0.0
     beside, through = math.exp(-1 / 0.2), 1 - math.exp(-1 / 0.2)  # diagonal neighbours stay below 1/255
-    share, lead = splat.overlap(1.0, 0.1, True)
+    share, lead = gaussian_cover.overlap(1.0, 0.1, True)
     weights = [beside, beside * through, ALPHA_MAX * through**2]
     weights += [beside * through**2 * (1 - ALPHA_MAX), beside * through**3 * (1 - ALPHA_MAX)]
     shares = [beside, beside * through**2, ALPHA_MAX * through**4]
     shares += [beside * through**4 * (1 - ALPHA_MAX) ** 2, beside * through**6 * (1 - ALPHA_MAX) ** 2]
     assert share == pytest.approx(sum(shares), rel=1e-12)
     assert lead == pytest.approx((weights[0] - weights[4]) / sum(weights), rel=1e-12)
-    assert splat.spread(0.4, 0.34) > splat.spread(0.8, 0.34) > 0.4
+    assert gaussian_cover.spread(0.4, 0.34) > gaussian_cover.spread(0.8, 0.34) > 0.4
 
 
 def test_quaternions_turn_like_their_matrices():
     """All four branches of the conversion: small turns, and half turns about each axis."""
     turns = [(1, 2, 3), (179, 3, 2), (2, 179, 3), (3, 2, 179), (100, -120, 60), (0, 0, 0)]
     matrices = np.stack([rotation_matrix(turn) for turn in turns])
-    w, x, y, z = splat._quaternion(matrices).T
+    w, x, y, z = gaussian_cover._quaternion(matrices).T
     np.testing.assert_allclose(w**2 + x**2 + y**2 + z**2, 1.0)
     got = np.stack(
         [
@@ -221,7 +221,7 @@ def test_discs_lie_in_their_surface():
     """Turned by their quaternions, the thin axes are the normals of a turned box at that time, and face the camera."""
     path = Line(position=(0.1, 0.0, 2.3), velocity=(0.0, 0.0, -1.0), turn_deg=TURN, spin_deg_per_s=(0.0, 400.0, 0.0))
     body = Body(shape=Box(size=(0.6, 0.6, 0.6)), texture=GREY, path=path)
-    field = splat.cover_moving(body, CAMERA, np.array([0.0, 0.1])).seen(CAMERA.centre, 0.07)
+    field = gaussian_cover.cover_moving(body, CAMERA, np.array([0.0, 0.1])).seen(CAMERA.centre, 0.07)
     w, x, y, z = field.quaternion.double().numpy().T
     thin = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=1)
     assert (field.log_scale.argmin(1) == 2).all()
@@ -246,7 +246,7 @@ def test_a_moving_cover_is_opaque_and_as_large_as_its_shape(shape, turn, bound):
     camera = Camera.from_fov(96, 72, 60.0)
     path = Line(position=(0.1, 0.0, 2.3), velocity=(1.0, 0.0, -1.0), turn_deg=turn)
     body = Body(shape=shape, texture=GREY, path=path)
-    field = splat.cover_moving(body, camera, np.array([0.0, 0.1])).seen(camera.centre, 0.05)
+    field = gaussian_cover.cover_moving(body, camera, np.array([0.0, 0.1])).seen(camera.centre, 0.05)
     opacity = rasterize(field, camera, Sensor()).opacity.numpy()
     fine = first_hit((body,), camera.resized(960, 720), 0.05).body >= 0
     area = fine.reshape(72, 10, 96, 10).mean((1, 3))
@@ -263,9 +263,9 @@ def test_a_moving_cover_is_opaque_and_as_large_as_its_shape(shape, turn, bound):
 def test_a_cover_returns_the_light_of_its_surface():
     """Mean amplitude of a rendered still room is the analytic one: the overlap of splats is accounted for."""
     bodies, camera = (room(),), Camera.from_fov(96, 72, 60.0)
-    field = splat.cover_still(bodies, camera).seen(camera.centre, 0.0)
+    field = gaussian_cover.cover_still(bodies, camera).seen(camera.centre, 0.0)
     rendered = rasterize(field, camera, Sensor()).phasor[2].numpy() / 2
     hit = first_hit(bodies, camera, 0.0)
     assert rendered.mean() == pytest.approx(hit.amplitude.mean(), rel=0.02)
     assert np.abs(rendered - hit.amplitude).mean() < 0.1 * hit.amplitude.mean()
-    assert LOW_PASS + splat.RADIUS**2 < 0.4  # what the constants of the cover were chosen for
+    assert LOW_PASS + gaussian_cover.RADIUS**2 < 0.4  # what the constants of the cover were chosen for

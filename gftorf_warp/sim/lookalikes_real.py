@@ -10,7 +10,7 @@ import math
 from functools import partial
 
 from ..scene.sensor import Sensor
-from .guided import Curve, Guided, Turn
+from .curves import Curve, Guided, Turn
 from .lookalikes import MIDDLE, around, look_alike, plain, wall_and_floor
 from .paths import Path, Still, Vector
 from .scene import Scene

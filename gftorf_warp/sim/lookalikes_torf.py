@@ -11,7 +11,7 @@ import math
 import numpy as np
 
 from .assembly import Assembly, Part
-from .guided import Curve, Guided, Turn
+from .curves import Curve, Guided, Turn
 from .lookalikes import around, look_alike, plain, wall_and_floor
 from .lookalikes_real import FIELD_OF_VIEW_DEG, box
 from .paths import Path, Still, Vector, rotation_matrix

@@ -1,4 +1,4 @@
-"""Point the camera at a scene: one image per raw frame, read out by the sensor; beside it the analytic truth."""
+"""Record a scene: one image per raw frame, read out by the sensor, and the analytic truth of each."""
 
 from __future__ import annotations
 
@@ -17,33 +17,32 @@ from ..render.trace import Bounces
 from ..scene.camera import Camera
 from ..scene.optics import shading
 from ..scene.sensor import Sensor, distance_from_phasor
-from .assembly import has_mesh
-from .layers import TRUTHS, layers
-from .look import Look, Splatted, look, look_colour
+from .checks import check_engine
+from .exposure import Exposure
+from .gaussian_engine import GaussianEngine
+from .ladder import resolved
+from .mesh_engine import MeshEngine, beam_is_traced, traced_albedo
 from .paths import inverse
-from .readout import mean_quad, read_out
-from .rolling import rolling_hits, take_rolling
+from .readout import read_out
+from .rolling import rolling_hits
 from .scene import Scene
-from .traced import Traced, lights_itself, trace_colour
+from .settings import SimSettings
 from .world import Hits, first_hit, flow_of
 
 Progress = Callable[[int, int], None]
 Images = dict[str, np.ndarray]
-Keep = Callable[[str, Callable[[], Images]], tuple[Images, bool]]
-"""Images of a name, made now or kept from an interrupted recording, and whether they were made now."""
-
-ENGINES = ("gaussian", "mesh")
-"""Ways from a scene to an image: splats that cover it, or rays through its surfaces."""
+Cached = Callable[[str, Callable[[], Images]], tuple[Images, bool]]
+"""Images of a name, computed now or read from an interrupted recording, and whether they were computed now."""
 
 LAYER = "layer "  # begins the names of layers among the images of a raw frame
-PATHS = 7  # tells the random numbers of paths from those of the read-out and of the colour camera
+COLOUR = 3  # part of the seed of the colour camera's noise
 
 
 @dataclass(frozen=True, kw_only=True)
 class Gap:
     """Distance as the engine sees it against the analytic truth, over interior pixels of still bodies.
 
-    Splats have a mean distance, divided by opacity; rays have a first hit.
+    Engine gaussian has a mean distance, divided by opacity; engine mesh has a first hit.
     """
 
     mean: float
@@ -64,8 +63,8 @@ class Recording:
     sequence: Sequence
     """As a camera would have recorded it."""
     truth: Truth
-    """Analytic distance along each pixel's centre ray at the time of each raw frame; what a sensor without noise would
-    decode if nothing moved; amplitude; which body is seen."""
+    """Analytic distance along each pixel's centre ray at the time of each raw frame; the distance that a sensor without
+    noise would decode if nothing moved; amplitude; the body that is seen; layers of a capture."""
     gap: Gap | None
     """Engine against truth on still interior pixels; None if no such pixel exists."""
     saturated: float
@@ -78,198 +77,164 @@ def frame_times(sensor: Sensor, frames: int, *, sync: bool) -> Float[np.ndarray,
     return (frame - frame % len(sensor.cycle) if sync else frame) * sensor.frame_period_s
 
 
-def seen_by(cameras: list[Camera]) -> dict[str, Any]:
-    """The fields of a sequence that say how its ToF camera looks, the same in all raw frames, and where it is."""
-    camera = cameras[0]
+def sequence_fields(sensor: Sensor, times: Float[np.ndarray, "F"], cameras: list[Camera]) -> dict[str, Any]:
+    """The fields of a sequence that follow from its sensor, its times [s] and its ToF camera at each of them."""
+    shots, camera = [sensor.at_frame(n) for n in range(len(times))], cameras[0]
     return {
         **{name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy")},
         "distortion": astuple(camera.distortion) if camera.distortion else None,
         "camera_from_world": np.stack([camera.camera_from_world for camera in cameras]),
+        "shifts": np.array([shot.shifts[0] for shot in shots]),
+        "times": times,
+        "f_mod_hz": float(sensor.f_mod_hz),
+        "frequencies_hz": np.array([float(shot.f_mod_hz) for shot in shots]) if sensor.further_hz else None,
+        "cycle_length": None if len(sensor.cycle) == FRAMES_PER_QUARTET else len(sensor.cycle),
+        "phase_offset": float(sensor.phase_offset),
+        "dc_offset": float(sensor.dc_offset),
     }
 
 
 def record(
     scene: Scene,
+    settings: SimSettings = SimSettings(),
     *,
-    frames: int | None = None,
-    size: tuple[int, int] | None = None,
-    seed: int = 0,
-    sync: bool = False,
-    noise: bool = True,
-    flow: bool = False,
-    exposure_samples: int = 1,
-    engine: str = "gaussian",
-    bounces: int = 0,
-    paths: int = 64,
     device: str = "cpu",
-    truth: str | None = None,
     progress: Progress | None = None,
-    keep: Keep | None = None,
+    cached: Cached | None = None,
+    **changes: Any,
 ) -> Recording:
-    """Record ``scene``, in memory. Arguments are those of :func:`gftorf_warp.sim.simulate.simulate`.
-
-    ``truth`` None is neither of its amounts: no layers, for layouts that have no place for them.
+    """Record ``scene``, in memory; all of ``settings`` apply but the layout on disk.
 
     Every raw frame depends on its number and on the settings alone, so that it may as well come from an interrupted
-    recording: ``keep`` decides, see sim/unfinished.py; None makes all of them.
+    recording.
+
+    Args:
+        scene: What is recorded.
+        settings: How.
+        device: Where engine mesh traces.
+        progress: Called with (raw frames done, raw frames in all).
+        cached: Returns finished images instead of computing them, see sim/resume.py; None computes all.
+        changes: Fields of ``settings`` with other values.
 
     Raises:
-        ValueError: If the sensor's contrast and DC offset contradict each other, see sim/readout.py; if there is no
-            such engine, or it cannot make the light that is asked for.
+        UsageError: If the settings contradict each other or the scene.
+        ValueError: If the sensor's contrast and DC offset contradict each other, see sim/readout.py.
     """
-    frames = scene.frames if frames is None else frames
-    keep = keep or _made_now
-    sensor = replace(scene.sensor, noise=noise and scene.sensor.noise)
-    times = frame_times(sensor, frames, sync=sync)
-    cameras = [scene.camera(size, float(time)) for time in times]
-    camera = cameras[0]
-    distances, bodies, interior = _truth(scene, size, cameras, times)
-    longest = frame_times(sensor, max(frames, scene.frames), sync=False)  # for fewer frames the same covers and images
-    evenness = shading(scene.lens, camera, beam=not lights_itself(scene, bounces))
-    take = _engine(engine, scene, size, longest, Bounces(count=bounces, paths=paths), device, seed, truth)
-    shots = [sensor.at_frame(n) for n in range(frames)]
-    offsets = ((np.arange(exposure_samples) + 0.5) / exposure_samples - 0.5) * sensor.exposure_s
-
-    def expose(n: int) -> Images:
-        seen = take(n, [float(times[n] + offset) for offset in offsets], float(times[n]), shots[n])
-        random = np.random.default_rng((seed, n))  # frame n: whatever F is
-        reading = read_out(seen.quad, seen.amplitude, shots[n], random, ambient=seen.ambient, shading=evenness)
-        return {
-            "quad": reading.quad,
-            "saturated": reading.saturated.sum(),
-            "amplitude": seen.amplitude.astype(np.float32),
-            "distance": seen.distance,
-            "phasor_distance": _static_distance(seen, shots[n]),
-            **{f"{LAYER}{name}": image for name, image in (seen.layers or {}).items()},
-        }
-
-    quads, phasor_distances, amplitudes = (np.zeros(distances.shape, dtype=np.float32) for _ in range(3))
-    more: dict[str, np.ndarray] = {}
-    largest, total, full = 0.0, 0.0, 0
-    for n in range(frames):
-        images, made = keep(f"frame-{n:06d}", partial(expose, n))
-        quads[n], amplitudes[n], phasor_distances[n] = (images[k] for k in ("quad", "amplitude", "phasor_distance"))
-        for name in (name for name in images if name.startswith(LAYER)):
-            stack = more.setdefault(name.removeprefix(LAYER), np.zeros((frames, *images[name].shape), np.float32))
-            stack[n] = images[name]
-        full += int(images["saturated"])
-        difference = np.abs(images["distance"] - distances[n])[interior[n]]
-        total += float(difference.sum())
-        largest = max(largest, float(difference.max(initial=0.0)))
-        if progress is not None and (made or n + 1 == frames):
-            progress(n + 1, frames)
-
-    pixels = int(interior.sum())
-    forward, backward = _flows(scene, cameras, times) if flow else ({}, {})
+    scene, settings = resolved(scene, replace(settings, **changes))
+    check_engine(scene, settings, device)
+    cached = cached or _computed
+    sensor = replace(scene.sensor, noise=settings.noise and scene.sensor.noise)
+    times = frame_times(sensor, settings.frames or scene.frames, sync=settings.sync)
+    cameras = [scene.camera(settings.size, float(time)) for time in times]
+    distances, bodies, interior = _truth(scene, settings, cameras, times)
+    expose = _exposing(scene, settings, sensor, times, device)
+    images: Images = {}
+    for n in range(len(times)):
+        one, computed = cached(f"frame-{n:06d}", partial(expose, n))
+        for name, image in one.items():
+            images.setdefault(name, np.zeros((len(times), *image.shape), image.dtype))[n] = image
+        if progress is not None and (computed or n + 1 == len(times)):
+            progress(n + 1, len(times))
     return Recording(
         sequence=Sequence(
-            quads=quads,
-            measured=np.ones(frames, dtype=bool),
-            shifts=np.array([shot.shifts[0] for shot in shots]),
-            times=times,
-            f_mod_hz=float(sensor.f_mod_hz),
-            frequencies_hz=np.array([float(shot.f_mod_hz) for shot in shots]) if sensor.further_hz else None,
-            cycle_length=None if len(sensor.cycle) == FRAMES_PER_QUARTET else len(sensor.cycle),
-            phase_offset=float(sensor.phase_offset),
-            dc_offset=float(sensor.dc_offset),
-            **seen_by(cameras),
+            quads=images["quad"],
+            measured=np.ones(len(times), dtype=bool),
+            **sequence_fields(sensor, times, cameras),
             novel_from_world=np.stack([inverse(view.world_from_body(0.0)) for view in scene.novel_views])
             if scene.novel_views
             else None,
-            forward_flow=forward,
-            backward_flow=backward,
-            exposures=np.full(frames, sensor.exposure_s),
+            **(_flows(scene, cameras, times) if settings.flow else {}),
+            exposures=np.full(len(times), sensor.exposure_s),
             sensor=sensor_settings(sensor),
-            **_colour(scene, size, times, longest, engine, keep, seed=seed, noise=noise),
+            **_colour(scene, settings, times, cached),
         ),
         truth=Truth(
             distance=distances.astype(np.float32),
-            known=np.ones(frames, dtype=bool),
-            phasor_distance=phasor_distances,
-            amplitude=amplitudes,
+            known=np.ones(len(times), dtype=bool),
+            phasor_distance=images["phasor_distance"],
+            amplitude=images["amplitude"],
             body=bodies,
-            layers=more,
+            layers={n.removeprefix(LAYER): image for n, image in images.items() if n.startswith(LAYER)},
         ),
-        gap=Gap(mean=total / pixels, max=largest, pixels=round(pixels / frames)) if pixels else None,
-        saturated=full / quads.size,
+        gap=_gap(images["distance"], distances, interior),
+        saturated=int(images["saturated"].sum()) / images["quad"].size,
     )
 
 
-def _engine(
-    engine: str,
-    scene: Scene,
-    size,
-    longest: Float[np.ndarray, "F"],
-    bounces: Bounces,
-    device: str,
-    seed: int,
-    truth: str | None,
-) -> Callable[[int, list[float], float, Sensor], Look]:
-    """What takes an image: a function of a raw frame's number, the instants it averages, its time, and the sensor."""
-    if engine not in ENGINES:
-        raise ValueError(f"engine {engine!r} must be one of {', '.join(ENGINES)}")
-    if engine == "mesh":
-        traced = Traced(
-            scene,
-            lambda time: scene.camera(size, time),
-            harmonics=scene.sensor.harmonics,
-            bounces=bounces,
-            device=device,
-            rolls=scene.sensor.row_time_s > 0,
-        )
-
-        def trace(n: int, instants: list[float], time: float, sensor: Sensor, row: int | None = None) -> Look:
-            numbers = (seed, n, PATHS) if row is None else (seed, n, PATHS, row)  # frame n: whatever F is
-            random = int(np.random.default_rng(numbers).integers(2**31))
-            mean = traced.light(instants, float(sensor.f_mod_hz), random, row=row)
-            still = mean if instants == [time] else traced.light([time], float(sensor.f_mod_hz), random, row=row)
-            quad, amplitude = mean_quad(mean.light, mean.amplitude, sensor)
-            phasor = still.light[0] * np.exp(1j * float(sensor.phase_offset))
-            hits = traced.first_hits(time, row=row)
-            known = None if truth is None else layers(mean, hits, sensor, truth, bounced=bounces.count > 0)
-            return Look(quad, amplitude, hits.distance, phasor, mean.ambient, known)
-
-        if scene.sensor.row_time_s > 0:
-            return partial(take_rolling, trace, height=scene.camera(size, 0.0).height)
-        return trace
-    if scene.sensor.row_time_s > 0:
-        raise ValueError(f"row_time_s {scene.sensor.row_time_s} needs engine 'mesh': {engine!r} has one time per image")
-    if needs_mesh(scene, bounces.count):
-        raise ValueError(
-            f"emitter {scene.emitter}, beam_deg {scene.beam_deg} and {bounces.count} bounces need engine 'mesh': "
-            f"{engine!r} has direct light at the camera only, no gloss, and no mesh that moves"
-        )
-    if truth == TRUTHS[-1]:
-        raise ValueError(f"truth {truth!r} needs engine 'mesh': {engine!r} has no layers")
-    splatted = Splatted(scene, lambda time: _fine(scene.camera(size, time), scene), longest)
-
-    def render(n: int, instants: list[float], time: float, sensor: Sensor) -> Look:
-        del n
-        looks = [look(splatted, instant, sensor, scene.subsamples) for instant in instants]
-        still = looks[0] if instants == [time] else look(splatted, time, sensor, scene.subsamples)
-        quad, amplitude, distance = (np.mean(images, axis=0) for images in list(zip(*looks, strict=True))[:3])
-        return Look(quad, amplitude, distance, still.phasor)
-
-    return render
+def _computed(_: str, compute: Callable[[], Images]) -> tuple[Images, bool]:
+    return compute(), True
 
 
-def _made_now(name: str, make: Callable[[], Images]) -> tuple[Images, bool]:
-    del name
-    return make(), True
+def longest_times(scene: Scene, settings: SimSettings) -> Float[np.ndarray, "F"]:
+    """Times [s] of the scene's own raw frames, and of all that are recorded if those are more.
 
-
-def _static_distance(seen: Look, sensor: Sensor) -> Float[np.ndarray, "H W"]:
-    """What a closed form decodes from four quads taken at once without noise [m], float32; NaN where there is no light.
-
-    In [0, c/2f): all light that reaches the pixel is in it, also what bounced. Harmonics of a sensor are not.
+    Covers are fine enough for all of them, so that a shorter recording has the same images.
     """
-    phasor = torch.from_numpy(np.asarray(seen.phasor, dtype=np.complex128))
+    return frame_times(scene.sensor, max(settings.frames or 0, scene.frames), sync=False)
+
+
+def _exposing(
+    scene: Scene, settings: SimSettings, sensor: Sensor, times: Float[np.ndarray, "F"], device: str
+) -> Callable[[int], Images]:
+    """A function that makes the images of a raw frame."""
+    camera_at = partial(scene.camera, settings.size)
+    evenness = shading(scene.lens, camera_at(0.0), beam=not beam_is_traced(scene, settings.bounces))
+    samples = settings.exposure_samples
+    offsets = ((np.arange(samples) + 0.5) / samples - 0.5) * sensor.exposure_s
+    engine = (
+        MeshEngine(
+            scene,
+            camera_at,
+            harmonics=scene.sensor.harmonics,
+            bounces=Bounces(count=settings.bounces, paths=settings.paths),
+            device=device,
+            seed=settings.seed,
+            truth=settings.truth if settings.format == "capture" else None,
+        )
+        if settings.engine == "mesh"
+        else GaussianEngine(scene, _fine(camera_at, scene), longest_times(scene, settings))
+    )
+
+    def expose(n: int) -> Images:
+        shot, time = sensor.at_frame(n), float(times[n])
+        exposure = engine.expose(n, [float(times[n] + offset) for offset in offsets], time, shot)
+        random = np.random.default_rng((settings.seed, n))  # independent of the number of frames
+        light = exposure.quad, exposure.amplitude
+        reading = read_out(*light, shot, random, ambient=exposure.ambient, shading=evenness)
+        return {
+            "quad": reading.quad,
+            "saturated": reading.saturated.sum(),
+            "amplitude": exposure.amplitude.astype(np.float32),
+            "distance": exposure.distance,
+            "phasor_distance": _static_distance(exposure, shot),
+            **{f"{LAYER}{name}": image for name, image in (exposure.layers or {}).items()},
+        }
+
+    return expose
+
+
+def _fine(camera_at: Callable[[float], Camera], scene: Scene) -> Callable[[float], Camera]:
+    """A camera at a time [s] at the resolution of the rays."""
+
+    def fine(time: float) -> Camera:
+        camera, n = camera_at(time), scene.subsamples
+        return camera.resized(camera.width * n, camera.height * n)
+
+    return fine
+
+
+def _static_distance(exposure: Exposure, sensor: Sensor) -> Float[np.ndarray, "H W"]:
+    """Closed-form distance of four quads taken at once without noise [m], float32; NaN where there is no light.
+
+    In [0, c/2f), of all light that reaches the pixel, bounces included; a sensor's harmonics are not.
+    """
+    phasor = torch.from_numpy(np.asarray(exposure.phasor, dtype=np.complex128))
     distance = distance_from_phasor(phasor.real, phasor.imag, sensor).numpy()
-    return np.where(np.abs(seen.phasor) > 0, distance, np.nan).astype(np.float32)
+    return np.where(np.abs(exposure.phasor) > 0, distance, np.nan).astype(np.float32)
 
 
 def sensor_settings(sensor: Sensor) -> dict[str, Any]:
-    """Every number of a sensor by name, for files: what a reader can check a result against."""
+    """Every field of a sensor by name, as numbers and lists for files."""
     plain: dict[str, Any] = {}
     for f in fields(sensor):
         value = getattr(sensor, f.name)
@@ -282,20 +247,9 @@ def sensor_settings(sensor: Sensor) -> dict[str, Any]:
     return plain
 
 
-def needs_mesh(scene: Scene, bounces: int) -> bool:
-    """Whether splats cannot do it: a lamp away from the camera, a beam, bounces, gloss, a mesh that moves."""
-    bodies = any(body.texture.gloss > 0 or (body.moves and has_mesh(body.shape)) for body in scene.bodies)
-    return bodies or any(scene.emitter) or scene.beam_deg is not None or bounces > 0
-
-
-def render_truth_gap(scene: Scene, *, frames: int = 1, size: tuple[int, int] | None = None) -> Gap | None:
-    """Renderer against analytic truth on still interior pixels of the first ``frames`` raw frames, without noise."""
-    return record(scene, frames=frames, size=size, noise=False).gap
-
-
 def still_interior(scene: Scene, hits: list[Hits]) -> Bool[np.ndarray, "H W"]:
     """Pixels that see the same face of a still body, with all neighbours up to two pixels away, in every raw frame."""
-    moves = np.array([*(body.moves for body in scene.bodies), False])  # the last stands for -1, nothing hit
+    moves = np.array([*(body.moves for body in scene.bodies), False])  # the last is index -1, nothing hit
     inside = np.ones(hits[0].body.shape, dtype=bool)
     inside[:2] = inside[-2:] = inside[:, :2] = inside[:, -2:] = False
     for hit in hits:
@@ -303,26 +257,18 @@ def still_interior(scene: Scene, hits: list[Hits]) -> Bool[np.ndarray, "H W"]:
         surface = hit.body * (hit.face.max() + 1) + hit.face
         for dy in range(-2, 3):
             for dx in range(-2, 3):
-                inside &= np.roll(surface, (dy, dx), (0, 1)) == surface  # what wraps around the image is masked above
+                inside &= np.roll(surface, (dy, dx), (0, 1)) == surface  # the wrapped border is masked above
     return inside
 
 
-def _fine(camera: Camera, scene: Scene) -> Camera:
-    """The camera at the resolution of the rays."""
-    return camera.resized(camera.width * scene.subsamples, camera.height * scene.subsamples)
-
-
 def _truth(
-    scene: Scene, size, cameras: list[Camera], times: Float[np.ndarray, "F"]
+    scene: Scene, settings: SimSettings, cameras: list[Camera], times: Float[np.ndarray, "F"]
 ) -> tuple[Float[np.ndarray, "F H W"], Int[np.ndarray, "F H W"], Bool[np.ndarray, "F H W"]]:
-    """Distance [m] and body of every raw frame, and its still interior: one for all raw frames of a camera at rest."""
+    """Distance [m] and body of every raw frame, and its still interior: that of all raw frames of a still camera."""
     distances, bodies, interior = [], [], []
-    for camera, time in zip(cameras, times, strict=True):
-        if scene.sensor.row_time_s > 0:
-            camera_at = partial(scene.camera, size)
-            hit = rolling_hits(scene.bodies, camera_at, float(time), scene.sensor, camera.height)
-        else:
-            hit = first_hit(scene.bodies, camera, float(time))
+    camera_at = partial(scene.camera, settings.size)
+    for time in times.tolist():
+        hit = rolling_hits(scene.bodies, camera_at, time, scene.sensor, cameras[0].height)
         distances.append(hit.distance)
         bodies.append(hit.body.astype(np.int16))
         interior.append(still_interior(scene, [hit]))
@@ -331,50 +277,56 @@ def _truth(
     return np.stack(distances), np.stack(bodies), inside
 
 
-def _colour(scene: Scene, size, times, longest, engine: str, keep: Keep, *, seed: int, noise: bool) -> dict[str, Any]:
+def _gap(
+    distance: Float[np.ndarray, "F H W"], truth: Float[np.ndarray, "F H W"], interior: Bool[np.ndarray, "F H W"]
+) -> Gap | None:
+    difference = np.abs(distance[interior] - truth[interior])
+    if not len(difference):
+        return None
+    pixels = round(len(difference) / len(truth))
+    return Gap(mean=float(difference.mean()), max=float(difference.max()), pixels=pixels)
+
+
+def _colour(scene: Scene, settings: SimSettings, times: Float[np.ndarray, "F"], cached: Cached) -> dict[str, Any]:
     """The fields of a sequence that a colour camera fills: an image at every quartet start, and its poses."""
     if scene.colour is None:
         return {}
-    spread = scene.colour.noise
-    cameras = [scene.colour_camera(size, float(time)) for time in times]
-    if engine == "gaussian":
-        splatted = Splatted(scene, lambda time: _fine(scene.colour_camera(size, time), scene), longest, colour=True)
+    noise = scene.colour.noise
+    camera_at = partial(scene.colour_camera, settings.size)
+    cameras = [camera_at(float(time)) for time in times]
+    albedo_at = lambda time: traced_albedo(scene, camera_at(time), time)  # noqa: E731
+    if settings.engine == "gaussian":
+        longest = longest_times(scene, settings)
+        albedo_at = GaussianEngine(scene, _fine(camera_at, scene), longest, colour=True).albedo
 
     def expose(n: int) -> Images:
-        if engine == "gaussian":
-            image = look_colour(splatted, float(times[n]), scene.subsamples)
-        else:
-            image = trace_colour(scene, cameras[n], float(times[n]))
-        if noise:
-            image = image + np.random.default_rng((seed, n, 3)).normal(0.0, spread, image.shape)
+        image = albedo_at(float(times[n]))
+        if settings.noise:
+            random = np.random.default_rng((settings.seed, n, COLOUR))
+            image = image + random.normal(0.0, noise, image.shape)
         return {"colour": image.astype(np.float32)}
 
     starts = range(0, len(times), len(scene.sensor.cycle))
-    images = {n: keep(f"colour-{n:06d}", partial(expose, n))[0]["colour"] for n in starts}
     first = cameras[0]
     return {
-        "colour": images,
+        "colour": {n: cached(f"colour-{n:06d}", partial(expose, n))[0]["colour"] for n in starts},
         "colour_intrinsics": (first.fx, first.fy, first.cx, first.cy),
         "colour_from_world": np.stack([camera.camera_from_world for camera in cameras]),
     }
 
 
-def _flows(scene: Scene, cameras: list[Camera], times: Float[np.ndarray, "F"]) -> tuple[dict, dict]:
-    """Exact optical flow at quartet starts, from n to n + K and to n - K; occlusion is not looked at.
+def _flows(scene: Scene, cameras: list[Camera], times: Float[np.ndarray, "F"]) -> dict[str, Any]:
+    """Exact optical flow at quartet starts, from n to n + K and to n - K, whether or not the target is occluded.
 
     It is what an estimate from images would give: motion of the scene and of the camera together.
     """
-    flows: tuple[dict, dict] = {}, {}
     cycle = len(scene.sensor.cycle)
-    starts = range(0, len(times), cycle)
-    for flow, step in zip(flows, (cycle, -cycle), strict=True):
-        for n in starts:
-            if 0 <= n + step < len(times):
-                flow[n] = _flow(scene, cameras[n], cameras[n + step], float(times[n]), float(times[n + step]))
+    flows: dict[str, Any] = {"forward_flow": {}, "backward_flow": {}}
+    for n in range(0, len(times), cycle):
+        hit = first_hit(scene.bodies, cameras[n], float(times[n]))
+        for name, m in (("forward_flow", n + cycle), ("backward_flow", n - cycle)):
+            if 0 <= m < len(times):
+                pair, instants = (cameras[n], cameras[m]), (float(times[n]), float(times[m]))
+                flow = flow_of(scene.bodies, hit.point, hit.body, pair, instants)
+                flows[name][n] = flow.astype(np.float32)
     return flows
-
-
-def _flow(scene: Scene, camera: Camera, other: Camera, time: float, later: float) -> Float[np.ndarray, "2 H W"]:
-    """Where what ``camera`` sees at ``time`` is in the image of ``other`` at ``later`` [px]; NaN: nothing is seen."""
-    hit = first_hit(scene.bodies, camera, time)
-    return flow_of(scene.bodies, hit.point, hit.body, (camera, other), (time, later)).astype(np.float32)

@@ -19,7 +19,7 @@ from typing import Any, Union
 
 from ..errors import InputError
 from ..scene.sensor import Sensor
-from . import assembly, guided, meshes, paths, world
+from . import assembly, curves, meshes, paths, world
 from .scene import Scene
 from .sensors import SENSORS
 
@@ -30,7 +30,7 @@ KINDS: dict[type, dict[str, type]] = {
     },
     paths.Path: {
         kind.__name__.lower(): kind
-        for kind in (paths.Still, paths.Line, paths.Arc, guided.Guided, paths.Viewpoint, paths.Sweep)
+        for kind in (paths.Still, paths.Line, paths.Arc, curves.Guided, paths.Viewpoint, paths.Sweep)
     },
 }
 NOT_THERE = ("closed_form", "overrides")  # fields of a scene that say something about it

@@ -1,4 +1,4 @@
-"""What a camera sees of a scene, by rays through the shapes themselves: meshes, balls and endless planes, no splats."""
+"""Engine mesh: rays are traced through the shapes themselves: meshes, balls and infinite planes, no Gaussians."""
 
 from __future__ import annotations
 
@@ -7,29 +7,35 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
-import torch
 from jaxtyping import Float, Int
 
 from ..render.trace import Bounces, FirstHits, Lamp, Light, RigidBody, Tracer
 from ..scene.camera import Camera
 from ..scene.optics import beam_of
+from ..scene.sensor import Sensor
 from .assembly import Assembly, Level, Part
-from .look import pooled
+from .exposure import Exposure, pooled
 from .meshes import Mesh
+from .readout import mean_quad
+from .rolling import join_rows, row_delays
 from .scene import Scene
-from .world import Body, Box, Plane, Shape, Sphere, albedo_seen, flow_of
+from .truth_layers import truth_layers
+from .world import Body, Box, Plane, Shape, Sphere, albedo_seen
+
+PATHS = 7  # part of the seed of the paths: other random numbers than those of read-out and colour camera
 
 
-class Traced:
+class MeshEngine:
     """A scene as meshes for one camera.
 
     Args:
-        scene: Bodies and their paths, rays per pixel, place and beam of the emitter.
+        scene: Bodies and their paths, rays per pixel, position and beam of the emitter; its sensor's rolling shutter.
         camera_at: The camera at a time [s].
         harmonics: Multiples of the modulation frequency at which light is wanted.
         bounces: Light that met more than one surface.
         device: Name of the device that traces.
-        rolls: Whether rows are traced one by one, each with a ``row`` of its own.
+        seed: Of the random paths of :meth:`expose`.
+        truth: Amount of layers in an exposure, see sim/truth_layers.py; None: no layers.
     """
 
     def __init__(
@@ -40,18 +46,19 @@ class Traced:
         harmonics: tuple[int, ...] = (1,),
         bounces: Bounces = Bounces(),
         device: str = "cpu",
-        rolls: bool = False,
+        seed: int = 0,
+        truth: str | None = None,
     ):
-        self.scene, self.camera_at, self.bounces = scene, camera_at, bounces
+        self.scene, self.camera_at, self.bounces, self.seed, self.truth = scene, camera_at, bounces, seed, truth
         pieces = [(index, piece) for index, body in enumerate(scene.bodies) for piece in rigid_bodies(body)]
         self._body = np.array([index for index, _ in pieces], dtype=np.int32)  # of each piece
         camera = camera_at(0.0)
-        beam = beam_of(scene.lens, camera) if lights_itself(scene, bounces.count) else None
+        beam = beam_of(scene.lens, camera) if beam_is_traced(scene, bounces.count) else None
         self._lamp = Lamp(position=scene.emitter, beam_deg=scene.beam_deg, beam=beam)
         self._tracer = Tracer(
             [piece for _, piece in pieces],
             camera.width,
-            1 if rolls else camera.height,
+            1 if scene.sensor.row_time_s > 0 else camera.height,
             harmonics=harmonics,
             device=device,
         )
@@ -73,12 +80,33 @@ class Traced:
         hits = self._tracer.first_hits(self._camera(time, row), self._poses(time))
         return replace(hits, body=np.where(hits.body < 0, hits.body, self._body[hits.body]))
 
-    def flow(self, time: float, later: float) -> Float[np.ndarray, "2 H W"]:
-        """How what is seen at ``time`` moves until ``later`` [px], see world.py; NaN: nothing is seen."""
-        camera, hits = self.camera_at(time), self.first_hits(time)
-        rays = camera.rays(dtype=torch.float64).numpy()
-        point = camera.centre + rays * hits.distance[..., None]
-        return flow_of(self.scene.bodies, point, hits.body, (camera, self.camera_at(later)), (time, later))
+    def expose(self, n: int, instants: list[float], time: float, sensor: Sensor) -> Exposure:
+        """Raw frame ``n``: the mean over ``instants`` [s]; phasor, distance and layers at ``time`` [s].
+
+        With a rolling shutter these are the times of the first row, and every row is traced at its own.
+        """
+        if not self.scene.sensor.row_time_s > 0:
+            return self._expose((n, PATHS), instants, time, sensor)
+        delays = row_delays(sensor, self.camera_at(0.0).height).tolist()
+        rows = [
+            self._expose((n, PATHS, row), [instant + delay for instant in instants], time + delay, sensor, row)
+            for row, delay in enumerate(delays)
+        ]
+        return join_rows(rows)
+
+    def _expose(
+        self, numbers: tuple[int, ...], instants: list[float], time: float, sensor: Sensor, row: int | None = None
+    ) -> Exposure:
+        f_mod_hz = float(sensor.f_mod_hz)
+        seed = int(np.random.default_rng((self.seed, *numbers)).integers(2**31))
+        mean = self.light(instants, f_mod_hz, seed, row=row)
+        still = mean if instants == [time] else self.light([time], f_mod_hz, seed, row=row)
+        quad, amplitude = mean_quad(mean.light, mean.amplitude, sensor)
+        phasor = still.light[0] * np.exp(1j * float(sensor.phase_offset))
+        hits, layers = self.first_hits(time, row=row), None
+        if self.truth is not None:
+            layers = truth_layers(mean, hits, sensor, self.truth, bounced=self.bounces.count > 0)
+        return Exposure(quad, amplitude, hits.distance, phasor, mean.ambient, layers)
 
     def _camera(self, time: float, row: int | None) -> Camera:
         return self.camera_at(time) if row is None else self.camera_at(time).row(row)
@@ -88,20 +116,17 @@ class Traced:
         return np.stack([body.path.world_from_body(time) for body in self.scene.bodies])[self._body]
 
 
-def lights_itself(scene: Scene, bounces: int) -> bool:
-    """Whether a beam is part of the light that is traced: of a lamp at the camera it can be multiplied afterwards.
-
-    That is so unless light comes from elsewhere or bounces.
-    """
+def beam_is_traced(scene: Scene, bounces: int) -> bool:
+    """Whether the beam has to be part of the traced light: direct light of a lamp at the camera is multiplied later."""
     return bounces > 0 or any(scene.emitter)
 
 
-def trace_colour(scene: Scene, camera: Camera, time: float) -> Float[np.ndarray, "H W 3"]:
+def traced_albedo(scene: Scene, camera: Camera, time: float) -> Float[np.ndarray, "H W 3"]:
     """Mean albedo of every pixel in linear RGB [1] over its rays; black where they meet nothing."""
     n = scene.subsamples
     fine = camera.resized(camera.width * n, camera.height * n)
     colour = albedo_seen(scene.bodies, fine, time)
-    return np.stack([pooled(channel, n) for channel in np.moveaxis(colour, -1, 0)], axis=-1)
+    return np.moveaxis(pooled(np.moveaxis(colour, -1, 0), n), 0, -1)
 
 
 def rigid_bodies(body: Body) -> list[RigidBody]:

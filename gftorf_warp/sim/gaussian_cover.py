@@ -106,7 +106,7 @@ class Cover:
     def __len__(self) -> int:
         return len(self.point)
 
-    def seen(self, centre: Float[np.ndarray, "3"], time: float, *, colour: bool = False) -> GaussianField:
+    def facing(self, centre: Float[np.ndarray, "3"], time: float, *, colour: bool = False) -> GaussianField:
         """The splats that face a camera at ``centre`` [m] at ``time`` [s], in world axes, shaded by their incidence.
 
         Splats that face away are left out: their own body hides them. ``colour`` adds their albedo, which has no shade.
@@ -119,16 +119,16 @@ class Cover:
         cosine, cosine_other = (
             -np.sum(normal @ rotation.T * ray, axis=1) / length for normal in (self.normal, self.other)
         )
-        facing = (cosine > self.limb) & (cosine_other > self.limb)
+        shown = (cosine > self.limb) & (cosine_other > self.limb)
         cosine = 0.5 * (cosine + cosine_other)
-        count = int(facing.sum())
+        count = int(shown.sum())
         return GaussianField(
-            mean=_tensor(mean[facing]),
-            log_scale=_tensor(np.log(self.scale[facing])),
-            quaternion=_tensor(_quaternion(rotation @ self.frame[facing])),
+            mean=_tensor(mean[shown]),
+            log_scale=_tensor(np.log(self.scale[shown])),
+            quaternion=_tensor(_quaternion(rotation @ self.frame[shown])),
             opacity_logit=torch.full((count,), OPACITY_LOGIT),
-            reflectivity_sh=constant_sh(_tensor(self.reflectance[facing] * cosine[facing])),
-            colour_sh=constant_sh(_tensor(self.albedo[facing])).mT if colour else None,
+            reflectivity_sh=constant_sh(_tensor(self.reflectance[shown] * cosine[shown])),
+            colour_sh=constant_sh(_tensor(self.albedo[shown])).mT if colour else None,
         )
 
 

@@ -20,7 +20,7 @@ from ..data.files import as_errors
 from ..data.folder import UNFINISHED
 from ..data.lock import locked
 from ..errors import UsageError
-from .record import Images, Keep
+from .record import Cached, Images
 
 CARD = "README.md"
 LOCK = ".lock"
@@ -74,7 +74,7 @@ def partial_of(out: Path) -> Path:
 
 
 @contextlib.contextmanager
-def unfinished(out: Path, card: str, *, fresh: bool) -> Iterator[Keep]:
+def cached_images(out: Path, card: str, *, fresh: bool) -> Iterator[Cached]:
     """Hold OUT.partial while a recording goes on; at a normal end it is removed.
 
     After an exception or a killed process it stays, unless not one image was finished.
@@ -101,7 +101,7 @@ def unfinished(out: Path, card: str, *, fresh: bool) -> Iterator[Keep]:
                     path.unlink()
             with as_errors(folder):
                 (folder / UNFINISHED).write_text(card, encoding="utf-8")
-            yield lambda name, make: _kept(folder / f"{name}.npz", make)
+            yield lambda name, make: _cached(folder / f"{name}.npz", make)
         shutil.rmtree(folder)
     except BaseException:
         if not _images(folder) and not _is_held(folder):
@@ -124,7 +124,7 @@ def _refuse_other_partial(folder: Path, card: str, *, fresh: bool) -> None:
         raise UsageError("another recording was begun", where=folder, why=why, fix=OTHER)
 
 
-def _kept(path: Path, make: Callable[[], Images]) -> tuple[Images, bool]:
+def _cached(path: Path, make: Callable[[], Images]) -> tuple[Images, bool]:
     """The images of a file, or those that ``make`` makes, which are then in the file."""
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:

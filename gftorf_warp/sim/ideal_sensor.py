@@ -14,11 +14,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float
 
-from ..constants import FRAMES_PER_QUARTET
 from ..data.sequence import Sequence, Truth
 from ..scene.sensor import Sensor
 from ..scene.unwrap import frequencies_of
-from .record import frame_times, seen_by
+from .record import frame_times, sequence_fields
 from .scene import Scene
 from .world import first_hit
 
@@ -90,16 +89,6 @@ def ideal_recording(
         turned = np.exp(1j * (float(sensor.phase_offset) - shifts[n]))
         quad = (light.phasor * turned).real + float(sensor.dc_offset) * light.amplitude
         quads[n], distance[n], known[n] = float(sensor.source_intensity) * quad, light.distance, True
-    sequence = Sequence(
-        quads=quads,
-        measured=known,
-        shifts=shifts,
-        times=times,
-        f_mod_hz=float(sensor.f_mod_hz),
-        frequencies_hz=frequencies if sensor.further_hz else None,
-        cycle_length=None if len(sensor.cycle) == FRAMES_PER_QUARTET else len(sensor.cycle),
-        phase_offset=float(sensor.phase_offset),
-        dc_offset=float(sensor.dc_offset),
-        **seen_by([scene.camera(time=float(time)) for time in times]),
-    )
+    cameras = [scene.camera(time=float(time)) for time in times]
+    sequence = Sequence(quads=quads, measured=known, **sequence_fields(sensor, times, cameras))
     return sequence, Truth(distance=distance, known=known)

@@ -1,0 +1,91 @@
+"""The settings of a simulation: with the scene, they decide every byte of the sequence."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from ..constants import FRAMES_PER_QUARTET
+from ..errors import UsageError
+
+ENGINES = ("gaussian", "mesh")
+"""From a scene to an image: Gaussians that cover it are rendered, or rays are traced through its surfaces."""
+FORMATS = ("ftorf", "torf", "capture")
+TRUTHS = ("usual", "all")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimSettings:
+    """How a scene is recorded.
+
+    Raises:
+        UsageError: If a value is out of range, or two values contradict each other.
+    """
+
+    frames: int | None = None
+    """Number of raw frames; None: the scene's own. The last quartet may be incomplete."""
+    size: tuple[int, int] | None = None
+    """(width, height) of the image [px]; None: the scene's own."""
+    seed: int = 0
+    """Seed of the noise and of the random paths. Frame n does not depend on the number of frames."""
+    sync: bool = False
+    """Control mode: all raw frames of a quartet are taken at the time of its first."""
+    noise: bool = True
+    """Shot noise, read noise, full well and ADC, if the scene's sensor has them."""
+    flow: bool = False
+    """Whether exact optical flow at quartet starts is stored [px], that of the camera included."""
+    exposure_samples: int = 1
+    """Instants that a raw frame averages over the exposure, centred on its time; 1: no motion blur."""
+    engine: str = "gaussian"
+    """One of ``ENGINES``. 'mesh' shares nothing with the renderer of `reconstruct`, and is the only one with light
+    beside the camera, a beam, bounces, gloss or a rolling shutter."""
+    bounces: int = 0
+    """Surfaces that light may meet after the first; 0: direct light only. More than 0 needs engine 'mesh'."""
+    paths: int = 64
+    """Random paths per pixel and raw frame for the light that bounces."""
+    format: str = "ftorf"
+    """Layout on disk: 'ftorf', raw quads; 'torf', one phasor per quartet with the time, pose and truth of its first
+    raw frame; 'capture', our own, which also holds any shifts, exposures, amplitude and objects."""
+    level: str | None = None
+    """Level of the ladder from ideal to realistic, see sim/ladder.py: it decides about engine, bounces, blur, noise
+    and what of the sensor is ideal. None: as set here and by the scene."""
+    truth: str = "usual"
+    """What a capture of engine mesh stores besides distance, amplitude and objects: 'usual' or 'all', see
+    sim/truth_layers.py. 'all' needs that engine and that format."""
+    overrides: tuple[str, ...] = ()
+    """Changes of single fields of the scene, its sensor and its bodies, such as ``sensor.f_mod_hz=30e6`` or
+    ``bodies.1.path.velocity=3,0,0``."""
+
+    def __post_init__(self):
+        least = FRAMES_PER_QUARTET if self.format == "torf" else 1  # a phasor needs a whole quartet
+        size = (1, 1) if self.size is None else self.size
+        require(self.frames is None or self.frames >= least, "--frames", f"{self.frames}", f"at least {least}")
+        sized = len(size) == 2 and min(size) >= 1
+        require(sized, "--size", "x".join(map(str, size)), "WIDTHxHEIGHT, both at least 1, for example 160x120")
+        require(self.seed >= 0, "--seed", f"{self.seed}", "0 or more")
+        require(self.exposure_samples >= 1, "exposure_samples", f"{self.exposure_samples}", "at least 1")
+        require(self.engine in ENGINES, "--engine", repr(self.engine), f"one of {', '.join(ENGINES)}")
+        require(self.bounces >= 0, "--bounces", f"{self.bounces}", "0 or more")
+        require(self.paths >= 1, "--paths", f"{self.paths}", "at least 1")
+        require(self.format in FORMATS, "--format", repr(self.format), f"one of {', '.join(FORMATS)}")
+        require(self.truth in TRUTHS, "--truth", repr(self.truth), f"one of {', '.join(TRUTHS)}")
+        if self.truth == "all" and self.level is None and (self.engine, self.format) != ("mesh", "capture"):
+            raise UsageError(
+                "cannot store all truth",
+                where="--truth",
+                why=f"engine {self.engine} and format {self.format} have no layers: engine mesh computes them, a "
+                "capture stores them",
+                fix="add --engine mesh --format capture",
+            )
+        if self.flow and self.format == "torf":
+            raise UsageError(
+                "a ToeRF folder cannot store optical flow",
+                where="--flow",
+                why="flow belongs to raw quads",
+                fix="leave --flow out, or --format ftorf",
+            )
+
+
+def require(good: bool, where: str, got: str, wanted: str) -> None:
+    """Raise a UsageError about the option ``where`` unless ``good``."""
+    if not good:
+        raise UsageError(f"cannot simulate with {got}", where=where, why=f"expected {wanted}", fix="change it")
