@@ -86,7 +86,7 @@ BAD = [  # what follows `gftorf simulate`, exit code, a word of the answer; {sce
     ("demo --device cuda:99 --engine mesh", 5, "cuda:99"),
     ("demo --format zip", 2, "ftorf, torf, capture"),
     ("demo --format torf --frames 3", 2, "at least 4"),
-    ("demo --format torf --flow", 2, "no place for optical flow"),
+    ("demo --format torf --flow", 2, "cannot store optical flow"),
     ("demo --truth all", 2, "--engine mesh --format capture"),
     ("demo --truth most", 2, "usual, all"),
     ("demo --paths 0 --engine mesh --bounces 1", 2, "at least 1"),
