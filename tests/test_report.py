@@ -170,7 +170,7 @@ def test_pictures_show_their_arrays(compared):
     """Distances, errors, quads and masks, decoded from the page and compared with the arrays on the stated scale."""
     _, _, html, found = compared
     s = panels.telling_row(found)
-    metres = panels.common_distance_scale(found)
+    metres = found.distance_scale
     assert (metres.low, metres.high) == (2.5, 4.0)
     quads = pictures.signed_scale([found.sequence.quads[n] for n in range(4, 8)])
     errors = pictures.error_scale([np.sqrt(found.judgement.errors["closed_form"][s])[found.judgement.moving[s]]])
@@ -260,7 +260,7 @@ def drawn_texts(svg):
 def test_views_that_nobody_took_are_shown(compared):
     """Distance on the scale of all others and colour, from three poses; colour measured above rendered."""
     _, _, html, found = compared
-    scale = panels.common_distance_scale(found)
+    scale = found.distance_scale
     assert found.novel.poses == [0, 1, 2]
     assert found.novel.time == pytest.approx(6.5 / 120)
     for m in range(3):

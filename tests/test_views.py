@@ -248,12 +248,12 @@ def test_a_shift_finds_its_quad(run):
 def test_colours_run_from_low_to_high_and_grey_is_unknown():
     """The ends of the map at and beyond the ends of the scale."""
     scale = pictures.Scale(low=1.0, high=2.0, colours="viridis", unit="m")
-    bar = pictures.bar(scale)[0]
+    bar = pictures.bar(scale.colours)[0]
     rgb = pictures.colour_mapped(np.array([[0.0, 1.0, 1.5, 2.0, 9.0, np.nan]]), scale)[0]
     np.testing.assert_array_equal(rgb[:5], bar[[0, 0, len(bar) // 2, -1, -1]])
     assert rgb[5].tolist() == [128, 128, 128]
     for colours in ("viridis", "magma", "twilight", "RdBu_r"):
-        assert not (pictures.bar(pictures.Scale(low=0, high=1, colours=colours, unit="m")) == 128).all(axis=-1).any()
+        assert not (pictures.bar(colours) == 128).all(axis=-1).any()
     with pytest.raises(ValueError, match="low < high"):
         pictures.Scale(low=1.0, high=1.0, colours="viridis", unit="m")
 
@@ -265,7 +265,7 @@ def test_scales():
     assert signed.low == -signed.high
     assert signed.high == pytest.approx(3.0, abs=0.05)
     assert pictures.error_scale([np.zeros(3)]).low == 0.0
-    first, last = pictures.bar(pictures.phase_scale())[0, [0, -1]].astype(int)
+    first, last = pictures.bar(pictures.phase_scale().colours)[0, [0, -1]].astype(int)
     assert np.abs(first - last).max() < 8
     dark = [np.zeros(4)]
     for scale in (pictures.distance_scale, pictures.error_scale, pictures.amplitude_scale, pictures.signed_scale):

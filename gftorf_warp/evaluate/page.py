@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import html
 import math
 from collections.abc import Callable, Mapping
@@ -118,9 +119,14 @@ def plain_picture(rgb: UInt8[np.ndarray, "h w 3"], title: str, note: str = "", b
 
 def colour_bar(scale: pictures.Scale) -> str:
     """The colours of a scale between its two values."""
-    source = pictures.data_uri(pictures.webp(pictures.bar(scale)), "image/webp")
+    source = _bar(scale.colours)
     low, high = (f"{value:.3g}".replace("-", "\N{MINUS SIGN}") for value in (scale.low, scale.high))
     return f'<div class="bar">{low}<img src="{source}" alt="colour bar">{high} {escape(scale.unit)}</div>'
+
+
+@functools.cache
+def _bar(colours: str) -> str:
+    return pictures.data_uri(pictures.webp(pictures.bar(colours)), "image/webp")
 
 
 def row(figures: list[str], columns: int | None = None) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -63,6 +64,12 @@ class Findings:
     novel: Novel | None = None
     """Views from poses that no raw frame has; None if the sequence names none."""
 
+    @functools.cached_property
+    def distance_scale(self) -> pictures.Scale:
+        """One scale for every distance in the report: the truth's, else that of the closed form and of ours."""
+        known = [self.views.closed_form, self.views.d] if self.judgement is None else [self.judgement.truth]
+        return pictures.distance_scale(known)
+
 
 def telling_row(found: Findings) -> int:
     """The row of the frame to show: in the middle half, the one where most pixels move.
@@ -78,12 +85,6 @@ def telling_row(found: Findings) -> int:
         return changed, -abs(s - count / 2)  # of equals, the one nearest to the middle
 
     return max(middle, key=telling)
-
-
-def common_distance_scale(found: Findings) -> pictures.Scale:
-    """One scale for every distance in the report: the truth's, else that of the closed form and of ours."""
-    views, judged = found.views, found.judgement
-    return pictures.distance_scale([views.closed_form, views.d] if judged is None else [judged.truth])
 
 
 def measured_quartet(found: Findings, s: int) -> str:
@@ -113,7 +114,7 @@ def measured_quartet(found: Findings, s: int) -> str:
     decoded = [
         page.picture(phase, pictures.phase_scale(), "measured phase", "mod 2π"),
         page.picture(amplitude, pictures.amplitude_scale([amplitude]), "measured amplitude", "of the phasor"),
-        page.picture(found.views.closed_form[s], common_distance_scale(found), "closed form", "phase as distance"),
+        page.picture(found.views.closed_form[s], found.distance_scale, "closed form", "phase as distance"),
     ]
     text = f'<p class="soft">{PHASOR_TEXT if sequence.from_phasors else QUARTET_TEXT}</p>'
     figures = [*measured, *decoded, *_by_frequency(found, s), text]
@@ -136,7 +137,7 @@ def _by_frequency(found: Findings, s: int) -> list[str]:
 
 def distances(found: Findings, s: int, window: Window = WHOLE) -> str:
     """Closed form, ours and truth on one scale."""
-    scale = common_distance_scale(found)
+    scale = found.distance_scale
     return page.row([page.picture(image[window], scale, title) for title, image in _distances(found, s).items()])
 
 
@@ -180,7 +181,7 @@ def strip_over_time(found: Findings) -> str:
     """Distances at a few frames, one row each, on one scale."""
     count = len(found.views.frames)
     chosen = sorted({round(x) for x in np.linspace(0, count - 1, STRIP_FRAMES)})
-    scale = common_distance_scale(found)
+    scale = found.distance_scale
     rows = []
     for title in (name for name in _distances(found, 0) if name != TITLES["d_tof"]):
         figures = [
@@ -201,7 +202,7 @@ def animation(found: Findings) -> str:
     starts = starts[:: -(-len(starts) // ANIMATION_FRAMES_MAX)]
     if len(starts) < 2:
         return ""
-    views, quad, metres = found.views, pictures.signed_scale([found.views.quad_measured]), common_distance_scale(found)
+    views, quad, metres = found.views, pictures.signed_scale([found.views.quad_measured]), found.distance_scale
 
     def frame(s: int) -> np.ndarray:
         panels = [

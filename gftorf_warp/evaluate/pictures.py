@@ -138,9 +138,9 @@ def data_uri(data: bytes, kind: str) -> str:
     return f"data:{kind};base64,{base64.b64encode(data).decode('ascii')}"
 
 
-def bar(scale: Scale) -> UInt8[np.ndarray, "1 T 3"]:
-    """The colours of a scale from low to high."""
-    return _colours(scale.colours)[None].copy()
+def bar(colours: str) -> UInt8[np.ndarray, "1 T 3"]:
+    """The colours of a map from low to high."""
+    return _colours(colours)[None].copy()
 
 
 @functools.cache

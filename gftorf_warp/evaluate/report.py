@@ -255,7 +255,7 @@ def _beyond(metrics: Mapping[str, Any], found: Findings) -> list[str]:
             '<p class="caption">The reconstruction in the middle of the sequence, from poses that the sequence names '
             "and no raw frame has. Grey: half of the light or more would pass.</p>"
         )
-        strip = gallery.novel_strip(found.novel, panels.common_distance_scale(found))
+        strip = gallery.novel_strip(found.novel, found.distance_scale)
         sections.append(_section("Views that nobody took", text + strip))
     return sections
 

@@ -28,6 +28,9 @@ if TYPE_CHECKING:
     from ..recon.run import Run
 
 
+RENDERED = ("quads", "phasor", "distance", "opacity")
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Views:
     """Everything that compare shows, for the S scored raw frames, at the sequence's own resolution, float32."""
@@ -83,20 +86,19 @@ def gather(
     decoded = {i: decode_quartet(sequence, i) for i in sorted({n // sequence.cycle for n in frames})}
     quartets = [decoded[n // sequence.cycle] for n in frames]
     rows: dict[str, list[np.ndarray]] = {"d": [], "opacity": [], "d_tof": [], "quad_rendered": []}
+    first, *further = sequence.frequencies
+    renderers = {first: run.renderer(RENDERED)} | {f: run.renderer(RENDERED, f_mod_hz=f) for f in further}
     for count, n in enumerate(frames, start=1):
-        rendering = render_frame(run, sequence, n)
-        light = {sequence.frequencies[0]: rendering}
-        for f in sequence.frequencies[1:]:
-            light[f] = render_frame(run, sequence, n, f_mod_hz=f)
-        d_tof = distance_from_quads(rendering.quads, run.sensor, *(light[f].quads for f in sequence.frequencies[1:]))
-        own = light[float(sequence.frame_frequencies[n])]
+        time = float(sequence.times[n])
+        light = {f: render(time, camera_at(run, sequence, time)) for f, render in renderers.items()}
+        rendering, measured = light[first], light[float(sequence.frame_frequencies[n])]
         images = {
             "d": rendering.distance,
             "opacity": rendering.opacity,
-            "d_tof": d_tof,
-            "quad_rendered": quad_of_shift(own, run.sensor, float(sequence.shifts[n])),
+            "d_tof": distance_from_quads(rendering.quads, run.sensor, *(light[f].quads for f in further)),
+            "quad_rendered": quad_of_shift(measured, run.sensor, float(sequence.shifts[n])),
         }
-        for name, image in images.items():
+        for name, image in zip(images, torch.stack([*images.values()]).cpu(), strict=True):
             rows[name].append(finite(image, f"{name} of raw frame {n}", run))
         if progress is not None:
             progress(count, len(frames))
@@ -116,14 +118,6 @@ def _agreement(quartets: list[Decoded]) -> dict[str, Any]:
         return {}
     single = np.stack([one.single for one in quartets]).astype(np.float32)
     return {"single": single, "confidence": np.stack(confidence).astype(np.float32)}
-
-
-def render_frame(run: Run, sequence: Sequence, n: int, *, f_mod_hz: float | None = None) -> Rendering:
-    """The field at the time and from the pose of raw frame n; quads at ``f_mod_hz``, None: the first frequency."""
-    time = float(sequence.times[n])
-    if f_mod_hz is None:
-        return run.render(time, camera_at(run, sequence, time))
-    return run.render(time, camera_at(run, sequence, time), f_mod_hz=f_mod_hz)
 
 
 def camera_at(run: Run, sequence: Sequence, time: float) -> Camera:

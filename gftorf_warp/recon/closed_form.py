@@ -114,9 +114,14 @@ class ClosedForm(Run):
             screen=None,
         )
 
-    def renderer(self, images: Iterable[str] = ()) -> Callable[[float, Camera], Rendering]:  # noqa: ARG002
+    def renderer(
+        self,
+        images: Iterable[str] = (),  # noqa: ARG002
+        *,
+        f_mod_hz: float | None = None,
+    ) -> Callable[[float, Camera], Rendering]:
         """:meth:`render`: there is nothing that images share."""
-        return self.render
+        return functools.partial(self.render, f_mod_hz=f_mod_hz)
 
     def _check(self, camera: Camera | None, sequence: Sequence, quartet: int, time: float) -> None:
         """Refuse every camera but the sequence's own."""

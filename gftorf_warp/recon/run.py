@@ -123,11 +123,10 @@ class Run:
             f_mod_hz: Modulation frequency of quads and phasor [Hz]; None: the first of the sensor.
         """
         camera = camera or self.camera
-        sensor = self.sensor if f_mod_hz is None else replace(self.sensor, f_mod_hz=f_mod_hz, further_hz=())
         rendering = rasterize(
             self.widened(self.field.moved(*self.motion.at(self.attachment, time)), camera),
             camera,
-            sensor,
+            self._at(f_mod_hz),
             self.render_settings,
             extra=extra,
         )
@@ -138,7 +137,12 @@ class Run:
             colour=None if rendering.colour is None else rendering.colour / self.colour_scale,
         )
 
-    def renderer(self, images: Iterable[str] = (*CHOICES, "colour")) -> Callable[[float, Camera], Rendering]:
+    def _at(self, f_mod_hz: float | None) -> Sensor:
+        return self.sensor if f_mod_hz is None else replace(self.sensor, f_mod_hz=f_mod_hz, further_hz=())
+
+    def renderer(
+        self, images: Iterable[str] = (*CHOICES, "colour"), *, f_mod_hz: float | None = None
+    ) -> Callable[[float, Camera], Rendering]:
         """:meth:`render` for many images: a function of time [s] and camera, which keeps what images share.
 
         Its images differ from those of :meth:`render` by rounding only, and the next call overwrites them.
@@ -146,10 +150,11 @@ class Run:
         Args:
             images: Names of what is wanted of quads, phasor, colour, distance, opacity and distortion; others have no
                 elements and cost nothing.
+            f_mod_hz: Modulation frequency of quads and phasor [Hz]; None: the first of the sensor.
         """
         names = frozenset(images)
         field = self.field if "colour" in names else replace(self.field, colour_sh=None)
-        sensor = replace(self.sensor, source_intensity=float(self.sensor.source_intensity) / self.quad_scale)
+        sensor = replace(self._at(f_mod_hz), source_intensity=float(self.sensor.source_intensity) / self.quad_scale)
         optimised = self.camera.resized(*self.config["size_optimised"])
         known = field, self.motion, self.attachment, sensor, self.render_settings, optimised, names
         return Replay(*known, colour_scale=self.colour_scale)
