@@ -45,6 +45,7 @@ HAS_BOTH = {  # the only modules that may know torch and Warp together
     "render/fused.py": "what a step does beside rendering: other kernels and callers",
     "render/displacement.py": "motion of torch, one kernel of Warp",
     "render/descent.py": "the end of a step: Adam and what judges it, of many tensors at once",
+    "render/moved.py": "Gaussians of a finished run at a time",
     "render/replay.py": "renderings of a finished run: a field of torch, a graph of Warp",
     "render/perceptron.py": "layers of a network: torch's function around them, Warp's kernels in them",
 }
@@ -55,7 +56,8 @@ LAUNCHES = {  # file: what it launches
     "render/training.py": "what a step does beside rendering",
     "render/perceptron.py": "a network's layers, before anything is rendered",
     "render/displacement.py": "Gaussians at a time, before they are rendered",
-    "render/replay.py": "Gaussians at a time, before they are rendered again",
+    "render/moved.py": "Gaussians at a time, before they are rendered again",
+    "render/replay.py": "the number of pairs of a rendering",
     "render/trace.py": "rays through meshes, which share nothing with a rendering",
 }
 KNOWS_STREAMS = {  # streams, events and graphs of torch

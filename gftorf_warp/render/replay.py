@@ -27,11 +27,11 @@ from . import launch
 from .api import Rendering
 from .bridge import ALIGNED, array_over, left_out, stream_of, without_garbage_collection
 from .buffers import Frame, RenderSettings
-from .inputs import CHOICES, Images, Inputs, View, names_of, shapes_of, wanted_images
+from .inputs import CHOICES, Images, View, names_of, shapes_of, wanted_images
+from .moved import MovedGaussians, footprint_row
 
 ROOM = 1.5  # pairs that are reserved, over the most that were needed so far
 CAMERAS_MAX = 16  # that are kept, with their graphs
-KEY, SHARE = 3, 4  # arguments of ``move_gaussians`` that say when
 Memory = TypeVar("Memory", Tensor, np.ndarray)
 
 
@@ -53,7 +53,7 @@ class _View:
 
     view: View
     target: Target
-    move: wp.Launch | None  # of the Gaussians, to a time that is filled in; None: there are none
+    footprint: wp.vec4
     used: int = 0
     graph: wp.Graph | None = None
 
@@ -93,31 +93,16 @@ class Replay:
             ValueError: If there is no such image.
         """
         wp.init()
-        field = field.map(lambda tensor: tensor.detach().contiguous())
-        self.motion, self.attachment, self.settings, self.colour_scale = motion, attachment, settings, colour_scale
+        self.settings, self.colour_scale = settings, colour_scale
         colour = {"colour"} & set(images) if field.colour_sh is not None else set()
         self.names, self._like = wanted_images(set(images) - {"colour"}) | colour, field.mean
         self.shifts = tuple(float(shift) for shift in sensor.shifts)
         self.device = wp.device_from_torch(field.device)
         self.graphs = self.device.is_cuda
-        self.count, self._field = len(field), field
-        self._offset = field.mean.new_zeros(len(motion.key_times), len(field), 3)
-        self._known: set[int] = set()
-        self._mean, self._log_scale = torch.empty_like(field.mean), torch.empty_like(field.log_scale)
+        self.count = len(field)
         values = sensor.phase_slope, sensor.phase_offset, sensor.source_intensity, sensor.dc_offset
-        self._calibration = torch.tensor([float(v) for v in values], dtype=torch.float32, device=field.device)
-        self._inputs = Inputs(
-            mean=array_over(self._mean, wp.vec3),
-            log_scale=array_over(self._log_scale, wp.vec3),
-            quaternion=array_over(field.quaternion, wp.vec4),
-            opacity_logit=array_over(field.opacity_logit),
-            reflectivity_sh=array_over(field.reflectivity_sh),
-            colour_sh=array_over(field.colour_sh, wp.vec3),
-            calibration=array_over(self._calibration),
-        )
-        rest = [array_over(tensor, wp.vec3) for tensor in (field.mean, field.log_scale, self._offset)]
-        self._rest, self._optimised = rest, _row(optimised)
-        self._moved = [self._inputs.mean, self._inputs.log_scale]
+        calibration = torch.tensor([float(v) for v in values], dtype=torch.float32, device=field.device)
+        self._gaussians = MovedGaussians(field, motion, attachment, calibration, optimised)
         self._views: dict[tuple, _View] = {}
         self._targets: dict[tuple[int, int], Target] = {}
         self._largest = wp.zeros(1, dtype=wp.int32, device=self.device)
@@ -156,25 +141,17 @@ class Replay:
     @property
     def largest(self) -> int:
         """The largest number of (tile, splat) pairs of a rendering so far; waits for the device."""
-        with stream_of(self._mean):
+        with stream_of(self._like):
             return int(self._largest.numpy()[0])
 
     @torch.no_grad()
     def draw(self, time: float, camera: Camera) -> Target:
         """The images at one instant, without a look at whether their pairs fitted; the next one overwrites them."""
-        key, share = self.motion.interval(time)
-        for number in (key, key + 1) if share > 0.0 else (key,):
-            if number not in self._known:
-                self._offset[number] = self.motion.at_keys(self.attachment, [number]).offset[0]
-                self._known.add(number)
         seen = self._view(camera)
         if self.graphs and self._capacity is not None and seen.used and seen.graph is None:
             seen.graph = self._captured(seen)
-        with stream_of(self._mean):
-            if seen.move is not None:
-                seen.move.set_param_at_index(KEY, key)
-                seen.move.set_param_at_index(SHARE, share)
-                seen.move.launch()
+        self._gaussians.move(time, seen.footprint)
+        with stream_of(self._like):
             if seen.graph is None:
                 self._draw(seen)
             else:
@@ -202,7 +179,7 @@ class Replay:
     def _draw(self, seen: _View) -> None:
         """What a graph holds: a rendering, and the number of its pairs."""
         frame = seen.target.frame
-        launch.forward(self._inputs, seen.view, frame, seen.target.images, differentiable=False)
+        launch.forward(self._gaussians.inputs, seen.view, frame, seen.target.images, differentiable=False)
         if self.count:
             noted = [self._largest, seen.target.pairs]
             wp.launch(move.note_largest, 1, [frame.total], noted, device=self.device, record_tape=False)
@@ -220,11 +197,7 @@ class Replay:
             if size not in self._targets:
                 self._targets[size] = self._target(*size)
             view = launch.uploaded(camera, self.shifts, self.settings, self.device)
-            inputs = [*self._rest, 0, 0.0, self._optimised, _row(camera)]
-            where = {"device": self.device, "record_tape": False}
-            # packed once: that is what a launch costs a host
-            moves = wp.launch(move.move_gaussians, self.count, inputs, self._moved, record_cmd=True, **where)
-            self._views[name] = _View(view=view, target=self._targets[size], move=moves)
+            self._views[name] = _View(view=view, target=self._targets[size], footprint=footprint_row(camera))
         return self._views[name]
 
     def _target(self, height: int, width: int) -> Target:
@@ -233,10 +206,10 @@ class Replay:
         for name in (name for name in shapes if name in self.names):
             places[name] = length, shapes[name]
             length += -(-math.prod(shapes[name]) // ALIGNED) * ALIGNED
-        packed = self._mean.new_zeros(length + ALIGNED)
+        packed = self._like.new_zeros(length + ALIGNED)
         tensors = {name: part(packed, *place) for name, place in places.items()}
         settings = replace(self.settings, pair_capacity=self._capacity)
-        with stream_of(self._mean):
+        with stream_of(self._like):
             frame = Frame(self.count, width, height, settings, self.device)
         images = Images(**dict.fromkeys(names_of(Images)) | {name: array_over(tensors[name]) for name in tensors})
         pairs = array_over(packed[-1:].view(torch.int32), wp.int32)
@@ -246,9 +219,3 @@ class Replay:
 def part(packed: Memory, start: int, shape: tuple[int, ...]) -> Memory:
     """The image of a shape that starts at an element of a memory of many."""
     return packed[start : start + math.prod(shape)].reshape(shape)
-
-
-def _row(camera: Camera) -> wp.vec4:
-    """The row of a pose that gives z-depth, divided by the focal length: the width of a pixel at a point [m]."""
-    row = np.asarray(camera.camera_from_world[2], dtype=np.float64) / math.sqrt(camera.fx * camera.fy)
-    return wp.vec4(*(float(value) for value in row))

@@ -1,8 +1,11 @@
-"""Gaussians of a finished run at a time: between two keys, and as wide as they looked while they were optimised."""
+"""Gaussians of a finished run at one time, widened for cameras that resolve more than that of the optimisation."""
+
+import functools
 
 import warp as wp
 
 from ...constants import LOW_PASS
+from .displace import OPTIONS, make_interpolation, product
 
 LOW_PASS_PX2 = wp.constant(float(LOW_PASS))  # [px^2]
 
@@ -13,35 +16,46 @@ def footprint(row: wp.vec4, point: wp.vec3) -> float:
     return row[0] * point[0] + row[1] * point[1] + row[2] * point[2] + row[3]
 
 
-@wp.kernel(enable_backward=False)
-def move_gaussians(
-    # In:
-    rest_mean: wp.array[wp.vec3],  # [N] where nothing has moved [m]
-    rest_log_scale: wp.array[wp.vec3],  # [N] [log m]
-    offset: wp.array2d[wp.vec3],  # [T, N] displacement at every key [m]
-    key: int,  # at or before the time [index]
-    share: float,  # of the way to the next key, 0 at the last one [1]
-    optimised: wp.vec4,  # row of the camera of the optimisation that gives a footprint [m]
-    here: wp.vec4,  # row of this camera [m]
-    # Out:
-    mean: wp.array[wp.vec3],  # [N] [m]
-    log_scale: wp.array[wp.vec3],  # [N] [log m]
-):
-    """One thread per Gaussian."""
-    i = wp.tid()
-    displacement = offset[key, i]
-    if share > 0.0:
-        displacement = (1.0 - share) * displacement + share * offset[key + 1, i]
-    point = rest_mean[i] + displacement
-    scale = rest_log_scale[i]
-    wide = footprint(optimised, point)
-    narrow = footprint(here, point)
-    missing = LOW_PASS_PX2 * (wide * wide - narrow * narrow)
-    if missing > 0.0:
-        for axis in range(3):
-            scale[axis] = 0.5 * wp.log(wp.exp(2.0 * scale[axis]) + missing)
-    mean[i] = point
-    log_scale[i] = scale
+@functools.cache
+def make_move(K: int) -> wp.Kernel:
+    """The kernel ``move_gaussians`` for times that depend on K keys; unused keys have weight zero."""
+    sums = make_interpolation(K)
+    Indices, Weights, interpolated = sums.Indices, sums.Weights, sums.interpolated
+
+    @wp.kernel(**OPTIONS)
+    def move_gaussians(
+        # In:
+        initial_mean: wp.array[wp.vec3],  # [N] undisplaced centres [m]
+        initial_log_scale: wp.array[wp.vec3],  # [N] [log m]
+        initial_quaternion: wp.array[wp.vec4],  # [N] orientations wxyz; empty: no rotation
+        offset: wp.array2d[wp.vec3],  # [T, N] displacements at all keys [m]
+        rotation: wp.array2d[wp.vec4],  # [T, N] rotations wxyz at all keys; empty: no rotation
+        optimised: wp.vec4,  # row of the camera of the optimisation that gives a footprint [m]
+        index: Indices,  # [K] keys of the time [index]
+        weight: Weights,  # [K] interpolation weights of the time [1]
+        here: wp.vec4,  # row of this camera that gives a footprint [m]
+        # Out:
+        mean: wp.array[wp.vec3],  # [N] [m]
+        log_scale: wp.array[wp.vec3],  # [N] [log m]
+        quaternion: wp.array[wp.vec4],  # [N] orientations wxyz; empty: no rotation
+    ):
+        """One thread per Gaussian."""
+        i = wp.tid()
+        point = initial_mean[i] + interpolated(offset, index, weight, i)
+        scale = initial_log_scale[i]
+        wide = footprint(optimised, point)
+        narrow = footprint(here, point)
+        missing = LOW_PASS_PX2 * (wide * wide - narrow * narrow)
+        if missing > 0.0:
+            for axis in range(3):
+                scale[axis] = 0.5 * wp.log(wp.exp(2.0 * scale[axis]) + missing)
+        mean[i] = point
+        log_scale[i] = scale
+        if quaternion.shape[0] > 0:
+            turn = wp.normalize(interpolated(rotation, index, weight, i))
+            quaternion[i] = product(turn, initial_quaternion[i])
+
+    return move_gaussians
 
 
 @wp.kernel(enable_backward=False)
