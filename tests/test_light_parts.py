@@ -133,7 +133,7 @@ def test_furnace_of_gloss(gloss, n, device):
     body = RigidBody(points=points, triangles=triangles, low=0.7, high=0.7, gloss=gloss, shininess=n, **PLAIN)
     tracer, camera = Tracer([body], 32, 24, device=device), Camera.from_fov(32, 24, 60.0)
     for count in (1, 4):
-        got = tracer.light([camera], HERE, 2e7, bounces=Bounces(count=count, paths=256), seed=count)
+        got = tracer.light([camera], HERE, 2e7, bounces=Bounces(count=count, paths=128), seed=count)
         amplitude = got.amplitude.astype(np.float64)
         sigma = amplitude.std() / math.sqrt(amplitude.size)
         want = sphere_of_gloss(0.7, gloss, n, count, 0.0).real
