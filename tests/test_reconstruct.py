@@ -40,8 +40,8 @@ def folder_of_a_sequence(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def sample_scores(tmp_path_factory):
-    """Scores of the ray-traced sample after a fifth of the preset's images."""
-    return scores(tmp_path_factory.mktemp("sample") / "run", demo(images=800))
+    """Scores of the ray-traced sample after 15 percent of the preset's images."""
+    return scores(tmp_path_factory.mktemp("sample") / "run", demo(images=600))
 
 
 def scores(out, settings):
@@ -63,7 +63,7 @@ def test_the_sample_is_much_better_than_the_closed_form(sample_scores):
 
 def test_half_the_resolution_and_computed_flow_come_close(tmp_path):
     """Optimised at 80x60 with flow from the quads, compared at 160x120."""
-    found = scores(tmp_path / "run", demo(images=600, width_max=80, flow=FlowSource.DIS))
+    found = scores(tmp_path / "run", demo(images=400, width_max=80, flow=FlowSource.DIS))
     assert found["moving"]["d_mse_x100"] < 0.2 * found["moving"]["closed_form_mse_x100"]
     assert found["d_mse_x100"] < 0.4 * found["closed_form_mse_x100"]
     assert found["flow_source"] == "computed"
@@ -71,7 +71,7 @@ def test_half_the_resolution_and_computed_flow_come_close(tmp_path):
 
 def test_without_motion_it_is_much_worse(sample_scores, tmp_path):
     """The control: the rest of the machinery alone does not explain the result."""
-    still = scores(tmp_path / "run", demo(images=800, motion=MotionSettings(kind="still")))
+    still = scores(tmp_path / "run", demo(images=600, motion=MotionSettings(kind="still")))
     assert still["moving"]["d_mse_x100"] > 5 * sample_scores["moving"]["d_mse_x100"]
     assert still["moving"]["d_mse_x100"] > 0.4 * still["moving"]["closed_form_mse_x100"]
 

@@ -19,7 +19,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from itertools import pairwise
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -145,7 +145,7 @@ class Motion(torch.nn.Module, abc.ABC):
 
     @classmethod
     @abc.abstractmethod
-    def start(cls, settings: MotionSettings, initial: MotionStart) -> Self:
+    def start(cls, settings: MotionSettings, initial: MotionStart) -> Motion:
         """The model at the beginning of a run."""
 
     @abc.abstractmethod
@@ -190,7 +190,7 @@ class Motion(torch.nn.Module, abc.ABC):
 
     @classmethod
     @abc.abstractmethod
-    def from_dict(cls, stored: dict[str, Any]) -> Self:
+    def from_dict(cls, stored: dict[str, Any]) -> Motion:
         """The inverse of :meth:`to_dict`."""
 
 
@@ -200,7 +200,7 @@ class Still(Motion):
     kind = "still"
 
     @classmethod
-    def start(cls, settings: MotionSettings, initial: MotionStart) -> Self:  # noqa: ARG003
+    def start(cls, settings: MotionSettings, initial: MotionStart) -> Still:  # noqa: ARG003
         """No parameters."""
         return cls(initial.key_times)
 
@@ -213,7 +213,7 @@ class Still(Motion):
         return KeyMotion(attachment.new_zeros(len(keys), len(attachment), 3), None)
 
     @classmethod
-    def from_dict(cls, stored: dict[str, Any]) -> Self:
+    def from_dict(cls, stored: dict[str, Any]) -> Still:
         """From its key times."""
         return cls(stored["tensors"]["key_times"])
 
@@ -267,7 +267,7 @@ class Nodes(Motion):
         """Displacement [T, M, 3] of every node at every key [m]."""
 
     @classmethod
-    def start(cls, settings: MotionSettings, initial: MotionStart) -> Self:
+    def start(cls, settings: MotionSettings, initial: MotionStart) -> Nodes:
         """Nodes spread over the moving layers; displacements are medians of tracks near each node, or zero."""
         field = initial.field
         if field.layer is None:
@@ -307,7 +307,7 @@ class Nodes(Motion):
         return super().to_dict() | {"neighbours": self.neighbours}
 
     @classmethod
-    def from_dict(cls, stored: dict[str, Any]) -> Self:
+    def from_dict(cls, stored: dict[str, Any]) -> Nodes:
         """From its tensors and the number of neighbours."""
         parts = (stored["tensors"][name] for name in ("key_times", "node", "layer", "offset"))
         return cls(*parts, neighbours=stored["neighbours"])

@@ -11,7 +11,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, replace
-from typing import Any, Self
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int
@@ -78,7 +78,7 @@ class Network(Motion):
         self.draw(generator)
 
     @classmethod
-    def start(cls, settings: MotionSettings, initial: MotionStart) -> Self:
+    def start(cls, settings: MotionSettings, initial: MotionStart) -> Network:
         """With random weights."""
         duration = initial.duration or 1.0  # a single instant: any duration serves
         length = settings.input_scale * initial.unambiguous_range
@@ -127,7 +127,7 @@ class Network(Motion):
         return super().to_dict() | {"shape": shape, "duration": self.duration, "length": self.length}
 
     @classmethod
-    def from_dict(cls, stored: dict[str, Any]) -> Self:
+    def from_dict(cls, stored: dict[str, Any]) -> Network:
         """From its shape and its tensors."""
         products = Products(stored["shape"].get("products", Products.FLOAT32))  # oldest checkpoints have none
         settings = MotionSettings(**stored["shape"] | {"products": products})
