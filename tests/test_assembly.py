@@ -95,7 +95,7 @@ def test_a_cover_of_an_assembly_is_as_large_as_it_is():
     table = Assembly(parts=(Part(shape=top), *(Part(shape=leg, position=(x, 0.35, 0.1)) for x in (-0.35, 0.35))))
     body = Body(shape=table, texture=GREY, path=Line(position=(0.0, -0.1, 2.3), velocity=(1.0, 0.0, 0.0)))
     camera = Camera.from_fov(96, 72, 60.0)
-    field = cover_moving(body, camera, np.array([0.0, 0.1])).seen(camera.centre, 0.05)
+    field = cover_moving(body, camera, np.array([0.0, 0.1])).facing(camera.centre, 0.05)
     opacity = rasterize(field, camera, Sensor()).opacity.numpy()
     area = (first_hit((body,), camera.resized(960, 720), 0.05).body >= 0).reshape(72, 10, 96, 10).mean((1, 3))
     inner = np.ones_like(area, dtype=bool)

@@ -225,7 +225,7 @@ def test_a_beam_beside_the_camera_is_seen_from_there(power):
 def test_a_beam_bounces():
     """Direct light has the beam of the pixels, as without bounces; what bounces comes of what the beam lights."""
     box = replace(WALL, shape=Box(size=(4.0, 3.0, 5.0), inside=True), path=Still(position=(0.0, 0.0, 1.0)))
-    options = {"engine": "mesh", "noise": False, "bounces": 1, "paths": 256, "frames": 1, "truth": "usual"}
+    options = {"engine": "mesh", "noise": False, "bounces": 1, "paths": 256, "frames": 1, "format": "capture"}
     plain, beam = (
         record(scene(bodies=(box,), lens=lens), **options).truth.layers for lens in (Lens(), Lens(beam_power=8.0))
     )

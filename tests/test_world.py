@@ -221,7 +221,7 @@ def test_discs_lie_in_their_surface():
     """Turned by their quaternions, the thin axes are the normals of a turned box at that time, and face the camera."""
     path = Line(position=(0.1, 0.0, 2.3), velocity=(0.0, 0.0, -1.0), turn_deg=TURN, spin_deg_per_s=(0.0, 400.0, 0.0))
     body = Body(shape=Box(size=(0.6, 0.6, 0.6)), texture=GREY, path=path)
-    field = gaussian_cover.cover_moving(body, CAMERA, np.array([0.0, 0.1])).seen(CAMERA.centre, 0.07)
+    field = gaussian_cover.cover_moving(body, CAMERA, np.array([0.0, 0.1])).facing(CAMERA.centre, 0.07)
     w, x, y, z = field.quaternion.double().numpy().T
     thin = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=1)
     assert (field.log_scale.argmin(1) == 2).all()
@@ -246,7 +246,7 @@ def test_a_moving_cover_is_opaque_and_as_large_as_its_shape(shape, turn, bound):
     camera = Camera.from_fov(96, 72, 60.0)
     path = Line(position=(0.1, 0.0, 2.3), velocity=(1.0, 0.0, -1.0), turn_deg=turn)
     body = Body(shape=shape, texture=GREY, path=path)
-    field = gaussian_cover.cover_moving(body, camera, np.array([0.0, 0.1])).seen(camera.centre, 0.05)
+    field = gaussian_cover.cover_moving(body, camera, np.array([0.0, 0.1])).facing(camera.centre, 0.05)
     opacity = rasterize(field, camera, Sensor()).opacity.numpy()
     fine = first_hit((body,), camera.resized(960, 720), 0.05).body >= 0
     area = fine.reshape(72, 10, 96, 10).mean((1, 3))
@@ -263,7 +263,7 @@ def test_a_moving_cover_is_opaque_and_as_large_as_its_shape(shape, turn, bound):
 def test_a_cover_returns_the_light_of_its_surface():
     """Mean amplitude of a rendered still room is the analytic one: the overlap of splats is accounted for."""
     bodies, camera = (room(),), Camera.from_fov(96, 72, 60.0)
-    field = gaussian_cover.cover_still(bodies, camera).seen(camera.centre, 0.0)
+    field = gaussian_cover.cover_still(bodies, camera).facing(camera.centre, 0.0)
     rendered = rasterize(field, camera, Sensor()).phasor[2].numpy() / 2
     hit = first_hit(bodies, camera, 0.0)
     assert rendered.mean() == pytest.approx(hit.amplitude.mean(), rel=0.02)
