@@ -23,7 +23,8 @@ from gftorf_warp.bench.timing import WARM_UP, watch_of
 from gftorf_warp.recon.objective import image_loss
 from gftorf_warp.recon.optimiser import BETAS, EPSILON
 from gftorf_warp.render import descent, fused, training
-from gftorf_warp.render.bridge import array_over, captured, stream_of
+from gftorf_warp.render.bridge import array_over
+from gftorf_warp.render.cuda import stream_of
 
 IMAGES = {"1 x 120 x 160": (1, 120, 160), "1 x 240 x 320": (1, 240, 320), "4 x 240 x 320": (4, 240, 320)}
 NETWORK = [(256, 84), *[(256, 256)] * 4, (256, 340), *[(256, 256)] * 2, (3, 256), *[(256,)] * 8, (3,)]
@@ -92,7 +93,7 @@ def replay_of(run: Callable[[], torch.Tensor]) -> tuple[Callable[[], None], torc
             run()
     torch.cuda.current_stream().wait_stream(side)
     graph = torch.cuda.CUDAGraph()
-    with captured(graph, side):
+    with capture(graph, side):
         result = run()
     return graph.replay, result
 

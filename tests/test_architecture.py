@@ -42,6 +42,7 @@ TABLE = {  # room: (rooms it may import besides itself, packages it may import);
 FREE = {"constants", "errors", "__version__"}
 HAS_BOTH = {  # the only modules that may know torch and Warp together
     "render/bridge.py": "a rendering, and its gradient",
+    "render/cuda.py": "streams and graphs that both use",
     "render/fused.py": "what a step does beside rendering: other kernels and callers",
     "render/displacement.py": "motion of torch, one kernel of Warp",
     "render/descent.py": "the end of a step: Adam and what judges it, of many tensors at once",
@@ -61,8 +62,7 @@ LAUNCHES = {  # file: what it launches
     "render/trace.py": "rays through meshes, which share nothing with a rendering",
 }
 KNOWS_STREAMS = {  # streams, events and graphs of torch
-    "render/bridge.py": "a step and its graphs",
-    "render/outgoing.py": "what leaves the device while it goes on",
+    "render/cuda.py": "the one module of streams, events and graphs",
     "scene/perceptron.py": "products of one gradient that run at the same time",
 }
 KNOWS_KINDS = {"render/buffers.py": "the shape of a tile depends on the kind of device, which is the input's"}

@@ -10,7 +10,7 @@ from test_captured_steps import begun, published
 from gftorf_warp.recon.captured import CapturedSteps
 from gftorf_warp.recon.reserve import ASK_EVERY
 from gftorf_warp.recon.settings import Batch
-from gftorf_warp.render.bridge import SLOTS, Inbox, Outbox
+from gftorf_warp.render.bridge import SLOTS
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA"))]
 INTEGERS = [0, -1, 2**31 - 1, -(2**31), 7]

@@ -9,7 +9,7 @@ from test_replay import CAMERA, DEVICES, IMAGES, PLAIN, aside, run  # noqa: F401
 
 from gftorf_warp.render import replay as replaying
 from gftorf_warp.render import series
-from gftorf_warp.render.outgoing import Outgoing
+from gftorf_warp.render.cuda import ReadbackRing
 from gftorf_warp.render.series import Series
 
 VIEWS = [
@@ -105,10 +105,10 @@ def test_images_that_overflowed_are_rendered_again(run, ahead, where, monkeypatc
 
 def test_memory_comes_back_when_nobody_looks_at_it():
     """A part of an array keeps all of it; what is held beyond the reserve is a copy; nothing is ever overwritten."""
-    outgoing = Outgoing(torch.zeros(8), ahead=1, kept=2)
+    outgoing = ReadbackRing(torch.zeros(8), ahead=1, kept=2)
     held = []
     for number in range(6):
-        array = outgoing.keep(outgoing.send(torch.full((8,), float(number))))
+        array = outgoing.keep(outgoing.copy(torch.full((8,), float(number))))
         held.append(array[2:6].reshape(2, 2)[1:])
         del array
     gc.collect()
@@ -118,11 +118,11 @@ def test_memory_comes_back_when_nobody_looks_at_it():
     held.clear()
     gc.collect()
     assert len(outgoing._free) == 4
-    first = outgoing.keep(outgoing.send(torch.ones(8)))
+    first = outgoing.keep(outgoing.copy(torch.ones(8)))
     address = first.ctypes.data
     del first
     gc.collect()
-    found = {outgoing.keep(outgoing.send(torch.ones(8))).ctypes.data for _ in range(8)}
+    found = {outgoing.keep(outgoing.copy(torch.ones(8))).ctypes.data for _ in range(8)}
     assert address in found
     assert len(found) == 4, "nothing was allocated"
 
@@ -130,8 +130,8 @@ def test_memory_comes_back_when_nobody_looks_at_it():
 @pytest.mark.parametrize("length", [1, 1024, 1025])
 def test_memory_starts_where_pages_do(length):
     """Every copy, so that a disk takes it as it is; none reaches into another."""
-    outgoing = Outgoing(torch.zeros(length), ahead=1, kept=3)
-    held = [outgoing.keep(outgoing.send(torch.full((length,), float(number)))) for number in range(3)]
+    outgoing = ReadbackRing(torch.zeros(length), ahead=1, kept=3)
+    held = [outgoing.keep(outgoing.copy(torch.full((length,), float(number)))) for number in range(3)]
     assert [one.ctypes.data % 4096 for one in held] == [0, 0, 0]
     assert [(one.shape, float(one.min()), float(one.max())) for one in held] == [((length,), k, k) for k in range(3)]
 
@@ -139,8 +139,8 @@ def test_memory_starts_where_pages_do(length):
 @pytest.mark.parametrize("kept", [2, 20])
 def test_as_many_are_held_as_was_asked_for(run, kept, monkeypatch):  # noqa: F811
     """Memory of one camera's images, all of which are held."""
-    made, right = [], Outgoing.__init__
-    monkeypatch.setattr(Outgoing, "__init__", lambda self, *a, **k: made.append(k["kept"]) or right(self, *a, **k))
+    made, right = [], ReadbackRing.__init__
+    monkeypatch.setattr(ReadbackRing, "__init__", lambda self, *a, **k: made.append(k["kept"]) or right(self, *a, **k))
     one = Series(run.renderer(PLAIN), [(0.001 * k, CAMERA) for k in range(8)])
     found = list(one.on_host(kept))
     assert made == [kept]

@@ -11,8 +11,8 @@ import warp as wp
 
 from gftorf_warp.render import buffers, launch
 from gftorf_warp.render.api import Background, rasterize
-from gftorf_warp.render.bridge import captured, without_garbage_collection
 from gftorf_warp.render.buffers import Frame, RenderSettings, Workspace
+from gftorf_warp.render.cuda import capture, without_garbage_collection
 from gftorf_warp.render.launch import Images, Inputs
 from gftorf_warp.scene.camera import Camera
 from gftorf_warp.scene.gaussians import GaussianField, constant_sh
@@ -243,7 +243,7 @@ def test_torch_captures_a_rendering_and_its_backward_pass():
             both()
     stream.synchronize()
     graph = torch.cuda.CUDAGraph()
-    with captured(graph, stream):
+    with capture(graph, stream):
         quads = both()
     with torch.no_grad():
         mean += 0.01
@@ -278,7 +278,7 @@ def test_an_old_graph_in_a_cycle_breaks_no_capture():
         made, there = torch.cuda.CUDAGraph(), torch.zeros(1 << 20, device="cuda")
         there.add_(value)
         torch.cuda.synchronize()
-        with captured(made):
+        with capture(made):
             holds = [made, there + value]
             for _ in range(1000):
                 holds.append([holds])  # objects that the collector counts, in a cycle

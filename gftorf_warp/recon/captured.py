@@ -18,8 +18,9 @@ from ..constants import FRAMES_PER_QUARTET
 from ..losses.prior import motion_size
 from ..render import descent, fused, perceptron
 from ..render.api import Rendering
-from ..render.bridge import Branches, Captured, Inbox, Outbox, pairs_of, shared_pool
+from ..render.bridge import pairs_of
 from ..render.buffers import RenderSettings, Workspace
+from ..render.cuda import CapturedGraph, DeviceReadback, DeviceUpload, SideStreams, graph_pool
 from ..scene.motion import Still
 from ..scene.network import Network
 from . import densify
@@ -91,22 +92,22 @@ class CapturedSteps:
         self._graphs: dict[Variant, Callable[[], None]] = {}
         self._part: tuple | None = None  # of the run: what graphs that are kept have in common
         self._steps = 0  # since rooms were last looked at
-        self._pool = shared_pool(device)
+        self._pool = graph_pool(device)
         self._reserve = Reserve()
         self._reserves = device.type != "cpu"  # a CPU counts pairs first: nobody waits for anybody there
         longest = max(len(batch) for batch in observations.batches)
         self._graphs_wanted = graphs
         self._ledger = descent.Ledger.empty(longest, device)
-        self._inbox, self._replays = Inbox(self._ledger.counts), 0
+        self._inbox, self._replays = DeviceReadback(self._ledger.counts), 0
         self._summed: set[str] = set()  # names of sums that a step has added to
         self._ones: dict[float, Tensor] = {}
         self._scratch = [fused.Scratch() for _ in range(longest)]
         numbers, values = HEAD + PER_IMAGE * longest, len(state.optimiser.leaves) + longest
-        self._outbox = Outbox([(numbers, torch.int32), (values, torch.float32)], device)
+        self._outbox = DeviceUpload([(numbers, torch.int32), (values, torch.float32)], device)
         self._numbers, self._values = self._outbox.parts
         self._groups = [*state.optimiser.tensors] + ["motion"] * len(state.optimiser.motion)
         self._flow = observations.flow_table() if settings.weights.flow > 0 else None
-        self._branches = Branches(longest, device)
+        self._branches = SideStreams(longest, device)
         self._workspaces = [Workspace() for _ in range(longest)]
         motion = state.motion
         if isinstance(motion, Network) and perceptron.fits(motion.form, device):
@@ -156,7 +157,7 @@ class CapturedSteps:
     def _forget(self) -> None:
         """Let go of all graphs, and of the memory that they shared: it is gone with the last of them."""
         self._graphs.clear()
-        self._pool = shared_pool(self.observations.quads.device)
+        self._pool = graph_pool(self.observations.quads.device)
 
     def _rest(self, rests: bool) -> None:
         """Ask the motion once where Gaussians hang on it, if they will not move any more."""
@@ -174,7 +175,7 @@ class CapturedSteps:
         device = self.observations.quads.device
         if device.type == "cpu" or not self._graphs_wanted:
             return lambda: self._body(variant, table, table.send)
-        return Captured(lambda: self._body(variant, table, None), device, ready, self._pool)
+        return CapturedGraph(lambda: self._body(variant, table, None), device, ready, self._pool)
 
     def collect(self) -> int:
         """Bring sums and counts of the steps so far into the state; waits for the device.
@@ -208,8 +209,8 @@ class CapturedSteps:
         """Make room for pairs before they need it: numbers of a few steps ago say so, and nobody waits for them."""
         self._replays += 1
         if self._replays % ASK_EVERY == 0:
-            self._inbox.ask()
-        seen = self._inbox.look(wait=self.settings.render.deterministic)  # when they arrive depends on the machine
+            self._inbox.request()
+        seen = self._inbox.latest(wait=self.settings.render.deterministic)  # when they arrive depends on the machine
         if seen is not None and self._reserve.is_nearly_full(seen[2]):
             self._look()
 
@@ -257,7 +258,7 @@ class CapturedSteps:
             table: Where its tensors lie; learns where its gradients do.
             send: What tells the device so; None: that comes later.
         """
-        padded, numbers, motion = self.padded, self._numbers.there, self.state.motion
+        padded, numbers, motion = self.padded, self._numbers, self.state.motion
         field = padded.field
         offsets: Tensor | None = None
         if variant.moves:
@@ -289,13 +290,13 @@ class CapturedSteps:
     def _image(self, variant: Variant, n: int, offsets: Tensor | None, render: RenderSettings) -> Image:
         """One image of the batch, compared, and its gradients by copies of what all images share."""
         settings, weights = self.settings, variant.weights
-        numbers, first = self._numbers.there[HEAD + PER_IMAGE * n :], len(self._groups) + n
+        numbers, first = self._numbers[HEAD + PER_IMAGE * n :], len(self._groups) + n
         field = self.padded.field.map(torch.Tensor.detach)
         values = [getattr(field, name).requires_grad_(not variant.rests) for name in self.padded.values]
         moved, flows, lights = field, None, {}
         if offsets is not None:
             offsets = offsets.detach().requires_grad_(offsets.requires_grad)
-            share, flow = self._values.there[first : first + 1], variant.flow and n == 0
+            share, flow = self._values[first : first + 1], variant.flow and n == 0
             mean, flows = fused.displaced(field.mean, offsets, share, channels=flow)
             moved = replace(field, mean=mean)
         if settings.background > 0:
@@ -318,7 +319,7 @@ class CapturedSteps:
         if flows is not None:  # both directions: what is unknown counts zero
             assert self._flow is not None
             assert tof.extra is not None
-            row, out = self._numbers.there[3:4], found[ROW["flow"] : ROW["flow"] + 1]
+            row, out = self._numbers[3:4], found[ROW["flow"] : ROW["flow"] + 1]
             terms["flow"] = fused.flow_loss(
                 tof.distance, tof.extra, self._flow, camera, [camera, camera], row=row, out=out
             )
@@ -375,7 +376,7 @@ class CapturedSteps:
         capacity = (-1 if self._reserve.capacity is None else self._reserve.capacity) if self._reserves else 0
         descent.descend(
             table,
-            self._values.there[: len(self._groups)],
+            self._values[: len(self._groups)],
             self._ledger,
             [weights[name] for name in descent.FOUND_NAMES],
             motion_from=len(self.padded.values),

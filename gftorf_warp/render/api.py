@@ -15,7 +15,7 @@ from ..scene.gaussians import GaussianField
 from ..scene.sensor import Sensor
 from .bridge import IMAGES, INPUTS, Rasterize, Request, left_out
 from .buffers import RenderSettings, Workspace
-from .device_camera import DeviceCamera, check
+from .control import DeviceCamera, check
 from .inputs import CHOICES, wanted_images
 
 

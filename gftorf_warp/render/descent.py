@@ -18,7 +18,8 @@ from ..kernels.training.adam import COLUMNS, GRADIENT, GRADIENTS, LENGTH, MORE, 
 from ..kernels.training.step_end import FOUND, PART, SUMS
 from . import training
 from .api import ScreenGradient
-from .bridge import array_over, stream_of
+from .bridge import array_over
+from .cuda import stream_of
 
 FOUND_NAMES = ("quads", "quad_mse", "opacity", "flow", "distortion", "motion_size")
 """What is found of an image, in the order of the kernel."""

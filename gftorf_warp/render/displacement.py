@@ -12,7 +12,8 @@ from torch.autograd.function import once_differentiable
 
 from ..kernels.motion.displace import make_displace
 from ..scene.motion import KeyMotion
-from .bridge import array_over, stream_of
+from .bridge import array_over
+from .cuda import stream_of
 
 
 def displaced(

@@ -22,7 +22,8 @@ from ..kernels.training.image_similarity import MOMENTS, REACH, SLOPES, SUMS
 from ..scene.camera import Camera
 from ..scene.motion import KeyMotion
 from . import displacement, training
-from .bridge import array_over, stream_of
+from .bridge import array_over
+from .cuda import stream_of
 
 LARGEST = 1e18  # radius of a lens that is none: its square is a float32, too
 

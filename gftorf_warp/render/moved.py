@@ -13,7 +13,8 @@ from ..kernels.motion.move import make_move
 from ..scene.camera import Camera
 from ..scene.gaussians import GaussianField
 from ..scene.motion import KeyMotion, Motion
-from .bridge import array_over, stream_of
+from .bridge import array_over
+from .cuda import stream_of
 from .inputs import Inputs
 
 INDEX, WEIGHT, HERE = 6, 7, 8  # parameters of ``move_gaussians`` that :meth:`MovedGaussians.move` sets

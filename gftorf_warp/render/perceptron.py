@@ -15,7 +15,8 @@ from ..kernels.network import gradient_scaling as ends
 from ..kernels.network import perceptron as kernels
 from ..kernels.training.ordered_sums import LANES
 from ..scene.perceptron import LARGEST, SMALLEST, Form, Products, Slopes, beside, join
-from .bridge import array_over, stream_of
+from .bridge import array_over
+from .cuda import stream_of
 
 LISTED = True  # whether rows without gradient are left out of the way back: design/network.md says what that brings
 

@@ -34,7 +34,7 @@ from ..scene.gaussians import GaussianField
 from ..scene.sensor import Sensor
 from .api import Background, Rendering, ScreenGradient
 from .buffers import ClampGradient, Distortion, RenderSettings, Stop, Support, Workspace
-from .device_camera import DeviceCamera
+from .control import DeviceCamera
 from .inputs import CHOICES, wanted_images
 
 _PARITY_TILE = 16  # [px] side of the released code's tiles, to which Support.SIGMA3_TILE16 rounds out

@@ -25,8 +25,9 @@ from ..scene.motion import Motion
 from ..scene.sensor import Sensor
 from . import launch
 from .api import Rendering
-from .bridge import ALIGNED, array_over, left_out, stream_of, without_garbage_collection
+from .bridge import ALIGNED, array_over, left_out
 from .buffers import Frame, RenderSettings
+from .cuda import stream_of, without_garbage_collection
 from .inputs import CHOICES, Images, View, names_of, shapes_of, wanted_images
 from .moved import MovedGaussians, footprint_row
 

@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from ..scene.camera import Camera
 from .api import Rendering
-from .outgoing import Outgoing
+from .cuda import ReadbackRing
 from .replay import Replay, Target, part
 
 AHEAD = 4  # images that are launched before the first of them is looked at: 1 ms, more than a host is ever late
@@ -31,7 +31,7 @@ class _Sent:
 
     view: View
     target: Target
-    outgoing: Outgoing
+    outgoing: ReadbackRing
     ticket: tuple[int, int]
 
 
@@ -50,7 +50,7 @@ class Series:
         self.again = 0
         """Images so far that were rendered again, because they needed more pairs than were reserved."""
         self._kept = KEPT
-        self._outgoing: dict[int, Outgoing] = {}  # by the length of a packed image
+        self._outgoing: dict[int, ReadbackRing] = {}  # by the length of a packed image
 
     def on_host(self, kept: int = KEPT) -> Iterator[dict[str, Float[np.ndarray, "..."]]]:
         """Images by name as arrays on the host, float32: quads [4, H, W], distance [H, W] and so on.
@@ -72,9 +72,9 @@ class Series:
                 yield self._replay(*view)
             return
         for sent in self._whole(tail=True):
-            packed, places = sent.outgoing.near(sent.ticket), sent.target.places
+            packed, places = sent.outgoing.on_device(sent.ticket), sent.target.places
             yield self._replay.rendering({name: part(packed, *places[name]) for name in places}, sent.view[1])
-            sent.outgoing.give_back(sent.ticket)
+            sent.outgoing.release(sent.ticket)
 
     def _whole(self, *, tail: bool) -> Iterator[_Sent]:
         """Images in order that have arrived, and for which the reserve sufficed."""
@@ -95,14 +95,14 @@ class Series:
         length = len(target.packed)
         if length not in self._outgoing:
             few = {"kept": 1, "tail": 1} if tail else {"kept": self._kept}
-            self._outgoing[length] = Outgoing(target.packed, ahead=self.ahead, **few)
+            self._outgoing[length] = ReadbackRing(target.packed, ahead=self.ahead, **few)
         outgoing = self._outgoing[length]
-        return _Sent(view=view, target=target, outgoing=outgoing, ticket=outgoing.send(target.packed))
+        return _Sent(view=view, target=target, outgoing=outgoing, ticket=outgoing.copy(target.packed))
 
     def _settled(self, sent: _Sent, tail: bool) -> _Sent:
         """An image, rendered again until it is whole: once, unless others grow the reserve in between."""
         while self._lacks_pairs(sent):
-            sent.outgoing.give_back(sent.ticket)
+            sent.outgoing.release(sent.ticket)
             self.again += 1
             if not self._replay.fits():
                 self._replay.grow()
@@ -111,7 +111,7 @@ class Series:
 
     @staticmethod
     def _lacks_pairs(sent: _Sent) -> bool:
-        needed = int(sent.outgoing.arrived(sent.ticket)[-1:].view(np.int32)[0])
+        needed = int(sent.outgoing.wait(sent.ticket)[-1:].view(np.int32)[0])
         reserved = sent.target.frame.settings.pair_capacity
         return reserved is not None and needed > reserved
 

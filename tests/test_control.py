@@ -9,9 +9,9 @@ from cases import SMALL, gaussians
 from comparison import DEVICES
 
 from gftorf_warp.render.api import rasterize
-from gftorf_warp.render.bridge import captured
 from gftorf_warp.render.buffers import RenderSettings, Workspace
-from gftorf_warp.render.device_camera import DeviceCamera, packed
+from gftorf_warp.render.control import DeviceCamera, packed
+from gftorf_warp.render.cuda import capture
 from gftorf_warp.scene.distortion import Distortion
 from gftorf_warp.scene.sensor import Sensor
 
@@ -104,7 +104,7 @@ def test_one_graph_serves_any_pose_frequency_and_shifts(lens):
     graph, stream = torch.cuda.CUDAGraph(), torch.cuda.Stream()
     with torch.cuda.stream(stream):
         render()
-    with captured(graph, stream):
+    with capture(graph, stream):
         render()
     row.copy_(torch.from_numpy(packed(second, SENSORS[1], SETTINGS)))
     graph.replay()
