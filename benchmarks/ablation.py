@@ -69,8 +69,8 @@ def reflectivities(path: Path, scale: float | None) -> tuple[float, float, float
     """10th, 50th and 90th percentile of the reflectivity a d^2 that measured quartets decode to."""
     import numpy as np
 
+    from gftorf_warp import Sequence
     from gftorf_warp.data.decode import closed_form_distance, quad_scale, quartet_phasor
-    from gftorf_warp.data.sequence import Sequence
 
     sequence = Sequence.open(path)
     factor = quad_scale(sequence)[0] if scale is None else scale
@@ -83,7 +83,7 @@ def reflectivities(path: Path, scale: float | None) -> tuple[float, float, float
 
 def row_of(job: tuple[Path, str, int, int, str, float | None, float | None]) -> dict[str, object]:
     """Reconstruct in a temporary folder, compare, and keep the numbers."""
-    from gftorf_warp.data.sequence import Sequence
+    from gftorf_warp import Sequence
     from gftorf_warp.evaluate.compare import compare
     from gftorf_warp.recon.train import reconstruct
     from gftorf_warp.scene.measured import sensor_of

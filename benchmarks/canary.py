@@ -20,10 +20,9 @@ from pathlib import Path
 
 import numpy as np
 
-from gftorf_warp import __version__
+from gftorf_warp import Truth, __version__
 from gftorf_warp.constants import FRAMES_PER_QUARTET
 from gftorf_warp.data.ftorf_write import write
-from gftorf_warp.data.sequence import Truth
 from gftorf_warp.evaluate.compare import compare
 from gftorf_warp.evaluate.views import quad_of_shift
 from gftorf_warp.recon.run import Run

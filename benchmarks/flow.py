@@ -17,8 +17,8 @@ from typing import get_args
 
 import numpy as np
 
+from gftorf_warp import Sequence
 from gftorf_warp.data.flow import Method, compute_flow
-from gftorf_warp.data.sequence import Sequence
 
 SAMPLE = Path(__file__).parents[1] / "tests" / "data" / "ftorf_sample_box"
 MOVING_PX = 0.5
@@ -29,7 +29,7 @@ def measure(sequence: Sequence, method: Method) -> dict[str, float]:
     begun = time.perf_counter()
     computed = compute_flow(sequence, method=method)
     row = {"seconds": time.perf_counter() - begun}
-    directions = ((computed.forward, sequence.forward_flow), (computed.backward, sequence.backward_flow))
+    directions = ((computed.forward, sequence.flow.forward), (computed.backward, sequence.flow.backward))
     pairs = [(found[n], exact[n]) for found, exact in directions for n in exact if n in found]
     row["images"] = len(pairs)
     error = np.stack([np.hypot(*(found - exact)) for found, exact in pairs])

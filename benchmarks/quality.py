@@ -24,8 +24,8 @@ import numpy as np
 import torch
 import warp as wp
 
+from gftorf_warp import Sequence
 from gftorf_warp.bench.command import about
-from gftorf_warp.data.sequence import Sequence
 from gftorf_warp.evaluate.compare import compare
 from gftorf_warp.recon import presets
 from gftorf_warp.recon.observations import with_flow

@@ -18,9 +18,9 @@ from pathlib import Path
 import torch
 import warp as wp
 
+from gftorf_warp import Sequence
 from gftorf_warp.bench import states, step
 from gftorf_warp.bench.command import about
-from gftorf_warp.data.sequence import Sequence
 
 
 def main() -> int:

@@ -18,7 +18,7 @@ def main(folder: Path, images: int = 400) -> dict:
     the calls. The preset as it is, is `gftorf reconstruct SEQ --out RUN --preset released`.
     """
     sequence = Sequence.open(simulate("tour", folder / "sequence", frames=16, size=(48, 36), format="torf"))
-    print(f"{len(sequence.complete_quartets)} phasors, {len(sequence.colour)} colour images, a pose for each")
+    print(f"{len(sequence.complete_quartets)} phasors, {len(sequence.colour.images)} colour images, a pose for each")
 
     recorded = presets.Recorded(input=Input.PHASOR, unambiguous_range=sensor_of(sequence).unambiguous_range)
     settings = presets.shortened(presets.released(recorded), images)  # every interval shrinks with the run

@@ -17,7 +17,7 @@ _HOME = {
     "RenderSettings": "render.buffers",
     "Run": "recon.run",
     "Sensor": "scene.sensor",
-    "Sequence": "data.sequence",
+    "Sequence": "data.read",
     "Truth": "data.sequence",
     "compare": "evaluate.compare",
     "rasterize": "render.api",

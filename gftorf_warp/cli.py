@@ -215,9 +215,9 @@ def _each_level(options: argparse.Namespace) -> Callable[[int, int], None]:
 
 
 def _reconstruct(options: argparse.Namespace) -> int:
-    from .data.sequence import Sequence
+    from .data.read import read
 
-    sequence = Sequence.open(options.sequence, frame_rate_hz=options.frame_rate)
+    sequence = read(options.sequence, frame_rate_hz=options.frame_rate)
     device = start(options)
     from .recon.train import reconstruct
 

@@ -48,7 +48,7 @@ def demo(
         UsageError: If ``out`` holds a demo with other settings, and ``fresh`` is not set, or anything else.
     """
     from .data.check import check
-    from .data.sequence import Sequence
+    from .data.read import read
     from .evaluate.compare import compare
     from .recon.train import reconstruct
     from .sim.simulate import simulate
@@ -61,7 +61,7 @@ def demo(
 
     with _Step("[1/4] simulate   ") as step:
         path = simulate(SCENE, out / "seq", frames=frames, size=size, seed=seed, progress=report("simulate"))
-        sequence = Sequence.open(path)
+        sequence = read(path)
         step.says = f"{SCENE} {sequence.width}x{sequence.height}, {sequence.frames} raw frames -> {out / 'seq'}"
     with _Step("[2/4] check      ") as step:
         found = check(out / "seq")
@@ -69,7 +69,9 @@ def demo(
             LOG.debug("      %s", line)
         for line in found.warnings:
             LOG.warning(line)
-        step.says = f"{len(sequence.complete_quartets)} complete quartets at {sequence.f_mod_hz / 1e6:.2f} MHz"
+        step.says = (
+            f"{len(sequence.complete_quartets)} complete quartets at {sequence.calibration.f_mod_hz / 1e6:.2f} MHz"
+        )
     with _Step("[3/4] reconstruct") as step:
         run = reconstruct(
             sequence, out / "run", PRESET, images=images, seed=seed, device=device, progress=report("reconstruct")

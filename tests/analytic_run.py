@@ -7,10 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from sequences import changed, sequence_of
 
+from gftorf_warp import Sequence, Truth
 from gftorf_warp.constants import CANONICAL_SHIFTS, FRAME_RATE_HZ
 from gftorf_warp.data import ftorf
-from gftorf_warp.data.sequence import Sequence, Truth
 from gftorf_warp.render.api import Rendering
 from gftorf_warp.scene.camera import Camera
 from gftorf_warp.scene.sensor import Sensor
@@ -54,7 +55,7 @@ def with_colour(measured):
     novel = np.tile(np.eye(4), (3, 1, 1))
     novel[:, 1, 3] = (0.5, 0.0, -0.5)
     images = {n: in_colour(true_distance(n)).transpose(1, 2, 0) for n in range(0, measured.frames, 4)}
-    return replace(
+    return changed(
         measured,
         colour={n: (2.0 * image).astype(np.float32) for n, image in images.items()},
         colour_intrinsics=(20.0, 20.0, WIDTH / 2, HEIGHT / 2),
@@ -82,7 +83,7 @@ def as_phasors(measured):
 def sequence(frames=FRAMES):
     """The measured quads, exact and asynchronous, in memory."""
     shifts = np.array([CANONICAL_SHIFTS[n % 4] for n in range(frames)])
-    return Sequence(
+    return sequence_of(
         quads=np.stack([quad(true_distance(n), shifts[n]) for n in range(frames)]).astype(np.float32),
         measured=np.ones(frames, dtype=bool),
         shifts=shifts,

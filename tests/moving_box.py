@@ -1,9 +1,10 @@
 """A textured box slides and comes nearer in front of a textured wall: quads, exact flow and truth in closed form."""
 
 import numpy as np
+from sequences import sequence_of
 
+from gftorf_warp import Truth
 from gftorf_warp.constants import CANONICAL_SHIFTS, FRAME_RATE_HZ, SPEED_OF_LIGHT
-from gftorf_warp.data.sequence import Sequence, Truth
 
 HEIGHT, WIDTH, FRAMES = 36, 48, 16
 FOCAL = 42.0  # [px]
@@ -73,4 +74,4 @@ def recording(
         fields["forward_flow"] = {n: flow(n, 4) for n in starts if n + 4 < frames}
         fields["backward_flow"] = {n: flow(n, -4) for n in starts if n >= 4}
     truth = Truth(distance=np.stack([d for d, _, _ in images]).astype(np.float32), known=np.ones(frames, dtype=bool))
-    return Sequence(**fields | changes), truth
+    return sequence_of(**fields | changes), truth

@@ -67,21 +67,6 @@ KNOWS_STREAMS = {  # streams, events and graphs of torch
 }
 KNOWS_KINDS = {"render/buffers.py": "the shape of a tile depends on the kind of device, which is the input's"}
 KNOWN_CIRCLES = [  # import circles that are still to be undone; the list only becomes shorter
-    {
-        "data." + name
-        for name in (
-            "capture",
-            "capture_write",
-            "decode",
-            "folder",
-            "ftorf",
-            "ftorf_write",
-            "sequence",
-            "torf",
-            "torf_write",
-            "writing",
-        )
-    },
     {"evaluate.processes", "evaluate.writers"},
     {"recon.closed_form", "recon.run"},
 ]
@@ -92,7 +77,6 @@ LARGE_CLASSES = {  # file:class: why it may be larger
     "scene/sensor.py:Sensor": "the physical constants of one camera, each independent of the others",
     "sim/scene.py:Scene": "what a scene file may say",
     "recon/settings.py:ReconSettings": "settings of one run; those that belong together are classes of their own",
-    "data/sequence.py:Sequence": "still to be divided",
     "recon/captured.py:CapturedSteps": "still to be divided",
     "recon/run.py:Run": "still to be divided",
     "recon/state.py:State": "still to be divided",

@@ -5,9 +5,8 @@ import json
 import pytest
 import torch
 
-from gftorf_warp import cli
+from gftorf_warp import Sequence, cli
 from gftorf_warp.bench import command, motion, renderer, states, step, timing
-from gftorf_warp.data.sequence import Sequence
 from gftorf_warp.errors import DivergedError, InputError, ResourceError, UsageError
 from gftorf_warp.recon.run import Run
 from gftorf_warp.recon.settings import Batch, Kernels

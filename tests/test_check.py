@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 import torf_folder
 from ftorf_folder import REAL_ORDER, SAMPLE, fingerprint, scene
+from sequences import changed
 
+from gftorf_warp import Sequence
 from gftorf_warp.constants import SPEED_OF_LIGHT
 from gftorf_warp.data import decode, estimates, ftorf
 from gftorf_warp.data.check import check
-from gftorf_warp.data.sequence import Sequence
 from gftorf_warp.errors import InputError
 
 HEIGHT, WIDTH = 24, 32
@@ -21,7 +22,7 @@ def recording(frames=8, **changes):
     """A static scene large enough to estimate from, and its truth."""
     wall = np.linspace(1.5, 3.5, HEIGHT * WIDTH).reshape(HEIGHT, WIDTH)
     sequence, truth = scene(frames, HEIGHT, WIDTH, distance=wall)
-    return dataclasses.replace(sequence, **changes), truth
+    return changed(sequence, **changes), truth
 
 
 def written(tmp_path, sequence, truth=None):
@@ -125,7 +126,7 @@ def test_defaults_and_ignored_files_are_warned_of(tmp_path):
 def test_a_wrong_value_is_noticed(tmp_path, changes, words):
     """The recording is sound; what is said about it is not."""
     sequence, truth = recording()
-    sequence = dataclasses.replace(sequence, **changes)
+    sequence = changed(sequence, **changes)
     if "shifts" in changes:  # the scene is in the real order, where the pairs are two steps apart
         order = np.argsort(REAL_ORDER)
         quads = sequence.quads.reshape(2, 4, HEIGHT, WIDTH)[:, np.argsort(order)].reshape(8, HEIGHT, WIDTH)
@@ -304,7 +305,7 @@ def test_estimates_of_a_noisy_recording_are_close():
 def test_flow_of_the_sample_beats_its_mistakes():
     """Sign, channels and no flow at all are told from the right flow; without motion there is nothing to tell."""
     sequence = Sequence.open(SAMPLE)
-    unwarped, warped, flipped, swapped = estimates.flow_match(sequence, sequence.forward_flow, 4)
+    unwarped, warped, flipped, swapped = estimates.flow_match(sequence, sequence.flow.forward, 4)
     assert warped < 0.3 * min(unwarped, flipped, swapped)
     assert estimates.flow_match(sequence, {0: np.zeros((2, 120, 160), np.float32)}, 4) is None
     assert estimates.flow_match(sequence, {28: np.ones((2, 120, 160), np.float32)}, 4) is None

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from moving_box import recording
 
+from gftorf_warp import Sequence
 from gftorf_warp.data import ftorf
 from gftorf_warp.data.decode import closed_form_distance, quartet_phasor
-from gftorf_warp.data.sequence import Sequence
 from gftorf_warp.errors import InputError, UsageError
 from gftorf_warp.evaluate.compare import compare
 from gftorf_warp.evaluate.views import render_to_folder

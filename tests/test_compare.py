@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import torch
 from analytic_run import BOX, PHASE_SLOPE, WALL, AnalyticRun, as_phasors, box_at, quad, true_distance, with_colour
+from sequences import changed
 
-from gftorf_warp import __version__
+from gftorf_warp import Truth, __version__
 from gftorf_warp.constants import CANONICAL_SHIFTS
 from gftorf_warp.data import ftorf
-from gftorf_warp.data.sequence import Truth
 from gftorf_warp.errors import DivergedError, InputError, UsageError
 from gftorf_warp.evaluate.compare import compare, findings, rows_of, sequence_title, summary, truth_statement
 from gftorf_warp.evaluate.metrics import scored_frames
@@ -302,7 +302,7 @@ def test_colour_is_compared_from_the_colour_camera(tmp_path):
     assert got["colour_psnr_db"] == pytest.approx(20 * math.log10(1.8 / 0.05), abs=1e-3)
     taken = [camera for camera in run.cameras if camera.camera_from_world[0, 3] == -0.1]
     assert len(taken) == 3
-    unknown = replace(sequence, colour_intrinsics=None)
+    unknown = changed(sequence, colour_intrinsics=None)
     run.sequence = lambda: unknown
     assert compare(run, report=False)["colour_psnr_db"] is None
     grey = AnalyticRun(tmp_path / "grey")

@@ -5,10 +5,11 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from sequences import changed
 
+from gftorf_warp import Sequence, Truth
 from gftorf_warp.data import contact_sheet as module
 from gftorf_warp.data.contact_sheet import contact_sheet
-from gftorf_warp.data.sequence import Sequence, Truth
 from gftorf_warp.sim.record import record
 from gftorf_warp.sim.scenes import SCENES
 from gftorf_warp.sim.simulate import simulate
@@ -50,7 +51,7 @@ def test_everything_that_is_known_is_on_it(monkeypatch, recording):
 
 def test_flow_is_shown_where_it_is(monkeypatch, recording):
     """It belongs to the start of a quartet that has another behind it."""
-    longer = replace(recording.sequence, forward_flow={4: np.full((2, *SIZE[::-1]), np.nan, np.float32)})
+    longer = changed(recording.sequence, forward_flow={4: np.full((2, *SIZE[::-1]), np.nan, np.float32)})
     assert any("flow to raw frame 8" in title for title in titles(monkeypatch, longer, recording.truth))
 
 

@@ -1,21 +1,21 @@
 """Cycles of any number of shifts at one or more frequencies: found, decoded, unwrapped, stored; noise as predicted."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sequences import changed, sequence_of
 
+from gftorf_warp import Sequence
 from gftorf_warp.constants import CANONICAL_SHIFTS, SPEED_OF_LIGHT
 from gftorf_warp.data import capture
 from gftorf_warp.data.check import check
 from gftorf_warp.data.cycles import find_cycle, phase_noise
 from gftorf_warp.data.decode import closed_form_distance, decode_quartet, quad_scale, quartet_phasors, unambiguous_range
 from gftorf_warp.data.ftorf_write import write as write_ftorf
-from gftorf_warp.data.sequence import Sequence
 from gftorf_warp.data.unwrap import CONFIDENT, choose, common_range, multiples
 from gftorf_warp.errors import InputError, UsageError
 from gftorf_warp.scene.measured import distance_noise, key_times, sensor_of
@@ -56,7 +56,7 @@ def still(distance, shifts, frequencies=(20e6,), cycles=1, offset=0.4, constant=
         "cy": height / 2,
         "camera_from_world": np.tile(np.eye(4), (len(f), 1, 1)),
     }
-    return Sequence(**fields | changes)
+    return sequence_of(**fields | changes)
 
 
 @pytest.mark.parametrize(
@@ -74,7 +74,7 @@ def test_a_recording_says_how_long_its_cycle_is(shifts, frequencies):
     np.testing.assert_allclose(np.diff(key_times(sequence).numpy()), length / 120.0)
     for frames in (length, length + 1):  # one cycle, and hardly more
         assert find_cycle(sequence.shifts[:frames], sequence.frame_frequencies[:frames]) == length
-    assert replace(sequence, cycle_length=3 * length).complete_quartets == [0]
+    assert changed(sequence, cycle_length=3 * length).complete_quartets == [0]
 
 
 def test_without_a_period_four_raw_frames_are_a_quartet():
@@ -210,10 +210,10 @@ def test_a_capture_keeps_the_cycle_and_says_what_is_wrong(tmp_path):
     distance = np.linspace(2.0, 7.0, 20 * 16).reshape(16, 20)
     sequence = still(distance, evenly(3), (60e6, 40e6), cycles=2, cycle_length=6)
     read = Sequence.open(capture.write(tmp_path / "stated", sequence))
-    assert (read.cycle, read.cycle_length, read.frequencies) == (6, 6, (60e6, 40e6))
+    assert (read.cycle, read.calibration.cycle_length, read.frequencies) == (6, 6, (60e6, 40e6))
     np.testing.assert_allclose(closed_form_distance(read, 1), distance, atol=1e-4)
-    found = Sequence.open(capture.write(tmp_path / "found", replace(sequence, cycle_length=None)))
-    assert (found.cycle, found.cycle_length) == (6, None)
+    found = Sequence.open(capture.write(tmp_path / "found", changed(sequence, cycle_length=None)))
+    assert (found.cycle, found.calibration.cycle_length) == (6, None)
     text = str(check(tmp_path / "found"))
     for line in (
         "cycle           6 raw frames; inferred",

@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from gftorf_warp import cli
+from gftorf_warp import Sequence, cli
 from gftorf_warp.constants import SPEED_OF_LIGHT
 from gftorf_warp.data import capture
 from gftorf_warp.data.decode import decode_quartet
-from gftorf_warp.data.sequence import Sequence
 from gftorf_warp.errors import InputError
 from gftorf_warp.evaluate.compare import compare
 from gftorf_warp.recon import presets
@@ -55,8 +54,8 @@ def test_what_was_simulated_is_read_and_decoded(folders, name):
     """The cycle is stated, flow spans it, and static pixels decode to their true distance."""
     sequence = Sequence.open(folders / name)
     truth, sensor = sequence.truth(), replace(SCENES["demo"].sensor, **SENSORS[name])
-    assert sequence.cycle == sequence.cycle_length == len(sensor.cycle)
-    assert sorted(sequence.forward_flow) == [0, sequence.cycle, 2 * sequence.cycle]
+    assert sequence.cycle == sequence.calibration.cycle_length == len(sensor.cycle)
+    assert sorted(sequence.flow.forward) == [0, sequence.cycle, 2 * sequence.cycle]
     decoded = decode_quartet(sequence, 1).distance
     frames = sequence.quartet_frames(1)
     still = np.ptp(truth.distance[frames], axis=0) < 1e-3

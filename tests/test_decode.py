@@ -8,9 +8,9 @@ from ftorf_folder import REAL_ORDER, SAMPLE, scene
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from gftorf_warp import Sequence
 from gftorf_warp.constants import SPEED_OF_LIGHT
 from gftorf_warp.data import decode
-from gftorf_warp.data.sequence import Sequence
 from gftorf_warp.errors import InputError
 
 UNAMBIGUOUS = 7.5  # [m] of the sample and of the scenes here
@@ -79,7 +79,7 @@ def test_any_three_distinct_shifts_determine_the_phase(shifts):
     """Least squares does not need the canonical four."""
     distance = np.array([[1.0, 3.0]])
     sequence, _ = scene(4, 1, 2, distance=distance)
-    phase = 2 * math.pi * distance / UNAMBIGUOUS + sequence.phase_offset
+    phase = 2 * math.pi * distance / UNAMBIGUOUS + sequence.calibration.phase_offset
     quads = 0.7 * (np.cos(phase - np.array(shifts)[:, None, None]) + 0.4)
     sequence, _ = scene(4, 1, 2, distance=distance, shifts=np.array(shifts), quads=quads.astype(np.float32))
     np.testing.assert_allclose(decode.closed_form_distance(sequence, 0), distance, atol=1e-5)
@@ -93,7 +93,7 @@ def test_the_phasor_is_the_difference_of_opposite_quads():
     re, im = decode.quartet_phasor(sequence, 1)
     np.testing.assert_allclose(re, plus_cos - minus_cos, atol=1e-12)
     np.testing.assert_allclose(im, plus_sin - minus_sin, atol=1e-12)
-    constant = sequence.quads[4:].mean(axis=0) / sequence.dc_offset
+    constant = sequence.quads[4:].mean(axis=0) / sequence.calibration.dc_offset
     np.testing.assert_allclose(np.hypot(re, im), 2 * constant, rtol=1e-5)
     assert truth.known.all()
 
@@ -103,7 +103,7 @@ def test_a_phase_that_rounds_up_to_a_turn_is_zero():
     sequence, _ = scene(phase_offset=0.0)
     np.testing.assert_array_equal(decode.distance_from_phase(np.array([-1e-18, 0.0]), sequence), [0.0, 0.0])
     assert decode.distance_from_phase(np.array(math.pi), sequence) == pytest.approx(
-        SPEED_OF_LIGHT / (4 * sequence.f_mod_hz)
+        SPEED_OF_LIGHT / (4 * sequence.calibration.f_mod_hz)
     )
 
 

@@ -11,7 +11,7 @@ from moving_box import recording
 from small_runs import demo, same
 from waits import WAITS, Operations, Reads
 
-from gftorf_warp.data.sequence import Truth
+from gftorf_warp import Truth
 from gftorf_warp.data.truth import moving_and_static, nearest
 from gftorf_warp.recon import diagnostics
 from gftorf_warp.recon.diagnostics import PAIRS, Watch, measured_static, watched_frames

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from test_simulate import SMALL, closed_form, contents, inside, slider
 
-from gftorf_warp import cli
-from gftorf_warp.data.sequence import Sequence
+from gftorf_warp import Sequence, cli
 from gftorf_warp.errors import UsageError
 from gftorf_warp.scene.sensor import Sensor
 from gftorf_warp.sim.paths import Still
@@ -65,7 +64,8 @@ def test_colour_is_the_albedo_of_the_rays():
     """Inside one cell of a still body it is the analytic albedo, as the splats have it; at edges it is a mean."""
     scene = SCENES["tour"]
     gaussian, mesh = (
-        record(scene, frames=1, size=(80, 60), noise=False, engine=e).sequence.colour[0] for e in ("gaussian", "mesh")
+        record(scene, frames=1, size=(80, 60), noise=False, engine=e).sequence.colour.images[0]
+        for e in ("gaussian", "mesh")
     )
     assert mesh.shape == gaussian.shape == (120, 160, 3)
     hit = first_hit(scene.bodies, scene.colour_camera((80, 60)), 0.0)

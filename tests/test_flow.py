@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from ftorf_folder import SAMPLE, scene
 
+from gftorf_warp import Sequence
 from gftorf_warp.data import flow as flow_module
 from gftorf_warp.data.flow import compute_flow, warp_back
-from gftorf_warp.data.sequence import Sequence
 from gftorf_warp.errors import InputError
 
 MOVING_PX = 0.5
@@ -49,7 +49,7 @@ def inner_error(flow, velocity, border=8):
 def test_flow_of_the_sample_is_close_to_the_exact_one(sample, direction):
     """A textured box that moves by 6 to 10 px in four frames, towards the camera too; the same frames as the file's."""
     sequence, computed = sample
-    exact, got = getattr(sequence, f"{direction}_flow"), getattr(computed, direction)
+    exact, got = getattr(sequence.flow, direction), getattr(computed, direction)
     assert got.keys() == exact.keys()
     gap = np.stack([np.hypot(*(got[n] - exact[n])) for n in exact])
     moves = np.stack([np.hypot(*flow) > MOVING_PX for flow in exact.values()])
@@ -65,7 +65,7 @@ def test_the_flow_explains_the_motion_of_the_sample(sample):
     """Bringing frame n + 4 back by the flow leaves a fraction of the difference to frame n."""
     sequence, computed = sample
     flow = np.nan_to_num(computed.forward[12])
-    moves = np.hypot(*sequence.forward_flow[12]) > MOVING_PX
+    moves = np.hypot(*sequence.flow.forward[12]) > MOVING_PX
     before = np.abs(sequence.quads[16] - sequence.quads[12])[moves].mean()
     after = np.abs(warp_back(sequence.quads[16], flow) - sequence.quads[12])[moves].mean()
     assert after < 0.3 * before

@@ -13,8 +13,8 @@ from ftorf_folder import fingerprint, scene
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from gftorf_warp import Sequence
 from gftorf_warp.data import arrays, ftorf, specs
-from gftorf_warp.data.sequence import Sequence
 from gftorf_warp.errors import InputError
 
 QUAD = "tofType2/0006.npy"

@@ -11,10 +11,11 @@ import pytest
 from ftorf_folder import CAPTURE_ONLY, SAMPLE, assert_same, assert_same_bits, fingerprint, random_poses, scene
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sequences import NAMES, changed, sequence_of
 
+from gftorf_warp import Truth
 from gftorf_warp.constants import CANONICAL_SHIFTS, SPEED_OF_LIGHT
 from gftorf_warp.data import ftorf, specs
-from gftorf_warp.data.sequence import Sequence, Truth
 from gftorf_warp.errors import UsageError
 
 ROOT = Path(__file__).parents[1]
@@ -48,7 +49,7 @@ def sequences(draw):
         return dict(sorted(result.items()))
 
     colour = images(draw(st.integers(1, 3)), draw(st.integers(1, 3)), 3, unknown=False)
-    sequence = Sequence(
+    sequence = sequence_of(
         quads=quads,
         measured=measured,
         shifts=np.array(CANONICAL_SHIFTS)[np.argsort(permutation)[np.arange(frames) % 4]],
@@ -128,8 +129,7 @@ def test_everything_written_is_described(folder):
 def test_descriptions_cover_the_sequence_and_the_truth():
     """Every field of Sequence and Truth is filled from a described one, and no description fills anything else."""
     filled = {name for field in specs.fields("ftorf").values() for name in field.fills}
-    names = {f.name for kind in (Sequence, Truth) for f in dataclasses.fields(kind)}
-    assert filled == names - {"sources", "path", *CAPTURE_ONLY}
+    assert filled == (NAMES | {f.name for f in dataclasses.fields(Truth)}) - CAPTURE_ONLY
     for field in specs.fields("ftorf").values():
         assert field.kind in {"array", "choice", "other"}, field.name
         assert field.role in {"measurement", "calibration", "truth", "check", "unused"}, field.name
@@ -183,7 +183,7 @@ def poses_with(**changes):
 def test_what_the_format_cannot_hold_is_refused(tmp_path, changes, word):
     """A named usage error, and nothing on disk."""
     with pytest.raises(UsageError) as caught:
-        ftorf.write(tmp_path / "seq", dataclasses.replace(scene()[0], **changes))
+        ftorf.write(tmp_path / "seq", changed(scene()[0], **changes))
     assert caught.value.exit_code == 2
     assert word in caught.value.what
     assert caught.value.fix
@@ -209,7 +209,6 @@ def test_truth_that_is_no_distance_is_refused(tmp_path, value):
         {"backward_flow": {8: np.zeros((2, 6, 8))}},
         {"colour": {0: np.zeros((6, 8, 3)), 1: np.zeros((6, 9, 3))}},
         {"colour_from_world": np.eye(4)},
-        {"colour_intrinsics": (9.0, 9.0, 4.0)},
         {"novel_from_world": np.eye(4)},
         {"from_phasors": True},
     ],

@@ -81,7 +81,7 @@ def test_absent_flow_is_replaced_by_the_reversed_other_direction():
     """At the last quartet there is only backward flow."""
     sequence, _ = recording()
     points = torch.tensor([[24.5, 18.5], [2.5, 2.5]])
-    last = max(sequence.backward_flow) // 4
+    last = max(sequence.flow.backward) // 4
     back = measured.flow_at(sequence, last, -1, points)
     assert back[0].norm() > 1
     torch.testing.assert_close(measured.flow_at(sequence, last, 1, points), -back)

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from sequences import sequence_of
 
 from gftorf_warp.constants import CANONICAL_SHIFTS, SPEED_OF_LIGHT
-from gftorf_warp.data.sequence import Sequence
 from gftorf_warp.render.api import rasterize
 from gftorf_warp.scene.clouds import Cloud, follow_clouds, moving_layer
 from gftorf_warp.scene.fusion import outlying, verdicts, views_of
@@ -57,7 +57,7 @@ def carried(*, quartets=12, step=STEP, noise=NOISE, at_once=True, **path):
     slope, shifts = 4.0 * np.pi / 15.0, np.tile(CANONICAL_SHIFTS, quartets)
     quads = np.stack([r / d**2 * np.cos(slope * d - s) for (d, r, _), s in zip(images, shifts, strict=True)])
     quads += noise * np.random.default_rng(0).standard_normal(quads.shape)
-    sequence = Sequence(
+    sequence = sequence_of(
         quads=quads.astype(np.float32),
         measured=np.ones(4 * quartets, dtype=bool),
         shifts=shifts,

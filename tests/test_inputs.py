@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 import torch
 from moving_box import FOCAL, HEIGHT, WIDTH, recording
+from sequences import changed
 from small_runs import demo, same, stored
 
 from gftorf_warp.constants import SH_COEFFICIENTS
+from gftorf_warp.data.sequence import Flow
 from gftorf_warp.errors import InputError, UsageError
 from gftorf_warp.recon import objective, presets, step
 from gftorf_warp.recon.observations import input_of, observe
@@ -39,7 +41,7 @@ def with_colour(sequence, *, size=(2 * WIDTH, 2 * HEIGHT)):
     poses = sequence.camera_from_world.copy()
     poses[:, 0, 3] -= BASELINE
     zoom = width / WIDTH
-    return replace(
+    return changed(
         sequence,
         colour=dict.fromkeys(range(0, sequence.frames, 4), image),
         colour_intrinsics=(zoom * FOCAL, zoom * FOCAL, width / 2, height / 2),
@@ -84,7 +86,7 @@ def test_a_phasor_is_compared_once_per_quartet_in_its_middle():
 def test_phasor_and_quad_input_agree_on_a_static_scene(tmp_path):
     """Within the noise: same start, as many images of each quartet."""
     one = recording(frames=12)[0]
-    still = replace(one, quads=np.tile(one.quads[:4], (3, 1, 1)), forward_flow={}, backward_flow={})
+    still = replace(one, quads=np.tile(one.quads[:4], (3, 1, 1)), flow=Flow())
     distances = []
     for kind, images in ((Input.QUADS, 480), (Input.PHASOR, 120)):
         run = reconstruct(still, tmp_path / kind, replace(demo(input=kind, images=images)))
@@ -184,7 +186,7 @@ def test_without_colour_a_colour_preset_says_so_and_others_go_on():
         observe(sequence, presets.dgs(), "cpu")
     assert observe(sequence, demo(weights=Weights(colour=1.0)), "cpu").colour == {}
     black = with_colour(sequence)
-    black = replace(black, colour={n: 0 * image for n, image in black.colour.items()})
+    black = changed(black, colour={n: 0 * image for n, image in black.colour.images.items()})
     with pytest.raises(InputError, match="black"):
         observe(black, presets.dgs(), "cpu")
 

@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from gftorf_warp import Sequence, Truth
 from gftorf_warp.cli import main
-from gftorf_warp.data.sequence import Sequence, Truth
 from gftorf_warp.errors import InputError, UsageError
 from gftorf_warp.sim.closed_form_errors import closed_form_errors, ladder_table
 from gftorf_warp.sim.ladder import LEVELS, NAMES, resolved

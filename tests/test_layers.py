@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gftorf_warp.data.sequence import Sequence
+from gftorf_warp import Sequence
 from gftorf_warp.errors import UsageError
 from gftorf_warp.scene.electrons import electron_gain
 from gftorf_warp.scene.sensor import Sensor
@@ -103,7 +103,7 @@ def test_light_in_parts_is_kept_if_it_bounces(tmp_path):
     for n in range(sequence.frames):  # the quads follow: intensity is in the light, the phase offset is not
         angle = 0.4 - sequence.shifts[n]
         quad = (light[1][n] * np.exp(1j * angle) - 0.1 * light[3][n] * np.exp(3j * angle)).real
-        quad = quad + sequence.dc_offset * whole.amplitude[n]
+        quad = quad + sequence.calibration.dc_offset * whole.amplitude[n]
         np.testing.assert_allclose(sequence.quads[n], quad, atol=2e-6)
     camera = SCENES["demo"].camera((24, 18))
     cosine = camera.rays().numpy()[..., 2]

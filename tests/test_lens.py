@@ -9,13 +9,14 @@ import pytest
 import torch
 import warp as wp
 from cases import BENT
+from sequences import changed
 from small_runs import demo
 from test_engines import agree_on_the_demo, apart, phasors
 from test_optics import BARREL, PINCUSHION
 from test_simulate import inside, slider
 
+from gftorf_warp import Sequence
 from gftorf_warp.data.check import check
-from gftorf_warp.data.sequence import Sequence
 from gftorf_warp.errors import UsageError
 from gftorf_warp.evaluate.compare import compare
 from gftorf_warp.kernels.geometry import CameraView
@@ -198,8 +199,8 @@ def test_flow_is_between_places_on_the_sensor():
     y, x = np.nonzero(moved)
     want = there - np.stack([x, y], -1) - 0.5
     assert np.abs(want).max() > 0.5
-    np.testing.assert_allclose(sequence.forward_flow[0][:, moved].T, want, atol=1e-3)
-    np.testing.assert_allclose(record(scene, flow=True).sequence.forward_flow[0][:, moved].T, want, atol=1e-3)
+    np.testing.assert_allclose(sequence.flow.forward[0][:, moved].T, want, atol=1e-3)
+    np.testing.assert_allclose(record(scene, flow=True).sequence.flow.forward[0][:, moved].T, want, atol=1e-3)
 
 
 def test_random_points_are_as_dense_everywhere_in_what_a_lens_sees():
@@ -252,7 +253,7 @@ def test_a_reconstruction_through_a_lens_is_the_scene(captured, tmp_path, kernel
     corners[6:-6, 12:-12] = False  # the box is there
     errors = []
     with caplog.at_level(logging.INFO):
-        for n, given in enumerate((sequence, replace(sequence, distortion=None))):
+        for n, given in enumerate((sequence, changed(sequence, distortion=None))):
             run = reconstruct(given, tmp_path / f"run{n}", settings)
             seen = Run.open(run.path).render(0.0, pinhole)
             errors.append(float(np.median(np.abs(seen.distance.numpy() - want)[corners])))

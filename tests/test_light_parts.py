@@ -194,7 +194,7 @@ def test_flow_is_where_bodies_go(name, device):
     scene, size = SCENES[name], (64, 48)
     traced = MeshEngine(scene, lambda time: scene.camera(size, time), device=device)
     sequence = record(scene, frames=8, size=size, noise=False, flow=True, engine="mesh").sequence
-    for flow, start, end in ((sequence.forward_flow[0], 0, 4), (sequence.backward_flow[4], 4, 0)):
+    for flow, start, end in ((sequence.flow.forward[0], 0, 4), (sequence.flow.backward[4], 4, 0)):
         got = traced_flow(traced, float(sequence.times[start]), float(sequence.times[end]))
         off = np.abs(got - flow).max(0) > 1e-3
         assert off.mean() < 1e-3  # a ray that grazes an outline

@@ -108,7 +108,7 @@ def test_a_look_alike_can_be_recorded(name):
     quad = (hit.phasor * np.exp(-1j * scene.sensor.shifts[0])).real + scene.sensor.dc_offset * hit.amplitude
     assert np.median(np.abs(recording.sequence.quads[0] - quad) / hit.amplitude) < 0.03
     assert np.isfinite(recording.truth.distance).all()
-    assert (recording.sequence.colour_intrinsics is not None) == (scene.colour is not None)
+    assert (recording.sequence.colour.intrinsics is not None) == (scene.colour is not None)
 
 
 def test_look_alikes_are_written_and_refuse_what_they_cannot(tmp_path):

@@ -7,8 +7,7 @@ import pytest
 import torch
 from test_trace import CAMERA, GREY, light, plane, scene_of
 
-from gftorf_warp import cli
-from gftorf_warp.data.sequence import Sequence
+from gftorf_warp import Sequence, cli
 from gftorf_warp.errors import InputError, UsageError
 from gftorf_warp.scene.camera import Camera
 from gftorf_warp.sim.assembly import Assembly, Part

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 import torch
 from analytic_run import sequence
+from sequences import sequence_of
 
+from gftorf_warp import Truth
 from gftorf_warp.constants import CANONICAL_SHIFTS
-from gftorf_warp.data.sequence import Sequence, Truth
 from gftorf_warp.data.truth import known_distance, moving_and_static
 from gftorf_warp.errors import InputError, UsageError
 from gftorf_warp.evaluate import metrics
@@ -22,7 +23,7 @@ def quartets(frames, missing=()):
     """A sequence of one pixel, of which some raw frames were not measured."""
     measured = np.ones(frames, dtype=bool)
     measured[list(missing)] = False
-    return Sequence(
+    return sequence_of(
         quads=np.ones((frames, 1, 1), dtype=np.float32),
         measured=measured,
         shifts=np.resize(CANONICAL_SHIFTS, frames),

@@ -11,11 +11,12 @@ import pytest
 import torch
 from ftorf_folder import REAL_ORDER
 from mistakes import DEPTH_RANGE, dots, phase_of, ramp, wall
+from sequences import changed
 
+from gftorf_warp import Sequence
 from gftorf_warp.constants import SPEED_OF_LIGHT
 from gftorf_warp.data import decode, estimates, ftorf
 from gftorf_warp.data.check import check
-from gftorf_warp.data.sequence import Sequence
 from gftorf_warp.errors import InputError
 from gftorf_warp.recon import presets
 from gftorf_warp.recon.observations import observe, reduced
@@ -93,7 +94,7 @@ def test_mistake_09_depth_range_is_twice_the_unambiguous_range(tmp_path):
     folder = ftorf.write(tmp_path / "seq", wall(distance))
     np.save(folder / "cams/depth_range.npy", np.float64(15.0))
     sequence = Sequence.open(folder)
-    assert sequence.f_mod_hz == pytest.approx(SPEED_OF_LIGHT / 15.0, rel=1e-12)
+    assert sequence.calibration.f_mod_hz == pytest.approx(SPEED_OF_LIGHT / 15.0, rel=1e-12)
     sensor = sensor_of(sequence)
     assert sensor.unambiguous_range == pytest.approx(7.5)
     assert sensor.phase_slope == pytest.approx(2 * math.pi / 7.5)
@@ -119,7 +120,7 @@ def test_mistake_15_a_pixel_of_unknown_flow_is_read_and_left_out(tmp_path):
     flow[0, 3, 4] = np.nan
     folder = ftorf.write(tmp_path / "seq", wall(ramp(12, 20), forward_flow={0: flow}))
     sequence = Sequence.open(folder)
-    assert np.isnan(sequence.forward_flow[0]).sum() == 1
+    assert np.isnan(sequence.flow.forward[0]).sum() == 1
     prepared = observe(sequence, replace(presets.demo(), width_max=10), "cpu")
     unknown = prepared.flow[0, 1].isnan().any(dim=0)
     assert unknown.sum() == 1
@@ -154,7 +155,7 @@ def test_mistake_15_a_quad_that_is_no_number_is_an_error_and_never_a_scale(tmp_p
 def test_mistake_16_the_factor_of_the_file_is_used_once_and_nothing_overrides_it(tmp_path):
     """Quads as read keep the units of the file; the optimisation multiplies by the stated factor, or by 1 / maximum."""
     plain = wall(ramp(6, 8))
-    stated = Sequence.open(ftorf.write(tmp_path / "seq", replace(plain, quad_scale=5.0)))
+    stated = Sequence.open(ftorf.write(tmp_path / "seq", changed(plain, quad_scale=5.0)))
     np.testing.assert_array_equal(stated.quads, plain.quads)
     for sequence, factor in ((stated, 5.0), (plain, 1.0 / decode.largest_amplitude(plain))):
         prepared = observe(sequence, WITHOUT_FLOW, "cpu")
@@ -171,7 +172,7 @@ def test_mistake_17_the_constant_part_is_tested_when_a_recording_is_checked(tmp_
     sequence = wall(ramp(12, 20), dc_offset=constant)
     assert estimates.dc_offset(sequence) == pytest.approx(constant, abs=1e-3)
     for stated in (0.0, 1.0):
-        folder = ftorf.write(tmp_path / f"says-{stated}", replace(sequence, dc_offset=stated))
+        folder = ftorf.write(tmp_path / f"says-{stated}", changed(sequence, dc_offset=stated))
         warned = any("dc_offset" in text for text in check(folder).warnings)
         assert warned == (stated != constant)
         assert sensor_of(Sequence.open(folder)).dc_offset == stated
@@ -194,8 +195,8 @@ def test_mistake_20_colour_keeps_its_digits(tmp_path):
     colour = np.linspace(-0.3, 3.0, 6 * 8 * 3, dtype=np.float32).reshape(6, 8, 3)
     colour[0, 0] = [0.5, 0.5 + 1e-6, 200.0]
     sequence = Sequence.open(ftorf.write(tmp_path / "seq", wall(ramp(6, 8), colour={0: colour})))
-    assert sequence.colour[0].dtype == np.float32
-    np.testing.assert_array_equal(sequence.colour[0], colour)
+    assert sequence.colour.images[0].dtype == np.float32
+    np.testing.assert_array_equal(sequence.colour.images[0], colour)
 
 
 def test_mistake_21_colour_of_another_size_resizes_nothing_else(tmp_path):
@@ -203,13 +204,13 @@ def test_mistake_21_colour_of_another_size_resizes_nothing_else(tmp_path):
     sequence = wall(ramp(6, 8), colour={0: np.random.default_rng(0).random((12, 16, 3)).astype(np.float32)})
     got = Sequence.open(ftorf.write(tmp_path / "seq", sequence))
     assert got.quads.shape == (8, 6, 8)
-    assert got.colour[0].shape == (12, 16, 3)
-    assert (got.fx, got.fy, got.cx, got.cy) == (sequence.fx, sequence.fy, sequence.cx, sequence.cy)
+    assert got.colour.images[0].shape == (12, 16, 3)
+    assert got.intrinsics == sequence.intrinsics
 
 
 def test_mistake_21_reducing_images_reduces_their_intrinsics():
     """A Gaussian is seen in the same place of the view at every size, by observation and by camera."""
-    sequence = replace(wall(ramp(24, 40)), cx=17.0, cy=14.0, fx=33.0, fy=36.0)
+    sequence = changed(wall(ramp(24, 40)), cx=17.0, cy=14.0, fx=33.0, fy=36.0)
     full, half = camera_of(sequence, 0), camera_of(reduced(sequence, 20), 0)
     assert (half.width, half.height) == (20, 12)
     for camera in (half, full.resized(20, 12)):

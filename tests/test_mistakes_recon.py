@@ -12,6 +12,7 @@ import pytest
 import torch
 from cases import pose
 from mistakes import dots, ramp, surface, wall
+from sequences import changed
 from small_runs import demo, same, small
 
 from gftorf_warp.constants import CANONICAL_SHIFTS, SH_Y0
@@ -44,7 +45,7 @@ def started(settings, sequence=None):
 @pytest.mark.parametrize(("height", "width"), [(24, 32), (32, 24), (8, 64), (64, 8)])
 def test_mistake_01_random_centres_fill_the_frustum_at_any_aspect_ratio(height, width):
     """All of them project into the image, evenly over its rows and columns, for a camera that is off its middle."""
-    sequence = replace(wall(ramp(height, width)), fx=40.0, fy=30.0, cx=0.4 * width, cy=0.6 * height)
+    sequence = changed(wall(ramp(height, width)), fx=40.0, fy=30.0, cx=0.4 * width, cy=0.6 * height)
     field = from_random(sequence, replace(RANDOM, count=2000), torch.Generator().manual_seed(0)).field
     x, y = camera_of(sequence, 0).project(field.mean).unbind(dim=1)
     inside = (x >= 0) & (x <= width) & (y >= 0) & (y <= height)
@@ -237,7 +238,7 @@ def test_mistake_14_all_harmonics_step_with_a_camera_at_rest():
 def test_mistake_15_unknown_flow_and_untaken_frames_leave_a_run_finite(tmp_path):
     """NaN in one pixel of every flow, the loss of flow included; a frame that was not taken is dark, and no data."""
     sequence = small()
-    for flow in (*sequence.forward_flow.values(), *sequence.backward_flow.values()):
+    for flow in (*sequence.flow.forward.values(), *sequence.flow.backward.values()):
         flow[:, 5, 7] = np.nan
     taken, quads = sequence.measured.copy(), sequence.quads.copy()
     taken[6], quads[6] = False, 0.0
@@ -281,7 +282,7 @@ def coloured():
     """The moving box with a colour image per quartet, from a camera of another size."""
     sequence = small()
     rng = np.random.default_rng(0)
-    return replace(
+    return changed(
         sequence,
         colour={4 * i: rng.random((18, 30, 3)).astype(np.float32) for i in range(3)},
         colour_intrinsics=(25.0, 25.0, 15.0, 9.0),
@@ -303,7 +304,8 @@ def test_mistake_22_colour_is_rendered_only_while_it_counts(monkeypatch, weight,
     monkeypatch.setattr(objective, "rasterize", spy)
     observations, state = started(settings, coloured())
     assert bool(observations.colour) == (weight > 0)
-    assert (observations.sequence.width, observations.sequence.fx) == (48, 42.0), "ToF images keep their size"
+    tof = observations.sequence
+    assert (tof.width, tof.intrinsics.fx) == (48, 42.0), "ToF images keep their size"
     while state.images < 24:
         seen.append([])
         assert step.step(state, observations, settings) is None

@@ -3,6 +3,7 @@
 The folders are written here, file by file, so that a reader and a writer cannot agree on a mistake.
 """
 
+import dataclasses
 import math
 
 import numpy as np
@@ -11,9 +12,9 @@ import torch
 from cases import pose
 from mistakes import dots
 
+from gftorf_warp import Sequence
 from gftorf_warp.constants import SPEED_OF_LIGHT
 from gftorf_warp.data import decode
-from gftorf_warp.data.sequence import Sequence
 from gftorf_warp.errors import InputError
 from gftorf_warp.render.api import rasterize
 from gftorf_warp.scene.measured import camera_of, colour_camera_of, sensor_of
@@ -51,7 +52,7 @@ def folder(tmp_path):
 def test_mistake_09_the_range_of_phasors_is_half_of_what_the_file_says(folder):
     """depth_range 10 m is 29.98 MHz and unambiguous to 5 m; the pixels decode to their distances."""
     sequence = Sequence.open(folder)
-    assert sequence.f_mod_hz == pytest.approx(SPEED_OF_LIGHT / 10.0, rel=1e-12)
+    assert sequence.calibration.f_mod_hz == pytest.approx(SPEED_OF_LIGHT / 10.0, rel=1e-12)
     assert sensor_of(sequence).unambiguous_range == pytest.approx(5.0)
     np.testing.assert_allclose(decode.closed_form_distance(sequence, 2), DISTANCE, rtol=1e-5)
 
@@ -107,15 +108,15 @@ def test_mistake_20_the_relative_pose_takes_colour_to_tof(folder):
 def test_mistake_20_colour_is_read_as_stored(folder):
     """Float, negative, above white, and between the steps of 8 bits."""
     sequence = Sequence.open(folder)
-    assert sorted(sequence.colour) == [0, 4, 8]
+    assert sorted(sequence.colour.images) == [0, 4, 8]
     for i in range(3):
-        assert sequence.colour[4 * i].dtype == np.float32
-        np.testing.assert_array_equal(sequence.colour[4 * i], COLOUR + np.float32(i))
+        assert sequence.colour.images[4 * i].dtype == np.float32
+        np.testing.assert_array_equal(sequence.colour.images[4 * i], COLOUR + np.float32(i))
 
 
 def test_mistake_21_tof_and_colour_keep_their_own_size_and_intrinsics(folder):
     """Twice the pixels in the colour images; the ToF camera does not notice. Integer centres gain half a pixel."""
     sequence = Sequence.open(folder)
     assert sequence.quads.shape == (12, 6, 8)
-    assert (sequence.fx, sequence.fy, sequence.cx, sequence.cy) == pytest.approx((7.0, 7.5, 3.9, 3.1))
-    assert sequence.colour_intrinsics == pytest.approx((14.0, 14.5, 7.7, 6.4))
+    assert dataclasses.astuple(sequence.intrinsics)[:4] == pytest.approx((7.0, 7.5, 3.9, 3.1))
+    assert dataclasses.astuple(sequence.colour.intrinsics)[:4] == pytest.approx((14.0, 14.5, 7.7, 6.4))

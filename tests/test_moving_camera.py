@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
+from gftorf_warp import Sequence
 from gftorf_warp.data.decode import closed_form_distance
-from gftorf_warp.data.sequence import Sequence
 from gftorf_warp.errors import UsageError
 from gftorf_warp.render.api import rasterize
 from gftorf_warp.scene.measured import camera_of, colour_camera_of, sample
@@ -102,7 +102,7 @@ def test_every_raw_frame_has_the_pose_of_its_own_time(sync):
     np.testing.assert_allclose(poses[:, :3, :3] @ poses[:, :3, :3].mT, np.tile(np.eye(3), (8, 1, 1)), atol=1e-12)
     for n, time in enumerate(sequence.times):
         np.testing.assert_allclose(poses[n] @ SWEEP.world_from_body(float(time)), np.eye(4), atol=1e-12)
-        np.testing.assert_allclose(sequence.colour_from_world[n], COLOUR.colour_from_tof @ poses[n], atol=1e-12)
+        np.testing.assert_allclose(sequence.colour.camera_from_world[n], COLOUR.colour_from_tof @ poses[n], atol=1e-12)
     step = np.linalg.norm(np.diff([camera_of(sequence, n).centre for n in range(8)], axis=0), axis=1)
     assert ((step > 0) == ([False, False, False, True] * 2 if sync else [True] * 8)[:7]).all()
     if not sync:
@@ -193,8 +193,8 @@ def test_flow_of_a_moving_camera_is_what_the_image_shows():
     """A texture seen at quartet start n is found again where the flow takes it, in the next image, and in the last."""
     scene = carried(colour=None)
     sequence = record(scene, frames=12, flow=True).sequence
-    assert sorted(sequence.forward_flow) == [0, 4]
-    for n, other, flow in ((4, 8, sequence.forward_flow[4]), (4, 0, sequence.backward_flow[4])):
+    assert sorted(sequence.flow.forward) == [0, 4]
+    for n, other, flow in ((4, 8, sequence.flow.forward[4]), (4, 0, sequence.flow.backward[4])):
         mask, hit = flat(scene, camera_of(sequence, n), float(sequence.times[n]))
         there, later = camera_of(sequence, other), first_hit(scene.bodies, camera_of(sequence, other), 0.0)
         y, x = np.nonzero(mask)
@@ -217,18 +217,18 @@ def test_a_colour_image_is_the_albedo_of_what_it_shows():
     )
     scene = carried(bodies=(*carried().bodies, ball))
     sequence = record(scene, frames=6).sequence
-    assert sorted(sequence.colour) == [0, 4]
+    assert sorted(sequence.colour.images) == [0, 4]
     for n in (0, 4):
         camera = colour_camera_of(sequence, n)
         assert (camera.width, camera.height) == (192, 144)
         mask, hit = flat(scene, camera, float(sequence.times[n]))
-        error = np.abs(sequence.colour[n] - albedo(scene.bodies, hit, float(sequence.times[n])))
+        error = np.abs(sequence.colour.images[n] - albedo(scene.bodies, hit, float(sequence.times[n])))
         assert set(np.unique(hit.body[mask])) == {0, 1, 2}
         assert error[mask & (hit.body < 2)].max() < 1e-6
         assert error[mask & (hit.body == 2)].max() < 0.02  # through the grid of a moving body a little may be seen
         assert error.mean() < 0.03
-    assert np.abs(sequence.colour[4] - sequence.colour[0]).max() > 0.1
-    assert 0.02 < sequence.colour[0].min() < sequence.colour[0].max() < 1.0
+    assert np.abs(sequence.colour.images[4] - sequence.colour.images[0]).max() > 0.1
+    assert 0.02 < sequence.colour.images[0].min() < sequence.colour.images[0].max() < 1.0
 
 
 def test_the_colour_camera_sits_where_it_is_put():
@@ -250,7 +250,7 @@ def test_two_cameras_see_the_same_point():
     mask, hit = flat(scene, tof, float(sequence.times[n]))
     point = tof.centre + tof.rays(dtype=torch.float64).numpy() * recording.truth.distance[n][..., None]
     want = albedo(scene.bodies, hit, float(sequence.times[n]))[mask]
-    image = torch.from_numpy(sequence.colour[n]).permute(2, 0, 1).double()
+    image = torch.from_numpy(sequence.colour.images[n]).permute(2, 0, 1).double()
     colour = colour_camera_of(sequence, n)
     errors = []
     for camera in (colour, colour.at(tof.camera_from_world)):
@@ -287,12 +287,14 @@ def test_noise_of_colour_belongs_to_the_seed_and_the_frame():
         for scene, seed in ((carried(), 0), (noisy, 0), (noisy, 0), (noisy, 1))
     )
     np.testing.assert_array_equal(first.quads, clean.quads)
-    noise = [first.colour[n] - clean.colour[n] for n in (0, 4)]
+    noise = [first.colour.images[n] - clean.colour.images[n] for n in (0, 4)]
     assert noise[0].std() == pytest.approx(0.02, rel=0.03)
     assert abs(np.corrcoef(noise[0].ravel(), noise[1].ravel())[0, 1]) < 0.05
-    np.testing.assert_array_equal(first.colour[4], same.colour[4])
-    assert (first.colour[0] != other.colour[0]).mean() > 0.9
-    np.testing.assert_array_equal(record(noisy, frames=1, size=SIZE, noise=False).sequence.colour[0], clean.colour[0])
+    np.testing.assert_array_equal(first.colour.images[4], same.colour.images[4])
+    assert (first.colour.images[0] != other.colour.images[0]).mean() > 0.9
+    np.testing.assert_array_equal(
+        record(noisy, frames=1, size=SIZE, noise=False).sequence.colour.images[0], clean.colour.images[0]
+    )
     with pytest.raises(ValueError, match="noise"):
         ColourCamera(width=4, height=4, noise=-0.1)
 
@@ -313,8 +315,8 @@ def test_a_camera_without_colour_has_none():
     """And asking for it says so."""
     scene = carried(colour=None)
     sequence = record(scene, frames=1).sequence
-    assert sequence.colour == {}
-    assert sequence.colour_from_world is None
+    assert sequence.colour.images == {}
+    assert sequence.colour.camera_from_world is None
     assert colour_camera_of(sequence, 0) is None
     with pytest.raises(ValueError, match="no colour camera"):
         scene.colour_camera()
@@ -331,7 +333,7 @@ def test_tour_is_what_it_says():
     centres = np.array([scene.camera(time=n / 120).centre for n in range(120)])
     assert 0.3 < np.linalg.norm(np.diff(centres, axis=0), axis=1).sum() < 0.5
     sequence = record(scene, frames=1, size=SIZE).sequence
-    assert sequence.colour[0].shape == (72, 96, 3)
+    assert sequence.colour.images[0].shape == (72, 96, 3)
     assert 4 <= len(sequence.novel_from_world) <= 8
     for pose in sequence.novel_from_world:
         centre = camera_of(sequence, 0).at(pose).centre
@@ -354,7 +356,7 @@ def test_tour_is_read_back(tmp_path, layout):
     np.testing.assert_allclose(truth.distance, want.truth.distance[frames], rtol=1e-6)
     for i in range(2):
         np.testing.assert_allclose(closed_form_distance(got, i), closed_form_distance(want.sequence, i), atol=1e-4)
-        np.testing.assert_allclose(got.colour[4 * i], want.sequence.colour[4 * i], atol=1e-6)
+        np.testing.assert_allclose(got.colour.images[4 * i], want.sequence.colour.images[4 * i], atol=1e-6)
     camera, expected = colour_camera_of(got, 4), colour_camera_of(want.sequence, 4)
     np.testing.assert_allclose(camera.camera_from_world, expected.camera_from_world, atol=1e-9)
     assert (camera.fx, camera.cx, camera.width) == pytest.approx((expected.fx, expected.cx, expected.width))

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from moving_box import recording
+from sequences import changed
 from small_runs import demo, small
 
 from gftorf_warp.errors import InputError
@@ -106,10 +107,11 @@ def test_reduced_keeps_the_view():
     """Intrinsics and flow shrink with the image."""
     sequence = small()
     half = reduced(sequence, 24)
-    assert (half.width, half.height, half.fx, half.cx, half.cy) == (24, 18, 21.0, 12.0, 9.0)
+    assert (half.width, half.height) == (24, 18)
+    assert (half.intrinsics.fx, half.intrinsics.cx, half.intrinsics.cy) == (21.0, 12.0, 9.0)
     want = sequence.quads[3].reshape(18, 2, 24, 2).mean(axis=(1, 3))
     np.testing.assert_allclose(half.quads[3], want, atol=1e-6)
-    np.testing.assert_allclose(half.forward_flow[4].max(), 0.5 * sequence.forward_flow[4].max(), rtol=0.05)
+    np.testing.assert_allclose(half.flow.forward[4].max(), 0.5 * sequence.flow.forward[4].max(), rtol=0.05)
     assert reduced(sequence, 48) is sequence
     assert reduced(sequence, None) is sequence
 
@@ -120,7 +122,7 @@ def test_the_hash_sees_what_is_read():
     assert data_hash(sequence) == data_hash(small())
     quads = sequence.quads.copy()
     quads[3, 4, 5] += 1e-6
-    others = [replace(sequence, quads=quads), replace(sequence, fx=43.0), replace(sequence, backward_flow={})]
+    others = [replace(sequence, quads=quads), changed(sequence, fx=43.0), changed(sequence, backward_flow={})]
     assert len({data_hash(other) for other in (sequence, *others)}) == 4
 
 

@@ -91,9 +91,9 @@ def test_truth_and_ideal_quads_are_seen_through_the_lens():
     assert np.abs(straight - 3.0 / cosine)[0, 0] > 0.05
     sequence, truth = ideal_recording(bent)
     np.testing.assert_allclose(truth.distance[0], 3.0 / cosine, rtol=1e-6)
-    assert sequence.distortion == (BARREL.k1, BARREL.k2, BARREL.p1, BARREL.p2, BARREL.k3)
+    assert sequence.intrinsics.distortion == (BARREL.k1, BARREL.k2, BARREL.p1, BARREL.p2, BARREL.k3)
     assert camera_of(sequence, 0).distortion == BARREL
-    assert ideal_recording(scene())[0].distortion is None
+    assert ideal_recording(scene())[0].intrinsics.distortion is None
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gftorf_warp.data.sequence import Sequence
+from gftorf_warp import Sequence
 from gftorf_warp.errors import UsageError
 from gftorf_warp.scene.changes import changed, names
 from gftorf_warp.sim.scene import OVERRIDES, overridden
@@ -84,7 +84,7 @@ def test_the_data_card_says_how_to_make_it_again(tmp_path):
     path = simulate("sliding_cube", tmp_path / "out", overrides=[text], **SMALL)
     card = (path / "README.md").read_text()
     assert f"gftorf simulate sliding_cube --out SEQ --override {text} --frames 4" in card
-    assert Sequence.open(path).f_mod_hz == pytest.approx(30e6)
+    assert Sequence.open(path).calibration.f_mod_hz == pytest.approx(30e6)
     assert simulate("sliding_cube", path, overrides=[text], **SMALL) == path
     with pytest.raises(UsageError, match="not empty"):
         simulate("sliding_cube", path, **SMALL)

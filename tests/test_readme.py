@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from gftorf_warp import cli, options
-from gftorf_warp.data.sequence import Sequence
+from gftorf_warp import Sequence, cli, options
 from gftorf_warp.sim.ladder import NAMES
 
 REPOSITORY = Path(__file__).parents[1]
@@ -35,7 +34,7 @@ def test_a_simulation_of_the_pages_runs(line, tmp_path, monkeypatch):
     wanted = {
         "--format capture": (folder / "capture.json").is_file(),
         "--format torf": sequence.from_phasors,
-        "--flow": bool(sequence.forward_flow),
+        "--flow": bool(sequence.flow.forward),
     }
     assert all(written for option, written in wanted.items() if option in line)
 

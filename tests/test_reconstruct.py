@@ -11,8 +11,9 @@ import torch
 from moving_box import recording
 from small_runs import KEYS, demo, field, rows, same, small, stored
 
+from gftorf_warp import Sequence
 from gftorf_warp.data import ftorf
-from gftorf_warp.data.sequence import Sequence
+from gftorf_warp.data.sequence import Flow
 from gftorf_warp.errors import InputError, UsageError
 from gftorf_warp.evaluate.compare import compare
 from gftorf_warp.recon import presets, train
@@ -78,7 +79,7 @@ def test_without_motion_it_is_much_worse(sample_scores, tmp_path):
 
 def test_keys_start_where_flow_leads_and_at_rest_without():
     """Against the motion of the sample."""
-    sequence = replace(Sequence.open(SAMPLE), forward_flow={}, backward_flow={})
+    sequence = replace(Sequence.open(SAMPLE), flow=Flow())
     offsets = {}
     for flow, source in ((FlowSource.AUTO, "computed"), (FlowSource.NONE, "none")):
         settings = demo(flow=flow, width_max=80)
@@ -217,7 +218,7 @@ def test_the_source_of_flow_can_be_chosen_by_name(tmp_path):
 
 def test_random_start_and_still_motion_run_too(tmp_path):
     """The controls, and a sequence without any flow: a few steps reduce the loss."""
-    sequence = replace(small(), forward_flow={}, backward_flow={})
+    sequence = replace(small(), flow=Flow())
     settings = demo(images=160, log_every=16, init=InitSettings(kind=Init.RANDOM, count=300, opacity=0.3))
     settings = replace(settings, flow=FlowSource.NONE)
     run = reconstruct(sequence, tmp_path / "run", settings)

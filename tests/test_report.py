@@ -12,9 +12,10 @@ import cv2
 import numpy as np
 import pytest
 from analytic_run import AnalyticRun, as_phasors, with_colour
+from sequences import sequence_of
 
+from gftorf_warp import Truth
 from gftorf_warp.constants import CANONICAL_SHIFTS
-from gftorf_warp.data.sequence import Sequence, Truth
 from gftorf_warp.evaluate import figures, page, panels, pictures
 from gftorf_warp.evaluate.compare import compare, findings, rows_of, summary
 from gftorf_warp.evaluate.gallery import colour_views, novel_views
@@ -353,7 +354,7 @@ def test_pages_of_large_noisy_images_stay_below_four_megabytes(compared):
     generator = np.random.default_rng(0)
     frames, height, width = 60, 240, 320
     noise = generator.uniform(2.0, 6.0, (frames, height, width)).astype(np.float32)
-    sequence = Sequence(
+    sequence = sequence_of(
         quads=noise - 4.0,
         measured=np.ones(frames, dtype=bool),
         shifts=np.resize(CANONICAL_SHIFTS, frames),

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
+from gftorf_warp import Sequence
 from gftorf_warp.cli import main
-from gftorf_warp.data.sequence import Sequence
 from gftorf_warp.errors import UsageError
 from gftorf_warp.scene.camera import Camera
 from gftorf_warp.scene.distortion import Distortion
@@ -96,7 +96,7 @@ def test_a_capture_says_so_and_reconstruction_warns(tmp_path, capsys):
         main(["simulate", "demo", "--engine", "mesh", "--format", "capture", *override, "--out", f"{tmp_path}/seq"])
         == 0
     )
-    assert Sequence.open(tmp_path / "seq").sensor["row_time_s"] == 1e-4
+    assert Sequence.open(tmp_path / "seq").calibration.settings["row_time_s"] == 1e-4
     assert main(["reconstruct", f"{tmp_path}/seq", "--images", "4", "--out", f"{tmp_path}/run"]) == 0
     assert "a rolling shutter: the last row is 1.7 ms later" in capsys.readouterr().err
 

@@ -5,8 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gftorf_warp import cli
-from gftorf_warp.data.sequence import Sequence
+from gftorf_warp import Sequence, cli
 from gftorf_warp.errors import InputError
 from gftorf_warp.sim.assembly import Assembly, Level, Part
 from gftorf_warp.sim.curves import Curve, Guided, Turn

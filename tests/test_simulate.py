@@ -6,8 +6,9 @@ import math
 import numpy as np
 import pytest
 import torch
+from sequences import values_of
 
-from gftorf_warp.data.sequence import Sequence
+from gftorf_warp import Sequence
 from gftorf_warp.errors import UsageError
 from gftorf_warp.scene.sensor import Sensor, distance_from_phasor, phasor_from_quads
 from gftorf_warp.sim.paths import Line
@@ -44,7 +45,7 @@ def closed_form(sequence):
     """Distance [m] decoded from each complete quartet."""
     quartets = sequence.frames // 4
     quads = torch.from_numpy(sequence.quads[: 4 * quartets].astype(np.float64)).unflatten(0, (quartets, 4))
-    sensor = Sensor(f_mod_hz=sequence.f_mod_hz, phase_offset=sequence.phase_offset)
+    sensor = Sensor(f_mod_hz=sequence.calibration.f_mod_hz, phase_offset=sequence.calibration.phase_offset)
     return np.stack([distance_from_phasor(*phasor_from_quads(q, tuple(sequence.shifts[:4])), sensor) for q in quads])
 
 
@@ -150,7 +151,7 @@ def test_the_demo_is_neither_easy_nor_hopeless():
     assert 0.03 < share < 0.11
     assert recording.sequence.frames >= 40
     assert recording.sequence.quads.shape[1:] >= (72, 96)
-    speed = np.stack([np.linalg.norm(f, axis=0) for f in recording.sequence.forward_flow.values()]) / 4
+    speed = np.stack([np.linalg.norm(f, axis=0) for f in recording.sequence.flow.forward.values()]) / 4
     assert 1.0 < speed[speed > 0.01].mean() < 3.0
     assert recording.saturated == 0
     assert recording.gap.max <= 0.01
@@ -178,15 +179,15 @@ def test_exact_flow_follows_the_motion():
     """A face at depth z that slides by v dt moves by f v dt / z pixels, and back; the room does not move."""
     scene = slider(frames=12)
     sequence = record(scene, flow=True, noise=False).sequence
-    assert sorted(sequence.forward_flow) == [0, 4]
-    assert sorted(sequence.backward_flow) == [4, 8]
+    assert sorted(sequence.flow.forward) == [0, 4]
+    assert sorted(sequence.flow.backward) == [4, 8]
     hit = first_hit(scene.bodies, scene.camera(), 4 / 120)
     front = (hit.body == 1) & (hit.face == 4)
     want = scene.camera().fx * 6.0 * (4 / 120) / (2.5 - 0.45)
-    np.testing.assert_allclose(sequence.forward_flow[4][0][front], want, rtol=1e-4)
-    np.testing.assert_allclose(sequence.backward_flow[4][0][front], -want, rtol=1e-4)
-    np.testing.assert_allclose(sequence.forward_flow[4][1][front], 0, atol=1e-4)
-    assert (sequence.forward_flow[4][:, hit.body == 0] == 0).all()
+    np.testing.assert_allclose(sequence.flow.forward[4][0][front], want, rtol=1e-4)
+    np.testing.assert_allclose(sequence.flow.backward[4][0][front], -want, rtol=1e-4)
+    np.testing.assert_allclose(sequence.flow.forward[4][1][front], 0, atol=1e-4)
+    assert (sequence.flow.forward[4][:, hit.body == 0] == 0).all()
     assert front.sum() > 100
 
 
@@ -256,10 +257,10 @@ def test_a_sequence_is_read_back_as_recorded(tmp_path):
     for name in ("quads", "measured", "shifts", "times", "camera_from_world"):
         np.testing.assert_allclose(getattr(got, name), getattr(want.sequence, name), atol=1e-9, err_msg=name)
     for name in ("f_mod_hz", "phase_offset", "dc_offset", "fx", "fy", "cx", "cy"):
-        assert getattr(got, name) == pytest.approx(getattr(want.sequence, name)), name
+        assert values_of(got)[name] == pytest.approx(values_of(want.sequence)[name]), name
     np.testing.assert_array_equal(got.truth().distance, want.truth.distance)
     assert got.truth().known.all()
-    np.testing.assert_array_equal(got.forward_flow[0], want.sequence.forward_flow[0])
+    np.testing.assert_array_equal(got.flow.forward[0], want.sequence.flow.forward[0])
     assert got.complete_quartets == [0]
     hit = first_hit(scene.bodies, scene.camera(), 0.0)
     wall = inside(hit, 0) & ~(first_hit(scene.bodies, scene.camera(), 4 / 120).body == 1)

@@ -11,10 +11,12 @@ import torf_folder
 from ftorf_folder import CAPTURE_ONLY, SAMPLE, assert_same, assert_same_bits, fingerprint, random_poses, scene
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sequences import NAMES, changed, sequence_of, values_of
 
+from gftorf_warp import Sequence, Truth
 from gftorf_warp.constants import CANONICAL_SHIFTS, SPEED_OF_LIGHT
 from gftorf_warp.data import decode, ftorf, specs, torf
-from gftorf_warp.data.sequence import Sequence, Truth
+from gftorf_warp.data.sequence import Calibration, Intrinsics
 from gftorf_warp.errors import UsageError
 
 ROOT = Path(__file__).parents[1]
@@ -44,11 +46,11 @@ def test_a_phasor_becomes_four_raw_frames(folder):
     np.testing.assert_array_equal(got.shifts, [*CANONICAL_SHIFTS] * 3)
     np.testing.assert_array_equal(got.times, np.repeat([0, 1 / 30, 2 / 30], 4))
     np.testing.assert_array_equal(got.camera_from_world, np.repeat(torf_folder.poses(3), 4, axis=0))
-    assert list(got.colour) == [0, 4, 8]
-    assert_same_bits(got.colour[4], torf_folder.colour_images(3)[1], "colour")
-    assert (got.f_mod_hz, got.dc_offset, got.quad_scale) == (SPEED_OF_LIGHT / 10, 0.0, None)
-    assert (got.cx, got.cy) == (4.0, 3.0)  # stored 3.5, 2.5 for integer centres
-    assert got.colour_intrinsics == (20.0, 21.0, 7.5, 5.5)
+    assert list(got.colour.images) == [0, 4, 8]
+    assert_same_bits(got.colour.images[4], torf_folder.colour_images(3)[1], "colour")
+    assert got.calibration == Calibration(f_mod_hz=SPEED_OF_LIGHT / 10)
+    assert (got.intrinsics.cx, got.intrinsics.cy) == (4.0, 3.0)  # stored 3.5, 2.5 for integer centres
+    assert got.colour.intrinsics == Intrinsics(fx=20.0, fy=21.0, cx=7.5, cy=5.5)
     assert got.sources["times"] == "default 30 Hz"
 
 
@@ -126,7 +128,7 @@ def test_the_relative_pose_goes_from_colour_to_tof(folder, shape):
     got = torf.read(folder)
     world = np.array([0.3, -0.2, 2.0, 1.0])
     for n in (0, 5, 11):
-        in_colour, in_tof = got.colour_from_world[n] @ world, got.camera_from_world[n] @ world
+        in_colour, in_tof = got.colour.camera_from_world[n] @ world, got.camera_from_world[n] @ world
         np.testing.assert_allclose(torf_folder.RELATIVE @ in_colour, in_tof, atol=1e-12)
     assert "replaces" in got.sources["colour_from_world"]
 
@@ -143,7 +145,7 @@ def test_colour_poses_come_from_the_best_file(folder):
 
     def first():
         got = torf.read(folder)
-        return got.colour_from_world[::4], got.sources["colour_from_world"]
+        return got.colour.camera_from_world[::4], got.sources["colour_from_world"]
 
     np.testing.assert_allclose(first()[0], relative)
     assert first()[1].startswith("file cams/relative_pose.npy")
@@ -166,16 +168,16 @@ def test_without_calibration_the_defaults_are_used_and_named(folder):
         if path.name != "tof_intrinsics.npy":
             path.unlink()
     got = torf.read(folder)
-    assert (got.f_mod_hz, got.phase_offset) == (SPEED_OF_LIGHT / 10, 0.0)
+    assert (got.calibration.f_mod_hz, got.calibration.phase_offset) == (SPEED_OF_LIGHT / 10, 0.0)
     np.testing.assert_array_equal(got.camera_from_world, np.tile(np.eye(4), (12, 1, 1)))
-    assert got.colour_intrinsics == (2 * got.fx, 2 * got.fy, 2 * got.cx, 2 * got.cy)
+    assert got.colour.intrinsics == got.intrinsics.scaled(2, 2)
     for name in ("f_mod_hz", "phase_offset", "times", "camera_from_world", "quad_scale", "novel_from_world"):
         assert got.sources[name].startswith("default"), name
     for name in ("colour_intrinsics", "colour_from_world", "pixel_centre"):
         assert got.sources[name].startswith("inferred"), name
     shutil.rmtree(folder / "color")
     got = torf.read(folder)
-    assert (got.colour, got.colour_intrinsics, got.colour_from_world) == ({}, None, None)
+    assert (got.colour.images, got.colour.intrinsics, got.colour.camera_from_world) == ({}, None, None)
 
 
 @pytest.mark.parametrize(("centre", "cx", "added"), [(None, 4.0, 0.0), ("integer", 4.0, 0.5), ("half", 3.9, 0.0)])
@@ -185,14 +187,14 @@ def test_pixel_centres_are_those_of_both_cameras(folder, centre, cx, added):
     if centre:
         (folder / "cams/pixel_centre.json").write_text(f'{{"pixel_centre": "{centre}"}}')
     got = torf.read(folder)
-    assert (got.cx, got.cy) == (cx + added, 2.5 + added)
-    assert got.colour_intrinsics == (20.0, 21.0, 7.0 + added, 5.0 + added)
+    assert (got.intrinsics.cx, got.intrinsics.cy) == (cx + added, 2.5 + added)
+    assert got.colour.intrinsics == Intrinsics(fx=20.0, fy=21.0, cx=7.0 + added, cy=5.0 + added)
 
 
 def test_every_field_names_its_source(folder):
     """Whatever the reader fills, it says where it is from, in one of four words."""
     got = torf.read(folder)
-    assert {f.name for f in dataclasses.fields(Sequence)} - {"sources", "path"} <= set(got.sources)
+    assert set(got.sources) >= NAMES
     assert all(text.split()[0] in {"file", "default", "inferred", "setting"} for text in got.sources.values())
 
 
@@ -255,7 +257,7 @@ def phasor_sequences(draw):
     distance = generator.uniform(0.1, 9.0, size=(count, height, width)).astype(np.float32)
     distance[generator.random(distance.shape) < 0.1] = np.nan
     distance[~known] = np.nan
-    sequence = Sequence(
+    sequence = sequence_of(
         quads=np.stack([re, -re, im, -im], axis=1).reshape(4 * count, height, width)
         * np.repeat(measured, 4)[:, None, None],
         measured=np.repeat(measured, 4),
@@ -297,7 +299,7 @@ def test_write_then_read_is_the_identity(tmp_path_factory, drawn):
         assert_same_bits(got_truth.known, truth.known, "known")
     else:
         assert got_truth is None
-    if sequence.colour:
+    if sequence.colour.images:
         assert (first / "cams/relative_pose.npy").exists() == (same or sequence.frames == 4)
     assert (first / "README.md").read_text() == "# a card\n"
 
@@ -335,9 +337,9 @@ def test_complete_quartets_of_raw_quads_become_phasors(tmp_path):
         )
     np.testing.assert_array_equal(got.times, np.repeat([0.0, 0.04, 0.08], 4))
     np.testing.assert_array_equal(got.camera_from_world, np.repeat(poses[[0, 4, 8]], 4, axis=0))
-    assert {n: image[0, 0, 0] for n, image in got.colour.items()} == {0: 0.0, 4: 2.0, 8: 4.0}
+    assert {n: image[0, 0, 0] for n, image in got.colour.images.items()} == {0: 0.0, 4: 2.0, 8: 4.0}
     np.testing.assert_array_equal(got.truth().distance[8:12], np.stack([truth.distance[8]] * 4))
-    assert (got.dc_offset, got.phase_offset) == (0.0, sequence.phase_offset)
+    assert (got.calibration.dc_offset, got.calibration.phase_offset) == (0.0, sequence.calibration.phase_offset)
 
 
 def test_the_sample_decodes_alike_as_phasors(tmp_path):
@@ -352,7 +354,7 @@ def test_the_sample_decodes_alike_as_phasors(tmp_path):
 
 def test_everything_written_is_described(folder, tmp_path):
     """No file of the writer lacks an entry in data_specs/, and its type is one that the entry allows."""
-    sequence = dataclasses.replace(torf.read(folder), quad_scale=2.0, novel_from_world=torf_folder.poses(2))
+    sequence = changed(torf.read(folder), quad_scale=2.0, novel_from_world=torf_folder.poses(2))
     written = torf.write(tmp_path / "written", sequence, sequence.truth())
     described = {path: field for field in specs.fields("torf").values() for path in field.paths}
     names = {str(path.relative_to(written)) for path in written.rglob("*.*")}
@@ -368,8 +370,8 @@ def test_descriptions_cover_the_sequence_and_the_truth():
     """Every field of Sequence and Truth but flow is filled from a described one, and the page names every path."""
     fields = specs.fields("torf").values()
     filled = {name for field in fields for name in field.fills}
-    names = {f.name for kind in (Sequence, Truth) for f in dataclasses.fields(kind)}
-    assert filled == names - {"sources", "path", "forward_flow", "backward_flow", *CAPTURE_ONLY}
+    names = (NAMES | {f.name for f in dataclasses.fields(Truth)}) - {"forward_flow", "backward_flow"}
+    assert filled == names - CAPTURE_ONLY
     page = (ROOT / "data_specs" / "README.md").read_text(encoding="utf-8")
     table = page.partition("## The fields of TöRF")[2].partition("\n## ")[0]
     for field in fields:
@@ -413,7 +415,7 @@ def test_phasors_that_are_none_are_a_programming_mistake(folder, tmp_path, name,
     """Raw frames that differ within a phasor would be lost without a word."""
     sequence = torf.read(folder)
     with pytest.raises(ValueError, match=f"from_phasors: {name}"):
-        torf.write(tmp_path / "new", dataclasses.replace(sequence, **{name: change(getattr(sequence, name))}))
+        torf.write(tmp_path / "new", changed(sequence, **{name: change(values_of(sequence)[name])}))
 
 
 def test_phasors_are_no_raw_quads(folder, tmp_path):

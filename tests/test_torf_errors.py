@@ -8,10 +8,10 @@ import pytest
 import torf_folder
 from ftorf_folder import fingerprint
 
+from gftorf_warp import Sequence
 from gftorf_warp.cli import main
 from gftorf_warp.data import torf
 from gftorf_warp.data.check import check
-from gftorf_warp.data.sequence import Sequence
 from gftorf_warp.errors import InputError
 
 PHASOR = "tof/0001.npy"

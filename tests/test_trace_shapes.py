@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from test_trace import AHEAD, CAMERA, F_MOD_HZ, GREY, expected, light, plane, scene_of
 
-from gftorf_warp import cli
-from gftorf_warp.data.sequence import Sequence
+from gftorf_warp import Sequence, cli
 from gftorf_warp.render.trace import Bounces
 from gftorf_warp.scene.camera import Camera
 from gftorf_warp.sim.assembly import Assembly, Level, Part
@@ -58,7 +57,7 @@ def test_every_scene_can_be_traced(name, tmp_path, capsys):
     assert "Engine mesh" in (tmp_path / "out" / "README.md").read_text()
     sequence = Sequence.open(tmp_path / "out")
     assert sequence.quads.shape == (2, 24, 32)
-    assert (sequence.colour_from_world is not None) == (scene.colour is not None)
+    assert (sequence.colour.camera_from_world is not None) == (scene.colour is not None)
     for n in range(2):
         rays = light_of(replace(scene, width=32, height=24), float(sequence.times[n]), rays=scene.subsamples)
         turned = rays.phasor * np.exp(1j * (scene.sensor.phase_offset - scene.sensor.shifts[n]))

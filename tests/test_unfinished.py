@@ -9,8 +9,8 @@ import time
 import numpy as np
 import pytest
 
+from gftorf_warp import Sequence
 from gftorf_warp.cli import main
-from gftorf_warp.data.sequence import Sequence
 from gftorf_warp.errors import BusyError, InputError, UsageError
 from gftorf_warp.sim import simulate as simulating
 from gftorf_warp.sim.resume import partial_of

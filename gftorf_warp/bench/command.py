@@ -19,7 +19,7 @@ import torch
 
 from .. import __version__
 from ..data.files import write_json
-from ..data.sequence import Sequence
+from ..data.read import read
 from ..errors import UsageError
 from . import motion, reconstruction, renderer, rendering, states, step
 from .timing import Report, quietly
@@ -68,7 +68,7 @@ class Shared:
     @functools.cached_property
     def fitted(self) -> states.Fitted:
         """The state of a reconstruction in its middle."""
-        wanted, sequence = self.wanted, Sequence.open(self.path)
+        wanted, sequence = self.wanted, read(self.path)
         settings = states.settings_of(sequence, wanted.preset or PRESETS["other"], list(wanted.changes), wanted.device)
         if wanted.run is not None:
             return states.from_run(wanted.run, sequence, settings, wanted.device)
@@ -250,7 +250,7 @@ def _check_folders(wanted: Wanted) -> None:
                 "no such folder", where=option, why=why, fix=f"name an existing one, or leave {option} out"
             )
     if wanted.sequence is not None:
-        Sequence.open(wanted.sequence)  # its own errors are the right ones
+        read(wanted.sequence)  # its own errors are the right ones
 
 
 def _check_file(path: Path) -> None:

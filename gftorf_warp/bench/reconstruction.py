@@ -21,7 +21,7 @@ import numpy as np
 
 from ..data import ftorf
 from ..data.flow import compute_flow
-from ..data.sequence import Sequence
+from ..data.read import read, read_truth
 from ..errors import GftorfError, ResourceError
 from .timing import Report, lines_of
 
@@ -37,14 +37,14 @@ def with_flow(path: Path, out: Path) -> tuple[Path, float]:
 
     Sequences that have flow, or cannot (phasors), stay where they are.
     """
-    sequence = Sequence.open(path)
-    if sequence.forward_flow or sequence.backward_flow or sequence.from_phasors:
+    sequence = read(path)
+    if sequence.flow.forward or sequence.flow.backward or sequence.from_phasors:
         return path, 0.0
     begun = time.perf_counter()
     flow = compute_flow(sequence)
     seconds = time.perf_counter() - begun
-    found = replace(sequence, forward_flow=flow.forward, backward_flow=flow.backward)
-    return ftorf.write(out, found, sequence.truth()), seconds
+    found = replace(sequence, flow=flow)
+    return ftorf.write(out, found, read_truth(sequence)), seconds
 
 
 def measure(

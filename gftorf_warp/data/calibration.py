@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,29 +13,30 @@ from ..errors import InputError, UsageError
 from . import specs
 from .arrays import read_array, read_choice
 from .problems import Problems
+from .sequence import Calibration, Intrinsics
 
 DEPTH_RANGES_M = (0.03, 30_000.0)  # [m] 10 GHz to 10 kHz: beyond, the number is another quantity or unit
 FOCAL_MIN = 0.05  # of the image width: a view of 168 degrees; what is shorter is given in image widths or millimetres
 
 
-@dataclass(kw_only=True)
-class Calibration:
-    """What cams/ says of the ToF camera; the names are those of :class:`gftorf_warp.data.sequence.Sequence`."""
-
-    f_mod_hz: float = math.nan
-    phase_offset: float = 0.0
-    dc_offset: float = 0.0
-    quad_scale: float | None = None
-    fx: float = math.nan
-    fy: float = math.nan
-    cx: float = math.nan
-    cy: float = math.nan
-    half: float = 0.0
-    """What was added to cx and cy, since stored pixel centres are at integers [px]."""
-    sources: dict[str, str] = field(default_factory=dict)
+UNREAD = Intrinsics(fx=math.nan, fy=math.nan, cx=math.nan, cy=math.nan)  # the error is among the problems
 
 
-def read_calibration(root: Path, form: str, problems: Problems, width: int | None) -> Calibration:
+@dataclass(frozen=True, kw_only=True)
+class Calibrated:
+    """Calibration of the ToF camera in cams/."""
+
+    calibration: Calibration
+    """Constants of the sensor."""
+    intrinsics: Intrinsics
+    """Intrinsics, pixel centres at i + 0.5."""
+    half: float
+    """Added to the stored cx and cy [px]: 0.5 if stored pixel centres are at integers, else 0."""
+    sources: dict[str, str]
+    """Source of each value by name."""
+
+
+def read_calibration(root: Path, form: str, problems: Problems, width: int | None) -> Calibrated:
     """Read everything in cams/ that does not depend on the number of frames or on colour.
 
     Args:
@@ -44,27 +45,29 @@ def read_calibration(root: Path, form: str, problems: Problems, width: int | Non
         problems: Takes what is wrong.
         width: Columns of the images; None if they could not be read, and then intrinsics are not judged by it.
     """
-    result, fields = Calibration(), specs.fields(form)
+    fields = specs.fields(form)
+    sources: dict[str, str] = {}
 
     def scalar(name: str, key: str) -> float | None:
-        return problems.attempt(_scalar, root, fields[name], result.sources, key)
+        return problems.attempt(_scalar, root, fields[name], sources, key)
 
     depth_range = scalar("depth_range", "f_mod_hz")
     if depth_range is not None:
-        result.f_mod_hz = SPEED_OF_LIGHT / depth_range
-        result.sources["f_mod_hz"] += f", depth_range {depth_range:.9g} m"
-    result.phase_offset = scalar("phase_offset", "phase_offset") or 0.0
-    if "dc_offset" in fields:
-        result.dc_offset = scalar("dc_offset", "dc_offset") or 0.0
-    result.quad_scale = scalar("quad_values_scale_factor", "quad_scale")
-    problems.attempt(_tof_intrinsics, root, fields, result, width)
-    return result
+        sources["f_mod_hz"] += f", depth_range {depth_range:.9g} m"
+    calibration = Calibration(
+        f_mod_hz=math.nan if depth_range is None else SPEED_OF_LIGHT / depth_range,
+        phase_offset=scalar("phase_offset", "phase_offset") or 0.0,
+        dc_offset=(scalar("dc_offset", "dc_offset") or 0.0) if "dc_offset" in fields else 0.0,
+        quad_scale=scalar("quad_values_scale_factor", "quad_scale"),
+    )
+    intrinsics, half = problems.attempt(_tof_intrinsics, root, fields, sources, width) or (UNREAD, 0.0)
+    return Calibrated(calibration=calibration, intrinsics=intrinsics, half=half, sources=sources)
 
 
 def read_colour_intrinsics(
-    root: Path, form: str, tof: Calibration, tof_size: dict[str, int], size: tuple[int, int], sources: dict[str, str]
-) -> tuple[float, float, float, float]:
-    """Intrinsics fx, fy, cx, cy [px] of the colour images: the file's, or those of the ToF camera, scaled.
+    root: Path, form: str, tof: Calibrated, tof_size: dict[str, int], size: tuple[int, int], sources: dict[str, str]
+) -> Intrinsics:
+    """Intrinsics of the colour images: the file's, or those of the ToF camera, scaled.
 
     Args:
         root: The folder.
@@ -80,13 +83,13 @@ def read_colour_intrinsics(
     spec = specs.fields(form)["color_intrinsics"]
     stored = _pinhole(root, spec, size[1])
     if stored is not None:
-        (fx, fy, cx, cy), path = stored
+        intrinsics, path = stored
         centres = f"integer pixel centres (cx, cy + {tof.half})" if tof.half else "half pixel centres (kept)"
         sources["colour_intrinsics"] = f"file {path}, {centres} as for the ToF camera"
-        return fx, fy, cx + tof.half, cy + tof.half
+        return replace(intrinsics, cx=intrinsics.cx + tof.half, cy=intrinsics.cy + tof.half)
     sources["colour_intrinsics"] = f"inferred from tof_intrinsics, scaled (no {spec.paths[0]})"
     sx, sy = size[1] / tof_size.get("W", 1), size[0] / tof_size.get("H", 1)
-    return tof.fx * sx, tof.fy * sy, tof.cx * sx, tof.cy * sy
+    return tof.intrinsics.scaled(sx, sy)
 
 
 def read_shifts(root: Path, frames: int, sources: dict[str, str]) -> np.ndarray:
@@ -190,8 +193,10 @@ def _scalar(root: Path, spec: specs.Field, sources: dict[str, str], key: str) ->
     return value
 
 
-def _tof_intrinsics(root: Path, fields: dict[str, specs.Field], result: Calibration, width: int | None) -> None:
-    """Pinhole matrix of the ToF camera and the pixel centres of the folder into ``result``."""
+def _tof_intrinsics(
+    root: Path, fields: dict[str, specs.Field], sources: dict[str, str], width: int | None
+) -> tuple[Intrinsics, float]:
+    """Intrinsics of the ToF camera, and what was added to cx and cy for pixel centres at i + 0.5 [px]."""
     spec, centre = fields["tof_intrinsics"], fields["pixel_centre"]
     stored = _pinhole(root, spec, width)
     if stored is None:
@@ -201,23 +206,23 @@ def _tof_intrinsics(root: Path, fields: dict[str, specs.Field], result: Calibrat
             why=f"expected {' or '.join(spec.paths)}, found neither",
             fix="store the 3x3 pinhole matrix of the ToF camera in pixels",
         )
-    (result.fx, result.fy, cx, cy), path = stored
+    intrinsics, path = stored
     if (root / centre.paths[0]).exists():
         convention = read_choice(root / centre.paths[0], centre)
         source = f"file {centre.paths[0]}"
     else:
-        convention = "half" if width is not None and cx == width / 2 else "integer"
-        source = f"inferred from cx = {cx:g} at width {width}"
-    result.half = 0.5 if convention == "integer" else 0.0
-    result.cx, result.cy = cx + result.half, cy + result.half
-    result.sources |= dict.fromkeys(("fx", "fy"), f"file {path}")
-    added = "cx, cy + 0.5" if result.half else "kept"
-    result.sources |= dict.fromkeys(("cx", "cy"), f"file {path}, {convention} pixel centres ({added}), {source}")
-    result.sources["pixel_centre"] = f"{source}: {convention}"
+        convention = "half" if width is not None and intrinsics.cx == width / 2 else "integer"
+        source = f"inferred from cx = {intrinsics.cx:g} at width {width}"
+    half = 0.5 if convention == "integer" else 0.0
+    sources |= dict.fromkeys(("fx", "fy"), f"file {path}")
+    added = "cx, cy + 0.5" if half else "kept"
+    sources |= dict.fromkeys(("cx", "cy"), f"file {path}, {convention} pixel centres ({added}), {source}")
+    sources["pixel_centre"] = f"{source}: {convention}"
+    return replace(intrinsics, cx=intrinsics.cx + half, cy=intrinsics.cy + half), half
 
 
-def _pinhole(root: Path, spec: specs.Field, width: int | None) -> tuple[tuple[float, float, float, float], str] | None:
-    """fx, fy, cx, cy as stored, and the file; None if there is none."""
+def _pinhole(root: Path, spec: specs.Field, width: int | None) -> tuple[Intrinsics, str] | None:
+    """Intrinsics as stored, and the file; None if there is none."""
     found = {path: read_array(root / path, spec) for path in spec.paths if (root / path).exists()}
     if not found:
         return None
@@ -241,4 +246,5 @@ def _pinhole(root: Path, spec: specs.Field, width: int | None) -> tuple[tuple[fl
             f"width ({'unknown' if width is None else width}), found {matrix.tolist()}",
             fix="store pixels, not fractions of the width or millimetres; no skew, not transposed",
         )
-    return (float(focal[0]), float(focal[1]), float(matrix[0, 2]), float(matrix[1, 2])), path
+    intrinsics = Intrinsics(fx=float(focal[0]), fy=float(focal[1]), cx=float(matrix[0, 2]), cy=float(matrix[1, 2]))
+    return intrinsics, path

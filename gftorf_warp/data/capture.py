@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from .exr import Parts, read_parts
 from .folder import FRAMES_MAX, empty_quads, format_of, numbered
 from .poses import rigid
 from .problems import Problems
-from .sequence import Sequence, Truth
+from .sequence import Calibration, ColourCamera, Flow, Intrinsics, Sequence, Truth
 
 __all__ = ["read", "read_truth", "write"]
 
@@ -75,34 +76,34 @@ def read(path: str | Path, *, frame_rate_hz: float | None = None) -> Sequence:
             images["colour"][n] = image
     problems.raise_if_any(root)
     frequencies, several = values["f_mod_hz"], len(set(values["f_mod_hz"].tolist())) > 1
-    fx, fy, cx, cy = _pinhole(values["intrinsics"])
-    colour, lens = values.get("colour_intrinsics"), values["distortion"].tolist() if "distortion" in values else None
+    lens = tuple(values["distortion"].tolist()) if "distortion" in values else None
     return Sequence(
         quads=quads,
         measured=measured,
         shifts=values["shift"],
         times=values["time"],
-        f_mod_hz=float(frequencies[0]),
         frequencies_hz=frequencies if several else None,
-        cycle_length=int(values["cycle"]) if "cycle" in values else None,
         exposures=values.get("exposure"),
-        sensor=values.get("sensor_settings", {}),
-        phase_offset=float(values["phase_offset"]),
-        dc_offset=float(values["dc_offset"]),
-        fx=fx,
-        fy=fy,
-        cx=cx,
-        cy=cy,
-        distortion=None if lens is None else (lens[0], lens[1], lens[2], lens[3], lens[4]),
         camera_from_world=inverse(values["pose"]),
-        quad_scale=float(values["raw_scale"]) if "raw_scale" in values else None,
+        intrinsics=replace(_intrinsics(values["intrinsics"]), distortion=lens),
+        calibration=Calibration(
+            f_mod_hz=float(frequencies[0]),
+            phase_offset=float(values["phase_offset"]),
+            dc_offset=float(values["dc_offset"]),
+            quad_scale=float(values["raw_scale"]) if "raw_scale" in values else None,
+            cycle_length=int(values["cycle"]) if "cycle" in values else None,
+            settings=values.get("sensor_settings", {}),
+        ),
         from_phasors=values["kind"] == "phasor",
-        colour_intrinsics=None if colour is None else _pinhole(colour),
-        colour_from_world=inverse(values["colour_pose"]) if "colour_pose" in values else None,
+        colour=ColourCamera(
+            images=images["colour"],
+            intrinsics=_intrinsics(values["colour_intrinsics"]) if "colour_intrinsics" in values else None,
+            camera_from_world=inverse(values["colour_pose"]) if "colour_pose" in values else None,
+        ),
+        flow=Flow(forward=images["forward_flow"], backward=images["backward_flow"]),
         novel_from_world=inverse(values["novel"]) if "novel" in values else None,
         sources=_sources(values, images, int(measured.sum())),
         path=root,
-        **images,
     )
 
 
@@ -303,8 +304,9 @@ def _is_pinhole(matrix: np.ndarray, width: float) -> bool:
     return np.array_equal(matrix, expected) and min(matrix[0, 0], matrix[1, 1]) >= FOCAL_MIN * width
 
 
-def _pinhole(matrix: np.ndarray) -> tuple[float, float, float, float]:
-    return float(matrix[0, 0]), float(matrix[1, 1]), float(matrix[0, 2]), float(matrix[1, 2])
+def _intrinsics(matrix: np.ndarray) -> Intrinsics:
+    fx, fy, cx, cy = (float(matrix[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    return Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy)
 
 
 def _sources(values: dict[str, Any], images: dict[str, dict[int, np.ndarray]], measured: int) -> dict[str, str]:

@@ -14,7 +14,7 @@ from .. import __version__
 from .capture_json import NAME
 from .exr import Parts, write_parts
 from .files import atomic_folder, write_through
-from .sequence import Sequence, Truth
+from .sequence import Intrinsics, Sequence, Truth
 from .specs import layer_field
 from .writing import float32, readme_and_sheet, refuse_inexpressible, validate
 
@@ -57,7 +57,7 @@ def write(
         (folder / "tof").mkdir()
         for n in np.flatnonzero(sequence.measured).tolist():
             write_parts(folder / f"tof/{n:06d}.exr", _raw_frame(sequence, n))
-        for n, image in sequence.colour.items():
+        for n, image in sequence.colour.images.items():
             (folder / "colour").mkdir(exist_ok=True)
             channels = dict(zip("RGB", np.moveaxis(float32(image), -1, 0), strict=True))
             write_parts(folder / f"colour/{n:06d}.exr", {"colour": channels})
@@ -76,7 +76,7 @@ def write(
 def _raw_frame(sequence: Sequence, n: int) -> Parts:
     """What the ToF camera recorded in one raw frame."""
     parts: Parts = {"raw": {"q": float32(sequence.quads[n])}}
-    for name, images in (("flow.forward", sequence.forward_flow), ("flow.backward", sequence.backward_flow)):
+    for name, images in (("flow.forward", sequence.flow.forward), ("flow.backward", sequence.flow.backward)):
         if n in images:
             parts[name] = dict(zip(("dx", "dy"), float32(images[n]), strict=True))
     return parts
@@ -98,26 +98,26 @@ def _truth(truth: Truth, n: int) -> Parts:
 
 def _json(sequence: Sequence) -> bytes:
     """Everything but images; one value a line, one raw frame a line."""
-    cameras = {"tof": _camera((sequence.width, sequence.height), sequence.fx, sequence.fy, sequence.cx, sequence.cy)}
-    if sequence.distortion is not None:
-        cameras["tof"]["distortion"] = [float(k) for k in sequence.distortion]
-    colour = next(iter(sequence.colour.values()), None)
-    if sequence.colour_intrinsics is not None:
-        size = (sequence.width, sequence.height) if colour is None else colour.shape[1::-1]
-        cameras["colour"] = _camera(size, *sequence.colour_intrinsics)
-    elif colour is not None:
-        cameras["colour"] = {"size": list(colour.shape[1::-1])}
+    cameras = {"tof": _camera((sequence.height, sequence.width), sequence.intrinsics)}
+    if sequence.intrinsics.distortion is not None:
+        cameras["tof"]["distortion"] = [float(k) for k in sequence.intrinsics.distortion]
+    colour = sequence.colour
+    if colour.intrinsics is not None:
+        cameras["colour"] = _camera(colour.size or (sequence.height, sequence.width), colour.intrinsics)
+    elif colour.size is not None:
+        cameras["colour"] = {"size": list(colour.size[::-1])}
+    stated = sequence.calibration
     sensor: dict[str, Any] = {
-        "phase_offset_rad": float(sequence.phase_offset),
-        "dc_offset": float(sequence.dc_offset),
+        "phase_offset_rad": float(stated.phase_offset),
+        "dc_offset": float(stated.dc_offset),
         "raw_unit": "relative",
     }
-    if sequence.quad_scale is not None:
-        sensor["raw_scale"] = float(sequence.quad_scale)
-    if sequence.cycle_length is not None:
-        sensor["cycle_frames"] = int(sequence.cycle_length)
-    if sequence.sensor:
-        sensor["settings"] = sequence.sensor
+    if stated.quad_scale is not None:
+        sensor["raw_scale"] = float(stated.quad_scale)
+    if stated.cycle_length is not None:
+        sensor["cycle_frames"] = int(stated.cycle_length)
+    if stated.settings:
+        sensor["settings"] = stated.settings
     head: dict[str, Any] = {
         "schema": "capture",
         "version": VERSION,
@@ -148,14 +148,15 @@ def _frames(sequence: Sequence) -> list[dict[str, Any]]:
     }
     if sequence.exposures is not None:
         columns["exposure"] = sequence.exposures.tolist()
-    if sequence.colour_from_world is not None:
-        columns["colour_to_world"] = inverse(sequence.colour_from_world).tolist()
+    if sequence.colour.camera_from_world is not None:
+        columns["colour_to_world"] = inverse(sequence.colour.camera_from_world).tolist()
     return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
 
-def _camera(size: tuple[int, ...], fx: float, fy: float, cx: float, cy: float) -> dict[str, Any]:
-    matrix = [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]
-    return {"size": [int(n) for n in size], "K": [[float(x) for x in row] for row in matrix]}
+def _camera(size: tuple[int, int], camera: Intrinsics) -> dict[str, Any]:
+    """Size as rows and columns; stored are columns and rows."""
+    matrix = [[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]]
+    return {"size": list(size[::-1]), "K": [[float(x) for x in row] for row in matrix]}
 
 
 def inverse(poses: Float[np.ndarray, "F 4 4"]) -> Float[np.ndarray, "F 4 4"]:

@@ -13,6 +13,7 @@ from . import findings, specs
 from .decode import unambiguous_range
 from .findings import Report
 from .folder import format_of, numbered
+from .read import read
 from .sequence import Sequence
 
 NARROW_VIEW = 5.0  # focal length in image widths: a view below 11 degrees is more often a mistake in units
@@ -27,7 +28,7 @@ def check(path: str | Path) -> Report:
     Raises:
         InputError: If the sequence cannot be read at all.
     """
-    sequence = Sequence.open(path)
+    sequence = read(path)
     report = Report(path=Path(path), form=format_of(Path(path)))
     _facts(sequence, report)
     _assumptions(sequence, report)
@@ -69,15 +70,16 @@ def _canonical(sequence: Sequence) -> bool:
 
 
 def _cycle_source(sequence: Sequence) -> str:
-    if sequence.cycle_length is not None:
+    if sequence.calibration.cycle_length is not None:
         return sequence.sources.get("cycle_length", "setting of the sequence")
     return "inferred from shifts and frequencies"
 
 
 def _facts(sequence: Sequence, report: Report) -> None:
     """Counts and values, each with its source."""
+    stated, tof = sequence.calibration, sequence.intrinsics
     measured, sources = int(sequence.measured.sum()), sequence.sources
-    colour, poses = next(iter(sequence.colour.values()), None), sources["camera_from_world"]
+    colour, poses = sequence.colour.size, sources["camera_from_world"]
     degrees = np.round(np.degrees(sequence.shifts[: sequence.cycle])).astype(int).tolist()
     period = np.diff(sequence.times[:: sequence.cycle if sequence.from_phasors else 1])
     report.lines += [
@@ -89,17 +91,16 @@ def _facts(sequence: Sequence, report: Report) -> None:
         f"times           0 .. {sequence.times[-1]:.4g} s"
         + (f", {period.min():.4g} to {period.max():.4g} s apart" if len(period) else "")
         + f"; {sources['times']}",
-        f"f_mod_hz        {sequence.f_mod_hz / 1e6:.6g} MHz, unambiguous to "
-        f"{SPEED_OF_LIGHT / (2 * sequence.f_mod_hz):.4g} m; {sources['f_mod_hz']}",
-        f"phase_offset    {sequence.phase_offset:.6g} rad; {sources['phase_offset']}",
-        f"dc_offset       {sequence.dc_offset:.6g}; {sources['dc_offset']}",
-        f"quad_scale      {'none' if sequence.quad_scale is None else f'{sequence.quad_scale:.6g}'}; "
+        f"f_mod_hz        {stated.f_mod_hz / 1e6:.6g} MHz, unambiguous to "
+        f"{SPEED_OF_LIGHT / (2 * stated.f_mod_hz):.4g} m; {sources['f_mod_hz']}",
+        f"phase_offset    {stated.phase_offset:.6g} rad; {sources['phase_offset']}",
+        f"dc_offset       {stated.dc_offset:.6g}; {sources['dc_offset']}",
+        f"quad_scale      {'none' if stated.quad_scale is None else f'{stated.quad_scale:.6g}'}; "
         f"{sources['quad_scale']}",
-        f"intrinsics      fx {sequence.fx:.6g}, fy {sequence.fy:.6g} px; {sources['fx']}",
-        f"principal point {sequence.cx:.6g}, {sequence.cy:.6g} px, centres at i + 0.5; {sources['cx']}",
+        f"intrinsics      fx {tof.fx:.6g}, fy {tof.fy:.6g} px; {sources['fx']}",
+        f"principal point {tof.cx:.6g}, {tof.cy:.6g} px, centres at i + 0.5; {sources['cx']}",
         f"poses           {poses}",
-        f"colour          {sources['colour']}"
-        + ("" if colour is None else f", {colour.shape[1]}x{colour.shape[0]} pixels"),
+        f"colour          {sources['colour']}" + ("" if colour is None else f", {colour[1]}x{colour[0]} pixels"),
         f"colour camera   {sources['colour_intrinsics']}; poses: {sources['colour_from_world']}",
         f"novel views     {sources['novel_from_world']}",
         f"forward flow    {sources['forward_flow']}",
@@ -112,8 +113,8 @@ def _facts(sequence: Sequence, report: Report) -> None:
         report.lines.append(
             f"frequencies     {several} MHz, unambiguous to {alone} m alone; {sources['frequencies_hz']}"
         )
-    if sequence.distortion is not None:
-        names = zip(("k1", "k2", "p1", "p2", "k3"), sequence.distortion, strict=True)
+    if tof.distortion is not None:
+        names = zip(("k1", "k2", "p1", "p2", "k3"), tof.distortion, strict=True)
         lens = ", ".join(f"{name} {value:.4g}" for name, value in names)
         report.lines.append(f"lens            {lens}; {sources['distortion']}")
     if sequence.exposures is not None:
@@ -131,6 +132,7 @@ def _facts(sequence: Sequence, report: Report) -> None:
 
 def _assumptions(sequence: Sequence, report: Report) -> None:
     """Everything that was not in a file and would matter, and what is missing."""
+    tof = sequence.intrinsics
     sources, missing = sequence.sources, np.flatnonzero(~sequence.measured)
     if len(missing):
         kind = "raw frames"
@@ -155,12 +157,15 @@ def _assumptions(sequence: Sequence, report: Report) -> None:
         report.warnings.append("colour: three equal channels: amplitude, not colour")
     if "warped copies" in sources["measured"]:
         report.warnings.append(f"quads: {sources['measured']}")
-    for name, focal, size in (("fx", sequence.fx, sequence.width), ("fy", sequence.fy, sequence.height)):
+    for name, focal, size in (
+        ("fx", tof.fx, sequence.width),
+        ("fy", tof.fy, sequence.height),
+    ):
         if focal > NARROW_VIEW * size:
             angle = math.degrees(2 * math.atan(size / (2 * focal)))
             report.warnings.append(f"{name} {focal:.4g} at {size} px is a view of {angle:.1f} degrees: millimetres?")
-    if not (0 <= sequence.cx <= sequence.width and 0 <= sequence.cy <= sequence.height):
-        report.warnings.append(f"the principal point {sequence.cx:.4g}, {sequence.cy:.4g} lies outside the image")
+    if not (0 <= tof.cx <= sequence.width and 0 <= tof.cy <= sequence.height):
+        report.warnings.append(f"the principal point {tof.cx:.4g}, {tof.cy:.4g} lies outside the image")
 
 
 def _counts(steps: np.ndarray) -> list[tuple[int, int]]:

@@ -160,14 +160,14 @@ def _more(sequence: Sequence, truth: Truth | None, n: int) -> list[Panel]:
         body = truth.body[n]
         index = np.where(body < 0, 0, 1 + body % len(PALETTE))
         panels.append(Panel(title=f"objects, {len(np.unique(body[body >= 0]))} in view", image=colours[index]))
-    flow = sequence.forward_flow.get(n)
+    flow = sequence.flow.forward.get(n)
     if flow is not None:
         length = np.hypot(*flow)
         end = max(float(np.nanmax(length)) if np.isfinite(length).any() else 0.0, 1e-6)
         panels.append(
             Panel(title=f"flow to raw frame {n + sequence.cycle}, up to {end:.3g} px", image=_flow(flow, end))
         )
-    image = sequence.colour.get(n)
+    image = sequence.colour.images.get(n)
     if image is not None:
         top = float(np.percentile(image, CLIP)) or 1.0
         panels.append(Panel(title=f"colour, raw frame {n}", image=_eight_bits(np.clip(image / top, 0, 1) ** (1 / 2.2))))

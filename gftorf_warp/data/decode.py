@@ -63,7 +63,7 @@ def decode_quartet(sequence: Sequence, i: int) -> Decoded:
         return Decoded(phasors=phasors, single=single, distance=single[0], range=reach, confidence=None)
     reach = unambiguous_range(sequence)
     ms, _ = multiples(frequencies)
-    chosen = choose(phases - sequence.phase_offset, ms)
+    chosen = choose(phases - sequence.calibration.phase_offset, ms)
     distance = single[0] + chosen.turns * (SPEED_OF_LIGHT / (2.0 * frequencies[0]))
     lit = np.hypot(phasors[:, 0], phasors[:, 1]).min(axis=0) > 0
     return Decoded(
@@ -126,8 +126,8 @@ def distance_from_phase(phase: np.ndarray, sequence: Sequence, f_mod_hz: float |
 
     ``f_mod_hz`` is the modulation frequency [Hz]; None: the first of the sequence.
     """
-    f_mod_hz = sequence.f_mod_hz if f_mod_hz is None else f_mod_hz
-    return wrapped(phase - sequence.phase_offset) * (SPEED_OF_LIGHT / (4.0 * math.pi * f_mod_hz))
+    f_mod_hz = sequence.calibration.f_mod_hz if f_mod_hz is None else f_mod_hz
+    return wrapped(phase - sequence.calibration.phase_offset) * (SPEED_OF_LIGHT / (4.0 * math.pi * f_mod_hz))
 
 
 def unambiguous_range(sequence: Sequence) -> float:
@@ -175,6 +175,6 @@ def quad_scale(sequence: Sequence) -> tuple[float, str]:
     Raises:
         InputError: If there is no factor and no light to compute one from.
     """
-    if sequence.quad_scale is not None:
-        return float(sequence.quad_scale), sequence.sources.get("quad_scale", "setting of the sequence")
+    if sequence.calibration.quad_scale is not None:
+        return float(sequence.calibration.quad_scale), sequence.sources.get("quad_scale", "setting of the sequence")
     return 1.0 / largest_amplitude(sequence), "inferred 1 / largest phasor amplitude"

@@ -17,6 +17,7 @@ STATIC_QUANTILE = 0.5  # the half of the pixels that changes least over time cou
 BRIGHT_QUANTILE = 0.5  # and of those the brighter half, where noise does not decide
 STILL_M = 1e-3  # [m] truth that changes less within a quartet is static
 CHANGED = 0.25  # of the amplitude: more than noise on bright pixels
+DC_TOLERANCE = 0.1  # [1] real differential quads stay within a few hundredths of 0, unipolar ones are at 1
 MOVING_PX = 0.5  # [px] flow above this is motion
 
 
@@ -44,7 +45,10 @@ def changed_share(sequence: Sequence) -> float:
 def distance_of_z(sequence: Sequence, truth: Truth) -> np.ndarray:
     """Distances [F, H, W] [m] if the numbers of the truth were z-depths."""
     y, x = np.mgrid[0 : sequence.height, 0 : sequence.width] + 0.5
-    slopes = (x - sequence.cx) / sequence.fx, (y - sequence.cy) / sequence.fy
+    slopes = (
+        (x - sequence.intrinsics.cx) / sequence.intrinsics.fx,
+        (y - sequence.intrinsics.cy) / sequence.intrinsics.fy,
+    )
     return (truth.distance * np.sqrt(1.0 + slopes[0] ** 2 + slopes[1] ** 2)).astype(np.float32)
 
 
@@ -135,7 +139,7 @@ class PhaseFit:
 def phase_fit(sequence: Sequence, truth: Truth) -> PhaseFit | None:
     """Fit psi = 4 pi d / depth_range + phase_offset to static pixels; None if fewer than a hundred are static."""
     phases, distances = [], []
-    kappa = 4.0 * math.pi * sequence.f_mod_hz / SPEED_OF_LIGHT
+    kappa = 4.0 * math.pi * sequence.calibration.f_mod_hz / SPEED_OF_LIGHT
     for i in sequence.complete_quartets:
         frames = sequence.quartet_frames(i)
         if not truth.known[frames].all():

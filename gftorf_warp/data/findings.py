@@ -15,10 +15,10 @@ from . import estimates, specs, torf
 from .arrays import as_float32, read_array
 from .decode import closed_form_distance, decode_quartet, largest_amplitude, quad_scale, unambiguous_range
 from .folder import numbered
+from .read import read_truth
 from .sequence import Sequence, Truth
 
 NAMES = {"capture": "capture", "ftorf": "F-ToeRF", "torf": "ToeRF"}
-DC_TOLERANCE = 0.1  # [1] real differential quads stay within a few hundredths of 0, unipolar ones are at 1
 SATURATED_SHARE = 1e-3  # of the pixels of a frame at the very extreme: light repeats itself only where it is cut off
 SATURATED_PIXELS = 10  # and no fewer, so that the one brightest pixel of a small image is none
 MATCH_MIN = 0.9  # of the correlation of stored phasors with the quads: motion alone costs a few per cent
@@ -91,9 +91,11 @@ def frequencies(sequence: Sequence, report: Report) -> None:
 def constant_part(sequence: Sequence, report: Report) -> None:
     """Constant part of raw quads."""
     estimate = estimates.dc_offset(sequence)
-    report.lines.append(f"dc estimate     {estimate:.4f} of the amplitude, {sequence.dc_offset:g} in use")
-    if abs(estimate - sequence.dc_offset) > DC_TOLERANCE:
-        report.warnings.append(f"dc_offset {sequence.dc_offset:g} is in use, but the quads say {estimate:.3f}")
+    report.lines.append(f"dc estimate     {estimate:.4f} of the amplitude, {sequence.calibration.dc_offset:g} in use")
+    if abs(estimate - sequence.calibration.dc_offset) > estimates.DC_TOLERANCE:
+        report.warnings.append(
+            f"dc_offset {sequence.calibration.dc_offset:g} is in use, but the quads say {estimate:.3f}"
+        )
 
 
 def order(sequence: Sequence, report: Report) -> None:
@@ -135,8 +137,8 @@ def camera(sequence: Sequence, report: Report) -> None:
                 f"poses: all are identity, but {share:.0%} of bright pixels change: if the camera moved, "
                 "store its poses in cams/tof_extrinsics.npy"
             )
-    if sequence.colour_from_world is not None:
-        relative = sequence.camera_from_world @ np.linalg.inv(sequence.colour_from_world)
+    if sequence.colour.camera_from_world is not None:
+        relative = sequence.camera_from_world @ np.linalg.inv(sequence.colour.camera_from_world)
         baseline = float(np.linalg.norm(relative[:, :3, 3], axis=1).max())
         report.lines.append(f"baseline        {baseline:.4g} m from the colour camera to the ToF camera")
         if baseline > BASELINE_MAX_M:
@@ -170,7 +172,7 @@ def truth(sequence: Sequence, report: Report) -> None:
     patterns = specs.fields(report.form)["distance"].paths
     folder = next((p for p in patterns if numbered(sequence.path, p)), patterns[0]).partition("/")[0]
     try:
-        truth = sequence.truth()
+        truth = read_truth(sequence)
     except InputError as error:
         report.warnings.append(f"{folder} cannot be read: {error.where}: {error.what}, {error.why}")
         return
@@ -217,12 +219,12 @@ def _fit(sequence: Sequence, truth: Truth, folder: str, report: Report) -> None:
             f"{fit.rms_m * 1e3:.1f} mm: it is read as distance along the ray, convert it"
         )
         return
-    used = SPEED_OF_LIGHT / sequence.f_mod_hz
-    offset = abs(np.angle(np.exp(1j * (fit.phase_offset - sequence.phase_offset))))
+    used = SPEED_OF_LIGHT / sequence.calibration.f_mod_hz
+    offset = abs(np.angle(np.exp(1j * (fit.phase_offset - sequence.calibration.phase_offset))))
     if abs(fit.depth_range / used - 1) > RANGE_TOLERANCE or offset > OFFSET_TOLERANCE_RAD:
         report.warnings.append(
             f"truth implies depth_range {fit.depth_range:.4g} m and phase_offset {fit.phase_offset:+.3f} rad, "
-            f"in use are {used:.4g} m and {sequence.phase_offset:+.3f} rad"
+            f"in use are {used:.4g} m and {sequence.calibration.phase_offset:+.3f} rad"
         )
 
 
@@ -241,8 +243,8 @@ def _is_decoded(sequence: Sequence, truth: Truth) -> bool:
 def flow(sequence: Sequence, report: Report) -> None:
     """Whether given flow explains the motion between frames of one shift."""
     for name, images, step in (
-        ("forward", sequence.forward_flow, sequence.cycle),
-        ("backward", sequence.backward_flow, -sequence.cycle),
+        ("forward", sequence.flow.forward, sequence.cycle),
+        ("backward", sequence.flow.backward, -sequence.cycle),
     ):
         match = estimates.flow_match(sequence, images, step)
         if match is None:

@@ -11,13 +11,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
 
 from ..errors import InputError
-from .sequence import Sequence
+from .sequence import Flow, Sequence
 
 Method = Literal["dis", "deepflow"]
 
@@ -28,15 +28,6 @@ CONSISTENCY_PX = (
 BLUR_PX = 0.7  # [px] before matching: halves the noise, keeps edges
 SMALLEST_PX = 12  # [px] the matcher refuses smaller images
 ROBUST_PERCENT = 0.05  # [%] of pixels at either end that may saturate, so that one hot pixel does not set the scale
-
-
-class Flow(NamedTuple):
-    """Optical flow of quartet starts, shaped like the fields of a sequence."""
-
-    forward: dict[int, Float[np.ndarray, "2 H W"]]
-    """(dx, dy) [px] by raw frame n, from n to n + K; NaN: unreliable pixel."""
-    backward: dict[int, Float[np.ndarray, "2 H W"]]
-    """(dx, dy) [px] by raw frame n, from n to n - K; NaN: unreliable pixel."""
 
 
 def compute_flow(sequence: Sequence, *, method: Method = "dis") -> Flow:

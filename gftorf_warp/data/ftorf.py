@@ -26,7 +26,7 @@ from .folder import (
 from .ftorf_write import write
 from .poses import read_novel, read_static_colour_poses, read_static_poses
 from .problems import Problems
-from .sequence import Sequence, Truth
+from .sequence import ColourCamera, Flow, Sequence, Truth
 
 __all__ = ["read", "read_truth", "write"]
 
@@ -51,7 +51,7 @@ def read(path: str | Path, *, frame_rate_hz: float | None = None) -> Sequence:
     sources["from_phasors"] = "file tofType0 .. tofType3: raw quads"
     frame_paths, copies = _measured_files(root)
     size = first_size(frame_paths, fields["quads"], problems)
-    calibration = read_calibration(root, FORMAT, problems, size.get("W"))
+    calibrated = read_calibration(root, FORMAT, problems, size.get("W"))
     times = problems.attempt(
         read_times, root, FORMAT, max(frame_paths) + 1, frame_rate_hz, default_hz=FRAME_RATE_HZ, sources=sources
     )
@@ -67,7 +67,7 @@ def read(path: str | Path, *, frame_rate_hz: float | None = None) -> Sequence:
         if all((image == image[..., :1]).all() for image in colour.values()):
             sources["colour"] += "; its three channels are equal: amplitude, not colour"
         height, width = next(iter(colour.values())).shape[:2]
-        intrinsics = problems.attempt(read_colour_intrinsics, root, FORMAT, calibration, size, (height, width), sources)
+        intrinsics = problems.attempt(read_colour_intrinsics, root, FORMAT, calibrated, size, (height, width), sources)
         if poses is not None:
             colour_poses = problems.attempt(read_static_colour_poses, root, poses, counts, sources)
     novel = problems.attempt(read_novel, root, FORMAT, sources)
@@ -81,7 +81,7 @@ def read(path: str | Path, *, frame_rate_hz: float | None = None) -> Sequence:
     assert poses is not None
     measured = np.zeros(frames, dtype=bool)
     measured[list(frame_paths)] = True
-    sources |= calibration.sources
+    sources |= calibrated.sources
     sources["quads"] = source
     sources["measured"] = f"file {len(frame_paths)} of {frames} raw frames" + (
         f"; {copies} files of another slot than their id's are warped copies, ignored" if copies else ""
@@ -91,21 +91,12 @@ def read(path: str | Path, *, frame_rate_hz: float | None = None) -> Sequence:
         measured=measured,
         shifts=shifts,
         times=times,
-        f_mod_hz=calibration.f_mod_hz,
-        phase_offset=calibration.phase_offset,
-        dc_offset=calibration.dc_offset,
-        fx=calibration.fx,
-        fy=calibration.fy,
-        cx=calibration.cx,
-        cy=calibration.cy,
         camera_from_world=poses,
-        quad_scale=calibration.quad_scale,
-        colour=colour,
-        colour_intrinsics=intrinsics,
-        colour_from_world=colour_poses,
+        intrinsics=calibrated.intrinsics,
+        calibration=calibrated.calibration,
+        colour=ColourCamera(images=colour, intrinsics=intrinsics, camera_from_world=colour_poses),
+        flow=Flow(forward=images["forward_flow"], backward=images["backward_flow"]),
         novel_from_world=novel,
-        forward_flow=images["forward_flow"],
-        backward_flow=images["backward_flow"],
         sources=sources,
         path=root,
     )

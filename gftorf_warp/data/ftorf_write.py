@@ -67,17 +67,17 @@ def _files(
 ) -> Iterator[tuple[str, bytes]]:
     """Every file of the folder, by relative name."""
     poses = sequence.camera_from_world
-    colour_poses = poses if sequence.colour_from_world is None else sequence.colour_from_world
+    colour_poses = poses if sequence.colour.camera_from_world is None else sequence.colour.camera_from_world
     yield from calibration_files(sequence, sequence.times, poses)
     yield "tof_permutation.npy", npy(permutation)
     yield "cams/poses.json", json_bytes({"poses": "camera_from_world"})
     yield "cams/color_extrinsics.npy", npy(colour_poses.astype(np.float64))
-    yield "cams/dc_offset.npy", npy(np.float64(sequence.dc_offset))
+    yield "cams/dc_offset.npy", npy(np.float64(sequence.calibration.dc_offset))
     for n in np.flatnonzero(sequence.measured).tolist():
         yield f"tofType{n % FRAMES_PER_QUARTET}/{n:04d}.npy", npy(float32(sequence.quads[n]))
-    for n, image in sequence.colour.items():
+    for n, image in sequence.colour.images.items():
         yield f"color/{n:04d}.npy", npy(shortest(float32(image)))
-    for direction, images in (("forward", sequence.forward_flow), ("backward", sequence.backward_flow)):
+    for direction, images in (("forward", sequence.flow.forward), ("backward", sequence.flow.backward)):
         for n, image in images.items():
             yield f"{direction}_flow_2/flow_{n:04d}.npy", npy(float32(image))
     if truth is not None:

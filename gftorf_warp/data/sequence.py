@@ -1,11 +1,10 @@
-"""A recorded sequence in memory: raw frames with shift, time and pose, calibration, and where each value is from."""
+"""A recorded sequence in memory, and the truth about it: plain values; :mod:`gftorf_warp.data.read` makes them."""
 
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -14,65 +13,110 @@ from jaxtyping import Bool, Float, Int
 from .cycles import find_cycle, frequencies_by_order, frequencies_decoded
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Sequence:
-    """F raw frames of one C-ToF camera. Nothing here is truth: see :class:`Truth`."""
+@dataclass(frozen=True, kw_only=True)
+class Intrinsics:
+    """Intrinsics of a camera [px], in the convention of the program: pixel centres at i + 0.5."""
 
-    quads: Float[np.ndarray, "F H W"]
-    """What each raw frame recorded, float32, in the units of the file; rows that were not measured are zero."""
-    measured: Bool[np.ndarray, "F"]
-    """Whether a raw frame exists; an absent one is 'not measured', never zero light."""
-    shifts: Float[np.ndarray, "F"]
-    """Phase shift of each raw frame [rad]."""
-    times: Float[np.ndarray, "F"]
-    """Time of each raw frame since the first [s]."""
-    f_mod_hz: float
-    """Modulation frequency [Hz]; the first of the cycle if there are several."""
-    frequencies_hz: Float[np.ndarray, "F"] | None = None
-    """Modulation frequency of each raw frame [Hz]; None: ``f_mod_hz`` throughout."""
-    cycle_length: int | None = None
-    """Raw frames K of a cycle, if the recording states it; None: see :attr:`cycle`."""
-    phase_offset: float = 0.0
-    """Measured minus true phase [rad]."""
-    dc_offset: float = 0.0
-    """Constant part of a quad as a multiple of its amplitude [1]."""
     fx: float
     """Focal length, x [px]."""
     fy: float
     """Focal length, y [px]."""
     cx: float
-    """Principal point, x [px], in the convention of the program: pixel centres at i + 0.5."""
+    """Principal point, x [px]."""
     cy: float
-    """Principal point, y [px], likewise."""
+    """Principal point, y [px]."""
     distortion: tuple[float, float, float, float, float] | None = None
-    """k1, k2, p1, p2, k3 of the lens as OpenCV names them [1]; None: a pinhole."""
+    """k1, k2, p1, p2, k3 of the lens in OpenCV's model [1]; None: a pinhole."""
+
+    def scaled(self, sx: float, sy: float) -> Intrinsics:
+        """Intrinsics for images resized by these factors; the distortion stays."""
+        return replace(self, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Calibration:
+    """Constants of the sensor, as the recording states them."""
+
+    f_mod_hz: float
+    """Modulation frequency [Hz]; the first of the cycle if there are several."""
+    phase_offset: float = 0.0
+    """Measured minus true phase [rad]."""
+    dc_offset: float = 0.0
+    """Constant part of a quad as a multiple of its amplitude [1]."""
+    quad_scale: float | None = None
+    """Factor for the quads that the file states; None if it states none. Never applied by a reader."""
+    cycle_length: int | None = None
+    """Raw frames K of a cycle, if the recording states it; None: see :attr:`Sequence.cycle`."""
+    settings: dict[str, Any] = field(default_factory=dict)
+    """Further settings of the sensor by name, numbers and texts."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ColourCamera:
+    """Images of a colour camera beside the ToF camera."""
+
+    images: dict[int, Float[np.ndarray, "h w 3"]] = field(default_factory=dict)
+    """Colour images by raw frame, linear, float32; empty if there are none."""
+    intrinsics: Intrinsics | None = None
+    """Intrinsics of the images; None if unknown."""
+    camera_from_world: Float[np.ndarray, "F 4 4"] | None = None
+    """Pose at each raw frame, world to camera [m]; None if unknown."""
+
+    @property
+    def size(self) -> tuple[int, int] | None:
+        """Rows h and columns w of the images; None if there are none."""
+        return next(((image.shape[0], image.shape[1]) for image in self.images.values()), None)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Flow:
+    """Optical flow between raw frames one cycle of K frames apart."""
+
+    forward: dict[int, Float[np.ndarray, "2 H W"]] = field(default_factory=dict)
+    """Flow (dx, dy) [px] by raw frame n, from n to n + K; NaN: unknown pixel."""
+    backward: dict[int, Float[np.ndarray, "2 H W"]] = field(default_factory=dict)
+    """Flow (dx, dy) [px] by raw frame n, from n to n - K; NaN: unknown pixel."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Sequence:
+    """F raw frames of one C-ToF camera. Contains no ground truth: see :class:`Truth`.
+
+    ``Sequence.open(path)`` reads a folder and ``sequence.truth()`` its ground truth;
+    :mod:`gftorf_warp.data.read` binds both.
+    """
+
+    quads: Float[np.ndarray, "F H W"]
+    """Values of each raw frame, float32, in the units of the file; zero in frames that were not measured."""
+    measured: Bool[np.ndarray, "F"]
+    """Whether a raw frame was measured; an absent one is 'not measured', never zero light."""
+    shifts: Float[np.ndarray, "F"]
+    """Phase shift of each raw frame [rad]."""
+    times: Float[np.ndarray, "F"]
+    """Time of each raw frame since the first [s]."""
+    frequencies_hz: Float[np.ndarray, "F"] | None = None
+    """Modulation frequency of each raw frame [Hz]; None: ``calibration.f_mod_hz`` throughout."""
+    exposures: Float[np.ndarray, "F"] | None = None
+    """Exposure time of each raw frame [s]; None: unknown."""
     camera_from_world: Float[np.ndarray, "F 4 4"]
     """Pose of each raw frame, world to camera [m]."""
-    quad_scale: float | None = None
-    """The file's own factor for the quads; None if it states none. Never applied by a reader."""
+    intrinsics: Intrinsics
+    """Intrinsics of the ToF camera."""
+    calibration: Calibration
+    """Constants of the sensor."""
     from_phasors: bool = False
-    """Whether the camera delivered phasors, each as if taken at one instant: the four raw frames of a quartet are then
+    """Whether the camera delivered phasors, each of one instant: the four raw frames of a quartet are then
     re/2, -re/2, im/2, -im/2 of one phasor, with one time and one pose."""
-    colour: dict[int, Float[np.ndarray, "h w 3"]] = field(default_factory=dict)
-    """Colour images by raw frame, linear, float32; empty if there are none."""
-    colour_intrinsics: tuple[float, float, float, float] | None = None
-    """fx, fy, cx, cy of the colour images [px], pixel centres at i + 0.5; None: the colour camera is not known."""
-    colour_from_world: Float[np.ndarray, "F 4 4"] | None = None
-    """Pose of the colour camera at each raw frame, world to camera [m]; None: the colour camera is not known."""
+    colour: ColourCamera = field(default_factory=ColourCamera)
+    """The colour camera, without images if there is none."""
+    flow: Flow = field(default_factory=Flow)
+    """Optical flow, empty if there is none."""
     novel_from_world: Float[np.ndarray, "M 4 4"] | None = None
-    """Poses of views that nobody took, world to camera [m], to be rendered for looking at; None if there are none."""
-    forward_flow: dict[int, Float[np.ndarray, "2 H W"]] = field(default_factory=dict)
-    """Optical flow (dx, dy) [px] by raw frame n, from n to n + K; NaN: unknown pixel."""
-    backward_flow: dict[int, Float[np.ndarray, "2 H W"]] = field(default_factory=dict)
-    """Optical flow (dx, dy) [px] by raw frame n, from n to n - K; NaN: unknown pixel."""
-    exposures: Float[np.ndarray, "F"] | None = None
-    """Length of each exposure [s]; None: not known."""
-    sensor: dict[str, Any] = field(default_factory=dict)
-    """Further settings of the sensor by name, numbers and texts, as the recording states them."""
+    """Poses of novel views to be rendered, world to camera [m]; None if there are none."""
     sources: dict[str, str] = field(default_factory=dict)
-    """Where each value is from, by field name: 'file ...', 'default ...', 'inferred ...' or 'setting ...'."""
+    """Source of each value by name: 'file ...', 'default ...', 'inferred ...' or 'setting ...'."""
     path: Path | None = None
-    """The folder this was read from; None for a sequence that lives in memory only."""
+    """The folder this was read from; None for a sequence that exists in memory only."""
 
     @property
     def frames(self) -> int:
@@ -95,7 +139,7 @@ class Sequence:
 
         As stated, else the period of shifts and frequencies: four for a sensor of four shifts at one frequency.
         """
-        return self.cycle_length or find_cycle(self.shifts, self.frame_frequencies)
+        return self.calibration.cycle_length or find_cycle(self.shifts, self.frame_frequencies)
 
     @functools.cached_property
     def frequencies(self) -> tuple[float, ...]:
@@ -121,32 +165,7 @@ class Sequence:
     @property
     def frame_frequencies(self) -> Float[np.ndarray, "F"]:
         """Modulation frequency of each raw frame [Hz]."""
-        return np.full(self.frames, self.f_mod_hz) if self.frequencies_hz is None else self.frequencies_hz
-
-    @classmethod
-    def open(cls, path: str | Path, *, frame_rate_hz: float | None = None) -> Sequence:
-        """Read a sequence from a folder.
-
-        Args:
-            path: A capture, an F-ToeRF folder of raw quads, or a ToeRF folder of phasors.
-            frame_rate_hz: Raw frames per second, or phasors per second of a ToeRF folder; overrides what the folder
-                says or the default of 120, or 30. A capture has none: it states every time.
-
-        Raises:
-            InputError: If the folder or a file in it is not what data_specs/ describes.
-        """
-        return _reader(path).read(path, frame_rate_hz=frame_rate_hz)
-
-    def truth(self) -> Truth | None:
-        """Ground truth stored beside the sequence, read now; None if there is none."""
-        return None if self.path is None else _reader(self.path).read_truth(self.path, frames=self.frames)
-
-
-def _reader(path: str | Path) -> ModuleType:
-    """The module that reads a folder."""
-    from . import capture, folder, ftorf, torf
-
-    return {"capture": capture, "ftorf": ftorf, "torf": torf}[folder.format_of(Path(path))]
+        return np.full(self.frames, self.calibration.f_mod_hz) if self.frequencies_hz is None else self.frequencies_hz
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -30,7 +30,7 @@ from .folder import (
 )
 from .poses import read_moving_colour_poses, read_moving_poses, read_novel
 from .problems import Problems
-from .sequence import Sequence, Truth
+from .sequence import ColourCamera, Sequence, Truth
 from .torf_write import write
 
 __all__ = ["phasor_files", "read", "read_truth", "write"]
@@ -64,7 +64,7 @@ def read(path: str | Path, *, frame_rate_hz: float | None = None) -> Sequence:
             fix="complete the folder",
         )
         problems.errors.append(missing)
-    calibration = read_calibration(root, FORMAT, problems, size.get("W"))
+    calibrated = read_calibration(root, FORMAT, problems, size.get("W"))
     times = problems.attempt(
         read_times, root, FORMAT, max(files) + 1, frame_rate_hz, default_hz=PHASOR_RATE_HZ, sources=sources
     )
@@ -75,7 +75,7 @@ def read(path: str | Path, *, frame_rate_hz: float | None = None) -> Sequence:
     sources |= dict.fromkeys(("colour_intrinsics", "colour_from_world"), "default none")
     if colour:
         height, width = next(iter(colour.values())).shape[:2]
-        intrinsics = problems.attempt(read_colour_intrinsics, root, FORMAT, calibration, size, (height, width), sources)
+        intrinsics = problems.attempt(read_colour_intrinsics, root, FORMAT, calibrated, size, (height, width), sources)
         if poses is not None:
             colour_poses = problems.attempt(read_moving_colour_poses, root, poses, sources)
     novel = problems.attempt(read_novel, root, FORMAT, sources)
@@ -89,7 +89,7 @@ def read(path: str | Path, *, frame_rate_hz: float | None = None) -> Sequence:
     assert poses is not None
     measured = np.zeros(phasors, dtype=bool)
     measured[list(files)] = True
-    sources |= calibration.sources
+    sources |= calibrated.sources
     sources["measured"] = f"file {len(files)} of {phasors} phasors, ids from {first_id:04d}"
     sources["shifts"] = "file tof: phasors, as four simultaneous quads 0, pi, pi/2, 3 pi/2"
     sources["from_phasors"] = "file tof: phasors"
@@ -100,18 +100,15 @@ def read(path: str | Path, *, frame_rate_hz: float | None = None) -> Sequence:
         measured=np.repeat(measured, step),
         shifts=np.tile(CANONICAL_SHIFTS, phasors),
         times=np.repeat(times, step),
-        f_mod_hz=calibration.f_mod_hz,
-        phase_offset=calibration.phase_offset,
-        fx=calibration.fx,
-        fy=calibration.fy,
-        cx=calibration.cx,
-        cy=calibration.cy,
         camera_from_world=np.repeat(poses, step, axis=0),
-        quad_scale=calibration.quad_scale,
+        intrinsics=calibrated.intrinsics,
+        calibration=calibrated.calibration,
         from_phasors=True,
-        colour={step * i: image for i, image in colour.items()},
-        colour_intrinsics=intrinsics,
-        colour_from_world=None if colour_poses is None else np.repeat(colour_poses, step, axis=0),
+        colour=ColourCamera(
+            images={step * i: image for i, image in colour.items()},
+            intrinsics=intrinsics,
+            camera_from_world=None if colour_poses is None else np.repeat(colour_poses, step, axis=0),
+        ),
         novel_from_world=novel,
         sources=sources,
         path=root,

@@ -76,7 +76,7 @@ def _files(
     step = FRAMES_PER_QUARTET
     starts = slice(0, sequence.frames // step * step, step)
     poses = sequence.camera_from_world[starts]
-    colour_poses = poses if sequence.colour_from_world is None else sequence.colour_from_world[starts]
+    colour_poses = poses if sequence.colour.camera_from_world is None else sequence.colour.camera_from_world[starts]
     yield from calibration_files(sequence, sequence.times[starts], poses)
     relative = poses @ np.linalg.inv(colour_poses)
     if np.ptp(relative, axis=0).max() <= SAME_POSE:
@@ -85,8 +85,8 @@ def _files(
     for i in sequence.complete_quartets:
         yield f"tof/{i:04d}.npy", npy(_phasor(sequence, i))
     for i in range(len(poses)):
-        if step * i in sequence.colour:
-            yield f"color/{i:04d}.npy", npy(shortest(float32(sequence.colour[step * i])))
+        if step * i in sequence.colour.images:
+            yield f"color/{i:04d}.npy", npy(shortest(float32(sequence.colour.images[step * i])))
         if truth is not None and truth.known[step * i]:
             yield f"distance/{i:04d}.npy", npy(float32(truth.distance[step * i]))
             if truth.phasor_distance is not None:

@@ -14,7 +14,7 @@ from ..errors import UsageError
 from .calibration import DEPTH_RANGES_M, FOCAL_MIN
 from .files import atomic_folder, write_through
 from .poses import rigid
-from .sequence import Sequence, Truth
+from .sequence import Intrinsics, Sequence, Truth
 from .specs import layer_field
 
 SHEET = "contact_sheet.png"  # in every simulated folder; no reader opens it
@@ -45,15 +45,15 @@ def calibration_files(
     sequence: Sequence, times: np.ndarray, camera_from_world: np.ndarray
 ) -> Iterator[tuple[str, bytes]]:
     """The files that both formats have, by relative name, for frames of these times [s] and poses."""
-    yield "cams/tof_intrinsics.npy", npy(_pinhole(sequence.fx, sequence.fy, sequence.cx, sequence.cy))
-    yield "cams/color_intrinsics.npy", npy(_pinhole(*_colour_intrinsics(sequence)))
+    yield "cams/tof_intrinsics.npy", npy(_pinhole(sequence.intrinsics))
+    yield "cams/color_intrinsics.npy", npy(_pinhole(_colour_intrinsics(sequence)))
     yield "cams/pixel_centre.json", json_bytes({"pixel_centre": "integer"})
     yield "cams/tof_extrinsics.npy", npy(camera_from_world.astype(np.float64))
     yield "cams/frame_times.npy", npy(times.astype(np.float64))
-    yield "cams/depth_range.npy", npy(np.float64(SPEED_OF_LIGHT / sequence.f_mod_hz))
-    yield "cams/phase_offset.npy", npy(np.float64(sequence.phase_offset))
-    if sequence.quad_scale is not None:
-        yield "cams/quad_values_scale_factor.npy", npy(np.float64(sequence.quad_scale))
+    yield "cams/depth_range.npy", npy(np.float64(SPEED_OF_LIGHT / sequence.calibration.f_mod_hz))
+    yield "cams/phase_offset.npy", npy(np.float64(sequence.calibration.phase_offset))
+    if sequence.calibration.quad_scale is not None:
+        yield "cams/quad_values_scale_factor.npy", npy(np.float64(sequence.calibration.quad_scale))
     if sequence.novel_from_world is not None:
         yield "test_poses.npy", npy(sequence.novel_from_world.astype(np.float64))
 
@@ -80,28 +80,28 @@ def validate(sequence: Sequence, truth: Truth | None) -> None:
         "frequencies_hz": (sequence.frame_frequencies.shape, (frames,)),
         "camera_from_world": (sequence.camera_from_world.shape, (frames, 4, 4)),
     }
-    if sequence.colour_from_world is not None:
-        lengths["colour_from_world"] = (sequence.colour_from_world.shape, (frames, 4, 4))
-    if sequence.colour_intrinsics is not None:
-        lengths["colour_intrinsics"] = ((len(sequence.colour_intrinsics),), (4,))
+    if sequence.colour.camera_from_world is not None:
+        lengths["colour_from_world"] = (sequence.colour.camera_from_world.shape, (frames, 4, 4))
     if sequence.novel_from_world is not None:
         views = sequence.novel_from_world
         lengths["novel_from_world"] = (views.shape, (max(1, len(views)), 4, 4))
-    for name in ("forward_flow", "backward_flow"):
-        lengths |= {f"{name}[{n}]": (flow.shape, (2, *shape[1:])) for n, flow in getattr(sequence, name).items()}
-    first = next((image.shape[:2] for image in sequence.colour.values()), ())
-    lengths |= {f"colour[{n}]": (image.shape, (*first, 3)) for n, image in sequence.colour.items()}
+    images = {"forward_flow": sequence.flow.forward, "backward_flow": sequence.flow.backward}
+    for name, flows in images.items():
+        lengths |= {f"{name}[{n}]": (flow.shape, (2, *shape[1:])) for n, flow in flows.items()}
+    images["colour"] = sequence.colour.images
+    size = sequence.colour.size or ()
+    lengths |= {f"colour[{n}]": (image.shape, (*size, 3)) for n, image in sequence.colour.images.items()}
     if truth is not None:
         lengths |= {"truth.distance": (truth.distance.shape, shape), "truth.known": (truth.known.shape, (frames,))}
         more = {name: getattr(truth, name) for name in ("phasor_distance", "amplitude", "body")}
-        lengths |= {f"truth.{name}": (images.shape, shape) for name, images in more.items() if images is not None}
-        for name, images in truth.layers.items():
-            lengths[f"truth.layers[{name}]"] = (images.shape, (frames, len(layer_field(name).channels), *shape[1:]))
+        lengths |= {f"truth.{name}": (image.shape, shape) for name, image in more.items() if image is not None}
+        for name, layer in truth.layers.items():
+            lengths[f"truth.layers[{name}]"] = (layer.shape, (frames, len(layer_field(name).channels), *shape[1:]))
     for name, (found, expected) in lengths.items():
         if found != expected:
             raise ValueError(f"{name} {found} must have shape {expected}")
-    for name in ("colour", "forward_flow", "backward_flow"):
-        outside = [n for n in getattr(sequence, name) if not 0 <= n < frames]
+    for name, by_frame in images.items():
+        outside = [n for n in by_frame if not 0 <= n < frames]
         if outside:
             raise ValueError(f"{name}: raw frames {outside} are not in 0..{frames - 1}")
     if sequence.from_phasors:
@@ -117,10 +117,15 @@ def _validate_phasors(sequence: Sequence) -> None:
     rules = {
         "shifts": np.array_equal(sequence.shifts, np.tile(CANONICAL_SHIFTS, len(quads))),
         "quads": np.array_equal(quads[:, 0], -quads[:, 1]) and np.array_equal(quads[:, 2], -quads[:, 3]),
-        "dc_offset": sequence.dc_offset == 0,
+        "dc_offset": sequence.calibration.dc_offset == 0,
     }
-    for name in ("measured", "times", "camera_from_world", "colour_from_world"):
-        values = getattr(sequence, name)
+    per_frame = {
+        "measured": sequence.measured,
+        "times": sequence.times,
+        "camera_from_world": sequence.camera_from_world,
+        "colour_from_world": sequence.colour.camera_from_world,
+    }
+    for name, values in per_frame.items():
         rules[name] = values is None or np.array_equal(values, np.repeat(values[::step], step, axis=0))
     for name, holds in rules.items():
         if not holds:
@@ -133,12 +138,13 @@ def refuse_inexpressible(form: str, sequence: Sequence, truth: Truth | None) -> 
     Raises:
         UsageError: If not.
     """
-    flows = [*sequence.forward_flow.values(), *sequence.backward_flow.values()]
+    flows = [*sequence.flow.forward.values(), *sequence.flow.backward.values()]
     times = sequence.times
     distance = np.ones(1) if truth is None else truth.distance[truth.known]
     static = np.zeros(1) if truth is None or truth.phasor_distance is None else truth.phasor_distance[truth.known]
-    numbers = (sequence.f_mod_hz, sequence.phase_offset, sequence.dc_offset, sequence.quad_scale or 1.0)
-    focal = sequence.fx, sequence.fy
+    stated, tof = sequence.calibration, sequence.intrinsics
+    numbers = (stated.f_mod_hz, stated.phase_offset, stated.dc_offset, stated.quad_scale or 1.0)
+    focal = tof.fx, tof.fy
     colour, colour_width = _colour_intrinsics(sequence), _colour_size(sequence)[1]
     family = form in ("ftorf", "torf")  # these state one depth range and one matrix
     rules = {  # what: (whether it holds, expected, found)
@@ -152,7 +158,7 @@ def refuse_inexpressible(form: str, sequence: Sequence, truth: Truth | None) -> 
             f"cycles of {FRAMES_PER_QUARTET} raw frames",
             f"of {sequence.cycle}",
         ),
-        "distortion": (not family or sequence.distortion is None, "a pinhole", f"a lens with {sequence.distortion}"),
+        "distortion": (not family or tof.distortion is None, "a pinhole", f"a lens with {tof.distortion}"),
         "an empty sequence": (sequence.measured.any(), "at least one measured raw frame", "none"),
         "quads": (np.isfinite(sequence.quads[sequence.measured]).all(), "finite numbers", "NaN or infinity"),
         "times": (
@@ -162,25 +168,34 @@ def refuse_inexpressible(form: str, sequence: Sequence, truth: Truth | None) -> 
         ),
         "calibration": (np.isfinite(numbers).all(), "finite numbers", str(numbers)),
         "f_mod_hz": (
-            DEPTH_RANGES_M[0] <= SPEED_OF_LIGHT / sequence.f_mod_hz <= DEPTH_RANGES_M[1],
+            DEPTH_RANGES_M[0] <= SPEED_OF_LIGHT / stated.f_mod_hz <= DEPTH_RANGES_M[1],
             f"speed of light / frequency between {DEPTH_RANGES_M[0]} and {DEPTH_RANGES_M[1]} m",
-            f"{sequence.f_mod_hz} Hz",
+            f"{stated.f_mod_hz} Hz",
         ),
-        "quad_scale": (sequence.quad_scale is None or sequence.quad_scale > 0, "above 0", str(sequence.quad_scale)),
+        "quad_scale": (stated.quad_scale is None or stated.quad_scale > 0, "above 0", str(stated.quad_scale)),
         "focal length": (
             min(focal) >= FOCAL_MIN * sequence.width,
             f"pixels, at least {FOCAL_MIN} of the width {sequence.width}",
             str(focal),
         ),
         "colour_intrinsics": (
-            np.isfinite(colour).all() and min(colour[:2]) >= FOCAL_MIN * colour_width,
+            np.isfinite([colour.fx, colour.fy, colour.cx, colour.cy]).all()
+            and min(colour.fx, colour.fy) >= FOCAL_MIN * colour_width,
             f"pixels, at least {FOCAL_MIN} of the width {colour_width}",
             str(colour),
         ),
-        "colour_from_world": (_rigid(sequence.colour_from_world), "rotations and translations", "other matrices"),
+        "colour_from_world": (
+            _rigid(sequence.colour.camera_from_world),
+            "rotations and translations",
+            "other matrices",
+        ),
         "novel_from_world": (_rigid(sequence.novel_from_world), "rotations and translations", "other matrices"),
         "camera_from_world": (_rigid(sequence.camera_from_world), "rotations and translations", "other matrices"),
-        "colour": (all(np.isfinite(i).all() for i in sequence.colour.values()), "finite numbers", "NaN or infinity"),
+        "colour": (
+            all(np.isfinite(i).all() for i in sequence.colour.images.values()),
+            "finite numbers",
+            "NaN or infinity",
+        ),
         "phasor_distance": (((static >= 0) & (static < np.inf) | np.isnan(static)).all(), "metres or NaN", "others"),
         "layers": (
             truth is None or not any(np.isinf(images).any() for images in truth.layers.values()),
@@ -211,25 +226,25 @@ def inexpressible(form: str, what: str, expected: str, found: str) -> UsageError
 
 def _colour_size(sequence: Sequence) -> tuple[int, int]:
     """Rows and columns of the colour images; without any, those of the quads."""
-    return next((image.shape[:2] for image in sequence.colour.values()), (sequence.height, sequence.width))
+    return sequence.colour.size or (sequence.height, sequence.width)
 
 
-def _colour_intrinsics(sequence: Sequence) -> tuple[float, float, float, float]:
+def _colour_intrinsics(sequence: Sequence) -> Intrinsics:
     """Those of the colour camera; public loaders want one, so without any it stands where the ToF camera stands."""
-    if sequence.colour_intrinsics is not None:
-        return sequence.colour_intrinsics
+    if sequence.colour.intrinsics is not None:
+        return sequence.colour.intrinsics
     height, width = _colour_size(sequence)
-    sx, sy = width / sequence.width, height / sequence.height
-    return sequence.fx * sx, sequence.fy * sy, sequence.cx * sx, sequence.cy * sy
+    return sequence.intrinsics.scaled(width / sequence.width, height / sequence.height)
 
 
 def _rigid(poses: np.ndarray | None) -> bool:
     return poses is None or bool(rigid(poses).all())
 
 
-def _pinhole(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
+def _pinhole(camera: Intrinsics) -> np.ndarray:
     """Matrix for integer pixel centres, 3x3."""
-    return np.array([[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1]], dtype=np.float64)
+    rows = [[camera.fx, 0, camera.cx - 0.5], [0, camera.fy, camera.cy - 0.5], [0, 0, 1]]
+    return np.array(rows, dtype=np.float64)
 
 
 def float32(array: np.ndarray) -> np.ndarray:

@@ -16,6 +16,7 @@ from jaxtyping import Float
 from .. import __version__
 from ..data.decode import unambiguous_range
 from ..data.files import atomic_write, write_json
+from ..data.read import read, read_truth
 from ..data.sequence import Sequence, Truth
 from ..data.truth import known_distance, moving_and_static
 from ..data.unwrap import CONFIDENT
@@ -104,7 +105,7 @@ def fitting_truth(sequence: Sequence, path: str | Path | None = None) -> Truth |
     Raises:
         InputError: If ``path`` holds no ground truth, or frames or size differ.
     """
-    found = sequence.truth() if path is None else Sequence.open(path).truth()
+    found = read_truth(sequence if path is None else read(path))
     if found is None or not found.known.any():
         if path is None:
             return None

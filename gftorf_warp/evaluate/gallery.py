@@ -86,13 +86,13 @@ def colour_views(run: Run, sequence: Sequence, frames: list[int]) -> Colour | No
         DivergedError: If a rendering is not finite.
     """
     found = []
-    for n in (n for n in frames if n in sequence.colour):
+    for n in (n for n in frames if n in sequence.colour.images):
         camera = colour_camera_of(sequence, n)
         rendered = None if camera is None else run.render(float(sequence.times[n]), camera).colour
         if rendered is None:
             return None
         image = finite(rendered, f"colour of raw frame {n}", run)
-        found.append((n, sequence.colour[n], image.transpose(1, 2, 0)))
+        found.append((n, sequence.colour.images[n], image.transpose(1, 2, 0)))
     if not found:
         return None
     chosen, measured, images = zip(*found, strict=True)

@@ -176,6 +176,6 @@ def quads_of(
     shifts = list(shifts)
     slots = [channel_of(sequence.shifts[frames].tolist(), shift) for shift in shifts]
     if any(slot is None for slot in slots) or len(frames) != len(slots):
-        constant = sequence.dc_offset * np.hypot(re, im)
+        constant = sequence.calibration.dc_offset * np.hypot(re, im)
         return np.stack([0.5 * (re * math.cos(shift) + im * math.sin(shift) + constant) for shift in shifts])
     return np.stack([sequence.quads[frames[slot]] for slot in slots if slot is not None])

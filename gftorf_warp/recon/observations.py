@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..data.decode import closed_form_distance, quad_scale, quartet_phasors
-from ..data.sequence import Sequence
+from ..data.sequence import Flow, Sequence
 from ..errors import InputError
 from ..scene.camera import Camera
 from ..scene.initialise import Init
@@ -20,8 +20,7 @@ from ..scene.measured import camera_of, colour_camera_of, sensor_of
 from ..scene.sensor import Sensor
 from .settings import Batch, FlowSource, Input, ReconSettings
 
-HASHED = ("quads", "measured", "shifts", "times", "frequencies_hz", "camera_from_world", "colour_from_world")
-HASHED_NUMBERS = ("f_mod_hz", "phase_offset", "dc_offset", "fx", "fy", "cx", "cy", "quad_scale", "colour_intrinsics")
+HASHED = ("quads", "measured", "shifts", "times", "frequencies_hz", "camera_from_world")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -138,7 +137,7 @@ def observe(sequence: Sequence, settings: ReconSettings, device: torch.device | 
     if settings.weights.depth > 0:
         closed_form = {i: on_device(closed_form_distance(prepared, i)) for i in prepared.complete_quartets}
     colour, colour_scale = _colour(prepared, settings)
-    steps = {1: prepared.forward_flow, -1: prepared.backward_flow}
+    steps = {1: prepared.flow.forward, -1: prepared.flow.backward}
     return Observations(
         sequence=prepared,
         quads=torch.tensor(prepared.quads, device=device),
@@ -185,10 +184,10 @@ def _colour(sequence: Sequence, settings: ReconSettings) -> tuple[dict[int, np.n
         if settings.weights.quads > 0:  # colour is an addition: a recording without it is compared without it
             return {}, None
         raise _nothing_to_compare(sequence, "no colour", "this preset compares colour images and nothing else")
-    largest = max(float(np.abs(image).max()) for image in sequence.colour.values())
+    largest = max(float(np.abs(image).max()) for image in sequence.colour.images.values())
     if not largest > 0:
         raise _nothing_to_compare(sequence, "colour is black", "all colour images are zero")
-    return {n: image / np.float32(largest) for n, image in sequence.colour.items()}, 1.0 / largest
+    return {n: image / np.float32(largest) for n, image in sequence.colour.images.items()}, 1.0 / largest
 
 
 def _nothing_to_compare(sequence: Sequence, what: str, why: str) -> InputError:
@@ -218,41 +217,40 @@ def reduced(sequence: Sequence, width_max: int | None) -> Sequence:
     return replace(
         sequence,
         quads=np.stack([shrink(quad) for quad in sequence.quads]),
-        fx=sequence.fx * sx,
-        fy=sequence.fy * sy,
-        cx=sequence.cx * sx,
-        cy=sequence.cy * sy,
-        forward_flow=shrink_flow(sequence.forward_flow),
-        backward_flow=shrink_flow(sequence.backward_flow),
+        intrinsics=sequence.intrinsics.scaled(sx, sy),
+        flow=Flow(forward=shrink_flow(sequence.flow.forward), backward=shrink_flow(sequence.flow.backward)),
     )
 
 
 def with_flow(sequence: Sequence, source: FlowSource) -> tuple[Sequence, str]:
     """The sequence with the optical flow that the settings ask for, and where it is from."""
-    given = bool(sequence.forward_flow or sequence.backward_flow)
+    given = bool(sequence.flow.forward or sequence.flow.backward)
     if source == FlowSource.NONE:
-        return replace(sequence, forward_flow={}, backward_flow={}), "none"
+        return replace(sequence, flow=Flow()), "none"
     if source == FlowSource.FILE or (source == FlowSource.AUTO and given):
         return sequence, "file" if given else "none"
     from ..data.flow import compute_flow
 
     flow = compute_flow(sequence, method="deepflow" if source == FlowSource.DEEPFLOW else "dis")
-    found = replace(sequence, forward_flow=flow.forward, backward_flow=flow.backward)
-    return found, "computed" if flow.forward else "none"
+    return replace(sequence, flow=flow), "computed" if flow.forward else "none"
 
 
 def data_hash(sequence: Sequence) -> str:
     """SHA-256 of everything a reconstruction reads from a sequence: frames, calibration, poses, flow and colour."""
     digest = hashlib.sha256()
-    for name in HASHED:
-        array = getattr(sequence, name)
+    arrays = {name: getattr(sequence, name) for name in HASHED}
+    for name, array in (arrays | {"colour_from_world": sequence.colour.camera_from_world}).items():
         if array is not None:
             digest.update(f"{name} {array.shape}".encode())
             digest.update(np.ascontiguousarray(array).tobytes())
-    digest.update(repr([getattr(sequence, name) for name in HASHED_NUMBERS]).encode())
-    if sequence.distortion is not None:
-        digest.update(repr(sequence.distortion).encode())
-    for name in ("forward_flow", "backward_flow", "colour"):
-        for frame, image in sorted(getattr(sequence, name).items()):
+    stated, tof, colour = sequence.calibration, sequence.intrinsics, sequence.colour.intrinsics
+    numbers: list = [stated.f_mod_hz, stated.phase_offset, stated.dc_offset, tof.fx, tof.fy, tof.cx, tof.cy]
+    numbers += [stated.quad_scale, colour and (colour.fx, colour.fy, colour.cx, colour.cy)]
+    digest.update(repr(numbers).encode())
+    if tof.distortion is not None:
+        digest.update(repr(tof.distortion).encode())
+    images = {"forward_flow": sequence.flow.forward, "backward_flow": sequence.flow.backward}
+    for name, by_frame in (images | {"colour": sequence.colour.images}).items():
+        for frame, image in sorted(by_frame.items()):
             digest.update(f"{name} {frame}".encode() + np.ascontiguousarray(image).tobytes())
     return digest.hexdigest()

@@ -14,6 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..constants import CANONICAL_SHIFTS, LOW_PASS
+from ..data.read import read
 from ..data.sequence import Sequence
 from ..errors import InputError
 from ..render.api import Rendering, rasterize
@@ -209,7 +210,7 @@ class Run:
                 fix="write the sequence with gftorf_warp.data.ftorf.write and reconstruct from the folder",
             )
         given = str(self.config.get("times") or "").startswith("setting")
-        return Sequence.open(source, frame_rate_hz=self.config["frame_rate_hz"] if given else None)
+        return read(source, frame_rate_hz=self.config["frame_rate_hz"] if given else None)
 
 
 def _camera(stored: dict) -> Camera:

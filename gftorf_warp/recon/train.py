@@ -18,8 +18,8 @@ from typing import TypeVar
 import torch
 
 from ..data.decode import unambiguous_range
-from ..data.estimates import dc_offset
-from ..data.findings import DC_TOLERANCE
+from ..data.estimates import DC_TOLERANCE, dc_offset
+from ..data.read import read, read_truth
 from ..data.sequence import Sequence, Truth
 from ..errors import DivergedError, InputError, UsageError
 from ..render.buffers import available_threads
@@ -94,7 +94,7 @@ def reconstruct(
     """
     begun = time.monotonic()
     if not isinstance(sequence, Sequence):
-        sequence = Sequence.open(sequence)
+        sequence = read(sequence)
     if isinstance(settings, str):
         found = input_of(sequence, _choice(Input, input, "--input"))
         recorded = presets.Recorded(input=found, unambiguous_range=unambiguous_range(sequence))
@@ -193,14 +193,14 @@ def _warn_of_constant_part(sequence: Sequence) -> None:
     if sequence.from_phasors or not sequence.complete_quartets:
         return
     found = dc_offset(sequence)
-    if abs(found - sequence.dc_offset) > DC_TOLERANCE:
+    if abs(found - sequence.calibration.dc_offset) > DC_TOLERANCE:
         text = "the quads hold a constant part of %.2f amplitudes, the calibration says %.2f: see `gftorf check`"
-        LOG.warning(text, found, sequence.dc_offset)
+        LOG.warning(text, found, sequence.calibration.dc_offset)
 
 
 def _warn_of_rows(sequence: Sequence) -> None:
     """A rolling shutter is fitted as a global one."""
-    delay = float(sequence.sensor.get("row_time_s", 0.0) or 0.0)
+    delay = float(sequence.calibration.settings.get("row_time_s", 0.0) or 0.0)
     if delay > 0:
         text = "a rolling shutter: the last row is %.3g ms later than the first, and fitted to its time all the same"
         LOG.warning(text, 1e3 * delay * (sequence.height - 1))
@@ -209,7 +209,7 @@ def _warn_of_rows(sequence: Sequence) -> None:
 def _truth(sequence: Sequence) -> Truth | None:
     """Ground truth for the diagnostics; None if there is none, or none that can be read, which stops no run."""
     try:
-        return sequence.truth()
+        return read_truth(sequence)
     except InputError as error:
         LOG.warning("diagnostics go without truth: %s: %s", error.where, error.what)
         return None

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ..data.cycles import phase_noise
 from ..data.decode import quartet_phasors, unambiguous_range
-from ..data.sequence import Sequence
+from ..data.sequence import Intrinsics, Sequence
 from .camera import Camera
 from .distortion import Distortion
 from .sensor import Sensor, phasor_from_quads
@@ -37,34 +37,36 @@ def sensor_of(sequence: Sequence) -> Sensor:
     return Sensor(
         f_mod_hz=sequence.frequencies[0],
         further_hz=sequence.frequencies[1:],
-        phase_offset=sequence.phase_offset,
-        dc_offset=sequence.dc_offset,
+        phase_offset=sequence.calibration.phase_offset,
+        dc_offset=sequence.calibration.dc_offset,
         frame_period_s=frame_period(sequence),
     )
 
 
 def camera_of(sequence: Sequence, frame: int) -> Camera:
     """The camera of raw frame ``frame``."""
-    return Camera(
-        width=sequence.width,
-        height=sequence.height,
-        fx=sequence.fx,
-        fy=sequence.fy,
-        cx=sequence.cx,
-        cy=sequence.cy,
-        camera_from_world=sequence.camera_from_world[frame],
-        distortion=Distortion.of(sequence.distortion),
-    )
+    return _camera(sequence.intrinsics, (sequence.height, sequence.width), sequence.camera_from_world[frame])
 
 
 def colour_camera_of(sequence: Sequence, frame: int) -> Camera | None:
     """The colour camera at raw frame ``frame``, at the size of the colour images; None if it is not known."""
-    if not sequence.colour or sequence.colour_intrinsics is None or sequence.colour_from_world is None:
+    colour = sequence.colour
+    if colour.size is None or colour.intrinsics is None or colour.camera_from_world is None:
         return None
-    height, width = next(iter(sequence.colour.values())).shape[:2]
-    fx, fy, cx, cy = sequence.colour_intrinsics
-    pose = sequence.colour_from_world[frame]
-    return Camera(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, camera_from_world=pose)
+    return _camera(colour.intrinsics, colour.size, colour.camera_from_world[frame])
+
+
+def _camera(intrinsics: Intrinsics, size: tuple[int, int], pose: np.ndarray) -> Camera:
+    return Camera(
+        width=size[1],
+        height=size[0],
+        fx=intrinsics.fx,
+        fy=intrinsics.fy,
+        cx=intrinsics.cx,
+        cy=intrinsics.cy,
+        camera_from_world=pose,
+        distortion=Distortion.of(intrinsics.distortion),
+    )
 
 
 def frame_period(sequence: Sequence) -> float:
@@ -98,7 +100,7 @@ def flow_at(sequence: Sequence, quartet: int, step: int, points: Float[Tensor, "
         step: 1 for the next quartet, -1 for the one before.
         points: Image positions (x, y) [px].
     """
-    same, other = (sequence.forward_flow, sequence.backward_flow)[:: 1 if step > 0 else -1]
+    same, other = (sequence.flow.forward, sequence.flow.backward)[:: 1 if step > 0 else -1]
     frame = sequence.cycle * quartet
     if frame in same:
         return sample(torch.tensor(same[frame]), points).T

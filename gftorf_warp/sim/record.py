@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 
 from ..constants import FRAMES_PER_QUARTET
-from ..data.sequence import Sequence, Truth
+from ..data.sequence import Calibration, ColourCamera, Flow, Intrinsics, Sequence, Truth
 from ..render.trace import Bounces
 from ..scene.camera import Camera
 from ..scene.optics import shading
@@ -77,21 +77,33 @@ def frame_times(sensor: Sensor, frames: int, *, sync: bool) -> Float[np.ndarray,
     return (frame - frame % len(sensor.cycle) if sync else frame) * sensor.frame_period_s
 
 
-def sequence_fields(sensor: Sensor, times: Float[np.ndarray, "F"], cameras: list[Camera]) -> dict[str, Any]:
-    """The fields of a sequence that follow from its sensor, its times [s] and its ToF camera at each of them."""
-    shots, camera = [sensor.at_frame(n) for n in range(len(times))], cameras[0]
+def sequence_fields(
+    sensor: Sensor, times: Float[np.ndarray, "F"], cameras: list[Camera], **settings: Any
+) -> dict[str, Any]:
+    """The fields of a sequence that follow from its sensor, its times [s] and its ToF camera at each of them.
+
+    ``settings`` are further settings of the sensor.
+    """
+    shots = [sensor.at_frame(n) for n in range(len(times))]
     return {
-        **{name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy")},
-        "distortion": astuple(camera.distortion) if camera.distortion else None,
+        "intrinsics": _intrinsics(cameras[0]),
+        "calibration": Calibration(
+            f_mod_hz=float(sensor.f_mod_hz),
+            phase_offset=float(sensor.phase_offset),
+            dc_offset=float(sensor.dc_offset),
+            cycle_length=None if len(sensor.cycle) == FRAMES_PER_QUARTET else len(sensor.cycle),
+            settings=settings,
+        ),
         "camera_from_world": np.stack([camera.camera_from_world for camera in cameras]),
         "shifts": np.array([shot.shifts[0] for shot in shots]),
         "times": times,
-        "f_mod_hz": float(sensor.f_mod_hz),
         "frequencies_hz": np.array([float(shot.f_mod_hz) for shot in shots]) if sensor.further_hz else None,
-        "cycle_length": None if len(sensor.cycle) == FRAMES_PER_QUARTET else len(sensor.cycle),
-        "phase_offset": float(sensor.phase_offset),
-        "dc_offset": float(sensor.dc_offset),
     }
+
+
+def _intrinsics(camera: Camera) -> Intrinsics:
+    lens = astuple(camera.distortion) if camera.distortion else None
+    return Intrinsics(fx=camera.fx, fy=camera.fy, cx=camera.cx, cy=camera.cy, distortion=lens)
 
 
 def record(
@@ -139,14 +151,13 @@ def record(
         sequence=Sequence(
             quads=images["quad"],
             measured=np.ones(len(times), dtype=bool),
-            **sequence_fields(sensor, times, cameras),
+            **sequence_fields(sensor, times, cameras, **sensor_settings(sensor)),
             novel_from_world=np.stack([inverse(view.world_from_body(0.0)) for view in scene.novel_views])
             if scene.novel_views
             else None,
-            **(_flows(scene, cameras, times) if settings.flow else {}),
+            flow=_flows(scene, cameras, times) if settings.flow else Flow(),
             exposures=np.full(len(times), sensor.exposure_s),
-            sensor=sensor_settings(sensor),
-            **_colour(scene, settings, times, cached),
+            colour=_colour(scene, settings, times, cached),
         ),
         truth=Truth(
             distance=distances.astype(np.float32),
@@ -287,10 +298,10 @@ def _gap(
     return Gap(mean=float(difference.mean()), max=float(difference.max()), pixels=pixels)
 
 
-def _colour(scene: Scene, settings: SimSettings, times: Float[np.ndarray, "F"], cached: Cached) -> dict[str, Any]:
-    """The fields of a sequence that a colour camera fills: an image at every quartet start, and its poses."""
+def _colour(scene: Scene, settings: SimSettings, times: Float[np.ndarray, "F"], cached: Cached) -> ColourCamera:
+    """The colour camera: an image at every quartet start, and its poses."""
     if scene.colour is None:
-        return {}
+        return ColourCamera()
     noise = scene.colour.noise
     camera_at = partial(scene.colour_camera, settings.size)
     cameras = [camera_at(float(time)) for time in times]
@@ -307,26 +318,25 @@ def _colour(scene: Scene, settings: SimSettings, times: Float[np.ndarray, "F"], 
         return {"colour": image.astype(np.float32)}
 
     starts = range(0, len(times), len(scene.sensor.cycle))
-    first = cameras[0]
-    return {
-        "colour": {n: cached(f"colour-{n:06d}", partial(expose, n))[0]["colour"] for n in starts},
-        "colour_intrinsics": (first.fx, first.fy, first.cx, first.cy),
-        "colour_from_world": np.stack([camera.camera_from_world for camera in cameras]),
-    }
+    return ColourCamera(
+        images={n: cached(f"colour-{n:06d}", partial(expose, n))[0]["colour"] for n in starts},
+        intrinsics=_intrinsics(cameras[0]),
+        camera_from_world=np.stack([camera.camera_from_world for camera in cameras]),
+    )
 
 
-def _flows(scene: Scene, cameras: list[Camera], times: Float[np.ndarray, "F"]) -> dict[str, Any]:
+def _flows(scene: Scene, cameras: list[Camera], times: Float[np.ndarray, "F"]) -> Flow:
     """Exact optical flow at quartet starts, from n to n + K and to n - K, whether or not the target is occluded.
 
     It is what an estimate from images would give: motion of the scene and of the camera together.
     """
     cycle = len(scene.sensor.cycle)
-    flows: dict[str, Any] = {"forward_flow": {}, "backward_flow": {}}
+    flows = Flow()
     for n in range(0, len(times), cycle):
         hit = first_hit(scene.bodies, cameras[n], float(times[n]))
-        for name, m in (("forward_flow", n + cycle), ("backward_flow", n - cycle)):
+        for images, m in ((flows.forward, n + cycle), (flows.backward, n - cycle)):
             if 0 <= m < len(times):
                 pair, instants = (cameras[n], cameras[m]), (float(times[n]), float(times[m]))
                 flow = flow_of(scene.bodies, hit.point, hit.body, pair, instants)
-                flows[name][n] = flow.astype(np.float32)
+                images[n] = flow.astype(np.float32)
     return flows

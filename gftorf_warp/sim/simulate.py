@@ -11,7 +11,7 @@ from typing import Any
 from ..data import capture_write, ftorf_write, torf_write
 from ..data.contact_sheet import contact_sheet
 from ..data.files import atomic_write
-from ..data.sequence import Sequence
+from ..data.read import read, read_truth
 from ..errors import UsageError
 from .card import outcome_card, settings_card
 from .checks import check_clearance, check_engine, check_format
@@ -103,8 +103,8 @@ def simulate_ladder(
     for name in NAMES:
         at_level = replace(settings, level=name)
         path = simulate(scene, out / name, at_level, device=device, fresh=fresh, progress=progress)
-        sequence = Sequence.open(path)
-        rows[name] = closed_form_errors(sequence, sequence.truth())
+        sequence = read(path)
+        rows[name] = closed_form_errors(sequence, read_truth(sequence))
     title = scene if isinstance(scene, str) else scene.name
     lines = "\n".join(f"    {line}" for line in ladder_table(rows))
     atomic_write(out / "ladder.md", f"# {title}: what each level of the ladder costs\n\n{lines}\n".encode())
