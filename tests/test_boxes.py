@@ -8,9 +8,9 @@ import torch
 from test_captured_steps import begun, published
 
 from gftorf_warp.recon.captured import CapturedSteps
-from gftorf_warp.recon.reserve import ASK_EVERY
 from gftorf_warp.recon.settings import Batch
 from gftorf_warp.render.bridge import SLOTS
+from gftorf_warp.render.pair_capacity import READ_EVERY
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA"))]
 INTEGERS = [0, -1, 2**31 - 1, -(2**31), 7]
@@ -102,7 +102,7 @@ def test_who_asks_too_often_is_not_heard(device):
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("deterministic", [False, True])
 def test_steps_ask_for_pairs_now_and_then(deterministic, device, monkeypatch):
-    """In every ``ASK_EVERY``-th replay; the same numbers at the same steps where a run is to be repeated."""
+    """In every ``READ_EVERY``-th replay; the same numbers at the same steps where a run is to be repeated."""
     settings = published(batch=Batch.FRAME)
     settings = replace(settings, render=replace(settings.render, deterministic=deterministic))
     state, observations = begun(settings, device)
@@ -120,7 +120,7 @@ def test_steps_ask_for_pairs_now_and_then(deterministic, device, monkeypatch):
     monkeypatch.setattr(Inbox, "look", kept)
     while state.images < 40:
         steps.step()
-    assert asked == list(range(ASK_EVERY, steps._replays + 1, ASK_EVERY))
+    assert asked == list(range(READ_EVERY, steps._replays + 1, READ_EVERY))
     assert len(asked) >= 2
     if deterministic or device == "cpu":
         assert [*told] == asked, "nobody is told later"
@@ -133,6 +133,6 @@ def test_room_is_made_as_soon_as_an_answer_asks_for_it(monkeypatch):
     steps, looked = CapturedSteps(*begun(settings), settings), []
     monkeypatch.setattr(steps._reserve, "is_nearly_full", lambda _: True)
     monkeypatch.setattr(steps, "_look", lambda: looked.append(steps._replays))
-    for _ in range(3 * ASK_EVERY):
+    for _ in range(3 * READ_EVERY):
         steps._watch()
-    assert looked == [ASK_EVERY, 2 * ASK_EVERY, 3 * ASK_EVERY]
+    assert looked == [READ_EVERY, 2 * READ_EVERY, 3 * READ_EVERY]

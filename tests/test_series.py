@@ -87,7 +87,7 @@ def test_images_that_overflowed_are_rendered_again(run, ahead, where, monkeypatc
         return replaying.replace(target, frame=frame)
 
     def grow(self):
-        spoilt_below[0] = int(replaying.ROOM * self.largest) + 1
+        spoilt_below[0] = int(1.5 * self.largest) + 1
 
     spoilt_below = [20]
     monkeypatch.setattr(replaying.Replay, "draw", draw)
@@ -168,7 +168,7 @@ def test_a_reserve_that_is_too_small_on_a_gpu(run):  # noqa: F811
     for way in ("host", "device"):
         render = run.renderer(PLAIN)
         render(*VIEWS[0])
-        render._capacity = 10
+        render._capacity.pairs = 10
         render._views.clear()
         render._targets.clear()
         one = Series(render, VIEWS)

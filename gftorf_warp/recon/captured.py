@@ -21,6 +21,7 @@ from ..render.api import Rendering
 from ..render.bridge import pairs_of
 from ..render.buffers import RenderSettings, Workspace
 from ..render.cuda import CapturedGraph, DeviceReadback, DeviceUpload, SideStreams, graph_pool
+from ..render.pair_capacity import READ_EVERY, PairCapacity
 from ..scene.motion import Still
 from ..scene.network import Network
 from . import densify
@@ -28,7 +29,6 @@ from .objective import image_loss, render_settings_at, rendering_of, weights_at
 from .observations import Observations
 from .optimiser import EPSILON, frozen, rates_at
 from .padded import Padded
-from .reserve import ASK_EVERY, Reserve
 from .settings import Kernels, ReconSettings
 from .state import State
 from .step import SEED_MASK, Map, Singles, densify_after, draw
@@ -93,7 +93,7 @@ class CapturedSteps:
         self._part: tuple | None = None  # of the run: what graphs that are kept have in common
         self._steps = 0  # since rooms were last looked at
         self._pool = graph_pool(device)
-        self._reserve = Reserve()
+        self._reserve = PairCapacity()
         self._reserves = device.type != "cpu"  # a CPU counts pairs first: nobody waits for anybody there
         longest = max(len(batch) for batch in observations.batches)
         self._graphs_wanted = graphs
@@ -130,7 +130,7 @@ class CapturedSteps:
         if run is None:  # the first one is done without a graph: libraries wake up, sizes become known
             table = self.padded.table()
             self._body(variant, table, table.send)
-            if self._reserve.capacity is None:
+            if self._reserve.pairs is None:
                 self._look()
             self._graphs[variant] = self._captured(variant, table)
         else:
@@ -201,14 +201,14 @@ class CapturedSteps:
             LOG.warning(text, failed, self.state.images, overfull)
         counts[0] = 0
         counts[2:] = 0
-        if self._reserve.learn(pairs, scarce=pairs > 0 and not self._workspaces[0].last.marks):
+        if self._reserve.learn(pairs, is_sorted=pairs > 0 and not self._workspaces[0].last.marks):
             self._forget()
         return 0 if overfull else in_a_row
 
     def _watch(self) -> None:
         """Make room for pairs before they need it: numbers of a few steps ago say so, and nobody waits for them."""
         self._replays += 1
-        if self._replays % ASK_EVERY == 0:
+        if self._replays % READ_EVERY == 0:
             self._inbox.request()
         seen = self._inbox.latest(wait=self.settings.render.deterministic)  # when they arrive depends on the machine
         if seen is not None and self._reserve.is_nearly_full(seen[2]):
@@ -265,7 +265,7 @@ class CapturedSteps:
             asked = motion.follows_means and not variant.rests
             attachment = motion.attach(field) if asked else padded.attachment
             offsets = motion.at_keys(attachment, numbers[: 3 if variant.flow else 2]).offset
-        render = replace(self.settings.render, sh_degree=variant.sh_degree, pair_capacity=self._reserve.capacity)
+        render = replace(self.settings.render, sh_degree=variant.sh_degree, pair_capacity=self._reserve.pairs)
         for name in descent.FOUND_NAMES:  # here, not on a branch, of which no other knows how far it is
             self._one_times(getattr(variant.weights, name, 1.0))
         images = []
@@ -373,7 +373,7 @@ class CapturedSteps:
         weights |= {name: float(getattr(variant.weights, name)) for name in terms}
         self._summed |= terms | {"quad_mse", "opacity", "loss", "count"}
         used = self._workspaces[: len(variant.shifts)]
-        capacity = (-1 if self._reserve.capacity is None else self._reserve.capacity) if self._reserves else 0
+        capacity = (-1 if self._reserve.pairs is None else self._reserve.pairs) if self._reserves else 0
         descent.descend(
             table,
             self._values[: len(self._groups)],

@@ -30,8 +30,8 @@ from .buffers import Frame, RenderSettings
 from .cuda import stream_of, without_garbage_collection
 from .inputs import CHOICES, Images, View, names_of, shapes_of, wanted_images
 from .moved import MovedGaussians, footprint_row
+from .pair_capacity import PairCapacity
 
-ROOM = 1.5  # pairs that are reserved, over the most that were needed so far
 CAMERAS_MAX = 16  # that are kept, with their graphs
 Memory = TypeVar("Memory", Tensor, np.ndarray)
 
@@ -107,7 +107,7 @@ class Replay:
         self._views: dict[tuple, _View] = {}
         self._targets: dict[tuple[int, int], Target] = {}
         self._largest = wp.zeros(1, dtype=wp.int32, device=self.device)
-        self._capacity: int | None = None  # of pairs; None: they are counted on the host, and on a CPU they always are
+        self._capacity = PairCapacity()  # on a CPU pairs are always counted first
 
     def __call__(self, time: float, camera: Camera, *, checked: bool = True) -> Rendering:
         """The images at one instant, in memory that the next call overwrites.
@@ -131,13 +131,15 @@ class Replay:
 
     def fits(self) -> bool:
         """Whether the reserve of pairs sufficed since it was made; waits for the device."""
-        return self._capacity is None or self.largest <= self._capacity
+        return self._capacity.pairs is None or self._capacity.fits(self.largest)
 
     def grow(self) -> None:
-        """Reserve more than the largest number of pairs so far; graphs are captured anew."""
+        """Adapt the pair capacity to the largest number of pairs so far; graphs are captured anew."""
+        if self.graphs:
+            is_sorted = not all(target.frame.marks for target in self._targets.values())
+            self._capacity.learn(self.largest, is_sorted=is_sorted)
         self._views.clear()
         self._targets.clear()
-        self._capacity = int(ROOM * self.largest) + 1 if self.graphs else None
 
     @property
     def largest(self) -> int:
@@ -149,7 +151,7 @@ class Replay:
     def draw(self, time: float, camera: Camera) -> Target:
         """The images at one instant, without a look at whether their pairs fitted; the next one overwrites them."""
         seen = self._view(camera)
-        if self.graphs and self._capacity is not None and seen.used and seen.graph is None:
+        if self.graphs and self._capacity.pairs is not None and seen.used and seen.graph is None:
             seen.graph = self._captured(seen)
         self._gaussians.move(time, seen.footprint)
         with stream_of(self._like):
@@ -158,7 +160,7 @@ class Replay:
             else:
                 self._launch(seen.graph)
         seen.used += 1
-        if self.graphs and self._capacity is None:
+        if self.graphs and self._capacity.pairs is None:
             self.grow()
         if "colour" in seen.target.tensors:
             seen.target.tensors["colour"].div_(self.colour_scale)
@@ -209,7 +211,7 @@ class Replay:
             length += -(-math.prod(shapes[name]) // ALIGNED) * ALIGNED
         packed = self._like.new_zeros(length + ALIGNED)
         tensors = {name: part(packed, *place) for name, place in places.items()}
-        settings = replace(self.settings, pair_capacity=self._capacity)
+        settings = replace(self.settings, pair_capacity=self._capacity.pairs)
         with stream_of(self._like):
             frame = Frame(self.count, width, height, settings, self.device)
         images = Images(**dict.fromkeys(names_of(Images)) | {name: array_over(tensors[name]) for name in tensors})
