@@ -26,7 +26,7 @@ from pathlib import Path
 
 PHASES = {  # functions that begin a phase, by module; those of one name are one phase
     "cli": {"start": "start of torch and Warp"},
-    "data.sequence": {"Sequence.open": "read", "Sequence.truth": "read truth"},
+    "data.read": {"read": "read", "read_truth": "read truth"},
     "data.flow": {"compute_flow": "optical flow"},
     "data.check": {"check": "check"},
     "recon.observations": {"data_hash": "hash"},

@@ -66,10 +66,6 @@ KNOWS_STREAMS = {  # streams, events and graphs of torch
     "scene/perceptron.py": "products of one gradient that run at the same time",
 }
 KNOWS_KINDS = {"render/buffers.py": "the shape of a tile depends on the kind of device, which is the input's"}
-KNOWN_CIRCLES = [  # import circles that are still to be undone; the list only becomes shorter
-    {"evaluate.processes", "evaluate.writers"},
-    {"recon.closed_form", "recon.run"},
-]
 MAX_CLASS_LINES, MAX_ATTRIBUTES = 150, 15
 LARGE_CLASSES = {  # file:class: why it may be larger
     "kernels/geometry.py:CameraView": "a camera as kernels read it: one number a field",
@@ -261,10 +257,7 @@ def test_circles_are_found():
 def test_no_module_imports_itself_by_a_detour():
     """No circle of imports, be they at the top of a file, inside a function or for the type checker alone."""
     found = circles(import_graph(imports))
-    new = {circle for circle in found if not any(set(circle) <= known for known in KNOWN_CIRCLES)}
-    assert not new, f"import circles: {new}"
-    gone = [sorted(known) for known in KNOWN_CIRCLES if not any(set(circle) <= known for circle in found)]
-    assert not gone, f"these circles are no more; take them from KNOWN_CIRCLES: {gone}"
+    assert not found, f"import circles: {found}"
 
 
 def attributes(node):

@@ -272,7 +272,7 @@ def test_the_cost_of_a_picture_does_not_grow_with_those_before_it(analytic, tmp_
     scales = {name: previews.preview_scale(name, [images[name]]) for name in WHAT}
     views_taken = [(time, analytic.camera) for time in times]
     writers.write_all(tmp_path, scales, views.series_of(render, views_taken, analytic.sensor, WHAT), FRAMES)
-    assert sorted(listed) == sorted(flushed) == sorted(WHAT)
+    assert sorted(name for name in listed if name in WHAT) == sorted(flushed) == sorted(WHAT)
     assert len(list((tmp_path / "distance").iterdir())) == 2 * FRAMES
     left = [path.name for path in (tmp_path / "quads").iterdir() if path.name.startswith(".")]
     assert left == [f".000002.exr.tmp-{os.getpid()}-999999"]

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from ..data.images import indexed_png_bytes, png_bytes
+from ..data.files import write_one_of_many
+from ..data.images import indexed_png_bytes, png_bytes, write_exr
 from . import pictures
 
 Channels = dict[str, Float[np.ndarray, "H W"]]
@@ -46,6 +47,17 @@ def preview(name: str, images: Channels, scale: pictures.Scale) -> bytes:
 def paths(out: Path, name: str, index: int) -> tuple[Path, Path]:
     """Where the EXR and the PNG of one thing at the index-th time belong."""
     return out / name / f"{index:06d}.exr", out / name / f"{index:06d}.png"
+
+
+def write_images(out: Path, scales: Mapping[str, pictures.Scale], index: int, images: Mapping[str, Channels]) -> None:
+    """Write what was rendered at the index-th time: for each thing one EXR and one PNG, each of them atomically.
+
+    What looks after their folders is :func:`many_files`.
+    """
+    for name, channels in images.items():
+        exr, png = paths(out, name, index)
+        write_exr(exr, channels, one_of=True)
+        write_one_of_many(png, preview(name, channels, scales[name]))
 
 
 def srgb(linear: Float[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:

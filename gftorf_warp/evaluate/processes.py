@@ -22,7 +22,7 @@ from jaxtyping import Float
 
 from ..errors import ResourceError
 from .pictures import Scale
-from .previews import Channels
+from .previews import Channels, write_images
 
 MANY = 300  # images from which on it pays: processes start in half a second of a CPU each
 CPUS = 4  # with no more of them threads write nearly as fast
@@ -184,8 +184,6 @@ def _mapped(file: int, shape: tuple[int, ...]) -> Float[np.ndarray, "M B C H W"]
 
 def work() -> None:
     """What a process does: write the images of each message, then say so, until nobody listens."""
-    from .writers import write_images
-
     connection, file = Connection(int(sys.argv[1])), int(sys.argv[2])
     with suppress(EOFError, BrokenPipeError, ConnectionResetError):
         out, scales, names, shape = connection.recv()

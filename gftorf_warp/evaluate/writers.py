@@ -12,11 +12,10 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
 
-from ..data.files import many_files, write_one_of_many
-from ..data.images import write_exr
-from . import previews, processes
+from ..data.files import many_files
+from . import processes
 from .pictures import Scale
-from .previews import Channels
+from .previews import Channels, write_images
 
 THREADS = 4  # they wait for the disk in turns; with more, for Python's lock, which OpenEXR holds
 QUEUED = 2  # images that wait for each thread, at most: what memory holds
@@ -83,14 +82,3 @@ def _write_by_threads(
             del images  # the memory of what is written is used again
             collect(QUEUED * THREADS)
         collect(0)
-
-
-def write_images(out: Path, scales: Mapping[str, Scale], index: int, images: Mapping[str, Channels]) -> None:
-    """Write what was rendered at the index-th time: for each thing one EXR and one PNG, each of them atomically.
-
-    What looks after their folders is :func:`many_files`.
-    """
-    for name, channels in images.items():
-        exr, png = previews.paths(out, name, index)
-        write_exr(exr, channels, one_of=True)
-        write_one_of_many(png, previews.preview(name, channels, scales[name]))

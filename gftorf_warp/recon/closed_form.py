@@ -6,12 +6,9 @@ Nothing was fitted, so there is one distance per quartet and one place to look f
 
 from __future__ import annotations
 
-import functools
 import math
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -24,133 +21,89 @@ from ..errors import InputError, UsageError
 from ..render.api import Rendering
 from ..scene.camera import Camera
 from ..scene.gaussians import GaussianField, constant_sh
-from ..scene.motion import Still
-from ..scene.sensor import Sensor, channel_of
-from .run import Run
+from ..scene.sensor import channel_of
 
 POSE_TOLERANCE = 1e-6  # [m], [1] poses are stored as float32 at worst
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class ClosedForm(Run):
-    """A run without Gaussians, which renders its own measurements."""
+def rendering_of(
+    sequence: Sequence,
+    time: float,
+    shifts: Iterable[float],
+    *,
+    f_mod_hz: float | None,
+    extra_channels: int | None,
+    device: torch.device,
+) -> Rendering:
+    """The measured quartet nearest to a time [s] as a rendering, see :meth:`ClosedForm.render`."""
+    quartet = nearest_quartet(sequence, time)
+    decoded = decode_quartet(sequence, quartet)
+    which = 0 if f_mod_hz is None else sequence.frequencies.index(f_mod_hz)
+    re, im = decoded.phasors[which]
+    size = (sequence.height, sequence.width)
 
-    @classmethod
-    def of(cls, path: Path, config: dict[str, Any], camera: Camera, sensor: Sensor, device: torch.device | str):
-        """The closed form of the sequence that a config names.
+    def tensor(image: np.ndarray) -> Tensor:
+        return torch.tensor(image, dtype=torch.float32, device=device)
 
-        Args:
-            path: The folder of the run.
-            config: Content of its ``config.json``.
-            camera: The camera of raw frame 0.
-            sensor: The sensor, with the four canonical shifts.
-            device: Where images are wanted.
-        """
-        none = torch.zeros(0, device=device)
-        triple = none.reshape(0, 3)
-        field = GaussianField(
-            mean=triple,
-            log_scale=triple,
-            quaternion=none.reshape(0, 4),
-            opacity_logit=none,
-            reflectivity_sh=constant_sh(none),
-        )
-        motion = Still(torch.tensor([0.0, 1.0])).to(device)
-        attachment = motion.attach(field)
-        return cls(
-            path=path,
-            config=config,
-            camera=camera,
-            sensor=sensor,
-            quad_scale=1.0,
-            field=field,
-            motion=motion,
-            attachment=attachment,
-        )
+    return Rendering(
+        quads=tensor(quads_of(sequence, quartet, shifts, which)),
+        phasor=tensor(np.stack([re, im, np.hypot(re, im)])),
+        colour=None,
+        distance=tensor(decoded.distance),
+        opacity=tensor(np.ones(size)),
+        distortion=tensor(np.zeros(size)),
+        extra=None if extra_channels is None else tensor(np.zeros((extra_channels, *size))),
+        screen=None,
+    )
 
-    def render(
-        self,
-        time: float,
-        camera: Camera | None = None,
-        *,
-        extra: Float[Tensor, "0 D"] | None = None,
-        f_mod_hz: float | None = None,
-    ) -> Rendering:
-        """The measured quartet nearest to a time, as if it had been taken at that instant.
 
-        Quads are the measured ones in canonical order, computed from the phasor where the sensor has another shift; the
-        distance is what all frequencies together decode to, and nothing is transparent. There is no colour and no
-        distortion, and extra channels are zero.
+def check_camera(sequence: Sequence, time: float, camera: Camera, own: Camera, where: Path) -> None:
+    """Refuse every camera but the sequence's own.
 
-        Args:
-            time: Seconds since raw frame 0, any number; during a quartet its own, else the nearest complete one.
-            camera: None, or the sequence's own at the time.
-            extra: Channels per Gaussian, of which there are none.
-            f_mod_hz: Modulation frequency of quads and phasor [Hz]; None: the first of the sensor.
-
-        Raises:
-            InputError: If the sequence cannot be read again, or none of its quartets is complete.
-            UsageError: If it is asked for from another camera.
-        """
-        sequence = self._measured
-        quartet = nearest_quartet(sequence, time)
-        self._check(camera, sequence, quartet, time)
-        decoded = decode_quartet(sequence, quartet)
-        which = 0 if f_mod_hz is None else sequence.frequencies.index(f_mod_hz)
-        re, im = decoded.phasors[which]
-        size = (sequence.height, sequence.width)
-
-        def tensor(image: np.ndarray) -> Tensor:
-            return torch.tensor(image, dtype=torch.float32, device=self.field.device)
-
-        return Rendering(
-            quads=tensor(quads_of(sequence, quartet, self.sensor.shifts, which)),
-            phasor=tensor(np.stack([re, im, np.hypot(re, im)])),
-            colour=None,
-            distance=tensor(decoded.distance),
-            opacity=tensor(np.ones(size)),
-            distortion=tensor(np.zeros(size)),
-            extra=None if extra is None else tensor(np.zeros((extra.shape[1], *size))),
-            screen=None,
+    Raises:
+        UsageError: If ``camera`` has other intrinsics than ``own``, or a pose far from those of the quartet.
+    """
+    frames = [*range(sequence.frames)[sequence.quartet_frames(nearest_quartet(sequence, time))]]
+    frames.append(int(np.abs(sequence.times - time).argmin()))
+    apart = np.abs(sequence.camera_from_world[frames] - camera.camera_from_world).max(axis=(1, 2)).min()
+    names = ("width", "height", "fx", "fy", "cx", "cy")
+    differ = [name for name in names if not math.isclose(getattr(camera, name), getattr(own, name))]
+    if apart > POSE_TOLERANCE or differ:
+        raise UsageError(
+            "a closed form has one view",
+            where=where,
+            why="asked for another " + (", ".join(differ) or f"pose, {apart:.3g} away from that of the quartet"),
+            fix="render other views from a run of Gaussians, for example --preset demo",
         )
 
-    def renderer(
-        self,
-        images: Iterable[str] = (),  # noqa: ARG002
-        *,
-        f_mod_hz: float | None = None,
-    ) -> Callable[[float, Camera], Rendering]:
-        """:meth:`render`: there is nothing that images share."""
-        return functools.partial(self.render, f_mod_hz=f_mod_hz)
 
-    def _check(self, camera: Camera | None, sequence: Sequence, quartet: int, time: float) -> None:
-        """Refuse every camera but the sequence's own."""
-        if camera is None:
-            return
-        frames = [*range(sequence.cycle * quartet, sequence.cycle * (quartet + 1))]
-        frames.append(int(np.abs(sequence.times - time).argmin()))
-        apart = np.abs(sequence.camera_from_world[frames] - camera.camera_from_world).max(axis=(1, 2)).min()
-        names = ("width", "height", "fx", "fy", "cx", "cy")
-        differ = [name for name in names if not math.isclose(getattr(camera, name), getattr(self.camera, name))]
-        if apart > POSE_TOLERANCE or differ:
-            raise UsageError(
-                "a closed form has one view",
-                where=self.path,
-                why="asked for another " + (", ".join(differ) or f"pose, {apart:.3g} away from that of the quartet"),
-                fix="render other views from a run of Gaussians, for example --preset demo",
-            )
+def checked(sequence: Sequence) -> Sequence:
+    """The sequence, which must have a complete quartet.
 
-    @functools.cached_property
-    def _measured(self) -> Sequence:
-        sequence = self.sequence()
-        if not sequence.complete_quartets:
-            raise InputError(
-                "no complete quartet",
-                where=sequence.path or "sequence",
-                why="a closed form needs all raw frames of a cycle in a row",
-                fix="check the sequence with `gftorf check`, or record longer",
-            )
-        return sequence
+    Raises:
+        InputError: If it has none.
+    """
+    if not sequence.complete_quartets:
+        raise InputError(
+            "no complete quartet",
+            where=sequence.path or "sequence",
+            why="a closed form needs all raw frames of a cycle in a row",
+            fix="check the sequence with `gftorf check`, or record longer",
+        )
+    return sequence
+
+
+def no_gaussians(device: torch.device | str) -> GaussianField:
+    """A field of N = 0 Gaussians."""
+    none = torch.zeros(0, device=device)
+    triple = none.reshape(0, 3)
+    return GaussianField(
+        mean=triple,
+        log_scale=triple,
+        quaternion=none.reshape(0, 4),
+        opacity_logit=none,
+        reflectivity_sh=constant_sh(none),
+    )
 
 
 def nearest_quartet(sequence: Sequence, time: float) -> int:

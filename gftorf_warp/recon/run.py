@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
@@ -25,9 +26,9 @@ from ..render.series import on_host
 from ..scene.camera import Camera
 from ..scene.distortion import Distortion as Lens
 from ..scene.gaussians import GaussianField
-from ..scene.motion import Motion
+from ..scene.motion import Motion, Still
 from ..scene.sensor import Sensor
-from . import checkpoint
+from . import checkpoint, closed_form
 from .folder import read_config
 from .settings import Method
 from .state import field_and_motion
@@ -68,8 +69,6 @@ class Run:
         further = tuple(stored.get("further_hz", ()))
         sensor = Sensor(**stored | {"further_hz": further}, shifts=CANONICAL_SHIFTS)
         if config["settings"].get("method") == Method.CTOF:
-            from .closed_form import ClosedForm
-
             return ClosedForm.of(path, config, camera, sensor, device)
         stored = checkpoint.last(path, device)
         if stored is None:
@@ -211,6 +210,82 @@ class Run:
             )
         given = str(self.config.get("times") or "").startswith("setting")
         return read(source, frame_rate_hz=self.config["frame_rate_hz"] if given else None)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ClosedForm(Run):
+    """A run without Gaussians, which renders its own measurements."""
+
+    @classmethod
+    def of(cls, path: Path, config: dict, camera: Camera, sensor: Sensor, device: torch.device | str) -> ClosedForm:
+        """The closed form of the sequence that a config names.
+
+        Args:
+            path: The folder of the run.
+            config: Content of its ``config.json``.
+            camera: The camera of raw frame 0.
+            sensor: The sensor, with the four canonical shifts.
+            device: Where images are wanted.
+        """
+        field, motion = closed_form.no_gaussians(device), Still(torch.tensor([0.0, 1.0])).to(device)
+        return cls(
+            path=path,
+            config=config,
+            camera=camera,
+            sensor=sensor,
+            quad_scale=1.0,
+            field=field,
+            motion=motion,
+            attachment=motion.attach(field),
+        )
+
+    def render(
+        self,
+        time: float,
+        camera: Camera | None = None,
+        *,
+        extra: Float[Tensor, "0 D"] | None = None,
+        f_mod_hz: float | None = None,
+    ) -> Rendering:
+        """The measured quartet nearest to a time, as if it had been taken at that instant.
+
+        Quads are the measured ones in canonical order, computed from the phasor where the sensor has another shift; the
+        distance is what all frequencies together decode to, and nothing is transparent. There is no colour and no
+        distortion, and extra channels are zero.
+
+        Args:
+            time: Seconds since raw frame 0, any number; during a quartet its own, else the nearest complete one.
+            camera: None, or the sequence's own at the time.
+            extra: Channels per Gaussian, of which there are none.
+            f_mod_hz: Modulation frequency of quads and phasor [Hz]; None: the first of the sensor.
+
+        Raises:
+            InputError: If the sequence cannot be read again, or none of its quartets is complete.
+            UsageError: If it is asked for from another camera.
+        """
+        if camera is not None:
+            closed_form.check_camera(self._measured, time, camera, self.camera, self.path)
+        return closed_form.rendering_of(
+            self._measured,
+            time,
+            self.sensor.shifts,
+            f_mod_hz=f_mod_hz,
+            extra_channels=None if extra is None else extra.shape[1],
+            device=self.field.device,
+        )
+
+    def renderer(
+        self,
+        images: Iterable[str] = (),  # noqa: ARG002
+        *,
+        f_mod_hz: float | None = None,
+    ) -> Callable[[float, Camera], Rendering]:
+        """:meth:`render`: there is nothing that images share."""
+        return functools.partial(self.render, f_mod_hz=f_mod_hz)
+
+    @functools.cached_property
+    def _measured(self) -> Sequence:
+        return closed_form.checked(self.sequence())
 
 
 def _camera(stored: dict) -> Camera:
