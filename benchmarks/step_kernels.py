@@ -24,7 +24,7 @@ from gftorf_warp.recon.objective import image_loss
 from gftorf_warp.recon.optimiser import BETAS, EPSILON
 from gftorf_warp.render import descent, fused, training
 from gftorf_warp.render.bridge import array_over
-from gftorf_warp.render.cuda import stream_of
+from gftorf_warp.render.cuda import capture, stream_of
 
 IMAGES = {"1 x 120 x 160": (1, 120, 160), "1 x 240 x 320": (1, 240, 320), "4 x 240 x 320": (4, 240, 320)}
 NETWORK = [(256, 84), *[(256, 256)] * 4, (256, 340), *[(256, 256)] * 2, (3, 256), *[(256,)] * 8, (3,)]

@@ -9,7 +9,7 @@ from test_captured_steps import begun, published
 
 from gftorf_warp.recon.captured import CapturedSteps
 from gftorf_warp.recon.settings import Batch
-from gftorf_warp.render.bridge import SLOTS
+from gftorf_warp.render.cuda import SLOTS, DeviceReadback, DeviceUpload
 from gftorf_warp.render.pair_capacity import READ_EVERY
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA"))]
@@ -19,8 +19,8 @@ REALS = [0.1, -0.0, 1e-45, math.inf, -math.inf, math.nan, 3e38]
 
 def outbox(device):
     """Room for both kinds of numbers, integers first."""
-    made = Outbox([(len(INTEGERS), torch.int32), (len(REALS), torch.float32)], torch.device(device))
-    return made, *(part.there for part in made.parts)
+    made = DeviceUpload([(len(INTEGERS), torch.int32), (len(REALS), torch.float32)], torch.device(device))
+    return made, *made.parts
 
 
 def bits(tensor):
@@ -73,30 +73,30 @@ def test_every_step_reads_its_own_numbers(device):
 def test_an_answer_is_that_of_the_question_and_told_once(device):
     """Not of what came later; the newest where several have arrived; nothing where nobody asked."""
     there = torch.tensor([1, 2], dtype=torch.int32, device=device)
-    inbox = Inbox(there)
-    assert inbox.look(wait=True) is None
-    inbox.ask()
+    readback = DeviceReadback(there)
+    assert readback.latest(wait=True) is None
+    readback.request()
     there += 10
-    assert inbox.look(wait=True) == [1, 2]
-    assert inbox.look(wait=True) is None
+    assert readback.latest(wait=True) == [1, 2]
+    assert readback.latest(wait=True) is None
     for _ in range(3):
-        inbox.ask()
+        readback.request()
         there += 10
-    assert inbox.look(wait=True) == [31, 32]
-    assert inbox.look() is None
+    assert readback.latest(wait=True) == [31, 32]
+    assert readback.latest() is None
 
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_who_asks_too_often_is_not_heard(device):
     """As many answers as slots may be on their way; afterwards one may ask again."""
     there = torch.zeros(1, dtype=torch.int32, device=device)
-    inbox = Inbox(there)
+    readback = DeviceReadback(there)
     for _ in range(SLOTS + 3):
-        inbox.ask()
+        readback.request()
         there += 1
-    assert inbox.look(wait=True) == [SLOTS - 1]
-    inbox.ask()
-    assert inbox.look(wait=True) == [SLOTS + 3]
+    assert readback.latest(wait=True) == [SLOTS - 1]
+    readback.request()
+    assert readback.latest(wait=True) == [SLOTS + 3]
 
 
 @pytest.mark.parametrize("device", DEVICES)
@@ -107,7 +107,7 @@ def test_steps_ask_for_pairs_now_and_then(deterministic, device, monkeypatch):
     settings = replace(settings, render=replace(settings.render, deterministic=deterministic))
     state, observations = begun(settings, device)
     steps = CapturedSteps(state, observations, settings)
-    asked, told, ask, look = [], {}, Inbox.ask, Inbox.look
+    asked, told, ask, look = [], {}, DeviceReadback.request, DeviceReadback.latest
 
     def kept(self, *, wait):
         assert wait == deterministic
@@ -116,8 +116,8 @@ def test_steps_ask_for_pairs_now_and_then(deterministic, device, monkeypatch):
             told[steps._replays] = found
         return found
 
-    monkeypatch.setattr(Inbox, "ask", lambda self: asked.append(steps._replays) or ask(self))
-    monkeypatch.setattr(Inbox, "look", kept)
+    monkeypatch.setattr(DeviceReadback, "request", lambda self: asked.append(steps._replays) or ask(self))
+    monkeypatch.setattr(DeviceReadback, "latest", kept)
     while state.images < 40:
         steps.step()
     assert asked == list(range(READ_EVERY, steps._replays + 1, READ_EVERY))
