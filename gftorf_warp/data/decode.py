@@ -8,8 +8,12 @@ has several frequencies, their phases together choose the turn of the first, see
 
 from __future__ import annotations
 
+import functools
 import math
+import weakref
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -19,6 +23,9 @@ from ..errors import InputError
 from .cycles import solution
 from .sequence import Sequence
 from .unwrap import CONFIDENT, choose, common_range, multiples, wrapped
+
+KEPT_BYTES_MAX = 1 << 30  # [bytes] of quads; decoded quartets take up to three times as much
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -30,23 +37,38 @@ class Decoded:
     single: Float[np.ndarray, "f H W"]
     """Distance that each frequency gives by itself [m], in [0, c/2f)."""
     distance: Float[np.ndarray, "H W"]
-    """Distance of all together [m], in [0, range)."""
-    range: float
-    """What distances are known modulo [m]: c / 2 f_0, or c/2f of a single frequency."""
+    """Distance by all frequencies together [m], in [0, :func:`unambiguous_range`)."""
     confidence: Float[np.ndarray, "H W"] | None
-    """How far one distance explains the phases better than any other [1], see unwrap.py, 0 where there is no light;
-    None if there is one frequency, which chooses nothing."""
+    """How much better one distance explains the phases than any other [1], see unwrap.py, 0 where there is no light;
+    None for a single frequency, where there is nothing to choose."""
 
     @property
     def ambiguous(self) -> Bool[np.ndarray, "H W"]:
-        """Where another distance, some whole turns away, would explain the phases nearly as well."""
+        """Pixels where a distance some whole turns away would explain the phases nearly as well."""
         if self.confidence is None:
             return np.zeros(self.distance.shape, dtype=bool)
         return self.confidence < CONFIDENT
 
 
+def _kept(function: Callable[[Sequence, int], T]) -> Callable[[Sequence, int], T]:
+    """Keep the results of a function of a sequence and a quartet as long as the sequence exists."""
+    results: weakref.WeakKeyDictionary[Sequence, dict[int, T]] = weakref.WeakKeyDictionary()
+
+    @functools.wraps(function)
+    def kept(sequence: Sequence, i: int) -> T:
+        if sequence.quads.nbytes > KEPT_BYTES_MAX:
+            return function(sequence, i)
+        by_quartet = results.setdefault(sequence, {})
+        if i not in by_quartet:
+            by_quartet[i] = function(sequence, i)
+        return by_quartet[i]
+
+    return kept
+
+
+@_kept
 def decode_quartet(sequence: Sequence, i: int) -> Decoded:
-    """Phasors and distances of quartet i, decoded as if its raw frames had been taken at once.
+    """Phasors and distances of quartet i, decoded as if its raw frames had been taken at once; kept, read-only.
 
     Any three or more shifts at each frequency will do, evenly spaced or not, in any order.
 
@@ -54,25 +76,19 @@ def decode_quartet(sequence: Sequence, i: int) -> Decoded:
         ValueError: If a frame of the quartet was not measured.
         InputError: If its shifts do not determine a phase, or its frequencies have no common range.
     """
-    phasors = np.stack([phasor for _, phasor in quartet_phasors(sequence, i)])
-    frequencies = sequence.frequencies
-    phases = np.arctan2(phasors[:, 1], phasors[:, 0])
+    phasors = _phasors(sequence, i)[1]
+    phases, frequencies = np.arctan2(phasors[:, 1], phasors[:, 0]), sequence.frequencies
     single = np.stack([distance_from_phase(p, sequence, f) for p, f in zip(phases, frequencies, strict=True)])
-    if len(frequencies) == 1:
-        reach = unambiguous_range(sequence)
-        return Decoded(phasors=phasors, single=single, distance=single[0], range=reach, confidence=None)
-    reach = unambiguous_range(sequence)
-    ms, _ = multiples(frequencies)
-    chosen = choose(phases - sequence.calibration.phase_offset, ms)
-    distance = single[0] + chosen.turns * (SPEED_OF_LIGHT / (2.0 * frequencies[0]))
-    lit = np.hypot(phasors[:, 0], phasors[:, 1]).min(axis=0) > 0
-    return Decoded(
-        phasors=phasors,
-        single=single,
-        distance=distance,
-        range=reach,
-        confidence=np.where(lit, chosen.confidence, 0.0),
-    )
+    distance, confidence = single[0], None
+    unambiguous_range(sequence)  # raises the error of frequencies without one
+    if len(frequencies) > 1:
+        chosen = choose(phases - sequence.calibration.phase_offset, multiples(frequencies)[0])
+        distance = single[0] + chosen.turns * (SPEED_OF_LIGHT / (2.0 * frequencies[0]))
+        lit = np.hypot(phasors[:, 0], phasors[:, 1]).min(axis=0) > 0
+        confidence = np.where(lit, chosen.confidence, 0.0)
+    for array in (single, distance) if confidence is None else (single, distance, confidence):
+        array.flags.writeable = False
+    return Decoded(phasors=phasors, single=single, distance=distance, confidence=confidence)
 
 
 def quartet_phasors(sequence: Sequence, i: int) -> list[tuple[list[int], Float[np.ndarray, "2 H W"]]]:
@@ -82,23 +98,32 @@ def quartet_phasors(sequence: Sequence, i: int) -> list[tuple[list[int], Float[n
         ValueError: If a frame of the quartet was not measured.
         InputError: If its shifts do not determine a phase.
     """
+    return list(zip(*_phasors(sequence, i), strict=True))
+
+
+@_kept
+def _phasors(sequence: Sequence, i: int) -> tuple[list[list[int]], Float[np.ndarray, "f 2 H W"]]:
+    """Raw frames at each frequency of quartet i, and the phasors decoded from them."""
     if i not in sequence.complete_quartets:
         raise ValueError(f"quartet {i} must be one of the complete ones, {sequence.complete_quartets}")
-    frames = np.arange(sequence.frames)[sequence.quartet_frames(i)]
-    found = []
+    first, last = sequence.cycle * i, sequence.cycle * (i + 1) - 1
+    groups, phasors = [], []
     for f in sequence.frequencies:
-        own = frames[sequence.frame_frequencies[frames] == f]
-        shifts = sequence.shifts[own]
+        frames = first + np.flatnonzero(sequence.frame_frequencies[first : last + 1] == f)
+        shifts = sequence.shifts[frames]
         rows = solution(shifts)
         if rows is None:
             raise InputError(
                 "phase shifts",
-                where=f"{sequence.path or 'sequence'}, frames {frames[0]} .. {frames[-1]}",
+                where=f"{sequence.path or 'sequence'}, frames {first} .. {last}",
                 why=f"expected at least three distinct shifts, found {np.degrees(shifts).tolist()} degrees",
                 fix="correct tof_permutation.npy, or the shifts in capture.json",
             )
-        found.append((own.tolist(), np.tensordot(rows, sequence.quads[own].astype(np.float64), axes=1)))
-    return found
+        groups.append(frames.tolist())
+        phasors.append(np.tensordot(rows, sequence.quads[frames].astype(np.float64), axes=1))
+    stack = np.stack(phasors)
+    stack.flags.writeable = False
+    return groups, stack
 
 
 def quartet_phasor(sequence: Sequence, i: int) -> Float[np.ndarray, "2 H W"]:

@@ -78,7 +78,7 @@ def frequencies(sequence: Sequence, report: Report) -> None:
     confidence = [d.confidence[np.hypot(*d.phasors[0]) > 0] for d in decoded if d.confidence is not None]
     ambiguous = float(np.mean([d.ambiguous.mean() for d in decoded]))
     report.lines.append(
-        f"unwrapping      {decoded[0].range:.4g} m together; median confidence "
+        f"unwrapping      {unambiguous_range(sequence):.4g} m together; median confidence "
         f"{float(np.median(np.concatenate(confidence))):.2f}, {ambiguous:.1%} of the pixels ambiguous"
     )
     if ambiguous > AMBIGUOUS_SHARE:

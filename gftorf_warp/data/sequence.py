@@ -151,7 +151,7 @@ class Sequence:
         """How many raw frames of a cycle have its first frequency."""
         return int((self.frame_frequencies[: self.cycle] == self.frequencies[0]).sum())
 
-    @property
+    @functools.cached_property
     def complete_quartets(self) -> list[int]:
         """Indices i of the quartets whose raw frames K i .. K (i + 1) - 1 were all measured, at three or more each."""
         step, frequencies = self.cycle, self.frame_frequencies
