@@ -7,11 +7,15 @@ from typing import Any
 from ..errors import InputError
 from .motion import Motion, Nodes, Still
 from .network import Network
+from .rigid_nodes import RigidNodes
+from .spline import Spline
 
 MODELS: tuple[type[Motion], ...] = (
     Still,
     Nodes,
     Network,
+    Spline,
+    RigidNodes,
 )
 KINDS = {model.kind: model for model in MODELS}
 

@@ -46,7 +46,7 @@ class MotionSettings:
     """Which motion model, and its size."""
 
     kind: str = "nodes"
-    """Name of the model: still, nodes, network, spline or rigid_nodes."""
+    """Name of the model, see scene/models.py."""
     nodes: int = 64
     """Nodes: largest number, spread over the moving layer."""
     neighbours: int = 4
@@ -309,8 +309,10 @@ class Nodes(Motion):
     @classmethod
     def from_dict(cls, stored: dict[str, Any]) -> Nodes:
         """From its tensors and the number of neighbours."""
-        parts = (stored["tensors"][name] for name in ("key_times", "node", "layer", "offset"))
-        return cls(*parts, neighbours=stored["neighbours"])
+        tensors = stored["tensors"]
+        made = cls(*(tensors[name] for name in ("key_times", "node", "layer")), neighbours=stored["neighbours"])
+        made.load_state_dict(tensors)
+        return made
 
 
 def interpolated(motion: KeyMotion, rows: Sequence[int], weights: Sequence[float]) -> Displacement:
