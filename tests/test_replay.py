@@ -76,14 +76,14 @@ def test_images_are_those_of_render(run):
 def test_colour_only_where_it_is_wanted(run):
     """Without it the other images stay."""
     got, want = run.renderer(PLAIN)(0.02, CAMERA), run.render(0.02)
-    assert got.colour.images is None
+    assert got.colour is None
     torch.testing.assert_close(got.quads, want.quads, rtol=1e-4, atol=1e-5)
 
 
 def test_only_what_is_wanted(run):
     """The rest is empty, and what is there is the same."""
     got, want = run.renderer(("quads", "distance", "opacity"))(0.02, CAMERA), run.render(0.02)
-    assert got.phasor.numel() == got.intrinsics.distortion.numel() == 0
+    assert got.phasor.numel() == got.distortion.numel() == 0
     for name in ("quads", "distance", "opacity"):
         torch.testing.assert_close(getattr(got, name), getattr(want, name), rtol=1e-4, atol=1e-4, msg=name)
     with pytest.raises(ValueError, match="no image 'depth'"):
