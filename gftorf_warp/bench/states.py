@@ -19,7 +19,6 @@ from ..recon.config import config_of
 from ..recon.observations import Observations, input_of, observe
 from ..recon.settings import Input, ReconSettings
 from ..recon.state import State, begin, field_and_motion, to_dict
-from ..recon.step import threads_for
 from ..recon.train import CHANGES
 from ..render.replay import Replay
 from ..scene.changes import changed
@@ -67,7 +66,8 @@ def settings_of(sequence: Sequence, preset: str, changes: list[str], device: str
     recorded = presets.Recorded(input=found, unambiguous_range=unambiguous_range(sequence))
     settings = changed(presets.preset(preset, recorded), changes, CHANGES)
     settings = replace(settings, densify=replace(settings.densify, stop_share=0.0))
-    return threads_for(settings, device, 1)[0]
+    threads = 1 if torch.device(device).type == "cpu" else settings.render.threads
+    return replace(settings, render=replace(settings.render, threads=threads))
 
 
 def from_run(run: Path | None, sequence: Sequence, settings: ReconSettings, device: str) -> Fitted:

@@ -1,7 +1,7 @@
-"""The training step: consecutive images of a fixed state, without rounds and resets, in every way that exists.
+"""The training step: consecutive images of one state, without densification and opacity resets.
 
-Ways are every member of ``Kernels`` and ``Batch`` with the last of ``Products``, and every member of ``Products`` with
-the last of ``Kernels``: these enumerations list from plain to fast. Every way begins with the same state.
+Rows are single images and quartets, with and without CUDA graphs, in every precision of the network; all
+begin with the same state.
 """
 
 from __future__ import annotations
@@ -18,11 +18,10 @@ from typing import Any, NamedTuple
 
 import torch
 
-from ..recon.captured import CapturedSteps, steps_of
 from ..recon.observations import Observations, observe
-from ..recon.settings import Batch, Kernels, ReconSettings
+from ..recon.settings import Batch, ReconSettings
 from ..recon.state import State, from_dict
-from ..recon.step import Singles
+from ..recon.stepper import Stepper
 from ..scene.motion import Products
 from ..scene.network import Network
 from .states import Fitted, pairs_of
@@ -39,19 +38,20 @@ QUICK_IMAGES, QUICK_PART, QUICK_WARM_UP = 8, 4, 4
 def ways(settings: ReconSettings, changes: list[str], device: str) -> list[ReconSettings]:
     """The settings of every row; what ``changes`` sets stays as it is."""
     fixed = {change.partition("=")[0].strip() for change in changes}
-    moves = settings.motion.kind == Network.kind and torch.device(device).type != "cpu"
-    kernels = [settings.kernels] if "kernels" in fixed else [kind for kind in Kernels if kind != Kernels.AUTO]
+    gpu = torch.device(device).type != "cpu"
+    moves = settings.motion.kind == Network.kind and gpu
+    graphs = [settings.graph] if "graph" in fixed or not gpu else [False, True]
     batches = [settings.schedule.batch] if "schedule.batch" in fixed else list(Batch)
     products = [settings.motion.products] if "motion.products" in fixed or not moves else list(Products)
-    pairs = [(kind, products[-1]) for kind in kernels] + [(kernels[-1], kind) for kind in products[:-1]]
+    pairs = [(graph, products[-1]) for graph in graphs] + [(graphs[-1], kind) for kind in products[:-1]]
     return [
         replace(
             settings,
-            kernels=kind,
+            graph=graph,
             schedule=replace(settings.schedule, batch=batch),
             motion=replace(settings.motion, products=precision),
         )
-        for kind, precision in pairs
+        for graph, precision in pairs
         for batch in batches
     ]
 
@@ -65,7 +65,7 @@ def fresh(
         stored["motion"]["shape"]["products"] = str(settings.motion.products)
     stored["queue"] = []  # batches are numbered anew
     state = from_dict(stored, device)
-    run = Run(state, steps_of(state, observations, settings))
+    run = Run(state, Stepper(state, observations, settings))
     advance(run, warm_up)
     return run
 
@@ -75,8 +75,8 @@ class Run(NamedTuple):
 
     state: State
     """Changed by steps."""
-    steps: Singles | CapturedSteps
-    """How they are done."""
+    steps: Stepper
+    """Its steps."""
 
 
 def advance(run: Run, images: int) -> int:
@@ -143,14 +143,14 @@ def rows_of(
             watch.synchronise()
             times.append(1e3 * (time.perf_counter() - begun) / (state.images - first))
             report((number * parts + done) * part, len(chosen) * parts * part, ms=times[-1])
-        row: dict[str, Any] = {"kernels": str(settings.kernels), "batch": str(settings.schedule.batch)}
+        row: dict[str, Any] = {"graph": settings.graph, "batch": str(settings.schedule.batch)}
         row |= {
             "products": str(settings.motion.products),
             "N": len(state.optimiser.field),
             "pairs": pairs,
             "from": before,
         }
-        row |= {"images": state.images - before, "flow": observations.flow_source, "not_sound": broken}
+        row |= {"images": state.images - before, "flow": observations.flow_source, "skipped": broken}
         row |= {"ms_per_image": statistics.mean(times), "parts": Timing.of(times).plain()}
         if torch.device(device).type != "cpu":
             row["waits_per_image"] = waits(fresh(fitted, observations, settings, device, warm_up), device)
@@ -200,10 +200,10 @@ def lines_of_trace(events: list[dict[str, Any]]) -> list[str]:
 
 def table(rows: list[dict[str, Any]]) -> list[str]:
     """One line per way."""
-    heads = ["kernels, batch, products", "N", "pairs", "images", "mean", "10 .. 90 % of parts", "waits per image"]
+    heads = ["graph, batch, products", "N", "pairs", "images", "mean", "10 .. 90 % of parts", "waits per image"]
     cells = [
         [
-            f"{row['kernels']}, {row['batch']}, {row['products']}",
+            f"{'graph' if row['graph'] else 'eager'}, {row['batch']}, {row['products']}",
             f"{row['N']:,}",
             f"{row['pairs']:,}",
             str(row["images"]),

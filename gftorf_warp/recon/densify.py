@@ -9,8 +9,6 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ..render.api import ScreenGradient
-from ..scene.camera import Camera
 from ..scene.gaussians import GaussianField
 from .optimiser import Optimiser
 from .settings import DensifySettings, Schedule
@@ -47,18 +45,6 @@ def start(field: GaussianField) -> Statistics:
     """Nothing observed yet."""
     zeros = field.opacity_logit.detach().new_zeros(len(STATISTICS), len(field)).unbind()
     return Statistics(**dict(zip(STATISTICS, zeros, strict=True)))
-
-
-def observe(statistics: Statistics, screen: ScreenGradient, camera: Camera) -> Statistics:
-    """Add one image, after its backward pass."""
-    x, y = screen.gradient.unbind(dim=1)  # two numbers as a tensor would be an upload, which makes a GPU wait
-    length = torch.hypot(0.5 * camera.width * x, 0.5 * camera.height * y)
-    return replace(
-        statistics,
-        gradient=statistics.gradient + screen.pixels * length,
-        pixels=statistics.pixels + screen.pixels,
-        weight=statistics.weight + screen.weight,
-    )
 
 
 def crossed(before: int, after: int, every: int | None) -> bool:

@@ -1,9 +1,9 @@
-"""What an optimisation looks like on its way: a row of ``diagnostics.jsonl`` now and then, which changes no byte of it.
+"""Diagnostics along a run: rows of ``diagnostics.jsonl``, which change nothing of the optimisation.
 
-d and d_ToF drift apart where quads leave the distance open (method, sections 2.5 and 9), and static matter is pushed
-along rays: neither shows in the loss. So a few fixed raw frames are rendered before black, at the poses and the size of
-the optimisation, without gradients and without random numbers. This is the only place of the room that sees truth, and
-nothing that it says is read again before the run is compared.
+d and d_ToF drift apart where quads do not determine the distance (method, sections 2.5 and 9), and
+static surfaces drift along rays: neither shows in the loss. So a few fixed raw frames are rendered with
+a black background, at the poses and the size of the optimisation, without gradients and without random
+numbers. This is the only file of recon/ that reads ground truth; only the report reads its rows.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from .settings import ReconSettings
 from .state import State
 
 ROWS = 40  # along a run, besides its first image
-FRAMES = 4  # that are looked at: with these, looking costs about a hundredth of a run of some thousand images
+FRAMES = 4  # rendered per row: about a hundredth of the time of a run of some thousand images
 STILL_M = 1e-6  # [m], [1] poses that differ less are one pose
 PAIRS = 1 << 22  # (tile, splat) pairs that a GPU may list uncounted: 16 MB; the published runs have a tenth
 Row = dict[str, float | int | None]
@@ -40,22 +40,22 @@ Wanted = dict[str, tuple[Tensor | None, Tensor | None]]  # image and mask by nam
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Seen:
-    """What a look found, on the device: not read yet."""
+class Rendered:
+    """One row on the device, not read back yet."""
 
     sums: dict[str, Tensor | None]
-    """By name the sum over pixels and their number, float64."""
+    """Sum over pixels and number of pixels by name, float64."""
     pairs: Int[Tensor, "S"]
     """(tile, splat) pairs of every frame."""
     counted: bool
-    """Whether there was room for all of them for certain."""
+    """Whether they were counted before memory was allocated, so that none was dropped."""
 
 
-class Watch:
-    """Looks at an optimisation and writes down what it sees."""
+class Diagnostics:
+    """Renders and writes the rows."""
 
     def __init__(self, observations: Observations, truth: Truth | None, path: Path):
-        """Choose the raw frames and the pixels to look at.
+        """Choose raw frames and masks.
 
         Args:
             observations: What is being fitted.
@@ -66,7 +66,7 @@ class Watch:
         self.observations = observations
         self.rows = Metrics(path)
         known = None if truth is None or not truth.known.any() else truth
-        self.frames = watched_frames(sequence, known)
+        self.frames = diagnostic_frames(sequence, known)
         self.truth: Tensor | None = None
         self.moving: Tensor | None = None
         self.static: Tensor | None = None
@@ -100,67 +100,67 @@ class Watch:
         """Drop rows beyond ``images``: the run goes on from there."""
         self.rows.rewind(images)
 
-    def look(self, state: State, settings: ReconSettings) -> Row:
-        """Append one row to the file, and return it: :meth:`begin` and :meth:`finish`."""
-        return self.finish(self.begin(state, settings), state, settings)
+    def add(self, state: State, settings: ReconSettings) -> Row:
+        """:meth:`render` and :meth:`write` one row."""
+        return self.write(self.render(state, settings), state, settings)
 
     @torch.no_grad()
-    def begin(self, state: State, settings: ReconSettings, *, counted: bool = False) -> Seen:
-        """Render what a row is made of, and add it up. No GPU is waited for, which may be busy with the steps before.
+    def render(self, state: State, settings: ReconSettings, *, counted: bool = False) -> Rendered:
+        """Render the frames and sum up what a row needs, without waiting for a GPU.
 
         Args:
-            state: What is looked at.
-            settings: How it is optimised.
-            counted: Whether (tile, splat) pairs are counted before they are listed, which waits; a CPU always does.
+            state: Of the optimisation.
+            settings: Of the run.
+            counted: Whether (tile, splat) pairs are counted first, which waits; on a CPU always.
         """
-        field, seen = state.optimiser.field, self.observations
+        field, shown = state.optimiser.field, self.observations
         attachment = state.motion.attach(field) if state.motion.follows_means else state.attachment
         bare = replace(field, colour_sh=None)
         capacity = None if counted or field.device.type == "cpu" else PAIRS
-        # only gradients depend on an order, and room to keep one would be 128 B of each pair
+        # no gradients: no memory for an order of their sums
         kept = replace(settings.render, distortion=Distortion.PAPER, pair_capacity=capacity, deterministic=False)
         images: dict[str, list[Tensor]] = {name: [] for name in ("d", "d_tof", "opacity", "distortion", "offset")}
         pairs: list[Tensor] = []
         displacements = [Displacement(torch.zeros_like(field.mean), None)] * len(self.frames)
         if state.images >= settings.schedule.warm_up:  # before, nothing moves
-            times = [float(seen.sequence.times[frame]) for frame in self.frames]
+            times = [float(shown.sequence.times[frame]) for frame in self.frames]
             displacements = state.motion.at_times(attachment, times)
         for frame, displacement in zip(self.frames, displacements, strict=True):
             length = displacement.offset.norm(dim=1, keepdim=True)
-            moved, camera, where = bare.moved(*displacement), seen.cameras[frame], self._workspace
-            rendering = rasterize(moved, camera, seen.sensor, kept, extra=length, workspace=where)
+            moved, camera, where = bare.moved(*displacement), shown.cameras[frame], self._workspace
+            rendering = rasterize(moved, camera, shown.sensor, kept, extra=length, workspace=where)
             assert rendering.extra is not None
             pairs.append(pairs_of(where).clone())
             images["d"].append(rendering.distance)
             light = [rendering.quads]
-            for f in seen.sensor.further_hz:
-                other = replace(seen.sensor, f_mod_hz=f, further_hz=())
+            for f in shown.sensor.further_hz:
+                other = replace(shown.sensor, f_mod_hz=f, further_hz=())
                 light.append(rasterize(moved, camera, other, kept, images=("quads",), workspace=where).quads)
-            phasors = [phasor_from_quads(quads, seen.sensor.shifts) for quads in light]
-            images["d_tof"].append(distance_from_phasors(phasors, seen.sensor))
+            phasors = [phasor_from_quads(quads, shown.sensor.shifts) for quads in light]
+            images["d_tof"].append(distance_from_phasors(phasors, shown.sensor))
             images["opacity"].append(rendering.opacity)
             images["distortion"].append(rendering.distortion)
             images["offset"].append(rendering.extra[0] / rendering.opacity.clamp_min(1e-6))
-        wanted = self._judge({name: torch.stack(parts) for name, parts in images.items()})
-        return Seen(sums=_sums(wanted), pairs=torch.cat(pairs), counted=capacity is None)
+        wanted = self._quantities({name: torch.stack(parts) for name, parts in images.items()})
+        return Rendered(sums=_sums(wanted), pairs=torch.cat(pairs), counted=capacity is None)
 
-    def finish(self, seen: Seen, state: State, settings: ReconSettings) -> Row:
-        """Append the row of what was seen to the file, and return it; the state is still the same.
+    def write(self, rendered: Rendered, state: State, settings: ReconSettings) -> Row:
+        """Append a row to the file and return it; the state must still be the same.
 
-        Errors are means over all known pixels of the watched frames; what is unknown or not finite is None. The keys:
+        Errors are means over all known pixels of the frames; None where unknown or not finite. The keys:
         images, gaussians; d_mse_x100 and d_tof_mse_x100, also as ``moving.`` and ``static.`` [m^2 x 100];
         transmittance T_e [1]; distortion, the sum over all pairs [m^2]; offset_static_m, the length of the displacement
         of what static pixels see; d_minus_dtof_static_m, |d - d_ToF| there up to a whole unambiguous range.
         """
-        if not seen.counted and max(seen.pairs.tolist()) > PAIRS:
-            seen = self.begin(state, settings, counted=True)
+        if not rendered.counted and max(rendered.pairs.tolist()) > PAIRS:
+            rendered = self.render(state, settings, counted=True)
         row: Row = {"images": state.images, "gaussians": len(state.optimiser.field)}
-        row |= _means(seen.sums)
+        row |= _means(rendered.sums)
         self.rows.add(row)
         return row
 
-    def _judge(self, images: dict[str, Tensor]) -> Wanted:
-        """What of images [S, H, W] the numbers of a row are means of, and where."""
+    def _quantities(self, images: dict[str, Tensor]) -> Wanted:
+        """Images [S, H, W] whose means are the numbers of a row, and their masks."""
         everywhere = torch.ones_like(images["d"], dtype=torch.bool)
         groups = {"": everywhere, "moving.": self.moving, "static.": self.static}
         wanted: Wanted = {}
@@ -179,7 +179,7 @@ class Watch:
         return wanted
 
 
-def watched_frames(sequence: Sequence, truth: Truth | None) -> list[int]:
+def diagnostic_frames(sequence: Sequence, truth: Truth | None) -> list[int]:
     """At most four starts of quartets, spread over the sequence, neither the first nor the last if there are others.
 
     With a truth, quartets that it knows nothing of do not count.
@@ -216,10 +216,10 @@ def _sums(images: Wanted) -> dict[str, Tensor | None]:
 
 
 def _means(sums: dict[str, Tensor | None]) -> Row:
-    """Means, None without a pixel, or if not finite; one look at all."""
-    there = {name: pair for name, pair in sums.items() if pair is not None}
+    """Means in one transfer; None without a pixel, or if not finite."""
+    present = {name: pair for name, pair in sums.items() if pair is not None}
     means: Row = dict.fromkeys(sums)
-    for name, (total, count) in zip(there, torch.stack([*there.values()]).tolist(), strict=True):
+    for name, (total, count) in zip(present, torch.stack([*present.values()]).tolist(), strict=True):
         if count and math.isfinite(total):
             means[name] = total / count
     return means

@@ -55,6 +55,9 @@ def prepare(run: Path, config: dict[str, object], *, fresh: bool) -> bool:
     return True
 
 
+CHANGES_NOTHING = ("render.threads", "schedule.checkpoint_every_s", "graph", "kernels")  # the last until 0.1.0
+
+
 def differences(old: dict[str, object], new: dict[str, object]) -> list[str]:
     """What keeps a run from going on under a new config, in words. A longer run is the same run.
 
@@ -68,7 +71,7 @@ def differences(old: dict[str, object], new: dict[str, object]) -> list[str]:
         before, after = flat_old.get(key), flat_new.get(key)
         if key == "schedule.images" and isinstance(before, int) and isinstance(after, int) and after >= before:
             continue
-        if before != after and key not in ("render.threads", "schedule.checkpoint_every_s"):
+        if before != after and key not in CHANGES_NOTHING:
             found.append(f"{key} was {_short(before)}, now {_short(after)}")
     return found
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import functools
 import hashlib
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,6 +23,33 @@ from .settings import Batch, FlowSource, Input, ReconSettings
 HASHED = ("quads", "measured", "shifts", "times", "frequencies_hz", "camera_from_world")
 
 
+@dataclass(frozen=True, eq=False)
+class ImageStack:
+    """Images of one kind in one tensor on the device, so that a kernel can select one by its row."""
+
+    images: Float[Tensor, "R *image"]
+    """All images; R = 0 if there are none."""
+    rows: Mapping[int, int]
+    """Row of each image by its raw frame or, where a docstring says so, by its quartet."""
+
+    @classmethod
+    def of(cls, images: Mapping[int, np.ndarray | Tensor], device: torch.device | str) -> ImageStack:
+        """Stack images of one shape in the order of their keys."""
+        keys = sorted(images)
+        tensors = [torch.as_tensor(images[key], dtype=torch.float32) for key in keys]
+        stacked = torch.stack(tensors) if tensors else torch.zeros(0)
+        return cls(stacked.to(device).contiguous(), {key: row for row, key in enumerate(keys)})
+
+    def __contains__(self, key: object) -> bool:
+        return key in self.rows
+
+    def __bool__(self) -> bool:
+        return bool(self.rows)
+
+    def __getitem__(self, key: int) -> Tensor:
+        return self.images[self.rows[key]]
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Observations:
     """Raw frames in the units and at the size of the optimisation."""
@@ -31,61 +58,40 @@ class Observations:
     """The prepared sequence: quads multiplied by ``quad_scale``, reduced images, flow filled in."""
     quads: Float[Tensor, "F H W"]
     """Its quads on the device; rows that were not measured are never read."""
-    phasors: dict[int, Float[Tensor, "2 H W"]]
-    """Phasors (re, im) by the raw frame that stands for them, the first of their frequency in the quartet; empty if
-    quads are compared."""
-    colour: dict[int, Float[Tensor, "3 h w"]]
-    """Colour images by raw frame, divided by the largest value of all; empty if colour is not compared."""
+    phasors: ImageStack
+    """[R, 2, H, W] phasors (re, im) by the raw frame that represents them, the first of their
+    frequency in the quartet; empty if quads are compared."""
+    colour: ImageStack
+    """[R, 3, h, w] colour images by raw frame, divided by the largest value of all; may be empty."""
     colour_cameras: dict[int, Camera]
     """The camera of every colour image, at its size."""
     colour_scale: float | None
-    """The file's units of colour times this are those of the optimisation; None if colour is not compared."""
-    closed_form: dict[int, Float[Tensor, "H W"]]
-    """Closed-form distances [m] by quartet; empty if they are not compared."""
+    """Units of colour in the file times this are those of the optimisation; None without colour."""
+    closed_form: ImageStack
+    """[R, 1, H, W] closed-form distances [m] by quartet; may be empty."""
     cameras: list[Camera]
     """The camera of every raw frame."""
     sensor: Sensor
     """The sensor, with the canonical shifts, at all frequencies."""
     batches: list[list[int]]
     """The raw frames of every possible step; each measured frame is in one of them."""
-    flow: dict[tuple[int, int], Float[Tensor, "2 H W"]]
-    """Optical flow [px] by (quartet, step), step 1 or -1."""
+    flow: ImageStack
+    """[R, 2, 2, H, W] optical flow [px] by quartet, to the next quartet and to the previous one;
+    NaN: unknown."""
     quad_scale: float
-    """The file's units times this are the units of the optimisation."""
+    """Units in the file times this are those of the optimisation."""
     quad_scale_source: str
     """Where that number is from."""
     flow_source: str
     """'file', 'computed' or 'none'."""
 
     def sensor_at(self, frame: int) -> Sensor:
-        """The sensor as one raw frame used it: at its frequency, reading its shift only."""
+        """The sensor of one raw frame: its modulation frequency and its phase shift only."""
         alone = self.sensor.with_shifts((float(self.sequence.shifts[frame]),))
         if not self.sensor.further_hz:
             return alone
-        return replace(alone, f_mod_hz=float(self.sequence.frame_frequencies[frame]), further_hz=())
-
-    def rays_at(self, frame: int) -> tuple[Float[Tensor, "3"], Float[Tensor, "H W 3"]]:
-        """Centre of the camera [m] and unit vectors through its pixels, in world axes; sent once per pose."""
-        camera = self.cameras[frame]
-        key = camera.camera_from_world.tobytes()
-        if key not in self._rays:
-            ray = camera.rays(device=self.quads.device)
-            self._rays[key] = torch.as_tensor(camera.centre).to(ray), ray
-        return self._rays[key]
-
-    def flow_table(self) -> Float[Tensor, "Q 2 2 H W"] | None:
-        """Flow [px] of every quartet to the next one and to the one before, NaN where there is none; None: no flow."""
-        if not self.flow:
-            return None
-        count = -(-len(self.quads) // self.sequence.cycle)
-        table = self.quads.new_full((count, 2, 2, *self.quads.shape[1:]), float("nan"))
-        for (quartet, step), flow in self.flow.items():
-            table[quartet, 0 if step == 1 else 1] = flow
-        return table
-
-    @functools.cached_property
-    def _rays(self) -> dict[bytes, tuple[Tensor, Tensor]]:
-        return {}
+        frequency = float(self.sequence.frame_frequencies[frame])
+        return replace(alone, f_mod_hz=frequency, further_hz=())
 
     def time_at(self, frame: int) -> float:
         """When raw frame ``frame`` was taken [s]; if phasors are compared, the mean time of those that made its own."""
@@ -125,37 +131,43 @@ def observe(sequence: Sequence, settings: ReconSettings, device: torch.device | 
     prepared, flow_source = with_flow(prepared, settings.flow if reads_flow(settings) else FlowSource.NONE)
     prepared = replace(prepared, quads=(prepared.quads * np.float32(scale)).astype(np.float32))
 
-    def on_device(array: np.ndarray) -> Tensor:
-        return torch.tensor(array, dtype=torch.float32, device=device)
-
-    phasors, closed_form = {}, {}
+    phasors: dict[int, np.ndarray] = {}
     if input_of(sequence, settings.input) == Input.PHASOR and settings.weights.quads > 0:
-        decoded = [found for i in prepared.complete_quartets for found in quartet_phasors(prepared, i)]
-        phasors = {frames[0]: on_device(phasor) for frames, phasor in decoded}
+        decoded = [item for i in prepared.complete_quartets for item in quartet_phasors(prepared, i)]
+        phasors = {frames[0]: phasor for frames, phasor in decoded}
         if not phasors:
             raise _nothing_to_compare(sequence, "no complete quartet", "a phasor needs all raw frames of one quartet")
+    closed_form = {}
     if settings.weights.depth > 0:
-        closed_form = {i: on_device(closed_form_distance(prepared, i)) for i in prepared.complete_quartets}
+        closed_form = {i: closed_form_distance(prepared, i)[None] for i in prepared.complete_quartets}
     colour, colour_scale = _colour(prepared, settings)
-    steps = {1: prepared.flow.forward, -1: prepared.flow.backward}
     return Observations(
         sequence=prepared,
         quads=torch.tensor(prepared.quads, device=device),
-        phasors=phasors,
-        colour={n: on_device(np.moveaxis(image, -1, 0)) for n, image in colour.items()},
+        phasors=ImageStack.of(phasors, device),
+        colour=ImageStack.of({n: np.moveaxis(image, -1, 0) for n, image in colour.items()}, device),
         colour_cameras={n: camera for n in colour if (camera := colour_camera_of(prepared, n)) is not None},
         colour_scale=colour_scale,
-        closed_form=closed_form,
+        closed_form=ImageStack.of(closed_form, device),
         cameras=[camera_of(prepared, n) for n in range(prepared.frames)],
         sensor=sensor_of(prepared),
-        batches=_batches(prepared, settings, phasors, colour),
-        flow={
-            (n // prepared.cycle, step): on_device(flow) for step, flows in steps.items() for n, flow in flows.items()
-        },
+        batches=_batches(prepared, settings, list(phasors), list(colour)),
+        flow=ImageStack.of(_flow_by_quartet(prepared), device),
         quad_scale=float(scale),
         quad_scale_source=scale_source,
         flow_source=flow_source,
     )
+
+
+def _flow_by_quartet(sequence: Sequence) -> dict[int, np.ndarray]:
+    """[2, 2, H, W] forward and backward flow [px] of each quartet with any, NaN where there is none."""
+    result: dict[int, np.ndarray] = {}
+    for direction, flows in enumerate((sequence.flow.forward, sequence.flow.backward)):
+        for frame, flow in flows.items():
+            shape = (2, 2, sequence.height, sequence.width)
+            pair = result.setdefault(frame // sequence.cycle, np.full(shape, np.nan, dtype=np.float32))
+            pair[direction] = flow
+    return result
 
 
 def reads_flow(settings: ReconSettings) -> bool:
@@ -163,7 +175,7 @@ def reads_flow(settings: ReconSettings) -> bool:
     return settings.weights.flow > 0 or settings.init.kind == Init.PHASE
 
 
-def _batches(sequence: Sequence, settings: ReconSettings, phasors: dict, colour: dict) -> list[list[int]]:
+def _batches(sequence: Sequence, settings: ReconSettings, phasors: list[int], colour: list[int]) -> list[list[int]]:
     """The raw frames of every possible step: a phasor, or an image where only colour counts, is a step of its own."""
     if phasors:
         return [[n] for n in phasors]

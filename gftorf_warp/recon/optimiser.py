@@ -1,10 +1,12 @@
-"""Adam over Gaussians and motion; every rate is set here, by one schedule (method, section 6.5)."""
+"""Learning rates of all groups by one schedule (method, section 6.5), and the state of Adam."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
+from typing import Any
 
 import torch
 from jaxtyping import Int
@@ -12,12 +14,14 @@ from torch import Tensor
 
 from ..scene.gaussians import GaussianField
 from ..scene.motion import Motion
-from .adam import MOMENTS, Adam
 from .settings import Batch, BatchRule, Input, ReconSettings
 
 BETAS = (0.9, 0.999)  # of steps of one image
 EPSILON = 1e-15  # far below any gradient here, so that a step depends on the direction of a gradient, not on its size
-MOTION = "motion"  # the group of everything that is not of the field
+MOTION = "motion"  # group of the parameters of the motion
+STORED = ("step", "exp_avg", "exp_avg_sq")  # keys of ``torch.optim.Adam``
+Moments = tuple[Tensor, Tensor, Tensor]
+"""Number of steps, first and second moment of a tensor."""
 
 
 def rates_at(
@@ -28,17 +32,18 @@ def rates_at(
     reset_at: int | None = None,
     revived_at: int | None = None,
 ) -> dict[str, float]:
-    """Learning rate of every group after ``images`` optimised images; 0 where a group rests.
+    """Learning rate of every group after ``images`` optimised images; 0: the group is not optimised.
 
-    Log-linear from ``rates`` to ``rates_last`` at the end of the run. The motion rests during the warm-up and for a
-    while after a reset of the opacities; then its rate rises from none. The Gaussians rest once they are frozen.
+    Log-linear from ``rates`` to ``rates_last`` at the end of the run. That of the motion is 0 during the
+    warm-up and for a while after an opacity reset, then it rises linearly. Those of frozen Gaussians
+    are 0.
 
     Args:
         settings: Rates and schedule.
         images: Progress.
-        factor: Multiplies all rates; below 1 after the run had to go back to a checkpoint.
-        reset_at: Progress at the last reset of the opacities; None: there was none.
-        revived_at: Progress when the motion was last drawn anew; None: it never was.
+        factor: Multiplies all rates; below 1 after a return to a checkpoint.
+        reset_at: Progress at the last opacity reset; None: there was none.
+        revived_at: Progress when the motion was last reinitialised; None: never.
     """
     schedule = settings.schedule
     first, last = asdict(settings.rates), asdict(settings.rates_last)
@@ -62,13 +67,13 @@ def rates_at(
 
 
 def betas_of(settings: ReconSettings) -> tuple[float, float]:
-    """Decays of both moments per step: as much is forgotten per image, whatever the batch, if its rule says so."""
+    """Decays of both moments per step; per image they do not depend on the batch, if the batch rule says so."""
     images = _images(settings)
     return BETAS[0] ** images, BETAS[1] ** images
 
 
 def _images(settings: ReconSettings) -> int:
-    """Images of a step as far as Adam is concerned; a last batch that is cut short counts as a whole one."""
+    """Images of a step in learning-rate scaling; a last batch that is cut short counts as a whole one."""
     schedule = settings.schedule
     joint = schedule.batch == Batch.QUARTET and settings.input != Input.PHASOR and settings.weights.quads > 0
     return settings.cycle if joint and schedule.batch_rule != BatchRule.NONE else 1
@@ -86,128 +91,139 @@ def _between(first: float, last: float, share: float) -> float:
 
 
 class Optimiser:
-    """Adam with one group per tensor of the field and one for the motion.
+    """The optimised tensors and their moments, one group per tensor of the field and one for the motion.
 
-    The harmonics of the colour are two tensors, ``colour_constant`` and ``colour_rest``, since their rates differ.
+    A step of Adam is render/descent.py. The harmonics of the colour are two tensors,
+    ``colour_constant`` and ``colour_rest``, because their rates differ.
     """
 
     def __init__(
         self,
         field: GaussianField,
         motion: Motion,
-        state: dict | None = None,
+        state: Mapping[str, Any] | None = None,
         *,
         betas: tuple[float, float] = BETAS,
     ):
-        """Take copies of the tensors of a field, which become leaves, and the parameters of a motion.
+        """Copy the tensors of a field, which become leaves; take the parameters of a motion.
 
         Args:
             field: The Gaussians.
             motion: Their motion.
-            state: ``adam.state_dict()`` of an earlier optimiser of the same tensors, whose decays go on; None starts
-                at zero.
+            state: :meth:`state_dict` of an earlier optimiser of the same tensors, which continues with
+                its decays; None: moments are zero.
             betas: Decays of both moments per step.
         """
-        self.layer = field.layer
+        self.layer, self.betas = field.layer, betas
         parts = field.parameters()
         colour = parts.pop("colour_sh", None)
         if colour is not None:
             parts |= {"colour_constant": colour[:, :1], "colour_rest": colour[:, 1:]}
-        groups = {name: [value.detach().clone().requires_grad_()] for name, value in parts.items()}
-        movable = [parameter for parameter in motion.parameters() if parameter.numel()]
-        self.adam = Adam(groups | ({MOTION: movable} if movable else {}), betas, EPSILON)
+        self.tensors = {name: value.detach().clone().requires_grad_() for name, value in parts.items()}
+        """Tensors of the field by name of their group."""
+        self.motion = [parameter for parameter in motion.parameters() if parameter.numel()]
+        """Parameters of the motion."""
+        self._moments: dict[Tensor, Moments] = {}
         if state is not None:
-            self.adam.load_state_dict(state)
-
-    @property
-    def tensors(self) -> dict[str, Tensor]:
-        """The tensors of the field by name of their group."""
-        return {name: group[0] for name, group in self.adam.groups.items() if name != MOTION}
-
-    @property
-    def motion(self) -> list[Tensor]:
-        """The parameters of the motion."""
-        return self.adam.groups.get(MOTION, [])
+            self._load(state)
 
     @property
     def field(self) -> GaussianField:
-        """The Gaussians as they are; their tensors are the leaves, those of the colour joined."""
-        parts = self.tensors
-        if "colour_rest" in parts:
-            parts["colour_sh"] = torch.cat([parts.pop("colour_constant"), parts.pop("colour_rest")], dim=1)
-        return GaussianField(**parts, layer=self.layer)
-
-    @property
-    def betas(self) -> tuple[float, float]:
-        """Decays of both moments per step."""
-        return self.adam.betas
+        """The Gaussians; their tensors are the leaves, those of the colour joined."""
+        return field_of(self.tensors, self.layer)
 
     @property
     def leaves(self) -> list[Tensor]:
         """Everything that is optimised: the tensors of the field, then the motion."""
-        return self.adam.tensors
+        return [*self.tensors.values(), *self.motion]
 
-    def step(self, gradients: list[Tensor | None], rates: dict[str, float], motion_gradient_max: float | None) -> None:
-        """One step of Adam.
+    @property
+    def groups(self) -> list[str]:
+        """Group of every leaf."""
+        return [*self.tensors] + [MOTION] * len(self.motion)
 
-        Args:
-            gradients: Of ``leaves``; None is zero.
-            rates: From :func:`rates_at`. A group of rate 0 is left alone, its moments included.
-            motion_gradient_max: Longest gradient of the motion; a longer one is shortened. None: no limit.
-        """
-        of_motion = [gradient for gradient in gradients[len(self.tensors) :] if gradient is not None]
-        if of_motion and motion_gradient_max is not None:
-            _shorten(of_motion, motion_gradient_max)
-        self.adam.step(gradients, rates)
+    def moments_of(self, leaf: Tensor) -> Moments:
+        """(step, first moment, second moment) of a leaf, zero at first."""
+        if leaf not in self._moments:
+            first, second = torch.zeros_like(leaf), torch.zeros_like(leaf)
+            self._moments[leaf] = torch.zeros((), device=leaf.device), first.detach(), second.detach()
+        return self._moments[leaf]
 
-    def moments_of(self, leaf: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """(step, first moment, second moment) of a leaf; zeros, as torch's Adam would begin, if it has none yet."""
-        state = self.adam.remembered(leaf)
-        return state["step"], state["exp_avg"], state["exp_avg_sq"]
-
-    def settle(self, name: str, value: Tensor, moments: tuple[Tensor, Tensor, Tensor]) -> None:
-        """Let one tensor of the field live elsewhere, with the moments that it has had so far."""
-        self.adam.put(name, value, dict(zip(("step", *MOMENTS), moments, strict=True)))
+    def put(self, name: str, value: Tensor, moments: Moments | None) -> None:
+        """Replace one tensor of the field and its moments; None: zero."""
+        self._moments.pop(self.tensors[name], None)
+        self.tensors[name] = value
+        if moments is not None:
+            self._moments[value] = moments
 
     def replace(self, rows: Int[Tensor, "M"], old: int, change: Callable[[str, Tensor], None]) -> None:
         """Rebuild every tensor of the field from rows of the present one, moments alike.
 
         Args:
-            rows: Which present Gaussian each new one comes from.
-            old: So many, the first ones, go on; the moments of all others start at zero.
-            change: Given a name and the selected rows, makes them the new values, in place.
+            rows: Row of the present tensor that each new row is copied from.
+            old: The first so many rows keep their moments; those of all others start at zero.
+            change: Gets the name and the selected rows and changes them in place.
         """
         fresh = []
         for name, before in self.tensors.items():
             new = before.detach().index_select(0, rows)
             change(name, new)
-            state = self.adam.state.get(before)
-            if state is not None:
-                for moment in MOMENTS:
-                    state[moment] = state[moment].index_select(0, rows)
-                    fresh.append(state[moment][old:])
-            self.adam.put(name, new.requires_grad_(), state)
+            moments = self._moments.get(before)
+            if moments is not None:
+                step, *both = moments
+                first, second = (moment.index_select(0, rows) for moment in both)
+                fresh += [first[old:], second[old:]]
+                moments = step, first, second
+            self.put(name, new.requires_grad_(), moments)
         if fresh and old < len(rows):
             torch._foreach_zero_(fresh)
         if self.layer is not None:
             self.layer = self.layer.index_select(0, rows)
 
     def forget(self, name: str) -> None:
-        """Zero the moments of one tensor of the field."""
-        for key, value in self.adam.state.get(self.tensors[name], {}).items():
-            if key in MOMENTS:
-                value.zero_()
+        """Zero the moments of one tensor of the field, not its number of steps."""
+        _, *both = self.moments_of(self.tensors[name])
+        torch._foreach_zero_(both)
 
     def forget_motion(self) -> None:
-        """Zero the moments of the motion and the number of its steps, as at the start."""
+        """Zero the moments of the motion and its number of steps."""
         for leaf in self.motion:
-            for value in self.adam.state.get(leaf, {}).values():
-                value.zero_()
+            torch._foreach_zero_([*self.moments_of(leaf)])
+
+    def state_dict(self) -> dict[str, Any]:
+        """Moments in the layout of ``torch.optim.Adam``: tensors are numbered in the order of the groups."""
+        numbers = {leaf: n for n, leaf in enumerate(self.leaves)}
+        groups: dict[str, list[int]] = {}
+        for n, name in enumerate(self.groups):
+            groups.setdefault(name, []).append(n)
+        shared = {"betas": self.betas, "eps": EPSILON}
+        return {
+            "state": {
+                numbers[leaf]: dict(zip(STORED, moments, strict=True)) for leaf, moments in self._moments.items()
+            },
+            "param_groups": [{"name": name, **shared, "params": of} for name, of in groups.items()],
+        }
+
+    def _load(self, stored: Mapping[str, Any]) -> None:
+        """Take decays and moments from :meth:`state_dict`.
+
+        Raises:
+            ValueError: If its groups differ.
+        """
+        sizes = Counter(self.groups)
+        groups = {group["name"]: len(group["params"]) for group in stored["param_groups"]}
+        if sizes != groups:
+            raise ValueError(f"tensors per group are {groups}, not {dict(sizes)}")
+        self.betas = tuple(stored["param_groups"][0]["betas"])
+        leaves = self.leaves
+        for n, moments in stored["state"].items():
+            step, first, second = (moments[name].to(leaves[n].device) for name in STORED)
+            self._moments[leaves[n]] = step, first, second
 
 
-def _shorten(gradients: list[Tensor], longest: float) -> None:
-    """Scale gradients together, in place, so that they are at most as long as ``longest``."""
-    length = torch.nn.utils.get_total_norm(gradients)
-    share = (longest / (length + 1e-6)).clamp(max=1.0)  # the device need not be asked
-    for gradient in gradients:
-        gradient.mul_(share)
+def field_of(tensors: Mapping[str, Tensor], layer: Tensor | None) -> GaussianField:
+    """A field of tensors by name of their group."""
+    parts = dict(tensors)
+    if "colour_rest" in parts:
+        parts["colour_sh"] = torch.cat([parts.pop("colour_constant"), parts.pop("colour_rest")], dim=1)
+    return GaussianField(**parts, layer=layer)

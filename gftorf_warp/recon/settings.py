@@ -81,21 +81,6 @@ class BatchRule(enum.StrEnum):
     """As ``root`` with rates times b: as far per image where gradients agree, which short runs need."""
 
 
-class Kernels(enum.StrEnum):
-    """How much of a step, beside the rendering, is done by kernels instead of torch: the same to rounding."""
-
-    AUTO = "auto"
-    """``graph`` on CUDA, ``loss`` on a CPU."""
-    NONE = "none"
-    """Nothing."""
-    LOSS = "loss"
-    """Losses of images that contain the similarity."""
-    STEP = "step"
-    """These and random backgrounds, which are other draws of the same kind: single steps to compare ``graph`` with."""
-    GRAPH = "graph"
-    """The whole step, captured as one CUDA graph; on a CPU the same without one. What cannot be one is ``loss``."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class Rates:
     """Learning rates of Adam: the size of one step, whatever the size of the gradient (method, section 6.5)."""
@@ -275,8 +260,8 @@ class ReconSettings:
     """Amplitude B of the random background, uniform in [-B, B] per pixel, channel and image; 0 is black."""
     motion_gradient_max: float | None = 1.0
     """Longest gradient of the motion; a longer one is shortened [1/m for nodes, 1 for a network]. None: never."""
-    kernels: Kernels = Kernels.AUTO
-    """How much of a step is done by kernels instead of torch."""
+    graph: bool = True
+    """Whether steps are captured as CUDA graphs; on a CPU there are none. Changes no operation."""
     failures_max: int = 5
     """So many steps without a finite loss and gradient in a row go back to the last checkpoint, with halved rates."""
     rollbacks_max: int = 3

@@ -1,8 +1,8 @@
-"""Everything an optimisation knows at one moment, as a value that can be stored and rebuilt."""
+"""The complete state of an optimisation between two steps, which can be stored and rebuilt."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import torch
 from jaxtyping import Float
@@ -20,49 +20,60 @@ from .observations import Observations
 from .optimiser import Optimiser, betas_of
 from .settings import ReconSettings
 
-FORMAT = 2  # of the stored form; a higher one is refused
+FORMAT = 3  # of checkpoints; 1 and 2 are read, a higher one is refused
+SEED_MASK = 0x7FFFFFFF  # a seed as a positive int32, for kernels
+CUDA_STATE = 16  # bytes of the state of a CUDA generator
+
+
+@dataclass(kw_only=True)
+class Progress:
+    """How far a run is, as plain numbers."""
+
+    images: int = 0
+    """Optimised images."""
+    seconds: float = 0.0
+    """Wall clock spent so far [s]."""
+    rate_factor: float = 1.0
+    """Multiplies all learning rates."""
+    skipped: int = 0
+    """Skipped steps: loss or gradient not finite."""
+    rollbacks: int = 0
+    """Returns to a checkpoint."""
+    restarts: int = 0
+    """Collapsed random starts before this one."""
+    reset_at: int | None = None
+    """Optimised images at the last opacity reset; None: there was none."""
+    revived_at: int | None = None
+    """Optimised images when the motion was last reinitialised; None: never."""
+    revivals: int = 0
+    """How often it was."""
+    unseen_at: int = 0
+    """Optimised images at the last visibility pruning."""
+
+
+PROGRESS = [field.name for field in fields(Progress)]
 
 
 @dataclass(kw_only=True, eq=False)
-class State:
+class State(Progress):
     """An optimisation between two steps."""
 
     optimiser: Optimiser
     """Gaussians and moments."""
     motion: Motion
-    """Where they move."""
+    """The motion model."""
     attachment: Float[Tensor, "N M"]
-    """How each Gaussian hangs on the motion."""
+    """What the motion model needs of each Gaussian."""
     statistics: densify.Statistics
-    """What densification has seen since its last round."""
+    """Of densification, since the last one."""
     generator: torch.Generator
-    """On the CPU: the order of raw frames, and where halves of split Gaussians go."""
-    noise: torch.Generator
-    """On the device: random backgrounds."""
+    """On the CPU: order of the raw frames, and positions of the halves of split Gaussians."""
+    noise_seed: int
+    """Of random backgrounds, which are a function of it and of the number of the image."""
     queue: list[int]
     """Batches still to be drawn in this epoch."""
-    images: int
-    """Optimised images."""
-    seconds: float
-    """Wall clock spent so far [s]."""
     sums: dict[str, Tensor]
     """Loss terms and others, summed over the images since the last logged row."""
-    rate_factor: float = 1.0
-    """Multiplies all rates."""
-    skipped: int = 0
-    """Steps without a finite loss and gradient so far."""
-    rollbacks: int = 0
-    """Returns to a checkpoint so far."""
-    restarts: int = 0
-    """Random starts before this one, all in the dark."""
-    reset_at: int | None = None
-    """Optimised images at the last reset of the opacities; None: there was none."""
-    revived_at: int | None = None
-    """Optimised images when the motion was last drawn anew; None: it never was."""
-    revivals: int = 0
-    """How often it was."""
-    unseen_at: int = 0
-    """Optimised images when Gaussians that nobody sees were last looked for."""
 
 
 def begin(observations: Observations, settings: ReconSettings, *, seed: int, device: torch.device | str) -> State:
@@ -87,10 +98,8 @@ def begin(observations: Observations, settings: ReconSettings, *, seed: int, dev
         attachment=motion.attach(field),
         statistics=densify.start(field),
         generator=generator,
-        noise=torch.Generator(device).manual_seed(seed),
+        noise_seed=seed & SEED_MASK,
         queue=[],
-        images=0,
-        seconds=0.0,
         sums={},
     )
 
@@ -109,33 +118,24 @@ def _motion(start: Start, observations: Observations, settings: ReconSettings, g
 
 
 def to_dict(state: State) -> dict[str, object]:
-    """Tensors, numbers, texts, lists and dictionaries only: what a safe loader reads back."""
+    """Tensors, numbers, strings, lists and dictionaries only, which a safe loader can read."""
     return {
         "format": FORMAT,
         "field": {name: value.detach() for name, value in state.optimiser.field.tensors().items()},
-        "adam": state.optimiser.adam.state_dict(),
+        "adam": state.optimiser.state_dict(),
         "motion": state.motion.to_dict(),
         "attachment": state.optimiser.field.mean.detach() if state.motion.follows_means else state.attachment,
         "statistics": {name: getattr(state.statistics, name) for name in densify.STATISTICS},
         "generator": state.generator.get_state(),
-        "noise": state.noise.get_state(),
+        "noise_seed": state.noise_seed,
         "queue": list(state.queue),
-        "images": state.images,
-        "seconds": state.seconds,
         "sums": dict(state.sums),
-        "rate_factor": state.rate_factor,
-        "skipped": state.skipped,
-        "rollbacks": state.rollbacks,
-        "restarts": state.restarts,
-        "reset_at": state.reset_at,
-        "revived_at": state.revived_at,
-        "revivals": state.revivals,
-        "unseen_at": state.unseen_at,
+        **{name: getattr(state, name) for name in PROGRESS},
     }
 
 
 def field_and_motion(stored: dict, device: torch.device | str) -> tuple[GaussianField, Motion, Tensor]:
-    """Gaussians, their motion and how they hang on it, from the stored form."""
+    """Gaussians, their motion and their attachment to it, from the stored form."""
     field = GaussianField(**{name: value.to(device) for name, value in stored["field"].items()})
     motion = motion_from_dict(stored["motion"]).to(device)
     attachment = motion.attach(field) if motion.follows_means else stored["attachment"].to(device)
@@ -143,29 +143,31 @@ def field_and_motion(stored: dict, device: torch.device | str) -> tuple[Gaussian
 
 
 def from_dict(stored: dict, device: torch.device | str) -> State:
-    """Rebuild a state from :func:`to_dict`; what follows is what would have followed, to the bit on a CPU."""
+    """Rebuild a state from :func:`to_dict`; on a CPU it continues to the same bits."""
     field, motion, attachment = field_and_motion(stored, device)
-    seen: dict[str, Tensor] = stored["statistics"]  # earlier runs did not look for the unseen
-    generator, noise = torch.Generator(), torch.Generator(device)
+    statistics = {name: value.to(device) for name, value in stored["statistics"].items()}
+    generator = torch.Generator()
     generator.set_state(stored["generator"].cpu())
-    drawn = stored["noise"].cpu()
-    if len(drawn) == len(noise.get_state()):
-        noise.set_state(drawn)
-    else:  # of another kind of device, whose generator is another: backgrounds go on with other numbers
-        noise.manual_seed(stored["images"])
+    progress = {name: stored[name] for name in PROGRESS if name in stored}  # format 1 had fewer
+    progress.setdefault("unseen_at", stored["images"])
     return State(
         optimiser=Optimiser(field, motion, stored["adam"]),
         motion=motion,
         attachment=attachment,
-        statistics=replace(densify.start(field), **{name: value.to(device) for name, value in seen.items()}),
+        statistics=replace(densify.start(field), **statistics),
         generator=generator,
-        noise=noise,
+        noise_seed=_noise_seed(stored),
         queue=list(stored["queue"]),
         sums={name: value.to(device) for name, value in stored["sums"].items()},
-        reset_at=stored.get("reset_at"),  # format 1 had none
-        restarts=stored.get("restarts", 0),  # neither had earlier runs
-        revived_at=stored.get("revived_at"),
-        revivals=stored.get("revivals", 0),
-        unseen_at=stored.get("unseen_at", stored["images"]),
-        **{name: stored[name] for name in ("images", "seconds", "rate_factor", "skipped", "rollbacks")},
+        **progress,
     )
+
+
+def _noise_seed(stored: dict) -> int:
+    """Seed of random backgrounds; formats 1 and 2 had the state of a generator of torch."""
+    if "noise_seed" in stored:
+        return stored["noise_seed"]
+    state = stored["noise"].cpu()
+    if len(state) == CUDA_STATE:  # seed and offset, eight bytes each
+        return int.from_bytes(bytes(state[:8].tolist()), "little") & SEED_MASK
+    return torch.Generator().set_state(state).initial_seed() & SEED_MASK

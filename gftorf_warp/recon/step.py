@@ -1,214 +1,332 @@
-"""One step of the optimiser: draw a batch, render, compare, descend; and what follows a step now and then."""
+"""One training step on the device: render a batch, evaluate the terms of the loss, descend.
+
+Runs eagerly on a CPU and is captured as a CUDA graph on a GPU: it reads nothing back and takes
+everything that changes from step to step from the control block.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
-from ..render import fused
-from . import densify
-from .objective import Seen, render_settings_at, terms, weights_at
+from ..render import descent, fused
+from ..render.api import Background, Rendering, ScreenGradient, rasterize
+from ..render.bridge import pairs_of
+from ..render.buffers import RenderSettings, Workspace
+from ..render.cuda import SideStreams
+from ..render.displacement import displaced
+from ..scene.gaussians import GaussianField
+from ..scene.motion import KeyMotion, Motion
+from .control import ControlBlock, GraphKey, ImageControl, ImageKey
 from .observations import Observations
-from .optimiser import frozen, rates_at
-from .settings import DensifySettings, Kernels, ReconSettings, Weights
-from .state import State
+from .optimiser import EPSILON, field_of
+from .padded import PaddedParameters
+from .settings import ReconSettings
+from .terms import LIGHT, Comparison, Term, View
 
-Map = Callable[[Callable, Iterable], Iterable]
-SEED_MASK = 0x7FFFFFFF  # a seed as a positive int32, for kernels
-
-
-def draw(state: State, observations: Observations, settings: ReconSettings) -> list[int]:
-    """Raw frames of the next step, without replacement within an epoch; the last batch of a run may be cut short."""
-    if not state.queue:
-        state.queue = torch.randperm(len(observations.batches), generator=state.generator).tolist()
-    batch = observations.batches[state.queue.pop()]
-    return batch[: settings.schedule.images - state.images]
+Map = Callable[[Callable[[int], "ImageGradients"], Iterable[int]], Iterable["ImageGradients"]]
+COLOUR_STREAM = 1  # of random numbers; that of quads and phasors is 0
 
 
-def step(
-    state: State, observations: Observations, settings: ReconSettings, run_all: Map = map
-) -> dict[str, float] | None:
-    """Advance a state by one batch.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ImageGradients:
+    """Gradients of the weighted terms of one image."""
 
-    The images of a batch are independent until their gradients are averaged, in the order of the frames. So ``run_all``
-    may work on several at once without changing a bit.
+    values: list[Tensor | None]
+    """With respect to the tensors of the field; None: zero."""
+    motion: list[Tensor | None]
+    """With respect to offsets and rotations at all keys."""
+    screen: ScreenGradient | None
+    """Of the rendering that densification is based on."""
+    pairs: list[Tensor]
+    """(tile, splat) pairs [1] of every rendering."""
 
-    Args:
-        state: Changed in place.
-        observations: What was measured.
-        settings: How.
-        run_all: ``map`` or the ``map`` of a pool of threads.
 
-    Returns:
-        None, or, if the loss or the gradient was not finite, the terms of the loss [1]: the step was skipped then.
-    """
-    frames = draw(state, observations, settings)
-    leaves = state.optimiser.leaves
-    moves = state.images >= settings.schedule.warm_up
-    if state.motion.follows_means:
-        state.attachment = state.motion.attach(state.optimiser.field)
-    weights, render = weights_at(settings, state.images), render_settings_at(settings, state.images)
-    rests = frozen(settings, state.images)
-    first = len(state.optimiser.tensors) if rests else 0  # of the leaves that learn; those of the motion come last
-    numbers = range(state.images, state.images + len(frames))
-    pairs = zip(numbers, frames, strict=True)
-    backgrounds = [_backgrounds(state, observations, frame, settings, weights, number) for number, frame in pairs]
+class Step:
+    """The operations of a step, for any key."""
 
-    def one(frame: int, lights: dict[str, Tensor]) -> tuple[dict[str, Tensor], Seen, list[Tensor | None]]:
-        field = state.optimiser.field
-        found, seen = terms(
-            field.map(torch.Tensor.detach) if rests else field,
-            state.motion if moves else None,
-            state.attachment,
-            observations,
-            frame,
-            settings,
-            weights,
-            lights,
+    def __init__(
+        self,
+        observations: Observations,
+        settings: ReconSettings,
+        terms: Sequence[Term],
+        control: ControlBlock,
+        padded: PaddedParameters,
+        betas: tuple[float, float],
+    ):
+        """Allocate what all steps share.
+
+        Args:
+            observations: What is compared.
+            settings: Of the run.
+            terms: All terms of the loss.
+            control: What differs between steps.
+            padded: Parameters and moments.
+            betas: Decays of the moments of Adam.
+        """
+        self.observations, self.settings, self.terms = observations, settings, tuple(terms)
+        self.control, self.padded, self.betas = control, padded, betas
+        device = observations.quads.device
+        self.output = descent.StepResults.empty(control.images, len(self.terms), control.images * len(View), device)
+        """Results and sums on the device."""
+        self._streams = SideStreams(control.images, device)
+        self._workspaces: defaultdict[tuple[int, View], Workspace] = defaultdict(Workspace)
+        self._scratch: defaultdict[tuple[int, str], fused.Scratch] = defaultdict(fused.Scratch)
+        self._sensor = observations.sensor_at(observations.batches[0][0])  # one shift; values from control
+        cameras = [*observations.colour_cameras.values(), observations.cameras[0]]
+        self._cameras = dict.fromkeys(View, observations.cameras[0]) | {View.COLOUR: cameras[0]}
+
+    def run(
+        self,
+        key: GraphKey,
+        motion: Motion,
+        render: RenderSettings,
+        table: descent.AdamTable,
+        send: Callable[[], None] | None,
+        map_images: Map = map,
+    ) -> None:
+        """One step, from the control block to new parameters.
+
+        Args:
+            key: Which operations.
+            motion: The motion model.
+            render: Renderer settings.
+            table: Addresses of parameters and moments; gets those of the gradients.
+            send: Uploads them; None: the caller does, after a capture.
+            map_images: ``map``, or that of a thread pool: images are independent.
+        """
+        key_motion = self._key_motion(key, motion)
+
+        def image(n: int) -> ImageGradients:
+            with self._streams.fork(n):
+                return self._image(n, key, key_motion, render)
+
+        images = [*map_images(image, range(len(key.images)))]
+        self._streams.join()
+        lists = self._gradient_lists(key, key_motion, images)
+        with torch.no_grad():
+            table.point(lists)
+            if send is not None:
+                send()
+            pairs = [count for image in images for count in image.pairs]
+            if pairs:
+                torch.cat(pairs, out=self.output.pairs[: len(pairs)])
+            descent.descend(
+                table,
+                self.control.rates,
+                self.output,
+                self.control.weights.flatten(1),
+                self.control.compared,
+                images=len(images),
+                renderings=len(pairs),
+                motion_from=len(self.padded.values),
+                motion_gradient_max=self.settings.motion_gradient_max,
+                capacity=render.pair_capacity,
+                betas=self.betas,
+                epsilon=EPSILON,
+            )
+            screens = [image.screen for image in images if image.screen is not None]
+            if screens:
+                camera, statistics = self._cameras[_primary(key.images[0])], self.padded.statistics
+                sums = statistics.gradient, statistics.pixels, statistics.weight
+                descent.add_statistics(screens, (camera.width, camera.height), self.output, *sums)
+
+    @property
+    def sorts_pairs(self) -> bool:
+        """Whether the last step sorted its (tile, splat) pairs."""
+        return any(not workspace.last.marks for workspace in self._workspaces.values())
+
+    def _key_motion(self, key: GraphKey, motion: Motion) -> KeyMotion | None:
+        """Motion at all keys of the batch, evaluated once; None: nothing moves yet."""
+        if not key.keys:
+            return None
+        attachment = self.padded.attachment
+        if motion.follows_means and not key.frozen:
+            attachment = motion.attach(self.padded.field)
+        return motion.at_keys(attachment, self.control.keys(key.keys))
+
+    def _image(self, n: int, key: GraphKey, key_motion: KeyMotion | None, render: RenderSettings) -> ImageGradients:
+        """Render one image, evaluate its terms, and differentiate them, independently of other images."""
+        image, control = key.images[n], self.control.image(n, key)
+        values = {name: value.detach().requires_grad_(not key.frozen) for name, value in self.padded.values.items()}
+        field, leaf = field_of(values, self.padded.layer), None
+        if key_motion is not None:
+            offset, rotation = key_motion
+            leaf = KeyMotion(_leaf_of(offset), None if rotation is None else _leaf_of(rotation))
+        renderings: dict[View, Rendering] = {}
+        displacement = None
+        no_view = any(term.view is None and term.name in image.terms for term in self.terms)
+        for view in [v for v in View if v in image.views or (no_view and v == View.TOF)]:
+            joint = view == View.TOF and "flow" in image.terms and View.FLOW not in image.views
+            moved, channels = self._moved(field, leaf, control, view, joint or view == View.FLOW)
+            if view == View.TOF:
+                displacement = None if leaf is None else moved.mean - field.mean
+            if view in image.views:
+                renderings[view] = self._render(view, n, image, moved, channels, control, render)
+            if joint:
+                renderings[View.FLOW] = renderings[view]
+        comparison = Comparison(
+            observations=self.observations,
+            settings=self.settings,
+            renderings=renderings,
+            rows=control.rows,
+            displacement=displacement,
+            mean_weight=self.padded.mean_weight,
+            flow_cameras=control.flow_cameras,
+            scratch=lambda name: self._scratch[n, name],
+        )
+        leaves = [*values.values(), *(t for t in leaf or () if t is not None)]
+        gradients = self._gradients(n, image, comparison, leaves)
+        primary = renderings.get(_primary(image))
+        return ImageGradients(
+            values=gradients[: len(values)],
+            motion=gradients[len(values) :],
+            screen=None if primary is None else primary.screen,
+            pairs=[pairs_of(self._workspaces[n, view]) for view in image.views],
+        )
+
+    def _moved(
+        self,
+        field: GaussianField,
+        leaf: KeyMotion | None,
+        control: ImageControl,
+        view: View,
+        channels: bool,
+    ) -> tuple[GaussianField, Float[Tensor, "N D"] | None]:
+        """The Gaussians at the time of a view, and their displacements along the flows."""
+        if leaf is None:
+            return field, None
+        mean, quaternion, ways = displaced(field.mean, field.quaternion, leaf, control.blend[view], channels=channels)
+        return replace(field, mean=mean, quaternion=quaternion), ways
+
+    def _render(
+        self,
+        view: View,
+        n: int,
+        image: ImageKey,
+        field: GaussianField,
+        channels: Float[Tensor, "N D"] | None,
+        control: ImageControl,
+        render: RenderSettings,
+    ) -> Rendering:
+        """One rendering of an image: the outputs that its terms read."""
+        joint = view == View.TOF and channels is not None
+        views = {view, View.FLOW} if joint else {view}
+        outputs = {"opacity"}
+        for term in self.terms:
+            if term.name in image.terms and term.view in views:
+                outputs |= term.outputs
+        camera, light = self._cameras[view], "phasor" if self.observations.phasors else "quads"
+        shape = {"phasor": 3, "quads": 1, "colour": 3}
+        background = {}
+        if LIGHT in outputs:
+            outputs = outputs - {LIGHT} | {light}
+            background[light] = 0
+        if view == View.COLOUR:
+            background["colour"] = COLOUR_STREAM
+        else:
+            field = replace(field, colour_sh=None)
+        if view == View.FLOW:
+            field = field.map(torch.Tensor.detach)
+        amplitude = self.settings.background
+        noise = {
+            name: fused.uniform(
+                (shape[name], camera.height, camera.width), control.noise_origin, amplitude, stream=stream
+            )
+            for name, stream in background.items()
+            if amplitude > 0
+        }
+        return rasterize(
+            field,
+            camera,
+            self._sensor,
             render,
+            control=control.camera[view],
+            background=Background(**noise),
+            screen_gradient=self.settings.densify.every is not None and view == _primary(image),
+            images=outputs,
+            extra=channels,
+            extra_detached=channels is not None,
+            workspace=self._workspaces[n, view],
         )
-        gradients: list[Tensor | None] = [None] * len(leaves)
-        loss = torch.stack([*found.values()]).sum() if found else None
-        if loss is not None and loss.requires_grad:
-            gradients[first:] = torch.autograd.grad(loss, leaves[first:], allow_unused=True)
-        return {name: value.detach() for name, value in found.items()}, seen, gradients
 
-    results = list(run_all(lambda pair: one(*pair), zip(frames, backgrounds, strict=True)))
-    gradients = [_mean([gradients[n] for _, _, gradients in results]) for n in range(len(leaves))]
-    before, state.images = state.images, state.images + len(frames)
-    checked = [value for found, _, _ in results for value in found.values()]
-    present = [gradient for gradient in gradients if gradient is not None]
-    checked += [torch.nn.utils.get_total_norm(present)] if present else []
-    rates = rates_at(settings, before, state.rate_factor, reset_at=state.reset_at, revived_at=state.revived_at)
-    options = settings.densify
-    due = densify.round_is_due(before, state.images, options, settings.schedule)
-    if due and options.loses_step:
-        rates = {name: rate if name == "motion" else 0.0 for name, rate in rates.items()}
-    sound = torch.stack(checked).sum().isfinite() if checked else None
-    if sound is not None and not bool(sound):
-        return {name: float(sum(found.get(name, 0.0) for found, _, _ in results)) for name in results[0][0]}
-    for frame, (found, seen, _) in zip(frames, results, strict=True):
-        _account(state, observations, frame, found, seen)
-    state.optimiser.step(gradients, rates, settings.motion_gradient_max)
-    densify_after(state, observations, before, settings)
-    return None
+    def _gradients(self, n: int, image: ImageKey, comparison: Comparison, leaves: list[Tensor]) -> list[Tensor | None]:
+        """Gradients of the weighted terms of one image; the results of the terms are stored."""
+        values, weights = [], []
+        results = self.output.results.view(-1, len(self.terms), self.control.weights.shape[-1])
+        for k, term in enumerate(self.terms):
+            if term.name not in image.terms:
+                continue
+            value = term.loss(comparison, results[n, k])
+            if value.data_ptr() != results[n, k].data_ptr():
+                results.data[n, k, 0] = value.detach()  # .data: other rows are part of a graph by now
+            if value.requires_grad:
+                values.append(value)
+                weights.append(self.control.weights[n, k, 0])
+        wanted = [leaf for leaf in leaves if leaf.requires_grad]
+        if not values or not wanted:
+            return [None] * len(leaves)
+        loss = fused.sum_for_gradients(weights, values)
+        return _in_order(leaves, wanted, torch.autograd.grad(loss, wanted, allow_unused=True))
 
+    def _gradient_lists(
+        self, key: GraphKey, key_motion: KeyMotion | None, images: list[ImageGradients]
+    ) -> list[list[Tensor | None]]:
+        """Gradients of all leaves as few enough lists, which Adam sums up."""
+        learning = self.padded.motion
+        of_values, of_motion = self._back_through_motion(key, key_motion, images)
+        none: list[Tensor | None] = [None] * len(learning)
+        first, *others = [image.values for image in images]
+        lists = [[*first, *of_motion], *([*values, *none] for values in others)]
+        if any(gradient is not None for gradient in of_values):
+            lists.append([*of_values, *none])
+        last = descent.GRADIENTS - 1
+        if len(lists) > descent.GRADIENTS:
+            lists[last:] = [[fused.added(same) for same in zip(*lists[last:], strict=True)]]
+        return lists
 
-class Singles:
-    """The steps of one run, one after the other."""
-
-    def __init__(self, state: State, observations: Observations, settings: ReconSettings, run_all: Map = map):
-        self._state, self._observations, self._settings = state, observations, settings
-        self._run_all, self._first, self._failures = run_all, True, 0
-
-    def step(self) -> dict[str, float] | None:
-        """One step; what it returns is that of :func:`step`."""
-        run_all = map if self._first else self._run_all  # the first one compiles kernels: one thread at a time
-        broken, self._first = step(self._state, self._observations, self._settings, run_all), False
-        self._failures = 0 if broken is None else self._failures + 1
-        self._state.skipped += broken is not None
-        return broken
-
-    def collect(self) -> int:
-        """How many steps in a row, up to the last one, changed nothing because something was not finite."""
-        return self._failures
-
-
-def threads_for(settings: ReconSettings, device: torch.device | str, available: int) -> tuple[ReconSettings, int]:
-    """Settings and number of images worked on at once.
-
-    On a CPU every image has one thread, so that the result depends on no number of cores.
-    """
-    if torch.device(device).type != "cpu":
-        return settings, 1
-    one = replace(settings, render=replace(settings.render, threads=1))
-    return one, available
-
-
-def pool(workers: int) -> ThreadPoolExecutor:
-    """Threads that work on the images of a batch."""
-    return ThreadPoolExecutor(workers, thread_name_prefix="gftorf-images")
-
-
-def _backgrounds(
-    state: State, observations: Observations, frame: int, settings: ReconSettings, weights: Weights, number: int
-) -> dict[str, Tensor]:
-    """Uniform in [-B, B] per pixel and channel, for every image that will be compared; ``number`` counts images."""
-    if settings.background == 0.0:
-        return {}
-    size = observations.quads.shape[1:]
-    shapes: dict[str, tuple[int, ...]] = {}
-    if weights.quads > 0:
-        shapes = {"phasor": (3, *size)} if observations.phasors else {"quads": (1, *size)}
-    if weights.colour > 0 and frame in observations.colour:
-        shapes["colour"] = tuple(observations.colour[frame].shape)
-
-    device = observations.quads.device
-    if settings.kernels == Kernels.STEP:
-        seed = state.noise.initial_seed() & SEED_MASK
-        origin = torch.tensor([seed, number], dtype=torch.int32, device=device)
-        streams = enumerate(shapes.items())
-        return {name: fused.uniform(shape, origin, settings.background, stream=n) for n, (name, shape) in streams}
-
-    def uniform(shape: tuple[int, ...]) -> Tensor:
-        drawn = torch.rand(shape, generator=state.noise, device=device)
-        return settings.background * (2.0 * drawn - 1.0)
-
-    return {name: uniform(shape) for name, shape in shapes.items()}
-
-
-def _mean(gradients: list[Tensor | None]) -> Tensor | None:
-    """Mean over the images of a batch; an image without a gradient counts as zero."""
-    present = [gradient for gradient in gradients if gradient is not None]
-    if len(gradients) == 1:
-        return gradients[0]
-    return torch.stack(present).sum(dim=0) / len(gradients) if present else None
-
-
-def _account(state: State, observations: Observations, frame: int, found: dict[str, Tensor], seen: Seen) -> None:
-    """Add an image to the sums of the log and to the statistics of densification."""
-    rendering = seen.tof or seen.colour
-    if rendering is None:  # nothing of this frame is compared
-        return
-    with torch.no_grad():
-        values = {**found, "loss": torch.stack([*found.values()]).sum(), "quad_mse": seen.squared}
-        values["opacity"] = rendering.opacity.detach().mean()
-        values["count"] = torch.ones_like(seen.squared)
-        for name, value in values.items():
-            state.sums[name] = state.sums[name] + value if name in state.sums else value.clone()
-        if rendering.screen is not None:
-            camera = (observations.cameras if seen.tof else observations.colour_cameras)[frame]
-            state.statistics = densify.observe(state.statistics, rendering.screen, camera)
-
-
-def densify_after(state: State, observations: Observations, before: int, settings: ReconSettings) -> None:
-    """Rounds and resets that are due after a step that began after ``before`` images."""
-    options, schedule = settings.densify, settings.schedule
-    if densify.round_is_due(before, state.images, options, schedule):
-        unseen = options.unseen_weight * (state.images - state.unseen_at)
-        looks = unseen_are_due(state, observations, options)
-        _, state.statistics = densify.round_of(
-            state.optimiser,
-            state.statistics,
-            options,
-            state.generator,
-            judge_scale=state.images > options.scale_from,
-            unseen_weight=unseen if looks else None,
+    def _back_through_motion(
+        self, key: GraphKey, key_motion: KeyMotion | None, images: list[ImageGradients]
+    ) -> tuple[list[Tensor | None], list[Tensor | None]]:
+        """Gradients of the field and of the motion parameters through the motion, for all images at once."""
+        values = [] if key.frozen else [*self.padded.values.values()]
+        none: tuple[list[Tensor | None], list[Tensor | None]] = (
+            [None] * len(self.padded.values),
+            [None] * len(self.padded.motion),
         )
-        if looks:
-            state.unseen_at = state.images
-        if not state.motion.follows_means:  # others are asked in every step
-            state.attachment = state.motion.attach(state.optimiser.field)
-    if densify.reset_is_due(before, state.images, options, schedule):
-        densify.reset_opacity(state.optimiser, options)
-        state.reset_at = state.images
+        shared = [t for t in key_motion or () if t is not None]
+        pairs = [
+            (total, tensor)
+            for tensor, *given in zip(shared, *(image.motion for image in images), strict=True)
+            if tensor.requires_grad and (total := fused.added(given)) is not None
+        ]
+        leaves = [*values, *self.padded.motion]
+        if not pairs or not leaves:
+            return none
+        totals, tensors = zip(*pairs, strict=True)
+        loss = fused.sum_for_gradients(totals, tensors)
+        gradients = _in_order(leaves, leaves, torch.autograd.grad(loss, leaves, allow_unused=True))
+        return gradients[: len(values)] or none[0], gradients[len(values) :]
 
 
-def unseen_are_due(state: State, observations: Observations, options: DensifySettings) -> bool:
-    """Whether a round removes who was not seen: two epochs since the last time contain every raw frame."""
-    frames = sum(len(batch) for batch in observations.batches)
-    return options.unseen_from is not None and state.images >= max(options.unseen_from, state.unseen_at + 2 * frames)
+def _leaf_of(tensor: Tensor) -> Tensor:
+    """The same values as a leaf."""
+    return tensor.detach().requires_grad_(tensor.requires_grad)
+
+
+def _primary(image: ImageKey) -> View:
+    """The view that densification is based on."""
+    return View.TOF if View.TOF in image.views else View.COLOUR
+
+
+def _in_order(leaves: list[Tensor], wanted: list[Tensor], gradients: Iterable[Tensor | None]) -> list[Tensor | None]:
+    """Contiguous gradients of leaves, of which only some are wanted."""
+    given = iter(gradients)
+    ids = {id(leaf) for leaf in wanted}
+    found = [next(given) if id(leaf) in ids else None for leaf in leaves]
+    return [None if gradient is None else gradient.contiguous() for gradient in found]

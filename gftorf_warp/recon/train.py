@@ -1,16 +1,11 @@
-"""Reconstruction: steps until the images are used up, in a folder that survives interruptions."""
+"""Reconstruction of a sequence in a folder that survives interruptions."""
 
 from __future__ import annotations
 
-import contextlib
 import enum
-import functools
 import logging
-import math
-import signal
-import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
@@ -21,23 +16,19 @@ from ..data.decode import unambiguous_range
 from ..data.estimates import DC_TOLERANCE, dc_offset
 from ..data.read import read, read_truth
 from ..data.sequence import Sequence, Truth
-from ..errors import DivergedError, InputError, UsageError
-from ..render.buffers import available_threads
+from ..errors import InputError, UsageError
 from ..scene.changes import Wording, changed
-from . import checkpoint, darkness, dead, folder, presets
-from .captured import steps_of
+from . import checkpoint, folder, presets
 from .config import config_of
-from .diagnostics import Watch
-from .observations import Observations, input_of, observe
+from .diagnostics import Diagnostics
+from .loop import Progress, TrainingLoop
+from .observations import input_of, observe
 from .record import Metrics, log_to
 from .run import Run
 from .settings import FlowSource, Input, Method, ReconSettings
-from .state import State, begin, from_dict, to_dict
-from .step import pool, threads_for
+from .state import begin, from_dict
 
 LOG = logging.getLogger("gftorf_warp")
-OTHER_SEED = 1_000_003  # between the seeds of one run, far from those that somebody counts up
-Progress = Callable[..., None]
 Choice = TypeVar("Choice", bound=enum.StrEnum)
 CHANGES = Wording(
     option="--set",
@@ -159,9 +150,9 @@ def _run(sequence, out, settings, config, seed, device, goes_on, begun, progress
     }
     folder.write_config(out, config)
     metrics = Metrics(out / "metrics.jsonl")
-    watch = Watch(observations, _truth(sequence), out / "diagnostics.jsonl")
-    for record in (metrics, watch):
-        record.rewind(state.images)
+    diagnostics = Diagnostics(observations, _truth(sequence), out / "diagnostics.jsonl")
+    for rows in (metrics, diagnostics):
+        rows.rewind(state.images)
     verb = "goes on at" if stored is not None else "starts at"
     moving = int((state.optimiser.layer > 0).sum()) if state.optimiser.layer is not None else 0
     count = len(state.optimiser.field)
@@ -172,8 +163,10 @@ def _run(sequence, out, settings, config, seed, device, goes_on, begun, progress
     def clock() -> float:
         return earlier + time.monotonic() - begun
 
-    loop = _Loop(observations, settings, seed, out, device, metrics, watch, clock, progress)
-    state = loop.until_done(state)
+    on_cpu = replace(settings.render, threads=1) if torch.device(device).type == "cpu" else settings.render
+    state = TrainingLoop(
+        observations, replace(settings, render=on_cpu), seed, out, metrics, diagnostics, clock, progress
+    ).run(state)
     folder.write_config(
         out,
         config
@@ -213,188 +206,3 @@ def _truth(sequence: Sequence) -> Truth | None:
     except InputError as error:
         LOG.warning("diagnostics go without truth: %s: %s", error.where, error.what)
         return None
-
-
-class _Loop:
-    """Steps, rows of metrics, checkpoints, and the way back when numbers leave the finite."""
-
-    def __init__(
-        self,
-        observations: Observations,
-        settings: ReconSettings,
-        seed: int,
-        out: Path,
-        device: torch.device | str,
-        metrics: Metrics,
-        watch: Watch,
-        clock: Callable[[], float],
-        progress: Progress | None,
-    ):
-        self.observations, self.seed, self.out, self.device = observations, seed, out, device
-        self.settings, self.workers = threads_for(settings, device, available_threads())
-        self.metrics, self.watch, self.clock, self.progress = metrics, watch, clock, progress
-        self.judged_at = darkness.judged_at(settings)
-        self.saved_at = clock()
-
-    def until_done(self, state: State) -> State:
-        total = self.settings.schedule.images
-        if state.images == 0:
-            self.save(state)
-            self.watch.look(state, self.settings)
-        with _one_torch_thread(self.device), pool(self.workers) as threads, _signals() as stop:
-            run_all = threads.map if self.workers > 1 else map
-            steps = steps_of(state, self.observations, self.settings, run_all)
-            while state.images < total:
-                before = state.images
-                broken = steps.step()
-                if broken is not None:
-                    LOG.warning("step at image %d skipped, not finite: %s", state.images, broken)
-                elif not (self.is_due(before, state.images) or stop.is_set()):
-                    continue
-                seen = self.watch.begin(state, self.settings) if self.watch.due(before, state.images, total) else None
-                died = seen is not None and state.images < total and dead.is_dead(state, self.settings)
-                failures = steps.collect()  # waits for the steps
-                if failures >= self.settings.failures_max:
-                    state = self.go_back(state, broken)
-                    steps = steps_of(state, self.observations, self.settings, run_all)
-                    continue
-                every = self.settings.schedule.log_every
-                if state.images // every > before // every or state.images >= total:
-                    self.report(state)
-                if self.judged_at is not None and before < self.judged_at <= state.images and self.is_dark(state):
-                    state = self.begin_again(state)
-                    steps = steps_of(state, self.observations, self.settings, run_all)
-                    continue
-                if seen is not None:
-                    self.watch.finish(seen, state, self.settings)
-                    if died:
-                        dead.revive(state, self.settings)
-                if stop.is_set():
-                    self.save(state)
-                    LOG.info("interrupted at image %d of %d, stored", state.images, total)
-                    raise KeyboardInterrupt
-                if self.saving_is_due and not failures:
-                    self.save(state)
-        self.save(state)
-        return state
-
-    def is_due(self, before: int, after: int) -> bool:
-        """Whether there is anything to be done besides the next step."""
-        every, total = self.settings.schedule.log_every, self.settings.schedule.images
-        return after // every > before // every or self.watch.due(before, after, total) or self.saving_is_due
-
-    @property
-    def saving_is_due(self) -> bool:
-        """Whether the last checkpoint is old."""
-        return self.clock() - self.saved_at > self.settings.schedule.checkpoint_every_s
-
-    def save(self, state: State) -> None:
-        state.seconds = self.saved_at = self.clock()
-        checkpoint.save(self.out, to_dict(state))
-
-    def report(self, state: State) -> None:
-        """One row of metrics: means over the images since the last one."""
-        read = torch.stack([*state.sums.values()]).tolist() if state.sums else []  # at once
-        sums, state.sums = dict(zip(state.sums, read, strict=True)), {}
-        count = sums.pop("count", 0.0)
-        if not count:
-            return
-        means = {name: value / count for name, value in sums.items()}
-        mse = means.pop("quad_mse")
-        psnr = 10.0 * math.log10(self.peak**2 / mse) if mse > 0 else None
-        row: dict[str, float | int | None] = {"images": state.images, "seconds": self.clock()}
-        row |= {"loss": means.pop("loss"), **means}
-        row |= {"gaussians": len(state.optimiser.field), "quad_psnr_db": psnr}
-        self.metrics.add(row)
-        if self.progress is not None:
-            total, shown = self.settings.schedule.images, {"loss": row["loss"], "psnr_db": psnr}
-            self.progress(state.images, total, **shown, gaussians=row["gaussians"])
-
-    @functools.cached_property
-    def peak(self) -> float:
-        """Largest absolute value of what is compared, in the units of the optimisation."""
-        shown = self.observations
-        measured = {0: shown.quads[torch.as_tensor(shown.sequence.measured)]}
-        images = shown.phasors or (measured if self.settings.weights.quads > 0 else shown.colour)
-        return max(float(image.abs().max()) for image in images.values())
-
-    def is_dark(self, state: State) -> bool:
-        """Whether the run sees nothing and may begin again; if it may not, the log says so."""
-        losses = [float(row["quads"] or 0.0) for row in self.metrics.rows()]
-        if not darkness.is_dark(losses, self.observations, self.settings):
-            return False
-        again = state.restarts < self.settings.restarts_max
-        then = "begins again with another seed" if again else "goes on all the same"
-        LOG.warning("after %d images the loss is still that of black images: %s", state.images, then)
-        return again
-
-    def begin_again(self, state: State) -> State:
-        """Another random start, with the time and the failures of those before."""
-        number = state.restarts + 1
-        anew = begin(self.observations, self.settings, seed=self.seed + OTHER_SEED * number, device=self.device)
-        anew.restarts, anew.skipped, anew.rollbacks = number, state.skipped, state.rollbacks
-        for record in (self.metrics, self.watch):
-            record.rewind(-1)
-        self.save(anew)
-        self.watch.look(anew, self.settings)
-        return anew
-
-    def go_back(self, state: State, broken: dict[str, float] | None) -> State:
-        """The last good checkpoint, with halved rates.
-
-        Raises:
-            DivergedError: If that has been done too often.
-        """
-        if state.rollbacks >= self.settings.rollbacks_max:
-            raise DivergedError(
-                "the optimisation diverged",
-                where=f"{self.out}, image {state.images}",
-                why=f"{self.settings.failures_max} steps in a row were not finite after {state.rollbacks} returns to a "
-                f"checkpoint: {broken or 'found late'}, {len(state.optimiser.field)} Gaussians",
-                fix="check the sequence with `gftorf check`, or lower the learning rates",
-            )
-        stored = checkpoint.last(self.out, self.device)
-        assert stored is not None, "a checkpoint is written before the first step"
-        restored = from_dict(stored, self.device)
-        restored.rate_factor = 0.5 * state.rate_factor
-        restored.rollbacks, restored.skipped = state.rollbacks + 1, state.skipped
-        for record in (self.metrics, self.watch):
-            record.rewind(restored.images)
-        LOG.warning("back to image %d with rates times %g", restored.images, restored.rate_factor)
-        return restored
-
-
-@contextlib.contextmanager
-def _one_torch_thread(device: torch.device | str) -> Iterator[None]:
-    """Small tensors are fastest on one thread, and their sums do not depend on the number of cores then."""
-    before = torch.get_num_threads()
-    if torch.device(device).type == "cpu":
-        torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
-
-
-@contextlib.contextmanager
-def _signals() -> Iterator[threading.Event]:
-    """An event that the first Ctrl-C or SIGTERM sets; the second one acts at once. Other threads get no signals."""
-    stop = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield stop
-        return
-    numbers = (signal.SIGINT, signal.SIGTERM)
-    before = {number: signal.getsignal(number) for number in numbers}
-
-    def first(*_) -> None:
-        stop.set()
-        for number in numbers:
-            signal.signal(number, before[number])
-
-    for number in numbers:
-        signal.signal(number, first)
-    try:
-        yield stop
-    finally:
-        for number in numbers:
-            signal.signal(number, before[number])

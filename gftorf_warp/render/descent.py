@@ -1,6 +1,6 @@
-"""The end of a step, behind its gradients, as a few kernels: whether it counts, Adam, running sums and statistics.
+"""The end of a training step as three launches: validity, Adam, running sums and statistics.
 
-recon/ holds the same in plain torch: torch's Adam is the oracle of this one.
+torch's Adam is the oracle of this one (tests/test_fused.py).
 """
 
 from __future__ import annotations
@@ -15,91 +15,91 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..kernels.training.adam import COLUMNS, GRADIENT, GRADIENTS, LENGTH, MORE, SIZES
-from ..kernels.training.step_end import FOUND, PART, SUMS
+from ..kernels.training.step_end import COLUMNS_MAX, PART, RENDERINGS_MAX, RESULTS, SCREENS, TOTALS
 from . import training
 from .api import ScreenGradient
 from .bridge import array_over
 from .cuda import stream_of
 
-FOUND_NAMES = ("quads", "quad_mse", "opacity", "flow", "distortion", "motion_size")
-"""What is found of an image, in the order of the kernel."""
-SUM_NAMES = (*FOUND_NAMES, "loss", "count")
-"""What is summed up over images."""
+TOTAL_NAMES = ("quad_mse", "opacity", "loss", "count")
+"""Names of the sums besides those of the terms, in the order of the kernel."""
 
 
 class AdamTable:
-    """Where the tensors of an Adam step lie. Good for as long as they do, so a captured graph may hold one.
+    """Addresses of the tensors of an Adam step, valid as long as the tensors live.
 
-    Gradients may lie elsewhere in the next step: :meth:`point` finds them, :meth:`send` tells the device, and may do so
-    after a graph that reads the table was captured, and before it is replayed.
+    Gradients may have other addresses in the next step: :meth:`point` notes them, :meth:`send` uploads
+    them. A CUDA graph may read the table: it is captured between the two, and replayed after both.
     """
 
     def __init__(
         self,
         parameters: Sequence[Tensor],
-        gradients: Sequence[Tensor | None],
         moments: Sequence[tuple[Tensor, Tensor, Tensor]],
     ):
-        """Look up where T >= 1 tensors lie; an upload, so not for a stream that is being captured.
+        """Collect the addresses of T >= 1 tensors; uploads, so not while a stream is captured.
 
         Args:
             parameters: Float32, contiguous, on one device.
-            gradients: Of their shapes; None: there is none, the tensor is left alone.
-            moments: (step, first moment, second moment) of each; the step is a float32 number on the same device.
+            moments: (step, first moment, second moment) of each; the step is a float32 number there.
 
         Raises:
-            ValueError: If a tensor is not float32, not contiguous, elsewhere, or of another shape than its parameter.
+            ValueError: If a tensor has another type, shape or device, or is not contiguous.
         """
         device = parameters[0].device
         self._parameters, self._moments = list(parameters), list(moments)
-        rows = []
+        self._host = []
         for value, (step, first, second) in zip(parameters, moments, strict=True):
             for tensor in (value, first, second, step):
                 _check(tensor, device, None if tensor is step else value.shape)
-            none = [0] * (GRADIENTS - 1)
-            rows.append([value.data_ptr(), 0, *(t.data_ptr() for t in (first, second, step)), value.numel(), *none])
-        self._host = rows
+            state = [tensor.data_ptr() for tensor in (first, second, step)]
+            self._host.append([value.data_ptr(), 0, *state, value.numel(), *[0] * (GRADIENTS - 1)])
         with stream_of(parameters[0]):
             width = training.adam_block(wp.device_from_torch(device))
-        ends = list(itertools.accumulate(-(-row[LENGTH] // width) for row in rows))
-        parts = list(itertools.accumulate(-(-row[LENGTH] // PART) for row in rows))
-        self.rows = torch.empty(len(rows), COLUMNS, dtype=torch.int64, device=device)
+        ends = list(itertools.accumulate(-(-row[LENGTH] // width) for row in self._host))
+        parts = list(itertools.accumulate(-(-row[LENGTH] // PART) for row in self._host))
+        count = len(self._host)
+        self.rows = torch.empty(count, COLUMNS, dtype=torch.int64, device=device)
         """[T, 9] addresses and lengths, see ``kernels/training/adam.py``."""
         self.first_block = torch.tensor([0, *ends[:-1]], dtype=torch.int32, device=device)
-        """[T] blocks of elements before those of a tensor."""
-        self.sizes = torch.empty(len(rows), SIZES, dtype=torch.float32, device=device)
-        """[T, 3] scratch: what a step comes to."""
+        """[T] number of Adam's blocks before those of a tensor."""
+        self.sizes = torch.empty(count, SIZES, dtype=torch.float32, device=device)
+        """[T, 3] scratch: step sizes."""
         self.blocks = ends[-1]
-        """Blocks in all."""
+        """Number of Adam's blocks."""
         self.parts = [0, *parts]
-        """Parts of gradients, whose squares are added up at once, before those of a tensor, and in all."""
+        """Number of parts of gradients before those of a tensor, and in all."""
         self.first_part = torch.tensor(self.parts[:-1], dtype=torch.int32, device=device)
         """The same on the device."""
         self.partials = torch.empty(parts[-1], dtype=torch.float32, device=device)
         """[P] scratch: sums of squares."""
-        self.point(gradients)
+        self._gradients: list[Tensor] = []
         self.send()
 
-    def point(self, *gradients: Sequence[Tensor | None]) -> None:
-        """Note where gradients lie, without telling the device: one to four lists of them, of which the sums count.
+    def point(self, gradients: Sequence[Sequence[Tensor | None]]) -> None:
+        """Note where gradients are, without an upload.
+
+        Args:
+            gradients: One to four lists with a gradient of every tensor, or None; they are summed.
 
         Raises:
             ValueError: As above.
         """
         self._gradients = []
-        for row, value, *found in zip(self._host, self._parameters, *gradients, strict=True):
-            present = [gradient for gradient in found if gradient is not None]
+        for row, value, *given in zip(self._host, self._parameters, *gradients, strict=True):
+            present = [gradient for gradient in given if gradient is not None]
             for gradient in present:
                 _check(gradient, value.device, value.shape)
-            row[GRADIENT], *row[MORE:] = [g.data_ptr() for g in present] + [0] * (GRADIENTS - len(present))
-            self._gradients += present  # an address keeps nothing alive
+            addresses = [gradient.data_ptr() for gradient in present]
+            row[GRADIENT], *row[MORE:] = addresses + [0] * (GRADIENTS - len(present))
+            self._gradients += present  # an address keeps no memory alive
 
     def send(self) -> None:
-        """Tell the device; waits for it."""
+        """Upload the addresses; waits for the device."""
         self.rows.copy_(torch.tensor(self._host, dtype=torch.int64))
 
     def release(self) -> None:
-        """Let go of the gradients, whose memory belongs to a graph that was captured."""
+        """Drop the references to gradients, whose memory belongs to a captured graph."""
         self._gradients = []
 
 
@@ -111,91 +111,102 @@ def _check(tensor: Tensor, device: torch.device, shape: torch.Size | None) -> No
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Ledger:
-    """What one run counts and sums up on its device."""
+class StepResults:
+    """What the steps of one run count and sum up on the device."""
 
-    found: Float[Tensor, "B F"]
-    """Of each image of a step, in the order of ``FOUND_NAMES``, without weights."""
+    results: Float[Tensor, "B L3"]
+    """Unweighted results of the latest step: of every image and term the term, its mean squared
+    difference, its mean opacity."""
+    pairs: Int[Tensor, "R"]
+    """(tile, splat) pairs of every rendering of the latest step."""
     counts: Int[Tensor, "4"]
-    """Steps that failed, in a row, and the most pairs of an image."""
+    """Skipped steps, skipped steps in a row, most pairs of a rendering, steps with too many pairs."""
     sums: Float[Tensor, "S"]
-    """Over images of sound steps, in the order of ``SUM_NAMES``, with weights."""
+    """Weighted terms over the images of valid steps, then those of ``TOTAL_NAMES``."""
 
     @classmethod
-    def empty(cls, images: int, device: torch.device) -> Ledger:
-        """Nothing happened yet; a step has up to so many images."""
+    def empty(cls, images: int, terms: int, renderings: int, device: torch.device) -> StepResults:
+        """Before the first step, for at most so many images, terms and renderings.
+
+        Raises:
+            ValueError: If the kernel has no memory for so many.
+        """
+        if RESULTS * terms > COLUMNS_MAX or renderings > RENDERINGS_MAX:
+            limits = f"{COLUMNS_MAX // RESULTS} terms and {RENDERINGS_MAX} renderings"
+            raise ValueError(f"{terms} terms and {renderings} renderings, at most {limits} per step")
         return cls(
-            found=torch.zeros(images, FOUND, device=device),
+            results=torch.zeros(images, RESULTS * terms, device=device),
+            pairs=torch.zeros(renderings, dtype=torch.int32, device=device),
             counts=torch.zeros(4, dtype=torch.int32, device=device),
-            sums=torch.zeros(SUMS, device=device),
+            sums=torch.zeros(terms + TOTALS, device=device),
         )
 
 
 def descend(
     table: AdamTable,
     rates: Float[Tensor, "T"],
-    ledger: Ledger,
-    weights: Sequence[float],
+    step: StepResults,
+    weights: Float[Tensor, "B L3"],
+    compared: Float[Tensor, "1"],
     *,
+    images: int,
+    renderings: int,
     motion_from: int,
     motion_gradient_max: float | None,
-    pairs: Sequence[Int[Tensor, "1"]],
-    capacity: int,
+    capacity: int | None,
     betas: tuple[float, float],
     epsilon: float,
 ) -> None:
-    """A step of Adam along the mean gradient of some images, if it is sound; three launches, and nobody waits.
+    """Adam along the mean gradient of some images, if the step is valid; nothing is read back.
 
-    A step is sound if its loss and all squared gradients are finite and no pair was dropped.
+    A step is valid if its loss and all squared gradients are finite and no pair was dropped.
 
     Args:
-        table: Of all tensors; its gradients are sums over images.
-        rates: Learning rate of each; 0: the tensor is left alone.
-        ledger: Changed.
-        weights: Of what was found: of terms their weight, of others 1, of what this step does not find 0.
+        table: All tensors; its gradients are summed over images.
+        rates: Learning rate of each tensor; one of rate 0 is left alone.
+        step: Results of this step, and the sums that it adds to.
+        weights: Of the results; 0 for those that were not computed.
+        compared: Number of images with any term.
+        images: Number of images B.
+        renderings: Number of renderings R.
         motion_from: First tensor of the motion.
-        motion_gradient_max: Longest gradient of these tensors, a longer one is shortened; None: any.
-        pairs: (tile, splat) pairs of each image, 1 to 4 of them, int32.
-        capacity: Pairs that are reserved; -1: not known; 0: nobody counts.
+        motion_gradient_max: Largest gradient norm of these tensors, longer ones are clipped; None: any.
+        capacity: Pairs with memory in a rendering, the others were dropped; None: as many as there are.
         betas: Decays of the moments.
         epsilon: Added to the root of the second moment.
     """
     with stream_of(rates):
         rows, sizes = array_over(table.rows, wp.int64), array_over(table.sizes)
-        counted = [array_over(number, wp.int32) for number in pairs]
-        training.judge(
+        training.finish_step(
             rows,
             array_over(table.first_part, wp.int32),
             array_over(table.partials),
             (table.parts[motion_from], motion_from),
-            motion_gradient_max or 0.0,
-            array_over(ledger.found),
-            tuple(weights),
-            counted,
-            capacity,
+            motion_gradient_max,
+            (array_over(step.results), array_over(weights), images, array_over(compared)),
+            (array_over(step.pairs, wp.int32), renderings, capacity),
             array_over(rates),
             betas,
-            array_over(ledger.counts, wp.int32),
-            array_over(ledger.sums),
-            sizes,
+            (array_over(step.counts, wp.int32), array_over(step.sums), sizes),
         )
-        training.adam_step(rows, array_over(table.first_block, wp.int32), table.blocks, betas, epsilon, sizes)
+        first = array_over(table.first_block, wp.int32)
+        training.adam_step(rows, first, table.blocks, betas, epsilon, sizes)
 
 
-def observe(
+def add_statistics(
     screens: Sequence[ScreenGradient],
     size: tuple[int, int],
-    ledger: Ledger,
+    step: StepResults,
     gradient: Float[Tensor, "N"],
     pixels: Float[Tensor, "N"],
     weight: Float[Tensor, "N"],
 ) -> None:
-    """Add one to four images to what densification looks at, if the step was sound.
+    """Add the images of a step to the statistics of densification, if the step was valid.
 
     Args:
-        screens: Of one to four images, after the backward pass.
+        screens: Of the images, after the backward pass.
         size: Columns and rows of the images.
-        ledger: What says whether the step was sound.
+        step: Tells on the device whether the step was valid.
         gradient: Sum of pixels times screen gradient, in half image sizes; changed.
         pixels: Sum of pixels; changed.
         weight: Sum of weights in them; changed.
@@ -204,6 +215,8 @@ def observe(
         return
     with stream_of(gradient):
         half = 0.5 * size[0], 0.5 * size[1]
-        arrays = [array_over(screen.values) for screen in screens]
-        counts = array_over(ledger.counts, wp.int32)
-        training.observe(arrays, half, counts, [array_over(sums) for sums in (gradient, pixels, weight)])
+        counts = array_over(step.counts, wp.int32)
+        sums = [array_over(total) for total in (gradient, pixels, weight)]
+        for begin in range(0, len(screens), SCREENS):
+            arrays = [array_over(screen.values) for screen in screens[begin : begin + SCREENS]]
+            training.add_statistics(arrays, half, counts, sums)

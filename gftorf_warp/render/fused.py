@@ -29,9 +29,9 @@ LARGEST = 1e18  # radius of a lens that is none: its square is a float32, too
 
 
 class Scratch:
-    """Planes that image losses of one size work in, one after the other; backward comes before the next loss.
+    """Memory for image losses of one size; the backward pass of one precedes the next.
 
-    Nobody writes their margins, which are zero. Without one every loss has planes of its own, zeroed each time.
+    Margins are zero and never written. Without it every loss allocates and clears its own.
     """
 
     def __init__(self) -> None:
@@ -146,39 +146,40 @@ def flow_loss(
     distance: Float[Tensor, "H W"],
     displacement: Float[Tensor, "D H W"],
     measured: Float[Tensor, "R F 2 H W"],
-    camera: Camera,
-    later: Sequence[Camera],
+    cameras: Float[Tensor, "F V"],
     *,
     row: Int[Tensor, "1"] | None = None,
     out: Float[Tensor, "1"] | None = None,
 ) -> Float[Tensor, ""]:
-    """Sum over F flows of the mean squared difference [px^2] to what composited displacements would show.
+    """Sum over F flows of the mean squared difference [px^2] to the flow of composited displacements.
 
-    Differentiable once, in ``displacement``. The mean is over all pixels and both components; unknown ones count zero.
+    Differentiable once, in ``displacement``. The mean is over all pixels and both components; unknown
+    ones count zero. losses/prior.py has the oracle.
 
     Args:
-        distance: Of the surface [m], where there is none at least a micrometre.
+        distance: Of the surface [m], at least a micrometre where there is none.
         displacement: To the end of each flow [m], D = 3F channels in world axes.
         measured: The flows [px]; NaN: unknown.
-        camera: Where from.
-        later: The camera at the end of each flow.
+        cameras: :func:`flow_cameras`; read when the kernels run.
         row: int32, which F flows; read when the kernels run. None: the first.
-        out: Where the result goes; None: into memory of its own.
+        out: Memory of the result; None: its own.
 
     Raises:
-        ValueError: If shapes do not fit or something is not float32.
+        ValueError: If shapes do not fit or a tensor is not float32.
     """
-    flows, size = len(later), tuple(distance.shape)
+    flows, size = len(cameras), tuple(distance.shape)
     if tuple(displacement.shape) != (3 * flows, *size) or tuple(measured.shape[1:]) != (flows, 2, *size):
         shapes = f"displacement {tuple(displacement.shape)} and measured {tuple(measured.shape)}"
-        raise ValueError(f"{shapes} must be {(3 * flows, *size)} and (R, {flows}, 2, H, W) for {flows} flows of {size}")
-    tensors = distance, displacement, measured
+        want = f"{(3 * flows, *size)} and (R, {flows}, 2, H, W) for {flows} flows of {size}"
+        raise ValueError(f"{shapes} must be {want}")
+    tensors = distance, displacement, measured, cameras
     if any(tensor.dtype != torch.float32 or tensor.device != distance.device for tensor in tensors):
-        raise ValueError(f"distance, displacement and measured must be float32 on {distance.device}")
-    views = _views(camera, tuple(later), distance.device)
+        want = f"float32 on {distance.device}"
+        raise ValueError(f"distance, displacement, measured and cameras must be {want}")
     row = _first(distance.device) if row is None else row
     out = distance.new_empty(1) if out is None else out
-    known = distance.detach().contiguous(), measured.detach().contiguous().flatten(0, 1), row, views
+    flat = measured.detach().contiguous().flatten(0, 1)
+    known = distance.detach().contiguous(), flat, row, cameras.contiguous()
     return _FlowLoss.apply(displacement.contiguous(), *known, out)
 
 
@@ -213,20 +214,22 @@ def _flow_arrays(
     return *images, array_over(row, wp.int32), array_over(views)
 
 
-@functools.lru_cache(maxsize=4096)
-def _views(camera: Camera, later: tuple[Camera, ...], device: torch.device) -> Tensor:
-    """[F, 29 or, with a lens, 40] what the kernels know of cameras, computed in float64 and uploaded once."""
+def flow_cameras(camera: Camera, later: Sequence[Camera]) -> Float[np.ndarray, "F V"]:
+    """Rows of kernels/training/optical_flow.py: the camera at the start and at the end of F flows.
+
+    V is 29, or 40 where any of them distorts.
+    """
     lens = any(one.distortion for one in (camera, *later))
     here, rows = camera.camera_from_world, []
     for then in later:
         there = then.camera_from_world
         between = there @ np.linalg.inv(here)
-        own = [camera.fx, camera.fy, camera.cx, camera.cy, then.fx, then.fy, then.cx, then.cy]
-        rows.append([*own, *between[:3, :3].flatten(), *between[:3, 3], *there[:3, :3].flatten()])
+        pinholes = [camera.fx, camera.fy, camera.cx, camera.cy, then.fx, then.fy, then.cx, then.cy]
+        rows.append([*pinholes, *between[:3, :3].flatten(), *between[:3, 3], *there[:3, :3].flatten()])
         if lens:
             radius = min(then.guard.radius, LARGEST)
             rows[-1] += [*astuple(camera.distortion), *astuple(then.distortion), radius]
-    return torch.tensor(np.array(rows), dtype=torch.float32, device=device)
+    return np.array(rows, dtype=np.float32)
 
 
 def displaced(
@@ -280,14 +283,15 @@ class _Sum(torch.autograd.Function):
 
 
 def added(tensors: Sequence[Tensor | None]) -> Tensor | None:
-    """The sum of one to four tensors of one shape, in their order, in one launch; None counts as zero.
+    """The sum of tensors of one shape in their order, four per launch; None counts as zero.
 
-    Without a derivative. Of one tensor it is that tensor.
+    Without a derivative. The sum of one tensor is that tensor.
     """
     present = [tensor.detach().contiguous() for tensor in tensors if tensor is not None]
-    if len(present) < 2:
-        return present[0] if present else None
-    total = torch.empty_like(present[0])
-    with stream_of(total):
-        training.added([array_over(tensor.flatten()) for tensor in present], array_over(total.flatten()))
-    return total
+    while len(present) > 1:
+        total = torch.empty_like(present[0])
+        with stream_of(total):
+            arrays = [array_over(tensor.flatten()) for tensor in present[:4]]
+            training.added(arrays, array_over(total.flatten()))
+        present = [total, *present[4:]]
+    return present[0] if present else None

@@ -158,67 +158,58 @@ def adam_step(
         blocks: In all, each of ``adam_block`` elements.
         betas: Decays of the moments.
         epsilon: Added to the root of the second moment.
-        sizes: [T, 3] what the step comes to, from :func:`judge`.
+        sizes: [T, 3] step sizes from :func:`finish_step`.
     """
     rest = [table, first_block, 1.0 - betas[0], 1.0 - betas[1], epsilon]
     _launch(adam.make_adam(adam_block(table.device)), blocks, rest, [sizes])
 
 
-def judge(
+def finish_step(
     table: wp.array,
     first_part: wp.array,
     partials: wp.array,
     motion: tuple[int, int],
-    longest: float,
-    found: wp.array,
-    weights: tuple[float, ...],
-    pairs: list[wp.array],
-    capacity: int,
+    gradient_max: float | None,
+    results: tuple[wp.array, wp.array, int, wp.array],
+    pairs: tuple[wp.array, int, int | None],
     rates: wp.array,
     betas: tuple[float, float],
-    counts: wp.array,
-    running: wp.array,
-    sizes: wp.array,
+    outputs: tuple[wp.array, wp.array, wp.array],
 ) -> None:
-    """Squares of all gradients, and what they mean for the step; see ``kernels/training/step_end.py``.
+    """Squares of all gradients, and whether the step is valid; see ``kernels/training/step_end.py``.
 
     Args:
         table: [T, 9] of Adam.
         first_part: [T] parts before those of a tensor.
         partials: [P] scratch.
         motion: Parts and tensors before those of the motion.
-        longest: Gradient of the motion; 0: any.
-        found: [images or more, 6].
-        weights: Six, see the kernel.
-        pairs: [1] of each image.
-        capacity: Pairs that are reserved; -1: not known; 0: nobody counts.
+        gradient_max: Largest gradient norm of the motion; None: any.
+        results: [B or more, 3 L] results, their weights, B, and [1] images with any term.
+        pairs: [R or more] of every rendering, R, and those with memory; None: all.
         rates: [T].
         betas: Decays of the moments.
-        counts: [4] changed.
-        running: [8] sums, changed.
-        sizes: [T, 3] filled.
+        outputs: [4] counts and [L + 4] sums, changed, and [T, 3] step sizes, filled.
     """
     cpu = table.device.is_cpu
     dim = len(partials) * (1 if cpu else ordered_sums.LANES)
     _launch(step_end.gradient_squares, dim, [table, first_part], [partials])
-    head = [partials, *motion, longest, found, step_end.Weights(*weights), len(pairs), *_four(pairs), capacity, table]
-    rest = [rates, *(wp.float64(beta) for beta in betas)]
-    judges = 1 if cpu else step_end.JUDGES
-    _launch(step_end.judge, judges, head + rest, [counts, running, sizes], block_dim=step_end.JUDGES)
+    used, renderings, capacity = pairs
+    head = [partials, *motion, gradient_max is not None, gradient_max or 0.0, *results]
+    limits = [used, renderings, capacity is not None, capacity or 0]
+    rest = [table, rates, *(wp.float64(beta) for beta in betas)]
+    threads = 1 if cpu else step_end.THREADS
+    inputs = head + limits + rest
+    _launch(step_end.finish_step, threads, inputs, [*outputs], block_dim=step_end.THREADS)
 
 
-def observe(
-    screens: list[wp.array],
-    half: tuple[float, float],
-    counts: wp.array,
-    sums: list[wp.array],
-) -> None:
-    """Add what one to four images say [N, 4] to gradients, pixels and weights [N], if ``counts[1]`` is 0."""
-    _launch(step_end.observe, len(sums[0]), [*_four(screens), len(screens), wp.vec2(*half), counts], sums)
+def add_statistics(screens: list[wp.array], half: tuple[float, float], counts: wp.array, sums: list[wp.array]) -> None:
+    """Add one to four images [N, 4] to gradients, pixels and weights [N], if ``counts[1]`` is 0."""
+    inputs = [*_four(screens), len(screens), wp.vec2(*half), counts]
+    _launch(step_end.add_statistics, len(sums[0]), inputs, sums)
 
 
 def _four(arrays: list[wp.array]) -> list[wp.array]:
-    return arrays + [arrays[0]] * (step_end.IMAGES - len(arrays))
+    return arrays + [arrays[0]] * (4 - len(arrays))
 
 
 def adam_block(device: wp.Device) -> int:

@@ -2,12 +2,12 @@
 
     m += (1 - b1) (g - m),   v += (1 - b2) (g^2 - v),   x -= rate / (1 - b1^t)  m / (sqrt(v / (1 - b2^t)) + eps)
 
-(Kingma and Ba, 2015). Step t and rate are those of a tensor. A tensor of rate 0 is left alone, t included; so is
-everything if the step is not sound, which is how a gradient that is not finite is survived without asking the host.
+(Kingma and Ba, 2015). Step t and learning rate are per tensor. A tensor of rate 0 is left alone, t
+included; so are all tensors if the step is invalid (``step_end.py``).
 
-A table names the tensors by address: they are as many as a network has layers, and live wherever torch put them. A
-gradient at address 0 is none: the tensor is left alone, too. Gradients are multiplied by a factor before anything else.
-A tensor may have up to four gradients, of as many images, of which nobody wants the sum but here: first ones first.
+A table holds the addresses of the tensors: there are as many as a network has layers, anywhere in
+memory. Address 0 as gradient: the tensor is left alone, too. Gradients are scaled first. A tensor may
+have up to four gradients, of as many images, which are summed here; the first ones come first.
 """
 
 import functools
@@ -15,27 +15,27 @@ import functools
 import warp as wp
 
 PARAMETER, GRADIENT, FIRST, SECOND, STEP, LENGTH, MORE = range(7)  # columns of the table
-GRADIENTS = 4  # of a tensor, of which the sum counts: one at ``GRADIENT``, others from ``MORE`` on
+GRADIENTS = 4  # of a tensor, which are summed: one at ``GRADIENT``, others from ``MORE`` on
 COLUMNS = MORE + GRADIENTS - 1
-SIZES = 3  # what a step of a tensor comes to: see ``ADVANCE``
+SIZES = 3  # step size, 1 / sqrt of the bias correction, gradient scale: see ``ADVANCE``
 
 ADVANCE = f"""
     const long long* row = table.data + {COLUMNS} * tensor;
     float* step = reinterpret_cast<float*>(row[{STEP}]);
     float* out = sizes.data + {SIZES} * tensor;
     out[0] = 0.0f;
-    if (!sound || rate == 0.0f || row[{GRADIENT}] == 0) return;
+    if (!valid || rate == 0.0f || row[{GRADIENT}] == 0) return;
     step[0] += 1.0f;
     const double first = 1.0 - pow((double)beta1, (double)step[0]), second = 1.0 - pow((double)beta2, (double)step[0]);
     out[0] = (float)((double)rate / first);
     out[1] = (float)(1.0 / sqrt(second));
     out[2] = factor;
 """
-"""C++ of ``finish.judge``: count a step of a tensor, unless it rests, and write what the step comes to."""
+"""C++ of ``step_end.finish``: count a step of a tensor, unless it is left alone, and its step size."""
 
 
 def _descend(K: int) -> str:
-    """C++: one block of K elements; what lies behind the end of a tensor is neither read nor written."""
+    """C++: one block of K elements; nothing behind the end of a tensor is read or written."""
     kind = f"typedef float F __attribute__((ext_vector_type({K})));" if K > 1 else "typedef float F;"
     root = "__builtin_elementwise_sqrt(v)" if K > 1 else "sqrtf(v)"
     at = "F v = 0.0f; __builtin_memcpy(&v, p, bytes); return v;" if K > 1 else "return *p;"
@@ -89,7 +89,7 @@ def make_adam(K: int):
         rest2: float,  # 1 - b2 [1]
         epsilon: float,  # added to the root of the second moment [units of the gradient]
         # Out:
-        sizes: wp.array2d[float],  # [T, 3] from ``finish.judge``; what changes are the tensors of the table, in place
+        sizes: wp.array2d[float],  # [T, 3] from ``step_end.py``; the tensors of the table change in place
     ):
         """One thread per block of K elements; changes parameters and moments where they are."""
         block = wp.tid()

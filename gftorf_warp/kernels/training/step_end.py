@@ -1,7 +1,7 @@
-"""What stands between the gradients of a step and its end, without asking the host: a judgement, and running sums.
+"""The end of a training step without reading anything back: validity, running sums, statistics.
 
-A step is sound if its loss and the sum of all squared gradients are finite and no (tile, splat) pair was dropped. One
-that is not changes no parameter, no moment, no sum and no statistic; it is counted.
+A step is valid if its loss and the sum of all squared gradients are finite and no (tile, splat) pair
+was dropped. An invalid step changes no parameter, moment, sum or statistic; it is counted.
 """
 
 import warp as wp
@@ -9,15 +9,13 @@ import warp as wp
 from .adam import ADVANCE, COLUMNS, GRADIENT, LENGTH, MORE
 from .ordered_sums import LANES, OVER_LANES
 
-PART = 256  # elements of a gradient whose squares are added up at once: few, since a warp waits for them one by one
-JUDGES = 1024  # threads of the block that judges
-IMAGES = 4  # of a step, at most
-LOSS, SQUARED, OPACITY, FLOW, DISTORTION, MOTION_SIZE = range(6)  # of an image; all but two are terms of its loss
-FOUND = 6
-WHOLE, COUNT = FOUND, FOUND + 1  # of the sums, beside what was found: loss and images
-SUMS = FOUND + 2
-
-Weights = wp.types.vector(length=FOUND, dtype=float)
+PART = 256  # elements of a gradient whose squares one warp sums up: few, since it reads them serially
+THREADS = 1024  # of the block that finishes a step
+SCREENS = 4  # images whose statistics one launch adds
+RESULTS = 3  # per image and term: the term, its mean squared difference, its mean opacity
+COLUMNS_MAX = 32 * RESULTS  # of all terms; shared memory
+RENDERINGS_MAX = 64  # of one step; shared memory
+TOTALS = 4  # sums besides the terms: squared difference, opacity, loss, number of images
 
 _SQUARES = f"""{OVER_LANES}
 #if defined(__CUDA_ARCH__)
@@ -52,71 +50,76 @@ _SQUARES = f"""{OVER_LANES}
     if (writes) partials.data[slot] = s;
 """
 
-_JUDGE = f"""
+_FINISH = f"""
 #if defined(__CUDA_ARCH__)
 #define SHARED __shared__
-#define TOGETHER __syncthreads()
-    const int t = threadIdx.x, all = {JUDGES};
+#define SYNCHRONISE __syncthreads()
+    const int t = threadIdx.x, threads = {THREADS};
 #else
 #define SHARED
-#define TOGETHER
-    const int t = 0, all = 1;
+#define SYNCHRONISE
+    const int t = 0, threads = 1;
 #endif
-    SHARED double room[2][{JUDGES // LANES}];
-    SHARED float control[3], seen[{IMAGES * FOUND}], values[{SUMS}];
-    SHARED int most[{IMAGES}];
-    double fixed = 0.0, moving = 0.0;
-    for (int i = t; i < partials.shape[0]; i += all)
-        if (i < motion_part) fixed += (double)partials.data[i]; else moving += (double)partials.data[i];
-    for (int i = t; i < {FOUND} * images; i += all) seen[i] = found.data[i];
-    for (int n = t; n < images; n += all)
-        if (capacity == 0) most[n] = 0;
-        else most[n] = *(n == 0 ? pairs0.data : n == 1 ? pairs1.data : n == 2 ? pairs2.data : pairs3.data);
+    SHARED double warp_sums[2][{THREADS // LANES}];
+    SHARED float control[3], totals[{TOTALS}], column[{COLUMNS_MAX}];
+    SHARED int used[{RENDERINGS_MAX}];
+    const int columns = results.shape[1], terms = columns / {RESULTS};
+    double of_field = 0.0, of_motion = 0.0;
+    for (int i = t; i < partials.shape[0]; i += threads)
+        if (i < motion_part) of_field += (double)partials.data[i]; else of_motion += (double)partials.data[i];
+    for (int k = t; k < columns; k += threads) {{
+        float s = 0.0f;  // a result of weight 0 was not computed: its memory holds that of an earlier step
+        for (int n = 0; n < images; ++n) {{
+            const float w = weights.data[columns * n + k];
+            if (w != 0.0f) s += w * results.data[columns * n + k];
+        }}
+        column[k] = s;
+    }}
+    for (int n = t; n < renderings; n += threads) used[n] = pairs.data[n];
 #if defined(__CUDA_ARCH__)
     auto over_lanes = [](double v) -> double {{
         for (int o = {LANES // 2}; o > 0; o >>= 1) v += __shfl_down_sync(0xffffffffu, v, o);
         return v;
     }};
-    fixed = over_lanes(fixed);
-    moving = over_lanes(moving);
-    if (t % {LANES} == 0) {{ room[0][t / {LANES}] = fixed; room[1][t / {LANES}] = moving; }}
-    TOGETHER;
-    if (t < {LANES}) {{ fixed = over_lanes(room[0][t]); moving = over_lanes(room[1][t]); }}
+    of_field = over_lanes(of_field);
+    of_motion = over_lanes(of_motion);
+    if (t % {LANES} == 0) {{ warp_sums[0][t / {LANES}] = of_field; warp_sums[1][t / {LANES}] = of_motion; }}
+    SYNCHRONISE;
+    if (t < {LANES}) {{ of_field = over_lanes(warp_sums[0][t]); of_motion = over_lanes(warp_sums[1][t]); }}
 #endif
     if (t == 0) {{
         const float largest = 3.402823466e38f;
-        float loss = 0.0f;
-        for (int k = 0; k < {FOUND}; ++k) {{
-            float s = 0.0f;  // what has no weight was not found: whatever stands there is of another step
-            if (weights[k] != 0.0f) for (int n = 0; n < images; ++n) s += seen[{FOUND} * n + k];
-            values[k] = weights[k] * s;
-            if (k != {SQUARED} && k != {OPACITY}) loss += values[k];
+        float squared = 0.0f, opacity = 0.0f, loss = 0.0f;
+        for (int k = 0; k < terms; ++k) {{
+            loss += column[{RESULTS} * k];
+            squared += column[{RESULTS} * k + 1];
+            opacity += column[{RESULTS} * k + 2];
         }}
-        values[{WHOLE}] = loss;
-        values[{COUNT}] = (float)images;
-        int pairs = 0;
-        for (int n = 0; n < images; ++n) pairs = most[n] > pairs ? most[n] : pairs;
-        const float norm = (float)(sqrt(fixed + moving) / images), length = (float)(sqrt(moving) / images);
-        const bool fits = capacity < 1 || pairs <= capacity;
-        const bool sound = fabsf(loss) <= largest && norm <= largest && fits;
-        const float left = longest / (length + 1e-6f);
+        totals[0] = squared; totals[1] = opacity; totals[2] = loss; totals[3] = compared.data[0];
+        int most = 0;
+        for (int n = 0; n < renderings; ++n) most = used[n] > most ? used[n] : most;
+        const float norm = (float)(sqrt(of_field + of_motion) / images), length = (float)(sqrt(of_motion) / images);
+        const bool fits = !limited || most <= capacity;
+        const bool valid = fabsf(loss) <= largest && norm <= largest && fits;
+        const float left = gradient_max / (length + 1e-6f);
         control[0] = 1.0f / images;
-        control[1] = (longest > 0.0f && left < 1.0f ? left : 1.0f) / images;
-        control[2] = sound;
-        counts.data[0] += !sound;
-        counts.data[1] = sound ? 0 : counts.data[1] + 1;
-        counts.data[2] = pairs > counts.data[2] ? pairs : counts.data[2];
+        control[1] = (clips && left < 1.0f ? left : 1.0f) / images;
+        control[2] = valid;
+        counts.data[0] += !valid;
+        counts.data[1] = valid ? 0 : counts.data[1] + 1;
+        counts.data[2] = most > counts.data[2] ? most : counts.data[2];
         counts.data[3] += !fits;
     }}
-    TOGETHER;
-    const bool sound = control[2] != 0.0f;
-    for (int k = t; k < {SUMS}; k += all) if (sound) sums.data[k] += values[k];
-    for (int tensor = t; tensor < table.shape[0]; tensor += all) {{
+    SYNCHRONISE;
+    const bool valid = control[2] != 0.0f;
+    for (int k = t; k < terms + {TOTALS}; k += threads)
+        if (valid) sums.data[k] += k < terms ? column[{RESULTS} * k] : totals[k - terms];
+    for (int tensor = t; tensor < table.shape[0]; tensor += threads) {{
         const float rate = rates.data[tensor], factor = control[tensor < motion_from ? 0 : 1];
         [&]() {{{ADVANCE}}}();
     }}
 #undef SHARED
-#undef TOGETHER
+#undef SYNCHRONISE
 """
 
 
@@ -125,19 +128,20 @@ def squares_of(table: wp.array2d[wp.int64], first_part: wp.array[int], thread: i
     """Squares of one part of a gradient, summed over the lanes of a warp."""
 
 
-@wp.func_native(_JUDGE)
-def judge_step(
+@wp.func_native(_FINISH)
+def finish(
     partials: wp.array[float],
     motion_part: int,
     motion_from: int,
-    longest: float,
-    found: wp.array2d[float],
-    weights: Weights,
+    clips: bool,
+    gradient_max: float,
+    results: wp.array2d[float],
+    weights: wp.array2d[float],
     images: int,
-    pairs0: wp.array[int],
-    pairs1: wp.array[int],
-    pairs2: wp.array[int],
-    pairs3: wp.array[int],
+    compared: wp.array[float],
+    pairs: wp.array[int],
+    renderings: int,
+    limited: bool,
     capacity: int,
     table: wp.array2d[wp.int64],
     rates: wp.array[float],
@@ -151,22 +155,22 @@ def judge_step(
 
 
 @wp.func
-def seen_of(screen: wp.array2d[float], half: wp.vec2, i: int) -> wp.vec3:
-    """What one image says of a Gaussian: pixels times screen gradient, pixels, and its weight in them."""
+def statistics_of(screen: wp.array2d[float], half: wp.vec2, i: int) -> wp.vec3:
+    """Statistics of a Gaussian in one image: pixels times screen gradient, pixels, weight in them."""
     length = wp.length(wp.vec2(half[0] * screen[i, 0], half[1] * screen[i, 1]))
     return wp.vec3(screen[i, 2] * length, screen[i, 2], screen[i, 3])
 
 
 @wp.kernel(enable_backward=False)
-def observe(
+def add_statistics(
     # In:
     screen0: wp.array2d[float],  # [N, 4] of the first image: derivative by the image position [1/px], pixels, weight
-    screen1: wp.array2d[float],  # [N, 4] of the second; any other if there is none
+    screen1: wp.array2d[float],  # [N, 4] of the second, if there is one
     screen2: wp.array2d[float],  # [N, 4] of the third
     screen3: wp.array2d[float],  # [N, 4] of the fourth
     images: int,  # 1 to 4 [1]
     half: wp.vec2,  # half an image [px]
-    counts: wp.array[int],  # [4] the second is 0 if the step is sound [1]
+    counts: wp.array[int],  # [4] the second is 0 if the step is valid [1]
     # Out:
     gradient: wp.array[float],  # [N] sum of pixels times screen gradient, in half image sizes
     pixels: wp.array[float],  # [N] sum of pixels [1]
@@ -175,22 +179,22 @@ def observe(
     """One thread per Gaussian."""
     i = wp.tid()
     if counts[1] == 0:
-        seen = seen_of(screen0, half, i)
+        total = statistics_of(screen0, half, i)
         if images > 1:
-            seen = seen + seen_of(screen1, half, i)
+            total = total + statistics_of(screen1, half, i)
         if images > 2:
-            seen = seen + seen_of(screen2, half, i)
+            total = total + statistics_of(screen2, half, i)
         if images > 3:
-            seen = seen + seen_of(screen3, half, i)
-        gradient[i] = gradient[i] + seen[0]
-        pixels[i] = pixels[i] + seen[1]
-        weight[i] = weight[i] + seen[2]
+            total = total + statistics_of(screen3, half, i)
+        gradient[i] = gradient[i] + total[0]
+        pixels[i] = pixels[i] + total[1]
+        weight[i] = weight[i] + total[2]
 
 
 @wp.kernel(enable_backward=False, grid_stride=False)
 def gradient_squares(
     # In:
-    table: wp.array2d[wp.int64],  # [T, 6] of ``adam.py``
+    table: wp.array2d[wp.int64],  # [T, 9] of ``adam.py``
     first_part: wp.array[int],  # [T] parts before those of a tensor [1]
     # Out:
     partials: wp.array[float],  # [P] sum of squares of each part
@@ -200,48 +204,32 @@ def gradient_squares(
 
 
 @wp.kernel(enable_backward=False, grid_stride=False)
-def judge(
+def finish_step(
     # In:
     partials: wp.array[float],  # [P] from ``gradient_squares``
     motion_part: int,  # parts before those of the motion [1]
     motion_from: int,  # tensors before those of the motion [1]
-    longest: float,  # gradient of the motion, a longer one is shortened; 0: none is [1]
-    found: wp.array2d[float],  # [images or more, 6] what was found of each image
-    weights: Weights,  # of what was found in the loss; of what is no term 1, of what is not there 0 [1]
-    images: int,  # of this step, 1 to 4 [1]
-    pairs0: wp.array[int],  # [1] (tile, splat) pairs of the first image
-    pairs1: wp.array[int],  # [1] of the second; any other if there is none
-    pairs2: wp.array[int],  # [1] of the third
-    pairs3: wp.array[int],  # [1] of the fourth
-    capacity: int,  # pairs that are reserved; -1: not known yet; 0: nobody counts [1]
-    table: wp.array2d[wp.int64],  # [T, 6] of ``adam.py``
-    rates: wp.array[float],  # [T] learning rates, 0: the tensor rests [1]
+    clips: bool,  # whether the gradient of the motion is clipped [1]
+    gradient_max: float,  # its largest norm [1]
+    results: wp.array2d[float],  # [B or more, 3 L] results of every image and term, see ``RESULTS``
+    weights: wp.array2d[float],  # [B or more, 3 L] weights of these; 0: not computed in this step [1]
+    images: int,  # B of this step [1]
+    compared: wp.array[float],  # [1] images with any term
+    pairs: wp.array[int],  # [R or more] (tile, splat) pairs of every rendering
+    renderings: int,  # R of this step [1]
+    limited: bool,  # whether pairs beyond ``capacity`` were dropped [1]
+    capacity: int,  # pairs of one rendering with memory [1]
+    table: wp.array2d[wp.int64],  # [T, 9] of ``adam.py``
+    rates: wp.array[float],  # [T] learning rates; a tensor of rate 0 is left alone [1]
     beta1: wp.float64,  # decay of the first moment [1]
     beta2: wp.float64,  # decay of the second moment [1]
     # Out:
-    counts: wp.array[int],  # [4] steps that failed, in a row, most pairs of an image so far, steps of too many pairs
-    sums: wp.array[float],  # [8] of what was found, times its weight, of the loss and of images
-    sizes: wp.array2d[float],  # [T, 3] what Adam's step comes to
+    counts: wp.array[int],  # [4] skipped steps, in a row, most pairs of a rendering, steps with too many pairs
+    sums: wp.array[float],  # [L + 4] weighted terms, squared difference, opacity, loss, images
+    sizes: wp.array2d[float],  # [T, 3] step sizes of Adam
 ):
     """One block, on the CPU one thread."""
-    judge_step(
-        partials,
-        motion_part,
-        motion_from,
-        longest,
-        found,
-        weights,
-        images,
-        pairs0,
-        pairs1,
-        pairs2,
-        pairs3,
-        capacity,
-        table,
-        rates,
-        beta1,
-        beta2,
-        counts,
-        sums,
-        sizes,
-    )
+    finish(
+        partials, motion_part, motion_from, clips, gradient_max, results, weights, images, compared, pairs,
+        renderings, limited, capacity, table, rates, beta1, beta2, counts, sums, sizes,
+    )  # fmt: skip

@@ -1,0 +1,296 @@
+"""The control block of a step: everything that differs between two steps of one kind, as device data.
+
+The host writes frame numbers, key numbers, interpolation weights, cameras, weights of the terms and
+learning rates into one buffer and uploads it before the step; kernels read it. So one CUDA graph
+serves every raw frame, pose, modulation frequency, phase shift and progress of the run.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from ..render import fused
+from ..render.control import DeviceCamera, packed
+from ..render.cuda import DeviceUpload
+from ..scene.motion import Motion
+from .observations import Observations
+from .settings import ReconSettings
+from .terms import Term, View
+
+ROWS = ("light", "depth", "colour", "flow")  # row numbers of an image, see ``Comparison.rows``
+FLOWS = 2  # of a quartet: to the next one and to the previous one
+RESULTS = 3  # numbers per image and term: the term, its mean squared difference, its mean opacity
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImageKey:
+    """One image of a batch, as far as it decides which operations a step consists of."""
+
+    terms: tuple[str, ...]
+    """Names of its terms."""
+    views: frozenset[View]
+    """What is rendered. Flow at the time of the ToF image comes with that rendering."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class GraphKey:
+    """What decides which operations a step consists of: steps of one key share a CUDA graph."""
+
+    images: tuple[ImageKey, ...]
+    """The images of the batch."""
+    keys: int
+    """Number of motion keys that are evaluated; 0: nothing moves."""
+    frozen: bool
+    """Whether only the motion is optimised."""
+    sh_degree: int
+    """Degree of the harmonics."""
+
+    @property
+    def stage(self) -> tuple[object, ...]:
+        """Equal for keys that alternate. When it changes, earlier graphs are not needed again."""
+        names = {name for image in self.images for name in image.terms} - {"flow"}
+        return self.keys > 0, self.frozen, self.sh_degree, frozenset(names)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ImageControl:
+    """Device memory of one image of the batch."""
+
+    rows: dict[str, Int[Tensor, "1"]]
+    """Rows of the measured images by name of ``ROWS``."""
+    noise_origin: Int[Tensor, "2"]
+    """Seed and number of its random background."""
+    blend: dict[View, Float[Tensor, "D K"]]
+    """Interpolation weights of the motion keys: first of the time of the view; where there is flow,
+    then differences of weights between the end and the start of either flow."""
+    camera: dict[View, DeviceCamera]
+    """Camera, calibration and phase shift."""
+    flow_cameras: Float[Tensor, "2 V"]
+    """Cameras at the ends of both flows."""
+
+
+class ControlBlock:
+    """Layout, host values and device memory of the control block of one run."""
+
+    def __init__(
+        self,
+        observations: Observations,
+        settings: ReconSettings,
+        terms: Sequence[Term],
+        motion: Motion,
+        groups: Sequence[str],
+    ):
+        """Reserve memory.
+
+        Args:
+            observations: What is compared.
+            settings: Of the run.
+            terms: All terms of the loss.
+            motion: The motion model.
+            groups: Learning-rate group of every optimised tensor.
+        """
+        self.observations, self.settings = observations, settings
+        self.terms, self.motion, self.groups = terms, motion, groups
+        self.images = max(len(batch) for batch in observations.batches)
+        self._key_counts = {flow: self._most_keys(flow=flow) for flow in (False, True)}
+        keys = max(self._key_counts.values())
+        camera = len(self._camera(View.TOF, observations.batches[0][0]))
+        flow_cameras = self._flow_cameras(observations.batches[0][0])
+        self._parts: dict[tuple[str, View], tuple[int, ...]] = {
+            ("camera", View.TOF): (camera,),
+            ("camera", View.COLOUR): (camera,),
+            ("camera", View.FLOW): flow_cameras.shape,
+            ("blend", View.TOF): (1 + FLOWS, keys),
+            ("blend", View.COLOUR): (1, keys),
+            ("blend", View.FLOW): (1 + FLOWS, keys),
+        }
+        self._constants: dict[tuple, tuple[list[int], np.ndarray]] = {}
+        sizes = len(groups) + 1, self.images * len(terms) * RESULTS, self.images * self._image_floats
+        ints = keys + self.images * (len(ROWS) + 2)
+        self._upload = DeviceUpload([(ints, torch.int32), (sum(sizes), torch.float32)], observations.quads.device)
+        self._ints, floats = self._upload.parts
+        scalars, weights, constants = floats.split(sizes)
+        self.rates: Float[Tensor, "G"] = scalars[: len(groups)]
+        """Learning rate of every optimised tensor."""
+        self.compared: Float[Tensor, "1"] = scalars[-1:]
+        """Number of images of the batch that are compared at all."""
+        self.weights: Float[Tensor, "B T 3"] = weights.view(self.images, len(terms), RESULTS)
+        """Weights of all results; 0 where an image has no such term."""
+        self._floats = constants.view(self.images, -1)
+
+    # -- host ----------------------------------------------------------------------------------------
+
+    def key_of(self, frames: list[int], first: int, *, moves: bool, frozen: bool, sh_degree: int) -> GraphKey:
+        """The key of a step of some raw frames that begins after ``first`` images."""
+        active = [
+            term for term in self.terms if term.weight(self.settings, first) > 0 and (moves or not term.needs_motion)
+        ]
+        images = tuple(self._image_key(frame, active) for frame in frames)
+        keys = self._key_counts[_has_flow(images)] if moves else 0
+        return GraphKey(images=images, keys=keys, frozen=frozen, sh_degree=sh_degree)
+
+    def write(self, key: GraphKey, frames: list[int], first: int, seed: int, rates: dict[str, float]) -> None:
+        """Upload the values of the next step, asynchronously.
+
+        Args:
+            key: Of the step.
+            frames: Raw frames of the batch.
+            first: Number of its first image, counted over the run.
+            seed: Of random backgrounds.
+            rates: Learning rate by group.
+        """
+        name = tuple(frames), key.keys, _has_flow(key.images)
+        if name not in self._constants:
+            self._constants[name] = self._constants_of(key, frames)
+        keys, constants = self._constants[name]
+        ints = keys + [0] * (self._key_counts[True] - len(keys))
+        for n, frame in enumerate(frames):
+            ints += [*self._rows_of(frame), seed, first + n]
+        weights = np.zeros((self.images, len(self.terms), RESULTS), np.float32)
+        for n, image in enumerate(key.images):
+            self._weigh(image, first, weights[n])
+        compared = float(sum(bool(image.terms) for image in key.images))
+        scalars = [*(rates[name] for name in self.groups), compared]
+        self._upload.send(ints, np.concatenate([scalars, weights.ravel(), constants], dtype=np.float32))
+
+    def _image_key(self, frame: int, active: list[Term]) -> ImageKey:
+        terms = [term for term in active if term.applies(self.observations, frame)]
+        views = {term.view for term in terms if term.view is not None}
+        start = self.motion.times[frame // self.observations.sequence.cycle]
+        if {View.TOF, View.FLOW} <= views and self.observations.time_at(frame) == start:
+            views.remove(View.FLOW)
+        return ImageKey(terms=tuple(term.name for term in terms), views=frozenset(views))
+
+    def _weigh(self, image: ImageKey, first: int, weights: Float[np.ndarray, "T 3"]) -> None:
+        """Fill in the weights of one image."""
+        logged = False
+        for term, row in zip(self.terms, weights, strict=True):
+            if term.name in image.terms:
+                row[0] = term.weight(self.settings, first)
+                if term.channels is not None and not logged:
+                    row[1:] = 1.0, term.channels(self.observations)
+                    logged = True
+
+    def _rows_of(self, frame: int) -> list[int]:
+        """In the order of ``ROWS``; 0 where there is no such image, which no term reads then."""
+        shown, quartet = self.observations, frame // self.observations.sequence.cycle
+        light = shown.phasors.rows.get(frame, 0) if shown.phasors else frame
+        depth, flow = (stack.rows.get(quartet, 0) for stack in (shown.closed_form, shown.flow))
+        return [light, depth, shown.colour.rows.get(frame, 0), flow]
+
+    def _constants_of(self, key: GraphKey, frames: list[int]) -> tuple[list[int], np.ndarray]:
+        """Keys of a batch, and what its frames decide alone, in the layout of the device."""
+        flow = _has_flow(key.images)
+        keys = self._keys_of(frames, flow=flow) if key.keys else []
+        keys += keys[-1:] * (key.keys - len(keys))  # a repeated key of weight 0
+        constants = np.zeros((self.images, self._image_floats), np.float32)
+        for n, frame in enumerate(frames):
+            start = 0
+            for (kind, view), shape in self._parts.items():
+                part = constants[n, start : start + math.prod(shape)]
+                start += math.prod(shape)
+                if kind == "blend" and not keys:
+                    continue  # nothing moves
+                if kind == "blend":
+                    rows = self._blend(view, frame, keys, flow=flow)
+                    part[: rows.size] = rows.ravel()  # of as many keys as the graph has
+                elif view == View.FLOW:
+                    part[:] = self._flow_cameras(frame).ravel()
+                elif view == View.TOF or frame in self.observations.colour:
+                    part[:] = self._camera(view, frame)
+        return keys, constants.ravel()
+
+    def _camera(self, view: View, frame: int) -> np.ndarray:
+        shown = self.observations
+        camera = (shown.colour_cameras if view == View.COLOUR else shown.cameras)[frame]
+        return packed(camera, shown.sensor_at(frame), self.settings.render)
+
+    def _flow_cameras(self, frame: int) -> np.ndarray:
+        cameras, cycle = self.observations.cameras, self.observations.sequence.cycle
+        last = len(cameras) - 1
+        ends = [cameras[min(max(frame + step * cycle, 0), last)] for step in (1, -1)]
+        return fused.flow_cameras(cameras[frame], ends)
+
+    def _blend(self, view: View, frame: int, keys: list[int], *, flow: bool) -> Float[np.ndarray, "D K"]:
+        """Interpolation weights of a view, see ``ImageControl.blend``."""
+        times = self.motion.key_times.tolist()
+        quartet, times = frame // self.observations.sequence.cycle, self.motion.times
+        at = self._weights(self._time(view, frame), keys)
+        if view == View.COLOUR or not flow:
+            return at[None]
+        start = self._weights(times[quartet], keys)
+        ends = [
+            self._weights(times[i], keys) - start if 0 <= i < len(times) else np.zeros(len(keys))
+            for i in (quartet + 1, quartet - 1)
+        ]
+        return np.stack([at, *ends])
+
+    def _time(self, view: View, frame: int) -> float:
+        """When a view is rendered [s]."""
+        shown = self.observations
+        if view == View.COLOUR:
+            return float(shown.sequence.times[frame])
+        if view == View.FLOW:
+            return self.motion.times[frame // shown.sequence.cycle]
+        return shown.time_at(frame)
+
+    def _weights(self, time: float, keys: list[int]) -> np.ndarray:
+        """Interpolation weight of every key at a time."""
+        result, needed = np.zeros(len(keys)), self.motion.keys_at(time)
+        for key, weight in zip(needed.index, needed.weight, strict=True):
+            result[keys.index(key)] += weight  # the first of repeated ones
+        return result
+
+    def _keys_of(self, frames: list[int], *, flow: bool) -> list[int]:
+        """All keys that a batch depends on."""
+        times = [self._time(View.TOF, frame) for frame in frames]
+        times += [self._time(View.COLOUR, frame) for frame in frames if frame in self.observations.colour]
+        if flow:
+            starts = self.motion.times
+            quartets = {frame // self.observations.sequence.cycle for frame in frames}
+            wanted = {i + step for i in quartets for step in (0, 1, -1)}
+            times += [starts[i] for i in wanted if 0 <= i < len(starts)]
+        return sorted({key for time in times for key in self.motion.keys_at(time).index})
+
+    def _most_keys(self, *, flow: bool) -> int:
+        """Of any batch."""
+        return max(len(self._keys_of(batch, flow=flow)) for batch in self.observations.batches)
+
+    @property
+    def _image_floats(self) -> int:
+        return sum(math.prod(shape) for shape in self._parts.values())
+
+    # -- device --------------------------------------------------------------------------------------
+
+    def keys(self, count: int) -> Int[Tensor, "K"]:
+        """Numbers of the motion keys."""
+        return self._ints[:count]
+
+    def image(self, n: int, key: GraphKey) -> ImageControl:
+        """Device memory of image ``n`` of the batch."""
+        begin = self._key_counts[True] + n * (len(ROWS) + 2)
+        ints = self._ints[begin : begin + len(ROWS) + 2]
+        parts = dict(zip(self._parts, self._floats[n].split([*map(math.prod, self._parts.values())]), strict=True))
+        blend = {}
+        for view in View:
+            rows = 1 + FLOWS if view != View.COLOUR and "flow" in key.images[n].terms else 1
+            blend[view] = parts["blend", view][: rows * key.keys].view(rows, key.keys)
+        cameras = {view: DeviceCamera.over(parts["camera", view]) for view in (View.TOF, View.COLOUR)}
+        return ImageControl(
+            rows={name: ints[k : k + 1] for k, name in enumerate(ROWS)},
+            noise_origin=ints[len(ROWS) :],
+            blend=blend,
+            camera=cameras | {View.FLOW: cameras[View.TOF]},
+            flow_cameras=parts["camera", View.FLOW].view(FLOWS, -1),
+        )
+
+
+def _has_flow(images: Sequence[ImageKey]) -> bool:
+    return any("flow" in image.terms for image in images)

@@ -1,0 +1,257 @@
+"""The training loop: steps, metrics, diagnostics, checkpoints, restarts.
+
+When losses or gradients are not finite for several steps, it returns to the last checkpoint.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import logging
+import math
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import torch
+
+from ..errors import DivergedError
+from ..render.buffers import available_threads
+from . import checkpoint, collapse
+from .diagnostics import Diagnostics
+from .observations import Observations
+from .record import Metrics
+from .settings import ReconSettings
+from .state import State, begin, from_dict, to_dict
+from .stepper import Stepper
+
+LOG = logging.getLogger("gftorf_warp")
+SEED_STEP = 1_000_003  # between the seeds of restarts, far from seeds that are counted up
+Progress = Callable[..., None]
+
+
+class TrainingLoop:
+    """Trains one state to the end of its run, in its folder."""
+
+    def __init__(
+        self,
+        observations: Observations,
+        settings: ReconSettings,
+        seed: int,
+        out: Path,
+        metrics: Metrics,
+        diagnostics: Diagnostics,
+        clock: Callable[[], float],
+        progress: Progress | None,
+    ):
+        """Take note of everything; :meth:`run` trains.
+
+        Args:
+            observations: What is fitted.
+            settings: How. On a CPU every image has one thread: no result depends on the number of cores.
+            seed: Of the run.
+            out: Its folder.
+            metrics: Rows of metrics.jsonl.
+            diagnostics: Rows of diagnostics.jsonl.
+            clock: Seconds spent on the run so far.
+            progress: Called as ``progress(images, images_in_all, loss=, psnr_db=, gaussians=)``.
+        """
+        self.observations, self.settings, self.seed, self.out = observations, settings, seed, out
+        self.device = observations.quads.device
+        self.metrics, self.diagnostics = metrics, diagnostics
+        self.clock, self.progress = clock, progress
+        self.checked_at = collapse.veil_checked_at(settings)
+        self.saved_at = clock()
+
+    def run(self, state: State) -> State:
+        """Train until the images are used up; returns the final state.
+
+        Raises:
+            DivergedError: If losses or gradients stay non-finite.
+            KeyboardInterrupt: After a signal, when everything is stored.
+        """
+        total = self.settings.schedule.images
+        if state.images == 0:
+            self.save(state)
+            self.diagnostics.add(state, self.settings)
+        with _one_torch_thread(self.device), image_threads(self.device) as map_images, _signals() as stop:
+            stepper = self.stepper(state, map_images)
+            while state.images < total:
+                before = state.images
+                stepper.step()
+                if not (self.is_due(before, state.images) or stop.is_set()):
+                    continue
+                rendered = died = None
+                if self.diagnostics.due(before, state.images, total):  # launched before the device is waited for
+                    rendered = self.diagnostics.render(state, self.settings)
+                    if state.images < total:
+                        died = collapse.has_dead_network(state, self.settings)
+                failures = stepper.collect()  # waits
+                if failures >= self.settings.failures_max:
+                    state = self.go_back(state)
+                    stepper = self.stepper(state, map_images)
+                    continue
+                every = self.settings.schedule.log_every
+                if state.images // every > before // every or state.images >= total:
+                    self.report(state)
+                if self.checked_at is not None and before < self.checked_at <= state.images and self.restarts(state):
+                    state = self.restart(state)
+                    stepper = self.stepper(state, map_images)
+                    continue
+                if rendered is not None:
+                    self.diagnostics.write(rendered, state, self.settings)
+                    if died:
+                        collapse.revive(state, self.settings)
+                if stop.is_set():
+                    self.save(state)
+                    LOG.info("interrupted at image %d of %d, stored", state.images, total)
+                    raise KeyboardInterrupt
+                if self.saving_is_due and not failures:
+                    self.save(state)
+        self.save(state)
+        return state
+
+    def stepper(self, state: State, map_images: Callable) -> Stepper:
+        """Training steps of a state."""
+        return Stepper(state, self.observations, self.settings, map_images=map_images)
+
+    def is_due(self, before: int, after: int) -> bool:
+        """Whether anything but the next step is due."""
+        every, total = self.settings.schedule.log_every, self.settings.schedule.images
+        logged = after // every > before // every
+        return logged or self.diagnostics.due(before, after, total) or self.saving_is_due
+
+    @property
+    def saving_is_due(self) -> bool:
+        """Whether the last checkpoint is old."""
+        return self.clock() - self.saved_at > self.settings.schedule.checkpoint_every_s
+
+    def save(self, state: State) -> None:
+        """Write a checkpoint."""
+        state.seconds = self.saved_at = self.clock()
+        checkpoint.save(self.out, to_dict(state))
+
+    def report(self, state: State) -> None:
+        """Write one row of metrics: means over the images since the last one."""
+        values = torch.stack([*state.sums.values()]).tolist() if state.sums else []  # one transfer
+        sums, state.sums = dict(zip(state.sums, values, strict=True)), {}
+        count = sums.pop("count", 0.0)
+        if not count:
+            return
+        means = {name: value / count for name, value in sums.items()}
+        mse = means.pop("quad_mse")
+        psnr = 10.0 * math.log10(self.peak**2 / mse) if mse > 0 else None
+        row: dict[str, float | int | None] = {"images": state.images, "seconds": self.clock()}
+        row |= {"loss": means.pop("loss"), **means}
+        row |= {"gaussians": len(state.optimiser.field), "quad_psnr_db": psnr}
+        self.metrics.add(row)
+        if self.progress is not None:
+            total, shown = self.settings.schedule.images, {"loss": row["loss"], "psnr_db": psnr}
+            self.progress(state.images, total, **shown, gaussians=row["gaussians"])
+
+    @functools.cached_property
+    def peak(self) -> float:
+        """Largest absolute value of what is compared, in the units of the optimisation."""
+        shown = self.observations
+        images = shown.colour.images
+        if self.settings.weights.quads > 0:
+            measured = torch.as_tensor(shown.sequence.measured).to(self.device)
+            images = shown.phasors.images if shown.phasors else shown.quads[measured]
+        return float(images.abs().max())
+
+    def restarts(self, state: State) -> bool:
+        """Whether the run collapsed to a veil and may restart; if it may not, the log says so."""
+        losses = [float(row.get("quads") or 0.0) for row in self.metrics.rows()]
+        if not collapse.is_veiled(losses, self.observations, self.settings):
+            return False
+        again = state.restarts < self.settings.restarts_max
+        then = "restarts with another seed" if again else "continues: it was restarted too often"
+        LOG.warning("after %d images the loss is still that of black images: the run %s", state.images, then)
+        return again
+
+    def restart(self, state: State) -> State:
+        """Another random start, which keeps the time and the failures of the one before."""
+        number = state.restarts + 1
+        seed = self.seed + SEED_STEP * number
+        fresh = begin(self.observations, self.settings, seed=seed, device=self.device)
+        fresh.restarts, fresh.skipped, fresh.rollbacks = number, state.skipped, state.rollbacks
+        for rows in (self.metrics, self.diagnostics):
+            rows.rewind(-1)
+        self.save(fresh)
+        self.diagnostics.add(fresh, self.settings)
+        return fresh
+
+    def go_back(self, state: State) -> State:
+        """The last good checkpoint, with halved rates.
+
+        Raises:
+            DivergedError: If that has been done too often.
+        """
+        if state.rollbacks >= self.settings.rollbacks_max:
+            failures, count = self.settings.failures_max, len(state.optimiser.field)
+            raise DivergedError(
+                "the optimisation diverged",
+                where=f"{self.out}, image {state.images}",
+                why=f"loss or gradient of {failures} steps in a row were not finite after "
+                f"{state.rollbacks} returns to a checkpoint, {count} Gaussians",
+                fix="check the sequence with `gftorf check`, or lower the learning rates",
+            )
+        stored = checkpoint.last(self.out, self.device)
+        assert stored is not None, "a checkpoint is written before the first step"
+        restored = from_dict(stored, self.device)
+        restored.rate_factor = 0.5 * state.rate_factor
+        restored.rollbacks, restored.skipped = state.rollbacks + 1, state.skipped
+        for rows in (self.metrics, self.diagnostics):
+            rows.rewind(restored.images)
+        text = "back to the checkpoint at image %d, learning rates times %g"
+        LOG.warning(text, restored.images, restored.rate_factor)
+        return restored
+
+
+@contextlib.contextmanager
+def image_threads(device: torch.device) -> Iterator[Callable]:
+    """``map`` over the images of a batch: on a CPU by a pool of threads."""
+    threads = available_threads() if device.type == "cpu" else 1
+    if threads == 1:
+        yield map
+        return
+    with ThreadPoolExecutor(threads, thread_name_prefix="gftorf-images") as pool:
+        yield pool.map
+
+
+@contextlib.contextmanager
+def _one_torch_thread(device: torch.device) -> Iterator[None]:
+    """One thread of torch on a CPU: fastest for small tensors, and sums do not depend on the machine."""
+    before = torch.get_num_threads()
+    if device.type == "cpu":
+        torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+@contextlib.contextmanager
+def _signals() -> Iterator[threading.Event]:
+    """An event set by the first Ctrl-C or SIGTERM; the second one acts at once. Main thread only."""
+    stop = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield stop
+        return
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = {number: signal.getsignal(number) for number in numbers}
+
+    def first(*_) -> None:
+        stop.set()
+        for number in numbers:
+            signal.signal(number, before[number])
+
+    for number in numbers:
+        signal.signal(number, first)
+    try:
+        yield stop
+    finally:
+        for number in numbers:
+            signal.signal(number, before[number])

@@ -1,0 +1,245 @@
+"""The training steps of a run: batches, CUDA graphs, densification and opacity resets, pair capacity.
+
+On a GPU the host runs ahead of the device: it uploads a control block, replays a graph, and learns
+later whether steps were valid and how many (tile, splat) pairs there were.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import torch
+
+from ..render import descent, perceptron
+from ..render.cuda import CapturedGraph, DeviceReadback, graph_pool
+from ..render.pair_capacity import READ_EVERY, PairCapacity
+from ..scene.motion import Still
+from ..scene.network import Network
+from . import densify
+from .control import ControlBlock, GraphKey
+from .observations import Observations
+from .optimiser import frozen, rates_at
+from .padded import PaddedParameters
+from .settings import DensifySettings, ReconSettings
+from .state import State
+from .step import Map, Step
+from .terms import TERMS, Term, render_settings_at
+
+LOG = logging.getLogger("gftorf_warp")
+
+
+def draw(state: State, observations: Observations, settings: ReconSettings) -> list[int]:
+    """Raw frames of the next step, without replacement within an epoch; the last batch may be cut short."""
+    if not state.queue:
+        order = torch.randperm(len(observations.batches), generator=state.generator)
+        state.queue = order.tolist()
+    batch = observations.batches[state.queue.pop()]
+    return batch[: settings.schedule.images - state.images]
+
+
+class Stepper:
+    """Advances one state.
+
+    Between two steps the state is complete but for sums and counts, see :meth:`collect`.
+    """
+
+    def __init__(
+        self,
+        state: State,
+        observations: Observations,
+        settings: ReconSettings,
+        *,
+        terms: Sequence[Term] = TERMS,
+        map_images: Map = map,
+    ):
+        """Take over a state.
+
+        Args:
+            state: Advanced in place.
+            observations: What it is fitted to.
+            settings: How.
+            terms: The terms of the loss.
+            map_images: ``map``, or that of a thread pool for the images of a batch on a CPU.
+        """
+        self.state, self.observations, self.settings = state, observations, settings
+        device = observations.quads.device
+        self._map_images = map_images
+        self._padded = PaddedParameters(pads=device.type != "cpu")
+        groups = state.optimiser.groups
+        self._control = ControlBlock(observations, settings, terms, state.motion, groups)
+        betas = state.optimiser.betas
+        self._step = Step(observations, settings, terms, self._control, self._padded, betas)
+        self._summed: set[str] = {*descent.TOTAL_NAMES}  # names of sums that any step has added to
+        self._readback, self._replays = DeviceReadback(self._step.output.counts), 0
+        self._capacity = PairCapacity()
+        self._graphs: dict[GraphKey, Callable[[], None]] = {}
+        self._stage: tuple[object, ...] | None = None
+        self._steps = 0  # since the last :meth:`_attach`
+        self._pool = graph_pool(device)
+        motion = state.motion
+        if isinstance(motion, Network) and perceptron.fits(motion.form, device):
+            motion.go_by(perceptron.TensorCores())
+        self._attach()
+
+    def step(self) -> None:
+        """Advance the state by one batch, and densify or reset opacities where that is due."""
+        state, settings = self.state, self.settings
+        frames = draw(state, self.observations, settings)
+        before, state.images = state.images, state.images + len(frames)
+        key = self._control.key_of(
+            frames,
+            before,
+            moves=before >= settings.schedule.warm_up and not isinstance(state.motion, Still),
+            frozen=frozen(settings, before),
+            sh_degree=render_settings_at(settings, before).sh_degree,
+        )
+        self._enter(key)
+        rates = rates_at(settings, before, state.rate_factor, reset_at=state.reset_at, revived_at=state.revived_at)
+        due = densify.round_is_due(before, state.images, settings.densify, settings.schedule)
+        if due and settings.densify.loses_step:
+            rates = {name: rate if name == "motion" else 0.0 for name, rate in rates.items()}
+        self._control.write(key, frames, before, state.noise_seed, rates)
+        self._run(key)
+        self._steps += 1
+        densify_after(state, self.observations, before, settings)
+        if due or not self._padded.holds(state):
+            self._read_counts()
+            self._attach()
+
+    def collect(self) -> int:
+        """Add the sums and counts of the steps so far to the state; waits for the device.
+
+        Returns:
+            Number of skipped steps in a row, up to the last step.
+        """
+        sums, state = self._step.output.sums, self.state
+        names = [*(term.name for term in self._step.terms), *descent.TOTAL_NAMES]
+        for name, value in zip(names, sums.clone(), strict=True):
+            if name in self._summed:
+                state.sums[name] = state.sums[name] + value if name in state.sums else value
+        sums.zero_()
+        return self._read_counts()
+
+    # -- graphs --------------------------------------------------------------------------------------
+
+    def _run(self, key: GraphKey) -> None:
+        """Launch a step; the first one of a key is not captured, since it loads modules."""
+        self._summed |= {name for image in key.images for name in image.terms}
+        if key in self._graphs:
+            self._graphs[key]()
+            self._watch_pairs()
+            return
+        table = self._padded.table()
+        self._launch(key, table, table.send, map)  # one thread: kernels are compiled now
+        if self._capacity.pairs is None:
+            self._read_counts()
+        self._graphs[key] = self._captured(key, table)
+
+    def _launch(
+        self,
+        key: GraphKey,
+        table: descent.AdamTable,
+        send: Callable[[], None] | None,
+        map_images: Map,
+    ) -> None:
+        capacity = self._capacity.pairs if self._padded.pads else None
+        render = replace(self.settings.render, sh_degree=key.sh_degree, pair_capacity=capacity)
+        self._step.run(key, self.state.motion, render, table, send, map_images)
+
+    def _captured(self, key: GraphKey, table: descent.AdamTable) -> Callable[[], None]:
+        """A step of this key as a function: a CUDA graph on a GPU, unless the settings say otherwise."""
+        if not (self._padded.pads and self.settings.graph):
+            return lambda: self._launch(key, table, table.send, self._map_images)
+
+        def ready() -> None:  # gradients have the addresses that the capture gave them
+            table.send()
+            table.release()
+
+        device = self.observations.quads.device
+        return CapturedGraph(lambda: self._launch(key, table, None, map), device, ready, self._pool)
+
+    def _enter(self, key: GraphKey) -> None:
+        """Release the graphs of a stage that is over; prepare the one that begins."""
+        if key.stage == self._stage:
+            return
+        if self._graphs:
+            self._read_counts()  # waits: graphs must have run before their memory is released
+            self._release_graphs()
+        self._stage = key.stage
+        self._attach(free=True)
+        motion, padded = self.state.motion, self._padded
+        if key.frozen and motion.follows_means:
+            padded.attachment.copy_(motion.attach(padded.field.map(torch.Tensor.detach)))
+
+    def _attach(self, *, free: bool = False) -> None:
+        """Move the state to the padded parameters, whose number of rows may change."""
+        state, settings = self.state, self.settings
+        grows = densify.rounds_remain(state.images, settings.densify, settings.schedule)
+        if self._padded.attach(state, steps=self._steps, free=free, grows=grows):
+            self._release_graphs()
+        self._steps = 0
+
+    def _release_graphs(self) -> None:
+        """Release all graphs; the memory that they share goes with the last one."""
+        self._graphs.clear()
+        self._pool = graph_pool(self.observations.quads.device)
+
+    # -- readback ------------------------------------------------------------------------------------
+
+    def _read_counts(self) -> int:
+        """Read how many steps were skipped, and adapt the pair capacity; waits for the device."""
+        counts = self._step.output.counts
+        skipped, in_a_row, pairs, overflowed = counts.tolist()
+        self.state.skipped += skipped
+        if skipped:
+            text = "%d steps before image %d skipped: %d with too many (tile, splat) pairs, the others not finite"
+            LOG.warning(text, skipped, self.state.images, overflowed)
+        counts[0] = 0
+        counts[2:] = 0
+        if self._padded.pads and self._capacity.learn(pairs, is_sorted=self._step.sorts_pairs):
+            self._release_graphs()
+        return 0 if overflowed else in_a_row
+
+    def _watch_pairs(self) -> None:
+        """Grow the pair capacity before it is exceeded, by counts of a few steps ago, without waiting."""
+        if not self._padded.pads:
+            return
+        self._replays += 1
+        if self._replays % READ_EVERY == 0:
+            self._readback.request()
+        # when counts arrive depends on the machine: deterministic runs wait
+        counts = self._readback.latest(wait=self.settings.render.deterministic)
+        if counts is not None and self._capacity.is_nearly_full(counts[2]):
+            self._read_counts()
+
+
+def densify_after(state: State, observations: Observations, before: int, settings: ReconSettings) -> None:
+    """Densification and opacity reset that are due after a step that began after ``before`` images."""
+    options, schedule = settings.densify, settings.schedule
+    if densify.round_is_due(before, state.images, options, schedule):
+        weight = options.unseen_weight * (state.images - state.unseen_at)
+        prunes = visibility_pruning_is_due(state, observations, options)
+        _, state.statistics = densify.round_of(
+            state.optimiser,
+            state.statistics,
+            options,
+            state.generator,
+            judge_scale=state.images > options.scale_from,
+            unseen_weight=weight if prunes else None,
+        )
+        if prunes:
+            state.unseen_at = state.images
+        if not state.motion.follows_means:  # otherwise it is evaluated in every step
+            state.attachment = state.motion.attach(state.optimiser.field)
+    if densify.reset_is_due(before, state.images, options, schedule):
+        densify.reset_opacity(state.optimiser, options)
+        state.reset_at = state.images
+
+
+def visibility_pruning_is_due(state: State, observations: Observations, options: DensifySettings) -> bool:
+    """Whether this densification also prunes by visibility: two epochs contain every raw frame."""
+    frames = sum(len(batch) for batch in observations.batches)
+    begins = options.unseen_from
+    return begins is not None and state.images >= max(begins, state.unseen_at + 2 * frames)
