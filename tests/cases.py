@@ -195,7 +195,7 @@ def moved_world(case: Case, axis: tuple[float, ...], angle: float, translation: 
     motion = pose(axis, angle, translation)
     rotation, shift = torch.from_numpy(motion[:3, :3]), torch.from_numpy(motion[:3, 3])
     points, weight = sphere()
-    turned, still = reference._harmonics(points, 3), reference._harmonics(points @ rotation, 3)
+    turned, still = reference.spherical_harmonics(points, 3), reference.spherical_harmonics(points @ rotation, 3)
     harmonics = turned.T @ (weight[:, None] * still)  # coefficients of the turned function, by projection
     half = angle / 2
     w1, v1 = math.cos(half), torch.from_numpy(math.sin(half) * np.asarray(axis) / np.linalg.norm(axis))

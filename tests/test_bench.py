@@ -228,10 +228,10 @@ def test_a_run_without_checkpoint_is_refused(fitted, tmp_path):
 
 def test_errors_of_another_process_keep_their_class():
     """By exit code; an unknown one is a matter of resources."""
-    from gftorf_warp.bench.reconstruction import _failed
+    from gftorf_warp.bench.reconstruction import error_of
 
-    assert isinstance(_failed("", 4), DivergedError)
-    assert isinstance(_failed("", -9), ResourceError)
+    assert isinstance(error_of("", 4), DivergedError)
+    assert isinstance(error_of("", -9), ResourceError)
 
 
 def test_half_precision_has_a_row_of_torch_where_steps_have_kernels(monkeypatch):

@@ -23,42 +23,34 @@ def recording():
     return record(SCENES["tour"], frames=8, size=SIZE, flow=True)
 
 
-def titles(monkeypatch, sequence, truth):
-    """What the panels of a sheet are called, and the sheet."""
-    found = []
-    place = module._place
-
-    def noting(sheet, panel, *where):
-        found.append(panel.title)
-        place(sheet, panel, *where)
-
-    monkeypatch.setattr(module, "_place", noting)
-    data = contact_sheet(sequence, truth, "a title")
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+def titles(sequence, truth):
+    """What the panels of a sheet are called; the sheet has something on it."""
+    image = cv2.imdecode(np.frombuffer(contact_sheet(sequence, truth, "a title"), np.uint8), cv2.IMREAD_COLOR)
     assert image.shape[0] > 500
     assert image.std() > 10, "an empty sheet"
-    return found
+    _, rows = module.middle_panels(sequence, truth)
+    return [panel.title for row in rows for panel in row]
 
 
-def test_everything_that_is_known_is_on_it(monkeypatch, recording):
+def test_everything_that_is_known_is_on_it(recording):
     """All shifts of a quartet, amplitude, both distances, the closed form, its error, objects, flow, colour."""
-    found = titles(monkeypatch, recording.sequence, recording.truth)
+    found = titles(recording.sequence, recording.truth)
     assert [title.partition(":")[0] for title in found[:4]] == [f"raw frame {n}" for n in (4, 5, 6, 7)]
     assert [title.split(": ")[1].split(",")[0] for title in found[:4]] == ["0 deg", "180 deg", "90 deg", "270 deg"]
     for word in ("amplitude", "true distance [m]", "closed form [m]", "error of", "static phasor", "objects", "colour"):
         assert any(word in title for title in found), word
 
 
-def test_flow_is_shown_where_it_is(monkeypatch, recording):
+def test_flow_is_shown_where_it_is(recording):
     """It belongs to the start of a quartet that has another behind it."""
     longer = changed(recording.sequence, forward_flow={4: np.full((2, *SIZE[::-1]), np.nan, np.float32)})
-    assert any("flow to raw frame 8" in title for title in titles(monkeypatch, longer, recording.truth))
+    assert any("flow to raw frame 8" in title for title in titles(longer, recording.truth))
 
 
 @pytest.mark.parametrize(
     "kind", ["no truth", "no distance", "one frame", "two frequencies", "one shift", "dark", "all still"]
 )
-def test_any_sequence_has_one(monkeypatch, recording, kind):
+def test_any_sequence_has_one(recording, kind):
     """What is missing is left out, and nothing warns."""
     sequence, truth = recording.sequence, recording.truth
     if kind == "no truth":
@@ -75,13 +67,13 @@ def test_any_sequence_has_one(monkeypatch, recording, kind):
         sequence = replace(sequence, quads=np.zeros_like(sequence.quads))
     else:
         truth = replace(truth, distance=np.full_like(truth.distance, 2.0))
-    assert titles(monkeypatch, sequence, truth)
+    assert titles(sequence, truth)
 
 
 def test_unknown_pixels_are_grey_and_ends_are_the_ends_of_the_scale():
     """The colour of a number is that of its place on the bar beside it."""
     image = np.array([[0.0, 1.0, np.nan, 0.5]])
-    panel = module._scaled("x", image, (0.0, 1.0), module._diverging)
+    panel = module.scaled("x", image, (0.0, 1.0), module.diverging)
     assert panel.image[0, 2].tolist() == [*module.UNKNOWN]
     assert panel.image[0, 3].tolist() == [255, 255, 255]
     assert panel.image[0, 0, 2] > panel.image[0, 0, 0], "below the middle is blue"

@@ -136,7 +136,7 @@ def test_sixteen_bits_are_wrong_by_no_more_than_a_key():
     orders, images = {}, {}
     for bits in (24, 16):
         case = layers(bits)
-        splats = reference._project(case.field.map(torch.Tensor.double), case.camera, case.settings)
+        splats = reference.project(case.field.map(torch.Tensor.double), case.camera, case.settings)
         orders[bits] = splats.z_depth.detach()
         images[bits] = case.outputs(reference.rasterize, case.inputs(torch.float64))["quads"].detach()
     behind = orders[16].cummax(0).values - orders[16]  # how far a splat lies before the farthest one of those before it

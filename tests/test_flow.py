@@ -111,7 +111,7 @@ def test_pairs_vote_where_the_surface_was_at_their_time(step):
     for n in range(4, 8):
         inside = abs(x - 20 - 2 * n) < 7
         exact[n] = np.stack([np.where(inside, 8.0 * sign, 0.0), np.zeros(x.shape)]).astype(np.float32)
-    got = flow_module._combined(4, exact, exact, np.arange(12) / 120.0, step)
+    got = flow_module.median_flow(4, exact, exact, np.arange(12) / 120.0, step)
     window = exact[4][0] != 0
     assert window.any()
     np.testing.assert_array_equal(got[:, window], exact[4][:, window])

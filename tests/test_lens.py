@@ -29,7 +29,7 @@ from gftorf_warp.render.buffers import RenderSettings
 from gftorf_warp.render.launch import view_of
 from gftorf_warp.scene.camera import Camera
 from gftorf_warp.scene.distortion import Distortion
-from gftorf_warp.scene.initialise import InitSettings, _in_frusta
+from gftorf_warp.scene.initialise import InitSettings, in_frusta
 from gftorf_warp.scene.optics import Lens
 from gftorf_warp.scene.sensor import Sensor
 from gftorf_warp.sim import gaussian_cover
@@ -178,9 +178,9 @@ def test_covers_know_how_a_lens_stretches():
     )
     want = np.sum(by_d * by_z, 1) / np.linalg.norm(by_z, axis=1)
     assert np.abs(want).max() > 5e-3
-    np.testing.assert_allclose(gaussian_cover._slope(normal, distance, plane(points)[2], camera), want, atol=1e-7)
+    np.testing.assert_allclose(gaussian_cover.depth_slope(normal, distance, plane(points)[2], camera), want, atol=1e-7)
     corner = float(wide(PINCUSHION).slopes(torch.tensor([[0.5, 239.5]], dtype=torch.float64)).norm())
-    assert gaussian_cover._magnification(wide(PINCUSHION)) == pytest.approx(
+    assert gaussian_cover.magnification(wide(PINCUSHION)) == pytest.approx(
         1 + 3 * 0.15 * corner**2 - 5 * 0.02 * corner**4
     )
 
@@ -207,7 +207,7 @@ def test_random_points_are_as_dense_everywhere_in_what_a_lens_sees():
     """Drawn on the sensor they would crowd where it magnifies: by 0.58 in the corners of this one."""
     camera = wide(BARREL)
     settings = replace(InitSettings(), count=40000, bounds=(1.0, 2.0))
-    points = _in_frusta([camera], settings, torch.Generator().manual_seed(0)).double()
+    points = in_frusta([camera], settings, torch.Generator().manual_seed(0)).double()
     assert len(points) == 40000
     seen = camera.project(points)
     assert (seen >= -1e-3).all()

@@ -228,7 +228,7 @@ def test_mistake_14_all_harmonics_step_with_a_camera_at_rest():
     steps, field = reflectivity_steps(settings)
     seen = steps.abs().amin(dim=1) > 0.5 * settings.rates.reflectivity_sh
     assert seen.float().mean() > 0.3
-    basis = reference._harmonics(torch.nn.functional.normalize(field.mean), 3)
+    basis = reference.spherical_harmonics(torch.nn.functional.normalize(field.mean), 3)
     apparent = (basis * steps).sum(dim=1).abs()[seen] / (settings.rates.reflectivity_sh * SH_Y0)
     assert apparent.min() > 7.0
     assert apparent.max() < 15.0

@@ -70,9 +70,9 @@ def test_quads_do_not_determine_the_mean_distance():
     alpha = torch.tensor([[0.3, 1.0]], dtype=torch.float64)
     d = torch.tensor([2.0, 4.5], dtype=torch.float64)
     r = torch.tensor([[0.3254], [0.7881]], dtype=torch.float64)  # the method's four digits
-    w, T, _ = reference._weights(alpha, Stop.INCLUSIVE)
-    two = (w * T) @ reference._correlate(d, r, LONG, 2.0)
-    one = reference._correlate(torch.tensor([3.0]).double(), torch.tensor([[0.2]]).double(), LONG, 2.0)
+    w, T, _ = reference.compositing_weights(alpha, Stop.INCLUSIVE)
+    two = (w * T) @ reference.correlate(d, r, LONG, 2.0)
+    one = reference.correlate(torch.tensor([3.0]).double(), torch.tensor([[0.2]]).double(), LONG, 2.0)
     assert_close(two[:, :4], one[:, :4], rtol=0, atol=1e-5)
     assert (w @ d).item() == pytest.approx(3.75)
 
@@ -96,7 +96,7 @@ def test_null_space_survives_the_whole_renderer():
 def test_fog_reflects_between_half_and_all_of_a_surface(alpha):
     """Of constant alpha, sum alpha T^2 = 1/(2 - alpha) while sum alpha T = 1 (method, 2.5)."""
     fog = torch.full((1, 2000), alpha, dtype=torch.float64)
-    w, T, T_end = reference._weights(fog, Stop.INCLUSIVE)
+    w, T, T_end = reference.compositing_weights(fog, Stop.INCLUSIVE)
     assert w.sum().item() == pytest.approx(1.0, abs=1e-4)
     assert (w * T).sum().item() == pytest.approx(1 / (2 - alpha), abs=1e-6)
     assert 0 < T_end.item() < 1e-4
@@ -143,11 +143,11 @@ def test_opposite_quads_cancel_but_for_the_constant_part():
 def test_harmonics_are_orthonormal():
     """The integral of Y_i Y_j over the sphere is 1 for i = j and 0 otherwise."""
     points, weight = sphere()
-    basis = reference._harmonics(points, 3)
+    basis = reference.spherical_harmonics(points, 3)
     gram = basis.T @ (weight[:, None] * basis)
     assert_close(gram, torch.eye(16, dtype=torch.float64), rtol=0, atol=1e-12)
-    y = reference._harmonics(torch.tensor([[0.0, 0.0, 1.0]]).double(), 3)[0]
-    signs = reference._harmonics(torch.tensor([[0.6, 0.48, 0.64]]).double(), 1)[0]
+    y = reference.spherical_harmonics(torch.tensor([[0.0, 0.0, 1.0]]).double(), 3)[0]
+    signs = reference.spherical_harmonics(torch.tensor([[0.6, 0.48, 0.64]]).double(), 1)[0]
     assert_close(y[:4], torch.tensor([0.2820948, 0.0, 0.4886025, 0.0]).double(), rtol=0, atol=1e-6)
     assert_close(signs[1:], 0.4886025 * torch.tensor([-0.48, 0.64, -0.6]).double(), rtol=0, atol=1e-6)
 
@@ -234,7 +234,7 @@ def test_alpha_gradient_follows_the_suffix_recursions():
     generator = torch.Generator().manual_seed(0)
     alpha = (0.6 * torch.rand(1, 12, generator=generator)).double().requires_grad_()
     c, beta = torch.rand(12, generator=generator).double(), 0.7
-    w, T, T_end = reference._weights(alpha, Stop.INCLUSIVE)
+    w, T, T_end = reference.compositing_weights(alpha, Stop.INCLUSIVE)
     (one_way,) = torch.autograd.grad((w @ c + T_end * beta).sum(), alpha, retain_graph=True)
     (two_way,) = torch.autograd.grad(((w * T) @ c + T_end * beta).sum(), alpha)
     a, t, t_end = alpha.detach()[0], T.detach()[0], T_end.item()
@@ -255,7 +255,7 @@ def test_sensor_gradient_follows_the_chain_of_one_gaussian():
     )
     sensor = Sensor(f_mod_hz=f, phase_offset=phi, dc_offset=b, source_intensity=s)
     v = torch.randn(7, generator=generator).double()
-    out = reference._correlate(d[None], r[None, None], sensor, 2.0)[0]
+    out = reference.correlate(d[None], r[None, None], sensor, 2.0)[0]
     got = torch.autograd.grad((v * out).sum(), [d, r, f, phi, b, s])
     kappa = 4 * math.pi * f / SPEED_OF_LIGHT
     psi, a = kappa * d + phi, s * r / d**2
@@ -337,7 +337,7 @@ def test_blocks_of_pixels_change_nothing(monkeypatch):
     """The image is computed in blocks only to save memory."""
     case = CASES["posed"]()
     want = case.outputs(reference.rasterize, case.inputs(torch.float64))
-    monkeypatch.setattr(reference, "_BLOCK", 7000)
+    monkeypatch.setattr(reference, "BLOCK", 7000)
     got = case.outputs(reference.rasterize, case.inputs(torch.float64))
     for name in want:
         assert_close(got[name], want[name], rtol=1e-12, atol=1e-13)

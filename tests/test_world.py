@@ -204,7 +204,7 @@ def test_quaternions_turn_like_their_matrices():
     """All four branches of the conversion: small turns, and half turns about each axis."""
     turns = [(1, 2, 3), (179, 3, 2), (2, 179, 3), (3, 2, 179), (100, -120, 60), (0, 0, 0)]
     matrices = np.stack([rotation_matrix(turn) for turn in turns])
-    w, x, y, z = gaussian_cover._quaternion(matrices).T
+    w, x, y, z = gaussian_cover.quaternions(matrices).T
     np.testing.assert_allclose(w**2 + x**2 + y**2 + z**2, 1.0)
     got = np.stack(
         [

@@ -134,10 +134,10 @@ def _running(command: list[str], cache: Path) -> Iterator[subprocess.Popen]:
             errors.seek(0)
             said = errors.read().strip().splitlines() or ["nothing"]
             failed = f"`gftorf {command[0]}` ended with {process.returncode} and said: {' '.join(said[:3])}"
-            raise _failed(failed, process.returncode)
+            raise error_of(failed, process.returncode)
 
 
-def _failed(why: str, code: int) -> GftorfError:
+def error_of(why: str, code: int) -> GftorfError:
     """The error of the other process, with its exit code."""
     kinds = {kind.exit_code: kind for kind in GftorfError.__subclasses__()}
     fix = "run that command by itself, with --debug"

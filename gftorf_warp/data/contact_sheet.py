@@ -54,10 +54,7 @@ def contact_sheet(sequence: Sequence, truth: Truth | None, title: str) -> bytes:
         truth: What the scene really was, if that is known.
         title: Heading.
     """
-    quartets = _decodable(sequence)
-    n = sequence.cycle * quartets[len(quartets) // 2] if quartets else int(np.flatnonzero(sequence.measured)[0])
-    rows = [_raw(sequence, n), _decoded(sequence, truth, n, bool(quartets)), _more(sequence, truth, n)]
-    panels = [row[i : i + COLUMNS] for row in rows for i in range(0, len(row), COLUMNS)]
+    n, panels = middle_panels(sequence, truth)
     height = round(PANEL * sequence.height / sequence.width)
     cell = PANEL + BAR_GAP + BAR + BAR_TEXT
     size = (2 * MARGIN + HEAD + len(panels) * (TITLE + height + GAP), 2 * MARGIN + COLUMNS * (cell + GAP) - GAP, 3)
@@ -74,6 +71,14 @@ def contact_sheet(sequence: Sequence, truth: Truth | None, title: str) -> bytes:
             x, y = MARGIN + j * (cell + GAP), MARGIN + HEAD + i * (TITLE + height + GAP)
             _place(sheet, panel, x, y, height)
     return png_bytes(sheet)
+
+
+def middle_panels(sequence: Sequence, truth: Truth | None) -> tuple[int, list[list[Panel]]]:
+    """First raw frame of the middle quartet, and its panels in rows."""
+    quartets = _decodable(sequence)
+    n = sequence.cycle * quartets[len(quartets) // 2] if quartets else int(np.flatnonzero(sequence.measured)[0])
+    rows = [_raw(sequence, n), _decoded(sequence, truth, n, bool(quartets)), _more(sequence, truth, n)]
+    return n, [row[i : i + COLUMNS] for row in rows for i in range(0, len(row), COLUMNS)]
 
 
 def _decodable(sequence: Sequence) -> list[int]:
@@ -99,7 +104,7 @@ def _raw(sequence: Sequence, n: int) -> list[Panel]:
     for m in frames:
         name = f"raw frame {m}: {math.degrees(sequence.shifts[m]):.4g} deg, {1e3 * sequence.times[m]:.2f} ms"
         name += f", {sequence.frame_frequencies[m] / 1e6:.4g} MHz" if several else ""
-        panels.append(_scaled(name, sequence.quads[m], (-end, end), _diverging))
+        panels.append(scaled(name, sequence.quads[m], (-end, end), diverging))
     return panels
 
 
@@ -111,24 +116,24 @@ def _decoded(sequence: Sequence, truth: Truth | None, n: int, whole: bool) -> li
         quartet = decode_quartet(sequence, n // sequence.cycle)
         decoded = quartet.distance
         amplitude = 0.5 * np.hypot(*quartet.phasors[0])
-        panels.append(_scaled("amplitude of the closed form", amplitude, (0.0, _end(amplitude)), _gray))
+        panels.append(scaled("amplitude of the closed form", amplitude, (0.0, _end(amplitude)), _gray))
     elif truth is not None and truth.amplitude is not None:
         amplitude = truth.amplitude[n].astype(np.float64)
-        panels.append(_scaled("amplitude without noise", amplitude, (0.0, _end(amplitude)), _gray))
+        panels.append(scaled("amplitude without noise", amplitude, (0.0, _end(amplitude)), _gray))
     if truth is None:
         if decoded is not None:
-            panels.append(_scaled("closed form [m]", decoded, (decoded.min(), decoded.max()), _viridis))
+            panels.append(scaled("closed form [m]", decoded, (decoded.min(), decoded.max()), _viridis))
             panels += _by_frequency(sequence, quartet)
         return panels
     true = known_distance(truth)[n]
     if not np.isfinite(true).any():
         return panels
     ends = float(np.nanmin(true)), float(np.nanmax(true))
-    panels.append(_scaled("true distance [m]", true, ends, _viridis))
+    panels.append(scaled("true distance [m]", true, ends, _viridis))
     if decoded is not None:
         error = np.abs(decoded - true)
-        panels.append(_scaled("closed form [m]", decoded, ends, _viridis))
-        panels.append(_scaled("error of the closed form [m]", error, (0.0, _end(error)), _inferno))
+        panels.append(scaled("closed form [m]", decoded, ends, _viridis))
+        panels.append(scaled("error of the closed form [m]", error, (0.0, _end(error)), _inferno))
         panels += _by_frequency(sequence, quartet)
     return panels
 
@@ -140,9 +145,9 @@ def _by_frequency(sequence: Sequence, quartet: Decoded) -> list[Panel]:
     panels = []
     for f, image in zip(sequence.frequencies, quartet.single, strict=True):
         ends = 0.0, SPEED_OF_LIGHT / (2.0 * f)
-        panels.append(_scaled(f"{f / 1e6:.4g} MHz alone, to {ends[1]:.3g} m [m]", image, ends, _viridis))
+        panels.append(scaled(f"{f / 1e6:.4g} MHz alone, to {ends[1]:.3g} m [m]", image, ends, _viridis))
     title = f"confidence, {100 * float(quartet.ambiguous.mean()):.3g} % ambiguous"
-    return [*panels, _scaled(title, quartet.confidence, (0.0, 1.0), _gray)]
+    return [*panels, scaled(title, quartet.confidence, (0.0, 1.0), _gray)]
 
 
 def _more(sequence: Sequence, truth: Truth | None, n: int) -> list[Panel]:
@@ -154,7 +159,7 @@ def _more(sequence: Sequence, truth: Truth | None, n: int) -> list[Panel]:
             alone = SPEED_OF_LIGHT / (2.0 * sequence.frame_frequencies[n])
             difference = np.mod(difference + 0.5 * alone, alone) - 0.5 * alone
         end = max(_end(np.abs(difference)), 1e-3)
-        panels.append(_scaled("static phasor - true distance [m]", difference, (-end, end), _diverging))
+        panels.append(scaled("static phasor - true distance [m]", difference, (-end, end), diverging))
     if truth is not None and truth.body is not None:
         colours = np.array([(255, 255, 255), *PALETTE], dtype=np.uint8)
         body = truth.body[n]
@@ -174,7 +179,8 @@ def _more(sequence: Sequence, truth: Truth | None, n: int) -> list[Panel]:
     return panels
 
 
-def _scaled(title: str, image: np.ndarray, ends: tuple[float, float], colours: Colours) -> Panel:
+def scaled(title: str, image: np.ndarray, ends: tuple[float, float], colours: Colours) -> Panel:
+    """An image in false colours between two values; NaN is grey."""
     low, high = ends if ends[1] > ends[0] else (ends[0] - 0.5, ends[0] + 0.5)
     with np.errstate(invalid="ignore"):
         share = np.clip((image - low) / (high - low), 0.0, 1.0)
@@ -240,7 +246,7 @@ def _inferno(share: np.ndarray) -> Picture:
     return _mapped(share, "COLORMAP_INFERNO")
 
 
-def _diverging(share: np.ndarray) -> Picture:
+def diverging(share: np.ndarray) -> Picture:
     """Blue below the middle, white in it, red above."""
     x = 2.0 * share[..., None] - 1.0
     blue, red, white = (np.array(c) / 255.0 for c in ((33, 102, 172), (178, 24, 43), (255, 255, 255)))

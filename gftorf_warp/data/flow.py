@@ -71,7 +71,7 @@ def compute_flow(sequence: Sequence, *, method: Method = "dis") -> Flow:
 
         def combined(raw: dict[int, np.ndarray], reliable: dict[int, np.ndarray], step: int) -> dict[int, np.ndarray]:
             starts = [n for n in range(0, sequence.frames, abs(step)) if n in raw]
-            flows = threads.map(lambda n: _combined(n, raw, reliable, times, step), starts)
+            flows = threads.map(lambda n: median_flow(n, raw, reliable, times, step), starts)
             return dict(zip(starts, flows, strict=True))
 
         return Flow(
@@ -120,7 +120,7 @@ def _consistent(flow: np.ndarray, back: np.ndarray) -> np.ndarray:
     return np.where(np.hypot(*gap) > CONSISTENCY_PX, np.float32(np.nan), flow)
 
 
-def _combined(
+def median_flow(
     n: int, raw: dict[int, np.ndarray], reliable: dict[int, np.ndarray], times: np.ndarray, step: int
 ) -> np.ndarray:
     """Median of the reliable flow of the pairs around n, each read where the surface of n was at its time."""

@@ -38,7 +38,7 @@ from .control import DeviceCamera
 from .inputs import CHOICES, wanted_images
 
 _PARITY_TILE = 16  # [px] side of the released code's tiles, to which Support.SIGMA3_TILE16 rounds out
-_BLOCK = 4_000_000  # (pixel, Gaussian) pairs worked on at once: bounds the memory of a forward pass
+BLOCK = 4_000_000  # (pixel, Gaussian) pairs worked on at once: bounds the memory of a forward pass
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,28 +83,28 @@ def rasterize(
     """
     background = background or Background()
     height, width, q = camera.height, camera.width, len(sensor.shifts)
-    splats = _project(field, camera, settings)
+    splats = project(field, camera, settings)
     screen = None
     if screen_gradient:
         screen = ScreenGradient(values=field.mean.new_zeros(len(field), 4))
     centre, seen_of = _watched(splats, screen, [*field.parameters().values(), extra, *_tensors(background, sensor)])
 
     # What Gaussian k carries: columns weighted by T (colour, distance, 1, extra) and by T^2 (quads, phasor)
-    basis = _harmonics(splats.direction, settings.sh_degree)  # [M, K]
+    basis = spherical_harmonics(splats.direction, settings.sh_degree)  # [M, K]
     reflectivity = _shade(basis, field.reflectivity_sh[splats.index])
     d = splats.distance
     one_way = [d[:, None], torch.ones_like(d)[:, None]]
     if field.colour_sh is not None:
         one_way.append(_shade(basis, field.colour_sh[splats.index].flatten(1), channels=3))
     more = d.new_zeros(len(d), 0) if extra is None else extra[splats.index].to(d)
-    two_way = _correlate(d, reflectivity, sensor, settings.phasor_factor)
+    two_way = correlate(d, reflectivity, sensor, settings.phasor_factor)
     zeta = d if settings.distortion is Distortion.PAPER else _normalised(d, settings)
     carried = torch.cat(one_way, 1)
 
     pixel = _pixel_centres(camera, d)  # [P, 2]
     blocks = []
-    for block in pixel.split(max(1, _BLOCK // max(1, len(d)))):
-        w, T, T_end = _weights(_alpha(block, splats, centre, settings), settings.stop)
+    for block in pixel.split(max(1, BLOCK // max(1, len(d)))):
+        w, T, T_end = compositing_weights(_alpha(block, splats, centre, settings), settings.stop)
         moments = [w @ torch.stack([zeta**n], 1) for n in (0, 1, 2)]  # A, M, V
         half_sum = moments[0] * moments[2] - moments[1] ** 2
         seen = (w.detach() if extra_detached else w) @ more
@@ -141,8 +141,8 @@ def undecided_pixels(
     """
     with torch.no_grad():
         exact = field.map(lambda tensor: tensor.detach().double() if tensor.is_floating_point() else tensor)
-        splats = _project(exact, camera, settings)
-        blocks = _pixel_centres(camera, splats.distance).split(max(1, _BLOCK // max(1, len(splats.index))))
+        splats = project(exact, camera, settings)
+        blocks = _pixel_centres(camera, splats.distance).split(max(1, BLOCK // max(1, len(splats.index))))
         undecided = torch.cat([_undecided(block, splats, settings) for block in blocks])
     return undecided.reshape(camera.height, camera.width)
 
@@ -176,7 +176,7 @@ def _undecided(pixel: Tensor, splats: _Splats, settings: RenderSettings) -> Bool
     return undecided
 
 
-def _project(field: GaussianField, camera: Camera, settings: RenderSettings) -> _Splats:
+def project(field: GaussianField, camera: Camera, settings: RenderSettings) -> _Splats:
     """EWA projection (method, 2.2): cull, order near to far, and linearise the pinhole at each centre."""
     pose = torch.as_tensor(camera.camera_from_world, dtype=field.mean.dtype, device=field.device)
     rotation, translation = pose[:3, :3], pose[:3, 3]
@@ -237,7 +237,7 @@ def _rotation(wxyz: Float[Tensor, "M 4"]) -> Float[Tensor, "M 3 3"]:
     return torch.stack([torch.stack(row, 1) for row in rows], 1)
 
 
-def _harmonics(n: Float[Tensor, "M 3"], degree: int) -> Float[Tensor, "M K"]:
+def spherical_harmonics(n: Float[Tensor, "M 3"], degree: int) -> Float[Tensor, "M K"]:
     """Real harmonics Y_0 .. Y_{K-1}, K = (degree + 1)^2, of unit vectors, with the signs of method 2.3."""
     x, y, z = n.unbind(1)
     one = torch.ones_like(x)
@@ -270,7 +270,7 @@ def _shade(basis: Float[Tensor, "M K"], sh: Float[Tensor, "M KC"], channels: int
     return torch.relu((basis[:, :, None] * coefficients).sum(1) + SH_BIAS)
 
 
-def _correlate(
+def correlate(
     d: Float[Tensor, "M"], reflectivity: Float[Tensor, "M 1"], sensor: Sensor, phasor_factor: float
 ) -> Float[Tensor, "M light"]:
     """What a C-ToF pixel makes of each Gaussian alone: its Q quads, then its phasor (method, 2.4)."""
@@ -342,7 +342,7 @@ def _inside_tiles(
     return ((tile >= first) & (tile < end)).all(2)
 
 
-def _weights(
+def compositing_weights(
     alpha: Float[Tensor, "P M"], stop: Stop
 ) -> tuple[Float[Tensor, "P M"], Float[Tensor, "P M"], Float[Tensor, "P"]]:
     """Weights w = alpha T of what a pixel composites, T before each Gaussian, T_e behind the last one (method, 2.5)."""

@@ -152,7 +152,7 @@ def from_random(sequence: Sequence, settings: InitSettings, generator: torch.Gen
 
     The scale of each is the root mean square distance to its three nearest neighbours.
     """
-    mean = _in_frusta(_distinct_cameras(sequence), settings, generator)
+    mean = in_frusta(_distinct_cameras(sequence), settings, generator)
     reflectivity = torch.full((settings.count,), settings.reflectivity)
     return Start(field=_field(mean, _spacing(mean), reflectivity, MOVING, settings.opacity), positions=None, quartet=0)
 
@@ -163,7 +163,7 @@ def _distinct_cameras(sequence: Sequence) -> list[Camera]:
     return [camera_of(sequence, int(n)) for n in np.sort(first)]
 
 
-def _in_frusta(cameras: list[Camera], settings: InitSettings, generator: torch.Generator) -> Float[Tensor, "N 3"]:
+def in_frusta(cameras: list[Camera], settings: InitSettings, generator: torch.Generator) -> Float[Tensor, "N 3"]:
     """Points spread evenly over the union of the cameras' frusta between two z-depths.
 
     Drawn in the frustum of a random camera and kept once in as many times as there are frusta that hold it.

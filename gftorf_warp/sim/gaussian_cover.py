@@ -125,7 +125,7 @@ class Cover:
         return GaussianField(
             mean=_tensor(mean[shown]),
             log_scale=_tensor(np.log(self.scale[shown])),
-            quaternion=_tensor(_quaternion(rotation @ self.frame[shown])),
+            quaternion=_tensor(quaternions(rotation @ self.frame[shown])),
             opacity_logit=torch.full((count,), OPACITY_LOGIT),
             reflectivity_sh=constant_sh(_tensor(self.reflectance[shown] * cosine[shown])),
             colour_sh=constant_sh(_tensor(self.albedo[shown])).mT if colour else None,
@@ -154,7 +154,7 @@ def cover_still(bodies: tuple[Body, ...], camera: Camera) -> Cover:
     if camera.distortion:
         footprint /= np.sqrt(wide.area(torch.from_numpy(hits.point[hit])).numpy())
     return Cover(
-        point=hits.point[hit] + ray * (lead * _slope(normal, distance, ray, wide))[:, None],
+        point=hits.point[hit] + ray * (lead * depth_slope(normal, distance, ray, wide))[:, None],
         normal=normal,
         other=normal,
         limb=0.0,
@@ -204,7 +204,7 @@ def cover_moving(
     nearest, typical = distances.min(), distances.mean() + body.shape.reach
     if nearest <= 0:
         raise ValueError(f"a moving body reaches the camera: clearance {nearest:.3f} m must be above 0")
-    focal = camera.fx * _magnification(camera)
+    focal = camera.fx * magnification(camera)
     spacing, variance = SPACING * nearest / focal, LOW_PASS + RADIUS**2
     inset = spread(SPACING * nearest / typical, variance) * typical / focal - spacing / 2
     point, normal, other, limb = body.shape.grid(spacing, inset)
@@ -246,7 +246,7 @@ def merge(fields: list[GaussianField]) -> GaussianField:
     return GaussianField(**{name: torch.cat([part[name] for part in parts]) for name in parts[0]})
 
 
-def _slope(normal, distance, ray, camera: Camera) -> Float[np.ndarray, "N"]:
+def depth_slope(normal, distance, ray, camera: Camera) -> Float[np.ndarray, "N"]:
     """Growth of distance [m/px] on the tangent plane, where on the image z-depth, which orders splats, grows fastest.
 
     With the normal n, the direction f = (x/z, y/z, 1) and n . f z constant, grad z = -z n / (n . f) / focal length and
@@ -278,7 +278,7 @@ def _per_pixel(gradient, flat, camera: Camera) -> Float[np.ndarray, "N 2"]:
     return np.stack([x * yy - y * xy, y * xx - x * xy], axis=1) / (xx * yy - xy * xy)[:, None] / focal
 
 
-def _magnification(camera: Camera) -> float:
+def magnification(camera: Camera) -> float:
     """The most by which a lens stretches anything in the image, over a pinhole [1]."""
     if not camera.distortion:
         return 1.0
@@ -291,7 +291,7 @@ def _tensor(array: np.ndarray) -> torch.Tensor:
     return torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))
 
 
-def _quaternion(rotation: Float[np.ndarray, "N 3 3"]) -> Float[np.ndarray, "N 4"]:
+def quaternions(rotation: Float[np.ndarray, "N 3 3"]) -> Float[np.ndarray, "N 4"]:
     """Unit quaternions (wxyz) of rotations, from the largest of the four components, which never vanishes."""
     r = rotation
     trace = np.trace(r, axis1=1, axis2=2)
