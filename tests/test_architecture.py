@@ -77,7 +77,6 @@ LARGE_CLASSES = {  # file:class: why it may be larger
     "recon/run.py:Run": "still to be divided",
     "recon/state.py:State": "still to be divided",
     "render/buffers.py:Frame": "still to be divided",
-    "render/replay.py:Replay": "still to be divided",
 }
 SENTINEL = re.compile(r"(?<![\w.+*/-])-?\d+(\.\d+)?(: | likewise| (if|where|for|means) )")
 SENTINELS = {  # kernel.parameter or struct.field: why a number may mean something else there

@@ -11,6 +11,7 @@ from gftorf_warp.constants import CANONICAL_SHIFTS
 from gftorf_warp.recon.run import Run
 from gftorf_warp.render import replay as module
 from gftorf_warp.scene.camera import Camera
+from gftorf_warp.scene.distortion import Distortion
 from gftorf_warp.scene.motion import MotionSettings
 from gftorf_warp.scene.network import Network
 from gftorf_warp.scene.sensor import Sensor
@@ -110,18 +111,18 @@ def test_an_empty_field_renders_black(run):
     assert float(rendering.quads.abs().max()) == 0.0
 
 
-def test_cameras_are_forgotten_when_there_are_many(run, monkeypatch):
-    """Images stay right."""
-    monkeypatch.setattr(module, "CAMERAS_MAX", 2)
-    render = run.renderer(PLAIN)
-    for x in (0.0, 0.1, 0.2, 0.0):
-        got, want = render(0.02, aside(x)), run.render(0.02, aside(x))
+def test_cameras_of_one_size_share_memory(run):
+    """Poses and focal lengths are data; another size, or a lens, has memory of its own."""
+    render, bent = run.renderer(PLAIN), replace(CAMERA, distortion=Distortion(k1=-0.1))
+    long = replace(aside(0.1), fx=1.3 * CAMERA.fx, cy=0.4 * CAMERA.height)
+    for camera in (CAMERA, aside(0.2), bent, long, CAMERA.resized(20, 15), bent, CAMERA):
+        got, want = render(0.02, camera), run.render(0.02, camera)
         torch.testing.assert_close(got.distance, want.distance, rtol=1e-4, atol=1e-4)
-    assert len(render._views) == 2
+    assert len(render._targets) == 3
 
 
 @pytest.mark.parametrize("run", ["cpu"], indirect=True)
-def test_a_camera_is_captured_when_it_comes_again(run, monkeypatch):
+def test_a_size_is_captured_when_it_comes_again(run, monkeypatch):
     """What becomes a graph, and when, with a list of drawings in place of graphs; images stay right throughout."""
     captured, launched = [], []
     monkeypatch.setattr(module.Replay, "_captured", lambda _, seen: captured.append(seen) or seen)
@@ -135,8 +136,8 @@ def test_a_camera_is_captured_when_it_comes_again(run, monkeypatch):
         if number == 0:
             first = render._capacity.pairs
             assert first >= 1.5 * render.largest
-    assert len(captured) == 2, "once per camera"
-    assert len(launched) == 2 * len(TIMES) - 3, "not the one that counts pairs, nor the first of each camera after it"
+    assert len(captured) == 1, "once per size"
+    assert len(launched) == 2 * len(TIMES) - 2, "not the one that counts pairs, nor the first one after it"
     assert render._capacity.pairs == first, "pairs fitted"
     render._largest.fill_(10 * first)
     assert not render.fits()
@@ -154,8 +155,8 @@ def test_a_replay_is_a_call_to_the_bit(run):
         got, want = graphs(time, CAMERA), calls(time, CAMERA)
         for name in ("quads", "phasor", "distance", "opacity", "distortion"):
             torch.testing.assert_close(getattr(got, name), getattr(want, name), rtol=0, atol=0, msg=name)
-    assert all(view.graph is not None for view in graphs._views.values())
-    assert all(view.graph is None for view in calls._views.values())
+    assert all(target.graph is not None for target in graphs._targets.values())
+    assert all(target.graph is None for target in calls._targets.values())
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
@@ -165,7 +166,6 @@ def test_pairs_that_do_not_fit_are_rendered_again(run):
     render = run.renderer(PLAIN)
     render(0.0, CAMERA)
     render._capacity.pairs = 10
-    render._views.clear()
     render._targets.clear()
     render(0.02, CAMERA, checked=False)
     assert not render.fits()

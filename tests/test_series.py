@@ -169,7 +169,6 @@ def test_a_reserve_that_is_too_small_on_a_gpu(run):  # noqa: F811
         render = run.renderer(PLAIN)
         render(*VIEWS[0])
         render._capacity.pairs = 10
-        render._views.clear()
         render._targets.clear()
         one = Series(render, VIEWS)
         assert one.ahead == series.AHEAD
@@ -179,4 +178,4 @@ def test_a_reserve_that_is_too_small_on_a_gpu(run):  # noqa: F811
             got = [{n: getattr(r, n).cpu().numpy().copy() for n in PLAIN} for r in one.on_device()]
         assert_same(got, want)
         assert 1 <= one.again < len(VIEWS)
-        assert any(view.graph is not None for view in render._views.values())
+        assert any(target.graph is not None for target in render._targets.values())

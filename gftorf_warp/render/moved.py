@@ -2,33 +2,43 @@
 
 from __future__ import annotations
 
-import math
+import functools
 
-import numpy as np
 import torch
 import warp as wp
 from torch import Tensor
 
+from ..kernels.geometry import CameraView
 from ..kernels.motion.move import make_move
 from ..scene.camera import Camera
 from ..scene.gaussians import GaussianField
 from ..scene.motion import KeyMotion, Motion
 from .bridge import array_over
+from .buffers import RenderSettings
 from .cuda import stream_of
 from .inputs import Inputs
+from .launch import view_of
 
-INDEX, WEIGHT, HERE = 6, 7, 8  # parameters of ``move_gaussians`` that :meth:`MovedGaussians.move` sets
+CAMERA, INDEX, WEIGHT = 6, 7, 8  # parameters of ``move_gaussians`` that :meth:`MovedGaussians.move` sets
 
 
 class MovedGaussians:
     """The arrays that a rendering reads, filled by :meth:`move`; without gradients."""
 
     inputs: Inputs
-    """The Gaussians, where they were moved last."""
+    """The Gaussians at the time of the last :meth:`move`."""
+    view: wp.array
+    """[1] its camera, as ``View`` has it."""
 
     @torch.no_grad()
     def __init__(
-        self, field: GaussianField, motion: Motion, attachment: Tensor, calibration: Tensor, optimised: Camera
+        self,
+        field: GaussianField,
+        motion: Motion,
+        attachment: Tensor,
+        calibration: Tensor,
+        optimised: Camera,
+        settings: RenderSettings,
     ):
         """Allocate.
 
@@ -38,6 +48,7 @@ class MovedGaussians:
             attachment: What ``motion.attach`` returned for them.
             calibration: Of the sensor, as ``Inputs`` has it.
             optimised: The camera at the size of the optimisation, whose low-pass filter widened the Gaussians.
+            settings: How to render.
         """
         field = field.map(lambda tensor: tensor.detach().contiguous())
         first = motion.at_keys(attachment, [0])
@@ -48,6 +59,8 @@ class MovedGaussians:
         self._known: set[int] = set()
         self._store(0, first)
         self._kept = field, calibration, mean, log_scale, turned  # Warp arrays do not own their memory
+        device = wp.device_from_torch(field.device)
+        self.view = wp.zeros(1, dtype=CameraView, device=device)
         offset, rotation = array_over(tables[0], wp.vec3), array_over(tables[1], wp.vec4)
         initial = [array_over(tensor, wp.vec3) for tensor in (field.mean, field.log_scale)]
         quaternion = array_over(field.quaternion, wp.vec4)
@@ -63,38 +76,28 @@ class MovedGaussians:
         )
         kernel = make_move(motion.support)
         self._indices, self._weights = (kernel.adj.args[n].type for n in (INDEX, WEIGHT))
-        row = footprint_row(optimised)
-        inputs = [*initial, quaternion, offset, rotation, row, self._indices(), self._weights(), row]
-        where = {"device": wp.device_from_torch(field.device), "record_tape": False}
-        self._launch = wp.launch(kernel, len(field), inputs, outputs, record_cmd=True, **where)  # None for N = 0
+        self._camera = functools.lru_cache(maxsize=1024)(lambda camera: view_of(camera, settings))  # slow on the host
+        camera = view_of(optimised, settings)
+        inputs = [*initial, quaternion, offset, rotation, camera, camera, self._indices(), self._weights()]
+        where = {"device": device, "record_tape": False}
+        # packed once: that is most of what a launch costs a host
+        self._launch = wp.launch(kernel, max(len(field), 1), inputs, [*outputs, self.view], record_cmd=True, **where)
 
     @torch.no_grad()
-    def move(self, time: float, here: wp.vec4) -> None:
-        """Fill ``inputs``.
-
-        Args:
-            time: Seconds since raw frame 0, any number.
-            here: :func:`footprint_row` of the camera.
-        """
+    def move(self, time: float, camera: Camera) -> None:
+        """Fill ``inputs`` and ``view`` for a time [s], any number, and a camera."""
         keys = self._motion.keys_at(time)
         for key in set(keys.index) - self._known:
             self._store(key, self._motion.at_keys(self._attachment, [key]))
-        if self._launch is not None:
-            unused = self._motion.support - len(keys.index)
-            self._launch.set_param_at_index(INDEX, self._indices(*keys.index, *keys.index[:1] * unused))
-            self._launch.set_param_at_index(WEIGHT, self._weights(*keys.weight, *(0.0,) * unused))
-            self._launch.set_param_at_index(HERE, here)
-            with stream_of(self._attachment):
-                self._launch.launch()
+        unused = self._motion.support - len(keys.index)
+        self._launch.set_param_at_index(CAMERA, self._camera(camera))
+        self._launch.set_param_at_index(INDEX, self._indices(*keys.index, *keys.index[:1] * unused))
+        self._launch.set_param_at_index(WEIGHT, self._weights(*keys.weight, *(0.0,) * unused))
+        with stream_of(self._attachment):
+            self._launch.launch()
 
     def _store(self, key: int, motion: KeyMotion) -> None:
         for table, values in zip(self._tables, motion, strict=True):
             if table is not None and values is not None:
                 table[key] = values[0]
         self._known.add(key)
-
-
-def footprint_row(camera: Camera) -> wp.vec4:
-    """The row of a pose that gives z-depth, divided by the focal length: the width of a pixel at a point [m]."""
-    row = np.asarray(camera.camera_from_world[2], dtype=np.float64) / math.sqrt(camera.fx * camera.fy)
-    return wp.vec4(*(float(value) for value in row))

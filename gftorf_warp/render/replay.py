@@ -1,9 +1,8 @@
-"""Moving Gaussians that are rendered again and again: nothing is allocated, looked up or read back twice.
+"""A finished run rendered many times: memory is kept, the motion at a key is computed once, nothing is read back.
 
-Displacements are computed once per key time and interpolated on the device. Cameras, calibration and the arrays of a
-rendering are kept. On CUDA a camera that is used a second time has its rendering captured as a graph, so that an image
-costs the host two launches, and the number of pairs is not read back but reserved; images that would need more are
-rendered again. A replay runs the very launches of a call, so it gives the same bits.
+On CUDA the second and all further renderings of one size are one CUDA graph, whatever the camera, so
+that an image costs the host two launches. Memory is reserved for as many (tile, splat) pairs as
+:class:`PairCapacity` says; a rendering that needed more is repeated. Graph and launches give the same bits.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from ..kernels.motion import move
+from ..kernels.motion.move import note_largest
 from ..scene.camera import Camera
 from ..scene.gaussians import GaussianField
 from ..scene.motion import Motion
@@ -29,38 +28,29 @@ from .bridge import ALIGNED, array_over, left_out
 from .buffers import Frame, RenderSettings
 from .cuda import stream_of, without_garbage_collection
 from .inputs import CHOICES, Images, View, names_of, shapes_of, wanted_images
-from .moved import MovedGaussians, footprint_row
+from .moved import MovedGaussians
 from .pair_capacity import PairCapacity
 
-CAMERAS_MAX = 16  # that are kept, with their graphs
 Memory = TypeVar("Memory", Tensor, np.ndarray)
 
 
 @dataclass(kw_only=True, eq=False)
 class Target:
-    """The arrays of all renderings of one size."""
+    """Workspace and images of all renderings of one size."""
 
     frame: Frame
-    packed: Tensor  # [L] all images, one after the other, so that they move at once; last, as int32, their pairs
-    places: dict[str, tuple[int, tuple[int, ...]]]  # where in it each of them starts, and its shape
+    view: View
+    packed: Tensor  # [L] all images, consecutive, so that one copy moves them; last, as int32, their number of pairs
+    places: dict[str, tuple[int, tuple[int, ...]]]  # first element and shape of every image in it
     tensors: dict[str, Tensor]
     images: Images
-    pairs: wp.array  # the last one of ``packed``
-
-
-@dataclass(kw_only=True, eq=False)
-class _View:
-    """A camera that was used before."""
-
-    view: View
-    target: Target
-    footprint: wp.vec4
-    used: int = 0
+    pairs: wp.array  # last element of ``packed``
+    used: bool = False
     graph: wp.Graph | None = None
 
 
 class Replay:
-    """A field and its motion, ready to be rendered at any time from any camera; without gradients.
+    """A field and its motion, rendered at any time from any camera; without gradients.
 
     ``replay(time, camera)`` returns images that the next call overwrites.
     """
@@ -77,46 +67,45 @@ class Replay:
         *,
         colour_scale: float = 1.0,
     ):
-        """Take a copy of what changes, and share the rest.
+        """Allocate what does not depend on the size of images.
 
         Args:
-            field: The Gaussians where nothing has moved, float32.
-            motion: Where they are at which time.
-            attachment: How they hang on it.
+            field: The undisplaced Gaussians, float32.
+            motion: Their motion.
+            attachment: What ``motion.attach`` returned for them.
             sensor: With the shifts of the quads.
-            settings: How to render; pairs are reserved as needed.
+            settings: How to render; the pair capacity is adapted.
             optimised: The camera at the size of the optimisation, whose low-pass filter widened the Gaussians.
-            images: Names of what is wanted of quads, phasor, colour, distance, opacity and distortion; others have no
-                elements and cost nothing.
-            colour_scale: What colour is divided by.
+            images: Names of the images to compute, of quads, phasor, colour, distance, opacity and distortion.
+            colour_scale: Colour is divided by this.
 
         Raises:
-            ValueError: If there is no such image.
+            ValueError: If an image has an unknown name.
         """
         wp.init()
         self.settings, self.colour_scale = settings, colour_scale
         colour = {"colour"} & set(images) if field.colour_sh is not None else set()
         self.names, self._like = wanted_images(set(images) - {"colour"}) | colour, field.mean
-        self.shifts = tuple(float(shift) for shift in sensor.shifts)
         self.device = wp.device_from_torch(field.device)
         self.graphs = self.device.is_cuda
-        self.count = len(field)
+        """Whether renderings are captured."""
+        shifts = [(math.cos(shift), math.sin(shift)) for shift in sensor.shifts]
+        self._shifts = wp.array(shifts, dtype=wp.vec2, device=self.device)
         values = sensor.phase_slope, sensor.phase_offset, sensor.source_intensity, sensor.dc_offset
         calibration = torch.tensor([float(v) for v in values], dtype=torch.float32, device=field.device)
-        self._gaussians = MovedGaussians(field, motion, attachment, calibration, optimised)
-        self._views: dict[tuple, _View] = {}
-        self._targets: dict[tuple[int, int], Target] = {}
+        self._gaussians = MovedGaussians(field, motion, attachment, calibration, optimised, settings)
+        self._targets: dict[tuple[int, int, bool], Target] = {}
         self._largest = wp.zeros(1, dtype=wp.int32, device=self.device)
         self._capacity = PairCapacity()  # on a CPU pairs are always counted first
 
     def __call__(self, time: float, camera: Camera, *, checked: bool = True) -> Rendering:
-        """The images at one instant, in memory that the next call overwrites.
+        """The images at one time, in memory that the next call overwrites.
 
         Args:
-            time: Seconds since raw frame 0, any number; held constant outside the keys.
-            camera: Where from, and how many pixels.
-            checked: Whether to wait for the device and see that all pairs fitted. Without, ask :meth:`fits` later: far
-                splats are missing in images for which the reserve was too small.
+            time: Seconds since raw frame 0, any number; motion is constant outside the keys.
+            camera: Pose, intrinsics and size.
+            checked: Whether to synchronise and repeat a rendering whose pairs exceeded the capacity. Otherwise far
+                splats are missing in such images; :meth:`fits` returns whether there was one.
         """
         target = self.draw(time, camera)
         if checked and not self.fits():
@@ -125,86 +114,71 @@ class Replay:
         return self.rendering(target.tensors, camera)
 
     def rendering(self, tensors: Mapping[str, Tensor], camera: Camera) -> Rendering:
-        """Images by name as a rendering, without elements where there is none."""
-        images = {name: tensors[name] if name in tensors else self._left_out(name, camera) for name in CHOICES}
+        """Images by name as a rendering; those that are absent have no elements."""
+        size = camera.height, camera.width
+        images = {name: tensors[name] if name in tensors else left_out(name, self._like, *size) for name in CHOICES}
         return Rendering(**images, colour=tensors.get("colour"), extra=None, screen=None)
 
     def fits(self) -> bool:
-        """Whether the reserve of pairs sufficed since it was made; waits for the device."""
+        """Whether no rendering exceeded the pair capacity since it last changed; synchronises."""
         return self._capacity.pairs is None or self._capacity.fits(self.largest)
 
     def grow(self) -> None:
-        """Adapt the pair capacity to the largest number of pairs so far; graphs are captured anew."""
+        """Adapt the pair capacity to the largest number of pairs so far; memory and graphs are released."""
         if self.graphs:
             is_sorted = not all(target.frame.marks for target in self._targets.values())
             self._capacity.learn(self.largest, is_sorted=is_sorted)
-        self._views.clear()
         self._targets.clear()
 
     @property
     def largest(self) -> int:
-        """The largest number of (tile, splat) pairs of a rendering so far; waits for the device."""
+        """Largest number of (tile, splat) pairs of a rendering so far; synchronises."""
         with stream_of(self._like):
             return int(self._largest.numpy()[0])
 
     @torch.no_grad()
     def draw(self, time: float, camera: Camera) -> Target:
-        """The images at one instant, without a look at whether their pairs fitted; the next one overwrites them."""
-        seen = self._view(camera)
-        if self.graphs and self._capacity.pairs is not None and seen.used and seen.graph is None:
-            seen.graph = self._captured(seen)
-        self._gaussians.move(time, seen.footprint)
+        """The images at one time, without checking the number of pairs; the next call overwrites them."""
+        size = camera.height, camera.width, bool(camera.distortion)
+        if size not in self._targets:
+            self._targets[size] = self._target(*size)
+        target = self._targets[size]
+        if self.graphs and self._capacity.pairs is not None and target.used and target.graph is None:
+            target.graph = self._captured(target)
+        self._gaussians.move(time, camera)
         with stream_of(self._like):
-            if seen.graph is None:
-                self._draw(seen)
+            if target.graph is None:
+                self._draw(target)
             else:
-                self._launch(seen.graph)
-        seen.used += 1
+                self._launch(target.graph)
+        target.used = True
         if self.graphs and self._capacity.pairs is None:
             self.grow()
-        if "colour" in seen.target.tensors:
-            seen.target.tensors["colour"].div_(self.colour_scale)
-        return seen.target
+        if "colour" in target.tensors:
+            target.tensors["colour"].div_(self.colour_scale)
+        return target
 
-    def _left_out(self, name: str, camera: Camera) -> Tensor:
-        return left_out(name, self._like, camera.height, camera.width)
-
-    def _captured(self, seen: _View) -> wp.Graph:
-        """The rendering of a camera that was drawn before, on Warp's own stream: torch's default one cannot capture."""
+    def _captured(self, target: Target) -> wp.Graph:
+        """A rendering, captured on Warp's stream, since torch's default stream cannot be captured."""
         with without_garbage_collection(), wp.ScopedCapture(device=self.device) as capture:
-            self._draw(seen)
+            self._draw(target)
         return capture.graph
 
     def _launch(self, graph: wp.Graph) -> None:
-        """Replay on the stream that is current, which is torch's."""
+        """Launch a graph on the current stream, which is torch's."""
         wp.capture_launch(graph, stream=self.device.stream)
 
-    def _draw(self, seen: _View) -> None:
-        """What a graph holds: a rendering, and the number of its pairs."""
-        frame = seen.target.frame
-        launch.forward(self._gaussians.inputs, seen.view, frame, seen.target.images, differentiable=False)
-        if self.count:
-            noted = [self._largest, seen.target.pairs]
-            wp.launch(move.note_largest, 1, [frame.total], noted, device=self.device, record_tape=False)
+    def _draw(self, target: Target) -> None:
+        """The launches of a rendering, and of storing its number of pairs."""
+        inputs, frame = self._gaussians.inputs, target.frame
+        launch.forward(inputs, target.view, frame, target.images, differentiable=False)
+        if len(self._like):
+            counts = [self._largest, target.pairs]
+            wp.launch(note_largest, 1, [frame.total], counts, device=self.device, record_tape=False)
 
-    def _view(self, camera: Camera) -> _View:
-        """What is kept for a camera; the one that came first leaves when there are too many."""
-        lens = camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, camera.distortion
-        name = (*lens, camera.camera_from_world.tobytes())
-        if name not in self._views:
-            if len(self._views) >= CAMERAS_MAX:
-                if self._views[first := next(iter(self._views))].graph is not None:
-                    wp.synchronize_device(self.device)  # it may be at work
-                self._views.pop(first)
-            size = camera.height, camera.width
-            if size not in self._targets:
-                self._targets[size] = self._target(*size)
-            view = launch.uploaded(camera, self.shifts, self.settings, self.device)
-            self._views[name] = _View(view=view, target=self._targets[size], footprint=footprint_row(camera))
-        return self._views[name]
-
-    def _target(self, height: int, width: int) -> Target:
-        shapes = shapes_of(len(self.shifts), height, width)
+    def _target(self, height: int, width: int, lens: bool) -> Target:
+        """Memory for renderings of one size, through a lens or not."""
+        shapes = shapes_of(len(self._shifts), height, width)
         places, length = {}, 0
         for name in (name for name in shapes if name in self.names):
             places[name] = length, shapes[name]
@@ -213,12 +187,18 @@ class Replay:
         tensors = {name: part(packed, *place) for name, place in places.items()}
         settings = replace(self.settings, pair_capacity=self._capacity.pairs)
         with stream_of(self._like):
-            frame = Frame(self.count, width, height, settings, self.device)
-        images = Images(**dict.fromkeys(names_of(Images)) | {name: array_over(tensors[name]) for name in tensors})
-        pairs = array_over(packed[-1:].view(torch.int32), wp.int32)
-        return Target(frame=frame, packed=packed, places=places, tensors=tensors, images=images, pairs=pairs)
+            frame = Frame(len(self._like), width, height, settings, self.device)
+        return Target(
+            frame=frame,
+            view=View(camera=self._gaussians.view, shifts=self._shifts, lens=lens),
+            packed=packed,
+            places=places,
+            tensors=tensors,
+            images=Images(**dict.fromkeys(names_of(Images)) | {name: array_over(tensors[name]) for name in tensors}),
+            pairs=array_over(packed[-1:].view(torch.int32), wp.int32),
+        )
 
 
 def part(packed: Memory, start: int, shape: tuple[int, ...]) -> Memory:
-    """The image of a shape that starts at an element of a memory of many."""
+    """One image in the memory of many: its first element and shape."""
     return packed[start : start + math.prod(shape)].reshape(shape)

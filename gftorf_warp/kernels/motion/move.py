@@ -1,19 +1,27 @@
-"""Gaussians of a finished run at one time, widened for cameras that resolve more than that of the optimisation."""
+"""Gaussians of a finished run at one time, widened for cameras that resolve more than that of the optimisation.
+
+The low-pass filter of the renderer widens every Gaussian by LOW_PASS pixels^2. With z the z-depth and f
+the focal length of the camera of the optimisation, and z', f' those of this camera,
+
+    exp(2 log_scale') = exp(2 log_scale) + LOW_PASS max(0, (z / f)^2 - (z' / f')^2)
+"""
 
 import functools
 
 import warp as wp
 
 from ...constants import LOW_PASS
+from ..geometry import CameraView
 from .displace import OPTIONS, make_interpolation, product
 
 LOW_PASS_PX2 = wp.constant(float(LOW_PASS))  # [px^2]
 
 
 @wp.func
-def footprint(row: wp.vec4, point: wp.vec3) -> float:
-    """Width of a pixel at a point [m]: its z-depth over the focal length, both from one row."""
-    return row[0] * point[0] + row[1] * point[1] + row[2] * point[2] + row[3]
+def squared_footprint(camera: CameraView, point: wp.vec3) -> float:
+    """Area that a pixel covers at a point [m^2]: (z-depth / focal length)^2."""
+    z = wp.dot(camera.rotation[2], point) + camera.translation[2]
+    return z * z / (camera.fx * camera.fy)
 
 
 @functools.cache
@@ -30,22 +38,25 @@ def make_move(K: int) -> wp.Kernel:
         initial_quaternion: wp.array[wp.vec4],  # [N] orientations wxyz; empty: no rotation
         offset: wp.array2d[wp.vec3],  # [T, N] displacements at all keys [m]
         rotation: wp.array2d[wp.vec4],  # [T, N] rotations wxyz at all keys; empty: no rotation
-        optimised: wp.vec4,  # row of the camera of the optimisation that gives a footprint [m]
+        optimised: CameraView,  # camera of the optimisation [struct]
+        camera: CameraView,  # camera of the image [struct]
         index: Indices,  # [K] keys of the time [index]
         weight: Weights,  # [K] interpolation weights of the time [1]
-        here: wp.vec4,  # row of this camera that gives a footprint [m]
         # Out:
         mean: wp.array[wp.vec3],  # [N] [m]
         log_scale: wp.array[wp.vec3],  # [N] [log m]
         quaternion: wp.array[wp.vec4],  # [N] orientations wxyz; empty: no rotation
+        view: wp.array[CameraView],  # [1] ``camera``, for the kernels of the rendering
     ):
-        """One thread per Gaussian."""
+        """One thread per Gaussian, at least one."""
         i = wp.tid()
+        if i == 0:
+            view[0] = camera
+        if i >= initial_mean.shape[0]:
+            return
         point = initial_mean[i] + interpolated(offset, index, weight, i)
         scale = initial_log_scale[i]
-        wide = footprint(optimised, point)
-        narrow = footprint(here, point)
-        missing = LOW_PASS_PX2 * (wide * wide - narrow * narrow)
+        missing = LOW_PASS_PX2 * (squared_footprint(optimised, point) - squared_footprint(camera, point))
         if missing > 0.0:
             for axis in range(3):
                 scale[axis] = 0.5 * wp.log(wp.exp(2.0 * scale[axis]) + missing)
@@ -63,8 +74,8 @@ def note_largest(
     # In:
     total: wp.array[int],  # [1] pairs of this rendering [1]
     # Out:
-    largest: wp.array[int],  # [1] of all so far [1]
-    latest: wp.array[int],  # [1] the same, beside the images that it belongs to [1]
+    largest: wp.array[int],  # [1] of all renderings so far [1]
+    latest: wp.array[int],  # [1] the same as ``total``, in the memory of the images [1]
 ):
     """One thread."""
     largest[0] = wp.max(largest[0], total[0])
