@@ -8,8 +8,8 @@ from gftorf_warp.render.api import rasterize
 from gftorf_warp.scene.camera import Camera
 from gftorf_warp.scene.sensor import Sensor
 from gftorf_warp.sim.assembly import FACES, Assembly, Level, Part
+from gftorf_warp.sim.bodies import chair
 from gftorf_warp.sim.gaussian_cover import clearance, cover_moving
-from gftorf_warp.sim.lookalikes import chair
 from gftorf_warp.sim.paths import Line, Still
 from gftorf_warp.sim.record import still_interior
 from gftorf_warp.sim.scene import Scene
@@ -128,11 +128,11 @@ def test_interior_pixels_know_the_parts_of_an_assembly():
 
 def test_what_cannot_be_is_refused():
     """Walls do not move, assemblies have parts, parts have an end, coordinates are three."""
-    with pytest.raises(ValueError, match="no end"):
+    with pytest.raises(ValueError, match="cannot be covered while it moves"):
         Level(axis=2, value=1.0).grid(0.1, 0.0)
     with pytest.raises(ValueError, match="at least one part"):
         Assembly(parts=())
-    with pytest.raises(ValueError, match="must have an end"):
+    with pytest.raises(ValueError, match="must be finite"):
         Part(shape=Level(axis=2, value=1.0))
     with pytest.raises(ValueError, match="single shape"):
         Part(shape=chair())

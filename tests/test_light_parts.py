@@ -14,12 +14,13 @@ from gftorf_warp.constants import SPEED_OF_LIGHT
 from gftorf_warp.render.trace import Bounces, RigidBody, Tracer
 from gftorf_warp.scene.camera import Camera
 from gftorf_warp.scene.sensor import Sensor
+from gftorf_warp.sim.bodies import room
 from gftorf_warp.sim.curves import Curve, Guided, Turn
 from gftorf_warp.sim.mesh_engine import MeshEngine
 from gftorf_warp.sim.paths import Line, Still
 from gftorf_warp.sim.readout import mean_quad
 from gftorf_warp.sim.record import record
-from gftorf_warp.sim.scenes import SCENES, room
+from gftorf_warp.sim.scenes import SCENES
 from gftorf_warp.sim.world import Body, Box, Sphere, Texture, first_hit, flow_of
 
 SHINY = Texture(low=0.6, high=0.6, gloss=0.4, shininess=30.0)

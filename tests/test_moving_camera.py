@@ -12,10 +12,12 @@ from gftorf_warp.errors import UsageError
 from gftorf_warp.render.api import rasterize
 from gftorf_warp.scene.measured import camera_of, colour_camera_of, sample
 from gftorf_warp.scene.sensor import Sensor
+from gftorf_warp.sim.bodies import box, room
 from gftorf_warp.sim.gaussian_engine import GaussianEngine
 from gftorf_warp.sim.paths import Line, Still, Sweep, Viewpoint, inverse, looking_at, rotation_matrix
 from gftorf_warp.sim.record import record, still_interior
-from gftorf_warp.sim.scenes import SCENES, ColourCamera, Scene, room, still
+from gftorf_warp.sim.scene import ColourCamera
+from gftorf_warp.sim.scenes import SCENES, Scene
 from gftorf_warp.sim.simulate import simulate
 from gftorf_warp.sim.world import Body, Box, Plane, Sphere, Texture, albedo, first_hit
 
@@ -27,12 +29,12 @@ COLOUR = ColourCamera(width=192, height=144, position=(0.06, -0.02, 0.01), turn_
 
 def carried(**more):
     """A room with a box at rest, seen by a camera on an arc, without noise unless the sensor has some."""
-    box = still(Box(size=(0.8, 0.8, 0.6)), (0.1, 0.1, 2.6), 0.4, 0.9, 0.2, 0.1)
+    still = box((0.8, 0.8, 0.6), (0.1, 0.1, 2.6), Texture(low=0.4, high=0.9, cell=0.2, hue=0.1))
     settings = {
         "name": "carried",
         "description": "a camera is carried past a box",
         "motion": "arc",
-        "bodies": (room(hue=0.55), box),
+        "bodies": (room(hue=0.55), still),
         "frames": 8,
         "width": 96,
         "height": 72,

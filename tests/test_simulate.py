@@ -11,9 +11,10 @@ from sequences import values_of
 from gftorf_warp import Sequence
 from gftorf_warp.errors import UsageError
 from gftorf_warp.scene.sensor import Sensor, distance_from_phasor, phasor_from_quads
+from gftorf_warp.sim.bodies import room
 from gftorf_warp.sim.paths import Line
 from gftorf_warp.sim.record import record, still_interior
-from gftorf_warp.sim.scenes import OURS, SCENES, Scene, room
+from gftorf_warp.sim.scenes import OURS, SCENES, Scene
 from gftorf_warp.sim.simulate import simulate
 from gftorf_warp.sim.world import Body, Box, Texture, first_hit
 

@@ -10,9 +10,10 @@ from comparison import DEVICES
 from gftorf_warp.constants import SPEED_OF_LIGHT
 from gftorf_warp.render.trace import RigidBody, Tracer
 from gftorf_warp.scene.camera import Camera
+from gftorf_warp.sim.bodies import room
 from gftorf_warp.sim.mesh_engine import MeshEngine, rigid_bodies, triangles_of
 from gftorf_warp.sim.paths import Line, Still, inverse, rigid, rotation_matrix
-from gftorf_warp.sim.scenes import SCENES, Scene, room
+from gftorf_warp.sim.scenes import SCENES, Scene
 from gftorf_warp.sim.world import Body, Box, Plane, Sphere, Texture, first_hit
 
 GREY = Texture(low=0.5, high=0.5)

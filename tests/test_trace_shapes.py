@@ -11,8 +11,8 @@ from gftorf_warp import Sequence, cli
 from gftorf_warp.render.trace import Bounces
 from gftorf_warp.scene.camera import Camera
 from gftorf_warp.sim.assembly import Assembly, Level, Part
+from gftorf_warp.sim.bodies import chair
 from gftorf_warp.sim.ideal_sensor import light_of
-from gftorf_warp.sim.lookalikes import chair
 from gftorf_warp.sim.mesh_engine import MeshEngine, rigid_bodies
 from gftorf_warp.sim.paths import Line, Still
 from gftorf_warp.sim.scene_file import read_scene

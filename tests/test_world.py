@@ -11,8 +11,8 @@ from gftorf_warp.render.api import rasterize
 from gftorf_warp.scene.camera import Camera
 from gftorf_warp.scene.sensor import Sensor, distance_from_phasor
 from gftorf_warp.sim import gaussian_cover
+from gftorf_warp.sim.bodies import room
 from gftorf_warp.sim.paths import Arc, Line, Still, rotation_matrix
-from gftorf_warp.sim.scenes import room
 from gftorf_warp.sim.world import Body, Box, Plane, Sphere, Texture, first_hit
 
 GREY = Texture(low=0.5, high=0.5)

@@ -1,4 +1,4 @@
-"""The scene: Gaussians as raw tensors by name, their activations as properties."""
+"""A field of Gaussians: raw tensors by name, and their activations as properties."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class GaussianField:
     mean: Float[Tensor, "N 3"]
     """Centre in the world [m]."""
     log_scale: Float[Tensor, "N 3"]
-    """Natural logarithm of the standard deviations along the own axes [log m]."""
+    """Natural logarithm of the standard deviations along the principal axes [log m]."""
     quaternion: Float[Tensor, "N 4"]
     """Orientation, wxyz; any length but zero."""
     opacity_logit: Float[Tensor, "N"]
@@ -28,7 +28,7 @@ class GaussianField:
     colour_sh: Float[Tensor, "N 16 3"] | None = None
     """Harmonics of linear RGB; None if there is no colour."""
     layer: Int[Tensor, "N"] | None = None
-    """Label of the motion layer a Gaussian belongs to (0: static); carried along, never optimised."""
+    """Label of the motion layer that a Gaussian belongs to (0: static); never optimised."""
 
     def __post_init__(self):
         n = len(self.mean)
@@ -51,7 +51,7 @@ class GaussianField:
 
     @property
     def scale(self) -> Float[Tensor, "N 3"]:
-        """Standard deviations along the own axes [m]."""
+        """Standard deviations along the principal axes [m]."""
         return self.log_scale.exp()
 
     @property
@@ -61,7 +61,7 @@ class GaussianField:
 
     @property
     def device(self) -> torch.device:
-        """Where the tensors live."""
+        """Device of the tensors."""
         return self.mean.device
 
     def tensors(self) -> dict[str, Tensor]:
@@ -80,6 +80,12 @@ class GaussianField:
         """The field with every centre displaced [m], and covariances rotated by quaternions wxyz of any length."""
         quaternion = self.quaternion if rotation is None else product(rotation, self.quaternion)
         return replace(self, mean=self.mean + offset, quaternion=quaternion)
+
+
+def concatenated(parts: list[GaussianField]) -> GaussianField:
+    """One field of several, in their order."""
+    tensors = [part.tensors() for part in parts]
+    return GaussianField(**{name: torch.cat([part[name] for part in tensors]) for name in tensors[0]})
 
 
 def product(a: Float[Tensor, "*n 4"], b: Float[Tensor, "*n 4"]) -> Float[Tensor, "*n 4"]:

@@ -21,7 +21,7 @@ from ..errors import InputError
 from .camera import CHECKED, Camera
 from .clouds import cloud_of, follow_clouds, moving_layer, reference, windows
 from .fusion import static_layer, verdicts, views_of
-from .gaussians import GaussianField, constant_sh
+from .gaussians import GaussianField, concatenated, constant_sh
 from .measured import (
     Change,
     FarLayer,
@@ -115,7 +115,7 @@ def from_phase(sequence: Sequence, settings: InitSettings = InitSettings()) -> S
     moving = _layer(
         positions[middle], distance, amplitude, MOVING, settings.moving_spacing, camera_of(sequence, 0), settings
     )
-    return Start(field=_joined(static, moving), positions=positions, quartet=middle)
+    return Start(field=concatenated([static, moving]), positions=positions, quartet=middle)
 
 
 def _from_views(sequence: Sequence, settings: InitSettings) -> Start:
@@ -138,13 +138,7 @@ def _from_views(sequence: Sequence, settings: InitSettings) -> Start:
             (replace(near, mean=positions[quartet]), MOVING, settings.moving_spacing),
         )
     )
-    return Start(field=_joined(static, moving), positions=positions, quartet=quartet)
-
-
-def _joined(static: GaussianField, moving: GaussianField) -> GaussianField:
-    """Both layers in one field, the static one first."""
-    both = {name: torch.cat([value, moving.tensors()[name]]) for name, value in static.tensors().items()}
-    return GaussianField(**both)
+    return Start(field=concatenated([static, moving]), positions=positions, quartet=quartet)
 
 
 def from_random(sequence: Sequence, settings: InitSettings, generator: torch.Generator) -> Start:

@@ -1,4 +1,4 @@
-"""Shapes beyond the three primitives: planes without an end, and several shapes that move as one rigid body."""
+"""Shapes beyond the three primitives: infinite planes, and several shapes that move as one rigid body."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from .meshes import Mesh
 from .paths import Vector
-from .world import Box, Grid, Shape, passing
+from .world import Box, Grid, Shape, rays_to_ball
 
 FACES = 1 << 32  # numbers that the faces of one part may use; a box has 6, a mesh as many as triangles
 
@@ -19,40 +19,31 @@ FACES = 1 << 32  # numbers that the faces of one part may use; a box has 6, a me
 class Level(Shape):
     """The infinite plane where one coordinate has a value, seen from both sides: a back wall, a floor.
 
-    Its axes are meant to be the world's, so that its texture is hashed from world coordinates. It cannot move, since no
+    Its axes are the world's, so that its texture is hashed from world coordinates. It cannot move, since no finite
     number of splats covers it.
     """
 
     axis: int
     """The coordinate: 0 is x, 1 is y, 2 is z."""
     value: float
-    """What that coordinate is on the plane [m]."""
+    """Its value on the plane [m]."""
 
     def __post_init__(self):
         if self.axis not in (0, 1, 2):
             raise ValueError(f"axis must be 0, 1 or 2, got {self.axis}")
 
     def hit(self, origin, ray):
-        """Where the coordinate takes the value; face 1 is met by rays along which the coordinate grows, else 0."""
+        """Where the coordinate takes the value; face 1 is hit by rays along which the coordinate grows, else 0."""
         along = ray[:, self.axis]
         with np.errstate(divide="ignore", invalid="ignore"):
             distance = (self.value - origin[self.axis]) / along
         return np.where(distance > 0, distance, np.inf), (along > 0).astype(np.int64)
 
     def normal(self, point, face):
-        """Along the axis, towards where the ray came from."""
+        """Along the axis, towards the origin of the ray."""
         normal = np.zeros_like(point)
         normal[:, self.axis] = np.where(face > 0, -1.0, 1.0)
         return normal
-
-    def grid(self, spacing, inset):
-        """There is none.
-
-        Raises:
-            ValueError: Always.
-        """
-        del spacing, inset
-        raise ValueError(f"{self} has no end, so nothing can cover it: let its path be Still")
 
     @property
     def reach(self) -> float:
@@ -71,17 +62,17 @@ class Part:
 
     def __post_init__(self):
         if not np.isfinite(self.shape.reach):
-            raise ValueError(f"a part must have an end, {self.shape} has none")
+            raise ValueError(f"a part must be finite, {self.shape} is not")
         if isinstance(self.shape, Assembly):
             raise ValueError("a part must be a single shape: list the parts of all assemblies in one")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Assembly(Shape):
-    """Shapes fixed to each other, of one texture, that move as one: a chair, the frame of a door."""
+    """Shapes of one texture that are fixed to each other: a chair, the frame of a door."""
 
     parts: tuple[Part, ...] = field(default_factory=tuple)
-    """What it is made of; parts may touch and overlap."""
+    """The shapes; parts may touch and overlap."""
 
     def __post_init__(self):
         if not self.parts:
@@ -90,10 +81,10 @@ class Assembly(Shape):
     def hit(self, origin, ray):
         """The nearest hit of any part; faces are numbered ``FACES`` times the part plus the face of the part."""
         distance, face = np.full(len(ray), np.inf), np.zeros(len(ray), dtype=np.int64)
-        near = passing(origin, ray, np.zeros(3), self.reach)
+        near = rays_to_ball(origin, ray, np.zeros(3), self.reach)
         for index, part in enumerate(self.parts):
             position = np.asarray(part.position)
-            rays = near[passing(origin, ray[near], position, part.shape.reach)]
+            rays = near[rays_to_ball(origin, ray[near], position, part.shape.reach)]
             reached, side = part.shape.hit(origin - position, ray[rays])
             nearer = reached < distance[rays]
             chosen = rays[nearer]
@@ -101,7 +92,7 @@ class Assembly(Shape):
         return distance, face
 
     def normal(self, point, face):
-        """That of the part that was hit."""
+        """Normal of the part that was hit."""
         normal = np.zeros_like(point)
         for index, part in enumerate(self.parts):
             mine = face // FACES == index
@@ -109,7 +100,7 @@ class Assembly(Shape):
         return normal
 
     def grid(self, spacing, inset):
-        """The grids of all parts, also where one part hides another."""
+        """The grids of all parts, hidden ones included."""
         grids = [part.shape.grid(spacing, inset) for part in self.parts]
         return Grid(
             np.concatenate([g.point + part.position for g, part in zip(grids, self.parts, strict=True)]),
@@ -120,11 +111,11 @@ class Assembly(Shape):
 
     @cached_property
     def reach(self) -> float:
-        """Of the part that reaches farthest [m]."""
+        """Of the farthest part [m]."""
         return max(float(np.linalg.norm(part.position)) + part.shape.reach for part in self.parts)
 
     def clearance(self, point: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P"]:
-        """How near the nearest part may be to points in its axes [m]: exact for boxes, to their balls for others."""
+        """Lower bound of the distance to points in its axes [m]: exact for boxes, bounding spheres for others."""
         least = np.full(len(point), np.inf)
         for part in self.parts:
             local = point - part.position

@@ -1,6 +1,6 @@
-"""Rigid paths out of curves: each coordinate and each angle is a sum of a few simple motions.
+"""Rigid paths of which each coordinate and each angle is a curve: a sum of a few simple motions.
 
-What swings, falls, opens, waves or is carried: a hinge is a position that stays, a turn, and an arm from the axis to
+They describe swinging, falling, opening and waving. A hinge is a fixed position, a turn, and an arm from its axis to
 the body.
 """
 
@@ -19,17 +19,17 @@ AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 @dataclass(frozen=True, kw_only=True)
 class Curve:
-    """A number that changes with time: all terms below, added. Units are those of what it stands for, m or deg.
+    """A coordinate [m] or angle [deg] as a function of time: the sum of all terms below.
 
-    Eased terms follow e(t) = (1 - cos(pi t)) / 2, from 0 to 1 within one second, at rest before and after.
+    Eased terms follow e(t) = (1 - cos(pi t)) / 2, from 0 to 1 within the first second, constant before and after.
     """
 
     start: float = 0.0
-    """Value at time 0 of what does not swing."""
+    """Value at time 0, without the swing."""
     rate: float = 0.0
-    """Growth per second."""
+    """First derivative at time 0 [per s]."""
     acceleration: float = 0.0
-    """Growth of the rate per second."""
+    """Second derivative [per s^2]."""
     swing: float = 0.0
     """Amplitude of swing sin(2 pi swing_hz t + phase)."""
     swing_hz: float = 1.0
@@ -37,9 +37,9 @@ class Curve:
     swing_phase_deg: float = 0.0
     """Its phase at time 0 [deg]."""
     eased: float = 0.0
-    """How far it goes with e(t)."""
+    """Amplitude of e(t)."""
     arched: float = 0.0
-    """How far it goes with sin(pi e(t)): there and back."""
+    """Amplitude of sin(pi e(t)): out and back."""
 
     def __call__(self, time: float) -> float:
         """Value at ``time`` [s]."""
@@ -65,18 +65,18 @@ class Turn:
 
 @dataclass(frozen=True, kw_only=True)
 class Guided(Path):
-    """A position, turns one after the other, and an arm that turns with the body."""
+    """A pivot, rotations one after the other, and an arm that turns with the body."""
 
     x: float | Curve = 0.0
-    """Of the point about which it turns [m]."""
+    """x of the pivot [m]."""
     y: float | Curve = 0.0
-    """Likewise [m]."""
+    """y of the pivot [m]."""
     z: float | Curve = 0.0
-    """Likewise [m]."""
+    """z of the pivot [m]."""
     turns: tuple[Turn, ...] = ()
-    """Orientation as the product of these, the first leftmost: the last is done first, in the body's own axes."""
+    """Orientation as the product of these, the first leftmost: the last is applied first, in the body's axes."""
     arm: Vector = (0.0, 0.0, 0.0)
-    """From that point to the origin of the body's axes, in those axes [m]."""
+    """From the pivot to the origin of the body's axes, in those axes [m]."""
 
     def world_from_body(self, time: float) -> Float[np.ndarray, "4 4"]:
         """Pose at ``time`` [s]."""

@@ -1,25 +1,24 @@
-"""Shapes covered by flat Gaussians, dense enough that a rendering of them is the surface.
+"""Covers: shapes as flat Gaussians, dense enough that a rendering of them is the surface.
 
-A splat seen by a pixel has the profile exp(-r^2 / 2v), v = its own variance on the image plus the renderer's low-pass.
-Neighbours overlap, and those nearer to the camera come first, so a cover differs from the surface it stands for in
-three known ways, computed by :func:`overlap` and :func:`spread` from the compositing rule itself:
+A splat at a pixel has the profile exp(-r^2 / 2v), v = its own variance on the image plus the renderer's low-pass.
+Neighbours overlap, and those nearer to the camera come first, so a cover differs from its surface in three ways, which
+:func:`overlap` and :func:`spread` compute from the compositing rule:
 
 * it returns only the share  sum alpha T^2 < 1  of the light, hence reflectivity = rho cos(incidence) / share;
-* it reaches beyond its outermost centres by ``spread`` pixels, hence grids stay that far inside what may be an outline;
-* on a slanted surface the near side of the footprint counts more, so the mean distance falls short by ``lead`` pixels
-  of slope. Splats of still bodies are set back along their rays by that much; on bodies that move it is left in,
-  since their covers are rigid and the view of them changes.
+* it extends ``spread`` pixels beyond its outermost centres, hence grids end that far inside of possible outlines;
+* on a slanted surface the near side of the footprint counts more, so the mean distance is too short by ``lead`` pixels
+  of slope. Splats of still bodies are moved back along their rays by that much; covers of moving bodies are rigid,
+  while the view of them changes, and keep this error.
 
-Still bodies are covered where the rays of the camera meet them, one splat a pixel: no splat is wasted and no beat with
-the pixel grid appears. A camera that moves gets another such cover at every instant, of the same surfaces. Bodies that
-move get a regular grid on each face, fine enough for their nearest point as seen from wherever the camera is then.
-Reflectivity is the same in every direction of view, and shading by the angle of incidence is evaluated anew for every
-instant: what the sensor measures obeys Lambert's law, not the model that is fitted to it.
+Still bodies are covered along the rays of the camera, one splat a pixel, which avoids moire with the pixel grid; a
+moving camera gets a new cover at every instant. Moving bodies get a regular grid on each face, fine enough for the
+nearest approach of body and camera. Reflectivity is the same in all directions; the cosine of the angle of incidence is
+evaluated at every instant, so that the data obey Lambert's law, and not the model that is fitted to them.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cache
 
 import numpy as np
@@ -43,12 +42,12 @@ COSINE_MIN = 0.1  # splats grow no longer than this on surfaces met at a glancin
 
 @cache
 def overlap(spacing: float, variance: float, aligned: bool) -> tuple[float, float]:
-    """What a cover does at a pixel: (share of the light returned [1], lead of the near side [px]).
+    """(Share of the light that a cover returns [1], lead of the near side [px]) at a pixel.
 
     Args:
         spacing: Distance between splats [px].
         variance: Variance v of a splat on the image [px^2].
-        aligned: Whether every pixel centre sees a splat centre; otherwise both are averaged over all alignments.
+        aligned: Whether splats are centred on pixels; otherwise both results are averaged over all alignments.
     """
     index = np.arange(-8, 9) * spacing
     x, y = (axis.ravel() for axis in np.meshgrid(index, index, indexing="ij"))  # x: from near to far
@@ -66,9 +65,9 @@ def overlap(spacing: float, variance: float, aligned: bool) -> tuple[float, floa
 
 @cache
 def spread(spacing: float, variance: float) -> float:
-    """How far a cover that ends at a straight row of splats reaches beyond that row [px], judged by the light it stops.
+    """How far a cover that ends at a straight row of splats extends beyond that row [px].
 
-    The opaque half-plane of equal coverage ends there. ``spacing`` [px] and ``variance`` [px^2] as in :func:`overlap`.
+    The opaque half-plane that stops as much light ends there. Arguments as in :func:`overlap`.
     """
     rows, columns = np.meshgrid(-np.arange(12) * spacing, np.arange(-12, 13) * spacing)
     step = 0.05
@@ -89,9 +88,9 @@ class Cover:
     normal: Float[np.ndarray, "N 3"]
     """Unit normals, likewise."""
     other: Float[np.ndarray, "N 3"]
-    """At an edge, normals of the other face: the splat shows only if both faces do, since elsewhere it is outline."""
+    """At an edge, normals of the other face: visible only if both faces are, since elsewhere it is an outline."""
     limb: float
-    """A splat shows only if the cosine of its incidence exceeds this [1]."""
+    """Visible only if the cosine of incidence exceeds this [1]."""
     frame: Float[np.ndarray, "N 3 3"]
     """Orientation of each disc, likewise: columns are its two axes and its normal."""
     scale: Float[np.ndarray, "N 3"]
@@ -99,17 +98,17 @@ class Cover:
     reflectance: Float[np.ndarray, "N"]
     """Reflectance rho over the share of the light that the cover returns [1]."""
     albedo: Float[np.ndarray, "N 3"]
-    """Albedo in linear RGB [1]; as it is, since colour has the weights alpha T, whose sum is the opacity."""
+    """Albedo in linear RGB [1]; not corrected, since colour has the weights alpha T, whose sum is the opacity."""
     body: Body | None
-    """Whose path moves it; None for the cover of the still bodies."""
+    """The moving body; None for the cover of the still bodies."""
 
     def __len__(self) -> int:
         return len(self.point)
 
     def facing(self, centre: Float[np.ndarray, "3"], time: float, *, colour: bool = False) -> GaussianField:
-        """The splats that face a camera at ``centre`` [m] at ``time`` [s], in world axes, shaded by their incidence.
+        """The splats that face a camera at ``centre`` [m] at ``time`` [s], in world axes, shaded by incidence.
 
-        Splats that face away are left out: their own body hides them. ``colour`` adds their albedo, which has no shade.
+        The others are occluded by their own body. ``colour`` adds the albedo, which is not shaded.
         """
         pose = np.eye(4) if self.body is None else self.body.path.world_from_body(time)
         rotation = pose[:3, :3]
@@ -135,7 +134,7 @@ class Cover:
 def cover_still(bodies: tuple[Body, ...], camera: Camera) -> Cover:
     """One splat on the ray of every pixel of ``camera`` (and a margin around the image) that meets a still body.
 
-    Each is a disc in the surface, stretched along the slope so that it looks round, and set back as described above.
+    Each is a disc in the surface, stretched along the slope so that its image is round, and moved back, see above.
     """
     wide = _wider(camera)
     hits = first_hit(bodies, wide, 0.0)
@@ -145,11 +144,10 @@ def cover_still(bodies: tuple[Body, ...], camera: Camera) -> Cover:
     cosine = np.clip(-np.sum(normal * ray, axis=1), COSINE_MIN, 1.0)
     share, lead = overlap(1.0, LOW_PASS + RADIUS**2, True)
 
-    across = np.cross(normal, ray)  # the axis of the disc that is not foreshortened; any, where it is met head-on
+    across = np.cross(normal, ray)  # axis of the disc that is not foreshortened; any at normal incidence
     level = np.linalg.norm(across, axis=1) < 1e-9
     across[level] = np.cross(normal[level], [1.0, 0.0, 0.0])
     across[level & (np.linalg.norm(across, axis=1) < 1e-9)] = [0.0, 1.0, 0.0]
-    across /= np.linalg.norm(across, axis=1, keepdims=True)
     footprint = RADIUS * distance / camera.fx
     if camera.distortion:
         footprint /= np.sqrt(wide.area(torch.from_numpy(hits.point[hit])).numpy())
@@ -158,7 +156,7 @@ def cover_still(bodies: tuple[Body, ...], camera: Camera) -> Cover:
         normal=normal,
         other=normal,
         limb=0.0,
-        frame=np.stack([across, np.cross(normal, across), normal], axis=2),
+        frame=_frame(across, normal),
         scale=np.stack([footprint, footprint / cosine, np.full(len(distance), THICKNESS)], axis=1),
         reflectance=hits.reflectance[hit] / share,
         albedo=albedo(bodies, hits, 0.0)[hit],
@@ -168,37 +166,29 @@ def cover_still(bodies: tuple[Body, ...], camera: Camera) -> Cover:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Wide(Camera):
-    """A camera with a margin around its image, into which its lens goes on as it does for the renderer."""
+    """A camera with a margin around its image, where its lens is extrapolated as in the renderer."""
 
     inner: Camera
 
     @property
     def guard(self) -> Guard:
-        """That of the image alone: in the margin a lens may fold."""
+        """That of the image alone: the polynomial of a lens may fold in the margin."""
         return self.inner.guard
 
 
 def _wider(camera: Camera) -> Camera:
-    """The same camera with a margin as wide as a splat reaches."""
-    return _Wide(
-        width=camera.width + 2 * MARGIN,
-        height=camera.height + 2 * MARGIN,
-        fx=camera.fx,
-        fy=camera.fy,
-        cx=camera.cx + MARGIN,
-        cy=camera.cy + MARGIN,
-        camera_from_world=camera.camera_from_world,
-        distortion=camera.distortion,
-        inner=camera,
-    )
+    """The same camera with a margin as wide as the reach of a splat."""
+    values = {f.name: getattr(camera, f.name) for f in fields(camera)}
+    values |= {"width": camera.width + 2 * MARGIN, "height": camera.height + 2 * MARGIN}
+    return _Wide(**{**values, "cx": camera.cx + MARGIN, "cy": camera.cy + MARGIN}, inner=camera)
 
 
 def cover_moving(
     body: Body, camera: Camera, times: Float[np.ndarray, "F"], centres: Float[np.ndarray, "F 3"] | None = None
 ) -> Cover:
-    """A regular grid of discs on each face, ``SPACING`` pixels apart where the body is nearest at ``times`` [s].
+    """A regular grid of discs on each face, ``SPACING`` pixels apart at the nearest approach at ``times`` [s].
 
-    ``centres`` [m] says where the camera is at those times; None: where ``camera`` is.
+    ``centres`` [m] are positions of the camera at those times; None: that of ``camera``.
     """
     distances = clearance(body, camera.centre if centres is None else centres, times)
     nearest, typical = distances.min(), distances.mean() + body.shape.reach
@@ -210,7 +200,6 @@ def cover_moving(
     point, normal, other, limb = body.shape.grid(spacing, inset)
     helper = np.where(np.abs(normal[:, :1]) < 0.7, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
     across = np.cross(normal, helper)
-    across /= np.linalg.norm(across, axis=1, keepdims=True)
     radius = RADIUS / SPACING * spacing
     share, _ = overlap(SPACING, variance, False)
     return Cover(
@@ -218,7 +207,7 @@ def cover_moving(
         normal=normal,
         other=other,
         limb=limb,
-        frame=np.stack([across, np.cross(normal, across), normal], axis=2),
+        frame=_frame(across, normal),
         scale=np.tile([radius, radius, THICKNESS], (len(point), 1)),
         reflectance=body.texture(point) / share,
         albedo=body.texture.albedo(point),
@@ -229,9 +218,9 @@ def cover_moving(
 def clearance(
     body: Body, camera: Float[np.ndarray, "*frames 3"], times: Float[np.ndarray, "F"]
 ) -> Float[np.ndarray, "F"]:
-    """Distance [m] between a camera and the smallest ball around a body, at ``times`` [s]; negative inside it.
+    """Distance [m] between a camera and the bounding sphere of a body, at ``times`` [s]; negative inside it.
 
-    ``camera`` is its position [m], or one position for each of the times. An assembly is no ball: doors are tall.
+    ``camera`` is its position [m], or one for each of the times. Assemblies are bounded part by part: doors are tall.
     """
     poses = np.array([body.path.world_from_body(float(t)) for t in times])
     if isinstance(body.shape, Assembly):
@@ -240,17 +229,17 @@ def clearance(
     return np.linalg.norm(poses[:, :3, 3] - camera, axis=1) - body.shape.reach
 
 
-def merge(fields: list[GaussianField]) -> GaussianField:
-    """One field of several, in their order."""
-    parts = [field.parameters() for field in fields]
-    return GaussianField(**{name: torch.cat([part[name] for part in parts]) for name in parts[0]})
+def _frame(across: np.ndarray, normal: np.ndarray) -> Float[np.ndarray, "N 3 3"]:
+    """Orientation of discs with these normals, of which one axis is along ``across``."""
+    across = across / np.linalg.norm(across, axis=1, keepdims=True)
+    return np.stack([across, np.cross(normal, across), normal], axis=2)
 
 
 def depth_slope(normal, distance, ray, camera: Camera) -> Float[np.ndarray, "N"]:
-    """Growth of distance [m/px] on the tangent plane, where on the image z-depth, which orders splats, grows fastest.
+    """Growth of distance [m/px] on the tangent plane, in the direction on the image in which z-depth grows fastest.
 
     With the normal n, the direction f = (x/z, y/z, 1) and n . f z constant, grad z = -z n / (n . f) / focal length and
-    d = z |f|. Zero where z-depth is level: then ties are broken by index and no side leads.
+    d = z |f|. Zero where z-depth, which orders splats, is constant: then no side leads.
     """
     camera_from_world = camera.camera_from_world[:3, :3]
     local_ray, local_normal = ray @ camera_from_world.T, normal @ camera_from_world.T
@@ -260,7 +249,7 @@ def depth_slope(normal, distance, ray, camera: Camera) -> Float[np.ndarray, "N"]
     gradient_z = -z[:, None] * local_normal[:, :2] / along[:, None] / [camera.fx, camera.fy]
     length = np.linalg.norm(flat, axis=1)
     gradient_length = flat[:, :2] / length[:, None] / [camera.fx, camera.fy]
-    if camera.distortion:  # a pixel is less or more of a slope than that of a pinhole
+    if camera.distortion:
         gradient_z, gradient_length = (_per_pixel(each, flat, camera) for each in (gradient_z, gradient_length))
     gradient = gradient_z * length[:, None] + z[:, None] * gradient_length
     steepness = np.linalg.norm(gradient_z, axis=1)
@@ -271,7 +260,7 @@ def depth_slope(normal, distance, ray, camera: Camera) -> Float[np.ndarray, "N"]
 
 
 def _per_pixel(gradient, flat, camera: Camera) -> Float[np.ndarray, "N 2"]:
-    """A gradient by pixels of a pinhole as one by pixels of a lens, whose derivative is symmetric."""
+    """A gradient per pixel of a pinhole as one per pixel of a lens, whose Jacobian is symmetric."""
     xx, xy, yy = camera.distortion.slope(*inside(flat[:, 0], flat[:, 1], camera.guard.radius))
     focal = np.array([camera.fx, camera.fy])
     x, y = (gradient * focal).T
@@ -279,7 +268,7 @@ def _per_pixel(gradient, flat, camera: Camera) -> Float[np.ndarray, "N 2"]:
 
 
 def magnification(camera: Camera) -> float:
-    """The most by which a lens stretches anything in the image, over a pinhole [1]."""
+    """Largest magnification in the image by the distortion of a lens [1]."""
     if not camera.distortion:
         return 1.0
     flat = camera.directions().flatten(0, 1).numpy()

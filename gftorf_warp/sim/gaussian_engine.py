@@ -11,10 +11,10 @@ from jaxtyping import Complex, Float
 
 from ..render.api import Rendering, rasterize
 from ..scene.camera import Camera
-from ..scene.gaussians import GaussianField
+from ..scene.gaussians import GaussianField, concatenated
 from ..scene.sensor import Sensor
 from .exposure import Exposure, pooled
-from .gaussian_cover import Cover, cover_moving, cover_still, merge
+from .gaussian_cover import Cover, cover_moving, cover_still
 from .readout import mean_quad
 from .scene import Scene
 
@@ -55,7 +55,7 @@ class GaussianEngine:
         centre = self.camera_at(time).centre
         static = self._cover_still(time) if self._camera_moves else self._static
         moving = [cover.facing(centre, time, colour=self._colour) for cover in self._moving]
-        return merge([*([] if static is None else [static]), *moving])
+        return concatenated([*([] if static is None else [static]), *moving])
 
     def _cover_still(self, time: float) -> GaussianField | None:
         if not self._still:

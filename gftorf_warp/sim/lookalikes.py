@@ -12,10 +12,10 @@ from typing import Any
 
 from ..constants import FRAME_RATE_HZ
 from ..scene.sensor import Sensor
-from .assembly import Assembly, Level, Part
-from .paths import Arc, Line, Still, Vector
+from .bodies import around, box, chair, passing, plain, wall_and_floor
+from .paths import Arc, Line, Path, Vector
 from .scene import Scene
-from .world import Body, Box, Shape, Texture
+from .world import Body, Texture
 
 FRAMES = 60
 STEP = FRAME_RATE_HZ  # [1/s]
@@ -25,26 +25,26 @@ SENSOR = Sensor(dc_offset=1.0, unipolar=True)  # one ideal tap; frequency and sh
 
 def sliding_cube() -> Scene:
     """Purely sideways and plain: only outlines go wrong."""
-    cube = Line(position=(0.0, 0.47, 2.4984), velocity=(0.021817 * STEP, 0.0, 0.0), passing_s=MIDDLE)
+    cube = passing(FRAMES, (0.0, 0.47, 2.4984), (0.021817 * STEP, 0.0, 0.0))
     return _synthetic(
         "sliding_cube",
         "a small plain cube slides in front of a wall",
         "sideways, 10 px per quartet",
         0.105,
-        (*wall_and_floor(2.6, 0.9, plain(0.5), plain(0.4)), _cube(0.16, plain(0.55), cube)),
+        (*wall_and_floor(2.6, 0.9, plain(0.5), plain(0.4)), _cube(0.16, cube, plain(0.55))),
     )
 
 
 def occlusion() -> Scene:
     """The cube is gone for a while."""
-    pole = Body(shape=Box(size=(0.08, 2.0, 0.08)), texture=plain(0.5), path=Still(position=(0.05, 0.1, 1.0)))
-    cube = Line(position=(0.0, 0.15, 2.25), velocity=(0.023274 * STEP, 0.0, 0.0), passing_s=MIDDLE)
+    pole = box((0.08, 2.0, 0.08), (0.05, 0.1, 1.0), plain(0.5))
+    cube = passing(FRAMES, (0.0, 0.15, 2.25), (0.023274 * STEP, 0.0, 0.0))
     return _synthetic(
         "occlusion",
         "a small plain cube slides behind a pole",
         "sideways, hidden for a while",
         0.142,
-        (*wall_and_floor(2.5, 0.9, plain(0.5), plain(0.4)), pole, _cube(0.2, plain(0.5), cube)),
+        (*wall_and_floor(2.5, 0.9, plain(0.5), plain(0.4)), pole, _cube(0.2, cube, plain(0.5))),
     )
 
 
@@ -53,7 +53,7 @@ def z_motion_speed_test() -> Scene:
     starts = ((-0.45, 0.30, 1.0), (0.05, -0.22, 0.8), (0.48, 0.25, 0.6))
     grey = around(0.5, 0.2, 0.3)
     cubes = [
-        _cube(0.168, grey, Line(position=(x, y, 3.2), velocity=(0.0, 0.0, -0.033051 * part * STEP)))
+        _cube(0.168, Line(position=(x, y, 3.2), velocity=(0.0, 0.0, -0.033051 * part * STEP)), grey)
         for x, y, part in starts
     ]
     return _synthetic(
@@ -68,7 +68,7 @@ def z_motion_speed_test() -> Scene:
 def speed_test_texture() -> Scene:
     """Three speeds side by side, with texture."""
     rows = ((-0.55, 0.032567), (0.05, 0.054280), (0.62, 0.081420))
-    cubes = [_cube(0.383, around(0.5, 0.2, 0.25), _row(y, 3.2, step)) for y, step in rows]
+    cubes = [_cube(0.383, _row(y, 3.2, step), around(0.5, 0.2, 0.25)) for y, step in rows]
     return _synthetic(
         "speed_test_texture",
         "three textured cubes slide at three speeds",
@@ -99,7 +99,7 @@ def arcing_cube() -> Scene:
         "a bright plain cube swings on a circle before a dark wall",
         "arc, 31 px per quartet, dark wall",
         37.50,
-        (*wall_and_floor(4.5, 1.1, plain(0.15), plain(0.12)), _cube(0.311, plain(0.4), path)),
+        (*wall_and_floor(4.5, 1.1, plain(0.15), plain(0.12)), _cube(0.311, path, plain(0.4))),
     )
 
 
@@ -111,7 +111,7 @@ def acute_z_speed_test() -> Scene:
         ((-0.5, 0.6, 4.6), (1.0, 0.45, 2.4)),
     )
     dark = around(0.08, 0.5, 0.2)
-    cubes = [_cube(0.9875, around(0.5, 0.5, 0.2), _way(*way)) for way in ways]
+    cubes = [_cube(0.9875, _way(*way), around(0.5, 0.5, 0.2)) for way in ways]
     return _synthetic(
         "acute_z_speed_test",
         "three large textured cubes come nearer on crossing ways before a dark wall",
@@ -121,43 +121,13 @@ def acute_z_speed_test() -> Scene:
     )
 
 
-def chair() -> Assembly:
-    """A chair of nine boxes around the middle of its seat: seat, four legs, two posts, two bars between them."""
-    bar, out = 0.0272, 0.1556  # [m]
-    boxes: list[tuple[Vector, Vector]] = [((0.35, bar, 0.35), (0.0, 0.0, 0.0))]
-    boxes += [((bar, 0.35, bar), (x, 0.175, z)) for x in (-out, out) for z in (-out, out)]
-    boxes += [((bar, 0.389, bar), (x, -0.1944, out)) for x in (-out, out)]
-    boxes += [((0.311, 0.070, bar), (0.0, y, out)) for y in (-out, -0.3111)]
-    return Assembly(parts=tuple(Part(shape=Box(size=size), position=at) for size, at in boxes))
-
-
-def plain(reflectance: float, hue: float | None = None) -> Texture:
-    """One reflectance [1] everywhere; ``hue`` in turns."""
-    return Texture(low=reflectance, high=reflectance, hue=hue)
-
-
-def around(reflectance: float, contrast: float, cell: float, hue: float | None = None) -> Texture:
-    """Reflectance [1] that varies by ``contrast`` of itself from cell to cell of ``cell`` [m]; ``hue`` in turns."""
-    low, high = reflectance * (1 - contrast), min(1.0, reflectance * (1 + contrast))
-    return Texture(low=low, high=high, cell=cell, hue=hue)
-
-
-def wall_and_floor(z: float, y: float, wall: Texture, floor: Texture) -> tuple[Body, Body]:
-    """An endless back wall at ``z`` [m] and an endless floor at ``y`` [m], textured in world axes."""
-
-    def still(shape: Shape, texture: Texture) -> Body:
-        return Body(shape=shape, texture=texture, path=Still())
-
-    return still(Level(axis=2, value=z), wall), still(Level(axis=1, value=y), floor)
-
-
-def _cube(edge: float, texture: Texture, path: Line | Arc) -> Body:
-    return Body(shape=Box(size=(edge, edge, edge)), texture=texture, path=path)
-
-
 def _row(y: float, z: float, step: float) -> Line:
     """To the right at height ``y`` and depth ``z`` [m], ``step`` metres per raw frame, in the middle at half time."""
-    return Line(position=(0.0, y, z), velocity=(step * STEP, 0.0, 0.0), passing_s=MIDDLE)
+    return passing(FRAMES, (0.0, y, z), (step * STEP, 0.0, 0.0))
+
+
+def _cube(edge: float, path: Path, texture: Texture) -> Body:
+    return box((edge, edge, edge), path, texture)
 
 
 def _way(start: Vector, end: Vector) -> Line:
@@ -168,41 +138,17 @@ def _way(start: Vector, end: Vector) -> Line:
 
 
 def look_alike(
-    name: str,
-    description: str,
-    motion: str,
-    closed_form: float,
-    bodies: tuple[Body, ...],
-    *,
-    sensor: Sensor,
-    frames: int = FRAMES,
-    **others: Any,
+    name: str, description: str, motion: str, closed_form: float, bodies: tuple[Body, ...], **others: Any
 ) -> Scene:
-    """A scene of 320x240 pixels; ``others`` are further fields of it."""
-    return Scene(
-        name=name,
-        description=description,
-        motion=motion,
-        closed_form=closed_form,
-        bodies=bodies,
-        frames=frames,
-        width=320,
-        height=240,
-        sensor=sensor,
-        **others,
-    )
+    """A scene of 320x240 pixels and 60 raw frames, unless ``others``, further fields of it, say otherwise."""
+    texts = {"name": name, "description": description, "motion": motion}
+    size = {"frames": FRAMES, "width": 320, "height": 240}
+    return Scene(**{**texts, **size, "closed_form": closed_form, "bodies": bodies, **others})
 
 
 _synthetic = partial(look_alike, sensor=SENSOR)
-"""60 deg wide, 60 raw frames, an ideal sensor of one tap."""
+"""60 deg wide, an ideal sensor of one tap."""
 
-SYNTHETIC = (
-    sliding_cube,
-    occlusion,
-    z_motion_speed_test,
-    speed_test_texture,
-    speed_test_chair,
-    arcing_cube,
-    acute_z_speed_test,
-)
+TEXTURED = (z_motion_speed_test, speed_test_texture, speed_test_chair)
+SYNTHETIC = (sliding_cube, occlusion, *TEXTURED, arcing_cube, acute_z_speed_test)
 """All seven, easiest kind of motion first."""

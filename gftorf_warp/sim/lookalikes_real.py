@@ -10,12 +10,13 @@ import math
 from functools import partial
 
 from ..scene.sensor import Sensor
+from .bodies import around, ball, box, plain, wall_and_floor
 from .curves import Curve, Guided, Turn
-from .lookalikes import MIDDLE, around, look_alike, plain, wall_and_floor
-from .paths import Path, Still, Vector
+from .lookalikes import MIDDLE, look_alike
+from .paths import Path
 from .scene import Scene
 from .sensors import PALINDROMIC
-from .world import Body, Box, Sphere, Texture
+from .world import Body, Texture
 
 FIELD_OF_VIEW_DEG = math.degrees(2 * math.atan(160 / 230))  # [deg] 320 pixels at the focal length of 230 of the OPT8241
 SENSOR = Sensor(f_mod_hz=20e6, shifts=PALINDROMIC, noise=True)
@@ -38,7 +39,7 @@ def pillow() -> Scene:
         2.108,
         (
             *wall_and_floor(4.2, 1.15, around(0.5, 0.2, 0.4), around(0.35, 0.2, 0.4)),
-            Body(shape=Box(size=(0.5, 0.36, 0.14)), texture=plain(0.7), path=path),
+            box((0.5, 0.36, 0.14), path, plain(0.7)),
         ),
         frames=64,
     )
@@ -59,8 +60,8 @@ def baseball() -> Scene:
             box((0.4, 0.7, 0.24), (-0.05, 0.2, 2.75), plain(0.35)),
             box((0.16, 0.9, 0.16), (-0.15, 0.95, 2.75), plain(0.2)),
             box((0.16, 0.9, 0.16), (0.08, 0.95, 2.75), plain(0.2)),
-            Body(shape=Sphere(radius=0.12), texture=plain(0.4), path=Still(position=(0.0, -0.3, 2.75))),
-            Body(shape=Box(size=(0.84, 0.06, 0.06)), texture=plain(0.5), path=bat),
+            ball(0.12, (0.0, -0.3, 2.75), plain(0.4)),
+            box((0.84, 0.06, 0.06), bat, plain(0.5)),
         ),
     )
 
@@ -73,8 +74,8 @@ def jacks() -> Scene:
         leg = Turn(axis="z", angle=Curve(start=64.0 * side, swing=-11.0 * side, swing_hz=1.6))
         shoulder = Guided(x=0.22 * side, y=-0.22, z=2.8, turns=(arm,), arm=(0.3 * side, 0.0, 0.0))
         hip = Guided(x=0.1 * side, y=0.28, z=2.8, turns=(leg,), arm=(0.42 * side, 0.0, 0.0))
-        limbs.append(Body(shape=Box(size=(0.6, 0.1, 0.1)), texture=plain(0.35), path=shoulder))
-        limbs.append(Body(shape=Box(size=(0.84, 0.14, 0.14)), texture=plain(0.25), path=hip))
+        limbs.append(box((0.6, 0.1, 0.1), shoulder, plain(0.35)))
+        limbs.append(box((0.84, 0.14, 0.14), hip, plain(0.25)))
 
     def bobbing(y: float) -> Path:
         return Guided(y=Curve(start=y, swing=0.06, swing_hz=3.2, swing_phase_deg=90.0), z=2.8)
@@ -86,8 +87,8 @@ def jacks() -> Scene:
         2.970,
         (
             *wall_and_floor(4.5, 1.2, around(0.4, 0.2, 0.4), around(0.25, 0.2, 0.4)),
-            Body(shape=Box(size=(0.4, 0.6, 0.24)), texture=plain(0.3), path=bobbing(-0.02)),
-            Body(shape=Sphere(radius=0.12), texture=plain(0.45), path=bobbing(-0.5)),
+            box((0.4, 0.6, 0.24), bobbing(-0.02), plain(0.3)),
+            ball(0.12, bobbing(-0.5), plain(0.45)),
             *limbs,
         ),
         frames=68,
@@ -110,7 +111,7 @@ def target() -> Scene:
         1925.6,
         (
             *wall_and_floor(6.8, 1.4, around(0.12, 0.3, 0.5), around(0.1, 0.3, 0.5)),
-            Body(shape=Box(size=(0.7, 0.7, 0.04)), texture=checks, path=board),
+            box((0.7, 0.7, 0.04), board, checks),
         ),
         frames=68,
     )
@@ -122,7 +123,7 @@ def fan(rpm: float = RPM) -> Scene:
     def blade(first: float) -> Body:
         turns = (Turn(axis="z", angle=Curve(start=first, rate=6.0 * rpm)), Turn(axis="x", angle=25.0))
         path = Guided(z=1.5, turns=turns, arm=(0.12, 0.0, 0.0))
-        return Body(shape=Box(size=(0.2, 0.1, 0.008)), texture=plain(0.6), path=path)
+        return box((0.2, 0.1, 0.008), path, plain(0.6))
 
     return _recorded(
         "fan",
@@ -136,11 +137,6 @@ def fan(rpm: float = RPM) -> Scene:
             box((0.1, 0.1, 0.12), (0.0, 0.0, 1.53), plain(0.4)),
         ),
     )
-
-
-def box(size: Vector, position: Vector, texture: Texture, turn_deg: Vector = (0.0, 0.0, 0.0)) -> Body:
-    """A box that stays, by full edge lengths and centre [m]."""
-    return Body(shape=Box(size=size), texture=texture, path=Still(position=position, turn_deg=turn_deg))
 
 
 _recorded = partial(look_alike, sensor=SENSOR, horizontal_fov_deg=FIELD_OF_VIEW_DEG)

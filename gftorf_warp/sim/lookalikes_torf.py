@@ -7,17 +7,19 @@ frame with its own pose; written with ``--format torf`` it becomes 30 phasors. C
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
 from .assembly import Assembly, Part
+from .bodies import CLOTH, SKIN, around, box, person, plain, wall_and_floor
 from .curves import Curve, Guided, Turn
-from .lookalikes import around, look_alike, plain, wall_and_floor
-from .lookalikes_real import FIELD_OF_VIEW_DEG, box
+from .lookalikes import look_alike
+from .lookalikes_real import FIELD_OF_VIEW_DEG
 from .paths import Path, Still, Vector, rotation_matrix
 from .scene import ColourCamera, Scene
 from .sensors import torf_real
-from .world import Body, Box, Sphere, Texture
+from .world import Body, Box
 
 FRAMES = 120  # one second
 COLOUR = ColourCamera(
@@ -27,8 +29,7 @@ COLOUR = ColourCamera(
     position=(0.04, 0.0, 0.0),
     noise=0.004,
 )
-FLOOR, WALL, SKIN, CLOTH, WOOD = 0.09, 0.12, 0.06, 0.62, 0.10  # [turns] hues
-Course = float | Curve
+FLOOR, WALL, WOOD = 0.09, 0.12, 0.10  # [turns] hues
 
 
 def photocopier() -> Scene:
@@ -46,8 +47,8 @@ def photocopier() -> Scene:
         (
             *_room(3.4, 1.1, 0.5, 0.3),
             box((1.10, 0.80, 0.64), (0.0, 0.70, 2.45), plain(0.55, 0.55)),
-            moving((1.04, 0.05, 0.60), plain(0.45, 0.55), lifted((0.0, -0.025, -0.30))),
-            moving((0.40, 0.08, 0.08), plain(0.4, CLOTH), lifted((0.62, -0.05, -0.55))),
+            box((1.04, 0.05, 0.60), lifted((0.0, -0.025, -0.30)), plain(0.45, 0.55)),
+            box((0.40, 0.08, 0.08), lifted((0.62, -0.05, -0.55)), plain(0.4, CLOTH)),
             *person(0.85, 0.10, 2.55),
         ),
         centre=2.3,
@@ -68,7 +69,7 @@ def cupboard() -> Scene:
     boards = ((1.10, 0.44, -0.69), (1.10, 0.44, 0.99), (1.06, 0.42, 0.15))
     case += [box((width, 0.02, deep), (0.10, y, 2.42), wood) for width, deep, y in boards]
     turned = (0.0, -95.0, 0.0)
-    middle = np.add((0.65, 0.15, 2.19), rotation_matrix(turned) @ (-0.27, 0.0, 0.0))
+    x, y, z = np.add((0.65, 0.15, 2.19), rotation_matrix(turned) @ (-0.27, 0.0, 0.0)).tolist()
     return _carried(
         "cupboard",
         "somebody opens a cupboard with things in it",
@@ -80,9 +81,9 @@ def cupboard() -> Scene:
             box((0.22, 0.30, 0.20), (-0.20, -0.01, 2.45), plain(0.25, 0.0)),
             box((0.18, 0.20, 0.18), (0.15, 0.04, 2.45), plain(0.6, 0.5)),
             box((0.26, 0.36, 0.22), (0.38, 0.80, 2.45), around(0.4, 0.4, 0.06, 0.33)),
-            moving((0.54, 1.70, 0.02), wood, hinged((0.27, 0.0, 0.0))),
-            box((0.54, 1.70, 0.02), (float(middle[0]), float(middle[1]), float(middle[2])), wood, turned),
-            moving((0.08, 0.08, 0.40), plain(0.4, SKIN), hinged((0.50, 0.10, -0.22))),
+            box((0.54, 1.70, 0.02), hinged((0.27, 0.0, 0.0)), wood),
+            box((0.54, 1.70, 0.02), Still(position=(x, y, z), turn_deg=turned), wood),
+            box((0.08, 0.08, 0.40), hinged((0.50, 0.10, -0.22)), plain(0.4, SKIN)),
             *person(Curve(start=-0.95, swing=0.04, swing_hz=0.5), 0.10, 1.90),
         ),
         centre=2.2,
@@ -109,8 +110,8 @@ def deskbox() -> Scene:
             box((1.60, 0.04, 0.75), (0.0, 0.42, 2.15), plain(0.45, WOOD)),
             *(box((0.04, 0.62, 0.70), (x, 0.75, 2.15), wood) for x in (-0.74, 0.74)),
             box((0.52, 0.32, 0.04), (0.52, 0.22, 2.35), plain(0.06, 0.6)),
-            moving((0.34, 0.26, 0.28), around(0.5, 0.2, 0.08, 0.08), carried()),
-            *(moving((0.08, 0.08, 0.45), plain(0.35, CLOTH), carried((x, -0.02, 0.20))) for x in (-0.21, 0.21)),
+            box((0.34, 0.26, 0.28), carried(), around(0.5, 0.2, 0.08, 0.08)),
+            *(box((0.08, 0.08, 0.45), carried((x, -0.02, 0.20)), plain(0.35, CLOTH)) for x in (-0.21, 0.21)),
             *person(Curve(start=-0.42, eased=0.42), 0.05, 2.75),
         ),
         centre=2.2,
@@ -140,10 +141,7 @@ def phonebooth(wall: float = 3.4, name: str = "phonebooth", closed_form: float =
             box((1.04, 0.04, 0.90), (0.0, -1.0, 2.75), plain(0.4, 0.98)),
             Body(shape=Assembly(parts=(*stiles, *rails)), texture=plain(0.5, 0.98), path=door),
             *person(swaying(0.05), -0.05, 2.85),
-            *(
-                moving((0.14, 0.80, 0.14), plain(0.2, CLOTH), Guided(x=swaying(x), y=0.65, z=2.85))
-                for x in (-0.05, 0.15)
-            ),
+            *(box((0.14, 0.80, 0.14), Guided(x=swaying(x), y=0.65, z=2.85), plain(0.2, CLOTH)) for x in (-0.05, 0.15)),
         ),
         centre=2.6,
         yaw_deg_per_s=-4.0,
@@ -169,11 +167,9 @@ def studybook() -> Scene:
             *_room(3.0, 1.1, 0.5, 0.35),
             box((1.40, 0.04, 0.70), (0.0, 0.45, 1.65), plain(0.4, WOOD)),
             *(box((0.20, 0.02, 0.27), (x, 0.42, 1.55), cover) for x in (-0.10, 0.10)),
-            moving(
-                (0.19, 0.002, 0.26), plain(0.7, 0.15), Guided(y=0.405, z=1.55, turns=(page,), arm=(0.095, 0.0, 0.0))
-            ),
+            box((0.19, 0.002, 0.26), Guided(y=0.405, z=1.55, turns=(page,), arm=(0.095, 0.0, 0.0)), plain(0.7, 0.15)),
             box((0.08, 0.07, 0.35), (-0.30, 0.38, 1.75), plain(0.4, CLOTH)),
-            moving((0.08, 0.07, 0.35), plain(0.4, CLOTH), reaching),
+            box((0.08, 0.07, 0.35), reaching, plain(0.4, CLOTH)),
             *person(Curve(swing=0.02, swing_hz=0.4), 0.10, 2.15),
         ),
         centre=1.7,
@@ -196,42 +192,14 @@ def carried_camera(centre: float, yaw_deg_per_s: float, pitch_deg: float) -> Gui
     )
 
 
-def moving(size: Vector, texture: Texture, path: Path) -> Body:
-    """A box, by full edge lengths [m], on a path."""
-    return Body(shape=Box(size=size), texture=texture, path=path)
-
-
-def person(x: Course, y: float, z: float) -> tuple[Body, Body]:
-    """Torso and head; (x, y, z) is the middle of the torso [m]."""
-    if not isinstance(x, Curve):
-        torso = box((0.42, 0.60, 0.24), (x, y, z), plain(0.3, CLOTH))
-        return torso, Body(shape=Sphere(radius=0.11), texture=plain(0.45, SKIN), path=Still(position=(x, y - 0.44, z)))
-    head = Body(shape=Sphere(radius=0.11), texture=plain(0.45, SKIN), path=Guided(x=x, y=y - 0.44, z=z))
-    return moving((0.42, 0.60, 0.24), plain(0.3, CLOTH), Guided(x=x, y=y, z=z)), head
-
-
 def _room(z: float, y: float, wall: float, floor: float) -> tuple[Body, Body]:
     return wall_and_floor(z, y, around(wall, 0.2, 0.3, WALL), around(floor, 0.2, 0.3, FLOOR))
 
 
-def _carried(
-    name: str,
-    description: str,
-    motion: str,
-    closed_form: float,
-    bodies: tuple[Body, ...],
-    *,
-    centre: float,
-    yaw_deg_per_s: float,
-    pitch_deg: float = 0.0,
-) -> Scene:
-    """With 640x480 pixels of colour, from a camera carried for one second."""
+def _carried(*texts_and_bodies: Any, centre: float, yaw_deg_per_s: float, pitch_deg: float = 0.0) -> Scene:
+    """With 640x480 pixels of colour, from a camera carried for one second; the rest as for ``look_alike``."""
     return look_alike(
-        name,
-        description,
-        motion,
-        closed_form,
-        bodies,
+        *texts_and_bodies,
         sensor=torf_real(),
         frames=FRAMES,
         horizontal_fov_deg=FIELD_OF_VIEW_DEG,

@@ -20,7 +20,7 @@ from .readout import mean_quad
 from .rolling import join_rows, row_delays
 from .scene import Scene
 from .truth_layers import truth_layers
-from .world import Body, Box, Plane, Shape, Sphere, albedo_seen
+from .world import Body, Box, Plane, Shape, Sphere, albedo, first_hit
 
 PATHS = 7  # part of the seed of the paths: other random numbers than those of read-out and colour camera
 
@@ -125,7 +125,7 @@ def traced_albedo(scene: Scene, camera: Camera, time: float) -> Float[np.ndarray
     """Mean albedo of every pixel in linear RGB [1] over its rays; black where they meet nothing."""
     n = scene.subsamples
     fine = camera.resized(camera.width * n, camera.height * n)
-    colour = albedo_seen(scene.bodies, fine, time)
+    colour = albedo(scene.bodies, first_hit(scene.bodies, fine, time), time)
     return np.moveaxis(pooled(np.moveaxis(colour, -1, 0), n), 0, -1)
 
 

@@ -1,4 +1,4 @@
-"""Triangles out of PLY and OBJ files, checked: what is traced has an inside, or is said to have none."""
+"""Read triangles from PLY and OBJ files, and check that they are a surface, closed unless it may be open."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from ..errors import InputError
 
 SUFFIXES = (".ply", ".obj")
-FLAT = 1e-9  # [1] height over longest edge, below which a triangle has no normal worth the name
+FLAT = 1e-9  # [1] height over longest edge, below which the normal of a triangle is undetermined
 
 
 def read_mesh(
@@ -20,20 +20,20 @@ def read_mesh(
 ) -> tuple[Float[np.ndarray, "V 3"], Int[np.ndarray, "T 3"]]:
     """Vertices [m] and triangles of a file, counter-clockwise as seen from the visible side.
 
-    Vertices at the same place become one. Quads and other polygons become triangles; of several objects all are taken;
-    materials, colours and normals of the file are not looked at.
+    Vertices at the same position are merged, polygons triangulated, all objects joined; materials, colours and normals
+    of the file are ignored.
 
     Args:
         file: A PLY or OBJ file.
         scale: Metres per unit of the file.
-        inside: Whether a closed surface is seen from within, as a room is, whichever way the file winds it.
-        open: Whether the surface may have borders. Then it is seen from the side from which the file winds it
+        inside: Whether a closed surface is visible from within, as a room is, whatever its winding in the file.
+        open: Whether the surface may have borders. Then it is visible from the side from which the file winds it
             counter-clockwise.
 
     Raises:
-        InputError: If there is no such file, it cannot be read, it has no triangle, a vertex that is no number, a
-            triangle without area, or is no surface: an edge of three triangles or more, neighbours of opposite winding,
-            or, without ``open``, a border.
+        InputError: If the file cannot be read, it has no triangle, a vertex that is no number or a triangle without
+            area, or it is no surface: an edge of three triangles, neighbours of opposite winding, or, without ``open``,
+            a border.
     """
     points, triangles = _loaded(file)
     if len(triangles) == 0:
@@ -75,10 +75,10 @@ def _loaded(file: Path) -> tuple[np.ndarray, np.ndarray]:
     options: dict[str, Any] = {"skip_materials": True} if file.suffix.lower() == ".obj" else {}
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RuntimeWarning)  # numbers that are none: looked at afterwards
+            warnings.simplefilter("ignore", RuntimeWarning)  # non-finite vertices are checked afterwards
             mesh: Any = trimesh.load(file, process=False, force="mesh", **options)
             return np.array(mesh.vertices, dtype=np.float64), np.array(mesh.faces, dtype=np.int64)
-    except Exception as error:  # a reader of foreign files fails in many ways, and all of them mean this
+    except Exception as error:  # readers of the formats raise many kinds
         raise _wrong(file, f"it cannot be read: {type(error).__name__}, {error}", "export it again") from error
 
 

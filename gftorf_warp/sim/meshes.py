@@ -1,11 +1,11 @@
-"""Shapes out of files: closed surfaces, rooms and sheets of triangles, and where rays meet them in float64.
+"""Triangle meshes from files: closed surfaces, rooms and sheets, and the first hits of rays on them in float64.
 
-The hits are truth, so they share nothing with the tracer: another hierarchy, another precision, all rays of an image at
+The hits are truth and share nothing with the tracer: another hierarchy, another precision, all rays of an image at
 once. Rays of one image start at one point o. With s = o - a for a corner a, edges e1 and e2 and the ray d,
 
     det = -d . (e1 x e2),   u = d . (e2 x s) / det,   v = d . (s x e1) / det,   distance = s . (e1 x e2) / det
 
-(Moeller and Trumbore, 1997), where everything in brackets belongs to the triangle and the image, not to the ray.
+(Moeller and Trumbore, 1997); the terms in brackets are the same for all rays of an image.
 """
 
 from __future__ import annotations
@@ -22,22 +22,22 @@ from jaxtyping import Float, Int
 from .mesh_file import read_mesh
 from .world import Shape
 
-LEAF = 16  # triangles that are asked without asking a box around them first
-SLACK = 1e-12  # [1] of a triangle's edges: a ray between two triangles meets one of them
-BOX_SLACK = 1e-9  # [1] of a box's distance, likewise
+LEAF = 16  # triangles in a leaf of the hierarchy
+SLACK = 1e-12  # [1] barycentric tolerance: a ray between two triangles hits one of them
+BOX_SLACK = 1e-9  # [1] relative tolerance of the distance to a box
 
 
 class Node(NamedTuple):
-    """A box in the axes of the mesh, and what lies in it."""
+    """A node of the bounding volume hierarchy, in the axes of the mesh."""
 
     low: Float[np.ndarray, "3"]
-    """Its smallest coordinates [m]."""
+    """Smallest coordinates [m]."""
     high: Float[np.ndarray, "3"]
-    """Its largest coordinates [m]."""
+    """Largest coordinates [m]."""
     triangles: Int[np.ndarray, "L"] | None
-    """Numbers of the triangles of a leaf; None: there are two boxes inside."""
+    """Indices of the triangles of a leaf; None: an inner node."""
     parts: tuple[Node, Node] | None
-    """Those two boxes."""
+    """The children of an inner node."""
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -45,13 +45,13 @@ class Mesh(Shape):
     """The triangles of a PLY or OBJ file, seen from outside; engine 'gaussian' covers it only where it rests."""
 
     file: FilePath
-    """Where it is; relative to the scene file that names it."""
+    """Path, relative to the scene file that names it."""
     scale: float = 1.0
     """Metres per unit of the file."""
     inside: bool = False
     """False: a solid. True: a room."""
     open: bool = False
-    """Whether it may have borders: a sheet, seen from the side from which the file winds it counter-clockwise."""
+    """Whether it may have borders: a sheet, visible from the side from which the file winds it counter-clockwise."""
 
     def __post_init__(self):
         if not 0 < self.scale < np.inf:
@@ -59,10 +59,10 @@ class Mesh(Shape):
         if self.open and self.inside:
             raise ValueError("an open mesh has no inside: set open or inside, not both")
         object.__setattr__(self, "file", FilePath(self.file))
-        _ = self.surface  # a bad file is named when the scene is made, not when it is traced
+        _ = self.surface  # a bad file is an error when the scene is made
 
     def __repr__(self):
-        """By content, not by place: another file of that name is another scene."""
+        """With a hash of the content instead of the path: another file of that name is another scene."""
         settings = f"scale={self.scale!r}, inside={self.inside!r}, open={self.open!r}"
         return f"Mesh(file={self.file.name!r}, sha256={self._digest!r}, {settings})"
 
@@ -72,7 +72,7 @@ class Mesh(Shape):
         return read_mesh(self.file, scale=self.scale, inside=self.inside, open=self.open)
 
     def hit(self, origin, ray):
-        """The nearest triangle that shows its visible side; faces are the numbers of triangles."""
+        """The nearest triangle whose visible side faces the ray; faces are the numbers of triangles."""
         distance, face = np.full(len(ray), np.inf), np.zeros(len(ray), dtype=np.int64)
         corner, e1, e2, normal = self._edges
         s = origin - corner
@@ -112,15 +112,6 @@ class Mesh(Shape):
         normal = self._edges[3][face]
         return normal / np.linalg.norm(normal, axis=1, keepdims=True)
 
-    def grid(self, spacing, inset):
-        """There is none.
-
-        Raises:
-            ValueError: Always.
-        """
-        del spacing, inset
-        raise ValueError(f"{self} cannot be covered while it moves: let its path be Still, or take engine 'mesh'")
-
     @cached_property
     def reach(self) -> float:
         """Of the vertex farthest from the origin [m]."""
@@ -145,7 +136,7 @@ class Mesh(Shape):
 
 
 def _tree(low: np.ndarray, high: np.ndarray, members: np.ndarray) -> Node:
-    """Boxes in boxes, halved where the middles of the triangles spread most."""
+    """Hierarchy of boxes, split at the median along the axis in which triangles spread most."""
     box = low[members].min(0), high[members].max(0)
     if len(members) <= LEAF:
         return Node(*box, members, None)
@@ -156,13 +147,10 @@ def _tree(low: np.ndarray, high: np.ndarray, members: np.ndarray) -> Node:
 
 
 def _enters(node: Node, origin: np.ndarray, inverse: np.ndarray, limit: np.ndarray) -> np.ndarray:
-    """Which rays of these inverse directions meet a box nearer than a limit [m]."""
+    """Which rays of these inverse directions hit a box nearer than a limit [m]."""
     near, far = np.zeros(len(inverse)), limit * (1 + BOX_SLACK)
     for axis in range(3):
-        with np.errstate(invalid="ignore"):  # 0 times infinity: in the plane of a side, so no side decides
-            a, b = (
-                (node.low[axis] - origin[axis]) * inverse[:, axis],
-                (node.high[axis] - origin[axis]) * inverse[:, axis],
-            )
+        with np.errstate(invalid="ignore"):  # 0 times infinity: in the plane of a side, which then does not count
+            a, b = ((side[axis] - origin[axis]) * inverse[:, axis] for side in (node.low, node.high))
         near, far = np.fmax(near, np.fmin(a, b)), np.fmin(far, np.fmax(a, b))
     return near <= far * (1 + BOX_SLACK)

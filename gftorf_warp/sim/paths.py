@@ -1,6 +1,6 @@
-"""Rigid paths: where a body is, and how it is turned, at any time.
+"""Rigid paths: position and orientation of a body or a camera at any time.
 
-A path is a pure function of seconds, so every raw frame sees the body at its own instant and flow is exact.
+A path is a pure function of time, so that poses at the instant of a raw frame and optical flow are exact.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def rigid(rotation: Float[np.ndarray, "3 3"], position: Float[np.ndarray, "3"]) 
 def inverse(pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
     """The rigid motion that undoes ``pose``."""
     rotation = pose[:3, :3].T
-    return rigid(rotation, 0.0 - rotation @ pose[:3, 3])  # a difference, so that the inverse of rest has no -0.0
+    return rigid(rotation, 0.0 - rotation @ pose[:3, 3])  # a difference, so that there is no -0.0
 
 
 def looking_at(position: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
@@ -54,11 +54,11 @@ def looking_at(position: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"])
 
 
 class Path(abc.ABC):
-    """A rigid motion. Final classes: Still, Line, Arc for bodies; Viewpoint, Sweep for cameras."""
+    """A rigid motion. Final classes: Still, Line, Arc, Guided for bodies; Viewpoint, Sweep for cameras."""
 
     @abc.abstractmethod
     def world_from_body(self, time: float) -> Float[np.ndarray, "4 4"]:
-        """Pose at ``time`` [s]: takes points in the body's own axes to the world [m]."""
+        """Pose at ``time`` [s]: maps points from the body's axes to the world [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,21 +71,21 @@ class Still(Path):
     """Orientation as a rotation vector [deg]."""
 
     def world_from_body(self, time: float) -> Float[np.ndarray, "4 4"]:
-        """The one pose, whatever the ``time`` [s]."""
+        """The pose, at any ``time`` [s]."""
         del time
         return rigid(rotation_matrix(self.turn_deg), np.asarray(self.position, dtype=np.float64))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Line(Path):
-    """Constant velocity, and optionally a constant spin about the body's origin: sliding, axial, or both at once."""
+    """Constant velocity, and optionally a constant spin about the body's origin."""
 
     position: Vector
     """Origin of the body's axes at ``passing_s`` [m]."""
     velocity: Vector
     """Velocity [m/s]."""
     passing_s: float = 0.0
-    """When the body is at ``position`` with orientation ``turn_deg`` [s]."""
+    """Time at which the body is at ``position`` with orientation ``turn_deg`` [s]."""
     turn_deg: Vector = (0.0, 0.0, 0.0)
     """Orientation at ``passing_s``, as a rotation vector [deg]."""
     spin_deg_per_s: Vector = (0.0, 0.0, 0.0)
@@ -122,33 +122,33 @@ class Arc(Path):
 
 @dataclass(frozen=True, kw_only=True)
 class Viewpoint(Path):
-    """A camera at rest that looks at something."""
+    """A camera at rest that looks at a point."""
 
     position: Vector
-    """Where it is in the world [m]."""
+    """Position in the world [m]."""
     target: Vector
-    """What its z axis points to [m]."""
+    """Point on its z axis [m]."""
 
     def world_from_body(self, time: float) -> Float[np.ndarray, "4 4"]:
-        """The one pose, whatever the ``time`` [s]."""
+        """The pose, at any ``time`` [s]."""
         del time
         return looking_at(np.asarray(self.position), np.asarray(self.target))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Sweep(Path):
-    """A camera that swings to and fro on a horizontal arc about what it looks at, smoothly, as a hand would."""
+    """A camera that swings to and fro on a horizontal arc about a point that it looks at."""
 
     middle: Vector
-    """Where it is halfway [m]."""
+    """Middle of the arc [m]."""
     target: Vector
-    """Centre of the arc, to which its z axis points [m]."""
+    """Centre of the arc, on the camera's z axis [m]."""
     sweep_deg: float
     """Angle from one end of the arc to the other, seen from the target [deg]; above 0 it starts at the left."""
     period_s: float
-    """Time for one way there and back [s]."""
+    """Time for the way out and back [s]."""
     rise: float = 0.0
-    """How far it goes up halfway there, and down halfway back [m]."""
+    """Rise in the middle of the way out, and descent in the middle of the way back [m]."""
 
     def world_from_body(self, time: float) -> Float[np.ndarray, "4 4"]:
         """Pose at ``time`` [s]; at time 0 it rests at one end of the arc."""

@@ -17,7 +17,7 @@ from ..scene.optics import Lens
 from ..scene.sensor import Sensor
 from .paths import Path, Still, Vector, Viewpoint, inverse, rigid, rotation_matrix
 from .sensors import SENSORS
-from .world import Body, Box, Shape, Texture
+from .world import Body
 
 OVERRIDES = Wording(
     option="--override",
@@ -155,33 +155,3 @@ def overridden(scene: Scene, overrides: Iterable[str]) -> Scene:
         return scene
     other = changed(scene, texts, OVERRIDES)
     return replace(other, closed_form=None, overrides=(*scene.overrides, *texts))
-
-
-def room(
-    *,
-    left: float = -2.1,
-    right: float = 2.1,
-    top: float = -1.6,
-    floor: float = 1.15,
-    back: float = 4.2,
-    hue: float | None = None,
-) -> Body:
-    """A textured room around the camera, walls at the given coordinates [m]; the wall behind the camera is at -0.5."""
-    front = -0.5
-    return Body(
-        shape=Box(size=(right - left, floor - top, back - front), inside=True),
-        texture=Texture(low=0.3, high=0.75, cell=0.3, hue=hue),
-        path=Still(position=((left + right) / 2, (top + floor) / 2, (front + back) / 2)),
-    )
-
-
-def still(
-    shape: Shape,
-    position: tuple[float, float, float],
-    low: float,
-    high: float,
-    cell: float,
-    hue: float | None = None,
-) -> Body:
-    """A body that stays at ``position`` [m], of reflectance ``low`` to ``high`` [1] in cells of ``cell`` [m]."""
-    return Body(shape=shape, texture=Texture(low=low, high=high, cell=cell, hue=hue), path=Still(position=position))

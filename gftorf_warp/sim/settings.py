@@ -68,24 +68,21 @@ class SimSettings:
         require(self.paths >= 1, "--paths", f"{self.paths}", "at least 1")
         require(self.format in FORMATS, "--format", repr(self.format), f"one of {', '.join(FORMATS)}")
         require(self.truth in TRUTHS, "--truth", repr(self.truth), f"one of {', '.join(TRUTHS)}")
-        if self.truth == "all" and self.level is None and (self.engine, self.format) != ("mesh", "capture"):
-            raise UsageError(
-                "cannot store all truth",
-                where="--truth",
-                why=f"engine {self.engine} and format {self.format} have no layers: engine mesh computes them, a "
-                "capture stores them",
-                fix="add --engine mesh --format capture",
-            )
-        if self.flow and self.format == "torf":
-            raise UsageError(
-                "a ToeRF folder cannot store optical flow",
-                where="--flow",
-                why="flow belongs to raw quads",
-                fix="leave --flow out, or --format ftorf",
-            )
+        layers = self.level is not None or (self.engine, self.format) == ("mesh", "capture")
+        why = "only engine mesh computes layers, and only a capture stores them"
+        fix = "add --engine mesh --format capture"
+        refuse(self.truth == "all" and not layers, ("cannot store all truth", "--truth"), why, fix)
+        why, fix = "flow belongs to raw quads", "leave --flow out, or --format ftorf"
+        phasors = self.flow and self.format == "torf"
+        refuse(phasors, ("a ToeRF folder cannot store optical flow", "--flow"), why, fix)
+
+
+def refuse(wrong: bool, what: tuple[str, str], why: str, fix: str) -> None:
+    """Raise a UsageError, (what is wrong, which option), if something is ``wrong``."""
+    if wrong:
+        raise UsageError(what[0], where=what[1], why=why, fix=fix)
 
 
 def require(good: bool, where: str, got: str, wanted: str) -> None:
-    """Raise a UsageError about the option ``where`` unless ``good``."""
-    if not good:
-        raise UsageError(f"cannot simulate with {got}", where=where, why=f"expected {wanted}", fix="change it")
+    """Raise a UsageError about the value ``got`` of an option unless it is ``good``."""
+    refuse(not good, (f"cannot simulate with {got}", where), f"expected {wanted}", "change it")

@@ -18,7 +18,7 @@ from ..scene.camera import Camera
 from .paths import Path, Still, inverse
 from .texture import Texture
 
-CHUNK = 1 << 14  # rays at a time: their numbers stay in the cache
+CHUNK = 1 << 14  # rays at a time: their arrays stay in the cache
 GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))  # [rad] between neighbours of a spiral that covers a sphere evenly
 
 
@@ -30,9 +30,9 @@ class Grid(NamedTuple):
     normal: Float[np.ndarray, "N 3"]
     """Unit normals."""
     other: Float[np.ndarray, "N 3"]
-    """Normal of the other face at an edge, the same normal elsewhere: a point shows only if both face the viewer."""
+    """Normal of the other face at an edge, the same normal elsewhere: visible only if both face the viewer."""
     limb: float
-    """A point shows only if the cosine of its incidence is above this [1]: keeps round shapes off their outline."""
+    """Visible only if the cosine of incidence is above this [1]: keeps covers inside round outlines."""
 
 
 class Shape(abc.ABC):
@@ -48,9 +48,14 @@ class Shape(abc.ABC):
     def normal(self, point: Float[np.ndarray, "P 3"], face: Int[np.ndarray, "P"]) -> Float[np.ndarray, "P 3"]:
         """Unit normals at points of the surface, towards the side from which it is seen."""
 
-    @abc.abstractmethod
     def grid(self, spacing: float, inset: float) -> Grid:
-        """Points about ``spacing`` [m] apart on the surface, ``inset`` [m] away from what may become its outline."""
+        """Points about ``spacing`` [m] apart on the surface, ``inset`` [m] away from its possible outlines.
+
+        Raises:
+            ValueError: If the shape has no such grid, and so cannot be covered while it moves.
+        """
+        del spacing, inset
+        raise ValueError(f"{self} cannot be covered while it moves: let its path be Still, or take engine 'mesh'")
 
     @property
     @abc.abstractmethod
@@ -108,10 +113,7 @@ class Box(Shape):
                 points.append(face)
                 normals.append(np.tile(turned * side * np.eye(3)[axis], (len(flat), 1)))
                 others.append(normals[-1])
-                for across in (
-                    -1.0,
-                    1.0,
-                ):  # the edge along ``axis`` between the faces ``side`` of u and ``across`` of v
+                for across in (-1.0, 1.0):  # edge along ``axis`` of the faces ``side`` of u and ``across`` of v
                     edge = np.empty((len(row), 3))
                     edge[:, axis], edge[:, u], edge[:, v] = row, side * half[u], across * half[v]
                     points.append(edge)
@@ -139,10 +141,10 @@ class Plane(Shape):
         """Where z = 0, if the ray comes from -z and meets the rectangle."""
         with np.errstate(divide="ignore", invalid="ignore"):
             distance = -origin[2] / ray[:, 2]
-        seen = (ray[:, 2] > 0) & (distance > 0)
-        point = origin + ray * np.where(seen, distance, 0.0)[:, None]
-        seen &= (np.abs(point[:, :2]) <= np.asarray(self.size) / 2).all(1)
-        return np.where(seen, distance, np.inf), np.zeros(len(ray), dtype=np.int64)
+        met = (ray[:, 2] > 0) & (distance > 0)
+        point = origin + ray * np.where(met, distance, 0.0)[:, None]
+        met &= (np.abs(point[:, :2]) <= np.asarray(self.size) / 2).all(1)
+        return np.where(met, distance, np.inf), np.zeros(len(ray), dtype=np.int64)
 
     def normal(self, point, face):
         """-z everywhere."""
@@ -226,7 +228,7 @@ class Body:
 
     def __post_init__(self):
         if self.moves and not np.isfinite(self.shape.reach):
-            raise ValueError(f"{self.shape} has no end, so it cannot move: let its path be still")
+            raise ValueError(f"{self.shape} is infinite, so it cannot move: let its path be still")
 
     @property
     def moves(self) -> bool:
@@ -261,14 +263,14 @@ def first_hit(bodies: tuple[Body, ...], camera: Camera, time: float) -> Hits:
     ray, distance, body, face = _nearest(bodies, poses, camera)
     normal, reflectance = np.full((len(ray), 3), np.nan), np.zeros(len(ray))
     amplitude = np.zeros(len(ray))
-    for index, (candidate, pose) in enumerate(zip(bodies, poses, strict=True)):  # of what is seen only
-        seen = np.flatnonzero(body == index)
-        rotation, reached = pose[:3, :3], distance[seen, None]
-        point = rotation.T @ (centre - pose[:3, 3]) + (ray[seen] @ rotation) * reached
-        normal[seen] = candidate.shape.normal(point, face[seen]) @ rotation.T
-        reflectance[seen] = candidate.texture(point)
-        cosine = np.abs((normal[seen] * ray[seen]).sum(1))
-        amplitude[seen] = reflectance[seen] * candidate.texture.shading(cosine) / distance[seen] ** 2
+    for index, (candidate, pose) in enumerate(zip(bodies, poses, strict=True)):
+        hit = np.flatnonzero(body == index)
+        rotation, reached = pose[:3, :3], distance[hit, None]
+        point = rotation.T @ (centre - pose[:3, 3]) + (ray[hit] @ rotation) * reached
+        normal[hit] = candidate.shape.normal(point, face[hit]) @ rotation.T
+        reflectance[hit] = candidate.texture(point)
+        cosine = np.abs((normal[hit] * ray[hit]).sum(1))
+        amplitude[hit] = reflectance[hit] * candidate.texture.shading(cosine) / distance[hit] ** 2
     distance = np.where(body < 0, np.nan, distance)
     return Hits(
         distance=distance.reshape(shape),
@@ -289,7 +291,7 @@ def _nearest(bodies: tuple[Body, ...], poses: list[np.ndarray], camera: Camera) 
     for start in range(0, len(ray), CHUNK):
         part = slice(start, start + CHUNK)
         for index, (candidate, pose) in enumerate(zip(bodies, poses, strict=True)):
-            rays = start + passing(centre, ray[part], pose[:3, 3], candidate.shape.reach)
+            rays = start + rays_to_ball(centre, ray[part], pose[:3, 3], candidate.shape.reach)
             if len(rays) == 0:
                 continue
             reached, side = candidate.shape.hit(pose[:3, :3].T @ (centre - pose[:3, 3]), ray[rays] @ pose[:3, :3])
@@ -299,35 +301,16 @@ def _nearest(bodies: tuple[Body, ...], poses: list[np.ndarray], camera: Camera) 
     return ray, distance, body, face
 
 
-def passing(
+def rays_to_ball(
     origin: Float[np.ndarray, "3"], ray: Float[np.ndarray, "P 3"], centre: Float[np.ndarray, "3"], radius: float
 ) -> Int[np.ndarray, "R"]:
-    """Indices of the rays that pass a ball; what lies in it need not be asked for the others."""
-    if not np.isfinite(radius):
-        return np.arange(len(ray))
+    """Indices of the rays that meet a ball: only these can hit what is inside of it."""
     to = np.subtract(centre, origin)
     outside = to @ to - radius**2
     if outside < 0:
         return np.arange(len(ray))
     along = ray @ to
     return np.flatnonzero((along > 0) & (to @ to - along**2 <= (radius * (1 + 1e-9)) ** 2))
-
-
-def carried(
-    bodies: tuple[Body, ...],
-    point: Float[np.ndarray, "H W 3"],
-    body: Int[np.ndarray, "H W"],
-    time: float,
-    later: float,
-) -> Float[np.ndarray, "H W 3"]:
-    """Where points of the bodies of these numbers, seen in the world [m] at ``time``, are ``later`` [s]."""
-    moved = point.copy()
-    for index, candidate in enumerate(bodies):
-        if candidate.moves:
-            seen = body == index
-            step = candidate.path.world_from_body(later) @ np.linalg.inv(candidate.path.world_from_body(time))
-            moved[seen] = point[seen] @ step[:3, :3].T + step[:3, 3]
-    return moved
 
 
 def flow_of(
@@ -337,34 +320,33 @@ def flow_of(
     cameras: tuple[Camera, Camera],
     times: tuple[float, float],
 ) -> Float[np.ndarray, "2 H W"]:
-    """Where what is seen at the first of two times [s] is in the image of the second, less where it was [px].
+    """Optical flow [px] between two times [s], whether or not the target is occluded; NaN where ``point`` is.
 
-    Surfaces are carried along with their bodies, and the camera moves, too; whether they are hidden then is not looked
-    at. The second time may be the earlier one. Arguments as for :func:`carried`; NaN where ``point`` is.
+    Points move with their bodies, and the camera moves, too. The second time may be the earlier one.
+
+    Args:
+        bodies: All bodies.
+        point: Points [m] of the bodies at the first time, one per pixel of the first camera.
+        body: Index of the body of each.
+        cameras: The camera at both times.
+        times: Both times.
     """
-    here = cameras[0].project(torch.from_numpy(point))
-    there = cameras[1].project(torch.from_numpy(carried(bodies, point, body, *times)))
-    return np.moveaxis((there - here).numpy(), -1, 0)
+    moved = point.copy()
+    for index, candidate in enumerate(bodies):
+        if candidate.moves:
+            first, second = (candidate.path.world_from_body(time) for time in times)
+            step, hit = second @ np.linalg.inv(first), body == index
+            moved[hit] = point[hit] @ step[:3, :3].T + step[:3, 3]
+    start, end = (c.project(torch.from_numpy(p)) for c, p in zip(cameras, (point, moved), strict=True))
+    return np.moveaxis((end - start).numpy(), -1, 0)
 
 
 def albedo(bodies: tuple[Body, ...], hits: Hits, time: float) -> Float[np.ndarray, "H W 3"]:
-    """Albedo in linear RGB [1] of what ``hits`` met at ``time`` [s]; 0 where nothing was hit."""
-    return _albedo(bodies, hits.body, hits.point, time)
-
-
-def albedo_seen(bodies: tuple[Body, ...], camera: Camera, time: float) -> Float[np.ndarray, "H W 3"]:
-    """Albedo in linear RGB [1] on every pixel's centre ray at ``time`` [s]; 0 where nothing is hit."""
-    poses = [candidate.path.world_from_body(time) for candidate in bodies]
-    ray, distance, body, _ = _nearest(bodies, poses, camera)
-    shape = (camera.height, camera.width)
-    point = camera.centre + ray * np.where(body < 0, np.nan, distance)[:, None]
-    return _albedo(bodies, body.reshape(shape), point.reshape(*shape, 3), time)
-
-
-def _albedo(bodies: tuple[Body, ...], body: np.ndarray, point: np.ndarray, time: float) -> np.ndarray:
-    colour = np.zeros((*body.shape, 3))
+    """Albedo in linear RGB [1] of the bodies in ``hits`` at ``time`` [s]; 0 where nothing was hit."""
+    colour = np.zeros(hits.point.shape)
     for index, candidate in enumerate(bodies):
-        seen = body == index
+        hit = hits.body == index
         body_from_world = inverse(candidate.path.world_from_body(time))
-        colour[seen] = candidate.texture.albedo(point[seen] @ body_from_world[:3, :3].T + body_from_world[:3, 3])
+        local = hits.point[hit] @ body_from_world[:3, :3].T + body_from_world[:3, 3]
+        colour[hit] = candidate.texture.albedo(local)
     return colour
