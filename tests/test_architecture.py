@@ -73,16 +73,19 @@ LARGE_CLASSES = {  # file:class: why it may be larger
     "scene/sensor.py:Sensor": "the physical constants of one camera, each independent of the others",
     "sim/scene.py:Scene": "what a scene file may say",
     "recon/settings.py:ReconSettings": "settings of one run; those that belong together are classes of their own",
-    "recon/captured.py:CapturedSteps": "still to be divided",
+    "recon/control.py:ControlBlock": "still to be divided",
+    "recon/loop.py:TrainingLoop": "still to be divided",
     "recon/run.py:Run": "still to be divided",
-    "recon/state.py:State": "still to be divided",
+    "recon/step.py:Step": "still to be divided",
+    "recon/stepper.py:Stepper": "still to be divided",
     "render/buffers.py:Frame": "still to be divided",
 }
 SENTINEL = re.compile(r"(?<![\w.+*/-])-?\d+(\.\d+)?(: | likewise| (if|where|for|means) )")
 SENTINELS = {  # kernel.parameter or struct.field: why a number may mean something else there
     "resolve_geometry.factor": "a factor that is multiplied with; the comment says which two there are",
     "add_records.geometry_only": "a flag",
-    "observe.counts": "a flag",
+    "add_statistics.counts": "a flag",
+    "finish_step.weights": "a term with weight 0 adds nothing",
     "project.box_px": "a box without pixels is a splat that is culled: nothing compares it with 0",
     "backward_listed.slopes": "what a row of the list without a number gets, not what it means",
     "number_pairs.owners": "what is written where no pair is, and read by nobody",
@@ -92,9 +95,6 @@ SENTINELS = {  # kernel.parameter or struct.field: why a number may mean somethi
     "CameraView.radius": "still to be said otherwise",
     "Solid.radius": "still to be said otherwise",
     "Layers.joined": "still to be said otherwise",
-    "judge.capacity": "still to be said otherwise",
-    "judge.longest": "still to be said otherwise",
-    "judge.rates": "a learning rate of 0 moves nothing",
 }
 HOMELESS = {"utils", "util", "common", "misc", "types", "helpers"}
 
