@@ -10,8 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from gftorf_warp.data.exr import read_exr, write_exr
 from gftorf_warp.data.files import atomic_folder, atomic_write, write_json
-from gftorf_warp.data.images import indexed_png_bytes, png_bytes, read_exr, write_exr
+from gftorf_warp.data.images import indexed_png_bytes, png_bytes
 from gftorf_warp.errors import InputError, ResourceError, UsageError
 
 
@@ -52,7 +53,7 @@ def test_a_full_disk_is_an_error_with_exit_code_5(tmp_path, write):
         "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))\n"
         "from gftorf_warp.data.files import atomic_write\n"
-        "from gftorf_warp.data.images import write_exr\n"
+        "from gftorf_warp.data.exr import write_exr\n"
         "from gftorf_warp.errors import ResourceError\n"
         "content = np.random.default_rng(0).normal(size=(60, 70))\n"
         "try:\n    {write}\n"

@@ -9,7 +9,7 @@ import pytest
 import torch
 from small_runs import small
 
-from gftorf_warp.data.images import write_exr
+from gftorf_warp.data.exr import write_exr
 from gftorf_warp.errors import InputError, UsageError
 from gftorf_warp.recon.train import reconstruct
 from gftorf_warp.scene.camera import Camera

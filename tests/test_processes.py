@@ -12,7 +12,7 @@ import pytest
 from analytic_run import FRAMES, AnalyticRun, interrupt
 from test_writers import WHAT, files_in, scales_and_series
 
-from gftorf_warp.data.images import read_exr
+from gftorf_warp.data.exr import read_exr
 from gftorf_warp.errors import ResourceError, UsageError
 from gftorf_warp.evaluate import processes, writers
 from gftorf_warp.evaluate.views import render_to_folder

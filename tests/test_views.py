@@ -10,7 +10,7 @@ import pytest
 import torch
 from analytic_run import FRAMES, HEIGHT, WIDTH, AnalyticRun, true_distance, with_colour
 
-from gftorf_warp.data.images import read_exr
+from gftorf_warp.data.exr import read_exr
 from gftorf_warp.errors import InputError, ResourceError, UsageError
 from gftorf_warp.evaluate import pictures, previews, renders, writers
 from gftorf_warp.evaluate.views import quad_of_shift, render_to_folder

@@ -23,7 +23,7 @@ except ImportError:  # not a Unix
     fcntl = None
 
 from gftorf_warp.data import files
-from gftorf_warp.data.images import read_exr
+from gftorf_warp.data.exr import read_exr
 from gftorf_warp.errors import ResourceError, UsageError
 from gftorf_warp.evaluate import previews, stored, views, writers
 from gftorf_warp.evaluate.views import render_to_folder

@@ -1,98 +1,158 @@
-"""OpenEXR files of several parts: what one camera recorded at one instant, each part of it with named channels."""
+"""OpenEXR files: images of named channels, in one part or several; every written file is read back and compared.
+
+A file of one part is not compressed: the last bits of float32 are noise, so that compressing six 320x240 images takes
+20 ms of a CPU and leaves four fifths of their size. Parts of a capture are compressed, once for all readers.
+"""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from ..errors import InputError, ResourceError
 from .arrays import SIDE_MAX
+from .files import atomic_path, one_of_many
 
 PARTS_MAX = 64  # a raw frame has a handful; a forged header may claim millions
-CHANNELS_MAX = 16  # of one part
-TYPES = {np.dtype(np.float32), np.dtype(np.uint32)}  # half is refused: its steps are 2 mm at 2 m
+CHANNELS_MAX = 256  # a rendering has a few dozen
+TYPES = {np.dtype(np.float32), np.dtype(np.uint32)}  # of captures; half is refused: its steps are 2 mm at 2 m
 
-Parts = dict[str, dict[str, np.ndarray]]
+Channels = dict[str, np.ndarray]
+Parts = dict[str, Channels]
+
+
+def write_exr(path: str | Path, channels: Mapping[str, np.ndarray], *, one_of: bool = False) -> None:
+    """Write named float32 images of one size as an OpenEXR file of one part, atomically.
+
+    Args:
+        path: The file; its folder must exist.
+        channels: Images [H, W] by name, for example ``{"distance": ..., "quads.0": ...}``; any real type that float32
+            holds. Viewers show the names R, G, B as colour. NaN is kept.
+        one_of: Whether it is one of the files of a folder inside ``files.many_files``.
+
+    Raises:
+        ValueError: If there are no channels, or their shapes differ or are not [H, W].
+        UsageError, ResourceError: If the file cannot be written.
+    """
+    import OpenEXR
+
+    images = {name: np.ascontiguousarray(image, dtype=np.float32) for name, image in channels.items()}
+    _check_images([images])
+    header = {"compression": OpenEXR.NO_COMPRESSION, "type": OpenEXR.scanlineimage}
+    with one_of_many(Path(path)) if one_of else atomic_path(path) as temporary:
+        file = OpenEXR.File(header, dict(images))  # which changes the dictionary
+        _write(temporary, file, [images], Path(path))
 
 
 def write_parts(path: str | Path, parts: Mapping[str, Mapping[str, np.ndarray]]) -> None:
-    """Write a new file, losslessly compressed, flush it to the disk and read it back.
+    """Write a new OpenEXR file of several parts, losslessly compressed, and flush it to the disk.
 
     Args:
-        path: A file that is not there; its folder must exist.
+        path: A file that does not exist; its folder must exist.
         parts: Channels [H, W] by name, by name of the part; all of one size, float32 or uint32. NaN is kept.
 
     Raises:
         ValueError: If there is nothing to write, or sizes or types do not fit.
-        ResourceError: If what was written is not what can be read.
+        ResourceError: If the content read back differs.
         OSError: If the file cannot be written.
     """
     import OpenEXR
 
-    # a slice, a flip or Fortran order is written with wrong pixels and no error
     whole = {n: {c: np.ascontiguousarray(image) for c, image in channels.items()} for n, channels in parts.items()}
-    images = [image for channels in whole.values() for image in channels.values()]
-    found = {(image.shape, image.dtype) for image in images}
-    if len({shape for shape, _ in found}) != 1 or images[0].ndim != 2 or not {t for _, t in found} <= TYPES:
-        raise ValueError(
-            f"channels must be float32 or uint32 images [H, W] of one shape, got {sorted(map(str, found))}"
-        )
+    _check_images(list(whole.values()))
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    with open(path, "xb"):  # so that a place that cannot be written to is told from a disk that is full
-        pass
-    try:
-        with OpenEXR.File([OpenEXR.Part(dict(header), dict(c), name) for name, c in whole.items()]) as file:
-            file.write(str(path))
-    except RuntimeError as error:
-        raise ResourceError("cannot write picture", where=path, why=str(error), fix="free disk space") from error
+    file = OpenEXR.File([OpenEXR.Part(dict(header), dict(c), name) for name, c in whole.items()])
+    _write(Path(path), file, list(whole.values()), Path(path))
     with open(path, "rb+") as written:
         os.fsync(written.fileno())
-    back = read_parts(path)
-    if not _same(back, whole):
-        why = "reading it back gave other pixels"
-        raise ResourceError("picture damaged while writing", where=path, why=why, fix="check the disk")
+
+
+def read_exr(path: str | Path) -> Channels:
+    """Read the images [H, W] of an OpenEXR file of one part by channel name.
+
+    Raises:
+        InputError: If it is missing, damaged, truncated, too large, or has subsampled channels or several parts.
+    """
+    return next(iter(_read(Path(path), 1).values()))
 
 
 def read_parts(path: str | Path) -> Parts:
-    """Channels [H, W] by name, by name of the part.
+    """Read the channels [H, W] of an OpenEXR file by name, by name of the part.
 
     Raises:
-        InputError: If the file is missing, damaged, cut off, too large, or has subsampled or half-precision channels.
+        InputError: If the file is missing, damaged, truncated, too large, or has subsampled or half-precision channels.
     """
+    path = Path(path)
+    parts = _read(path, PARTS_MAX)
+    other = {str(image.dtype) for channels in parts.values() for image in channels.values() if image.dtype not in TYPES}
+    if other:
+        raise _unreadable(path, PARTS_MAX, f"{', '.join(other)} instead of float32")
+    return parts
+
+
+def _check_images(parts: list[Channels]) -> None:
+    """One size and known types; OpenEXR writes wrong pixels of slices, flips and Fortran order without an error."""
+    images = [image for channels in parts for image in channels.values()]
+    found = {(image.shape, image.dtype) for image in images}
+    if len({shape for shape, _ in found}) != 1 or images[0].ndim != 2 or not {t for _, t in found} <= TYPES:
+        kinds = ", ".join(sorted(map(str, found))) or "none"
+        raise ValueError(f"channels must be float32 or uint32 images [H, W] of one shape, got {kinds}")
+
+
+def _write(path: Path, file: Any, parts: list[Channels], where: Path) -> None:
+    """Write a file of OpenEXR's and compare it: the library does not notice a full disk at the end of a file."""
+    path.touch(exist_ok=False)  # so that a folder without permission and a full disk are different errors
+    try:
+        with file:
+            file.write(str(path))
+    except RuntimeError as error:
+        raise ResourceError("cannot write picture", where=where, why=str(error), fix="free disk space") from error
+    try:
+        back = list(_read(path, PARTS_MAX).values())
+    except InputError:
+        back = []
+    if not _same(back, parts):
+        why, fix = "reading it back gave other pixels", "check the disk, and that it is not full"
+        raise ResourceError("picture damaged while writing", where=where, why=why, fix=fix)
+
+
+def _read(path: Path, parts_max: int) -> Parts:
+    """Every part of a file; sizes are checked before anything is allocated."""
     import OpenEXR
 
-    path = Path(path)
     if not path.is_file():
-        raise InputError("no such picture", where=path, why="expected an OpenEXR file", fix="complete the folder")
+        raise InputError("no such picture", where=path, why="expected an OpenEXR file", fix="check the path")
     try:
         with OpenEXR.File(str(path), separate_channels=True, header_only=True) as file:
-            stated = {part.name(): _stated(part.header) for part in file.parts}
-            if not 1 <= len(file.parts) <= PARTS_MAX or len(stated) != len(file.parts):
-                raise ValueError(f"{len(file.parts)} parts named {sorted(stated)}")
+            stated = [_stated(part.header) for part in file.parts]
+            names = {part.name() for part in file.parts}
+        if not 1 <= len(stated) <= parts_max or len(names) != len(stated):
+            raise ValueError(f"{len(stated)} parts")
         with OpenEXR.File(str(path), separate_channels=True) as file:
             parts = {
                 part.name(): {name: np.array(channel.pixels) for name, channel in part.channels.items()}
                 for part in file.parts
             }
-        for name, (shape, names) in stated.items():
-            got = parts.get(name, {})
-            if got.keys() != names or any(image.shape != shape or image.dtype not in TYPES for image in got.values()):
-                raise ValueError(f"{len(got)} of {len(names)} channels of part {name} with {shape} float32 pixels")
-    except Exception as error:  # the library turns whatever it meets into whatever it likes
-        raise InputError(
-            "unreadable picture",
-            where=path,
-            why=f"expected whole OpenEXR parts of at most {SIDE_MAX}x{SIDE_MAX} in float32, found {error}",
-            fix="copy or export the file again",
-        ) from error
+        for (shape, channels), got in zip(stated, parts.values(), strict=True):
+            if got.keys() != channels or any(image.shape != shape for image in got.values()):
+                raise ValueError(f"{len(got)} of {len(channels)} channels")
+    except Exception as error:  # the library raises many kinds of exceptions
+        raise _unreadable(path, parts_max, str(error)) from error
     return parts
 
 
+def _unreadable(path: Path, parts_max: int, found: str) -> InputError:
+    count = "one whole OpenEXR part" if parts_max == 1 else "whole OpenEXR parts"
+    why = f"expected {count} of at most {SIDE_MAX}x{SIDE_MAX} in float32, found {found}"
+    return InputError("unreadable picture", where=path, why=why, fix="copy or export the file again")
+
+
 def _stated(header: Mapping) -> tuple[tuple[int, int], set[str]]:
-    """Shape and channel names that the header of a part states, before anything is allocated."""
+    """Shape and channel names in the header of a part."""
     low, high = header["dataWindow"]
     width, height = (int(b) - int(a) + 1 for a, b in zip(low, high, strict=True))
     channels = header["channels"]
@@ -103,8 +163,8 @@ def _stated(header: Mapping) -> tuple[tuple[int, int], set[str]]:
     return (height, width), {channel.name for channel in channels}
 
 
-def _same(one: Parts, other: Parts) -> bool:
+def _same(one: list[Channels], other: list[Channels]) -> bool:
     """Whether all parts have the same bits."""
-    if one.keys() != other.keys() or any(one[n].keys() != other[n].keys() for n in one):
+    if [part.keys() for part in one] != [part.keys() for part in other]:
         return False
-    return all(one[n][c].tobytes() == other[n][c].tobytes() for n in one for c in one[n])
+    return all(a[c].tobytes() == b[c].tobytes() for a, b in zip(one, other, strict=True) for c in a)

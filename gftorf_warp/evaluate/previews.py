@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from ..data.exr import write_exr
 from ..data.files import write_one_of_many
-from ..data.images import indexed_png_bytes, png_bytes, write_exr
+from ..data.images import indexed_png_bytes, png_bytes
 from . import pictures
 
 Channels = dict[str, Float[np.ndarray, "H W"]]

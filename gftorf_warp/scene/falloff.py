@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from ..data.images import read_exr
+from ..data.exr import read_exr
 from ..errors import InputError
 
 SUFFIXES = (".npy", ".exr", ".png")
