@@ -46,7 +46,7 @@ def read_calibration(root: Path, form: str, problems: Problems, width: int | Non
         width: Columns of the images; None if they could not be read, and then intrinsics are not judged by it.
     """
     fields = specs.fields(form)
-    sources: dict[str, str] = {}
+    sources = {"dc_offset": "default 0: a phasor has no constant part"}
 
     def scalar(name: str, key: str) -> float | None:
         return problems.attempt(_scalar, root, fields[name], sources, key)
@@ -92,12 +92,15 @@ def read_colour_intrinsics(
     return tof.intrinsics.scaled(sx, sy)
 
 
-def read_shifts(root: Path, frames: int, sources: dict[str, str]) -> np.ndarray:
-    """Shift of each raw frame [F] [rad] of an F-ToeRF folder: slot k has canonical channel argsort(permutation)[k].
+def read_shifts(root: Path, form: str, frames: int, sources: dict[str, str]) -> np.ndarray:
+    """Shift of each raw frame [F] [rad]; slot k of an F-ToeRF folder has canonical channel argsort(permutation)[k].
 
     Raises:
-        InputError: If the permutation is none.
+        InputError: If the permutation is not one.
     """
+    if form == "torf":
+        sources["shifts"] = "file tof: phasors, as four simultaneous quads 0, pi, pi/2, 3 pi/2"
+        return np.resize(CANONICAL_SHIFTS, frames)
     spec = specs.fields("ftorf")["permutation"]
     path = root / spec.paths[0]
     if path.exists():

@@ -16,13 +16,14 @@ from . import specs
 from .arrays import SIDE_MAX
 from .calibration import DEPTH_RANGES_M, FOCAL_MIN
 from .capture_json import FORMAT, NAME, json_fields, read_values
-from .capture_write import MANIFEST, inverse, write
+from .capture_write import inverse, write
 from .cycles import QUADS_MIN
 from .exr import Parts, read_parts
 from .folder import FRAMES_MAX, empty_quads, format_of, numbered
 from .poses import rigid
 from .problems import Problems
 from .sequence import Calibration, ColourCamera, Flow, Intrinsics, Sequence, Truth
+from .writing import MANIFEST
 
 __all__ = ["read", "read_truth", "write"]
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,14 +12,12 @@ from jaxtyping import Float
 
 from .. import __version__
 from .capture_json import NAME
-from .exr import Parts, write_parts
-from .files import atomic_folder, write_through
+from .exr import Parts
 from .sequence import Intrinsics, Sequence, Truth
 from .specs import layer_field
-from .writing import float32, readme_and_sheet, refuse_inexpressible, validate
+from .writing import float32, write_folder
 
 VERSION = "1.0"
-MANIFEST = "MANIFEST.sha256"
 
 
 def write(
@@ -30,47 +28,24 @@ def write(
     readme: str | None = None,
     sheet: bytes | None = None,
 ) -> Path:
-    """Write a sequence, and its truth if there is any, as a capture that appears only when it is complete.
+    """Write a sequence as a capture; arguments and errors are those of :func:`writing.write_folder`.
 
     Reading it again gives the same sequence: images bit by bit in float32, numbers as they were, poses, which are
     stored inverted, to the last digit or two.
-
-    Args:
-        path: New or empty folder.
-        sequence: What to write: any shifts, any frequencies, raw frames or phasors.
-        truth: True distances [m] of the raw frames, and whatever else of it is known.
-        readme: Text of a README.md in the folder.
-        sheet: A picture of it all, as PNG.
-
-    Returns:
-        The folder.
-
-    Raises:
-        UsageError: If the format cannot express the sequence, or the folder cannot be created.
-        ResourceError: If the disk is full.
-        ValueError: If shapes of the sequence or the truth contradict each other.
     """
-    validate(sequence, truth)
-    refuse_inexpressible("capture", sequence, truth)
-    with atomic_folder(path) as folder:
-        write_through(folder / NAME, _json(sequence))
-        (folder / "tof").mkdir()
-        for n in np.flatnonzero(sequence.measured).tolist():
-            write_parts(folder / f"tof/{n:06d}.exr", _raw_frame(sequence, n))
-        for n, image in sequence.colour.images.items():
-            (folder / "colour").mkdir(exist_ok=True)
-            channels = dict(zip("RGB", np.moveaxis(float32(image), -1, 0), strict=True))
-            write_parts(folder / f"colour/{n:06d}.exr", {"colour": channels})
-        if truth is not None:
-            (folder / "truth").mkdir()
-            for n in np.flatnonzero(truth.known).tolist():
-                write_parts(folder / f"truth/{n:06d}.exr", _truth(truth, n))
-        names = sorted(file.relative_to(folder).as_posix() for file in folder.rglob("*") if file.is_file())
-        digests = [f"{hashlib.sha256((folder / name).read_bytes()).hexdigest()}  {name}\n" for name in names]
-        for name, content in readme_and_sheet(readme, sheet):
-            write_through(folder / name, content)
-        write_through(folder / MANIFEST, "".join(digests).encode())
-    return Path(path)
+    return write_folder(path, "capture", sequence, truth, _files, readme=readme, sheet=sheet, manifest=True)
+
+
+def _files(sequence: Sequence, truth: Truth | None) -> Iterator[tuple[str, bytes | Parts]]:
+    """Every file of the folder, by relative name."""
+    yield NAME, _json(sequence)
+    for n in np.flatnonzero(sequence.measured).tolist():
+        yield f"tof/{n:06d}.exr", _raw_frame(sequence, n)
+    for n, image in sequence.colour.images.items():
+        yield f"colour/{n:06d}.exr", {"colour": dict(zip("RGB", np.moveaxis(float32(image), -1, 0), strict=True))}
+    if truth is not None:
+        for n in np.flatnonzero(truth.known).tolist():
+            yield f"truth/{n:06d}.exr", _truth(truth, n)
 
 
 def _raw_frame(sequence: Sequence, n: int) -> Parts:

@@ -13,11 +13,9 @@ from . import specs
 from .arrays import as_float32, read_array, read_shape
 from .capture_json import NAME as CAPTURE
 from .problems import Problems
-from .sequence import Truth
 
 SLOT_FOLDERS = tuple(f"tofType{slot}" for slot in range(FRAMES_PER_QUARTET))
 PHASOR_FOLDER = "tof"
-NOT_IN_FAMILY = ("frequencies_hz", "cycle_length", "distortion", "exposures", "sensor")  # only a capture holds these
 EXPECTED = (
     "expected a folder with capture.json (a capture), tofType0 .. tofType3 and cams (F-ToeRF: raw quads), or tof and "
     "cams (ToeRF: phasors)"
@@ -154,41 +152,6 @@ def load(
     folder = next(iter(files.values())).parent.relative_to(root) if files else ""
     where = f"{SLOT_FOLDERS[0]} .. {SLOT_FOLDERS[-1]}" if str(folder) in SLOT_FOLDERS else folder
     return images, f"file {where}" + (f", {rounded} rounded to float32" if rounded else "")
-
-
-def read_distances(
-    root: Path, spec: specs.Field, frames: int, size: dict[str, int], problems: Problems, first_id: int = 0
-) -> dict[int, np.ndarray]:
-    """True distances [m] by frame, NaN where the file has NaN or 0; arguments as for :func:`read_field`."""
-    images, _ = read_field(root, spec, frames, size, problems, first_id)
-    folder = next((p for p in spec.paths if numbered(root, p)), spec.paths[0])
-    for n, image in images.items():
-        if (image < 0).any():
-            error = InputError(
-                "distance: negative",
-                where=root / folder.replace("{id}", f"{n + first_id:04d}"),
-                why=f"expected metres along the ray, NaN where unknown, found {np.nanmin(image):g}",
-                fix="store NaN where the distance is unknown",
-            )
-            problems.errors.append(error)
-    return {n: np.where(image == 0, np.float32(np.nan), image) for n, image in images.items()}
-
-
-def truth_of(
-    distances: dict[int, np.ndarray], phasor_distances: dict[int, np.ndarray], frames: int, step: int = 1
-) -> Truth | None:
-    """Truth of F raw frames from distances [m] by image, each of which counts for ``step`` raw frames; None if none."""
-    if not distances:
-        return None
-    shape = (frames, *next(iter(distances.values())).shape)
-    filled = []
-    for images in (distances, phasor_distances):
-        stack = np.full(shape, np.nan, dtype=np.float32)
-        for i, image in images.items():
-            stack[step * i : step * (i + 1)] = image
-        filled.append(stack)
-    known = np.isin(np.arange(frames) // step, list(distances))
-    return Truth(distance=filled[0], known=known, phasor_distance=filled[1] if phasor_distances else None)
 
 
 def empty_quads(root: Path, frames: int, size: dict[str, int]) -> np.ndarray:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
 from ..constants import CANONICAL_SHIFTS, FRAMES_PER_QUARTET
+from .folder import SLOT_FOLDERS
 from .sequence import Sequence, Truth
 from .writing import (
     calibration_files,
@@ -16,10 +17,7 @@ from .writing import (
     inexpressible,
     json_bytes,
     npy,
-    readme_and_sheet,
-    refuse_inexpressible,
     shortest,
-    validate,
     write_folder,
 )
 
@@ -34,42 +32,23 @@ def write(
     readme: str | None = None,
     sheet: bytes | None = None,
 ) -> Path:
-    """Write a sequence, and its truth if there is any, as an F-ToeRF folder that appears only when it is complete.
+    """Write a sequence as an F-ToeRF folder; arguments and errors are those of :func:`writing.write_folder`.
 
     Reading it again gives the same sequence: images bit by bit in float32, calibration in float64; only a frequency
-    that was not read from such a folder may change in its last bit, since its inverse is stored.
-
-    Args:
-        path: New or empty folder.
-        sequence: What to write; every slot needs one of the four canonical shifts, each slot another.
-        truth: True distances [m] of the raw frames.
-        readme: Text of a README.md in the folder.
-        sheet: A picture of it all, as PNG.
-
-    Returns:
-        The folder.
-
-    Raises:
-        UsageError: If the format cannot express the sequence, or the folder cannot be created.
-        ResourceError: If the disk is full.
-        ValueError: If shapes of the sequence or the truth contradict each other.
+    that was not read from such a folder may change in its last bit, since its inverse is stored. Every slot needs one
+    of the four canonical shifts, each slot another.
     """
-    validate(sequence, truth)
-    refuse_inexpressible("ftorf", sequence, truth)
+    return write_folder(path, "ftorf", sequence, truth, _files, readme=readme, sheet=sheet, folders=SLOT_FOLDERS)
+
+
+def _files(sequence: Sequence, truth: Truth | None) -> Iterator[tuple[str, bytes]]:
+    """Every file of the folder, by relative name."""
     if sequence.from_phasors:
         raise inexpressible("ftorf", "phasors", "raw quads that were measured one by one", "phasors: write format torf")
-    slots = [f"tofType{slot}" for slot in range(FRAMES_PER_QUARTET)]  # one without frames still belongs to the layout
-    return write_folder(path, _files(sequence, truth, _permutation(sequence), readme_and_sheet(readme, sheet)), slots)
-
-
-def _files(
-    sequence: Sequence, truth: Truth | None, permutation: np.ndarray, for_people: Iterable[tuple[str, bytes]]
-) -> Iterator[tuple[str, bytes]]:
-    """Every file of the folder, by relative name."""
     poses = sequence.camera_from_world
     colour_poses = poses if sequence.colour.camera_from_world is None else sequence.colour.camera_from_world
     yield from calibration_files(sequence, sequence.times, poses)
-    yield "tof_permutation.npy", npy(permutation)
+    yield "tof_permutation.npy", npy(_permutation(sequence))
     yield "cams/poses.json", json_bytes({"poses": "camera_from_world"})
     yield "cams/color_extrinsics.npy", npy(colour_poses.astype(np.float64))
     yield "cams/dc_offset.npy", npy(np.float64(sequence.calibration.dc_offset))
@@ -85,7 +64,6 @@ def _files(
             yield f"synthetic_depth/{n:04d}.npy", npy(float32(truth.distance[n]))
             if truth.phasor_distance is not None:
                 yield f"phasor_distance/{n:04d}.npy", npy(float32(truth.phasor_distance[n]))
-    yield from for_people
 
 
 def _permutation(sequence: Sequence) -> np.ndarray:

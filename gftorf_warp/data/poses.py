@@ -1,4 +1,4 @@
-"""Where the cameras of a folder stood: poses of the ToF camera, of the colour camera, and of views nobody took."""
+"""Poses in a folder: of the ToF camera, of the colour camera, and of novel views."""
 
 from __future__ import annotations
 
@@ -26,93 +26,83 @@ def rigid(poses: np.ndarray) -> np.ndarray:
     )
 
 
-def read_static_poses(root: Path, frames: int, sources: dict[str, str]) -> tuple[np.ndarray, bool]:
-    """F-ToeRF: camera_from_world of each raw frame [F, 4, 4] [m], and whether poses of this folder count.
+def read_poses(root: Path, form: str, frames: int, sources: dict[str, str]) -> np.ndarray:
+    """camera_from_world of each image [F, 4, 4] [m]: of each raw frame of F-ToeRF, of each phasor of ToeRF.
 
-    They are identity, unless cams/poses.json says that the file counts.
-
-    Raises:
-        InputError: If poses that count are too few, too many, or no rigid motions.
-    """
-    fields = specs.fields("ftorf")
-    spec, marker = fields["tof_extrinsics"], fields["poses"]
-    path = root / spec.paths[0]
-    counts = (root / marker.paths[0]).exists() and bool(read_choice(root / marker.paths[0], marker))
-    if counts:
-        sources["camera_from_world"] = f"file {spec.paths[0]}"
-        advice = f"complete the poses, or remove {marker.paths[0]} for a static camera"
-        return _motions(root, spec, frames, "raw frames", advice), True
-    stored = read_array(path, spec) if path.exists() else None
-    still = stored is None or np.array_equal(stored, np.broadcast_to(np.eye(4), stored.shape))
-    sources["camera_from_world"] = "default identity" + (
-        ": the camera of this format stands still"
-        if still
-        else f": {spec.paths[0]} holds other poses, which this format's loaders ignore"
-    )
-    return _identity(frames), False
-
-
-def read_static_colour_poses(root: Path, poses: np.ndarray, counts: bool, sources: dict[str, str]) -> np.ndarray:
-    """F-ToeRF: pose of the colour camera at each raw frame [F, 4, 4] [m]; that of the ToF camera unless poses count.
+    Identity without a file; for F-ToeRF also with one, unless cams/poses.json says that its poses are used.
 
     Raises:
-        InputError: If poses that count are too few, too many, or no rigid motions.
+        InputError: If used poses are too few, too many, or no rigid motions.
     """
-    spec = specs.fields("ftorf")["color_extrinsics"]
-    if counts and (root / spec.paths[0]).exists():
-        sources["colour_from_world"] = f"file {spec.paths[0]}"
-        return _motions(root, spec, len(poses), "raw frames", "complete the poses, or remove the file")
-    sources["colour_from_world"] = "default as the ToF camera"
-    return poses.copy()
+    spec = specs.fields(form)["tof_extrinsics"]
+    path, name = root / spec.paths[0], spec.paths[0]
+    sources["camera_from_world"] = f"file {name}"
+    if form == "torf":
+        if path.exists():
+            advice = "store one world-to-camera pose per phasor, or state the number of phasors by cams/frame_times.npy"
+            return _motions(root, spec, frames, "phasors", advice)
+        sources["camera_from_world"] = f"default identity: no {name}"
+    elif _uses_poses(root):
+        marker = specs.fields(form)["poses"].paths[0]
+        return _motions(root, spec, frames, "raw frames", f"complete the poses, or remove {marker} for a static camera")
+    else:
+        stored = read_array(path, spec) if path.exists() else None
+        still = stored is None or np.array_equal(stored, np.broadcast_to(np.eye(4), stored.shape))
+        sources["camera_from_world"] = "default identity" + (
+            ": the camera of this format stands still"
+            if still
+            else f": {name} holds other poses, which this format's loaders ignore"
+        )
+    return _identity(frames)
 
 
-def read_moving_poses(root: Path, frames: int, sources: dict[str, str]) -> np.ndarray:
-    """ToeRF: camera_from_world of each phasor [N, 4, 4] [m]; identity if there is no file.
+def _uses_poses(root: Path) -> bool:
+    """Whether the poses of an F-ToeRF folder are used."""
+    marker = specs.fields("ftorf")["poses"]
+    path = root / marker.paths[0]
+    return path.exists() and bool(read_choice(path, marker))
+
+
+def read_colour_poses(root: Path, form: str, poses: np.ndarray, sources: dict[str, str]) -> np.ndarray:
+    """Pose of the colour camera at each image [F, 4, 4] [m], from the best file of the folder.
+
+    F-ToeRF: cams/color_extrinsics.npy if poses are used, else the pose of the ToF camera. ToeRF: a relative pose E
+    takes colour-camera to ToF-camera coordinates, so colour_from_world = inv(E) @ camera_from_world; in this order,
+    cams/relative_pose.npy; cams/color_extrinsics.npy, also where it equals the first, since it needs no product;
+    cams/relative_R.mat and relative_T.mat as E = [R | -T]; the pose of the ToF camera.
 
     Raises:
-        InputError: If there are too few or too many, or they are no rigid motions.
+        InputError: If a file is not what data_specs/ describes.
     """
-    spec = specs.fields("torf")["tof_extrinsics"]
-    if not (root / spec.paths[0]).exists():
-        sources["camera_from_world"] = f"default identity: no {spec.paths[0]}"
-        return _identity(frames)
-    sources["camera_from_world"] = f"file {spec.paths[0]}"
-    advice = "store one world-to-camera pose per phasor, or state the number of phasors by cams/frame_times.npy"
-    return _motions(root, spec, frames, "phasors", advice)
-
-
-def read_moving_colour_poses(root: Path, poses: np.ndarray, sources: dict[str, str]) -> np.ndarray:
-    """ToeRF: pose of the colour camera at each phasor [N, 4, 4] [m], from the best file there is.
-
-    A relative pose E takes colour-camera to ToF-camera coordinates, so colour_from_world = inv(E) @ camera_from_world.
-    In order: cams/relative_pose.npy; cams/color_extrinsics.npy, also where it says the same as the first, since it
-    needs no product; cams/relative_R.mat and relative_T.mat as E = [R | -T]; the pose of the ToF camera.
-
-    Raises:
-        InputError: If a file is not what data_specs/torf.toml describes.
-    """
-    fields = specs.fields("torf")
-    spec, absolute = fields["relative_pose"], fields["color_extrinsics"]
-    halves = [fields["relative_R"], fields["relative_T"]]
-    stored = None
+    fields = specs.fields(form)
+    absolute = fields["color_extrinsics"]
+    name = absolute.paths[0]
+    has_absolute = (root / name).exists()
+    if form == "ftorf":
+        if has_absolute and _uses_poses(root):
+            sources["colour_from_world"] = f"file {name}"
+            return _motions(root, absolute, len(poses), "raw frames", "complete the poses, or remove the file")
+        sources["colour_from_world"] = "default as the ToF camera"
+        return poses.copy()
+    spec, halves = fields["relative_pose"], [fields["relative_R"], fields["relative_T"]]
     if (root / spec.paths[0]).exists():
         relative = read_array(root / spec.paths[0], spec).astype(np.float64).reshape(1, 4, 4)
         _refuse_others(root / spec.paths[0], spec.name, relative)
         product = np.linalg.inv(relative[0]) @ poses
         sources["colour_from_world"] = f"file {spec.paths[0]}"
-        if (root / absolute.paths[0]).exists():
-            stored = read_array(root / absolute.paths[0], absolute).astype(np.float64)
+        if has_absolute:
+            stored = read_array(root / name, absolute).astype(np.float64)
             if stored.shape == product.shape and np.abs(stored - product).max() <= SAME_POSE:
-                sources["colour_from_world"] = f"file {absolute.paths[0]}, as {spec.paths[0]} says"
+                sources["colour_from_world"] = f"file {name}, as {spec.paths[0]} says"
                 return stored
-            sources["colour_from_world"] += f"; {absolute.paths[0]} holds other poses, which it replaces"
+            sources["colour_from_world"] += f"; {name} holds other poses, which it replaces"
         return product
-    if (root / absolute.paths[0]).exists():
-        stored = _motions(root, absolute, len(poses), "phasors", "complete the poses, or remove the file")
     inferable = all((root / half.paths[0]).exists() for half in halves)
-    if stored is not None and not (inferable and np.array_equal(stored, _identity(len(poses)))):
-        sources["colour_from_world"] = f"file {absolute.paths[0]}"
-        return stored
+    if has_absolute:
+        stored = _motions(root, absolute, len(poses), "phasors", "complete the poses, or remove the file")
+        if not (inferable and np.array_equal(stored, _identity(len(poses)))):
+            sources["colour_from_world"] = f"file {name}"
+            return stored
     if inferable:
         rotation, translation = (read_array(root / half.paths[0], half).astype(np.float64) for half in halves)
         relative = _identity(1)
@@ -120,12 +110,12 @@ def read_moving_colour_poses(root: Path, poses: np.ndarray, sources: dict[str, s
         _refuse_others(root / halves[0].paths[0], halves[0].name, relative)
         sources["colour_from_world"] = "inferred from cams/relative_R.mat and relative_T.mat as E = [R | -T]"
         return np.linalg.inv(relative[0]) @ poses
-    sources["colour_from_world"] = f"inferred as the ToF camera: neither {spec.paths[0]} nor {absolute.paths[0]}"
+    sources["colour_from_world"] = f"inferred as the ToF camera: neither {spec.paths[0]} nor {name}"
     return poses.copy()
 
 
 def read_novel(root: Path, form: str, sources: dict[str, str]) -> np.ndarray | None:
-    """Poses [M, 4, 4] [m] of views that nobody took; None if there is no file.
+    """Poses [M, 4, 4] [m] of novel views; None if there is no file.
 
     Raises:
         InputError: If they are no rigid motions.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -16,10 +16,7 @@ from .writing import (
     float32,
     inexpressible,
     npy,
-    readme_and_sheet,
-    refuse_inexpressible,
     shortest,
-    validate,
     write_folder,
 )
 
@@ -34,31 +31,19 @@ def write(
     readme: str | None = None,
     sheet: bytes | None = None,
 ) -> Path:
-    """Write the complete quartets of a sequence as phasors, in a ToeRF folder that appears only when it is complete.
+    """Write the complete quartets of a sequence as phasors, in a ToeRF folder.
 
-    A sequence of phasors is written so that reading it again gives the same one: images bit by bit in float32,
-    calibration in float64. Of raw quads, phasor i gets the time, pose, colour and truth of raw frame 4i, as phasors
-    beside F-ToeRF quads are named; incomplete quartets, other colour images, optical flow and the constant part of the
-    quads are left out.
-
-    Args:
-        path: New or empty folder.
-        sequence: Phasors, or raw quads of any shifts that determine a phase.
-        truth: True distances [m] of the raw frames.
-        readme: Text of a README.md in the folder.
-        sheet: A picture of it all, as PNG.
-
-    Returns:
-        The folder.
-
-    Raises:
-        UsageError: If the format cannot express the sequence, or the folder cannot be created.
-        InputError: If the shifts of a quartet do not determine a phase.
-        ResourceError: If the disk is full.
-        ValueError: If shapes of the sequence or the truth contradict each other.
+    Arguments and errors are those of :func:`writing.write_folder`, and an InputError if the shifts of a quartet do not
+    determine a phase. A sequence of phasors is written so that reading it again gives the same one: images bit by bit
+    in float32, calibration in float64. Of raw quads, phasor i gets the time, pose, colour and truth of raw frame 4i, as
+    phasors beside F-ToeRF quads are named; incomplete quartets, other colour images, optical flow and the constant part
+    of the quads are left out.
     """
-    validate(sequence, truth)
-    refuse_inexpressible("torf", sequence, truth)
+    return write_folder(path, "torf", sequence, truth, _files, readme=readme, sheet=sheet)
+
+
+def _files(sequence: Sequence, truth: Truth | None) -> Iterator[tuple[str, bytes]]:
+    """Every file of the folder, by relative name."""
     largest = np.abs(sequence.quads).max()
     if not largest < QUAD_MAX:
         raise inexpressible("torf", "quads", f"numbers below {QUAD_MAX:.2g}", f"{largest:.2g}")
@@ -66,13 +51,6 @@ def write(
         raise inexpressible(
             "torf", "quartets", "one or more with all of their four raw frames", f"none in {sequence.frames} raw frames"
         )
-    return write_folder(path, _files(sequence, truth, readme_and_sheet(readme, sheet)))
-
-
-def _files(
-    sequence: Sequence, truth: Truth | None, for_people: Iterable[tuple[str, bytes]]
-) -> Iterator[tuple[str, bytes]]:
-    """Every file of the folder, by relative name."""
     step = FRAMES_PER_QUARTET
     starts = slice(0, sequence.frames // step * step, step)
     poses = sequence.camera_from_world[starts]
@@ -91,7 +69,6 @@ def _files(
             yield f"distance/{i:04d}.npy", npy(float32(truth.distance[step * i]))
             if truth.phasor_distance is not None:
                 yield f"phasor_distance/{i:04d}.npy", npy(float32(truth.phasor_distance[step * i]))
-    yield from for_people
 
 
 def _phasor(sequence: Sequence, i: int) -> np.ndarray:

@@ -1,0 +1,169 @@
+"""F-TöRF and TöRF folders as sequences: numbered arrays of raw quads or of phasors, and cams/ with calibration.
+
+A folder of N phasors becomes 4 N raw frames: quartet i has re/2, -re/2, im/2, -im/2 of phasor i, the canonical shifts,
+one time and one pose. Their differences are the phasor again, exactly, since halving a float32 is exact.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import InputError
+from . import specs
+from .calibration import read_calibration, read_colour_intrinsics, read_shifts, read_times
+from .folder import empty_quads, first_size, load, numbered, read_field
+from .poses import read_colour_poses, read_novel, read_poses
+from .problems import Problems
+from .sequence import ColourCamera, Flow, Sequence, Truth
+
+ABSENT = (  # without a source unless a folder has them
+    *("frequencies_hz", "cycle_length", "distortion", "exposures", "sensor"),  # only a capture has these
+    *("colour_intrinsics", "colour_from_world", "forward_flow", "backward_flow"),
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stored:
+    """The images of a folder of this family."""
+
+    root: Path
+    """The folder."""
+    form: str
+    """Its format, ``ftorf`` or ``torf``."""
+    files: dict[int, Path]
+    """File of each measured image 0, 1, .."""
+    field: str
+    """Name of the field in data_specs/ that describes these files."""
+    counted: str
+    """What the images are, for messages."""
+    step: int
+    """Raw frames of each image: 1 of a raw quad, 4 of a phasor."""
+    rate_hz: float
+    """Images per second if nothing states a rate."""
+    first_id: int = 0
+    """Number in the name of image 0."""
+    note: str = ""
+    """Remark on the source of ``measured``."""
+
+    def size(self, problems: Problems) -> dict[str, int]:
+        """Rows H and columns W, see :func:`first_size`."""
+        return first_size(self.files, specs.fields(self.form)[self.field], problems)
+
+
+def read_sequence(stored: Stored, frame_rate_hz: float | None) -> Sequence:
+    """Read the images, calibration, colour, flow and novel views of a folder, never truth or masks.
+
+    Args:
+        stored: The folder.
+        frame_rate_hz: Images per second; None takes the folder's times, or the default rate if it states none.
+
+    Raises:
+        InputError: If a file is not what data_specs/ describes; names all of them at once.
+        UsageError: If the rate is not above 0.
+        ResourceError: If it does not fit into memory.
+    """
+    root, form, step, fields = stored.root, stored.form, stored.step, specs.fields(stored.form)
+    problems, sources = Problems(), dict.fromkeys(ABSENT, "default none")
+    size = stored.size(problems)
+    if not (root / "cams").is_dir():
+        why, fix = "expected a folder cams with tof_intrinsics, found none", "complete the folder"
+        problems.errors.append(InputError("cams missing", where=root, why=why, fix=fix))
+    calibrated = read_calibration(root, form, problems, size.get("W"))
+    sources |= calibrated.sources
+    count = max(stored.files) + 1
+    times = problems.attempt(read_times, root, form, count, frame_rate_hz, stored.rate_hz, sources)
+    count = count if times is None else len(times)
+    shifts = problems.attempt(read_shifts, root, form, step * count, sources)
+    poses = problems.attempt(read_poses, root, form, count, sources)
+    images: dict[str, dict[int, np.ndarray]] = {"forward_flow": {}, "backward_flow": {}}
+    for name in ("colour", *images):
+        if name in fields:
+            images[name], sources[name] = read_field(root, fields[name], count, size, problems, stored.first_id)
+    colour = ColourCamera(images={step * i: image for i, image in images["colour"].items()})
+    intrinsics = colour_poses = None
+    if colour.size is not None:
+        if all((image == image[..., :1]).all() for image in colour.images.values()):
+            sources["colour"] += "; its three channels are equal: amplitude, not colour"
+        intrinsics = problems.attempt(read_colour_intrinsics, root, form, calibrated, size, colour.size, sources)
+        if poses is not None:
+            colour_poses = problems.attempt(read_colour_poses, root, form, poses, sources)
+    novel = problems.attempt(read_novel, root, form, sources)
+    quads = empty_quads(root, step * count, size)
+    raw, sources["quads"] = load(root, fields[stored.field], stored.files, size, problems)
+    for i, image in raw.items():
+        quads[step * i : step * (i + 1)] = image if step == 1 else _quads_of(image)
+    problems.raise_if_any(root)
+    assert times is not None
+    assert shifts is not None
+    assert poses is not None
+    measured = np.isin(np.arange(count), list(stored.files))
+    sources["measured"] = f"file {len(stored.files)} of {count} {stored.counted}{stored.note}"
+    sources["from_phasors"] = sources["quads"].partition(",")[0] + (": raw quads" if step == 1 else ": phasors")
+    return Sequence(
+        quads=quads,
+        measured=np.repeat(measured, step),
+        shifts=shifts,
+        times=np.repeat(times, step),
+        camera_from_world=np.repeat(poses, step, axis=0),
+        intrinsics=calibrated.intrinsics,
+        calibration=calibrated.calibration,
+        from_phasors=step > 1,
+        colour=ColourCamera(
+            images=colour.images,
+            intrinsics=intrinsics,
+            camera_from_world=None if colour_poses is None else np.repeat(colour_poses, step, axis=0),
+        ),
+        flow=Flow(forward=images["forward_flow"], backward=images["backward_flow"]),
+        novel_from_world=novel,
+        sources=sources,
+        path=root,
+    )
+
+
+def _quads_of(phasor: np.ndarray) -> tuple[np.ndarray, ...]:
+    """The four quads of a stored phasor [H, W, 2 or 3]."""
+    re, im = np.moveaxis(phasor[..., :2], -1, 0) / np.float32(2.0)
+    return re, -re, im, -im
+
+
+def read_distances(stored: Stored, frames: int) -> Truth | None:
+    """Read the true distances stored with a sequence, each for all raw frames of its image.
+
+    Args:
+        stored: The folder.
+        frames: Number F of raw frames of the sequence; later ids are not read.
+
+    Returns:
+        Truth, with NaN where the file has NaN or 0 and at frames without a file; None if no frame has a file.
+
+    Raises:
+        InputError: If a distance image is not what data_specs/ describes.
+    """
+    root, step, fields, problems = stored.root, stored.step, specs.fields(stored.form), Problems()
+    size = stored.size(problems)
+    stacks, known = {}, np.zeros(frames, dtype=bool)
+    for name in ("distance", "phasor_distance"):
+        images, _ = read_field(root, fields[name], frames // step, size, problems, stored.first_id)
+        stack = np.full((frames, size.get("H", 1), size.get("W", 1)), np.nan, dtype=np.float32)
+        for i, image in images.items():
+            frames_of = slice(step * i, step * (i + 1))
+            if name == "distance" and (image < 0).any():
+                problems.errors.append(_negative(stored, i, image))
+            stack[frames_of] = np.where(image == 0, np.nan, image) if name == "distance" else image
+            known[frames_of] |= name == "distance"
+        stacks[name] = stack if images else None
+    problems.raise_if_any(root)
+    if stacks["distance"] is None:
+        return None
+    return Truth(distance=stacks["distance"], known=known, phasor_distance=stacks["phasor_distance"])
+
+
+def _negative(stored: Stored, i: int, image: np.ndarray) -> InputError:
+    patterns = specs.fields(stored.form)["distance"].paths
+    files = next(filter(None, (numbered(stored.root, pattern) for pattern in patterns)))
+    why = f"expected metres along the ray, NaN where unknown, found {np.nanmin(image):g}"
+    fix = "store NaN where the distance is unknown"
+    return InputError("distance: negative", where=files[i + stored.first_id], why=why, fix=fix)
