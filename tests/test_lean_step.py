@@ -1,4 +1,4 @@
-"""Flow loss, displacements and the end of a step as kernels, against plain torch in float64 and torch's Adam."""
+"""Flow loss and the end of a step as kernels, against plain torch in float64 and torch's Adam."""
 
 import math
 from dataclasses import replace
@@ -108,33 +108,6 @@ def test_flows_that_do_not_fit_are_refused():
         fused.flow_loss(torch.ones(4, 5), torch.zeros(3, 4, 5), flow, first, later)
     with pytest.raises(ValueError, match="float32"):
         fused.flow_loss(torch.ones(4, 5), torch.zeros(6, 4, 5), flow.double(), first, later)
-
-
-@pytest.mark.parametrize("keys", [2, 3])
-@pytest.mark.parametrize("channels", [False, True])
-def test_displacements_and_their_gradient_are_torchs(device, keys, channels):
-    """Between two keys, and the ways to other keys; gradients of both results, and of either alone."""
-    generator = torch.Generator().manual_seed(0)
-    mean, offsets = torch.randn(37, 3, generator=generator), torch.randn(keys, 37, 3, generator=generator)
-    weights = torch.randn(37, 3, generator=generator), torch.randn(37, 3 * (keys - 1), generator=generator)
-    share = torch.tensor([0.3])
-    for used in ((0,), (0, 1), (1,)) if channels else ((0,),):
-        leaves = [value.to(device).requires_grad_() for value in (mean, offsets)]
-        found = fused.displaced(*leaves, share.to(device), channels=channels)
-        exact = [value.double().requires_grad_() for value in (mean, offsets)]
-        ways = torch.cat([exact[1][k] - exact[1][0] for k in range(1, keys)], dim=1)
-        want = exact[0] + torch.lerp(exact[1][0], exact[1][1], share.double()), ways
-        assert (found[1] is None) == (not channels)
-        gradients = []
-        for results, inputs in ((found, leaves), (want, exact)):
-            for n in used:
-                torch.testing.assert_close(results[n].double().cpu(), want[n], rtol=1e-5, atol=1e-6)
-            loss = sum((results[n] * weights[n].to(results[n])).sum() for n in used)
-            gradients.append(torch.autograd.grad(loss, inputs, allow_unused=True))
-        for got, slope in zip(*gradients, strict=True):
-            assert (got is None) == (slope is None)
-            if slope is not None:
-                torch.testing.assert_close(got.double().cpu(), slope, rtol=1e-5, atol=1e-6)
 
 
 class Descent:

@@ -100,7 +100,7 @@ def test_images_that_overflowed_are_rendered_again(run, ahead, where, monkeypatc
         got = [{n: getattr(r, n).numpy().copy() for n in PLAIN} for r in one.on_device()]
     assert_same(got, want)
     assert 1 + ahead <= len(spoilt) < len(VIEWS), "those that were on their way as well; then there is room"
-    assert one.again == len(spoilt) or not ahead
+    assert one.repeated == len(spoilt) or not ahead
 
 
 def test_memory_comes_back_when_nobody_looks_at_it():
@@ -177,5 +177,5 @@ def test_a_reserve_that_is_too_small_on_a_gpu(run):  # noqa: F811
         else:
             got = [{n: getattr(r, n).cpu().numpy().copy() for n in PLAIN} for r in one.on_device()]
         assert_same(got, want)
-        assert 1 <= one.again < len(VIEWS)
+        assert 1 <= one.repeated < len(VIEWS)
         assert any(target.graph is not None for target in render._targets.values())

@@ -20,8 +20,7 @@ from torch.autograd.function import once_differentiable
 
 from ..kernels.training.image_similarity import MOMENTS, REACH, SLOPES, SUMS
 from ..scene.camera import Camera
-from ..scene.motion import KeyMotion
-from . import displacement, training
+from . import training
 from .bridge import array_over
 from .cuda import stream_of
 
@@ -230,17 +229,6 @@ def flow_cameras(camera: Camera, later: Sequence[Camera]) -> Float[np.ndarray, "
             radius = min(then.guard.radius, LARGEST)
             rows[-1] += [*astuple(camera.distortion), *astuple(then.distortion), radius]
     return np.array(rows, dtype=np.float32)
-
-
-def displaced(
-    mean: Float[Tensor, "N 3"], offsets: Float[Tensor, "K N 3"], share: Float[Tensor, "1"], *, channels: bool
-) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N D"] | None]:
-    """Centres between the first two of K = 2 or 3 keys, and displacements from the first key to every other one."""
-    rest = share.new_zeros(len(offsets) - 2)
-    ways = torch.eye(len(offsets), device=share.device)[1:] - torch.eye(len(offsets), device=share.device)[:1]
-    weights = torch.cat([torch.cat([1.0 - share, share, rest])[None], ways])
-    moved, _, flows = displacement.displaced(mean, mean, KeyMotion(offsets, None), weights, channels=channels)
-    return moved, flows
 
 
 def uniform(

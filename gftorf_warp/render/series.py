@@ -1,8 +1,8 @@
-"""Many images of a replay, one after the other, without waiting for any of them.
+"""Many images of a replay, rendered ahead without synchronisation.
 
-How many pairs an image needed arrives with it, a few images later. One that did not fit into the reserve is rendered
-again with more before it is handed out, so every image is whole, in the order of the views. On a CPU, where there is
-nothing to run ahead of, each is rendered when it is asked for.
+The number of pairs of an image arrives with it, a few images later. An image that exceeded the pair capacity
+is rendered again with a larger one before it is returned, so every image is complete, in the order of the
+views. On a CPU every image is rendered when it is iterated over.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from .api import Rendering
 from .cuda import ReadbackRing
 from .replay import Replay, Target, part
 
-AHEAD = 4  # images that are launched before the first of them is looked at: 1 ms, more than a host is ever late
-KEPT = 40  # images on the host that others may hold while the rest goes on without a copy
-View = tuple[float, Camera]  # time [s], where from
+AHEAD = 4  # images that are launched before the first is read: 1 ms, longer than a host is late
+KEPT = 40  # arrays on the host that a caller may keep without copies being made
+View = tuple[float, Camera]  # time [s] and camera
 
 
 @dataclass(kw_only=True, eq=False)
-class _Sent:
-    """An image on its way."""
+class _Pending:
+    """An image that was launched."""
 
     view: View
     target: Target
-    outgoing: ReadbackRing
+    readback: ReadbackRing
     ticket: tuple[int, int]
 
 
@@ -39,93 +39,97 @@ class Series:
     """The images of a replay from many views; iterate over :meth:`on_host` or :meth:`on_device`."""
 
     def __init__(self, replay: Replay, views: Iterable[View]):
-        """Take note of what to render.
+        """Nothing is rendered yet.
 
         Args:
-            replay: What is rendered.
+            replay: What to render.
             views: Time [s] and camera of each image.
         """
         self._replay, self._views = replay, iter(views)
         self.ahead = AHEAD if replay.device.is_cuda else 0
-        self.again = 0
-        """Images so far that were rendered again, because they needed more pairs than were reserved."""
+        self.repeated = 0
+        """Images so far that were rendered again because they exceeded the pair capacity."""
         self._kept = KEPT
-        self._outgoing: dict[int, ReadbackRing] = {}  # by the length of a packed image
+        self._readbacks: dict[int, ReadbackRing] = {}  # by the length of a packed image
 
     def on_host(self, kept: int = KEPT) -> Iterator[dict[str, Float[np.ndarray, "..."]]]:
         """Images by name as arrays on the host, float32: quads [4, H, W], distance [H, W] and so on.
 
-        An array belongs to whoever has it, for as long as he wants: its memory is used again only when nothing refers
-        to it or a part of it. Of ``kept`` images at a time that memory is reserved beforehand (of fewer, if they would
-        take more than 256 MiB); whoever holds more of them gets the rest as copies in ordinary memory.
+        Arrays stay valid: their memory is reused only when nothing refers to it or a part of it. Pinned
+        memory is reserved for ``kept`` images (for fewer, if they would take more than 256 MiB); a caller
+        that keeps more of them gets the others as copies in pageable memory.
         """
         self._kept = kept
-        for sent in self._whole(tail=False):
-            packed = sent.outgoing.keep(sent.ticket)
-            places = sent.target.places
+        for image in self._complete(tail=False):
+            packed, places = image.readback.keep(image.ticket), image.target.places
             yield {name: part(packed, *places[name]) for name in places}
 
     def on_device(self) -> Iterator[Rendering]:
-        """Images on the device, which the next step of the iteration may overwrite."""
+        """Images on the device, which the next iteration may overwrite."""
         if not self.ahead:
             for view in self._views:
                 yield self._replay(*view)
             return
-        for sent in self._whole(tail=True):
-            packed, places = sent.outgoing.on_device(sent.ticket), sent.target.places
-            yield self._replay.rendering({name: part(packed, *places[name]) for name in places}, sent.view[1])
-            sent.outgoing.release(sent.ticket)
+        for image in self._complete(tail=True):
+            packed, places = image.readback.on_device(image.ticket), image.target.places
+            tensors = {name: part(packed, *places[name]) for name in places}
+            yield self._replay.rendering(tensors, image.view[1])
+            image.readback.release(image.ticket)
 
-    def _whole(self, *, tail: bool) -> Iterator[_Sent]:
-        """Images in order that have arrived, and for which the reserve sufficed."""
-        waiting: deque[_Sent] = deque()
+    def _complete(self, *, tail: bool) -> Iterator[_Pending]:
+        """Images in order that have arrived and did not exceed the pair capacity."""
+        pending: deque[_Pending] = deque()
         try:
             for view in self._views:
-                waiting.append(self._send(view, tail))
-                if len(waiting) > self.ahead:
-                    yield self._settled(waiting.popleft(), tail)
-            while waiting:
-                yield self._settled(waiting.popleft(), tail)
+                pending.append(self._launch(view, tail))
+                if len(pending) > self.ahead:
+                    yield self._checked(pending.popleft(), tail)
+            while pending:
+                yield self._checked(pending.popleft(), tail)
         finally:
-            for outgoing in self._outgoing.values():
-                outgoing.close()
+            for readback in self._readbacks.values():
+                readback.close()
 
-    def _send(self, view: View, tail: bool) -> _Sent:
+    def _launch(self, view: View, tail: bool) -> _Pending:
         target = self._replay.draw(*view)
         length = len(target.packed)
-        if length not in self._outgoing:
+        if length not in self._readbacks:
             few = {"kept": 1, "tail": 1} if tail else {"kept": self._kept}
-            self._outgoing[length] = ReadbackRing(target.packed, ahead=self.ahead, **few)
-        outgoing = self._outgoing[length]
-        return _Sent(view=view, target=target, outgoing=outgoing, ticket=outgoing.copy(target.packed))
+            self._readbacks[length] = ReadbackRing(target.packed, ahead=self.ahead, **few)
+        readback = self._readbacks[length]
+        return _Pending(view=view, target=target, readback=readback, ticket=readback.copy(target.packed))
 
-    def _settled(self, sent: _Sent, tail: bool) -> _Sent:
-        """An image, rendered again until it is whole: once, unless others grow the reserve in between."""
-        while self._lacks_pairs(sent):
-            sent.outgoing.release(sent.ticket)
-            self.again += 1
+    def _checked(self, image: _Pending, tail: bool) -> _Pending:
+        """An image, rendered again until it is complete: once, unless the capacity changes in between."""
+        while self._exceeded(image):
+            image.readback.release(image.ticket)
+            self.repeated += 1
             if not self._replay.fits():
                 self._replay.grow()
-            sent = self._send(sent.view, tail)
-        return sent
+            image = self._launch(image.view, tail)
+        return image
 
     @staticmethod
-    def _lacks_pairs(sent: _Sent) -> bool:
-        needed = int(sent.outgoing.wait(sent.ticket)[-1:].view(np.int32)[0])
-        reserved = sent.target.frame.settings.pair_capacity
-        return reserved is not None and needed > reserved
+    def _exceeded(image: _Pending) -> bool:
+        pairs = int(image.readback.wait(image.ticket)[-1:].view(np.int32)[0])
+        capacity = image.target.frame.settings.pair_capacity
+        return capacity is not None and pairs > capacity
 
 
 def on_host(
-    render: Callable[[float, Camera], Rendering], views: Iterable[View], names: Iterable[str], *, kept: int = KEPT
+    render: Callable[[float, Camera], Rendering],
+    views: Iterable[View],
+    names: Iterable[str],
+    *,
+    kept: int = KEPT,
 ) -> Iterator[dict[str, Float[np.ndarray, "..."]]]:
-    """Images by name as arrays that stay valid, of whatever renders: see :meth:`Series.on_host` for a replay.
+    """Images by name as arrays that stay valid, of any renderer; see :meth:`Series.on_host` for a replay.
 
     Args:
-        render: A :class:`Replay`, or any other function of time [s] and camera.
+        render: A :class:`Replay`, or another function of time [s] and camera.
         views: Time [s] and camera of each image.
-        names: Of what is wanted; an image that is not there, or has no elements, is left out.
-        kept: Images that the caller may hold without more of them being copied.
+        names: Names of the images; those that are absent or empty are left out.
+        kept: Images that the caller may keep without copies being made.
     """
     if isinstance(render, Replay):
         yield from Series(render, views).on_host(kept)
