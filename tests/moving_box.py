@@ -1,7 +1,9 @@
 """A textured box slides and comes nearer in front of a textured wall: quads, exact flow and truth in closed form."""
 
+from dataclasses import replace
+
 import numpy as np
-from sequences import sequence_of
+from sequences import changed, sequence_of
 
 from gftorf_warp import Truth
 from gftorf_warp.constants import CANONICAL_SHIFTS, FRAME_RATE_HZ, SPEED_OF_LIGHT
@@ -12,6 +14,7 @@ WALL_Z, BOX_Z = 3.6, 2.4  # [m] z-depths at frame 0
 BOX = (-0.75, 0.05, -0.40, 0.35)  # [m] left, right of the box at frame 0; top, bottom
 STEP = np.array([0.035, 0.004, -0.008])  # [m] per raw frame
 NOISE = 0.0004  # [quad units]
+BASELINE = 0.06  # [m] the colour camera stands to the right of the other
 
 
 def ray_slopes():
@@ -75,3 +78,37 @@ def recording(
         fields["backward_flow"] = {n: flow(n, -4) for n in starts if n >= 4}
     truth = Truth(distance=np.stack([d for d, _, _ in images]).astype(np.float32), known=np.ones(frames, dtype=bool))
     return sequence_of(**fields | changes), truth
+
+
+def turned(degrees, position=(0.0, 0.0, 0.0)):
+    """World-to-camera pose of a camera at ``position`` turned about the vertical axis."""
+    a = np.radians(degrees)
+    pose = np.eye(4)
+    pose[:3, :3] = [[np.cos(a), 0, -np.sin(a)], [0, 1, 0], [np.sin(a), 0, np.cos(a)]]
+    pose[:3, 3] = -pose[:3, :3] @ position
+    return pose
+
+
+def with_colour(sequence, *, size=(2 * WIDTH, 2 * HEIGHT)):
+    """The sequence with smooth images of a colour camera of its own at quartet starts."""
+    width, height = size
+    y, x = np.mgrid[0:height, 0:width] / 20.0
+    image = 40.0 * np.stack([0.5 + 0.4 * np.sin(x), 0.5 + 0.4 * np.cos(y), 0.3 + 0.0 * x], axis=-1).astype(np.float32)
+    poses = sequence.camera_from_world.copy()
+    poses[:, 0, 3] -= BASELINE
+    zoom = width / WIDTH
+    return changed(
+        sequence,
+        colour=dict.fromkeys(range(0, sequence.frames, 4), image),
+        colour_intrinsics=(zoom * FOCAL, zoom * FOCAL, width / 2, height / 2),
+        colour_from_world=poses,
+    )
+
+
+def as_phasors(sequence):
+    """What a camera that combines quartets itself would have delivered."""
+    quads = sequence.quads.reshape(-1, 4, *sequence.quads.shape[1:])
+    re, im = quads[:, 0] - quads[:, 1], quads[:, 2] - quads[:, 3]
+    halves = np.stack([re, -re, im, -im], axis=1) / 2
+    times = sequence.times - (np.arange(sequence.frames) % 4) / 120
+    return replace(sequence, quads=halves.reshape(sequence.quads.shape), times=times, from_phasors=True)

@@ -7,6 +7,10 @@ import torch
 from moving_box import recording
 
 from gftorf_warp.recon import checkpoint, presets
+from gftorf_warp.recon.state import from_dict, to_dict
+from gftorf_warp.recon.stepper import Stepper
+from gftorf_warp.recon.terms import TERMS, Term
+from gftorf_warp.render.descent import TOTAL_NAMES
 from gftorf_warp.scene.gaussians import GaussianField, constant_sh
 
 KEYS = torch.arange(4, dtype=torch.float64) * (4 / 120)  # three quartets
@@ -62,3 +66,34 @@ def same(a, b):
     if isinstance(a, (list, tuple)):
         return len(a) == len(b) and all(same(x, y) for x, y in zip(a, b, strict=True))
     return a == b
+
+
+class OneStep:
+    """A step of some raw frames from a copy of a state: terms, gradients and renderings."""
+
+    def __init__(self, state, observations, settings, *frames, terms=TERMS):
+        """Run it; ``frames`` are one batch. Moments of the state must be zero."""
+        copy = from_dict(to_dict(state), observations.quads.device)
+        copy.queue, copy.sums = [0], {}
+        one = replace(observations, batches=[[*frames]])
+        watch = Term(name="watch", loss=self._watch, weight=lambda *_: 1.0, view=None)
+        self.images = []
+        """What the terms of every image got."""
+        stepper = Stepper(copy, one, settings, terms=(*terms, watch))
+        stepper.step()
+        self.skipped = stepper.collect()
+        """1 if it was not valid."""
+        self.sums = {name: float(value) for name, value in copy.sums.items() if name != "watch"}
+        """Weighted terms and the other sums of the log."""
+        self.terms = {name: value for name, value in self.sums.items() if name not in TOTAL_NAMES}
+        """Weighted terms."""
+        optimiser = copy.optimiser
+        moments = [optimiser.moments_of(leaf)[1] / (1 - optimiser.betas[0]) for leaf in optimiser.leaves]
+        self.gradients = dict(zip(optimiser.groups, moments, strict=True))
+        """By group; of a motion of several tensors the last."""
+        self.state = copy
+        """Afterwards."""
+
+    def _watch(self, image, _):
+        self.images.append(image)
+        return torch.zeros((), device=image.mean_weight.device)

@@ -5,10 +5,12 @@ from dataclasses import replace
 
 import pytest
 import torch
-from test_captured_steps import begun, published
+from test_stepper import begun, published
 
-from gftorf_warp.recon.captured import CapturedSteps
+from gftorf_warp.recon import stepper
+from gftorf_warp.recon.padded import PaddedParameters
 from gftorf_warp.recon.settings import Batch
+from gftorf_warp.recon.stepper import Stepper
 from gftorf_warp.render.cuda import SLOTS, DeviceReadback, DeviceUpload
 from gftorf_warp.render.pair_capacity import READ_EVERY
 
@@ -99,40 +101,48 @@ def test_who_asks_too_often_is_not_heard(device):
     assert readback.latest(wait=True) == [SLOTS + 3]
 
 
+def watched(settings, device, monkeypatch):
+    """Steps with padding rows, on a CPU without graphs."""
+    monkeypatch.setattr(stepper, "PaddedParameters", lambda *, pads: PaddedParameters(pads=True))  # noqa: ARG005
+    settings = replace(settings, graph=device != "cpu")
+    state, observations = begun(settings, device)
+    return state, Stepper(state, observations, settings)
+
+
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("deterministic", [False, True])
-def test_steps_ask_for_pairs_now_and_then(deterministic, device, monkeypatch):
-    """In every ``READ_EVERY``-th replay; the same numbers at the same steps where a run is to be repeated."""
+def test_steps_read_pair_counts_now_and_then(deterministic, device, monkeypatch):
+    """In every ``READ_EVERY``-th replay; the same numbers at the same steps where a run is deterministic."""
     settings = published(batch=Batch.FRAME)
     settings = replace(settings, render=replace(settings.render, deterministic=deterministic))
-    state, observations = begun(settings, device)
-    steps = CapturedSteps(state, observations, settings)
-    asked, told, ask, look = [], {}, DeviceReadback.request, DeviceReadback.latest
+    state, steps = watched(settings, device, monkeypatch)
+    requested, results = [], {}
+    request, latest = DeviceReadback.request, DeviceReadback.latest
 
     def kept(self, *, wait):
         assert wait == deterministic
-        found = look(self, wait=wait)
+        found = latest(self, wait=wait)
         if found is not None:
-            told[steps._replays] = found
+            results[steps._replays] = found
         return found
 
-    monkeypatch.setattr(DeviceReadback, "request", lambda self: asked.append(steps._replays) or ask(self))
+    monkeypatch.setattr(DeviceReadback, "request", lambda self: requested.append(steps._replays) or request(self))
     monkeypatch.setattr(DeviceReadback, "latest", kept)
     while state.images < 40:
         steps.step()
-    assert asked == list(range(READ_EVERY, steps._replays + 1, READ_EVERY))
-    assert len(asked) >= 2
+    assert requested == list(range(READ_EVERY, steps._replays + 1, READ_EVERY))
+    assert len(requested) >= 2
     if deterministic or device == "cpu":
-        assert [*told] == asked, "nobody is told later"
-    assert all((pairs > 0) == (device != "cpu") for _, _, pairs, _ in told.values()), "a CPU counts before it reserves"
+        assert [*results] == requested
+    assert all(counts[2] > 0 for counts in results.values())
 
 
-def test_room_is_made_as_soon_as_an_answer_asks_for_it(monkeypatch):
-    """In the very replay, on a CPU; without an answer nobody looks."""
-    settings = published(batch=Batch.FRAME)
-    steps, looked = CapturedSteps(*begun(settings), settings), []
-    monkeypatch.setattr(steps._reserve, "is_nearly_full", lambda _: True)
-    monkeypatch.setattr(steps, "_look", lambda: looked.append(steps._replays))
+def test_the_capacity_grows_as_soon_as_a_count_is_near_it(monkeypatch):
+    """In the very replay, on a CPU; without a readback nothing is learnt."""
+    _, steps = watched(published(batch=Batch.FRAME), "cpu", monkeypatch)
+    read = []
+    monkeypatch.setattr(steps._capacity, "is_nearly_full", lambda _: True)
+    monkeypatch.setattr(steps, "_read_counts", lambda: read.append(steps._replays))
     for _ in range(3 * READ_EVERY):
-        steps._watch()
-    assert looked == [READ_EVERY, 2 * READ_EVERY, 3 * READ_EVERY]
+        steps._watch_pairs()
+    assert read == [READ_EVERY, 2 * READ_EVERY, 3 * READ_EVERY]

@@ -21,42 +21,6 @@ from gftorf_warp.render.api import rasterize
 from gftorf_warp.scene.initialise import Init, InitSettings, from_random
 from gftorf_warp.scene.measured import colour_camera_of, sensor_of
 
-BASELINE = 0.06  # [m] the colour camera stands to the right of the other
-
-
-def turned(degrees, position=(0.0, 0.0, 0.0)):
-    """World-to-camera pose of a camera at ``position`` turned about the vertical axis."""
-    a = np.radians(degrees)
-    pose = np.eye(4)
-    pose[:3, :3] = [[np.cos(a), 0, -np.sin(a)], [0, 1, 0], [np.sin(a), 0, np.cos(a)]]
-    pose[:3, 3] = -pose[:3, :3] @ position
-    return pose
-
-
-def with_colour(sequence, *, size=(2 * WIDTH, 2 * HEIGHT)):
-    """The sequence with smooth images of a colour camera of its own at quartet starts."""
-    width, height = size
-    y, x = np.mgrid[0:height, 0:width] / 20.0
-    image = 40.0 * np.stack([0.5 + 0.4 * np.sin(x), 0.5 + 0.4 * np.cos(y), 0.3 + 0.0 * x], axis=-1).astype(np.float32)
-    poses = sequence.camera_from_world.copy()
-    poses[:, 0, 3] -= BASELINE
-    zoom = width / WIDTH
-    return changed(
-        sequence,
-        colour=dict.fromkeys(range(0, sequence.frames, 4), image),
-        colour_intrinsics=(zoom * FOCAL, zoom * FOCAL, width / 2, height / 2),
-        colour_from_world=poses,
-    )
-
-
-def as_phasors(sequence):
-    """What a camera that combines quartets itself would have delivered."""
-    quads = sequence.quads.reshape(-1, 4, *sequence.quads.shape[1:])
-    re, im = quads[:, 0] - quads[:, 1], quads[:, 2] - quads[:, 3]
-    halves = np.stack([re, -re, im, -im], axis=1) / 2
-    times = sequence.times - (np.arange(sequence.frames) % 4) / 120
-    return replace(sequence, quads=halves.reshape(sequence.quads.shape), times=times, from_phasors=True)
-
 
 def test_auto_follows_the_camera():
     """And a choice is a choice."""

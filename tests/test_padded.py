@@ -1,4 +1,4 @@
-"""Rooms for Gaussians that come and go: what they hold, when there are others, and what moving there costs the host."""
+"""Padding rows: what they hold, when memory is allocated anew, and what attaching a state costs the host."""
 
 from dataclasses import replace
 
@@ -9,9 +9,16 @@ from waits import WAITS, Operations, Reads
 
 from gftorf_warp.recon import densify
 from gftorf_warp.recon.observations import observe
-from gftorf_warp.recon.padded import BUCKET, CAPTURE_S, DEAD, DEAD_ROW_S, LAST_BUCKET, Padded
+from gftorf_warp.recon.padded import (
+    BUCKET,
+    CAPTURE_S,
+    LAST_BUCKET,
+    PADDING_LOGIT,
+    PADDING_ROW_S,
+    PaddedParameters,
+)
 from gftorf_warp.recon.state import begin
-from gftorf_warp.recon.step import densify_after
+from gftorf_warp.recon.stepper import densify_after
 from gftorf_warp.scene.motion import MotionSettings
 
 NETWORK = MotionSettings(kind="network", layers=3, width=16, skip_after=1)
@@ -39,17 +46,17 @@ def begun(count=300, motion=NETWORK):
 
 
 @pytest.mark.parametrize("motion", [NETWORK, None], ids=["network", "nodes"])
-def test_a_state_finds_everything_there_and_the_rest_is_dead(motion):
-    """After a round in the rooms as without them, to the bit; rows behind have no moments and nobody sees them."""
+def test_a_state_is_moved_to_the_bit_and_the_rest_is_padding(motion):
+    """After a densification with padding as without, to the bit; padding rows have no moments and no opacity."""
     states = []
-    for rooms in (False, True):
+    for pads in (False, True):
         state, observations, settings = begun(motion=motion)
-        padded, state.images = Padded(), 16
-        if rooms:
-            assert padded.adopt(state)
+        padded, state.images = PaddedParameters(pads=True), 16
+        if pads:
+            assert padded.attach(state)
         densify_after(state, observations, 8, settings)
-        if rooms:
-            assert not padded.adopt(state)
+        if pads:
+            assert not padded.attach(state)
             assert padded.holds(state)
         states.append(state)
     one, other = states
@@ -64,7 +71,7 @@ def test_a_state_finds_everything_there_and_the_rest_is_dead(motion):
         assert torch.equal(padded.attachment[:count], one.attachment)
     for name in densify.STATISTICS:
         assert torch.equal(getattr(one.statistics, name), getattr(other.statistics, name))
-    assert (padded.values["opacity_logit"][count:] == DEAD).all()
+    assert (padded.values["opacity_logit"][count:] == PADDING_LOGIT).all()
     assert all(bool(value.isfinite().all()) for value in padded.values.values())
     for _, *moments in padded.table()._moments[: len(padded.values)]:
         assert not any(moment[count:].any() for moment in moments)
@@ -78,63 +85,60 @@ def resized(state, count):
     state.statistics = densify.start(state.optimiser.field)
 
 
-def test_rows_that_somebody_has_left_are_dead():
-    """In the same rooms: nobody sees them, and neither moments nor statistics nor a share in means are left."""
+def test_rows_of_removed_gaussians_become_padding():
+    """In the same memory: no opacity, moments, statistics or weight in means are left."""
     state, _, _ = begun()
-    padded = Padded()
-    assert padded.adopt(state)
+    padded = PaddedParameters(pads=True)
+    assert padded.attach(state)
     count = 100
     resized(state, count)
-    assert not padded.adopt(state)
-    assert (padded.values["opacity_logit"][count:] == DEAD).all()
-    assert (state.optimiser.tensors["opacity_logit"] > DEAD).all()
+    assert not padded.attach(state)
+    assert (padded.values["opacity_logit"][count:] == PADDING_LOGIT).all()
+    assert (state.optimiser.tensors["opacity_logit"] > PADDING_LOGIT).all()
     for _, *moments in padded.table()._moments[: len(padded.values)]:
         assert all(moment[:count].any() and not moment[count:].any() for moment in moments)
     padded.statistics.weight[:] = 1.0
-    assert not padded.adopt(state)
+    assert not padded.attach(state)
     assert padded.statistics.weight.tolist() == [1.0] * count + [0.0] * (padded.rows - count)
-    assert padded.share.tolist() == pytest.approx([1 / count] * count + [0.0] * (padded.rows - count))
+    assert padded.mean_weight.tolist() == pytest.approx([1 / count] * count + [0.0] * (padded.rows - count))
 
 
-def test_rooms_last():
-    """Captures follow from others: they are made for more than there are, and given up once that has cost as much."""
+def test_memory_is_kept():
+    """Other addresses need new graphs: there are spare rows, and they are released once they have cost as much."""
     state, _, _ = begun(3000)
-    padded = Padded()
-    assert padded.adopt(state)
+    padded = PaddedParameters(pads=True)
+    assert padded.attach(state)
     assert padded.rows == BUCKET
     resized(state, BUCKET)
-    assert not padded.adopt(state, steps=25)
+    assert not padded.attach(state, steps=25)
     resized(state, BUCKET + 1)
-    assert padded.adopt(state, steps=25)
+    assert padded.attach(state, steps=25)
     assert padded.rows == 2 * BUCKET
     resized(state, 100)
-    patience = int(CAPTURE_S / DEAD_ROW_S / BUCKET)  # so many steps of superfluous rows cost a capture
-    assert not padded.adopt(state, steps=patience - 1)
-    assert padded.adopt(state, steps=2)
+    patience = int(CAPTURE_S / PADDING_ROW_S / BUCKET)  # so many steps of unnecessary rows cost a capture
+    assert not padded.attach(state, steps=patience - 1)
+    assert padded.attach(state, steps=2)
     assert padded.rows == BUCKET
     resized(state, 100)
-    assert not padded.adopt(state, grows=False), "other rooms are not free"
-    assert padded.adopt(state, free=True, grows=False)
+    assert not padded.attach(state, grows=False), "other addresses are not free"
+    assert padded.attach(state, free=True, grows=False)
     assert padded.rows == LAST_BUCKET
-    assert not padded.adopt(state, free=True, grows=False)
+    assert not padded.attach(state, free=True, grows=False)
 
 
-@pytest.mark.parametrize("where", ["in rooms", "alone"])
-def test_a_round_waits_once(where):
-    """All that it needs to know is read at once: a GPU idles from there to the next step, 6 to 10 us an operation.
-
-    With a look at counts it was 243 operations and 14 reads or masks before.
-    """
+@pytest.mark.parametrize("where", ["padded", "alone"])
+def test_a_densification_waits_once(where):
+    """All numbers are read at once: a GPU idles from there to the next step, 6 to 10 us an operation."""
     state, observations, settings = begun()
-    padded, state.images = Padded(), 16
-    if where == "in rooms":
-        padded.adopt(state)
+    padded, state.images = PaddedParameters(pads=True), 16
+    if where == "padded":
+        padded.attach(state)
     before = len(state.optimiser.field)
     with Operations() as operations, Reads() as reads:
         densify_after(state, observations, 8, settings)
-        if where == "in rooms":
-            padded.adopt(state)
+        if where == "padded":
+            padded.attach(state)
     assert len(state.optimiser.field) != before
     assert reads.found == 1
     assert not WAITS & set(operations.found)
-    assert operations.found.total() <= (90 if where == "in rooms" else 80)
+    assert operations.found.total() <= (90 if where == "padded" else 80)

@@ -33,12 +33,11 @@ class ImageStack:
     """Row of each image by its raw frame or, where a docstring says so, by its quartet."""
 
     @classmethod
-    def of(cls, images: Mapping[int, np.ndarray | Tensor], device: torch.device | str) -> ImageStack:
+    def of(cls, images: Mapping[int, np.ndarray], device: torch.device | str) -> ImageStack:
         """Stack images of one shape in the order of their keys."""
         keys = sorted(images)
-        tensors = [torch.as_tensor(images[key], dtype=torch.float32) for key in keys]
-        stacked = torch.stack(tensors) if tensors else torch.zeros(0)
-        return cls(stacked.to(device).contiguous(), {key: row for row, key in enumerate(keys)})
+        stacked = np.stack([images[key] for key in keys], dtype=np.float32) if keys else np.zeros(0, np.float32)
+        return cls(torch.from_numpy(stacked).to(device), {key: row for row, key in enumerate(keys)})
 
     def __contains__(self, key: object) -> bool:
         return key in self.rows
