@@ -59,7 +59,6 @@ def test_quick_bench_writes_everything_it_prints(tmp_path, capsys):
         "render",
         "renderer",
         "unchecked",
-        "arrays",
         "series",
         "host",
         "files",

@@ -59,7 +59,7 @@ def test_previews_of_quads_are_in_a_row_with_white_between(run):
     """Each pixel in the colour of its value, grey where there is none: what any reader makes of colours by number."""
     import cv2
 
-    images = renders.channels("quads", run.render(0.02), run.sensor)
+    images = renders.named("quads", {"quads": run.render(0.02).quads.numpy()}, run.sensor)
     images["quad_180"][2, 3] = np.nan
     scale = previews.preview_scale("quads", [images])
     content = np.frombuffer(previews.preview("quads", images, scale), np.uint8)
@@ -101,7 +101,7 @@ def test_writing_reports_in_order_and_stops_at_the_first_error(run, tmp_path, mo
         if path.name == "000003.png":
             raise ResourceError("no space left", where=path, why="full", fix="free some")
 
-    monkeypatch.setattr(writers, "write_one_of_many", full)
+    monkeypatch.setattr(previews, "write_one_of_many", full)
     with pytest.raises(ResourceError, match=r"000003\.png"):
         render_to_folder(run, tmp_path / "other", what="distance")
 
@@ -151,7 +151,7 @@ def test_other_poses_are_other_images(run, tmp_path):
 
 def test_novel_poses_are_those_of_the_sequence(run, tmp_path):
     """Three of them; a sequence without any says so."""
-    with pytest.raises(UsageError, match="carries no poses"):
+    with pytest.raises(UsageError, match="no poses of novel views"):
         render_to_folder(run, tmp_path / "out", poses="novel")
     sequence = with_colour(run.sequence())
     run.sequence = lambda: sequence
@@ -227,7 +227,7 @@ def test_colour_is_written_linear_and_shown_as_srgb(run):
     import cv2
 
     colour = torch.stack([torch.full((HEIGHT, WIDTH), value) for value in (0.5, 0.0, 7.0)])
-    images = renders.channels("colour", replace(run.render(0.0), colour=colour), run.sensor)
+    images = renders.named("colour", {"colour": colour.numpy()}, run.sensor)
     assert list(images) == ["R", "G", "B"]
     assert images["B"].max() == 7.0
     content = previews.preview("colour", images, previews.preview_scale("colour", [images]))

@@ -62,7 +62,8 @@ def test_threads_write_what_one_call_after_the_other_does(analytic, tmp_path, mo
 def scales_and_series(of):
     """What ``render_to_folder`` hands on."""
     render, times = of.renderer(), [k / 120 for k in range(FRAMES)]
-    samples = [views.images_of(render, of.sensor, ("distance",))(times[k], of.camera) for k in (0, FRAMES // 2, -1)]
+    few = [(times[k], of.camera) for k in (0, FRAMES // 2, -1)]
+    samples = list(views.series_of(render, few, of.sensor, ("distance",)))
     scales = {"distance": previews.preview_scale("distance", [sample["distance"] for sample in samples])}
     return scales, views.series_of(render, [(time, of.camera) for time in times], of.sensor, ("distance",))
 
@@ -268,7 +269,7 @@ def test_the_cost_of_a_picture_does_not_grow_with_those_before_it(analytic, tmp_
     (tmp_path / "quads" / f".000001.exr.tmp-{dead.pid}-0").write_bytes(b"cut off")
     (tmp_path / "quads" / f".000002.exr.tmp-{os.getpid()}-999999").write_bytes(b"being written")
     render, times = analytic.renderer(), [k / 120 for k in range(FRAMES)]
-    images = views.images_of(render, analytic.sensor, WHAT)(0.0, analytic.camera)
+    (images,) = views.series_of(render, [(0.0, analytic.camera)], analytic.sensor, WHAT)
     scales = {name: previews.preview_scale(name, [images[name]]) for name in WHAT}
     views_taken = [(time, analytic.camera) for time in times]
     writers.write_all(tmp_path, scales, views.series_of(render, views_taken, analytic.sensor, WHAT), FRAMES)

@@ -1,13 +1,12 @@
-"""Images per second of a finished run, quads and distance, motion included: in every way in which they are asked for.
+"""Images per second of a finished run, quads and distance, motion included, for each way of rendering.
 
-``render`` is a Python loop over ``Run.render``, ``renderer`` one over ``Run.renderer``, which keeps arrays and on CUDA
-replays a graph; ``unchecked`` is the same without looking after every image whether all pairs fitted, ``launched``
-without graphs, pairs counted on the host. ``series`` is a loop over images that stay on the device and are looked after
-a few images later, ``host`` one over NumPy arrays that come to the host meanwhile, ``Run.images``; ``arrays`` waits for
-each of them. ``files`` is ``gftorf render``, EXR and PNG included, ``stored`` the same with ``--arrays``, until
-everything is flushed to the disk; in brackets the rate before that. Compilation, capture and the displacements at the
-first two keys are over when the clock starts, those at all later keys are part of the time; the two commands start from
-nothing.
+``render``: a Python loop over ``Run.render``. ``renderer``: over ``Run.renderer``, which keeps buffers and on CUDA
+replays a graph. ``unchecked``: the same without the check of the pair capacity after every image. ``launched``: without
+graphs, pairs counted on the host. ``series``: images stay on the device, capacity is checked a few images later.
+``host``: the same with asynchronous readback to NumPy arrays, ``Run.images``. ``files``: ``gftorf render``, EXR and PNG
+included. ``stored``: the same with ``--arrays``, until everything is flushed to the disk; in brackets the rate before
+the flush. Compilation, capture and the displacements at the first two keys precede the measurement, those at later keys
+are part of it; the two commands include everything.
 """
 
 from __future__ import annotations
@@ -56,7 +55,6 @@ WAYS: dict[str, Callable[[Run, Render], Way | None]] = {  # of a run and a new r
     "renderer": lambda _, render: _single(render),
     "unchecked": lambda _, render: _single(partial(render, checked=False)) if isinstance(render, Replay) else None,
     "launched": _launched,
-    "arrays": lambda run, render: _single(views.images_of(render, run.sensor, WHAT)),
     "series": lambda _, render: (
         (lambda taken: Series(render, taken).on_device()) if isinstance(render, Replay) else None
     ),

@@ -1,4 +1,4 @@
-"""``gftorf compare``: a run against ground truth and against the closed form, as numbers and as an offline page."""
+"""``gftorf compare``: errors of a run and of the closed form, as numbers and as an offline page."""
 
 from __future__ import annotations
 
@@ -30,19 +30,11 @@ if TYPE_CHECKING:
     from ..recon.run import Run
 
 AGAINST = ("geometry", "static-phasor")
-"""Distances that can be the true one; the first is the default."""
+"""Choices of the true distance; the first is the default."""
 FACTS = (
-    "seconds_reconstruct",
-    "images_optimised",
-    "device",
-    "seed",
-    "preset",
-    "ablation",
-    "input",
-    "flow_source",
-    "init",
-    "motion",
-)
+    "seconds_reconstruct", "images_optimised", "device", "seed", "preset",
+    "ablation", "input", "flow_source", "init", "motion",
+)  # fmt: skip
 
 
 def compare(
@@ -56,16 +48,16 @@ def compare(
 ) -> dict[str, Any]:
     """Score a run and write ``RUN/metrics.json`` and ``RUN/report.html``.
 
-    Rendered at the time and pose of every scored raw frame, at the sequence's own resolution, before black. Errors are
-    mean squared errors of the distance along the ray [m^2], times 100.
+    Every scored raw frame is rendered at its time and pose, at the sequence's own resolution, over a black background.
+    Errors are mean squared errors of the distance along the ray [m^2], times 100.
 
     Args:
         run: A finished reconstruction, or its folder.
-        truth: A sequence whose ground truth to use; None: that of the sequence the run was made from.
-        frames: Which raw frames are scored: ``all``, or ``ftorf13`` as in the published tables.
-        against: Which distance is the true one: ``geometry``, or ``static-phasor``, what the closed form would decode
-            if nothing moved and nothing were noisy. Pixels that move are those of geometry in both cases.
-        report: Whether the page is written as well.
+        truth: A sequence with the ground truth; None: the sequence of the run.
+        frames: The scored raw frames: ``all``, or ``ftorf13`` as in the published tables.
+        against: The true distance: ``geometry``, or ``static-phasor``, the closed form of a static, noise-free scene.
+            Moving pixels are those of geometry in both cases.
+        report: Whether to write the page as well.
         progress: Called with (frames done, frames in all).
 
     Returns:
@@ -100,7 +92,7 @@ def compare(
 
 
 def fitting_truth(sequence: Sequence, path: str | Path | None = None) -> Truth | None:
-    """Ground truth of a sequence, or of the one at ``path``, of the same frames and size; None if nothing is known.
+    """Ground truth of a sequence, or of the sequence at ``path`` with the same frames and size; None if unknown.
 
     Raises:
         InputError: If ``path`` holds no ground truth, or frames or size differ.
@@ -127,10 +119,10 @@ def fitting_truth(sequence: Sequence, path: str | Path | None = None) -> Truth |
 
 
 def findings(sequence: Sequence, gathered: views.Views, truth: Truth | None, *, against: str = AGAINST[0]) -> Findings:
-    """Gathered views, judged by the truth if there is any.
+    """Views with their errors if there is a truth.
 
     Raises:
-        InputError: If the static-phasor distance is asked for, and the truth does not have it.
+        InputError: If ``against`` is static-phasor and the truth has no such distance.
     """
     if truth is None:
         return Findings(sequence=sequence, views=gathered, judgement=None)
@@ -163,7 +155,7 @@ def _static_phasor(sequence: Sequence, truth: Truth) -> Float[np.ndarray, "F H W
 
 
 def summary(run: Run, found: Findings, *, protocol: str, against: str = AGAINST[0]) -> dict[str, Any]:
-    """The content of metrics.json, in numbers, texts and None only."""
+    """The content of metrics.json: numbers, texts and None."""
     confidence = found.views.confidence
     return {
         "frames": len(found.views.frames),
@@ -192,7 +184,8 @@ def _errors(judgement: Judgement | None) -> dict[str, object]:
     """The errors of metrics.json on all, moving and static pixels; all None without ground truth."""
     if judgement is None:
         unknown: dict[str, None] = {f"{name}_mse_x100": None for name in measure.DISTANCES}
-        return {**unknown, "moving": {**unknown, "share": None}, "static": {**unknown, "share": None}}
+        group = {**unknown, "share": None}
+        return {**unknown, "moving": group, "static": group}
     moving, static, errors = judgement.moving, judgement.static, judgement.errors
     return {
         **measure.distance_errors(errors, np.ones_like(moving), measure.mean_over_frames),
@@ -221,26 +214,20 @@ def write_report(run: Run, result: dict[str, Any], found: Findings) -> Path:
 
 
 def installed_versions() -> str:
-    """This program, what it computes with, and on what, in words."""
+    """Versions of this package, its main dependencies and the platform."""
     packages = ("torch", "warp-lang", "numpy")
     versions = ", ".join(f"{name} {importlib.metadata.version(name)}" for name in packages)
     return f"gftorf-warp {__version__}, {versions}, Python {platform.python_version()}, {platform.system()}"
 
 
 def rows_of(path: Path) -> list[dict[str, float]]:
-    """The rows of a run's metrics.jsonl or diagnostics.jsonl; none if there is no such file.
-
-    A last line that was cut off by an interruption is no row.
-    """
-    if not path.exists():
-        return []
-    return [
-        json.loads(line) for line in path.read_text(encoding="utf-8").splitlines(keepends=True) if line.endswith("\n")
-    ]
+    """The complete rows of a run's metrics.jsonl or diagnostics.jsonl; none if there is no such file."""
+    lines = path.read_text(encoding="utf-8").splitlines(keepends=True) if path.exists() else []
+    return [json.loads(line) for line in lines if line.endswith("\n")]
 
 
 def sequence_title(path: Path | None) -> str | None:
-    """What a sequence calls itself: the heading of its README.md, else the name of its folder."""
+    """Title of a sequence: the heading of its README.md, else the name of its folder."""
     first = _data_card(path).partition("\n")[0]
     if first.startswith("# "):
         return first.removeprefix("# ").strip()
@@ -248,7 +235,7 @@ def sequence_title(path: Path | None) -> str | None:
 
 
 def truth_statement(path: Path | None) -> str | None:
-    """What the README.md of a sequence says about its ground truth, in its own words; None if nothing."""
+    """The paragraphs of a sequence's README.md on ground truth; None if there are none."""
     paragraphs = _data_card(path).split("\n\n")
     about = [" ".join(text.split()) for text in paragraphs if text.lower().startswith("ground truth")]
     return " ".join(about) or None

@@ -1,4 +1,4 @@
-"""Pictures that no ToF pixel took: views from novel poses, and colour as the colour camera would have seen it."""
+"""Pictures beyond the ToF camera: novel views, and renderings of the colour camera."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ if TYPE_CHECKING:
 
 STRIP_VIEWS = 5  # columns of a strip
 STRIP_SIZE_MAX = 240  # [px]
-NORMALISED_MIN = 0.5  # [1] a novel view shows distance / opacity where at least half of the light was stopped
+NORMALISED_MIN = 0.5  # [1] novel views show distance / opacity from this opacity on
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Novel:
-    """M views that nobody took, all at one time."""
+    """M novel views at one time."""
 
     poses: list[int]
     """Their indices among those of the sequence."""
     time: float
-    """When [s]."""
+    """Time [s]."""
     distance: Float[np.ndarray, "M H W"]
-    """Mean distance divided by opacity [m]; NaN where less than half of the light was stopped."""
+    """Mean distance divided by opacity [m]; NaN where opacity is below one half."""
     colour: Float[np.ndarray, "M H W 3"] | None
     """Linear RGB in the units of the sequence's colour images; None if the run has no colour."""
 
@@ -44,15 +44,15 @@ class Colour:
     frames: list[int]
     """The raw frames n."""
     measured: Float[np.ndarray, "C h w 3"]
-    """What the colour camera recorded."""
+    """Recorded images."""
     rendered: Float[np.ndarray, "C h w 3"]
-    """What the run shows from there, at the same time."""
+    """Renderings at the same times and poses."""
 
 
 def novel_views(run: Run, sequence: Sequence, count: int = STRIP_VIEWS) -> Novel | None:
     """Views from up to ``count`` of the novel poses of a sequence, in the middle of it.
 
-    None if it carries none, or if the run has no Gaussians and so no other view than its own.
+    None if the sequence has none, or if the run has no Gaussians.
 
     Raises:
         DivergedError: If a rendering is not finite.
@@ -69,12 +69,8 @@ def novel_views(run: Run, sequence: Sequence, count: int = STRIP_VIEWS) -> Novel
         distances.append(np.where(opacity >= NORMALISED_MIN, distance / np.maximum(opacity, NORMALISED_MIN), np.nan))
         if rendering.colour is not None:
             colours.append(finite(rendering.colour, f"colour of novel view {m}", run).transpose(1, 2, 0))
-    return Novel(
-        poses=chosen,
-        time=time,
-        distance=np.stack(distances),
-        colour=np.stack(colours) if colours else None,
-    )
+    colour = np.stack(colours) if colours else None
+    return Novel(poses=chosen, time=time, distance=np.stack(distances), colour=colour)
 
 
 def colour_views(run: Run, sequence: Sequence, frames: list[int]) -> Colour | None:
@@ -101,27 +97,19 @@ def colour_views(run: Run, sequence: Sequence, frames: list[int]) -> Colour | No
 
 def novel_strip(novel: Novel, scale: pictures.Scale) -> str:
     """Distance, and colour if there is any, of the novel views as HTML."""
-    notes = [f"pose {m}" for m in novel.poses]
-    rows = [
-        [
-            page.plain_picture(pictures.colour_mapped(_thinned(image), scale), "distance / opacity", note)
-            for image, note in zip(novel.distance, notes, strict=True)
-        ]
-    ]
+    rows = {"distance / opacity": [pictures.colour_mapped(_thinned(image), scale) for image in novel.distance]}
     if novel.colour is not None:
         white = float(np.percentile(novel.colour, 99.5))
-        rows.append(
-            [
-                page.plain_picture(_shown(image, white), "colour", note)
-                for image, note in zip(novel.colour, notes, strict=True)
-            ]
-        )
-    bar = f'<div class="wide">{page.colour_bar(scale)}</div>'
-    return page.row(rows[0]) + bar + "".join(page.row(row) for row in rows[1:])
+        rows["colour"] = [_shown(image, white) for image in novel.colour]
+    first, *others = (
+        page.row([page.plain_picture(rgb, title, f"pose {m}") for rgb, m in zip(images, novel.poses, strict=True)])
+        for title, images in rows.items()
+    )
+    return first + f'<div class="wide">{page.colour_bar(scale)}</div>' + "".join(others)
 
 
 def colour_strip(colour: Colour) -> str:
-    """Measured above rendered colour at a few frames, on one brightness, as HTML."""
+    """Measured and rendered colour at a few frames, with one white level, as HTML."""
     chosen = sorted({round(x) for x in np.linspace(0, len(colour.frames) - 1, STRIP_VIEWS)})
     white = float(np.percentile(colour.measured, 99.5))
     return "".join(

@@ -1,7 +1,7 @@
-"""Errors of distances and quads, and the raw frames they are taken over (method, section 8); masks are arguments.
+"""Errors of distances and quads, and the scored raw frames (method, section 8).
 
-All errors are mean squared errors [m^2], times 100. ``all`` and ``static`` reach every pixel nearly alike, so most of
-what distinguishes methods is in ``moving``: the few per cent of pixels that change within a quartet.
+All errors are mean squared errors [m^2], times 100. Methods differ mostly on ``moving``, the few per cent of pixels
+that change within a quartet.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from ..scene.unwrap import distance_from_phasors
 
 PROTOCOLS = ("all", "ftorf13")
 ERROR_UNIT = 100.0  # errors are printed times 100, as in the published tables
-CRITERION = "d_minus_dtof_static_m"  # of a row of diagnostics: tells a good moment of a run without truth
+CRITERION = "d_minus_dtof_static_m"  # key of diagnostics that indicates a good state without truth
 DISTANCES = ("closed_form", "d", "d_normalised", "d_tof")
 
 
 def scored_frames(sequence: Sequence, protocol: str = "all") -> list[int]:
-    """Raw frames n that count.
+    """Raw frames n to score.
 
     Args:
         sequence: What was measured.
-        protocol: ``all``: every raw frame of a complete quartet, of a phasor only the first: its raw frames are one
-            image of one instant. ``ftorf13``: the first frame of every complete quartet but the first and the last,
-            as in the published tables (13 of 60 frames).
+        protocol: ``all``: every raw frame of a complete quartet; of a phasor, which has one time, only the first.
+            ``ftorf13``: the first frame of every complete quartet but the first and the last, as in the published
+            tables (13 of 60 frames).
 
     Raises:
         UsageError: If the protocol is unknown, or leaves nothing.
@@ -72,7 +72,7 @@ def squared_error(
     if distance.shape != truth.shape:
         raise ValueError(f"distance {distance.shape} and truth {truth.shape} must share a shape")
     if not np.isfinite(distance[~np.isnan(truth)]).all():
-        raise ValueError("distance: not finite at pixels whose truth is known, which no mean may hide")
+        raise ValueError("distance: not finite at pixels with a known truth")
     return np.square(distance - truth)
 
 
@@ -139,17 +139,17 @@ def quad_psnr_db(
 
 
 def colour_psnr_db(rendered: Float[np.ndarray, "C h w 3"], measured: Float[np.ndarray, "C h w 3"]) -> float | None:
-    """The same for linear RGB [dB], the peak being the largest measured value; None where it is not a number."""
+    """PSNR of linear RGB [dB] over the largest measured value; None where it is not a number."""
     return _psnr_db(rendered, measured, float(measured.max()))
 
 
 def along_run(rows: list[dict[str, float]]) -> dict[str, float | int | None] | None:
-    """What the rows of ``diagnostics.jsonl`` say in a few numbers; None if there are none.
+    """Summary of the rows of ``diagnostics.jsonl``; None if there are none.
 
     Returns:
-        rows: their number. d_mse_x100_least, images_at_least: the least error of d along the run [m^2 x 100], and after
-        how many images; None without truth. criterion_m_least, images_at_criterion, d_mse_x100_at_criterion: the least
-        |d - d_ToF| on static pixels [m], which needs no truth, after how many images, and the error of d there.
+        rows: their number. d_mse_x100_least, images_at_least: the least error of d [m^2 x 100] and its number of
+        images; None without truth. criterion_m_least, images_at_criterion, d_mse_x100_at_criterion: the least
+        |d - d_ToF| on static pixels [m], which needs no truth, its number of images, and the error of d there.
     """
     if not rows:
         return None

@@ -1,4 +1,4 @@
-"""Poses to render from that no raw frame has: those of a file, or those that a sequence carries."""
+"""Poses to render from: those of a file, or the novel views of a sequence."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ..data.sequence import Sequence
 from ..data.specs import Field
 from ..errors import InputError, UsageError
 
-NOVEL = "novel"  # instead of a file: the poses that the sequence carries
+NOVEL = "novel"  # instead of a file: the novel views of the sequence
 FIELD = Field(
     name="poses",
     paths=("FILE.npy",),
@@ -32,20 +32,20 @@ def read(poses: str | Path, sequence: Sequence) -> Float[np.ndarray, "M 4 4"]:
     """Poses to render from, world to camera [m].
 
     Args:
-        poses: A .npy file of shape [M, 4, 4], or [M, 3, 4] without the last row 0 0 0 1; or ``novel``, the poses of
-            ``sequence`` at which nobody took a picture.
+        poses: A .npy file of shape [M, 4, 4], or [M, 3, 4] without the last row 0 0 0 1; or ``novel``, the novel
+            views of ``sequence``.
         sequence: What was measured.
 
     Raises:
         UsageError: If the sequence has no such poses.
-        InputError: If the file cannot be read, or holds something else than rigid motions.
+        InputError: If the file cannot be read, or its matrices are not rigid motions.
     """
     if str(poses) == NOVEL:
         if sequence.novel_from_world is None or not len(sequence.novel_from_world):
             raise UsageError(
                 "no novel views",
                 where="--poses novel",
-                why=f"{sequence.path or 'the sequence'} carries no poses of views that nobody took",
+                why=f"{sequence.path or 'the sequence'} has no poses of novel views",
                 fix="give a .npy file of camera_from_world matrices, or leave --poses out",
             )
         return np.asarray(sequence.novel_from_world, dtype=np.float64)

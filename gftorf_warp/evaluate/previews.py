@@ -1,4 +1,4 @@
-"""Pictures of what ``gftorf render`` writes, one scale for all times of each thing."""
+"""The EXR and PNG files of ``gftorf render``; previews of one kind share one scale."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Channels = dict[str, Float[np.ndarray, "H W"]]
 
 
 def preview_scale(name: str, samples: Iterable[Channels]) -> pictures.Scale:
-    """One scale for the previews of all times, from a few of them; for a phasor it is that of the amplitude."""
+    """Scale of all previews of one kind, from a few samples; for a phasor, of its amplitude."""
     samples = list(samples)
     if name == "distance":
         return pictures.distance_scale([sample["distance"] for sample in samples])
@@ -29,7 +29,7 @@ def preview_scale(name: str, samples: Iterable[Channels]) -> pictures.Scale:
 
 
 def preview(name: str, images: Channels, scale: pictures.Scale) -> bytes:
-    """A picture of one thing as a PNG file: distance; the quads in a row; phase and amplitude in a row; or sRGB."""
+    """A PNG file: distance; quads in a row; phase and amplitude in a row; or sRGB."""
     if name == "distance":
         return indexed_png_bytes(pictures.ticks(images["distance"], scale), pictures.palette(scale))
     if name == "quads":
@@ -46,15 +46,12 @@ def preview(name: str, images: Channels, scale: pictures.Scale) -> bytes:
 
 
 def paths(out: Path, name: str, index: int) -> tuple[Path, Path]:
-    """Where the EXR and the PNG of one thing at the index-th time belong."""
+    """Paths of the EXR and the PNG of one kind at the index-th time."""
     return out / name / f"{index:06d}.exr", out / name / f"{index:06d}.png"
 
 
 def write_images(out: Path, scales: Mapping[str, pictures.Scale], index: int, images: Mapping[str, Channels]) -> None:
-    """Write what was rendered at the index-th time: for each thing one EXR and one PNG, each of them atomically.
-
-    What looks after their folders is :func:`many_files`.
-    """
+    """Write one EXR and one PNG of each kind at the index-th time, atomically, inside :func:`many_files`."""
     for name, channels in images.items():
         exr, png = paths(out, name, index)
         write_exr(exr, channels, one_of=True)

@@ -1,4 +1,4 @@
-"""What ``gftorf render`` may be asked for, which images that takes, and the folder it goes to."""
+"""The options of ``gftorf render``: names of images, the channels of each, and the output folder."""
 
 from __future__ import annotations
 
@@ -8,19 +8,17 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
-import torch
 from jaxtyping import Float
 
 from ..data.files import write_json
 from ..errors import UsageError
 from ..recon.folder import set_aside
-from ..render.api import Rendering
 from ..scene.sensor import Sensor
 from .previews import Channels
 
 LIST = "renders.json"
-LISTED = ("run", "times_s", "camera_from_world", "channels", "arrays")  # its keys that say which images these are
-NEEDS = {  # what may be asked for: the images of a rendering that it consists of
+LISTED = ("run", "times_s", "camera_from_world", "channels", "arrays")  # its keys that identify the images
+NEEDS = {  # images of a rendering, by option
     "distance": ("distance", "opacity"),
     "quads": ("quads",),
     "phasor": ("phasor",),
@@ -30,10 +28,10 @@ WHAT = tuple(NEEDS)
 
 
 def checked(what: str | Iterable[str]) -> tuple[str, ...]:
-    """The names of what is to be rendered, each once.
+    """Valid names without repetition.
 
     Args:
-        what: Names out of distance, quads, phasor, colour; or one text with commas between them.
+        what: Names out of distance, quads, phasor, colour; or one text, separated by commas.
 
     Raises:
         UsageError: If a name is unknown, or there is none.
@@ -51,30 +49,16 @@ def checked(what: str | Iterable[str]) -> tuple[str, ...]:
     return names
 
 
-def channels(name: str, rendering: Rendering, sensor: Sensor) -> Channels:
-    """The images of one thing by channel name, see :func:`named`, of a rendering wherever it is.
-
-    Raises:
-        UsageError: If colour is asked for and the field has none.
-    """
-    given = [getattr(rendering, image) for image in NEEDS[name]]
-    if given[0] is None:
-        return named(name, {}, sensor)
-    images = torch.stack(given) if len(given) > 1 else given[0]
-    host = images.detach().cpu().numpy().astype(np.float32)  # one transfer, and memory of its own
-    return named(name, dict(zip(NEEDS[name], host if len(given) > 1 else [host], strict=True)), sensor)
-
-
 def named(name: str, images: Mapping[str, Float[np.ndarray, "..."]], sensor: Sensor) -> Channels:
-    """The images of one thing by channel name: what its EXR holds.
+    """Images by channel name, as in an EXR file.
 
     distance: ``distance`` [m], not divided by ``opacity`` [1]. quads: ``quad_<shift in degrees>`` [file units]. phasor:
     ``re``, ``im``, ``amplitude`` [file units]. colour: ``R``, ``G``, ``B``, linear [1].
 
     Args:
-        name: Of the thing.
-        images: What it consists of, by name, and perhaps more.
-        sensor: Whose shifts the quads have.
+        name: One of ``WHAT``.
+        images: Images of a rendering by name, at least those in ``NEEDS``.
+        sensor: Defines the shifts of the quads.
 
     Raises:
         UsageError: If colour is asked for and there is none.
@@ -93,16 +77,16 @@ def named(name: str, images: Mapping[str, Float[np.ndarray, "..."]], sensor: Sen
     return dict(zip(names, images[name], strict=True))
 
 
-def make_room(out: Path, listed: Mapping[str, object], *, fresh: bool) -> None:
-    """Make a folder ready for images and list them in its ``renders.json``.
+def prepare_folder(out: Path, listed: Mapping[str, object], *, fresh: bool) -> None:
+    """Prepare an output folder and write its ``renders.json``.
 
     Args:
-        out: New, empty, or one that holds images of the same run, times, poses and channels, which are written again.
-        listed: What will be in the folder.
-        fresh: Whether to move other images aside, to ``out/old-<k>``.
+        out: New, empty, or with images of the same run, times, poses and channels, which will be overwritten.
+        listed: Content of ``renders.json``.
+        fresh: Whether to move other images to ``out/old-<k>``.
 
     Raises:
-        UsageError: If it holds other images, and ``fresh`` is not set, or anything else.
+        UsageError: If it holds other images and ``fresh`` is not set, or other files.
     """
     if out.exists() and not out.is_dir():
         raise UsageError("not a folder", where=out, why="--out names a file", fix="choose another --out")

@@ -1,4 +1,4 @@
-"""A finished run as arrays: what is scored, frame by frame, and what ``gftorf render`` puts on disk."""
+"""Images of a finished run as arrays: those that are scored, and those that ``gftorf render`` writes."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ RENDERED = ("quads", "phasor", "distance", "opacity")
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Views:
-    """Everything that compare shows, for the S scored raw frames, at the sequence's own resolution, float32."""
+    """Images of the S scored raw frames, at the sequence's own resolution, float32."""
 
     frames: list[int]
     """The scored raw frames n."""
@@ -48,11 +48,11 @@ class Views:
     quad_rendered: Float[np.ndarray, "S H W"]
     """The slot that was measured, as rendered [file units]."""
     quad_measured: Float[np.ndarray, "S H W"]
-    """What was recorded there [file units]."""
+    """The slot as measured [file units]."""
     single: Float[np.ndarray, "S f H W"] | None = None
-    """What each of several frequencies by itself decodes to in that quartet [m]; None: there is one."""
+    """Distance decoded from each of several frequencies alone [m]; None: there is one."""
     confidence: Float[np.ndarray, "S H W"] | None = None
-    """How far they agree on the closed form [1], see data/unwrap.py; None: there is one frequency."""
+    """Agreement of the frequencies on the closed form [1], see data/unwrap.py; None: there is one."""
 
     @property
     def d_normalised(self) -> Float[np.ndarray, "S H W"]:
@@ -61,7 +61,7 @@ class Views:
 
     @property
     def distances(self) -> dict[str, Float[np.ndarray, "S H W"]]:
-        """Every kind of distance [m], by the name it has in metrics.json."""
+        """All distances [m], by their names in metrics.json."""
         return {"closed_form": self.closed_form, "d": self.d, "d_normalised": self.d_normalised, "d_tof": self.d_tof}
 
 
@@ -112,7 +112,7 @@ def gather(
 
 
 def _agreement(quartets: list[Decoded]) -> dict[str, Any]:
-    """What several frequencies say by themselves, and how far they agree; empty of one."""
+    """The fields ``single`` and ``confidence`` where there are several frequencies."""
     confidence = [one.confidence for one in quartets if one.confidence is not None]
     if len(confidence) < len(quartets):
         return {}
@@ -170,12 +170,10 @@ def render_to_folder(
     arrays: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> Path:
-    """Write what the run looks like at some times: ``OUT/<what>/<index>.exr`` (float32) and ``.png`` to look at.
+    """Render a run at some times: ``OUT/<what>/<index>.exr`` (float32) and a preview ``.png``.
 
-    ``OUT/renders.json`` lists the times [s], the channels with their units and the scale of the previews; poses, if any
-    were given. Otherwise the pose is that of the raw frame nearest to each time.
-
-    Pictures are written by a few threads, or many of them by processes. Arrays are only copied, and many times as fast:
+    ``OUT/renders.json`` lists the times [s], the channels with their units, the scale of the previews, and poses if any
+    were given; otherwise the pose is that of the raw frame nearest to each time. With ``arrays``, files are
     ``OUT/<what>/<channel>.npy``, float32 [S, H, W] of all S times, with the values of the EXR files.
 
     Args:
@@ -184,10 +182,10 @@ def render_to_folder(
         what: Names out of distance, quads, phasor, colour.
         times: Seconds since raw frame 0; None: the times of all raw frames, truncated quartets included; with poses,
             the middle of the sequence.
-        poses: A .npy file of world-to-camera matrices [M, 4, 4] or [M, 3, 4], or ``novel``, those that the sequence
-            carries. Image k is taken from pose k at time k; the shorter list starts over.
-        fresh: Whether to move what else ``out`` holds aside, to ``out/old-<k>``.
-        arrays: Whether to write arrays, and no pictures.
+        poses: A .npy file of world-to-camera matrices [M, 4, 4] or [M, 3, 4], or ``novel``, those of the sequence.
+            Image k is rendered from pose k at time k; the shorter list repeats.
+        fresh: Whether to move other content of ``out`` to ``out/old-<k>``.
+        arrays: Whether to write arrays instead of pictures; many times as fast.
         progress: Called with (times done, times in all).
 
     Raises:
@@ -202,8 +200,9 @@ def render_to_folder(
 
     needed = {image for name in names for image in renders.NEEDS[name]}
     render = run.renderer(needed)
-    images = images_of(render, run.sensor, names)
-    samples = [images(seconds[i], cameras[i]) for i in sorted({0, len(seconds) // 2, len(seconds) - 1})]
+    taken = list(zip(seconds, cameras, strict=True))
+    few = [taken[i] for i in sorted({0, len(taken) // 2, len(taken) - 1})]
+    samples = list(series_of(render, few, run.sensor, names, kept=len(few)))
     out, channels = Path(out), {name: list(samples[0][name]) for name in names}
     listed: dict[str, Any] = {
         "run": str(run.path),
@@ -216,10 +215,9 @@ def render_to_folder(
     else:
         scales = {name: previews.preview_scale(name, (sample[name] for sample in samples)) for name in names}
         listed["preview"] = {name: asdict(scale) for name, scale in scales.items()}
-    renders.make_room(out, listed, fresh=fresh)
+    renders.prepare_folder(out, listed, fresh=fresh)
     for name in names:
         (out / name).mkdir(exist_ok=True)
-    taken = list(zip(seconds, cameras, strict=True))
     if arrays:
         series = series_of(render, taken, run.sensor, names, kept=min(stored.HELD, len(taken)))
         shape = len(seconds), *next(iter(samples[0][names[0]].values())).shape
@@ -238,26 +236,11 @@ def series_of(
     *,
     kept: int = KEPT,
 ) -> Iterator[Mapping[str, previews.Channels]]:
-    """What ``gftorf render`` writes, image by image: arrays on the host, which stay as they are while they are held.
-
-    On CUDA the next images are rendered meanwhile, and none of them waits for the device.
-    """
+    """Channels of each view as arrays on the host, valid while referenced; on CUDA, later views render meanwhile."""
     names = list(names)
     needed = sorted({image for name in names for image in renders.NEEDS[name]})
     for found in on_host(render, views, needed, kept=kept):
         yield {name: renders.named(name, found, sensor) for name in names}
-
-
-def images_of(
-    render: Callable[[float, Camera], Rendering], sensor: Sensor, names: Iterable[str]
-) -> Callable[[float, Camera], dict[str, previews.Channels]]:
-    """The same one by one, each time waiting for the device: arrays on the host, which no later call overwrites."""
-
-    def images(time: float, camera: Camera) -> dict[str, previews.Channels]:
-        rendering = render(time, camera)
-        return {name: renders.channels(name, rendering, sensor) for name in names}
-
-    return images
 
 
 def views_to_take(
