@@ -9,14 +9,12 @@ from gftorf_warp import Sequence, cli
 from gftorf_warp.bench import command, motion, renderer, states, step, timing
 from gftorf_warp.errors import DivergedError, InputError, ResourceError, UsageError
 from gftorf_warp.recon.run import Run
-from gftorf_warp.recon.settings import Batch, Kernels
+from gftorf_warp.recon.settings import Batch
 from gftorf_warp.render import launch, stages
 from gftorf_warp.scene.motion import MotionSettings, Products
 from gftorf_warp.scene.network import Network
 
 DEVICE = "cuda:0" if torch.cuda.is_available() else "cpu"
-
-KINDS = set(Kernels) - {Kernels.AUTO}  # which is one of the others
 
 
 @pytest.fixture(scope="module")
@@ -64,10 +62,10 @@ def test_quick_bench_writes_everything_it_prints(tmp_path, capsys):
         "files",
         "stored",
     ]
-    ways = {(row["kernels"], row["batch"]) for row in found["parts"]["step"]["rows"]}
-    assert ways == {(str(k), str(b)) for k in KINDS for b in Batch}
+    ways = {row["batch"] for row in found["parts"]["step"]["rows"]}
+    assert ways == {str(batch) for batch in Batch}
     assert all(row["pairs"] > row["N"] > 0 for row in found["parts"]["step"]["rows"])
-    assert all(row["not_sound"] == 0 for row in found["parts"]["step"]["rows"])
+    assert all(row["skipped"] == 0 for row in found["parts"]["step"]["rows"])
 
 
 def test_reconstruction_with_both_kernel_caches(tmp_path, monkeypatch):
@@ -209,14 +207,15 @@ def test_the_state_is_in_its_middle(fitted, tmp_path):
 
 
 def test_every_way_of_a_step_is_timed_once(fitted):
-    """Members of the enumerations, not names; what is set stays set; a CPU has one precision."""
+    """What is set stays set; a CPU has one precision and no graphs."""
     every = step.ways(fitted.settings, [], "cpu")
-    assert len(every) == len(KINDS) * len(Batch)
+    assert len(every) == len(Batch)
     assert {way.motion.products for way in every} == {Products.FLOAT32}
     on_gpu = step.ways(fitted.settings, [], "cuda:0")
     assert {way.motion.products for way in on_gpu} == set(Products)
-    assert len({(w.kernels, w.schedule.batch, w.motion.products) for w in on_gpu}) == len(on_gpu)
-    assert {way.kernels for way in step.ways(fitted.settings, ["kernels=loss"], "cpu")} == {fitted.settings.kernels}
+    assert {way.graph for way in on_gpu} == {False, True}
+    assert len({(w.graph, w.schedule.batch, w.motion.products) for w in on_gpu}) == len(on_gpu)
+    assert {way.graph for way in step.ways(fitted.settings, ["graph=true"], "cuda:0")} == {fitted.settings.graph}
 
 
 def test_a_run_without_checkpoint_is_refused(fitted, tmp_path):

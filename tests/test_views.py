@@ -12,7 +12,7 @@ from analytic_run import FRAMES, HEIGHT, WIDTH, AnalyticRun, true_distance, with
 
 from gftorf_warp.data.exr import read_exr
 from gftorf_warp.errors import InputError, ResourceError, UsageError
-from gftorf_warp.evaluate import pictures, previews, renders, writers
+from gftorf_warp.evaluate import pictures, previews, renders
 from gftorf_warp.evaluate.views import quad_of_shift, render_to_folder
 from gftorf_warp.scene.sensor import Sensor
 

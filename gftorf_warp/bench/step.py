@@ -28,9 +28,9 @@ from .states import Fitted, pairs_of
 from .timing import Report, Timing, lines_of, quietly, watch_of
 
 WARM_UP = 24  # images before anything is timed: kernels are loaded, moments exist
-WATCHED = 16  # images in which waits are counted and profiled
+WATCHED = 16  # images of a profile
 ON_DEVICE = {"kernel", "gpu_memset", "gpu_memcpy"}  # kinds of events of torch's profiler
-PART = 40  # images between two looks at the clock
+PART = 40  # images of one timing
 IMAGES = 400
 QUICK_IMAGES, QUICK_PART, QUICK_WARM_UP = 8, 4, 4
 
@@ -59,11 +59,11 @@ def ways(settings: ReconSettings, changes: list[str], device: str) -> list[Recon
 def fresh(
     fitted: Fitted, observations: Observations, settings: ReconSettings, device: str, warm_up: int = WARM_UP
 ) -> Run:
-    """The state again, a few images later, and how its steps are done."""
+    """A copy of the state with its stepper, after a warm-up."""
     stored = copy.deepcopy(fitted.stored)
-    if "shape" in stored["motion"]:  # precision is a matter of speed: that of the row, not of the checkpoint
+    if "shape" in stored["motion"]:  # of the row, not of the checkpoint
         stored["motion"]["shape"]["products"] = str(settings.motion.products)
-    stored["queue"] = []  # batches are numbered anew
+    stored["queue"] = []  # batches of other settings have other numbers
     state = from_dict(stored, device)
     run = Run(state, Stepper(state, observations, settings))
     advance(run, warm_up)
@@ -71,16 +71,14 @@ def fresh(
 
 
 class Run(NamedTuple):
-    """A state on its way."""
+    """A state and its stepper."""
 
     state: State
-    """Changed by steps."""
     steps: Stepper
-    """Its steps."""
 
 
 def advance(run: Run, images: int) -> int:
-    """Steps until so many more images are optimised; returns how many of the steps were not sound."""
+    """Optimise so many more images; returns the number of skipped updates."""
     end, skipped = run.state.images + images, run.state.skipped
     while run.state.images < end:
         run.steps.step()
@@ -91,21 +89,19 @@ def advance(run: Run, images: int) -> int:
 def measure(
     fitted: Fitted, device: str, *, changes: list[str], quick: bool, images: int | None, report: Report
 ) -> list[dict[str, Any]]:
-    """Rows of all ways.
+    """Rows of :func:`ways`.
 
     Args:
         fitted: The state.
-        device: Where.
+        device: "cpu" or a CUDA device.
         changes: Single settings that ``fitted`` was made with.
         quick: A few images only.
-        images: How many; None: 400.
+        images: Their number; None: 400.
         report: Called with (images done, images in all).
     """
+    count, part, warm_up = (QUICK_IMAGES, QUICK_PART, QUICK_WARM_UP) if quick else (IMAGES, PART, WARM_UP)
     chosen = ways(fitted.settings, changes, device)
-    if quick:
-        short: dict[str, int] = {"images": images or QUICK_IMAGES, "part": QUICK_PART, "warm_up": QUICK_WARM_UP}
-        return rows_of(chosen, fitted, device, **short, report=report)
-    return rows_of(chosen, fitted, device, images=images or IMAGES, report=report)
+    return rows_of(chosen, fitted, device, images=images or count, part=part, warm_up=warm_up, report=report)
 
 
 def rows_of(
@@ -118,15 +114,15 @@ def rows_of(
     warm_up: int = WARM_UP,
     report: Report = quietly,
 ) -> list[dict[str, Any]]:
-    """Mean over consecutive images and the spread of its parts [ms per image], for every one of some settings.
+    """Mean over consecutive images and percentiles over parts of them [ms per image], one row per settings.
 
     Args:
         chosen: The settings.
-        fitted: The state that each begins with.
-        device: Where.
-        images: How many; whole parts, at least one.
-        part: Images between two looks at the clock.
-        warm_up: Images before the first that counts.
+        fitted: The initial state of each.
+        device: "cpu" or a CUDA device.
+        images: Number of images, rounded down to whole parts, at least one.
+        part: Images of one timing.
+        warm_up: Images before the first timing.
         report: Called with (images done, images in all).
     """
     parts, rows, watch = max(images // part, 1), [], watch_of(device)
@@ -135,23 +131,27 @@ def rows_of(
         observations = observe(fitted.sequence, settings, device)
         run = fresh(fitted, observations, settings, device, warm_up)
         state = run.state
-        times, before, broken = [], state.images, 0
+        times, before, skipped = [], state.images, 0
         for done in range(1, parts + 1):
             watch.synchronise()
             first, begun = state.images, time.perf_counter()
-            broken += advance(run, part)
+            skipped += advance(run, part)
             watch.synchronise()
             times.append(1e3 * (time.perf_counter() - begun) / (state.images - first))
             report((number * parts + done) * part, len(chosen) * parts * part, ms=times[-1])
-        row: dict[str, Any] = {"graph": settings.graph, "batch": str(settings.schedule.batch)}
-        row |= {
+        row: dict[str, Any] = {
+            "graph": settings.graph,
+            "batch": str(settings.schedule.batch),
             "products": str(settings.motion.products),
             "N": len(state.optimiser.field),
             "pairs": pairs,
             "from": before,
+            "images": state.images - before,
+            "flow": observations.flow_source,
+            "skipped": skipped,
+            "ms_per_image": statistics.mean(times),
+            "parts": Timing.of(times).plain(),
         }
-        row |= {"images": state.images - before, "flow": observations.flow_source, "skipped": broken}
-        row |= {"ms_per_image": statistics.mean(times), "parts": Timing.of(times).plain()}
         if torch.device(device).type != "cpu":
             row["waits_per_image"] = waits(fresh(fitted, observations, settings, device, warm_up), device)
         rows.append(row)
@@ -159,7 +159,7 @@ def rows_of(
 
 
 def waits(run: Run, device: str) -> float:
-    """How often the host waits for the device in an image, as torch sees it; reads of Warp are not seen."""
+    """Synchronisations with the device per image that torch reports; those of Warp are not included."""
     module = torch.get_device_module(device)
     module.set_sync_debug_mode("warn")
     with warnings.catch_warnings(record=True) as seen:
@@ -181,7 +181,7 @@ def profiled(run: Run, device: str) -> str:
 
 
 def timeline(run: Run, device: str) -> list[str]:
-    """Everything that a GPU did in a few steps, in its order: begin and length [us], stream, name."""
+    """GPU activities of a few steps in order of their begin: begin and duration [us], stream, name."""
     with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CUDA]) as profile:
         advance(run, WATCHED)
         watch_of(device).synchronise()
@@ -192,7 +192,7 @@ def timeline(run: Run, device: str) -> list[str]:
 
 
 def lines_of_trace(events: list[dict[str, Any]]) -> list[str]:
-    """Lines of :func:`timeline` from what torch exports; what a host did is left out."""
+    """Lines of :func:`timeline` from torch's trace events; those of the host are left out."""
     found = sorted((e for e in events if e.get("cat") in ON_DEVICE), key=lambda event: event["ts"])
     rows = [(e["ts"] - found[0]["ts"], e["dur"], e["args"].get("stream", "-"), e["name"]) for e in found]
     return [f"{begin:10.1f} {length:8.1f}  {stream!s:>4}  {name}" for begin, length, stream, name in rows]
@@ -213,4 +213,4 @@ def table(rows: list[dict[str, Any]]) -> list[str]:
         ]
         for row in rows
     ]
-    return lines_of("training step, no rounds, no resets [ms per image]", heads, cells)
+    return lines_of("training step without densification and opacity resets [ms per image]", heads, cells)
