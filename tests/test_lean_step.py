@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import torch
 from comparison import DEVICES
+from gftorf_warp.recon.objective import flow_between
 
 from gftorf_warp.recon import densify
-from gftorf_warp.recon.objective import flow_between
 from gftorf_warp.render import descent, fused
 from gftorf_warp.render.api import ScreenGradient
 from gftorf_warp.scene.camera import Camera

@@ -344,7 +344,7 @@ def test_images_in_threads_are_the_same_to_the_bit(device):
 def test_padding_rows_change_nothing(make, monkeypatch):
     """As on a GPU, but on a CPU: in ``published`` ten times as many rows as Gaussians, also after densification."""
     whole = stepper.PaddedParameters
-    monkeypatch.setattr(stepper, "PaddedParameters", lambda *, pads: whole(pads=not pads))  # noqa: ARG005
+    monkeypatch.setattr(stepper, "PaddedParameters", lambda *, pads: whole(pads=not pads))
     settings = replace(make(batch=Batch.QUARTET), graph=False)
     settings = replace(settings, weights=replace(settings.weights, motion_size=0.5))
     state = compared(settings, "cpu", images=((20, 0.01),), signs=0.01)  # where little moves, directions are rounding
