@@ -11,8 +11,14 @@ from test_replay import CAMERA, DEVICES, TIMES, aside, compare, run  # noqa: F40
 
 from gftorf_warp.errors import InputError, UsageError
 from gftorf_warp.recon import presets
+from gftorf_warp.recon.observations import observe
 from gftorf_warp.recon.run import Run
+from gftorf_warp.recon.settings import Weights
+from gftorf_warp.recon.state import begin
+from gftorf_warp.recon.stepper import Stepper
 from gftorf_warp.recon.train import CHANGES, reconstruct
+from gftorf_warp.render import descent
+from gftorf_warp.render.buffers import ClampGradient
 from gftorf_warp.scene.changes import changed
 from gftorf_warp.scene.models import KINDS, MODELS, motion_from_dict
 from gftorf_warp.scene.motion import KeyMotion, MotionSettings, MotionStart, interpolated
@@ -267,3 +273,36 @@ def test_a_short_fit_lowers_the_loss_and_is_read_again(kind, device, tmp_path):
     assert same(again.motion.state_dict(), {n: t.cpu() for n, t in run.motion.state_dict().items()})
     assert stored(run.path)["motion"]["kind"] == kind
     torch.testing.assert_close(again.render(0.06).quads, run.render(0.06).quads.cpu(), rtol=1e-4, atol=1e-4)
+
+
+def test_a_training_step_differentiates_means_through_rotations(monkeypatch):
+    """Its gradient is that of finite differences of its loss, where the moving layer is rotated by one radian."""
+    weights = Weights(quads=1.0, ssim=0.0, distortion=0.0, flow=0.0, motion_size=0.0)
+    settings = demo(images=60, warm_up=0, weights=weights, background=0.0, motion=MotionSettings(kind="rigid_nodes"))
+    settings = replace(settings, render=replace(settings.render, clamp_gradient=ClampGradient.EXACT))
+    observations, lists = observe(small(), settings, "cpu"), []
+    point = descent.AdamTable.point
+    monkeypatch.setattr(descent.AdamTable, "point", lambda table, given: lists.append(given) or point(table, given))
+
+    def loss(shift=0.0):
+        """Mean over the images of the first batch, with all nodes in one rigid motion; means moved before it."""
+        state = begin(observations, settings, seed=0, device="cpu")
+        vector = torch.tensor([0.2, 0.9, -0.3])
+        with torch.no_grad():
+            arm = state.motion.node - state.motion.node.mean(dim=0)
+            state.motion.rotation[:] = vector
+            state.motion.offset[:] = arm @ torch.matrix_exp(skew(vector)).T - arm
+            state.optimiser.tensors["mean"].add_(shift)
+        stepper = Stepper(state, observations, settings)
+        stepper.step()
+        stepper.collect()
+        return float(state.sums["loss"] / state.sums["count"]), state.optimiser
+
+    _, optimiser = loss()
+    row, batch = list(optimiser.tensors).index("mean"), len(observations.batches[0])
+    gradient = sum(given[row] for given in lists[0] if given[row] is not None) / batch
+    gradient = gradient * (optimiser.layer > 0)[:, None]
+    step = 1e-3 * gradient / gradient.abs().max()
+    slope = (loss(step)[0] - loss(-step)[0]) / 2.0
+    assert slope > 1e-6
+    assert slope == pytest.approx(float((gradient * step).sum()), rel=0.03)
