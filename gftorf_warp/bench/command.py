@@ -1,4 +1,4 @@
-"""``gftorf bench``: parts by name, what they share, tables for eyes and JSON for everything else."""
+"""``gftorf bench``: parts by name, the scenes and states that they share, printed tables and JSON."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ import platform
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,49 +24,46 @@ from . import motion, reconstruction, renderer, rendering, states, step
 from .timing import Report, quietly
 
 RUNS, QUICK_RUNS = 30, 5
-PRESETS = {"cpu": "demo", "other": "released"}  # of whole reconstructions; a step is always of the second
+PRESETS = {"cpu": "demo", "other": "released"}  # of whole reconstructions; steps always have the second
 Rows = list[dict[str, Any]]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Wanted:
-    """What was typed."""
+    """Options of the command."""
 
     device: str
-    """Where to compute."""
+    """"cpu" or a CUDA device."""
     quick: bool = False
-    """Small sizes and few runs: whether it works, not what it costs."""
+    """Small sizes and few runs, as a test of the benchmark itself."""
     sequence: Path | None = None
-    """Of the parts that need one; None: a simulated scene."""
+    """Sequence of ``step``, ``reconstruction`` and ``render``; None: a simulated scene."""
     run: Path | None = None
-    """The run whose state is timed by ``step`` and ``render``; None: one made from measured phase."""
+    """Run whose state is used by ``step`` and ``render``; None: a state initialised from measured phase."""
     images: int | None = None
-    """Length of what is counted in images; None: the part's own."""
+    """Number of images of ``step``, ``reconstruction`` and ``render``; None: their defaults."""
     preset: str | None = None
-    """Of step and reconstruction; None: their own."""
+    """Preset of ``step`` and ``reconstruction``; None: their defaults."""
     changes: tuple[str, ...] = ()
-    """Single settings."""
+    """Changes of single settings."""
 
 
 class Shared:
-    """What several parts need, made when the first of them asks."""
+    """Sequence, state and run that several parts use, made on first access."""
 
     def __init__(self, wanted: Wanted, folder: Path):
         self.wanted, self.folder = wanted, folder
-
-    @property
-    def runs(self) -> int:
-        """How often short things are done."""
-        return QUICK_RUNS if self.wanted.quick else RUNS
+        self.device, self.quick = wanted.device, wanted.quick
+        self.runs = QUICK_RUNS if wanted.quick else RUNS
 
     @functools.cached_property
     def path(self) -> Path:
         """The folder of the sequence."""
-        return self.wanted.sequence or states.simulated(self.folder / "sequence", quick=self.wanted.quick)
+        return self.wanted.sequence or states.simulated(self.folder / "sequence", quick=self.quick)
 
     @functools.cached_property
     def fitted(self) -> states.Fitted:
-        """The state of a reconstruction in its middle."""
+        """State of a reconstruction in progress."""
         wanted, sequence = self.wanted, read(self.path)
         settings = states.settings_of(sequence, wanted.preset or PRESETS["other"], list(wanted.changes), wanted.device)
         if wanted.run is not None:
@@ -81,35 +77,36 @@ class Shared:
 
 
 def _renderer(shared: Shared, report: Report) -> Rows:
-    wanted = shared.wanted
-    return renderer.measure(wanted.device, quick=wanted.quick, runs=shared.runs, report=report)
+    return renderer.measure(shared.device, quick=shared.quick, runs=shared.runs, report=report)
 
 
 def _motion(shared: Shared, report: Report) -> Rows:
-    wanted = shared.wanted
-    return motion.measure(wanted.device, quick=wanted.quick, runs=shared.runs, report=report)
+    return motion.measure(shared.device, quick=shared.quick, runs=shared.runs, report=report)
 
 
 def _step(shared: Shared, report: Report) -> Rows:
-    wanted = shared.wanted
-    chosen: dict[str, Any] = {"changes": list(wanted.changes), "quick": wanted.quick, "images": wanted.images}
-    return step.measure(shared.fitted, wanted.device, **chosen, report=report)
+    changes, images = list(shared.wanted.changes), shared.wanted.images
+    return step.measure(shared.fitted, shared.device, changes=changes, quick=shared.quick, images=images, report=report)
 
 
 def _reconstruction(shared: Shared, report: Report) -> Rows:
-    wanted = shared.wanted
     folder = shared.folder / "reconstruction"
     folder.mkdir()
-    kind = "cpu" if wanted.quick or wanted.device == "cpu" else "other"
-    chosen: dict[str, Any] = {"preset": wanted.preset or PRESETS[kind], "changes": list(wanted.changes)}
-    chosen |= {"quick": wanted.quick, "images": wanted.images}
-    return reconstruction.measure(shared.path, folder, wanted.device, **chosen, report=report)
+    return reconstruction.measure(
+        shared.path,
+        folder,
+        shared.device,
+        preset=shared.wanted.preset or PRESETS["cpu" if shared.quick or shared.device == "cpu" else "other"],
+        changes=list(shared.wanted.changes),
+        quick=shared.quick,
+        images=shared.wanted.images,
+        report=report,
+    )
 
 
 def _render(shared: Shared, report: Report) -> Rows:
-    wanted = shared.wanted
-    chosen: dict[str, Any] = {"quick": wanted.quick, "images": wanted.images}
-    return rendering.measure(shared.run_folder, shared.folder / "images", wanted.device, **chosen, report=report)
+    out, images = shared.folder / "images", shared.wanted.images
+    return rendering.measure(shared.run_folder, out, shared.device, quick=shared.quick, images=images, report=report)
 
 
 PARTS: dict[str, tuple[Callable[[Shared, Report], Rows], Callable[[Rows], list[str]]]] = {
@@ -129,36 +126,31 @@ def bench(
     progress: Callable[[str], Report] | None = None,
     say: Callable[[str], None] = print,
 ) -> dict[str, Any]:
-    """Measure parts one after the other.
+    """Measure parts in turn.
 
     Args:
         parts: Names out of ``PARTS``; none: all.
-        wanted: How and on what.
-        json: File for everything, written anew after every part, so that an interruption keeps what was measured.
-        progress: Called with the name of a part; returns what that part calls with (done, total).
-        say: Called with every line of every table.
+        wanted: Options.
+        json: File of all results, written after every part.
+        progress: Called with the name of a part; returns the progress callback of that part.
+        say: Called with every line of the tables.
 
     Returns:
-        What the file holds: machine and versions, and rows by part.
+        The content of the file: machine and versions, and rows by part.
 
     Raises:
         UsageError: If a part is unknown, a folder is missing, or the file cannot be written.
     """
     chosen = checked(parts)
     _check_folders(wanted)
-    found: dict[str, Any] = {
-        **about(wanted.device),
-        "quick": wanted.quick,
-        "command": _words(chosen, wanted),
-        "parts": {},
-    }
+    found = about(wanted.device) | {"quick": wanted.quick, "command": _words(chosen, wanted), "parts": {}}
     if json is not None:
         _check_file(Path(json))
     if wanted.device != "cpu":  # events and graphs are those of the current device
         torch.get_device_module(torch.device(wanted.device)).set_device(wanted.device)
     say(" - ".join(str(found[name]) for name in ("device", "driver", "warp", "torch", "commit")))
-    with _folder() as folder:
-        shared = Shared(wanted, folder)
+    with tempfile.TemporaryDirectory(prefix="gftorf-bench-") as folder:
+        shared = Shared(wanted, Path(folder))
         for name in chosen:
             measure, table = PARTS[name]
             begun = time.perf_counter()
@@ -172,7 +164,7 @@ def bench(
 
 
 def checked(parts: list[str]) -> list[str]:
-    """The parts that are meant, each once, in the order of the table.
+    """The chosen parts without repetition, in the order of ``PARTS``.
 
     Raises:
         UsageError: If one is unknown.
@@ -186,7 +178,7 @@ def checked(parts: list[str]) -> list[str]:
 
 
 def _version_of(package: str) -> str:
-    """As installed; a folder on the path may have none."""
+    """Version of an installed package."""
     try:
         return importlib.metadata.version(package)
     except importlib.metadata.PackageNotFoundError:
@@ -194,7 +186,7 @@ def _version_of(package: str) -> str:
 
 
 def about(device: str) -> dict[str, Any]:
-    """The machine and the versions, as every result states them."""
+    """Machine and versions, for the JSON of every benchmark."""
     on_cpu = device == "cpu"
     name = platform.processor() or platform.machine()
     return {
@@ -210,17 +202,17 @@ def about(device: str) -> dict[str, Any]:
 
 
 def _driver() -> str:
-    """Version of the GPU's driver, as its own tool says it."""
+    """Version of the NVIDIA driver, by nvidia-smi."""
     command = ["nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader"]
     try:
-        said = subprocess.run(command, check=True, capture_output=True, text=True, timeout=30).stdout
+        output = subprocess.run(command, check=True, capture_output=True, text=True, timeout=30).stdout
     except (OSError, subprocess.SubprocessError):
         return "unknown"
-    return said.splitlines()[0].strip() if said.strip() else "unknown"
+    return output.splitlines()[0].strip() if output.strip() else "unknown"
 
 
 def _commit() -> str | None:
-    """Commit of the checkout that the package lies in, marked if files of it were changed; None without one."""
+    """Commit of the package's checkout, with "-dirty" if files were changed; None without a checkout."""
     root = Path(__file__).parents[2]
     if not (root / ".git").exists():
         return None
@@ -232,7 +224,7 @@ def _commit() -> str | None:
 
 
 def _words(parts: list[str], wanted: Wanted) -> str:
-    """The command, as it could be typed again; folders by their names only."""
+    """The command line; folders by their names only."""
     words = ["gftorf bench", *parts, "--device", wanted.device] + ["--quick"] * wanted.quick
     for option, value in (("sequence", wanted.sequence), ("run", wanted.run)):
         words += [] if value is None else [f"--{option}", value.name]
@@ -242,28 +234,20 @@ def _words(parts: list[str], wanted: Wanted) -> str:
 
 
 def _check_folders(wanted: Wanted) -> None:
-    """Whether what was named is there, before anything is measured."""
+    """Check that the named folders exist and the sequence can be read."""
     for option, path in (("--sequence", wanted.sequence), ("--run", wanted.run)):
         if path is not None and not path.is_dir():
-            why = f"{path} is no folder"
-            raise UsageError(
-                "no such folder", where=option, why=why, fix=f"name an existing one, or leave {option} out"
-            )
+            fix = f"name an existing one, or leave {option} out"
+            raise UsageError("no such folder", where=option, why=f"{path} is no folder", fix=fix)
     if wanted.sequence is not None:
-        read(wanted.sequence)  # its own errors are the right ones
+        read(wanted.sequence)  # raises its own errors
 
 
 def _check_file(path: Path) -> None:
-    """Whether the JSON can be written, before anything is measured; what is there stays as it is."""
+    """Check that the JSON can be written, without changing an existing file."""
     fix = "choose another --json"
     if path.is_dir():
         raise UsageError("not a file", where=path, why="--json names a folder", fix=fix)
     if not path.absolute().parent.is_dir() or not os.access(path.absolute().parent, os.W_OK):
         why = "its folder does not exist, or nothing may be written there"
         raise UsageError("cannot write", where=path, why=why, fix=fix)
-
-
-@contextmanager
-def _folder() -> Iterator[Path]:
-    with tempfile.TemporaryDirectory(prefix="gftorf-bench-") as folder:
-        yield Path(folder)

@@ -1,7 +1,7 @@
-"""A whole reconstruction in a process of its own, twice: with an empty kernel cache and with the one that left.
+"""A whole reconstruction in its own process, twice: with an empty kernel cache, then with the filled one.
 
-What a person waits for: from the start of the process to its end, start-up of libraries and loading of data included,
-and what config.json calls ``seconds_reconstruct``. N, d and d_ToF are read from metrics.jsonl and diagnostics.jsonl.
+Wall clock of the process, imports and reading of data included, and ``seconds_reconstruct`` of config.json. N, d and
+d_ToF are read from metrics.jsonl and diagnostics.jsonl.
 """
 
 from __future__ import annotations
@@ -23,28 +23,28 @@ from ..data import ftorf
 from ..data.flow import compute_flow
 from ..data.read import read, read_truth
 from ..errors import GftorfError, ResourceError
+from ..evaluate.compare import rows_of
 from .timing import Report, lines_of
 
 IMAGES = {"cpu": 4_000, "other": 20_000}
 QUICK_IMAGES = 24
-POLL_S = 0.2  # [s] between two looks at how far the process is
-PACKAGE = Path(__file__).parents[2]  # where the package lies, installed or not
+POLL_S = 0.2  # [s] interval of progress updates
+PACKAGE = Path(__file__).parents[2]  # on the path of the other process
 KEYS = ("d_mse_x100", "d_tof_mse_x100", "moving.d_mse_x100", "moving.d_tof_mse_x100")
 
 
 def with_flow(path: Path, out: Path) -> tuple[Path, float]:
-    """The sequence with its optical flow in its folder, and the seconds that computing it took.
+    """A copy of the sequence with its optical flow, and the time [s] of computing it.
 
-    Sequences that have flow, or cannot (phasors), stay where they are.
+    Sequences that have flow, or phasors, are returned as they are.
     """
     sequence = read(path)
     if sequence.flow.forward or sequence.flow.backward or sequence.from_phasors:
         return path, 0.0
     begun = time.perf_counter()
-    flow = compute_flow(sequence)
+    with_flow = replace(sequence, flow=compute_flow(sequence))
     seconds = time.perf_counter() - begun
-    found = replace(sequence, flow=flow)
-    return ftorf.write(out, found, read_truth(sequence)), seconds
+    return ftorf.write(out, with_flow, read_truth(sequence)), seconds
 
 
 def measure(
@@ -62,8 +62,8 @@ def measure(
 
     Args:
         path: Folder of the sequence.
-        folder: An empty one to work in.
-        device: Where.
+        folder: An empty folder for results.
+        device: "cpu" or a CUDA device.
         preset: Name of the preset.
         changes: Single settings.
         quick: A few images only.
@@ -95,16 +95,16 @@ def measure(
 def found_in(run: Path) -> dict[str, Any]:
     """Length, size and curves of a finished run."""
     config = json.loads((run / "config.json").read_text())
-    metrics, looks = (_lines(run / name) for name in ("metrics.jsonl", "diagnostics.jsonl"))
+    metrics, diagnostics = (rows_of(run / name) for name in ("metrics.jsonl", "diagnostics.jsonl"))
     images, seconds = [0, *(row["images"] for row in metrics)], [0.0, *(row["seconds"] for row in metrics)]
     curve = [
         {
-            "images": look["images"],
-            "seconds": float(np.interp(look["images"], images, seconds)),
-            "N": look["gaussians"],
-            **{key: look.get(key) for key in KEYS},
+            "images": row["images"],
+            "seconds": float(np.interp(row["images"], images, seconds)),
+            "N": row["gaussians"],
+            **{key: row.get(key) for key in KEYS},
         }
-        for look in looks
+        for row in diagnostics
     ]
     last = curve[-1]
     facts = {"images": config["images_optimised"], "seconds": config["seconds_reconstruct"], "N": last["N"]}
@@ -113,7 +113,7 @@ def found_in(run: Path) -> dict[str, Any]:
 
 @contextmanager
 def _running(command: list[str], cache: Path) -> Iterator[subprocess.Popen]:
-    """The command in a process of its own, with a kernel cache of its own; it does not outlive this block.
+    """Run the command in another process with its own kernel cache; terminated at the end of the block.
 
     Raises:
         ResourceError: If it fails.
@@ -132,42 +132,27 @@ def _running(command: list[str], cache: Path) -> Iterator[subprocess.Popen]:
                 process.wait()
         if process.returncode:
             errors.seek(0)
-            said = errors.read().strip().splitlines() or ["nothing"]
-            failed = f"`gftorf {command[0]}` ended with {process.returncode} and said: {' '.join(said[:3])}"
+            lines = errors.read().strip().splitlines() or ["no message"]
+            failed = f"`gftorf {command[0]}` ended with {process.returncode}: {' '.join(lines[:3])}"
             raise error_of(failed, process.returncode)
 
 
 def error_of(why: str, code: int) -> GftorfError:
-    """The error of the other process, with its exit code."""
+    """The class of error that has the exit code of the other process."""
     kinds = {kind.exit_code: kind for kind in GftorfError.__subclasses__()}
     fix = "run that command by itself, with --debug"
     return kinds.get(code, ResourceError)("the reconstruction failed", where="gftorf bench", why=why, fix=fix)
 
 
 def _reached(run: Path) -> int:
-    """Images of a run that is under way."""
-    path = run / "metrics.jsonl"
-    return max((row["images"] for row in _lines(path)), default=0) if path.exists() else 0
-
-
-def _lines(path: Path) -> list[dict[str, Any]]:
-    """The complete rows of a file of JSON lines."""
-    return [json.loads(line) for line in path.read_text().splitlines(keepends=True) if line.endswith("\n")]
+    """Optimised images of a run in progress."""
+    return max((row["images"] for row in rows_of(run / "metrics.jsonl")), default=0)
 
 
 def table(rows: list[dict[str, Any]]) -> list[str]:
     """Totals, then the warm run over time."""
-    heads = [
-        "kernel cache",
-        "images",
-        "process [s]",
-        "reconstruct [s]",
-        "N at the end",
-        "d",
-        "d_ToF",
-        "moving d",
-        "d_ToF",
-    ]
+    errors = ["d", "d_ToF", "moving d", "d_ToF"]
+    heads = ["kernel cache", "images", "process [s]", "reconstruct [s]", "N at the end", *errors]
     totals = [
         [row["kernels"], f"{row['images']:,}", f"{row['wall_s']:.2f}", f"{row['seconds']:.2f}", f"{row['N']:,}"]
         + [_number(row[key]) for key in KEYS]
@@ -175,10 +160,10 @@ def table(rows: list[dict[str, Any]]) -> list[str]:
     ]
     lines = lines_of(f"reconstruction, preset {rows[0]['preset']}: MSE x100 [m^2]", heads, totals)
     curve = [
-        [f"{look['images']:,}", f"{look['seconds']:.2f}", f"{look['N']:,}", *(_number(look[key]) for key in KEYS)]
-        for look in rows[-1]["curve"]
+        [f"{row['images']:,}", f"{row['seconds']:.2f}", f"{row['N']:,}", *(_number(row[key]) for key in KEYS)]
+        for row in rows[-1]["curve"]
     ]
-    heads = ["images", "seconds", "N", "d", "d_ToF", "moving d", "d_ToF"]
+    heads = ["images", "seconds", "N", *errors]
     return [*lines, "", *lines_of("warm, over time: MSE x100 [m^2]", heads, curve)]
 
 

@@ -1,8 +1,8 @@
-"""The renderer: every stage by itself and forward and backward in all, on two families of scenes; Warp only.
+"""The renderer: forward, forward with backward, and every stage, on two families of scenes.
 
-Two forms. *all*: quads, phasor, colour, distance, opacity and distortion, a random derivative of each. *training*: a
-field without colour, one quad of which a derivative is known, as in a step of the presets without colour. Stages are
-those that launch.py asks for, in its order, each repeated with the arguments it got there.
+Two forms. *all*: quads, phasor, colour, distance, opacity and distortion, with a random cotangent of each. *training*:
+no colour, and the cotangent of one quad only, as in a step of the presets without colour. Stages are the calls of
+launch.py in its order, each repeated with its arguments.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ COUNTS = (20_000, 50_000, 100_000, 200_000, 300_000)
 QUICK_COUNTS = (500,)
 FORMS = ("all", "training")
 WITHIN = 10  # repetitions of a stage in one graph
-ROOM = 1.3  # pairs that are reserved, over those that there are
+HEADROOM = 1.3  # pair capacity over the number of pairs
 GAUSSIANS = ("mean", "log_scale", "quaternion", "opacity_logit", "reflectivity_sh", "colour_sh")
 
 
@@ -51,14 +51,14 @@ class WarpWatch:
         wp.synchronize_device(self.device)
 
     def captured(self, function: Function) -> Function | None:
-        """A graph of the launches of a function, which has run before."""
+        """A graph of the launches of a function, whose modules are loaded."""
         with wp.ScopedCapture(device=self.device) as capture:
             function()
         return partial(wp.capture_launch, capture.graph)
 
 
 class Case:
-    """One scene in one form, ready to be rendered and differentiated."""
+    """One scene in one form with its buffers."""
 
     def __init__(self, kind: str, count: int, scale: float, opacity: float, form: str, device: wp.Device):
         """Make everything but the frame's reserve of pairs, which needs a first rendering."""
@@ -88,7 +88,7 @@ class Case:
         self.pairs = int(self.frame.total.numpy()[0])
 
     def start(self, capacity: int | None) -> None:
-        """A fresh frame with room for ``capacity`` pairs."""
+        """Buffers for ``capacity`` pairs; None: as many as needed."""
         settings = RenderSettings(near=NEAR, far=FAR, pair_capacity=capacity)
         self.frame = Frame(self.count, WIDTH, HEIGHT, settings, self.device)
         self.view = launch.uploaded(CAMERA, self.shifts, settings, self.device)
@@ -107,22 +107,19 @@ class Case:
         self.backward()
 
     def stages(self) -> dict[str, Function]:
-        """What one forward and backward pass asks of stages.py, by name and in its order, ready to be repeated."""
+        """Calls of stages.py in one forward and backward pass, by name, to be repeated."""
         calls: dict[str, list[Function]] = {}
-        with _overheard(calls):
+        with _recorded(calls):
             self.both()
 
-        def all_of(functions: list[Function]) -> Function:
-            return lambda: [function() for function in functions]
-
-        return {name: all_of(functions) for name, functions in calls.items()}
+        return {name: lambda calls=some: [call() for call in calls] for name, some in calls.items()}
 
 
 @contextlib.contextmanager
-def _overheard(calls: dict[str, list[Function]]) -> Iterator[None]:
-    """Note what launch.py asks of the stages while it runs."""
+def _recorded(calls: dict[str, list[Function]]) -> Iterator[None]:
+    """Record the calls that launch.py makes to stages.py."""
 
-    class Overheard:
+    class Recorder:
         def __getattr__(self, name: str) -> Callable[..., Any]:
             stage = getattr(stages, name)
 
@@ -132,7 +129,7 @@ def _overheard(calls: dict[str, list[Function]]) -> Iterator[None]:
 
             return call
 
-    launch.stages = Overheard()  # type: ignore[assignment]
+    launch.stages = Recorder()  # type: ignore[assignment]
     try:
         yield
     finally:
@@ -152,7 +149,7 @@ def measure(
 
     Args:
         device_name: Of Warp and torch, for example "cpu".
-        runs: How often everything is done.
+        runs: Repetitions of every timing.
         quick: Small N and one family.
         counts: Numbers of Gaussians, unless ``quick``.
         forms: Out of ``FORMS``.
@@ -166,8 +163,8 @@ def measure(
     for done, (kind, scale, opacity, count, form) in enumerate(cases, start=1):
         case = Case(kind, count, scale, opacity, form, device)
         free = timed_free(case, watch, runs)
-        if device.is_cuda:  # nothing is read back then
-            case.start(int(ROOM * case.pairs) + 1)
+        if device.is_cuda:  # no readback of the number of pairs
+            case.start(int(HEADROOM * case.pairs) + 1)
         forward, both = (both_ways(function, watch, runs) for function in (case.forward, case.both))
         parts = {name: both_ways(function, watch, runs, within=WITHIN) for name, function in case.stages().items()}
         case.frame.check_capacity()
@@ -181,7 +178,7 @@ def measure(
 
 
 def timed_free(case: Case, watch: Watch, runs: int) -> dict[str, Any] | None:
-    """Forward and backward with the number of pairs read back, as without a reserve [ms]; on a CPU it always is."""
+    """Forward and backward with readback of the number of pairs, on CUDA [ms]; a CPU always reads it."""
     if not case.device.is_cuda:
         return None
     return timed(case.both, watch, runs).plain()

@@ -1,4 +1,4 @@
-"""The two families of scenes on which the renderer is timed, and what it reads of them; Warp and NumPy only."""
+"""Two families of scenes for timing the renderer, as Warp arrays."""
 
 from __future__ import annotations
 
@@ -45,29 +45,13 @@ def volume(count: int, scale: float, opacity: float) -> dict[str, np.ndarray]:
     return scene
 
 
-def grown(count: int, scale: float, opacity: float) -> dict[str, np.ndarray]:
-    """The surface with sizes over two decades about ``scale`` [m], thirty Gaussians of half a metre and more."""
-    scene = surface(count, scale, opacity)
-    rng = np.random.default_rng(3)
-    scene["log_scale"] = math.log(scale) + 1.2 * rng.normal(size=(count, 3))
-    scene["log_scale"][:30] = np.log(rng.uniform(0.5, 4.0, (30, 3)))
-    return scene
-
-
 def scene_of(kind: str, count: int, scale: float, opacity: float) -> dict[str, np.ndarray]:
-    """A scene of one of the families.
-
-    Args:
-        kind: "surface", "volume" or "grown".
-        count: Number N of Gaussians.
-        scale: Standard deviation of each [m].
-        opacity: Of each at its peak [1].
-    """
-    return {"surface": surface, "volume": volume, "grown": grown}[kind](count, scale, opacity)
+    """A scene of the family "surface" or "volume": ``count`` Gaussians of one scale [m] and peak opacity [1]."""
+    return {"surface": surface, "volume": volume}[kind](count, scale, opacity)
 
 
 def inputs_of(scene: dict[str, np.ndarray], device: str | wp.Device, *, colour: bool = True) -> Inputs:
-    """The scene as Warp arrays, seen by a sensor with depth_range 15 m, with or without colour."""
+    """The scene as Warp arrays, with the calibration of a sensor with depth_range 15 m."""
     rgb = array_of(_constant(scene["colour"].T).transpose(1, 2, 0), device, wp.vec3) if colour else None
     return Inputs(
         mean=array_of(scene["mean"], device, wp.vec3),
@@ -86,7 +70,7 @@ def array_of(value, device: str | wp.Device, dtype=float) -> wp.array:
 
 
 def _constant(value: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n 16"]:
-    """Harmonics that give ``value`` in every direction."""
+    """Spherical harmonics that are ``value`` in every direction."""
     coefficients = np.zeros((*value.shape, SH_COEFFICIENTS), dtype=np.float32)
     coefficients[..., 0] = (value.astype(np.float32) - SH_BIAS) / SH_Y0
     return coefficients

@@ -1,7 +1,7 @@
-"""What a step and a rendering are timed on without an earlier run: a simulated scene, and Gaussians that look fitted.
+"""States for timing steps and renderings without an earlier run: a simulated scene, Gaussians from measured phase.
 
-The scene slides past a camera at rest. Gaussians start from its measured phase, as many as are left of the published
-start after its first reset of opacities (19 to 21 thousand), and a network moves them, as published.
+The scene slides past a static camera. The number of Gaussians is that of the published initialisation after its first
+opacity reset (19 to 21 thousand); a network moves them, as published.
 """
 
 from __future__ import annotations
@@ -28,24 +28,24 @@ from ..sim.simulate import simulate
 SCENE = "sliding"
 FRAMES, SIZE = 60, (320, 240)
 QUICK_FRAMES, QUICK_SIZE = 12, (64, 48)
-COUNT = (19_000, 21_000)  # Gaussians that are left of the published start [Gaussians]
+COUNT = (19_000, 21_000)  # least and largest number of Gaussians
 QUICK_COUNT = (700, 900)
-TRIES = 8  # at a spacing that gives so many
-REACHED = 5_000  # images that count as optimised: past the warm-up, before the freeze
+TRIES = 8  # to find a spacing that gives so many
+REACHED = 5_000  # optimised images of the state: after the warm-up, before motion freezes
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Fitted:
-    """An optimisation in its middle."""
+    """State of an optimisation in progress."""
 
     observations: Observations
-    """What is compared."""
+    """The prepared sequence."""
     settings: ReconSettings
-    """Without rounds and resets."""
+    """Without densification and opacity resets."""
     stored: dict
-    """The state, as a checkpoint holds it, on the device."""
+    """The state as a checkpoint, on the device."""
     sequence: Sequence
-    """As it was read."""
+    """The sequence as read."""
 
     @property
     def gaussians(self) -> int:
@@ -61,7 +61,7 @@ def simulated(path: Path, *, quick: bool) -> Path:
 
 
 def settings_of(sequence: Sequence, preset: str, changes: list[str], device: str) -> ReconSettings:
-    """A preset, changed, that neither adds nor removes nor dims Gaussians."""
+    """A preset with changes, without densification and opacity resets."""
     found = input_of(sequence, Input.AUTO)
     recorded = presets.Recorded(input=found, unambiguous_range=unambiguous_range(sequence))
     settings = changed(presets.preset(preset, recorded), changes, CHANGES)
@@ -87,7 +87,7 @@ def from_run(run: Path | None, sequence: Sequence, settings: ReconSettings, devi
 
 
 def from_phase(sequence: Sequence, settings: ReconSettings, device: str, *, quick: bool) -> Fitted:
-    """Gaussians from measured phase, 19 to 21 thousand of them, with the motion of the settings."""
+    """19 to 21 thousand Gaussians from measured phase, with the motion of the settings."""
     low, high = QUICK_COUNT if quick else COUNT
     observations = observe(sequence, settings, device)
     init = replace(InitSettings(), kind=Init.PHASE)
@@ -108,28 +108,28 @@ def from_phase(sequence: Sequence, settings: ReconSettings, device: str, *, quic
 
 def pairs_of(fitted: Fitted) -> int:
     """(tile, splat) pairs of the state in the middle of the sequence, at the size of the optimisation."""
-    seen, device = fitted.observations, fitted.observations.quads.device
-    middle = seen.sequence.frames // 2
-    camera = seen.cameras[middle]
-    field, motion, attachment = field_and_motion(fitted.stored, device)
-    replay = Replay(field, motion, attachment, seen.sensor, fitted.settings.render, camera)
-    replay(seen.time_at(middle), camera)
+    observations = fitted.observations
+    middle = observations.sequence.frames // 2
+    camera = observations.cameras[middle]
+    gaussians = field_and_motion(fitted.stored, observations.quads.device)
+    replay = Replay(*gaussians, observations.sensor, fitted.settings.render, camera)
+    replay(observations.time_at(middle), camera)
     return replay.largest
 
 
 def as_run(fitted: Fitted, path: Path, device: torch.device | str) -> Path:
     """The state as the folder of a run, which ``Run.open`` reads."""
-    seen = fitted.observations
+    observations = fitted.observations
     config = config_of(fitted.sequence, fitted.settings, seed=0, device=device)
     config |= {
         "flow": None,
         "changes": [],
-        "quad_scale": seen.quad_scale,
-        "quad_scale_source": seen.quad_scale_source,
-        "flow_source": seen.flow_source,
-        "input": str(Input.PHASOR if seen.phasors else Input.QUADS),
-        "colour_scale": seen.colour_scale,
-        "size_optimised": [seen.sequence.width, seen.sequence.height],
+        "quad_scale": observations.quad_scale,
+        "quad_scale_source": observations.quad_scale_source,
+        "flow_source": observations.flow_source,
+        "input": str(Input.PHASOR if observations.phasors else Input.QUADS),
+        "colour_scale": observations.colour_scale,
+        "size_optimised": [observations.sequence.width, observations.sequence.height],
     }
     path.mkdir(parents=True, exist_ok=True)
     folder.write_config(path, config)

@@ -1,4 +1,4 @@
-"""How long things take: repeated, warmed up, by the clock of the device where it has one; medians and percentiles."""
+"""Repeated timings after a warm-up, by device events on CUDA; medians and percentiles."""
 
 from __future__ import annotations
 
@@ -13,39 +13,39 @@ import numpy as np
 import torch
 
 LOG = logging.getLogger("gftorf_warp")
-WARM_UP = 3  # runs before the first that counts: kernels are loaded, memory is found
+WARM_UP = 3  # runs before the first timing, which load kernels and allocate
 Function = Callable[[], object]
 Report = Callable[..., None]
 
 
 class Watch(Protocol):
-    """A clock of one device, and the graphs of the library that works on it."""
+    """Clock and graphs of one device."""
 
     def mark(self) -> Any:
-        """A moment in the order of what was asked for."""
+        """A time stamp in stream order."""
 
     def between(self, start: Any, stop: Any) -> float:
-        """Milliseconds between two moments; waits for the second."""
+        """Milliseconds between two time stamps; waits for the second."""
 
     def synchronise(self) -> None:
-        """Wait until everything that was asked for is done."""
+        """Wait for the device."""
 
     def captured(self, function: Function) -> Function | None:
-        """The work of a function as something that replays it; None where there are no graphs."""
+        """A function that replays the graph of another; None on a CPU."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Timing:
-    """Milliseconds of one thing over its runs."""
+    """Statistics of repeated timings."""
 
     median: float
-    """Half of the runs are faster [ms]."""
+    """[ms]"""
     p10: float
-    """A tenth of the runs is faster [ms]."""
+    """10th percentile [ms]."""
     p90: float
-    """A tenth of the runs is slower [ms]."""
+    """90th percentile [ms]."""
     runs: int
-    """How often it was done."""
+    """Number of repetitions."""
 
     @classmethod
     def of(cls, times: list[float]) -> Timing:
@@ -54,7 +54,7 @@ class Timing:
         return cls(median=median, p10=p10, p90=p90, runs=len(times))
 
     def over(self, count: int) -> Timing:
-        """Of one, where each run did ``count``."""
+        """Per item, where each run had ``count`` items."""
         return Timing(median=self.median / count, p10=self.p10 / count, p90=self.p90 / count, runs=self.runs)
 
     def plain(self) -> dict[str, float | int]:
@@ -63,7 +63,7 @@ class Timing:
 
 
 class HostWatch:
-    """The clock of the processor; on a CPU, what was asked for is done when the call returns."""
+    """The clock of the host, where calls are synchronous."""
 
     def mark(self) -> float:
         """Now [s]."""
@@ -112,7 +112,7 @@ class TorchWatch:
         self.module.current_stream().wait_stream(side)
         graph = self.module.CUDAGraph()
         with self.module.graph(graph):
-            kept = function()  # results live in the graph's memory as long as the function that replays it
+            kept = function()  # keeps the graph's memory
 
         def replay() -> object:
             graph.replay()
@@ -122,16 +122,16 @@ class TorchWatch:
 
 
 def quietly(done: int, total: int, **values: object) -> None:
-    """A report that says nothing."""
+    """A progress callback that does nothing."""
 
 
 def watch_of(device: torch.device | str) -> Watch:
-    """The clock for work that torch asks for."""
+    """The clock of torch's device."""
     return HostWatch() if torch.device(device).type == "cpu" else TorchWatch(device)
 
 
 def timed(function: Function, watch: Watch, runs: int, *, warm_up: int = WARM_UP) -> Timing:
-    """Time of one call, over so many calls that count."""
+    """Times of single calls, after ``warm_up`` calls; without garbage collection."""
     for _ in range(warm_up):
         function()
     watch.synchronise()
@@ -139,7 +139,7 @@ def timed(function: Function, watch: Watch, runs: int, *, warm_up: int = WARM_UP
     gc.disable()
     try:
         marks = []
-        for _ in range(runs):  # nothing waits in between: an idle device would count the host's way to it
+        for _ in range(runs):  # without synchronisation, so that launch latency is hidden
             start = watch.mark()
             function()
             marks.append((start, watch.mark()))
@@ -153,9 +153,8 @@ def timed(function: Function, watch: Watch, runs: int, *, warm_up: int = WARM_UP
 def both_ways(function: Function, watch: Watch, runs: int, *, within: int = 1) -> dict[str, Any]:
     """``eager``: called from Python; ``graph``: replayed, None where there are no graphs.
 
-    A graph holds the function ``within`` times, and times are those of one: what takes a few microseconds is not
-    measured by launching a graph, which takes as long. What a library cannot capture is reported under ``graph_error``
-    and in the log, and the table goes on.
+    A graph holds the function ``within`` times, and times are per call: launching a graph takes some microseconds
+    itself. A failed capture is reported under ``graph_error`` and in the log.
     """
     found: dict[str, Any] = {"eager": timed(function, watch, runs).plain(), "graph": None}
     try:
@@ -177,7 +176,7 @@ def cell(timing: dict[str, Any] | None) -> str:
 
 
 def lines_of(title: str, heads: list[str], rows: list[list[str]]) -> list[str]:
-    """A table as lines of text, columns as wide as they need to be; the first one to the left."""
+    """A table as lines of text; the first column is left-aligned."""
     widths = [max(len(row[k]) for row in [heads, *rows]) for k in range(len(heads))]
 
     def line(row: list[str]) -> str:
