@@ -2,38 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Protocol, runtime_checkable
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
-
-
-@runtime_checkable
-class Encoder(Protocol):
-    """Encodes positions of Gaussians."""
-
-    def encode(
-        self, mean: Float[Tensor, "N 3"], length: float, powers: Float[Tensor, "f"], *, columns: int, dtype: torch.dtype
-    ) -> Float[Tensor, "N columns"]:
-        """gamma(x) of positions over a length, without gradient.
-
-        Args:
-            mean: Where Gaussians are [m].
-            length: What positions are divided by [m].
-            powers: 2^0, 2^1, ..
-            columns: Length of a row, zeros at its end.
-            dtype: Of the result; computed in the precision of the positions, and rounded at the end.
-        """
-        ...
-
-
-class Waves:
-    """Encodes as torch does, in several passes over memory."""
-
-    def encode(self, mean: Tensor, length: float, powers: Tensor, *, columns: int, dtype: torch.dtype) -> Tensor:
-        """As the protocol says."""
-        return encoded(mean.detach() / length, powers, columns=columns, dtype=dtype)
 
 
 def powers_of_two(count: int) -> Float[Tensor, "f"]:

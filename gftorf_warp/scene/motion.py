@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import abc
 import bisect
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
@@ -27,6 +28,7 @@ from torch import Tensor
 
 from .gaussians import GaussianField
 
+LOG = logging.getLogger("gftorf_warp")
 NODE_FELLOWS = 8  # nearest points whose median displacement is the initial displacement of a node
 
 
@@ -35,10 +37,16 @@ class Products(StrEnum):
 
     FLOAT32 = "float32"
     """The reference."""
-    TF32 = "tf32"
-    """On CUDA factors rounded to 11 bits, sums in float32: a fraction of the time; offsets differ by a thousandth."""
     HALF = "half"
     """Factors and activations in float16 on any device, sums and parameters in float32: the fastest on CUDA."""
+
+    @classmethod
+    def _missing_(cls, value: object) -> Products | None:
+        """TF32, which earlier versions had, is read as float32."""
+        if value != "tf32":
+            return None
+        LOG.warning("products = tf32 is no longer supported: the motion network is computed in float32")
+        return cls.FLOAT32
 
 
 @dataclass(frozen=True, kw_only=True)

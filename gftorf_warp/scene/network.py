@@ -8,21 +8,33 @@ the first raw frame to 1 at the last. The encoded input is joined to the output 
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict, replace
+from collections.abc import Sequence
+from dataclasses import asdict
 from typing import Any
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from .encoding import Encoder, Waves, encoded, encoded_size, powers_of_two
+from .encoding import encoded, encoded_size, powers_of_two
 from .gaussians import GaussianField
 from .motion import KeyMotion, Motion, MotionSettings, MotionStart, Products, rows_of
-from .perceptron import Form, Passes, Stacked
 
 HEAD_DEVIATION = 1e-5  # of the weights of the last layer: motion starts at rest, to a hundredth of a millimetre
+
+
+class Backend(Protocol):
+    """Computes a network in another way; ``render.network`` has those for half precision."""
+
+    def encode(self, network: Network, mean: Float[Tensor, "N 3"]) -> Float[Tensor, "N p"]:
+        """gamma(x) of positions [m], without gradient."""
+        ...
+
+    def offsets(
+        self, network: Network, attachment: Float[Tensor, "N p"], moment: Float[Tensor, "k t"]
+    ) -> Float[Tensor, "k N 3"]:
+        """Displacements [m] at times given as gamma(t), differentiable in the parameters."""
+        ...
 
 
 class Network(Motion):
@@ -64,14 +76,13 @@ class Network(Motion):
         self.register_buffer("rounded", times.float(), persistent=False)
         self.register_buffer("powers", powers_of_two(settings.position_frequencies), persistent=False)
         self._inputs = (encoded_size(3, settings.position_frequencies), encoded_size(1, settings.time_frequencies))
+        self.backend: Backend | None = None
+        """Computes the network in half precision; None: torch, in the precision of the parameters."""
         joined, width = sum(self._inputs), settings.width
         sizes = [joined] + [width] * (settings.layers - 1)
         again = settings.skip_after if settings.skip_after < settings.layers else None
         if again is not None:
             sizes[again] += joined
-        place, moment = self._inputs
-        self._form = Form(place=place, moment=moment, width=width, joined=again, dtype=torch.float16)
-        self._encoder: Encoder = Waves()
         self._layers = [torch.nn.Linear(size, width) for size in sizes]
         self.layers = torch.nn.ModuleList(self._layers)
         self.head = torch.nn.Linear(width, 3)
@@ -96,25 +107,12 @@ class Network(Motion):
             layer.weight.copy_(drawn)
             layer.bias.zero_()
 
-    @property
-    def form(self) -> Form:
-        """Sizes of the perceptron in half precision."""
-        return self._form
-
-    def go_by(self, passes: Passes) -> None:
-        """Let somebody else take rows through the layers where products are of halves, to the same results.
-
-        Who is an :class:`Encoder` as well encodes the positions for them.
-        """
-        self._form = replace(self._form, passes=passes)
-        self._encoder = passes if isinstance(passes, Encoder) else Waves()
-
     def attach(self, field: GaussianField) -> Float[Tensor, "N p"]:
-        """gamma(x) of the positions at which it is asked, without gradient, in the precision of the products [1]."""
-        mean, form = field.mean.detach(), self._form
-        if self.settings.products != Products.HALF:
-            return encoded(mean / self.length, self.powers)
-        return self._encoder.encode(mean, self.length, self.powers, columns=form.columns, dtype=form.dtype)
+        """gamma(x) of the positions, without gradient [1]."""
+        mean = field.mean.detach()
+        if self.backend is not None:
+            return self.backend.encode(self, mean)
+        return encoded(mean / self.length, self.powers)
 
     def at_keys(self, attachment: Float[Tensor, "N p"], keys: Sequence[int] | Int[Tensor, "K"]) -> KeyMotion:
         """Displacements, without rotation."""
@@ -143,10 +141,8 @@ class Network(Motion):
         one vector, added like a bias.
         """
         moment = moment.to(self.head.weight)
-        if self.settings.products == Products.HALF:
-            layers = [*self._layers, self.head]
-            parameters = [value for layer in layers for value in (layer.weight, layer.bias)]
-            return Stacked.apply(self._form, attachment, moment, *parameters)
+        if self.backend is not None:
+            return self.backend.offsets(self, attachment, moment)
         hidden = self._joined(self._layers[0], None, attachment, moment)
         for number, layer in enumerate(self._layers[1:], start=1):
             hidden = torch.relu(hidden)
@@ -154,14 +150,8 @@ class Network(Motion):
             if skip:
                 hidden = self._joined(layer, hidden, attachment, moment)
             else:
-                hidden = self._product(hidden, layer.weight) + layer.bias
-        return self._product(torch.relu(hidden), self.head.weight) + self.head.bias
-
-    def _product(self, rows: Float[Tensor, "*n i"], weight: Float[Tensor, "o i"]) -> Float[Tensor, "*n o"]:
-        """Product of rows with the transposed weight."""
-        if self.settings.products == Products.TF32 and rows.is_cuda:
-            return Rounded.apply(rows, weight)
-        return rows @ weight.T
+                hidden = hidden @ layer.weight.T + layer.bias
+        return torch.relu(hidden) @ self.head.weight.T + self.head.bias
 
     def _joined(
         self, layer: torch.nn.Linear, hidden: Tensor | None, place: Float[Tensor, "N p"], moment: Float[Tensor, "k t"]
@@ -170,38 +160,5 @@ class Network(Motion):
         weight, first = layer.weight, 0 if hidden is None else self.settings.width
         at_place, at_moment = weight[:, first:].split(self._inputs, dim=1)
         own = moment @ at_moment.T + layer.bias
-        out = self._product(place, at_place) + own[:, None]
-        return out if hidden is None else out + self._product(hidden, weight[:, :first])
-
-
-class Rounded(torch.autograd.Function):
-    """rows weight^T with factors rounded to TF32 on CUDA, in the gradient as well."""
-
-    @staticmethod
-    def forward(context, rows: Tensor, weight: Tensor) -> Tensor:
-        """The product."""
-        context.save_for_backward(rows, weight)
-        with _tf32():
-            return rows @ weight.T
-
-    @staticmethod
-    def backward(context, gradient: Tensor) -> tuple[Tensor | None, Tensor | None]:
-        """Gradients of both factors, where they are wanted."""
-        rows, weight = context.saved_tensors
-        with _tf32():
-            of_rows = gradient @ weight if context.needs_input_grad[0] else None
-            of_weight = None
-            if context.needs_input_grad[1]:
-                of_weight = gradient.flatten(0, -2).T @ rows.flatten(0, -2)
-        return of_rows, of_weight
-
-
-@contextlib.contextmanager
-def _tf32() -> Iterator[None]:
-    """Lets torch round the factors of matrix products on CUDA; other code, the similarity above all, must not."""
-    before = torch.get_float32_matmul_precision()
-    torch.set_float32_matmul_precision("high")
-    try:
-        yield
-    finally:
-        torch.set_float32_matmul_precision(before)
+        out = place @ at_place.T + own[:, None]
+        return out if hidden is None else out + hidden @ weight[:, :first].T

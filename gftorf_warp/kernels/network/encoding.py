@@ -18,7 +18,7 @@ def encode(
     length: float,  # what they are divided by [m]
     powers: wp.array[float],  # [F] 2^0, 2^1, .. [1]
     # Out:
-    place: wp.array2d[wp.float16],  # [N, columns] gamma(x) [1], zeros behind it
+    position: wp.array2d[wp.float16],  # [N, columns] gamma(x) [1], zeros behind it
 ):
     """One thread per sine and cosine of an argument, neighbours side by side; the last of a row has what is none."""
     lanes = 3 * powers.shape[0] + 1
@@ -26,11 +26,11 @@ def encode(
     wave = wp.tid() % lanes
     if wave == lanes - 1:
         for i in range(3):
-            place[n, i] = wp.float16(mean[n, i] / length)
-        for i in range(3 + 6 * powers.shape[0], place.shape[1]):
-            place[n, i] = wp.float16(0.0)
+            position[n, i] = wp.float16(mean[n, i] / length)
+        for i in range(3 + 6 * powers.shape[0], position.shape[1]):
+            position[n, i] = wp.float16(0.0)
         return
     column = 3 + wave // 3 * 6 + wave % 3
     angle = mean[n, wave % 3] / length * powers[wave // 3]
-    place[n, column] = wp.float16(wp.sin(angle))
-    place[n, column + 3] = wp.float16(wp.cos(angle))
+    position[n, column] = wp.float16(wp.sin(angle))
+    position[n, column + 3] = wp.float16(wp.cos(angle))

@@ -72,9 +72,9 @@ def count_block(gradient: wp.array2d[float], count: int, block: int, counts: wp.
     const bool listed_ = has(key, low);
     const unsigned others = __ballot_sync(0xffffffffu, listed_);
     over_block(lane == 0 ? __popc(others) : 0);
-    int place = begin + before + __popc(others & ((1u << lane) - 1u));
-    for (int n = 0; n < warp; ++n) place += of_warps[n];
-    if (listed_) listed.data[place] = key * count + low;
+    int position = begin + before + __popc(others & ((1u << lane) - 1u));
+    for (int n = 0; n < warp; ++n) position += of_warps[n];
+    if (listed_) listed.data[position] = key * count + low;
     const bool writes_ends = own == blocks - 1;
     const int thread = threadIdx.x, threads = {BLOCK};
 #else
@@ -84,9 +84,9 @@ def count_block(gradient: wp.array2d[float], count: int, block: int, counts: wp.
         if (other < key) begin += whole(sum);
         else before = sum;
     }}
-    int place = begin + before;
+    int position = begin + before;
     for (int n = own * {BLOCK}; n < (own + 1) * {BLOCK}; ++n)
-        if (has(key, n)) listed.data[place++] = key * count + n;
+        if (has(key, n)) listed.data[position++] = key * count + n;
     const bool writes_ends = own == blocks - 1;
     const int thread = 0, threads = 1;
 #endif
@@ -105,7 +105,7 @@ def list_block(
     listed: wp.array[wp.int32],
     begins: wp.array[wp.int32],
 ):
-    """Rows of a block that have a gradient go to their places; behind a key's last ones there are none."""
+    """Write the rows of a block that have a gradient in order, and ``NO_ROW`` behind the last one of a key."""
 
 
 @wp.kernel(enable_backward=False, grid_stride=False)

@@ -129,9 +129,9 @@ def collect(
     unit: wp.array[float],  # [1] what everything but the bias of the head is in
     sums: wp.array3d[float],  # [layers, k, WIDTH] of slopes over rows
     head_sum: wp.array[float],  # [VALUES] of gradients at the head
-    moment: wp.array2d[float],  # [k, t] gamma(t)
+    time: wp.array2d[float],  # [k, t] gamma(t)
     of_outputs: wp.array3d[float],  # [parts, jobs, HALF WIDTH] of ``multiply_outputs``
-    of_places: wp.array3d[float],  # [parts, jobs, HALF COLUMNS] of ``multiply_places``
+    of_places: wp.array3d[float],  # [parts, jobs, HALF COLUMNS] of ``multiply_positions``
     of_head: wp.array3d[float],  # [parts, 1, VALUES WIDTH] of ``multiply_head``
     # Out:
     gradients: wp.array[float],  # [P] of all layers and the head
@@ -160,12 +160,12 @@ def collect(
         total = total_of(of_head, 0, n * WIDTH + input)
     elif own < 0:
         total = total_of(of_outputs, (number - 1) * HALVES + n // HALF, n % HALF * WIDTH + input)
-    elif own < form.place:
+    elif own < form.position:
         job = n // HALF
         if number > 0:
             job += HALVES
         total = total_of(of_places, job, n % HALF * COLUMNS + own)
     else:
         for key in range(sums.shape[1]):
-            total += sums[number, key, n] * moment[key, own - form.place]
+            total += sums[number, key, n] * time[key, own - form.position]
     gradients[at] = total * unit[0]

@@ -6,7 +6,7 @@ order in which tensor cores read them, what a layer makes of gamma(t) added to i
 
 import warp as wp
 
-from .wgmma import BLOCK, PART, SHARED, TILE, VALUES, WIDTH, listed_backward, rows_backward, rows_forward
+from .wgmma import BLOCK, PART, SHARED, TILE, VALUES, WIDTH, listed_backward, rows_forward
 
 UNIT = wp.constant(8)  # halves of 16 bytes
 _FOURS = wp.constant(SHARED // 16)
@@ -23,8 +23,8 @@ class Layers:
 
     layers: int  # without the head
     joined: int  # number of the layer that gamma(x) and gamma(t) enter again; -1: none
-    place: int  # values of gamma(x)
-    moment: int  # values of gamma(t)
+    position: int  # values of gamma(x)
+    time: int  # values of gamma(t)
 
 
 @wp.func
@@ -40,7 +40,7 @@ def inputs_of(form: Layers, number: int) -> int:
     if number == 0:
         inputs = 0
     if enters(form, number):
-        inputs += form.place + form.moment
+        inputs += form.position + form.time
     return inputs
 
 
@@ -49,24 +49,24 @@ def weight_of(form: Layers, number: int) -> int:
     """Where the weight of a layer begins."""
     at = number * (WIDTH * WIDTH + WIDTH)
     if number > 0:
-        at += WIDTH * (form.place + form.moment - WIDTH)
+        at += WIDTH * (form.position + form.time - WIDTH)
     if form.joined >= 0 and number > form.joined:
-        at += WIDTH * (form.place + form.moment)
+        at += WIDTH * (form.position + form.time)
     return at
 
 
 @wp.func
 def shift_of(
-    form: Layers, parameters: wp.array[float], moment: wp.array2d[float], number: int, key: int, n: int
+    form: Layers, parameters: wp.array[float], time: wp.array2d[float], number: int, key: int, n: int
 ) -> float:
     """What is added to output ``n`` of a layer at a key: its bias, and what gamma(t) makes of the weight."""
     inputs = inputs_of(form, number)
     at = weight_of(form, number)
     total = parameters[at + inputs * WIDTH + n]
     if enters(form, number):
-        row = at + (n + 1) * inputs - form.moment
-        for k in range(form.moment):
-            total += parameters[row + k] * moment[key, k]
+        row = at + (n + 1) * inputs - form.time
+        for k in range(form.time):
+            total += parameters[row + k] * time[key, k]
     return total
 
 
@@ -75,7 +75,7 @@ def pack(
     # In:
     form: Layers,  # sizes [1]
     parameters: wp.array[float],  # [P] of all layers and the head
-    moment: wp.array2d[float],  # [k, t] gamma(t)
+    time: wp.array2d[float],  # [k, t] gamma(t)
     # Out:
     forth: wp.array[wp.float16],  # [4 PART ..] of all layers
     back: wp.array[wp.float16],  # [4 PART ..] of all but the first, last one first, transposed, without gamma(x)
@@ -91,9 +91,9 @@ def pack(
     if at >= forth.shape[0] + back.shape[0] + head.shape[0]:
         own = (at - forth.shape[0] - back.shape[0] - head.shape[0]) // UNIT
         n = own % WIDTH
-        key = own // WIDTH % moment.shape[0]
-        number = own // (WIDTH * moment.shape[0])
-        shifts[number, key, n] = shift_of(form, parameters, moment, number, key, n)
+        key = own // WIDTH % time.shape[0]
+        number = own // (WIDTH * time.shape[0])
+        shifts[number, key, n] = shift_of(form, parameters, time, number, key, n)
         return
     if at >= forth.shape[0] + back.shape[0]:
         at -= forth.shape[0] + back.shape[0]
@@ -146,7 +146,7 @@ def forward(
     # In:
     form: Layers,  # sizes [1]
     keys: int,  # how many [1]
-    place: wp.array2d[wp.float16],  # [N, COLUMNS] gamma(x)
+    position: wp.array2d[wp.float16],  # [N, COLUMNS] gamma(x)
     forth: wp.array[wp.float16],  # [4 PART ..] of ``pack``
     shifts: wp.array3d[float],  # [layers, k, WIDTH]
     # Out:
@@ -155,31 +155,11 @@ def forward(
 ):
     """From gamma(x) to the output of the last layer, at all keys."""
     wp.tile_zeros(shape=(_FOURS,), dtype=wp.vec4, storage="shared")  # how Warp is told of shared memory
-    rows_forward(form.layers, form.joined, keys, place.shape[0], place, forth, shifts, outputs, masks)
+    rows_forward(form.layers, form.joined, keys, position.shape[0], position, forth, shifts, outputs, masks)
 
 
 @wp.kernel(enable_backward=False, grid_stride=False, launch_bounds=(BLOCK, 1), module="unique")
 def backward(
-    # In:
-    form: Layers,  # sizes [1]
-    keys: int,  # how many [1]
-    after: wp.array2d[wp.float16],  # [k N, HEAD] gradient at the head
-    head: wp.array2d[float],  # [VALUES, WIDTH] its weight
-    back: wp.array[wp.float16],  # [4 PART ..] of ``pack``
-    outputs: wp.array3d[wp.float16],  # [layers, k N, WIDTH] of ``forward``
-    masks: wp.array[wp.int32],  # [``mask_words``] of ``forward``
-    # Out:
-    slopes: wp.array3d[wp.float16],  # [layers, k N, WIDTH] gradient before every ReLU
-    partials: wp.array4d[float],  # [layers, k, GROUPS blocks, WIDTH] added to: sums of slopes over rows
-):
-    """From the gradient at the head to those of all layers."""
-    wp.tile_zeros(shape=(_FOURS,), dtype=wp.vec4, storage="shared")
-    rows = outputs.shape[1] // keys
-    rows_backward(form.layers, form.joined, keys, rows, after, head, back, outputs, masks, slopes, partials)
-
-
-@wp.kernel(enable_backward=False, grid_stride=False, launch_bounds=(BLOCK, 1), module="unique")
-def backward_listed(
     # In:
     form: Layers,  # sizes [1]
     keys: int,  # how many [1]
@@ -194,7 +174,7 @@ def backward_listed(
     slopes: wp.array3d[wp.float16],  # [layers, capacity, WIDTH] of the listed rows, as they are listed; 0 for no row
     partials: wp.array4d[float],  # [layers, k, GROUPS blocks, WIDTH] added to: sums of slopes over rows
 ):
-    """As ``backward``, for listed rows; behind the last of them slopes are not written."""
+    """From the gradient at the head to those of all layers, of listed rows; nothing is written behind the last one."""
     wp.tile_zeros(shape=(_FOURS,), dtype=wp.vec4, storage="shared")
     rows = outputs.shape[1] // keys
     listed_backward(

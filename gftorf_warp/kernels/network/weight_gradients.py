@@ -174,7 +174,7 @@ def by_outputs(
 
 
 @wp.func_native(_snippet(COLUMNS, f"job / {HALVES} ? joined : 0", "0", "row % count"))
-def by_places(
+def by_positions(
     block: int,
     jobs: int,
     parts: int,
@@ -212,7 +212,7 @@ def multiply_outputs(
 
 
 @wp.kernel(enable_backward=False, grid_stride=False, launch_bounds=(BLOCK, 2), module="unique")
-def multiply_places(
+def multiply_positions(
     # In:
     threads: int,  # of a block; one on a CPU [1]
     keys: int,  # how many [1]
@@ -220,7 +220,7 @@ def multiply_places(
     begins: wp.array[wp.int32],  # [k + 1] the same
     joined: int,  # number of the layer that gamma(x) enters again [1]
     slopes: wp.array3d[wp.float16],  # [layers, capacity, WIDTH] of listed rows
-    place: wp.array2d[wp.float16],  # [N, COLUMNS] gamma(x)
+    position: wp.array2d[wp.float16],  # [N, COLUMNS] gamma(x)
     # Out:
     partials: wp.array3d[float],  # [parts, entries HALVES, HALF COLUMNS] weight gradients by parts of the list
 ):
@@ -228,7 +228,7 @@ def multiply_places(
     wp.tile_zeros(shape=(wp.static(shared(COLUMNS) // 16),), dtype=wp.vec4, storage="shared")
     jobs = partials.shape[1]
     block = wp.tid() // threads
-    count = place.shape[0]
-    by_places(
-        block, jobs, partials.shape[0], keys, count, slopes.shape[1], joined, listed, begins, slopes, place, partials
+    count = position.shape[0]
+    by_positions(
+        block, jobs, partials.shape[0], keys, count, slopes.shape[1], joined, listed, begins, slopes, position, partials
     )

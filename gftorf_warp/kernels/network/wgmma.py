@@ -35,7 +35,7 @@ _KEPT = " ".join(f'asm volatile("" : "+f"(sums[{n}]) :: "memory");' for n in ran
 
 
 def _multiply(add: int) -> str:
-    """C++: 16 inputs of 64 rows times 256 outputs, added to ``sums`` or in their place."""
+    """C++: 16 inputs of 64 rows times 256 outputs, added to ``sums`` replacing them."""
     return f"""asm volatile("{{ .reg .pred p; setp.ne.b32 p, {add}, 0; "
             "wgmma.mma_async.sync.aligned.m64n256k16.f32.f16.f16 "
             "{{{_SUMS}}}, {{%128, %129, %130, %131}}, %132, p, 1, 1, 0; }}"
@@ -85,13 +85,13 @@ _CUDA = f"""
         {_multiply(1)}
     }};
     // 16 inputs of rows g and g + 8 of this warp at a time; those of two are eight neighbours of both rows
-    auto read = [&](auto kind, const wp::half* before, const wp::half* place_, int tile, auto& rows) {{
+    auto read = [&](auto kind, const wp::half* before, const wp::half* position_, int tile, auto& rows) {{
         constexpr int H = decltype(kind)::H, P = decltype(kind)::P;
         const int key = tile / of_key, low = (tile - key * of_key) * {TILE} + 16 * warp + g;
         const int row = min(low, count - 1), next = min(low + 8, count - 1);
         #pragma unroll
         for (int c = 0; c < 2 * (H + P); ++c) {{
-            const wp::half* from = c < 2 * H ? before + (size_t)key * count * {WIDTH} : place_;
+            const wp::half* from = c < 2 * H ? before + (size_t)key * count * {WIDTH} : position_;
             const int width = c < 2 * H ? {WIDTH} : {COLUMNS}, column = 8 * t + 32 * (c < 2 * H ? c : c - 2 * H);
             const uint4 one = *reinterpret_cast<const uint4*>(from + (size_t)row * width + column);
             const uint4 two = *reinterpret_cast<const uint4*>(from + (size_t)next * width + column);
@@ -157,7 +157,7 @@ _FORWARD = f"""
     {_CUDA}
     const int parts = layers * 4 - 3 + (joined >= 0);
     const int all = parts * ((last - first + {ROUND - 1}) / {ROUND});
-    int passed = 0;  // tiles of this group in all layers so far: shifts have two places
+    int passed = 0;  // tiles of this group in all layers so far: shifts have two buffers
     auto layer = [&](auto kind, int number, int begin, int end) {{
         constexpr int C = decltype(kind)::H + decltype(kind)::P;
         const wp::half* before = outputs.data + (number ? number - 1 : 0) * of_layer;
@@ -203,15 +203,15 @@ _FORWARD = f"""
         if constexpr (C == 4) {{
             if (begin + group >= end) return;
             unsigned rows[16][4];
-            read(kind, before, place.data, begin + group, rows);
+            read(kind, before, position.data, begin + group, rows);
             for (int tile = begin + group; tile < end; tile += {GROUPS})
                 through(tile, rows, [&]() {{
-                    if (tile + {GROUPS} < end) read(kind, before, place.data, tile + {GROUPS}, rows);
+                    if (tile + {GROUPS} < end) read(kind, before, position.data, tile + {GROUPS}, rows);
                 }});
         }} else {{
             for (int tile = begin + group; tile < end; tile += {GROUPS}) {{
                 unsigned rows[4 * C][4];
-                read(kind, before, place.data, tile, rows);
+                read(kind, before, position.data, tile, rows);
                 through(tile, rows, []() {{}});
             }}
         }}
@@ -227,7 +227,7 @@ _FORWARD = f"""
         }}
     }}
 #else
-    PLACE_OF
+    INDEX_OF
     const size_t of_layer = (size_t)keys * count * {WIDTH};
     for (int key = 0; key < keys; ++key)
         for (int row = 0; row < count; ++row) {{
@@ -240,8 +240,8 @@ _FORWARD = f"""
                     float sum = shifts.data[((size_t)number * keys + key) * {WIDTH} + n];
                     for (int k = 0; k < K; ++k) {{
                         const wp::half x = k < H ? outputs.data[(number - 1) * of_layer + at + k]
-                                                 : place.data[(size_t)row * {COLUMNS} + k - H];
-                        sum += wp::half_to_float(x) * wp::half_to_float(packed[place_of(k, n)]);
+                                                 : position.data[(size_t)row * {COLUMNS} + k - H];
+                        sum += wp::half_to_float(x) * wp::half_to_float(packed[index_of(k, n)]);
                     }}
                     outputs.data[number * of_layer + at + n] = wp::float_to_half(sum > 0.0f ? sum : 0.0f);
                 }}
@@ -270,7 +270,15 @@ _BACKWARD = f"""
         if (there) *reinterpret_cast<uint4*>(to) = make_uint4(out[0], out[1], out[2], out[3]);
     }};
     auto alive_of = [&](int number, int tile, auto& alive) {{  // nobody is where there is no row
-        ALIVE_OF
+        #pragma unroll
+        for (int half = 0; half < 2; ++half) {{
+            const int row = __ldg(listed.data + tile * {TILE} + 16 * warp + g + 8 * half), key = max(row, 0) / of_rows;
+            const int low = max(row, 0) - key * of_rows, of = low / {TILE} + key * in_key, own = low % {TILE};
+            const int thread = own / 16 * 32 + own % 8 * 4 + t;  // which wrote it in the forward pass, in which half
+            const uint2 bits = reinterpret_cast<const uint2*>(masks.data)[
+                (((size_t)number * of_key + of) * 128 + thread) * 2 + own % 16 / 8];
+            alive[2 * half] = row < 0 ? 0u : bits.x; alive[2 * half + 1] = row < 0 ? 0u : bits.y;
+        }}
     }};
     auto halve = [&](auto kind, auto& value) {{
         constexpr int N = decltype(kind)::N;
@@ -297,7 +305,7 @@ _BACKWARD = f"""
             own[i] = 0.0f;
         }}
         group_waits();
-        const size_t part = ((size_t)number * KEYS + key) * {GROUPS} * gridDim.x + {GROUPS} * blockIdx.x + group;
+        const size_t part = ((size_t)number * of_keys + key) * {GROUPS} * gridDim.x + {GROUPS} * blockIdx.x + group;
         float* const to = partials.data + part * {WIDTH};
         const float* const of_warps = shared_sums;
         for (int n = threadIdx.x & 127; n < {WIDTH}; n += 128)
@@ -321,7 +329,7 @@ _BACKWARD = f"""
                 #pragma unroll
                 for (int v = 0; v < {VALUES}; ++v)
                     a[half][v] = wp::half_to_float(
-                        after.data[ROW_OF * {HEAD} + v]);
+                        after.data[(size_t)max(__ldg(listed.data + low + 8 * half), 0) * {HEAD} + v]);
             #pragma unroll
             for (int q = 0; q < 8; ++q) {{
                 float value[2][8] = {{}};
@@ -387,10 +395,12 @@ _BACKWARD = f"""
         for (int number = layers - 1; number > 0; --number) layer(number, begin, end);
     }}
 #else
-    PLACE_OF
-    ROWS {{
-            const int from = FROM;
-            const bool there = THERE;
+    INDEX_OF
+    const size_t of_layer = (size_t)of_keys * ((of_rows + {TILE - 1}) / {TILE}) * {TILE * WIDTH};
+    for (int key = 0; key < of_keys; ++key)
+        for (int r = starts.data[key]; r < starts.data[key + 1]; ++r) {{
+            const int from = wp::max(listed.data[r], 0);
+            const bool there = listed.data[r] >= 0;
             for (int number = layers - 1; number >= 0; --number) {{
                 const size_t at = number * of_layer + (size_t)r * {WIDTH};
                 for (int n = 0; n < {WIDTH}; ++n) {{
@@ -402,10 +412,10 @@ _BACKWARD = f"""
                     else
                         for (int k = 0; k < {WIDTH}; ++k)
                             sum += wp::half_to_float(slopes.data[at + of_layer + k]) * wp::half_to_float(
-                                back.data[(size_t)(layers - 2 - number) * {WIDTH * WIDTH} + place_of(k, n)]);
-                    const size_t is = ((size_t)number * KEYS * of_rows + from) * {WIDTH} + n;
+                                back.data[(size_t)(layers - 2 - number) * {WIDTH * WIDTH} + index_of(k, n)]);
+                    const size_t is = ((size_t)number * of_keys * of_rows + from) * {WIDTH} + n;
                     if (!there || !(wp::half_to_float(outputs.data[is]) > 0.0f)) sum = 0.0f;
-                    partials.data[((size_t)number * KEYS + key) * {GROUPS * WIDTH} + n] += sum;
+                    partials.data[((size_t)number * of_keys + key) * {GROUPS * WIDTH} + n] += sum;
                     slopes.data[at + n] = wp::float_to_half(sum);
                 }}
             }}
@@ -413,75 +423,33 @@ _BACKWARD = f"""
 #endif
 """
 
-_PLACE_OF = f"""
-    auto place_of = [](int k, int p) {{  // of a weight among those of its layer: the inverse of what ``pack`` does
+_INDEX_OF = f"""
+    auto index_of = [](int k, int p) {{  // of a weight among those of its layer: the inverse of what ``pack`` does
         const int n = p / 32 * 32 + p % 8 / 2 * 8 + p % 32 / 8 * 2 + p % 2;
         const int u = k % 64 / 32 * 4 + k % 8 / 4 * 2 + k % 4 / 2;
         return k / 64 * {PART} + n * 64 + (u ^ (n & 7)) * 8 + k % 32 / 8 * 2 + k % 2;
     }};"""
 
+_ALL_ROWS = f"""const int of_key = (count + {TILE - 1}) / {TILE}, tiles = keys * of_key;"""  # key by key, in order
 
-_ALL = {  # rows in their order, key by key
-    "SIZES": f"""const int of_key = (count + {TILE - 1}) / {TILE}, tiles = keys * of_key;
-    auto key_of = [&](int tile) {{ return tile / of_key; }};""",
-    "KEYS": "keys",
-    "ROW_OF": "((size_t)key * count + min(low + 8 * half, count - 1))",
-    "ALIVE_OF": """const uint4 bits = reinterpret_cast<const uint4*>(masks.data)[
-            ((size_t)number * tiles + tile) * 128 + (threadIdx.x & 127)];
-        const int low = tile % of_key * 64 + 16 * warp + g;
-        alive[0] = low < count ? bits.x : 0u; alive[1] = low < count ? bits.y : 0u;
-        alive[2] = low + 8 < count ? bits.z : 0u; alive[3] = low + 8 < count ? bits.w : 0u;""",
-    "ROWS": f"""const int of_rows = count;
-    const size_t of_layer = (size_t)keys * count * {WIDTH};
-    for (int key = 0; key < keys; ++key)
-        for (int r = key * count; r < (key + 1) * count; ++r)""",
-    "FROM": "r",
-    "THERE": "true",
-}
-
-# Rows of a list, the parts of keys padded to whole tiles. Slopes lie as the list does, so they are those of one key of
-# as many rows as a list can have; all else lies as before
-_LISTED = {
-    "SIZES": f"""const int in_key = (of_rows + {TILE - 1}) / {TILE};
+# Rows of a list, those of each key padded to whole tiles. Gradients are in the order of the list, as if there were one
+# key with as many rows as a list can have; everything else is in the order of the forward pass
+_LISTED_ROWS = f"""const int in_key = (of_rows + {TILE - 1}) / {TILE};
     const int keys = 1, of_key = of_keys * in_key, count = {TILE} * of_key, tiles = starts.data[of_keys] / {TILE};
     auto key_of = [&](int tile) {{
         int key = 0;
         while (key + 1 < of_keys && {TILE} * tile >= __ldg(starts.data + key + 1)) ++key;
         return key;
-    }};""",
-    "KEYS": "of_keys",
-    "ROW_OF": "(size_t)max(__ldg(listed.data + low + 8 * half), 0)",
-    "ALIVE_OF": f"""#pragma unroll
-        for (int half = 0; half < 2; ++half) {{
-            const int row = __ldg(listed.data + tile * {TILE} + 16 * warp + g + 8 * half), key = max(row, 0) / of_rows;
-            const int low = max(row, 0) - key * of_rows, of = low / {TILE} + key * in_key, own = low % {TILE};
-            const int thread = own / 16 * 32 + own % 8 * 4 + t;  // who had it on the way there, in which half
-            const uint2 bits = reinterpret_cast<const uint2*>(masks.data)[
-                (((size_t)number * of_key + of) * 128 + thread) * 2 + own % 16 / 8];
-            alive[2 * half] = row < 0 ? 0u : bits.x; alive[2 * half + 1] = row < 0 ? 0u : bits.y;
-        }}""",
-    "ROWS": f"""const size_t of_layer = (size_t)of_keys * ((of_rows + {TILE - 1}) / {TILE}) * {TILE * WIDTH};
-    for (int key = 0; key < of_keys; ++key)
-        for (int r = starts.data[key]; r < starts.data[key + 1]; ++r)""",
-    "FROM": "wp::max(listed.data[r], 0)",
-    "THERE": "listed.data[r] >= 0",
-}
+    }};"""
 
 
-def _filled(snippet: str, words: dict[str, str]) -> str:
-    """A snippet with what stands for its words in capitals."""
-    for word, text in {**words, "PLACE_OF": _PLACE_OF}.items():
-        snippet = snippet.replace(word, text)
-    return snippet
-
-
-@wp.func_native(_filled(_FORWARD, _ALL))
+@wp.func_native(_FORWARD.replace("SIZES", _ALL_ROWS).replace("INDEX_OF", _INDEX_OF))
 def rows_forward(
     layers: int,
     joined: int,
     keys: int,
     count: int,
-    place: wp.array2d[wp.float16],
+    position: wp.array2d[wp.float16],
     forth: wp.array[wp.float16],
     shifts: wp.array3d[float],
     outputs: wp.array3d[wp.float16],
@@ -490,24 +458,7 @@ def rows_forward(
     """All layers of all rows of this block."""
 
 
-@wp.func_native(_filled(_BACKWARD, _ALL))
-def rows_backward(
-    layers: int,
-    joined: int,
-    keys: int,
-    count: int,
-    after: wp.array2d[wp.float16],
-    head: wp.array2d[float],
-    back: wp.array[wp.float16],
-    outputs: wp.array3d[wp.float16],
-    masks: wp.array[wp.int32],
-    slopes: wp.array3d[wp.float16],
-    partials: wp.array4d[float],
-):
-    """Slopes at all layers of all rows of this block, and their sums over the rows of each key."""
-
-
-@wp.func_native(_filled(_BACKWARD, _LISTED))
+@wp.func_native(_BACKWARD.replace("SIZES", _LISTED_ROWS).replace("INDEX_OF", _INDEX_OF))
 def listed_backward(
     layers: int,
     joined: int,
@@ -523,4 +474,4 @@ def listed_backward(
     slopes: wp.array3d[wp.float16],
     partials: wp.array4d[float],
 ):
-    """The same for rows of a list, ``rows.list_rows``; slopes lie as the list does."""
+    """Gradients at all layers of the listed rows of this block, in the order of the list, and their sums per key."""
