@@ -44,7 +44,7 @@ from gftorf_warp.render.buffers import TILE_SHAPES, WALKS
 
 FRAME_SIZE, REGISTERS = 0x11, 0x2F  # attributes in the .nv.info section of a cubin
 ALLOWED_STACK = 32  # [B]
-PASSES = "perceptron forward", "perceptron backward", "perceptron backward, listed"  # for sm_90a
+PASSES = "perceptron forward", "perceptron backward"  # for sm_90a
 HIERARCHIES = {
     "trace": 1024,
     "paths": 1024,
@@ -75,10 +75,10 @@ def modules(arch: int) -> dict[str, wp.Module]:
         "rows": gradient_rows.list_rows.module,
         "gradients": parameter_gradients.collect.module,
         "weights of outputs": weight_gradients.multiply_outputs.module,
-        "weights of places": weight_gradients.multiply_places.module,
+        "weights of positions": weight_gradients.multiply_positions.module,
     }
     if arch == wgmma.ARCHITECTURE:
-        passes = perceptron.forward, perceptron.backward, perceptron.backward_listed
+        passes = perceptron.forward, perceptron.backward
         found |= {title: kernel.module for title, kernel in zip(PASSES, passes, strict=True)}
     for keys in (2, 3, 4):
         for name, kernel in vars(displace.make_displace(keys)).items():

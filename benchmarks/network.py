@@ -1,14 +1,12 @@
 """What the motion network costs: forward and backward, all queries of a step stacked, in each precision.
 
     python benchmarks/network.py [--device cpu|cuda] [--gaussians N ..] [--queries Q ..] [--repeats R]
-                                 [--products float32|tf32|half|'half by torch'|'half, all rows' ..]
+                                 [--products float32|half|'half by torch' ..]
                                  [--hidden SHARE] [--profile] [--json FILE]
 
 A query is one key time; a timing holds one encoding of positions, as a step has it, and the gradient of all weights.
-``half`` is what a captured step has, ``half by torch`` the same without kernels of ours, by default where they differ;
-``half, all rows`` has rows without gradient on the way back as well. With ``--hidden`` that share of the Gaussians,
-drawn at random, has none. Behind ``half`` it says how far its gradients are from those, the largest distance of a
-tensor.
+``half`` is the backend of a run on the device, ``half by torch`` that by cuBLAS, by default where they differ. With
+``--hidden`` that fraction of the Gaussians, drawn at random, has no gradient.
 On a GPU every row is timed twice: called from Python, and replayed as a CUDA graph, which must give what the call gave.
 Rows of one N and Q take turns. ``kernels`` counts what the device ran in one call, products included; ``error`` is the
 largest difference of an offset from that in float32, for weights whose offsets are a few decimetres. With ``--profile``
@@ -28,7 +26,7 @@ from pathlib import Path
 import torch
 
 from gftorf_warp.bench.command import about
-from gftorf_warp.bench.motion import ALL_ROWS, BY_TORCH, go_by, kinds, points, products_of
+from gftorf_warp.bench.motion import BY_TORCH, kinds, points, products_of, set_backend
 from gftorf_warp.bench.timing import WARM_UP, Watch, watch_of
 from gftorf_warp.scene.gaussians import GaussianField
 from gftorf_warp.scene.motion import MotionSettings, Products
@@ -57,7 +55,7 @@ def network(kind: str, device: str) -> Network:
     with torch.no_grad():
         made.head.weight.normal_(0.0, 0.05, generator=generator)
     made = made.to(device)
-    go_by(made, kind)
+    set_backend(made, kind)
     return made
 
 
@@ -114,16 +112,11 @@ def rows_of(count: int, queries: int, options: argparse.Namespace) -> list[dict[
     calls = {kind: call_of(network(kind, device), gaussians, queries, options.hidden) for kind in wanted}
     exact = call_of(network(str(Products.FLOAT32), device), gaussians, queries, options.hidden)()[0]
     rows: dict[str, dict[str, object]] = {}
-    gradients: dict[str, list[torch.Tensor]] = {}
     runs: dict[tuple[str, str], Callable[[], object]] = {}
     for kind, call in calls.items():
         for _ in range(WARM_UP):
             found = call()
         row: dict[str, object] = {"gaussians": count, "queries": queries, "products": kind}
-        gradients[kind] = found[1:]
-        if kind == ALL_ROWS and str(Products.HALF) in gradients:
-            both = zip(found[1:], gradients[str(Products.HALF)], strict=True)
-            row["from_half"] = max(float((one - other).norm() / other.norm()) for one, other in both)
         row["error_mm"] = 1e3 * float((found[0] - exact).norm(dim=-1).max())
         runs[kind, "called"] = call
         replay = watch.captured(call)
@@ -154,7 +147,7 @@ def main() -> int:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--gaussians", type=int, nargs="+", default=[20_000, 100_000])
     parser.add_argument("--queries", type=int, nargs="+", default=[1, 2, 3])
-    parser.add_argument("--products", nargs="+", choices=[*map(str, Products), BY_TORCH, ALL_ROWS])
+    parser.add_argument("--products", nargs="+", choices=[*map(str, Products), BY_TORCH])
     parser.add_argument("--hidden", type=float, default=0.0, help="share of Gaussians without gradient")
     parser.add_argument("--repeats", type=int, default=50)
     parser.add_argument("--profile", action="store_true")
@@ -173,7 +166,6 @@ def main() -> int:
                 texts = [row["gaussians"], row["queries"], row["products"], row.get("kernels", "-")]
                 texts += ["-" if number is None else f"{number:.3f}" for number in numbers]
                 texts += ["" if row.get("replay_equals_call", True) else " replay differs"]
-                texts += [f" {row['from_half']:.1e} from half"] if "from_half" in row else []
                 print("\n".join(["".join(f"{text:>14}" for text in texts), *row.get("profile", [])]), flush=True)
     if options.json:
         options.json.write_text(json.dumps(found | {"command": " ".join(sys.argv), "rows": rows}, indent=1) + "\n")

@@ -48,14 +48,14 @@ HAS_BOTH = {  # the only modules that may know torch and Warp together
     "render/descent.py": "the end of a step: Adam and what judges it, of many tensors at once",
     "render/moved.py": "Gaussians of a finished run at a time",
     "render/replay.py": "renderings of a finished run: a field of torch, a graph of Warp",
-    "render/perceptron.py": "layers of a network: torch's function around them, Warp's kernels in them",
+    "render/tensor_cores.py": "layers of a network: tensors of torch, kernels of Warp",
 }
 LAUNCHES = {  # file: what it launches
     "render/launch.py": "the order of a rendering",
     "render/stages.py": "the stages of a rendering",
     "render/side_by_side.py": "its launches over ranges of tiles",
     "render/training.py": "what a step does beside rendering",
-    "render/perceptron.py": "a network's layers, before anything is rendered",
+    "render/tensor_cores.py": "a network's layers, before anything is rendered",
     "render/displacement.py": "Gaussians at a time, before they are rendered",
     "render/moved.py": "Gaussians at a time, before they are rendered again",
     "render/replay.py": "the number of pairs of a rendering",
@@ -63,7 +63,6 @@ LAUNCHES = {  # file: what it launches
 }
 KNOWS_STREAMS = {  # streams, events and graphs of torch
     "render/cuda.py": "the one module of streams, events and graphs",
-    "scene/perceptron.py": "products of one gradient that run at the same time",
 }
 KNOWS_KINDS = {"render/buffers.py": "the shape of a tile depends on the kind of device, which is the input's"}
 MAX_CLASS_LINES, MAX_ATTRIBUTES = 150, 15
@@ -87,7 +86,7 @@ SENTINELS = {  # kernel.parameter or struct.field: why a number may mean somethi
     "add_statistics.counts": "a flag",
     "finish_step.weights": "a term with weight 0 adds nothing",
     "project.box_px": "a box without pixels is a splat that is culled: nothing compares it with 0",
-    "backward_listed.slopes": "what a row of the list without a number gets, not what it means",
+    "backward.slopes": "what a row of the list without a number gets, not what it means",
     "number_pairs.owners": "what is written where no pair is, and read by nobody",
     "trace_hits.body": "the constant NOTHING",
     "Emitter.power": "cosine ** 0 is 1: the limit, and no case",

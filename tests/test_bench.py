@@ -11,6 +11,8 @@ from gftorf_warp.errors import DivergedError, InputError, ResourceError, UsageEr
 from gftorf_warp.recon.run import Run
 from gftorf_warp.recon.settings import Batch
 from gftorf_warp.render import launch, stages
+from gftorf_warp.render.cublas import CublasLayers
+from gftorf_warp.render.tensor_cores import FusedLayers
 from gftorf_warp.scene.motion import MotionSettings, Products
 from gftorf_warp.scene.network import Network
 
@@ -235,17 +237,17 @@ def test_errors_of_another_process_keep_their_class():
 def test_half_precision_has_a_row_of_torch_where_steps_have_kernels(monkeypatch):
     """There are two ways then; elsewhere a second row would measure the same again."""
     assert motion.kinds("cpu") == [str(kind) for kind in Products]
-    monkeypatch.setattr(motion.perceptron, "fits", lambda form, device: (form.width, device.type) == (256, "cpu"))
+    fitting = lambda form, device: (form.width, device.type) == (256, "cpu")  # noqa: E731
+    monkeypatch.setattr(motion, "fits", fitting)
+    monkeypatch.setattr("gftorf_warp.render.network.fits", fitting)
     assert motion.kinds("cpu") == [*map(str, Products), motion.BY_TORCH]
     assert {motion.products_of(kind) for kind in motion.kinds("cpu")} == set(Products)
     assert motion.products_of(motion.BY_TORCH) == Products.HALF
-    assert motion.products_of(motion.ALL_ROWS) == Products.HALF
-    ours = motion.perceptron.TensorCores
-    for kind, passes in ((str(Products.HALF), ours), (motion.ALL_ROWS, ours), (motion.BY_TORCH, type(None))):
-        made = Network(torch.arange(3.0), MotionSettings(), duration=1.0, length=7.5)
-        motion.go_by(made, kind)
-        assert isinstance(made.form.passes, passes)
-        assert getattr(made.form.passes, "listed", False) == (kind == str(Products.HALF))
+    for kind, layers in ((str(Products.HALF), FusedLayers), (motion.BY_TORCH, CublasLayers)):
+        settings = MotionSettings(products=motion.products_of(kind))
+        made = Network(torch.arange(3.0), settings, duration=1.0, length=7.5)
+        motion.set_backend(made, kind)
+        assert isinstance(made.backend.layers, layers)
 
 
 def test_a_timeline_is_of_the_device_in_its_order():

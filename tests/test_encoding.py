@@ -7,10 +7,12 @@ import torch
 from small_runs import field, random
 from test_perceptron import half, network
 
-from gftorf_warp.render.perceptron import TensorCores
-from gftorf_warp.scene.encoding import Encoder, Waves, encoded, powers_of_two
+from gftorf_warp.render.cublas import CublasLayers
+from gftorf_warp.render.layers import Form
+from gftorf_warp.render.network import HalfPrecision
+from gftorf_warp.render.tensor_cores import FusedLayers
+from gftorf_warp.scene.encoding import encoded, powers_of_two
 from gftorf_warp.scene.motion import MotionSettings
-from gftorf_warp.scene.perceptron import Products
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA"))]
 LENGTH = 7.5
@@ -44,7 +46,7 @@ def test_a_kernel_encodes_to_the_last_half(count, frequencies, columns, device):
     """Arguments of 20,000 rad and of 1e-9 alike; zeros behind the values, nothing unwritten."""
     mean = anywhere(count)
     powers = powers_of_two(frequencies).to(device)
-    found = TensorCores().encode(mean.to(device), LENGTH, powers, columns=columns, dtype=torch.float16).cpu()
+    found = FusedLayers().encode(mean.to(device), LENGTH, powers, columns=columns, dtype=torch.float16).cpu()
     want = wanted(mean, frequencies, columns)
     assert found.shape == (count, columns)
     assert found.dtype == torch.float16
@@ -58,7 +60,9 @@ def test_a_kernel_encodes_to_the_last_half(count, frequencies, columns, device):
 def test_torch_and_the_kernel_encode_alike(device):
     """On a GPU torch multiplies by 1 / length, so that arguments of both differ by a rounding, 2^9 times."""
     mean, powers = anywhere(500).to(device), powers_of_two(10).to(device)
-    one, other = (way.encode(mean, LENGTH, powers, columns=64, dtype=torch.float16) for way in (TensorCores(), Waves()))
+    one, other = (
+        way.encode(mean, LENGTH, powers, columns=64, dtype=torch.float16) for way in (FusedLayers(), CublasLayers())
+    )
     if device == "cpu":
         assert halves_between(one, other).max() <= 1
     argument = 2.0**9 * float(mean.abs().max()) / LENGTH
@@ -71,37 +75,34 @@ def test_positions_may_lie_apart_and_may_be_none():
     mean = wide[:, 3:]
     assert not mean.is_contiguous()
     for rows in (mean, mean[:0]):
-        found = TensorCores().encode(rows, LENGTH, powers, columns=64, dtype=torch.float16)
+        found = FusedLayers().encode(rows, LENGTH, powers, columns=64, dtype=torch.float16)
         assert found.shape == (len(rows), 64)
         assert torch.equal(
-            found, TensorCores().encode(rows.contiguous(), LENGTH, powers, columns=64, dtype=torch.float16)
+            found, FusedLayers().encode(rows.contiguous(), LENGTH, powers, columns=64, dtype=torch.float16)
         )
 
 
-def test_a_network_encodes_by_whom_it_goes(monkeypatch):
-    """By torch at first, then by its passes if those can; in float32 nobody else is asked."""
+def test_a_network_is_encoded_by_its_backend(monkeypatch):
+    """By cuBLAS's layers with torch, by kernels with those; without a backend in float32."""
     asked = []
-    encode = TensorCores.encode
+    encode = FusedLayers.encode
 
     def counted(self, mean, *given, **named):
         asked.append(len(mean))
         return encode(self, mean, *given, **named)
 
-    monkeypatch.setattr(TensorCores, "encode", counted)
+    monkeypatch.setattr(FusedLayers, "encode", counted)
     quick, plain, gaussians = network(half()), network(), field(anywhere(40), None)
     first = quick.attach(gaussians)
     assert not asked
-    quick.go_by(TensorCores())
-    plain.go_by(TensorCores())
+    quick.backend = HalfPrecision(FusedLayers(), Form.of(quick))
     found = quick.attach(gaussians)
     assert asked == [40]
     assert halves_between(first, found).max() <= 1
     assert plain.attach(gaussians).dtype == torch.float32
-    quick.go_by(Products())
+    quick.backend = HalfPrecision(CublasLayers(), Form.of(quick))
     assert torch.equal(quick.attach(gaussians), first)
     assert asked == [40]
-    assert isinstance(TensorCores(), Encoder)
-    assert not isinstance(Products(), Encoder)
 
 
 @pytest.mark.parametrize("device", DEVICES)

@@ -7,11 +7,13 @@ import pytest
 import torch
 from small_runs import KEYS, field, random
 
-from gftorf_warp.scene import perceptron
+from gftorf_warp.render import cublas
+from gftorf_warp.render.cublas import CublasLayers
+from gftorf_warp.render.layers import Form
+from gftorf_warp.render.network import HalfPrecision, Offsets, with_backend
 from gftorf_warp.scene.encoding import encoded
 from gftorf_warp.scene.motion import MotionSettings, Products
 from gftorf_warp.scene.network import Network
-from gftorf_warp.scene.perceptron import Form, Stacked
 
 DEVICES = [
     "cpu",
@@ -34,7 +36,7 @@ def network(settings=MotionSettings(), *, head=0.1, seed=0):
         made.head.weight.normal_(0.0, head, generator=generator)
         for layer in [*made.layers, made.head]:
             layer.bias.normal_(0.0, 0.1, generator=generator)
-    return made
+    return with_backend(made)
 
 
 def half(settings=MotionSettings()):
@@ -95,23 +97,25 @@ def compare_replay(made, gaussians, cotangent):
 def test_finite_differences_agree_in_float64(shape):
     """Nothing is rounded there, so the derivative by hand is compared with the very function."""
     made = network(SHAPES[shape]).double()
-    form = replace(made._form, dtype=torch.float64)
+    form = Form.of(made, torch.float64)
     gaussians = positions(7).map(torch.Tensor.double)
     place = encoded(gaussians.mean / made.length, made.settings.position_frequencies, columns=form.columns)
     moment = made.moments[[0, 2]]
     layers = [*made.layers, made.head]
     parameters = [value.detach().requires_grad_() for layer in layers for value in (layer.weight, layer.bias)]
-    found = Stacked.apply(form, place, moment, *parameters)
+    found = Offsets.apply(form, CublasLayers(), place, moment, *parameters)
     want = exact(made, gaussians, torch.ones_like(found), [0, 2])[0]
     torch.testing.assert_close(found, want, rtol=1e-12, atol=1e-13)
-    assert torch.autograd.gradcheck(lambda *values: Stacked.apply(form, place, moment, *values), parameters)
+    assert torch.autograd.gradcheck(
+        lambda *values: Offsets.apply(form, CublasLayers(), place, moment, *values), parameters
+    )
 
 
 @pytest.mark.parametrize("keys", [[1], [0, 2, 3]])
 def test_in_float32_it_is_the_network(keys):
     """At the published size: offsets and every gradient to 1e-5."""
     made, gaussians = network(half()), positions(50)
-    made._form = replace(made._form, dtype=torch.float32)
+    made.backend = HalfPrecision(CublasLayers(), Form.of(made, torch.float32))
     cotangent = random(len(keys), 50, 3, seed=5) - 0.5
     found, got = gradients(made, gaussians, cotangent, keys)
     want, wanted = exact(made, gaussians, cotangent, keys)
@@ -233,8 +237,8 @@ def test_rows_may_go_through_the_layers_in_parts(monkeypatch):
     """Of unequal length here, three to a key, and four rows side by side in sums; the results are the same."""
     made, gaussians, cotangent = network(half()), positions(172), random(2, 172, 3)
     whole = gradients(made, gaussians, cotangent, [0, 2])
-    monkeypatch.setattr(perceptron, "PIECE", 60)
-    assert [end - begin for _, begin, end in perceptron._pieces(2, 172)] == [57, 57, 58] * 2
+    monkeypatch.setattr(cublas, "PIECE", 60)
+    assert [end - begin for _, begin, end in cublas._pieces(2, 172)] == [57, 57, 58] * 2
     parts = gradients(made, gaussians, cotangent, [0, 2])
     for one, other in zip([parts[0], *parts[1]], [whole[0], *whole[1]], strict=True):
         assert other.abs().max() > 0
@@ -246,7 +250,7 @@ def test_rows_may_go_through_the_layers_in_parts(monkeypatch):
 def test_sums_over_rows_are_those_of_their_key(keys, count):
     """Also of more keys than 16 bytes hold, and of a number of rows that no power of two divides."""
     slopes = random(2, keys * count, 4).double()
-    torch.testing.assert_close(perceptron._sums(slopes, keys, torch.float64), slopes.view(2, keys, count, 4).sum(2))
+    torch.testing.assert_close(cublas._sums(slopes, keys, torch.float64), slopes.view(2, keys, count, 4).sum(2))
 
 
 def test_a_loss_without_gradient_has_none():
@@ -278,7 +282,7 @@ def test_attached_positions_are_aligned_halves():
     assert (place.dtype, place.shape) == (torch.float16, (5, 64))
     torch.testing.assert_close(place[:, :63].float(), encoded(gaussians.mean / 7.5, 10), rtol=1e-3, atol=1e-4)
     assert place[:, 63].abs().max() == 0
-    assert Form(place=63, moment=0, width=8, joined=None, dtype=torch.float16).columns == 63, "no wider than a weight"
+    assert Form(position=63, time=0, width=8, joined=None, dtype=torch.float16).columns == 63, "no wider than a weight"
 
 
 def test_parameters_and_stored_form_are_those_of_float32():

@@ -15,11 +15,14 @@ from gftorf_warp.kernels.network import gradient_scaling as ends
 from gftorf_warp.kernels.network import perceptron as kernels
 from gftorf_warp.kernels.network import wgmma
 from gftorf_warp.kernels.training.ordered_sums import LANES
-from gftorf_warp.render import perceptron
+from gftorf_warp.render import tensor_cores
 from gftorf_warp.render.bridge import array_over
-from gftorf_warp.render.perceptron import TensorCores, fits
+from gftorf_warp.render.cublas import CublasLayers
+from gftorf_warp.render.cuda import side_stream
+from gftorf_warp.render.layers import LARGEST, SMALLEST, Form
+from gftorf_warp.render.network import HalfPrecision, with_backend
+from gftorf_warp.render.tensor_cores import FusedLayers, fits
 from gftorf_warp.scene.motion import MotionSettings
-from gftorf_warp.scene.perceptron import LARGEST, SMALLEST, Form, Products, join
 
 HOPPER = torch.cuda.is_available() and torch.cuda.get_device_capability() == (9, 0)
 ON_HOPPER = pytest.mark.skipif(not HOPPER, reason="needs CUDA with sm_90")
@@ -36,10 +39,10 @@ SHAPES = {  # the published one; shallow; deep and not joined; joined at its sec
 
 
 def pair(settings=FULL, device="cpu", **options):
-    """The same network twice: by tensor cores, all rows, and by torch."""
+    """The same network twice: by tensor cores and by torch."""
     plain = network(half(settings), **options).to(device)
     quick = copy.deepcopy(plain)
-    quick.go_by(TensorCores(listed=False))
+    quick.backend = HalfPrecision(FusedLayers(), Form.of(quick))
     return quick, plain
 
 
@@ -55,7 +58,7 @@ def inputs_of(made, count, keys):
     place = made.attach(positions(count).map(lambda value: value.to(device)))
     layers = [*made.layers, made.head]
     weights, biases = zip(*((layer.weight.detach(), layer.bias.detach()) for layer in layers), strict=True)
-    return made.form, place, made.moments[:keys].to(device, torch.float32), weights, biases
+    return made.backend.form, place, made.moments[:keys].to(device, torch.float32), weights, biases
 
 
 def alike(made, twin, count, keys, *, device="cpu", scale=1.0):
@@ -90,7 +93,7 @@ def placed(form, layers, parameters, moment, device="cpu"):
 
 def of(form, layers):
     """Sizes as kernels have them."""
-    return perceptron._layers(form, layers)
+    return tensor_cores._layers(form, layers)
 
 
 def launched(kernel, dim, inputs, outputs, device):
@@ -166,8 +169,8 @@ def test_what_comes_out_of_every_layer(shape, device):
     """Outputs of all layers, and the head as a factor, against torch's; nothing is left unwritten."""
     made, _ = pair(SHAPES[shape], device)
     inputs = inputs_of(made, 21, 3)
-    outputs, head, _ = TensorCores().forward(*inputs)
-    want, same, _ = Products().forward(*inputs)
+    outputs, head, _ = FusedLayers().forward(*inputs)
+    want, same, _ = CublasLayers().forward(*inputs)
     assert torch.equal(head, same)
     for one, other in zip(outputs, want, strict=True):
         assert 0.2 < float((other > 0).float().mean()) < 0.8
@@ -180,13 +183,18 @@ def test_slopes_of_the_same_outputs(shape, device):
     """The way back alone, where the same units are at rest: every slope, and its sums, which are no halves."""
     made, _ = pair(SHAPES[shape], device)
     inputs = inputs_of(made, 33, 2)
-    form, gradient = made.form, (random(66, 3, seed=6) - 0.3).to(device)
-    outputs, _, kept = TensorCores().forward(*inputs)
-    found = TensorCores(listed=False).backward(form, 2, gradient, outputs, kept)
-    join(torch.device(outputs.device))
-    want = Products().backward(form, 2, gradient, outputs, Products().forward(*inputs)[2])
+    form, gradient = made.backend.form, (random(66, 3, seed=6) - 0.3).to(device)
+    outputs, _, kept = FusedLayers().forward(*inputs)
+    found = FusedLayers().backward(form, 2, gradient, outputs, kept)
+    side_stream(outputs.device).join()
+    want = CublasLayers().backward(form, 2, gradient, outputs, CublasLayers().forward(*inputs)[2])
     torch.testing.assert_close(found.unit, want.unit, rtol=1e-6, atol=0)
     torch.testing.assert_close(found.head, want.head, rtol=2e-3, atol=1e-5)
+    assert (found.listed[: found.begins[-1]] >= 0).sum() == 66, "every row has a gradient"
+    order = found.listed[: found.begins[-1]].long()
+    layers = torch.zeros_like(outputs)
+    layers[:, order[order >= 0]] = found.layers[:, : len(order)][:, order >= 0]
+    found = found._replace(layers=layers)
     torch.testing.assert_close(found.head_sum, gradient.sum(0), rtol=1e-5, atol=1e-5)
     assert found.layers[outputs == 0].abs().max() == 0
     assert float((found.layers[outputs > 0] != 0).float().mean()) > 0.99
@@ -261,12 +269,12 @@ def test_a_replay_equals_a_call(count):
 def test_every_weight_is_packed_once(shape, device):
     """Numbers of weights in place of weights, in two digits that halves hold: where each of them went."""
     made = network(half(SHAPES[shape]))
-    form, layers = made.form, len(made.layers)
+    form, layers = Form.of(made), len(made.layers)
     weights = [layer.weight for layer in [*made.layers, made.head]]
     biases = [layer.bias for layer in [*made.layers, made.head]]
     count = sum(value.numel() for value in [*weights, *biases])
     number = torch.arange(count, device=device)
-    moment, digits = torch.zeros(1, form.moment, device=device), (number % 1024, number // 1024)
+    moment, digits = torch.zeros(1, form.time, device=device), (number % 1024, number // 1024)
     low, high = (placed(form, layers, digit.float(), moment, device)[:3] for digit in digits)
     forth, back, head = (1024 * two.long() + one.long() for one, two in zip(low, high, strict=True))
     inputs, outputs = shares()
@@ -301,7 +309,7 @@ def test_what_a_time_adds(shape, device):
     for number in range(layers):
         want = biases[number].expand(3, -1)
         if number in form.entries:
-            own = moment @ weights[number][:, -form.moment :].T
+            own = moment @ weights[number][:, -form.time :].T
             assert own.abs().max() > 0.1
             want = want + own
         torch.testing.assert_close(found[number], want, rtol=1e-5, atol=1e-5)
@@ -346,7 +354,7 @@ def test_partial_sums_become_sums(parts, device):
 
 def test_it_fits_the_published_network_on_hopper_only(monkeypatch):
     """Anything else is torch's: a CPU, other GPUs, other widths, more frequencies, factors that are no halves."""
-    published = network().form
+    published = Form.of(network())
     assert (published.width, published.columns, published.dtype) == (256, 64, torch.float16)
     assert not fits(published, torch.device("cpu"))
     gpu = torch.device("cuda", 0)
@@ -354,15 +362,21 @@ def test_it_fits_the_published_network_on_hopper_only(monkeypatch):
         monkeypatch.setattr(wp, "device_from_torch", lambda _, arch=arch: SimpleNamespace(arch=arch))
         assert fits(published, gpu) == fitting
     monkeypatch.setattr(wp, "device_from_torch", lambda _: SimpleNamespace(arch=90))
-    others = [{"width": 128}, {"place": 64 + 1}, {"place": 48}, {"dtype": torch.float32}, {"dtype": torch.float64}]
+    others = [
+        {"width": 128},
+        {"position": 64 + 1},
+        {"position": 48},
+        {"dtype": torch.float32},
+        {"dtype": torch.float64},
+    ]
     assert not any(fits(replace(published, **change), gpu) for change in others)
     assert fits(replace(published, joined=None), gpu)
 
 
-def test_torch_goes_by_itself_unless_told():
-    """A network that nobody told otherwise has torch's products, and a copy goes the same way."""
-    made = network()
-    assert made.form.passes is None
-    made.go_by(TensorCores())
-    assert isinstance(copy.deepcopy(made).form.passes, TensorCores)
-    assert isinstance(made.form, Form)
+def test_a_run_has_the_backend_of_its_device(monkeypatch):
+    """Kernels of ours where they fit, else torch's products; none in float32; a copy has the same."""
+    assert with_backend(network()).backend is None
+    assert isinstance(with_backend(network(half())).backend.layers, CublasLayers)
+    monkeypatch.setattr("gftorf_warp.render.network.fits", lambda _, device: device.type == "cpu")
+    made = with_backend(network(half()))
+    assert isinstance(copy.deepcopy(made).backend.layers, FusedLayers)

@@ -8,7 +8,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..render import perceptron
+from ..render.cublas import CublasLayers
+from ..render.layers import Form
+from ..render.network import HalfPrecision, with_backend
+from ..render.tensor_cores import fits
 from ..scene.gaussians import GaussianField, constant_sh
 from ..scene.motion import MotionSettings, Products
 from ..scene.network import Network
@@ -18,8 +21,7 @@ COUNTS = (20_000, 100_000)
 QUICK_COUNTS = (100,)
 QUERIES = (1, 2, 3)
 KEYS, PERIOD_S, LENGTH_M = 16, 4 / 120, 7.5
-BY_TORCH = "half by torch"  # where captured steps have kernels of ours for it
-ALL_ROWS = "half, all rows"  # those kernels, and on the way back also rows without gradient
+BY_TORCH = "half by torch"  # by cuBLAS, where there are kernels of ours for it
 
 
 def measure(device: str, *, quick: bool, runs: int, report: Report) -> list[dict[str, Any]]:
@@ -43,7 +45,7 @@ def measure(device: str, *, quick: bool, runs: int, report: Report) -> list[dict
         times = torch.arange(KEYS, dtype=torch.float64) * PERIOD_S
         settings = MotionSettings(kind=Network.kind, products=products_of(products))
         network = Network(times, settings, duration=float(times[-1]), length=LENGTH_M, generator=generator).to(device)
-        go_by(network, products)
+        set_backend(network, products)
         field = points(LENGTH_M * torch.rand(count, 3, generator=generator)).map(lambda value: value.to(device))
         slope = torch.randn(queries, count, 3, generator=generator).to(device)
         weights = list(network.parameters())
@@ -66,20 +68,22 @@ def measure(device: str, *, quick: bool, runs: int, report: Report) -> list[dict
 
 def products_of(kind: str) -> Products:
     """The setting behind a row."""
-    return Products.HALF if kind in {BY_TORCH, ALL_ROWS} else Products(kind)
+    return Products.HALF if kind == BY_TORCH else Products(kind)
 
 
-def go_by(network: Network, kind: str) -> None:
-    """Let kernels take rows through the layers where captured steps do so, unless the row is about torch."""
-    if kind != BY_TORCH and perceptron.fits(network.form, network.head.weight.device):
-        network.go_by(perceptron.TensorCores(listed=kind != ALL_ROWS))
+def set_backend(network: Network, kind: str) -> None:
+    """The backend of a run on this device, or cuBLAS."""
+    if kind == BY_TORCH:
+        network.backend = HalfPrecision(CublasLayers(), Form.of(network))
+    else:
+        with_backend(network)
 
 
 def kinds(device: str) -> list[str]:
     """Rows of one case: every precision, and half precision by torch, if steps have something else on the device."""
     times = torch.arange(KEYS, dtype=torch.float64) * PERIOD_S
-    form = Network(times, MotionSettings(), duration=1.0, length=LENGTH_M).form
-    own = perceptron.fits(form, torch.empty(0, device=device).device)
+    form = Form.of(Network(times, MotionSettings(), duration=1.0, length=LENGTH_M))
+    own = fits(form, torch.empty(0, device=device).device)
     return [*map(str, Products), *[BY_TORCH] * own]
 
 

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..constants import SH_COEFFICIENTS
+from ..render.network import with_backend
 from ..scene.gaussians import GaussianField
 from ..scene.initialise import Init, Start, from_phase, from_random
 from ..scene.measured import key_times
@@ -88,7 +89,7 @@ def begin(observations: Observations, settings: ReconSettings, *, seed: int, dev
         first = from_phase(sequence, settings.init)
     else:
         first = from_random(sequence, settings.init, generator)
-    motion = _motion(first, observations, settings, generator).to(device)
+    motion = with_backend(_motion(first, observations, settings, generator).to(device))
     field = first.field.map(lambda value: value.to(device))
     if settings.weights.colour > 0:
         field = replace(field, colour_sh=torch.zeros(len(field), SH_COEFFICIENTS, 3, device=device))
@@ -137,7 +138,7 @@ def to_dict(state: State) -> dict[str, object]:
 def field_and_motion(stored: dict, device: torch.device | str) -> tuple[GaussianField, Motion, Tensor]:
     """Gaussians, their motion and their attachment to it, from the stored form."""
     field = GaussianField(**{name: value.to(device) for name, value in stored["field"].items()})
-    motion = motion_from_dict(stored["motion"]).to(device)
+    motion = with_backend(motion_from_dict(stored["motion"]).to(device))
     attachment = motion.attach(field) if motion.follows_means else stored["attachment"].to(device)
     return field, motion, attachment
 

@@ -12,11 +12,10 @@ from dataclasses import replace
 
 import torch
 
-from ..render import descent, perceptron
+from ..render import descent
 from ..render.cuda import CapturedGraph, DeviceReadback, graph_pool
 from ..render.pair_capacity import READ_EVERY, PairCapacity
 from ..scene.motion import Still
-from ..scene.network import Network
 from . import densify
 from .control import ControlBlock, GraphKey
 from .observations import Observations
@@ -78,9 +77,6 @@ class Stepper:
         self._stage: tuple[object, ...] | None = None
         self._steps = 0  # since the last :meth:`_attach`
         self._pool = graph_pool(device)
-        motion = state.motion
-        if isinstance(motion, Network) and perceptron.fits(motion.form, device):
-            motion.go_by(perceptron.TensorCores())
         self._attach()
 
     def step(self) -> None:

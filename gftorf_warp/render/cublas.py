@@ -42,7 +42,9 @@ class CublasLayers(Layers):
                 hidden = out
         return outputs, factors[-1], tuple(factors)
 
-    def backward(self, form: Form, keys: int, gradient: Tensor, outputs: Tensor, saved: tuple[Tensor, ...]) -> LayerGradients:
+    def backward(
+        self, form: Form, keys: int, gradient: Tensor, outputs: Tensor, saved: tuple[Tensor, ...]
+    ) -> LayerGradients:
         """As the base class says."""
         unit = _largest(gradient).clamp_min(SMALLEST) / LARGEST
         head = outputs.new_zeros(len(gradient), len(saved[-1]))
@@ -57,7 +59,9 @@ class CublasLayers(Layers):
             after = slope
         return LayerGradients(unit, head, gradients, _sums(gradients, keys, gradient.dtype), _sum_rows(gradient))
 
-    def parameter_gradients(self, form: Form, position: Tensor, time: Tensor, gradients: LayerGradients, outputs: Tensor) -> list[Tensor]:
+    def parameter_gradients(
+        self, form: Form, position: Tensor, time: Tensor, gradients: LayerGradients, outputs: Tensor
+    ) -> list[Tensor]:
         """As the base class says."""
         keys, found = len(time), _ParameterGradients(form, time, len(outputs), gradients)
         side = side_stream(position.device)
@@ -87,9 +91,20 @@ class _ParameterGradients:
     """
 
     def __init__(self, form: Form, time: Tensor, layers: int, gradients: LayerGradients):
-        width, wide, rows, values = form.width, form.position + form.time, gradients.head.shape[1], len(gradients.head_sum)
+        width, wide, rows, values = (
+            form.width,
+            form.position + form.time,
+            gradients.head.shape[1],
+            len(gradients.head_sum),
+        )
         columns = [wide + (width if number else 0) for number in form.entries]
-        sizes = [(layers - 1) * width * width, *(width * inputs for inputs in columns), rows * width, layers * width, values]
+        sizes = [
+            (layers - 1) * width * width,
+            *(width * inputs for inputs in columns),
+            rows * width,
+            layers * width,
+            values,
+        ]
         self.scaled = time.new_empty(sum(sizes))
         square, *entries, head, biases, self.head_bias = self.scaled.split(sizes)
         self.square = square.view(layers - 1, width, width)
@@ -145,7 +160,9 @@ def _copy(to: Tensor, rows: Tensor) -> None:
     to.copy_(rows)
 
 
-def _sums(gradients: Float[Tensor, "layers rows width"], keys: int, dtype: torch.dtype) -> Float[Tensor, "layers k width"]:
+def _sums(
+    gradients: Float[Tensor, "layers rows width"], keys: int, dtype: torch.dtype
+) -> Float[Tensor, "layers k width"]:
     """Sums over the rows of each key, by products with zeros and ones.
 
     A product of few rows with many columns fills a GPU without splitting its sum; what lies side by side is added

@@ -92,9 +92,11 @@ class LayerGradients(NamedTuple):
 class Layers(abc.ABC):
     """Computes the layers for all rows, forward and backward."""
 
-    def encode(self, mean: Tensor, length: float, powers: Tensor, form: Form) -> Float[Tensor, "N columns"]:
-        """gamma(x) of positions [m] over a length [m], without gradient, padded with zeros."""
-        return encoded(mean.detach() / length, powers, columns=form.columns, dtype=form.dtype)
+    def encode(
+        self, mean: Float[Tensor, "N 3"], length: float, powers: Float[Tensor, "f"], *, columns: int, dtype: torch.dtype
+    ) -> Float[Tensor, "N columns"]:
+        """gamma(x) of positions [m] over a length [m], without gradient, rounded at the end, padded with zeros."""
+        return encoded(mean.detach() / length, powers, columns=columns, dtype=dtype)
 
     @abc.abstractmethod
     def forward(

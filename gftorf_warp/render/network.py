@@ -23,7 +23,8 @@ class HalfPrecision:
 
     def encode(self, network: Network, mean: Tensor) -> Tensor:
         """gamma(x), as the layers read it."""
-        return self.layers.encode(mean, network.length, network.powers, self.form)
+        columns, dtype = self.form.columns, self.form.dtype
+        return self.layers.encode(mean, network.length, network.powers, columns=columns, dtype=dtype)
 
     def offsets(self, network: Network, attachment: Tensor, time: Tensor) -> Tensor:
         """[k, N, 3] displacements [m]."""

@@ -25,9 +25,9 @@ class FusedLayers(Layers):
     The backward pass is over the listed rows that have a gradient. On a CPU the same kernels run row by row, for tests.
     """
 
-    def encode(self, mean: Tensor, length: float, powers: Tensor, form: Form) -> Tensor:
+    def encode(self, mean: Tensor, length: float, powers: Tensor, *, columns: int, dtype: torch.dtype) -> Tensor:
         """As the base class says, in one launch, of float32 to halves."""
-        position = torch.empty(len(mean), form.columns, dtype=form.dtype, device=mean.device)
+        position = torch.empty(len(mean), columns, dtype=dtype, device=mean.device)
         if len(mean):
             with stream_of(mean):
                 given, found = [array_over(mean), length, array_over(powers)], [array_over(position, wp.float16)]
@@ -59,7 +59,9 @@ class FusedLayers(Layers):
                 _launch(kernels.forward, _threads(device), rows, found, device)
         return outputs, packed[2].view(wgmma.HEAD, form.width), (packed[1], weights[-1], masks)
 
-    def backward(self, form: Form, keys: int, gradient: Tensor, outputs: Tensor, saved: tuple[Tensor, ...]) -> LayerGradients:
+    def backward(
+        self, form: Form, keys: int, gradient: Tensor, outputs: Tensor, saved: tuple[Tensor, ...]
+    ) -> LayerGradients:
         """As the base class says, over listed rows."""
         back, head, masks = saved
         device, rows, layers = _ready(outputs.device), len(gradient), len(outputs)
@@ -89,7 +91,9 @@ class FusedLayers(Layers):
             _launch(ends.add_partials, dim, [block, array_over(partials)], [array_over(sums)], device)
         return LayerGradients(unit.view(()), after, gradients, sums, total, listed, begins, partials)
 
-    def parameter_gradients(self, form: Form, position: Tensor, time: Tensor, gradients: LayerGradients, outputs: Tensor) -> list[Tensor]:
+    def parameter_gradients(
+        self, form: Form, position: Tensor, time: Tensor, gradients: LayerGradients, outputs: Tensor
+    ) -> list[Tensor]:
         """As the base class says, by three concurrent products, and one launch that adds up their partial results.
 
         The largest is launched behind the smallest, so that its blocks get whole multiprocessors, and before the one
@@ -113,7 +117,10 @@ class FusedLayers(Layers):
         )
         by_head = time.new_empty(parameter_gradients.HEAD_BLOCKS * left, 1, wgmma.VALUES * wgmma.WIDTH)
         parts = [array_over(part) for part in (by_outputs, by_positions, by_head)]
-        of, listed = _layers(form, layers), [array_over(part, wp.int32) for part in (gradients.listed, gradients.begins)]
+        of, listed = (
+            _layers(form, layers),
+            [array_over(part, wp.int32) for part in (gradients.listed, gradients.begins)],
+        )
         given, back = [threads, len(time), *listed], array_over(gradients.layers, wp.float16)
         after, ahead = array_over(gradients.head, wp.float16), array_over(outputs, wp.float16)
         with side.fork(), stream_of(position):
@@ -125,7 +132,10 @@ class FusedLayers(Layers):
                 blocks = by_outputs.shape[0] * by_outputs.shape[1]
                 _launch(weight_gradients.multiply_outputs, blocks * threads, [*given, back, ahead], parts[:1], device)
         with side.fork(wait=False), stream_of(position):
-            more, blocks = [of.joined, back, array_over(position, wp.float16)], by_positions.shape[0] * by_positions.shape[1]
+            more, blocks = (
+                [of.joined, back, array_over(position, wp.float16)],
+                by_positions.shape[0] * by_positions.shape[1],
+            )
             _launch(weight_gradients.multiply_positions, blocks * threads, [*given, *more], parts[1:2], device)
         side.join()
         with stream_of(position):
