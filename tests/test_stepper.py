@@ -19,8 +19,9 @@ from gftorf_warp.recon.settings import Batch, Input, Norm, Weights
 from gftorf_warp.recon.state import begin
 from gftorf_warp.recon.stepper import Stepper
 from gftorf_warp.recon.terms import TERMS, Term, View
-from gftorf_warp.render import perceptron
 from gftorf_warp.render.cuda import CapturedGraph
+from gftorf_warp.render.layers import Form
+from gftorf_warp.render.tensor_cores import FusedLayers, fits
 from gftorf_warp.scene.initialise import Init
 from gftorf_warp.scene.motion import MotionSettings, Products
 
@@ -428,20 +429,18 @@ def of_full_size(**changes):
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_the_network_runs_on_tensor_cores_where_they_fit(device, monkeypatch):
-    """On Hopper those of the published network; other sizes never, nor on a CPU."""
+    """On Hopper those of the published network; other sizes never, nor on a CPU; a network in float32 has none."""
     for settings, size in ((of_full_size(), True), (published(), False)):
         state, observations = begun(settings, device)
-        fitting = size and perceptron.fits(state.motion.form, observations.quads.device)
-        Stepper(state, observations, settings)
-        assert isinstance(state.motion.form.passes, perceptron.TensorCores) == fitting
+        if state.motion.settings.products != Products.HALF:
+            assert state.motion.backend is None
+            continue
+        fitting = size and fits(Form.of(state.motion), observations.quads.device)
+        assert isinstance(state.motion.backend.layers, FusedLayers) == fitting
     assert device != "cpu" or not fitting
-    asked = []
-    monkeypatch.setattr(perceptron, "fits", lambda *given: asked.append(given) or True)
-    state, observations = begun(settings, device)
-    form = state.motion.form
-    Stepper(state, observations, settings)
-    assert isinstance(state.motion.form.passes, perceptron.TensorCores), "it is what decides"
-    assert asked == [(form, observations.quads.device)]
+    monkeypatch.setattr("gftorf_warp.render.network.fits", lambda *_: True)
+    state, _ = begun(of_full_size(), device)
+    assert isinstance(state.motion.backend.layers, FusedLayers), "it is what decides"
 
 
 @pytest.mark.skipif(
@@ -454,7 +453,7 @@ def test_steps_learn_by_tensor_cores(batch):
     state, observations = begun(settings, "cuda")
     before = [value.detach().clone() for value in state.motion.parameters()]
     steps = Stepper(state, observations, settings)
-    assert isinstance(state.motion.form.passes, perceptron.TensorCores)
+    assert isinstance(state.motion.backend.layers, FusedLayers)
     while state.images < 40:
         steps.step()
     assert steps.collect() == 0

@@ -1,4 +1,4 @@
-"""All layers of a perceptron in one launch, forward and backward; scene/perceptron.py has the formulas.
+"""All layers of a perceptron in one launch, forward and backward; render/layers.py has the formulas.
 
 ``wgmma.py`` takes rows through the layers. Here parameters are made ready for it: weights rounded and packed in the
 order in which tensor cores read them, what a layer makes of gamma(t) added to its bias.
