@@ -22,7 +22,7 @@ import numpy as np
 
 from gftorf_warp import Truth, __version__
 from gftorf_warp.constants import FRAMES_PER_QUARTET
-from gftorf_warp.data.ftorf_write import write
+from gftorf_warp.data.write import write
 from gftorf_warp.evaluate.compare import compare
 from gftorf_warp.evaluate.views import quad_of_shift
 from gftorf_warp.recon.run import Run
@@ -51,7 +51,7 @@ def own_model(run: Run, out: Path) -> Path:
         distances[n] = (rendering.distance / rendering.opacity.clamp_min(1e-6)).numpy()
     known = np.ones(len(quads), dtype=bool)
     assert len(quads) % FRAMES_PER_QUARTET == 0
-    return write(out, replace(sequence, quads=quads), Truth(distance=distances, known=known))
+    return write("ftorf", out, replace(sequence, quads=quads), Truth(distance=distances, known=known))
 
 
 def scores(run: Run) -> dict[str, float]:

@@ -11,7 +11,7 @@ from sequences import changed, sequence_of
 
 from gftorf_warp import Sequence, Truth
 from gftorf_warp.constants import CANONICAL_SHIFTS, FRAME_RATE_HZ
-from gftorf_warp.data import ftorf
+from gftorf_warp.data.write import write
 from gftorf_warp.render.api import Rendering
 from gftorf_warp.scene.camera import Camera
 from gftorf_warp.scene.sensor import Sensor
@@ -110,7 +110,7 @@ class AnalyticRun:
         self.path = Path(folder) / "run"
         self.path.mkdir(parents=True)
         where = Path(folder) / "sliding-box"
-        ftorf.write(where, sequence(), truth() if with_truth else None)
+        write("ftorf", where, sequence(), truth() if with_truth else None)
         self.camera = Camera(width=WIDTH, height=HEIGHT, fx=20.0, fy=20.0, cx=WIDTH / 2, cy=HEIGHT / 2)
         self.sensor = Sensor()
         self.quad_scale = 1.0

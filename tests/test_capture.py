@@ -12,10 +12,11 @@ from ftorf_folder import random_poses
 from sequences import NAMES, changed, sequence_of, values_of
 
 from gftorf_warp import Sequence, Truth
-from gftorf_warp.data import capture, specs
+from gftorf_warp.data import specs
 from gftorf_warp.data.check import check
 from gftorf_warp.data.decode import closed_form_distance
 from gftorf_warp.data.exr import read_parts, write_parts
+from gftorf_warp.data.write import write
 from gftorf_warp.errors import InputError, UsageError
 from gftorf_warp.scene.sensor import Sensor
 from gftorf_warp.sim.scenes import SCENES
@@ -78,7 +79,7 @@ def recording(**changes):
 @pytest.fixture
 def folder(tmp_path):
     """A capture with everything in it."""
-    return capture.write(tmp_path / "seq", *recording(), readme="# a capture\n")
+    return write("capture", tmp_path / "seq", *recording(), readme="# a capture\n")
 
 
 def edit(folder, change):
@@ -158,7 +159,7 @@ def test_a_minimal_capture_has_no_more_than_it_needs(tmp_path):
         "forward_flow": {},
         "backward_flow": {},
     }
-    got = Sequence.open(capture.write(tmp_path / "seq", recording(**bare)[0]))
+    got = Sequence.open(write("capture", tmp_path / "seq", recording(**bare)[0]))
     for name, value in bare.items():
         assert values_of(got)[name] == value, name
     assert got.truth() is None
@@ -277,10 +278,10 @@ def test_layers_are_checked_too(folder, tmp_path):
     sequence, truth = recording()
     for layers, word in (({"mine": image}, "no layer"), ({"normal": np.ones((FRAMES, 1, HEIGHT, WIDTH))}, "shape")):
         with pytest.raises(ValueError, match=word):
-            capture.write(tmp_path / "other", sequence, dataclasses.replace(truth, layers=layers))
+            write("capture", tmp_path / "other", sequence, dataclasses.replace(truth, layers=layers))
     full = {"ambient": np.full((FRAMES, 1, HEIGHT, WIDTH), np.inf)}
     with pytest.raises(UsageError, match="layers"):
-        capture.write(tmp_path / "other", sequence, dataclasses.replace(truth, layers=full))
+        write("capture", tmp_path / "other", sequence, dataclasses.replace(truth, layers=full))
 
 
 def test_a_link_out_of_the_folder_is_not_followed(folder, tmp_path):
@@ -324,9 +325,7 @@ def test_a_cycle_is_complete_if_all_of_its_frequencies_are(folder):
 
 def test_other_layouts_refuse_several_frequencies(tmp_path):
     """They have one place for it."""
-    from gftorf_warp.data import ftorf
-
     sequence = recording(distortion=None, shifts=np.array([0, np.pi, np.pi / 2, 3 * np.pi / 2, 0, np.pi, np.pi / 2]))[0]
     with pytest.raises(UsageError, match="frequencies_hz"):
-        ftorf.write(tmp_path / "seq", sequence)
+        write("ftorf", tmp_path / "seq", sequence)
     assert not any(tmp_path.iterdir())

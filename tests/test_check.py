@@ -11,8 +11,9 @@ from sequences import changed
 
 from gftorf_warp import Sequence
 from gftorf_warp.constants import SPEED_OF_LIGHT
-from gftorf_warp.data import decode, estimates, ftorf
+from gftorf_warp.data import decode, estimates
 from gftorf_warp.data.check import check
+from gftorf_warp.data.write import write
 from gftorf_warp.errors import InputError
 
 HEIGHT, WIDTH = 24, 32
@@ -27,7 +28,7 @@ def recording(frames=8, **changes):
 
 def written(tmp_path, sequence, truth=None):
     """The report on a sequence that was written to disk."""
-    return check(ftorf.write(tmp_path / "seq", sequence, truth))
+    return check(write("ftorf", tmp_path / "seq", sequence, truth))
 
 
 def said(lines, *words):
@@ -70,7 +71,7 @@ def test_a_sound_recording_has_no_warnings(tmp_path):
 
 def test_an_unreadable_sequence_is_an_input_error(tmp_path):
     """Check does not survive what the reader refuses."""
-    folder = ftorf.write(tmp_path / "seq", recording()[0])
+    folder = write("ftorf", tmp_path / "seq", recording()[0])
     (folder / "tofType0/0000.npy").write_text("text")
     with pytest.raises(InputError, match="0000"):
         check(folder)
@@ -90,7 +91,7 @@ def test_what_is_missing_is_listed(tmp_path):
 
 def test_gaps_in_the_ids_are_listed(tmp_path):
     """Ids of a folder: how many, from where to where, in which steps."""
-    folder = ftorf.write(tmp_path / "seq", recording(16)[0])
+    folder = write("ftorf", tmp_path / "seq", recording(16)[0])
     (folder / "tofType1/0005.npy").unlink()
     assert said(check(folder).lines, "tofType1/{id}.npy", "3 from 1 to 13", "4 (1x)", "8 (1x)")
 
@@ -100,7 +101,7 @@ def test_defaults_and_ignored_files_are_warned_of(tmp_path):
     poses = np.tile(np.eye(4), (8, 1, 1))
     poses[:, 0, 3] = np.arange(8)
     colour = {0: np.ones((HEIGHT, WIDTH, 3), np.float32)}
-    folder = ftorf.write(tmp_path / "seq", recording(camera_from_world=poses, colour=colour)[0])
+    folder = write("ftorf", tmp_path / "seq", recording(camera_from_world=poses, colour=colour)[0])
     (folder / "cams/poses.json").unlink()
     (folder / "cams/depth_range.npy").unlink()
     shutil.copy(folder / "tofType0/0000.npy", folder / "tofType1/0000.npy")
@@ -145,7 +146,7 @@ def test_saturation_is_noticed(tmp_path):
 def test_a_swapped_phase_disagrees_with_the_stored_phasor(tmp_path):
     """Order and sign that the pairing cannot see: sine and cosine swapped, or the phase mirrored."""
     sequence, _ = recording()
-    folder = ftorf.write(tmp_path / "seq", sequence)
+    folder = write("ftorf", tmp_path / "seq", sequence)
     (folder / "synthetic_tof").mkdir()
     re, im = decode.quartet_phasor(sequence, 0)
     for stored, words in (
@@ -176,7 +177,7 @@ def test_a_decoded_distance_is_no_truth(tmp_path):
 def test_wrapped_and_unreadable_truth_are_warned_of(tmp_path):
     """Beyond c/2f, and not an array at all."""
     sequence, truth = scene(8, HEIGHT, WIDTH, distance=np.linspace(2.0, 9.0, HEIGHT * WIDTH).reshape(HEIGHT, WIDTH))
-    folder = ftorf.write(tmp_path / "seq", sequence, truth)
+    folder = write("ftorf", tmp_path / "seq", sequence, truth)
     warnings = check(folder).warnings
     assert said(warnings, "range wraps", "9 m", "7.5 m")
     assert not said(warnings, "truth implies")
@@ -269,7 +270,7 @@ def test_z_depth_in_place_of_distance_is_noticed(tmp_path, form):
     folder = torf(tmp_path, truth="depth", speed=0.1)
     if form == "ftorf":
         sequence, truth = recording(fx=matrix[0, 0], fy=matrix[1, 1])
-        folder = ftorf.write(tmp_path / "seq", sequence, truth)
+        folder = write("ftorf", tmp_path / "seq", sequence, truth)
     assert not said(check(folder).warnings, "z-depth")
     for path in folder.glob("*depth/*.npy"):
         np.save(path, np.load(path) * cosine)

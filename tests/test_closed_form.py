@@ -8,8 +8,8 @@ import pytest
 from moving_box import recording
 
 from gftorf_warp import Sequence
-from gftorf_warp.data import ftorf
 from gftorf_warp.data.decode import closed_form_distance, quartet_phasor
+from gftorf_warp.data.write import write
 from gftorf_warp.errors import InputError, UsageError
 from gftorf_warp.evaluate.compare import compare
 from gftorf_warp.evaluate.views import render_to_folder
@@ -27,7 +27,7 @@ def run(tmp_path_factory):
     """The closed form of three quartets and two frames, with an offset, an offset phase and the order of real files."""
     folder = tmp_path_factory.mktemp("closed-form")
     sequence, truth = recording(frames=14, order=REAL_ORDER, phase_offset=0.5, dc_offset=0.2)
-    ftorf.write(folder / "box", sequence, truth)
+    write("ftorf", folder / "box", sequence, truth)
     return reconstruct(folder / "box", folder / "run", "ctof")
 
 

@@ -13,7 +13,7 @@ from sequences import changed
 
 from gftorf_warp import Truth, __version__
 from gftorf_warp.constants import CANONICAL_SHIFTS
-from gftorf_warp.data import ftorf
+from gftorf_warp.data.write import write
 from gftorf_warp.errors import DivergedError, InputError, UsageError
 from gftorf_warp.evaluate.compare import compare, findings, rows_of, sequence_title, summary, truth_statement
 from gftorf_warp.evaluate.metrics import scored_frames
@@ -159,7 +159,7 @@ def test_truth_of_another_folder(tmp_path):
     run = AnalyticRun(tmp_path, with_truth=False)
     truth = analytic_run.truth()
     shifted = Truth(distance=truth.distance + np.float32(0.5), known=truth.known)
-    ftorf.write(tmp_path / "other", analytic_run.sequence(), shifted)
+    write("ftorf", tmp_path / "other", analytic_run.sequence(), shifted)
     got = compare(run, truth=tmp_path / "other", report=False)
     assert got["d_tof_mse_x100"] == pytest.approx(100 * (0.5 - 0.03) ** 2, rel=1e-4)
 
@@ -169,7 +169,7 @@ def test_either_distance_can_be_the_true_one(tmp_path):
     run = AnalyticRun(tmp_path)
     truth = analytic_run.truth()
     both = Truth(distance=truth.distance, known=truth.known, phasor_distance=truth.distance + np.float32(0.5))
-    ftorf.write(tmp_path / "both", analytic_run.sequence(), both)
+    write("ftorf", tmp_path / "both", analytic_run.sequence(), both)
     geometry, static = (compare(run, truth=tmp_path / "both", against=a) for a in ("geometry", "static-phasor"))
     assert (geometry["against"], static["against"]) == ("geometry", "static-phasor")
     assert geometry["d_tof_mse_x100"] == compare(run, report=False)["d_tof_mse_x100"]
@@ -188,7 +188,7 @@ def test_unknown_truth_is_not_scored(tmp_path):
     truth = analytic_run.truth()
     truth.distance[2, 1:] = np.nan  # all that is left is wall
     truth.known[5] = False
-    ftorf.write(tmp_path / "partly", analytic_run.sequence(), truth)
+    write("ftorf", tmp_path / "partly", analytic_run.sequence(), truth)
     got = compare(run, truth=tmp_path / "partly")
     box, wall = 100 * 0.1**2, 100 * 0.02**2
     whole = (BOX_PIXELS * box + (PIXELS - BOX_PIXELS) * wall) / PIXELS
@@ -201,7 +201,7 @@ def test_a_still_scene_has_no_moving_pixels(tmp_path):
     """Null where no pixel is, with a share of zero, and the page says it for all pixels."""
     run = AnalyticRun(tmp_path)
     still = np.tile(true_distance(0), (14, 1, 1)).astype(np.float32)
-    ftorf.write(tmp_path / "still", analytic_run.sequence(), Truth(distance=still, known=np.ones(14, dtype=bool)))
+    write("ftorf", tmp_path / "still", analytic_run.sequence(), Truth(distance=still, known=np.ones(14, dtype=bool)))
     got = compare(run, truth=tmp_path / "still")
     assert got["moving"] == {**dict.fromkeys(k for k in KEYS if k.endswith("_mse_x100")), "share": 0.0}
     assert got["static"]["d_mse_x100"] == pytest.approx(got["d_mse_x100"])
@@ -211,11 +211,11 @@ def test_a_still_scene_has_no_moving_pixels(tmp_path):
 def test_a_truth_that_does_not_fit_is_named(tmp_path):
     """Another number of frames, or no truth at all, where one was asked for."""
     run = AnalyticRun(tmp_path)
-    ftorf.write(tmp_path / "short", analytic_run.sequence(8), analytic_run.truth(8))
+    write("ftorf", tmp_path / "short", analytic_run.sequence(8), analytic_run.truth(8))
     with pytest.raises(InputError, match=r"expected frames x rows x columns 14x12x20, found 8x12x20") as error:
         compare(run, truth=tmp_path / "short")
     assert error.value.where == str(tmp_path / "short")
-    ftorf.write(tmp_path / "blind", analytic_run.sequence())
+    write("ftorf", tmp_path / "blind", analytic_run.sequence())
     with pytest.raises(InputError, match="no ground truth"):
         compare(run, truth=tmp_path / "blind")
     with pytest.raises(UsageError, match="unknown protocol"):

@@ -11,12 +11,11 @@ from sequences import changed, sequence_of
 
 from gftorf_warp import Sequence
 from gftorf_warp.constants import CANONICAL_SHIFTS, SPEED_OF_LIGHT
-from gftorf_warp.data import capture
 from gftorf_warp.data.check import check
 from gftorf_warp.data.cycles import find_cycle, phase_noise
 from gftorf_warp.data.decode import closed_form_distance, decode_quartet, quad_scale, quartet_phasors, unambiguous_range
-from gftorf_warp.data.ftorf_write import write as write_ftorf
 from gftorf_warp.data.unwrap import CONFIDENT, choose, common_range, multiples
+from gftorf_warp.data.write import write
 from gftorf_warp.errors import InputError, UsageError
 from gftorf_warp.scene.measured import distance_noise, key_times, sensor_of
 from gftorf_warp.scene.sensor import phasor_from_quads
@@ -210,10 +209,10 @@ def test_a_capture_keeps_the_cycle_and_says_what_is_wrong(tmp_path):
     """Stated or found; other layouts have no place for it; impossible ones are named."""
     distance = np.linspace(2.0, 7.0, 20 * 16).reshape(16, 20)
     sequence = still(distance, evenly(3), (60e6, 40e6), cycles=2, cycle_length=6)
-    read = Sequence.open(capture.write(tmp_path / "stated", sequence))
+    read = Sequence.open(write("capture", tmp_path / "stated", sequence))
     assert (read.cycle, read.calibration.cycle_length, read.frequencies) == (6, 6, (60e6, 40e6))
     np.testing.assert_allclose(closed_form_distance(read, 1), distance, atol=1e-4)
-    found = Sequence.open(capture.write(tmp_path / "found", changed(sequence, cycle_length=None)))
+    found = Sequence.open(write("capture", tmp_path / "found", changed(sequence, cycle_length=None)))
     assert (found.cycle, found.calibration.cycle_length) == (6, None)
     text = str(check(tmp_path / "found"))
     for line in (
@@ -225,7 +224,7 @@ def test_a_capture_keeps_the_cycle_and_says_what_is_wrong(tmp_path):
         assert line in text
     assert quad_scale(read)[0] == pytest.approx(1 / 1.4, rel=1e-3)
     with pytest.raises(UsageError, match="shifts: the ftorf format"):
-        write_ftorf(tmp_path / "other", still(distance, evenly(8), cycles=2))
+        write("ftorf", tmp_path / "other", still(distance, evenly(8), cycles=2))
     path = tmp_path / "stated" / "capture.json"
     (tmp_path / "stated" / "MANIFEST.sha256").unlink()
     path.write_text(path.read_text().replace('"cycle_frames": 6', '"cycle_frames": 5'))
@@ -236,9 +235,9 @@ def test_a_capture_keeps_the_cycle_and_says_what_is_wrong(tmp_path):
 def test_check_names_frequencies_that_nothing_unwraps(tmp_path):
     """A warning instead of a decoded distance; frequencies that contradict each other are a warning, too."""
     distance = np.linspace(2.0, 7.0, 20 * 16).reshape(16, 20)
-    capture.write(tmp_path / "odd", still(distance, evenly(3), (60e6, 60e6 / math.sqrt(2)), cycles=2))
+    write("capture", tmp_path / "odd", still(distance, evenly(3), (60e6, 60e6 / math.sqrt(2)), cycles=2))
     assert "warning: frequencies without a common range" in str(check(tmp_path / "odd"))
     wrong = still(distance, evenly(3), (60e6, 40e6), cycles=2)
     wrong.quads[[4, 5, 10, 11]] = wrong.quads[[5, 4, 11, 10]]  # the phase of the second frequency runs backwards
-    capture.write(tmp_path / "wrong", wrong)
+    write("capture", tmp_path / "wrong", wrong)
     assert "frequencies disagree" in str(check(tmp_path / "wrong"))

@@ -7,16 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from gftorf_warp.recon.captured import unsuitable
+from gftorf_warp.recon.objective import terms, weights_at
 
 from gftorf_warp import Sequence, cli
 from gftorf_warp.constants import SPEED_OF_LIGHT
-from gftorf_warp.data import capture
 from gftorf_warp.data.decode import decode_quartet
+from gftorf_warp.data.write import write
 from gftorf_warp.errors import InputError
 from gftorf_warp.evaluate.compare import compare
 from gftorf_warp.recon import presets
-from gftorf_warp.recon.captured import unsuitable
-from gftorf_warp.recon.objective import terms, weights_at
 from gftorf_warp.recon.observations import observe
 from gftorf_warp.recon.optimiser import betas_of
 from gftorf_warp.recon.run import Run
@@ -195,7 +195,7 @@ def test_frequencies_without_a_common_range_stop_by_name(folders, tmp_path):
     """Before anything is written."""
     sequence = Sequence.open(folders / "two frequencies")
     odd = np.where(sequence.frequencies_hz == 40e6, 60e6 / math.sqrt(2), 60e6)
-    folder = capture.write(tmp_path / "odd", replace(sequence, frequencies_hz=odd, path=None))
+    folder = write("capture", tmp_path / "odd", replace(sequence, frequencies_hz=odd, path=None))
     for preset in ("demo", "ctof"):
         with pytest.raises(InputError, match="frequencies without a common range"):
             reconstruct(folder, tmp_path / "run", preset, images=4)

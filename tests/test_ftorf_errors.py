@@ -14,7 +14,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gftorf_warp import Sequence
-from gftorf_warp.data import arrays, ftorf, specs
+from gftorf_warp.data import arrays, specs
+from gftorf_warp.data.write import write
 from gftorf_warp.errors import InputError
 
 QUAD = "tofType2/0006.npy"
@@ -26,7 +27,7 @@ def original(tmp_path_factory):
     """A complete folder with colour and flow."""
     colour = {n: np.full((6, 8, 3), 0.1 * n, np.float32) for n in range(8)}
     sequence, truth = scene(colour=colour, forward_flow={0: FLOW}, backward_flow={4: FLOW}, quad_scale=2.0)
-    return ftorf.write(tmp_path_factory.mktemp("original") / "seq", sequence, truth)
+    return write("ftorf", tmp_path_factory.mktemp("original") / "seq", sequence, truth)
 
 
 @pytest.fixture
@@ -105,7 +106,6 @@ def test_a_folder_of_phasors_is_told_from_one_of_quads(folder):
     for name in ("frame_times", "tof_extrinsics", "color_extrinsics"):
         (folder / f"cams/{name}.npy").unlink()
     assert Sequence.open(folder).from_phasors
-    assert_names(refused(folder, read=ftorf.read), "seq", "not an F-ToeRF folder", "tofType0")
 
 
 def test_no_frame_of_its_own_slot_is_no_raw_frame(folder):
@@ -381,7 +381,7 @@ def test_truth_is_checked_when_it_is_read(folder, array, words):
     """And only then."""
     np.save(folder / "synthetic_depth/0003.npy", array)
     Sequence.open(folder)
-    error = refused(folder, read=lambda path: ftorf.read_truth(path, frames=8))
+    error = refused(folder, read=lambda path: Sequence.open(path).truth())
     assert_names(error, "synthetic_depth/0003.npy", "distance", *words)
 
 

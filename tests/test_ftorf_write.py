@@ -13,9 +13,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sequences import NAMES, changed, sequence_of
 
-from gftorf_warp import Truth
+from gftorf_warp import Sequence, Truth
 from gftorf_warp.constants import CANONICAL_SHIFTS, SPEED_OF_LIGHT
-from gftorf_warp.data import ftorf, specs
+from gftorf_warp.data import specs
+from gftorf_warp.data.write import write
 from gftorf_warp.errors import UsageError
 
 ROOT = Path(__file__).parents[1]
@@ -24,7 +25,7 @@ ROOT = Path(__file__).parents[1]
 @pytest.fixture
 def folder(tmp_path):
     """A complete folder in the order of the real recordings."""
-    return ftorf.write(tmp_path / "seq", *scene())
+    return write("ftorf", tmp_path / "seq", *scene())
 
 
 @st.composite
@@ -83,12 +84,12 @@ def test_write_then_read_is_the_identity(tmp_path_factory, drawn):
     """Images bit by bit in float32, calibration in float64, whatever is missing; and a second round too."""
     sequence, truth = drawn
     with mock.patch("os.fsync"):  # waiting for the disk, thousands of times, shows nothing here
-        first = ftorf.write(tmp_path_factory.mktemp("round") / "first", sequence, truth, readme="# a card\n")
-        got = ftorf.read(first)
-        again = ftorf.write(first.parent / "second", got, got.truth())
+        first = write("ftorf", tmp_path_factory.mktemp("round") / "first", sequence, truth, readme="# a card\n")
+        got = Sequence.open(first)
+        again = write("ftorf", first.parent / "second", got, got.truth())
     assert_same(got, sequence)
-    assert_same(ftorf.read(again), sequence)
-    got_truth = ftorf.read_truth(again, frames=sequence.frames)
+    assert_same(Sequence.open(again), sequence)
+    got_truth = Sequence.open(again).truth()
     if truth.known.any():
         assert_same_bits(got_truth.distance, truth.distance, "distance")
         assert_same_bits(got_truth.known, truth.known, "known")
@@ -99,9 +100,9 @@ def test_write_then_read_is_the_identity(tmp_path_factory, drawn):
 
 def test_the_sample_survives_a_round(tmp_path):
     """Read, write, read: every bit of the sample, though the writer stores other pixel centres and states them."""
-    want = ftorf.read(SAMPLE)
-    folder = ftorf.write(tmp_path / "seq", want, want.truth())
-    got = ftorf.read(folder)
+    want = Sequence.open(SAMPLE)
+    folder = write("ftorf", tmp_path / "seq", want, want.truth())
+    got = Sequence.open(folder)
     assert_same(got, want)
     assert_same_bits(got.truth().distance, want.truth().distance, "distance")
     assert np.load(folder / "cams/tof_intrinsics.npy")[:2, 2].tolist() == [79.5, 59.5]
@@ -183,7 +184,7 @@ def poses_with(**changes):
 def test_what_the_format_cannot_hold_is_refused(tmp_path, changes, word):
     """A named usage error, and nothing on disk."""
     with pytest.raises(UsageError) as caught:
-        ftorf.write(tmp_path / "seq", changed(scene()[0], **changes))
+        write("ftorf", tmp_path / "seq", changed(scene()[0], **changes))
     assert caught.value.exit_code == 2
     assert word in caught.value.what
     assert caught.value.fix
@@ -196,7 +197,7 @@ def test_truth_that_is_no_distance_is_refused(tmp_path, value):
     sequence, truth = scene()
     truth.distance[1, 2, 3] = value
     with pytest.raises(UsageError, match="truth"):
-        ftorf.write(tmp_path / "seq", sequence, truth)
+        write("ftorf", tmp_path / "seq", sequence, truth)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -216,14 +217,14 @@ def test_truth_that_is_no_distance_is_refused(tmp_path, value):
 def test_parts_that_do_not_fit_together_are_a_programming_mistake(tmp_path, changes):
     """The message names the part and both shapes."""
     with pytest.raises(ValueError, match=next(iter(changes))):
-        ftorf.write(tmp_path / "seq", scene(**changes)[0])
+        write("ftorf", tmp_path / "seq", scene(**changes)[0])
 
 
 def test_a_full_folder_is_not_written_to(folder):
     """Nor is one written half: the check comes before the first file."""
     before = fingerprint(folder)
     with pytest.raises(UsageError) as caught:
-        ftorf.write(folder, scene()[0])
+        write("ftorf", folder, scene()[0])
     assert caught.value.exit_code == 2
     assert str(folder) in caught.value.where
     assert fingerprint(folder) == before

@@ -15,8 +15,9 @@ from sequences import changed
 
 from gftorf_warp import Sequence
 from gftorf_warp.constants import SPEED_OF_LIGHT
-from gftorf_warp.data import decode, estimates, ftorf
+from gftorf_warp.data import decode, estimates
 from gftorf_warp.data.check import check
+from gftorf_warp.data.write import write
 from gftorf_warp.errors import InputError
 from gftorf_warp.recon import presets
 from gftorf_warp.recon.observations import observe, reduced
@@ -75,7 +76,7 @@ def test_mistake_04_the_start_is_one_distance_per_pixel_within_one_range():
 def test_mistake_07_the_order_of_quads_is_read_from_the_folder(tmp_path, permutation):
     """Every stored order decodes to the truth; real files in the paper's order are off by a quarter of c/2f."""
     distance = ramp(6, 8)
-    folder = ftorf.write(tmp_path / "seq", wall(distance, permutation=permutation))
+    folder = write("ftorf", tmp_path / "seq", wall(distance, permutation=permutation))
     sequence = Sequence.open(folder)
     np.testing.assert_allclose(decode.closed_form_distance(sequence, 1), distance, rtol=1e-5)
     start = from_phase(sequence, EVERY_PIXEL).field
@@ -91,7 +92,7 @@ def test_mistake_07_the_order_of_quads_is_read_from_the_folder(tmp_path, permuta
 def test_mistake_09_depth_range_is_twice_the_unambiguous_range(tmp_path):
     """A file that says 15 means 19.986 MHz and 7.5 m: a wall at 6 m is at 6 m, one at 9 m appears at 1.5 m."""
     distance = np.where(np.arange(8) < 4, 6.0, 9.0) * np.ones((6, 1))
-    folder = ftorf.write(tmp_path / "seq", wall(distance))
+    folder = write("ftorf", tmp_path / "seq", wall(distance))
     np.save(folder / "cams/depth_range.npy", np.float64(15.0))
     sequence = Sequence.open(folder)
     assert sequence.calibration.f_mod_hz == pytest.approx(SPEED_OF_LIGHT / 15.0, rel=1e-12)
@@ -118,7 +119,7 @@ def test_mistake_15_a_pixel_of_unknown_flow_is_read_and_left_out(tmp_path):
     """NaN in a flow file stays NaN on its way to the loss, where it is masked, also after the images are reduced."""
     flow = np.ones((2, 12, 20), np.float32)
     flow[0, 3, 4] = np.nan
-    folder = ftorf.write(tmp_path / "seq", wall(ramp(12, 20), forward_flow={0: flow}))
+    folder = write("ftorf", tmp_path / "seq", wall(ramp(12, 20), forward_flow={0: flow}))
     sequence = Sequence.open(folder)
     assert np.isnan(sequence.flow.forward[0]).sum() == 1
     prepared = observe(sequence, replace(presets.demo(), width_max=10), "cpu")
@@ -138,7 +139,7 @@ def test_mistake_15_a_quad_that_is_no_number_is_an_error_and_never_a_scale(tmp_p
     broken[frame, 3, 4] = np.nan
     with pytest.raises(InputError):
         observe(replace(sequence, quads=broken), WITHOUT_FLOW, "cpu")
-    folder = ftorf.write(tmp_path / "seq", sequence)
+    folder = write("ftorf", tmp_path / "seq", sequence)
     np.save(folder / f"tofType2/{frame:04d}.npy", broken[frame])
     with pytest.raises(InputError, match="nan"):
         Sequence.open(folder)
@@ -155,7 +156,7 @@ def test_mistake_15_a_quad_that_is_no_number_is_an_error_and_never_a_scale(tmp_p
 def test_mistake_16_the_factor_of_the_file_is_used_once_and_nothing_overrides_it(tmp_path):
     """Quads as read keep the units of the file; the optimisation multiplies by the stated factor, or by 1 / maximum."""
     plain = wall(ramp(6, 8))
-    stated = Sequence.open(ftorf.write(tmp_path / "seq", changed(plain, quad_scale=5.0)))
+    stated = Sequence.open(write("ftorf", tmp_path / "seq", changed(plain, quad_scale=5.0)))
     np.testing.assert_array_equal(stated.quads, plain.quads)
     for sequence, factor in ((stated, 5.0), (plain, 1.0 / decode.largest_amplitude(plain))):
         prepared = observe(sequence, WITHOUT_FLOW, "cpu")
@@ -172,7 +173,7 @@ def test_mistake_17_the_constant_part_is_tested_when_a_recording_is_checked(tmp_
     sequence = wall(ramp(12, 20), dc_offset=constant)
     assert estimates.dc_offset(sequence) == pytest.approx(constant, abs=1e-3)
     for stated in (0.0, 1.0):
-        folder = ftorf.write(tmp_path / f"says-{stated}", changed(sequence, dc_offset=stated))
+        folder = write("ftorf", tmp_path / f"says-{stated}", changed(sequence, dc_offset=stated))
         warned = any("dc_offset" in text for text in check(folder).warnings)
         assert warned == (stated != constant)
         assert sensor_of(Sequence.open(folder)).dc_offset == stated
@@ -194,7 +195,7 @@ def test_mistake_20_colour_keeps_its_digits(tmp_path):
     """Values between two steps of 8 bits, above white and below black are read as they were written."""
     colour = np.linspace(-0.3, 3.0, 6 * 8 * 3, dtype=np.float32).reshape(6, 8, 3)
     colour[0, 0] = [0.5, 0.5 + 1e-6, 200.0]
-    sequence = Sequence.open(ftorf.write(tmp_path / "seq", wall(ramp(6, 8), colour={0: colour})))
+    sequence = Sequence.open(write("ftorf", tmp_path / "seq", wall(ramp(6, 8), colour={0: colour})))
     assert sequence.colour.images[0].dtype == np.float32
     np.testing.assert_array_equal(sequence.colour.images[0], colour)
 
@@ -202,7 +203,7 @@ def test_mistake_20_colour_keeps_its_digits(tmp_path):
 def test_mistake_21_colour_of_another_size_resizes_nothing_else(tmp_path):
     """Quads keep their size and the ToF camera its intrinsics, whatever the colour camera has."""
     sequence = wall(ramp(6, 8), colour={0: np.random.default_rng(0).random((12, 16, 3)).astype(np.float32)})
-    got = Sequence.open(ftorf.write(tmp_path / "seq", sequence))
+    got = Sequence.open(write("ftorf", tmp_path / "seq", sequence))
     assert got.quads.shape == (8, 6, 8)
     assert got.colour.images[0].shape == (12, 16, 3)
     assert got.intrinsics == sequence.intrinsics
@@ -227,7 +228,7 @@ def test_mistake_21_reducing_images_reduces_their_intrinsics():
 
 def test_mistake_21_a_truncated_quartet_is_recognised(tmp_path):
     """Fourteen frames: three quartets to decode, all frames to compare, and a key after the last one."""
-    folder = ftorf.write(tmp_path / "seq", wall(ramp(12, 20), frames=14))
+    folder = write("ftorf", tmp_path / "seq", wall(ramp(12, 20), frames=14))
     sequence = Sequence.open(folder)
     assert sequence.complete_quartets == [0, 1, 2]
     assert any("truncated after 2" in text for text in check(folder).warnings)

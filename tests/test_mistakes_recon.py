@@ -16,7 +16,7 @@ from sequences import changed
 from small_runs import demo, same, small
 
 from gftorf_warp.constants import CANONICAL_SHIFTS, SH_Y0
-from gftorf_warp.data import ftorf
+from gftorf_warp.data.write import write
 from gftorf_warp.evaluate.compare import compare
 from gftorf_warp.evaluate.metrics import scored_frames
 from gftorf_warp.recon import checkpoint, densify, objective, step
@@ -172,7 +172,7 @@ def test_mistake_11_nothing_claims_to_prune_by_size_on_the_screen():
 def box(tmp_path_factory):
     """A recording of a moving box in a folder, and a few steps of a reconstruction that adds Gaussians."""
     root = tmp_path_factory.mktemp("box")
-    folder = ftorf.write(root / "seq", small())
+    folder = write("ftorf", root / "seq", small())
     grow = DensifySettings(every=8, start=4, stop_share=0.9, gradient_min=1e-6)
     return reconstruct(folder, root / "run", demo(images=20, densify=grow))
 

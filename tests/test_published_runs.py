@@ -9,7 +9,7 @@ from moving_box import recording
 from small_runs import rows, same, stored
 from test_inputs import as_phasors, with_colour
 
-from gftorf_warp.data import ftorf
+from gftorf_warp.data.write import write
 from gftorf_warp.errors import InputError
 from gftorf_warp.evaluate.compare import compare
 from gftorf_warp.recon import presets, step
@@ -81,7 +81,7 @@ def test_phasors_with_colour(tmp_path, name, device):
 @pytest.mark.parametrize("products", [Products.FLOAT32, Products.HALF])
 def test_a_run_with_a_network_stops_and_goes_on_to_the_same_bytes(tmp_path, products):
     """Across a densification and a reset; scored in between, it says how far it was."""
-    path = ftorf.write(tmp_path / "seq", *recording(frames=12))
+    path = write("ftorf", tmp_path / "seq", *recording(frames=12))
     settings = small("released", 120)
     settings = replace(settings, schedule=replace(settings.schedule, checkpoint_every_s=0.0))
     settings = replace(settings, motion=replace(settings.motion, products=products))

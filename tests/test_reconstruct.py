@@ -12,8 +12,8 @@ from moving_box import recording
 from small_runs import KEYS, demo, field, rows, same, small, stored
 
 from gftorf_warp import Sequence
-from gftorf_warp.data import ftorf
 from gftorf_warp.data.sequence import Flow
+from gftorf_warp.data.write import write
 from gftorf_warp.errors import InputError, UsageError
 from gftorf_warp.evaluate.compare import compare
 from gftorf_warp.recon import presets, train
@@ -35,7 +35,7 @@ DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 def folder_of_a_sequence(tmp_path_factory):
     """The small recording on disk, with its truth."""
     path = tmp_path_factory.mktemp("sequence") / "box"
-    ftorf.write(path, small(), recording(frames=12)[1])
+    write("ftorf", path, small(), recording(frames=12)[1])
     return path
 
 

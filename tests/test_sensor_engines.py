@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from gftorf_warp.data.decode import closed_form_distance
-from gftorf_warp.data.ftorf_write import write
+from gftorf_warp.data.write import write
 from gftorf_warp.errors import UsageError
 from gftorf_warp.scene.pattern import Pattern, phase_map
 from gftorf_warp.scene.sensor import Sensor, phasor_from_quads
@@ -93,7 +93,9 @@ def test_two_frequencies_see_beyond_the_range_of_each(engine, tmp_path):
     np.testing.assert_allclose(got[2:-2, 2:-2], distance[2:-2, 2:-2], atol=WITHIN[engine][1])
     np.testing.assert_allclose(closed_form_distance(sequence, 0), got, atol=1e-6)
     with pytest.raises(UsageError, match="frequencies_hz"):
-        write(tmp_path / "out", replace(sequence, shifts=np.resize([0, math.pi, math.pi / 2, 1.5 * math.pi], 6)))
+        write(
+            "ftorf", tmp_path / "out", replace(sequence, shifts=np.resize([0, math.pi, math.pi / 2, 1.5 * math.pi], 6))
+        )
     ideal = ideal_recording(wall(sensor))[0]
     assert (ideal.cycle, ideal.frequencies) == (6, (60e6, 40e6))
     np.testing.assert_allclose(closed_form_distance(ideal, 0), distance, atol=1e-4)

@@ -15,8 +15,9 @@ from sequences import NAMES, changed, sequence_of, values_of
 
 from gftorf_warp import Sequence, Truth
 from gftorf_warp.constants import CANONICAL_SHIFTS, SPEED_OF_LIGHT
-from gftorf_warp.data import decode, ftorf, specs, torf
+from gftorf_warp.data import decode, specs
 from gftorf_warp.data.sequence import Calibration, Intrinsics
+from gftorf_warp.data.write import write
 from gftorf_warp.errors import UsageError
 
 ROOT = Path(__file__).parents[1]
@@ -71,9 +72,9 @@ def test_both_conventions_are_one_sequence(folder, tmp_path, first_id):
     """Ids from 0001 and .mat files, as originally published, or renumbered: nothing differs, truth included."""
     other = torf_folder.build(tmp_path / "other", first_id=first_id, matlab=True)
     before = fingerprint(other)
-    got = torf.read(other)
-    assert_same(got, torf.read(folder))
-    assert_same_bits(got.truth().distance, torf.read(folder).truth().distance, "distance")
+    got = Sequence.open(other)
+    assert_same(got, Sequence.open(folder))
+    assert_same_bits(got.truth().distance, Sequence.open(folder).truth().distance, "distance")
     assert f"ids from {first_id:04d}" in got.sources["measured"]
     assert got.sources["fx"] == "file cams/tof_intrinsics.mat"
     assert fingerprint(other) == before
@@ -83,9 +84,9 @@ def test_both_conventions_are_one_sequence(folder, tmp_path, first_id):
 def test_a_gap_is_not_measured_and_nothing_moves_up(tmp_path, first_id):
     """The four raw frames of a missing phasor are masked; later ones keep their times, poses and colour."""
     folder = torf_folder.build(tmp_path / "seq", 4, first_id=first_id)
-    want = torf.read(folder)
+    want = Sequence.open(folder)
     (folder / f"tof/{first_id + 1:04d}.npy").unlink()
-    got = torf.read(folder)
+    got = Sequence.open(folder)
     assert np.flatnonzero(~got.measured).tolist() == [4, 5, 6, 7]
     assert not got.quads[4:8].any()
     assert got.complete_quartets == [0, 2, 3]
@@ -99,20 +100,20 @@ def test_phasor_0_is_known_by_colour_and_times(tmp_path):
     """A missing first phasor does not renumber the others where another file tells the count."""
     folder = torf_folder.build(tmp_path / "seq", 3)
     (folder / "tof/0000.npy").unlink()
-    assert torf.read(folder).complete_quartets == [1, 2]
+    assert Sequence.open(folder).complete_quartets == [1, 2]
     shutil.rmtree(folder / "color")
     np.save(folder / "cams/frame_times.npy", np.array([0.0, 0.5, 0.75]))
-    got = torf.read(folder)
+    got = Sequence.open(folder)
     assert got.complete_quartets == [1, 2]
     np.testing.assert_array_equal(got.times, np.repeat([0.0, 0.5, 0.75], 4))
-    assert torf.read_truth(folder, frames=12).distance[0, 0, 0] == torf_folder.images(3)[1][0, 0, 0]
+    assert Sequence.open(folder).truth().distance[0, 0, 0] == torf_folder.images(3)[1][0, 0, 0]
 
 
 def test_times_are_the_file_s_unless_a_rate_is_given(folder):
     """One time per phasor; the file may state phasors after the last file."""
     np.save(folder / "cams/frame_times.npy", np.array([0.0, 0.1, 0.3, 0.4]))
     np.save(folder / "cams/tof_extrinsics.npy", torf_folder.poses(4))
-    got = torf.read(folder)
+    got = Sequence.open(folder)
     np.testing.assert_array_equal(got.times, np.repeat([0.0, 0.1, 0.3, 0.4], 4))
     assert got.complete_quartets == [0, 1, 2]
     got = Sequence.open(folder, frame_rate_hz=10.0)
@@ -125,7 +126,7 @@ def test_the_relative_pose_goes_from_colour_to_tof(folder, shape):
     """A point in front of the colour camera, taken by E to the ToF camera, is the same point of the world."""
     np.save(folder / "cams/relative_pose.npy", torf_folder.RELATIVE.reshape(shape))
     np.save(folder / "cams/color_extrinsics.npy", torf_folder.poses(3))  # replaced
-    got = torf.read(folder)
+    got = Sequence.open(folder)
     world = np.array([0.3, -0.2, 2.0, 1.0])
     for n in (0, 5, 11):
         in_colour, in_tof = got.colour.camera_from_world[n] @ world, got.camera_from_world[n] @ world
@@ -144,7 +145,7 @@ def test_colour_poses_come_from_the_best_file(folder):
     relative = np.linalg.inv(torf_folder.RELATIVE) @ torf_folder.poses(3)
 
     def first():
-        got = torf.read(folder)
+        got = Sequence.open(folder)
         return got.colour.camera_from_world[::4], got.sources["colour_from_world"]
 
     np.testing.assert_allclose(first()[0], relative)
@@ -167,7 +168,7 @@ def test_without_calibration_the_defaults_are_used_and_named(folder):
     for path in (folder / "cams").iterdir():
         if path.name != "tof_intrinsics.npy":
             path.unlink()
-    got = torf.read(folder)
+    got = Sequence.open(folder)
     assert (got.calibration.f_mod_hz, got.calibration.phase_offset) == (SPEED_OF_LIGHT / 10, 0.0)
     np.testing.assert_array_equal(got.camera_from_world, np.tile(np.eye(4), (12, 1, 1)))
     assert got.colour.intrinsics == got.intrinsics.scaled(2, 2)
@@ -176,7 +177,7 @@ def test_without_calibration_the_defaults_are_used_and_named(folder):
     for name in ("colour_intrinsics", "colour_from_world", "pixel_centre"):
         assert got.sources[name].startswith("inferred"), name
     shutil.rmtree(folder / "color")
-    got = torf.read(folder)
+    got = Sequence.open(folder)
     assert (got.colour.images, got.colour.intrinsics, got.colour.camera_from_world) == ({}, None, None)
 
 
@@ -186,14 +187,14 @@ def test_pixel_centres_are_those_of_both_cameras(folder, centre, cx, added):
     np.save(folder / "cams/tof_intrinsics.npy", np.array([[9.0, 0, cx], [0, 9.0, 2.5], [0, 0, 1]]))
     if centre:
         (folder / "cams/pixel_centre.json").write_text(f'{{"pixel_centre": "{centre}"}}')
-    got = torf.read(folder)
+    got = Sequence.open(folder)
     assert (got.intrinsics.cx, got.intrinsics.cy) == (cx + added, 2.5 + added)
     assert got.colour.intrinsics == Intrinsics(fx=20.0, fy=21.0, cx=7.0 + added, cy=5.0 + added)
 
 
 def test_every_field_names_its_source(folder):
     """Whatever the reader fills, it says where it is from, in one of four words."""
-    got = torf.read(folder)
+    got = Sequence.open(folder)
     assert set(got.sources) >= NAMES
     assert all(text.split()[0] in {"file", "default", "inferred", "setting"} for text in got.sources.values())
 
@@ -204,31 +205,31 @@ def test_truth_is_distance_before_depth(folder):
     image[0, 0], image[1, 1] = 0.0, np.nan
     (folder / "depth").mkdir()
     np.save(folder / "depth/0001.npy", image)
-    assert torf.read(folder).truth().distance[4, 2, 2] != 2.5
+    assert Sequence.open(folder).truth().distance[4, 2, 2] != 2.5
     shutil.rmtree(folder / "distance")
-    truth = torf.read(folder).truth()
+    truth = Sequence.open(folder).truth()
     assert np.flatnonzero(truth.known).tolist() == [4, 5, 6, 7]
     assert np.argwhere(np.isnan(truth.distance[6])).tolist() == [[0, 0], [1, 1]]
     assert np.isnan(truth.distance[:4]).all()
     shutil.rmtree(folder / "depth")
-    assert torf.read(folder).truth() is None
+    assert Sequence.open(folder).truth() is None
 
 
 def test_reading_never_opens_truth_or_masks(folder):
     """Without them, or with rubbish in them, the sequence is the same."""
-    want = torf.read(folder)
+    want = Sequence.open(folder)
     for name in ("distance", "depth", "mask_tof", "mask_color"):
         (folder / name).mkdir(exist_ok=True)
         (folder / name / "0000.npy").write_bytes(b"rubbish")
-    assert_same(torf.read(folder), want)
+    assert_same(Sequence.open(folder), want)
     for name in ("distance", "depth"):
         shutil.rmtree(folder / name)
-    assert_same(torf.read(folder), want)
+    assert_same(Sequence.open(folder), want)
 
 
 def test_raw_quads_are_looked_for_before_phasors(folder, tmp_path):
     """An F-TöRF folder may have phasors too, and its reader is chosen; a TöRF folder has a reader of its own."""
-    mixed = ftorf.write(tmp_path / "mixed", *scene())
+    mixed = write("ftorf", tmp_path / "mixed", *scene())
     shutil.copytree(folder / "tof", mixed / "tof")
     assert not Sequence.open(mixed).from_phasors
     assert Sequence.open(mixed).truth().known.all()
@@ -286,14 +287,14 @@ def test_write_then_read_is_the_identity(tmp_path_factory, drawn):
     """Bit by bit, poses of both cameras included, whichever phasor is missing; and a second round too."""
     sequence, truth, same = drawn
     with mock.patch("os.fsync"):  # waiting for the disk, thousands of times, shows nothing here
-        first = torf.write(tmp_path_factory.mktemp("round") / "first", sequence, truth, readme="# a card\n")
+        first = write("torf", tmp_path_factory.mktemp("round") / "first", sequence, truth, readme="# a card\n")
         got = Sequence.open(first)
-        again = torf.write(first.parent / "second", got, got.truth())
+        again = write("torf", first.parent / "second", got, got.truth())
     want = dataclasses.replace(sequence, quads=sequence.quads * sequence.measured[:, None, None])
     for other in (got, Sequence.open(again)):
         np.testing.assert_array_equal(other.quads, want.quads)  # -0 of an absent phasor is 0
         assert_same(dataclasses.replace(other, quads=want.quads), want)
-    got_truth = torf.read_truth(again, frames=sequence.frames)
+    got_truth = Sequence.open(again).truth()
     if truth.known.any():
         assert_same_bits(got_truth.distance, truth.distance, "distance")
         assert_same_bits(got_truth.known, truth.known, "known")
@@ -308,8 +309,8 @@ def test_an_original_folder_survives_a_round(tmp_path):
     """Ids from 1 and .mat files: read, write, read gives every bit; the third channel becomes the length."""
     folder = torf_folder.build(tmp_path / "seq", first_id=1, matlab=True, phase_offset=0.2)
     np.save(folder / "test_poses.npy", torf_folder.poses(5)[:, :3])
-    want = torf.read(folder)
-    again = torf.write(tmp_path / "again", want, want.truth())
+    want = Sequence.open(folder)
+    again = write("torf", tmp_path / "again", want, want.truth())
     got = Sequence.open(again)
     assert_same(got, want)
     assert_same_bits(got.truth().distance, want.truth().distance, "distance")
@@ -328,7 +329,7 @@ def test_complete_quartets_of_raw_quads_become_phasors(tmp_path):
     sequence.measured[[2, 7]] = False  # quartets 0 and 1 are incomplete, 3 is truncated
     sequence.quads[[2, 7]] = 0.0
     sequence.measured[2] = True
-    got = Sequence.open(torf.write(tmp_path / "seq", sequence, truth))
+    got = Sequence.open(write("torf", tmp_path / "seq", sequence, truth))
     assert got.complete_quartets == [0, 2]
     assert got.frames == 12
     for i in (0, 2):
@@ -345,7 +346,7 @@ def test_complete_quartets_of_raw_quads_become_phasors(tmp_path):
 def test_the_sample_decodes_alike_as_phasors(tmp_path):
     """The closed form of the sample's quads and of the phasors they are written as."""
     sequence = Sequence.open(SAMPLE)
-    got = Sequence.open(torf.write(tmp_path / "seq", sequence, sequence.truth()))
+    got = Sequence.open(write("torf", tmp_path / "seq", sequence, sequence.truth()))
     assert (got.frames, got.from_phasors) == (32, True)
     want = decode.closed_form_distance(sequence, 3)
     difference = np.abs(decode.closed_form_distance(got, 3) - want)
@@ -354,8 +355,8 @@ def test_the_sample_decodes_alike_as_phasors(tmp_path):
 
 def test_everything_written_is_described(folder, tmp_path):
     """No file of the writer lacks an entry in data_specs/, and its type is one that the entry allows."""
-    sequence = changed(torf.read(folder), quad_scale=2.0, novel_from_world=torf_folder.poses(2))
-    written = torf.write(tmp_path / "written", sequence, sequence.truth())
+    sequence = changed(Sequence.open(folder), quad_scale=2.0, novel_from_world=torf_folder.poses(2))
+    written = write("torf", tmp_path / "written", sequence, sequence.truth())
     described = {path: field for field in specs.fields("torf").values() for path in field.paths}
     names = {str(path.relative_to(written)) for path in written.rglob("*.*")}
     assert {"test_poses.npy", "distance/0002.npy", "cams/relative_pose.npy"} <= names
@@ -394,7 +395,7 @@ def test_descriptions_cover_the_sequence_and_the_truth():
 def test_what_the_format_cannot_hold_is_refused(tmp_path, changes, word):
     """A named usage error, and nothing on disk."""
     with pytest.raises(UsageError) as caught:
-        torf.write(tmp_path / "seq", scene(12, **changes)[0])
+        write("torf", tmp_path / "seq", scene(12, **changes)[0])
     assert word in caught.value.what
     assert "torf" in caught.value.where
     assert list(tmp_path.iterdir()) == []
@@ -413,12 +414,12 @@ def test_what_the_format_cannot_hold_is_refused(tmp_path, changes, word):
 )
 def test_phasors_that_are_none_are_a_programming_mistake(folder, tmp_path, name, change):
     """Raw frames that differ within a phasor would be lost without a word."""
-    sequence = torf.read(folder)
+    sequence = Sequence.open(folder)
     with pytest.raises(ValueError, match=f"from_phasors: {name}"):
-        torf.write(tmp_path / "new", changed(sequence, **{name: change(values_of(sequence)[name])}))
+        write("torf", tmp_path / "new", changed(sequence, **{name: change(values_of(sequence)[name])}))
 
 
 def test_phasors_are_no_raw_quads(folder, tmp_path):
     """They were not measured one by one, so the other format refuses them."""
     with pytest.raises(UsageError, match="phasors"):
-        ftorf.write(tmp_path / "new", torf.read(folder))
+        write("ftorf", tmp_path / "new", Sequence.open(folder))

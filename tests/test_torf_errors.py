@@ -10,7 +10,6 @@ from ftorf_folder import fingerprint
 
 from gftorf_warp import Sequence
 from gftorf_warp.cli import main
-from gftorf_warp.data import torf
 from gftorf_warp.data.check import check
 from gftorf_warp.errors import InputError
 
@@ -154,10 +153,10 @@ def test_an_absurd_number_is_refused(folder):
 
 
 def test_raw_quads_are_not_read_as_phasors(folder):
-    """The reader of phasors leaves a folder of the other format alone."""
+    """A folder with tofType0 .. is one of raw quads, and these are missing."""
     for slot in range(4):
         (folder / f"tofType{slot}").mkdir()
-    assert_names(refused(folder, read=torf.read), "seq", "raw quads")
+    assert_names(refused(folder), "tofType0", "no raw frames")
 
 
 def test_one_pass_names_everything_that_is_wrong(folder, capsys):
@@ -194,5 +193,5 @@ def test_truth_is_checked_when_it_is_read(folder, array, words, name):
     (folder / "distance").rename(folder / name)
     np.save(folder / f"{name}/0002.npy", array)
     Sequence.open(folder)
-    error = refused(folder, read=lambda path: torf.read_truth(path, frames=12))
+    error = refused(folder, read=lambda path: Sequence.open(path).truth())
     assert_names(error, f"{name}/0002.npy", "distance", *words)

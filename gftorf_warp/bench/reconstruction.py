@@ -19,9 +19,9 @@ from typing import Any
 
 import numpy as np
 
-from ..data import ftorf
 from ..data.flow import compute_flow
 from ..data.read import read, read_truth
+from ..data.write import write
 from ..errors import GftorfError, ResourceError
 from ..evaluate.compare import rows_of
 from .timing import Report, lines_of
@@ -44,7 +44,7 @@ def with_flow(path: Path, out: Path) -> tuple[Path, float]:
     begun = time.perf_counter()
     with_flow = replace(sequence, flow=compute_flow(sequence))
     seconds = time.perf_counter() - begun
-    return ftorf.write(out, with_flow, read_truth(sequence)), seconds
+    return write("ftorf", out, with_flow, read_truth(sequence)), seconds
 
 
 def measure(

@@ -15,24 +15,21 @@ from ..errors import InputError, UsageError
 from . import specs
 from .arrays import SIDE_MAX
 from .calibration import DEPTH_RANGES_M, FOCAL_MIN
-from .capture_json import FORMAT, NAME, json_fields, read_values
-from .capture_write import inverse, write
+from .capture_json import FORMAT, MANIFEST, NAME, json_fields, read_values
+from .capture_write import inverse
 from .cycles import QUADS_MIN
 from .exr import Parts, read_parts
-from .folder import FRAMES_MAX, empty_quads, format_of, numbered
+from .folder import FRAMES_MAX, empty_quads, numbered
 from .poses import rigid
 from .problems import Problems
 from .sequence import Calibration, ColourCamera, Flow, Intrinsics, Sequence, Truth
-from .writing import MANIFEST
-
-__all__ = ["read", "read_truth", "write"]
 
 
-def read(path: str | Path, *, frame_rate_hz: float | None = None) -> Sequence:
+def read(root: Path, frame_rate_hz: float | None) -> Sequence:
     """Read a capture: raw frames, calibration, colour, flow and novel views, never truth.
 
     Args:
-        path: The folder.
+        root: The folder.
         frame_rate_hz: Must be None: a capture states the time of every raw frame.
 
     Raises:
@@ -43,7 +40,6 @@ def read(path: str | Path, *, frame_rate_hz: float | None = None) -> Sequence:
     if frame_rate_hz is not None:
         why = "a capture states the time of every raw frame"
         raise UsageError("frame rate", where="frame_rate_hz", why=why, fix="leave it out")
-    root = _root(Path(path))
     values, problems = read_values(root), Problems()
     _judge(root / NAME, values, problems)
     problems.raise_if_any(root)
@@ -108,19 +104,19 @@ def read(path: str | Path, *, frame_rate_hz: float | None = None) -> Sequence:
     )
 
 
-def read_truth(path: str | Path, *, frames: int) -> Truth | None:
+def read_truth(root: Path, frames: int) -> Truth | None:
     """Read what is known of the scene itself: both distances, amplitude, objects and layers; None if nothing is.
 
     A layer is NaN in raw frames that do not have it. Parts of files that nobody describes are left out.
 
     Args:
-        path: The folder.
+        root: The folder.
         frames: Number F of raw frames of the sequence.
 
     Raises:
         InputError: If an image is not what data_specs/capture.toml describes.
     """
-    root, problems = _root(Path(path)), Problems()
+    problems = Problems()
     files = _files(root, "truth", frames, problems)
     problems.raise_if_any(root)
     if not files:
@@ -159,14 +155,6 @@ def read_truth(path: str | Path, *, frames: int) -> Truth | None:
     return Truth(
         distance=distance, known=known, body=None if body is None else body.astype(np.int32), layers=layers, **more
     )
-
-
-def _root(path: Path) -> Path:
-    """The folder, if it is one of this format."""
-    if format_of(path) != FORMAT:
-        why = f"expected a folder with {NAME}, found none"
-        raise InputError("not a capture", where=path, why=why, fix="read it as what it is")
-    return path
 
 
 def _files(root: Path, folder: str, frames: int, problems: Problems) -> dict[int, Path]:

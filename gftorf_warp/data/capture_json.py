@@ -14,6 +14,7 @@ from . import specs
 from .problems import Problems
 
 NAME = "capture.json"
+MANIFEST = "MANIFEST.sha256"
 FORMAT = "capture"
 BYTES_MAX = 1 << 28  # 256 MB: a few hundred bytes per raw frame, and a million of them
 FRAMES = "frames"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,29 +14,17 @@ from .capture_json import NAME
 from .exr import Parts
 from .sequence import Intrinsics, Sequence, Truth
 from .specs import layer_field
-from .writing import float32, write_folder
+from .writing import float32
 
 VERSION = "1.0"
 
 
-def write(
-    path: str | Path,
-    sequence: Sequence,
-    truth: Truth | None = None,
-    *,
-    readme: str | None = None,
-    sheet: bytes | None = None,
-) -> Path:
-    """Write a sequence as a capture; arguments and errors are those of :func:`writing.write_folder`.
+def files(sequence: Sequence, truth: Truth | None) -> Iterator[tuple[str, bytes | Parts]]:
+    """Name and content of every file of a folder.
 
     Reading it again gives the same sequence: images bit by bit in float32, numbers as they were, poses, which are
     stored inverted, to the last digit or two.
     """
-    return write_folder(path, "capture", sequence, truth, _files, readme=readme, sheet=sheet, manifest=True)
-
-
-def _files(sequence: Sequence, truth: Truth | None) -> Iterator[tuple[str, bytes | Parts]]:
-    """Every file of the folder, by relative name."""
     yield NAME, _json(sequence)
     for n in np.flatnonzero(sequence.measured).tolist():
         yield f"tof/{n:06d}.exr", _raw_frame(sequence, n)

@@ -116,7 +116,7 @@ def third_channel(sequence: Sequence, report: Report) -> None:
     """Third channel of stored phasors against the length of the first two."""
     assert sequence.path is not None
     spec = specs.fields(report.form)["phasor"]
-    files = torf.stored_phasors(sequence.path).files
+    files = torf.stored(sequence.path).files
     stored = np.stack([as_float32(f, spec, read_array(f, spec))[0] for f in files.values()]).astype(np.float64)
     length, third = np.hypot(stored[..., 0], stored[..., 1]), stored[..., 2]
     scale = math.sqrt(float((length**2).sum()) * float((third**2).sum()))

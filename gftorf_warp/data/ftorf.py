@@ -2,38 +2,30 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
 from pathlib import Path
 
-from ..constants import FRAME_RATE_HZ, FRAMES_PER_QUARTET
+import numpy as np
+
+from ..constants import CANONICAL_SHIFTS, FRAME_RATE_HZ, FRAMES_PER_QUARTET
 from ..errors import InputError
 from . import specs
-from .family import Stored, read_distances, read_sequence
-from .folder import SLOT_FOLDERS, format_of, numbered, refuse_absurd_ids
-from .ftorf_write import write
+from .family import Stored
+from .folder import SLOT_FOLDERS, numbered, refuse_absurd_ids
 from .sequence import Sequence, Truth
-
-__all__ = ["read", "read_truth", "write"]
+from .writing import calibration_files, float32, inexpressible, json_bytes, npy, shortest
 
 FORMAT = "ftorf"
+SHIFT_TOLERANCE = 1e-6  # [rad] a shift is stored as one of four names; what differs by more is another shift
 
 
-def read(path: str | Path, *, frame_rate_hz: float | None = None) -> Sequence:
-    """Read an F-ToeRF folder, raw frames per second given or not, see :func:`gftorf_warp.data.family.read_sequence`."""
-    return read_sequence(_stored(Path(path)), frame_rate_hz)
-
-
-def read_truth(path: str | Path, *, frames: int) -> Truth | None:
-    """Read the true distances of an F-ToeRF folder, see :func:`gftorf_warp.data.family.read_distances`."""
-    return read_distances(_stored(Path(path)), frames)
-
-
-def _stored(root: Path) -> Stored:
+def stored(root: Path) -> Stored:
     """The measured raw frames of a complete folder of this format; other files of tofType0 .. are warped copies.
 
     Raises:
-        InputError: If the folder has another format, is not complete, or has no raw frame.
+        InputError: If the folder is not complete, or has no raw frame.
     """
-    format_of(root)
     missing = [name for name in (*SLOT_FOLDERS, "cams") if not (root / name).is_dir()]
     if missing:
         raise InputError(
@@ -68,3 +60,57 @@ def _stored(root: Path) -> Stored:
         rate_hz=FRAME_RATE_HZ,
         note=f"; {copies} files of another slot than their id's are warped copies, ignored" if copies else "",
     )
+
+
+def files(sequence: Sequence, truth: Truth | None) -> Iterator[tuple[str, bytes]]:
+    """Name and content of every file of a folder.
+
+    Reading it again gives the same sequence: images bit by bit in float32, calibration in float64; only a frequency
+    that was not read from such a folder may change in its last bit, since its inverse is stored.
+
+    Raises:
+        UsageError: If the slots do not have the four canonical shifts, one each, or the sequence is of phasors.
+    """
+    if sequence.from_phasors:
+        raise inexpressible(FORMAT, "phasors", "raw quads that were measured one by one", "phasors: write format torf")
+    poses = sequence.camera_from_world
+    colour_poses = poses if sequence.colour.camera_from_world is None else sequence.colour.camera_from_world
+    yield from calibration_files(sequence, sequence.times, poses)
+    yield "tof_permutation.npy", npy(_permutation(sequence))
+    yield "cams/poses.json", json_bytes({"poses": "camera_from_world"})
+    yield "cams/color_extrinsics.npy", npy(colour_poses.astype(np.float64))
+    yield "cams/dc_offset.npy", npy(np.float64(sequence.calibration.dc_offset))
+    for n in np.flatnonzero(sequence.measured).tolist():
+        yield f"tofType{n % FRAMES_PER_QUARTET}/{n:04d}.npy", npy(float32(sequence.quads[n]))
+    for n, image in sequence.colour.images.items():
+        yield f"color/{n:04d}.npy", npy(shortest(float32(image)))
+    for direction, images in (("forward", sequence.flow.forward), ("backward", sequence.flow.backward)):
+        for n, image in images.items():
+            yield f"{direction}_flow_2/flow_{n:04d}.npy", npy(float32(image))
+    if truth is not None:
+        for n in np.flatnonzero(truth.known).tolist():
+            yield f"synthetic_depth/{n:04d}.npy", npy(float32(truth.distance[n]))
+            if truth.phasor_distance is not None:
+                yield f"phasor_distance/{n:04d}.npy", npy(float32(truth.phasor_distance[n]))
+
+
+def _permutation(sequence: Sequence) -> np.ndarray:
+    """The permutation with canonical = raw[permutation], from the shift of every slot.
+
+    Raises:
+        UsageError: If the slots do not have the four canonical shifts, one each.
+    """
+    gap = np.abs(sequence.shifts[:, None] - np.array(CANONICAL_SHIFTS))
+    gap = np.minimum(gap % (2 * math.pi), -gap % (2 * math.pi))
+    channel = gap.argmin(axis=1)
+    slots = [set(channel[slot::FRAMES_PER_QUARTET].tolist()) for slot in range(FRAMES_PER_QUARTET)]
+    used = [next(iter(slot)) for slot in slots if len(slot) == 1]
+    if gap.min(axis=1).max() > SHIFT_TOLERANCE or any(len(slot) > 1 for slot in slots) or len(set(used)) < len(used):
+        raise inexpressible(
+            FORMAT,
+            "phase shifts",
+            "each of the four slots to have its own of the shifts 0, pi, pi/2, 3 pi/2 in every quartet",
+            f"{np.round(sequence.shifts[:8], 6).tolist()} .. over {sequence.frames} frames",
+        )
+    unused = iter(sorted(set(range(FRAMES_PER_QUARTET)) - set(used)))  # of a recording shorter than a quartet
+    return np.argsort([next(iter(slot)) if slot else next(unused) for slot in slots])

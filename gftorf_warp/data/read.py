@@ -5,10 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 from . import capture, ftorf, torf
+from .family import read_distances, read_sequence
 from .folder import format_of
 from .sequence import Sequence, Truth
 
-READERS = {"capture": capture, "ftorf": ftorf, "torf": torf}
+STORED = {"ftorf": ftorf.stored, "torf": torf.stored}
 
 
 def read(path: str | Path, *, frame_rate_hz: float | None = None) -> Sequence:
@@ -22,7 +23,11 @@ def read(path: str | Path, *, frame_rate_hz: float | None = None) -> Sequence:
     Raises:
         InputError: If the folder or a file in it does not conform to data_specs/.
     """
-    return READERS[format_of(Path(path))].read(path, frame_rate_hz=frame_rate_hz)
+    root = Path(path)
+    form = format_of(root)
+    if form == capture.FORMAT:
+        return capture.read(root, frame_rate_hz)
+    return read_sequence(STORED[form](root), frame_rate_hz)
 
 
 def read_truth(sequence: Sequence) -> Truth | None:
@@ -31,8 +36,13 @@ def read_truth(sequence: Sequence) -> Truth | None:
     Raises:
         InputError: If a file of it does not conform to data_specs/.
     """
-    path = sequence.path
-    return None if path is None else READERS[format_of(path)].read_truth(path, frames=sequence.frames)
+    root = sequence.path
+    if root is None:
+        return None
+    form = format_of(root)
+    if form == capture.FORMAT:
+        return capture.read_truth(root, sequence.frames)
+    return read_distances(STORED[form](root), sequence.frames)
 
 
 # methods of the public class; sequence.py does not import the readers, which import it

@@ -2,50 +2,37 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
+
+import numpy as np
 
 from ..constants import FRAME_RATE_HZ, FRAMES_PER_QUARTET
 from ..errors import InputError
 from . import specs
 from .arrays import read_shape
-from .family import Stored, read_distances, read_sequence
-from .folder import SLOT_FOLDERS, format_of, numbered, refuse_absurd_ids
+from .decode import quartet_phasor
+from .family import Stored
+from .folder import numbered, refuse_absurd_ids
+from .poses import SAME_POSE
 from .problems import Problems
 from .sequence import Sequence, Truth
-from .torf_write import write
-
-__all__ = ["read", "read_truth", "stored_phasors", "write"]
+from .writing import calibration_files, float32, inexpressible, npy, shortest
 
 FORMAT = "torf"
 PHASOR_RATE_HZ = FRAME_RATE_HZ / FRAMES_PER_QUARTET  # [Hz] the sensor is that of the F-ToeRF recordings
+QUAD_MAX = float(np.finfo(np.float32).max) / 4.0  # the length of a phasor is up to 2 sqrt(2) times as large
 
 
-def read(path: str | Path, *, frame_rate_hz: float | None = None) -> Sequence:
-    """Read a ToeRF folder, phasors per second given or not, see :func:`gftorf_warp.data.family.read_sequence`."""
-    return read_sequence(stored_phasors(Path(path)), frame_rate_hz)
-
-
-def read_truth(path: str | Path, *, frames: int) -> Truth | None:
-    """Read the true distances of a ToeRF folder, see :func:`gftorf_warp.data.family.read_distances`."""
-    return read_distances(stored_phasors(Path(path)), frames)
-
-
-def stored_phasors(root: Path) -> Stored:
+def stored(root: Path) -> Stored:
     """The measured phasors of a folder of this format.
 
     Ids count from 0, or from the smallest id of tof/ and color/, 0001 in the original recordings; where the times
     of the folder outnumber its largest id, they count from 0.
 
     Raises:
-        InputError: If the folder has another format, there are no phasors, or an id is absurd.
+        InputError: If there are no phasors, or an id is absurd.
     """
-    if format_of(root) != FORMAT:
-        raise InputError(
-            "an F-ToeRF folder, which holds raw quads",
-            where=root,
-            why=f"expected a ToeRF folder with tof and cams, found {', '.join(SLOT_FOLDERS)} or some of them",
-            fix="read it as a sequence of raw quads",
-        )
     fields = specs.fields(FORMAT)
     files = numbered(root, fields["phasor"].paths[0])
     if not files:
@@ -72,3 +59,52 @@ def stored_phasors(root: Path) -> Stored:
         first_id=first_id,
         note=f", ids from {first_id:04d}",
     )
+
+
+def files(sequence: Sequence, truth: Truth | None) -> Iterator[tuple[str, bytes]]:
+    """Name and content of every file of a folder with the complete quartets as phasors.
+
+    A sequence of phasors is written so that reading it again gives the same one: images bit by bit in float32,
+    calibration in float64. Of raw quads, phasor i gets the time, pose, colour and truth of raw frame 4i, as phasors
+    beside F-ToeRF quads are named; incomplete quartets, other colour images, optical flow and the constant part of the
+    quads are left out.
+
+    Raises:
+        UsageError: If the quads are too large, or no quartet is complete.
+        InputError: If the shifts of a quartet do not determine a phase.
+    """
+    largest = np.abs(sequence.quads).max()
+    if not largest < QUAD_MAX:
+        raise inexpressible(FORMAT, "quads", f"numbers below {QUAD_MAX:.2g}", f"{largest:.2g}")
+    if not sequence.complete_quartets:
+        raise inexpressible(
+            FORMAT, "quartets", "one or more with all of their four raw frames", f"none in {sequence.frames} raw frames"
+        )
+    step = FRAMES_PER_QUARTET
+    starts = slice(0, sequence.frames // step * step, step)
+    poses = sequence.camera_from_world[starts]
+    colour_poses = poses if sequence.colour.camera_from_world is None else sequence.colour.camera_from_world[starts]
+    yield from calibration_files(sequence, sequence.times[starts], poses)
+    relative = poses @ np.linalg.inv(colour_poses)
+    if np.ptp(relative, axis=0).max() <= SAME_POSE:
+        yield "cams/relative_pose.npy", npy(relative[0].astype(np.float64))
+    yield "cams/color_extrinsics.npy", npy(colour_poses.astype(np.float64))  # what is constant loses its last bits
+    for i in sequence.complete_quartets:
+        yield f"tof/{i:04d}.npy", npy(_phasor(sequence, i))
+    for i in range(len(poses)):
+        if step * i in sequence.colour.images:
+            yield f"color/{i:04d}.npy", npy(shortest(float32(sequence.colour.images[step * i])))
+        if truth is not None and truth.known[step * i]:
+            yield f"distance/{i:04d}.npy", npy(float32(truth.distance[step * i]))
+            if truth.phasor_distance is not None:
+                yield f"phasor_distance/{i:04d}.npy", npy(float32(truth.phasor_distance[step * i]))
+
+
+def _phasor(sequence: Sequence, i: int) -> np.ndarray:
+    """Phasor of quartet i [H, W, 3]: re, im and their length, float32."""
+    quads = sequence.quads[FRAMES_PER_QUARTET * i : FRAMES_PER_QUARTET * (i + 1)]
+    if sequence.from_phasors:
+        re, im = quads[0] - quads[1], quads[2] - quads[3]  # exact: halving was
+    else:
+        re, im = quartet_phasor(sequence, i)
+    return float32(np.stack([re, im, np.hypot(re, im)], axis=-1))

@@ -1,81 +1,19 @@
-"""Writing a sequence folder of any format: checks of the sequence, the folder, and files that formats share."""
+"""Checks of a sequence that is to be written, and files that formats share."""
 
 from __future__ import annotations
 
-import hashlib
 import io
 import json
-from collections.abc import Callable, Iterable, Iterator
-from pathlib import Path
+from collections.abc import Iterator
 
 import numpy as np
 
 from ..constants import CANONICAL_SHIFTS, FRAMES_PER_QUARTET, SPEED_OF_LIGHT
 from ..errors import UsageError
 from .calibration import DEPTH_RANGES_M, FOCAL_MIN
-from .exr import Parts, write_parts
-from .files import atomic_folder, write_through
 from .poses import rigid
 from .sequence import Intrinsics, Sequence, Truth
 from .specs import layer_field
-
-MANIFEST = "MANIFEST.sha256"
-SHEET = "contact_sheet.png"  # in every simulated folder; no reader opens it
-
-
-def write_folder(
-    path: str | Path,
-    form: str,
-    sequence: Sequence,
-    truth: Truth | None,
-    files: Callable[[Sequence, Truth | None], Iterable[tuple[str, bytes | Parts]]],
-    *,
-    readme: str | None,
-    sheet: bytes | None,
-    folders: Iterable[str] = (),
-    manifest: bool = False,
-) -> Path:
-    """Write a sequence, and its ground truth if there is any, as a folder that appears only when it is complete.
-
-    Args:
-        path: New or empty folder.
-        form: Name of the format.
-        sequence: The sequence.
-        truth: Its ground truth.
-        files: Yields relative name, at most one level down, and content of each file; parts become an OpenEXR file.
-        readme: Text of a README.md in the folder.
-        sheet: A contact sheet for people, as PNG.
-        folders: Folders that exist even if they are empty.
-        manifest: Whether the folder lists the SHA-256 of its files, those for people excepted.
-
-    Returns:
-        The folder.
-
-    Raises:
-        UsageError: If the format cannot express the sequence, or the folder cannot be created.
-        ResourceError: If the disk is full.
-        ValueError: If shapes of the sequence or the truth contradict each other.
-    """
-    validate(sequence, truth)
-    refuse_inexpressible(form, sequence, truth)
-    with atomic_folder(path) as folder:
-        for name in folders:
-            (folder / name).mkdir()
-        for name, content in files(sequence, truth):
-            (folder / name).parent.mkdir(exist_ok=True)
-            if isinstance(content, bytes):
-                write_through(folder / name, content)
-            else:
-                write_parts(folder / name, content)
-        names = sorted(file.relative_to(folder).as_posix() for file in folder.rglob("*") if file.is_file())
-        for_people = {"README.md": None if readme is None else readme.encode(), SHEET: sheet}
-        if manifest:
-            digests = [f"{hashlib.sha256((folder / name).read_bytes()).hexdigest()}  {name}\n" for name in names]
-            for_people[MANIFEST] = "".join(digests).encode()
-        for name, data in for_people.items():
-            if data is not None:
-                write_through(folder / name, data)
-    return Path(path)
 
 
 def calibration_files(

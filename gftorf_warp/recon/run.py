@@ -206,7 +206,7 @@ class Run:
                 "the sequence is not on disk",
                 where=self.path,
                 why="the run was made from a sequence in memory",
-                fix="write the sequence with gftorf_warp.data.ftorf.write and reconstruct from the folder",
+                fix="write the sequence with gftorf_warp.data.write.write and reconstruct from the folder",
             )
         given = str(self.config.get("times") or "").startswith("setting")
         return read(source, frame_rate_hz=self.config["frame_rate_hz"] if given else None)

@@ -8,10 +8,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from ..data import capture_write, ftorf_write, torf_write
 from ..data.contact_sheet import contact_sheet
 from ..data.files import atomic_write
 from ..data.read import read, read_truth
+from ..data.write import write
 from ..errors import UsageError
 from .card import outcome_card, settings_card
 from .checks import check_clearance, check_engine, check_format
@@ -72,13 +72,13 @@ def simulate(
     out = Path(out).absolute() if fresh else Path(out)
     if not needs_recording(out, card, fresh=fresh):
         return out
-    write = {"ftorf": ftorf_write, "torf": torf_write, "capture": capture_write}[used.format].write
     with cached_images(out, card, fresh=fresh) as cached:
         recording = record(recorded, used, device=device, progress=progress, cached=cached)
         if fresh:
             set_aside(out)
         sheet = contact_sheet(recording.sequence, recording.truth, card.partition("\n")[0].removeprefix("# "))
-        write(out, recording.sequence, recording.truth, readme=card + outcome_card(recording), sheet=sheet)
+        readme = card + outcome_card(recording)
+        write(used.format, out, recording.sequence, recording.truth, readme=readme, sheet=sheet)
     return out
 
 

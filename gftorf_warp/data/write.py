@@ -1,0 +1,68 @@
+"""Writing a sequence and its ground truth as a folder of any of the formats of data_specs/."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+from . import capture_write, ftorf, torf
+from .capture_json import FORMAT as CAPTURE
+from .capture_json import MANIFEST
+from .exr import write_parts
+from .files import atomic_folder, write_through
+from .folder import SLOT_FOLDERS
+from .sequence import Sequence, Truth
+from .writing import refuse_inexpressible, validate
+
+FILES = {"capture": capture_write.files, "ftorf": ftorf.files, "torf": torf.files}
+SHEET = "contact_sheet.png"  # in every simulated folder; no reader opens it
+
+
+def write(
+    form: str,
+    path: str | Path,
+    sequence: Sequence,
+    truth: Truth | None = None,
+    *,
+    readme: str | None = None,
+    sheet: bytes | None = None,
+) -> Path:
+    """Write a sequence, and its ground truth if there is any, as a folder that appears only when it is complete.
+
+    Args:
+        form: Name of the format: ``capture``, ``ftorf`` or ``torf``.
+        path: New or empty folder.
+        sequence: The sequence.
+        truth: Its ground truth.
+        readme: Text of a README.md in the folder.
+        sheet: A contact sheet for people, as PNG.
+
+    Returns:
+        The folder.
+
+    Raises:
+        UsageError: If the format cannot express the sequence, or the folder cannot be created.
+        InputError: If phasors are to be written and shifts do not determine a phase.
+        ResourceError: If the disk is full.
+        ValueError: If shapes of the sequence or the truth contradict each other.
+    """
+    validate(sequence, truth)
+    refuse_inexpressible(form, sequence, truth)
+    with atomic_folder(path) as folder:
+        for name in SLOT_FOLDERS if form == ftorf.FORMAT else ():  # they belong to the layout, frames or not
+            (folder / name).mkdir()
+        for name, content in FILES[form](sequence, truth):
+            (folder / name).parent.mkdir(exist_ok=True)
+            if isinstance(content, bytes):
+                write_through(folder / name, content)
+            else:
+                write_parts(folder / name, content)
+        names = sorted(file.relative_to(folder).as_posix() for file in folder.rglob("*") if file.is_file())
+        others = {"README.md": None if readme is None else readme.encode(), SHEET: sheet}
+        if form == CAPTURE:
+            digests = [f"{hashlib.sha256((folder / name).read_bytes()).hexdigest()}  {name}\n" for name in names]
+            others[MANIFEST] = "".join(digests).encode()
+        for name, data in others.items():
+            if data is not None:
+                write_through(folder / name, data)
+    return Path(path)
