@@ -6,9 +6,9 @@ from io import BytesIO
 
 import pytest
 import torch
+from gftorf_warp.recon.adam import Adam
 from small_runs import KEYS, field, random, same
 
-from gftorf_warp.recon.adam import Adam
 from gftorf_warp.recon.optimiser import BETAS, EPSILON, Optimiser
 from gftorf_warp.scene.motion import Nodes
 

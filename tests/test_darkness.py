@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import pytest
 import torch
+from gftorf_warp.recon.objective import image_loss
 from moving_box import recording
 from small_runs import rows
 from test_published_runs import small
 
 from gftorf_warp.recon import darkness, train
-from gftorf_warp.recon.objective import image_loss
 from gftorf_warp.recon.observations import observe
 from gftorf_warp.recon.presets import demo
 from gftorf_warp.recon.state import begin

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 from comparison import DEVICES
+from gftorf_warp.recon.objective import image_loss as torch_loss
 
 from gftorf_warp.losses.image import similarity
-from gftorf_warp.recon.objective import image_loss as torch_loss
 from gftorf_warp.recon.settings import Norm
 from gftorf_warp.render import descent, fused, training
 

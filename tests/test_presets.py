@@ -4,12 +4,12 @@ from dataclasses import fields, is_dataclass, replace
 
 import pytest
 import torch
+from gftorf_warp.recon.objective import render_settings_at, weights_at
 from small_runs import demo, small
 
 from gftorf_warp.errors import UsageError
 from gftorf_warp.recon import densify, presets, step
 from gftorf_warp.recon.config import resolved
-from gftorf_warp.recon.objective import render_settings_at, weights_at
 from gftorf_warp.recon.observations import observe
 from gftorf_warp.recon.optimiser import frozen, rates_at
 from gftorf_warp.recon.presets import Recorded
