@@ -163,7 +163,7 @@ class Stepper:
         if self._graphs:
             self._read_counts()  # waits: graphs must have run before their memory is released
             self._release_graphs()
-        self._stage = key.stage
+        self._stage, self._capacity = key.stage, PairCapacity()  # other renderings: count their pairs first
         self._attach(free=True)
         motion, padded = self.state.motion, self._padded
         if key.frozen and motion.follows_means:
