@@ -1,7 +1,6 @@
-"""The command ``gftorf``: verbs to functions, options to arguments, exceptions to messages and exit codes.
+"""The command ``gftorf``: commands to functions, options to arguments, exceptions to messages and exit codes.
 
-No command has logic of its own, and nothing heavy is imported before a command needs it: ``gftorf --help`` is instant.
-This is the only file that names a device.
+Heavy modules are imported when a command needs them. This is the only file that chooses a device.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run one command.
 
     Args:
-        arguments: What follows ``gftorf``; None takes the process's own.
+        arguments: Words after ``gftorf``; None: those of the process, which then ends with the exit code.
 
     Returns:
         Exit code: 0 ok, 1 a bug or a failed self-test, 2 usage, 3 bad input, 4 diverged, 5 resources, 6 busy, 130
@@ -51,7 +50,7 @@ def main(arguments: list[str] | None = None) -> int:
             return COMMANDS[options.command](options)
     except SystemExit as stop:  # --help and --version
         return int(stop.code or 0)
-    except BrokenPipeError:  # the reader of our output has left, as `head` does
+    except BrokenPipeError:  # the reader of stdout has ended, as `head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except (Exception, KeyboardInterrupt) as error:
@@ -61,13 +60,13 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def choose_device(name: str) -> tuple[str, str]:
-    """Device for torch and Warp, and why it was taken, or which it is.
+    """Device for torch and Warp, and its name or the reason for the CPU.
 
     Args:
         name: "auto", "cpu", "cuda" or "cuda:N".
 
     Raises:
-        ResourceError: If CUDA was asked for and cannot be had.
+        ResourceError: If CUDA was requested and is not available.
     """
     import torch
     import warp as wp
@@ -85,7 +84,7 @@ def choose_device(name: str) -> tuple[str, str]:
             return f"cuda:{index}", torch.cuda.get_device_name(index)
         reason = f"there are {torch.cuda.device_count()} GPUs, counted from 0"
     if name == "auto":
-        return "cpu", f"{reason}: fine, only slower"
+        return "cpu", reason
     raise ResourceError(f"no device {name}", where="--device", why=reason, fix="leave --device out, or --device cpu")
 
 
@@ -118,8 +117,8 @@ def _exit_at_once(codes: list[int]) -> None:
 
 
 def start(options: argparse.Namespace, *, compile_first: bool = True) -> str:
-    """Start torch and Warp, say on what, compile the kernels if none are cached, and return the device."""
-    with _here_to_stay():
+    """Import torch and Warp, log the device, compile kernels if none are cached, and return the device."""
+    with _without_garbage_collection():
         import torch
 
         from . import terminal
@@ -177,22 +176,22 @@ def _simulate(options: argparse.Namespace) -> int:
 
     device = start(options)
     settings = SimSettings(**{f.name: getattr(options, f.name) for f in fields(SimSettings)})
-    how = {"device": device, "fresh": options.fresh}
     if options.ladder:
         if options.level is not None:
             why = "--ladder records all of them"
             raise UsageError("one level or all", where="--level", why=why, fix="leave one of the two out")
-        progress = _each_level(options)
-        rows = simulate_ladder(options.scene, options.out, settings, progress=progress, **how)
+        rows = simulate_ladder(
+            options.scene, options.out, settings, device=device, fresh=options.fresh, progress=_each_level(options)
+        )
         print("\n".join(ladder_table(rows)))
         return 0
     progress = _progress(options)("simulate")
-    print(simulate(options.scene, options.out, settings, progress=progress, **how))
+    print(simulate(options.scene, options.out, settings, device=device, fresh=options.fresh, progress=progress))
     return 0
 
 
 def _listed(options: argparse.Namespace, scenes: Mapping[str, Scene]) -> list[Scene]:
-    """The scenes that ``--list`` describes: all, or the one that was named, as its overrides make it."""
+    """The scenes of ``--list``: all, or the named one with its overrides."""
     if options.scene is None:
         return list(scenes.values())
     from .sim.closed_form_errors import with_closed_form
@@ -202,7 +201,7 @@ def _listed(options: argparse.Namespace, scenes: Mapping[str, Scene]) -> list[Sc
 
 
 def _each_level(options: argparse.Namespace) -> Callable[[int, int], None]:
-    """Progress of recordings that follow each other: a clock of its own for each."""
+    """Progress of several recordings in turn, each with its own clock."""
     clocks: list = []
 
     def show(done: int, total: int) -> None:
@@ -250,9 +249,17 @@ def _render(options: argparse.Namespace) -> int:
     from .recon.run import Run
 
     run = Run.open(options.run_folder, device)
-    progress = _progress(options)("render", unit="images")
-    chosen = {name: getattr(options, name) for name in ("what", "times", "poses", "fresh", "arrays")}
-    print(render_to_folder(run, options.out, **chosen, progress=progress))
+    out = render_to_folder(
+        run,
+        options.out,
+        options.what,
+        options.times,
+        poses=options.poses,
+        fresh=options.fresh,
+        arrays=options.arrays,
+        progress=_progress(options)("render", unit="images"),
+    )
+    print(out)
     return 0
 
 
@@ -291,12 +298,17 @@ def _bench(options: argparse.Namespace) -> int:
     device = start(options)
     from .bench.command import Wanted, bench
 
-    folders = {name: Path(getattr(options, name)) for name in ("sequence", "run") if getattr(options, name)}
-    chosen = {"quick": options.quick, "images": options.images, "preset": options.preset, **folders}
-    wanted = Wanted(device=device, changes=tuple(options.set), **chosen)
-    bench(
-        options.parts, wanted, json=options.json, progress=_progress(options), say=functools.partial(print, flush=True)
+    wanted = Wanted(
+        device=device,
+        quick=options.quick,
+        sequence=None if options.sequence is None else Path(options.sequence),
+        run=None if options.run is None else Path(options.run),
+        images=options.images,
+        preset=options.preset,
+        changes=tuple(options.set),
     )
+    say = functools.partial(print, flush=True)
+    bench(options.parts, wanted, json=options.json, progress=_progress(options), say=say)
     return 0
 
 
@@ -313,7 +325,7 @@ COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
 
 
 def table(metrics: dict) -> str:
-    """The errors of metrics.json as lines of text, MSE x100 [m^2]: closed form against ours."""
+    """The errors of metrics.json as a table, MSE x100 [m^2]: closed form and ours."""
     lines = [f"{'MSE x100 [m^2]':<16}{'closed form':>12}{'d':>10}{'d / opacity':>13}{'d_ToF':>10}"]
     keys = ("closed_form_mse_x100", "d_mse_x100", "d_normalised_mse_x100", "d_tof_mse_x100")
     for name, row in (("all", metrics), ("moving", metrics["moving"]), ("static", metrics["static"])):
@@ -345,8 +357,8 @@ def _available_cpus() -> int:
 
 
 @contextmanager
-def _here_to_stay() -> Iterator[None]:
-    """Keep Python from searching the objects that modules bring along, 240,000, for garbage: now, and ever after."""
+def _without_garbage_collection() -> Iterator[None]:
+    """Import without garbage collection, and exclude the 240,000 imported objects from later collections."""
     before = gc.isenabled()
     gc.disable()
     try:
@@ -359,7 +371,7 @@ def _here_to_stay() -> Iterator[None]:
 
 @contextmanager
 def _cpus(threads: int | None) -> Iterator[None]:
-    """Restrict this process to so many CPUs, which torch, OpenCV and the renderer all follow."""
+    """Restrict this process to ``threads`` CPUs, which torch, OpenCV and the renderer respect."""
     if threads is None or not hasattr(os, "sched_setaffinity"):
         yield
         return

@@ -1,4 +1,4 @@
-"""``gftorf demo``: simulate a moving scene, check it, reconstruct it, compare. Only their order is decided here."""
+"""``gftorf demo``: simulate a moving scene, check it, reconstruct it, compare."""
 
 from __future__ import annotations
 
@@ -29,23 +29,23 @@ def demo(
     fresh: bool = False,
     progress: Callable[[str], Callable[..., None]] | None = None,
 ) -> list[str]:
-    """Run the four steps in one folder; steps that were finished there with the same settings are not repeated.
+    """Run the four steps in one folder; finished steps with the same settings are not repeated.
 
     Args:
         out: Folder to write: ``seq``, ``run``, ``metrics.json``, ``report.html``.
-        device: Where to reconstruct.
+        device: Device of the reconstruction.
         seed: Of the sensor's noise and of the optimiser.
         size: (width, height) [px]; None is the scene's own.
         frames: Raw frames; None is the scene's own number.
         images: Raw frames to optimise; None is the preset's own number.
-        fresh: Start over; what an earlier demo left in ``out`` is moved to ``out/old-1``, ``old-2``, ...
-        progress: Called with the name of a step; returns what that step calls with (done, total).
+        fresh: Start over; an earlier demo in ``out`` is moved to ``out/old-1``, ``old-2``, ...
+        progress: Called with the name of a step; returns the progress callback (done, total) of that step.
 
     Returns:
-        What to tell the user at the end: errors on moving and on static pixels, and where the report is.
+        Lines to print: errors on moving and on static pixels, and the path of the report.
 
     Raises:
-        UsageError: If ``out`` holds a demo with other settings, and ``fresh`` is not set, or anything else.
+        UsageError: If ``out`` holds a demo with other settings and ``fresh`` is not set, or other files.
     """
     from .data.check import check
     from .data.read import read
@@ -62,46 +62,46 @@ def demo(
     with _Step("[1/4] simulate   ") as step:
         path = simulate(SCENE, out / "seq", frames=frames, size=size, seed=seed, progress=report("simulate"))
         sequence = read(path)
-        step.says = f"{SCENE} {sequence.width}x{sequence.height}, {sequence.frames} raw frames -> {out / 'seq'}"
+        step.result = f"{SCENE} {sequence.width}x{sequence.height}, {sequence.frames} raw frames -> {out / 'seq'}"
     with _Step("[2/4] check      ") as step:
         found = check(out / "seq")
         for line in found.lines:
             LOG.debug("      %s", line)
         for line in found.warnings:
             LOG.warning(line)
-        step.says = (
+        step.result = (
             f"{len(sequence.complete_quartets)} complete quartets at {sequence.calibration.f_mod_hz / 1e6:.2f} MHz"
         )
     with _Step("[3/4] reconstruct") as step:
         run = reconstruct(
             sequence, out / "run", PRESET, images=images, seed=seed, device=device, progress=report("reconstruct")
         )
-        step.says = f"{run.gaussians} Gaussians -> {out / 'run'}"
+        step.result = f"{run.gaussians} Gaussians -> {out / 'run'}"
     with _Step("[4/4] compare    ") as step:
         metrics = compare(run, progress=report("compare"))
         for name in ("metrics.json", "report.html"):
             shutil.copyfile(run.path / name, out / name)
-        step.says = f"{metrics['frames']} raw frames scored -> {out / 'metrics.json'}"
+        step.result = f"{metrics['frames']} raw frames scored -> {out / 'metrics.json'}"
     return [*summary(metrics), f"open {out / 'report.html'} (one file, works offline)"]
 
 
 def prepare(out: Path, settings: dict, *, fresh: bool) -> None:
-    """Make sure that ``out`` is empty or holds a demo with these settings.
+    """Check that ``out`` is empty or holds a demo with these settings, and store the settings in it.
 
     Raises:
-        UsageError: If it holds a demo with others, and ``fresh`` is not set, or anything else.
+        UsageError: If it holds a demo with other settings and ``fresh`` is not set, or other files.
     """
     from .recon.folder import set_aside
 
     wanted = json.loads(json.dumps(settings))  # tuples become lists, as they are on disk
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         found = _read(out / SETTINGS)
-        fix = "choose another --out, or --fresh, which keeps what is there under old-1"
+        fix = "choose another --out, or --fresh, which moves its content to old-1"
         if found is None:
             why, fix = f"it has no {SETTINGS}: no demo has begun in it", "choose another --out"
             raise UsageError("the folder is not empty", where=out, why=why, fix=fix)
         if fresh:
-            LOG.info("what was there is now in %s", set_aside(out, [out / n for n in OURS if (out / n).exists()]))
+            LOG.info("the earlier demo is now in %s", set_aside(out, [out / n for n in OURS if (out / n).exists()]))
         elif found != wanted:
             differ = ", ".join(key for key in wanted if found.get(key) != wanted[key])
             raise UsageError("the folder is not empty", where=out, why=f"it was made with another {differ}", fix=fix)
@@ -126,19 +126,19 @@ def summary(metrics: dict) -> list[str]:
 
 
 class _Step:
-    """Times one of the four steps and says at its end what came out."""
+    """Times one of the four steps and logs its result at the end."""
 
     def __init__(self, name: str):
-        self.name, self.says = name, ""
+        self.name, self.result = name, ""
 
     def __enter__(self) -> _Step:
-        self.begun = time.monotonic()
+        self.start = time.monotonic()
         LOG.info(self.name.rstrip())
         return self
 
     def __exit__(self, kind, *_) -> None:
         if kind is None:
-            LOG.info("%s %s   %.1f s", self.name, self.says, time.monotonic() - self.begun)
+            LOG.info("%s %s   %.1f s", self.name, self.result, time.monotonic() - self.start)
 
 
 def _read(path: Path) -> dict | None:

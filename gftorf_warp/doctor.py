@@ -1,4 +1,4 @@
-"""``gftorf doctor``: what this machine has, and whether the renderer agrees with the formula it was made from."""
+"""``gftorf doctor``: versions and devices of this machine, and a test of the renderer against a closed form."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ TOLERANCE = 1e-5  # [relative] float32 rounds to 6e-8; phase, exponential and fa
 
 
 def doctor(device: str) -> tuple[bool, list[str]]:
-    """Look at this installation and test it.
+    """Describe and test this installation.
 
     Args:
-        device: Where the test runs.
+        device: Device of the test.
 
     Returns:
         Whether the renderer passed, and the lines to print.
@@ -47,10 +47,10 @@ def doctor(device: str) -> tuple[bool, list[str]]:
         "packages": ", ".join(versions[:4]),
         "": ", ".join(versions[4:]),
         "CUDA driver": "none found" if driver is None else ".".join(map(str, driver)),
-        "GPUs": ", ".join(gpus) or "none; everything runs on the CPU, only slower",
+        "GPUs": ", ".join(gpus) or "none: computing on the CPU, which is slower",
         "CPU threads": f"{torch.get_num_threads()} of {os.cpu_count()}",
         "kernel cache": f"{terminal.home_as_tilde(cache)} ({writable}; kernels ready after {seconds:.1f} s)",
-        "free disk": f"{free / 1e9:.1f} GB beside the cache",
+        "free disk": f"{free / 1e9:.1f} GB on the disk of the cache",
         "self-test": f"{verdict}: one Gaussian on {device} against the formula, quads, phasor, distance, opacity; "
         f"largest relative error {error:.1e}, allowed {TOLERANCE:.0e}",
     }
@@ -60,7 +60,7 @@ def doctor(device: str) -> tuple[bool, list[str]]:
 def self_test_error(device: str) -> float:
     """Largest relative error of one rendered Gaussian against the closed form, quads and distance at its centre pixel.
 
-    A Gaussian whose centre projects onto a pixel centre has there alpha = o exactly, so the quad of shift theta is
+    At a pixel centre onto which the Gaussian's centre projects, alpha = o exactly, so the quad of shift theta is
     o a (cos(psi - theta) + b), the distance o d, and the opacity o.
     """
     field, camera, sensor = single_gaussian(device)
@@ -80,7 +80,7 @@ def self_test_error(device: str) -> float:
 
 
 def compile_kernels(device: str) -> float:
-    """Render one Gaussian forward and backward, which compiles what rendering needs; returns the seconds it took."""
+    """Compile the rendering kernels by rendering one Gaussian forward and backward; returns the time [s]."""
     from dataclasses import replace
 
     from .render.api import rasterize
@@ -93,7 +93,7 @@ def compile_kernels(device: str) -> float:
 
 
 def single_gaussian(device: str):
-    """A round Gaussian on the ray of the middle pixel, its camera, and a sensor with every offset in use."""
+    """An isotropic Gaussian on the ray of the middle pixel, its camera, and a sensor with all offsets nonzero."""
     import torch
 
     from .scene.camera import Camera

@@ -1,4 +1,4 @@
-"""What may be typed after ``gftorf``: commands, options, their values, and a hint where a name is nearly right."""
+"""Commands and options of ``gftorf``, their types, and hints for misspelt names."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from .errors import UsageError
 
 
 class Parser(argparse.ArgumentParser):
-    """An argparse parser whose mistakes are :class:`UsageError`, with the nearest option as a hint."""
+    """An argparse parser that raises :class:`UsageError`, with the nearest option as a hint."""
 
     def error(self, message: str) -> NoReturn:
-        """Raise instead of leaving the process."""
-        raise UsageError("these options do not fit", where=self.prog, why=message, fix=f"see `{self.prog} --help`")
+        """Raise instead of exiting."""
+        raise UsageError("invalid options", where=self.prog, why=message, fix=f"see `{self.prog} --help`")
 
     def parse(self, arguments: list[str]) -> argparse.Namespace:
-        """Parse everything, or name what is unknown and what is nearest to it."""
+        """Parse all arguments; an unknown one is an error with the nearest option as a hint."""
         values, unknown = self.parse_known_args(arguments)
         if unknown:
             name = unknown[0].partition("=")[0]
@@ -38,7 +38,7 @@ def parse(arguments: list[str]) -> argparse.Namespace:
     """Options of one command as attributes; ``command`` is its name.
 
     Raises:
-        UsageError: If the command or an option is unknown, or a value cannot be meant.
+        UsageError: If the command or an option is unknown, or a value is invalid.
     """
     command = next((a for a in arguments if not a.startswith("-")), None)
     parsers = command_parsers()
@@ -56,7 +56,7 @@ def parse(arguments: list[str]) -> argparse.Namespace:
 
 
 def top_parser(parsers: dict[str, Parser]) -> Parser:
-    """What ``gftorf --help`` prints."""
+    """The parser of ``gftorf --help``."""
     width = max(map(len, parsers))
     rows = "\n".join(f"  {name:<{width}}  {parser.description}" for name, parser in parsers.items())
     parser = Parser(
@@ -91,17 +91,17 @@ def command_parsers() -> dict[str, Parser]:
     simulate.add_argument("--frames", metavar="N", type=_positive, help="raw frames (the scene's own number)")
     simulate.add_argument("--size", metavar="WxH", type=_size, help="image size in pixels (the scene's own)")
     _seed_option(simulate, "seed of the noise (0)")
-    layouts = "folder layout (ftorf): raw quads, one phasor per quartet, or the layout of our own"
+    layouts = "folder layout (ftorf): raw quads, one phasor per quartet, or our own layout"
     simulate.add_argument("--format", metavar="ftorf|torf|capture", default="ftorf", help=layouts)
-    amounts = "what a capture of engine mesh keeps of the truth: usual, or all: light by harmonic, z-depth, normals too"
+    amounts = "truth in a capture of engine mesh: usual, or all, with light by harmonic, z-depth and normals"
     simulate.add_argument("--truth", metavar="usual|all", default="usual", help=amounts)
-    levels = "step from ideal to realistic, sync, L0, L1, L2, L3 or L4: decides about engine, noise, blur and bounces"
+    levels = "level of realism, sync, L0, L1, L2, L3 or L4: sets engine, noise, motion blur and bounces"
     simulate.add_argument("--level", metavar="NAME", help=levels)
-    ladder = "record all levels into SEQ/sync, SEQ/L0 .. SEQ/L4 and print what each costs the closed form"
+    ladder = "record all levels into SEQ/sync, SEQ/L0 .. SEQ/L4 and print the closed form's error on each"
     simulate.add_argument("--ladder", action="store_true", help=ladder)
     engines = "gaussian: splats cover the scene; mesh: rays meet its surfaces (gaussian)"
     simulate.add_argument("--engine", metavar="gaussian|mesh", default="gaussian", help=engines)
-    bounces = "surfaces that light may meet after the first, with engine mesh (0: direct light only)"
+    bounces = "bounces of indirect light, with engine mesh (0: direct light only)"
     simulate.add_argument("--bounces", metavar="N", type=_whole, default=0, help=bounces)
     paths = "random paths per pixel for the light that bounces (64)"
     simulate.add_argument("--paths", metavar="N", type=_positive, default=64, help=paths)
@@ -110,7 +110,7 @@ def command_parsers() -> dict[str, Parser]:
     simulate.add_argument("--sync", action="store_true", help="all quads of a quartet at one instant")
     simulate.add_argument("--no-noise", dest="noise", action="store_false", help="an ideal sensor")
     simulate.add_argument("--flow", action="store_true", help="store exact optical flow too")
-    blur = "instants that one exposure averages (1: no motion blur)"
+    blur = "samples in time of one exposure (1: no motion blur)"
     simulate.add_argument("--exposure-samples", metavar="N", type=_positive, default=1, help=blur)
     single = "change one setting, for example sensor.f_mod_hz=30e6 or bodies.1.path.velocity=3,0,0 (may be repeated)"
     simulate.add_argument(
@@ -121,19 +121,21 @@ def command_parsers() -> dict[str, Parser]:
 
     reconstruct = _command("reconstruct", "fit moving Gaussians to the raw quads of a sequence")
     reconstruct.add_argument("sequence", metavar="SEQ", help="folder of the sequence")
-    reconstruct.add_argument("--out", metavar="RUN", required=True, help="folder to write; goes on where it stopped")
+    reconstruct.add_argument(
+        "--out", metavar="RUN", required=True, help="folder to write; an interrupted run is resumed"
+    )
     presets = "settings: demo, paper, released, fast, dgs, dgs_depth or ctof, the closed form (demo)"
     reconstruct.add_argument("--preset", metavar="NAME", default="demo", help=presets)
-    inputs = "what is compared: quads, phasor, or auto: what the camera delivered (auto)"
+    inputs = "fitted data: quads, phasor, or auto: as recorded (auto)"
     reconstruct.add_argument("--input", metavar="KIND", default="auto", help=inputs)
     rows = "apply a row of the ablation table: nobias, dd, h1, h1h2 or h1h2dd"
     reconstruct.add_argument("--ablation", metavar="ROW", help=rows)
     single = "change one setting, for example init.reflectivity=0.5; config.json of a run names all (may be repeated)"
     reconstruct.add_argument("--set", metavar="NAME=VALUE", action="append", default=[], help=single)
     reconstruct.add_argument("--images", metavar="N", type=_positive, help="raw frames to optimise (the preset's own)")
-    batch = "raw frames of a step: 1, or 4 for those of a quartet, however many (the preset's own)"
+    batch = "raw frames of a training step: 1, or 4 for a whole quartet (the preset's own)"
     reconstruct.add_argument("--batch", metavar="N", type=int, choices=(1, 4), help=batch)
-    order = "sum gradients in one order on CUDA, too, so that equal runs give equal bytes; slower"
+    order = "sum gradients in a fixed order on CUDA, for bitwise reproducible runs; slower"
     reconstruct.add_argument("--deterministic", action="store_true", help=order)
     flows = "the folder's, computed, or none; auto: the folder's if it has any, else dis"
     reconstruct.add_argument("--flow", metavar="KIND", help=f"auto, file, dis, deepflow or none: optical flow, {flows}")
@@ -157,32 +159,30 @@ def command_parsers() -> dict[str, Parser]:
 
     compare = _command("compare", "score a reconstruction against the truth and write a report")
     compare.add_argument("run_folder", metavar="RUN", help="folder of the reconstruction")
-    compare.add_argument("--truth", metavar="SEQ", help="sequence whose true distance counts (the one reconstructed)")
-    conventions = (
-        "geometry, or static-phasor: what the closed form would decode if nothing moved, without noise (geometry)"
-    )
+    compare.add_argument("--truth", metavar="SEQ", help="sequence with the true distance (the reconstructed one)")
+    conventions = "true distance: geometry, or static-phasor, the closed form without motion and noise (geometry)"
     compare.add_argument("--against", metavar="geometry|static-phasor", default="geometry", help=conventions)
     compare.add_argument("--json", action="store_true", help="print metrics.json instead of a table")
     compare.add_argument("--frames", metavar="all|ftorf13", default="all", help="which raw frames are scored (all)")
     _device_options(compare)
 
-    check = _command("check", "read a sequence, list what was found and assumed, warn about what looks wrong")
+    check = _command("check", "read a sequence, list its contents and assumptions, warn about suspicious values")
     check.add_argument("sequence", metavar="SEQ", help="folder of the sequence")
 
     doctor = _command("doctor", "print versions and devices, and test the renderer on this machine")
     _device_options(doctor)
 
-    bench = _command("bench", "measure what things cost: tables, and JSON")
+    bench = _command("bench", "measure times: tables and JSON")
     parts = "renderer, motion, step, reconstruction, render (all of them)"
     bench.add_argument("parts", metavar="PART", nargs="*", help=parts)
     bench.add_argument(
-        "--quick", action="store_true", help="small sizes, few runs: whether it works, not what it costs"
+        "--quick", action="store_true", help="small sizes and few runs, as a test of the benchmark itself"
     )
-    bench.add_argument("--json", metavar="FILE", help="file for everything that was measured")
+    bench.add_argument("--json", metavar="FILE", help="file of all results")
     bench.add_argument("--sequence", metavar="SEQ", help="folder of a sequence (a simulated scene that slides past)")
-    state = "run whose state is timed by step and render (one made from measured phase)"
+    state = "run whose state step and render use (one initialised from measured phase)"
     bench.add_argument("--run", metavar="RUN", help=state)
-    lengths = "images of step, reconstruction and render (their own numbers)"
+    lengths = "number of images of step, reconstruction and render (their defaults)"
     bench.add_argument("--images", metavar="N", type=_positive, help=lengths)
     bench.add_argument(
         "--preset", metavar="NAME", help="of step and reconstruction (released; on a CPU demo for the latter)"
@@ -196,7 +196,7 @@ def command_parsers() -> dict[str, Parser]:
 
 
 def _command(name: str, what: str) -> Parser:
-    """A parser with the options that every command has."""
+    """A parser with the options of every command."""
     parser = Parser(prog=f"gftorf {name}", description=what, allow_abbrev=False)
     parser.set_defaults(command=name)
     loudness = parser.add_mutually_exclusive_group()
@@ -270,6 +270,6 @@ def _list_of(item: Callable[[str], object]) -> Callable[[str], list]:
 
 
 def nearest(name: str, names: list[str], otherwise: str) -> str:
-    """A hint: the name that looks most like ``name``, or something else to say."""
+    """A hint: the most similar of ``names``, else ``otherwise``."""
     close = difflib.get_close_matches(name, names, n=1)
     return f"did you mean {close[0]}?" if close else otherwise

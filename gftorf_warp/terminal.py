@@ -1,4 +1,4 @@
-"""What a person at the terminal sees: progress with the time left, log lines, Warp's messages in our words, errors."""
+"""Terminal output: progress with the remaining time, log lines, Warp's messages, errors."""
 
 from __future__ import annotations
 
@@ -17,24 +17,22 @@ from .errors import GftorfError, InputError, ResourceError
 LOG = logging.getLogger("gftorf_warp")
 PLAIN_EVERY_S = 10.0  # [s] between two progress lines where the output is not a terminal
 LIVE_EVERY_S = 0.2  # [s] between two redraws where it is
-NO_DRIVER = (
-    "Could not find or load the NVIDIA CUDA driver"  # Warp writes it past its own logger; our first line says it
-)
+NO_DRIVER = "Could not find or load the NVIDIA CUDA driver"  # of Warp's native code; our first line reports it
 
 
 class Progress:
-    """Prints how far a loop is: one line that is redrawn on a terminal, one plain line per ten seconds elsewhere.
+    """Progress of a loop: one line that is redrawn on a terminal, one plain line per ten seconds elsewhere.
 
-    Call it as ``progress(done, total, name=value, ...)``; the values are shown as they are.
+    Called as ``progress(done, total, name=value, ...)``; the values are printed.
     """
 
     def __init__(self, label: str, *, quiet: bool = False, unit: str | None = None):
         """Start the clock.
 
         Args:
-            label: What is being done.
-            quiet: Whether to print nothing at all.
-            unit: What is counted, to show how many of them a second takes; None: not shown.
+            label: Name of the loop.
+            quiet: Whether to print nothing.
+            unit: Name of the items, to print a rate; None: no rate.
         """
         self.label, self.quiet, self.unit = label, quiet, unit
         self.live = sys.stderr.isatty()
@@ -43,9 +41,9 @@ class Progress:
         self.first: int | None = None
 
     def __call__(self, done: int, total: int, **values: object) -> None:
-        """Show that ``done`` of ``total`` steps are behind us."""
+        """Print that ``done`` of ``total`` steps are finished."""
         now = time.monotonic()
-        if self.first is None:  # a resumed loop does not start at zero, and its speed must not count what was there
+        if self.first is None:  # a resumed loop does not start at zero; its rate excludes earlier steps
             self.first, self.start = done, now
         every = LIVE_EVERY_S if self.live else PLAIN_EVERY_S
         if self.quiet or (now - self.shown < every and done < total):
@@ -73,14 +71,14 @@ def progress_line(label: str, done: int, total: int, first: int, elapsed_s: floa
 
 
 class WarpLog:
-    """Warp's messages in our log: a compilation is news, a kernel found in the cache is not."""
+    """Warp's messages in our log: compilations, but no kernels loaded from the cache."""
 
     def debug(self, message: str) -> None:
         """Pass on at the lowest level."""
         LOG.debug("warp: %s", message)
 
     def info(self, message: str) -> None:
-        """Announce what was compiled, keep the rest for -v."""
+        """Log compilations briefly and other messages in full, both for -v."""
         if message.rstrip().endswith("(compiled)"):
             LOG.debug("  compiled %s", message.strip().removeprefix("Module ").removesuffix("(compiled)").strip())
         else:
@@ -96,7 +94,7 @@ class WarpLog:
 
 
 def start_warp() -> None:
-    """Initialise Warp with its messages in our log, except that no CUDA driver was found: our first line says that."""
+    """Initialise Warp with its messages in our log, without the one about a missing CUDA driver."""
     import warp as wp
 
     wp.config.log_level = wp.LOG_WARNING
@@ -110,19 +108,19 @@ def start_warp() -> None:
 
 
 def kernel_cache() -> Path:
-    """Folder in which Warp keeps what it compiled."""
+    """Folder of Warp's compiled kernels."""
     import warp as wp
 
     return Path(wp.config.kernel_cache_dir)
 
 
 def kernels_are_cached() -> bool:
-    """Whether kernels of this package were compiled before, in any version."""
+    """Whether the cache holds kernels of this package, of any version."""
     return any(kernel_cache().glob("wp_gftorf_warp*"))
 
 
 def home_as_tilde(path: Path) -> str:
-    """A path as people write it."""
+    """A path with ~ for the home folder."""
     with contextlib.suppress(ValueError, RuntimeError):
         return f"~/{path.relative_to(Path.home())}"
     return str(path)
@@ -145,7 +143,7 @@ def logging_to_stderr(level: int) -> Iterator[None]:
 
 
 def as_known_error(error: BaseException) -> GftorfError | None:
-    """The error in our own words if a user can do something about it; None for a bug."""
+    """The error as one that a user can fix; None for a bug."""
     if isinstance(error, GftorfError):
         return error
     text = str(error)
@@ -167,11 +165,11 @@ def as_known_error(error: BaseException) -> GftorfError | None:
 
 
 def print_error(error: BaseException, *, debug: bool) -> int:
-    """Print an error to stderr, three lines if a user can cause it, and return the exit code.
+    """Print an error to stderr, in three lines if a user can fix it, and return the exit code.
 
     Args:
-        error: What ended the command.
-        debug: Whether the traceback is wanted too.
+        error: The exception that ended the command.
+        debug: Whether to print the traceback too.
     """
     if debug:
         traceback.print_exception(error)
@@ -180,7 +178,7 @@ def print_error(error: BaseException, *, debug: bool) -> int:
         print(f"error: {known}", file=sys.stderr)
         return known.exit_code
     if isinstance(error, KeyboardInterrupt):
-        print("interrupted: what was finished is kept; the same command goes on from there", file=sys.stderr)
+        print("interrupted: finished work is kept; the same command resumes it", file=sys.stderr)
         return 130
     summary = (str(error).splitlines() or [""])[0]
     hint = "" if debug else "; --debug shows where"
@@ -196,7 +194,7 @@ class _Plain(logging.Formatter):
 
 @contextlib.contextmanager
 def _native_stderr() -> Iterator[list[str]]:
-    """Collect what libraries write to file descriptor 2 themselves."""
+    """Collect lines that native code writes to file descriptor 2."""
     lines: list[str] = []
     sys.stderr.flush()
     saved = os.dup(2)
