@@ -67,7 +67,7 @@ def call_of(made: Network, gaussians: GaussianField, queries: int, hidden: float
     keys, parameters = list(range(7, 7 + queries)), list(made.parameters())
 
     def call() -> list[torch.Tensor]:
-        offsets = made.at_keys(made.attach(gaussians), keys).offset
+        offsets = made.at_keys(made.bind(gaussians), keys).offset
         return [offsets.detach(), *torch.autograd.grad(offsets, parameters, cotangent)]
 
     return call

@@ -27,7 +27,7 @@ def weights_of(run: Run, seconds: list[float]) -> tuple[torch.Tensor, np.ndarray
     weights, lengths = [], []
     for time in seconds:
         with torch.no_grad():
-            field = run.widened(run.field.moved(*run.motion.at(run.attachment, time)), run.camera)
+            field = run.widened(run.field.moved(*run.motion.at(run.binding, time)), run.camera)
         field = field.map(lambda value: value.requires_grad_(value.is_floating_point()))
         workspace = Workspace()
         options = {"images": ("distance",), "screen_gradient": True, "workspace": workspace}

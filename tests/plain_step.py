@@ -64,7 +64,7 @@ def plain_weights(settings: ReconSettings, images: int) -> dict[str, float]:
 def plain_image(
     field: GaussianField,
     motion: Motion | None,
-    attachment: Tensor,
+    binding: Tensor,
     observations: Observations,
     frame: int,
     settings: ReconSettings,
@@ -78,7 +78,7 @@ def plain_image(
     Args:
         field: Gaussians.
         motion: Their motion; None: nothing moves.
-        attachment: Of the Gaussians to it.
+        binding: Of the Gaussians to it.
         observations: What is compared.
         frame: The raw frame.
         settings: Of the run.
@@ -92,7 +92,7 @@ def plain_image(
     quartet, camera, sensor = frame // sequence.cycle, observations.cameras[frame], observations.sensor_at(frame)
 
     def displacement_at(time: float):
-        return (torch.zeros_like(field.mean), None) if motion is None else motion.at(attachment, time)
+        return (torch.zeros_like(field.mean), None) if motion is None else motion.at(binding, time)
 
     def background(channels: int, camera, stream: int) -> Tensor | None:
         if seed is None or settings.background == 0:
@@ -128,7 +128,7 @@ def plain_image(
     if motion is not None:
         compared["motion_size"] = motion_size(displacement[0]).mean()
         if "flow" in weights and frame % sequence.cycle == 0 and quartet in observations.flow:
-            compared["flow"] = plain_flow(field, motion, attachment, observations, frame, render)
+            compared["flow"] = plain_flow(field, motion, binding, observations, frame, render)
     image.terms = {name: weights[name] * value for name, value in compared.items() if name in weights}
     return image
 
@@ -141,13 +141,13 @@ def plain_loss(rendered: Tensor, measured: Tensor, ssim: float, norm: Norm = Nor
 
 
 def plain_flow(
-    field: GaussianField, motion: Motion, attachment: Tensor, observations: Observations, frame: int, render
+    field: GaussianField, motion: Motion, binding: Tensor, observations: Observations, frame: int, render
 ) -> Tensor:
     """Squared difference to the measured flow [px^2] to both neighbours of a quartet; blending is held fixed."""
     cycle, times = observations.sequence.cycle, motion.key_times.tolist()
     times, quartet, camera = motion.times, frame // cycle, observations.cameras[frame]
-    start = motion.at(attachment, times[quartet])
-    ends = {step: motion.at(attachment, times[quartet + step]) for step in (1, -1) if 0 <= quartet + step < len(times)}
+    start = motion.at(binding, times[quartet])
+    ends = {step: motion.at(binding, times[quartet + step]) for step in (1, -1) if 0 <= quartet + step < len(times)}
     still = replace(field, colour_sh=None).moved(*start).map(torch.Tensor.detach)
     channels = torch.cat([end.offset - start.offset for end in ends.values()], dim=1)
     seen = rasterize(still, camera, observations.sensor_at(frame), render, extra=channels)
@@ -189,7 +189,7 @@ def plain_step(state: State, observations: Observations, settings: ReconSettings
     frames, before = draw(state, observations, settings), state.images
     state.images += len(frames)
     if state.motion.follows_means:
-        state.attachment = state.motion.attach(state.optimiser.field)
+        state.binding = state.motion.bind(state.optimiser.field)
     rests, leaves = frozen(settings, before), state.optimiser.leaves
     moves = before >= settings.schedule.warm_up and not isinstance(state.motion, Still)
     field = state.optimiser.field
@@ -201,7 +201,7 @@ def plain_step(state: State, observations: Observations, settings: ReconSettings
             plain_image(
                 field,
                 state.motion if moves else None,
-                state.attachment,
+                state.binding,
                 observations,
                 frame,
                 settings,
@@ -215,7 +215,7 @@ def plain_step(state: State, observations: Observations, settings: ReconSettings
         learning = [k for k, _ in enumerate(leaves) if not rests or k >= len(state.optimiser.tensors)]
         loss = torch.stack([*images[-1].terms.values()]).sum()
         wanted = [leaves[k] for k in learning]
-        # the graph through the attachment is shared by the images
+        # the graph through the binding is shared by the images
         found = torch.autograd.grad(loss, wanted, allow_unused=True, retain_graph=True)
         for k, gradient in zip(learning, found, strict=True):
             if gradient is not None:

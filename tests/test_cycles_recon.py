@@ -113,7 +113,7 @@ def test_every_raw_frame_is_rendered_with_its_own_shift_and_frequency(folders, n
         set_, slot = divmod(frame, len(stated["shifts"]))
         sensor = seen.sensor_at(frame)
         assert (sensor.shifts, sensor.f_mod_hz) == ((stated["shifts"][slot],), frequencies[set_])
-        found, _ = terms(field, None, state.attachment, seen, frame, settings, weights)
+        found, _ = terms(field, None, state.binding, seen, frame, settings, weights)
         mean = field.mean.detach().double().requires_grad_()
         exact = replace(
             field.map(lambda value: value.detach().double() if value.is_floating_point() else value), mean=mean

@@ -72,7 +72,7 @@ def test_a_revived_network_is_at_rest_and_learns():
     assert not dead.is_dead(state, wanted)
     assert [leaf.data_ptr() for leaf in state.optimiser.motion] == addresses, "graphs know them"
     assert not torch.equal(state.motion.head.weight, first)
-    assert state.motion.at(state.attachment, float(state.motion.key_times[1])).offset.abs().max() < 1e-3
+    assert state.motion.at(state.binding, float(state.motion.key_times[1])).offset.abs().max() < 1e-3
     for leaf in state.optimiser.motion:
         assert all(value.abs().max() == 0 for value in state.optimiser.moments_of(leaf))
     torch.testing.assert_close(state.optimiser.field.mean.detach(), mean, rtol=0, atol=0)

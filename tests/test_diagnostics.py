@@ -92,7 +92,7 @@ def test_a_row_by_hand(observations, tmp_path):
     moving, static = moving_and_static(TRUTH.distance, frames)
     for s, n in enumerate(frames):
         with torch.no_grad():
-            delta = state.motion.at(state.attachment, n / 120).offset
+            delta = state.motion.at(state.binding, n / 120).offset
             seen = rasterize(
                 field.moved(delta), observations.cameras[n], sensor, SETTINGS.render, extra=delta.norm(dim=1)[:, None]
             )
@@ -146,7 +146,7 @@ def test_static_matter_that_was_pushed_is_seen(observations, tmp_path):
     watch = Watch(observations, TRUTH, tmp_path / "a")
     state = at_start(observations)
     calm = watch.look(state, SETTINGS)["offset_static_m"]
-    pushed = torch.full((len(state.attachment), 3), 0.3 / math.sqrt(3.0))
+    pushed = torch.full((len(state.binding), 3), 0.3 / math.sqrt(3.0))
     state.motion.at_times = lambda _, times: [Displacement(pushed, None)] * len(times)
     assert calm < 0.05
     assert watch.look(state, SETTINGS)["offset_static_m"] == pytest.approx(0.3, rel=1e-4)

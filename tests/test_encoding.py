@@ -93,15 +93,15 @@ def test_a_network_is_encoded_by_its_backend(monkeypatch):
 
     monkeypatch.setattr(FusedLayers, "encode", counted)
     quick, plain, gaussians = network(half()), network(), field(anywhere(40), None)
-    first = quick.attach(gaussians)
+    first = quick.bind(gaussians)
     assert not asked
     quick.backend = HalfPrecision(FusedLayers(), Form.of(quick))
-    found = quick.attach(gaussians)
+    found = quick.bind(gaussians)
     assert asked == [40]
     assert halves_between(first, found).max() <= 1
-    assert plain.attach(gaussians).dtype == torch.float32
+    assert plain.bind(gaussians).dtype == torch.float32
     quick.backend = HalfPrecision(CublasLayers(), Form.of(quick))
-    assert torch.equal(quick.attach(gaussians), first)
+    assert torch.equal(quick.bind(gaussians), first)
     assert asked == [40]
 
 
@@ -112,7 +112,7 @@ def test_times_are_rounded_once_and_in_advance(settings, device):
     made, gaussians = network(settings).to(device), field(anywhere(20), None).map(lambda value: value.to(device))
     assert torch.equal(made.rounded, made.moments.float())
     assert not torch.equal(made.rounded.double(), made.moments), "otherwise nothing was rounded"
-    place = made.attach(gaussians)
+    place = made.bind(gaussians)
     for keys in ([0, 2, 3], torch.tensor([3, 0], dtype=torch.int32, device=device)):
         want = made.offsets(place, made.moments[keys])
         assert torch.equal(made.at_keys(place, keys).offset, want)
@@ -121,7 +121,7 @@ def test_times_are_rounded_once_and_in_advance(settings, device):
 def test_in_float64_times_are_not_rounded():
     """A network that became one of float64 reads the table of float64."""
     made, gaussians = network().double(), field(anywhere(20).double(), None)
-    place, keys = made.attach(gaussians), [0, 2, 3]
+    place, keys = made.bind(gaussians), [0, 2, 3]
     found = made.at_keys(place, keys).offset
     assert torch.equal(found, made.offsets(place, made.moments[keys]))
     assert not torch.equal(found, made.offsets(place, made.rounded[keys]))

@@ -42,7 +42,7 @@ def test_a_phasor_is_compared_once_per_quartet_in_its_middle():
     want = torch.tensor(np.stack([q[4] - q[5], q[6] - q[7]]))
     torch.testing.assert_close(observations.phasors[4], want, rtol=1e-4, atol=1e-5)
     state = begin(observations, settings, seed=0, device="cpu")
-    fixed = (state.optimiser.field, state.motion, state.attachment)
+    fixed = (state.optimiser.field, state.motion, state.binding)
     found, seen = objective.terms(*fixed, observations, 4, settings, settings.weights)
     torch.testing.assert_close(found["quads"], (seen.tof.phasor[:2] - want).square().mean(), rtol=1e-4, atol=1e-9)
 
@@ -74,9 +74,9 @@ def test_colour_is_compared_from_its_own_camera():
     assert max(float(image.max()) for image in observations.colour.values()) == pytest.approx(1.0)
     state = begin(observations, settings, seed=0, device="cpu")
     field = state.optimiser.field
-    fixed = (field, state.motion, state.attachment)
+    fixed = (field, state.motion, state.binding)
     found, seen = objective.terms(*fixed, observations, 4, settings, settings.weights)
-    moved = field.moved(*state.motion.at(state.attachment, 4 / 120))
+    moved = field.moved(*state.motion.at(state.binding, 4 / 120))
     want = rasterize(moved, camera, sensor_of(sequence), settings.render).colour
     error = 2.0 * (want - observations.colour[4]).square().mean()
     torch.testing.assert_close(found["colour"], error)
@@ -164,7 +164,7 @@ def test_dgs_compares_colour_and_closed_form_distance_and_no_quads(monkeypatch):
         observations = observe(sequence, settings, "cpu")
         assert observations.batches == [[0], [4]]
         state = begin(observations, settings, seed=0, device="cpu")
-        fixed = (state.optimiser.field, state.motion, state.attachment)
+        fixed = (state.optimiser.field, state.motion, state.binding)
         found, seen = objective.terms(*fixed, observations, 4, settings, settings.weights)
         assert found.keys() == names
         assert (seen.tof is None) == (names == {"colour"})
@@ -188,7 +188,7 @@ def test_every_raw_frame_is_rendered_from_its_own_pose():
     observations = observe(sequence, settings, "cpu")
     state = begin(observations, settings, seed=0, device="cpu")
     field = state.optimiser.field
-    fixed = (field, None, state.attachment, observations)
+    fixed = (field, None, state.binding, observations)
     for n in (1, 6):
         _, seen = objective.terms(*fixed, n, settings, replace(settings.weights, flow=0.0))
         want = rasterize(field, observations.cameras[n], observations.sensor_at(n), settings.render).quads
@@ -204,10 +204,10 @@ def test_every_raw_frame_is_rendered_from_its_own_pose():
     surface = (centre + ray * seen.distance[..., None]).detach()
     here, *there = (observations.cameras[n].project(surface).movedim(2, 0) for n in (4, 8, 0))
     flow = {(1, step): place - here for step, place in zip((1, -1), there, strict=True)}
-    attachment = motion.attach(field)
-    right = objective.flow_loss(field, motion, attachment, replace(observations, flow=flow), 4, settings.render)
+    binding = motion.bind(field)
+    right = objective.flow_loss(field, motion, binding, replace(observations, flow=flow), 4, settings.render)
     zero = {key: torch.zeros_like(value) for key, value in flow.items()}
-    wrong = objective.flow_loss(field, motion, attachment, replace(observations, flow=zero), 4, settings.render)
+    wrong = objective.flow_loss(field, motion, binding, replace(observations, flow=zero), 4, settings.render)
     assert float(wrong.detach()) > 0.1
     assert float(right.detach()) < 1e-6 * float(wrong.detach())
 

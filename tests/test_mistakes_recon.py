@@ -93,7 +93,7 @@ def test_mistake_02_a_checkpoint_holds_the_network_and_its_moments(tmp_path):
         assert torch.equal(value, weights[name]), name
         assert again.optimiser.adam.state[value]["exp_avg"].abs().max() > 0, name
         assert again.optimiser.adam.state[value]["exp_avg_sq"].abs().max() > 0, name
-    moved = [s.motion.at(s.motion.attach(s.optimiser.field), 0.05).offset for s in (state, again)]
+    moved = [s.motion.at(s.motion.bind(s.optimiser.field), 0.05).offset for s in (state, again)]
     assert moved[0].abs().max() > 1e-4
     assert torch.equal(*moved)
     for s in (state, again):
@@ -124,7 +124,7 @@ def test_mistake_10_phasors_and_quads_of_one_light_have_one_fit():
             objective.terms(
                 replace(field, reflectivity_sh=field.reflectivity_sh + SH_OFFSET * more),
                 still,
-                still.attach(field),
+                still.bind(field),
                 observations,
                 4,
                 settings,
@@ -253,7 +253,7 @@ def test_mistake_15_one_unknown_pixel_is_left_out_of_the_flow_loss():
     settings = demo(weights=Weights(flow=1.0))
     sequence = small()
     observations, state = started(settings, sequence)
-    fixed = (state.optimiser.field, state.motion, state.attachment)
+    fixed = (state.optimiser.field, state.motion, state.binding)
     whole = objective.flow_loss(*fixed, observations, 4, settings.render)
     holed = {key: flow.clone() for key, flow in observations.flow.items()}
     for flow in holed.values():

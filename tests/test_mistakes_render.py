@@ -134,7 +134,7 @@ def flow_loss_of(camera, step, flow, later=None):
     offset = torch.stack([torch.zeros(1, 3), world[None]])
     motion = Nodes(torch.tensor([0.0, 1.0]), torch.zeros(1, 3), torch.ones(1, dtype=torch.long), offset)
     measured = Measured([camera] * 4 + [later or camera], flow)
-    loss = objective.flow_loss(field, motion, motion.attach(field), measured, 0, RenderSettings())
+    loss = objective.flow_loss(field, motion, motion.bind(field), measured, 0, RenderSettings())
     (gradient,) = torch.autograd.grad(loss, motion.offset)
     assert gradient.isfinite().all()
     return float(loss.detach())

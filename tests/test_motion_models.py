@@ -73,7 +73,7 @@ def test_a_model_stores_and_loads_itself(kind, tmp_path):
     torch.save(motion.to_dict(), tmp_path / "motion.pt")
     again = motion_from_dict(torch.load(tmp_path / "motion.pt", weights_only=True))
     assert type(again) is type(motion) is KINDS[kind]
-    before, after = (one.at(one.attach(scene), 0.05) for one in (motion, again))
+    before, after = (one.at(one.bind(scene), 0.05) for one in (motion, again))
     for one, other in zip(before, after, strict=True):
         assert (one is None and other is None) or torch.equal(one, other)
     assert kind == "still" or before.offset.abs().max() > 1e-3
@@ -163,16 +163,16 @@ def test_rotations_are_matrix_exponentials():
 
 
 def rigid():
-    """In float64: a model, its attachment, and which Gaussians move."""
+    """In float64: a model, its binding, and which Gaussians move."""
     scene = layered().map(lambda t: t.double() if t.is_floating_point() else t)
     motion = made("rigid_nodes", scene, size=1.0).double()
-    return motion, motion.attach(scene), scene
+    return motion, motion.bind(scene), scene
 
 
 def test_rigid_nodes_are_their_definition():
     """By R(w) (x - p) + p + t with weighted means, written out in matrices; the static layer does not move."""
-    motion, attachment, scene = rigid()
-    weight, got = attachment[:, : len(motion.node)], motion.at_keys(attachment, [0, 3])
+    motion, binding, scene = rigid()
+    weight, got = binding[:, : len(motion.node)], motion.at_keys(binding, [0, 3])
     for n, key in enumerate((0, 3)):
         turn = torch.matrix_exp(skew(weight @ motion.rotation[key]))
         centre = weight @ motion.node
@@ -186,8 +186,8 @@ def test_rigid_nodes_are_their_definition():
 
 def test_gradients_of_rigid_nodes_are_those_of_finite_differences():
     """W.r.t. rotations, translations and means, of which the gradient is the rotation; from no rotation, too."""
-    motion, attachment, scene = rigid()
-    weight, mean = attachment[:, : len(motion.node)], scene.mean
+    motion, binding, scene = rigid()
+    weight, mean = binding[:, : len(motion.node)], scene.mean
 
     def results(rotation, offset, mean):
         values = {"rotation": rotation, "offset": offset}
@@ -201,7 +201,7 @@ def test_gradients_of_rigid_nodes_are_those_of_finite_differences():
         assert torch.autograd.gradcheck(results, [leaf.clone().requires_grad_() for leaf in leaves])
     leaf = mean.clone().requires_grad_()
     cotangent = random(*mean.shape, seed=9).double()
-    moved = leaf + motion.at_keys(motion.attach(replace(scene, mean=leaf)), [1]).offset[0]
+    moved = leaf + motion.at_keys(motion.bind(replace(scene, mean=leaf)), [1]).offset[0]
     (gradient,) = torch.autograd.grad((moved * cotangent).sum(), leaf)
     turn = torch.matrix_exp(skew(weight @ motion.rotation[1]))
     torch.testing.assert_close(gradient, (turn.mT @ cotangent[..., None])[..., 0])
@@ -215,8 +215,8 @@ class _AtKeys(torch.nn.Module):
         super().__init__()
         self.motion = motion
 
-    def forward(self, attachment, keys):
-        return self.motion.at_keys(attachment, keys)
+    def forward(self, binding, keys):
+        return self.motion.at_keys(binding, keys)
 
 
 def test_a_rigid_motion_that_nodes_share_is_reproduced():
@@ -228,7 +228,7 @@ def test_a_rigid_motion_that_nodes_share_is_reproduced():
     with torch.no_grad():
         motion.rotation[1] = 0.7 * axis
         motion.offset[1] = (motion.node - centre) @ turn.T + centre - motion.node
-    moved = scene.moved(*motion.at(motion.attach(scene), motion.times[1]))
+    moved = scene.moved(*motion.at(motion.bind(scene), motion.times[1]))
     torch.testing.assert_close(moved.mean, (scene.mean - centre) @ turn.T + centre, rtol=1e-5, atol=1e-6)
     one, other = (matrix(torch.nn.functional.normalize(g.quaternion, dim=1)) for g in (scene, moved))
     torch.testing.assert_close(other, turn @ one, rtol=1e-5, atol=1e-6)
@@ -249,7 +249,7 @@ def test_a_replay_draws_what_render_draws(run, kind):  # noqa: F811
     scene = replace(gaussians(60, CAMERA, seed=3), layer=torch.ones(60, dtype=torch.long))
     motion = made(kind, scene, size=0.5).to(run.field.device)
     scene = scene.map(lambda tensor: tensor.to(run.field.device))
-    moving = replace(run, field=scene, motion=motion, attachment=motion.attach(scene))
+    moving = replace(run, field=scene, motion=motion, binding=motion.bind(scene))
     render = moving.renderer()
     for camera in (CAMERA, aside(0.1), CAMERA.resized(20, 15)):
         for time in (*TIMES, 0.02, 0.05):

@@ -53,7 +53,7 @@ def test_it_computes_what_the_method_says():
     position = random(40, 3) * 6 - 3
     for settings in (MotionSettings(), MotionSettings(layers=4, width=32)):
         made = network(settings, head=0.1)
-        place = made.attach(field(position, None))
+        place = made.bind(field(position, None))
         found = made.at_keys(place, [0, 2, 3]).offset
         for row, key in zip(found, (0, 2, 3), strict=True):
             want = spelt_out(copy.deepcopy(made).double(), position, key)
@@ -69,7 +69,7 @@ def test_gradients_reach_every_weight_and_no_position():
     cotangent = random(25, 3, seed=5)
     parameters = list(made.parameters())
     gaussians = field(position, None)
-    loss = (made.at(made.attach(gaussians), 5 / 120).offset * cotangent).sum()
+    loss = (made.at(made.bind(gaussians), 5 / 120).offset * cotangent).sum()
     *found, none = torch.autograd.grad(loss, [*parameters, position], allow_unused=True)
     assert none is None
     twin = copy.deepcopy(made).double()
@@ -84,7 +84,7 @@ def test_it_starts_at_rest_and_the_same_for_a_seed():
     """To a fraction of a millimetre."""
     position = random(200, 3) * 6 - 3
     made = network()
-    moved = made.at(made.attach(field(position, None)), 0.05).offset.abs().max()
+    moved = made.at(made.bind(field(position, None)), 0.05).offset.abs().max()
     assert 0 < moved < 5e-4
     for one, other in zip(network(seed=3).parameters(), network(seed=3).parameters(), strict=True):
         assert torch.equal(one, other)
@@ -104,9 +104,9 @@ def test_encoding_has_no_factor_pi():
 def test_layers_say_nothing_to_a_network():
     """Nodes pin the static layer; a network decides for itself who moves."""
     made, position = network(head=0.1), random(30, 3)
-    static = made.at_keys(made.attach(field(position, torch.zeros(30, dtype=torch.long))), [1]).offset[0]
+    static = made.at_keys(made.bind(field(position, torch.zeros(30, dtype=torch.long))), [1]).offset[0]
     assert static.any(dim=1).all()
-    assert torch.equal(static, made.at_keys(made.attach(field(position, None)), [1]).offset[0])
+    assert torch.equal(static, made.at_keys(made.bind(field(position, None)), [1]).offset[0])
 
 
 @pytest.mark.contract

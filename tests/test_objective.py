@@ -25,7 +25,7 @@ def test_flow_loss_is_small_for_the_true_motion_and_pulls_only_at_keys():
     field = state.optimiser.field
 
     def loss():
-        return objective.flow_loss(field, state.motion, state.attachment, observations, 4, settings.render)
+        return objective.flow_loss(field, state.motion, state.binding, observations, 4, settings.render)
 
     true = loss()
     assert torch.autograd.grad(loss(), state.optimiser.leaves[:-1], allow_unused=True) == (None,) * 5
@@ -45,7 +45,7 @@ def test_flow_loss_is_small_for_the_true_motion_and_pulls_only_at_keys():
         down = float(loss())
     assert (up - down) / (2 * h) == pytest.approx(float(gradient.norm()), rel=0.05)
     without = replace(observations, flow={})
-    assert objective.flow_loss(field, state.motion, state.attachment, without, 4, settings.render) is None
+    assert objective.flow_loss(field, state.motion, state.binding, without, 4, settings.render) is None
 
 
 def test_terms_of_weight_zero_are_left_out_and_others_begin_when_the_schedule_says():
@@ -58,7 +58,7 @@ def test_terms_of_weight_zero_are_left_out_and_others_begin_when_the_schedule_sa
     assert (middle.distortion, late.distortion) == (0.0, 2.0)
     observations = observe(small(), settings, "cpu")
     state = begin(observations, settings, seed=0, device="cpu")
-    fixed = (state.optimiser.field, state.motion, state.attachment, observations)
+    fixed = (state.optimiser.field, state.motion, state.binding, observations)
     for frame, weights, names in (
         (8, late, {"quads", "distortion", "flow", "motion_size"}),
         (9, late, {"quads", "distortion", "motion_size"}),
@@ -74,7 +74,7 @@ def test_the_measured_slot_is_compared_at_its_own_time_and_shift():
     settings = demo()
     observations = observe(small(), settings, "cpu")
     state = begin(observations, settings, seed=0, device="cpu")
-    fixed = (state.optimiser.field, state.motion, state.attachment)
+    fixed = (state.optimiser.field, state.motion, state.binding)
     right = objective.terms(*fixed, observations, 6, settings, Weights(ssim=0.0))[0]["quads"]
     shifted = replace(observations.sequence, shifts=np.roll(observations.sequence.shifts, 1))
     late = replace(observations.sequence, times=observations.sequence.times + 8 / 120)

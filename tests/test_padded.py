@@ -68,7 +68,7 @@ def test_a_state_is_moved_to_the_bit_and_the_rest_is_padding(motion):
         for moment, known in zip(one.optimiser.moments_of(tensor), other.optimiser.moments_of(twin), strict=True):
             assert torch.equal(moment, known)
     if not other.motion.follows_means:
-        assert torch.equal(padded.attachment[:count], one.attachment)
+        assert torch.equal(padded.binding[:count], one.binding)
     for name in densify.STATISTICS:
         assert torch.equal(getattr(one.statistics, name), getattr(other.statistics, name))
     assert (padded.values["opacity_logit"][count:] == PADDING_LOGIT).all()

@@ -51,7 +51,7 @@ def positions(count):
 
 def gradients(made, gaussians, cotangent, keys):
     """Offsets and the gradient of every parameter, by autograd through whatever the network does."""
-    found = made.at_keys(made.attach(gaussians), keys).offset
+    found = made.at_keys(made.bind(gaussians), keys).offset
     return found, torch.autograd.grad((found * cotangent).sum(), list(made.parameters()))
 
 
@@ -69,7 +69,7 @@ def distance(one, other):
 
 def compare_replay(made, gaussians, cotangent):
     """Capture offsets and gradients at two keys; replay for other positions and times, and ask again."""
-    place, moment = made.attach(gaussians), made.moments[:2].clone()
+    place, moment = made.bind(gaussians), made.moments[:2].clone()
     parameters = list(made.parameters())
 
     def call():
@@ -129,7 +129,7 @@ def test_in_float32_it_is_the_network(keys):
 
 def on_the_same_side(made, gaussians, cotangent, keys):
     """Gradients of the plain network in float64 whose units are at rest where those of the rounded one are."""
-    offsets = made.at_keys(made.attach(gaussians), keys).offset  # kept: what is saved may go with it
+    offsets = made.at_keys(made.bind(gaussians), keys).offset  # kept: what is saved may go with it
     saved = offsets.grad_fn.saved_tensors[-1]
     alive = [rows[:, : made.settings.width] > 0 for rows in saved]
     twin = copy.deepcopy(made).double()
@@ -194,7 +194,7 @@ def test_offsets_of_a_trained_field_differ_by_less_than_a_millimetre(device):
     """A field that turns by decimetres, learnt in float32, asked in half precision."""
     made, gaussians = network(MotionSettings(), head=1e-2), positions(256)
     made, gaussians = made.to(device), gaussians.map(lambda value: value.to(device))
-    place, keys = made.attach(gaussians), [0, 1, 2, 3]
+    place, keys = made.bind(gaussians), [0, 1, 2, 3]
     turn = torch.linspace(0, 1, len(keys), device=device)[:, None, None]
     target = 0.3 * turn * torch.sin(1.5 * gaussians.mean.roll(1, dims=1) + turn)
     adam = torch.optim.Adam(made.parameters(), lr=1e-3)
@@ -207,7 +207,7 @@ def test_offsets_of_a_trained_field_differ_by_less_than_a_millimetre(device):
     quick = network(half()).to(device)
     quick.load_state_dict(made.state_dict())
     with torch.no_grad():
-        error = (quick.at_keys(quick.attach(gaussians), keys).offset - made.at_keys(place, keys).offset).norm(dim=-1)
+        error = (quick.at_keys(quick.bind(gaussians), keys).offset - made.at_keys(place, keys).offset).norm(dim=-1)
     assert 0 < error.max() < 1e-3, f"{error.max()} m"
 
 
@@ -275,10 +275,10 @@ def test_a_replay_equals_a_call():
     compare_replay(made, gaussians, random(2, 2000, 3).to("cuda"))
 
 
-def test_attached_positions_are_aligned_halves():
+def test_bound_positions_are_aligned_halves():
     """Encoded once for all calls of a step: 63 values and one of zeros."""
     made, gaussians = network(half()), positions(5)
-    place = made.attach(gaussians)
+    place = made.bind(gaussians)
     assert (place.dtype, place.shape) == (torch.float16, (5, 64))
     torch.testing.assert_close(place[:, :63].float(), encoded(gaussians.mean / 7.5, 10), rtol=1e-3, atol=1e-4)
     assert place[:, 63].abs().max() == 0

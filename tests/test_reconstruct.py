@@ -127,7 +127,7 @@ def test_a_finer_camera_sees_what_was_optimised():
         quad_scale=1.0,
         field=gaussians,
         motion=Still(KEYS),
-        attachment=torch.zeros(2, 0),
+        binding=torch.zeros(2, 0),
     )
     coarse, fine = run.render(0.0, camera.resized(24, 18)).opacity, run.render(0.0).opacity
     assert coarse.sum() > 1

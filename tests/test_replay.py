@@ -43,7 +43,7 @@ def run(request, tmp_path):
         quad_scale=3.0,
         field=field,
         motion=motion,
-        attachment=motion.attach(field),
+        binding=motion.bind(field),
     )
 
 
@@ -105,7 +105,7 @@ def test_every_key_is_computed_once(run, monkeypatch):
 def test_an_empty_field_renders_black(run):
     """N = 0."""
     none = slice(0, 0)
-    empty = replace(run, field=run.field.map(lambda t: t[none]), attachment=run.attachment[none])
+    empty = replace(run, field=run.field.map(lambda t: t[none]), binding=run.binding[none])
     rendering = empty.renderer()(0.01, CAMERA)
     assert float(rendering.opacity.abs().max()) == 0.0
     assert float(rendering.quads.abs().max()) == 0.0

@@ -222,7 +222,7 @@ def test_a_term_from_outside_is_trained_and_logged(device):
     frames = observations.batches[0]
     field, motion, total, values = state.optimiser.field, state.motion, 0.0, []
     for frame in frames:
-        displacement = motion.at(state.attachment, observations.time_at(frame))
+        displacement = motion.at(state.binding, observations.time_at(frame))
         moved = field.moved(*displacement)
         quads = stepper_rendering(moved, observations, frame, settings).quads
         values.append(0.5 * (quads.abs().mean() + 0.1 * displacement.offset.square().sum(dim=1).mean()))

@@ -55,7 +55,7 @@ def rows(count, keys, device="cpu", scale=1.0):
 def inputs_of(made, count, keys):
     """What ``Passes.forward`` gets: form, gamma(x), gamma(t), weights and biases."""
     device = made.head.weight.device
-    place = made.attach(positions(count).map(lambda value: value.to(device)))
+    place = made.bind(positions(count).map(lambda value: value.to(device)))
     layers = [*made.layers, made.head]
     weights, biases = zip(*((layer.weight.detach(), layer.bias.detach()) for layer in layers), strict=True)
     return made.backend.form, place, made.moments[:keys].to(device, torch.float32), weights, biases

@@ -52,11 +52,11 @@ def measure(device: str, *, quick: bool, runs: int, report: Report) -> list[dict
         keys = list(range(4, 4 + queries))
 
         def both(network=network, field=field, slope=slope, weights=weights, keys=keys) -> object:
-            return torch.autograd.grad(network.at_keys(network.attach(field), keys).offset, weights, slope)
+            return torch.autograd.grad(network.at_keys(network.bind(field), keys).offset, weights, slope)
 
         def forward(network=network, field=field, keys=keys) -> object:
             with torch.no_grad():
-                return network.at_keys(network.attach(field), keys).offset
+                return network.at_keys(network.bind(field), keys).offset
 
         found = both_ways(both, watch, runs)
         best = (found["graph"] or found["eager"])["median"]

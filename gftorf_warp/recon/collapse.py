@@ -80,7 +80,7 @@ def has_dead_network(state: State, settings: ReconSettings) -> bool | Tensor:
     if not isinstance(state.motion, Network) or state.images <= settings.schedule.warm_up:
         return False
     keys = [0, len(state.motion.key_times) // 2]
-    offsets = state.motion.at_keys(state.motion.attach(state.optimiser.field), keys).offset
+    offsets = state.motion.at_keys(state.motion.bind(state.optimiser.field), keys).offset
     return len(offsets[0]) > 1 and (offsets == offsets[:1, :1]).all()
 
 

@@ -114,7 +114,7 @@ class Diagnostics:
             counted: Whether (tile, splat) pairs are counted first, which waits; on a CPU always.
         """
         field, shown = state.optimiser.field, self.observations
-        attachment = state.motion.attach(field) if state.motion.follows_means else state.attachment
+        binding = state.motion.bind(field) if state.motion.follows_means else state.binding
         bare = replace(field, colour_sh=None)
         capacity = None if counted or field.device.type == "cpu" else PAIRS
         # no gradients: no memory for an order of their sums
@@ -124,7 +124,7 @@ class Diagnostics:
         displacements = [Displacement(torch.zeros_like(field.mean), None)] * len(self.frames)
         if state.images >= settings.schedule.warm_up:  # before, nothing moves
             times = [float(shown.sequence.times[frame]) for frame in self.frames]
-            displacements = state.motion.at_times(attachment, times)
+            displacements = state.motion.at_times(binding, times)
         for frame, displacement in zip(self.frames, displacements, strict=True):
             length = displacement.offset.norm(dim=1, keepdim=True)
             moved, camera, where = bare.moved(*displacement), shown.cameras[frame], self._workspace

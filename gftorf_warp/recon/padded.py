@@ -101,7 +101,7 @@ class PaddedParameters:
         if self.layer is not None and state.optimiser.layer is not None:
             _copy([(self.layer, state.optimiser.layer)], count)
         if not state.motion.follows_means:  # otherwise it is evaluated in every step
-            _copy([(self.attachment, state.attachment)], count)
+            _copy([(self.binding, state.binding)], count)
         views = {name: getattr(self.statistics, name)[:count] for name in STATISTICS}
         state.statistics = Statistics(**views)
         return moved
@@ -126,7 +126,7 @@ class PaddedParameters:
         self._moments = {name: (tensor.new_zeros(()), like(tensor), like(tensor)) for name, tensor in tensors.items()}
         self.motion = list(optimiser.motion)
         self.layer = None if optimiser.layer is None else like(optimiser.layer)
-        self.attachment = like(state.attachment.detach())
+        self.binding = like(state.binding.detach())
         """Attachment of all rows to a motion that does not follow the means."""
         self.statistics = Statistics(**{name: like(tensors["opacity_logit"]) for name in STATISTICS})
         """Statistics of densification of all rows."""

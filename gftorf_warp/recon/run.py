@@ -52,7 +52,7 @@ class Run:
     """The Gaussians where nothing has moved, in the units of the optimisation."""
     motion: Motion
     """Where they are at which time."""
-    attachment: Float[Tensor, "N M"] = dataclasses.field(repr=False)
+    binding: Float[Tensor, "N M"] = dataclasses.field(repr=False)
     """How each Gaussian hangs on the motion."""
 
     @classmethod
@@ -78,7 +78,7 @@ class Run:
                 why="nothing was reconstructed yet",
                 fix="run `gftorf reconstruct` with this --out first",
             )
-        gaussians, motion, attachment = field_and_motion(stored, device)
+        gaussians, motion, binding = field_and_motion(stored, device)
         reached = {"images_optimised": stored["images"], "seconds_reconstruct": stored["seconds"]}
         return cls(
             path=path,
@@ -88,7 +88,7 @@ class Run:
             quad_scale=config["quad_scale"],
             field=gaussians,
             motion=motion,
-            attachment=attachment,
+            binding=binding,
         )
 
     @property
@@ -124,7 +124,7 @@ class Run:
         """
         camera = camera or self.camera
         rendering = rasterize(
-            self.widened(self.field.moved(*self.motion.at(self.attachment, time)), camera),
+            self.widened(self.field.moved(*self.motion.at(self.binding, time)), camera),
             camera,
             self._at(f_mod_hz),
             self.render_settings,
@@ -156,7 +156,7 @@ class Run:
         field = self.field if "colour" in names else replace(self.field, colour_sh=None)
         sensor = replace(self._at(f_mod_hz), source_intensity=float(self.sensor.source_intensity) / self.quad_scale)
         optimised = self.camera.resized(*self.config["size_optimised"])
-        known = field, self.motion, self.attachment, sensor, self.render_settings, optimised, names
+        known = field, self.motion, self.binding, sensor, self.render_settings, optimised, names
         return Replay(*known, colour_scale=self.colour_scale)
 
     def images(
@@ -236,7 +236,7 @@ class ClosedForm(Run):
             quad_scale=1.0,
             field=field,
             motion=motion,
-            attachment=motion.attach(field),
+            binding=motion.bind(field),
         )
 
     def render(

@@ -63,7 +63,7 @@ class State(Progress):
     """Gaussians and moments."""
     motion: Motion
     """The motion model."""
-    attachment: Float[Tensor, "N M"]
+    binding: Float[Tensor, "N M"]
     """What the motion model needs of each Gaussian."""
     statistics: densify.Statistics
     """Of densification, since the last one."""
@@ -96,7 +96,7 @@ def begin(observations: Observations, settings: ReconSettings, *, seed: int, dev
     return State(
         optimiser=Optimiser(field, motion, betas=betas_of(settings)),
         motion=motion,
-        attachment=motion.attach(field),
+        binding=motion.bind(field),
         statistics=densify.start(field),
         generator=generator,
         noise_seed=seed & SEED_MASK,
@@ -125,7 +125,7 @@ def to_dict(state: State) -> dict[str, object]:
         "field": {name: value.detach() for name, value in state.optimiser.field.tensors().items()},
         "adam": state.optimiser.state_dict(),
         "motion": state.motion.to_dict(),
-        "attachment": state.optimiser.field.mean.detach() if state.motion.follows_means else state.attachment,
+        "attachment": state.optimiser.field.mean.detach() if state.motion.follows_means else state.binding,
         "statistics": {name: getattr(state.statistics, name) for name in densify.STATISTICS},
         "generator": state.generator.get_state(),
         "noise_seed": state.noise_seed,
@@ -136,16 +136,16 @@ def to_dict(state: State) -> dict[str, object]:
 
 
 def field_and_motion(stored: dict, device: torch.device | str) -> tuple[GaussianField, Motion, Tensor]:
-    """Gaussians, their motion and their attachment to it, from the stored form."""
+    """Gaussians, their motion and their binding to it, from the stored form."""
     field = GaussianField(**{name: value.to(device) for name, value in stored["field"].items()})
     motion = with_backend(motion_from_dict(stored["motion"]).to(device))
-    attachment = motion.attach(field) if motion.follows_means else stored["attachment"].to(device)
-    return field, motion, attachment
+    binding = motion.bind(field) if motion.follows_means else stored["attachment"].to(device)
+    return field, motion, binding
 
 
 def from_dict(stored: dict, device: torch.device | str) -> State:
     """Rebuild a state from :func:`to_dict`; on a CPU it continues to the same bits."""
-    field, motion, attachment = field_and_motion(stored, device)
+    field, motion, binding = field_and_motion(stored, device)
     statistics = {name: value.to(device) for name, value in stored["statistics"].items()}
     generator = torch.Generator()
     generator.set_state(stored["generator"].cpu())
@@ -154,7 +154,7 @@ def from_dict(stored: dict, device: torch.device | str) -> State:
     return State(
         optimiser=Optimiser(field, motion, stored["adam"]),
         motion=motion,
-        attachment=attachment,
+        binding=binding,
         statistics=replace(densify.start(field), **statistics),
         generator=generator,
         noise_seed=_noise_seed(stored),

@@ -145,10 +145,10 @@ class Step:
         """Motion at all keys of the batch, evaluated once; None: nothing moves yet."""
         if not key.keys:
             return None
-        attachment = self.padded.attachment
+        binding = self.padded.binding
         if motion.follows_means and not key.frozen:
-            attachment = motion.attach(self.padded.field)
-        return motion.at_keys(attachment, self.control.keys(key.keys))
+            binding = motion.bind(self.padded.field)
+        return motion.at_keys(binding, self.control.keys(key.keys))
 
     def _image(self, n: int, key: GraphKey, key_motion: KeyMotion | None, render: RenderSettings) -> ImageGradients:
         """Render one image, evaluate its terms, and differentiate them, independently of other images."""

@@ -167,7 +167,7 @@ class Stepper:
         self._attach(free=True)
         motion, padded = self.state.motion, self._padded
         if key.frozen and motion.follows_means:
-            padded.attachment.copy_(motion.attach(padded.field.map(torch.Tensor.detach)))
+            padded.binding.copy_(motion.bind(padded.field.map(torch.Tensor.detach)))
 
     def _attach(self, *, free: bool = False) -> None:
         """Move the state to the padded parameters, whose number of rows may change."""
@@ -228,7 +228,7 @@ def densify_after(state: State, observations: Observations, before: int, setting
         if prunes:
             state.unseen_at = state.images
         if not state.motion.follows_means:  # otherwise it is evaluated in every step
-            state.attachment = state.motion.attach(state.optimiser.field)
+            state.binding = state.motion.bind(state.optimiser.field)
     if densify.reset_is_due(before, state.images, options, schedule):
         densify.reset_opacity(state.optimiser, options)
         state.reset_at = state.images

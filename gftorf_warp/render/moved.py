@@ -35,7 +35,7 @@ class MovedGaussians:
         self,
         field: GaussianField,
         motion: Motion,
-        attachment: Tensor,
+        binding: Tensor,
         calibration: Tensor,
         optimised: Camera,
         settings: RenderSettings,
@@ -45,17 +45,17 @@ class MovedGaussians:
         Args:
             field: The undisplaced Gaussians, float32.
             motion: Their motion.
-            attachment: What ``motion.attach`` returned for them.
+            binding: What ``motion.bind`` returned for them.
             calibration: Of the sensor, as ``Inputs`` has it.
             optimised: The camera at the size of the optimisation, whose low-pass filter widened the Gaussians.
             settings: How to render.
         """
         field = field.map(lambda tensor: tensor.detach().contiguous())
-        first = motion.at_keys(attachment, [0])
+        first = motion.at_keys(binding, [0])
         tables = [None if t is None else t.new_zeros(len(motion.times), *t.shape[1:]) for t in first]
         mean, log_scale = torch.empty_like(field.mean), torch.empty_like(field.log_scale)
         turned = None if first.rotation is None else torch.empty_like(field.quaternion)
-        self._motion, self._attachment, self._tables = motion, attachment, tables
+        self._motion, self._binding, self._tables = motion, binding, tables
         self._known: set[int] = set()
         self._store(0, first)
         self._kept = field, calibration, mean, log_scale, turned  # Warp arrays do not own their memory
@@ -88,12 +88,12 @@ class MovedGaussians:
         """Fill ``inputs`` and ``view`` for a time [s], any number, and a camera."""
         keys = self._motion.keys_at(time)
         for key in set(keys.index) - self._known:
-            self._store(key, self._motion.at_keys(self._attachment, [key]))
+            self._store(key, self._motion.at_keys(self._binding, [key]))
         unused = self._motion.support - len(keys.index)
         self._launch.set_param_at_index(CAMERA, self._camera(camera))
         self._launch.set_param_at_index(INDEX, self._indices(*keys.index, *keys.index[:1] * unused))
         self._launch.set_param_at_index(WEIGHT, self._weights(*keys.weight, *(0.0,) * unused))
-        with stream_of(self._attachment):
+        with stream_of(self._binding):
             self._launch.launch()
 
     def _store(self, key: int, motion: KeyMotion) -> None:

@@ -26,10 +26,10 @@ class HalfPrecision:
         columns, dtype = self.form.columns, self.form.dtype
         return self.layers.encode(mean, network.length, network.powers, columns=columns, dtype=dtype)
 
-    def offsets(self, network: Network, attachment: Tensor, time: Tensor) -> Tensor:
+    def offsets(self, network: Network, binding: Tensor, time: Tensor) -> Tensor:
         """[k, N, 3] displacements [m]."""
         parameters = [value for layer in [*network.layers, network.head] for value in (layer.weight, layer.bias)]
-        return Offsets.apply(self.form, self.layers, attachment, time, *parameters)
+        return Offsets.apply(self.form, self.layers, binding, time, *parameters)
 
 
 def with_backend(motion: Motion) -> Motion:

@@ -59,7 +59,7 @@ class Replay:
         self,
         field: GaussianField,
         motion: Motion,
-        attachment: Tensor,
+        binding: Tensor,
         sensor: Sensor,
         settings: RenderSettings,
         optimised: Camera,
@@ -72,7 +72,7 @@ class Replay:
         Args:
             field: The undisplaced Gaussians, float32.
             motion: Their motion.
-            attachment: What ``motion.attach`` returned for them.
+            binding: What ``motion.bind`` returned for them.
             sensor: With the shifts of the quads.
             settings: How to render; the pair capacity is adapted.
             optimised: The camera at the size of the optimisation, whose low-pass filter widened the Gaussians.
@@ -93,7 +93,7 @@ class Replay:
         self._shifts = wp.array(shifts, dtype=wp.vec2, device=self.device)
         values = sensor.phase_slope, sensor.phase_offset, sensor.source_intensity, sensor.dc_offset
         calibration = torch.tensor([float(v) for v in values], dtype=torch.float32, device=field.device)
-        self._gaussians = MovedGaussians(field, motion, attachment, calibration, optimised, settings)
+        self._gaussians = MovedGaussians(field, motion, binding, calibration, optimised, settings)
         self._targets: dict[tuple[int, int, bool], Target] = {}
         self._largest = wp.zeros(1, dtype=wp.int32, device=self.device)
         self._capacity = PairCapacity()  # on a CPU pairs are always counted first

@@ -131,14 +131,14 @@ class Displacement(NamedTuple):
 
 
 class Motion(torch.nn.Module, abc.ABC):
-    """A motion model: ``attach`` binds Gaussians to it, ``at_keys`` displaces them."""
+    """A motion model: ``bind`` binds Gaussians to it, ``at_keys`` displaces them."""
 
     kind: ClassVar[str]
     """Name in settings and checkpoints."""
     support: ClassVar[int] = 2
     """Largest number of keys that a time depends on."""
     follows_means: ClassVar[bool] = False
-    """Whether ``attach`` depends on the present means, so that it is evaluated in every step; it must then be
+    """Whether ``bind`` depends on the present means, so that it is evaluated in every step; it must then be
     capturable in a CUDA graph."""
     key_times: Tensor  # [T] float64 [s]
 
@@ -157,14 +157,14 @@ class Motion(torch.nn.Module, abc.ABC):
         """The model at the beginning of a run."""
 
     @abc.abstractmethod
-    def attach(self, field: GaussianField) -> Float[Tensor, "N M"]:
+    def bind(self, field: GaussianField) -> Float[Tensor, "N M"]:
         """What the model needs of each Gaussian; evaluated when Gaussians are added or removed, see ``follows_means``.
 
         A model whose displacements depend on the means differentiably returns them with their gradient.
         """
 
     @abc.abstractmethod
-    def at_keys(self, attachment: Float[Tensor, "N M"], keys: Sequence[int] | Int[Tensor, "K"]) -> KeyMotion:
+    def at_keys(self, binding: Float[Tensor, "N M"], keys: Sequence[int] | Int[Tensor, "K"]) -> KeyMotion:
         """Motion at keys given by their indices; a tensor of indices is read on its device only."""
 
     def keys_at(self, time: float) -> Keys:
@@ -180,15 +180,15 @@ class Motion(torch.nn.Module, abc.ABC):
         start, end = self.times[key], self.times[key + 1]
         return key, max((time - start) / (end - start), 0.0)
 
-    def at(self, attachment: Float[Tensor, "N M"], time: float) -> Displacement:
+    def at(self, binding: Float[Tensor, "N M"], time: float) -> Displacement:
         """Motion at ``time`` [s], any number."""
-        return self.at_times(attachment, [time])[0]
+        return self.at_times(binding, [time])[0]
 
-    def at_times(self, attachment: Float[Tensor, "N M"], times: Sequence[float]) -> list[Displacement]:
+    def at_times(self, binding: Float[Tensor, "N M"], times: Sequence[float]) -> list[Displacement]:
         """:meth:`at` for several times, whose keys are evaluated together."""
         needed = [self.keys_at(time) for time in times]
         keys = sorted({key for one in needed for key in one.index})
-        motion = self.at_keys(attachment, keys)
+        motion = self.at_keys(binding, keys)
         row = {key: n for n, key in enumerate(keys)}
         return [interpolated(motion, [row[key] for key in one.index], one.weight) for one in needed]
 
@@ -212,13 +212,13 @@ class Still(Motion):
         """No parameters."""
         return cls(initial.key_times)
 
-    def attach(self, field: GaussianField) -> Float[Tensor, "N 0"]:
+    def bind(self, field: GaussianField) -> Float[Tensor, "N 0"]:
         """No columns."""
         return field.mean.new_zeros(len(field), 0)
 
-    def at_keys(self, attachment: Float[Tensor, "N 0"], keys: Sequence[int] | Int[Tensor, "K"]) -> KeyMotion:
+    def at_keys(self, binding: Float[Tensor, "N 0"], keys: Sequence[int] | Int[Tensor, "K"]) -> KeyMotion:
         """Zero."""
-        return KeyMotion(attachment.new_zeros(len(keys), len(attachment), 3), None)
+        return KeyMotion(binding.new_zeros(len(keys), len(binding), 3), None)
 
     @classmethod
     def from_dict(cls, stored: dict[str, Any]) -> Still:
@@ -289,7 +289,7 @@ class Nodes(Motion):
         layer = field.layer[field.layer > 0][nodes]
         return cls(initial.key_times, moving[nodes], layer, offset, neighbours=settings.neighbours)
 
-    def attach(self, field: GaussianField) -> Float[Tensor, "N M"]:
+    def bind(self, field: GaussianField) -> Float[Tensor, "N M"]:
         """Weight of every node for every Gaussian: rows sum to 1, those of the static layer are zero.
 
         The nearest nodes are weighted by exp(-2 (distance / distance of the farthest of them)^2): smooth in the
@@ -306,9 +306,9 @@ class Nodes(Motion):
         share = torch.softmax(-2.0 * (near / farthest.clamp_min(1e-9)).square(), dim=1)
         return weight.scatter(1, index, share.masked_fill(near.isinf(), 0.0))
 
-    def at_keys(self, attachment: Float[Tensor, "N M"], keys: Sequence[int] | Int[Tensor, "K"]) -> KeyMotion:
+    def at_keys(self, binding: Float[Tensor, "N M"], keys: Sequence[int] | Int[Tensor, "K"]) -> KeyMotion:
         """Weighted means of the displacements of nodes."""
-        return KeyMotion(torch.stack([attachment @ offset for offset in rows_of(self.offset, keys)]), None)
+        return KeyMotion(torch.stack([binding @ offset for offset in rows_of(self.offset, keys)]), None)
 
     def to_dict(self) -> dict[str, Any]:
         """With the number of neighbours."""

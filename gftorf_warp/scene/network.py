@@ -31,7 +31,7 @@ class Backend(Protocol):
         ...
 
     def offsets(
-        self, network: Network, attachment: Float[Tensor, "N p"], moment: Float[Tensor, "k t"]
+        self, network: Network, binding: Float[Tensor, "N p"], moment: Float[Tensor, "k t"]
     ) -> Float[Tensor, "k N 3"]:
         """Displacements [m] at times given as gamma(t), differentiable in the parameters."""
         ...
@@ -107,17 +107,17 @@ class Network(Motion):
             layer.weight.copy_(drawn)
             layer.bias.zero_()
 
-    def attach(self, field: GaussianField) -> Float[Tensor, "N p"]:
+    def bind(self, field: GaussianField) -> Float[Tensor, "N p"]:
         """gamma(x) of the positions, without gradient [1]."""
         mean = field.mean.detach()
         if self.backend is not None:
             return self.backend.encode(self, mean)
         return encoded(mean / self.length, self.powers)
 
-    def at_keys(self, attachment: Float[Tensor, "N p"], keys: Sequence[int] | Int[Tensor, "K"]) -> KeyMotion:
+    def at_keys(self, binding: Float[Tensor, "N p"], keys: Sequence[int] | Int[Tensor, "K"]) -> KeyMotion:
         """Displacements, without rotation."""
         moments = self.rounded if self.head.weight.dtype == self.rounded.dtype == torch.float32 else self.moments
-        return KeyMotion(self.offsets(attachment, rows_of(moments, keys)), None)
+        return KeyMotion(self.offsets(binding, rows_of(moments, keys)), None)
 
     def to_dict(self) -> dict[str, Any]:
         """With its shape, its duration and its length."""
@@ -134,7 +134,7 @@ class Network(Motion):
         made.load_state_dict(tensors)
         return made
 
-    def offsets(self, attachment: Float[Tensor, "N p"], moment: Float[Tensor, "k t"]) -> Float[Tensor, "k N 3"]:
+    def offsets(self, binding: Float[Tensor, "N p"], moment: Float[Tensor, "k t"]) -> Float[Tensor, "k N 3"]:
         """Displacements [m] at several times, given as gamma(t): rows of ``moments``, chosen on the host or the device.
 
         A layer is linear, so what it makes of positions is computed once for all times, and what it makes of a time is
@@ -142,13 +142,13 @@ class Network(Motion):
         """
         moment = moment.to(self.head.weight)
         if self.backend is not None:
-            return self.backend.offsets(self, attachment, moment)
-        hidden = self._joined(self._layers[0], None, attachment, moment)
+            return self.backend.offsets(self, binding, moment)
+        hidden = self._joined(self._layers[0], None, binding, moment)
         for number, layer in enumerate(self._layers[1:], start=1):
             hidden = torch.relu(hidden)
             skip = number == self.settings.skip_after
             if skip:
-                hidden = self._joined(layer, hidden, attachment, moment)
+                hidden = self._joined(layer, hidden, binding, moment)
             else:
                 hidden = hidden @ layer.weight.T + layer.bias
         return torch.relu(hidden) @ self.head.weight.T + self.head.bias

@@ -40,13 +40,13 @@ class RigidNodes(Nodes):
         self.rotation = torch.nn.Parameter(torch.zeros_like(self.offset))
         """Rotation vector [T, M, 3] of every node at every key [rad]."""
 
-    def attach(self, field: GaussianField) -> Float[Tensor, "N M+3"]:
+    def bind(self, field: GaussianField) -> Float[Tensor, "N M+3"]:
         """Weights of the nodes, and the means."""
-        return torch.cat([super().attach(field), field.mean], dim=1)
+        return torch.cat([super().bind(field), field.mean], dim=1)
 
-    def at_keys(self, attachment: Float[Tensor, "N M+3"], keys: Sequence[int] | Int[Tensor, "K"]) -> KeyMotion:
+    def at_keys(self, binding: Float[Tensor, "N M+3"], keys: Sequence[int] | Int[Tensor, "K"]) -> KeyMotion:
         """Displacements, and rotations of the covariances."""
-        weight, mean = attachment.split([len(self.node), 3], dim=1)
+        weight, mean = binding.split([len(self.node), 3], dim=1)
         turn = quaternion_of(weight @ rows_of(self.rotation, keys))
         arm = (mean - weight @ self.node).expand(len(turn), -1, -1)
         half = torch.linalg.cross(turn[..., 1:], arm)
