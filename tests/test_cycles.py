@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from closed_forms import unwrap_failure
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from sequences import changed, sequence_of
@@ -19,7 +20,7 @@ from gftorf_warp.data.write import write
 from gftorf_warp.errors import InputError, UsageError
 from gftorf_warp.scene.measured import distance_noise, key_times, sensor_of
 from gftorf_warp.scene.sensor import phasor_from_quads
-from gftorf_warp.scene.unwrap import unwrap, unwrap_failure
+from gftorf_warp.scene.unwrap import unwrap
 
 TURN = 2 * math.pi
 REAL = (math.pi, math.pi / 2, 0.0, 1.5 * math.pi)

@@ -65,7 +65,7 @@ def test_every_setting_of_a_scene_has_a_name_and_can_be_set_to_what_it_is(name):
         ("bodies.2.shape.size=1,0,1", "lengths must be above 0"),
         ("bodies.2.texture.low=0.9", "low <= high"),
         ("bodies.2.path=5", "single setting"),
-        ("colour=5", "made of parts"),
+        ("colour=5", "a text cannot express"),
         ("name=other", "no such setting"),
         ("sensor", "NAME=VALUE"),
     ],

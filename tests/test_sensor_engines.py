@@ -6,13 +6,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from closed_forms import cycle_distance
 
 from gftorf_warp.data.decode import closed_form_distance
 from gftorf_warp.data.write import write
 from gftorf_warp.errors import UsageError
 from gftorf_warp.scene.pattern import Pattern, phase_map
 from gftorf_warp.scene.sensor import Sensor, phasor_from_quads
-from gftorf_warp.scene.unwrap import common_range, cycle_distance
+from gftorf_warp.scene.unwrap import common_range
 from gftorf_warp.sim.assembly import Level
 from gftorf_warp.sim.ideal_sensor import ideal_recording
 from gftorf_warp.sim.paths import Still

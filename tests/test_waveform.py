@@ -6,9 +6,10 @@ import math
 import numpy as np
 import pytest
 import torch
+from closed_forms import wiggling
 
 from gftorf_warp.scene.sensor import Sensor, phasor_from_quads
-from gftorf_warp.scene.waveform import Waveform, contrast_ratios, contrasts, harmonics_of, peak, wiggling
+from gftorf_warp.scene.waveform import Waveform, contrast_ratios, contrasts, harmonics_of, peak
 from gftorf_warp.sim.readout import mean_quad
 
 SINE, SQUARE = Waveform.SINE, Waveform.SQUARE

@@ -15,18 +15,18 @@ from torch import Tensor
 from ..constants import GUARD
 from .distortion import Distortion, inside
 
-CHECKED = 33  # places per axis at which a lens is tried when a camera is made
+CHECKED = 33  # positions per axis at which the lens of a new camera is checked
 
 
 class Guard(NamedTuple):
-    """Up to where a projection is what it says [1], as slopes x/z and y/z of what is seen."""
+    """Limits of the projection, as x/z and y/z of a point [1]."""
 
     x: float
-    """Half the width of the view times 1.3: no derivative of the projection is taken farther out (method, 2.2)."""
+    """Half the width of the view times 1.3: derivatives are those at this limit beyond it (method, 2.2)."""
     y: float
-    """Likewise of its height."""
+    """Half its height times 1.3, likewise."""
     radius: float
-    """Beyond it a lens that distorts goes on as its tangent."""
+    """Radius beyond which a distortion is extrapolated by its tangent."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -48,7 +48,7 @@ class Camera:
     camera_from_world: np.ndarray = field(default_factory=lambda: np.eye(4))
     """Pose, 4x4 on column vectors, world to camera [m]."""
     distortion: Distortion = field(default_factory=Distortion)
-    """Of the lens; the default is a pinhole."""
+    """Distortion of the lens; the default is a pinhole."""
 
     def __post_init__(self):
         pose = np.asarray(self.camera_from_world, dtype=np.float64)
@@ -63,7 +63,7 @@ class Camera:
                 f"fx {self.fx}, fy {self.fy}"
             )
         object.__setattr__(self, "camera_from_world", pose)
-        _ = self.guard  # a lens that cannot be undone inside the image is none: ValueError
+        _ = self.guard  # raises ValueError if the lens cannot be inverted inside the image
 
     @classmethod
     def from_fov(cls, width: int, height: int, horizontal_fov_deg: float, **pose: Any) -> Camera:
@@ -79,7 +79,7 @@ class Camera:
 
     @functools.cached_property
     def guard(self) -> Guard:
-        """Where derivatives of the projection stop to change, and where the polynomial of a lens ends."""
+        """Limits of the derivatives of the projection, and of the polynomial of the lens."""
         if not self.distortion:
             return Guard(0.5 * GUARD * self.width / self.fx, 0.5 * GUARD * self.height / self.fy, math.inf)
         return _guard(self.distortion, self.width, self.height, self.fx, self.fy, self.cx, self.cy)
@@ -90,17 +90,16 @@ class Camera:
 
     def resized(self, width: int, height: int) -> Camera:
         """The same view at another resolution: intrinsics scale with the image."""
-        sx, sy = width / self.width, height / self.height
-        return replace(
-            self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy
-        )
+        x, y = width / self.width, height / self.height
+        scaled = {"fx": self.fx * x, "fy": self.fy * y, "cx": self.cx * x, "cy": self.cy * y}
+        return replace(self, width=width, height=height, **scaled)
 
     def row(self, number: int) -> Camera:
-        """What sees one row of the image, and nothing else."""
+        """The camera of one row of the image."""
         return replace(self, height=1, cy=self.cy - number)
 
     def area(self, point: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n"]:
-        """Area on the sensor over that of a pinhole's image [1], of something small at points in the world [m]."""
+        """Area magnification of the distortion [1] at points in the world [m]."""
         if not self.distortion:
             return torch.ones_like(point[..., 0])
         pose = torch.from_numpy(self.camera_from_world).to(point)
@@ -109,10 +108,10 @@ class Camera:
         return xx * yy - xy * xy
 
     def slopes(self, points: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n 2"]:
-        """x/z and y/z [1] of what is seen at image positions (x, y) [px], in their dtype; a lens is undone.
+        """x/z and y/z [1] of rays at image positions (x, y) [px], in their dtype, without distortion.
 
         Raises:
-            ValueError: If positions lie so far outside the image that the lens cannot be undone there.
+            ValueError: If a position is so far outside the image that the lens cannot be inverted there.
         """
         flat = (points - points.new_tensor([self.cx, self.cy])) / points.new_tensor([self.fx, self.fy])
         if not self.distortion:
@@ -122,10 +121,7 @@ class Camera:
         return torch.from_numpy(np.stack([x, y], axis=-1)).to(points).reshape(points.shape)
 
     def directions(self) -> Float[Tensor, "H W 3"]:
-        """Unit vectors through the pixel centres, in camera axes, float64; a lens is undone.
-
-        What a tracer may look rays up in; that of sub-samples is the table of the camera ``resized`` to their number.
-        """
+        """Unit vectors through the pixel centres, in camera axes, float64, without distortion."""
         x = (np.arange(self.width) + 0.5 - self.cx) / self.fx
         y = (np.arange(self.height)[:, None] + 0.5 - self.cy) / self.fy
         if self.distortion:
@@ -155,15 +151,15 @@ class Camera:
 
     @functools.cached_property
     def _sent(self) -> dict[tuple[torch.device, torch.dtype], tuple[Tensor, ...]]:
-        """Pose, focal lengths and principal point where ``project`` was asked: an upload makes a GPU wait."""
+        """Pose, focal lengths and principal point by device and dtype, uploaded once: an upload synchronises a GPU."""
         return {}
 
 
 @functools.lru_cache(maxsize=256)
 def _guard(lens: Distortion, width: int, height: int, fx: float, fy: float, cx: float, cy: float) -> Guard:
-    """That of a lens: of all poses of one camera."""
+    """Guard of a lens, for all poses of a camera."""
     x, y = np.linspace(0, width, CHECKED), np.linspace(0, height, CHECKED)[:, None]
     x, y = lens.undo((x - cx) / fx, (y - cy) / fy)
-    seen = float(np.hypot(x, y).max())
-    radius = lens.radius(seen, GUARD * seen)
+    corner = float(np.hypot(x, y).max())
+    radius = lens.radius(corner, GUARD * corner)
     return Guard(0.5 * GUARD * float(np.ptp(x)), 0.5 * GUARD * float(np.ptp(y)), radius)

@@ -1,6 +1,6 @@
-"""Single settings changed by name, as people type them: ``init.reflectivity=0.5``, ``bodies.1.path.velocity=3,0,0``.
+"""Changes of single settings by name: ``init.reflectivity=0.5``, ``bodies.1.path.velocity=3,0,0``.
 
-Whatever is a frozen dataclass can be changed: parts by dots, members of a tuple of parts by their number.
+They apply to frozen dataclasses: dots select fields of nested ones, numbers select members of tuples.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ Settings = TypeVar("Settings")
 
 @dataclass(frozen=True, kw_only=True)
 class Wording:
-    """What a typing error is told."""
+    """Texts of error messages, and which settings are special."""
 
     option: str
-    """The option that was typed."""
+    """The command-line option."""
     example: str
-    """A change that would be right."""
+    """A valid change."""
     where: str
-    """What names all settings, as a hint when none is near."""
+    """Where all settings are listed, named if no similar one exists."""
     fixed: tuple[str, ...] = ()
-    """Settings that have options of their own, or cannot be changed."""
+    """Settings with options of their own, and those that cannot be changed."""
     named: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    """By the name of a part: what it can be as a whole, by name."""
+    """By name of a setting: its named values."""
 
 
 def changed(settings: Settings, changes: Iterable[str], wording: Wording) -> Settings:
@@ -40,7 +40,7 @@ def changed(settings: Settings, changes: Iterable[str], wording: Wording) -> Set
     Args:
         settings: A frozen dataclass.
         changes: Texts ``name=value``; dots join the parts of a name, commas the values of a tuple, None is ``none``.
-        wording: For messages.
+        wording: Texts of error messages.
 
     Raises:
         UsageError: If a text has no value, a name is unknown, or a value is not of the kind of the setting.
@@ -55,27 +55,19 @@ def changed(settings: Settings, changes: Iterable[str], wording: Wording) -> Set
 
 def _with(settings: Any, path: list[str], value: str, name: str, wording: Wording) -> Any:
     head, *rest = path
-    if isinstance(settings, tuple):
-        members = {str(i): part for i, part in enumerate(settings)}
-        kinds: dict[str, Any] = dict.fromkeys(members)
-    else:
-        members = {f.name: getattr(settings, f.name) for f in fields(settings)}
-        kinds = typing.get_type_hints(type(settings))
+    members = _members(settings)
+    kinds = dict.fromkeys(members) if isinstance(settings, tuple) else typing.get_type_hints(type(settings))
     if head not in members or (head in wording.fixed and not rest):
         before = name.removesuffix(".".join(path))
         known = sorted(before + other for other in set(names(settings)) - set(wording.fixed))
-        close = difflib.get_close_matches(name, known, n=1, cutoff=0.4)
-        fix = f"did you mean {close[0]}?" if close else f"see {wording.where}"
+        fix = _suggestion(name, known) or f"see {wording.where}"
         raise _refused(name, "there is no such setting", fix, wording)
     present = members[head]
     if name in wording.named and not rest:
         whole = wording.named[name]
         if value in whole:
             return replace(settings, **{head: whole[value]})
-        close = difflib.get_close_matches(value, whole, n=1, cutoff=0.4)
-        fix = (
-            f"did you mean {close[0]}?" if close else f"take one of {', '.join(whole)}, or name a single setting of it"
-        )
+        fix = _suggestion(value, whole) or f"take one of {', '.join(whole)}, or name a single setting of it"
         raise _refused(f"{name}={value}", f"there is no {head} of that name", fix, wording)
     if _has_parts(present) == (not rest):
         inner = ", ".join(names(present)) if _has_parts(present) else "nothing"
@@ -90,20 +82,21 @@ def _with(settings: Any, path: list[str], value: str, name: str, wording: Wordin
 
 
 def names(settings: Any, prefix: str = "") -> list[str]:
-    """All settings, those of parts by dots."""
-    found = []
-    parts = enumerate(settings) if isinstance(settings, tuple) else _items(settings)
-    for name, value in parts:
-        found += names(value, f"{prefix}{name}.") if _has_parts(value) else [f"{prefix}{name}"]
-    return found
+    """Names of all settings, nested ones with dots."""
+    listed = []
+    for name, value in _members(settings).items():
+        listed += names(value, f"{prefix}{name}.") if _has_parts(value) else [f"{prefix}{name}"]
+    return listed
 
 
-def _items(settings: Any) -> list[tuple[str, Any]]:
-    return [(f.name, getattr(settings, f.name)) for f in fields(settings)]
+def _members(settings: Any) -> dict[str, Any]:
+    if isinstance(settings, tuple):
+        return {str(i): part for i, part in enumerate(settings)}
+    return {f.name: getattr(settings, f.name) for f in fields(settings)}
 
 
 def _has_parts(value: Any) -> bool:
-    """Whether a value has settings of its own: a dataclass, or a tuple of such."""
+    """Whether a value has nested settings: a dataclass, or a tuple of such."""
     return is_dataclass(value) or (isinstance(value, tuple) and bool(value) and all(map(is_dataclass, value)))
 
 
@@ -126,7 +119,7 @@ def _parsed(text: str, kind: Any, name: str, wording: Wording) -> Any:
             raise _refused(f"{name}={text}", "expected true or false", "choose one", wording)
         return text.lower() == "true"
     if is_dataclass(kind) or kind is None:
-        raise _refused(f"{name}={text}", "it is made of parts, which a text cannot say", "write it in Python", wording)
+        raise _refused(f"{name}={text}", "it has fields, which a text cannot express", "write it in Python", wording)
     try:
         value = kind(text)
         if value != value:
@@ -136,6 +129,11 @@ def _parsed(text: str, kind: Any, name: str, wording: Wording) -> Any:
         expected = ", ".join(kind) if isinstance(kind, enum.EnumMeta) else {"int": "a whole number"}.get(kind.__name__)
         why = f"expected {expected or 'a number'}"
         raise _refused(f"{name}={text}", why, "choose another value", wording) from None
+
+
+def _suggestion(name: str, known: Iterable[str]) -> str:
+    close = difflib.get_close_matches(name, list(known), n=1, cutoff=0.4)
+    return f"did you mean {close[0]}?" if close else ""
 
 
 def _refused(what: str, why: str, fix: str, wording: Wording) -> UsageError:

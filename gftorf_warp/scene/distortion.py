@@ -1,15 +1,15 @@
-"""Distortion of a lens, OpenCV's five coefficients, and its inverse.
+"""Distortion of a lens by OpenCV's five coefficients, and its inverse.
 
-With x = X/Z, y = Y/Z and r^2 = x^2 + y^2, a lens images what a pinhole would have at (x, y) at
+With x = X/Z, y = Y/Z and r^2 = x^2 + y^2, a lens images the point (x, y) of a pinhole image at
 
     x' = x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2)
     y' = y (1 + k1 r^2 + k2 r^4 + k3 r^6) + p1 (r^2 + 2 y^2) + 2 p2 x y
 
-Rays are looked up by the inverse, found by Newton's iteration. Raw frames are never resampled to undo a distortion:
+Rays are computed by the inverse, by Newton's iteration. Raw frames are never resampled to undo a distortion:
 interpolation mixes surfaces as motion does.
 
-A polynomial that was fitted inside an image may turn back outside of it, and would fold what nobody sees into it.
-Within a disc of radius R about the axis it does not, and what is outside is imaged as the tangent there goes on:
+A polynomial that was fitted inside an image may not be monotonic outside, and would fold invisible points into the
+image. Within a disc of radius R about the axis it does not fold; outside, it is extrapolated by the tangent:
 
     p = min(1, R / r) (x, y),   (x', y')  becomes  D(p) + J(p) ((x, y) - p)
 
@@ -29,12 +29,12 @@ from torch import Tensor
 Coordinate = TypeVar("Coordinate", np.ndarray, Tensor)
 STEPS_MAX = 30
 CONVERGED = 1e-12  # [1] of image coordinates, a billionth of a pixel
-ANGLES, RADII = 64, 512  # around the axis and away from it, where a lens is tried for folds
-SHRINK_MIN = 1e-3  # [1] area on the sensor per area of the pinhole's image; at 0 the lens folds the world over
+ANGLES, RADII = 64, 512  # numbers of angles and radii at which a lens is checked for folds
+SHRINK_MIN = 1e-3  # [1] least area magnification; at 0 the image folds
 
 
 def inside(x: Coordinate, y: Coordinate, radius: float) -> tuple[Coordinate, Coordinate]:
-    """The place (x, y) [1], or, of what is farther than ``radius`` [1] from the axis, the place there on its way."""
+    """The point (x, y) [1], clamped to ``radius`` [1] from the axis."""
     share = (radius**2 / (x * x + y * y).clip(radius**2)) ** 0.5
     return share * x, share * y
 
@@ -61,21 +61,17 @@ class Distortion:
 
     @classmethod
     def of(cls, coefficients: tuple[float, float, float, float, float] | None) -> Distortion:
-        """That of k1, k2, p1, p2, k3, OpenCV's order; None is a pinhole."""
-        return (
-            cls()
-            if coefficients is None
-            else cls(**dict(zip((f.name for f in fields(cls)), coefficients, strict=True)))
-        )
+        """From k1, k2, p1, p2, k3, OpenCV's order; None is a pinhole."""
+        return cls(**dict(zip((f.name for f in fields(cls)), coefficients or [0.0] * 5, strict=True)))
 
     def __bool__(self) -> bool:
-        """Whether there is any."""
+        """Whether any coefficient is not zero."""
         return any(astuple(self))
 
     def apply(self, x: Coordinate, y: Coordinate, radius: float = math.inf) -> tuple[Coordinate, Coordinate]:
-        """Where the lens images what a pinhole would have at (x, y) [1]; arrays or tensors of any shape.
+        """Image of the point (x, y) [1] of a pinhole image; arrays or tensors of any shape.
 
-        Beyond ``radius`` [1] from the axis the tangent goes on; without one, the polynomial.
+        Extrapolated by the tangent beyond ``radius`` [1] from the axis.
         """
         if math.isfinite(radius):
             near_x, near_y = inside(x, y, radius)
@@ -93,14 +89,14 @@ class Distortion:
     def undo(
         self, x: Float[np.ndarray, "..."], y: Float[np.ndarray, "..."], radius: float = math.inf
     ) -> tuple[Float[np.ndarray, "*n"], Float[np.ndarray, "*n"]]:
-        """Where a pinhole would have what the lens images at (x, y) [1], which are broadcast; ``radius`` as in apply.
+        """Inverse of :meth:`apply` at (x, y) [1], which are broadcast.
 
         Raises:
-            ValueError: If some place on the sensor sees nothing, or two things, through such a lens.
+            ValueError: If a position has no inverse, or two.
         """
         wanted = np.broadcast_arrays(np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64))
         u, v = (axis.copy() for axis in wanted)
-        with np.errstate(all="ignore"):  # what runs away is found below
+        with np.errstate(all="ignore"):  # divergence is detected below
             for _ in range(STEPS_MAX):
                 got = self.apply(u, v, radius)
                 dx, dy = wanted[0] - got[0], wanted[1] - got[1]
@@ -121,7 +117,7 @@ class Distortion:
         return u, v
 
     def _derivative(self, x, y, radius):
-        """All four derivatives of ``apply``; the tangent turns with the place where it begins."""
+        """All four derivatives of ``apply``; beyond ``radius`` they are not symmetric."""
         if not math.isfinite(radius):
             xx, xy, yy = self.slope(x, y)
             return xx, xy, xy, yy
@@ -135,7 +131,7 @@ class Distortion:
         return xx - to_x * sine, xy + to_x * cosine, xy - to_y * sine, yy + to_y * cosine
 
     def slope(self, x: Coordinate, y: Coordinate) -> tuple[Coordinate, Coordinate, Coordinate]:
-        """Derivatives [1] of what the lens images: d x'/dx, d x'/dy = d y'/dx, d y'/dy."""
+        """Derivatives [1] of the polynomial: d x'/dx, d x'/dy = d y'/dx, d y'/dy."""
         r2 = x * x + y * y
         radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
         bend = 2 * (self.k1 + r2 * (2 * self.k2 + 3 * self.k3 * r2))
@@ -145,27 +141,27 @@ class Distortion:
             radial + bend * y * y + 6 * self.p1 * y + 2 * self.p2 * x,
         )
 
-    def radius(self, seen: float, most: float) -> float:
-        """Radius R of a disc about the axis in which the lens does not fold [1]: ``most``, or as much as there is.
+    def radius(self, corner: float, most: float) -> float:
+        """Radius R of the disc about the axis in which the lens does not fold [1], at most ``most``.
 
         Raises:
-            ValueError: If it folds nearer than ``seen`` [1], somewhere around the axis.
+            ValueError: If it folds nearer to the axis than ``corner`` [1].
         """
         angle = np.linspace(0.0, 2.0 * math.pi, ANGLES, endpoint=False)
         part = np.linspace(0.0, most, RADII + 1)[1:, None]
         x, y = part * np.cos(angle), part * np.sin(angle)
         xx, xy, yy = self.slope(x, y)
         good = ((xx * yy - xy * xy > SHRINK_MIN) & (xx > 0)).all(axis=1)
-        found = most if good.all() else most * int(good.argmin()) / RADII
-        if found < seen:
+        radius = most if good.all() else most * int(good.argmin()) / RADII
+        if radius < corner:
             raise ValueError(
-                f"a lens with {self} folds the world over {found:.3g} focal lengths from the principal point, and the "
-                f"image reaches to {seen:.3g}"
+                f"a lens with {self} folds the image {radius:.3g} focal lengths from the principal point, and the "
+                f"image reaches to {corner:.3g}"
             )
-        return found
+        return radius
 
     def _unfolded(self, x, y, radius):
-        """Whether the lens images everything between the axis and (x, y) the right way round."""
+        """Whether the lens does not fold between the axis and (x, y)."""
         if math.isfinite(radius):
             x, y = inside(x, y, radius)
         good = np.ones(np.shape(x), dtype=bool)

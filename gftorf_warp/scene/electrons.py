@@ -1,12 +1,12 @@
-"""How many electrons a sensor counts, and how exactly it then knows a distance (sensor notes, 2.2 to 2.5).
+"""Electrons that a sensor counts, and the noise of phase and distance that follows (sensor notes, 2.2 to 2.5).
 
 A tap holds B + A cos(..) electrons and adds read noise of deviation s_r. With K equally spaced shifts
 
     sigma_psi = sqrt(2/K) sqrt(B + s_r^2) / A      one tap          sigma_d = c / (4 pi f) sigma_psi
               = sqrt(1/K) sqrt(B + s_r^2) / A      two taps
 
-whatever the phase, but for three shifts of one tap. An ADC of e electrons per code adds e^2/12 to the variance of a
-quad: of one tap, or half of it to each of two. Tensors give tensors, with gradients: sensors can be designed with them.
+for all phases, except with three shifts of one tap. An ADC of e electrons per code adds e^2/12 to the variance of a
+quad: to one tap, or half of it to each of two. Tensors give differentiable tensors, for the design of sensors.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from torch import Tensor
 from ..constants import SPEED_OF_LIGHT
 from .sensor import Scalar, Sensor
 
-REFERENCE_EXPOSURE_S = 2.34e-3  # the exposure that electrons_per_unit refers to
+REFERENCE_EXPOSURE_S = 2.34e-3  # of electrons_per_unit
 
 
 def electron_gain(sensor: Sensor) -> float:
@@ -49,7 +49,7 @@ def phase_noise(
     Args:
         mean: Mean electrons B of a tap [e-]; number or tensor.
         amplitude: Amplitude A of the electrons of a tap [e-]; likewise.
-        read: Standard deviation of what is added to a tap's count [e-].
+        read: Standard deviation of the read noise of a tap [e-].
         samples: Number K of equally spaced shifts.
         taps: 1, or 2 whose difference is taken.
         phase: True phase [rad]; only K = 3 with one tap depends on it. None: the mean over all phases.

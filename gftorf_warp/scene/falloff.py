@@ -1,4 +1,4 @@
-"""A measured map of how a lens darkens towards its edge: a picture or an array of any size."""
+"""Read a measured map of the fall-off of a lens: an image or an array of any size."""
 
 from __future__ import annotations
 
@@ -14,12 +14,10 @@ SUFFIXES = (".npy", ".exr", ".png")
 
 
 def read_falloff(path: Path) -> Float[np.ndarray, "h w"]:
-    """The map in a file, over its largest value: above 0, and 1 where the lens lets most light through.
-
-    A PNG is taken as linear, an OpenEXR file must have one channel.
+    """The map in a file, above 0 and normalised to a maximum of 1. PNG files are linear, EXR files have one channel.
 
     Raises:
-        InputError: If there is no such file, it cannot be read, or it is no image of numbers above 0.
+        InputError: If the file cannot be read, or it is no image of numbers above 0.
     """
     if path.suffix.lower() not in SUFFIXES:
         raise _wrong(path, f"expected one of {', '.join(SUFFIXES)}, found {path.suffix!r}")
@@ -35,7 +33,7 @@ def read_falloff(path: Path) -> Float[np.ndarray, "h w"]:
 
 
 def resized(image: Float[np.ndarray, "h w"], height: int, width: int) -> Float[np.ndarray, "H W"]:
-    """The map at the pixels of an image: means of what they cover, or, of a coarser map, linear in between."""
+    """The map at the pixels of an image: means over pixels, or linear interpolation of a coarser map."""
     import cv2
 
     if image.shape == (height, width):

@@ -1,11 +1,11 @@
-"""What decoded quartets of a moving camera agree on: points that stay where they are, and points that do not.
+"""Consistency of the decoded quartets of a moving camera: which points are static, and which are not.
 
-A point that one quartet sees is judged by the others, its witnesses. A witness that has it in view *supports* it if it
-decodes the same distance in that direction, and *sees through* it if everything around there is farther. If it decodes
-something nearer, the point is hidden, and it says nothing. Static is what is hardly ever seen through; what many see
-through was there for a while only, so it moves, or it never was: two surfaces mix in a pixel at an outline.
+Each point of a quartet is compared with other quartets, its witnesses. A witness *supports* a point in its view if it
+decodes the same distance in that direction, and *sees through* it if everything around there is farther; if it decodes
+a smaller distance, the point is occluded and the witness does not count. Points that are rarely seen through are
+static. The others move, or are mixtures of two surfaces in a pixel at an outline.
 
-What moves by less than its own width is seen through along its outline only, and the rest of it counts as static. Only
+A body that moves by less than its width is seen through along its outline only; the rest of it counts as static. Only
 measured quads and poses are read.
 """
 
@@ -26,66 +26,66 @@ from .measured import DISTANCE_TRUSTED, camera_of, decoded_phasors, distance_noi
 from .tracks import unproject
 from .unwrap import distance_from_phasors
 
-WITNESSES = 32  # quartets that judge a point, spread evenly: more cost time and see little else
-SEEN_THROUGH = 0.3  # share of the witnesses with a say beyond which a point is not static
-CHUNK = 1 << 20  # points times witnesses judged at once: some ten megabytes per intermediate
+WITNESSES = 32  # quartets that a point is compared with, spread evenly: more cost time and add little
+SEEN_THROUGH = 0.3  # share of the witnesses that count beyond which a point is not static
+CHUNK = 1 << 20  # points times witnesses at once: some ten megabytes per intermediate
 CLOSE = 0.02  # [m] z-depth below which nothing is projected
-COVERS = 0.75  # a point stands for what is so near [spacings]: half a diagonal is 0.71, and less adds mixed outlines
+COVERS = 0.75  # radius that a point covers [spacings]: half a diagonal is 0.71, and less adds mixed outlines
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Views:
-    """The complete quartets of a sequence, each decoded as if taken at once from where the camera was in its middle."""
+    """The complete quartets of a sequence, each decoded as if taken at once with the pose in its middle."""
 
     quartets: list[int]
     """Their numbers."""
     times: list[float]
-    """When each was taken [s]."""
+    """Time of each [s]."""
     cameras: list[Camera]
-    """From where: the pose of the second of its raw frames."""
+    """Camera of each: that of the second of its raw frames."""
     distance: Float[Tensor, "J H W"]
-    """[m], in [0, c/2f); in pixels too dark to tell, that of their neighbours."""
+    """Distance in [0, c/2f) [m]; in pixels too dark to decode, that of their neighbours."""
     amplitude: Float[Tensor, "J H W"]
-    """In quad units."""
+    """Amplitude [quad units]."""
     margin: Float[Tensor, "J H W"]
-    """Distances that differ by no more are the same [m]."""
+    """Largest difference between equal distances [m]."""
     unambiguous_range: float
-    """[m]."""
+    """Unambiguous range [m]."""
 
     def points(self, view: int) -> Float[Tensor, "H W 3"]:
-        """What the pixels of a view see, in the world [m]."""
+        """Points in the world that the pixels of a view decode [m]."""
         camera = self.cameras[view]
         return torch.tensor(camera.centre, dtype=torch.float32) + self.distance[view, ..., None] * camera.rays()
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Verdict:
-    """What the witnesses say about the pixels of one view."""
+    """Counts and means over the witnesses, for the pixels of one view."""
 
     supports: Int[Tensor, "H W"]
-    """How many see something at this place."""
+    """Number of witnesses that support the point."""
     through: Int[Tensor, "H W"]
-    """How many see something behind it only."""
+    """Number of witnesses that see through it."""
     distance: Float[Tensor, "H W"]
-    """Mean over the view and those that support it [m]."""
+    """Mean distance over the view and its supporting witnesses [m]."""
     reflectivity: Float[Tensor, "H W"]
-    """Amplitude times distance squared, likewise [m^2 in quad units]."""
+    """Mean amplitude times distance squared, likewise [m^2 in quad units]."""
 
     @property
     def moving(self) -> Bool[Tensor, "H W"]:
-        """Seen through too often to be static."""
+        """Whether a point is seen through too often to be static."""
         return self.through > SEEN_THROUGH * (self.supports + self.through)
 
 
 def views_of(sequence: Sequence, nearer: float) -> Views:
     """Decode every complete quartet of a sequence.
 
-    The noise is the median difference between what neighbouring quartets decode in the same direction: it is right as
-    long as most of the scene rests.
+    The noise is estimated by the median difference of neighbouring quartets in the same direction, which is right as
+    long as most of the scene is static.
 
     Args:
         sequence: Raw frames with poses; at least one quartet is complete.
-        nearer: The least difference of distances that means something, besides noise [m].
+        nearer: The least significant difference of distances, besides noise [m].
     """
     sensor = sensor_of(sequence)
     quartets = sequence.complete_quartets
@@ -110,21 +110,21 @@ def views_of(sequence: Sequence, nearer: float) -> Views:
 
 
 def _noise(views: Views, phase_slope: float, gain: float) -> float:
-    """Standard deviation of the noise of one quad, from distances that neighbouring views see in the same direction."""
-    found = []
+    """Standard deviation of the noise of one quad, from distances of neighbouring views in the same direction."""
+    differences = [torch.zeros(0)]
     for view in range(len(views.quartets) - 1):
-        seen = _seen(views, views.points(view).flatten(0, 1), [view + 1])
-        apart = _wrapped(seen.decoded - seen.expected, views.unambiguous_range)[0]
-        weak = torch.minimum(views.amplitude[view].flatten(), seen.amplitude[0])
-        found.append((apart.abs() * weak)[seen.inside[0]])
-    values = torch.cat(found) if found else torch.zeros(0)
+        other = _projected(views, views.points(view).flatten(0, 1), [view + 1])
+        apart = _wrapped(other.decoded - other.expected, views.unambiguous_range)[0]
+        weak = torch.minimum(views.amplitude[view].flatten(), other.amplitude[0])
+        differences.append((apart.abs() * weak)[other.inside[0]])
+    values = torch.cat(differences)
     one = gain / 2.0**0.5  # both views are noisy; for four quads this is 1
     return one * 1.4826 * phase_slope * float(values.median()) if len(values) else 0.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Seen:
-    """Points in the images of some views."""
+class _Projected:
+    """Points projected into some views."""
 
     inside: Bool[Tensor, "J P"]
     pixel: Int[Tensor, "J P"]
@@ -134,8 +134,8 @@ class _Seen:
     margin: Float[Tensor, "J P"]
 
 
-def _seen(views: Views, points: Float[Tensor, "P 3"], of: list[int]) -> _Seen:
-    """Where points are in the images of the views ``of``, how far away they are, and what is decoded there."""
+def _projected(views: Views, points: Float[Tensor, "P 3"], of: list[int]) -> _Projected:
+    """Pixels and distances of points in the views ``of``, and what these decode there."""
     camera = views.cameras[0]
     poses = torch.tensor(np.stack([views.cameras[j].camera_from_world for j in of]), dtype=torch.float32)
     x, y, z = (torch.matmul(poses[:, :3, :3], points.T) + poses[:, :3, 3:]).unbind(dim=1)
@@ -150,7 +150,7 @@ def _seen(views: Views, points: Float[Tensor, "P 3"], of: list[int]) -> _Seen:
     pixel = torch.where(inside, row * camera.width + column, 0.0).long()
     images = (views.distance, views.amplitude, views.margin)
     decoded, amplitude, margin = (image[of].flatten(1).gather(1, pixel) for image in images)
-    return _Seen(
+    return _Projected(
         inside=inside,
         pixel=pixel,
         expected=(x.square() + y.square() + z.square()).sqrt(),
@@ -167,7 +167,7 @@ def _wrapped(difference: Tensor, unambiguous_range: float) -> Tensor:
 
 
 def verdicts(views: Views) -> Iterator[Verdict]:
-    """What the witnesses say about each view, in order."""
+    """The comparison of each view with its witnesses, in order."""
     count = len(views.quartets)
     spread = np.unique(np.linspace(0, count - 1, min(count, WITNESSES)).round().astype(int)).tolist()
     nearest = -torch.nn.functional.max_pool2d(-views.distance[:, None], 3, stride=1, padding=1)[:, 0]
@@ -178,17 +178,17 @@ def verdicts(views: Views) -> Iterator[Verdict]:
 
 def _verdict(views: Views, view: int, witnesses: list[int], nearest: Float[Tensor, "J H W"]) -> Verdict:
     size = views.distance.shape[1:]
-    margins, own = views.margin[view].flatten(), views.distance[view].flatten()
-    reflectivity = views.amplitude[view].flatten() * own.square()
+    margins, near = views.margin[view].flatten(), views.distance[view].flatten()
+    reflectivity = views.amplitude[view].flatten() * near.square()
     parts = []
     step = max(CHUNK // max(len(witnesses), 1), 1)
     points = views.points(view).flatten(0, 1)
     for start in range(0, len(points), step):
         rows = slice(start, start + step)
-        supports = through = torch.zeros(len(own[rows]), dtype=torch.long)
-        apart = bright = torch.zeros(len(own[rows]))
+        supports = through = torch.zeros(len(near[rows]), dtype=torch.long)
+        apart = bright = torch.zeros(len(near[rows]))
         if witnesses:
-            seen = _seen(views, points[rows], witnesses)
+            seen = _projected(views, points[rows], witnesses)
             margin = torch.maximum(seen.margin, margins[rows])
             difference = _wrapped(seen.decoded - seen.expected, views.unambiguous_range)
             supporting = seen.inside & (difference.abs() <= margin)
@@ -197,7 +197,7 @@ def _verdict(views: Views, view: int, witnesses: list[int], nearest: Float[Tenso
             apart = torch.where(supporting, difference, 0.0).sum(dim=0)
             bright = torch.where(supporting, seen.amplitude * seen.decoded.square(), 0.0).sum(dim=0)
         share = 1.0 / (1.0 + supports)
-        parts.append((supports, through, own[rows] + share * apart, share * (reflectivity[rows] + bright)))
+        parts.append((supports, through, near[rows] + share * apart, share * (reflectivity[rows] + bright)))
     supports, through, distance, reflectivity = (torch.cat(part).view(size) for part in zip(*parts, strict=True))
     return Verdict(supports=supports, through=through, distance=distance, reflectivity=reflectivity)
 
@@ -207,21 +207,21 @@ class Layer:
     """Points that become Gaussians."""
 
     mean: Float[Tensor, "P 3"]
-    """Where they are in the world [m]."""
+    """Positions in the world [m]."""
     distance: Float[Tensor, "P"]
-    """From the camera of the view that they were taken from [m]."""
+    """Distance from the camera of the view that each is from [m]."""
     amplitude: Float[Tensor, "P"]
-    """There, in quad units."""
+    """Amplitude in that view [quad units]."""
 
 
 def static_layer(views: Views, judged: list[Verdict], grid: Float[Tensor, "P 2"], spacing: float) -> Layer:
-    """Points about ``spacing`` pixels apart on everything static that any view sees, each place once.
+    """Points about ``spacing`` pixels apart on all static surfaces of all views, each surface once.
 
-    The views come in turn, the middle one first, and each adds the points of its grid that no point so far explains.
+    In turn, beginning with the middle one, each view adds the points of its grid that no earlier point covers.
 
     Args:
         views: Decoded quartets.
-        judged: What is known about each of them.
+        judged: One verdict per view.
         grid: Image positions (x, y) [px].
         spacing: Distance between them [px].
     """
@@ -231,7 +231,7 @@ def static_layer(views: Views, judged: list[Verdict], grid: Float[Tensor, "P 2"]
         verdict = judged[view]
         alone = verdict.supports + verdict.through == 0
         there = torch.where(alone, ~outlying(views.distance[view], views.margin[view]), verdict.supports > 0)
-        wanted = (there & ~verdict.moving & ~_explained(views, view, layer, spacing))[row, column]
+        wanted = (there & ~verdict.moving & ~_covered(views, view, layer, spacing))[row, column]
         distance = verdict.distance[row, column][wanted]
         amplitude = verdict.reflectivity[row, column][wanted] / distance.square().clamp_min(1e-12)
         mean = unproject(views.cameras[view], grid[wanted], distance)
@@ -244,7 +244,7 @@ def static_layer(views: Views, judged: list[Verdict], grid: Float[Tensor, "P 2"]
 
 
 def _outwards(count: int) -> list[int]:
-    """The middle of ``count`` views, both ends, then the middles of what lies between: early ones look elsewhere."""
+    """The middle of ``count`` views, both ends, then the middles in between, so that early ones differ most."""
     order = [count // 2, 0, count - 1]
     gaps = [(0, count // 2), (count // 2, count - 1)]
     for start, end in gaps:  # grows
@@ -255,21 +255,21 @@ def _outwards(count: int) -> list[int]:
     return list(dict.fromkeys(order))
 
 
-def _explained(views: Views, view: int, layer: Layer, spacing: float) -> Bool[Tensor, "H W"]:
-    """Which pixels of a view see a place that a point of the layer stands for, as large as the point is from here."""
+def _covered(views: Views, view: int, layer: Layer, spacing: float) -> Bool[Tensor, "H W"]:
+    """Pixels of a view that see a surface covered by a point of the layer, at its size in this view."""
     height, width = views.distance.shape[1:]
-    explained = torch.zeros(height, width)
+    covered = torch.zeros(height, width)
     if not len(layer.mean):
-        return explained.bool()
-    seen = _seen(views, layer.mean, [view])
+        return covered.bool()
+    seen = _projected(views, layer.mean, [view])
     here = seen.inside[0] & (_wrapped(seen.decoded - seen.expected, views.unambiguous_range).abs() <= seen.margin)[0]
     radius = (COVERS * spacing * layer.distance / seen.expected[0]).round().long().clamp(0, min(height, width) // 4)
     for size in radius[here].unique().tolist():
         marks = torch.zeros(height * width)
         marks[seen.pixel[0][here & (radius == size)]] = 1.0
         pooled = torch.nn.functional.max_pool2d(marks.view(1, height, width), 2 * size + 1, stride=1, padding=size)
-        explained = torch.maximum(explained, pooled[0])
-    return explained.bool()
+        covered = torch.maximum(covered, pooled[0])
+    return covered.bool()
 
 
 def outlying(distance: Float[Tensor, "H W"], margin: Float[Tensor, "H W"]) -> Bool[Tensor, "H W"]:

@@ -19,7 +19,7 @@ from torch import Tensor
 from ..data.sequence import Sequence
 from ..errors import InputError
 from .camera import CHECKED, Camera
-from .clouds import cloud_of, follow_clouds, moving_layer, reference, windows
+from .clouds import cloud_of, follow_clouds, moving_layer, reference
 from .fusion import static_layer, verdicts, views_of
 from .gaussians import GaussianField, concatenated, constant_sh
 from .measured import (
@@ -124,7 +124,7 @@ def _from_views(sequence: Sequence, settings: InitSettings) -> Start:
     judged = list(verdicts(views))
     size = (sequence.width, sequence.height)
     still = static_layer(views, judged, _grid(*size, settings.static_spacing).flatten(0, 1), settings.static_spacing)
-    clouds = [cloud_of(views, view, verdict) for view, verdict in enumerate(judged)]
+    clouds = [cloud_of(v.moving, *image) for v, *image in zip(judged, views.distance, views.margin, strict=True)]
     view = reference(clouds)
     grid = _grid(*size, settings.moving_spacing)
     near, objects = moving_layer(views, view, clouds[view], grid, settings.fellows)
@@ -242,10 +242,8 @@ def _nearer(
             there = points + flow.nan_to_num(0.0)
             near &= _in_front(sequence, quartet + step, there, change, far, settings)[0]
     near, distance, amplitude, noise = (value.view(size) for value in (near, distance, amplitude, noise))
-    near &= windows(near.float()).mean(dim=0) > 0.5
-    median = windows(torch.where(near, distance, torch.nan)).nanmedian(dim=0).values
-    distance = torch.where((distance - median).abs() > settings.nearer + 4.0 * noise, median, distance)
-    return grid[near], distance[near], amplitude[near]
+    cloud = cloud_of(near, distance, settings.nearer + 4.0 * noise)
+    return grid[cloud.mask], cloud.distance[cloud.mask], amplitude[cloud.mask]
 
 
 def _in_front(

@@ -1,8 +1,8 @@
-"""Fixed patterns: what differs from pixel to pixel and stays from raw frame to raw frame (sensor notes, 2.4 and 3).
+"""Fixed patterns: differences between pixels that are the same in all raw frames (sensor notes, 2.4 and 3).
 
     psi += p(u, v)        light times 1 + N(0, gain)        dark current times 1 + N(0, dark)
 
-They are drawn from a seed that belongs to the sensor, not to a recording: its recordings share one pattern.
+They are drawn from a seed of the sensor, not of a recording: all recordings of a sensor share one pattern.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from functools import lru_cache
 import numpy as np
 from jaxtyping import Float
 
-CODE = 2.0 * math.pi / 4096  # [rad] the unit of the calibration file that the phase pattern is shaped like
-PHASE, GAIN, DARK = range(3)  # tell the random numbers of the three maps from each other
+CODE = 2.0 * math.pi / 4096  # [rad] unit of the calibration file that the phase pattern imitates
+PHASE, GAIN, DARK = range(3)  # parts of the seeds of the three maps
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,7 +29,7 @@ class Pattern:
     dark: float = 0.0
     """Standard deviation of the dark current, DSNU [1]; 0.2 is usual, an assumption."""
     seed: int = 0
-    """Of the maps: which specimen of the sensor it is."""
+    """Seed of the maps: the specimen of the sensor."""
 
     def __post_init__(self):
         for name in ("phase", "gain", "dark"):
@@ -42,7 +42,7 @@ class Pattern:
 
 @lru_cache(maxsize=8)
 def phase_map(pattern: Pattern, height: int, width: int) -> Float[np.ndarray, "H W"] | None:
-    """What each pixel adds to the phase [rad]; None: nothing.
+    """Phase offset of each pixel [rad]; None: 0 everywhere.
 
     A quadratic bowl over the image, in which x and y run over half its width, and noise of pixels, columns and rows.
     """
@@ -54,7 +54,7 @@ def phase_map(pattern: Pattern, height: int, width: int) -> Float[np.ndarray, "H
     bowl = -15.6 - 110.1 * y - 27.9 * y**2 + 40.5 * x + 30.7 * x * y - 154.8 * x**2
     random = np.random.default_rng((pattern.seed, PHASE))
     noise = random.normal(0.0, 8.9, (height, width)) + random.normal(0.0, 3.6, width)
-    return _kept(pattern.phase * CODE * (bowl + noise + random.normal(0.0, 1.4, (height, 1))))
+    return _constant(pattern.phase * CODE * (bowl + noise + random.normal(0.0, 1.4, (height, 1))))
 
 
 @lru_cache(maxsize=8)
@@ -72,10 +72,10 @@ def dark_map(pattern: Pattern, height: int, width: int) -> Float[np.ndarray, "H 
 def _spread(deviation: float, seed: tuple[int, int], shape: tuple[int, int]) -> np.ndarray | None:
     if deviation == 0.0:
         return None
-    return _kept(np.maximum(1.0 + np.random.default_rng(seed).normal(0.0, deviation, shape), 0.0))
+    return _constant(np.maximum(1.0 + np.random.default_rng(seed).normal(0.0, deviation, shape), 0.0))
 
 
-def _kept(values: np.ndarray) -> np.ndarray:
-    """An array that nobody can change: all raw frames share it."""
+def _constant(values: np.ndarray) -> np.ndarray:
+    """A read-only array, shared by all raw frames."""
     values.setflags(write=False)
     return values

@@ -1,7 +1,7 @@
-"""Points followed through a sequence: sideways by optical flow, along the ray by measured phase.
+"""Tracks of points through a sequence: across the image by optical flow, along the ray by measured phase.
 
-The result starts the keys of a motion model. Steps of single points are noisy, so every step is the median over the
-nearest fellows of a point, which is right wherever neighbours on one object move alike.
+They initialise the keys of a motion model. Steps of single points are noisy, so each step is the median over the
+nearest neighbours of a point, which is right wherever neighbours belong to one object.
 """
 
 from __future__ import annotations
@@ -18,22 +18,20 @@ from .measured import camera_of, decode_along_flow, flow_at, key_times
 def follow(
     sequence: Sequence, quartet: int, points: Float[Tensor, "P 2"], distance: Float[Tensor, "P"], *, fellows: int
 ) -> Float[Tensor, "T P 3"]:
-    """Positions in the world [m] of points at every key time.
-
-    Beyond the quartets that flow and measurements reach, points go on as in the last known step.
+    """Positions in the world [m] of points at every key time, extrapolated beyond the known quartets.
 
     Args:
         sequence: Raw frames and optical flow of a camera at rest; without flow the points stay.
-        quartet: Where the points are given; all of its raw frames are measured.
+        quartet: A quartet of which all raw frames are measured.
         points: Image positions (x, y) at its start [px].
-        distance: Distances decoded there [m].
-        fellows: How many nearest points share a step.
+        distance: Decoded distances of these points [m].
+        fellows: Number of nearest points that share a step.
     """
     times = key_times(sequence)
     if not len(points):
         return torch.zeros(len(times), 0, 3)
     camera = camera_of(sequence, sequence.cycle * quartet)
-    group = _nearest(unproject(camera, points, distance), fellows)
+    group = nearest(unproject(camera, points, distance), fellows)
     places, distances = {quartet: points}, {quartet: distance}
     complete = set(sequence.complete_quartets)
     last = (sequence.frames - 1) // sequence.cycle
@@ -49,7 +47,8 @@ def follow(
                 decoded, _ = decode_along_flow(sequence, i, here, *along)
                 far = far + _shared((decoded - far)[:, None], group)[:, 0]
                 distances[i] = far
-    place, far = (_at({float(times[i]): value for i, value in known.items()}, times) for known in (places, distances))
+    known = ({float(times[i]): value for i, value in each.items()} for each in (places, distances))
+    place, far = (interpolated(each, times, outer=2) for each in known)
     return unproject(camera, place, far)
 
 
@@ -64,27 +63,28 @@ def unproject(camera: Camera, points: Float[Tensor, "*n 2"], distance: Float[Ten
     return (ray / ray.norm(dim=-1, keepdim=True) * distance[..., None] - pose[:3, 3]) @ pose[:3, :3]
 
 
-def _nearest(points: Float[Tensor, "P 3"], count: int) -> Int[Tensor, "P G"]:
+def nearest(points: Float[Tensor, "P 3"], count: int) -> Int[Tensor, "P G"]:
     """Indices of the nearest points of each point, itself included."""
     return torch.cdist(points, points).topk(min(count, len(points)), dim=1, largest=False).indices
 
 
 def _shared(step: Float[Tensor, "P D"], group: Int[Tensor, "P G"]) -> Float[Tensor, "P D"]:
-    """Median over the fellows; unknown (NaN) steps do not vote, and a group without a vote rests."""
+    """Median over each group without unknown (NaN) steps; 0 for a group without any known."""
     return step[group].nanmedian(dim=1).values.nan_to_num(0.0)
 
 
-def _at(known: dict[float, Tensor], times: Float[Tensor, "T"]) -> Tensor:
-    """Values at ``times``, linear in between; beyond the known ones with the mean slope of the two outer intervals."""
+def interpolated(known: dict[float, Tensor], times: Float[Tensor, "T"], *, outer: int) -> Tensor:
+    """Values at ``times`` [s], linear between known ones; beyond them, with the mean slope of ``outer`` intervals."""
     at = sorted(known)
-    if len(at) == 1:
+    last = len(at) - 1
+    if not last:
         return known[at[0]].expand(len(times), *known[at[0]].shape)
     values = []
     for time in times.tolist():
         if time < at[0]:
-            start, end, anchor = at[0], at[min(2, len(at) - 1)], at[0]
+            start, end, anchor = at[0], at[min(outer, last)], at[0]
         elif time > at[-1]:
-            start, end, anchor = at[max(len(at) - 3, 0)], at[-1], at[-1]
+            start, end, anchor = at[max(last - outer, 0)], at[-1], at[-1]
         else:
             after = next(n for n in range(1, len(at)) if at[n] >= time)
             start, end, anchor = at[after - 1], at[after], at[after - 1]

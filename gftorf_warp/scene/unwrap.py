@@ -1,6 +1,6 @@
-"""Unwrapping of several modulation frequencies in torch: the candidates are chosen as data/unwrap.py chooses them.
+"""Unwrapping of several modulation frequencies in torch, with the choice of candidates of data/unwrap.py.
 
-What is chosen has no gradient; the distance is that of the first phase, and differentiable by it.
+The choice has no gradient; the distance is that of the first phase, and differentiable with respect to it.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from ..data import unwrap as numbers
-from .sensor import Sensor, phasor_from_quads
+from .sensor import Sensor, distance_from_phasor
 
 
 def unwrap(phases: Sequence[Tensor], ms: Sequence[int]) -> Tensor:
@@ -21,7 +21,7 @@ def unwrap(phases: Sequence[Tensor], ms: Sequence[int]) -> Tensor:
 
     Args:
         phases: One of any shape for each frequency [rad], wrapped or not; the result is as exact as the first, and
-            differentiable by it. The others decide between the candidates only.
+            differentiable with respect to it. The others only select among the candidates.
         ms: Their multiples: positive, without a common divisor.
 
     Raises:
@@ -37,39 +37,18 @@ def unwrap(phases: Sequence[Tensor], ms: Sequence[int]) -> Tensor:
     return torch.where(base >= turn, torch.zeros_like(base), base)  # a remainder can round up to a whole turn
 
 
-def unwrap_failure(sigma: float, m1: int, m2: int) -> float:
-    """Probability that :func:`unwrap` of two phases takes a wrong candidate, noise ``sigma`` [rad] on both."""
-    return math.erfc(math.pi / (sigma * math.sqrt(2.0 * (m1**2 + m2**2))))
-
-
 def frequencies_of(sensor: Sensor) -> tuple[float, ...]:
     """All modulation frequencies of a sensor [Hz], in the order of its cycle."""
     return (float(sensor.f_mod_hz), *sensor.further_hz)
 
 
 def common_range(sensor: Sensor) -> float:
-    """Range [m] that all frequencies of a sensor know together: c / 2 f_0, or c / 2f of a single one.
+    """Unambiguous range [m] of all frequencies of a sensor together: c / 2 f_0, or c / 2f of a single one.
 
     Raises:
         ValueError: If they are no small multiples of one frequency.
     """
     return numbers.common_range(frequencies_of(sensor)) if sensor.further_hz else sensor.unambiguous_range
-
-
-def cycle_distance(quads: Tensor, sensor: Sensor) -> Tensor:
-    """Distance [m] in [0, c / 2 f_0) of one cycle, as the sensor would decode it: each frequency, then all.
-
-    Args:
-        quads: The raw frames [cycle, ...] in the order of ``sensor.cycle``.
-        sensor: Its shifts, frequencies and phase offset, which is the same at all frequencies.
-
-    Raises:
-        ValueError: If the number of raw frames is another, shifts determine no phase, or frequencies do not fit.
-    """
-    if len(quads) != len(sensor.cycle):
-        raise ValueError(f"quads {tuple(quads.shape)} must start with {len(sensor.cycle)}, the raw frames of a cycle")
-    sets = quads.reshape(-1, len(sensor.shifts), *quads.shape[1:])
-    return distance_from_phasors([phasor_from_quads(one, sensor.shifts) for one in sets], sensor)
 
 
 def distance_from_phasors(phasors: Sequence[tuple[Tensor, Tensor]], sensor: Sensor) -> Tensor:
@@ -83,10 +62,8 @@ def distance_from_phasors(phasors: Sequence[tuple[Tensor, Tensor]], sensor: Sens
     frequencies = frequencies_of(sensor)
     if len(phasors) != len(frequencies):
         raise ValueError(f"{len(phasors)} phasors for {len(frequencies)} frequencies")
-    turn = 2.0 * math.pi
-    phases = [torch.remainder(torch.atan2(im, re) - sensor.phase_offset, turn) for re, im in phasors]
-    if len(phases) == 1:
-        wrapped = torch.where(phases[0] >= turn, torch.zeros_like(phases[0]), phases[0])
-        return wrapped / sensor.phase_slope
+    if len(phasors) == 1:
+        return distance_from_phasor(*phasors[0], sensor)
+    phases = [torch.remainder(torch.atan2(im, re) - sensor.phase_offset, 2.0 * math.pi) for re, im in phasors]
     ms, _ = numbers.multiples(frequencies)
     return unwrap(phases, ms) * ms[0] / sensor.phase_slope

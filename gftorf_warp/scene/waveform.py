@@ -1,10 +1,10 @@
-"""Waves that are no sines: their harmonics, what a sensor correlates of them, and the error that remains of it.
+"""Waveforms of modulation: their harmonics, and the contrast of each in the correlation of a sensor.
 
 Light is emitted as 1 + sum_h s_h cos(h w t), a tap opens as (1 + sum_h m_h cos(h (w t - shift))) / 2, and a quad has
 
     sum_h C_h cos(h (psi - shift)),   C_h = s_h m_h / 2
 
-(sensor notes, 2.3). Decoding takes that for a sine: the phase errs by an amount that depends on the phase, *wiggling*.
+(sensor notes, 2.3). Decoding assumes a sine, so harmonics cause a phase-dependent phase error, *wiggling*.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float
 
 
 class Waveform(enum.StrEnum):
@@ -55,7 +54,7 @@ def contrasts(emission: Waveform, demodulation: Waveform, count: int, duty: floa
 def contrast_ratios(emission: Waveform, demodulation: Waveform, count: int, duty: float = 0.5) -> tuple[float, ...]:
     """C_h / C_1 for h = 2 .. ``count`` [1], as :class:`Sensor` takes them; arguments as in :func:`contrasts`.
 
-    Rounding of what is exactly 0, the even harmonics of a square wave, is removed, so that nobody renders them.
+    Rounding errors of contrasts that are exactly 0, those of even harmonics of a square wave, are set to 0.
     """
     first, *others = contrasts(emission, demodulation, count, duty)
     return tuple(0.0 if abs(other) < 1e-12 else other / first for other in others)
@@ -65,23 +64,3 @@ def peak(ratios: Sequence[float]) -> float:
     """Largest magnitude of cos x + sum_h r_h cos(h x) over a period [1]; ``ratios`` start at h = 2."""
     x = np.linspace(0.0, 2.0 * math.pi, 256 * (len(ratios) + 1))  # 256 points in the shortest period
     return float(np.abs(sum(r * np.cos(h * x) for h, r in enumerate((1.0, *ratios), start=1))).max())
-
-
-def wiggling(phase: Float[np.ndarray, "*n"], ratios: Sequence[float], samples: int) -> Float[np.ndarray, "*n"]:
-    """Decoded minus true phase [rad] of ``samples`` equally spaced shifts, to first order in C_h / C_1.
-
-    A harmonic is seen as the fundamental if it is a neighbour of a multiple of the number of shifts, and not at all
-    otherwise (sensor notes, 2.6).
-
-    Args:
-        phase: True phase [rad].
-        ratios: C_h / C_1 for h = 2, 3, ... [1].
-        samples: Number of shifts K.
-    """
-    error = np.zeros(np.shape(phase))
-    for h, ratio in enumerate(ratios, start=2):
-        if (h - 1) % samples == 0:
-            error = error + ratio * np.sin((h - 1) * np.asarray(phase))
-        if (h + 1) % samples == 0:
-            error = error - ratio * np.sin((h + 1) * np.asarray(phase))
-    return error

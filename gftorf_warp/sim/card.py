@@ -39,11 +39,7 @@ def settings_card(own: Scene, settings: SimSettings) -> str:
         "shifts in time order": ", ".join(f"{math.degrees(shift):.0f}" for shift in sensor.shifts) + " deg",
         "raw frames": f"{1 / sensor.frame_period_s:.6g} per second, "
         + (_together(len(sensor.cycle)) if used.sync else "each at its own time"),
-        **(
-            {"phasors": "one per quartet, with time, pose and truth of its first raw frame"}
-            if used.format == "torf"
-            else {}
-        ),
+        **({"phasors": PHASORS} if used.format == "torf" else {}),
         **({} if settings.level is None else {"ladder": f"level {settings.level}: {adds_of(settings.level)}"}),
         **_camera_rows(scene, used),
         "exposure": f"{1e3 * sensor.exposure_s:g} ms, "
