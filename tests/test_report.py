@@ -246,7 +246,7 @@ def test_along_the_run_is_drawn_from_its_rows(compared):
     titles = [set(drawn_texts(figures.along_run(given))) for given in (rows, blind)]
     assert titles[0] - titles[1] >= {"Error of d", "Error of d_ToF"}
     for both in titles:
-        assert {"On static pixels", "Light let through", "Depth distortion", "Gaussians"} <= both
+        assert {"On static pixels", "Transmittance", "Depth distortion", "Gaussians"} <= both
     assert figures.along_run([]) is None
     bare = Page(report(title="bare", metrics=metrics, config=run.config, log=[], found=found))
     assert "Along the run" not in bare.texts

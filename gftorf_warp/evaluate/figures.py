@@ -20,7 +20,7 @@ SQUARED = "m\N{SUPERSCRIPT TWO} \N{MULTIPLICATION SIGN} 100"
 DASHED, DOTTED = "5 3", "1.5 2"
 GROUPS = {"": ("all pixels", ""), "moving.": ("moving pixels", DASHED), "static.": ("static pixels", DOTTED)}
 SINGLE = {  # title and unit of a plot of one curve: key of the rows of diagnostics
-    ("Light let through", "mean of 1 \N{MINUS SIGN} opacity"): "transmittance",
+    ("Transmittance", "mean of 1 \N{MINUS SIGN} opacity"): "transmittance",
     ("Depth distortion", "m\N{SUPERSCRIPT TWO}"): "distortion",
     ("Gaussians", "number N"): "gaussians",
 }

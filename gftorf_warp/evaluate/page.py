@@ -1,4 +1,4 @@
-"""The parts of an offline page: nothing in it runs, and nothing is loaded from elsewhere."""
+"""Parts of an offline HTML page without scripts and external resources."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from jaxtyping import Float, UInt8
 from . import pictures
 
 POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
-PICTURE_SIZE_MAX = 320  # [px] longer sides are thinned out, so that a page of thirty pictures stays below 4 MB
+PICTURE_SIZE_MAX = 320  # [px] larger pictures are subsampled, so that a page of thirty pictures stays below 4 MB
 STYLE = """
 :root { color-scheme: light dark; --ink: #1c2430; --soft: #5b6676; --line: #d9dee6; --page: #f4f6f9; --card: #ffffff;
   --ours: #0072b2; --naive: #d55e00; --mark: #e8f1f8; }
@@ -62,7 +62,7 @@ code { font-size: 13px; overflow-wrap: anywhere; }
 @media (max-width: 700px) { .row { grid-template-columns: repeat(2, minmax(0, 1fr)); } }
 """
 
-FORMATS: dict[str, Callable[[Any], str]] = {  # how a value of metrics.json is printed, by name
+FORMATS: dict[str, Callable[[Any], str]] = {  # formats of values of metrics.json
     "error": lambda value: f"{value:.3f}",  # [m^2 x 100]
     "rms_cm": lambda value: f"{10.0 * math.sqrt(value):.1f} cm",  # root of a mean squared error given in m^2 x 100
     "length_cm": lambda value: f"{100.0 * value:.2f} cm",  # of a length given in m
@@ -75,7 +75,7 @@ FORMATS: dict[str, Callable[[Any], str]] = {  # how a value of metrics.json is p
 
 
 def escape(text: object) -> str:
-    """Text that shows itself, whatever it holds."""
+    """Text with HTML's special characters escaped."""
     return html.escape(str(text), quote=True)
 
 
@@ -88,14 +88,14 @@ def look_up(metrics: Mapping[str, Any], key: str) -> Any:
 
 
 def number(metrics: Mapping[str, Any], key: str, form: str) -> str:
-    """A value of metrics.json, marked with where it is from, so that a test can compare each printed number."""
+    """A value of metrics.json, marked with its key, so that a test can compare each printed number."""
     value = look_up(metrics, key)
     text = "not known" if value is None else FORMATS[form](value)
     return f'<span data-key="{escape(key)}" data-form="{escape(form)}">{escape(text)}</span>'
 
 
 def ratio(metrics: Mapping[str, Any], above: str, below: str) -> str:
-    """One value of metrics.json over another, likewise marked; both must be known and above zero."""
+    """The ratio of two values of metrics.json, marked with their keys; both must be above zero."""
     value = look_up(metrics, above) / look_up(metrics, below)
     return f'<span data-above="{escape(above)}" data-below="{escape(below)}">{value:.1f}</span>'
 
@@ -135,13 +135,13 @@ def row(figures: list[str], columns: int | None = None) -> str:
 
 
 def chart(svg: bytes, title: str) -> str:
-    """A drawing on white; embedded as an image, since an SVG header names addresses."""
+    """An SVG drawing on white, embedded as an image."""
     source = pictures.data_uri(svg, "image/svg+xml")
     return f'<div class="chart"><img src="{source}" alt="{escape(title)}"></div>'
 
 
 def thinned(image: np.ndarray) -> np.ndarray:
-    """The image at most 320 pixels long, by leaving out rows and columns."""
+    """The image subsampled to at most 320 pixels."""
     return pictures.thinned(image, PICTURE_SIZE_MAX)
 
 

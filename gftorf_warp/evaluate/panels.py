@@ -1,4 +1,4 @@
-"""The pictures of a report: which frames and pixels to look at, and what is shown on one common scale."""
+"""The pictures of a report: the chosen frames and pixels, on common scales."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ ANIMATION_PERIOD_S = 0.25  # [s] slow enough to compare panels
 CLOSE_UP_MIN = 24  # [px] smallest side of a close-up
 CLOSE_UP_MARGIN = 0.25  # around the moving pixels, as a fraction of their extent
 CLOSE_UP_SHARE_MAX = 0.6  # a larger close-up would repeat the whole picture
-PHASOR_TEXT = "The camera delivered real and imaginary part, taken here as one instant."
+PHASOR_TEXT = "The camera delivered real and imaginary part, taken as simultaneous."
 QUARTET_TEXT = (
-    "Each raw frame shows another instant: what moves has moved on from the first to the last. The closed form takes "
-    "them for one instant, hence the false distances along moving outlines."
+    "Each raw frame has its own time, during which objects move. The closed form takes the frames as simultaneous, "
+    "hence the false distances along moving outlines."
 )
 TITLES = {"closed_form": "closed form", "d": "ours, d", "d_tof": "ours, d_ToF"}
 
@@ -46,23 +46,23 @@ class Judgement:
     moving: Bool[np.ndarray, "S H W"]
     """Pixels that move within their quartet."""
     static: Bool[np.ndarray, "S H W"]
-    """Pixels that rest."""
+    """Pixels that do not."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Findings:
-    """What a comparison found, in arrays; a report draws it and computes nothing new."""
+    """The arrays of a comparison, from which a report is drawn."""
 
     sequence: Sequence
-    """What was measured."""
+    """The measurement."""
     views: Views
-    """What was rendered and decoded."""
+    """Rendered and decoded images."""
     judgement: Judgement | None
-    """What ground truth says about it; None without."""
+    """Truth and errors; None without ground truth."""
     colour: Colour | None = None
-    """Colour images beside what the run shows in their place; None if one of both has no colour."""
+    """Measured and rendered colour; None if one of both has no colour."""
     novel: Novel | None = None
-    """Views from poses that no raw frame has; None if the sequence names none."""
+    """Novel views; None if the sequence has none."""
 
     @functools.cached_property
     def distance_scale(self) -> pictures.Scale:
@@ -72,9 +72,9 @@ class Findings:
 
 
 def telling_row(found: Findings) -> int:
-    """The row of the frame to show: in the middle half, the one where most pixels move.
+    """The row of the frame to show: in the middle half, the one with most moving pixels.
 
-    Without ground truth, a pixel's change between quads of one shift stands for its motion.
+    Without ground truth, motion is estimated by the change between quads of one shift.
     """
     count = len(found.views.frames)
     middle = range(count // 4, max(count // 4 + 1, -(-3 * count // 4)))
@@ -88,7 +88,7 @@ def telling_row(found: Findings) -> int:
 
 
 def measured_quartet(found: Findings, s: int) -> str:
-    """The quads of the quartet, one after the other, or the phasor; and what they decode to."""
+    """The quads of the quartet, or the phasor, and the decoded images."""
     sequence, frame = found.sequence, found.views.frames[s]
     quartet = frame // sequence.cycle
     re, im = quartet_phasor(sequence, quartet)
@@ -122,7 +122,7 @@ def measured_quartet(found: Findings, s: int) -> str:
 
 
 def _by_frequency(found: Findings, s: int) -> list[str]:
-    """What each of several frequencies decodes to by itself, and how far they agree; nothing of one."""
+    """Distances decoded from each of several frequencies alone, and their agreement."""
     views = found.views
     if views.single is None or views.confidence is None:
         return []
@@ -136,14 +136,14 @@ def _by_frequency(found: Findings, s: int) -> list[str]:
 
 
 def distances(found: Findings, s: int, window: Window = WHOLE) -> str:
-    """Closed form, ours and truth on one scale."""
+    """Closed form, ours and truth, on one scale."""
     scale = found.distance_scale
     return page.row([page.picture(image[window], scale, title) for title, image in _distances(found, s).items()])
 
 
 def error_maps(judged: Judgement, s: int, window: Window = WHOLE) -> str:
-    """Absolute errors on one scale, under the distances that they belong to; under the truth, what moves."""
-    scale = pictures.error_scale([_errors_that_matter(judged, s)])
+    """Absolute errors on one scale, in the order of :func:`distances`; under the truth, moving pixels."""
+    scale = pictures.error_scale([_scale_errors(judged, s)])
     figures = [
         page.picture(np.sqrt(judged.errors[name][s][window]), scale, f"error of {title}")
         for name, title in TITLES.items()
@@ -153,7 +153,7 @@ def error_maps(judged: Judgement, s: int, window: Window = WHOLE) -> str:
 
 
 def close_up(found: Findings, judged: Judgement, s: int) -> str:
-    """The surroundings of the moving pixels, enlarged: distances and errors; empty if that is most of the image."""
+    """Distances and errors around the moving pixels; empty if that is most of the image."""
     moving = judged.moving[s]
     if not moving.any():
         return ""
@@ -164,7 +164,7 @@ def close_up(found: Findings, judged: Judgement, s: int) -> str:
 
 
 def quad_residual(found: Findings, s: int) -> str:
-    """The quad of the frame as measured, as rendered, and what is left."""
+    """The quad of the frame: measured, rendered and the residual."""
     measured, rendered = found.views.quad_measured[s], found.views.quad_rendered[s]
     scale = pictures.signed_scale([measured])
     residual, left = measured - rendered, 1.0 - found.views.opacity[s]
@@ -172,7 +172,7 @@ def quad_residual(found: Findings, s: int) -> str:
         page.picture(measured, scale, "measured quad", f"raw frame {found.views.frames[s]}"),
         page.picture(rendered, scale, "rendered quad", "same time and shift"),
         page.picture(residual, pictures.signed_scale([residual]), "measured minus rendered", "its own scale"),
-        page.picture(left, _share_scale(max(0.01, float(left.max()))), "light let through", "1 \N{MINUS SIGN} opacity"),
+        page.picture(left, _share_scale(max(0.01, float(left.max()))), "transmittance", "1 \N{MINUS SIGN} opacity"),
     ]
     return page.row(figures)
 
@@ -197,7 +197,7 @@ def strip_over_time(found: Findings) -> str:
 
 
 def animation(found: Findings) -> str:
-    """Quartet starts one after the other: measured quad, rendered quad, closed form, ours."""
+    """The first frames of all quartets: measured quad, rendered quad, closed form, ours."""
     starts = [s for s, n in enumerate(found.views.frames) if n % found.sequence.cycle == 0]
     starts = starts[:: -(-len(starts) // ANIMATION_FRAMES_MAX)]
     if len(starts) < 2:
@@ -227,14 +227,14 @@ def animation(found: Findings) -> str:
 
 
 def _distances(found: Findings, s: int) -> dict[str, np.ndarray]:
-    """Images [m] by title: closed form, ours, and truth if it is known."""
+    """Images [m] by title: closed form, ours, and truth if known."""
     views, judged = found.views, found.judgement
     images = {TITLES["closed_form"]: views.closed_form[s], TITLES["d"]: views.d[s], TITLES["d_tof"]: views.d_tof[s]}
     return images if judged is None else images | {"truth": judged.truth[s]}
 
 
-def _errors_that_matter(judged: Judgement, s: int) -> np.ndarray:
-    """Absolute errors [m] of the closed form, on moving pixels if there are any: they set the scale for all."""
+def _scale_errors(judged: Judgement, s: int) -> np.ndarray:
+    """Absolute errors [m] of the closed form, on moving pixels if there are any, which define the scale."""
     error = np.sqrt(judged.errors["closed_form"][s])
     return error[judged.moving[s]] if judged.moving[s].any() else error
 
@@ -244,7 +244,7 @@ def _share_scale(high: float) -> pictures.Scale:
 
 
 def _change(sequence: Sequence, n: int) -> float:
-    """Mean change [quad units] to the quads of the same shift one quartet earlier and later."""
+    """Largest mean change [quad units] to the quads of the same shift one quartet earlier and later."""
     near = [m for m in (n - sequence.cycle, n + sequence.cycle) if 0 <= m < sequence.frames]
     changes = [float(np.abs(sequence.quads[m] - sequence.quads[n]).mean()) for m in near if sequence.measured[m]]
     return max(changes, default=0.0)

@@ -1,4 +1,4 @@
-"""Arrays to coloured pictures: one scale and one colour map for pictures that are to be compared."""
+"""Coloured pictures of arrays, with one scale and one colour map for pictures to be compared."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, UInt8
 
-UNKNOWN_GREY = 128  # colour of pixels without a value: none of the colour maps below contains this grey
+UNKNOWN_GREY = 128  # pixels without a value; no colour map contains this grey
 WHITE = 255  # between pictures in a row
 WEBP_LOSSLESS = 101  # OpenCV: a WebP quality above 100 means lossless
-TICKS = 254  # colours of a map: with grey and white they are as many as a byte can name
+TICKS = 254  # colours of a map; with grey and white, 256
 BLUE_TO_RED = (  # RdBu of ColorBrewer, reversed
     (5, 48, 97), (33, 102, 172), (67, 147, 195), (146, 197, 222), (209, 229, 240), (247, 247, 247),
     (253, 219, 199), (244, 165, 130), (214, 96, 77), (178, 24, 43), (103, 0, 31),
 )  # fmt: skip
-UNKNOWN, GAP = TICKS, TICKS + 1  # what a byte calls these two
+UNKNOWN, GAP = TICKS, TICKS + 1  # indices of these two
 
 
 @dataclass(frozen=True, kw_only=True)
 class Scale:
-    """What the colours of a picture mean."""
+    """Maps values to colours."""
 
     low: float
     """Value of the first colour."""
@@ -40,18 +40,18 @@ class Scale:
 
 
 def distance_scale(images: Iterable[Float[np.ndarray, "*n"]]) -> Scale:
-    """A scale [m] that holds all but the extreme hundredths of some distances."""
+    """A scale [m] between the percentiles 0.5 and 99.5 of distances."""
     low, high = _range(images, 0.5, 99.5)
     return Scale(low=low, high=max(high, low + 1e-3), colours="viridis", unit="m")
 
 
 def error_scale(images: Iterable[Float[np.ndarray, "*n"]]) -> Scale:
-    """A scale [m] from 0 to nearly the largest of some errors, at least a millimetre."""
+    """A scale [m] from 0 to percentile 98 of errors, at least a millimetre."""
     return Scale(low=0.0, high=max(_range(images, 0.0, 98.0)[1], 1e-3), colours="magma", unit="m")
 
 
 def amplitude_scale(images: Iterable[Float[np.ndarray, "*n"]]) -> Scale:
-    """A scale [quad units] from 0 to nearly the largest of some amplitudes."""
+    """A scale [quad units] from 0 to percentile 99.5 of amplitudes."""
     high = _range(images, 0.0, 99.5)[1]
     return Scale(low=0.0, high=high if high > 0 else 1.0, colours="gray", unit="quad units")
 
@@ -69,22 +69,22 @@ def phase_scale() -> Scale:
 
 
 def colour_mapped(image: Float[np.ndarray, "H W"], scale: Scale) -> UInt8[np.ndarray, "H W 3"]:
-    """RGB of an image on a scale; values beyond its ends take the end's colour, NaN is grey."""
+    """RGB of an image; values beyond the scale are clamped, NaN is grey."""
     return palette(scale)[ticks(image, scale)]
 
 
 def ticks(image: Float[np.ndarray, "H W"], scale: Scale) -> UInt8[np.ndarray, "H W"]:
-    """Which colour of :func:`palette` each pixel of an image has on a scale."""
+    """Indices into :func:`palette` of the pixels of an image."""
     level = image - scale.low
     level *= TICKS / (scale.high - scale.low)
     np.clip(level, 0, TICKS - 1, out=level)
-    if np.isnan(level.min()):  # in one of them: it is asked before a mask is made
+    if np.isnan(level.min()):  # a reduction is cheaper than a mask
         level[np.isnan(level)] = UNKNOWN
     return level.astype(np.uint8)
 
 
 def palette(scale: Scale) -> UInt8[np.ndarray, "C 3"]:
-    """RGB of all that :func:`ticks` names, and white."""
+    """RGB of all colours of :func:`ticks`, and white."""
     return _palette(scale.colours)
 
 
@@ -94,7 +94,7 @@ def side_by_side(pictures: list[UInt8[np.ndarray, "H w 3"]], gap: int = 2) -> UI
 
 
 def ticks_side_by_side(images: list[UInt8[np.ndarray, "H w"]], gap: int = 2) -> UInt8[np.ndarray, "H W"]:
-    """The same of pictures that are given by :func:`ticks`, on scales of one palette."""
+    """:func:`side_by_side` of indices by :func:`ticks` into one palette."""
     return _row(images, gap, GAP)
 
 
@@ -105,7 +105,7 @@ def _row(pictures: list[np.ndarray], gap: int, white: int) -> np.ndarray:
 
 
 def thinned(image: np.ndarray, size_max: int) -> np.ndarray:
-    """Every k-th row and column, with the smallest k for sides of at most ``size_max``: no value is invented."""
+    """Every k-th row and column, with the smallest k for sides of at most ``size_max``; no interpolation."""
     step = -(-max(image.shape[:2]) // size_max)
     return image[::step, ::step]
 
@@ -134,7 +134,7 @@ def animated_webp(pictures: list[UInt8[np.ndarray, "H W 3"]], period_s: float, q
 
 
 def data_uri(data: bytes, kind: str) -> str:
-    """A file as an address that holds it, for example of kind ``image/webp``."""
+    """A data URI of a file, for example of kind ``image/webp``."""
     return f"data:{kind};base64,{base64.b64encode(data).decode('ascii')}"
 
 

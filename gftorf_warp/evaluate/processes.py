@@ -1,8 +1,8 @@
-"""Pictures on disk by other processes, to which images go through shared memory.
+"""Pictures written by other processes, which receive images through shared memory.
 
-OpenEXR holds Python's lock while it writes, so the threads of one process keep no more than two CPUs busy. These
-processes are started and not forked, and load what writes: neither torch nor Warp, and nothing of CUDA. The memory has
-no name, and each of them ends when its connection does, so nothing is left, however this process ends.
+OpenEXR holds the GIL while it writes, so threads use no more than two CPUs. The processes are started, not forked, and
+import neither torch nor Warp. The shared memory is anonymous and a process ends with its connection, so nothing is left
+when this process is killed.
 """
 
 from __future__ import annotations
@@ -24,23 +24,23 @@ from ..errors import ResourceError
 from .pictures import Scale
 from .previews import Channels, write_images
 
-MANY = 300  # images from which on it pays: processes start in half a second of a CPU each
-CPUS = 4  # with no more of them threads write nearly as fast
-MOST = 16  # processes: they take images as fast as one process gives them away
-BLOCK = 4  # images of a message, unless
-BLOCK_BYTES = 1 << 23  # they would take more
-HELD = 2  # messages for each process: one that is written and one that comes next
-SURROUNDINGS = {  # variables of their environment
-    "OMP_NUM_THREADS": "1",  # or NumPy starts a thread for each CPU
-    "MALLOC_MMAP_THRESHOLD_": str(1 << 25),  # or glibc gives the memory of each image back,
-    "MALLOC_TRIM_THRESHOLD_": str(1 << 28),  # and new pages for the next take a third of the time
+MANY = 300  # fewest images for processes: each needs half a second of a CPU to start
+CPUS = 4  # up to these, threads write nearly as fast
+MOST = 16  # processes, which write as fast as one process copies images to them
+BLOCK = 4  # images of a message, at most
+BLOCK_BYTES = 1 << 23  # of a message, at most
+HELD = 2  # messages of each process: one being written and the next
+ENVIRONMENT = {
+    "OMP_NUM_THREADS": "1",  # else NumPy starts a thread for each CPU
+    "MALLOC_MMAP_THRESHOLD_": str(1 << 25),  # else glibc returns the memory of each image to the system,
+    "MALLOC_TRIM_THRESHOLD_": str(1 << 28),  # and new pages take a third of the time
 }
 NOTHING: Float[np.ndarray, "M B C H W"] = np.empty((0, 0, 0, 0, 0), np.float32)
-START = 4096  # [bytes] where images begin in the memory; its first byte says whether to stop
+START = 4096  # [bytes] offset of the images in shared memory; the first byte is the stop flag
 
 
 def useful(total: int) -> int:
-    """How many processes pay for so many images on this machine; 0: threads do as well."""
+    """Number of processes for ``total`` images on this machine; 0: use threads."""
     if total < MANY or not hasattr(os, "memfd_create"):
         return 0
     cpus = len(os.sched_getaffinity(0))
@@ -49,15 +49,15 @@ def useful(total: int) -> int:
 
 @contextmanager
 def writing(out: Path, scales: Mapping[str, Scale], count: int, done: Callable[[int], None]) -> Iterator[Writing]:
-    """Some processes that write what they are given; at a normal end they have written it all.
+    """Processes that write images; all are written at the end of the block, unless it raises.
 
-    At any other each completes the picture that it writes, and drops what waits.
+    After an exception each process completes its current picture and drops the rest.
 
     Args:
-        out: Folder with a folder for each thing, which ``many_files`` looks after.
-        scales: Of the previews of each thing.
-        count: How many processes.
-        done: Called with how many more images are written.
+        out: Folder with a folder for each kind of image, inside ``many_files``.
+        scales: Scale of the previews of each kind.
+        count: Number of processes.
+        done: Called with the number of further images written.
 
     Raises:
         UsageError, ResourceError: If a file cannot be written, or a process was stopped.
@@ -72,37 +72,39 @@ def writing(out: Path, scales: Mapping[str, Scale], count: int, done: Callable[[
 
 
 class Writing:
-    """Processes at work, and the memory [M, B, C, H, W] of all messages between here and there."""
+    """Writing processes and the shared memory [M, B, C, H, W] of all messages."""
 
     def __init__(self, out: Path, scales: Mapping[str, Scale], done: Callable[[int], None]):
-        """Take note; nothing is started yet."""
+        """Create the shared memory, empty; no process is started."""
         self._out, self._scales, self._done = out, scales, done
         self._file = os.memfd_create("gftorf-pictures")
         self._processes: dict[Connection, subprocess.Popen] = {}
-        self._busy: dict[Connection, dict[int, int]] = {}  # images of each message under way
+        self._busy: dict[Connection, dict[int, int]] = {}  # number of images of each message in flight
         self._images = NOTHING
-        self._first, self._filled = 0, 0  # what lies in the message that is being filled
-        self._free: list[int] = []  # messages; the last one is being filled
+        self._first, self._filled = 0, 0  # index of the first image and number of images of the current message
+        self._free: list[int] = []  # free messages; the last one is the current one
 
     def start(self, count: int) -> None:
-        """Start some processes, which do not wait for the first image to load what they need."""
+        """Start processes, which import their modules at once."""
         code = f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import work; work()"
-        here = os.environ | SURROUNDINGS
+        environment = os.environ | ENVIRONMENT
         for _ in range(count):
             ours, theirs = Pipe()
             with theirs:
                 files = theirs.fileno(), self._file
                 command = [sys.executable, "-c", code, *map(str, files)]
-                # groups of their own: Ctrl-C is for this process, which lets them complete what they write
-                process = subprocess.Popen(command, env=here, pass_fds=files, stdin=subprocess.DEVNULL, process_group=0)
+                # own process groups: Ctrl-C reaches this process only, which lets them complete their picture
+                process = subprocess.Popen(
+                    command, env=environment, pass_fds=files, stdin=subprocess.DEVNULL, process_group=0
+                )
             self._processes[ours], self._busy[ours] = process, {}
 
     def write(self, index: int, images: Mapping[str, Channels]) -> None:
-        """Have the index-th image written; its memory may be used again when this returns."""
+        """Copy the index-th image to a message; the last image of a message sends it."""
         if not self._images.size:
             self._begin(images)
         if not self._filled:
-            self._hear(len(self._free) == 0)
+            self._receive(wait_for_one=not self._free)
             self._first = index
         planes = self._images[self._free[-1], self._filled]
         channels = (channel for thing in images.values() for channel in thing.values())
@@ -117,16 +119,16 @@ class Writing:
         if self._filled:
             self._send()
         while any(self._busy.values()):
-            self._hear(True)
+            self._receive(wait_for_one=True)
 
     def stop(self) -> None:
-        """Let each process complete the picture that it writes, and end."""
+        """Let each process complete its current picture and end."""
         os.pwrite(self._file, b"\1", 0)
         for connection in self._processes:
             connection.close()
         for process in self._processes.values():
             process.wait()
-        self._images = NOTHING  # an error that is looked at later holds no memory
+        self._images = NOTHING  # a traceback must not hold the memory
         os.close(self._file)
 
     def _begin(self, images: Mapping[str, Channels]) -> None:
@@ -139,38 +141,38 @@ class Writing:
         self._images = _mapped(self._file, shape)
         self._free = list(range(shape[0]))
         for connection in self._processes:
-            self._tell(connection, (self._out, self._scales, names, shape))
+            self._post(connection, (self._out, self._scales, names, shape))
 
     def _send(self) -> None:
         connection = min(self._busy, key=lambda one: len(self._busy[one]))
         message = self._free.pop()
         self._busy[connection][message] = self._filled
-        self._tell(connection, (message, self._first, self._filled))
+        self._post(connection, (message, self._first, self._filled))
         self._filled = 0
 
-    def _tell(self, connection: Connection, what: object) -> None:
+    def _post(self, connection: Connection, what: object) -> None:
         try:
             connection.send(what)
         except OSError as error:
             raise self._ended(connection) from error
 
-    def _hear(self, patiently: bool) -> None:
-        """What processes have said, and if there is reason to wait, until one has said something."""
-        ready = wait([one for one, busy in self._busy.items() if busy], None if patiently else 0)
+    def _receive(self, *, wait_for_one: bool) -> None:
+        """Handle replies of the processes, waiting for at least one if asked to."""
+        ready = wait([one for one, busy in self._busy.items() if busy], None if wait_for_one else 0)
         for connection in [one for one in self._busy if one in ready]:
             try:
-                said = connection.recv()
+                reply = connection.recv()
             except (EOFError, OSError) as error:
                 raise self._ended(connection) from error
-            if isinstance(said, BaseException):
-                raise said
-            self._free.append(said)
-            self._done(self._busy[connection].pop(said))
+            if isinstance(reply, BaseException):
+                raise reply
+            self._free.append(reply)
+            self._done(self._busy[connection].pop(reply))
 
     def _ended(self, connection: Connection) -> ResourceError:
         connection.close()
         code = self._processes[connection].wait()
-        why = f"signal {-code} stopped it" if code < 0 else f"it ended with {code}"
+        why = f"signal {-code} stopped it" if code < 0 else f"its exit code is {code}"
         return ResourceError(
             "a process that writes pictures ended", where=self._out, why=why, fix="free memory, then render again"
         )
@@ -183,7 +185,7 @@ def _mapped(file: int, shape: tuple[int, ...]) -> Float[np.ndarray, "M B C H W"]
 
 
 def work() -> None:
-    """What a process does: write the images of each message, then say so, until nobody listens."""
+    """Main function of a process: write the images of each message and acknowledge it, until the connection closes."""
     connection, file = Connection(int(sys.argv[1])), int(sys.argv[2])
     with suppress(EOFError, BrokenPipeError, ConnectionResetError):
         out, scales, names, shape = connection.recv()

@@ -1,4 +1,4 @@
-"""One offline page: what was found, in pictures and numbers, how it was made, and how to read it. Renders nothing."""
+"""The offline page of a comparison: results in pictures and numbers, how they were made, and how to read them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from ..data.decode import unambiguous_range
 from ..data.truth import MOVING_M
 from . import figures, gallery, page, panels, provenance
-from .metrics import DISTANCES, per_frame_mean
+from .metrics import DISTANCES, ERROR_UNIT, per_frame_mean
 from .panels import Findings
 
 ROWS = {
@@ -25,31 +25,31 @@ TO_READ = f"""
 <dl>
 <dt>distance</dt><dd>Length from the camera to the surface along the ray of a pixel, in metres. It is not the
 z-depth.</dd>
-<dt>closed form</dt><dd>What a camera computes by itself: raw quads give a phase, the phase a distance; where there
-are several modulation frequencies, their phases together say how many whole turns to add. The quads are taken one after
-the other, so whatever moved in between gets a distance that nothing in the scene has.</dd>
+<dt>closed form</dt><dd>The distance that a camera computes: raw quads give a phase, the phase a distance; several
+modulation frequencies together determine the number of whole turns. Quads are taken one after the other, so moving
+objects get false distances.</dd>
 <dt>d</dt><dd>Mean distance of the reconstructed Gaussians at the time of one raw frame. It is not divided by
-opacity: where Gaussians let light through, the missing part counts as error.</dd>
-<dt>d_ToF</dt><dd>Quads rendered at the time of one raw frame and decoded as the closed form. Like it, it lies within
-the unambiguous range: c / 2f, or that of all frequencies together.</dd>
-<dt>moving pixels</dt><dd>Pixels whose true distance changes by more than {MOVING_M} m within the raw frames of their
-quartet: mostly the outline of what moves, and the object itself if it moves fast in depth.</dd>
+opacity: where opacity is below one, the missing part counts as error.</dd>
+<dt>d_ToF</dt><dd>Quads rendered at the time of one raw frame, decoded like the closed form, within the unambiguous
+range: c / 2f, or that of all frequencies together.</dd>
+<dt>moving pixels</dt><dd>Pixels whose true distance changes by more than {MOVING_M} m within their quartet: mostly
+outlines of moving objects, and whole objects that move fast in depth.</dd>
 <dt>errors</dt><dd>Mean squared error in square metres times 100, then its root in centimetres. <em>All pixels</em> is
 the mean over frames of each frame's mean; <em>moving</em> and <em>static</em> pool the pixels of all frames. The closed
-form of a raw frame is the one image of its quartet, against the truth of that frame.</dd>
-<dt>quad PSNR</dt><dd>How well rendered quads match the measured ones, in the slot that each frame measured. It needs no
-ground truth, and noise in the measurement bounds it.</dd>
-<dt>grey pixels</dt><dd>Unknown: nothing is scored there.</dd>
+form of a quartet is compared with the truth of each of its raw frames.</dd>
+<dt>quad PSNR</dt><dd>Rendered against measured quads, at the phase shift of each raw frame. It needs no ground truth
+and is bounded by the noise of the measurement.</dd>
+<dt>grey pixels</dt><dd>Unknown truth, not scored.</dd>
 </dl>"""
 
 
 PHASORS_TO_READ = f"""
-<p class="soft">This camera delivered phasors. The four raw frames of a quartet are one image of one instant, so each
-quartet is scored once, and pixels move if their true distance changes by more than {MOVING_M} m from one phasor to the
-next.</p>"""
+<p class="soft">This camera delivered phasors. The four raw frames of a quartet are simultaneous, so each quartet is
+scored once, and moving pixels are those whose true distance changes by more than {MOVING_M} m between consecutive
+phasors.</p>"""
 ALONG_TEXT = (
-    "Rendered before black at a few fixed raw frames, at the size of the optimisation, which learnt nothing of it. "
-    "Where d and d_ToF part on pixels that rest, light is explained by layers instead of surfaces"
+    "Rendered over black at a few fixed raw frames, at the size of the optimisation, which does not use these numbers. "
+    "Where d and d_ToF differ on static pixels, light is explained by layers instead of surfaces"
 )
 
 
@@ -68,13 +68,13 @@ def report(
 
     Args:
         title: Name of the sequence.
-        metrics: Content of metrics.json: every number that the page prints about the result is one of these.
+        metrics: Content of metrics.json, of which all printed results are taken.
         config: Content of the run's config.json.
-        log: Steps of the run's metrics.jsonl.
-        found: Arrays behind the pictures.
+        log: Rows of the run's metrics.jsonl.
+        found: Arrays of the pictures.
         diagnostics: Rows of the run's diagnostics.jsonl.
-        installed: Versions of the programs that compared.
-        data_card: What the sequence's README says about its truth; None if it has none.
+        installed: Versions of the software of the comparison.
+        data_card: Statement on the truth in the sequence's README; None if it has none.
     """
     s = panels.telling_row(found)
     sections = [
@@ -99,14 +99,14 @@ def verdict(metrics: Mapping[str, Any]) -> str:
     """The result in one or two sentences of HTML, with the numbers of metrics.json."""
     if page.look_up(metrics, "d_mse_x100") is None:
         return (
-            "There is no ground truth, so no distance error is known. Rendered quads match the measured ones to "
+            "There is no ground truth, so distance errors are unknown. The PSNR of rendered quads is "
             f'<span class="ours">{page.number(metrics, "quad_psnr_db", "decibel")}</span>.'
         )
     group = "moving." if page.look_up(metrics, "moving.d_mse_x100") is not None else ""
     if metrics.get("method") == "ctof":
         where = "on moving pixels" if group else "over all pixels"
         return (
-            f"This run is the closed form itself: nothing was optimised. It is off by "
+            f"This run is the closed form itself: nothing was optimised. Its error is "
             f"{page.number(metrics, f'{group}d_mse_x100', 'rms_cm')} {where} (root mean square)."
         )
     naive, ours = f"{group}closed_form_mse_x100", f"{group}d_mse_x100"
@@ -127,7 +127,7 @@ def verdict(metrics: Mapping[str, Any]) -> str:
 
 
 def _comparison(metrics: Mapping[str, Any], naive: str, ours: str) -> str:
-    """Ours against the closed form in words."""
+    """Our error relative to that of the closed form, in words."""
     was, now = page.look_up(metrics, naive), page.look_up(metrics, ours)
     values = f"{page.number(metrics, naive, 'error')} against {page.number(metrics, ours, 'error')} m² &times; 100"
     if not (was > 0 and now > 0):
@@ -189,11 +189,11 @@ def _facts(metrics: Mapping[str, Any]) -> str:
 
 
 def _distance_text(found: Findings, s: int) -> str:
-    reason = "most pixels move" if found.judgement is not None else "quads change most"
-    scale = "on the truth's scale" if found.judgement is not None else "on one scale"
+    known = found.judgement is not None
+    reason, scale = ("most moving pixels", "the truth's") if known else ("the largest change of quads", "one")
     return (
-        f'<p class="caption">Distance along the ray, all {scale}. Shown is raw frame {found.views.frames[s]}: in the '
-        f"middle half of the sequence, the one where {reason}.</p>"
+        f'<p class="caption">Distance along the ray, on {scale} scale, of raw frame {found.views.frames[s]}: the one '
+        f"with {reason} in the middle half of the sequence.</p>"
     )
 
 
@@ -217,22 +217,20 @@ def _distance_pictures(found: Findings, s: int) -> str:
     html += (
         "<h3>Absolute error</h3>"
         f"{panels.error_maps(found.judgement, s)}"
-        '<p class="caption">One scale for all three, set by the errors of the closed form where things move; '
-        "what exceeds it has the brightest colour.</p>"
+        '<p class="caption">One scale for all three, defined by the errors of the closed form on moving pixels; '
+        "larger errors are clamped.</p>"
     )
     close_up = panels.close_up(found, found.judgement, s)
-    return html + (f"<h3>Close-up of what moves</h3>{close_up}" if close_up else "")
+    return html + (f"<h3>Close-up of moving pixels</h3>{close_up}" if close_up else "")
 
 
 def _quad_text(found: Findings, s: int) -> str:
+    which = f"The quad of raw frame {found.views.frames[s]}"
     if found.sequence.from_phasors:
-        return (
-            '<p class="caption">As a quad of shift zero, which is half the real part of the phasor. Rendered from the '
-            "same pose at the same time before a black background; the difference should look like noise.</p>"
-        )
+        which = "The quad of shift zero, half the real part of the phasor"
     return (
-        f'<p class="caption">Raw frame {found.views.frames[s]} measured one of the quads. Rendered from the same '
-        "pose at the same time before a black background; the difference should look like noise.</p>"
+        f'<p class="caption">{which}, measured and rendered at its time and pose over a black background; the '
+        "residual should look like noise.</p>"
     )
 
 
@@ -242,21 +240,21 @@ def _time_pictures(found: Findings) -> str:
 
 
 def _beyond(metrics: Mapping[str, Any], found: Findings) -> list[str]:
-    """Sections of what no ToF pixel took: colour, and novel views; those that there are."""
+    """Sections of colour and of novel views, where there are any."""
     sections = []
     if found.colour is not None:
         text = (
             '<p class="caption">From the colour camera, at the time of the raw frame. '
-            f"Rendered colour matches to {page.number(metrics, 'colour_psnr_db', 'decibel')}.</p>"
+            f"Its PSNR is {page.number(metrics, 'colour_psnr_db', 'decibel')}.</p>"
         )
         sections.append(_section("Colour", text + gallery.colour_strip(found.colour)))
     if found.novel is not None:
         text = (
-            '<p class="caption">The reconstruction in the middle of the sequence, from poses that the sequence names '
-            "and no raw frame has. Grey: half of the light or more would pass.</p>"
+            '<p class="caption">The reconstruction in the middle of the sequence, from its novel poses. '
+            "Grey: opacity below one half.</p>"
         )
         strip = gallery.novel_strip(found.novel, found.distance_scale)
-        sections.append(_section("Views that nobody took", text + strip))
+        sections.append(_section("Novel views", text + strip))
     return sections
 
 
@@ -269,7 +267,7 @@ def _along(metrics: Mapping[str, Any], rows: Sequence[Mapping[str, float]]) -> l
     key = "diagnostics.criterion_m_least"
     if page.look_up(metrics, key) is not None:
         text += (
-            f"; they are nearest to each other, {page.number(metrics, key, 'length_cm')} apart, after"
+            f"; their difference is least, {page.number(metrics, key, 'length_cm')}, after"
             f" {page.number(metrics, 'diagnostics.images_at_criterion', 'count')} images"
         )
         if page.look_up(metrics, "diagnostics.d_mse_x100_at_criterion") is not None:
@@ -295,18 +293,13 @@ def _curves(found: Findings, log: Sequence[Mapping[str, float]]) -> str:
         groups = {"all pixels": everywhere, "moving pixels": judged.moving, "static pixels": judged.static}
         groups = {name: mask for name, mask in groups.items() if mask.any()}
         per_frame = {
-            group: {name: [_x100(v) for v in per_frame_mean(error, mask)] for name, error in errors.items()}
+            group: {
+                name: [None if v is None else ERROR_UNIT * v for v in per_frame_mean(error, mask)]
+                for name, error in errors.items()
+            }
             for group, mask in groups.items()
         }
         charts.append(("Error of every raw frame", figures.error_over_frames(found.views.frames, per_frame)))
-        charts.append(
-            (
-                "How large the errors are (the first bin holds all below a millimetre)",
-                figures.error_histogram(errors, groups),
-            )
-        )
+        title = "Distribution of errors (the first bin holds all below a millimetre)"
+        charts.append((title, figures.error_histogram(errors, groups)))
     return "".join(f"<h3>{title}</h3>{page.chart(svg, title)}" for title, svg in charts)
-
-
-def _x100(value: float | None) -> float | None:
-    return None if value is None else 100.0 * value

@@ -1,12 +1,9 @@
-"""Rendered images as arrays on disk: for each channel one .npy file [S, H, W] float32, filled while rendering goes on.
+"""Rendered images as arrays on disk: one .npy file [S, H, W] float32 per channel, filled during rendering.
 
-Nothing is encoded, so what is left is to copy. Files are written and not mapped: a full disk is an error then and not a
-signal, and it took half the time. Each file is filled by one thread at a time, which is all that systems do in any
-case, so channels have files of their own. Many images go into one call of the system, because each call gives Python's
-lock back and asks for it again, and the rendering waits for it each time.
-
-Where a disk takes them as they are, images go there past the memory in which systems keep files (``O_DIRECT``). Else it
-begins with what it is given while more is rendered, not at the end.
+Files are written rather than mapped: a full disk then raises an error instead of a signal, and it takes half the time.
+Each file is written by one thread at a time, with many images per system call, because every call releases and
+reacquires the GIL, for which rendering waits. Writes bypass the page cache (``O_DIRECT``) where the file system allows
+it; otherwise write-back is started early.
 """
 
 from __future__ import annotations
@@ -34,17 +31,21 @@ from ..data.files import as_errors, atomic_path
 from ..errors import ResourceError
 from .previews import Channels
 
-BLOCK = 32  # images that one call of the system writes, unless
-BLOCK_BYTES = 1 << 26  # they would take more: memory holds the block that is written and the one that comes next
-HELD = 2 * BLOCK + 2  # images at most that are held meanwhile
-HEADER = 4096  # [bytes] of a file: then images start where a page does, of files and of what maps them
+BLOCK = 32  # images of one system call, at most
+BLOCK_BYTES = 1 << 26  # of one system call, at most; memory holds two blocks
+HELD = 2 * BLOCK + 2  # images in memory, at most
+HEADER = 4096  # [bytes] so that images are aligned to pages
 DIRECT = getattr(os, "O_DIRECT", 0)
-REFUSED = {errno.EINVAL, errno.EFAULT, errno.EOPNOTSUPP}  # a size, an address, a kind of memory, a kind of file
+REFUSED = {
+    errno.EINVAL,
+    errno.EFAULT,
+    errno.EOPNOTSUPP,
+}  # errors of O_DIRECT for an unsuitable size, address, memory or file system
 LOG = logging.getLogger("gftorf_warp")
 
 
 def path_of(out: Path, name: str, channel: str) -> Path:
-    """Where all images of one channel of one thing belong."""
+    """Path of the file of one channel."""
     return out / name / f"{channel}.npy"
 
 
@@ -55,18 +56,18 @@ def store_all(
     shape: tuple[int, int, int],
     progress: Callable[[int, int], None] | None = None,
 ) -> None:
-    """Write a series of images as arrays, while it goes on; files appear when all images are in them.
+    """Write a series of images as arrays; files get their names when they are complete.
 
     Args:
-        out: Folder with a folder for each thing.
-        channels: Names of the channels of each thing.
+        out: Folder with a folder for each kind of image.
+        channels: Names of the channels of each kind.
         series: Images in order.
         shape: (S, H, W) of each channel.
-        progress: Called with (images written, images in all); the last time when everything is on the disk.
+        progress: Called with (images written, images in all); the last time after the flush.
 
     Raises:
-        ResourceError: If the disk is full, or cannot hold them.
-        UsageError: If the place cannot be written to.
+        ResourceError: If the disk is full, or too small.
+        UsageError: If ``out`` is not writable.
     """
     paths = [path_of(out, name, channel) for name in channels for channel in channels[name]]
     needed = 4 * math.prod(shape) * len(paths)
@@ -89,7 +90,7 @@ def store_all(
             while len(waiting) > most:
                 last, futures = waiting.popleft()
                 for future in futures:
-                    future.result()  # raises what stopped the writing
+                    future.result()  # raises the error of the thread
                 if progress is not None and last < shape[0]:
                     progress(last, shape[0])
 
@@ -97,7 +98,7 @@ def store_all(
         block: list[Mapping[str, Channels]] = []
         for done, images in enumerate(series, start=1):
             block.append(images)
-            del images  # the memory of what is written is used again
+            del images  # so that its memory is reused
             if len(block) == most or done == shape[0]:
                 waiting.append((done, _submit(threads, files, out, done - len(block), block)))
                 block = []
@@ -114,7 +115,7 @@ def _submit(
     first: int,
     block: list[Mapping[str, Channels]],
 ) -> list[Future]:
-    """Write some images, each channel by itself, some day."""
+    """Submit the writing of a block, each channel on its own."""
     return [
         threads.submit(_fill, files[path_of(out, name, channel)], first, [images[name][channel] for images in block])
         for name, channels in block[0].items()
@@ -123,7 +124,7 @@ def _submit(
 
 
 def _fill(file: Stored, first: int, images: list[Float[np.ndarray, "H W"]]) -> None:
-    """Write some images of a channel, and let go of them before anybody hears of it: their memory is used again."""
+    """Write images of a channel and release them before the future completes, so that their memory is reused."""
     try:
         file.write(first, images)
     finally:
@@ -131,13 +132,13 @@ def _fill(file: Stored, first: int, images: list[Float[np.ndarray, "H W"]]) -> N
 
 
 class Stored:
-    """A .npy file [S, H, W] that is filled in any order, and appears under its name at the end of a ``with``."""
+    """A .npy file [S, H, W] that is filled in any order and gets its name at the end of a ``with``."""
 
     def __init__(self, path: Path, shape: tuple[int, int, int]):
-        """Take note of where and how large; nothing is written yet."""
+        """Store path and shape; nothing is written yet."""
         self._path, self._shape = path, shape
         self._lock, self._stack = threading.Lock(), ExitStack()
-        self._direct = False  # whether it is written past the system's memory
+        self._direct = False  # whether O_DIRECT is set
 
     def __enter__(self) -> Stored:
         with ExitStack() as stack:
@@ -170,16 +171,16 @@ class Stored:
             except OSError as error:
                 if not (self._direct and error.errno in REFUSED):
                     raise
-                LOG.debug("%s goes through the system's memory: %s", self._path, error)
+                LOG.debug("%s is written through the page cache: %s", self._path, error)
                 self._direct = _set_direct(self._file, False)
                 self._file.seek(start)
                 _write(self._file, rows)
             if not self._direct:
-                _begin_to_flush(self._file, start, sum(map(len, rows)))
+                _start_write_back(self._file, start, sum(map(len, rows)))
 
 
 def _header(shape: tuple[int, int, int]) -> bytes:
-    """What a .npy file of float32 starts with, filled up with spaces as the format allows."""
+    """Header of a .npy file of float32, padded with spaces."""
     file = io.BytesIO()
     np.lib.format.write_array_header_1_0(file, {"descr": "<f4", "fortran_order": False, "shape": shape})
     magic = np.lib.format.magic(1, 0)
@@ -188,32 +189,29 @@ def _header(shape: tuple[int, int, int]) -> bytes:
 
 
 def _write(file: FileIO, rows: list[memoryview]) -> None:
-    """Write bytes one after the other, all of them."""
+    """Write all rows."""
     done = os.writev(file.fileno(), rows) if hasattr(os, "writev") else 0
     for row in rows:
-        there = min(done, len(row))
-        rest, done = row[there:], done - there
+        skipped = min(done, len(row))
+        rest, done = row[skipped:], done - skipped
         while rest:
             rest = rest[file.write(rest) :]
 
 
 def _set_direct(file: FileIO, wanted: bool) -> bool:
-    """Write past the system's memory from now on, or no more; whether it will be so."""
+    """Set or clear O_DIRECT; returns whether it is set."""
     if not DIRECT:
         return False
     import fcntl
 
     flags = fcntl.fcntl(file, fcntl.F_GETFL) & ~DIRECT
-    with contextlib.suppress(OSError):  # not every file system can
+    with contextlib.suppress(OSError):  # not supported by every file system
         fcntl.fcntl(file, fcntl.F_SETFL, flags | (DIRECT if wanted else 0))
         return wanted
     return False
 
 
-def _begin_to_flush(file: FileIO, start: int, length: int) -> None:
-    """Let the disk begin with a part of a file, without waiting for it.
-
-    Linux does when told that the part will not be needed; otherwise the disk is idle until much more is in memory.
-    """
+def _start_write_back(file: FileIO, start: int, length: int) -> None:
+    """Start write-back of a part of a file, which Linux does for pages that are declared as not needed."""
     if hasattr(os, "posix_fadvise"):
         os.posix_fadvise(file.fileno(), start, length, os.POSIX_FADV_DONTNEED)

@@ -1,7 +1,6 @@
-"""Pictures on disk while the next images are rendered: by a few threads, or of many images by processes.
+"""Pictures written while the next images are rendered: by a few threads or, for many images, by processes.
 
-A 320x240 image with four quads and distance costs a CPU 5 ms. For half of it OpenEXR and others hold Python's lock, so
-more threads write no more; what processes write is the same.
+A 320x240 image with four quads and distance takes 5 ms of a CPU, half of it with the GIL held by OpenEXR.
 """
 
 from __future__ import annotations
@@ -17,8 +16,8 @@ from . import processes
 from .pictures import Scale
 from .previews import Channels, write_images
 
-THREADS = 4  # they wait for the disk in turns; with more, for Python's lock, which OpenEXR holds
-QUEUED = 2  # images that wait for each thread, at most: what memory holds
+THREADS = 4  # more would wait for the GIL
+QUEUED = 2  # waiting images per thread, at most, which bounds memory
 
 
 def write_all(
@@ -28,15 +27,15 @@ def write_all(
     total: int,
     progress: Callable[[int, int], None] | None = None,
 ) -> None:
-    """Write a series of images while it goes on; files have the numbers of their images.
+    """Write a series of images as files numbered from 0.
 
-    Whatever stops it, an interruption included, what is being written is completed before, and nothing else is written.
+    After an exception or interruption, files in progress are completed and no others are written.
 
     Args:
-        out: Folder with a folder for each thing.
-        scales: Of the previews of each thing.
+        out: Folder with a folder for each kind of image.
+        scales: Scale of the previews of each kind.
         series: Images in order.
-        total: How many they are.
+        total: Their number.
         progress: Called with (images written, images in all), counting up.
 
     Raises:
@@ -66,12 +65,12 @@ def write_all(
 def _write_by_threads(
     out: Path, scales: Mapping[str, Scale], series: Iterable[Mapping[str, Channels]], done: Callable[[int], None]
 ) -> None:
-    """The same as processes do, in this one."""
+    """Write in threads of this process."""
     waiting: deque[Future] = deque()
 
     def collect(most: int) -> None:
         while waiting and (len(waiting) > most or waiting[0].done()):
-            waiting.popleft().result()  # raises what stopped the writing
+            waiting.popleft().result()  # raises the error of the thread
             done(1)
 
     with ExitStack() as stack:
@@ -79,6 +78,6 @@ def _write_by_threads(
         stack.callback(threads.shutdown, wait=True, cancel_futures=True)
         for index, images in enumerate(series):
             waiting.append(threads.submit(write_images, out, scales, index, images))
-            del images  # the memory of what is written is used again
+            del images  # so that its memory is reused
             collect(QUEUED * THREADS)
         collect(0)
