@@ -40,7 +40,7 @@ from gftorf_warp.kernels.rasterise import (
 )
 from gftorf_warp.kernels.tracing import light_paths, rays
 from gftorf_warp.kernels.training import adam, image_similarity, noise, optical_flow, ordered_sums, step_end
-from gftorf_warp.render.buffers import TILE_SHAPES, WALKS
+from gftorf_warp.render.buffers import SEGMENTS, TILE_SHAPES
 
 FRAME_SIZE, REGISTERS = 0x11, 0x2F  # attributes in the .nv.info section of a cubin
 ALLOWED_STACK = 32  # [B]
@@ -65,7 +65,7 @@ def modules(arch: int) -> dict[str, wp.Module]:
         "noise": noise.uniform_noise.module,
         "adam": adam.make_adam(1).module,
         "encoding": encoding.encode.module,
-        "finish": step_end.judge.module,
+        "finish": step_end.finish_step.module,
         "flow": optical_flow.flow_errors.module,
         "sums": ordered_sums.means.module,
         "trace": rays.trace_hits.module,
@@ -97,16 +97,13 @@ def modules(arch: int) -> dict[str, wp.Module]:
         what = " ".join(["light"] * light + ["channels"] * channels + ["fixed"] * fixed)
         for metric in (True, False, None) if light else (None,):
             name = f"{what} {'without' if metric is None else 'paper' if metric else 'released'}"
-            ways = {"": (True, False), " by entries": (False, False)}
-            if light and channels:
-                ways[" and three more"] = True, True
-            for way, (rounds, more) in ways.items():
-                splits = rounds and light and metric is None and (fixed or not channels)
-                for parts in {1, WALKS["cuda"] if splits else 1}:
-                    given = *shape, light, channels, bool(metric), metric, rounds, more, parts
-                    arguments = *shape, light, channels, not metric, metric, fixed, rounds, more, parts
-                    title = name + way + " in parts" * (parts > 1)
-                    if not fixed or parts > 1:
+            for more in {False, light and channels}:
+                split = light and metric is None and (fixed or not channels)
+                for segments in {1, SEGMENTS["cuda"] if split else 1}:
+                    given = *shape, light, channels, bool(metric), metric, more, segments
+                    arguments = *shape, light, channels, not metric, metric, fixed, more, segments
+                    title = name + " and three more" * more + " in segments" * (segments > 1)
+                    if not fixed or segments > 1:
                         found[f"composite {title}"] = composite.make_composite(*given).module
                     found[f"composite_backward {title}"] = composite_backward.make_composite_backward(*arguments).module
     return found

@@ -70,7 +70,7 @@ def test_each_output_alone_has_the_oracles_gradient(name, output, device):
 def test_the_cuda_mapping_is_right_on_the_cpu_too(name, monkeypatch):
     """One pixel per thread and tiles of 8 x 4, what CUDA compiles but for the warp shuffles, against the oracle."""
     monkeypatch.setitem(buffers.TILE_SHAPES, "cpu", buffers.TILE_SHAPES["cuda"])
-    monkeypatch.setitem(buffers.WALKS, "cpu", 4)
+    monkeypatch.setitem(buffers.SEGMENTS, "cpu", 4)
     comparison = Comparison(CASES[name](), "cpu")
     comparison.check_images()
     comparison.check_gradients(*comparison.want)

@@ -21,7 +21,7 @@ def device(request, monkeypatch) -> str:
     where, mapping = request.param
     if mapping != "own":
         monkeypatch.setitem(buffers.TILE_SHAPES, where, buffers.TILE_SHAPES[mapping])
-        monkeypatch.setitem(buffers.WALKS, where, 4)
+        monkeypatch.setitem(buffers.SEGMENTS, where, 4)
         monkeypatch.setattr(buffers, "available_threads", lambda: 1)  # then two groups of channels share a pass
     return where
 

@@ -10,7 +10,7 @@ from enum import StrEnum
 import numpy as np
 import warp as wp
 
-from ..kernels.rasterise import shared_batches, tile_bitmask
+from ..kernels.rasterise import tile_bitmask
 from ..kernels.rasterise.composite import LIGHT_PLANES, make_pixels
 from ..kernels.rasterise.planes_to_images import Tiling
 from ..kernels.rasterise.simd import make_lanes
@@ -125,8 +125,8 @@ class RenderSettings:
 # owns a tile and every thread a pixel (design/tiles.md)
 TILE_SHAPES = {"cpu": (16, 8, 8), "cuda": (1, 8, 4)}
 
-# parts in which lists are walked back where warps own tiles (kernels/rasterise/list_segments.py, design/tiles.md)
-WALKS = {"cpu": 1, "cuda": 4}
+# segments of a list in the backward pass where warps own tiles (kernels/rasterise/list_segments.py, design/tiles.md)
+SEGMENTS = {"cpu": 1, "cuda": 4}
 LANES_PER_SPLAT = {"cpu": 1, "cuda": 32}  # threads that write the (tile, splat) pairs of a splat
 
 # a bit per tile and splat is zeroed, counted and read whether it is set or not: three times these bytes, which at
@@ -162,8 +162,8 @@ class Frame:
         self.tiles = self.tiles_x * math.ceil(height / self.tile_height)
         pixels = make_pixels(self.K, self.tile_width, self.tile_height)
         self.lanes = pixels.lanes
-        self.walks_wanted = WALKS[kind] if self.cooperative else 1
-        self.walks = 1  # parts in which the lists of the last rendering may be walked back
+        self.segments_wanted = SEGMENTS[kind] if self.cooperative else 1
+        self.segments = 1  # in which the backward pass of the last rendering may take its lists
         self.threads = (settings.threads or available_threads()) if device.is_cpu else 1
         self.tiling = Tiling()
         self.tiling.width_log2, self.tiling.height_log2 = (
@@ -203,7 +203,7 @@ class Frame:
     @property
     def cooperative(self) -> bool:
         """Whether the lanes of a warp fetch records for each other, as they may where a warp owns a tile."""
-        return self.K == 1 and shared_batches.COOPERATIVE
+        return self.K == 1
 
     @property
     def groups_with_light(self) -> int:

@@ -9,7 +9,6 @@ from itertools import pairwise
 import numpy as np
 import warp as wp
 
-from ..kernels.rasterise import shared_batches
 from .buffers import Frame
 
 
@@ -37,7 +36,7 @@ def over_tiles(frame: Frame, kernel, edges: list[int], arguments, warps: int = 1
             dim=((stop - start) * warps, frame.lanes),
             inputs=arguments(start, part),
             device=frame.device,
-            block_dim=32 * shared_batches.WARPS if frame.cooperative else 128,
+            block_dim=32 if frame.cooperative else 128,
             record_tape=False,
             record_cmd=side_by_side,
         )

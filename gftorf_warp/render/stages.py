@@ -135,19 +135,17 @@ def composite(frame: Frame, number: int, distortion: bool = True, *, differentia
     light, channels = number == 0, bool(frame.channels)
     shape = frame.K, frame.tile_width, frame.tile_height
     metric = _metric(frame, light and distortion)
-    parts = frame.walks_wanted if light and metric is None and differentiable else 1
+    segments = frame.segments_wanted if light and metric is None and differentiable else 1
     if light:
-        frame.walks = parts
-    kernel = make_composite(
-        *shape, light, channels, frame.settings.stop == Stop.INCLUSIVE, metric, frame.cooperative, more, parts
-    )
+        frame.segments = segments
+    kernel = make_composite(*shape, light, channels, frame.settings.stop == Stop.INCLUSIVE, metric, more, segments)
     channel = frame.channels[number].lanes if channels else nothing
     splats = _spread(frame, number)
     more_splats, more_channel = (_spread(frame, 1), frame.channels[1].lanes) if more else (splats, nothing)
     lists = [frame.first, frame.ids, splats, frame.tiles_x, frame.width, frame.height]
 
     def arguments(tile0: int, _part: int) -> list:
-        outputs = [frame.sums.lanes, channel, more_channel, _states(frame, parts)]
+        outputs = [frame.sums.lanes, channel, more_channel, _states(frame, segments)]
         return [*lists, tile0, _mapping(frame), more_splats, *outputs]
 
     over_tiles(frame, kernel, tile_edges(frame, frame.threads), arguments)
@@ -182,11 +180,9 @@ def composite_backward(
     shape = frame.K, frame.tile_width, frame.tile_height
     passes = frame.settings.clamp_gradient == ClampGradient.STRAIGHT
     metric = _metric(frame, light and distortion)
-    parts = frame.walks if light and metric is None and (fixed or not channels) else 1
+    segments = frame.segments if light and metric is None and (fixed or not channels) else 1
     fixed = fixed and channels
-    kernel = make_composite_backward(
-        *shape, light, channels, passes, metric, fixed, frame.cooperative, grad_more is not None, parts
-    )
+    kernel = make_composite_backward(*shape, light, channels, passes, metric, fixed, grad_more is not None, segments)
     nothing = _nothing(frame, 3, frame.sums.lanes.dtype)
     channel = grad_channel.lanes if grad_channel is not None else nothing
     more = grad_more.lanes if grad_more is not None else nothing
@@ -207,12 +203,12 @@ def composite_backward(
             grad_light.lanes,
             channel,
             more,
-            _states(frame, parts),
+            _states(frame, segments),
             targets[part],
             more_added if more_added is not None else added,
         ]
 
-    over_tiles(frame, kernel, edges, arguments, parts)
+    over_tiles(frame, kernel, edges, arguments, segments)
     for target in targets[1:]:
         _launch(splat.add_records, frame.count, [target, 0], [records])
     if frame.ordered:
@@ -330,11 +326,11 @@ def _mapping(frame: Frame) -> wp.vec2:
     return wp.vec2(far / (far - near), far * near / (far - near))
 
 
-def _states(frame: Frame, parts: int) -> wp.array:
-    """What is known where parts of lists end."""
-    if parts == 1:
+def _states(frame: Frame, segments: int) -> wp.array:
+    """State of pixels where segments end, see list_segments.py."""
+    if segments == 1:
         return _nothing(frame, 3, frame.sums.lanes.dtype)
-    return frame.planes(f"ends of {parts} parts", PLANES * (parts - 1)).lanes
+    return frame.planes(f"ends of {segments} segments", PLANES * (segments - 1)).lanes
 
 
 def _launch(kernel, dim, inputs: list, outputs: list, **adjoint) -> None:

@@ -15,7 +15,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from ...constants import ALPHA_MAX, TRANSMITTANCE_MIN
-from .list_segments import PLANES, part_length
+from .list_segments import PLANES, segment_length
 from .shared_batches import GROUP, ROUND, make_batches
 from .simd import make_lanes, warp_any
 from .splat import AHEAD, Splat, block_missed, load_splat, prefetch
@@ -90,9 +90,8 @@ def make_composite(
     channels: bool,
     inclusive: bool,
     metric: bool | None,
-    cooperative: bool = False,
     more: bool = False,
-    parts: int = 1,
+    segments: int = 1,
 ):
     """The kernel for one tile shape and one set of outputs.
 
@@ -105,14 +104,13 @@ def make_composite(
         inclusive: Whether the splat that ends a pixel is still added.
         metric: Whether distortion is measured on the distance itself, or on the released mapping of it; None: there is
             no distortion, and its three planes are left alone.
-        cooperative: Whether the lanes of a warp fetch records for each other (shared_batches.py); K must be 1.
-        more: Whether three further channels are summed in the same pass; it must be cooperative.
-        parts: In which the list will be walked back (list_segments.py); if > 1, the pass must be cooperative, with
+        more: Whether three further channels are summed in the same pass; K must be 1.
+        segments: Segments of the list in the backward pass (list_segments.py); more than one only where K is 1, with
             light and without distortion.
     """
-    parted = parts > 1
-    if parted and not (cooperative and light and metric is None):
-        raise ValueError("a list is walked back in parts with light, without distortion and by warps only")
+    cooperative, split = K == 1, segments > 1  # the lanes of a warp fetch records for each other, see shared_batches.py
+    if split and not (cooperative and light and metric is None):
+        raise ValueError("segments need light, no distortion, and a warp per tile")
     ops, pixels = make_lanes(K), make_pixels(K, tile_width, tile_height)
     V, fill, affine, mul, axpy, fma, fnma = ops.V, ops.fill, ops.affine, ops.mul, ops.axpy, ops.fma, ops.fnma
     above, add, reaches, drop_below, set_where = ops.above, ops.add, ops.reaches, ops.drop_below, ops.set_where
@@ -144,12 +142,12 @@ def make_composite(
     goes_on = trusts if cooperative else asks
 
     @wp.func
-    def leave(states: wp.array3d[V], part: int, tile: int, lane: int, T: V, re: V, im: V, amplitude: V, distance: V):
-        """What is known where a part ends: T, but of the last one, and what it has added, but of the first."""
-        if part < wp.static(parts - 1):
-            states[part * wp.static(PLANES), tile, lane] = T
-        if part > 0:
-            place = (part - 1) * wp.static(PLANES)
+    def leave(states: wp.array3d[V], segment: int, tile: int, lane: int, T: V, re: V, im: V, amplitude: V, distance: V):
+        """What is known where a segment ends: T, but of the last one, and what it has added, but of the first."""
+        if segment < wp.static(segments - 1):
+            states[segment * wp.static(PLANES), tile, lane] = T
+        if segment > 0:
+            place = (segment - 1) * wp.static(PLANES)
             states[place + 1, tile, lane] = re
             states[place + 2, tile, lane] = im
             states[place + 3, tile, lane] = amplitude
@@ -171,7 +169,7 @@ def make_composite(
         sums: wp.array3d[V],  # [9, tiles, lanes] planes RE .. LAST of ``light``
         channel: wp.array3d[V],  # [3, tiles, lanes] the three channels
         more_channel: wp.array3d[V],  # [3, tiles, lanes] the further channels
-        states: wp.array3d[V],  # [5 (parts - 1), tiles, lanes] where parts end, see list_segments.py
+        states: wp.array3d[V],  # [5 (segments - 1), tiles, lanes] where segments end, see list_segments.py
     ):
         """One thread per block of K pixels; on CUDA one warp per tile, so all control is uniform over 32 lanes."""
         t, lane = wp.tid()
@@ -191,7 +189,7 @@ def make_composite(
             im = fill(0.0)
             amplitude = fill(0.0)
             distance = fill(0.0)
-        if wp.static(parted):  # sums of the parts before this one
+        if wp.static(split):  # sums of the segments before this one
             re_before = fill(0.0)
             im_before = fill(0.0)
             amplitude_before = fill(0.0)
@@ -210,10 +208,10 @@ def make_composite(
             c5 = fill(0.0)
         begin = first[tile]
         end = first[tile + 1]
-        part = int(0)
+        segment = int(0)
         length = int(0)
-        if wp.static(parted):
-            length = part_length(end - begin, wp.static(parts))
+        if wp.static(split):
+            length = segment_length(end - begin, wp.static(segments))
         zeta0 = float(0.0)  # distortion is blind to a common shift; near the surface its sums keep their digits
         if wp.static(spreads):
             if begin < end:
@@ -229,22 +227,14 @@ def make_composite(
                 if wp.static(more):
                     ask_more(memory, more_splats, coming, 0)
                 coming = entry(ids, begin, 1, wp.static(ROUND), count)
-        if wp.static(
-            K == 1 and not cooperative
-        ):  # a record comes from afar: a warp asks for the next one while it works on this one
-            following = Splat()
-            after = int(0)
-            if begin < end:
-                following = load_splat(splats, ids[begin])
-                after = ids[wp.min(begin + 1, end - 1)]
         # `continue` instead of nested `if`s: after an `if` Warp selects between the old and the new value of everything
         # assigned inside, here a dozen vectors per splat
         while k < end and warp_any(nonzero(live)):
             stop = end
-            if wp.static(parted):
-                if k - begin == (part + 1) * length:  # a part begins, since it is whole rounds
-                    leave(states, part, tile, lane, T, re, im, amplitude, distance)
-                    part += 1
+            if wp.static(split):
+                if k - begin == (segment + 1) * length:  # a segment begins, since it is whole rounds
+                    leave(states, segment, tile, lane, T, re, im, amplitude, distance)
+                    segment += 1
                     re_before = add(re_before, re)
                     im_before = add(im_before, im)
                     amplitude_before = add(amplitude_before, amplitude)
@@ -274,12 +264,8 @@ def make_composite(
                         if block_missed(splats, i, x0 + wp.static(half), y0 + wp.static(half)):
                             continue
                         q = load_splat(splats, i)
-                    elif wp.static(cooperative):
-                        q = record_of(memory, start - begin, k - 1 - start, splats, ids, k - 1, k <= end)
                     else:
-                        q = following
-                        following = load_splat(splats, after)
-                        after = ids[wp.min(k + 1, end - 1)]
+                        q = record_of(memory, start - begin, k - 1 - start, splats, ids, k - 1, k <= end)
                     power = power_of(affine(x, -1.0, q[0]), affine(y, -1.0, q[1]), q[2], q[3], q[4])
                     hit = hits(power, live, q[6])
                     alpha = alpha_of(power, hit, q[5], ALPHA_MAX)
@@ -322,10 +308,10 @@ def make_composite(
                 k = end  # one round was all
         if wp.static(cooperative):
             arrive()  # records that nobody needs may still be on their way
-        if wp.static(parted):
-            leave(states, part, tile, lane, T, re, im, amplitude, distance)
+        if wp.static(split):
+            leave(states, segment, tile, lane, T, re, im, amplitude, distance)
             nothing = fill(0.0)
-            for later in range(part + 1, wp.static(parts)):  # nobody walked there
+            for later in range(segment + 1, wp.static(segments)):  # nobody walked there
                 leave(states, later, tile, lane, T, nothing, nothing, nothing, nothing)
             re = add(re, re_before)
             im = add(im, im_before)

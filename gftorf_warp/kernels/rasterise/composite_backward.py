@@ -16,9 +16,9 @@ import warp as wp
 
 from ...constants import ALPHA_MAX, ALPHA_MIN
 from .composite import LAST, NEAREST, SUM_ZETA, SUM_ZETA2, TRANSMITTANCE, make_pixels, make_zeta, options
-from .list_segments import PLANES, part_length
+from .list_segments import PLANES, segment_length
 from .shared_batches import GROUP, ROUND, make_gradient_rounds
-from .simd import make_lanes, sums_of, types_of, warp_any, warp_max
+from .simd import make_lanes, sums_of, types_of, warp_max
 from .splat import AHEAD, Splat, block_missed, load_splat, prefetch
 
 # planes of ``grad_sums``, each [tiles, lanes] of V: gradients of the first five planes of the forward pass, and of T_e
@@ -27,23 +27,10 @@ GRAD_LIGHT_PLANES = 6
 V1 = make_lanes(1).V
 
 
-_FOLD = r"""    const unsigned lane = threadIdx.x & 31u;
-    #define FOLD(BIT, HALF) { const bool up = (lane >> BIT) & 1u; \
-        _Pragma("unroll") for (int j = 0; j < HALF; ++j) { \
-        const float send = up ? record[j] : record[j + HALF], keep = up ? record[j + HALF] : record[j]; \
-        record[j] = keep + __shfl_xor_sync(0xffffffffu, send, 1 << BIT); } }
-    FOLD(4, 8) FOLD(3, 4) FOLD(2, 2) FOLD(1, 1)
-    #undef FOLD
-    record[0] += __shfl_xor_sync(0xffffffffu, record[0], 1);
-    if (!(lane & 1u)) atomicAdd(reinterpret_cast<float*>(grads.data + i) + (lane >> 1), record[0]);"""
+def _add_moments(K: int, light: bool, channels: bool, geometry: bool) -> str:
+    """C++ that adds the sums over the K pixels of a CPU thread to the gradient record of one splat.
 
-
-def _add_moments(K: int, light: bool, channels: bool, geometry: bool, cooperative: bool) -> str:
-    """C++ that adds what the K pixels of a thread, or of a warp on CUDA, say about one splat to its record.
-
-    On the CPU one permutation brings the sums into the order of the record. On CUDA 16 values of 32 lanes are summed in
-    16 shuffles, each of which halves the values a lane carries; then 16 lanes add one 64-byte line. Where warps work
-    together (shared_batches.py) there is nothing to do on CUDA.
+    One permutation brings the sums into the order of the record. On CUDA ``add_round`` of shared_batches.py does it.
     """
     names = ["v", "dx", "dy", "alpha", "w", "w2", "g0", "g1", "g2", "g_re", "g_im", "g_amplitude", "g_distance"]
     loads = " ".join(f"const F {name}_ = load({name});" for name in names)
@@ -57,35 +44,16 @@ def _add_moments(K: int, light: bool, channels: bool, geometry: bool, cooperativ
     if light:
         values |= {"re": "w2_ * g_re_", "im": "w2_ * g_im_", "amplitude": "w2_ * g_amplitude_"}
         values |= {"distance": "w_ * g_distance_"}
-    slots = [
-        "dx",
-        "dy",
-        "dx2",
-        "dxdy",
-        "dy2",
-        "v",
-        "count",
-        "weight",
-        "c0",
-        "c1",
-        "c2",
-        "re",
-        "im",
-        "amplitude",
-        "distance",
-        "",
-    ]
+    slots = [*"dx dy dx2 dxdy dy2 v count weight c0 c1 c2 re im amplitude distance".split(), ""]
     sums, lanes = sums_of(K, values)
     if K == 1:
-        fold = "" if cooperative else _FOLD
         entries = [f"s[{lanes.index(of)}]" if of in lanes else "0.0f" for of in slots]
-        return f"""{types_of(K)}
+        return f"""
+#if !defined(__CUDA_ARCH__)
+    {types_of(K)}
     {loads}
     {sums}
-    float record[16] = {{{", ".join(entries)}}};
-#if defined(__CUDA_ARCH__)
-    {fold}
-#else
+    const float record[16] = {{{", ".join(entries)}}};
     for (int j = 0; j < 16; ++j) grads.data[i].c[j] += record[j];
 #endif
 """
@@ -140,9 +108,8 @@ def make_composite_backward(
     clamp_passes: bool,
     metric: bool | None,
     fixed: bool = False,
-    cooperative: bool = False,
     more: bool = False,
-    parts: int = 1,
+    segments: int = 1,
 ):
     """The adjoint kernel for one tile shape and one set of outputs; arguments as in ``make_composite``.
 
@@ -155,14 +122,13 @@ def make_composite_backward(
         clamp_passes: Whether a clamped alpha passes its gradient on, as the released code does.
         metric: As in ``make_composite``; None: the distortion has no gradient.
         fixed: Whether weights are held fixed under the channels, so that only these have their gradient.
-        cooperative: As in ``make_composite``.
         more: Whether three further channels, under which weights are held fixed, have their gradient, too.
-        parts: Warps per tile, each with a part of its list (list_segments.py); if > 1, the forward pass must have
+        segments: Warps per tile, each with a segment of its list (list_segments.py); if > 1, the forward pass must have
             had as many, and weights be held fixed under all channels.
     """
-    parted = parts > 1
-    if parted and not (cooperative and light and metric is None and (fixed or not channels)):
-        raise ValueError("a list is walked back in parts with light, without distortion or colour, by warps only")
+    cooperative, split = K == 1, segments > 1
+    if split and not (cooperative and light and metric is None and (fixed or not channels)):
+        raise ValueError("segments need light, no distortion, no weights that depend on channels, and a warp per tile")
     ops, pixels = make_lanes(K), make_pixels(K, tile_width, tile_height)
     V, fill, affine, mul, axpy, fma, fnma = ops.V, ops.fill, ops.affine, ops.mul, ops.axpy, ops.fma, ops.fnma
     add, scaled, exceeds, keep_below = ops.add, ops.scaled, ops.exceeds, ops.keep_below
@@ -173,7 +139,7 @@ def make_composite_backward(
     half, zeta_of = 0.5 * (pixels.side - 1), make_zeta(bool(metric))
     spreads = light and metric is not None
 
-    @wp.func_native(_add_moments(K, light, channels, light or not fixed, cooperative))
+    @wp.func_native(_add_moments(K, light, channels, light or not fixed))
     def add_moments(
         grads: wp.array[Splat], i: int, v: V, dx: V, dy: V, alpha: V, w: V, w2: V,
         g0: V, g1: V, g2: V, g_re: V, g_im: V, g_amplitude: V, g_distance: V,
@@ -203,17 +169,17 @@ def make_composite_backward(
         grad_sums: wp.array3d[V],  # [6, tiles, lanes] gradients of RE .. DISTORTION and of T_e
         grad_channel: wp.array3d[V],  # [3, tiles, lanes] gradients of the three channels
         grad_more: wp.array3d[V],  # [3, tiles, lanes] gradients of the further channels
-        states: wp.array3d[V],  # [5 (parts - 1), tiles, lanes] where parts end, see list_segments.py
+        states: wp.array3d[V],  # [5 (segments - 1), tiles, lanes] where segments end, see list_segments.py
         # Out:
         grad_splats: wp.array[Splat],  # [N] added to: moments in 0-5, pixels in 6, weights in 7, gradients in 8-15
         more_splats: wp.array[Splat],  # [N] added to: slots 8-10, gradients of the further channels
     ):
         """One thread per block of K pixels; visits exactly the contributors of the forward pass, last one first.
 
-        Where lists have parts, that many warps per tile, side by side.
+        Where lists have segments, that many warps per tile, side by side.
         """
         t, lane = wp.tid()
-        tile = tile0 + t // wp.static(parts)
+        tile = tile0 + t // wp.static(segments)
         x0 = block_x(tile, lane, tiles_x)
         y0 = block_y(tile, lane, tiles_x)
         x = columns(x0)
@@ -257,16 +223,16 @@ def make_composite_backward(
         begin = first[tile]
         k = begin + warp_max(int(largest_of(last)))
         position = fill(float(k - begin))
-        if wp.static(parted):
-            part = t % wp.static(parts)
-            length = part_length(first[tile + 1] - begin, wp.static(parts))
-            stop_of_part = wp.min(k, begin + (part + 1) * length)
-            position = fill(float(stop_of_part - begin))
-            begin += part * length
-            k = wp.max(stop_of_part, begin)
-            for m in range(wp.static(parts - 1)):  # what later parts have added, the last one first
-                end_of = wp.static(parts - 2) - m
-                if end_of >= part:
+        if wp.static(split):
+            segment = t % wp.static(segments)
+            length = segment_length(first[tile + 1] - begin, wp.static(segments))
+            stop_of_segment = wp.min(k, begin + (segment + 1) * length)
+            position = fill(float(stop_of_segment - begin))
+            begin += segment * length
+            k = wp.max(stop_of_segment, begin)
+            for m in range(wp.static(segments - 1)):  # what later segments have added, the last one first
+                end_of = wp.static(segments - 2) - m
+                if end_of >= segment:
                     place = end_of * wp.static(PLANES)
                     lit = mul(g_re, states[place + 1, tile, lane])
                     lit = fma(lit, g_im, states[place + 2, tile, lane])
@@ -286,12 +252,6 @@ def make_composite_backward(
                 keep_derivatives(memory, g0, g1, g2, g_re, g_im, g_amplitude, g_distance, g3, g4, g5)
                 ask(memory, splats, entry(ids, top, -1, 0, count), 0)
                 coming = entry(ids, top, -1, wp.static(ROUND), count)
-        if wp.static(K == 1 and not cooperative):  # as in the forward pass
-            following = Splat()
-            after = int(0)
-            if begin < k:
-                following = load_splat(splats, ids[k - 1])
-                after = ids[wp.max(k - 2, begin)]
         while k > begin:
             stop = begin
             if wp.static(cooperative):
@@ -319,13 +279,8 @@ def make_composite_backward(
                         if block_missed(splats, i, x0 + wp.static(half), y0 + wp.static(half)):
                             continue
                         q = load_splat(splats, i)
-                    elif wp.static(cooperative):
-                        q = record_of(memory, behind, n - 1, splats, ids, k, k >= begin)
                     else:
-                        i = ids[k]
-                        q = following
-                        following = load_splat(splats, after)
-                        after = ids[wp.max(k - 2, begin)]
+                        q = record_of(memory, behind, n - 1, splats, ids, k, k >= begin)
                     gate = exceeds(last, position)  # only what this pixel composited
                     dx = affine(x, -1.0, q[0])
                     dy = affine(y, -1.0, q[1])
@@ -333,7 +288,7 @@ def make_composite_backward(
                     hit = hits(power, gate, q[6])
                     alpha = alpha_of(power, hit, q[5], ALPHA_MAX)
                     if wp.static(not cooperative):
-                        if not warp_any(nonzero(alpha)):  # uniform: all lanes of a warp reach `add_moments`, or none
+                        if not nonzero(alpha):
                             continue
                     restored = inverse(affine(alpha, -1.0, 1.0))
                     T = mul(T, restored)

@@ -18,10 +18,8 @@ import warp as wp
 from .simd import make_lanes
 from .splat import Splat
 
-COOPERATIVE = True  # False: every lane reads every record itself, to compare with
 ROUND = wp.constant(16)  # entries of a list that are fetched, and whose gradients are summed, together
 GROUP = wp.constant(4)  # of a round that the compiler sees at once: it works on some while others wait for their turn
-WARPS = 1  # tiles of a block of threads: all blocks run at once, and the more there are, the more evenly they spread
 STRIDE = 36  # floats from the values of one entry to those of the next: 4-float reads of 8 lanes meet all 32 banks
 OUT_STRIDE = 20  # the same for gradient records
 PIXELS = 32  # of a tile
@@ -67,8 +65,8 @@ def make_batches(values: int = 0, derivatives: int = 0, more: bool = False) -> S
     memory_snippet = f"""
 #if defined(__CUDA_ARCH__)
     {_CHECK}
-    __shared__ __align__(16) float memory[{WARPS} * {floats}];
-    return (wp::uint64)(memory + (threadIdx.x >> 5) * {floats});
+    __shared__ __align__(16) float memory[{floats}];  // of the one warp of a block
+    return (wp::uint64)memory;
 #else
     return 0;
 #endif

@@ -4,12 +4,8 @@ import shutil
 import subprocess
 
 import pytest
-import torch
-from cases import CASES, cotangents
-from torch.testing import assert_close
 
 from gftorf_warp.kernels.rasterise import shared_batches, simd, tile_bitmask
-from gftorf_warp.render import api
 
 COMPILER = shutil.which("c++") or shutil.which("g++")
 
@@ -286,26 +282,3 @@ def test_lanes_list_bits(tmp_path):
     homes = {"sum_of_lanes": simd, "of_lane": simd, "two_words": tile_bitmask, "write_ids": tile_bitmask}
     functions = {name: getattr(home, name) for name, home in homes.items()}
     assert numbers_of(tmp_path, functions, LISTS) == [0.0] * 64
-
-
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
-@pytest.mark.parametrize("name", CASES)
-def test_rounds_change_no_image_and_no_gradient(name, monkeypatch):
-    """Walking in rounds and walking entry by entry give the same images and, to rounding, the same gradients."""
-    found = []
-    for rounds in (True, False):
-        monkeypatch.setattr(shared_batches, "COOPERATIVE", rounds)
-        case = CASES[name]()
-        inputs = case.inputs(torch.float32, "cuda")
-        images = case.outputs(api.rasterize, inputs)
-        nothing = torch.zeros(next(iter(images.values())).shape[-2:], dtype=torch.bool)
-        seeds = cotangents(images, nothing, 0)
-        total = sum((images[key] * seeds[key].to(images[key])).sum() for key in images)
-        gradients = torch.autograd.grad(total, list(inputs.values()), allow_unused=True, materialize_grads=True)
-        found.append((images, dict(zip(inputs, gradients, strict=True))))
-    (images, gradients), (wanted_images, wanted) = found
-    for key, image in wanted_images.items():
-        assert_close(images[key], image, rtol=1e-6, atol=1e-6, msg=key)
-    for key, gradient in wanted.items():
-        scale = float(gradient.abs().max()) if gradient.numel() else 0.0
-        assert_close(gradients[key], gradient, rtol=0, atol=2e-5 * scale + 1e-7, msg=key)

@@ -87,10 +87,10 @@ def test_parts_are_one_walk(count, opacity, stop, device, monkeypatch):
     settings = RenderSettings(near=0.1, far=20.0, stop=stop)
     results = {}
     for wanted in (1, 4):
-        monkeypatch.setitem(buffers.WALKS, device, wanted)
+        monkeypatch.setitem(buffers.SEGMENTS, device, wanted)
         field = scene(count, opacity, device)
         *results[wanted], workspace = outcome(api.rasterize, field, settings)
-        assert workspace.last.walks == wanted
+        assert workspace.last.segments == wanted
     exact = outcome(reference.rasterize, scene(count, opacity, "cpu", torch.float64), settings)
     for one, other, want in zip(results[4], results[1], exact, strict=False):
         for name, value in one.items():
@@ -106,7 +106,7 @@ def test_channels_with_fixed_weights_take_part(device, monkeypatch):
         extra = torch.rand(300, number, generator=torch.Generator().manual_seed(2))
         results = []
         for wanted in (1, 4):
-            monkeypatch.setitem(buffers.WALKS, device, wanted)
+            monkeypatch.setitem(buffers.SEGMENTS, device, wanted)
             field = scene(300, 0.05, device)
             results.append(outcome(api.rasterize, field, settings, extra)[:2])
         for one, other in zip(*results, strict=True):
@@ -119,7 +119,7 @@ def test_what_cannot_be_split_is_not(device, monkeypatch):
     for change, images in (({}, (*IMAGES, "distortion")), ({"colour_sh": torch.rand(100, 16, 3)}, IMAGES)):
         found = []
         for wanted in (1, 4):
-            monkeypatch.setitem(buffers.WALKS, device, wanted)
+            monkeypatch.setitem(buffers.SEGMENTS, device, wanted)
             field, workspace = scene(100, 0.1, device), Workspace()
             field = replace(field, **{name: value.to(device).requires_grad_() for name, value in change.items()})
             rendering = api.rasterize(field, CAMERA, SENSOR, RenderSettings(), images=images, workspace=workspace)
@@ -134,29 +134,33 @@ def test_what_nobody_differentiates_is_one_sum(device, monkeypatch):
     """As a replay renders it, to the bit: what a way back would need is not left."""
     settings, fields = RenderSettings(near=0.1, far=20.0), []
     for wanted in (1, 4):
-        monkeypatch.setitem(buffers.WALKS, device, wanted)
+        monkeypatch.setitem(buffers.SEGMENTS, device, wanted)
         field, workspace = scene(300, 0.05, device).map(torch.Tensor.detach), Workspace()
         fields.append(api.rasterize(field, CAMERA, SENSOR, settings, images=IMAGES, workspace=workspace))
-        assert workspace.last.walks == 1
+        assert workspace.last.segments == 1
     assert all(torch.equal(getattr(fields[0], name), getattr(fields[1], name)) for name in IMAGES)
 
 
 @pytest.mark.parametrize("walks", [1, 4])
 def test_memory_is_used_again_where_lists_are_read_in_parts_too(walks, device, monkeypatch):
     """Of so many Gaussians several warps read the list of a tile, whatever walks it back afterwards."""
-    monkeypatch.setitem(buffers.WALKS, device, walks)
+    monkeypatch.setitem(buffers.SEGMENTS, device, walks)
     field, workspace, seen = scene(20_000, 0.01, device), Workspace(), []
     for _ in range(2):
         rendering = api.rasterize(field, CAMERA, SENSOR, RenderSettings(), images=IMAGES, workspace=workspace)
         seen.append(rendering.distance.detach().clone())
-    assert workspace.last.walks == walks
+    assert workspace.last.segments == walks
     assert workspace.last.parts > 1
     assert torch.equal(*seen)
 
 
 def test_parts_are_whole_rounds_and_hold_every_list():
     """Of any length."""
-    length = list_segments.part_length.func if hasattr(list_segments.part_length, "func") else list_segments.part_length
+    length = (
+        list_segments.segment_length.func
+        if hasattr(list_segments.segment_length, "func")
+        else list_segments.segment_length
+    )
     for count in (0, 1, 15, 16, 64, 65, 255, 256, 257, 1000, 4469):
         found = length(count, 4)
         assert found % int(ROUND) == 0
