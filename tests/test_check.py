@@ -168,10 +168,10 @@ def test_a_decoded_distance_is_no_truth(tmp_path):
     sequence, truth = recording()
     noise = np.random.default_rng(0).normal(scale=0.01, size=sequence.quads.shape)
     sequence = dataclasses.replace(sequence, quads=(sequence.quads + noise).astype(np.float32))
-    assert not said(written(tmp_path / "true", sequence, truth).warnings, "no truth")
+    assert not said(written(tmp_path / "true", sequence, truth).warnings, "not ground truth")
     for i in range(2):
         truth.distance[4 * i : 4 * i + 4] = decode.closed_form_distance(sequence, i)
-    assert said(written(tmp_path, sequence, truth).warnings, "no truth")
+    assert said(written(tmp_path, sequence, truth).warnings, "not ground truth")
 
 
 def test_wrapped_and_unreadable_truth_are_warned_of(tmp_path):
@@ -249,7 +249,7 @@ def test_identity_poses_of_a_resting_camera_are_fine(tmp_path):
     [
         ("cams/phase_offset.npy", np.float64(1.0), ("truth implies", "phase_offset", "in use are 10 m and +1.000")),
         ("cams/depth_range.npy", np.float64(9.0), ("truth implies depth_range", "in use are 9 m")),
-        ("cams/relative_pose.npy", np.diag([1.0, 1, 1, 1]) + 35.0 * np.eye(4, k=3), ("stands 35 m off", "millimetres")),
+        ("cams/relative_pose.npy", np.diag([1.0, 1, 1, 1]) + 35.0 * np.eye(4, k=3), ("35 m away", "millimetres")),
         ("cams/color_extrinsics.npy", torf_folder.poses(3), ("colour_from_world", "replaces")),
         ("tof/0001.npy", np.random.default_rng(0).normal(size=(HEIGHT, WIDTH, 3)), ("third channel",)),
     ],

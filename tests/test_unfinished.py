@@ -65,7 +65,7 @@ def test_what_is_unfinished_is_no_sequence(tmp_path):
     interrupted(tmp_path / "seq")
     with pytest.raises(InputError, match="unfinished") as caught:
         Sequence.open(partial_of(tmp_path / "seq"))
-    assert "goes on" in str(caught.value)
+    assert "continues" in str(caught.value)
 
 
 def test_another_command_is_refused_unless_fresh(tmp_path):

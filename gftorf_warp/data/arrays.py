@@ -1,4 +1,4 @@
-"""Reading single files that anyone may have made: nothing in them is run, sizes are checked before allocation."""
+"""Reading single untrusted files: nothing in them is executed, and sizes are checked before allocation."""
 
 from __future__ import annotations
 
@@ -130,16 +130,16 @@ def _read_npy(path: Path, field: Field, sizes: Mapping[str, int]) -> np.ndarray:
 
 
 def _header(path: Path, field: Field, file: Any) -> tuple[tuple[int, ...], bool, np.dtype]:
-    """Shape, order and type that a .npy file claims; only types without Python objects."""
+    """Shape, order and type in the header of a .npy file; only types without Python objects."""
     readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("error")  # a header that numpy only warns about is none that numpy wrote
+            warnings.simplefilter("error")  # numpy writes no header that it warns about
             version = np.lib.format.read_magic(file)
             if version not in readers:
                 raise ValueError(f"format version {version}")
             shape, fortran, dtype = readers[version](file)
-    except Exception as error:  # the header is a Python literal: what a damaged one raises is nearly anything
+    except Exception as error:  # the header is a Python literal: a damaged one raises nearly any exception
         raise InputError(
             f"{field.name}: not a .npy array",
             where=path,
@@ -150,7 +150,7 @@ def _header(path: Path, field: Field, file: Any) -> tuple[tuple[int, ...], bool,
         raise InputError(
             f"{field.name}: pickled Python objects",
             where=path,
-            why=f"expected plain numbers, found dtype {dtype}; opening it could run foreign code, so it was not opened",
+            why=f"expected plain numbers, found dtype {dtype}; loading it could execute code, so it was not loaded",
             fix="save a numeric array: numpy.save(path, array.astype(numpy.float32), allow_pickle=False)",
         )
     return tuple(int(n) for n in shape), fortran, dtype
@@ -171,7 +171,7 @@ def _read_mat(path: Path, field: Field) -> np.ndarray:
 
 
 def _check(path: Path, field: Field, shape: tuple[int, ...], dtype: np.dtype, sizes: Mapping[str, int]) -> None:
-    """Type and shape against the field's description; bounds of letters that are not known yet."""
+    """Check type and shape against the field's description, and bounds of letters without a known value."""
     if dtype.kind not in field.dtypes:
         raise InputError(
             f"{field.name}: wrong type",
@@ -211,7 +211,7 @@ def _shape_text(allowed: tuple[int | str, ...], sizes: Mapping[str, int]) -> str
 
 
 def _open(path: Path, field: Field) -> Any:
-    if not path.is_file():  # opening a pipe would wait for ever
+    if not path.is_file():  # opening a pipe would block
         raise InputError(
             f"{field.name}: no such file",
             where=path,
@@ -240,7 +240,7 @@ def _small_file(path: Path, field: Field) -> bytes:
 
 
 def _excerpt(path: Path) -> str:
-    """What a file starts with, for a message."""
+    """First bytes of a file, for a message."""
     with path.open("rb") as file:
         start = file.read(24)
     return f"a file that starts with {start!r}" if start else "an empty file"

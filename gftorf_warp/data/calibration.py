@@ -15,8 +15,8 @@ from .arrays import read_array, read_choice
 from .problems import Problems
 from .sequence import Calibration, Intrinsics
 
-DEPTH_RANGES_M = (0.03, 30_000.0)  # [m] 10 GHz to 10 kHz: beyond, the number is another quantity or unit
-FOCAL_MIN = 0.05  # of the image width: a view of 168 degrees; what is shorter is given in image widths or millimetres
+DEPTH_RANGES_M = (0.03, 30_000.0)  # [m] 10 GHz to 10 kHz: outside, the number is another quantity or unit
+FOCAL_MIN = 0.05  # of the image width: a view of 168 degrees; a shorter one is in image widths or millimetres
 
 
 UNREAD = Intrinsics(fx=math.nan, fy=math.nan, cx=math.nan, cy=math.nan)  # the error is among the problems
@@ -42,8 +42,8 @@ def read_calibration(root: Path, form: str, problems: Problems, width: int | Non
     Args:
         root: The folder.
         form: Its format, ``ftorf`` or ``torf``.
-        problems: Takes what is wrong.
-        width: Columns of the images; None if they could not be read, and then intrinsics are not judged by it.
+        problems: Collects errors.
+        width: Columns of the images; None if they could not be read; intrinsics are then not compared with it.
     """
     fields = specs.fields(form)
     sources = {"dc_offset": "default 0: a phasor has no constant part"}
@@ -75,7 +75,7 @@ def read_colour_intrinsics(
         tof: Calibration of the ToF camera; its pixel centres are those of the folder.
         tof_size: Its rows H and columns W.
         size: Rows and columns of the colour images.
-        sources: Takes where they are from.
+        sources: Receives their source.
 
     Raises:
         InputError: If the file is not what data_specs/ describes.
@@ -123,18 +123,18 @@ def read_shifts(root: Path, form: str, frames: int, sources: dict[str, str]) -> 
 def read_times(
     root: Path, form: str, frames: int, frame_rate_hz: float | None, default_hz: float, sources: dict[str, str]
 ) -> np.ndarray:
-    """Time of each frame [s]; the file may hold more than ``frames``, when the last were not measured.
+    """Time of each frame [s]; more than ``frames`` in the file if the last were not measured.
 
     Args:
         root: The folder.
         form: Its format.
-        frames: Frames with a file, or the ids between them: raw frames of F-ToeRF, phasors of ToeRF.
+        frames: Number of frames up to the last file: raw frames of F-ToeRF, phasors of ToeRF.
         frame_rate_hz: Overrides the file, if given.
         default_hz: Rate if nothing states one.
-        sources: Takes where the times are from.
+        sources: Receives their source.
 
     Raises:
-        UsageError: If the given rate is no rate.
+        UsageError: If the given rate is not above 0.
         InputError: If the file has too few times, or they decrease.
     """
     spec = specs.fields(form)["frame_times"]

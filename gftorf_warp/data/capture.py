@@ -1,4 +1,4 @@
-"""Captures, our own sequences: the one place that knows their layout, which data_specs/capture.toml describes."""
+"""Reading captures, our own format, which data_specs/capture.toml describes."""
 
 from __future__ import annotations
 
@@ -105,9 +105,9 @@ def read(root: Path, frame_rate_hz: float | None) -> Sequence:
 
 
 def read_truth(root: Path, frames: int) -> Truth | None:
-    """Read what is known of the scene itself: both distances, amplitude, objects and layers; None if nothing is.
+    """Read the ground truth: both distances, amplitude, objects and layers; None if there is none.
 
-    A layer is NaN in raw frames that do not have it. Parts of files that nobody describes are left out.
+    A layer is NaN in raw frames without it. Parts that data_specs/capture.toml does not describe are ignored.
 
     Args:
         root: The folder.
@@ -158,7 +158,7 @@ def read_truth(root: Path, frames: int) -> Truth | None:
 
 
 def _files(root: Path, folder: str, frames: int, problems: Problems) -> dict[int, Path]:
-    """Files of raw frames in a folder; those of others are errors, and links may not lead out of it."""
+    """Files of raw frames in a folder; other ids and links out of the folder are errors."""
     found = numbered(root, f"{folder}/{{id}}.exr")
     for n, file in found.items():
         if n >= frames or not file.resolve().is_relative_to(root.resolve()):
@@ -202,7 +202,7 @@ def _verified(root: Path, file: Path, digests: dict[str, str]) -> Parts:
 
 
 def _layer(file: Path, parts: Parts, name: str, shape: tuple[int, ...]) -> np.ndarray | None:
-    """One layer of the truth, channels first; None if this part is none."""
+    """One layer of the truth, channels first; None if the part is not a layer."""
     try:
         field = specs.layer_field(name)
     except ValueError:
@@ -211,7 +211,7 @@ def _layer(file: Path, parts: Parts, name: str, shape: tuple[int, ...]) -> np.nd
 
 
 def _image(file: Path, parts: Parts, name: str, shape: tuple[int, ...] | None) -> np.ndarray | None:
-    """One field of a file, channels first if it has several, last if they are colours; None if it may be absent."""
+    """One field of a file, channels first if there are several, last of colour; None if an optional one is absent."""
     field = specs.fields(FORMAT)[name]
     if field.key not in parts:
         if not field.required:
@@ -242,7 +242,7 @@ def _channels(
 
 
 def _judge(path: Path, values: dict[str, Any], problems: Problems) -> None:
-    """What each value by itself cannot say: bounds, and what fits together."""
+    """Bounds of the values of capture.json, and their consistency."""
     frames, width = len(values["id"]), float(values["size"][0])
     times, frequencies = values["time"], values["f_mod_hz"]
     poses = [values[name] for name in ("pose", "colour_pose", "novel") if name in values]
@@ -299,7 +299,7 @@ def _intrinsics(matrix: np.ndarray) -> Intrinsics:
 
 
 def _sources(values: dict[str, Any], images: dict[str, dict[int, np.ndarray]], measured: int) -> dict[str, str]:
-    """Where each field of the sequence is from."""
+    """Source of each value of the sequence."""
     sources = {}
     for field in specs.fields(FORMAT).values():
         for name in field.fills:

@@ -1,4 +1,4 @@
-"""``capture.json``: every value of it checked against data_specs/capture.toml before anything uses it."""
+"""``capture.json``: every value is checked against data_specs/capture.toml."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def read_values(root: Path) -> dict[str, Any]:
         raise _wrong(path, FRAMES, "a list with an object for every raw frame", frames)
     version = content.get("version")
     if not isinstance(version, str) or version.partition(".")[0] != "1":
-        raise _wrong(path, "version", "1.x, which this program knows", version, "use a newer version of this program")
+        raise _wrong(path, "version", "1.x, which this program reads", version, "use a newer version of this program")
     problems.attempt(_refuse_unknown, path, content)
     for number, frame in enumerate(frames):
         problems.attempt(_refuse_unknown, path, frame, f"{FRAMES}[{number}]", f"{FRAMES}.")
@@ -71,7 +71,7 @@ def _load(path: Path) -> dict[str, Any]:
 
 
 def _refuse_unknown(path: Path, table: dict[str, Any], where: str = "", prefix: str = "") -> None:
-    """A key that nobody describes is more often a typing error than something to ignore."""
+    """Refuse keys that are not described: they are more often typing errors than additions."""
     known = [field.key for field in json_fields().values()]
     for key, value in table.items():
         full = f"{prefix}{key}"
@@ -86,7 +86,7 @@ def _refuse_unknown(path: Path, table: dict[str, Any], where: str = "", prefix: 
 
 
 def _value(path: Path, content: dict[str, Any], field: specs.Field) -> Any:
-    """One value, checked; None if it is absent and need not be there."""
+    """One value, checked; None if it is optional and absent."""
     if field.key.startswith(f"{FRAMES}."):
         key = field.key.removeprefix(f"{FRAMES}.")
         there = [key in frame for frame in content[FRAMES]]
@@ -126,7 +126,7 @@ def _array(path: Path, field: specs.Field, value: Any) -> np.ndarray:
     try:
         array: np.ndarray = np.array(leaves, dtype=kind).reshape(shape)
     except OverflowError as error:
-        raise _wrong(path, field.key, "numbers that a computer holds", value) from error
+        raise _wrong(path, field.key, "numbers of 64 bits", value) from error
     if not np.isfinite(array).all():
         raise _wrong(path, field.key, "finite numbers", value)
     return array
@@ -146,5 +146,5 @@ def _wrong(path: Path, where: str, expected: str, found: Any, fix: str = "correc
     text = "nothing" if found is None else json.dumps(found, default=str)
     shown = text if len(text) <= 80 else f"{text[:77]}..."
     return InputError(
-        f"{where}: not what a capture holds", where=path, why=f"expected {expected}, found {shown}", fix=fix
+        f"{where}: not valid in a capture", where=path, why=f"expected {expected}, found {shown}", fix=fix
     )

@@ -36,7 +36,7 @@ def files(sequence: Sequence, truth: Truth | None) -> Iterator[tuple[str, bytes 
 
 
 def _raw_frame(sequence: Sequence, n: int) -> Parts:
-    """What the ToF camera recorded in one raw frame."""
+    """Parts of one raw frame."""
     parts: Parts = {"raw": {"q": float32(sequence.quads[n])}}
     for name, images in (("flow.forward", sequence.flow.forward), ("flow.backward", sequence.flow.backward)):
         if n in images:
@@ -45,7 +45,7 @@ def _raw_frame(sequence: Sequence, n: int) -> Parts:
 
 
 def _truth(truth: Truth, n: int) -> Parts:
-    """What is known of the scene at the time of one raw frame."""
+    """Parts of the ground truth of one raw frame."""
     parts: Parts = {"distance": {"distance": float32(truth.distance[n])}}
     if truth.phasor_distance is not None:
         parts["phasor_distance"] = {"distance": float32(truth.phasor_distance[n])}
@@ -122,5 +122,5 @@ def _camera(size: tuple[int, int], camera: Intrinsics) -> dict[str, Any]:
 
 
 def inverse(poses: Float[np.ndarray, "F 4 4"]) -> Float[np.ndarray, "F 4 4"]:
-    """Poses the other way round, as they are stored, or as they are read; without minus zeros."""
+    """Inverse poses, without negative zeros."""
     return np.linalg.inv(poses) + 0.0

@@ -1,4 +1,4 @@
-"""``gftorf check``: what a sequence holds, where each value is from, what it says about itself, what looks wrong."""
+"""``gftorf check``: content of a sequence, source of each value, estimates from its images, and warnings."""
 
 from __future__ import annotations
 
@@ -20,10 +20,7 @@ NARROW_VIEW = 5.0  # focal length in image widths: a view below 11 degrees is mo
 
 
 def check(path: str | Path) -> Report:
-    """Read a sequence, print-ready, with estimates that betray a wrong order, offset or scale.
-
-    Args:
-        path: The folder.
+    """Report on a sequence folder, with estimates that reveal a wrong order, offset or scale.
 
     Raises:
         InputError: If the sequence cannot be read at all.
@@ -32,33 +29,34 @@ def check(path: str | Path) -> Report:
     report = Report(path=Path(path), form=format_of(Path(path)))
     _facts(sequence, report)
     _assumptions(sequence, report)
-    reach = _range(sequence, report)
-    if reach is not None and sequence.complete_quartets and np.abs(sequence.quads).max() > 0:
-        findings.light(sequence, report)
-        findings.frequencies(sequence, report)
-        if sequence.from_phasors and report.form == "torf":
-            findings.third_channel(sequence, report)
-        elif not sequence.from_phasors:
-            findings.constant_part(sequence, report)
-            if _canonical(sequence):
-                findings.order(sequence, report)
-        if report.form == "ftorf":
-            findings.phasors(sequence, report)
-        findings.camera(sequence, report)
-        findings.truth(sequence, report)
-    elif reach is not None:
-        report.warnings.append("no complete quartet with light: nothing can be decoded or estimated")
+    has_light = sequence.complete_quartets and np.abs(sequence.quads).max() > 0
+    try:
+        unambiguous_range(sequence)
+    except InputError as error:
+        report.warnings.append(f"{error.what}: {error.why}; nothing is decoded")
+    else:
+        if has_light:
+            _estimates(sequence, report)
+        else:
+            report.warnings.append("no complete quartet with light: nothing can be decoded or estimated")
     findings.flow(sequence, report)
     return report
 
 
-def _range(sequence: Sequence, report: Report) -> float | None:
-    """The unambiguous range of all frequencies [m]; None, with a warning, if they have none together."""
-    try:
-        return unambiguous_range(sequence)
-    except InputError as error:
-        report.warnings.append(f"{error.what}: {error.why}; nothing is decoded")
-        return None
+def _estimates(sequence: Sequence, report: Report) -> None:
+    """Findings that need decoded quartets."""
+    findings.light(sequence, report)
+    findings.frequencies(sequence, report)
+    if sequence.from_phasors and report.form == "torf":
+        findings.third_channel(sequence, report)
+    elif not sequence.from_phasors:
+        findings.constant_part(sequence, report)
+        if _canonical(sequence):
+            findings.order(sequence, report)
+    if report.form == "ftorf":
+        findings.phasors(sequence, report)
+    findings.camera(sequence, report)
+    findings.truth(sequence, report)
 
 
 def _canonical(sequence: Sequence) -> bool:
@@ -69,15 +67,10 @@ def _canonical(sequence: Sequence) -> bool:
     )
 
 
-def _cycle_source(sequence: Sequence) -> str:
-    if sequence.calibration.cycle_length is not None:
-        return sequence.sources.get("cycle_length", "setting of the sequence")
-    return "inferred from shifts and frequencies"
-
-
 def _facts(sequence: Sequence, report: Report) -> None:
     """Counts and values, each with its source."""
     stated, tof = sequence.calibration, sequence.intrinsics
+    cycle = "inferred from shifts and frequencies" if stated.cycle_length is None else sequence.sources["cycle_length"]
     measured, sources = int(sequence.measured.sum()), sequence.sources
     colour, poses = sequence.colour.size, sources["camera_from_world"]
     degrees = np.round(np.degrees(sequence.shifts[: sequence.cycle])).astype(int).tolist()
@@ -85,7 +78,7 @@ def _facts(sequence: Sequence, report: Report) -> None:
     report.lines += [
         f"raw frames      {measured} of {sequence.frames} measured, {len(sequence.complete_quartets)} complete "
         f"quartets, {sequence.width}x{sequence.height} pixels; {sources['measured']}",
-        f"cycle           {sequence.cycle} raw frames; {_cycle_source(sequence)}",
+        f"cycle           {sequence.cycle} raw frames; {cycle}",
         f"quads           {sequence.quads.min():.4g} .. {sequence.quads.max():.4g}; {sources['quads']}",
         f"shifts          {', '.join(map(str, degrees))} degrees in time; {sources['shifts']}",
         f"times           0 .. {sequence.times[-1]:.4g} s"
@@ -131,7 +124,7 @@ def _facts(sequence: Sequence, report: Report) -> None:
 
 
 def _assumptions(sequence: Sequence, report: Report) -> None:
-    """Everything that was not in a file and would matter, and what is missing."""
+    """Values that were assumed, and what is missing."""
     tof = sequence.intrinsics
     sources, missing = sequence.sources, np.flatnonzero(~sequence.measured)
     if len(missing):
@@ -165,10 +158,10 @@ def _assumptions(sequence: Sequence, report: Report) -> None:
             angle = math.degrees(2 * math.atan(size / (2 * focal)))
             report.warnings.append(f"{name} {focal:.4g} at {size} px is a view of {angle:.1f} degrees: millimetres?")
     if not (0 <= tof.cx <= sequence.width and 0 <= tof.cy <= sequence.height):
-        report.warnings.append(f"the principal point {tof.cx:.4g}, {tof.cy:.4g} lies outside the image")
+        report.warnings.append(f"the principal point {tof.cx:.4g}, {tof.cy:.4g} is outside the image")
 
 
 def _counts(steps: np.ndarray) -> list[tuple[int, int]]:
-    """Each different step with how often it occurs."""
+    """Distinct steps and the number of times each occurs."""
     values, counts = np.unique(steps, return_counts=True)
     return list(zip(values.tolist(), counts.tolist(), strict=True))

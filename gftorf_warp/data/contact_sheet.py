@@ -1,6 +1,6 @@
-"""A picture of a sequence for people: raw quads of one quartet, amplitude, distances, errors, objects, flow, colour.
+"""Contact sheet of a sequence: raw quads of one quartet, amplitude, distances, errors, objects, flow, colour.
 
-It is drawn from numbers and never read back. No dependency beyond OpenCV, which encodes PNG and has a font.
+OpenCV encodes the PNG and draws the text.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from .sequence import Sequence, Truth
 from .truth import known_distance
 
 PANEL = 340  # [px] width of an image on the sheet
-BAR, BAR_GAP, BAR_TEXT = 12, 8, 70  # [px] width of a colour bar, its distance from the image, room for its numbers
+BAR, BAR_GAP, BAR_TEXT = 12, 8, 70  # [px] width of a colour bar, its distance from the image, width of its numbers
 TITLE, GAP, MARGIN = 30, 18, 24  # [px] height of a title, space between panels, around all of them
 HEAD = 70  # [px] height of the heading
 INK, SOFT, UNKNOWN = (32, 32, 32), (110, 110, 110), (200, 200, 200)
-CLIP = 99.5  # percentile of an error that is the end of its scale: one wrapped pixel must not darken all others
+CLIP = 99.5  # percentile at which the scale of an error ends, so that one wrapped pixel does not darken all others
 COLUMNS = 4
 SHIFTS_MIN = 3  # different ones: cosine, sine and a constant
 PALETTE = ((230, 159, 0), (86, 180, 233), (0, 158, 115), (240, 228, 66), (0, 114, 178), (213, 94, 0), (204, 121, 167))
@@ -39,7 +39,7 @@ class Panel:
     """One image with its title and its scale."""
 
     title: str
-    """What it shows, with its unit."""
+    """Content, with its unit."""
     image: Picture
     """Red, green, blue."""
     scale: tuple[float, float, Colours] | None = None
@@ -50,8 +50,8 @@ def contact_sheet(sequence: Sequence, truth: Truth | None, title: str) -> bytes:
     """PNG of the middle quartet of a sequence.
 
     Args:
-        sequence: What was recorded.
-        truth: What the scene really was, if that is known.
+        sequence: The sequence.
+        truth: Its ground truth, if known.
         title: Heading.
     """
     n, panels = middle_panels(sequence, truth)
@@ -82,7 +82,7 @@ def middle_panels(sequence: Sequence, truth: Truth | None) -> tuple[int, list[li
 
 
 def _decodable(sequence: Sequence) -> list[int]:
-    """Quartets whose closed form there is: complete, with shifts that determine a phase at every frequency."""
+    """Complete quartets whose shifts determine a phase at every frequency."""
     try:
         unambiguous_range(sequence)
     except InputError:  # its frequencies have nothing in common
@@ -109,7 +109,7 @@ def _raw(sequence: Sequence, n: int) -> list[Panel]:
 
 
 def _decoded(sequence: Sequence, truth: Truth | None, n: int, whole: bool) -> list[Panel]:
-    """Amplitude, true distance, closed form and its error, each frequency by itself; what of it there is."""
+    """Amplitude, true distance, closed form and its error, each frequency by itself; as far as available."""
     panels = []
     decoded = None
     if whole:
@@ -139,7 +139,7 @@ def _decoded(sequence: Sequence, truth: Truth | None, n: int, whole: bool) -> li
 
 
 def _by_frequency(sequence: Sequence, quartet: Decoded) -> list[Panel]:
-    """What each of several frequencies decodes to by itself, and how far they agree."""
+    """Distance of each of several frequencies by itself, and their agreement."""
     if quartet.confidence is None:
         return []
     panels = []
@@ -151,11 +151,11 @@ def _by_frequency(sequence: Sequence, quartet: Decoded) -> list[Panel]:
 
 
 def _more(sequence: Sequence, truth: Truth | None, n: int) -> list[Panel]:
-    """What the light alone does to the distance, objects, flow and colour; what of it there is."""
+    """Effect of indirect light on the distance, objects, flow and colour; as far as available."""
     panels = []
     if truth is not None and truth.phasor_distance is not None:
         difference = truth.phasor_distance[n] - known_distance(truth)[n]
-        if len(sequence.frequencies) > 1:  # it is that of one frequency, and wraps sooner than the scene ends
+        if len(sequence.frequencies) > 1:  # of one frequency, whose range may be shorter than the scene
             alone = SPEED_OF_LIGHT / (2.0 * sequence.frame_frequencies[n])
             difference = np.mod(difference + 0.5 * alone, alone) - 0.5 * alone
         end = max(_end(np.abs(difference)), 1e-3)
@@ -212,14 +212,14 @@ def _place(sheet: Picture, panel: Panel, x: int, y: int, height: int) -> None:
 
 
 def _write(sheet: Picture, text: str, at: tuple[int, int], size: int, colour, *, bold: bool = False) -> None:
-    """Text with the left end of its base line at a place [px]."""
+    """Text with the left end of its base line at (x, y) [px]."""
     import cv2
 
     cv2.putText(sheet, text, at, colour, cv2.FontFace("sans"), size, 700 if bold else 400)
 
 
 def _end(image: np.ndarray) -> float:
-    """Where the scale of something that is never negative ends."""
+    """Upper end of the scale of values that are never negative."""
     known = image[np.isfinite(image)]
     return float(np.percentile(known, CLIP)) if known.size else 1.0
 
@@ -254,7 +254,7 @@ def diverging(share: np.ndarray) -> Picture:
 
 
 def _flow(flow: np.ndarray, end: float) -> Picture:
-    """Direction as hue, length as saturation: white is at rest."""
+    """Direction as hue, length as saturation: white is no motion."""
     import cv2
 
     known = np.isfinite(flow).all(axis=0)

@@ -1,4 +1,4 @@
-"""After how many raw frames a sensor begins anew, and whether these determine a phase at each of its frequencies."""
+"""Cycle length of a sensor, and whether its raw frames determine a phase at each frequency."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ RANK_TOLERANCE = 1e-3  # singular values of three unknowns are about 1; two shif
 
 
 def find_cycle(shifts: Float[np.ndarray, "F"], frequencies: Float[np.ndarray, "F"]) -> int:
-    """Raw frames of a cycle of a recording that does not state it.
+    """Number of raw frames in a cycle, for a recording that does not state it.
 
-    The shortest period of shifts [rad] and frequencies [Hz] that determines a phase at each of them; it is seen twice,
-    or has no raw frame twice. Without a period it is everything, if that is one cycle: several frequencies, or no shift
-    twice. Else four raw frames, in whatever order, of which a recording may have measured fewer.
+    The shortest period of shifts [rad] and frequencies [Hz] that determines a phase at each of them and either occurs
+    twice or repeats no raw frame. Without a period it is the whole recording, if that is one cycle: several
+    frequencies, or no repeated shift. Else four raw frames in any order, of which a recording may have fewer.
     """
     count = len(shifts)
     waves = np.exp(1j * np.asarray(shifts, dtype=np.float64))
@@ -36,7 +36,7 @@ def find_cycle(shifts: Float[np.ndarray, "F"], frequencies: Float[np.ndarray, "F
 
 
 def _distinct(waves: np.ndarray, frequencies: np.ndarray) -> bool:
-    """Whether no raw frame has shift and frequency of another."""
+    """Whether no two raw frames have the same shift and frequency."""
     same = (np.abs(waves[:, None] - waves) < SAME_RAD) & (frequencies[:, None] == frequencies)
     return int(same.sum()) == len(waves)
 
@@ -47,13 +47,13 @@ def frequencies_by_order(frequencies: Float[np.ndarray, "F"]) -> tuple[float, ..
 
 
 def frequencies_decoded(frequencies: Float[np.ndarray, "K"], wanted: tuple[float, ...]) -> bool:
-    """Whether some raw frames have the wanted frequencies, each three times or more."""
+    """Whether these frequencies are the wanted ones, each three times or more."""
     found, counts = np.unique(frequencies, return_counts=True)
     return set(found.tolist()) == set(wanted) and int(counts.min()) >= QUADS_MIN
 
 
 def solution(shifts: Float[np.ndarray, "Q"]) -> Float[np.ndarray, "2 Q"] | None:
-    """Rows that take the quads of these shifts [rad] to (re, im) by least squares; None if they determine no phase."""
+    """Matrix from the quads of these shifts [rad] to (re, im) by least squares; None if they determine no phase."""
     model = np.stack([np.cos(shifts), np.sin(shifts), np.ones(len(shifts))], axis=1)
     if len(shifts) < QUADS_MIN or np.linalg.svd(model, compute_uv=False).min() < RANK_TOLERANCE:
         return None

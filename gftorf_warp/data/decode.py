@@ -156,7 +156,7 @@ def distance_from_phase(phase: np.ndarray, sequence: Sequence, f_mod_hz: float |
 
 
 def unambiguous_range(sequence: Sequence) -> float:
-    """What the distances of a sequence are known modulo [m]: c/2f, or c / 2 f_0 of all its frequencies together.
+    """Unambiguous range of a sequence [m]: c/2f, or c / 2 f_0 of all its frequencies together.
 
     Raises:
         InputError: If its frequencies are no small multiples of one.
@@ -176,7 +176,7 @@ def largest_amplitude(sequence: Sequence) -> float:
     """Largest length of a quartet's phasors over all pixels and complete quartets, twice the amplitude of a quad.
 
     Raises:
-        InputError: If no quartet is complete, or all of them are dark.
+        InputError: If no quartet is complete, or none has light.
     """
     found = (phasor for i in sequence.complete_quartets for _, phasor in quartet_phasors(sequence, i))
     largest = max((float(np.hypot(*phasor).max()) for phasor in found), default=0.0)
@@ -192,7 +192,7 @@ def largest_amplitude(sequence: Sequence) -> float:
 
 
 def quad_scale(sequence: Sequence) -> tuple[float, str]:
-    """Factor that brings the quads to order one, and where it is from.
+    """Factor that scales the quads to order one, and its source.
 
     Returns:
         The file's own factor if it states one, else 1 / (largest phasor amplitude of the sequence); its source.

@@ -1,4 +1,4 @@
-"""What a recording says about itself: estimates that a wrong order, offset or scale would betray (``gftorf check``)."""
+"""Estimates from the images of a sequence that reveal a wrong order, offset or scale (``gftorf check``)."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from .decode import quartet_phasor, quartet_phasors
 from .flow import warp_back
 from .sequence import Sequence, Truth
 
-PAIRINGS = (((0, 1), (2, 3)), ((0, 2), (1, 3)), ((0, 3), (1, 2)))  # of the four slots: the three ways to pair them
-STATIC_QUANTILE = 0.5  # the half of the pixels that changes least over time counts as static
-BRIGHT_QUANTILE = 0.5  # and of those the brighter half, where noise does not decide
-STILL_M = 1e-3  # [m] truth that changes less within a quartet is static
+PAIRINGS = (((0, 1), (2, 3)), ((0, 2), (1, 3)), ((0, 3), (1, 2)))  # the three ways to pair four slots
+STATIC_QUANTILE = 0.5  # the half of the pixels that changes least over time is taken as static
+BRIGHT_QUANTILE = 0.5  # and of those the brighter half, where noise is small
+STILL_M = 1e-3  # [m] a pixel whose true distance changes less within a quartet is static
 CHANGED = 0.25  # of the amplitude: more than noise on bright pixels
 DC_TOLERANCE = 0.1  # [1] real differential quads stay within a few hundredths of 0, unipolar ones are at 1
 MOVING_PX = 0.5  # [px] flow above this is motion
@@ -35,7 +35,7 @@ def steady_pixels(sequence: Sequence) -> np.ndarray:
 
 
 def changed_share(sequence: Sequence) -> float:
-    """Share of bright pixels whose phasor changes from the first complete quartet to the last."""
+    """Fraction of bright pixels whose phasor changes from the first complete quartet to the last."""
     first, last = (quartet_phasor(sequence, sequence.complete_quartets[at]) for at in (0, -1))
     amplitude = np.hypot(*first)
     bright = amplitude >= np.quantile(amplitude, BRIGHT_QUANTILE)
@@ -55,7 +55,7 @@ def distance_of_z(sequence: Sequence, truth: Truth) -> np.ndarray:
 def dc_offset(sequence: Sequence) -> float:
     """Constant part of the quads as a multiple of their amplitude, mean(Q0 + Q1 + Q2 + Q3) / (4 mean a) of four.
 
-    What is left of the quads of any shifts without the wave of their phasor is constant.
+    For any shifts it is the mean of the quads minus the wave of their phasor.
     """
     total = amplitude = 0.0
     for i in sequence.complete_quartets:
@@ -68,11 +68,11 @@ def dc_offset(sequence: Sequence) -> float:
 
 
 def pairings(sequence: Sequence) -> tuple[int | None, list[float]]:
-    """How well each way of pairing the slots of four-shift quartets fits: two opposite pairs have the same sum.
+    """Agreement of each way of pairing the slots of four-shift quartets: two opposite pairs have the same sum.
 
     Returns:
-        Which of ``PAIRINGS`` the shifts state (None if they have no opposite pairs), and for each the share of steady
-        pixels where its two sums differ least. Reversing a pair, or swapping the pairs, cannot be seen this way.
+        Index into ``PAIRINGS`` of the stated shifts (None if they have no opposite pairs), and for each pairing the
+        fraction of steady pixels where its two sums differ least. A reversed pair or swapped pairs are not detected.
     """
     frames = [sequence.quartet_frames(i) for i in sequence.complete_quartets]
     quartets = [sequence.quads[own].astype(np.float64) for own in frames]
@@ -88,12 +88,12 @@ def pairings(sequence: Sequence) -> tuple[int | None, list[float]]:
 
 @dataclass(frozen=True, kw_only=True)
 class PhasorMatch:
-    """How stored phasors relate to those of the quads."""
+    """Relation of stored phasors to those of the quads."""
 
     correlation: float
     """Length of the complex correlation over steady pixels, 0..1."""
     angle: float
-    """Its angle [rad]: 0 if both mean the same phase."""
+    """Its angle [rad]: 0 if both have the same phase."""
     conjugate: float
     """Length of the correlation with the mirrored phase; near 1 if the sign of the phase is swapped."""
     factor: float
@@ -101,7 +101,7 @@ class PhasorMatch:
 
 
 def phasor_match(sequence: Sequence, stored: dict[int, np.ndarray]) -> PhasorMatch | None:
-    """Compare stored phasors [H, W, 3], by quartet start, with the quads on steady pixels; None if they never meet."""
+    """Compare stored phasors [H, W, 3], by quartet start, with the quads on steady pixels; None without any."""
     steady = steady_pixels(sequence)
     common = [i for i in sequence.complete_quartets if sequence.cycle * i in stored]
     if not common:
@@ -131,9 +131,9 @@ class PhaseFit:
     phase_offset: float
     """From the intercept [rad], in (-pi, pi]."""
     rms_m: float
-    """Root mean square of what is left, as a distance [m]."""
+    """Root mean square of the residual, as a distance [m]."""
     pixels: int
-    """How many pixels took part."""
+    """Number of pixels."""
 
 
 def phase_fit(sequence: Sequence, truth: Truth) -> PhaseFit | None:
@@ -154,29 +154,27 @@ def phase_fit(sequence: Sequence, truth: Truth) -> PhaseFit | None:
     if sum(map(len, phases)) < 100:
         return None
     psi, d = np.concatenate(phases), np.concatenate(distances)
-    centre = np.angle(
-        np.exp(1j * (psi - kappa * d)).mean()
-    )  # offset before the line is fitted, so that it unwraps right
+    centre = np.angle(np.exp(1j * (psi - kappa * d)).mean())  # initial offset, for unwrapping
     unwrapped = kappa * d + centre + np.angle(np.exp(1j * (psi - kappa * d - centre)))
     kept = np.ones(len(d), dtype=bool)
-    for _ in range(3):  # pixels that mix two distances are few and far off
+    for _ in range(3):  # outliers: a few pixels mix two distances
         slope, offset = np.polyfit(d[kept], unwrapped[kept], 1) if np.ptp(d[kept]) > STILL_M else (kappa, centre)
-        left = np.abs(unwrapped - slope * d - offset)
-        kept = left <= 4.0 * np.median(left) + 1e-9
+        residual = np.abs(unwrapped - slope * d - offset)
+        kept = residual <= 4.0 * np.median(residual) + 1e-9
     return PhaseFit(
         depth_range=4.0 * math.pi / float(slope),
         phase_offset=float(np.angle(np.exp(1j * offset))),
-        rms_m=float(np.sqrt((left[kept] ** 2).mean()) / kappa),
+        rms_m=float(np.sqrt((residual[kept] ** 2).mean()) / kappa),
         pixels=int(kept.sum()),
     )
 
 
 def flow_match(sequence: Sequence, flow: dict[int, np.ndarray], step: int) -> tuple[float, float, float, float] | None:
-    """Whether flow explains motion: mean |difference| of quads n and n + step where it moves.
+    """Test of flow: mean |difference| of quads n and n + step where the flow is not small.
 
     Returns:
         Unwarped, warped by the flow, warped by the flow with its sign flipped, and with dx and dy swapped, in quad
-        units; None if nothing moves.
+        units; None if no pixel moves.
     """
     sums, count = np.zeros(4), 0
     for n, image in flow.items():

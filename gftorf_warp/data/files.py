@@ -1,8 +1,8 @@
-"""Writing that leaves either the old content or the new one, never half of it.
+"""Atomic writing: after a crash there is the old content or the new one, never a part of it.
 
-A file is written under a temporary name in its own folder, flushed to the disk, and renamed; a folder of many files is
-filled under a temporary name beside its target and renamed as a whole. Temporary names are ``.NAME.tmp-PID-COUNT``, so
-that what a killed process left can be told from what a living one is writing, and swept.
+A file is written under a temporary name in its folder, flushed to the disk, and renamed; a folder is filled under a
+temporary name next to its target and renamed as a whole. Temporary names are ``.NAME.tmp-PID-COUNT``, so that files of
+processes that no longer run are recognised and removed.
 """
 
 from __future__ import annotations
@@ -26,15 +26,11 @@ _NO_SPACE = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 
 
 def atomic_write(path: str | Path, data: bytes | memoryview) -> None:
-    """Replace the content of a file, all at once.
-
-    Args:
-        path: The file; its folder must exist.
-        data: The whole new content.
+    """Replace the content of a file in an existing folder atomically.
 
     Raises:
         ResourceError: If the disk is full.
-        UsageError: If the place cannot be written to.
+        UsageError: If the file cannot be written.
     """
     path = Path(path)
     sweep(path)
@@ -45,17 +41,13 @@ def atomic_write(path: str | Path, data: bytes | memoryview) -> None:
 
 @contextlib.contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
-    """Let a library write a file that replaces ``path`` only when it is complete.
+    """Temporary file name for a library to write to; the file replaces ``path`` at a normal end.
 
-    Yields a temporary name in the same folder. At a normal end that file is flushed and renamed to ``path``; at an
-    exception it is removed and the old content stays.
-
-    Args:
-        path: The file; its folder must exist.
+    After an exception it is removed and the old content stays.
 
     Raises:
         ResourceError: If the disk is full.
-        UsageError: If the place cannot be written to.
+        UsageError: If the file cannot be written.
     """
     path = Path(path)
     sweep(path)
@@ -67,15 +59,10 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def many_files(folder: str | Path) -> Iterator[None]:
-    """Let :func:`one_of_many` and :func:`write_one_of_many` fill a folder.
+    """Fill an existing folder by :func:`one_of_many` and :func:`write_one_of_many`: it is listed and flushed once.
 
-    What lies in it is looked at once, and its names are flushed once.
-
-    Doing both for every file makes each cost as much as there are files before it, and keeps threads waiting for
-    Python's lock meanwhile: listing a folder gives it back and asks for it again with every name.
-
-    Args:
-        folder: It must exist.
+    Listing it for every file makes each file cost as much as there are files already, and holds up threads: Python's
+    lock is released and taken again with every name.
 
     Raises:
         ResourceError, UsageError: If it cannot be flushed.
@@ -85,7 +72,7 @@ def many_files(folder: str | Path) -> Iterator[None]:
     try:
         yield
     except BaseException:
-        _sweep(folder, ".")  # one who wrote here may have been killed
+        _sweep(folder, ".")  # a process that wrote here may have been killed
         raise
     finally:
         with as_errors(folder):
@@ -94,12 +81,7 @@ def many_files(folder: str | Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def one_of_many(path: Path) -> Iterator[Path]:
-    """A temporary name for a writer that wants one, in a folder that :func:`many_files` looks after.
-
-    Raises:
-        ResourceError: If the disk is full.
-        UsageError: If the place cannot be written to.
-    """
+    """:func:`atomic_path` for one of the files of a folder inside :func:`many_files`."""
     with as_errors(path), _renamed_to(path) as temporary:
         yield temporary
         with open(temporary, "rb+") as file:
@@ -107,62 +89,41 @@ def one_of_many(path: Path) -> Iterator[Path]:
 
 
 def write_one_of_many(path: Path, data: bytes | memoryview) -> None:
-    """Replace the content of a file, all at once, in a folder that :func:`many_files` looks after.
+    """:func:`atomic_write` for one of the files of a folder inside :func:`many_files`.
 
-    The content is on the disk before it has the name, as in :func:`atomic_write`; the name is on the disk later. So a
-    power failure costs names, never a part of a content.
-
-    Raises:
-        ResourceError: If the disk is full.
-        UsageError: If the place cannot be written to.
+    The content is on the disk before the name is, so a power failure may lose a file, but leaves none incomplete.
     """
     with as_errors(path), _renamed_to(path) as temporary:
         write_through(temporary, data)
 
 
 def write_json(path: str | Path, content: object) -> None:
-    """Write an object as JSON, atomically.
-
-    Args:
-        path: The file; its folder must exist.
-        content: What ``json`` can hold; numpy numbers and arrays and paths are converted.
+    """Write an object as JSON atomically; numpy numbers and arrays and paths are converted.
 
     Raises:
-        ValueError: If it holds NaN or infinity, which JSON cannot express: use None.
+        ValueError: If it contains NaN or infinity, which JSON cannot express: use None.
     """
     atomic_write(path, (json.dumps(content, indent=2, allow_nan=False, default=_plain) + "\n").encode())
 
 
 @contextlib.contextmanager
 def atomic_folder(path: str | Path) -> Iterator[Path]:
-    """Fill a folder that appears under its name only when it is complete.
+    """Temporary folder to fill, which is flushed and renamed to ``path`` at a normal end.
 
-    Yields a temporary folder beside the target, in which the caller writes. At a normal end everything in it is flushed
-    and the folder is renamed to ``path``; at an exception it is removed and nothing remains.
-
-    Args:
-        path: The folder to create; missing parents are created, an existing one must be empty.
+    After an exception it is removed. Missing parents of ``path`` are created; if it exists, it must be empty.
 
     Raises:
-        UsageError: If the target exists and is not an empty folder, or the place cannot be written to.
+        UsageError: If the target exists and is not an empty folder, or cannot be written.
         ResourceError: If the disk is full.
     """
     path = Path(path)
     with as_errors(path):
+        why = "expected a new or empty folder to write to, found"
         if path.is_symlink() or (path.exists() and not path.is_dir()):
-            raise UsageError(
-                "not a folder",
-                where=path,
-                why="expected a new or empty folder to write to, found something else",
-                fix="choose another path",
-            )
+            raise UsageError("not a folder", where=path, why=f"{why} something else", fix="choose another path")
         if path.is_dir() and any(path.iterdir()):
-            raise UsageError(
-                "folder is not empty",
-                where=path,
-                why=f"expected a new or empty folder to write to, found {len(list(path.iterdir()))} entries",
-                fix="choose another path, or remove the folder first",
-            )
+            why, fix = f"{why} {len(list(path.iterdir()))} entries", "choose another path, or remove the folder first"
+            raise UsageError("folder is not empty", where=path, why=why, fix=fix)
         made = [parent for parent in reversed(path.absolute().parents) if not parent.exists()]
         path.parent.mkdir(parents=True, exist_ok=True)
         sweep(path)
@@ -185,11 +146,7 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
 
 
 def write_through(path: Path, data: bytes | memoryview) -> None:
-    """Create a file, flush it to the disk and check its size.
-
-    Raises:
-        OSError: If it exists, or could not be written in full.
-    """
+    """Create a file, flush it to the disk and check its size; an OSError if it exists or is incomplete."""
     with open(path, "xb") as file:
         file.write(data)
         file.flush()
@@ -211,13 +168,13 @@ def flush_folder(path: str | Path) -> None:
 
 
 def sweep(path: str | Path) -> None:
-    """Remove what killed processes left of earlier attempts to write ``path``; living ones keep theirs."""
+    """Remove temporary files of ``path`` that belong to processes which no longer run."""
     path = Path(path)
     _sweep(path.absolute().parent, f".{path.name}.tmp-")
 
 
 def _sweep(folder: Path, start: str) -> None:
-    """The same for all temporary names that start so."""
+    """:func:`sweep` for all temporary names with this start."""
     with contextlib.suppress(OSError):  # another process may sweep at the same time
         for name in [name for name in os.listdir(folder) if name.startswith(start)]:  # few of perhaps many
             match, entry = re.fullmatch(r"\..+\.tmp-(\d+)-\d+", name), folder / name
@@ -230,7 +187,7 @@ def _sweep(folder: Path, start: str) -> None:
 
 @contextlib.contextmanager
 def _renamed_to(path: Path) -> Iterator[Path]:
-    """A temporary name: at a normal end it becomes ``path``, at an exception what has it is removed."""
+    """Temporary file name, renamed to ``path`` at a normal end, removed after an exception."""
     temporary = _temporary(path)
     try:
         yield temporary
@@ -245,9 +202,9 @@ def _temporary(path: Path) -> Path:
 
 
 def _alive(pid: int) -> bool:
-    """Whether a process runs; where the system cannot say, yes."""
+    """Whether a process runs; true where the system cannot tell."""
     if os.name == "nt" or pid <= 0:
-        return True  # on Windows os.kill would end the process instead of asking
+        return True  # on Windows os.kill would end the process
     try:
         os.kill(pid, 0)
     except ProcessLookupError:
@@ -259,12 +216,7 @@ def _alive(pid: int) -> bool:
 
 @contextlib.contextmanager
 def as_errors(path: Path) -> Iterator[None]:
-    """Turn what the system says about writing to ``path`` into errors a user can act on.
-
-    Raises:
-        ResourceError: If the disk is full.
-        UsageError: If the place cannot be written to.
-    """
+    """Convert errors of the system while writing ``path``: ResourceError for a full disk, else UsageError."""
     try:
         yield
     except GftorfError:
@@ -274,7 +226,7 @@ def as_errors(path: Path) -> Iterator[None]:
             raise ResourceError(
                 "no space left", where=path, why=str(error), fix="free disk space, or write to another disk"
             ) from error
-        raise UsageError("cannot write", where=path, why=str(error), fix="choose a place you may write to") from error
+        raise UsageError("cannot write", where=path, why=str(error), fix="choose a writable folder") from error
 
 
 def _plain(value: object) -> object:

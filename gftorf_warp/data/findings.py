@@ -1,4 +1,4 @@
-"""What ``gftorf check`` finds in the images of a sequence: order, scale, truth, flow, a camera that moved."""
+"""Findings of ``gftorf check`` in the images of a sequence: order, scale, truth, flow, camera motion."""
 
 from __future__ import annotations
 
@@ -19,34 +19,36 @@ from .read import read_truth
 from .sequence import Sequence, Truth
 
 NAMES = {"capture": "capture", "ftorf": "F-ToeRF", "torf": "ToeRF"}
-SATURATED_SHARE = 1e-3  # of the pixels of a frame at the very extreme: light repeats itself only where it is cut off
-SATURATED_PIXELS = 10  # and no fewer, so that the one brightest pixel of a small image is none
-MATCH_MIN = 0.9  # of the correlation of stored phasors with the quads: motion alone costs a few per cent
+SATURATED_SHARE = 1e-3  # of the pixels of a frame at an extreme value: light repeats a value only where it is clipped
+SATURATED_PIXELS = 10  # and at least so many, since the brightest pixel of a small image is not saturation
+MATCH_MIN = 0.9  # of the correlation of stored phasors with the quads: motion alone lowers it by a few per cent
 RANGE_TOLERANCE = 0.02  # relative, of the depth_range that the truth implies
 OFFSET_TOLERANCE_RAD = 0.05  # [rad] 6 cm at 20 MHz
-DECODED_M = 1e-3  # [m] a "truth" this close to the decoded quads, where those change by more, was decoded from them
+DECODED_M = (
+    1e-3  # [m] a stored "truth" this close to the decoded distance where that changes by more is not independent
+)
 DECODED_SHARE = 0.9  # of the changing pixels
-CHANGING_PIXELS = 100  # a static scene without noise is decoded to its truth, and nothing is wrong with that
+CHANGING_PIXELS = 100  # a static scene without noise decodes to its truth
 THIRD_MATCH_MIN = 0.9  # of the correlation of the third channel with the length of (re, im), where it is an amplitude
-AMBIGUOUS_SHARE = 0.1  # of the pixels: outlines of what moves and dark corners are fewer
-MOVED_SHARE = 0.5  # of the bright pixels: an object alone rarely covers as much
+AMBIGUOUS_SHARE = 0.1  # of the pixels: outlines of moving objects and dark corners are fewer
+MOVED_SHARE = 0.5  # of the bright pixels: a single object rarely covers as much
 BASELINE_MAX_M = 1.0  # [m] two cameras of one housing are centimetres apart
-Z_FITS = 0.8  # of the residual as distance: below, the stored numbers are z-depth
+Z_FITS = 0.8  # ratio of residuals: below, the stored numbers are z-depth
 FITTED_M = 1e-3  # [m] a residual below this needs no other explanation
 
 
 @dataclass(kw_only=True)
 class Report:
-    """Outcome of a check; ``str`` of it is what is printed."""
+    """Result of a check; ``str`` of it is printed."""
 
     path: Path
     """The sequence."""
     form: str
-    """Its format, ``ftorf`` or ``torf``."""
+    """Its format, ``capture``, ``ftorf`` or ``torf``."""
     lines: list[str] = field(default_factory=list)
     """Facts, one a line."""
     warnings: list[str] = field(default_factory=list)
-    """What looks wrong, or was assumed."""
+    """Implausible or assumed values."""
 
     def __str__(self) -> str:
         flags = [f"warning: {text}" for text in self.warnings] or ["no warnings"]
@@ -71,7 +73,7 @@ def light(sequence: Sequence, report: Report) -> None:
 
 
 def frequencies(sequence: Sequence, report: Report) -> None:
-    """How far several modulation frequencies agree on one distance."""
+    """Agreement of several modulation frequencies on one distance."""
     if len(sequence.frequencies) < 2:
         return
     decoded = [decode_quartet(sequence, i) for i in sequence.complete_quartets]
@@ -83,7 +85,7 @@ def frequencies(sequence: Sequence, report: Report) -> None:
     )
     if ambiguous > AMBIGUOUS_SHARE:
         report.warnings.append(
-            f"frequencies disagree: {ambiguous:.0%} of the pixels could as well be another distance; noise, motion "
+            f"frequencies disagree: {ambiguous:.0%} of the pixels would fit another distance as well; noise, motion "
             "within a cycle, or another phase offset at each frequency"
         )
 
@@ -94,7 +96,7 @@ def constant_part(sequence: Sequence, report: Report) -> None:
     report.lines.append(f"dc estimate     {estimate:.4f} of the amplitude, {sequence.calibration.dc_offset:g} in use")
     if abs(estimate - sequence.calibration.dc_offset) > estimates.DC_TOLERANCE:
         report.warnings.append(
-            f"dc_offset {sequence.calibration.dc_offset:g} is in use, but the quads say {estimate:.3f}"
+            f"dc_offset {sequence.calibration.dc_offset:g} is in use, but the quads have {estimate:.3f}"
         )
 
 
@@ -113,7 +115,7 @@ def order(sequence: Sequence, report: Report) -> None:
 
 
 def third_channel(sequence: Sequence, report: Report) -> None:
-    """Third channel of stored phasors against the length of the first two."""
+    """Third channel of stored phasors compared with the length of the first two."""
     assert sequence.path is not None
     spec = specs.fields(report.form)["phasor"]
     files = torf.stored(sequence.path).files
@@ -128,7 +130,7 @@ def third_channel(sequence: Sequence, report: Report) -> None:
 
 
 def camera(sequence: Sequence, report: Report) -> None:
-    """A camera that moved without poses, and a colour camera that is implausibly far off."""
+    """Camera motion without poses, and an implausibly distant colour camera."""
     if np.array_equal(sequence.camera_from_world, np.broadcast_to(np.eye(4), sequence.camera_from_world.shape)):
         share = estimates.changed_share(sequence)
         report.lines.append(f"change          {share:.0%} of bright pixels from the first to the last quartet")
@@ -142,11 +144,13 @@ def camera(sequence: Sequence, report: Report) -> None:
         baseline = float(np.linalg.norm(relative[:, :3, 3], axis=1).max())
         report.lines.append(f"baseline        {baseline:.4g} m from the colour camera to the ToF camera")
         if baseline > BASELINE_MAX_M:
-            report.warnings.append(f"the colour camera stands {baseline:.4g} m off: millimetres, or another world?")
+            report.warnings.append(
+                f"the colour camera is {baseline:.4g} m away: millimetres, or another coordinate system?"
+            )
 
 
 def phasors(sequence: Sequence, report: Report) -> None:
-    """Stored phasors against those of the quads."""
+    """Stored phasors compared with those of the quads."""
     assert sequence.path is not None
     spec = specs.fields(report.form)["phasor"]
     size = {"H": sequence.height, "W": sequence.width}
@@ -167,7 +171,7 @@ def phasors(sequence: Sequence, report: Report) -> None:
 
 
 def truth(sequence: Sequence, report: Report) -> None:
-    """Decoded static pixels against the stored distance."""
+    """Stored distance compared with decoded static pixels."""
     assert sequence.path is not None
     patterns = specs.fields(report.form)["distance"].paths
     folder = next((p for p in patterns if numbered(sequence.path, p)), patterns[0]).partition("/")[0]
@@ -179,22 +183,22 @@ def truth(sequence: Sequence, report: Report) -> None:
     if truth is None:
         report.lines.append("truth           none")
         return
-    seen = truth.distance[np.isfinite(truth.distance)]
+    known = truth.distance[np.isfinite(truth.distance)]
     unambiguous = unambiguous_range(sequence)
     frames = int(truth.known.sum()) // (sequence.cycle if sequence.from_phasors else 1)
     report.lines.append(
         f"truth           {frames} frames in {folder}"
-        + (f", {seen.min():.4g} .. {seen.max():.4g} m" if len(seen) else ", no known pixel")
+        + (f", {known.min():.4g} .. {known.max():.4g} m" if len(known) else ", no known pixel")
     )
     if _is_decoded(sequence, truth):
         if sequence.from_phasors:
-            decoded = "decoded from these phasors, or they are without noise: doubtful as truth"
+            decoded = "decoded from these phasors, or they are without noise: doubtful as ground truth"
         else:
-            decoded = "decoded from these quads: it is no truth, do not compare with it"
+            decoded = "decoded from these quads: it is not ground truth, do not compare with it"
         report.warnings.append(f"{folder} was {decoded}")
         return
-    if len(seen) and seen.max() > unambiguous:
-        report.warnings.append(f"range wraps: distances to {seen.max():.4g} m, unambiguous to {unambiguous:.4g} m")
+    if len(known) and known.max() > unambiguous:
+        report.warnings.append(f"range wraps: distances to {known.max():.4g} m, unambiguous to {unambiguous:.4g} m")
     poses = sequence.camera_from_world
     if not sequence.from_phasors and not np.array_equal(poses, np.broadcast_to(poses[0], poses.shape)):
         report.lines.append("phase fit       none: the camera moves between the raw frames of a quartet")
@@ -203,7 +207,7 @@ def truth(sequence: Sequence, report: Report) -> None:
 
 
 def _fit(sequence: Sequence, truth: Truth, folder: str, report: Report) -> None:
-    """Range and offset that the truth implies, and whether it is distance at all."""
+    """Range and offset implied by the truth, and whether it is distance along the ray or z-depth."""
     fit = estimates.phase_fit(sequence, truth)
     if fit is None:
         report.lines.append("phase fit       too few static pixels")
@@ -229,7 +233,7 @@ def _fit(sequence: Sequence, truth: Truth, folder: str, report: Report) -> None:
 
 
 def _is_decoded(sequence: Sequence, truth: Truth) -> bool:
-    """Whether the stored distance follows the decoded one even where noise and motion change it."""
+    """Whether the stored distance follows the decoded one even where that changes by noise and motion."""
     quartets = sequence.complete_quartets
     decoded = {i: closed_form_distance(sequence, i) for i in quartets}
     changing = agreeing = 0
@@ -241,7 +245,7 @@ def _is_decoded(sequence: Sequence, truth: Truth) -> bool:
 
 
 def flow(sequence: Sequence, report: Report) -> None:
-    """Whether given flow explains the motion between frames of one shift."""
+    """Whether stored flow explains the motion between frames of one shift."""
     for name, images, step in (
         ("forward", sequence.flow.forward, sequence.cycle),
         ("backward", sequence.flow.backward, -sequence.cycle),

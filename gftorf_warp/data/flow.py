@@ -1,8 +1,8 @@
-"""Optical flow from raw frames, where a recording brings none: between frames of one shift, a cycle apart.
+"""Optical flow from raw frames, for recordings without flow: between frames of one shift, a cycle apart.
 
 Frames n and n + K have the same shift and frequency, K being the raw frames of a cycle, so a moving surface looks
 nearly alike in both. The flow of quartet start n is the median over the pairs n + j that start at most half a cycle
-away: pair n + j saw the surface a little earlier or later, at x + s F(x), s being its time from n in units of the
+away: pair n + j shows the surface a little earlier or later, at x + s F(x), s being its time from n in units of the
 pair's length. Pairs of different shifts have their weak contrast at different distances, and their noise is
 independent.
 """
@@ -21,10 +21,8 @@ from .sequence import Flow, Sequence
 
 Method = Literal["dis", "deepflow"]
 
-APART_MAX = 0.5  # of a cycle: pairs that start farther from n see another motion where paths are curved
-CONSISTENCY_PX = (
-    1.0  # [px] forward and backward may disagree by this much; occluded pixels disagree by the motion itself
-)
+APART_MAX = 0.5  # of a cycle: pairs that start farther from n have another motion where paths are curved
+CONSISTENCY_PX = 1.0  # [px] of forward and backward flow; occluded pixels disagree by the motion itself
 BLUR_PX = 0.7  # [px] before matching: halves the noise, keeps edges
 SMALLEST_PX = 12  # [px] the matcher refuses smaller images
 ROBUST_PERCENT = 0.05  # [%] of pixels at either end that may saturate, so that one hot pixel does not set the scale
@@ -34,7 +32,7 @@ def compute_flow(sequence: Sequence, *, method: Method = "dis") -> Flow:
     """Compute the optical flow of every quartet start whose partner a cycle away was measured too.
 
     Args:
-        sequence: Its quads; flow it brings itself is not looked at.
+        sequence: Its quads; stored flow is ignored.
         method: ``dis`` is fast and follows large motion; ``deepflow`` is smoother where motion stays below about two
             pixels in a cycle, and loses what moves farther.
 
@@ -52,7 +50,7 @@ def compute_flow(sequence: Sequence, *, method: Method = "dis") -> Flow:
             "images too small for optical flow",
             where=sequence.path or "sequence",
             why=f"expected at least {SMALLEST_PX}x{SMALLEST_PX} pixels, found {sequence.width}x{sequence.height}",
-            fix="bring the flow as files, or use larger images",
+            fix="provide flow as files, or use larger images",
         )
     step, times, quads = sequence.cycle, sequence.times, sequence.quads
     pairs = [n for n in range(sequence.frames - step) if sequence.measured[n] and sequence.measured[n + step]]
@@ -92,7 +90,7 @@ def _matcher(method: Method) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
     engine: Any  # OpenCV's stubs do not know that the flow to start from may be None
     if method == "dis":
         engine = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-        engine.setFinestScale(0)  # the preset stops at half resolution, where a raw frame has few pixels to begin with
+        engine.setFinestScale(0)  # the preset stops at half resolution; raw frames are small
         engine.setVariationalRefinementIterations(20)
     else:
         engine = cv2.optflow.createOptFlow_DeepFlow()

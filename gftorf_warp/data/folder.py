@@ -1,4 +1,4 @@
-"""Sequence folders: which format one has, which numbered files it holds, and the images in them."""
+"""Sequence folders: their format, numbered files and images."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ EXPECTED = (
     "expected a folder with capture.json (a capture), tofType0 .. tofType3 and cams (F-ToeRF: raw quads), or tof and "
     "cams (ToeRF: phasors)"
 )
-UNFINISHED = "unfinished.md"  # stands in the folder of a recording that is not complete
+UNFINISHED = "unfinished.md"  # exists in the folder of an incomplete recording
 FRAMES_MAX = 1_000_000  # over two hours at 120 Hz: a higher id is a typing error
 
 
@@ -46,8 +46,8 @@ def format_of(path: Path) -> str:
         raise InputError(
             "an unfinished recording",
             where=path,
-            why=f"{EXPECTED}, found what an interrupted `gftorf simulate` left",
-            fix="give that command again, and it goes on",
+            why=f"{EXPECTED}, found files of an interrupted `gftorf simulate`",
+            fix="repeat that command, which continues",
         )
     for other in [path.absolute().parent, *sorted(entry for entry in path.iterdir() if entry.is_dir())]:
         if format_or_none(other) is not None:
@@ -56,7 +56,7 @@ def format_of(path: Path) -> str:
 
 
 def format_or_none(path: Path) -> str | None:
-    """Format that a folder looks like, by what every folder of it holds; None: of none."""
+    """Format of a folder by the names in it; None if it has none."""
     if (path / UNFINISHED).is_file():
         return None
     if (path / CAPTURE).is_file():
@@ -67,11 +67,11 @@ def format_or_none(path: Path) -> str | None:
 
 
 def numbered(root: Path, pattern: str) -> dict[int, Path]:
-    """Files of a folder by the number in their name, in order; other names are left alone.
+    """Files of a folder by the number in their name, in order; other names are ignored.
 
     Args:
         root: The sequence.
-        pattern: Where they lie, for example ``forward_flow/flow_{id}.npy``; numbers of .exr files have six digits,
+        pattern: Relative name, for example ``forward_flow/flow_{id}.npy``; numbers of .exr files have six digits,
             others four or more.
     """
     folder, _, name = pattern.rpartition("/")
@@ -85,7 +85,7 @@ def numbered(root: Path, pattern: str) -> dict[int, Path]:
 
 
 def refuse_absurd_ids(files: dict[int, Path]) -> None:
-    """Whether the ids are numbers of frames: memory is asked for in proportion.
+    """Check that the ids are numbers of frames: memory is allocated in proportion.
 
     Raises:
         InputError: If not.
@@ -100,7 +100,7 @@ def refuse_absurd_ids(files: dict[int, Path]) -> None:
 
 
 def first_size(files: dict[int, Path], spec: specs.Field, problems: Problems) -> dict[str, int]:
-    """Rows H and columns W that the first readable header states; empty if none is, and then ``problems`` says why."""
+    """Rows H and columns W in the first readable header; empty if there is none, with the reasons in ``problems``."""
     unread = Problems()
     for file in files.values():
         shape = unread.attempt(read_shape, file, spec)
@@ -119,8 +119,8 @@ def read_field(
         root: The sequence.
         spec: The field.
         frames: Number of frames; files of later ones are not opened.
-        size: Rows H and columns W, where they are known.
-        problems: Takes what is wrong.
+        size: Rows H and columns W, if known.
+        problems: Collects errors.
         first_id: Id of frame 0.
     """
     for pattern in spec.paths:
@@ -136,7 +136,7 @@ def read_field(
 def load(
     root: Path, spec: specs.Field, files: dict[int, Path], size: dict[str, int], problems: Problems
 ) -> tuple[dict[int, np.ndarray], str]:
-    """Read image files as float32; what the first one leaves open of their shape binds the others."""
+    """Read image files as float32; all have the shape of the first."""
     images: dict[int, np.ndarray] = {}
     rounded: str | None = None
     bound = dict(size)
@@ -155,7 +155,7 @@ def load(
 
 
 def empty_quads(root: Path, frames: int, size: dict[str, int]) -> np.ndarray:
-    """Zeros [F, H, W], or an error that says why not.
+    """Zeros [F, H, W].
 
     Raises:
         ResourceError: If they do not fit into memory.
@@ -169,5 +169,5 @@ def empty_quads(root: Path, frames: int, size: dict[str, int]) -> np.ndarray:
 
 
 def _free(array: np.ndarray, spec: specs.Field) -> list[int]:
-    """Lengths of the axes that the field names by a letter."""
+    """Lengths of the axes that have a letter in the field."""
     return [n for n, letter in zip(array.shape, spec.shapes[0], strict=True) if isinstance(letter, str)]

@@ -18,7 +18,7 @@ def locked(folder: Path, name: str, what: str) -> Iterator[None]:
     Args:
         folder: It is made if it is missing.
         name: File name of the lock; it stays.
-        what: What the folder holds, for the message.
+        what: Content of the folder, for the message.
 
     Raises:
         BusyError: If another process, or another call in this one, holds it.
@@ -30,7 +30,7 @@ def locked(folder: Path, name: str, what: str) -> Iterator[None]:
             raise BusyError(
                 f"another process works on this {what}",
                 where=folder,
-                why=f"its lock is held by {file.read().strip() or 'somebody'}",
+                why=f"its lock is held by {file.read().strip() or 'an unknown process'}",
                 fix="wait for it, stop it, or choose another --out",
             )
         file.truncate(0)
@@ -43,7 +43,7 @@ def locked(folder: Path, name: str, what: str) -> Iterator[None]:
 
 
 def _try_lock(descriptor: int) -> bool:
-    """Take the system's lock on an open file, without waiting; where the system has none, everybody gets it."""
+    """Take the system's lock on an open file, without waiting; on systems without one it always succeeds."""
     try:
         import fcntl
     except ImportError:  # not a Unix

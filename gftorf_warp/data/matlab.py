@@ -1,6 +1,6 @@
-"""One real matrix out of a MATLAB 5 file, and nothing else: no cells, structures, objects or code.
+"""One real matrix of a MATLAB 5 file: no cells, structures, objects or code.
 
-A page of our own instead of ``scipy.io.loadmat``, which crashes the interpreter on damaged files. A file is 128 bytes
+Used instead of ``scipy.io.loadmat``, which crashes the interpreter on damaged files. A file is 128 bytes
 of header and then elements: a tag (type, length) and the data, padded to eight bytes; four bytes or fewer fit into the
 tag. A matrix is an element of elements: flags with the class, size, name, values by column.
 """

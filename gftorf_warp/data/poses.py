@@ -11,7 +11,7 @@ from . import specs
 from .arrays import read_array, read_choice
 
 ROTATION_TOLERANCE = 1e-4  # float32 poses are off by 1e-7, mixed-up or scaled matrices by much more
-SAME_POSE = 1e-9  # float64 products of poses differ by 1e-15, other poses by much more; metres, and 1 for rotations
+SAME_POSE = 1e-9  # float64 products of poses differ by 1e-15, other poses by much more; [m] and [1]
 
 
 def rigid(poses: np.ndarray) -> np.ndarray:
@@ -156,7 +156,7 @@ def _refuse_others(path: Path, name: str, poses: np.ndarray) -> None:
     if not fine.all():
         n = int(np.argmin(fine))
         raise InputError(
-            f"{name}: {int((~fine).sum())} poses are no rigid motions",
+            f"{name}: {int((~fine).sum())} poses are not rigid motions",
             where=path,
             why=f"expected rotations of determinant +1 and a last row 0 0 0 1, found at pose {n} {poses[n].tolist()}",
             fix="store matrices that take world to camera (relative_pose: colour to ToF camera), x right, y down, "

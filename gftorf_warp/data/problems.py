@@ -1,4 +1,4 @@
-"""Collecting what is wrong with a folder, so that one pass names all of it."""
+"""Collecting input errors of a folder, so that one pass reports all of them."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import ParamSpec, TypeVar
 
 from ..errors import InputError
 
-SHOWN = 20  # one broken export repeats itself in every file
+SHOWN = 20  # a broken export has the same error in every file
 P = ParamSpec("P")
 T = TypeVar("T")
 

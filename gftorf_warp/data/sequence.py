@@ -135,20 +135,20 @@ class Sequence:
 
     @functools.cached_property
     def cycle(self) -> int:
-        """Raw frames K of a cycle, after which the sensor begins anew: quartet i is raw frames K i .. K (i + 1) - 1.
+        """Number K of raw frames in a cycle: quartet i is raw frames K i .. K (i + 1) - 1.
 
-        As stated, else the period of shifts and frequencies: four for a sensor of four shifts at one frequency.
+        The stated one, else the period of shifts and frequencies: four for a sensor of four shifts at one frequency.
         """
         return self.calibration.cycle_length or find_cycle(self.shifts, self.frame_frequencies)
 
     @functools.cached_property
     def frequencies(self) -> tuple[float, ...]:
-        """The modulation frequencies of a cycle [Hz], in the order in which it has them."""
+        """The modulation frequencies of a cycle [Hz], in order of appearance."""
         return frequencies_by_order(self.frame_frequencies[: self.cycle])
 
     @functools.cached_property
     def quads_per_phasor(self) -> int:
-        """How many raw frames of a cycle have its first frequency."""
+        """Number of raw frames of a cycle at its first frequency."""
         return int((self.frame_frequencies[: self.cycle] == self.frequencies[0]).sum())
 
     @functools.cached_property
@@ -170,20 +170,20 @@ class Sequence:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Truth:
-    """What the scene really was. Only simulation knows it, and only evaluation may read it."""
+    """Ground truth of a sequence, from simulation; for evaluation only."""
 
     distance: Float[np.ndarray, "F H W"]
     """Distance along the ray through each pixel centre at each raw frame [m], float32; NaN: unknown."""
     known: Bool[np.ndarray, "F"]
-    """Whether a raw frame has a distance at all."""
+    """Whether a raw frame has a distance."""
     phasor_distance: Float[np.ndarray, "F H W"] | None = None
-    """Static-phasor distance [m], float32, in [0, c/2f) of the raw frame's frequency: what the closed form would decode
-    if all quads at it were taken without noise at the very time of the raw frame, indirect light included; NaN:
-    unknown. None: not stored."""
+    """Static-phasor distance [m], float32, in [0, c/2f) of the raw frame's frequency: the closed form of
+    quads without noise, all taken at the time of the raw frame, indirect light included; NaN: unknown. None: not
+    stored."""
     amplitude: Float[np.ndarray, "F H W"] | None = None
     """Mean amplitude without noise [relative units], float32; None: not stored."""
     body: Int[np.ndarray, "F H W"] | None = None
-    """Which object the ray through each pixel centre meets, counted from 0; -1: none. None: not stored."""
+    """Index of the object that the ray through each pixel centre meets, from 0; -1: none. None: not stored."""
     layers: dict[str, Float[np.ndarray, "F C H W"]] = field(default_factory=dict)
-    """Whatever else a simulator knows, float32, by the names and with the channels of data_specs/capture.toml: light by
-    harmonic, its direct part and standard error, ambient light, z-depth, normals. Only a capture has a place for it."""
+    """Further layers, float32, with the names and channels of data_specs/capture.toml: light by harmonic, its direct
+    part and standard error, ambient light, z-depth, normals. Only captures store them."""

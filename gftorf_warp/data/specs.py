@@ -1,4 +1,4 @@
-"""The description of a format in data_specs/, as values: what readers check against and writers follow."""
+"""The descriptions of formats in data_specs/ as values, which readers check and writers follow."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ class Field:
     """One field of a format; the comments on top of data_specs/ftorf.toml explain each entry."""
 
     name: str
-    """What errors and reports call it."""
+    """Name in errors and reports."""
     paths: tuple[str, ...]
-    """Where it lies in the folder, best first, with {slot} and {id} open."""
+    """Relative names of its files, best first, with {slot} and {id} open."""
     kind: str
     """array, choice, json, exr or other."""
     role: str
@@ -30,25 +30,25 @@ class Field:
     unit: str
     """Unit of the stored numbers."""
     meaning: str
-    """What it is, in sentences."""
+    """Description in sentences."""
     written: str
-    """What our writer stores."""
+    """Value that our writer stores."""
     required: bool
-    """Whether a folder without it is no sequence."""
+    """Whether a folder must have it."""
     fills: tuple[str, ...] = ()
-    """Fields of Sequence or Truth that it becomes."""
+    """Values of a Sequence or Truth that it becomes, by the names of ``Sequence.sources``."""
     shapes: tuple[tuple[Size, ...], ...] = ()
     """Allowed shapes, numbers or letters; () is any array of one number."""
     dtypes: str = ""
     """Allowed numpy kinds."""
     nan: str = "error"
-    """error or unknown: what a NaN means."""
+    """error or unknown: meaning of a NaN."""
     default: float | tuple[int, ...] | None = None
     """The value where the file is missing."""
     mat_key: str | None = None
     """The one variable that is read from a .mat file."""
     key: str = ""
-    """The one key of a choice; where a value stands in a JSON file; the part of an EXR file."""
+    """Key of a choice; path of a value in a JSON file; part of an EXR file."""
     choices: tuple[str, ...] = ()
     """Its allowed values."""
     channels: tuple[str, ...] = ()
@@ -68,7 +68,7 @@ def fields(name: str) -> dict[str, Field]:
 
 
 def layer_field(name: str) -> Field:
-    """The field of data_specs/capture.toml that describes a layer of the truth: ``{h}`` stands for a harmonic.
+    """The field of data_specs/capture.toml that describes a layer of the truth; ``{h}`` is a harmonic.
 
     Raises:
         ValueError: If none does.

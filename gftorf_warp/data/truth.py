@@ -1,4 +1,4 @@
-"""What ground truth says about pixels: how far they are, which of them move. For evaluation and diagnostics only."""
+"""Distances and moving pixels from ground truth, for evaluation and diagnostics only."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ MOVING_M = 0.05  # [m] twice the noise of a distance decoded from typical quads,
 
 
 def known_distance(truth: Truth) -> Float[np.ndarray, "F H W"]:
-    """True distance of every raw frame [m], NaN wherever it is unknown."""
+    """True distance of every raw frame [m], NaN where unknown."""
     return np.where(truth.known[:, None, None], truth.distance, np.nan)
 
 
@@ -23,12 +23,12 @@ def moving_and_static(
     from_phasors: bool = False,
     cycle: int = FRAMES_PER_QUARTET,
 ) -> tuple[Bool[np.ndarray, "S H W"], Bool[np.ndarray, "S H W"]]:
-    """Which pixels of the S scored frames move, and which rest.
+    """Moving and static pixels of the S scored frames.
 
-    A pixel moves if its true distance has max - min > 0.05 m within the raw frames of its quartet. It rests if all of
-    them are known and it does not move; with unknown truth [NaN] it may be neither. The raw frames of a phasor are one
-    instant, so there a pixel moves if its distance differs that much from one phasor to the next (the last: from the
-    one before).
+    A pixel moves if its true distance has max - min > 0.05 m within the raw frames of its quartet. It is static if all
+    of them are known and it does not move; with unknown truth [NaN] it may be neither. The raw frames of a phasor are
+    of one instant, so a pixel of phasors moves if its distance differs that much from one phasor to the next (the last:
+    from the previous one).
 
     Args:
         distance_truth: True distance of every raw frame [m]; NaN: unknown.
@@ -39,12 +39,15 @@ def moving_and_static(
     step = cycle
     moving, static = {}, {}
     for quartet in {n // step for n in frames}:
-        seen = distance_truth[step * quartet : step * (quartet + 1)]
+        quartet_truth = distance_truth[step * quartet : step * (quartet + 1)]
         if from_phasors:
             neighbour = quartet + 1 if step * (quartet + 1) < len(distance_truth) else max(quartet - 1, 0)
-            seen = distance_truth[[step * quartet, step * neighbour]]
-        unknown = np.isnan(seen)
-        low, high = np.where(unknown, np.inf, seen).min(axis=0), np.where(unknown, -np.inf, seen).max(axis=0)
+            quartet_truth = distance_truth[[step * quartet, step * neighbour]]
+        unknown = np.isnan(quartet_truth)
+        low, high = (
+            np.where(unknown, np.inf, quartet_truth).min(axis=0),
+            np.where(unknown, -np.inf, quartet_truth).max(axis=0),
+        )
         moving[quartet] = high - low > MOVING_M
         static[quartet] = ~moving[quartet] & ~unknown.any(axis=0)
     rows = [n // step for n in frames]
@@ -52,7 +55,7 @@ def moving_and_static(
 
 
 def nearest(images: Float[np.ndarray, "F H W"], height: int, width: int) -> Float[np.ndarray, "F h w"]:
-    """Images at another size: of each new pixel's centre the pixel that holds it. Distances must not be averaged."""
+    """Images resized by nearest neighbours: distances must not be averaged."""
     rows = ((np.arange(height) + 0.5) * images.shape[1] / height).astype(int)
     columns = ((np.arange(width) + 0.5) * images.shape[2] / width).astype(int)
     return images[:, rows[:, None], columns]

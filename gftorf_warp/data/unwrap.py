@@ -1,10 +1,10 @@
-"""Several modulation frequencies together know distances farther than each alone, as a sensor computes it.
+"""Phase unwrapping by several modulation frequencies, as a sensor computes it.
 
 With f_i = m_i f_0 and m_1, m_2, .. without common divisor the range is c / 2 f_0. A wrapped phase at f_1 leaves the m_1
-candidates (psi_1 + 2 pi k) / m_1 for the phase at f_0. Each of them says what the other phases are; the one whose
-straight line through all phases leaves least is taken. For two frequencies that is the pair of candidates that is
-closest on the circle (sensor notes, 2.7). The phases are from raw frames of different times: what moves between them
-breaks this before noise does.
+candidates (psi_1 + 2 pi k) / m_1 for the phase at f_0. Each candidate predicts the other phases; the one with the
+smallest residual of a straight line through all phases is chosen. For two frequencies that is the pair of candidates
+closest on the circle (sensor notes, 2.7). The phases are from raw frames of different times: motion between them breaks
+this before noise does.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from ..constants import SPEED_OF_LIGHT
 
 MULTIPLE_MAX = 16  # f_1 / f_2 is a fraction of numbers up to this: more candidates are closer than any noise allows
 COMMENSURATE = 1e-4  # [1] of the ratio: beyond it the phases drift by more than 0.01 rad over the common range
-CONFIDENT = 0.5  # [1] below, another distance leaves less than twice the residual of the one that was taken
+CONFIDENT = 0.5  # [1] below, another distance has less than twice the residual of the chosen one
 
 
 class Chosen(NamedTuple):
-    """Which candidate the phases of several frequencies speak for."""
+    """Candidate that fits the phases of several frequencies best."""
 
     turns: Int[np.ndarray, "*n"]
     """Whole turns k of the first phase, 0 .. m_1 - 1."""
@@ -66,7 +66,7 @@ def _incommensurate(listed: str) -> ValueError:
 
 
 def common_range(frequencies_hz: Sequence[float]) -> float:
-    """Range [m] that some frequencies know together: c / 2 f_0, or c / 2f of a single one.
+    """Unambiguous range [m] of some frequencies together: c / 2 f_0, or c / 2f of a single one.
 
     Raises:
         ValueError: If they are no small multiples of one.
@@ -76,7 +76,7 @@ def common_range(frequencies_hz: Sequence[float]) -> float:
 
 
 def choose(phases: Float[np.ndarray, "f *n"], ms: Sequence[int]) -> Chosen:
-    """Which of the m_1 candidates of the first phase all phases speak for.
+    """Choose among the m_1 candidates of the first phase the one that fits all phases best.
 
     Args:
         phases: At m_i f_0 [rad], phase offset removed, wrapped to [0, 2 pi) or not.
@@ -97,7 +97,7 @@ def choose(phases: Float[np.ndarray, "f *n"], ms: Sequence[int]) -> Chosen:
         second = np.where(nearer, best, np.minimum(second, left))
         turns[nearer] = k
         best = np.where(nearer, left, best)
-    if ms[0] == 1:  # the other phases choose nothing, but they may contradict: a whole turn of the finest is the scale
+    if ms[0] == 1:  # one candidate, which the other phases may contradict: compared with a whole turn of the finest
         second = np.full(phases.shape[1:], _spacing(m.ravel()))
     with np.errstate(invalid="ignore", divide="ignore"):
         share = np.sqrt(np.where(second > 0, best / second, 1.0))
@@ -105,7 +105,7 @@ def choose(phases: Float[np.ndarray, "f *n"], ms: Sequence[int]) -> Chosen:
 
 
 def _spacing(m: np.ndarray) -> float:
-    """Least squared residual that one more turn of a single phase leaves where all others agree [rad^2]."""
+    """Smallest squared residual [rad^2] of one more turn of a single phase where all others agree."""
     return float(min((2.0 * math.pi) ** 2 * (1.0 - one**2 / np.sum(m**2)) for one in m))
 
 

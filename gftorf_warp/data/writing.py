@@ -34,7 +34,7 @@ def calibration_files(
 
 
 def validate(sequence: Sequence, truth: Truth | None) -> None:
-    """Whether the parts of a sequence fit together.
+    """Check that the parts of a sequence fit together.
 
     Raises:
         ValueError: If not, which is a programming mistake.
@@ -76,7 +76,7 @@ def validate(sequence: Sequence, truth: Truth | None) -> None:
 
 
 def _validate_phasors(sequence: Sequence) -> None:
-    """Whether raw frames that say they are from phasors look like it."""
+    """Check that raw frames of phasors have their form."""
     step = FRAMES_PER_QUARTET
     if sequence.frames % step:
         raise ValueError(f"from_phasors: {sequence.frames} raw frames must be a multiple of {step}")
@@ -100,7 +100,7 @@ def _validate_phasors(sequence: Sequence) -> None:
 
 
 def refuse_inexpressible(form: str, sequence: Sequence, truth: Truth | None) -> None:
-    """Whether the reader would accept what is written: its limits are those of the format.
+    """Check that the reader will accept the folder: its limits are those of the format.
 
     Raises:
         UsageError: If not.
@@ -182,7 +182,7 @@ def refuse_inexpressible(form: str, sequence: Sequence, truth: Truth | None) -> 
 
 
 def inexpressible(form: str, what: str, expected: str, found: str) -> UsageError:
-    """The error for what a format has no place for."""
+    """The error for values that a format cannot store."""
     return UsageError(
         f"{what}: the {form} format cannot hold this",
         where=f"format {form}",
@@ -197,7 +197,7 @@ def _colour_size(sequence: Sequence) -> tuple[int, int]:
 
 
 def _colour_intrinsics(sequence: Sequence) -> Intrinsics:
-    """Those of the colour camera; public loaders want one, so without any it stands where the ToF camera stands."""
+    """Those of the colour camera; public loaders require one, so without any, those of the ToF camera, scaled."""
     if sequence.colour.intrinsics is not None:
         return sequence.colour.intrinsics
     height, width = _colour_size(sequence)
@@ -220,7 +220,7 @@ def float32(array: np.ndarray) -> np.ndarray:
 
 
 def shortest(array: np.ndarray) -> np.ndarray:
-    """The array as float16 if every number survives that, else as it is."""
+    """The array as float16 if that is exact, else unchanged."""
     with np.errstate(over="ignore"):
         half = array.astype(np.float16)
     return half if np.array_equal(half.astype(np.float32), array) else array
