@@ -110,11 +110,11 @@ def test_a_network_is_encoded_by_its_backend(monkeypatch):
 def test_times_are_rounded_once_and_in_advance(settings, device):
     """Rows chosen in float32 are the rows chosen in float64 and rounded then, to the bit, and so are offsets."""
     made, gaussians = network(settings).to(device), field(anywhere(20), None).map(lambda value: value.to(device))
-    assert torch.equal(made.rounded, made.moments.float())
-    assert not torch.equal(made.rounded.double(), made.moments), "otherwise nothing was rounded"
+    assert torch.equal(made.time_encodings_f32, made.time_encodings.float())
+    assert not torch.equal(made.time_encodings_f32.double(), made.time_encodings), "otherwise nothing was rounded"
     place = made.bind(gaussians)
     for keys in ([0, 2, 3], torch.tensor([3, 0], dtype=torch.int32, device=device)):
-        want = made.offsets(place, made.moments[keys])
+        want = made.offsets(place, made.time_encodings[keys])
         assert torch.equal(made.at_keys(place, keys).offset, want)
 
 
@@ -123,5 +123,5 @@ def test_in_float64_times_are_not_rounded():
     made, gaussians = network().double(), field(anywhere(20).double(), None)
     place, keys = made.bind(gaussians), [0, 2, 3]
     found = made.at_keys(place, keys).offset
-    assert torch.equal(found, made.offsets(place, made.moments[keys]))
-    assert not torch.equal(found, made.offsets(place, made.rounded[keys]))
+    assert torch.equal(found, made.offsets(place, made.time_encodings[keys]))
+    assert not torch.equal(found, made.offsets(place, made.time_encodings_f32[keys]))

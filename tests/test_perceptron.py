@@ -69,7 +69,7 @@ def distance(one, other):
 
 def compare_replay(made, gaussians, cotangent):
     """Capture offsets and gradients at two keys; replay for other positions and times, and ask again."""
-    place, moment = made.bind(gaussians), made.moments[:2].clone()
+    place, moment = made.bind(gaussians), made.time_encodings[:2].clone()
     parameters = list(made.parameters())
 
     def call():
@@ -87,7 +87,7 @@ def compare_replay(made, gaussians, cotangent):
     with torch.cuda.graph(graph):
         kept = call()
     place.mul_(0.5)
-    moment.copy_(made.moments[2:])
+    moment.copy_(made.time_encodings[2:])
     graph.replay()
     for one, other in zip(kept, call(), strict=True):
         assert torch.equal(one, other)
@@ -100,7 +100,7 @@ def test_finite_differences_agree_in_float64(shape):
     form = Form.of(made, torch.float64)
     gaussians = positions(7).map(torch.Tensor.double)
     place = encoded(gaussians.mean / made.length, made.settings.position_frequencies, columns=form.columns)
-    moment = made.moments[[0, 2]]
+    moment = made.time_encodings[[0, 2]]
     layers = [*made.layers, made.head]
     parameters = [value.detach().requires_grad_() for layer in layers for value in (layer.weight, layer.bias)]
     found = Offsets.apply(form, CublasLayers(), place, moment, *parameters)
@@ -134,7 +134,7 @@ def on_the_same_side(made, gaussians, cotangent, keys):
     alive = [rows[:, : made.settings.width] > 0 for rows in saved]
     twin = copy.deepcopy(made).double()
     place = encoded(gaussians.mean.double() / made.length, made.settings.position_frequencies)
-    moment = made.moments[keys][:, None].expand(-1, len(place), -1)
+    moment = made.time_encodings[keys][:, None].expand(-1, len(place), -1)
     inputs = torch.cat([place.expand(len(keys), -1, -1), moment], dim=2).flatten(0, 1)
     hidden = inputs
     for number, layer in enumerate(twin.layers):

@@ -58,7 +58,7 @@ def inputs_of(made, count, keys):
     place = made.bind(positions(count).map(lambda value: value.to(device)))
     layers = [*made.layers, made.head]
     weights, biases = zip(*((layer.weight.detach(), layer.bias.detach()) for layer in layers), strict=True)
-    return made.backend.form, place, made.moments[:keys].to(device, torch.float32), weights, biases
+    return made.backend.form, place, made.time_encodings[:keys].to(device, torch.float32), weights, biases
 
 
 def alike(made, twin, count, keys, *, device="cpu", scale=1.0):

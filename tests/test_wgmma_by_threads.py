@@ -395,7 +395,7 @@ def test_a_block_of_threads_is_row_by_row(layers, skip_after, count, keys, tmp_p
     settings = MotionSettings(layers=layers, skip_after=skip_after)
     made = network(half(settings))
     form, place = made.backend.form, made.bind(positions(count))
-    moment = made.moments[:keys].float()
+    moment = made.time_encodings[:keys].float()
     both = [(layer.weight.detach(), layer.bias.detach()) for layer in [*made.layers, made.head]]
     weights, biases = (tuple(values) for values in zip(*both, strict=True))
     given = {}

@@ -92,6 +92,6 @@ def revive(state: State, settings: ReconSettings) -> None:
     if not again:
         return
     assert isinstance(state.motion, Network)
-    state.motion.draw(state.generator)
+    state.motion.reset_parameters(state.generator)
     state.optimiser.forget_motion()
     state.revived_at, state.revivals = state.images, state.revivals + 1

@@ -1,4 +1,4 @@
-"""Positions and times as a network reads them: gamma(v) = [v, sin 2^0 v, cos 2^0 v, sin 2^1 v, cos 2^1 v, ..]."""
+"""Positional encoding of positions and times: gamma(v) = [v, sin 2^0 v, cos 2^0 v, sin 2^1 v, cos 2^1 v, ..]."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ def powers_of_two(count: int) -> Float[Tensor, "f"]:
 
 
 def encoded_size(dimensions: int, frequencies: int) -> int:
-    """How many values gamma(v) has."""
+    """Number of elements of gamma(v)."""
     return dimensions * (1 + 2 * frequencies)
 
 
@@ -24,20 +24,20 @@ def encoded(
     columns: int | None = None,
     dtype: torch.dtype | None = None,
 ) -> Float[Tensor, "*n e"]:
-    """gamma(v): the values themselves, then sine and cosine of 2^0 v, 2^1 v, .., without a factor pi.
+    """gamma(v): the values, then sine and cosine of 2^0 v, 2^1 v, .., without a factor pi.
 
     Args:
         value: Without gradient.
-        frequencies: How many, or their ``powers_of_two``, which saves making them.
-        columns: Length of a row, zeros at its end; None: as many as there are.
+        frequencies: Their number, or their ``powers_of_two``, which saves an upload.
+        columns: Length of a row, padded with zeros; None: no padding.
         dtype: Of the result, rounded at the end; None: that of the values.
     """
     powers = (powers_of_two(frequencies) if isinstance(frequencies, int) else frequencies).to(value)
     count, dimensions = len(powers), value.shape[-1]
     size = encoded_size(dimensions, count)
     angles = value[..., None, :] * powers[:, None]
-    made = torch.empty if columns in (None, size) else torch.zeros
-    rows = made(*value.shape[:-1], columns or size, dtype=dtype or value.dtype, device=value.device)
+    allocate = torch.empty if columns in (None, size) else torch.zeros
+    rows = allocate(*value.shape[:-1], columns or size, dtype=dtype or value.dtype, device=value.device)
     rows[..., :dimensions] = value
     waves = rows[..., dimensions:size].unflatten(-1, (count, 2, dimensions))
     torch.sin(angles, out=waves[..., 0, :])

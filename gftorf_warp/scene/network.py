@@ -1,9 +1,10 @@
-"""Motion as a network of position and time: one multi-layer perceptron gives the offset of every Gaussian at every key.
+"""Motion by a network of position and time: an MLP gives the displacement of every Gaussian at every key.
 
-    delta(x, t) = head(layers([gamma(x), gamma(t)])),   gamma(v) = [v, sin 2^0 v, cos 2^0 v, .., sin 2^9 v, cos 2^9 v]
+    delta(x, t) = head(layers([gamma(x), gamma(t)]))
+    gamma(v) = [v, sin 2^0 v, cos 2^0 v, .., sin 2^9 v, cos 2^9 v]
 
-Layers end in a ReLU (method, section 4). Positions are divided by a length and enter without gradient; t runs from 0 at
-the first raw frame to 1 at the last. The encoded input is joined to the output of the fifth layer again.
+Layers end in a ReLU (method, section 4). Positions are divided by a length and have no gradient; t is 0 at
+the first raw frame and 1 at the last. The encoded input is concatenated to the output of the fifth layer.
 """
 
 from __future__ import annotations
@@ -20,31 +21,31 @@ from .encoding import encoded, encoded_size, powers_of_two
 from .gaussians import GaussianField
 from .motion import KeyMotion, Motion, MotionSettings, MotionStart, Products, rows_of
 
-HEAD_DEVIATION = 1e-5  # of the weights of the last layer: motion starts at rest, to a hundredth of a millimetre
+HEAD_DEVIATION = 1e-5  # of the initial weights of the head: displacements of a hundredth of a millimetre
 
 
 class Backend(Protocol):
-    """Computes a network in another way; ``render.network`` has those for half precision."""
+    """Another implementation of a network; ``render.network`` has those for half precision."""
 
     def encode(self, network: Network, mean: Float[Tensor, "N 3"]) -> Float[Tensor, "N p"]:
         """gamma(x) of positions [m], without gradient."""
         ...
 
     def offsets(
-        self, network: Network, binding: Float[Tensor, "N p"], moment: Float[Tensor, "k t"]
+        self, network: Network, binding: Float[Tensor, "N p"], time: Float[Tensor, "k t"]
     ) -> Float[Tensor, "k N 3"]:
         """Displacements [m] at times given as gamma(t), differentiable in the parameters."""
         ...
 
 
 class Network(Motion):
-    """Key offsets from a perceptron that knows nothing of single Gaussians: whoever is at a place moves with it."""
+    """Displacements by an MLP of position and time."""
 
     kind = "network"
     follows_means = True
-    moments: Tensor  # [T, t] float64, gamma(t) of every key; of the key times, so it is not stored
-    rounded: Tensor  # [T, t] the same for parameters in float32, so that a step converts nothing; not stored either
-    powers: Tensor  # [F] 2^0, 2^1, .. of the positions; not stored either
+    time_encodings: Tensor  # [T, t] float64, gamma(t) of every key; not stored, as all three
+    time_encodings_f32: Tensor  # [T, t] the same in float32, so that a step converts nothing
+    powers: Tensor  # [F] 2^0, 2^1, .. of the positions
 
     def __init__(
         self,
@@ -55,13 +56,13 @@ class Network(Motion):
         length: float,
         generator: torch.Generator | None = None,
     ):
-        """Draw the weights.
+        """Create the network with random weights.
 
         Args:
             key_times: Start of every quartet and the time one quartet after the last start [s].
             settings: Layers, width and frequencies.
-            duration: Time from the first raw frame to the last [s]; key times divided by it enter the network.
-            length: Positions divided by this enter the network [m].
+            duration: Time from the first raw frame to the last [s], by which times are divided.
+            length: Positions are divided by it [m].
             generator: For the weights, on the CPU.
 
         Raises:
@@ -72,21 +73,21 @@ class Network(Motion):
             raise ValueError(f"duration and length must be above 0, got {duration} s and {length} m")
         self.settings, self.duration, self.length = settings, float(duration), float(length)
         times = encoded(self.key_times[:, None] / self.duration, settings.time_frequencies)
-        self.register_buffer("moments", times, persistent=False)
-        self.register_buffer("rounded", times.float(), persistent=False)
+        self.register_buffer("time_encodings", times, persistent=False)
+        self.register_buffer("time_encodings_f32", times.float(), persistent=False)
         self.register_buffer("powers", powers_of_two(settings.position_frequencies), persistent=False)
-        self._inputs = (encoded_size(3, settings.position_frequencies), encoded_size(1, settings.time_frequencies))
+        frequencies = (3, settings.position_frequencies), (1, settings.time_frequencies)
+        self._sizes = [encoded_size(*numbers) for numbers in frequencies]  # of gamma(x) and gamma(t)
         self.backend: Backend | None = None
         """Computes the network in half precision; None: torch, in the precision of the parameters."""
-        joined, width = sum(self._inputs), settings.width
-        sizes = [joined] + [width] * (settings.layers - 1)
-        again = settings.skip_after if settings.skip_after < settings.layers else None
-        if again is not None:
-            sizes[again] += joined
-        self._layers = [torch.nn.Linear(size, width) for size in sizes]
+        size, width = sum(self._sizes), settings.width
+        inputs = [size] + [width] * (settings.layers - 1)
+        if settings.skip_after < settings.layers:
+            inputs[settings.skip_after] += size
+        self._layers = [torch.nn.Linear(count, width) for count in inputs]
         self.layers = torch.nn.ModuleList(self._layers)
         self.head = torch.nn.Linear(width, 3)
-        self.draw(generator)
+        self.reset_parameters(generator)
 
     @classmethod
     def start(cls, settings: MotionSettings, initial: MotionStart) -> Network:
@@ -96,10 +97,10 @@ class Network(Motion):
         return cls(initial.key_times, settings, duration=duration, length=length, generator=initial.generator)
 
     @torch.no_grad()
-    def draw(self, generator: torch.Generator | None) -> None:
-        """Begin anew, in place: other weights, everything at rest."""
+    def reset_parameters(self, generator: torch.Generator | None) -> None:
+        """New random weights, in place, with hardly any displacement."""
         for layer in [*self._layers, self.head]:
-            drawn = torch.empty(layer.weight.shape)  # on the CPU, where the generator is
+            drawn = torch.empty(layer.weight.shape)  # on the CPU, like the generator
             if layer is self.head:
                 drawn.normal_(0.0, HEAD_DEVIATION, generator=generator)
             else:
@@ -116,8 +117,9 @@ class Network(Motion):
 
     def at_keys(self, binding: Float[Tensor, "N p"], keys: Sequence[int] | Int[Tensor, "K"]) -> KeyMotion:
         """Displacements, without rotation."""
-        moments = self.rounded if self.head.weight.dtype == self.rounded.dtype == torch.float32 else self.moments
-        return KeyMotion(self.offsets(binding, rows_of(moments, keys)), None)
+        single = self.head.weight.dtype == self.time_encodings_f32.dtype == torch.float32
+        times = self.time_encodings_f32 if single else self.time_encodings
+        return KeyMotion(self.offsets(binding, rows_of(times, keys)), None)
 
     def to_dict(self) -> dict[str, Any]:
         """With its shape, its duration and its length."""
@@ -134,31 +136,33 @@ class Network(Motion):
         made.load_state_dict(tensors)
         return made
 
-    def offsets(self, binding: Float[Tensor, "N p"], moment: Float[Tensor, "k t"]) -> Float[Tensor, "k N 3"]:
-        """Displacements [m] at several times, given as gamma(t): rows of ``moments``, chosen on the host or the device.
+    def offsets(self, binding: Float[Tensor, "N p"], time: Float[Tensor, "k t"]) -> Float[Tensor, "k N 3"]:
+        """Displacements [m] at times given as gamma(t).
 
-        A layer is linear, so what it makes of positions is computed once for all times, and what it makes of a time is
-        one vector, added like a bias.
+        Layers are linear in their input: the contribution of positions is computed once for all times, that
+        of a time is one vector, added like a bias.
         """
-        moment = moment.to(self.head.weight)
+        time = time.to(self.head.weight)
         if self.backend is not None:
-            return self.backend.offsets(self, binding, moment)
-        hidden = self._joined(self._layers[0], None, binding, moment)
+            return self.backend.offsets(self, binding, time)
+        hidden = self._with_input(self._layers[0], None, binding, time)
         for number, layer in enumerate(self._layers[1:], start=1):
             hidden = torch.relu(hidden)
-            skip = number == self.settings.skip_after
-            if skip:
-                hidden = self._joined(layer, hidden, binding, moment)
+            if number == self.settings.skip_after:
+                hidden = self._with_input(layer, hidden, binding, time)
             else:
                 hidden = hidden @ layer.weight.T + layer.bias
         return torch.relu(hidden) @ self.head.weight.T + self.head.bias
 
-    def _joined(
-        self, layer: torch.nn.Linear, hidden: Tensor | None, place: Float[Tensor, "N p"], moment: Float[Tensor, "k t"]
+    def _with_input(
+        self,
+        layer: torch.nn.Linear,
+        hidden: Tensor | None,
+        position: Float[Tensor, "N p"],
+        time: Float[Tensor, "k t"],
     ) -> Float[Tensor, "k N width"]:
-        """A layer of [hidden, gamma(x), gamma(t)] without building that."""
+        """A layer of [hidden, gamma(x), gamma(t)], without concatenating them."""
         weight, first = layer.weight, 0 if hidden is None else self.settings.width
-        at_place, at_moment = weight[:, first:].split(self._inputs, dim=1)
-        own = moment @ at_moment.T + layer.bias
-        out = place @ at_place.T + own[:, None]
+        by_position, by_time = weight[:, first:].split(self._sizes, dim=1)
+        out = position @ by_position.T + (time @ by_time.T + layer.bias)[:, None]
         return out if hidden is None else out + hidden @ weight[:, :first].T
