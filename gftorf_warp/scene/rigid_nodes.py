@@ -40,11 +40,11 @@ class RigidNodes(Nodes):
         self.rotation = torch.nn.Parameter(torch.zeros_like(self.offset))
         """Rotation vector [T, M, 3] of every node at every key [rad]."""
 
-    def bind(self, field: GaussianField) -> Float[Tensor, "N M+3"]:
+    def bind(self, field: GaussianField) -> Float[Tensor, "N columns"]:
         """Weights of the nodes, and the means."""
         return torch.cat([super().bind(field), field.mean], dim=1)
 
-    def at_keys(self, binding: Float[Tensor, "N M+3"], keys: Sequence[int] | Int[Tensor, "K"]) -> KeyMotion:
+    def at_keys(self, binding: Float[Tensor, "N columns"], keys: Sequence[int] | Int[Tensor, "K"]) -> KeyMotion:
         """Displacements, and rotations of the covariances."""
         weight, mean = binding.split([len(self.node), 3], dim=1)
         turn = quaternion_of(weight @ rows_of(self.rotation, keys))
