@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from comparison import DEVICES
-from gftorf_warp.recon.objective import image_loss as torch_loss
+from plain_step import plain_loss
 
 from gftorf_warp.losses.image import similarity
 from gftorf_warp.recon.settings import Norm
@@ -36,7 +36,7 @@ def image(shape, seed, smooth=False):
 def oracle(rendered, measured, ssim, norm):
     """Loss and gradient in float64."""
     leaf = rendered.double().requires_grad_()
-    loss, squared = torch_loss(leaf, measured.double(), ssim, norm)
+    loss, squared = plain_loss(leaf, measured.double(), ssim, norm)
     return loss.detach(), squared, torch.autograd.grad(loss, leaf)[0]
 
 
@@ -182,28 +182,30 @@ def moments_of(values):
 
 
 def one_step(values, gradients, moments, rates, images=1, motion_from=None, longest=None):
-    """A step with everything in device memory, after images whose loss is zero; whether it was sound.
+    """A step with everything in device memory, after images whose loss is zero; whether it was valid.
 
     ``gradients`` are one list or, as a tuple, several of which the sum counts.
     """
     device = values[0].device
-    ledger, none = descent.Ledger.empty(images, device), torch.zeros(1, dtype=torch.int32, device=device)
-    table = descent.AdamTable(values, [None] * len(values), moments)
-    table.point(*(gradients if isinstance(gradients, tuple) else (gradients,)))
+    output = descent.StepResults.empty(images, 1, images, device)
+    table = descent.AdamTable(values, moments)
+    table.point(gradients if isinstance(gradients, tuple) else (gradients,))
     table.send()
     descent.descend(
         table,
         torch.tensor(rates, device=device),
-        ledger,
-        [0.0] * len(descent.FOUND_NAMES),
+        output,
+        torch.zeros(images, 3, device=device),
+        torch.ones(1, device=device),
+        images=images,
+        renderings=images,
         motion_from=len(values) if motion_from is None else motion_from,
         motion_gradient_max=longest,
-        pairs=[none] * images,
         capacity=0,
         betas=(0.9, 0.999),
         epsilon=1e-15,
     )
-    return ledger.counts[0].item() == 0
+    return output.counts[0].item() == 0
 
 
 @pytest.mark.parametrize("block", [16, 1], ids=["vectors", "elements"])
@@ -232,7 +234,7 @@ def test_adam_is_torchs_over_fifty_steps(monkeypatch, device, block):
 
 @pytest.mark.parametrize("images", [1, 2, 3, 4])
 def test_gradients_of_several_images_count_as_their_sum(device, images):
-    """In Adam, in the length of what is shortened and in what is sound; whoever of them has none, the others count."""
+    """In Adam, in the length of what is shortened and in what is valid; whoever of them has none, the others count."""
     values, rates, gradients = adam_case(device)
     lists = tuple(gradients() for _ in range(images))
     for n, found in enumerate(lists[:-1]):
@@ -254,7 +256,7 @@ def test_gradients_of_several_images_count_as_their_sum(device, images):
     assert not one_step(values, lists, moments_of(values), rates, images)
 
 
-def test_adam_rests_at_rate_zero_and_when_a_step_is_not_sound(device):
+def test_adam_rests_at_rate_zero_and_when_a_step_is_invalid(device):
     """To the bit, moments and step included; and the other tensors go on."""
     values, rates, gradients = adam_case(device)
     moments = moments_of(values)

@@ -1,14 +1,15 @@
-"""Rates, Adam's first step, clipping, and groups that rest."""
+"""Learning rates along a run, and what is stored of Adam."""
 
 import dataclasses
 from dataclasses import replace
+from io import BytesIO
 
 import pytest
 import torch
-from small_runs import KEYS, field, random
+from small_runs import KEYS, field, random, same
 
 from gftorf_warp.recon import presets
-from gftorf_warp.recon.optimiser import BETAS, Optimiser, betas_of, rates_at
+from gftorf_warp.recon.optimiser import BETAS, STORED, Optimiser, betas_of, rates_at
 from gftorf_warp.recon.presets import Recorded
 from gftorf_warp.recon.settings import Batch, BatchRule, Input, Rates, ReconSettings, Schedule
 from gftorf_warp.scene.motion import Nodes, Still
@@ -38,17 +39,10 @@ def test_rates_decay_log_linearly_over_the_run():
 
 
 def test_motion_rests_during_the_warm_up():
-    """It neither moves nor gathers moments."""
+    """And only the motion."""
     assert rates_at(SETTINGS, 99)["motion"] == 0
     assert rates_at(SETTINGS, 100)["motion"] > 0
     assert rates_at(SETTINGS, 99)["mean"] > 0
-    adam, motion = optimiser()
-    rates = rates_at(SETTINGS, 0)
-    gradients = [torch.ones_like(leaf) for leaf in adam.leaves]
-    before = motion.offset.detach().clone()
-    adam.step(gradients, rates, None)
-    torch.testing.assert_close(motion.offset.detach(), before, rtol=0, atol=0)
-    assert motion.offset not in adam.adam.state, "a resting group must not gather moments"
 
 
 def test_the_rate_of_the_motion_rises_from_none():
@@ -67,45 +61,14 @@ def test_the_rate_of_the_motion_rises_from_none():
     assert rates_at(fours, 120)["motion"] == pytest.approx(24 / 50 * rates_at(settled, 120)["motion"])
 
 
-def test_the_first_step_is_the_rate_of_the_group_whatever_the_gradient():
-    """Adam's first step is the rate times the sign."""
-    adam, motion = optimiser()
-    before = {name: value.detach().clone() for name, value in adam.tensors.items()}
-    generator = torch.Generator().manual_seed(4)
-    gradients = [torch.randn(leaf.shape, generator=generator) * 1e-7 for leaf in adam.leaves]
-    adam.step(gradients, rates_at(SETTINGS, 100), None)
-    rates = rates_at(SETTINGS, 100)
-    for (name, value), gradient in zip(adam.tensors.items(), gradients, strict=False):
-        torch.testing.assert_close(value.detach() - before[name], -rates[name] * gradient.sign(), rtol=1e-3, atol=1e-7)
-    torch.testing.assert_close(motion.offset.detach(), -rates["motion"] * gradients[-1].sign(), rtol=1e-3, atol=1e-7)
-
-
-def test_a_tensor_without_gradient_stays():
-    """None is no gradient."""
-    adam, _ = optimiser()
-    before = adam.tensors["mean"].detach().clone()
-    gradients = [None, *(torch.ones_like(leaf) for leaf in adam.leaves[1:])]
-    adam.step(gradients, rates_at(SETTINGS, 200), 1.0)
-    torch.testing.assert_close(adam.tensors["mean"].detach(), before, rtol=0, atol=0)
-
-
-def test_long_gradients_of_the_motion_are_shortened():
-    """Adam forgets the size of a first gradient, so look at its moments."""
-    adam, motion = optimiser()
-    gradients = [torch.zeros_like(leaf) for leaf in adam.leaves]
-    gradients[-1] = 10.0 * torch.ones_like(motion.offset)
-    gradients[0] = 10.0 * torch.ones_like(adam.tensors["mean"])
-    adam.step(gradients, rates_at(SETTINGS, 200), 1.0)
-    assert adam.adam.state[motion.offset]["exp_avg"].norm() == pytest.approx(0.1, rel=1e-4)
-    assert adam.adam.state[adam.tensors["mean"]]["exp_avg"].norm() == pytest.approx(15**0.5, rel=1e-4)
-
-
 def test_a_field_without_motion_has_no_motion_group():
     """Still motion has no parameters."""
-    adam = Optimiser(field(random(5, 3), None), Still(KEYS))
-    assert [*adam.adam.groups] == [*adam.tensors]
-    adam.step([torch.ones_like(leaf) for leaf in adam.leaves], rates_at(SETTINGS, 200), 1.0)
-    assert adam.field.mean.isfinite().all()
+    still = Optimiser(field(random(5, 3), None), Still(KEYS))
+    assert still.groups == [*still.tensors]
+    assert len(still.leaves) == len(still.groups)
+    moving, motion = optimiser()
+    assert moving.groups == [*moving.tensors, "motion"]
+    assert moving.leaves[-1] is motion.offset
 
 
 def test_quartets_may_have_rates_and_moments_of_their_own():
@@ -129,12 +92,56 @@ def test_quartets_may_have_rates_and_moments_of_their_own():
         assert settings.schedule.batch_rule == BatchRule.NONE
 
 
-def test_decays_of_an_optimiser_are_stored_with_it():
-    """And are those of its steps: four gradients are remembered as one of quartets is."""
-    adam, motion = optimiser()
-    own = Optimiser(adam.field, motion, betas=(0.6561, 0.996))
-    gradients = [torch.ones_like(leaf) for leaf in own.leaves]
-    own.step(gradients, rates_at(SETTINGS, 200), None)
-    first = own.adam.state[own.tensors["mean"]]["exp_avg"]
-    torch.testing.assert_close(first, torch.full_like(first, 1 - 0.6561), rtol=1e-5, atol=0)
-    assert Optimiser(own.field, motion, own.adam.state_dict()).betas == (0.6561, 0.996)
+def stepped():
+    """Torch's Adam with moments over the tensors of an optimiser: what was stored until format 2."""
+    own, _ = optimiser()
+    groups = [{"name": name, "params": [leaf]} for name, leaf in zip(own.groups, own.leaves, strict=True)]
+    adam = torch.optim.Adam(groups, lr=0.0, betas=(0.6561, 0.996), eps=1e-15, fused=True)
+    for n, leaf in enumerate(own.leaves):
+        leaf.grad = random(*leaf.shape, seed=n) if n != 1 else None
+    adam.step()
+    return own, adam
+
+
+def test_moments_and_decays_are_stored_as_torch_does():
+    """Those of torch's Adam are read; what is stored of them has its keys and reads back to the bit."""
+    own, adam = stepped()
+    buffer = BytesIO()
+    torch.save(adam.state_dict(), buffer)
+    buffer.seek(0)
+    again, _ = optimiser()
+    again = Optimiser(again.field, optimiser()[1], torch.load(buffer, weights_only=True))
+    assert again.betas == (0.6561, 0.996)
+    for n, (leaf, twin) in enumerate(zip(own.leaves, again.leaves, strict=True)):
+        moments = again.moments_of(twin)
+        if n == 1:
+            assert not any(moment.any() for moment in moments), "it had no gradient"
+            continue
+        assert all(torch.equal(moment, adam.state[leaf][name]) for moment, name in zip(moments, STORED, strict=True))
+    stored, torchs = again.state_dict(), adam.state_dict()
+    assert stored["state"].keys() - torchs["state"].keys() <= {1}
+    assert [group["params"] for group in stored["param_groups"]] == [g["params"] for g in torchs["param_groups"]]
+    third = Optimiser(again.field, optimiser()[1], stored)
+    for twin, leaf in zip(again.leaves, third.leaves, strict=True):
+        assert same(again.moments_of(twin), third.moments_of(leaf))
+
+
+def test_moments_of_other_groups_are_refused():
+    """They are of another field."""
+    own, adam = stepped()
+    with pytest.raises(ValueError, match="tensors per group"):
+        Optimiser(own.field, Still(KEYS), adam.state_dict())
+
+
+def test_moments_are_zero_at_first_and_can_be_forgotten():
+    """Of one tensor without its number of steps; of the motion with it."""
+    own, adam = stepped()
+    again = Optimiser(own.field, optimiser()[1], adam.state_dict())
+    fresh, _ = optimiser()
+    assert not any(moment.any() for leaf in fresh.leaves for moment in fresh.moments_of(leaf))
+    again.forget("mean")
+    step, *both = again.moments_of(again.tensors["mean"])
+    assert (float(step), any(moment.any() for moment in both)) == (1.0, False)
+    again.forget_motion()
+    assert not any(moment.any() for moment in again.moments_of(again.motion[0]))
+    assert again.moments_of(again.tensors["quaternion"])[1].any()

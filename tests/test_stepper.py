@@ -1,6 +1,8 @@
 """Training steps: on a CPU eager, on a GPU as CUDA graphs, both against plain torch (plain_step.py)."""
 
 import math
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -414,6 +416,25 @@ def test_a_new_stage_releases_graphs():
     image = {"images": (), "frozen": False, "sh_degree": 3}
     assert GraphKey(keys=2, **image).stage == GraphKey(keys=3, **image).stage
     assert GraphKey(keys=0, **image).stage != GraphKey(keys=2, **image).stage
+
+
+# -- imports
+
+SHORT_RUN = """
+import sys
+from small_runs import demo, small
+from gftorf_warp.recon.train import reconstruct
+reconstruct(small(), sys.argv[1], demo(images=12, warm_up=0, log_every=4))
+print("imported:", *(name for name in ("torch._dynamo", "torch._inductor", "sympy") if name in sys.modules))
+"""
+
+
+def test_a_run_does_not_import_the_compiler_of_torch(tmp_path):
+    """It takes a second or three, and compiles nothing here; in a process of its own, since others may have it."""
+    command = [sys.executable, "-c", SHORT_RUN, str(tmp_path / "run")]
+    done = subprocess.run(command, cwd=__file__.rpartition("/")[0], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[-1] == "imported:"
 
 
 # -- tensor cores ------------------------------------------------------------------------------------
