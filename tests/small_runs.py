@@ -1,5 +1,6 @@
 """Small fields, sequences and runs that the tests of motion and of recon/ share."""
 
+import copy
 import json
 from dataclasses import replace
 
@@ -68,30 +69,48 @@ def same(a, b):
     return a == b
 
 
+FLOW = replace(next(term for term in TERMS if term.name == "flow"), weight=lambda *_: 1.0)
+"""The flow term alone, in every step."""
+
+
+def weights_at(settings, images):
+    """Weight of every term after so many images."""
+    return {term.name: term.weight(settings, images) for term in TERMS}
+
+
+def advance(state, observations, settings, steps=1):
+    """Train a state by some batches; returns how many of the last ones in a row were skipped."""
+    stepper = Stepper(state, observations, settings)
+    for _ in range(steps):
+        stepper.step()
+    return stepper.collect()
+
+
 class OneStep:
     """A step of some raw frames from a copy of a state: terms, gradients and renderings."""
 
     def __init__(self, state, observations, settings, *frames, terms=TERMS):
         """Run it; ``frames`` are one batch. Moments of the state must be zero."""
-        copy = from_dict(to_dict(state), observations.quads.device)
-        copy.queue, copy.sums = [0], {}
+        device = observations.quads.device
+        twin = from_dict(copy.deepcopy(to_dict(state)), device)
+        twin.queue, twin.sums = [0], {}
         one = replace(observations, batches=[[*frames]])
         watch = Term(name="watch", loss=self._watch, weight=lambda *_: 1.0, view=None)
         self.images = []
         """What the terms of every image got."""
-        stepper = Stepper(copy, one, settings, terms=(*terms, watch))
+        stepper = Stepper(twin, one, settings, terms=(*terms, watch))
         stepper.step()
         self.skipped = stepper.collect()
         """1 if it was not valid."""
-        self.sums = {name: float(value) for name, value in copy.sums.items() if name != "watch"}
+        self.sums = {name: float(value) for name, value in twin.sums.items() if name != "watch"}
         """Weighted terms and the other sums of the log."""
         self.terms = {name: value for name, value in self.sums.items() if name not in TOTAL_NAMES}
         """Weighted terms."""
-        optimiser = copy.optimiser
+        optimiser = twin.optimiser
         moments = [optimiser.moments_of(leaf)[1] / (1 - optimiser.betas[0]) for leaf in optimiser.leaves]
         self.gradients = dict(zip(optimiser.groups, moments, strict=True))
         """By group; of a motion of several tensors the last."""
-        self.state = copy
+        self.state = twin
         """Afterwards."""
 
     def _watch(self, image, _):

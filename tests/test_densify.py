@@ -6,12 +6,14 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from plain_step import plain_adam
 from small_runs import KEYS, field, random
 
 from gftorf_warp.recon import densify
-from gftorf_warp.recon.optimiser import Optimiser, rates_at
+from gftorf_warp.recon.optimiser import STORED, Optimiser, rates_at
 from gftorf_warp.recon.settings import DensifySettings, ReconSettings, Schedule
-from gftorf_warp.recon.step import unseen_are_due
+from gftorf_warp.recon.stepper import visibility_pruning_is_due
+from gftorf_warp.render import descent
 from gftorf_warp.render.api import ScreenGradient
 from gftorf_warp.scene.camera import Camera
 from gftorf_warp.scene.motion import Nodes
@@ -29,14 +31,14 @@ def optimiser(n=6):
     result = Optimiser(start, Nodes(KEYS, random(2, 3), torch.ones(2, dtype=torch.long)))
     generator = torch.Generator().manual_seed(1)
     gradients = [torch.randn(leaf.shape, generator=generator) for leaf in result.leaves]
-    result.step(gradients, dict.fromkeys(rates_at(ReconSettings(preset="test"), 0), 1e-4), None)
+    plain_adam(result, gradients, dict.fromkeys(rates_at(ReconSettings(preset="test"), 0), 1e-4), None)
     return result
 
 
 def moments(optimiser):
     """Copies of Adam's state, by tensor."""
     return {
-        name: {key: value.clone() for key, value in optimiser.adam.state[tensor].items()}
+        name: {key: value.clone() for key, value in zip(STORED, optimiser.moments_of(tensor), strict=True)}
         for name, tensor in optimiser.tensors.items()
     }
 
@@ -56,8 +58,12 @@ def generator():
 def test_the_statistic_is_the_pixel_weighted_mean_in_half_image_sizes():
     """Two images, worked out by hand."""
     seen = densify.start(field(random(2, 3), None))
-    for values in ([[0.3, 0, 2, 0.5], [0, 0.1, 0, 0]], [[0, 0.4, 6, 3], [0, 0.2, 5, 0.25]]):
-        seen = densify.observe(seen, ScreenGradient(values=torch.tensor(values)), CAMERA)
+    screens = [
+        ScreenGradient(values=torch.tensor(values))
+        for values in ([[0.3, 0, 2, 0.5], [0, 0.1, 0, 0]], [[0, 0.4, 6, 3], [0, 0.2, 5, 0.25]])
+    ]
+    step = descent.StepResults.empty(2, 1, 2, torch.device("cpu"))
+    descent.add_statistics(screens, (CAMERA.width, CAMERA.height), step, seen.gradient, seen.pixels, seen.weight)
     assert seen.weight.tolist() == [3.5, 0.25]
     torch.testing.assert_close(seen.mean_gradient, torch.tensor([(2 * 6.0 + 6 * 4.0) / 8, 2.0]))
 
@@ -76,7 +82,7 @@ def test_a_small_gaussian_is_cloned_with_fresh_moments():
             torch.testing.assert_close(state[key][:6], old[name][key], rtol=0, atol=0)
             assert old[name][key][2].abs().max() > 0
             assert state[key][6].abs().max() == 0
-    assert len(adam.adam.groups) == len(adam.adam.state) == 6
+    assert len(adam.state_dict()["state"]) == 6
 
 
 def test_a_large_gaussian_is_split_in_two_smaller_ones_drawn_from_itself():
@@ -199,16 +205,16 @@ def test_a_round_is_as_if_it_first_added_and_then_removed(floor):
             assert torch.equal(one, other)
 
 
-def test_the_unseen_are_due_when_every_raw_frame_was_compared():
-    """Rounds at 100, 200, .. of 60 raw frames: two epochs lie between judgements."""
+def test_visibility_pruning_is_due_when_every_raw_frame_was_compared():
+    """Densification at 100, 200, .. of 60 raw frames: two epochs lie between."""
     observations = SimpleNamespace(batches=[[0] * 4] * 15)
     state = SimpleNamespace(images=0, unseen_at=0)
     due = []
     for state.images in range(100, 1000, 100):
-        if unseen_are_due(state, observations, replace(SETTINGS, unseen_from=300)):
+        if visibility_pruning_is_due(state, observations, replace(SETTINGS, unseen_from=300)):
             due.append(state.images)
             state.unseen_at = state.images
-        assert not unseen_are_due(state, observations, SETTINGS)
+        assert not visibility_pruning_is_due(state, observations, SETTINGS)
     assert due == [300, 500, 700, 900]
 
 
@@ -241,7 +247,7 @@ def test_rebuilt_tensors_go_on_being_optimised():
     densify.round_of(adam, statistics(0, 0, 1.0, 0, 0, 0), SETTINGS, generator(), judge_scale=False)
     before = adam.field.mean.detach().clone()
     gradients = [100.0 * torch.ones_like(leaf) for leaf in adam.leaves]
-    adam.step(gradients, dict.fromkeys(rates_at(ReconSettings(preset="test"), 0), 0.1), None)
+    plain_adam(adam, gradients, dict.fromkeys(rates_at(ReconSettings(preset="test"), 0), 0.1), None)
     assert ((adam.field.mean.detach() - before) < 0).all()
 
 

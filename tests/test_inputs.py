@@ -5,17 +5,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from moving_box import FOCAL, HEIGHT, WIDTH, recording
+from moving_box import BASELINE, FOCAL, HEIGHT, WIDTH, as_phasors, recording, turned, with_colour
 from sequences import changed
-from small_runs import demo, same, stored
+from small_runs import FLOW, OneStep, advance, demo, same, stored
 
 from gftorf_warp.constants import SH_COEFFICIENTS
 from gftorf_warp.data.sequence import Flow
 from gftorf_warp.errors import InputError, UsageError
-from gftorf_warp.recon import objective, presets, step
-from gftorf_warp.recon.observations import input_of, observe
+from gftorf_warp.recon import presets, step
+from gftorf_warp.recon.observations import ImageStack, input_of, observe
 from gftorf_warp.recon.settings import Input, Norm, Weights
 from gftorf_warp.recon.state import begin
+from gftorf_warp.recon.terms import View
 from gftorf_warp.recon.train import reconstruct
 from gftorf_warp.render.api import rasterize
 from gftorf_warp.scene.initialise import Init, InitSettings, from_random
@@ -34,7 +35,7 @@ def test_auto_follows_the_camera():
 def test_a_phasor_is_compared_once_per_quartet_in_its_middle():
     """Rendered real and imaginary parts against the differences of opposite quads, of length 2a."""
     sequence = recording(frames=12)[0]
-    settings = demo(input=Input.PHASOR, weights=Weights(ssim=0.0))
+    settings = demo(input=Input.PHASOR, weights=Weights(ssim=0.0), background=0.0)
     observations = observe(sequence, settings, "cpu")
     assert observations.batches == [[0], [4], [8]]
     assert observations.time_at(4) == pytest.approx(5.5 / 120)
@@ -42,9 +43,9 @@ def test_a_phasor_is_compared_once_per_quartet_in_its_middle():
     want = torch.tensor(np.stack([q[4] - q[5], q[6] - q[7]]))
     torch.testing.assert_close(observations.phasors[4], want, rtol=1e-4, atol=1e-5)
     state = begin(observations, settings, seed=0, device="cpu")
-    fixed = (state.optimiser.field, state.motion, state.binding)
-    found, seen = objective.terms(*fixed, observations, 4, settings, settings.weights)
-    torch.testing.assert_close(found["quads"], (seen.tof.phasor[:2] - want).square().mean(), rtol=1e-4, atol=1e-9)
+    one = OneStep(state, observations, settings, 4)
+    phasor = one.images[0].renderings[View.TOF].phasor[:2].detach()
+    assert one.terms["quads"] == pytest.approx(float((phasor - want).square().mean()), rel=1e-4)
 
 
 def test_phasor_and_quad_input_agree_on_a_static_scene(tmp_path):
@@ -68,24 +69,22 @@ def test_colour_is_compared_from_its_own_camera():
     assert (camera.width, camera.height) == (2 * WIDTH, 2 * HEIGHT)
     middle = camera.project(torch.tensor([[BASELINE, 0.0, 3.0]], dtype=torch.float64))[0].tolist()
     assert middle == pytest.approx([WIDTH, HEIGHT])
-    settings = demo(weights=Weights(ssim=0.0, colour=2.0))
+    settings = demo(weights=Weights(ssim=0.0, colour=2.0), background=0.0, warm_up=0)
     observations = observe(sequence, settings, "cpu")
     assert observations.colour_scale == pytest.approx(1 / 36.0)
-    assert max(float(image.max()) for image in observations.colour.values()) == pytest.approx(1.0)
+    assert float(observations.colour.images.max()) == pytest.approx(1.0)
     state = begin(observations, settings, seed=0, device="cpu")
     field = state.optimiser.field
-    fixed = (field, state.motion, state.binding)
-    found, seen = objective.terms(*fixed, observations, 4, settings, settings.weights)
     moved = field.moved(*state.motion.at(state.binding, 4 / 120))
     want = rasterize(moved, camera, sensor_of(sequence), settings.render).colour
-    error = 2.0 * (want - observations.colour[4]).square().mean()
-    torch.testing.assert_close(found["colour"], error)
-    wrong = rasterize(moved, observations.cameras[4].resized(*seen.colour.colour.shape[:0:-1]), sensor_of(sequence))
+    squared = (want - observations.colour[4]).square().mean()
+    assert OneStep(state, observations, settings, 4).terms["colour"] == pytest.approx(2.0 * float(squared), rel=1e-5)
+    wrong = rasterize(moved, observations.cameras[4].resized(*want.shape[:0:-1]), sensor_of(sequence))
     assert (wrong.colour - want).abs().max() > 0.05, "the other camera sees something else"
-    absolute = replace(settings.weights, colour_norm=Norm.L1)
-    found, _ = objective.terms(*fixed, observations, 4, settings, absolute)
-    torch.testing.assert_close(found["colour"], 2.0 * (want - observations.colour[4]).abs().mean())
-    assert "colour" not in objective.terms(*fixed, observations, 5, settings, settings.weights)[0], "no image there"
+    absolute = replace(settings, weights=replace(settings.weights, colour_norm=Norm.L1))
+    difference = 2.0 * float((want - observations.colour[4]).abs().mean())
+    assert OneStep(state, observations, absolute, 4).terms["colour"] == pytest.approx(difference, rel=1e-5)
+    assert "colour" not in OneStep(state, observations, settings, 5).terms, "no image there"
 
 
 def test_colour_of_weight_zero_is_never_rendered(monkeypatch):
@@ -98,14 +97,14 @@ def test_colour_of_weight_zero_is_never_rendered(monkeypatch):
         asked.append(images if field.colour_sh is not None else {"opacity"})
         return rasterize(field, *arguments, images=images, **more)
 
-    monkeypatch.setattr(objective, "rasterize", noted)
+    monkeypatch.setattr(step, "rasterize", noted)
     for weight, colours in ((0.0, 0), (1.0, 1)):
         settings = demo(weights=Weights(colour=weight), images=8)
         observations = observe(sequence, settings, "cpu")
         state = begin(observations, settings, seed=0, device="cpu")
         assert bool(observations.colour) == (state.optimiser.field.colour_sh is not None) == bool(colours)
         calls.clear()
-        step.step(state, observations, settings)
+        advance(state, observations, settings)
         assert len(calls) == 4 + colours
         assert sum(field.colour_sh is not None for field in calls) == colours
     assert all(images == {"opacity"} for images in asked)
@@ -118,7 +117,7 @@ def test_constant_and_other_harmonics_of_colour_have_rates_of_their_own():
     state = begin(observations, settings, seed=0, device="cpu")
     before = state.optimiser.field.colour_sh.detach().clone()
     assert before.shape == (len(before), SH_COEFFICIENTS, 3)
-    step.step(state, observations, settings)
+    advance(state, observations, settings)
     change = (state.optimiser.field.colour_sh.detach() - before).abs().amax(dim=(0, 2))
     assert change[0] == pytest.approx(settings.rates.colour_constant, rel=1e-3)
     assert change[1:].max() == pytest.approx(settings.rates.colour_rest, rel=1e-3)
@@ -148,14 +147,14 @@ def test_without_colour_a_colour_preset_says_so_and_others_go_on():
     sequence = recording(frames=8)[0]
     with pytest.raises(InputError, match="no colour"):
         observe(sequence, presets.dgs(), "cpu")
-    assert observe(sequence, demo(weights=Weights(colour=1.0)), "cpu").colour == {}
+    assert not observe(sequence, demo(weights=Weights(colour=1.0)), "cpu").colour
     black = with_colour(sequence)
     black = changed(black, colour={n: 0 * image for n, image in black.colour.images.items()})
     with pytest.raises(InputError, match="black"):
         observe(black, presets.dgs(), "cpu")
 
 
-def test_dgs_compares_colour_and_closed_form_distance_and_no_quads(monkeypatch):
+def test_dgs_compares_colour_and_closed_form_distance_and_no_quads():
     """One query per image; the second term is as wrong as the camera."""
     sequence = with_colour(recording(frames=8)[0])
     quarter = InitSettings(kind=Init.RANDOM, count=200, opacity=0.3, bounds=(1.0, 5.0))
@@ -164,16 +163,14 @@ def test_dgs_compares_colour_and_closed_form_distance_and_no_quads(monkeypatch):
         observations = observe(sequence, settings, "cpu")
         assert observations.batches == [[0], [4]]
         state = begin(observations, settings, seed=0, device="cpu")
-        fixed = (state.optimiser.field, state.motion, state.binding)
-        found, seen = objective.terms(*fixed, observations, 4, settings, settings.weights)
-        assert found.keys() == names
-        assert (seen.tof is None) == (names == {"colour"})
-        monkeypatch.undo()
-        assert step.step(state, observations, settings) is None
+        one = OneStep(state, observations, settings, 4)
+        assert one.terms.keys() == names
+        assert (View.TOF in one.images[0].renderings) == (names != {"colour"})
+        assert one.skipped == 0
     depth = replace(settings, weights=replace(settings.weights, ssim=0.0))
-    found, seen = objective.terms(*fixed, observations, 4, depth, depth.weights)
-    want = depth.weights.depth * (seen.tof.distance - observations.closed_form[1]).abs().mean()
-    torch.testing.assert_close(found["depth"], want)
+    one = OneStep(state, observations, depth, 4)
+    difference = (one.images[0].renderings[View.TOF].distance - observations.closed_form[1][0]).abs().mean()
+    assert one.terms["depth"] == pytest.approx(depth.weights.depth * float(difference), rel=1e-5)
 
 
 def test_every_raw_frame_is_rendered_from_its_own_pose():
@@ -188,28 +185,28 @@ def test_every_raw_frame_is_rendered_from_its_own_pose():
     observations = observe(sequence, settings, "cpu")
     state = begin(observations, settings, seed=0, device="cpu")
     field = state.optimiser.field
-    fixed = (field, None, state.binding, observations)
     for n in (1, 6):
-        _, seen = objective.terms(*fixed, n, settings, replace(settings.weights, flow=0.0))
+        resting = replace(settings, background=0.0, schedule=replace(settings.schedule, warm_up=100))
+        seen = OneStep(state, observations, resting, n).images[0].renderings[View.TOF]
         want = rasterize(field, observations.cameras[n], observations.sensor_at(n), settings.render).quads
-        torch.testing.assert_close(seen.tof.quads, want)
+        torch.testing.assert_close(seen.quads, want)
         other = rasterize(field, observations.cameras[0], observations.sensor_at(n), settings.render).quads
         assert (other - want).abs().max() > 0.02 * want.abs().max()
     # nothing moves: the flow of the camera alone has no error, that of a camera at rest has
-    still = replace(settings.motion, from_tracks=False)
-    motion = begin(observations, replace(settings, motion=still), seed=0, device="cpu").motion
+    assert not state.motion.offset.any()
     seen = rasterize(field, observations.cameras[4], observations.sensor_at(4), settings.render)
     ray = observations.cameras[4].rays()
     centre = torch.as_tensor(observations.cameras[4].centre, dtype=torch.float32)
     surface = (centre + ray * seen.distance[..., None]).detach()
     here, *there = (observations.cameras[n].project(surface).movedim(2, 0) for n in (4, 8, 0))
-    flow = {(1, step): place - here for step, place in zip((1, -1), there, strict=True)}
-    binding = motion.bind(field)
-    right = objective.flow_loss(field, motion, binding, replace(observations, flow=flow), 4, settings.render)
-    zero = {key: torch.zeros_like(value) for key, value in flow.items()}
-    wrong = objective.flow_loss(field, motion, binding, replace(observations, flow=zero), 4, settings.render)
-    assert float(wrong.detach()) > 0.1
-    assert float(right.detach()) < 1e-6 * float(wrong.detach())
+    flow = torch.stack([place - here for place in there]).numpy()
+    settings = replace(settings, schedule=replace(settings.schedule, warm_up=0))
+    right, wrong = (
+        OneStep(state, replace(observations, flow=ImageStack.of({1: given}, "cpu")), settings, 4, terms=(FLOW,))
+        for given in (flow, 0 * flow)
+    )
+    assert wrong.terms["flow"] > 0.1
+    assert right.terms["flow"] < 1e-6 * wrong.terms["flow"]
 
 
 def test_random_gaussians_fill_what_all_cameras_see_evenly():

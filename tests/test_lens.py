@@ -23,7 +23,6 @@ from gftorf_warp.kernels.geometry import CameraView
 from gftorf_warp.kernels.lens import distorted
 from gftorf_warp.kernels.tracing.rays import ray_through
 from gftorf_warp.recon.run import Run
-from gftorf_warp.recon.settings import Kernels
 from gftorf_warp.recon.train import reconstruct
 from gftorf_warp.render.buffers import RenderSettings
 from gftorf_warp.render.launch import view_of
@@ -241,10 +240,9 @@ def test_a_capture_through_a_lens_is_checked_and_decoded(captured, tmp_path):
     assert compare(run, report=False)["frames"] == 8
 
 
-@pytest.mark.parametrize("kernels", [Kernels.NONE, Kernels.GRAPH])
-def test_a_reconstruction_through_a_lens_is_the_scene(captured, tmp_path, kernels, caplog):
+def test_a_reconstruction_through_a_lens_is_the_scene(captured, tmp_path, caplog):
     """A pinhole at the same place sees it as the scene is; had the lens been left out, walls would bend."""
-    settings = demo(images=200, kernels=kernels)
+    settings = demo(images=200)
     sequence = Sequence.open(captured)
     pinhole = Camera.from_fov(64, 48, 60.0)
     want, bent = 3.0 / pinhole.directions()[..., 2].numpy(), sequence.truth().distance[0]

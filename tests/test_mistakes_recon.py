@@ -13,13 +13,13 @@ import torch
 from cases import pose
 from mistakes import dots, ramp, surface, wall
 from sequences import changed
-from small_runs import demo, same, small
+from small_runs import FLOW, OneStep, advance, demo, same, small
 
 from gftorf_warp.constants import CANONICAL_SHIFTS, SH_Y0
 from gftorf_warp.data.write import write
 from gftorf_warp.evaluate.compare import compare
 from gftorf_warp.evaluate.metrics import scored_frames
-from gftorf_warp.recon import checkpoint, densify, objective, step
+from gftorf_warp.recon import checkpoint, densify, step
 from gftorf_warp.recon.observations import observe
 from gftorf_warp.recon.optimiser import Optimiser
 from gftorf_warp.recon.run import Run
@@ -83,21 +83,20 @@ def test_mistake_02_a_checkpoint_holds_the_network_and_its_moments(tmp_path):
     """What is loaded moves as before, and the next step is the same to the bit; without motion neither would be."""
     settings = demo(images=400, motion=NETWORK, init=RANDOM, batch=Batch.FRAME)
     observations, state = started(settings)
-    for _ in range(12):
-        step.step(state, observations, settings)
+    advance(state, observations, settings, 12)
     again = from_dict(checkpoint.load(checkpoint.save(tmp_path, to_dict(state))), "cpu")
     assert same(to_dict(again), to_dict(state))
     weights = dict(state.motion.named_parameters())
     assert len(weights) >= 8
     for name, value in again.motion.named_parameters():
         assert torch.equal(value, weights[name]), name
-        assert again.optimiser.adam.state[value]["exp_avg"].abs().max() > 0, name
-        assert again.optimiser.adam.state[value]["exp_avg_sq"].abs().max() > 0, name
+        _, first, second = again.optimiser.moments_of(value)
+        assert min(first.abs().max(), second.abs().max()) > 0, name
     moved = [s.motion.at(s.motion.bind(s.optimiser.field), 0.05).offset for s in (state, again)]
     assert moved[0].abs().max() > 1e-4
     assert torch.equal(*moved)
     for s in (state, again):
-        step.step(s, observations, settings)
+        advance(s, observations, settings)
     assert same(to_dict(again), to_dict(state))
 
 
@@ -117,21 +116,16 @@ def test_mistake_10_phasors_and_quads_of_one_light_have_one_fit():
     )
     still = Still(torch.tensor([0.0, 0.1]))
     for kind in (Input.PHASOR, Input.QUADS):
-        settings = demo(input=kind, flow=FlowSource.NONE)
+        settings = demo(input=kind, flow=FlowSource.NONE, weights=Weights(ssim=0.0), background=0.0)
         observations = observe(sequence, settings, "cpu")
         assert bool(observations.phasors) == (kind == Input.PHASOR)
-        loss = [
-            objective.terms(
-                replace(field, reflectivity_sh=field.reflectivity_sh + SH_OFFSET * more),
-                still,
-                still.bind(field),
-                observations,
-                4,
-                settings,
-                Weights(ssim=0.0),
-            )[0]["quads"]
-            for more in (0.0, 1.0)
-        ]
+        state = begin(observations, settings, seed=0, device="cpu")
+        loss = []
+        for more in (0.0, 1.0):
+            brighter = replace(field, reflectivity_sh=field.reflectivity_sh + SH_OFFSET * more)
+            bound = {"motion": still, "binding": still.bind(field), "statistics": densify.start(field)}
+            given = replace(state, optimiser=Optimiser(brighter, still), **bound)
+            loss.append(OneStep(given, observations, settings, 4).terms["quads"])
         assert loss[0] < 1e-10
         assert loss[1] > 1e4 * loss[0]
 
@@ -204,7 +198,7 @@ def reflectivity_steps(settings):
     """Change of the harmonics of the reflectivity [N, 16] in the first step, and the field before it."""
     observations, state = started(settings)
     before = state.optimiser.field.map(lambda value: value.detach().clone())
-    step.step(state, observations, settings)
+    advance(state, observations, settings)
     return state.optimiser.field.reflectivity_sh.detach() - before.reflectivity_sh, before
 
 
@@ -253,15 +247,14 @@ def test_mistake_15_one_unknown_pixel_is_left_out_of_the_flow_loss():
     settings = demo(weights=Weights(flow=1.0))
     sequence = small()
     observations, state = started(settings, sequence)
-    fixed = (state.optimiser.field, state.motion, state.binding)
-    whole = objective.flow_loss(*fixed, observations, 4, settings.render)
-    holed = {key: flow.clone() for key, flow in observations.flow.items()}
-    for flow in holed.values():
-        flow[0, 18, 20] = torch.nan
-    partly = objective.flow_loss(*fixed, replace(observations, flow=holed), 4, settings.render)
-    assert 0 < partly < whole
-    assert partly > 0.8 * whole
-    assert torch.autograd.grad(partly, state.motion.offset)[0].isfinite().all()
+    whole = OneStep(state, observations, settings, 4, terms=(FLOW,)).terms["flow"]
+    holed = observations.flow.images.clone()
+    holed[:, :, 0, 18, 20] = torch.nan
+    holed = replace(observations, flow=replace(observations.flow, images=holed))
+    partly = OneStep(state, holed, settings, 4, terms=(FLOW,))
+    assert 0 < partly.terms["flow"] < whole
+    assert partly.terms["flow"] > 0.8 * whole
+    assert partly.gradients["motion"].isfinite().all()
 
 
 def test_mistake_16_renders_are_in_the_units_of_the_file(tmp_path):
@@ -301,14 +294,14 @@ def test_mistake_22_colour_is_rendered_only_while_it_counts(monkeypatch, weight,
         seen[-1].append((field.colour_sh is not None, camera.width))
         return rasterize(field, camera, *args, **options)
 
-    monkeypatch.setattr(objective, "rasterize", spy)
+    monkeypatch.setattr(step, "rasterize", spy)
     observations, state = started(settings, coloured())
     assert bool(observations.colour) == (weight > 0)
     tof = observations.sequence
     assert (tof.width, tof.intrinsics.fx) == (48, 42.0), "ToF images keep their size"
     while state.images < 24:
         seen.append([])
-        assert step.step(state, observations, settings) is None
+        assert advance(state, observations, settings) == 0
     counts = [sum(colour for colour, _ in renderings) for renderings in seen]
     widths = {width for renderings in seen for colour, width in renderings if colour}
     assert counts == ([0] * 6 if weight == 0 else [0, 0, 1, 1, 1, 1])

@@ -5,7 +5,6 @@ Each test is named after the number of the mistake it would fail at; design/mist
 
 import math
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,8 +15,7 @@ from torch.testing import assert_close
 
 from gftorf_warp.constants import LOW_PASS, SPEED_OF_LIGHT
 from gftorf_warp.evaluate.metrics import distance_from_quads
-from gftorf_warp.recon import objective
-from gftorf_warp.render import api, reference
+from gftorf_warp.render import api, fused, reference
 from gftorf_warp.render.api import Background, rasterize
 from gftorf_warp.render.buffers import RenderSettings
 from gftorf_warp.scene.camera import Camera
@@ -100,22 +98,6 @@ def test_mistake_08_pixel_centres_are_the_same_for_renderer_rays_and_back_projec
     assert row[0] > 0.1
 
 
-class Measured:
-    """Observations of flow from one quartet to the next, and of nothing else."""
-
-    def __init__(self, cameras, flow):
-        self.cameras, self.flow = cameras, {(0, 1): flow}
-        self.sequence = SimpleNamespace(cycle=4)
-
-    def sensor_at(self, _):
-        """The sensor."""
-        return SENSOR
-
-    def rays_at(self, frame):
-        """Centre and rays of the camera."""
-        return torch.tensor(self.cameras[frame].centre, dtype=torch.float32), self.cameras[frame].rays()
-
-
 def wall_flow(camera, step, half=0.0):
     """[2, H, W] flow of a wall at z = 2 m that moves by ``step`` in camera axes; pixel centres at i + 0.5 - half."""
     x, y = (centres(camera) - half).unbind(dim=-1)
@@ -133,8 +115,10 @@ def flow_loss_of(camera, step, flow, later=None):
     world = torch.from_numpy(camera.camera_from_world[:3, :3].T @ np.array(step)).float()
     offset = torch.stack([torch.zeros(1, 3), world[None]])
     motion = Nodes(torch.tensor([0.0, 1.0]), torch.zeros(1, 3), torch.ones(1, dtype=torch.long), offset)
-    measured = Measured([camera] * 4 + [later or camera], flow)
-    loss = objective.flow_loss(field, motion, motion.bind(field), measured, 0, RenderSettings())
+    start, end = (motion.at(motion.bind(field), time).offset for time in (0.0, 1.0))
+    seen = rasterize(field, camera, SENSOR, extra=end - start, extra_detached=True)
+    cameras = torch.from_numpy(fused.flow_cameras(camera, [later or camera]))
+    loss = fused.flow_loss(seen.distance, seen.extra, flow.float()[None, None], cameras)
     (gradient,) = torch.autograd.grad(loss, motion.offset)
     assert gradient.isfinite().all()
     return float(loss.detach())

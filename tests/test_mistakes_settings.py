@@ -9,7 +9,7 @@ from dataclasses import replace
 import pytest
 from mistakes import ramp, wall
 
-from gftorf_warp.recon import densify, objective, presets
+from gftorf_warp.recon import densify, presets, terms
 from gftorf_warp.recon.observations import observe
 from gftorf_warp.recon.optimiser import rates_at
 from gftorf_warp.recon.settings import BatchRule, FlowSource, Input
@@ -95,5 +95,5 @@ def test_mistake_14_every_preset_ends_with_all_harmonics(name):
     for recorded in RECORDED:
         settings = presets.preset(name, recorded)
         for course in (settings, presets.shortened(settings, 300)):
-            assert objective.render_settings_at(course, course.schedule.images // 2).sh_degree == 3
+            assert terms.render_settings_at(course, course.schedule.images // 2).sh_degree == 3
         assert settings.render.sh_degree == 3

@@ -1,4 +1,4 @@
-"""What is compared with what: terms of the loss, turns of the frames, preparation of a sequence."""
+"""What is compared with what: terms of the loss, order of the frames, preparation of a sequence."""
 
 from dataclasses import replace
 
@@ -7,80 +7,87 @@ import pytest
 import torch
 from moving_box import recording
 from sequences import changed
-from small_runs import demo, small
+from small_runs import FLOW, OneStep, advance, demo, small, weights_at
 
 from gftorf_warp.errors import InputError
-from gftorf_warp.recon import objective, presets, step
-from gftorf_warp.recon.observations import data_hash, observe, reduced
+from gftorf_warp.recon import presets
+from gftorf_warp.recon.observations import ImageStack, data_hash, observe, reduced
 from gftorf_warp.recon.settings import Batch, Weights
 from gftorf_warp.recon.state import begin
+from gftorf_warp.recon.stepper import draw
+from gftorf_warp.recon.terms import View, flow_weight
 from gftorf_warp.scene.gaussians import constant_sh
 
 
 def test_flow_loss_is_small_for_the_true_motion_and_pulls_only_at_keys():
     """And its gradient is that of finite differences."""
-    settings = demo()
+    settings = demo(warm_up=0, motion_gradient_max=None)
     observations = observe(small(), settings, "cpu")
     state = begin(observations, settings, seed=0, device="cpu")
-    field = state.optimiser.field
+
+    def step():
+        return OneStep(state, observations, settings, 4, terms=(FLOW,))
 
     def loss():
-        return objective.flow_loss(field, state.motion, state.binding, observations, 4, settings.render)
+        return step().terms["flow"]
 
-    true = loss()
-    assert torch.autograd.grad(loss(), state.optimiser.leaves[:-1], allow_unused=True) == (None,) * 5
+    true = step()
+    assert all(name == "motion" or not gradient.any() for name, gradient in true.gradients.items())
     with torch.no_grad():
         state.motion.offset[2] *= 0.0
-    wrong = loss()
-    assert float(wrong.detach()) > 3 * float(true.detach())
-    (gradient,) = torch.autograd.grad(wrong, state.motion.offset)
+    wrong = step()
+    assert wrong.terms["flow"] > 3 * true.terms["flow"]
+    gradient = wrong.gradients["motion"]
     assert gradient[:3].abs().amax(dim=(1, 2)).min() > 1e-4
     assert gradient[3].abs().max() == 0
     direction = gradient / gradient.norm()
     h = 1e-3
     with torch.no_grad():
         state.motion.offset += h * direction
-        up = float(loss())
+        up = loss()
         state.motion.offset -= 2 * h * direction
-        down = float(loss())
+        down = loss()
     assert (up - down) / (2 * h) == pytest.approx(float(gradient.norm()), rel=0.05)
-    without = replace(observations, flow={})
-    assert objective.flow_loss(field, state.motion, state.binding, without, 4, settings.render) is None
+    without = replace(observations, flow=ImageStack.of({}, "cpu"))
+    assert "flow" not in OneStep(state, without, settings, 4, terms=(FLOW,)).terms
 
 
 def test_terms_of_weight_zero_are_left_out_and_others_begin_when_the_schedule_says():
     """Flow at quartet starts only."""
     settings = demo(weights=Weights(distortion=2.0, flow=3.0, motion_size=4.0, ssim=0.2))
     schedule = replace(settings.schedule, images=1000, distortion_from=0.4, flow_from=200)
-    settings = replace(settings, schedule=schedule)
-    early, middle, late = (objective.weights_at(settings, images) for images in (199, 200, 400))
-    assert (early.flow, middle.flow) == (0.0, 3.0)
-    assert (middle.distortion, late.distortion) == (0.0, 2.0)
+    settings = replace(settings, schedule=replace(schedule, warm_up=0))
+    early, middle, late = (weights_at(settings, images) for images in (199, 200, 400))
+    assert (early["flow"], middle["flow"]) == (0.0, 3.0)
+    assert (middle["distortion"], late["distortion"]) == (0.0, 2.0)
     observations = observe(small(), settings, "cpu")
     state = begin(observations, settings, seed=0, device="cpu")
-    fixed = (state.optimiser.field, state.motion, state.binding, observations)
+    state.images = 400
     for frame, weights, names in (
-        (8, late, {"quads", "distortion", "flow", "motion_size"}),
-        (9, late, {"quads", "distortion", "motion_size"}),
+        (8, settings.weights, {"quads", "distortion", "flow", "motion_size"}),
+        (9, settings.weights, {"quads", "distortion", "motion_size"}),
         (9, Weights(), {"quads"}),
     ):
-        found, _ = objective.terms(*fixed, frame, settings, weights)
-        assert found.keys() == names
-        assert all(value > 0 for value in found.values())
+        terms = OneStep(state, observations, replace(settings, weights=weights), frame).terms
+        assert terms.keys() == names
+        assert all(value > 0 for value in terms.values())
+    images = OneStep(state, observations, settings, 9).images
+    assert images[0].renderings.keys() == {View.TOF}, "no flow, no colour"
+    fixed = replace(settings, schedule=replace(settings.schedule, warm_up=1000))
+    assert OneStep(state, observations, fixed, 8).terms.keys() == {"quads", "distortion"}, "nothing moves"
 
 
 def test_the_measured_slot_is_compared_at_its_own_time_and_shift():
     """Frame n of a recording rendered from itself: only the right shift and time fit."""
-    settings = demo()
+    settings = demo(weights=Weights(ssim=0.0), background=0.0, warm_up=0)
     observations = observe(small(), settings, "cpu")
     state = begin(observations, settings, seed=0, device="cpu")
-    fixed = (state.optimiser.field, state.motion, state.binding)
-    right = objective.terms(*fixed, observations, 6, settings, Weights(ssim=0.0))[0]["quads"]
+    right = OneStep(state, observations, settings, 6).terms["quads"]
     shifted = replace(observations.sequence, shifts=np.roll(observations.sequence.shifts, 1))
     late = replace(observations.sequence, times=observations.sequence.times + 8 / 120)
     for sequence in (shifted, late):
-        wrong = objective.terms(*fixed, replace(observations, sequence=sequence), 6, settings, Weights(ssim=0.0))
-        assert wrong[0]["quads"] > 1.5 * right
+        wrong = OneStep(state, replace(observations, sequence=sequence), settings, 6).terms["quads"]
+        assert wrong > 1.5 * right
 
 
 def test_every_measured_frame_has_its_turn_once_per_epoch():
@@ -94,13 +101,13 @@ def test_every_measured_frame_has_its_turn_once_per_epoch():
         state = begin(observations, settings, seed=0, device="cpu")
         epochs = []
         for _ in range(2):
-            drawn = [step.draw(state, observations, settings) for _ in observations.batches]
+            drawn = [draw(state, observations, settings) for _ in observations.batches]
             assert max(map(len, drawn)) == size
             epochs.append([n for batch_of in drawn for n in batch_of])
         assert sorted(epochs[0]) == sorted(epochs[1]) == [n for n in range(12) if n not in (2, 7)]
         assert epochs[0] != epochs[1]
     state.images = 998
-    assert len(step.draw(state, observations, settings)) == 2, "a run of 1000 images ends at 1000"
+    assert len(draw(state, observations, settings)) == 2, "a run of 1000 images ends at 1000"
 
 
 def test_reduced_keeps_the_view():
@@ -139,31 +146,15 @@ def test_reflectivity_can_start_clamped_and_recover():
     state = begin(observations, settings, seed=0, device="cpu")
     with torch.no_grad():
         state.optimiser.tensors["reflectivity_sh"][::2] = constant_sh(torch.tensor(-1.0))
-    assert step.step(state, observations, settings) is None
+    assert advance(state, observations, settings) == 0
     assert all(leaf.isfinite().all() for leaf in state.optimiser.leaves)
-
-
-def test_rays_are_computed_once_per_pose():
-    """The same tensors for all frames of one pose, and those of its camera."""
-    observations = observe(small(), demo(), "cpu")
-    centre, ray = observations.rays_at(4)
-    assert torch.equal(ray, observations.cameras[4].rays())
-    assert observations.rays_at(8)[1] is ray
-    pose = np.diag([-1.0, 1.0, -1.0, 1.0])
-    pose[0, 3] = 0.5
-    turned = observations.cameras[5].at(pose)
-    moving = replace(observations, cameras=[*observations.cameras[:5], turned, *observations.cameras[6:]])
-    other_centre, other = moving.rays_at(5)
-    assert torch.equal(other, turned.rays())
-    assert not torch.equal(other, ray)
-    torch.testing.assert_close(other_centre - centre, torch.tensor([0.5, 0.0, 0.0]))
 
 
 def test_flow_may_come_now_and_then():
     """In one of three quartets, and three times as heavy there."""
     settings = presets.released()
     settings = replace(settings, schedule=replace(settings.schedule, flow_every=3))
-    flows = [objective.weights_at(settings, images).flow for images in range(1992, 2028)]
+    flows = [flow_weight(settings, images) for images in range(1992, 2028)]
     assert flows[:8] == [0.0] * 8, "it has not begun"
     want = 3 * settings.weights.flow
     assert flows[8:] == [want if n // 4 % 3 == 0 else 0.0 for n in range(2000, 2028)]

@@ -85,9 +85,9 @@ def test_quartets_may_have_rates_and_moments_of_their_own():
     without = replace(quartet, schedule=replace(quartet.schedule, batch_rule=BatchRule.NONE))
     phasors = presets.released(Recorded(input=Input.PHASOR))
     phasors = replace(phasors, schedule=replace(phasors.schedule, batch=Batch.QUARTET))
-    for same, single in ((without, released), (phasors, presets.released(Recorded(input=Input.PHASOR)))):
-        assert betas_of(same) == BETAS
-        assert rates_at(same, 5000) == rates_at(single, 5000)
+    for fours, single in ((without, released), (phasors, presets.released(Recorded(input=Input.PHASOR)))):
+        assert betas_of(fours) == BETAS
+        assert rates_at(fours, 5000) == rates_at(single, 5000)
     for settings in (presets.paper(), presets.demo()):
         assert settings.schedule.batch_rule == BatchRule.NONE
 

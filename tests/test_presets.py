@@ -4,17 +4,17 @@ from dataclasses import fields, is_dataclass, replace
 
 import pytest
 import torch
-from gftorf_warp.recon.objective import render_settings_at, weights_at
-from small_runs import demo, small
+from small_runs import advance, demo, small
 
 from gftorf_warp.errors import UsageError
-from gftorf_warp.recon import densify, presets, step
+from gftorf_warp.recon import densify, presets
 from gftorf_warp.recon.config import resolved
 from gftorf_warp.recon.observations import observe
 from gftorf_warp.recon.optimiser import frozen, rates_at
 from gftorf_warp.recon.presets import Recorded
 from gftorf_warp.recon.settings import Batch, Input, Norm, plain
 from gftorf_warp.recon.state import begin
+from gftorf_warp.recon.terms import colour_weight, render_settings_at
 from gftorf_warp.render.buffers import ClampGradient, Stop, Support
 from gftorf_warp.scene.initialise import Init, InitSettings
 from gftorf_warp.scene.motion import MotionSettings, Products
@@ -105,7 +105,7 @@ def test_released_for_phasors():
     weights = s.weights
     assert (weights.flow, weights.colour, weights.colour_norm, weights.motion_size) == (0.0, 1.0, Norm.L1, 0.05)
     assert presets.paper(PHASOR).weights.colour_norm == Norm.L2
-    assert (weights_at(s, 1999).colour, weights_at(s, 2000).colour) == (0.0, 1.0)
+    assert (colour_weight(s, 1999), colour_weight(s, 2000)) == (0.0, 1.0)
     assert s.schedule.freeze_from is None
 
 
@@ -221,11 +221,11 @@ def test_nothing_moves_in_the_warm_up_and_the_network_learns_nothing():
     before = [parameter.detach().clone() for parameter in state.motion.parameters()]
     still = begin(observations, s, seed=0, device="cpu")
     for _ in range(6):
-        assert step.step(state, observations, s) is None
-        assert step.step(still, observations, s) is None
+        assert advance(state, observations, s) == 0
+        assert advance(still, observations, s) == 0
     assert torch.equal(state.optimiser.field.mean, still.optimiser.field.mean)
     assert all(torch.equal(a, b) for a, b in zip(before, state.motion.parameters(), strict=True))
-    step.step(state, observations, s)
+    advance(state, observations, s)
     assert not all(torch.equal(a, b) for a, b in zip(before, state.motion.parameters(), strict=True))
 
 
@@ -236,10 +236,10 @@ def test_frozen_gaussians_stay_and_the_network_goes_on():
     observations = observe(small(), s, "cpu")
     state = begin(observations, s, seed=0, device="cpu")
     for _ in range(4):
-        step.step(state, observations, s)
+        advance(state, observations, s)
     gaussians = {name: value.detach().clone() for name, value in state.optimiser.tensors.items()}
     weights = [parameter.detach().clone() for parameter in state.motion.parameters()]
-    step.step(state, observations, s)
+    advance(state, observations, s)
     assert all(torch.equal(value, gaussians[name]) for name, value in state.optimiser.tensors.items())
     assert not all(torch.equal(a, b) for a, b in zip(weights, state.motion.parameters(), strict=True))
 
@@ -252,9 +252,9 @@ def test_the_step_of_a_round_is_lost_only_where_the_preset_says_so():
         observations = observe(small(), s, "cpu")
         state = begin(observations, s, seed=0, device="cpu")
         for _ in range(3):
-            step.step(state, observations, s)
+            advance(state, observations, s)
         before = state.optimiser.field.mean.detach().clone()
-        step.step(state, observations, s)
+        advance(state, observations, s)
         assert torch.equal(state.optimiser.field.mean, before) == loses
 
 

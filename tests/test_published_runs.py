@@ -1,18 +1,19 @@
 """The published presets from end to end, small: they run on every device, learn, stop, go on, and say what they did."""
 
+import copy
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 from moving_box import recording
-from small_runs import rows, same, stored
+from small_runs import advance, rows, same, stored
 from test_inputs import as_phasors, with_colour
 
 from gftorf_warp.data.write import write
 from gftorf_warp.errors import InputError
 from gftorf_warp.evaluate.compare import compare
-from gftorf_warp.recon import presets, step
+from gftorf_warp.recon import presets
 from gftorf_warp.recon.observations import observe
 from gftorf_warp.recon.presets import Recorded
 from gftorf_warp.recon.run import Run
@@ -118,12 +119,12 @@ def test_a_step_beyond_the_range_of_halves_changes_nothing():
         return [leaf.detach().clone() for leaf in state.optimiser.leaves]
 
     before = scaled(2.0**20)
-    assert step.step(state, observations, settings) is not None
+    assert advance(state, observations, settings) == 1
     assert all(map(torch.equal, before, state.optimiser.leaves))
     scaled(2.0**-20)
     before = [weight.detach().clone() for weight in weights]
     for _ in range(2):
-        assert step.step(state, observations, settings) is None
+        assert advance(state, observations, settings) == 0
     assert not any(map(torch.equal, before, weights))
 
 
@@ -155,12 +156,15 @@ def test_too_short_a_run_is_warned_of(tmp_path, caplog):
     assert "nothing will move" in caplog.text
 
 
-def test_a_run_goes_on_on_another_kind_of_device():
-    """Whose random generator has a state of another length: only the backgrounds become others."""
+def test_an_earlier_run_continues_with_its_seed_of_backgrounds():
+    """Formats 1 and 2 stored a generator, whose state has another length on a GPU; both hold the seed."""
     settings = small("paper", 8)
     observations = observe(recording(frames=12)[0], settings, "cpu")
     kept = to_dict(begin(observations, settings, seed=0, device="cpu"))
-    elsewhere = kept | {"noise": torch.zeros(16, dtype=torch.uint8)}
-    state = from_dict(elsewhere, "cpu")
-    assert step.step(state, observations, settings) is None
-    assert torch.equal(from_dict(kept, "cpu").noise.get_state(), kept["noise"])
+    kept.pop("noise_seed")
+    on_cpu = torch.Generator().manual_seed(77).get_state()
+    on_gpu = torch.tensor([*(77).to_bytes(8, "little"), *(12).to_bytes(8, "little")], dtype=torch.uint8)
+    for noise in (on_cpu, on_gpu):
+        state = from_dict(copy.deepcopy(kept | {"noise": noise}), "cpu")
+        assert state.noise_seed == 77
+        assert advance(state, observations, settings) == 0

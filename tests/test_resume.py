@@ -1,6 +1,7 @@
 """Long runs: interrupted, killed, started twice, in the wrong folder, without numbers."""
 
 import copy
+import functools
 import json
 import os
 import signal
@@ -12,14 +13,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 from moving_box import recording
-from small_runs import demo, rows, same, small, stored
+from small_runs import advance, demo, rows, same, small, stored
 
 from gftorf_warp.errors import BusyError, DivergedError, UsageError
-from gftorf_warp.recon import checkpoint, folder, objective, presets, step
+from gftorf_warp.recon import checkpoint, folder, loop, presets
 from gftorf_warp.recon.observations import observe
 from gftorf_warp.recon.run import Run
 from gftorf_warp.recon.settings import Batch, DensifySettings, Weights, plain
 from gftorf_warp.recon.state import begin, from_dict, to_dict
+from gftorf_warp.recon.stepper import Stepper
+from gftorf_warp.recon.terms import TERMS
 from gftorf_warp.recon.train import reconstruct
 
 KILLED = """
@@ -118,16 +121,15 @@ def test_two_calls_do_not_share_a_folder(tmp_path):
 
 def broken_at(monkeypatch, is_broken):
     """Make the loss NaN in steps chosen by the number of calls so far."""
-    calls, whole = [0], objective.terms
+    calls, (first, *others) = [0], TERMS
 
-    def terms(*arguments):
-        found, rendering = whole(*arguments)
+    def loss(image, out):
         calls[0] += 1
-        if is_broken(calls[0]):
-            found = {name: value * float("nan") for name, value in found.items()}
-        return found, rendering
+        value = first.loss(image, out)
+        return value * float("nan") if is_broken(calls[0]) else value
 
-    monkeypatch.setattr(step, "terms", terms)
+    terms = replace(first, loss=loss), *others
+    monkeypatch.setattr(loop, "Stepper", functools.partial(Stepper, terms=terms))
 
 
 def test_a_step_without_numbers_is_skipped_and_counted(monkeypatch, tmp_path):
@@ -164,13 +166,12 @@ def test_a_state_survives_being_stored(tmp_path):
     settings = demo(images=40)
     observations = observe(small(), settings, "cpu")
     state = begin(observations, settings, seed=0, device="cpu")
-    for _ in range(3):
-        step.step(state, observations, settings)
+    advance(state, observations, settings, 3)
     path = checkpoint.save(tmp_path, to_dict(state))
     again = from_dict(checkpoint.load(path), "cpu")
     assert same(to_dict(again), to_dict(state))
-    step.step(state, observations, settings)
-    step.step(again, observations, settings)
+    advance(state, observations, settings)
+    advance(again, observations, settings)
     assert same(to_dict(again), to_dict(state))
 
 

@@ -196,8 +196,8 @@ class ControlBlock:
             for (kind, view), shape in self._parts.items():
                 part = constants[n, start : start + math.prod(shape)]
                 start += math.prod(shape)
-                if kind == "blend" and not keys:
-                    continue  # nothing moves
+                if kind == "blend" and (not keys or (view == View.FLOW and not flow)):
+                    continue  # nothing moves, or the keys of the quartet's start are not among them
                 if kind == "blend":
                     rows = self._blend(view, frame, keys, flow=flow)
                     part[: rows.size] = rows.ravel()  # of as many keys as the graph has
@@ -220,7 +220,6 @@ class ControlBlock:
 
     def _blend(self, view: View, frame: int, keys: list[int], *, flow: bool) -> Float[np.ndarray, "D K"]:
         """Interpolation weights of a view, see ``ImageControl.blend``."""
-        times = self.motion.key_times.tolist()
         quartet, times = frame // self.observations.sequence.cycle, self.motion.times
         at = self._weights(self._time(view, frame), keys)
         if view == View.COLOUR or not flow:
