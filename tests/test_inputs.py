@@ -76,7 +76,7 @@ def test_colour_is_compared_from_its_own_camera():
     state = begin(observations, settings, seed=0, device="cpu")
     field = state.optimiser.field
     moved = field.moved(*state.motion.at(state.binding, 4 / 120))
-    want = rasterize(moved, camera, sensor_of(sequence), settings.render).colour
+    want = rasterize(moved, camera, sensor_of(sequence), settings.render).colour.detach()
     squared = (want - observations.colour[4]).square().mean()
     assert OneStep(state, observations, settings, 4).terms["colour"] == pytest.approx(2.0 * float(squared), rel=1e-5)
     wrong = rasterize(moved, observations.cameras[4].resized(*want.shape[:0:-1]), sensor_of(sequence))
