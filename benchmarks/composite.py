@@ -26,7 +26,7 @@ from gftorf_warp.kernels.rasterise.composite import CHANNEL_PLANES
 from gftorf_warp.kernels.rasterise.composite_backward import GRAD_LIGHT_PLANES
 from gftorf_warp.kernels.rasterise.splat import Splat
 from gftorf_warp.render import launch, stages
-from gftorf_warp.render.buffers import Frame, RenderSettings
+from gftorf_warp.render.buffers import Buffers, RenderSettings
 
 
 class Ours:
@@ -35,43 +35,50 @@ class Ours:
     def __init__(self, scene: dict, device: str, threads: int):
         self.inputs = inputs_of(scene, device)
         settings = RenderSettings(near=NEAR, far=FAR, threads=threads)
-        self.frame = Frame(len(scene["mean"]), WIDTH, HEIGHT, settings, wp.get_device(device))
-        self.view = launch.uploaded(CAMERA, (), settings, self.frame.device)
-        stages.project(self.inputs, self.view, self.frame)
-        stages.sort_by_depth(self.frame)
-        stages.sort_by_tile(self.frame)
-        self.frame.records = [self.frame.splats]
-        self.frame.channels = [self.frame.planes("channels 0", CHANNEL_PLANES)]
+        self.buffers = Buffers(len(scene["mean"]), WIDTH, HEIGHT, settings, wp.get_device(device))
+        self.view = launch.uploaded(CAMERA, (), settings, self.buffers.device)
+        stages.project(self.inputs, self.view, self.buffers)
+        stages.sort_by_depth(self.buffers)
+        stages.sort_by_tile(self.buffers)
+        self.buffers.records = [self.buffers.splats]
+        self.buffers.channels = [self.buffers.planes("channels 0", CHANNEL_PLANES)]
         self.grad_light, self.grad_channel = (
-            self.frame.gradient_planes("gradient of light", GRAD_LIGHT_PLANES),
-            self.frame.gradient_planes("gradient of channels 0", CHANNEL_PLANES),
+            self.buffers.gradient_planes("gradient of light", GRAD_LIGHT_PLANES),
+            self.buffers.gradient_planes("gradient of channels 0", CHANNEL_PLANES),
         )
         rng = np.random.default_rng(1)
         for planes in (self.grad_light, self.grad_channel):
             planes.flat.assign(rng.normal(size=planes.flat.shape).astype(np.float32))
-        self.records = wp.zeros(self.frame.count, dtype=Splat, device=device)
+        self.records = wp.zeros(self.buffers.count, dtype=Splat, device=device)
 
     def forward(self) -> None:
         """Blend."""
-        stages.composite(self.frame, 0)
+        stages.composite(self.buffers, 0)
 
     def backward(self) -> None:
         """Blend backward, gradient records zeroed."""
         self.records.zero_()
-        stages.composite_backward(self.frame, 0, self.grad_light, self.grad_channel, self.records)
-        stages.finish(self.frame, self.records)
+        stages.composite_backward(self.buffers, 0, self.grad_light, self.grad_channel, self.records)
+        stages.finish(self.buffers, self.records)
 
 
 class Naive:
     """One thread per pixel, on the splats and lists of ours."""
 
     def __init__(self, ours: Ours):
-        frame = ours.frame
-        self.lists = [frame.first, frame.ids, frame.splats, frame.tile_width, frame.tile_height, frame.tiles_x]
-        self.sums = wp.zeros((12, HEIGHT, WIDTH), dtype=float, device=frame.device)
+        buffers = ours.buffers
+        self.lists = [
+            buffers.first,
+            buffers.ids,
+            buffers.splats,
+            buffers.tile_width,
+            buffers.tile_height,
+            buffers.tiles_x,
+        ]
+        self.sums = wp.zeros((12, HEIGHT, WIDTH), dtype=float, device=buffers.device)
         grad = np.random.default_rng(1).normal(size=(9, HEIGHT, WIDTH))
-        self.grad = wp.array(grad, dtype=float, device=frame.device)
-        self.records = wp.zeros(frame.count, dtype=Splat, device=frame.device)
+        self.grad = wp.array(grad, dtype=float, device=buffers.device)
+        self.records = wp.zeros(buffers.count, dtype=Splat, device=buffers.device)
 
     def forward(self) -> None:
         """Blend."""

@@ -77,7 +77,7 @@ LARGE_CLASSES = {  # file:class: why it may be larger
     "recon/run.py:Run": "still to be divided",
     "recon/step.py:Step": "still to be divided",
     "recon/stepper.py:Stepper": "still to be divided",
-    "render/buffers.py:Frame": "still to be divided",
+    "render/buffers.py:Buffers": "still to be divided",
 }
 SENTINEL = re.compile(r"(?<![\w.+*/-])-?\d+(\.\d+)?(: | likewise| (if|where|for|means) )")
 SENTINELS = {  # kernel.parameter or struct.field: why a number may mean something else there

@@ -10,8 +10,9 @@ from cases import CASES, SMALL, Case, gaussians, light
 from comparison import DEVICES, Comparison
 
 from gftorf_warp.bench.scenes import inputs_of
-from gftorf_warp.render import buffers, launch, reference, stages
-from gftorf_warp.render.buffers import Frame, RenderSettings
+from gftorf_warp.render import buffers as sizes
+from gftorf_warp.render import launch, reference, stages
+from gftorf_warp.render.buffers import Buffers, RenderSettings
 
 NEXT = float(np.nextafter(np.float32(1.0), np.float32(2.0)))
 PRESETS = 0.135, 7.425  # near and far at 20 MHz [m]
@@ -46,11 +47,11 @@ def ordered(z, settings, device, opacity=0.5):
         "colour": np.zeros((count, 3)),
         "reflectivity": np.full(count, 0.5),
     }
-    frame = Frame(count, SMALL.width, SMALL.height, settings, wp.get_device(device))
-    stages.project(inputs_of(scene, device), launch.uploaded(SMALL, (), settings, frame.device), frame)
-    keys = frame.depth_key.numpy()[:count].copy()
-    stages.sort_by_depth(frame)
-    return keys, frame.order.numpy()[:count]
+    buffers = Buffers(count, SMALL.width, SMALL.height, settings, wp.get_device(device))
+    stages.project(inputs_of(scene, device), launch.uploaded(SMALL, (), settings, buffers.device), buffers)
+    keys = buffers.depth_key.numpy()[:count].copy()
+    stages.sort_by_depth(buffers)
+    return keys, buffers.order.numpy()[:count]
 
 
 @pytest.mark.parametrize("bits", [24, 16])
@@ -185,13 +186,13 @@ def test_classes_give_the_order_of_a_sort(count, kind, bits, device, monkeypatch
     }[kind]
     found = []
     for most in (0, 1 << 20):
-        monkeypatch.setitem(buffers.RANKED_MAX, "cpu" if device == "cpu" else "cuda", most)
-        frame = Frame(count, 64, 48, settings, wp.get_device(device))
-        assert frame.ranks == (most > 0)
-        frame.depth_key.assign(np.concatenate([keys, keys]).astype(np.int32))
-        frame.order.assign(np.concatenate([np.arange(count)] * 2).astype(np.int32))
-        stages.sort_by_depth(frame)
-        found.append(frame.order.numpy()[:count].copy())
+        monkeypatch.setitem(sizes.RANKED_MAX, "cpu" if device == "cpu" else "cuda", most)
+        buffers = Buffers(count, 64, 48, settings, wp.get_device(device))
+        assert buffers.ranks == (most > 0)
+        buffers.depth_key.assign(np.concatenate([keys, keys]).astype(np.int32))
+        buffers.order.assign(np.concatenate([np.arange(count)] * 2).astype(np.int32))
+        stages.sort_by_depth(buffers)
+        found.append(buffers.order.numpy()[:count].copy())
     seen = int((keys != culled).sum())
     np.testing.assert_array_equal(found[0][:seen], np.argsort(keys, kind="stable")[:seen])
     np.testing.assert_array_equal(found[1][:seen], found[0][:seen])

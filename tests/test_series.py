@@ -79,12 +79,12 @@ def test_images_that_overflowed_are_rendered_again(run, ahead, where, monkeypatc
         target = right(self, time, camera)
         needed = int(target.packed[-1:].view(torch.int32))
         reserved = spoilt_below[0]
-        shown = replaying.replace(target.frame.settings, pair_capacity=reserved)
+        shown = replaying.replace(target.buffers.settings, pair_capacity=reserved)
         if needed > reserved:
             target.packed[:-1] = float("nan")
             spoilt.append((time, camera))
-        frame = type("Shown", (), {"settings": shown})
-        return replaying.replace(target, frame=frame)
+        buffers = type("Shown", (), {"settings": shown})
+        return replaying.replace(target, buffers=buffers)
 
     def grow(self):
         spoilt_below[0] = int(1.5 * self.largest) + 1

@@ -9,9 +9,10 @@ import pytest
 import torch
 import warp as wp
 
-from gftorf_warp.render import buffers, launch
+from gftorf_warp.render import buffers as sizes
+from gftorf_warp.render import launch
 from gftorf_warp.render.api import Background, rasterize
-from gftorf_warp.render.buffers import Frame, RenderSettings, Workspace
+from gftorf_warp.render.buffers import Buffers, RenderSettings, Workspace
 from gftorf_warp.render.cuda import capture, without_garbage_collection
 from gftorf_warp.render.launch import Images, Inputs
 from gftorf_warp.scene.camera import Camera
@@ -86,9 +87,9 @@ def test_tape_and_torch_agree_and_the_tape_accumulates(device):
         **{name: wp.zeros(s, dtype=float, device=wp_device, requires_grad=True) for name, s in shapes.items()}
     )
     inputs = Inputs(**arrays, calibration=calibration)
-    frame = Frame(COUNT, WIDTH, HEIGHT, SETTINGS, wp_device)
+    buffers = Buffers(COUNT, WIDTH, HEIGHT, SETTINGS, wp_device)
     with wp.Tape() as tape:
-        launch.render(inputs, launch.uploaded(CAMERA, SHIFTS, SETTINGS, wp_device), frame, images)
+        launch.render(inputs, launch.uploaded(CAMERA, SHIFTS, SETTINGS, wp_device), buffers, images)
     for name, image in wanted_images.items():
         torch.testing.assert_close(wp.to_torch(getattr(images, name)), image.detach())
 
@@ -107,7 +108,7 @@ def test_tape_and_torch_agree_and_the_tape_accumulates(device):
 def test_one_thread_per_pixel_gives_the_same_on_the_cpu(monkeypatch):
     """The instance that CUDA runs, one pixel per thread in tiles of 8 x 4, agrees with the 16-lane one."""
     images, wanted = torch_gradients()
-    monkeypatch.setitem(buffers.TILE_SHAPES, "cpu", buffers.TILE_SHAPES["cuda"])
+    monkeypatch.setitem(sizes.TILE_SHAPES, "cpu", sizes.TILE_SHAPES["cuda"])
     other_images, other = torch_gradients()
     for name, image in images.items():
         torch.testing.assert_close(other_images[name], image, rtol=1e-5, atol=2e-6, msg=name)
@@ -121,7 +122,7 @@ def test_a_fixed_capacity_gives_the_same_and_reports_what_did_not_fit():
     free = rasterize(field, CAMERA, SENSOR, SETTINGS)
     roomy = RenderSettings(near=0.1, far=20.0, pair_capacity=5000)
     torch.testing.assert_close(rasterize(field, CAMERA, SENSOR, roomy).quads, free.quads, rtol=0, atol=0)
-    with pytest.raises(ValueError, match=r"pair_capacity = 10 is too small: this frame has \d+"):
+    with pytest.raises(ValueError, match=r"pair_capacity = 10 is too small: this rendering has \d+"):
         rasterize(field, CAMERA, SENSOR, RenderSettings(near=0.1, far=20.0, pair_capacity=10))
 
 
@@ -140,11 +141,11 @@ def test_a_reserved_rendering_never_waits_for_the_host():
     shapes = {name: tuple(t.shape) for name, t in cotangents().items() if name != "extra"}
     images = Images(**{name: wp.zeros(shape, dtype=float, device=device) for name, shape in shapes.items()})
     seeds = Images(**{name: wp.from_torch(cotangents("cuda")[name]) for name in shapes})
-    frame = Frame(COUNT, WIDTH, HEIGHT, settings, device)
+    buffers = Buffers(COUNT, WIDTH, HEIGHT, settings, device)
 
     def both():
-        launch.forward(inputs, view, frame, images)
-        launch.backward(inputs, view, frame, seeds, wanted)
+        launch.forward(inputs, view, buffers, images)
+        launch.backward(inputs, view, buffers, seeds, wanted)
 
     both()
     with wp.ScopedCapture(device=device) as capture:
@@ -155,7 +156,7 @@ def test_a_reserved_rendering_never_waits_for_the_host():
     replayed, gradient = wp.to_torch(images.quads).clone(), wp.to_torch(wanted.mean).clone()
     wanted.mean.zero_()
     both()
-    frame.check_capacity()
+    buffers.check_capacity()
     torch.testing.assert_close(replayed, wp.to_torch(images.quads), rtol=0, atol=0)
     torch.testing.assert_close(gradient, wp.to_torch(wanted.mean), rtol=1e-4, atol=1e-4)
 
@@ -202,13 +203,13 @@ def test_a_workspace_changes_nothing_and_allocates_once(device):
                 got, want, rtol=0 if device == "cpu" else 1e-4, atol=0 if device == "cpu" else 1e-4
             )
     kind = COUNT, WIDTH, HEIGHT, SETTINGS, wp.get_device(device)
-    frame = workspace.frame(*kind)
-    held = {name: array.ptr for name, array in frame._arrays.items() if name not in ("keys", "ids")}
+    buffers = workspace.buffers(*kind)
+    held = {name: array.ptr for name, array in buffers._arrays.items() if name not in ("keys", "ids")}
     assert len(held) > 12
     rendered_in(workspace, device)
-    assert workspace.frame(*kind) is frame
-    assert {name: frame._arrays[name].ptr for name in held} == held
-    assert workspace.frame(COUNT + 1, *kind[1:]) is not frame
+    assert workspace.buffers(*kind) is buffers
+    assert {name: buffers._arrays[name].ptr for name in held} == held
+    assert workspace.buffers(COUNT + 1, *kind[1:]) is not buffers
 
 
 def test_backward_after_the_next_rendering_in_a_workspace_is_an_error():

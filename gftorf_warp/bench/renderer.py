@@ -17,7 +17,7 @@ import warp as wp
 
 from ..constants import CANONICAL_SHIFTS
 from ..render import launch, stages
-from ..render.buffers import Frame, RenderSettings
+from ..render.buffers import Buffers, RenderSettings
 from ..render.inputs import Images, Inputs, names_of
 from .scenes import CAMERA, FAMILIES, FAR, HEIGHT, NEAR, WIDTH, array_of, inputs_of, scene_of
 from .timing import Function, HostWatch, Report, Watch, both_ways, cell, lines_of, quietly, timed
@@ -61,7 +61,7 @@ class Case:
     """One scene in one form with its buffers."""
 
     def __init__(self, kind: str, count: int, scale: float, opacity: float, form: str, device: wp.Device):
-        """Make everything but the frame's reserve of pairs, which needs a first rendering."""
+        """Make everything but the pair capacity of its buffers, which needs a first rendering."""
         if form not in FORMS:
             raise ValueError(f"form {form!r} must be one of {FORMS}")
         everything = form == "all"
@@ -85,21 +85,21 @@ class Case:
         self.count, self.device = count, device
         self.start(None)
         self.forward()
-        self.pairs = int(self.frame.total.numpy()[0])
+        self.pairs = int(self.buffers.total.numpy()[0])
 
     def start(self, capacity: int | None) -> None:
         """Buffers for ``capacity`` pairs; None: as many as needed."""
         settings = RenderSettings(near=NEAR, far=FAR, pair_capacity=capacity)
-        self.frame = Frame(self.count, WIDTH, HEIGHT, settings, self.device)
+        self.buffers = Buffers(self.count, WIDTH, HEIGHT, settings, self.device)
         self.view = launch.uploaded(CAMERA, self.shifts, settings, self.device)
 
     def forward(self) -> None:
         """Render."""
-        launch.forward(self.inputs, self.view, self.frame, self.images)
+        launch.forward(self.inputs, self.view, self.buffers, self.images)
 
     def backward(self) -> None:
         """Differentiate; the forward pass has run."""
-        launch.backward(self.inputs, self.view, self.frame, self.cotangents, self.wanted)
+        launch.backward(self.inputs, self.view, self.buffers, self.cotangents, self.wanted)
 
     def both(self) -> None:
         """Forward and backward."""
@@ -167,7 +167,7 @@ def measure(
             case.start(int(HEADROOM * case.pairs) + 1)
         forward, both = (both_ways(function, watch, runs) for function in (case.forward, case.both))
         parts = {name: both_ways(function, watch, runs, within=WITHIN) for name, function in case.stages().items()}
-        case.frame.check_capacity()
+        case.buffers.check_capacity()
         assert case.images.distance is not None
         row: dict[str, Any] = {"form": form, "scene": kind, "scale": scale, "opacity": opacity, "N": count}
         row |= {"pairs": case.pairs, "forward": forward, "forward_backward": both, "pairs_counted_on_host": free}

@@ -14,7 +14,7 @@ from torch.autograd.function import once_differentiable
 from ..kernels.geometry import CameraView
 from ..scene.camera import Camera
 from . import launch
-from .buffers import Frame, RenderSettings, Workspace
+from .buffers import Buffers, RenderSettings, Workspace
 from .control import DeviceCamera
 from .cuda import stream_of
 from .inputs import Images, Inputs, View, names_of, shapes_of
@@ -74,12 +74,12 @@ class Rasterize(torch.autograd.Function):
         with stream_of(mean):
             device = wp.device_from_torch(mean.device)
             kind = len(mean), camera.width, camera.height, request.settings, device
-            frame = Frame(*kind) if request.workspace is None else request.workspace.frame(*kind)
+            buffers = Buffers(*kind) if request.workspace is None else request.workspace.buffers(*kind)
             view = _view(request, device)
             learns = any(ctx.needs_input_grad)  # otherwise these are the launches of a replay
-            launch.forward(_inputs(named), view, frame, _images(images), differentiable=learns)
+            launch.forward(_inputs(named), view, buffers, _images(images), differentiable=learns)
         ctx.save_for_backward(*tensors)
-        ctx.state = request, view, frame, frame.turns
+        ctx.state = request, view, buffers, buffers.turns
         return tuple(images.get(name) for name in IMAGES)
 
     @staticmethod
@@ -87,8 +87,8 @@ class Rasterize(torch.autograd.Function):
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
         """Launch the adjoints explicitly: no tape, no state outside ``ctx``; gradients into fresh tensors."""
         named = dict(zip(INPUTS, ctx.saved_tensors, strict=True))
-        request, view, frame, turn = ctx.state
-        if frame.turns != turn:
+        request, view, buffers, turn = ctx.state
+        if buffers.turns != turn:
             raise ValueError("its workspace has rendered again since: call backward before the next rendering with it")
         screen = request.screen
         needed = dict(zip(INPUTS, ctx.needs_input_grad[1:], strict=True))
@@ -96,7 +96,7 @@ class Rasterize(torch.autograd.Function):
         cotangents = {name: g.contiguous() for name, g in zip(IMAGES, grads, strict=True) if g is not None}
         if cotangents and wanted:
             with stream_of(named["mean"]):
-                arrays = _inputs(named), view, frame, _images(cotangents), _inputs(wanted)
+                arrays = _inputs(named), view, buffers, _images(cotangents), _inputs(wanted)
                 records = launch.backward(*arrays, extra_detached=request.extra_detached)
                 if screen is not None and len(screen):
                     pairs = wp.to_torch(records).unflatten(1, (-1, 2))  # of slots: the first and the fourth

@@ -84,7 +84,7 @@ class RenderSettings:
     pair_capacity: int | None = None
     """(tile, splat) pairs to reserve; None reads their number back, the one host synchronisation of a rendering.
 
-    With a number nothing is read back on CUDA: pairs that do not fit are dropped, and ``Frame.check_capacity`` tells.
+    With a number nothing is read back on CUDA: pairs that do not fit are dropped, and ``Buffers.check_capacity`` tells.
     On the CPU it is asked every time.
     """
     deterministic: bool = False
@@ -144,10 +144,10 @@ def available_threads() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-class Frame:
-    """The arrays of one rendering: what forward leaves for backward. Nothing is shared between two frames.
+class Buffers:
+    """The arrays of one rendering: what forward leaves for backward. Nothing is shared between two buffers.
 
-    A frame may render again: then it is the same memory, every array of it by its name, and backward belongs to the
+    A buffers may render again: then it is the same memory, every array of it by its name, and backward belongs to the
     last rendering.
     """
 
@@ -211,7 +211,7 @@ class Frame:
         return min(len(self.channels), 2 if self.cooperative and self.threads == 1 else 1)
 
     def array(self, name: str, shape: int | tuple[int, ...], dtype=wp.int32) -> wp.array:
-        """Memory on the device of this frame, as whoever used it last under that name left it."""
+        """Memory on the device of this buffers, as whoever used it last under that name left it."""
         wanted = (shape,) if isinstance(shape, int) else shape
         if name not in self._arrays or self._arrays[name].shape != wanted:
             self._arrays[name] = wp.empty(wanted, dtype=dtype, device=self.device)
@@ -238,7 +238,9 @@ class Frame:
         """
         capacity, needed = self.settings.pair_capacity, int(self.total.numpy()[0]) if self.count else 0
         if capacity is not None and needed > capacity:
-            raise ValueError(f"pair_capacity = {capacity} is too small: this frame has {needed} (tile, splat) pairs")
+            raise ValueError(
+                f"pair_capacity = {capacity} is too small: this rendering has {needed} (tile, splat) pairs"
+            )
 
     def planes(self, name: str, count: int) -> Planes:
         """``count`` image planes in tile order."""
@@ -261,23 +263,23 @@ class Frame:
 class Planes:
     """Image planes in tile order, seen twice: ``lanes`` for the compositor, ``flat`` for everything per pixel."""
 
-    def __init__(self, flat: wp.array, frame: Frame):
+    def __init__(self, flat: wp.array, buffers: Buffers):
         self.flat = flat
         self.lanes = wp.array(
             ptr=flat.ptr,
-            dtype=make_lanes(frame.K).V,
-            shape=(flat.shape[0], frame.tiles + 1, frame.lanes),
-            device=frame.device,
+            dtype=make_lanes(buffers.K).V,
+            shape=(flat.shape[0], buffers.tiles + 1, buffers.lanes),
+            device=buffers.device,
         )  # a view: ``flat`` owns the memory, and lives as long as this object
 
     @staticmethod
-    def shape_of(frame: Frame, count: int) -> tuple[int, int]:
+    def shape_of(buffers: Buffers, count: int) -> tuple[int, int]:
         """Planes and their floats, with one tile of padding.
 
         320 x 240 floats are exactly 75 pages, and a loop that touches the same pixel of nine such planes would keep
         evicting its own cache lines.
         """
-        return count, (frame.tiles + 1) * frame.lanes * frame.K
+        return count, (buffers.tiles + 1) * buffers.lanes * buffers.K
 
 
 class Workspace:
@@ -291,27 +293,27 @@ class Workspace:
 
     def __init__(self) -> None:
         self._key: tuple | None = None
-        self._frame: Frame | None = None
+        self._buffers: Buffers | None = None
 
-    def frame(self, count: int, width: int, height: int, settings: RenderSettings, device: wp.Device) -> Frame:
-        """The frame of the last rendering if it was of this kind, otherwise a new one."""
+    def buffers(self, count: int, width: int, height: int, settings: RenderSettings, device: wp.Device) -> Buffers:
+        """The buffers of the last rendering if it was of this kind, otherwise a new one."""
         key = count, width, height, settings, device
-        if self._frame is None or self._key != key:
-            self._key, self._frame = key, Frame(count, width, height, settings, device)
-        return self._frame
+        if self._buffers is None or self._key != key:
+            self._key, self._buffers = key, Buffers(count, width, height, settings, device)
+        return self._buffers
 
     @property
-    def last(self) -> Frame:
-        """The frame of the last rendering.
+    def last(self) -> Buffers:
+        """The buffers of the last rendering.
 
         Raises:
             ValueError: If there was none.
         """
-        if self._frame is None:
+        if self._buffers is None:
             raise ValueError("nothing has been rendered in this workspace")
-        return self._frame
+        return self._buffers
 
     def check_capacity(self) -> None:
-        """As ``Frame.check_capacity``, for the last rendering."""
-        if self._frame is not None:
-            self._frame.check_capacity()
+        """As ``Buffers.check_capacity``, for the last rendering."""
+        if self._buffers is not None:
+            self._buffers.check_capacity()

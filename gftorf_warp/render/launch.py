@@ -2,9 +2,9 @@
 
 A Warp program renders with
 
-    frame = Frame(count, width, height, settings, device)
+    buffers = Buffers(count, width, height, settings, device)
     with wp.Tape() as tape:
-        render(inputs, uploaded(camera, shifts, settings, device), frame, images)
+        render(inputs, uploaded(camera, shifts, settings, device), buffers, images)
     tape.backward(grads={images.quads: ...})
 
 and finds gradients added to the ``.grad`` of its inputs. torch programs come through bridge.py.
@@ -26,7 +26,7 @@ from ..kernels.rasterise import splat
 from ..kernels.rasterise.composite import CHANNEL_PLANES
 from ..scene.camera import Camera
 from . import stages
-from .buffers import Frame, RenderSettings
+from .buffers import Buffers, RenderSettings
 from .inputs import Images, Inputs, View, channel_groups, gradients_in, names_of, present_in
 
 __all__ = ["Images", "Inputs", "backward", "forward", "render", "uploaded", "view_bits", "view_of"]
@@ -71,12 +71,12 @@ def _uploaded(bits: bytes, shifts: tuple[float, ...], lens: bool, device: str) -
     )
 
 
-def render(inputs: Inputs, view: View, frame: Frame, images: Images) -> None:
+def render(inputs: Inputs, view: View, buffers: Buffers, images: Images) -> None:
     """Fill those of ``images`` that are there.
 
     On an active ``wp.Tape`` also record the adjoint, which adds to the ``.grad`` of the inputs.
     """
-    forward(inputs, view, frame, images)
+    forward(inputs, view, buffers, images)
     tape = wp._src.context.runtime.tape  # the public API has no name for the active tape
     if tape is not None:
         arrays = [a for group in (inputs, images) for a in present_in(group).values() if a.requires_grad]
@@ -84,7 +84,7 @@ def render(inputs: Inputs, view: View, frame: Frame, images: Images) -> None:
         def adjoint():
             cotangents = Images(**dict.fromkeys(names_of(Images)) | gradients_in(images))
             wanted = Inputs(**dict.fromkeys(names_of(Inputs)) | gradients_in(inputs))
-            backward(inputs, view, frame, cotangents, wanted)
+            backward(inputs, view, buffers, cotangents, wanted)
 
         tape.record_func(adjoint, arrays)
 
@@ -92,62 +92,62 @@ def render(inputs: Inputs, view: View, frame: Frame, images: Images) -> None:
 def forward(
     inputs: Inputs,
     view: View,
-    frame: Frame,
+    buffers: Buffers,
     images: Images,
     *,
     differentiable: bool = True,
 ) -> None:
     """Project, sort, composite, resolve; images that are None cost nothing, nor does what backward alone needs."""
-    frame.turns += 1
+    buffers.turns += 1
     groups = channel_groups(inputs)
-    frame.channels = [frame.planes(f"channels {number}", CHANNEL_PLANES) for number in range(len(groups))]
-    frame.records = [frame.splats]
-    if frame.count:
-        stages.project(inputs, view, frame)
+    buffers.channels = [buffers.planes(f"channels {number}", CHANNEL_PLANES) for number in range(len(groups))]
+    buffers.records = [buffers.splats]
+    if buffers.count:
+        stages.project(inputs, view, buffers)
     for number, (name, start) in enumerate(groups):  # before lists are made, which leaves most of a GPU idle
         if number > 0:
-            frame.records.append(frame.array(f"records {number}", frame.count, splat.Splat))
+            buffers.records.append(buffers.array(f"records {number}", buffers.count, splat.Splat))
         if name == "extra":
-            stages.set_channels(frame, inputs, start, frame.records[number])
-    if frame.count:
-        stages.sort_by_depth(frame)
-        stages.sort_by_tile(frame)
+            stages.set_channels(buffers, inputs, start, buffers.records[number])
+    if buffers.count:
+        stages.sort_by_depth(buffers)
+        stages.sort_by_tile(buffers)
     else:
-        frame.first.zero_()
-    for number in [0, *range(max(1, frame.groups_with_light), len(frame.records))]:
-        stages.composite(frame, number, images.distortion is not None, differentiable=differentiable)
-    stages.resolve_images(inputs, view, frame, images, groups)
+        buffers.first.zero_()
+    for number in [0, *range(max(1, buffers.groups_with_light), len(buffers.records))]:
+        stages.composite(buffers, number, images.distortion is not None, differentiable=differentiable)
+    stages.resolve_images(inputs, view, buffers, images, groups)
 
 
 def backward(
     inputs: Inputs,
     view: View,
-    frame: Frame,
+    buffers: Buffers,
     cotangents: Images,
     wanted: Inputs,
     *,
     extra_detached: bool = False,
 ) -> wp.array:
-    """Add to the arrays of ``wanted`` what ``cotangents`` say; what forward left in the frame stays as it was.
+    """Add to the arrays of ``wanted`` what ``cotangents`` say; what forward left in the buffers stays as it was.
 
     With ``extra_detached`` weights are held fixed under the extra images, so that only the extra channels learn.
 
     Returns:
         [N] gradient records of the splats: slots 0 and 1 are the screen gradient, 6 the number of pixels, 7 the weight.
-        They belong to the frame.
+        They belong to the buffers.
     """
     groups = channel_groups(inputs)
-    grad_light, grad_channels = stages.fold_images(inputs, view, frame, cotangents, wanted, groups)
-    grad_splats = frame.zeros("gradient records", frame.count, splat.Splat)
-    if not frame.count:
+    grad_light, grad_channels = stages.fold_images(inputs, view, buffers, cotangents, wanted, groups)
+    grad_splats = buffers.zeros("gradient records", buffers.count, splat.Splat)
+    if not buffers.count:
         return grad_splats
     distortion, fixed = cotangents.distortion is not None, [name == "extra" and extra_detached for name, _ in groups]
     first: dict[str, Any] = {"distortion": distortion, "fixed": bool(groups) and fixed[0]}
-    together = frame.groups_with_light > 1 and fixed[1] and grad_channels[1] is not None
+    together = buffers.groups_with_light > 1 and fixed[1] and grad_channels[1] is not None
     if together:
         first["grad_more"] = grad_channels[1]
-        first["more_records"] = frame.zeros("gradient records of the second group", frame.count, splat.Splat)
-    stages.composite_backward(frame, 0, grad_light, grad_channels[0], grad_splats, **first)
+        first["more_records"] = buffers.zeros("gradient records of the second group", buffers.count, splat.Splat)
+    stages.composite_backward(buffers, 0, grad_light, grad_channels[0], grad_splats, **first)
     for number, (name, start) in enumerate(groups):
         if grad_channels[number] is None:
             continue
@@ -155,12 +155,12 @@ def backward(
         if number == 1 and together:
             records = first["more_records"]
         elif number > 0:  # a further pass shares centres, conics and opacities with the first
-            records = frame.zeros("gradient records of a further pass", frame.count, splat.Splat)
-            stages.composite_backward(frame, number, grad_light, grad_channels[number], records, fixed=fixed[number])
+            records = buffers.zeros("gradient records of a further pass", buffers.count, splat.Splat)
+            stages.composite_backward(buffers, number, grad_light, grad_channels[number], records, fixed=fixed[number])
             if not fixed[number]:
                 stages.add_geometry(records, grad_splats)
         if name == "extra" and wanted.extra is not None:
             stages.take_channels(records, start, wanted)
-    stages.finish(frame, grad_splats)
-    stages.project_backward(inputs, view, frame, grad_splats, wanted)
+    stages.finish(buffers, grad_splats)
+    stages.project_backward(inputs, view, buffers, grad_splats, wanted)
     return grad_splats

@@ -25,7 +25,7 @@ from ..scene.sensor import Sensor
 from . import launch
 from .api import Rendering
 from .bridge import ALIGNED, array_over, left_out
-from .buffers import Frame, RenderSettings
+from .buffers import Buffers, RenderSettings
 from .cuda import stream_of, without_garbage_collection
 from .inputs import CHOICES, Images, View, names_of, shapes_of, wanted_images
 from .moved import MovedGaussians
@@ -38,7 +38,7 @@ Memory = TypeVar("Memory", Tensor, np.ndarray)
 class Target:
     """Workspace and images of all renderings of one size."""
 
-    frame: Frame
+    buffers: Buffers
     view: View
     packed: Tensor  # [L] all images, consecutive, so that one copy moves them; last, as int32, their number of pairs
     places: dict[str, tuple[int, tuple[int, ...]]]  # first element and shape of every image in it
@@ -126,7 +126,7 @@ class Replay:
     def grow(self) -> None:
         """Adapt the pair capacity to the largest number of pairs so far; memory and graphs are released."""
         if self.graphs:
-            is_sorted = not all(target.frame.marks for target in self._targets.values())
+            is_sorted = not all(target.buffers.marks for target in self._targets.values())
             self._capacity.learn(self.largest, is_sorted=is_sorted)
         self._targets.clear()
 
@@ -170,11 +170,11 @@ class Replay:
 
     def _draw(self, target: Target) -> None:
         """The launches of a rendering, and of storing its number of pairs."""
-        inputs, frame = self._gaussians.inputs, target.frame
-        launch.forward(inputs, target.view, frame, target.images, differentiable=False)
+        inputs, buffers = self._gaussians.inputs, target.buffers
+        launch.forward(inputs, target.view, buffers, target.images, differentiable=False)
         if len(self._like):
             counts = [self._largest, target.pairs]
-            wp.launch(note_largest, 1, [frame.total], counts, device=self.device, record_tape=False)
+            wp.launch(note_largest, 1, [buffers.total], counts, device=self.device, record_tape=False)
 
     def _target(self, height: int, width: int, lens: bool) -> Target:
         """Memory for renderings of one size, through a lens or not."""
@@ -187,9 +187,9 @@ class Replay:
         tensors = {name: part(packed, *place) for name, place in places.items()}
         settings = replace(self.settings, pair_capacity=self._capacity.pairs)
         with stream_of(self._like):
-            frame = Frame(len(self._like), width, height, settings, self.device)
+            buffers = Buffers(len(self._like), width, height, settings, self.device)
         return Target(
-            frame=frame,
+            buffers=buffers,
             view=View(camera=self._gaussians.view, shifts=self._shifts, lens=lens),
             packed=packed,
             places=places,

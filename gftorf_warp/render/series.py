@@ -112,7 +112,7 @@ class Series:
     @staticmethod
     def _exceeded(image: _Pending) -> bool:
         pairs = int(image.readback.wait(image.ticket)[-1:].view(np.int32)[0])
-        capacity = image.target.frame.settings.pair_capacity
+        capacity = image.target.buffers.settings.pair_capacity
         return capacity is not None and pairs > capacity
 
 

@@ -9,17 +9,17 @@ from itertools import pairwise
 import numpy as np
 import warp as wp
 
-from .buffers import Frame
+from .buffers import Buffers
 
 
-def tile_edges(frame: Frame, parts: int) -> list[int]:
+def tile_edges(buffers: Buffers, parts: int) -> list[int]:
     """Edges of at most ``parts`` ranges of tiles with about equally many pairs; one range where one thread works."""
-    if frame.threads == 1:
-        return [0, frame.tiles]
-    first = frame.first.numpy()  # CPU only: a view, not a copy
-    work = first[:-1] + np.arange(frame.tiles)  # an empty tile costs about as much as a pair
-    targets = [(first[-1] + frame.tiles) * p / parts for p in range(1, parts)]
-    return sorted({0, *(int(e) for e in np.searchsorted(work, targets)), frame.tiles})
+    if buffers.threads == 1:
+        return [0, buffers.tiles]
+    first = buffers.first.numpy()  # CPU only: a view, not a copy
+    work = first[:-1] + np.arange(buffers.tiles)  # an empty tile costs about as much as a pair
+    targets = [(first[-1] + buffers.tiles) * p / parts for p in range(1, parts)]
+    return sorted({0, *(int(e) for e in np.searchsorted(work, targets)), buffers.tiles})
 
 
 @cache
@@ -27,23 +27,23 @@ def _pool(threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, thread_name_prefix="gftorf-tiles")
 
 
-def over_tiles(frame: Frame, kernel, edges: list[int], arguments, warps: int = 1) -> None:
+def over_tiles(buffers: Buffers, kernel, edges: list[int], arguments, warps: int = 1) -> None:
     """Launch over ranges of tiles, some warps each; CPU launches let others run, so ranges are done side by side."""
     side_by_side = len(edges) > 2
     commands = [
         wp.launch(
             kernel,
-            dim=((stop - start) * warps, frame.lanes),
+            dim=((stop - start) * warps, buffers.lanes),
             inputs=arguments(start, part),
-            device=frame.device,
-            block_dim=32 if frame.cooperative else 128,
+            device=buffers.device,
+            block_dim=32 if buffers.cooperative else 128,
             record_tape=False,
             record_cmd=side_by_side,
         )
         for part, (start, stop) in enumerate(pairwise(edges))
     ]
     if side_by_side:
-        run_side_by_side(commands, frame.threads)
+        run_side_by_side(commands, buffers.threads)
 
 
 def run_side_by_side(commands: list, threads: int) -> None:

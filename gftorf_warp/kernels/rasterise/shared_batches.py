@@ -65,8 +65,8 @@ def make_batches(values: int = 0, derivatives: int = 0, more: bool = False) -> S
     memory_snippet = f"""
 #if defined(__CUDA_ARCH__)
     {_CHECK}
-    __shared__ __align__(16) float memory[{floats}];  // of the one warp of a block
-    return (wp::uint64)memory;
+    __shared__ __align__(16) float memory[{floats}];
+    return (wp::uint64)(memory + (threadIdx.x >> 5) * {floats});  // the only warp: 0, but not to the register allocator
 #else
     return 0;
 #endif
