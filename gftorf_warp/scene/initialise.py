@@ -1,7 +1,7 @@
-"""Gaussians and motion to start from: out of measured phase, or out of noise (the control).
+"""Initial Gaussians and motion: from measured phase, or random (the control).
 
-Phase: a static layer at the farthest distance where each pixel has rested, and a moving layer at what is nearer than
-that in the middle of the sequence; if the camera moves, what all its views agree on, and what they see through.
+Phase: a static layer at the largest distance at which each pixel was static, and a moving layer of nearer points in the
+middle of the sequence; for a moving camera, points that are consistent over its views, and others that are not.
 Reflectivity is amplitude times distance squared. Only measured quads, poses and flow are read.
 """
 
@@ -36,25 +36,25 @@ from .measured import (
 from .tracks import follow, unproject
 
 STATIC, MOVING = 0, 1  # labels of the two layers
-RESTS = 1e-6  # a camera rests if no element of its pose differs by more
-EXACT_TREE = 4  # OpenCV's name for a k-d tree that misses no neighbour
+RESTS = 1e-6  # largest difference of the elements of the poses of a static camera
+EXACT_TREE = 4  # OpenCV's constant for an exact k-d tree
 
 
 class Init(StrEnum):
-    """Where the first Gaussians come from."""
+    """Origin of the first Gaussians."""
 
     PHASE = "phase"
     """Distance and amplitude decoded from measured quads."""
     RANDOM = "random"
-    """Uniform in the frustum, all moving."""
+    """Uniform in the frusta, all moving."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class InitSettings:
-    """How the first Gaussians are made."""
+    """Initialisation of the Gaussians."""
 
     kind: Init = Init.PHASE
-    """Where they come from."""
+    """Origin of the Gaussians."""
     opacity: float = 0.9
     """Of every Gaussian [1]."""
     static_spacing: float = 2.5
@@ -64,9 +64,9 @@ class InitSettings:
     footprint: float = 0.6
     """Phase: standard deviation of a Gaussian as a multiple of the spacing [1]."""
     nearer: float = 0.1
-    """Phase: what is at least this much nearer than the far layer belongs to the moving layer [m]."""
+    """Phase: least distance in front of the background of points of the moving layer [m]."""
     fellows: int = 16
-    """Phase: how many neighbouring points share one step along the flow."""
+    """Phase: number of neighbouring points that share one step along the flow."""
     count: int = 3000
     """Random: number of Gaussians."""
     reflectivity: float = 0.1
@@ -77,14 +77,14 @@ class InitSettings:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Start:
-    """What an optimisation starts from."""
+    """Initial state of an optimisation."""
 
     field: GaussianField
-    """Gaussians of the static and the moving layer, where they are at the start of ``quartet``."""
+    """Gaussians of the static and the moving layer at the start of ``quartet``."""
     positions: Float[Tensor, "T M 3"] | None
-    """Where the Gaussians of the moving layer, in their order, are at every key time [m]; None: not known."""
+    """Positions of the Gaussians of the moving layer at every key time [m]; None: unknown."""
     quartet: int
-    """The quartet at whose start the moving layer was seen."""
+    """The quartet at whose start the moving layer was measured."""
 
 
 def from_phase(sequence: Sequence, settings: InitSettings = InitSettings()) -> Start:
@@ -119,7 +119,7 @@ def from_phase(sequence: Sequence, settings: InitSettings = InitSettings()) -> S
 
 
 def _from_views(sequence: Sequence, settings: InitSettings) -> Start:
-    """The same for a moving camera, whose views are compared in the world and not pixel by pixel."""
+    """The same for a moving camera, whose views are compared in world coordinates."""
     views = views_of(sequence, settings.nearer)
     judged = list(verdicts(views))
     size = (sequence.width, sequence.height)
@@ -142,7 +142,7 @@ def _from_views(sequence: Sequence, settings: InitSettings) -> Start:
 
 
 def from_random(sequence: Sequence, settings: InitSettings, generator: torch.Generator) -> Start:
-    """Gaussians spread evenly over all the volume that any camera sees, all of them moving (method, section 6.1).
+    """Gaussians distributed uniformly over the volume of all frusta, all of them moving (method, section 6.1).
 
     The scale of each is the root mean square distance to its three nearest neighbours.
     """
@@ -158,9 +158,9 @@ def _distinct_cameras(sequence: Sequence) -> list[Camera]:
 
 
 def in_frusta(cameras: list[Camera], settings: InitSettings, generator: torch.Generator) -> Float[Tensor, "N 3"]:
-    """Points spread evenly over the union of the cameras' frusta between two z-depths.
+    """Points distributed uniformly over the union of the cameras' frusta between two z-depths.
 
-    Drawn in the frustum of a random camera and kept once in as many times as there are frusta that hold it.
+    A point is drawn in the frustum of a random camera and kept with one over the number of frusta that contain it.
     """
     near, far = settings.bounds
     kept: list[Tensor] = []
@@ -178,7 +178,7 @@ def in_frusta(cameras: list[Camera], settings: InitSettings, generator: torch.Ge
             local = torch.cat([slopes, torch.ones(len(slopes), 1)], dim=1) * z[rows, None]
             points[rows] = (local - pose[:3, 3]) @ pose[:3, :3]
         holders = torch.stack([_holds(camera, points, near, far) for camera in cameras]).sum(dim=0).clamp_min(1)
-        if cameras[0].distortion:  # points were drawn on the sensor: more of them where the lens magnifies
+        if cameras[0].distortion:  # points were drawn on the sensor: more where the lens magnifies
             drawn = [_holds(camera, points, near, far) * camera.area(points) for camera in cameras]
             holders = torch.stack(drawn).sum(dim=0) / _least_area(cameras[0])
         kept.append(points[u[:, 3] * holders < 1.0])
@@ -187,7 +187,7 @@ def in_frusta(cameras: list[Camera], settings: InitSettings, generator: torch.Ge
 
 
 def _least_area(camera: Camera) -> float:
-    """Smallest area on the sensor over that of a pinhole's image, over the image [1]."""
+    """Smallest area magnification by the distortion over the image [1]."""
     axes = (torch.linspace(0, size, CHECKED, dtype=torch.float64) for size in (camera.width, camera.height))
     slopes = camera.slopes(torch.cartesian_prod(*axes))
     xx, xy, yy = camera.distortion.slope(*slopes.unbind(dim=1))
@@ -195,7 +195,7 @@ def _least_area(camera: Camera) -> float:
 
 
 def _holds(camera: Camera, points: Float[Tensor, "N 3"], near: float, far: float) -> Bool[Tensor, "N"]:
-    """Which points lie in the frustum of a camera."""
+    """Which points are in the frustum of a camera."""
     pose = torch.as_tensor(camera.camera_from_world, dtype=torch.float32)
     z = points @ pose[2, :3] + pose[2, 3]
     x, y = camera.project(points).unbind(dim=1)
@@ -215,7 +215,7 @@ def _spacing(points: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
 
 
 def _static_layer(sequence: Sequence, far: FarLayer, settings: InitSettings) -> GaussianField:
-    """Gaussians on the far layer, one per cell of the static grid."""
+    """Gaussians on the background, one per cell of the static grid."""
     grid = _grid(sequence.width, sequence.height, settings.static_spacing).flatten(0, 1)
     x, y = grid.long().unbind(dim=1)
     camera, distance = camera_of(sequence, 0), far.distance[y, x]
@@ -226,11 +226,10 @@ def _static_layer(sequence: Sequence, far: FarLayer, settings: InitSettings) -> 
 def _nearer(
     sequence: Sequence, quartet: int, change: Change, far: FarLayer, settings: InitSettings
 ) -> tuple[Float[Tensor, "P 2"], Float[Tensor, "P"], Float[Tensor, "P"]]:
-    """Points [px], distances [m] and amplitudes of what is in front of the far layer at the start of a quartet.
+    """Points [px], distances [m] and amplitudes in front of the background at the start of a quartet.
 
-    A point has to be in front of it in the neighbouring quartets as well, where the flow takes it: what only appears to
-    be near because an outline passes within the quartet is not. Lonely points are dropped, and a distance far from the
-    median of its neighbourhood is replaced by it.
+    A point has to be in front of it in the neighbouring quartets as well, along the flow: pixels that seem to be near
+    because an outline passes within the quartet are not. Isolated points and outliers are removed, see ``cloud_of``.
     """
     grid = _grid(sequence.width, sequence.height, settings.moving_spacing)
     size = grid.shape[:2]
@@ -254,7 +253,7 @@ def _in_front(
     far: FarLayer,
     settings: InitSettings,
 ) -> tuple[Bool[Tensor, "P"], Float[Tensor, "P"], Float[Tensor, "P"], Float[Tensor, "P"]]:
-    """Whether points are nearer than the far layer; their distance [m], amplitude, and noise of the distance [m]."""
+    """Whether points are nearer than the background; their distance [m], amplitude, and noise of the distance [m]."""
     ahead, behind = (flow_at(sequence, quartet, step, points) for step in (1, -1))
     distance, amplitude = decode_along_flow(sequence, quartet, points, ahead, behind)
     noise = distance_noise(amplitude, change.noise, sequence)
@@ -264,7 +263,7 @@ def _in_front(
 
 
 def _grid(width: int, height: int, spacing: float) -> Float[Tensor, "h w 2"]:
-    """Image positions (x, y) [px] about ``spacing`` apart, evenly spread from border to border."""
+    """Image positions (x, y) [px] about ``spacing`` apart, evenly distributed over the image."""
     columns, rows = max(round(width / spacing), 1), max(round(height / spacing), 1)
     x = (torch.arange(columns) + 0.5) * (width / columns)
     y = (torch.arange(rows) + 0.5) * (height / rows)

@@ -1,6 +1,6 @@
-"""What can be read off raw quads before anything is fitted: distance along the flow, change over time, the far layer.
+"""Closed-form analysis of measured quads: distance along the flow, changes over time, the background (method, 2.9).
 
-Everything here decodes measured quads (method, section 2.9); nothing knows a truth.
+Truth is never read.
 """
 
 from __future__ import annotations
@@ -21,8 +21,10 @@ from .distortion import Distortion
 from .sensor import Sensor, phasor_from_quads
 from .unwrap import distance_from_phasors
 
-CHANGED = 2.5  # a pixel changes if its quads, pooled over slots and 3x3 pixels, differ by so many noise deviations
-DISTANCE_TRUSTED = 0.15  # [m] a pixel whose distance is noisier than this is too dark to start from
+CHANGED = (
+    2.5  # [standard deviations of the noise] quads, pooled over slots and 3x3 pixels, that differ more have changed
+)
+DISTANCE_TRUSTED = 0.15  # [m] largest noise of a distance that is used
 
 
 def sensor_of(sequence: Sequence) -> Sensor:
@@ -70,7 +72,7 @@ def _camera(intrinsics: Intrinsics, size: tuple[int, int], pose: np.ndarray) -> 
 
 
 def frame_period(sequence: Sequence) -> float:
-    """Mean time between raw frames [s]; that of a single frame is 1 s, where nothing can move anyway."""
+    """Mean time between raw frames [s]; 1 s for a single frame."""
     return float(np.diff(sequence.times).mean()) if sequence.frames > 1 else 1.0
 
 
@@ -89,23 +91,15 @@ def sample(image: Float[Tensor, "C H W"], points: Float[Tensor, "P 2"]) -> Float
 
 
 def flow_at(sequence: Sequence, quartet: int, step: int, points: Float[Tensor, "P 2"]) -> Float[Tensor, "P 2"] | None:
-    """Optical flow [px] of points from the start of ``quartet`` to that of ``quartet + step``; NaN: unknown.
+    """Optical flow [px] of points (x, y) [px] from the start of ``quartet`` to that of the next (1) or last (-1) one.
 
-    Where the flow of this direction is absent, the reversed flow of the other direction at the same place stands in.
-    None if there is neither.
-
-    Args:
-        sequence: Its flow, from the file or computed.
-        quartet: Where the points are given.
-        step: 1 for the next quartet, -1 for the one before.
-        points: Image positions (x, y) [px].
+    NaN where it is unknown. If the flow of this direction is absent, it is the negative flow of the other direction;
+    None if both are absent.
     """
     same, other = (sequence.flow.forward, sequence.flow.backward)[:: 1 if step > 0 else -1]
-    frame = sequence.cycle * quartet
-    if frame in same:
-        return sample(torch.tensor(same[frame]), points).T
-    if frame in other:
-        return -sample(torch.tensor(other[frame]), points).T
+    for sign, flow in ((1.0, same), (-1.0, other)):
+        if sequence.cycle * quartet in flow:
+            return sign * sample(torch.tensor(flow[sequence.cycle * quartet]), points).T
     return None
 
 
@@ -118,17 +112,17 @@ def decode_along_flow(
 ) -> tuple[Float[Tensor, "P"], Float[Tensor, "P"]]:
     """Distance [m] and amplitude [quad units] of moving points at the start of a quartet.
 
-    Slot k was measured k raw frames later and, in the quartet before, K - k raw frames earlier. Both are read where the
-    flow takes the point, and the value at the start is interpolated between them: motion across the image and along the
-    ray leaves no artefact to first order. Without a measured quartet before, the one after serves to extrapolate, and
-    without either slot k is taken as it is.
+    Slot k was measured k raw frames later and, in the quartet before, K - k raw frames earlier. Both are sampled along
+    the flow and interpolated to the start, so that motion across the image and along the ray causes no artefact to
+    first order. Without a measured quartet before, the value is extrapolated from the one after; without either, slot k
+    is used as measured.
 
     Args:
         sequence: Raw frames; those of ``quartet`` must be measured.
-        quartet: Which quartet.
+        quartet: Number of the quartet.
         points: Image positions (x, y) at its start [px].
-        ahead: Their flow to the next quartet [px]; NaN counts as rest. None: unknown, everything rests.
-        behind: Their flow to the quartet before [px], likewise.
+        ahead: Flow of the points to the next quartet [px]; NaN and None: no motion.
+        behind: Flow of the points to the quartet before [px], likewise.
     """
     complete = set(sequence.complete_quartets)
     ahead = torch.zeros_like(points) if ahead is None else ahead.nan_to_num(0.0)
@@ -159,27 +153,28 @@ def _quad_at(sequence: Sequence, frame: int, points: Float[Tensor, "P 2"]) -> Fl
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Change:
-    """Where same-shift quads of neighbouring quartets differ by more than noise."""
+    """Pixels in which same-shift quads of successive quartets differ by more than noise."""
 
     quartets: tuple[int, ...]
     """The complete quartets."""
     changed: Bool[Tensor, "J H W"]
-    """Whether a pixel changes from one complete quartet to the next; one image less than there are quartets."""
+    """Whether a pixel changes from one complete quartet to the next; J is one less than the number of quartets."""
     noise: float
-    """Standard deviation of the noise of one quad, in quad units."""
+    """Standard deviation of the noise of one quad [quad units]."""
 
 
 def change_of(sequence: Sequence) -> Change:
     """Compare every complete quartet with the next one, slot by slot.
 
-    The noise is the median absolute difference: it is right as long as most pixels rest. Slots are matched by
-    frequency and shift, so any order and any number of missing frames in between will do.
+    The noise is estimated by the median absolute difference, right as long as most pixels are static. Slots are
+    matched by frequency and shift, whatever their order and the number of missing frames.
     """
     quartets = sequence.complete_quartets
-    step = sequence.cycle
-    keys = [sequence.quartet_frames(i) for i in quartets]
-    order = [np.lexsort((sequence.shifts[own], sequence.frame_frequencies[own])) for own in keys]
-    quads = torch.stack([torch.tensor(sequence.quads[step * i + o]) for i, o in zip(quartets, order, strict=True)])
+    ordered = []
+    for frames in map(sequence.quartet_frames, quartets):
+        order = np.lexsort((sequence.shifts[frames], sequence.frame_frequencies[frames]))
+        ordered.append(torch.tensor(sequence.quads[frames][order]))
+    quads = torch.stack(ordered)
     difference = quads.diff(dim=0)
     if difference.numel() == 0:
         return Change(quartets=tuple(quartets), changed=difference.new_zeros(0, *quads.shape[2:]).bool(), noise=0.0)
@@ -193,15 +188,15 @@ def change_of(sequence: Sequence) -> Change:
 
 
 def distance_noise(amplitude: Tensor, noise: float, sequence: Sequence) -> Tensor:
-    """Standard deviation [m] of a decoded distance: noise / (sqrt(K / 2) amplitude) radians of the first phase.
-
-    That is of K equally spaced quads, sqrt(2) for four; for others see :func:`gftorf_warp.data.cycles.phase_noise`.
-    """
+    """Standard deviation [m] of a decoded distance: noise / (gain amplitude) radians of the first phase."""
     return noise / (quads_gain(sequence) * amplitude.clamp_min(1e-12)) / sensor_of(sequence).phase_slope
 
 
 def quads_gain(sequence: Sequence) -> float:
-    """Amplitude over noise of a quad, times this, is one over the noise of the first phase of a quartet [1]."""
+    """Signal-to-noise ratio of the first phase of a quartet over that of a quad [1].
+
+    It is sqrt(K / 2) of K equally spaced quads; for others see :func:`gftorf_warp.data.cycles.phase_noise`.
+    """
     frames = slice(0, sequence.cycle)
     shifts = sequence.shifts[frames][sequence.frame_frequencies[frames] == sequence.frequencies[0]]
     gain = 1.0 / phase_noise(shifts)
@@ -211,21 +206,21 @@ def quads_gain(sequence: Sequence) -> float:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FarLayer:
-    """The farthest distance at which each pixel has rested: what is behind everything that moves."""
+    """The background of all moving bodies: the largest distance at which each pixel was static."""
 
     distance: Float[Tensor, "H W"]
-    """[m]; where unknown, that of the nearest known pixels."""
+    """Distance [m]; where unknown, that of the nearest known pixels."""
     amplitude: Float[Tensor, "H W"]
-    """In quad units, likewise filled."""
+    """Amplitude [quad units], likewise filled."""
     known: Bool[Tensor, "H W"]
-    """Whether the pixel rested at least once and was bright enough."""
+    """Whether the pixel was static and bright enough at least once."""
 
 
 def far_layer(sequence: Sequence, change: Change) -> FarLayer:
-    """Mean phasors of the quartets in which a pixel rests at its largest distance.
+    """Mean phasors of the quartets in which a pixel is static at its largest distance.
 
-    A quartet counts for a pixel that changes neither from the quartet before nor to the next one. Distances are
-    wrapped: a background beyond the range of all frequencies together comes out too near.
+    A pixel is static in a quartet if it changes neither from the quartet before nor to the next one. Distances are
+    wrapped: a background beyond the common range of all frequencies becomes too near.
     """
     sensor = sensor_of(sequence)
     still = torch.ones(len(change.quartets), *sequence.quads.shape[1:], dtype=torch.bool)
@@ -243,18 +238,18 @@ def far_layer(sequence: Sequence, change: Change) -> FarLayer:
     known = count > 0
     together = distance_from_phasors([(mean[0], mean[1]) for mean in means], sensor)
     fields = torch.stack([together, 0.5 * means[0].norm(dim=0)])
-    filled = fill(fields, known)
-    return FarLayer(distance=filled[0], amplitude=filled[1], known=known)
+    distance, amplitude = fill(fields, known)
+    return FarLayer(distance=distance, amplitude=amplitude, known=known)
 
 
 def decoded_phasors(sequence: Sequence, quartets: Iterable[int]) -> Float[Tensor, "f J 2 H W"]:
     """Phasors of some complete quartets, at each frequency, float32 [quad units]."""
-    found = [[phasor for _, phasor in quartet_phasors(sequence, i)] for i in quartets]
-    return torch.as_tensor(np.stack(found, axis=1), dtype=torch.float32)
+    phasors = [[phasor for _, phasor in quartet_phasors(sequence, i)] for i in quartets]
+    return torch.as_tensor(np.stack(phasors, axis=1), dtype=torch.float32)
 
 
 def fill(image: Float[Tensor, "C H W"], known: Bool[Tensor, "H W"]) -> Float[Tensor, "C H W"]:
-    """Replace unknown pixels by the mean of known neighbours, ring by ring; zero if nothing is known at all."""
+    """Replace unknown pixels by the mean of known neighbours, ring by ring; zero if no pixel is known."""
     weight = known.to(image)[None]
     value = torch.where(known, image, 0.0)
     while bool((weight == 0).any()) and bool((weight > 0).any()):
