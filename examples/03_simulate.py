@@ -4,12 +4,13 @@ import sys
 import tempfile
 from pathlib import Path
 
-from gftorf_warp import Sequence, simulate
+from gftorf_warp import Sequence, SimSettings, simulate
 
 
 def main(folder: Path) -> Path:
-    """Write a small sequence below ``folder`` and return where it is."""
-    path = simulate("axial", folder / "axial", frames=8, size=(48, 36), seed=1)
+    """Write a small sequence below ``folder`` and return its path."""
+    settings = SimSettings(frames=8, size=(48, 36), seed=1)
+    path = simulate("axial", folder / "axial", settings)  # or single settings: simulate(scene, out, frames=8)
     sequence = Sequence.open(path)
     print(f"{sequence.frames} raw frames of {sequence.width}x{sequence.height} in {path}")
     for n in range(4):  # one quartet: four phase shifts, four instants

@@ -1,4 +1,4 @@
-"""Open a sequence, ask where its values are from, and decode distance the closed-form way, which motion breaks."""
+"""Open a sequence, list the sources of its values, and decode distance in closed form, which motion breaks."""
 
 import sys
 import tempfile

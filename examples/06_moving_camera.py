@@ -1,4 +1,4 @@
-"""Reconstruct phasors of a camera that moves, with colour, and look at the scene from where no camera was."""
+"""Reconstruct phasors and colour images of a moving camera, and render a view that no camera had."""
 
 import sys
 import tempfile
@@ -14,8 +14,8 @@ from gftorf_warp.scene.measured import sensor_of
 def main(folder: Path, images: int = 400) -> dict:
     """Work below ``folder`` and return the content of metrics.json.
 
-    The course of the published preset in a fiftieth of its images, from few Gaussians, with a small network: this shows
-    the calls. The preset as it is, is `gftorf reconstruct SEQ --out RUN --preset released`.
+    The published preset with a fiftieth of its images, few Gaussians and a small network: this shows the calls. The
+    whole preset is `gftorf reconstruct SEQ --out RUN --preset released`.
     """
     sequence = Sequence.open(simulate("tour", folder / "sequence", frames=16, size=(48, 36), format="torf"))
     print(f"{len(sequence.complete_quartets)} phasors, {len(sequence.colour.images)} colour images, a pose for each")
@@ -34,9 +34,9 @@ def main(folder: Path, images: int = 400) -> dict:
     print(f"{run.gaussians} Gaussians after {images} images; colour PSNR {metrics['colour_psnr_db']:.1f} dB")
     print(f"d and d_ToF were nearest to each other after {along['images_at_criterion']} images")
 
-    camera = run.camera.at(sequence.novel_from_world[0])  # a pose that the folder names, and no phasor has
-    seen = run.render(time=0.05, camera=camera)
-    print(f"from there: colour {tuple(seen.colour.shape)}, mean distance {float(seen.distance.mean()):.2f} m")
+    camera = run.camera.at(sequence.novel_from_world[0])  # a pose in the folder without a phasor
+    view = run.render(time=0.05, camera=camera)
+    print(f"novel view: colour {tuple(view.colour.shape)}, mean distance {float(view.distance.mean()):.2f} m")
     return metrics
 
 

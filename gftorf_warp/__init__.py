@@ -18,6 +18,7 @@ _HOME = {
     "Run": "recon.run",
     "Sensor": "scene.sensor",
     "Sequence": "data.read",
+    "SimSettings": "sim.settings",
     "Truth": "data.sequence",
     "compare": "evaluate.compare",
     "rasterize": "render.api",

@@ -38,7 +38,7 @@ SCENES = {
     **{f"{name.partition('.')[0]}.mesh.toml": MESH % (name, "false") for name in OBJ},
 }
 BAD = [  # what follows `gftorf simulate`, exit code, a word of the answer; {scenes} and {out} are folders
-    ("slidin", 2, "did you mean 'sliding'"),
+    ("slidin", 2, "did you mean sliding"),
     ("{scenes}/none.toml", 3, "none.toml"),
     ("{scenes}", 2, "there is no scene"),
     ("{scenes}/bare.toml", 3, "bodies"),

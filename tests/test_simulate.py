@@ -319,7 +319,7 @@ def test_a_finished_sequence_is_not_made_again(tmp_path):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"scene": "slidin"}, ("slidin", "did you mean 'sliding'", "demo, sliding, axial, arc, tour")),
+        ({"scene": "slidin"}, ("slidin", "did you mean sliding", "demo, sliding, axial, arc, tour")),
         ({"scene": "xyzzy"}, ("xyzzy", "take one of these")),
         ({"frames": 0}, ("--frames", "at least 1")),
         ({"frames": -4}, ("--frames", "-4")),

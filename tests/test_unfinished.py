@@ -132,7 +132,7 @@ def test_something_else_in_its_place_is_left_alone(tmp_path):
     (tmp_path / "seq.partial").mkdir()
     (tmp_path / "seq.partial" / "mine").write_text("mine")
     for fresh in (False, True):
-        with pytest.raises(UsageError, match="in the way"):
+        with pytest.raises(UsageError, match="is in use"):
             simulate("demo", tmp_path / "seq", **OPTIONS, fresh=fresh)
     assert contents(tmp_path) == {"seq.partial/mine": b"mine"}
 

@@ -60,14 +60,14 @@ def _with(settings: Any, path: list[str], value: str, name: str, wording: Wordin
     if head not in members or (head in wording.fixed and not rest):
         before = name.removesuffix(".".join(path))
         known = sorted(before + other for other in set(names(settings)) - set(wording.fixed))
-        fix = _suggestion(name, known) or f"see {wording.where}"
+        fix = suggestion(name, known) or f"see {wording.where}"
         raise _refused(name, "there is no such setting", fix, wording)
     present = members[head]
     if name in wording.named and not rest:
         whole = wording.named[name]
         if value in whole:
             return replace(settings, **{head: whole[value]})
-        fix = _suggestion(value, whole) or f"take one of {', '.join(whole)}, or name a single setting of it"
+        fix = suggestion(value, whole) or f"take one of {', '.join(whole)}, or name a single setting of it"
         raise _refused(f"{name}={value}", f"there is no {head} of that name", fix, wording)
     if _has_parts(present) == (not rest):
         inner = ", ".join(names(present)) if _has_parts(present) else "nothing"
@@ -131,7 +131,8 @@ def _parsed(text: str, kind: Any, name: str, wording: Wording) -> Any:
         raise _refused(f"{name}={text}", why, "choose another value", wording) from None
 
 
-def _suggestion(name: str, known: Iterable[str]) -> str:
+def suggestion(name: str, known: Iterable[str]) -> str:
+    """A question after the most similar of some names; empty if none is similar."""
     close = difflib.get_close_matches(name, list(known), n=1, cutoff=0.4)
     return f"did you mean {close[0]}?" if close else ""
 

@@ -1,4 +1,4 @@
-"""The README.md of a simulated sequence: what it shows, how to make it again, and every number of the sensor."""
+"""The README.md of a simulated sequence: its content, the command that makes it, and all numbers of the sensor."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def _together(count: int) -> str:
 
 
 def outcome_card(recording: Recording) -> str:
-    """The part that is known only afterwards: how far the rendering is from the truth, and what saturated."""
+    """The part that is known after the recording: distance of the engine from the truth, and saturation."""
     agreement = "no such pixel" if recording.gap is None else str(recording.gap)
     return f"""
 Ground truth against the distance that the engine sees, on interior pixels of still surfaces in all raw frames:
@@ -99,8 +99,8 @@ Ground truth against the distance that the engine sees, on interior pixels of st
 
 Saturated: {100 * recording.saturated:.3g} % of all pixels and raw frames.
 
-Beside the distance stands the static-phasor distance: what the closed form would decode from four quads taken without
-noise at the very time of a raw frame, all light included. contact_sheet.png is a picture for people.
+The static-phasor distance is that which the closed form would decode from four quads taken without noise at the time of
+a raw frame, all light included. contact_sheet.png is an overview; no program reads it.
 """
 
 
@@ -124,7 +124,7 @@ def _engine(scene: Scene, used: SimSettings) -> str:
 
 
 def _camera_rows(scene: Scene, used: SimSettings) -> dict[str, str]:
-    """How the cameras move and what the colour camera is; nothing for one ToF camera at rest at the origin."""
+    """Motion of the cameras, and the colour camera; empty for a ToF camera at rest at the origin alone."""
     rows = {}
     if scene.camera_path != Still():
         rows["camera path"] = f"{scene.camera_path}" + (
@@ -145,7 +145,7 @@ def _camera_rows(scene: Scene, used: SimSettings) -> dict[str, str]:
 
 
 def _command(scene: Scene, used: SimSettings, level: str | None) -> str:
-    """What makes the same sequence again: a command line if there is one for it, else a call."""
+    """Command that makes the same sequence again; a call in Python for scenes without a name."""
     named = SCENES.get(scene.name)
     if named is None or overridden(named, scene.overrides) != scene:
         values = {name: getattr(used, name) for name in CALLED}
@@ -169,7 +169,7 @@ def _command(scene: Scene, used: SimSettings, level: str | None) -> str:
 
 
 def _fingerprint(scene: Scene) -> str:
-    """Every setting of a scene as text; without the optional ones that it does not use, as if they did not exist."""
+    """Every setting of a scene as text, without unused optional ones, so that new options do not change it."""
     optional = {"camera_path": Still(), "emitter": (0.0, 0.0, 0.0), "beam_deg": None, "colour": None, "novel_views": ()}
     optional |= {"lens": Lens()}
     values = {f.name: getattr(scene, f.name) for f in fields(scene)}

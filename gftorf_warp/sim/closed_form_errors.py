@@ -18,10 +18,10 @@ from .scene import Scene
 
 
 class Errors(NamedTuple):
-    """How wrong the closed form is: mean squared error of the distance [m^2 x 100]; None where there is no such pixel.
+    """Mean squared distance errors of the closed form [m^2 x 100]; None without any such pixel.
 
-    Truth is that of the first raw frame of each quartet, and distances that wrap are not unwrapped. The first and the
-    last quartet do not count, as in the published tables, where there are more than two.
+    Truth is that of the first raw frame of each quartet; distances are not unwrapped. The first and the last of more
+    than two quartets are left out, as in the published tables.
     """
 
     all: float | None
@@ -31,7 +31,7 @@ class Errors(NamedTuple):
     static: float | None
     """Against geometry, where it does not."""
     static_phasor: float | None
-    """Against the static-phasor distance, on all pixels: what motion and the sensor did, not the light."""
+    """Against the static-phasor distance, on all pixels: errors of motion and sensor, not of indirect light."""
 
 
 def closed_form_errors(sequence: Sequence, truth: Truth | None) -> Errors:
@@ -54,22 +54,16 @@ def closed_form_errors(sequence: Sequence, truth: Truth | None) -> Errors:
     distance = known_distance(truth)
     squares = 100.0 * (decoded - distance[frames]) ** 2
     moving, static = moving_and_static(distance, frames, from_phasors=sequence.from_phasors, cycle=sequence.cycle)
-    one = len(sequence.frequencies) == 1  # a static-phasor distance is that of one frequency, and wraps with it
-    by_phasor = (
-        None if truth.phasor_distance is None or not one else 100.0 * (decoded - truth.phasor_distance[frames]) ** 2
-    )
-    return Errors(
-        all=_mean(squares),
-        moving=_mean(squares[moving]),
-        static=_mean(squares[static]),
-        static_phasor=None if by_phasor is None else _mean(by_phasor),
-    )
+    by_phasor = None
+    if truth.phasor_distance is not None and len(sequence.frequencies) == 1:  # it wraps with its one frequency
+        by_phasor = _mean(100.0 * (decoded - truth.phasor_distance[frames]) ** 2)
+    return Errors(_mean(squares), _mean(squares[moving]), _mean(squares[static]), by_phasor)
 
 
 def with_closed_form(scene: Scene) -> Scene:
-    """A scene that knows the error of its closed form: mean over ideal quads of its own sensor [m^2 x 100].
+    """The scene with its closed-form error: the mean over ideal quads of its sensor [m^2 x 100].
 
-    A scene that knows it already is left alone; one that is too short for a cycle stays without.
+    It is unchanged if it has one already, or is too short for a cycle.
     """
     if scene.closed_form is not None or scene.frames < len(scene.sensor.cycle):
         return scene
@@ -93,5 +87,5 @@ def ladder_table(rows: Mapping[str, Errors]) -> list[str]:
 
 
 def _mean(values: np.ndarray) -> float | None:
-    found = values[np.isfinite(values)]
-    return float(found.mean()) if found.size else None
+    finite = values[np.isfinite(values)]
+    return float(finite.mean()) if finite.size else None

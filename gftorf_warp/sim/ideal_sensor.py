@@ -1,8 +1,8 @@
-"""Quads without a renderer: the analytic first hit on a few rays per pixel, read by an ideal sensor.
+"""Ideal quads without a renderer: analytic first hits on a few rays per pixel, read by an ideal sensor.
 
-No noise, no blur, direct light only: what remains of the error of a closed form is motion, and the mixture of surfaces
-within a pixel if there is more than one ray. It is what the closed-form errors of the named scenes refer to. Light and
-sensor are two steps, so that one light can be read by many sensors of the same modulation frequencies.
+Without noise, blur and indirect light, the remaining errors of the closed form are those of motion, and of mixtures of
+surfaces in a pixel if it has more than one ray. Closed-form errors of named scenes refer to these quads. Light and
+sensor are separate, so that light can be read by several sensors of the same modulation frequencies.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from .world import first_hit
 
 
 class Light(NamedTuple):
-    """What reaches the camera in one raw frame, whatever its shift."""
+    """Light of one raw frame, of any shift."""
 
     amplitude: Float[np.ndarray, "H W"]
     """Mean amplitude a of each pixel for a source intensity of 1 [relative units]; 0 where nothing is hit."""
@@ -37,8 +37,8 @@ def light_of(scene: Scene, time: float, *, rays: int = 1, f_mod_hz: float | None
     """Light at an instant.
 
     Args:
-        scene: What is seen, at its own size.
-        time: When [s].
+        scene: The scene, at its own size.
+        time: Time [s].
         rays: Rays per pixel and axis that are averaged.
         f_mod_hz: Modulation frequency [Hz]; None: the first of the scene's sensor.
 
@@ -62,11 +62,11 @@ def light_of(scene: Scene, time: float, *, rays: int = 1, f_mod_hz: float | None
 def ideal_recording(
     scene: Scene, lights: Mapping[int, Light] | None = None, sensor: Sensor | None = None
 ) -> tuple[Sequence, Truth]:
-    """What an ideal sensor would have recorded of a scene at its own size, and the true distance.
+    """The ideal recording of a scene at its own size, and the true distance.
 
     Args:
-        scene: What is recorded; its own frames and times.
-        lights: Light by raw frame; the others are not measured and their truth is unknown. None: that of all frames.
+        scene: The scene, with its own frames and times.
+        lights: Light by raw frame; others are not measured and their truth is unknown. None: that of all frames.
         sensor: Instead of the scene's; its noise is ignored, and its modulation frequencies must be the same.
 
     Raises:

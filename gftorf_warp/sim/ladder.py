@@ -1,8 +1,7 @@
-"""The ladder: one scene from ideal and synchronous to fully realistic in named steps, so that an error has a cause.
+"""The ladder: one scene from ideal and synchronous to realistic in named levels, to attribute errors to causes.
 
-Each level is the one before it and a few settings more (sensor notes, 1.2). What a level takes from the scene itself is
-``OWN``: the scene's own light, well and ADC count from the level on that is about them. All levels are traced by engine
-mesh, since light beside the camera and light that bounces need it.
+Each level changes a few settings of the one before it (sensor notes, 1.2); ``OWN`` is the value of the scene itself.
+All levels are traced by engine mesh, since light beside the camera and bounces need it.
 """
 
 from __future__ import annotations
@@ -19,21 +18,20 @@ from .scene import Scene, overridden
 from .settings import SimSettings
 
 OWN = object()
-"""Stands for the value of the scene itself."""
-NO_LIMIT_ELECTRONS = 1e12  # [e-] a well that nothing fills
-FINE_ADC_BITS = 20  # with the scene's own step it reaches 1.7e7 electrons: it rounds, but does not clip
-EMITTER_M = (0.04, 0.0, 0.0)  # [m] sensor notes 2.6: 40 mm beside the lens, where a scene says nothing
+NO_LIMIT_ELECTRONS = 1e12  # [e-] a full well that is never reached
+FINE_ADC_BITS = 20  # with the scene's electrons per code up to 1.7e7 electrons: it rounds, but does not clip
+EMITTER_M = (0.04, 0.0, 0.0)  # [m] sensor notes 2.6: 40 mm beside the lens, if the scene has no other position
 BEAM_DEG = (74.4, 59.3)  # [deg] the advertised field of view of the OPT8241 kit, sensor notes 3
 
 
 @dataclass(frozen=True, kw_only=True)
 class LadderLevel:
-    """What one step of the ladder adds."""
+    """Changes of a level of the ladder to the one before it."""
 
     name: str
-    """What the command line calls it."""
+    """Name on the command line."""
     adds: str
-    """What is new, in words."""
+    """Description of the changes."""
     scene: Mapping[str, Any] = field(default_factory=dict)
     """Fields of the scene."""
     sensor: Mapping[str, Any] = field(default_factory=dict)
@@ -85,7 +83,7 @@ NAMES = tuple(level.name for level in LEVELS)
 
 
 def adds_of(name: str) -> str:
-    """What a level adds, in words."""
+    """Description of the changes of a level."""
     return next(level.adds for level in LEVELS if level.name == name)
 
 
@@ -125,10 +123,7 @@ def resolved(scene: Scene, settings: SimSettings) -> tuple[Scene, SimSettings]:
 
 
 def _changed(sensor: Sensor, settings: Mapping[str, Any]) -> Sensor:
-    """A sensor with other settings.
-
-    One tap can never hold less than nothing: if harmonics make its light swing farther, its constant part rises too.
-    """
+    """A sensor with other settings; harmonics raise the DC offset of a unipolar one, so that no tap is negative."""
     swing = peak(settings["harmonic_contrast"])
     if sensor.unipolar and float(sensor.dc_offset) < swing:
         settings = {**settings, "dc_offset": swing}

@@ -1,7 +1,7 @@
-"""From mean light to what a sensor writes down: taps, shot and read noise, full well, ADC (sensor notes, 2.3 to 2.5).
+"""Read-out of a sensor: from mean light to digital numbers, by taps, shot and read noise, full well and ADC.
 
-With S_h the light of a pixel at harmonic h, a the amplitude, r_h the contrast of h relative to that of the first, and
-p the fixed phase pattern, the quad in relative units is
+See sensor notes, 2.3 to 2.5. With S_h the light of a pixel at harmonic h, a the amplitude, r_h the contrast of h
+relative to that of the first, and p the fixed phase pattern, the quad in relative units is
 
     q = Re sum_h r_h S_h exp(i h (phase_offset + p - shift)) + a b
 
@@ -13,10 +13,10 @@ With G electrons per unit,
     differential   code = clip(round((n'_A - n'_B) / e))           signed;    quad = code e / (C G)
     unipolar       code = clip(round(n'_A / e) + pedestal)         unsigned;  quad = (n'_A - N_a/2 - N_dark) 2 / (C G)
 
-A unipolar sensor has C = 1 / b. The constant levels that it subtracts are known to it: ambient light from a frame
-without its own light, dark current on average over the pixels. Pixels that respond differently multiply all light by
-their gain, and dark current by their own factor. The numbers written are in relative units again, and without clipping
-their mean is q times the gain. Their phase noise is that of scene/electrons.py.
+A unipolar sensor has C = 1 / b. It subtracts constant levels: ambient light, measured by a frame without active light,
+and the mean dark current of all pixels. The fixed pattern multiplies all light by the gain of each pixel, and the dark
+current by another factor. Results are in relative units again; without clipping their mean is q times the gain. Their
+phase noise is that of scene/electrons.py.
 """
 
 from __future__ import annotations
@@ -41,11 +41,11 @@ class Reading(NamedTuple):
     quad: Float[np.ndarray, "H W"]
     """Relative units, float32."""
     saturated: Bool[np.ndarray, "H W"]
-    """Where a tap was full or the ADC at its end: the quad is then wrong, not only noisy."""
+    """Whether a tap was full or the ADC at an end of its range: the quad is then biased."""
 
 
 def why_impossible(sensor: Sensor) -> str | None:
-    """Why the taps of a sensor would hold negative light; None: they would not."""
+    """Why the taps of a sensor would hold negative light; None if they do not."""
     modulated, constant = float(contrast(sensor)) * peak(sensor.harmonic_contrast), 0.0
     if not sensor.unipolar:
         constant = float(contrast(sensor)) * abs(float(sensor.dc_offset))
@@ -104,14 +104,14 @@ def mean_taps(
     """
     gain = electron_gain(sensor)
     signal = float(contrast(sensor)) * gain * np.asarray(quad, dtype=np.float64)
-    if sensor.unipolar:  # the offset is the light itself, not a difference of the taps
+    if sensor.unipolar:  # the offset is the light of the tap, not a difference of two
         signal = signal - gain * np.asarray(amplitude, dtype=np.float64)
     common = 0.5 * (_ambient(sensor, ambient) + gain * np.asarray(amplitude, dtype=np.float64))
     spread = dark_map(sensor.pattern, *common.shape)
     dark = dark_electrons(sensor) if spread is None else dark_electrons(sensor) * spread
     taps = common + 0.5 * signal + dark, common - 0.5 * signal + dark
     least = min(tap.min() for tap in taps)
-    if least < -1e-3:  # less than rounding of float32 quads can do
+    if least < -1e-3:  # beyond the rounding errors of float32 quads
         raise ValueError(
             f"a tap would hold {least:.3g} electrons: contrast {float(contrast(sensor)):.3g} times (1 + |dc_offset|) "
             f"{1 + abs(float(sensor.dc_offset)):.3g} must not exceed 1 for a differential sensor"
@@ -128,15 +128,15 @@ def read_out(
     ambient: Float[np.ndarray, "H W"] | None = None,
     shading: Shading | None = None,
 ) -> Reading:
-    """What ``sensor`` writes down for one raw frame.
+    """Simulate the read-out of one raw frame.
 
     Args:
         quad: Mean quad, DC offset included [relative units].
         amplitude: Mean amplitude a, source intensity included [relative units].
-        sensor: Without ``noise`` the mean is returned, as it is but for ``shading`` and the pattern of the gain.
+        sensor: Without ``noise`` the mean is returned, after ``shading`` and the pattern of the gain.
         generator: Source of all randomness. The order of draws is fixed: shots A, shots B, reads A, reads B.
-        ambient: Share of even ambient light that each pixel sends back, its reflectance [1]; None: 1.
-        shading: What of the light reaches each pixel; None: all.
+        ambient: Share of even ambient light that each pixel reflects [1]; None: 1.
+        shading: Factors of the light of each pixel; None: 1.
 
     Raises:
         ValueError: If the sensor's contrast and DC offset contradict each other, see :func:`mean_taps`.
@@ -151,7 +151,7 @@ def read_out(
     if not sensor.noise:
         return Reading(np.asarray(quad, dtype=np.float32), np.zeros(np.shape(quad), dtype=bool))
     mean_a, mean_b = mean_taps(quad, amplitude, sensor, ambient)
-    shots_a, shots_b = generator.poisson(mean_a), generator.poisson(mean_b)  # exact at any mean: no normal limit needed
+    shots_a, shots_b = generator.poisson(mean_a), generator.poisson(mean_b)
     tap_a = shots_a + generator.normal(0.0, sensor.read_noise_electrons, mean_a.shape)
     tap_b = shots_b + generator.normal(0.0, sensor.read_noise_electrons, mean_b.shape)
     full_a, full_b = tap_a >= sensor.full_well_electrons, tap_b >= sensor.full_well_electrons
@@ -168,10 +168,10 @@ def read_out(
 def quantise(
     electrons: Float[np.ndarray, "H W"], sensor: Sensor
 ) -> tuple[Float[np.ndarray, "H W"], Bool[np.ndarray, "H W"]]:
-    """Electrons through the ADC and back [e-], and where it was at an end of its range.
+    """Electrons after quantisation by the ADC [e-], and whether it was at an end of its range.
 
     Codes run from -2^(bits-1) to 2^(bits-1) - 1. A unipolar sensor has a pedestal, one 64th of the range above the
-    lowest code, so that read noise around zero is not cut off; it is subtracted again.
+    lowest code, so that read noise around zero is not clipped; it is subtracted again.
     """
     if sensor.adc_bits is None:
         return electrons, np.zeros(np.shape(electrons), dtype=bool)

@@ -1,8 +1,8 @@
-"""Where a sequence is written, and what an interrupted recording has finished: the folder OUT.partial beside OUT.
+"""Resume interrupted recordings: finished images are kept in the folder OUT.partial beside OUT.
 
-Each image of a recording is a file of its own there, renamed into place when it is complete, so that after any
-interruption the same command makes the missing ones only and ends with the same bytes. The folder says in
-``unfinished.md`` what is being recorded; nothing reads it as a sequence, and it is gone when OUT is there.
+Each image of a recording is a file there, renamed into place when it is complete, so that after any interruption the
+same command computes only the missing ones and ends with the same bytes. ``unfinished.md`` in the folder holds the
+settings; no reader takes it for a sequence, and it is removed when OUT is complete.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ OTHER = "continue with the same settings, choose another --out, or start over wi
 
 
 def needs_recording(out: Path, card: str, *, fresh: bool) -> bool:
-    """Whether there is anything to do: False if ``out`` holds what these settings give.
+    """Whether ``out`` has to be recorded: False if it is a sequence with these settings.
 
     Args:
         out: Folder of the sequence.
-        card: Settings of the recording, as its README.md begins.
-        fresh: Whether another sequence there may be moved aside.
+        card: Settings of the recording, the beginning of its README.md.
+        fresh: Whether another sequence there may be renamed.
 
     Raises:
-        UsageError: If ``out`` holds anything else that may not be moved aside, or OUT.partial something else.
+        UsageError: If ``out`` holds anything else that may not be renamed, or OUT.partial another recording.
     """
     _refuse_other_partial(partial_of(out), card, fresh=fresh)
     if not out.exists() or (out.is_dir() and not any(out.iterdir())):
@@ -46,7 +46,7 @@ def needs_recording(out: Path, card: str, *, fresh: bool) -> bool:
     sequence = any(all((out / mark).exists() for mark in marks) for marks in MARKS)
     text = (out / CARD).read_text(errors="replace") if sequence and (out / CARD).is_file() else ""
     if not fresh and text.startswith(card):
-        shutil.rmtree(partial_of(out), ignore_errors=True)  # of a process that was killed on its last metre
+        shutil.rmtree(partial_of(out), ignore_errors=True)  # of a process that was killed just before it removed it
         return False
     if fresh and sequence:
         return True
@@ -68,25 +68,21 @@ def set_aside(out: Path) -> None:
 
 
 def partial_of(out: Path) -> Path:
-    """The folder of what is unfinished."""
+    """The folder of finished images of an interrupted recording."""
     out = out.absolute()
     return out.with_name(f"{out.name}.partial")
 
 
 @contextlib.contextmanager
 def cached_images(out: Path, card: str, *, fresh: bool) -> Iterator[Cached]:
-    """Hold OUT.partial while a recording goes on; at a normal end it is removed.
+    """A cache of finished images in OUT.partial, which is locked meanwhile, and removed at a normal end.
 
-    After an exception or a killed process it stays, unless not one image was finished.
-
-    Args:
-        out: Folder of the sequence, see :func:`needs_recording`.
-        card: Settings of the recording.
-        fresh: Whether to begin again.
+    After an exception or a killed process it stays, unless no image was finished. Arguments as for
+    :func:`needs_recording`; ``fresh`` discards finished images.
 
     Raises:
         BusyError: If another process records the same.
-        UsageError: If the place cannot be written to.
+        UsageError: If the folder cannot be written to.
         ResourceError: If the disk is full.
     """
     folder = partial_of(out)
@@ -117,19 +113,19 @@ def _refuse_other_partial(folder: Path, card: str, *, fresh: bool) -> None:
         return
     begun = folder / UNFINISHED
     if not begun.is_file():
-        why = "it holds something that no recording left there"
-        raise UsageError("in the way of what is unfinished", where=folder, why=why, fix="choose another --out")
+        what, why = "the folder of finished images is in use", "it holds something that is no recording"
+        raise UsageError(what, where=folder, why=why, fix="choose another --out")
     if not fresh and begun.read_text(encoding="utf-8", errors="replace") != card:
         why = "an interrupted recording with other settings left it there"
         raise UsageError("another recording was begun", where=folder, why=why, fix=OTHER)
 
 
 def _cached(path: Path, make: Callable[[], Images]) -> tuple[Images, bool]:
-    """The images of a file, or those that ``make`` makes, which are then in the file."""
+    """The images of a file, or those that ``make`` returns, which are then stored in it."""
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
             return dict(stored), False
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):  # not there, or cut off when power failed
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):  # missing or truncated
         images = make()
     temporary = path.with_suffix(".tmp")
     with as_errors(path):
@@ -144,5 +140,5 @@ def _images(folder: Path) -> list[Path]:
 
 
 def _is_held(folder: Path) -> bool:
-    """Whether a process names itself in the lock: then the folder is not ours to remove."""
+    """Whether a process holds the lock: then the folder must not be removed here."""
     return (folder / LOCK).is_file() and (folder / LOCK).stat().st_size > 0

@@ -1,4 +1,4 @@
-"""What a scene is: bodies on their paths, a ToF camera, perhaps a colour camera beside it, and a sensor.
+"""A scene: bodies on paths, a ToF camera with a sensor, and optionally a colour camera beside it.
 
 Axes: x right, y down, z forward; a camera that does not move is at the origin.
 """
@@ -32,22 +32,22 @@ OVERRIDES = Wording(
 class ColourCamera:
     """A colour camera mounted beside the ToF camera; it takes an image at the start of every quartet.
 
-    Its light comes evenly from everywhere, so a Lambertian surface looks like its albedo from any side and at any
-    distance: linear RGB, no shadow, no falloff, black where there is nothing.
+    Illumination is uniform from all directions, so that a pixel is the albedo of a Lambertian surface: linear RGB,
+    no shadows, no falloff, black where there is no surface.
     """
 
     width: int
-    """Columns of the image, beside a ToF image of the scene's default size; both scale together."""
+    """Columns of the image at the scene's default size of the ToF image; both scale together."""
     height: int
     """Rows of the image, likewise."""
     horizontal_fov_deg: float = 60.0
     """Horizontal field of view [deg]; pixels are square."""
     position: Vector = (0.0, 0.0, 0.0)
-    """Where it sits, in the axes of the ToF camera [m]."""
+    """Position in the axes of the ToF camera [m]."""
     turn_deg: Vector = (0.0, 0.0, 0.0)
-    """How it is turned in those axes, as a rotation vector [deg]."""
+    """Orientation in those axes, as a rotation vector [deg]."""
     noise: float = 0.0
-    """Standard deviation of each value [1]; the values of a white surface are 1."""
+    """Standard deviation of the noise [1]; a white surface has the value 1."""
 
     def __post_init__(self):
         if not self.noise >= 0:
@@ -61,16 +61,16 @@ class ColourCamera:
 
 @dataclass(frozen=True, kw_only=True)
 class Scene:
-    """Bodies on their paths, a ToF camera, perhaps a colour camera beside it, and a sensor."""
+    """Bodies on paths, a ToF camera with a sensor, and optionally a colour camera beside it."""
 
     name: str
-    """What the command line calls it."""
+    """Name on the command line."""
     description: str
-    """One line for people."""
+    """Description in one line."""
     motion: str
-    """What moves how, in a few words: what the scene is hard for."""
+    """Kind of motion, in a few words."""
     bodies: tuple[Body, ...]
-    """What there is; bodies whose path is ``Still`` are static."""
+    """All bodies; those whose path is ``Still`` are static."""
     frames: int
     """Default number of raw frames."""
     width: int
@@ -80,25 +80,25 @@ class Scene:
     horizontal_fov_deg: float = 60.0
     """Horizontal field of view [deg]; pixels are square."""
     subsamples: int = 2
-    """Rays per pixel and axis that a quad averages: a pixel has an area, and at outlines it mixes what it sees."""
+    """Rays per pixel and axis that a quad averages: pixels at outlines mix surfaces."""
     sensor: Sensor = field(default_factory=lambda: Sensor(noise=True))
-    """The sensor; raw frame n is the one of number n in its cycle. By name, too: see sim/sensors.py."""
+    """The sensor, with its cycle of raw frames; also by name, see sim/sensors.py."""
     lens: Lens = field(default_factory=Lens)
-    """The lens of the ToF camera, and the beam of its light; the default is a pinhole, lit evenly."""
+    """The lens of the ToF camera, and the beam of its emitter; the default is a pinhole and an isotropic emitter."""
     camera_path: Path = field(default_factory=Still)
-    """How the ToF camera moves; the default is at rest at the origin, looking along +z."""
+    """Path of the ToF camera; the default is at rest at the origin, looking along +z."""
     emitter: Vector = (0.0, 0.0, 0.0)
-    """Where the light is, in the axes of the ToF camera [m]; away from it only engine 'mesh' can see."""
+    """Position of the emitter in the axes of the ToF camera [m]; engine 'mesh' only unless at the origin."""
     beam_deg: tuple[float, float] | None = None
-    """What the light shines on: full angles across and down about the camera's z axis [deg]; None: all directions."""
+    """Limits of the light: full angles across and down about the camera's z axis [deg]; None: all directions."""
     colour: ColourCamera | None = None
     """The colour camera, which moves with the ToF camera; None: there is none."""
     novel_views: tuple[Path, ...] = ()
-    """Where nobody looked from: poses, at time 0, of views to be rendered for looking at."""
+    """Poses, at time 0, of views without images, to be rendered after a reconstruction."""
     closed_form: float | None = None
     """Error of the closed form on ideal quads [m^2 x 100], one ray per pixel; None: not measured."""
     overrides: tuple[str, ...] = ()
-    """How it differs from the named scene, as texts ``name=value``; for the data card only."""
+    """Differences from the named scene, as texts ``name=value``; for the data card."""
 
     def __post_init__(self):
         if not self.bodies:
@@ -112,12 +112,12 @@ class Scene:
             raise ValueError(f"emitter must be finite, got {self.emitter}")
         if self.beam_deg is not None and not all(0 < angle < 180 for angle in self.beam_deg):
             raise ValueError(f"beam_deg must be between 0 and 180, got {self.beam_deg}")
-        if self.lens.distortion:  # it must be one that can be undone
-            self.camera()
+        if self.lens.distortion:
+            self.camera()  # raises ValueError if the distortion cannot be inverted
 
     @property
     def camera_moves(self) -> bool:
-        """Whether the camera path is anything but a pose at rest."""
+        """Whether the camera path is not a static pose."""
         return not isinstance(self.camera_path, Still | Viewpoint)
 
     def camera(self, size: tuple[int, int] | None = None, time: float = 0.0) -> Camera:
@@ -145,7 +145,7 @@ class Scene:
 
 
 def overridden(scene: Scene, overrides: Iterable[str]) -> Scene:
-    """A scene with single settings changed; it keeps its name and says on its data card what was changed.
+    """A scene with single settings changed; it keeps its name, and its data card lists the changes.
 
     Raises:
         UsageError: If a name is unknown or a value cannot be meant.

@@ -1,14 +1,13 @@
-"""Scenes as TOML files of the user: the fields of :class:`gftorf_warp.sim.scene.Scene`, as tables.
+"""Scenes as TOML files: the fields of :class:`gftorf_warp.sim.scene.Scene`, as tables.
 
-Every table is the settings of one dataclass. Where several kinds could stand, `kind` names one: a shape is "box",
-"plane", "sphere", "level", "assembly" or "mesh", a path "still", "line", "arc", "guided", "viewpoint" or "sweep". A
-sensor may be a name of sim/sensors.py, or a table with that name as `preset`. What a table leaves out has its default.
-Paths of files are relative to the file that names them. See examples/scene.toml.
+A table holds the fields of a dataclass; others have their defaults. `kind` selects a class: a shape is "box", "plane",
+"sphere", "level", "assembly" or "mesh", a path "still", "line", "arc", "guided", "viewpoint" or "sweep". A sensor may
+be a name of sim/sensors.py, or a table with that name as `preset`. Paths of files are relative to the scene file. See
+examples/scene.toml.
 """
 
 from __future__ import annotations
 
-import difflib
 import math
 import tomllib
 import types
@@ -18,6 +17,7 @@ from pathlib import Path as FilePath
 from typing import Any, Union
 
 from ..errors import InputError
+from ..scene.changes import suggestion
 from ..scene.sensor import Sensor
 from . import assembly, curves, meshes, paths, world
 from .scene import Scene
@@ -33,16 +33,15 @@ KINDS: dict[type, dict[str, type]] = {
         for kind in (paths.Still, paths.Line, paths.Arc, curves.Guided, paths.Viewpoint, paths.Sweep)
     },
 }
-NOT_THERE = ("closed_form", "overrides")  # fields of a scene that say something about it
-SIZES = {"frames": 48, "width": 160, "height": 120}  # where a file says nothing
+NOT_THERE = ("closed_form", "overrides")  # fields of a scene that are no settings
+SIZES = {"frames": 48, "width": 160, "height": 120}  # defaults
 
 
 def read_scene(path: str | FilePath) -> Scene:
     """The scene that a TOML file describes.
 
     Raises:
-        InputError: If there is no such file, it is no TOML, or a table is not what its dataclass needs: which table,
-            which key, what was expected.
+        InputError: If the file cannot be read, it is no TOML, or a table does not match its dataclass.
     """
     path = FilePath(path)
     try:
@@ -80,8 +79,7 @@ def _made(kind: type, table: Any, path: FilePath, where: str) -> Any:
     hints = typing.get_type_hints(kind)
     for key in table:
         if key not in known:
-            close = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
-            fix = f"did you mean {close[0]}?" if close else f"there are {', '.join(known)}"
+            fix = suggestion(key, known) or f"there are {', '.join(known)}"
             raise _wrong(path, _join(where, key), f"a {kind.__name__} has no such setting", fix)
     for name, f in known.items():
         if name not in table and f.default is MISSING and f.default_factory is MISSING:
@@ -94,7 +92,7 @@ def _made(kind: type, table: Any, path: FilePath, where: str) -> Any:
 
 
 def _value(kind: Any, value: Any, path: FilePath, where: str) -> Any:
-    """A value of TOML as what the field of a dataclass holds."""
+    """A TOML value as the value of a field of a dataclass."""
     if typing.get_origin(kind) in (Union, types.UnionType):
         options = [option for option in typing.get_args(kind) if option is not type(None)]
         table = isinstance(value, dict)

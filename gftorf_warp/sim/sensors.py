@@ -2,8 +2,8 @@
 
     gftorf simulate occlusion --override sensor=mlx75027        or, in a scene file, sensor = "mlx75027"
 
-A name sets every field of the sensor; single ones can be changed after it. Products are *like* theirs: no unit was
-measured, and what makers do not publish is assumed, as said below. Lens, image size and field of view are the scene's.
+A name sets every field of the sensor; single ones can be changed after it. Products are approximated: no unit was
+measured, and unpublished values are assumed, as stated below. Lens, image size and field of view are the scene's.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ SENSORS: Mapping[str, Sensor] = {
 
 
 def effect_rows(sensor: Sensor) -> dict[str, str]:
-    """What of a sensor goes beyond one frequency, a sine and equal pixels, for people; empty: nothing."""
+    """Rows of a data card on effects beyond one frequency, a sine and equal pixels; empty without any."""
     rows = {}
     if sensor.further_hz:
         listed = ", then at ".join(f"{float(f) / 1e6:.9g} MHz" for f in (sensor.f_mod_hz, *sensor.further_hz))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +12,7 @@ from ..data.files import atomic_write
 from ..data.read import read, read_truth
 from ..data.write import write
 from ..errors import UsageError
+from ..scene.changes import suggestion
 from .card import outcome_card, settings_card
 from .checks import check_clearance, check_engine, check_format
 from .closed_form_errors import Errors, closed_form_errors, ladder_table
@@ -118,22 +118,12 @@ def scene_of(scene: str | Scene, overrides: Iterable[str] = ()) -> Scene:
         UsageError: If there is no such scene, or a setting cannot be changed so.
         InputError: If a TOML file does not describe a scene.
     """
-    return overridden(_scene(scene), overrides)
-
-
-def _scene(scene: str | Scene) -> Scene:
     if isinstance(scene, Scene):
-        return scene
+        return overridden(scene, overrides)
     if scene.endswith(".toml"):
-        return read_scene(scene)
+        return overridden(read_scene(scene), overrides)
     if scene not in SCENES:
-        close = difflib.get_close_matches(scene, SCENES, n=1, cutoff=0.5)
-        raise UsageError(
-            f"there is no scene named {scene!r}",
-            where="SCENE",
-            why=f"the named scenes are {', '.join(SCENES)}",
-            fix=f"did you mean {close[0]!r}?"
-            if close
-            else "take one of these, `--list` describes them, or a file that ends in .toml",
-        )
-    return SCENES[scene]
+        others = "take one of these, `--list` describes them, or a file that ends in .toml"
+        why, fix = f"the named scenes are {', '.join(SCENES)}", suggestion(scene, SCENES) or others
+        raise UsageError(f"there is no scene named {scene!r}", where="SCENE", why=why, fix=fix)
+    return overridden(SCENES[scene], overrides)

@@ -1,4 +1,4 @@
-"""Reflectance of a surface: a pattern in its own axes, and how much of it is Lambert's."""
+"""Reflectance of a surface: a pattern in the axes of its body, partly Lambertian, partly glossy."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ import numpy as np
 from jaxtyping import Float, Int
 
 SATURATION = 0.6  # [1] of the colours: no channel is less than 0.4 of the brightest
-HUE_SPREAD = 0.2  # [turns] from one end to the other of the hues of one texture, where it has a hue at all
-TEXTURE_ORIGIN = 37.0001  # [m] keeps cell numbers positive and cell borders off the faces, which lie at round numbers
+HUE_SPREAD = 0.2  # [turns] range of the hues of one texture
+TEXTURE_ORIGIN = 37.0001  # [m] keeps cell numbers positive and cell borders off faces, which are at round numbers
 
 
 @dataclass(frozen=True, kw_only=True)
 class Texture:
     """Reflectance in hashed cells of a 3-D grid in the body's axes (sensor notes, 4.1); ``low == high`` is plain.
 
-    In colour every cell has its own hue, hashed from other bits, and its brightest channel is its reflectance.
+    In colour each cell has a hue, hashed from other bits, and its brightest channel is its reflectance.
     """
 
     low: float
@@ -26,9 +26,9 @@ class Texture:
     cell: float = 0.3
     """Edge of a cell [m]."""
     hue: float | None = None
-    """Middle of the cells' hues, in turns: 0 red, 1/3 green, 2/3 blue; None: they have all hues."""
+    """Middle of the cells' hues, in turns: 0 red, 1/3 green, 2/3 blue; None: all hues."""
     gloss: float = 0.0
-    """Share of the reflectance that is mirrored into a lobe, the rest is Lambert's [1]; engine 'mesh' only."""
+    """Share of the reflectance in a specular lobe, the rest is Lambertian [1]; engine 'mesh' only."""
     shininess: float = 50.0
     """Exponent of that lobe [1]: 10 is satin, 1000 nearly a mirror; its half width is 1.2 / sqrt(shininess) [rad]."""
 
@@ -38,14 +38,14 @@ class Texture:
                 f"gloss must be 0 to 1, shininess 0 or more and finite, got {self.gloss} and {self.shininess}"
             )
         if self.gloss > 0 and self.high > 1:
-            raise ValueError(f"a glossy surface returns at most the light that it gets: high {self.high} must be <= 1")
+            raise ValueError(f"a glossy surface reflects at most the incident light: high {self.high} must be <= 1")
         if not 0 <= self.low <= self.high:
             raise ValueError(f"reflectances must be 0 <= low <= high, got low {self.low}, high {self.high}")
         if not self.cell > 0:
             raise ValueError(f"cell must be above 0, got {self.cell}")
 
     def __repr__(self):
-        """Without the hue, which only a colour camera sees, and without the lobe where there is none."""
+        """Without the hue, which only matters to a colour camera, and without the lobe if there is none."""
         names = ("low", "high", "cell", *(("gloss", "shininess") if self.gloss else ()))
         return f"Texture({', '.join(f'{name}={getattr(self, name)!r}' for name in names)})"
 
@@ -61,7 +61,7 @@ class Texture:
         return self(point)[:, None] * (1.0 - SATURATION * (1.0 - np.clip(ramp, 0.0, 1.0)))
 
     def shading(self, cosine: Float[np.ndarray, "P"]) -> Float[np.ndarray, "P"]:
-        """Share of a reflectance of 1 that comes back to a camera at the light, met at this cosine of incidence [1]."""
+        """Amplitude [1] per reflectance at this cosine of incidence, for a camera at the light source."""
         twice = np.maximum(2.0 * cosine**2 - 1.0, 0.0)  # cosine between the view and the mirrored light
         lobe = 0.5 * (self.shininess + 2.0) * twice**self.shininess if self.gloss else 0.0
         return cosine * (1.0 + self.gloss * (lobe - 1.0))
