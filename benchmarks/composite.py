@@ -1,6 +1,6 @@
-"""What compositing costs: our kernels, the naive ones, and a prototype if its folder is named.
+"""Times of compositing: our kernels and naive ones.
 
-    python benchmarks/composite.py [--prototype FOLDER] [--device cpu|cuda] [--json FILE]
+    python benchmarks/composite.py [--device cpu|cuda] [--json FILE]
 
 Scene: isotropic Gaussians on a wavy surface 1-5 m away, 320x240, the same positions, sizes and opacities for all. All
 rows of one table come from one process, alternating, so that a busy machine slows them alike. Ratios matter, not times.
@@ -10,9 +10,7 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import statistics
-import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -43,8 +41,8 @@ class Ours:
         self.buffers.records = [self.buffers.splats]
         self.buffers.channels = [self.buffers.planes("channels 0", CHANNEL_PLANES)]
         self.grad_light, self.grad_channel = (
-            self.buffers.gradient_planes("gradient of light", GRAD_LIGHT_PLANES),
-            self.buffers.gradient_planes("gradient of channels 0", CHANNEL_PLANES),
+            self.buffers.gradient_planes("gradient of light", GRAD_LIGHT_PLANES, added=True),
+            self.buffers.gradient_planes("gradient of channels 0", CHANNEL_PLANES, added=False),
         )
         rng = np.random.default_rng(1)
         for planes in (self.grad_light, self.grad_channel):
@@ -91,23 +89,6 @@ class Naive:
         wp.launch(naive.backward, (HEIGHT, WIDTH), inputs, [self.records], device=self.sums.device)
 
 
-class Prototype:
-    """The stages of a prototype folder with bench.py and pipeline.py."""
-
-    def __init__(self, folder: Path, scene: tuple, device: str, threads: int):
-        sys.path.insert(0, str(folder))
-        import bench
-        import pipeline
-
-        shape = (16, 16, 4) if device == "cpu" else (1, 8, 4)
-        made = bench.make_scene("surface", *scene, wp.get_device(device))
-        self.raster = pipeline.Rasterizer(made, *shape, threads=threads)
-        self.raster.grad_image.assign(np.random.default_rng(1).normal(size=self.raster.image.shape))
-        self.raster.forward()
-        self.raster.fold()
-        self.forward, self.backward = self.raster.blend, self.raster.blend_backward
-
-
 def medians(rows: dict[str, object], repeats: int) -> dict[str, dict[str, float]]:
     """Median milliseconds of both stages of each row, rows taking turns; the first turn is thrown away."""
     times: dict[str, dict[str, list[float]]] = {name: {"forward": [], "backward": []} for name in rows}
@@ -123,7 +104,7 @@ def medians(rows: dict[str, object], repeats: int) -> dict[str, dict[str, float]
 
 
 def side_by_side(scene: dict[str, np.ndarray]) -> float:
-    """What the machine gives two threads at the moment: time of two renderings at once over that of one."""
+    """Time of two concurrent renderings over that of one: the load of the machine."""
     copies = [Ours(scene, "cpu", 1) for _ in range(2)]
     times: dict[int, list[float]] = {1: [], 2: []}
     with ThreadPoolExecutor(2) as pool:
@@ -138,7 +119,6 @@ def side_by_side(scene: dict[str, np.ndarray]) -> float:
 def main() -> None:
     """Print the table, write the JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--prototype", type=Path, help="folder of a prototype to compare with")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--scene", nargs=3, default=["20000", "0.03", "0.6"], metavar=("N", "SCALE", "OPACITY"))
     parser.add_argument("--repeats", type=int, default=7)
@@ -151,24 +131,17 @@ def main() -> None:
     if a.device == "cpu":
         rows["ours, 2 threads"] = Ours(scene, a.device, 2)
     rows["naive, 1 thread"] = Naive(rows["ours, 1 thread"])
-    if a.prototype:
-        rows["prototype, 1 thread"] = Prototype(a.prototype, numbers, a.device, 1)
     table = medians(rows, a.repeats)
-    table.setdefault("prototype, 1 thread", {"forward": math.nan, "backward": math.nan})
     base = table["ours, 1 thread"]
     if a.device == "cpu":
         shared = side_by_side(scene)
         print(f"two independent copies side by side take {shared:.2f} times one: 1 means two whole cores, 2 only one")
     print(f"surface {' '.join(a.scene)}, {WIDTH}x{HEIGHT}, {a.device}, medians of {a.repeats}, Warp {wp.__version__}")
     for name, both in table.items():
-        cells = [
-            "not measured" if math.isnan(t) else f"{t:8.2f} ms  {t / base[stage]:6.2f} x ours"
-            for stage, t in both.items()
-        ]
+        cells = [f"{t:8.2f} ms  {t / base[stage]:6.2f} x ours" for stage, t in both.items()]
         print(f"  {name:<20} forward {cells[0]:<26} backward {cells[1]}")
     if a.json:
-        clean = {name: {s: None if math.isnan(t) else t for s, t in both.items()} for name, both in table.items()}
-        a.json.write_text(json.dumps({"scene": a.scene, "device": a.device, "ms": clean}, indent=1) + "\n")
+        a.json.write_text(json.dumps({"scene": a.scene, "device": a.device, "ms": table}, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -140,7 +140,7 @@ def rows_of(
             times.append(1e3 * (time.perf_counter() - begun) / (state.images - first))
             report((number * parts + done) * part, len(chosen) * parts * part, ms=times[-1])
         row: dict[str, Any] = {
-            "graph": settings.graph,
+            "graph": settings.graph and torch.device(device).type != "cpu",
             "batch": str(settings.schedule.batch),
             "products": str(settings.motion.products),
             "N": len(state.optimiser.field),
