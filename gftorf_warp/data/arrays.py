@@ -52,6 +52,28 @@ def read_array(path: Path, field: Field, sizes: Mapping[str, int] | None = None)
     return array.astype(array.dtype.newbyteorder("="), copy=False)
 
 
+def read_stored(root: Path, field: Field) -> tuple[np.ndarray, str] | None:
+    """Array of a field from the first of its files that exist, and the relative name; None if there is none.
+
+    Raises:
+        InputError: If a file is not valid, or files of one field disagree.
+    """
+    found = {path: read_array(root / path, field) for path in field.paths if (root / path).exists()}
+    if not found:
+        return None
+    path, first = next(iter(found.items()))
+    if any(not np.array_equal(_compared(array), _compared(first)) for array in found.values()):
+        texts = ", ".join(f"{array.tolist()} in {name}" for name, array in found.items())
+        why = f"expected the same value in all of its files, found {texts}"
+        raise InputError(f"{field.name}: files disagree", where=root / path, why=why, fix="remove the wrong file")
+    return first, path
+
+
+def _compared(array: np.ndarray) -> np.ndarray:
+    """Of a 3x3 or 4x4 matrix the part that both have; of a number, MATLAB's 1x1 or not, the number."""
+    return array[:3, :3] if array.ndim == 2 and array.size > 1 else array.reshape(-1)
+
+
 def read_shape(path: Path, field: Field) -> tuple[int, ...]:
     """Shape that the header of a .npy file states, checked like :func:`read_array` checks it; no data are read.
 

@@ -11,14 +11,12 @@ import numpy as np
 from ..constants import CANONICAL_SHIFTS, FRAMES_PER_QUARTET, SPEED_OF_LIGHT
 from ..errors import InputError, UsageError
 from . import specs
-from .arrays import read_array, read_choice
+from .arrays import read_choice, read_stored
 from .problems import Problems
 from .sequence import Calibration, Intrinsics
 
 DEPTH_RANGES_M = (0.03, 30_000.0)  # [m] 10 GHz to 10 kHz: outside, the number is another quantity or unit
 FOCAL_MIN = 0.05  # of the image width: a view of 168 degrees; a shorter one is in image widths or millimetres
-
-
 UNREAD = Intrinsics(fx=math.nan, fy=math.nan, cx=math.nan, cy=math.nan)  # the error is among the problems
 
 
@@ -102,17 +100,17 @@ def read_shifts(root: Path, form: str, frames: int, sources: dict[str, str]) -> 
         sources["shifts"] = "file tof: phasors, as four simultaneous quads 0, pi, pi/2, 3 pi/2"
         return np.resize(CANONICAL_SHIFTS, frames)
     spec = specs.fields("ftorf")["permutation"]
-    path = root / spec.paths[0]
-    if path.exists():
-        values = read_array(path, spec)
+    stored = read_stored(root, spec)
+    if stored is not None:
+        values, name = stored
         if sorted(values.tolist()) != [0, 1, 2, 3]:
             raise InputError(
                 "unknown permutation",
-                where=path,
+                where=root / name,
                 why=f"expected the numbers 0, 1, 2, 3 in some order, found {values.tolist()}",
                 fix="store the order with canonical = raw[permutation], canonical being +cos, -cos, +sin, -sin",
             )
-        sources["shifts"] = f"file {spec.paths[0]}: {[int(v) for v in values]}"
+        sources["shifts"] = f"file {name}: {[int(v) for v in values]}"
     else:
         values = np.array(spec.default)
         sources["shifts"] = "default order +cos, -cos, +sin, -sin (no tof_permutation.npy)"
@@ -137,22 +135,21 @@ def read_times(
         UsageError: If the given rate is not above 0.
         InputError: If the file has too few times, or they decrease.
     """
-    spec = specs.fields(form)["frame_times"]
-    path = root / spec.paths[0]
-    times = read_array(path, spec).astype(np.float64) if path.exists() else None
-    if times is not None:
+    stored = read_stored(root, specs.fields(form)["frame_times"])
+    times = None if stored is None else stored[0].astype(np.float64)
+    if stored is not None and times is not None:
         if len(times) < frames or times[0] != 0.0 or (np.diff(times) < 0).any():
             steps = np.flatnonzero(np.diff(times) < 0)
             raise InputError(
                 "frame_times",
-                where=path,
+                where=root / stored[1],
                 why=f"expected {frames} or more times in seconds that start at 0 and never decrease, "
                 f"found {len(times)} from {times[0]:g} to {times[-1]:g}"
                 + (f", decreasing after frame {steps[0]}" if len(steps) else ""),
                 fix=f"correct the order and subtract the first time, or remove the file for {default_hz:g} Hz",
             )
         frames = len(times)
-        sources["times"] = f"file {spec.paths[0]}"
+        sources["times"] = f"file {stored[1]}"
     if frame_rate_hz is not None:
         if not (math.isfinite(frame_rate_hz) and frame_rate_hz > 0):
             raise UsageError(
@@ -168,18 +165,11 @@ def read_times(
 
 def _scalar(root: Path, spec: specs.Field, sources: dict[str, str], key: str) -> float | None:
     """One number and its source; None if it has neither file nor default."""
-    found = {path: float(read_array(root / path, spec).reshape(())) for path in spec.paths if (root / path).exists()}
-    if len(set(found.values())) > 1:
-        raise InputError(
-            f"{spec.name}: files disagree",
-            where=root / spec.paths[0],
-            why=f"expected one value, found {', '.join(f'{value!r} in {path}' for path, value in found.items())}",
-            fix="remove the wrong file",
-        )
-    if not found:
+    stored = read_stored(root, spec)
+    if stored is None:
         sources[key] = f"default {spec.default} (no {spec.paths[0]})" if spec.default is not None else "default none"
         return spec.default if isinstance(spec.default, float) else None
-    path, value = next(iter(found.items()))
+    value, path = float(stored[0].reshape(())), stored[1]
     bounds = {"depth_range": DEPTH_RANGES_M, "quad_values_scale_factor": (math.ulp(0.0), math.inf)}.get(spec.name)
     if bounds and not bounds[0] <= value <= bounds[1]:
         raise InputError(
@@ -226,18 +216,10 @@ def _tof_intrinsics(
 
 def _pinhole(root: Path, spec: specs.Field, width: int | None) -> tuple[Intrinsics, str] | None:
     """Intrinsics as stored, and the file; None if there is none."""
-    found = {path: read_array(root / path, spec) for path in spec.paths if (root / path).exists()}
-    if not found:
+    stored = read_stored(root, spec)
+    if stored is None:
         return None
-    path, stored = next(iter(found.items()))
-    matrix = stored.astype(np.float64)
-    if len(found) > 1 and not all(np.array_equal(other[:3, :3], matrix[:3, :3]) for other in found.values()):
-        raise InputError(
-            f"{spec.name}: files disagree",
-            where=root / path,
-            why=f"expected one matrix, found different ones in {' and '.join(found)}",
-            fix="remove the wrong file",
-        )
+    matrix, path = stored[0].astype(np.float64), stored[1]
     focal = (matrix[0, 0], matrix[1, 1])
     pinhole = np.eye(len(matrix))
     pinhole[0, 0], pinhole[1, 1], pinhole[:2, 2] = *focal, matrix[:2, 2]

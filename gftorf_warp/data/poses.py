@@ -8,7 +8,7 @@ import numpy as np
 
 from ..errors import InputError
 from . import specs
-from .arrays import read_array, read_choice
+from .arrays import read_array, read_choice, read_stored
 
 ROTATION_TOLERANCE = 1e-4  # float32 poses are off by 1e-7, mixed-up or scaled matrices by much more
 SAME_POSE = 1e-9  # float64 products of poses differ by 1e-15, other poses by much more; [m] and [1]
@@ -121,15 +121,15 @@ def read_novel(root: Path, form: str, sources: dict[str, str]) -> np.ndarray | N
         InputError: If they are no rigid motions.
     """
     spec = specs.fields(form)["test_poses"]
-    path = root / spec.paths[0]
-    if not path.exists():
+    found = read_stored(root, spec)
+    if found is None:
         sources["novel_from_world"] = "default none"
         return None
-    stored = read_array(path, spec)[:, :, :4].astype(np.float64)
+    stored, name = found[0][:, :, :4].astype(np.float64), found[1]
     poses = _identity(len(stored))
     poses[:, : stored.shape[1]] = stored
-    _refuse_others(path, spec.name, poses)
-    sources["novel_from_world"] = f"file {spec.paths[0]}, {len(poses)} poses"
+    _refuse_others(root / name, spec.name, poses)
+    sources["novel_from_world"] = f"file {name}, {len(poses)} poses"
     return poses
 
 

@@ -151,13 +151,6 @@ def refuse_inexpressible(form: str, sequence: Sequence, truth: Truth | None) -> 
             f"pixels, at least {FOCAL_MIN} of the width {colour_width}",
             str(colour),
         ),
-        "colour_from_world": (
-            _rigid(sequence.colour.camera_from_world),
-            "rotations and translations",
-            "other matrices",
-        ),
-        "novel_from_world": (_rigid(sequence.novel_from_world), "rotations and translations", "other matrices"),
-        "camera_from_world": (_rigid(sequence.camera_from_world), "rotations and translations", "other matrices"),
         "colour": (
             all(np.isfinite(i).all() for i in sequence.colour.images.values()),
             "finite numbers",
@@ -176,6 +169,14 @@ def refuse_inexpressible(form: str, sequence: Sequence, truth: Truth | None) -> 
             "zero, negative or infinite distances",
         ),
     }
+    poses = {
+        "colour_from_world": sequence.colour.camera_from_world,
+        "novel_from_world": sequence.novel_from_world,
+        "camera_from_world": sequence.camera_from_world,
+    }
+    for what, matrices in poses.items():
+        holds = matrices is None or rigid(matrices).all()
+        rules[what] = (holds, "rotations and translations", "other matrices")
     for what, (holds, expected, found) in rules.items():
         if not holds:
             raise inexpressible(form, what, expected, found)
@@ -202,10 +203,6 @@ def _colour_intrinsics(sequence: Sequence) -> Intrinsics:
         return sequence.colour.intrinsics
     height, width = _colour_size(sequence)
     return sequence.intrinsics.scaled(width / sequence.width, height / sequence.height)
-
-
-def _rigid(poses: np.ndarray | None) -> bool:
-    return poses is None or bool(rigid(poses).all())
 
 
 def _pinhole(camera: Intrinsics) -> np.ndarray:
