@@ -30,7 +30,7 @@ def wanted(mean, frequencies, columns):
 
 
 def anywhere(count):
-    """Positions in a room, far away, next to zero, and where waves of high frequency are near zero [m]."""
+    """Positions within metres, far away, next to zero, and where waves of high frequency are near zero [m]."""
     rows = random(count, 3) * 12 - 6
     rows[::5] *= 50
     rows[1::5] *= 1e-6
@@ -46,14 +46,14 @@ def test_a_kernel_encodes_to_the_last_half(count, frequencies, columns, device):
     """Arguments of 20,000 rad and of 1e-9 alike; zeros behind the values, nothing unwritten."""
     mean = anywhere(count)
     powers = powers_of_two(frequencies).to(device)
-    found = FusedLayers().encode(mean.to(device), LENGTH, powers, columns=columns, dtype=torch.float16).cpu()
+    got = FusedLayers().encode(mean.to(device), LENGTH, powers, columns=columns, dtype=torch.float16).cpu()
     want = wanted(mean, frequencies, columns)
-    assert found.shape == (count, columns)
-    assert found.dtype == torch.float16
-    apart = halves_between(found, want)
+    assert got.shape == (count, columns)
+    assert got.dtype == torch.float16
+    apart = halves_between(got, want)
     assert apart.max() <= 1
     assert (apart == 0).float().mean() > 0.99, "two roundings differ from one now and then"
-    assert not found[:, 3 + 6 * frequencies :].any()
+    assert not got[:, 3 + 6 * frequencies :].any()
 
 
 @pytest.mark.parametrize("device", DEVICES)
@@ -75,10 +75,10 @@ def test_positions_may_lie_apart_and_may_be_none():
     mean = wide[:, 3:]
     assert not mean.is_contiguous()
     for rows in (mean, mean[:0]):
-        found = FusedLayers().encode(rows, LENGTH, powers, columns=64, dtype=torch.float16)
-        assert found.shape == (len(rows), 64)
+        got = FusedLayers().encode(rows, LENGTH, powers, columns=64, dtype=torch.float16)
+        assert got.shape == (len(rows), 64)
         assert torch.equal(
-            found, FusedLayers().encode(rows.contiguous(), LENGTH, powers, columns=64, dtype=torch.float16)
+            got, FusedLayers().encode(rows.contiguous(), LENGTH, powers, columns=64, dtype=torch.float16)
         )
 
 
@@ -96,9 +96,9 @@ def test_a_network_is_encoded_by_its_backend(monkeypatch):
     first = quick.bind(gaussians)
     assert not asked
     quick.backend = HalfPrecision(FusedLayers(), Form.of(quick))
-    found = quick.bind(gaussians)
+    got = quick.bind(gaussians)
     assert asked == [40]
-    assert halves_between(first, found).max() <= 1
+    assert halves_between(first, got).max() <= 1
     assert plain.bind(gaussians).dtype == torch.float32
     quick.backend = HalfPrecision(CublasLayers(), Form.of(quick))
     assert torch.equal(quick.bind(gaussians), first)
@@ -112,16 +112,16 @@ def test_times_are_rounded_once_and_in_advance(settings, device):
     made, gaussians = network(settings).to(device), field(anywhere(20), None).map(lambda value: value.to(device))
     assert torch.equal(made.time_encodings_f32, made.time_encodings.float())
     assert not torch.equal(made.time_encodings_f32.double(), made.time_encodings), "otherwise nothing was rounded"
-    place = made.bind(gaussians)
+    binding = made.bind(gaussians)
     for keys in ([0, 2, 3], torch.tensor([3, 0], dtype=torch.int32, device=device)):
-        want = made.offsets(place, made.time_encodings[keys])
-        assert torch.equal(made.at_keys(place, keys).offset, want)
+        want = made.offsets(binding, made.time_encodings[keys])
+        assert torch.equal(made.at_keys(binding, keys).offset, want)
 
 
 def test_in_float64_times_are_not_rounded():
     """A network that became one of float64 reads the table of float64."""
     made, gaussians = network().double(), field(anywhere(20).double(), None)
-    place, keys = made.bind(gaussians), [0, 2, 3]
-    found = made.at_keys(place, keys).offset
-    assert torch.equal(found, made.offsets(place, made.time_encodings[keys]))
-    assert not torch.equal(found, made.offsets(place, made.time_encodings_f32[keys]))
+    binding, keys = made.bind(gaussians), [0, 2, 3]
+    got = made.at_keys(binding, keys).offset
+    assert torch.equal(got, made.offsets(binding, made.time_encodings[keys]))
+    assert not torch.equal(got, made.offsets(binding, made.time_encodings_f32[keys]))

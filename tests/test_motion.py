@@ -1,4 +1,4 @@
-"""Motion: what interpolation means, who follows whom, and where gradients go."""
+"""Motion: interpolation between keys, binding of Gaussians to nodes, and gradients."""
 
 import pytest
 import torch
@@ -16,7 +16,7 @@ def nodes():
 
 @pytest.fixture
 def gaussians():
-    """Nine Gaussians in three layers, two of them at rest."""
+    """Nine Gaussians in three layers, two of them static."""
     return field(random(9, 3, seed=2), torch.tensor([0, 1, 1, 2, 0, 1, 2, 1, 1]))
 
 

@@ -80,7 +80,7 @@ def test_a_model_stores_and_loads_itself(kind, tmp_path):
 
 
 def test_checkpoints_of_before_models_stored_themselves_load():
-    """The dictionaries that recon/state.py wrote, of all three models that there were."""
+    """The dictionaries that recon/state.py wrote, of the three models of that time."""
     times, node = KEYS, random(2, 3)
     tensors = {"key_times": times, "node": node, "layer": torch.tensor([1, 1]), "offset": random(4, 2, 3, seed=1)}
     assert type(motion_from_dict({"kind": "still", "tensors": {"key_times": times}})) is KINDS["still"]

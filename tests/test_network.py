@@ -1,4 +1,4 @@
-"""The motion network: its size, what it computes, that it starts at rest, and that it survives a checkpoint."""
+"""The motion network: its size, what it computes, its small initial displacements, and its checkpoints."""
 
 import copy
 
@@ -53,14 +53,14 @@ def test_it_computes_what_the_method_says():
     position = random(40, 3) * 6 - 3
     for settings in (MotionSettings(), MotionSettings(layers=4, width=32)):
         made = network(settings, head=0.1)
-        place = made.bind(field(position, None))
-        found = made.at_keys(place, [0, 2, 3]).offset
-        for row, key in zip(found, (0, 2, 3), strict=True):
+        binding = made.bind(field(position, None))
+        got = made.at_keys(binding, [0, 2, 3]).offset
+        for row, key in zip(got, (0, 2, 3), strict=True):
             want = spelt_out(copy.deepcopy(made).double(), position, key)
             assert want.abs().max() > 0.01
             torch.testing.assert_close(row.double(), want, rtol=1e-4, atol=1e-5)
-            torch.testing.assert_close(made.at_keys(place, [key]).offset[0], row, rtol=1e-4, atol=1e-6)
-    assert (found[0] - found[1]).abs().max() > 1e-3, "it depends on time"
+            torch.testing.assert_close(made.at_keys(binding, [key]).offset[0], row, rtol=1e-4, atol=1e-6)
+    assert (got[0] - got[1]).abs().max() > 1e-3, "it depends on time"
 
 
 def test_gradients_reach_every_weight_and_no_position():
@@ -70,12 +70,12 @@ def test_gradients_reach_every_weight_and_no_position():
     parameters = list(made.parameters())
     gaussians = field(position, None)
     loss = (made.at(made.bind(gaussians), 5 / 120).offset * cotangent).sum()
-    *found, none = torch.autograd.grad(loss, [*parameters, position], allow_unused=True)
+    *got, none = torch.autograd.grad(loss, [*parameters, position], allow_unused=True)
     assert none is None
     twin = copy.deepcopy(made).double()
     ends = [spelt_out(twin, position.detach(), key) for key in (1, 2)]
     want = torch.autograd.grad(((0.75 * ends[0] + 0.25 * ends[1]) * cotangent).sum(), list(twin.parameters()))
-    for one, other in zip(found, want, strict=True):
+    for one, other in zip(got, want, strict=True):
         assert other.abs().max() > 1e-6
         torch.testing.assert_close(one.double(), other, rtol=2e-3, atol=2e-4 * float(other.abs().max()))
 
@@ -94,15 +94,15 @@ def test_it_starts_at_rest_and_the_same_for_a_seed():
 def test_encoding_has_no_factor_pi():
     """gamma(v) = [v, sin v, cos v, sin 2v, cos 2v, ..]; the order of the waves is a convention of the weights only."""
     value = torch.tensor([[0.3]])
-    found = sorted(encoded(value, 2)[0].tolist())
+    got = sorted(encoded(value, 2)[0].tolist())
     want = sorted([0.3, *(float(wave(torch.tensor(a))) for a in (0.3, 0.6) for wave in (torch.sin, torch.cos))])
-    assert found == pytest.approx(want)
+    assert got == pytest.approx(want)
     assert encoded(torch.zeros(4, 3), 10).shape == (4, 63)
     assert encoded(torch.zeros(4, 1), 10).shape == (4, 21)
 
 
 def test_layers_say_nothing_to_a_network():
-    """Nodes pin the static layer; a network decides for itself who moves."""
+    """Nodes do not move the static layer; a network has no layers."""
     made, position = network(head=0.1), random(30, 3)
     static = made.at_keys(made.bind(field(position, torch.zeros(30, dtype=torch.long))), [1]).offset[0]
     assert static.any(dim=1).all()

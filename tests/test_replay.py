@@ -82,7 +82,7 @@ def test_colour_only_where_it_is_wanted(run):
 
 
 def test_only_what_is_wanted(run):
-    """The rest is empty, and what is there is the same."""
+    """Other images are empty; those that are computed are the same."""
     got, want = run.renderer(("quads", "distance", "opacity"))(0.02, CAMERA), run.render(0.02)
     assert got.phasor.numel() == got.distortion.numel() == 0
     for name in ("quads", "distance", "opacity"):
@@ -123,10 +123,10 @@ def test_cameras_of_one_size_share_memory(run):
 
 @pytest.mark.parametrize("run", ["cpu"], indirect=True)
 def test_a_size_is_captured_when_it_comes_again(run, monkeypatch):
-    """What becomes a graph, and when, with a list of drawings in place of graphs; images stay right throughout."""
+    """When a rendering is captured, with plain renderings instead of graphs; images are right throughout."""
     captured, launched = [], []
-    monkeypatch.setattr(module.Replay, "_captured", lambda _, seen: captured.append(seen) or seen)
-    monkeypatch.setattr(module.Replay, "_launch", lambda self, seen: launched.append(seen) or self._draw(seen))
+    monkeypatch.setattr(module.Replay, "_captured", lambda _, target: captured.append(target) or target)
+    monkeypatch.setattr(module.Replay, "_launch", lambda self, target: launched.append(target) or self._draw(target))
     render = run.renderer(PLAIN)
     render.graphs = True
     for number, (time, camera) in enumerate([(t, c) for t in TIMES for c in (CAMERA, aside(0.1))]):

@@ -1,4 +1,4 @@
-"""Many images of a replay: whole, in order, and memory that is used again only when nobody looks at it."""
+"""Many images of a replay: complete, in order, in memory that is reused only when nothing refers to it."""
 
 import gc
 
@@ -57,7 +57,7 @@ def test_arrays_are_those_of_single_calls(run, ahead):  # noqa: F811, ARG001
 
 
 def test_renderings_on_the_device_are_those_of_single_calls(run, ahead):  # noqa: F811, ARG001
-    """What is not wanted has no elements, as in a call."""
+    """Images that are not computed have no elements, as in a call."""
     want = one_by_one(run, ("quads", "distance"))
     rows = []
     for rendering in Series(run.renderer(("quads", "distance")), VIEWS).on_device():
@@ -69,69 +69,69 @@ def test_renderings_on_the_device_are_those_of_single_calls(run, ahead):  # noqa
 @pytest.mark.parametrize("run", ["cpu"], indirect=True)
 @pytest.mark.parametrize("where", ["host", "device"])
 def test_images_that_overflowed_are_rendered_again(run, ahead, where, monkeypatch):  # noqa: F811
-    """A reserve of a tenth of what is needed: what is drawn with it is spoilt, and none of it is handed out."""
+    """A capacity of a tenth of the pairs: incomplete images are rendered again, and none of them is returned."""
     want = one_by_one(run, PLAIN)
     render, right = run.renderer(PLAIN), replaying.Replay.draw
-    spoilt = []
+    incomplete = []
 
     def draw(self, time, camera):
-        """As on CUDA: pairs are reserved, and what does not fit is missing, unnoticed."""
+        """As on CUDA: memory for some pairs; an image with more is incomplete, without an error."""
         target = right(self, time, camera)
         needed = int(target.packed[-1:].view(torch.int32))
-        reserved = spoilt_below[0]
+        reserved = capacity[0]
         shown = replaying.replace(target.buffers.settings, pair_capacity=reserved)
         if needed > reserved:
             target.packed[:-1] = float("nan")
-            spoilt.append((time, camera))
+            incomplete.append((time, camera))
         buffers = type("Shown", (), {"settings": shown})
         return replaying.replace(target, buffers=buffers)
 
     def grow(self):
-        spoilt_below[0] = int(1.5 * self.largest) + 1
+        capacity[0] = int(1.5 * self.largest) + 1
 
-    spoilt_below = [20]
+    capacity = [20]
     monkeypatch.setattr(replaying.Replay, "draw", draw)
     monkeypatch.setattr(replaying.Replay, "grow", grow)
-    monkeypatch.setattr(replaying.Replay, "fits", lambda self: self.largest <= spoilt_below[0])
+    monkeypatch.setattr(replaying.Replay, "fits", lambda self: self.largest <= capacity[0])
     one = Series(render, VIEWS)
     if where == "host":
         got = list(one.on_host())
     else:
         got = [{n: getattr(r, n).numpy().copy() for n in PLAIN} for r in one.on_device()]
     assert_same(got, want)
-    assert 1 + ahead <= len(spoilt) < len(VIEWS), "those that were on their way as well; then there is room"
-    assert one.repeated == len(spoilt) or not ahead
+    assert 1 + ahead <= len(incomplete) < len(VIEWS), "those in flight as well; then the capacity suffices"
+    assert one.repeated == len(incomplete) or not ahead
 
 
-def test_memory_comes_back_when_nobody_looks_at_it():
+def test_memory_is_reused_when_nothing_refers_to_it():
     """A part of an array keeps all of it; what is held beyond the reserve is a copy; nothing is ever overwritten."""
-    outgoing = ReadbackRing(torch.zeros(8), ahead=1, kept=2)
+    ring = ReadbackRing(torch.zeros(8), ahead=1, kept=2)
     held = []
     for number in range(6):
-        array = outgoing.keep(outgoing.copy(torch.full((8,), float(number))))
+        array = ring.keep(ring.copy(torch.full((8,), float(number))))
         held.append(array[2:6].reshape(2, 2)[1:])
         del array
     gc.collect()
     assert [float(one[0, 0]) for one in held] == [0, 1, 2, 3, 4, 5]
     assert [one.base.base is not None for one in held] == [True, True, False, False, False, False]
-    assert len(outgoing._free) == 2, "those under way need so many"
+    assert len(ring._free) == 2, "those under way need so many"
     held.clear()
     gc.collect()
-    assert len(outgoing._free) == 4
-    first = outgoing.keep(outgoing.copy(torch.ones(8)))
+    assert len(ring._free) == 4
+    first = ring.keep(ring.copy(torch.ones(8)))
     address = first.ctypes.data
     del first
     gc.collect()
-    found = {outgoing.keep(outgoing.copy(torch.ones(8))).ctypes.data for _ in range(8)}
-    assert address in found
-    assert len(found) == 4, "nothing was allocated"
+    got = {ring.keep(ring.copy(torch.ones(8))).ctypes.data for _ in range(8)}
+    assert address in got
+    assert len(got) == 4, "nothing was allocated"
 
 
 @pytest.mark.parametrize("length", [1, 1024, 1025])
 def test_memory_starts_where_pages_do(length):
     """Every copy, so that a disk takes it as it is; none reaches into another."""
-    outgoing = ReadbackRing(torch.zeros(length), ahead=1, kept=3)
-    held = [outgoing.keep(outgoing.copy(torch.full((length,), float(number)))) for number in range(3)]
+    ring = ReadbackRing(torch.zeros(length), ahead=1, kept=3)
+    held = [ring.keep(ring.copy(torch.full((length,), float(number)))) for number in range(3)]
     assert [one.ctypes.data % 4096 for one in held] == [0, 0, 0]
     assert [(one.shape, float(one.min()), float(one.max())) for one in held] == [((length,), k, k) for k in range(3)]
 
@@ -142,9 +142,9 @@ def test_as_many_are_held_as_was_asked_for(run, kept, monkeypatch):  # noqa: F81
     made, right = [], ReadbackRing.__init__
     monkeypatch.setattr(ReadbackRing, "__init__", lambda self, *a, **k: made.append(k["kept"]) or right(self, *a, **k))
     one = Series(run.renderer(PLAIN), [(0.001 * k, CAMERA) for k in range(8)])
-    found = list(one.on_host(kept))
+    got = list(one.on_host(kept))
     assert made == [kept]
-    starts = [min(array.ctypes.data for array in image.values()) for image in found]
+    starts = [min(array.ctypes.data for array in image.values()) for image in got]
     assert len(set(starts)) == 8
     assert all(start % 4096 == 0 for start in starts[:kept])
 
@@ -152,11 +152,11 @@ def test_as_many_are_held_as_was_asked_for(run, kept, monkeypatch):  # noqa: F81
 def test_a_loop_that_is_left_early_leaves_nothing_behind(run, ahead):  # noqa: F811, ARG001
     """The replay goes on as if nothing had been."""
     render = run.renderer(PLAIN)
-    for found in Series(render, VIEWS).on_host():
-        assert found["distance"].shape == (30, 40)
+    for got in Series(render, VIEWS).on_host():
+        assert got["distance"].shape == (30, 40)
         break
-    found, want = render(*VIEWS[3]), run.renderer(PLAIN)(*VIEWS[3])
-    assert torch.equal(found.distance, want.distance)
+    got, want = render(*VIEWS[3]), run.renderer(PLAIN)(*VIEWS[3])
+    assert torch.equal(got.distance, want.distance)
     assert float(want.distance.max()) > 0.5
 
 

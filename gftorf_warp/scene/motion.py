@@ -169,8 +169,10 @@ class Motion(torch.nn.Module, abc.ABC):
 
     def keys_at(self, time: float) -> Keys:
         """Keys and interpolation weights of ``time`` [s], any number."""
-        key, share = self.interval(time)
-        return Keys((key,), (1.0,)) if share == 0.0 else Keys((key, key + 1), (1.0 - share, share))
+        key, fraction = self.interval(time)
+        if fraction == 0.0:
+            return Keys((key,), (1.0,))
+        return Keys((key, key + 1), (1.0 - fraction, fraction))
 
     def interval(self, time: float) -> tuple[int, float]:
         """Index i of the key at or before ``time`` [s], and (time - t_i) / (t_{i+1} - t_i) in [0, 1), 0 outside."""
@@ -303,8 +305,8 @@ class Nodes(Motion):
         apart = apart.masked_fill(field.layer[:, None] != self.layer, torch.inf)
         near, index = apart.topk(count, dim=1, largest=False)
         farthest = near.masked_fill(near.isinf(), 0.0).amax(dim=1, keepdim=True)
-        share = torch.softmax(-2.0 * (near / farthest.clamp_min(1e-9)).square(), dim=1)
-        return weight.scatter(1, index, share.masked_fill(near.isinf(), 0.0))
+        near_weight = torch.softmax(-2.0 * (near / farthest.clamp_min(1e-9)).square(), dim=1)
+        return weight.scatter(1, index, near_weight.masked_fill(near.isinf(), 0.0))
 
     def at_keys(self, binding: Float[Tensor, "N M"], keys: Sequence[int] | Int[Tensor, "K"]) -> KeyMotion:
         """Weighted means of the displacements of nodes."""
