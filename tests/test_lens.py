@@ -113,7 +113,7 @@ def test_a_lens_that_folds_beside_its_image_is_refused():
     lens = Distortion(k1=-0.4, p2=-0.25)  # folds at .48 to the right of the axis, far later to its left
     options = {"width": 40, "height": 4, "fx": 50.0, "fy": 50.0, "cy": 2.0, "distortion": lens}
     Camera(cx=30.0, **options)
-    with pytest.raises(ValueError, match=r"folds the world over 0\.\d+ focal lengths"):
+    with pytest.raises(ValueError, match=r"folds the image 0\.\d+ focal lengths"):
         Camera(cx=39.0, **options)
 
 
