@@ -14,7 +14,7 @@ from gftorf_warp.recon import presets
 from gftorf_warp.recon.observations import observe
 from gftorf_warp.recon.run import Run
 from gftorf_warp.recon.settings import Weights
-from gftorf_warp.recon.state import begin
+from gftorf_warp.recon.state import begin, from_dict, to_dict
 from gftorf_warp.recon.stepper import Stepper
 from gftorf_warp.recon.train import CHANGES, reconstruct
 from gftorf_warp.render import descent
@@ -96,6 +96,22 @@ def test_checkpoints_of_before_models_stored_themselves_load():
     for more in ({}, {"products": "float32"}):
         again = motion_from_dict(old | {"shape": shape | more})
         assert same(again.state_dict(), network.state_dict())
+
+
+@pytest.mark.parametrize("kind", ["still", "nodes", "network"])
+def test_a_whole_checkpoint_of_format_2_loads(kind):
+    """Its motion had these keys; the state of a torch generator was where the seed of the noise is now."""
+    settings = demo(motion=MotionSettings(kind=kind, layers=3, width=16, skip_after=2))
+    state = begin(observe(small(), settings, "cpu"), settings, seed=3, device="cpu")
+    stored = to_dict(state)
+    keys = {"still": set(), "nodes": {"neighbours"}, "network": {"shape", "duration", "length"}}
+    assert stored["motion"].keys() == {"kind", "tensors"} | keys[kind]
+    del stored["noise_seed"]
+    again = from_dict(stored | {"format": 2, "noise": torch.Generator().manual_seed(3).get_state()}, "cpu")
+    assert type(again.motion) is KINDS[kind]
+    assert again.noise_seed == state.noise_seed
+    for one, other in zip(state.motion.at(state.binding, 0.05), again.motion.at(again.binding, 0.05), strict=True):
+        assert (one is None and other is None) or torch.equal(one, other)
 
 
 def test_an_unknown_model_is_refused_by_name():
