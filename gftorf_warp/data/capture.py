@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import re
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -54,9 +55,8 @@ def read(root: Path, frame_rate_hz: float | None) -> Sequence:
             problems.errors.append(InputError("quads: no such file", where=root / "tof", why=why, fix=fix))
     quads = empty_quads(root, frames, {"H": height, "W": width})
     images: dict[str, Any] = {"forward_flow": {}, "backward_flow": {}, "colour": {}}
-    for n, file in files.items():
-        parts = problems.attempt(_verified, root, file, digests)
-        if parts is None or not measured[n]:
+    for n, file, parts in _read(root, files, digests, problems):
+        if not measured[n]:
             continue
         quad = problems.attempt(_image, file, parts, "quads", (height, width))
         if quad is not None:
@@ -66,20 +66,19 @@ def read(root: Path, frame_rate_hz: float | None) -> Sequence:
             if flow is not None:
                 images[name][n] = flow
     colour_size = tuple(int(n) for n in values["colour_size"][::-1]) if "colour_size" in values else None
-    for n, file in _files(root, "colour", frames, problems).items():
-        parts = problems.attempt(_verified, root, file, digests)
-        image = None if parts is None else problems.attempt(_image, file, parts, "colour", colour_size)
+    for n, file, parts in _read(root, _files(root, "colour", frames, problems), digests, problems):
+        image = problems.attempt(_image, file, parts, "colour", colour_size)
         if image is not None:
             images["colour"][n] = image
     problems.raise_if_any(root)
-    frequencies, several = values["f_mod_hz"], len(set(values["f_mod_hz"].tolist())) > 1
+    frequencies = values["f_mod_hz"]
     lens = tuple(values["distortion"].tolist()) if "distortion" in values else None
     return Sequence(
         quads=quads,
         measured=measured,
         shifts=values["shift"],
         times=values["time"],
-        frequencies_hz=frequencies if several else None,
+        frequencies_hz=frequencies if len(set(frequencies.tolist())) > 1 else None,
         exposures=values.get("exposure"),
         camera_from_world=inverse(values["pose"]),
         intrinsics=replace(_intrinsics(values["intrinsics"]), distortion=lens),
@@ -126,10 +125,7 @@ def read_truth(root: Path, frames: int) -> Truth | None:
     stacks: dict[str, np.ndarray] = {}
     layers: dict[str, np.ndarray] = {}
     known = np.zeros(frames, dtype=bool)
-    for n, file in files.items():
-        parts = problems.attempt(_verified, root, file, digests)
-        if parts is None:
-            continue
+    for n, file, parts in _read(root, files, digests, problems):
         for name in ("distance", "phasor_distance", "amplitude", "object"):
             image = problems.attempt(_image, file, parts, name, (height, width))
             if image is None:
@@ -179,16 +175,12 @@ def _manifest(root: Path) -> dict[str, str]:
             why = f"expected 64 hexadecimal digits, two blanks and a name, found {line[:80]!r} in line {number}"
             raise InputError("no manifest", where=path, why=why, fix="copy it again, or remove it")
         digests[match[2]] = match[1]
-    verify(root, root / NAME, digests)
+    _verify(root, root / NAME, digests)
     return digests
 
 
-def verify(root: Path, file: Path, digests: dict[str, str]) -> None:
-    """Compare a file with the manifest, if there is one.
-
-    Raises:
-        InputError: If the file differs, or the manifest does not name it.
-    """
+def _verify(root: Path, file: Path, digests: dict[str, str]) -> None:
+    """Compare a file with the manifest, if there is one."""
     name = file.relative_to(root).as_posix()
     if digests and hashlib.sha256(file.read_bytes()).hexdigest() != digests.get(name):
         why = f"its SHA-256 is not that of {MANIFEST}" if name in digests else f"{MANIFEST} does not name it"
@@ -196,9 +188,16 @@ def verify(root: Path, file: Path, digests: dict[str, str]) -> None:
         raise InputError("content changed", where=file, why=why, fix=fix)
 
 
-def _verified(root: Path, file: Path, digests: dict[str, str]) -> Parts:
-    verify(root, file, digests)
-    return read_parts(file)
+def _read(
+    root: Path, files: dict[int, Path], digests: dict[str, str], problems: Problems
+) -> Iterator[tuple[int, Path, Parts]]:
+    """Number, file and parts of every verified and readable file."""
+    for n, file in files.items():
+        errors = len(problems.errors)
+        problems.attempt(_verify, root, file, digests)
+        parts = problems.attempt(read_parts, file) if len(problems.errors) == errors else None
+        if parts is not None:
+            yield n, file, parts
 
 
 def _layer(file: Path, parts: Parts, name: str, shape: tuple[int, ...]) -> np.ndarray | None:
