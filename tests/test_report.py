@@ -378,4 +378,4 @@ def test_pages_of_large_noisy_images_stay_below_four_megabytes(compared):
     found = findings(sequence, views, Truth(distance=noise[:, ::-1], known=np.ones(frames, dtype=bool)))
     text = report(title="noise", metrics=compared[1], config={}, log=[], found=found)
     assert 1_000_000 < len(text) < 4_000_000
-    assert page.thinned(np.zeros((240, 641))).shape == (80, 214)
+    assert pictures.thinned(np.zeros((240, 641)), page.PICTURE_SIZE_MAX).shape == (80, 214)

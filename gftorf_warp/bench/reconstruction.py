@@ -146,7 +146,7 @@ def error_of(why: str, code: int) -> GftorfError:
 
 def _reached(run: Path) -> int:
     """Optimised images of a run in progress."""
-    return max((row["images"] for row in rows_of(run / "metrics.jsonl")), default=0)
+    return max((int(row["images"]) for row in rows_of(run / "metrics.jsonl")), default=0)
 
 
 def table(rows: list[dict[str, Any]]) -> list[str]:

@@ -112,7 +112,12 @@ class Case:
         with _recorded(calls):
             self.both()
 
-        return {name: lambda calls=some: [call() for call in calls] for name, some in calls.items()}
+        return {name: partial(_run_all, some) for name, some in calls.items()}
+
+
+def _run_all(calls: list[Function]) -> None:
+    for call in calls:
+        call()
 
 
 @contextlib.contextmanager

@@ -156,7 +156,7 @@ def _static_phasor(sequence: Sequence, truth: Truth) -> Float[np.ndarray, "F H W
 
 def summary(run: Run, found: Findings, *, protocol: str, against: str = AGAINST[0]) -> dict[str, Any]:
     """The content of metrics.json: numbers, texts and None."""
-    confidence = found.views.confidence
+    confidence, colour = found.views.confidence, found.colour
     return {
         "frames": len(found.views.frames),
         "protocol": protocol,
@@ -164,14 +164,13 @@ def summary(run: Run, found: Findings, *, protocol: str, against: str = AGAINST[
         **_errors(found.judgement),
         "unambiguous_range_m": unambiguous_range(found.sequence),
         "ambiguous_share": None if confidence is None else float((confidence < CONFIDENT).mean()),
-        "quad_psnr_db": measure.quad_psnr_db(
+        "quad_psnr_db": measure.psnr_db(
             found.views.quad_rendered,
             found.views.quad_measured,
             peak=float(np.abs(found.sequence.quads[found.sequence.measured]).max()),
         ),
-        "colour_psnr_db": None
-        if found.colour is None
-        else measure.colour_psnr_db(found.colour.rendered, found.colour.measured),
+        "colour_psnr_db": colour
+        and measure.psnr_db(colour.rendered, colour.measured, peak=float(colour.measured.max())),
         "gaussians": run.gaussians,
         "diagnostics": measure.along_run(rows_of(run.path / "diagnostics.jsonl")),
         **{name: fact(run.config, name) for name in FACTS},

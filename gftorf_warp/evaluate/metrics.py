@@ -125,22 +125,10 @@ def normalised(distance: Float[np.ndarray, "*n"], opacity: Float[np.ndarray, "*n
     return np.divide(distance, opacity, out=np.zeros_like(distance), where=opacity > 0)
 
 
-def quad_psnr_db(
-    rendered: Float[np.ndarray, "S H W"], measured: Float[np.ndarray, "S H W"], peak: float
-) -> float | None:
-    """10 log10(peak^2 / MSE) [dB], the MSE pooled over all pixels; None where it is not a number.
-
-    Args:
-        rendered: The measured slot of every scored frame, as rendered [file units].
-        measured: What was recorded there [file units].
-        peak: Largest measured |quad| [file units].
-    """
-    return _psnr_db(rendered, measured, peak)
-
-
-def colour_psnr_db(rendered: Float[np.ndarray, "C h w 3"], measured: Float[np.ndarray, "C h w 3"]) -> float | None:
-    """PSNR of linear RGB [dB] over the largest measured value; None where it is not a number."""
-    return _psnr_db(rendered, measured, float(measured.max()))
+def psnr_db(rendered: Float[np.ndarray, "*n"], measured: Float[np.ndarray, "*n"], peak: float) -> float | None:
+    """10 log10(peak^2 / MSE) [dB], the MSE pooled over all elements; None where it is not a number."""
+    mse = float(np.square(rendered - measured, dtype=np.float64).mean())
+    return 10.0 * math.log10(peak**2 / mse) if mse > 0 and peak > 0 else None
 
 
 def along_run(rows: list[dict[str, float]]) -> dict[str, float | int | None] | None:
@@ -168,8 +156,3 @@ def _least(rows: list[dict[str, float]], name: str) -> dict[str, float]:
     """The first row with the least value of a name; empty if no row has it."""
     known = [row for row in rows if row.get(name) is not None]
     return min(known, key=lambda row: row[name], default={})
-
-
-def _psnr_db(rendered: np.ndarray, measured: np.ndarray, peak: float) -> float | None:
-    mse = float(np.square(rendered - measured, dtype=np.float64).mean())
-    return 10.0 * math.log10(peak**2 / mse) if mse > 0 and peak > 0 else None

@@ -102,7 +102,7 @@ def ratio(metrics: Mapping[str, Any], above: str, below: str) -> str:
 
 def picture(image: Float[np.ndarray, "H W"], scale: pictures.Scale, title: str, note: str = "") -> str:
     """An image with its title, its colour bar and its unit."""
-    rgb = pictures.colour_mapped(thinned(image), scale)
+    rgb = pictures.colour_mapped(pictures.thinned(image, PICTURE_SIZE_MAX), scale)
     return plain_picture(rgb, title, note, colour_bar(scale))
 
 
@@ -138,11 +138,6 @@ def chart(svg: bytes, title: str) -> str:
     """An SVG drawing on white, embedded as an image."""
     source = pictures.data_uri(svg, "image/svg+xml")
     return f'<div class="chart"><img src="{source}" alt="{escape(title)}"></div>'
-
-
-def thinned(image: np.ndarray) -> np.ndarray:
-    """The image subsampled to at most 320 pixels."""
-    return pictures.thinned(image, PICTURE_SIZE_MAX)
 
 
 def document(title: str, body: str) -> str:

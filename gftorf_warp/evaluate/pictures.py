@@ -151,11 +151,11 @@ def _colours(name: str) -> UInt8[np.ndarray, "T 3"]:
         at = np.arange(TICKS) * (len(BLUE_TO_RED) - 1) / (TICKS - 1)
         channels = [np.interp(at, range(len(BLUE_TO_RED)), channel) for channel in zip(*BLUE_TO_RED, strict=True)]
         return np.round(np.stack(channels, axis=-1)).astype(np.uint8)
-    table = np.arange(256, dtype=np.uint8)
-    if name != "gray":
-        table = cv2.applyColorMap(table[:, None], getattr(cv2, f"COLORMAP_{name.upper()}"))[:, 0, ::-1]
-    nearest = np.minimum(np.arange(TICKS) * 256 // (TICKS - 1), 255)
-    return np.ascontiguousarray(np.broadcast_to(table[nearest].reshape(TICKS, -1), (TICKS, 3)))
+    nearest = np.minimum(np.arange(TICKS) * 256 // (TICKS - 1), 255).astype(np.uint8)[:, None]
+    if name == "gray":
+        return np.repeat(nearest, 3, axis=1)
+    bgr = cv2.applyColorMap(nearest, getattr(cv2, f"COLORMAP_{name.upper()}"))[:, 0]
+    return np.ascontiguousarray(bgr[:, ::-1], dtype=np.uint8)
 
 
 @functools.cache

@@ -5,7 +5,7 @@ from __future__ import annotations
 import html
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -22,63 +22,42 @@ LABELS = 5  # of an axis, about
 SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Curve:
+class Curve(NamedTuple):
     """One line; values that are not finite, or not positive on a logarithmic axis, interrupt it."""
 
     x: Float[np.ndarray, "K"]
-    """Horizontal values."""
     y: Float[np.ndarray, "K"]
-    """Vertical values."""
     colour: str
-    """As in SVG."""
     label: str = ""
-    """In the legend; empty: not listed there."""
-    dashes: str = ""
-    """As in SVG, for example ``5 3``; empty: a solid line."""
-    points: bool = False
-    """Whether every value is marked."""
+    dashes: str = ""  # as in SVG, for example "5 3"; empty: a solid line
+    points: bool = False  # whether every value is marked
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Plot:
-    """One pair of axes."""
+class Plot(NamedTuple):
+    """One pair of axes with their labels."""
 
     title: str
-    """Above the axes."""
     x: str
-    """Label of the horizontal axis."""
     y: str
-    """Label of the vertical axis."""
     curves: Sequence[Curve]
-    """Lines, later ones in front."""
     log_x: bool = False
-    """Whether the horizontal axis is logarithmic."""
-    log_y: bool | None = None
-    """None: if all values are positive and span more than a factor of 20."""
-    from_zero: bool = True
-    """Whether a linear vertical axis starts at zero."""
+    log_y: bool | None = None  # None: if all values are positive and span more than ``LOG_SPAN``
+    from_zero: bool = True  # whether a linear vertical axis starts at zero
 
 
-@dataclass(frozen=True)
-class _Axis:
-    """Maps values to pixels."""
+class _Axis(NamedTuple):
+    """Maps values between ``low`` and ``high`` to pixels between ``start`` and ``end``."""
 
     low: float
-    """Value at ``start``."""
     high: float
-    """Value at ``end``."""
     log: bool
-    """Whether logarithmic."""
     start: float
-    """[px]"""
     end: float
-    """[px]"""
 
     def __call__(self, values: Float[np.ndarray, "K"]) -> Float[np.ndarray, "K"]:
         with np.errstate(divide="ignore", invalid="ignore"):
-            values, low, high = (np.log10(v) if self.log else v for v in (values, self.low, self.high))
-        return self.start + (values - low) / (high - low) * (self.end - self.start)
+            at, low, high = (np.log10(v) if self.log else np.asarray(v) for v in (values, self.low, self.high))
+        return self.start + (at - low) / (high - low) * (self.end - self.start)
 
     def ticks(self) -> list[tuple[float, str]]:
         """Values with a label, or without one."""
