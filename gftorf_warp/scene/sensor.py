@@ -4,16 +4,16 @@ A point at distance d that reflects r gives the quad of shift theta (method, sec
 
     a (cos(psi - theta) + b),   a = s r / d^2,   psi = kappa d + phase_offset,   kappa = 4 pi f / c
 
-in *relative units*. Sections 2.3 and 2.4 of the sensor notes add harmonics, electrons and patterns: fields that are
-off, or do nothing, unless they are set. OPT8241 stands for its datasheet, SBAS704B, MLX75027 for its datasheet, 1.0;
-*assumed* values are published nowhere.
+in *relative units*. Sections 2.3 and 2.4 of the sensor notes add harmonics, electrons and patterns: fields that are off
+by default. Values of the OPT8241 are of its datasheet, SBAS704B, those of the MLX75027 of its datasheet, 1.0;
+*assumed* values are not published.
 """
 
 from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import NamedTuple
 
@@ -28,11 +28,14 @@ from .waveform import peak
 
 Scalar = float | Tensor
 EVEN = SAME_RAD  # [1] shifts are equally spaced if the means of exp(i theta) and exp(2 i theta) are below this
+POSITIVE = ("f_mod_hz", "frame_period_s", "electrons_per_unit", "electrons_per_code", "full_well_electrons")
+POSITIVE += ("contrast_cutoff_hz",)
+NON_NEGATIVE = ("ambient_electrons", "dark_electrons_per_s", "read_noise_electrons", "source_intensity", "row_time_s")
 EFFECTS = ("further_hz", "harmonic_contrast", "contrast_cutoff_hz", "pattern", "row_time_s")  # off unless they are set
 
 
 class RawFrame(NamedTuple):
-    """What is set for one raw frame."""
+    """Settings of one raw frame."""
 
     f_mod_hz: Scalar
     """Modulation frequency [Hz]."""
@@ -78,9 +81,9 @@ class Sensor:
     harmonic_contrast: tuple[float, ...] = ()
     """Contrast of harmonics 2, 3, ... as multiples of that of the first [1]; default: a sine. See scene/waveform.py."""
     ambient_electrons: float = 0.0
-    """Unmodulated electrons per exposure, both taps together [e-]. Engine mesh knows the reflectance of what each pixel
-    sees: there this is per unit of reflectance, what a white surface gives. Engine gaussian does not: there every pixel
-    gets this number. A ninth of direct sunlight is 3.1e5 from reflectance .5, 6.3e5 from white (notes, 3)."""
+    """Unmodulated electrons per exposure, both taps together [e-]: of every pixel with engine gaussian, per unit of
+    reflectance with engine mesh. A ninth of direct sunlight is 3.1e5 from reflectance .5, 6.3e5 from white (notes,
+    3)."""
     dark_electrons_per_s: float = 5.0e4
     """Dark current per tap [e-/s]; assumed for the OPT8241."""
     read_noise_electrons: float = 80.0
@@ -99,24 +102,22 @@ class Sensor:
             value = getattr(self, name)
             if isinstance(value, Tensor) and value.ndim != 0:
                 raise ValueError(f"{name} must be a number or a 0-d tensor, got shape {tuple(value.shape)}")
-        # numbers are checked; tensors belong to an optimiser, and looking into one could make a GPU wait
+        # tensors are not checked: reading one would synchronise a GPU
         numbers = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "full_well_electrons"}
         for name, value in numbers.items():
             for one in value if isinstance(value, tuple) else (value,):
                 if isinstance(one, int | float) and not math.isfinite(one):
                     raise ValueError(f"{name} must be finite, got {value}")
-        _demand(self, "above 0", lambda value: value > 0, "f_mod_hz", "frame_period_s", "electrons_per_unit")
-        _demand(self, "above 0", lambda value: value > 0, "electrons_per_code", "full_well_electrons")
-        _demand(self, "above 0", lambda value: value > 0, "contrast_cutoff_hz")
-        _demand(self, "0 or more", lambda value: value >= 0, "ambient_electrons", "dark_electrons_per_s")
-        _demand(self, "0 or more", lambda value: value >= 0, "read_noise_electrons", "source_intensity")
+        for name in POSITIVE + NON_NEGATIVE:
+            value, zero = getattr(self, name), name in NON_NEGATIVE
+            if value is not None and not isinstance(value, Tensor) and not (value > 0 or (zero and value == 0)):
+                raise ValueError(f"{name} must be {'0 or more' if zero else 'above 0'}, got {value}")
         if len(self.shifts) < 1:
             raise ValueError("shifts: a sensor needs at least one phase shift")
         if not all(f > 0 for f in self.further_hz):
             raise ValueError(f"further_hz must be above 0, got {self.further_hz}")
         if self.exposure_s < 0 or (self.noise and self.exposure_s == 0):
             raise ValueError(f"exposure_s must be above 0, or 0 without noise, got {self.exposure_s}")
-        _demand(self, "0 or more", lambda value: value >= 0, "row_time_s")
         if not 0 < self.contrast <= 1:
             raise ValueError(f"contrast must be in (0, 1], got {self.contrast}")
         if self.harmonic_contrast and self.contrast * peak(self.harmonic_contrast) > 1 + 1e-6:
@@ -134,13 +135,13 @@ class Sensor:
             )
 
     def __repr__(self) -> str:
-        """As of any dataclass, but for effects that are off: data cards hash this text."""
+        """That of a dataclass without effects that are off: data cards hash this text."""
         shown = [f for f in fields(self) if f.name not in EFFECTS or getattr(self, f.name) != getattr(PLAIN, f.name)]
         return f"Sensor({', '.join(f'{f.name}={getattr(self, f.name)!r}' for f in shown)})"
 
     @property
     def phase_slope(self) -> Scalar:
-        """Phase per distance kappa = 4 pi f / c [rad/m]: light travels the distance twice."""
+        """Phase per distance kappa = 4 pi f / c [rad/m]."""
         return 4.0 * math.pi / SPEED_OF_LIGHT * self.f_mod_hz
 
     @property
@@ -156,7 +157,7 @@ class Sensor:
 
     @property
     def harmonics(self) -> tuple[int, ...]:
-        """Multiples of the modulation frequency that it sees: 1, and those with a contrast."""
+        """Multiples of the modulation frequency with contrast, the first included."""
         return (1, *(h for h, ratio in enumerate(self.harmonic_contrast, start=2) if ratio != 0.0))
 
     def contrast_ratio(self, harmonic: int) -> float:
@@ -164,7 +165,7 @@ class Sensor:
         return 1.0 if harmonic == 1 else self.harmonic_contrast[harmonic - 2]
 
     def at_frame(self, n: int) -> Sensor:
-        """The same sensor as raw frame ``n`` of a recording uses it: at one frequency and with one shift."""
+        """The sensor as set for raw frame ``n`` of a recording: one frequency and one shift."""
         frame = self.cycle[n % len(self.cycle)]
         return replace(self, f_mod_hz=frame.f_mod_hz, shifts=(float(frame.shift),), further_hz=())
 
@@ -189,7 +190,7 @@ def distance_from_phasor(re: Tensor, im: Tensor, sensor: Sensor) -> Tensor:
 
 @functools.lru_cache(maxsize=64)
 def _uploaded(values: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Numbers where they are needed, once: a GPU is waited for."""
+    """Numbers on a device, uploaded once: an upload synchronises a GPU."""
     return torch.tensor(values, dtype=dtype, device=device)
 
 
@@ -220,14 +221,6 @@ def phasor_from_quads(quads: Tensor, shifts: tuple[float, ...] | Tensor) -> tupl
 def _evenly(shifts: np.ndarray) -> bool:
     """Whether the plain sum over these shifts [rad] is the least-squares solution."""
     return all(abs(np.exp(1j * turns * shifts).mean()) < EVEN for turns in (1, 2))
-
-
-def _demand(sensor: Sensor, what: str, holds: Callable[[float], bool], *names: str) -> None:
-    """Check the numbers among these fields."""
-    for name in names:
-        value = getattr(sensor, name)
-        if value is not None and not isinstance(value, Tensor) and not holds(value):
-            raise ValueError(f"{name} must be {what}, got {value}")
 
 
 PLAIN = Sensor()  # the default

@@ -1,1 +1,1 @@
-"""What the camera would have seen: moving worlds, rendered one raw frame at a time, and read out with noise."""
+"""Simulation: scenes with moving bodies, an image for each raw frame, and the read-out with noise."""

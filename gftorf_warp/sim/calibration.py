@@ -1,6 +1,6 @@
-"""Scenes at rest whose answers are known: what a sensor is calibrated on.
+"""Static scenes with known solutions, for the calibration of a sensor.
 
-The closed form is right on them but for noise, so any other error is one of the sensor or of light that took detours.
+The closed form is exact on them but for noise, so any other error is one of the sensor or of indirect light.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from .paths import Path, Still, Viewpoint
 from .scene import Scene
 from .world import Body
 
-DISTANCE = 2.0  # [m] of what is in the middle of the image
+DISTANCE = 2.0  # [m] of the surface in the middle of the image
 SENSOR = Sensor(f_mod_hz=20e6, noise=True)
 
 

@@ -1,4 +1,4 @@
-"""Mistakes of users in what is to be simulated: each is refused by a named error before anything is written."""
+"""Checks of a scene and its settings: mistakes of users raise a UsageError before anything is written."""
 
 from __future__ import annotations
 

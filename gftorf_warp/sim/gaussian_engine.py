@@ -18,7 +18,7 @@ from .gaussian_cover import Cover, cover_moving, cover_still
 from .readout import mean_quad
 from .scene import Scene
 
-OPAQUE = 0.5  # [1] a ray whose opacity is below this passes beside the covers: their outline is where it is reached
+OPAQUE = 0.5  # [1] opacity at the outline of a cover
 
 
 class GaussianEngine:
@@ -72,10 +72,7 @@ class GaussianEngine:
         return Exposure(quad, amplitude, distance, still.phasor)
 
     def _instant(self, time: float, sensor: Sensor) -> Exposure:
-        """An instant. A harmonic is a rendering of its own, at that multiple of the modulation frequency.
-
-        That is exact for any mixture of surfaces in a pixel, unlike a closed form from distance.
-        """
+        """An instant; each harmonic is rendered separately, which is exact for any mixture of surfaces in a pixel."""
         field, camera = self.field_at(time), self.camera_at(time)
         rendering = _rendering(field, camera, sensor)
         f_mod_hz, offset = float(sensor.f_mod_hz), float(sensor.phase_offset)

@@ -52,7 +52,7 @@ def baseball() -> Scene:
     bat = Guided(x=0.0, y=0.05, z=2.6, turns=(swing,), arm=(0.62, 0.0, 0.0))
     return _recorded(
         "baseball",
-        "a bat is swung in front of somebody who stands",
+        "a bat is swung in front of a person who stands",
         "turning, 117 px per quartet at the tip",
         1.492,
         (
@@ -82,7 +82,7 @@ def jacks() -> Scene:
 
     return _recorded(
         "jacks",
-        "somebody does jumping jacks",
+        "a person does jumping jacks",
         "arms and legs on arcs, 22 px per quartet",
         2.970,
         (

@@ -1,4 +1,4 @@
-"""Look-alikes of five ToeRF scenes: a camera carried on an arc, a colour camera beside it, somebody who does something.
+"""Look-alikes of five ToeRF scenes: a person moves something; ToF camera and colour camera are carried on an arc.
 
 Only the subject is borrowed; the recipes are ours (sensor notes, 4.4). One second, 30 quartets of raw quads, each raw
 frame with its own pose; written with ``--format torf`` it becomes 30 phasors. Colours are free choices.
@@ -41,7 +41,7 @@ def photocopier() -> Scene:
 
     return _carried(
         "photocopier",
-        "somebody opens the lid of a copier",
+        "a person opens the lid of a copier",
         "camera on an arc, lid and arm turn",
         0.123,
         (
@@ -72,7 +72,7 @@ def cupboard() -> Scene:
     x, y, z = np.add((0.65, 0.15, 2.19), rotation_matrix(turned) @ (-0.27, 0.0, 0.0)).tolist()
     return _carried(
         "cupboard",
-        "somebody opens a cupboard with things in it",
+        "a person opens a cupboard with things in it",
         "camera on an arc, door turns",
         0.395,
         (
@@ -102,7 +102,7 @@ def deskbox() -> Scene:
 
     return _carried(
         "deskbox",
-        "somebody puts a carton on a desk",
+        "a person puts a carton on a desk",
         "camera on an arc, carton is carried",
         0.188,
         (
@@ -131,7 +131,7 @@ def phonebooth(wall: float = 3.4, name: str = "phonebooth", closed_form: float =
 
     return _carried(
         name,
-        "somebody closes the door of a phone booth" + ("" if wall < 5 else ", before a wall that wraps"),
+        "a person closes the door of a phone booth" + ("" if wall < 5 else ", before a wall that wraps"),
         "camera on an arc, frame of a door turns",
         closed_form,
         (
@@ -160,7 +160,7 @@ def studybook() -> Scene:
     reaching = Guided(x=Curve(start=0.30, eased=-0.20), y=Curve(start=0.38, arched=-0.10), z=1.78)
     return _carried(
         "studybook",
-        "somebody turns the page of a book on a desk",
+        "a person turns the page of a book on a desk",
         "camera on an arc, a page turns",
         0.213,
         (

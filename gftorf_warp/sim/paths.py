@@ -122,7 +122,7 @@ class Arc(Path):
 
 @dataclass(frozen=True, kw_only=True)
 class Viewpoint(Path):
-    """A camera at rest that looks at a point."""
+    """A static camera that looks at a point."""
 
     position: Vector
     """Position in the world [m]."""

@@ -64,7 +64,7 @@ class Recording:
     """As a camera would have recorded it."""
     truth: Truth
     """Analytic distance along each pixel's centre ray at the time of each raw frame; the distance that a sensor without
-    noise would decode if nothing moved; amplitude; the body that is seen; layers of a capture."""
+    noise would decode if nothing moved; amplitude; visible body; layers of a capture."""
     gap: Gap | None
     """Engine against truth on still interior pixels; None if no such pixel exists."""
     saturated: float
@@ -121,8 +121,8 @@ def record(
     recording.
 
     Args:
-        scene: What is recorded.
-        settings: How.
+        scene: The scene.
+        settings: How it is recorded.
         device: Where engine mesh traces.
         progress: Called with (raw frames done, raw frames in all).
         cached: Returns finished images instead of computing them, see sim/resume.py; None computes all.

@@ -1,4 +1,4 @@
-"""All named scenes, and our own: a textured room in which something moves.
+"""All named scenes, and our own: textured rooms with moving bodies.
 
 All distances of our own are inside the unambiguous range of 7.5 m.
 """

@@ -78,7 +78,7 @@ class SimSettings:
 
 
 def refuse(wrong: bool, what: tuple[str, str], why: str, fix: str) -> None:
-    """Raise a UsageError, (what is wrong, which option), if something is ``wrong``."""
+    """Raise a UsageError if ``wrong``; ``what`` are its message and the option."""
     if wrong:
         raise UsageError(what[0], where=what[1], why=why, fix=fix)
 

@@ -37,11 +37,11 @@ def simulate(
 ) -> Path:
     """Record a moving scene with an asynchronous C-ToF sensor and write it as a sequence.
 
-    Raw frame n is an image of the scene at its own time, of which only the quad of its own shift and frequency is kept
-    and read out. Its truth is the analytic distance along each pixel's centre ray at that time. A camera that moves has
-    a pose for each raw frame; a colour camera adds an image per quartet. The folder appears when it is complete; if it
-    exists and was made with the same settings, it is left as it is. After an interruption the same call continues at
-    the next raw frame: finished images are in OUT.partial, and the final bytes are the same.
+    Each raw frame is an image at its own time, of which the quad of its shift and frequency is read out. Its truth is
+    the analytic distance along each pixel's centre ray at that time. A moving camera has a pose for each raw frame; a
+    colour camera adds an image per quartet. The folder appears when it is complete; if it exists and has the same
+    settings, it is not changed. After an interruption the same call continues at the next raw frame: finished images
+    are in OUT.partial, and the final bytes are the same.
 
     Args:
         scene: Name of a scene, see ``SCENES``, a TOML file of one, or a scene.
