@@ -91,8 +91,8 @@ class Camera:
     def resized(self, width: int, height: int) -> Camera:
         """The same view at another resolution: intrinsics scale with the image."""
         x, y = width / self.width, height / self.height
-        scaled = {"fx": self.fx * x, "fy": self.fy * y, "cx": self.cx * x, "cy": self.cy * y}
-        return replace(self, width=width, height=height, **scaled)
+        fx, fy, cx, cy = self.fx * x, self.fy * y, self.cx * x, self.cy * y
+        return replace(self, width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy)
 
     def row(self, number: int) -> Camera:
         """The camera of one row of the image."""

@@ -20,7 +20,7 @@ from ..data.sequence import Sequence
 from ..errors import InputError
 from .camera import CHECKED, Camera
 from .clouds import cloud_of, follow_clouds, moving_layer, reference
-from .fusion import static_layer, verdicts, views_of
+from .fusion import Layer, static_layer, verdicts, views_of
 from .gaussians import GaussianField, concatenated, constant_sh
 from .measured import (
     Change,
@@ -112,9 +112,8 @@ def from_phase(sequence: Sequence, settings: InitSettings = InitSettings()) -> S
     middle = min(change.quartets, key=lambda i: abs(sequence.cycle * (i + 0.5) - sequence.frames / 2))
     points, distance, amplitude = _nearer(sequence, middle, change, far, settings)
     positions = follow(sequence, middle, points, distance, fellows=settings.fellows)
-    moving = _layer(
-        positions[middle], distance, amplitude, MOVING, settings.moving_spacing, camera_of(sequence, 0), settings
-    )
+    near = Layer(mean=positions[middle], distance=distance, amplitude=amplitude)
+    moving = _layer(near, MOVING, settings.moving_spacing, camera_of(sequence, 0), settings)
     return Start(field=concatenated([static, moving]), positions=positions, quartet=middle)
 
 
@@ -132,7 +131,7 @@ def _from_views(sequence: Sequence, settings: InitSettings) -> Start:
     positions = follow_clouds(views, clouds, view, near.mean, objects, keys, fellows=settings.fellows)
     quartet, camera = views.quartets[view], views.cameras[view]
     static, moving = (
-        _layer(part.mean, part.distance, part.amplitude, label, spacing, camera, settings)
+        _layer(part, label, spacing, camera, settings)
         for part, label, spacing in (
             (still, STATIC, settings.static_spacing),
             (replace(near, mean=positions[quartet]), MOVING, settings.moving_spacing),
@@ -219,8 +218,8 @@ def _static_layer(sequence: Sequence, far: FarLayer, settings: InitSettings) -> 
     grid = _grid(sequence.width, sequence.height, settings.static_spacing).flatten(0, 1)
     x, y = grid.long().unbind(dim=1)
     camera, distance = camera_of(sequence, 0), far.distance[y, x]
-    mean = unproject(camera, grid, distance)
-    return _layer(mean, distance, far.amplitude[y, x], STATIC, settings.static_spacing, camera, settings)
+    layer = Layer(mean=unproject(camera, grid, distance), distance=distance, amplitude=far.amplitude[y, x])
+    return _layer(layer, STATIC, settings.static_spacing, camera, settings)
 
 
 def _nearer(
@@ -270,11 +269,11 @@ def _grid(width: int, height: int, spacing: float) -> Float[Tensor, "h w 2"]:
     return torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)
 
 
-def _layer(mean, distance, amplitude, label, spacing, camera, settings) -> GaussianField:
-    scale = settings.footprint * spacing * distance / math.sqrt(camera.fx * camera.fy)
+def _layer(layer: Layer, label: int, spacing: float, camera: Camera, settings: InitSettings) -> GaussianField:
+    scale = settings.footprint * spacing * layer.distance / math.sqrt(camera.fx * camera.fy)
     if camera.distortion:
-        scale = scale / camera.area(mean).sqrt()
-    return _field(mean, scale, amplitude * distance.square(), label, settings.opacity)
+        scale = scale / camera.area(layer.mean).sqrt()
+    return _field(layer.mean, scale, layer.amplitude * layer.distance.square(), label, settings.opacity)
 
 
 def _field(mean: Tensor, scale: Tensor, reflectivity: Tensor, label: int, opacity: float) -> GaussianField:

@@ -28,8 +28,8 @@ from .waveform import peak
 
 Scalar = float | Tensor
 EVEN = SAME_RAD  # [1] shifts are equally spaced if the means of exp(i theta) and exp(2 i theta) are below this
-POSITIVE = ("f_mod_hz", "frame_period_s", "electrons_per_unit", "electrons_per_code", "full_well_electrons")
-POSITIVE += ("contrast_cutoff_hz",)
+ELECTRONS = ("electrons_per_unit", "electrons_per_code", "full_well_electrons")
+POSITIVE = ("f_mod_hz", "frame_period_s", "contrast_cutoff_hz", *ELECTRONS)
 NON_NEGATIVE = ("ambient_electrons", "dark_electrons_per_s", "read_noise_electrons", "source_intensity", "row_time_s")
 EFFECTS = ("further_hz", "harmonic_contrast", "contrast_cutoff_hz", "pattern", "row_time_s")  # off unless they are set
 
