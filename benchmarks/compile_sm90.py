@@ -57,7 +57,7 @@ def modules(arch: int) -> dict[str, wp.Module]:
     found = {
         "tiles": tiles.count_pairs.module,
         "bits": tile_bitmask.count_bits.module,
-        "ranks": depth_bins.count_classes.module,
+        "ranks": depth_bins.count_bins.module,
         "resolve": planes_to_images.resolve_quads.module,
         "splat": splat.add_records.module,
         "move": move.make_move(2).module,

@@ -186,9 +186,9 @@ def test_classes_give_the_order_of_a_sort(count, kind, bits, device, monkeypatch
     }[kind]
     found = []
     for most in (0, 1 << 20):
-        monkeypatch.setitem(sizes.RANKED_MAX, "cpu" if device == "cpu" else "cuda", most)
+        monkeypatch.setitem(sizes.BINNED_MAX, "cpu" if device == "cpu" else "cuda", most)
         buffers = Buffers(count, 64, 48, settings, wp.get_device(device))
-        assert buffers.ranks == (most > 0)
+        assert buffers.binned == (most > 0)
         buffers.depth_key.assign(np.concatenate([keys, keys]).astype(np.int32))
         buffers.order.assign(np.concatenate([np.arange(count)] * 2).astype(np.int32))
         stages.sort_by_depth(buffers)

@@ -87,18 +87,18 @@ static double walk(int begin, int end, int step) {
         const float* d = &derivatives[10 * lane];
         int coming = 0;
         if (count > 0) {
-            if (step < 0) keep_derivatives(memory, V{d[0]}, V{d[1]}, V{d[2]}, V{d[3]}, V{d[4]}, V{d[5]}, V{d[6]},
+            if (step < 0) store_derivatives(memory, V{d[0]}, V{d[1]}, V{d[2]}, V{d[3]}, V{d[4]}, V{d[5]}, V{d[6]},
                              V{d[7]}, V{d[8]}, V{d[9]});
-            ask(memory, S, entry(I, start, step, 0, count), 0);
-            if (step > 0) ask_more(memory, S, entry(I, start, step, 0, count), 0);
+            fetch_records(memory, S, entry(I, start, step, 0, count), 0);
+            if (step > 0) fetch_more(memory, S, entry(I, start, step, 0, count), 0);
             coming = entry(I, start, step, 16, count);
         }
         for (int at = 0; at < count; at += 16) {
             const int stop = std::min(at + 16, count);
-            arrive();
+            wait_for_records();
             if (stop < count) {
-                ask(memory, S, coming, stop);
-                if (step > 0) ask_more(memory, S, coming, stop);
+                fetch_records(memory, S, coming, stop);
+                if (step > 0) fetch_more(memory, S, coming, stop);
                 coming = entry(I, start, step, stop + 16, count);
             }
             for (int n = at; n < at + 16; ++n) {
@@ -111,12 +111,12 @@ static double walk(int begin, int end, int step) {
                 }
                 if (n >= count || step > 0) continue;
                 const float* u = &values[(k * 32 + lane) * 4];
-                keep_values(memory, first, n - first, V{u[0]}, V{u[1]}, V{u[2]}, V{u[3]});
+                store_values(memory, first, n - first, V{u[0]}, V{u[1]}, V{u[2]}, V{u[3]});
             }
             if (step < 0)
-                add_round(memory, G, M, I, start, at, stop - at, V{40.5f + lane % 8}, V{20.5f + lane / 8});
+                accumulate_round(memory, G, M, I, start, at, stop - at, V{40.5f + lane % 8}, V{20.5f + lane / 8});
         }
-        arrive();
+        wait_for_records();
     });
     if (wrong) return 1e9;
     std::vector<double> want(200 * 32), size(200 * 32);
@@ -212,18 +212,18 @@ int main() {{
 
 SIGNATURES = {
     "entry": "int entry(wp::array_t<int> ids, int start, int step, int at, int count)",
-    "ask": "void ask(wp::uint64 memory, wp::array_t<Splat> splats, int i, int at)",
-    "ask_more": "void ask_more(wp::uint64 memory, wp::array_t<Splat> records, int i, int at)",
+    "fetch_records": "void fetch_records(wp::uint64 memory, wp::array_t<Splat> splats, int i, int at)",
+    "fetch_more": "void fetch_more(wp::uint64 memory, wp::array_t<Splat> records, int i, int at)",
     "more_of": "wp::vec_t<3, float> more_of(wp::uint64 memory, int at, wp::array_t<Splat> records, "
     "wp::array_t<int> ids, int k, bool there)",
-    "arrive": "void arrive()",
+    "wait_for_records": "void wait_for_records()",
     "record_of": "Splat record_of(wp::uint64 memory, int first, int n, wp::array_t<Splat> splats, "
     "wp::array_t<int> ids, int k, bool there)",
     "warp_memory": "wp::uint64 warp_memory()",
-    "keep_derivatives": "void keep_derivatives(wp::uint64 memory, V g0, V g1, V g2, V g_re, V g_im, V g_amplitude, "
+    "store_derivatives": "void store_derivatives(wp::uint64 memory, V g0, V g1, V g2, V g_re, V g_im, V g_amplitude, "
     "V g_distance, V g3, V g4, V g5)",
-    "keep_values": "void keep_values(wp::uint64 memory, int first, int n, V v, V w, V w2, V g_d)",
-    "add_round": "void add_round(wp::uint64 memory, wp::array_t<Splat> grads, wp::array_t<Splat> more, "
+    "store_values": "void store_values(wp::uint64 memory, int first, int n, V v, V w, V w2, V g_d)",
+    "accumulate_round": "void accumulate_round(wp::uint64 memory, wp::array_t<Splat> grads, wp::array_t<Splat> more, "
     "wp::array_t<int> ids, int start, int at, int n, V x, V y)",
     "sum_of_lanes": "int sum_of_lanes(int x)",
     "of_lane": "int of_lane(int x, int lane)",

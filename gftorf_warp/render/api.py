@@ -21,7 +21,7 @@ from .inputs import CHOICES, wanted_images
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Background:
-    """Light from behind everything, added as T_e * background; a missing field is black.
+    """Light behind all Gaussians, added as T_e * background; a missing field is black.
 
     Each field is broadcast to its image, so a number, [C, 1, 1] or [C, H, W] all work; all are differentiable.
     """
@@ -36,9 +36,9 @@ class Background:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Rendering:
-    """What a pixel sees. With w = alpha T, and T_e the transmittance behind the last splat.
+    """Images of one rendering. With w = alpha T, and T_e the transmittance behind the last splat.
 
-    An image that was not asked for has no elements.
+    An image that was not requested has no elements.
     """
 
     quads: Float[Tensor, "Q H W"]
@@ -56,15 +56,15 @@ class Rendering:
     extra: Float[Tensor, "D H W"] | None
     """Sum of w times the extra channels; no background."""
     screen: ScreenGradient | None
-    """Filled by the backward pass if it was asked for."""
+    """Filled by the backward pass if it was requested."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ScreenGradient:
-    """What densification looks at: zero until a backward pass has run, then what the last one said."""
+    """Statistics for densification: zero until a backward pass has run, then those of the last one."""
 
     values: Float[Tensor, "N 4"]
-    """All of it, side by side."""
+    """All columns."""
 
     @property
     def gradient(self) -> Float[Tensor, "N 2"]:
@@ -113,7 +113,7 @@ def rasterize(
         images: Which of quads, phasor, distance, opacity and distortion are wanted; what is left out saves its time,
             above all distortion.
         screen_gradient: Whether ``Rendering.screen`` is wanted.
-        workspace: Memory to render in, for whoever does so again and again; None: each rendering has its own.
+        workspace: Memory of consecutive renderings of one size; None: each rendering allocates its own.
         control: Pose, intrinsics, calibration and shifts in device memory, in place of those of ``camera`` and
             ``sensor``, whose size, kind of lens and number of shifts still count; None: they are uploaded.
 
@@ -166,7 +166,7 @@ def _spread(name: str, value: Tensor | float, shape: tuple[int, ...], field: Gau
     """A background as [C, H, W]."""
     if isinstance(value, Tensor):
         tensor = value.to(device=field.device, dtype=torch.float32)
-    else:  # filled where it is needed: an upload would make a GPU wait
+    else:  # filled on the device: an upload would synchronise
         tensor = torch.full((), float(value), dtype=torch.float32, device=field.device)
     try:
         return tensor.expand(shape)

@@ -1,4 +1,4 @@
-"""Where torch renders with Warp: shares memory, follows torch's stream, attaches gradients."""
+"""Renders torch tensors with Warp: shares memory, uses torch's stream, attaches gradients."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _VECTORS = {"mean": wp.vec3, "log_scale": wp.vec3, "quaternion": wp.vec4, "colou
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Request:
-    """What is rendered, and how, besides tensors with a derivative."""
+    """Arguments of a rendering without a derivative."""
 
     camera: Camera
     """Its size, and whether its lens distorts; without ``control`` all of it."""
@@ -115,12 +115,12 @@ def _view(request: Request, device: wp.Device) -> View:
 
 
 def _zeros_like(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Zeros of these shapes, cleared at once: parts of one memory, each with lines of cache of its own."""
+    """Zeros of these shapes in one allocation, cleared at once, aligned to cache lines."""
     if not tensors:
         return {}
-    rooms = [-(-tensor.numel() // ALIGNED) * ALIGNED for tensor in tensors.values()]
+    sizes = [-(-tensor.numel() // ALIGNED) * ALIGNED for tensor in tensors.values()]
     first = next(iter(tensors.values()))
-    parts = first.new_zeros(sum(rooms)).split(rooms)
+    parts = first.new_zeros(sum(sizes)).split(sizes)
     return {name: part[: t.numel()].view(t.shape) for part, (name, t) in zip(parts, tensors.items(), strict=True)}
 
 
@@ -133,7 +133,7 @@ def _images(named: Mapping[str, Tensor]) -> Images:
 
 
 def left_out(name: str, like: Tensor, height: int, width: int) -> Tensor:
-    """What stands for an image that nobody asked for: no elements, where ``like`` is."""
+    """An image that was not requested: no elements, on the device of ``like``."""
     return like.new_empty(0, *shapes_of(0, height, width)[name][1:])
 
 
@@ -142,14 +142,14 @@ def array_over(tensor: Tensor | None, dtype=wp.float32) -> wp.array | None:
     if tensor is None:
         return None
     wp.init()  # from_torch needs the runtime; does nothing after the first call
-    if tensor.numel() == 0:  # strides of an empty tensor say nothing, and from_torch believes them
+    if tensor.numel() == 0:  # from_torch would use the strides of an empty tensor, which are undefined
         shape = tensor.shape[: tensor.ndim - len(getattr(dtype, "_shape_", ()))]
         return wp.empty(tuple(shape), dtype=dtype, device=wp.device_from_torch(tensor.device))
     return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False)
 
 
 def pairs_of(workspace: Workspace) -> Tensor:
-    """[1] int32: (tile, splat) pairs of the last rendering, where it was made; more than the reserve if some were lost.
+    """[1] int32 on the device: (tile, splat) pairs of the last rendering; above the capacity if some were dropped.
 
     Raises:
         ValueError: If nothing has been rendered there.

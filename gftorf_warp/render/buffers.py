@@ -27,7 +27,7 @@ class Support(StrEnum):
 
 
 class Stop(StrEnum):
-    """What happens to the splat that takes a pixel's transmittance below 1e-4."""
+    """Treatment of the splat that takes a pixel's transmittance below 1e-4."""
 
     INCLUSIVE = "inclusive"
     """It is the last one added: almost nothing is left over."""
@@ -84,13 +84,13 @@ class RenderSettings:
     pair_capacity: int | None = None
     """(tile, splat) pairs to reserve; None reads their number back, the one host synchronisation of a rendering.
 
-    With a number nothing is read back on CUDA: pairs that do not fit are dropped, and ``Buffers.check_capacity`` tells.
-    On the CPU it is asked every time.
+    With a number nothing is read back on CUDA: pairs that do not fit are dropped, and ``Buffers.check_capacity``
+    raises. On the CPU it is called in every rendering.
     """
     deterministic: bool = False
     """Whether gradients are summed in one order on CUDA, as on the CPU, so that equal work gives equal bytes.
 
-    All but those of the sensor's numbers. Every (tile, splat) pair has 128 bytes of its own then.
+    Except those of the sensor's numbers. It takes 128 bytes for every (tile, splat) pair.
     """
     threads: int | None = None
     """CPU threads of the blend; None: as many as this process may use. Another number changes sums by rounding only."""
@@ -135,8 +135,8 @@ MATRIX_MAX = 128 << 20  # [B]
 READERS = 8192  # warps that read it: about as many as 132 multiprocessors hold at once
 
 
-# splats that are ordered by classes of depth: if all of so many were in one, each would look at all, 0.1 ms
-RANKED_MAX = {"cpu": 0, "cuda": 32_768}
+# splats that are ordered by depth bins: if all were in one bin, each would be compared with all, 0.1 ms
+BINNED_MAX = {"cpu": 0, "cuda": 32_768}
 
 
 def available_threads() -> int:
@@ -145,7 +145,7 @@ def available_threads() -> int:
 
 
 class Buffers:
-    """The arrays of one rendering: what forward leaves for backward. Nothing is shared between two buffers.
+    """The arrays of one rendering, also those that the backward pass reads. Two objects share nothing.
 
     A buffers may render again: then it is the same memory, every array of it by its name, and backward belongs to the
     last rendering.
@@ -178,9 +178,9 @@ class Buffers:
         self.splats = self.array("splats", count, Splat)
         self.box_px = self.array("boxes", count, wp.vec4i)
         self.depth_shift = settings.depth_shift
-        self.depth_key = self.array("depth keys", 2 * count)  # the radix sort wants twice the room
+        self.depth_key = self.array("depth keys", 2 * count)  # the radix sort needs twice the length
         self.order = self.array("order", 2 * count)
-        self.ranks = 0 < count <= RANKED_MAX[kind] and not self.ordered  # whether no sort is needed for the order
+        self.binned = 0 < count <= BINNED_MAX[kind] and not self.ordered  # whether no sort is needed for the order
         self.words = 2 * math.ceil(count / 64)  # of a tile in a matrix of a bit per tile and splat
         self.matrix = math.ceil(self.tiles / tile_bitmask.GROUP) * tile_bitmask.GROUP * self.words
         self.marks = not self.ordered and 4 * self.matrix <= MATRIX_MAX  # whether lists of tiles are made of it
@@ -197,7 +197,7 @@ class Buffers:
 
     @property
     def ordered(self) -> bool:
-        """Whether every pair has a record of its own: where warps add to records side by side, and order is wanted."""
+        """Whether every pair has its own gradient record: on CUDA, for deterministic gradients."""
         return self.settings.deterministic and self.K == 1
 
     @property
@@ -211,7 +211,7 @@ class Buffers:
         return min(len(self.channels), 2 if self.cooperative and self.threads == 1 else 1)
 
     def array(self, name: str, shape: int | tuple[int, ...], dtype=wp.int32) -> wp.array:
-        """Memory on the device of this buffers, as whoever used it last under that name left it."""
+        """Device memory by name, with the content of its last use."""
         wanted = (shape,) if isinstance(shape, int) else shape
         if name not in self._arrays or self._arrays[name].shape != wanted:
             self._arrays[name] = wp.empty(wanted, dtype=dtype, device=self.device)
@@ -224,14 +224,14 @@ class Buffers:
         return array
 
     def reserve_pairs(self, capacity: int) -> None:
-        """Make room for ``capacity`` (tile, splat) pairs, and for a sort with keys and as much again."""
-        room = capacity if self.marks else 2 * capacity
-        if len(self.ids) < room:
-            self.ids = self.array("ids", room)
-            self.keys = self.keys if self.marks else self.array("keys", room)
+        """Allocate ``capacity`` (tile, splat) pairs, for a sort with keys and twice as many."""
+        length = capacity if self.marks else 2 * capacity
+        if len(self.ids) < length:
+            self.ids = self.array("ids", length)
+            self.keys = self.keys if self.marks else self.array("keys", length)
 
     def check_capacity(self) -> None:
-        """Raise if the reserve of pairs was too small, so that far splats are missing; waits for the device.
+        """Raise if the pair capacity was too small, so that far splats are missing; synchronises.
 
         Raises:
             ValueError: With the number of pairs that would have fitted.
@@ -261,7 +261,7 @@ class Buffers:
 
 
 class Planes:
-    """Image planes in tile order, seen twice: ``lanes`` for the compositor, ``flat`` for everything per pixel."""
+    """Image planes in tile order as two views: ``lanes`` for the compositor, ``flat`` for kernels per pixel."""
 
     def __init__(self, flat: wp.array, buffers: Buffers):
         self.flat = flat
@@ -285,10 +285,9 @@ class Planes:
 class Workspace:
     """Memory that renderings of one size share, one after the other.
 
-    Whoever renders the same number of Gaussians into the same image again and again hands the same workspace to
-    ``rasterize``: then nothing but the images and their gradients is allocated, and a CUDA graph replays into memory
-    that stays. Backward must come before the next rendering with it. Another size or another setting takes fresh
-    memory and lets go of the old, which a graph captured with the old one must not outlive.
+    With one workspace, renderings of the same number of Gaussians and the same size allocate nothing but images and
+    gradients, and a CUDA graph can be replayed. Backward must come before the next rendering with it. Another size or
+    setting allocates new memory and releases the old, which graphs captured with it must not outlive.
     """
 
     def __init__(self) -> None:

@@ -139,17 +139,17 @@ def _of_times(
 ) -> dict[int, Float[Tensor, "k width"]]:
     """Bias of every key in the layers that gamma(t) enters: W_t gamma(t) + b."""
     with_time = time.new_empty(len(form.entries), len(time), form.width)
-    for room, number in zip(with_time, form.entries, strict=True):
+    for out, number in zip(with_time, form.entries, strict=True):
         at_time = weights[number][:, weights[number].shape[1] - form.time :]
-        torch.addmm(biases[number], time, at_time.T, out=room)
+        torch.addmm(biases[number], time, at_time.T, out=out)
     return dict(zip(form.entries, with_time.to(form.dtype), strict=True))
 
 
 def _joined_input(form: Form, position: Tensor, keys: int) -> Float[Tensor, "rows i"]:
-    """Room for the input of the layer that is joined, gamma(x) at its end for all keys."""
-    room = position.new_empty(keys * len(position), form.width + form.columns)
-    _copy(room.view(keys, len(position), -1)[..., form.width :], position.expand(keys, -1, -1))
-    return room
+    """Buffer for the input of the joined layer, with gamma(x) at its end for all keys."""
+    joined = position.new_empty(keys * len(position), form.width + form.columns)
+    _copy(joined.view(keys, len(position), -1)[..., form.width :], position.expand(keys, -1, -1))
+    return joined
 
 
 def _copy(to: Tensor, rows: Tensor) -> None:
@@ -165,8 +165,8 @@ def _sums(
 ) -> Float[Tensor, "layers k width"]:
     """Sums over the rows of each key, by products with zeros and ones.
 
-    A product of few rows with many columns fills a GPU without splitting its sum; what lies side by side is added
-    later. Columns are what is contiguous: there are as many rows as 16 bytes hold.
+    A product of few rows with many columns fills a GPU without splitting its sum; the columns are added
+    later. Rows are padded to 16 bytes.
     """
     layers, rows, width = gradients.shape
     fold = math.gcd(rows // keys, FOLD)
@@ -178,7 +178,7 @@ def _sums(
 
 
 def _largest(values: Float[Tensor, "rows v"]) -> Float[Tensor, ""]:
-    """The largest magnitude, in two steps: one block of a GPU alone would look for long."""
+    """The largest magnitude, in two steps, since one thread block alone would take long."""
     parts = values.reshape(math.gcd(values.numel(), 16 * FOLD), -1)
     return torch.linalg.vector_norm(torch.linalg.vector_norm(parts, math.inf, dim=1), math.inf)
 

@@ -64,7 +64,7 @@ def shapes_of(quads: int, height: int, width: int, extra: int = 0) -> dict[str, 
 
 
 def wanted_images(names: Collection[str]) -> frozenset[str]:
-    """The names of the images that are asked for.
+    """Names of the requested images.
 
     Raises:
         ValueError: If one is not in ``CHOICES``.
@@ -81,7 +81,7 @@ def names_of(kind: type) -> list[str]:
 
 
 def present_in(group: Inputs | Images) -> dict[str, wp.array]:
-    """The arrays that are there, by name."""
+    """The arrays that are not None, by name."""
     return {name: getattr(group, name) for name in names_of(type(group)) if getattr(group, name) is not None}
 
 

@@ -1,4 +1,4 @@
-"""Which kernels run, in which order, forward and backward. Warp arrays in, Warp arrays filled; knows no torch.
+"""Which kernels run, in which order, forward and backward. Warp arrays only, no torch.
 
 A Warp program renders with
 
@@ -36,7 +36,7 @@ UPLOADED_MAX = 1024  # cameras that are kept on devices, some 150 bytes each
 
 
 def view_of(camera: Camera, settings: RenderSettings) -> CameraView:
-    """The camera as kernels see it."""
+    """The camera as kernels read it."""
     view = CameraView()
     pose = camera.camera_from_world
     view.rotation = wp.mat33(pose[:3, :3].astype(np.float32))
@@ -72,7 +72,7 @@ def _uploaded(bits: bytes, shifts: tuple[float, ...], lens: bool, device: str) -
 
 
 def render(inputs: Inputs, view: View, buffers: Buffers, images: Images) -> None:
-    """Fill those of ``images`` that are there.
+    """Fill those of ``images`` that are not None.
 
     On an active ``wp.Tape`` also record the adjoint, which adds to the ``.grad`` of the inputs.
     """
@@ -104,7 +104,7 @@ def forward(
     buffers.records = [buffers.splats]
     if buffers.count:
         stages.project(inputs, view, buffers)
-    for number, (name, start) in enumerate(groups):  # before lists are made, which leaves most of a GPU idle
+    for number, (name, start) in enumerate(groups):  # before lists are made: that has few threads
         if number > 0:
             buffers.records.append(buffers.array(f"records {number}", buffers.count, splat.Splat))
         if name == "extra":
@@ -128,7 +128,7 @@ def backward(
     *,
     extra_detached: bool = False,
 ) -> wp.array:
-    """Add to the arrays of ``wanted`` what ``cotangents`` say; what forward left in the buffers stays as it was.
+    """Add the gradients for ``cotangents`` to the arrays of ``wanted``; forward's results in the buffers stay.
 
     With ``extra_detached`` weights are held fixed under the extra images, so that only the extra channels learn.
 

@@ -1,4 +1,4 @@
-"""Launches over ranges of tiles: one on CUDA, and on a CPU several side by side, each in a thread of its own."""
+"""Launches over ranges of tiles: one on CUDA, several concurrent ones on a CPU, each in its own thread."""
 
 from __future__ import annotations
 

@@ -63,7 +63,7 @@ def _project_outputs(buffers: Buffers) -> list:
 
 def sort_by_depth(buffers: Buffers) -> None:
     """Order the splats near to far, those of one key by index; what is culled comes last, in any order."""
-    if not buffers.ranks:
+    if not buffers.binned:
         wp.utils.radix_sort_pairs(buffers.depth_key, buffers.order, buffers.count, end_bit=buffers.settings.depth_bits)
         return
     counts, first = (
@@ -71,12 +71,12 @@ def sort_by_depth(buffers: Buffers) -> None:
         buffers.array("first of classes", depth_bins.COUNTS),
     )
     places, members = buffers.array("places", buffers.count), buffers.array("members", buffers.count, wp.int64)
-    shift = buffers.settings.depth_bits - (depth_bins.CLASSES.bit_length() - 1)
+    shift = buffers.settings.depth_bits - (depth_bins.BINS.bit_length() - 1)
     keys = [buffers.depth_key, buffers.settings.depth_culled, shift]
-    _launch(depth_bins.count_classes, buffers.count, keys, [counts, places])
+    _launch(depth_bins.count_bins, buffers.count, keys, [counts, places])
     wp.utils.array_scan(counts, first, inclusive=True)
-    _launch(depth_bins.fill_classes, buffers.count, [*keys, first, places], [members])
-    _launch(depth_bins.order_classes, buffers.count, [members, *keys[1:], first], [buffers.order])
+    _launch(depth_bins.fill_bins, buffers.count, [*keys, first, places], [members])
+    _launch(depth_bins.order_within_bins, buffers.count, [members, *keys[1:], first], [buffers.order])
 
 
 def sort_by_tile(buffers: Buffers) -> None:
@@ -128,11 +128,11 @@ def _count_and_sort(buffers: Buffers, lists: list) -> None:
 
 
 def _sum_counts(buffers: Buffers) -> int:
-    """Counts of pairs to where those of each end, and room for them; returns how many fit."""
+    """Prefix sums of the counts of pairs, and memory for them; returns the pair capacity."""
     wp.utils.array_scan(buffers.counts, buffers.ends, inclusive=True)
     capacity = buffers.settings.pair_capacity
     if capacity is None:
-        # the declared host synchronisation: how many pairs there are decides how much memory they need
+        # the documented host synchronisation: memory is allocated for the number of pairs
         capacity = int(buffers.ends[-1:].numpy()[0])
     buffers.reserve_pairs(capacity)
     return capacity
@@ -241,7 +241,7 @@ def take_channels(records: wp.array, start: int, wanted: Inputs) -> None:
 
 
 def add_geometry(records: wp.array, total: wp.array) -> None:
-    """Add what a further pass says about centres, conics and opacities."""
+    """Add the gradients of centres, conics and opacities of a further pass."""
     _launch(splat.add_records, len(records), [records, 1], [total])
 
 
@@ -322,7 +322,7 @@ def _distortion_factor(buffers: Buffers) -> float:
 
 
 def _spread(buffers: Buffers, number: int, *, anew: bool = True) -> wp.array:
-    """Records of a pass as the compositor reads them: of splats, or, where order matters, a copy for each pair."""
+    """Records of a pass for the compositor: of splats, or, for deterministic sums, a copy per pair."""
     if not buffers.ordered:
         return buffers.records[number]
     copies = buffers.array(f"records of pairs {number}", len(buffers.owners), splat.Splat)

@@ -80,7 +80,7 @@ class RigidBody:
 
     @property
     def reach(self) -> float:
-        """Distance of the farthest point from the centre [m]; 0 for a plane, which nobody asks."""
+        """Distance of the farthest point from the centre [m]; 0 for a plane, where it is not used."""
         return self.radius if self.points is None else float(np.linalg.norm(self.points, axis=1).max())
 
 
@@ -176,7 +176,7 @@ class Tracer:
         wp.init()
         self.device = wp.get_device(device)
         self.width, self.height = width, height
-        self._meshes = [_mesh(body, self.device) for body in bodies]  # kept alive: kernels know their numbers only
+        self._meshes = [_mesh(body, self.device) for body in bodies]  # kept alive: kernels get their ids only
         self._solids = _solids(bodies, self._meshes, self.device)
         self._poses: dict[int, tuple[wp.array, wp.array]] = {}
         self._harmonics = wp.array(np.asarray(harmonics, dtype=np.int32), dtype=wp.int32, device=self.device)

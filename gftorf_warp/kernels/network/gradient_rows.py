@@ -1,11 +1,11 @@
-"""Which rows have a gradient: a list of them, made on the device, so that nobody walks the others.
+"""The list of rows that have a gradient, made on the device, so that kernels skip the others.
 
 Rows of k keys lie one key after the other. The list has each key's in ascending order, ``NO_ROW`` behind them up to a
 multiple of ``TILE``, which is what kernels multiply at once. Blocks of rows are counted, then each block finds what is
-before it from all counts and writes its rows: the order is fixed, and launches have sizes that no host must ask for.
+before it from all counts and writes its rows: the order is fixed, and launch sizes do not depend on the list.
 
-A gradient that is no number counts as one. A row of zeros adds nothing to any weight's gradient, unless an output of it
-is infinite: with all rows 0 times that is no number and the step not sound, with a list nobody sees such a row.
+A NaN counts as a gradient. A row of zeros adds nothing to any weight's gradient, unless an output of it
+is infinite: with all rows 0 times infinity is NaN and the update skipped, with a list such a row is not read.
 """
 
 import warp as wp
@@ -53,7 +53,7 @@ def count_block(gradient: wp.array2d[float], count: int, block: int, counts: wp.
     auto over_block = [&](int value) {{  // for all threads
         #pragma unroll
         for (int over = 16; over > 0; over /= 2) value += __shfl_xor_sync(0xffffffffu, value, over);
-        __syncthreads();  // nobody reads what was there any more
+        __syncthreads();  // no thread reads the previous content any more
         if (lane == 0) of_warps[warp] = value;
         __syncthreads();
         int sum = 0;

@@ -1,6 +1,6 @@
-"""Before and behind a perceptron's way back: gradients of offsets are scaled to halves, partial sums are added up.
+"""Loss scaling before the backward pass, and reductions: gradients of offsets become halves, partial sums are added.
 
-A kernel leaves one partial result per warp, on the CPU per row, and the next one adds them up in a fixed order.
+A kernel writes one partial result per warp, on the CPU per row, and the next one adds them up in a fixed order.
 """
 
 import warp as wp
@@ -34,7 +34,7 @@ SLICES = BLOCK // COLUMNS
     }
 #endif
 """)
-def leave_part(gradient: wp.array2d[float], count: int, row: int, partials: wp.array2d[float]):
+def reduce_warp(gradient: wp.array2d[float], count: int, row: int, partials: wp.array2d[float]):
     """Sums over the rows of this warp, and the largest magnitude."""
 
 
@@ -46,7 +46,7 @@ def measure_rows(
     partials: wp.array2d[float],  # [warps, 4] sums over rows of a warp, and their largest magnitude
 ):
     """One thread per row, a whole number of warps."""
-    leave_part(gradient, gradient.shape[0], wp.tid(), partials)
+    reduce_warp(gradient, gradient.shape[0], wp.tid(), partials)
 
 
 @wp.func_native("""
@@ -99,7 +99,7 @@ def scale_row(
     unit: wp.array[float],
     total: wp.array[float],
 ):
-    """One row; every block of threads finds the unit for itself."""
+    """One row; every block of threads computes the unit."""
 
 
 @wp.kernel(enable_backward=False, grid_stride=False)

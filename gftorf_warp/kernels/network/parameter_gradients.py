@@ -1,4 +1,4 @@
-"""Gradients of a perceptron's parameters by listed rows: the head's weight, and how parts become all of them.
+"""Gradients of the network's parameters over listed rows: the head's weight, and all of them from partial sums.
 
 The head has three outputs, so its weight gradient is what reading 512 bytes of every listed row costs: warps walk rows,
 a lane has eight of 256 inputs times three outputs in registers. ``collect`` then adds up parts of all weights in their

@@ -1,4 +1,4 @@
-"""Gradients of weights over listed rows: dW = d^T h, where d lies as the list does and h where it always was.
+"""Weight gradients over listed rows: dW = d^T h, d in the order of the list, h in that of the forward pass.
 
 A block of 256 threads has 128 outputs of a layer times all its inputs, 256 of the layer before or 64 of gamma(x), and
 a part of the list; each of its eight warps has 64 of the outputs and a quarter of the inputs in registers. Tiles of 64

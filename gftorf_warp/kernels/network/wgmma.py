@@ -1,8 +1,8 @@
 """The layers of a perceptron on Hopper's tensor cores, as C++ for CUDA, and row by row for the CPU.
 
-Rows are independent, so a block of threads takes its rows through all layers and waits for nobody. Two groups of four
+Rows are independent, so a block of threads computes all layers of its rows independently of others. Two groups of four
 warps have tiles of 64 rows each: while one multiplies, the other adds shifts, masks, rounds and stores. Weights come in
-blocks of 64 inputs into a ring in shared memory, copied as they lie in global memory, ahead of the layer that needs
+blocks of 64 inputs into a ring in shared memory, copied from global memory ahead of the layer that needs
 them. Rows never meet shared memory: what a lane stores of a row is what it reads of it one layer later, so that groups
 wait for each other only before weights are overwritten.
 
@@ -124,8 +124,8 @@ _CUDA = f"""
         {_KEPT}
     }};
 
-    // this group has multiplied by ``blocks`` weights for the last time; who says so of a layer as the second one sends
-    // for others. A group without a tile says so of all layers at once, so each has a count of its own, half of a word:
+    // this group has multiplied by ``blocks`` weights for the last time; the second group to release a layer
+    // starts other copies. A group without a tile releases all layers at once, so each has a count, half of a word:
     // what an addition finds in the other half is the only order there is
     int done = 0, layers_done = 0;  // blocks of weights, and layers, that this group needs no more
     auto release = [&](int blocks, const wp::half* packed, int of_round, int all) {{
@@ -170,7 +170,7 @@ _FORWARD = f"""
             product(kind, done, rows, sums);
             float* const added = shared_sums + (passed++ & 1) * {WIDTH};
             reinterpret_cast<float2*>(added)[threadIdx.x & 127] = own;
-            group_waits();  // nobody reads what was added two tiles ago any more, either
+            group_waits();  // also: no lane reads what was added two tiles ago any more
             multiplied(sums);
             if (tile + {GROUPS} >= end) release(C, forth.data, parts, all);
             wp::half* to = after + ((size_t)key * count + row) * {WIDTH} + 8 * t;
@@ -258,7 +258,7 @@ _BACKWARD = f"""
     struct Of64 {{ enum {{ N = 32 }}; }};
     struct Of32 {{ enum {{ N = 16 }}; }};
     struct Of16 {{ enum {{ N = 8 }}; }};
-    // eight slopes of a row: the mask, the store; ``value`` is what was stored, before it was rounded
+    // eight gradients of a row: mask and store; ``value`` is what was stored, before it was rounded
     auto masked = [&](auto& value, unsigned alive, wp::half* to, bool there) {{
         unsigned out[4];
         #pragma unroll
@@ -269,7 +269,7 @@ _BACKWARD = f"""
         }}
         if (there) *reinterpret_cast<uint4*>(to) = make_uint4(out[0], out[1], out[2], out[3]);
     }};
-    auto alive_of = [&](int number, int tile, auto& alive) {{  // nobody is where there is no row
+    auto alive_of = [&](int number, int tile, auto& alive) {{  // 0 where there is no row
         #pragma unroll
         for (int half = 0; half < 2; ++half) {{
             const int row = __ldg(listed.data + tile * {TILE} + 16 * warp + g + 8 * half), key = max(row, 0) / of_rows;
@@ -297,7 +297,7 @@ _BACKWARD = f"""
         #pragma unroll
         for (int i = 0; i < 8; ++i) own[i] += value[i];
     }};
-    // the sums of a key that has passed, over the warps of this group; another round adds to them
+    // the sums of a finished key over the warps of this group; other rounds add to them
     auto flush = [&](int number, int key, auto& own) {{
         #pragma unroll
         for (int i = 0; i < 8; ++i) {{
@@ -312,7 +312,7 @@ _BACKWARD = f"""
             to[n] += (of_warps[n] + of_warps[{WIDTH} + n]) + (of_warps[{2 * WIDTH} + n] + of_warps[{3 * WIDTH} + n]);
         group_waits();
     }};
-    auto passes = [&](int tile, int end) {{  // whether this is the group's last tile of its key
+    auto ends_key = [&](int tile, int end) {{  // whether this is the group's last tile of its key
         return tile + {GROUPS} >= end || key_of(tile + {GROUPS}) != key_of(tile);
     }};
     auto top = [&](int begin, int end) {{
@@ -349,7 +349,7 @@ _BACKWARD = f"""
                 for (int i = 0; i < 8; ++i) all_[8 * q + i] = value[0][i] + value[1][i];
             }}
             fold(all_, own);
-            if (passes(tile, end)) flush(number, key_of(tile), own);
+            if (ends_key(tile, end)) flush(number, key_of(tile), own);
         }}
     }};
     auto layer = [&](int number, int begin, int end) {{
@@ -384,7 +384,7 @@ _BACKWARD = f"""
                 for (int i = 0; i < 8; ++i) all_[8 * q + i] = value[0][i] + value[1][i];
             }}
             fold(all_, own);
-            if (passes(tile, end)) flush(number - 1, key_of(tile), own);
+            if (ends_key(tile, end)) flush(number - 1, key_of(tile), own);
         }}
     }};
     if (threadIdx.x == 0)

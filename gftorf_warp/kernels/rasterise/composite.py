@@ -3,10 +3,10 @@
 Splat k with alpha_k = min(0.99, o_k G_k) leaves T_{k+1} = T_k (1 - alpha_k), T_0 = 1, and adds to its pixel
 
     w_k = alpha_k T_k   times   distance d, three channels c, and to the distortion (half of the double sum)
-    w_k T_k             times   light (a cos psi, a sin psi, a): what a quad sees passes every splat twice
+    w_k T_k             times   light (a cos psi, a sin psi, a): light of a quad passes every splat twice
 
-(paper, equations 3-5; method, sections 2.5 and 2.7). The background is no business of this file: it is linear in the
-transmittance T_e that is left over. The adjoint stands in composite_backward.py.
+(paper, equations 3-5; method, sections 2.5 and 2.7). The background is linear in the
+transmittance T_e that remains, and added in planes_to_images.py. The adjoint is composite_backward.py.
 """
 
 import functools
@@ -23,7 +23,7 @@ from .splat import AHEAD, Splat, block_missed, load_splat, prefetch
 # planes of ``light``, each [tiles, lanes] of V
 RE, IM, AMPLITUDE, DISTANCE, DISTORTION, SUM_ZETA, SUM_ZETA2, TRANSMITTANCE, LAST = range(9)
 LIGHT_PLANES = 9
-NEAREST = 1e-6  # [m] of a splat: what stands for none has no distance, and no weight, which infinities would ignore
+NEAREST = 1e-6  # [m] of a splat: padding records have distance 0, which must not become infinite times a weight of 0
 CHANNEL_PLANES = 3  # planes of ``channel``
 
 
@@ -121,29 +121,31 @@ def make_composite(
     zeta_of = make_zeta(bool(metric))
     spreads = light and metric is not None
     fetch = make_batches(more=more)
-    warp_memory, ask, arrive, entry, record_of = (
+    warp_memory, fetch_records, wait_for_records, entry, record_of = (
         fetch.warp_memory,
-        fetch.ask,
-        fetch.arrive,
+        fetch.fetch_records,
+        fetch.wait_for_records,
         fetch.entry,
         fetch.record_of,
     )
-    ask_more, more_of = fetch.ask_more, fetch.more_of
+    fetch_more, more_of = fetch.fetch_more, fetch.more_of
 
     @wp.func
-    def asks(live: V) -> bool:
+    def any_alive(live: V) -> bool:
         """Whether a pixel is still alive."""
         return warp_any(nonzero(live))
 
     @wp.func_native("return true;")
-    def trusts(live: V) -> bool:
-        """In the middle of a round nobody asks."""
+    def always(live: V) -> bool:
+        """Within a round all entries are processed."""
 
-    goes_on = trusts if cooperative else asks
+    goes_on = always if cooperative else any_alive
 
     @wp.func
-    def leave(states: wp.array3d[V], segment: int, tile: int, lane: int, T: V, re: V, im: V, amplitude: V, distance: V):
-        """What is known where a segment ends: T, but of the last one, and what it has added, but of the first."""
+    def store_state(
+        states: wp.array3d[V], segment: int, tile: int, lane: int, T: V, re: V, im: V, amplitude: V, distance: V
+    ):
+        """State where a segment ends: T, except of the last one, and what it has added, except of the first."""
         if segment < wp.static(segments - 1):
             states[segment * wp.static(PLANES), tile, lane] = T
         if segment > 0:
@@ -182,7 +184,7 @@ def make_composite(
         live = mul(above(affine(x, -1.0, float(width)), 0.0), above(affine(y, -1.0, float(height)), 0.0))
         T = fill(1.0)
         if wp.static(inclusive):
-            T = add(live, fill(0.0))  # says by itself who goes on; a variable of its own, for Warp
+            T = add(live, fill(0.0))  # is 0 for pixels outside the image; a copy, since Warp aliases variables
         last = fill(0.0)
         if wp.static(light):
             re = fill(0.0)
@@ -223,9 +225,9 @@ def make_composite(
             coming = int(0)
             if begin < end:
                 coming = entry(ids, begin, 1, 0, count)
-                ask(memory, splats, coming, 0)
+                fetch_records(memory, splats, coming, 0)
                 if wp.static(more):
-                    ask_more(memory, more_splats, coming, 0)
+                    fetch_more(memory, more_splats, coming, 0)
                 coming = entry(ids, begin, 1, wp.static(ROUND), count)
         # `continue` instead of nested `if`s: after an `if` Warp selects between the old and the new value of everything
         # assigned inside, here a dozen vectors per splat
@@ -233,7 +235,7 @@ def make_composite(
             stop = end
             if wp.static(split):
                 if k - begin == (segment + 1) * length:  # a segment begins, since it is whole rounds
-                    leave(states, segment, tile, lane, T, re, im, amplitude, distance)
+                    store_state(states, segment, tile, lane, T, re, im, amplitude, distance)
                     segment += 1
                     re_before = add(re_before, re)
                     im_before = add(im_before, im)
@@ -244,12 +246,12 @@ def make_composite(
                     amplitude = fill(0.0)
                     distance = fill(0.0)
             if wp.static(cooperative):
-                stop = k + ROUND  # behind the end of the list there are splats that nobody sees
-                arrive()
+                stop = k + ROUND  # behind the end of the list are padding records without effect
+                wait_for_records()
                 if stop < end:
-                    ask(memory, splats, coming, stop - begin)
+                    fetch_records(memory, splats, coming, stop - begin)
                     if wp.static(more):
-                        ask_more(memory, more_splats, coming, stop - begin)
+                        fetch_more(memory, more_splats, coming, stop - begin)
                     coming = entry(ids, begin, 1, stop - begin + wp.static(ROUND), count)
             while k < stop and goes_on(live):
                 group = stop
@@ -269,7 +271,7 @@ def make_composite(
                     power = power_of(affine(x, -1.0, q[0]), affine(y, -1.0, q[1]), q[2], q[3], q[4])
                     hit = hits(power, live, q[6])
                     alpha = alpha_of(power, hit, q[5], ALPHA_MAX)
-                    if wp.static(not cooperative):  # with records at hand a miss costs less than a branch
+                    if wp.static(not cooperative):  # with records in shared memory a miss costs less than a branch
                         if not nonzero(alpha):
                             continue
                     if wp.static(not inclusive):
@@ -307,12 +309,12 @@ def make_composite(
             if wp.static(not cooperative):
                 k = end  # one round was all
         if wp.static(cooperative):
-            arrive()  # records that nobody needs may still be on their way
+            wait_for_records()  # records that are not needed may still be in flight
         if wp.static(split):
-            leave(states, segment, tile, lane, T, re, im, amplitude, distance)
+            store_state(states, segment, tile, lane, T, re, im, amplitude, distance)
             nothing = fill(0.0)
-            for later in range(segment + 1, wp.static(segments)):  # nobody walked there
-                leave(states, later, tile, lane, T, nothing, nothing, nothing, nothing)
+            for later in range(segment + 1, wp.static(segments)):  # segments that no pixel reached
+                store_state(states, later, tile, lane, T, nothing, nothing, nothing, nothing)
             re = add(re, re_before)
             im = add(im, im_before)
             amplitude = add(amplitude, amplitude_before)

@@ -5,8 +5,8 @@ ones, and T_e, E = T_e dL/dT_e behind the last splat (method, section 3.1):
 
     T <- T / (1 - alpha);  dL/dalpha = tau T + sigma T^2 - E / (1 - alpha);  E <- E + w (tau + 2 sigma T),  w = alpha T
 
-E is what the loss gains from all that lies behind. Walked back to front it keeps its digits; front to back it is a
-difference of sums that turns to noise behind a surface. The distortion is quadratic in w: its tau uses the final sums.
+E is the gradient of everything behind. Computed back to front it is accurate; front to back it would be a
+difference of sums that is noise behind a surface. The distortion is quadratic in w: its tau uses the final sums.
 The generated adjoint of the forward loop would be wrong without a warning, since dynamic loops are not replayed.
 """
 
@@ -30,7 +30,7 @@ V1 = make_lanes(1).V
 def _add_moments(K: int, light: bool, channels: bool, geometry: bool) -> str:
     """C++ that adds the sums over the K pixels of a CPU thread to the gradient record of one splat.
 
-    One permutation brings the sums into the order of the record. On CUDA ``add_round`` of shared_batches.py does it.
+    One permutation brings the sums into the order of the record. On CUDA ``accumulate_round`` does it.
     """
     names = ["v", "dx", "dy", "alpha", "w", "w2", "g0", "g1", "g2", "g_re", "g_im", "g_amplitude", "g_distance"]
     loads = " ".join(f"const F {name}_ = load({name});" for name in names)
@@ -105,7 +105,7 @@ def make_composite_backward(
     tile_height: int,
     light: bool,
     channels: bool,
-    clamp_passes: bool,
+    clamp_straight: bool,
     metric: bool | None,
     fixed: bool = False,
     more: bool = False,
@@ -119,7 +119,7 @@ def make_composite_backward(
         tile_height: Rows of a tile [px].
         light: Whether light, distance and distortion have gradients.
         channels: Whether the three channels have gradients.
-        clamp_passes: Whether a clamped alpha passes its gradient on, as the released code does.
+        clamp_straight: Whether the gradient ignores the clamp of alpha (straight-through), as the released code does.
         metric: As in ``make_composite``; None: the distortion has no gradient.
         fixed: Whether weights are held fixed under the channels, so that only these have their gradient.
         more: Whether three further channels, under which weights are held fixed, have their gradient, too.
@@ -147,14 +147,18 @@ def make_composite_backward(
 
     if cooperative:
         rounds = make_gradient_rounds(tile_width, light, channels, light or not fixed, spreads, more)
-        warp_memory, ask, arrive, entry, record_of = (
+        warp_memory, fetch_records, wait_for_records, entry, record_of = (
             rounds.warp_memory,
-            rounds.ask,
-            rounds.arrive,
+            rounds.fetch_records,
+            rounds.wait_for_records,
             rounds.entry,
             rounds.record_of,
         )
-        keep_derivatives, keep_values, add_round = rounds.keep_derivatives, rounds.keep_values, rounds.add_round
+        store_derivatives, store_values, accumulate_round = (
+            rounds.store_derivatives,
+            rounds.store_values,
+            rounds.accumulate_round,
+        )
 
     @wp.kernel(**options(K))
     def composite_backward(
@@ -174,9 +178,9 @@ def make_composite_backward(
         grad_splats: wp.array[Splat],  # [N] added to: moments in 0-5, pixels in 6, weights in 7, gradients in 8-15
         more_splats: wp.array[Splat],  # [N] added to: slots 8-10, gradients of the further channels
     ):
-        """One thread per block of K pixels; visits exactly the contributors of the forward pass, last one first.
+        """One thread per block of K pixels; visits exactly the splats of the forward pass, last one first.
 
-        Where lists have segments, that many warps per tile, side by side.
+        Where lists have segments, one warp per segment.
         """
         t, lane = wp.tid()
         tile = tile0 + t // wp.static(segments)
@@ -249,17 +253,17 @@ def make_composite_backward(
             count = k - begin
             coming = int(0)
             if begin < k:
-                keep_derivatives(memory, g0, g1, g2, g_re, g_im, g_amplitude, g_distance, g3, g4, g5)
-                ask(memory, splats, entry(ids, top, -1, 0, count), 0)
+                store_derivatives(memory, g0, g1, g2, g_re, g_im, g_amplitude, g_distance, g3, g4, g5)
+                fetch_records(memory, splats, entry(ids, top, -1, 0, count), 0)
                 coming = entry(ids, top, -1, wp.static(ROUND), count)
         while k > begin:
             stop = begin
             if wp.static(cooperative):
-                stop = k - ROUND  # behind the last one there are splats that nobody sees
+                stop = k - ROUND  # behind the last one are padding records without effect
                 at = top + 1 - k  # entries behind us
-                arrive()
+                wait_for_records()
                 if stop > begin:
-                    ask(memory, splats, coming, at + wp.static(ROUND))
+                    fetch_records(memory, splats, coming, at + wp.static(ROUND))
                     coming = entry(ids, top, -1, at + wp.static(2 * ROUND), count)
             while k > stop:
                 length_of_group = k - stop
@@ -316,18 +320,18 @@ def make_composite_backward(
                     tau = add(tau, sigma_T)
                     v = fnma(mul(w, tau), E, mul(alpha, restored))  # alpha dL/dalpha
                     E = fma(E, w, add(tau, sigma_T))
-                    if wp.static(clamp_passes):
+                    if wp.static(clamp_straight):
                         raw = scaled(response(power, hit), q[5])
                         v = fma(zero, v, mul(raw, inverse(at_least(alpha, ALPHA_MIN))))  # o G / alpha
                     else:
                         v = keep_below(v, alpha, ALPHA_MAX)
                     if wp.static(cooperative):
-                        i = ids[wp.max(k, begin)]  # for the CPU; on CUDA nobody asks
-                        keep_values(memory, behind, n - 1, v, w, w2, g_d)
+                        i = ids[wp.max(k, begin)]  # read on the CPU only
+                        store_values(memory, behind, n - 1, v, w, w2, g_d)
                         if wp.static(more):
                             add_more(more_splats, i, w, g3, g4, g5)
                     add_moments(grad_splats, i, v, dx, dy, alpha, w, w2, g0, g1, g2, g_re, g_im, g_amplitude, g_d)
             if wp.static(cooperative):
-                add_round(memory, grad_splats, more_splats, ids, top, at, wp.min(count - at, ROUND), x, y)
+                accumulate_round(memory, grad_splats, more_splats, ids, top, at, wp.min(count - at, ROUND), x, y)
 
     return composite_backward

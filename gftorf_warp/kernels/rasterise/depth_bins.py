@@ -1,75 +1,75 @@
-"""The order of few splats by depth key without a sort: classes of keys are counted, and who is in one is compared.
+"""Depth order of few splats without a sort: depth keys are counted into bins, and compared within a bin.
 
 A radix sort of 20,000 keys takes a pass over all of them for every eight bits, each of which waits for the one before.
-Here a class is the highest bits of a key. Where its splats go is a sum over the classes before it; among themselves
-every splat counts those in front of it: those of a smaller key, or of an equal one and a smaller index, which is one
-comparison of both in 64 bits. What is culled is one class more, in which nobody asks for an order.
+Here a bin is the highest bits of a key. The first place of a bin is a sum over the bins before it; within a bin every
+splat counts those in front of it: with a smaller key, or an equal one and a smaller index, one comparison of both in 64
+bits. Culled splats have one more bin, which is not ordered.
 """
 
 import warp as wp
 
-CLASSES = 1 << 16  # of what is not culled: a wall that faces a camera is in few of them, which is what takes long
-COUNTS = CLASSES + 2  # one more for what is culled, and the end
+BINS = 1 << 16  # of splats that are not culled; a wall that faces the camera fills few of them, which takes longest
+COUNTS = BINS + 2  # one more for culled splats, and the end
 
 
 @wp.func
-def class_of(key: int, culled: int, shift: int) -> int:
-    """The class of a key; that of what is culled is behind all others."""
+def bin_of(key: int, culled: int, shift: int) -> int:
+    """The bin of a key; culled splats are in the last one."""
     number = key >> shift
     if key == culled:
-        number = CLASSES
+        number = BINS
     return number
 
 
 @wp.kernel(enable_backward=False)
-def count_classes(
+def count_bins(
     # In:
     keys: wp.array[wp.int32],  # [>= N] of each splat
-    culled: int,  # key of what is culled [1]
-    shift: int,  # bits of a key that its class leaves out [1]
+    culled: int,  # key of culled splats [1]
+    shift: int,  # lowest bits of a key, which its bin ignores [1]
     # Out:
-    counts: wp.array[int],  # [COUNTS] splats of the class before, added to
-    places: wp.array[wp.int32],  # [N] of each splat in its class, in the order of arrival
+    counts: wp.array[int],  # [COUNTS] splats of the bin before, added to
+    places: wp.array[wp.int32],  # [N] of each splat in its bin, in any order
 ):
     """A thread per splat."""
     n = wp.tid()
-    places[n] = wp.atomic_add(counts, class_of(keys[n], culled, shift) + 1, 1)
+    places[n] = wp.atomic_add(counts, bin_of(keys[n], culled, shift) + 1, 1)
 
 
 @wp.kernel(enable_backward=False)
-def fill_classes(
+def fill_bins(
     # In:
     keys: wp.array[wp.int32],  # [>= N] of each splat
-    culled: int,  # key of what is culled [1]
-    shift: int,  # bits of a key that its class leaves out [1]
-    first: wp.array[int],  # [COUNTS] where the splats of each class begin
-    places: wp.array[wp.int32],  # [N] of each splat in its class
+    culled: int,  # key of culled splats [1]
+    shift: int,  # lowest bits of a key, which its bin ignores [1]
+    first: wp.array[int],  # [COUNTS] first place of each bin
+    places: wp.array[wp.int32],  # [N] of each splat in its bin
     # Out:
-    members: wp.array[wp.int64],  # [N] key and index of every splat in the upper and the lower half, class by class
+    members: wp.array[wp.int64],  # [N] key and index of every splat in the upper and the lower half, bin by bin
 ):
     """A thread per splat."""
     n = wp.tid()
-    at = first[class_of(keys[n], culled, shift)] + places[n]
+    at = first[bin_of(keys[n], culled, shift)] + places[n]
     members[at] = (wp.int64(keys[n]) << wp.int64(32)) | wp.int64(n)
 
 
 @wp.kernel(enable_backward=False)
-def order_classes(
+def order_within_bins(
     # In:
-    members: wp.array[wp.int64],  # [N] key and index of every splat, class by class
-    culled: int,  # key of what is culled [1]
-    shift: int,  # bits of a key that its class leaves out [1]
-    first: wp.array[int],  # [COUNTS] where the splats of each class begin
+    members: wp.array[wp.int64],  # [N] key and index of every splat, bin by bin
+    culled: int,  # key of culled splats [1]
+    shift: int,  # lowest bits of a key, which its bin ignores [1]
+    first: wp.array[int],  # [COUNTS] first place of each bin
     # Out:
     order: wp.array[wp.int32],  # [>= N] splats near to far
 ):
-    """A thread per splat, neighbours of one class."""
+    """A thread per splat, neighbours in one bin."""
     at = wp.tid()
     own = members[at]
     key = int(own >> wp.int64(32))
     place = at
     if key != culled:
-        number = class_of(key, culled, shift)
+        number = bin_of(key, culled, shift)
         place = first[number]
         for other in range(first[number], first[number + 1]):
             place += int(members[other] < own)

@@ -1,8 +1,8 @@
-"""Every (tile, splat) pair with a record of its own, so that gradients are summed in one order and no other.
+"""Deterministic gradients: one gradient record per (tile, splat) pair, summed in a fixed order.
 
-The adjoint of the compositor adds to the record of a splat from many tiles, in whatever order they come. Where each
-pair has a copy of the record, nobody shares; what the copies of a splat have got is then summed in the order in which
-its pairs were written, which depends on the splats alone.
+The adjoint of the compositor adds to the record of a splat from many tiles, in an undefined order. With a record per
+pair there is a single writer; the records of a splat are then summed in the order in which its pairs were written,
+which depends on the splats alone.
 """
 
 import warp as wp
@@ -13,7 +13,7 @@ from .splat import Splat
 @wp.kernel(enable_backward=False)
 def number_pairs(
     # In:
-    total: wp.array[int],  # [1] pairs there are, whether they fit or not
+    total: wp.array[int],  # [1] number of pairs, also of those that do not fit
     capacity: int,  # pairs that fit [1]
     # Out:
     ids: wp.array[wp.int32],  # [>= capacity] splat of each pair as written; replaced by the number of the pair

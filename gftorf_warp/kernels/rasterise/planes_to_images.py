@@ -1,4 +1,4 @@
-"""From sums in tile order to images in rows, with quads and background; and the adjoint.
+"""Planes in tile order to row-major images, with quads and background; and the adjoint.
 
     quad_q = light . (cos theta_q, sin theta_q, b) + T_e background,   phasor = eta light + T_e background
     colour = channels + T_e background,   opacity = 1 - T_e,   distortion = factor * (half sum)
@@ -21,7 +21,7 @@ _DC = wp.constant(DC_OFFSET)
 
 @wp.struct
 class Tiling:
-    """How pixels lie in planes that are stored by (tile, block, row, column); sides are powers of two."""
+    """Layout of planes that are stored by (tile, block, row, column); sides are powers of two."""
 
     width_log2: int  # columns of a tile
     height_log2: int  # rows of a tile
@@ -108,7 +108,7 @@ def fold_dc_offset(
     tiling: Tiling,  # order of the pixels [px]
     grad_quads: wp.array3d[float],  # [Q, H, W]
     # Out:
-    grad_rows: wp.array[wp.float64],  # [H] what each row adds to the derivative by the DC offset
+    grad_rows: wp.array[wp.float64],  # [H] contribution of each row to the derivative by the DC offset
 ):
     """One thread per row: sum of amplitude times gradient, in double precision."""
     y = wp.tid()
@@ -128,7 +128,7 @@ def add_dc_offset(
     # Out:
     grad_calibration: wp.array[float],  # [4] its last entry is added to
 ):
-    """One thread in all: rows are summed in order, so that the result does not depend on the device's mood."""
+    """One thread in all: rows are summed in order, so that the result is deterministic."""
     total = wp.float64(0.0)
     for y in range(grad_rows.shape[0]):
         total += grad_rows[y]

@@ -21,7 +21,7 @@ BLOCK_RADIUS = wp.constant(
 
 @wp.func
 def visit_of(opacity: float, cov: wp.vec4) -> wp.vec2:
-    """(low, limit) of a record: low decides what has an effect; limit, a little wide, which blocks are visited.
+    """(low, limit) of a record: low is the power at alpha 1/255; limit, conservative, decides which blocks are visited.
 
     With K the conic, sqrt(v K v) is a norm: it changes by at most sqrt(largest eigenvalue) times the distance. So where
     it exceeds sqrt(cutoff) by that much at the middle of a block, no pixel centre of the block lies inside the ellipse.

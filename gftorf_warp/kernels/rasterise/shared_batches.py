@@ -1,13 +1,13 @@
-"""How a warp reads a tile's list, and adds to gradient records, sixteen entries at a time through shared memory.
+"""Splat records, and gradients of them, through shared memory: sixteen entries of a tile's list at a time.
 
-A list is walked in rounds of ``ROUND`` entries. While a warp works on one round, the records of the next one travel
-from global to shared memory without passing registers (cp.async), two lanes per record; then every lane reads the same
-record, a broadcast. On the way back each lane leaves what its pixel says about the records of a round in shared memory,
-and the sums over pixels are taken with other roles: a lane owns one record and one half of the tile. That costs a fifth
-of what folding sums across lanes costs record by record.
+A list is processed in rounds of ``ROUND`` entries. While a warp computes one round, the records of the next one are
+copied from global to shared memory asynchronously (cp.async), two lanes per record; every lane then reads the same
+record, a broadcast. In the backward pass each lane stores the contributions of its pixel to the records of a round in
+shared memory; for the sums over pixels, a lane is assigned one record and one half of the tile. That costs a fifth of
+a warp reduction per record.
 
-The CPU, where a thread is alone, has no shared memory: there a record is read where it lies, and nothing else happens.
-All functions must be reached by all 32 lanes of a warp together.
+On a CPU there is no shared memory: records are read directly, and the other functions do nothing. All 32 lanes of a
+warp must call each function together.
 """
 
 import functools
@@ -19,7 +19,7 @@ from .simd import make_lanes
 from .splat import Splat
 
 ROUND = wp.constant(16)  # entries of a list that are fetched, and whose gradients are summed, together
-GROUP = wp.constant(4)  # of a round that the compiler sees at once: it works on some while others wait for their turn
+GROUP = wp.constant(4)  # of a round that are unrolled together, so that their instructions overlap
 STRIDE = 36  # floats from the values of one entry to those of the next: 4-float reads of 8 lanes meet all 32 banks
 OUT_STRIDE = 20  # the same for gradient records
 PIXELS = 32  # of a tile
@@ -41,10 +41,10 @@ _CHECK = f'static_assert({ROUND} == 16 && {PIXELS} == 32, "two lanes per record,
 
 
 def shared_floats(values: int, derivatives: int) -> int:
-    """Floats of shared memory of a warp: two buffers of records, and what backward keeps.
+    """Floats of shared memory of a warp: two buffers of records, and the values of the backward pass.
 
     Args:
-        values: Values a pixel keeps of each entry of a round.
+        values: Values per pixel and entry of a round.
         derivatives: Groups of four derivatives that belong to a pixel.
     """
     kept = max(values * ROUND * STRIDE, 2 * ROUND * OUT_STRIDE) if values else 0
@@ -58,7 +58,7 @@ def make_batches(values: int = 0, derivatives: int = 0, more: bool = False) -> S
     Args:
         values: As in :func:`shared_floats`.
         derivatives: As in :func:`shared_floats`.
-        more: Whether there is room for three further channels, behind everything else that a forward pass needs.
+        more: Whether three further channels are fetched, too.
     """
     floats = shared_floats(values, derivatives) + _MORE * more
 
@@ -78,11 +78,11 @@ def make_batches(values: int = 0, derivatives: int = 0, more: bool = False) -> S
 
     return SimpleNamespace(
         warp_memory=warp_memory,
-        ask=ask,
-        arrive=arrive,
+        fetch_records=fetch_records,
+        wait_for_records=wait_for_records,
         entry=entry,
         record_of=record_of,
-        ask_more=ask_more,
+        fetch_more=fetch_more,
         more_of=more_of,
     )
 
@@ -116,10 +116,10 @@ def entry(ids: wp.array[int], start: int, step: int, at: int, count: int) -> int
 #endif
 #endif
 """)
-def ask(memory: wp.uint64, splats: wp.array[Splat], i: int, at: int):
-    """Send for the records of the round that begins at entry ``at``, of which ``i`` is this lane's.
+def fetch_records(memory: wp.uint64, splats: wp.array[Splat], i: int, at: int):
+    """Start copying the records of the round that begins at entry ``at``, of which ``i`` is this lane's.
 
-    Where there is none zeros come: a power is never above ``low`` then, and no pixel sees it.
+    Without a record zeros are copied, which have no effect: their power is never above ``low``.
     """
 
 
@@ -137,10 +137,10 @@ def ask(memory: wp.uint64, splats: wp.array[Splat], i: int, at: int):
 #endif
 #endif
 """)
-def ask_more(memory: wp.uint64, records: wp.array[Splat], i: int, at: int):
-    """Send for three further channels, slots 8-10 of other records, as :func:`ask` does for the records.
+def fetch_more(memory: wp.uint64, records: wp.array[Splat], i: int, at: int):
+    """Start copying three further channels, slots 8-10 of other records, as :func:`ask` does for the records.
 
-    Zeros where there is none: what is not a number stays so, whatever its weight.
+    Zeros where there is none: NaN times a weight of 0 would be NaN.
     """
 
 
@@ -149,11 +149,11 @@ def ask_more(memory: wp.uint64, records: wp.array[Splat], i: int, at: int):
 #if __CUDA_ARCH__ >= 800
     asm volatile("cp.async.wait_all;" ::: "memory");
 #endif
-    __syncwarp();  // the records of all lanes are there, and no lane reads the round before any more
+    __syncwarp();  // the records of all lanes have arrived, and no lane reads the previous round any more
 #endif
 """)
-def arrive():
-    """Wait for the records that were sent for."""
+def wait_for_records():
+    """Wait for the records that are being copied."""
 
 
 @wp.func_native(f"""
@@ -189,14 +189,14 @@ def record_of(
 """.replace("Splat&", "wp::vec_t<16, float>&")
 )
 def more_of(memory: wp.uint64, at: int, records: wp.array[Splat], ids: wp.array[int], k: int, there: bool) -> wp.vec3:
-    """The further channels of entry ``at`` of the walk, which is number ``k`` of the pairs."""
+    """The further channels of entry ``at``, which is number ``k`` of the pairs."""
 
 
 @functools.cache
 def make_gradient_rounds(
     tile_width: int, light: bool, channels: bool, geometry: bool, spreads: bool, more: bool = False
 ) -> SimpleNamespace:
-    """Functions that sum what pixels say about the entries of a round; 32 pixels of a tile, one per lane.
+    """Functions that sum the gradients of the entries of a round over the 32 pixels of a tile, one per lane.
 
     Args:
         tile_width: Columns of a tile [px]; each half of its 32 pixels is whole rows.
@@ -204,13 +204,13 @@ def make_gradient_rounds(
         channels: Whether the three channels have.
         geometry: Whether centre, conic and opacity have.
         spreads: Whether the distortion has; then the derivative of the distance differs from entry to entry.
-        more: Whether three further channels have gradients, of their own records.
+        more: Whether three further channels have gradients, in other records.
     """
     half = PIXELS // 2
     if half % tile_width:
         raise ValueError(f"half of a tile must be whole rows, got {tile_width} columns")
     V = make_lanes(1).V
-    kept = ["w"] + ["v"] * geometry + ["w2"] * light + ["wd"] * spreads  # values a pixel keeps of an entry
+    kept = ["w"] + ["v"] * geometry + ["w2"] * light + ["wd"] * spreads  # values per pixel and entry
     derivatives = light + channels + more
     floats = shared_floats(len(kept), derivatives)
     kept_at = _RECORDS + 4 * PIXELS * derivatives
@@ -229,10 +229,10 @@ def make_gradient_rounds(
 """
 
     @wp.func_native(derivatives_snippet)
-    def keep_derivatives(
+    def store_derivatives(
         memory: wp.uint64, g0: V, g1: V, g2: V, g_re: V, g_im: V, g_amplitude: V, g_distance: V, g3: V, g4: V, g5: V
     ):
-        """Leave what belongs to this lane's pixel alone; read after the next barrier."""
+        """Store the derivatives by this lane's pixel; read after the next barrier."""
 
     stores = [f"to[{n * ROUND * STRIDE}] = {name}[0]{' * g_d[0]' * (name == 'wd')};" for n, name in enumerate(kept)]
     stores = [store.replace("wd[0]", "w[0]") for store in stores]
@@ -246,8 +246,8 @@ def make_gradient_rounds(
 """
 
     @wp.func_native(values_snippet)
-    def keep_values(memory: wp.uint64, first: int, n: int, v: V, w: V, w2: V, g_d: V):
-        """Leave what this lane's pixel says about entry ``n`` of the group that begins at entry ``first``."""
+    def store_values(memory: wp.uint64, first: int, n: int, v: V, w: V, w2: V, g_d: V):
+        """Store the values of this lane's pixel for entry ``n`` of the group that begins at entry ``first``."""
 
     take = "\n        ".join(
         f"const float4 {name}4 = from[{(n * ROUND * STRIDE) // 4} + part];"
@@ -281,9 +281,9 @@ def make_gradient_rounds(
 #if defined(__CUDA_ARCH__)
     {places}
     {_ADD4}
-    const int s = lane & 15, upper = lane >> 4;  // this lane owns entry s of the round, and one half of the tile
+    const int s = lane & 15, upper = lane >> 4;  // this lane sums entry s of the round over one half of the tile
     const int i = ids.data[start - at - (s < n ? s : n - 1)];
-    __syncwarp();  // what all lanes kept is there
+    __syncwarp();  // the values of all lanes are stored
     const float* const q = mine + ((at + s) & {2 * ROUND - 1}) * 16;
     float dx[{tile_width}];
     for (int c = 0; c < {tile_width}; ++c)
@@ -306,7 +306,7 @@ def make_gradient_rounds(
             {lit}
         }}
     }}
-    __syncwarp();  // everything kept has been read: its place takes the sums of both halves
+    __syncwarp();  // all values have been read: the sums of both halves overwrite them
     float4* const out = reinterpret_cast<float4*>(kept + (upper * {ROUND} + s) * {OUT_STRIDE});
     #pragma unroll
     for (int part = 0; part < 4; ++part)
@@ -322,12 +322,12 @@ def make_gradient_rounds(
              make_float4(a.x + b.x, a.y + b.y, a.z + b.z, a.w + b.w), of < n);
     }}
     {add_more if more else ""}
-    __syncwarp();  // the next round may keep its values
+    __syncwarp();  // the next round may store its values
 #endif
 """
 
     @wp.func_native(round_snippet)
-    def add_round(
+    def accumulate_round(
         memory: wp.uint64, grads: wp.array[Splat], more: wp.array[Splat], ids: wp.array[int], start: int, at: int,
         n: int, x: V, y: V,
     ):  # fmt: skip
@@ -335,5 +335,9 @@ def make_gradient_rounds(
 
     fetch = make_batches(len(kept), derivatives)
     return SimpleNamespace(
-        **vars(fetch), keep_derivatives=keep_derivatives, keep_values=keep_values, add_round=add_round, floats=floats
+        **vars(fetch),
+        store_derivatives=store_derivatives,
+        store_values=store_values,
+        accumulate_round=accumulate_round,
+        floats=floats,
     )

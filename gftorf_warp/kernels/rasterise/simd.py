@@ -1,4 +1,4 @@
-"""Arithmetic on the K pixels of a thread: one expression, a clang vector on the CPU, scalars on CUDA.
+"""SIMD arithmetic on the K pixels of a thread: one expression, a clang vector on the CPU, scalars on CUDA.
 
 A compositor thread owns a block of K pixels. On the CPU K = 16, a block of 4 x 4, and every operation below becomes one
 vector instruction, because Warp runs CPU threads one after the other and LLVM finds no parallelism by itself. On CUDA

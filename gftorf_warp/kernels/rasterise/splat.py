@@ -18,7 +18,9 @@ import warp as wp
 
 Splat = wp.types.vector(length=16, dtype=wp.float32)
 CHANNEL = wp.constant(8)  # first slot of the T-weighted channels
-AHEAD = wp.constant(4)  # records a CPU thread asks for in advance: they lie scattered, and waiting costs a tenth
+AHEAD = wp.constant(
+    4
+)  # records that a CPU thread prefetches: they are scattered in memory, and cache misses cost a tenth
 
 _LOAD = """
 #if defined(__CUDA_ARCH__)  // component-wise reads would be sixteen; a record is aligned, so four of 16 bytes do
@@ -60,7 +62,7 @@ def block_missed(splats: wp.array[Splat], i: int, x: float, y: float) -> bool:
 
 @wp.func_native("__builtin_prefetch(splats.data + i, 0, 3);")
 def prefetch(splats: wp.array[Splat], i: int):
-    """Ask for record ``i`` before it is needed; only a CPU has the instruction."""
+    """Prefetch record ``i``; on a CPU."""
 
 
 @wp.kernel(enable_backward=False)

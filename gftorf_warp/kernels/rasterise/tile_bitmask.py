@@ -1,6 +1,6 @@
-"""The list of each tile out of a matrix of bits, one per tile and splat: counted, then read in the order of depth.
+"""The list of each tile out of a bit mask with one bit per tile and splat: counted, then read in depth order.
 
-Bit r % 32 of word r / 32 of a tile says whether the tile lists the splat of depth rank r. Splats are in the order of
+Bit r % 32 of word r / 32 of a tile is set if the tile lists the splat of depth rank r. Splats are in the order of
 depth already, so the bits of a tile in their order are its list, and nothing is left to sort. ``mark_pairs`` of
 tiles.py writes the matrix.
 """
@@ -36,7 +36,7 @@ STEP = wp.constant(2048)  # bits that a warp of CUDA reads at once, 64 a lane
 WARPS = 8  # of a block
 
 
-# plain pointers: of Warp's way to an element, by strides and from the end, the loop would have twice the instructions
+# plain pointers: Warp's indexing, with strides and negative indices, takes twice the instructions
 @wp.func_native(f"""
 #if defined(__CUDA_ARCH__)
     __shared__ unsigned short room[{WARPS}][{STEP}];
@@ -64,7 +64,7 @@ def write_ids(
     """List the splats whose bits are set; the lowest bit is that of depth rank ``rank``, of this warp ``lowest``.
 
     Those of this lane go to ``place`` and behind it, those of the warp to ``begin`` .. ``end`` - 1, neighbours by
-    neighbouring lanes: they find ranks in shared memory, where every lane has left its own.
+    neighbouring lanes, by way of shared memory.
     """
 
 
@@ -112,7 +112,7 @@ def list_bits(
     first: wp.array[int],  # [tiles + 1] where the list of each tile begins; the last entry ends the last list
     total: wp.array[int],  # [1] pairs there would be, whether they fit or not
 ):
-    """One warp per part of a tile: a sum over lanes tells each lane where the splats of its two words go.
+    """One warp per part of a tile: a sum over lanes gives the place of the splats of each lane's two words.
 
     Pairs that do not fit are dropped, those of the last tiles first, and show in ``total``.
     """

@@ -1,4 +1,4 @@
-"""Which splats each tile has to look at: where an ellipse crosses a row of tiles, counts, keys, and each tile's list.
+"""Which splats each tile composites: where an ellipse crosses a row of tiles, counts, keys, and the list of each tile.
 
 A tile lists a splat if the ellipse alpha >= 1/255 reaches the rectangle of its pixel centres. The tiles of one row that
 an ellipse reaches are neighbours, so a row is a span, and a splat costs as many steps as it has rows. Either each pair
@@ -91,7 +91,7 @@ def rows_from(
 
 @wp.func
 def tile_of(rows: wp.vec2i, pair: int, top: int, tiles_x: int) -> int:
-    """The tile of a pair by its number in the rows of :func:`rows_from`; every lane must ask, for one of its own."""
+    """The tile of a pair by its number in the rows of :func:`rows_from`; all lanes must call it, each for its pair."""
     row = lane_beyond(rows[0], pair)
     return (top + row) * tiles_x + of_lane(rows[1], row) + pair
 
@@ -110,7 +110,7 @@ def mark_pairs(
     # Out:
     bits: wp.array[wp.uint32],  # [groups * words * GROUP] zeroed; which splats each tile lists
 ):
-    """One warp per splat, as in :func:`emit_pairs`, but a pair is a bit, whose place depends on nobody else."""
+    """One warp per splat, as in :func:`emit_pairs`, but a pair is a bit, at a place that depends on no other pair."""
     rank, lane = wp.tid()
     i = order[rank]
     if box_px[i][2] > 0:
