@@ -7,9 +7,11 @@ serves every raw frame, pose, modulation frequency, phase shift and progress of 
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -25,6 +27,7 @@ from .settings import ReconSettings
 from .terms import Term, View
 
 ROWS = ("light", "depth", "colour", "flow")  # row numbers of an image, see ``Comparison.rows``
+NUMBERS = len(ROWS) + 2  # integers of an image: its rows, seed and number of its random background
 FLOWS = 2  # of a quartet: to the next one and to the previous one
 RESULTS = 3  # numbers per image and term: the term, its mean squared difference, its mean opacity
 
@@ -39,9 +42,12 @@ class ImageKey:
     """What is rendered. Flow at the time of the ToF image comes with that rendering."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class GraphKey:
-    """What decides which operations a step consists of: steps of one key share a CUDA graph."""
+    """What decides which operations a step consists of: steps of one key share a CUDA graph.
+
+    Keys are compared by identity: a control block makes one object for equal values.
+    """
 
     images: tuple[ImageKey, ...]
     """The images of the batch."""
@@ -52,11 +58,20 @@ class GraphKey:
     sh_degree: int
     """Degree of the harmonics."""
 
+    @cached_property
+    def terms(self) -> frozenset[str]:
+        """Names of all terms but the flow, which not all steps have."""
+        return frozenset(name for image in self.images for name in image.terms) - {"flow"}
+
     @property
+    def has_flow(self) -> bool:
+        """Whether any image has the flow term."""
+        return any("flow" in image.terms for image in self.images)
+
+    @cached_property
     def stage(self) -> tuple[object, ...]:
         """Equal for keys that alternate. When it changes, earlier graphs are not needed again."""
-        names = {name for image in self.images for name in image.terms} - {"flow"}
-        return self.keys > 0, self.frozen, self.sh_degree, frozenset(names)
+        return self.keys > 0, self.frozen, self.sh_degree, self.terms
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -99,7 +114,9 @@ class ControlBlock:
         self.observations, self.settings = observations, settings
         self.terms, self.motion, self.groups = terms, motion, groups
         self.images = max(len(batch) for batch in observations.batches)
-        self._key_counts = {flow: self._most_keys(flow=flow) for flow in (False, True)}
+        self._key_counts = {
+            flow: max(len(self._keys_of(batch, flow=flow)) for batch in observations.batches) for flow in (False, True)
+        }
         keys = max(self._key_counts.values())
         camera = len(self._camera(View.TOF, observations.batches[0][0]))
         flow_cameras = self._flow_cameras(observations.batches[0][0])
@@ -111,9 +128,10 @@ class ControlBlock:
             ("blend", View.COLOUR): (1, keys),
             ("blend", View.FLOW): (1 + FLOWS, keys),
         }
-        self._constants: dict[tuple, tuple[list[int], np.ndarray]] = {}
+        self._keys: dict[tuple, GraphKey] = {}
+        self._constants: dict[tuple, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
         sizes = len(groups) + 1, self.images * len(terms) * RESULTS, self.images * self._image_floats
-        ints = keys + self.images * (len(ROWS) + 2)
+        ints = keys + self.images * NUMBERS
         self._upload = DeviceUpload([(ints, torch.int32), (sum(sizes), torch.float32)], observations.quads.device)
         self._ints, floats = self._upload.parts
         scalars, weights, constants = floats.split(sizes)
@@ -127,16 +145,31 @@ class ControlBlock:
 
     # -- host ----------------------------------------------------------------------------------------
 
-    def key_of(self, frames: list[int], first: int, *, moves: bool, frozen: bool, sh_degree: int) -> GraphKey:
-        """The key of a step of some raw frames that begins after ``first`` images."""
-        active = [
-            term for term in self.terms if term.weight(self.settings, first) > 0 and (moves or not term.needs_motion)
-        ]
-        images = tuple(self._image_key(frame, active) for frame in frames)
-        keys = self._key_counts[_has_flow(images)] if moves else 0
-        return GraphKey(images=images, keys=keys, frozen=frozen, sh_degree=sh_degree)
+    def key_of(
+        self, frames: list[int], weights: tuple[float, ...], *, moves: bool, frozen: bool, sh_degree: int
+    ) -> GraphKey:
+        """The key of a step of some raw frames with these weights of the terms."""
+        active = tuple(w > 0 and (moves or not t.needs_motion) for t, w in zip(self.terms, weights, strict=True))
+        name = (*frames, active, moves, frozen, sh_degree)
+        if name not in self._keys:
+            terms = list(itertools.compress(self.terms, active))
+            images = tuple(self._image_key(frame, terms) for frame in frames)
+            keys = self._key_counts[_has_flow(images)] if moves else 0
+            values = images, keys, frozen, sh_degree
+            if values not in self._keys:
+                self._keys[values] = GraphKey(images=images, keys=keys, frozen=frozen, sh_degree=sh_degree)
+            self._keys[name] = self._keys[values]
+        return self._keys[name]
 
-    def write(self, key: GraphKey, frames: list[int], first: int, seed: int, rates: dict[str, float]) -> None:
+    def write(
+        self,
+        key: GraphKey,
+        frames: list[int],
+        first: int,
+        seed: int,
+        weights: tuple[float, ...],
+        rates: dict[str, float],
+    ) -> None:
         """Upload the values of the next step, asynchronously.
 
         Args:
@@ -144,21 +177,21 @@ class ControlBlock:
             frames: Raw frames of the batch.
             first: Number of its first image, counted over the run.
             seed: Of random backgrounds.
+            weights: Of all terms.
             rates: Learning rate by group.
         """
-        name = tuple(frames), key.keys, _has_flow(key.images)
+        name = (*frames, key)
         if name not in self._constants:
             self._constants[name] = self._constants_of(key, frames)
-        keys, constants = self._constants[name]
-        ints = keys + [0] * (self._key_counts[True] - len(keys))
-        for n, frame in enumerate(frames):
-            ints += [*self._rows_of(frame), seed, first + n]
-        weights = np.zeros((self.images, len(self.terms), RESULTS), np.float32)
-        for n, image in enumerate(key.images):
-            self._weigh(image, first, weights[n])
-        compared = float(sum(bool(image.terms) for image in key.images))
+        ints, present, constants = self._constants[name]
+        origins = ints[-self.images * NUMBERS :].reshape(self.images, NUMBERS)[:, len(ROWS) :]
+        origins[:, 0], origins[:, 1] = seed, np.arange(first, first + self.images)
+        scale = np.ones((len(self.terms), RESULTS), np.float32)
+        scale[:, 0] = weights
+        compared = sum(bool(image.terms) for image in key.images)
         scalars = [*(rates[name] for name in self.groups), compared]
-        self._upload.send(ints, np.concatenate([scalars, weights.ravel(), constants], dtype=np.float32))
+        factors = (present * scale).ravel()
+        self._upload.send(ints, np.concatenate([scalars, factors, constants], dtype=np.float32))
 
     def _image_key(self, frame: int, active: list[Term]) -> ImageKey:
         terms = [term for term in active if term.applies(self.observations, frame)]
@@ -168,16 +201,6 @@ class ControlBlock:
             views.remove(View.FLOW)
         return ImageKey(terms=tuple(term.name for term in terms), views=frozenset(views))
 
-    def _weigh(self, image: ImageKey, first: int, weights: Float[np.ndarray, "T 3"]) -> None:
-        """Fill in the weights of one image."""
-        logged = False
-        for term, row in zip(self.terms, weights, strict=True):
-            if term.name in image.terms:
-                row[0] = term.weight(self.settings, first)
-                if term.channels is not None and not logged:
-                    row[1:] = 1.0, term.channels(self.observations)
-                    logged = True
-
     def _rows_of(self, frame: int) -> list[int]:
         """In the order of ``ROWS``; 0 where there is no such image, which no term reads then."""
         shown, quartet = self.observations, frame // self.observations.sequence.cycle
@@ -185,27 +208,40 @@ class ControlBlock:
         depth, flow = (stack.rows.get(quartet, 0) for stack in (shown.closed_form, shown.flow))
         return [light, depth, shown.colour.rows.get(frame, 0), flow]
 
-    def _constants_of(self, key: GraphKey, frames: list[int]) -> tuple[list[int], np.ndarray]:
-        """Keys of a batch, and what its frames decide alone, in the layout of the device."""
+    def _constants_of(self, key: GraphKey, frames: list[int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """What frames and key of a batch decide, in the layout of the device.
+
+        Returns:
+            Integers; factors [B, T, 3] of the results; other floats.
+        """
         flow = _has_flow(key.images)
         keys = self._keys_of(frames, flow=flow) if key.keys else []
         keys += keys[-1:] * (key.keys - len(keys))  # a repeated key of weight 0
+        ints = np.zeros(self._key_counts[True] + self.images * NUMBERS, np.int32)
+        ints[: len(keys)] = keys
+        rows = ints[-self.images * NUMBERS :].reshape(self.images, NUMBERS)
+        factors = np.zeros((self.images, len(self.terms), RESULTS), np.float32)
         constants = np.zeros((self.images, self._image_floats), np.float32)
-        for n, frame in enumerate(frames):
+        for n, (frame, image) in enumerate(zip(frames, key.images, strict=True)):
+            rows[n, : len(ROWS)] = self._rows_of(frame)
+            terms = [(k, term) for k, term in enumerate(self.terms) if term.name in image.terms]
+            for k, _ in terms:
+                factors[n, k, 0] = 1.0
+            logged = [(k, term.channels) for k, term in terms if term.channels is not None][:1]
+            for k, channels in logged:
+                factors[n, k, 1:] = 1.0, channels(self.observations)
             start = 0
             for (kind, view), shape in self._parts.items():
                 part = constants[n, start : start + math.prod(shape)]
                 start += math.prod(shape)
-                if kind == "blend" and (not keys or (view == View.FLOW and not flow)):
-                    continue  # nothing moves, or the keys of the quartet's start are not among them
-                if kind == "blend":
-                    rows = self._blend(view, frame, keys, flow=flow)
-                    part[: rows.size] = rows.ravel()  # of as many keys as the graph has
-                elif view == View.FLOW:
+                if kind == "blend" and keys:
+                    blend = self._blend(view, frame, keys, flow=flow)
+                    part[: blend.size] = blend.ravel()  # of as many keys as the graph has
+                elif kind == "camera" and view == View.FLOW:
                     part[:] = self._flow_cameras(frame).ravel()
-                elif view == View.TOF or frame in self.observations.colour:
+                elif kind == "camera" and (view == View.TOF or frame in self.observations.colour):
                     part[:] = self._camera(view, frame)
-        return keys, constants.ravel()
+        return ints, factors, constants.ravel()
 
     def _camera(self, view: View, frame: int) -> np.ndarray:
         shown = self.observations
@@ -258,10 +294,6 @@ class ControlBlock:
             times += [starts[i] for i in wanted if 0 <= i < len(starts)]
         return sorted({key for time in times for key in self.motion.keys_at(time).index})
 
-    def _most_keys(self, *, flow: bool) -> int:
-        """Of any batch."""
-        return max(len(self._keys_of(batch, flow=flow)) for batch in self.observations.batches)
-
     @property
     def _image_floats(self) -> int:
         return sum(math.prod(shape) for shape in self._parts.values())
@@ -274,8 +306,8 @@ class ControlBlock:
 
     def image(self, n: int, key: GraphKey) -> ImageControl:
         """Device memory of image ``n`` of the batch."""
-        begin = self._key_counts[True] + n * (len(ROWS) + 2)
-        ints = self._ints[begin : begin + len(ROWS) + 2]
+        begin = self._key_counts[True] + n * NUMBERS
+        ints = self._ints[begin : begin + NUMBERS]
         parts = dict(zip(self._parts, self._floats[n].split([*map(math.prod, self._parts.values())]), strict=True))
         blend = {}
         for view in View:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import asdict
 from typing import Any
 
 import torch
@@ -46,7 +45,7 @@ def rates_at(
         revived_at: Progress when the motion was last reinitialised; None: never.
     """
     schedule = settings.schedule
-    first, last = asdict(settings.rates), asdict(settings.rates_last)
+    first, last = vars(settings.rates), vars(settings.rates_last)
     share = min(images / schedule.images, 1.0)
     begin = schedule.motion_decay_from
     shares = dict.fromkeys(first, share)

@@ -74,7 +74,7 @@ class Stepper:
         self._readback, self._replays = DeviceReadback(self._step.output.counts), 0
         self._capacity = PairCapacity()
         self._graphs: dict[GraphKey, Callable[[], None]] = {}
-        self._stage: tuple[object, ...] | None = None
+        self._key: GraphKey | None = None  # of the last step
         self._steps = 0  # since the last :meth:`_attach`
         self._pool = graph_pool(device)
         self._attach()
@@ -84,9 +84,10 @@ class Stepper:
         state, settings = self.state, self.settings
         frames = draw(state, self.observations, settings)
         before, state.images = state.images, state.images + len(frames)
+        weights = tuple(term.weight(settings, before) for term in self._step.terms)
         key = self._control.key_of(
             frames,
-            before,
+            weights,
             moves=before >= settings.schedule.warm_up and not isinstance(state.motion, Still),
             frozen=frozen(settings, before),
             sh_degree=render_settings_at(settings, before).sh_degree,
@@ -96,7 +97,7 @@ class Stepper:
         due = densify.round_is_due(before, state.images, settings.densify, settings.schedule)
         if due and settings.densify.loses_step:
             rates = {name: rate if name == "motion" else 0.0 for name, rate in rates.items()}
-        self._control.write(key, frames, before, state.noise_seed, rates)
+        self._control.write(key, frames, before, state.noise_seed, weights, rates)
         self._run(key)
         self._steps += 1
         densify_after(state, self.observations, before, settings)
@@ -158,12 +159,14 @@ class Stepper:
 
     def _enter(self, key: GraphKey) -> None:
         """Release the graphs of a stage that is over; prepare the one that begins."""
-        if key.stage == self._stage:
+        last, self._key = self._key, key
+        if last is not None and last.stage == key.stage:
             return
         if self._graphs:
             self._read_counts()  # waits: graphs must have run before their memory is released
             self._release_graphs()
-        self._stage, self._capacity = key.stage, PairCapacity()  # other renderings: count their pairs first
+        if last is None or last.terms != key.terms:  # other renderings: their pairs are counted first
+            self._capacity = PairCapacity()
         self._attach(free=True)
         motion, padded = self.state.motion, self._padded
         if key.frozen and motion.follows_means:
