@@ -123,7 +123,7 @@ def test_mistake_15_a_pixel_of_unknown_flow_is_read_and_left_out(tmp_path):
     sequence = Sequence.open(folder)
     assert np.isnan(sequence.flow.forward[0]).sum() == 1
     prepared = observe(sequence, replace(presets.demo(), width_max=10), "cpu")
-    unknown = prepared.flow[0, 1].isnan().any(dim=0)
+    unknown = prepared.flow[0][0].isnan().any(dim=0)
     assert unknown.sum() == 1
     assert unknown[1, 2]
     field = from_phase(sequence, EVERY_PIXEL).field
