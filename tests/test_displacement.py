@@ -1,5 +1,6 @@
 """Displaced Gaussians by kernels against the oracle, finite differences, and rotations known otherwise."""
 
+import inspect
 import math
 
 import pytest
@@ -133,6 +134,11 @@ def test_few_gaussians(device, count):
     results, gradients = evaluated(displaced, values, weights.float().to(device), True)
     assert [len(result) for result in results] == [count] * 3
     assert [gradient.shape for gradient in gradients] == [value.shape for value in values]
+
+
+def test_the_oracle_takes_the_same_arguments():
+    """So that a test can call both alike."""
+    assert inspect.signature(displaced) == inspect.signature(reference.displaced)
 
 
 @pytest.mark.contract
