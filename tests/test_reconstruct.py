@@ -16,7 +16,7 @@ from gftorf_warp.data.sequence import Flow
 from gftorf_warp.data.write import write
 from gftorf_warp.errors import InputError, UsageError
 from gftorf_warp.evaluate.compare import compare
-from gftorf_warp.recon import presets, train
+from gftorf_warp.recon import loop, presets
 from gftorf_warp.recon.observations import observe
 from gftorf_warp.recon.run import Run
 from gftorf_warp.recon.settings import FlowSource, plain
@@ -157,7 +157,7 @@ def test_the_number_of_threads_changes_no_bit(monkeypatch, tmp_path):
     """Images of a batch are summed in their order, whoever finishes first."""
     results = []
     for workers in (1, 3):
-        monkeypatch.setattr(train, "available_threads", lambda workers=workers: workers)
+        monkeypatch.setattr(loop, "available_threads", lambda workers=workers: workers)
         results.append(stored(reconstruct(small(), tmp_path / str(workers), demo(images=24)).path))
     assert same(*results)
 
