@@ -1,4 +1,4 @@
-"""Numbers that more than one room needs, each with its reason."""
+"""Numbers used by several packages, each with its reason."""
 
 import math
 
@@ -16,5 +16,5 @@ FRAME_RATE_HZ = 120.0  # [Hz] raw frames per second of the F-ToeRF recordings
 CANONICAL_SHIFTS = (0.0, math.pi, math.pi / 2, 3 * math.pi / 2)  # [rad] order in memory: +cos, -cos, +sin, -sin
 WINDOW = 11  # taps of the Gaussian window of the similarity, as published for images of 8 bits
 WINDOW_SIGMA = 1.5  # [px] standard deviation of that window
-STABILISE_MEAN = 1e-4  # (0.01 L)^2 for a range L = 1: keeps the comparison of means defined in the dark
+STABILISE_MEAN = 1e-4  # (0.01 L)^2 for a range L = 1: keeps the comparison of means defined in black regions
 STABILISE_SPREAD = 9e-4  # (0.03 L)^2, the same for the comparison of contrasts

@@ -1,4 +1,4 @@
-"""Errors a user can cause: each says what is wrong, where, why, and what to do; the command line adds exit codes."""
+"""Errors that a user can fix: each states what is wrong, where, why, and a fix; each class has an exit code."""
 
 
 class GftorfError(Exception):

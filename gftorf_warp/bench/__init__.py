@@ -1,1 +1,1 @@
-"""What things cost: the parts of ``gftorf bench``, one file each. Imports every room; no room imports it."""
+"""The parts of ``gftorf bench``, one file each. May import every package; only the command line imports it."""

@@ -1,4 +1,4 @@
-"""The motion network: forward and backward for Q key times at once, per query; what it needs of places included."""
+"""The motion network: forward and backward for Q key times at once, encoding of positions included."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ COUNTS = (20_000, 100_000)
 QUICK_COUNTS = (100,)
 QUERIES = (1, 2, 3)
 KEYS, PERIOD_S, LENGTH_M = 16, 4 / 120, 7.5
-BY_TORCH = "half by torch"  # by cuBLAS, where there are kernels of ours for it
+BY_TORCH = "half by torch"  # by cuBLAS, for comparison with our kernels
 
 
 def measure(device: str, *, quick: bool, runs: int, report: Report) -> list[dict[str, Any]]:
     """Rows of N, Q and precision: time of one forward and backward pass, and per query [ms].
 
-    The network is the published one, 8 layers of 256. On a CPU all precisions are one, so that one is timed. Half
-    precision is what captured steps have; where those are kernels of ours, torch's products follow as ``BY_TORCH``.
+    The network is the published one, 8 layers of 256. A CPU has one precision. Where half precision has kernels of
+    ours, it is also timed with cuBLAS, as ``BY_TORCH``.
 
     Args:
-        device: Where.
+        device: "cpu" or a CUDA device.
         quick: Small N.
-        runs: How often everything is done.
+        runs: Repetitions of every timing.
         report: Called with (rows done, rows in all).
     """
     watch = watch_of(device)
@@ -47,12 +47,12 @@ def measure(device: str, *, quick: bool, runs: int, report: Report) -> list[dict
         network = Network(times, settings, duration=float(times[-1]), length=LENGTH_M, generator=generator).to(device)
         set_backend(network, products)
         field = points(LENGTH_M * torch.rand(count, 3, generator=generator)).map(lambda value: value.to(device))
-        slope = torch.randn(queries, count, 3, generator=generator).to(device)
+        cotangent = torch.randn(queries, count, 3, generator=generator).to(device)
         weights = list(network.parameters())
         keys = list(range(4, 4 + queries))
 
-        def both(network=network, field=field, slope=slope, weights=weights, keys=keys) -> object:
-            return torch.autograd.grad(network.at_keys(network.bind(field), keys).offset, weights, slope)
+        def both(network=network, field=field, cotangent=cotangent, weights=weights, keys=keys) -> object:
+            return torch.autograd.grad(network.at_keys(network.bind(field), keys).offset, weights, cotangent)
 
         def forward(network=network, field=field, keys=keys) -> object:
             with torch.no_grad():
@@ -67,12 +67,12 @@ def measure(device: str, *, quick: bool, runs: int, report: Report) -> list[dict
 
 
 def products_of(kind: str) -> Products:
-    """The setting behind a row."""
+    """The setting of a row."""
     return Products.HALF if kind == BY_TORCH else Products(kind)
 
 
 def set_backend(network: Network, kind: str) -> None:
-    """The backend of a run on this device, or cuBLAS."""
+    """Select the backend of training on this device, or cuBLAS."""
     if kind == BY_TORCH:
         network.backend = HalfPrecision(CublasLayers(), Form.of(network))
     else:
@@ -80,7 +80,7 @@ def set_backend(network: Network, kind: str) -> None:
 
 
 def kinds(device: str) -> list[str]:
-    """Rows of one case: every precision, and half precision by torch, if steps have something else on the device."""
+    """Rows of one case: every precision, and half precision by cuBLAS where the device has kernels of ours."""
     times = torch.arange(KEYS, dtype=torch.float64) * PERIOD_S
     form = Form.of(Network(times, MotionSettings(), duration=1.0, length=LENGTH_M))
     own = fits(form, torch.empty(0, device=device).device)
@@ -88,7 +88,7 @@ def kinds(device: str) -> list[str]:
 
 
 def points(mean: Float[Tensor, "N 3"]) -> GaussianField:
-    """Gaussians of which only the places [m] matter."""
+    """Gaussians at given positions [m]; other parameters are arbitrary."""
     count = len(mean)
     return GaussianField(
         mean=mean,

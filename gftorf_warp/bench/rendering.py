@@ -50,7 +50,7 @@ def _launched(_: Run, render: Render) -> Way | None:
     return _single(render)
 
 
-WAYS: dict[str, Callable[[Run, Render], Way | None]] = {  # of a run and a new renderer of it; None: there is none here
+WAYS: dict[str, Callable[[Run, Render], Way | None]] = {  # of a run and a new renderer of it; None: not available
     "render": lambda run, _: _single(run.render),
     "renderer": lambda _, render: _single(render),
     "unchecked": lambda _, render: _single(partial(render, checked=False)) if isinstance(render, Replay) else None,
@@ -66,14 +66,14 @@ COMMANDS = {"files": False, "stored": True}  # whether they write arrays
 def measure(
     path: Path, out: Path, device: str, *, quick: bool, images: int | None, report: Report
 ) -> list[dict[str, Any]]:
-    """Rows of the ways: images per second.
+    """Images per second, one row for each of ``WAYS`` and ``COMMANDS``.
 
     Args:
         path: Folder of the run.
         out: New folder for images.
-        device: Where.
+        device: "cpu" or a CUDA device.
         quick: A few images only.
-        images: How many; None: 600.
+        images: Their number; None: 600.
         report: Called with (ways done, ways in all).
     """
     run, watch = Run.open(path, device), watch_of(device)
@@ -106,7 +106,7 @@ def measure(
         rate = total / (time.perf_counter() - start)
         fits = not isinstance(render, Replay) or render.fits()
         if not fits:
-            LOG.warning("%s: some images needed more pairs than were reserved, and lack far splats", name)
+            LOG.warning("%s: some images needed more than the pair capacity and lack far splats", name)
         row = about | {"way": name, "images": total, "images_per_s": rate, "ms": Timing.of(times).plain(), "fits": fits}
         rows.append(row)
         report(done, steps, images_per_s=rate)
@@ -120,20 +120,20 @@ def measure(
 
 
 def _commanded(run: Run, out: Path, seconds: list[float], arrays: bool) -> dict[str, Any]:
-    """What ``gftorf render`` takes: all of it, and from the first to the last but one progress, before the flush."""
-    seen: list[tuple[int, float]] = []
+    """Rates of ``gftorf render``: overall, and between the first and the last but one progress, before the flush."""
+    times: list[tuple[int, float]] = []
     begun = time.perf_counter()
     views.render_to_folder(
-        run, out, WHAT, seconds, arrays=arrays, progress=lambda done, _: seen.append((done, time.perf_counter()))
+        run, out, WHAT, seconds, arrays=arrays, progress=lambda done, _: times.append((done, time.perf_counter()))
     )
     spent = time.perf_counter() - begun
-    (first, early), (last, late) = seen[0], seen[max(0, len(seen) - 2)]
+    (first, early), (last, late) = times[0], times[max(0, len(times) - 2)]
     going = (last - first) / (late - early) if last > first else None
     return {"images": len(seconds), "images_per_s": len(seconds) / spent, "going_images_per_s": going, "ms": None}
 
 
 def _exhaust(images: Iterator[Any]) -> None:
-    """Ask for all of them, and hold none."""
+    """Iterate without keeping references."""
     deque(images, maxlen=0)
 
 

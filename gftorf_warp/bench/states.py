@@ -54,7 +54,7 @@ class Fitted:
 
 
 def simulated(path: Path, *, quick: bool) -> Path:
-    """The scene as a folder, simulated unless it is there."""
+    """The folder of the scene, simulated if absent."""
     if path.exists():
         return path
     return simulate(SCENE, path, frames=QUICK_FRAMES if quick else FRAMES, size=QUICK_SIZE if quick else SIZE, seed=0)

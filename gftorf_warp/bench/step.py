@@ -162,11 +162,11 @@ def waits(run: Run, device: str) -> float:
     """Synchronisations with the device per image that torch reports; those of Warp are not included."""
     module = torch.get_device_module(device)
     module.set_sync_debug_mode("warn")
-    with warnings.catch_warnings(record=True) as seen:
+    with warnings.catch_warnings(record=True) as messages:
         warnings.simplefilter("always")
         advance(run, WATCHED)
     module.set_sync_debug_mode("default")
-    return sum("synchroniz" in str(warning.message) for warning in seen) / WATCHED
+    return sum("synchroniz" in str(warning.message) for warning in messages) / WATCHED
 
 
 def profiled(run: Run, device: str) -> str:

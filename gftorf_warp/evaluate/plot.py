@@ -64,7 +64,7 @@ class _Axis(NamedTuple):
         if not self.log:
             step = _step((self.high - self.low) / LABELS)
             first, last = math.ceil(self.low / step - 1e-9), math.floor(self.high / step + 1e-9)
-            return [(step * k, f"{step * k:.10g}") for k in range(first, last + 1)]
+            return [(step * k, _number(step * k)) for k in range(first, last + 1)]
         decades = range(math.floor(math.log10(self.low)), math.ceil(math.log10(self.high)) + 1)
         every = -(-len(decades) // (LABELS + 2))
         decimal = self.high / self.low < 100.0
@@ -155,6 +155,15 @@ def _axis(
     low = min(low, 0.0) if from_zero else low
     span = high - low or abs(high) or 1.0
     return _Axis(low if from_zero and low == 0.0 else low - MARGIN * span, high + MARGIN * span, False, start, end)
+
+
+def _number(value: float) -> str:
+    """A number in up to five characters, else with a power of ten."""
+    text = f"{value:.10g}"
+    if len(text) <= 5:
+        return text
+    digits, exponent = f"{value:.3e}".split("e")
+    return f"{float(digits):g}\N{MIDDLE DOT}10{str(int(exponent)).translate(SUPERSCRIPT)}"
 
 
 def _step(least: float) -> float:

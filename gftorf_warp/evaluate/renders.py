@@ -100,7 +100,7 @@ def prepare_folder(out: Path, listed: Mapping[str, object], *, fresh: bool) -> N
                 why="it holds images of another run, or other times or poses"
                 if ours
                 else f"it has no {LIST}: these are no images",
-                fix="choose another --out" + (", or --fresh, which moves what is there aside" if ours else ""),
+                fix="choose another --out" + (", or --fresh, which moves its content aside" if ours else ""),
             )
         set_aside(out, held)
     out.mkdir(parents=True, exist_ok=True)
