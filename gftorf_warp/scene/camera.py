@@ -1,4 +1,4 @@
-"""The camera: intrinsics of the stored resolution, one pose, and a pinhole or a lens that distorts."""
+"""The camera: intrinsics of the stored resolution, one pose, and a pinhole or a distortion."""
 
 from __future__ import annotations
 
@@ -22,7 +22,8 @@ class Guard(NamedTuple):
     """Limits of the projection, as x/z and y/z of a point [1]."""
 
     x: float
-    """Half the width of the view times 1.3: derivatives are those at this limit beyond it (method, 2.2)."""
+    """Half the width of the view times 1.3: derivatives are those at this limit beyond it (method,
+    2.2)."""
     y: float
     """Half its height times 1.3, likewise."""
     radius: float
@@ -31,7 +32,7 @@ class Guard(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Camera:
-    """A camera with axes x right, y down, z forward; the centre of pixel [0, 0] is at (0.5, 0.5)."""
+    """A camera with axes x right, y down, z forward; pixel [0, 0] is centred at (0.5, 0.5)."""
 
     width: int
     """Columns W of the image."""
@@ -67,7 +68,7 @@ class Camera:
 
     @classmethod
     def from_fov(cls, width: int, height: int, horizontal_fov_deg: float, **pose: Any) -> Camera:
-        """A camera with square pixels, a centred principal point and a horizontal field of view [deg]."""
+        """A camera with square pixels, a centred principal point and a field of view [deg]."""
         focal = 0.5 * width / math.tan(math.radians(horizontal_fov_deg) / 2)
         return cls(width=width, height=height, fx=focal, fy=focal, cx=width / 2, cy=height / 2, **pose)
 
@@ -108,10 +109,11 @@ class Camera:
         return xx * yy - xy * xy
 
     def slopes(self, points: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n 2"]:
-        """x/z and y/z [1] of rays at image positions (x, y) [px], in their dtype, without distortion.
+        """x/z and y/z [1] of rays at image positions (x, y) [px], without distortion.
 
         Raises:
-            ValueError: If a position is so far outside the image that the lens cannot be inverted there.
+            ValueError: If a position is so far outside the image that the lens cannot be inverted
+                there.
         """
         flat = (points - points.new_tensor([self.cx, self.cy])) / points.new_tensor([self.fx, self.fy])
         if not self.distortion:
@@ -132,12 +134,12 @@ class Camera:
         return directions / directions.norm(dim=-1, keepdim=True)
 
     def rays(self, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32) -> Float[Tensor, "H W 3"]:
-        """Unit vectors through the pixel centres, in world axes: point = centre + distance * ray."""
+        """World unit vectors through the pixel centres: point = centre + distance * ray."""
         world_from_camera = torch.from_numpy(self.camera_from_world[:3, :3].T.copy())
         return (self.directions() @ world_from_camera.T).to(device=device, dtype=dtype)
 
     def project(self, point: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 2"]:
-        """Image position (x, y) [px] of points in the world [m]; meaningless for points behind the camera."""
+        """Image position (x, y) [px] of points in the world [m], in front of the camera."""
         kind = point.device, point.dtype
         if kind not in self._sent:
             numbers = self.camera_from_world, np.array([self.fx, self.fy]), np.array([self.cx, self.cy])
@@ -151,7 +153,7 @@ class Camera:
 
     @functools.cached_property
     def _sent(self) -> dict[tuple[torch.device, torch.dtype], tuple[Tensor, ...]]:
-        """Pose, focal lengths and principal point by device and dtype, uploaded once: an upload synchronises a GPU."""
+        """Pose and intrinsics by device and dtype: an upload synchronises a GPU."""
         return {}
 
 

@@ -1,6 +1,7 @@
 """Changes of single settings by name: ``init.reflectivity=0.5``, ``bodies.1.path.velocity=3,0,0``.
 
-They apply to frozen dataclasses: dots select fields of nested ones, numbers select members of tuples.
+They apply to frozen dataclasses: dots select fields of nested ones, numbers select members of
+tuples.
 """
 
 from __future__ import annotations
@@ -39,11 +40,13 @@ def changed(settings: Settings, changes: Iterable[str], wording: Wording) -> Set
 
     Args:
         settings: A frozen dataclass.
-        changes: Texts ``name=value``; dots join the parts of a name, commas the values of a tuple, None is ``none``.
+        changes: Texts ``name=value``; dots join the parts of a name, commas the values of a tuple,
+            None is ``none``.
         wording: Texts of error messages.
 
     Raises:
-        UsageError: If a text has no value, a name is unknown, or a value is not of the kind of the setting.
+        UsageError: If a text has no value, a name is unknown, or a value is not of the kind of the
+            setting.
     """
     for text in changes:
         name, sign, value = (part.strip() for part in text.partition("="))

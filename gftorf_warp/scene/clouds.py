@@ -1,8 +1,8 @@
-"""Clouds of moving points, one per view of a moving camera, and tracks of objects from one cloud to the next.
+"""Clouds of moving points, one per view of a moving camera, and tracks of their objects.
 
-A cloud holds the points that other views see through. Tracking needs no optical flow: in world coordinates static
-points do not move, so an object is found near its predicted position, by its centroid as long as its visible area does
-not change much.
+A cloud holds the points that other views see through. Tracking needs no optical flow: in world
+coordinates static points do not move, so an object is found near its predicted position, by its
+centroid as long as its visible area does not change much.
 """
 
 from __future__ import annotations
@@ -36,7 +36,8 @@ class Cloud:
 def cloud_of(moving: Bool[Tensor, "H W"], distance: Float[Tensor, "H W"], margin: Float[Tensor, "H W"]) -> Cloud:
     """The moving points of an image, without isolated ones, as mixtures at outlines are.
 
-    Distances [m] that differ by more than ``margin`` [m] from the median of their moving neighbourhood become it.
+    Distances [m] that differ by more than ``margin`` [m] from the median of their moving
+    neighbourhood become it.
     """
     mask, distance = moving & (_windows(moving.float()).mean(dim=0) > 0.5), distance.clone()
     median = _windows(torch.where(mask, distance, torch.nan))[:, mask].nanmedian(dim=0).values
@@ -45,7 +46,7 @@ def cloud_of(moving: Bool[Tensor, "H W"], distance: Float[Tensor, "H W"], margin
 
 
 def reference(clouds: list[Cloud]) -> int:
-    """The view to start from: that nearest to the middle with at least half as many points as the largest cloud."""
+    """The view nearest to the middle with at least half as many points as the largest cloud."""
     sizes = [int(cloud.mask.sum()) for cloud in clouds]
     middle = len(clouds) // 2
     return min((j for j, size in enumerate(sizes) if 2 * size >= max(sizes)), key=lambda j: (abs(j - middle), j))
@@ -56,8 +57,8 @@ def moving_layer(
 ) -> tuple[Layer, Int[Tensor, "P"]]:
     """The points of a grid that are in a cloud, and the number of the object that each belongs to.
 
-    Neighbours of the grid belong to one object if their distances differ by no more than the noise; objects of fewer
-    than ``fellows`` points are dropped.
+    Neighbours of the grid belong to one object if their distances differ by no more than the noise;
+    objects of fewer than ``fellows`` points are dropped.
     """
     column, row = grid.long().unbind(dim=2)
     mask, distance = cloud.mask[row, column], cloud.distance[row, column]
@@ -82,8 +83,9 @@ def follow_clouds(
 ) -> Float[Tensor, "T P 3"]:
     """Positions [m] of moving points at ``times`` [s].
 
-    The points of an object move by one shift, and then each of them by the median displacement of its neighbours to
-    the visible surface, which follows rotations. Beyond the views that see an object, its last step is extrapolated.
+    The points of an object move by one shift, and then each of them by the median displacement of
+    its neighbours to the visible surface, which follows rotations. Beyond the views that see an
+    object, its last step is extrapolated.
 
     Args:
         views: Times and cameras of the clouds.
@@ -158,7 +160,7 @@ class _Track:
         return self.shift + (time - self.time) * self.velocity
 
     def update(self, surface: Float[Tensor, "Q 3"], shift: Float[Tensor, "3"], area: float, time: float) -> None:
-        """Add the shift [m] of a view, its visible points [m], and their area [m^2 up to a factor]."""
+        """Add the shift [m] of a view, by its visible points [m] and their area [m^2]."""
         self.velocity = (shift - self.shift) / (time - self.time)
         self.shift, self.time, self.area = shift, time, area
         moved = self.points + shift
@@ -167,7 +169,7 @@ class _Track:
 
 
 def _find(tracks: list[_Track], visible: _Visible, time: float) -> None:
-    """Move every object to the centroid of the points nearest to it, if their area is about the same as before."""
+    """Move objects to the centroids of the points nearest to them, if areas hardly changed."""
     if not len(visible.points):
         return
     shifts = [track.predicted(time) for track in tracks]
@@ -222,5 +224,5 @@ def _connected(
 
 
 def _windows(image: Float[Tensor, "H W"]) -> Float[Tensor, "25 H W"]:
-    """The 5x5 neighbourhood of every pixel; beyond the border, NaN for floats that have any and else zero."""
+    """The 5x5 neighbourhood of every pixel, padded with zeros."""
     return torch.nn.functional.unfold(image[None, None], 5, padding=2).view(25, *image.shape)

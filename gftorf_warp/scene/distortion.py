@@ -5,15 +5,17 @@ With x = X/Z, y = Y/Z and r^2 = x^2 + y^2, a lens images the point (x, y) of a p
     x' = x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2)
     y' = y (1 + k1 r^2 + k2 r^4 + k3 r^6) + p1 (r^2 + 2 y^2) + 2 p2 x y
 
-Rays are computed by the inverse, by Newton's iteration. Raw frames are never resampled to undo a distortion:
-interpolation mixes surfaces as motion does.
+Rays are computed by the inverse, by Newton's iteration. Raw frames are never resampled to undo a
+distortion: interpolation mixes surfaces as motion does.
 
-A polynomial that was fitted inside an image may not be monotonic outside, and would fold invisible points into the
-image. Within a disc of radius R about the axis it does not fold; outside, it is extrapolated by the tangent:
+A polynomial that was fitted inside an image may not be monotonic outside, and would fold invisible
+points into the image. Within a disc of radius R about the axis it does not fold; outside, it is
+extrapolated by the tangent:
 
     p = min(1, R / r) (x, y),   (x', y')  becomes  D(p) + J(p) ((x, y) - p)
 
-J is symmetric, and positive definite in the disc, so that (x', y') moves outwards along every ray from the axis.
+J is symmetric, and positive definite in the disc, so that (x', y') moves outwards along every ray
+from the axis.
 """
 
 from __future__ import annotations
@@ -142,7 +144,7 @@ class Distortion:
         )
 
     def radius(self, corner: float, most: float) -> float:
-        """Radius R of the disc about the axis in which the lens does not fold [1], at most ``most``.
+        """Radius R of the disc in which the lens does not fold [1], at most ``most``.
 
         Raises:
             ValueError: If it folds nearer to the axis than ``corner`` [1].

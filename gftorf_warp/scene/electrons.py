@@ -1,12 +1,14 @@
-"""Electrons that a sensor counts, and the noise of phase and distance that follows (sensor notes, 2.2 to 2.5).
+"""Electrons that a sensor counts, and the noise of distance (sensor notes, 2.2 to 2.5).
 
-A tap holds B + A cos(..) electrons and adds read noise of deviation s_r. With K equally spaced shifts
+A tap holds B + A cos(..) electrons and adds read noise of deviation s_r. With K equally spaced
+shifts
 
     sigma_psi = sqrt(2/K) sqrt(B + s_r^2) / A      one tap          sigma_d = c / (4 pi f) sigma_psi
               = sqrt(1/K) sqrt(B + s_r^2) / A      two taps
 
-for all phases, except with three shifts of one tap. An ADC of e electrons per code adds e^2/12 to the variance of a
-quad: to one tap, or half of it to each of two. Tensors give differentiable tensors, for the design of sensors.
+for all phases, except with three shifts of one tap. An ADC of e electrons per code adds e^2/12 to
+the variance of a quad: to one tap, or half of it to each of two. Tensors give differentiable
+tensors, for the design of sensors.
 """
 
 from __future__ import annotations
@@ -23,12 +25,12 @@ REFERENCE_EXPOSURE_S = 2.34e-3  # of electrons_per_unit
 
 
 def electron_gain(sensor: Sensor) -> float:
-    """Modulated electrons per exposure and relative unit of amplitude, G, both taps together [e-]."""
+    """Modulated electrons G per exposure and unit of amplitude, both taps together [e-]."""
     return sensor.electrons_per_unit * sensor.exposure_s / REFERENCE_EXPOSURE_S
 
 
 def contrast(sensor: Sensor) -> Scalar:
-    """Demodulation contrast C at the modulation frequency [1]; 1 / dc_offset of a unipolar sensor."""
+    """Contrast C at the modulation frequency [1]; 1 / dc_offset of a unipolar sensor."""
     if sensor.unipolar:
         return 1.0 / sensor.dc_offset
     if sensor.contrast_cutoff_hz is None:
@@ -52,7 +54,8 @@ def phase_noise(
         read: Standard deviation of the read noise of a tap [e-].
         samples: Number K of equally spaced shifts.
         taps: 1, or 2 whose difference is taken.
-        phase: True phase [rad]; only K = 3 with one tap depends on it. None: the mean over all phases.
+        phase: True phase [rad]; only K = 3 with one tap depends on it. None: the mean over all
+            phases.
 
     Raises:
         ValueError: If there are fewer than three shifts, or another number of taps.
@@ -68,7 +71,7 @@ def phase_noise(
 
 
 def predicted_phase_noise(amplitude: Scalar, sensor: Sensor) -> Tensor:
-    """Standard deviation [rad] of the phase that ``sensor`` decodes from one cycle at its first frequency, float64.
+    """Standard deviation [rad] of the phase that ``sensor`` decodes at its first frequency.
 
     A plain sine, equally spaced shifts and nothing full are assumed; patterns are left out.
 
@@ -85,9 +88,9 @@ def predicted_phase_noise(amplitude: Scalar, sensor: Sensor) -> Tensor:
 
 
 def predicted_distance_noise(amplitude: Scalar, sensor: Sensor) -> Tensor:
-    """Standard deviation [m] of the distance that ``sensor`` decodes; as :func:`predicted_phase_noise`.
+    """Standard deviation [m] of a decoded distance; see :func:`predicted_phase_noise`.
 
-    Differentiable by ``f_mod_hz``: -sigma (1/f + C'/C). The modulation frequency with the least noise is the cutoff of
-    the contrast; long before, distances are no longer unambiguous.
+    Differentiable by ``f_mod_hz``: -sigma (1/f + C'/C). The modulation frequency with the least
+    noise is the cutoff of the contrast; long before, distances are no longer unambiguous.
     """
     return SPEED_OF_LIGHT / (4.0 * math.pi * sensor.f_mod_hz) * predicted_phase_noise(amplitude, sensor)

@@ -14,7 +14,7 @@ SUFFIXES = (".npy", ".exr", ".png")
 
 
 def read_falloff(path: Path) -> Float[np.ndarray, "h w"]:
-    """The map in a file, above 0 and normalised to a maximum of 1. PNG files are linear, EXR files have one channel.
+    """The map in a file, above 0 and of maximum 1. PNG is linear, EXR has one channel.
 
     Raises:
         InputError: If the file cannot be read, or it is no image of numbers above 0.
@@ -33,7 +33,7 @@ def read_falloff(path: Path) -> Float[np.ndarray, "h w"]:
 
 
 def resized(image: Float[np.ndarray, "h w"], height: int, width: int) -> Float[np.ndarray, "H W"]:
-    """The map at the pixels of an image: means over pixels, or linear interpolation of a coarser map."""
+    """The map at the pixels of an image: means, or linear interpolation of a coarser map."""
     import cv2
 
     if image.shape == (height, width):

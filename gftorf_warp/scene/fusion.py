@@ -1,12 +1,13 @@
-"""Consistency of the decoded quartets of a moving camera: which points are static, and which are not.
+"""Consistency of the decoded quartets of a moving camera: which points are static.
 
-Each point of a quartet is compared with other quartets, its witnesses. A witness *supports* a point in its view if it
-decodes the same distance in that direction, and *sees through* it if everything around there is farther; if it decodes
-a smaller distance, the point is occluded and the witness does not count. Points that are rarely seen through are
-static. The others move, or are mixtures of two surfaces in a pixel at an outline.
+Each point of a quartet is compared with other quartets, its witnesses. A witness *supports* a point
+in its view if it decodes the same distance in that direction, and *sees through* it if everything
+around there is farther; if it decodes a smaller distance, the point is occluded and the witness
+does not count. Points that are rarely seen through are static. The others move, or are mixtures of
+two surfaces in a pixel at an outline.
 
-A body that moves by less than its width is seen through along its outline only; the rest of it counts as static. Only
-measured quads and poses are read.
+A body that moves by less than its width is seen through along its outline only; the rest of it
+counts as static. Only measured quads and poses are read.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ COVERS = 0.75  # radius that a point covers [spacings]: half a diagonal is 0.71,
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Views:
-    """The complete quartets of a sequence, each decoded as if taken at once with the pose in its middle."""
+    """The complete quartets of a sequence, decoded as if taken at once in their middle."""
 
     quartets: list[int]
     """Their numbers."""
@@ -80,8 +81,8 @@ class Verdict:
 def views_of(sequence: Sequence, nearer: float) -> Views:
     """Decode every complete quartet of a sequence.
 
-    The noise is estimated by the median difference of neighbouring quartets in the same direction, which is right as
-    long as most of the scene is static.
+    The noise is estimated by the median difference of neighbouring quartets in the same direction,
+    which is right as long as most of the scene is static.
 
     Args:
         sequence: Raw frames with poses; at least one quartet is complete.
@@ -110,7 +111,7 @@ def views_of(sequence: Sequence, nearer: float) -> Views:
 
 
 def _noise(views: Views, phase_slope: float, gain: float) -> float:
-    """Standard deviation of the noise of one quad, from distances of neighbouring views in the same direction."""
+    """Standard deviation of the noise of one quad, from distances of neighbouring views."""
     differences = [torch.zeros(0)]
     for view in range(len(views.quartets) - 1):
         other = _projected(views, views.points(view).flatten(0, 1), [view + 1])
@@ -217,7 +218,8 @@ class Layer:
 def static_layer(views: Views, judged: list[Verdict], grid: Float[Tensor, "P 2"], spacing: float) -> Layer:
     """Points about ``spacing`` pixels apart on all static surfaces of all views, each surface once.
 
-    In turn, beginning with the middle one, each view adds the points of its grid that no earlier point covers.
+    In turn, beginning with the middle one, each view adds the points of its grid that no earlier
+    point covers.
 
     Args:
         views: Decoded quartets.
@@ -244,7 +246,7 @@ def static_layer(views: Views, judged: list[Verdict], grid: Float[Tensor, "P 2"]
 
 
 def _outwards(count: int) -> list[int]:
-    """The middle of ``count`` views, both ends, then the middles in between, so that early ones differ most."""
+    """The middle of ``count`` views, both ends, then the middles in between."""
     order = [count // 2, 0, count - 1]
     gaps = [(0, count // 2), (count // 2, count - 1)]
     for start, end in gaps:  # grows
@@ -256,7 +258,7 @@ def _outwards(count: int) -> list[int]:
 
 
 def _covered(views: Views, view: int, layer: Layer, spacing: float) -> Bool[Tensor, "H W"]:
-    """Pixels of a view that see a surface covered by a point of the layer, at its size in this view."""
+    """Pixels of a view that see a surface covered by a point of the layer."""
     height, width = views.distance.shape[1:]
     covered = torch.zeros(height, width)
     if not len(layer.mean):
@@ -273,7 +275,7 @@ def _covered(views: Views, view: int, layer: Layer, spacing: float) -> Bool[Tens
 
 
 def outlying(distance: Float[Tensor, "H W"], margin: Float[Tensor, "H W"]) -> Bool[Tensor, "H W"]:
-    """Pixels whose distance differs from the median of their 3x3 neighbourhood: mixtures at outlines, and noise."""
+    """Pixels whose distance differs from the median of their 3x3 neighbourhood."""
     padded = torch.nn.functional.pad(distance[None, None], (1, 1, 1, 1), mode="replicate")
     median = torch.nn.functional.unfold(padded, 3).view(9, *distance.shape).median(dim=0).values
     return (distance - median).abs() > margin

@@ -1,8 +1,9 @@
 """Initial Gaussians and motion: from measured phase, or random (the control).
 
-Phase: a static layer at the largest distance at which each pixel was static, and a moving layer of nearer points in the
-middle of the sequence; for a moving camera, points that are consistent over its views, and others that are not.
-Reflectivity is amplitude times distance squared. Only measured quads, poses and flow are read.
+Phase: a static layer at the largest distance at which each pixel was static, and a moving layer of
+nearer points in the middle of the sequence; for a moving camera, points that are consistent over
+its views, and others that are not. Reflectivity is amplitude times distance squared. Only measured
+quads, poses and flow are read.
 """
 
 from __future__ import annotations
@@ -141,7 +142,7 @@ def _from_views(sequence: Sequence, settings: InitSettings) -> Start:
 
 
 def from_random(sequence: Sequence, settings: InitSettings, generator: torch.Generator) -> Start:
-    """Gaussians distributed uniformly over the volume of all frusta, all of them moving (method, section 6.1).
+    """Moving Gaussians, uniform over the volume of all frusta (method, section 6.1).
 
     The scale of each is the root mean square distance to its three nearest neighbours.
     """
@@ -159,7 +160,8 @@ def _distinct_cameras(sequence: Sequence) -> list[Camera]:
 def in_frusta(cameras: list[Camera], settings: InitSettings, generator: torch.Generator) -> Float[Tensor, "N 3"]:
     """Points distributed uniformly over the union of the cameras' frusta between two z-depths.
 
-    A point is drawn in the frustum of a random camera and kept with one over the number of frusta that contain it.
+    A point is drawn in the frustum of a random camera and kept with one over the number of frusta
+    that contain it.
     """
     near, far = settings.bounds
     kept: list[Tensor] = []
@@ -202,7 +204,7 @@ def _holds(camera: Camera, points: Float[Tensor, "N 3"], near: float, far: float
 
 
 def _spacing(points: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
-    """Root mean square distance of every point to its three nearest neighbours [m]; 1 for a point alone."""
+    """Root mean square distance [m] to the three nearest neighbours; 1 for a point alone."""
     if len(points) < 2:
         return torch.ones(len(points))
     import cv2
@@ -225,10 +227,11 @@ def _static_layer(sequence: Sequence, far: FarLayer, settings: InitSettings) -> 
 def _nearer(
     sequence: Sequence, quartet: int, change: Change, far: FarLayer, settings: InitSettings
 ) -> tuple[Float[Tensor, "P 2"], Float[Tensor, "P"], Float[Tensor, "P"]]:
-    """Points [px], distances [m] and amplitudes in front of the background at the start of a quartet.
+    """Points [px], distances [m], amplitudes in front of the background, at a quartet's start.
 
-    A point has to be in front of it in the neighbouring quartets as well, along the flow: pixels that seem to be near
-    because an outline passes within the quartet are not. Isolated points and outliers are removed, see ``cloud_of``.
+    A point has to be in front of it in the neighbouring quartets as well, along the flow: pixels
+    that seem to be near because an outline passes within the quartet are not. Isolated points and
+    outliers are removed, see ``cloud_of``.
     """
     grid = _grid(sequence.width, sequence.height, settings.moving_spacing)
     size = grid.shape[:2]
@@ -252,7 +255,7 @@ def _in_front(
     far: FarLayer,
     settings: InitSettings,
 ) -> tuple[Bool[Tensor, "P"], Float[Tensor, "P"], Float[Tensor, "P"], Float[Tensor, "P"]]:
-    """Whether points are nearer than the background; their distance [m], amplitude, and noise of the distance [m]."""
+    """Whether points are before the background; distance [m], amplitude, its noise [m]."""
     ahead, behind = (flow_at(sequence, quartet, step, points) for step in (1, -1))
     distance, amplitude = decode_along_flow(sequence, quartet, points, ahead, behind)
     noise = distance_noise(amplitude, change.noise, sequence)

@@ -1,4 +1,4 @@
-"""Closed-form analysis of measured quads: distance along the flow, changes over time, the background (method, 2.9).
+"""Closed-form analysis of quads: distance along the flow, changes, background (method, 2.9).
 
 Truth is never read.
 """
@@ -51,7 +51,7 @@ def camera_of(sequence: Sequence, frame: int) -> Camera:
 
 
 def colour_camera_of(sequence: Sequence, frame: int) -> Camera | None:
-    """The colour camera at raw frame ``frame``, at the size of the colour images; None if it is not known."""
+    """The colour camera at raw frame ``frame``; None if it is not known."""
     colour = sequence.colour
     if colour.size is None or colour.intrinsics is None or colour.camera_from_world is None:
         return None
@@ -83,7 +83,7 @@ def key_times(sequence: Sequence) -> Float[Tensor, "T"]:
 
 
 def sample(image: Float[Tensor, "C H W"], points: Float[Tensor, "P 2"]) -> Float[Tensor, "C P"]:
-    """Values at image positions (x, y) [px], bilinear between pixel centres, repeated beyond the border."""
+    """Values at image positions (x, y) [px], bilinear, repeated beyond the border."""
     size = image.new_tensor([image.shape[2], image.shape[1]])
     grid = (2.0 * points / size - 1.0)[None, None]
     interpolate = torch.nn.functional.grid_sample
@@ -91,10 +91,10 @@ def sample(image: Float[Tensor, "C H W"], points: Float[Tensor, "P 2"]) -> Float
 
 
 def flow_at(sequence: Sequence, quartet: int, step: int, points: Float[Tensor, "P 2"]) -> Float[Tensor, "P 2"] | None:
-    """Optical flow [px] of points (x, y) [px] from the start of ``quartet`` to that of the next (1) or last (-1) one.
+    """Optical flow [px] of points [px] from the start of ``quartet`` to the next (1) or last (-1).
 
-    NaN where it is unknown. If the flow of this direction is absent, it is the negative flow of the other direction;
-    None if both are absent.
+    NaN where it is unknown. If the flow of this direction is absent, it is the negative flow of the
+    other direction; None if both are absent.
     """
     same, other = (sequence.flow.forward, sequence.flow.backward)[:: 1 if step > 0 else -1]
     for sign, flow in ((1.0, same), (-1.0, other)):
@@ -112,10 +112,10 @@ def decode_along_flow(
 ) -> tuple[Float[Tensor, "P"], Float[Tensor, "P"]]:
     """Distance [m] and amplitude [quad units] of moving points at the start of a quartet.
 
-    Slot k was measured k raw frames later and, in the quartet before, K - k raw frames earlier. Both are sampled along
-    the flow and interpolated to the start, so that motion across the image and along the ray causes no artefact to
-    first order. Without a measured quartet before, the value is extrapolated from the one after; without either, slot k
-    is used as measured.
+    Slot k was measured k raw frames later and, in the quartet before, K - k raw frames earlier.
+    Both are sampled along the flow and interpolated to the start, so that motion across the image
+    and along the ray causes no artefact to first order. Without a measured quartet before, the
+    value is extrapolated from the one after; without either, slot k is used as measured.
 
     Args:
         sequence: Raw frames; those of ``quartet`` must be measured.
@@ -158,7 +158,8 @@ class Change:
     quartets: tuple[int, ...]
     """The complete quartets."""
     changed: Bool[Tensor, "J H W"]
-    """Whether a pixel changes from one complete quartet to the next; J is one less than the number of quartets."""
+    """Whether a pixel changes from one complete quartet to the next; J is one less than the number
+    of quartets."""
     noise: float
     """Standard deviation of the noise of one quad [quad units]."""
 
@@ -166,8 +167,9 @@ class Change:
 def change_of(sequence: Sequence) -> Change:
     """Compare every complete quartet with the next one, slot by slot.
 
-    The noise is estimated by the median absolute difference, right as long as most pixels are static. Slots are
-    matched by frequency and shift, whatever their order and the number of missing frames.
+    The noise is estimated by the median absolute difference, right as long as most pixels are
+    static. Slots are matched by frequency and shift, whatever their order and the number of missing
+    frames.
     """
     quartets = sequence.complete_quartets
     ordered = []
@@ -188,14 +190,15 @@ def change_of(sequence: Sequence) -> Change:
 
 
 def distance_noise(amplitude: Tensor, noise: float, sequence: Sequence) -> Tensor:
-    """Standard deviation [m] of a decoded distance: noise / (gain amplitude) radians of the first phase."""
+    """Standard deviation [m] of a distance: noise / (gain amplitude) radians."""
     return noise / (quads_gain(sequence) * amplitude.clamp_min(1e-12)) / sensor_of(sequence).phase_slope
 
 
 def quads_gain(sequence: Sequence) -> float:
     """Signal-to-noise ratio of the first phase of a quartet over that of a quad [1].
 
-    It is sqrt(K / 2) of K equally spaced quads; for others see :func:`gftorf_warp.data.cycles.phase_noise`.
+    It is sqrt(K / 2) of K equally spaced quads; for others see
+    :func:`gftorf_warp.data.cycles.phase_noise`.
     """
     frames = slice(0, sequence.cycle)
     shifts = sequence.shifts[frames][sequence.frame_frequencies[frames] == sequence.frequencies[0]]
@@ -219,8 +222,9 @@ class FarLayer:
 def far_layer(sequence: Sequence, change: Change) -> FarLayer:
     """Mean phasors of the quartets in which a pixel is static at its largest distance.
 
-    A pixel is static in a quartet if it changes neither from the quartet before nor to the next one. Distances are
-    wrapped: a background beyond the common range of all frequencies becomes too near.
+    A pixel is static in a quartet if it changes neither from the quartet before nor to the next
+    one. Distances are wrapped: a background beyond the common range of all frequencies becomes too
+    near.
     """
     sensor = sensor_of(sequence)
     still = torch.ones(len(change.quartets), *sequence.quads.shape[1:], dtype=torch.bool)
@@ -249,7 +253,7 @@ def decoded_phasors(sequence: Sequence, quartets: Iterable[int]) -> Float[Tensor
 
 
 def fill(image: Float[Tensor, "C H W"], known: Bool[Tensor, "H W"]) -> Float[Tensor, "C H W"]:
-    """Replace unknown pixels by the mean of known neighbours, ring by ring; zero if no pixel is known."""
+    """Replace unknown pixels by the mean of known neighbours, ring by ring, else by zero."""
     weight = known.to(image)[None]
     value = torch.where(known, image, 0.0)
     while bool((weight == 0).any()) and bool((weight > 0).any()):

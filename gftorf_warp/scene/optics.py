@@ -1,11 +1,12 @@
-"""Non-uniform illumination of the image: fall-off of the lens, beam of the emitter (sensor notes, 2.2 and 2.8).
+"""Non-uniform illumination: fall-off of the lens, beam of the emitter (notes, 2.2 and 2.8).
 
 With th the angle between a pixel's ray and the optical axis, the light of a pixel is multiplied by
 
     light of the emitter: beam(th) cos^n(th) V(r) M         ambient light: cos^n(th) V(r) M
 
-r is 1 in the farthest corner of the image, M is a measured map. On a frontal wall an isotropic emitter gives cos^3;
-with a lens of n = 4 cos^7; with a beam of power -3, too, which lights the wall evenly, cos^4.
+r is 1 in the farthest corner of the image, M is a measured map. On a frontal wall an isotropic
+emitter gives cos^3; with a lens of n = 4 cos^7; with a beam of power -3, too, which lights the wall
+evenly, cos^4.
 """
 
 from __future__ import annotations
@@ -31,15 +32,18 @@ class Lens:
     distortion: Distortion = field(default_factory=Distortion)
     """Distortion in OpenCV's model."""
     cosine_power: float = 0.0
-    """Power n of the cosine by which the image darkens towards its edge [1]; 4: the law of a thin lens."""
+    """Power n of the cosine by which the image darkens towards its edge [1]; 4: the law of a thin
+    lens."""
     vignetting: tuple[float, ...] = ()
-    """Coefficients v of V = 1 + v_1 r^2 + v_2 r^4 + ... [1], r = 1 in the farthest corner; none: V = 1."""
+    """Coefficients v of V = 1 + v_1 r^2 + v_2 r^4 + ... [1], r = 1 in the farthest corner; none: V
+    = 1."""
     beam_power: float = 0.0
-    """Power of the cosine by which the beam of the emitter weakens to the side [1]; 0: isotropic; -3: a frontal wall is
-    lit evenly. The light over the whole image is the same."""
+    """Power of the cosine by which the beam of the emitter weakens to the side [1]; 0: isotropic;
+    -3: a frontal wall is lit evenly. The light over the whole image is the same."""
     falloff: FilePath | None = None
-    """File of a map M of the light per pixel, normalised by its maximum [1]: .npy [h, w], one-channel .exr or
-    grey .png, linear, of any size; relative to the scene file that names it. None: M = 1."""
+    """File of a map M of the light per pixel, normalised by its maximum [1]: .npy [h, w],
+    one-channel .exr or grey .png, linear, of any size; relative to the scene file that names it.
+    None: M = 1."""
 
     def __post_init__(self):
         for name in ("cosine_power", "beam_power", "vignetting"):
@@ -78,7 +82,8 @@ class Beam(NamedTuple):
     factor: float
     """Intensity on the axis [1]."""
     least: float
-    """Cosine beyond which a beam of negative power is constant, that of the image corner [1]; others: 0."""
+    """Cosine beyond which a beam of negative power is constant, that of the image corner [1];
+    others: 0."""
 
 
 class Shading(NamedTuple):
@@ -91,7 +96,7 @@ class Shading(NamedTuple):
 
 
 def beam_of(lens: Lens, camera: Camera) -> Beam | None:
-    """The beam of the emitter of a camera, of mean 1 over the solid angle of the image; None: isotropic."""
+    """The beam of the emitter, of mean 1 over the solid angle of the image; None: isotropic."""
     if not lens.beam_power:
         return None
     cosine = camera.directions()[..., 2].numpy()
@@ -103,7 +108,8 @@ def beam_of(lens: Lens, camera: Camera) -> Beam | None:
 def shading(lens: Lens, camera: Camera, *, beam: bool = True) -> Shading | None:
     """Factors of the light of the pixels of a camera; None: 1 everywhere.
 
-    ``beam``: whether the beam of an emitter at the camera is included; False if it is part of the traced light.
+    ``beam``: whether the beam of an emitter at the camera is included; False if it is part of the
+    traced light.
     """
     shape = beam_of(lens, camera) if beam else None
     if not (lens.cosine_power or lens.vignetting or lens.falloff or shape):

@@ -1,8 +1,9 @@
-"""Fixed patterns: differences between pixels that are the same in all raw frames (sensor notes, 2.4 and 3).
+"""Fixed patterns: constant differences between pixels (sensor notes, 2.4 and 3).
 
     psi += p(u, v)        light times 1 + N(0, gain)        dark current times 1 + N(0, dark)
 
-They are drawn from a seed of the sensor, not of a recording: all recordings of a sensor share one pattern.
+They are drawn from a seed of the sensor, not of a recording: all recordings of a sensor share one
+pattern.
 """
 
 from __future__ import annotations
@@ -23,7 +24,8 @@ class Pattern:
     """How much pixels differ; everything is off by default."""
 
     phase: float = 0.0
-    """Multiple of the phase pattern [1]; 1: as large as in the calibration file shipped with an OPT8241 kit."""
+    """Multiple of the phase pattern [1]; 1: as large as in the calibration file shipped with an
+    OPT8241 kit."""
     gain: float = 0.0
     """Standard deviation of the response to light, PRNU [1]; 0.01 is usual, an assumption."""
     dark: float = 0.0
@@ -44,7 +46,8 @@ class Pattern:
 def phase_map(pattern: Pattern, height: int, width: int) -> Float[np.ndarray, "H W"] | None:
     """Phase offset of each pixel [rad]; None: 0 everywhere.
 
-    A quadratic bowl over the image, in which x and y run over half its width, and noise of pixels, columns and rows.
+    A quadratic bowl over the image, in which x and y run over half its width, and noise of pixels,
+    columns and rows.
     """
     if pattern.phase == 0.0:
         return None

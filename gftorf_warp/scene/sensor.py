@@ -4,9 +4,9 @@ A point at distance d that reflects r gives the quad of shift theta (method, sec
 
     a (cos(psi - theta) + b),   a = s r / d^2,   psi = kappa d + phase_offset,   kappa = 4 pi f / c
 
-in *relative units*. Sections 2.3 and 2.4 of the sensor notes add harmonics, electrons and patterns: fields that are off
-by default. Values of the OPT8241 are of its datasheet, SBAS704B, those of the MLX75027 of its datasheet, 1.0;
-*assumed* values are not published.
+in *relative units*. Sections 2.3 and 2.4 of the sensor notes add harmonics, electrons and patterns:
+fields that are off by default. Values of the OPT8241 are of its datasheet, SBAS704B, those of the
+MLX75027 of its datasheet, 1.0; *assumed* values are not published.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from .pattern import Pattern
 from .waveform import peak
 
 Scalar = float | Tensor
-EVEN = SAME_RAD  # [1] shifts are equally spaced if the means of exp(i theta) and exp(2 i theta) are below this
+EVEN = SAME_RAD  # [1] means of exp(i theta), exp(2 i theta) of equally spaced shifts are below
 ELECTRONS = ("electrons_per_unit", "electrons_per_code", "full_well_electrons")
 POSITIVE = ("f_mod_hz", "frame_period_s", "contrast_cutoff_hz", *ELECTRONS)
 NON_NEGATIVE = ("ambient_electrons", "dark_electrons_per_s", "read_noise_electrons", "source_intensity", "row_time_s")
@@ -45,15 +45,18 @@ class RawFrame(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Sensor:
-    """One C-ToF sensor. The four ``Scalar`` fields accept 0-d tensors, which receive gradients from the renderer."""
+    """One C-ToF sensor. The ``Scalar`` fields accept 0-d tensors, which receive gradients."""
 
     f_mod_hz: Scalar = SPEED_OF_LIGHT / 15.0
-    """Modulation frequency [Hz]; the default, 19.986 MHz, is that of the public F-ToeRF files (depth_range 15 m)."""
+    """Modulation frequency [Hz]; the default, 19.986 MHz, is that of the public F-ToeRF files
+    (depth_range 15 m)."""
     shifts: tuple[float, ...] = CANONICAL_SHIFTS
-    """Phase shifts of the quads that a rendering returns, in this order [rad]: any number, in any order. A recording
-    takes them one after the other; a phase needs three different ones. Default: that of the synthetic F-ToeRF files."""
+    """Phase shifts of the quads that a rendering returns, in this order [rad]: any number, in any
+    order. A recording takes them one after the other; a phase needs three different ones. Default:
+    that of the synthetic F-ToeRF files."""
     further_hz: tuple[float, ...] = ()
-    """Modulation frequencies that follow in every cycle [Hz], each with all shifts; default: ``f_mod_hz`` alone."""
+    """Modulation frequencies that follow in every cycle [Hz], each with all shifts; default:
+    ``f_mod_hz`` alone."""
     phase_offset: Scalar = 0.0
     """Measured minus true phase [rad]: rendering adds it, decoding subtracts it."""
     dc_offset: Scalar = 0.0
@@ -63,27 +66,32 @@ class Sensor:
     frame_period_s: float = 1.0 / FRAME_RATE_HZ
     """Time from one raw frame to the next [s]; frame n is taken at n times this."""
     exposure_s: float = 2.34e-3
-    """Length of one exposure [s]; OPT8241 at 18/64 duty. Scales the number of electrons; 0 only without noise."""
+    """Length of one exposure [s]; OPT8241 at 18/64 duty. Scales the number of electrons; 0 only
+    without noise."""
     row_time_s: float = 0.0
-    """Delay from one row to the next [s]; 0: global shutter, as both makers say. A raw frame has the time of its first
-    row. Engine mesh simulates it; nothing is reconstructed row by row."""
+    """Delay from one row to the next [s]; 0: global shutter, as both makers say. A raw frame has
+    the time of its first row. Engine mesh simulates it; nothing is reconstructed row by row."""
     unipolar: bool = False
-    """False: difference of two taps, signed. True: one tap, never negative; needs dc_offset >= 1."""
+    """False: difference of two taps, signed. True: one tap, never negative; needs dc_offset >=
+    1."""
     noise: bool = False
     """Whether shot noise, read noise, full well and ADC apply; without, quads are exact."""
     electrons_per_unit: float = 3.144e5
-    """Modulated electrons, both taps together, of one unit (r = 1 at d = 1 m) in 2.34 ms [e-]; OPT8241-like."""
+    """Modulated electrons, both taps together, of one unit (r = 1 at d = 1 m) in 2.34 ms [e-];
+    OPT8241-like."""
     contrast: float = 0.45
-    """Demodulation contrast C of a differential sensor [1]; OPT8241 at 50 MHz. A unipolar one has 1 / dc_offset."""
+    """Demodulation contrast C of a differential sensor [1]; OPT8241 at 50 MHz. A unipolar one has 1
+    / dc_offset."""
     contrast_cutoff_hz: float | None = None
-    """Frequency f_c at which the contrast has halved [Hz], as C / (1 + (f / f_c)^2); None: it has one value. 303e6 fits
-    the MLX75027."""
+    """Frequency f_c at which the contrast has halved [Hz], as C / (1 + (f / f_c)^2); None: it has
+    one value. 303e6 fits the MLX75027."""
     harmonic_contrast: tuple[float, ...] = ()
-    """Contrast of harmonics 2, 3, ... as multiples of that of the first [1]; default: a sine. See scene/waveform.py."""
+    """Contrast of harmonics 2, 3, ... as multiples of that of the first [1]; default: a sine. See
+    scene/waveform.py."""
     ambient_electrons: float = 0.0
-    """Unmodulated electrons per exposure, both taps together [e-]: of every pixel with engine gaussian, per unit of
-    reflectance with engine mesh. A ninth of direct sunlight is 3.1e5 from reflectance .5, 6.3e5 from white (notes,
-    3)."""
+    """Unmodulated electrons per exposure, both taps together [e-]: of every pixel with engine
+    gaussian, per unit of reflectance with engine mesh. A ninth of direct sunlight is 3.1e5 from
+    reflectance .5, 6.3e5 from white (notes, 3)."""
     dark_electrons_per_s: float = 5.0e4
     """Dark current per tap [e-/s]; assumed for the OPT8241."""
     read_noise_electrons: float = 80.0
@@ -152,7 +160,7 @@ class Sensor:
 
     @property
     def cycle(self) -> tuple[RawFrame, ...]:
-        """The raw frames of one cycle in time order: all shifts at the first frequency, then at each further one."""
+        """The raw frames of one cycle: all shifts at the first frequency, then at the others."""
         return tuple(RawFrame(f, shift) for f in (self.f_mod_hz, *self.further_hz) for shift in self.shifts)
 
     @property
@@ -182,7 +190,7 @@ def channel_of(shifts: Sequence[float], shift: float) -> int | None:
 
 
 def distance_from_phasor(re: Tensor, im: Tensor, sensor: Sensor) -> Tensor:
-    """Distance [m] in [0, c/2f) of a phasor, ((atan2(im, re) - phase_offset) mod 2 pi) / kappa (method, 2.9)."""
+    """Distance [m] of a phasor: ((atan2(im, re) - phase_offset) mod 2 pi) / kappa."""
     phase = torch.remainder(torch.atan2(im, re) - sensor.phase_offset, 2.0 * math.pi)
     wrapped = torch.where(phase >= 2.0 * math.pi, torch.zeros_like(phase), phase)  # remainder can round up to 2 pi
     return wrapped / sensor.phase_slope
@@ -197,11 +205,12 @@ def _uploaded(values: tuple[float, ...], dtype: torch.dtype, device: torch.devic
 def phasor_from_quads(quads: Tensor, shifts: tuple[float, ...] | Tensor) -> tuple[Tensor, Tensor]:
     """(re, im) of quads [Q, ...] by least squares over three or more shifts [rad], in any order.
 
-    For equally spaced ones that is 4/K sum_j Q_j exp(i theta_j); for the four canonical shifts, the differences of
-    opposite quads, of length 2a.
+    For equally spaced ones that is 4/K sum_j Q_j exp(i theta_j); for the four canonical shifts, the
+    differences of opposite quads, of length 2a.
 
     Raises:
-        ValueError: If the shifts do not determine a phase. Shifts in a tensor are taken to be equally spaced.
+        ValueError: If the shifts do not determine a phase. Shifts in a tensor are taken to be
+            equally spaced.
     """
     known = shifts if isinstance(shifts, Tensor) else _uploaded(tuple(shifts), quads.dtype, quads.device)
     theta = known.to(quads).reshape(-1, *[1] * (quads.ndim - 1))

@@ -1,7 +1,8 @@
-"""Tracks of points through a sequence: across the image by optical flow, along the ray by measured phase.
+"""Tracks of points: across the image by optical flow, along the ray by measured phase.
 
-They initialise the keys of a motion model. Steps of single points are noisy, so each step is the median over the
-nearest neighbours of a point, which is right wherever neighbours belong to one object.
+They initialise the keys of a motion model. Steps of single points are noisy, so each step is the
+median over the nearest neighbours of a point, which is right wherever neighbours belong to one
+object.
 """
 
 from __future__ import annotations
@@ -74,7 +75,7 @@ def _shared(step: Float[Tensor, "P D"], group: Int[Tensor, "P G"]) -> Float[Tens
 
 
 def interpolated(known: dict[float, Tensor], times: Float[Tensor, "T"], *, outer: int) -> Tensor:
-    """Values at ``times`` [s], linear between known ones; beyond them, with the mean slope of ``outer`` intervals."""
+    """Linear interpolation at ``times`` [s]; extrapolation by the slope of ``outer`` intervals."""
     at = sorted(known)
     last = len(at) - 1
     if not last:

@@ -1,6 +1,7 @@
-"""Unwrapping of several modulation frequencies in torch, with the choice of candidates of data/unwrap.py.
+"""Unwrapping of several frequencies in torch, by the candidates of data/unwrap.py.
 
-The choice has no gradient; the distance is that of the first phase, and differentiable with respect to it.
+The choice has no gradient; the distance is that of the first phase, and differentiable with respect
+to it.
 """
 
 from __future__ import annotations
@@ -20,8 +21,9 @@ def unwrap(phases: Sequence[Tensor], ms: Sequence[int]) -> Tensor:
     """Phase [rad] in [0, 2 pi) at the common frequency f_0, from wrapped phases at m_i f_0.
 
     Args:
-        phases: One of any shape for each frequency [rad], wrapped or not; the result is as exact as the first, and
-            differentiable with respect to it. The others only select among the candidates.
+        phases: One of any shape for each frequency [rad], wrapped or not; the result is as exact as
+            the first, and differentiable with respect to it. The others only select among the
+            candidates.
         ms: Their multiples: positive, without a common divisor.
 
     Raises:
@@ -43,7 +45,7 @@ def frequencies_of(sensor: Sensor) -> tuple[float, ...]:
 
 
 def common_range(sensor: Sensor) -> float:
-    """Unambiguous range [m] of all frequencies of a sensor together: c / 2 f_0, or c / 2f of a single one.
+    """Unambiguous range [m] of all frequencies of a sensor together: c / 2 f_0.
 
     Raises:
         ValueError: If they are no small multiples of one frequency.

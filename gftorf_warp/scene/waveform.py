@@ -1,10 +1,12 @@
-"""Waveforms of modulation: their harmonics, and the contrast of each in the correlation of a sensor.
+"""Waveforms of modulation: their harmonics, and the contrast of each.
 
-Light is emitted as 1 + sum_h s_h cos(h w t), a tap opens as (1 + sum_h m_h cos(h (w t - shift))) / 2, and a quad has
+Light is emitted as 1 + sum_h s_h cos(h w t), a tap opens as (1 + sum_h m_h cos(h (w t - shift))) /
+2, and a quad has
 
     sum_h C_h cos(h (psi - shift)),   C_h = s_h m_h / 2
 
-(sensor notes, 2.3). Decoding assumes a sine, so harmonics cause a phase-dependent phase error, *wiggling*.
+(sensor notes, 2.3). Decoding assumes a sine, so harmonics cause a phase-dependent phase error,
+*wiggling*.
 """
 
 from __future__ import annotations
@@ -29,7 +31,8 @@ def harmonics_of(wave: Waveform, count: int, duty: float = 0.5) -> tuple[float, 
     Args:
         wave: 'sine': 1 + cos. 'square': on for the share ``duty`` of a period, off otherwise.
         count: How many.
-        duty: Share of the period that is on [1]; a short pulse has a larger first coefficient, 2 sin(pi D) / (pi D).
+        duty: Share of the period that is on [1]; a short pulse has a larger first coefficient, 2
+            sin(pi D) / (pi D).
 
     Raises:
         ValueError: If the duty is not between 0 and 1, or there is no coefficient.
@@ -42,7 +45,7 @@ def harmonics_of(wave: Waveform, count: int, duty: float = 0.5) -> tuple[float, 
 
 
 def contrasts(emission: Waveform, demodulation: Waveform, count: int, duty: float = 0.5) -> tuple[float, ...]:
-    """Contrast C_h of each harmonic h = 1 .. ``count`` [1]; ``duty`` is of the emission; taps are open half the time.
+    """Contrast C_h of harmonics h = 1 .. ``count`` [1]; ``duty`` of the emission, taps 1/2.
 
     Raises:
         ValueError: If the duty is not between 0 and 1, or there is no coefficient.
@@ -52,15 +55,16 @@ def contrasts(emission: Waveform, demodulation: Waveform, count: int, duty: floa
 
 
 def contrast_ratios(emission: Waveform, demodulation: Waveform, count: int, duty: float = 0.5) -> tuple[float, ...]:
-    """C_h / C_1 for h = 2 .. ``count`` [1], as :class:`Sensor` takes them; arguments as in :func:`contrasts`.
+    """C_h / C_1 for h = 2 .. ``count`` [1]; arguments as in :func:`contrasts`.
 
-    Rounding errors of contrasts that are exactly 0, those of even harmonics of a square wave, are set to 0.
+    Rounding errors of contrasts that are exactly 0, those of even harmonics of a square wave, are
+    set to 0.
     """
     first, *others = contrasts(emission, demodulation, count, duty)
     return tuple(0.0 if abs(other) < 1e-12 else other / first for other in others)
 
 
 def peak(ratios: Sequence[float]) -> float:
-    """Largest magnitude of cos x + sum_h r_h cos(h x) over a period [1]; ``ratios`` start at h = 2."""
+    """Largest magnitude of cos x + sum_h r_h cos(h x) [1]; ``ratios`` start at h = 2."""
     x = np.linspace(0.0, 2.0 * math.pi, 256 * (len(ratios) + 1))  # 256 points in the shortest period
     return float(np.abs(sum(r * np.cos(h * x) for h, r in enumerate((1.0, *ratios), start=1))).max())

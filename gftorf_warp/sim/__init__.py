@@ -1,1 +1,1 @@
-"""Simulation: scenes with moving bodies, an image for each raw frame, and the read-out with noise."""
+"""Simulation: scenes with moving bodies, an image per raw frame, read-out with noise."""

@@ -1,4 +1,4 @@
-"""Shapes beyond the three primitives: infinite planes, and several shapes that move as one rigid body."""
+"""Infinite planes, and several shapes that move as one rigid body."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ FACES = 1 << 32  # numbers that the faces of one part may use; a box has 6, a me
 
 @dataclass(frozen=True, kw_only=True)
 class Level(Shape):
-    """The infinite plane where one coordinate has a value, seen from both sides: a back wall, a floor.
+    """The infinite plane where one coordinate has a value, visible from both sides.
 
-    Its axes are the world's, so that its texture is hashed from world coordinates. It cannot move, since no finite
-    number of splats covers it.
+    Its axes are the world's, so that its texture is hashed from world coordinates. It cannot move,
+    since no finite number of splats covers it.
     """
 
     axis: int
@@ -33,7 +33,7 @@ class Level(Shape):
             raise ValueError(f"axis must be 0, 1 or 2, got {self.axis}")
 
     def hit(self, origin, ray):
-        """Where the coordinate takes the value; face 1 is hit by rays along which the coordinate grows, else 0."""
+        """Hits of the plane; face 1 by rays along which the coordinate grows, else 0."""
         along = ray[:, self.axis]
         with np.errstate(divide="ignore", invalid="ignore"):
             distance = (self.value - origin[self.axis]) / along
@@ -79,7 +79,7 @@ class Assembly(Shape):
             raise ValueError("an assembly needs at least one part")
 
     def hit(self, origin, ray):
-        """The nearest hit of any part; faces are numbered ``FACES`` times the part plus the face of the part."""
+        """The nearest hit of any part; face ``FACES`` times the part plus the face of the part."""
         distance, face = np.full(len(ray), np.inf), np.zeros(len(ray), dtype=np.int64)
         near = rays_to_ball(origin, ray, np.zeros(3), self.reach)
         for index, part in enumerate(self.parts):
@@ -115,7 +115,7 @@ class Assembly(Shape):
         return max(float(np.linalg.norm(part.position)) + part.shape.reach for part in self.parts)
 
     def clearance(self, point: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P"]:
-        """Lower bound of the distance to points in its axes [m]: exact for boxes, bounding spheres for others."""
+        """Lower bound of the distance to points [m]: exact for boxes, of bounding spheres else."""
         least = np.full(len(point), np.inf)
         for part in self.parts:
             local = point - part.position

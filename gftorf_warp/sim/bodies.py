@@ -1,4 +1,4 @@
-"""Bodies that named scenes are made of: boxes, balls, people, walls and rooms, with their textures."""
+"""Bodies of named scenes: boxes, balls, people, walls and rooms, with textures."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def room(
     back: float = 4.2,
     hue: float | None = None,
 ) -> Body:
-    """A textured room around the camera, by coordinates [m]; the wall behind the camera is at -0.5."""
+    """A textured room by coordinates [m]; the wall behind the camera is at -0.5."""
     front = -0.5
     return Body(
         shape=Box(size=(right - left, floor - top, back - front), inside=True),
@@ -78,7 +78,7 @@ def chair() -> Assembly:
 
 
 def passing(frames: int, position: Vector, velocity: Vector) -> Line:
-    """Constant velocity [m/s] through ``position`` [m] in the middle of a recording of ``frames`` raw frames."""
+    """Constant velocity [m/s] through ``position`` [m] in the middle of ``frames`` raw frames."""
     return Line(position=position, velocity=velocity, passing_s=(frames - 1) / 2 / FRAME_RATE_HZ)
 
 

@@ -1,6 +1,7 @@
 """Static scenes with known solutions, for the calibration of a sensor.
 
-The closed form is exact on them but for noise, so any other error is one of the sensor or of indirect light.
+The closed form is exact on them but for noise, so any other error is one of the sensor or of
+indirect light.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ def wedge() -> Scene:
 
 
 def corner() -> Scene:
-    """Two bright walls that light each other: camera and light 1 m from one and 2 m from the other."""
+    """Two bright walls that light each other, 1 m and 2 m from camera and light."""
     view = Viewpoint(position=(0.0, 0.0, 0.0), target=(-1.0, 0.0, DISTANCE))
     return _at_rest(
         "corner",

@@ -1,4 +1,4 @@
-"""The README.md of a simulated sequence: its content, the command that makes it, and all numbers of the sensor."""
+"""The README.md of a simulated sequence: content, command and sensor."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def _together(count: int) -> str:
 
 
 def outcome_card(recording: Recording) -> str:
-    """The part that is known after the recording: distance of the engine from the truth, and saturation."""
+    """The part that is known after the recording: engine against truth, and saturation."""
     agreement = "no such pixel" if recording.gap is None else str(recording.gap)
     return f"""
 Ground truth against the distance that the engine sees, on interior pixels of still surfaces in all raw frames:
@@ -124,7 +124,7 @@ def _engine(scene: Scene, used: SimSettings) -> str:
 
 
 def _camera_rows(scene: Scene, used: SimSettings) -> dict[str, str]:
-    """Motion of the cameras, and the colour camera; empty for a ToF camera at rest at the origin alone."""
+    """Rows on camera motion and colour camera; empty for a static ToF camera at the origin."""
     rows = {}
     if scene.camera_path != Still():
         rows["camera path"] = f"{scene.camera_path}" + (
@@ -169,7 +169,7 @@ def _command(scene: Scene, used: SimSettings, level: str | None) -> str:
 
 
 def _fingerprint(scene: Scene) -> str:
-    """Every setting of a scene as text, without unused optional ones, so that new options do not change it."""
+    """Every setting of a scene as text, without unused optional ones."""
     optional = {"camera_path": Still(), "emitter": (0.0, 0.0, 0.0), "beam_deg": None, "colour": None, "novel_views": ()}
     optional |= {"lens": Lens()}
     values = {f.name: getattr(scene, f.name) for f in fields(scene)}

@@ -1,4 +1,4 @@
-"""Checks of a scene and its settings: mistakes of users raise a UsageError before anything is written."""
+"""Checks of a scene and its settings, before anything is written."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def check_engine(scene: Scene, settings: SimSettings, device: str = "cpu") -> No
 
 
 def check_format(scene: Scene, settings: SimSettings) -> None:
-    """Raise a UsageError if the sensor contradicts itself, or the layout on disk cannot store sensor or lens."""
+    """Raise a UsageError if the sensor is contradictory, or the layout cannot store it."""
     sensor, lens, capture = scene.sensor, scene.lens, settings.format == "capture"
     turns = sorted(round(math.degrees(shift), 4) % 360.0 for shift in sensor.shifts)
     few = capture and len(set(turns)) < SHIFTS_MIN
@@ -68,7 +68,7 @@ def check_format(scene: Scene, settings: SimSettings) -> None:
 
 
 def check_clearance(scene: Scene, times: Float[np.ndarray, "F"]) -> None:
-    """Raise a UsageError if a body comes too near to the camera at one of ``times`` [s]: paths have no end."""
+    """Raise a UsageError if a body comes too near to the camera at one of ``times`` [s]."""
     centres = np.array([scene.camera(time=float(time)).centre for time in times])
     what = f"a body comes nearer to the camera than {CLEARANCE} m"
     for body in (body for body in scene.bodies if body.moves):

@@ -1,4 +1,4 @@
-"""Errors of the closed form on a recording, and a table of what each level of the ladder adds to them."""
+"""Errors of the closed form, and a table of them by level of the ladder."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from .scene import Scene
 class Errors(NamedTuple):
     """Mean squared distance errors of the closed form [m^2 x 100]; None without any such pixel.
 
-    Truth is that of the first raw frame of each quartet; distances are not unwrapped. The first and the last of more
-    than two quartets are left out, as in the published tables.
+    Truth is that of the first raw frame of each quartet; distances are not unwrapped. The first and
+    the last of more than two quartets are left out, as in the published tables.
     """
 
     all: float | None
@@ -31,7 +31,8 @@ class Errors(NamedTuple):
     static: float | None
     """Against geometry, where it does not."""
     static_phasor: float | None
-    """Against the static-phasor distance, on all pixels: errors of motion and sensor, not of indirect light."""
+    """Against the static-phasor distance, on all pixels: errors of motion and sensor, not of
+    indirect light."""
 
 
 def closed_form_errors(sequence: Sequence, truth: Truth | None) -> Errors:
@@ -71,7 +72,7 @@ def with_closed_form(scene: Scene) -> Scene:
 
 
 def ladder_table(rows: Mapping[str, Errors]) -> list[str]:
-    """Lines of a table: the error of each level, by name, and what the level added to the one before."""
+    """Lines of a table: errors of each level, and the difference from the one before."""
     heads = ("all", "moving", "static", "vs phasor", "added")
     lines = [f"{'closed form, MSE x100 [m^2]':<28}" + "".join(f"{head:>11}" for head in heads) + "  what is new"]
     before = None

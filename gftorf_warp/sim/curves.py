@@ -1,7 +1,7 @@
 """Rigid paths of which each coordinate and each angle is a curve: a sum of a few simple motions.
 
-They describe swinging, falling, opening and waving. A hinge is a fixed position, a turn, and an arm from its axis to
-the body.
+They describe swinging, falling, opening and waving. A hinge is a fixed position, a turn, and an arm
+from its axis to the body.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 class Curve:
     """A coordinate [m] or angle [deg] as a function of time: the sum of all terms below.
 
-    Eased terms follow e(t) = (1 - cos(pi t)) / 2, from 0 to 1 within the first second, constant before and after.
+    Eased terms follow e(t) = (1 - cos(pi t)) / 2, from 0 to 1 within the first second, constant
+    before and after.
     """
 
     start: float = 0.0
@@ -74,7 +75,8 @@ class Guided(Path):
     z: float | Curve = 0.0
     """z of the pivot [m]."""
     turns: tuple[Turn, ...] = ()
-    """Orientation as the product of these, the first leftmost: the last is applied first, in the body's axes."""
+    """Orientation as the product of these, the first leftmost: the last is applied first, in the
+    body's axes."""
     arm: Vector = (0.0, 0.0, 0.0)
     """From the pivot to the origin of the body's axes, in those axes [m]."""
 

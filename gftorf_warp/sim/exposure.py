@@ -17,12 +17,15 @@ class Exposure(NamedTuple):
     amplitude: Float[np.ndarray, "H W"]
     """Mean amplitude a, source intensity included [relative units]."""
     distance: Float[np.ndarray, "H W"]
-    """Distance that the engine sees [m]: mean over opacity of Gaussians, or first hit; NaN where a pixel sees none."""
+    """Distance that the engine sees [m]: mean over opacity of Gaussians, or first hit; NaN where a
+    pixel sees none."""
     phasor: Complex[np.ndarray, "H W"]
-    """Light at the modulation frequency, the sensor's phase offset included, in any unit; 0 where there is none."""
+    """Light at the modulation frequency, the sensor's phase offset included, in any unit; 0 where
+    there is none."""
     ambient: Float[np.ndarray, "H W"] | None = None
-    """Share of even ambient light that is reflected, the mean reflectance of a pixel's rays [1]; None: the engine does
-    not compute it, and every pixel receives all of the sensor's ambient electrons."""
+    """Share of even ambient light that is reflected, the mean reflectance of a pixel's rays [1];
+    None: the engine does not compute it, and every pixel receives all of the sensor's ambient
+    electrons."""
     layers: dict[str, Float[np.ndarray, "C H W"]] | None = None
     """Further images by name, see sim/truth_layers.py; None: none."""
 

@@ -1,19 +1,23 @@
 """Covers: shapes as flat Gaussians, dense enough that a rendering of them is the surface.
 
-A splat at a pixel has the profile exp(-r^2 / 2v), v = its own variance on the image plus the renderer's low-pass.
-Neighbours overlap, and those nearer to the camera come first, so a cover differs from its surface in three ways, which
-:func:`overlap` and :func:`spread` compute from the compositing rule:
+A splat at a pixel has the profile exp(-r^2 / 2v), v = its own variance on the image plus the
+renderer's low-pass. Neighbours overlap, and those nearer to the camera come first, so a cover
+differs from its surface in three ways, which :func:`overlap` and :func:`spread` compute from the
+compositing rule:
 
-* it returns only the share  sum alpha T^2 < 1  of the light, hence reflectivity = rho cos(incidence) / share;
-* it extends ``spread`` pixels beyond its outermost centres, hence grids end that far inside of possible outlines;
-* on a slanted surface the near side of the footprint counts more, so the mean distance is too short by ``lead`` pixels
-  of slope. Splats of still bodies are moved back along their rays by that much; covers of moving bodies are rigid,
-  while the view of them changes, and keep this error.
+* it returns only the share  sum alpha T^2 < 1  of the light, hence reflectivity = rho
+  cos(incidence) / share;
+* it extends ``spread`` pixels beyond its outermost centres, hence grids end that far inside of
+  possible outlines;
+* on a slanted surface the near side of the footprint counts more, so the mean distance is too short
+  by ``lead`` pixels of slope. Splats of still bodies are moved back along their rays by that much;
+  covers of moving bodies are rigid, while the view of them changes, and keep this error.
 
-Still bodies are covered along the rays of the camera, one splat a pixel, which avoids moire with the pixel grid; a
-moving camera gets a new cover at every instant. Moving bodies get a regular grid on each face, fine enough for the
-nearest approach of body and camera. Reflectivity is the same in all directions; the cosine of the angle of incidence is
-evaluated at every instant, so that the data obey Lambert's law, and not the model that is fitted to them.
+Still bodies are covered along the rays of the camera, one splat a pixel, which avoids moire with
+the pixel grid; a moving camera gets a new cover at every instant. Moving bodies get a regular grid
+on each face, fine enough for the nearest approach of body and camera. Reflectivity is the same in
+all directions; the cosine of the angle of incidence is evaluated at every instant, so that the data
+obey Lambert's law, and not the model that is fitted to them.
 """
 
 from __future__ import annotations
@@ -32,8 +36,8 @@ from ..scene.gaussians import GaussianField, constant_sh
 from .assembly import Assembly
 from .world import Body, albedo, first_hit
 
-RADIUS = 0.2  # [px] of a splat before the low-pass: small, because every pixel of overlap blurs the surface
-SPACING = 0.8  # [px] of the grid on moving bodies; the renderer's low-pass closes the gaps up to about 1 px
+RADIUS = 0.2  # [px] of a splat before the low-pass: small, because overlap blurs the surface
+SPACING = 0.8  # [px] of the grid on moving bodies; the low-pass closes gaps up to about 1 px
 MARGIN = 3  # [px] of cover beyond the image, more than a splat reaches
 OPACITY_LOGIT = 9.0  # opacity 0.9999, above the clamp of alpha
 THICKNESS = 1e-4  # [m] of the discs
@@ -47,7 +51,8 @@ def overlap(spacing: float, variance: float, aligned: bool) -> tuple[float, floa
     Args:
         spacing: Distance between splats [px].
         variance: Variance v of a splat on the image [px^2].
-        aligned: Whether splats are centred on pixels; otherwise both results are averaged over all alignments.
+        aligned: Whether splats are centred on pixels; otherwise both results are averaged over all
+            alignments.
     """
     index = np.arange(-8, 9) * spacing
     x, y = (axis.ravel() for axis in np.meshgrid(index, index, indexing="ij"))  # x: from near to far
@@ -88,7 +93,8 @@ class Cover:
     normal: Float[np.ndarray, "N 3"]
     """Unit normals, likewise."""
     other: Float[np.ndarray, "N 3"]
-    """At an edge, normals of the other face: visible only if both faces are, since elsewhere it is an outline."""
+    """At an edge, normals of the other face: visible only if both faces are, since elsewhere it is
+    an outline."""
     limb: float
     """Visible only if the cosine of incidence exceeds this [1]."""
     frame: Float[np.ndarray, "N 3 3"]
@@ -98,7 +104,8 @@ class Cover:
     reflectance: Float[np.ndarray, "N"]
     """Reflectance rho over the share of the light that the cover returns [1]."""
     albedo: Float[np.ndarray, "N 3"]
-    """Albedo in linear RGB [1]; not corrected, since colour has the weights alpha T, whose sum is the opacity."""
+    """Albedo in linear RGB [1]; not corrected, since colour has the weights alpha T, whose sum is
+    the opacity."""
     body: Body | None
     """The moving body; None for the cover of the still bodies."""
 
@@ -106,7 +113,7 @@ class Cover:
         return len(self.point)
 
     def facing(self, centre: Float[np.ndarray, "3"], time: float, *, colour: bool = False) -> GaussianField:
-        """The splats that face a camera at ``centre`` [m] at ``time`` [s], in world axes, shaded by incidence.
+        """The splats facing a camera at ``centre`` [m] at ``time`` [s], shaded by incidence.
 
         The others are occluded by their own body. ``colour`` adds the albedo, which is not shaded.
         """
@@ -132,9 +139,10 @@ class Cover:
 
 
 def cover_still(bodies: tuple[Body, ...], camera: Camera) -> Cover:
-    """One splat on the ray of every pixel of ``camera`` (and a margin around the image) that meets a still body.
+    """One splat on the ray of every pixel, and of a margin, that meets a still body.
 
-    Each is a disc in the surface, stretched along the slope so that its image is round, and moved back, see above.
+    Each is a disc in the surface, stretched along the slope so that its image is round, and moved
+    back, see above.
     """
     wide = _wider(camera)
     hits = first_hit(bodies, wide, 0.0)
@@ -166,7 +174,7 @@ def cover_still(bodies: tuple[Body, ...], camera: Camera) -> Cover:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Wide(Camera):
-    """A camera with a margin around its image, where its lens is extrapolated as in the renderer."""
+    """A camera with a margin around its image, where its lens is extrapolated."""
 
     inner: Camera
 
@@ -186,7 +194,7 @@ def _wider(camera: Camera) -> Camera:
 def cover_moving(
     body: Body, camera: Camera, times: Float[np.ndarray, "F"], centres: Float[np.ndarray, "F 3"] | None = None
 ) -> Cover:
-    """A regular grid of discs on each face, ``SPACING`` pixels apart at the nearest approach at ``times`` [s].
+    """Grids of discs on the faces, ``SPACING`` pixels apart at the nearest of ``times`` [s].
 
     ``centres`` [m] are positions of the camera at those times; None: that of ``camera``.
     """
@@ -218,9 +226,10 @@ def cover_moving(
 def clearance(
     body: Body, camera: Float[np.ndarray, "*frames 3"], times: Float[np.ndarray, "F"]
 ) -> Float[np.ndarray, "F"]:
-    """Distance [m] between a camera and the bounding sphere of a body, at ``times`` [s]; negative inside it.
+    """Distance [m] of a camera from the bounding sphere of a body at ``times`` [s].
 
-    ``camera`` is its position [m], or one for each of the times. Assemblies are bounded part by part: doors are tall.
+    ``camera`` is its position [m], or one for each of the times. Assemblies are bounded part by
+    part: doors are tall.
     """
     poses = np.array([body.path.world_from_body(float(t)) for t in times])
     if isinstance(body.shape, Assembly):
@@ -236,10 +245,11 @@ def _frame(across: np.ndarray, normal: np.ndarray) -> Float[np.ndarray, "N 3 3"]
 
 
 def depth_slope(normal, distance, ray, camera: Camera) -> Float[np.ndarray, "N"]:
-    """Growth of distance [m/px] on the tangent plane, in the direction on the image in which z-depth grows fastest.
+    """Growth of distance [m/px] on the tangent plane, where z-depth grows fastest.
 
-    With the normal n, the direction f = (x/z, y/z, 1) and n . f z constant, grad z = -z n / (n . f) / focal length and
-    d = z |f|. Zero where z-depth, which orders splats, is constant: then no side leads.
+    With the normal n, the direction f = (x/z, y/z, 1) and n . f z constant, grad z = -z n / (n . f)
+    / focal length and d = z |f|. Zero where z-depth, which orders splats, is constant: then no side
+    leads.
     """
     camera_from_world = camera.camera_from_world[:3, :3]
     local_ray, local_normal = ray @ camera_from_world.T, normal @ camera_from_world.T
@@ -281,7 +291,7 @@ def _tensor(array: np.ndarray) -> torch.Tensor:
 
 
 def quaternions(rotation: Float[np.ndarray, "N 3 3"]) -> Float[np.ndarray, "N 4"]:
-    """Unit quaternions (wxyz) of rotations, from the largest of the four components, which never vanishes."""
+    """Unit quaternions (wxyz) of rotations, from the largest of the four components."""
     r = rotation
     trace = np.trace(r, axis1=1, axis2=2)
     squares = np.stack([trace, r[:, 0, 0], r[:, 1, 1], r[:, 2, 2]], axis=1)

@@ -1,4 +1,4 @@
-"""Engine gaussian: the scene is covered by Gaussians, which are rendered with several rays per pixel."""
+"""Engine gaussian: Gaussians that cover the scene, rendered with several rays per pixel."""
 
 from __future__ import annotations
 
@@ -22,13 +22,15 @@ OPAQUE = 0.5  # [1] opacity at the outline of a cover
 
 
 class GaussianEngine:
-    """A scene as Gaussians for one camera: a rigid cover per moving body and one for all still bodies.
+    """A scene as Gaussians for one camera: a cover per moving body, one for all still ones.
 
-    Still bodies are covered along the rays of the camera, so a camera that moves gets a new cover at every instant.
+    Still bodies are covered along the rays of the camera, so a camera that moves gets a new cover
+    at every instant.
 
     Args:
         scene: Bodies and their paths.
-        camera_at: The camera at a time [s], at the resolution of the rays: pixels times ``scene.subsamples``.
+        camera_at: The camera at a time [s], at the resolution of the rays: pixels times
+            ``scene.subsamples``.
         times: Instants [s] at whose nearest approach the covers are still fine enough.
         colour: Whether the Gaussians have colour.
     """
@@ -64,7 +66,7 @@ class GaussianEngine:
         return cover_still(self._still, camera).facing(camera.centre, 0.0, colour=self._colour)
 
     def expose(self, n: int, instants: list[float], time: float, sensor: Sensor) -> Exposure:
-        """The mean over ``instants`` [s], and the phasor at ``time`` [s], for the first shift of the sensor."""
+        """The mean over ``instants`` [s], and the phasor at ``time`` [s], of the first shift."""
         del n  # nothing is random
         images = [self._instant(instant, sensor) for instant in instants]
         still = images[0] if instants == [time] else self._instant(time, sensor)
@@ -72,7 +74,7 @@ class GaussianEngine:
         return Exposure(quad, amplitude, distance, still.phasor)
 
     def _instant(self, time: float, sensor: Sensor) -> Exposure:
-        """An instant; each harmonic is rendered separately, which is exact for any mixture of surfaces in a pixel."""
+        """An instant; each harmonic is rendered separately, exact for mixtures in a pixel."""
         field, camera = self.field_at(time), self.camera_at(time)
         rendering = _rendering(field, camera, sensor)
         f_mod_hz, offset = float(sensor.f_mod_hz), float(sensor.phase_offset)
@@ -96,7 +98,7 @@ class GaussianEngine:
         return re / 2 + 0.5j * im
 
     def albedo(self, time: float) -> Float[np.ndarray, "H W 3"]:
-        """Mean albedo of every pixel in linear RGB [1]: colour over opacity where a ray meets a body, else black."""
+        """Mean albedo of every pixel in linear RGB [1]; black where rays meet nothing."""
         rendering = _rendering(self.field_at(time), self.camera_at(time), Sensor())
         assert rendering.colour is not None, "the Gaussians of a colour camera have colour"
         met = torch.where(rendering.opacity > OPAQUE, rendering.colour / rendering.opacity, 0.0)

@@ -1,8 +1,9 @@
-"""Ideal quads without a renderer: analytic first hits on a few rays per pixel, read by an ideal sensor.
+"""Ideal quads without a renderer: analytic first hits, read by an ideal sensor.
 
-Without noise, blur and indirect light, the remaining errors of the closed form are those of motion, and of mixtures of
-surfaces in a pixel if it has more than one ray. Closed-form errors of named scenes refer to these quads. Light and
-sensor are separate, so that light can be read by several sensors of the same modulation frequencies.
+Without noise, blur and indirect light, the remaining errors of the closed form are those of motion,
+and of mixtures of surfaces in a pixel if it has more than one ray. Closed-form errors of named
+scenes refer to these quads. Light and sensor are separate, so that light can be read by several
+sensors of the same modulation frequencies.
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ class Light(NamedTuple):
     """Light of one raw frame, of any shift."""
 
     amplitude: Float[np.ndarray, "H W"]
-    """Mean amplitude a of each pixel for a source intensity of 1 [relative units]; 0 where nothing is hit."""
+    """Mean amplitude a of each pixel for a source intensity of 1 [relative units]; 0 where nothing
+    is hit."""
     phasor: Complex[np.ndarray, "H W"]
     """Mean of a exp(i kappa d), likewise."""
     distance: Float[np.ndarray, "H W"]
@@ -66,8 +68,10 @@ def ideal_recording(
 
     Args:
         scene: The scene, with its own frames and times.
-        lights: Light by raw frame; others are not measured and their truth is unknown. None: that of all frames.
-        sensor: Instead of the scene's; its noise is ignored, and its modulation frequencies must be the same.
+        lights: Light by raw frame; others are not measured and their truth is unknown. None: that
+            of all frames.
+        sensor: Instead of the scene's; its noise is ignored, and its modulation frequencies must be
+            the same.
 
     Raises:
         ValueError: If the modulation frequencies differ.

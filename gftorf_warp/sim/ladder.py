@@ -1,7 +1,8 @@
-"""The ladder: one scene from ideal and synchronous to realistic in named levels, to attribute errors to causes.
+"""The ladder: a scene from ideal and synchronous to realistic in named levels.
 
-Each level changes a few settings of the one before it (sensor notes, 1.2); ``OWN`` is the value of the scene itself.
-All levels are traced by engine mesh, since light beside the camera and bounces need it.
+Each level changes a few settings of the one before it (sensor notes, 1.2); ``OWN`` is the value of
+the scene itself. All levels are traced by engine mesh, since light beside the camera and bounces
+need it.
 """
 
 from __future__ import annotations
@@ -88,9 +89,10 @@ def adds_of(name: str) -> str:
 
 
 def resolved(scene: Scene, settings: SimSettings) -> tuple[Scene, SimSettings]:
-    """The scene as it is recorded, and settings without defaults, overrides and level: all of them applied.
+    """The scene as it is recorded, and settings with defaults, overrides and level applied.
 
-    Resolving twice is the same as once. ``settings.sync`` holds at every level; else a level's settings replace others.
+    Resolving twice is the same as once. ``settings.sync`` holds at every level; else a level's
+    settings replace others.
 
     Raises:
         UsageError: If there is no such level, or a field cannot be overridden so.
@@ -123,7 +125,7 @@ def resolved(scene: Scene, settings: SimSettings) -> tuple[Scene, SimSettings]:
 
 
 def _changed(sensor: Sensor, settings: Mapping[str, Any]) -> Sensor:
-    """A sensor with other settings; harmonics raise the DC offset of a unipolar one, so that no tap is negative."""
+    """A sensor with other settings; harmonics raise the DC offset of a unipolar one."""
     swing = peak(settings["harmonic_contrast"])
     if sensor.unipolar and float(sensor.dc_offset) < swing:
         settings = {**settings, "dc_offset": swing}

@@ -1,8 +1,9 @@
-"""Look-alikes of the seven synthetic F-ToeRF scenes: as hard for the closed form as the published ones, not the same.
+"""Look-alikes of the seven synthetic F-ToeRF scenes: as hard for the closed form.
 
-Scene files, materials and speeds of the published scenes are not public. These are recipes of ours with about two
-knobs each, turned until the error of the closed form was near the published one, and for that alone (sensor notes,
-4.2). Raw frame n is at n / 120 s; ``STEP`` turns metres per raw frame into metres per second.
+Scene files, materials and speeds of the published scenes are not public. These are recipes of ours
+with about two knobs each, turned until the error of the closed form was near the published one, and
+for that alone (sensor notes, 4.2). Raw frame n is at n / 120 s; ``STEP`` turns metres per raw frame
+into metres per second.
 """
 
 from __future__ import annotations
@@ -104,7 +105,7 @@ def arcing_cube() -> Scene:
 
 
 def acute_z_speed_test() -> Scene:
-    """Sideways and nearer at once; the cubes pass through each other, which is harmless for distance."""
+    """Sideways and nearer at once; the cubes pass through each other."""
     ways: tuple[tuple[Vector, Vector], ...] = (
         ((-1.5, 0.1, 4.2), (0.25, 0.1, 2.0)),
         ((1.6, -0.5, 3.8), (-0.05, -0.2, 2.1)),
@@ -122,7 +123,7 @@ def acute_z_speed_test() -> Scene:
 
 
 def _row(y: float, z: float, step: float) -> Line:
-    """To the right at height ``y`` and depth ``z`` [m], ``step`` metres per raw frame, in the middle at half time."""
+    """To the right at height ``y`` and depth ``z`` [m], ``step`` metres per raw frame."""
     return passing(FRAMES, (0.0, y, z), (step * STEP, 0.0, 0.0))
 
 
@@ -140,7 +141,7 @@ def _way(start: Vector, end: Vector) -> Line:
 def look_alike(
     name: str, description: str, motion: str, closed_form: float, bodies: tuple[Body, ...], **others: Any
 ) -> Scene:
-    """A scene of 320x240 pixels and 60 raw frames, unless ``others``, further fields of it, say otherwise."""
+    """A scene of 320x240 pixels and 60 raw frames; ``others`` are further fields of it."""
     texts = {"name": name, "description": description, "motion": motion}
     size = {"frames": FRAMES, "width": 320, "height": 240}
     return Scene(**{**texts, **size, "closed_form": closed_form, "bodies": bodies, **others})

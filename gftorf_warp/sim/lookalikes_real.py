@@ -1,7 +1,7 @@
-"""Look-alikes of the five recorded F-ToeRF scenes: a static camera like the OPT8241, at 20 MHz (sensor notes, 4.3).
+"""Look-alikes of the five recorded F-ToeRF scenes: static OPT8241 at 20 MHz (notes, 4.3).
 
-Only subject and kind of motion are borrowed. At 30 MHz all but the fan would wrap; the target wraps at 20 MHz too.
-Colours are free choices.
+Only subject and kind of motion are borrowed. At 30 MHz all but the fan would wrap; the target wraps
+at 20 MHz too. Colours are free choices.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ def jacks() -> Scene:
 
 
 def target() -> Scene:
-    """A wall beyond the unambiguous range: a third of all pixels wraps, and only errors modulo the range say much."""
+    """A wall beyond the unambiguous range: a third of all pixels wraps."""
     board = Guided(
         x=Curve(start=-4.0 * MIDDLE, rate=4.0),
         y=-0.1,
@@ -118,7 +118,7 @@ def target() -> Scene:
 
 
 def fan(rpm: float = RPM) -> Scene:
-    """Periodic and faster than a quartet: the blades pass a third of their circle in four raw frames."""
+    """Periodic: the blades pass a third of their circle in four raw frames."""
 
     def blade(first: float) -> Body:
         turns = (Turn(axis="z", angle=Curve(start=first, rate=6.0 * rpm)), Turn(axis="x", angle=25.0))

@@ -1,7 +1,8 @@
-"""Look-alikes of five ToeRF scenes: a person moves something; ToF camera and colour camera are carried on an arc.
+"""Look-alikes of five ToeRF scenes: a person acts, and both cameras move on an arc.
 
-Only the subject is borrowed; the recipes are ours (sensor notes, 4.4). One second, 30 quartets of raw quads, each raw
-frame with its own pose; written with ``--format torf`` it becomes 30 phasors. Colours are free choices.
+Only the subject is borrowed; the recipes are ours (sensor notes, 4.4). One second, 30 quartets of
+raw quads, each raw frame with its own pose; written with ``--format torf`` it becomes 30 phasors.
+Colours are free choices.
 """
 
 from __future__ import annotations
@@ -179,7 +180,7 @@ def studybook() -> Scene:
 
 
 def carried_camera(centre: float, yaw_deg_per_s: float, pitch_deg: float) -> Guided:
-    """An arc about a point ``centre`` [m] ahead, straight at half a second, looking down by ``pitch_deg``; a tremor."""
+    """An arc about a point ``centre`` [m] ahead, looking down by ``pitch_deg``, with a tremor."""
     pitch = math.radians(pitch_deg)
     return Guided(
         y=Curve(swing=0.004, swing_hz=3.0),
@@ -197,7 +198,7 @@ def _room(z: float, y: float, wall: float, floor: float) -> tuple[Body, Body]:
 
 
 def _carried(*texts_and_bodies: Any, centre: float, yaw_deg_per_s: float, pitch_deg: float = 0.0) -> Scene:
-    """With 640x480 pixels of colour, from a camera carried for one second; the rest as for ``look_alike``."""
+    """With a colour camera, moving for one second; the rest as for ``look_alike``."""
     return look_alike(
         *texts_and_bodies,
         sensor=torf_real(),

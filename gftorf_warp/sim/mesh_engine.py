@@ -1,4 +1,4 @@
-"""Engine mesh: rays are traced through the shapes themselves: meshes, balls and infinite planes, no Gaussians."""
+"""Engine mesh: rays are traced through the shapes: meshes, balls and infinite planes."""
 
 from __future__ import annotations
 
@@ -22,14 +22,15 @@ from .scene import Scene
 from .truth_layers import truth_layers
 from .world import Body, Box, Plane, Shape, Sphere, albedo, first_hit
 
-PATHS = 7  # part of the seed of the paths: other random numbers than those of read-out and colour camera
+PATHS = 7  # part of the seed of the paths, unlike that of read-out and colour camera
 
 
 class MeshEngine:
     """A scene as meshes for one camera.
 
     Args:
-        scene: Bodies and their paths, rays per pixel, position and beam of the emitter; its sensor's rolling shutter.
+        scene: Bodies and their paths, rays per pixel, position and beam of the emitter; its
+            sensor's rolling shutter.
         camera_at: The camera at a time [s].
         harmonics: Multiples of the modulation frequency at which light is wanted.
         bounces: Light that met more than one surface.
@@ -64,7 +65,7 @@ class MeshEngine:
         )
 
     def light(self, times: Sequence[float], f_mod_hz: float, seed: int = 0, *, row: int | None = None) -> Light:
-        """Mean light over instants [s] of an exposure, for a source intensity of 1; ``seed`` is of the bounces."""
+        """Mean light over instants [s], for a source intensity of 1; ``seed`` of the bounces."""
         return self._tracer.light(
             [self._camera(time, row) for time in times],
             np.stack([self._poses(time) for time in times]),
@@ -81,9 +82,10 @@ class MeshEngine:
         return replace(hits, body=np.where(hits.body < 0, hits.body, self._body[hits.body]))
 
     def expose(self, n: int, instants: list[float], time: float, sensor: Sensor) -> Exposure:
-        """Raw frame ``n``: the mean over ``instants`` [s]; phasor, distance and layers at ``time`` [s].
+        """Raw frame ``n``: mean over ``instants`` [s]; phasor, distance, layers at ``time`` [s].
 
-        With a rolling shutter these are the times of the first row, and every row is traced at its own.
+        With a rolling shutter these are the times of the first row, and every row is traced at its
+        own.
         """
         if not self.scene.sensor.row_time_s > 0:
             return self._expose((n, PATHS), instants, time, sensor)
@@ -117,7 +119,7 @@ class MeshEngine:
 
 
 def beam_is_traced(scene: Scene, bounces: int) -> bool:
-    """Whether the beam has to be part of the traced light: direct light of a lamp at the camera is multiplied later."""
+    """Whether the beam is part of the traced light; else it is multiplied afterwards."""
     return bounces > 0 or any(scene.emitter)
 
 
@@ -130,7 +132,7 @@ def traced_albedo(scene: Scene, camera: Camera, time: float) -> Float[np.ndarray
 
 
 def rigid_bodies(body: Body) -> list[RigidBody]:
-    """A body of the world as the tracer takes it: one piece, or several that share its pose and its texture.
+    """The rigid bodies of the tracer for a body; all share its pose and its texture.
 
     The flat-sided parts of an assembly are one piece together; each of its balls is another.
     """
@@ -159,7 +161,7 @@ def rigid_bodies(body: Body) -> list[RigidBody]:
 
 
 def triangles_of(shape: Shape) -> tuple[Float[np.ndarray, "V 3"], Int[np.ndarray, "T 3"]]:
-    """Vertices [m] and triangles of a flat-sided shape, counter-clockwise as seen from its visible side.
+    """Vertices [m] and triangles of a shape, counter-clockwise from its visible side.
 
     Raises:
         ValueError: If the shape is no box, plane or mesh.

@@ -1,4 +1,4 @@
-"""Read triangles from PLY and OBJ files, and check that they are a surface, closed unless it may be open."""
+"""Read triangles from PLY and OBJ files, and check that they are a surface."""
 
 from __future__ import annotations
 
@@ -20,20 +20,21 @@ def read_mesh(
 ) -> tuple[Float[np.ndarray, "V 3"], Int[np.ndarray, "T 3"]]:
     """Vertices [m] and triangles of a file, counter-clockwise as seen from the visible side.
 
-    Vertices at the same position are merged, polygons triangulated, all objects joined; materials, colours and normals
-    of the file are ignored.
+    Vertices at the same position are merged, polygons triangulated, all objects joined; materials,
+    colours and normals of the file are ignored.
 
     Args:
         file: A PLY or OBJ file.
         scale: Metres per unit of the file.
-        inside: Whether a closed surface is visible from within, as a room is, whatever its winding in the file.
-        open: Whether the surface may have borders. Then it is visible from the side from which the file winds it
-            counter-clockwise.
+        inside: Whether a closed surface is visible from within, as a room is, whatever its winding
+            in the file.
+        open: Whether the surface may have borders. Then it is visible from the side from which the
+            file winds it counter-clockwise.
 
     Raises:
-        InputError: If the file cannot be read, it has no triangle, a vertex that is no number or a triangle without
-            area, or it is no surface: an edge of three triangles, neighbours of opposite winding, or, without ``open``,
-            a border.
+        InputError: If the file cannot be read, it has no triangle, a vertex that is no number or a
+            triangle without area, or it is no surface: an edge of three triangles, neighbours of
+            opposite winding, or, without ``open``, a border.
     """
     points, triangles = _loaded(file)
     if len(triangles) == 0:

@@ -1,9 +1,11 @@
-"""Triangle meshes from files: closed surfaces, rooms and sheets, and the first hits of rays on them in float64.
+"""Triangle meshes from files, and the first hits of rays on them in float64.
 
-The hits are truth and share nothing with the tracer: another hierarchy, another precision, all rays of an image at
-once. Rays of one image start at one point o. With s = o - a for a corner a, edges e1 and e2 and the ray d,
+The hits are truth and share nothing with the tracer: another hierarchy, another precision, all rays
+of an image at once. Rays of one image start at one point o. With s = o - a for a corner a, edges e1
+and e2 and the ray d,
 
-    det = -d . (e1 x e2),   u = d . (e2 x s) / det,   v = d . (s x e1) / det,   distance = s . (e1 x e2) / det
+    det = -d . (e1 x e2),       distance = s . (e1 x e2) / det
+    u = d . (e2 x s) / det,     v = d . (s x e1) / det
 
 (Moeller and Trumbore, 1997); the terms in brackets are the same for all rays of an image.
 """
@@ -42,7 +44,7 @@ class Node(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Mesh(Shape):
-    """The triangles of a PLY or OBJ file, seen from outside; engine 'gaussian' covers it only where it rests."""
+    """The triangles of a PLY or OBJ file; engine 'gaussian' covers it only if it is static."""
 
     file: FilePath
     """Path, relative to the scene file that names it."""
@@ -51,7 +53,8 @@ class Mesh(Shape):
     inside: bool = False
     """False: a solid. True: a room."""
     open: bool = False
-    """Whether it may have borders: a sheet, visible from the side from which the file winds it counter-clockwise."""
+    """Whether it may have borders: a sheet, visible from the side from which the file winds it
+    counter-clockwise."""
 
     def __post_init__(self):
         if not 0 < self.scale < np.inf:
@@ -62,7 +65,7 @@ class Mesh(Shape):
         _ = self.surface  # a bad file is an error when the scene is made
 
     def __repr__(self):
-        """With a hash of the content instead of the path: another file of that name is another scene."""
+        """With a hash of the content instead of the path."""
         settings = f"scale={self.scale!r}, inside={self.inside!r}, open={self.open!r}"
         return f"Mesh(file={self.file.name!r}, sha256={self._digest!r}, {settings})"
 
@@ -72,7 +75,7 @@ class Mesh(Shape):
         return read_mesh(self.file, scale=self.scale, inside=self.inside, open=self.open)
 
     def hit(self, origin, ray):
-        """The nearest triangle whose visible side faces the ray; faces are the numbers of triangles."""
+        """The nearest triangle that faces the ray; faces are numbers of triangles."""
         distance, face = np.full(len(ray), np.inf), np.zeros(len(ray), dtype=np.int64)
         corner, e1, e2, normal = self._edges
         s = origin - corner

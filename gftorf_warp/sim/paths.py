@@ -1,6 +1,7 @@
 """Rigid paths: position and orientation of a body or a camera at any time.
 
-A path is a pure function of time, so that poses at the instant of a raw frame and optical flow are exact.
+A path is a pure function of time, so that poses at the instant of a raw frame and optical flow are
+exact.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ Vector = tuple[float, float, float]
 
 
 def rotation_matrix(turn_deg: Vector) -> Float[np.ndarray, "3 3"]:
-    """Rotation of a rotation vector [deg]: its direction is the axis, its length the angle (Rodrigues)."""
+    """Rotation of a rotation vector [deg]: axis times angle (Rodrigues)."""
     vector = np.radians(np.asarray(turn_deg, dtype=np.float64))
     angle = float(np.linalg.norm(vector))
     if angle == 0.0:
@@ -40,7 +41,7 @@ def inverse(pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
 
 
 def looking_at(position: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
-    """World from camera at ``position`` [m] whose z axis points to ``target`` [m] and whose x axis is level.
+    """World from camera at ``position`` [m], z axis to ``target`` [m], x axis horizontal.
 
     Raises:
         ValueError: If the view is straight up or down, where no x axis is more level than another.
@@ -54,7 +55,7 @@ def looking_at(position: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"])
 
 
 class Path(abc.ABC):
-    """A rigid motion. Final classes: Still, Line, Arc, Guided for bodies; Viewpoint, Sweep for cameras."""
+    """A rigid motion. Final classes: Still, Line, Arc, Guided; Viewpoint, Sweep for cameras."""
 
     @abc.abstractmethod
     def world_from_body(self, time: float) -> Float[np.ndarray, "4 4"]:
@@ -101,14 +102,15 @@ class Line(Path):
 
 @dataclass(frozen=True, kw_only=True)
 class Arc(Path):
-    """A horizontal circle at constant rate; the body turns with it, so that one face always points outwards."""
+    """A horizontal circle at constant rate; the body turns with it."""
 
     centre: Vector
     """Centre of the circle in the world [m]."""
     radius: float
     """Radius [m]."""
     start_deg: float
-    """Angle at time 0 [deg]: 0 is to the right of the centre (+x), 90 behind it (+z), -90 between it and the camera."""
+    """Angle at time 0 [deg]: 0 is to the right of the centre (+x), 90 behind it (+z), -90 between
+    it and the camera."""
     rate_deg_per_s: float
     """Angular rate [deg/s]."""
 
@@ -144,7 +146,8 @@ class Sweep(Path):
     target: Vector
     """Centre of the arc, on the camera's z axis [m]."""
     sweep_deg: float
-    """Angle from one end of the arc to the other, seen from the target [deg]; above 0 it starts at the left."""
+    """Angle from one end of the arc to the other, seen from the target [deg]; above 0 it starts at
+    the left."""
     period_s: float
     """Time for the way out and back [s]."""
     rise: float = 0.0

@@ -1,22 +1,24 @@
-"""Read-out of a sensor: from mean light to digital numbers, by taps, shot and read noise, full well and ADC.
+"""Read-out of a sensor: taps, shot and read noise, full well and ADC.
 
-See sensor notes, 2.3 to 2.5. With S_h the light of a pixel at harmonic h, a the amplitude, r_h the contrast of h
-relative to that of the first, and p the fixed phase pattern, the quad in relative units is
+See sensor notes, 2.3 to 2.5. With S_h the light of a pixel at harmonic h, a the amplitude, r_h the
+contrast of h relative to that of the first, and p the fixed phase pattern, the quad in relative
+units is
 
     q = Re sum_h r_h S_h exp(i h (phase_offset + p - shift)) + a b
 
 With G electrons per unit,
 
     N_s = G a                                            modulated electrons, both taps together
-    n_A, n_B = 1/2 [N_a + N_s +- C G q] + N_dark         mean electrons per tap; N_a ambient, C contrast
+    n_A, n_B = 1/2 [N_a + N_s +- C G q] + N_dark         mean electrons per tap; N_a ambient
     n'  = min(Poisson(n) + Normal(0, s_r), full well)    per tap
-    differential   code = clip(round((n'_A - n'_B) / e))           signed;    quad = code e / (C G)
-    unipolar       code = clip(round(n'_A / e) + pedestal)         unsigned;  quad = (n'_A - N_a/2 - N_dark) 2 / (C G)
+    differential   code = clip(round((n'_A - n'_B) / e)),      quad = code e / (C G)
+    unipolar       code = clip(round(n'_A / e) + pedestal),    quad = (n'_A - N_a/2 - N_dark) 2 / (C G)
 
-A unipolar sensor has C = 1 / b. It subtracts constant levels: ambient light, measured by a frame without active light,
-and the mean dark current of all pixels. The fixed pattern multiplies all light by the gain of each pixel, and the dark
-current by another factor. Results are in relative units again; without clipping their mean is q times the gain. Their
-phase noise is that of scene/electrons.py.
+C is the contrast. Differential codes are signed. A unipolar sensor has C = 1 / b. It subtracts
+constant levels: ambient light, measured by a frame without active light, and the mean dark current
+of all pixels. The fixed pattern multiplies all light by the gain of each pixel, and the dark
+current by another factor. Results are in relative units again; without clipping their mean is q
+times the gain. Their phase noise is that of scene/electrons.py.
 """
 
 from __future__ import annotations
@@ -65,8 +67,8 @@ def mean_quad(
     """Mean quad of the sensor's first shift, and mean amplitude, of every pixel.
 
     Args:
-        light: Sum of amplitude exp(i h phase) for each h of ``sensor.harmonics``, for a source intensity of 1 and
-            without phase offset [relative units].
+        light: Sum of amplitude exp(i h phase) for each h of ``sensor.harmonics``, for a source
+            intensity of 1 and without phase offset [relative units].
         amplitude: Sum of the amplitudes, likewise.
         sensor: Its offsets, harmonics and phase pattern.
 
@@ -100,7 +102,8 @@ def mean_taps(
         ambient: Share of the sensor's ambient electrons that each pixel gets [1]; None: 1.
 
     Raises:
-        ValueError: If a tap would hold a negative number of electrons: contrast and DC offset contradict each other.
+        ValueError: If a tap would hold a negative number of electrons: contrast and DC offset
+            contradict each other.
     """
     gain = electron_gain(sensor)
     signal = float(contrast(sensor)) * gain * np.asarray(quad, dtype=np.float64)
@@ -133,13 +136,16 @@ def read_out(
     Args:
         quad: Mean quad, DC offset included [relative units].
         amplitude: Mean amplitude a, source intensity included [relative units].
-        sensor: Without ``noise`` the mean is returned, after ``shading`` and the pattern of the gain.
-        generator: Source of all randomness. The order of draws is fixed: shots A, shots B, reads A, reads B.
+        sensor: Without ``noise`` the mean is returned, after ``shading`` and the pattern of the
+            gain.
+        generator: Source of all randomness. The order of draws is fixed: shots A, shots B, reads A,
+            reads B.
         ambient: Share of even ambient light that each pixel reflects [1]; None: 1.
         shading: Factors of the light of each pixel; None: 1.
 
     Raises:
-        ValueError: If the sensor's contrast and DC offset contradict each other, see :func:`mean_taps`.
+        ValueError: If the sensor's contrast and DC offset contradict each other, see
+            :func:`mean_taps`.
     """
     response = gain_map(sensor.pattern, *np.shape(quad))
     for active, other in [
@@ -170,8 +176,9 @@ def quantise(
 ) -> tuple[Float[np.ndarray, "H W"], Bool[np.ndarray, "H W"]]:
     """Electrons after quantisation by the ADC [e-], and whether it was at an end of its range.
 
-    Codes run from -2^(bits-1) to 2^(bits-1) - 1. A unipolar sensor has a pedestal, one 64th of the range above the
-    lowest code, so that read noise around zero is not clipped; it is subtracted again.
+    Codes run from -2^(bits-1) to 2^(bits-1) - 1. A unipolar sensor has a pedestal, one 64th of the
+    range above the lowest code, so that read noise around zero is not clipped; it is subtracted
+    again.
     """
     if sensor.adc_bits is None:
         return electrons, np.zeros(np.shape(electrons), dtype=bool)

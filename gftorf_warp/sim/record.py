@@ -1,4 +1,4 @@
-"""Record a scene: one image per raw frame, read out by the sensor, and the analytic truth of each."""
+"""Record a scene: one image per raw frame, read out by the sensor, and its truth."""
 
 from __future__ import annotations
 
@@ -32,7 +32,8 @@ from .world import Hits, first_hit, flow_of
 Progress = Callable[[int, int], None]
 Images = dict[str, np.ndarray]
 Cached = Callable[[str, Callable[[], Images]], tuple[Images, bool]]
-"""Images of a name, computed now or read from an interrupted recording, and whether they were computed now."""
+"""Images of a name, computed now or read from an interrupted recording, and whether they were
+computed now."""
 
 LAYER = "layer "  # begins the names of layers among the images of a raw frame
 COLOUR = 3  # part of the seed of the colour camera's noise
@@ -40,7 +41,7 @@ COLOUR = 3  # part of the seed of the colour camera's noise
 
 @dataclass(frozen=True, kw_only=True)
 class Gap:
-    """Distance as the engine sees it against the analytic truth, over interior pixels of still bodies.
+    """Distance of the engine against the truth, over interior pixels of still bodies.
 
     Engine gaussian has a mean distance, divided by opacity; engine mesh has a first hit.
     """
@@ -50,7 +51,8 @@ class Gap:
     max: float
     """Largest absolute difference [m]."""
     pixels: int
-    """Number of interior pixels in the image; their mean over all raw frames if the camera moves."""
+    """Number of interior pixels in the image; their mean over all raw frames if the camera
+    moves."""
 
     def __str__(self) -> str:
         return f"mean {1e3 * self.mean:.1f} mm, max {1e3 * self.max:.1f} mm over {self.pixels} pixels"
@@ -63,8 +65,9 @@ class Recording:
     sequence: Sequence
     """As a camera would have recorded it."""
     truth: Truth
-    """Analytic distance along each pixel's centre ray at the time of each raw frame; the distance that a sensor without
-    noise would decode if nothing moved; amplitude; visible body; layers of a capture."""
+    """Analytic distance along each pixel's centre ray at the time of each raw frame; the distance
+    that a sensor without noise would decode if nothing moved; amplitude; visible body; layers of a
+    capture."""
     gap: Gap | None
     """Engine against truth on still interior pixels; None if no such pixel exists."""
     saturated: float
@@ -72,7 +75,7 @@ class Recording:
 
 
 def frame_times(sensor: Sensor, frames: int, *, sync: bool) -> Float[np.ndarray, "F"]:
-    """Time of each raw frame [s]: n times the frame period, or, ``sync``, that of the first frame of its cycle."""
+    """Time of each raw frame [s]; with ``sync``, that of the first frame of its cycle."""
     frame = np.arange(frames)
     return (frame - frame % len(sensor.cycle) if sync else frame) * sensor.frame_period_s
 
@@ -80,7 +83,7 @@ def frame_times(sensor: Sensor, frames: int, *, sync: bool) -> Float[np.ndarray,
 def sequence_fields(
     sensor: Sensor, times: Float[np.ndarray, "F"], cameras: list[Camera], **settings: Any
 ) -> dict[str, Any]:
-    """The fields of a sequence that follow from its sensor, its times [s] and its ToF camera at each of them.
+    """The fields of a sequence given by its sensor, its times [s] and its ToF cameras.
 
     ``settings`` are further settings of the sensor.
     """
@@ -117,20 +120,22 @@ def record(
 ) -> Recording:
     """Record ``scene``, in memory; all of ``settings`` apply but the layout on disk.
 
-    Every raw frame depends on its number and on the settings alone, so that it may as well come from an interrupted
-    recording.
+    Every raw frame depends on its number and on the settings alone, so that it may as well come
+    from an interrupted recording.
 
     Args:
         scene: The scene.
         settings: How it is recorded.
         device: Where engine mesh traces.
         progress: Called with (raw frames done, raw frames in all).
-        cached: Returns finished images instead of computing them, see sim/resume.py; None computes all.
+        cached: Returns finished images instead of computing them, see sim/resume.py; None computes
+            all.
         changes: Fields of ``settings`` with other values.
 
     Raises:
         UsageError: If the settings contradict each other or the scene.
-        ValueError: If the sensor's contrast and DC offset contradict each other, see sim/readout.py.
+        ValueError: If the sensor's contrast and DC offset contradict each other, see
+            sim/readout.py.
     """
     scene, settings = resolved(scene, replace(settings, **changes))
     check_engine(scene, settings, device)
@@ -235,9 +240,10 @@ def _fine(camera_at: Callable[[float], Camera], scene: Scene) -> Callable[[float
 
 
 def _static_distance(exposure: Exposure, sensor: Sensor) -> Float[np.ndarray, "H W"]:
-    """Closed-form distance of four quads taken at once without noise [m], float32; NaN where there is no light.
+    """Closed-form distance [m] of four quads taken at once without noise; NaN without light.
 
-    In [0, c/2f), of all light that reaches the pixel, bounces included; a sensor's harmonics are not.
+    In [0, c/2f), of all light that reaches the pixel, bounces included; a sensor's harmonics are
+    not.
     """
     phasor = torch.from_numpy(np.asarray(exposure.phasor, dtype=np.complex128))
     distance = distance_from_phasor(phasor.real, phasor.imag, sensor).numpy()
@@ -259,7 +265,7 @@ def sensor_settings(sensor: Sensor) -> dict[str, Any]:
 
 
 def still_interior(scene: Scene, hits: list[Hits]) -> Bool[np.ndarray, "H W"]:
-    """Pixels that see the same face of a still body, with all neighbours up to two pixels away, in every raw frame."""
+    """Pixels that see the same face of a still body as all neighbours up to two pixels away."""
     moves = np.array([*(body.moves for body in scene.bodies), False])  # the last is index -1, nothing hit
     inside = np.ones(hits[0].body.shape, dtype=bool)
     inside[:2] = inside[-2:] = inside[:, :2] = inside[:, -2:] = False
@@ -275,7 +281,7 @@ def still_interior(scene: Scene, hits: list[Hits]) -> Bool[np.ndarray, "H W"]:
 def _truth(
     scene: Scene, settings: SimSettings, cameras: list[Camera], times: Float[np.ndarray, "F"]
 ) -> tuple[Float[np.ndarray, "F H W"], Int[np.ndarray, "F H W"], Bool[np.ndarray, "F H W"]]:
-    """Distance [m] and body of every raw frame, and its still interior: that of all raw frames of a still camera."""
+    """Distance [m], body and still interior of every raw frame."""
     distances, bodies, interior = [], [], []
     camera_at = partial(scene.camera, settings.size)
     for time in times.tolist():
@@ -326,7 +332,7 @@ def _colour(scene: Scene, settings: SimSettings, times: Float[np.ndarray, "F"], 
 
 
 def _flows(scene: Scene, cameras: list[Camera], times: Float[np.ndarray, "F"]) -> Flow:
-    """Exact optical flow at quartet starts, from n to n + K and to n - K, whether or not the target is occluded.
+    """Exact optical flow at quartet starts, from n to n + K and n - K, occluded or not.
 
     It is what an estimate from images would give: motion of the scene and of the camera together.
     """

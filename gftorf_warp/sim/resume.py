@@ -1,8 +1,9 @@
 """Resume interrupted recordings: finished images are kept in the folder OUT.partial beside OUT.
 
-Each image of a recording is a file there, renamed into place when it is complete, so that after any interruption the
-same command computes only the missing ones and ends with the same bytes. ``unfinished.md`` in the folder holds the
-settings; no reader takes it for a sequence, and it is removed when OUT is complete.
+Each image of a recording is a file there, renamed into place when it is complete, so that after any
+interruption the same command computes only the missing ones and ends with the same bytes.
+``unfinished.md`` in the folder holds the settings; no reader takes it for a sequence, and it is
+removed when OUT is complete.
 """
 
 from __future__ import annotations
@@ -38,7 +39,8 @@ def needs_recording(out: Path, card: str, *, fresh: bool) -> bool:
         fresh: Whether another sequence there may be renamed.
 
     Raises:
-        UsageError: If ``out`` holds anything else that may not be renamed, or OUT.partial another recording.
+        UsageError: If ``out`` holds anything else that may not be renamed, or OUT.partial another
+            recording.
     """
     _refuse_other_partial(partial_of(out), card, fresh=fresh)
     if not out.exists() or (out.is_dir() and not any(out.iterdir())):
@@ -75,7 +77,7 @@ def partial_of(out: Path) -> Path:
 
 @contextlib.contextmanager
 def cached_images(out: Path, card: str, *, fresh: bool) -> Iterator[Cached]:
-    """A cache of finished images in OUT.partial, which is locked meanwhile, and removed at a normal end.
+    """A cache of finished images in OUT.partial, locked meanwhile, removed at a normal end.
 
     After an exception or a killed process it stays, unless no image was finished. Arguments as for
     :func:`needs_recording`; ``fresh`` discards finished images.

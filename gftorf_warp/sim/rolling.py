@@ -1,4 +1,4 @@
-"""A rolling shutter: each row is exposed later than the one above, so an image is one row each of many images."""
+"""A rolling shutter: each row is exposed later than the one above."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .world import Body, Hits, first_hit
 
 
 def row_delays(sensor: Sensor, height: int) -> Float[np.ndarray, "H"]:
-    """Delay of each row after the first one [s]; the time of a raw frame is that of its first row."""
+    """Delay of each row after the first one [s], at the time of the raw frame."""
     return sensor.row_time_s * np.arange(height)
 
 
@@ -32,7 +32,7 @@ def join_rows(rows: list[Exposure]) -> Exposure:
 def rolling_hits(
     bodies: tuple[Body, ...], camera_at: Callable[[float], Camera], time: float, sensor: Sensor, height: int
 ) -> Hits:
-    """First hit of every pixel's centre ray, each row when it is exposed; of a global shutter, all at once.
+    """First hit of every pixel's centre ray, each row when it is exposed.
 
     Args:
         bodies: What there is.

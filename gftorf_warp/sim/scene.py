@@ -30,10 +30,10 @@ OVERRIDES = Wording(
 
 @dataclass(frozen=True, kw_only=True)
 class ColourCamera:
-    """A colour camera mounted beside the ToF camera; it takes an image at the start of every quartet.
+    """A colour camera beside the ToF camera; it takes an image at each quartet start.
 
-    Illumination is uniform from all directions, so that a pixel is the albedo of a Lambertian surface: linear RGB,
-    no shadows, no falloff, black where there is no surface.
+    Illumination is uniform from all directions, so that a pixel is the albedo of a Lambertian
+    surface: linear RGB, no shadows, no falloff, black where there is no surface.
     """
 
     width: int
@@ -84,19 +84,23 @@ class Scene:
     sensor: Sensor = field(default_factory=lambda: Sensor(noise=True))
     """The sensor, with its cycle of raw frames; also by name, see sim/sensors.py."""
     lens: Lens = field(default_factory=Lens)
-    """The lens of the ToF camera, and the beam of its emitter; the default is a pinhole and an isotropic emitter."""
+    """The lens of the ToF camera, and the beam of its emitter; the default is a pinhole and an
+    isotropic emitter."""
     camera_path: Path = field(default_factory=Still)
     """Path of the ToF camera; the default is at rest at the origin, looking along +z."""
     emitter: Vector = (0.0, 0.0, 0.0)
-    """Position of the emitter in the axes of the ToF camera [m]; engine 'mesh' only unless at the origin."""
+    """Position of the emitter in the axes of the ToF camera [m]; engine 'mesh' only unless at the
+    origin."""
     beam_deg: tuple[float, float] | None = None
-    """Limits of the light: full angles across and down about the camera's z axis [deg]; None: all directions."""
+    """Limits of the light: full angles across and down about the camera's z axis [deg]; None: all
+    directions."""
     colour: ColourCamera | None = None
     """The colour camera, which moves with the ToF camera; None: there is none."""
     novel_views: tuple[Path, ...] = ()
     """Poses, at time 0, of views without images, to be rendered after a reconstruction."""
     closed_form: float | None = None
-    """Error of the closed form on ideal quads [m^2 x 100], one ray per pixel; None: not measured."""
+    """Error of the closed form on ideal quads [m^2 x 100], one ray per pixel; None: not
+    measured."""
     overrides: tuple[str, ...] = ()
     """Differences from the named scene, as texts ``name=value``; for the data card."""
 
@@ -121,13 +125,13 @@ class Scene:
         return not isinstance(self.camera_path, Still | Viewpoint)
 
     def camera(self, size: tuple[int, int] | None = None, time: float = 0.0) -> Camera:
-        """The ToF camera at (width, height) ``size`` [px], or at the default size, as it is at ``time`` [s]."""
+        """The ToF camera at ``time`` [s], of (width, height) ``size`` [px] or the default size."""
         pose = inverse(self.camera_path.world_from_body(time))
         camera = Camera.from_fov(*(size or (self.width, self.height)), self.horizontal_fov_deg, camera_from_world=pose)
         return replace(camera, distortion=self.lens.distortion) if self.lens.distortion else camera
 
     def colour_camera(self, size: tuple[int, int] | None = None, time: float = 0.0) -> Camera:
-        """The colour camera beside a ToF image of ``size`` [px], or of the default size, as it is at ``time`` [s].
+        """The colour camera at ``time`` [s], for a ToF image of ``size`` [px] or the default.
 
         Raises:
             ValueError: If the scene has none.

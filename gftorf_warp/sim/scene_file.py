@@ -1,9 +1,9 @@
 """Scenes as TOML files: the fields of :class:`gftorf_warp.sim.scene.Scene`, as tables.
 
-A table holds the fields of a dataclass; others have their defaults. `kind` selects a class: a shape is "box", "plane",
-"sphere", "level", "assembly" or "mesh", a path "still", "line", "arc", "guided", "viewpoint" or "sweep". A sensor may
-be a name of sim/sensors.py, or a table with that name as `preset`. Paths of files are relative to the scene file. See
-examples/scene.toml.
+A table holds the fields of a dataclass; others have their defaults. `kind` selects a class: a shape
+is "box", "plane", "sphere", "level", "assembly" or "mesh", a path "still", "line", "arc", "guided",
+"viewpoint" or "sweep". A sensor may be a name of sim/sensors.py, or a table with that name as
+`preset`. Paths of files are relative to the scene file. See examples/scene.toml.
 """
 
 from __future__ import annotations
@@ -41,7 +41,8 @@ def read_scene(path: str | FilePath) -> Scene:
     """The scene that a TOML file describes.
 
     Raises:
-        InputError: If the file cannot be read, it is no TOML, or a table does not match its dataclass.
+        InputError: If the file cannot be read, it is no TOML, or a table does not match its
+            dataclass.
     """
     path = FilePath(path)
     try:

@@ -21,7 +21,7 @@ _scene = partial(Scene, frames=48, width=160, height=120)
 
 
 def demo() -> Scene:
-    """The scene of ``gftorf demo``: small, quick, and wrong in closed form wherever the box passes."""
+    """The scene of ``gftorf demo``: small, quick, wrong in closed form along the box."""
     path = passing(44, (-0.16, -0.2, 2.65), (4.9, 2.9, -2.7))
     return _scene(
         name="demo",
@@ -36,7 +36,7 @@ def demo() -> Scene:
 
 
 def sliding() -> Scene:
-    """Purely sideways: no pixel inside the box changes its distance, only its outline goes wrong."""
+    """Purely sideways: only the outline of the box has errors."""
     path = passing(48, (0.0, -0.1, 2.8), (3.0, 0.0, 0.0))
     return _scene(
         name="sliding",
@@ -52,7 +52,7 @@ def sliding() -> Scene:
 
 
 def axial() -> Scene:
-    """Along the line of sight: the outline hardly moves, but the phase does; the closed form lags and ripples."""
+    """Along the line of sight: the phase changes, and the closed form lags and ripples."""
     approach = passing(48, (-0.55, 0.0, 2.9), (0.0, 0.0, -4.0))
     retreat = passing(48, (0.7, 0.2, 2.7), (0.0, 0.0, 3.0))
     return _scene(
@@ -85,7 +85,7 @@ def arc() -> Scene:
 
 
 def tour() -> Scene:
-    """A camera moves past a desk, as in recordings of the TöRF family: phasors, colour, a pose per frame."""
+    """A camera moves past a desk, as in the TöRF family: phasors, colour, poses."""
     target = (0.0, 0.1, 2.7)
     path = Arc(centre=(0.0, -0.2, 2.75), radius=0.55, start_deg=-180.0, rate_deg_per_s=180.0)
     views = ((-0.45, -0.1, 0.0), (-0.2, -0.35, 0.1), (0.0, 0.2, 0.0), (0.0, 0.0, 0.4), (0.2, -0.35, 0.1))

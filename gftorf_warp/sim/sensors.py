@@ -1,9 +1,11 @@
-"""Sensors by name: two products and three that public data sets were recorded with (sensor notes, section 3).
+"""Sensors by name: two products and three of public data sets (sensor notes, 3).
 
-    gftorf simulate occlusion --override sensor=mlx75027        or, in a scene file, sensor = "mlx75027"
+    gftorf simulate occlusion --override sensor=mlx75027
+    sensor = "mlx75027"                                     in a scene file
 
-A name sets every field of the sensor; single ones can be changed after it. Products are approximated: no unit was
-measured, and unpublished values are assumed, as stated below. Lens, image size and field of view are the scene's.
+A name sets every field of the sensor; single ones can be changed after it. Products are
+approximated: no unit was measured, and unpublished values are assumed, as stated below. Lens, image
+size and field of view are the scene's.
 """
 
 from __future__ import annotations
@@ -21,12 +23,12 @@ GAIN, DARK = 0.01, 0.2  # [1] PRNU and DSNU, assumed for both makers
 
 
 def ftorf_synthetic() -> Sensor:
-    """The synthetic F-TöRF sequences: one ideal tap, exact numbers, an instant; 19.986 MHz, from their depth_range."""
+    """The synthetic F-TöRF sequences: one ideal tap, an instant; 19.986 MHz."""
     return Sensor(f_mod_hz=SPEED_OF_LIGHT / 15.0, shifts=CANONICAL_SHIFTS, dc_offset=1.0, unipolar=True, exposure_s=0.0)
 
 
 def ftorf_real() -> Sensor:
-    """The real F-TöRF captures: two taps at 120 raw frames a second, their order of shifts, electrons of an OPT8241.
+    """The real F-TöRF captures: two taps, their order of shifts, electrons of an OPT8241.
 
     The files say 19.986 MHz, the paper 30 MHz: ``sensor.f_mod_hz=29.979e6`` for the latter.
     """
@@ -41,8 +43,9 @@ def torf_real() -> Sensor:
 def opt8241_cdk() -> Sensor:
     """Like a TI OPT8241 in its CDK-EVM kit, at 30 MHz.
 
-    From its datasheet: contrast, 12 bits; from its SDK: exposure at 18/64 duty, phase pattern. Assumed: read noise,
-    full well, dark current, electrons per code, PRNU, DSNU, and the f/1.2 lens behind the electrons per unit.
+    From its datasheet: contrast, 12 bits; from its SDK: exposure at 18/64 duty, phase pattern.
+    Assumed: read noise, full well, dark current, electrons per code, PRNU, DSNU, and the f/1.2 lens
+    behind the electrons per unit.
     """
     return Sensor(
         f_mod_hz=30e6,
@@ -63,9 +66,10 @@ def opt8241_cdk() -> Sensor:
 def mlx75027() -> Sensor:
     """Like a Melexis MLX75027 at 60 MHz, with the light, lens and exposure of the other.
 
-    From its datasheet 1.0: contrast .85 at 40 and .78 at 100 MHz, which a cutoff of 303 MHz fits; read noise, full well
-    and dark current at the middle temperature; 12 bits of 94.3 electrons. Electrons per unit are the other's times the
-    area of a pixel, (10 um / 15 um)^2, at the same efficiency of 51 %. Assumed: PRNU, DSNU.
+    From its datasheet 1.0: contrast .85 at 40 and .78 at 100 MHz, which a cutoff of 303 MHz fits;
+    read noise, full well and dark current at the middle temperature; 12 bits of 94.3 electrons.
+    Electrons per unit are the other's times the area of a pixel, (10 um / 15 um)^2, at the same
+    efficiency of 51 %. Assumed: PRNU, DSNU.
     """
     return Sensor(
         f_mod_hz=60e6,
@@ -91,7 +95,7 @@ SENSORS: Mapping[str, Sensor] = {
 
 
 def effect_rows(sensor: Sensor) -> dict[str, str]:
-    """Rows of a data card on effects beyond one frequency, a sine and equal pixels; empty without any."""
+    """Rows of a data card on effects beyond one frequency, a sine and equal pixels."""
     rows = {}
     if sensor.further_hz:
         listed = ", then at ".join(f"{float(f) / 1e6:.9g} MHz" for f in (sensor.f_mod_hz, *sensor.further_hz))

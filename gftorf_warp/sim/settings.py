@@ -8,7 +8,8 @@ from ..constants import FRAMES_PER_QUARTET
 from ..errors import UsageError
 
 ENGINES = ("gaussian", "mesh")
-"""From a scene to an image: Gaussians that cover it are rendered, or rays are traced through its surfaces."""
+"""From a scene to an image: Gaussians that cover it are rendered, or rays are traced through its
+surfaces."""
 FORMATS = ("ftorf", "torf", "capture")
 TRUTHS = ("usual", "all")
 
@@ -26,7 +27,8 @@ class SimSettings:
     size: tuple[int, int] | None = None
     """(width, height) of the image [px]; None: the scene's own."""
     seed: int = 0
-    """Seed of the noise and of the random paths. Frame n does not depend on the number of frames."""
+    """Seed of the noise and of the random paths. Frame n does not depend on the number of
+    frames."""
     sync: bool = False
     """Control mode: all raw frames of a quartet are taken at the time of its first."""
     noise: bool = True
@@ -34,26 +36,29 @@ class SimSettings:
     flow: bool = False
     """Whether exact optical flow at quartet starts is stored [px], that of the camera included."""
     exposure_samples: int = 1
-    """Instants that a raw frame averages over the exposure, centred on its time; 1: no motion blur."""
+    """Instants that a raw frame averages over the exposure, centred on its time; 1: no motion
+    blur."""
     engine: str = "gaussian"
-    """One of ``ENGINES``. 'mesh' shares nothing with the renderer of `reconstruct`, and is the only one with light
-    beside the camera, a beam, bounces, gloss or a rolling shutter."""
+    """One of ``ENGINES``. 'mesh' shares nothing with the renderer of `reconstruct`, and is the only
+    one with light beside the camera, a beam, bounces, gloss or a rolling shutter."""
     bounces: int = 0
-    """Surfaces that light may meet after the first; 0: direct light only. More than 0 needs engine 'mesh'."""
+    """Surfaces that light may meet after the first; 0: direct light only. More than 0 needs engine
+    'mesh'."""
     paths: int = 64
     """Random paths per pixel and raw frame for the light that bounces."""
     format: str = "ftorf"
-    """Layout on disk: 'ftorf', raw quads; 'torf', one phasor per quartet with the time, pose and truth of its first
-    raw frame; 'capture', our own, which also holds any shifts, exposures, amplitude and objects."""
+    """Layout on disk: 'ftorf', raw quads; 'torf', one phasor per quartet with the time, pose and
+    truth of its first raw frame; 'capture', our own, which also holds any shifts, exposures,
+    amplitude and objects."""
     level: str | None = None
-    """Level of the ladder from ideal to realistic, see sim/ladder.py: it decides about engine, bounces, blur, noise
-    and what of the sensor is ideal. None: as set here and by the scene."""
+    """Level of the ladder from ideal to realistic, see sim/ladder.py: it decides about engine,
+    bounces, blur, noise and what of the sensor is ideal. None: as set here and by the scene."""
     truth: str = "usual"
-    """What a capture of engine mesh stores besides distance, amplitude and objects: 'usual' or 'all', see
-    sim/truth_layers.py. 'all' needs that engine and that format."""
+    """What a capture of engine mesh stores besides distance, amplitude and objects: 'usual' or
+    'all', see sim/truth_layers.py. 'all' needs that engine and that format."""
     overrides: tuple[str, ...] = ()
-    """Changes of single fields of the scene, its sensor and its bodies, such as ``sensor.f_mod_hz=30e6`` or
-    ``bodies.1.path.velocity=3,0,0``."""
+    """Changes of single fields of the scene, its sensor and its bodies, such as
+    ``sensor.f_mod_hz=30e6`` or ``bodies.1.path.velocity=3,0,0``."""
 
     def __post_init__(self):
         least = FRAMES_PER_QUARTET if self.format == "torf" else 1  # a phasor needs a whole quartet

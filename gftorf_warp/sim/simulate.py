@@ -37,19 +37,20 @@ def simulate(
 ) -> Path:
     """Record a moving scene with an asynchronous C-ToF sensor and write it as a sequence.
 
-    Each raw frame is an image at its own time, of which the quad of its shift and frequency is read out. Its truth is
-    the analytic distance along each pixel's centre ray at that time. A moving camera has a pose for each raw frame; a
-    colour camera adds an image per quartet. The folder appears when it is complete; if it exists and has the same
-    settings, it is not changed. After an interruption the same call continues at the next raw frame: finished images
-    are in OUT.partial, and the final bytes are the same.
+    Each raw frame is an image at its own time, of which the quad of its shift and frequency is read
+    out. Its truth is the analytic distance along each pixel's centre ray at that time. A moving
+    camera has a pose for each raw frame; a colour camera adds an image per quartet. The folder
+    appears when it is complete; if it exists and has the same settings, it is not changed. After an
+    interruption the same call continues at the next raw frame: finished images are in OUT.partial,
+    and the final bytes are the same.
 
     Args:
         scene: Name of a scene, see ``SCENES``, a TOML file of one, or a scene.
         out: Folder to write.
         settings: How the scene is recorded.
         device: Where engine mesh traces; engine gaussian renders on the CPU.
-        fresh: Whether another sequence in ``out`` is renamed to ``out-old-1``, instead of being an error, and an
-            unfinished one restarted.
+        fresh: Whether another sequence in ``out`` is renamed to ``out-old-1``, instead of being an
+            error, and an unfinished one restarted.
         progress: Called with (raw frames done, raw frames in all).
         changes: Fields of ``settings`` with other values: ``simulate("arc", "arc", frames=16)``.
 
@@ -57,8 +58,8 @@ def simulate(
         The folder.
 
     Raises:
-        UsageError: If settings contradict each other or the scene, the format cannot express the sensor, ``out`` or
-            OUT.partial holds something else, or the folder cannot be written to.
+        UsageError: If settings contradict each other or the scene, the format cannot express the
+            sensor, ``out`` or OUT.partial holds something else, or the folder cannot be written to.
         BusyError: If another process records the same sequence.
         InputError: If a TOML file does not describe a scene.
     """
@@ -91,10 +92,10 @@ def simulate_ladder(
     fresh: bool = False,
     progress: Progress | None = None,
 ) -> dict[str, Errors]:
-    """Record a scene at every level of the ladder, into OUT/sync, OUT/L0 and so on; OUT/ladder.md holds the errors.
+    """Record a scene at all levels, into OUT/sync, OUT/L0, ...; errors in OUT/ladder.md.
 
-    Arguments and errors are those of :func:`simulate`; progress is that of each level in turn. Levels that exist
-    already with the same settings are left as they are.
+    Arguments and errors are those of :func:`simulate`; progress is that of each level in turn.
+    Levels that exist already with the same settings are left as they are.
 
     Returns:
         Errors of the closed form by name of the level.

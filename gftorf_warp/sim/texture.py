@@ -9,14 +9,15 @@ from jaxtyping import Float, Int
 
 SATURATION = 0.6  # [1] of the colours: no channel is less than 0.4 of the brightest
 HUE_SPREAD = 0.2  # [turns] range of the hues of one texture
-TEXTURE_ORIGIN = 37.0001  # [m] keeps cell numbers positive and cell borders off faces, which are at round numbers
+TEXTURE_ORIGIN = 37.0001  # [m] cell numbers are positive, cell borders not at round numbers
 
 
 @dataclass(frozen=True, kw_only=True)
 class Texture:
-    """Reflectance in hashed cells of a 3-D grid in the body's axes (sensor notes, 4.1); ``low == high`` is plain.
+    """Reflectance in hashed cells of a 3-D grid (sensor notes, 4.1); ``low == high``: plain.
 
-    In colour each cell has a hue, hashed from other bits, and its brightest channel is its reflectance.
+    In colour each cell has a hue, hashed from other bits, and its brightest channel is its
+    reflectance.
     """
 
     low: float
@@ -28,9 +29,11 @@ class Texture:
     hue: float | None = None
     """Middle of the cells' hues, in turns: 0 red, 1/3 green, 2/3 blue; None: all hues."""
     gloss: float = 0.0
-    """Share of the reflectance in a specular lobe, the rest is Lambertian [1]; engine 'mesh' only."""
+    """Share of the reflectance in a specular lobe, the rest is Lambertian [1]; engine 'mesh'
+    only."""
     shininess: float = 50.0
-    """Exponent of that lobe [1]: 10 is satin, 1000 nearly a mirror; its half width is 1.2 / sqrt(shininess) [rad]."""
+    """Exponent of that lobe [1]: 10 is satin, 1000 nearly a mirror; its half width is 1.2 /
+    sqrt(shininess) [rad]."""
 
     def __post_init__(self):
         if not 0 <= self.gloss <= 1 or not 0 <= self.shininess < np.inf:
@@ -45,7 +48,7 @@ class Texture:
             raise ValueError(f"cell must be above 0, got {self.cell}")
 
     def __repr__(self):
-        """Without the hue, which only matters to a colour camera, and without the lobe if there is none."""
+        """Without the hue, and without the lobe if there is none."""
         names = ("low", "high", "cell", *(("gloss", "shininess") if self.gloss else ()))
         return f"Texture({', '.join(f'{name}={getattr(self, name)!r}' for name in names)})"
 
@@ -61,7 +64,7 @@ class Texture:
         return self(point)[:, None] * (1.0 - SATURATION * (1.0 - np.clip(ramp, 0.0, 1.0)))
 
     def shading(self, cosine: Float[np.ndarray, "P"]) -> Float[np.ndarray, "P"]:
-        """Amplitude [1] per reflectance at this cosine of incidence, for a camera at the light source."""
+        """Amplitude [1] per reflectance at this cosine of incidence, light at the camera."""
         twice = np.maximum(2.0 * cosine**2 - 1.0, 0.0)  # cosine between the view and the mirrored light
         lobe = 0.5 * (self.shininess + 2.0) * twice**self.shininess if self.gloss else 0.0
         return cosine * (1.0 + self.gloss * (lobe - 1.0))

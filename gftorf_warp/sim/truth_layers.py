@@ -1,4 +1,4 @@
-"""Images that engine mesh computes besides distance and amplitude: the layers of a recording's truth."""
+"""Images of engine mesh besides distance and amplitude: the layers of the truth."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ def truth_layers(
 ) -> dict[str, Float[np.ndarray, "C H W"]]:
     """Images by the names of data_specs/capture.toml, float32, channels in the order given there.
 
-    Light is the mean over the exposure, for the sensor's source intensity and without its phase offset; depth and
-    normals are those of the middle of the exposure.
+    Light is the mean over the exposure, for the sensor's source intensity and without its phase
+    offset; depth and normals are those of the middle of the exposure.
 
     Args:
         light: Of one raw frame.
         hits: First hits of the centre rays.
         sensor: Its source intensity, and the harmonics of ``light``.
-        amount: 'usual': ``ambient`` and, if light bounced, its direct part ``direct`` and its standard
-            ``error``: small, and not computable from the rest of a capture. 'all': also the light at
-            every harmonic, ``z_depth`` and ``normal``.
+        amount: 'usual': ``ambient`` and, if light bounced, its direct part ``direct`` and its
+            standard ``error``: small, and not computable from the rest of a capture. 'all': also
+            the light at every harmonic, ``z_depth`` and ``normal``.
         bounced: Whether ``light`` has any that met more than one surface.
     """
     intensity = float(sensor.source_intensity)

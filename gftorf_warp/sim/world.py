@@ -1,7 +1,8 @@
-"""Shapes with reflectance, moved along rigid paths, and the exact first hit of every pixel's centre ray.
+"""Shapes with reflectance on rigid paths, and the exact first hit of every pixel.
 
-The hits are the ground truth: closed forms in float64 that share no step with the renderer. Light and camera coincide:
-a surface of reflectance rho met under the angle of incidence i has the amplitude rho cos(i) / d^2 (sensor notes, 2.2).
+The hits are the ground truth: closed forms in float64 that share no step with the renderer. Light
+and camera coincide: a surface of reflectance rho met under the angle of incidence i has the
+amplitude rho cos(i) / d^2 (sensor notes, 2.2).
 """
 
 from __future__ import annotations
@@ -30,26 +31,28 @@ class Grid(NamedTuple):
     normal: Float[np.ndarray, "N 3"]
     """Unit normals."""
     other: Float[np.ndarray, "N 3"]
-    """Normal of the other face at an edge, the same normal elsewhere: visible only if both face the viewer."""
+    """Normal of the other face at an edge, the same normal elsewhere: visible only if both face the
+    viewer."""
     limb: float
-    """Visible only if the cosine of incidence is above this [1]: keeps covers inside round outlines."""
+    """Visible only if the cosine of incidence is above this [1]: keeps covers inside round
+    outlines."""
 
 
 class Shape(abc.ABC):
-    """A surface in its own axes, seen from one side. Further classes: sim/assembly.py, sim/meshes.py."""
+    """A surface in its axes, seen from one side; see also sim/assembly.py, sim/meshes.py."""
 
     @abc.abstractmethod
     def hit(
         self, origin: Float[np.ndarray, "3"], ray: Float[np.ndarray, "P 3"]
     ) -> tuple[Float[np.ndarray, "P"], Int[np.ndarray, "P"]]:
-        """Distance along unit rays to the first hit [m], infinite where there is none, and the number of the face."""
+        """Distance along unit rays to the first hit [m], inf without any, and its face."""
 
     @abc.abstractmethod
     def normal(self, point: Float[np.ndarray, "P 3"], face: Int[np.ndarray, "P"]) -> Float[np.ndarray, "P 3"]:
         """Unit normals at points of the surface, towards the side from which it is seen."""
 
     def grid(self, spacing: float, inset: float) -> Grid:
-        """Points about ``spacing`` [m] apart on the surface, ``inset`` [m] away from its possible outlines.
+        """Points about ``spacing`` [m] apart, ``inset`` [m] away from possible outlines.
 
         Raises:
             ValueError: If the shape has no such grid, and so cannot be covered while it moves.
@@ -129,7 +132,7 @@ class Box(Shape):
 
 @dataclass(frozen=True, kw_only=True)
 class Plane(Shape):
-    """A rectangle in the plane z = 0, seen from its -z side: unturned, it faces a camera that looks along +z."""
+    """A rectangle in the plane z = 0, visible from its -z side."""
 
     size: tuple[float, float]
     """Edge lengths along x and y [m]."""
@@ -208,7 +211,7 @@ def _check_lengths(lengths: tuple[float, ...]) -> None:
 
 
 def _grid(width: float, height: float, spacing: float) -> Float[np.ndarray, "N 2"]:
-    """Centres of a grid of cells no larger than ``spacing`` that fill a rectangle about the origin."""
+    """Centres of grid cells, at most ``spacing`` large, of a rectangle about the origin."""
     columns, rows = (max(1, int(np.ceil(length / spacing))) for length in (width, height))
     x = ((np.arange(columns) + 0.5) / columns - 0.5) * max(width, 0.0)
     y = ((np.arange(rows) + 0.5) / rows - 0.5) * max(height, 0.0)
@@ -253,11 +256,12 @@ class Hits:
     reflectance: Float[np.ndarray, "H W"]
     """Reflectance rho [1]; 0 where nothing is hit."""
     amplitude: Float[np.ndarray, "H W"]
-    """rho cos(incidence) / d^2 for a source intensity of 1, gloss included [relative units]; 0 where nothing is hit."""
+    """rho cos(incidence) / d^2 for a source intensity of 1, gloss included [relative units]; 0
+    where nothing is hit."""
 
 
 def first_hit(bodies: tuple[Body, ...], camera: Camera, time: float) -> Hits:
-    """First hit of every pixel's centre ray with all ``bodies`` as they are at ``time`` [s], in float64."""
+    """First hit of every pixel's centre ray with ``bodies`` at ``time`` [s], in float64."""
     shape, centre = (camera.height, camera.width), camera.centre
     poses = [candidate.path.world_from_body(time) for candidate in bodies]
     ray, distance, body, face = _nearest(bodies, poses, camera)
@@ -322,7 +326,8 @@ def flow_of(
 ) -> Float[np.ndarray, "2 H W"]:
     """Optical flow [px] between two times [s], whether or not the target is occluded; NaN where ``point`` is.
 
-    Points move with their bodies, and the camera moves, too. The second time may be the earlier one.
+    Points move with their bodies, and the camera moves, too. The second time may be the earlier
+    one.
 
     Args:
         bodies: All bodies.
