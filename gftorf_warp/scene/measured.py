@@ -21,9 +21,7 @@ from .distortion import Distortion
 from .sensor import Sensor, phasor_from_quads
 from .unwrap import distance_from_phasors
 
-CHANGED = (
-    2.5  # [standard deviations of the noise] quads, pooled over slots and 3x3 pixels, that differ more have changed
-)
+CHANGED = 2.5  # [standard deviations] least change of quads, pooled over slots and 3x3 pixels
 DISTANCE_TRUSTED = 0.15  # [m] largest noise of a distance that is used
 
 
