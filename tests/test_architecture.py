@@ -54,7 +54,7 @@ LAUNCHES = {  # file: what it launches
     "render/launch.py": "the order of a rendering",
     "render/stages.py": "the stages of a rendering",
     "render/side_by_side.py": "its launches over ranges of tiles",
-    "render/training.py": "what a step does beside rendering",
+    "render/fused.py": "losses, backgrounds and Adam",
     "render/tensor_cores.py": "a network's layers, before anything is rendered",
     "render/displacement.py": "Gaussians at a time, before they are rendered",
     "render/moved.py": "Gaussians at a time, before they are rendered again",

@@ -10,7 +10,7 @@ from plain_step import plain_loss
 
 from gftorf_warp.losses.image import similarity
 from gftorf_warp.recon.settings import Norm
-from gftorf_warp.render import descent, fused, training
+from gftorf_warp.render import descent, fused
 
 SIZES = [(1, 120, 160), (3, 37, 53), (2, 9, 11), (1, 5, 16), (1, 12, 33)]  # shorter than a window, than a block, odd
 PHILOX_OF_ZERO = (0x6627E8D5, 0xE169C58D, 0xBC57AC4C, 0x9B00DBD8)  # Random123's known answer for key and counter 0

@@ -14,12 +14,12 @@ import warp as wp
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from ..kernels.training.adam import COLUMNS, GRADIENT, GRADIENTS, LENGTH, MORE, SIZES
-from ..kernels.training.step_end import COLUMNS_MAX, PART, RENDERINGS_MAX, RESULTS, SCREENS, TOTALS
-from . import training
+from ..kernels.training import step_end
+from ..kernels.training.adam import COLUMNS, GRADIENT, GRADIENTS, LENGTH, MORE, SIZES, make_adam
+from ..kernels.training.ordered_sums import LANES
+from ..kernels.training.step_end import COLUMNS_MAX, PART, RENDERINGS_MAX, RESULTS, TOTALS
 from .api import ScreenGradient
-from .bridge import array_over
-from .cuda import stream_of
+from .fused import BLOCK, launch
 
 TOTAL_NAMES = ("quad_mse", "opacity", "loss", "count")
 """Names of the sums besides those of the terms, in the order of the kernel."""
@@ -54,8 +54,7 @@ class AdamTable:
                 _check(tensor, device, None if tensor is step else value.shape)
             state = [tensor.data_ptr() for tensor in (first, second, step)]
             self._host.append([value.data_ptr(), 0, *state, value.numel(), *[0] * (GRADIENTS - 1)])
-        with stream_of(parameters[0]):
-            width = training.adam_block(wp.device_from_torch(device))
+        width = _adam_block(parameters[0])
         ends = list(itertools.accumulate(-(-row[LENGTH] // width) for row in self._host))
         parts = list(itertools.accumulate(-(-row[LENGTH] // PART) for row in self._host))
         count = len(self._host)
@@ -175,22 +174,21 @@ def descend(
         betas: Decays of the moments.
         epsilon: Added to the root of the second moment.
     """
-    with stream_of(rates):
-        rows, sizes = array_over(table.rows, wp.int64), array_over(table.sizes)
-        training.finish_step(
-            rows,
-            array_over(table.first_part, wp.int32),
-            array_over(table.partials),
-            (table.parts[motion_from], motion_from),
-            motion_gradient_max,
-            (array_over(step.results), array_over(weights), images, array_over(compared)),
-            (array_over(step.pairs, wp.int32), renderings, capacity),
-            array_over(rates),
-            betas,
-            (array_over(step.counts, wp.int32), array_over(step.sums), sizes),
-        )
-        first = array_over(table.first_block, wp.int32)
-        training.adam_step(rows, first, table.blocks, betas, epsilon, sizes)
+    lanes = LANES if rates.is_cuda else 1
+    launch(step_end.gradient_squares, len(table.partials) * lanes, [table.rows, table.first_part], [table.partials])
+    inputs = [table.partials, table.parts[motion_from], motion_from]
+    inputs += [motion_gradient_max is not None, motion_gradient_max or 0.0]
+    inputs += [step.results, weights, images, compared, step.pairs, renderings]
+    inputs += [capacity is not None, capacity or 0, table.rows, rates, *map(wp.float64, betas)]
+    threads, outputs = (step_end.THREADS if rates.is_cuda else 1), [step.counts, step.sums, table.sizes]
+    launch(step_end.finish_step, threads, inputs, outputs, block_dim=step_end.THREADS)
+    inputs = [table.rows, table.first_block, *(1.0 - beta for beta in betas), epsilon]
+    launch(make_adam(_adam_block(rates)), table.blocks, inputs, [table.sizes])
+
+
+def _adam_block(like: Tensor) -> int:
+    """Elements of a tensor per thread of Adam."""
+    return 1 if like.is_cuda else BLOCK
 
 
 def add_statistics(
@@ -213,10 +211,9 @@ def add_statistics(
     """
     if not len(gradient):
         return
-    with stream_of(gradient):
-        half = 0.5 * size[0], 0.5 * size[1]
-        counts = array_over(step.counts, wp.int32)
-        sums = [array_over(total) for total in (gradient, pixels, weight)]
-        for begin in range(0, len(screens), SCREENS):
-            arrays = [array_over(screen.values) for screen in screens[begin : begin + SCREENS]]
-            training.add_statistics(arrays, half, counts, sums)
+    half, sums = wp.vec2(0.5 * size[0], 0.5 * size[1]), [gradient, pixels, weight]
+    for begin in range(0, len(screens), step_end.SCREENS):
+        values = [screen.values for screen in screens[begin : begin + step_end.SCREENS]]
+        values += values[:1] * (step_end.SCREENS - len(values))
+        count = min(len(screens) - begin, step_end.SCREENS)
+        launch(step_end.add_statistics, len(gradient), [*values, count, half, step.counts], sums)

@@ -1,7 +1,6 @@
-"""What a training step does beside rendering, as a few kernels behind torch functions: the second file that knows both.
+"""Losses, random backgrounds and sums of a training step as kernels behind torch functions.
 
-losses/ and recon/ hold the same in plain torch, in any precision: the oracle of these functions, and what runs where
-settings do not ask for kernels. The end of a step, behind its gradients, is descent.py.
+losses/ has the oracles of the losses in plain torch. The end of a step is descent.py.
 """
 
 from __future__ import annotations
@@ -18,13 +17,26 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from ..kernels.training.image_similarity import MOMENTS, REACH, SLOPES, SUMS
+from ..kernels.training import image_similarity, noise, optical_flow, ordered_sums
 from ..scene.camera import Camera
-from . import training
 from .bridge import array_over
 from .cuda import stream_of
 
-LARGEST = 1e18  # radius of a lens that is none: its square is a float32, too
+RADIUS_MAX = 1e18  # of a lens without distortion: its square is a float32, too
+BLOCK = 16  # pixels of a row, or elements of a tensor, per CPU thread
+DTYPES = {torch.float32: wp.float32, torch.int32: wp.int32, torch.int64: wp.int64}
+
+
+def launch(kernel: Any, dim: Any, inputs: Sequence[Any], outputs: Sequence[Tensor], block_dim: int = 256) -> None:
+    """Launch a kernel over the memory of tensors, on torch's current stream; other inputs are passed on."""
+
+    def argument(value: Any) -> Any:
+        return array_over(value, DTYPES[value.dtype]) if isinstance(value, Tensor) else value
+
+    with stream_of(outputs[0]):
+        device = wp.device_from_torch(outputs[0].device)
+        arrays = [argument(value) for value in inputs], [argument(value) for value in outputs]
+        wp.launch(kernel, dim, *arrays, device=device, record_tape=False, block_dim=block_dim)
 
 
 class Scratch:
@@ -39,7 +51,7 @@ class Scratch:
     def planes(self, name: str, image: Tensor, count: int) -> Tensor:
         """[count, C, H, W + 10] zeroed when they are made."""
         channels, height, width = image.shape
-        shape = count, channels, height, width + 2 * REACH
+        shape = count, channels, height, width + 2 * image_similarity.REACH
         found = self._planes.get(name)
         if found is None or found.shape != shape or found.device != image.device:
             self._planes[name] = found = image.new_zeros(shape)
@@ -88,7 +100,7 @@ def image_loss(
     rows = measured.detach().contiguous().flatten(0, measured.ndim - 3)
     also = rendered.new_empty(0) if opacity is None else opacity.detach().contiguous().flatten()
     row = _first(rendered.device) if row is None else row
-    out = rendered.new_empty(SUMS) if out is None else out
+    out = rendered.new_empty(image_similarity.SUMS) if out is None else out
     return _ImageLoss.apply(rendered.contiguous(), rows, row, also, float(ssim), absolute, scratch or Scratch(), out)
 
 
@@ -114,15 +126,18 @@ class _ImageLoss(torch.autograd.Function):
         out: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor]:
         ctx.set_materialize_grads(False)
-        columns, slopes = scratch.planes("columns", rendered, MOMENTS), scratch.planes("slopes", rendered, SLOPES)
-        with stream_of(rendered):
-            images = array_over(rendered), array_over(measured), array_over(row, wp.int32)
-            partials = rendered.new_empty(SUMS, training.loss_parts(images[0]))
-            arrays = (array_over(tensor) for tensor in (columns, partials, slopes, out))
-            training.image_loss(*images, array_over(also), ssim, absolute, *arrays)
+        kernels, dim = _similarity_of(rendered)
+        columns = scratch.planes("columns", rendered, image_similarity.MOMENTS)
+        slopes = scratch.planes("slopes", rendered, image_similarity.SLOPES)
+        threads, parts = _threads(dim[0] * dim[1] * dim[2], rendered)
+        partials = rendered.new_empty(image_similarity.SUMS, parts)
+        launch(kernels.columns_of_products, dim, [rendered, measured, row], [columns])
+        inputs = [columns, rendered, measured, row, also, ssim, absolute]
+        launch(kernels.compare_images, threads, inputs, [partials, slopes])
+        _means(partials, 1.0 / rendered.numel(), out)
         loss, squared, other = out.unbind()
         ctx.save_for_backward(rendered, measured, row)
-        ctx.options = ssim, absolute, slopes, columns[:SLOPES]
+        ctx.options = ssim, absolute, slopes, columns[: image_similarity.SLOPES]
         ctx.mark_non_differentiable(squared, other)
         return loss, squared, other
 
@@ -132,13 +147,36 @@ class _ImageLoss(torch.autograd.Function):
         rendered, measured, row = ctx.saved_tensors
         if grad_loss is None:
             return (None,) * 8
-        grad = torch.empty_like(rendered)
         ssim, absolute, slopes, columns = ctx.options
-        with stream_of(rendered):
-            images = array_over(rendered), array_over(measured), array_over(row, wp.int32)
-            rest = array_over(slopes), array_over(grad_loss.reshape(1)), array_over(columns), array_over(grad)
-            training.image_loss_backward(*images, ssim, absolute, *rest)
+        kernels, dim = _similarity_of(rendered)
+        grad = torch.empty_like(rendered)
+        launch(kernels.columns_of_slopes, dim, [slopes], [columns])
+        scale = 1.0 / rendered.numel()
+        inputs = [columns, rendered, measured, row, ssim, absolute, scale, grad_loss.reshape(1)]
+        launch(kernels.gradient_of_image, dim, inputs, [grad])
         return grad, *[None] * 7
+
+
+def _similarity_of(image: Float[Tensor, "C H W"]) -> tuple[Any, tuple[int, int, int]]:
+    """Kernels for an image, and their number of threads."""
+    channels, height, width = image.shape
+    block = BLOCK if not image.is_cuda and width >= BLOCK else 1
+    return image_similarity.make_similarity(block), (channels, height, -(-width // block))
+
+
+def _threads(count: int, like: Tensor) -> tuple[int, int]:
+    """Threads for so many elements, and their partial sums: one per warp of CUDA, per thread of a CPU."""
+    if not like.is_cuda:
+        return count, count
+    parts = -(-count // ordered_sums.LANES)
+    return parts * ordered_sums.LANES, parts
+
+
+def _means(partials: Tensor, scale: float, out: Tensor) -> None:
+    """Rows of partial sums, added up and scaled."""
+    threads = ordered_sums.THREADS if partials.is_cuda else 1
+    dim = len(partials) * threads
+    launch(ordered_sums.means, dim, [partials, threads, scale], [out], block_dim=ordered_sums.THREADS)
 
 
 def flow_loss(
@@ -187,30 +225,30 @@ class _FlowLoss(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, displacement: Tensor, distance: Tensor, measured: Tensor, row: Tensor, views: Tensor, out: Tensor
+        ctx: Any,
+        displacement: Tensor,
+        distance: Tensor,
+        measured: Tensor,
+        row: Tensor,
+        cameras: Tensor,
+        out: Tensor,
     ) -> Tensor:
-        with stream_of(distance):
-            arrays = _flow_arrays(displacement, distance, measured, row, views)
-            partials = distance.new_empty(1, training.flow_parts(arrays[0]))
-            training.flow_loss(*arrays, *(array_over(tensor) for tensor in (partials, out)))
-        ctx.save_for_backward(displacement, distance, measured, row, views)
+        threads, parts = _threads(distance.numel(), distance)
+        partials = distance.new_empty(1, parts)
+        inputs = [distance, displacement, measured, row, cameras]
+        launch(optical_flow.flow_errors, threads, inputs, [partials])
+        _means(partials, 0.5 / distance.numel(), out)
+        ctx.save_for_backward(*inputs)
         return out[0]
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad_loss: Tensor) -> tuple[Tensor | None, ...]:
-        grad = torch.empty_like(ctx.saved_tensors[0])
-        with stream_of(grad):
-            ends = grad_loss.reshape(1), grad
-            training.flow_loss_backward(*_flow_arrays(*ctx.saved_tensors), *(array_over(tensor) for tensor in ends))
+        distance, displacement, *_, cameras = ctx.saved_tensors
+        grad, scale = torch.empty_like(displacement), 0.5 / distance.numel()
+        inputs = [*ctx.saved_tensors, scale, grad_loss.reshape(1)]
+        launch(optical_flow.flow_gradient, (len(cameras), distance.numel()), inputs, [grad])
         return grad, *[None] * 5
-
-
-def _flow_arrays(
-    displacement: Tensor, distance: Tensor, measured: Tensor, row: Tensor, views: Tensor
-) -> tuple[wp.array, wp.array, wp.array, wp.array, wp.array]:
-    images = array_over(distance), array_over(displacement), array_over(measured)
-    return *images, array_over(row, wp.int32), array_over(views)
 
 
 def flow_cameras(camera: Camera, later: Sequence[Camera]) -> Float[np.ndarray, "F V"]:
@@ -226,7 +264,7 @@ def flow_cameras(camera: Camera, later: Sequence[Camera]) -> Float[np.ndarray, "
         pinholes = [camera.fx, camera.fy, camera.cx, camera.cy, then.fx, then.fy, then.cx, then.cy]
         rows.append([*pinholes, *between[:3, :3].flatten(), *between[:3, 3], *there[:3, :3].flatten()])
         if lens:
-            radius = min(then.guard.radius, LARGEST)
+            radius = min(then.guard.radius, RADIUS_MAX)
             rows[-1] += [*astuple(camera.distortion), *astuple(then.distortion), radius]
     return np.array(rows, dtype=np.float32)
 
@@ -243,8 +281,9 @@ def uniform(
         stream: Tells several images of one number apart.
     """
     image = torch.empty(shape, dtype=torch.float32, device=origin.device)
-    with stream_of(origin):
-        training.uniform(array_over(origin, wp.int32), stream, amplitude, array_over(image.flatten(1)))
+    pixels = image.flatten(1)
+    dim = len(pixels), -(-pixels.shape[1] // noise.PER_THREAD)
+    launch(noise.uniform_noise, dim, [origin, stream, amplitude], [pixels])
     return image
 
 
@@ -277,9 +316,8 @@ def added(tensors: Sequence[Tensor | None]) -> Tensor | None:
     """
     present = [tensor.detach().contiguous() for tensor in tensors if tensor is not None]
     while len(present) > 1:
-        total = torch.empty_like(present[0])
-        with stream_of(total):
-            arrays = [array_over(tensor.flatten()) for tensor in present[:4]]
-            training.added(arrays, array_over(total.flatten()))
+        total, flat = torch.empty_like(present[0]), [tensor.flatten() for tensor in present[:4]]
+        arrays = flat + flat[:1] * (4 - len(flat))
+        launch(ordered_sums.add_up, total.numel(), [*arrays, len(flat)], [total.flatten()])
         present = [total, *present[4:]]
     return present[0] if present else None
