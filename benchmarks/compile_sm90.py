@@ -1,10 +1,12 @@
-"""Compile every kernel for a CUDA architecture, without a GPU or a driver, and print registers, stack and code size.
+"""Compile every kernel for a CUDA architecture, without a GPU or a driver, and print registers,
+stack and code size.
 
     python benchmarks/compile_sm90.py [--arch 90] [--json FILE]
 
-Ends with exit code 1 if a kernel does not compile or keeps more than 32 bytes on the stack: a local array indexed at
-run time, or spilled registers, is how a fast kernel silently becomes a slow one (sinf and cosf own 32 bytes that are
-never touched). The motion network's passes are compiled for sm_90a, and left out for other architectures.
+Ends with exit code 1 if a kernel does not compile or keeps more than 32 bytes on the stack: a local
+array indexed at run time, or spilled registers, is how a fast kernel silently becomes a slow one
+(sinf and cosf own 32 bytes that are never touched). The motion network's passes are compiled for
+sm_90a, and left out for other architectures.
 """
 
 from __future__ import annotations
@@ -39,7 +41,14 @@ from gftorf_warp.kernels.rasterise import (
     tiles,
 )
 from gftorf_warp.kernels.tracing import light_paths, rays
-from gftorf_warp.kernels.training import adam, image_similarity, noise, optical_flow, ordered_sums, step_end
+from gftorf_warp.kernels.training import (
+    adam,
+    image_similarity,
+    noise,
+    optical_flow,
+    ordered_sums,
+    step_end,
+)
 from gftorf_warp.render.buffers import SEGMENTS, TILE_SHAPES
 
 FRAME_SIZE, REGISTERS = 0x11, 0x2F  # attributes in the .nv.info section of a cubin
@@ -92,7 +101,8 @@ def modules(arch: int) -> dict[str, wp.Module]:
             kernel = project.make_project(colour, square)
             found["project" + " colour" * colour + " square" * square] = kernel.module
     for light, channels, fixed in (
-        (True, False, False), (True, True, False), (True, True, True), (False, True, False), (False, True, True)
+        (True, False, False), (True, True, False), (True, True, True), (False, True, False),
+        (False, True, True),
     ):  # fmt: skip
         what = " ".join(["light"] * light + ["channels"] * channels + ["fixed"] * fixed)
         for metric in (True, False, None) if light else (None,):
@@ -105,15 +115,23 @@ def modules(arch: int) -> dict[str, wp.Module]:
                     title = name + " and three more" * more + " in segments" * (segments > 1)
                     if not fixed or segments > 1:
                         found[f"composite {title}"] = composite.make_composite(*given).module
-                    found[f"composite_backward {title}"] = composite_backward.make_composite_backward(*arguments).module
+                    found[f"composite_backward {title}"] = (
+                        composite_backward.make_composite_backward(*arguments).module
+                    )
     return found
 
 
 def compiled(title: str, module: wp.Module, arch: int, folder: str) -> list[Path]:
     """Cubins of a module; those of ``PASSES`` with what only this architecture has."""
-    before, wp.config.cuda_arch_suffix = wp.config.cuda_arch_suffix, "a" if title in PASSES else None
+    before, wp.config.cuda_arch_suffix = (
+        wp.config.cuda_arch_suffix,
+        "a" if title in PASSES else None,
+    )
     try:
-        return [Path(path) for path in wp.compile_aot_module(module, arch=arch, module_dir=folder, use_ptx=False)]
+        return [
+            Path(path)
+            for path in wp.compile_aot_module(module, arch=arch, module_dir=folder, use_ptx=False)
+        ]
     finally:
         wp.config.cuda_arch_suffix = before
 
@@ -128,7 +146,8 @@ def kernels_in(cubin: Path) -> dict[str, tuple[int, int, int]]:
     def text(at: int) -> str:
         return data[at : data.index(b"\0", at)].decode()
 
-    sections = {text(headers[names][4] + h[0]): h for h in headers}  # name, type, flags, address, offset, size, ...
+    # name, type, flags, address, offset, size, ...
+    sections = {text(headers[names][4] + h[0]): h for h in headers}
     symbols, strings = sections[".symtab"][4], sections[".strtab"][4]
     found: dict[str, dict[int, int]] = {}
     at, end = sections[".nv.info"][4], sum(sections[".nv.info"][4:6])
@@ -148,8 +167,12 @@ def kernels_in(cubin: Path) -> dict[str, tuple[int, int, int]]:
 
 def main() -> int:
     """Print the table, write the JSON, judge the stack."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--arch", type=int, default=90, help="compute capability, 90 is H100 and H200")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--arch", type=int, default=90, help="compute capability, 90 is H100 and H200"
+    )
     parser.add_argument("--json", type=Path)
     a = parser.parse_args()
     wp.config.log_level = wp.LOG_ERROR
@@ -161,13 +184,25 @@ def main() -> int:
                 for name, (registers, stack, code) in kernels_in(path).items():
                     kernel, _, way = name.partition("_cuda_kernel_")
                     kernel = kernel.rpartition("__locals__")[2].rpartition("_")[0]
-                    rows.append({"module": title, "kernel": f"{kernel} {way}", "registers": registers, "stack": stack})
+                    rows.append(
+                        {
+                            "module": title,
+                            "kernel": f"{kernel} {way}",
+                            "registers": registers,
+                            "stack": stack,
+                        }
+                    )
                     offenders += stack > HIERARCHIES.get(title, ALLOWED_STACK)
                     use = f"{registers:4d} registers {stack:4d} B stack {code:6d} B code"
                     print(f"sm_{a.arch} {title:<38} {kernel:<20} {way:<9}{use}")
     if a.json:
-        a.json.write_text(json.dumps({"arch": a.arch, "warp": wp.__version__, "kernels": rows}, indent=1) + "\n")
-    print(f"{len(rows)} kernels, {offenders} with more than {ALLOWED_STACK} B of stack ({HIERARCHIES})")
+        a.json.write_text(
+            json.dumps({"arch": a.arch, "warp": wp.__version__, "kernels": rows}, indent=1) + "\n"
+        )
+    print(
+        f"{len(rows)} kernels, {offenders} with more than {ALLOWED_STACK} B of stack "
+        f"({HIERARCHIES})"
+    )
     return int(offenders > 0 or not rows)
 
 

@@ -2,8 +2,9 @@
 
     python benchmarks/composite.py [--device cpu|cuda] [--json FILE]
 
-Scene: isotropic Gaussians on a wavy surface 1-5 m away, 320x240, the same positions, sizes and opacities for all. All
-rows of one table come from one process, alternating, so that a busy machine slows them alike. Ratios matter, not times.
+Scene: isotropic Gaussians on a wavy surface 1-5 m away, 320x240, the same positions, sizes and
+opacities for all. All rows of one table come from one process, alternating, so that a busy machine
+slows them alike. Ratios matter, not times.
 """
 
 from __future__ import annotations
@@ -90,8 +91,12 @@ class Naive:
 
 
 def medians(rows: dict[str, object], repeats: int) -> dict[str, dict[str, float]]:
-    """Median milliseconds of both stages of each row, rows taking turns; the first turn is thrown away."""
-    times: dict[str, dict[str, list[float]]] = {name: {"forward": [], "backward": []} for name in rows}
+    """Median milliseconds of both stages of each row, rows taking turns;
+    the first turn is thrown away.
+    """
+    times: dict[str, dict[str, list[float]]] = {
+        name: {"forward": [], "backward": []} for name in rows
+    }
     for _ in range(repeats + 1):
         for name, row in rows.items():
             for stage in ("forward", "backward"):
@@ -100,7 +105,9 @@ def medians(rows: dict[str, object], repeats: int) -> dict[str, dict[str, float]
                 getattr(row, stage)()
                 wp.synchronize()
                 times[name][stage].append(1e3 * (time.perf_counter() - start))
-    return {name: {s: statistics.median(t[1:]) for s, t in both.items()} for name, both in times.items()}
+    return {
+        name: {s: statistics.median(t[1:]) for s, t in both.items()} for name, both in times.items()
+    }
 
 
 def side_by_side(scene: dict[str, np.ndarray]) -> float:
@@ -118,9 +125,13 @@ def side_by_side(scene: dict[str, np.ndarray]) -> float:
 
 def main() -> None:
     """Print the table, write the JSON."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--device", default="cpu")
-    parser.add_argument("--scene", nargs=3, default=["20000", "0.03", "0.6"], metavar=("N", "SCALE", "OPACITY"))
+    parser.add_argument(
+        "--scene", nargs=3, default=["20000", "0.03", "0.6"], metavar=("N", "SCALE", "OPACITY")
+    )
     parser.add_argument("--repeats", type=int, default=7)
     parser.add_argument("--json", type=Path)
     a = parser.parse_args()
@@ -135,13 +146,21 @@ def main() -> None:
     base = table["ours, 1 thread"]
     if a.device == "cpu":
         shared = side_by_side(scene)
-        print(f"two independent copies side by side take {shared:.2f} times one: 1 means two whole cores, 2 only one")
-    print(f"surface {' '.join(a.scene)}, {WIDTH}x{HEIGHT}, {a.device}, medians of {a.repeats}, Warp {wp.__version__}")
+        print(
+            f"two independent copies side by side take {shared:.2f} times one: 1 means two "
+            f"whole cores, 2 only one"
+        )
+    print(
+        f"surface {' '.join(a.scene)}, {WIDTH}x{HEIGHT}, {a.device}, medians of {a.repeats}, "
+        f"Warp {wp.__version__}"
+    )
     for name, both in table.items():
         cells = [f"{t:8.2f} ms  {t / base[stage]:6.2f} x ours" for stage, t in both.items()]
         print(f"  {name:<20} forward {cells[0]:<26} backward {cells[1]}")
     if a.json:
-        a.json.write_text(json.dumps({"scene": a.scene, "device": a.device, "ms": table}, indent=1) + "\n")
+        a.json.write_text(
+            json.dumps({"scene": a.scene, "device": a.device, "ms": table}, indent=1) + "\n"
+        )
 
 
 if __name__ == "__main__":

@@ -1,8 +1,10 @@
-"""Engine gaussian against engine mesh on the demo: a picture of where they differ, and by how much along the motion.
+"""Engine gaussian against engine mesh on the demo: a picture of where they differ, and by how much
+along the motion.
 
     python benchmarks/engines.py [--size WIDTHxHEIGHT] [--out docs/engines.png]
 
-Simultaneous quads without noise. 'Inside' is two pixels or more inside one texture cell of one face.
+Simultaneous quads without noise. 'Inside' is two pixels or more inside one texture cell of one
+face.
 """
 
 from __future__ import annotations
@@ -23,14 +25,18 @@ PHASE_MM, SHARE = 20.0, 0.2  # ends of the scales
 
 def phasors(scene: Scene, size: tuple[int, int], engine: str) -> np.ndarray:
     """Complex a exp(i psi) [quartets, H, W]."""
-    quads = record(scene, size=size, noise=False, sync=True, engine=engine).sequence.quads.astype(np.float64)
+    quads = record(scene, size=size, noise=False, sync=True, engine=engine).sequence.quads.astype(
+        np.float64
+    )
     quads = quads.reshape(-1, 4, *quads.shape[1:])
     return (quads[:, 0] - quads[:, 1] + 1j * (quads[:, 2] - quads[:, 3])) / 2
 
 
 def inside(hit: Hits, moves: np.ndarray, wanted: bool) -> np.ndarray:
     """Pixels of bodies that move, or that do not, away from edges of faces and of texture cells."""
-    key = np.where(moves[hit.body] == wanted, hit.body + 10 * hit.face + 1000 * hit.reflectance, np.nan)
+    key = np.where(
+        moves[hit.body] == wanted, hit.body + 10 * hit.face + 1000 * hit.reflectance, np.nan
+    )
     mask = np.isfinite(key)
     for dy in range(-PIXELS, PIXELS + 1):
         for dx in range(-PIXELS, PIXELS + 1):
@@ -40,9 +46,13 @@ def inside(hit: Hits, moves: np.ndarray, wanted: bool) -> np.ndarray:
 
 def main() -> None:
     """Record twice, print, draw."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--size", default="192x144")
-    parser.add_argument("--out", type=Path, default=Path(__file__).parents[1] / "docs" / "engines.png")
+    parser.add_argument(
+        "--out", type=Path, default=Path(__file__).parents[1] / "docs" / "engines.png"
+    )
     a = parser.parse_args()
     scene = SCENES["demo"]
     width, height = (int(part) for part in a.size.split("x"))
@@ -55,15 +65,28 @@ def main() -> None:
         hit = first_hit(scene.bodies, scene.camera((width, height)), time)
         for name, wanted in (("still", False), ("moving", True)):
             mask = inside(hit, moves, wanted)
-            distance, phase, amplitude = hit.distance[mask].mean(), phase_mm[quartet][mask], share[quartet][mask]
-            print(f"quartet {quartet:2d} {name:<7}{mask.sum():6d} pixels at {distance:.2f} m", end="   ")
+            distance, phase, amplitude = (
+                hit.distance[mask].mean(),
+                phase_mm[quartet][mask],
+                share[quartet][mask],
+            )
+            print(
+                f"quartet {quartet:2d} {name:<7}{mask.sum():6d} pixels at {distance:.2f} m",
+                end="   ",
+            )
             print(f"phase {phase.mean():+6.2f} (at most {np.abs(phase).max():6.2f}) mm", end="   ")
             print(f"amplitude {100 * amplitude.mean():+6.2f} %")
     figure = Figure(figsize=(12.0, 6.0), layout="constrained")
     axes = figure.subplots(2, 3)
     for row, quartet in zip(axes, (0, len(mesh) - 1), strict=True):
         panels = (
-            ("amplitude, mesh", np.abs(mesh[quartet]), "gray", 0.0, float(np.quantile(np.abs(mesh), 0.99))),
+            (
+                "amplitude, mesh",
+                np.abs(mesh[quartet]),
+                "gray",
+                0.0,
+                float(np.quantile(np.abs(mesh), 0.99)),
+            ),
             ("phase, gaussian - mesh [mm]", phase_mm[quartet], "RdBu", -PHASE_MM, PHASE_MM),
             ("amplitude, gaussian / mesh - 1", share[quartet], "RdBu", -SHARE, SHARE),
         )

@@ -1,17 +1,21 @@
-"""What limits ``gftorf render`` on a machine: its memory, its disk, those that write, or the rendering.
+"""What limits ``gftorf render`` on a machine: its memory, its disk, those that write, or the
+rendering.
 
-    python benchmarks/files.py FOLDER .. [--images N ..] [--run RUN] [--device cpu|cuda] [--rounds R] [--no-warm]
+    python benchmarks/files.py FOLDER .. [--images N ..] [--run RUN] [--device cpu|cuda] [--rounds
+    R] [--no-warm]
                                [--pictures P ..]
 
-Distance and four quads of 320x240, 1.84 MB per image, below each folder, which may be on a disk or in memory. Rows:
-``pages`` are plain files of as many bytes from one thread for each of six files, flushed, then removed: the first round
-of them takes memory that a virtual machine may never have used, which can cost more than all that follows.
-``past memory`` is the same by O_DIRECT: what the disk does. ``written`` is what the command does with images that cost
-nothing, ``rendered`` the command itself with RUN, from the first block on, flush included, as its progress line has it;
-in brackets the rate of all of it, with what comes before. Pages are used just before every row, unless --no-warm.
+Distance and four quads of 320x240, 1.84 MB per image, below each folder, which may be on a disk or
+in memory. Rows: ``pages`` are plain files of as many bytes from one thread for each of six files,
+flushed, then removed: the first round of them takes memory that a virtual machine may never have
+used, which can cost more than all that follows. ``past memory`` is the same by O_DIRECT: what the
+disk does. ``written`` is what the command does with images that cost nothing, ``rendered`` the
+command itself with RUN, from the first block on, flush included, as its progress line has it; in
+brackets the rate of all of it, with what comes before. Pages are used just before every row, unless
+--no-warm.
 
-All this is of ``--arrays``. With --pictures it is of pictures, ``written`` and ``rendered`` by so many processes each,
-0: by threads. Files are 2.24 MB per image, GB/s are of what is rendered.
+All this is of ``--arrays``. With --pictures it is of pictures, ``written`` and ``rendered`` by so
+many processes each, 0: by threads. Files are 2.24 MB per image, GB/s are of what is rendered.
 """
 
 from __future__ import annotations
@@ -32,7 +36,10 @@ from gftorf_warp.evaluate import previews, processes, stored, views, writers
 from gftorf_warp.recon.run import Run
 
 HEIGHT, WIDTH = 240, 320
-CHANNELS = {"distance": ("distance", "opacity"), "quads": ("quad_000", "quad_180", "quad_090", "quad_270")}
+CHANNELS = {
+    "distance": ("distance", "opacity"),
+    "quads": ("quad_000", "quad_180", "quad_090", "quad_270"),
+}
 PLANES = 6
 IMAGE = 4 * PLANES * HEIGHT * WIDTH  # [bytes]
 CALL = 32 * 4 * HEIGHT * WIDTH  # [bytes] that a thread writes at a time
@@ -66,7 +73,10 @@ def series(images: int, ring: np.ndarray) -> Iterator[dict[str, dict[str, np.nda
     """Images that are there already, in memory that goes round."""
     for k in range(images):
         planes = iter(ring[k % len(ring)])
-        yield {name: {channel: next(planes) for channel in channels} for name, channels in CHANNELS.items()}
+        yield {
+            name: {channel: next(planes) for channel in channels}
+            for name, channels in CHANNELS.items()
+        }
 
 
 def written(out: Path, images: int, ring: np.ndarray) -> None:
@@ -82,7 +92,13 @@ def pictured(out: Path, images: int, ring: np.ndarray) -> float:
     scales = {name: previews.preview_scale(name, [channels]) for name, channels in first.items()}
     for name in CHANNELS:
         (out / name).mkdir()
-    writers.write_all(out, scales, series(images, ring), images, lambda k, _: seen.append((k, time.perf_counter())))
+    writers.write_all(
+        out,
+        scales,
+        series(images, ring),
+        images,
+        lambda k, _: seen.append((k, time.perf_counter())),
+    )
     return each_of(seen)
 
 
@@ -97,7 +113,12 @@ def rendered(out: Path, images: int, run: Run, arrays: bool = True) -> float:
     sequence, seen = run.sequence(), []
     seconds = [float(t) for t in np.linspace(sequence.times[0], sequence.times[-1], images)]
     views.render_to_folder(
-        run, out, tuple(CHANNELS), seconds, arrays=arrays, progress=lambda k, _: seen.append((k, time.perf_counter()))
+        run,
+        out,
+        tuple(CHANNELS),
+        seconds,
+        arrays=arrays,
+        progress=lambda k, _: seen.append((k, time.perf_counter())),
     )
     return each_of(seen)
 
@@ -114,7 +135,9 @@ def by(count: int, way: Callable[[Path, int], float]) -> Callable[[Path, int], f
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("folder", type=Path, nargs="+")
     parser.add_argument("--images", type=int, nargs="+", default=[2000])
     parser.add_argument("--run", type=Path)
@@ -135,9 +158,15 @@ def main() -> None:
     if run:
         ways["rendered"] = lambda out, n: rendered(out, n, run)
     if options.pictures is not None:
-        ways = {f"written by {p}": by(p, lambda out, n: pictured(out, n, ring)) for p in options.pictures}
+        ways = {
+            f"written by {p}": by(p, lambda out, n: pictured(out, n, ring))
+            for p in options.pictures
+        }
         if run:
-            ways |= {f"rendered by {p}": by(p, lambda out, n: rendered(out, n, run, False)) for p in options.pictures}
+            ways |= {
+                f"rendered by {p}": by(p, lambda out, n: rendered(out, n, run, False))
+                for p in options.pictures
+            }
     for folder in options.folder:
         for images in options.images:
             for name, way in ways.items():
@@ -152,10 +181,16 @@ def main() -> None:
                     each = way(out, images)
                     spent, cpu = time.perf_counter() - begun, sum(os.times()[:4]) - cpu
                     shutil.rmtree(out)
-                    rate = f"{1 / each:.0f} ({images / spent:.0f})" if each else f"{images / spent:.0f}"
+                    rate = (
+                        f"{1 / each:.0f} ({images / spent:.0f})"
+                        if each
+                        else f"{images / spent:.0f}"
+                    )
                     print(
-                        f"{folder!s:<12} {name:<12} {images} images, round {number}: {rate} images/s, "
-                        f"{images * IMAGE / spent / 1e9:.2f} GB/s, {1e3 * cpu / images:.2f} ms of CPUs each",
+                        f"{folder!s:<12} {name:<12} {images} images, round {number}: {rate} "
+                        f"images/s, "
+                        f"{images * IMAGE / spent / 1e9:.2f} GB/s, {1e3 * cpu / images:.2f} ms "
+                        f"of CPUs each",
                         flush=True,
                     )
 

@@ -1,15 +1,18 @@
 """Errors of the closed form on the look-alikes, beside what their recipes should give.
 
-    python benchmarks/look_alikes.py [--group synthetic|recorded|carried|all] [--rays 2] [--json FILE]
+    python benchmarks/look_alikes.py [--group synthetic|recorded|carried|all] [--rays 2] [--json
+    FILE]
 
-Ideal quads from analytic first hits: one centre ray per pixel (or --rays x --rays), instantaneous exposure, no noise,
-direct light. Protocol ftorf13: first raw frame of every quartet but the first and the last of 60 raw frames, all
-pixels, mean over pixels and frames of the squared difference from the truth [m^2 x 100]; no cyclic distance, so that a
-wrapped pixel costs up to 56 m^2. Longer recordings are scored on the same 13 quartets, carried cameras on every third
-quartet from the third on. Truth is that of the first raw frame of the quartet, or, "mid", half a quartet (1.5 raw
-frames) later. Columns differ in the sensor too: one tap (dc 1) or two (dc 0), and the shifts in time order.
+Ideal quads from analytic first hits: one centre ray per pixel (or --rays x --rays), instantaneous
+exposure, no noise, direct light. Protocol ftorf13: first raw frame of every quartet but the first
+and the last of 60 raw frames, all pixels, mean over pixels and frames of the squared difference
+from the truth [m^2 x 100]; no cyclic distance, so that a wrapped pixel costs up to 56 m^2. Longer
+recordings are scored on the same 13 quartets, carried cameras on every third quartet from the third
+on. Truth is that of the first raw frame of the quartet, or, "mid", half a quartet (1.5 raw frames)
+later. Columns differ in the sensor too: one tap (dc 1) or two (dc 0), and the shifts in time order.
 
-Ours, then the recipe; accepted within 3 % or 0.002 (0.005 for carried cameras). Ends with 1 if a value is not.
+Ours, then the recipe; accepted within 3 % or 0.002 (0.005 for carried cameras). Ends with 1 if a
+value is not.
 """
 
 from __future__ import annotations
@@ -86,7 +89,13 @@ SYNTHETIC = Group(
 MIXED = replace(
     SYNTHETIC,
     columns={"dc 1 0/180/90/270": Column(dc=1.0, shifts=PAIRED)},
-    targets=dict(zip(SYNTHETIC.targets, ((x,) for x in (0.063, 0.080, 1.66, 3.03, 0.591, 36.7, 44.7)), strict=True)),
+    targets=dict(
+        zip(
+            SYNTHETIC.targets,
+            ((x,) for x in (0.063, 0.080, 1.66, 3.03, 0.591, 36.7, 44.7)),
+            strict=True,
+        )
+    ),
 )
 RECORDED = Group(
     columns={
@@ -132,17 +141,28 @@ def errors(scene: Scene, group: Group, *, rays: int = 1) -> list[float]:
     truths = {0.0: np.stack([lights[n].distance for n in group.frames])}
     found = []
     for column in group.columns.values():
-        sensor = replace(scene.sensor, dc_offset=column.dc, unipolar=column.dc >= 1, shifts=column.shifts)
+        sensor = replace(
+            scene.sensor, dc_offset=column.dc, unipolar=column.dc >= 1, shifts=column.shifts
+        )
         if column.delay not in truths:
-            later = [light_of(scene, float(times[n]) + column.delay * sensor.frame_period_s) for n in group.frames]
+            later = [
+                light_of(scene, float(times[n]) + column.delay * sensor.frame_period_s)
+                for n in group.frames
+            ]
             truths[column.delay] = np.stack([light.distance for light in later])
         true = truths[column.delay]
         sequence, _ = ideal_recording(scene, lights, sensor)
-        decoded = np.stack([closed_form_distance(sequence, n // FRAMES_PER_QUARTET) for n in group.frames])
+        decoded = np.stack(
+            [closed_form_distance(sequence, n // FRAMES_PER_QUARTET) for n in group.frames]
+        )
         if column.cyclic:
-            decoded = decoded - sensor.unambiguous_range * np.round((decoded - true) / sensor.unambiguous_range)
+            decoded = decoded - sensor.unambiguous_range * np.round(
+                (decoded - true) / sensor.unambiguous_range
+            )
         error = squared_error(decoded, true)
-        found.append(ERROR_UNIT * (mean_over_frames(error, np.ones(error.shape, dtype=bool)) or 0.0))
+        found.append(
+            ERROR_UNIT * (mean_over_frames(error, np.ones(error.shape, dtype=bool)) or 0.0)
+        )
     return found
 
 
@@ -153,9 +173,19 @@ def accepted(ours: float, target: float, group: Group) -> bool:
 
 def main() -> int:
     """Print the table, write the JSON."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--group", choices=(*GROUPS, "all"), default="synthetic", help="which scenes (synthetic)")
-    parser.add_argument("--rays", type=int, default=1, choices=(1, 2), help="rays per pixel and axis, of synthetic (1)")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--group", choices=(*GROUPS, "all"), default="synthetic", help="which scenes (synthetic)"
+    )
+    parser.add_argument(
+        "--rays",
+        type=int,
+        default=1,
+        choices=(1, 2),
+        help="rays per pixel and axis, of synthetic (1)",
+    )
     parser.add_argument("--json", type=Path)
     a = parser.parse_args()
     groups = GROUPS if a.group == "all" else {a.group: GROUPS[a.group]}
@@ -166,9 +196,14 @@ def main() -> int:
         print(f"{title + ': ours / recipe':26}" + "".join(f"{name:>22}" for name in group.columns))
         for name, targets in group.targets.items():
             ours = errors(SCENES[name], group, rays=a.rays)
-            marks = ["" if accepted(x, t, group) else " !" for x, t in zip(ours, targets, strict=True)]
+            marks = [
+                "" if accepted(x, t, group) else " !" for x, t in zip(ours, targets, strict=True)
+            ]
             good &= not any(marks)
-            cells = [f"{x:.3f} / {t:.3f}{mark:2}" for x, t, mark in zip(ours, targets, marks, strict=True)]
+            cells = [
+                f"{x:.3f} / {t:.3f}{mark:2}"
+                for x, t, mark in zip(ours, targets, marks, strict=True)
+            ]
             print(f"{name:26}" + "".join(f"{cell:>22}" for cell in cells), flush=True)
             rows[name] = {
                 "ours": dict(zip(group.columns, ours, strict=True)),

@@ -1,6 +1,8 @@
-"""The yardstick: one thread per pixel, plain Warp, on the same splats and tile lists as the compositor.
+"""The yardstick: one thread per pixel, plain Warp, on the same splats and tile lists as the
+compositor.
 
-Correct and obvious, with the same hand-written adjoint; what a first version of these kernels looks like.
+Correct and obvious, with the same hand-written adjoint; what a first version of these kernels looks
+like.
 """
 
 import warp as wp
@@ -13,7 +15,9 @@ _OPTIONS = {"enable_backward": False}
 
 @wp.func
 def alpha_at(q: Splat, x: float, y: float) -> wp.vec2:
-    """(alpha, Gaussian value) of a splat at a pixel centre; alpha is 0 where the splat is too faint."""
+    """(alpha, Gaussian value) of a splat at a pixel centre;
+    alpha is 0 where the splat is too faint.
+    """
     dx = q[0] - x
     dy = q[1] - y
     power = q[2] * dx * dx + q[3] * dx * dy + q[4] * dy * dy

@@ -1,16 +1,20 @@
-"""What the motion network costs: forward and backward, all queries of a step stacked, in each precision.
+"""What the motion network costs: forward and backward, all queries of a step stacked, in each
+precision.
 
-    python benchmarks/network.py [--device cpu|cuda] [--gaussians N ..] [--queries Q ..] [--repeats R]
+    python benchmarks/network.py [--device cpu|cuda] [--gaussians N ..] [--queries Q ..] [--repeats
+    R]
                                  [--products float32|half|'half by torch' ..]
                                  [--hidden SHARE] [--profile] [--json FILE]
 
-A query is one key time; a timing holds one encoding of positions, as a step has it, and the gradient of all weights.
-``half`` is the backend of a run on the device, ``half by torch`` that by cuBLAS, by default where they differ. With
-``--hidden`` that fraction of the Gaussians, drawn at random, has no gradient.
-On a GPU every row is timed twice: called from Python, and replayed as a CUDA graph, which must give what the call gave.
-Rows of one N and Q take turns. ``kernels`` counts what the device ran in one call, products included; ``error`` is the
-largest difference of an offset from that in float32, for weights whose offsets are a few decimetres. With ``--profile``
-what ran longest in it is listed under every row, replayed on a GPU: where the next saving is to be looked for.
+A query is one key time; a timing holds one encoding of positions, as a step has it, and the
+gradient of all weights. ``half`` is the backend of a run on the device, ``half by torch`` that by
+cuBLAS, by default where they differ. With ``--hidden`` that fraction of the Gaussians, drawn at
+random, has no gradient. On a GPU every row is timed twice: called from Python, and replayed as a
+CUDA graph, which must give what the call gave. Rows of one N and Q take turns. ``kernels`` counts
+what the device ran in one call, products included; ``error`` is the largest difference of an offset
+from that in float32, for weights whose offsets are a few decimetres. With ``--profile`` what ran
+longest in it is listed under every row, replayed on a GPU: where the next saving is to be looked
+for.
 """
 
 from __future__ import annotations
@@ -60,9 +64,13 @@ def network(kind: str, device: str) -> Network:
 
 
 def call_of(made: Network, gaussians: GaussianField, queries: int, hidden: float) -> Call:
-    """Offsets at the middle keys and the gradient of every parameter; a share of the Gaussians has none of its own."""
+    """Offsets at the middle keys and the gradient of every parameter;
+    a share of the Gaussians has none of its own.
+    """
     generator = torch.Generator().manual_seed(2)
-    cotangent = torch.randn(queries, len(gaussians), 3, generator=generator).to(gaussians.mean) / 76_800
+    cotangent = (
+        torch.randn(queries, len(gaussians), 3, generator=generator).to(gaussians.mean) / 76_800
+    )
     cotangent *= (torch.rand(len(gaussians), 1, generator=generator) >= hidden).to(cotangent)
     keys, parameters = list(range(7, 7 + queries)), list(made.parameters())
 
@@ -91,12 +99,17 @@ def kernels(call: Call) -> int:
 def longest(run: Callable[[], object], device: str) -> list[str]:
     """Lines of what takes the most time in one run: microseconds, how often, name."""
     kinds = torch.profiler.ProfilerActivity
-    with torch.profiler.profile(activities=[kinds.CPU if device == "cpu" else kinds.CUDA]) as profile:
+    with torch.profiler.profile(
+        activities=[kinds.CPU if device == "cpu" else kinds.CUDA]
+    ) as profile:
         run()
         if device != "cpu":
             torch.cuda.synchronize()
     times = {
-        event.key: (event.self_cpu_time_total if device == "cpu" else event.self_device_time_total, event.count)
+        event.key: (
+            event.self_cpu_time_total if device == "cpu" else event.self_device_time_total,
+            event.count,
+        )
         for event in profile.key_averages()
     }
     lines = [f"    {sum(spent for spent, _ in times.values()):10.1f} us in all, gaps not counted"]
@@ -107,9 +120,15 @@ def longest(run: Callable[[], object], device: str) -> list[str]:
 
 def rows_of(count: int, queries: int, options: argparse.Namespace) -> list[dict[str, object]]:
     """One row per precision."""
-    device, watch, gaussians = options.device, watch_of(options.device), field(count, options.device)
+    device, watch, gaussians = (
+        options.device,
+        watch_of(options.device),
+        field(count, options.device),
+    )
     wanted = options.products or kinds(device)
-    calls = {kind: call_of(network(kind, device), gaussians, queries, options.hidden) for kind in wanted}
+    calls = {
+        kind: call_of(network(kind, device), gaussians, queries, options.hidden) for kind in wanted
+    }
     exact = call_of(network(str(Products.FLOAT32), device), gaussians, queries, options.hidden)()[0]
     rows: dict[str, dict[str, object]] = {}
     runs: dict[tuple[str, str], Callable[[], object]] = {}
@@ -143,19 +162,34 @@ def rows_of(count: int, queries: int, options: argparse.Namespace) -> list[dict[
 
 def main() -> int:
     """Print, write the JSON."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--gaussians", type=int, nargs="+", default=[20_000, 100_000])
     parser.add_argument("--queries", type=int, nargs="+", default=[1, 2, 3])
     parser.add_argument("--products", nargs="+", choices=[*map(str, Products), BY_TORCH])
-    parser.add_argument("--hidden", type=float, default=0.0, help="share of Gaussians without gradient")
+    parser.add_argument(
+        "--hidden", type=float, default=0.0, help="share of Gaussians without gradient"
+    )
     parser.add_argument("--repeats", type=int, default=50)
     parser.add_argument("--profile", action="store_true")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
     found, rows = about(options.device), []
     print(" - ".join(map(str, found.values())))
-    head = ["N", "Q", "products", "kernels", "called", "per query", "replayed", "per query", "TFLOP/s", "error [mm]"]
+    head = [
+        "N",
+        "Q",
+        "products",
+        "kernels",
+        "called",
+        "per query",
+        "replayed",
+        "per query",
+        "TFLOP/s",
+        "error [mm]",
+    ]
     print("".join(f"{name:>14}" for name in head), flush=True)
     for count in options.gaussians:
         for queries in options.queries:
@@ -166,9 +200,14 @@ def main() -> int:
                 texts = [row["gaussians"], row["queries"], row["products"], row.get("kernels", "-")]
                 texts += ["-" if number is None else f"{number:.3f}" for number in numbers]
                 texts += ["" if row.get("replay_equals_call", True) else " replay differs"]
-                print("\n".join(["".join(f"{text:>14}" for text in texts), *row.get("profile", [])]), flush=True)
+                print(
+                    "\n".join(["".join(f"{text:>14}" for text in texts), *row.get("profile", [])]),
+                    flush=True,
+                )
     if options.json:
-        options.json.write_text(json.dumps(found | {"command": " ".join(sys.argv), "rows": rows}, indent=1) + "\n")
+        options.json.write_text(
+            json.dumps(found | {"command": " ".join(sys.argv), "rows": rows}, indent=1) + "\n"
+        )
     return 0
 
 

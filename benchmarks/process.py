@@ -4,9 +4,10 @@
     python benchmarks/process.py reconstruct SEQ --out RUN --preset fast --fresh
     python benchmarks/process.py --runs 3 compare RUN
 
-Runs ``gftorf COMMAND ...`` N times (2; the first may compile kernels), each in a process of its own, and prints the
-phases of the last run in the order in which they began. A phase excludes those inside it. Times are those of the host's
-main thread: the device is not synchronised for them, so work of the device counts where the host waits for it.
+Runs ``gftorf COMMAND ...`` N times (2; the first may compile kernels), each in a process of its
+own, and prints the phases of the last run in the order in which they began. A phase excludes those
+inside it. Times are those of the host's main thread: the device is not synchronised for them, so
+work of the device counts where the host waits for it.
 """
 
 from __future__ import annotations
@@ -45,8 +46,16 @@ PHASES = {  # functions that begin a phase, by module; those of one name are one
     "recon.checkpoint": {"save": "checkpoint", "last": "read checkpoint"},
     "recon.run": {"Run.open": "open run"},
     "evaluate.views": {"gather": "render and decode", "render_to_folder": "render to folder"},
-    "evaluate.gallery": {"colour_views": "colour and novel views", "novel_views": "colour and novel views"},
-    "evaluate.compare": {"findings": "errors", "summary": "errors", "write_report": "report", "compare": "compare"},
+    "evaluate.gallery": {
+        "colour_views": "colour and novel views",
+        "novel_views": "colour and novel views",
+    },
+    "evaluate.compare": {
+        "findings": "errors",
+        "summary": "errors",
+        "write_report": "report",
+        "compare": "compare",
+    },
     "sim.simulate": {"simulate": "simulate"},
 }
 FIRST = {"steps": "first step"}  # name of the first call of a phase, where that differs
@@ -87,10 +96,16 @@ class Clock:
 
 
 class Patcher:
-    """Turns functions into phases when their modules have been imported; an import is a phase itself."""
+    """Turns functions into phases when their modules have been imported;
+    an import is a phase itself.
+    """
 
     def __init__(self, clock: Clock):
-        self.clock, self.waiting, self.depth = clock, {f"gftorf_warp.{name}": PHASES[name] for name in PHASES}, 0
+        self.clock, self.waiting, self.depth = (
+            clock,
+            {f"gftorf_warp.{name}": PHASES[name] for name in PHASES},
+            0,
+        )
         self.original = builtins.__import__
         self.import_timed = clock.timed("imports", self.original)
 
@@ -122,7 +137,11 @@ class Patcher:
                 setattr(holder, name, classmethod(self.clock.timed(label, what.__func__)))
                 continue
             timed = self.clock.timed(label, what)
-            homes = [holder] if owner else [m for key, m in sys.modules.items() if key.startswith("gftorf_warp")]
+            homes = (
+                [holder]
+                if owner
+                else [m for key, m in sys.modules.items() if key.startswith("gftorf_warp")]
+            )
             for home in homes:
                 if vars(home).get(name) is what:
                     setattr(home, name, timed)
@@ -155,7 +174,9 @@ def run(command: list[str]) -> dict:
 
 def main() -> None:
     """Measure, print, and optionally store as JSON."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--runs", type=int, default=2)
     parser.add_argument("--json", type=Path)
     parser.add_argument("--child", type=Path, help=argparse.SUPPRESS)
@@ -169,11 +190,16 @@ def main() -> None:
     for name, seconds in last["seconds"].items():
         print(f"{name:32}{last['calls'].get(name, 1):8}{seconds:9.3f} s")
     walls = [one["wall"] for one in runs]
-    print(f"{'wall clock':40}{last['wall']:9.3f} s; all runs {', '.join(f'{wall:.2f}' for wall in walls)}")
+    print(
+        f"{'wall clock':40}{last['wall']:9.3f} s; all runs "
+        f"{', '.join(f'{wall:.2f}' for wall in walls)}"
+    )
     if len(runs) > 2:
         print(f"{'median but the first':40}{statistics.median(walls[1:]):9.3f} s")
     if options.json:
-        options.json.write_text(json.dumps({"command": options.command, "runs": runs}, indent=1) + "\n")
+        options.json.write_text(
+            json.dumps({"command": options.command, "runs": runs}, indent=1) + "\n"
+        )
 
 
 if __name__ == "__main__":

@@ -1,14 +1,16 @@
-"""What speed costs in quality: two presets, or one with other settings, on several sequences with several seeds.
+"""What speed costs in quality: two presets, or one with other settings, on several sequences with
+several seeds.
 
-    python benchmarks/quality.py SEQUENCE... --out DIR [--preset released] [--fast-preset fast] [--images 5000]
-        [--seeds 0 1 2] [--device cuda] [--reference NAME=VALUE...] [--fast NAME=VALUE...] [--limit SECONDS]
-        [--known FILE] [--json FILE]
+    python benchmarks/quality.py SEQUENCE... --out DIR [--preset released] [--fast-preset fast]
+    [--images 5000]
+        [--seeds 0 1 2] [--device cuda] [--reference NAME=VALUE...] [--fast NAME=VALUE...] [--limit
+        SECONDS] [--known FILE] [--json FILE]
 
-Every run is ``presets.shortened`` to --images, so that warm-up, rounds and resets have their places in it. Errors are
-those of `gftorf compare`: mean squared errors of the distance times 100 [m^2], all raw frames, all pixels. The last
-lines are geometric means over sequences and seeds of fast over reference. A run that is there and finished is not
-repeated, so the same command goes on where the time was up. --known is the JSON of an earlier call, whose reference
-runs are not repeated either.
+Every run is ``presets.shortened`` to --images, so that warm-up, rounds and resets have their places
+in it. Errors are those of `gftorf compare`: mean squared errors of the distance times 100 [m^2],
+all raw frames, all pixels. The last lines are geometric means over sequences and seeds of fast over
+reference. A run that is there and finished is not repeated, so the same command goes on where the
+time was up. --known is the JSON of an earlier call, whose reference runs are not repeated either.
 """
 
 from __future__ import annotations
@@ -45,7 +47,9 @@ def settings_of(sequence: Sequence, preset: str, images: int, changes: list[str]
     return changed(presets.shortened(presets.preset(preset, recorded), images), changes, CHANGES)
 
 
-def run(sequence: Sequence, out: Path, settings: ReconSettings, seed: int, device: str) -> dict[str, float]:
+def run(
+    sequence: Sequence, out: Path, settings: ReconSettings, seed: int, device: str
+) -> dict[str, float]:
     """One reconstruction and its score."""
     begun = time.perf_counter()
     found = reconstruct(sequence, out, settings, seed=seed, device=device)
@@ -60,15 +64,26 @@ def run(sequence: Sequence, out: Path, settings: ReconSettings, seed: int, devic
 
 def ratios(rows: dict[str, dict[str, dict]]) -> dict[str, float]:
     """Geometric mean over all pairs of fast over reference, by error."""
-    pairs = [(rows["fast"][name], rows["reference"][name]) for name in rows["fast"] if name in rows["reference"]]
+    pairs = [
+        (rows["fast"][name], rows["reference"][name])
+        for name in rows["fast"]
+        if name in rows["reference"]
+    ]
     return (
-        {key: math.exp(float(np.mean([math.log(a[key] / b[key]) for a, b in pairs]))) for key in KEYS} if pairs else {}
+        {
+            key: math.exp(float(np.mean([math.log(a[key] / b[key]) for a, b in pairs])))
+            for key in KEYS
+        }
+        if pairs
+        else {}
     )
 
 
 def main() -> None:
     """Run what the time allows, print, store."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("sequences", type=Path, nargs="+")
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--preset", default="released")
@@ -79,7 +94,9 @@ def main() -> None:
     parser.add_argument("--reference", nargs="+", default=REFERENCE, metavar="NAME=VALUE")
     parser.add_argument("--fast", nargs="+", default=FAST, metavar="NAME=VALUE")
     parser.add_argument("--known", type=Path)
-    parser.add_argument("--limit", type=float, default=math.inf, help="no further run begins after so many seconds")
+    parser.add_argument(
+        "--limit", type=float, default=math.inf, help="no further run begins after so many seconds"
+    )
     parser.add_argument("--json", type=Path)
     a = parser.parse_args()
     wp.config.log_level = wp.LOG_ERROR
@@ -91,7 +108,10 @@ def main() -> None:
     sequences = [Sequence.open(path) for path in a.sequences]
     flown = [with_flow(sequence, FlowSource.AUTO)[0] for sequence in sequences]
     for seed in a.seeds:
-        for way, preset, changes in (("fast", a.fast_preset, a.fast), ("reference", a.preset, a.reference)):
+        for way, preset, changes in (
+            ("fast", a.fast_preset, a.fast),
+            ("reference", a.preset, a.reference),
+        ):
             for path, sequence in zip(a.sequences, flown, strict=True):
                 if f"{path.name}-{seed}" in rows[way]:
                     continue
@@ -99,17 +119,24 @@ def main() -> None:
                     left += 1
                     continue
                 settings = settings_of(sequence, preset, a.images, changes)
-                settings = replace(settings, schedule=replace(settings.schedule, checkpoint_every_s=1e9))
+                settings = replace(
+                    settings, schedule=replace(settings.schedule, checkpoint_every_s=1e9)
+                )
                 name = f"{path.name}-{seed}"
                 rows[way][name] = run(sequence, a.out / f"{name}-{way}", settings, seed, a.device)
     means = ratios(rows)
-    print("fast over reference, geometric mean: " + ", ".join(f"{k} {v:.4f}" for k, v in means.items()))
+    print(
+        "fast over reference, geometric mean: "
+        + ", ".join(f"{k} {v:.4f}" for k, v in means.items())
+    )
     if left:
         print(f"{left} runs are left: run this again to go on")
     if a.json:
         what = {"preset": a.preset, "fast_preset": a.fast_preset, "images": a.images}
         what |= {"reference": a.reference, "fast": a.fast}
-        a.json.write_text(json.dumps(about(a.device) | what | {"ratios": means, "rows": rows}, indent=1) + "\n")
+        a.json.write_text(
+            json.dumps(about(a.device) | what | {"ratios": means, "rows": rows}, indent=1) + "\n"
+        )
 
 
 if __name__ == "__main__":

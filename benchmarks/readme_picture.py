@@ -2,7 +2,8 @@
 
     python benchmarks/readme_picture.py [DEMO_FOLDER] [--out docs/demo.png]
 
-One raw frame in which much moves: what was measured, three distances on one scale, two errors on another.
+One raw frame in which much moves: what was measured, three distances on one scale, two errors on
+another.
 """
 
 from __future__ import annotations
@@ -24,7 +25,9 @@ INCHES = (12.0, 4.9)
 
 def main() -> None:
     """Render, draw, store."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("demo", type=Path, nargs="?", default=Path("gftorf-demo"))
     parser.add_argument("--out", type=Path, default=Path(__file__).parents[1] / "docs" / "demo.png")
     a = parser.parse_args()
@@ -52,7 +55,9 @@ def main() -> None:
     ]
     units = ["quad units", "m", "m", "m", "m", "m"]
     figure = Figure(figsize=INCHES, layout="constrained")
-    for axes, (title, image, colours), unit in zip(figure.subplots(2, 3).flat, panels, units, strict=True):
+    for axes, (title, image, colours), unit in zip(
+        figure.subplots(2, 3).flat, panels, units, strict=True
+    ):
         drawn = axes.imshow(image, interpolation="nearest", **colours)
         axes.set_title(title, fontsize=10)
         axes.set_xticks([])

@@ -1,11 +1,14 @@
-"""What a training step costs on a sequence or run of your own, and with --profile where its time goes.
+"""What a training step costs on a sequence or run of your own, and with --profile where its time
+goes.
 
-    python benchmarks/step.py SEQUENCE [--run RUN] [--preset released] [--from IMAGES] [--images N] [--set NAME=VALUE]
+    python benchmarks/step.py SEQUENCE [--run RUN] [--preset released] [--from IMAGES] [--images N]
+    [--set NAME=VALUE]
         [--device cpu|cuda] [--profile] [--timeline FILE] [--json FILE]
 
-The same measurement as ``gftorf bench step``, for the one way that preset and --set name. The state is the last
-checkpoint of RUN or, without one, the first of the preset; every timing begins with it again. --timeline writes when
-each kernel of a few steps began, how long it took, and on which stream: what waits for what is seen there only.
+The same measurement as ``gftorf bench step``, for the one way that preset and --set name. The state
+is the last checkpoint of RUN or, without one, the first of the preset; every timing begins with it
+again. --timeline writes when each kernel of a few steps began, how long it took, and on which
+stream: what waits for what is seen there only.
 """
 
 from __future__ import annotations
@@ -25,11 +28,15 @@ from gftorf_warp.bench.command import about
 
 def main() -> int:
     """Print, write the JSON."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("sequence", type=Path)
     parser.add_argument("--run", type=Path)
     parser.add_argument("--preset", default="released")
-    parser.add_argument("--from", dest="begin", type=int, help="pretend that so many images are optimised")
+    parser.add_argument(
+        "--from", dest="begin", type=int, help="pretend that so many images are optimised"
+    )
     parser.add_argument("--images", type=int, default=step.IMAGES)
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE")
     parser.add_argument("--device", default="cpu")

@@ -1,9 +1,11 @@
-"""How many Gaussians of a run nobody sees, and how long the lists of its tiles are (design/whole-run.md).
+"""How many Gaussians of a run nobody sees, and how long the lists of its tiles are
+(design/whole-run.md).
 
     python benchmarks/unseen.py RUN... [--times N] [--device cpu|cuda]
 
-The weight of a Gaussian is what the backward pass sums: w = alpha T over the pixels of an image [px]. Rows: which share
-of the Gaussians has at most so much in every image, and which share of all weight is theirs.
+The weight of a Gaussian is what the backward pass sums: w = alpha T over the pixels of an image
+[px]. Rows: which share of the Gaussians has at most so much in every image, and which share of all
+weight is theirs.
 """
 
 from __future__ import annotations
@@ -40,7 +42,9 @@ def weights_of(run: Run, seconds: list[float]) -> tuple[torch.Tensor, np.ndarray
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("run", type=Path, nargs="+")
     parser.add_argument("--times", type=int, default=12)
     parser.add_argument("--device", default="cpu")
@@ -55,9 +59,19 @@ def main() -> None:
         for most in AT_MOST:
             few = largest <= most
             share, theirs = float(few.float().mean()), float(mean[few].sum() / mean.sum())
-            print(f"  at most {most:5.3f} px: {share:6.1%} of the Gaussians, {theirs:7.3%} of all weight")
-        tile, middle, most = "8x8" if options.device == "cpu" else "8x4", np.median(lengths), np.percentile(lengths, 99)
-        print(f"  lists of {tile} pixels: median {middle:.0f}, 99 % at most {most:.0f}, longest {lengths.max()}")
+            print(
+                f"  at most {most:5.3f} px: {share:6.1%} of the Gaussians, {theirs:7.3%} of "
+                f"all weight"
+            )
+        tile, middle, most = (
+            "8x8" if options.device == "cpu" else "8x4",
+            np.median(lengths),
+            np.percentile(lengths, 99),
+        )
+        print(
+            f"  lists of {tile} pixels: median {middle:.0f}, 99 % at most {most:.0f}, longest "
+            f"{lengths.max()}"
+        )
 
 
 if __name__ == "__main__":

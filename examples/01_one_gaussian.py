@@ -1,4 +1,6 @@
-"""Render one Gaussian as a C-ToF camera sees it, and decode its distance from the four quads again."""
+"""Render one Gaussian as a C-ToF camera sees it, and decode its distance from the four quads
+again.
+"""
 
 import math
 
@@ -29,8 +31,14 @@ def main() -> float:
     decoded = distance_from_phasor(re, im, sensor)
     x, y = (int(v) for v in camera.project(centre)[0])  # the pixel that the centre falls into
     mean_distance = float(rendering.distance[y, x] / rendering.opacity[y, x])
-    print(f"at pixel [{y}, {x}]: true {float(centre.norm()):.4f} m, rendered mean {mean_distance:.4f} m,")
-    print(f"decoded from quads {float(decoded[y, x]):.4f} m, known modulo {sensor.unambiguous_range:.3f} m")
+    print(
+        f"at pixel [{y}, {x}]: true {float(centre.norm()):.4f} m, rendered mean "
+        f"{mean_distance:.4f} m,"
+    )
+    print(
+        f"decoded from quads {float(decoded[y, x]):.4f} m, known modulo "
+        f"{sensor.unambiguous_range:.3f} m"
+    )
     return float(decoded[y, x])
 
 

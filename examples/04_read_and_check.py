@@ -1,4 +1,6 @@
-"""Open a sequence, list the sources of its values, and decode distance in closed form, which motion breaks."""
+"""Open a sequence, list the sources of its values, and decode distance in closed form,
+which motion breaks.
+"""
 
 import sys
 import tempfile
@@ -19,10 +21,14 @@ def main(path: Path) -> float:
     for name, source in sequence.sources.items():
         print(f"{name}: {source}")
 
-    decoded = closed_form_distance(sequence, 0)  # from raw frames 0..3, as if they were simultaneous
+    # from raw frames 0..3, as if they were simultaneous
+    decoded = closed_form_distance(sequence, 0)
     error = np.abs(decoded - sequence.truth().distance[0])
     y, x = np.unravel_index(np.nanargmax(error), error.shape)
-    print(f"median error {1e3 * np.nanmedian(error):.1f} mm, largest {error[y, x]:.2f} m at pixel [{y}, {x}]")
+    print(
+        f"median error {1e3 * np.nanmedian(error):.1f} mm, largest {error[y, x]:.2f} m at "
+        f"pixel [{y}, {x}]"
+    )
     return float(error[y, x])
 
 

@@ -1,4 +1,6 @@
-"""Simulate, reconstruct and compare from Python, then render the reconstruction between two raw frames."""
+"""Simulate, reconstruct and compare from Python, then render the reconstruction between two raw
+frames.
+"""
 
 import sys
 import tempfile
@@ -16,12 +18,18 @@ def main(folder: Path, images: int = 400) -> dict:
     run = reconstruct(sequence, folder / "run", "demo", images=images)
 
     metrics = compare(run)
-    print(f"{run.gaussians} Gaussians; distance error (MSE x100 [m^2]) over {metrics['frames']} raw frames:")
+    print(
+        f"{run.gaussians} Gaussians; distance error (MSE x100 [m^2]) over {metrics['frames']} "
+        f"raw frames:"
+    )
     print(f"  closed form {metrics['closed_form_mse_x100']:.3f}, ours {metrics['d_mse_x100']:.3f}")
 
     period = run.sensor.frame_period_s
     rendering = run.render(5.5 * period)  # no camera ever measured at this instant
-    print(f"between raw frames 5 and 6: quads {tuple(rendering.quads.shape)}, mean distance of the middle pixel ")
+    print(
+        f"between raw frames 5 and 6: quads {tuple(rendering.quads.shape)}, mean distance of "
+        f"the middle pixel "
+    )
     print(f"  {float(rendering.distance[run.camera.height // 2, run.camera.width // 2]):.3f} m")
     return metrics
 

@@ -1,4 +1,6 @@
-"""Reconstruct phasors and colour images of a moving camera, and render a view that no camera had."""
+"""Reconstruct phasors and colour images of a moving camera,
+and render a view that no camera had.
+"""
 
 import sys
 import tempfile
@@ -14,14 +16,22 @@ from gftorf_warp.scene.measured import sensor_of
 def main(folder: Path, images: int = 400) -> dict:
     """Work below ``folder`` and return the content of metrics.json.
 
-    The published preset with a fiftieth of its images, few Gaussians and a small network: this shows the calls. The
-    whole preset is `gftorf reconstruct SEQ --out RUN --preset released`.
+    The published preset with a fiftieth of its images, few Gaussians and a small network: this
+    shows the calls. The whole preset is `gftorf reconstruct SEQ --out RUN --preset released`.
     """
-    sequence = Sequence.open(simulate("tour", folder / "sequence", frames=16, size=(48, 36), format="torf"))
-    print(f"{len(sequence.complete_quartets)} phasors, {len(sequence.colour.images)} colour images, a pose for each")
+    sequence = Sequence.open(
+        simulate("tour", folder / "sequence", frames=16, size=(48, 36), format="torf")
+    )
+    print(
+        f"{len(sequence.complete_quartets)} phasors, {len(sequence.colour.images)} colour "
+        f"images, a pose for each"
+    )
 
-    recorded = presets.Recorded(input=Input.PHASOR, unambiguous_range=sensor_of(sequence).unambiguous_range)
-    settings = presets.shortened(presets.released(recorded), images)  # every interval shrinks with the run
+    recorded = presets.Recorded(
+        input=Input.PHASOR, unambiguous_range=sensor_of(sequence).unambiguous_range
+    )
+    # every interval shrinks with the run
+    settings = presets.shortened(presets.released(recorded), images)
     settings = replace(
         settings,
         init=replace(settings.init, count=1000),
@@ -31,12 +41,18 @@ def main(folder: Path, images: int = 400) -> dict:
 
     metrics = compare(run)
     along = metrics["diagnostics"]
-    print(f"{run.gaussians} Gaussians after {images} images; colour PSNR {metrics['colour_psnr_db']:.1f} dB")
+    print(
+        f"{run.gaussians} Gaussians after {images} images; colour PSNR "
+        f"{metrics['colour_psnr_db']:.1f} dB"
+    )
     print(f"d and d_ToF were nearest to each other after {along['images_at_criterion']} images")
 
     camera = run.camera.at(sequence.novel_from_world[0])  # a pose in the folder without a phasor
     view = run.render(time=0.05, camera=camera)
-    print(f"novel view: colour {tuple(view.colour.shape)}, mean distance {float(view.distance.mean()):.2f} m")
+    print(
+        f"novel view: colour {tuple(view.colour.shape)}, mean distance "
+        f"{float(view.distance.mean()):.2f} m"
+    )
     return metrics
 
 

@@ -1,4 +1,5 @@
-"""Differentiable simulation and reconstruction of continuous-wave time-of-flight scenes of Gaussians.
+"""Differentiable simulation and reconstruction of continuous-wave time-of-flight scenes of
+Gaussians.
 
 The public names are resolved on first use, so that ``import gftorf_warp`` stays instant.
 """

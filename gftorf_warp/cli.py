@@ -1,4 +1,5 @@
-"""The command ``gftorf``: commands to functions, options to arguments, exceptions to messages and exit codes.
+"""The command ``gftorf``: commands to functions, options to arguments, exceptions to messages and
+exit codes.
 
 Heavy modules are imported when a command needs them. This is the only file that chooses a device.
 """
@@ -29,11 +30,12 @@ def main(arguments: list[str] | None = None) -> int:
     """Run one command.
 
     Args:
-        arguments: Words after ``gftorf``; None: those of the process, which then ends with the exit code.
+        arguments: Words after ``gftorf``; None: those of the process, which then ends with the exit
+            code.
 
     Returns:
-        Exit code: 0 ok, 1 a bug or a failed self-test, 2 usage, 3 bad input, 4 diverged, 5 resources, 6 busy, 130
-        interrupted.
+        Exit code: 0 ok, 1 a bug or a failed self-test, 2 usage, 3 bad input, 4 diverged, 5
+        resources, 6 busy, 130 interrupted.
     """
     from .terminal import logging_to_stderr, print_error
 
@@ -74,7 +76,11 @@ def choose_device(name: str) -> tuple[str, str]:
     if name == "cpu":
         return "cpu", ""
     if not torch.cuda.is_available():
-        build = "this torch is a CPU build" if torch.version.cuda is None else "no CUDA driver or GPU found"
+        build = (
+            "this torch is a CPU build"
+            if torch.version.cuda is None
+            else "no CUDA driver or GPU found"
+        )
         reason = "no CUDA driver found" if wp.get_cuda_driver_version() is None else build
     elif not wp.is_cuda_available():
         reason = "Warp cannot use the CUDA driver"
@@ -85,14 +91,19 @@ def choose_device(name: str) -> tuple[str, str]:
         reason = f"there are {torch.cuda.device_count()} GPUs, counted from 0"
     if name == "auto":
         return "cpu", reason
-    raise ResourceError(f"no device {name}", where="--device", why=reason, fix="leave --device out, or --device cpu")
+    raise ResourceError(
+        f"no device {name}", where="--device", why=reason, fix="leave --device out, or --device cpu"
+    )
 
 
 def _open_cuda(device: str) -> None:
-    """Create the CUDA context that torch and Warp will share in a thread, while they are imported."""
+    """Create the CUDA context that torch and Warp will share in a thread,
+    while they are imported.
+    """
     if device == "cpu":
         return
-    os.environ.setdefault("CUDA_MODULE_LOADING", "LAZY")  # as torch does before it initialises the driver
+    # as torch does before it initialises the driver
+    os.environ.setdefault("CUDA_MODULE_LOADING", "LAZY")
 
     def create() -> None:
         import ctypes
@@ -108,7 +119,9 @@ def _open_cuda(device: str) -> None:
 
 
 def _exit_at_once(codes: list[int]) -> None:
-    """End the process with the exit code of its command, and without freeing modules and CUDA objects one by one."""
+    """End the process with the exit code of its command,
+    and without freeing modules and CUDA objects one by one.
+    """
     for stream in (sys.stdout, sys.stderr):
         with suppress(OSError, ValueError):
             stream.flush()
@@ -117,7 +130,9 @@ def _exit_at_once(codes: list[int]) -> None:
 
 
 def start(options: argparse.Namespace, *, compile_first: bool = True) -> str:
-    """Import torch and Warp, log the device, compile kernels if none are cached, and return the device."""
+    """Import torch and Warp, log the device, compile kernels if none are cached,
+    and return the device.
+    """
     with _without_garbage_collection():
         import torch
 
@@ -129,10 +144,18 @@ def start(options: argparse.Namespace, *, compile_first: bool = True) -> str:
     threads = min(torch.get_num_threads(), _available_cpus())
     cache = terminal.home_as_tilde(terminal.kernel_cache())
     details = "; ".join(filter(None, [f"{threads} threads", reason]))
-    terminal.LOG.info("gftorf_warp %s - device %s (%s) - kernels cached in %s", __version__, device, details, cache)
+    terminal.LOG.info(
+        "gftorf_warp %s - device %s (%s) - kernels cached in %s",
+        __version__,
+        device,
+        details,
+        cache,
+    )
     if compile_first and not terminal.kernels_are_cached():
         terminal.LOG.info("  compiling kernels (first run only) ...")
-        terminal.LOG.info("  compiling kernels (first run only) ... %.1f s", compile_kernels(device))
+        terminal.LOG.info(
+            "  compiling kernels (first run only) ... %.1f s", compile_kernels(device)
+        )
     return device
 
 
@@ -161,13 +184,24 @@ def _simulate(options: argparse.Namespace) -> int:
         print(f"{'scene':<21}{'raw frames':>10}{'closed form':>13}  motion: description")
         for scene in _listed(options, SCENES):
             error = "-" if scene.closed_form is None else f"{scene.closed_form:.4g}"
-            print(f"{scene.name:<21}{scene.frames:>10}{error:>13}  {scene.motion}: {scene.description}")
-        print("closed form: its mean squared error on ideal quads [m^2 x 100], see design/look-alikes.md")
+            print(
+                f"{scene.name:<21}{scene.frames:>10}{error:>13}  {scene.motion}: "
+                f"{scene.description}"
+            )
+        print(
+            "closed form: its mean squared error on ideal quads [m^2 x 100], see "
+            "design/look-alikes.md"
+        )
         return 0
     if options.scene is None or options.out is None:
         missing = "SCENE" if options.scene is None else "--out SEQ"
-        fix = f"for example `gftorf simulate {next(iter(SCENES))} --out sequence`; `gftorf simulate --list`"
-        raise UsageError(f"{missing} is missing", where="gftorf simulate", why="both are needed", fix=fix)
+        fix = (
+            f"for example `gftorf simulate {next(iter(SCENES))} --out sequence`; `gftorf "
+            f"simulate --list`"
+        )
+        raise UsageError(
+            f"{missing} is missing", where="gftorf simulate", why="both are needed", fix=fix
+        )
     from dataclasses import fields
 
     from .sim.closed_form_errors import ladder_table
@@ -179,14 +213,30 @@ def _simulate(options: argparse.Namespace) -> int:
     if options.ladder:
         if options.level is not None:
             why = "--ladder records all of them"
-            raise UsageError("one level or all", where="--level", why=why, fix="leave one of the two out")
+            raise UsageError(
+                "one level or all", where="--level", why=why, fix="leave one of the two out"
+            )
         rows = simulate_ladder(
-            options.scene, options.out, settings, device=device, fresh=options.fresh, progress=_each_level(options)
+            options.scene,
+            options.out,
+            settings,
+            device=device,
+            fresh=options.fresh,
+            progress=_each_level(options),
         )
         print("\n".join(ladder_table(rows)))
         return 0
     progress = _progress(options)("simulate")
-    print(simulate(options.scene, options.out, settings, device=device, fresh=options.fresh, progress=progress))
+    print(
+        simulate(
+            options.scene,
+            options.out,
+            settings,
+            device=device,
+            fresh=options.fresh,
+            progress=progress,
+        )
+    )
     return 0
 
 
@@ -271,7 +321,9 @@ def _compare(options: argparse.Namespace) -> int:
     from .recon.run import Run
 
     run, progress = Run.open(options.run_folder, device), _progress(options)("compare")
-    metrics = compare(run, truth=options.truth, frames=options.frames, against=options.against, progress=progress)
+    metrics = compare(
+        run, truth=options.truth, frames=options.frames, against=options.against, progress=progress
+    )
     print(json.dumps(metrics, indent=2) if options.json else table(metrics))
     return 0
 
@@ -328,12 +380,19 @@ def table(metrics: dict) -> str:
     """The errors of metrics.json as a table, MSE x100 [m^2]: closed form and ours."""
     lines = [f"{'MSE x100 [m^2]':<16}{'closed form':>12}{'d':>10}{'d / opacity':>13}{'d_ToF':>10}"]
     keys = ("closed_form_mse_x100", "d_mse_x100", "d_normalised_mse_x100", "d_tof_mse_x100")
-    for name, row in (("all", metrics), ("moving", metrics["moving"]), ("static", metrics["static"])):
+    for name, row in (
+        ("all", metrics),
+        ("moving", metrics["moving"]),
+        ("static", metrics["static"]),
+    ):
         cells = ["-" if row is None or row[key] is None else f"{row[key]:.4g}" for key in keys]
         lines.append(f"{name:<16}{cells[0]:>12}{cells[1]:>10}{cells[2]:>13}{cells[3]:>10}")
     psnr = metrics["quad_psnr_db"]
     quality = "-" if psnr is None else f"{psnr:.2f} dB"
-    scored = f"{metrics['frames']} raw frames ({metrics['protocol']}), against {metrics.get('against', 'geometry')}"
+    scored = (
+        f"{metrics['frames']} raw frames ({metrics['protocol']}), against "
+        f"{metrics.get('against', 'geometry')}"
+    )
     lines.append(f"{scored}, quad PSNR {quality}")
     share = metrics.get("ambiguous_share")
     if share is not None:
@@ -358,7 +417,9 @@ def _available_cpus() -> int:
 
 @contextmanager
 def _without_garbage_collection() -> Iterator[None]:
-    """Import without garbage collection, and exclude the 240,000 imported objects from later collections."""
+    """Import without garbage collection, and exclude the 240,000 imported objects from later
+    collections.
+    """
     before = gc.isenabled()
     gc.disable()
     try:

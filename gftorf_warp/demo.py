@@ -39,13 +39,15 @@ def demo(
         frames: Raw frames; None is the scene's own number.
         images: Raw frames to optimise; None is the preset's own number.
         fresh: Start over; an earlier demo in ``out`` is moved to ``out/old-1``, ``old-2``, ...
-        progress: Called with the name of a step; returns the progress callback (done, total) of that step.
+        progress: Called with the name of a step; returns the progress callback (done, total) of
+            that step.
 
     Returns:
         Lines to print: errors on moving and on static pixels, and the path of the report.
 
     Raises:
-        UsageError: If ``out`` holds a demo with other settings and ``fresh`` is not set, or other files.
+        UsageError: If ``out`` holds a demo with other settings and ``fresh`` is not set, or other
+            files.
     """
     from .data.check import check
     from .data.read import read
@@ -54,15 +56,24 @@ def demo(
     from .sim.simulate import simulate
 
     out = Path(out)
-    prepare(out, {"version": __version__, "seed": seed, "size": size, "frames": frames, "images": images}, fresh=fresh)
+    prepare(
+        out,
+        {"version": __version__, "seed": seed, "size": size, "frames": frames, "images": images},
+        fresh=fresh,
+    )
 
     def report(label: str) -> Callable[..., None] | None:
         return None if progress is None else progress(label)
 
     with _Step("[1/4] simulate   ") as step:
-        path = simulate(SCENE, out / "seq", frames=frames, size=size, seed=seed, progress=report("simulate"))
+        path = simulate(
+            SCENE, out / "seq", frames=frames, size=size, seed=seed, progress=report("simulate")
+        )
         sequence = read(path)
-        step.result = f"{SCENE} {sequence.width}x{sequence.height}, {sequence.frames} raw frames -> {out / 'seq'}"
+        step.result = (
+            f"{SCENE} {sequence.width}x{sequence.height}, {sequence.frames} raw frames "
+            f"-> {out / 'seq'}"
+        )
     with _Step("[2/4] check      ") as step:
         found = check(out / "seq")
         for line in found.lines:
@@ -70,11 +81,18 @@ def demo(
         for line in found.warnings:
             LOG.warning(line)
         step.result = (
-            f"{len(sequence.complete_quartets)} complete quartets at {sequence.calibration.f_mod_hz / 1e6:.2f} MHz"
+            f"{len(sequence.complete_quartets)} complete quartets at "
+            f"{sequence.calibration.f_mod_hz / 1e6:.2f} MHz"
         )
     with _Step("[3/4] reconstruct") as step:
         run = reconstruct(
-            sequence, out / "run", PRESET, images=images, seed=seed, device=device, progress=report("reconstruct")
+            sequence,
+            out / "run",
+            PRESET,
+            images=images,
+            seed=seed,
+            device=device,
+            progress=report("reconstruct"),
         )
         step.result = f"{run.gaussians} Gaussians -> {out / 'run'}"
     with _Step("[4/4] compare    ") as step:
@@ -86,7 +104,8 @@ def demo(
 
 
 def prepare(out: Path, settings: dict, *, fresh: bool) -> None:
-    """Check that ``out`` is empty or holds a demo with these settings, and store the settings in it.
+    """Check that ``out`` is empty or holds a demo with these settings, and store the settings in
+    it.
 
     Raises:
         UsageError: If it holds a demo with other settings and ``fresh`` is not set, or other files.
@@ -101,10 +120,18 @@ def prepare(out: Path, settings: dict, *, fresh: bool) -> None:
             why, fix = f"it has no {SETTINGS}: no demo has begun in it", "choose another --out"
             raise UsageError("the folder is not empty", where=out, why=why, fix=fix)
         if fresh:
-            LOG.info("the earlier demo is now in %s", set_aside(out, [out / n for n in OURS if (out / n).exists()]))
+            LOG.info(
+                "the earlier demo is now in %s",
+                set_aside(out, [out / n for n in OURS if (out / n).exists()]),
+            )
         elif found != wanted:
             differ = ", ".join(key for key in wanted if found.get(key) != wanted[key])
-            raise UsageError("the folder is not empty", where=out, why=f"it was made with another {differ}", fix=fix)
+            raise UsageError(
+                "the folder is not empty",
+                where=out,
+                why=f"it was made with another {differ}",
+                fix=fix,
+            )
     out.mkdir(parents=True, exist_ok=True)
     (out / SETTINGS).write_text(json.dumps(wanted, indent=2) + "\n")
 

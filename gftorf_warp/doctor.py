@@ -1,4 +1,6 @@
-"""``gftorf doctor``: versions and devices of this machine, and a test of the renderer against a closed form."""
+"""``gftorf doctor``: versions and devices of this machine,
+and a test of the renderer against a closed form.
+"""
 
 from __future__ import annotations
 
@@ -13,10 +15,12 @@ from pathlib import Path
 from . import __version__, terminal
 
 PACKAGES = ("torch", "warp-lang", "numpy", "opencv-contrib-python-headless", "OpenEXR")
-DISTANCE = 2.0  # [m] of the Gaussian that is tested; in the first unambiguous range, where 1 cm is 8 mrad
+# [m] of the Gaussian that is tested; in the first unambiguous range, where 1 cm is 8 mrad
+DISTANCE = 2.0
 REFLECTIVITY = 0.7
 OPACITY = 0.8  # below the clamp of 0.99, and far from 1/255
-TOLERANCE = 1e-5  # [relative] float32 rounds to 6e-8; phase, exponential and falloff take some tens of operations
+# [relative] float32 rounds to 6e-8; phase, exponential and falloff take some tens of operations
+TOLERANCE = 1e-5
 
 
 def doctor(device: str) -> tuple[bool, list[str]]:
@@ -40,7 +44,9 @@ def doctor(device: str) -> tuple[bool, list[str]]:
     driver = wp.get_cuda_driver_version()
     gpus = [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())]
     free = shutil.disk_usage(cache if cache.exists() else Path.home()).free
-    writable = "writable" if os.access(cache, os.W_OK) else "NOT WRITABLE: every start compiles again"
+    writable = (
+        "writable" if os.access(cache, os.W_OK) else ("NOT WRITABLE: every start compiles again")
+    )
     rows = {
         "gftorf_warp": f"{__version__} in {terminal.home_as_tilde(Path(__file__).parent)}",
         "python": f"{platform.python_version()} on {platform.platform()}",
@@ -49,19 +55,22 @@ def doctor(device: str) -> tuple[bool, list[str]]:
         "CUDA driver": "none found" if driver is None else ".".join(map(str, driver)),
         "GPUs": ", ".join(gpus) or "none: computing on the CPU, which is slower",
         "CPU threads": f"{torch.get_num_threads()} of {os.cpu_count()}",
-        "kernel cache": f"{terminal.home_as_tilde(cache)} ({writable}; kernels ready after {seconds:.1f} s)",
+        "kernel cache": f"{terminal.home_as_tilde(cache)} ({writable}; kernels ready after "
+        f"{seconds:.1f} s)",
         "free disk": f"{free / 1e9:.1f} GB on the disk of the cache",
-        "self-test": f"{verdict}: one Gaussian on {device} against the formula, quads, phasor, distance, opacity; "
+        "self-test": f"{verdict}: one Gaussian on {device} against the formula, quads, phasor, "
+        f"distance, opacity; "
         f"largest relative error {error:.1e}, allowed {TOLERANCE:.0e}",
     }
     return passed, [f"{name:<14}{text}" for name, text in rows.items()]
 
 
 def self_test_error(device: str) -> float:
-    """Largest relative error of one rendered Gaussian against the closed form, quads and distance at its centre pixel.
+    """Largest relative error of one rendered Gaussian against the closed form, quads and distance
+    at its centre pixel.
 
-    At a pixel centre onto which the Gaussian's centre projects, alpha = o exactly, so the quad of shift theta is
-    o a (cos(psi - theta) + b), the distance o d, and the opacity o.
+    At a pixel centre onto which the Gaussian's centre projects, alpha = o exactly, so the quad of
+    shift theta is o a (cos(psi - theta) + b), the distance o d, and the opacity o.
     """
     field, camera, sensor = single_gaussian(device)
     from .render.api import rasterize
@@ -70,7 +79,9 @@ def self_test_error(device: str) -> float:
     y, x = camera.height // 2, camera.width // 2
     amplitude = OPACITY * REFLECTIVITY / DISTANCE**2
     psi = float(sensor.phase_slope) * DISTANCE + float(sensor.phase_offset)
-    want = [amplitude * (math.cos(psi - shift) + float(sensor.dc_offset)) for shift in sensor.shifts]
+    want = [
+        amplitude * (math.cos(psi - shift) + float(sensor.dc_offset)) for shift in sensor.shifts
+    ]
     want += [2 * amplitude * math.cos(psi), 2 * amplitude * math.sin(psi), 2 * amplitude]
     got = [float(value) for value in (*rendering.quads[:, y, x], *rendering.phasor[:, y, x])]
     errors = [abs(g - w) / (2 * amplitude) for g, w in zip(got, want, strict=True)]
@@ -80,7 +91,9 @@ def self_test_error(device: str) -> float:
 
 
 def compile_kernels(device: str) -> float:
-    """Compile the rendering kernels by rendering one Gaussian forward and backward; returns the time [s]."""
+    """Compile the rendering kernels by rendering one Gaussian forward and backward;
+    returns the time [s].
+    """
     from dataclasses import replace
 
     from .render.api import rasterize
@@ -93,7 +106,9 @@ def compile_kernels(device: str) -> float:
 
 
 def single_gaussian(device: str):
-    """An isotropic Gaussian on the ray of the middle pixel, its camera, and a sensor with all offsets nonzero."""
+    """An isotropic Gaussian on the ray of the middle pixel, its camera,
+    and a sensor with all offsets nonzero.
+    """
     import torch
 
     from .scene.camera import Camera

@@ -1,4 +1,6 @@
-"""Errors that a user can fix: each states what is wrong, where, why, and a fix; each class has an exit code."""
+"""Errors that a user can fix: each states what is wrong, where, why, and a fix;
+each class has an exit code.
+"""
 
 
 class GftorfError(Exception):

@@ -17,11 +17,13 @@ from .errors import GftorfError, InputError, ResourceError
 LOG = logging.getLogger("gftorf_warp")
 PLAIN_EVERY_S = 10.0  # [s] between two progress lines where the output is not a terminal
 LIVE_EVERY_S = 0.2  # [s] between two redraws where it is
-NO_DRIVER = "Could not find or load the NVIDIA CUDA driver"  # of Warp's native code; our first line reports it
+# of Warp's native code; our first line reports it
+NO_DRIVER = "Could not find or load the NVIDIA CUDA driver"
 
 
 class Progress:
-    """Progress of a loop: one line that is redrawn on a terminal, one plain line per ten seconds elsewhere.
+    """Progress of a loop: one line that is redrawn on a terminal, one plain line per ten seconds
+    elsewhere.
 
     Called as ``progress(done, total, name=value, ...)``; the values are printed.
     """
@@ -43,7 +45,8 @@ class Progress:
     def __call__(self, done: int, total: int, **values: object) -> None:
         """Print that ``done`` of ``total`` steps are finished."""
         now = time.monotonic()
-        if self.first is None:  # a resumed loop does not start at zero; its rate excludes earlier steps
+        # a resumed loop does not start at zero; its rate excludes earlier steps
+        if self.first is None:
             self.first, self.start = done, now
         every = LIVE_EVERY_S if self.live else PLAIN_EVERY_S
         if self.quiet or (now - self.shown < every and done < total):
@@ -53,16 +56,26 @@ class Progress:
             values = {f"{self.unit}/s": (done - self.first) / (now - self.start), **values}
         line = progress_line(self.label, done, total, self.first, now - self.start, values)
         if self.live:
-            print(f"\r{line:<{self.width}}", end="\n" if done >= total else "", file=sys.stderr, flush=True)
+            print(
+                f"\r{line:<{self.width}}",
+                end="\n" if done >= total else "",
+                file=sys.stderr,
+                flush=True,
+            )
             self.width = 0 if done >= total else len(line)
         else:
             print(line, file=sys.stderr, flush=True)
 
 
-def progress_line(label: str, done: int, total: int, first: int, elapsed_s: float, values: dict[str, object]) -> str:
+def progress_line(
+    label: str, done: int, total: int, first: int, elapsed_s: float, values: dict[str, object]
+) -> str:
     """One line of progress; the time left [s] follows from the speed since step ``first``."""
     given = {name: value for name, value in values.items() if value is not None}
-    shown = [f"{name} {value:.4g}" if isinstance(value, float) else f"{name} {value}" for name, value in given.items()]
+    shown = [
+        f"{name} {value:.4g}" if isinstance(value, float) else f"{name} {value}"
+        for name, value in given.items()
+    ]
     if done >= total:
         shown.append(f"{elapsed_s:.1f} s")
     elif done > first:
@@ -80,11 +93,19 @@ class WarpLog:
     def info(self, message: str) -> None:
         """Log compilations briefly and other messages in full, both for -v."""
         if message.rstrip().endswith("(compiled)"):
-            LOG.debug("  compiled %s", message.strip().removeprefix("Module ").removesuffix("(compiled)").strip())
+            LOG.debug(
+                "  compiled %s",
+                message.strip().removeprefix("Module ").removesuffix("(compiled)").strip(),
+            )
         else:
             self.debug(message)
 
-    def warning(self, message: str, category: type[Warning] | None = None, stacklevel: int = 1) -> None:  # noqa: ARG002
+    def warning(
+        self,
+        message: str,
+        category: type[Warning] | None = None,  # noqa: ARG002
+        stacklevel: int = 1,  # noqa: ARG002
+    ) -> None:
         """Pass on as a warning."""
         LOG.warning("warp: %s", message)
 
@@ -147,7 +168,11 @@ def as_known_error(error: BaseException) -> GftorfError | None:
     if isinstance(error, GftorfError):
         return error
     text = str(error)
-    if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError" or "can't allocate memory" in text:
+    if (
+        isinstance(error, MemoryError)
+        or type(error).__name__ == "OutOfMemoryError"
+        or "can't allocate memory" in text
+    ):
         return ResourceError(
             "out of memory",
             where=text.splitlines()[0][:120] if text else "this process",
@@ -160,8 +185,12 @@ def as_known_error(error: BaseException) -> GftorfError | None:
 
     where, why = error.filename or "a file", error.strerror or text
     if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
-        return ResourceError("no space left", where=where, why=why, fix="free disk space, or choose another --out")
-    return InputError("cannot read or write", where=where, why=why, fix="check the path and its permissions")
+        return ResourceError(
+            "no space left", where=where, why=why, fix="free disk space, or choose another --out"
+        )
+    return InputError(
+        "cannot read or write", where=where, why=why, fix="check the path and its permissions"
+    )
 
 
 def print_error(error: BaseException, *, debug: bool) -> int:
@@ -189,7 +218,11 @@ def print_error(error: BaseException, *, debug: bool) -> int:
 class _Plain(logging.Formatter):
     def format(self, record: logging.LogRecord) -> str:
         message = record.getMessage()
-        return f"{record.levelname.lower()}: {message}" if record.levelno >= logging.WARNING else message
+        return (
+            f"{record.levelname.lower()}: {message}"
+            if record.levelno >= logging.WARNING
+            else message
+        )
 
 
 @contextlib.contextmanager
@@ -206,4 +239,6 @@ def _native_stderr() -> Iterator[list[str]]:
             os.dup2(saved, 2)
             os.close(saved)
             sink.seek(0)
-            lines.extend(line for line in sink.read().decode(errors="replace").splitlines() if line.strip())
+            lines.extend(
+                line for line in sink.read().decode(errors="replace").splitlines() if line.strip()
+            )

@@ -1,4 +1,6 @@
-"""A finished run whose errors are known beforehand: a box slides past a wall, and both are rendered a little wrong."""
+"""A finished run whose errors are known beforehand: a box slides past a wall,
+and both are rendered a little wrong.
+"""
 
 import json
 from dataclasses import replace
@@ -19,14 +21,17 @@ from gftorf_warp.scene.sensor import Sensor
 HEIGHT, WIDTH, FRAMES = 12, 20, 14  # three complete quartets, and a truncated one
 WALL, BOX = 4.0, 2.5  # [m]
 COLOUR_ERROR = 0.05  # of every channel, in units of the colour images
-WALL_ERROR, BOX_ERROR, QUAD_ERROR = 0.02, -0.1, 0.03  # [m] of the mean distance, and of what the quads encode
+# [m] of the mean distance, and of what the quads encode
+WALL_ERROR, BOX_ERROR, QUAD_ERROR = 0.02, -0.1, 0.03
 OPACITY = 0.98
 GROUPS = ("", "moving.", "static.")
 PHASE_SLOPE = float(Sensor().phase_slope)
 
 
 def box_at(n):
-    """[H, W] whether a pixel sees the box: rows 3..8, four columns that move on by one each raw frame."""
+    """[H, W] whether a pixel sees the box: rows 3..8, four columns that move on by one each raw
+    frame.
+    """
     seen = np.zeros((HEIGHT, WIDTH), dtype=bool)
     seen[3:9, 2 + n : 6 + n] = True
     return seen
@@ -45,16 +50,24 @@ def quad(distance, shift, amplitude_distance=None):
 
 def in_colour(distance):
     """[3, H, W] linear RGB of surfaces at a distance: a reddish wall, a bluish box."""
-    return np.where(distance == BOX, np.array([0.1, 0.2, 0.9])[:, None, None], np.array([0.8, 0.5, 0.1])[:, None, None])
+    return np.where(
+        distance == BOX,
+        np.array([0.1, 0.2, 0.9])[:, None, None],
+        np.array([0.8, 0.5, 0.1])[:, None, None],
+    )
 
 
 def with_colour(measured):
-    """A sequence with a colour image of every quartet's start, taken a decimetre aside, and three novel poses."""
+    """A sequence with a colour image of every quartet's start, taken a decimetre aside,
+    and three novel poses.
+    """
     beside = np.tile(np.eye(4), (measured.frames, 1, 1))
     beside[:, 0, 3] = -0.1
     novel = np.tile(np.eye(4), (3, 1, 1))
     novel[:, 1, 3] = (0.5, 0.0, -0.5)
-    images = {n: in_colour(true_distance(n)).transpose(1, 2, 0) for n in range(0, measured.frames, 4)}
+    images = {
+        n: in_colour(true_distance(n)).transpose(1, 2, 0) for n in range(0, measured.frames, 4)
+    }
     return changed(
         measured,
         colour={n: (2.0 * image).astype(np.float32) for n, image in images.items()},
@@ -65,9 +78,13 @@ def with_colour(measured):
 
 
 def as_phasors(measured):
-    """The complete quartets as a camera gives them that delivers phasors, at the instants of their starts."""
+    """The complete quartets as a camera gives them that delivers phasors,
+    at the instants of their starts.
+    """
     starts = [4 * i for i in measured.complete_quartets]
-    phasors = [quad(true_distance(n), 0.0) * 2 + 2j * quad(true_distance(n), np.pi / 2) for n in starts]
+    phasors = [
+        quad(true_distance(n), 0.0) * 2 + 2j * quad(true_distance(n), np.pi / 2) for n in starts
+    ]
     quads = np.stack([part / 2 for p in phasors for part in (p.real, -p.real, p.imag, -p.imag)])
     return replace(
         measured,
@@ -84,7 +101,9 @@ def sequence(frames=FRAMES):
     """The measured quads, exact and asynchronous, in memory."""
     shifts = np.array([CANONICAL_SHIFTS[n % 4] for n in range(frames)])
     return sequence_of(
-        quads=np.stack([quad(true_distance(n), shifts[n]) for n in range(frames)]).astype(np.float32),
+        quads=np.stack([quad(true_distance(n), shifts[n]) for n in range(frames)]).astype(
+            np.float32
+        ),
         measured=np.ones(frames, dtype=bool),
         shifts=shifts,
         times=np.arange(frames) / FRAME_RATE_HZ,
@@ -111,7 +130,9 @@ class AnalyticRun:
         self.path.mkdir(parents=True)
         where = Path(folder) / "sliding-box"
         write("ftorf", where, sequence(), truth() if with_truth else None)
-        self.camera = Camera(width=WIDTH, height=HEIGHT, fx=20.0, fy=20.0, cx=WIDTH / 2, cy=HEIGHT / 2)
+        self.camera = Camera(
+            width=WIDTH, height=HEIGHT, fx=20.0, fy=20.0, cx=WIDTH / 2, cy=HEIGHT / 2
+        )
         self.sensor = Sensor()
         self.quad_scale = 1.0
         self.gaussians = 1234
@@ -131,15 +152,26 @@ class AnalyticRun:
             "motion": "nodes",
             "seconds_reconstruct": 41.25,
         }
-        steps = [{"images": 100 * i, "seconds": 1.0 * i, "loss": 1.0 / i, "quads": 0.8 / i} for i in range(1, 6)]
-        lines = [json.dumps(step | {"gaussians": 1200 + i, "quad_psnr_db": 20.0 + i}) for i, step in enumerate(steps)]
+        steps = [
+            {"images": 100 * i, "seconds": 1.0 * i, "loss": 1.0 / i, "quads": 0.8 / i}
+            for i in range(1, 6)
+        ]
+        lines = [
+            json.dumps(step | {"gaussians": 1200 + i, "quad_psnr_db": 20.0 + i})
+            for i, step in enumerate(steps)
+        ]
         (self.path / "metrics.jsonl").write_text("\n".join(lines) + "\n")
 
     def watched(self, *rows):
         """Write rows of diagnostics, each (images, error of d, |d - d_ToF| on static pixels)."""
         lines = [
             json.dumps(
-                {"images": images, "gaussians": 1000 + images, "transmittance": 0.5 / images, "distortion": 0.02}
+                {
+                    "images": images,
+                    "gaussians": 1000 + images,
+                    "transmittance": 0.5 / images,
+                    "distortion": 0.02,
+                }
                 | {f"{group}{name}_mse_x100": error for group in GROUPS for name in ("d", "d_tof")}
                 | {"offset_static_m": 0.01, "d_minus_dtof_static_m": apart}
             )

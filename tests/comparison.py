@@ -12,7 +12,8 @@ DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 
 TOLERANCE = TOLERANCES[torch.float32]
 
-FULL = ("translucent", "posed", "outside", "distorted")  # cases in which every output and every input exists
+# cases in which every output and every input exists
+FULL = ("translucent", "posed", "outside", "distorted")
 
 
 class Comparison:
@@ -24,7 +25,10 @@ class Comparison:
         undecided = reference.undecided_pixels(case.field, case.camera, case.settings)
         assert undecided.double().mean() <= UNDECIDED_SHARE
         self.exact, self.inputs = case.inputs(torch.float64), case.inputs(torch.float32, device)
-        self.want, self.got = case.outputs(reference.rasterize, self.exact), case.outputs(api.rasterize, self.inputs)
+        self.want, self.got = (
+            case.outputs(reference.rasterize, self.exact),
+            case.outputs(api.rasterize, self.inputs),
+        )
         self.weight, self.decided = cotangents(self.want, undecided), ~undecided
 
     def check_images(self) -> None:
@@ -45,11 +49,17 @@ class Comparison:
             assert ((got - want).abs() * self.decided).max() <= bound, name
 
     def check_gradients(self, *outputs: str) -> dict[str, Tensor]:
-        """Derivatives of the randomly weighted ``outputs`` by every input; those of the oracle are returned."""
+        """Derivatives of the randomly weighted ``outputs`` by every input;
+        those of the oracle are returned.
+        """
         results = []
         for images, inputs in ((self.want, self.exact), (self.got, self.inputs)):
-            loss = sum((images[name] * self.weight[name].to(images[name])).sum() for name in outputs)
-            gradients = torch.autograd.grad(loss, [*inputs.values()], retain_graph=True, allow_unused=True)
+            loss = sum(
+                (images[name] * self.weight[name].to(images[name])).sum() for name in outputs
+            )
+            gradients = torch.autograd.grad(
+                loss, [*inputs.values()], retain_graph=True, allow_unused=True
+            )
             results.append(
                 {
                     name: torch.zeros_like(value) if gradient is None else gradient
@@ -68,7 +78,8 @@ def check_gradient(name: str, got: Tensor, want: Tensor, value: Tensor) -> None:
     if want.numel() == 0:
         return
     assert torch.isfinite(got).all(), name
-    scale = value.detach().item() if name == "f_mod_hz" else 1.0  # by the logarithm of the frequency
+    # by the logarithm of the frequency
+    scale = value.detach().item() if name == "f_mod_hz" else 1.0
     want, error = want * scale, (got.cpu() - want) * scale
     scalar = name in SENSOR_SCALARS
     part = TOLERANCE.scalar if scalar else TOLERANCE.gradient
@@ -79,10 +90,14 @@ def check_gradient(name: str, got: Tensor, want: Tensor, value: Tensor) -> None:
 
 def magnitude(name: str, gradient: Tensor, value: Tensor) -> float:
     """Largest element, in a unit in which every gradient of the cases is of the order of 1."""
-    return (gradient.abs().max() * (value.detach().abs().max() if name == "f_mod_hz" else 1.0)).item()
+    return (
+        gradient.abs().max() * (value.detach().abs().max() if name == "f_mod_hz" else 1.0)
+    ).item()
 
 
-def gradients_of(images: dict[str, Tensor], inputs: dict[str, Tensor], seed: int = 0, **options) -> dict[str, Tensor]:
+def gradients_of(
+    images: dict[str, Tensor], inputs: dict[str, Tensor], seed: int = 0, **options
+) -> dict[str, Tensor]:
     """Gradients of randomly weighted images by all inputs that need them."""
     decided_everywhere = torch.zeros(images["opacity"].shape, dtype=torch.bool)
     weight = cotangents(images, decided_everywhere, seed)

@@ -1,4 +1,6 @@
-"""How tests are spread over processes: a file's tests stay together, so that what they share is made once."""
+"""How tests are spread over processes: a file's tests stay together,
+so that what they share is made once.
+"""
 
 import pytest
 

@@ -25,14 +25,21 @@ CAPTURE_ONLY = {
 
 
 def scene(
-    frames=8, height=6, width=8, permutation=REAL_ORDER, phase_offset=0.3, dc_offset=0.2, distance=None, **changes
+    frames=8,
+    height=6,
+    width=8,
+    permutation=REAL_ORDER,
+    phase_offset=0.3,
+    dc_offset=0.2,
+    distance=None,
+    **changes,
 ):
     """A noise-free recording of a static wall in front of a camera, and its truth."""
     generator = np.random.default_rng(frames * 1000 + height * 100 + width)
     if distance is None:
-        distance = np.linspace(1.0, 4.0, height * width).reshape(height, width) + 0.1 * generator.random(
-            (height, width)
-        )
+        distance = np.linspace(1.0, 4.0, height * width).reshape(
+            height, width
+        ) + 0.1 * generator.random((height, width))
     distance = np.broadcast_to(distance, (frames, height, width)).astype(np.float32)
     shifts = np.array(CANONICAL_SHIFTS)[np.argsort(permutation)[np.arange(frames) % 4]]
     f_mod_hz = SPEED_OF_LIGHT / 15.0
@@ -91,5 +98,10 @@ def fingerprint(folder):
     """Every file below a folder with its content and time of change."""
     files = sorted(path for path in Path(folder).rglob("*") if path.is_file())
     return [
-        (str(f.relative_to(folder)), f.stat().st_mtime_ns, hashlib.sha256(f.read_bytes()).hexdigest()) for f in files
+        (
+            str(f.relative_to(folder)),
+            f.stat().st_mtime_ns,
+            hashlib.sha256(f.read_bytes()).hexdigest(),
+        )
+        for f in files
     ]

@@ -1,4 +1,6 @@
-"""What the tests of known mistakes share: Gaussians at given places, recordings of given distances."""
+"""What the tests of known mistakes share: Gaussians at given places,
+recordings of given distances.
+"""
 
 import math
 
@@ -15,7 +17,9 @@ DEPTH_RANGE = 15.0  # [m] c / f of the recordings below, twice the unambiguous r
 
 
 def dots(points, *, scale, opacity=0.9, reflectivity=0.5, colour=None):
-    """Round Gaussians at points [N, 3] in the world; the other arguments are one for all, or one for each."""
+    """Round Gaussians at points [N, 3] in the world; the other arguments are one for all,
+    or one for each.
+    """
     points = torch.as_tensor(np.asarray(points), dtype=torch.float32).reshape(-1, 3)
     n = len(points)
 
@@ -28,7 +32,9 @@ def dots(points, *, scale, opacity=0.9, reflectivity=0.5, colour=None):
         quaternion=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
         opacity_logit=torch.logit(each(opacity)),
         reflectivity_sh=constant_sh(each(reflectivity)),
-        colour_sh=None if colour is None else constant_sh(torch.as_tensor(colour).expand(n, 3)).mT.contiguous(),
+        colour_sh=None
+        if colour is None
+        else constant_sh(torch.as_tensor(colour).expand(n, 3)).mT.contiguous(),
     )
 
 
@@ -39,7 +45,9 @@ def centres(camera: Camera) -> torch.Tensor:
 
 
 def surface(camera: Camera, distance, **options) -> GaussianField:
-    """A closed surface: one small opaque Gaussian per pixel, at ``distance`` [H, W] along its ray [m]."""
+    """A closed surface: one small opaque Gaussian per pixel, at ``distance`` [H,
+    W] along its ray [m].
+    """
     distance = torch.as_tensor(distance, dtype=torch.float32).expand(camera.height, camera.width)
     points = unproject(camera, centres(camera), distance).reshape(-1, 3)
     scale = 0.7 * distance.flatten() / math.sqrt(camera.fx * camera.fy)
@@ -52,7 +60,9 @@ def ramp(height, width):
 
 
 def wall(distance, *, frames=8, **changes):
-    """A noise-free recording of a scene at rest, distance [H, W] or [F, H, W] [m], and the phase of every pixel."""
+    """A noise-free recording of a scene at rest, distance [H, W] or [F, H, W] [m],
+    and the phase of every pixel.
+    """
     distance = np.asarray(distance, dtype=np.float64)
     height, width = distance.shape[-2:]
     return scene(frames, height, width, distance=distance, **changes)[0]

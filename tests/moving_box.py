@@ -1,4 +1,6 @@
-"""A textured box slides and comes nearer in front of a textured wall: quads, exact flow and truth in closed form."""
+"""A textured box slides and comes nearer in front of a textured wall: quads,
+exact flow and truth in closed form.
+"""
 
 from dataclasses import replace
 
@@ -24,7 +26,9 @@ def ray_slopes():
 
 
 def seen(n):
-    """[H, W] at raw frame n: distance along the ray [m], reflectivity, and whether it is the box."""
+    """[H, W] at raw frame n: distance along the ray [m], reflectivity,
+    and whether it is the box.
+    """
     sx, sy = ray_slopes()
     z = BOX_Z + STEP[2] * n
     x, y = sx * z - STEP[0] * n, sy * z - STEP[1] * n
@@ -45,7 +49,14 @@ def flow(n, frames):
 
 
 def recording(
-    *, frames=FRAMES, order=(0, 1, 2, 3), phase_offset=0.0, dc_offset=0.0, noise=NOISE, with_flow=True, **changes
+    *,
+    frames=FRAMES,
+    order=(0, 1, 2, 3),
+    phase_offset=0.0,
+    dc_offset=0.0,
+    noise=NOISE,
+    with_flow=True,
+    **changes,
 ):
     """The sequence and its truth; slot k shows canonical shift ``order[k]``."""
     shifts = np.array(CANONICAL_SHIFTS)[np.array(order)[np.arange(frames) % 4]]
@@ -76,7 +87,10 @@ def recording(
     if with_flow:
         fields["forward_flow"] = {n: flow(n, 4) for n in starts if n + 4 < frames}
         fields["backward_flow"] = {n: flow(n, -4) for n in starts if n >= 4}
-    truth = Truth(distance=np.stack([d for d, _, _ in images]).astype(np.float32), known=np.ones(frames, dtype=bool))
+    truth = Truth(
+        distance=np.stack([d for d, _, _ in images]).astype(np.float32),
+        known=np.ones(frames, dtype=bool),
+    )
     return sequence_of(**fields | changes), truth
 
 
@@ -93,7 +107,9 @@ def with_colour(sequence, *, size=(2 * WIDTH, 2 * HEIGHT)):
     """The sequence with smooth images of a colour camera of its own at quartet starts."""
     width, height = size
     y, x = np.mgrid[0:height, 0:width] / 20.0
-    image = 40.0 * np.stack([0.5 + 0.4 * np.sin(x), 0.5 + 0.4 * np.cos(y), 0.3 + 0.0 * x], axis=-1).astype(np.float32)
+    image = 40.0 * np.stack(
+        [0.5 + 0.4 * np.sin(x), 0.5 + 0.4 * np.cos(y), 0.3 + 0.0 * x], axis=-1
+    ).astype(np.float32)
     poses = sequence.camera_from_world.copy()
     poses[:, 0, 3] -= BASELINE
     zoom = width / WIDTH
@@ -111,4 +127,6 @@ def as_phasors(sequence):
     re, im = quads[:, 0] - quads[:, 1], quads[:, 2] - quads[:, 3]
     halves = np.stack([re, -re, im, -im], axis=1) / 2
     times = sequence.times - (np.arange(sequence.frames) % 4) / 120
-    return replace(sequence, quads=halves.reshape(sequence.quads.shape), times=times, from_phasors=True)
+    return replace(
+        sequence, quads=halves.reshape(sequence.quads.shape), times=times, from_phasors=True
+    )

@@ -87,9 +87,15 @@ def plain_image(
         seed: Of backgrounds; None: black.
     """
     sequence, image = observations.sequence, PlainImage({})
-    weights = {name: weight for name, weight in plain_weights(settings, first).items() if weight > 0}
+    weights = {
+        name: weight for name, weight in plain_weights(settings, first).items() if weight > 0
+    }
     render, ssim = render_settings_at(settings, first), settings.weights.ssim
-    quartet, camera, sensor = frame // sequence.cycle, observations.cameras[frame], observations.sensor_at(frame)
+    quartet, camera, sensor = (
+        frame // sequence.cycle,
+        observations.cameras[frame],
+        observations.sensor_at(frame),
+    )
 
     def displacement_at(time: float):
         return (torch.zeros_like(field.mean), None) if motion is None else motion.at(binding, time)
@@ -98,7 +104,9 @@ def plain_image(
         if seed is None or settings.background == 0:
             return None
         origin = torch.tensor([seed, number], dtype=torch.int32, device=field.device)
-        return fused.uniform((channels, camera.height, camera.width), origin, settings.background, stream=stream)
+        return fused.uniform(
+            (channels, camera.height, camera.width), origin, settings.background, stream=stream
+        )
 
     displacement = displacement_at(observations.time_at(frame))
     compared: dict[str, Tensor] = {}
@@ -108,9 +116,13 @@ def plain_image(
         moved = replace(field, colour_sh=None).moved(*displacement)
         image.tof = tof = _rendered(moved, camera, sensor, render, behind, settings)
         if "quads" in weights and observations.phasors:
-            compared["quads"], image.squared = plain_loss(tof.phasor[:2], observations.phasors[frame], ssim)
+            compared["quads"], image.squared = plain_loss(
+                tof.phasor[:2], observations.phasors[frame], ssim
+            )
         elif "quads" in weights:
-            compared["quads"], image.squared = plain_loss(tof.quads, observations.quads[frame][None], ssim)
+            compared["quads"], image.squared = plain_loss(
+                tof.quads, observations.quads[frame][None], ssim
+            )
         if "depth" in weights and quartet in observations.closed_form:
             measured = observations.closed_form[quartet]
             compared["depth"], _ = plain_loss(tof.distance[None], measured, ssim, Norm.L1)
@@ -129,36 +141,60 @@ def plain_image(
         compared["motion_size"] = motion_size(displacement[0]).mean()
         if "flow" in weights and frame % sequence.cycle == 0 and quartet in observations.flow:
             compared["flow"] = plain_flow(field, motion, binding, observations, frame, render)
-    image.terms = {name: weights[name] * value for name, value in compared.items() if name in weights}
+    image.terms = {
+        name: weights[name] * value for name, value in compared.items() if name in weights
+    }
     return image
 
 
-def plain_loss(rendered: Tensor, measured: Tensor, ssim: float, norm: Norm = Norm.L2) -> tuple[Tensor, Tensor]:
-    """(1 - ssim) times the mean L1 or L2 difference + ssim (1 - SSIM), and the mean squared difference."""
+def plain_loss(
+    rendered: Tensor, measured: Tensor, ssim: float, norm: Norm = Norm.L2
+) -> tuple[Tensor, Tensor]:
+    """(1 - ssim) times the mean L1 or L2 difference + ssim (1 - SSIM),
+    and the mean squared difference.
+    """
     squared = quad_error(rendered, measured).mean()
     difference = squared if norm == Norm.L2 else (rendered - measured).abs().mean()
-    return (1.0 - ssim) * difference + ssim * (1.0 - similarity(rendered, measured).mean()), squared.detach()
+    return (1.0 - ssim) * difference + ssim * (
+        1.0 - similarity(rendered, measured).mean()
+    ), squared.detach()
 
 
 def plain_flow(
-    field: GaussianField, motion: Motion, binding: Tensor, observations: Observations, frame: int, render
+    field: GaussianField,
+    motion: Motion,
+    binding: Tensor,
+    observations: Observations,
+    frame: int,
+    render,
 ) -> Tensor:
-    """Squared difference to the measured flow [px^2] to both neighbours of a quartet; blending is held fixed."""
+    """Squared difference to the measured flow [px^2] to both neighbours of a quartet;
+    blending is held fixed.
+    """
     cycle, times = observations.sequence.cycle, motion.key_times.tolist()
     times, quartet, camera = motion.times, frame // cycle, observations.cameras[frame]
     start = motion.at(binding, times[quartet])
-    ends = {step: motion.at(binding, times[quartet + step]) for step in (1, -1) if 0 <= quartet + step < len(times)}
+    ends = {
+        step: motion.at(binding, times[quartet + step])
+        for step in (1, -1)
+        if 0 <= quartet + step < len(times)
+    }
     still = replace(field, colour_sh=None).moved(*start).map(torch.Tensor.detach)
     channels = torch.cat([end.offset - start.offset for end in ends.values()], dim=1)
     seen = rasterize(still, camera, observations.sensor_at(frame), render, extra=channels)
-    later = [observations.cameras[min(max(frame + cycle * step, 0), len(observations.cameras) - 1)] for step in ends]
+    later = [
+        observations.cameras[min(max(frame + cycle * step, 0), len(observations.cameras) - 1)]
+        for step in ends
+    ]
     measured = [observations.flow[quartet][(1, -1).index(step)] for step in ends]
     rays = torch.from_numpy(camera.centre), camera.rays(dtype=torch.float64)
     rays = [ray.to(seen.distance) for ray in rays]
     return plain_flow_error(seen.distance, seen.extra, measured, camera, later, rays)
 
 
-def plain_flow_error(distance: Tensor, displacement: Tensor, measured, camera, later, rays) -> Tensor:
+def plain_flow_error(
+    distance: Tensor, displacement: Tensor, measured, camera, later, rays
+) -> Tensor:
     """Sum over flows of the mean squared difference [px^2] to the flow that displacements cause.
 
     Args:
@@ -173,19 +209,26 @@ def plain_flow_error(distance: Tensor, displacement: Tensor, measured, camera, l
     surface = centre + ray * distance.detach().clamp_min(NEAREST)[..., None]
     ends = zip(displacement.split(3), measured, later, strict=True)
     errors = [
-        flow_error(image_motion(surface, moved, camera.project, then.project), flow) for moved, flow, then in ends
+        flow_error(image_motion(surface, moved, camera.project, then.project), flow)
+        for moved, flow, then in ends
     ]
     return torch.stack([error.mean() for error, _ in errors]).sum()
 
 
-def _rendered(field, camera, sensor, render: RenderSettings, behind: dict, settings: ReconSettings) -> Rendering:
+def _rendered(
+    field, camera, sensor, render: RenderSettings, behind: dict, settings: ReconSettings
+) -> Rendering:
     behind = {name: light for name, light in behind.items() if light is not None}
     watched = settings.densify.every is not None
-    return rasterize(field, camera, sensor, render, background=Background(**behind), screen_gradient=watched)
+    return rasterize(
+        field, camera, sensor, render, background=Background(**behind), screen_gradient=watched
+    )
 
 
 def plain_step(state: State, observations: Observations, settings: ReconSettings) -> bool:
-    """Advance a state by one batch; False: loss or gradient were not finite and no parameter changed."""
+    """Advance a state by one batch; False: loss or gradient were not finite and no parameter
+    changed.
+    """
     frames, before = draw(state, observations, settings), state.images
     state.images += len(frames)
     if state.motion.follows_means:
@@ -212,7 +255,9 @@ def plain_step(state: State, observations: Observations, settings: ReconSettings
         )
         if not images[-1].terms:
             continue
-        learning = [k for k, _ in enumerate(leaves) if not rests or k >= len(state.optimiser.tensors)]
+        learning = [
+            k for k, _ in enumerate(leaves) if not rests or k >= len(state.optimiser.tensors)
+        ]
         loss = torch.stack([*images[-1].terms.values()]).sum()
         wanted = [leaves[k] for k in learning]
         # the graph through the binding is shared by the images
@@ -225,19 +270,29 @@ def plain_step(state: State, observations: Observations, settings: ReconSettings
     valid = all(bool(value.isfinite().all()) for value in [*values, *total])
     if valid:
         _add_up(state, observations, frames, images)
-        rates = rates_at(settings, before, state.rate_factor, reset_at=state.reset_at, revived_at=state.revived_at)
+        rates = rates_at(
+            settings,
+            before,
+            state.rate_factor,
+            reset_at=state.reset_at,
+            revived_at=state.revived_at,
+        )
         if (
             densify.round_is_due(before, state.images, settings.densify, settings.schedule)
             and settings.densify.loses_step
         ):
             rates = {name: rate if name == "motion" else 0.0 for name, rate in rates.items()}
-        gradients = [gradient if used else None for gradient, used in zip(total, touched, strict=True)]
+        gradients = [
+            gradient if used else None for gradient, used in zip(total, touched, strict=True)
+        ]
         plain_adam(state.optimiser, gradients, rates, settings.motion_gradient_max)
     densify_after(state, observations, before, settings)
     return valid
 
 
-def plain_adam(optimiser, gradients: list[Tensor | None], rates: dict[str, float], longest: float | None) -> None:
+def plain_adam(
+    optimiser, gradients: list[Tensor | None], rates: dict[str, float], longest: float | None
+) -> None:
     """Adam of torch on the moments of an optimiser; a group of rate 0 has no gradient."""
     for leaf, gradient, group in zip(optimiser.leaves, gradients, optimiser.groups, strict=True):
         leaf.grad = gradient if rates[group] > 0 else None
@@ -246,7 +301,9 @@ def plain_adam(optimiser, gradients: list[Tensor | None], rates: dict[str, float
     for leaf, group in zip(optimiser.leaves, optimiser.groups, strict=True):
         if leaf.grad is None:
             continue
-        adam = torch.optim.Adam([leaf], lr=rates[group], betas=optimiser.betas, eps=EPSILON, foreach=False)
+        adam = torch.optim.Adam(
+            [leaf], lr=rates[group], betas=optimiser.betas, eps=EPSILON, foreach=False
+        )
         step, first, second = optimiser.moments_of(leaf)
         count = step.cpu()  # torch keeps it there
         adam.state[leaf] = {"step": count, "exp_avg": first, "exp_avg_sq": second}
@@ -255,14 +312,19 @@ def plain_adam(optimiser, gradients: list[Tensor | None], rates: dict[str, float
         leaf.grad = None
 
 
-def _add_up(state: State, observations: Observations, frames: list[int], images: list[PlainImage]) -> None:
+def _add_up(
+    state: State, observations: Observations, frames: list[int], images: list[PlainImage]
+) -> None:
     """Add images to the sums of the log and to the statistics of densification."""
     for frame, image in zip(frames, images, strict=True):
         if image.primary is None:
             continue
         with torch.no_grad():
             values = {name: value.detach() for name, value in image.terms.items()}
-            values |= {"loss": torch.stack([*values.values()]).sum(), "opacity": image.primary.opacity.mean()}
+            values |= {
+                "loss": torch.stack([*values.values()]).sum(),
+                "opacity": image.primary.opacity.mean(),
+            }
             values |= {"quad_mse": image.squared, "count": torch.ones_like(values["loss"])}
             for name, value in values.items():
                 state.sums[name] = state.sums.get(name, 0.0) + value
@@ -272,7 +334,8 @@ def _add_up(state: State, observations: Observations, frames: list[int], images:
                 half = screen.gradient.new_tensor([0.5 * camera.width, 0.5 * camera.height])
                 state.statistics = replace(
                     state.statistics,
-                    gradient=state.statistics.gradient + screen.pixels * (half * screen.gradient).norm(dim=1),
+                    gradient=state.statistics.gradient
+                    + screen.pixels * (half * screen.gradient).norm(dim=1),
                     pixels=state.statistics.pixels + screen.pixels,
                     weight=state.statistics.weight + screen.weight,
                 )

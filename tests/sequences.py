@@ -14,7 +14,11 @@ PARTS = {  # part of a sequence: (its class, {flat name: name in the part})
     ),
     "colour": (
         ColourCamera,
-        {"colour": "images", "colour_intrinsics": "intrinsics", "colour_from_world": "camera_from_world"},
+        {
+            "colour": "images",
+            "colour_intrinsics": "intrinsics",
+            "colour_from_world": "camera_from_world",
+        },
     ),
     "flow": (Flow, {"forward_flow": "forward", "backward_flow": "backward"}),
 }
@@ -23,9 +27,13 @@ NAMES |= {name for _, names in PARTS.values() for name in names}
 
 
 def sequence_of(**values):
-    """A sequence of values by their flat names; intrinsics of the colour camera also as (fx, fy, cx, cy)."""
+    """A sequence of values by their flat names; intrinsics of the colour camera also as (fx, fy,
+    cx, cy).
+    """
     if isinstance(values.get("colour_intrinsics"), tuple):
-        values["colour_intrinsics"] = Intrinsics(**dict(zip(PINHOLE, values["colour_intrinsics"], strict=True)))
+        values["colour_intrinsics"] = Intrinsics(
+            **dict(zip(PINHOLE, values["colour_intrinsics"], strict=True))
+        )
     for part, (kind, names) in PARTS.items():
         given = {name: values.pop(name) for name in [*values] if name in names}
         values[part] = kind(**{names[name]: value for name, value in given.items()})
@@ -34,7 +42,11 @@ def sequence_of(**values):
 
 def values_of(sequence):
     """The values of a sequence by their flat names, without its sources and path."""
-    values = {name: getattr(sequence, name) for name in NAMES if hasattr(sequence, name) and name not in PARTS}
+    values = {
+        name: getattr(sequence, name)
+        for name in NAMES
+        if hasattr(sequence, name) and name not in PARTS
+    }
     for part, (_, names) in PARTS.items():
         values |= {name: getattr(getattr(sequence, part), inner) for name, inner in names.items()}
     return values

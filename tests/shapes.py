@@ -1,4 +1,6 @@
-"""The checker of `--jaxtyping-packages=...,shapes.checked`: beartype, to which an int is a float, as in PEP 484."""
+"""The checker of `--jaxtyping-packages=...,shapes.checked`: beartype, to which an int is a float,
+as in PEP 484.
+"""
 
 from beartype import BeartypeConf, beartype
 

@@ -38,7 +38,11 @@ def random(*shape, seed=0):
 def demo(**changes):
     """The demo preset with other values; those of the schedule by their own names."""
     settings = presets.demo()
-    schedule = {name: changes.pop(name) for name in ("images", "batch", "log_every", "warm_up") if name in changes}
+    schedule = {
+        name: changes.pop(name)
+        for name in ("images", "batch", "log_every", "warm_up")
+        if name in changes
+    }
     return replace(settings, schedule=replace(settings.schedule, **schedule), **changes)
 
 
@@ -107,7 +111,9 @@ class OneStep:
         self.terms = {name: value for name, value in self.sums.items() if name not in TOTAL_NAMES}
         """Weighted terms."""
         optimiser = twin.optimiser
-        moments = [optimiser.moments_of(leaf)[1] / (1 - optimiser.betas[0]) for leaf in optimiser.leaves]
+        moments = [
+            optimiser.moments_of(leaf)[1] / (1 - optimiser.betas[0]) for leaf in optimiser.leaves
+        ]
         self.gradients = dict(zip(optimiser.groups, moments, strict=True))
         """By group; of a motion of several tensors the last."""
         self.state = twin

@@ -26,7 +26,9 @@ def posed(shape, position=(0.1, 0.0, 2.2), turn=TURN, texture=GREY):
 
 
 def test_a_wall_without_end_is_a_wall():
-    """The same hits as a rectangle that fills the view; a floor is met below the horizon only, and from both sides."""
+    """The same hits as a rectangle that fills the view; a floor is met below the horizon only,
+    and from both sides.
+    """
     wall = first_hit((posed(Level(axis=2, value=3.0), (0, 0, 0), (0, 0, 0)),), CAMERA, 0.0)
     want = first_hit((posed(Plane(size=(9.0, 9.0)), (0, 0, 3.0), (0, 0, 0)),), CAMERA, 0.0)
     np.testing.assert_allclose(wall.distance, want.distance, rtol=1e-12)
@@ -39,7 +41,9 @@ def test_a_wall_without_end_is_a_wall():
         np.testing.assert_array_equal(np.isfinite(level.distance), met)
         np.testing.assert_allclose((level.distance * down)[met], value, rtol=1e-12)
         np.testing.assert_allclose(
-            (level.normal * CAMERA.rays(dtype=torch.float64).numpy()).sum(-1)[met].max(), 0, atol=0.02
+            (level.normal * CAMERA.rays(dtype=torch.float64).numpy()).sum(-1)[met].max(),
+            0,
+            atol=0.02,
         )
         assert (level.normal[met][:, 1] == -np.sign(value)).all()
 
@@ -53,7 +57,9 @@ def test_texture_of_a_wall_is_that_of_the_world():
 
 
 def test_an_assembly_is_hit_where_its_parts_are():
-    """Distance, normal and amplitude of parts as one body and as bodies of their own; each part keeps its faces."""
+    """Distance, normal and amplitude of parts as one body and as bodies of their own;
+    each part keeps its faces.
+    """
     parts = (
         Part(shape=Box(size=(0.5, 0.1, 0.3)), position=(0.0, 0.2, 0.0)),
         Part(shape=Box(size=(0.1, 0.6, 0.1)), position=(0.17, -0.1, 0.07)),  # no faces in one plane
@@ -73,8 +79,14 @@ def test_an_assembly_is_hit_where_its_parts_are():
 
 
 def test_an_assembly_reaches_as_far_as_its_parts_and_is_as_near():
-    """Every point of its grid is within reach, and none is nearer to the camera than the clearance says."""
-    body = Body(shape=chair(), texture=GREY, path=Line(position=(0.3, 0.2, 1.4), velocity=(0, 0, -1.0), turn_deg=TURN))
+    """Every point of its grid is within reach, and none is nearer to the camera than the clearance
+    says.
+    """
+    body = Body(
+        shape=chair(),
+        texture=GREY,
+        path=Line(position=(0.3, 0.2, 1.4), velocity=(0, 0, -1.0), turn_deg=TURN),
+    )
     grid = body.shape.grid(0.01, 0.0)
     assert len(grid.point) == len(grid.normal) == len(grid.other) > 1000
     assert np.linalg.norm(grid.point, axis=1).max() <= body.shape.reach
@@ -85,19 +97,31 @@ def test_an_assembly_reaches_as_far_as_its_parts_and_is_as_near():
         assert near <= nearest + 1e-12
         assert near > nearest - 0.02
         assert near > np.linalg.norm(pose[:3, 3]) - body.shape.reach
-    ball = Body(shape=Assembly(parts=(Part(shape=Sphere(radius=0.2)),)), texture=GREY, path=body.path)
-    assert clearance(ball, np.zeros(3), times[:1])[0] == pytest.approx(np.linalg.norm((0.3, 0.2, 1.4)) - 0.2)
+    ball = Body(
+        shape=Assembly(parts=(Part(shape=Sphere(radius=0.2)),)), texture=GREY, path=body.path
+    )
+    assert clearance(ball, np.zeros(3), times[:1])[0] == pytest.approx(
+        np.linalg.norm((0.3, 0.2, 1.4)) - 0.2
+    )
 
 
 def test_a_cover_of_an_assembly_is_as_large_as_it_is():
     """Opacity sums up to the area of a table but for its outline, and is 1 inside it."""
     top, leg = Box(size=(0.9, 0.1, 0.5)), Box(size=(0.15, 0.6, 0.15))
-    table = Assembly(parts=(Part(shape=top), *(Part(shape=leg, position=(x, 0.35, 0.1)) for x in (-0.35, 0.35))))
-    body = Body(shape=table, texture=GREY, path=Line(position=(0.0, -0.1, 2.3), velocity=(1.0, 0.0, 0.0)))
+    table = Assembly(
+        parts=(Part(shape=top), *(Part(shape=leg, position=(x, 0.35, 0.1)) for x in (-0.35, 0.35)))
+    )
+    body = Body(
+        shape=table, texture=GREY, path=Line(position=(0.0, -0.1, 2.3), velocity=(1.0, 0.0, 0.0))
+    )
     camera = Camera.from_fov(96, 72, 60.0)
     field = cover_moving(body, camera, np.array([0.0, 0.1])).facing(camera.centre, 0.05)
     opacity = rasterize(field, camera, Sensor()).opacity.numpy()
-    area = (first_hit((body,), camera.resized(960, 720), 0.05).body >= 0).reshape(72, 10, 96, 10).mean((1, 3))
+    area = (
+        (first_hit((body,), camera.resized(960, 720), 0.05).body >= 0)
+        .reshape(72, 10, 96, 10)
+        .mean((1, 3))
+    )
     inner = np.ones_like(area, dtype=bool)
     for dy in (-1, 0, 1):
         for dx in (-1, 0, 1):
@@ -109,13 +133,19 @@ def test_a_cover_of_an_assembly_is_as_large_as_it_is():
 
 
 def test_interior_pixels_know_the_parts_of_an_assembly():
-    """The front of the second part of one body and that of the next body have numbers of their own: no interior."""
-    parts = tuple(Part(shape=Box(size=(0.4, 3.0, 0.4)), position=(x, 0.0, 0.0)) for x in (-0.4, 0.0))
+    """The front of the second part of one body and that of the next body have numbers of their
+    own: no interior.
+    """
+    parts = tuple(
+        Part(shape=Box(size=(0.4, 3.0, 0.4)), position=(x, 0.0, 0.0)) for x in (-0.4, 0.0)
+    )
     posts = (
         posed(Assembly(parts=parts), (0.0, 0.0, 2.0), (0, 0, 0)),
         posed(Box(size=(0.4, 3.0, 0.4)), (0.4, 0, 2.0), (0, 0, 0)),
     )
-    scene = Scene(name="posts", description="", motion="", bodies=posts, frames=1, width=64, height=48)
+    scene = Scene(
+        name="posts", description="", motion="", bodies=posts, frames=1, width=64, height=48
+    )
     hit = first_hit(posts, CAMERA, 0.0)
     inside = still_interior(scene, [hit])
     steps = np.flatnonzero(np.diff(hit.body[24] * 100 + hit.face[24]))

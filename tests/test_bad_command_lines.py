@@ -1,4 +1,6 @@
-"""Wrong `gftorf simulate` lines: scenes, sensors, meshes, sizes, folders: three lines, a code, nothing written."""
+"""Wrong `gftorf simulate` lines: scenes, sensors, meshes, sizes, folders: three lines, a code,
+nothing written.
+"""
 
 import pytest
 
@@ -37,7 +39,8 @@ SCENES = {
     "moving.toml": MESH % ("sheet.obj", "true"),
     **{f"{name.partition('.')[0]}.mesh.toml": MESH % (name, "false") for name in OBJ},
 }
-BAD = [  # what follows `gftorf simulate`, exit code, a word of the answer; {scenes} and {out} are folders
+# what follows `gftorf simulate`, exit code, a word of the answer; {scenes} and {out} are folders
+BAD = [
     ("slidin", 2, "did you mean sliding"),
     ("{scenes}/none.toml", 3, "none.toml"),
     ("{scenes}", 2, "there is no scene"),
@@ -61,7 +64,11 @@ BAD = [  # what follows `gftorf simulate`, exit code, a word of the answer; {sce
     ("demo --override sensor.exposure_s=-0.001", 2, "exposure_s"),
     ("demo --override sensor.row_time_s=1e-5 --format capture", 2, "--engine mesh"),
     ("demo --override sensor.row_time_s=1e-5 --engine mesh", 2, "--format capture"),
-    ("demo --override sensor.row_time_s=1e-5 --engine mesh --format capture --flow", 2, "leave --flow out"),
+    (
+        "demo --override sensor.row_time_s=1e-5 --engine mesh --format capture --flow",
+        2,
+        "leave --flow out",
+    ),
     ("demo --override sensor.row_time_s=-1e-5", 2, "row_time_s must be 0 or more"),
     ("demo --override sensor.contrast=2", 2, "contrast must be in (0, 1]"),
     ("demo --override sensor.ambient_electrons=-1", 2, "0 or more"),
@@ -115,10 +122,18 @@ def refused(arguments, code, word, capsys):
 
 
 @pytest.mark.parametrize(("line", "code", "word"), BAD, ids=[line for line, _, _ in BAD])
-def test_a_wrong_line_ends_in_three_lines_and_writes_nothing(line, code, word, scenes, tmp_path, capsys):
+def test_a_wrong_line_ends_in_three_lines_and_writes_nothing(
+    line, code, word, scenes, tmp_path, capsys
+):
     """Whatever is wrong; the folder and what is unfinished beside it do not appear."""
     size = [] if "--size" in line else ["--size", "8x6"]
-    arguments = ["simulate", *line.format(scenes=scenes).split(), *size, "--out", str(tmp_path / "out" / "seq")]
+    arguments = [
+        "simulate",
+        *line.format(scenes=scenes).split(),
+        *size,
+        "--out",
+        str(tmp_path / "out" / "seq"),
+    ]
     refused(arguments, code, word, capsys)
     assert [path.name for path in tmp_path.iterdir()] == ["scenes"]
     assert {path.name for path in scenes.iterdir()} == {*SCENES, *OBJ}
@@ -133,7 +148,13 @@ def test_folders_that_cannot_be_written_stay_as_they_are(scenes, tmp_path, capsy
     assert main([*good, "--out", str(tmp_path / "seq"), "-q"]) == 0
     capsys.readouterr()
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
-    for name, more in (("file", []), ("folder", []), ("folder", ["--fresh"]), ("file/seq", []), ("seq", ["--sync"])):
+    for name, more in (
+        ("file", []),
+        ("folder", []),
+        ("folder", ["--fresh"]),
+        ("file/seq", []),
+        ("seq", ["--sync"]),
+    ):
         refused([*good, "--out", str(tmp_path / name), *more], 2, name, capsys)
     refused(good, 2, "--out SEQ", capsys)
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before

@@ -1,4 +1,6 @@
-"""``gftorf bench`` at small sizes: every part measures something, and what it writes says on what."""
+"""``gftorf bench`` at small sizes: every part measures something,
+and what it writes says on what.
+"""
 
 import json
 
@@ -34,7 +36,9 @@ def fitted(recorded):
 
 
 def test_quick_bench_writes_everything_it_prints(tmp_path, capsys):
-    """All parts but the reconstruction, which has a test of its own; tables on stdout, the same rows in the file."""
+    """All parts but the reconstruction, which has a test of its own; tables on stdout,
+    the same rows in the file.
+    """
     path = tmp_path / "bench.json"
     names = ["renderer", "motion", "step", "render"]
     assert cli.main(["bench", *names, "--quick", "--device", "cpu", "--json", str(path)]) == 0
@@ -77,7 +81,11 @@ def test_reconstruction_with_both_kernel_caches(tmp_path, monkeypatch):
     seen = []
     path = tmp_path / "bench.json"
     found = command.bench(
-        ["reconstruction"], wanted, json=path, progress=lambda _: lambda *a, **_: seen.append(a), say=lambda _: None
+        ["reconstruction"],
+        wanted,
+        json=path,
+        progress=lambda _: lambda *a, **_: seen.append(a),
+        say=lambda _: None,
     )
     cold, warm = found["parts"]["reconstruction"]["rows"]
     assert (cold["kernels"], warm["kernels"]) == ("cold", "warm")
@@ -109,11 +117,14 @@ def test_a_reconstruction_that_fails_says_why(recorded):
         (["motion", "--device", "cuda"], 5, "cuda"),
     ],
 )
-def test_mistakes_are_named_before_anything_is_measured(words, code, hint, tmp_path, monkeypatch, capsys):
+def test_mistakes_are_named_before_anything_is_measured(
+    words, code, hint, tmp_path, monkeypatch, capsys
+):
     """Unknown parts, missing folders, files that cannot be written, no GPU."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    monkeypatch.setattr(command, "PARTS", dict.fromkeys(command.PARTS, (None, None)))  # measuring would fail
+    # measuring would fail
+    monkeypatch.setattr(command, "PARTS", dict.fromkeys(command.PARTS, (None, None)))
     device = [] if "--device" in words else ["--device", "cpu"]
     assert cli.main(["bench", *words, *device]) == code
     assert hint in capsys.readouterr().err
@@ -129,7 +140,12 @@ def test_what_was_measured_before_an_interruption_is_kept(tmp_path, monkeypatch)
     monkeypatch.setitem(command.PARTS, "motion", (interrupted, motion.table))
     path = tmp_path / "bench.json"
     with pytest.raises(KeyboardInterrupt):
-        command.bench(["renderer", "motion"], command.Wanted(device="cpu", quick=True), json=path, say=lambda _: None)
+        command.bench(
+            ["renderer", "motion"],
+            command.Wanted(device="cpu", quick=True),
+            json=path,
+            say=lambda _: None,
+        )
     assert list(json.loads(path.read_text())["parts"]) == ["renderer"]
 
 
@@ -163,7 +179,9 @@ def test_what_cannot_be_captured_is_reported(caplog):
 
 
 def test_stages_are_those_of_a_rendering():
-    """Every stage that launch.py asks for, in its order; repeated, they leave the image as it was."""
+    """Every stage that launch.py asks for, in its order; repeated,
+    they leave the image as it was.
+    """
     import warp as wp
 
     case = renderer.Case("surface", 300, 0.03, 0.6, "training", wp.get_device(DEVICE))
@@ -197,10 +215,16 @@ def test_the_families_hold_what_they_say():
 
 
 def test_the_state_is_in_its_middle(fitted, tmp_path):
-    """As many Gaussians as asked for, a network that moves them, past the warm-up; as a folder it is a run."""
+    """As many Gaussians as asked for, a network that moves them, past the warm-up;
+    as a folder it is a run.
+    """
     low, high = states.QUICK_COUNT
     assert low <= fitted.gaussians <= high
-    assert fitted.settings.schedule.warm_up < fitted.stored["images"] < 0.6 * fitted.settings.schedule.images
+    assert (
+        fitted.settings.schedule.warm_up
+        < fitted.stored["images"]
+        < 0.6 * fitted.settings.schedule.images
+    )
     assert fitted.observations.flow
     run = Run.open(states.as_run(fitted, tmp_path / "run", DEVICE), DEVICE)
     assert run.gaussians == fitted.gaussians
@@ -217,7 +241,9 @@ def test_every_way_of_a_step_is_timed_once(fitted):
     assert {way.motion.products for way in on_gpu} == set(Products)
     assert {way.graph for way in on_gpu} == {False, True}
     assert len({(w.graph, w.schedule.batch, w.motion.products) for w in on_gpu}) == len(on_gpu)
-    assert {way.graph for way in step.ways(fitted.settings, ["graph=true"], "cuda:0")} == {fitted.settings.graph}
+    assert {way.graph for way in step.ways(fitted.settings, ["graph=true"], "cuda:0")} == {
+        fitted.settings.graph
+    }
 
 
 def test_a_run_without_checkpoint_is_refused(fitted, tmp_path):
@@ -251,9 +277,23 @@ def test_half_precision_has_a_row_of_torch_where_steps_have_kernels(monkeypatch)
 
 
 def test_a_timeline_is_of_the_device_in_its_order():
-    """Times count from the first of what a GPU did, copies and zeros included; what the host did is no part of it."""
-    kernel = {"cat": "kernel", "ts": 1_012.5, "dur": 3.25, "name": "composite", "args": {"stream": 7}}
-    zeros = {"cat": "gpu_memset", "ts": 1_000.0, "dur": 1.0, "name": "Memset", "args": {"stream": 144}}
+    """Times count from the first of what a GPU did, copies and zeros included;
+    what the host did is no part of it.
+    """
+    kernel = {
+        "cat": "kernel",
+        "ts": 1_012.5,
+        "dur": 3.25,
+        "name": "composite",
+        "args": {"stream": 7},
+    }
+    zeros = {
+        "cat": "gpu_memset",
+        "ts": 1_000.0,
+        "dur": 1.0,
+        "name": "Memset",
+        "args": {"stream": 144},
+    }
     copy = {"cat": "gpu_memcpy", "ts": 1_020.0, "dur": 0.5, "name": "Memcpy HtoD", "args": {}}
     host = {"cat": "cpu_op", "ts": 900.0, "dur": 200.0, "name": "aten::mm", "args": {}}
     lines = [line.split() for line in step.lines_of_trace([kernel, copy, host, zeros])]

@@ -1,4 +1,6 @@
-"""Numbers between host and device: what was sent is what is read, in its order, and what is asked for is told once."""
+"""Numbers between host and device: what was sent is what is read, in its order,
+and what is asked for is told once.
+"""
 
 import math
 from dataclasses import replace
@@ -14,14 +16,21 @@ from gftorf_warp.recon.stepper import Stepper
 from gftorf_warp.render.cuda import SLOTS, DeviceReadback, DeviceUpload
 from gftorf_warp.render.pair_capacity import READ_EVERY
 
-DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA"))]
+DEVICES = [
+    "cpu",
+    pytest.param(
+        "cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
+    ),
+]
 INTEGERS = [0, -1, 2**31 - 1, -(2**31), 7]
 REALS = [0.1, -0.0, 1e-45, math.inf, -math.inf, math.nan, 3e38]
 
 
 def outbox(device):
     """Room for both kinds of numbers, integers first."""
-    made = DeviceUpload([(len(INTEGERS), torch.int32), (len(REALS), torch.float32)], torch.device(device))
+    made = DeviceUpload(
+        [(len(INTEGERS), torch.int32), (len(REALS), torch.float32)], torch.device(device)
+    )
     return made, *made.parts
 
 
@@ -57,7 +66,9 @@ def test_a_shorter_list_says_nothing_of_the_rest(device):
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_every_step_reads_its_own_numbers(device):
-    """Though the host is ahead, more often than there are slots; where they are read stays the same."""
+    """Though the host is ahead, more often than there are slots;
+    where they are read stays the same.
+    """
     made, integers, reals = outbox(device)
     places = integers.data_ptr(), reals.data_ptr()
     steps = 5 * SLOTS
@@ -112,7 +123,9 @@ def watched(settings, device, monkeypatch):
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("deterministic", [False, True])
 def test_steps_read_pair_counts_now_and_then(deterministic, device, monkeypatch):
-    """In every ``READ_EVERY``-th replay; the same numbers at the same steps where a run is deterministic."""
+    """In every ``READ_EVERY``-th replay; the same numbers at the same steps where a run is
+    deterministic.
+    """
     settings = published(batch=Batch.FRAME)
     settings = replace(settings, render=replace(settings.render, deterministic=deterministic))
     state, steps = watched(settings, device, monkeypatch)
@@ -126,7 +139,9 @@ def test_steps_read_pair_counts_now_and_then(deterministic, device, monkeypatch)
             results[steps._replays] = found
         return found
 
-    monkeypatch.setattr(DeviceReadback, "request", lambda self: requested.append(steps._replays) or request(self))
+    monkeypatch.setattr(
+        DeviceReadback, "request", lambda self: requested.append(steps._replays) or request(self)
+    )
     monkeypatch.setattr(DeviceReadback, "latest", kept)
     while state.images < 40:
         steps.step()

@@ -46,7 +46,9 @@ def test_wedge():
 
 
 def test_corner():
-    """The camera looks at the line x = -1, z = 2 and sees both walls, each over half of the image or so."""
+    """The camera looks at the line x = -1, z = 2 and sees both walls,
+    each over half of the image or so.
+    """
     light, ray, _ = seen("corner")
     with np.errstate(divide="ignore"):
         left = np.where(ray[..., 0] < 0, -1.0 / ray[..., 0], np.inf)

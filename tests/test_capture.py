@@ -1,4 +1,6 @@
-"""Captures, our own folders: writing is undone by reading, every value is checked, and what is wrong is named."""
+"""Captures, our own folders: writing is undone by reading, every value is checked,
+and what is wrong is named.
+"""
 
 import dataclasses
 import json
@@ -27,7 +29,9 @@ FRAMES, HEIGHT, WIDTH = 7, 5, 6
 
 
 def recording(**changes):
-    """Seven raw frames, one missing, of any shifts and two frequencies, with everything that can be stored."""
+    """Seven raw frames, one missing, of any shifts and two frequencies,
+    with everything that can be stored.
+    """
     rng = np.random.default_rng(5)
     shape = (FRAMES, HEIGHT, WIDTH)
     measured = np.arange(FRAMES) != 5
@@ -69,9 +73,18 @@ def recording(**changes):
         body=rng.integers(-1, 3, shape),
         layers={
             name: rng.normal(size=(FRAMES, channels, HEIGHT, WIDTH)).astype(np.float32)
-            for name, channels in (("ambient", 1), ("direct", 3), ("error", 1), ("phasor.1", 2), ("phasor.3", 2))
+            for name, channels in (
+                ("ambient", 1),
+                ("direct", 3),
+                ("error", 1),
+                ("phasor.1", 2),
+                ("phasor.3", 2),
+            )
         }
-        | {"z_depth": np.full((FRAMES, 1, HEIGHT, WIDTH), np.nan, np.float32), "normal": np.ones((7, 3, 5, 6), "f4")},
+        | {
+            "z_depth": np.full((FRAMES, 1, HEIGHT, WIDTH), np.nan, np.float32),
+            "normal": np.ones((7, 3, 5, 6), "f4"),
+        },
     )
     return sequence_of(**{**fields, **changes}), truth
 
@@ -111,7 +124,8 @@ def test_writing_is_undone_by_reading(folder):
     known = got.truth()
     for field in dataclasses.fields(Truth):
         one, other = (
-            {"": v} if not isinstance(v, dict) else v for v in (getattr(t, field.name) for t in (truth, known))
+            {"": v} if not isinstance(v, dict) else v
+            for v in (getattr(t, field.name) for t in (truth, known))
         )
         assert one.keys() == other.keys(), field.name
         for name in one:
@@ -120,7 +134,9 @@ def test_writing_is_undone_by_reading(folder):
 
 
 def test_every_field_names_its_source_and_is_described(folder):
-    """What a sequence holds is filled from described values, and the page beside the descriptions names all of them."""
+    """What a sequence holds is filled from described values,
+    and the page beside the descriptions names all of them.
+    """
     got = Sequence.open(folder)
     names = set(NAMES)
     assert names <= set(got.sources)
@@ -139,7 +155,10 @@ def test_every_field_names_its_source_and_is_described(folder):
         for name in ("tof/000000", "colour/000000", "truth/000000")
         for part, channels in read_parts(folder / f"{name}.exr").items()
     }
-    described = {(f.paths[0].replace("{id}", "000000").removesuffix(".exr"), f.key): set(f.channels) for f in fields}
+    described = {
+        (f.paths[0].replace("{id}", "000000").removesuffix(".exr"), f.key): set(f.channels)
+        for f in fields
+    }
     for (file, part), channels in parts.items():
         assert described[file, re.sub("[0-9]+$", "{h}", part)] == set(channels), part
 
@@ -163,7 +182,11 @@ def test_a_minimal_capture_has_no_more_than_it_needs(tmp_path):
     for name, value in bare.items():
         assert values_of(got)[name] == value, name
     assert got.truth() is None
-    assert sorted(p.name for p in (tmp_path / "seq").iterdir()) == ["MANIFEST.sha256", "capture.json", "tof"]
+    assert sorted(p.name for p in (tmp_path / "seq").iterdir()) == [
+        "MANIFEST.sha256",
+        "capture.json",
+        "tof",
+    ]
 
 
 @pytest.mark.parametrize(
@@ -183,13 +206,22 @@ def test_a_minimal_capture_has_no_more_than_it_needs(tmp_path):
         (lambda c: c["frames"][3].update(exposure=0), ("frames.exposure",)),
         (lambda c: c["frames"][3].update(measured=1), ("frames.measured", "true or false")),
         (lambda c: c["frames"][3].update(id=9), ("frames.id",)),
-        (lambda c: c["frames"][3].update(camera_to_world=[[1, 0], [0, 1]]), ("frames.camera_to_world",)),
-        (lambda c: c["frames"][3]["camera_to_world"][0].__setitem__(0, 9), ("frames.camera_to_world", "rotations")),
+        (
+            lambda c: c["frames"][3].update(camera_to_world=[[1, 0], [0, 1]]),
+            ("frames.camera_to_world",),
+        ),
+        (
+            lambda c: c["frames"][3]["camera_to_world"][0].__setitem__(0, 9),
+            ("frames.camera_to_world", "rotations"),
+        ),
         (lambda c: c["cameras"]["tof"]["K"][0].__setitem__(1, 1), ("cameras.tof.K",)),
         (lambda c: c["cameras"]["tof"].update(size=[6, 0]), ("cameras.tof.size",)),
         (lambda c: c["cameras"]["tof"].update(size=[5, 6]), ("quads", "wrong shape", "(5, 6)")),
         (lambda c: c["cameras"]["tof"].update(size=[10**30, 6]), ("cameras.tof.size",)),
-        (lambda c: c["frames"][5].update(measured=True), ("quads: no such file", "found none for 5")),
+        (
+            lambda c: c["frames"][5].update(measured=True),
+            ("quads: no such file", "found none for 5"),
+        ),
         (lambda c: c.update(frames=[]), ("frames",)),
         (lambda c: c.update(frames={"0": {}}), ("frames",)),
         (lambda c: c["units"].update(length="mm"), ("units.length", "mm")),
@@ -200,7 +232,10 @@ def test_what_is_wrong_in_the_description_is_named(folder, change, words):
     edit(folder, change)
     with pytest.raises(InputError) as caught:
         Sequence.open(folder)
-    for word in ("capture.json" if "quads" not in words[0] else "exr" if "shape" in words[1] else "tof", *words):
+    for word in (
+        "capture.json" if "quads" not in words[0] else "exr" if "shape" in words[1] else "tof",
+        *words,
+    ):
         assert word in str(caught.value)
 
 
@@ -212,12 +247,21 @@ def test_our_own_additions_are_ignored(folder):
 
 def test_all_problems_are_named_at_once(folder):
     """One pass, one error."""
-    edit(folder, lambda c: (c.update(axes="opengl"), c["frames"][0].update(t="now"), c["units"].update(time="ms")))
+    edit(
+        folder,
+        lambda c: (
+            c.update(axes="opengl"),
+            c["frames"][0].update(t="now"),
+            c["units"].update(time="ms"),
+        ),
+    )
     with pytest.raises(InputError, match="3 problems"):
         Sequence.open(folder)
 
 
-@pytest.mark.parametrize("name", ["tof/000003.exr", "colour/000000.exr", "truth/000002.exr", "capture.json"])
+@pytest.mark.parametrize(
+    "name", ["tof/000003.exr", "colour/000000.exr", "truth/000002.exr", "capture.json"]
+)
 def test_a_changed_file_is_noticed(folder, name):
     """One flipped bit anywhere, and the manifest knows."""
     data = bytearray((folder / name).read_bytes())
@@ -256,7 +300,9 @@ def test_half_precision_and_missing_parts_are_refused(folder, tmp_path):
 
 
 def test_layers_are_checked_too(folder, tmp_path):
-    """Wrong channels, sizes and numbers of a layer; what nobody describes is nobody's; names and shapes on writing."""
+    """Wrong channels, sizes and numbers of a layer; what nobody describes is nobody's;
+    names and shapes on writing.
+    """
     (folder / "MANIFEST.sha256").unlink()
     path, image = folder / "truth/000002.exr", np.ones((HEIGHT, WIDTH), np.float32)
     distance = {"distance": {"distance": image}}
@@ -276,9 +322,14 @@ def test_layers_are_checked_too(folder, tmp_path):
     assert set(got) == set(recording()[1].layers)
     assert np.isnan(got["normal"][2]).all()
     sequence, truth = recording()
-    for layers, word in (({"mine": image}, "no layer"), ({"normal": np.ones((FRAMES, 1, HEIGHT, WIDTH))}, "shape")):
+    for layers, word in (
+        ({"mine": image}, "no layer"),
+        ({"normal": np.ones((FRAMES, 1, HEIGHT, WIDTH))}, "shape"),
+    ):
         with pytest.raises(ValueError, match=word):
-            write("capture", tmp_path / "other", sequence, dataclasses.replace(truth, layers=layers))
+            write(
+                "capture", tmp_path / "other", sequence, dataclasses.replace(truth, layers=layers)
+            )
     full = {"ambient": np.full((FRAMES, 1, HEIGHT, WIDTH), np.inf)}
     with pytest.raises(UsageError, match="layers"):
         write("capture", tmp_path / "other", sequence, dataclasses.replace(truth, layers=full))
@@ -294,7 +345,9 @@ def test_a_link_out_of_the_folder_is_not_followed(folder, tmp_path):
 
 
 def test_three_shifts_two_frequencies_and_no_frame_rate(tmp_path):
-    """A simulated sensor with three shifts is stored and decoded; a frame rate cannot be given; check reads it."""
+    """A simulated sensor with three shifts is stored and decoded; a frame rate cannot be given;
+    check reads it.
+    """
     sensor = Sensor(shifts=(0.0, 2 * np.pi / 3, 4 * np.pi / 3), f_mod_hz=3e7)
     scene = dataclasses.replace(SCENES["demo"], sensor=sensor, bodies=SCENES["demo"].bodies[:1])
     with pytest.raises(UsageError, match="--format capture"):
@@ -302,7 +355,9 @@ def test_three_shifts_two_frequencies_and_no_frame_rate(tmp_path):
     path = simulate(scene, tmp_path / "seq", frames=8, size=(24, 18), format="capture")
     sequence = Sequence.open(path)
     truth = sequence.truth()
-    np.testing.assert_allclose(closed_form_distance(sequence, 0), truth.phasor_distance[0], atol=1e-5)
+    np.testing.assert_allclose(
+        closed_form_distance(sequence, 0), truth.phasor_distance[0], atol=1e-5
+    )
     assert np.abs(truth.phasor_distance[0] - truth.distance[0]).max() < 0.2
     assert {sequence.calibration.settings["f_mod_hz"], sequence.calibration.f_mod_hz} == {3e7}
     np.testing.assert_allclose(sequence.exposures, sensor.exposure_s)
@@ -312,20 +367,26 @@ def test_three_shifts_two_frequencies_and_no_frame_rate(tmp_path):
 
 
 def test_a_cycle_is_complete_if_all_of_its_frequencies_are(folder):
-    """Seven raw frames of two frequencies, one of them missing; read as quartets, the first has one frequency."""
+    """Seven raw frames of two frequencies, one of them missing; read as quartets,
+    the first has one frequency.
+    """
     read = Sequence.open(folder)
     assert (read.cycle, read.frequencies, read.complete_quartets) == (7, (2e7, 6e7), [])
     whole = np.ones(FRAMES, dtype=bool)
     assert dataclasses.replace(read, measured=whole).complete_quartets == [0]
     assert changed(read, cycle_length=4).complete_quartets == [0]
     assert changed(read, measured=whole, cycle_length=None).cycle == 7
-    mixed = recording(frequencies_hz=np.array([2e7, 2e7, 2e7, 6e7, 6e7, 6e7, 6e7]), cycle_length=4)[0]
+    mixed = recording(frequencies_hz=np.array([2e7, 2e7, 2e7, 6e7, 6e7, 6e7, 6e7]), cycle_length=4)[
+        0
+    ]
     assert mixed.complete_quartets == []
 
 
 def test_other_layouts_refuse_several_frequencies(tmp_path):
     """They have one place for it."""
-    sequence = recording(distortion=None, shifts=np.array([0, np.pi, np.pi / 2, 3 * np.pi / 2, 0, np.pi, np.pi / 2]))[0]
+    sequence = recording(
+        distortion=None, shifts=np.array([0, np.pi, np.pi / 2, 3 * np.pi / 2, 0, np.pi, np.pi / 2])
+    )[0]
     with pytest.raises(UsageError, match="frequencies_hz"):
         write("ftorf", tmp_path / "seq", sequence)
     assert not any(tmp_path.iterdir())

@@ -21,13 +21,32 @@ def changed(settings, texts):
 def test_values_become_what_the_setting_holds():
     """Numbers, names, pairs and nothing, in parts and at the top; the last one counts."""
     base = presets.paper()
-    texts = ["weights.quads=5", "init.reflectivity = 0.5", "densify.gradient_min=none", "quad_scale=10"]
-    texts += ["init.bounds=0.2,6", "flow=dis", "motion.products=half", "densify.loses_step=TRUE", "init.count=7"]
+    texts = [
+        "weights.quads=5",
+        "init.reflectivity = 0.5",
+        "densify.gradient_min=none",
+        "quad_scale=10",
+    ]
+    texts += [
+        "init.bounds=0.2,6",
+        "flow=dis",
+        "motion.products=half",
+        "densify.loses_step=TRUE",
+        "init.count=7",
+    ]
     found = changed(base, [*texts, "init.count=8"])
-    assert (found.weights.quads, found.init.reflectivity, found.densify.gradient_min) == (5.0, 0.5, None)
+    assert (found.weights.quads, found.init.reflectivity, found.densify.gradient_min) == (
+        5.0,
+        0.5,
+        None,
+    )
     assert (found.quad_scale, found.init.bounds, found.init.count) == (10.0, (0.2, 6.0), 8)
     assert isinstance(found.weights.quads, float)
-    assert (found.flow, found.motion.products, found.densify.loses_step) == (FlowSource.DIS, Products.HALF, True)
+    assert (found.flow, found.motion.products, found.densify.loses_step) == (
+        FlowSource.DIS,
+        Products.HALF,
+        True,
+    )
     assert changed(base, []) == base
 
 

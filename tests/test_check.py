@@ -120,8 +120,14 @@ def test_defaults_and_ignored_files_are_warned_of(tmp_path):
         ({"dc_offset": 0.0}, ("dc_offset 0", "0.2")),
         ({"phase_offset": 0.0}, ("truth implies", "+0.3")),
         ({"f_mod_hz": SPEED_OF_LIGHT / 14.0}, ("truth implies depth_range 15 m",)),
-        ({"shifts": np.tile(np.pi * np.array([0, 0.5, 1, 1.5]), 2)}, ("quad order doubtful", "(q0,q2)(q1,q3)")),
-        ({"forward_flow": {0: np.full((2, HEIGHT, WIDTH), 3.0)}}, ("forward flow does not explain",)),
+        (
+            {"shifts": np.tile(np.pi * np.array([0, 0.5, 1, 1.5]), 2)},
+            ("quad order doubtful", "(q0,q2)(q1,q3)"),
+        ),
+        (
+            {"forward_flow": {0: np.full((2, HEIGHT, WIDTH), 3.0)}},
+            ("forward flow does not explain",),
+        ),
     ],
 )
 def test_a_wrong_value_is_noticed(tmp_path, changes, words):
@@ -130,7 +136,9 @@ def test_a_wrong_value_is_noticed(tmp_path, changes, words):
     sequence = changed(sequence, **changes)
     if "shifts" in changes:  # the scene is in the real order, where the pairs are two steps apart
         order = np.argsort(REAL_ORDER)
-        quads = sequence.quads.reshape(2, 4, HEIGHT, WIDTH)[:, np.argsort(order)].reshape(8, HEIGHT, WIDTH)
+        quads = sequence.quads.reshape(2, 4, HEIGHT, WIDTH)[:, np.argsort(order)].reshape(
+            8, HEIGHT, WIDTH
+        )
         sequence = dataclasses.replace(sequence, quads=quads)
     assert said(written(tmp_path, sequence, truth).warnings, *words)
 
@@ -144,7 +152,9 @@ def test_saturation_is_noticed(tmp_path):
 
 
 def test_a_swapped_phase_disagrees_with_the_stored_phasor(tmp_path):
-    """Order and sign that the pairing cannot see: sine and cosine swapped, or the phase mirrored."""
+    """Order and sign that the pairing cannot see: sine and cosine swapped,
+    or the phase mirrored.
+    """
     sequence, _ = recording()
     folder = write("ftorf", tmp_path / "seq", sequence)
     (folder / "synthetic_tof").mkdir()
@@ -176,7 +186,9 @@ def test_a_decoded_distance_is_no_truth(tmp_path):
 
 def test_wrapped_and_unreadable_truth_are_warned_of(tmp_path):
     """Beyond c/2f, and not an array at all."""
-    sequence, truth = scene(8, HEIGHT, WIDTH, distance=np.linspace(2.0, 9.0, HEIGHT * WIDTH).reshape(HEIGHT, WIDTH))
+    sequence, truth = scene(
+        8, HEIGHT, WIDTH, distance=np.linspace(2.0, 9.0, HEIGHT * WIDTH).reshape(HEIGHT, WIDTH)
+    )
     folder = write("ftorf", tmp_path / "seq", sequence, truth)
     warnings = check(folder).warnings
     assert said(warnings, "range wraps", "9 m", "7.5 m")
@@ -187,7 +199,9 @@ def test_wrapped_and_unreadable_truth_are_warned_of(tmp_path):
 
 def torf(tmp_path, count=3, **how):
     """A TöRF folder large enough to estimate from, with some noise, that states everything."""
-    folder = torf_folder.build(tmp_path / "torf", count, height=HEIGHT, width=WIDTH, **{"noise": 2e-4} | how)
+    folder = torf_folder.build(
+        tmp_path / "torf", count, height=HEIGHT, width=WIDTH, **{"noise": 2e-4} | how
+    )
     np.save(folder / "cams/frame_times.npy", np.arange(count) / 30)
     (folder / "cams/pixel_centre.json").write_text('{"pixel_centre": "integer"}')
     return folder
@@ -216,13 +230,17 @@ def test_a_sound_phasor_folder_has_no_warnings(tmp_path):
     ):
         assert said(report.lines, *words), words
     fit = next(line for line in report.lines if "phase fit" in line)
-    fitted = [float(fit.partition(f"{name} ")[2].split()[0]) for name in ("depth_range", "phase_offset")]
+    fitted = [
+        float(fit.partition(f"{name} ")[2].split()[0]) for name in ("depth_range", "phase_offset")
+    ]
     assert fitted == pytest.approx([10.0, 0.3], rel=0.01)
     assert not said(report.lines, "order")
 
 
 def test_assumptions_of_a_phasor_folder_are_warned_of(tmp_path):
-    """Ids from 1 with a gap, default range and rate, identity poses while the picture moves, inferred colour camera."""
+    """Ids from 1 with a gap, default range and rate, identity poses while the picture moves,
+    inferred colour camera.
+    """
     folder = torf(tmp_path, 4, first_id=1, speed=0.5)
     (folder / "tof/0002.npy").unlink()
     for path in (folder / "cams").iterdir():
@@ -247,11 +265,23 @@ def test_identity_poses_of_a_resting_camera_are_fine(tmp_path):
 @pytest.mark.parametrize(
     ("name", "array", "words"),
     [
-        ("cams/phase_offset.npy", np.float64(1.0), ("truth implies", "phase_offset", "in use are 10 m and +1.000")),
+        (
+            "cams/phase_offset.npy",
+            np.float64(1.0),
+            ("truth implies", "phase_offset", "in use are 10 m and +1.000"),
+        ),
         ("cams/depth_range.npy", np.float64(9.0), ("truth implies depth_range", "in use are 9 m")),
-        ("cams/relative_pose.npy", np.diag([1.0, 1, 1, 1]) + 35.0 * np.eye(4, k=3), ("35 m away", "millimetres")),
+        (
+            "cams/relative_pose.npy",
+            np.diag([1.0, 1, 1, 1]) + 35.0 * np.eye(4, k=3),
+            ("35 m away", "millimetres"),
+        ),
         ("cams/color_extrinsics.npy", torf_folder.poses(3), ("colour_from_world", "replaces")),
-        ("tof/0001.npy", np.random.default_rng(0).normal(size=(HEIGHT, WIDTH, 3)), ("third channel",)),
+        (
+            "tof/0001.npy",
+            np.random.default_rng(0).normal(size=(HEIGHT, WIDTH, 3)),
+            ("third channel",),
+        ),
     ],
 )
 def test_a_wrong_file_of_a_phasor_folder_is_noticed(tmp_path, name, array, words):
@@ -266,7 +296,9 @@ def test_z_depth_in_place_of_distance_is_noticed(tmp_path, form):
     """The phase tells which of the two fits, in either format."""
     matrix = torf_folder.intrinsics(HEIGHT, WIDTH)
     y, x = np.mgrid[0:HEIGHT, 0:WIDTH].astype(float)
-    cosine = 1 / np.hypot(1, np.hypot((x - matrix[0, 2]) / matrix[0, 0], (y - matrix[1, 2]) / matrix[1, 1]))
+    cosine = 1 / np.hypot(
+        1, np.hypot((x - matrix[0, 2]) / matrix[0, 0], (y - matrix[1, 2]) / matrix[1, 1])
+    )
     folder = torf(tmp_path, truth="depth", speed=0.1)
     if form == "ftorf":
         sequence, truth = recording(fx=matrix[0, 0], fy=matrix[1, 1])
@@ -281,7 +313,9 @@ def test_a_moving_camera_leaves_raw_quads_unfitted(tmp_path):
     """Their four instants saw different places; phasors have one instant."""
     poses = np.tile(np.eye(4), (8, 1, 1))
     poses[:, 0, 3] = 0.01 * np.arange(8)
-    report = written(tmp_path, *[dataclasses.replace(recording()[0], camera_from_world=poses), recording()[1]])
+    report = written(
+        tmp_path, *[dataclasses.replace(recording()[0], camera_from_world=poses), recording()[1]]
+    )
     assert said(report.lines, "phase fit", "camera moves")
 
 
@@ -293,9 +327,15 @@ def test_distances_that_are_the_decoded_phasors_are_doubtful(tmp_path):
 def test_estimates_of_a_noisy_recording_are_close():
     """Constant part, range and offset within noise, on the sample with a known change of each."""
     sequence = Sequence.open(SAMPLE)
-    amplitude = np.repeat([np.hypot(*decode.quartet_phasor(sequence, i)) / 2 for i in range(8)], 4, axis=0)
-    shifted = dataclasses.replace(sequence, quads=(sequence.quads + 0.5 * amplitude).astype(np.float32))
-    assert estimates.dc_offset(shifted) - estimates.dc_offset(sequence) == pytest.approx(0.5, abs=0.02)
+    amplitude = np.repeat(
+        [np.hypot(*decode.quartet_phasor(sequence, i)) / 2 for i in range(8)], 4, axis=0
+    )
+    shifted = dataclasses.replace(
+        sequence, quads=(sequence.quads + 0.5 * amplitude).astype(np.float32)
+    )
+    assert estimates.dc_offset(shifted) - estimates.dc_offset(sequence) == pytest.approx(
+        0.5, abs=0.02
+    )
     rotated = dataclasses.replace(sequence, shifts=sequence.shifts + 1.0)
     before, after = (estimates.phase_fit(s, sequence.truth()) for s in (sequence, rotated))
     assert after.phase_offset - before.phase_offset == pytest.approx(1.0, abs=1e-3)
@@ -304,7 +344,9 @@ def test_estimates_of_a_noisy_recording_are_close():
 
 
 def test_flow_of_the_sample_beats_its_mistakes():
-    """Sign, channels and no flow at all are told from the right flow; without motion there is nothing to tell."""
+    """Sign, channels and no flow at all are told from the right flow;
+    without motion there is nothing to tell.
+    """
     sequence = Sequence.open(SAMPLE)
     unwarped, warped, flipped, swapped = estimates.flow_match(sequence, sequence.flow.forward, 4)
     assert warped < 0.3 * min(unwarped, flipped, swapped)

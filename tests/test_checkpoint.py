@@ -50,9 +50,17 @@ def test_the_last_two_are_kept(tmp_path):
     for images in (20, 40, 1000):
         checkpoint.save(tmp_path, STORED | {"images": images})
     names = sorted(path.name for path in (tmp_path / "ckpt").iterdir())
-    assert names == ["0000000040.pt", "0000000040.pt.sha256", "0000001000.pt", "0000001000.pt.sha256"]
+    assert names == [
+        "0000000040.pt",
+        "0000000040.pt.sha256",
+        "0000001000.pt",
+        "0000001000.pt.sha256",
+    ]
     checkpoint.save(tmp_path, STORED | {"images": 60})
-    assert sorted(path.name for path in (tmp_path / "ckpt").glob("*.pt")) == ["0000000040.pt", "0000000060.pt"]
+    assert sorted(path.name for path in (tmp_path / "ckpt").glob("*.pt")) == [
+        "0000000040.pt",
+        "0000000060.pt",
+    ]
 
 
 @pytest.mark.parametrize("damage", ["flip", "cut", "empty", "no sidecar"])
@@ -111,7 +119,9 @@ def test_a_newer_format_is_refused(tmp_path):
 def test_what_a_killed_process_left_is_swept(tmp_path):
     """Temporary files of dead processes go, those of living ones stay."""
     checkpoint.save(tmp_path, STORED)
-    process = subprocess.run([sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, check=True)
+    process = subprocess.run(
+        [sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, check=True
+    )
     gone = tmp_path / "ckpt" / f".0000000999.pt.tmp-{int(process.stdout)}-0"
     living = tmp_path / "ckpt" / f".0000000999.pt.tmp-{os.getpid()}-0"
     for stray in (gone, living):
@@ -122,7 +132,8 @@ def test_what_a_killed_process_left_is_swept(tmp_path):
 
 
 def test_a_checkpoint_of_format_2_continues_as_it_did_then():
-    """Written before torch's Adam and the generator of backgrounds went; two more steps gave these numbers then.
+    """Written before torch's Adam and the generator of backgrounds went; two more steps gave these
+    numbers then.
 
     Three quartets of ``small`` with twenty random Gaussians and four nodes, seed 77.
     """
@@ -130,7 +141,9 @@ def test_a_checkpoint_of_format_2_continues_as_it_did_then():
     assert stored["format"] == 2 < FORMAT
     assert "noise" in stored
     settings = demo(images=60, warm_up=0)
-    settings = replace(settings, init=replace(settings.init, kind=Init.RANDOM, count=20, bounds=(2.0, 4.0)))
+    settings = replace(
+        settings, init=replace(settings.init, kind=Init.RANDOM, count=20, bounds=(2.0, 4.0))
+    )
     settings = replace(settings, motion=replace(settings.motion, nodes=4))
     state = from_dict(stored, "cpu")
     assert (state.images, state.noise_seed, len(state.optimiser.field)) == (12, 77, 20)

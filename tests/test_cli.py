@@ -1,4 +1,6 @@
-"""What the command line accepts, prints and returns. Quality is not its business: everything runs at tiny size."""
+"""What the command line accepts, prints and returns. Quality is not its business:
+everything runs at tiny size.
+"""
 
 import argparse
 import errno
@@ -22,7 +24,23 @@ HEAVY = ("torch", "warp", "numpy", "matplotlib", "cv2", "scipy")
 def sequence(tmp_path_factory):
     """A tiny sequence written by the command line."""
     path = tmp_path_factory.mktemp("cli") / "sequence"
-    assert cli.main(["simulate", "demo", "--out", str(path), "--size", SIZE, "--frames", FRAMES, "--seed", "3"]) == 0
+    assert (
+        cli.main(
+            [
+                "simulate",
+                "demo",
+                "--out",
+                str(path),
+                "--size",
+                SIZE,
+                "--frames",
+                FRAMES,
+                "--seed",
+                "3",
+            ]
+        )
+        == 0
+    )
     return path
 
 
@@ -30,7 +48,16 @@ def sequence(tmp_path_factory):
 def run(sequence):
     """A tiny reconstruction of it, far from finished."""
     path = sequence.parent / "run"
-    arguments = ["reconstruct", str(sequence), "--out", str(path), "--preset", "demo", "--images", "40"]
+    arguments = [
+        "reconstruct",
+        str(sequence),
+        "--out",
+        str(path),
+        "--preset",
+        "demo",
+        "--images",
+        "40",
+    ]
     assert cli.main([*arguments, "--seed", "1", "--device", "cpu"]) == 0
     return path
 
@@ -55,13 +82,16 @@ def fails(arguments, code, capsys, *words):
         assert word in "\n".join(err[-3:]), f"{word!r} is not in {err[-3:]}"
 
 
-# -- parsing -----------------------------------------------------------------------------------------------------------
+# -- parsing ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("arguments", [["--help"], ["reconstruct", "--help"], ["--version"]])
 def test_help_imports_nothing_heavy(arguments):
     """`gftorf --help` is instant because it loads neither torch nor Warp nor any other library."""
-    code = f"import sys; from gftorf_warp.cli import main; c = main({arguments}); print(c, *sorted(sys.modules))"
+    code = (
+        f"import sys; from gftorf_warp.cli import main; c = main({arguments}); print(c, "
+        f"*sorted(sys.modules))"
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     code, *modules = done.stdout.splitlines()[-1].split()
     assert code == "0"
@@ -85,7 +115,16 @@ def test_help_names_every_command(capsys):
     """The top page lists what there is."""
     assert cli.main(["--help"]) == 0
     text = capsys.readouterr().out
-    for name in ("demo", "simulate", "reconstruct", "render", "compare", "check", "doctor", "bench"):
+    for name in (
+        "demo",
+        "simulate",
+        "reconstruct",
+        "render",
+        "compare",
+        "check",
+        "doctor",
+        "bench",
+    ):
         assert f"\n  {name} " in text
         assert name in cli.COMMANDS
     assert set(options.command_parsers()) == set(cli.COMMANDS)
@@ -94,10 +133,15 @@ def test_help_names_every_command(capsys):
 def test_module_and_script_are_the_same():
     """`python -m gftorf_warp` ends like `gftorf`."""
     done = subprocess.run(
-        [sys.executable, "-m", "gftorf_warp", "--version"], capture_output=True, text=True, check=True
+        [sys.executable, "-m", "gftorf_warp", "--version"],
+        capture_output=True,
+        text=True,
+        check=True,
     )
     assert done.stdout == f"gftorf_warp {__version__}\n"
-    wrong = subprocess.run([sys.executable, "-m", "gftorf_warp", "nonsense"], check=False, stderr=subprocess.PIPE)
+    wrong = subprocess.run(
+        [sys.executable, "-m", "gftorf_warp", "nonsense"], check=False, stderr=subprocess.PIPE
+    )
     assert wrong.returncode == 2
 
 
@@ -113,11 +157,23 @@ def test_module_and_script_are_the_same():
         ("simulate S --out Q --ladder --format capture", "ladder", True),
         ("compare R --against static-phasor", "against", "static-phasor"),
         ("simulate S --out Q --engine mesh --bounces 2 --paths 8 --device cpu", "bounces", 2),
-        ("simulate S --out Q --sync --no-noise --flow --exposure-samples 3 --fresh", "exposure_samples", 3),
-        ("reconstruct SEQ --out RUN --preset demo --images 100 --seed 2 --device cpu --fresh", "images", 100),
+        (
+            "simulate S --out Q --sync --no-noise --flow --exposure-samples 3 --fresh",
+            "exposure_samples",
+            3,
+        ),
+        (
+            "reconstruct SEQ --out RUN --preset demo --images 100 --seed 2 --device cpu --fresh",
+            "images",
+            100,
+        ),
         ("reconstruct SEQ --out RUN --frame-rate 60", "frame_rate", 60.0),
         ("reconstruct SEQ --out RUN --flow dis", "flow", "dis"),
-        ("render RUN --out DIR --what distance,quads,phasor,colour", "what", ["distance", "quads", "phasor", "colour"]),
+        (
+            "render RUN --out DIR --what distance,quads,phasor,colour",
+            "what",
+            ["distance", "quads", "phasor", "colour"],
+        ),
         ("render RUN --out DIR --times 0.1,0.2", "times", [0.1, 0.2]),
         ("render RUN --out DIR", "times", None),
         ("compare RUN --truth SEQ --json", "truth", "SEQ"),
@@ -163,7 +219,7 @@ def test_wrong_options_end_with_2_and_a_hint(text, hint, capsys):
     fails(text.split(), 2, capsys, hint)
 
 
-# -- errors ------------------------------------------------------------------------------------------------------------
+# -- errors ----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", [UsageError, InputError, DivergedError, ResourceError, BusyError])
@@ -181,7 +237,13 @@ def test_our_errors_become_three_lines_and_their_code(kind, monkeypatch, capsys)
     ("error", "code", "words"),
     [
         (MemoryError(), 5, "out of memory"),
-        (RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to allocate 9 bytes"), 5, "out of memory"),
+        (
+            RuntimeError(
+                "DefaultCPUAllocator: can't allocate memory: you tried to allocate 9 bytes"
+            ),
+            5,
+            "out of memory",
+        ),
         (OSError(errno.ENOSPC, "No space left on device", "run/a.npy"), 5, "run/a.npy"),
         (PermissionError(errno.EACCES, "Permission denied", "run"), 3, "Permission denied"),
     ],
@@ -250,32 +312,54 @@ def test_missing_folders_are_bad_input(tmp_path, capsys):
 
 
 def test_names_that_a_room_does_not_know(run, sequence, tmp_path, capsys):
-    """Scenes, formats, presets, images and protocols are named by their rooms, and so are the hints; all end with 2."""
+    """Scenes, formats, presets, images and protocols are named by their rooms,
+    and so are the hints; all end with 2.
+    """
     out = str(tmp_path / "x")
     fails(["simulate", "slidin", "--out", out], 2, capsys, "slidin", "sliding")
     fails(["simulate", "demo", "--out", out, "--format", "zip"], 2, capsys, "zip", "ftorf")
-    fails(["reconstruct", str(sequence), "--out", out, "--preset", "dmeo"], 2, capsys, "dmeo", "demo")
-    fails(["reconstruct", str(sequence), "--out", out, "--flow", "raft"], 2, capsys, "raft", "deepflow")
+    fails(
+        ["reconstruct", str(sequence), "--out", out, "--preset", "dmeo"], 2, capsys, "dmeo", "demo"
+    )
+    fails(
+        ["reconstruct", str(sequence), "--out", out, "--flow", "raft"],
+        2,
+        capsys,
+        "raft",
+        "deepflow",
+    )
     fails(["render", str(run), "--out", out, "--what", "distance,quad"], 2, capsys, "quad", "quads")
     fails(["compare", str(run), "--frames", "some"], 2, capsys, "some", "ftorf13")
     assert not (tmp_path / "x").exists()
 
 
-# -- commands ----------------------------------------------------------------------------------------------------------
+# -- commands --------------------------------------------------------------------------------------
 
 
 def test_scenes_are_listed(capsys):
-    """One line each under their heads, the demo's first: name, frames, error of the closed form, what it is."""
+    """One line each under their heads, the demo's first: name, frames, error of the closed form,
+    what it is.
+    """
     assert cli.main(["simulate", "--list"]) == 0
     out, _ = lines_of(capsys)
     assert out[0].split()[0] == "scene"
     assert out[1].split()[:3] == ["demo", "44", "13.02"]
-    assert {line.split()[0] for line in out} >= {"demo", "sliding", "axial", "arc", "arcing_cube", "fan", "cupboard"}
+    assert {line.split()[0] for line in out} >= {
+        "demo",
+        "sliding",
+        "axial",
+        "arc",
+        "arcing_cube",
+        "fan",
+        "cupboard",
+    }
     assert "a chequered board" in next(line for line in out if line.startswith("target "))
 
 
 def test_simulate_writes_a_sequence_and_prints_where(sequence, tmp_path, capsys):
-    """The path is the result; the same seed gives the same bytes, another one does not, no noise neither."""
+    """The path is the result; the same seed gives the same bytes, another one does not,
+    no noise neither.
+    """
     arguments = ["simulate", "demo", "--size", SIZE, "--frames", FRAMES, "--out"]
     assert cli.main([*arguments, str(tmp_path / "same"), "--seed", "3"]) == 0
     out, err = lines_of(capsys)
@@ -284,7 +368,10 @@ def test_simulate_writes_a_sequence_and_prints_where(sequence, tmp_path, capsys)
     assert cli.main([*arguments, str(tmp_path / "clean"), "-q", "--seed", "3", "--no-noise"]) == 0
     assert lines_of(capsys) == ([str(tmp_path / "clean")], [])
     assert cli.main([*arguments, str(tmp_path / "other"), "-q", "--seed", "4"]) == 0
-    quads = {name: (tmp_path / name / "tofType1/0005.npy").read_bytes() for name in ("same", "clean", "other")}
+    quads = {
+        name: (tmp_path / name / "tofType1/0005.npy").read_bytes()
+        for name in ("same", "clean", "other")
+    }
     measured = (sequence / "tofType1/0005.npy").read_bytes()
     assert quads["same"] == measured
     assert len({measured, quads["clean"], quads["other"]}) == 3
@@ -293,7 +380,12 @@ def test_simulate_writes_a_sequence_and_prints_where(sequence, tmp_path, capsys)
 def test_simulate_sync_takes_a_quartet_at_one_instant(tmp_path):
     """The truth of all four raw frames of a quartet is the same."""
     path = tmp_path / "sync"
-    assert cli.main(["simulate", "demo", "--size", SIZE, "--frames", "4", "--sync", "--out", str(path)]) == 0
+    assert (
+        cli.main(
+            ["simulate", "demo", "--size", SIZE, "--frames", "4", "--sync", "--out", str(path)]
+        )
+        == 0
+    )
     first, *others = (np.load(path / f"synthetic_depth/{n:04d}.npy") for n in range(4))
     for other in others:
         np.testing.assert_array_equal(first, other)
@@ -302,7 +394,13 @@ def test_simulate_sync_takes_a_quartet_at_one_instant(tmp_path):
 def test_simulate_refuses_a_folder_that_is_not_empty(sequence, capsys):
     """Nothing is overwritten."""
     before = sorted(path.name for path in sequence.iterdir())
-    fails(["simulate", "arc", "--out", str(sequence), "--size", SIZE], 2, capsys, str(sequence), "--fresh")
+    fails(
+        ["simulate", "arc", "--out", str(sequence), "--size", SIZE],
+        2,
+        capsys,
+        str(sequence),
+        "--fresh",
+    )
     assert sorted(path.name for path in sequence.iterdir()) == before
 
 
@@ -318,7 +416,16 @@ def test_check_prints_what_it_found(sequence, capsys):
 
 def test_reconstruct_prints_the_run_and_goes_on(run, sequence, capsys):
     """The same command again finds everything done; other settings need --fresh."""
-    arguments = ["reconstruct", str(sequence), "--out", str(run), "--images", "40", "--device", "cpu"]
+    arguments = [
+        "reconstruct",
+        str(sequence),
+        "--out",
+        str(run),
+        "--images",
+        "40",
+        "--device",
+        "cpu",
+    ]
     assert cli.main([*arguments, "--seed", "1"]) == 0
     out, _ = lines_of(capsys)
     assert out == [str(run)]
@@ -328,14 +435,29 @@ def test_reconstruct_prints_the_run_and_goes_on(run, sequence, capsys):
 def test_render_writes_what_was_asked_for(run, tmp_path, capsys):
     """Two times, two kinds of image."""
     out_folder = tmp_path / "images"
-    arguments = ["render", str(run), "--out", str(out_folder), "--what", "distance,quads", "--times", "0.0,0.021"]
+    arguments = [
+        "render",
+        str(run),
+        "--out",
+        str(out_folder),
+        "--what",
+        "distance,quads",
+        "--times",
+        "0.0,0.021",
+    ]
     assert cli.main([*arguments, "--device", "cpu"]) == 0
     out, _ = lines_of(capsys)
     assert out == [str(out_folder)]
     for what in ("distance", "quads"):
         assert len(list((out_folder / what).glob("*.exr"))) == 2
     assert not (out_folder / "phasor").exists()
-    fails(["render", str(run), "--out", str(out_folder), "--times", "0.5"], 2, capsys, str(out_folder), "--fresh")
+    fails(
+        ["render", str(run), "--out", str(out_folder), "--times", "0.5"],
+        2,
+        capsys,
+        str(out_folder),
+        "--fresh",
+    )
     fails([*arguments, "--arrays"], 2, capsys, str(out_folder), "--fresh")
     assert cli.main([*arguments, "--arrays", "--fresh"]) == 0
     assert np.load(out_folder / "quads" / "quad_180.npy").shape[0] == 2
@@ -358,8 +480,17 @@ def test_compare_prints_a_table_or_json(run, sequence, capsys):
 
 def test_table_without_truth():
     """What was not measured is a dash, not a zero."""
-    nothing = dict.fromkeys(("closed_form_mse_x100", "d_mse_x100", "d_normalised_mse_x100", "d_tof_mse_x100"))
-    metrics = {"frames": 4, "protocol": "all", "quad_psnr_db": 20.0, **nothing, "moving": nothing, "static": nothing}
+    nothing = dict.fromkeys(
+        ("closed_form_mse_x100", "d_mse_x100", "d_normalised_mse_x100", "d_tof_mse_x100")
+    )
+    metrics = {
+        "frames": 4,
+        "protocol": "all",
+        "quad_psnr_db": 20.0,
+        **nothing,
+        "moving": nothing,
+        "static": nothing,
+    }
     lines = cli.table(metrics).splitlines()
     assert [line.split()[1:] for line in lines[1:4]] == [["-"] * 4] * 3
     assert "20.00 dB" in lines[-1]
@@ -392,7 +523,9 @@ def test_doctor_fails_if_the_renderer_is_wrong(monkeypatch, capsys):
     assert "FAILED" in out[-1]
 
 
-@pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="needs a system that can restrict a process")
+@pytest.mark.skipif(
+    not hasattr(os, "sched_getaffinity"), reason="needs a system that can restrict a process"
+)
 def test_threads_restrict_the_process_while_it_runs(monkeypatch):
     """--threads is what every library sees, and only for this command."""
     seen = []

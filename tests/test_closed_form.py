@@ -1,4 +1,6 @@
-"""The closed form behind the interface of a run: its own measurements, from its own camera, without a checkpoint."""
+"""The closed form behind the interface of a run: its own measurements, from its own camera,
+without a checkpoint.
+"""
 
 import json
 from dataclasses import replace
@@ -24,7 +26,9 @@ ERRORS = ("d_mse_x100", "d_normalised_mse_x100", "d_tof_mse_x100")
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    """The closed form of three quartets and two frames, with an offset, an offset phase and the order of real files."""
+    """The closed form of three quartets and two frames, with an offset,
+    an offset phase and the order of real files.
+    """
     folder = tmp_path_factory.mktemp("closed-form")
     sequence, truth = recording(frames=14, order=REAL_ORDER, phase_offset=0.5, dc_offset=0.2)
     write("ftorf", folder / "box", sequence, truth)
@@ -41,16 +45,22 @@ def test_it_is_a_run_without_gaussians_and_without_a_checkpoint(run):
 
 
 def test_during_a_quartet_it_shows_that_quartet(run):
-    """Distance, phasor and quads in canonical order at each of its four frames; what it shows decodes to itself."""
+    """Distance, phasor and quads in canonical order at each of its four frames;
+    what it shows decodes to itself.
+    """
     sequence = run.sequence()
     for n in range(12):
         rendering = run.render(float(sequence.times[n]), run.camera)
         want = closed_form_distance(sequence, n // 4)
         np.testing.assert_allclose(rendering.distance, want, rtol=1e-6)
-        np.testing.assert_allclose(rendering.phasor[:2], quartet_phasor(sequence, n // 4), rtol=1e-5, atol=1e-7)
+        np.testing.assert_allclose(
+            rendering.phasor[:2], quartet_phasor(sequence, n // 4), rtol=1e-5, atol=1e-7
+        )
         canonical = [sequence.quads[4 * (n // 4) + REAL_ORDER.index(k)] for k in range(4)]
         np.testing.assert_array_equal(rendering.quads, np.stack(canonical))
-        decoded = distance_from_phasor(*phasor_from_quads(rendering.quads, run.sensor.shifts), run.sensor)
+        decoded = distance_from_phasor(
+            *phasor_from_quads(rendering.quads, run.sensor.shifts), run.sensor
+        )
         np.testing.assert_allclose(decoded, want, atol=1e-4)
         assert (rendering.opacity == 1).all()
         assert (rendering.distortion == 0).all()
@@ -60,7 +70,16 @@ def test_during_a_quartet_it_shows_that_quartet(run):
 def test_times_outside_go_to_the_nearest_complete_quartet(run):
     """Before the first, in a truncated one, and in one with a missing frame."""
     sequence = run.sequence()
-    assert [nearest_quartet(sequence, t / 120) for t in (-5, 0, 3, 3.4, 3.6, 11, 13, 99)] == [0, 0, 0, 0, 1, 2, 2, 2]
+    assert [nearest_quartet(sequence, t / 120) for t in (-5, 0, 3, 3.4, 3.6, 11, 13, 99)] == [
+        0,
+        0,
+        0,
+        0,
+        1,
+        2,
+        2,
+        2,
+    ]
     measured = sequence.measured.copy()
     measured[6] = False
     holed = replace(sequence, measured=measured)
@@ -68,7 +87,9 @@ def test_times_outside_go_to_the_nearest_complete_quartet(run):
 
 
 def test_a_shift_that_nobody_measured_is_computed(run):
-    """The quads of a phasor at eighths of a turn lie between those of quarters, with the same constant part."""
+    """The quads of a phasor at eighths of a turn lie between those of quarters,
+    with the same constant part.
+    """
     sequence = run.sequence()
     re, im = quartet_phasor(sequence, 1)
     between, zero = quads_of(sequence, 1, [np.pi / 4, 0.0])
@@ -111,7 +132,9 @@ def test_a_moving_camera_is_its_own(run):
 
 
 def test_compared_it_is_the_closed_form(run):
-    """All columns agree; no Gaussians, no images, and a page that does not claim a reconstruction."""
+    """All columns agree; no Gaussians, no images, and a page that does not claim a
+    reconstruction.
+    """
     got = compare(run)
     assert got["method"] == "ctof"
     assert (got["gaussians"], got["images_optimised"], got["quad_psnr_db"]) == (0, 0, None)

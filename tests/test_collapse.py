@@ -1,4 +1,6 @@
-"""A random start behind an opaque veil restarts, a dead motion network is reinitialised; other runs are left alone."""
+"""A random start behind an opaque veil restarts, a dead motion network is reinitialised;
+other runs are left alone.
+"""
 
 from dataclasses import replace
 
@@ -35,7 +37,8 @@ def veiled_starts(monkeypatch, starts):
         if len(seeds) <= starts:
             state.optimiser.tensors["reflectivity_sh"].data[:, 0] = BLACK
             state.optimiser.tensors["opacity_logit"].data[:] = 4.0
-            state.optimiser.tensors["log_scale"].data[:] = 0.0  # a metre each: they cover everything
+            # a metre each: they cover everything
+            state.optimiser.tensors["log_scale"].data[:] = 0.0
         return state
 
     for module in (loop, train):
@@ -44,12 +47,19 @@ def veiled_starts(monkeypatch, starts):
 
 
 def test_when_a_run_is_checked_for_a_veil():
-    """After the warm-up and a share of the run, at a row of metrics; not where Gaussians start from phase."""
+    """After the warm-up and a share of the run, at a row of metrics;
+    not where Gaussians start from phase.
+    """
     wanted = settings()
     assert collapse.veil_checked_at(wanted) == 48  # one and a half warm-ups of 30
-    longer = replace(wanted, schedule=replace(wanted.schedule, images=20_000, warm_up=2000, log_every=100))
+    longer = replace(
+        wanted, schedule=replace(wanted.schedule, images=20_000, warm_up=2000, log_every=100)
+    )
     assert collapse.veil_checked_at(longer) == 3000
-    assert collapse.veil_checked_at(replace(wanted, schedule=replace(wanted.schedule, warm_up=50))) is None, "too late"
+    assert (
+        collapse.veil_checked_at(replace(wanted, schedule=replace(wanted.schedule, warm_up=50)))
+        is None
+    ), "too late"
     assert collapse.veil_checked_at(demo()) is None
 
 
@@ -57,29 +67,44 @@ def test_the_loss_of_black_images():
     """That of the objective, over all images where there are few."""
     observations = observe(recording(frames=8)[0], settings(), "cpu")
     quads = observations.quads
-    each = [float(plain_loss(torch.zeros_like(q)[None], q[None], settings().weights.ssim)[0]) for q in quads]
+    each = [
+        float(plain_loss(torch.zeros_like(q)[None], q[None], settings().weights.ssim)[0])
+        for q in quads
+    ]
     want = settings().weights.quads * sum(each) / len(each)
     assert collapse.loss_of_black(observations, settings()) == pytest.approx(want, rel=1e-6)
     assert want > 0.01
     veiled = [share * want for share in (1.9, 1.1, 1.0, 1.01, 0.99, 1.07)]  # a reset at the end
     assert collapse.is_veiled(veiled, observations, settings())
-    assert not collapse.is_veiled([*veiled, 0.95 * want], observations, settings()), "seen something once"
-    assert not collapse.is_veiled([1.3 * want, 1.2 * want, 1.1 * want, want], observations, settings()), "passing by"
+    assert not collapse.is_veiled([*veiled, 0.95 * want], observations, settings()), (
+        "seen something once"
+    )
+    assert not collapse.is_veiled(
+        [1.3 * want, 1.2 * want, 1.1 * want, want], observations, settings()
+    ), "passing by"
     assert not collapse.is_veiled([], observations, settings())
 
 
 def test_a_veiled_start_restarts(tmp_path, monkeypatch):
-    """With another seed, from image 0, as often as it takes; the run that is left is one that sees."""
+    """With another seed, from image 0, as often as it takes;
+    the run that is left is one that sees.
+    """
     seeds = veiled_starts(monkeypatch, 2)
     run = reconstruct(recording(frames=12)[0], tmp_path / "run", settings(), seed=5)
     assert seeds == [5, 5 + loop.SEED_STEP, 5 + 2 * loop.SEED_STEP]
     assert run.config["restarts"] == 2
     assert (run.path / "run.log").read_text().count("restarts with another seed") == 2
     found = rows(run.path)
-    assert [row["images"] for row in found] == sorted({row["images"] for row in found}), "rows of veiled ones are gone"
+    assert [row["images"] for row in found] == sorted({row["images"] for row in found}), (
+        "rows of veiled ones are gone"
+    )
     monkeypatch.undo()
-    undisturbed = reconstruct(recording(frames=12)[0], tmp_path / "other", settings(), seed=seeds[-1])
-    for one, other in zip(run.field.tensors().values(), undisturbed.field.tensors().values(), strict=True):
+    undisturbed = reconstruct(
+        recording(frames=12)[0], tmp_path / "other", settings(), seed=seeds[-1]
+    )
+    for one, other in zip(
+        run.field.tensors().values(), undisturbed.field.tensors().values(), strict=True
+    ):
         assert torch.equal(one, other), "a start that follows a veiled one is like any other"
     assert undisturbed.config["restarts"] == 0
 
@@ -148,7 +173,9 @@ def test_nodes_are_never_dead():
 
 
 def test_a_reinitialised_network_displaces_nothing_and_learns():
-    """Its weights are others, its moments those of the start, everything else stays; a stored state knows of it."""
+    """Its weights are others, its moments those of the start, everything else stays;
+    a stored state knows of it.
+    """
     wanted = settings()
     state = learnt(wanted)
     first = state.motion.head.weight.detach().clone()
@@ -159,7 +186,9 @@ def test_a_reinitialised_network_displaces_nothing_and_learns():
     assert not collapse.has_dead_network(state, wanted)
     assert [leaf.data_ptr() for leaf in state.optimiser.motion] == addresses, "graphs know them"
     assert not torch.equal(state.motion.head.weight, first)
-    assert state.motion.at(state.binding, float(state.motion.key_times[1])).offset.abs().max() < 1e-3
+    assert (
+        state.motion.at(state.binding, float(state.motion.key_times[1])).offset.abs().max() < 1e-3
+    )
     for leaf in state.optimiser.motion:
         assert all(value.abs().max() == 0 for value in state.optimiser.moments_of(leaf))
     torch.testing.assert_close(state.optimiser.field.mean.detach(), mean, rtol=0, atol=0)

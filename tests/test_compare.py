@@ -1,4 +1,6 @@
-"""Comparing a run whose errors are known beforehand: every number of metrics.json worked out by hand."""
+"""Comparing a run whose errors are known beforehand: every number of metrics.json worked out by
+hand.
+"""
 
 import json
 import math
@@ -8,19 +10,37 @@ import analytic_run
 import numpy as np
 import pytest
 import torch
-from analytic_run import BOX, PHASE_SLOPE, WALL, AnalyticRun, as_phasors, box_at, quad, true_distance, with_colour
+from analytic_run import (
+    BOX,
+    PHASE_SLOPE,
+    WALL,
+    AnalyticRun,
+    as_phasors,
+    box_at,
+    quad,
+    true_distance,
+    with_colour,
+)
 from sequences import changed
 
 from gftorf_warp import Truth, __version__
 from gftorf_warp.constants import CANONICAL_SHIFTS
 from gftorf_warp.data.write import write
 from gftorf_warp.errors import DivergedError, InputError, UsageError
-from gftorf_warp.evaluate.compare import compare, findings, rows_of, sequence_title, summary, truth_statement
+from gftorf_warp.evaluate.compare import (
+    compare,
+    findings,
+    rows_of,
+    sequence_title,
+    summary,
+    truth_statement,
+)
 from gftorf_warp.evaluate.metrics import scored_frames
 from gftorf_warp.evaluate.views import gather
 
 PIXELS, BOX_PIXELS = 12 * 20, 6 * 4
-MOVING, MOVING_BOX = 6 * 6, 6 * 3  # seven columns see the box within a quartet, one of them all the time
+# seven columns see the box within a quartet, one of them all the time
+MOVING, MOVING_BOX = 6 * 6, 6 * 3
 KEYS = {
     "frames",
     "protocol",
@@ -70,7 +90,9 @@ def run(tmp_path):
 
 
 def test_every_number_by_hand(run):
-    """Errors of d, d / opacity, d_ToF and the closed form on all, moving and static pixels, and what was copied."""
+    """Errors of d, d / opacity, d_ToF and the closed form on all, moving and static pixels,
+    and what was copied.
+    """
     got = compare(run, report=False)
     assert set(got) == KEYS
     assert got["unambiguous_range_m"] == pytest.approx(7.5)
@@ -86,23 +108,40 @@ def test_every_number_by_hand(run):
     box, wall = 0.98 * (BOX - 0.1) - BOX, 0.98 * (WALL + 0.02) - WALL
     for row, boxes, pixels in groups.values():
         assert row["d_mse_x100"] == pytest.approx(100 * mixed(box, wall, boxes, pixels), rel=1e-4)
-        assert row["d_normalised_mse_x100"] == pytest.approx(100 * mixed(-0.1, 0.02, boxes, pixels), rel=1e-4)
+        assert row["d_normalised_mse_x100"] == pytest.approx(
+            100 * mixed(-0.1, 0.02, boxes, pixels), rel=1e-4
+        )
         assert row["d_tof_mse_x100"] == pytest.approx(100 * 0.03**2, rel=1e-4)
     assert got["static"]["closed_form_mse_x100"] == pytest.approx(0.0, abs=1e-8)
     squared = [(closed_form(n // 4) - true_distance(n)) ** 2 for n in range(12)]
     assert got["closed_form_mse_x100"] == pytest.approx(100 * np.mean(squared), rel=1e-4)
-    assert got["moving"]["closed_form_mse_x100"] == pytest.approx(100 * np.mean(squared) * PIXELS / MOVING, rel=1e-4)
+    assert got["moving"]["closed_form_mse_x100"] == pytest.approx(
+        100 * np.mean(squared) * PIXELS / MOVING, rel=1e-4
+    )
     assert got["moving"]["closed_form_mse_x100"] > 10.0, "an exact closed form would test nothing"
-    for name, value in {"gaussians": 1234, "images_optimised": 2988, "seconds_reconstruct": 41.25, "seed": 7}.items():
+    for name, value in {
+        "gaussians": 1234,
+        "images_optimised": 2988,
+        "seconds_reconstruct": 41.25,
+        "seed": 7,
+    }.items():
         assert got[name] == value
-    copied = {"device": "cpu", "preset": "demo", "flow_source": "computed", "init": "phase", "motion": "nodes"}
+    copied = {
+        "device": "cpu",
+        "preset": "demo",
+        "flow_source": "computed",
+        "init": "phase",
+        "motion": "nodes",
+    }
     assert {name: got[name] for name in copied} == copied
     assert got["method"] == "gaussians"
     assert got["input"] is got["ablation"] is got["diagnostics"] is got["colour_psnr_db"] is None
 
 
 def test_quad_psnr_pools_the_measured_slots(run):
-    """The peak over the root of the mean squared difference, in dB; slots that were not measured do not count."""
+    """The peak over the root of the mean squared difference, in dB;
+    slots that were not measured do not count.
+    """
     shifts = [CANONICAL_SHIFTS[n % 4] for n in range(14)]
     measured = [quad(true_distance(n), shifts[n]) for n in range(14)]
     rendered = [quad(true_distance(n) + 0.03, shifts[n], true_distance(n)) for n in range(12)]
@@ -112,7 +151,9 @@ def test_quad_psnr_pools_the_measured_slots(run):
 
 
 def test_what_is_returned_is_what_is_written(run):
-    """metrics.json is plain JSON without NaN; the page is written beside it unless it is not wanted."""
+    """metrics.json is plain JSON without NaN; the page is written beside it unless it is not
+    wanted.
+    """
     got = compare(run, report=False)
 
     def refuse(name):
@@ -140,7 +181,9 @@ def test_every_frame_is_rendered_at_its_own_pose(tmp_path):
     original = run.sequence
     run.sequence = lambda: replace(original(), camera_from_world=poses)
     compare(run, report=False)
-    np.testing.assert_allclose([camera.camera_from_world[0, 3] for camera in run.cameras], poses[:12, 0, 3])
+    np.testing.assert_allclose(
+        [camera.camera_from_world[0, 3] for camera in run.cameras], poses[:12, 0, 3]
+    )
 
 
 def test_without_truth_errors_are_null(tmp_path):
@@ -165,12 +208,18 @@ def test_truth_of_another_folder(tmp_path):
 
 
 def test_either_distance_can_be_the_true_one(tmp_path):
-    """Against the static-phasor distance all errors are those to it; pixels that move are those of geometry."""
+    """Against the static-phasor distance all errors are those to it;
+    pixels that move are those of geometry.
+    """
     run = AnalyticRun(tmp_path)
     truth = analytic_run.truth()
-    both = Truth(distance=truth.distance, known=truth.known, phasor_distance=truth.distance + np.float32(0.5))
+    both = Truth(
+        distance=truth.distance, known=truth.known, phasor_distance=truth.distance + np.float32(0.5)
+    )
     write("ftorf", tmp_path / "both", analytic_run.sequence(), both)
-    geometry, static = (compare(run, truth=tmp_path / "both", against=a) for a in ("geometry", "static-phasor"))
+    geometry, static = (
+        compare(run, truth=tmp_path / "both", against=a) for a in ("geometry", "static-phasor")
+    )
     assert (geometry["against"], static["against"]) == ("geometry", "static-phasor")
     assert geometry["d_tof_mse_x100"] == compare(run, report=False)["d_tof_mse_x100"]
     assert static["d_tof_mse_x100"] == pytest.approx(100 * (0.5 - 0.03) ** 2, rel=1e-4)
@@ -183,7 +232,9 @@ def test_either_distance_can_be_the_true_one(tmp_path):
 
 
 def test_unknown_truth_is_not_scored(tmp_path):
-    """One frame known in its first row only, another not at all: each known frame weighs alike in the mean."""
+    """One frame known in its first row only, another not at all:
+    each known frame weighs alike in the mean.
+    """
     run = AnalyticRun(tmp_path, with_truth=False)
     truth = analytic_run.truth()
     truth.distance[2, 1:] = np.nan  # all that is left is wall
@@ -201,9 +252,17 @@ def test_a_still_scene_has_no_moving_pixels(tmp_path):
     """Null where no pixel is, with a share of zero, and the page says it for all pixels."""
     run = AnalyticRun(tmp_path)
     still = np.tile(true_distance(0), (14, 1, 1)).astype(np.float32)
-    write("ftorf", tmp_path / "still", analytic_run.sequence(), Truth(distance=still, known=np.ones(14, dtype=bool)))
+    write(
+        "ftorf",
+        tmp_path / "still",
+        analytic_run.sequence(),
+        Truth(distance=still, known=np.ones(14, dtype=bool)),
+    )
     got = compare(run, truth=tmp_path / "still")
-    assert got["moving"] == {**dict.fromkeys(k for k in KEYS if k.endswith("_mse_x100")), "share": 0.0}
+    assert got["moving"] == {
+        **dict.fromkeys(k for k in KEYS if k.endswith("_mse_x100")),
+        "share": 0.0,
+    }
     assert got["static"]["d_mse_x100"] == pytest.approx(got["d_mse_x100"])
     assert "Over all pixels" in (run.path / "report.html").read_text()
 
@@ -212,7 +271,11 @@ def test_a_truth_that_does_not_fit_is_named(tmp_path):
     """Another number of frames, or no truth at all, where one was asked for."""
     run = AnalyticRun(tmp_path)
     write("ftorf", tmp_path / "short", analytic_run.sequence(8), analytic_run.truth(8))
-    with pytest.raises(InputError, match=r"expected frames x rows x columns 14x12x20, found 8x12x20") as error:
+    with pytest.raises(
+        InputError,
+        match=r"expected frames x rows x columns 14x12x20, found "
+        r"8x12x20",
+    ) as error:
         compare(run, truth=tmp_path / "short")
     assert error.value.where == str(tmp_path / "short")
     write("ftorf", tmp_path / "blind", analytic_run.sequence())
@@ -265,19 +328,26 @@ def test_truth_statement_is_the_paragraph_of_the_data_card(tmp_path):
     """The paragraph about ground truth, on one line; nothing without a data card."""
     assert truth_statement(None) is None
     assert truth_statement(tmp_path) is None
-    (tmp_path / "README.md").write_text("# box\n\nGround truth is the analytic hit,\nnot a rendering.\n\nMore.\n")
+    (tmp_path / "README.md").write_text(
+        "# box\n\nGround truth is the analytic hit,\nnot a rendering.\n\nMore.\n"
+    )
     assert truth_statement(tmp_path) == "Ground truth is the analytic hit, not a rendering."
 
 
 def test_settings_fill_in_what_the_config_does_not_say(run):
     """The input is resolved in the config, the row of the ablation stands in its settings."""
-    run.config |= {"input": "quads", "settings": {"method": "gaussians", "input": "auto", "ablation": "h1"}}
+    run.config |= {
+        "input": "quads",
+        "settings": {"method": "gaussians", "input": "auto", "ablation": "h1"},
+    }
     got = compare(run, report=False)
     assert (got["input"], got["ablation"], got["method"]) == ("quads", "h1", "gaussians")
 
 
 def test_phasors_are_scored_once(run):
-    """Four raw frames of one instant are one image; what moves is what changes to the next phasor."""
+    """Four raw frames of one instant are one image; what moves is what changes to the next
+    phasor.
+    """
     phasors = as_phasors(run.sequence())
     run.sequence = lambda: phasors
     known = analytic_run.truth().distance
@@ -290,11 +360,15 @@ def test_phasors_are_scored_once(run):
     assert got["d_tof_mse_x100"] == pytest.approx(100 * 0.03**2, rel=1e-4)
     box, wall = 0.98 * (BOX - 0.1) - BOX, 0.98 * (WALL + 0.02) - WALL
     assert got["moving"]["d_mse_x100"] == pytest.approx(100 * (box**2 + wall**2) / 2, rel=1e-4)
-    assert got["moving"]["share"] == pytest.approx(2 * BOX_PIXELS / PIXELS), "four columns appear, four disappear"
+    assert got["moving"]["share"] == pytest.approx(2 * BOX_PIXELS / PIXELS), (
+        "four columns appear, four disappear"
+    )
 
 
 def test_colour_is_compared_from_the_colour_camera(tmp_path):
-    """At the frames that have an image, from the pose of the colour camera, at its size; the peak is the largest."""
+    """At the frames that have an image, from the pose of the colour camera, at its size;
+    the peak is the largest.
+    """
     run = AnalyticRun(tmp_path, colour=True)
     sequence = with_colour(run.sequence())
     run.sequence = lambda: sequence

@@ -1,4 +1,6 @@
-"""The picture of a sequence: one for every kind, of the numbers themselves, and of no consequence for readers."""
+"""The picture of a sequence: one for every kind, of the numbers themselves,
+and of no consequence for readers.
+"""
 
 from dataclasses import replace
 
@@ -25,7 +27,9 @@ def recording():
 
 def titles(sequence, truth):
     """What the panels of a sheet are called; the sheet has something on it."""
-    image = cv2.imdecode(np.frombuffer(contact_sheet(sequence, truth, "a title"), np.uint8), cv2.IMREAD_COLOR)
+    image = cv2.imdecode(
+        np.frombuffer(contact_sheet(sequence, truth, "a title"), np.uint8), cv2.IMREAD_COLOR
+    )
     assert image.shape[0] > 500
     assert image.std() > 10, "an empty sheet"
     _, rows = module.middle_panels(sequence, truth)
@@ -33,22 +37,42 @@ def titles(sequence, truth):
 
 
 def test_everything_that_is_known_is_on_it(recording):
-    """All shifts of a quartet, amplitude, both distances, the closed form, its error, objects, flow, colour."""
+    """All shifts of a quartet, amplitude, both distances, the closed form, its error, objects,
+    flow, colour.
+    """
     found = titles(recording.sequence, recording.truth)
-    assert [title.partition(":")[0] for title in found[:4]] == [f"raw frame {n}" for n in (4, 5, 6, 7)]
-    assert [title.split(": ")[1].split(",")[0] for title in found[:4]] == ["0 deg", "180 deg", "90 deg", "270 deg"]
-    for word in ("amplitude", "true distance [m]", "closed form [m]", "error of", "static phasor", "objects", "colour"):
+    assert [title.partition(":")[0] for title in found[:4]] == [
+        f"raw frame {n}" for n in (4, 5, 6, 7)
+    ]
+    assert [title.split(": ")[1].split(",")[0] for title in found[:4]] == [
+        "0 deg",
+        "180 deg",
+        "90 deg",
+        "270 deg",
+    ]
+    for word in (
+        "amplitude",
+        "true distance [m]",
+        "closed form [m]",
+        "error of",
+        "static phasor",
+        "objects",
+        "colour",
+    ):
         assert any(word in title for title in found), word
 
 
 def test_flow_is_shown_where_it_is(recording):
     """It belongs to the start of a quartet that has another behind it."""
-    longer = changed(recording.sequence, forward_flow={4: np.full((2, *SIZE[::-1]), np.nan, np.float32)})
+    longer = changed(
+        recording.sequence, forward_flow={4: np.full((2, *SIZE[::-1]), np.nan, np.float32)}
+    )
     assert any("flow to raw frame 8" in title for title in titles(longer, recording.truth))
 
 
 @pytest.mark.parametrize(
-    "kind", ["no truth", "no distance", "one frame", "two frequencies", "one shift", "dark", "all still"]
+    "kind",
+    ["no truth", "no distance", "one frame", "two frequencies", "one shift", "dark", "all still"],
 )
 def test_any_sequence_has_one(recording, kind):
     """What is missing is left out, and nothing warns."""

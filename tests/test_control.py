@@ -1,4 +1,6 @@
-"""Camera, calibration and shifts in device memory: the same bits as without, and whatever is written there later."""
+"""Camera, calibration and shifts in device memory: the same bits as without,
+and whatever is written there later.
+"""
 
 from dataclasses import replace
 
@@ -28,7 +30,11 @@ def cameras(lens=False):
     turned = np.eye(4)
     turned[:3, :3] = [[np.cos(0.1), 0, np.sin(0.1)], [0, 1, 0], [-np.sin(0.1), 0, np.cos(0.1)]]
     turned[:3, 3] = 0.1, -0.05, 0.2
-    bends = (Distortion(k1=-0.1, p1=0.01), Distortion(k1=0.05, k2=0.01)) if lens else (Distortion(), Distortion())
+    bends = (
+        (Distortion(k1=-0.1, p1=0.01), Distortion(k1=0.05, k2=0.01))
+        if lens
+        else (Distortion(), Distortion())
+    )
     first, second = (replace(SMALL, distortion=bend) for bend in bends)
     return first, replace(second, camera_from_world=turned, fx=SMALL.fx * 1.1, cx=SMALL.cx + 2.5)
 
@@ -38,14 +44,20 @@ def rendered(device, camera, sensor, control=None):
     field = gaussians(60, SMALL, seed=3).map(lambda t: t.to(device, torch.float32).requires_grad_())
     images = rasterize(field, camera, sensor, SETTINGS, control=control)
     seeds = [torch.linspace(-1, 1, getattr(images, n).numel(), device=device) for n in NAMES]
-    sum((getattr(images, n).flatten() * seed).sum() for n, seed in zip(NAMES, seeds, strict=True)).backward()
-    return [getattr(images, n).detach() for n in NAMES], [t.grad for t in field.parameters().values()]
+    sum(
+        (getattr(images, n).flatten() * seed).sum() for n, seed in zip(NAMES, seeds, strict=True)
+    ).backward()
+    return [getattr(images, n).detach() for n in NAMES], [
+        t.grad for t in field.parameters().values()
+    ]
 
 
 @pytest.mark.parametrize("lens", [False, True], ids=["pinhole", "lens"])
 @pytest.mark.parametrize("device", DEVICES)
 def test_a_rendering_reads_pose_calibration_and_shifts_from_the_device(device, lens):
-    """With the row of a second camera and sensor in memory, the call with the first ones renders the second."""
+    """With the row of a second camera and sensor in memory,
+    the call with the first ones renders the second.
+    """
     (first, second), row = cameras(lens), None
     want = rendered(device, second, SENSORS[1])
     for camera, sensor in ((first, SENSORS[0]), (second, SENSORS[1])):
@@ -57,7 +69,9 @@ def test_a_rendering_reads_pose_calibration_and_shifts_from_the_device(device, l
     for got, image in zip(images, want[0], strict=True):
         torch.testing.assert_close(got, image, rtol=0, atol=0)
     for got, gradient in zip(gradients, want[1], strict=True):
-        torch.testing.assert_close(got, gradient, rtol=1e-5, atol=1e-5 * float(gradient.abs().max()))
+        torch.testing.assert_close(
+            got, gradient, rtol=1e-5, atol=1e-5 * float(gradient.abs().max())
+        )
 
 
 def test_the_calibration_of_a_control_has_the_gradient_of_the_sensors():
@@ -85,13 +99,21 @@ def test_a_control_that_does_not_fit_is_an_error():
     with pytest.raises(ValueError, match=r"control.shifts is \(3, 2\) .* must be \(4, 2\)"):
         rasterize(field, camera, Sensor(), SETTINGS, control=control)
     with pytest.raises(ValueError, match=r"control.view is .* must be"):
-        rasterize(field, camera, SENSORS[0], SETTINGS, control=replace(control, view=control.view.double()))
+        rasterize(
+            field,
+            camera,
+            SENSORS[0],
+            SETTINGS,
+            control=replace(control, view=control.view.double()),
+        )
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
 @pytest.mark.parametrize("lens", [False, True], ids=["pinhole", "lens"])
 def test_one_graph_serves_any_pose_frequency_and_shifts(lens):
-    """A graph captured with one camera and sensor replays with another that was written to its memory."""
+    """A graph captured with one camera and sensor replays with another that was written to its
+    memory.
+    """
     (first, second), workspace = cameras(lens), Workspace()
     field = gaussians(60, SMALL, seed=3).map(lambda t: t.to("cuda", torch.float32))
     row = torch.from_numpy(packed(first, SENSORS[0], SETTINGS)).cuda()

@@ -1,4 +1,6 @@
-"""Cycles of any number of shifts at one or more frequencies: found, decoded, unwrapped, stored; noise as predicted."""
+"""Cycles of any number of shifts at one or more frequencies: found, decoded, unwrapped, stored;
+noise as predicted.
+"""
 
 import math
 
@@ -14,7 +16,13 @@ from gftorf_warp import Sequence
 from gftorf_warp.constants import CANONICAL_SHIFTS, SPEED_OF_LIGHT
 from gftorf_warp.data.check import check
 from gftorf_warp.data.cycles import find_cycle, phase_noise
-from gftorf_warp.data.decode import closed_form_distance, decode_quartet, quad_scale, quartet_phasors, unambiguous_range
+from gftorf_warp.data.decode import (
+    closed_form_distance,
+    decode_quartet,
+    quad_scale,
+    quartet_phasors,
+    unambiguous_range,
+)
 from gftorf_warp.data.unwrap import CONFIDENT, choose, common_range, multiples
 from gftorf_warp.data.write import write
 from gftorf_warp.errors import InputError, UsageError
@@ -32,7 +40,9 @@ def evenly(count):
     return tuple(TURN * k / count for k in range(count))
 
 
-def still(distance, shifts, frequencies=(20e6,), cycles=1, offset=0.4, constant=0.3, noise=0.0, **changes):
+def still(
+    distance, shifts, frequencies=(20e6,), cycles=1, offset=0.4, constant=0.3, noise=0.0, **changes
+):
     """A wall at rest: all shifts at the first frequency, then at the next, and so on."""
     rng = np.random.default_rng(len(shifts) + 10 * len(frequencies))
     f = np.tile(np.repeat(frequencies, len(shifts)), cycles)
@@ -64,7 +74,9 @@ def still(distance, shifts, frequencies=(20e6,), cycles=1, offset=0.4, constant=
 )
 @pytest.mark.parametrize("frequencies", [(20e6,), (60e6, 40e6), (50e6, 40e6, 30e6)])
 def test_a_recording_says_how_long_its_cycle_is(shifts, frequencies):
-    """The period of shifts and frequencies, also if the recording ends within a cycle, or states it."""
+    """The period of shifts and frequencies, also if the recording ends within a cycle,
+    or states it.
+    """
     sequence = still(np.full((1, 2), 3.0), shifts, frequencies, cycles=3)
     length = len(shifts) * len(frequencies)
     assert (sequence.cycle, sequence.frequencies) == (length, frequencies)
@@ -81,7 +93,12 @@ def test_without_a_period_four_raw_frames_are_a_quartet():
     """Orders that change, a recording of one quartet or less, and shifts that say nothing."""
     rng = np.random.default_rng(4)
     shuffled = np.concatenate([rng.permutation(CANONICAL_SHIFTS) for _ in range(5)])
-    for shifts in (shuffled, np.array(CANONICAL_SHIFTS), np.array(CANONICAL_SHIFTS[:2]), np.zeros(9)):
+    for shifts in (
+        shuffled,
+        np.array(CANONICAL_SHIFTS),
+        np.array(CANONICAL_SHIFTS[:2]),
+        np.zeros(9),
+    ):
         assert find_cycle(shifts, np.full(len(shifts), 2e7)) == 4
 
 
@@ -93,11 +110,15 @@ def test_without_a_period_four_raw_frames_are_a_quartet():
     constant=st.floats(-2.0, 2.0),
 )
 def test_any_shifts_of_two_frequencies_give_the_distance(shifts, distance, offset, constant):
-    """Tenths of a turn in any order, at 30 and 20 MHz: 15 m together, 5 and 7.5 m alone; float32 quads."""
+    """Tenths of a turn in any order, at 30 and 20 MHz: 15 m together, 5 and 7.5 m alone;
+    float32 quads.
+    """
     angles = tuple(math.radians(10 * k) for k in shifts)
     if phase_noise(angles) > 4.0:
         return  # three neighbours magnify the rounding of float32 beyond the tolerance
-    sequence = still(np.full((1, 2), distance), angles, (30e6, 20e6), offset=offset, constant=constant)
+    sequence = still(
+        np.full((1, 2), distance), angles, (30e6, 20e6), offset=offset, constant=constant
+    )
     decoded = decode_quartet(sequence, 0)
     assert unambiguous_range(sequence) == pytest.approx(SPEED_OF_LIGHT / 2e7)
     np.testing.assert_allclose(decoded.distance, distance, atol=1e-4)
@@ -128,9 +149,13 @@ def test_four_shifts_are_the_published_formula():
         np.testing.assert_allclose(quartet_phasors(other, 0)[0][1], torch.stack(want), atol=1e-9)
 
 
-@pytest.mark.parametrize(("shifts", "theory"), [(evenly(n), math.sqrt(2 / n)) for n in (3, 4, 5, 8)] + [(UNEVEN, None)])
+@pytest.mark.parametrize(
+    ("shifts", "theory"), [(evenly(n), math.sqrt(2 / n)) for n in (3, 4, 5, 8)] + [(UNEVEN, None)]
+)
 def test_noise_of_a_phase_is_as_predicted(shifts, theory):
-    """sqrt(2 / K) of noise over amplitude, for uneven shifts the root mean square over all phases; 3 sigma."""
+    """sqrt(2 / K) of noise over amplitude, for uneven shifts the root mean square over all phases;
+    3 sigma.
+    """
     distance = np.linspace(0, SPEED_OF_LIGHT / 40e6, 60_001)[:-1].reshape(200, 300)
     noise, amplitude = 0.01, 0.7
     sequence = still(distance, shifts, noise=noise)
@@ -147,7 +172,9 @@ def test_noise_of_a_phase_is_as_predicted(shifts, theory):
 
 
 def test_wrong_turns_are_as_frequent_as_predicted_and_flagged():
-    """110 and 100 MHz, noisy: sensor notes, T28; most of the wrong ones are flagged, as many as should be."""
+    """110 and 100 MHz, noisy: sensor notes, T28; most of the wrong ones are flagged,
+    as many as should be.
+    """
     distance = np.random.default_rng(3).uniform(0, 14.9, (300, 400))
     sigma = 0.1
     noise = 0.7 * sigma / phase_noise(evenly(8))
@@ -157,30 +184,40 @@ def test_wrong_turns_are_as_frequent_as_predicted_and_flagged():
     apart = np.mod(decoded.distance - distance + reach / 2, reach) - reach / 2
     wrong = np.abs(apart) > 0.5 * SPEED_OF_LIGHT / (2 * 110e6)
     predicted = unwrap_failure(sigma, 11, 10)
-    assert wrong.mean() == pytest.approx(predicted, abs=0.05 * predicted + 4 * math.sqrt(predicted / wrong.size))
-    flagged = 1.0 - unwrap_failure(0.75 * sigma, 11, 10) / predicted  # noise below four thirds of what it takes
+    assert wrong.mean() == pytest.approx(
+        predicted, abs=0.05 * predicted + 4 * math.sqrt(predicted / wrong.size)
+    )
+    # noise below four thirds of what it takes
+    flagged = 1.0 - unwrap_failure(0.75 * sigma, 11, 10) / predicted
     assert decoded.ambiguous[wrong].mean() == pytest.approx(flagged, abs=0.04)
     assert decoded.ambiguous.mean() < 0.3
     assert (decoded.ambiguous == (decoded.confidence < CONFIDENT)).all()
 
 
 def test_three_frequencies_reach_farther_and_choose_as_one():
-    """All of them have a say: with 50, 40 and 30 MHz the range is 15 m, and torch takes the same candidates."""
+    """All of them have a say: with 50, 40 and 30 MHz the range is 15 m,
+    and torch takes the same candidates.
+    """
     ms, base = multiples((50e6, 40e6, 30e6))
     assert (ms, base) == ((5, 4, 3), pytest.approx(10e6))
     assert common_range((50e6, 40e6, 30e6)) == pytest.approx(SPEED_OF_LIGHT / 2e7)
     distance = np.linspace(0.01, 14.9, 600).reshape(20, 30)
     sequence = still(distance, evenly(3), (50e6, 40e6, 30e6), noise=0.02)
     np.testing.assert_allclose(decode_quartet(sequence, 0).distance, distance, atol=0.1)
-    phases = np.stack([np.mod(m * np.linspace(0, TURN, 500)[:-1] + 0.05 * k, TURN) for k, m in enumerate(ms)])
+    phases = np.stack(
+        [np.mod(m * np.linspace(0, TURN, 500)[:-1] + 0.05 * k, TURN) for k, m in enumerate(ms)]
+    )
     turns = choose(phases, ms).turns
     together = unwrap([torch.from_numpy(phase) for phase in phases], ms)
     np.testing.assert_allclose(together, (phases[0] + TURN * turns) / ms[0], atol=1e-12)
 
 
 def test_two_that_agree_outvote_none_and_a_tie_has_no_confidence():
-    """Half way between two candidates nothing can be chosen; without light there is no confidence either."""
-    turn = np.array([0.0, math.pi / 6, math.pi / 3])  # of the second phase at m = 3, 2: candidates are pi / 3 apart
+    """Half way between two candidates nothing can be chosen;
+    without light there is no confidence either.
+    """
+    # of the second phase at m = 3, 2: candidates are pi / 3 apart
+    turn = np.array([0.0, math.pi / 6, math.pi / 3])
     confidence = choose(np.stack([np.zeros(3), 2 * turn]), (3, 2)).confidence
     np.testing.assert_allclose(confidence, [1.0, 0.0, 1.0], atol=1e-6)
     dark = still(np.full((1, 2), 3.0), evenly(3), (60e6, 40e6))
@@ -213,7 +250,9 @@ def test_a_capture_keeps_the_cycle_and_says_what_is_wrong(tmp_path):
     read = Sequence.open(write("capture", tmp_path / "stated", sequence))
     assert (read.cycle, read.calibration.cycle_length, read.frequencies) == (6, 6, (60e6, 40e6))
     np.testing.assert_allclose(closed_form_distance(read, 1), distance, atol=1e-4)
-    found = Sequence.open(write("capture", tmp_path / "found", changed(sequence, cycle_length=None)))
+    found = Sequence.open(
+        write("capture", tmp_path / "found", changed(sequence, cycle_length=None))
+    )
     assert (found.cycle, found.calibration.cycle_length) == (6, None)
     text = str(check(tmp_path / "found"))
     for line in (
@@ -234,11 +273,18 @@ def test_a_capture_keeps_the_cycle_and_says_what_is_wrong(tmp_path):
 
 
 def test_check_names_frequencies_that_nothing_unwraps(tmp_path):
-    """A warning instead of a decoded distance; frequencies that contradict each other are a warning, too."""
+    """A warning instead of a decoded distance; frequencies that contradict each other are a
+    warning, too.
+    """
     distance = np.linspace(2.0, 7.0, 20 * 16).reshape(16, 20)
-    write("capture", tmp_path / "odd", still(distance, evenly(3), (60e6, 60e6 / math.sqrt(2)), cycles=2))
+    write(
+        "capture",
+        tmp_path / "odd",
+        still(distance, evenly(3), (60e6, 60e6 / math.sqrt(2)), cycles=2),
+    )
     assert "warning: frequencies without a common range" in str(check(tmp_path / "odd"))
     wrong = still(distance, evenly(3), (60e6, 40e6), cycles=2)
-    wrong.quads[[4, 5, 10, 11]] = wrong.quads[[5, 4, 11, 10]]  # the phase of the second frequency runs backwards
+    # the phase of the second frequency runs backwards
+    wrong.quads[[4, 5, 10, 11]] = wrong.quads[[5, 4, 11, 10]]
     write("capture", tmp_path / "wrong", wrong)
     assert "frequencies disagree" in str(check(tmp_path / "wrong"))

@@ -1,4 +1,6 @@
-"""From the simulator to the report with cycles that are not four shifts at one frequency: closed form and Gaussians."""
+"""From the simulator to the report with cycles that are not four shifts at one frequency:
+closed form and Gaussians.
+"""
 
 import json
 import math
@@ -38,13 +40,17 @@ SENSORS = {
 
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory):
-    """The demo scene, 2 to 4 m away, without noise, once with each sensor: three cycles and one raw frame."""
+    """The demo scene, 2 to 4 m away, without noise, once with each sensor:
+    three cycles and one raw frame.
+    """
     root = tmp_path_factory.mktemp("cycles")
     for name, changes in SENSORS.items():
         sensor = replace(SCENES["demo"].sensor, **changes)
         scene = replace(SCENES["demo"], sensor=sensor, closed_form=None)
         frames = 3 * len(sensor.cycle) + 1
-        simulate(scene, root / name, frames=frames, size=SIZE, noise=False, flow=True, format="capture")
+        simulate(
+            scene, root / name, frames=frames, size=SIZE, noise=False, flow=True, format="capture"
+        )
     return root
 
 
@@ -67,12 +73,17 @@ def test_what_was_simulated_is_read_and_decoded(folders, name):
 
 @pytest.mark.parametrize("name", SENSORS)
 def test_the_command_line_decodes_and_compares(folders, name, tmp_path, capsys):
-    """Reconstruct with preset ctof, compare, check, render; the page shows both frequencies and the range."""
+    """Reconstruct with preset ctof, compare, check, render;
+    the page shows both frequencies and the range.
+    """
     run, sequence = tmp_path / "run", folders / name
     assert cli.main(["reconstruct", str(sequence), "--preset", "ctof", "--out", str(run)]) == 0
     assert cli.main(["compare", str(run)]) == 0
     printed = capsys.readouterr().out
-    metrics, page = json.loads((run / "metrics.json").read_text()), (run / "report.html").read_text()
+    metrics, page = (
+        json.loads((run / "metrics.json").read_text()),
+        (run / "report.html").read_text(),
+    )
     for row in (metrics, metrics["moving"], metrics["static"]):
         for key in ("d_mse_x100", "d_tof_mse_x100"):
             assert row[key] == pytest.approx(row["closed_form_mse_x100"], rel=1e-3)
@@ -107,7 +118,10 @@ def test_every_raw_frame_is_rendered_with_its_own_shift_and_frequency(folders, n
     settings = replace(settings, schedule=replace(settings.schedule, warm_up=100))
     field = state.optimiser.field
     stated = SENSORS[name]
-    frequencies = (stated.get("f_mod_hz", SCENES["demo"].sensor.f_mod_hz), *stated.get("further_hz", ()))
+    frequencies = (
+        stated.get("f_mod_hz", SCENES["demo"].sensor.f_mod_hz),
+        *stated.get("further_hz", ()),
+    )
     losses = []
     for frame in range(seen.sequence.cycle):
         set_, slot = divmod(frame, len(stated["shifts"]))
@@ -116,23 +130,32 @@ def test_every_raw_frame_is_rendered_with_its_own_shift_and_frequency(folders, n
         found = OneStep(state, seen, settings, frame)
         mean = field.mean.detach().double().requires_grad_()
         exact = replace(
-            field.map(lambda value: value.detach().double() if value.is_floating_point() else value), mean=mean
+            field.map(
+                lambda value: value.detach().double() if value.is_floating_point() else value
+            ),
+            mean=mean,
         )
-        seen_by = replace(sensor, f_mod_hz=frequencies[set_], shifts=(stated["shifts"][slot],), further_hz=())
+        seen_by = replace(
+            sensor, f_mod_hz=frequencies[set_], shifts=(stated["shifts"][slot],), further_hz=()
+        )
         rendered = oracle(exact, seen.cameras[frame], seen_by, settings.render).quads
         want = (rendered - seen.quads[frame][None].double()).square().mean()
         assert found.terms["quads"] == pytest.approx(want.item(), rel=1e-3)
         got = found.gradients["mean"]
         (grad,) = torch.autograd.grad(want, mean)
         assert grad.abs().max() > 1e-8, "a vanished gradient would pass any tolerance"
-        torch.testing.assert_close(got.double(), grad, rtol=2e-2, atol=2e-3 * float(grad.abs().max()))
+        torch.testing.assert_close(
+            got.double(), grad, rtol=2e-2, atol=2e-3 * float(grad.abs().max())
+        )
         losses.append(want.item())
     assert len(set(losses)) == len(losses)
 
 
 @pytest.mark.parametrize("name", SENSORS)
 def test_the_start_is_at_the_unwrapped_distance(folders, name):
-    """Gaussians of the static layer lie on what the truth has there, beyond the range of one frequency too."""
+    """Gaussians of the static layer lie on what the truth has there,
+    beyond the range of one frequency too.
+    """
     sequence = Sequence.open(folders / name)
     truth = sequence.truth()
     start = from_phase(sequence, presets.demo().init)
@@ -147,26 +170,40 @@ def test_the_start_is_at_the_unwrapped_distance(folders, name):
 
 @pytest.mark.parametrize("name", SENSORS)
 def test_gaussians_are_fitted_to_it(folders, name, tmp_path):
-    """A short run of the demo preset: fits better than it began, and what moves better than the closed form."""
-    run = reconstruct(folders / name, tmp_path / "run", "demo", images=480, changes=["schedule.log_every=60"])
+    """A short run of the demo preset: fits better than it began,
+    and what moves better than the closed form.
+    """
+    run = reconstruct(
+        folders / name, tmp_path / "run", "demo", images=480, changes=["schedule.log_every=60"]
+    )
     rows = [json.loads(line) for line in (run.path / "metrics.jsonl").read_text().splitlines()]
     assert rows[-1]["quad_psnr_db"] > rows[0]["quad_psnr_db"] + 1.0
-    looked = [json.loads(line) for line in (run.path / "diagnostics.jsonl").read_text().splitlines()]
+    looked = [
+        json.loads(line) for line in (run.path / "diagnostics.jsonl").read_text().splitlines()
+    ]
     assert looked[-1]["d_minus_dtof_static_m"] < 0.1
     metrics = compare(run, report=False)
     assert metrics["moving"]["d_mse_x100"] < 0.7 * metrics["moving"]["closed_form_mse_x100"]
     assert metrics["static"]["d_mse_x100"] < 3.0
     again = Run.open(run.path)
     assert again.sensor.further_hz == SENSORS[name].get("further_hz", ())
-    assert json.loads((run.path / "config.json").read_text())["settings"]["cycle"] == run.sequence().cycle
+    assert (
+        json.loads((run.path / "config.json").read_text())["settings"]["cycle"]
+        == run.sequence().cycle
+    )
 
 
 def test_a_batch_is_a_cycle_and_rates_know(folders):
-    """The raw frames of one cycle pull at once; Adam forgets as much per image as in a batch of four."""
+    """The raw frames of one cycle pull at once; Adam forgets as much per image as in a batch of
+    four.
+    """
     _, seen, _ = observed(folders / "eight shifts")
     assert [len(batch) for batch in seen.batches] == [8, 8, 8, 1]
     released = presets.preset("released")
-    joint = replace(released, schedule=replace(released.schedule, batch=Batch.QUARTET, batch_rule=BatchRule.ROOT))
+    joint = replace(
+        released,
+        schedule=replace(released.schedule, batch=Batch.QUARTET, batch_rule=BatchRule.ROOT),
+    )
     assert betas_of(replace(joint, cycle=8))[0] == pytest.approx(betas_of(joint)[0] ** 2)
 
 
@@ -177,7 +214,9 @@ def test_phasors_of_each_frequency_are_compared(folders, tmp_path):
     assert sorted(seen.phasors.rows) == [0, 3, 6, 9, 12, 15]
     assert [seen.time_at(n) * 120 for n in (0, 3, 6)] == pytest.approx([1.0, 4.0, 7.0])
     assert [seen.sensor_at(n).f_mod_hz for n in (0, 3)] == [60e6, 40e6]
-    run = reconstruct(folders / "two frequencies", tmp_path / "run", "demo", images=60, input="phasor")
+    run = reconstruct(
+        folders / "two frequencies", tmp_path / "run", "demo", images=60, input="phasor"
+    )
     assert np.isfinite(compare(run, report=False)["d_mse_x100"])
 
 

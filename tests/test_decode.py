@@ -20,19 +20,27 @@ UNAMBIGUOUS = 7.5  # [m] of the sample and of the scenes here
 def sample():
     """The sample, its truth, and the decoded distance of its eight quartets."""
     sequence = Sequence.open(SAMPLE)
-    return sequence, sequence.truth(), np.stack([decode.closed_form_distance(sequence, i) for i in range(8)])
+    return (
+        sequence,
+        sequence.truth(),
+        np.stack([decode.closed_form_distance(sequence, i) for i in range(8)]),
+    )
 
 
 def test_quartet_starts_of_the_sample_score_as_published(sample):
     """Its README lists the error of every quartet against the truth of its first frame."""
     _, truth, decoded = sample
     errors = 100 * ((decoded - truth.distance[::4]) ** 2).mean(axis=(1, 2))
-    np.testing.assert_allclose(errors, [2.674, 3.234, 4.559, 5.491, 6.503, 9.042, 11.785, 16.370], atol=6e-4)
+    np.testing.assert_allclose(
+        errors, [2.674, 3.234, 4.559, 5.491, 6.503, 9.042, 11.785, 16.370], atol=6e-4
+    )
     assert round(errors.mean(), 3) == 7.457
 
 
 def test_every_frame_of_the_sample_scores_as_published(sample):
-    """One image per quartet against the truth of each of its four frames; moving pixels are few and bad."""
+    """One image per quartet against the truth of each of its four frames;
+    moving pixels are few and bad.
+    """
     _, truth, decoded = sample
     squared = (np.repeat(decoded, 4, axis=0) - truth.distance) ** 2
     assert round(100 * squared.mean(), 3) == 3.791
@@ -48,7 +56,10 @@ def test_the_sample_has_no_factor_of_its_own(sample):
     factor, source = decode.quad_scale(sequence)
     assert factor == 1.0 / decode.largest_amplitude(sequence)
     assert source.startswith("inferred")
-    lengths = [np.hypot(*(sequence.quads[a] - sequence.quads[a + 1] for a in (4 * i, 4 * i + 2))) for i in range(8)]
+    lengths = [
+        np.hypot(*(sequence.quads[a] - sequence.quads[a + 1] for a in (4 * i, 4 * i + 2)))
+        for i in range(8)
+    ]
     assert decode.largest_amplitude(sequence) == pytest.approx(np.max(lengths), rel=1e-6)
 
 
@@ -66,7 +77,9 @@ def test_the_file_s_own_factor_comes_first():
     constant=st.floats(-2.0, 2.0),
 )
 def test_a_wall_is_decoded_up_to_its_wraps(permutation, distance, offset, constant):
-    """Any order, offset and constant part; the result is the distance modulo c/2f, never c/2f itself."""
+    """Any order, offset and constant part; the result is the distance modulo c/2f,
+    never c/2f itself.
+    """
     sequence, _ = scene(4, 2, 2, permutation, offset, constant, distance=distance)
     decoded = decode.closed_form_distance(sequence, 0)
     assert ((decoded >= 0) & (decoded < UNAMBIGUOUS)).all()
@@ -81,7 +94,9 @@ def test_any_three_distinct_shifts_determine_the_phase(shifts):
     sequence, _ = scene(4, 1, 2, distance=distance)
     phase = 2 * math.pi * distance / UNAMBIGUOUS + sequence.calibration.phase_offset
     quads = 0.7 * (np.cos(phase - np.array(shifts)[:, None, None]) + 0.4)
-    sequence, _ = scene(4, 1, 2, distance=distance, shifts=np.array(shifts), quads=quads.astype(np.float32))
+    sequence, _ = scene(
+        4, 1, 2, distance=distance, shifts=np.array(shifts), quads=quads.astype(np.float32)
+    )
     np.testing.assert_allclose(decode.closed_form_distance(sequence, 0), distance, atol=1e-5)
     np.testing.assert_allclose(np.hypot(*decode.quartet_phasor(sequence, 0)), 1.4, rtol=1e-5)
 
@@ -101,7 +116,9 @@ def test_the_phasor_is_the_difference_of_opposite_quads():
 def test_a_phase_that_rounds_up_to_a_turn_is_zero():
     """The modulo of a tiny negative number is 2 pi, which lies outside [0, 2 pi)."""
     sequence, _ = scene(phase_offset=0.0)
-    np.testing.assert_array_equal(decode.distance_from_phase(np.array([-1e-18, 0.0]), sequence), [0.0, 0.0])
+    np.testing.assert_array_equal(
+        decode.distance_from_phase(np.array([-1e-18, 0.0]), sequence), [0.0, 0.0]
+    )
     assert decode.distance_from_phase(np.array(math.pi), sequence) == pytest.approx(
         SPEED_OF_LIGHT / (4 * sequence.calibration.f_mod_hz)
     )

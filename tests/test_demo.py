@@ -1,4 +1,6 @@
-"""The demo at a reduced size, without a time limit: its order, its files, what it prints, and that it goes on."""
+"""The demo at a reduced size, without a time limit: its order, its files, what it prints,
+and that it goes on.
+"""
 
 import json
 
@@ -20,7 +22,13 @@ def folder(tmp_path_factory):
 
 def test_demo_leaves_sequence_run_numbers_and_report(folder):
     """What the README promises to find."""
-    assert {path.name for path in folder.iterdir()} == {"demo.json", "seq", "run", "metrics.json", "report.html"}
+    assert {path.name for path in folder.iterdir()} == {
+        "demo.json",
+        "seq",
+        "run",
+        "metrics.json",
+        "report.html",
+    }
     assert (folder / "metrics.json").read_bytes() == (folder / "run" / "metrics.json").read_bytes()
     assert (folder / "report.html").read_bytes() == (folder / "run" / "report.html").read_bytes()
     assert len(list((folder / "seq").glob("tofType*/*.npy"))) == 12
@@ -44,7 +52,8 @@ def test_demo_goes_on_and_prints_the_numbers_of_its_metrics(folder, capsys):
     for line, name in ((moving, "moving"), (static, "static")):
         assert line.startswith(f"{name} pixels: ")
         assert (
-            f"closed form {metrics[name]['closed_form_mse_x100']:.3f} -> ours {metrics[name]['d_mse_x100']:.3f}" in line
+            f"closed form {metrics[name]['closed_form_mse_x100']:.3f} -> ours "
+            f"{metrics[name]['d_mse_x100']:.3f}" in line
         )
     assert str(folder / "report.html") in report
     steps = [line[:5] for line in captured.err.splitlines() if line.startswith("[")]
@@ -76,7 +85,9 @@ def test_fresh_moves_the_old_demo_aside(tmp_path):
         demo.prepare(tmp_path, {"seed": seed, "size": (3, 4)}, fresh=True)
         (tmp_path / "seq").mkdir()
     demo.prepare(tmp_path, {"seed": 2, "size": (3, 4)}, fresh=False)
-    assert [json.loads((tmp_path / f"old-{n}" / "demo.json").read_text())["seed"] for n in (1, 2)] == [0, 1]
+    assert [
+        json.loads((tmp_path / f"old-{n}" / "demo.json").read_text())["seed"] for n in (1, 2)
+    ] == [0, 1]
     assert (tmp_path / "old-2" / "seq").is_dir()
 
 

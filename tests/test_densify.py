@@ -1,4 +1,6 @@
-"""Cloning, splitting, pruning and resetting: rows and moments together, on sets small enough to check by hand."""
+"""Cloning, splitting, pruning and resetting: rows and moments together,
+on sets small enough to check by hand.
+"""
 
 import math
 from dataclasses import replace
@@ -19,7 +21,13 @@ from gftorf_warp.scene.camera import Camera
 from gftorf_warp.scene.motion import Nodes
 
 SETTINGS = DensifySettings(
-    every=100, start=250, stop_share=0.6, gradient_min=0.5, clone_scale_max=0.1, opacity_min=0.01, gaussians_min=2
+    every=100,
+    start=250,
+    stop_share=0.6,
+    gradient_min=0.5,
+    clone_scale_max=0.1,
+    opacity_min=0.01,
+    gaussians_min=2,
 )
 CAMERA = Camera(width=40, height=20, fx=30.0, fy=30.0, cx=20.0, cy=10.0)
 
@@ -27,18 +35,27 @@ CAMERA = Camera(width=40, height=20, fx=30.0, fy=30.0, cx=20.0, cy=10.0)
 def optimiser(n=6):
     """Gaussians 0..n-1 told apart by every tensor, after one step, so that moments exist."""
     start = field(random(n, 3), torch.arange(n) % 2)
-    start = replace(start, opacity_logit=torch.linspace(1.0, 3.0, n), log_scale=torch.full((n, 3), math.log(0.05)))
+    start = replace(
+        start,
+        opacity_logit=torch.linspace(1.0, 3.0, n),
+        log_scale=torch.full((n, 3), math.log(0.05)),
+    )
     result = Optimiser(start, Nodes(KEYS, random(2, 3), torch.ones(2, dtype=torch.long)))
     generator = torch.Generator().manual_seed(1)
     gradients = [torch.randn(leaf.shape, generator=generator) for leaf in result.leaves]
-    plain_adam(result, gradients, dict.fromkeys(rates_at(ReconSettings(preset="test"), 0), 1e-4), None)
+    plain_adam(
+        result, gradients, dict.fromkeys(rates_at(ReconSettings(preset="test"), 0), 1e-4), None
+    )
     return result
 
 
 def moments(optimiser):
     """Copies of Adam's state, by tensor."""
     return {
-        name: {key: value.clone() for key, value in zip(STORED, optimiser.moments_of(tensor), strict=True)}
+        name: {
+            key: value.clone()
+            for key, value in zip(STORED, optimiser.moments_of(tensor), strict=True)
+        }
         for name, tensor in optimiser.tensors.items()
     }
 
@@ -47,7 +64,9 @@ def statistics(*gradient):
     """One pixel per Gaussian, with these gradients."""
     zero = torch.zeros(len(gradient))
     one = torch.ones(len(gradient))
-    return densify.Statistics(gradient=torch.tensor(gradient), pixels=one, weight=0.25 * one, earlier=zero)
+    return densify.Statistics(
+        gradient=torch.tensor(gradient), pixels=one, weight=0.25 * one, earlier=zero
+    )
 
 
 def generator():
@@ -63,7 +82,9 @@ def test_the_statistic_is_the_pixel_weighted_mean_in_half_image_sizes():
         for values in ([[0.3, 0, 2, 0.5], [0, 0.1, 0, 0]], [[0, 0.4, 6, 3], [0, 0.2, 5, 0.25]])
     ]
     step = descent.StepResults.empty(2, 1, 2, torch.device("cpu"))
-    descent.add_statistics(screens, (CAMERA.width, CAMERA.height), step, seen.gradient, seen.pixels, seen.weight)
+    descent.add_statistics(
+        screens, (CAMERA.width, CAMERA.height), step, seen.gradient, seen.pixels, seen.weight
+    )
     assert seen.weight.tolist() == [3.5, 0.25]
     torch.testing.assert_close(seen.mean_gradient, torch.tensor([(2 * 6.0 + 6 * 4.0) / 8, 2.0]))
 
@@ -72,11 +93,15 @@ def test_a_small_gaussian_is_cloned_with_fresh_moments():
     """The others keep their values and moments."""
     adam = optimiser()
     before, old = adam.field.map(torch.clone), moments(adam)
-    counts, _ = densify.round_of(adam, statistics(0, 0, 1.0, 0, 0, 0), SETTINGS, generator(), judge_scale=False)
+    counts, _ = densify.round_of(
+        adam, statistics(0, 0, 1.0, 0, 0, 0), SETTINGS, generator(), judge_scale=False
+    )
     assert counts == {"cloned": 1, "split": 0, "pruned": 0}
     rows = torch.tensor([0, 1, 2, 3, 4, 5, 2])
     for name, value in adam.field.tensors().items():
-        torch.testing.assert_close(value.detach(), before.tensors()[name].detach()[rows], rtol=0, atol=0)
+        torch.testing.assert_close(
+            value.detach(), before.tensors()[name].detach()[rows], rtol=0, atol=0
+        )
     for name, state in moments(adam).items():
         for key in ("exp_avg", "exp_avg_sq"):
             torch.testing.assert_close(state[key][:6], old[name][key], rtol=0, atol=0)
@@ -91,9 +116,12 @@ def test_a_large_gaussian_is_split_in_two_smaller_ones_drawn_from_itself():
     with torch.no_grad():
         adam.tensors["log_scale"][1] = torch.tensor([math.log(0.4), math.log(1e-6), math.log(1e-6)])
         half = math.sqrt(0.5)
-        adam.tensors["quaternion"][1] = torch.tensor([half, 0.0, 0.0, half])  # turns its x axis to y
+        # turns its x axis to y
+        adam.tensors["quaternion"][1] = torch.tensor([half, 0.0, 0.0, half])
     before = adam.field.map(lambda t: t.detach().clone())
-    counts, _ = densify.round_of(adam, statistics(0, 9.0, 0), SETTINGS, generator(), judge_scale=False)
+    counts, _ = densify.round_of(
+        adam, statistics(0, 9.0, 0), SETTINGS, generator(), judge_scale=False
+    )
     assert counts == {"cloned": 0, "split": 1, "pruned": 0}
     after = adam.field
     torch.testing.assert_close(after.mean.detach()[:2], before.mean[[0, 2]], rtol=0, atol=0)
@@ -112,7 +140,9 @@ def test_halves_have_the_spread_of_the_original():
     n = 4000
     whole = field(torch.zeros(n, 3), None)
     whole = replace(
-        whole, log_scale=torch.tensor([0.3, 0.2, 0.1]).log().repeat(n, 1), quaternion=random(1, 4).repeat(n, 1)
+        whole,
+        log_scale=torch.tensor([0.3, 0.2, 0.1]).log().repeat(n, 1),
+        quaternion=random(1, 4).repeat(n, 1),
     )
     local = torch.randn(1, n, 3, generator=generator()) * whole.scale
     drawn = densify._turned(whole.quaternion, local)[0]
@@ -135,10 +165,14 @@ def test_faint_gaussians_are_pruned_and_the_floor_holds():
         adam.tensors["opacity_logit"][[1, 4]] = -6.0
     kept = adam.tensors["mean"].detach()[[0, 2, 3, 5]].clone()
     old = moments(adam)
-    counts, _ = densify.round_of(adam, statistics(*[0.0] * 6), SETTINGS, generator(), judge_scale=False)
+    counts, _ = densify.round_of(
+        adam, statistics(*[0.0] * 6), SETTINGS, generator(), judge_scale=False
+    )
     assert counts == {"cloned": 0, "split": 0, "pruned": 2}
     torch.testing.assert_close(adam.tensors["mean"].detach(), kept, rtol=0, atol=0)
-    torch.testing.assert_close(moments(adam)["mean"]["exp_avg"], old["mean"]["exp_avg"][[0, 2, 3, 5]])
+    torch.testing.assert_close(
+        moments(adam)["mean"]["exp_avg"], old["mean"]["exp_avg"][[0, 2, 3, 5]]
+    )
     with torch.no_grad():
         adam.tensors["opacity_logit"][:3] = -6.0
     densify.round_of(adam, statistics(*[0.0] * 4), SETTINGS, generator(), judge_scale=False)
@@ -160,7 +194,9 @@ def test_sizes_are_judged_only_when_asked():
 
 
 def test_who_was_not_seen_goes_when_the_unseen_are_judged():
-    """What was seen before the last round counts as well, copies are as seen as what they come from."""
+    """What was seen before the last round counts as well,
+    copies are as seen as what they come from.
+    """
     adam = optimiser()
     before = adam.field.mean.detach().clone()
     seen = statistics(0, 0, 1.0, 0, 0, 0)
@@ -172,7 +208,9 @@ def test_who_was_not_seen_goes_when_the_unseen_are_judged():
     seen.weight[[3, 4]] = torch.tensor([2.0, 0.125])
     with torch.no_grad():
         adam.tensors["opacity_logit"][0] = -6.0
-    counts, seen = densify.round_of(adam, seen, SETTINGS, generator(), judge_scale=False, unseen_weight=0.125)
+    counts, seen = densify.round_of(
+        adam, seen, SETTINGS, generator(), judge_scale=False, unseen_weight=0.125
+    )
     assert counts == {"cloned": 0, "split": 0, "pruned": 3}, "0 is faint, 1 and 4 are behind others"
     torch.testing.assert_close(adam.field.mean.detach(), before[[2, 3, 5, 2]], rtol=0, atol=0)
     assert seen.earlier.tolist() == [0, 0, 0, 0], "from here on it is judged anew"
@@ -180,7 +218,9 @@ def test_who_was_not_seen_goes_when_the_unseen_are_judged():
 
 @pytest.mark.parametrize("floor", [2, 65])
 def test_a_round_is_as_if_it_first_added_and_then_removed(floor):
-    """All at once and one after the other, to the bit: rows, moments, random vectors, and the sizes of halves."""
+    """All at once and one after the other, to the bit: rows, moments, random vectors,
+    and the sizes of halves.
+    """
     settings = replace(SETTINGS, opacity_min=0.3, scale_range=(0.08, 0.4), gaussians_min=floor)
     everybody = replace(settings, opacity_min=1e-6, scale_range=(1e-6, 1e6))
     found = []
@@ -201,7 +241,9 @@ def test_a_round_is_as_if_it_first_added_and_then_removed(floor):
     assert (counts["pruned"] > 20) == (floor == 2)
     for name, tensor in adam.tensors.items():
         assert torch.equal(tensor, twin.tensors[name])
-        for one, other in zip(adam.moments_of(tensor), twin.moments_of(twin.tensors[name]), strict=True):
+        for one, other in zip(
+            adam.moments_of(tensor), twin.moments_of(twin.tensors[name]), strict=True
+        ):
             assert torch.equal(one, other)
 
 
@@ -223,7 +265,9 @@ def test_the_cap_lets_the_largest_gradients_through():
     adam = optimiser()
     settings = replace(SETTINGS, gaussians_max=8)
     before = adam.field.mean.detach().clone()
-    densify.round_of(adam, statistics(0.6, 3.0, 0.7, 0.1, 2.0, 0.9), settings, generator(), judge_scale=False)
+    densify.round_of(
+        adam, statistics(0.6, 3.0, 0.7, 0.1, 2.0, 0.9), settings, generator(), judge_scale=False
+    )
     assert len(adam.field) == 8
     torch.testing.assert_close(adam.field.mean.detach()[6:], before[[1, 4]], rtol=0, atol=0)
 
@@ -260,7 +304,8 @@ def test_rounds_and_resets_are_due_when_the_schedule_says():
     assert rounds[-1] == 5900
     assert len(rounds) == 57
     resets = [n for n in range(4, 10_001, 4) if densify.reset_is_due(n - 4, n, options, schedule)]
-    assert resets == [1900, 3800]  # 5700 lies in the last tenth before the end at 6000, which is quiet
+    # 5700 lies in the last tenth before the end at 6000, which is quiet
+    assert resets == [1900, 3800]
     never = replace(options, every=None)
     assert not any(densify.round_is_due(n - 4, n, never, schedule) for n in range(4, 10_001, 4))
     assert not any(densify.reset_is_due(n - 4, n, never, schedule) for n in range(4, 10_001, 4))

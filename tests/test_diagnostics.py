@@ -1,4 +1,6 @@
-"""Diagnostics of an optimisation: rows worked out by hand, when they are due, and no byte of the run changes."""
+"""Diagnostics of an optimisation: rows worked out by hand, when they are due,
+and no byte of the run changes.
+"""
 
 import json
 import math
@@ -23,7 +25,12 @@ from gftorf_warp.scene.motion import Displacement, MotionSettings
 
 SETTINGS = demo(images=64)
 TRUTH = recording()[1]
-DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA"))]
+DEVICES = [
+    "cpu",
+    pytest.param(
+        "cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
+    ),
+]
 
 
 @pytest.fixture(scope="module")
@@ -38,11 +45,15 @@ def at_start(observations, settings=SETTINGS):
 
 
 def test_a_run_is_the_same_with_and_without_diagnostics(observations, tmp_path):
-    """Generators, moments, sums and Gaussians after some steps, to the bit: with truth, without, and unobserved."""
+    """Generators, moments, sums and Gaussians after some steps, to the bit: with truth, without,
+    and unobserved.
+    """
     results = []
     for truth in (None, TRUTH, "none"):
         state = at_start(observations)
-        diagnosed = Diagnostics(observations, None if truth == "none" else truth, tmp_path / f"{id(truth)}.jsonl")
+        diagnosed = Diagnostics(
+            observations, None if truth == "none" else truth, tmp_path / f"{id(truth)}.jsonl"
+        )
         for _ in range(4):
             before = to_dict(state)
             torch.manual_seed(1)
@@ -60,7 +71,9 @@ def test_a_run_is_the_same_with_and_without_diagnostics(observations, tmp_path):
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_a_row_reads_once_and_at_its_end(device, tmp_path):
-    """What a GPU renders is not waited for before; if there were more pairs than fit, they are counted after all."""
+    """What a GPU renders is not waited for before; if there were more pairs than fit,
+    they are counted after all.
+    """
     observations = observe(recording()[0], SETTINGS, device)
     state = begin(observations, SETTINGS, seed=0, device=device)
     diagnosed = Diagnostics(observations, TRUTH, tmp_path / "a")
@@ -73,7 +86,12 @@ def test_a_row_reads_once_and_at_its_end(device, tmp_path):
     with Reads() as reads:
         assert diagnosed.write(seen, state, SETTINGS) == pytest.approx(row, rel=1e-5)
     assert reads.found == 1 + (device != "cpu")
-    few = replace(seen, sums=dict.fromkeys(seen.sums), pairs=torch.full_like(seen.pairs, PAIRS + 1), counted=False)
+    few = replace(
+        seen,
+        sums=dict.fromkeys(seen.sums),
+        pairs=torch.full_like(seen.pairs, PAIRS + 1),
+        counted=False,
+    )
     assert diagnosed.write(few, state, SETTINGS) == pytest.approx(row, rel=1e-5)
 
 
@@ -92,7 +110,11 @@ def test_a_row_by_hand(observations, tmp_path):
         with torch.no_grad():
             delta = state.motion.at(state.binding, n / 120).offset
             seen = rasterize(
-                field.moved(delta), observations.cameras[n], sensor, SETTINGS.render, extra=delta.norm(dim=1)[:, None]
+                field.moved(delta),
+                observations.cameras[n],
+                sensor,
+                SETTINGS.render,
+                extra=delta.norm(dim=1)[:, None],
             )
         d, q = seen.distance.numpy().astype(float), seen.quads.numpy().astype(float)
         d_tof = np.angle((q[0] - q[1]) + 1j * (q[2] - q[3])) % (2 * math.pi) * 15 / (4 * math.pi)
@@ -104,7 +126,11 @@ def test_a_row_by_hand(observations, tmp_path):
             "offset": seen.extra[0].numpy() / seen.opacity.numpy(),
             "apart": np.abs(d - d_tof),
         }
-        for name, mask in (("", np.ones_like(moving[s])), ("moving.", moving[s]), ("static.", static[s])):
+        for name, mask in (
+            ("", np.ones_like(moving[s])),
+            ("moving.", moving[s]),
+            ("static.", static[s]),
+        ):
             pixels[name].append({key: image[mask] for key, image in table.items()})
 
     def mean(group, key):
@@ -113,8 +139,15 @@ def test_a_row_by_hand(observations, tmp_path):
     for group in pixels:
         want |= {f"{group}{name}_mse_x100": 100 * mean(group, name) for name in ("d", "d_tof")}
     want |= {"transmittance": mean("", "left"), "distortion": mean("", "distortion")}
-    want |= {"offset_static_m": mean("static.", "offset"), "d_minus_dtof_static_m": mean("static.", "apart")}
-    assert row == {"images": 12, "gaussians": len(field), **{k: pytest.approx(v, rel=1e-3) for k, v in want.items()}}
+    want |= {
+        "offset_static_m": mean("static.", "offset"),
+        "d_minus_dtof_static_m": mean("static.", "apart"),
+    }
+    assert row == {
+        "images": 12,
+        "gaussians": len(field),
+        **{k: pytest.approx(v, rel=1e-3) for k, v in want.items()},
+    }
     assert all(value > 0 for value in row.values()), "zeros would agree with anything"
     assert row["transmittance"] > 0.02
     assert row["moving.d_mse_x100"] > 2 * row["static.d_mse_x100"]
@@ -122,10 +155,14 @@ def test_a_row_by_hand(observations, tmp_path):
 
 
 def test_without_truth_the_errors_are_unknown_and_the_rest_is_there(observations, tmp_path):
-    """Static pixels are then those that were measured to rest; where the camera moves, there are none."""
+    """Static pixels are then those that were measured to rest; where the camera moves,
+    there are none.
+    """
     state = at_start(observations)
     row = Diagnostics(observations, None, tmp_path / "a").add(state, SETTINGS)
-    assert {name for name, value in row.items() if value is None} == {name for name in row if "mse" in name}
+    assert {name for name, value in row.items() if value is None} == {
+        name for name in row if "mse" in name
+    }
     static = measured_static(observations.sequence)
     box = np.any([image > 0.05 for image in np.abs(np.diff(TRUTH.distance, axis=0))], axis=0)
     assert 0.2 < static.mean() <= 0.5
@@ -159,7 +196,9 @@ def test_d_and_dtof_may_differ_by_a_whole_range(observations, tmp_path, monkeypa
 
     def far(*arguments, **options) -> Rendering:
         rendering = rasterize(*arguments, **options)
-        return replace(rendering, distance=rendering.distance + observations.sensor.unambiguous_range)
+        return replace(
+            rendering, distance=rendering.distance + observations.sensor.unambiguous_range
+        )
 
     near = diagnosed.add(state, SETTINGS)
     monkeypatch.setattr(diagnostics, "rasterize", far)
@@ -172,7 +211,8 @@ def test_distortion_is_in_square_metres_whatever_is_optimised(observations, tmp_
     """The released form is on another scale."""
     state, diagnosed = at_start(observations), Diagnostics(observations, TRUTH, tmp_path / "a")
     rows = [
-        diagnosed.add(state, replace(SETTINGS, render=replace(SETTINGS.render, distortion=kind))) for kind in Distortion
+        diagnosed.add(state, replace(SETTINGS, render=replace(SETTINGS.render, distortion=kind)))
+        for kind in Distortion
     ]
     assert rows[0]["distortion"] == rows[1]["distortion"] > 0
 
@@ -206,12 +246,17 @@ def test_rows_are_few_dense_at_the_start_and_there_at_the_end(observations, tmp_
 
 def test_rewinding_drops_later_rows(observations, tmp_path):
     """What was seen after the checkpoint is seen again."""
-    state, diagnosed = at_start(observations), Diagnostics(observations, TRUTH, tmp_path / "rows.jsonl")
+    state, diagnosed = (
+        at_start(observations),
+        Diagnostics(observations, TRUTH, tmp_path / "rows.jsonl"),
+    )
     for images in (0, 8, 16):
         state.images = images
         diagnosed.add(state, SETTINGS)
     diagnosed.rewind(8)
-    assert [json.loads(line)["images"] for line in (tmp_path / "rows.jsonl").read_text().splitlines()] == [0, 8]
+    assert [
+        json.loads(line)["images"] for line in (tmp_path / "rows.jsonl").read_text().splitlines()
+    ] == [0, 8]
 
 
 def test_the_frames_of_diagnostics():
@@ -227,7 +272,9 @@ def test_the_frames_of_diagnostics():
 
 
 def test_truth_is_reduced_without_inventing_distances(tmp_path):
-    """Half the size: every value is one of the four that it stands for; an error is measured against it."""
+    """Half the size: every value is one of the four that it stands for;
+    an error is measured against it.
+    """
     image = np.arange(2 * 6 * 8, dtype=float).reshape(2, 6, 8)
     small = nearest(image, 3, 4)
     assert small.shape == (2, 3, 4)
@@ -240,11 +287,15 @@ def test_truth_is_reduced_without_inventing_distances(tmp_path):
     row = Diagnostics(half, TRUTH, tmp_path / "a").add(at_start(half, settings), settings)
     assert 0 < row["static.d_mse_x100"] < 10.0, "box and wall are 1.2 m apart"
     with pytest.raises(ValueError, match="15"):
-        Diagnostics(half, Truth(distance=TRUTH.distance[:15], known=TRUTH.known[:15]), tmp_path / "a")
+        Diagnostics(
+            half, Truth(distance=TRUTH.distance[:15], known=TRUTH.known[:15]), tmp_path / "a"
+        )
 
 
 def test_a_still_motion_has_rows_too(observations, tmp_path):
     """Nothing moves, so nothing was pushed."""
     settings = replace(SETTINGS, motion=MotionSettings(kind="still"))
-    row = Diagnostics(observations, TRUTH, tmp_path / "a").add(at_start(observations, settings), settings)
+    row = Diagnostics(observations, TRUTH, tmp_path / "a").add(
+        at_start(observations, settings), settings
+    )
     assert row["offset_static_m"] == 0.0

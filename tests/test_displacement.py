@@ -1,4 +1,6 @@
-"""Displaced Gaussians by kernels against the oracle, finite differences, and rotations known otherwise."""
+"""Displaced Gaussians by kernels against the oracle, finite differences,
+and rotations known otherwise.
+"""
 
 import inspect
 import math
@@ -14,7 +16,8 @@ from gftorf_warp.scene.gaussians import product
 from gftorf_warp.scene.motion import KeyMotion
 
 N = 37
-CASES = [(1, 0, False), (2, 0, False), (3, 2, False), (2, 1, True), (4, 0, True), (6, 2, True)]  # K, D, rotations
+# K, D, rotations
+CASES = [(1, 0, False), (2, 0, False), (3, 2, False), (2, 1, True), (4, 0, True), (6, 2, True)]
 
 
 @pytest.fixture(params=DEVICES)
@@ -24,7 +27,9 @@ def device(request):
 
 
 def case(keys, channels, rotations):
-    """Float64 leaves mean, quaternion, offset and, perhaps, rotation; weights, of which row 0 sums to 1."""
+    """Float64 leaves mean, quaternion, offset and, perhaps, rotation; weights,
+    of which row 0 sums to 1.
+    """
     values = [random(N, 3), random(N, 4, seed=1), random(keys, N, 3, seed=2)]
     if rotations:
         values.append(torch.tensor([2.0, 0, 0, 0]) + random(keys, N, 4, seed=3))
@@ -39,12 +44,18 @@ def evaluated(function, values, weights, channels, used=(0, 1, 2)):
     mean, quaternion, offset, *rest = leaves
     motion = KeyMotion(offset, rest[0] if rest else None)
     results = function(mean, quaternion, motion, weights, channels=channels)
-    pairs = [(results[n], random(*results[n].shape, seed=5 + n).to(results[n])) for n in used if results[n] is not None]
+    pairs = [
+        (results[n], random(*results[n].shape, seed=5 + n).to(results[n]))
+        for n in used
+        if results[n] is not None
+    ]
     loss = sum((result * cotangent).sum() for result, cotangent in pairs)
     return results, torch.autograd.grad(loss, leaves, allow_unused=True)
 
 
-@pytest.mark.parametrize("used", [(0,), (1,), (2,), (0, 1, 2)], ids=["moved", "turned", "channels", "all"])
+@pytest.mark.parametrize(
+    "used", [(0,), (1,), (2,), (0, 1, 2)], ids=["moved", "turned", "channels", "all"]
+)
 @pytest.mark.parametrize(("keys", "channels", "rotations"), CASES)
 def test_values_and_gradients_are_the_oracles(device, keys, channels, rotations, used):
     """To float32; gradients of each result alone, absent where the oracle's are."""
@@ -78,7 +89,9 @@ def test_the_oracles_gradient_is_that_of_finite_differences(keys, channels, rota
         motion = KeyMotion(offset, rest[0] if rest else None)
         return tuple(
             result
-            for result in reference.displaced(mean, quaternion, motion, weights, channels=channels > 0)
+            for result in reference.displaced(
+                mean, quaternion, motion, weights, channels=channels > 0
+            )
             if result is not None
         )
 
@@ -96,7 +109,12 @@ def test_gradients_of_the_kernel_are_those_of_finite_differences(device):
     for sign in (1, -1):
         moved = [value.detach() + sign * h * d for value, d in zip(values, directions, strict=True)]
         results = displaced(*moved[:2], KeyMotion(*moved[2:]), weights, channels=True)
-        ends.append(sum(float((r.double() * random(*r.shape, seed=5 + n).to(r)).sum()) for n, r in enumerate(results)))
+        ends.append(
+            sum(
+                float((r.double() * random(*r.shape, seed=5 + n).to(r)).sum())
+                for n, r in enumerate(results)
+            )
+        )
     assert abs(slope) > 1.0
     assert (ends[0] - ends[1]) / (2 * h) == pytest.approx(slope, rel=5e-3)
 
@@ -114,9 +132,13 @@ def test_without_rotations_orientations_are_the_same_tensor(device):
 
 
 def test_halfway_between_two_rotations_is_half_the_angle(device):
-    """A quarter turn about z at the second key is an eighth of a turn halfway, for any quaternion it is applied to."""
+    """A quarter turn about z at the second key is an eighth of a turn halfway,
+    for any quaternion it is applied to.
+    """
     half = math.pi / 4
-    rotation = torch.tensor([[1.0, 0, 0, 0], [math.cos(half), 0, 0, math.sin(half)]], device=device)[:, None]
+    rotation = torch.tensor(
+        [[1.0, 0, 0, 0], [math.cos(half), 0, 0, math.sin(half)]], device=device
+    )[:, None]
     own = torch.tensor([[0.5, 0.5, -0.5, 0.5]], device=device)
     zero = torch.zeros(2, 1, 3, device=device)
     weights = torch.tensor([[0.5, 0.5]], device=device)
@@ -149,4 +171,6 @@ def test_numbers_of_keys_that_disagree_and_float64_are_refused():
     with pytest.raises(ValueError, match=r"weights \(1, 2\) must be \(1 \+ D, 3\)"):
         displaced(mean, quaternion, KeyMotion(offset, None), weights[:, :2].float(), channels=False)
     with pytest.raises(ValueError, match="float32"):
-        displaced(mean, quaternion, KeyMotion(offset.double(), None), weights.float(), channels=False)
+        displaced(
+            mean, quaternion, KeyMotion(offset.double(), None), weights.float(), channels=False
+        )

@@ -1,4 +1,6 @@
-"""Predicted noise against what the read-out does, against published numbers, and its derivatives."""
+"""Predicted noise against what the read-out does, against published numbers,
+and its derivatives.
+"""
 
 import math
 from dataclasses import replace
@@ -61,13 +63,19 @@ def test_prediction_is_the_spread_of_the_read_out(count, unipolar):
 
 
 def test_three_shifts_of_one_tap_depend_on_the_phase():
-    """Sensor notes, 2.5: the variance is lower where cos(3 psi) is 1; nothing else depends on it."""
-    low, high = (float(phase_noise(1e4, 4.5e3, 50.0, 3, taps=1, phase=psi)) for psi in (0.0, math.pi / 3))
+    """Sensor notes, 2.5: the variance is lower where cos(3 psi) is 1;
+    nothing else depends on it.
+    """
+    low, high = (
+        float(phase_noise(1e4, 4.5e3, 50.0, 3, taps=1, phase=psi)) for psi in (0.0, math.pi / 3)
+    )
     mean = float(phase_noise(1e4, 4.5e3, 50.0, 3, taps=1))
     assert low < mean < high
     assert low**2 + high**2 == pytest.approx(2 * mean**2)
     assert low / mean == pytest.approx(math.sqrt(1 - 4.5e3 / (2 * 12500)))
-    assert float(phase_noise(1e4, 4.5e3, 50.0, 4, taps=1, phase=0.0)) == float(phase_noise(1e4, 4.5e3, 50.0, 4, taps=1))
+    assert float(phase_noise(1e4, 4.5e3, 50.0, 4, taps=1, phase=0.0)) == float(
+        phase_noise(1e4, 4.5e3, 50.0, 4, taps=1)
+    )
     for wrong in ({"samples": 2}, {"samples": 4, "taps": 3}):
         with pytest.raises(ValueError, match="at least 3 samples"):
             phase_noise(1e4, 4.5e3, 50.0, **wrong)
@@ -105,9 +113,17 @@ def test_a_unipolar_sensor_knows_the_ambient_level():
     """What it writes down has no ambient light in it on average, whatever a pixel reflects."""
     sensor = Sensor(noise=True, unipolar=True, dc_offset=2.0, ambient_electrons=3e4, adc_bits=None)
     share = np.linspace(0.0, 1.0, DRAWS)[None]
-    quad = read_out(np.full((1, DRAWS), 0.2), np.full((1, DRAWS), 0.1), sensor, np.random.default_rng(0), ambient=share)
+    quad = read_out(
+        np.full((1, DRAWS), 0.2),
+        np.full((1, DRAWS), 0.1),
+        sensor,
+        np.random.default_rng(0),
+        ambient=share,
+    )
     for half in (quad.quad[0, : DRAWS // 2], quad.quad[0, DRAWS // 2 :]):
-        assert half.mean(dtype=np.float64) == pytest.approx(0.2, abs=4 * float(half.std()) / math.sqrt(DRAWS / 2))
+        assert half.mean(dtype=np.float64) == pytest.approx(
+            0.2, abs=4 * float(half.std()) / math.sqrt(DRAWS / 2)
+        )
 
 
 def test_contrast_falls_with_the_frequency():
@@ -121,7 +137,9 @@ def test_contrast_falls_with_the_frequency():
 
 
 def test_derivative_of_the_noise_by_the_frequency():
-    """Sensor notes, T29: -sigma_d (1/f + C'/C), float64 1e-6; the least noise is at the cutoff of the contrast."""
+    """Sensor notes, T29: -sigma_d (1/f + C'/C), float64 1e-6;
+    the least noise is at the cutoff of the contrast.
+    """
     for f in (20e6, 100e6, 303e6, 500e6):
         value = torch.tensor(f, dtype=torch.float64, requires_grad=True)
         sigma = predicted_distance_noise(0.1, replace(SENSORS["mlx75027"], f_mod_hz=value))

@@ -1,4 +1,6 @@
-"""gamma(x) and gamma(t) in the precision of a step: by one kernel and by torch, within a half of what float64 gives."""
+"""gamma(x) and gamma(t) in the precision of a step: by one kernel and by torch,
+within a half of what float64 gives.
+"""
 
 import math
 
@@ -14,23 +16,37 @@ from gftorf_warp.render.tensor_cores import FusedLayers
 from gftorf_warp.scene.encoding import encoded, powers_of_two
 from gftorf_warp.scene.motion import MotionSettings
 
-DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA"))]
+DEVICES = [
+    "cpu",
+    pytest.param(
+        "cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
+    ),
+]
 LENGTH = 7.5
 
 
 def halves_between(one, other):
-    """How many halves lie between two tensors of halves, element by element: 0 means equal, 1 neighbours."""
-    ordered = [torch.where(bits < 0, -32768 - bits, bits) for bits in (t.view(torch.int16).int() for t in (one, other))]
+    """How many halves lie between two tensors of halves, element by element: 0 means equal,
+    1 neighbours.
+    """
+    ordered = [
+        torch.where(bits < 0, -32768 - bits, bits)
+        for bits in (t.view(torch.int16).int() for t in (one, other))
+    ]
     return (ordered[0] - ordered[1]).abs()
 
 
 def wanted(mean, frequencies, columns):
-    """Rounded once: float32 positions over a length in float32, as both ways begin, everything else in float64."""
+    """Rounded once: float32 positions over a length in float32, as both ways begin,
+    everything else in float64.
+    """
     return encoded((mean / LENGTH).double(), frequencies, columns=columns).half()
 
 
 def anywhere(count):
-    """Positions within metres, far away, next to zero, and where waves of high frequency are near zero [m]."""
+    """Positions within metres, far away, next to zero,
+    and where waves of high frequency are near zero [m].
+    """
     rows = random(count, 3) * 12 - 6
     rows[::5] *= 50
     rows[1::5] *= 1e-6
@@ -46,7 +62,11 @@ def test_a_kernel_encodes_to_the_last_half(count, frequencies, columns, device):
     """Arguments of 20,000 rad and of 1e-9 alike; zeros behind the values, nothing unwritten."""
     mean = anywhere(count)
     powers = powers_of_two(frequencies).to(device)
-    got = FusedLayers().encode(mean.to(device), LENGTH, powers, columns=columns, dtype=torch.float16).cpu()
+    got = (
+        FusedLayers()
+        .encode(mean.to(device), LENGTH, powers, columns=columns, dtype=torch.float16)
+        .cpu()
+    )
     want = wanted(mean, frequencies, columns)
     assert got.shape == (count, columns)
     assert got.dtype == torch.float16
@@ -58,10 +78,13 @@ def test_a_kernel_encodes_to_the_last_half(count, frequencies, columns, device):
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_torch_and_the_kernel_encode_alike(device):
-    """On a GPU torch multiplies by 1 / length, so that arguments of both differ by a rounding, 2^9 times."""
+    """On a GPU torch multiplies by 1 / length, so that arguments of both differ by a rounding,
+    2^9 times.
+    """
     mean, powers = anywhere(500).to(device), powers_of_two(10).to(device)
     one, other = (
-        way.encode(mean, LENGTH, powers, columns=64, dtype=torch.float16) for way in (FusedLayers(), CublasLayers())
+        way.encode(mean, LENGTH, powers, columns=64, dtype=torch.float16)
+        for way in (FusedLayers(), CublasLayers())
     )
     if device == "cpu":
         assert halves_between(one, other).max() <= 1
@@ -78,7 +101,10 @@ def test_positions_may_lie_apart_and_may_be_none():
         got = FusedLayers().encode(rows, LENGTH, powers, columns=64, dtype=torch.float16)
         assert got.shape == (len(rows), 64)
         assert torch.equal(
-            got, FusedLayers().encode(rows.contiguous(), LENGTH, powers, columns=64, dtype=torch.float16)
+            got,
+            FusedLayers().encode(
+                rows.contiguous(), LENGTH, powers, columns=64, dtype=torch.float16
+            ),
         )
 
 
@@ -108,10 +134,17 @@ def test_a_network_is_encoded_by_its_backend(monkeypatch):
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("settings", [MotionSettings(), half()], ids=["float32", "half"])
 def test_times_are_rounded_once_and_in_advance(settings, device):
-    """Rows chosen in float32 are the rows chosen in float64 and rounded then, to the bit, and so are offsets."""
-    made, gaussians = network(settings).to(device), field(anywhere(20), None).map(lambda value: value.to(device))
+    """Rows chosen in float32 are the rows chosen in float64 and rounded then, to the bit,
+    and so are offsets.
+    """
+    made, gaussians = (
+        network(settings).to(device),
+        field(anywhere(20), None).map(lambda value: value.to(device)),
+    )
     assert torch.equal(made.time_encodings_f32, made.time_encodings.float())
-    assert not torch.equal(made.time_encodings_f32.double(), made.time_encodings), "otherwise nothing was rounded"
+    assert not torch.equal(made.time_encodings_f32.double(), made.time_encodings), (
+        "otherwise nothing was rounded"
+    )
     binding = made.bind(gaussians)
     for keys in ([0, 2, 3], torch.tensor([3, 0], dtype=torch.int32, device=device)):
         want = made.offsets(binding, made.time_encodings[keys])

@@ -37,7 +37,9 @@ def test_a_sequence_is_written(tmp_path):
 
 
 def test_a_sequence_is_read_and_motion_breaks_its_closed_form(tmp_path, capsys):
-    """Far from where something moves the closed form is right, at an outline it is off by decimetres."""
+    """Far from where something moves the closed form is right,
+    at an outline it is off by decimetres.
+    """
     path = load("03_simulate").simulate("sliding", tmp_path / "sliding", frames=4, size=(48, 36))
     assert load("04_read_and_check").main(path) > 0.3
     assert "quads: file" in capsys.readouterr().out

@@ -32,7 +32,9 @@ def test_atomic_write_replaces_and_leaves_nothing_else(tmp_path):
 def test_a_failed_write_keeps_the_old_content(tmp_path, monkeypatch):
     """A disk that fails to flush costs the new content only."""
     atomic_write(tmp_path / "a.bin", b"old")
-    monkeypatch.setattr(os, "fsync", lambda _: (_ for _ in ()).throw(OSError(28, "No space left on device")))
+    monkeypatch.setattr(
+        os, "fsync", lambda _: (_ for _ in ()).throw(OSError(28, "No space left on device"))
+    )
     with pytest.raises(ResourceError) as caught:
         atomic_write(tmp_path / "a.bin", b"new")
     assert caught.value.exit_code == 5
@@ -41,9 +43,12 @@ def test_a_failed_write_keeps_the_old_content(tmp_path, monkeypatch):
     assert names(tmp_path) == ["a.bin"]
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="limits of file size are tested where the system has them")
+@pytest.mark.skipif(
+    sys.platform != "linux", reason="limits of file size are tested where the system has them"
+)
 @pytest.mark.parametrize(
-    "write", ["atomic_write(sys.argv[1], content.tobytes())", "write_exr(sys.argv[1], {'a': content})"]
+    "write",
+    ["atomic_write(sys.argv[1], content.tobytes())", "write_exr(sys.argv[1], {'a': content})"],
 )
 def test_a_full_disk_is_an_error_with_exit_code_5(tmp_path, write):
     """A limit on the size of files stands in for a full disk."""
@@ -59,7 +64,8 @@ def test_a_full_disk_is_an_error_with_exit_code_5(tmp_path, write):
         "try:\n    {write}\n"
         "except ResourceError as error:\n    sys.exit(error.exit_code)\n"
     ).replace("{write}", write)
-    command = [sys.executable, "-B", "-c", program, str(tmp_path / "a.bin")]  # -B: no bytecode cut off by the limit
+    # -B: no bytecode cut off by the limit
+    command = [sys.executable, "-B", "-c", program, str(tmp_path / "a.bin")]
     done = subprocess.run(command, check=False, capture_output=True)
     assert done.returncode == 5, done.stderr
     assert names(tmp_path) == []
@@ -67,7 +73,11 @@ def test_a_full_disk_is_an_error_with_exit_code_5(tmp_path, write):
 
 def test_a_missing_folder_is_a_usage_error(tmp_path):
     """Whoever writes, the place is named."""
-    for write, content in ((atomic_write, b"x"), (write_json, {}), (write_exr, {"a": np.zeros((2, 3))})):
+    for write, content in (
+        (atomic_write, b"x"),
+        (write_json, {}),
+        (write_exr, {"a": np.zeros((2, 3))}),
+    ):
         with pytest.raises(UsageError) as caught:
             write(tmp_path / "nowhere" / "a.bin", content)
         assert caught.value.exit_code == 2
@@ -78,16 +88,30 @@ def test_leftovers_of_dead_processes_are_swept_and_of_living_ones_kept(tmp_path)
     """Only temporaries of the same name whose process is gone."""
     dead = subprocess.Popen([sys.executable, "-c", ""])
     dead.wait()
-    for name in (f".a.bin.tmp-{dead.pid}-0", f".a.bin.tmp-{os.getpid()}-999999", f".b.bin.tmp-{dead.pid}-0"):
+    for name in (
+        f".a.bin.tmp-{dead.pid}-0",
+        f".a.bin.tmp-{os.getpid()}-999999",
+        f".b.bin.tmp-{dead.pid}-0",
+    ):
         (tmp_path / name).write_bytes(b"half")
     (tmp_path / f".a.bin.tmp-{dead.pid}-1").mkdir()
     atomic_write(tmp_path / "a.bin", b"whole")
-    assert names(tmp_path) == [f".a.bin.tmp-{os.getpid()}-999999", f".b.bin.tmp-{dead.pid}-0", "a.bin"]
+    assert names(tmp_path) == [
+        f".a.bin.tmp-{os.getpid()}-999999",
+        f".b.bin.tmp-{dead.pid}-0",
+        "a.bin",
+    ]
 
 
 def test_json_is_plain_and_refuses_what_json_cannot_say(tmp_path):
     """Numbers of numpy and paths become plain values; NaN and objects are mistakes."""
-    content = {"a": np.float32(0.5), "b": np.arange(2), "c": tmp_path, "d": None, "e": np.bool_(True)}
+    content = {
+        "a": np.float32(0.5),
+        "b": np.arange(2),
+        "c": tmp_path,
+        "d": None,
+        "e": np.bool_(True),
+    }
     write_json(tmp_path / "m.json", content)
     assert json.loads((tmp_path / "m.json").read_text()) == {
         "a": 0.5,
@@ -136,11 +160,18 @@ def test_a_folder_is_never_overwritten(tmp_path):
 
 
 @settings(max_examples=25, deadline=None, derandomize=True, database=None)
-@given(height=st.integers(1, 9), width=st.integers(1, 9), count=st.integers(1, 5), seed=st.integers(0, 2**16))
+@given(
+    height=st.integers(1, 9),
+    width=st.integers(1, 9),
+    count=st.integers(1, 5),
+    seed=st.integers(0, 2**16),
+)
 def test_exr_gives_back_every_bit(tmp_path_factory, height, width, count, seed):
     """Any size, any number of channels, NaN included."""
     generator = np.random.default_rng(seed)
-    images = {f"part.{n}": generator.normal(size=(height, width)).astype(np.float32) for n in range(count)}
+    images = {
+        f"part.{n}": generator.normal(size=(height, width)).astype(np.float32) for n in range(count)
+    }
     images["part.0"].flat[0] = np.nan
     path = tmp_path_factory.mktemp("exr") / "a.exr"
     write_exr(path, images)
@@ -151,12 +182,19 @@ def test_exr_gives_back_every_bit(tmp_path_factory, height, width, count, seed):
         np.testing.assert_array_equal(back[name], image)
 
 
-@pytest.mark.parametrize("names", [["distance", "opacity"], ["quad_000", "B", "a.b", "é"], ["n" * 32, "n" * 31]])
+@pytest.mark.parametrize(
+    "names", [["distance", "opacity"], ["quad_000", "B", "a.b", "é"], ["n" * 32, "n" * 31]]
+)
 def test_exr_is_what_openexr_itself_writes_uncompressed(tmp_path, names):
-    """Byte by byte, names of any length and order included; so whatever reads that library's files reads ours."""
+    """Byte by byte, names of any length and order included;
+    so whatever reads that library's files reads ours.
+    """
     import OpenEXR
 
-    images = {name: np.random.default_rng(k).random((5, 7), dtype=np.float32) for k, name in enumerate(names)}
+    images = {
+        name: np.random.default_rng(k).random((5, 7), dtype=np.float32)
+        for k, name in enumerate(names)
+    }
     header = {"compression": OpenEXR.NO_COMPRESSION, "type": OpenEXR.scanlineimage}
     with OpenEXR.File(header, dict(images)) as file:
         file.write(str(tmp_path / "theirs.exr"))
@@ -167,14 +205,20 @@ def test_exr_is_what_openexr_itself_writes_uncompressed(tmp_path, names):
 def test_exr_of_slices_flips_and_fortran_order_holds_the_right_pixels(tmp_path):
     """OpenEXR's own writer puts wrong pixels there, and says nothing."""
     whole = np.arange(48.0).reshape(6, 8)
-    images = {"slice": whole[::2, 1::3], "flip": whole[2::-1, 2::-1], "fortran": np.asfortranarray(whole[:3, :3])}
+    images = {
+        "slice": whole[::2, 1::3],
+        "flip": whole[2::-1, 2::-1],
+        "fortran": np.asfortranarray(whole[:3, :3]),
+    }
     write_exr(tmp_path / "a.exr", images)
     for name, image in read_exr(tmp_path / "a.exr").items():
         np.testing.assert_array_equal(image, images[name].astype(np.float32), err_msg=name)
     assert names(tmp_path) == ["a.exr"]
 
 
-@pytest.mark.parametrize("images", [{}, {"a": np.zeros((2, 3)), "b": np.zeros((3, 2))}, {"a": np.zeros(4)}])
+@pytest.mark.parametrize(
+    "images", [{}, {"a": np.zeros((2, 3)), "b": np.zeros((3, 2))}, {"a": np.zeros(4)}]
+)
 def test_exr_needs_images_of_one_size(tmp_path, images):
     """Anything else is a programming mistake."""
     with pytest.raises(ValueError, match="one shape"):
@@ -185,7 +229,9 @@ def test_exr_needs_images_of_one_size(tmp_path, images):
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 0.999])
 def test_a_truncated_exr_is_refused(tmp_path, share):
     """The library returns the parts it could read, and no error."""
-    write_exr(tmp_path / "a.exr", {n: np.random.default_rng(0).normal(size=(40, 30)) for n in "RGB"})
+    write_exr(
+        tmp_path / "a.exr", {n: np.random.default_rng(0).normal(size=(40, 30)) for n in "RGB"}
+    )
     data = (tmp_path / "a.exr").read_bytes()
     (tmp_path / "a.exr").write_bytes(data[: int(share * len(data))])
     with pytest.raises(InputError) as caught:
@@ -232,7 +278,9 @@ def test_png_of_numbered_colours_is_that_picture(height, width, colours):
     np.testing.assert_array_equal(
         cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)[..., ::-1], palette[index]
     )
-    np.testing.assert_array_equal(np.round(255 * mpl.imread(io.BytesIO(content))[..., :3]), palette[index])
+    np.testing.assert_array_equal(
+        np.round(255 * mpl.imread(io.BytesIO(content))[..., :3]), palette[index]
+    )
 
 
 def test_numbered_colours_are_bytes():

@@ -1,4 +1,6 @@
-"""Optical flow from quads: against the exact flow of the sample, and against motion that the test makes."""
+"""Optical flow from quads: against the exact flow of the sample,
+and against motion that the test makes.
+"""
 
 import dataclasses
 
@@ -23,16 +25,25 @@ def sample():
 
 def texture(x, y):
     """A smooth signed pattern of three waves."""
-    return np.sin(0.5 * x + 0.3 * y) + np.sin(0.21 * x - 0.45 * y + 1.0) + np.sin(0.7 * y + 0.17 * x + 2.0)
+    return (
+        np.sin(0.5 * x + 0.3 * y)
+        + np.sin(0.21 * x - 0.45 * y + 1.0)
+        + np.sin(0.7 * y + 0.17 * x + 2.0)
+    )
 
 
-def moving(velocity, frames=12, height=48, width=64, times=None, noise=0.0, gains=(1.0, -0.6, 0.8, -1.1)):
-    """A sequence whose whole picture moves by ``velocity`` [px] per quartet; slots differ in contrast and sign."""
+def moving(
+    velocity, frames=12, height=48, width=64, times=None, noise=0.0, gains=(1.0, -0.6, 0.8, -1.1)
+):
+    """A sequence whose whole picture moves by ``velocity`` [px] per quartet;
+    slots differ in contrast and sign.
+    """
     times = np.arange(frames) / 120.0 if times is None else times
     quartets = times * 30.0
     y, x = np.indices((height, width))
     quads = [
-        gains[n % 4] * texture(x - velocity[0] * quartets[n], y - velocity[1] * quartets[n]) for n in range(frames)
+        gains[n % 4] * texture(x - velocity[0] * quartets[n], y - velocity[1] * quartets[n])
+        for n in range(frames)
     ]
     quads += noise * np.random.default_rng(0).normal(size=(frames, height, width))
     sequence, _ = scene(frames, height, width)
@@ -47,7 +58,9 @@ def inner_error(flow, velocity, border=8):
 
 @pytest.mark.parametrize("direction", ["forward", "backward"])
 def test_flow_of_the_sample_is_close_to_the_exact_one(sample, direction):
-    """A textured box that moves by 6 to 10 px in four frames, towards the camera too; the same frames as the file's."""
+    """A textured box that moves by 6 to 10 px in four frames, towards the camera too;
+    the same frames as the file's.
+    """
     sequence, computed = sample
     exact, got = getattr(sequence.flow, direction), getattr(computed, direction)
     assert got.keys() == exact.keys()
@@ -88,12 +101,16 @@ def test_neighbouring_pairs_reduce_the_noise():
     """The first quartet has three pairs to vote, a lone pair only itself."""
     velocity = (2.0, 1.0)
     many = compute_flow(moving(velocity, frames=12, noise=0.3)).forward[4]
-    one = compute_flow(dataclasses.replace(moving(velocity, frames=12, noise=0.3), measured=np.arange(12) % 4 == 0))
+    one = compute_flow(
+        dataclasses.replace(moving(velocity, frames=12, noise=0.3), measured=np.arange(12) % 4 == 0)
+    )
     assert inner_error(many, velocity)[0] < 0.8 * inner_error(one.forward[4], velocity)[0]
 
 
 def test_frames_of_one_instant_are_read_where_they_are():
-    """In a synchronous recording the four pairs of a quartet saw the same motion at the same place."""
+    """In a synchronous recording the four pairs of a quartet saw the same motion at the same
+    place.
+    """
     times = np.repeat(np.arange(3), 4) / 30.0
     velocity = (2.5, -1.0)
     computed = compute_flow(moving(velocity, times=times))
@@ -104,13 +121,17 @@ def test_frames_of_one_instant_are_read_where_they_are():
 
 @pytest.mark.parametrize("step", [4, -4])
 def test_pairs_vote_where_the_surface_was_at_their_time(step):
-    """A window that moves by 2 px per frame over a still wall, with exact flow: all of it keeps its motion."""
+    """A window that moves by 2 px per frame over a still wall, with exact flow:
+    all of it keeps its motion.
+    """
     x = np.indices((8, 60))[1]
     sign = np.sign(step)
     exact = {}
     for n in range(4, 8):
         inside = abs(x - 20 - 2 * n) < 7
-        exact[n] = np.stack([np.where(inside, 8.0 * sign, 0.0), np.zeros(x.shape)]).astype(np.float32)
+        exact[n] = np.stack([np.where(inside, 8.0 * sign, 0.0), np.zeros(x.shape)]).astype(
+            np.float32
+        )
     got = flow_module.median_flow(4, exact, exact, np.arange(12) / 120.0, step)
     window = exact[4][0] != 0
     assert window.any()
@@ -128,7 +149,9 @@ def test_accelerated_motion_is_not_taken_for_its_later_speed():
 
 
 def test_missing_frames_leave_out_their_pairs():
-    """A start or partner that was not measured has no flow; a missing neighbour only loses its vote."""
+    """A start or partner that was not measured has no flow;
+    a missing neighbour only loses its vote.
+    """
     measured = np.ones(16, dtype=bool)
     measured[[4, 9]] = False
     sequence = moving((2.0, 0.0), frames=16)
@@ -150,23 +173,34 @@ def test_what_does_not_come_back_is_unknown():
 
 
 def test_scale_offset_and_a_hot_pixel_do_not_matter():
-    """Quads have arbitrary units and a constant part; one broken pixel must not darken all others."""
+    """Quads have arbitrary units and a constant part; one broken pixel must not darken all
+    others.
+    """
     sequence, velocity = moving((2.0, 1.0)), (2.0, 1.0)
     quads = 1e-4 * sequence.quads + 7.0
     quads[:, 20, 30] = 1000.0
-    assert inner_error(compute_flow(dataclasses.replace(sequence, quads=quads)).forward[4], velocity)[0] < 0.2
+    assert (
+        inner_error(compute_flow(dataclasses.replace(sequence, quads=quads)).forward[4], velocity)[
+            0
+        ]
+        < 0.2
+    )
 
 
 def test_dark_recordings_do_not_move():
     """No light, no division by zero: flow is zero."""
-    computed = compute_flow(dataclasses.replace(scene(8, 48, 64)[0], quads=np.zeros((8, 48, 64), np.float32)))
+    computed = compute_flow(
+        dataclasses.replace(scene(8, 48, 64)[0], quads=np.zeros((8, 48, 64), np.float32))
+    )
     assert not computed.forward[0].any()
 
 
 def test_deepflow_follows_small_motion():
     """The other method, on motion it was made for."""
     velocity = (1.5, -1.0)
-    error, known = inner_error(compute_flow(moving(velocity), method="deepflow").forward[4], velocity)
+    error, known = inner_error(
+        compute_flow(moving(velocity), method="deepflow").forward[4], velocity
+    )
     assert error < 0.3
     assert known > 0.95
 

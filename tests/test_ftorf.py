@@ -5,7 +5,15 @@ import shutil
 
 import numpy as np
 import pytest
-from ftorf_folder import REAL_ORDER, SAMPLE, assert_same, assert_same_bits, fingerprint, random_poses, scene
+from ftorf_folder import (
+    REAL_ORDER,
+    SAMPLE,
+    assert_same,
+    assert_same_bits,
+    fingerprint,
+    random_poses,
+    scene,
+)
 from sequences import NAMES
 
 from gftorf_warp import Sequence
@@ -30,7 +38,9 @@ def folder(original, tmp_path):
 
 
 def test_the_sample_is_read_as_it_is_described():
-    """Sizes, calibration and flow of the sample, with half-integer pixel centres because cx is half the width."""
+    """Sizes, calibration and flow of the sample, with half-integer pixel centres because cx is
+    half the width.
+    """
     sequence = Sequence.open(SAMPLE)
     assert (sequence.frames, sequence.height, sequence.width) == (32, 120, 160)
     assert sequence.measured.all()
@@ -59,15 +69,34 @@ def test_reading_twice_changes_nothing_on_disk(folder):
 
 
 def test_without_calibration_the_defaults_are_used_and_named(tmp_path):
-    """Absent scalars: offset 0, no gain, 15 m, 120 Hz, default order, identity poses, each said to be a default."""
-    folder = write("ftorf", tmp_path / "seq", *scene(phase_offset=0.0, dc_offset=0.0, permutation=(0, 1, 2, 3)))
-    for name in ("depth_range", "phase_offset", "dc_offset", "frame_times", "tof_extrinsics", "color_intrinsics"):
+    """Absent scalars: offset 0, no gain, 15 m, 120 Hz, default order, identity poses,
+    each said to be a default.
+    """
+    folder = write(
+        "ftorf", tmp_path / "seq", *scene(phase_offset=0.0, dc_offset=0.0, permutation=(0, 1, 2, 3))
+    )
+    for name in (
+        "depth_range",
+        "phase_offset",
+        "dc_offset",
+        "frame_times",
+        "tof_extrinsics",
+        "color_intrinsics",
+    ):
         (folder / f"cams/{name}.npy").unlink()
     (folder / "cams/poses.json").unlink()
     (folder / "tof_permutation.npy").unlink()
     got = Sequence.open(folder)
     assert_same(got, scene(phase_offset=0.0, dc_offset=0.0, permutation=(0, 1, 2, 3))[0])
-    for name in ("f_mod_hz", "phase_offset", "dc_offset", "times", "camera_from_world", "shifts", "quad_scale"):
+    for name in (
+        "f_mod_hz",
+        "phase_offset",
+        "dc_offset",
+        "times",
+        "camera_from_world",
+        "shifts",
+        "quad_scale",
+    ):
         assert got.sources[name].startswith("default"), name
 
 
@@ -75,18 +104,24 @@ def test_every_field_of_a_sequence_names_its_source(folder):
     """Whatever the reader fills, it says where it is from, in one of four words."""
     got = Sequence.open(folder)
     assert set(got.sources) >= NAMES
-    assert all(text.split()[0] in {"file", "default", "inferred", "setting"} for text in got.sources.values())
+    assert all(
+        text.split()[0] in {"file", "default", "inferred", "setting"}
+        for text in got.sources.values()
+    )
 
 
 @pytest.mark.parametrize(
     ("permutation", "order"),
     [
         (REAL_ORDER, [MINUS_COS, PLUS_SIN, PLUS_COS, MINUS_SIN]),
-        ((1, 3, 0, 2), [PLUS_SIN, PLUS_COS, MINUS_SIN, MINUS_COS]),  # sine first, as the literature prints it
+        # sine first, as the literature prints it
+        ((1, 3, 0, 2), [PLUS_SIN, PLUS_COS, MINUS_SIN, MINUS_COS]),
     ],
 )
 def test_permutation_is_canonical_from_raw(tmp_path, permutation, order):
-    """The file means canonical = raw[permutation]: the order of the real recordings and of the paper, spelled out."""
+    """The file means canonical = raw[permutation]: the order of the real recordings and of the
+    paper, spelled out.
+    """
     sequence, _ = scene(permutation=(0, 1, 2, 3))
     folder = write("ftorf", tmp_path / "seq", sequence)
     np.save(folder / "tof_permutation.npy", np.array(permutation))
@@ -137,7 +172,9 @@ def test_colour_of_three_equal_channels_is_called_amplitude(tmp_path):
 
 
 def test_flow_of_the_second_folder_counts_only_if_the_first_is_empty(folder):
-    """forward_flow_2 before forward_flow; NaN stays NaN; frames behind the end are dropped and said to be."""
+    """forward_flow_2 before forward_flow; NaN stays NaN;
+    frames behind the end are dropped and said to be.
+    """
     flow = np.full((2, 6, 8), 2.0, np.float32)
     flow[0, 1, 2] = np.nan
     (folder / "forward_flow").mkdir()
@@ -167,17 +204,27 @@ def test_any_real_type_and_memory_order_is_read(tmp_path, dtype, order):
 
 @pytest.mark.parametrize(
     ("centre", "cx", "added"),
-    [("integer", 4.0, 0.5), ("half", 4.0, 0.0), (None, 4.0, 0.0), (None, 3.5, 0.5), (None, 3.9, 0.5)],
+    [
+        ("integer", 4.0, 0.5),
+        ("half", 4.0, 0.0),
+        (None, 4.0, 0.0),
+        (None, 3.5, 0.5),
+        (None, 3.9, 0.5),
+    ],
 )
 def test_pixel_centres_follow_the_file_then_cx(folder, centre, cx, added):
-    """The width is 8: without a file, cx = 4 means half-integer centres and is kept, anything else gets 0.5."""
+    """The width is 8: without a file, cx = 4 means half-integer centres and is kept,
+    anything else gets 0.5.
+    """
     np.save(folder / "cams/tof_intrinsics.npy", np.array([[9.0, 0, cx], [0, 9.0, 2.5], [0, 0, 1]]))
     (folder / "cams/pixel_centre.json").unlink()
     if centre:
         (folder / "cams/pixel_centre.json").write_text(json.dumps({"pixel_centre": centre}))
     got = Sequence.open(folder)
     assert (got.intrinsics.cx, got.intrinsics.cy) == (cx + added, 2.5 + added)
-    assert got.sources["pixel_centre"].startswith("file cams/pixel_centre.json" if centre else "inferred from cx")
+    assert got.sources["pixel_centre"].startswith(
+        "file cams/pixel_centre.json" if centre else "inferred from cx"
+    )
 
 
 def test_matlab_calibration_is_read_like_numpy(folder):
@@ -192,7 +239,12 @@ def test_matlab_calibration_is_read_like_numpy(folder):
         (folder / f"cams/{name}.npy").unlink()
         scipy.io.savemat(folder / f"cams/{name}.mat", {key: value}, do_compression=True)
     got = Sequence.open(folder)
-    assert (got.intrinsics.fx, got.intrinsics.fy, got.intrinsics.cx, got.intrinsics.cy) == (9.0, 8.0, 4.5, 3.5)
+    assert (got.intrinsics.fx, got.intrinsics.fy, got.intrinsics.cx, got.intrinsics.cy) == (
+        9.0,
+        8.0,
+        4.5,
+        3.5,
+    )
     assert (got.calibration.phase_offset, got.calibration.f_mod_hz) == (0.25, SPEED_OF_LIGHT / 10)
     assert got.sources["phase_offset"] == "file cams/phase_offset.mat"
 
@@ -211,7 +263,9 @@ def test_frame_rate_is_the_file_s_unless_one_is_given(folder):
 
 
 def test_poses_count_only_where_the_folder_says_so(folder):
-    """F-TöRF cameras stand still: stored poses are ignored, and that is reported, unless cams/poses.json is there."""
+    """F-TöRF cameras stand still: stored poses are ignored, and that is reported,
+    unless cams/poses.json is there.
+    """
     poses = np.tile(np.eye(4), (8, 1, 1))
     poses[:, 0, 3] = np.arange(8)
     np.save(folder / "cams/tof_extrinsics.npy", poses)
@@ -229,10 +283,14 @@ def colour_at(height, width):
 
 
 def test_the_colour_camera_is_that_of_the_files(folder):
-    """Intrinsics in the pixel centres of the folder; poses only where the folder says that poses count."""
+    """Intrinsics in the pixel centres of the folder; poses only where the folder says that poses
+    count.
+    """
     (folder / "color").mkdir()
     np.save(folder / "color/0000.npy", colour_at(12, 16)[0])
-    np.save(folder / "cams/color_intrinsics.npy", np.array([[20.0, 0, 7.0], [0, 21.0, 5.0], [0, 0, 1]]))
+    np.save(
+        folder / "cams/color_intrinsics.npy", np.array([[20.0, 0, 7.0], [0, 21.0, 5.0], [0, 0, 1]])
+    )
     poses = np.tile(np.eye(4), (8, 1, 1))
     poses[:, 0, 3] = 0.05
     np.save(folder / "cams/color_extrinsics.npy", poses)
@@ -242,12 +300,19 @@ def test_the_colour_camera_is_that_of_the_files(folder):
     (folder / "cams/pixel_centre.json").write_text('{"pixel_centre": "half"}')
     assert Sequence.open(folder).colour.intrinsics == Intrinsics(fx=20.0, fy=21.0, cx=7.0, cy=5.0)
     (folder / "cams/poses.json").unlink()
-    np.testing.assert_array_equal(Sequence.open(folder).colour.camera_from_world, np.tile(np.eye(4), (8, 1, 1)))
+    np.testing.assert_array_equal(
+        Sequence.open(folder).colour.camera_from_world, np.tile(np.eye(4), (8, 1, 1))
+    )
 
 
 def test_without_its_files_the_colour_camera_is_the_tof_camera(folder):
-    """Intrinsics scaled to the colour image and flagged, poses those of the ToF camera; none without colour."""
-    assert (Sequence.open(folder).colour.intrinsics, Sequence.open(folder).colour.camera_from_world) == (None, None)
+    """Intrinsics scaled to the colour image and flagged, poses those of the ToF camera;
+    none without colour.
+    """
+    assert (
+        Sequence.open(folder).colour.intrinsics,
+        Sequence.open(folder).colour.camera_from_world,
+    ) == (None, None)
     (folder / "color").mkdir()
     np.save(folder / "color/0000.npy", colour_at(12, 24)[0])
     for name in ("color_intrinsics", "color_extrinsics"):
@@ -266,13 +331,16 @@ def test_novel_views_are_read_in_every_shape(folder, shape):
     """Rows and columns beyond the rotation and the translation are left out or made up."""
     want = random_poses(5, np.random.default_rng(1))
     np.save(
-        folder / "test_poses.npy", np.concatenate([want, np.full((5, 4, 1), 7.0)], axis=2)[:, : shape[0], : shape[1]]
+        folder / "test_poses.npy",
+        np.concatenate([want, np.full((5, 4, 1), 7.0)], axis=2)[:, : shape[0], : shape[1]],
     )
     np.testing.assert_array_equal(Sequence.open(folder).novel_from_world, want)
 
 
 def test_truth_masks_what_nobody_knows(folder):
-    """Frames without a file are unknown, and so are pixels of NaN or 0; frames after the sequence are not read."""
+    """Frames without a file are unknown, and so are pixels of NaN or 0;
+    frames after the sequence are not read.
+    """
     image = np.full((6, 8), 2.0, np.float32)
     image[0, 0], image[1, 1] = np.nan, 0.0
     np.save(folder / "synthetic_depth/0001.npy", image)

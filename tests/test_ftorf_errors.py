@@ -1,4 +1,6 @@
-"""Bad input ends in one named error: file, field, expected, found, what to do, exit code 3, and nothing written."""
+"""Bad input ends in one named error: file, field, expected, found, what to do, exit code 3,
+and nothing written.
+"""
 
 import contextlib
 import json
@@ -26,7 +28,9 @@ FLOW = np.zeros((2, 6, 8), np.float32)
 def original(tmp_path_factory):
     """A complete folder with colour and flow."""
     colour = {n: np.full((6, 8, 3), 0.1 * n, np.float32) for n in range(8)}
-    sequence, truth = scene(colour=colour, forward_flow={0: FLOW}, backward_flow={4: FLOW}, quad_scale=2.0)
+    sequence, truth = scene(
+        colour=colour, forward_flow={0: FLOW}, backward_flow={4: FLOW}, quad_scale=2.0
+    )
     return write("ftorf", tmp_path_factory.mktemp("original") / "seq", sequence, truth)
 
 
@@ -127,12 +131,24 @@ def test_no_frame_of_its_own_slot_is_no_raw_frame(folder):
         (QUAD, np.full((6, 8), "1"), ["quads", "<U1"]),
         (QUAD, np.zeros((0, 8), np.float32), ["quads", "(0, 8)"]),
         (QUAD, np.full((6, 8), 1e300), ["quads", "float32"]),
-        (QUAD, np.where(np.arange(48).reshape(6, 8) == 19, np.nan, 1.0), ["quads", "nan", "[2, 3]", "1 values"]),
-        (QUAD, np.where(np.arange(48).reshape(6, 8) > 45, -np.inf, 1.0), ["quads", "-inf", "[5, 6]", "2 values"]),
+        (
+            QUAD,
+            np.where(np.arange(48).reshape(6, 8) == 19, np.nan, 1.0),
+            ["quads", "nan", "[2, 3]", "1 values"],
+        ),
+        (
+            QUAD,
+            np.where(np.arange(48).reshape(6, 8) > 45, -np.inf, 1.0),
+            ["quads", "-inf", "[5, 6]", "2 values"],
+        ),
         ("color/0003.npy", np.zeros((6, 9, 3), np.float32), ["colour", "(6, 9, 3)"]),
         ("color/0003.npy", np.zeros((6, 8), np.float32), ["colour", "(6, 8)"]),
         ("color/0003.npy", np.full((6, 8, 3), np.nan), ["colour", "nan"]),
-        ("forward_flow_2/flow_0000.npy", np.zeros((6, 8, 2), np.float32), ["forward_flow", "(2, 6, 8)", "(6, 8, 2)"]),
+        (
+            "forward_flow_2/flow_0000.npy",
+            np.zeros((6, 8, 2), np.float32),
+            ["forward_flow", "(2, 6, 8)", "(6, 8, 2)"],
+        ),
         ("forward_flow_2/flow_0000.npy", np.zeros((2, 6, 8), int), ["forward_flow", "int64"]),
         ("backward_flow_2/flow_0004.npy", np.full((2, 6, 8), np.inf), ["backward_flow", "inf"]),
         ("tof_permutation.npy", np.array([0, 1, 2, 2]), ["unknown permutation", "[0, 1, 2, 2]"]),
@@ -146,24 +162,56 @@ def test_no_frame_of_its_own_slot_is_no_raw_frame(folder):
         ("cams/depth_range.npy", np.float64(np.nan), ["depth_range", "nan"]),
         ("cams/phase_offset.npy", np.float64(np.inf), ["phase_offset", "inf"]),
         ("cams/dc_offset.npy", np.array("0"), ["dc_offset", "<U1"]),
-        ("cams/quad_values_scale_factor.npy", np.float64(0.0), ["quad_values_scale_factor", "found 0"]),
+        (
+            "cams/quad_values_scale_factor.npy",
+            np.float64(0.0),
+            ["quad_values_scale_factor", "found 0"],
+        ),
         ("cams/tof_intrinsics.npy", np.eye(2), ["tof_intrinsics", "(3, 3)", "(2, 2)"]),
         ("cams/tof_intrinsics.npy", np.diag([0.2, 0.2, 1.0]), ["implausible intrinsics", "0.2"]),
         ("cams/tof_intrinsics.npy", np.diag([-9.0, 9.0, 1.0]), ["implausible intrinsics", "-9"]),
-        ("cams/tof_intrinsics.npy", np.array([[9.0, 0, 0], [0, 9, 0], [4, 3, 1]]), ["implausible", "transposed"]),
-        ("cams/tof_intrinsics.npy", np.array([[9.0, 1, 4], [0, 9, 3], [0, 0, 1]]), ["implausible", "skew"]),
+        (
+            "cams/tof_intrinsics.npy",
+            np.array([[9.0, 0, 0], [0, 9, 0], [4, 3, 1]]),
+            ["implausible", "transposed"],
+        ),
+        (
+            "cams/tof_intrinsics.npy",
+            np.array([[9.0, 1, 4], [0, 9, 3], [0, 0, 1]]),
+            ["implausible", "skew"],
+        ),
         ("cams/tof_extrinsics.npy", np.tile(np.eye(4), (7, 1, 1)), ["tof_extrinsics", "8", "7"]),
-        ("cams/tof_extrinsics.npy", np.tile(2 * np.eye(4), (8, 1, 1)), ["tof_extrinsics", "rotations", "2.0"]),
-        ("cams/tof_extrinsics.npy", np.tile(np.diag([1.0, 1, -1, 1]), (8, 1, 1)), ["tof_extrinsics", "determinant"]),
+        (
+            "cams/tof_extrinsics.npy",
+            np.tile(2 * np.eye(4), (8, 1, 1)),
+            ["tof_extrinsics", "rotations", "2.0"],
+        ),
+        (
+            "cams/tof_extrinsics.npy",
+            np.tile(np.diag([1.0, 1, -1, 1]), (8, 1, 1)),
+            ["tof_extrinsics", "determinant"],
+        ),
         ("cams/tof_extrinsics.npy", np.full((8, 4, 4), 1e200), ["tof_extrinsics", "rotations"]),
-        ("cams/color_extrinsics.npy", np.tile(np.eye(4), (7, 1, 1)), ["color_extrinsics", "8", "7"]),
-        ("cams/color_extrinsics.npy", np.tile(2 * np.eye(4), (8, 1, 1)), ["color_extrinsics", "rotations"]),
+        (
+            "cams/color_extrinsics.npy",
+            np.tile(np.eye(4), (7, 1, 1)),
+            ["color_extrinsics", "8", "7"],
+        ),
+        (
+            "cams/color_extrinsics.npy",
+            np.tile(2 * np.eye(4), (8, 1, 1)),
+            ["color_extrinsics", "rotations"],
+        ),
         ("cams/color_intrinsics.npy", np.diag([0.2, 0.2, 1.0]), ["implausible intrinsics", "0.2"]),
         ("test_poses.npy", np.tile(2 * np.eye(4), (2, 1, 1)), ["test_poses", "rotations"]),
         ("test_poses.npy", np.eye(4), ["test_poses", "(M, 3, 4)", "(4, 4)"]),
         ("cams/frame_times.npy", np.arange(7.0), ["frame_times", "8", "7"]),
         ("cams/frame_times.npy", np.arange(8.0) + 1, ["frame_times", "start at 0"]),
-        ("cams/frame_times.npy", np.array([0, 1, 2, 3, 2.5, 5, 6, 7]), ["frame_times", "after frame 3"]),
+        (
+            "cams/frame_times.npy",
+            np.array([0, 1, 2, 3, 2.5, 5, 6, 7]),
+            ["frame_times", "after frame 3"],
+        ),
     ],
 )
 def test_a_wrong_array_is_named_with_field_expected_and_found(folder, name, array, words):
@@ -174,16 +222,21 @@ def test_a_wrong_array_is_named_with_field_expected_and_found(folder, name, arra
 
 
 @pytest.mark.parametrize(
-    "name", [QUAD, "tofType0/0000.npy", "cams/dc_offset.npy", "cams/tof_extrinsics.npy", "color/0000.npy"]
+    "name",
+    [QUAD, "tofType0/0000.npy", "cams/dc_offset.npy", "cams/tof_extrinsics.npy", "color/0000.npy"],
 )
-@pytest.mark.parametrize("content", [b"", b"1 2 3\n4 5 6\n", b"\x93NUMPY", b"\x93NUMPY\x09\x00v\x00", npy("(6, 8")])
+@pytest.mark.parametrize(
+    "content", [b"", b"1 2 3\n4 5 6\n", b"\x93NUMPY", b"\x93NUMPY\x09\x00v\x00", npy("(6, 8")]
+)
 def test_text_and_other_files_where_an_array_should_be(folder, name, content):
     """Anything without a sound header, from an empty file to a damaged one."""
     (folder / name).write_bytes(content)
     assert_names(refused(folder), name, "not a .npy array", "numpy.save")
 
 
-@pytest.mark.parametrize("name", [QUAD, "cams/phase_offset.npy", "tof_permutation.npy", "forward_flow_2/flow_0000.npy"])
+@pytest.mark.parametrize(
+    "name", [QUAD, "cams/phase_offset.npy", "tof_permutation.npy", "forward_flow_2/flow_0000.npy"]
+)
 @pytest.mark.parametrize("wrapped", [True, False])
 def test_pickles_are_refused_and_never_run(folder, name, wrapped):
     """As an array of objects, and as a bare pickle."""
@@ -214,7 +267,9 @@ def test_pickles_are_refused_and_never_run(folder, name, wrapped):
 )
 @pytest.mark.parametrize("name", ["tofType0/0000.npy", QUAD])
 def test_forged_headers_are_refused_before_memory_is_allocated(folder, name, shape, descr):
-    """The first file of a recording sets the size, so its own header must be judged by the file's length."""
+    """The first file of a recording sets the size, so its own header must be judged by the file's
+    length.
+    """
     (folder / name).write_bytes(npy(shape, descr, bytes(6 * 8 * 4)))
     error = refused(folder)
     assert name in str(error), error
@@ -241,7 +296,9 @@ def test_every_truncation_of_a_quad_is_refused(folder):
     st.booleans(),
 )
 def test_a_mutated_header_is_refused_or_read_as_numbers(tmp_path_factory, changes, matlab):
-    """Whatever bytes change, there is a checked array or a named error: no other exception, no objects, no warning."""
+    """Whatever bytes change, there is a checked array or a named error: no other exception,
+    no objects, no warning.
+    """
     name = "tof_intrinsics" if matlab else "quads"
     path = tmp_path_factory.getbasetemp() / ("mutated.mat" if matlab else "mutated.npy")
     spec = specs.fields("ftorf")[name]
@@ -389,4 +446,6 @@ def test_errors_are_one_line_of_json_when_asked_for(folder):
     """Their parts are plain text, so that a command can print them as it likes."""
     (folder / QUAD).write_text("text")
     error = refused(folder)
-    assert json.loads(json.dumps([error.what, error.where, error.why, error.fix]))[1] == str(folder / QUAD)
+    assert json.loads(json.dumps([error.what, error.where, error.why, error.fix]))[1] == str(
+        folder / QUAD
+    )

@@ -1,4 +1,6 @@
-"""Writing an F-TöRF folder: the inverse of reading it, described to the last file, and refused where it cannot hold."""
+"""Writing an F-TöRF folder: the inverse of reading it, described to the last file,
+and refused where it cannot hold.
+"""
 
 import dataclasses
 import json
@@ -8,7 +10,15 @@ from unittest import mock
 
 import numpy as np
 import pytest
-from ftorf_folder import CAPTURE_ONLY, SAMPLE, assert_same, assert_same_bits, fingerprint, random_poses, scene
+from ftorf_folder import (
+    CAPTURE_ONLY,
+    SAMPLE,
+    assert_same,
+    assert_same_bits,
+    fingerprint,
+    random_poses,
+    scene,
+)
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from sequences import NAMES, changed, sequence_of
@@ -31,12 +41,18 @@ def folder(tmp_path):
 @st.composite
 def sequences(draw):
     """Sequences in which nothing is trivial, with truth."""
-    frames, height, width = draw(st.integers(1, 11)), draw(st.integers(1, 4)), draw(st.integers(1, 5))
+    frames, height, width = (
+        draw(st.integers(1, 11)),
+        draw(st.integers(1, 4)),
+        draw(st.integers(1, 5)),
+    )
     generator = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     permutation = draw(st.permutations(range(4)))
     measured = np.array(draw(st.lists(st.booleans(), min_size=frames, max_size=frames)))
     measured[draw(st.integers(0, frames - 1))] = True
-    quads = (generator.normal(size=(frames, height, width)) * 10.0 ** draw(st.integers(-30, 30))).astype(np.float32)
+    quads = (
+        generator.normal(size=(frames, height, width)) * 10.0 ** draw(st.integers(-30, 30))
+    ).astype(np.float32)
     quads[~measured] = 0.0
     poses = random_poses(frames, generator)
     steps = generator.random(frames - 1) * (generator.random(frames - 1) < 0.5)
@@ -46,7 +62,11 @@ def sequences(draw):
         result = {}
         for n in draw(st.lists(st.integers(0, frames - 1), unique=True)):
             image = generator.normal(size=shape).astype(np.float32)
-            result[n] = np.where(generator.random(shape) < 0.2, np.float32(np.nan), image) if unknown else image
+            result[n] = (
+                np.where(generator.random(shape) < 0.2, np.float32(np.nan), image)
+                if unknown
+                else image
+            )
         return dict(sorted(result.items()))
 
     colour = images(draw(st.integers(1, 3)), draw(st.integers(1, 3)), 3, unknown=False)
@@ -81,10 +101,18 @@ def sequences(draw):
 @settings(max_examples=60, deadline=None, derandomize=True, database=None)
 @given(sequences())
 def test_write_then_read_is_the_identity(tmp_path_factory, drawn):
-    """Images bit by bit in float32, calibration in float64, whatever is missing; and a second round too."""
+    """Images bit by bit in float32, calibration in float64, whatever is missing;
+    and a second round too.
+    """
     sequence, truth = drawn
     with mock.patch("os.fsync"):  # waiting for the disk, thousands of times, shows nothing here
-        first = write("ftorf", tmp_path_factory.mktemp("round") / "first", sequence, truth, readme="# a card\n")
+        first = write(
+            "ftorf",
+            tmp_path_factory.mktemp("round") / "first",
+            sequence,
+            truth,
+            readme="# a card\n",
+        )
         got = Sequence.open(first)
         again = write("ftorf", first.parent / "second", got, got.truth())
     assert_same(got, sequence)
@@ -99,19 +127,25 @@ def test_write_then_read_is_the_identity(tmp_path_factory, drawn):
 
 
 def test_the_sample_survives_a_round(tmp_path):
-    """Read, write, read: every bit of the sample, though the writer stores other pixel centres and states them."""
+    """Read, write, read: every bit of the sample, though the writer stores other pixel centres and
+    states them.
+    """
     want = Sequence.open(SAMPLE)
     folder = write("ftorf", tmp_path / "seq", want, want.truth())
     got = Sequence.open(folder)
     assert_same(got, want)
     assert_same_bits(got.truth().distance, want.truth().distance, "distance")
     assert np.load(folder / "cams/tof_intrinsics.npy")[:2, 2].tolist() == [79.5, 59.5]
-    assert json.loads((folder / "cams/pixel_centre.json").read_text()) == {"pixel_centre": "integer"}
+    assert json.loads((folder / "cams/pixel_centre.json").read_text()) == {
+        "pixel_centre": "integer"
+    }
     assert np.load(folder / "color/0000.npy").dtype == np.float16
 
 
 def test_everything_written_is_described(folder):
-    """No file of the writer lacks an entry in data_specs/, and its type is one that the entry allows."""
+    """No file of the writer lacks an entry in data_specs/,
+    and its type is one that the entry allows.
+    """
     described = {
         pattern.replace("{slot}", str(slot)): field
         for field in specs.fields("ftorf").values()
@@ -128,7 +162,9 @@ def test_everything_written_is_described(folder):
 
 
 def test_descriptions_cover_the_sequence_and_the_truth():
-    """Every field of Sequence and Truth is filled from a described one, and no description fills anything else."""
+    """Every field of Sequence and Truth is filled from a described one,
+    and no description fills anything else.
+    """
     filled = {name for field in specs.fields("ftorf").values() for name in field.fills}
     assert filled == (NAMES | {f.name for f in dataclasses.fields(Truth)}) - CAPTURE_ONLY
     for field in specs.fields("ftorf").values():
@@ -140,14 +176,25 @@ def test_descriptions_cover_the_sequence_and_the_truth():
 
 
 def test_the_page_beside_the_descriptions_names_every_field():
-    """data_specs/README.md mentions every path, and the wheel carries the description where the reader looks."""
+    """data_specs/README.md mentions every path, and the wheel carries the description where the
+    reader looks.
+    """
     page = (ROOT / "data_specs" / "README.md").read_text(encoding="utf-8")
     for field in specs.fields("ftorf").values():
         assert all(f"`{path}`" in page for path in field.paths), field.name
-    included = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["hatch"]["build"]["targets"]["wheel"]
+    included = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["hatch"]["build"][
+        "targets"
+    ]["wheel"]
     names = [path.name for path in (ROOT / "data_specs").glob("*.toml")]
-    assert included["force-include"] == {f"data_specs/{name}": f"gftorf_warp/data/specs/{name}" for name in names}
-    assert (specs.INSTALLED / "ftorf.toml").parts[-4:] == ("gftorf_warp", "data", "specs", "ftorf.toml")
+    assert included["force-include"] == {
+        f"data_specs/{name}": f"gftorf_warp/data/specs/{name}" for name in names
+    }
+    assert (specs.INSTALLED / "ftorf.toml").parts[-4:] == (
+        "gftorf_warp",
+        "data",
+        "specs",
+        "ftorf.toml",
+    )
 
 
 def poses_with(**changes):

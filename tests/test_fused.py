@@ -1,4 +1,6 @@
-"""Kernels of a training step beside rendering, against plain torch in float64, torch's Adam and published numbers."""
+"""Kernels of a training step beside rendering, against plain torch in float64,
+torch's Adam and published numbers.
+"""
 
 import math
 
@@ -12,8 +14,10 @@ from gftorf_warp.losses.image import similarity
 from gftorf_warp.recon.settings import Norm
 from gftorf_warp.render import descent, fused
 
-SIZES = [(1, 120, 160), (3, 37, 53), (2, 9, 11), (1, 5, 16), (1, 12, 33)]  # shorter than a window, than a block, odd
-PHILOX_OF_ZERO = (0x6627E8D5, 0xE169C58D, 0xBC57AC4C, 0x9B00DBD8)  # Random123's known answer for key and counter 0
+# shorter than a window, than a block, odd
+SIZES = [(1, 120, 160), (3, 37, 53), (2, 9, 11), (1, 5, 16), (1, 12, 33)]
+# Random123's known answer for key and counter 0
+PHILOX_OF_ZERO = (0x6627E8D5, 0xE169C58D, 0xBC57AC4C, 0x9B00DBD8)
 
 
 @pytest.fixture(params=DEVICES)
@@ -45,9 +49,14 @@ def oracle(rendered, measured, ssim, norm):
 @pytest.mark.parametrize("block", [16, 1], ids=["vectors", "pixels"])
 @pytest.mark.parametrize("shape", SIZES, ids=str)
 def test_loss_of_an_image_is_the_oracles(monkeypatch, device, shape, block, smooth, norm):
-    """Value to 1e-5, gradient to 2e-6 of its largest, 3e-5 where variance cancels: in blocks and pixel by pixel."""
+    """Value to 1e-5, gradient to 2e-6 of its largest, 3e-5 where variance cancels:
+    in blocks and pixel by pixel.
+    """
     monkeypatch.setattr(training, "BLOCK", block)
-    rendered, measured = image(shape, 1, smooth).to(device).requires_grad_(), image(shape, 2, smooth).to(device)
+    rendered, measured = (
+        image(shape, 1, smooth).to(device).requires_grad_(),
+        image(shape, 2, smooth).to(device),
+    )
     loss, squared, _ = fused.image_loss(rendered, measured, 0.2, absolute=norm == Norm.L1)
     (gradient,) = torch.autograd.grad(3.0 * loss, rendered)
     want, want_squared, want_gradient = oracle(rendered.detach(), measured, 0.2, norm)
@@ -55,29 +64,44 @@ def test_loss_of_an_image_is_the_oracles(monkeypatch, device, shape, block, smoo
     torch.testing.assert_close(squared.double(), want_squared, rtol=1e-5, atol=0)
     scale = float(want_gradient.abs().max())
     assert scale > 1e-2 / rendered.numel(), "a gradient of zero would pass any test"
-    torch.testing.assert_close(gradient.double() / 3, want_gradient, rtol=1e-5, atol=(3e-5 if smooth else 2e-6) * scale)
+    torch.testing.assert_close(
+        gradient.double() / 3, want_gradient, rtol=1e-5, atol=(3e-5 if smooth else 2e-6) * scale
+    )
     assert not squared.requires_grad
 
 
 def test_its_gradient_is_that_of_finite_differences(device):
-    """Along a random direction and along the gradient itself, where it must be the square of its length."""
-    rendered, measured = image((1, 24, 40), 1).to(device).requires_grad_(), image((1, 24, 40), 2).to(device)
+    """Along a random direction and along the gradient itself,
+    where it must be the square of its length.
+    """
+    rendered, measured = (
+        image((1, 24, 40), 1).to(device).requires_grad_(),
+        image((1, 24, 40), 2).to(device),
+    )
     loss, *_ = fused.image_loss(rendered, measured, 0.6)
     (gradient,) = torch.autograd.grad(loss, rendered)
     assert gradient.norm() > 1e-3
     for direction in (gradient / gradient.abs().max(), image((1, 24, 40), 3).to(device)):
         h = 2e-3
-        ends = [fused.image_loss(rendered.detach() + s * h * direction, measured, 0.6)[0].double() for s in (1, -1)]
+        ends = [
+            fused.image_loss(rendered.detach() + s * h * direction, measured, 0.6)[0].double()
+            for s in (1, -1)
+        ]
         slope = float(ends[0] - ends[1]) / (2 * h)
         assert slope == pytest.approx(float((gradient * direction).sum()), rel=5e-3, abs=2e-4)
 
 
 def test_without_a_similarity_only_the_difference_is_left(device):
     """Share 0, in closed form: 2 (r - m) / n; share 1 of equal images: nothing is left at all."""
-    rendered, measured = image((2, 20, 30), 1).to(device).requires_grad_(), image((2, 20, 30), 2).to(device)
+    rendered, measured = (
+        image((2, 20, 30), 1).to(device).requires_grad_(),
+        image((2, 20, 30), 2).to(device),
+    )
     loss, squared, _ = fused.image_loss(rendered, measured, 0.0)
     (gradient,) = torch.autograd.grad(loss, rendered)
-    torch.testing.assert_close(gradient, 2 * (rendered - measured).detach() / rendered.numel(), rtol=1e-5, atol=1e-9)
+    torch.testing.assert_close(
+        gradient, 2 * (rendered - measured).detach() / rendered.numel(), rtol=1e-5, atol=1e-9
+    )
     torch.testing.assert_close(loss, squared)
     loss, *_ = fused.image_loss(measured.clone().requires_grad_(), measured, 1.0)
     assert abs(float(loss.detach())) < 1e-5
@@ -98,9 +122,14 @@ def test_bright_images_of_little_contrast_cancel_no_worse_than_in_torch(device, 
 
 @pytest.mark.parametrize("shape", [(1, 37, 53), (2, 9, 11), (1, 12, 33)], ids=str)
 def test_a_row_of_many_images_is_compared_in_kept_memory(device, shape):
-    """As that row alone, to the bit, also in planes that a loss before has used; the opacity is summed up beside it."""
+    """As that row alone, to the bit, also in planes that a loss before has used;
+    the opacity is summed up beside it.
+    """
     measured = torch.stack([image(shape, n) for n in range(2, 5)]).to(device)
-    rendered, opacity = image(shape, 1).to(device).requires_grad_(), image((1, *shape[1:]), 5)[0].to(device)
+    rendered, opacity = (
+        image(shape, 1).to(device).requires_grad_(),
+        image((1, *shape[1:]), 5)[0].to(device),
+    )
     scratch, out = fused.Scratch(), torch.zeros(3, device=device)
     for n in (2, 0):
         row = torch.tensor([n], dtype=torch.int32, device=device)
@@ -131,7 +160,9 @@ def origin(seed, number, device="cpu"):
 
 
 def test_noise_begins_with_the_known_answer(device):
-    """The first four pixels are the published words of Philox 4x32-10 for a key and a counter of zero."""
+    """The first four pixels are the published words of Philox 4x32-10 for a key and a counter of
+    zero.
+    """
     drawn = fused.uniform((1, 1, 4), origin(0, 0, device), 3.0).flatten().double().cpu().numpy()
     words = np.array(PHILOX_OF_ZERO, dtype=np.uint64) >> np.uint64(9)
     np.testing.assert_allclose(drawn, 3.0 * (2.0 * (words + 0.5) * 2.0**-23 - 1.0), rtol=1e-6)
@@ -141,8 +172,13 @@ def test_noise_depends_on_seed_image_stream_channel_and_pixel_only(device):
     """Not on how many channels or pixels are asked for; and on each of the five."""
     whole = fused.uniform((3, 10, 7), origin(5, 9, device), 1.0)
     assert torch.equal(fused.uniform((2, 10, 7), origin(5, 9, device), 1.0), whole[:2])
-    assert torch.equal(fused.uniform((3, 1, 33), origin(5, 9, device), 1.0).flatten(1), whole.flatten(1)[:, :33])
-    others = [fused.uniform((3, 10, 7), origin(*names, device), 1.0) for names in ((6, 9), (5, 10), (9, 5))]
+    assert torch.equal(
+        fused.uniform((3, 1, 33), origin(5, 9, device), 1.0).flatten(1), whole.flatten(1)[:, :33]
+    )
+    others = [
+        fused.uniform((3, 10, 7), origin(*names, device), 1.0)
+        for names in ((6, 9), (5, 10), (9, 5))
+    ]
     others.append(fused.uniform((3, 10, 7), origin(5, 9, device), 1.0, stream=1))
     for other in others:
         assert (other != whole).float().mean() > 0.99
@@ -150,12 +186,18 @@ def test_noise_depends_on_seed_image_stream_channel_and_pixel_only(device):
 
 
 def test_noise_is_uniform_and_without_memory(device):
-    """Moments, a histogram and correlations of 300,000 values, each within five standard deviations."""
-    first, second = (fused.uniform((3, 250, 400), origin(11, n, device), 2.0).double().flatten() for n in (0, 1))
+    """Moments, a histogram and correlations of 300,000 values,
+    each within five standard deviations.
+    """
+    first, second = (
+        fused.uniform((3, 250, 400), origin(11, n, device), 2.0).double().flatten() for n in (0, 1)
+    )
     n = first.numel()
     assert first.abs().max() < 2.0
     assert abs(float(first.mean())) < 5 * 2.0 / math.sqrt(3 * n)
-    assert float(first.square().mean()) == pytest.approx(4 / 3, abs=5 * 4 * math.sqrt((1 / 5 - 1 / 9) / n))
+    assert float(first.square().mean()) == pytest.approx(
+        4 / 3, abs=5 * 4 * math.sqrt((1 / 5 - 1 / 9) / n)
+    )
     counts = torch.histc(first.float().cpu(), bins=64, min=-2.0, max=2.0).double()
     assert float(((counts - n / 64).square() / (n / 64)).sum()) < 63 + 5 * math.sqrt(2 * 63)
     for other in (second, first.roll(1), first.roll(4), first.roll(400), first.roll(100_000)):
@@ -178,11 +220,14 @@ def adam_case(device):
 
 def moments_of(values):
     """Zero moments, as torch's Adam keeps them."""
-    return [(torch.zeros((), device=x.device), torch.zeros_like(x), torch.zeros_like(x)) for x in values]
+    return [
+        (torch.zeros((), device=x.device), torch.zeros_like(x), torch.zeros_like(x)) for x in values
+    ]
 
 
 def one_step(values, gradients, moments, rates, images=1, motion_from=None, longest=None):
-    """A step with everything in device memory, after images whose loss is zero; whether it was valid.
+    """A step with everything in device memory, after images whose loss is zero; whether it was
+    valid.
 
     ``gradients`` are one list or, as a tuple, several of which the sum counts.
     """
@@ -234,11 +279,14 @@ def test_adam_is_torchs_over_fifty_steps(monkeypatch, device, block):
 
 @pytest.mark.parametrize("images", [1, 2, 3, 4])
 def test_gradients_of_several_images_count_as_their_sum(device, images):
-    """In Adam, in the length of what is shortened and in what is valid; whoever of them has none, the others count."""
+    """In Adam, in the length of what is shortened and in what is valid; whoever of them has none,
+    the others count.
+    """
     values, rates, gradients = adam_case(device)
     lists = tuple(gradients() for _ in range(images))
     for n, found in enumerate(lists[:-1]):
-        found[n], found[4] = None, None  # one that another image has, and one that the last image alone has
+        # one that another image has, and one that the last image alone has
+        found[n], found[4] = None, None
     sums = [sum(g for g in each if g is not None) for each in zip(*lists, strict=True)]
     ends = []
     for given in (lists, sums):
@@ -251,7 +299,9 @@ def test_gradients_of_several_images_count_as_their_sum(device, images):
         for x, y in zip(one, other, strict=True):
             torch.testing.assert_close(x, y, rtol=1e-5, atol=1e-12)
     moved = float(torch.cat([first.flatten() for _, _, first, _ in ends[0][1:]]).norm())
-    assert moved == pytest.approx(0.19 * 1e-3, rel=0.01), "the gradient was shortened by the length of the sum"
+    assert moved == pytest.approx(0.19 * 1e-3, rel=0.01), (
+        "the gradient was shortened by the length of the sum"
+    )
     lists[-1][-1] = torch.full_like(values[-1], math.inf)
     assert not one_step(values, lists, moments_of(values), rates, images)
 
@@ -261,7 +311,9 @@ def test_adam_rests_at_rate_zero_and_when_a_step_is_invalid(device):
     values, rates, gradients = adam_case(device)
     moments = moments_of(values)
     assert one_step(values, gradients(), moments, rates)
-    before = [[x.clone() for x in (value, *kept)] for value, kept in zip(values, moments, strict=True)]
+    before = [
+        [x.clone() for x in (value, *kept)] for value, kept in zip(values, moments, strict=True)
+    ]
     assert not one_step(values, [g * math.nan for g in gradients()], moments, rates)
     for old, value, kept in zip(before, values, moments, strict=True):
         assert all(torch.equal(x, y) for x, y in zip(old, (value, *kept), strict=True))

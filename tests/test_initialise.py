@@ -51,7 +51,9 @@ def test_noise_is_measured_and_most_of_the_wall_rests():
     change = measured.change_of(sequence)
     assert change.noise == pytest.approx(NOISE, rel=0.25)
     noise = NOISE * np.random.default_rng(5).standard_normal(sequence.quads.shape)
-    resting = measured.change_of(recording(quads=(sequence.quads[:1] + noise).astype(np.float32))[0])
+    resting = measured.change_of(
+        recording(quads=(sequence.quads[:1] + noise).astype(np.float32))[0]
+    )
     assert resting.noise == pytest.approx(NOISE, rel=0.03)
     assert resting.changed.float().mean() < 0.001
     boxes = np.stack([seen(n)[2] for n in range(FRAMES)]).any(axis=0)
@@ -68,7 +70,9 @@ def test_decoding_along_the_flow_has_no_motion_artefact(order):
     ahead, behind = (measured.flow_at(sequence, 2, step, points) for step in (1, -1))
     distance, amplitude = measured.decode_along_flow(sequence, 2, points, ahead, behind)
     true, reflectivity, box = seen(8)
-    interior = box & np.roll(box, 2, 1) & np.roll(box, -2, 1) & np.roll(box, 2, 0) & np.roll(box, -2, 0)
+    interior = (
+        box & np.roll(box, 2, 1) & np.roll(box, -2, 1) & np.roll(box, 2, 0) & np.roll(box, -2, 0)
+    )
     error = np.abs(distance.numpy().reshape(HEIGHT, WIDTH) - true)[interior]
     naive = np.abs(closed_form_distance(sequence, 2) - true)[interior]
     assert naive.mean() > 0.01
@@ -97,7 +101,10 @@ def test_two_layers_where_wall_and_box_are(order):
     frame = 4 * start.quartet
     true, reflectivity, box = seen(frame)
     camera = measured.camera_of(sequence, frame)
-    static, moving = (start.field.map(lambda t, at=start.field.layer == label: t[at]) for label in (STATIC, MOVING))
+    static, moving = (
+        start.field.map(lambda t, at=start.field.layer == label: t[at])
+        for label in (STATIC, MOVING)
+    )
     x, y = camera.project(moving.mean).long().unbind(dim=1)
     on_box = box[y.numpy(), x.numpy()]
     assert on_box.mean() > 0.9
@@ -147,7 +154,9 @@ def test_unproject_is_the_inverse_of_projection():
     camera = measured.camera_of(recording()[0], 0).at(
         np.array([[0, 1, 0, 0.1], [-1, 0, 0, 0.2], [0, 0, 1, 0.3], [0, 0, 0, 1.0]])
     )
-    points = torch.rand(7, 2, generator=torch.Generator().manual_seed(0)) * torch.tensor([WIDTH, HEIGHT])
+    points = torch.rand(7, 2, generator=torch.Generator().manual_seed(0)) * torch.tensor(
+        [WIDTH, HEIGHT]
+    )
     world = unproject(camera, points, torch.linspace(1, 4, 7))
     torch.testing.assert_close(camera.project(world), points, rtol=1e-4, atol=1e-3)
     apart = (world - torch.tensor(camera.centre, dtype=torch.float32)).norm(dim=1)
@@ -205,7 +214,10 @@ def test_random_gaussians_fill_what_the_camera_sees():
     near, far = settings.bounds
     assert z.min() >= near * 0.999
     assert z.max() <= far * 1.001
-    assert (z < 0.5 * (near**3 + far**3) ** (1 / 3)).float().mean() == pytest.approx(0.125, abs=0.05)  # even in volume
+    # even in volume
+    assert (z < 0.5 * (near**3 + far**3) ** (1 / 3)).float().mean() == pytest.approx(
+        0.125, abs=0.05
+    )
     assert start.positions is None
     assert (start.field.layer == MOVING).all()
     again = from_random(sequence, settings, torch.Generator().manual_seed(3))
@@ -219,6 +231,8 @@ def test_flow_of_the_recording_is_what_the_tests_assume():
     step = flow(4, 4)
     y, x = np.nonzero(box)
     u, v = x + 0.5 + step[0, y, x], y + 0.5 + step[1, y, x]
-    got = measured.sample(torch.tensor(r_next, dtype=torch.float32)[None], torch.tensor(np.stack([u, v], 1)).float())
+    got = measured.sample(
+        torch.tensor(r_next, dtype=torch.float32)[None], torch.tensor(np.stack([u, v], 1)).float()
+    )
     inner = (x > x.min() + 1) & (x < x.max() - 1) & (y > y.min() + 1) & (y < y.max() - 1)
     assert np.abs(got[0].numpy() - r[y, x])[inner].mean() < 0.05

@@ -1,4 +1,6 @@
-"""The start from measured phase of a camera that moves, on recordings whose truth is known in closed form."""
+"""The start from measured phase of a camera that moves,
+on recordings whose truth is known in closed form.
+"""
 
 from dataclasses import replace
 
@@ -16,7 +18,8 @@ from gftorf_warp.scene.measured import camera_of, key_times, sensor_of
 from gftorf_warp.sim.paths import inverse, looking_at
 
 HEIGHT, WIDTH, FOCAL = 36, 48, 42.0  # [px]
-WALL_Z, BOX = 3.6, (-0.35, 0.25, -0.3, 0.3, 2.2)  # [m] wall; left, right, top, bottom, z-depth of a box's front
+# [m] wall; left, right, top, bottom, z-depth of a box's front
+WALL_Z, BOX = 3.6, (-0.35, 0.25, -0.3, 0.3, 2.2)
 TARGET = np.array([0.0, 0.0, 3.0])  # [m] what the camera looks at
 PERIOD = 1.0 / 30.0  # [s] between phasors
 STEP = np.array([0.09, 0.02, -0.03])  # [m] of the box from one phasor to the next
@@ -24,7 +27,9 @@ NOISE = 0.0004  # [quad units]
 
 
 def poses(count, *, shift=0.6, turn=0.0):
-    """World-to-camera poses of a camera carried from left to right that turns away from the target as it goes [m]."""
+    """World-to-camera poses of a camera carried from left to right that turns away from the target
+    as it goes [m].
+    """
     found = []
     for share in np.linspace(-0.5, 0.5, count):
         position = np.array([shift * share, -0.1 * share, 0.1 * share])
@@ -33,7 +38,9 @@ def poses(count, *, shift=0.6, turn=0.0):
 
 
 def seen(pose, shift):
-    """[H, W] distance [m], reflectivity, and whether it is the front of the box, which moved by ``shift`` [m]."""
+    """[H, W] distance [m], reflectivity, and whether it is the front of the box,
+    which moved by ``shift`` [m].
+    """
     y, x = np.mgrid[0:HEIGHT, 0:WIDTH] + 0.5
     local = np.stack([(x - WIDTH / 2) / FOCAL, (y - HEIGHT / 2) / FOCAL, np.ones_like(x)], axis=-1)
     ray = local / np.linalg.norm(local, axis=-1, keepdims=True) @ pose[:3, :3]
@@ -49,13 +56,17 @@ def seen(pose, shift):
 
 
 def carried(*, quartets=12, step=STEP, noise=NOISE, at_once=True, **path):
-    """Phasors, or raw quads that follow each other, of a wall and a box; true distance, and whether the box is seen."""
+    """Phasors, or raw quads that follow each other, of a wall and a box; true distance,
+    and whether the box is seen.
+    """
     frames = np.arange(4 * quartets)
     instant = frames - frames % 4 if at_once else frames
     pose = poses(4 * quartets, **path)[instant]
     images = [seen(p, step * (n / 4 - quartets // 2)) for p, n in zip(pose, instant, strict=True)]
     slope, shifts = 4.0 * np.pi / 15.0, np.tile(CANONICAL_SHIFTS, quartets)
-    quads = np.stack([r / d**2 * np.cos(slope * d - s) for (d, r, _), s in zip(images, shifts, strict=True)])
+    quads = np.stack(
+        [r / d**2 * np.cos(slope * d - s) for (d, r, _), s in zip(images, shifts, strict=True)]
+    )
     quads += noise * np.random.default_rng(0).standard_normal(quads.shape)
     sequence = sequence_of(
         quads=quads.astype(np.float32),
@@ -70,7 +81,11 @@ def carried(*, quartets=12, step=STEP, noise=NOISE, at_once=True, **path):
         camera_from_world=pose,
         from_phasors=at_once,
     )
-    return sequence, np.stack([d for d, _, _ in images[::4]]), np.stack([box for _, _, box in images[::4]])
+    return (
+        sequence,
+        np.stack([d for d, _, _ in images[::4]]),
+        np.stack([box for _, _, box in images[::4]]),
+    )
 
 
 def of_layer(start, label):
@@ -83,32 +98,42 @@ def rendered(start, sequence, quartet):
     field = start.field
     moved = field.mean.clone()
     moved[field.layer == MOVING] = start.positions[quartet]
-    seen = rasterize(replace(field, mean=moved), camera_of(sequence, 4 * quartet), sensor_of(sequence))
+    seen = rasterize(
+        replace(field, mean=moved), camera_of(sequence, 4 * quartet), sensor_of(sequence)
+    )
     return (seen.distance / seen.opacity).numpy(), seen.opacity.numpy()
 
 
 def off(start, step=STEP):
-    """[T, 3] mean and [T] largest difference [m] of the displacements of the moving layer to those of the box."""
+    """[T, 3] mean and [T] largest difference [m] of the displacements of the moving layer to those
+    of the box.
+    """
     gap = start.positions - start.positions[start.quartet]
     gap = gap - torch.tensor(step).float() * (torch.arange(len(gap)) - start.quartet)[:, None, None]
     return gap.mean(dim=1), gap.norm(dim=2).amax(dim=1)
 
 
 def apart(start, shift):
-    """Distance [m] of every point of the moving layer to the front of the box, which moved by ``shift`` [m]."""
+    """Distance [m] of every point of the moving layer to the front of the box,
+    which moved by ``shift`` [m].
+    """
     x, y, z = (of_layer(start, MOVING).mean - torch.tensor(shift).float()).unbind(dim=1)
     left, right, top, bottom, front = BOX
     return torch.stack([x - x.clamp(left, right), y - y.clamp(top, bottom), z - front]).norm(dim=0)
 
 
 def test_a_static_room_looks_right_from_all_along_the_path():
-    """Distance and opacity of the start, rendered from first to last; nothing moves, so nothing is labelled so."""
+    """Distance and opacity of the start, rendered from first to last; nothing moves,
+    so nothing is labelled so.
+    """
     sequence, truth, box = carried(step=np.zeros(3))
     start = from_phase(sequence)
     assert (start.field.layer == STATIC).all()
     assert start.positions.shape == (13, 0, 3)
     grid = round(WIDTH / 2.5) * round(HEIGHT / 2.5)
-    assert grid <= len(start.field) < 1.3 * grid, "a place that several views see has points of one of them"
+    assert grid <= len(start.field) < 1.3 * grid, (
+        "a place that several views see has points of one of them"
+    )
     for quartet in (0, 3, 6, 11):
         distance, opacity = rendered(start, sequence, quartet)
         error = np.abs(distance - truth[quartet])
@@ -124,9 +149,12 @@ def test_witnesses_take_the_noise_out():
     sequence, truth, _ = carried(step=np.zeros(3), noise=0.004)
     views = views_of(sequence, 0.1)
     verdict = list(verdicts(views))[6]
-    interior = ~outlying(torch.tensor(truth[6]), torch.full((HEIGHT, WIDTH), 0.05))[2:-2, 4:-4].numpy()
+    interior = ~outlying(torch.tensor(truth[6]), torch.full((HEIGHT, WIDTH), 0.05))[
+        2:-2, 4:-4
+    ].numpy()
     alone, together = (
-        np.abs(d.numpy() - truth[6])[2:-2, 4:-4][interior] for d in (views.distance[6], verdict.distance)
+        np.abs(d.numpy() - truth[6])[2:-2, 4:-4][interior]
+        for d in (views.distance[6], verdict.distance)
     )
     assert np.median(alone) > 0.04
     assert np.median(together) < 0.5 * np.median(alone)
@@ -134,7 +162,9 @@ def test_witnesses_take_the_noise_out():
 
 
 def test_what_moves_gets_the_label_and_its_keys_follow_it():
-    """A box that moves by 1.1 m, within 4 cm of the truth on the mean and 6 cm everywhere; nothing else moves."""
+    """A box that moves by 1.1 m, within 4 cm of the truth on the mean and 6 cm everywhere;
+    nothing else moves.
+    """
     sequence, truth, box = carried()
     start = from_phase(sequence)
     quartet = start.quartet
@@ -150,13 +180,21 @@ def test_what_moves_gets_the_label_and_its_keys_follow_it():
     static = of_layer(start, STATIC).mean[:, 2]
     assert (static - WALL_Z).abs().max() < 0.15, "the box leaves no ghost"
     distance, _ = rendered(start, sequence, 2)
-    inner = box[2] & np.roll(box[2], 3, 1) & np.roll(box[2], -3, 1) & np.roll(box[2], 3, 0) & np.roll(box[2], -3, 0)
+    inner = (
+        box[2]
+        & np.roll(box[2], 3, 1)
+        & np.roll(box[2], -3, 1)
+        & np.roll(box[2], 3, 0)
+        & np.roll(box[2], -3, 0)
+    )
     assert inner.sum() > 10
     assert np.abs(distance - truth[2])[inner].mean() < 0.05
 
 
 def test_raw_quads_of_a_moving_camera_start_as_well():
-    """Taken one after the other from poses of their own; the closed form is only roughly right, and so is the start."""
+    """Taken one after the other from poses of their own; the closed form is only roughly right,
+    and so is the start.
+    """
     sequence, truth, _ = carried(at_once=False)
     start = from_phase(sequence)
     assert (start.field.layer == MOVING).sum() > 30
@@ -167,14 +205,19 @@ def test_raw_quads_of_a_moving_camera_start_as_well():
 
 
 def test_what_only_one_view_sees_is_covered():
-    """Three views that turn away from each other: where the others do not look, the start is as good."""
+    """Three views that turn away from each other: where the others do not look,
+    the start is as good.
+    """
     sequence, truth, _ = carried(quartets=3, step=np.zeros(3), turn=3.0)
     start = from_phase(sequence)
     assert (start.field.layer == STATIC).all()
     cameras = [camera_of(sequence, 4 * quartet) for quartet in range(3)]
     for quartet, least in ((0, 0.2), (2, 0.2)):
         camera = cameras[quartet]
-        points = torch.tensor(camera.centre).float() + torch.tensor(truth[quartet]).float()[..., None] * camera.rays()
+        points = (
+            torch.tensor(camera.centre).float()
+            + torch.tensor(truth[quartet]).float()[..., None] * camera.rays()
+        )
         only = np.ones((HEIGHT, WIDTH), dtype=bool)
         for other in {0, 1, 2} - {quartet}:
             x, y = cameras[other].project(points).numpy().transpose(2, 0, 1)
@@ -183,7 +226,8 @@ def test_what_only_one_view_sees_is_covered():
         distance, opacity = rendered(start, sequence, quartet)
         assert opacity[only].mean() > 0.93
         assert np.quantile(opacity[only], 0.05) > 0.8
-        assert np.median(np.abs(distance - truth[quartet])[only]) < 0.15  # round Gaussians on a wall seen at a slant
+        # round Gaussians on a wall seen at a slant
+        assert np.median(np.abs(distance - truth[quartet])[only]) < 0.15
 
 
 def test_a_quartet_with_a_hole_is_not_read_and_the_keys_stay_whole():
@@ -201,9 +245,11 @@ def test_a_quartet_with_a_hole_is_not_read_and_the_keys_stay_whole():
 
 
 def followed(clouds, start):
-    """Points of the clouds' objects in the view ``start``, object of each, their shifts by view [m] and by view [px].
+    """Points of the clouds' objects in the view ``start``, object of each, their shifts by view [m]
+    and by view [px].
 
-    A cloud is a list of (first column, last column, distances [m]) in rows 8 to 17; the camera rests.
+    A cloud is a list of (first column, last column, distances [m]) in rows 8 to 17; the camera
+    rests.
     """
     sequence, _, _ = carried(quartets=len(clouds), shift=0.1)
     views = views_of(sequence, 0.1)
@@ -211,17 +257,27 @@ def followed(clouds, start):
     views = replace(views, cameras=[camera] * len(clouds))
     found = []
     for patches in clouds:
-        mask, distance = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool), torch.full((HEIGHT, WIDTH), 3.6)
+        mask, distance = (
+            torch.zeros(HEIGHT, WIDTH, dtype=torch.bool),
+            torch.full((HEIGHT, WIDTH), 3.6),
+        )
         for first, end, far in patches:
             mask[8:18, first:end], distance[8:18, first:end] = True, far
         found.append(Cloud(mask=mask, distance=distance))
-    grid = torch.stack(torch.meshgrid(torch.arange(WIDTH) + 0.5, torch.arange(HEIGHT) + 0.5, indexing="xy"), dim=-1)
+    grid = torch.stack(
+        torch.meshgrid(torch.arange(WIDTH) + 0.5, torch.arange(HEIGHT) + 0.5, indexing="xy"), dim=-1
+    )
     layer, objects = moving_layer(views, start, found[start], grid, 16)
     times = torch.tensor(views.times, dtype=torch.float64)
     positions = follow_clouds(views, found, start, layer.mean, objects, times, fellows=16)
     dropped, _ = moving_layer(views, start, found[start], grid, 1 + int(objects.bincount().max()))
     assert len(dropped.mean) == 0, "objects of fewer points than fellows are dropped"
-    return layer.mean, objects, positions - layer.mean, camera.project(positions) - camera.project(layer.mean)
+    return (
+        layer.mean,
+        objects,
+        positions - layer.mean,
+        camera.project(positions) - camera.project(layer.mean),
+    )
 
 
 def test_two_objects_go_their_own_ways():
@@ -232,11 +288,15 @@ def test_two_objects_go_their_own_ways():
     for view in range(5):
         assert pixels[view, :, 1].abs().max() < 0.3
         for number, direction in ((0, 1), (1, -1)):
-            assert float(pixels[view, objects == number, 0].mean()) == pytest.approx(direction * (view - 2), abs=0.1)
+            assert float(pixels[view, objects == number, 0].mean()) == pytest.approx(
+                direction * (view - 2), abs=0.1
+            )
 
 
 def test_what_is_hidden_or_leaves_goes_on_as_before():
-    """Out of sight in one view, half hidden in two, and leaving in the last: three pixels per view all the while."""
+    """Out of sight in one view, half hidden in two, and leaving in the last:
+    three pixels per view all the while.
+    """
     first = [3 * view for view in range(15)]
     clouds = [[(at, min(at + 10, WIDTH), 2.0)] for at in first]
     clouds[6] = []
@@ -247,7 +307,9 @@ def test_what_is_hidden_or_leaves_goes_on_as_before():
 
 
 def test_what_comes_back_is_known_again_where_it_was_going():
-    """Out of sight for 20 pixels, and then it turns round: nothing but its speed tells where it will be."""
+    """Out of sight for 20 pixels, and then it turns round:
+    nothing but its speed tells where it will be.
+    """
     first = [2, 7, 12, None, None, None, 32, 28, 24]
     clouds = [[] if at is None else [(at, at + 10, 2.0)] for at in first]
     _, _, _, pixels = followed(clouds, 0)
@@ -261,7 +323,10 @@ def test_what_turns_turns_its_surface():
     slant = torch.linspace(-1.0, 1.0, 20)
     clouds = [[(14, 34, 2.0 + 0.03 * view * slant)] for view in range(5)]
     points, _, shifts, _ = followed(clouds, 0)
-    left, right = points[:, 0] < points[:, 0].quantile(0.25), points[:, 0] > points[:, 0].quantile(0.75)
+    left, right = (
+        points[:, 0] < points[:, 0].quantile(0.25),
+        points[:, 0] > points[:, 0].quantile(0.75),
+    )
     for view in (2, 4):
         assert -0.03 * view < float(shifts[view, left, 2].mean()) < -0.4 * 0.03 * view
         assert 0.4 * 0.03 * view < float(shifts[view, right, 2].mean()) < 0.03 * view

@@ -1,4 +1,6 @@
-"""What may be compared besides quads: phasors, colour from its own camera, closed-form distance; and moving cameras."""
+"""What may be compared besides quads: phasors, colour from its own camera, closed-form distance;
+and moving cameras.
+"""
 
 from dataclasses import replace
 
@@ -63,7 +65,9 @@ def test_phasor_and_quad_input_agree_on_a_static_scene(tmp_path):
 
 
 def test_colour_is_compared_from_its_own_camera():
-    """A Gaussian on the axis of the colour camera appears in the middle of its image, and only there."""
+    """A Gaussian on the axis of the colour camera appears in the middle of its image,
+    and only there.
+    """
     sequence = with_colour(recording(frames=8)[0])
     camera = colour_camera_of(sequence, 4)
     assert (camera.width, camera.height) == (2 * WIDTH, 2 * HEIGHT)
@@ -78,17 +82,25 @@ def test_colour_is_compared_from_its_own_camera():
     moved = field.moved(*state.motion.at(state.binding, 4 / 120))
     want = rasterize(moved, camera, sensor_of(sequence), settings.render).colour.detach()
     squared = (want - observations.colour[4]).square().mean()
-    assert OneStep(state, observations, settings, 4).terms["colour"] == pytest.approx(2.0 * float(squared), rel=1e-5)
-    wrong = rasterize(moved, observations.cameras[4].resized(*want.shape[:0:-1]), sensor_of(sequence))
+    assert OneStep(state, observations, settings, 4).terms["colour"] == pytest.approx(
+        2.0 * float(squared), rel=1e-5
+    )
+    wrong = rasterize(
+        moved, observations.cameras[4].resized(*want.shape[:0:-1]), sensor_of(sequence)
+    )
     assert (wrong.colour - want).abs().max() > 0.05, "the other camera sees something else"
     absolute = replace(settings, weights=replace(settings.weights, colour_norm=Norm.L1))
     difference = 2.0 * float((want - observations.colour[4]).abs().mean())
-    assert OneStep(state, observations, absolute, 4).terms["colour"] == pytest.approx(difference, rel=1e-5)
+    assert OneStep(state, observations, absolute, 4).terms["colour"] == pytest.approx(
+        difference, rel=1e-5
+    )
     assert "colour" not in OneStep(state, observations, settings, 5).terms, "no image there"
 
 
 def test_colour_of_weight_zero_is_never_rendered(monkeypatch):
-    """Neither tensors nor a pass; and a pass for colour makes no image that only the other camera is asked for."""
+    """Neither tensors nor a pass; and a pass for colour makes no image that only the other camera
+    is asked for.
+    """
     sequence = with_colour(recording(frames=8)[0])
     calls, asked = [], []
 
@@ -102,7 +114,11 @@ def test_colour_of_weight_zero_is_never_rendered(monkeypatch):
         settings = demo(weights=Weights(colour=weight), images=8)
         observations = observe(sequence, settings, "cpu")
         state = begin(observations, settings, seed=0, device="cpu")
-        assert bool(observations.colour) == (state.optimiser.field.colour_sh is not None) == bool(colours)
+        assert (
+            bool(observations.colour)
+            == (state.optimiser.field.colour_sh is not None)
+            == bool(colours)
+        )
         calls.clear()
         advance(state, observations, settings)
         assert len(calls) == 4 + colours
@@ -134,7 +150,9 @@ def test_a_run_with_colour_goes_on_where_it_stopped(tmp_path):
         if images >= 16:
             raise KeyboardInterrupt
 
-    every = replace(settings, schedule=replace(settings.schedule, log_every=8, checkpoint_every_s=0.0))
+    every = replace(
+        settings, schedule=replace(settings.schedule, log_every=8, checkpoint_every_s=0.0)
+    )
     with pytest.raises(KeyboardInterrupt):
         reconstruct(sequence, stopped, every, progress=stop)
     again = reconstruct(sequence, stopped, every)
@@ -181,17 +199,25 @@ def test_every_raw_frame_is_rendered_from_its_own_pose():
     sequence = replace(sequence, camera_from_world=poses)
     settings = demo(init=InitSettings(kind=Init.RANDOM, count=400, opacity=0.5, bounds=(2.0, 5.0)))
     settings = replace(
-        settings, weights=Weights(ssim=0.0, flow=1.0), motion=replace(settings.motion, from_tracks=False)
+        settings,
+        weights=Weights(ssim=0.0, flow=1.0),
+        motion=replace(settings.motion, from_tracks=False),
     )
     observations = observe(sequence, settings, "cpu")
     state = begin(observations, settings, seed=0, device="cpu")
     field = state.optimiser.field
     for n in (1, 6):
-        resting = replace(settings, background=0.0, schedule=replace(settings.schedule, warm_up=100))
+        resting = replace(
+            settings, background=0.0, schedule=replace(settings.schedule, warm_up=100)
+        )
         seen = OneStep(state, observations, resting, n).images[0].renderings[View.TOF]
-        want = rasterize(field, observations.cameras[n], observations.sensor_at(n), settings.render).quads
+        want = rasterize(
+            field, observations.cameras[n], observations.sensor_at(n), settings.render
+        ).quads
         torch.testing.assert_close(seen.quads, want)
-        other = rasterize(field, observations.cameras[0], observations.sensor_at(n), settings.render).quads
+        other = rasterize(
+            field, observations.cameras[0], observations.sensor_at(n), settings.render
+        ).quads
         assert (other - want).abs().max() > 0.02 * want.abs().max()
     # nothing moves: the flow of the camera alone has no error, that of a camera at rest has
     assert not state.motion.offset.any()
@@ -203,7 +229,13 @@ def test_every_raw_frame_is_rendered_from_its_own_pose():
     flow = torch.stack([place - here for place in there]).numpy()
     settings = replace(settings, schedule=replace(settings.schedule, warm_up=0))
     right, wrong = (
-        OneStep(state, replace(observations, flow=ImageStack.of({1: given}, "cpu")), settings, 4, terms=(FLOW,))
+        OneStep(
+            state,
+            replace(observations, flow=ImageStack.of({1: given}, "cpu")),
+            settings,
+            4,
+            terms=(FLOW,),
+        )
         for given in (flow, 0 * flow)
     )
     assert wrong.terms["flow"] > 0.1
@@ -228,8 +260,11 @@ def test_random_gaussians_fill_what_all_cameras_see_evenly():
     assert (inside[0] | inside[1]).float().mean() > 0.99
     both = inside[0] & inside[1]
     assert 0.2 < both.sum() / inside[0].sum() < 0.8
-    assert inside[0].sum() == pytest.approx(int(inside[1].sum()), rel=0.08), "both cameras see as many"
-    # drawn twice where frusta overlap, the density there would be double: compare a band inside with one outside
+    assert inside[0].sum() == pytest.approx(int(inside[1].sum()), rel=0.08), (
+        "both cameras see as many"
+    )
+    # drawn twice where frusta overlap, the density there would be double: compare a band inside
+    # with one outside
     near = (mean[:, 2] > 2.5) & (mean[:, 2] < 3.0) & (mean[:, 1].abs() < 0.5)
     x = mean[near, 0]
     overlap, alone = ((x > 0.3) & (x < 0.9)).sum(), ((x > -1.2) & (x < -0.6)).sum()

@@ -21,7 +21,9 @@ SMALL = {"size": (32, 24), "frames": 16}
 
 
 def test_each_level_is_the_one_before_and_more():
-    """Settings change where the level says so, and stay at all later ones but for what is the scene's own again."""
+    """Settings change where the level says so, and stay at all later ones but for what is the
+    scene's own again.
+    """
     demo = SCENES["demo"]
     at = {name: resolved(demo, replace(SETTINGS, level=name)) for name in NAMES}
     assert [level.name for level in LEVELS] == ["sync", "L0", "L1", "L2", "L3", "L4"]
@@ -34,18 +36,43 @@ def test_each_level_is_the_one_before_and_more():
         True,
         True,
     ]
-    assert [at[name][1].exposure_samples > 1 for name in NAMES] == [False, False, False, True, True, True]
+    assert [at[name][1].exposure_samples > 1 for name in NAMES] == [
+        False,
+        False,
+        False,
+        True,
+        True,
+        True,
+    ]
     assert [any(at[name][0].emitter) for name in NAMES] == [False, False, False, True, True, True]
-    assert [at[name][0].subsamples for name in NAMES] == [1, 1, 1, demo.subsamples, demo.subsamples, demo.subsamples]
+    assert [at[name][0].subsamples for name in NAMES] == [
+        1,
+        1,
+        1,
+        demo.subsamples,
+        demo.subsamples,
+        demo.subsamples,
+    ]
     assert [at[name][1].bounces > 0 for name in NAMES] == [False, False, False, False, True, True]
-    assert [at[name][0].beam_deg is not None for name in NAMES] == [False, False, False, False, True, True]
-    assert [at[name][0].sensor.full_well_electrons == demo.sensor.full_well_electrons for name in NAMES][-2:] == [
+    assert [at[name][0].beam_deg is not None for name in NAMES] == [
+        False,
+        False,
+        False,
+        False,
+        True,
+        True,
+    ]
+    assert [
+        at[name][0].sensor.full_well_electrons == demo.sensor.full_well_electrons for name in NAMES
+    ][-2:] == [
         False,
         True,
     ]
     assert [bool(at[name][0].sensor.harmonic_contrast) for name in NAMES][-2:] == [False, True]
     assert {at[name][1].engine for name in NAMES} == {"mesh"}
-    assert resolved(demo, replace(SETTINGS, level="L2", sync=True))[1].sync, "--sync counts at every level"
+    assert resolved(demo, replace(SETTINGS, level="L2", sync=True))[1].sync, (
+        "--sync counts at every level"
+    )
 
 
 def test_what_a_scene_has_of_its_own_stays():
@@ -67,7 +94,9 @@ def test_every_scene_can_be_recorded_at_the_last_level(name):
 
 
 def test_the_ladder_attributes_an_error(tmp_path, capsys):
-    """Nothing is wrong at one instant; asynchrony, noise and bounces each cost what they must, where they must."""
+    """Nothing is wrong at one instant; asynchrony, noise and bounces each cost what they must,
+    where they must.
+    """
     rows = simulate_ladder("demo", tmp_path / "ladder", SimSettings(**SMALL))
     assert [*rows] == [*NAMES]
     assert rows["sync"].all < 1e-6
@@ -76,7 +105,9 @@ def test_the_ladder_attributes_an_error(tmp_path, capsys):
     assert rows["L0"].static_phasor == pytest.approx(rows["L0"].all, rel=1e-3)
     assert 0.05 < rows["L1"].static < 2
     assert rows["L3"].static > 5 * rows["L2"].static, "light that bounces changes nothing"
-    assert rows["L3"].all - rows["L3"].static_phasor > 2, "the static phasor knows the light that bounces"
+    assert rows["L3"].all - rows["L3"].static_phasor > 2, (
+        "the static phasor knows the light that bounces"
+    )
     assert rows["L4"].all != pytest.approx(rows["L3"].all, rel=0.05)
     text = (tmp_path / "ladder" / "ladder.md").read_text()
     for line in ladder_table(rows):
@@ -87,15 +118,30 @@ def test_the_ladder_attributes_an_error(tmp_path, capsys):
     before = {path: path.stat().st_mtime_ns for path in (tmp_path / "ladder").rglob("*.npy")}
     simulate("demo", tmp_path / "ladder" / "L2", **SMALL, level="L2")
     code = main(
-        ["simulate", "demo", "--ladder", "--size", "32x24", "--frames", "16", "-q", "--out", str(tmp_path / "ladder")]
+        [
+            "simulate",
+            "demo",
+            "--ladder",
+            "--size",
+            "32x24",
+            "--frames",
+            "16",
+            "-q",
+            "--out",
+            str(tmp_path / "ladder"),
+        ]
     )
     assert code == 0
     assert [line.split()[0] for line in capsys.readouterr().out.splitlines()[1:]] == [*NAMES]
-    assert before == {path: path.stat().st_mtime_ns for path in (tmp_path / "ladder").rglob("*.npy")}
+    assert before == {
+        path: path.stat().st_mtime_ns for path in (tmp_path / "ladder").rglob("*.npy")
+    }
 
 
 def test_wrong_levels_are_refused(tmp_path, capsys):
-    """By name, before anything is made; a ladder has no level of its own, and too few frames have no error."""
+    """By name, before anything is made; a ladder has no level of its own,
+    and too few frames have no error.
+    """
     with pytest.raises(UsageError, match="--level") as caught:
         simulate("demo", tmp_path / "seq", **SMALL, level="L5")
     assert "sync, L0, L1, L2, L3, L4" in str(caught.value)
@@ -109,11 +155,15 @@ def test_wrong_levels_are_refused(tmp_path, capsys):
 
 
 def test_errors_are_means_of_squares():
-    """A decoded distance that is 10 cm long everywhere: 1 in square decimetres, against either truth."""
+    """A decoded distance that is 10 cm long everywhere: 1 in square decimetres,
+    against either truth.
+    """
     recording = record(SCENES["demo"], size=(16, 12), frames=8, sync=True, noise=False)
     sequence, truth = recording.sequence, recording.truth
     shifted = Truth(
-        distance=truth.phasor_distance - 0.1, known=truth.known, phasor_distance=truth.phasor_distance + 0.2
+        distance=truth.phasor_distance - 0.1,
+        known=truth.known,
+        phasor_distance=truth.phasor_distance + 0.2,
     )
     errors = closed_form_errors(sequence, shifted)
     assert errors.all == pytest.approx(1.0, rel=1e-3)

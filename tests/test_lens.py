@@ -1,4 +1,6 @@
-"""A lens that distorts, in both engines and in a reconstruction: rays, splats, what lies outside, what comes of it."""
+"""A lens that distorts, in both engines and in a reconstruction: rays, splats, what lies outside,
+what comes of it.
+"""
 
 import logging
 from dataclasses import replace
@@ -40,7 +42,9 @@ from gftorf_warp.sim.simulate import simulate
 from gftorf_warp.sim.world import Body, Texture, first_hit
 
 SEVERE = Distortion(k1=-0.3, k2=0.12, p1=0.01, p2=-0.02, k3=-0.02)
-LENSES = pytest.mark.parametrize("lens", [BARREL, PINCUSHION, SEVERE], ids=["barrel", "pincushion", "severe"])
+LENSES = pytest.mark.parametrize(
+    "lens", [BARREL, PINCUSHION, SEVERE], ids=["barrel", "pincushion", "severe"]
+)
 
 
 def wide(lens):
@@ -50,7 +54,9 @@ def wide(lens):
 
 @wp.kernel(enable_backward=False)
 def look(view: CameraView, at: wp.array[wp.vec2], rays: wp.array[wp.vec3], seen: wp.array[wp.vec2]):
-    """Rays through image points, and where the lens images the points one step of a pinhole away."""
+    """Rays through image points, and where the lens images the points one step of a pinhole
+    away.
+    """
     i = wp.tid()
     rays[i] = ray_through(view, at[i][0], at[i][1])
     slope = distorted(view, at[i][0], at[i][1])
@@ -60,8 +66,13 @@ def look(view: CameraView, at: wp.array[wp.vec2], rays: wp.array[wp.vec3], seen:
 def looked(camera, points):
     """What ``look`` finds for image points, or slopes, [N, 2]."""
     at = wp.array(points.astype(np.float32), dtype=wp.vec2, device="cpu")
-    rays, seen = wp.zeros(len(points), dtype=wp.vec3, device="cpu"), wp.zeros(len(points), dtype=wp.vec2, device="cpu")
-    wp.launch(look, len(points), [view_of(camera, RenderSettings()), at], [rays, seen], device="cpu")
+    rays, seen = (
+        wp.zeros(len(points), dtype=wp.vec3, device="cpu"),
+        wp.zeros(len(points), dtype=wp.vec2, device="cpu"),
+    )
+    wp.launch(
+        look, len(points), [view_of(camera, RenderSettings()), at], [rays, seen], device="cpu"
+    )
     return rays.numpy(), seen.numpy()
 
 
@@ -73,12 +84,19 @@ def test_rays_of_kernels_are_those_of_the_camera_and_of_opencv(lens):
     rays, _ = looked(camera, points)
     got = rays[:, :2] / rays[:, 2:]
     np.testing.assert_allclose(np.linalg.norm(rays, axis=1), 1.0, atol=1e-6)
-    np.testing.assert_allclose(got, camera.slopes(torch.from_numpy(points).double()).numpy(), atol=1e-6)
+    np.testing.assert_allclose(
+        got, camera.slopes(torch.from_numpy(points).double()).numpy(), atol=1e-6
+    )
     matrix = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]])
     coefficients = np.array([lens.k1, lens.k2, lens.p1, lens.p2, lens.k3])
     stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 500, 1e-14)
     want = cv2.undistortPoints(
-        points.astype(np.float64)[:, None], matrix, coefficients, R=np.eye(3), P=np.eye(3), criteria=stop
+        points.astype(np.float64)[:, None],
+        matrix,
+        coefficients,
+        R=np.eye(3),
+        P=np.eye(3),
+        criteria=stop,
     )[:, 0]
     np.testing.assert_allclose(got, want, atol=1e-6)
     y, x = np.mgrid[:240, :320] + 0.5
@@ -88,7 +106,9 @@ def test_rays_of_kernels_are_those_of_the_camera_and_of_opencv(lens):
 
 @LENSES
 def test_what_is_far_outside_stays_outside(lens):
-    """Where the polynomial would turn back, its tangent goes on: outwards, alike in kernels and camera."""
+    """Where the polynomial would turn back, its tangent goes on: outwards,
+    alike in kernels and camera.
+    """
     camera = wide(lens)
     radius = camera.guard.radius
     angle, far = np.meshgrid(np.linspace(0, 2 * np.pi, 41), np.linspace(0.2, 6.0, 400))
@@ -103,14 +123,16 @@ def test_what_is_far_outside_stays_outside(lens):
     _, got = looked(camera, slopes.reshape(-1, 2))
     np.testing.assert_allclose(got, seen.reshape(-1, 2), rtol=2e-5, atol=2e-4)
     np.testing.assert_allclose(camera.slopes(torch.from_numpy(seen)).numpy(), slopes, atol=1e-6)
-    if lens is BARREL:  # and without a radius it is OpenCV's polynomial, which comes back into the image
+    # and without a radius it is OpenCV's polynomial, which comes back into the image
+    if lens is BARREL:
         x, _ = lens.apply(np.linspace(radius, 3.0, 200), np.zeros(200))
         assert np.abs(x).min() < 0.1
 
 
 def test_a_lens_that_folds_beside_its_image_is_refused():
     """Its tangent would have to begin inside the image; the message says how far it can see."""
-    lens = Distortion(k1=-0.4, p2=-0.25)  # folds at .48 to the right of the axis, far later to its left
+    # folds at .48 to the right of the axis, far later to its left
+    lens = Distortion(k1=-0.4, p2=-0.25)
     options = {"width": 40, "height": 4, "fx": 50.0, "fy": 50.0, "cy": 2.0, "distortion": lens}
     Camera(cx=30.0, **options)
     with pytest.raises(ValueError, match=r"folds the image 0\.\d+ focal lengths"):
@@ -119,20 +141,26 @@ def test_a_lens_that_folds_beside_its_image_is_refused():
 
 @pytest.mark.parametrize("lens", [BARREL, PINCUSHION], ids=["barrel", "pincushion"])
 def test_light_is_that_of_the_bent_rays(lens):
-    """Nine rays a pixel: quads of engine mesh are those of the analytic hits, first hits are the truth."""
+    """Nine rays a pixel: quads of engine mesh are those of the analytic hits,
+    first hits are the truth.
+    """
     scene = slider(lens=Lens(distortion=lens), subsamples=3, sensor=Sensor(dc_offset=0.2))
     recording = record(scene, frames=4, engine="mesh")
     sequence = recording.sequence
     camera = scene.camera()
     for n, time in enumerate(sequence.times):
-        hit = first_hit(scene.bodies, camera.resized(3 * camera.width, 3 * camera.height), float(time))
+        hit = first_hit(
+            scene.bodies, camera.resized(3 * camera.width, 3 * camera.height), float(time)
+        )
         psi = hit.distance * scene.sensor.phase_slope
         fine = hit.amplitude * (np.cos(psi - sequence.shifts[n]) + 0.2)
         want = fine.reshape(camera.height, 3, camera.width, 3).mean((1, 3))
         off = np.abs(sequence.quads[n] - want) > 1e-4 * np.abs(want).mean()
         assert off.mean() < 1e-2  # a ray on a border of two cells
     assert recording.gap.max < 2e-5
-    plain = record(slider(subsamples=3, sensor=Sensor(dc_offset=0.2)), frames=4, engine="mesh").sequence
+    plain = record(
+        slider(subsamples=3, sensor=Sensor(dc_offset=0.2)), frames=4, engine="mesh"
+    ).sequence
     assert np.abs(plain.quads - sequence.quads).max() > 0.05 * np.abs(plain.quads).max()
 
 
@@ -141,7 +169,8 @@ def test_engines_agree_through_a_lens(lens):
     """On the demo, away from edges, within the bounds that a pinhole has."""
     scene, size = replace(SCENES["demo"], lens=Lens(distortion=lens)), (192, 144)
     gaussian, mesh = (
-        record(scene, frames=4, size=size, noise=False, sync=True, engine=e) for e in ("gaussian", "mesh")
+        record(scene, frames=4, size=size, noise=False, sync=True, engine=e)
+        for e in ("gaussian", "mesh")
     )
     np.testing.assert_array_equal(gaussian.truth.distance, mesh.truth.distance)
     distance, amplitude = apart(phasors(gaussian)[0], phasors(mesh)[0], scene.sensor)
@@ -150,11 +179,15 @@ def test_engines_agree_through_a_lens(lens):
     assert still.sum() > 5000
     assert moving.sum() > 100
     agree_on_the_demo(distance, amplitude, still, moving)
-    assert -0.010 < amplitude[still].mean() < -0.006, "splats as round and as large on the image as a pinhole's"
+    assert -0.010 < amplitude[still].mean() < -0.006, (
+        "splats as round and as large on the image as a pinhole's"
+    )
 
 
 def test_covers_know_how_a_lens_stretches():
-    """Growth of distance per pixel towards where z-depth grows fastest, and the largest stretch, by differences."""
+    """Growth of distance per pixel towards where z-depth grows fastest, and the largest stretch,
+    by differences.
+    """
     camera, rng = wide(BARREL), np.random.default_rng(0)
     points = rng.uniform([20, 20], [300, 220], (100, 2))
     normal = rng.normal(size=(100, 3)) * [0.4, 0.4, 0.1] - [0, 0, 1.0]
@@ -173,19 +206,26 @@ def test_covers_know_how_a_lens_stretches():
 
     h = np.array([[1e-3, 0.0], [0.0, 1e-3]])
     by_d, by_z = (
-        np.stack([(plane(points + step)[k] - plane(points - step)[k]) / 2e-3 for step in h], 1) for k in (0, 1)
+        np.stack([(plane(points + step)[k] - plane(points - step)[k]) / 2e-3 for step in h], 1)
+        for k in (0, 1)
     )
     want = np.sum(by_d * by_z, 1) / np.linalg.norm(by_z, axis=1)
     assert np.abs(want).max() > 5e-3
-    np.testing.assert_allclose(gaussian_cover.depth_slope(normal, distance, plane(points)[2], camera), want, atol=1e-7)
-    corner = float(wide(PINCUSHION).slopes(torch.tensor([[0.5, 239.5]], dtype=torch.float64)).norm())
+    np.testing.assert_allclose(
+        gaussian_cover.depth_slope(normal, distance, plane(points)[2], camera), want, atol=1e-7
+    )
+    corner = float(
+        wide(PINCUSHION).slopes(torch.tensor([[0.5, 239.5]], dtype=torch.float64)).norm()
+    )
     assert gaussian_cover.magnification(wide(PINCUSHION)) == pytest.approx(
         1 + 3 * 0.15 * corner**2 - 5 * 0.02 * corner**4
     )
 
 
 def test_flow_is_between_places_on_the_sensor():
-    """Of a body in front of a camera at rest, by both engines: the image of the carried point less the pixel."""
+    """Of a body in front of a camera at rest, by both engines:
+    the image of the carried point less the pixel.
+    """
     scene = slider(lens=Lens(distortion=BARREL), frames=8)
     camera, sequence = scene.camera(), record(scene, engine="mesh", noise=False, flow=True).sequence
     hit = first_hit(scene.bodies, camera, 0.0)
@@ -199,11 +239,15 @@ def test_flow_is_between_places_on_the_sensor():
     want = there - np.stack([x, y], -1) - 0.5
     assert np.abs(want).max() > 0.5
     np.testing.assert_allclose(sequence.flow.forward[0][:, moved].T, want, atol=1e-3)
-    np.testing.assert_allclose(record(scene, flow=True).sequence.flow.forward[0][:, moved].T, want, atol=1e-3)
+    np.testing.assert_allclose(
+        record(scene, flow=True).sequence.flow.forward[0][:, moved].T, want, atol=1e-3
+    )
 
 
 def test_random_points_are_as_dense_everywhere_in_what_a_lens_sees():
-    """Drawn on the sensor they would crowd where it magnifies: by 0.58 in the corners of this one."""
+    """Drawn on the sensor they would crowd where it magnifies:
+    by 0.58 in the corners of this one.
+    """
     camera = wide(BARREL)
     settings = replace(InitSettings(), count=40000, bounds=(1.0, 2.0))
     points = in_frusta([camera], settings, torch.Generator().manual_seed(0)).double()
@@ -220,15 +264,24 @@ def test_random_points_are_as_dense_everywhere_in_what_a_lens_sees():
 @pytest.fixture(scope="module")
 def captured(tmp_path_factory):
     """A capture of a box in front of a wall through a strong lens, made by rays, with flow."""
-    wall = Body(shape=Level(axis=2, value=3.0), texture=Texture(low=0.3, high=0.7, cell=0.4), path=Still())
-    box = replace(slider().bodies[1], path=Line(position=(-0.1, 0.0, 2.4), velocity=(4.0, 0.0, 0.0)))
+    wall = Body(
+        shape=Level(axis=2, value=3.0), texture=Texture(low=0.3, high=0.7, cell=0.4), path=Still()
+    )
+    box = replace(
+        slider().bodies[1], path=Line(position=(-0.1, 0.0, 2.4), velocity=(4.0, 0.0, 0.0))
+    )
     scene = slider(bodies=(wall, box), lens=Lens(distortion=BARREL))
-    out, options = tmp_path_factory.mktemp("lens") / "seq", {"engine": "mesh", "format": "capture", "flow": True}
+    out, options = (
+        tmp_path_factory.mktemp("lens") / "seq",
+        {"engine": "mesh", "format": "capture", "flow": True},
+    )
     return simulate(scene, out, size=(64, 48), noise=False, **options)
 
 
 def test_a_capture_through_a_lens_is_checked_and_decoded(captured, tmp_path):
-    """Check names the lens and warns of nothing; the closed form has the truth's distances; comparison takes it."""
+    """Check names the lens and warns of nothing; the closed form has the truth's distances;
+    comparison takes it.
+    """
     report = str(check(captured))
     assert "lens            k1 -0.25, k2 0.08, p1 0.002, p2 -0.003, k3 -0.01" in report
     assert "no warnings" in report
@@ -241,7 +294,9 @@ def test_a_capture_through_a_lens_is_checked_and_decoded(captured, tmp_path):
 
 
 def test_a_reconstruction_through_a_lens_is_the_scene(captured, tmp_path, caplog):
-    """A pinhole at the same place sees it as the scene is; had the lens been left out, walls would bend."""
+    """A pinhole at the same place sees it as the scene is; had the lens been left out,
+    walls would bend.
+    """
     settings = demo(images=200)
     sequence = Sequence.open(captured)
     pinhole = Camera.from_fov(64, 48, 60.0)
@@ -266,11 +321,14 @@ def test_a_reconstruction_through_a_lens_is_the_scene(captured, tmp_path, caplog
     torch.testing.assert_close(again, run.render(0.01).distance, rtol=1e-4, atol=1e-4)
     straight = run.renderer()
     straight(0.01, replace(run.camera, distortion=Distortion()))
-    torch.testing.assert_close(straight(0.01, run.camera).distance, again, rtol=0, atol=0)  # two cameras, two views
+    # two cameras, two views
+    torch.testing.assert_close(straight(0.01, run.camera).distance, again, rtol=0, atol=0)
 
 
 def test_layouts_without_a_lens_refuse_it(tmp_path):
-    """Before anything is recorded; so is an image in which it folds at the size that is asked for."""
+    """Before anything is recorded; so is an image in which it folds at the size that is asked
+    for.
+    """
     for layout in ("ftorf", "torf"):
         with pytest.raises(UsageError, match="cannot express this lens") as caught:
             simulate("demo", tmp_path / "out", format=layout, overrides=["lens.distortion.k1=-0.1"])
@@ -283,12 +341,16 @@ def test_layouts_without_a_lens_refuse_it(tmp_path):
 
 
 def test_covers_reach_into_a_margin_where_the_lens_folds():
-    """Three pixels of 24 beside the image: there the polynomial has an end, and the cover goes on."""
+    """Three pixels of 24 beside the image: there the polynomial has an end,
+    and the cover goes on.
+    """
     scene = replace(SCENES["demo"], lens=Lens(distortion=Distortion(k1=-0.27)))
     camera = scene.camera((24, 18))
     with pytest.raises(ValueError, match="cannot be undone"):
         replace(camera, width=30, height=24, cx=camera.cx + 3, cy=camera.cy + 3)
-    gaussian, mesh = (record(scene, frames=1, size=(24, 18), noise=False, engine=e) for e in ("gaussian", "mesh"))
+    gaussian, mesh = (
+        record(scene, frames=1, size=(24, 18), noise=False, engine=e) for e in ("gaussian", "mesh")
+    )
     border = np.ones((18, 24), dtype=bool)
     border[1:-1, 1:-1] = False
     light = [recording.truth.amplitude[0][border].mean() for recording in (gaussian, mesh)]

@@ -1,4 +1,6 @@
-"""Lists of tiles walked back in parts: the gradients of one walk, for lists of any length, wherever pixels end."""
+"""Lists of tiles walked back in parts: the gradients of one walk, for lists of any length,
+wherever pixels end.
+"""
 
 from dataclasses import replace
 
@@ -18,7 +20,12 @@ WIDTH, HEIGHT = 13, 9  # tiles of 8 x 4: five of six stick out of the image
 CAMERA = Camera.from_fov(WIDTH, HEIGHT, 60.0)
 SENSOR = Sensor(shifts=(0.3,), phase_offset=0.2, dc_offset=0.4, source_intensity=1.3)
 IMAGES = ("quads", "distance", "opacity")
-WHERE = ["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA"))]
+WHERE = [
+    "cpu",
+    pytest.param(
+        "cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
+    ),
+]
 
 
 @pytest.fixture(params=WHERE)
@@ -68,11 +75,18 @@ def outcome(rasterize, field, settings, extra=None):
     if extra is not None:
         found["extra"] = rendering.extra
     generator = torch.Generator().manual_seed(1)
-    total = sum((image * torch.rand(image.shape, generator=generator).to(image)).sum() for image in found.values())
+    total = sum(
+        (image * torch.rand(image.shape, generator=generator).to(image)).sum()
+        for image in found.values()
+    )
     total.backward()
     gradients = {name: value.grad.cpu().double() for name, value in field.parameters().items()}
     gradients["screen"] = rendering.screen.values.cpu().double()
-    return {name: image.detach().cpu().double() for name, image in found.items()}, gradients, workspace
+    return (
+        {name: image.detach().cpu().double() for name, image in found.items()},
+        gradients,
+        workspace,
+    )
 
 
 def far(one, other):
@@ -81,9 +95,13 @@ def far(one, other):
 
 
 @pytest.mark.parametrize("stop", Stop)
-@pytest.mark.parametrize(("count", "opacity"), [(1, 0.5), (40, 0.1), (65, 0.9), (200, 0.02), (900, 0.01), (900, 0.3)])
+@pytest.mark.parametrize(
+    ("count", "opacity"), [(1, 0.5), (40, 0.1), (65, 0.9), (200, 0.02), (900, 0.01), (900, 0.3)]
+)
 def test_parts_are_one_walk(count, opacity, stop, device, monkeypatch):
-    """No list, none that needs parts, a part of one round, all parts; pixels that end in every one of them."""
+    """No list, none that needs parts, a part of one round, all parts;
+    pixels that end in every one of them.
+    """
     settings = RenderSettings(near=0.1, far=20.0, stop=stop)
     results = {}
     for wanted in (1, 4):
@@ -116,13 +134,20 @@ def test_channels_with_fixed_weights_take_part(device, monkeypatch):
 
 def test_what_cannot_be_split_is_not(device, monkeypatch):
     """Distortion is a sum over pairs of entries; colour has weights that learn."""
-    for change, images in (({}, (*IMAGES, "distortion")), ({"colour_sh": torch.rand(100, 16, 3)}, IMAGES)):
+    for change, images in (
+        ({}, (*IMAGES, "distortion")),
+        ({"colour_sh": torch.rand(100, 16, 3)}, IMAGES),
+    ):
         found = []
         for wanted in (1, 4):
             monkeypatch.setitem(buffers.SEGMENTS, device, wanted)
             field, workspace = scene(100, 0.1, device), Workspace()
-            field = replace(field, **{name: value.to(device).requires_grad_() for name, value in change.items()})
-            rendering = api.rasterize(field, CAMERA, SENSOR, RenderSettings(), images=images, workspace=workspace)
+            field = replace(
+                field, **{name: value.to(device).requires_grad_() for name, value in change.items()}
+            )
+            rendering = api.rasterize(
+                field, CAMERA, SENSOR, RenderSettings(), images=images, workspace=workspace
+            )
             terms = [rendering.quads.sum(), rendering.distortion.sum()]
             terms += [] if rendering.colour is None else [rendering.colour.square().sum()]
             sum(terms).backward()
@@ -136,18 +161,24 @@ def test_what_nobody_differentiates_is_one_sum(device, monkeypatch):
     for wanted in (1, 4):
         monkeypatch.setitem(buffers.SEGMENTS, device, wanted)
         field, workspace = scene(300, 0.05, device).map(torch.Tensor.detach), Workspace()
-        fields.append(api.rasterize(field, CAMERA, SENSOR, settings, images=IMAGES, workspace=workspace))
+        fields.append(
+            api.rasterize(field, CAMERA, SENSOR, settings, images=IMAGES, workspace=workspace)
+        )
         assert workspace.last.segments == 1
     assert all(torch.equal(getattr(fields[0], name), getattr(fields[1], name)) for name in IMAGES)
 
 
 @pytest.mark.parametrize("walks", [1, 4])
 def test_memory_is_used_again_where_lists_are_read_in_parts_too(walks, device, monkeypatch):
-    """Of so many Gaussians several warps read the list of a tile, whatever walks it back afterwards."""
+    """Of so many Gaussians several warps read the list of a tile,
+    whatever walks it back afterwards.
+    """
     monkeypatch.setitem(buffers.SEGMENTS, device, walks)
     field, workspace, seen = scene(20_000, 0.01, device), Workspace(), []
     for _ in range(2):
-        rendering = api.rasterize(field, CAMERA, SENSOR, RenderSettings(), images=IMAGES, workspace=workspace)
+        rendering = api.rasterize(
+            field, CAMERA, SENSOR, RenderSettings(), images=IMAGES, workspace=workspace
+        )
         seen.append(rendering.distance.detach().clone())
     assert workspace.last.segments == walks
     assert workspace.last.parts > 1

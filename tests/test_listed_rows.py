@@ -1,6 +1,8 @@
-"""Rows without gradient left out of a network's way back: the list, slopes and weight gradients by it, nothing else.
+"""Rows without gradient left out of a network's way back: the list, slopes and weight gradients by
+it, nothing else.
 
-What a GPU runs is executed by threads of a CPU, see test_wgmma_by_threads.py, and compared with the CPU's own way.
+What a GPU runs is executed by threads of a CPU, see test_wgmma_by_threads.py, and compared with the
+CPU's own way.
 """
 
 import numpy as np
@@ -25,17 +27,20 @@ WIDTH, TILE = wgmma.WIDTH, wgmma.TILE
 BY_THREADS = pytest.mark.skipif(COMPILER is None, reason="needs a C++ compiler")
 
 LIST = """
-static void count_block(wp::array_t<float> gradient, int count, int block, wp::array_t<int> counts) { COUNT }
+static void count_block(wp::array_t<float> gradient, int count, int block,
+    wp::array_t<int> counts) { COUNT }
 static void list_block(wp::array_t<float> gradient, wp::array_t<int> counts, int count, int block,
                        wp::array_t<int> listed, wp::array_t<int> begins) { CODE }
 int main(int, char** given) {
     const int keys = std::stoi(given[1]), count = std::stoi(given[2]);
     auto gradient = loaded<float>("gradient");
     const int blocks = keys * ((count + 255) / 256);
-    std::vector<int> counts(blocks, -9), listed(keys * ((count + 63) / 64) * 64, -9), begins(keys + 1, -9);
+    std::vector<int> counts(blocks, -9), listed(keys * ((count + 63) / 64) * 64, -9),
+        begins(keys + 1, -9);
     on_blocks(blocks, [&] { count_block({gradient.data()}, count, blockIdx.x, {counts.data()}); });
     on_blocks(blocks, [&] {
-        list_block({gradient.data()}, {counts.data()}, count, blockIdx.x, {listed.data()}, {begins.data()});
+        list_block({gradient.data()}, {counts.data()}, count, blockIdx.x, {listed.data()},
+            {begins.data()});
     });
     stored("listed", listed); stored("begins", begins);
 }
@@ -46,7 +51,8 @@ static void multiply(int block, int jobs, int parts, int keys, int count, int ca
                      wp::array_t<wp::half> inputs, wp::array_t<float> partials) { CODE }
 int main(int, char** given) {
     const int jobs = std::stoi(given[1]), parts = std::stoi(given[2]), keys = std::stoi(given[3]);
-    const int count = std::stoi(given[4]), joined = std::stoi(given[5]), columns = std::stoi(given[6]);
+    const int count = std::stoi(given[4]), joined = std::stoi(given[5]), columns =
+        std::stoi(given[6]);
     auto listed = loaded<int>("listed"), begins = loaded<int>("starts");
     // copies of 16 bytes are aligned as they are in the memory of a device
     auto aligned = [](const std::vector<wp::half>& from) {
@@ -57,7 +63,8 @@ int main(int, char** given) {
     auto* const inputs = aligned(loaded<wp::half>("inputs"));
     std::vector<float> partials((size_t)jobs * parts * 128 * columns, NAN);
     on_blocks(jobs * parts, [&] {
-        multiply(blockIdx.x, jobs, parts, keys, count, listed.size(), joined, {listed.data()}, {begins.data()},
+        multiply(blockIdx.x, jobs, parts, keys, count, listed.size(), joined, {listed.data()},
+            {begins.data()},
                  {slopes}, {inputs}, {partials.data()});
     });
     stored("partials", partials);
@@ -65,7 +72,8 @@ int main(int, char** given) {
 """
 HEADS = """
 static void multiply(int part, int parts, int keys, int layers, int rows, wp::array_t<int> listed,
-                     wp::array_t<int> begins, wp::array_t<wp::half> after, wp::array_t<wp::half> outputs,
+                     wp::array_t<int> begins, wp::array_t<wp::half> after,
+                         wp::array_t<wp::half> outputs,
                      wp::array_t<float> partials) { CODE }
 int main(int, char** given) {
     const int parts = std::stoi(given[1]), keys = std::stoi(given[2]), layers = std::stoi(given[3]);
@@ -73,7 +81,8 @@ int main(int, char** given) {
     auto after = loaded<wp::half>("after"), outputs = loaded<wp::half>("outputs");
     std::vector<float> partials((size_t)parts * 768, NAN);
     on_blocks(parts, [&] {
-        multiply(blockIdx.x, parts, keys, layers, after.size() / 8, {listed.data()}, {begins.data()}, {after.data()},
+        multiply(blockIdx.x, parts, keys, layers, after.size() / 8, {listed.data()},
+            {begins.data()}, {after.data()},
                  {outputs.data()}, {partials.data()});
     });
     stored("partials", partials);
@@ -82,7 +91,9 @@ int main(int, char** given) {
 
 
 def hidden(gradient, share, keys, *, seed=4):
-    """Zeros in a share of the rows, of each sign; of the first row of the last key only one value is left."""
+    """Zeros in a share of the rows, of each sign; of the first row of the last key only one value
+    is left.
+    """
     found = gradient.clone()
     drawn = random(len(gradient), 1, seed=seed).to(gradient.device)
     found = torch.where(drawn < share, found.sign() * 0.0, found)
@@ -107,7 +118,9 @@ def read(path, dtype):
 
 
 @pytest.mark.parametrize("device", DEVICES)
-@pytest.mark.parametrize(("keys", "count"), [(1, 1), (2, 33), (3, 64), (2, 300), (3, 1_000), (3, 20_480)])
+@pytest.mark.parametrize(
+    ("keys", "count"), [(1, 1), (2, 33), (3, 64), (2, 300), (3, 1_000), (3, 20_480)]
+)
 @pytest.mark.parametrize("share", [0.0, 0.6, 1.0])
 def test_a_list_is_in_order_and_whole_tiles(keys, count, share, device):
     """Key by key; also where everybody has a gradient, or nobody."""
@@ -134,7 +147,13 @@ def test_a_list_by_blocks_of_threads(keys, count, tmp_path):
     """The code for CUDA, several blocks of rows and keys."""
     gradient = hidden(random(keys * count, 3, seed=2) - 0.5, 0.6, keys)
     stored(tmp_path, gradient=gradient.numpy())
-    run(tmp_path, LIST.replace("COUNT", lists.count_block.native_snippet), lists.list_block, keys, count)
+    run(
+        tmp_path,
+        LIST.replace("COUNT", lists.count_block.native_snippet),
+        lists.list_block,
+        keys,
+        count,
+    )
     want, ends = wanted(gradient, keys)
     assert read(tmp_path / "begins", np.int32).tolist() == ends
     assert read(tmp_path / "listed", np.int32)[: ends[-1]].tolist() == want
@@ -171,7 +190,9 @@ def test_slopes_by_a_block_of_threads(layers, skip_after, count, keys, share, tm
     nobody = slopes.listed[:end] < 0
     assert nobody.any()
     assert same[:, :end][:, nobody].abs().max() == 0
-    partials = read(tmp_path / "partials", np.float32).view(layers, keys, BLOCKS * wgmma.GROUPS, WIDTH)
+    partials = read(tmp_path / "partials", np.float32).view(
+        layers, keys, BLOCKS * wgmma.GROUPS, WIDTH
+    )
     scale = float(slopes.sums.abs().max())
     torch.testing.assert_close(partials.sum(2), slopes.sums, rtol=2e-3, atol=2e-4 * scale)
     assert float(slopes.layers[:, :end].abs().max()) > 1
@@ -197,9 +218,11 @@ def launches(form, place, moment, all_weights, biases):
 @pytest.mark.parametrize("columns", [WIDTH, wgmma.COLUMNS])
 @pytest.mark.parametrize(("keys", "count", "parts"), [(2, 600, 3), (2, 600, 1), (1, 40, 2)])
 def test_weight_gradients_by_blocks_of_threads(columns, keys, count, parts, tmp_path):
-    """Parts of a list longer than what shared memory holds, and an empty one: added up they are d^T h in float64.
+    """Parts of a list longer than what shared memory holds, and an empty one: added up they are d^T
+    h in float64.
 
-    What no row may be is no number here: outputs of rows that are not listed, and slopes behind the list.
+    What no row may be is no number here: outputs of rows that are not listed, and slopes behind the
+    list.
     """
     layers, joined = 3, 2
     gradient = hidden(random(keys * count, 3, seed=2) - 0.5, 0.3, keys)
@@ -211,15 +234,27 @@ def test_weight_gradients_by_blocks_of_threads(columns, keys, count, parts, tmp_
     at = torch.tensor(listed)
     slopes[:, : begins[-1]][:, at < 0] = 0.0
     if columns == WIDTH:
-        inputs, jobs, rows_of = random(layers, keys * count, WIDTH, seed=6) - 0.3, 2 * (layers - 1), keys * count
+        inputs, jobs, rows_of = (
+            random(layers, keys * count, WIDTH, seed=6) - 0.3,
+            2 * (layers - 1),
+            keys * count,
+        )
         inputs[:, (gradient == 0).all(1)] = torch.nan
         factors = [(slopes[n + 1], inputs[n].half()[at]) for n in range(layers - 1)]
     else:
         inputs, jobs, rows_of = random(count, columns, seed=6) - 0.3, 4, count
         inputs[0] = torch.nan
         factors = [(slopes[n], inputs.half()[at % count]) for n in (0, joined)]
-    stored(tmp_path, listed=np.pad(np.array(listed, np.int32), (0, capacity - len(listed)), constant_values=-7))
-    stored(tmp_path, starts=np.array(begins, np.int32), slopes=slopes.numpy(), inputs=inputs.half().numpy())
+    stored(
+        tmp_path,
+        listed=np.pad(np.array(listed, np.int32), (0, capacity - len(listed)), constant_values=-7),
+    )
+    stored(
+        tmp_path,
+        starts=np.array(begins, np.int32),
+        slopes=slopes.numpy(),
+        inputs=inputs.half().numpy(),
+    )
     way = weight_gradients.by_outputs if columns == WIDTH else weight_gradients.by_positions
     run(tmp_path, WEIGHTS, way, jobs, parts, keys, rows_of, joined, columns)
     found = read(tmp_path / "partials", np.float32).view(parts, -1, WIDTH, columns)
@@ -236,7 +271,9 @@ def test_weight_gradients_by_blocks_of_threads(columns, keys, count, parts, tmp_
 @BY_THREADS
 @pytest.mark.parametrize(("keys", "count", "parts"), [(2, 600, 3), (1, 40, 2)])
 def test_the_heads_weight_by_blocks_of_threads(keys, count, parts, tmp_path):
-    """The code for CUDA: parts added up are what float64 has of listed rows; nobody reads the others."""
+    """The code for CUDA: parts added up are what float64 has of listed rows;
+    nobody reads the others.
+    """
     gradient = hidden(random(keys * count, 3, seed=2) - 0.5, 0.3, keys)
     listed, begins = wanted(gradient, keys)
     there = (gradient != 0).any(1)
@@ -245,7 +282,11 @@ def test_the_heads_weight_by_blocks_of_threads(keys, count, parts, tmp_path):
     after[~there] = torch.nan
     outputs = random(2, keys * count, WIDTH, seed=6) - 0.3
     outputs[0], outputs[1, ~there] = torch.nan, torch.inf
-    padded = np.pad(np.array(listed, np.int32), (0, lists.capacity(keys, count) - len(listed)), constant_values=-7)
+    padded = np.pad(
+        np.array(listed, np.int32),
+        (0, lists.capacity(keys, count) - len(listed)),
+        constant_values=-7,
+    )
     stored(tmp_path, listed=padded, starts=np.array(begins, np.int32))
     stored(tmp_path, after=after.half().numpy(), outputs=outputs.half().numpy())
     run(tmp_path, HEADS, ends.by_head, parts, keys, 2)
@@ -269,7 +310,9 @@ def test_nobody_reads_rows_that_are_not_listed(shape, device):
     want = passes.parameter_gradients(form, place, moment, slopes, outputs)
     outputs[:, (gradient == 0).all(1)] = torch.inf
     found = passes.parameter_gradients(form, place, moment, slopes, outputs)
-    assert [value.shape for value in found] == [v.shape for both in zip(all_weights, biases, strict=True) for v in both]
+    assert [value.shape for value in found] == [
+        v.shape for both in zip(all_weights, biases, strict=True) for v in both
+    ]
     assert all(map(torch.equal, found, want))
     assert all(value.isfinite().all() and value.abs().max() > 0 for value in found)
 
@@ -282,18 +325,27 @@ def test_parts_and_sums_become_gradients(shape, keys, parts, device):
     form = Form.of(network(half(SHAPES[shape])))
     layers, halves, columns = SHAPES[shape].layers, weight_gradients.HALVES, wgmma.COLUMNS
     drawn = [
-        (layers, keys, WIDTH), (3,), (keys, form.time), (parts, halves * (layers - 1), weight_gradients.HALF * WIDTH),
+        (layers, keys, WIDTH), (3,), (keys, form.time),
+        (parts, halves * (layers - 1), weight_gradients.HALF * WIDTH),
         (parts, halves * len(form.entries), weight_gradients.HALF * columns), (parts, 1, 3 * WIDTH),
     ]  # fmt: skip
-    sums, total, moment, outputs, places, head = ((random(*size, seed=8) - 0.4).to(device) for size in drawn)
+    sums, total, moment, outputs, places, head = (
+        (random(*size, seed=8) - 0.4).to(device) for size in drawn
+    )
     unit = torch.tensor([0.25], device=device)
     shapes = tensor_cores._shapes(form, layers)
     found = torch.full((sum(np.prod(size) for size in shapes),), torch.nan, device=device)
     given = [array_over(value) for value in (unit, sums, total, moment, outputs, places, head)]
     dim = layers * WIDTH + 3, WIDTH + form.position + form.time + 1
-    launched(ends.collect, dim, [tensor_cores._layers(form, layers), *given], [array_over(found)], device)
+    launched(
+        ends.collect, dim, [tensor_cores._layers(form, layers), *given], [array_over(found)], device
+    )
     square = outputs.sum(0).view(layers - 1, WIDTH, WIDTH)
-    entered = dict(zip(form.entries, places.sum(0).view(-1, WIDTH, columns)[:, :, : form.position], strict=True))
+    entered = dict(
+        zip(
+            form.entries, places.sum(0).view(-1, WIDTH, columns)[:, :, : form.position], strict=True
+        )
+    )
     want = []
     for number in range(layers):
         pieces = [square[number - 1]] if number else []
@@ -302,14 +354,18 @@ def test_parts_and_sums_become_gradients(shape, keys, parts, device):
         want += [0.25 * torch.cat(pieces, 1), 0.25 * sums[number].sum(0)]
     want += [0.25 * head.sum(0).view(3, WIDTH), total]
     assert [value.shape for value in want] == [torch.Size(size) for size in shapes]
-    torch.testing.assert_close(found, torch.cat([value.flatten() for value in want]), rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(
+        found, torch.cat([value.flatten() for value in want]), rtol=1e-5, atol=1e-5
+    )
 
 
 @pytest.mark.parametrize("multiprocessors", [16, 78, 114, 132])
 @pytest.mark.parametrize("layers", [1, 2, 3, 8])
 @pytest.mark.parametrize("entries", [1, 2])
 def test_all_blocks_run_at_once(multiprocessors, layers, entries):
-    """The products' blocks fit beside each other, few multiprocessors have nothing to do, and shares are as work is."""
+    """The products' blocks fit beside each other, few multiprocessors have nothing to do,
+    and shares are as work is.
+    """
     own, others, left = weight_gradients.parts(multiprocessors, layers, entries)
     jobs = weight_gradients.HALVES * (layers - 1)
     assert own * jobs + left == multiprocessors
@@ -325,8 +381,13 @@ def test_all_blocks_run_at_once(multiprocessors, layers, entries):
 
 
 def test_shared_memory_is_enough():
-    """227 KB are all that a block can have, and of a multiprocessor's 228 each block takes one more."""
-    assert max(weight_gradients.shared(WIDTH), weight_gradients.shared(wgmma.COLUMNS), wgmma.SHARED) <= 227 * 1024
+    """227 KB are all that a block can have, and of a multiprocessor's 228 each block takes one
+    more.
+    """
+    assert (
+        max(weight_gradients.shared(WIDTH), weight_gradients.shared(wgmma.COLUMNS), wgmma.SHARED)
+        <= 227 * 1024
+    )
     assert 2 * (weight_gradients.shared(wgmma.COLUMNS) + 1024) <= 228 * 1024
 
 
@@ -334,7 +395,9 @@ def test_shared_memory_is_enough():
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("share", [0.0, 0.6])
 def test_gradients_are_those_of_all_rows(shape, share, device):
-    """Rows without gradient add nothing: alone, the others give the same gradients, up to the order of their sums."""
+    """Rows without gradient add nothing: alone, the others give the same gradients,
+    up to the order of their sums.
+    """
     made, _ = pair(SHAPES[shape], device)
     gaussians, cotangent = rows(70, 3, device)
     drawn = hidden(cotangent[0], share, 1)  # the same Gaussians at all keys
@@ -367,14 +430,18 @@ def test_a_gradient_that_is_not_finite_is_not_lost(value, device):
     gaussians, cotangent = rows(30, 2, device)
     cotangent *= 0
     cotangent[1, 4, 2] = value
-    assert not torch.nn.utils.get_total_norm(gradients(made, gaussians, cotangent, [0, 1])[1]).isfinite()
+    assert not torch.nn.utils.get_total_norm(
+        gradients(made, gaussians, cotangent, [0, 1])[1]
+    ).isfinite()
 
 
 @ON_HOPPER
 @pytest.mark.parametrize("share", [0.0, 0.6, 0.98])
 @pytest.mark.parametrize("count", [2_000, 20_289, 20_480])
 def test_many_rows(count, share):
-    """On a GPU: the gradients of torch's products, some units at rest in one of both only, twice the same bits."""
+    """On a GPU: the gradients of torch's products, some units at rest in one of both only,
+    twice the same bits.
+    """
     short, plain = pair(FULL, "cuda")
     gaussians, cotangent = rows(count, 3, "cuda")
     cotangent = hidden(cotangent.view(-1, 3), share, 3).view(3, count, 3)

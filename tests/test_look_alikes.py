@@ -1,4 +1,6 @@
-"""Look-alikes: as hard for the closed form as their recipes say, by the command that prints the table."""
+"""Look-alikes: as hard for the closed form as their recipes say,
+by the command that prints the table.
+"""
 
 import dataclasses
 import importlib.util
@@ -39,7 +41,9 @@ ROWS = [
 
 @pytest.mark.parametrize(("group", "name"), ROWS)
 def test_the_closed_form_fails_as_much_as_the_recipe_says(group, name):
-    """T32: every column of the table within its tolerance, and the list of scenes says the first."""
+    """T32: every column of the table within its tolerance,
+    and the list of scenes says the first.
+    """
     found = TABLE.errors(SCENES[name], group)
     for error, want in zip(found, group.targets[name], strict=True):
         assert TABLE.accepted(error, want, group), (found, group.targets[name])
@@ -52,10 +56,14 @@ def test_the_list_says_how_wrong_the_closed_form_is():
     sequence, _ = ideal_recording(scene)
     frames = tuple(scored_frames(sequence, "ftorf13"))
     group = dataclasses.replace(
-        TABLE.SYNTHETIC, columns={"own": TABLE.Column(dc=0.0, shifts=scene.sensor.shifts)}, frames=frames
+        TABLE.SYNTHETIC,
+        columns={"own": TABLE.Column(dc=0.0, shifts=scene.sensor.shifts)},
+        frames=frames,
     )
     assert TABLE.errors(scene, group)[0] == pytest.approx(scene.closed_form, rel=1e-3)
-    assert scored_frames(ideal_recording(SCENES["arcing_cube"])[0], "ftorf13") == list(TABLE.SYNTHETIC.frames)
+    assert scored_frames(ideal_recording(SCENES["arcing_cube"])[0], "ftorf13") == list(
+        TABLE.SYNTHETIC.frames
+    )
 
 
 def test_tolerances_are_those_of_the_recipes():
@@ -69,16 +77,22 @@ def test_tolerances_are_those_of_the_recipes():
 
 def test_the_stored_table_is_of_these_scenes():
     """T32: benchmarks/results/look_alikes.json has a row for every look-alike, all accepted."""
-    stored = json.loads((REPOSITORY / "benchmarks" / "results" / "look_alikes.json").read_text())["scenes"]
+    stored = json.loads((REPOSITORY / "benchmarks" / "results" / "look_alikes.json").read_text())[
+        "scenes"
+    ]
     names = {name: group for group in TABLE.GROUPS.values() for name in group.targets}
     assert set(stored) == set(names) == {make.__name__ for make in LOOK_ALIKES}
     for name, row in stored.items():
         assert tuple(row["recipe"].values()) == names[name].targets[name]
-        assert all(TABLE.accepted(row["ours"][c], row["recipe"][c], names[name]) for c in row["ours"]), name
+        assert all(
+            TABLE.accepted(row["ours"][c], row["recipe"][c], names[name]) for c in row["ours"]
+        ), name
 
 
 def test_light_at_rest_decodes_to_the_truth():
-    """Of simultaneous quads with any offsets; rays are averaged as light, and the truth stays that of the centre."""
+    """Of simultaneous quads with any offsets; rays are averaged as light,
+    and the truth stays that of the centre.
+    """
     scene = dataclasses.replace(SCENES["occlusion"], width=64, height=48)
     sensor = dataclasses.replace(scene.sensor, phase_offset=0.3, source_intensity=2.0)
     light = light_of(scene, 0.1)
@@ -86,10 +100,14 @@ def test_light_at_rest_decodes_to_the_truth():
     np.testing.assert_allclose(closed_form_distance(sequence, 1), light.distance, atol=1e-5)
     np.testing.assert_array_equal(truth.distance[4], light.distance.astype(np.float32))
     assert sequence.measured.tolist() == truth.known.tolist() == [4 <= n < 8 for n in range(60)]
-    assert sequence.quads[4].max() == pytest.approx(2.0 * (light.amplitude + light.phasor.real).max(), rel=0.2)
+    assert sequence.quads[4].max() == pytest.approx(
+        2.0 * (light.amplitude + light.phasor.real).max(), rel=0.2
+    )
     finer = light_of(scene, 0.1, rays=2)
     single = light_of(dataclasses.replace(scene, width=128, height=96), 0.1)
-    np.testing.assert_allclose(finer.amplitude, single.amplitude.reshape(48, 2, 64, 2).mean((1, 3)), rtol=1e-12)
+    np.testing.assert_allclose(
+        finer.amplitude, single.amplitude.reshape(48, 2, 64, 2).mean((1, 3)), rtol=1e-12
+    )
     np.testing.assert_array_equal(finer.distance, light.distance)
     with pytest.raises(ValueError, match="rays must be at least 1"):
         light_of(scene, 0.1, rays=0)
@@ -99,21 +117,29 @@ def test_light_at_rest_decodes_to_the_truth():
 
 @pytest.mark.parametrize("name", sorted(set(SCENES) - {make.__name__ for make in OURS}))
 def test_a_look_alike_can_be_recorded(name):
-    """By the splat renderer: light and distance of most pixels are the analytic ones, and nothing is missing."""
+    """By the splat renderer: light and distance of most pixels are the analytic ones,
+    and nothing is missing.
+    """
     scene = SCENES[name]
     assert scene.name == name
     recording = record(scene, frames=1, size=(96, 72), noise=False)
     assert recording.gap.max < 0.02
     hit = light_of(dataclasses.replace(scene, width=96, height=72), 0.0, rays=2)
-    quad = (hit.phasor * np.exp(-1j * scene.sensor.shifts[0])).real + scene.sensor.dc_offset * hit.amplitude
+    quad = (
+        hit.phasor * np.exp(-1j * scene.sensor.shifts[0])
+    ).real + scene.sensor.dc_offset * hit.amplitude
     assert np.median(np.abs(recording.sequence.quads[0] - quad) / hit.amplitude) < 0.03
     assert np.isfinite(recording.truth.distance).all()
     assert (recording.sequence.colour.intrinsics is not None) == (scene.colour is not None)
 
 
 def test_look_alikes_are_written_and_refuse_what_they_cannot(tmp_path):
-    """A folder with the sensor of the published files; frames after which something would be too near are refused."""
-    card = (simulate("sliding_cube", tmp_path / "cube", frames=4, size=(32, 24)) / "README.md").read_text()
+    """A folder with the sensor of the published files;
+    frames after which something would be too near are refused.
+    """
+    card = (
+        simulate("sliding_cube", tmp_path / "cube", frames=4, size=(32, 24)) / "README.md"
+    ).read_text()
     assert "unambiguous to 7.5000 m" in card
     assert "| taps | one, unipolar |" in card
     assert "Level(axis=2" not in card

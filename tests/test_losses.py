@@ -1,4 +1,6 @@
-"""Losses: values against definitions, gradients against finite differences, and what must not pass a gradient."""
+"""Losses: values against definitions, gradients against finite differences,
+and what must not pass a gradient.
+"""
 
 import math
 
@@ -12,7 +14,10 @@ from gftorf_warp.scene.camera import Camera
 
 def draw(*shape, seed=0):
     """Seeded float64 values in [-1, 1]."""
-    return torch.rand(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) * 2 - 1
+    return (
+        torch.rand(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) * 2
+        - 1
+    )
 
 
 def naive_similarity(a, b):
@@ -35,14 +40,20 @@ def naive_similarity(a, b):
             ma, mb = (weight * wa).sum(), (weight * wb).sum()
             va, vb = (weight * wa * wa).sum() - ma**2, (weight * wb * wb).sum() - mb**2
             cov = (weight * wa * wb).sum() - ma * mb
-            result[y, x] = (2 * ma * mb + 1e-4) * (2 * cov + 9e-4) / ((ma**2 + mb**2 + 1e-4) * (va + vb + 9e-4))
+            result[y, x] = (
+                (2 * ma * mb + 1e-4)
+                * (2 * cov + 9e-4)
+                / ((ma**2 + mb**2 + 1e-4) * (va + vb + 9e-4))
+            )
     return result
 
 
 def test_similarity_is_the_published_formula():
     """Also where the window reaches beyond the border, and for signed values."""
     a, b = draw(13, 17), draw(13, 17, seed=1)
-    torch.testing.assert_close(image.similarity(a, b), naive_similarity(a, b), rtol=1e-9, atol=1e-12)
+    torch.testing.assert_close(
+        image.similarity(a, b), naive_similarity(a, b), rtol=1e-9, atol=1e-12
+    )
 
 
 def test_similarity_of_an_image_with_itself_is_one_and_works_on_stacks():
@@ -79,7 +90,9 @@ CAMERA = Camera(width=6, height=4, fx=5.0, fy=6.0, cx=3.2, cy=1.9)
 
 
 def test_image_motion_is_focal_length_times_motion_over_depth():
-    """A fronto-parallel plane that slides; and one that approaches spreads from the principal point."""
+    """A fronto-parallel plane that slides; and one that approaches spreads from the principal
+    point.
+    """
     rays = CAMERA.rays(dtype=torch.float64)
     plane = rays / rays[..., 2:] * 2.0
     slide = torch.tensor([0.3, -0.2, 0.0], dtype=torch.float64)[:, None, None].expand(3, 4, 6)
@@ -89,7 +102,8 @@ def test_image_motion_is_focal_length_times_motion_over_depth():
     approach = torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64)[:, None, None].expand(3, 4, 6)
     flow = prior.image_motion(plane, approach, CAMERA.project)
     x = torch.arange(6, dtype=torch.float64) + 0.5
-    torch.testing.assert_close(flow[0], (x - 3.2).expand(4, 6))  # twice as near, twice as far from the centre
+    # twice as near, twice as far from the centre
+    torch.testing.assert_close(flow[0], (x - 3.2).expand(4, 6))
 
 
 def test_image_motion_passes_gradient_to_the_motion_only():
@@ -97,7 +111,9 @@ def test_image_motion_passes_gradient_to_the_motion_only():
     surface = (CAMERA.rays(dtype=torch.float64) * 2.5).requires_grad_()
     motion = (0.1 * draw(3, 4, 6)).requires_grad_()
     flow = prior.image_motion(surface, motion, CAMERA.project)
-    assert torch.autograd.grad(flow.square().sum(), surface, retain_graph=True, allow_unused=True) == (None,)
+    assert torch.autograd.grad(
+        flow.square().sum(), surface, retain_graph=True, allow_unused=True
+    ) == (None,)
     (gradient,) = torch.autograd.grad(flow.square().sum(), motion)
     assert gradient.abs().max() > 1e-2
     assert gradcheck(lambda m: prior.image_motion(surface.detach(), m, CAMERA.project), motion)

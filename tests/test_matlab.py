@@ -53,7 +53,9 @@ def by_hand(order, values, stored="i2", kind=3, shape=(2, 3), flags=6):
 def test_every_matrix_that_scipy_writes_is_read(rows, columns, dtype, packed, seed):
     """Any size and type, compressed or not, behind other variables of any kind."""
     matrix = (100 * np.random.default_rng(seed).random((rows, columns))).astype(dtype)
-    data = saved({"text": "a", "cell": np.array([1, "b"], dtype=object), "K": matrix}, do_compression=packed)
+    data = saved(
+        {"text": "a", "cell": np.array([1, "b"], dtype=object), "K": matrix}, do_compression=packed
+    )
     got = read_matrix(data, "K")
     assert got.dtype == matrix.dtype
     np.testing.assert_array_equal(got, matrix)
@@ -65,7 +67,9 @@ def test_small_numbers_of_a_large_class_in_either_byte_order(order):
     got = read_matrix(by_hand(order, [[1, 2, 3], [4, 5, -6]]), "K")
     assert got.dtype == np.float64
     np.testing.assert_array_equal(got, [[1, 2, 3], [4, 5, -6]])
-    np.testing.assert_array_equal(scipy.io.loadmat(io.BytesIO(by_hand(order, [[1, 2, 3], [4, 5, -6]])))["K"], got)
+    np.testing.assert_array_equal(
+        scipy.io.loadmat(io.BytesIO(by_hand(order, [[1, 2, 3], [4, 5, -6]])))["K"], got
+    )
 
 
 @pytest.mark.parametrize(

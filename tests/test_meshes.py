@@ -1,4 +1,6 @@
-"""Meshes out of files: hit where their triangles are, traced like shapes of the same form, and refused by name."""
+"""Meshes out of files: hit where their triangles are, traced like shapes of the same form,
+and refused by name.
+"""
 
 from dataclasses import replace
 
@@ -22,18 +24,30 @@ from gftorf_warp.sim.world import Body, Box, Plane, Texture, first_hit
 PATTERN = Texture(low=0.1, high=0.9, cell=0.07)
 TURNED = Still(position=(0.1, -0.1, 3.0), turn_deg=(15.0, 40.0, -10.0))
 BOX = Box(size=(0.6, 0.9, 0.5))
-TETRAHEDRON = (np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]), [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
+TETRAHEDRON = (
+    np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]),
+    [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]],
+)
 
 
 def written(path, points, faces):
     """A PLY or OBJ file with these vertices and faces."""
     if path.suffix == ".obj":
         lines = [f"v {' '.join(map(repr, map(float, p)))}" for p in points]
-        path.write_text("\n".join([*lines, *(f"f {' '.join(str(i + 1) for i in f)}" for f in faces)]) + "\n")
+        path.write_text(
+            "\n".join([*lines, *(f"f {' '.join(str(i + 1) for i in f)}" for f in faces)]) + "\n"
+        )
         return path
-    head = ["ply", "format ascii 1.0", f"element vertex {len(points)}", *(f"property double {a}" for a in "xyz")]
+    head = [
+        "ply",
+        "format ascii 1.0",
+        f"element vertex {len(points)}",
+        *(f"property double {a}" for a in "xyz"),
+    ]
     head += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header"]
-    rows = [" ".join(map(repr, map(float, p))) for p in points] + [f"{len(f)} {' '.join(map(str, f))}" for f in faces]
+    rows = [" ".join(map(repr, map(float, p))) for p in points] + [
+        f"{len(f)} {' '.join(map(str, f))}" for f in faces
+    ]
     path.write_text("\n".join([*head, *rows]) + "\n")
     return path
 
@@ -51,7 +65,9 @@ def same_image(bodies, others, time=0.0):
 @pytest.mark.parametrize("suffix", [".ply", ".obj"])
 @pytest.mark.parametrize("inside", [False, True])
 def test_a_box_out_of_a_file_is_a_box(tmp_path, suffix, inside):
-    """Millimetres scaled, either winding, solid or room: hits, normals and light of the closed form."""
+    """Millimetres scaled, either winding, solid or room: hits,
+    normals and light of the closed form.
+    """
     size = (6.0, 5.0, 9.0) if inside else BOX.size
     shape = Box(size=size, inside=inside)
     points, triangles = triangles_of(Box(size=size))
@@ -62,27 +78,45 @@ def test_a_box_out_of_a_file_is_a_box(tmp_path, suffix, inside):
         assert mesh.reach == pytest.approx(shape.reach, rel=1e-12)
         bodies, others = ((Body(shape=s, texture=GREY, path=path),) for s in (mesh, shape))
         same_image(bodies, others)
-        np.testing.assert_allclose(light(*bodies).amplitude, light(*others).amplitude, rtol=1e-4, atol=1e-6)
+        np.testing.assert_allclose(
+            light(*bodies).amplitude, light(*others).amplitude, rtol=1e-4, atol=1e-6
+        )
         hits = MeshEngine(scene_of(*bodies), lambda _: CAMERA).first_hits(0.0)
-        np.testing.assert_allclose(hits.distance, first_hit(others, CAMERA, 0.0).distance, atol=5e-5)
+        np.testing.assert_allclose(
+            hits.distance, first_hit(others, CAMERA, 0.0).distance, atol=5e-5
+        )
 
 
 def test_many_triangles_are_hit_as_one_by_one(tmp_path):
-    """A bumpy ball of 2,000 quads on its way: truth of the hierarchy is that of all triangles, and the tracer's."""
+    """A bumpy ball of 2,000 quads on its way: truth of the hierarchy is that of all triangles,
+    and the tracer's.
+    """
     v, u = np.meshgrid(np.arange(1, 40) / 40 * np.pi, np.arange(50) / 50 * 2 * np.pi, indexing="ij")
     r = 0.5 + 0.05 * np.sin(5 * u) * np.sin(v) ** 2
-    ring = np.stack([r * np.sin(v) * np.cos(u), r * np.sin(v) * np.sin(u), r * np.cos(v)], -1).reshape(-1, 3)
+    ring = np.stack(
+        [r * np.sin(v) * np.cos(u), r * np.sin(v) * np.sin(u), r * np.cos(v)], -1
+    ).reshape(-1, 3)
     points = np.concatenate([ring, [[0, 0, 0.5], [0, 0, -0.5]]])
     at = lambda i, j: 50 * i + j % 50  # noqa: E731
-    faces = [[at(i, j), at(i + 1, j), at(i + 1, j + 1), at(i, j + 1)] for i in range(38) for j in range(50)]
+    faces = [
+        [at(i, j), at(i + 1, j), at(i + 1, j + 1), at(i, j + 1)]
+        for i in range(38)
+        for j in range(50)
+    ]
     faces += [[len(ring), at(0, j), at(0, j + 1)] for j in range(50)]
     faces += [[len(ring) + 1, at(38, j + 1), at(38, j)] for j in range(50)]
     mesh = Mesh(file=written(tmp_path / "bumpy.ply", points, faces))
     path = Line(position=(-0.2, 0.1, 1.6), velocity=(1.0, 0.0, -0.5), turn_deg=(15.0, 40.0, -10.0))
-    bodies, camera = (plane(3.0), Body(shape=mesh, texture=PATTERN, path=path)), Camera.from_fov(96, 72, 60.0)
+    bodies, camera = (
+        (plane(3.0), Body(shape=mesh, texture=PATTERN, path=path)),
+        Camera.from_fov(96, 72, 60.0),
+    )
     got, want = (
         f(0.2)
-        for f in (MeshEngine(scene_of(*bodies), lambda _: camera).first_hits, lambda t: first_hit(bodies, camera, t))
+        for f in (
+            MeshEngine(scene_of(*bodies), lambda _: camera).first_hits,
+            lambda t: first_hit(bodies, camera, t),
+        )
     )
     same = got.body == want.body
     assert (~same).sum() <= 1
@@ -94,7 +128,8 @@ def test_many_triangles_are_hit_as_one_by_one(tmp_path):
     rays = camera.rays(dtype=torch.float64).numpy().reshape(-1, 3)
     a, b, c = (world[tri[:, n]] for n in range(3))
     best = np.full(len(rays), np.inf)
-    for corner, e1, e2 in zip(a, b - a, c - a, strict=True):  # the textbook way, one triangle after the other
+    # the textbook way, one triangle after the other
+    for corner, e1, e2 in zip(a, b - a, c - a, strict=True):
         p = np.cross(rays, e2)
         det = p @ e1
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -108,14 +143,20 @@ def test_many_triangles_are_hit_as_one_by_one(tmp_path):
 
 
 def test_a_sheet_is_seen_from_one_side(tmp_path):
-    """Borders need open = true; then it is the rectangle that the file winds, and nothing from behind."""
+    """Borders need open = true; then it is the rectangle that the file winds,
+    and nothing from behind.
+    """
     points, triangles = triangles_of(Plane(size=(1.0, 0.8)))
     file = written(tmp_path / "sheet.ply", points, triangles.tolist())
     with pytest.raises(InputError, match="open = true"):
         Mesh(file=file)
     sheet = Mesh(file=file, open=True)
-    same_image(*((Body(shape=s, texture=GREY, path=TURNED),) for s in (sheet, Plane(size=(1.0, 0.8)))))
-    behind = Body(shape=sheet, texture=GREY, path=Still(position=(0, 0, 2.0), turn_deg=(0.0, 180.0, 0.0)))
+    same_image(
+        *((Body(shape=s, texture=GREY, path=TURNED),) for s in (sheet, Plane(size=(1.0, 0.8))))
+    )
+    behind = Body(
+        shape=sheet, texture=GREY, path=Still(position=(0, 0, 2.0), turn_deg=(0.0, 180.0, 0.0))
+    )
     assert (first_hit((behind,), CAMERA, 0.0).body < 0).all()
     assert (light(behind).amplitude == 0).all()
     with pytest.raises(ValueError, match="not both"):
@@ -126,12 +167,16 @@ def test_a_mesh_can_be_a_part(tmp_path):
     """An assembly of a mesh and a box is that of two boxes."""
     mesh = Mesh(file=written(tmp_path / "b.obj", *(x.tolist() for x in triangles_of(BOX))))
     pair = [
-        Assembly(parts=(Part(shape=s, position=(0.4, 0, 0)), Part(shape=BOX, position=(-0.4, 0, 0))))
+        Assembly(
+            parts=(Part(shape=s, position=(0.4, 0, 0)), Part(shape=BOX, position=(-0.4, 0, 0)))
+        )
         for s in (mesh, BOX)
     ]
     bodies, others = ((Body(shape=s, texture=GREY, path=TURNED),) for s in pair)
     same_image(bodies, others)
-    np.testing.assert_allclose(light(*bodies).amplitude, light(*others).amplitude, rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(
+        light(*bodies).amplitude, light(*others).amplitude, rtol=1e-4, atol=1e-6
+    )
 
 
 def faces_of(*more, points=TETRAHEDRON[0], faces=TETRAHEDRON[1]):
@@ -150,7 +195,11 @@ def faces_of(*more, points=TETRAHEDRON[0], faces=TETRAHEDRON[1]):
         ),
         (faces_of([0, 1, 1]), "1 of 5 triangles have no area", "degenerate"),
         (faces_of(faces=TETRAHEDRON[1][:3]), "open: 3 edges", "open = true"),
-        (faces_of([0, 1, 4], points=np.vstack([TETRAHEDRON[0], [1.0, -1, 0]])), "1 edges have three", "split it"),
+        (
+            faces_of([0, 1, 4], points=np.vstack([TETRAHEDRON[0], [1.0, -1, 0]])),
+            "1 edges have three",
+            "split it",
+        ),
         (
             faces_of([1, 0, 3], faces=[f for i, f in enumerate(TETRAHEDRON[1]) if i != 1]),
             "3 edges two neighbours",
@@ -161,7 +210,9 @@ def faces_of(*more, points=TETRAHEDRON[0], faces=TETRAHEDRON[1]):
 )
 @pytest.mark.parametrize("suffix", [".ply", ".obj"])
 def test_surfaces_that_cannot_be_traced(tmp_path, surface, why, fix, suffix):
-    """Empty, not finite, degenerate, open, non-manifold, twisted, out of range: file, number and remedy."""
+    """Empty, not finite, degenerate, open, non-manifold, twisted, out of range: file,
+    number and remedy.
+    """
     file = written(tmp_path / f"bad{suffix}", *surface)
     with pytest.raises(InputError) as caught:
         Mesh(file=file)
@@ -204,7 +255,9 @@ path = { kind = "line", position = [0, 0, 2], velocity = [1, 0, 0] }
 
 
 def test_a_scene_file_names_a_mesh_beside_it(tmp_path, capsys):
-    """Found from anywhere, simulated by mesh, refused by gaussian if it moves or shines; a bad one writes nothing."""
+    """Found from anywhere, simulated by mesh, refused by gaussian if it moves or shines;
+    a bad one writes nothing.
+    """
     (tmp_path / "parts").mkdir()
     points, triangles = triangles_of(BOX)
     file = written(tmp_path / "parts" / "box.ply", 1e3 * points, triangles.tolist())
@@ -214,11 +267,16 @@ def test_a_scene_file_names_a_mesh_beside_it(tmp_path, capsys):
     assert scene.bodies[1].shape == Mesh(file=file, scale=1e-3)
     assert (scene.bodies[1].texture.gloss, scene.bodies[1].texture.shininess) == (0.3, 20.0)
     small = ["--frames", "4", "--size", "24x18", "--engine", "mesh", "-q"]
-    assert cli.main(["simulate", str(toml), "--out", str(tmp_path / "a"), *small]) == 0, capsys.readouterr().err
+    assert cli.main(["simulate", str(toml), "--out", str(tmp_path / "a"), *small]) == 0, (
+        capsys.readouterr().err
+    )
     assert Sequence.open(tmp_path / "a").quads.shape == (4, 18, 24)
     card = (tmp_path / "a" / "README.md").read_text()
     moved = replace(scene.bodies[1], texture=GREY)
-    for bodies in ((scene.bodies[0], replace(scene.bodies[1], path=TURNED)), (scene.bodies[0], moved)):
+    for bodies in (
+        (scene.bodies[0], replace(scene.bodies[1], path=TURNED)),
+        (scene.bodies[0], moved),
+    ):
         with pytest.raises(UsageError, match="glossy or a mesh that moves"):
             simulate(replace(scene, bodies=bodies), tmp_path / "g", frames=4)
         with pytest.raises(UsageError, match="a mesh that moves"):
@@ -226,10 +284,14 @@ def test_a_scene_file_names_a_mesh_beside_it(tmp_path, capsys):
     with pytest.raises(ValueError, match="cannot be covered"):
         moved.shape.grid(0.1, 0.0)
     resting = replace(scene, bodies=(scene.bodies[0], replace(moved, path=TURNED)))
-    got, want = (record(resting, frames=1, size=(48, 36), noise=False, engine=e) for e in ("gaussian", "mesh"))
+    got, want = (
+        record(resting, frames=1, size=(48, 36), noise=False, engine=e)
+        for e in ("gaussian", "mesh")
+    )
     np.testing.assert_array_equal(got.truth.distance, want.truth.distance)
     assert np.median(np.abs(got.sequence.quads / want.sequence.quads - 1)) < 0.02
-    written(file, 2e3 * points, triangles.tolist())  # another mesh of the same name is another scene
+    # another mesh of the same name is another scene
+    written(file, 2e3 * points, triangles.tolist())
     with pytest.raises(UsageError, match="other settings"):
         simulate(str(toml), tmp_path / "a", frames=4, size=(24, 18), engine="mesh")
     assert "mine" in card

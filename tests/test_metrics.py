@@ -1,4 +1,6 @@
-"""Which frames and pixels are scored, and errors of small arrays, against numbers worked out by hand."""
+"""Which frames and pixels are scored, and errors of small arrays,
+against numbers worked out by hand.
+"""
 
 import math
 from dataclasses import replace
@@ -50,11 +52,17 @@ def test_a_phasor_is_scored_once():
 
 
 def test_between_phasors_is_where_things_move():
-    """From one phasor to the next, and from the one before at the end; within one there is nothing to see."""
+    """From one phasor to the next, and from the one before at the end;
+    within one there is nothing to see.
+    """
     distance = np.repeat([[2.0, 2.0, 2.0], [2.0, 2.1, 2.0], [2.0, 2.1, NAN]], 4, axis=0)[:, None]
     assert not moving_and_static(distance, [0, 4])[0].any()
     moving, static = moving_and_static(distance, [0, 4, 8], from_phasors=True)
-    assert moving[:, 0].tolist() == [[False, True, False], [False, False, False], [False, False, False]]
+    assert moving[:, 0].tolist() == [
+        [False, True, False],
+        [False, False, False],
+        [False, False, False],
+    ]
     assert static[:, 0].tolist() == [[True, False, True], [True, True, False], [True, True, False]]
     assert moving_and_static(distance[:4], [0], from_phasors=True)[1].all()
 
@@ -79,7 +87,9 @@ def test_nothing_to_score_is_an_error(given, protocol, error, text):
 
 
 def test_moving_is_a_change_of_more_than_five_centimetres_within_the_quartet():
-    """Four pixels over two quartets; the jump between quartets is no motion, and the unknown is neither."""
+    """Four pixels over two quartets; the jump between quartets is no motion,
+    and the unknown is neither.
+    """
     distance = np.full((8, 1, 4), 3.0)
     distance[:4, 0, 0] += [0.0, 0.02, 0.051, 0.04]  # 5.1 cm: moves
     distance[:4, 0, 1] += [0.0, 0.049, 0.04, 0.04]  # 4.9 cm: rests
@@ -101,7 +111,10 @@ def test_frames_weigh_alike_in_one_mean_and_pixels_in_the_other():
     everywhere = np.ones(error.shape, dtype=bool)
     assert metrics.mean_over_frames(error, everywhere) == 5.0
     assert metrics.pooled(error, everywhere) == pytest.approx(13 / 5)
-    assert metrics.per_frame_mean(error, everywhere & (np.arange(2) == 1)[:, None, None]) == [None, 9.0]
+    assert metrics.per_frame_mean(error, everywhere & (np.arange(2) == 1)[:, None, None]) == [
+        None,
+        9.0,
+    ]
     assert metrics.pooled(error, ~everywhere) is None
     assert metrics.mean_over_frames(error, ~everywhere) is None
 
@@ -109,7 +122,12 @@ def test_frames_weigh_alike_in_one_mean_and_pixels_in_the_other():
 def test_unknown_truth_hides_a_pixel_but_never_a_broken_distance():
     """NaN in a rendered distance is an error unless nobody knows the truth there."""
     truth = np.array([[[2.0, NAN]]])
-    assert metrics.pooled(metrics.squared_error(np.array([[[2.5, NAN]]]), truth), np.ones((1, 1, 2), bool)) == 0.25
+    assert (
+        metrics.pooled(
+            metrics.squared_error(np.array([[[2.5, NAN]]]), truth), np.ones((1, 1, 2), bool)
+        )
+        == 0.25
+    )
     with pytest.raises(ValueError, match="not finite"):
         metrics.squared_error(np.array([[[NAN, 1.0]]]), truth)
     with pytest.raises(ValueError, match=r"\(1, 1, 3\)"):
@@ -139,16 +157,23 @@ def test_normalised_is_zero_where_nothing_was_hit():
 
 
 def test_quad_psnr():
-    """An error of 0.1 everywhere under a peak of 2 is 10 log10(4 / 0.01) dB; no error or no light is no number."""
+    """An error of 0.1 everywhere under a peak of 2 is 10 log10(4 / 0.01) dB;
+    no error or no light is no number.
+    """
     measured = np.full((2, 3, 4), 0.5)
-    assert metrics.psnr_db(measured + 0.1, measured, peak=2.0) == pytest.approx(10 * math.log10(400))
+    assert metrics.psnr_db(measured + 0.1, measured, peak=2.0) == pytest.approx(
+        10 * math.log10(400)
+    )
     assert metrics.psnr_db(measured, measured, peak=2.0) is None
     assert metrics.psnr_db(measured + 0.1, measured, peak=0.0) is None
 
 
 def test_errors_are_printed_times_100_or_as_unknown():
     """One row of the table, and the same row where no pixel counts."""
-    errors = {name: np.full((1, 1, 2), value) for name, value in zip(metrics.DISTANCES, (4, 3, 2, 1), strict=True)}
+    errors = {
+        name: np.full((1, 1, 2), value)
+        for name, value in zip(metrics.DISTANCES, (4, 3, 2, 1), strict=True)
+    }
     row = metrics.distance_errors(errors, np.ones((1, 1, 2), dtype=bool))
     assert row == {
         "closed_form_mse_x100": 400.0,

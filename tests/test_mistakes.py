@@ -22,7 +22,9 @@ def rows():
 
 def names_of(path):
     """Names of the tests of a file."""
-    return {node.name for node in ast.parse(path.read_text()).body if isinstance(node, ast.FunctionDef)}
+    return {
+        node.name for node in ast.parse(path.read_text()).body if isinstance(node, ast.FunctionDef)
+    }
 
 
 def test_every_mistake_has_a_row_and_a_test():
@@ -50,4 +52,6 @@ def test_every_test_named_after_a_mistake_stands_in_its_row():
                 holders = [n for n, names in table.items() if f"tests/{path.name}::{test}" in names]
                 assert holders == [int(number[1])], f"{path.name}::{test} stands in rows {holders}"
             else:
-                assert not test.startswith("test_"), f"{path.name}::{test} is named after no mistake"
+                assert not test.startswith("test_"), (
+                    f"{path.name}::{test} is named after no mistake"
+                )

@@ -1,6 +1,8 @@
-"""Known mistakes of reconstructions (method, section 10): starts, checkpoints, pruning, steps, gaps, colour, scores.
+"""Known mistakes of reconstructions (method, section 10): starts, checkpoints, pruning, steps,
+gaps, colour, scores.
 
-Each test is named after the number of the mistake it would fail at; design/mistakes.md lists all of them.
+Each test is named after the number of the mistake it would fail at; design/mistakes.md lists all of
+them.
 """
 
 import dataclasses
@@ -44,9 +46,13 @@ def started(settings, sequence=None):
 
 @pytest.mark.parametrize(("height", "width"), [(24, 32), (32, 24), (8, 64), (64, 8)])
 def test_mistake_01_random_centres_fill_the_frustum_at_any_aspect_ratio(height, width):
-    """All of them project into the image, evenly over its rows and columns, for a camera that is off its middle."""
+    """All of them project into the image, evenly over its rows and columns,
+    for a camera that is off its middle.
+    """
     sequence = changed(wall(ramp(height, width)), fx=40.0, fy=30.0, cx=0.4 * width, cy=0.6 * height)
-    field = from_random(sequence, replace(RANDOM, count=2000), torch.Generator().manual_seed(0)).field
+    field = from_random(
+        sequence, replace(RANDOM, count=2000), torch.Generator().manual_seed(0)
+    ).field
     x, y = camera_of(sequence, 0).project(field.mean).unbind(dim=1)
     inside = (x >= 0) & (x <= width) & (y >= 0) & (y <= height)
     assert inside.float().mean() > 0.99
@@ -64,7 +70,9 @@ def test_mistake_01_random_centres_fill_what_any_pose_sees():
     sequence = replace(wall(ramp(24, 32)), camera_from_world=poses)
 
     def seen(of):
-        mean = from_random(of, replace(RANDOM, count=4000), torch.Generator().manual_seed(0)).field.mean
+        mean = from_random(
+            of, replace(RANDOM, count=4000), torch.Generator().manual_seed(0)
+        ).field.mean
         for frame in (0, 7):
             x, y = camera_of(sequence, frame).project(mean).unbind(dim=1)
             z = mean @ torch.tensor(poses[frame, 2, :3]).float() + float(poses[frame, 2, 3])
@@ -75,12 +83,18 @@ def test_mistake_01_random_centres_fill_what_any_pose_sees():
     _, shared = seen(wall(ramp(24, 32)))
     overlap = float(shared.float().mean())  # of the first frustum alone
     assert 0.2 < overlap < 0.8
-    assert float((first & second).float().mean()) == pytest.approx(overlap / (2.0 - overlap), abs=0.03)
-    assert float(first.float().mean()) == pytest.approx(1.0 / (2.0 - overlap), abs=0.03), "equal frusta, equally full"
+    assert float((first & second).float().mean()) == pytest.approx(
+        overlap / (2.0 - overlap), abs=0.03
+    )
+    assert float(first.float().mean()) == pytest.approx(1.0 / (2.0 - overlap), abs=0.03), (
+        "equal frusta, equally full"
+    )
 
 
 def test_mistake_02_a_checkpoint_holds_the_network_and_its_moments(tmp_path):
-    """What is loaded moves as before, and the next step is the same to the bit; without motion neither would be."""
+    """What is loaded moves as before, and the next step is the same to the bit;
+    without motion neither would be.
+    """
     settings = demo(images=400, motion=NETWORK, init=RANDOM, batch=Batch.FRAME)
     observations, state = started(settings)
     advance(state, observations, settings, 12)
@@ -101,7 +115,9 @@ def test_mistake_02_a_checkpoint_holds_the_network_and_its_moments(tmp_path):
 
 
 def test_mistake_10_phasors_and_quads_of_one_light_have_one_fit():
-    """The field that made the quads of a phasor camera fits them both ways: half a phasor is a quad, and no other."""
+    """The field that made the quads of a phasor camera fits them both ways:
+    half a phasor is a quad, and no other.
+    """
     sequence = wall(ramp(12, 16), phase_offset=0.0, dc_offset=0.0, quad_scale=1.0)
     camera, sensor = camera_of(sequence, 0), sensor_of(sequence)
     field = surface(camera, ramp(12, 16), reflectivity=0.8)
@@ -123,7 +139,11 @@ def test_mistake_10_phasors_and_quads_of_one_light_have_one_fit():
         loss = []
         for more in (0.0, 1.0):
             brighter = replace(field, reflectivity_sh=field.reflectivity_sh + SH_OFFSET * more)
-            bound = {"motion": still, "binding": still.bind(field), "statistics": densify.start(field)}
+            bound = {
+                "motion": still,
+                "binding": still.bind(field),
+                "statistics": densify.start(field),
+            }
             given = replace(state, optimiser=Optimiser(brighter, still), **bound)
             loss.append(OneStep(given, observations, settings, 4).terms["quads"])
         assert loss[0] < 1e-10
@@ -135,14 +155,24 @@ SH_OFFSET[0] = 0.1 / SH_Y0  # a tenth more reflectivity, in every direction
 
 
 def test_mistake_11_whatever_is_said_to_prune_does_so_in_a_round_that_also_adds():
-    """No criterion looks at a record that cloning clears: faint, too large and too small ones go in the same round."""
-    field = dots(np.random.default_rng(0).random((40, 3)) + np.array([0, 0, 2]), scale=0.05, opacity=0.5)
-    field.opacity_logit[0], field.log_scale[1], field.log_scale[2] = -9.0, math.log(3.0), math.log(1e-4)
+    """No criterion looks at a record that cloning clears: faint,
+    too large and too small ones go in the same round.
+    """
+    field = dots(
+        np.random.default_rng(0).random((40, 3)) + np.array([0, 0, 2]), scale=0.05, opacity=0.5
+    )
+    field.opacity_logit[0], field.log_scale[1], field.log_scale[2] = (
+        -9.0,
+        math.log(3.0),
+        math.log(1e-4),
+    )
     settings = DensifySettings(every=100, gradient_min=1.0, scale_range=(1e-3, 0.5))
     seen = replace(densify.start(field), pixels=torch.ones(40))
     seen.gradient[10:14] = 2.0
     adam = Optimiser(field, Still(torch.tensor([0.0, 1.0])))
-    done, _ = densify.round_of(adam, seen, settings, torch.Generator().manual_seed(0), judge_scale=True)
+    done, _ = densify.round_of(
+        adam, seen, settings, torch.Generator().manual_seed(0), judge_scale=True
+    )
     assert done == {"cloned": 4, "split": 0, "pruned": 3}
     left = adam.field
     assert left.opacity.min() > 0.4
@@ -151,7 +181,9 @@ def test_mistake_11_whatever_is_said_to_prune_does_so_in_a_round_that_also_adds(
 
 
 def test_mistake_11_nothing_claims_to_prune_by_size_on_the_screen():
-    """A Gaussian that fills the image stays as long as its size in metres is allowed, and no setting says otherwise."""
+    """A Gaussian that fills the image stays as long as its size in metres is allowed,
+    and no setting says otherwise.
+    """
     field = dots([[0.0, 0.0, 0.5], *([[0.0, 0.0, 2.0]] * 20)], scale=[0.4] + [0.05] * 20)
     adam = Optimiser(field, Still(torch.tensor([0.0, 1.0])))
     settings = DensifySettings(every=100, gradient_min=None, scale_range=(1e-3, 0.5))
@@ -159,12 +191,16 @@ def test_mistake_11_nothing_claims_to_prune_by_size_on_the_screen():
     densify.round_of(adam, seen, settings, torch.Generator().manual_seed(0), judge_scale=True)
     assert len(adam.field) == 21
     names = {f.name for f in dataclasses.fields(DensifySettings)}
-    assert not [name for name in names if "screen" in name or "radius" in name or "footprint" in name]
+    assert not [
+        name for name in names if "screen" in name or "radius" in name or "footprint" in name
+    ]
 
 
 @pytest.fixture(scope="module")
 def box(tmp_path_factory):
-    """A recording of a moving box in a folder, and a few steps of a reconstruction that adds Gaussians."""
+    """A recording of a moving box in a folder, and a few steps of a reconstruction that adds
+    Gaussians.
+    """
     root = tmp_path_factory.mktemp("box")
     folder = write("ftorf", root / "seq", small())
     grow = DensifySettings(every=8, start=4, stop_share=0.9, gradient_min=1e-6)
@@ -172,9 +208,13 @@ def box(tmp_path_factory):
 
 
 def test_mistake_13_a_finished_run_is_rendered_before_black(box):
-    """It was trained before a random background; where nothing is hit there is nothing, and twice is the same."""
+    """It was trained before a random background; where nothing is hit there is nothing,
+    and twice is the same.
+    """
     assert box.config["settings"]["background"] > 0
-    faint = replace(box, field=replace(box.field, opacity_logit=torch.full_like(box.field.opacity_logit, -9.0)))
+    faint = replace(
+        box, field=replace(box.field, opacity_logit=torch.full_like(box.field.opacity_logit, -9.0))
+    )
     for name in ("quads", "phasor", "distance", "opacity"):
         assert getattr(faint.render(0.0), name).abs().max() == 0.0, name
         assert torch.equal(getattr(box.render(0.03), name), getattr(box.render(0.03), name))
@@ -183,7 +223,9 @@ def test_mistake_13_a_finished_run_is_rendered_before_black(box):
 
 
 def test_mistake_13_the_published_frames_are_thirteen_of_sixty():
-    """Quartet starts without the first and the last, and the protocol is named beside the numbers."""
+    """Quartet starts without the first and the last, and the protocol is named beside the
+    numbers.
+    """
     assert scored_frames(wall(ramp(2, 3), frames=60), "ftorf13") == list(range(4, 53, 4))
 
 
@@ -195,7 +237,9 @@ def test_mistake_13_a_comparison_names_its_frames(box):
 
 
 def reflectivity_steps(settings):
-    """Change of the harmonics of the reflectivity [N, 16] in the first step, and the field before it."""
+    """Change of the harmonics of the reflectivity [N, 16] in the first step,
+    and the field before it.
+    """
     observations, state = started(settings)
     before = state.optimiser.field.map(lambda value: value.detach().clone())
     advance(state, observations, settings)
@@ -208,16 +252,22 @@ def test_mistake_14_scaling_the_loss_changes_no_step(factor):
     settings = demo(init=RANDOM, weights=Weights(quads=1.0), motion=MotionSettings(kind="still"))
     plain, _ = reflectivity_steps(settings)
     scaled, _ = reflectivity_steps(replace(settings, weights=Weights(quads=factor)))
-    slower, _ = reflectivity_steps(replace(settings, rates=replace(settings.rates, reflectivity_sh=1e-3)))
+    slower, _ = reflectivity_steps(
+        replace(settings, rates=replace(settings.rates, reflectivity_sh=1e-3))
+    )
     rate = settings.rates.reflectivity_sh
     moved = torch.minimum(plain.abs(), scaled.abs()) > 0.99 * rate
-    assert moved.float().mean() > 0.3, "all that is seen, but for gradients as small as Adam's epsilon"
+    assert moved.float().mean() > 0.3, (
+        "all that is seen, but for gradients as small as Adam's epsilon"
+    )
     torch.testing.assert_close(scaled[moved], plain[moved], rtol=1e-2, atol=0)
     torch.testing.assert_close(slower[moved], plain[moved] * (1e-3 / rate), rtol=1e-2, atol=0)
 
 
 def test_mistake_14_all_harmonics_step_with_a_camera_at_rest():
-    """Seen from one side they act as one number, whose step is 8 to 14 times that of the constant harmonic alone."""
+    """Seen from one side they act as one number, whose step is 8 to 14 times that of the constant
+    harmonic alone.
+    """
     settings = demo(init=RANDOM, motion=MotionSettings(kind="still"))
     steps, field = reflectivity_steps(settings)
     seen = steps.abs().amin(dim=1) > 0.5 * settings.rates.reflectivity_sh
@@ -230,7 +280,9 @@ def test_mistake_14_all_harmonics_step_with_a_camera_at_rest():
 
 
 def test_mistake_15_unknown_flow_and_untaken_frames_leave_a_run_finite(tmp_path):
-    """NaN in one pixel of every flow, the loss of flow included; a frame that was not taken is dark, and no data."""
+    """NaN in one pixel of every flow, the loss of flow included;
+    a frame that was not taken is dark, and no data.
+    """
     sequence = small()
     for flow in (*sequence.flow.forward.values(), *sequence.flow.backward.values()):
         flow[:, 5, 7] = np.nan
@@ -239,7 +291,10 @@ def test_mistake_15_unknown_flow_and_untaken_frames_leave_a_run_finite(tmp_path)
     sequence = replace(sequence, quads=quads, measured=taken)
     run = reconstruct(sequence, tmp_path / "run", demo(images=12, weights=Weights(flow=1e-3)))
     assert run.config["skipped"] == 0
-    assert all(value.isfinite().all() for value in (*run.field.parameters().values(), *run.motion.parameters()))
+    assert all(
+        value.isfinite().all()
+        for value in (*run.field.parameters().values(), *run.motion.parameters())
+    )
 
 
 def test_mistake_15_one_unknown_pixel_is_left_out_of_the_flow_loss():
@@ -285,7 +340,9 @@ def coloured():
 
 @pytest.mark.parametrize(("weight", "begins"), [(0.0, 0), (1.0, 8)])
 def test_mistake_22_colour_is_rendered_only_while_it_counts(monkeypatch, weight, begins):
-    """With weight 0, or before it begins, no rendering sees a colour and no image of it is uploaded."""
+    """With weight 0, or before it begins, no rendering sees a colour and no image of it is
+    uploaded.
+    """
     settings = demo(images=24, weights=Weights(colour=weight), init=RANDOM)
     settings = replace(settings, schedule=replace(settings.schedule, colour_from=begins))
     seen = []

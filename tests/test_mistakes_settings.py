@@ -1,6 +1,8 @@
-"""Known mistakes in settings (method, section 10): hidden decays, lengths by the wrong range, late resets, harmonics.
+"""Known mistakes in settings (method, section 10): hidden decays, lengths by the wrong range, late
+resets, harmonics.
 
-Each test is named after the number of the mistake it would fail at; design/mistakes.md lists all of them.
+Each test is named after the number of the mistake it would fail at; design/mistakes.md lists all of
+them.
 """
 
 import dataclasses
@@ -17,16 +19,26 @@ from gftorf_warp.recon.state import begin
 from gftorf_warp.scene.initialise import Init, InitSettings
 from gftorf_warp.scene.motion import MotionSettings
 
-RECORDED = [presets.Recorded(input=kind, unambiguous_range=d) for kind, d in ((Input.QUADS, 7.5), (Input.PHASOR, 5.0))]
+RECORDED = [
+    presets.Recorded(input=kind, unambiguous_range=d)
+    for kind, d in ((Input.QUADS, 7.5), (Input.PHASOR, 5.0))
+]
 FITTED = [name for name in presets.PRESETS if name != "ctof"]
 
 
 @pytest.mark.parametrize("recorded", RECORDED, ids=["quads", "phasor"])
 @pytest.mark.parametrize("name", FITTED)
 def test_mistake_03_both_ends_of_every_rate_are_stated(name, recorded):
-    """First and last rate of every group are fields, what is in force is log-linear between them, and nothing else."""
+    """First and last rate of every group are fields, what is in force is log-linear between them,
+    and nothing else.
+    """
     settings = presets.preset(name, recorded)
-    plain = {"pause_after_reset": 0, "freeze_from": None, "motion_ramp": 0, "batch_rule": BatchRule.NONE}
+    plain = {
+        "pause_after_reset": 0,
+        "freeze_from": None,
+        "motion_ramp": 0,
+        "batch_rule": BatchRule.NONE,
+    }
     settings = replace(settings, schedule=replace(settings.schedule, **plain))
     first, last = (dataclasses.asdict(rates) for rates in (settings.rates, settings.rates_last))
     assert first.keys() == last.keys() == rates_at(settings, 0).keys()
@@ -34,14 +46,20 @@ def test_mistake_03_both_ends_of_every_rate_are_stated(name, recorded):
     for group in first.keys() - {"motion"}:
         got = [rates_at(settings, n)[group] for n in (0, total // 4, total // 2, total)]
         ratio = last[group] / first[group]
-        assert got == pytest.approx([first[group] * ratio**share for share in (0, 0.25, 0.5, 1)]), group
+        assert got == pytest.approx([first[group] * ratio**share for share in (0, 0.25, 0.5, 1)]), (
+            group
+        )
     begin_at = max(settings.schedule.warm_up, settings.schedule.motion_decay_from)
     assert rates_at(settings, total)["motion"] == pytest.approx(last["motion"])
-    assert rates_at(settings, begin_at)["motion"] > last["motion"] or first["motion"] == last["motion"]
+    assert (
+        rates_at(settings, begin_at)["motion"] > last["motion"] or first["motion"] == last["motion"]
+    )
 
 
 def test_mistake_03_the_decay_of_the_published_code_is_spelled_out():
-    """Reflectivity: constant in the paper, 68 times down in the released code for quads and 30 times for phasors."""
+    """Reflectivity: constant in the paper, 68 times down in the released code for quads and 30
+    times for phasors.
+    """
     quads, phasor = RECORDED
     for recorded in RECORDED:
         paper = presets.paper(recorded)
@@ -50,15 +68,21 @@ def test_mistake_03_the_decay_of_the_published_code_is_spelled_out():
     assert released.rates.reflectivity_sh == pytest.approx(1.09e-3, rel=2e-3)
     assert released.rates_last.reflectivity_sh == pytest.approx(1.6e-5)
     settings = replace(released, schedule=replace(released.schedule, freeze_from=None))
-    assert rates_at(settings, released.schedule.images // 2)["reflectivity_sh"] == pytest.approx(1.32e-4, rel=5e-3)
+    assert rates_at(settings, released.schedule.images // 2)["reflectivity_sh"] == pytest.approx(
+        1.32e-4, rel=5e-3
+    )
     released = presets.released(phasor)
-    assert released.rates.reflectivity_sh / released.rates_last.reflectivity_sh == pytest.approx(30.25)
+    assert released.rates.reflectivity_sh / released.rates_last.reflectivity_sh == pytest.approx(
+        30.25
+    )
     assert released.rates.mean == pytest.approx(8.8e-4)
     assert released.rates_last.mean == pytest.approx(8.8e-6)
 
 
 def test_mistake_09_lengths_follow_the_unambiguous_range():
-    """S is 1.1 of it, 8.25 m at depth_range 15; the network sees positions in units of 7.5 m, or 8.25 m."""
+    """S is 1.1 of it, 8.25 m at depth_range 15; the network sees positions in units of 7.5 m,
+    or 8.25 m.
+    """
     quads = RECORDED[0]
     for name, unit in (("paper", 7.5), ("released", 8.25)):
         settings = presets.preset(name, quads)
@@ -66,9 +90,18 @@ def test_mistake_09_lengths_follow_the_unambiguous_range():
         assert settings.densify.clone_scale_max == pytest.approx(0.0825)
         assert settings.init.bounds == pytest.approx((0.135, 7.425))
         motion = MotionSettings(
-            kind="network", width=16, layers=3, skip_after=1, input_scale=settings.motion.input_scale
+            kind="network",
+            width=16,
+            layers=3,
+            skip_after=1,
+            input_scale=settings.motion.input_scale,
         )
-        settings = replace(settings, init=InitSettings(kind=Init.RANDOM, count=50), motion=motion, flow=FlowSource.NONE)
+        settings = replace(
+            settings,
+            init=InitSettings(kind=Init.RANDOM, count=50),
+            motion=motion,
+            flow=FlowSource.NONE,
+        )
         state = begin(observe(wall(ramp(12, 16)), settings, "cpu"), settings, seed=0, device="cpu")
         assert state.motion.length == pytest.approx(unit, rel=1e-6)
 
@@ -76,8 +109,12 @@ def test_mistake_09_lengths_follow_the_unambiguous_range():
 @pytest.mark.parametrize("recorded", RECORDED, ids=["quads", "phasor"])
 @pytest.mark.parametrize("images", [3000, 20_000, 30_000])
 @pytest.mark.parametrize("name", FITTED)
-def test_mistake_12_the_last_tenth_before_a_freeze_or_the_end_is_free_of_resets(name, images, recorded):
-    """At any length, also when the course is compressed; phasors would be reset at 19,500 of 20,000 otherwise."""
+def test_mistake_12_the_last_tenth_before_a_freeze_or_the_end_is_free_of_resets(
+    name, images, recorded
+):
+    """At any length, also when the course is compressed;
+    phasors would be reset at 19,500 of 20,000 otherwise.
+    """
     settings = presets.preset(name, recorded)
     long = replace(settings, schedule=replace(settings.schedule, images=images))
     for course in (long, presets.shortened(settings, images)):

@@ -1,4 +1,5 @@
-"""Known mistakes with phasors of a moving camera (method, section 10): poses, lengths, ranges, unknown pixels, colour.
+"""Known mistakes with phasors of a moving camera (method, section 10): poses, lengths, ranges,
+unknown pixels, colour.
 
 The folders are written here, file by file, so that a reader and a writer cannot agree on a mistake.
 """
@@ -19,8 +20,11 @@ from gftorf_warp.errors import InputError
 from gftorf_warp.render.api import rasterize
 from gftorf_warp.scene.measured import camera_of, colour_camera_of, sensor_of
 
-TOF_FROM_WORLD = np.stack([pose((0.2, 1.0, 0.1), 0.3 + 0.1 * i, (0.1, -0.2 * i, 0.3)) for i in range(3)])
-TOF_FROM_COLOUR = pose((0.1, 0.3, 1.0), 0.2, (0.12, 0.03, -0.05))  # a relative pose E, colour to ToF
+TOF_FROM_WORLD = np.stack(
+    [pose((0.2, 1.0, 0.1), 0.3 + 0.1 * i, (0.1, -0.2 * i, 0.3)) for i in range(3)]
+)
+# a relative pose E, colour to ToF
+TOF_FROM_COLOUR = pose((0.1, 0.3, 1.0), 0.2, (0.12, 0.03, -0.05))
 DISTANCE = 1.0 + 0.07 * np.arange(48).reshape(6, 8)
 AMPLITUDE = 0.8 / DISTANCE**2  # of a quad
 COLOUR = np.linspace(-0.2, 3.0, 12 * 16 * 3, dtype=np.float32).reshape(12, 16, 3)
@@ -28,12 +32,18 @@ COLOUR = np.linspace(-0.2, 3.0, 12 * 16 * 3, dtype=np.float32).reshape(12, 16, 3
 
 @pytest.fixture
 def folder(tmp_path):
-    """Three phasors of 8x6 pixels at depth_range 10 m, colour images of 16x12, a pose per phasor, a relative pose."""
+    """Three phasors of 8x6 pixels at depth_range 10 m, colour images of 16x12, a pose per phasor,
+    a relative pose.
+    """
     root = tmp_path / "seq"
     for name in ("tof", "color", "cams"):
         (root / name).mkdir(parents=True)
     phase = 4 * math.pi * DISTANCE / 10.0 - 0.4
-    phasor = 2 * AMPLITUDE[..., None] * np.stack([np.cos(phase), np.sin(phase), np.ones_like(phase)], axis=-1)
+    phasor = (
+        2
+        * AMPLITUDE[..., None]
+        * np.stack([np.cos(phase), np.sin(phase), np.ones_like(phase)], axis=-1)
+    )
     for i in range(3):
         np.save(root / f"tof/{i:04d}.npy", phasor.astype(np.float32))
         np.save(root / f"color/{i:04d}.npy", COLOUR + np.float32(i))
@@ -50,7 +60,9 @@ def folder(tmp_path):
 
 
 def test_mistake_09_the_range_of_phasors_is_half_of_what_the_file_says(folder):
-    """depth_range 10 m is 29.98 MHz and unambiguous to 5 m; the pixels decode to their distances."""
+    """depth_range 10 m is 29.98 MHz and unambiguous to 5 m;
+    the pixels decode to their distances.
+    """
     sequence = Sequence.open(folder)
     assert sequence.calibration.f_mod_hz == pytest.approx(SPEED_OF_LIGHT / 10.0, rel=1e-12)
     assert sensor_of(sequence).unambiguous_range == pytest.approx(5.0)
@@ -58,7 +70,9 @@ def test_mistake_09_the_range_of_phasors_is_half_of_what_the_file_says(folder):
 
 
 def test_mistake_10_quads_of_a_phasor_are_half_as_long(folder):
-    """Their differences are the stored phasor to the bit, so a rendered amplitude of a is compared with 2a / 2."""
+    """Their differences are the stored phasor to the bit,
+    so a rendered amplitude of a is compared with 2a / 2.
+    """
     sequence = Sequence.open(folder)
     stored = np.load(folder / "tof/0001.npy")
     np.testing.assert_array_equal(sequence.quads[4] - sequence.quads[5], stored[..., 0])
@@ -85,14 +99,20 @@ def test_mistake_20_poses_are_world_to_camera_for_all_four_quads(folder, phasor)
     for frame in range(4 * phasor, 4 * phasor + 4):
         at = camera_of(sequence, frame).project(torch.tensor(world[:3]))
         assert at.tolist() == pytest.approx([7.0 * 0.15 + 3.9, 7.5 * -0.05 + 3.1])
-    image = rasterize(dots(world[:3], scale=0.3), camera_of(sequence, 4 * phasor), sensor_of(sequence))
+    image = rasterize(
+        dots(world[:3], scale=0.3), camera_of(sequence, 4 * phasor), sensor_of(sequence)
+    )
     y, x = divmod(int(image.opacity.argmax()), 8)
     assert (x, y) == (4, 2)
-    assert float((image.distance / image.opacity)[y, x]) == pytest.approx(math.hypot(0.3, 0.1, 2.0), rel=1e-4)
+    assert float((image.distance / image.opacity)[y, x]) == pytest.approx(
+        math.hypot(0.3, 0.1, 2.0), rel=1e-4
+    )
 
 
 def test_mistake_20_the_relative_pose_takes_colour_to_tof(folder):
-    """What the colour camera has at (x, y, z) is where E and the ToF pose put it; the inverse of E would miss it."""
+    """What the colour camera has at (x, y, z) is where E and the ToF pose put it;
+    the inverse of E would miss it.
+    """
     sequence = Sequence.open(folder)
     for phasor in range(3):
         local = np.array([0.2, 0.3, 1.5, 1.0])
@@ -115,8 +135,12 @@ def test_mistake_20_colour_is_read_as_stored(folder):
 
 
 def test_mistake_21_tof_and_colour_keep_their_own_size_and_intrinsics(folder):
-    """Twice the pixels in the colour images; the ToF camera does not notice. Integer centres gain half a pixel."""
+    """Twice the pixels in the colour images; the ToF camera does not notice.
+    Integer centres gain half a pixel.
+    """
     sequence = Sequence.open(folder)
     assert sequence.quads.shape == (12, 6, 8)
     assert dataclasses.astuple(sequence.intrinsics)[:4] == pytest.approx((7.0, 7.5, 3.9, 3.1))
-    assert dataclasses.astuple(sequence.colour.intrinsics)[:4] == pytest.approx((14.0, 14.5, 7.7, 6.4))
+    assert dataclasses.astuple(sequence.colour.intrinsics)[:4] == pytest.approx(
+        (14.0, 14.5, 7.7, 6.4)
+    )

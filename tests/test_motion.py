@@ -47,9 +47,13 @@ def test_motion_is_continuous_at_keys_and_holds_beyond_the_ends(nodes, gaussians
     key = float(KEYS[1])
     before, after = (nodes.at(binding, key + dt).offset for dt in (-1e-7, 1e-7))
     torch.testing.assert_close(before, after, rtol=0, atol=1e-5)
-    torch.testing.assert_close(nodes.at(binding, -5.0).offset, nodes.at_keys(binding, [0]).offset[0])
+    torch.testing.assert_close(
+        nodes.at(binding, -5.0).offset, nodes.at_keys(binding, [0]).offset[0]
+    )
     torch.testing.assert_close(nodes.at(binding, 1e3).offset, nodes.at_keys(binding, [3]).offset[0])
-    assert (nodes.at_keys(binding, [0]).offset[0] - nodes.at_keys(binding, [3]).offset[0]).abs().max() > 0.05
+    assert (
+        nodes.at_keys(binding, [0]).offset[0] - nodes.at_keys(binding, [3]).offset[0]
+    ).abs().max() > 0.05
 
 
 def test_gaussians_follow_nodes_of_their_own_layer_and_the_static_layer_is_pinned(nodes, gaussians):
@@ -67,7 +71,9 @@ def test_gaussians_follow_nodes_of_their_own_layer_and_the_static_layer_is_pinne
 def test_nearer_nodes_count_more():
     """And two nodes equally far count the same."""
     motion = Nodes(KEYS, torch.tensor([[0.0, 0, 0], [1.0, 0, 0]]), torch.tensor([1, 1]))
-    weights = motion.bind(field(torch.tensor([[0.0, 0, 0], [0.4, 0, 0], [0.5, 0, 0]]), torch.ones(3, dtype=int)))
+    weights = motion.bind(
+        field(torch.tensor([[0.0, 0, 0], [0.4, 0, 0], [0.5, 0, 0]]), torch.ones(3, dtype=int))
+    )
     assert weights[0, 0] > weights[1, 0] > 0.5
     torch.testing.assert_close(weights[2], torch.tensor([0.5, 0.5]))
     points = random(20, 3)
@@ -81,7 +87,9 @@ def test_gradient_reaches_the_two_keys_around_a_time_only(nodes, gaussians):
     """With the weights of the interpolation."""
     binding = nodes.bind(gaussians)
     cotangent = random(9, 3, seed=3)
-    (gradient,) = torch.autograd.grad((nodes.at(binding, 5 / 120).offset * cotangent).sum(), nodes.offset)
+    (gradient,) = torch.autograd.grad(
+        (nodes.at(binding, 5 / 120).offset * cotangent).sum(), nodes.offset
+    )
     assert gradient[[0, 3]].abs().max() == 0
     torch.testing.assert_close(gradient[1], 0.75 * binding.T @ cotangent, rtol=1e-4, atol=1e-6)
     torch.testing.assert_close(gradient[2], 0.25 * binding.T @ cotangent, rtol=1e-4, atol=1e-6)

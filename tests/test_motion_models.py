@@ -1,4 +1,6 @@
-"""Every motion model: the same start, store, gradients, training and rendering; splines and rotations in particular."""
+"""Every motion model: the same start, store, gradients, training and rendering;
+splines and rotations in particular.
+"""
 
 import math
 from dataclasses import replace
@@ -52,7 +54,9 @@ def made(kind, gaussians, *, keys=KEYS, size=0.2):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_weights_sum_to_one_and_hold_the_ends(kind):
-    """At any time, over no more keys than the model says; before the first key and after the last nothing changes."""
+    """At any time, over no more keys than the model says;
+    before the first key and after the last nothing changes.
+    """
     scene = layered()
     motion = made(kind, scene)
     for time in (*KEYS.tolist(), -3.0, 0.01, 0.0401, 0.099, 7.0):
@@ -67,7 +71,9 @@ def test_weights_sum_to_one_and_hold_the_ends(kind):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_model_stores_and_loads_itself(kind, tmp_path):
-    """Through a file that a safe loader reads; also a model of another kind is not mistaken for it."""
+    """Through a file that a safe loader reads; also a model of another kind is not mistaken for
+    it.
+    """
     scene = layered()
     motion = made(kind, scene)
     torch.save(motion.to_dict(), tmp_path / "motion.pt")
@@ -82,17 +88,31 @@ def test_a_model_stores_and_loads_itself(kind, tmp_path):
 def test_checkpoints_of_before_models_stored_themselves_load():
     """The dictionaries that recon/state.py wrote, of the three models of that time."""
     times, node = KEYS, random(2, 3)
-    tensors = {"key_times": times, "node": node, "layer": torch.tensor([1, 1]), "offset": random(4, 2, 3, seed=1)}
-    assert type(motion_from_dict({"kind": "still", "tensors": {"key_times": times}})) is KINDS["still"]
+    tensors = {
+        "key_times": times,
+        "node": node,
+        "layer": torch.tensor([1, 1]),
+        "offset": random(4, 2, 3, seed=1),
+    }
+    assert (
+        type(motion_from_dict({"kind": "still", "tensors": {"key_times": times}})) is KINDS["still"]
+    )
     nodes = motion_from_dict({"kind": "nodes", "tensors": tensors, "neighbours": 3})
     assert nodes.neighbours == 3
     assert torch.equal(nodes.offset, tensors["offset"])
     network = made("network", layered())
     shape = {
-        "kind": "network", "nodes": 64, "neighbours": 4, "from_tracks": True, "layers": 3, "width": 16, "skip_after": 2,
+        "kind": "network", "nodes": 64, "neighbours": 4, "from_tracks": True, "layers": 3,
+        "width": 16, "skip_after": 2,
         "position_frequencies": 3, "time_frequencies": 10, "input_scale": 1.0,
     }  # fmt: skip
-    old = {"kind": "network", "tensors": network.state_dict(), "shape": shape, "duration": 0.1, "length": 7.5}
+    old = {
+        "kind": "network",
+        "tensors": network.state_dict(),
+        "shape": shape,
+        "duration": 0.1,
+        "length": 7.5,
+    }
     for more in ({}, {"products": "float32"}):
         again = motion_from_dict(old | {"shape": shape | more})
         assert same(again.state_dict(), network.state_dict())
@@ -100,23 +120,33 @@ def test_checkpoints_of_before_models_stored_themselves_load():
 
 @pytest.mark.parametrize("kind", ["still", "nodes", "network"])
 def test_a_whole_checkpoint_of_format_2_loads(kind):
-    """Its motion had these keys; the state of a torch generator was where the seed of the noise is now."""
+    """Its motion had these keys; the state of a torch generator was where the seed of the noise is
+    now.
+    """
     settings = demo(motion=MotionSettings(kind=kind, layers=3, width=16, skip_after=2))
     state = begin(observe(small(), settings, "cpu"), settings, seed=3, device="cpu")
     stored = to_dict(state)
     keys = {"still": set(), "nodes": {"neighbours"}, "network": {"shape", "duration", "length"}}
     assert stored["motion"].keys() == {"kind", "tensors"} | keys[kind]
     del stored["noise_seed"]
-    again = from_dict(stored | {"format": 2, "noise": torch.Generator().manual_seed(3).get_state()}, "cpu")
+    again = from_dict(
+        stored | {"format": 2, "noise": torch.Generator().manual_seed(3).get_state()}, "cpu"
+    )
     assert type(again.motion) is KINDS[kind]
     assert again.noise_seed == state.noise_seed
-    for one, other in zip(state.motion.at(state.binding, 0.05), again.motion.at(again.binding, 0.05), strict=True):
+    for one, other in zip(
+        state.motion.at(state.binding, 0.05), again.motion.at(again.binding, 0.05), strict=True
+    ):
         assert (one is None and other is None) or torch.equal(one, other)
 
 
 def test_an_unknown_model_is_refused_by_name():
     """In a checkpoint, in settings and on the command line; all that exist are listed."""
-    with pytest.raises(InputError, match=r"unknown motion model 'flock'(.|\n)*still, nodes, network"):
+    with pytest.raises(
+        InputError,
+        match=r"unknown motion model 'flock'(.|\n)*still, nodes, "
+        r"network",
+    ):
         motion_from_dict({"kind": "flock", "tensors": {}})
     with pytest.raises(ValueError, match=r"motion.kind must be one of still, .*, got 'flock'"):
         demo(motion=MotionSettings(kind="flock"))
@@ -127,15 +157,21 @@ def test_an_unknown_model_is_refused_by_name():
 
 
 def test_splines_reproduce_lines():
-    """Control points on a line, evenly spaced: the curve is at the same point of it at every time."""
+    """Control points on a line, evenly spaced: the curve is at the same point of it at every
+    time.
+    """
     motion = Spline(KEYS, random(1, 3), torch.ones(1, dtype=torch.long))
     for time in torch.linspace(0.0, float(KEYS[-1]), 23).tolist():
         keys = motion.keys_at(time)
-        assert sum(w * motion.times[k] for k, w in zip(keys.index, keys.weight, strict=True)) == pytest.approx(time)
+        assert sum(
+            w * motion.times[k] for k, w in zip(keys.index, keys.weight, strict=True)
+        ) == pytest.approx(time)
 
 
 def test_splines_have_two_continuous_derivatives():
-    """Across every inner key, for any control points; a curve that is linear between keys has none."""
+    """Across every inner key, for any control points; a curve that is linear between keys has
+    none.
+    """
     values, h = random(len(KEYS), seed=5).double(), 1e-4
 
     def at(motion, time):
@@ -149,7 +185,9 @@ def test_splines_have_two_continuous_derivatives():
             left, right = ([at(motion, key + side * n * h) for n in (0, 1, 2)] for side in (-1, 1))
             slopes = [(one[1] - one[0]) / (side * h) for side, one in ((-1, left), (1, right))]
             bends = [(one[2] - 2 * one[1] + one[0]) / h**2 for one in (left, right)]
-            jumps.setdefault(kind, []).append((abs(slopes[1] - slopes[0]), abs(bends[1] - bends[0])))
+            jumps.setdefault(kind, []).append(
+                (abs(slopes[1] - slopes[0]), abs(bends[1] - bends[0]))
+            )
     size = float(values.abs().max()) * 30  # per second: keys are a thirtieth apart
     assert max(slope for slope, _ in jumps["spline"]) < 0.02 * size
     assert max(bend for _, bend in jumps["spline"]) < 0.02 * size * 30
@@ -186,13 +224,17 @@ def rigid():
 
 
 def test_rigid_nodes_are_their_definition():
-    """By R(w) (x - p) + p + t with weighted means, written out in matrices; the static layer does not move."""
+    """By R(w) (x - p) + p + t with weighted means, written out in matrices;
+    the static layer does not move.
+    """
     motion, binding, scene = rigid()
     weight, got = binding[:, : len(motion.node)], motion.at_keys(binding, [0, 3])
     for n, key in enumerate((0, 3)):
         turn = torch.matrix_exp(skew(weight @ motion.rotation[key]))
         centre = weight @ motion.node
-        want = (turn @ (scene.mean - centre)[..., None])[..., 0] + centre + weight @ motion.offset[key]
+        want = (
+            (turn @ (scene.mean - centre)[..., None])[..., 0] + centre + weight @ motion.offset[key]
+        )
         torch.testing.assert_close(scene.mean + got.offset[n], want)
         torch.testing.assert_close(matrix(got.rotation[n]), turn)
     static = scene.layer == 0
@@ -201,7 +243,9 @@ def test_rigid_nodes_are_their_definition():
 
 
 def test_gradients_of_rigid_nodes_are_those_of_finite_differences():
-    """W.r.t. rotations, translations and means, of which the gradient is the rotation; from no rotation, too."""
+    """W.r.t. rotations, translations and means, of which the gradient is the rotation;
+    from no rotation, too.
+    """
     motion, binding, scene = rigid()
     weight, mean = binding[:, : len(motion.node)], scene.mean
 
@@ -209,7 +253,9 @@ def test_gradients_of_rigid_nodes_are_those_of_finite_differences():
         values = {"rotation": rotation, "offset": offset}
         arguments = torch.cat([weight, mean], dim=1), [1, 2]
         return tuple(
-            torch.func.functional_call(_AtKeys(motion), {f"motion.{k}": v for k, v in values.items()}, arguments)
+            torch.func.functional_call(
+                _AtKeys(motion), {f"motion.{k}": v for k, v in values.items()}, arguments
+            )
         )
 
     for factor in (1.0, 0.0):
@@ -236,17 +282,28 @@ class _AtKeys(torch.nn.Module):
 
 
 def test_a_rigid_motion_that_nodes_share_is_reproduced():
-    """Rotation by 0.7 about an axis through any point: all Gaussians of the layer follow exactly, covariances too."""
-    scene = replace(layered(30), layer=torch.ones(30, dtype=torch.long), quaternion=random(30, 4, seed=7))
+    """Rotation by 0.7 about an axis through any point: all Gaussians of the layer follow exactly,
+    covariances too.
+    """
+    scene = replace(
+        layered(30), layer=torch.ones(30, dtype=torch.long), quaternion=random(30, 4, seed=7)
+    )
     motion = made("rigid_nodes", scene, size=0.0)
-    axis, centre = torch.nn.functional.normalize(torch.tensor([0.3, -0.5, 0.8]), dim=0), torch.tensor([0.2, 0.9, -0.4])
+    axis, centre = (
+        torch.nn.functional.normalize(torch.tensor([0.3, -0.5, 0.8]), dim=0),
+        torch.tensor([0.2, 0.9, -0.4]),
+    )
     turn = torch.matrix_exp(skew(0.7 * axis))
     with torch.no_grad():
         motion.rotation[1] = 0.7 * axis
         motion.offset[1] = (motion.node - centre) @ turn.T + centre - motion.node
     moved = scene.moved(*motion.at(motion.bind(scene), motion.times[1]))
-    torch.testing.assert_close(moved.mean, (scene.mean - centre) @ turn.T + centre, rtol=1e-5, atol=1e-6)
-    one, other = (matrix(torch.nn.functional.normalize(g.quaternion, dim=1)) for g in (scene, moved))
+    torch.testing.assert_close(
+        moved.mean, (scene.mean - centre) @ turn.T + centre, rtol=1e-5, atol=1e-6
+    )
+    one, other = (
+        matrix(torch.nn.functional.normalize(g.quaternion, dim=1)) for g in (scene, moved)
+    )
     torch.testing.assert_close(other, turn @ one, rtol=1e-5, atol=1e-6)
 
 
@@ -278,7 +335,9 @@ def test_a_replay_draws_what_render_draws(run, kind):  # noqa: F811
 @pytest.mark.parametrize("kind", ["spline", "rigid_nodes"])
 def test_a_short_fit_lowers_the_loss_and_is_read_again(kind, device, tmp_path):
     """Sixty images; all parameters move, and the folder gives back the model that was trained."""
-    settings = demo(images=60, log_every=12, warm_up=0, motion=MotionSettings(kind=kind, from_tracks=False))
+    settings = demo(
+        images=60, log_every=12, warm_up=0, motion=MotionSettings(kind=kind, from_tracks=False)
+    )
     run = reconstruct(small(), tmp_path / "run", settings, device=device)  # noqa: F811
     losses = [row["loss"] for row in rows(run.path) if "loss" in row]
     assert losses[-1] < 0.9 * losses[0]
@@ -288,20 +347,36 @@ def test_a_short_fit_lowers_the_loss_and_is_read_again(kind, device, tmp_path):
     again = Run.open(run.path)
     assert same(again.motion.state_dict(), {n: t.cpu() for n, t in run.motion.state_dict().items()})
     assert stored(run.path)["motion"]["kind"] == kind
-    torch.testing.assert_close(again.render(0.06).quads, run.render(0.06).quads.cpu(), rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(
+        again.render(0.06).quads, run.render(0.06).quads.cpu(), rtol=1e-4, atol=1e-4
+    )
 
 
 def test_a_training_step_differentiates_means_through_rotations(monkeypatch):
-    """Its gradient is that of finite differences of its loss, where the moving layer is rotated by one radian."""
+    """Its gradient is that of finite differences of its loss,
+    where the moving layer is rotated by one radian.
+    """
     weights = Weights(quads=1.0, ssim=0.0, distortion=0.0, flow=0.0, motion_size=0.0)
-    settings = demo(images=60, warm_up=0, weights=weights, background=0.0, motion=MotionSettings(kind="rigid_nodes"))
-    settings = replace(settings, render=replace(settings.render, clamp_gradient=ClampGradient.EXACT))
+    settings = demo(
+        images=60,
+        warm_up=0,
+        weights=weights,
+        background=0.0,
+        motion=MotionSettings(kind="rigid_nodes"),
+    )
+    settings = replace(
+        settings, render=replace(settings.render, clamp_gradient=ClampGradient.EXACT)
+    )
     observations, lists = observe(small(), settings, "cpu"), []
     point = descent.AdamTable.point
-    monkeypatch.setattr(descent.AdamTable, "point", lambda table, given: lists.append(given) or point(table, given))
+    monkeypatch.setattr(
+        descent.AdamTable, "point", lambda table, given: lists.append(given) or point(table, given)
+    )
 
     def loss(shift=0.0):
-        """Mean over the images of the first batch, with all nodes in one rigid motion; means moved before it."""
+        """Mean over the images of the first batch, with all nodes in one rigid motion;
+        means moved before it.
+        """
         state = begin(observations, settings, seed=0, device="cpu")
         vector = torch.tensor([0.2, 0.9, -0.3])
         with torch.no_grad():

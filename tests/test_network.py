@@ -1,4 +1,6 @@
-"""The motion network: its size, what it computes, its small initial displacements, and its checkpoints."""
+"""The motion network: its size, what it computes, its small initial displacements,
+and its checkpoints.
+"""
 
 import copy
 
@@ -12,7 +14,9 @@ from gftorf_warp.scene.network import Network
 
 
 def network(settings=MotionSettings(), *, seed=0, head=None):
-    """A network over three quartets of twelve frames; ``head``: deviation of the last layer, to see it move."""
+    """A network over three quartets of twelve frames; ``head``: deviation of the last layer,
+    to see it move.
+    """
     generator = torch.Generator().manual_seed(seed)
     made = Network(KEYS, settings, duration=11 / 120, length=7.5, generator=generator)
     if head is not None:
@@ -25,12 +29,20 @@ def network(settings=MotionSettings(), *, seed=0, head=None):
 
 def spelt_out(motion, position, key):
     """What a float64 network gives, every input joined as the method has it."""
-    settings, time = motion.settings, torch.full((len(position), 1), float(KEYS[key]) / motion.duration).double()
-    parts = (position.double() / motion.length, settings.position_frequencies), (time, settings.time_frequencies)
+    settings, time = (
+        motion.settings,
+        torch.full((len(position), 1), float(KEYS[key]) / motion.duration).double(),
+    )
+    parts = (
+        (position.double() / motion.length, settings.position_frequencies),
+        (time, settings.time_frequencies),
+    )
     inputs = torch.cat([_gamma(*part) for part in parts], dim=1)
     hidden = inputs
     for number, layer in enumerate(motion.layers):
-        hidden = torch.relu(layer(torch.cat([hidden, inputs], dim=1) if number == settings.skip_after else hidden))
+        hidden = torch.relu(
+            layer(torch.cat([hidden, inputs], dim=1) if number == settings.skip_after else hidden)
+        )
     return motion.head(hidden)
 
 
@@ -45,11 +57,22 @@ def test_it_has_the_published_size():
     """84 inputs, eight layers of 256, the input again before the sixth, three outputs."""
     made = network()
     assert sum(parameter.numel() for parameter in made.parameters()) == 504_579
-    assert [layer.weight.shape[1] for layer in made.layers] == [84, 256, 256, 256, 256, 340, 256, 256]
+    assert [layer.weight.shape[1] for layer in made.layers] == [
+        84,
+        256,
+        256,
+        256,
+        256,
+        340,
+        256,
+        256,
+    ]
 
 
 def test_it_computes_what_the_method_says():
-    """Sharing the part of the positions between keys changes nothing but rounding; four layers without a skip too."""
+    """Sharing the part of the positions between keys changes nothing but rounding;
+    four layers without a skip too.
+    """
     position = random(40, 3) * 6 - 3
     for settings in (MotionSettings(), MotionSettings(layers=4, width=32)):
         made = network(settings, head=0.1)
@@ -59,7 +82,9 @@ def test_it_computes_what_the_method_says():
             want = spelt_out(copy.deepcopy(made).double(), position, key)
             assert want.abs().max() > 0.01
             torch.testing.assert_close(row.double(), want, rtol=1e-4, atol=1e-5)
-            torch.testing.assert_close(made.at_keys(binding, [key]).offset[0], row, rtol=1e-4, atol=1e-6)
+            torch.testing.assert_close(
+                made.at_keys(binding, [key]).offset[0], row, rtol=1e-4, atol=1e-6
+            )
     assert (got[0] - got[1]).abs().max() > 1e-3, "it depends on time"
 
 
@@ -74,10 +99,14 @@ def test_gradients_reach_every_weight_and_no_position():
     assert none is None
     twin = copy.deepcopy(made).double()
     ends = [spelt_out(twin, position.detach(), key) for key in (1, 2)]
-    want = torch.autograd.grad(((0.75 * ends[0] + 0.25 * ends[1]) * cotangent).sum(), list(twin.parameters()))
+    want = torch.autograd.grad(
+        ((0.75 * ends[0] + 0.25 * ends[1]) * cotangent).sum(), list(twin.parameters())
+    )
     for one, other in zip(got, want, strict=True):
         assert other.abs().max() > 1e-6
-        torch.testing.assert_close(one.double(), other, rtol=2e-3, atol=2e-4 * float(other.abs().max()))
+        torch.testing.assert_close(
+            one.double(), other, rtol=2e-3, atol=2e-4 * float(other.abs().max())
+        )
 
 
 def test_it_starts_at_rest_and_the_same_for_a_seed():
@@ -92,10 +121,17 @@ def test_it_starts_at_rest_and_the_same_for_a_seed():
 
 
 def test_encoding_has_no_factor_pi():
-    """gamma(v) = [v, sin v, cos v, sin 2v, cos 2v, ..]; the order of the waves is a convention of the weights only."""
+    """gamma(v) = [v, sin v, cos v, sin 2v, cos 2v, ..];
+    the order of the waves is a convention of the weights only.
+    """
     value = torch.tensor([[0.3]])
     got = sorted(encoded(value, 2)[0].tolist())
-    want = sorted([0.3, *(float(wave(torch.tensor(a))) for a in (0.3, 0.6) for wave in (torch.sin, torch.cos))])
+    want = sorted(
+        [
+            0.3,
+            *(float(wave(torch.tensor(a))) for a in (0.3, 0.6) for wave in (torch.sin, torch.cos)),
+        ]
+    )
     assert got == pytest.approx(want)
     assert encoded(torch.zeros(4, 3), 10).shape == (4, 63)
     assert encoded(torch.zeros(4, 1), 10).shape == (4, 21)
@@ -104,7 +140,9 @@ def test_encoding_has_no_factor_pi():
 def test_layers_say_nothing_to_a_network():
     """Nodes do not move the static layer; a network has no layers."""
     made, position = network(head=0.1), random(30, 3)
-    static = made.at_keys(made.bind(field(position, torch.zeros(30, dtype=torch.long))), [1]).offset[0]
+    static = made.at_keys(
+        made.bind(field(position, torch.zeros(30, dtype=torch.long))), [1]
+    ).offset[0]
     assert static.any(dim=1).all()
     assert torch.equal(static, made.at_keys(made.bind(field(position, None)), [1]).offset[0])
 

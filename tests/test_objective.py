@@ -74,7 +74,9 @@ def test_terms_of_weight_zero_are_left_out_and_others_begin_when_the_schedule_sa
     images = OneStep(state, observations, settings, 9).images
     assert images[0].renderings.keys() == {View.TOF}, "no flow, no colour"
     fixed = replace(settings, schedule=replace(settings.schedule, warm_up=1000))
-    assert OneStep(state, observations, fixed, 8).terms.keys() == {"quads", "distortion"}, "nothing moves"
+    assert OneStep(state, observations, fixed, 8).terms.keys() == {"quads", "distortion"}, (
+        "nothing moves"
+    )
 
 
 def test_the_measured_slot_is_compared_at_its_own_time_and_shift():
@@ -118,7 +120,9 @@ def test_reduced_keeps_the_view():
     assert (half.intrinsics.fx, half.intrinsics.cx, half.intrinsics.cy) == (21.0, 12.0, 9.0)
     want = sequence.quads[3].reshape(18, 2, 24, 2).mean(axis=(1, 3))
     np.testing.assert_allclose(half.quads[3], want, atol=1e-6)
-    np.testing.assert_allclose(half.flow.forward[4].max(), 0.5 * sequence.flow.forward[4].max(), rtol=0.05)
+    np.testing.assert_allclose(
+        half.flow.forward[4].max(), 0.5 * sequence.flow.forward[4].max(), rtol=0.05
+    )
     assert reduced(sequence, 48) is sequence
     assert reduced(sequence, None) is sequence
 
@@ -129,7 +133,11 @@ def test_the_hash_sees_what_is_read():
     assert data_hash(sequence) == data_hash(small())
     quads = sequence.quads.copy()
     quads[3, 4, 5] += 1e-6
-    others = [replace(sequence, quads=quads), changed(sequence, fx=43.0), changed(sequence, backward_flow={})]
+    others = [
+        replace(sequence, quads=quads),
+        changed(sequence, fx=43.0),
+        changed(sequence, backward_flow={}),
+    ]
     assert len({data_hash(other) for other in (sequence, *others)}) == 4
 
 
@@ -140,7 +148,9 @@ def test_an_empty_recording_is_refused():
 
 
 def test_reflectivity_can_start_clamped_and_recover():
-    """A Gaussian whose reflectivity is below zero everywhere has no gradient of its own; the run must not break."""
+    """A Gaussian whose reflectivity is below zero everywhere has no gradient of its own;
+    the run must not break.
+    """
     settings = demo(images=8)
     observations = observe(small(), settings, "cpu")
     state = begin(observations, settings, seed=0, device="cpu")

@@ -1,4 +1,6 @@
-"""Lenses: distortion against OpenCV, its inverse, what it does to the truth; fall-off and beam on a frontal wall."""
+"""Lenses: distortion against OpenCV, its inverse, what it does to the truth;
+fall-off and beam on a frontal wall.
+"""
 
 import math
 from dataclasses import replace
@@ -31,7 +33,11 @@ from gftorf_warp.sim.world import Body, Box, Texture
 
 BARREL = Distortion(k1=-0.25, k2=0.08, p1=0.002, p2=-0.003, k3=-0.01)
 PINCUSHION = Distortion(k1=0.15, k2=-0.02)
-WALL = Body(shape=Level(axis=2, value=3.0), texture=Texture(low=0.5, high=0.5), path=Still(position=(0.0, 0.0, 0.0)))
+WALL = Body(
+    shape=Level(axis=2, value=3.0),
+    texture=Texture(low=0.5, high=0.5),
+    path=Still(position=(0.0, 0.0, 0.0)),
+)
 
 
 def scene(**settings):
@@ -57,10 +63,21 @@ def test_distortion_is_opencv_s(lens):
 
 @pytest.mark.parametrize("lens", [BARREL, PINCUSHION], ids=["barrel", "pincushion"])
 def test_rays_meet_the_pixel_centres(lens):
-    """A point on the ray of a pixel is imaged at its centre; a pose turns the rays as it did before."""
+    """A point on the ray of a pixel is imaged at its centre;
+    a pose turns the rays as it did before.
+    """
     pose = np.eye(4)
     pose[:3, :3] = [[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]]
-    camera = Camera(width=40, height=30, fx=29.0, fy=28.0, cx=19.0, cy=16.0, camera_from_world=pose, distortion=lens)
+    camera = Camera(
+        width=40,
+        height=30,
+        fx=29.0,
+        fy=28.0,
+        cx=19.0,
+        cy=16.0,
+        camera_from_world=pose,
+        distortion=lens,
+    )
     rays = camera.rays(dtype=torch.float64)
     seen = camera.project(torch.from_numpy(camera.centre) + 2.0 * rays).numpy()
     y, x = np.mgrid[:30, :40] + 0.5
@@ -68,7 +85,8 @@ def test_rays_meet_the_pixel_centres(lens):
     np.testing.assert_allclose(rays.norm(dim=-1).numpy(), 1.0)
     fine = camera.resized(80, 60).directions().reshape(30, 2, 40, 2, 3).mean((1, 3))
     bent = torch.nn.functional.normalize(fine, dim=-1) - camera.directions()
-    assert bent.norm(dim=-1).max() < 1e-3  # sub-samples of the same lens surround the ray of the pixel
+    # sub-samples of the same lens surround the ray of the pixel
+    assert bent.norm(dim=-1).max() < 1e-3
 
 
 def test_derivatives_of_a_lens():
@@ -99,7 +117,10 @@ def test_truth_and_ideal_quads_are_seen_through_the_lens():
 @pytest.mark.parametrize(
     ("changes", "says"),
     [
-        ({"frequencies_hz": np.repeat([20e6, 20e6 * math.sqrt(2)], 6)}, "frequencies without a common range"),
+        (
+            {"frequencies_hz": np.repeat([20e6, 20e6 * math.sqrt(2)], 6)},
+            "frequencies without a common range",
+        ),
     ],
 )
 def test_what_cannot_be_rendered_is_not_reconstructed(changes, says, tmp_path):
@@ -109,13 +130,18 @@ def test_what_cannot_be_rendered_is_not_reconstructed(changes, says, tmp_path):
 
 
 def test_lenses_that_cannot_be_undone_are_refused():
-    """A fold inside the image, and coefficients that are no numbers; nothing is decided by luck of an iteration."""
+    """A fold inside the image, and coefficients that are no numbers;
+    nothing is decided by luck of an iteration.
+    """
     fold = Distortion(k1=-2.0)  # r (1 - 2 r^2) turns at r = .41
     with pytest.raises(ValueError, match=r"k1=-2\.0.* cannot be undone"):
         Camera.from_fov(33, 25, 60.0, distortion=fold)
     Camera.from_fov(33, 25, 10.0, distortion=fold)  # far inside its turn
-    twice = Distortion(k1=-1.0, k2=0.3)  # turns, and turns back: what it images at .5 is behind both, at 1.546
-    np.testing.assert_allclose(twice.apply(np.array([1.54582907]), np.zeros(1)), [[0.5], [0.0]], atol=1e-7)
+    # turns, and turns back: what it images at .5 is behind both, at 1.546
+    twice = Distortion(k1=-1.0, k2=0.3)
+    np.testing.assert_allclose(
+        twice.apply(np.array([1.54582907]), np.zeros(1)), [[0.5], [0.0]], atol=1e-7
+    )
     with pytest.raises(ValueError, match="cannot be undone"):
         twice.undo(np.array([0.5]), np.zeros(1))
     with pytest.raises(ValueError, match="cannot be undone"):
@@ -140,8 +166,14 @@ def test_a_lens_that_cannot_be_undone_is_an_error_of_the_user(tmp_path):
     ],
 )
 def test_fall_off_of_a_frontal_wall(lens, power):
-    """Sensor notes, T24: cos^3 of an isotropic emitter, cos^7 with the lens, cos^4 if the wall is lit evenly; 1e-5."""
-    image = record(scene(lens=lens), engine="mesh", noise=False).sequence.quads.astype(np.float64).mean(0)
+    """Sensor notes, T24: cos^3 of an isotropic emitter, cos^7 with the lens,
+    cos^4 if the wall is lit evenly; 1e-5.
+    """
+    image = (
+        record(scene(lens=lens), engine="mesh", noise=False)
+        .sequence.quads.astype(np.float64)
+        .mean(0)
+    )
     cosine = scene().camera().directions()[..., 2].numpy()
     assert cosine.min() < 0.83
     np.testing.assert_allclose(image / image[12, 16], cosine**power, rtol=1e-5)
@@ -151,12 +183,19 @@ def test_both_engines_are_shaded_alike():
     """The shading is the sensor's, not an engine's: it multiplies what either of them gives."""
     lens = Lens(cosine_power=4.0, vignetting=(-0.3, 0.05), beam_power=2.0)
     for engine in ("gaussian", "mesh"):
-        plain, shaded = (record(scene(lens=one), engine=engine, noise=False).sequence.quads for one in (Lens(), lens))
-        np.testing.assert_allclose(shaded, plain * shading(lens, scene().camera()).active, rtol=1e-6)
+        plain, shaded = (
+            record(scene(lens=one), engine=engine, noise=False).sequence.quads
+            for one in (Lens(), lens)
+        )
+        np.testing.assert_allclose(
+            shaded, plain * shading(lens, scene().camera()).active, rtol=1e-6
+        )
 
 
 def test_a_beam_keeps_its_power():
-    """Sensor notes, T6: whatever its shape, its mean over the solid angle of the image is 1; ambient light has none."""
+    """Sensor notes, T6: whatever its shape, its mean over the solid angle of the image is 1;
+    ambient light has none.
+    """
     camera = Camera.from_fov(320, 240, 70.0)
     cosine = camera.directions()[..., 2].numpy()
     for power in (-3.0, 1.0, 8.0):
@@ -167,16 +206,23 @@ def test_a_beam_keeps_its_power():
 
 
 def test_ambient_light_passes_the_lens_and_not_the_beam():
-    """What each pixel gets of the ambient electrons is its reflectance times the fall-off times its own response."""
-    sensor = Sensor(noise=True, ambient_electrons=4e4, pattern=Pattern(gain=0.2), dark_electrons_per_s=0.0)
+    """What each pixel gets of the ambient electrons is its reflectance times the fall-off times
+    its own response.
+    """
+    sensor = Sensor(
+        noise=True, ambient_electrons=4e4, pattern=Pattern(gain=0.2), dark_electrons_per_s=0.0
+    )
     sensor = replace(sensor, read_noise_electrons=0.0, adc_bits=None)
     camera = Camera.from_fov(8, 6, 60.0)
     seen, dark = shading(Lens(cosine_power=4.0, beam_power=8.0), camera), np.zeros((6, 8))
     draws = [
-        read_out(dark, dark, sensor, np.random.default_rng(n), ambient=np.full((6, 8), 0.5), shading=seen).quad
+        read_out(
+            dark, dark, sensor, np.random.default_rng(n), ambient=np.full((6, 8), 0.5), shading=seen
+        ).quad
         for n in range(4000)
     ]
-    want = 2e4 * seen.ambient * gain_map(sensor.pattern, 6, 8)  # the variance of a difference of two taps
+    # the variance of a difference of two taps
+    want = 2e4 * seen.ambient * gain_map(sensor.pattern, 6, 8)
     got = np.var(draws, axis=0) * (sensor.contrast * electron_gain(sensor)) ** 2
     np.testing.assert_allclose(got, want, rtol=5 * math.sqrt(2 / 4000))
     assert np.ptp(want) > 0.5 * want.max()
@@ -223,24 +269,43 @@ def test_a_beam_beside_the_camera_is_seen_from_there(power):
 
 
 def test_a_beam_bounces():
-    """Direct light has the beam of the pixels, as without bounces; what bounces comes of what the beam lights."""
-    box = replace(WALL, shape=Box(size=(4.0, 3.0, 5.0), inside=True), path=Still(position=(0.0, 0.0, 1.0)))
-    options = {"engine": "mesh", "noise": False, "bounces": 1, "paths": 256, "frames": 1, "format": "capture"}
+    """Direct light has the beam of the pixels, as without bounces;
+    what bounces comes of what the beam lights.
+    """
+    box = replace(
+        WALL, shape=Box(size=(4.0, 3.0, 5.0), inside=True), path=Still(position=(0.0, 0.0, 1.0))
+    )
+    options = {
+        "engine": "mesh",
+        "noise": False,
+        "bounces": 1,
+        "paths": 256,
+        "frames": 1,
+        "format": "capture",
+    }
     plain, beam = (
-        record(scene(bodies=(box,), lens=lens), **options).truth.layers for lens in (Lens(), Lens(beam_power=8.0))
+        record(scene(bodies=(box,), lens=lens), **options).truth.layers
+        for lens in (Lens(), Lens(beam_power=8.0))
     )
     active = shading(Lens(beam_power=8.0), scene().camera()).active
     np.testing.assert_allclose(beam["direct"][0, 2], plain["direct"][0, 2] * active, rtol=2e-5)
     assert active[12, 16] > 1.3
-    both = [record(scene(bodies=(box,), lens=lens), **options).truth for lens in (Lens(), Lens(beam_power=8.0))]
+    both = [
+        record(scene(bodies=(box,), lens=lens), **options).truth
+        for lens in (Lens(), Lens(beam_power=8.0))
+    ]
     bounced = [truth.amplitude[0] - truth.layers["direct"][0, 2] for truth in both]
     assert bounced[0].min() > 0
-    assert 0 < bounced[1].mean() < 0.6 * bounced[0].mean(), "what shines to the side and back comes by more walls"
+    assert 0 < bounced[1].mean() < 0.6 * bounced[0].mean(), (
+        "what shines to the side and back comes by more walls"
+    )
 
 
 @pytest.mark.parametrize("suffix", [".npy", ".exr", ".png"])
 def test_a_measured_map_multiplies_all_light(tmp_path, suffix):
-    """Of any size, over its largest value; it counts by content, and a scene file names it beside itself."""
+    """Of any size, over its largest value; it counts by content,
+    and a scene file names it beside itself.
+    """
     y, x = np.mgrid[:50, :66] / 66.0
     image = (40000 * (1.0 - 0.5 * x - 0.2 * y)).astype(np.uint16)
     file = tmp_path / f"map{suffix}"
@@ -253,21 +318,31 @@ def test_a_measured_map_multiplies_all_light(tmp_path, suffix):
     lens, camera = Lens(falloff=file, cosine_power=2.0), scene().camera()
     want = image.reshape(25, 2, 33, 2).mean((1, 3)) / image.max()
     seen = shading(lens, camera)
-    np.testing.assert_allclose(seen.ambient, want * camera.directions()[..., 2].numpy() ** 2, rtol=1e-6)
+    np.testing.assert_allclose(
+        seen.ambient, want * camera.directions()[..., 2].numpy() ** 2, rtol=1e-6
+    )
     np.testing.assert_array_equal(seen.active, seen.ambient)
     coarse = shading(Lens(falloff=file), Camera.from_fov(132, 100, 60.0)).ambient
     assert 0 < np.abs(np.diff(coarse, axis=1)).max() < 0.01, "linear in between"
     file.with_name(f"other{suffix}").write_bytes(file.read_bytes())
-    assert repr(Lens(falloff=file)) == repr(Lens(falloff=file.with_name(f"other{suffix}"))) != repr(Lens())
+    assert (
+        repr(Lens(falloff=file))
+        == repr(Lens(falloff=file.with_name(f"other{suffix}")))
+        != repr(Lens())
+    )
     assert "falloff" not in repr(Lens(cosine_power=1.0))
     assert f"map{suffix}, 66x50" in lens_rows(lens)["fall-off map"]
     table = tmp_path / "scene.toml"
-    body = '[[bodies]]\nshape = { kind = "sphere", radius = 0.5 }\npath = { kind = "still", position = [0, 0, 2] }\n'
+    body = (
+        '[[bodies]]\nshape = { kind = "sphere", radius = 0.5 }\npath = { kind = "still", '
+        "position = [0, 0, 2] }\n"
+    )
     body += "texture = { low = 0.5, high = 0.5 }\n"
     table.write_text(f'[lens]\nfalloff = "map{suffix}"\n{body}')
     np.testing.assert_array_equal(read_scene(table).lens.map, lens.map)
     shaded, plain = (
-        record(scene(lens=one), engine="mesh", noise=False).sequence.quads for one in (Lens(falloff=file), Lens())
+        record(scene(lens=one), engine="mesh", noise=False).sequence.quads
+        for one in (Lens(falloff=file), Lens())
     )
     np.testing.assert_allclose(shaded, plain * want, rtol=1e-5)
 
@@ -275,7 +350,10 @@ def test_a_measured_map_multiplies_all_light(tmp_path, suffix):
 def test_maps_that_cannot_be(tmp_path):
     """Each is named, with what is wrong."""
     good = np.ones((4, 5), dtype=np.float32)
-    wrong = {"zero.npy": (good * [1, 1, 0, 1, 1], "above 0"), "three.npy": (np.ones((4, 5, 3)), "rows and columns")}
+    wrong = {
+        "zero.npy": (good * [1, 1, 0, 1, 1], "above 0"),
+        "three.npy": (np.ones((4, 5, 3)), "rows and columns"),
+    }
     for name, (image, says) in wrong.items():
         np.save(tmp_path / name, image)
         with pytest.raises(InputError, match=says):
@@ -308,4 +386,7 @@ def test_the_card_names_what_a_lens_does(tmp_path):
     overrides = ["lens.cosine_power=4", "lens.vignetting=-0.2,0.05"]
     path = simulate("demo", tmp_path / "out", frames=4, size=(24, 18), overrides=overrides)
     card = (path / "README.md").read_text()
-    assert "| fall-off | cosine to the power 4, times 1 -0.2 r^2 +0.05 r^4 with r = 1 in the farthest corner |" in card
+    assert (
+        "| fall-off | cosine to the power 4, times 1 -0.2 r^2 +0.05 r^4 with r = 1 in the "
+        "farthest corner |"
+    ) in card

@@ -14,9 +14,19 @@ from gftorf_warp.recon.presets import Recorded
 from gftorf_warp.recon.settings import Batch, BatchRule, Input, Rates, ReconSettings, Schedule
 from gftorf_warp.scene.motion import Nodes, Still
 
-RATES = Rates(mean=1e-2, log_scale=2e-2, quaternion=3e-2, opacity_logit=4e-2, reflectivity_sh=5e-2, motion=6e-2)
+RATES = Rates(
+    mean=1e-2,
+    log_scale=2e-2,
+    quaternion=3e-2,
+    opacity_logit=4e-2,
+    reflectivity_sh=5e-2,
+    motion=6e-2,
+)
 SETTINGS = ReconSettings(
-    preset="test", rates=RATES, rates_last=RATES.times(0.01), schedule=Schedule(images=1000, warm_up=100)
+    preset="test",
+    rates=RATES,
+    rates_last=RATES.times(0.01),
+    schedule=Schedule(images=1000, warm_up=100),
 )
 
 
@@ -46,7 +56,9 @@ def test_motion_rests_during_the_warm_up():
 
 
 def test_the_rate_of_the_motion_rises_from_none():
-    """Over its first images, after the warm-up or after it was drawn anew; other rates know nothing of it."""
+    """Over its first images, after the warm-up or after it was drawn anew;
+    other rates know nothing of it.
+    """
     settings = replace(SETTINGS, schedule=replace(SETTINGS.schedule, motion_ramp=50))
     plain, ramped = ({n: rates_at(s, n) for n in range(90, 160)} for s in (SETTINGS, settings))
     for images, share in ((99, 0.0), (100, 1 / 50), (124, 0.5), (149, 1.0), (159, 1.0)):
@@ -58,7 +70,9 @@ def test_the_rate_of_the_motion_rises_from_none():
     quartets = replace(settings.schedule, batch=Batch.QUARTET, batch_rule=BatchRule.LINEAR)
     fours = replace(settings, schedule=quartets)
     settled = replace(fours, schedule=replace(quartets, motion_ramp=0))
-    assert rates_at(fours, 120)["motion"] == pytest.approx(24 / 50 * rates_at(settled, 120)["motion"])
+    assert rates_at(fours, 120)["motion"] == pytest.approx(
+        24 / 50 * rates_at(settled, 120)["motion"]
+    )
 
 
 def test_a_field_without_motion_has_no_motion_group():
@@ -72,7 +86,9 @@ def test_a_field_without_motion_has_no_motion_group():
 
 
 def test_quartets_may_have_rates_and_moments_of_their_own():
-    """Rates times two, or four, decays to the power of four; only where a step compares four images."""
+    """Rates times two, or four, decays to the power of four;
+    only where a step compares four images.
+    """
     released = presets.released()
     quartet = replace(released, schedule=replace(released.schedule, batch=Batch.QUARTET))
     assert betas_of(quartet) == pytest.approx((0.6561, 0.996006), rel=1e-6)
@@ -85,7 +101,10 @@ def test_quartets_may_have_rates_and_moments_of_their_own():
     without = replace(quartet, schedule=replace(quartet.schedule, batch_rule=BatchRule.NONE))
     phasors = presets.released(Recorded(input=Input.PHASOR))
     phasors = replace(phasors, schedule=replace(phasors.schedule, batch=Batch.QUARTET))
-    for fours, single in ((without, released), (phasors, presets.released(Recorded(input=Input.PHASOR)))):
+    for fours, single in (
+        (without, released),
+        (phasors, presets.released(Recorded(input=Input.PHASOR))),
+    ):
         assert betas_of(fours) == BETAS
         assert rates_at(fours, 5000) == rates_at(single, 5000)
     for settings in (presets.paper(), presets.demo()):
@@ -93,9 +112,13 @@ def test_quartets_may_have_rates_and_moments_of_their_own():
 
 
 def stepped():
-    """Torch's Adam with moments over the tensors of an optimiser: what was stored until format 2."""
+    """Torch's Adam with moments over the tensors of an optimiser:
+    what was stored until format 2.
+    """
     own, _ = optimiser()
-    groups = [{"name": name, "params": [leaf]} for name, leaf in zip(own.groups, own.leaves, strict=True)]
+    groups = [
+        {"name": name, "params": [leaf]} for name, leaf in zip(own.groups, own.leaves, strict=True)
+    ]
     adam = torch.optim.Adam(groups, lr=0.0, betas=(0.6561, 0.996), eps=1e-15, fused=True)
     for n, leaf in enumerate(own.leaves):
         leaf.grad = random(*leaf.shape, seed=n) if n != 1 else None
@@ -104,7 +127,9 @@ def stepped():
 
 
 def test_moments_and_decays_are_stored_as_torch_does():
-    """Those of torch's Adam are read; what is stored of them has its keys and reads back to the bit."""
+    """Those of torch's Adam are read; what is stored of them has its keys and reads back to the
+    bit.
+    """
     own, adam = stepped()
     buffer = BytesIO()
     torch.save(adam.state_dict(), buffer)
@@ -117,10 +142,15 @@ def test_moments_and_decays_are_stored_as_torch_does():
         if n == 1:
             assert not any(moment.any() for moment in moments), "it had no gradient"
             continue
-        assert all(torch.equal(moment, adam.state[leaf][name]) for moment, name in zip(moments, STORED, strict=True))
+        assert all(
+            torch.equal(moment, adam.state[leaf][name])
+            for moment, name in zip(moments, STORED, strict=True)
+        )
     stored, torchs = again.state_dict(), adam.state_dict()
     assert stored["state"].keys() - torchs["state"].keys() <= {1}
-    assert [group["params"] for group in stored["param_groups"]] == [g["params"] for g in torchs["param_groups"]]
+    assert [group["params"] for group in stored["param_groups"]] == [
+        g["params"] for g in torchs["param_groups"]
+    ]
     third = Optimiser(again.field, optimiser()[1], stored)
     for twin, leaf in zip(again.leaves, third.leaves, strict=True):
         assert same(again.moments_of(twin), third.moments_of(leaf))

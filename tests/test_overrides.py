@@ -1,4 +1,6 @@
-"""Single settings of a scene changed by name: what they reach, what the data card says, what is refused."""
+"""Single settings of a scene changed by name: what they reach, what the data card says,
+what is refused.
+"""
 
 import numpy as np
 import pytest
@@ -14,10 +16,20 @@ SMALL = {"frames": 4, "size": (24, 18)}
 
 
 def test_sensor_camera_and_bodies_are_reached():
-    """By dots, members of tuples by number; the rest stays, and the error of the closed form is no longer known."""
+    """By dots, members of tuples by number; the rest stays,
+    and the error of the closed form is no longer known.
+    """
     scene = SCENES["sliding_cube"]
-    texts = ["sensor.f_mod_hz=30e6", "frames=12", "bodies.2.path.velocity=5,0,-1", "bodies.2.shape.size=0.3,0.3,0.3"]
-    other = overridden(scene, [*texts, "bodies.0.texture.high=0.6", "sensor.shifts=3.14159265,0,1.57079633,4.71238898"])
+    texts = [
+        "sensor.f_mod_hz=30e6",
+        "frames=12",
+        "bodies.2.path.velocity=5,0,-1",
+        "bodies.2.shape.size=0.3,0.3,0.3",
+    ]
+    other = overridden(
+        scene,
+        [*texts, "bodies.0.texture.high=0.6", "sensor.shifts=3.14159265,0,1.57079633,4.71238898"],
+    )
     assert other.sensor.f_mod_hz == 30e6
     assert other.frames == 12
     assert other.bodies[2].path.velocity == (5.0, 0.0, -1.0)

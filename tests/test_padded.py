@@ -1,4 +1,6 @@
-"""Padding rows: what they hold, when memory is allocated anew, and what attaching a state costs the host."""
+"""Padding rows: what they hold, when memory is allocated anew,
+and what attaching a state costs the host.
+"""
 
 from dataclasses import replace
 
@@ -25,11 +27,17 @@ NETWORK = MotionSettings(kind="network", layers=3, width=16, skip_after=1)
 
 
 def begun(count=300, motion=NETWORK):
-    """A state of so many Gaussians with moments, half of which want to be more; motion None: that of the demo."""
+    """A state of so many Gaussians with moments, half of which want to be more; motion None:
+    that of the demo.
+    """
     settings = demo(images=1000)
     settings = replace(settings, motion=motion or settings.motion)
-    rules = replace(settings.densify, every=8, start=4, stop_share=0.6, gradient_min=0.5, clone_scale_max=0.05)
-    rules = replace(rules, scale_from=0, scale_range=(0.001, 10.0), unseen_from=1, unseen_weight=0.0)
+    rules = replace(
+        settings.densify, every=8, start=4, stop_share=0.6, gradient_min=0.5, clone_scale_max=0.05
+    )
+    rules = replace(
+        rules, scale_from=0, scale_range=(0.001, 10.0), unseen_from=1, unseen_weight=0.0
+    )
     settings = replace(settings, init=replace(settings.init, count=count), densify=rules)
     observations = observe(small(), settings, "cpu")
     state = begin(observations, settings, seed=3, device="cpu")
@@ -41,13 +49,17 @@ def begun(count=300, motion=NETWORK):
         scale = state.optimiser.tensors["log_scale"]
         scale += torch.randn(scale.shape, generator=generator)
     some = {name: torch.rand(len(scale), generator=generator) for name in densify.STATISTICS}
-    state.statistics = densify.Statistics(**some | {"gradient": some["gradient"] * some["pixels"].clamp_min(1.0)})
+    state.statistics = densify.Statistics(
+        **some | {"gradient": some["gradient"] * some["pixels"].clamp_min(1.0)}
+    )
     return state, observations, settings
 
 
 @pytest.mark.parametrize("motion", [NETWORK, None], ids=["network", "nodes"])
 def test_a_state_is_moved_to_the_bit_and_the_rest_is_padding(motion):
-    """After a densification with padding as without, to the bit; padding rows have no moments and no opacity."""
+    """After a densification with padding as without, to the bit;
+    padding rows have no moments and no opacity.
+    """
     states = []
     for pads in (False, True):
         state, observations, settings = begun(motion=motion)
@@ -65,7 +77,9 @@ def test_a_state_is_moved_to_the_bit_and_the_rest_is_padding(motion):
     for name, tensor in one.optimiser.tensors.items():
         twin = other.optimiser.tensors[name]
         assert torch.equal(tensor, twin)
-        for moment, known in zip(one.optimiser.moments_of(tensor), other.optimiser.moments_of(twin), strict=True):
+        for moment, known in zip(
+            one.optimiser.moments_of(tensor), other.optimiser.moments_of(twin), strict=True
+        ):
             assert torch.equal(moment, known)
     if not other.motion.follows_means:
         assert torch.equal(padded.binding[:count], one.binding)
@@ -100,11 +114,15 @@ def test_rows_of_removed_gaussians_become_padding():
     padded.statistics.weight[:] = 1.0
     assert not padded.attach(state)
     assert padded.statistics.weight.tolist() == [1.0] * count + [0.0] * (padded.rows - count)
-    assert padded.mean_weight.tolist() == pytest.approx([1 / count] * count + [0.0] * (padded.rows - count))
+    assert padded.mean_weight.tolist() == pytest.approx(
+        [1 / count] * count + [0.0] * (padded.rows - count)
+    )
 
 
 def test_memory_is_kept():
-    """Other addresses need new graphs: there are spare rows, and they are released once they have cost as much."""
+    """Other addresses need new graphs: there are spare rows,
+    and they are released once they have cost as much.
+    """
     state, _, _ = begun(3000)
     padded = PaddedParameters(pads=True)
     assert padded.attach(state)
@@ -115,7 +133,8 @@ def test_memory_is_kept():
     assert padded.attach(state, steps=25)
     assert padded.rows == 2 * BUCKET
     resized(state, 100)
-    patience = int(CAPTURE_S / PADDING_ROW_S / BUCKET)  # so many steps of unnecessary rows cost a capture
+    # so many steps of unnecessary rows cost a capture
+    patience = int(CAPTURE_S / PADDING_ROW_S / BUCKET)
     assert not padded.attach(state, steps=patience - 1)
     assert padded.attach(state, steps=2)
     assert padded.rows == BUCKET
@@ -128,7 +147,9 @@ def test_memory_is_kept():
 
 @pytest.mark.parametrize("where", ["padded", "alone"])
 def test_a_densification_waits_once(where):
-    """All numbers are read at once: a GPU idles from there to the next step, 6 to 10 us an operation."""
+    """All numbers are read at once: a GPU idles from there to the next step,
+    6 to 10 us an operation.
+    """
     state, observations, settings = begun()
     padded, state.images = PaddedParameters(pads=True), 16
     if where == "padded":

@@ -19,12 +19,17 @@ def test_it_grows_before_it_is_full():
 
 
 def test_what_grows_after_a_reset_never_fills_it():
-    """All opacities grow at once then, pairs by half within 30 steps; numbers are up to sixteen steps old.
+    """All opacities grow at once then, pairs by half within 30 steps; numbers are up to sixteen
+    steps old.
 
-    So many steps lie between two questions and between host and device, together. Growth that went on at this rate
-    would leave room for all of them, but not for a few more.
+    So many steps lie between two questions and between host and device, together. Growth that went
+    on at this rate would leave room for all of them, but not for a few more.
     """
-    assert FULL * 1.5 ** ((READ_EVERY + SLOTS) / 30) <= 1 < FULL * 1.5 ** ((READ_EVERY + SLOTS + 1) / 30)
+    assert (
+        FULL * 1.5 ** ((READ_EVERY + SLOTS) / 30)
+        <= 1
+        < FULL * 1.5 ** ((READ_EVERY + SLOTS + 1) / 30)
+    )
     for late in range(READ_EVERY + SLOTS + 1):
         capacity, pairs = PairCapacity(), [1_360_000]
         capacity.learn(pairs[0], is_sorted=True)
@@ -40,13 +45,20 @@ def test_room_that_costs_nothing_is_given_up_late():
     capacity = PairCapacity()
     capacity.learn(1_000_000, is_sorted=False)
     assert 3_000_000 <= capacity.pairs < 3_000_000 + ROUNDED_TO
-    assert not any(capacity.learn(pairs, is_sorted=False) for pairs in [2_300_000, *([160_000] * 20), 2_300_000])
+    assert not any(
+        capacity.learn(pairs, is_sorted=False)
+        for pairs in [2_300_000, *([160_000] * 20), 2_300_000]
+    )
     assert capacity.learn(2_500_000, is_sorted=False)
-    assert [capacity.learn(1_000, is_sorted=False) for _ in range(PATIENCE + 1)] == [False] * PATIENCE + [True]
+    assert [capacity.learn(1_000, is_sorted=False) for _ in range(PATIENCE + 1)] == [
+        False
+    ] * PATIENCE + [True]
 
 
 def test_it_shrinks_only_if_it_stays_empty():
-    """A reset of the opacities leaves few pairs for some hundred images, and more than before after that."""
+    """A reset of the opacities leaves few pairs for some hundred images,
+    and more than before after that.
+    """
     capacity = PairCapacity()
     capacity.learn(1_000_000, is_sorted=True)
     for _ in range(PATIENCE):

@@ -29,11 +29,16 @@ def wrapped(phase):
 def cycle(psi, sensor):
     """Mean quads of a surface of phase ``psi`` [rad] and amplitude 1, one per shift."""
     light = np.exp(1j * np.array(sensor.harmonics)[:, None, None] * psi)
-    return [mean_quad(light, np.ones(psi.shape), sensor.at_frame(j))[0] for j in range(len(sensor.shifts))]
+    return [
+        mean_quad(light, np.ones(psi.shape), sensor.at_frame(j))[0]
+        for j in range(len(sensor.shifts))
+    ]
 
 
 def test_the_phase_pattern_adds_to_the_phase_and_a_calibration_removes_it():
-    """Sensor notes, T27: 1e-6 rad; the map of the sensor is the calibration map of a recording without noise."""
+    """Sensor notes, T27: 1e-6 rad; the map of the sensor is the calibration map of a recording
+    without noise.
+    """
     psi = np.random.default_rng(0).uniform(0, 2 * math.pi, SIZE)
     sensor = Sensor(pattern=Pattern(phase=1.0, seed=4), phase_offset=0.3, dc_offset=0.2)
     known = phase_map(sensor.pattern, *SIZE)
@@ -64,14 +69,17 @@ def test_the_phase_pattern_is_as_large_as_the_notes_say():
     assert centre == pytest.approx(-15.6 * CODE, abs=3 * CODE)
     assert corner == pytest.approx(bowl * CODE, abs=3 * CODE)
     np.testing.assert_allclose(phase_map(Pattern(phase=0.5), *SIZE), 0.5 * map_)
-    noise = (map_ - phase_map(Pattern(phase=1.0, seed=1), *SIZE)) / (math.sqrt(2) * CODE)  # two specimens, one bowl
+    # two specimens, one bowl
+    noise = (map_ - phase_map(Pattern(phase=1.0, seed=1), *SIZE)) / (math.sqrt(2) * CODE)
     for axis, deviation in ((0, 3.6), (1, 1.4)):  # of columns and of rows
         want = math.hypot(deviation, 8.9 / math.sqrt(SIZE[axis]))
         assert noise.mean(axis).std() == pytest.approx(want, rel=4 / math.sqrt(2 * SIZE[1 - axis]))
     assert noise.std() == pytest.approx(math.sqrt(8.9**2 + 3.6**2 + 1.4**2), rel=0.03)
 
 
-@pytest.mark.parametrize(("make", "name", "deviation"), [(gain_map, "gain", 0.01), (dark_map, "dark", 0.2)])
+@pytest.mark.parametrize(
+    ("make", "name", "deviation"), [(gain_map, "gain", 0.01), (dark_map, "dark", 0.2)]
+)
 def test_responses_spread_as_asked(make, name, deviation):
     """Mean 1 and the deviation, 4 sigma; never negative, and none at all at 0."""
     map_ = make(Pattern(**{name: deviation}), *SIZE)
@@ -82,12 +90,19 @@ def test_responses_spread_as_asked(make, name, deviation):
 
 
 def test_a_specimen_is_its_seed():
-    """One seed, one pattern, which nobody can change; other seeds and other maps have nothing in common."""
+    """One seed, one pattern, which nobody can change; other seeds and other maps have nothing in
+    common.
+    """
     for make in (phase_map, gain_map, dark_map):
-        one, other = (make(Pattern(phase=1.0, gain=0.01, dark=0.2, seed=seed), 60, 80) for seed in (1, 2))
+        one, other = (
+            make(Pattern(phase=1.0, gain=0.01, dark=0.2, seed=seed), 60, 80) for seed in (1, 2)
+        )
         make.cache_clear()
-        np.testing.assert_array_equal(one, make(Pattern(phase=1.0, gain=0.01, dark=0.2, seed=1), 60, 80))
-        noise = [np.diff(np.diff(map_, axis=0), axis=1).ravel() for map_ in (one, other)]  # neither bowl nor stripes
+        np.testing.assert_array_equal(
+            one, make(Pattern(phase=1.0, gain=0.01, dark=0.2, seed=1), 60, 80)
+        )
+        # neither bowl nor stripes
+        noise = [np.diff(np.diff(map_, axis=0), axis=1).ravel() for map_ in (one, other)]
         assert abs(np.corrcoef(*noise)[0, 1]) < 0.1
         with pytest.raises(ValueError, match="read-only"):
             one[0, 0] = 0.0
@@ -96,24 +111,36 @@ def test_a_specimen_is_its_seed():
 
 
 def test_pixels_respond_differently_to_all_light_and_to_none():
-    """The gain multiplies the quad, ambient light and the light of both taps; dark current has its own factor."""
-    sensor = Sensor(noise=True, pattern=Pattern(gain=0.1, dark=0.2), ambient_electrons=1e4, adc_bits=None)
+    """The gain multiplies the quad, ambient light and the light of both taps;
+    dark current has its own factor.
+    """
+    sensor = Sensor(
+        noise=True, pattern=Pattern(gain=0.1, dark=0.2), ambient_electrons=1e4, adc_bits=None
+    )
     gain, dark = gain_map(sensor.pattern, 6, 8), dark_map(sensor.pattern, 6, 8)
     ones = np.ones((6, 8))
-    exact = read_out(0.05 * ones, 0.1 * ones, replace(sensor, noise=False), np.random.default_rng(0))
+    exact = read_out(
+        0.05 * ones, 0.1 * ones, replace(sensor, noise=False), np.random.default_rng(0)
+    )
     np.testing.assert_allclose(exact.quad, 0.05 * gain, rtol=1e-6)
     n_a, n_b = mean_taps(0.05 * gain, 0.1 * gain, sensor, gain)
     constant = 2 * dark * sensor.dark_electrons_per_s * sensor.exposure_s
-    np.testing.assert_allclose(n_a + n_b, (1e4 + 0.1 * electron_gain(sensor)) * gain + constant, rtol=1e-12)
+    np.testing.assert_allclose(
+        n_a + n_b, (1e4 + 0.1 * electron_gain(sensor)) * gain + constant, rtol=1e-12
+    )
     many = replace(sensor, read_noise_electrons=0.0, dark_electrons_per_s=5e6)
-    draws = [read_out(0 * ones, 0.1 * ones, many, np.random.default_rng(n)).quad for n in range(4000)]
+    draws = [
+        read_out(0 * ones, 0.1 * ones, many, np.random.default_rng(n)).quad for n in range(4000)
+    ]
     taps = sum(mean_taps(0 * gain, 0.1 * gain, many, gain))  # the variance of a difference
     np.testing.assert_allclose(
         np.var(draws, axis=0) * (0.45 * electron_gain(many)) ** 2, taps, rtol=5 / math.sqrt(2000)
     )
 
 
-@pytest.mark.parametrize("wrong", [{"phase": -1.0}, {"gain": math.nan}, {"dark": math.inf}, {"seed": -1}])
+@pytest.mark.parametrize(
+    "wrong", [{"phase": -1.0}, {"gain": math.nan}, {"dark": math.inf}, {"seed": -1}]
+)
 def test_patterns_that_cannot_be(wrong):
     """The message names the setting."""
     with pytest.raises(ValueError, match=next(iter(wrong))):

@@ -1,4 +1,6 @@
-"""The network in half precision: its hand-written gradient is exact, its rounding small, its overflow seen."""
+"""The network in half precision: its hand-written gradient is exact, its rounding small,
+its overflow seen.
+"""
 
 import copy
 from dataclasses import replace
@@ -17,7 +19,9 @@ from gftorf_warp.scene.network import Network
 
 DEVICES = [
     "cpu",
-    pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")),
+    pytest.param(
+        "cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
+    ),
 ]
 SMALL = MotionSettings(width=16, position_frequencies=3, time_frequencies=2, layers=5, skip_after=2)
 SHAPES = {  # with a join, without, right behind the first layer, with nothing to pad by
@@ -50,16 +54,28 @@ def positions(count):
 
 
 def gradients(made, gaussians, cotangent, keys):
-    """Offsets and the gradient of every parameter, by autograd through whatever the network does."""
+    """Offsets and the gradient of every parameter, by autograd through whatever the network
+    does.
+    """
     found = made.at_keys(made.bind(gaussians), keys).offset
     return found, torch.autograd.grad((found * cotangent).sum(), list(made.parameters()))
 
 
 def exact(made, gaussians, cotangent, keys):
     """The plain network in float64."""
-    twin = Network(KEYS, replace(made.settings, products=Products.FLOAT32), duration=made.duration, length=made.length)
+    twin = Network(
+        KEYS,
+        replace(made.settings, products=Products.FLOAT32),
+        duration=made.duration,
+        length=made.length,
+    )
     twin.load_state_dict(made.state_dict())
-    return gradients(twin.double().to(cotangent.device), gaussians.map(torch.Tensor.double), cotangent.double(), keys)
+    return gradients(
+        twin.double().to(cotangent.device),
+        gaussians.map(torch.Tensor.double),
+        cotangent.double(),
+        keys,
+    )
 
 
 def distance(one, other):
@@ -68,7 +84,9 @@ def distance(one, other):
 
 
 def compare_replay(made, gaussians, cotangent):
-    """Capture offsets and gradients at two keys; replay for other positions and times, and ask again."""
+    """Capture offsets and gradients at two keys; replay for other positions and times,
+    and ask again.
+    """
     place, moment = made.bind(gaussians), made.time_encodings[:2].clone()
     parameters = list(made.parameters())
 
@@ -99,10 +117,14 @@ def test_finite_differences_agree_in_float64(shape):
     made = network(SHAPES[shape]).double()
     form = Form.of(made, torch.float64)
     gaussians = positions(7).map(torch.Tensor.double)
-    place = encoded(gaussians.mean / made.length, made.settings.position_frequencies, columns=form.columns)
+    place = encoded(
+        gaussians.mean / made.length, made.settings.position_frequencies, columns=form.columns
+    )
     moment = made.time_encodings[[0, 2]]
     layers = [*made.layers, made.head]
-    parameters = [value.detach().requires_grad_() for layer in layers for value in (layer.weight, layer.bias)]
+    parameters = [
+        value.detach().requires_grad_() for layer in layers for value in (layer.weight, layer.bias)
+    ]
     found = Offsets.apply(form, CublasLayers(), place, moment, *parameters)
     want = exact(made, gaussians, torch.ones_like(found), [0, 2])[0]
     torch.testing.assert_close(found, want, rtol=1e-12, atol=1e-13)
@@ -128,7 +150,9 @@ def test_in_float32_it_is_the_network(keys):
 
 
 def on_the_same_side(made, gaussians, cotangent, keys):
-    """Gradients of the plain network in float64 whose units are at rest where those of the rounded one are."""
+    """Gradients of the plain network in float64 whose units are at rest where those of the rounded
+    one are.
+    """
     offsets = made.at_keys(made.bind(gaussians), keys).offset  # kept: what is saved may go with it
     saved = offsets.grad_fn.saved_tensors[-1]
     alive = [rows[:, : made.settings.width] > 0 for rows in saved]
@@ -138,7 +162,9 @@ def on_the_same_side(made, gaussians, cotangent, keys):
     inputs = torch.cat([place.expand(len(keys), -1, -1), moment], dim=2).flatten(0, 1)
     hidden = inputs
     for number, layer in enumerate(twin.layers):
-        hidden = torch.cat([hidden, inputs], dim=1) if number == made.settings.skip_after else hidden
+        hidden = (
+            torch.cat([hidden, inputs], dim=1) if number == made.settings.skip_after else hidden
+        )
         hidden = layer(hidden) * alive[number]
     found = twin.head(hidden).view_as(cotangent)
     return torch.autograd.grad((found * cotangent.double()).sum(), list(twin.parameters()))
@@ -147,10 +173,12 @@ def on_the_same_side(made, gaussians, cotangent, keys):
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("scale", [1.0, 1e-9, 1e9])
 def test_in_half_precision_every_gradient_is_right_to_a_thousandth(device, scale):
-    """However small or large the loss is: a mean over 76,800 pixels has gradients that no half can hold.
+    """However small or large the loss is: a mean over 76,800 pixels has gradients that no half can
+    hold.
 
-    One unit in ten thousand is at rest in one precision only, and has all of its gradient or none. That is no mistake
-    of the gradient: among equals it is right to 1e-3. If gradients of Gaussians point the same way, the rest cancels.
+    One unit in ten thousand is at rest in one precision only, and has all of its gradient or none.
+    That is no mistake of the gradient: among equals it is right to 1e-3. If gradients of Gaussians
+    point the same way, the rest cancels.
     """
     made, gaussians = network(half()).to(device), positions(400).map(lambda value: value.to(device))
     for offset, difference in ((0.0, 2e-2), (0.5, 8e-2)):
@@ -170,7 +198,10 @@ def test_in_half_precision_every_gradient_is_right_to_a_thousandth(device, scale
 @pytest.mark.parametrize("device", DEVICES)
 def test_sums_over_many_gaussians_are_no_halves(device):
     """What pulls all of them the same way is 10^5 in scaled units, beyond the largest half."""
-    made, gaussians = network(half()).to(device), positions(4000).map(lambda value: value.to(device))
+    made, gaussians = (
+        network(half()).to(device),
+        positions(4000).map(lambda value: value.to(device)),
+    )
     cotangent = torch.ones(2, 4000, 3, device=device)
     _, got = gradients(made, gaussians, cotangent, [0, 2])
     _, wanted = exact(made, gaussians, cotangent, [0, 2])
@@ -207,7 +238,9 @@ def test_offsets_of_a_trained_field_differ_by_less_than_a_millimetre(device):
     quick = network(half()).to(device)
     quick.load_state_dict(made.state_dict())
     with torch.no_grad():
-        error = (quick.at_keys(quick.bind(gaussians), keys).offset - made.at_keys(place, keys).offset).norm(dim=-1)
+        error = (
+            quick.at_keys(quick.bind(gaussians), keys).offset - made.at_keys(place, keys).offset
+        ).norm(dim=-1)
     assert 0 < error.max() < 1e-3, f"{error.max()} m"
 
 
@@ -234,7 +267,9 @@ def test_overflow_ends_in_a_gradient_that_is_not_finite(device, where):
 
 
 def test_rows_may_go_through_the_layers_in_parts(monkeypatch):
-    """Of unequal length here, three to a key, and four rows side by side in sums; the results are the same."""
+    """Of unequal length here, three to a key, and four rows side by side in sums;
+    the results are the same.
+    """
     made, gaussians, cotangent = network(half()), positions(172), random(2, 172, 3)
     whole = gradients(made, gaussians, cotangent, [0, 2])
     monkeypatch.setattr(cublas, "PIECE", 60)
@@ -248,9 +283,13 @@ def test_rows_may_go_through_the_layers_in_parts(monkeypatch):
 @pytest.mark.parametrize("keys", [1, 3, 9])
 @pytest.mark.parametrize("count", [5, 192])
 def test_sums_over_rows_are_those_of_their_key(keys, count):
-    """Also of more keys than 16 bytes hold, and of a number of rows that no power of two divides."""
+    """Also of more keys than 16 bytes hold, and of a number of rows that no power of two
+    divides.
+    """
     slopes = random(2, keys * count, 4).double()
-    torch.testing.assert_close(cublas._sums(slopes, keys, torch.float64), slopes.view(2, keys, count, 4).sum(2))
+    torch.testing.assert_close(
+        cublas._sums(slopes, keys, torch.float64), slopes.view(2, keys, count, 4).sum(2)
+    )
 
 
 def test_a_loss_without_gradient_has_none():
@@ -271,7 +310,10 @@ def test_two_calls_agree_to_the_bit():
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
 def test_a_replay_equals_a_call():
     """Captured with its gradient; also with other positions and times written in between."""
-    made, gaussians = network(half()).to("cuda"), positions(2000).map(lambda value: value.to("cuda"))
+    made, gaussians = (
+        network(half()).to("cuda"),
+        positions(2000).map(lambda value: value.to("cuda")),
+    )
     compare_replay(made, gaussians, random(2, 2000, 3).to("cuda"))
 
 
@@ -280,15 +322,21 @@ def test_bound_positions_are_aligned_halves():
     made, gaussians = network(half()), positions(5)
     place = made.bind(gaussians)
     assert (place.dtype, place.shape) == (torch.float16, (5, 64))
-    torch.testing.assert_close(place[:, :63].float(), encoded(gaussians.mean / 7.5, 10), rtol=1e-3, atol=1e-4)
+    torch.testing.assert_close(
+        place[:, :63].float(), encoded(gaussians.mean / 7.5, 10), rtol=1e-3, atol=1e-4
+    )
     assert place[:, 63].abs().max() == 0
-    assert Form(position=63, time=0, width=8, joined=None, dtype=torch.float16).columns == 63, "no wider than a weight"
+    assert Form(position=63, time=0, width=8, joined=None, dtype=torch.float16).columns == 63, (
+        "no wider than a weight"
+    )
 
 
 def test_parameters_and_stored_form_are_those_of_float32():
     """Precision is a matter of speed: a checkpoint knows no difference."""
     plain, quick = network(), network(half())
     assert [*plain.state_dict()] == [*quick.state_dict()]
-    for one, other in zip(plain.state_dict().values(), copy.deepcopy(quick).state_dict().values(), strict=True):
+    for one, other in zip(
+        plain.state_dict().values(), copy.deepcopy(quick).state_dict().values(), strict=True
+    ):
         assert one.dtype == other.dtype
         assert torch.equal(one, other)

@@ -19,19 +19,34 @@ from gftorf_warp.render.buffers import ClampGradient, Stop, Support
 from gftorf_warp.scene.initialise import Init, InitSettings
 from gftorf_warp.scene.motion import MotionSettings, Products
 
-QUADS, PHASOR = Recorded(), Recorded(input=Input.PHASOR, unambiguous_range=5.0)  # F-ToeRF at 15 m, ToeRF at 10 m
+# F-ToeRF at 15 m, ToeRF at 10 m
+QUADS, PHASOR = Recorded(), Recorded(input=Input.PHASOR, unambiguous_range=5.0)
 
 
 def test_paper_is_what_the_paper_says():
     """Counts, warm-up, network, losses, heuristics and length; one raw frame per step."""
     s = presets.paper()
-    assert (s.init.kind, s.init.count, s.init.opacity, s.init.reflectivity) == (Init.RANDOM, 100_000, 0.1, 0.1)
+    assert (s.init.kind, s.init.count, s.init.opacity, s.init.reflectivity) == (
+        Init.RANDOM,
+        100_000,
+        0.1,
+        0.1,
+    )
     assert s.init.bounds == (s.render.near, s.render.far) == pytest.approx((0.135, 7.425))
     assert (s.schedule.images, s.schedule.warm_up, s.schedule.batch) == (60_000, 2000, Batch.FRAME)
     motion = s.motion
     assert (motion.kind, motion.layers, motion.width, motion.skip_after) == ("network", 8, 256, 5)
-    assert (motion.position_frequencies, motion.time_frequencies, motion.input_scale) == (10, 10, 1.0)
-    assert (s.weights.quads, s.weights.ssim, s.weights.flow, s.weights.colour) == (1.0, 0.2, 8e-4, 0.0)
+    assert (motion.position_frequencies, motion.time_frequencies, motion.input_scale) == (
+        10,
+        10,
+        1.0,
+    )
+    assert (s.weights.quads, s.weights.ssim, s.weights.flow, s.weights.colour) == (
+        1.0,
+        0.2,
+        8e-4,
+        0.0,
+    )
     assert (s.weights.distortion, s.weights.motion_size, s.background) == (0.0, 0.0, 1.0)
     assert s.rates.reflectivity_sh == s.rates_last.reflectivity_sh == 1.6e-4
     assert (s.rates.mean, s.rates_last.mean) == pytest.approx((1.32e-3, 1.32e-5))
@@ -39,7 +54,11 @@ def test_paper_is_what_the_paper_says():
     for name, rate in {"opacity_logit": 0.05, "log_scale": 1e-3, "quaternion": 1e-3}.items():
         assert getattr(s.rates, name) == getattr(s.rates_last, name) == rate
     assert (s.rates.colour_constant, s.rates.colour_rest) == (2.5e-3, 1.25e-4)
-    assert (s.motion_gradient_max, s.schedule.freeze_from, s.schedule.pause_after_reset) == (None, None, 0)
+    assert (s.motion_gradient_max, s.schedule.freeze_from, s.schedule.pause_after_reset) == (
+        None,
+        None,
+        0,
+    )
     assert s.render.sh_degree == 3, "a camera at rest is no reason for fewer harmonics"
 
 
@@ -47,11 +66,22 @@ def test_densification_is_that_of_the_released_code_in_both():
     """Section 6.6."""
     for made in (presets.paper, presets.released):
         d = made(QUADS).densify
-        assert (d.every, d.start, d.stop_share, d.gradient_min, d.opacity_min) == (100, 250, 0.6, 2e-4, 0.01)
+        assert (d.every, d.start, d.stop_share, d.gradient_min, d.opacity_min) == (
+            100,
+            250,
+            0.6,
+            2e-4,
+            0.01,
+        )
         assert (d.clone_scale_max, *d.scale_range) == pytest.approx((0.0825, 0.00825, 0.4125))
         assert (d.reset_every, d.reset_faster, d.scale_from) == (3000, None, 3000)
         d = made(PHASOR).densify
-        assert (d.stop_share, d.gradient_min, d.reset_faster, d.scale_from) == (1.0, 4e-4, (2001, 1500), 2000)
+        assert (d.stop_share, d.gradient_min, d.reset_faster, d.scale_from) == (
+            1.0,
+            4e-4,
+            (2001, 1500),
+            2000,
+        )
 
 
 def test_released_differs_where_the_tables_say():
@@ -69,7 +99,12 @@ def test_released_differs_where_the_tables_say():
     shared = replace(s, preset="paper", motion_gradient_max=None, render=presets.paper().render)
     differing = {name for name, a, b in _leaves(shared, presets.paper()) if a != b}
     assert differing == {
-        *("schedule.images", "schedule.motion_decay_from", "schedule.pause_after_reset", "schedule.freeze_from"),
+        *(
+            "schedule.images",
+            "schedule.motion_decay_from",
+            "schedule.pause_after_reset",
+            "schedule.freeze_from",
+        ),
         *("init.count", "init.reflectivity", "motion.input_scale"),
         *("rates.reflectivity_sh", "rates_last.reflectivity_sh"),
         *("weights.colour_norm", "densify.loses_step"),
@@ -78,9 +113,13 @@ def test_released_differs_where_the_tables_say():
 
 
 def test_fast_is_released_but_for_what_makes_it_fast():
-    """Named settings only; for phasors, where quartets mean nothing and nothing freezes, it stays so."""
+    """Named settings only; for phasors, where quartets mean nothing and nothing freezes,
+    it stays so.
+    """
     s = presets.fast()
-    differing = {name for name, a, b in _leaves(replace(s, preset="released"), presets.released()) if a != b}
+    differing = {
+        name for name, a, b in _leaves(replace(s, preset="released"), presets.released()) if a != b
+    }
     assert differing == {
         *("motion.products", "schedule.batch", "schedule.motion_ramp", "schedule.freeze_from"),
         *("densify.unseen_from", "densify.unseen_weight"),
@@ -95,7 +134,9 @@ def test_fast_is_released_but_for_what_makes_it_fast():
 
 
 def test_released_for_phasors():
-    """ToeRF: other bounds, colour, no flow, no freeze; its phasor is a, ours 2a, so reflectivities are half."""
+    """ToeRF: other bounds, colour, no flow, no freeze; its phasor is a, ours 2a,
+    so reflectivities are half.
+    """
     s = presets.released(PHASOR)
     assert s.init.bounds == pytest.approx((0.09, 6.05))
     assert s.rates.mean == pytest.approx(8.8e-4)
@@ -103,7 +144,12 @@ def test_released_for_phasors():
     assert s.rates_last.reflectivity_sh == pytest.approx(1.6e-4 / 2)
     assert s.init.reflectivity == 0.1 / 2
     weights = s.weights
-    assert (weights.flow, weights.colour, weights.colour_norm, weights.motion_size) == (0.0, 1.0, Norm.L1, 0.05)
+    assert (weights.flow, weights.colour, weights.colour_norm, weights.motion_size) == (
+        0.0,
+        1.0,
+        Norm.L1,
+        0.05,
+    )
     assert presets.paper(PHASOR).weights.colour_norm == Norm.L2
     assert (colour_weight(s, 1999), colour_weight(s, 2000)) == (0.0, 1.0)
     assert s.schedule.freeze_from is None
@@ -114,17 +160,25 @@ def test_lengths_follow_the_unambiguous_range():
     once, twice = (presets.released(Recorded(unambiguous_range=r)) for r in (7.5, 15.0))
     lengths = [("densify", "clone_scale_max"), ("render", "far"), ("rates", "mean")]
     for part, name in lengths:
-        assert getattr(getattr(twice, part), name) == pytest.approx(2 * getattr(getattr(once, part), name))
+        assert getattr(getattr(twice, part), name) == pytest.approx(
+            2 * getattr(getattr(once, part), name)
+        )
 
 
 def test_the_motion_waits_rests_and_goes_on_alone():
-    """Warm-up, decay counted from its end, a pause after every reset, and the freeze of everything else."""
+    """Warm-up, decay counted from its end, a pause after every reset,
+    and the freeze of everything else.
+    """
     s = presets.released()
     at = {images: rates_at(s, images) for images in (1999, 2000, 11_000, 11_999, 12_000)}
     assert at[1999]["motion"] == 0.0
     assert at[2000]["motion"] == pytest.approx(8e-4)
     assert at[11_000]["motion"] == pytest.approx((8e-4 * 1.6e-6) ** 0.5)
-    assert rates_at(s, 6199, reset_at=6000)["motion"] == 0.0 < rates_at(s, 6200, reset_at=6000)["motion"]
+    assert (
+        rates_at(s, 6199, reset_at=6000)["motion"]
+        == 0.0
+        < rates_at(s, 6200, reset_at=6000)["motion"]
+    )
     assert at[11_999]["mean"] > 0
     assert {name for name, rate in at[12_000].items() if rate > 0} == {"motion"}
     assert not frozen(s, 11_999)
@@ -136,12 +190,18 @@ def test_the_motion_waits_rests_and_goes_on_alone():
     ("made", "recorded", "want"),
     [
         (presets.released, QUADS, [3000, 6000, 9000]),
-        (presets.released, PHASOR, [3000, 4500, 6000, 7500, 9000, 10_500, 12_000, 13_500, 15_000, 16_500]),
+        (
+            presets.released,
+            PHASOR,
+            [3000, 4500, 6000, 7500, 9000, 10_500, 12_000, 13_500, 15_000, 16_500],
+        ),
         (presets.paper, QUADS, [3000 * k for k in range(1, 11)]),
     ],
 )
 def test_opacities_are_never_reset_shortly_before_a_freeze_or_the_end(made, recorded, want):
-    """The published ToeRF settings reset 500 images before the end: what that dims cannot recover."""
+    """The published ToeRF settings reset 500 images before the end:
+    what that dims cannot recover.
+    """
     s = made(recorded)
     assert densify.resets(s.densify, s.schedule) == want
     assert resolved(s)["opacity_resets"] == want
@@ -150,8 +210,16 @@ def test_opacities_are_never_reset_shortly_before_a_freeze_or_the_end(made, reco
 def test_config_prints_the_resolved_schedule():
     """As JSON would hold it."""
     found = resolved(presets.released())
-    assert (found["gaussians_frozen_from"], found["densify_until"], found["motion_from"]) == (12_000, 12_000, 2000)
-    assert (found["flow_from"], found["colour_from"], found["motion_rests_after_reset"]) == (2000, None, 200)
+    assert (found["gaussians_frozen_from"], found["densify_until"], found["motion_from"]) == (
+        12_000,
+        12_000,
+        2000,
+    )
+    assert (found["flow_from"], found["colour_from"], found["motion_rests_after_reset"]) == (
+        2000,
+        None,
+        200,
+    )
     assert found["rates_half_way"]["reflectivity_sh"] == pytest.approx(1.3e-4, rel=0.02)
     assert plain(presets.paper(PHASOR))["weights"]["colour_norm"] == "l2"
 
@@ -159,7 +227,9 @@ def test_config_prints_the_resolved_schedule():
 def test_harmonics_gain_a_degree_every_thousand_images():
     """And keep all three in the end."""
     s = presets.paper()
-    degrees = [render_settings_at(s, images).sh_degree for images in (0, 999, 1000, 2999, 3000, 59_999)]
+    degrees = [
+        render_settings_at(s, images).sh_degree for images in (0, 999, 1000, 2999, 3000, 59_999)
+    ]
     assert degrees == [0, 0, 1, 2, 3, 3]
     assert render_settings_at(presets.demo(), 0) == presets.demo().render
 
@@ -181,9 +251,19 @@ def test_ablations_change_reflectivity_and_distortion_and_nothing_else():
             reflectivity,
         )
         assert (s.weights.distortion > 0) == distorted
-        allowed = {"ablation", "init.reflectivity", "rates.reflectivity_sh", "rates_last.reflectivity_sh"}
-        assert {name for name, a, b in _leaves(s, base) if a != b} <= {*allowed, "weights.distortion"}
-    assert [name for name, a, b in _leaves(presets.ablated(base, "h1h2"), base) if a != b] == ["ablation"]
+        allowed = {
+            "ablation",
+            "init.reflectivity",
+            "rates.reflectivity_sh",
+            "rates_last.reflectivity_sh",
+        }
+        assert {name for name, a, b in _leaves(s, base) if a != b} <= {
+            *allowed,
+            "weights.distortion",
+        }
+    assert [name for name, a, b in _leaves(presets.ablated(base, "h1h2"), base) if a != b] == [
+        "ablation"
+    ]
     with pytest.raises(UsageError, match="unknown ablation h3"):
         presets.ablated(base, "h3")
     for other in (presets.demo(), presets.dgs_depth(), presets.ctof()):
@@ -203,10 +283,13 @@ def test_shortened_keeps_the_course():
 def small_published(**changes):
     """Paper's settings at a size for tests: twelve frames, 300 Gaussians, a narrow network."""
     s = presets.shortened(presets.paper(), changes.pop("images", 600))
-    init = InitSettings(kind=Init.RANDOM, count=300, opacity=0.3, reflectivity=0.1, bounds=(1.0, 5.0))
+    init = InitSettings(
+        kind=Init.RANDOM, count=300, opacity=0.3, reflectivity=0.1, bounds=(1.0, 5.0)
+    )
     motion = MotionSettings(kind="network", layers=3, width=16, skip_after=2)
     schedule = replace(
-        s.schedule, **{name: changes.pop(name) for name in ("freeze_from", "warm_up") if name in changes}
+        s.schedule,
+        **{name: changes.pop(name) for name in ("freeze_from", "warm_up") if name in changes},
     )
     return replace(s, init=init, motion=motion, schedule=schedule, **changes)
 
@@ -226,7 +309,9 @@ def test_nothing_moves_in_the_warm_up_and_the_network_learns_nothing():
     assert torch.equal(state.optimiser.field.mean, still.optimiser.field.mean)
     assert all(torch.equal(a, b) for a, b in zip(before, state.motion.parameters(), strict=True))
     advance(state, observations, s)
-    assert not all(torch.equal(a, b) for a, b in zip(before, state.motion.parameters(), strict=True))
+    assert not all(
+        torch.equal(a, b) for a, b in zip(before, state.motion.parameters(), strict=True)
+    )
 
 
 def test_frozen_gaussians_stay_and_the_network_goes_on():
@@ -240,15 +325,21 @@ def test_frozen_gaussians_stay_and_the_network_goes_on():
     gaussians = {name: value.detach().clone() for name, value in state.optimiser.tensors.items()}
     weights = [parameter.detach().clone() for parameter in state.motion.parameters()]
     advance(state, observations, s)
-    assert all(torch.equal(value, gaussians[name]) for name, value in state.optimiser.tensors.items())
-    assert not all(torch.equal(a, b) for a, b in zip(weights, state.motion.parameters(), strict=True))
+    assert all(
+        torch.equal(value, gaussians[name]) for name, value in state.optimiser.tensors.items()
+    )
+    assert not all(
+        torch.equal(a, b) for a, b in zip(weights, state.motion.parameters(), strict=True)
+    )
 
 
 def test_the_step_of_a_round_is_lost_only_where_the_preset_says_so():
     """No pruning, no splitting: then the round itself changes nothing."""
     for loses in (True, False):
         options = replace(demo().densify, every=4, start=0, stop_share=1.0, gradient_min=None)
-        s = small_published(warm_up=0, images=100, densify=replace(options, loses_step=loses, scale_from=1000))
+        s = small_published(
+            warm_up=0, images=100, densify=replace(options, loses_step=loses, scale_from=1000)
+        )
         observations = observe(small(), s, "cpu")
         state = begin(observations, s, seed=0, device="cpu")
         for _ in range(3):

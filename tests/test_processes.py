@@ -1,4 +1,6 @@
-"""Pictures by processes: the files that threads write, their errors, and nothing left of those who wrote."""
+"""Pictures by processes: the files that threads write, their errors,
+and nothing left of those who wrote.
+"""
 
 import gc
 import os
@@ -17,7 +19,9 @@ from gftorf_warp.errors import ResourceError, UsageError
 from gftorf_warp.evaluate import processes, writers
 from gftorf_warp.evaluate.views import render_to_folder
 
-needs_memory = pytest.mark.skipif(not hasattr(os, "memfd_create"), reason="no memory without a name on this system")
+needs_memory = pytest.mark.skipif(
+    not hasattr(os, "memfd_create"), reason="no memory without a name on this system"
+)
 ALL = ("distance", "quads", "phasor", "colour")
 
 
@@ -75,8 +79,12 @@ def test_processes_write_what_threads_do(analytic, tmp_path, monkeypatch, count,
     monkeypatch.setattr(processes, "BLOCK_BYTES", limit)
     seen, found = [], {}
     for number in (0, count):
-        monkeypatch.setattr(processes, "useful", lambda total, n=number: n if total == FRAMES else 0)
-        out = render_to_folder(analytic, tmp_path / str(number), ALL, progress=lambda *done: seen.append(done))
+        monkeypatch.setattr(
+            processes, "useful", lambda total, n=number: n if total == FRAMES else 0
+        )
+        out = render_to_folder(
+            analytic, tmp_path / str(number), ALL, progress=lambda *done: seen.append(done)
+        )
         found[number] = files_in(out)
     assert found[0] == found[count]
     assert len(found[0]) == 1 + 2 * len(ALL) * FRAMES
@@ -184,17 +192,20 @@ import numpy as np
 from gftorf_warp.evaluate import processes, writers
 from gftorf_warp.evaluate.pictures import Scale
 
-signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores it, and so do children
+# a shell's background job ignores the signal, and so do its children
+signal.signal(signal.SIGINT, signal.default_int_handler)
 scales = {"distance": Scale(low=0.0, high=1.0, colours="viridis", unit="m")}
 processes.useful = lambda _: 3
 
 
 def series():
     for k in range(10000):
-        yield {"distance": {"distance": np.random.default_rng(k).random((240, 320), dtype=np.float32)}}
+        image = np.random.default_rng(k).random((240, 320), dtype=np.float32)
+        yield {"distance": {"distance": image}}
 
 
-writers.write_all(Path(sys.argv[1]), scales, series(), 10000, lambda done, _: print(done, flush=True))
+progress = lambda done, _: print(done, flush=True)
+writers.write_all(Path(sys.argv[1]), scales, series(), 10000, progress)
 """
 
 
@@ -213,7 +224,9 @@ def of_command(marker):
 @needs_memory
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
 def test_a_signal_leaves_no_process(tmp_path, number):
-    """Ctrl-C as from a terminal, and what nobody can catch: no half of a file, and an end of all."""
+    """Ctrl-C as from a terminal, and what nobody can catch: no half of a file,
+    and an end of all.
+    """
     folder = tmp_path / "distance"
     folder.mkdir()
     marker = f"GFTORF_TEST={tmp_path}"

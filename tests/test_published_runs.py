@@ -1,4 +1,6 @@
-"""The published presets from end to end, small: they run on every device, learn, stop, go on, and say what they did."""
+"""The published presets from end to end, small: they run on every device, learn, stop, go on,
+and say what they did.
+"""
 
 import copy
 from dataclasses import replace
@@ -23,7 +25,12 @@ from gftorf_warp.recon.train import reconstruct
 from gftorf_warp.scene.initialise import Init
 from gftorf_warp.scene.motion import Products
 
-DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA"))]
+DEVICES = [
+    "cpu",
+    pytest.param(
+        "cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
+    ),
+]
 
 
 def small(name, images, **recorded):
@@ -33,15 +40,35 @@ def small(name, images, **recorded):
     motion = replace(s.motion, layers=3, width=32, skip_after=2)
     init = replace(s.init, count=400, opacity=0.3, reflectivity=0.4, bounds=(1.5, 5.0))
     rates = replace(s.rates, mean=5e-3, reflectivity_sh=2e-3, log_scale=1e-2)
-    schedule = replace(s.schedule, images=images, log_every=10, warm_up=warm_up, flow_from=warm_up, pause_after_reset=2)
+    schedule = replace(
+        s.schedule,
+        images=images,
+        log_every=10,
+        warm_up=warm_up,
+        flow_from=warm_up,
+        pause_after_reset=2,
+    )
     colour_from = warm_up if s.weights.quads > 0 else 0
     densify = replace(
-        s.densify, every=20, start=20, reset_every=max(images // 3, 1), reset_faster=None, gaussians_max=600
+        s.densify,
+        every=20,
+        start=20,
+        reset_every=max(images // 3, 1),
+        reset_faster=None,
+        gaussians_max=600,
     )
     densify = replace(densify, scale_range=(0.0, 10.0), clone_scale_max=0.1)
     schedule = replace(schedule, colour_from=colour_from, motion_decay_from=0, sh_degree_every=10)
     last = replace(s.rates_last, reflectivity_sh=2e-3)
-    return replace(s, init=init, motion=motion, rates=rates, rates_last=last, densify=densify, schedule=schedule)
+    return replace(
+        s,
+        init=init,
+        motion=motion,
+        rates=rates,
+        rates_last=last,
+        densify=densify,
+        schedule=schedule,
+    )
 
 
 @pytest.mark.parametrize("device", DEVICES)
@@ -55,7 +82,11 @@ def test_quads(tmp_path, name, device):
     assert any("flow" in row for row in found[1:])
     assert "flow" not in found[0], "not in the warm-up"
     assert len({row["gaussians"] for row in found}) > 2, "densified and pruned"
-    assert (run.config["motion"], run.config["init"], run.config["input"]) == ("network", "random", "quads")
+    assert (run.config["motion"], run.config["init"], run.config["input"]) == (
+        "network",
+        "random",
+        "quads",
+    )
     assert run.render(0.03).distance.isfinite().all()
 
 
@@ -73,7 +104,9 @@ def test_phasors_with_colour(tmp_path, name, device):
     assert run.field.colour_sh is not None
     seen = run.render(0.03)
     assert seen.colour.isfinite().all()
-    assert float(seen.colour.max()) > 3.0, "in the units of the recording, whose brightest value is 36"
+    assert float(seen.colour.max()) > 3.0, (
+        "in the units of the recording, whose brightest value is 36"
+    )
     if name != "dgs_depth":
         assert run.config["input"] == "phasor"
         assert "colour" not in found[0]
@@ -100,7 +133,9 @@ def test_a_run_with_a_network_stops_and_goes_on_to_the_same_bytes(tmp_path, prod
     again = reconstruct(path, tmp_path / "run", settings)
     assert same(stored(again.path), stored(whole.path))
     assert rows(again.path) == rows(whole.path)
-    assert (again.path / "diagnostics.jsonl").read_text() == (whole.path / "diagnostics.jsonl").read_text()
+    assert (again.path / "diagnostics.jsonl").read_text() == (
+        whole.path / "diagnostics.jsonl"
+    ).read_text()
 
 
 def test_a_step_beyond_the_range_of_halves_changes_nothing():
@@ -157,13 +192,17 @@ def test_too_short_a_run_is_warned_of(tmp_path, caplog):
 
 
 def test_an_earlier_run_continues_with_its_seed_of_backgrounds():
-    """Formats 1 and 2 stored a generator, whose state has another length on a GPU; both hold the seed."""
+    """Formats 1 and 2 stored a generator, whose state has another length on a GPU;
+    both hold the seed.
+    """
     settings = small("paper", 8)
     observations = observe(recording(frames=12)[0], settings, "cpu")
     kept = to_dict(begin(observations, settings, seed=0, device="cpu"))
     kept.pop("noise_seed")
     on_cpu = torch.Generator().manual_seed(77).get_state()
-    on_gpu = torch.tensor([*(77).to_bytes(8, "little"), *(12).to_bytes(8, "little")], dtype=torch.uint8)
+    on_gpu = torch.tensor(
+        [*(77).to_bytes(8, "little"), *(12).to_bytes(8, "little")], dtype=torch.uint8
+    )
     for noise in (on_cpu, on_gpu):
         state = from_dict(copy.deepcopy(kept | {"noise": noise}), "cpu")
         assert state.noise_seed == 77

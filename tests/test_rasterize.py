@@ -1,4 +1,6 @@
-"""The kernels against the float64 oracle: every output, every input, every setting, and scenes nobody chose."""
+"""The kernels against the float64 oracle: every output, every input, every setting,
+and scenes nobody chose.
+"""
 
 from dataclasses import replace
 
@@ -37,25 +39,39 @@ def device(request) -> str:
 
 @pytest.mark.parametrize("name", CASES)
 def test_images_and_gradients_match_the_oracle(name, device):
-    """All outputs together, with a random cotangent for every channel of every pixel, by all inputs."""
+    """All outputs together, with a random cotangent for every channel of every pixel,
+    by all inputs.
+    """
     comparison = Comparison(CASES[name](), device)
     comparison.check_images()
     gradients = comparison.check_gradients(*comparison.want)
     for key, gradient in gradients.items():
         if gradient.numel() and (name != "empty" or key.startswith("background")):
-            assert magnitude(key, gradient, comparison.exact[key]) > 1e-2, f"{key}: a vanished gradient would pass"
+            assert magnitude(key, gradient, comparison.exact[key]) > 1e-2, (
+                f"{key}: a vanished gradient would pass"
+            )
 
 
-@pytest.mark.parametrize("output", ["quads", "phasor", "colour", "distance", "opacity", "distortion", "extra"])
+@pytest.mark.parametrize(
+    "output", ["quads", "phasor", "colour", "distance", "opacity", "distortion", "extra"]
+)
 @pytest.mark.parametrize("name", FULL)
 def test_each_output_alone_has_the_oracles_gradient(name, output, device):
-    """One output at a time, so that none hides behind a larger one; inputs it cannot depend on get zero."""
+    """One output at a time, so that none hides behind a larger one;
+    inputs it cannot depend on get zero.
+    """
     comparison = Comparison(CASES[name](), device)
     gradients = comparison.check_gradients(output)
     expected = {"mean", "log_scale", "quaternion", "opacity_logit"}
     expected |= {
         "quads": {"reflectivity_sh", "background.quads", *SENSOR_SCALARS},
-        "phasor": {"reflectivity_sh", "background.phasor", "f_mod_hz", "phase_offset", "source_intensity"},
+        "phasor": {
+            "reflectivity_sh",
+            "background.phasor",
+            "f_mod_hz",
+            "phase_offset",
+            "source_intensity",
+        },
         "colour": {"colour_sh", "background.colour"},
         "extra": {"extra"},
     }.get(output, set())
@@ -68,7 +84,9 @@ def test_each_output_alone_has_the_oracles_gradient(name, output, device):
 
 @pytest.mark.parametrize("name", ["posed", "opaque", "released"])
 def test_the_cuda_mapping_is_right_on_the_cpu_too(name, monkeypatch):
-    """One pixel per thread and tiles of 8 x 4, what CUDA compiles but for the warp shuffles, against the oracle."""
+    """One pixel per thread and tiles of 8 x 4, what CUDA compiles but for the warp shuffles,
+    against the oracle.
+    """
     monkeypatch.setitem(buffers.TILE_SHAPES, "cpu", buffers.TILE_SHAPES["cuda"])
     monkeypatch.setitem(buffers.SEGMENTS, "cpu", 4)
     comparison = Comparison(CASES[name](), "cpu")
@@ -107,10 +125,16 @@ def test_every_setting_matches_the_oracle(switch, device):
 
 
 def test_a_clamped_alpha_passes_a_gradient_only_straight_through(device):
-    """Where alpha is clamped everywhere, opacity and position have no influence; the released code pretends they do."""
-    field = gaussians(1, SMALL, seed=0, z=(2.0, 2.0), scale=(50.0, 60.0), opacity=(0.9999, 0.9999), spread=0.0)
+    """Where alpha is clamped everywhere, opacity and position have no influence;
+    the released code pretends they do.
+    """
+    field = gaussians(
+        1, SMALL, seed=0, z=(2.0, 2.0), scale=(50.0, 60.0), opacity=(0.9999, 0.9999), spread=0.0
+    )
     for clamp_gradient in ClampGradient:
-        case = Case(field=field, camera=SMALL, settings=RenderSettings(clamp_gradient=clamp_gradient))
+        case = Case(
+            field=field, camera=SMALL, settings=RenderSettings(clamp_gradient=clamp_gradient)
+        )
         inputs = case.inputs(torch.float32, device)
         opacity = case.outputs(api.rasterize, inputs)["opacity"]
         assert_close(opacity.detach().cpu(), torch.full((20, 24), 0.99), rtol=0, atol=1e-6)
@@ -122,13 +146,18 @@ def test_a_clamped_alpha_passes_a_gradient_only_straight_through(device):
 
 
 def test_gradients_behind_a_surface_keep_their_digits(device):
-    """Of Gaussians seen at T down to 1e-3, each gradient is good to 1e-3 of its own size, not only of the largest."""
+    """Of Gaussians seen at T down to 1e-3, each gradient is good to 1e-3 of its own size,
+    not only of the largest.
+    """
     comparison = Comparison(CASES["behind_surface"](), device)
     for outputs in (("quads", "phasor"), ("distance", "colour")):
         for key in ("opacity_logit", "log_scale", "mean"):
             want, got = (
                 torch.autograd.grad(
-                    sum((images[name] * comparison.weight[name].to(images[name])).sum() for name in outputs),
+                    sum(
+                        (images[name] * comparison.weight[name].to(images[name])).sum()
+                        for name in outputs
+                    ),
                     inputs[key],
                     retain_graph=True,
                 )[0].reshape(len(inputs["mean"]), -1)
@@ -139,7 +168,9 @@ def test_gradients_behind_a_surface_keep_their_digits(device):
             )
             size = want.norm(dim=1)
             error = (got.cpu() - want).norm(dim=1) / size
-            assert size.max() > 20 * size[21:].median(), "the last ones must be small for this to mean something"
+            assert size.max() > 20 * size[21:].median(), (
+                "the last ones must be small for this to mean something"
+            )
             assert error.median() < 1e-5, (outputs, key)
             assert error.max() < 1e-3, (outputs, key)
 
@@ -148,8 +179,12 @@ def test_gradients_behind_a_surface_keep_their_digits(device):
 def scenes(draw) -> Case:
     """Any small scene: sizes, poses, densities, channels and shifts."""
     width, height = draw(st.integers(1, 40)), draw(st.integers(1, 30))
-    camera = Camera.from_fov(max(width, height, 8), max(width, height, 8), draw(st.sampled_from([30.0, 60.0, 100.0])))
-    camera = replace(camera, width=width, height=height, cx=width * draw(st.floats(0.2, 0.8)), cy=height / 2)
+    camera = Camera.from_fov(
+        max(width, height, 8), max(width, height, 8), draw(st.sampled_from([30.0, 60.0, 100.0]))
+    )
+    camera = replace(
+        camera, width=width, height=height, cx=width * draw(st.floats(0.2, 0.8)), cy=height / 2
+    )
     case = Case(field=gaussians(0, camera, seed=0), camera=camera)
     low = draw(st.sampled_from([0.02, 0.1, 0.5]))
     faint = draw(st.sampled_from([0.01, 0.3, 0.9]))
@@ -164,13 +199,19 @@ def scenes(draw) -> Case:
         colour=draw(st.booleans()),
     )
     shifts = tuple(draw(st.lists(st.floats(-7.0, 7.0), min_size=1, max_size=6)))
-    sensor = Sensor(shifts=shifts, f_mod_hz=draw(st.sampled_from([5e6, 2e7, 6e7])), dc_offset=draw(st.floats(0.0, 1.0)))
+    sensor = Sensor(
+        shifts=shifts,
+        f_mod_hz=draw(st.sampled_from([5e6, 2e7, 6e7])),
+        dc_offset=draw(st.floats(0.0, 1.0)),
+    )
     extra = draw(st.sampled_from([None, 0, 1, 3, 6, 7]))
     case = replace(
         case,
         field=field,
         sensor=sensor,
-        settings=replace(case.settings, sh_degree=draw(st.integers(0, 3)), stop=draw(st.sampled_from(Stop))),
+        settings=replace(
+            case.settings, sh_degree=draw(st.integers(0, 3)), stop=draw(st.sampled_from(Stop))
+        ),
         background=draw(st.sampled_from([None, light(camera, len(shifts), seed=3)])),
         extra=None if extra is None else channels(field, extra),
     )
@@ -183,14 +224,17 @@ def scenes(draw) -> Case:
 def test_random_scenes_match_the_oracle(device_name, case):
     """Images and gradients of scenes nobody chose; pixels on a jump are left out."""
     undecided = reference.undecided_pixels(case.field, case.camera, case.settings)
-    assume(undecided.double().mean() <= UNDECIDED_SHARE)  # else: an image of a few pixels, one of them on a jump
+    # else: an image of a few pixels, one of them on a jump
+    assume(undecided.double().mean() <= UNDECIDED_SHARE)
     comparison = Comparison(case, device_name)
     comparison.check_images()
     comparison.check_gradients(*comparison.want)
 
 
 def test_random_scenes_are_mostly_decided():
-    """The assumption above is rare: of many scenes, fewer than one in ten has too many pixels on a jump."""
+    """The assumption above is rare: of many scenes, fewer than one in ten has too many pixels on a
+    jump.
+    """
     left_out = []
 
     @profile(max_examples=40, deadline=None, derandomize=True, database=None)

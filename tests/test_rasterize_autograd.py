@@ -1,4 +1,6 @@
-"""The renderer as a good citizen of torch: graphs, threads, streams, strides, broadcasting, errors."""
+"""The renderer as a good citizen of torch: graphs, threads, streams, strides, broadcasting,
+errors.
+"""
 
 from dataclasses import replace
 
@@ -33,7 +35,9 @@ def test_two_forwards_before_one_backward(device):
 
 
 def test_one_graph_can_be_differentiated_twice(device):
-    """With retain_graph, a second backward pass gives the same; another cotangent, another gradient."""
+    """With retain_graph, a second backward pass gives the same; another cotangent,
+    another gradient.
+    """
     case = CASES["saturated"]()
     inputs = case.inputs(torch.float32, device)
     images = case.outputs(api.rasterize, inputs)
@@ -58,14 +62,18 @@ def test_gradients_accumulate_in_leaves(device):
 
 @pytest.mark.parametrize("name", ["posed", "opaque"])
 def test_threads_change_sums_by_rounding_only(name):
-    """On the CPU the images of one, two and five threads are the same to the bit; gradients are to rounding."""
+    """On the CPU the images of one, two and five threads are the same to the bit;
+    gradients are to rounding.
+    """
     results = []
     for threads in (1, 2, 5):
         case = CASES[name]()
         case = replace(case, settings=replace(case.settings, threads=threads))
         inputs = case.inputs(torch.float32)
         images = case.outputs(api.rasterize, inputs)
-        results.append(({k: v.detach().clone() for k, v in images.items()}, gradients_of(images, inputs)))
+        results.append(
+            ({k: v.detach().clone() for k, v in images.items()}, gradients_of(images, inputs))
+        )
     for images, gradients in results[1:]:
         same(images, results[0][0], exact=True)
         same(gradients, results[0][1], exact=False)
@@ -78,13 +86,17 @@ def test_same_call_same_bytes():
     for _ in range(2):
         inputs = case.inputs(torch.float32)
         images = case.outputs(api.rasterize, inputs)
-        results.append({**images, **{f"grad {k}": v for k, v in gradients_of(images, inputs).items()}})
+        results.append(
+            {**images, **{f"grad {k}": v for k, v in gradients_of(images, inputs).items()}}
+        )
     same(results[1], results[0], exact=True)
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="streams exist on CUDA only")
 def test_a_side_stream_is_followed():
-    """On a stream of its own, the renderer waits for torch's work before it, and torch's work after it waits."""
+    """On a stream of its own, the renderer waits for torch's work before it,
+    and torch's work after it waits.
+    """
     case = CASES["posed"]()
     inputs = case.inputs(torch.float32, "cuda")
     want = case.outputs(api.rasterize, inputs)
@@ -104,7 +116,9 @@ def test_a_side_stream_is_followed():
     same(again, gradients, exact=False)
 
 
-@pytest.mark.parametrize("wanted", [("mean",), ("colour_sh",), ("background.quads",), ("f_mod_hz",), ("extra", "mean")])
+@pytest.mark.parametrize(
+    "wanted", [("mean",), ("colour_sh",), ("background.quads",), ("f_mod_hz",), ("extra", "mean")]
+)
 def test_a_gradient_may_be_wanted_of_some_inputs_only(wanted, device):
     """The same numbers as when all are wanted."""
     case = CASES["translucent"]()
@@ -155,7 +169,9 @@ def test_strided_inputs_and_cotangents_are_welcome(device):
     fresh = case.outputs(api.rasterize, inputs)
     weight = torch.randn(24, 20, generator=torch.Generator().manual_seed(0)).to(device).T
     (loose,) = torch.autograd.grad(fresh["distance"], inputs["mean"], weight, retain_graph=True)
-    (tight,) = torch.autograd.grad(fresh["distance"], inputs["mean"], weight.contiguous(), retain_graph=True)
+    (tight,) = torch.autograd.grad(
+        fresh["distance"], inputs["mean"], weight.contiguous(), retain_graph=True
+    )
     (spread,) = torch.autograd.grad(fresh["opacity"].sum(), inputs["mean"])  # an expanded cotangent
     assert_close(loose, tight, rtol=1e-5, atol=1e-6)
     assert spread.abs().max() > 0.1
@@ -163,14 +179,19 @@ def test_strided_inputs_and_cotangents_are_welcome(device):
 
 @pytest.mark.parametrize("kind", ["number", "channel", "image"])
 def test_backgrounds_broadcast(kind, device):
-    """A number, one value per channel or an image: the same light, and the gradient of the given shape."""
+    """A number, one value per channel or an image: the same light,
+    and the gradient of the given shape.
+    """
     case = CASES["translucent"]()
     shape = {"number": (), "channel": (4, 1, 1), "image": (4, 20, 24)}[kind]
-    value = torch.randn(shape, generator=torch.Generator().manual_seed(0)).to(device).requires_grad_()
+    value = (
+        torch.randn(shape, generator=torch.Generator().manual_seed(0)).to(device).requires_grad_()
+    )
     inputs = case.inputs(torch.float32, device, grad=False)
     quads = [
         replace(case, background=Background(quads=light)).render(
-            api.rasterize, {**{k: v for k, v in inputs.items() if "." not in k}, "background.quads": light}
+            api.rasterize,
+            {**{k: v for k, v in inputs.items() if "." not in k}, "background.quads": light},
         )
         for light in (value, value.detach().expand(4, 20, 24).contiguous())
     ]
@@ -193,7 +214,9 @@ def test_sensor_numbers_and_tensors_agree(device):
 
 
 def test_reserved_pairs_change_nothing(device):
-    """With room reserved in advance the host need not wait, and the images are the same to the bit."""
+    """With room reserved in advance the host need not wait,
+    and the images are the same to the bit.
+    """
     case = CASES["posed"]()
     inputs = case.inputs(torch.float32, device)
     want = case.outputs(api.rasterize, inputs)
@@ -233,4 +256,7 @@ def test_wrong_shapes_are_named(device):
     with pytest.raises(ValueError, match=r"extra \(39, 3\).* 40"):
         case.render(api.rasterize, {**inputs, "extra": inputs["extra"][1:].detach()})
     with pytest.raises(ValueError, match=r"background.colour \(3, 20, 23\).*\(3, 20, 24\)"):
-        case.render(api.rasterize, {**inputs, "background.colour": inputs["background.colour"][..., 1:].detach()})
+        case.render(
+            api.rasterize,
+            {**inputs, "background.colour": inputs["background.colour"][..., 1:].detach()},
+        )

@@ -22,7 +22,8 @@ def device(request, monkeypatch) -> str:
     if mapping != "own":
         monkeypatch.setitem(buffers.TILE_SHAPES, where, buffers.TILE_SHAPES[mapping])
         monkeypatch.setitem(buffers.SEGMENTS, where, 4)
-        monkeypatch.setattr(buffers, "available_threads", lambda: 1)  # then two groups of channels share a pass
+        # then two groups of channels share a pass
+        monkeypatch.setattr(buffers, "available_threads", lambda: 1)
     return where
 
 
@@ -37,7 +38,9 @@ def gradients(inputs, images, names, seed=0):
     nothing = torch.zeros(next(iter(images.values())).shape[-2:], dtype=torch.bool)
     seeds = cotangents({name: images[name] for name in names}, nothing, seed)
     total = sum((images[name] * seeds[name].to(images[name])).sum() for name in names)
-    found = torch.autograd.grad(total, list(inputs.values()), allow_unused=True, materialize_grads=True)
+    found = torch.autograd.grad(
+        total, list(inputs.values()), allow_unused=True, materialize_grads=True
+    )
     return dict(zip(inputs, found, strict=True))
 
 
@@ -48,10 +51,14 @@ def check(got, want, tolerance=2e-5):
         assert_close(got[name].to(value), value, rtol=0, atol=tolerance * scale + 1e-7, msg=name)
 
 
-@pytest.mark.parametrize("wanted", [("quads",), ("phasor", "opacity"), ("quads", "distance"), ("distortion",), ()])
+@pytest.mark.parametrize(
+    "wanted", [("quads",), ("phasor", "opacity"), ("quads", "distance"), ("distortion",), ()]
+)
 @pytest.mark.parametrize("name", ["posed", "released"])
 def test_what_is_left_out_changes_nothing_else(name, wanted, device):
-    """Images that were asked for, and their gradients, are those of a full rendering; the others have no elements."""
+    """Images that were asked for, and their gradients, are those of a full rendering;
+    the others have no elements.
+    """
     case = CASES[name]()
     full_inputs, full = rendered(case, device)
     inputs, images = rendered(case, device, images=wanted)
@@ -72,12 +79,17 @@ def test_the_oracle_leaves_out_the_same():
     """Shapes of images that nobody asked for are those of the kernels."""
     case = CASES["posed"]()
     got, want = (
-        rendered(case, "cpu", rasterize, images=("opacity",))[1] for rasterize in (api.rasterize, reference.rasterize)
+        rendered(case, "cpu", rasterize, images=("opacity",))[1]
+        for rasterize in (api.rasterize, reference.rasterize)
     )
-    assert {name: image.shape for name, image in got.items()} == {name: image.shape for name, image in want.items()}
+    assert {name: image.shape for name, image in got.items()} == {
+        name: image.shape for name, image in want.items()
+    }
 
 
-@pytest.mark.parametrize("rasterize", [api.rasterize, reference.rasterize], ids=["kernels", "oracle"])
+@pytest.mark.parametrize(
+    "rasterize", [api.rasterize, reference.rasterize], ids=["kernels", "oracle"]
+)
 def test_an_image_that_does_not_exist_is_named(rasterize):
     """A typo must not silently leave out an image."""
     with pytest.raises(ValueError, match=r"'depth'.*quads, phasor, distance, opacity, distortion"):
@@ -99,7 +111,9 @@ def names_in(images):
 
 @pytest.mark.parametrize("coloured", [False, True])
 def test_detached_extra_equals_a_second_rendering_of_a_detached_field(coloured, device):
-    """One rendering gives the images and the gradients of two: of the field, and of its detached twin with channels."""
+    """One rendering gives the images and the gradients of two: of the field,
+    and of its detached twin with channels.
+    """
     case = with_extra(coloured)
     inputs, images = rendered(case, device, extra_detached=True)
     got = gradients(inputs, images, names_in(images))
@@ -121,7 +135,9 @@ def test_detached_extra_equals_a_second_rendering_of_a_detached_field(coloured, 
 
 @pytest.mark.parametrize("coloured", [False, True])
 def test_detached_extra_matches_the_oracle(coloured, device):
-    """Under derivatives of all images, and of the extra ones alone: then nothing but the channels has a gradient."""
+    """Under derivatives of all images, and of the extra ones alone:
+    then nothing but the channels has a gradient.
+    """
     case = with_extra(coloured)
     inputs, images = rendered(case, device, extra_detached=True)
     exact, oracle = rendered(case, "cpu", reference.rasterize, torch.float64, extra_detached=True)
@@ -154,7 +170,9 @@ def test_detached_extra_leaves_screen_gradients_alone(coloured, device):
 
 @pytest.mark.parametrize("detached", [False, True])
 def test_ordered_sums_are_the_sums(detached, device):
-    """Pairs with records of their own give the same images and, to rounding, gradients; twice the same to the bit."""
+    """Pairs with records of their own give the same images and, to rounding, gradients;
+    twice the same to the bit.
+    """
     case = with_extra(True)
     inputs, images = rendered(case, device, extra_detached=detached)
     want = gradients(inputs, images, names_in(images))

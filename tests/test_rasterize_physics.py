@@ -1,4 +1,6 @@
-"""The kernels against physics, symmetries and their own finite differences: evidence that needs no oracle."""
+"""The kernels against physics, symmetries and their own finite differences:
+evidence that needs no oracle.
+"""
 
 import math
 from dataclasses import replace
@@ -34,7 +36,9 @@ def device(request) -> str:
 
 
 def test_finite_differences_of_the_kernel_itself(device):
-    """Central differences in float32 along each gradient, where no jump is near: evidence without the oracle."""
+    """Central differences in float32 along each gradient, where no jump is near:
+    evidence without the oracle.
+    """
     case = CASES["smooth"]()
     inputs = case.inputs(torch.float32, device)
     images = case.outputs(api.rasterize, inputs)
@@ -49,7 +53,9 @@ def test_finite_differences_of_the_kernel_itself(device):
         unit = value.detach().item() if key == "f_mod_hz" else 1.0
         direction, step = unit * gradient / gradient.norm(), 0.03
         with torch.no_grad():
-            ahead, behind = (loss({**inputs, key: value + sign * step * direction}).item() for sign in (1, -1))
+            ahead, behind = (
+                loss({**inputs, key: value + sign * step * direction}).item() for sign in (1, -1)
+            )
         want = unit * gradient.double().norm().item()
         assert (ahead - behind) / (2 * step) == pytest.approx(want, rel=1e-2), key
         assert want > 0.1, f"{key}: too little to be measured"
@@ -69,7 +75,9 @@ def test_order_in_memory_does_not_matter(name, device):
         assert torch.equal(got[output], want[output]), output
     for key in ("mean", "opacity_logit", "reflectivity_sh"):
         one, two = (
-            torch.autograd.grad(sum((images[k] * weight[k]).sum() for k in images), tensors[key], retain_graph=True)[0]
+            torch.autograd.grad(
+                sum((images[k] * weight[k]).sum() for k in images), tensors[key], retain_graph=True
+            )[0]
             for images, tensors in ((want, inputs), (got, shuffled))
         )
         assert_close(two, one[shuffle.to(device)], rtol=1e-4, atol=1e-5 * one.abs().max().item())
@@ -82,7 +90,9 @@ def test_moving_world_and_camera_together_changes_nothing(name, device):
     undecided = reference.undecided_pixels(case.field, case.camera, case.settings)
     axis, angle, translation = (0.3, -1.0, 0.8), 1.1, (0.5, -1.0, 0.7)
     other = moved_world(case, axis, angle, translation)
-    rotation = torch.from_numpy(other.camera.camera_from_world[:3, :3].T @ case.camera.camera_from_world[:3, :3])
+    rotation = torch.from_numpy(
+        other.camera.camera_from_world[:3, :3].T @ case.camera.camera_from_world[:3, :3]
+    )
     results = []
     for one in (case, other):
         inputs = one.inputs(torch.float32, device)
@@ -94,8 +104,15 @@ def test_moving_world_and_camera_together_changes_nothing(name, device):
     for name, image in want.items():
         error = ((got[name] - image).abs().cpu() * ~undecided).max()
         assert error < TOLERANCE.image * max(1.0, image.abs().max().item()), name
-    assert_close(by_moved.double(), by_mean.double() @ rotation.T, rtol=0, atol=2e-4 * by_mean.abs().max().item())
-    assert (by_moved - by_mean).abs().max() > 0.1 * by_mean.abs().max(), "unturned gradients must not pass"
+    assert_close(
+        by_moved.double(),
+        by_mean.double() @ rotation.T,
+        rtol=0,
+        atol=2e-4 * by_mean.abs().max().item(),
+    )
+    assert (by_moved - by_mean).abs().max() > 0.1 * by_mean.abs().max(), (
+        "unturned gradients must not pass"
+    )
 
 
 def on_axis(distance, opacity, device: str, reflectivity=0.5, scale: float = 30.0) -> GaussianField:
@@ -120,7 +137,9 @@ def test_single_gaussian_is_its_closed_form(device):
     """On the axis alpha is the opacity, and the paper's sensor equations say the rest."""
     o, d, r, bg = 0.6, 3.0, 0.4, 0.25
     sensor = Sensor(shifts=(0.2, 1.7, 4.0), phase_offset=0.3, dc_offset=1.2, source_intensity=1.7)
-    background = Background(quads=torch.tensor(bg, device=device), phasor=torch.tensor(-bg, device=device))
+    background = Background(
+        quads=torch.tensor(bg, device=device), phasor=torch.tensor(-bg, device=device)
+    )
     image = api.rasterize(on_axis([d], o, device, r, 0.2), ODD, sensor, background=background)
     a, psi = 1.7 * r / d**2, 4 * math.pi / 15.0 * d + 0.3
     quads = [o * a * (math.cos(psi - shift) + 1.2) + (1 - o) * bg for shift in sensor.shifts]
@@ -136,27 +155,41 @@ def test_single_gaussian_is_its_closed_form(device):
 
 
 def test_one_range_farther_is_dimmer_but_in_phase(device):
-    """Phase wraps at c/2f, 7.5 m; amplitude falls off with the square of the distance; decoding gives 2 m for both."""
+    """Phase wraps at c/2f, 7.5 m; amplitude falls off with the square of the distance;
+    decoding gives 2 m for both.
+    """
     sensor = Sensor(f_mod_hz=SPEED_OF_LIGHT / 15.0, phase_offset=0.7)
-    near, far = (api.rasterize(on_axis([d], 0.9, device), ODD, sensor).phasor[AXIS].cpu() for d in (2.0, 9.5))
+    near, far = (
+        api.rasterize(on_axis([d], 0.9, device), ODD, sensor).phasor[AXIS].cpu() for d in (2.0, 9.5)
+    )
     assert_close(far / far[2], near / near[2], rtol=1e-4, atol=1e-5)
     assert (near[2] / far[2]).item() == pytest.approx((9.5 / 2.0) ** 2, rel=1e-5)
     for phasor in (near, far):
-        assert distance_from_phasor(phasor[0], phasor[1], sensor).item() == pytest.approx(2.0, abs=1e-4)
+        assert distance_from_phasor(phasor[0], phasor[1], sensor).item() == pytest.approx(
+            2.0, abs=1e-4
+        )
 
 
 def test_opposite_quads_cancel_but_for_the_constant_part(device):
-    """Q(0) + Q(pi) is the DC offset times twice the amplitude; Q(0) - Q(pi) is the phasor's real part."""
+    """Q(0) + Q(pi) is the DC offset times twice the amplitude;
+    Q(0) - Q(pi) is the phasor's real part.
+    """
     case = replace(CASES["translucent"](), background=None)
     image = case.render(api.rasterize, case.inputs(torch.float32, device, grad=False))
     for i in (0, 2):
-        assert_close(image.quads[i] + image.quads[i + 1], 0.3 * image.phasor[2], rtol=1e-5, atol=1e-6)
-        assert_close(image.quads[i] - image.quads[i + 1], image.phasor[i // 2], rtol=1e-5, atol=1e-6)
+        assert_close(
+            image.quads[i] + image.quads[i + 1], 0.3 * image.phasor[2], rtol=1e-5, atol=1e-6
+        )
+        assert_close(
+            image.quads[i] - image.quads[i + 1], image.phasor[i // 2], rtol=1e-5, atol=1e-6
+        )
     assert image.phasor[2].max() > 0.1
 
 
 def test_early_stop_drops_or_adds_the_gaussian_that_crosses(device):
-    """T is 0.5, 0.005, 5e-5: the third Gaussian is the crossing one; the fourth is never seen, and gets no gradient."""
+    """T is 0.5, 0.005, 5e-5: the third Gaussian is the crossing one; the fourth is never seen,
+    and gets no gradient.
+    """
     field = on_axis([1.0, 2.0, 3.0, 4.0], torch.tensor([0.5, 0.9999, 0.9999, 0.9]), device)
     third = {Stop.INCLUSIVE: 0.00495, Stop.EXCLUSIVE: 0.0}
     for stop, weight in third.items():
@@ -164,19 +197,24 @@ def test_early_stop_drops_or_adds_the_gaussian_that_crosses(device):
         image = api.rasterize(field, ODD, Sensor(), RenderSettings(stop=stop), extra=extra)
         want = torch.tensor([0.5, 0.495, weight, 0.0])
         assert_close(image.extra[AXIS].detach().cpu(), want, rtol=1e-4, atol=1e-7)
-        assert image.distance[AXIS].item() == pytest.approx((want * torch.arange(1, 5)).sum().item(), rel=1e-5)
+        assert image.distance[AXIS].item() == pytest.approx(
+            (want * torch.arange(1, 5)).sum().item(), rel=1e-5
+        )
         (gradient,) = torch.autograd.grad(image.extra.sum(), extra)
         assert (gradient[3] == 0).all()
         assert (gradient[2, 2] > 0) == (stop is Stop.INCLUSIVE)
 
 
 @pytest.mark.parametrize(
-    ("centre", "exact", "parity"), [(48.0, (15, 80), (16, 79)), (47.2, (14, 79), (14, 79)), (46.0, (13, 78), (13, 78))]
+    ("centre", "exact", "parity"),
+    [(48.0, (15, 80), (16, 79)), (47.2, (14, 79), (14, 79)), (46.0, (13, 78), (13, 78))],
 )
 def test_parity_support_cuts_at_tiles_and_the_exact_one_does_not(centre, exact, parity, device):
-    """Standard deviation 10 px: alpha = 1/255 lies at 33 px, the square of half-width 31 px ends at a tile's edge.
+    """Standard deviation 10 px: alpha = 1/255 lies at 33 px, the square of half-width 31 px ends at
+    a tile's edge.
 
-    Counted from integer pixel centres, 47.5 - 31 lies in the second tile and 46.7 - 31 in the first.
+    Counted from integer pixel centres, 47.5 - 31 lies in the second tile and 46.7 - 31 in the
+    first.
     """
     camera = Camera(width=96, height=1, fx=96.0, fy=96.0, cx=centre, cy=0.5)
     field = on_axis([1.0], 0.9999, device, scale=math.sqrt(100 - LOW_PASS) / 96.0)
@@ -187,27 +225,35 @@ def test_parity_support_cuts_at_tiles_and_the_exact_one_does_not(centre, exact, 
 
 
 def test_culled_gaussians_have_zero_finite_gradients(device):
-    """Behind, in the camera's plane, too far, off-screen or too faint: nothing is seen, nothing is learned."""
+    """Behind, in the camera's plane, too far, off-screen or too faint: nothing is seen,
+    nothing is learned.
+    """
     field = gaussians(15, SMALL, seed=0)
     field.mean[:3, 2] *= -1
     field.mean[3:6, 2] = 0.0
     field.mean[6:9, 2] = 1e4
     field.mean[9:12, 0] = 50.0
     field.opacity_logit[12:] = -6.0
-    case = Case(field=field, camera=SMALL, background=light(SMALL, 4, seed=0), extra=channels(field, 3))
+    case = Case(
+        field=field, camera=SMALL, background=light(SMALL, 4, seed=0), extra=channels(field, 3)
+    )
     inputs = case.inputs(torch.float32, device)
     images = case.outputs(api.rasterize, inputs)
     for name in ("distance", "opacity", "distortion", "extra"):
         assert (images[name] == 0).all(), name
     for name in ("quads", "phasor", "colour"):
         assert_close(images[name], inputs[f"background.{name}"])
-    gradients = torch.autograd.grad(sum(image.sum() for image in images.values()), [*inputs.values()])
+    gradients = torch.autograd.grad(
+        sum(image.sum() for image in images.values()), [*inputs.values()]
+    )
     for name, gradient in zip(inputs, gradients, strict=True):
         assert (gradient == (1.0 if name.startswith("background") else 0.0)).all(), name
 
 
 def test_screen_gradient_is_that_of_the_principal_point(device):
-    """Moving the principal point moves all image positions alike: the sum of the screen gradients is its derivative."""
+    """Moving the principal point moves all image positions alike:
+    the sum of the screen gradients is its derivative.
+    """
     case = CASES["smooth"]()
     inputs = case.inputs(torch.float32, device)
     rendering = case.render(api.rasterize, inputs, screen_gradient=True)
@@ -231,8 +277,14 @@ def test_any_number_of_shifts_is_one_model(device):
     shifts = (0.0, 0.4, 2.2, 0.4, -1.0, 9.0, 4.4)
     case = replace(CASES["translucent"](), background=None)
     inputs = case.inputs(torch.float32, device, grad=False)
-    together = replace(case, sensor=case.sensor.with_shifts(shifts)).render(api.rasterize, inputs).quads
+    together = (
+        replace(case, sensor=case.sensor.with_shifts(shifts)).render(api.rasterize, inputs).quads
+    )
     for quad, shift in zip(together, shifts, strict=True):
-        alone = replace(case, sensor=case.sensor.with_shifts((shift,))).render(api.rasterize, inputs).quads
+        alone = (
+            replace(case, sensor=case.sensor.with_shifts((shift,)))
+            .render(api.rasterize, inputs)
+            .quads
+        )
         assert_close(quad, alone[0], rtol=1e-6, atol=1e-7)
     assert torch.equal(together[1], together[3])

@@ -1,4 +1,6 @@
-"""Every `gftorf simulate` line of README.md and docs/simulate.md is run at a tiny size; other commands are parsed."""
+"""Every `gftorf simulate` line of README.md and docs/simulate.md is run at a tiny size;
+other commands are parsed.
+"""
 
 import re
 import shlex
@@ -10,11 +12,20 @@ from gftorf_warp import Sequence, cli, options
 from gftorf_warp.sim.ladder import NAMES
 
 REPOSITORY = Path(__file__).parents[1]
-README, PAGE = ((REPOSITORY / name).read_text(encoding="utf-8") for name in ("README.md", "docs/simulate.md"))
-LINES = sorted(
-    {line.partition("#")[0].strip() for line in re.findall(r"(?:^|`)(gftorf [^`\n]*)", README + PAGE, re.MULTILINE)}
+README, PAGE = (
+    (REPOSITORY / name).read_text(encoding="utf-8") for name in ("README.md", "docs/simulate.md")
 )
-SIMULATE = [line for line in LINES if line.startswith("gftorf simulate ") and "--out" in line and "SCENE" not in line]
+LINES = sorted(
+    {
+        line.partition("#")[0].strip()
+        for line in re.findall(r"(?:^|`)(gftorf [^`\n]*)", README + PAGE, re.MULTILINE)
+    }
+)
+SIMULATE = [
+    line
+    for line in LINES
+    if line.startswith("gftorf simulate ") and "--out" in line and "SCENE" not in line
+]
 
 
 @pytest.mark.parametrize("line", SIMULATE)
@@ -40,7 +51,9 @@ def test_a_simulation_of_the_pages_runs(line, tmp_path, monkeypatch):
 
 
 def test_the_pages_show_everything_that_can_be_simulated():
-    """Meshes, gloss, blur, bounces, sensors, levels, captures, phasors, resuming; every option of the command."""
+    """Meshes, gloss, blur, bounces, sensors, levels, captures, phasors, resuming;
+    every option of the command.
+    """
     for word in (
         ".toml",
         "--engine mesh",
@@ -52,7 +65,13 @@ def test_the_pages_show_everything_that_can_be_simulated():
         "--ladder",
     ):
         assert any(word in line for line in SIMULATE), word
-    for word in ("--format capture", "--format torf", "--truth all", "ambient", "--override emitter"):
+    for word in (
+        "--format capture",
+        "--format torf",
+        "--truth all",
+        "ambient",
+        "--override emitter",
+    ):
         assert any(word in line for line in SIMULATE), word
     for word in ("--list", "seq.partial", "--fresh"):
         assert word in README, word
@@ -65,7 +84,9 @@ def test_printed_commands_can_be_parsed():
     """Options that are printed exist."""
     commands = options.command_parsers()
     typed = [
-        line for line in LINES if "COMMAND" not in line and "SCENE" not in line and shlex.split(line)[1] in commands
+        line
+        for line in LINES
+        if "COMMAND" not in line and "SCENE" not in line and shlex.split(line)[1] in commands
     ]
     assert len(typed) > 20
     for line in typed:

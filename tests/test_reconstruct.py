@@ -93,7 +93,9 @@ def test_keys_start_where_flow_leads_and_at_rest_without():
 
 
 @pytest.mark.parametrize("device", DEVICES)
-@pytest.mark.parametrize("what", ["truncated", "missing frames", "static", "single quartet", "real order, offset, DC"])
+@pytest.mark.parametrize(
+    "what", ["truncated", "missing frames", "static", "single quartet", "real order, offset, DC"]
+)
 def test_unusual_recordings_are_fitted_too(tmp_path, what, device):
     """Forty steps clearly reduce the error of the quads."""
     measured = np.ones(12, dtype=bool)
@@ -101,11 +103,17 @@ def test_unusual_recordings_are_fitted_too(tmp_path, what, device):
     recordings = {
         "truncated": lambda: recording(frames=10),
         "missing frames": lambda: recording(frames=12, measured=measured),
-        "static": lambda: recording(frames=12, quads=np.tile(small().quads[:4], (3, 1, 1)), with_flow=False),
+        "static": lambda: recording(
+            frames=12, quads=np.tile(small().quads[:4], (3, 1, 1)), with_flow=False
+        ),
         "single quartet": lambda: recording(frames=4, with_flow=False),
-        "real order, offset, DC": lambda: recording(frames=12, order=(1, 2, 0, 3), phase_offset=0.5, dc_offset=0.2),
+        "real order, offset, DC": lambda: recording(
+            frames=12, order=(1, 2, 0, 3), phase_offset=0.5, dc_offset=0.2
+        ),
     }
-    run = reconstruct(recordings[what]()[0], tmp_path / "run", demo(images=160, log_every=16), device=device)
+    run = reconstruct(
+        recordings[what]()[0], tmp_path / "run", demo(images=160, log_every=16), device=device
+    )
     found = rows(run.path)
     assert found[-1]["quad_psnr_db"] > found[0]["quad_psnr_db"] + 2.0
     assert found[-1]["quads"] < found[0]["quads"]
@@ -114,7 +122,9 @@ def test_unusual_recordings_are_fitted_too(tmp_path, what, device):
 
 
 def test_a_finer_camera_sees_what_was_optimised():
-    """Averaged over blocks, the finer image is the one that was optimised; unwidened it would be thinner."""
+    """Averaged over blocks, the finer image is the one that was optimised;
+    unwidened it would be thinner.
+    """
     mean = torch.tensor([[0.0, 0.0, 2.0], [0.3, -0.2, 3.0]])
     gaussians = field(mean, None)
     gaussians = replace(gaussians, log_scale=torch.full((2, 3), 0.005).log())
@@ -141,13 +151,16 @@ def test_truth_is_never_read(tmp_path, folder_of_a_sequence):
     """Without truth and masks: the same bytes."""
     bare = tmp_path / "box"
     shutil.copytree(folder_of_a_sequence, bare)
-    removed = [p for p in bare.iterdir() if p.name.startswith(("synthetic", "union", "dynamic", "occ"))]
+    removed = [
+        p for p in bare.iterdir() if p.name.startswith(("synthetic", "union", "dynamic", "occ"))
+    ]
     assert removed
     for path in removed:
         shutil.rmtree(path)
     settings = demo(images=24, log_every=8)
     runs = [
-        reconstruct(path, tmp_path / name, settings).path for name, path in (("a", folder_of_a_sequence), ("b", bare))
+        reconstruct(path, tmp_path / name, settings).path
+        for name, path in (("a", folder_of_a_sequence), ("b", bare))
     ]
     assert same(*map(stored, runs))
     assert rows(runs[0]) == rows(runs[1])
@@ -166,12 +179,18 @@ def test_config_and_metrics_say_what_happened(tmp_path):
     """Settings, sources and rates as they were in force."""
     run = reconstruct(small(), tmp_path / "run", demo(images=24, log_every=8), seed=5)
     config = run.config
-    assert (config["images"], config["images_optimised"], config["seed"], config["preset"]) == (24, 24, 5, "demo")
+    assert (config["images"], config["images_optimised"], config["seed"], config["preset"]) == (
+        24,
+        24,
+        5,
+        "demo",
+    )
     assert (config["init"], config["motion"], config["flow_source"]) == ("phase", "nodes", "file")
     assert config["seconds_reconstruct"] > 0
     assert config["frame_rate_hz"] == pytest.approx(120.0)
     largest = max(
-        np.hypot(*(small().quads[4 * i + j] - small().quads[4 * i + j + 1] for j in (0, 2))).max() for i in range(3)
+        np.hypot(*(small().quads[4 * i + j] - small().quads[4 * i + j + 1] for j in (0, 2))).max()
+        for i in range(3)
     )
     assert config["quad_scale"] == pytest.approx(1 / largest, rel=1e-5)
     assert "inferred" in config["quad_scale_source"]
@@ -179,7 +198,9 @@ def test_config_and_metrics_say_what_happened(tmp_path):
     assert config["schedule"]["rates_last"] == pytest.approx(config["settings"]["rates_last"])
     found = rows(run.path)
     assert [row["images"] for row in found] == [8, 16, 24]
-    assert all(row["loss"] == pytest.approx(row["quads"] + row["distortion"], rel=1e-4) for row in found)
+    assert all(
+        row["loss"] == pytest.approx(row["quads"] + row["distortion"], rel=1e-4) for row in found
+    )
     assert found[-1]["gaussians"] == run.gaussians
     assert 10 < found[-1]["quad_psnr_db"] < 80
     assert "is finished" in (run.path / "run.log").read_text()
@@ -197,7 +218,9 @@ def test_a_run_is_found_again_and_renders_in_the_units_of_the_file(tmp_path, fol
     rendered = run.render(float(sequence.times[5])).quads[1].numpy()
     assert np.abs(rendered - sequence.quads[5]).mean() < 0.25 * np.abs(sequence.quads[5]).mean()
     first = run.render(0.0)
-    torch.testing.assert_close(first.phasor[0], first.quads[0] - first.quads[1], rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(
+        first.phasor[0], first.quads[0] - first.quads[1], rtol=1e-4, atol=1e-5
+    )
     assert run.render(0.0, run.camera.resized(24, 18)).distance.shape == (18, 24)
     far, end = run.render(1e3), run.render(12 / 120)
     torch.testing.assert_close(far.distance, end.distance)
@@ -219,7 +242,9 @@ def test_the_source_of_flow_can_be_chosen_by_name(tmp_path):
 def test_random_start_and_still_motion_run_too(tmp_path):
     """The controls, and a sequence without any flow: a few steps reduce the loss."""
     sequence = replace(small(), flow=Flow())
-    settings = demo(images=160, log_every=16, init=InitSettings(kind=Init.RANDOM, count=300, opacity=0.3))
+    settings = demo(
+        images=160, log_every=16, init=InitSettings(kind=Init.RANDOM, count=300, opacity=0.3)
+    )
     settings = replace(settings, flow=FlowSource.NONE)
     run = reconstruct(sequence, tmp_path / "run", settings)
     found = rows(run.path)
@@ -236,4 +261,7 @@ def test_presets_have_names():
     with pytest.raises(UsageError, match="unknown preset dmeo") as caught:
         presets.preset("dmeo")
     assert "demo, paper, released" in str(caught.value)
-    assert json.loads(json.dumps(plain(presets.demo())))["schedule"]["images"] == presets.demo().schedule.images
+    assert (
+        json.loads(json.dumps(plain(presets.demo())))["schedule"]["images"]
+        == presets.demo().schedule.images
+    )

@@ -21,7 +21,8 @@ CAMERA = Camera.from_fov(40, 30, 60.0)
 NEAR = {"near": 0.1, "far": 20.0, "support": "alpha", "stop": "inclusive"}
 IMAGES = ("quads", "phasor", "colour", "distance", "opacity", "distortion")
 PLAIN = ("quads", "phasor", "distance", "opacity", "distortion")
-TIMES = (-1.0, 0.0, 0.011, 0.04, 0.0667, 0.5)  # before the first key, on keys, between them, behind the last
+# before the first key, on keys, between them, behind the last
+TIMES = (-1.0, 0.0, 0.011, 0.04, 0.0667, 0.5)
 
 
 @pytest.fixture(params=DEVICES)
@@ -30,7 +31,9 @@ def run(request, tmp_path):
     field = gaussians(60, CAMERA, seed=3).map(lambda tensor: tensor.to(request.param))
     shape = MotionSettings(kind="network", layers=3, width=16, skip_after=2, position_frequencies=3)
     keys = torch.arange(3, dtype=torch.float64) / 30
-    motion = Network(keys, shape, duration=0.1, length=5.0, generator=torch.Generator().manual_seed(1))
+    motion = Network(
+        keys, shape, duration=0.1, length=5.0, generator=torch.Generator().manual_seed(1)
+    )
     with torch.no_grad():
         motion.head.weight.mul_(1e4)
     motion = motion.to(request.param)
@@ -39,7 +42,9 @@ def run(request, tmp_path):
         path=tmp_path,
         config={"settings": {"render": render}, "size_optimised": [20, 15], "colour_scale": 0.5},
         camera=CAMERA,
-        sensor=Sensor(phase_offset=0.2, dc_offset=0.1, source_intensity=1.5, shifts=CANONICAL_SHIFTS),
+        sensor=Sensor(
+            phase_offset=0.2, dc_offset=0.1, source_intensity=1.5, shifts=CANONICAL_SHIFTS
+        ),
         quad_scale=3.0,
         field=field,
         motion=motion,
@@ -58,7 +63,9 @@ def compare(got, want):
     """To rounding, of the largest pixel."""
     for name in IMAGES:
         image, other = getattr(got, name), getattr(want, name)
-        torch.testing.assert_close(image, other, rtol=1e-4, atol=2e-5 * float(other.abs().max()), msg=name)
+        torch.testing.assert_close(
+            image, other, rtol=1e-4, atol=2e-5 * float(other.abs().max()), msg=name
+        )
 
 
 def test_images_are_those_of_render(run):
@@ -71,7 +78,9 @@ def test_images_are_those_of_render(run):
     first = render(0.0, CAMERA).distance.clone()
     assert float((render(0.0667, CAMERA).distance - first).abs().max()) > 0.1
     thin = replace(run, config=run.config | {"size_optimised": [40, 30]})
-    assert float((thin.renderer()(0.0, CAMERA).opacity - run.render(0.0).opacity).abs().max()) > 1e-3
+    assert (
+        float((thin.renderer()(0.0, CAMERA).opacity - run.render(0.0).opacity).abs().max()) > 1e-3
+    )
 
 
 def test_colour_only_where_it_is_wanted(run):
@@ -86,7 +95,9 @@ def test_only_what_is_wanted(run):
     got, want = run.renderer(("quads", "distance", "opacity"))(0.02, CAMERA), run.render(0.02)
     assert got.phasor.numel() == got.distortion.numel() == 0
     for name in ("quads", "distance", "opacity"):
-        torch.testing.assert_close(getattr(got, name), getattr(want, name), rtol=1e-4, atol=1e-4, msg=name)
+        torch.testing.assert_close(
+            getattr(got, name), getattr(want, name), rtol=1e-4, atol=1e-4, msg=name
+        )
     with pytest.raises(ValueError, match="no image 'depth'"):
         run.renderer(("quads", "depth"))
 
@@ -123,10 +134,16 @@ def test_cameras_of_one_size_share_memory(run):
 
 @pytest.mark.parametrize("run", ["cpu"], indirect=True)
 def test_a_size_is_captured_when_it_comes_again(run, monkeypatch):
-    """When a rendering is captured, with plain renderings instead of graphs; images are right throughout."""
+    """When a rendering is captured, with plain renderings instead of graphs;
+    images are right throughout.
+    """
     captured, launched = [], []
-    monkeypatch.setattr(module.Replay, "_captured", lambda _, target: captured.append(target) or target)
-    monkeypatch.setattr(module.Replay, "_launch", lambda self, target: launched.append(target) or self._draw(target))
+    monkeypatch.setattr(
+        module.Replay, "_captured", lambda _, target: captured.append(target) or target
+    )
+    monkeypatch.setattr(
+        module.Replay, "_launch", lambda self, target: launched.append(target) or self._draw(target)
+    )
     render = run.renderer(PLAIN)
     render.graphs = True
     for number, (time, camera) in enumerate([(t, c) for t in TIMES for c in (CAMERA, aside(0.1))]):
@@ -137,7 +154,9 @@ def test_a_size_is_captured_when_it_comes_again(run, monkeypatch):
             first = render._capacity.pairs
             assert first >= 1.5 * render.largest
     assert len(captured) == 1, "once per size"
-    assert len(launched) == 2 * len(TIMES) - 2, "not the one that counts pairs, nor the first one after it"
+    assert len(launched) == 2 * len(TIMES) - 2, (
+        "not the one that counts pairs, nor the first one after it"
+    )
     assert render._capacity.pairs == first, "pairs fitted"
     render._largest.fill_(10 * first)
     assert not render.fits()
@@ -154,7 +173,9 @@ def test_a_replay_is_a_call_to_the_bit(run):
     for time in (*TIMES, *TIMES):
         got, want = graphs(time, CAMERA), calls(time, CAMERA)
         for name in ("quads", "phasor", "distance", "opacity", "distortion"):
-            torch.testing.assert_close(getattr(got, name), getattr(want, name), rtol=0, atol=0, msg=name)
+            torch.testing.assert_close(
+                getattr(got, name), getattr(want, name), rtol=0, atol=0, msg=name
+            )
     assert all(target.graph is not None for target in graphs._targets.values())
     assert all(target.graph is None for target in calls._targets.values())
 
@@ -162,7 +183,9 @@ def test_a_replay_is_a_call_to_the_bit(run):
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 @pytest.mark.parametrize("run", ["cuda"], indirect=True)
 def test_pairs_that_do_not_fit_are_rendered_again(run):
-    """A checked image is whole whatever was reserved; an unchecked one is not, and the replay says so."""
+    """A checked image is whole whatever was reserved; an unchecked one is not,
+    and the replay says so.
+    """
     render = run.renderer(PLAIN)
     render(0.0, CAMERA)
     render._capacity.pairs = 10

@@ -1,4 +1,6 @@
-"""The page: every printed number is one of metrics.json, every picture shows its array, and nothing in it can run."""
+"""The page: every printed number is one of metrics.json, every picture shows its array,
+and nothing in it can run.
+"""
 
 import base64
 import json
@@ -38,7 +40,9 @@ PRINTED = {  # how the page prints a value of metrics.json, written a second tim
 
 
 class Page(HTMLParser):
-    """What a browser would see: tags, texts, marked numbers, embedded images by their alternative text."""
+    """What a browser would see: tags, texts, marked numbers,
+    embedded images by their alternative text.
+    """
 
     def __init__(self, text):
         super().__init__()
@@ -88,7 +92,9 @@ def picture(source):
     """RGB of an embedded image."""
     kind, _, data = source.partition(",")
     assert kind == "data:image/webp;base64"
-    return cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+    return cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_COLOR)[
+        ..., ::-1
+    ]
 
 
 def look_up(metrics, key):
@@ -127,14 +133,26 @@ def test_every_printed_number_is_in_metrics(compared):
         assert text == f"{look_up(metrics, above) / look_up(metrics, below):.1f}"
     printed = {key for key, _, _ in html.numbers}
     wanted = {
-        f"{group}{name}_mse_x100" for group in ("", "moving.", "static.") for name in ("closed_form", "d", "d_tof")
+        f"{group}{name}_mse_x100"
+        for group in ("", "moving.", "static.")
+        for name in ("closed_form", "d", "d_tof")
     }
-    wanted |= {"moving.share", "static.share", "quad_psnr_db", "colour_psnr_db", "gaussians", "frames", "seed"}
+    wanted |= {
+        "moving.share",
+        "static.share",
+        "quad_psnr_db",
+        "colour_psnr_db",
+        "gaussians",
+        "frames",
+        "seed",
+    }
     wanted |= {f"diagnostics.{name}" for name in metrics["diagnostics"] if name != "rows"}
     assert wanted <= printed
     assert len(html.ratios) == 1
     for section in ("top", "Errors", "Along the run", "Colour"):
-        left = html.texts[section].replace("m² \N{MULTIPLICATION SIGN} 100", "").replace("atan2", "")
+        left = (
+            html.texts[section].replace("m² \N{MULTIPLICATION SIGN} 100", "").replace("atan2", "")
+        )
         left = re.sub(r"\bframe \d+", "", left)  # which picture it is
         assert not re.search(r"\d", left), left
 
@@ -142,24 +160,41 @@ def test_every_printed_number_is_in_metrics(compared):
 def test_nothing_runs_and_nothing_is_loaded(compared):
     """No script, no handler, no form, no address but embedded data; the policy forbids the rest."""
     run, _, html, _ = compared
-    assert not {"script", "iframe", "object", "embed", "link", "form", "base", "svg", "a"} & set(html.tags)
+    assert not {"script", "iframe", "object", "embed", "link", "form", "base", "svg", "a"} & set(
+        html.tags
+    )
     for tag, name, value in html.attributes:
         assert not name.startswith("on"), f"{tag} {name}"
         if name in {"src", "href", "srcset", "action", "data"}:
             assert value.startswith("data:image/"), f"{tag} {name}"
     text = (run.path / "report.html").read_text()
-    assert not re.search(r"https?:|//[a-z]|url\(|@import|javascript:", re.sub(r"base64,[A-Za-z0-9+/=]*", "", text))
-    policies = [value for tag, name, value in html.attributes if tag == "meta" and value and "default-src" in value]
+    assert not re.search(
+        r"https?:|//[a-z]|url\(|@import|javascript:", re.sub(r"base64,[A-Za-z0-9+/=]*", "", text)
+    )
+    policies = [
+        value
+        for tag, name, value in html.attributes
+        if tag == "meta" and value and "default-src" in value
+    ]
     assert policies == ["default-src 'none'; img-src data:; style-src 'unsafe-inline'"]
 
 
 def test_a_hostile_name_stays_a_name(compared):
     """Text from folders, configuration and data cards is shown, never obeyed."""
     run, metrics, _, found = compared
-    config = {name: HOSTILE if isinstance(value, str) else value for name, value in run.config.items()}
-    hostile = {name: HOSTILE if isinstance(value, str) else value for name, value in metrics.items()}
-    log = [{"images": i, "loss": 1.0, HOSTILE: 0.5, "gaussians": 3, "quad_psnr_db": None} for i in (1, 2)]
-    text = report(title=HOSTILE, metrics=hostile, config=config, log=log, found=found, data_card=HOSTILE)
+    config = {
+        name: HOSTILE if isinstance(value, str) else value for name, value in run.config.items()
+    }
+    hostile = {
+        name: HOSTILE if isinstance(value, str) else value for name, value in metrics.items()
+    }
+    log = [
+        {"images": i, "loss": 1.0, HOSTILE: 0.5, "gaussians": 3, "quad_psnr_db": None}
+        for i in (1, 2)
+    ]
+    text = report(
+        title=HOSTILE, metrics=hostile, config=config, log=log, found=found, data_card=HOSTILE
+    )
     html = Page(text)
     assert "script" not in html.tags
     assert html.headline == HOSTILE
@@ -168,19 +203,26 @@ def test_a_hostile_name_stays_a_name(compared):
 
 
 def test_pictures_show_their_arrays(compared):
-    """Distances, errors, quads and masks, decoded from the page and compared with the arrays on the stated scale."""
+    """Distances, errors, quads and masks, decoded from the page and compared with the arrays on
+    the stated scale.
+    """
     _, _, html, found = compared
     s = panels.telling_row(found)
     metres = found.distance_scale
     assert (metres.low, metres.high) == (2.5, 4.0)
     quads = pictures.signed_scale([found.sequence.quads[n] for n in range(4, 8)])
-    errors = pictures.error_scale([np.sqrt(found.judgement.errors["closed_form"][s])[found.judgement.moving[s]]])
+    errors = pictures.error_scale(
+        [np.sqrt(found.judgement.errors["closed_form"][s])[found.judgement.moving[s]]]
+    )
     want = {
         "closed form": (found.views.closed_form[s], metres),
         "ours, d": (found.views.d[s], metres),
         "ours, d_ToF": (found.views.d_tof[s], metres),
         "truth": (analytic_run.true_distance(found.views.frames[s]), metres),
-        "error of closed form": (np.abs(found.views.closed_form[s] - found.judgement.truth[s]), errors),
+        "error of closed form": (
+            np.abs(found.views.closed_form[s] - found.judgement.truth[s]),
+            errors,
+        ),
         "error of ours, d": (np.abs(found.views.d[s] - found.judgement.truth[s]), errors),
         "moving pixels": (
             found.judgement.moving[s].astype(float),
@@ -190,8 +232,12 @@ def test_pictures_show_their_arrays(compared):
     }
     assert found.views.frames[s] // 4 == 1
     for title, (image, scale) in want.items():
-        np.testing.assert_array_equal(picture(html.images[title][0]), pictures.colour_mapped(image, scale), title)
-        assert len(np.unique(picture(html.images[title][0]).reshape(-1, 3), axis=0)) > 1, f"{title} is one colour"
+        np.testing.assert_array_equal(
+            picture(html.images[title][0]), pictures.colour_mapped(image, scale), title
+        )
+        assert len(np.unique(picture(html.images[title][0]).reshape(-1, 3), axis=0)) > 1, (
+            f"{title} is one colour"
+        )
 
 
 def test_phase_and_amplitude_are_those_of_the_quartet(compared):
@@ -199,7 +245,9 @@ def test_phase_and_amplitude_are_those_of_the_quartet(compared):
     _, _, html, _ = compared
     phase = picture(html.images["measured phase"][0])[0, 0]
     psi = analytic_run.PHASE_SLOPE * analytic_run.WALL
-    np.testing.assert_array_equal(phase, pictures.colour_mapped(np.array([[psi]]), pictures.phase_scale())[0, 0])
+    np.testing.assert_array_equal(
+        phase, pictures.colour_mapped(np.array([[psi]]), pictures.phase_scale())[0, 0]
+    )
     amplitude = picture(html.images["measured amplitude"][0])
     assert amplitude[0, 0, 0] < amplitude[5, 8, 0], "the box is nearer, so brighter"
 
@@ -207,8 +255,12 @@ def test_phase_and_amplitude_are_those_of_the_quartet(compared):
 def test_animation_has_a_picture_for_every_quartet_start(compared):
     """Three quartets, four panels of 20 pixels with gaps between them."""
     _, _, html, _ = compared
-    (source,) = (sources[0] for title, sources in html.images.items() if title.startswith("animation"))
-    ok, animation = cv2.imdecodeanimation(np.frombuffer(base64.b64decode(source.partition(",")[2]), np.uint8))
+    (source,) = (
+        sources[0] for title, sources in html.images.items() if title.startswith("animation")
+    )
+    ok, animation = cv2.imdecodeanimation(
+        np.frombuffer(base64.b64decode(source.partition(",")[2]), np.uint8)
+    )
     assert ok
     assert len(animation.frames) == 3
     assert animation.frames[0].shape[:2] == (12, 4 * 20 + 3 * 2)
@@ -227,7 +279,10 @@ def test_curves_are_drawn_from_the_log(compared):
     """One line per loss term, and none without a log."""
     _, _, html, _ = compared
     assert {"During optimisation", "Error of every raw frame"} <= set(html.images)
-    log = [{"images": i, "seconds": 1.0, "loss": 1.0 / i, "quads": 0.5 / i, "gaussians": 9} for i in (1, 2, 3)]
+    log = [
+        {"images": i, "seconds": 1.0, "loss": 1.0 / i, "quads": 0.5 / i, "gaussians": 9}
+        for i in (1, 2, 3)
+    ]
     both, one = (
         figures.training_curves(log),
         figures.training_curves([{k: s[k] for k in s if k != "quads"} for s in log]),
@@ -242,7 +297,9 @@ def test_along_the_run_is_drawn_from_its_rows(compared):
     assert "Along the run" in html.images
     assert "Along the run" in html.texts
     rows = rows_of(run.path / "diagnostics.jsonl")
-    blind = [{name: None if "mse" in name else value for name, value in row.items()} for row in rows]
+    blind = [
+        {name: None if "mse" in name else value for name, value in row.items()} for row in rows
+    ]
     titles = [set(drawn_texts(figures.along_run(given))) for given in (rows, blind)]
     assert titles[0] - titles[1] >= {"Error of d", "Error of d_ToF"}
     for both in titles:
@@ -259,7 +316,9 @@ def drawn_texts(svg):
 
 
 def test_views_that_nobody_took_are_shown(compared):
-    """Distance on the scale of all others and colour, from three poses; colour measured above rendered."""
+    """Distance on the scale of all others and colour, from three poses;
+    colour measured above rendered.
+    """
     _, _, html, found = compared
     scale = found.distance_scale
     assert found.novel.poses == [0, 1, 2]
@@ -271,7 +330,9 @@ def test_views_that_nobody_took_are_shown(compared):
     wrong = np.where(right == analytic_run.BOX, analytic_run.BOX_ERROR, analytic_run.WALL_ERROR)
     np.testing.assert_allclose(found.novel.distance[1], right + wrong, rtol=1e-5)
     assert len(html.images["colour"]) == 3
-    measured, rendered = (picture(html.images[f"{kind} colour"][0]).astype(int) for kind in ("measured", "rendered"))
+    measured, rendered = (
+        picture(html.images[f"{kind} colour"][0]).astype(int) for kind in ("measured", "rendered")
+    )
     assert measured[0, 0].argmax() == 0, "the wall is reddish"
     assert measured[5, 3].argmax() == 2, "the box is bluish"
     assert 0 < np.abs(measured - rendered).max() < 60
@@ -317,7 +378,10 @@ def test_verdict_says_which_is_better():
     rows = {"closed_form_mse_x100": 100.0, "d_mse_x100": 4.0, "share": 0.125}
     good = {"moving": rows, "static": rows, "d_mse_x100": 1.0}
     text = re.sub(r"<[^>]*>", "", verdict(good))
-    assert "moving pixels (12.5 % of all), the closed form is off by 100.0 cm and ours by 20.0 cm" in text
+    assert (
+        "moving pixels (12.5 % of all), the closed form is off by 100.0 cm and ours by 20.0 cm"
+        in text
+    )
     assert "25.0 times less squared error" in text
     bad = {"moving": {**rows, "closed_form_mse_x100": 2.0}, "static": rows, "d_mse_x100": 1.0}
     assert "2.0 times more squared error" in re.sub(r"<[^>]*>", "", verdict(bad))
@@ -342,7 +406,9 @@ def test_the_frame_shown_is_the_one_that_moves_most(compared):
     _, _, _, found = compared
     moving = np.zeros_like(found.judgement.moving)
     moving[7, :3] = moving[4, :1] = moving[11] = True
-    assert panels.telling_row(replace(found, judgement=replace(found.judgement, moving=moving))) == 7
+    assert (
+        panels.telling_row(replace(found, judgement=replace(found.judgement, moving=moving))) == 7
+    )
     quads = np.zeros_like(found.sequence.quads)
     quads[9] = 1.0  # against frames 5 and 13; the first of the two in the middle half is shown
     blind = replace(found, judgement=None, sequence=replace(found.sequence, quads=quads))
@@ -375,7 +441,9 @@ def test_pages_of_large_noisy_images_stay_below_four_megabytes(compared):
         quad_rendered=noise - 4.0,
         quad_measured=noise[::-1] - 4.0,
     )
-    found = findings(sequence, views, Truth(distance=noise[:, ::-1], known=np.ones(frames, dtype=bool)))
+    found = findings(
+        sequence, views, Truth(distance=noise[:, ::-1], known=np.ones(frames, dtype=bool))
+    )
     text = report(title="noise", metrics=compared[1], config={}, log=[], found=found)
     assert 1_000_000 < len(text) < 4_000_000
     assert pictures.thinned(np.zeros((240, 641)), page.PICTURE_SIZE_MAX).shape == (80, 214)

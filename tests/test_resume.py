@@ -38,9 +38,18 @@ reconstruct(small(), RUN, settings, progress=kill)
 
 
 def test_an_interrupted_run_goes_on_to_the_same_bytes(tmp_path):
-    """Stopped by SIGTERM in the middle of an epoch; densification, random splits and its statistics included."""
-    options = DensifySettings(every=8, start=4, stop_share=0.9, gradient_min=1e-6, clone_scale_max=0.04, reset_every=24)
-    settings = demo(images=40, log_every=4, densify=options, weights=Weights(distortion=1e-3, ssim=0.1, flow=1e-4))
+    """Stopped by SIGTERM in the middle of an epoch; densification,
+    random splits and its statistics included.
+    """
+    options = DensifySettings(
+        every=8, start=4, stop_share=0.9, gradient_min=1e-6, clone_scale_max=0.04, reset_every=24
+    )
+    settings = demo(
+        images=40,
+        log_every=4,
+        densify=options,
+        weights=Weights(distortion=1e-3, ssim=0.1, flow=1e-4),
+    )
     whole = reconstruct(small(), tmp_path / "whole", settings, seed=3)
 
     def stop(images, _, **__):
@@ -52,7 +61,11 @@ def test_an_interrupted_run_goes_on_to_the_same_bytes(tmp_path):
     assert stored(tmp_path / "parts")["images"] == 20
     seen = []
     parts = reconstruct(
-        small(), tmp_path / "parts", settings, seed=3, progress=lambda images, _, **__: seen.append(images)
+        small(),
+        tmp_path / "parts",
+        settings,
+        seed=3,
+        progress=lambda images, _, **__: seen.append(images),
     )
     assert seen[0] == 24
     assert same(stored(whole.path), stored(parts.path))
@@ -65,10 +78,14 @@ def test_an_interrupted_run_goes_on_to_the_same_bytes(tmp_path):
 
 
 def test_a_killed_run_goes_on_to_the_same_bytes(tmp_path):
-    """SIGKILL leaves no time to store anything: the last checkpoint counts, and later rows are dropped."""
+    """SIGKILL leaves no time to store anything: the last checkpoint counts,
+    and later rows are dropped.
+    """
     run = tmp_path / "killed"
     script = KILLED.replace("RUN", repr(str(run)))
-    done = subprocess.run([sys.executable, "-c", script], cwd=Path(__file__).parent, capture_output=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", script], cwd=Path(__file__).parent, capture_output=True, check=False
+    )
     assert done.returncode == -signal.SIGKILL, done.stderr.decode()
     assert checkpoint.last(run)["images"] == 20
     assert rows(run)[-1]["images"] == 24
@@ -84,7 +101,9 @@ def test_a_folder_resumes_or_says_why_not(tmp_path):
     settings = demo(images=8)
     run = reconstruct(small(), tmp_path / "run", settings, seed=1)
     first = stored(run.path)
-    assert same(stored(reconstruct(small(), run.path, settings, seed=1).path), first), "a finished run is left alone"
+    assert same(stored(reconstruct(small(), run.path, settings, seed=1).path), first), (
+        "a finished run is left alone"
+    )
     for changed in ({"seed": 2}, {"settings": demo(images=8, background=0.5)}, {"images": 4}):
         arguments = {"settings": settings, "seed": 1} | changed
         with pytest.raises(UsageError, match="--fresh") as caught:
@@ -113,7 +132,10 @@ def test_a_folder_of_something_else_is_not_touched(tmp_path):
 
 def test_two_calls_do_not_share_a_folder(tmp_path):
     """The second is told who works there."""
-    with folder.locked(tmp_path / "run"), pytest.raises(BusyError, match=str(os.getpid())) as caught:
+    with (
+        folder.locked(tmp_path / "run"),
+        pytest.raises(BusyError, match=str(os.getpid())) as caught,
+    ):
         reconstruct(small(), tmp_path / "run", demo(images=4))
     assert caught.value.exit_code == 6
     assert reconstruct(small(), tmp_path / "run", demo(images=4)).config["images_optimised"] == 4
@@ -148,7 +170,12 @@ def test_many_in_a_row_go_back_with_halved_rates(monkeypatch, tmp_path):
     broken_at(monkeypatch, lambda call: 4 <= call < 9)
     run = reconstruct(small(), tmp_path / "run", settings)
     final = stored(run.path)
-    assert (final["images"], final["rollbacks"], final["rate_factor"], final["skipped"]) == (16, 1, 0.5, 5)
+    assert (final["images"], final["rollbacks"], final["rate_factor"], final["skipped"]) == (
+        16,
+        1,
+        0.5,
+        5,
+    )
 
 
 def test_a_run_that_stays_without_numbers_ends_as_diverged(monkeypatch, tmp_path):
@@ -158,7 +185,9 @@ def test_a_run_that_stays_without_numbers_ends_as_diverged(monkeypatch, tmp_path
     with pytest.raises(DivergedError, match=r"(?s)image \d.*5 steps in a row.*Gaussians") as caught:
         reconstruct(small(), tmp_path / "run", settings)
     assert caught.value.exit_code == 4
-    assert all(value.isfinite().all() for value in Run.open(tmp_path / "run").field.parameters().values())
+    assert all(
+        value.isfinite().all() for value in Run.open(tmp_path / "run").field.parameters().values()
+    )
 
 
 def test_a_state_survives_being_stored(tmp_path):
@@ -181,5 +210,7 @@ def test_an_old_run_goes_on_under_settings_that_it_is_too_old_to_know():
     old = copy.deepcopy(new)
     del old["settings"]["densify"]["unseen_from"], old["settings"]["schedule"]["motion_ramp"]
     assert folder.differences(old, new) == []
-    new["settings"] = plain(replace(presets.released(), densify=replace(presets.released().densify, unseen_from=300)))
+    new["settings"] = plain(
+        replace(presets.released(), densify=replace(presets.released().densify, unseen_from=300))
+    )
     assert folder.differences(old, new) == ["densify.unseen_from was None, now 300"]

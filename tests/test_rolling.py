@@ -1,4 +1,6 @@
-"""A rolling shutter: every row of an image is that of a global one taken when the row is exposed."""
+"""A rolling shutter: every row of an image is that of a global one taken when the row is
+exposed.
+"""
 
 from dataclasses import replace
 from functools import partial
@@ -36,12 +38,16 @@ def test_a_row_is_seen_as_in_the_whole_image(distortion):
     camera = replace(Camera.from_fov(*SIZE, 60.0), distortion=distortion, cy=11.3)
     rays = camera.rays(dtype=torch.float64)
     for row in (0, 7, 23):
-        torch.testing.assert_close(camera.row(row).rays(dtype=torch.float64)[0], rays[row], rtol=0, atol=1e-9)
+        torch.testing.assert_close(
+            camera.row(row).rays(dtype=torch.float64)[0], rays[row], rtol=0, atol=1e-9
+        )
 
 
 @pytest.mark.parametrize("bounces", [0, 1])
 def test_each_row_has_its_own_time(bounces):
-    """Light, amplitude, and truth of row n are those of a global shutter at that moment; no two rows share paths."""
+    """Light, amplitude, and truth of row n are those of a global shutter at that moment;
+    no two rows share paths.
+    """
     options = {"frames": 2, "size": SIZE, "engine": "mesh", "bounces": bounces, "paths": 64}
     found = record(scene(), **options)
     times, delays = found.sequence.times, row_delays(scene().sensor, SIZE[1])
@@ -58,14 +64,18 @@ def test_each_row_has_its_own_time(bounces):
                 assert (found.truth.amplitude[n, row] >= 0.999 * direct).all()
                 assert found.truth.amplitude[n, row].sum() > 1.01 * direct.sum()
             else:
-                np.testing.assert_allclose(found.truth.amplitude[n, row], direct, rtol=1e-4, atol=1e-6)
+                np.testing.assert_allclose(
+                    found.truth.amplitude[n, row], direct, rtol=1e-4, atol=1e-6
+                )
 
 
 def test_a_still_scene_looks_as_ever():
     """Nothing moves, so it does not matter when a row is taken."""
     still = replace(scene(), bodies=tuple(body for body in scene().bodies if not body.moves))
     rolling = record(still, frames=1, size=SIZE, engine="mesh")
-    whole = record(replace(still, sensor=scene(row_time=0.0).sensor), frames=1, size=SIZE, engine="mesh")
+    whole = record(
+        replace(still, sensor=scene(row_time=0.0).sensor), frames=1, size=SIZE, engine="mesh"
+    )
     np.testing.assert_allclose(rolling.sequence.quads, whole.sequence.quads, rtol=1e-4, atol=1e-6)
     assert np.abs(whole.sequence.quads).max() > 0.01
 
@@ -82,7 +92,10 @@ def test_an_upright_edge_leans():
     upright = first_hit(rolling.bodies, camera_at(0.0), 0.0)
     seen = (hits.body == moving) & (upright.body == moving)
     rows = np.flatnonzero(seen.sum(1) > 8)[4:-4]
-    edge, before = (np.array([np.flatnonzero(h.body[row] == moving)[-1] for row in rows]) for h in (hits, upright))
+    edge, before = (
+        np.array([np.flatnonzero(h.body[row] == moving)[-1] for row in rows])
+        for h in (hits, upright)
+    )
     z = upright.point[rows, before, 2]
     want = velocity / z * camera_at(0.0).fx * row_delays(rolling.sensor, wide[1])[rows]
     assert abs(want).max() > 2, "pixels"
@@ -93,11 +106,25 @@ def test_a_capture_says_so_and_reconstruction_warns(tmp_path, capsys):
     """What was set is in the file, and nobody fits rows without a word."""
     override = ["--override", "sensor.row_time_s=1e-4", "--size", "24x18", "--frames", "8"]
     assert (
-        main(["simulate", "demo", "--engine", "mesh", "--format", "capture", *override, "--out", f"{tmp_path}/seq"])
+        main(
+            [
+                "simulate",
+                "demo",
+                "--engine",
+                "mesh",
+                "--format",
+                "capture",
+                *override,
+                "--out",
+                f"{tmp_path}/seq",
+            ]
+        )
         == 0
     )
     assert Sequence.open(tmp_path / "seq").calibration.settings["row_time_s"] == 1e-4
-    assert main(["reconstruct", f"{tmp_path}/seq", "--images", "4", "--out", f"{tmp_path}/run"]) == 0
+    assert (
+        main(["reconstruct", f"{tmp_path}/seq", "--images", "4", "--out", f"{tmp_path}/run"]) == 0
+    )
     assert "a rolling shutter: the last row is 1.7 ms later" in capsys.readouterr().err
 
 

@@ -1,4 +1,6 @@
-"""Scenes out of TOML files: the same as in Python, and every mistake named with its table and key."""
+"""Scenes out of TOML files: the same as in Python, and every mistake named with its table and
+key.
+"""
 
 from pathlib import Path
 
@@ -42,8 +44,16 @@ def test_the_example_is_what_it_says():
     )
     swing = Turn(axis="z", angle=Curve(swing=25.0, swing_hz=0.9))
     assert scene.bodies == (
-        Body(shape=Level(axis=2, value=3.6), texture=Texture(low=0.3, high=0.7, cell=0.3), path=Still()),
-        Body(shape=Level(axis=1, value=1.0), texture=Texture(low=0.3, high=0.5, cell=0.3), path=Still()),
+        Body(
+            shape=Level(axis=2, value=3.6),
+            texture=Texture(low=0.3, high=0.7, cell=0.3),
+            path=Still(),
+        ),
+        Body(
+            shape=Level(axis=1, value=1.0),
+            texture=Texture(low=0.3, high=0.5, cell=0.3),
+            path=Still(),
+        ),
         Body(
             shape=Box(size=(0.2, 2.0, 0.2)),
             texture=Texture(low=0.5, high=0.5),
@@ -58,12 +68,15 @@ def test_the_example_is_what_it_says():
 
 
 def test_what_is_left_out_has_its_default(tmp_path):
-    """One body suffices; the name is the file's; colour, moving cameras and integers for lengths are understood."""
+    """One body suffices; the name is the file's; colour,
+    moving cameras and integers for lengths are understood.
+    """
     scene = read_scene(written(tmp_path, SHORT))
     assert (scene.name, scene.frames, scene.colour) == ("mine", 48, None)
     assert scene.bodies[0].path == Line(position=(0.0, 0.0, 3.0), velocity=(1.0, 0.0, -0.5))
     more = """
-    camera_path = { kind = "sweep", middle = [0, 0, 0], target = [0, 0, 3], sweep_deg = 8, period_s = 2 }
+    camera_path = { kind = "sweep", middle = [0, 0, 0], target = [0, 0, 3], sweep_deg = 8,\
+ period_s = 2 }
     colour = { width = 40, height = 30, noise = 0 }
     novel_views = [{ kind = "viewpoint", position = [0.1, 0, 0], target = [0, 0, 3] }]
     """
@@ -76,7 +89,18 @@ def test_what_is_left_out_has_its_default(tmp_path):
 def test_a_file_is_simulated_like_a_name(tmp_path, capsys):
     """From the command line and from Python, overrides included."""
     path, out = written(tmp_path, SHORT), tmp_path / "out"
-    arguments = ["simulate", str(path), "--out", str(out), "--frames", "4", "--size", "24x18", "--override", "width=80"]
+    arguments = [
+        "simulate",
+        str(path),
+        "--out",
+        str(out),
+        "--frames",
+        "4",
+        "--size",
+        "24x18",
+        "--override",
+        "width=80",
+    ]
     assert cli.main([*arguments, "--no-noise"]) == 0
     capsys.readouterr()
     other = simulate(str(path), tmp_path / "other", frames=4, size=(24, 18), noise=False)
@@ -103,15 +127,32 @@ def test_a_file_is_simulated_like_a_name(tmp_path, capsys):
         ("sensor = { noise = 1 }" + SHORT, "sensor.noise", "true or false"),
         (SHORT.replace("sphere", "sphre"), "bodies[0].shape.kind", "found 'sphre'"),
         (SHORT.replace('kind = "line", ', ""), "bodies[0].path.kind", "found None"),
-        (SHORT.replace('kind = "sphere"', 'kind = ["sphere"]'), "bodies[0].shape.kind", "found ['sphere']"),
+        (
+            SHORT.replace('kind = "sphere"', 'kind = ["sphere"]'),
+            "bodies[0].shape.kind",
+            "found ['sphere']",
+        ),
         (SHORT.replace("0.4", "-0.4"), "bodies[0].shape", "above 0"),
         (SHORT.replace("0.4", '"big"'), "bodies[0].shape.radius", "found 'big'"),
-        (SHORT.replace("[1, 0, -0.5]", "[1, 0]"), "bodies[0].path.velocity", "expected 3 values, found 2"),
-        (SHORT.replace("low = 0.2, ", ""), "bodies[0].texture.low", "needs it"),
-        (SHORT.replace('"sphere", radius = 0.4', '"level", axis = 2, value = 3'), "bodies[0]", "cannot move"),
-        (SHORT.replace('"sphere", radius = 0.4', '"assembly", parts = []'), "bodies[0].shape", "at least one part"),
         (
-            'camera_path = { kind = "viewpoint", position = [0, 0, 0], target = [0, 1, 0] }' + SHORT,
+            SHORT.replace("[1, 0, -0.5]", "[1, 0]"),
+            "bodies[0].path.velocity",
+            "expected 3 values, found 2",
+        ),
+        (SHORT.replace("low = 0.2, ", ""), "bodies[0].texture.low", "needs it"),
+        (
+            SHORT.replace('"sphere", radius = 0.4', '"level", axis = 2, value = 3'),
+            "bodies[0]",
+            "cannot move",
+        ),
+        (
+            SHORT.replace('"sphere", radius = 0.4', '"assembly", parts = []'),
+            "bodies[0].shape",
+            "at least one part",
+        ),
+        (
+            'camera_path = { kind = "viewpoint", position = [0, 0, 0], target = [0, 1, 0] }'
+            + SHORT,
             "camera",
             "straight",
         ),

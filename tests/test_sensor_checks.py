@@ -1,4 +1,6 @@
-"""The checks of the sensor notes: which test makes each of them, and those that concern the whole of the simulator."""
+"""The checks of the sensor notes: which test makes each of them,
+and those that concern the whole of the simulator.
+"""
 
 import ast
 import importlib.util
@@ -28,7 +30,9 @@ LATER = {"T25", "T26"}  # features that are not simulated
 
 def rows():
     """Cells of the table by number of the check."""
-    found = [[cell.strip() for cell in line.strip("| \n").split(" | ")] for line in PAGE.splitlines()]
+    found = [
+        [cell.strip() for cell in line.strip("| \n").split(" | ")] for line in PAGE.splitlines()
+    ]
     table = [cells for cells in found if re.fullmatch(r"T\d+", cells[0])]
     assert len({cells[0] for cells in table}) == len(table), "a check has two rows"
     return {cells[0]: cells for cells in table}
@@ -36,8 +40,14 @@ def rows():
 
 def docstrings_of(path):
     """Docstrings of the tests of a file by name."""
-    functions = [node for node in ast.parse(path.read_text()).body if isinstance(node, ast.FunctionDef)]
-    return {node.name: ast.get_docstring(node) or "" for node in functions if node.name.startswith("test_")}
+    functions = [
+        node for node in ast.parse(path.read_text()).body if isinstance(node, ast.FunctionDef)
+    ]
+    return {
+        node.name: ast.get_docstring(node) or ""
+        for node in functions
+        if node.name.startswith("test_")
+    }
 
 
 def named(text):
@@ -46,7 +56,9 @@ def named(text):
 
 
 def test_every_check_names_its_tests_and_they_exist():
-    """All 34 have a row; what it names is there and says the number, with a tolerance and what was measured."""
+    """All 34 have a row; what it names is there and says the number,
+    with a tolerance and what was measured.
+    """
     table = rows()
     assert set(table) == NUMBERS
     for number, (_, what, where, tolerance, measured) in table.items():
@@ -60,7 +72,9 @@ def test_every_check_names_its_tests_and_they_exist():
         for file, name in references:
             docstrings = docstrings_of(REPOSITORY / "tests" / f"{file}.py")
             assert name in docstrings, f"{number}: {file}.py has no {name}"
-            assert number in named(docstrings[name]), f"{file}.py::{name} does not say that it is {number}"
+            assert number in named(docstrings[name]), (
+                f"{file}.py::{name} does not say that it is {number}"
+            )
 
 
 def test_no_test_of_a_check_is_missing_in_the_table():
@@ -69,22 +83,33 @@ def test_no_test_of_a_check_is_missing_in_the_table():
     for path in sorted((REPOSITORY / "tests").glob("test_*.py")):
         for name, docstring in docstrings_of(path).items():
             for number in named(docstring.splitlines()[0] if docstring else ""):
-                assert f"`{path.name}::{name}`" in table[number][2], f"{number} does not name {path.name}::{name}"
+                assert f"`{path.name}::{name}`" in table[number][2], (
+                    f"{number} does not name {path.name}::{name}"
+                )
                 said += 1
     assert said > 40
 
 
 def test_one_seed_is_one_result_and_another_changes_noise_only(tmp_path):
-    """T33: twice the same bytes; with another seed, truth, mean light and everything but the noise are the same."""
+    """T33: twice the same bytes; with another seed, truth,
+    mean light and everything but the noise are the same.
+    """
     for level in (level.name for level in LEVELS if level.name in ("L0", "L1", "L2", "L4")):
         folders = [
             simulate(
-                "demo", tmp_path / f"{level}-{k}", level=level, frames=4, size=(16, 12), format="capture", seed=seed
+                "demo",
+                tmp_path / f"{level}-{k}",
+                level=level,
+                frames=4,
+                size=(16, 12),
+                format="capture",
+                seed=seed,
             )
             for k, seed in enumerate((5, 5, 6))
         ]
         first, again, other = (
-            {str(f.relative_to(folder)): f.read_bytes() for f in folder.rglob("*") if f.is_file()} for folder in folders
+            {str(f.relative_to(folder)): f.read_bytes() for f in folder.rglob("*") if f.is_file()}
+            for folder in folders
         )
         assert first == again, level
         changed = {name for name in first if first[name] != other[name]}
@@ -104,21 +129,35 @@ def test_one_seed_is_one_result_and_another_changes_noise_only(tmp_path):
 def test_light_is_at_least_as_long_as_its_phasors():
     """T6: the amplitude bounds every harmonic; half the reflectance is half the direct light."""
     scene = SCENES["demo"]
-    dim = [replace(body.texture, low=body.texture.low / 2, high=body.texture.high / 2) for body in scene.bodies]
-    half = replace(scene, bodies=tuple(replace(b, texture=t) for b, t in zip(scene.bodies, dim, strict=True)))
+    dim = [
+        replace(body.texture, low=body.texture.low / 2, high=body.texture.high / 2)
+        for body in scene.bodies
+    ]
+    half = replace(
+        scene, bodies=tuple(replace(b, texture=t) for b, t in zip(scene.bodies, dim, strict=True))
+    )
     options = {"harmonics": (1, 2, 5), "bounces": Bounces(count=2, paths=8)}
-    light, less = (MeshEngine(s, lambda _: scene.camera((32, 24)), **options).light((0.1,), 2e7) for s in (scene, half))
+    light, less = (
+        MeshEngine(s, lambda _: scene.camera((32, 24)), **options).light((0.1,), 2e7)
+        for s in (scene, half)
+    )
     for h in range(3):
         assert (np.abs(light.light[h]) <= light.amplitude * (1 + 1e-6)).all()
     np.testing.assert_allclose(2 * less.direct_amplitude, light.direct_amplitude, rtol=1e-6)
-    np.testing.assert_allclose(2 * less.direct, light.direct, atol=1e-6 * light.direct_amplitude.max())
+    np.testing.assert_allclose(
+        2 * less.direct, light.direct, atol=1e-6 * light.direct_amplitude.max()
+    )
     once, twice = (x.amplitude - x.direct_amplitude for x in (less, light))
     assert (4 * once <= twice * (1 + 1e-5)).all(), "light of two surfaces has two reflectances"
 
 
 def test_the_stored_canary_sings():
-    """T34: fits to rays are at least twice as wrong as a fit to its own rendering, in every row of the stored table."""
-    stored = json.loads((REPOSITORY / "benchmarks" / "results" / "cpu_canary.json").read_text())["rows"]
+    """T34: fits to rays are at least twice as wrong as a fit to its own rendering,
+    in every row of the stored table.
+    """
+    stored = json.loads((REPOSITORY / "benchmarks" / "results" / "cpu_canary.json").read_text())[
+        "rows"
+    ]
     own = stored.pop("own model")["d_mse_x100"]
     assert {"mesh, one ray", "mesh, 4x4 rays", "gaussian"} <= set(stored)
     assert own > 0
@@ -135,9 +174,13 @@ def benchmark(name):
 
 @pytest.mark.slow
 def test_the_canary_sings(tmp_path):
-    """T34: live and small: a fit to rays is more than twice as wrong as an equal fit to its own rendering."""
+    """T34: live and small: a fit to rays is more than twice as wrong as an equal fit to its own
+    rendering.
+    """
     canary, options = benchmark("canary"), {"images": 900, "device": "cpu"}
-    sequence = simulate("demo", tmp_path / "rays", size=(64, 48), noise=False, **canary.ROWS[canary.SOURCE])
+    sequence = simulate(
+        "demo", tmp_path / "rays", size=(64, 48), noise=False, **canary.ROWS[canary.SOURCE]
+    )
     run = reconstruct(sequence, tmp_path / "run", **options)
     again = reconstruct(canary.own_model(run, tmp_path / "own"), tmp_path / "again", **options)
     assert canary.scores(run)["d_mse_x100"] > 2 * canary.scores(again)["d_mse_x100"]

@@ -1,4 +1,6 @@
-"""One sensor behind both engines: harmonics, patterns, several frequencies and any shifts on a wall, in closed form."""
+"""One sensor behind both engines: harmonics, patterns,
+several frequencies and any shifts on a wall, in closed form.
+"""
 
 import math
 from dataclasses import replace
@@ -23,19 +25,26 @@ from gftorf_warp.sim.world import Body, Texture
 
 ENGINES = ["gaussian", "mesh"]
 SIZE = 18, 24
-WITHIN = {"gaussian": (1.2e-2, 2e-3), "mesh": (8e-5, 2e-5)}  # of the amplitude [1], of a distance [m]
+# of the amplitude [1], of a distance [m]
+WITHIN = {"gaussian": (1.2e-2, 2e-3), "mesh": (8e-5, 2e-5)}
 
 
 def wall(sensor, z=5.2, **more):
     """A grey wall in front of a narrow camera, in which splats are as exact as they get."""
-    body = Body(shape=Level(axis=2, value=z), texture=Texture(low=0.5, high=0.5), path=Still(position=(0.0, 0.0, 0.0)))
+    body = Body(
+        shape=Level(axis=2, value=z),
+        texture=Texture(low=0.5, high=0.5),
+        path=Still(position=(0.0, 0.0, 0.0)),
+    )
     texts = {"name": "wall", "description": "a wall", "motion": "none"}
     view = {"width": SIZE[1], "height": SIZE[0], "horizontal_fov_deg": 10.0, "subsamples": 1}
     return Scene(**texts, bodies=(body,), frames=len(sensor.cycle), sensor=sensor, **view, **more)
 
 
 def quads_and_light(sensor, engine):
-    """Recorded quads without noise, and amplitude and phase [rad] at the first frequency, from shapes alone."""
+    """Recorded quads without noise, and amplitude and phase [rad] at the first frequency,
+    from shapes alone.
+    """
     scene = wall(sensor)
     got = record(scene, engine=engine, noise=False)
     cosine = scene.camera().directions()[..., 2].numpy()
@@ -46,7 +55,9 @@ def quads_and_light(sensor, engine):
 
 @pytest.mark.parametrize("engine", ENGINES)
 def test_harmonics_and_patterns_are_the_closed_form(engine):
-    """Sum_h r_h cos h (psi + offset + pattern - shift) of an opaque wall, at every raw frame and pixel."""
+    """Sum_h r_h cos h (psi + offset + pattern - shift) of an opaque wall,
+    at every raw frame and pixel.
+    """
     ratios = {1: 1.0, 3: 0.2, 4: -0.05}
     sensor = Sensor(
         f_mod_hz=30e6,
@@ -68,7 +79,9 @@ def test_harmonics_and_patterns_are_the_closed_form(engine):
 
 
 def test_every_effect_alone_changes_what_is_recorded():
-    """Harmonics, the pattern of the phase and that of the gain, by both engines; what is zero changes nothing."""
+    """Harmonics, the pattern of the phase and that of the gain, by both engines;
+    what is zero changes nothing.
+    """
     for engine in ENGINES:
         plain = record(wall(Sensor()), engine=engine).sequence.quads
         for effect in (
@@ -78,13 +91,17 @@ def test_every_effect_alone_changes_what_is_recorded():
         ):
             other = record(wall(Sensor(**effect)), engine=engine).sequence.quads
             assert np.abs(other - plain).max() > 0.01 * np.abs(plain).max(), (engine, effect)
-        none = record(wall(Sensor(harmonic_contrast=(0.0, 0.0), pattern=Pattern(seed=3))), engine=engine)
+        none = record(
+            wall(Sensor(harmonic_contrast=(0.0, 0.0), pattern=Pattern(seed=3))), engine=engine
+        )
         np.testing.assert_array_equal(none.sequence.quads, plain)
 
 
 @pytest.mark.parametrize("engine", ENGINES)
 def test_two_frequencies_see_beyond_the_range_of_each(engine, tmp_path):
-    """A wall at 5.2 m by 60 and 40 MHz, which alone reach 2.5 and 3.7 m; each raw frame keeps its own frequency."""
+    """A wall at 5.2 m by 60 and 40 MHz, which alone reach 2.5 and 3.7 m;
+    each raw frame keeps its own frequency.
+    """
     sensor = Sensor(f_mod_hz=60e6, further_hz=(40e6,), shifts=(0.0, 2.1, 4.2))
     sequence, _, distance = quads_and_light(sensor, engine)
     assert sequence.frequencies_hz.tolist() == [60e6] * 3 + [40e6] * 3
@@ -95,7 +112,9 @@ def test_two_frequencies_see_beyond_the_range_of_each(engine, tmp_path):
     np.testing.assert_allclose(closed_form_distance(sequence, 0), got, atol=1e-6)
     with pytest.raises(UsageError, match="frequencies_hz"):
         write(
-            "ftorf", tmp_path / "out", replace(sequence, shifts=np.resize([0, math.pi, math.pi / 2, 1.5 * math.pi], 6))
+            "ftorf",
+            tmp_path / "out",
+            replace(sequence, shifts=np.resize([0, math.pi, math.pi / 2, 1.5 * math.pi], 6)),
         )
     ideal = ideal_recording(wall(sensor))[0]
     assert (ideal.cycle, ideal.frequencies) == (6, (60e6, 40e6))
@@ -105,14 +124,17 @@ def test_two_frequencies_see_beyond_the_range_of_each(engine, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "shifts", [(0.0, 1.0, 2.5), (3.0, 0.2, 5.5, 1.7, 4.0), tuple(math.tau * j / 8 for j in range(8))]
+    "shifts",
+    [(0.0, 1.0, 2.5), (3.0, 0.2, 5.5, 1.7, 4.0), tuple(math.tau * j / 8 for j in range(8))],
 )
 def test_any_shifts_give_the_distance(shifts):
     """Three, five and eight of them, evenly spaced or not."""
     sensor = Sensor(f_mod_hz=20e6, shifts=shifts, dc_offset=0.3)
     sequence, _, distance = quads_and_light(sensor, "mesh")
     assert sequence.shifts.tolist() == list(shifts)
-    np.testing.assert_allclose(cycle_distance(torch.from_numpy(sequence.quads).double(), sensor), distance, atol=1e-4)
+    np.testing.assert_allclose(
+        cycle_distance(torch.from_numpy(sequence.quads).double(), sensor), distance, atol=1e-4
+    )
 
 
 def test_a_cycle_of_any_length_shares_one_time_in_sync():
@@ -124,9 +146,14 @@ def test_a_cycle_of_any_length_shares_one_time_in_sync():
 
 
 def test_frames_of_a_shorter_recording_are_those_of_a_longer():
-    """With pattern, harmonics, noise and two frequencies: everything belongs to the raw frame or to the sensor."""
+    """With pattern, harmonics, noise and two frequencies:
+    everything belongs to the raw frame or to the sensor.
+    """
     sensor = Sensor(
-        noise=True, further_hz=(30e6,), harmonic_contrast=(0.0, 0.1), pattern=Pattern(phase=1.0, gain=0.01, dark=0.2)
+        noise=True,
+        further_hz=(30e6,),
+        harmonic_contrast=(0.0, 0.1),
+        pattern=Pattern(phase=1.0, gain=0.01, dark=0.2),
     )
     long, short = (record(wall(sensor), frames=n, seed=3, engine="mesh").sequence for n in (10, 6))
     np.testing.assert_array_equal(long.quads[:6], short.quads)

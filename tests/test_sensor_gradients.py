@@ -1,4 +1,6 @@
-"""Derivatives through the sensor: of decoding, and of a rendered distance by what the sensor is set to."""
+"""Derivatives through the sensor: of decoding, and of a rendered distance by what the sensor is
+set to.
+"""
 
 import math
 from dataclasses import replace
@@ -21,7 +23,9 @@ TURN = 2 * math.pi
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-6), (torch.float32, 1e-3)])
-@pytest.mark.parametrize("shifts", [Sensor().shifts, (0.1, 0.1 + TURN / 3, 0.1 + 2 * TURN / 3), (0.1, 1.0, 2.5, 4, 5)])
+@pytest.mark.parametrize(
+    "shifts", [Sensor().shifts, (0.1, 0.1 + TURN / 3, 0.1 + 2 * TURN / 3), (0.1, 1.0, 2.5, 4, 5)]
+)
 def test_phase_by_each_quad(shifts, dtype, tolerance):
     """Sensor notes, T29: sin(shift - psi) / |z| of even shifts; of any, those of least squares."""
     theta = torch.tensor(shifts, dtype=dtype)
@@ -38,11 +42,15 @@ def test_phase_by_each_quad(shifts, dtype, tolerance):
             0.0: torch.ones_like(theta),
         }
         for want, direction in along.items():
-            assert torch.dot(got, direction).item() == pytest.approx(want, rel=tolerance, abs=tolerance)
+            assert torch.dot(got, direction).item() == pytest.approx(
+                want, rel=tolerance, abs=tolerance
+            )
 
 
 def three_surfaces(dtype, device="cpu"):
-    """Wide Gaussians on the axis whose light has the amplitudes above: each passes those before it twice."""
+    """Wide Gaussians on the axis whose light has the amplitudes above:
+    each passes those before it twice.
+    """
     d = torch.tensor(DISTANCES, dtype=torch.float64)
     through = OPACITY * (1 - OPACITY) ** (2.0 * torch.arange(3))
     reflectivity = 0.05 * torch.tensor(AMPLITUDES) * d**2 / through
@@ -65,12 +73,17 @@ def decoded(rasterize, field, sensor):
 def tensors(dtype, device="cpu"):
     """A sensor all of whose differentiable settings are tensors, and these."""
     values = {"f_mod_hz": 20e6, "phase_offset": 0.3, "dc_offset": 0.4, "source_intensity": 1.5}
-    leaves = {name: torch.tensor(v, dtype=dtype, device=device, requires_grad=True) for name, v in values.items()}
+    leaves = {
+        name: torch.tensor(v, dtype=dtype, device=device, requires_grad=True)
+        for name, v in values.items()
+    }
     return Sensor(**leaves), leaves
 
 
 def test_distance_by_frequency_exactly():
-    """Sensor notes, T29: -d/f + Re(sum a L e^{i psi} conj S) / (f |S|^2) of three paths; the oracle, float64, 1e-6."""
+    """Sensor notes, T29: -d/f + Re(sum a L e^{i psi} conj S) / (f |S|^2) of three paths;
+    the oracle, float64, 1e-6.
+    """
     sensor, leaves = tensors(torch.float64)
     distance, _ = decoded(reference.rasterize, three_surfaces(torch.float64), sensor)
     (got,) = torch.autograd.grad(distance, leaves["f_mod_hz"])
@@ -88,7 +101,9 @@ def test_distance_by_frequency_in_float32(device):
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_every_differentiable_setting_has_its_closed_form(device):
-    """Of a quad by phase offset, DC offset, source intensity and frequency: sums over the three paths, 1e-3."""
+    """Of a quad by phase offset, DC offset, source intensity and frequency:
+    sums over the three paths, 1e-3.
+    """
     sensor, leaves = tensors(torch.float32, device)
     shots = [replace(sensor, shifts=(shift,)) for shift in (0.0, 1.0, 4.0)]
     for shot in shots:
@@ -96,7 +111,8 @@ def test_every_differentiable_setting_has_its_closed_form(device):
         got = dict(zip(leaves, torch.autograd.grad(quad, [*leaves.values()]), strict=True))
         slope = 4 * math.pi / SPEED_OF_LIGHT
         waves = [
-            (0.05 * a, slope * 20e6 * d + 0.3 - shot.shifts[0], d) for a, d in zip(AMPLITUDES, DISTANCES, strict=True)
+            (0.05 * a, slope * 20e6 * d + 0.3 - shot.shifts[0], d)
+            for a, d in zip(AMPLITUDES, DISTANCES, strict=True)
         ]
         want = {
             "f_mod_hz": sum(-1.5 * a * slope * d * math.sin(angle) for a, angle, d in waves),
@@ -109,10 +125,14 @@ def test_every_differentiable_setting_has_its_closed_form(device):
 
 
 def test_a_shot_of_a_cycle_keeps_the_gradient():
-    """The sensor of one raw frame shares the leaves of the whole: what is recorded asynchronously can be calibrated."""
+    """The sensor of one raw frame shares the leaves of the whole:
+    what is recorded asynchronously can be calibrated.
+    """
     sensor, leaves = tensors(torch.float64)
     field = three_surfaces(torch.float64)
     whole = reference.rasterize(field, CAMERA, sensor).quads[2, 10, 12]
     alone = reference.rasterize(field, CAMERA, sensor.at_frame(6)).quads[0, 10, 12]
-    for one, other in zip(*(torch.autograd.grad(quad, [*leaves.values()]) for quad in (whole, alone)), strict=True):
+    for one, other in zip(
+        *(torch.autograd.grad(quad, [*leaves.values()]) for quad in (whole, alone)), strict=True
+    ):
         torch.testing.assert_close(one, other)

@@ -18,18 +18,29 @@ from gftorf_warp.sim.scenes import SCENES
 from gftorf_warp.sim.sensors import SENSORS, effect_rows
 from gftorf_warp.sim.simulate import simulate
 
-BALL = '[[bodies]]\nshape = { kind = "sphere", radius = 0.4 }\ntexture = { low = 0.2, high = 0.8, cell = 0.1 }\n'
+BALL = (
+    '[[bodies]]\nshape = { kind = "sphere", radius = 0.4 }\ntexture = { low = 0.2, high = '
+    "0.8, cell = 0.1 }\n"
+)
 BALL += 'path = { kind = "still", position = [0, 0, 3] }\n'
 
 
 def test_names_are_the_five_of_the_notes():
     """With the values that tell them apart; every one of them could exist."""
     assert set(SENSORS) == {"ftorf_synthetic", "ftorf_real", "torf_real", "opt8241_cdk", "mlx75027"}
-    degrees = {name: [round(math.degrees(shift)) for shift in sensor.shifts] for name, sensor in SENSORS.items()}
+    degrees = {
+        name: [round(math.degrees(shift)) for shift in sensor.shifts]
+        for name, sensor in SENSORS.items()
+    }
     assert degrees["ftorf_synthetic"] == [0, 180, 90, 270]
     assert degrees["ftorf_real"] == [180, 90, 0, 270]
     synthetic, real = SENSORS["ftorf_synthetic"], SENSORS["ftorf_real"]
-    assert (synthetic.unipolar, synthetic.dc_offset, synthetic.noise, synthetic.exposure_s) == (True, 1.0, False, 0.0)
+    assert (synthetic.unipolar, synthetic.dc_offset, synthetic.noise, synthetic.exposure_s) == (
+        True,
+        1.0,
+        False,
+        0.0,
+    )
     assert (real.unipolar, real.dc_offset, real.noise) == (False, 0.0, True)
     assert synthetic.unambiguous_range == pytest.approx(7.5)
     assert SENSORS["torf_real"].unambiguous_range == pytest.approx(5.0)
@@ -49,7 +60,9 @@ def test_an_override_takes_a_name_and_then_single_settings(tmp_path):
         overridden(SCENES["demo"], ["sensor=5"])
     with pytest.raises(UsageError, match="single setting"):
         overridden(SCENES["demo"], ["lens=opt8241_cdk"])
-    path = simulate("demo", tmp_path / "out", overrides=["sensor=mlx75027"], frames=4, size=(24, 18))
+    path = simulate(
+        "demo", tmp_path / "out", overrides=["sensor=mlx75027"], frames=4, size=(24, 18)
+    )
     card = (path / "README.md").read_text()
     assert "--override sensor=mlx75027 --frames 4" in card
     assert "| fixed pattern | phase 0 times" in card
@@ -62,7 +75,9 @@ def test_a_scene_file_takes_a_name_too(tmp_path):
     path = tmp_path / "mine.toml"
     path.write_text('sensor = "mlx75027"\n' + BALL)
     assert read_scene(path).sensor == SENSORS["mlx75027"]
-    path.write_text('sensor = { preset = "opt8241_cdk", exposure_s = 1e-3, pattern = { phase = 0.5 } }\n' + BALL)
+    path.write_text(
+        'sensor = { preset = "opt8241_cdk", exposure_s = 1e-3, pattern = { phase = 0.5 } }\n' + BALL
+    )
     want = replace(SENSORS["opt8241_cdk"], exposure_s=1e-3, pattern=Pattern(phase=0.5))
     assert read_scene(path).sensor == want
     path.write_text("lens = { cosine_power = 4, distortion = { k1 = -0.2 } }\n" + BALL)
@@ -118,9 +133,14 @@ IMPOSSIBLE = [  # setting, what a person types, a word of the message
 
 @pytest.mark.parametrize(("name", "value", "says"), IMPOSSIBLE, ids=lambda text: text[:24])
 def test_impossible_sensors_end_in_one_message(name, value, says, tmp_path, capsys):
-    """From the command line: exit code 2, what is wrong and where, no traceback, nothing written."""
+    """From the command line: exit code 2, what is wrong and where, no traceback,
+    nothing written.
+    """
     out = tmp_path / "out"
-    assert cli.main(["simulate", "demo", "--out", str(out), "--override", f"sensor.{name}={value}"]) == 2
+    assert (
+        cli.main(["simulate", "demo", "--out", str(out), "--override", f"sensor.{name}={value}"])
+        == 2
+    )
     text = capsys.readouterr().err
     assert says in text
     assert f"sensor.{name}" in text or name in ("further_hz", "shifts", "dc_offset")
@@ -190,6 +210,8 @@ def test_what_is_off_leaves_no_trace():
     }
     for name, value in on.items():
         sensor = Sensor(**{name: value})
-        assert repr(sensor) == repr(Sensor())[:-1] + f", {name}={value!r})" or f" {name}={value!r}," in repr(sensor)
+        assert repr(sensor) == repr(Sensor())[
+            :-1
+        ] + f", {name}={value!r})" or f" {name}={value!r}," in repr(sensor)
         assert len(effect_rows(sensor)) == 1
     assert repr(Sensor()).startswith("Sensor(f_mod_hz=")

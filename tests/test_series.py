@@ -1,4 +1,6 @@
-"""Many images of a replay: complete, in order, in memory that is reused only when nothing refers to it."""
+"""Many images of a replay: complete, in order, in memory that is reused only when nothing refers
+to it.
+"""
 
 import gc
 
@@ -22,7 +24,10 @@ VIEWS = [
 def one_by_one(run, names=IMAGES):  # noqa: F811
     """What a loop over checked calls gives."""
     render = run.renderer(names)
-    return [{name: getattr(render(*view), name).cpu().numpy().copy() for name in names} for view in VIEWS]
+    return [
+        {name: getattr(render(*view), name).cpu().numpy().copy() for name in names}
+        for view in VIEWS
+    ]
 
 
 def assert_same(got, want):
@@ -48,7 +53,9 @@ def ahead(request, monkeypatch):
 
 
 def test_arrays_are_those_of_single_calls(run, ahead):  # noqa: F811, ARG001
-    """Of several cameras and sizes; all of them are held, so memory that was reserved does not suffice."""
+    """Of several cameras and sizes; all of them are held,
+    so memory that was reserved does not suffice.
+    """
     want = one_by_one(run)
     times, cameras = zip(*VIEWS, strict=True)
     got = list(run.images(times, cameras))
@@ -62,14 +69,18 @@ def test_renderings_on_the_device_are_those_of_single_calls(run, ahead):  # noqa
     rows = []
     for rendering in Series(run.renderer(("quads", "distance")), VIEWS).on_device():
         assert rendering.phasor.numel() == 0
-        rows.append({name: getattr(rendering, name).cpu().numpy().copy() for name in ("quads", "distance")})
+        rows.append(
+            {name: getattr(rendering, name).cpu().numpy().copy() for name in ("quads", "distance")}
+        )
     assert_same(rows, want)
 
 
 @pytest.mark.parametrize("run", ["cpu"], indirect=True)
 @pytest.mark.parametrize("where", ["host", "device"])
 def test_images_that_overflowed_are_rendered_again(run, ahead, where, monkeypatch):  # noqa: F811
-    """A capacity of a tenth of the pairs: incomplete images are rendered again, and none of them is returned."""
+    """A capacity of a tenth of the pairs: incomplete images are rendered again,
+    and none of them is returned.
+    """
     want = one_by_one(run, PLAIN)
     render, right = run.renderer(PLAIN), replaying.Replay.draw
     incomplete = []
@@ -99,12 +110,16 @@ def test_images_that_overflowed_are_rendered_again(run, ahead, where, monkeypatc
     else:
         got = [{n: getattr(r, n).numpy().copy() for n in PLAIN} for r in one.on_device()]
     assert_same(got, want)
-    assert 1 + ahead <= len(incomplete) < len(VIEWS), "those in flight as well; then the capacity suffices"
+    assert 1 + ahead <= len(incomplete) < len(VIEWS), (
+        "those in flight as well; then the capacity suffices"
+    )
     assert one.repeated == len(incomplete) or not ahead
 
 
 def test_memory_is_reused_when_nothing_refers_to_it():
-    """A part of an array keeps all of it; what is held beyond the reserve is a copy; nothing is ever overwritten."""
+    """A part of an array keeps all of it; what is held beyond the reserve is a copy;
+    nothing is ever overwritten.
+    """
     ring = ReadbackRing(torch.zeros(8), ahead=1, kept=2)
     held = []
     for number in range(6):
@@ -133,14 +148,20 @@ def test_memory_starts_where_pages_do(length):
     ring = ReadbackRing(torch.zeros(length), ahead=1, kept=3)
     held = [ring.keep(ring.copy(torch.full((length,), float(number)))) for number in range(3)]
     assert [one.ctypes.data % 4096 for one in held] == [0, 0, 0]
-    assert [(one.shape, float(one.min()), float(one.max())) for one in held] == [((length,), k, k) for k in range(3)]
+    assert [(one.shape, float(one.min()), float(one.max())) for one in held] == [
+        ((length,), k, k) for k in range(3)
+    ]
 
 
 @pytest.mark.parametrize("kept", [2, 20])
 def test_as_many_are_held_as_was_asked_for(run, kept, monkeypatch):  # noqa: F811
     """Memory of one camera's images, all of which are held."""
     made, right = [], ReadbackRing.__init__
-    monkeypatch.setattr(ReadbackRing, "__init__", lambda self, *a, **k: made.append(k["kept"]) or right(self, *a, **k))
+    monkeypatch.setattr(
+        ReadbackRing,
+        "__init__",
+        lambda self, *a, **k: made.append(k["kept"]) or right(self, *a, **k),
+    )
     one = Series(run.renderer(PLAIN), [(0.001 * k, CAMERA) for k in range(8)])
     got = list(one.on_host(kept))
     assert made == [kept]

@@ -1,4 +1,6 @@
-"""Rounds of a warp: what CUDA executes, by 32 threads of the CPU; and on CUDA, that rounds change nothing."""
+"""Rounds of a warp: what CUDA executes, by 32 threads of the CPU; and on CUDA,
+that rounds change nothing.
+"""
 
 import shutil
 import subprocess
@@ -9,7 +11,8 @@ from gftorf_warp.kernels.rasterise import shared_batches, simd, tile_bitmask
 
 COMPILER = shutil.which("c++") or shutil.which("g++")
 
-# a warp of CPU threads: a barrier for every synchronisation, so that shared memory is only as ordered as on CUDA
+# a warp of CPU threads: a barrier for every synchronisation, so that shared memory is only as
+# ordered as on CUDA
 WARP = """
 #include <algorithm>
 #include <atomic>
@@ -72,14 +75,17 @@ static double walk(int begin, int end, int step) {
     std::vector<float> values(300 * 32 * 4), derivatives(32 * 10);
     for (auto& q : splats) for (float& x : q.c) x = 10 * normal(random);
     for (float& x : splats[0].c) x = NAN;  // no list has it, so it may be anything
-    for (int k = 0; k < 300; ++k) ids[k] = k >= begin && k < end ? 1 + random() % 199 : 1 << 28;  // another tile's
+    // another tile's
+    for (int k = 0; k < 300; ++k) ids[k] = k >= begin && k < end ? 1 + random() % 199 : 1 << 28;
     for (float& x : values) x = normal(random);
     for (float& x : derivatives) x = normal(random);
-    for (size_t n = 0; n < values.size(); n += 4) {  // v, w, w2, g_d: a third of the pixels is missed
+    // v, w, w2, g_d: a third of the pixels is missed
+    for (size_t n = 0; n < values.size(); n += 4) {
         const float hit = random() % 3 ? 1.0f : 0.0f;
         values[n] *= hit; values[n + 1] = std::fabs(values[n + 1]) * hit; values[n + 2] *= hit;
     }
-    const wp::array_t<Splat> S{splats.data()}, G{grads.data()}, M{more.data()}; const wp::array_t<int> I{ids.data()};
+    const wp::array_t<Splat> S{splats.data()}, G{grads.data()}, M{more.data()};
+    const wp::array_t<int> I{ids.data()};
     std::atomic<int> wrong(0);
     const int start = step > 0 ? begin : end - 1, count = end - begin;
     in_a_warp([&](int lane) {
@@ -87,7 +93,8 @@ static double walk(int begin, int end, int step) {
         const float* d = &derivatives[10 * lane];
         int coming = 0;
         if (count > 0) {
-            if (step < 0) store_derivatives(memory, V{d[0]}, V{d[1]}, V{d[2]}, V{d[3]}, V{d[4]}, V{d[5]}, V{d[6]},
+            if (step < 0) store_derivatives(memory, V{d[0]}, V{d[1]}, V{d[2]}, V{d[3]}, V{d[4]},
+                V{d[5]}, V{d[6]},
                              V{d[7]}, V{d[8]}, V{d[9]});
             fetch_records(memory, S, entry(I, start, step, 0, count), 0);
             if (step > 0) fetch_more(memory, S, entry(I, start, step, 0, count), 0);
@@ -114,7 +121,8 @@ static double walk(int begin, int end, int step) {
                 store_values(memory, first, n - first, V{u[0]}, V{u[1]}, V{u[2]}, V{u[3]});
             }
             if (step < 0)
-                accumulate_round(memory, G, M, I, start, at, stop - at, V{40.5f + lane % 8}, V{20.5f + lane / 8});
+                accumulate_round(memory, G, M, I, start, at, stop - at, V{40.5f + lane % 8}, V{20.5f
+                    + lane / 8});
         }
         wait_for_records();
     });
@@ -122,13 +130,17 @@ static double walk(int begin, int end, int step) {
     std::vector<double> want(200 * 32), size(200 * 32);
     for (int k = begin; step < 0 && k < end; ++k) for (int p = 0; p < 32; ++p) {
         const float *u = &values[(k * 32 + p) * 4], *d = &derivatives[10 * p];
-        const double dx = splats[ids[k]][0] - (40.5 + p % 8), dy = splats[ids[k]][1] - (20.5 + p / 8);
-        const double v = GEOMETRY ? u[0] : 0, w = CHANNELS ? u[1] : 0, w2 = LIGHT ? u[2] : 0, wd = LIGHT ? u[1] : 0;
-        const double all[16] = {v * dx, v * dy, v * dx * dx, v * dx * dy, v * dy * dy, v, double(GEOMETRY && u[1] > 0),
+        const double dx = splats[ids[k]][0] - (40.5 + p % 8), dy = splats[ids[k]][1]
+            - (20.5 + p / 8);
+        const double v = GEOMETRY ? u[0] : 0, w = CHANNELS ? u[1] : 0, w2 = LIGHT ? u[2] : 0, wd =
+            LIGHT ? u[1] : 0;
+        const double all[16] = {v * dx, v * dy, v * dx * dx, v * dx * dy, v * dy * dy, v,
+            double(GEOMETRY && u[1] > 0),
             GEOMETRY ? u[1] : 0, w * d[0], w * d[1], w * d[2], w2 * d[3], w2 * d[4], w2 * d[5],
             wd * (SPREADS ? u[3] : d[6]), 0};
         for (int j = 0; j < 32; ++j) {  // a record, and that of further channels
-            const double one = j < 16 ? all[j] : MORE && j >= 24 && j < 27 ? double(u[1]) * d[j - 17] : 0;
+            const double one = j < 16 ? all[j] : MORE && j >= 24 && j < 27 ? double(u[1])
+                * d[j - 17] : 0;
             want[ids[k] * 32 + j] += one; size[ids[k] * 32 + j] += std::fabs(one);
         }
     }
@@ -149,7 +161,8 @@ LANES = """
 int main() {
     std::atomic<int> wrong(0);
     for (int turn = 0; turn < 20; ++turn) in_a_warp([&](int lane) {
-        auto width = [=](int n) { return n < turn ? (n * 7 + turn * 5) % 11 : 0; };  // rows behind the last are empty
+        // rows behind the last are empty
+        auto width = [=](int n) { return n < turn ? (n * 7 + turn * 5) % 11 : 0; };
         int before = 0, total = 0;
         for (int n = 0; n < 32; ++n) { before += n < lane ? width(n) : 0; total += width(n); }
         const int sums = sum_of_lanes(width(lane));
@@ -163,7 +176,8 @@ int main() {
         }
         const int count = 33 * turn;
         for (int wanted : {0, count / 3, count - 1, count}) {
-            int low = 0, high = count;  // the first place not before ``wanted``, as in `tile_starts`
+            // the first place not before ``wanted``, as in `tile_starts`
+            int low = 0, high = count;
             while (low < high) {
                 const int step = (high - low + 33) / 33, place = low + (lane + 1) * step - 1;
                 const int steps = lanes_with(place < high && place < wanted);
@@ -177,10 +191,12 @@ int main() {
 }
 """
 
-# a tile's words to its list, as in `list_bits`: of no bits, of few, of all, with and without room for them
+# a tile's words to its list, as in `list_bits`: of no bits, of few, of all, with and without room
+# for them
 LISTS = f"""
 static int list(int words, int share, int capacity) {{
-    std::mt19937 random(words + share); std::vector<unsigned> matrix(words * {tile_bitmask.GROUP}, ~0u);
+    std::mt19937 random(words + share); std::vector<unsigned> matrix(words * {tile_bitmask.GROUP},
+        ~0u);
     std::vector<int> ranks(32 * words), ids(32 * words + 1, -1), want(32 * words + 1, -1);
     for (int n = 0; n < 32 * words; ++n) ranks[n] = random();
     int total = 0;
@@ -191,14 +207,16 @@ static int list(int words, int share, int capacity) {{
             if (total++ < capacity) want[total - 1] = ranks[32 * w + b];
         }}
     }}
-    const wp::array_t<unsigned> M{{matrix.data()}}; const wp::array_t<int> R{{ranks.data()}}, I{{ids.data()}};
+    const wp::array_t<unsigned> M{{matrix.data()}}; const wp::array_t<int> R{{ranks.data()}},
+        I{{ids.data()}};
     in_a_warp([&](int lane) {{
         for (int at = 0, word = 0; at < std::min(total, capacity); word += 64) {{
             const int own = word + 2 * lane;
             const wp::uint64 found = own < words ? two_words(M, own * {tile_bitmask.GROUP} + 3) : 0;
             const int count = __builtin_popcountll(found), sums = sum_of_lanes(count);
             const int until = at + of_lane(sums, 31);
-            write_ids(found, R, 32 * own, 32 * word, I, at + sums - count, at, until < capacity ? until : capacity);
+            write_ids(found, R, 32 * own, 32 * word, I, at + sums - count, at, until < capacity
+                ? until : capacity);
             at = until;
         }}
     }});
@@ -206,13 +224,15 @@ static int list(int words, int share, int capacity) {{
 }}
 int main() {{
     for (int words : {{2, 64, 66, 256}}) for (int share : {{0, 1, 30, 100}})
-        for (int capacity : {{0, 1, 100, 1 << 20}}) std::printf("%d\\n", list(words, share, capacity));
+        for (int capacity : {{0, 1, 100, 1 << 20}}) std::printf("%d\\n",
+            list(words, share, capacity));
 }}
 """
 
 SIGNATURES = {
     "entry": "int entry(wp::array_t<int> ids, int start, int step, int at, int count)",
-    "fetch_records": "void fetch_records(wp::uint64 memory, wp::array_t<Splat> splats, int i, int at)",
+    "fetch_records": "void fetch_records(wp::uint64 memory, wp::array_t<Splat> splats, int i, "
+    "int at)",
     "fetch_more": "void fetch_more(wp::uint64 memory, wp::array_t<Splat> records, int i, int at)",
     "more_of": "wp::vec_t<3, float> more_of(wp::uint64 memory, int at, wp::array_t<Splat> records, "
     "wp::array_t<int> ids, int k, bool there)",
@@ -220,10 +240,12 @@ SIGNATURES = {
     "record_of": "Splat record_of(wp::uint64 memory, int first, int n, wp::array_t<Splat> splats, "
     "wp::array_t<int> ids, int k, bool there)",
     "warp_memory": "wp::uint64 warp_memory()",
-    "store_derivatives": "void store_derivatives(wp::uint64 memory, V g0, V g1, V g2, V g_re, V g_im, V g_amplitude, "
+    "store_derivatives": "void store_derivatives(wp::uint64 memory, V g0, V g1, V g2, V g_re, V "
+    "g_im, V g_amplitude, "
     "V g_distance, V g3, V g4, V g5)",
     "store_values": "void store_values(wp::uint64 memory, int first, int n, V v, V w, V w2, V g_d)",
-    "accumulate_round": "void accumulate_round(wp::uint64 memory, wp::array_t<Splat> grads, wp::array_t<Splat> more, "
+    "accumulate_round": "void accumulate_round(wp::uint64 memory, wp::array_t<Splat> grads, "
+    "wp::array_t<Splat> more, "
     "wp::array_t<int> ids, int start, int at, int n, V x, V y)",
     "sum_of_lanes": "int sum_of_lanes(int x)",
     "of_lane": "int of_lane(int x, int lane)",
@@ -231,18 +253,26 @@ SIGNATURES = {
     "lane_beyond": "int lane_beyond(int sums, int bound)",
     "lanes_with": "int lanes_with(bool x)",
     "two_words": "wp::uint64 two_words(wp::array_t<unsigned> bits, int place)",
-    "write_ids": "void write_ids(wp::uint64 found, wp::array_t<int> order, int rank, int lowest, wp::array_t<int> ids, "
+    "write_ids": "void write_ids(wp::uint64 found, wp::array_t<int> order, int rank, int lowest, "
+    "wp::array_t<int> ids, "
     "int place, int begin, int end)",
 }
 
 
 def numbers_of(folder, functions, program):
-    """Compile native functions as CUDA would see them, run ``program`` on them, and return what it printed."""
-    parts = [f"static {SIGNATURES[name]} {{ {function.native_snippet} }}" for name, function in functions.items()]
+    """Compile native functions as CUDA would see them, run ``program`` on them,
+    and return what it printed.
+    """
+    parts = [
+        f"static {SIGNATURES[name]} {{ {function.native_snippet} }}"
+        for name, function in functions.items()
+    ]
     (folder / "warp.cpp").write_text("\n".join([WARP, *parts, program]))
     command = [COMPILER, "-std=c++20", "-O1", "-w", "-pthread", "warp.cpp", "-o", "warp"]
     subprocess.run(command, cwd=folder, check=True, timeout=120)
-    done = subprocess.run([folder / "warp"], check=True, timeout=120, capture_output=True, text=True)
+    done = subprocess.run(
+        [folder / "warp"], check=True, timeout=120, capture_output=True, text=True
+    )
     return [float(line) for line in done.stdout.split()]
 
 
@@ -256,11 +286,19 @@ def numbers_of(folder, functions, program):
         (True, True, True, False, True),
     ],
 )
-def test_rounds_read_every_record_and_sum_every_pixel(light, channels, geometry, spreads, more, tmp_path):
+def test_rounds_read_every_record_and_sum_every_pixel(
+    light, channels, geometry, spreads, more, tmp_path
+):
     """Lists of no, one, 16 and many entries, in both directions; sums against float64."""
     rounds = vars(shared_batches.make_gradient_rounds(8, light, channels, geometry, spreads, more))
     functions = {name: rounds[name] for name in SIGNATURES if name in rounds}
-    values = {"LIGHT": light, "CHANNELS": channels, "GEOMETRY": geometry, "SPREADS": spreads, "MORE": more}
+    values = {
+        "LIGHT": light,
+        "CHANNELS": channels,
+        "GEOMETRY": geometry,
+        "SPREADS": spreads,
+        "MORE": more,
+    }
     constants = "".join(f"const bool {name} = {int(value)};\n" for name, value in values.items())
     errors = numbers_of(tmp_path, functions, constants + WALK)
     assert len(errors) == 14
@@ -270,7 +308,9 @@ def test_rounds_read_every_record_and_sum_every_pixel(light, channels, geometry,
 
 @pytest.mark.skipif(COMPILER is None, reason="needs a C++ compiler")
 def test_lanes_find_their_row(tmp_path):
-    """Sums and the largest over lanes, the lane that a pair of a row of tiles belongs to, and a search by all lanes."""
+    """Sums and the largest over lanes, the lane that a pair of a row of tiles belongs to,
+    and a search by all lanes.
+    """
     names = "sum_of_lanes", "of_lane", "warp_max", "lane_beyond", "lanes_with"
     functions = {name: getattr(simd, name) for name in names}
     assert numbers_of(tmp_path, functions, LANES) == [0.0]
@@ -278,7 +318,14 @@ def test_lanes_find_their_row(tmp_path):
 
 @pytest.mark.skipif(COMPILER is None, reason="needs a C++ compiler")
 def test_lanes_list_bits(tmp_path):
-    """A warp writes the ranks of all bits that are set in order, and nothing behind what there is room for."""
-    homes = {"sum_of_lanes": simd, "of_lane": simd, "two_words": tile_bitmask, "write_ids": tile_bitmask}
+    """A warp writes the ranks of all bits that are set in order,
+    and nothing behind what there is room for.
+    """
+    homes = {
+        "sum_of_lanes": simd,
+        "of_lane": simd,
+        "two_words": tile_bitmask,
+        "write_ids": tile_bitmask,
+    }
     functions = {name: getattr(home, name) for name, home in homes.items()}
     assert numbers_of(tmp_path, functions, LISTS) == [0.0] * 64

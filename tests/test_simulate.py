@@ -1,4 +1,6 @@
-"""Recording a scene: what each raw frame shows and when, its truth, its files, and what is refused."""
+"""Recording a scene: what each raw frame shows and when, its truth, its files,
+and what is refused.
+"""
 
 import dataclasses
 import math
@@ -23,7 +25,9 @@ MIDDLE = (96, 72)
 
 
 def slider(**more):
-    """A plain box that slides fast in front of the room, with another sensor or whatever else is given."""
+    """A plain box that slides fast in front of the room,
+    with another sensor or whatever else is given.
+    """
     box = Body(
         shape=Box(size=(0.9, 0.9, 0.9)),
         texture=Texture(low=0.8, high=0.8),
@@ -45,18 +49,33 @@ def slider(**more):
 def closed_form(sequence):
     """Distance [m] decoded from each complete quartet."""
     quartets = sequence.frames // 4
-    quads = torch.from_numpy(sequence.quads[: 4 * quartets].astype(np.float64)).unflatten(0, (quartets, 4))
-    sensor = Sensor(f_mod_hz=sequence.calibration.f_mod_hz, phase_offset=sequence.calibration.phase_offset)
-    return np.stack([distance_from_phasor(*phasor_from_quads(q, tuple(sequence.shifts[:4])), sensor) for q in quads])
+    quads = torch.from_numpy(sequence.quads[: 4 * quartets].astype(np.float64)).unflatten(
+        0, (quartets, 4)
+    )
+    sensor = Sensor(
+        f_mod_hz=sequence.calibration.f_mod_hz, phase_offset=sequence.calibration.phase_offset
+    )
+    return np.stack(
+        [
+            distance_from_phasor(*phasor_from_quads(q, tuple(sequence.shifts[:4])), sensor)
+            for q in quads
+        ]
+    )
 
 
 def errors(recording):
-    """MSE x 100 [m^2] of the closed form on moving and on static pixels of every raw frame, and the moving share."""
+    """MSE x 100 [m^2] of the closed form on moving and on static pixels of every raw frame,
+    and the moving share.
+    """
     truth = recording.truth.distance
     truth = truth[: len(truth) // 4 * 4].reshape(-1, 4, *truth.shape[1:])
     squares = 100 * (closed_form(recording.sequence)[:, None] - truth) ** 2
     moving = np.broadcast_to((np.ptp(truth, axis=1) > 0.05)[:, None], squares.shape)
-    return (squares[moving].mean() if moving.any() else None), squares[~moving].mean(), moving.mean()
+    return (
+        (squares[moving].mean() if moving.any() else None),
+        squares[~moving].mean(),
+        moving.mean(),
+    )
 
 
 def inside(hit, body, pixels=2):
@@ -71,15 +90,21 @@ def inside(hit, body, pixels=2):
 
 def contents(folder):
     """Every file of a folder by relative name."""
-    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_file()
+    }
 
 
-# -- what is recorded --------------------------------------------------------------------------------------------------
+# -- what is recorded ------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", sorted(make.__name__ for make in OURS))
 def test_rendered_and_true_distance_agree_on_still_surfaces(name):
-    """Within 1 cm on every interior pixel of every scene of ours at its own size: the worlds are the same."""
+    """Within 1 cm on every interior pixel of every scene of ours at its own size:
+    the worlds are the same.
+    """
     gap = record(SCENES[name], frames=2, noise=False).gap
     assert gap.pixels > 1000
     assert gap.max <= 0.01
@@ -109,8 +134,12 @@ def test_interior_pixels_keep_away_from_edges_and_motion():
 
 @pytest.mark.parametrize("sync", [False, True])
 def test_every_raw_frame_shows_its_own_instant(sync):
-    """Frame n is a (cos(kappa d - shift_n) + b) of what stands there at its time, on the moving box and on the wall."""
-    sensor = Sensor(shifts=(math.pi, math.pi / 2, 0.0, 3 * math.pi / 2), phase_offset=0.4, dc_offset=0.2)
+    """Frame n is a (cos(kappa d - shift_n) + b) of what stands there at its time,
+    on the moving box and on the wall.
+    """
+    sensor = Sensor(
+        shifts=(math.pi, math.pi / 2, 0.0, 3 * math.pi / 2), phase_offset=0.4, dc_offset=0.2
+    )
     scene = slider(sensor=sensor)
     recording = record(scene, frames=6, size=MIDDLE, sync=sync)
     sequence, camera = recording.sequence, scene.camera(MIDDLE)
@@ -120,18 +149,24 @@ def test_every_raw_frame_shows_its_own_instant(sync):
     for n, time in enumerate(sequence.times):
         hit = first_hit(scene.bodies, camera, float(time))
         np.testing.assert_allclose(recording.truth.distance[n], hit.distance, rtol=1e-6)
-        want = hit.amplitude * (np.cos(hit.distance * sensor.phase_slope + 0.4 - sensor.shifts[n % 4]) + 0.2)
+        want = hit.amplitude * (
+            np.cos(hit.distance * sensor.phase_slope + 0.4 - sensor.shifts[n % 4]) + 0.2
+        )
         for body, bound in ((0, 0.15), (1, 0.08)):
             mask = inside(hit, body)
             assert mask.sum() > 20
             error = np.abs(sequence.quads[n] - want)[mask] / hit.amplitude[mask]
             assert np.quantile(error, 0.9) < bound
-    moved = first_hit(scene.bodies, camera, 0.0).body != first_hit(scene.bodies, camera, 3 / 120).body
+    moved = (
+        first_hit(scene.bodies, camera, 0.0).body != first_hit(scene.bodies, camera, 3 / 120).body
+    )
     assert moved.sum() > 100, "nothing moved, so any time would have passed"
 
 
 def test_asynchrony_is_what_breaks_the_closed_form():
-    """At one instant a quartet decodes to the truth except at outlines; one frame after the other it does not."""
+    """At one instant a quartet decodes to the truth except at outlines;
+    one frame after the other it does not.
+    """
     scene = SCENES["demo"]
     moving, static, share = errors(record(scene, frames=8))
     none, outlines, still = errors(record(scene, frames=8, sync=True))
@@ -144,7 +179,9 @@ def test_asynchrony_is_what_breaks_the_closed_form():
 
 
 def test_the_demo_is_neither_easy_nor_hopeless():
-    """Closed-form error, share of moving pixels and speed are in the range for which the demo promises its factor."""
+    """Closed-form error, share of moving pixels and speed are in the range for which the demo
+    promises its factor.
+    """
     recording = record(SCENES["demo"], flow=True)
     moving, static, share = errors(recording)
     assert moving > 20
@@ -152,7 +189,9 @@ def test_the_demo_is_neither_easy_nor_hopeless():
     assert 0.03 < share < 0.11
     assert recording.sequence.frames >= 40
     assert recording.sequence.quads.shape[1:] >= (72, 96)
-    speed = np.stack([np.linalg.norm(f, axis=0) for f in recording.sequence.flow.forward.values()]) / 4
+    speed = (
+        np.stack([np.linalg.norm(f, axis=0) for f in recording.sequence.flow.forward.values()]) / 4
+    )
     assert 1.0 < speed[speed > 0.01].mean() < 3.0
     assert recording.saturated == 0
     assert recording.gap.max <= 0.01
@@ -163,7 +202,13 @@ def test_named_scenes_stay_in_range(name):
     """Nothing wraps, nothing is missing, something moves, and the name is its own."""
     scene = SCENES[name]
     assert scene.name == name
-    assert scene.motion in ("sliding", "axial", "arc", "sideways and in depth", "camera and ball on arcs")
+    assert scene.motion in (
+        "sliding",
+        "axial",
+        "arc",
+        "sideways and in depth",
+        "camera and ball on arcs",
+    )
     times = [n / 120 for n in (0, scene.frames // 2, scene.frames - 1)]
     hits = [first_hit(scene.bodies, scene.camera(SMALL, time), time) for time in times]
     distances = np.stack([hit.distance for hit in hits])
@@ -173,11 +218,15 @@ def test_named_scenes_stay_in_range(name):
     moving = [index for index, body in enumerate(scene.bodies) if body.moves]
     for hit in hits:
         assert np.isin(hit.body, moving).mean() > 0.03
-        assert set(np.unique(hit.body)) == set(range(len(scene.bodies))), "something is hidden or out of view"
+        assert set(np.unique(hit.body)) == set(range(len(scene.bodies))), (
+            "something is hidden or out of view"
+        )
 
 
 def test_exact_flow_follows_the_motion():
-    """A face at depth z that slides by v dt moves by f v dt / z pixels, and back; the room does not move."""
+    """A face at depth z that slides by v dt moves by f v dt / z pixels, and back;
+    the room does not move.
+    """
     scene = slider(frames=12)
     sequence = record(scene, flow=True, noise=False).sequence
     assert sorted(sequence.flow.forward) == [0, 4]
@@ -201,7 +250,9 @@ def test_exposure_is_an_average_over_its_instants():
     for offset in (-1.5e-3, 1.5e-3):
         box = scene.bodies[1]
         path = dataclasses.replace(box.path, passing_s=-offset)
-        moved = dataclasses.replace(scene, bodies=(scene.bodies[0], dataclasses.replace(box, path=path)))
+        moved = dataclasses.replace(
+            scene, bodies=(scene.bodies[0], dataclasses.replace(box, path=path))
+        )
         shifted.append(record(moved, noise=False).sequence.quads)
     scale = np.abs(blurred).max()
     np.testing.assert_allclose(blurred, np.mean(shifted, axis=0), atol=0.01 * scale)
@@ -209,27 +260,45 @@ def test_exposure_is_an_average_over_its_instants():
 
 
 def test_noise_belongs_to_the_seed_and_the_frame():
-    """The same seed and frame give the same noise whatever the number of frames; another seed another, of mean zero."""
+    """The same seed and frame give the same noise whatever the number of frames;
+    another seed another, of mean zero.
+    """
     scene = slider()
     clean = record(scene, frames=4, noise=False).sequence.quads
-    first, longer, other = (record(scene, frames=n, seed=s).sequence.quads for n, s in ((4, 1), (8, 1), (4, 2)))
+    first, longer, other = (
+        record(scene, frames=n, seed=s).sequence.quads for n, s in ((4, 1), (8, 1), (4, 2))
+    )
     np.testing.assert_array_equal(first, longer[:4])
     assert (first != other).mean() > 0.9
     noise = first - clean
     assert noise.std() > 1e-4
     assert abs(noise.mean()) < 4 * noise.std() / math.sqrt(noise.size)
     assert abs(np.corrcoef(noise[0].ravel(), noise[1].ravel())[0, 1]) < 4 / math.sqrt(noise[0].size)
-    assert abs(np.corrcoef(noise.ravel(), (other - clean).ravel())[0, 1]) < 4 / math.sqrt(noise.size)
+    assert abs(np.corrcoef(noise.ravel(), (other - clean).ravel())[0, 1]) < 4 / math.sqrt(
+        noise.size
+    )
 
 
 def test_noise_has_the_strength_of_the_light():
-    """On still surfaces the variance of a quad is (N_s + 2 (N_dark + s_r^2) + e^2/12) / (C G)^2, N_s analytic."""
-    sensor = Sensor(noise=True, electrons_per_unit=3e6, full_well_electrons=1e9, read_noise_electrons=20.0, adc_bits=16)
+    """On still surfaces the variance of a quad is (N_s + 2 (N_dark + s_r^2) + e^2/12) / (C G)^2,
+    N_s analytic.
+    """
+    sensor = Sensor(
+        noise=True,
+        electrons_per_unit=3e6,
+        full_well_electrons=1e9,
+        read_noise_electrons=20.0,
+        adc_bits=16,
+    )
     scene = slider(sensor=sensor, frames=40, bodies=(room(),), width=64)
     noise = record(scene).sequence.quads - record(scene, noise=False).sequence.quads
     hit = first_hit(scene.bodies, scene.camera(), 0.0)
     gain = 3e6
-    electrons = hit.amplitude * gain + 2 * (sensor.dark_electrons_per_s * sensor.exposure_s + 20.0**2) + 32**2 / 12
+    electrons = (
+        hit.amplitude * gain
+        + 2 * (sensor.dark_electrons_per_s * sensor.exposure_s + 20.0**2)
+        + 32**2 / 12
+    )
     expected = np.sqrt(electrons) / (sensor.contrast * gain)
     mask = inside(hit, 0, pixels=1)
     assert mask.sum() > 100
@@ -243,20 +312,28 @@ def test_saturation_is_reported():
     assert record(bright, noise=False).saturated == 0
 
 
-# -- what is written ---------------------------------------------------------------------------------------------------
+# -- what is written -------------------------------------------------------------------------------
 
 
 def test_a_sequence_is_read_back_as_recorded(tmp_path):
-    """A sensor in the order of real recordings with offsets: quads, shifts, times, calibration, truth, flow."""
+    """A sensor in the order of real recordings with offsets: quads, shifts, times, calibration,
+    truth, flow.
+    """
     sensor = Sensor(
-        shifts=(math.pi, math.pi / 2, 0.0, 3 * math.pi / 2), phase_offset=0.3, dc_offset=1.0, unipolar=True, noise=True
+        shifts=(math.pi, math.pi / 2, 0.0, 3 * math.pi / 2),
+        phase_offset=0.3,
+        dc_offset=1.0,
+        unipolar=True,
+        noise=True,
     )
     scene = slider(sensor=sensor, frames=7)
     path = simulate(scene, tmp_path / "deep" / "seq", seed=4, flow=True)
     assert path == tmp_path / "deep" / "seq"
     got, want = Sequence.open(path), record(scene, seed=4, flow=True)
     for name in ("quads", "measured", "shifts", "times", "camera_from_world"):
-        np.testing.assert_allclose(getattr(got, name), getattr(want.sequence, name), atol=1e-9, err_msg=name)
+        np.testing.assert_allclose(
+            getattr(got, name), getattr(want.sequence, name), atol=1e-9, err_msg=name
+        )
     for name in ("f_mod_hz", "phase_offset", "dc_offset", "fx", "fy", "cx", "cy"):
         assert values_of(got)[name] == pytest.approx(values_of(want.sequence)[name]), name
     np.testing.assert_array_equal(got.truth().distance, want.truth.distance)
@@ -270,18 +347,25 @@ def test_a_sequence_is_read_back_as_recorded(tmp_path):
 
 
 def test_the_same_seed_writes_the_same_bytes(tmp_path):
-    """T33: another seed changes the quads, their picture and the card that names it, nothing else."""
+    """T33: another seed changes the quads, their picture and the card that names it,
+    nothing else.
+    """
     scene = slider(frames=5)
     folders = [simulate(scene, tmp_path / str(k), seed=seed) for k, seed in enumerate((7, 7, 8))]
     first, same, other = (contents(folder) for folder in folders)
     assert first == same
     assert first.keys() == other.keys()
     differ = {name for name in first if first[name] != other[name]}
-    assert differ == {name for name in first if name.startswith("tofType")} | {"README.md", "contact_sheet.png"}
+    assert differ == {name for name in first if name.startswith("tofType")} | {
+        "README.md",
+        "contact_sheet.png",
+    }
 
 
 def test_the_card_says_how_to_make_it_again(tmp_path):
-    """Scene, command, sensor, and how far rendering and truth are apart; a scene of one's own has no command."""
+    """Scene, command, sensor, and how far rendering and truth are apart;
+    a scene of one's own has no command.
+    """
     path = simulate("demo", tmp_path / "seq", frames=2, size=SMALL, seed=3, noise=False)
     card = (path / "README.md").read_text()
     assert "gftorf simulate demo --out SEQ --frames 2 --size 48x36 --seed 3 --no-noise" in card
@@ -297,7 +381,13 @@ def test_a_finished_sequence_is_not_made_again(tmp_path):
     calls = []
 
     def make(seed, **more):
-        return simulate(slider(frames=2), tmp_path / "seq", seed=seed, progress=lambda *n: calls.append(n), **more)
+        return simulate(
+            slider(frames=2),
+            tmp_path / "seq",
+            seed=seed,
+            progress=lambda *n: calls.append(n),
+            **more,
+        )
 
     make(0)
     assert calls == [(1, 2), (2, 2)]
@@ -313,27 +403,41 @@ def test_a_finished_sequence_is_not_made_again(tmp_path):
     assert contents(tmp_path / "seq-old-2") == contents(tmp_path / "seq") != before
 
 
-# -- what is refused ---------------------------------------------------------------------------------------------------
+# -- what is refused -------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"scene": "slidin"}, ("slidin", "did you mean sliding", "demo, sliding, axial, arc, tour")),
+        (
+            {"scene": "slidin"},
+            ("slidin", "did you mean sliding", "demo, sliding, axial, arc, tour"),
+        ),
         ({"scene": "xyzzy"}, ("xyzzy", "take one of these")),
         ({"frames": 0}, ("--frames", "at least 1")),
         ({"frames": -4}, ("--frames", "-4")),
         ({"size": (0, 4)}, ("--size", "0x4", "WIDTHxHEIGHT")),
         ({"size": (4, -1)}, ("--size",)),
-        ({"scene": "axial", "frames": 400}, ("--frames", "nearer to the camera", "simulate at most ")),
+        (
+            {"scene": "axial", "frames": 400},
+            ("--frames", "nearer to the camera", "simulate at most "),
+        ),
         ({"seed": -1}, ("--seed", "0 or more")),
         ({"exposure_samples": 0}, ("exposure_samples",)),
         ({"format": "zip"}, ("--format", "zip", "ftorf", "capture")),
-        ({"scene": slider(sensor=Sensor(shifts=(0.0, 2.0, 4.0)))}, ("F-ToeRF", "sensor.shifts", "four shifts")),
+        (
+            {"scene": slider(sensor=Sensor(shifts=(0.0, 2.0, 4.0)))},
+            ("F-ToeRF", "sensor.shifts", "four shifts"),
+        ),
         ({"scene": slider(sensor=Sensor(shifts=(0.0, 1.0, 2.0, 3.0)))}, ("sensor.shifts",)),
-        ({"scene": slider(sensor=Sensor(noise=True, contrast=0.9, dc_offset=0.5))}, ("dc_offset", "negative light")),
+        (
+            {"scene": slider(sensor=Sensor(noise=True, contrast=0.9, dc_offset=0.5))},
+            ("dc_offset", "negative light"),
+        ),
     ],
-    ids=lambda value: str(value)[:40] if isinstance(value, dict) and "sensor" not in str(value) else None,
+    ids=lambda value: (
+        str(value)[:40] if isinstance(value, dict) and "sensor" not in str(value) else None
+    ),
 )
 def test_what_cannot_be_meant_is_refused(tmp_path, options, words):
     """A named error with the option, what was expected and what was found; nothing is written."""
@@ -346,7 +450,9 @@ def test_what_cannot_be_meant_is_refused(tmp_path, options, words):
 
 
 def test_nothing_is_overwritten(tmp_path):
-    """Neither a file nor a folder with something in it; what is no sequence is not even moved aside."""
+    """Neither a file nor a folder with something in it;
+    what is no sequence is not even moved aside.
+    """
     (tmp_path / "file").write_text("mine")
     (tmp_path / "folder").mkdir()
     (tmp_path / "folder" / "mine").write_text("mine")

@@ -1,4 +1,6 @@
-"""The second truth: what the closed form would decode from four noise-free quads of one instant, of all the light."""
+"""The second truth: what the closed form would decode from four noise-free quads of one instant,
+of all the light.
+"""
 
 import math
 from dataclasses import replace
@@ -15,10 +17,19 @@ SIZE = (32, 24)
 
 
 @pytest.mark.parametrize(
-    "more", [{}, {"engine": "mesh"}, {"engine": "mesh", "bounces": 2, "paths": 512}, {"exposure_samples": 3}], ids=str
+    "more",
+    [
+        {},
+        {"engine": "mesh"},
+        {"engine": "mesh", "bounces": 2, "paths": 512},
+        {"exposure_samples": 3},
+    ],
+    ids=str,
 )
 def test_it_is_the_closed_form_of_one_instant(more):
-    """At quartet starts the noise-free closed form of simultaneous quads, whatever noise, blur and motion did."""
+    """At quartet starts the noise-free closed form of simultaneous quads, whatever noise,
+    blur and motion did.
+    """
     scene = replace(SCENES["demo"], sensor=Sensor(noise=True, phase_offset=0.7, dc_offset=0.1))
     truth = record(scene, size=SIZE, frames=5, **more).truth
     still = {**more, "exposure_samples": 1}
@@ -28,13 +39,18 @@ def test_it_is_the_closed_form_of_one_instant(more):
         difference = np.abs(closed_form_distance(sync, i) - truth.phasor_distance[4 * i])
         assert np.median(difference) < bound
         assert np.quantile(difference, 0.9 if "bounces" in more else 1.0) < 5 * bound
-    assert np.abs(truth.phasor_distance[1] - truth.phasor_distance[0]).max() > 0.3, "nothing moved: any time would do"
+    assert np.abs(truth.phasor_distance[1] - truth.phasor_distance[0]).max() > 0.3, (
+        "nothing moved: any time would do"
+    )
 
 
 def test_light_that_bounces_makes_it_longer_and_geometry_does_not_know():
-    """In a closed room at 20 MHz indirect light comes late; the geometric distance is that of the first hit."""
+    """In a closed room at 20 MHz indirect light comes late;
+    the geometric distance is that of the first hit.
+    """
     direct, indirect = (
-        record(SCENES["demo"], size=SIZE, frames=1, engine="mesh", bounces=n, paths=64).truth for n in (0, 2)
+        record(SCENES["demo"], size=SIZE, frames=1, engine="mesh", bounces=n, paths=64).truth
+        for n in (0, 2)
     )
     np.testing.assert_array_equal(direct.distance, indirect.distance)
     assert np.median(indirect.phasor_distance - direct.phasor_distance) > 0.05

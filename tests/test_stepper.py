@@ -1,4 +1,6 @@
-"""Training steps: on a CPU eager, on a GPU as CUDA graphs, both against plain torch (plain_step.py)."""
+"""Training steps: on a CPU eager, on a GPU as CUDA graphs,
+both against plain torch (plain_step.py).
+"""
 
 import math
 import subprocess
@@ -28,7 +30,12 @@ from gftorf_warp.render.tensor_cores import FusedLayers, fits
 from gftorf_warp.scene.initialise import Init
 from gftorf_warp.scene.motion import MotionSettings, Products
 
-DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA"))]
+DEVICES = [
+    "cpu",
+    pytest.param(
+        "cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
+    ),
+]
 
 
 def begun(settings, device="cpu", sequence=None):
@@ -42,24 +49,40 @@ def begun(settings, device="cpu", sequence=None):
 
 
 def published(name="released", **changes):
-    """A short run of a published preset: warm-up, small network, flow, densification and an opacity reset."""
+    """A short run of a published preset: warm-up, small network, flow,
+    densification and an opacity reset.
+    """
     settings = presets.shortened(presets.preset(name), 60)
-    motion = replace(settings.motion, layers=3, width=16, skip_after=1, position_frequencies=3, time_frequencies=2)
+    motion = replace(
+        settings.motion,
+        layers=3,
+        width=16,
+        skip_after=1,
+        position_frequencies=3,
+        time_frequencies=2,
+    )
     init = replace(settings.init, count=300)
-    densify = replace(settings.densify, every=8, start=12, reset_every=20, gradient_min=1e-6, loses_step=False)
+    densify = replace(
+        settings.densify, every=8, start=12, reset_every=20, gradient_min=1e-6, loses_step=False
+    )
     schedule = {key: changes.pop(key) for key in ("batch", "colour_from") if key in changes}
     settings = replace(settings, **{"motion": motion, "init": init, "densify": densify} | changes)
-    return replace(settings, schedule=replace(settings.schedule, warm_up=6, flow_from=8, **schedule))
+    return replace(
+        settings, schedule=replace(settings.schedule, warm_up=6, flow_from=8, **schedule)
+    )
 
 
 def alike(one, other, few=0.01, signs=0.0):
-    """Two states after the same images: to rounding on a CPU, but for a share of ``few`` elements on a GPU.
+    """Two states after the same images: to rounding on a CPU, but for a share of ``few`` elements
+    on a GPU.
 
-    On a CPU a share of ``signs`` may differ alike: the gradient of an L1 term is the sign of a difference.
+    On a CPU a share of ``signs`` may differ alike: the gradient of an L1 term is the sign of a
+    difference.
 
-    Atomic additions of the backward pass happen there in any order, so gradients differ by a rounding, graph or
-    not. Adam, whose epsilon is far below any gradient, makes whole steps of gradients that are nothing but rounding: a
-    few elements may be a few steps apart, which is no error.
+    Atomic additions of the backward pass happen there in any order, so gradients differ by a
+    rounding, graph or not. Adam, whose epsilon is far below any gradient, makes whole steps of
+    gradients that are nothing but rounding: a few elements may be a few steps apart, which is no
+    error.
     """
     few = few if one.optimiser.leaves[0].is_cuda else signs
     assert len(one.optimiser.field) == len(other.optimiser.field)
@@ -70,12 +93,18 @@ def alike(one, other, few=0.01, signs=0.0):
     assert one.sums.keys() == other.sums.keys()
     for name in one.sums:
         torch.testing.assert_close(one.sums[name], other.sums[name], rtol=1e-3, atol=1e-6)
-    torch.testing.assert_close(one.statistics.pixels, other.statistics.pixels, rtol=1e-3 if few else 0, atol=4 * few)
-    torch.testing.assert_close(one.statistics.gradient, other.statistics.gradient, rtol=1e-2, atol=1e-6 + 1e-2 * few)
+    torch.testing.assert_close(
+        one.statistics.pixels, other.statistics.pixels, rtol=1e-3 if few else 0, atol=4 * few
+    )
+    torch.testing.assert_close(
+        one.statistics.gradient, other.statistics.gradient, rtol=1e-2, atol=1e-6 + 1e-2 * few
+    )
 
 
 def launches_of(steps):
-    """A list that gets the key of every graph that is captured, and the graph; on a CPU a function."""
+    """A list that gets the key of every graph that is captured, and the graph;
+    on a CPU a function.
+    """
     found, whole = [], steps._captured
 
     def captured(key, table):
@@ -87,7 +116,9 @@ def launches_of(steps):
 
 
 def compared(settings, device, sequence=None, *, images=((20, 0.01),), signs=0.0):
-    """The stepper and plain torch from one start, compared after so many images; returns the stepper's state."""
+    """The stepper and plain torch from one start, compared after so many images;
+    returns the stepper's state.
+    """
     plain, observations = begun(settings, device, sequence)
     state, _ = begun(settings, device, sequence)
     steps = Stepper(state, observations, settings)
@@ -112,11 +143,13 @@ SETTINGS = [published, lambda **changes: demo(images=60, **changes)]
 @pytest.mark.parametrize("batch", [Batch.FRAME, Batch.QUARTET])
 @pytest.mark.parametrize("make", SETTINGS, ids=["published", "demo"])
 def test_steps_are_those_of_plain_torch(make, batch, device):
-    """Every tensor, sum and statistic after 20 images and after 40, with densification and an opacity reset.
+    """Every tensor, sum and statistic after 20 images and after 40, with densification and an
+    opacity reset.
 
-    On a GPU rounding grows: whether a pixel still takes a splat is decided differently somewhere, and splats behind it
-    differ by a part of a step. Measured on an H200 with quartets of ``demo``: 2e-6 at most after 20 images, after 40
-    4.5 % of the quaternions and 2.2 % of the harmonics, a third of a step at most.
+    On a GPU rounding grows: whether a pixel still takes a splat is decided differently somewhere,
+    and splats behind it differ by a part of a step. Measured on an H200 with quartets of ``demo``:
+    2e-6 at most after 20 images, after 40 4.5 % of the quaternions and 2.2 % of the harmonics, a
+    third of a step at most.
     """
     compared(make(batch=batch), device, images=((20, 0.01), (40, 0.06)))
 
@@ -136,9 +169,11 @@ def test_steps_of_other_inputs_are_those_of_plain_torch(name, device):
     """Every term of the loss is part of one of these or of the presets."""
     state = compared(demo(images=60, **INPUTS[name]), device, images=((12, 0.01),), signs=0.02)
     weights = INPUTS[name].get("weights", demo().weights)
-    assert {term for term in ("flow", "depth", "distortion", "motion_size") if getattr(weights, term) > 0} <= {
-        *state.sums
-    }
+    assert {
+        term
+        for term in ("flow", "depth", "distortion", "motion_size")
+        if getattr(weights, term) > 0
+    } <= {*state.sums}
 
 
 def moving(frames=12):
@@ -156,7 +191,9 @@ def test_steps_of_a_moving_camera_with_colour_are_those_of_plain_torch(case, dev
     changes = {"input": Input.PHASOR} if case == "phasors and colour" else {}
     if case == "colour alone":
         weights = replace(weights, quads=0.0, flow=0.0, depth=0.1)
-    settings = published(weights=weights, colour_from=8 if "and" in case else 0, batch=Batch.QUARTET, **changes)
+    settings = published(
+        weights=weights, colour_from=8 if "and" in case else 0, batch=Batch.QUARTET, **changes
+    )
     settings = replace(settings, init=replace(settings.init, kind=Init.RANDOM, bounds=(2.0, 5.0)))
     state = compared(settings, device, with_colour(moving()), images=((16, 0.01),), signs=0.02)
     assert "colour" in state.sums
@@ -164,7 +201,9 @@ def test_steps_of_a_moving_camera_with_colour_are_those_of_plain_torch(case, dev
 
 
 def cycled(shifts, frequencies=(20e6,), *, cycles=3):
-    """A recording of some shifts at some frequencies, one after the other; its quads are of no matter."""
+    """A recording of some shifts at some frequencies, one after the other;
+    its quads are of no matter.
+    """
     count = cycles * len(shifts) * len(frequencies)
     base = recording(frames=count, with_flow=False)[0]
     hz = np.tile(np.repeat(frequencies, len(shifts)), cycles)
@@ -190,18 +229,24 @@ def test_steps_of_other_cycles_are_those_of_plain_torch(name, device):
     """Batches of 3, 5 and 6 raw frames; more than four images need one more sum of gradients."""
     sequence = CYCLES[name]()
     settings = replace(demo(images=60), cycle=sequence.cycle)
-    settings = replace(settings, init=replace(settings.init, kind=Init.RANDOM, count=200, bounds=(2.0, 5.0)))
+    settings = replace(
+        settings, init=replace(settings.init, kind=Init.RANDOM, count=200, bounds=(2.0, 5.0))
+    )
     state = compared(settings, device, sequence, images=((2 * sequence.cycle, 0.01),))
     assert state.images == 2 * sequence.cycle
 
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_one_graph_serves_every_frame(device):
-    """Other raw frames, poses, shifts and frequencies have the same key: only control data differ."""
+    """Other raw frames, poses, shifts and frequencies have the same key:
+    only control data differ.
+    """
     sequence = CYCLES["two frequencies"]()
     poses = np.stack([turned(0.5 * n, (0.01 * n, 0.0, 0.0)) for n in range(sequence.frames)])
     settings = replace(demo(images=36, batch=Batch.FRAME, warm_up=0), cycle=sequence.cycle)
-    settings = replace(settings, init=replace(settings.init, kind=Init.RANDOM, count=200, bounds=(2.0, 5.0)))
+    settings = replace(
+        settings, init=replace(settings.init, kind=Init.RANDOM, count=200, bounds=(2.0, 5.0))
+    )
     state, observations = begun(settings, device, replace(sequence, camera_from_world=poses))
     steps = Stepper(state, observations, settings)
     launches = launches_of(steps)
@@ -211,7 +256,7 @@ def test_one_graph_serves_every_frame(device):
     assert len({key for key, _ in launches}) == 1
 
 
-# -- terms from outside ------------------------------------------------------------------------------
+# -- terms from outside ----------------------------------------------------------------------------
 
 
 def brightness(image, _out):
@@ -231,7 +276,9 @@ EXTRA = Term(
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_a_term_from_outside_is_trained_and_logged(device):
-    """Plain torch operations: its gradient arrives in the parameters, its weighted sum in the log."""
+    """Plain torch operations: its gradient arrives in the parameters,
+    its weighted sum in the log.
+    """
     only = replace(EXTRA, weight=lambda *_: 0.5)
     settings = demo(images=60, warm_up=0, background=0.0)
     state, observations = begun(settings, device)
@@ -241,7 +288,9 @@ def test_a_term_from_outside_is_trained_and_logged(device):
         displacement = motion.at(state.binding, observations.time_at(frame))
         camera, sensor = observations.cameras[frame], observations.sensor_at(frame)
         quads = rasterize(field.moved(*displacement), camera, sensor, settings.render).quads
-        values.append(0.5 * (quads.abs().mean() + 0.1 * displacement.offset.square().sum(dim=1).mean()))
+        values.append(
+            0.5 * (quads.abs().mean() + 0.1 * displacement.offset.square().sum(dim=1).mean())
+        )
         total = total + values[-1] / len(frames)
     wanted = torch.autograd.grad(total, state.optimiser.leaves, allow_unused=True)
     state.queue = [0]
@@ -256,12 +305,16 @@ def test_a_term_from_outside_is_trained_and_logged(device):
         gradient = wanted[[*state.optimiser.tensors].index(name)]
         assert gradient.abs().max() > 0
         share = 1 - state.optimiser.betas[0]
-        torch.testing.assert_close(first, share * gradient, rtol=1e-2, atol=1e-3 * share * float(gradient.abs().max()))
+        torch.testing.assert_close(
+            first, share * gradient, rtol=1e-2, atol=1e-3 * share * float(gradient.abs().max())
+        )
 
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_a_term_from_outside_beside_the_others(device):
-    """It begins along the run; the others are logged as before, and several steps and graphs are valid."""
+    """It begins along the run; the others are logged as before,
+    and several steps and graphs are valid.
+    """
     settings = demo(images=60, warm_up=0)
     state, observations = begun(settings, device)
     steps = Stepper(state, observations, settings, terms=(*TERMS, EXTRA))
@@ -307,13 +360,15 @@ def test_a_term_that_never_applies_changes_nothing(device):
         assert torch.equal(leaf, twin)
 
 
-# -- graphs, padding, validity -----------------------------------------------------------------------
+# -- graphs, padding, validity ---------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("batch", [Batch.FRAME, Batch.QUARTET])
 def test_a_graph_is_the_same_work_as_eager_steps(batch, device):
-    """The same kernels in the same order; what differs on a GPU is the order of atomic additions, see ``alike``."""
+    """The same kernels in the same order; what differs on a GPU is the order of atomic additions,
+    see ``alike``.
+    """
     states = []
     for graph in (False, True):
         settings = replace(published(batch=batch), graph=graph)
@@ -332,12 +387,15 @@ def test_a_graph_is_the_same_work_as_eager_steps(batch, device):
 
 @pytest.mark.parametrize("make", SETTINGS, ids=["network", "nodes"])
 def test_padding_rows_change_nothing(make, monkeypatch):
-    """As on a GPU, but on a CPU: in ``published`` ten times as many rows as Gaussians, also after densification."""
+    """As on a GPU, but on a CPU: in ``published`` ten times as many rows as Gaussians,
+    also after densification.
+    """
     whole = stepper.PaddedParameters
     monkeypatch.setattr(stepper, "PaddedParameters", lambda *, pads: whole(pads=not pads))
     settings = replace(make(batch=Batch.QUARTET), graph=False)
     settings = replace(settings, weights=replace(settings.weights, motion_size=0.5))
-    state = compared(settings, "cpu", images=((20, 0.01),), signs=0.01)  # where little moves, directions are rounding
+    # where little moves, directions are rounding
+    state = compared(settings, "cpu", images=((20, 0.01),), signs=0.01)
     mean = state.optimiser.tensors["mean"]
     assert mean.untyped_storage().nbytes() > mean.nbytes
 
@@ -345,7 +403,9 @@ def test_padding_rows_change_nothing(make, monkeypatch):
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("make", SETTINGS, ids=["network", "nodes"])
 def test_padding_rows_are_in_no_mean(make, device):
-    """On a GPU there are ten times as many rows as Gaussians in ``published``, displaced like others."""
+    """On a GPU there are ten times as many rows as Gaussians in ``published``,
+    displaced like others.
+    """
     settings = make(batch=Batch.QUARTET)
     settings = replace(settings, weights=replace(settings.weights, motion_size=0.5))
     plain, observations = begun(settings, device)
@@ -356,7 +416,8 @@ def test_padding_rows_are_in_no_mean(make, device):
         steps.step()
     assert steps.collect() == 0
     assert plain.sums["motion_size"] > 0.01
-    for name, value in plain.sums.items():  # no more: where little moves, the direction of its gradient is rounding
+    # no more: where little moves, the direction of its gradient is rounding
+    for name, value in plain.sums.items():
         torch.testing.assert_close(state.sums[name], value, rtol=2e-3, atol=1e-6)
 
 
@@ -412,32 +473,44 @@ import sys
 from small_runs import demo, small
 from gftorf_warp.recon.train import reconstruct
 reconstruct(small(), sys.argv[1], demo(images=12, warm_up=0, log_every=4))
-print("imported:", *(name for name in ("torch._dynamo", "torch._inductor", "sympy") if name in sys.modules))
+heavy = "torch._dynamo", "torch._inductor", "sympy"
+print("imported:", *(name for name in heavy if name in sys.modules))
 """
 
 
 def test_a_run_does_not_import_the_compiler_of_torch(tmp_path):
-    """It takes a second or three, and compiles nothing here; in a process of its own, since others may have it."""
+    """It takes a second or three, and compiles nothing here; in a process of its own,
+    since others may have it.
+    """
     command = [sys.executable, "-c", SHORT_RUN, str(tmp_path / "run")]
-    done = subprocess.run(command, cwd=__file__.rpartition("/")[0], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        command, cwd=__file__.rpartition("/")[0], capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines()[-1] == "imported:"
 
 
-# -- tensor cores ------------------------------------------------------------------------------------
+# -- tensor cores ----------------------------------------------------------------------------------
 
 
 def of_full_size(**changes):
     """A short run with the published network, in half precision."""
     full, settings = MotionSettings(), published(**changes)
     sizes = {"layers": full.layers, "width": full.width, "skip_after": full.skip_after}
-    frequencies = {"position_frequencies": full.position_frequencies, "time_frequencies": full.time_frequencies}
-    return replace(settings, motion=replace(settings.motion, products=Products.HALF, **sizes, **frequencies))
+    frequencies = {
+        "position_frequencies": full.position_frequencies,
+        "time_frequencies": full.time_frequencies,
+    }
+    return replace(
+        settings, motion=replace(settings.motion, products=Products.HALF, **sizes, **frequencies)
+    )
 
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_the_network_runs_on_tensor_cores_where_they_fit(device, monkeypatch):
-    """On Hopper those of the published network; other sizes never, nor on a CPU; a network in float32 has none."""
+    """On Hopper those of the published network; other sizes never, nor on a CPU;
+    a network in float32 has none.
+    """
     for settings, size in ((of_full_size(), True), (published(), False)):
         state, observations = begun(settings, device)
         if state.motion.settings.products != Products.HALF:
@@ -452,7 +525,8 @@ def test_the_network_runs_on_tensor_cores_where_they_fit(device, monkeypatch):
 
 
 @pytest.mark.skipif(
-    not torch.cuda.is_available() or torch.cuda.get_device_capability() != (9, 0), reason="needs CUDA with sm_90"
+    not torch.cuda.is_available() or torch.cuda.get_device_capability() != (9, 0),
+    reason="needs CUDA with sm_90",
 )
 @pytest.mark.parametrize("batch", [Batch.FRAME, Batch.QUARTET])
 def test_steps_learn_by_tensor_cores(batch):

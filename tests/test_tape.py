@@ -1,4 +1,6 @@
-"""The renderer from a Warp program: gradients through wp.Tape, and the CUDA mapping of the kernels run on the CPU."""
+"""The renderer from a Warp program: gradients through wp.Tape,
+and the CUDA mapping of the kernels run on the CPU.
+"""
 
 import gc
 import math
@@ -35,7 +37,9 @@ def scene(device="cpu"):
     def normal(*shape):
         return torch.randn(*shape, generator=rng)
 
-    mean = torch.rand(COUNT, 3, generator=rng) * torch.tensor([2.0, 1.4, 2.0]) + torch.tensor([-1.0, -0.7, 1.5])
+    mean = torch.rand(COUNT, 3, generator=rng) * torch.tensor([2.0, 1.4, 2.0]) + torch.tensor(
+        [-1.0, -0.7, 1.5]
+    )
     field = GaussianField(
         mean=mean,
         log_scale=math.log(0.1) + 0.4 * normal(COUNT, 3),
@@ -52,7 +56,12 @@ def cotangents(device="cpu"):
     """Return a random derivative of the loss by every image."""
     rng = torch.Generator().manual_seed(1)
     size = HEIGHT, WIDTH
-    shapes = {"quads": (len(SHIFTS), *size), "phasor": (3, *size), "colour": (3, *size), "extra": (EXTRA, *size)}
+    shapes = {
+        "quads": (len(SHIFTS), *size),
+        "phasor": (3, *size),
+        "colour": (3, *size),
+        "extra": (EXTRA, *size),
+    }
     shapes |= dict.fromkeys(("distance", "opacity", "distortion"), size)
     return {name: torch.randn(*shape, generator=rng).to(device) for name, shape in shapes.items()}
 
@@ -63,15 +72,21 @@ def torch_gradients(device="cpu"):
     named = {**field.parameters(), "extra": extra, "background_quads": background}
     for tensor in named.values():
         tensor.requires_grad_()
-    rendering = rasterize(field, CAMERA, SENSOR, SETTINGS, extra=extra, background=Background(quads=background))
+    rendering = rasterize(
+        field, CAMERA, SENSOR, SETTINGS, extra=extra, background=Background(quads=background)
+    )
     images = {name: getattr(rendering, name) for name in cotangents()}
     outputs, grads = list(images.values()), [cotangents(device)[name] for name in images]
-    return images, dict(zip(named, torch.autograd.grad(outputs, list(named.values()), grads), strict=True))
+    return images, dict(
+        zip(named, torch.autograd.grad(outputs, list(named.values()), grads), strict=True)
+    )
 
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_tape_and_torch_agree_and_the_tape_accumulates(device):
-    """A Warp program that records a tape gets torch's gradients; a second backward adds the same again."""
+    """A Warp program that records a tape gets torch's gradients;
+    a second backward adds the same again.
+    """
     wanted_images, wanted = torch_gradients(device)
     field, extra, background = scene(device)
     named = {**field.parameters(), "extra": extra, "background_quads": background}
@@ -79,12 +94,23 @@ def test_tape_and_torch_agree_and_the_tape_accumulates(device):
         name: wp.from_torch(t.clone(), dtype=VECTORS.get(name, wp.float32), requires_grad=True)
         for name, t in named.items()
     }
-    values = [float(v) for v in (SENSOR.phase_slope, SENSOR.phase_offset, SENSOR.source_intensity, SENSOR.dc_offset)]
+    values = [
+        float(v)
+        for v in (
+            SENSOR.phase_slope,
+            SENSOR.phase_offset,
+            SENSOR.source_intensity,
+            SENSOR.dc_offset,
+        )
+    ]
     wp_device = arrays["mean"].device
     calibration = wp.array(values, dtype=float, device=wp_device, requires_grad=True)
     shapes = {name: tuple(t.shape) for name, t in cotangents().items()}
     images = Images(
-        **{name: wp.zeros(s, dtype=float, device=wp_device, requires_grad=True) for name, s in shapes.items()}
+        **{
+            name: wp.zeros(s, dtype=float, device=wp_device, requires_grad=True)
+            for name, s in shapes.items()
+        }
     )
     inputs = Inputs(**arrays, calibration=calibration)
     buffers = Buffers(COUNT, WIDTH, HEIGHT, SETTINGS, wp_device)
@@ -98,48 +124,76 @@ def test_tape_and_torch_agree_and_the_tape_accumulates(device):
     once = {name: wp.to_torch(array.grad).clone() for name, array in arrays.items()}
     for name, want in wanted.items():
         assert want.abs().max() > 1e-3, name
-        torch.testing.assert_close(once[name].reshape(want.shape), want, rtol=1e-5, atol=1e-5, msg=name)
+        torch.testing.assert_close(
+            once[name].reshape(want.shape), want, rtol=1e-5, atol=1e-5, msg=name
+        )
     assert np.abs(calibration.grad.numpy()).min() > 1e-2
     tape.backward(grads=seeds)
     for name, array in arrays.items():
-        torch.testing.assert_close(wp.to_torch(array.grad), 2.0 * once[name], rtol=1e-5, atol=1e-5, msg=name)
+        torch.testing.assert_close(
+            wp.to_torch(array.grad), 2.0 * once[name], rtol=1e-5, atol=1e-5, msg=name
+        )
 
 
 def test_one_thread_per_pixel_gives_the_same_on_the_cpu(monkeypatch):
-    """The instance that CUDA runs, one pixel per thread in tiles of 8 x 4, agrees with the 16-lane one."""
+    """The instance that CUDA runs, one pixel per thread in tiles of 8 x 4,
+    agrees with the 16-lane one.
+    """
     images, wanted = torch_gradients()
     monkeypatch.setitem(sizes.TILE_SHAPES, "cpu", sizes.TILE_SHAPES["cuda"])
     other_images, other = torch_gradients()
     for name, image in images.items():
         torch.testing.assert_close(other_images[name], image, rtol=1e-5, atol=2e-6, msg=name)
     for name, want in wanted.items():
-        torch.testing.assert_close(other[name], want, rtol=1e-4, atol=2e-5 * float(want.abs().max()), msg=name)
+        torch.testing.assert_close(
+            other[name], want, rtol=1e-4, atol=2e-5 * float(want.abs().max()), msg=name
+        )
 
 
 def test_a_fixed_capacity_gives_the_same_and_reports_what_did_not_fit():
-    """A reserve of pairs changes nothing as long as it suffices; one that does not is an error with both numbers."""
+    """A reserve of pairs changes nothing as long as it suffices;
+    one that does not is an error with both numbers.
+    """
     field, _, _ = scene()
     free = rasterize(field, CAMERA, SENSOR, SETTINGS)
     roomy = RenderSettings(near=0.1, far=20.0, pair_capacity=5000)
-    torch.testing.assert_close(rasterize(field, CAMERA, SENSOR, roomy).quads, free.quads, rtol=0, atol=0)
-    with pytest.raises(ValueError, match=r"pair_capacity = 10 is too small: this rendering has \d+"):
+    torch.testing.assert_close(
+        rasterize(field, CAMERA, SENSOR, roomy).quads, free.quads, rtol=0, atol=0
+    )
+    with pytest.raises(
+        ValueError, match=r"pair_capacity = 10 is too small: this rendering has \d+"
+    ):
         rasterize(field, CAMERA, SENSOR, RenderSettings(near=0.1, far=20.0, pair_capacity=10))
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 def test_a_reserved_rendering_never_waits_for_the_host():
-    """With a reserve of pairs, forward and backward can be captured in a CUDA graph, and its replay sees new inputs."""
+    """With a reserve of pairs, forward and backward can be captured in a CUDA graph,
+    and its replay sees new inputs.
+    """
     field, _, _ = scene("cuda")
     settings = RenderSettings(near=0.1, far=20.0, pair_capacity=20_000)
     device = wp.get_device("cuda:0")
     view = launch.uploaded(CAMERA, SHIFTS, settings, device)
     tensors = {name: t.clone() for name, t in field.parameters().items()}
-    arrays = {name: wp.from_torch(t, dtype=VECTORS.get(name, wp.float32)) for name, t in tensors.items()}
-    values = [float(v) for v in (SENSOR.phase_slope, SENSOR.phase_offset, SENSOR.source_intensity, SENSOR.dc_offset)]
+    arrays = {
+        name: wp.from_torch(t, dtype=VECTORS.get(name, wp.float32)) for name, t in tensors.items()
+    }
+    values = [
+        float(v)
+        for v in (
+            SENSOR.phase_slope,
+            SENSOR.phase_offset,
+            SENSOR.source_intensity,
+            SENSOR.dc_offset,
+        )
+    ]
     inputs = Inputs(**arrays, calibration=wp.array(values, dtype=float, device=device))
     wanted = Inputs(**{name: wp.zeros_like(a) for name, a in arrays.items()}, calibration=None)
     shapes = {name: tuple(t.shape) for name, t in cotangents().items() if name != "extra"}
-    images = Images(**{name: wp.zeros(shape, dtype=float, device=device) for name, shape in shapes.items()})
+    images = Images(
+        **{name: wp.zeros(shape, dtype=float, device=device) for name, shape in shapes.items()}
+    )
     seeds = Images(**{name: wp.from_torch(cotangents("cuda")[name]) for name in shapes})
     buffers = Buffers(COUNT, WIDTH, HEIGHT, settings, device)
 
@@ -172,7 +226,14 @@ def test_torch_does_not_wait_for_the_host_either():
     for mode in ("default", "error"):  # the first pass uploads calibration and loads kernels
         torch.cuda.set_sync_debug_mode(mode)
         try:
-            images = rasterize(field, CAMERA, SENSOR, settings, extra=extra, background=Background(quads=background))
+            images = rasterize(
+                field,
+                CAMERA,
+                SENSOR,
+                settings,
+                extra=extra,
+                background=Background(quads=background),
+            )
             (images.quads.square().sum() + images.distance.sum()).backward()
         finally:
             torch.cuda.set_sync_debug_mode("default")
@@ -185,26 +246,41 @@ def rendered_in(workspace, device="cpu", shift=0.0):
     moved = field.moved(torch.full((1, 3), shift, device=device))
     backdrop = Background(quads=background)
     rendering = rasterize(
-        moved, CAMERA, SENSOR, SETTINGS, extra=extra, background=backdrop, screen_gradient=True, workspace=workspace
+        moved,
+        CAMERA,
+        SENSOR,
+        SETTINGS,
+        extra=extra,
+        background=backdrop,
+        screen_gradient=True,
+        workspace=workspace,
     )
     seeds = cotangents(device)
     images = {name: getattr(rendering, name) for name in seeds}
-    grads = torch.autograd.grad(list(images.values()), list(field.parameters().values()), list(seeds.values()))
+    grads = torch.autograd.grad(
+        list(images.values()), list(field.parameters().values()), list(seeds.values())
+    )
     return [*images.values(), *grads, rendering.screen.gradient]
 
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_a_workspace_changes_nothing_and_allocates_once(device):
-    """Renderings in one workspace equal those in memory of their own, and the second one finds all memory there."""
+    """Renderings in one workspace equal those in memory of their own,
+    and the second one finds all memory there.
+    """
     workspace = Workspace()
     for shift in (0.0, 0.05, 0.0):
-        for got, want in zip(rendered_in(workspace, device, shift), rendered_in(None, device, shift), strict=True):
+        for got, want in zip(
+            rendered_in(workspace, device, shift), rendered_in(None, device, shift), strict=True
+        ):
             torch.testing.assert_close(
                 got, want, rtol=0 if device == "cpu" else 1e-4, atol=0 if device == "cpu" else 1e-4
             )
     kind = COUNT, WIDTH, HEIGHT, SETTINGS, wp.get_device(device)
     buffers = workspace.buffers(*kind)
-    held = {name: array.ptr for name, array in buffers._arrays.items() if name not in ("keys", "ids")}
+    held = {
+        name: array.ptr for name, array in buffers._arrays.items() if name not in ("keys", "ids")
+    }
     assert len(held) > 12
     rendered_in(workspace, device)
     assert workspace.buffers(*kind) is buffers
@@ -225,7 +301,9 @@ def test_backward_after_the_next_rendering_in_a_workspace_is_an_error():
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 def test_torch_captures_a_rendering_and_its_backward_pass():
-    """A graph of torch holds both passes; its replay sees new inputs, and a stream survives all renderings on it."""
+    """A graph of torch holds both passes; its replay sees new inputs,
+    and a stream survives all renderings on it.
+    """
     field, extra, background = scene("cuda")
     settings, workspace = RenderSettings(near=0.1, far=20.0, pair_capacity=20_000), Workspace()
     mean = field.mean.clone().requires_grad_()
@@ -233,8 +311,12 @@ def test_torch_captures_a_rendering_and_its_backward_pass():
 
     def both():
         moving, backdrop = replace(field, mean=mean), Background(quads=background)
-        rendering = rasterize(moving, CAMERA, SENSOR, settings, extra=extra, background=backdrop, workspace=workspace)
-        grad.copy_(torch.autograd.grad(rendering.quads.square().sum() + rendering.extra.sum(), mean)[0])
+        rendering = rasterize(
+            moving, CAMERA, SENSOR, settings, extra=extra, background=backdrop, workspace=workspace
+        )
+        grad.copy_(
+            torch.autograd.grad(rendering.quads.square().sum() + rendering.extra.sum(), mean)[0]
+        )
         return rendering.quads
 
     stream = torch.cuda.Stream()

@@ -1,4 +1,6 @@
-"""The motion network by Warp kernels: the same results as torch's products, whatever the sizes, and nothing lost."""
+"""The motion network by Warp kernels: the same results as torch's products, whatever the sizes,
+and nothing lost.
+"""
 
 import copy
 from dataclasses import replace
@@ -9,7 +11,16 @@ import pytest
 import torch
 import warp as wp
 from small_runs import random
-from test_perceptron import compare_replay, distance, exact, gradients, half, network, on_the_same_side, positions
+from test_perceptron import (
+    compare_replay,
+    distance,
+    exact,
+    gradients,
+    half,
+    network,
+    on_the_same_side,
+    positions,
+)
 
 from gftorf_warp.kernels.network import gradient_scaling as ends
 from gftorf_warp.kernels.network import perceptron as kernels
@@ -29,7 +40,9 @@ ON_HOPPER = pytest.mark.skipif(not HOPPER, reason="needs CUDA with sm_90")
 DEVICES = ["cpu", pytest.param("cuda", marks=ON_HOPPER)]
 WIDTH, TILE = wgmma.WIDTH, wgmma.TILE
 FULL = MotionSettings()
-SHAPES = {  # the published one; shallow; deep and not joined; joined at its second layer, with fewer frequencies
+# the published one; shallow; deep and not joined; joined at its second layer, with fewer
+# frequencies
+SHAPES = {
     "published": FULL,
     "single": replace(FULL, layers=1),
     "two": replace(FULL, layers=2),
@@ -57,12 +70,22 @@ def inputs_of(made, count, keys):
     device = made.head.weight.device
     place = made.bind(positions(count).map(lambda value: value.to(device)))
     layers = [*made.layers, made.head]
-    weights, biases = zip(*((layer.weight.detach(), layer.bias.detach()) for layer in layers), strict=True)
-    return made.backend.form, place, made.time_encodings[:keys].to(device, torch.float32), weights, biases
+    weights, biases = zip(
+        *((layer.weight.detach(), layer.bias.detach()) for layer in layers), strict=True
+    )
+    return (
+        made.backend.form,
+        place,
+        made.time_encodings[:keys].to(device, torch.float32),
+        weights,
+        biases,
+    )
 
 
 def alike(made, twin, count, keys, *, device="cpu", scale=1.0):
-    """Offsets and gradients are those of torch's products and of float64, as closely as halves can be."""
+    """Offsets and gradients are those of torch's products and of float64,
+    as closely as halves can be.
+    """
     gaussians, cotangent = rows(count, len(keys), device, scale)
     found, got = gradients(made, gaussians, cotangent, keys)
     also, _ = gradients(twin, gaussians, cotangent, keys)
@@ -76,13 +99,21 @@ def alike(made, twin, count, keys, *, device="cpu", scale=1.0):
         assert other.abs().max() > 1e-4 * scale, "a vanished gradient would pass any tolerance"
         assert one.dtype == torch.float32
         assert distance(one, equal) < 2e-3
-        assert distance(one, other) < (0.1 if count > 1 else 0.5), "some units are at rest in one precision only"
+        assert distance(one, other) < (0.1 if count > 1 else 0.5), (
+            "some units are at rest in one precision only"
+        )
 
 
 def placed(form, layers, parameters, moment, device="cpu"):
-    """What ``pack`` makes of parameters: halves of all layers, of the way back, of the head, and shifts."""
+    """What ``pack`` makes of parameters: halves of all layers, of the way back, of the head,
+    and shifts.
+    """
     square, entry = form.width * form.width, form.width * form.columns
-    sizes = [(layers - 1) * square + len(form.entries) * entry, (layers - 1) * square, wgmma.HEAD * form.width]
+    sizes = [
+        (layers - 1) * square + len(form.entries) * entry,
+        (layers - 1) * square,
+        wgmma.HEAD * form.width,
+    ]
     parts = [torch.full((size,), torch.nan, dtype=torch.float16, device=device) for size in sizes]
     shifts = torch.full((layers, len(moment), form.width), torch.nan, device=device)
     arrays = [*(array_over(part, wp.float16) for part in parts), array_over(shifts)]
@@ -106,14 +137,21 @@ def launched(kernel, dim, inputs, outputs, device):
 
 
 def shares():
-    """Which output every row of packed weights is, and which input every piece of 32: as one lane has its share.
+    """Which output every row of packed weights is, and which input every piece of 32: as one lane
+    has its share.
 
-    A lane t of four has inputs 2t, 2t + 1, 2t + 8 and 2t + 9 of 16, and of every eight outputs 2t and 2t + 1 (PTX,
-    wgmma: fragments of A and D); those of two products, or of four times eight outputs, are neighbours 8 t to 8 t + 7.
+    A lane t of four has inputs 2t, 2t + 1, 2t + 8 and 2t + 9 of 16, and of every eight outputs 2t
+    and 2t + 1 (PTX, wgmma: fragments of A and D); those of two products, or of four times eight
+    outputs, are neighbours 8 t to 8 t + 7.
     """
     inputs, outputs = np.zeros(32, int), np.zeros(32, int)
     for lane in range(4):
-        own = [16 * product + 8 * upper + 2 * lane + e for product in (0, 1) for upper in (0, 1) for e in (0, 1)]
+        own = [
+            16 * product + 8 * upper + 2 * lane + e
+            for product in (0, 1)
+            for upper in (0, 1)
+            for e in (0, 1)
+        ]
         inputs[own] = 8 * lane + np.arange(8)
         own = [8 * eight + 2 * lane + e for eight in range(4) for e in (0, 1)]
         outputs[own] = 8 * lane + np.arange(8)
@@ -121,7 +159,9 @@ def shares():
 
 
 def unswizzled(packed):
-    """[blocks, outputs, 64 inputs] as tensor cores see them: pieces of 16 bytes are exchanged by the row's number."""
+    """[blocks, outputs, 64 inputs] as tensor cores see them:
+    pieces of 16 bytes are exchanged by the row's number.
+    """
     pieces = packed.view(-1, WIDTH, 8, 8).clone()
     for n in range(WIDTH):
         pieces[:, n] = packed.view(-1, WIDTH, 8, 8)[:, n, [u ^ n % 8 for u in range(8)]]
@@ -146,19 +186,28 @@ def test_other_numbers_of_layers(shape, device):
 @pytest.mark.parametrize("scale", [1e-9, 1e9])
 def test_however_large_the_loss(scale, device):
     """No half holds these gradients."""
-    alike(*pair(replace(FULL, layers=4, skip_after=2), device), 33, [0, 1], device=device, scale=scale)
+    alike(
+        *pair(replace(FULL, layers=4, skip_after=2), device), 33, [0, 1], device=device, scale=scale
+    )
 
 
 @ON_HOPPER
 @pytest.mark.parametrize(
     ("count", "keys"),
-    [(5_000, [0, 1, 2]), (16_339, [1]), (20_289, [0, 1]), (20_480, [2]), (36_864, [0, 1, 3]), (40_000, [0, 1, 3])],
+    [
+        (5_000, [0, 1, 2]),
+        (16_339, [1]),
+        (20_289, [0, 1]),
+        (20_480, [2]),
+        (36_864, [0, 1, 3]),
+        (40_000, [0, 1, 3]),
+    ],
 )
 def test_many_rows(count, keys):
     """More tiles than multiprocessors, several rounds of a block, keys that end within one.
 
-    16,339 rows give some of 132 blocks one tile, 36,864 at three keys give some 13, one more than a round: then one of
-    two groups of warps has none, as in tests/test_weight_ring.py.
+    16,339 rows give some of 132 blocks one tile, 36,864 at three keys give some 13, one more than a
+    round: then one of two groups of warps has none, as in tests/test_weight_ring.py.
     """
     alike(*pair(device="cuda"), count, keys, device="cuda")
 
@@ -166,7 +215,9 @@ def test_many_rows(count, keys):
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("shape", SHAPES)
 def test_what_comes_out_of_every_layer(shape, device):
-    """Outputs of all layers, and the head as a factor, against torch's; nothing is left unwritten."""
+    """Outputs of all layers, and the head as a factor, against torch's;
+    nothing is left unwritten.
+    """
     made, _ = pair(SHAPES[shape], device)
     inputs = inputs_of(made, 21, 3)
     outputs, head, _ = FusedLayers().forward(*inputs)
@@ -180,7 +231,9 @@ def test_what_comes_out_of_every_layer(shape, device):
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("shape", SHAPES)
 def test_slopes_of_the_same_outputs(shape, device):
-    """The way back alone, where the same units are at rest: every slope, and its sums, which are no halves."""
+    """The way back alone, where the same units are at rest: every slope, and its sums,
+    which are no halves.
+    """
     made, _ = pair(SHAPES[shape], device)
     inputs = inputs_of(made, 33, 2)
     form, gradient = made.backend.form, (random(66, 3, seed=6) - 0.3).to(device)
@@ -267,7 +320,9 @@ def test_a_replay_equals_a_call(count):
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("shape", SHAPES)
 def test_every_weight_is_packed_once(shape, device):
-    """Numbers of weights in place of weights, in two digits that halves hold: where each of them went."""
+    """Numbers of weights in place of weights, in two digits that halves hold:
+    where each of them went.
+    """
     made = network(half(SHAPES[shape]))
     form, layers = Form.of(made), len(made.layers)
     weights = [layer.weight for layer in [*made.layers, made.head]]
@@ -284,17 +339,23 @@ def test_every_weight_is_packed_once(shape, device):
     at = part = 0
     for layer, (weight, bias) in enumerate(zip(weights[:-1], biases[:-1], strict=True)):
         numbers = (at + torch.arange(weight.numel())).view(weight.shape)
-        used = numbers[:, : (WIDTH if layer else 0) + (form.columns if layer in form.entries else 0)]
+        used = numbers[
+            :, : (WIDTH if layer else 0) + (form.columns if layer in form.entries else 0)
+        ]
         for block in used.split(64, dim=1):
             assert torch.equal(forth[part], block[p][:, k]), f"block {part}, of layer {layer}"
             part += 1
         for block in range(4 if layer else 0):
             turned = numbers[:, :WIDTH].T[p][:, 64 * block + k]
-            assert torch.equal(back[4 * (layers - 1 - layer) + block], turned), f"back from layer {layer}"
+            assert torch.equal(back[4 * (layers - 1 - layer) + block], turned), (
+                f"back from layer {layer}"
+            )
         at += weight.numel() + bias.numel()
     assert (part, 4 * (layers - 1)) == (len(forth), len(back))
     want = at + torch.arange(3 * WIDTH)
-    assert torch.equal(head, torch.cat([want, torch.zeros((wgmma.HEAD - 3) * WIDTH, dtype=torch.long)]))
+    assert torch.equal(
+        head, torch.cat([want, torch.zeros((wgmma.HEAD - 3) * WIDTH, dtype=torch.long)])
+    )
 
 
 @pytest.mark.parametrize("device", DEVICES)
@@ -304,7 +365,9 @@ def test_what_a_time_adds(shape, device):
     made = network(half(SHAPES[shape])).to(device)
     form, _, moment, weights, biases = inputs_of(made, 1, 3)
     layers = len(made.layers)
-    parameters = torch.cat([value.reshape(-1) for both in zip(weights, biases, strict=True) for value in both])
+    parameters = torch.cat(
+        [value.reshape(-1) for both in zip(weights, biases, strict=True) for value in both]
+    )
     found = placed(form, layers, parameters, moment, device)[-1]
     for number in range(layers):
         want = biases[number].expand(3, -1)
@@ -325,7 +388,13 @@ def test_gradients_become_halves(count, device):
     gradient[count // 2, 1] = -3e-7
     lanes, block = (1, 1) if device == "cpu" else (LANES, ends.BLOCK)
     partials = torch.full((-(-count // lanes), 4), torch.nan, device=device)
-    launched(ends.measure_rows, len(partials) * lanes, [array_over(gradient)], [array_over(partials)], device)
+    launched(
+        ends.measure_rows,
+        len(partials) * lanes,
+        [array_over(gradient)],
+        [array_over(partials)],
+        device,
+    )
     torch.testing.assert_close(partials[:, :3].sum(0), gradient.sum(0), rtol=1e-5, atol=1e-12)
     assert partials[:, 3].max() == gradient.abs().max()
     after = torch.full((count, wgmma.HEAD), torch.nan, dtype=torch.float16, device=device)
@@ -353,13 +422,17 @@ def test_partial_sums_become_sums(parts, device):
 
 
 def test_it_fits_the_published_network_on_hopper_only(monkeypatch):
-    """Anything else is torch's: a CPU, other GPUs, other widths, more frequencies, factors that are no halves."""
+    """Anything else is torch's: a CPU, other GPUs, other widths, more frequencies,
+    factors that are no halves.
+    """
     published = Form.of(network())
     assert (published.width, published.columns, published.dtype) == (256, 64, torch.float16)
     assert not fits(published, torch.device("cpu"))
     gpu = torch.device("cuda", 0)
     for arch, fitting in ((80, False), (89, False), (90, True), (100, False), (120, False)):
-        monkeypatch.setattr(wp, "device_from_torch", lambda _, arch=arch: SimpleNamespace(arch=arch))
+        monkeypatch.setattr(
+            wp, "device_from_torch", lambda _, arch=arch: SimpleNamespace(arch=arch)
+        )
         assert fits(published, gpu) == fitting
     monkeypatch.setattr(wp, "device_from_torch", lambda _: SimpleNamespace(arch=90))
     others = [
@@ -374,7 +447,9 @@ def test_it_fits_the_published_network_on_hopper_only(monkeypatch):
 
 
 def test_a_run_has_the_backend_of_its_device(monkeypatch):
-    """Kernels of ours where they fit, else torch's products; none in float32; a copy has the same."""
+    """Kernels of ours where they fit, else torch's products; none in float32;
+    a copy has the same.
+    """
     assert with_backend(network()).backend is None
     assert isinstance(with_backend(network(half())).backend.layers, CublasLayers)
     monkeypatch.setattr("gftorf_warp.render.network.fits", lambda _, device: device.type == "cpu")

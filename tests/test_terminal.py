@@ -21,7 +21,9 @@ def test_progress_is_plain_and_rare_without_a_terminal(capsys):
         progress = terminal.Progress("x", quiet=quiet)
         for done in range(1, 6):
             progress(done, 5)
-    assert [line.partition("  ")[2][:5] for line in capsys.readouterr().err.splitlines()] == ["x 5/5"]
+    assert [line.partition("  ")[2][:5] for line in capsys.readouterr().err.splitlines()] == [
+        "x 5/5"
+    ]
 
 
 def test_progress_counts_per_second_what_has_a_unit(capsys, monkeypatch):

@@ -1,4 +1,6 @@
-"""Lists of tiles out of a matrix of bits: those of a sort of the pairs, entry by entry, however many of them fit."""
+"""Lists of tiles out of a matrix of bits: those of a sort of the pairs, entry by entry,
+however many of them fit.
+"""
 
 import contextlib
 
@@ -15,12 +17,15 @@ from gftorf_warp.render import buffers as sizes
 from gftorf_warp.render import stages
 from gftorf_warp.render.buffers import Buffers, RenderSettings
 
-SHAPES = [(1, 8, 4), (16, 8, 8), (16, 16, 16), (1, 16, 8)]  # pixels per thread, columns and rows of a tile
+# pixels per thread, columns and rows of a tile
+SHAPES = [(1, 8, 4), (16, 8, 8), (16, 16, 16), (1, 16, 8)]
 ALL, NONE = [0, 0, WIDTH, HEIGHT], [0, 0, 0, 0]  # boxes
 
 
 def buffers_of(record, box, settings, device="cpu", *, marks=True):
-    """Buffers whose splats are given, in an order of depth of their own, that makes its lists in one of the ways."""
+    """Buffers whose splats are given, in an order of depth of their own,
+    that makes its lists in one of the ways.
+    """
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sizes, "MATRIX_MAX", sizes.MATRIX_MAX if marks else 0)
         buffers = Buffers(len(record), WIDTH, HEIGHT, settings, wp.get_device(device))
@@ -124,15 +129,21 @@ def test_no_pairs_at_all(capacity, device):
 @pytest.mark.parametrize("share", [0.0, 1e-3, 0.4, 1.0, 1.2])
 @pytest.mark.parametrize("count", [60, 10_000])
 def test_what_does_not_fit_is_dropped_and_counted(count, share, device):
-    """The first pairs in the order of tiles stay, nothing is written behind the reserve, and lists end there."""
+    """The first pairs in the order of tiles stay, nothing is written behind the reserve,
+    and lists end there.
+    """
     kind = "round" if count < 100 else "small"
     record, box = splats(kind, count)
-    want_first, want_ids, want_total = lists_of(buffers_of(record, box, RenderSettings(), device, marks=False))
+    want_first, want_ids, want_total = lists_of(
+        buffers_of(record, box, RenderSettings(), device, marks=False)
+    )
     capacity = int(share * want_total)
     buffers = buffers_of(record, box, RenderSettings(pair_capacity=capacity), device)
     buffers.ids = wp.full(capacity + 100, -7, dtype=wp.int32, device=device)
     tight = capacity < want_total
-    refused = pytest.raises(ValueError, match=f"has {want_total} ") if tight else contextlib.nullcontext()
+    refused = (
+        pytest.raises(ValueError, match=f"has {want_total} ") if tight else contextlib.nullcontext()
+    )
     with refused:
         stages.sort_by_tile(buffers)
         buffers.check_capacity()
@@ -151,7 +162,11 @@ def test_a_frame_forgets_its_last_lists(device):
     fill(buffers, *splats("small", 200))
     place = buffers.ids.ptr, buffers.first.ptr, buffers.array("bits", buffers.matrix, wp.uint32).ptr
     got = lists_of(buffers)
-    assert place == (buffers.ids.ptr, buffers.first.ptr, buffers.array("bits", buffers.matrix, wp.uint32).ptr)
+    assert place == (
+        buffers.ids.ptr,
+        buffers.first.ptr,
+        buffers.array("bits", buffers.matrix, wp.uint32).ptr,
+    )
     assert before[2] > 2 * got[2]
     is_same(got, lists_of(buffers_of(*splats("small", 200), RenderSettings(), device, marks=False)))
 
@@ -160,7 +175,11 @@ def test_three_launches_and_no_sort(monkeypatch):
     """What a step of training pays for."""
     buffers, launched = buffers_of(*splats("round"), RenderSettings(pair_capacity=100_000)), []
     launch = stages._launch
-    monkeypatch.setattr(stages, "_launch", lambda kernel, *rest: (launched.append(kernel.key), launch(kernel, *rest)))
+    monkeypatch.setattr(
+        stages,
+        "_launch",
+        lambda kernel, *rest: (launched.append(kernel.key), launch(kernel, *rest)),
+    )
     monkeypatch.setattr(wp.utils, "radix_sort_pairs", None)
     stages.sort_by_tile(buffers)
     assert launched == ["mark_pairs", "count_bits", "list_bits"]
@@ -168,7 +187,9 @@ def test_three_launches_and_no_sort(monkeypatch):
 
 
 def test_too_large_a_matrix_and_pairs_in_order_are_sorted(monkeypatch):
-    """The bound is in bytes and counts words that only fill up; gradients in one order need pairs that are sorted."""
+    """The bound is in bytes and counts words that only fill up;
+    gradients in one order need pairs that are sorted.
+    """
     monkeypatch.setitem(sizes.TILE_SHAPES, "cpu", (1, 8, 4))
     tiles, words = -(-19 * 18 // tile_bitmask.GROUP) * tile_bitmask.GROUP, 10  # of 257 splats
 
@@ -184,7 +205,9 @@ def test_too_large_a_matrix_and_pairs_in_order_are_sorted(monkeypatch):
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
 def test_a_graph_makes_the_lists_of_new_splats():
-    """Zeroing, marking, counting, summing and listing can be captured, and nothing waits for the host."""
+    """Zeroing, marking, counting, summing and listing can be captured,
+    and nothing waits for the host.
+    """
     buffers = buffers_of(*splats("round", 200), RenderSettings(pair_capacity=200_000), "cuda")
     lists_of(buffers)
     with wp.ScopedCapture(device=buffers.device) as capture:

@@ -1,4 +1,6 @@
-"""Lists of tiles: no pair that a pixel needs is missing, none too many, and who writes them does not matter."""
+"""Lists of tiles: no pair that a pixel needs is missing, none too many,
+and who writes them does not matter.
+"""
 
 import numpy as np
 import pytest
@@ -16,29 +18,44 @@ KINDS = ["small", "round", "long", "needle", "far", "faint"]
 
 
 def splats(kind, count=150):
-    """Return records [count, 16] and boxes [count, 4] of ellipses of one kind, as projection writes them."""
+    """Return records [count, 16] and boxes [count, 4] of ellipses of one kind,
+    as projection writes them.
+    """
     rng = np.random.default_rng(KINDS.index(kind))
     centre = rng.uniform(-20, [WIDTH + 20, HEIGHT + 20], (count, 2))
     axes = {
         "small": rng.uniform(0.5, 2.0, (count, 2)),
         "round": np.exp(rng.uniform(0, 5, (count, 1))) * rng.uniform(0.8, 1.0, (count, 2)),
         "long": np.exp(rng.uniform([-0.6, 2.0], [0.5, 5.0], (count, 2))),
-        "needle": np.exp(rng.uniform([-0.6, 5.0], [-0.5, 8.5], (count, 2))),  # determinant lost in float32
+        # determinant lost in float32
+        "needle": np.exp(rng.uniform([-0.6, 5.0], [-0.5, 8.5], (count, 2))),
         "far": np.exp(rng.uniform(4, 8, (count, 2))),
         "faint": rng.uniform(0.5, 30.0, (count, 2)),
     }[kind]
     if kind == "far":
         centre += rng.normal(size=(count, 2)) * 2.0 * axes
     angle = rng.uniform(0, np.pi, count)
-    turn = np.stack([np.stack([np.cos(angle), -np.sin(angle)], -1), np.stack([np.sin(angle), np.cos(angle)], -1)], -2)
+    turn = np.stack(
+        [
+            np.stack([np.cos(angle), -np.sin(angle)], -1),
+            np.stack([np.sin(angle), np.cos(angle)], -1),
+        ],
+        -2,
+    )
     covariance = np.einsum("nij,nj,nkj->nik", turn, axes**2, turn)
     xx, xy, yy = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
     determinant = np.prod(axes, 1) ** 2
-    opacity = rng.uniform(1 / 255, 1.2 / 255, count) if kind == "faint" else rng.uniform(0.02, 1.0, count)
+    opacity = (
+        rng.uniform(1 / 255, 1.2 / 255, count) if kind == "faint" else rng.uniform(0.02, 1.0, count)
+    )
     cutoff = 2 * np.log(255 * opacity) + 1e-5
     record = np.zeros((count, 16))
     record[:, :2], record[:, 5], record[:, 6] = centre, opacity, -0.5 * cutoff
-    record[:, 2], record[:, 3], record[:, 4] = -0.5 * yy / determinant, xy / determinant, -0.5 * xx / determinant
+    record[:, 2], record[:, 3], record[:, 4] = (
+        -0.5 * yy / determinant,
+        xy / determinant,
+        -0.5 * xx / determinant,
+    )
     reach = np.sqrt(cutoff[:, None] * np.stack([xx, yy], 1)) * 1.0001 + 1e-3
     size = np.array([WIDTH, HEIGHT])
     low, high = np.ceil(centre - reach - 0.5), np.floor(centre + reach - 0.5) + 1
@@ -48,10 +65,16 @@ def splats(kind, count=150):
 
 
 def lists(record, box, shape, capacity=None, device="cpu"):
-    """Return keys and ids of the pairs in the order they are emitted, and the number of pairs there would be."""
+    """Return keys and ids of the pairs in the order they are emitted,
+    and the number of pairs there would be.
+    """
     order = np.random.default_rng(9).permutation(len(record)).astype(np.int32)
     values, threads = ((order, int), (record, Splat), (box, wp.vec4i)), LANES_PER_SPLAT[device]
-    where = [*(wp.array(value, dtype=dtype, device=device) for value, dtype in values), *shape, threads]
+    where = [
+        *(wp.array(value, dtype=dtype, device=device) for value, dtype in values),
+        *shape,
+        threads,
+    ]
     counts, ends = (wp.zeros(len(record), dtype=int, device=device) for _ in range(2))
     wp.launch(tiles.count_pairs, (len(record), threads), where, [counts], device=device)
     wp.utils.array_scan(counts, ends, inclusive=True)
@@ -64,7 +87,9 @@ def lists(record, box, shape, capacity=None, device="cpu"):
 
 
 def touched(record, box, shape, dtype, slack):
-    """Return [tiles, N], by looking at every pixel: whether the power of one reaches its lower bound less ``slack``."""
+    """Return [tiles, N], by looking at every pixel: whether the power of one reaches its lower
+    bound less ``slack``.
+    """
     columns, rows = -(-WIDTH // shape[0]), -(-HEIGHT // shape[1])
     y, x = np.mgrid[: rows * shape[1], : columns * shape[0]]
     found = np.zeros((rows * columns, len(record)), bool)
@@ -72,18 +97,24 @@ def touched(record, box, shape, dtype, slack):
         dx, dy = q[0] - (x + 0.5).astype(dtype), q[1] - (y + 0.5).astype(dtype)
         reached = (dx * q[2] + dy * q[3]) * dx + (dy * q[4]) * dy >= q[6] * (1 + slack) - slack
         reached &= (x >= b[0]) & (x < b[2]) & (y >= b[1]) & (y < b[3])
-        found[:, n] = reached.reshape(rows, shape[1], columns, shape[0]).any(axis=(1, 3)).reshape(-1)
+        found[:, n] = (
+            reached.reshape(rows, shape[1], columns, shape[0]).any(axis=(1, 3)).reshape(-1)
+        )
     return found
 
 
 def rectangles(record, box, shape):
-    """Return [tiles, N]: whether the ellipse reaches the rectangle of a tile's pixel centres; its form is convex."""
+    """Return [tiles, N]: whether the ellipse reaches the rectangle of a tile's pixel centres;
+    its form is convex.
+    """
     columns, rows = -(-WIDTH // shape[0]), -(-HEIGHT // shape[1])
     found = np.zeros((rows * columns, len(record)), bool)
     for n, (q, b) in enumerate(zip(record.astype(np.float64), box, strict=True)):
         if b[2] == 0:
             continue
-        row, column = np.mgrid[b[1] // shape[1] : -(-b[3] // shape[1]), b[0] // shape[0] : -(-b[2] // shape[0])]
+        row, column = np.mgrid[
+            b[1] // shape[1] : -(-b[3] // shape[1]), b[0] // shape[0] : -(-b[2] // shape[0])
+        ]
         left, top = column * shape[0] + 0.5 - q[0], row * shape[1] + 0.5 - q[1]
         right, bottom = left + shape[0] - 1, top + shape[1] - 1
         best = np.full(row.shape, -np.inf)
@@ -100,7 +131,9 @@ def rectangles(record, box, shape):
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("kind", KINDS)
 def test_lists_hold_what_a_pixel_needs_and_little_else(kind, shape):
-    """Every pixel finds its splats, in float32 and float64; what else is listed touches the tile's rectangle."""
+    """Every pixel finds its splats, in float32 and float64;
+    what else is listed touches the tile's rectangle.
+    """
     record, box = splats(kind)
     keys, ids, total = lists(record, box, shape)
     listed = np.zeros((keys.max() + 1, len(record)), int)
@@ -110,7 +143,9 @@ def test_lists_hold_what_a_pixel_needs_and_little_else(kind, shape):
     for dtype in (np.float32, np.float64):
         needed = touched(record, box, shape, dtype, 0.0)[: len(listed)]
         assert needed.sum() > 50
-        assert not (needed & (listed == 0)).any(), f"{(needed & (listed == 0)).sum()} of {needed.sum()} pairs missing"
+        assert not (needed & (listed == 0)).any(), (
+            f"{(needed & (listed == 0)).sum()} of {needed.sum()} pairs missing"
+        )
     exact = rectangles(record, box, shape)
     assert exact.sum() == exact[: len(listed)].sum()
     spare = (listed == 1) & ~exact[: len(listed)]
@@ -133,7 +168,9 @@ def test_pairs_are_in_the_order_that_a_stable_sort_by_tile_needs():
 
 @pytest.mark.parametrize("capacity", [0, 1, 100, 20_000])
 def test_a_capacity_keeps_the_nearest_pairs_and_marks_what_is_free(capacity):
-    """Pairs that do not fit are missing at the end; places that none takes carry the number of tiles."""
+    """Pairs that do not fit are missing at the end; places that none takes carry the number of
+    tiles.
+    """
     record, box = splats("round", 60)
     keys, ids, total = lists(record, box, (8, 4))
     assert 200 < total < 20_000
@@ -148,14 +185,22 @@ def test_a_capacity_keeps_the_nearest_pairs_and_marks_what_is_free(capacity):
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("count", [0, 1, 2, 31, 32, 33, 34, 1089, 5000])
 def test_lists_begin_where_sorted_keys_do(count, device):
-    """Of every tile, also of those without a pair; behind the last one are the places that no pair takes."""
+    """Of every tile, also of those without a pair; behind the last one are the places that no pair
+    takes.
+    """
     rng, columns = np.random.default_rng(count), 40
     for used in (1, 5, columns + 1):  # the last one: some places are free
-        sorted_keys = np.sort(rng.choice(columns + 1, used, replace=False)[rng.integers(0, used, count)])
+        sorted_keys = np.sort(
+            rng.choice(columns + 1, used, replace=False)[rng.integers(0, used, count)]
+        )
         keys = wp.array(sorted_keys, dtype=wp.int32, device=device)
         first, lanes = wp.full(columns + 1, -1, dtype=int, device=device), LANES_PER_SPLAT[device]
-        wp.launch(tiles.tile_starts, (columns + 1, lanes), [keys, count, lanes], [first], device=device)
-        np.testing.assert_array_equal(first.numpy(), np.searchsorted(sorted_keys, np.arange(columns + 1)))
+        wp.launch(
+            tiles.tile_starts, (columns + 1, lanes), [keys, count, lanes], [first], device=device
+        )
+        np.testing.assert_array_equal(
+            first.numpy(), np.searchsorted(sorted_keys, np.arange(columns + 1))
+        )
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
@@ -164,12 +209,16 @@ def test_lists_begin_where_sorted_keys_do(count, device):
 def test_a_warp_writes_the_pairs_of_a_splat_as_one_thread_does(kind, capacity):
     """On CUDA lists are those of the CPU, pair by pair: without contraction both round alike."""
     record, box = splats(kind)
-    for got, want in zip(*(lists(record, box, (8, 4), capacity, device) for device in ("cuda", "cpu")), strict=True):
+    for got, want in zip(
+        *(lists(record, box, (8, 4), capacity, device) for device in ("cuda", "cpu")), strict=True
+    ):
         np.testing.assert_array_equal(got, want)
 
 
 def test_boxes_cut_lists():
-    """A splat is listed nowhere outside the tiles of its box, however far its ellipse reaches: the 3-sigma square."""
+    """A splat is listed nowhere outside the tiles of its box, however far its ellipse reaches:
+    the 3-sigma square.
+    """
     record, box = splats("round")
     box = np.where(box[:, 2:3] > 0, np.array([16, 16, 48, 32], np.int32), 0).astype(np.int32)
     keys, _, total = lists(record, box, (8, 4))
@@ -180,7 +229,9 @@ def test_boxes_cut_lists():
 
 
 def test_a_needle_across_a_large_image_keeps_its_pixels(monkeypatch):
-    """Far from the centre of a needle float32 loses much of the power; what it decides in a pixel's favour counts."""
+    """Far from the centre of a needle float32 loses much of the power;
+    what it decides in a pixel's favour counts.
+    """
     monkeypatch.setattr("test_tiles.WIDTH", 1280)
     monkeypatch.setattr("test_tiles.HEIGHT", 640)
     record, box = splats("needle", 120)

@@ -1,4 +1,6 @@
-"""The TöRF folder: what is read from where in both of its conventions, and that writing is the inverse of reading."""
+"""The TöRF folder: what is read from where in both of its conventions,
+and that writing is the inverse of reading.
+"""
 
 import dataclasses
 import shutil
@@ -8,7 +10,15 @@ from unittest import mock
 import numpy as np
 import pytest
 import torf_folder
-from ftorf_folder import CAPTURE_ONLY, SAMPLE, assert_same, assert_same_bits, fingerprint, random_poses, scene
+from ftorf_folder import (
+    CAPTURE_ONLY,
+    SAMPLE,
+    assert_same,
+    assert_same_bits,
+    fingerprint,
+    random_poses,
+    scene,
+)
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from sequences import NAMES, changed, sequence_of, values_of
@@ -36,40 +46,51 @@ def folder(original, tmp_path):
 
 
 def test_a_phasor_becomes_four_raw_frames(folder):
-    """re/2, -re/2, im/2, -im/2 with the canonical shifts, one time and one pose; colour at the first of the four."""
+    """re/2, -re/2, im/2, -im/2 with the canonical shifts, one time and one pose;
+    colour at the first of the four.
+    """
     got = Sequence.open(folder)
     phasors, _ = torf_folder.images(3)
     assert got.from_phasors
     assert (got.frames, got.height, got.width, got.measured.all()) == (12, 6, 8, True)
     for i in range(3):
         re, im = phasors[i, ..., 0], phasors[i, ..., 1]
-        assert_same_bits(got.quads[4 * i : 4 * i + 4], np.stack([re, -re, im, -im]) / np.float32(2), "quads")
+        assert_same_bits(
+            got.quads[4 * i : 4 * i + 4], np.stack([re, -re, im, -im]) / np.float32(2), "quads"
+        )
     np.testing.assert_array_equal(got.shifts, [*CANONICAL_SHIFTS] * 3)
     np.testing.assert_array_equal(got.times, np.repeat([0, 1 / 30, 2 / 30], 4))
     np.testing.assert_array_equal(got.camera_from_world, np.repeat(torf_folder.poses(3), 4, axis=0))
     assert list(got.colour.images) == [0, 4, 8]
     assert_same_bits(got.colour.images[4], torf_folder.colour_images(3)[1], "colour")
     assert got.calibration == Calibration(f_mod_hz=SPEED_OF_LIGHT / 10)
-    assert (got.intrinsics.cx, got.intrinsics.cy) == (4.0, 3.0)  # stored 3.5, 2.5 for integer centres
+    # stored 3.5, 2.5 for integer centres
+    assert (got.intrinsics.cx, got.intrinsics.cy) == (4.0, 3.0)
     assert got.colour.intrinsics == Intrinsics(fx=20.0, fy=21.0, cx=7.5, cy=5.5)
     assert got.sources["times"] == "default 30 Hz"
 
 
 def test_phasors_decode_to_the_truth(folder):
-    """The length of the phasor, its angle and the distance are those that made the folder, for every raw frame."""
+    """The length of the phasor, its angle and the distance are those that made the folder,
+    for every raw frame.
+    """
     got = Sequence.open(folder)
     phasors, distance = torf_folder.images(3)
     truth = got.truth()
     assert truth.known.all()
     for i in range(3):
-        np.testing.assert_allclose(decode.quartet_phasor(got, i), np.moveaxis(phasors[i, ..., :2], -1, 0), atol=1e-7)
+        np.testing.assert_allclose(
+            decode.quartet_phasor(got, i), np.moveaxis(phasors[i, ..., :2], -1, 0), atol=1e-7
+        )
         np.testing.assert_allclose(decode.closed_form_distance(got, i), distance[i], atol=1e-5)
         assert_same_bits(truth.distance[4 * i : 4 * i + 4], np.stack([distance[i]] * 4), "distance")
 
 
 @pytest.mark.parametrize("first_id", [1, 0, 17])
 def test_both_conventions_are_one_sequence(folder, tmp_path, first_id):
-    """Ids from 0001 and .mat files, as originally published, or renumbered: nothing differs, truth included."""
+    """Ids from 0001 and .mat files, as originally published, or renumbered: nothing differs,
+    truth included.
+    """
     other = torf_folder.build(tmp_path / "other", first_id=first_id, matlab=True)
     before = fingerprint(other)
     got = Sequence.open(other)
@@ -82,7 +103,9 @@ def test_both_conventions_are_one_sequence(folder, tmp_path, first_id):
 
 @pytest.mark.parametrize("first_id", [0, 1])
 def test_a_gap_is_not_measured_and_nothing_moves_up(tmp_path, first_id):
-    """The four raw frames of a missing phasor are masked; later ones keep their times, poses and colour."""
+    """The four raw frames of a missing phasor are masked; later ones keep their times,
+    poses and colour.
+    """
     folder = torf_folder.build(tmp_path / "seq", 4, first_id=first_id)
     want = Sequence.open(folder)
     (folder / f"tof/{first_id + 1:04d}.npy").unlink()
@@ -123,19 +146,26 @@ def test_times_are_the_file_s_unless_a_rate_is_given(folder):
 
 @pytest.mark.parametrize("shape", [(4, 4), (1, 4, 4)])
 def test_the_relative_pose_goes_from_colour_to_tof(folder, shape):
-    """A point in front of the colour camera, taken by E to the ToF camera, is the same point of the world."""
+    """A point in front of the colour camera, taken by E to the ToF camera,
+    is the same point of the world.
+    """
     np.save(folder / "cams/relative_pose.npy", torf_folder.RELATIVE.reshape(shape))
     np.save(folder / "cams/color_extrinsics.npy", torf_folder.poses(3))  # replaced
     got = Sequence.open(folder)
     world = np.array([0.3, -0.2, 2.0, 1.0])
     for n in (0, 5, 11):
-        in_colour, in_tof = got.colour.camera_from_world[n] @ world, got.camera_from_world[n] @ world
+        in_colour, in_tof = (
+            got.colour.camera_from_world[n] @ world,
+            got.camera_from_world[n] @ world,
+        )
         np.testing.assert_allclose(torf_folder.RELATIVE @ in_colour, in_tof, atol=1e-12)
     assert "replaces" in got.sources["colour_from_world"]
 
 
 def test_colour_poses_come_from_the_best_file(folder):
-    """relative_pose, then color_extrinsics that are not all identity, then R and T, then the ToF camera's."""
+    """relative_pose, then color_extrinsics that are not all identity, then R and T,
+    then the ToF camera's.
+    """
     import scipy.io
 
     own = random_poses(3, np.random.default_rng(2))
@@ -164,7 +194,9 @@ def test_colour_poses_come_from_the_best_file(folder):
 
 
 def test_without_calibration_the_defaults_are_used_and_named(folder):
-    """10 m, offset 0, identity poses, a colour camera scaled from the ToF camera; each says what it is."""
+    """10 m, offset 0, identity poses, a colour camera scaled from the ToF camera;
+    each says what it is.
+    """
     for path in (folder / "cams").iterdir():
         if path.name != "tof_intrinsics.npy":
             path.unlink()
@@ -172,18 +204,33 @@ def test_without_calibration_the_defaults_are_used_and_named(folder):
     assert (got.calibration.f_mod_hz, got.calibration.phase_offset) == (SPEED_OF_LIGHT / 10, 0.0)
     np.testing.assert_array_equal(got.camera_from_world, np.tile(np.eye(4), (12, 1, 1)))
     assert got.colour.intrinsics == got.intrinsics.scaled(2, 2)
-    for name in ("f_mod_hz", "phase_offset", "times", "camera_from_world", "quad_scale", "novel_from_world"):
+    for name in (
+        "f_mod_hz",
+        "phase_offset",
+        "times",
+        "camera_from_world",
+        "quad_scale",
+        "novel_from_world",
+    ):
         assert got.sources[name].startswith("default"), name
     for name in ("colour_intrinsics", "colour_from_world", "pixel_centre"):
         assert got.sources[name].startswith("inferred"), name
     shutil.rmtree(folder / "color")
     got = Sequence.open(folder)
-    assert (got.colour.images, got.colour.intrinsics, got.colour.camera_from_world) == ({}, None, None)
+    assert (got.colour.images, got.colour.intrinsics, got.colour.camera_from_world) == (
+        {},
+        None,
+        None,
+    )
 
 
-@pytest.mark.parametrize(("centre", "cx", "added"), [(None, 4.0, 0.0), ("integer", 4.0, 0.5), ("half", 3.9, 0.0)])
+@pytest.mark.parametrize(
+    ("centre", "cx", "added"), [(None, 4.0, 0.0), ("integer", 4.0, 0.5), ("half", 3.9, 0.0)]
+)
 def test_pixel_centres_are_those_of_both_cameras(folder, centre, cx, added):
-    """The width is 8: cx = 4 means half-integer centres, for colour too, unless the folder says otherwise."""
+    """The width is 8: cx = 4 means half-integer centres, for colour too,
+    unless the folder says otherwise.
+    """
     np.save(folder / "cams/tof_intrinsics.npy", np.array([[9.0, 0, cx], [0, 9.0, 2.5], [0, 0, 1]]))
     if centre:
         (folder / "cams/pixel_centre.json").write_text(f'{{"pixel_centre": "{centre}"}}')
@@ -196,7 +243,10 @@ def test_every_field_names_its_source(folder):
     """Whatever the reader fills, it says where it is from, in one of four words."""
     got = Sequence.open(folder)
     assert set(got.sources) >= NAMES
-    assert all(text.split()[0] in {"file", "default", "inferred", "setting"} for text in got.sources.values())
+    assert all(
+        text.split()[0] in {"file", "default", "inferred", "setting"}
+        for text in got.sources.values()
+    )
 
 
 def test_truth_is_distance_before_depth(folder):
@@ -228,7 +278,9 @@ def test_reading_never_opens_truth_or_masks(folder):
 
 
 def test_raw_quads_are_looked_for_before_phasors(folder, tmp_path):
-    """An F-TöRF folder may have phasors too, and its reader is chosen; a TöRF folder has a reader of its own."""
+    """An F-TöRF folder may have phasors too, and its reader is chosen;
+    a TöRF folder has a reader of its own.
+    """
     mixed = write("ftorf", tmp_path / "mixed", *scene())
     shutil.copytree(folder / "tof", mixed / "tof")
     assert not Sequence.open(mixed).from_phasors
@@ -284,10 +336,14 @@ def phasor_sequences(draw):
 @settings(max_examples=60, deadline=None, derandomize=True, database=None)
 @given(phasor_sequences())
 def test_write_then_read_is_the_identity(tmp_path_factory, drawn):
-    """Bit by bit, poses of both cameras included, whichever phasor is missing; and a second round too."""
+    """Bit by bit, poses of both cameras included, whichever phasor is missing;
+    and a second round too.
+    """
     sequence, truth, same = drawn
     with mock.patch("os.fsync"):  # waiting for the disk, thousands of times, shows nothing here
-        first = write("torf", tmp_path_factory.mktemp("round") / "first", sequence, truth, readme="# a card\n")
+        first = write(
+            "torf", tmp_path_factory.mktemp("round") / "first", sequence, truth, readme="# a card\n"
+        )
         got = Sequence.open(first)
         again = write("torf", first.parent / "second", got, got.truth())
     want = dataclasses.replace(sequence, quads=sequence.quads * sequence.measured[:, None, None])
@@ -306,7 +362,9 @@ def test_write_then_read_is_the_identity(tmp_path_factory, drawn):
 
 
 def test_an_original_folder_survives_a_round(tmp_path):
-    """Ids from 1 and .mat files: read, write, read gives every bit; the third channel becomes the length."""
+    """Ids from 1 and .mat files: read, write, read gives every bit;
+    the third channel becomes the length.
+    """
     folder = torf_folder.build(tmp_path / "seq", first_id=1, matlab=True, phase_offset=0.2)
     np.save(folder / "test_poses.npy", torf_folder.poses(5)[:, :3])
     want = Sequence.open(folder)
@@ -316,13 +374,19 @@ def test_an_original_folder_survives_a_round(tmp_path):
     assert_same_bits(got.truth().distance, want.truth().distance, "distance")
     assert len(got.novel_from_world) == 5
     stored = np.load(again / "tof/0000.npy")
-    assert_same_bits(stored[..., :2], torf_folder.images(3, phase_offset=0.2)[0][0, ..., :2], "phasor")
+    assert_same_bits(
+        stored[..., :2], torf_folder.images(3, phase_offset=0.2)[0][0, ..., :2], "phasor"
+    )
     np.testing.assert_allclose(stored[..., 2], np.hypot(stored[..., 0], stored[..., 1]), rtol=1e-6)
-    np.testing.assert_allclose(np.load(again / "cams/relative_pose.npy"), torf_folder.RELATIVE, atol=1e-12)
+    np.testing.assert_allclose(
+        np.load(again / "cams/relative_pose.npy"), torf_folder.RELATIVE, atol=1e-12
+    )
 
 
 def test_complete_quartets_of_raw_quads_become_phasors(tmp_path):
-    """In any order of the slots, with the time, pose, colour and truth of raw frame 4i; the constant part is gone."""
+    """In any order of the slots, with the time, pose, colour and truth of raw frame 4i;
+    the constant part is gone.
+    """
     poses = random_poses(14, np.random.default_rng(3))
     colour = {n: np.full((2, 2, 3), 0.5 * n, np.float32) for n in range(14)}
     sequence, truth = scene(14, camera_from_world=poses, colour=colour, times=np.arange(14) / 100)
@@ -340,7 +404,10 @@ def test_complete_quartets_of_raw_quads_become_phasors(tmp_path):
     np.testing.assert_array_equal(got.camera_from_world, np.repeat(poses[[0, 4, 8]], 4, axis=0))
     assert {n: image[0, 0, 0] for n, image in got.colour.images.items()} == {0: 0.0, 4: 2.0, 8: 4.0}
     np.testing.assert_array_equal(got.truth().distance[8:12], np.stack([truth.distance[8]] * 4))
-    assert (got.calibration.dc_offset, got.calibration.phase_offset) == (0.0, sequence.calibration.phase_offset)
+    assert (got.calibration.dc_offset, got.calibration.phase_offset) == (
+        0.0,
+        sequence.calibration.phase_offset,
+    )
 
 
 def test_the_sample_decodes_alike_as_phasors(tmp_path):
@@ -354,7 +421,9 @@ def test_the_sample_decodes_alike_as_phasors(tmp_path):
 
 
 def test_everything_written_is_described(folder, tmp_path):
-    """No file of the writer lacks an entry in data_specs/, and its type is one that the entry allows."""
+    """No file of the writer lacks an entry in data_specs/,
+    and its type is one that the entry allows.
+    """
     sequence = changed(Sequence.open(folder), quad_scale=2.0, novel_from_world=torf_folder.poses(2))
     written = write("torf", tmp_path / "written", sequence, sequence.truth())
     described = {path: field for field in specs.fields("torf").values() for path in field.paths}
@@ -368,10 +437,15 @@ def test_everything_written_is_described(folder, tmp_path):
 
 
 def test_descriptions_cover_the_sequence_and_the_truth():
-    """Every field of Sequence and Truth but flow is filled from a described one, and the page names every path."""
+    """Every field of Sequence and Truth but flow is filled from a described one,
+    and the page names every path.
+    """
     fields = specs.fields("torf").values()
     filled = {name for field in fields for name in field.fills}
-    names = (NAMES | {f.name for f in dataclasses.fields(Truth)}) - {"forward_flow", "backward_flow"}
+    names = (NAMES | {f.name for f in dataclasses.fields(Truth)}) - {
+        "forward_flow",
+        "backward_flow",
+    }
     assert filled == names - CAPTURE_ONLY
     page = (ROOT / "data_specs" / "README.md").read_text(encoding="utf-8")
     table = page.partition("## The fields of TöRF")[2].partition("\n## ")[0]
@@ -416,7 +490,9 @@ def test_phasors_that_are_none_are_a_programming_mistake(folder, tmp_path, name,
     """Raw frames that differ within a phasor would be lost without a word."""
     sequence = Sequence.open(folder)
     with pytest.raises(ValueError, match=f"from_phasors: {name}"):
-        write("torf", tmp_path / "new", changed(sequence, **{name: change(values_of(sequence)[name])}))
+        write(
+            "torf", tmp_path / "new", changed(sequence, **{name: change(values_of(sequence)[name])})
+        )
 
 
 def test_phasors_are_no_raw_quads(folder, tmp_path):

@@ -70,13 +70,29 @@ def with_nan():
         (PHASOR, with_nan(), ["phasor", "nan", "[2, 3, 1]", "1 values"]),
         ("color/0002.npy", np.zeros((12, 17, 3)), ["colour", "(12, 16, 3)", "(12, 17, 3)"]),
         ("color/0002.npy", np.full((12, 16, 3), np.inf), ["colour", "inf"]),
-        ("cams/tof_extrinsics.npy", np.tile(np.eye(4), (4, 1, 1)), ["tof_extrinsics", "3 phasors", "4"]),
-        ("cams/tof_extrinsics.npy", np.tile(2 * np.eye(4), (3, 1, 1)), ["tof_extrinsics", "rotations"]),
-        ("cams/tof_extrinsics.npy", np.tile(np.diag([1.0, 1, -1, 1]), (3, 1, 1)), ["tof_extrinsics", "determinant"]),
+        (
+            "cams/tof_extrinsics.npy",
+            np.tile(np.eye(4), (4, 1, 1)),
+            ["tof_extrinsics", "3 phasors", "4"],
+        ),
+        (
+            "cams/tof_extrinsics.npy",
+            np.tile(2 * np.eye(4), (3, 1, 1)),
+            ["tof_extrinsics", "rotations"],
+        ),
+        (
+            "cams/tof_extrinsics.npy",
+            np.tile(np.diag([1.0, 1, -1, 1]), (3, 1, 1)),
+            ["tof_extrinsics", "determinant"],
+        ),
         ("cams/tof_extrinsics.npy", np.full((3, 4, 4), np.nan), ["tof_extrinsics", "nan"]),
         ("cams/tof_extrinsics.npy", np.eye(4), ["tof_extrinsics", "(P, 4, 4)"]),
         ("cams/relative_pose.npy", 2 * np.eye(4), ["relative_pose", "rotations"]),
-        ("cams/relative_pose.npy", np.tile(np.eye(4), (3, 1, 1)), ["relative_pose", "(1, 4, 4)", "(3, 4, 4)"]),
+        (
+            "cams/relative_pose.npy",
+            np.tile(np.eye(4), (3, 1, 1)),
+            ["relative_pose", "(1, 4, 4)", "(3, 4, 4)"],
+        ),
         ("cams/tof_intrinsics.npy", np.diag([0.2, 0.2, 1.0]), ["implausible intrinsics"]),
         ("cams/color_intrinsics.npy", np.diag([0.2, 0.2, 1.0]), ["implausible intrinsics"]),
         ("cams/depth_range.npy", np.float64(10e6), ["depth_range", "1e+07"]),
@@ -160,7 +176,9 @@ def test_raw_quads_are_not_read_as_phasors(folder):
 
 
 def test_one_pass_names_everything_that_is_wrong(folder, capsys):
-    """Seven broken files of different kinds in one error, and the command prints it and exits with 3."""
+    """Seven broken files of different kinds in one error,
+    and the command prints it and exits with 3.
+    """
     np.save(folder / PHASOR, with_nan())
     np.save(folder / "tof/0002.npy", np.zeros((6, 9, 3)))
     np.save(folder / "color/0000.npy", np.full((12, 16, 3), np.nan))
@@ -171,7 +189,15 @@ def test_one_pass_names_everything_that_is_wrong(folder, capsys):
     error = refused(folder)
     assert error.what == "7 problems"
     assert error.where == str(folder)
-    names = (PHASOR, "tof/0002.npy", "color/0000.npy", "depth_range", "tof_extrinsics", "test_poses", "tof_intrinsics")
+    names = (
+        PHASOR,
+        "tof/0002.npy",
+        "color/0000.npy",
+        "depth_range",
+        "tof_extrinsics",
+        "test_poses",
+        "tof_intrinsics",
+    )
     for name in names:
         assert name in error.why, name
     assert main(["check", str(folder)]) == 3

@@ -1,4 +1,6 @@
-"""Interrupted recordings go on at the next raw frame, end with the same bytes, and are never read as sequences."""
+"""Interrupted recordings go on at the next raw frame, end with the same bytes,
+and are never read as sequences.
+"""
 
 import os
 import signal
@@ -24,7 +26,11 @@ COMMAND = HEARS + "import sys; from gftorf_warp.cli import main; sys.exit(main()
 
 def contents(folder):
     """Every file of a folder by relative name."""
-    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_file()
+    }
 
 
 def stop_after(frames):
@@ -44,12 +50,19 @@ def interrupted(out, scene="demo", frames=3, **more):
 
 
 @pytest.mark.parametrize(
-    "more", [{}, {"engine": "mesh", "bounces": 1, "paths": 4}, {"scene": "tour", "format": "torf"}], ids=str
+    "more",
+    [{}, {"engine": "mesh", "bounces": 1, "paths": 4}, {"scene": "tour", "format": "torf"}],
+    ids=str,
 )
 def test_an_interrupted_recording_goes_on_with_the_same_bytes(tmp_path, more):
     """Only what was missing is made, and nobody can tell afterwards."""
     more = {"scene": "demo", **more}
-    whole = simulate(more["scene"], tmp_path / "whole", **OPTIONS, **{k: v for k, v in more.items() if k != "scene"})
+    whole = simulate(
+        more["scene"],
+        tmp_path / "whole",
+        **OPTIONS,
+        **{k: v for k, v in more.items() if k != "scene"},
+    )
     interrupted(tmp_path / "seq", **more)
     assert not (tmp_path / "seq").exists()
     done = []
@@ -76,7 +89,9 @@ def test_another_command_is_refused_unless_fresh(tmp_path):
         simulate("demo", tmp_path / "seq", **{**OPTIONS, "seed": 4})
     assert contents(partial_of(tmp_path / "seq")) == before
     simulate("demo", tmp_path / "seq", **{**OPTIONS, "seed": 4}, fresh=True)
-    assert contents(tmp_path / "seq") == contents(simulate("demo", tmp_path / "other", **{**OPTIONS, "seed": 4}))
+    assert contents(tmp_path / "seq") == contents(
+        simulate("demo", tmp_path / "other", **{**OPTIONS, "seed": 4})
+    )
     assert not partial_of(tmp_path / "seq").exists()
 
 
@@ -112,7 +127,9 @@ def test_two_processes_do_not_record_the_same(tmp_path):
 
     with pytest.raises(BusyError, match=str(os.getpid())):
         simulate("demo", tmp_path / "seq", **OPTIONS, progress=meanwhile)
-    assert len(list(partial_of(tmp_path / "seq").glob("*.npz"))) == 1, "the second removed what the first had made"
+    assert len(list(partial_of(tmp_path / "seq").glob("*.npz"))) == 1, (
+        "the second removed what the first had made"
+    )
 
 
 def test_a_mistake_leaves_nothing(tmp_path, monkeypatch):
@@ -149,14 +166,22 @@ def test_a_place_that_cannot_be_written_to_is_named_before_anything_is_made(tmp_
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory):
     """What nobody stopped."""
-    return simulate("demo", tmp_path_factory.mktemp("undisturbed") / "seq", size=(96, 72), frames=16)
+    return simulate(
+        "demo", tmp_path_factory.mktemp("undisturbed") / "seq", size=(96, 72), frames=16
+    )
 
 
-@pytest.mark.parametrize("kind", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL], ids=lambda s: s.name)
+@pytest.mark.parametrize(
+    "kind", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL], ids=lambda s: s.name
+)
 def test_a_signal_loses_no_finished_frame(tmp_path, kind, undisturbed):
-    """The command line, stopped in the middle however hard, goes on and gives the bytes of one that was not."""
+    """The command line, stopped in the middle however hard,
+    goes on and gives the bytes of one that was not.
+    """
     command = ["simulate", "demo", "--size", "96x72", "--frames", "16", "--out"]
-    process = subprocess.Popen([sys.executable, "-c", COMMAND, *command, str(tmp_path / "seq")], stderr=subprocess.PIPE)
+    process = subprocess.Popen(
+        [sys.executable, "-c", COMMAND, *command, str(tmp_path / "seq")], stderr=subprocess.PIPE
+    )
     folder = partial_of(tmp_path / "seq")
     while len(list(folder.glob("*.npz")) if folder.exists() else []) < 3 and process.poll() is None:
         time.sleep(0.005)
@@ -166,10 +191,14 @@ def test_a_signal_loses_no_finished_frame(tmp_path, kind, undisturbed):
     kept = {path.name: path.stat().st_mtime_ns for path in folder.glob("*.npz")}
     assert 3 <= len(kept) < 16, "the signal came too late to be a test"
     done = []
-    simulate("demo", tmp_path / "seq", size=(96, 72), frames=16, progress=lambda n, _: done.append(n))
+    simulate(
+        "demo", tmp_path / "seq", size=(96, 72), frames=16, progress=lambda n, _: done.append(n)
+    )
     assert len(done) == 16 - len(kept)
     assert contents(tmp_path / "seq") == contents(undisturbed)
-    np.testing.assert_array_equal(Sequence.open(undisturbed).quads, Sequence.open(tmp_path / "seq").quads)
+    np.testing.assert_array_equal(
+        Sequence.open(undisturbed).quads, Sequence.open(tmp_path / "seq").quads
+    )
 
 
 @pytest.mark.parametrize(

@@ -24,7 +24,9 @@ def run(tmp_path):
 
 
 def test_every_raw_frame_is_rendered_by_default(run, tmp_path):
-    """Values in float32 as rendered, the truncated quartet included; a preview each, and a list of what is where."""
+    """Values in float32 as rendered, the truncated quartet included; a preview each,
+    and a list of what is where.
+    """
     out = render_to_folder(run, tmp_path / "out")
     assert sorted(path.name for path in out.iterdir()) == ["distance", "quads", "renders.json"]
     for n in (0, 5, FRAMES - 1):
@@ -35,7 +37,11 @@ def test_every_raw_frame_is_rendered_by_default(run, tmp_path):
         quads = read_exr(out / "quads" / f"{n:06d}.exr")
         assert set(quads) == {"quad_000", "quad_180", "quad_090", "quad_270"}
         np.testing.assert_array_equal(quads["quad_180"], rendering.quads[1].numpy())
-    assert len(list((out / "distance").glob("*.exr"))) == len(list((out / "distance").glob("*.png"))) == FRAMES
+    assert (
+        len(list((out / "distance").glob("*.exr")))
+        == len(list((out / "distance").glob("*.png")))
+        == FRAMES
+    )
     listed = json.loads((out / "renders.json").read_text())
     assert listed["times_s"] == pytest.approx([n / 120 for n in range(FRAMES)])
     assert listed["channels"]["distance"] == ["distance", "opacity"]
@@ -56,7 +62,9 @@ def test_previews_of_all_times_share_a_scale(run, tmp_path):
 
 
 def test_previews_of_quads_are_in_a_row_with_white_between(run):
-    """Each pixel in the colour of its value, grey where there is none: what any reader makes of colours by number."""
+    """Each pixel in the colour of its value, grey where there is none:
+    what any reader makes of colours by number.
+    """
     import cv2
 
     images = renders.named("quads", {"quads": run.render(0.02).quads.numpy()}, run.sensor)
@@ -64,21 +72,27 @@ def test_previews_of_quads_are_in_a_row_with_white_between(run):
     scale = previews.preview_scale("quads", [images])
     content = np.frombuffer(previews.preview("quads", images, scale), np.uint8)
     rgb = cv2.imdecode(content, cv2.IMREAD_COLOR)[..., ::-1]
-    want = pictures.side_by_side([pictures.colour_mapped(image, scale) for image in images.values()])
+    want = pictures.side_by_side(
+        [pictures.colour_mapped(image, scale) for image in images.values()]
+    )
     np.testing.assert_array_equal(rgb, want)
     assert (want[2, WIDTH + 2 + 3] == pictures.UNKNOWN_GREY).all()
     assert (want[:, WIDTH : WIDTH + 2] == 255).all()
 
 
 def test_chosen_times_and_things(run, tmp_path):
-    """Phasors at two times, at the pose of the nearest raw frame; previews show phase and amplitude."""
+    """Phasors at two times, at the pose of the nearest raw frame;
+    previews show phase and amplitude.
+    """
     import cv2
 
     poses = np.tile(np.eye(4), (FRAMES, 1, 1))
     poses[:, 1, 3] = np.arange(FRAMES)
     sequence = replace(run.sequence(), camera_from_world=poses)
     run.sequence = lambda: sequence
-    out = render_to_folder(run, tmp_path / "out", what=["phasor", "phasor"], times=[3.4 / 120, 8 / 120])
+    out = render_to_folder(
+        run, tmp_path / "out", what=["phasor", "phasor"], times=[3.4 / 120, 8 / 120]
+    )
     assert {camera.camera_from_world[1, 3] for camera in run.cameras} == {3.0, 8.0}
     images = read_exr(out / "phasor" / "000001.exr")
     np.testing.assert_allclose(np.hypot(images["re"], images["im"]), images["amplitude"], rtol=1e-5)
@@ -86,15 +100,21 @@ def test_chosen_times_and_things(run, tmp_path):
     rgb = cv2.imread(str(out / "phasor" / "000001.png"))[..., ::-1]
     assert rgb.shape == (HEIGHT, 2 * WIDTH + 2, 3)
     phase = analytic_run.PHASE_SLOPE * (true_distance(8) + analytic_run.QUAD_ERROR)
-    np.testing.assert_array_equal(rgb[:, :WIDTH], pictures.colour_mapped(phase, pictures.phase_scale()))
+    np.testing.assert_array_equal(
+        rgb[:, :WIDTH], pictures.colour_mapped(phase, pictures.phase_scale())
+    )
     assert rgb[0, -1, 0] < rgb[4, WIDTH + 2 + 11, 0], "the box is nearer, so brighter"
     assert len(list((out / "phasor").iterdir())) == 4
 
 
 def test_writing_reports_in_order_and_stops_at_the_first_error(run, tmp_path, monkeypatch):
-    """Files are written by threads: progress still counts up, and what stops one of them stops the command."""
+    """Files are written by threads: progress still counts up,
+    and what stops one of them stops the command.
+    """
     seen = []
-    render_to_folder(run, tmp_path / "out", what="distance", progress=lambda *done: seen.append(done))
+    render_to_folder(
+        run, tmp_path / "out", what="distance", progress=lambda *done: seen.append(done)
+    )
     assert seen == [(k + 1, FRAMES) for k in range(FRAMES)]
 
     def full(path, _):
@@ -107,13 +127,17 @@ def test_writing_reports_in_order_and_stops_at_the_first_error(run, tmp_path, mo
 
 
 def taken(run):
-    """Height of every camera that something was rendered from, without the samples for the previews, and the times."""
+    """Height of every camera that something was rendered from,
+    without the samples for the previews, and the times.
+    """
     return [float(camera.camera_from_world[1, 3]) for camera in run.cameras]
 
 
 @pytest.mark.parametrize("rows", [4, 3])
 def test_poses_from_a_file(run, tmp_path, rows):
-    """Pose k at time k, the shorter list starting over; without times in the middle of the sequence."""
+    """Pose k at time k, the shorter list starting over;
+    without times in the middle of the sequence.
+    """
     poses = np.tile(np.eye(4), (3, 1, 1))
     poses[:, 1, 3] = (1.0, 2.0, 3.0)
     path = tmp_path / "poses.npy"
@@ -165,7 +189,10 @@ def test_novel_poses_are_those_of_the_sequence(run, tmp_path):
         (np.eye(4), r"\(4, 4\)"),
         (np.zeros((2, 4, 3)), r"\(2, 4, 3\)"),
         (np.zeros((0, 4, 4)), r"\(0, 4, 4\)"),
-        (np.stack([np.eye(4), np.diag([1.0, 1.0, -1.0, 1.0])]), "1 of 2 are no rigid motions.*index 1"),
+        (
+            np.stack([np.eye(4), np.diag([1.0, 1.0, -1.0, 1.0])]),
+            "1 of 2 are no rigid motions.*index 1",
+        ),
         (2 * np.eye(4)[None], "no rigid"),
         (np.full((1, 4, 4), np.nan), "not finite"),
         (np.array([["a"]]), "wrong type"),
@@ -231,14 +258,22 @@ def test_colour_is_written_linear_and_shown_as_srgb(run):
     assert list(images) == ["R", "G", "B"]
     assert images["B"].max() == 7.0
     content = previews.preview("colour", images, previews.preview_scale("colour", [images]))
-    assert cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)[0, 0].tolist() == [255, 0, 188]
+    assert cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)[0, 0].tolist() == [
+        255,
+        0,
+        188,
+    ]
 
 
 def test_a_shift_finds_its_quad(run):
-    """A turn more or less is the same shift; one that is not rendered follows from the phasor, constant part too."""
+    """A turn more or less is the same shift; one that is not rendered follows from the phasor,
+    constant part too.
+    """
     rendering, sensor = run.render(0.02), Sensor()
     for shift, channel in ((0.0, 0), (np.pi, 1), (np.pi / 2, 2), (-np.pi / 2, 3), (2 * np.pi, 0)):
-        torch.testing.assert_close(quad_of_shift(rendering, sensor, shift), rendering.quads[channel], rtol=0, atol=0)
+        torch.testing.assert_close(
+            quad_of_shift(rendering, sensor, shift), rendering.quads[channel], rtol=0, atol=0
+        )
     phasor = torch.tensor([3.0, 4.0, 6.0])[:, None, None].expand(-1, *rendering.distance.shape)
     got = quad_of_shift(replace(rendering, phasor=phasor), replace(sensor, dc_offset=0.5), 0.3)
     want = torch.full_like(rendering.distance, 1.5 * np.cos(0.3) + 2.0 * np.sin(0.3) + 1.5)
@@ -268,7 +303,12 @@ def test_scales():
     first, last = pictures.bar(pictures.phase_scale().colours)[0, [0, -1]].astype(int)
     assert np.abs(first - last).max() < 8
     dark = [np.zeros(4)]
-    for scale in (pictures.distance_scale, pictures.error_scale, pictures.amplitude_scale, pictures.signed_scale):
+    for scale in (
+        pictures.distance_scale,
+        pictures.error_scale,
+        pictures.amplitude_scale,
+        pictures.signed_scale,
+    ):
         assert scale(dark).low < scale(dark).high
         assert scale([np.full(4, np.nan)]).high > scale([np.full(4, np.nan)]).low
 

@@ -1,4 +1,6 @@
-"""Waves that are no sines, through the sensor: their contrast, and the error that decoding makes of them."""
+"""Waves that are no sines, through the sensor: their contrast,
+and the error that decoding makes of them.
+"""
 
 import itertools
 import math
@@ -23,15 +25,23 @@ def error(ratios, samples, **more):
     light = np.exp(1j * np.array(sensor.harmonics)[:, None, None] * PHASE)
     quads = [mean_quad(light, np.ones_like(PHASE), sensor.at_frame(j))[0] for j in range(samples)]
     re, im = phasor_from_quads(torch.from_numpy(np.stack(quads)), shifts)
-    return np.angle(np.exp(1j * (np.arctan2(im.numpy(), re.numpy()) - float(sensor.phase_offset) - PHASE)))
+    return np.angle(
+        np.exp(1j * (np.arctan2(im.numpy(), re.numpy()) - float(sensor.phase_offset) - PHASE))
+    )
 
 
-@pytest.mark.parametrize(("samples", "want"), [(3, 0.01976), (4, 0.07110), (6, 0.01976), (8, 0.00803)])
+@pytest.mark.parametrize(
+    ("samples", "want"), [(3, 0.01976), (4, 0.07110), (6, 0.01976), (8, 0.00803)]
+)
 def test_square_waves_wiggle(samples, want):
-    """Sensor notes, T17: two square waves of 50 %; the phase offset shifts the wave and does not change its size."""
+    """Sensor notes, T17: two square waves of 50 %; the phase offset shifts the wave and does not
+    change its size.
+    """
     ratios = contrast_ratios(SQUARE, SQUARE, 59)
     for offset in (0.0, 0.7):
-        assert np.abs(error(ratios, samples, phase_offset=offset)).max() == pytest.approx(want, abs=1e-4)
+        assert np.abs(error(ratios, samples, phase_offset=offset)).max() == pytest.approx(
+            want, abs=1e-4
+        )
 
 
 @pytest.mark.parametrize("samples", [3, 4, 6, 8])
@@ -43,7 +53,9 @@ def test_a_sine_does_not_wiggle(samples):
 
 @pytest.mark.parametrize("samples", [3, 4, 6, 8])
 def test_wiggling_is_its_formula_where_it_is_small(samples):
-    """Sensor notes, 2.6: up to second order in the harmonics; those not beside a multiple of K are unseen."""
+    """Sensor notes, 2.6: up to second order in the harmonics;
+    those not beside a multiple of K are unseen.
+    """
     for ratios in ((0.0, 0.01), (0.02, 0.0, 0.0, -0.01), (0.01, 0.01, 0.01, 0.01, 0.01, 0.01)):
         got, want = error(ratios, samples), wiggling(PHASE, ratios, samples)
         assert np.abs(got - want).max() < 4 * sum(map(abs, ratios)) ** 2
@@ -54,11 +66,15 @@ def test_short_pulses_have_more_contrast():
     """Sensor notes, T18: the first coefficient of a pulse of mean 1 is 2 sin(pi D) / (pi D)."""
     for duty, want in ((1 / 2, 1.2732), (1 / 3, 1.6540), (1 / 4, 1.8006)):
         assert harmonics_of(SQUARE, 1, duty)[0] == pytest.approx(want, abs=1e-4)
-        assert contrasts(SQUARE, SQUARE, 1, duty)[0] == pytest.approx(want * 4 / math.pi / 2, abs=1e-4)
+        assert contrasts(SQUARE, SQUARE, 1, duty)[0] == pytest.approx(
+            want * 4 / math.pi / 2, abs=1e-4
+        )
 
 
 def test_coefficients_are_those_of_the_wave():
-    """Their sum is the wave: on for the duty at height 1 / D, off otherwise; a sine has one of them."""
+    """Their sum is the wave: on for the duty at height 1 / D, off otherwise;
+    a sine has one of them.
+    """
     turn = np.arange(4000) / 4000
     for duty in (0.5, 0.2):
         waves = enumerate(harmonics_of(SQUARE, 400, duty), start=1)
@@ -87,4 +103,6 @@ def test_waves_that_are_none():
         with pytest.raises(ValueError, match="duty"):
             harmonics_of(**{"wave": SQUARE, "count": 3, **wrong})
     with pytest.raises(ValueError, match="number of harmonics"):
-        mean_quad(np.ones((2, 1, 1), complex), np.ones((1, 1)), Sensor(harmonic_contrast=(0.0, 0.1, 0.1)))
+        mean_quad(
+            np.ones((2, 1, 1), complex), np.ones((1, 1)), Sensor(harmonic_contrast=(0.0, 0.1, 0.1))
+        )

@@ -1,7 +1,9 @@
-"""Who may overwrite weights in the ring of wgmma.py: a model of its two groups, in any order of their steps.
+"""Who may overwrite weights in the ring of wgmma.py: a model of its two groups, in any order of
+their steps.
 
-Only a GPU runs the kernel; what this checks is the rule of ``release``: a group that has no tile says of all layers at
-once that it needs their weights no more, and must not be taken for the other one.
+Only a GPU runs the kernel; what this checks is the rule of ``release``: a group that has no tile
+says of all layers at once that it needs their weights no more, and must not be taken for the other
+one.
 """
 
 import random
@@ -29,7 +31,9 @@ class Ring:
         """Ask for a block."""
         slot = block % SLOTS
         assert self.coming[slot] is None, "two blocks are on their way to one slot"
-        assert all(other % SLOTS != slot for group in self.read for other in group), "weights in use are overwritten"
+        assert all(other % SLOTS != slot for group in self.read for other in group), (
+            "weights in use are overwritten"
+        )
         self.coming[slot] = block
         self.sent.append(block)
 
@@ -77,7 +81,9 @@ def group(me, layers, rounds, ring, counts, total):
 @pytest.mark.parametrize("layers", [PUBLISHED, BACK, (1,), (1, 4)], ids=str)
 @pytest.mark.parametrize("tiles", [1, 2, 3, ROUND, ROUND + 1, ROUND + 2, 2 * ROUND + 1])
 def test_every_block_comes_once_and_in_time(tiles, layers):
-    """No slot is filled while a group reads it, no group waits for ever, and all blocks come in their order."""
+    """No slot is filled while a group reads it, no group waits for ever,
+    and all blocks come in their order.
+    """
     rounds = [(begin, min(begin + ROUND, tiles)) for begin in range(0, tiles, ROUND)]
     total = sum(layers) * len(rounds)
     for seed in range(20):

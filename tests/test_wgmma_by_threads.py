@@ -1,9 +1,11 @@
-"""What wgmma.py has for CUDA, executed by 256 fibres of the CPU: a block, its barriers and its tensor cores.
+"""What wgmma.py has for CUDA, executed by 256 fibres of the CPU: a block, its barriers and its
+tensor cores.
 
-Instructions of PTX are replaced by functions that do what they say; all else is the code that a GPU gets. A product
-sees fragments and swizzled weights as wgmma does (PTX, m64n256k16), copies arrive late, and barriers are barriers. A
-fibre runs until it waits, those of a warp in random order, and a warp may rest for a while: what lacks a barrier reads
-what is not yet written, in the same way in every run.
+Instructions of PTX are replaced by functions that do what they say; all else is the code that a GPU
+gets. A product sees fragments and swizzled weights as wgmma does (PTX, m64n256k16), copies arrive
+late, and barriers are barriers. A fibre runs until it waits, those of a warp in random order, and a
+warp may rest for a while: what lacks a barrier reads what is not yet written, in the same way in
+every run.
 """
 
 import fcntl
@@ -65,7 +67,8 @@ struct Barrier {
 };
 alignas(1024) static char block_memory[MEMORY];
 static size_t __cvta_generic_to_shared(const void*) { return 0; }
-static Barrier whole{256}, group_barrier[2]{{128}, {128}}, of_warp[8]{{32}, {32}, {32}, {32}, {32}, {32}, {32}, {32}};
+static Barrier whole{256}, group_barrier[2]{{128}, {128}}, of_warp[8]{{32}, {32}, {32}, {32}, {32},
+    {32}, {32}, {32}};
 static float told[256]; static unsigned words[256], fragments[256][4];
 static void __syncthreads() { whole.arrive_and_wait(); }
 static int __syncthreads_count(bool one) {
@@ -78,11 +81,14 @@ static int __syncthreads_count(bool one) {
 static void named(int number) { group_barrier[number - 1].arrive_and_wait(); }
 static void meet() { of_warp[threadIdx.x >> 5].arrive_and_wait(); }
 static void __threadfence_block() {}
-static unsigned atomicAdd(unsigned* to, unsigned x) { const unsigned old = *to; *to += x; return old; }
+static unsigned atomicAdd(unsigned* to, unsigned x) { const unsigned old = *to; *to += x;
+return old; }
 static unsigned __shfl_sync(unsigned, unsigned x, int from) {
-    words[threadIdx.x] = x; meet(); const unsigned heard = words[threadIdx.x / 32 * 32 + from]; meet(); return heard;
+    words[threadIdx.x] = x; meet(); const unsigned heard = words[threadIdx.x / 32 * 32 + from];
+    meet(); return heard;
 }
-static int __shfl_xor_sync(unsigned all, int x, int by) { return __shfl_sync(all, x, threadIdx.x % 32 ^ by); }
+static int __shfl_xor_sync(unsigned all, int x, int by) {
+    return __shfl_sync(all, x, threadIdx.x % 32 ^ by); }
 static unsigned __ballot_sync(unsigned, bool one) {
     words[threadIdx.x] = one; meet();
     unsigned found = 0;
@@ -114,7 +120,8 @@ static half float_to_half(float x) {
     if (size >= 65520.0f) return {(unsigned short)(sign | 0x7c00)};
     int e; std::frexp(size, &e);
     e = std::max(e, -13);
-    const unsigned m = (unsigned)std::nearbyint(std::ldexp(size, 11 - e));  // may round up to the next power of two
+    // may round up to the next power of two
+    const unsigned m = (unsigned)std::nearbyint(std::ldexp(size, 11 - e));
     return {(unsigned short)(sign | (m < 1024 ? m : ((e + 14) << 10) + (m - 1024)))};
 }
 template <class T> struct array_t { T* data; };
@@ -122,7 +129,8 @@ template <class T> struct array_t { T* data; };
 static unsigned packed(float high, float low) {
     return (unsigned)wp::float_to_half(high).u << 16 | wp::float_to_half(low).u;
 }
-static unsigned packed_relu(float high, float low) { return packed(high > 0 ? high : 0, low > 0 ? low : 0); }
+static unsigned packed_relu(float high, float low) {
+    return packed(high > 0 ? high : 0, low > 0 ? low : 0); }
 
 struct Phase { unsigned done = 0, awaited = 0; };
 static Phase phases[SLOTS];
@@ -154,14 +162,18 @@ static unsigned is_done(unsigned barrier, unsigned parity) {
     next_fibre();
     return 0;
 }
-// D[16 w + g (+ 8)][8 j + 2 t (+ 1)] of a group's 64 x 256, A 16 inputs of its rows, B at a descriptor of 128-byte rows
-template <class Sums, class A> static void tensor(Sums& sums, const A& a, unsigned long long matrix, bool add) {
+// D[16 w + g (+ 8)][8 j + 2 t (+ 1)] of a group's 64 x 256, A 16 inputs of its rows, B at a
+// descriptor of 128-byte rows
+template <class Sums, class A> static void tensor(Sums& sums, const A& a, unsigned long long matrix,
+    bool add) {
     for (int n = 0; n < 4; ++n) fragments[threadIdx.x][n] = a[n];
     meet();
     const unsigned lane = threadIdx.x & 31, g = lane >> 2, t = lane & 3, first = threadIdx.x - lane;
     const unsigned begin = (matrix & 0x3fff) << 4, rows = begin & ~1023u, offset = begin & 127u;
-    if (matrix >> 62 != 1 || (matrix >> 32 & 0x3fff) != 64) { std::puts("another layout"); std::_Exit(1); }
-    auto of = [](unsigned two, int which) { return wp::half_to_float({(unsigned short)(which ? two >> 16 : two)}); };
+    if (matrix >> 62 != 1 || (matrix >> 32 & 0x3fff) != 64) { std::puts("another layout");
+    std::_Exit(1); }
+    auto of = [](unsigned two, int which) {
+        return wp::half_to_float({(unsigned short)(which ? two >> 16 : two)}); };
     float A_[2][16];
     for (int k = 0; k < 16; ++k) for (int half = 0; half < 2; ++half)
         A_[half][k] = of(fragments[first + 4 * g + k % 8 / 2][half + 2 * (k / 8)], k % 2);
@@ -180,7 +192,8 @@ template <class Sums, class A> static void tensor(Sums& sums, const A& a, unsign
     }
     meet();
 }
-// copies of 16 bytes, zeros behind those asked for: some arrive at once, the others when somebody waits for their group
+// copies of 16 bytes, zeros behind those asked for: some arrive at once, the others when somebody
+// waits for their group
 struct Copy { unsigned to; const void* from; int bytes; };
 static std::vector<std::vector<Copy>> groups_of[FIBRES];  // the last one is open
 static void arrive(const Copy& copy) {
@@ -198,8 +211,8 @@ static void wait_copies(unsigned pending) {
     for (; groups.size() > pending + 1; groups.erase(groups.begin()))
         for (const Copy& copy : groups.front()) arrive(copy);
 }
-// ldmatrix .m8n8.x4.trans: lane 8 i + r says where row r of matrix i begins; of each, a lane has column lane / 4, rows
-// 2 (lane % 4) and the one behind it
+// ldmatrix .m8n8.x4.trans: lane 8 i + r says where row r of matrix i begins; of each, a lane has
+// column lane / 4, rows 2 (lane % 4) and the one behind it
 static void load_turned(unsigned& a, unsigned& b, unsigned& c, unsigned& d, unsigned row) {
     if (row % 16) { std::puts("a row not at 16 bytes"); std::_Exit(1); }
     words[threadIdx.x] = row; meet();
@@ -215,16 +228,19 @@ static void load_turned(unsigned& a, unsigned& b, unsigned& c, unsigned& d, unsi
     }
     meet();
 }
-// mma.m16n8k16 .row.col, g = lane / 4, t = lane % 4: A has rows g, g + 8, g, g + 8 at inputs 2 t, 2 t, 2 t + 8 and
-// 2 t + 8, each with the next one, B inputs 2 t and 2 t + 8 of column g, D rows g and g + 8 of columns 2 t and 2 t + 1
-static void mma_16816(float& c0, float& c1, float& c2, float& c3, unsigned a0, unsigned a1, unsigned a2, unsigned a3,
+// mma.m16n8k16 .row.col, g = lane / 4, t = lane % 4: A has rows g, g + 8, g, g + 8 at inputs 2 t, 2
+// t, 2 t + 8 and 2 t + 8, each with the next one, B inputs 2 t and 2 t + 8 of column g, D rows g
+// and g + 8 of columns 2 t and 2 t + 1
+static void mma_16816(float& c0, float& c1, float& c2, float& c3, unsigned a0, unsigned a1,
+    unsigned a2, unsigned a3,
                       unsigned b0, unsigned b1) {
     static unsigned fragments_b[256][2];
     const unsigned own[4] = {a0, a1, a2, a3}, lane = threadIdx.x % 32, first = threadIdx.x - lane;
     for (int n = 0; n < 4; ++n) fragments[threadIdx.x][n] = own[n];
     fragments_b[threadIdx.x][0] = b0; fragments_b[threadIdx.x][1] = b1;
     meet();
-    auto of = [](unsigned two, int which) { return wp::half_to_float({(unsigned short)(which ? two >> 16 : two)}); };
+    auto of = [](unsigned two, int which) {
+        return wp::half_to_float({(unsigned short)(which ? two >> 16 : two)}); };
     float* const c[2][2] = {{&c0, &c1}, {&c2, &c3}};
     for (int half = 0; half < 2; ++half) for (int e = 0; e < 2; ++e) for (int k = 0; k < 16; ++k) {
         const unsigned t = k % 8 / 2, column = 2 * (lane % 4) + e;
@@ -235,7 +251,8 @@ static void mma_16816(float& c0, float& c1, float& c2, float& c3, unsigned a0, u
 }
 template <class T> static std::vector<T> loaded(const char* name) {
     std::FILE* file = std::fopen(name, "rb");
-    std::fseek(file, 0, SEEK_END); std::vector<T> found(std::ftell(file) / sizeof(T)); std::rewind(file);
+    std::fseek(file, 0, SEEK_END); std::vector<T> found(std::ftell(file) / sizeof(T));
+    std::rewind(file);
     if (std::fread(found.data(), sizeof(T), found.size(), file) != found.size()) std::_Exit(2);
     std::fclose(file); return found;
 }
@@ -253,9 +270,11 @@ template <class F> static void on_blocks(unsigned blocks, F f) {
         for (unsigned n = 0; n < FIBRES; ++n) {
             order[n] = n; done[n] = false; groups_of[n].assign(1, {});
             getcontext(&fibres[n]);
-            fibres[n].uc_stack.ss_sp = &stacks[(size_t)n << 18]; fibres[n].uc_stack.ss_size = 1 << 18;
+            fibres[n].uc_stack.ss_sp = &stacks[(size_t)n << 18]; fibres[n].uc_stack.ss_size = 1
+                << 18;
             fibres[n].uc_link = &scheduler;
-            makecontext(&fibres[n], (void (*)())+[] { (*code)(); done[threadIdx.x] = true; idle = 0; }, 0);
+            makecontext(&fibres[n], (void (*)())+[] { (*code)(); done[threadIdx.x] = true; idle = 0;
+                }, 0);
         }
         for (idle = 0; left; ++turns, ++idle) {
             if (idle > 10000) { std::puts("everybody waits"); std::_Exit(1); }
@@ -272,17 +291,22 @@ template <class F> static void on_blocks(unsigned blocks, F f) {
 """
 
 FORWARD = """
-static void rows_forward(int layers, int joined, int keys, int count, wp::array_t<wp::half> position,
-                         wp::array_t<wp::half> forth, wp::array_t<float> shifts, wp::array_t<wp::half> outputs,
+static void rows_forward(int layers, int joined, int keys, int count,
+    wp::array_t<wp::half> position,
+                         wp::array_t<wp::half> forth, wp::array_t<float> shifts,
+                             wp::array_t<wp::half> outputs,
                          wp::array_t<int> masks) { CODE }
 int main(int, char** given) {
-    const int layers = std::stoi(given[1]), joined = std::stoi(given[2]), keys = std::stoi(given[3]);
+    const int layers = std::stoi(given[1]), joined = std::stoi(given[2]), keys =
+        std::stoi(given[3]);
     const int count = std::stoi(given[4]);
-    auto place = loaded<wp::half>("place"), forth = loaded<wp::half>("forth"); auto shifts = loaded<float>("shifts");
+    auto place = loaded<wp::half>("place"), forth = loaded<wp::half>("forth"); auto shifts =
+        loaded<float>("shifts");
     std::vector<wp::half> outputs((size_t)layers * keys * count * 256);
     std::vector<int> masks((size_t)layers * keys * ((count + 63) / 64) * 512);
     on_blocks(BLOCKS, [&] {
-        rows_forward(layers, joined, keys, count, {place.data()}, {forth.data()}, {shifts.data()}, {outputs.data()},
+        rows_forward(layers, joined, keys, count, {place.data()}, {forth.data()}, {shifts.data()},
+            {outputs.data()},
                      {masks.data()});
     });
     stored("outputs", outputs); stored("masks", masks);
@@ -292,19 +316,25 @@ int main(int, char** given) {
 BACKWARD = """
 static void backward(int layers, int joined, int of_keys, int of_rows, wp::array_t<int> listed,
                      wp::array_t<int> starts, wp::array_t<wp::half> after, wp::array_t<float> head,
-                     wp::array_t<wp::half> back, wp::array_t<wp::half> outputs, wp::array_t<int> masks,
+                     wp::array_t<wp::half> back, wp::array_t<wp::half> outputs,
+                         wp::array_t<int> masks,
                      wp::array_t<wp::half> slopes, wp::array_t<float> partials) { CODE }
 int main(int, char** given) {
-    const int layers = std::stoi(given[1]), joined = std::stoi(given[2]), keys = std::stoi(given[3]);
+    const int layers = std::stoi(given[1]), joined = std::stoi(given[2]), keys =
+        std::stoi(given[3]);
     const int count = std::stoi(given[4]);
-    auto after = loaded<wp::half>("after"), back = loaded<wp::half>("back"), outputs = loaded<wp::half>("outputs");
+    auto after = loaded<wp::half>("after"), back = loaded<wp::half>("back"), outputs =
+        loaded<wp::half>("outputs");
     auto head = loaded<float>("head");
-    auto masks = loaded<int>("masks"), listed = loaded<int>("listed"), starts = loaded<int>("starts");
+    auto masks = loaded<int>("masks"), listed = loaded<int>("listed"), starts =
+        loaded<int>("starts");
     std::vector<wp::half> slopes((size_t)layers * listed.size() * 256, wp::half{0x7e00});
     std::vector<float> partials((size_t)layers * keys * BLOCKS * 512);
     on_blocks(BLOCKS, [&] {
-        backward(layers, joined, keys, count, {listed.data()}, {starts.data()}, {after.data()}, {head.data()},
-                 {back.data()}, {outputs.data()}, {masks.data()}, {slopes.data()}, {partials.data()});
+        backward(layers, joined, keys, count, {listed.data()}, {starts.data()}, {after.data()},
+            {head.data()},
+                 {back.data()}, {outputs.data()}, {masks.data()}, {slopes.data()},
+                     {partials.data()});
     });
     stored("slopes", slopes); stored("partials", partials);
 }
@@ -343,7 +373,10 @@ def for_threads(snippet):
             ("cp.async.cg", "copy_16({0}, {1}, {2});"),
             ("cp.async.commit_group", "commit_copies();"),
             ("ldmatrix.sync.aligned.m8n8.x4.trans", "load_turned({0}, {1}, {2}, {3}, {4});"),
-            ("mma.sync.aligned.m16n8k16.row.col", f"mma_16816({', '.join(f'{{{n}}}' for n in range(10))});"),
+            (
+                "mma.sync.aligned.m16n8k16.row.col",
+                f"mma_16816({', '.join(f'{{{n}}}' for n in range(10))});",
+            ),
             ("cvt.rn.relu.f16x2", "{0} = packed_relu({1}, {2});"),
             ("cvt.rn.f16x2", "{0} = packed({1}, {2});"),
         ):
@@ -359,16 +392,28 @@ def for_threads(snippet):
 
 def run(folder, program, function, *numbers):
     """Compile a snippet into a program of threads and run it in its folder."""
-    constants = {"MEMORY": wgmma.SHARED, "SLOTS": wgmma.SLOTS, "BARRIERS": wgmma._RING + wgmma._SUMS_OF_GROUPS}
-    defined = "".join(f"#define {name} {value}\n" for name, value in {**constants, "BLOCKS": BLOCKS}.items())
-    (folder / "block.cpp").write_text(defined + DEVICE + program.replace("CODE", for_threads(function.native_snippet)))
+    constants = {
+        "MEMORY": wgmma.SHARED,
+        "SLOTS": wgmma.SLOTS,
+        "BARRIERS": wgmma._RING + wgmma._SUMS_OF_GROUPS,
+    }
+    defined = "".join(
+        f"#define {name} {value}\n" for name, value in {**constants, "BLOCKS": BLOCKS}.items()
+    )
+    (folder / "block.cpp").write_text(
+        defined + DEVICE + program.replace("CODE", for_threads(function.native_snippet))
+    )
     subprocess.run([compiled(folder), *map(str, numbers)], cwd=folder, check=True, timeout=300)
 
 
 def compiled(folder):
-    """The program of a folder's block.cpp, which all tests and workers of a session compile once."""
+    """The program of a folder's block.cpp, which all tests and workers of a session compile
+    once.
+    """
     session = folder.parent.parent if "PYTEST_XDIST_WORKER" in os.environ else folder.parent
-    program = session / f"block-{hashlib.sha256((folder / 'block.cpp').read_bytes()).hexdigest()[:16]}"
+    program = (
+        session / f"block-{hashlib.sha256((folder / 'block.cpp').read_bytes()).hexdigest()[:16]}"
+    )
     with (session / f"{program.name}.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not program.exists():
@@ -391,7 +436,9 @@ def stored(folder, **arrays):
     ids=["a tile", "tiles of several keys", "a tile more than a round"],
 )
 def test_a_block_of_threads_is_row_by_row(layers, skip_after, count, keys, tmp_path, monkeypatch):
-    """Outputs of two blocks are those of the CPU's own way; nobody waits for ever. Masks: see test_listed_rows.py."""
+    """Outputs of two blocks are those of the CPU's own way; nobody waits for ever. Masks:
+    see test_listed_rows.py.
+    """
     settings = MotionSettings(layers=layers, skip_after=skip_after)
     made = network(half(settings))
     form, place = made.backend.form, made.bind(positions(count))

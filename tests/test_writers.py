@@ -1,4 +1,6 @@
-"""Files beside the rendering: the same whoever writes them, whole or not there, and errors that say what happened."""
+"""Files beside the rendering: the same whoever writes them, whole or not there,
+and errors that say what happened.
+"""
 
 import errno
 import json
@@ -39,7 +41,11 @@ def analytic(tmp_path):
 
 def files_in(folder):
     """Content of every file below a folder, by its name."""
-    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_file()
+    }
 
 
 def test_threads_write_what_one_call_after_the_other_does(analytic, tmp_path, monkeypatch):
@@ -47,7 +53,9 @@ def test_threads_write_what_one_call_after_the_other_does(analytic, tmp_path, mo
     seen, found = [], {}
     for threads in (1, 20):
         monkeypatch.setattr(writers, "THREADS", threads)
-        out = render_to_folder(analytic, tmp_path / str(threads), WHAT, progress=lambda *done: seen.append(done))
+        out = render_to_folder(
+            analytic, tmp_path / str(threads), WHAT, progress=lambda *done: seen.append(done)
+        )
         found[threads] = files_in(out)
     assert found[1] == found[20]
     assert len(found[1]) == 1 + 4 * FRAMES
@@ -56,7 +64,9 @@ def test_threads_write_what_one_call_after_the_other_does(analytic, tmp_path, mo
     (tmp_path / "plain" / "distance").mkdir(parents=True)
     for index, images in enumerate(series):
         writers.write_images(tmp_path / "plain", scales, index, images)
-    assert {name: found[1][name] for name in files_in(tmp_path / "plain")} == files_in(tmp_path / "plain")
+    assert {name: found[1][name] for name in files_in(tmp_path / "plain")} == files_in(
+        tmp_path / "plain"
+    )
 
 
 def scales_and_series(of):
@@ -64,8 +74,12 @@ def scales_and_series(of):
     render, times = of.renderer(), [k / 120 for k in range(FRAMES)]
     few = [(times[k], of.camera) for k in (0, FRAMES // 2, -1)]
     samples = list(views.series_of(render, few, of.sensor, ("distance",)))
-    scales = {"distance": previews.preview_scale("distance", [sample["distance"] for sample in samples])}
-    return scales, views.series_of(render, [(time, of.camera) for time in times], of.sensor, ("distance",))
+    scales = {
+        "distance": previews.preview_scale("distance", [sample["distance"] for sample in samples])
+    }
+    return scales, views.series_of(
+        render, [(time, of.camera) for time in times], of.sensor, ("distance",)
+    )
 
 
 def test_what_stops_a_thread_is_the_error_of_the_command(analytic, tmp_path):
@@ -105,20 +119,29 @@ def test_not_more_images_wait_than_memory_holds(analytic, tmp_path, monkeypatch)
 
 
 def test_arrays_hold_what_pictures_hold(analytic, tmp_path, monkeypatch):
-    """Every channel of every image, mapped or read; written again into the same folder, and not over pictures."""
+    """Every channel of every image, mapped or read; written again into the same folder,
+    and not over pictures.
+    """
     monkeypatch.setattr(stored, "BLOCK", 8)
     pictures = render_to_folder(analytic, tmp_path / "pictures", WHAT)
     seen = []
-    out = render_to_folder(analytic, tmp_path / "out", WHAT, arrays=True, progress=lambda *done: seen.append(done))
+    out = render_to_folder(
+        analytic, tmp_path / "out", WHAT, arrays=True, progress=lambda *done: seen.append(done)
+    )
     names = {f"quads/quad_{degrees}.npy" for degrees in ("000", "180", "090", "270")}
-    assert set(files_in(out)) == {"renders.json", "distance/distance.npy", "distance/opacity.npy"} | names
+    assert (
+        set(files_in(out))
+        == {"renders.json", "distance/distance.npy", "distance/opacity.npy"} | names
+    )
     for name, channels in json.loads((out / "renders.json").read_text())["channels"].items():
         for channel in channels:
             array = np.load(out / name / f"{channel}.npy", mmap_mode="r")
             assert (array.shape, array.dtype) == ((FRAMES, HEIGHT, WIDTH), np.dtype("<f4"))
             assert array.offset == stored.HEADER
             for k in range(FRAMES):
-                np.testing.assert_array_equal(array[k], read_exr(pictures / name / f"{k:06d}.exr")[channel])
+                np.testing.assert_array_equal(
+                    array[k], read_exr(pictures / name / f"{k:06d}.exr")[channel]
+                )
     assert seen == [(stored.BLOCK, FRAMES), (FRAMES, FRAMES)]
     before = files_in(out)
     assert files_in(render_to_folder(analytic, out, WHAT, arrays=True)) == before
@@ -129,16 +152,23 @@ def test_arrays_hold_what_pictures_hold(analytic, tmp_path, monkeypatch):
 
 
 def test_arrays_of_a_replay(run, tmp_path, monkeypatch):  # noqa: F811
-    """Through memory that is used again, of more images than are held at a time: those of single calls."""
+    """Through memory that is used again, of more images than are held at a time:
+    those of single calls.
+    """
     monkeypatch.setattr(stored, "BLOCK", 3)
     monkeypatch.setattr(stored, "HELD", 2 * 3 + 2)
     times = [float(time) for time in np.linspace(0.0, 0.07, 60)]
     cameras = [run.camera] * len(times)
     monkeypatch.setattr(views, "views_to_take", lambda *_: (times, cameras))
     monkeypatch.setattr(type(run), "sequence", lambda _: None)
-    out = render_to_folder(run, tmp_path / "out", ("distance", "phasor", "colour"), times, arrays=True)
+    out = render_to_folder(
+        run, tmp_path / "out", ("distance", "phasor", "colour"), times, arrays=True
+    )
     render = run.renderer((*PLAIN, "colour"))
-    found = {name: np.load(out / f"{name}.npy") for name in ("distance/distance", "phasor/im", "colour/B")}
+    found = {
+        name: np.load(out / f"{name}.npy")
+        for name in ("distance/distance", "phasor/im", "colour/B")
+    }
     for k, time_s in enumerate(times):
         want = render(time_s, run.camera)
         np.testing.assert_array_equal(found["distance/distance"][k], want.distance.cpu().numpy())
@@ -150,7 +180,9 @@ def test_arrays_of_a_replay(run, tmp_path, monkeypatch):  # noqa: F811
 def test_arrays_are_whole_where_the_system_takes_a_part(tmp_path, monkeypatch, taken):
     """A call may write less than it is given, and some systems have no call for several images."""
     images = np.random.default_rng(0).random((3, 5, 7), dtype=np.float32)
-    monkeypatch.setattr(os, "writev", lambda file, rows: os.write(file, b"".join(rows)[:taken]), raising=False)
+    monkeypatch.setattr(
+        os, "writev", lambda file, rows: os.write(file, b"".join(rows)[:taken]), raising=False
+    )
     if not taken:
         monkeypatch.delattr(os, "writev")
         monkeypatch.delattr(os, "posix_fadvise", raising=False)
@@ -162,7 +194,9 @@ def test_arrays_are_whole_where_the_system_takes_a_part(tmp_path, monkeypatch, t
 
 def on_pages(count, height, width):
     """Images that start where pages do, as those of a renderer: no two are the same."""
-    images = np.frombuffer(mmap.mmap(-1, 4 * count * height * width), dtype=np.float32).reshape(count, height, width)
+    images = np.frombuffer(mmap.mmap(-1, 4 * count * height * width), dtype=np.float32).reshape(
+        count, height, width
+    )
     images[:] = np.random.default_rng(1).random(images.shape, dtype=np.float32)
     return images
 
@@ -171,7 +205,9 @@ def on_pages(count, height, width):
 @pytest.mark.parametrize("code", [errno.EINVAL, errno.EFAULT])
 @pytest.mark.parametrize("refused", [(), (0,), (1,), (0, 1, 2)])
 def test_arrays_past_the_systems_memory(tmp_path, monkeypatch, refused, code):
-    """What the disk does not take as it is, it gets as other programs write; the same file in any case."""
+    """What the disk does not take as it is, it gets as other programs write;
+    the same file in any case.
+    """
     images, direct = on_pages(6, 32, 64), []
     right = os.writev
 
@@ -213,7 +249,10 @@ def test_an_error_of_the_disk_is_no_reason_to_try_again(tmp_path, monkeypatch):
         return os.write(file, b"".join(rows))
 
     monkeypatch.setattr(os, "writev", writev, raising=False)
-    with pytest.raises(UsageError, match="Input/output"), stored.Stored(tmp_path / "a.npy", (2, 4, 4)) as file:
+    with (
+        pytest.raises(UsageError, match="Input/output"),
+        stored.Stored(tmp_path / "a.npy", (2, 4, 4)) as file,
+    ):
         file.write(0, np.zeros((2, 4, 4), dtype=np.float32))
     assert calls == [1, 2]
     assert not list(tmp_path.iterdir())
@@ -221,7 +260,9 @@ def test_an_error_of_the_disk_is_no_reason_to_try_again(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("limit", [stored.BLOCK_BYTES, 3 * 2 * 64])
 def test_of_arrays_two_blocks_are_held(tmp_path, monkeypatch, limit):
-    """One that is written and one that comes next, of fewer images where they are large: what a renderer reserves."""
+    """One that is written and one that comes next, of fewer images where they are large:
+    what a renderer reserves.
+    """
     monkeypatch.setattr(stored, "BLOCK", 4)
     monkeypatch.setattr(stored, "BLOCK_BYTES", limit)
     held, most, calls = weakref.WeakSet(), [], []
@@ -257,11 +298,17 @@ def test_of_arrays_two_blocks_are_held(tmp_path, monkeypatch, limit):
 
 
 def test_the_cost_of_a_picture_does_not_grow_with_those_before_it(analytic, tmp_path, monkeypatch):
-    """A folder is listed and flushed once, however many files come into it; what a dead process left there goes."""
+    """A folder is listed and flushed once, however many files come into it;
+    what a dead process left there goes.
+    """
     listed, flushed = [], []
     right = os.listdir, files.flush_folder
-    monkeypatch.setattr(files.os, "listdir", lambda folder: listed.append(Path(folder).name) or right[0](folder))
-    monkeypatch.setattr(files, "flush_folder", lambda folder: flushed.append(Path(folder).name) or right[1](folder))
+    monkeypatch.setattr(
+        files.os, "listdir", lambda folder: listed.append(Path(folder).name) or right[0](folder)
+    )
+    monkeypatch.setattr(
+        files, "flush_folder", lambda folder: flushed.append(Path(folder).name) or right[1](folder)
+    )
     for name in WHAT:
         (tmp_path / name).mkdir()
     dead = subprocess.Popen([sys.executable, "-c", ""])
@@ -272,7 +319,9 @@ def test_the_cost_of_a_picture_does_not_grow_with_those_before_it(analytic, tmp_
     (images,) = views.series_of(render, [(0.0, analytic.camera)], analytic.sensor, WHAT)
     scales = {name: previews.preview_scale(name, [images[name]]) for name in WHAT}
     views_taken = [(time, analytic.camera) for time in times]
-    writers.write_all(tmp_path, scales, views.series_of(render, views_taken, analytic.sensor, WHAT), FRAMES)
+    writers.write_all(
+        tmp_path, scales, views.series_of(render, views_taken, analytic.sensor, WHAT), FRAMES
+    )
     assert sorted(name for name in listed if name in WHAT) == sorted(flushed) == sorted(WHAT)
     assert len(list((tmp_path / "distance").iterdir())) == 2 * FRAMES
     left = [path.name for path in (tmp_path / "quads").iterdir() if path.name.startswith(".")]
@@ -285,13 +334,21 @@ def test_what_stops_the_rendering_leaves_nothing_half_written(analytic, tmp_path
     interrupt(analytic, 13)
     with pytest.raises(KeyboardInterrupt):
         render_to_folder(analytic, tmp_path / "out", WHAT, arrays=arrays)
-    left = [path for path in (tmp_path / "out").rglob("*") if path.is_file() and path.name != "renders.json"]
+    left = [
+        path
+        for path in (tmp_path / "out").rglob("*")
+        if path.is_file() and path.name != "renders.json"
+    ]
     assert not [path for path in left if path.name.startswith(".") or path.suffix == ".npy"]
     for path in left:
         if path.suffix == ".exr":
             read_exr(path)
     assert arrays == (not left)
-    assert not [one.name for one in threading.enumerate() if one.name.startswith(("gftorf-files", "gftorf-arrays"))]
+    assert not [
+        one.name
+        for one in threading.enumerate()
+        if one.name.startswith(("gftorf-files", "gftorf-arrays"))
+    ]
 
 
 def test_a_disk_that_cannot_hold_the_arrays(analytic, tmp_path, monkeypatch):
@@ -309,7 +366,9 @@ def test_a_disk_that_cannot_hold_the_arrays(analytic, tmp_path, monkeypatch):
             return super().write(data)
 
     monkeypatch.setattr(stored, "FileIO", Full)
-    monkeypatch.setattr(os, "writev", lambda file, rows: os.write(file, rows[0][:10]), raising=False)
+    monkeypatch.setattr(
+        os, "writev", lambda file, rows: os.write(file, rows[0][:10]), raising=False
+    )
     with pytest.raises(ResourceError, match="no space left"):
         render_to_folder(analytic, tmp_path / "out", WHAT, arrays=True)
     assert not list((tmp_path / "out").rglob("*.npy*"))
@@ -325,16 +384,19 @@ import numpy as np
 from gftorf_warp.evaluate import writers
 from gftorf_warp.evaluate.pictures import Scale
 
-signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores it, and so do children
+# a shell's background job ignores the signal, and so do its children
+signal.signal(signal.SIGINT, signal.default_int_handler)
 scales = {"distance": Scale(low=0.0, high=1.0, colours="viridis", unit="m")}
 
 
 def series():
     for k in range(10000):
-        yield {"distance": {"distance": np.random.default_rng(k).random((240, 320), dtype=np.float32)}}
+        image = np.random.default_rng(k).random((240, 320), dtype=np.float32)
+        yield {"distance": {"distance": image}}
 
 
-writers.write_all(Path(sys.argv[1]), scales, series(), 10000, lambda done, _: print(done, flush=True))
+progress = lambda done, _: print(done, flush=True)
+writers.write_all(Path(sys.argv[1]), scales, series(), 10000, progress)
 """
 
 
@@ -356,6 +418,8 @@ def test_ctrl_c_ends_threads_between_images(tmp_path):
     left = sorted((tmp_path / "distance").iterdir())
     assert len(left) < 10000
     assert not [path.name for path in left if path.name.startswith(".")]
-    assert {path.with_suffix(".png") for path in left} == set(left) - {path for path in left if path.suffix == ".exr"}
+    assert {path.with_suffix(".png") for path in left} == set(left) - {
+        path for path in left if path.suffix == ".exr"
+    }
     time.sleep(0.2)
     assert sorted((tmp_path / "distance").iterdir()) == left, "nobody writes any more"

@@ -1,10 +1,13 @@
-"""TöRF folders that tests make themselves, file by file: a camera and a colour camera move in front of a wall."""
+"""TöRF folders that tests make themselves, file by file:
+a camera and a colour camera move in front of a wall.
+"""
 
 import numpy as np
 
 DEPTH_RANGE = 10.0  # [m]
 WALL_Z = 3.0  # [m]
-RELATIVE = np.array([[1, 0, 0, 0.05], [0, 0.8, -0.6, 0.01], [0, 0.6, 0.8, 0], [0, 0, 0, 1.0]])  # ToF from colour camera
+# ToF from colour camera
+RELATIVE = np.array([[1, 0, 0, 0.05], [0, 0.8, -0.6, 0.01], [0, 0.6, 0.8, 0], [0, 0, 0, 1.0]])
 
 
 def poses(count, speed=0.2):
@@ -16,10 +19,14 @@ def poses(count, speed=0.2):
 
 def intrinsics(height, width):
     """For integer pixel centres; cx is not half the width."""
-    return np.array([[0.8 * width, 0, (width - 1) / 2], [0, 0.9 * width, (height - 1) / 2], [0, 0, 1]])
+    return np.array(
+        [[0.8 * width, 0, (width - 1) / 2], [0, 0.9 * width, (height - 1) / 2], [0, 0, 1]]
+    )
 
 
-def images(count, height=6, width=8, *, speed=0.2, noise=0.0, phase_offset=0.0, depth_range=DEPTH_RANGE):
+def images(
+    count, height=6, width=8, *, speed=0.2, noise=0.0, phase_offset=0.0, depth_range=DEPTH_RANGE
+):
     """Phasors [N, H, W, 3] and true distances [N, H, W] [m], float32."""
     matrix, pose = intrinsics(height, width), poses(count, speed)
     y, x = np.mgrid[0:height, 0:width].astype(np.float64)

@@ -1,1 +1,3 @@
-"""The parts of ``gftorf bench``, one file each. May import every package; only the command line imports it."""
+"""The parts of ``gftorf bench``, one file each. May import every package;
+only the command line imports it.
+"""

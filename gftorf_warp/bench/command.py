@@ -1,4 +1,6 @@
-"""``gftorf bench``: parts by name, the scenes and states that they share, printed tables and JSON."""
+"""``gftorf bench``: parts by name, the scenes and states that they share,
+printed tables and JSON.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,8 @@ from . import motion, reconstruction, renderer, rendering, states, step
 from .timing import Report, quietly
 
 RUNS, QUICK_RUNS = 30, 5
-PRESETS = {"cpu": "demo", "other": "released"}  # of whole reconstructions; steps always have the second
+# of whole reconstructions; steps always have the second
+PRESETS = {"cpu": "demo", "other": "released"}
 Rows = list[dict[str, Any]]
 
 
@@ -39,7 +42,8 @@ class Wanted:
     sequence: Path | None = None
     """Sequence of ``step``, ``reconstruction`` and ``render``; None: a simulated scene."""
     run: Path | None = None
-    """Run whose state is used by ``step`` and ``render``; None: a state initialised from measured phase."""
+    """Run whose state is used by ``step`` and ``render``; None: a state initialised from measured
+    phase."""
     images: int | None = None
     """Number of images of ``step``, ``reconstruction`` and ``render``; None: their defaults."""
     preset: str | None = None
@@ -65,7 +69,9 @@ class Shared:
     def fitted(self) -> states.Fitted:
         """State of a reconstruction in progress."""
         wanted, sequence = self.wanted, read(self.path)
-        settings = states.settings_of(sequence, wanted.preset or PRESETS["other"], list(wanted.changes), wanted.device)
+        settings = states.settings_of(
+            sequence, wanted.preset or PRESETS["other"], list(wanted.changes), wanted.device
+        )
         if wanted.run is not None:
             return states.from_run(wanted.run, sequence, settings, wanted.device)
         return states.from_phase(sequence, settings, wanted.device, quick=wanted.quick)
@@ -73,7 +79,9 @@ class Shared:
     @functools.cached_property
     def run_folder(self) -> Path:
         """A run that can be rendered."""
-        return self.wanted.run or states.as_run(self.fitted, self.folder / "run", self.wanted.device)
+        return self.wanted.run or states.as_run(
+            self.fitted, self.folder / "run", self.wanted.device
+        )
 
 
 def _renderer(shared: Shared, report: Report) -> Rows:
@@ -86,7 +94,14 @@ def _motion(shared: Shared, report: Report) -> Rows:
 
 def _step(shared: Shared, report: Report) -> Rows:
     changes, images = list(shared.wanted.changes), shared.wanted.images
-    return step.measure(shared.fitted, shared.device, changes=changes, quick=shared.quick, images=images, report=report)
+    return step.measure(
+        shared.fitted,
+        shared.device,
+        changes=changes,
+        quick=shared.quick,
+        images=images,
+        report=report,
+    )
 
 
 def _reconstruction(shared: Shared, report: Report) -> Rows:
@@ -96,7 +111,8 @@ def _reconstruction(shared: Shared, report: Report) -> Rows:
         shared.path,
         folder,
         shared.device,
-        preset=shared.wanted.preset or PRESETS["cpu" if shared.quick or shared.device == "cpu" else "other"],
+        preset=shared.wanted.preset
+        or PRESETS["cpu" if shared.quick or shared.device == "cpu" else "other"],
         changes=list(shared.wanted.changes),
         quick=shared.quick,
         images=shared.wanted.images,
@@ -106,7 +122,9 @@ def _reconstruction(shared: Shared, report: Report) -> Rows:
 
 def _render(shared: Shared, report: Report) -> Rows:
     out, images = shared.folder / "images", shared.wanted.images
-    return rendering.measure(shared.run_folder, out, shared.device, quick=shared.quick, images=images, report=report)
+    return rendering.measure(
+        shared.run_folder, out, shared.device, quick=shared.quick, images=images, report=report
+    )
 
 
 PARTS: dict[str, tuple[Callable[[Shared, Report], Rows], Callable[[Rows], list[str]]]] = {
@@ -143,7 +161,11 @@ def bench(
     """
     chosen = checked(parts)
     _check_folders(wanted)
-    found = about(wanted.device) | {"quick": wanted.quick, "command": _words(chosen, wanted), "parts": {}}
+    found = about(wanted.device) | {
+        "quick": wanted.quick,
+        "command": _words(chosen, wanted),
+        "parts": {},
+    }
     if json is not None:
         _check_file(Path(json))
     if wanted.device != "cpu":  # events and graphs are those of the current device
@@ -173,7 +195,9 @@ def checked(parts: list[str]) -> list[str]:
     if unknown:
         why = f"there are {', '.join(PARTS)}"
         fix = "leave PART out for all of them"
-        raise UsageError(f"unknown part {', '.join(unknown)}", where="gftorf bench", why=why, fix=fix)
+        raise UsageError(
+            f"unknown part {', '.join(unknown)}", where="gftorf bench", why=why, fix=fix
+        )
     return [name for name in PARTS if name in parts or not parts]
 
 
@@ -190,8 +214,12 @@ def about(device: str) -> dict[str, Any]:
     on_cpu = device == "cpu"
     name = platform.processor() or platform.machine()
     return {
-        "device": f"cpu, {name}" if on_cpu else torch.get_device_module(torch.device(device)).get_device_name(device),
-        "cpus": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "device": f"cpu, {name}"
+        if on_cpu
+        else torch.get_device_module(torch.device(device)).get_device_name(device),
+        "cpus": len(os.sched_getaffinity(0))
+        if hasattr(os, "sched_getaffinity")
+        else os.cpu_count(),
         "driver": "no driver" if on_cpu else f"driver {_driver()}",
         "python": platform.python_version(),
         "warp": f"Warp {_version_of('warp-lang')}",
@@ -205,20 +233,35 @@ def _driver() -> str:
     """Version of the NVIDIA driver, by nvidia-smi."""
     command = ["nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader"]
     try:
-        output = subprocess.run(command, check=True, capture_output=True, text=True, timeout=30).stdout
+        output = subprocess.run(
+            command, check=True, capture_output=True, text=True, timeout=30
+        ).stdout
     except (OSError, subprocess.SubprocessError):
         return "unknown"
     return output.splitlines()[0].strip() if output.strip() else "unknown"
 
 
 def _commit() -> str | None:
-    """Commit of the package's checkout, with "-dirty" if files were changed; None without a checkout."""
+    """Commit of the package's checkout, with "-dirty" if files were changed;
+    None without a checkout.
+    """
     root = Path(__file__).parents[2]
     if not (root / ".git").exists():
         return None
     try:
-        words = ["git", "-C", str(root), "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"]
-        return subprocess.run(words, check=True, capture_output=True, text=True, timeout=30).stdout.strip()
+        words = [
+            "git",
+            "-C",
+            str(root),
+            "describe",
+            "--always",
+            "--dirty",
+            "--abbrev=12",
+            "--exclude=*",
+        ]
+        return subprocess.run(
+            words, check=True, capture_output=True, text=True, timeout=30
+        ).stdout.strip()
     except (OSError, subprocess.SubprocessError):
         return None
 

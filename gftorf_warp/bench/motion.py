@@ -1,4 +1,6 @@
-"""The motion network: forward and backward for Q key times at once, encoding of positions included."""
+"""The motion network: forward and backward for Q key times at once,
+encoding of positions included.
+"""
 
 from __future__ import annotations
 
@@ -27,8 +29,8 @@ BY_TORCH = "half by torch"  # by cuBLAS, for comparison with our kernels
 def measure(device: str, *, quick: bool, runs: int, report: Report) -> list[dict[str, Any]]:
     """Rows of N, Q and precision: time of one forward and backward pass, and per query [ms].
 
-    The network is the published one, 8 layers of 256. A CPU has one precision. Where half precision has kernels of
-    ours, it is also timed with cuBLAS, as ``BY_TORCH``.
+    The network is the published one, 8 layers of 256. A CPU has one precision. Where half precision
+    has kernels of ours, it is also timed with cuBLAS, as ``BY_TORCH``.
 
     Args:
         device: "cpu" or a CUDA device.
@@ -38,21 +40,31 @@ def measure(device: str, *, quick: bool, runs: int, report: Report) -> list[dict
     """
     watch = watch_of(device)
     precisions = [str(Products.FLOAT32)] if torch.device(device).type == "cpu" else kinds(device)
-    cases = [(n, q, p) for n in (QUICK_COUNTS if quick else COUNTS) for q in QUERIES for p in precisions]
+    cases = [
+        (n, q, p) for n in (QUICK_COUNTS if quick else COUNTS) for q in QUERIES for p in precisions
+    ]
     rows = []
     for done, (count, queries, products) in enumerate(cases, start=1):
         generator = torch.Generator().manual_seed(0)
         times = torch.arange(KEYS, dtype=torch.float64) * PERIOD_S
         settings = MotionSettings(kind=Network.kind, products=products_of(products))
-        network = Network(times, settings, duration=float(times[-1]), length=LENGTH_M, generator=generator).to(device)
+        network = Network(
+            times, settings, duration=float(times[-1]), length=LENGTH_M, generator=generator
+        ).to(device)
         set_backend(network, products)
-        field = points(LENGTH_M * torch.rand(count, 3, generator=generator)).map(lambda value: value.to(device))
+        field = points(LENGTH_M * torch.rand(count, 3, generator=generator)).map(
+            lambda value: value.to(device)
+        )
         cotangent = torch.randn(queries, count, 3, generator=generator).to(device)
         weights = list(network.parameters())
         keys = list(range(4, 4 + queries))
 
-        def both(network=network, field=field, cotangent=cotangent, weights=weights, keys=keys) -> object:
-            return torch.autograd.grad(network.at_keys(network.bind(field), keys).offset, weights, cotangent)
+        def both(
+            network=network, field=field, cotangent=cotangent, weights=weights, keys=keys
+        ) -> object:
+            return torch.autograd.grad(
+                network.at_keys(network.bind(field), keys).offset, weights, cotangent
+            )
 
         def forward(network=network, field=field, keys=keys) -> object:
             with torch.no_grad():
@@ -61,7 +73,9 @@ def measure(device: str, *, quick: bool, runs: int, report: Report) -> list[dict
         found = both_ways(both, watch, runs)
         best = (found["graph"] or found["eager"])["median"]
         row = {"N": count, "queries": queries, "products": products, "forward_backward": found}
-        rows.append(row | {"forward": both_ways(forward, watch, runs), "ms_per_query": best / queries})
+        rows.append(
+            row | {"forward": both_ways(forward, watch, runs), "ms_per_query": best / queries}
+        )
         report(done, len(cases), N=count, ms=best)
     return rows
 
@@ -80,7 +94,9 @@ def set_backend(network: Network, kind: str) -> None:
 
 
 def kinds(device: str) -> list[str]:
-    """Rows of one case: every precision, and half precision by cuBLAS where the device has kernels of ours."""
+    """Rows of one case: every precision, and half precision by cuBLAS where the device has kernels
+    of ours.
+    """
     times = torch.arange(KEYS, dtype=torch.float64) * PERIOD_S
     form = Form.of(Network(times, MotionSettings(), duration=1.0, length=LENGTH_M))
     own = fits(form, torch.empty(0, device=device).device)
@@ -101,7 +117,16 @@ def points(mean: Float[Tensor, "N 3"]) -> GaussianField:
 
 def table(rows: list[dict[str, Any]]) -> list[str]:
     """One line per row."""
-    heads = ["precision", "N", "queries", "forward, graph", "with backward", "called", "with backward", "per query"]
+    heads = [
+        "precision",
+        "N",
+        "queries",
+        "forward, graph",
+        "with backward",
+        "called",
+        "with backward",
+        "per query",
+    ]
     cells = [
         [
             row["products"],

@@ -1,7 +1,8 @@
-"""A whole reconstruction in its own process, twice: with an empty kernel cache, then with the filled one.
+"""A whole reconstruction in its own process, twice: with an empty kernel cache, then with the
+filled one.
 
-Wall clock of the process, imports and reading of data included, and ``seconds_reconstruct`` of config.json. N, d and
-d_ToF are read from metrics.jsonl and diagnostics.jsonl.
+Wall clock of the process, imports and reading of data included, and ``seconds_reconstruct`` of
+config.json. N, d and d_ToF are read from metrics.jsonl and diagnostics.jsonl.
 """
 
 from __future__ import annotations
@@ -77,8 +78,22 @@ def measure(
     rows = []
     for number, name in enumerate(("cold", "warm")):
         out = folder / name
-        command = ["reconstruct", str(sequence), "--out", str(out), "--preset", preset, "--images", str(total)]
-        command += ["--device", device, "--quiet", *(word for change in changes for word in ("--set", change))]
+        command = [
+            "reconstruct",
+            str(sequence),
+            "--out",
+            str(out),
+            "--preset",
+            preset,
+            "--images",
+            str(total),
+        ]
+        command += [
+            "--device",
+            device,
+            "--quiet",
+            *(word for change in changes for word in ("--set", change)),
+        ]
         begun = time.perf_counter()
         with _running(command, cache) as process:
             while process.poll() is None:
@@ -87,7 +102,14 @@ def measure(
         wall = time.perf_counter() - begun
         report((number + 1) * total, 2 * total, kernels=name)
         rows.append(
-            {"kernels": name, "preset": preset, "set": changes, "wall_s": wall, "flow_s": flow_s, **found_in(out)}
+            {
+                "kernels": name,
+                "preset": preset,
+                "set": changes,
+                "wall_s": wall,
+                "flow_s": flow_s,
+                **found_in(out),
+            }
         )
     return rows
 
@@ -96,7 +118,10 @@ def found_in(run: Path) -> dict[str, Any]:
     """Length, size and curves of a finished run."""
     config = json.loads((run / "config.json").read_text())
     metrics, diagnostics = (rows_of(run / name) for name in ("metrics.jsonl", "diagnostics.jsonl"))
-    images, seconds = [0, *(row["images"] for row in metrics)], [0.0, *(row["seconds"] for row in metrics)]
+    images, seconds = (
+        [0, *(row["images"] for row in metrics)],
+        [0.0, *(row["seconds"] for row in metrics)],
+    )
     curve = [
         {
             "images": row["images"],
@@ -107,13 +132,18 @@ def found_in(run: Path) -> dict[str, Any]:
         for row in diagnostics
     ]
     last = curve[-1]
-    facts = {"images": config["images_optimised"], "seconds": config["seconds_reconstruct"], "N": last["N"]}
+    facts = {
+        "images": config["images_optimised"],
+        "seconds": config["seconds_reconstruct"],
+        "N": last["N"],
+    }
     return facts | {key: last[key] for key in KEYS} | {"curve": curve}
 
 
 @contextmanager
 def _running(command: list[str], cache: Path) -> Iterator[subprocess.Popen]:
-    """Run the command in another process with its own kernel cache; terminated at the end of the block.
+    """Run the command in another process with its own kernel cache; terminated at the end of the
+    block.
 
     Raises:
         ResourceError: If it fails.
@@ -122,7 +152,10 @@ def _running(command: list[str], cache: Path) -> Iterator[subprocess.Popen]:
     environment = os.environ | {"WARP_CACHE_PATH": str(cache), "PYTHONPATH": paths}
     with (cache.parent / "errors.txt").open("w+") as errors:
         process = subprocess.Popen(
-            [sys.executable, "-m", "gftorf_warp", *command], stdout=subprocess.DEVNULL, stderr=errors, env=environment
+            [sys.executable, "-m", "gftorf_warp", *command],
+            stdout=subprocess.DEVNULL,
+            stderr=errors,
+            env=environment,
         )
         try:
             yield process
@@ -141,7 +174,9 @@ def error_of(why: str, code: int) -> GftorfError:
     """The class of error that has the exit code of the other process."""
     kinds = {kind.exit_code: kind for kind in GftorfError.__subclasses__()}
     fix = "run that command by itself, with --debug"
-    return kinds.get(code, ResourceError)("the reconstruction failed", where="gftorf bench", why=why, fix=fix)
+    return kinds.get(code, ResourceError)(
+        "the reconstruction failed", where="gftorf bench", why=why, fix=fix
+    )
 
 
 def _reached(run: Path) -> int:
@@ -154,13 +189,24 @@ def table(rows: list[dict[str, Any]]) -> list[str]:
     errors = ["d", "d_ToF", "moving d", "d_ToF"]
     heads = ["kernel cache", "images", "process [s]", "reconstruct [s]", "N at the end", *errors]
     totals = [
-        [row["kernels"], f"{row['images']:,}", f"{row['wall_s']:.2f}", f"{row['seconds']:.2f}", f"{row['N']:,}"]
+        [
+            row["kernels"],
+            f"{row['images']:,}",
+            f"{row['wall_s']:.2f}",
+            f"{row['seconds']:.2f}",
+            f"{row['N']:,}",
+        ]
         + [_number(row[key]) for key in KEYS]
         for row in rows
     ]
     lines = lines_of(f"reconstruction, preset {rows[0]['preset']}: MSE x100 [m^2]", heads, totals)
     curve = [
-        [f"{row['images']:,}", f"{row['seconds']:.2f}", f"{row['N']:,}", *(_number(row[key]) for key in KEYS)]
+        [
+            f"{row['images']:,}",
+            f"{row['seconds']:.2f}",
+            f"{row['N']:,}",
+            *(_number(row[key]) for key in KEYS),
+        ]
         for row in rows[-1]["curve"]
     ]
     heads = ["images", "seconds", "N", *errors]

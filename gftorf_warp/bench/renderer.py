@@ -1,8 +1,8 @@
 """The renderer: forward, forward with backward, and every stage, on two families of scenes.
 
-Two forms. *all*: quads, phasor, colour, distance, opacity and distortion, with a random cotangent of each. *training*:
-no colour, and the cotangent of one quad only, as in a step of the presets without colour. Stages are the calls of
-launch.py in its order, each repeated with its arguments.
+Two forms. *all*: quads, phasor, colour, distance, opacity and distortion, with a random cotangent
+of each. *training*: no colour, and the cotangent of one quad only, as in a step of the presets
+without colour. Stages are the calls of launch.py in its order, each repeated with its arguments.
 """
 
 from __future__ import annotations
@@ -60,7 +60,9 @@ class WarpWatch:
 class Case:
     """One scene in one form with its buffers."""
 
-    def __init__(self, kind: str, count: int, scale: float, opacity: float, form: str, device: wp.Device):
+    def __init__(
+        self, kind: str, count: int, scale: float, opacity: float, form: str, device: wp.Device
+    ):
         """Make everything but the pair capacity of its buffers, which needs a first rendering."""
         if form not in FORMS:
             raise ValueError(f"form {form!r} must be one of {FORMS}")
@@ -68,15 +70,21 @@ class Case:
         self.shifts = CANONICAL_SHIFTS if everything else CANONICAL_SHIFTS[:1]
         self.inputs = inputs_of(scene_of(kind, count, scale, opacity), device, colour=everything)
         size = HEIGHT, WIDTH
-        shapes: dict[str, tuple[int, ...]] = {"quads": (len(self.shifts), *size), "phasor": (3, *size)}
+        shapes: dict[str, tuple[int, ...]] = {
+            "quads": (len(self.shifts), *size),
+            "phasor": (3, *size),
+        }
         shapes |= {"colour": (3, *size)} if everything else {}
         shapes |= dict.fromkeys(("distance", "opacity", "distortion"), size)
         rng = np.random.default_rng(1)
         empty = dict.fromkeys(names_of(Images))
-        self.images = Images(**empty | {name: array_of(np.zeros(shape), device) for name, shape in shapes.items()})
+        self.images = Images(
+            **empty | {name: array_of(np.zeros(shape), device) for name, shape in shapes.items()}
+        )
         known = shapes if everything else {"quads": shapes["quads"]}
         self.cotangents = Images(
-            **empty | {name: array_of(rng.normal(size=shape), device) for name, shape in known.items()}
+            **empty
+            | {name: array_of(rng.normal(size=shape), device) for name, shape in known.items()}
         )
         self.wanted = Inputs(**dict.fromkeys(names_of(Inputs)))
         for name in GAUSSIANS:
@@ -171,11 +179,25 @@ def measure(
         if device.is_cuda:  # no readback of the number of pairs
             case.start(int(HEADROOM * case.pairs) + 1)
         forward, both = (both_ways(function, watch, runs) for function in (case.forward, case.both))
-        parts = {name: both_ways(function, watch, runs, within=WITHIN) for name, function in case.stages().items()}
+        parts = {
+            name: both_ways(function, watch, runs, within=WITHIN)
+            for name, function in case.stages().items()
+        }
         case.buffers.check_capacity()
         assert case.images.distance is not None
-        row: dict[str, Any] = {"form": form, "scene": kind, "scale": scale, "opacity": opacity, "N": count}
-        row |= {"pairs": case.pairs, "forward": forward, "forward_backward": both, "pairs_counted_on_host": free}
+        row: dict[str, Any] = {
+            "form": form,
+            "scene": kind,
+            "scale": scale,
+            "opacity": opacity,
+            "N": count,
+        }
+        row |= {
+            "pairs": case.pairs,
+            "forward": forward,
+            "forward_backward": both,
+            "pairs_counted_on_host": free,
+        }
         row |= {"stages": parts, "mean_distance": float(case.images.distance.numpy().mean())}
         rows.append(row)
         report(done, len(cases), N=count, ms=both["eager"]["median"])
@@ -183,7 +205,9 @@ def measure(
 
 
 def timed_free(case: Case, watch: Watch, runs: int) -> dict[str, Any] | None:
-    """Forward and backward with readback of the number of pairs, on CUDA [ms]; a CPU always reads it."""
+    """Forward and backward with readback of the number of pairs, on CUDA [ms];
+    a CPU always reads it.
+    """
     if not case.device.is_cuda:
         return None
     return timed(case.both, watch, runs).plain()
@@ -203,7 +227,15 @@ def table(rows: list[dict[str, Any]]) -> list[str]:
         ]
         for row in rows
     ]
-    heads = ["form, scene", "N", "pairs", "forward, graph", "with backward", "forward, called", "with backward"]
+    heads = [
+        "form, scene",
+        "N",
+        "pairs",
+        "forward, graph",
+        "with backward",
+        "forward, called",
+        "with backward",
+    ]
     lines = lines_of(f"renderer, {WIDTH}x{HEIGHT}: median (10 .. 90 %) [ms]", heads, totals)
     for form in dict.fromkeys(row["form"] for row in rows):
         some = [row for row in rows if row["form"] == form]
@@ -217,7 +249,9 @@ def table(rows: list[dict[str, Any]]) -> list[str]:
         lines += [
             "",
             *lines_of(
-                f"stages, form {form}: median [ms], of a graph where there is one", ["scene", "N", *words], parts
+                f"stages, form {form}: median [ms], of a graph where there is one",
+                ["scene", "N", *words],
+                parts,
             ),
         ]
     return lines

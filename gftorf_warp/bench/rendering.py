@@ -1,12 +1,14 @@
-"""Images per second of a finished run, quads and distance, motion included, for each way of rendering.
+"""Images per second of a finished run, quads and distance, motion included, for each way of
+rendering.
 
-``render``: a Python loop over ``Run.render``. ``renderer``: over ``Run.renderer``, which keeps buffers and on CUDA
-replays a graph. ``unchecked``: the same without the check of the pair capacity after every image. ``launched``: without
-graphs, pairs counted on the host. ``series``: images stay on the device, capacity is checked a few images later.
-``host``: the same with asynchronous readback to NumPy arrays, ``Run.images``. ``files``: ``gftorf render``, EXR and PNG
-included. ``stored``: the same with ``--arrays``, until everything is flushed to the disk; in brackets the rate before
-the flush. Compilation, capture and the displacements at the first two keys precede the measurement, those at later keys
-are part of it; the two commands include everything.
+``render``: a Python loop over ``Run.render``. ``renderer``: over ``Run.renderer``, which keeps
+buffers and on CUDA replays a graph. ``unchecked``: the same without the check of the pair capacity
+after every image. ``launched``: without graphs, pairs counted on the host. ``series``: images stay
+on the device, capacity is checked a few images later. ``host``: the same with asynchronous readback
+to NumPy arrays, ``Run.images``. ``files``: ``gftorf render``, EXR and PNG included. ``stored``: the
+same with ``--arrays``, until everything is flushed to the disk; in brackets the rate before the
+flush. Compilation, capture and the displacements at the first two keys precede the measurement,
+those at later keys are part of it; the two commands include everything.
 """
 
 from __future__ import annotations
@@ -50,10 +52,13 @@ def _launched(_: Run, render: Render) -> Way | None:
     return _single(render)
 
 
-WAYS: dict[str, Callable[[Run, Render], Way | None]] = {  # of a run and a new renderer of it; None: not available
+# of a run and a new renderer of it; None: not available
+WAYS: dict[str, Callable[[Run, Render], Way | None]] = {
     "render": lambda run, _: _single(run.render),
     "renderer": lambda _, render: _single(render),
-    "unchecked": lambda _, render: _single(partial(render, checked=False)) if isinstance(render, Replay) else None,
+    "unchecked": lambda _, render: (
+        _single(partial(render, checked=False)) if isinstance(render, Replay) else None
+    ),
     "launched": _launched,
     "series": lambda _, render: (
         (lambda taken: Series(render, taken).on_device()) if isinstance(render, Replay) else None
@@ -83,7 +88,11 @@ def measure(
     taken = [(t, views.camera_at(run, sequence, t)) for t in seconds]
 
     rows: list[dict[str, Any]] = []
-    about: dict[str, Any] = {"N": run.gaussians, "width": run.camera.width, "height": run.camera.height}
+    about: dict[str, Any] = {
+        "N": run.gaussians,
+        "width": run.camera.width,
+        "height": run.camera.height,
+    }
     shared = run.renderer(NEEDED)
     if isinstance(shared, Replay):
         shared(*taken[total // 2])
@@ -97,7 +106,9 @@ def measure(
         _exhaust(way(taken[:WARM_UP]))
         images_left = way(taken)
         times, start = [], time.perf_counter()
-        for first, last in pairwise(np.linspace(0, total, min(ROUNDS, total) + 1).astype(int).tolist()):
+        for first, last in pairwise(
+            np.linspace(0, total, min(ROUNDS, total) + 1).astype(int).tolist()
+        ):
             watch.synchronise()
             begun = time.perf_counter()
             _exhaust(islice(images_left, last - first))
@@ -106,8 +117,16 @@ def measure(
         rate = total / (time.perf_counter() - start)
         fits = not isinstance(render, Replay) or render.fits()
         if not fits:
-            LOG.warning("%s: some images needed more than the pair capacity and lack far splats", name)
-        row = about | {"way": name, "images": total, "images_per_s": rate, "ms": Timing.of(times).plain(), "fits": fits}
+            LOG.warning(
+                "%s: some images needed more than the pair capacity and lack far splats", name
+            )
+        row = about | {
+            "way": name,
+            "images": total,
+            "images_per_s": rate,
+            "ms": Timing.of(times).plain(),
+            "fits": fits,
+        }
         rows.append(row)
         report(done, steps, images_per_s=rate)
     for done, (name, arrays) in enumerate(COMMANDS.items(), start=len(WAYS) + 1):
@@ -120,16 +139,28 @@ def measure(
 
 
 def _commanded(run: Run, out: Path, seconds: list[float], arrays: bool) -> dict[str, Any]:
-    """Rates of ``gftorf render``: overall, and between the first and the last but one progress, before the flush."""
+    """Rates of ``gftorf render``: overall, and between the first and the last but one progress,
+    before the flush.
+    """
     times: list[tuple[int, float]] = []
     begun = time.perf_counter()
     views.render_to_folder(
-        run, out, WHAT, seconds, arrays=arrays, progress=lambda done, _: times.append((done, time.perf_counter()))
+        run,
+        out,
+        WHAT,
+        seconds,
+        arrays=arrays,
+        progress=lambda done, _: times.append((done, time.perf_counter())),
     )
     spent = time.perf_counter() - begun
     (first, early), (last, late) = times[0], times[max(0, len(times) - 2)]
     going = (last - first) / (late - early) if last > first else None
-    return {"images": len(seconds), "images_per_s": len(seconds) / spent, "going_images_per_s": going, "ms": None}
+    return {
+        "images": len(seconds),
+        "images_per_s": len(seconds) / spent,
+        "going_images_per_s": going,
+        "ms": None,
+    }
 
 
 def _exhaust(images: Iterator[Any]) -> None:
@@ -144,9 +175,14 @@ def table(rows: list[dict[str, Any]]) -> list[str]:
         [
             row["way"],
             str(row["images"]),
-            f"{row['images_per_s']:.1f}" + (f" ({going:.0f})" if (going := row.get("going_images_per_s")) else ""),
+            f"{row['images_per_s']:.1f}"
+            + (f" ({going:.0f})" if (going := row.get("going_images_per_s")) else ""),
             "-" if row["ms"] is None else f"{row['ms']['median']:.3f}",
         ]
         for row in rows
     ]
-    return lines_of(f"render rate, quads and distance, {size}", ["way", "images", "images/s", "ms per image"], cells)
+    return lines_of(
+        f"render rate, quads and distance, {size}",
+        ["way", "images", "images/s", "ms per image"],
+        cells,
+    )

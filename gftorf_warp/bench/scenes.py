@@ -15,8 +15,10 @@ from ..scene.camera import Camera
 WIDTH, HEIGHT, FOCAL = 320, 240, 280.0
 NEAR, FAR = 0.135, 7.425  # [m]
 CAMERA = Camera(width=WIDTH, height=HEIGHT, fx=FOCAL, fy=FOCAL, cx=WIDTH / 2, cy=HEIGHT / 2)
-CALIBRATION = (4 * math.pi / 15, 0.0, 1.0, 0.0)  # phase slope of depth_range 15 m [rad/m], offsets, intensity
-FAMILIES = (("surface", 0.015, 0.6), ("surface", 0.03, 0.6), ("volume", 0.03, 0.1))  # kind, scale [m], opacity
+# phase slope of depth_range 15 m [rad/m], offsets, intensity
+CALIBRATION = (4 * math.pi / 15, 0.0, 1.0, 0.0)
+# kind, scale [m], opacity
+FAMILIES = (("surface", 0.015, 0.6), ("surface", 0.03, 0.6), ("volume", 0.03, 0.1))
 
 
 def surface(count: int, scale: float, opacity: float) -> dict[str, np.ndarray]:
@@ -41,18 +43,28 @@ def volume(count: int, scale: float, opacity: float) -> dict[str, np.ndarray]:
     scene = surface(count, scale, opacity)
     u = np.random.default_rng(0).random((count, 3))
     z = NEAR + (FAR - NEAR) * u[:, 2] ** (1 / 3)
-    scene["mean"] = np.stack([(u[:, 0] - 0.5) * WIDTH / FOCAL * z, (u[:, 1] - 0.5) * HEIGHT / FOCAL * z, z], 1)
+    scene["mean"] = np.stack(
+        [(u[:, 0] - 0.5) * WIDTH / FOCAL * z, (u[:, 1] - 0.5) * HEIGHT / FOCAL * z, z], 1
+    )
     return scene
 
 
 def scene_of(kind: str, count: int, scale: float, opacity: float) -> dict[str, np.ndarray]:
-    """A scene of the family "surface" or "volume": ``count`` Gaussians of one scale [m] and peak opacity [1]."""
+    """A scene of the family "surface" or "volume": ``count`` Gaussians of one scale [m] and peak
+    opacity [1].
+    """
     return {"surface": surface, "volume": volume}[kind](count, scale, opacity)
 
 
-def inputs_of(scene: dict[str, np.ndarray], device: str | wp.Device, *, colour: bool = True) -> Inputs:
+def inputs_of(
+    scene: dict[str, np.ndarray], device: str | wp.Device, *, colour: bool = True
+) -> Inputs:
     """The scene as Warp arrays, with the calibration of a sensor with depth_range 15 m."""
-    rgb = array_of(_constant(scene["colour"].T).transpose(1, 2, 0), device, wp.vec3) if colour else None
+    rgb = (
+        array_of(_constant(scene["colour"].T).transpose(1, 2, 0), device, wp.vec3)
+        if colour
+        else None
+    )
     return Inputs(
         mean=array_of(scene["mean"], device, wp.vec3),
         log_scale=array_of(scene["log_scale"], device, wp.vec3),

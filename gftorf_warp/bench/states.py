@@ -1,7 +1,9 @@
-"""States for timing steps and renderings without an earlier run: a simulated scene, Gaussians from measured phase.
+"""States for timing steps and renderings without an earlier run: a simulated scene, Gaussians from
+measured phase.
 
-The scene slides past a static camera. The number of Gaussians is that of the published initialisation after its first
-opacity reset (19 to 21 thousand); a network moves them, as published.
+The scene slides past a static camera. The number of Gaussians is that of the published
+initialisation after its first opacity reset (19 to 21 thousand); a network moves them, as
+published.
 """
 
 from __future__ import annotations
@@ -57,7 +59,13 @@ def simulated(path: Path, *, quick: bool) -> Path:
     """The folder of the scene, simulated if absent."""
     if path.exists():
         return path
-    return simulate(SCENE, path, frames=QUICK_FRAMES if quick else FRAMES, size=QUICK_SIZE if quick else SIZE, seed=0)
+    return simulate(
+        SCENE,
+        path,
+        frames=QUICK_FRAMES if quick else FRAMES,
+        size=QUICK_SIZE if quick else SIZE,
+        seed=0,
+    )
 
 
 def settings_of(sequence: Sequence, preset: str, changes: list[str], device: str) -> ReconSettings:
@@ -80,7 +88,9 @@ def from_run(run: Path | None, sequence: Sequence, settings: ReconSettings, devi
     stored = None if run is None else checkpoint.last(run, device)
     if stored is None and run is not None:
         fix = "name the --out of a reconstruction, or leave --run out"
-        raise InputError("the run has no checkpoint", where=run, why="nothing was reconstructed yet", fix=fix)
+        raise InputError(
+            "the run has no checkpoint", where=run, why="nothing was reconstructed yet", fix=fix
+        )
     if stored is None:
         stored = to_dict(begin(observations, settings, seed=0, device=device))
     return Fitted(observations=observations, settings=settings, stored=stored, sequence=sequence)
@@ -91,7 +101,9 @@ def from_phase(sequence: Sequence, settings: ReconSettings, device: str, *, quic
     low, high = QUICK_COUNT if quick else COUNT
     observations = observe(sequence, settings, device)
     init = replace(InitSettings(), kind=Init.PHASE)
-    spacing = (observations.sequence.width * observations.sequence.height / (0.5 * (low + high))) ** 0.5
+    spacing = (
+        observations.sequence.width * observations.sequence.height / (0.5 * (low + high))
+    ) ** 0.5
     state: State | None = None
     for _ in range(TRIES):
         init = replace(init, static_spacing=spacing, moving_spacing=0.5 * spacing)
@@ -107,7 +119,9 @@ def from_phase(sequence: Sequence, settings: ReconSettings, device: str, *, quic
 
 
 def pairs_of(fitted: Fitted) -> int:
-    """(tile, splat) pairs of the state in the middle of the sequence, at the size of the optimisation."""
+    """(tile, splat) pairs of the state in the middle of the sequence,
+    at the size of the optimisation.
+    """
     observations = fitted.observations
     middle = observations.sequence.frames // 2
     camera = observations.cameras[middle]

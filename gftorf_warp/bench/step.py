@@ -1,7 +1,7 @@
 """The training step: consecutive images of one state, without densification and opacity resets.
 
-Rows are single images and quartets, with and without CUDA graphs, in every precision of the network; all
-begin with the same state.
+Rows are single images and quartets, with and without CUDA graphs, in every precision of the
+network; all begin with the same state.
 """
 
 from __future__ import annotations
@@ -42,8 +42,12 @@ def ways(settings: ReconSettings, changes: list[str], device: str) -> list[Recon
     moves = settings.motion.kind == Network.kind and gpu
     graphs = [settings.graph] if "graph" in fixed or not gpu else [False, True]
     batches = [settings.schedule.batch] if "schedule.batch" in fixed else list(Batch)
-    products = [settings.motion.products] if "motion.products" in fixed or not moves else list(Products)
-    pairs = [(graph, products[-1]) for graph in graphs] + [(graphs[-1], kind) for kind in products[:-1]]
+    products = (
+        [settings.motion.products] if "motion.products" in fixed or not moves else list(Products)
+    )
+    pairs = [(graph, products[-1]) for graph in graphs] + [
+        (graphs[-1], kind) for kind in products[:-1]
+    ]
     return [
         replace(
             settings,
@@ -57,7 +61,11 @@ def ways(settings: ReconSettings, changes: list[str], device: str) -> list[Recon
 
 
 def fresh(
-    fitted: Fitted, observations: Observations, settings: ReconSettings, device: str, warm_up: int = WARM_UP
+    fitted: Fitted,
+    observations: Observations,
+    settings: ReconSettings,
+    device: str,
+    warm_up: int = WARM_UP,
 ) -> Run:
     """A copy of the state with its stepper, after a warm-up."""
     stored = copy.deepcopy(fitted.stored)
@@ -87,7 +95,13 @@ def advance(run: Run, images: int) -> int:
 
 
 def measure(
-    fitted: Fitted, device: str, *, changes: list[str], quick: bool, images: int | None, report: Report
+    fitted: Fitted,
+    device: str,
+    *,
+    changes: list[str],
+    quick: bool,
+    images: int | None,
+    report: Report,
 ) -> list[dict[str, Any]]:
     """Rows of :func:`ways`.
 
@@ -99,9 +113,13 @@ def measure(
         images: Their number; None: 400.
         report: Called with (images done, images in all).
     """
-    count, part, warm_up = (QUICK_IMAGES, QUICK_PART, QUICK_WARM_UP) if quick else (IMAGES, PART, WARM_UP)
+    count, part, warm_up = (
+        (QUICK_IMAGES, QUICK_PART, QUICK_WARM_UP) if quick else (IMAGES, PART, WARM_UP)
+    )
     chosen = ways(fitted.settings, changes, device)
-    return rows_of(chosen, fitted, device, images=images or count, part=part, warm_up=warm_up, report=report)
+    return rows_of(
+        chosen, fitted, device, images=images or count, part=part, warm_up=warm_up, report=report
+    )
 
 
 def rows_of(
@@ -114,7 +132,8 @@ def rows_of(
     warm_up: int = WARM_UP,
     report: Report = quietly,
 ) -> list[dict[str, Any]]:
-    """Mean over consecutive images and percentiles over parts of them [ms per image], one row per settings.
+    """Mean over consecutive images and percentiles over parts of them [ms per image], one row per
+    settings.
 
     Args:
         chosen: The settings.
@@ -153,13 +172,17 @@ def rows_of(
             "parts": Timing.of(times).plain(),
         }
         if torch.device(device).type != "cpu":
-            row["waits_per_image"] = waits(fresh(fitted, observations, settings, device, warm_up), device)
+            row["waits_per_image"] = waits(
+                fresh(fitted, observations, settings, device, warm_up), device
+            )
         rows.append(row)
     return rows
 
 
 def waits(run: Run, device: str) -> float:
-    """Synchronisations with the device per image that torch reports; those of Warp are not included."""
+    """Synchronisations with the device per image that torch reports;
+    those of Warp are not included.
+    """
     module = torch.get_device_module(device)
     module.set_sync_debug_mode("warn")
     with warnings.catch_warnings(record=True) as messages:
@@ -173,7 +196,9 @@ def profiled(run: Run, device: str) -> str:
     """Torch's table of the most expensive kernels and operators."""
     on_cpu = torch.device(device).type == "cpu"
     activity = torch.profiler.ProfilerActivity
-    with torch.profiler.profile(activities=[activity.CPU] if on_cpu else [activity.CPU, activity.CUDA]) as profile:
+    with torch.profiler.profile(
+        activities=[activity.CPU] if on_cpu else [activity.CPU, activity.CUDA]
+    ) as profile:
         advance(run, WATCHED)
         watch_of(device).synchronise()
     order = "self_cpu_time_total" if on_cpu else "self_device_time_total"
@@ -181,7 +206,9 @@ def profiled(run: Run, device: str) -> str:
 
 
 def timeline(run: Run, device: str) -> list[str]:
-    """GPU activities of a few steps in order of their begin: begin and duration [us], stream, name."""
+    """GPU activities of a few steps in order of their begin: begin and duration [us], stream,
+    name.
+    """
     with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CUDA]) as profile:
         advance(run, WATCHED)
         watch_of(device).synchronise()
@@ -194,13 +221,26 @@ def timeline(run: Run, device: str) -> list[str]:
 def lines_of_trace(events: list[dict[str, Any]]) -> list[str]:
     """Lines of :func:`timeline` from torch's trace events; those of the host are left out."""
     found = sorted((e for e in events if e.get("cat") in ON_DEVICE), key=lambda event: event["ts"])
-    rows = [(e["ts"] - found[0]["ts"], e["dur"], e["args"].get("stream", "-"), e["name"]) for e in found]
-    return [f"{begin:10.1f} {length:8.1f}  {stream!s:>4}  {name}" for begin, length, stream, name in rows]
+    rows = [
+        (e["ts"] - found[0]["ts"], e["dur"], e["args"].get("stream", "-"), e["name"]) for e in found
+    ]
+    return [
+        f"{begin:10.1f} {length:8.1f}  {stream!s:>4}  {name}"
+        for begin, length, stream, name in rows
+    ]
 
 
 def table(rows: list[dict[str, Any]]) -> list[str]:
     """One line per way."""
-    heads = ["graph, batch, products", "N", "pairs", "images", "mean", "10 .. 90 % of parts", "waits per image"]
+    heads = [
+        "graph, batch, products",
+        "N",
+        "pairs",
+        "images",
+        "mean",
+        "10 .. 90 % of parts",
+        "waits per image",
+    ]
     cells = [
         [
             f"{'graph' if row['graph'] else 'eager'}, {row['batch']}, {row['products']}",
@@ -213,4 +253,6 @@ def table(rows: list[dict[str, Any]]) -> list[str]:
         ]
         for row in rows
     ]
-    return lines_of("training step without densification and opacity resets [ms per image]", heads, cells)
+    return lines_of(
+        "training step without densification and opacity resets [ms per image]", heads, cells
+    )

@@ -55,7 +55,9 @@ class Timing:
 
     def over(self, count: int) -> Timing:
         """Per item, where each run had ``count`` items."""
-        return Timing(median=self.median / count, p10=self.p10 / count, p90=self.p90 / count, runs=self.runs)
+        return Timing(
+            median=self.median / count, p10=self.p10 / count, p90=self.p90 / count, runs=self.runs
+        )
 
     def plain(self) -> dict[str, float | int]:
         """For JSON."""
@@ -103,7 +105,9 @@ class TorchWatch:
         self.module.synchronize()
 
     def captured(self, function: Function) -> Function | None:
-        """A CUDA graph of the function, which has run before on a stream of its own, as torch wants it."""
+        """A CUDA graph of the function, which has run before on a stream of its own,
+        as torch wants it.
+        """
         side = self.module.Stream()
         side.wait_stream(self.module.current_stream())
         with self.module.stream(side):
@@ -153,8 +157,8 @@ def timed(function: Function, watch: Watch, runs: int, *, warm_up: int = WARM_UP
 def both_ways(function: Function, watch: Watch, runs: int, *, within: int = 1) -> dict[str, Any]:
     """``eager``: called from Python; ``graph``: replayed, None where there are no graphs.
 
-    A graph holds the function ``within`` times, and times are per call: launching a graph takes some microseconds
-    itself. A failed capture is reported under ``graph_error`` and in the log.
+    A graph holds the function ``within`` times, and times are per call: launching a graph takes
+    some microseconds itself. A failed capture is reported under ``graph_error`` and in the log.
     """
     found: dict[str, Any] = {"eager": timed(function, watch, runs).plain(), "graph": None}
     try:

@@ -1,4 +1,6 @@
-"""Reading single untrusted files: nothing in them is executed, and sizes are checked before allocation."""
+"""Reading single untrusted files: nothing in them is executed,
+and sizes are checked before allocation.
+"""
 
 from __future__ import annotations
 
@@ -16,8 +18,11 @@ from .matlab import read_matrix
 from .specs import Field
 
 SIDE_MAX = 8192  # [px] no C-ToF image is larger; a forged header would ask for terabytes
-LIMITS = {"H": SIDE_MAX, "W": SIDE_MAX, "h": SIDE_MAX, "w": SIDE_MAX} | dict.fromkeys("FPM", 1_000_000)
-SMALL_FILE_BYTES = 65_536  # .json and .mat calibration files hold a few numbers; a larger one is something else
+LIMITS = {"H": SIDE_MAX, "W": SIDE_MAX, "h": SIDE_MAX, "w": SIDE_MAX} | dict.fromkeys(
+    "FPM", 1_000_000
+)
+# .json and .mat calibration files hold a few numbers; a larger one is something else
+SMALL_FILE_BYTES = 65_536
 KINDS = {"f": "floating point", "i": "integer", "u": "unsigned integer"}
 
 
@@ -30,7 +35,8 @@ def read_array(path: Path, field: Field, sizes: Mapping[str, int] | None = None)
         sizes: Known values of letters in the field's shapes, for example ``{"H": 240, "W": 320}``.
 
     Returns:
-        The array in its stored type, little endian, without infinities, and without NaN unless the field allows them.
+        The array in its stored type, little endian, without infinities, and without NaN unless the
+        field allows them.
 
     Raises:
         InputError: If it is not a plain numeric array of the expected type, shape and content.
@@ -43,8 +49,10 @@ def read_array(path: Path, field: Field, sizes: Mapping[str, int] | None = None)
         raise InputError(
             f"{len(bad)} values of {field.name} are not finite",
             where=path,
-            why=f"expected {'finite numbers' if field.nan == 'error' else 'numbers, or NaN for unknown'}, found "
-            f"{array[tuple(bad[0])]} first at index {[int(i) for i in bad[0]]} of shape {array.shape}",
+            why="expected "
+            f"{'finite numbers' if field.nan == 'error' else 'numbers, or NaN for unknown'}, found "
+            f"{array[tuple(bad[0])]} first at index {[int(i) for i in bad[0]]} of shape "
+            f"{array.shape}",
             fix="export the file again; a frame that was not measured is an absent file, not NaN"
             if field.role == "measurement" and field.nan == "error"
             else "correct the numbers",
@@ -53,7 +61,8 @@ def read_array(path: Path, field: Field, sizes: Mapping[str, int] | None = None)
 
 
 def read_stored(root: Path, field: Field) -> tuple[np.ndarray, str] | None:
-    """Array of a field from the first of its files that exist, and the relative name; None if there is none.
+    """Array of a field from the first of its files that exist, and the relative name; None if there
+    is none.
 
     Raises:
         InputError: If a file is not valid, or files of one field disagree.
@@ -65,20 +74,26 @@ def read_stored(root: Path, field: Field) -> tuple[np.ndarray, str] | None:
     if any(not np.array_equal(_compared(array), _compared(first)) for array in found.values()):
         texts = ", ".join(f"{array.tolist()} in {name}" for name, array in found.items())
         why = f"expected the same value in all of its files, found {texts}"
-        raise InputError(f"{field.name}: files disagree", where=root / path, why=why, fix="remove the wrong file")
+        raise InputError(
+            f"{field.name}: files disagree", where=root / path, why=why, fix="remove the wrong file"
+        )
     return first, path
 
 
 def _compared(array: np.ndarray) -> np.ndarray:
-    """Of a 3x3 or 4x4 matrix the part that both have; of a number, MATLAB's 1x1 or not, the number."""
+    """Of a 3x3 or 4x4 matrix the part that both have; of a number, MATLAB's 1x1 or not,
+    the number.
+    """
     return array[:3, :3] if array.ndim == 2 and array.size > 1 else array.reshape(-1)
 
 
 def read_shape(path: Path, field: Field) -> tuple[int, ...]:
-    """Shape that the header of a .npy file states, checked like :func:`read_array` checks it; no data are read.
+    """Shape that the header of a .npy file states, checked like :func:`read_array` checks it; no
+    data are read.
 
     Raises:
-        InputError: If the file is not a plain numeric array of the expected type and number of axes.
+        InputError: If the file is not a plain numeric array of the expected type and number of
+            axes.
     """
     with _open(path, field) as file:
         shape, _, dtype = _header(path, field, file)
@@ -107,7 +122,9 @@ def as_float32(path: Path, field: Field, array: np.ndarray) -> tuple[np.ndarray,
     if array.dtype.itemsize <= 2 or array.dtype == np.float32:
         return converted, False
     with np.errstate(invalid="ignore"):
-        return converted, not np.array_equal(converted.astype(np.float64), array.astype(np.float64), equal_nan=True)
+        return converted, not np.array_equal(
+            converted.astype(np.float64), array.astype(np.float64), equal_nan=True
+        )
 
 
 def read_choice(path: Path, field: Field) -> str:
@@ -116,15 +133,24 @@ def read_choice(path: Path, field: Field) -> str:
     Raises:
         InputError: If it is anything else.
     """
-    expected = f"expected {{{json.dumps(field.key)}: {' or '.join(json.dumps(c) for c in field.choices)}}}"
+    expected = (
+        f"expected {{{json.dumps(field.key)}: {' or '.join(json.dumps(c) for c in field.choices)}}}"
+    )
     text = _small_file(path, field)
     try:
         content = json.loads(text.decode("utf-8"))
     except (ValueError, RecursionError) as error:
         raise InputError(
-            f"{field.name} is not JSON", where=path, why=f"{expected}, found {error}", fix="correct or remove the file"
+            f"{field.name} is not JSON",
+            where=path,
+            why=f"{expected}, found {error}",
+            fix="correct or remove the file",
         ) from error
-    if not isinstance(content, dict) or set(content) != {field.key} or content[field.key] not in field.choices:
+    if (
+        not isinstance(content, dict)
+        or set(content) != {field.key}
+        or content[field.key] not in field.choices
+    ):
         raise InputError(
             f"unknown {field.name}",
             where=path,
@@ -142,9 +168,11 @@ def _read_npy(path: Path, field: Field, sizes: Mapping[str, int]) -> np.ndarray:
         expected = math.prod(shape) * dtype.itemsize
         if found != expected:
             raise InputError(
-                f"{field.name}: file is {'truncated' if found < expected else 'longer than its array'}",
+                f"{field.name}: file is "
+                f"{'truncated' if found < expected else 'longer than its array'}",
                 where=path,
-                why=f"expected {expected} bytes of data for shape {shape} of {dtype}, found {found}",
+                why=f"expected {expected} bytes of data for shape {shape} of {dtype}, found "
+                f"{found}",
                 fix="copy or export the file again",
             )
         data = np.frombuffer(file.read(expected), dtype=dtype, count=math.prod(shape))
@@ -153,7 +181,10 @@ def _read_npy(path: Path, field: Field, sizes: Mapping[str, int]) -> np.ndarray:
 
 def _header(path: Path, field: Field, file: Any) -> tuple[tuple[int, ...], bool, np.dtype]:
     """Shape, order and type in the header of a .npy file; only types without Python objects."""
-    readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+    readers = {
+        (1, 0): np.lib.format.read_array_header_1_0,
+        (2, 0): np.lib.format.read_array_header_2_0,
+    }
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")  # numpy writes no header that it warns about
@@ -161,7 +192,8 @@ def _header(path: Path, field: Field, file: Any) -> tuple[tuple[int, ...], bool,
             if version not in readers:
                 raise ValueError(f"format version {version}")
             shape, fortran, dtype = readers[version](file)
-    except Exception as error:  # the header is a Python literal: a damaged one raises nearly any exception
+    except Exception as error:
+        # the header is a Python literal: a damaged one raises nearly any exception
         raise InputError(
             f"{field.name}: not a .npy array",
             where=path,
@@ -172,8 +204,10 @@ def _header(path: Path, field: Field, file: Any) -> tuple[tuple[int, ...], bool,
         raise InputError(
             f"{field.name}: pickled Python objects",
             where=path,
-            why=f"expected plain numbers, found dtype {dtype}; loading it could execute code, so it was not loaded",
-            fix="save a numeric array: numpy.save(path, array.astype(numpy.float32), allow_pickle=False)",
+            why=f"expected plain numbers, found dtype {dtype}; loading it could execute code, so "
+            f"it was not loaded",
+            fix="save a numeric array: numpy.save(path, array.astype(numpy.float32), "
+            "allow_pickle=False)",
         )
     return tuple(int(n) for n in shape), fortran, dtype
 
@@ -187,13 +221,18 @@ def _read_mat(path: Path, field: Field) -> np.ndarray:
         raise InputError(
             f"{field.name}: no MATLAB matrix",
             where=path,
-            why=f"expected a MATLAB 5 file with a real matrix {field.mat_key!r}, found {_excerpt(path)} ({error})",
+            why=f"expected a MATLAB 5 file with a real matrix {field.mat_key!r}, found "
+            f"{_excerpt(path)} ({error})",
             fix=f"save the matrix under the name {field.mat_key!r} with save -v7, or as .npy",
         ) from error
 
 
-def _check(path: Path, field: Field, shape: tuple[int, ...], dtype: np.dtype, sizes: Mapping[str, int]) -> None:
-    """Check type and shape against the field's description, and bounds of letters without a known value."""
+def _check(
+    path: Path, field: Field, shape: tuple[int, ...], dtype: np.dtype, sizes: Mapping[str, int]
+) -> None:
+    """Check type and shape against the field's description,
+    and bounds of letters without a known value.
+    """
     if dtype.kind not in field.dtypes:
         raise InputError(
             f"{field.name}: wrong type",
@@ -212,7 +251,9 @@ def _check(path: Path, field: Field, shape: tuple[int, ...], dtype: np.dtype, si
     )
 
 
-def _matches(shape: tuple[int, ...], allowed: tuple[int | str, ...], sizes: Mapping[str, int]) -> bool:
+def _matches(
+    shape: tuple[int, ...], allowed: tuple[int | str, ...], sizes: Mapping[str, int]
+) -> bool:
     if not allowed:
         return math.prod(shape) == 1 and len(shape) <= 2  # MATLAB writes a number as 1x1
     if len(shape) != len(allowed):
@@ -237,14 +278,18 @@ def _open(path: Path, field: Field) -> Any:
         raise InputError(
             f"{field.name}: no such file",
             where=path,
-            why=f"expected a file, found {'a folder' if path.is_dir() else 'nothing that can be read'}",
+            why=f"expected a file, found "
+            f"{'a folder' if path.is_dir() else 'nothing that can be read'}",
             fix="complete the folder",
         )
     try:
         return path.open("rb")
     except OSError as error:
         raise InputError(
-            f"{field.name}: cannot be read", where=path, why=str(error), fix="check permissions and the disk"
+            f"{field.name}: cannot be read",
+            where=path,
+            why=str(error),
+            fix="check permissions and the disk",
         ) from error
 
 

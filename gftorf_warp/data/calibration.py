@@ -1,4 +1,6 @@
-"""Calibration of a folder: scalars, intrinsics of both cameras, shifts and times, each value with its source."""
+"""Calibration of a folder: scalars, intrinsics of both cameras, shifts and times,
+each value with its source.
+"""
 
 from __future__ import annotations
 
@@ -15,9 +17,12 @@ from .arrays import read_choice, read_stored
 from .problems import Problems
 from .sequence import Calibration, Intrinsics
 
-DEPTH_RANGES_M = (0.03, 30_000.0)  # [m] 10 GHz to 10 kHz: outside, the number is another quantity or unit
-FOCAL_MIN = 0.05  # of the image width: a view of 168 degrees; a shorter one is in image widths or millimetres
-UNREAD = Intrinsics(fx=math.nan, fy=math.nan, cx=math.nan, cy=math.nan)  # the error is among the problems
+# [m] 10 GHz to 10 kHz: outside, the number is another quantity or unit
+DEPTH_RANGES_M = (0.03, 30_000.0)
+# of the image width: a view of 168 degrees; a shorter one is in image widths or millimetres
+FOCAL_MIN = 0.05
+# the error is among the problems
+UNREAD = Intrinsics(fx=math.nan, fy=math.nan, cx=math.nan, cy=math.nan)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,7 +46,8 @@ def read_calibration(root: Path, form: str, problems: Problems, width: int | Non
         root: The folder.
         form: Its format, ``ftorf`` or ``torf``.
         problems: Collects errors.
-        width: Columns of the images; None if they could not be read; intrinsics are then not compared with it.
+        width: Columns of the images; None if they could not be read; intrinsics are then not
+            compared with it.
     """
     fields = specs.fields(form)
     sources = {"dc_offset": "default 0: a phasor has no constant part"}
@@ -58,12 +64,20 @@ def read_calibration(root: Path, form: str, problems: Problems, width: int | Non
         dc_offset=(scalar("dc_offset", "dc_offset") or 0.0) if "dc_offset" in fields else 0.0,
         quad_scale=scalar("quad_values_scale_factor", "quad_scale"),
     )
-    intrinsics, half = problems.attempt(_tof_intrinsics, root, fields, sources, width) or (UNREAD, 0.0)
+    intrinsics, half = problems.attempt(_tof_intrinsics, root, fields, sources, width) or (
+        UNREAD,
+        0.0,
+    )
     return Calibrated(calibration=calibration, intrinsics=intrinsics, half=half, sources=sources)
 
 
 def read_colour_intrinsics(
-    root: Path, form: str, tof: Calibrated, tof_size: dict[str, int], size: tuple[int, int], sources: dict[str, str]
+    root: Path,
+    form: str,
+    tof: Calibrated,
+    tof_size: dict[str, int],
+    size: tuple[int, int],
+    sources: dict[str, str],
 ) -> Intrinsics:
     """Intrinsics of the colour images: the file's, or those of the ToF camera, scaled.
 
@@ -82,7 +96,11 @@ def read_colour_intrinsics(
     stored = _pinhole(root, spec, size[1])
     if stored is not None:
         intrinsics, path = stored
-        centres = f"integer pixel centres (cx, cy + {tof.half})" if tof.half else "half pixel centres (kept)"
+        centres = (
+            f"integer pixel centres (cx, cy + {tof.half})"
+            if tof.half
+            else "half pixel centres (kept)"
+        )
         sources["colour_intrinsics"] = f"file {path}, {centres} as for the ToF camera"
         return replace(intrinsics, cx=intrinsics.cx + tof.half, cy=intrinsics.cy + tof.half)
     sources["colour_intrinsics"] = f"inferred from tof_intrinsics, scaled (no {spec.paths[0]})"
@@ -91,7 +109,8 @@ def read_colour_intrinsics(
 
 
 def read_shifts(root: Path, form: str, frames: int, sources: dict[str, str]) -> np.ndarray:
-    """Shift of each raw frame [F] [rad]; slot k of an F-ToeRF folder has canonical channel argsort(permutation)[k].
+    """Shift of each raw frame [F] [rad]; slot k of an F-ToeRF folder has canonical channel
+    argsort(permutation)[k].
 
     Raises:
         InputError: If the permutation is not one.
@@ -108,7 +127,8 @@ def read_shifts(root: Path, form: str, frames: int, sources: dict[str, str]) -> 
                 "unknown permutation",
                 where=root / name,
                 why=f"expected the numbers 0, 1, 2, 3 in some order, found {values.tolist()}",
-                fix="store the order with canonical = raw[permutation], canonical being +cos, -cos, +sin, -sin",
+                fix="store the order with canonical = raw[permutation], canonical being +cos, "
+                "-cos, +sin, -sin",
             )
         sources["shifts"] = f"file {name}: {[int(v) for v in values]}"
     else:
@@ -119,7 +139,12 @@ def read_shifts(root: Path, form: str, frames: int, sources: dict[str, str]) -> 
 
 
 def read_times(
-    root: Path, form: str, frames: int, frame_rate_hz: float | None, default_hz: float, sources: dict[str, str]
+    root: Path,
+    form: str,
+    frames: int,
+    frame_rate_hz: float | None,
+    default_hz: float,
+    sources: dict[str, str],
 ) -> np.ndarray:
     """Time of each frame [s]; more than ``frames`` in the file if the last were not measured.
 
@@ -143,17 +168,22 @@ def read_times(
             raise InputError(
                 "frame_times",
                 where=root / stored[1],
-                why=f"expected {frames} or more times in seconds that start at 0 and never decrease, "
+                why=f"expected {frames} or more times in seconds that start at 0 and never "
+                f"decrease, "
                 f"found {len(times)} from {times[0]:g} to {times[-1]:g}"
                 + (f", decreasing after frame {steps[0]}" if len(steps) else ""),
-                fix=f"correct the order and subtract the first time, or remove the file for {default_hz:g} Hz",
+                fix=f"correct the order and subtract the first time, or remove the file for "
+                f"{default_hz:g} Hz",
             )
         frames = len(times)
         sources["times"] = f"file {stored[1]}"
     if frame_rate_hz is not None:
         if not (math.isfinite(frame_rate_hz) and frame_rate_hz > 0):
             raise UsageError(
-                "frame rate", where="frame_rate_hz", why=f"expected more than 0, found {frame_rate_hz}", fix="give Hz"
+                "frame rate",
+                where="frame_rate_hz",
+                why=f"expected more than 0, found {frame_rate_hz}",
+                fix="give Hz",
             )
         sources["times"] = f"setting {frame_rate_hz:g} Hz"
         return np.arange(frames) / frame_rate_hz
@@ -167,10 +197,17 @@ def _scalar(root: Path, spec: specs.Field, sources: dict[str, str], key: str) ->
     """One number and its source; None if it has neither file nor default."""
     stored = read_stored(root, spec)
     if stored is None:
-        sources[key] = f"default {spec.default} (no {spec.paths[0]})" if spec.default is not None else "default none"
+        sources[key] = (
+            f"default {spec.default} (no {spec.paths[0]})"
+            if spec.default is not None
+            else "default none"
+        )
         return spec.default if isinstance(spec.default, float) else None
     value, path = float(stored[0].reshape(())), stored[1]
-    bounds = {"depth_range": DEPTH_RANGES_M, "quad_values_scale_factor": (math.ulp(0.0), math.inf)}.get(spec.name)
+    bounds = {
+        "depth_range": DEPTH_RANGES_M,
+        "quad_values_scale_factor": (math.ulp(0.0), math.inf),
+    }.get(spec.name)
     if bounds and not bounds[0] <= value <= bounds[1]:
         raise InputError(
             f"implausible {spec.name}",
@@ -189,7 +226,9 @@ def _scalar(root: Path, spec: specs.Field, sources: dict[str, str], key: str) ->
 def _tof_intrinsics(
     root: Path, fields: dict[str, specs.Field], sources: dict[str, str], width: int | None
 ) -> tuple[Intrinsics, float]:
-    """Intrinsics of the ToF camera, and what was added to cx and cy for pixel centres at i + 0.5 [px]."""
+    """Intrinsics of the ToF camera, and what was added to cx and cy for pixel centres at i + 0.5
+    [px].
+    """
     spec, centre = fields["tof_intrinsics"], fields["pixel_centre"]
     stored = _pinhole(root, spec, width)
     if stored is None:
@@ -209,7 +248,9 @@ def _tof_intrinsics(
     half = 0.5 if convention == "integer" else 0.0
     sources |= dict.fromkeys(("fx", "fy"), f"file {path}")
     added = "cx, cy + 0.5" if half else "kept"
-    sources |= dict.fromkeys(("cx", "cy"), f"file {path}, {convention} pixel centres ({added}), {source}")
+    sources |= dict.fromkeys(
+        ("cx", "cy"), f"file {path}, {convention} pixel centres ({added}), {source}"
+    )
     sources["pixel_centre"] = f"{source}: {convention}"
     return replace(intrinsics, cx=intrinsics.cx + half, cy=intrinsics.cy + half), half
 
@@ -223,13 +264,20 @@ def _pinhole(root: Path, spec: specs.Field, width: int | None) -> tuple[Intrinsi
     focal = (matrix[0, 0], matrix[1, 1])
     pinhole = np.eye(len(matrix))
     pinhole[0, 0], pinhole[1, 1], pinhole[:2, 2] = *focal, matrix[:2, 2]
-    if not np.allclose(matrix, pinhole, atol=1e-6) or min(focal) <= 0 or min(focal) < FOCAL_MIN * (width or 0):
+    if (
+        not np.allclose(matrix, pinhole, atol=1e-6)
+        or min(focal) <= 0
+        or min(focal) < FOCAL_MIN * (width or 0)
+    ):
         raise InputError(
             "implausible intrinsics",
             where=root / path,
-            why=f"expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels, fx and fy at least {FOCAL_MIN} of the "
+            why=f"expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels, fx and fy at least "
+            f"{FOCAL_MIN} of the "
             f"width ({'unknown' if width is None else width}), found {matrix.tolist()}",
             fix="store pixels, not fractions of the width or millimetres; no skew, not transposed",
         )
-    intrinsics = Intrinsics(fx=float(focal[0]), fy=float(focal[1]), cx=float(matrix[0, 2]), cy=float(matrix[1, 2]))
+    intrinsics = Intrinsics(
+        fx=float(focal[0]), fy=float(focal[1]), cx=float(matrix[0, 2]), cy=float(matrix[1, 2])
+    )
     return intrinsics, path

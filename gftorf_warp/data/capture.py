@@ -34,7 +34,8 @@ def read(root: Path, frame_rate_hz: float | None) -> Sequence:
         frame_rate_hz: Must be None: a capture states the time of every raw frame.
 
     Raises:
-        InputError: If the folder or a file in it is not what data_specs/capture.toml describes; names all of it.
+        InputError: If the folder or a file in it is not what data_specs/capture.toml describes;
+            names all of it.
         UsageError: If a frame rate is given.
         ResourceError: If it does not fit into memory.
     """
@@ -52,7 +53,9 @@ def read(root: Path, frame_rate_hz: float | None) -> Sequence:
         if n not in files:
             why = f"expected a file for every measured raw frame, found none for {n}"
             fix = "complete the folder, or set measured to false"
-            problems.errors.append(InputError("quads: no such file", where=root / "tof", why=why, fix=fix))
+            problems.errors.append(
+                InputError("quads: no such file", where=root / "tof", why=why, fix=fix)
+            )
     quads = empty_quads(root, frames, {"H": height, "W": width})
     images: dict[str, Any] = {"forward_flow": {}, "backward_flow": {}, "colour": {}}
     for n, file, parts in _read(root, files, digests, problems):
@@ -65,7 +68,9 @@ def read(root: Path, frame_rate_hz: float | None) -> Sequence:
             flow = problems.attempt(_image, file, parts, name, (height, width))
             if flow is not None:
                 images[name][n] = flow
-    colour_size = tuple(int(n) for n in values["colour_size"][::-1]) if "colour_size" in values else None
+    colour_size = (
+        tuple(int(n) for n in values["colour_size"][::-1]) if "colour_size" in values else None
+    )
     for n, file, parts in _read(root, _files(root, "colour", frames, problems), digests, problems):
         image = problems.attempt(_image, file, parts, "colour", colour_size)
         if image is not None:
@@ -93,7 +98,9 @@ def read(root: Path, frame_rate_hz: float | None) -> Sequence:
         from_phasors=values["kind"] == "phasor",
         colour=ColourCamera(
             images=images["colour"],
-            intrinsics=_intrinsics(values["colour_intrinsics"]) if "colour_intrinsics" in values else None,
+            intrinsics=_intrinsics(values["colour_intrinsics"])
+            if "colour_intrinsics" in values
+            else None,
             camera_from_world=inverse(values["colour_pose"]) if "colour_pose" in values else None,
         ),
         flow=Flow(forward=images["forward_flow"], backward=images["backward_flow"]),
@@ -106,7 +113,8 @@ def read(root: Path, frame_rate_hz: float | None) -> Sequence:
 def read_truth(root: Path, frames: int) -> Truth | None:
     """Read the ground truth: both distances, amplitude, objects and layers; None if there is none.
 
-    A layer is NaN in raw frames without it. Parts that data_specs/capture.toml does not describe are ignored.
+    A layer is NaN in raw frames without it. Parts that data_specs/capture.toml does not describe
+    are ignored.
 
     Args:
         root: The folder.
@@ -131,17 +139,23 @@ def read_truth(root: Path, frames: int) -> Truth | None:
             if image is None:
                 continue
             if name not in stacks:
-                stacks[name] = np.full((frames, height, width), 0 if name == "object" else np.nan, dtype=image.dtype)
+                stacks[name] = np.full(
+                    (frames, height, width), 0 if name == "object" else np.nan, dtype=image.dtype
+                )
             if name != "object" and (image < 0).any():
                 why = f"expected 0 or more, or NaN where unknown, found {np.nanmin(image):g}"
                 fix = "store NaN where it is unknown"
-                problems.errors.append(InputError(f"{name}: negative", where=file, why=why, fix=fix))
+                problems.errors.append(
+                    InputError(f"{name}: negative", where=file, why=why, fix=fix)
+                )
             stacks[name][n] = image
             known[n] |= name == "distance"
         for name in parts:
             image = problems.attempt(_layer, file, parts, name, (height, width))
             if image is not None:
-                layers.setdefault(name, np.full((frames, *image.shape), np.nan, dtype=np.float32))[n] = image
+                layers.setdefault(name, np.full((frames, *image.shape), np.nan, dtype=np.float32))[
+                    n
+                ] = image
     problems.raise_if_any(root)
     if "distance" not in stacks:
         return None
@@ -149,7 +163,11 @@ def read_truth(root: Path, frames: int) -> Truth | None:
     body = stacks["object"].astype(np.int64) - 1 if "object" in stacks else None
     more = {name: stacks.get(name) for name in ("phasor_distance", "amplitude")}
     return Truth(
-        distance=distance, known=known, body=None if body is None else body.astype(np.int32), layers=layers, **more
+        distance=distance,
+        known=known,
+        body=None if body is None else body.astype(np.int32),
+        layers=layers,
+        **more,
     )
 
 
@@ -169,10 +187,15 @@ def _manifest(root: Path) -> dict[str, str]:
     if not path.is_file():
         return {}
     digests = {}
-    for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), start=1):
+    for number, line in enumerate(
+        path.read_text(encoding="utf-8", errors="replace").splitlines(), start=1
+    ):
         match = re.fullmatch(r"([0-9a-f]{64})  (\S+)", line)
         if match is None:
-            why = f"expected 64 hexadecimal digits, two blanks and a name, found {line[:80]!r} in line {number}"
+            why = (
+                f"expected 64 hexadecimal digits, two blanks and a name, found {line[:80]!r} "
+                f"in line {number}"
+            )
             raise InputError("no manifest", where=path, why=why, fix="copy it again, or remove it")
         digests[match[2]] = match[1]
     _verify(root, root / NAME, digests)
@@ -183,7 +206,11 @@ def _verify(root: Path, file: Path, digests: dict[str, str]) -> None:
     """Compare a file with the manifest, if there is one."""
     name = file.relative_to(root).as_posix()
     if digests and hashlib.sha256(file.read_bytes()).hexdigest() != digests.get(name):
-        why = f"its SHA-256 is not that of {MANIFEST}" if name in digests else f"{MANIFEST} does not name it"
+        why = (
+            f"its SHA-256 is not that of {MANIFEST}"
+            if name in digests
+            else f"{MANIFEST} does not name it"
+        )
         fix = f"restore it, or remove {MANIFEST} if the change was yours"
         raise InputError("content changed", where=file, why=why, fix=fix)
 
@@ -210,7 +237,9 @@ def _layer(file: Path, parts: Parts, name: str, shape: tuple[int, ...]) -> np.nd
 
 
 def _image(file: Path, parts: Parts, name: str, shape: tuple[int, ...] | None) -> np.ndarray | None:
-    """One field of a file, channels first if there are several, last of colour; None if an optional one is absent."""
+    """One field of a file, channels first if there are several, last of colour;
+    None if an optional one is absent.
+    """
     field = specs.fields(FORMAT)[name]
     if field.key not in parts:
         if not field.required:
@@ -222,21 +251,42 @@ def _image(file: Path, parts: Parts, name: str, shape: tuple[int, ...] | None) -
 
 
 def _channels(
-    file: Path, channels: dict[str, np.ndarray], name: str, field: specs.Field, shape: tuple[int, ...] | None
+    file: Path,
+    channels: dict[str, np.ndarray],
+    name: str,
+    field: specs.Field,
+    shape: tuple[int, ...] | None,
 ) -> list[np.ndarray]:
     """The channels of a part in the order of its description, checked."""
     images = [channels[channel] for channel in field.channels if channel in channels]
     kinds = {image.dtype.kind for image in images}
-    if len(images) != len(channels) or len(images) != len(field.channels) or kinds != {field.dtypes}:
-        why = f"expected channels {', '.join(field.channels)}, found {', '.join(channels)} of kinds {kinds}"
-        raise InputError(f"{name}: wrong channels", where=file, why=why, fix="export the file again")
+    if (
+        len(images) != len(channels)
+        or len(images) != len(field.channels)
+        or kinds != {field.dtypes}
+    ):
+        why = (
+            f"expected channels {', '.join(field.channels)}, found {', '.join(channels)} of "
+            f"kinds {kinds}"
+        )
+        raise InputError(
+            f"{name}: wrong channels", where=file, why=why, fix="export the file again"
+        )
     if shape is None or images[0].shape != shape:
         why = f"expected rows x columns {shape}, found {images[0].shape}"
-        raise InputError(f"{name}: wrong shape", where=file, why=why, fix=f"export that size, or correct {NAME}")
+        raise InputError(
+            f"{name}: wrong shape", where=file, why=why, fix=f"export that size, or correct {NAME}"
+        )
     for image in images if field.dtypes == "f" else []:
         if np.isinf(image).any() or (field.nan == "error" and np.isnan(image).any()):
-            why = f"expected finite numbers{' or NaN for unknown' if field.nan == 'unknown' else ''}, found others"
-            raise InputError(f"{name}: not finite", where=file, why=why, fix="export the file again")
+            why = (
+                f"expected finite "
+                f"numbers{' or NaN for unknown' if field.nan == 'unknown' else ''}, found "
+                f"others"
+            )
+            raise InputError(
+                f"{name}: not finite", where=file, why=why, fix="export the file again"
+            )
     return images
 
 
@@ -246,44 +296,73 @@ def _judge(path: Path, values: dict[str, Any], problems: Problems) -> None:
     times, frequencies = values["time"], values["f_mod_hz"]
     poses = [values[name] for name in ("pose", "colour_pose", "novel") if name in values]
     rules = {  # field: (whether it holds, what is expected)
-        "size": (((values["size"] >= 1) & (values["size"] <= SIDE_MAX)).all(), f"1 to {SIDE_MAX} pixels"),
+        "size": (
+            ((values["size"] >= 1) & (values["size"] <= SIDE_MAX)).all(),
+            f"1 to {SIDE_MAX} pixels",
+        ),
         "id": (
             np.array_equal(values["id"], np.arange(frames)) and frames < FRAMES_MAX,
             "0, 1, 2 and so on, one for each raw frame",
         ),
-        "time": (times[0] == 0 and (np.diff(times) >= 0).all(), "seconds from 0 that never decrease"),
+        "time": (
+            times[0] == 0 and (np.diff(times) >= 0).all(),
+            "seconds from 0 that never decrease",
+        ),
         "f_mod_hz": (
             ((frequencies > 0) & (frequencies * DEPTH_RANGES_M[0] <= SPEED_OF_LIGHT)).all()
             and (frequencies * DEPTH_RANGES_M[1] >= SPEED_OF_LIGHT).all(),
-            f"{SPEED_OF_LIGHT / DEPTH_RANGES_M[1]:.3g} to {SPEED_OF_LIGHT / DEPTH_RANGES_M[0]:.3g} Hz",
+            f"{SPEED_OF_LIGHT / DEPTH_RANGES_M[1]:.3g} to "
+            f"{SPEED_OF_LIGHT / DEPTH_RANGES_M[0]:.3g} Hz",
         ),
         "exposure": ("exposure" not in values or (values["exposure"] > 0).all(), "seconds above 0"),
         "measured": (values["measured"].any(), "at least one measured raw frame"),
-        "intrinsics": (_is_pinhole(values["intrinsics"], width), "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels"),
+        "intrinsics": (
+            _is_pinhole(values["intrinsics"], width),
+            "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels",
+        ),
         "colour_intrinsics": (
             "colour_intrinsics" not in values
-            or ("colour_size" in values and _is_pinhole(values["colour_intrinsics"], float(values["colour_size"][0]))),
+            or (
+                "colour_size" in values
+                and _is_pinhole(values["colour_intrinsics"], float(values["colour_size"][0]))
+            ),
             "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels, and a size",
         ),
-        "cycle": (_is_cycle(values), "raw frames of a cycle: three or more shifts at each of its frequencies"),
+        "cycle": (
+            _is_cycle(values),
+            "raw frames of a cycle: three or more shifts at each of its frequencies",
+        ),
         "raw_scale": ("raw_scale" not in values or values["raw_scale"] > 0, "more than 0"),
-        "pose": (all(rigid(matrices).all() for matrices in poses), "rotations and translations, camera to world"),
+        "pose": (
+            all(rigid(matrices).all() for matrices in poses),
+            "rotations and translations, camera to world",
+        ),
     }
     for name, (holds, expected) in rules.items():
         if not holds:
             key = json_fields()[name].key
-            error = InputError(f"{key}: implausible", where=path, why=f"expected {expected}", fix="correct the file")
+            error = InputError(
+                f"{key}: implausible",
+                where=path,
+                why=f"expected {expected}",
+                fix="correct the file",
+            )
             problems.errors.append(error)
 
 
 def _is_cycle(values: dict[str, Any]) -> bool:
-    """Whether a stated cycle, as far as it was recorded, has three raw frames or more at each of its frequencies."""
+    """Whether a stated cycle, as far as it was recorded,
+    has three raw frames or more at each of its frequencies.
+    """
     if "cycle" not in values:
         return True
     length, frequencies = int(values["cycle"]), values["f_mod_hz"]
     if length < QUADS_MIN or (values["kind"] == "phasor" and length != FRAMES_PER_QUARTET):
         return False
-    return length > len(frequencies) or int(np.unique(frequencies[:length], return_counts=True)[1].min()) >= QUADS_MIN
+    return (
+        length > len(frequencies)
+        or int(np.unique(frequencies[:length], return_counts=True)[1].min()) >= QUADS_MIN
+    )
 
 
 def _is_pinhole(matrix: np.ndarray, width: float) -> bool:
@@ -297,13 +376,17 @@ def _intrinsics(matrix: np.ndarray) -> Intrinsics:
     return Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy)
 
 
-def _sources(values: dict[str, Any], images: dict[str, dict[int, np.ndarray]], measured: int) -> dict[str, str]:
+def _sources(
+    values: dict[str, Any], images: dict[str, dict[int, np.ndarray]], measured: int
+) -> dict[str, str]:
     """Source of each value of the sequence."""
     sources = {}
     for field in specs.fields(FORMAT).values():
         for name in field.fills:
             there = field.name in values if field.kind == "json" else bool(images.get(name, True))
-            place = f"{NAME} {field.key}" if field.kind == "json" else field.paths[0].partition("/")[0]
+            place = (
+                f"{NAME} {field.key}" if field.kind == "json" else field.paths[0].partition("/")[0]
+            )
             if field.role != "truth":
                 sources[name] = f"file {place}" if there else "default none"
     for name, found in images.items():

@@ -19,7 +19,13 @@ FORMAT = "capture"
 BYTES_MAX = 1 << 28  # 256 MB: a few hundred bytes per raw frame, and a million of them
 FRAMES = "frames"
 KINDS = {"f": (int, float), "i": (int,), "b": (bool,), "U": (str,), "O": (dict,)}
-WORDS = {"f": "numbers", "i": "whole numbers", "b": "true or false", "U": "a text", "O": "an object"}
+WORDS = {
+    "f": "numbers",
+    "i": "whole numbers",
+    "b": "true or false",
+    "U": "a text",
+    "O": "an object",
+}
 
 
 def json_fields() -> dict[str, specs.Field]:
@@ -28,19 +34,31 @@ def json_fields() -> dict[str, specs.Field]:
 
 
 def read_values(root: Path) -> dict[str, Any]:
-    """Values of capture.json by field name: texts, objects, and arrays for numbers; what is absent is left out.
+    """Values of capture.json by field name: texts, objects, and arrays for numbers; what is absent
+    is left out.
 
     Raises:
-        InputError: If the file is not what data_specs/capture.toml describes; names all of it at once.
+        InputError: If the file is not what data_specs/capture.toml describes; names all of it at
+            once.
     """
     path, problems = root / NAME, Problems()
     content = _load(path)
     frames = content.get(FRAMES)
-    if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
+    if (
+        not isinstance(frames, list)
+        or not frames
+        or not all(isinstance(frame, dict) for frame in frames)
+    ):
         raise _wrong(path, FRAMES, "a list with an object for every raw frame", frames)
     version = content.get("version")
     if not isinstance(version, str) or version.partition(".")[0] != "1":
-        raise _wrong(path, "version", "1.x, which this program reads", version, "use a newer version of this program")
+        raise _wrong(
+            path,
+            "version",
+            "1.x, which this program reads",
+            version,
+            "use a newer version of this program",
+        )
     problems.attempt(_refuse_unknown, path, content)
     for number, frame in enumerate(frames):
         problems.attempt(_refuse_unknown, path, frame, f"{FRAMES}[{number}]", f"{FRAMES}.")
@@ -57,14 +75,21 @@ def _load(path: Path) -> dict[str, Any]:
     try:
         if path.stat().st_size > BYTES_MAX:
             raise InputError(
-                "file too large", where=path, why=f"more than {BYTES_MAX} bytes", fix="split the recording"
+                "file too large",
+                where=path,
+                why=f"more than {BYTES_MAX} bytes",
+                fix="split the recording",
             )
         content = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         why = error.strerror or str(error)
-        raise InputError("cannot be read", where=path, why=why, fix="check permissions and the disk") from error
+        raise InputError(
+            "cannot be read", where=path, why=why, fix="check permissions and the disk"
+        ) from error
     except (ValueError, RecursionError) as error:
-        raise InputError("no JSON", where=path, why=str(error)[:200], fix="correct the file") from error
+        raise InputError(
+            "no JSON", where=path, why=str(error)[:200], fix="correct the file"
+        ) from error
     if not isinstance(content, dict):
         raise _wrong(path, "the whole file", "an object", content)
     return content
@@ -79,8 +104,16 @@ def _refuse_unknown(path: Path, table: dict[str, Any], where: str = "", prefix: 
         if key.startswith("x-") or full in known:
             continue
         if not inside:
-            names = sorted({k.removeprefix(prefix).partition(".")[0] for k in known if k.startswith(prefix)})
-            raise _wrong(path, f"{where or 'the top'}", f"keys {', '.join(names)}, or x-..", key, "correct the key")
+            names = sorted(
+                {k.removeprefix(prefix).partition(".")[0] for k in known if k.startswith(prefix)}
+            )
+            raise _wrong(
+                path,
+                f"{where or 'the top'}",
+                f"keys {', '.join(names)}, or x-..",
+                key,
+                "correct the key",
+            )
         if full != FRAMES and isinstance(value, dict):
             _refuse_unknown(path, value, full, f"{full}.")
 
@@ -93,7 +126,9 @@ def _value(path: Path, content: dict[str, Any], field: specs.Field) -> Any:
         if not any(there) and not field.required:
             return None
         if not all(there):
-            raise _wrong(path, f"{FRAMES}[{there.index(False)}].{key}", "a value for every raw frame", None)
+            raise _wrong(
+                path, f"{FRAMES}[{there.index(False)}].{key}", "a value for every raw frame", None
+            )
         return _array(path, field, [frame[key] for frame in content[FRAMES]])
     value: Any = content
     for key in field.key.split("."):
@@ -116,10 +151,15 @@ def _array(path: Path, field: specs.Field, value: Any) -> np.ndarray:
     leaves, shape = _flatten(value)
     allowed = tuple(kind for letter in field.dtypes for kind in KINDS[letter])
     fits = len(shape) == len(field.shapes[0]) and all(
-        isinstance(want, str) or want == got for want, got in zip(field.shapes[0], shape, strict=False)
+        isinstance(want, str) or want == got
+        for want, got in zip(field.shapes[0], shape, strict=False)
     )
     # a bool is an int to isinstance
-    if not fits or math.prod(shape) != len(leaves) or not all(type(leaf) in allowed for leaf in leaves):
+    if (
+        not fits
+        or math.prod(shape) != len(leaves)
+        or not all(type(leaf) in allowed for leaf in leaves)
+    ):
         want = f"{WORDS[field.dtypes[0]]} of shape ({', '.join(map(str, field.shapes[0]))})"
         raise _wrong(path, field.key, want, value)
     kind = np.dtype({"f": "f8", "i": "i8", "b": "?"}[field.dtypes[0]])
@@ -133,7 +173,9 @@ def _array(path: Path, field: specs.Field, value: Any) -> np.ndarray:
 
 
 def _flatten(value: Any) -> tuple[list[Any], tuple[int, ...]]:
-    """Leaves and shape of nested lists; an uneven nesting has fewer or more leaves than its shape says."""
+    """Leaves and shape of nested lists; an uneven nesting has fewer or more leaves than its shape
+    says.
+    """
     if not isinstance(value, list):
         return [value], ()
     inner = [_flatten(item) for item in value]
@@ -142,9 +184,14 @@ def _flatten(value: Any) -> tuple[list[Any], tuple[int, ...]]:
     return leaves, (len(value), *next(iter(shapes))) if len(shapes) == 1 else (len(value), -1)
 
 
-def _wrong(path: Path, where: str, expected: str, found: Any, fix: str = "correct the file") -> InputError:
+def _wrong(
+    path: Path, where: str, expected: str, found: Any, fix: str = "correct the file"
+) -> InputError:
     text = "nothing" if found is None else json.dumps(found, default=str)
     shown = text if len(text) <= 80 else f"{text[:77]}..."
     return InputError(
-        f"{where}: not valid in a capture", where=path, why=f"expected {expected}, found {shown}", fix=fix
+        f"{where}: not valid in a capture",
+        where=path,
+        why=f"expected {expected}, found {shown}",
+        fix=fix,
     )

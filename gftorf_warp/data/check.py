@@ -1,4 +1,6 @@
-"""``gftorf check``: content of a sequence, source of each value, estimates from its images, and warnings."""
+"""``gftorf check``: content of a sequence, source of each value, estimates from its images,
+and warnings.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,8 @@ from .folder import format_of, numbered
 from .read import read
 from .sequence import Sequence
 
-NARROW_VIEW = 5.0  # focal length in image widths: a view below 11 degrees is more often a mistake in units
+# focal length in image widths: a view below 11 degrees is more often a mistake in units
+NARROW_VIEW = 5.0
 
 
 def check(path: str | Path) -> Report:
@@ -38,7 +41,9 @@ def check(path: str | Path) -> Report:
         if has_light:
             _estimates(sequence, report)
         else:
-            report.warnings.append("no complete quartet with light: nothing can be decoded or estimated")
+            report.warnings.append(
+                "no complete quartet with light: nothing can be decoded or estimated"
+            )
     findings.flow(sequence, report)
     return report
 
@@ -70,16 +75,22 @@ def _canonical(sequence: Sequence) -> bool:
 def _facts(sequence: Sequence, report: Report) -> None:
     """Counts and values, each with its source."""
     stated, tof = sequence.calibration, sequence.intrinsics
-    cycle = "inferred from shifts and frequencies" if stated.cycle_length is None else sequence.sources["cycle_length"]
+    cycle = (
+        "inferred from shifts and frequencies"
+        if stated.cycle_length is None
+        else sequence.sources["cycle_length"]
+    )
     measured, sources = int(sequence.measured.sum()), sequence.sources
     colour, poses = sequence.colour.size, sources["camera_from_world"]
     degrees = np.round(np.degrees(sequence.shifts[: sequence.cycle])).astype(int).tolist()
     period = np.diff(sequence.times[:: sequence.cycle if sequence.from_phasors else 1])
     report.lines += [
-        f"raw frames      {measured} of {sequence.frames} measured, {len(sequence.complete_quartets)} complete "
+        f"raw frames      {measured} of {sequence.frames} measured, "
+        f"{len(sequence.complete_quartets)} complete "
         f"quartets, {sequence.width}x{sequence.height} pixels; {sources['measured']}",
         f"cycle           {sequence.cycle} raw frames; {cycle}",
-        f"quads           {sequence.quads.min():.4g} .. {sequence.quads.max():.4g}; {sources['quads']}",
+        f"quads           {sequence.quads.min():.4g} .. {sequence.quads.max():.4g}; "
+        f"{sources['quads']}",
         f"shifts          {', '.join(map(str, degrees))} degrees in time; {sources['shifts']}",
         f"times           0 .. {sequence.times[-1]:.4g} s"
         + (f", {period.min():.4g} to {period.max():.4g} s apart" if len(period) else "")
@@ -93,7 +104,8 @@ def _facts(sequence: Sequence, report: Report) -> None:
         f"intrinsics      fx {tof.fx:.6g}, fy {tof.fy:.6g} px; {sources['fx']}",
         f"principal point {tof.cx:.6g}, {tof.cy:.6g} px, centres at i + 0.5; {sources['cx']}",
         f"poses           {poses}",
-        f"colour          {sources['colour']}" + ("" if colour is None else f", {colour[1]}x{colour[0]} pixels"),
+        f"colour          {sources['colour']}"
+        + ("" if colour is None else f", {colour[1]}x{colour[0]} pixels"),
         f"colour camera   {sources['colour_intrinsics']}; poses: {sources['colour_from_world']}",
         f"novel views     {sources['novel_from_world']}",
         f"forward flow    {sources['forward_flow']}",
@@ -101,10 +113,13 @@ def _facts(sequence: Sequence, report: Report) -> None:
     ]
     assert sequence.path is not None
     if sequence.frequencies_hz is not None:
-        several = ", ".join(f"{f / 1e6:.6g}" for f in dict.fromkeys(sequence.frame_frequencies.tolist()))
+        several = ", ".join(
+            f"{f / 1e6:.6g}" for f in dict.fromkeys(sequence.frame_frequencies.tolist())
+        )
         alone = ", ".join(f"{SPEED_OF_LIGHT / (2 * f):.4g}" for f in sequence.frequencies)
         report.lines.append(
-            f"frequencies     {several} MHz, unambiguous to {alone} m alone; {sources['frequencies_hz']}"
+            f"frequencies     {several} MHz, unambiguous to {alone} m alone; "
+            f"{sources['frequencies_hz']}"
         )
     if tof.distortion is not None:
         names = zip(("k1", "k2", "p1", "p2", "k3"), tof.distortion, strict=True)
@@ -120,7 +135,9 @@ def _facts(sequence: Sequence, report: Report) -> None:
             ids = list(numbered(sequence.path, name))
             if ids:
                 steps = ", ".join(f"{step} ({count}x)" for step, count in _counts(np.diff(ids)))
-                report.lines.append(f"ids {name:<28} {len(ids)} from {ids[0]} to {ids[-1]}, steps {steps or 'none'}")
+                report.lines.append(
+                    f"ids {name:<28} {len(ids)} from {ids[0]} to {ids[-1]}, steps {steps or 'none'}"
+                )
 
 
 def _assumptions(sequence: Sequence, report: Report) -> None:
@@ -134,15 +151,23 @@ def _assumptions(sequence: Sequence, report: Report) -> None:
         shown = ", ".join(f"{n}" for n in missing[:10]) + (" .." if len(missing) > 10 else "")
         report.warnings.append(f"{len(missing)} {kind} were not measured: {shown}")
     if sequence.frames % sequence.cycle:
-        report.warnings.append(f"the last quartet is truncated after {sequence.frames % sequence.cycle} frames")
+        report.warnings.append(
+            f"the last quartet is truncated after {sequence.frames % sequence.cycle} frames"
+        )
     if sources["times"].startswith("default"):
-        report.warnings.append(f"frame rate assumed: {sources['times'][8:]}; cams/frame_times.npy states another")
+        report.warnings.append(
+            f"frame rate assumed: {sources['times'][8:]}; cams/frame_times.npy states another"
+        )
     if sources["f_mod_hz"].startswith("default"):
         report.warnings.append("modulation frequency assumed: no cams/depth_range.npy")
     if sources["pixel_centre"].startswith("inferred"):
-        report.warnings.append(f"pixel centres {sources['pixel_centre']}; state them in cams/pixel_centre.json")
+        report.warnings.append(
+            f"pixel centres {sources['pixel_centre']}; state them in cams/pixel_centre.json"
+        )
     if "other poses" in sources["camera_from_world"]:
-        report.warnings.append(f"poses: {sources['camera_from_world']}; cams/poses.json makes them count")
+        report.warnings.append(
+            f"poses: {sources['camera_from_world']}; cams/poses.json makes them count"
+        )
     for name in ("colour_intrinsics", "colour_from_world"):
         if sources[name].startswith("inferred") or "replaces" in sources[name]:
             report.warnings.append(f"{name}: {sources[name]}")
@@ -156,9 +181,13 @@ def _assumptions(sequence: Sequence, report: Report) -> None:
     ):
         if focal > NARROW_VIEW * size:
             angle = math.degrees(2 * math.atan(size / (2 * focal)))
-            report.warnings.append(f"{name} {focal:.4g} at {size} px is a view of {angle:.1f} degrees: millimetres?")
+            report.warnings.append(
+                f"{name} {focal:.4g} at {size} px is a view of {angle:.1f} degrees: millimetres?"
+            )
     if not (0 <= tof.cx <= sequence.width and 0 <= tof.cy <= sequence.height):
-        report.warnings.append(f"the principal point {tof.cx:.4g}, {tof.cy:.4g} is outside the image")
+        report.warnings.append(
+            f"the principal point {tof.cx:.4g}, {tof.cy:.4g} is outside the image"
+        )
 
 
 def _counts(steps: np.ndarray) -> list[tuple[int, int]]:

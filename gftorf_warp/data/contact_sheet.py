@@ -1,4 +1,5 @@
-"""Contact sheet of a sequence: raw quads of one quartet, amplitude, distances, errors, objects, flow, colour.
+"""Contact sheet of a sequence: raw quads of one quartet, amplitude, distances, errors, objects,
+flow, colour.
 
 OpenCV encodes the PNG and draws the text.
 """
@@ -21,14 +22,25 @@ from .sequence import Sequence, Truth
 from .truth import known_distance
 
 PANEL = 340  # [px] width of an image on the sheet
-BAR, BAR_GAP, BAR_TEXT = 12, 8, 70  # [px] width of a colour bar, its distance from the image, width of its numbers
+# [px] width of a colour bar, its distance from the image, width of its numbers
+BAR, BAR_GAP, BAR_TEXT = 12, 8, 70
 TITLE, GAP, MARGIN = 30, 18, 24  # [px] height of a title, space between panels, around all of them
 HEAD = 70  # [px] height of the heading
 INK, SOFT, UNKNOWN = (32, 32, 32), (110, 110, 110), (200, 200, 200)
-CLIP = 99.5  # percentile at which the scale of an error ends, so that one wrapped pixel does not darken all others
+# percentile at which the scale of an error ends, so that one wrapped pixel does not darken all
+# others
+CLIP = 99.5
 COLUMNS = 4
 SHIFTS_MIN = 3  # different ones: cosine, sine and a constant
-PALETTE = ((230, 159, 0), (86, 180, 233), (0, 158, 115), (240, 228, 66), (0, 114, 178), (213, 94, 0), (204, 121, 167))
+PALETTE = (
+    (230, 159, 0),
+    (86, 180, 233),
+    (0, 158, 115),
+    (240, 228, 66),
+    (0, 114, 178),
+    (213, 94, 0),
+    (204, 121, 167),
+)
 
 Picture = UInt8[np.ndarray, "h w 3"]
 Colours = Callable[[Float[np.ndarray, "H W"]], Picture]
@@ -57,13 +69,21 @@ def contact_sheet(sequence: Sequence, truth: Truth | None, title: str) -> bytes:
     n, panels = middle_panels(sequence, truth)
     height = round(PANEL * sequence.height / sequence.width)
     cell = PANEL + BAR_GAP + BAR + BAR_TEXT
-    size = (2 * MARGIN + HEAD + len(panels) * (TITLE + height + GAP), 2 * MARGIN + COLUMNS * (cell + GAP) - GAP, 3)
+    size = (
+        2 * MARGIN + HEAD + len(panels) * (TITLE + height + GAP),
+        2 * MARGIN + COLUMNS * (cell + GAP) - GAP,
+        3,
+    )
     sheet = np.full(size, 255, dtype=np.uint8)
     _write(sheet, title, (MARGIN, MARGIN + 22), 24, INK, bold=True)
-    frequencies = ", ".join(f"{f / 1e6:.6g}" for f in dict.fromkeys(sequence.frame_frequencies.tolist()))
+    frequencies = ", ".join(
+        f"{f / 1e6:.6g}" for f in dict.fromkeys(sequence.frame_frequencies.tolist())
+    )
     about = (
-        f"{int(sequence.measured.sum())} raw frames of {sequence.width}x{sequence.height} pixels, {frequencies} MHz, "
-        f"{sequence.times[-1]:.3g} s; shown: the quartet of raw frame {n}. A picture for people, no data."
+        f"{int(sequence.measured.sum())} raw frames of {sequence.width}x{sequence.height} "
+        f"pixels, {frequencies} MHz, "
+        f"{sequence.times[-1]:.3g} s; shown: the quartet of raw frame {n}. A picture for people, "
+        f"no data."
     )
     _write(sheet, about, (MARGIN, MARGIN + 48), 15, SOFT)
     for i, row in enumerate(panels):
@@ -76,8 +96,16 @@ def contact_sheet(sequence: Sequence, truth: Truth | None, title: str) -> bytes:
 def middle_panels(sequence: Sequence, truth: Truth | None) -> tuple[int, list[list[Panel]]]:
     """First raw frame of the middle quartet, and its panels in rows."""
     quartets = _decodable(sequence)
-    n = sequence.cycle * quartets[len(quartets) // 2] if quartets else int(np.flatnonzero(sequence.measured)[0])
-    rows = [_raw(sequence, n), _decoded(sequence, truth, n, bool(quartets)), _more(sequence, truth, n)]
+    n = (
+        sequence.cycle * quartets[len(quartets) // 2]
+        if quartets
+        else int(np.flatnonzero(sequence.measured)[0])
+    )
+    rows = [
+        _raw(sequence, n),
+        _decoded(sequence, truth, n, bool(quartets)),
+        _more(sequence, truth, n),
+    ]
     return n, [row[i : i + COLUMNS] for row in rows for i in range(0, len(row), COLUMNS)]
 
 
@@ -102,27 +130,36 @@ def _raw(sequence: Sequence, n: int) -> list[Panel]:
     end = float(np.percentile(np.abs(sequence.quads[frames]), CLIP)) or 1.0
     several, panels = len(sequence.frequencies) > 1, []
     for m in frames:
-        name = f"raw frame {m}: {math.degrees(sequence.shifts[m]):.4g} deg, {1e3 * sequence.times[m]:.2f} ms"
+        name = (
+            f"raw frame {m}: {math.degrees(sequence.shifts[m]):.4g} deg, "
+            f"{1e3 * sequence.times[m]:.2f} ms"
+        )
         name += f", {sequence.frame_frequencies[m] / 1e6:.4g} MHz" if several else ""
         panels.append(scaled(name, sequence.quads[m], (-end, end), diverging))
     return panels
 
 
 def _decoded(sequence: Sequence, truth: Truth | None, n: int, whole: bool) -> list[Panel]:
-    """Amplitude, true distance, closed form and its error, each frequency by itself; as far as available."""
+    """Amplitude, true distance, closed form and its error, each frequency by itself;
+    as far as available.
+    """
     panels = []
     decoded = None
     if whole:
         quartet = decode_quartet(sequence, n // sequence.cycle)
         decoded = quartet.distance
         amplitude = 0.5 * np.hypot(*quartet.phasors[0])
-        panels.append(scaled("amplitude of the closed form", amplitude, (0.0, _end(amplitude)), _gray))
+        panels.append(
+            scaled("amplitude of the closed form", amplitude, (0.0, _end(amplitude)), _gray)
+        )
     elif truth is not None and truth.amplitude is not None:
         amplitude = truth.amplitude[n].astype(np.float64)
         panels.append(scaled("amplitude without noise", amplitude, (0.0, _end(amplitude)), _gray))
     if truth is None:
         if decoded is not None:
-            panels.append(scaled("closed form [m]", decoded, (decoded.min(), decoded.max()), _viridis))
+            panels.append(
+                scaled("closed form [m]", decoded, (decoded.min(), decoded.max()), _viridis)
+            )
             panels += _by_frequency(sequence, quartet)
         return panels
     true = known_distance(truth)[n]
@@ -145,7 +182,9 @@ def _by_frequency(sequence: Sequence, quartet: Decoded) -> list[Panel]:
     panels = []
     for f, image in zip(sequence.frequencies, quartet.single, strict=True):
         ends = 0.0, SPEED_OF_LIGHT / (2.0 * f)
-        panels.append(scaled(f"{f / 1e6:.4g} MHz alone, to {ends[1]:.3g} m [m]", image, ends, _viridis))
+        panels.append(
+            scaled(f"{f / 1e6:.4g} MHz alone, to {ends[1]:.3g} m [m]", image, ends, _viridis)
+        )
     title = f"confidence, {100 * float(quartet.ambiguous.mean()):.3g} % ambiguous"
     return [*panels, scaled(title, quartet.confidence, (0.0, 1.0), _gray)]
 
@@ -155,27 +194,40 @@ def _more(sequence: Sequence, truth: Truth | None, n: int) -> list[Panel]:
     panels = []
     if truth is not None and truth.phasor_distance is not None:
         difference = truth.phasor_distance[n] - known_distance(truth)[n]
-        if len(sequence.frequencies) > 1:  # of one frequency, whose range may be shorter than the scene
+        # of one frequency, whose range may be shorter than the scene
+        if len(sequence.frequencies) > 1:
             alone = SPEED_OF_LIGHT / (2.0 * sequence.frame_frequencies[n])
             difference = np.mod(difference + 0.5 * alone, alone) - 0.5 * alone
         end = max(_end(np.abs(difference)), 1e-3)
-        panels.append(scaled("static phasor - true distance [m]", difference, (-end, end), diverging))
+        panels.append(
+            scaled("static phasor - true distance [m]", difference, (-end, end), diverging)
+        )
     if truth is not None and truth.body is not None:
         colours = np.array([(255, 255, 255), *PALETTE], dtype=np.uint8)
         body = truth.body[n]
         index = np.where(body < 0, 0, 1 + body % len(PALETTE))
-        panels.append(Panel(title=f"objects, {len(np.unique(body[body >= 0]))} in view", image=colours[index]))
+        panels.append(
+            Panel(title=f"objects, {len(np.unique(body[body >= 0]))} in view", image=colours[index])
+        )
     flow = sequence.flow.forward.get(n)
     if flow is not None:
         length = np.hypot(*flow)
         end = max(float(np.nanmax(length)) if np.isfinite(length).any() else 0.0, 1e-6)
         panels.append(
-            Panel(title=f"flow to raw frame {n + sequence.cycle}, up to {end:.3g} px", image=_flow(flow, end))
+            Panel(
+                title=f"flow to raw frame {n + sequence.cycle}, up to {end:.3g} px",
+                image=_flow(flow, end),
+            )
         )
     image = sequence.colour.images.get(n)
     if image is not None:
         top = float(np.percentile(image, CLIP)) or 1.0
-        panels.append(Panel(title=f"colour, raw frame {n}", image=_eight_bits(np.clip(image / top, 0, 1) ** (1 / 2.2))))
+        panels.append(
+            Panel(
+                title=f"colour, raw frame {n}",
+                image=_eight_bits(np.clip(image / top, 0, 1) ** (1 / 2.2)),
+            )
+        )
     return panels
 
 
@@ -199,19 +251,28 @@ def _place(sheet: Picture, panel: Panel, x: int, y: int, height: int) -> None:
     factor = min(PANEL / w, height / h)
     size = max(1, round(w * factor)), max(1, round(h * factor))
     shrinks = cv2.INTER_AREA if factor < 1 else cv2.INTER_NEAREST
-    sheet[top : top + size[1], x : x + size[0]] = cv2.resize(panel.image, size, interpolation=shrinks)
-    cv2.rectangle(sheet, (x - 1, top - 1), (x + size[0], top + size[1]), UNKNOWN, 1)  # white may be a value
+    sheet[top : top + size[1], x : x + size[0]] = cv2.resize(
+        panel.image, size, interpolation=shrinks
+    )
+    # white may be a value
+    cv2.rectangle(sheet, (x - 1, top - 1), (x + size[0], top + size[1]), UNKNOWN, 1)
     if panel.scale is None:
         return
     low, high, colours = panel.scale
     left = x + PANEL + BAR_GAP
     ramp = np.linspace(1.0, 0.0, height)[:, None]
     sheet[top : top + height, left : left + BAR] = colours(np.repeat(ramp, BAR, axis=1))
-    for value, at in ((high, top + 12), ((low + high) / 2, top + height // 2 + 5), (low, top + height - 2)):
+    for value, at in (
+        (high, top + 12),
+        ((low + high) / 2, top + height // 2 + 5),
+        (low, top + height - 2),
+    ):
         _write(sheet, f"{value:.3g}", (left + BAR + 6, at), 14, INK)
 
 
-def _write(sheet: Picture, text: str, at: tuple[int, int], size: int, colour, *, bold: bool = False) -> None:
+def _write(
+    sheet: Picture, text: str, at: tuple[int, int], size: int, colour, *, bold: bool = False
+) -> None:
     """Text with the left end of its base line at (x, y) [px]."""
     import cv2
 
@@ -235,7 +296,9 @@ def _gray(share: np.ndarray) -> Picture:
 def _mapped(share: np.ndarray, name: str) -> Picture:
     import cv2
 
-    return np.ascontiguousarray(cv2.applyColorMap(_eight_bits(share), getattr(cv2, name))[..., ::-1])
+    return np.ascontiguousarray(
+        cv2.applyColorMap(_eight_bits(share), getattr(cv2, name))[..., ::-1]
+    )
 
 
 def _viridis(share: np.ndarray) -> Picture:
@@ -249,7 +312,9 @@ def _inferno(share: np.ndarray) -> Picture:
 def diverging(share: np.ndarray) -> Picture:
     """Blue below the middle, white in it, red above."""
     x = 2.0 * share[..., None] - 1.0
-    blue, red, white = (np.array(c) / 255.0 for c in ((33, 102, 172), (178, 24, 43), (255, 255, 255)))
+    blue, red, white = (
+        np.array(c) / 255.0 for c in ((33, 102, 172), (178, 24, 43), (255, 255, 255))
+    )
     return _eight_bits(white + np.abs(x) * (np.where(x < 0, blue, red) - white))
 
 

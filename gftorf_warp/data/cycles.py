@@ -9,15 +9,17 @@ from ..constants import CANONICAL_SHIFTS, FRAMES_PER_QUARTET
 
 QUADS_MIN = 3  # of a phasor: cosine, sine and a constant
 SAME_RAD = 1e-5  # [rad] shifts are stored as float32 at worst
-RANK_TOLERANCE = 1e-3  # singular values of three unknowns are about 1; two shifts closer than 0.1 degrees are one
+# singular values of three unknowns are about 1; two shifts closer than 0.1 degrees are one
+RANK_TOLERANCE = 1e-3
 
 
 def find_cycle(shifts: Float[np.ndarray, "F"], frequencies: Float[np.ndarray, "F"]) -> int:
     """Number of raw frames in a cycle, for a recording that does not state it.
 
-    The shortest period of shifts [rad] and frequencies [Hz] that determines a phase at each of them and either occurs
-    twice or repeats no raw frame. Without a period it is the whole recording, if that is one cycle: several
-    frequencies, or no repeated shift. Else four raw frames in any order, of which a recording may have fewer.
+    The shortest period of shifts [rad] and frequencies [Hz] that determines a phase at each of them
+    and either occurs twice or repeats no raw frame. Without a period it is the whole recording, if
+    that is one cycle: several frequencies, or no repeated shift. Else four raw frames in any order,
+    of which a recording may have fewer.
     """
     count = len(shifts)
     waves = np.exp(1j * np.asarray(shifts, dtype=np.float64))
@@ -30,7 +32,9 @@ def find_cycle(shifts: Float[np.ndarray, "F"], frequencies: Float[np.ndarray, "F
     if len(set(frequencies.tolist())) > 1:
         return count
     canonical = np.exp(1j * np.asarray(CANONICAL_SHIFTS))
-    begun = count < FRAMES_PER_QUARTET and bool((np.abs(waves[:, None] - canonical).min(axis=1) < SAME_RAD).all())
+    begun = count < FRAMES_PER_QUARTET and bool(
+        (np.abs(waves[:, None] - canonical).min(axis=1) < SAME_RAD).all()
+    )
     whole = not begun and _distinct(waves, frequencies) and _determined(shifts, frequencies)
     return count if whole else FRAMES_PER_QUARTET
 
@@ -53,7 +57,9 @@ def frequencies_decoded(frequencies: Float[np.ndarray, "K"], wanted: tuple[float
 
 
 def solution(shifts: Float[np.ndarray, "Q"]) -> Float[np.ndarray, "2 Q"] | None:
-    """Matrix from the quads of these shifts [rad] to (re, im) by least squares; None if they determine no phase."""
+    """Matrix from the quads of these shifts [rad] to (re, im) by least squares;
+    None if they determine no phase.
+    """
     model = np.stack([np.cos(shifts), np.sin(shifts), np.ones(len(shifts))], axis=1)
     if len(shifts) < QUADS_MIN or np.linalg.svd(model, compute_uv=False).min() < RANK_TOLERANCE:
         return None
@@ -61,17 +67,20 @@ def solution(shifts: Float[np.ndarray, "Q"]) -> Float[np.ndarray, "2 Q"] | None:
 
 
 def phase_noise(shifts: Float[np.ndarray, "Q"]) -> float:
-    """Standard deviation of a decoded phase [rad] times amplitude over noise of one quad, root mean square over phases.
+    """Standard deviation of a decoded phase [rad] times amplitude over noise of one quad, root mean
+    square over phases.
 
-    sqrt(2 / Q) if the shifts are equally spaced. At a given phase psi of uneven ones it is half the root of u C u,
-    C being the product of the rows with themselves and u = (-sin psi, cos psi).
+    sqrt(2 / Q) if the shifts are equally spaced. At a given phase psi of uneven ones it is half the
+    root of u C u, C being the product of the rows with themselves and u = (-sin psi, cos psi).
 
     Raises:
         ValueError: If the shifts determine no phase.
     """
     rows = solution(np.asarray(shifts, dtype=np.float64))
     if rows is None:
-        raise ValueError(f"shifts: a phase needs three different ones, got {np.degrees(shifts).tolist()} degrees")
+        raise ValueError(
+            f"shifts: a phase needs three different ones, got {np.degrees(shifts).tolist()} degrees"
+        )
     return 0.5 * float(np.sqrt(0.5 * np.sum(rows**2)))
 
 

@@ -1,9 +1,11 @@
-"""Closed-form distance of a quartet, as if its raw frames had been taken at once: the C-ToF baseline.
+"""Closed-form distance of a quartet, as if its raw frames had been taken at once: the C-ToF
+baseline.
 
-A quad of shift theta is a (cos(psi - theta) + b) = (a cos psi) cos theta + (a sin psi) sin theta + a b, linear in three
-unknowns: least squares over the quads of one frequency gives the phasor 2a (cos psi, sin psi), for the four canonical
-shifts the differences of opposite quads, and d = ((atan2(im, re) - phase_offset) mod 2 pi) c / 4 pi f. Where a cycle
-has several frequencies, their phases together choose the turn of the first, see unwrap.py.
+A quad of shift theta is a (cos(psi - theta) + b) = (a cos psi) cos theta + (a sin psi) sin theta +
+a b, linear in three unknowns: least squares over the quads of one frequency gives the phasor 2a
+(cos psi, sin psi), for the four canonical shifts the differences of opposite quads, and d =
+((atan2(im, re) - phase_offset) mod 2 pi) c / 4 pi f. Where a cycle has several frequencies, their
+phases together choose the turn of the first, see unwrap.py.
 """
 
 from __future__ import annotations
@@ -33,14 +35,15 @@ class Decoded:
     """One quartet as a sensor would decode it, float64."""
 
     phasors: Float[np.ndarray, "f 2 H W"]
-    """(re, im) = 2a (cos psi, sin psi) at each frequency, in the order of ``Sequence.frequencies`` [quad units]."""
+    """(re, im) = 2a (cos psi, sin psi) at each frequency, in the order of ``Sequence.frequencies``
+    [quad units]."""
     single: Float[np.ndarray, "f H W"]
     """Distance that each frequency gives by itself [m], in [0, c/2f)."""
     distance: Float[np.ndarray, "H W"]
     """Distance by all frequencies together [m], in [0, :func:`unambiguous_range`)."""
     confidence: Float[np.ndarray, "H W"] | None
-    """How much better one distance explains the phases than any other [1], see unwrap.py, 0 where there is no light;
-    None for a single frequency, where there is nothing to choose."""
+    """How much better one distance explains the phases than any other [1], see unwrap.py, 0 where
+    there is no light; None for a single frequency, where there is nothing to choose."""
 
     @property
     def ambiguous(self) -> Bool[np.ndarray, "H W"]:
@@ -68,7 +71,8 @@ def _kept(function: Callable[[Sequence, int], T]) -> Callable[[Sequence, int], T
 
 @_kept
 def decode_quartet(sequence: Sequence, i: int) -> Decoded:
-    """Phasors and distances of quartet i, decoded as if its raw frames had been taken at once; kept, read-only.
+    """Phasors and distances of quartet i, decoded as if its raw frames had been taken at once;
+    kept, read-only.
 
     Any three or more shifts at each frequency will do, evenly spaced or not, in any order.
 
@@ -78,7 +82,9 @@ def decode_quartet(sequence: Sequence, i: int) -> Decoded:
     """
     phasors = _phasors(sequence, i)[1]
     phases, frequencies = np.arctan2(phasors[:, 1], phasors[:, 0]), sequence.frequencies
-    single = np.stack([distance_from_phase(p, sequence, f) for p, f in zip(phases, frequencies, strict=True)])
+    single = np.stack(
+        [distance_from_phase(p, sequence, f) for p, f in zip(phases, frequencies, strict=True)]
+    )
     distance, confidence = single[0], None
     unambiguous_range(sequence)  # raises the error of frequencies without one
     if len(frequencies) > 1:
@@ -91,8 +97,11 @@ def decode_quartet(sequence: Sequence, i: int) -> Decoded:
     return Decoded(phasors=phasors, single=single, distance=distance, confidence=confidence)
 
 
-def quartet_phasors(sequence: Sequence, i: int) -> list[tuple[list[int], Float[np.ndarray, "2 H W"]]]:
-    """Raw frames and phasor of quartet i at each of its frequencies, in the order of ``Sequence.frequencies``.
+def quartet_phasors(
+    sequence: Sequence, i: int
+) -> list[tuple[list[int], Float[np.ndarray, "2 H W"]]]:
+    """Raw frames and phasor of quartet i at each of its frequencies, in the order of
+    ``Sequence.frequencies``.
 
     Raises:
         ValueError: If a frame of the quartet was not measured.
@@ -105,7 +114,9 @@ def quartet_phasors(sequence: Sequence, i: int) -> list[tuple[list[int], Float[n
 def _phasors(sequence: Sequence, i: int) -> tuple[list[list[int]], Float[np.ndarray, "f 2 H W"]]:
     """Raw frames at each frequency of quartet i, and the phasors decoded from them."""
     if i not in sequence.complete_quartets:
-        raise ValueError(f"quartet {i} must be one of the complete ones, {sequence.complete_quartets}")
+        raise ValueError(
+            f"quartet {i} must be one of the complete ones, {sequence.complete_quartets}"
+        )
     first, last = sequence.cycle * i, sequence.cycle * (i + 1) - 1
     groups, phasors = [], []
     for f in sequence.frequencies:
@@ -116,7 +127,8 @@ def _phasors(sequence: Sequence, i: int) -> tuple[list[list[int]], Float[np.ndar
             raise InputError(
                 "phase shifts",
                 where=f"{sequence.path or 'sequence'}, frames {first} .. {last}",
-                why=f"expected at least three distinct shifts, found {np.degrees(shifts).tolist()} degrees",
+                why=f"expected at least three distinct shifts, found "
+                f"{np.degrees(shifts).tolist()} degrees",
                 fix="correct tof_permutation.npy, or the shifts in capture.json",
             )
         groups.append(frames.tolist())
@@ -127,7 +139,8 @@ def _phasors(sequence: Sequence, i: int) -> tuple[list[list[int]], Float[np.ndar
 
 
 def quartet_phasor(sequence: Sequence, i: int) -> Float[np.ndarray, "2 H W"]:
-    """Phasor (re, im) = 2a (cos psi, sin psi) of quartet i at its first frequency, float64, in quad units.
+    """Phasor (re, im) = 2a (cos psi, sin psi) of quartet i at its first frequency, float64, in quad
+    units.
 
     Raises:
         ValueError: If a frame of the quartet was not measured.
@@ -146,13 +159,17 @@ def closed_form_distance(sequence: Sequence, i: int) -> Float[np.ndarray, "H W"]
     return decode_quartet(sequence, i).distance
 
 
-def distance_from_phase(phase: np.ndarray, sequence: Sequence, f_mod_hz: float | None = None) -> np.ndarray:
+def distance_from_phase(
+    phase: np.ndarray, sequence: Sequence, f_mod_hz: float | None = None
+) -> np.ndarray:
     """Distance [m] in [0, c/2f) of measured phases [rad], phase offset removed; same shape.
 
     ``f_mod_hz`` is the modulation frequency [Hz]; None: the first of the sequence.
     """
     f_mod_hz = sequence.calibration.f_mod_hz if f_mod_hz is None else f_mod_hz
-    return wrapped(phase - sequence.calibration.phase_offset) * (SPEED_OF_LIGHT / (4.0 * math.pi * f_mod_hz))
+    return wrapped(phase - sequence.calibration.phase_offset) * (
+        SPEED_OF_LIGHT / (4.0 * math.pi * f_mod_hz)
+    )
 
 
 def unambiguous_range(sequence: Sequence) -> float:
@@ -173,12 +190,15 @@ def unambiguous_range(sequence: Sequence) -> float:
 
 
 def largest_amplitude(sequence: Sequence) -> float:
-    """Largest length of a quartet's phasors over all pixels and complete quartets, twice the amplitude of a quad.
+    """Largest length of a quartet's phasors over all pixels and complete quartets, twice the
+    amplitude of a quad.
 
     Raises:
         InputError: If no quartet is complete, or none has light.
     """
-    found = (phasor for i in sequence.complete_quartets for _, phasor in quartet_phasors(sequence, i))
+    found = (
+        phasor for i in sequence.complete_quartets for _, phasor in quartet_phasors(sequence, i)
+    )
     largest = max((float(np.hypot(*phasor).max()) for phasor in found), default=0.0)
     if not largest > 0.0:
         raise InputError(
@@ -195,11 +215,14 @@ def quad_scale(sequence: Sequence) -> tuple[float, str]:
     """Factor that scales the quads to order one, and its source.
 
     Returns:
-        The file's own factor if it states one, else 1 / (largest phasor amplitude of the sequence); its source.
+        The file's own factor if it states one, else 1 / (largest phasor amplitude of the sequence);
+        its source.
 
     Raises:
         InputError: If there is no factor and no light to compute one from.
     """
     if sequence.calibration.quad_scale is not None:
-        return float(sequence.calibration.quad_scale), sequence.sources.get("quad_scale", "setting of the sequence")
+        return float(sequence.calibration.quad_scale), sequence.sources.get(
+            "quad_scale", "setting of the sequence"
+        )
     return 1.0 / largest_amplitude(sequence), "inferred 1 / largest phasor amplitude"

@@ -1,4 +1,6 @@
-"""Estimates from the images of a sequence that reveal a wrong order, offset or scale (``gftorf check``)."""
+"""Estimates from the images of a sequence that reveal a wrong order,
+offset or scale (``gftorf check``).
+"""
 
 from __future__ import annotations
 
@@ -12,30 +14,38 @@ from .decode import quartet_phasor, quartet_phasors
 from .flow import warp_back
 from .sequence import Sequence, Truth
 
-PAIRINGS = (((0, 1), (2, 3)), ((0, 2), (1, 3)), ((0, 3), (1, 2)))  # the three ways to pair four slots
+# the three ways to pair four slots
+PAIRINGS = (((0, 1), (2, 3)), ((0, 2), (1, 3)), ((0, 3), (1, 2)))
 STATIC_QUANTILE = 0.5  # the half of the pixels that changes least over time is taken as static
 BRIGHT_QUANTILE = 0.5  # and of those the brighter half, where noise is small
 STILL_M = 1e-3  # [m] a pixel whose true distance changes less within a quartet is static
 CHANGED = 0.25  # of the amplitude: more than noise on bright pixels
-DC_TOLERANCE = 0.1  # [1] real differential quads stay within a few hundredths of 0, unipolar ones are at 1
+# [1] real differential quads stay within a few hundredths of 0, unipolar ones are at 1
+DC_TOLERANCE = 0.1
 MOVING_PX = 0.5  # [px] flow above this is motion
 
 
 def steady_pixels(sequence: Sequence) -> np.ndarray:
-    """Bright pixels [H, W] whose quads of one slot change least over the sequence, relative to their amplitude."""
+    """Bright pixels [H, W] whose quads of one slot change least over the sequence,
+    relative to their amplitude.
+    """
     change = np.zeros(sequence.quads.shape[1:])
     for slot in range(step := sequence.cycle):
         frames = np.flatnonzero(sequence.measured[slot::step]) * step + slot
         if len(frames):
             change = np.maximum(change, np.ptp(sequence.quads[frames].astype(np.float64), axis=0))
-    amplitude = np.mean([np.hypot(*quartet_phasor(sequence, i)) for i in sequence.complete_quartets], axis=0)
+    amplitude = np.mean(
+        [np.hypot(*quartet_phasor(sequence, i)) for i in sequence.complete_quartets], axis=0
+    )
     relative = change / np.maximum(amplitude, np.finfo(np.float64).tiny)
     steady = relative <= np.quantile(relative, STATIC_QUANTILE)
     return steady & (amplitude >= np.quantile(amplitude[steady], BRIGHT_QUANTILE)) & (amplitude > 0)
 
 
 def changed_share(sequence: Sequence) -> float:
-    """Fraction of bright pixels whose phasor changes from the first complete quartet to the last."""
+    """Fraction of bright pixels whose phasor changes from the first complete quartet to the
+    last.
+    """
     first, last = (quartet_phasor(sequence, sequence.complete_quartets[at]) for at in (0, -1))
     amplitude = np.hypot(*first)
     bright = amplitude >= np.quantile(amplitude, BRIGHT_QUANTILE)
@@ -53,7 +63,8 @@ def distance_of_z(sequence: Sequence, truth: Truth) -> np.ndarray:
 
 
 def dc_offset(sequence: Sequence) -> float:
-    """Constant part of the quads as a multiple of their amplitude, mean(Q0 + Q1 + Q2 + Q3) / (4 mean a) of four.
+    """Constant part of the quads as a multiple of their amplitude, mean(Q0 + Q1 + Q2 + Q3) / (4
+    mean a) of four.
 
     For any shifts it is the mean of the quads minus the wave of their phasor.
     """
@@ -68,16 +79,21 @@ def dc_offset(sequence: Sequence) -> float:
 
 
 def pairings(sequence: Sequence) -> tuple[int | None, list[float]]:
-    """Agreement of each way of pairing the slots of four-shift quartets: two opposite pairs have the same sum.
+    """Agreement of each way of pairing the slots of four-shift quartets: two opposite pairs have
+    the same sum.
 
     Returns:
-        Index into ``PAIRINGS`` of the stated shifts (None if they have no opposite pairs), and for each pairing the
-        fraction of steady pixels where its two sums differ least. A reversed pair or swapped pairs are not detected.
+        Index into ``PAIRINGS`` of the stated shifts (None if they have no opposite pairs), and for
+        each pairing the fraction of steady pixels where its two sums differ least. A reversed pair
+        or swapped pairs are not detected.
     """
     frames = [sequence.quartet_frames(i) for i in sequence.complete_quartets]
     quartets = [sequence.quads[own].astype(np.float64) for own in frames]
     gaps = np.stack(
-        [np.abs(np.median([q[a] + q[b] - q[c] - q[d] for q in quartets], axis=0)) for (a, b), (c, d) in PAIRINGS]
+        [
+            np.abs(np.median([q[a] + q[b] - q[c] - q[d] for q in quartets], axis=0))
+            for (a, b), (c, d) in PAIRINGS
+        ]
     )
     best = gaps.argmin(axis=0)[steady_pixels(sequence)]
     shares = [float((best == p).mean()) for p in range(len(PAIRINGS))]
@@ -95,19 +111,24 @@ class PhasorMatch:
     angle: float
     """Its angle [rad]: 0 if both have the same phase."""
     conjugate: float
-    """Length of the correlation with the mirrored phase; near 1 if the sign of the phase is swapped."""
+    """Length of the correlation with the mirrored phase; near 1 if the sign of the phase is
+    swapped."""
     factor: float
     """Stored length / length of the quads' phasor."""
 
 
 def phasor_match(sequence: Sequence, stored: dict[int, np.ndarray]) -> PhasorMatch | None:
-    """Compare stored phasors [H, W, 3], by quartet start, with the quads on steady pixels; None without any."""
+    """Compare stored phasors [H, W, 3], by quartet start, with the quads on steady pixels;
+    None without any.
+    """
     steady = steady_pixels(sequence)
     common = [i for i in sequence.complete_quartets if sequence.cycle * i in stored]
     if not common:
         return None
     ours = np.stack([quartet_phasor(sequence, i)[:, steady] for i in common], axis=1)
-    theirs = np.stack([stored[sequence.cycle * i][steady, :2].T for i in common], axis=1).astype(np.float64)
+    theirs = np.stack([stored[sequence.cycle * i][steady, :2].T for i in common], axis=1).astype(
+        np.float64
+    )
     a, b = ours[0] + 1j * ours[1], theirs[0] + 1j * theirs[1]
     length_a, length_b = np.sqrt((np.abs(a) ** 2).sum()), np.sqrt((np.abs(b) ** 2).sum())
     if not length_b > 0:
@@ -137,7 +158,9 @@ class PhaseFit:
 
 
 def phase_fit(sequence: Sequence, truth: Truth) -> PhaseFit | None:
-    """Fit psi = 4 pi d / depth_range + phase_offset to static pixels; None if fewer than a hundred are static."""
+    """Fit psi = 4 pi d / depth_range + phase_offset to static pixels;
+    None if fewer than a hundred are static.
+    """
     phases, distances = [], []
     kappa = 4.0 * math.pi * sequence.calibration.f_mod_hz / SPEED_OF_LIGHT
     for i in sequence.complete_quartets:
@@ -145,7 +168,9 @@ def phase_fit(sequence: Sequence, truth: Truth) -> PhaseFit | None:
         if not truth.known[frames].all():
             continue
         distance = truth.distance[frames].astype(np.float64)
-        still = np.isfinite(distance).all(axis=0) & (np.ptp(np.nan_to_num(distance), axis=0) < STILL_M)
+        still = np.isfinite(distance).all(axis=0) & (
+            np.ptp(np.nan_to_num(distance), axis=0) < STILL_M
+        )
         re, im = quartet_phasor(sequence, i)
         amplitude = np.hypot(re, im)
         still &= amplitude >= np.quantile(amplitude, 1.0 - BRIGHT_QUANTILE)
@@ -158,7 +183,11 @@ def phase_fit(sequence: Sequence, truth: Truth) -> PhaseFit | None:
     unwrapped = kappa * d + centre + np.angle(np.exp(1j * (psi - kappa * d - centre)))
     kept = np.ones(len(d), dtype=bool)
     for _ in range(3):  # outliers: a few pixels mix two distances
-        slope, offset = np.polyfit(d[kept], unwrapped[kept], 1) if np.ptp(d[kept]) > STILL_M else (kappa, centre)
+        slope, offset = (
+            np.polyfit(d[kept], unwrapped[kept], 1)
+            if np.ptp(d[kept]) > STILL_M
+            else (kappa, centre)
+        )
         residual = np.abs(unwrapped - slope * d - offset)
         kept = residual <= 4.0 * np.median(residual) + 1e-9
     return PhaseFit(
@@ -169,22 +198,28 @@ def phase_fit(sequence: Sequence, truth: Truth) -> PhaseFit | None:
     )
 
 
-def flow_match(sequence: Sequence, flow: dict[int, np.ndarray], step: int) -> tuple[float, float, float, float] | None:
+def flow_match(
+    sequence: Sequence, flow: dict[int, np.ndarray], step: int
+) -> tuple[float, float, float, float] | None:
     """Test of flow: mean |difference| of quads n and n + step where the flow is not small.
 
     Returns:
-        Unwarped, warped by the flow, warped by the flow with its sign flipped, and with dx and dy swapped, in quad
-        units; None if no pixel moves.
+        Unwarped, warped by the flow, warped by the flow with its sign flipped, and with dx and dy
+        swapped, in quad units; None if no pixel moves.
     """
     sums, count = np.zeros(4), 0
     for n, image in flow.items():
         target = n + step
-        if not (0 <= target < sequence.frames and sequence.measured[n] and sequence.measured[target]):
+        if not (
+            0 <= target < sequence.frames and sequence.measured[n] and sequence.measured[target]
+        ):
             continue
         moving = np.isfinite(image).all(axis=0) & (np.hypot(*np.nan_to_num(image)) > MOVING_PX)
         known = np.nan_to_num(image)
         for k, tried in enumerate((np.zeros_like(known), known, -known, known[::-1])):
-            sums[k] += np.abs(warp_back(sequence.quads[target], tried) - sequence.quads[n])[moving].sum()
+            sums[k] += np.abs(warp_back(sequence.quads[target], tried) - sequence.quads[n])[
+                moving
+            ].sum()
         count += int(moving.sum())
     if not count:
         return None

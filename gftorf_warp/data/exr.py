@@ -1,7 +1,9 @@
-"""OpenEXR files: images of named channels, in one part or several; every written file is read back and compared.
+"""OpenEXR files: images of named channels, in one part or several; every written file is read back
+and compared.
 
-A file of one part is not compressed: the last bits of float32 are noise, so that compressing six 320x240 images takes
-20 ms of a CPU and leaves four fifths of their size. Parts of a capture are compressed, once for all readers.
+A file of one part is not compressed: the last bits of float32 are noise, so that compressing six
+320x240 images takes 20 ms of a CPU and leaves four fifths of their size. Parts of a capture are
+compressed, once for all readers.
 """
 
 from __future__ import annotations
@@ -19,19 +21,22 @@ from .files import atomic_path, one_of_many
 
 PARTS_MAX = 64  # a raw frame has a handful; a forged header may claim millions
 CHANNELS_MAX = 256  # a rendering has a few dozen
-TYPES = {np.dtype(np.float32), np.dtype(np.uint32)}  # of captures; half is refused: its steps are 2 mm at 2 m
+# of captures; half is refused: its steps are 2 mm at 2 m
+TYPES = {np.dtype(np.float32), np.dtype(np.uint32)}
 
 Channels = dict[str, np.ndarray]
 Parts = dict[str, Channels]
 
 
-def write_exr(path: str | Path, channels: Mapping[str, np.ndarray], *, one_of: bool = False) -> None:
+def write_exr(
+    path: str | Path, channels: Mapping[str, np.ndarray], *, one_of: bool = False
+) -> None:
     """Write named float32 images of one size as an OpenEXR file of one part, atomically.
 
     Args:
         path: The file; its folder must exist.
-        channels: Images [H, W] by name, for example ``{"distance": ..., "quads.0": ...}``; any real type that float32
-            holds. Viewers show the names R, G, B as colour. NaN is kept.
+        channels: Images [H, W] by name, for example ``{"distance": ..., "quads.0": ...}``; any real
+            type that float32 holds. Viewers show the names R, G, B as colour. NaN is kept.
         one_of: Whether it is one of the files of a folder inside ``files.many_files``.
 
     Raises:
@@ -40,7 +45,9 @@ def write_exr(path: str | Path, channels: Mapping[str, np.ndarray], *, one_of: b
     """
     import OpenEXR
 
-    images = {name: np.ascontiguousarray(image, dtype=np.float32) for name, image in channels.items()}
+    images = {
+        name: np.ascontiguousarray(image, dtype=np.float32) for name, image in channels.items()
+    }
     _check_images([images])
     header = {"compression": OpenEXR.NO_COMPRESSION, "type": OpenEXR.scanlineimage}
     with one_of_many(Path(path)) if one_of else atomic_path(path) as temporary:
@@ -53,7 +60,8 @@ def write_parts(path: str | Path, parts: Mapping[str, Mapping[str, np.ndarray]])
 
     Args:
         path: A file that does not exist; its folder must exist.
-        parts: Channels [H, W] by name, by name of the part; all of one size, float32 or uint32. NaN is kept.
+        parts: Channels [H, W] by name, by name of the part; all of one size, float32 or uint32. NaN
+            is kept.
 
     Raises:
         ValueError: If there is nothing to write, or sizes or types do not fit.
@@ -62,7 +70,10 @@ def write_parts(path: str | Path, parts: Mapping[str, Mapping[str, np.ndarray]])
     """
     import OpenEXR
 
-    whole = {n: {c: np.ascontiguousarray(image) for c, image in channels.items()} for n, channels in parts.items()}
+    whole = {
+        n: {c: np.ascontiguousarray(image) for c, image in channels.items()}
+        for n, channels in parts.items()
+    }
     _check_images(list(whole.values()))
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     file = OpenEXR.File([OpenEXR.Part(dict(header), dict(c), name) for name, c in whole.items()])
@@ -75,7 +86,8 @@ def read_exr(path: str | Path) -> Channels:
     """Read the images [H, W] of an OpenEXR file of one part by channel name.
 
     Raises:
-        InputError: If it is missing, damaged, truncated, too large, or has subsampled channels or several parts.
+        InputError: If it is missing, damaged, truncated, too large, or has subsampled channels or
+            several parts.
     """
     return next(iter(_read(Path(path), 1).values()))
 
@@ -84,33 +96,52 @@ def read_parts(path: str | Path) -> Parts:
     """Read the channels [H, W] of an OpenEXR file by name, by name of the part.
 
     Raises:
-        InputError: If the file is missing, damaged, truncated, too large, or has subsampled or half-precision channels.
+        InputError: If the file is missing, damaged, truncated, too large, or has subsampled or
+            half-precision channels.
     """
     path = Path(path)
     parts = _read(path, PARTS_MAX)
-    other = {str(image.dtype) for channels in parts.values() for image in channels.values() if image.dtype not in TYPES}
+    other = {
+        str(image.dtype)
+        for channels in parts.values()
+        for image in channels.values()
+        if image.dtype not in TYPES
+    }
     if other:
         raise _unreadable(path, PARTS_MAX, f"{', '.join(other)} instead of float32")
     return parts
 
 
 def _check_images(parts: list[Channels]) -> None:
-    """One size and known types; OpenEXR writes wrong pixels of slices, flips and Fortran order without an error."""
+    """One size and known types; OpenEXR writes wrong pixels of slices,
+    flips and Fortran order without an error.
+    """
     images = [image for channels in parts for image in channels.values()]
     found = {(image.shape, image.dtype) for image in images}
-    if len({shape for shape, _ in found}) != 1 or images[0].ndim != 2 or not {t for _, t in found} <= TYPES:
+    if (
+        len({shape for shape, _ in found}) != 1
+        or images[0].ndim != 2
+        or not {t for _, t in found} <= TYPES
+    ):
         kinds = ", ".join(sorted(map(str, found))) or "none"
-        raise ValueError(f"channels must be float32 or uint32 images [H, W] of one shape, got {kinds}")
+        raise ValueError(
+            f"channels must be float32 or uint32 images [H, W] of one shape, got {kinds}"
+        )
 
 
 def _write(path: Path, file: Any, parts: list[Channels], where: Path) -> None:
-    """Write a file of OpenEXR's and compare it: the library does not notice a full disk at the end of a file."""
-    path.touch(exist_ok=False)  # so that a folder without permission and a full disk are different errors
+    """Write a file of OpenEXR's and compare it: the library does not notice a full disk at the end
+    of a file.
+    """
+    # so that a folder without permission and a full disk are different errors
+    path.touch(exist_ok=False)
     try:
         with file:
             file.write(str(path))
     except RuntimeError as error:
-        raise ResourceError("cannot write picture", where=where, why=str(error), fix="free disk space") from error
+        raise ResourceError(
+            "cannot write picture", where=where, why=str(error), fix="free disk space"
+        ) from error
     try:
         back = list(_read(path, PARTS_MAX).values())
     except InputError:
@@ -125,7 +156,9 @@ def _read(path: Path, parts_max: int) -> Parts:
     import OpenEXR
 
     if not path.is_file():
-        raise InputError("no such picture", where=path, why="expected an OpenEXR file", fix="check the path")
+        raise InputError(
+            "no such picture", where=path, why="expected an OpenEXR file", fix="check the path"
+        )
     try:
         with OpenEXR.File(str(path), separate_channels=True, header_only=True) as file:
             stated = [_stated(part.header) for part in file.parts]
@@ -134,7 +167,9 @@ def _read(path: Path, parts_max: int) -> Parts:
             raise ValueError(f"{len(stated)} parts")
         with OpenEXR.File(str(path), separate_channels=True) as file:
             parts = {
-                part.name(): {name: np.array(channel.pixels) for name, channel in part.channels.items()}
+                part.name(): {
+                    name: np.array(channel.pixels) for name, channel in part.channels.items()
+                }
                 for part in file.parts
             }
         for (shape, channels), got in zip(stated, parts.values(), strict=True):
@@ -148,7 +183,9 @@ def _read(path: Path, parts_max: int) -> Parts:
 def _unreadable(path: Path, parts_max: int, found: str) -> InputError:
     count = "one whole OpenEXR part" if parts_max == 1 else "whole OpenEXR parts"
     why = f"expected {count} of at most {SIDE_MAX}x{SIDE_MAX} in float32, found {found}"
-    return InputError("unreadable picture", where=path, why=why, fix="copy or export the file again")
+    return InputError(
+        "unreadable picture", where=path, why=why, fix="copy or export the file again"
+    )
 
 
 def _stated(header: Mapping) -> tuple[tuple[int, int], set[str]]:
@@ -156,7 +193,9 @@ def _stated(header: Mapping) -> tuple[tuple[int, int], set[str]]:
     low, high = header["dataWindow"]
     width, height = (int(b) - int(a) + 1 for a, b in zip(low, high, strict=True))
     channels = header["channels"]
-    if not (1 <= width <= SIDE_MAX and 1 <= height <= SIDE_MAX and 1 <= len(channels) <= CHANNELS_MAX):
+    if not (
+        1 <= width <= SIDE_MAX and 1 <= height <= SIDE_MAX and 1 <= len(channels) <= CHANNELS_MAX
+    ):
         raise ValueError(f"a part of {width}x{height} with {len(channels)} channels")
     if any(channel.xSampling != 1 or channel.ySampling != 1 for channel in channels):
         raise ValueError("subsampled channels")

@@ -1,7 +1,9 @@
-"""F-TöRF and TöRF folders as sequences: numbered arrays of raw quads or of phasors, and cams/ with calibration.
+"""F-TöRF and TöRF folders as sequences: numbered arrays of raw quads or of phasors, and cams/ with
+calibration.
 
-A folder of N phasors becomes 4 N raw frames: quartet i has re/2, -re/2, im/2, -im/2 of phasor i, the canonical shifts,
-one time and one pose. Their differences are the phasor again, exactly, since halving a float32 is exact.
+A folder of N phasors becomes 4 N raw frames: quartet i has re/2, -re/2, im/2, -im/2 of phasor i,
+the canonical shifts, one time and one pose. Their differences are the phasor again, exactly, since
+halving a float32 is exact.
 """
 
 from __future__ import annotations
@@ -20,7 +22,8 @@ from .problems import Problems
 from .sequence import ColourCamera, Flow, Sequence, Truth
 
 ABSENT = (  # without a source unless a folder has them
-    *("frequencies_hz", "cycle_length", "distortion", "exposures", "sensor"),  # only a capture has these
+    # only a capture has these
+    *("frequencies_hz", "cycle_length", "distortion", "exposures", "sensor"),
     *("colour_intrinsics", "colour_from_world", "forward_flow", "backward_flow"),
 )
 
@@ -58,7 +61,8 @@ def read_sequence(stored: Stored, frame_rate_hz: float | None) -> Sequence:
 
     Args:
         stored: The folder.
-        frame_rate_hz: Images per second; None takes the folder's times, or the default rate if it states none.
+        frame_rate_hz: Images per second; None takes the folder's times, or the default rate if it
+            states none.
 
     Raises:
         InputError: If a file is not what data_specs/ describes; names all of them at once.
@@ -81,13 +85,17 @@ def read_sequence(stored: Stored, frame_rate_hz: float | None) -> Sequence:
     images: dict[str, dict[int, np.ndarray]] = {"forward_flow": {}, "backward_flow": {}}
     for name in ("colour", *images):
         if name in fields:
-            images[name], sources[name] = read_field(root, fields[name], count, size, problems, stored.first_id)
+            images[name], sources[name] = read_field(
+                root, fields[name], count, size, problems, stored.first_id
+            )
     colour = ColourCamera(images={step * i: image for i, image in images["colour"].items()})
     intrinsics = colour_poses = None
     if colour.size is not None:
         if all((image == image[..., :1]).all() for image in colour.images.values()):
             sources["colour"] += "; its three channels are equal: amplitude, not colour"
-        intrinsics = problems.attempt(read_colour_intrinsics, root, form, calibrated, size, colour.size, sources)
+        intrinsics = problems.attempt(
+            read_colour_intrinsics, root, form, calibrated, size, colour.size, sources
+        )
         if poses is not None:
             colour_poses = problems.attempt(read_colour_poses, root, form, poses, sources)
     novel = problems.attempt(read_novel, root, form, sources)
@@ -101,7 +109,9 @@ def read_sequence(stored: Stored, frame_rate_hz: float | None) -> Sequence:
     assert poses is not None
     measured = np.isin(np.arange(count), list(stored.files))
     sources["measured"] = f"file {len(stored.files)} of {count} {stored.counted}{stored.note}"
-    sources["from_phasors"] = sources["quads"].partition(",")[0] + (": raw quads" if step == 1 else ": phasors")
+    sources["from_phasors"] = sources["quads"].partition(",")[0] + (
+        ": raw quads" if step == 1 else ": phasors"
+    )
     return Sequence(
         quads=quads,
         measured=np.repeat(measured, step),
@@ -114,7 +124,9 @@ def read_sequence(stored: Stored, frame_rate_hz: float | None) -> Sequence:
         colour=ColourCamera(
             images=colour.images,
             intrinsics=intrinsics,
-            camera_from_world=None if colour_poses is None else np.repeat(colour_poses, step, axis=0),
+            camera_from_world=None
+            if colour_poses is None
+            else np.repeat(colour_poses, step, axis=0),
         ),
         flow=Flow(forward=images["forward_flow"], backward=images["backward_flow"]),
         novel_from_world=novel,
@@ -137,7 +149,8 @@ def read_distances(stored: Stored, frames: int) -> Truth | None:
         frames: Number F of raw frames of the sequence; later ids are not read.
 
     Returns:
-        Truth, with NaN where the file has NaN or 0 and at frames without a file; None if no frame has a file.
+        Truth, with NaN where the file has NaN or 0 and at frames without a file; None if no frame
+        has a file.
 
     Raises:
         InputError: If a distance image is not what data_specs/ describes.
@@ -158,7 +171,9 @@ def read_distances(stored: Stored, frames: int) -> Truth | None:
     problems.raise_if_any(root)
     if stacks["distance"] is None:
         return None
-    return Truth(distance=stacks["distance"], known=known, phasor_distance=stacks["phasor_distance"])
+    return Truth(
+        distance=stacks["distance"], known=known, phasor_distance=stacks["phasor_distance"]
+    )
 
 
 def _negative(stored: Stored, i: int, image: np.ndarray) -> InputError:

@@ -1,8 +1,8 @@
 """Atomic writing: after a crash there is the old content or the new one, never a part of it.
 
-A file is written under a temporary name in its folder, flushed to the disk, and renamed; a folder is filled under a
-temporary name next to its target and renamed as a whole. Temporary names are ``.NAME.tmp-PID-COUNT``, so that files of
-processes that no longer run are recognised and removed.
+A file is written under a temporary name in its folder, flushed to the disk, and renamed; a folder
+is filled under a temporary name next to its target and renamed as a whole. Temporary names are
+``.NAME.tmp-PID-COUNT``, so that files of processes that no longer run are recognised and removed.
 """
 
 from __future__ import annotations
@@ -59,10 +59,11 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def many_files(folder: str | Path) -> Iterator[None]:
-    """Fill an existing folder by :func:`one_of_many` and :func:`write_one_of_many`: it is listed and flushed once.
+    """Fill an existing folder by :func:`one_of_many` and :func:`write_one_of_many`: it is listed
+    and flushed once.
 
-    Listing it for every file makes each file cost as much as there are files already, and holds up threads: Python's
-    lock is released and taken again with every name.
+    Listing it for every file makes each file cost as much as there are files already, and holds up
+    threads: Python's lock is released and taken again with every name.
 
     Raises:
         ResourceError, UsageError: If it cannot be flushed.
@@ -91,7 +92,8 @@ def one_of_many(path: Path) -> Iterator[Path]:
 def write_one_of_many(path: Path, data: bytes | memoryview) -> None:
     """:func:`atomic_write` for one of the files of a folder inside :func:`many_files`.
 
-    The content is on the disk before the name is, so a power failure may lose a file, but leaves none incomplete.
+    The content is on the disk before the name is, so a power failure may lose a file, but leaves
+    none incomplete.
     """
     with as_errors(path), _renamed_to(path) as temporary:
         write_through(temporary, data)
@@ -103,14 +105,17 @@ def write_json(path: str | Path, content: object) -> None:
     Raises:
         ValueError: If it contains NaN or infinity, which JSON cannot express: use None.
     """
-    atomic_write(path, (json.dumps(content, indent=2, allow_nan=False, default=_plain) + "\n").encode())
+    atomic_write(
+        path, (json.dumps(content, indent=2, allow_nan=False, default=_plain) + "\n").encode()
+    )
 
 
 @contextlib.contextmanager
 def atomic_folder(path: str | Path) -> Iterator[Path]:
     """Temporary folder to fill, which is flushed and renamed to ``path`` at a normal end.
 
-    After an exception it is removed. Missing parents of ``path`` are created; if it exists, it must be empty.
+    After an exception it is removed. Missing parents of ``path`` are created; if it exists, it must
+    be empty.
 
     Raises:
         UsageError: If the target exists and is not an empty folder, or cannot be written.
@@ -120,9 +125,14 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
     with as_errors(path):
         why = "expected a new or empty folder to write to, found"
         if path.is_symlink() or (path.exists() and not path.is_dir()):
-            raise UsageError("not a folder", where=path, why=f"{why} something else", fix="choose another path")
+            raise UsageError(
+                "not a folder", where=path, why=f"{why} something else", fix="choose another path"
+            )
         if path.is_dir() and any(path.iterdir()):
-            why, fix = f"{why} {len(list(path.iterdir()))} entries", "choose another path, or remove the folder first"
+            why, fix = (
+                f"{why} {len(list(path.iterdir()))} entries",
+                "choose another path, or remove the folder first",
+            )
             raise UsageError("folder is not empty", where=path, why=why, fix=fix)
         made = [parent for parent in reversed(path.absolute().parents) if not parent.exists()]
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -146,7 +156,9 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
 
 
 def write_through(path: Path, data: bytes | memoryview) -> None:
-    """Create a file, flush it to the disk and check its size; an OSError if it exists or is incomplete."""
+    """Create a file, flush it to the disk and check its size;
+    an OSError if it exists or is incomplete.
+    """
     with open(path, "xb") as file:
         file.write(data)
         file.flush()
@@ -176,7 +188,8 @@ def sweep(path: str | Path) -> None:
 def _sweep(folder: Path, start: str) -> None:
     """:func:`sweep` for all temporary names with this start."""
     with contextlib.suppress(OSError):  # another process may sweep at the same time
-        for name in [name for name in os.listdir(folder) if name.startswith(start)]:  # few of perhaps many
+        # few of perhaps many
+        for name in [name for name in os.listdir(folder) if name.startswith(start)]:
             match, entry = re.fullmatch(r"\..+\.tmp-(\d+)-\d+", name), folder / name
             if match and not _alive(int(match[1])):
                 if entry.is_dir():
@@ -216,7 +229,9 @@ def _alive(pid: int) -> bool:
 
 @contextlib.contextmanager
 def as_errors(path: Path) -> Iterator[None]:
-    """Convert errors of the system while writing ``path``: ResourceError for a full disk, else UsageError."""
+    """Convert errors of the system while writing ``path``: ResourceError for a full disk,
+    else UsageError.
+    """
     try:
         yield
     except GftorfError:
@@ -224,9 +239,14 @@ def as_errors(path: Path) -> Iterator[None]:
     except OSError as error:
         if error.errno in _NO_SPACE:
             raise ResourceError(
-                "no space left", where=path, why=str(error), fix="free disk space, or write to another disk"
+                "no space left",
+                where=path,
+                why=str(error),
+                fix="free disk space, or write to another disk",
             ) from error
-        raise UsageError("cannot write", where=path, why=str(error), fix="choose a writable folder") from error
+        raise UsageError(
+            "cannot write", where=path, why=str(error), fix="choose a writable folder"
+        ) from error
 
 
 def _plain(value: object) -> object:

@@ -17,7 +17,8 @@ from .problems import Problems
 SLOT_FOLDERS = tuple(f"tofType{slot}" for slot in range(FRAMES_PER_QUARTET))
 PHASOR_FOLDER = "tof"
 EXPECTED = (
-    "expected a folder with capture.json (a capture), tofType0 .. tofType3 and cams (F-ToeRF: raw quads), or tof and "
+    "expected a folder with capture.json (a capture), tofType0 .. tofType3 and cams (F-ToeRF: "
+    "raw quads), or tof and "
     "cams (ToeRF: phasors)"
 )
 UNFINISHED = "unfinished.md"  # exists in the folder of an incomplete recording
@@ -25,9 +26,11 @@ FRAMES_MAX = 1_000_000  # over two hours at 120 Hz: a higher id is a typing erro
 
 
 def format_of(path: Path) -> str:
-    """Format of a sequence folder: ``capture`` with its own description, ``ftorf`` with raw quads, else ``torf``.
+    """Format of a sequence folder: ``capture`` with its own description, ``ftorf`` with raw quads,
+    else ``torf``.
 
-    Folders with raw quads may hold phasors too, so quads are looked for first; captures have a folder tof as well.
+    Folders with raw quads may hold phasors too, so quads are looked for first; captures have a
+    folder tof as well.
 
     Raises:
         InputError: If it is neither; points to a sequence one level up or down, if there is one.
@@ -49,10 +52,23 @@ def format_of(path: Path) -> str:
             why=f"{EXPECTED}, found files of an interrupted `gftorf simulate`",
             fix="repeat that command, which continues",
         )
-    for other in [path.absolute().parent, *sorted(entry for entry in path.iterdir() if entry.is_dir())]:
+    for other in [
+        path.absolute().parent,
+        *sorted(entry for entry in path.iterdir() if entry.is_dir()),
+    ]:
         if format_or_none(other) is not None:
-            raise InputError("one level off", where=path, why=f"{EXPECTED}, found one at {other}", fix=f"use {other}")
-    raise InputError("not a sequence folder", where=path, why=f"{EXPECTED}, found none of them", fix="check the path")
+            raise InputError(
+                "one level off",
+                where=path,
+                why=f"{EXPECTED}, found one at {other}",
+                fix=f"use {other}",
+            )
+    raise InputError(
+        "not a sequence folder",
+        where=path,
+        why=f"{EXPECTED}, found none of them",
+        fix="check the path",
+    )
 
 
 def format_or_none(path: Path) -> str | None:
@@ -71,8 +87,8 @@ def numbered(root: Path, pattern: str) -> dict[int, Path]:
 
     Args:
         root: The sequence.
-        pattern: Relative name, for example ``forward_flow/flow_{id}.npy``; numbers of .exr files have six digits,
-            others four or more.
+        pattern: Relative name, for example ``forward_flow/flow_{id}.npy``; numbers of .exr files
+            have six digits, others four or more.
     """
     folder, _, name = pattern.rpartition("/")
     before, _, after = name.partition("{id}")
@@ -100,7 +116,9 @@ def refuse_absurd_ids(files: dict[int, Path]) -> None:
 
 
 def first_size(files: dict[int, Path], spec: specs.Field, problems: Problems) -> dict[str, int]:
-    """Rows H and columns W in the first readable header; empty if there is none, with the reasons in ``problems``."""
+    """Rows H and columns W in the first readable header; empty if there is none,
+    with the reasons in ``problems``.
+    """
     unread = Problems()
     for file in files.values():
         shape = unread.attempt(read_shape, file, spec)
@@ -111,9 +129,15 @@ def first_size(files: dict[int, Path], spec: specs.Field, problems: Problems) ->
 
 
 def read_field(
-    root: Path, spec: specs.Field, frames: int, size: dict[str, int], problems: Problems, first_id: int = 0
+    root: Path,
+    spec: specs.Field,
+    frames: int,
+    size: dict[str, int],
+    problems: Problems,
+    first_id: int = 0,
 ) -> tuple[dict[int, np.ndarray], str]:
-    """Images of one field from the best folder that has any, by frame below ``frames``, and their source.
+    """Images of one field from the best folder that has any, by frame below ``frames``, and their
+    source.
 
     Args:
         root: The sequence.
@@ -128,7 +152,11 @@ def read_field(
         if files:
             used = {n: file for n, file in files.items() if 0 <= n < frames}
             images, source = load(root, spec, used, size, problems)
-            other = f"; {len(files) - len(used)} of later frames ignored" if len(used) < len(files) else ""
+            other = (
+                f"; {len(files) - len(used)} of later frames ignored"
+                if len(used) < len(files)
+                else ""
+            )
             return images, f"{source}, {len(used)} images{other}"
     return {}, "default none"
 
@@ -144,7 +172,16 @@ def load(
         array = problems.attempt(read_array, file, spec, bound)
         if array is None:
             continue
-        bound = dict(zip((s for s in spec.shapes[0] if isinstance(s, str)), _free(array, spec), strict=True)) | size
+        bound = (
+            dict(
+                zip(
+                    (s for s in spec.shapes[0] if isinstance(s, str)),
+                    _free(array, spec),
+                    strict=True,
+                )
+            )
+            | size
+        )
         image = problems.attempt(as_float32, file, spec, array)
         if image is not None:
             images[n], lossy = image
@@ -164,10 +201,15 @@ def empty_quads(root: Path, frames: int, size: dict[str, int]) -> np.ndarray:
         return np.zeros((frames, size.get("H", 1), size.get("W", 1)), dtype=np.float32)
     except MemoryError as error:
         raise ResourceError(
-            "not enough memory", where=root, why=f"{frames} frames of {size} do not fit", fix="use a shorter recording"
+            "not enough memory",
+            where=root,
+            why=f"{frames} frames of {size} do not fit",
+            fix="use a shorter recording",
         ) from error
 
 
 def _free(array: np.ndarray, spec: specs.Field) -> list[int]:
     """Lengths of the axes that have a letter in the field."""
-    return [n for n, letter in zip(array.shape, spec.shapes[0], strict=True) if isinstance(letter, str)]
+    return [
+        n for n, letter in zip(array.shape, spec.shapes[0], strict=True) if isinstance(letter, str)
+    ]

@@ -17,11 +17,13 @@ from .sequence import Sequence, Truth
 from .writing import calibration_files, float32, inexpressible, json_bytes, npy, shortest
 
 FORMAT = "ftorf"
-SHIFT_TOLERANCE = 1e-6  # [rad] a shift is stored as one of four names; what differs by more is another shift
+# [rad] a shift is stored as one of four names; what differs by more is another shift
+SHIFT_TOLERANCE = 1e-6
 
 
 def stored(root: Path) -> Stored:
-    """The measured raw frames of a complete folder of this format; other files of tofType0 .. are warped copies.
+    """The measured raw frames of a complete folder of this format; other files of tofType0 .. are
+    warped copies.
 
     Raises:
         InputError: If the folder is not complete, or has no raw frame.
@@ -31,7 +33,8 @@ def stored(root: Path) -> Stored:
         raise InputError(
             "not an F-ToeRF folder" if len(missing) > 1 else f"{missing[0]} missing",
             where=root,
-            why=f"expected an F-ToeRF folder with tofType0 .. tofType3 and cams, found no {', '.join(missing)}",
+            why=f"expected an F-ToeRF folder with tofType0 .. tofType3 and cams, found no "
+            f"{', '.join(missing)}",
             fix="complete the folder",
         )
     pattern = specs.fields(FORMAT)["quads"].paths[0]
@@ -46,7 +49,8 @@ def stored(root: Path) -> Stored:
         raise InputError(
             "no raw frames",
             where=root / SLOT_FOLDERS[0],
-            why="expected files tofType{id % 4}/{id}.npy with ids of four digits, 0000.npy, 0004.npy, .., found none",
+            why="expected files tofType{id % 4}/{id}.npy with ids of four digits, 0000.npy, "
+            "0004.npy, .., found none",
             fix="name each measured quad by its raw frame",
         )
     refuse_absurd_ids(measured)
@@ -58,23 +62,34 @@ def stored(root: Path) -> Stored:
         counted="raw frames",
         step=1,
         rate_hz=FRAME_RATE_HZ,
-        note=f"; {copies} files of another slot than their id's are warped copies, ignored" if copies else "",
+        note=f"; {copies} files of another slot than their id's are warped copies, ignored"
+        if copies
+        else "",
     )
 
 
 def files(sequence: Sequence, truth: Truth | None) -> Iterator[tuple[str, bytes]]:
     """Name and content of every file of a folder.
 
-    Reading it again gives the same sequence: images bit by bit in float32, calibration in float64; only a frequency
-    that was not read from such a folder may change in its last bit, since its inverse is stored.
+    Reading it again gives the same sequence: images bit by bit in float32, calibration in float64;
+    only a frequency that was not read from such a folder may change in its last bit, since its
+    inverse is stored.
 
     Raises:
-        UsageError: If the slots do not have the four canonical shifts, one each, or the sequence is of phasors.
+        UsageError: If the slots do not have the four canonical shifts, one each, or the sequence is
+            of phasors.
     """
     if sequence.from_phasors:
-        raise inexpressible(FORMAT, "phasors", "raw quads that were measured one by one", "phasors: write format torf")
+        raise inexpressible(
+            FORMAT,
+            "phasors",
+            "raw quads that were measured one by one",
+            "phasors: write format torf",
+        )
     poses = sequence.camera_from_world
-    colour_poses = poses if sequence.colour.camera_from_world is None else sequence.colour.camera_from_world
+    colour_poses = (
+        poses if sequence.colour.camera_from_world is None else sequence.colour.camera_from_world
+    )
     yield from calibration_files(sequence, sequence.times, poses)
     yield "tof_permutation.npy", npy(_permutation(sequence))
     yield "cams/poses.json", json_bytes({"poses": "camera_from_world"})
@@ -84,7 +99,10 @@ def files(sequence: Sequence, truth: Truth | None) -> Iterator[tuple[str, bytes]
         yield f"tofType{n % FRAMES_PER_QUARTET}/{n:04d}.npy", npy(float32(sequence.quads[n]))
     for n, image in sequence.colour.images.items():
         yield f"color/{n:04d}.npy", npy(shortest(float32(image)))
-    for direction, images in (("forward", sequence.flow.forward), ("backward", sequence.flow.backward)):
+    for direction, images in (
+        ("forward", sequence.flow.forward),
+        ("backward", sequence.flow.backward),
+    ):
         for n, image in images.items():
             yield f"{direction}_flow_2/flow_{n:04d}.npy", npy(float32(image))
     if truth is not None:
@@ -105,12 +123,18 @@ def _permutation(sequence: Sequence) -> np.ndarray:
     channel = gap.argmin(axis=1)
     slots = [set(channel[slot::FRAMES_PER_QUARTET].tolist()) for slot in range(FRAMES_PER_QUARTET)]
     used = [next(iter(slot)) for slot in slots if len(slot) == 1]
-    if gap.min(axis=1).max() > SHIFT_TOLERANCE or any(len(slot) > 1 for slot in slots) or len(set(used)) < len(used):
+    if (
+        gap.min(axis=1).max() > SHIFT_TOLERANCE
+        or any(len(slot) > 1 for slot in slots)
+        or len(set(used)) < len(used)
+    ):
         raise inexpressible(
             FORMAT,
             "phase shifts",
-            "each of the four slots to have its own of the shifts 0, pi, pi/2, 3 pi/2 in every quartet",
+            "each of the four slots to have its own of the shifts 0, pi, pi/2, 3 pi/2 in every "
+            "quartet",
             f"{np.round(sequence.shifts[:8], 6).tolist()} .. over {sequence.frames} frames",
         )
-    unused = iter(sorted(set(range(FRAMES_PER_QUARTET)) - set(used)))  # of a recording shorter than a quartet
+    # of a recording shorter than a quartet
+    unused = iter(sorted(set(range(FRAMES_PER_QUARTET)) - set(used)))
     return np.argsort([next(iter(slot)) if slot else next(unused) for slot in slots])

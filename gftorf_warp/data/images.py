@@ -18,16 +18,19 @@ def png_bytes(rgb: np.ndarray) -> bytes:
 
     if rgb.dtype != np.uint8 or rgb.ndim != 3 or rgb.shape[2] != 3:
         raise ValueError(f"rgb {rgb.dtype} {rgb.shape} must be uint8 [H, W, 3]")
-    done, data = cv2.imencode(".png", np.ascontiguousarray(rgb[..., ::-1]))  # OpenCV keeps blue first
+    # OpenCV keeps blue first
+    done, data = cv2.imencode(".png", np.ascontiguousarray(rgb[..., ::-1]))
     if not done:
         raise ValueError(f"rgb {rgb.shape} could not be encoded")
     return data.tobytes()
 
 
 def indexed_png_bytes(index: np.ndarray, palette: np.ndarray) -> bytes:
-    """A picture of at most 256 colours as the content of a PNG file: a byte per pixel, not compressed.
+    """A picture of at most 256 colours as the content of a PNG file: a byte per pixel, not
+    compressed.
 
-    As it is, it is smaller than what OpenCV makes of three bytes per pixel, and takes a thirtieth of the time.
+    As it is, it is smaller than what OpenCV makes of three bytes per pixel, and takes a thirtieth
+    of the time.
 
     Args:
         index: Image [H, W], uint8: which colour.
@@ -36,10 +39,19 @@ def indexed_png_bytes(index: np.ndarray, palette: np.ndarray) -> bytes:
     Raises:
         ValueError: If they are other types or shapes.
     """
-    if index.dtype != np.uint8 or index.ndim != 2 or palette.dtype != np.uint8 or palette.shape[1:] != (3,):
-        raise ValueError(f"index {index.dtype} {index.shape} must be uint8 [H, W], of colours {palette.shape} [C, 3]")
+    if (
+        index.dtype != np.uint8
+        or index.ndim != 2
+        or palette.dtype != np.uint8
+        or palette.shape[1:] != (3,)
+    ):
+        raise ValueError(
+            f"index {index.dtype} {index.shape} must be uint8 [H, W], of colours "
+            f"{palette.shape} [C, 3]"
+        )
     height, width = index.shape
-    lines = np.zeros((height, 1 + width), np.uint8)  # each begins with how it differs from the one above: it does not
+    # each begins with how it differs from the one above: it does not
+    lines = np.zeros((height, 1 + width), np.uint8)
     lines[:, 1:] = index
     chunks = [
         (b"IHDR", struct.pack(">2I5B", width, height, 8, 3, 0, 0, 0)),

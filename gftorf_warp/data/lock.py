@@ -1,4 +1,6 @@
-"""One process at a time in a folder: a lock that the system releases when the process ends, however it ends."""
+"""One process at a time in a folder: a lock that the system releases when the process ends,
+however it ends.
+"""
 
 from __future__ import annotations
 
@@ -39,11 +41,14 @@ def locked(folder: Path, name: str, what: str) -> Iterator[None]:
         try:
             yield
         finally:
-            file.truncate(0)  # the file stays: removing it would let two others each lock a file of that name
+            # the file stays: removing it would let two others each lock a file of that name
+            file.truncate(0)
 
 
 def _try_lock(descriptor: int) -> bool:
-    """Take the system's lock on an open file, without waiting; on systems without one it always succeeds."""
+    """Take the system's lock on an open file, without waiting;
+    on systems without one it always succeeds.
+    """
     try:
         import fcntl
     except ImportError:  # not a Unix

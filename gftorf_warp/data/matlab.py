@@ -1,8 +1,9 @@
 """One real matrix of a MATLAB 5 file: no cells, structures, objects or code.
 
-Used instead of ``scipy.io.loadmat``, which crashes the interpreter on damaged files. A file is 128 bytes
-of header and then elements: a tag (type, length) and the data, padded to eight bytes; four bytes or fewer fit into the
-tag. A matrix is an element of elements: flags with the class, size, name, values by column.
+Used instead of ``scipy.io.loadmat``, which crashes the interpreter on damaged files. A file is 128
+bytes of header and then elements: a tag (type, length) and the data, padded to eight bytes; four
+bytes or fewer fit into the tag. A matrix is an element of elements: flags with the class, size,
+name, values by column.
 """
 
 from __future__ import annotations
@@ -15,8 +16,30 @@ from collections.abc import Iterator
 import numpy as np
 
 MATRIX, COMPRESSED = 14, 15
-NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}  # by stored type
-CLASSES = {6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4", 14: "i8", 15: "u8"}
+NUMBERS = {
+    1: "i1",
+    2: "u1",
+    3: "i2",
+    4: "u2",
+    5: "i4",
+    6: "u4",
+    7: "f4",
+    9: "f8",
+    12: "i8",
+    13: "u8",
+}  # by stored type
+CLASSES = {
+    6: "f8",
+    7: "f4",
+    8: "i1",
+    9: "u1",
+    10: "i2",
+    11: "u2",
+    12: "i4",
+    13: "u4",
+    14: "i8",
+    15: "u8",
+}
 COMPLEX = 0x0800
 UNPACKED_MAX = 1 << 20  # [bytes] of a compressed matrix: calibration has a few hundred
 
@@ -32,7 +55,8 @@ def read_matrix(data: bytes, name: str) -> np.ndarray:
         The matrix [rows, columns], in the type that its class states.
 
     Raises:
-        ValueError: If the file is not of this kind, damaged, or has no such matrix of real numbers; says which.
+        ValueError: If the file is not of this kind, damaged, or has no such matrix of real numbers;
+            says which.
     """
     if len(data) < 128 or data[126:128] not in (b"IM", b"MI"):
         raise ValueError("no MATLAB 5 header")
@@ -40,7 +64,9 @@ def read_matrix(data: bytes, name: str) -> np.ndarray:
     found = []
     for element in _elements(data[128:], order):
         packed = element[0] == COMPRESSED
-        kind, content = next(_elements(_unpacked(element[1]), order), (0, b"")) if packed else element
+        kind, content = (
+            next(_elements(_unpacked(element[1]), order), (0, b"")) if packed else element
+        )
         if kind == MATRIX:
             parts = list(_elements(content, order))
             found.append(_name(parts))
@@ -57,7 +83,9 @@ def _matrix(parts: list[tuple[int, bytes]], order: str) -> np.ndarray:
     shape = struct.unpack(order + "2i", parts[1][1])
     kind, values = parts[3]
     if flags & 0xFF not in CLASSES or flags & COMPLEX or kind not in NUMBERS or min(shape) < 1:
-        raise ValueError(f"class {flags & 0xFF}, type {kind}, size {shape} is no matrix of real numbers")
+        raise ValueError(
+            f"class {flags & 0xFF}, type {kind}, size {shape} is no matrix of real numbers"
+        )
     stored = np.dtype(order + NUMBERS[kind])
     if len(values) != math.prod(shape) * stored.itemsize:
         raise ValueError(f"{len(values)} bytes for {shape} numbers of {stored}")
@@ -76,7 +104,9 @@ def _unpacked(data: bytes) -> bytes:
     except zlib.error as error:
         raise ValueError(str(error)) from error
     if not unpacker.eof:
-        raise ValueError(f"compressed data are truncated, or unpack to more than {UNPACKED_MAX} bytes")
+        raise ValueError(
+            f"compressed data are truncated, or unpack to more than {UNPACKED_MAX} bytes"
+        )
     return content
 
 

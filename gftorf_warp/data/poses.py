@@ -22,14 +22,19 @@ def rigid(poses: np.ndarray) -> np.ndarray:
         proper = np.linalg.det(rotation) > 0
     last_row = np.abs(poses[:, 3] - [0, 0, 0, 1]).max(axis=1)
     return (
-        (defect <= ROTATION_TOLERANCE) & proper & (last_row <= ROTATION_TOLERANCE) & np.isfinite(poses).all(axis=(1, 2))
+        (defect <= ROTATION_TOLERANCE)
+        & proper
+        & (last_row <= ROTATION_TOLERANCE)
+        & np.isfinite(poses).all(axis=(1, 2))
     )
 
 
 def read_poses(root: Path, form: str, frames: int, sources: dict[str, str]) -> np.ndarray:
-    """camera_from_world of each image [F, 4, 4] [m]: of each raw frame of F-ToeRF, of each phasor of ToeRF.
+    """camera_from_world of each image [F, 4, 4] [m]: of each raw frame of F-ToeRF, of each phasor
+    of ToeRF.
 
-    Identity without a file; for F-ToeRF also with one, unless cams/poses.json says that its poses are used.
+    Identity without a file; for F-ToeRF also with one, unless cams/poses.json says that its poses
+    are used.
 
     Raises:
         InputError: If used poses are too few, too many, or no rigid motions.
@@ -39,12 +44,21 @@ def read_poses(root: Path, form: str, frames: int, sources: dict[str, str]) -> n
     sources["camera_from_world"] = f"file {name}"
     if form == "torf":
         if path.exists():
-            advice = "store one world-to-camera pose per phasor, or state the number of phasors by cams/frame_times.npy"
+            advice = (
+                "store one world-to-camera pose per phasor, or state the number of phasors "
+                "by cams/frame_times.npy"
+            )
             return _motions(root, spec, frames, "phasors", advice)
         sources["camera_from_world"] = f"default identity: no {name}"
     elif _uses_poses(root):
         marker = specs.fields(form)["poses"].paths[0]
-        return _motions(root, spec, frames, "raw frames", f"complete the poses, or remove {marker} for a static camera")
+        return _motions(
+            root,
+            spec,
+            frames,
+            "raw frames",
+            f"complete the poses, or remove {marker} for a static camera",
+        )
     else:
         stored = read_array(path, spec) if path.exists() else None
         still = stored is None or np.array_equal(stored, np.broadcast_to(np.eye(4), stored.shape))
@@ -63,13 +77,16 @@ def _uses_poses(root: Path) -> bool:
     return path.exists() and bool(read_choice(path, marker))
 
 
-def read_colour_poses(root: Path, form: str, poses: np.ndarray, sources: dict[str, str]) -> np.ndarray:
+def read_colour_poses(
+    root: Path, form: str, poses: np.ndarray, sources: dict[str, str]
+) -> np.ndarray:
     """Pose of the colour camera at each image [F, 4, 4] [m], from the best file of the folder.
 
-    F-ToeRF: cams/color_extrinsics.npy if poses are used, else the pose of the ToF camera. ToeRF: a relative pose E
-    takes colour-camera to ToF-camera coordinates, so colour_from_world = inv(E) @ camera_from_world; in this order,
-    cams/relative_pose.npy; cams/color_extrinsics.npy, also where it equals the first, since it needs no product;
-    cams/relative_R.mat and relative_T.mat as E = [R | -T]; the pose of the ToF camera.
+    F-ToeRF: cams/color_extrinsics.npy if poses are used, else the pose of the ToF camera. ToeRF: a
+    relative pose E takes colour-camera to ToF-camera coordinates, so colour_from_world = inv(E) @
+    camera_from_world; in this order, cams/relative_pose.npy; cams/color_extrinsics.npy, also where
+    it equals the first, since it needs no product; cams/relative_R.mat and relative_T.mat as E = [R
+    | -T]; the pose of the ToF camera.
 
     Raises:
         InputError: If a file is not what data_specs/ describes.
@@ -81,7 +98,9 @@ def read_colour_poses(root: Path, form: str, poses: np.ndarray, sources: dict[st
     if form == "ftorf":
         if has_absolute and _uses_poses(root):
             sources["colour_from_world"] = f"file {name}"
-            return _motions(root, absolute, len(poses), "raw frames", "complete the poses, or remove the file")
+            return _motions(
+                root, absolute, len(poses), "raw frames", "complete the poses, or remove the file"
+            )
         sources["colour_from_world"] = "default as the ToF camera"
         return poses.copy()
     spec, halves = fields["relative_pose"], [fields["relative_R"], fields["relative_T"]]
@@ -99,16 +118,22 @@ def read_colour_poses(root: Path, form: str, poses: np.ndarray, sources: dict[st
         return product
     inferable = all((root / half.paths[0]).exists() for half in halves)
     if has_absolute:
-        stored = _motions(root, absolute, len(poses), "phasors", "complete the poses, or remove the file")
+        stored = _motions(
+            root, absolute, len(poses), "phasors", "complete the poses, or remove the file"
+        )
         if not (inferable and np.array_equal(stored, _identity(len(poses)))):
             sources["colour_from_world"] = f"file {name}"
             return stored
     if inferable:
-        rotation, translation = (read_array(root / half.paths[0], half).astype(np.float64) for half in halves)
+        rotation, translation = (
+            read_array(root / half.paths[0], half).astype(np.float64) for half in halves
+        )
         relative = _identity(1)
         relative[0, :3, :3], relative[0, :3, 3] = rotation, -translation.reshape(3)
         _refuse_others(root / halves[0].paths[0], halves[0].name, relative)
-        sources["colour_from_world"] = "inferred from cams/relative_R.mat and relative_T.mat as E = [R | -T]"
+        sources["colour_from_world"] = (
+            "inferred from cams/relative_R.mat and relative_T.mat as E = [R | -T]"
+        )
         return np.linalg.inv(relative[0]) @ poses
     sources["colour_from_world"] = f"inferred as the ToF camera: neither {spec.paths[0]} nor {name}"
     return poses.copy()
@@ -158,7 +183,9 @@ def _refuse_others(path: Path, name: str, poses: np.ndarray) -> None:
         raise InputError(
             f"{name}: {int((~fine).sum())} poses are not rigid motions",
             where=path,
-            why=f"expected rotations of determinant +1 and a last row 0 0 0 1, found at pose {n} {poses[n].tolist()}",
-            fix="store matrices that take world to camera (relative_pose: colour to ToF camera), x right, y down, "
+            why=f"expected rotations of determinant +1 and a last row 0 0 0 1, found at pose {n} "
+            f"{poses[n].tolist()}",
+            fix="store matrices that take world to camera (relative_pose: colour to ToF camera), "
+            "x right, y down, "
             "z forward",
         )

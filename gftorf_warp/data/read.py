@@ -17,8 +17,9 @@ def read(path: str | Path, *, frame_rate_hz: float | None = None) -> Sequence:
 
     Args:
         path: A capture, an F-ToeRF folder of raw quads, or a ToeRF folder of phasors.
-        frame_rate_hz: Raw frames per second, or phasors per second of a ToeRF folder; overrides the times of the
-            folder and the default of 120, or 30. Not allowed for a capture, which states every time.
+        frame_rate_hz: Raw frames per second, or phasors per second of a ToeRF folder; overrides the
+            times of the folder and the default of 120, or 30. Not allowed for a capture, which
+            states every time.
 
     Raises:
         InputError: If the folder or a file in it does not conform to data_specs/.

@@ -1,4 +1,6 @@
-"""A recorded sequence in memory, and the truth about it: plain values; :mod:`gftorf_warp.data.read` makes them."""
+"""A recorded sequence in memory, and the truth about it: plain values;
+:mod:`gftorf_warp.data.read` makes them.
+"""
 
 from __future__ import annotations
 
@@ -44,7 +46,8 @@ class Calibration:
     dc_offset: float = 0.0
     """Constant part of a quad as a multiple of its amplitude [1]."""
     quad_scale: float | None = None
-    """Factor for the quads that the file states; None if it states none. Never applied by a reader."""
+    """Factor for the quads that the file states; None if it states none. Never applied by a
+    reader."""
     cycle_length: int | None = None
     """Raw frames K of a cycle, if the recording states it; None: see :attr:`Sequence.cycle`."""
     settings: dict[str, Any] = field(default_factory=dict)
@@ -87,7 +90,8 @@ class Sequence:
     """
 
     quads: Float[np.ndarray, "F H W"]
-    """Values of each raw frame, float32, in the units of the file; zero in frames that were not measured."""
+    """Values of each raw frame, float32, in the units of the file; zero in frames that were not
+    measured."""
     measured: Bool[np.ndarray, "F"]
     """Whether a raw frame was measured; an absent one is 'not measured', never zero light."""
     shifts: Float[np.ndarray, "F"]
@@ -105,8 +109,8 @@ class Sequence:
     calibration: Calibration
     """Constants of the sensor."""
     from_phasors: bool = False
-    """Whether the camera delivered phasors, each of one instant: the four raw frames of a quartet are then
-    re/2, -re/2, im/2, -im/2 of one phasor, with one time and one pose."""
+    """Whether the camera delivered phasors, each of one instant: the four raw frames of a quartet
+    are then re/2, -re/2, im/2, -im/2 of one phasor, with one time and one pose."""
     colour: ColourCamera = field(default_factory=ColourCamera)
     """The colour camera, without images if there is none."""
     flow: Flow = field(default_factory=Flow)
@@ -137,7 +141,8 @@ class Sequence:
     def cycle(self) -> int:
         """Number K of raw frames in a cycle: quartet i is raw frames K i .. K (i + 1) - 1.
 
-        The stated one, else the period of shifts and frequencies: four for a sensor of four shifts at one frequency.
+        The stated one, else the period of shifts and frequencies: four for a sensor of four shifts
+        at one frequency.
         """
         return self.calibration.cycle_length or find_cycle(self.shifts, self.frame_frequencies)
 
@@ -153,10 +158,18 @@ class Sequence:
 
     @functools.cached_property
     def complete_quartets(self) -> list[int]:
-        """Indices i of the quartets whose raw frames K i .. K (i + 1) - 1 were all measured, at three or more each."""
+        """Indices i of the quartets whose raw frames K i .. K (i + 1) - 1 were all measured,
+        at three or more each.
+        """
         step, frequencies = self.cycle, self.frame_frequencies
-        whole = [i for i in range(self.frames // step) if self.measured[step * i : step * (i + 1)].all()]
-        return [i for i in whole if frequencies_decoded(frequencies[step * i : step * (i + 1)], self.frequencies)]
+        whole = [
+            i for i in range(self.frames // step) if self.measured[step * i : step * (i + 1)].all()
+        ]
+        return [
+            i
+            for i in whole
+            if frequencies_decoded(frequencies[step * i : step * (i + 1)], self.frequencies)
+        ]
 
     def quartet_frames(self, quartet: int) -> slice:
         """The raw frames of a quartet."""
@@ -165,7 +178,11 @@ class Sequence:
     @property
     def frame_frequencies(self) -> Float[np.ndarray, "F"]:
         """Modulation frequency of each raw frame [Hz]."""
-        return np.full(self.frames, self.calibration.f_mod_hz) if self.frequencies_hz is None else self.frequencies_hz
+        return (
+            np.full(self.frames, self.calibration.f_mod_hz)
+            if self.frequencies_hz is None
+            else self.frequencies_hz
+        )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -173,17 +190,20 @@ class Truth:
     """Ground truth of a sequence, from simulation; for evaluation only."""
 
     distance: Float[np.ndarray, "F H W"]
-    """Distance along the ray through each pixel centre at each raw frame [m], float32; NaN: unknown."""
+    """Distance along the ray through each pixel centre at each raw frame [m], float32; NaN:
+    unknown."""
     known: Bool[np.ndarray, "F"]
     """Whether a raw frame has a distance."""
     phasor_distance: Float[np.ndarray, "F H W"] | None = None
-    """Static-phasor distance [m], float32, in [0, c/2f) of the raw frame's frequency: the closed form of
-    quads without noise, all taken at the time of the raw frame, indirect light included; NaN: unknown. None: not
-    stored."""
+    """Static-phasor distance [m], float32, in [0, c/2f) of the raw frame's frequency: the closed
+    form of quads without noise, all taken at the time of the raw frame, indirect light included;
+    NaN: unknown. None: not stored."""
     amplitude: Float[np.ndarray, "F H W"] | None = None
     """Mean amplitude without noise [relative units], float32; None: not stored."""
     body: Int[np.ndarray, "F H W"] | None = None
-    """Index of the object that the ray through each pixel centre meets, from 0; -1: none. None: not stored."""
+    """Index of the object that the ray through each pixel centre meets, from 0; -1: none. None: not
+    stored."""
     layers: dict[str, Float[np.ndarray, "F C H W"]] = field(default_factory=dict)
-    """Further layers, float32, with the names and channels of data_specs/capture.toml: light by harmonic, its direct
-    part and standard error, ambient light, z-depth, normals. Only captures store them."""
+    """Further layers, float32, with the names and channels of data_specs/capture.toml: light by
+    harmonic, its direct part and standard error, ambient light, z-depth, normals. Only captures
+    store them."""

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-INSTALLED = Path(__file__).parent / "specs"  # an installed package carries a copy, see pyproject.toml
+# an installed package carries a copy, see pyproject.toml
+INSTALLED = Path(__file__).parent / "specs"
 CHECKED_OUT = Path(__file__).parents[2] / "data_specs"
 
 Size = int | str
@@ -64,17 +65,23 @@ def fields(name: str) -> dict[str, Field]:
     """
     folder = INSTALLED if INSTALLED.is_dir() else CHECKED_OUT
     content = tomllib.loads((folder / f"{name}.toml").read_text(encoding="utf-8"))
-    return {entry["name"]: Field(**{key: _frozen(value) for key, value in entry.items()}) for entry in content["field"]}
+    return {
+        entry["name"]: Field(**{key: _frozen(value) for key, value in entry.items()})
+        for entry in content["field"]
+    }
 
 
 def layer_field(name: str) -> Field:
-    """The field of data_specs/capture.toml that describes a layer of the truth; ``{h}`` is a harmonic.
+    """The field of data_specs/capture.toml that describes a layer of the truth; ``{h}`` is a
+    harmonic.
 
     Raises:
         ValueError: If none does.
     """
     for field in fields("capture").values():
-        if "layers" in field.fills and re.fullmatch(re.escape(field.key).replace(r"\{h\}", "[1-9][0-9]?"), name):
+        if "layers" in field.fills and re.fullmatch(
+            re.escape(field.key).replace(r"\{h\}", "[1-9][0-9]?"), name
+        ):
             return field
     raise ValueError(f"no layer is named {name!r}")
 

@@ -20,15 +20,17 @@ from .sequence import Sequence, Truth
 from .writing import calibration_files, float32, inexpressible, npy, shortest
 
 FORMAT = "torf"
-PHASOR_RATE_HZ = FRAME_RATE_HZ / FRAMES_PER_QUARTET  # [Hz] the sensor is that of the F-ToeRF recordings
-QUAD_MAX = float(np.finfo(np.float32).max) / 4.0  # the length of a phasor is up to 2 sqrt(2) times as large
+# [Hz] the sensor is that of the F-ToeRF recordings
+PHASOR_RATE_HZ = FRAME_RATE_HZ / FRAMES_PER_QUARTET
+# the length of a phasor is up to 2 sqrt(2) times as large
+QUAD_MAX = float(np.finfo(np.float32).max) / 4.0
 
 
 def stored(root: Path) -> Stored:
     """The measured phasors of a folder of this format.
 
-    Ids count from 0, or from the smallest id of tof/ and color/, 0001 in the original recordings; where the times
-    of the folder outnumber its largest id, they count from 0.
+    Ids count from 0, or from the smallest id of tof/ and color/, 0001 in the original recordings;
+    where the times of the folder outnumber its largest id, they count from 0.
 
     Raises:
         InputError: If there are no phasors, or an id is absurd.
@@ -39,13 +41,16 @@ def stored(root: Path) -> Stored:
         raise InputError(
             "no phasors",
             where=root / "tof",
-            why="expected files tof/{id}.npy with ids of four digits, 0000.npy or 0001.npy and so on, found none",
+            why="expected files tof/{id}.npy with ids of four digits, 0000.npy or 0001.npy and "
+            "so on, found none",
             fix="name each phasor by its number",
         )
     refuse_absurd_ids(files)
     first_id = min([*files, *numbered(root, fields["colour"].paths[0])])
     times = root / fields["frame_times"].paths[0]
-    stated = Problems().attempt(read_shape, times, fields["frame_times"]) if times.exists() else None
+    stated = (
+        Problems().attempt(read_shape, times, fields["frame_times"]) if times.exists() else None
+    )
     if stated is not None and stated[0] > max(files):
         first_id = 0
     return Stored(
@@ -64,10 +69,10 @@ def stored(root: Path) -> Stored:
 def files(sequence: Sequence, truth: Truth | None) -> Iterator[tuple[str, bytes]]:
     """Name and content of every file of a folder with the complete quartets as phasors.
 
-    A sequence of phasors is written so that reading it again gives the same one: images bit by bit in float32,
-    calibration in float64. Of raw quads, phasor i gets the time, pose, colour and truth of raw frame 4i, as phasors
-    beside F-ToeRF quads are named; incomplete quartets, other colour images, optical flow and the constant part of the
-    quads are left out.
+    A sequence of phasors is written so that reading it again gives the same one: images bit by bit
+    in float32, calibration in float64. Of raw quads, phasor i gets the time, pose, colour and truth
+    of raw frame 4i, as phasors beside F-ToeRF quads are named; incomplete quartets, other colour
+    images, optical flow and the constant part of the quads are left out.
 
     Raises:
         UsageError: If the quads are too large, or no quartet is complete.
@@ -78,17 +83,25 @@ def files(sequence: Sequence, truth: Truth | None) -> Iterator[tuple[str, bytes]
         raise inexpressible(FORMAT, "quads", f"numbers below {QUAD_MAX:.2g}", f"{largest:.2g}")
     if not sequence.complete_quartets:
         raise inexpressible(
-            FORMAT, "quartets", "one or more with all of their four raw frames", f"none in {sequence.frames} raw frames"
+            FORMAT,
+            "quartets",
+            "one or more with all of their four raw frames",
+            f"none in {sequence.frames} raw frames",
         )
     step = FRAMES_PER_QUARTET
     starts = slice(0, sequence.frames // step * step, step)
     poses = sequence.camera_from_world[starts]
-    colour_poses = poses if sequence.colour.camera_from_world is None else sequence.colour.camera_from_world[starts]
+    colour_poses = (
+        poses
+        if sequence.colour.camera_from_world is None
+        else sequence.colour.camera_from_world[starts]
+    )
     yield from calibration_files(sequence, sequence.times[starts], poses)
     relative = poses @ np.linalg.inv(colour_poses)
     if np.ptp(relative, axis=0).max() <= SAME_POSE:
         yield "cams/relative_pose.npy", npy(relative[0].astype(np.float64))
-    yield "cams/color_extrinsics.npy", npy(colour_poses.astype(np.float64))  # what is constant loses its last bits
+    # what is constant loses its last bits
+    yield "cams/color_extrinsics.npy", npy(colour_poses.astype(np.float64))
     for i in sequence.complete_quartets:
         yield f"tof/{i:04d}.npy", npy(_phasor(sequence, i))
     for i in range(len(poses)):

@@ -8,7 +8,8 @@ from jaxtyping import Bool, Float
 from ..constants import FRAMES_PER_QUARTET
 from .sequence import Truth
 
-MOVING_M = 0.05  # [m] twice the noise of a distance decoded from typical quads, a fraction of any object
+# [m] twice the noise of a distance decoded from typical quads, a fraction of any object
+MOVING_M = 0.05
 
 
 def known_distance(truth: Truth) -> Float[np.ndarray, "F H W"]:
@@ -25,10 +26,10 @@ def moving_and_static(
 ) -> tuple[Bool[np.ndarray, "S H W"], Bool[np.ndarray, "S H W"]]:
     """Moving and static pixels of the S scored frames.
 
-    A pixel moves if its true distance has max - min > 0.05 m within the raw frames of its quartet. It is static if all
-    of them are known and it does not move; with unknown truth [NaN] it may be neither. The raw frames of a phasor are
-    of one instant, so a pixel of phasors moves if its distance differs that much from one phasor to the next (the last:
-    from the previous one).
+    A pixel moves if its true distance has max - min > 0.05 m within the raw frames of its quartet.
+    It is static if all of them are known and it does not move; with unknown truth [NaN] it may be
+    neither. The raw frames of a phasor are of one instant, so a pixel of phasors moves if its
+    distance differs that much from one phasor to the next (the last: from the previous one).
 
     Args:
         distance_truth: True distance of every raw frame [m]; NaN: unknown.
@@ -41,7 +42,9 @@ def moving_and_static(
     for quartet in {n // step for n in frames}:
         quartet_truth = distance_truth[step * quartet : step * (quartet + 1)]
         if from_phasors:
-            neighbour = quartet + 1 if step * (quartet + 1) < len(distance_truth) else max(quartet - 1, 0)
+            neighbour = (
+                quartet + 1 if step * (quartet + 1) < len(distance_truth) else max(quartet - 1, 0)
+            )
             quartet_truth = distance_truth[[step * quartet, step * neighbour]]
         unknown = np.isnan(quartet_truth)
         low, high = (
@@ -54,7 +57,9 @@ def moving_and_static(
     return np.stack([moving[i] for i in rows]), np.stack([static[i] for i in rows])
 
 
-def nearest(images: Float[np.ndarray, "F H W"], height: int, width: int) -> Float[np.ndarray, "F h w"]:
+def nearest(
+    images: Float[np.ndarray, "F H W"], height: int, width: int
+) -> Float[np.ndarray, "F h w"]:
     """Images resized by nearest neighbours: distances must not be averaged."""
     rows = ((np.arange(height) + 0.5) * images.shape[1] / height).astype(int)
     columns = ((np.arange(width) + 0.5) * images.shape[2] / width).astype(int)

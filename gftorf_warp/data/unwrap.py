@@ -1,10 +1,11 @@
 """Phase unwrapping by several modulation frequencies, as a sensor computes it.
 
-With f_i = m_i f_0 and m_1, m_2, .. without common divisor the range is c / 2 f_0. A wrapped phase at f_1 leaves the m_1
-candidates (psi_1 + 2 pi k) / m_1 for the phase at f_0. Each candidate predicts the other phases; the one with the
-smallest residual of a straight line through all phases is chosen. For two frequencies that is the pair of candidates
-closest on the circle (sensor notes, 2.7). The phases are from raw frames of different times: motion between them breaks
-this before noise does.
+With f_i = m_i f_0 and m_1, m_2, .. without common divisor the range is c / 2 f_0. A wrapped phase
+at f_1 leaves the m_1 candidates (psi_1 + 2 pi k) / m_1 for the phase at f_0. Each candidate
+predicts the other phases; the one with the smallest residual of a straight line through all phases
+is chosen. For two frequencies that is the pair of candidates closest on the circle (sensor notes,
+2.7). The phases are from raw frames of different times: motion between them breaks this before
+noise does.
 """
 
 from __future__ import annotations
@@ -19,8 +20,10 @@ from jaxtyping import Float, Int
 
 from ..constants import SPEED_OF_LIGHT
 
-MULTIPLE_MAX = 16  # f_1 / f_2 is a fraction of numbers up to this: more candidates are closer than any noise allows
-COMMENSURATE = 1e-4  # [1] of the ratio: beyond it the phases drift by more than 0.01 rad over the common range
+# f_1 / f_2 is a fraction of numbers up to this: more candidates are closer than any noise allows
+MULTIPLE_MAX = 16
+# [1] of the ratio: beyond it the phases drift by more than 0.01 rad over the common range
+COMMENSURATE = 1e-4
 CONFIDENT = 0.5  # [1] below, another distance has less than twice the residual of the chosen one
 
 
@@ -30,8 +33,8 @@ class Chosen(NamedTuple):
     turns: Int[np.ndarray, "*n"]
     """Whole turns k of the first phase, 0 .. m_1 - 1."""
     confidence: Float[np.ndarray, "*n"]
-    """1 - (residual of the chosen candidate) / (residual of the second best) [1]: 1 if all phases agree, 0 if two
-    distances explain them equally well."""
+    """1 - (residual of the chosen candidate) / (residual of the second best) [1]: 1 if all phases
+    agree, 0 if two distances explain them equally well."""
 
 
 def multiples(frequencies_hz: Sequence[float]) -> tuple[tuple[int, ...], float]:
@@ -62,7 +65,9 @@ def _ratio(one_hz: float, other_hz: float, listed: str) -> Fraction:
 
 
 def _incommensurate(listed: str) -> ValueError:
-    return ValueError(f"{listed} Hz must be different multiples, up to {MULTIPLE_MAX}, of one frequency")
+    return ValueError(
+        f"{listed} Hz must be different multiples, up to {MULTIPLE_MAX}, of one frequency"
+    )
 
 
 def common_range(frequencies_hz: Sequence[float]) -> float:
@@ -97,7 +102,8 @@ def choose(phases: Float[np.ndarray, "f *n"], ms: Sequence[int]) -> Chosen:
         second = np.where(nearer, best, np.minimum(second, left))
         turns[nearer] = k
         best = np.where(nearer, left, best)
-    if ms[0] == 1:  # one candidate, which the other phases may contradict: compared with a whole turn of the finest
+    # one candidate, which the other phases may contradict: compared with a whole turn of the finest
+    if ms[0] == 1:
         second = np.full(phases.shape[1:], _spacing(m.ravel()))
     with np.errstate(invalid="ignore", divide="ignore"):
         share = np.sqrt(np.where(second > 0, best / second, 1.0))
@@ -105,7 +111,9 @@ def choose(phases: Float[np.ndarray, "f *n"], ms: Sequence[int]) -> Chosen:
 
 
 def _spacing(m: np.ndarray) -> float:
-    """Smallest squared residual [rad^2] of one more turn of a single phase where all others agree."""
+    """Smallest squared residual [rad^2] of one more turn of a single phase where all others
+    agree.
+    """
     return float(min((2.0 * math.pi) ** 2 * (1.0 - one**2 / np.sum(m**2)) for one in m))
 
 

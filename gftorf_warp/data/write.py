@@ -27,7 +27,8 @@ def write(
     readme: str | None = None,
     sheet: bytes | None = None,
 ) -> Path:
-    """Write a sequence, and its ground truth if there is any, as a folder that appears only when it is complete.
+    """Write a sequence, and its ground truth if there is any, as a folder that appears only when it
+    is complete.
 
     Args:
         form: Name of the format: ``capture``, ``ftorf`` or ``torf``.
@@ -49,7 +50,8 @@ def write(
     validate(sequence, truth)
     refuse_inexpressible(form, sequence, truth)
     with atomic_folder(path) as folder:
-        for name in SLOT_FOLDERS if form == ftorf.FORMAT else ():  # they belong to the layout, frames or not
+        # they belong to the layout, frames or not
+        for name in SLOT_FOLDERS if form == ftorf.FORMAT else ():
             (folder / name).mkdir()
         for name, content in FILES[form](sequence, truth):
             (folder / name).parent.mkdir(exist_ok=True)
@@ -57,10 +59,15 @@ def write(
                 write_through(folder / name, content)
             else:
                 write_parts(folder / name, content)
-        names = sorted(file.relative_to(folder).as_posix() for file in folder.rglob("*") if file.is_file())
+        names = sorted(
+            file.relative_to(folder).as_posix() for file in folder.rglob("*") if file.is_file()
+        )
         others = {"README.md": None if readme is None else readme.encode(), SHEET: sheet}
         if form == CAPTURE:
-            digests = [f"{hashlib.sha256((folder / name).read_bytes()).hexdigest()}  {name}\n" for name in names]
+            digests = [
+                f"{hashlib.sha256((folder / name).read_bytes()).hexdigest()}  {name}\n"
+                for name in names
+            ]
             others[MANIFEST] = "".join(digests).encode()
         for name, data in others.items():
             if data is not None:

@@ -19,7 +19,9 @@ from .specs import layer_field
 def calibration_files(
     sequence: Sequence, times: np.ndarray, camera_from_world: np.ndarray
 ) -> Iterator[tuple[str, bytes]]:
-    """The files that both formats have, by relative name, for frames of these times [s] and poses."""
+    """The files that both formats have, by relative name,
+    for frames of these times [s] and poses.
+    """
     yield "cams/tof_intrinsics.npy", npy(_pinhole(sequence.intrinsics))
     yield "cams/color_intrinsics.npy", npy(_pinhole(_colour_intrinsics(sequence)))
     yield "cams/pixel_centre.json", json_bytes({"pixel_centre": "integer"})
@@ -57,13 +59,25 @@ def validate(sequence: Sequence, truth: Truth | None) -> None:
         lengths |= {f"{name}[{n}]": (flow.shape, (2, *shape[1:])) for n, flow in flows.items()}
     images["colour"] = sequence.colour.images
     size = sequence.colour.size or ()
-    lengths |= {f"colour[{n}]": (image.shape, (*size, 3)) for n, image in sequence.colour.images.items()}
+    lengths |= {
+        f"colour[{n}]": (image.shape, (*size, 3)) for n, image in sequence.colour.images.items()
+    }
     if truth is not None:
-        lengths |= {"truth.distance": (truth.distance.shape, shape), "truth.known": (truth.known.shape, (frames,))}
+        lengths |= {
+            "truth.distance": (truth.distance.shape, shape),
+            "truth.known": (truth.known.shape, (frames,)),
+        }
         more = {name: getattr(truth, name) for name in ("phasor_distance", "amplitude", "body")}
-        lengths |= {f"truth.{name}": (image.shape, shape) for name, image in more.items() if image is not None}
+        lengths |= {
+            f"truth.{name}": (image.shape, shape)
+            for name, image in more.items()
+            if image is not None
+        }
         for name, layer in truth.layers.items():
-            lengths[f"truth.layers[{name}]"] = (layer.shape, (frames, len(layer_field(name).channels), *shape[1:]))
+            lengths[f"truth.layers[{name}]"] = (
+                layer.shape,
+                (frames, len(layer_field(name).channels), *shape[1:]),
+            )
     for name, (found, expected) in lengths.items():
         if found != expected:
             raise ValueError(f"{name} {found} must have shape {expected}")
@@ -83,7 +97,8 @@ def _validate_phasors(sequence: Sequence) -> None:
     quads = sequence.quads.reshape(-1, step, sequence.height, sequence.width)
     rules = {
         "shifts": np.array_equal(sequence.shifts, np.tile(CANONICAL_SHIFTS, len(quads))),
-        "quads": np.array_equal(quads[:, 0], -quads[:, 1]) and np.array_equal(quads[:, 2], -quads[:, 3]),
+        "quads": np.array_equal(quads[:, 0], -quads[:, 1])
+        and np.array_equal(quads[:, 2], -quads[:, 3]),
         "dc_offset": sequence.calibration.dc_offset == 0,
     }
     per_frame = {
@@ -93,10 +108,14 @@ def _validate_phasors(sequence: Sequence) -> None:
         "colour_from_world": sequence.colour.camera_from_world,
     }
     for name, values in per_frame.items():
-        rules[name] = values is None or np.array_equal(values, np.repeat(values[::step], step, axis=0))
+        rules[name] = values is None or np.array_equal(
+            values, np.repeat(values[::step], step, axis=0)
+        )
     for name, holds in rules.items():
         if not holds:
-            raise ValueError(f"from_phasors: {name} must be those of re/2, -re/2, im/2, -im/2 at one instant")
+            raise ValueError(
+                f"from_phasors: {name} must be those of re/2, -re/2, im/2, -im/2 at one instant"
+            )
 
 
 def refuse_inexpressible(form: str, sequence: Sequence, truth: Truth | None) -> None:
@@ -108,7 +127,11 @@ def refuse_inexpressible(form: str, sequence: Sequence, truth: Truth | None) -> 
     flows = [*sequence.flow.forward.values(), *sequence.flow.backward.values()]
     times = sequence.times
     distance = np.ones(1) if truth is None else truth.distance[truth.known]
-    static = np.zeros(1) if truth is None or truth.phasor_distance is None else truth.phasor_distance[truth.known]
+    static = (
+        np.zeros(1)
+        if truth is None or truth.phasor_distance is None
+        else truth.phasor_distance[truth.known]
+    )
     stated, tof = sequence.calibration, sequence.intrinsics
     numbers = (stated.f_mod_hz, stated.phase_offset, stated.dc_offset, stated.quad_scale or 1.0)
     focal = tof.fx, tof.fy
@@ -125,9 +148,17 @@ def refuse_inexpressible(form: str, sequence: Sequence, truth: Truth | None) -> 
             f"cycles of {FRAMES_PER_QUARTET} raw frames",
             f"of {sequence.cycle}",
         ),
-        "distortion": (not family or tof.distortion is None, "a pinhole", f"a lens with {tof.distortion}"),
+        "distortion": (
+            not family or tof.distortion is None,
+            "a pinhole",
+            f"a lens with {tof.distortion}",
+        ),
         "an empty sequence": (sequence.measured.any(), "at least one measured raw frame", "none"),
-        "quads": (np.isfinite(sequence.quads[sequence.measured]).all(), "finite numbers", "NaN or infinity"),
+        "quads": (
+            np.isfinite(sequence.quads[sequence.measured]).all(),
+            "finite numbers",
+            "NaN or infinity",
+        ),
         "times": (
             np.isfinite(times).all() and times[0] == 0 and (np.diff(times) >= 0).all(),
             "seconds since the first raw frame, never decreasing",
@@ -139,7 +170,11 @@ def refuse_inexpressible(form: str, sequence: Sequence, truth: Truth | None) -> 
             f"speed of light / frequency between {DEPTH_RANGES_M[0]} and {DEPTH_RANGES_M[1]} m",
             f"{stated.f_mod_hz} Hz",
         ),
-        "quad_scale": (stated.quad_scale is None or stated.quad_scale > 0, "above 0", str(stated.quad_scale)),
+        "quad_scale": (
+            stated.quad_scale is None or stated.quad_scale > 0,
+            "above 0",
+            str(stated.quad_scale),
+        ),
         "focal length": (
             min(focal) >= FOCAL_MIN * sequence.width,
             f"pixels, at least {FOCAL_MIN} of the width {sequence.width}",
@@ -156,13 +191,21 @@ def refuse_inexpressible(form: str, sequence: Sequence, truth: Truth | None) -> 
             "finite numbers",
             "NaN or infinity",
         ),
-        "phasor_distance": (((static >= 0) & (static < np.inf) | np.isnan(static)).all(), "metres or NaN", "others"),
+        "phasor_distance": (
+            ((static >= 0) & (static < np.inf) | np.isnan(static)).all(),
+            "metres or NaN",
+            "others",
+        ),
         "layers": (
             truth is None or not any(np.isinf(images).any() for images in truth.layers.values()),
             "numbers, or NaN for unknown",
             "infinity",
         ),
-        "flow": (not any(np.isinf(flow).any() for flow in flows), "pixels, or NaN for unknown", "infinity"),
+        "flow": (
+            not any(np.isinf(flow).any() for flow in flows),
+            "pixels, or NaN for unknown",
+            "infinity",
+        ),
         "truth": (
             ((distance > 0) & (distance < np.inf) | np.isnan(distance)).all(),
             "distances above 0 m, or NaN for unknown",
@@ -198,7 +241,9 @@ def _colour_size(sequence: Sequence) -> tuple[int, int]:
 
 
 def _colour_intrinsics(sequence: Sequence) -> Intrinsics:
-    """Those of the colour camera; public loaders require one, so without any, those of the ToF camera, scaled."""
+    """Those of the colour camera; public loaders require one, so without any,
+    those of the ToF camera, scaled.
+    """
     if sequence.colour.intrinsics is not None:
         return sequence.colour.intrinsics
     height, width = _colour_size(sequence)
@@ -227,7 +272,9 @@ def npy(array: np.ndarray | np.floating) -> bytes:
     """Bytes of a .npy file, little endian."""
     buffer = io.BytesIO()
     array = np.asarray(array)
-    np.lib.format.write_array(buffer, array.astype(array.dtype.newbyteorder("<")), version=(1, 0), allow_pickle=False)
+    np.lib.format.write_array(
+        buffer, array.astype(array.dtype.newbyteorder("<")), version=(1, 0), allow_pickle=False
+    )
     return buffer.getvalue()
 
 

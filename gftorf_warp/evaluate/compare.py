@@ -48,15 +48,16 @@ def compare(
 ) -> dict[str, Any]:
     """Score a run and write ``RUN/metrics.json`` and ``RUN/report.html``.
 
-    Every scored raw frame is rendered at its time and pose, at the sequence's own resolution, over a black background.
-    Errors are mean squared errors of the distance along the ray [m^2], times 100.
+    Every scored raw frame is rendered at its time and pose, at the sequence's own resolution, over
+    a black background. Errors are mean squared errors of the distance along the ray [m^2], times
+    100.
 
     Args:
         run: A finished reconstruction, or its folder.
         truth: A sequence with the ground truth; None: the sequence of the run.
         frames: The scored raw frames: ``all``, or ``ftorf13`` as in the published tables.
-        against: The true distance: ``geometry``, or ``static-phasor``, the closed form of a static, noise-free scene.
-            Moving pixels are those of geometry in both cases.
+        against: The true distance: ``geometry``, or ``static-phasor``, the closed form of a static,
+            noise-free scene. Moving pixels are those of geometry in both cases.
         report: Whether to write the page as well.
         progress: Called with (frames done, frames in all).
 
@@ -64,7 +65,8 @@ def compare(
         The content of metrics.json; None where there is no truth or no such pixel.
 
     Raises:
-        InputError: If the run or a sequence cannot be read, the truth does not fit, or no quartet is complete.
+        InputError: If the run or a sequence cannot be read, the truth does not fit, or no quartet
+            is complete.
         UsageError: If ``frames`` is unknown or leaves nothing, or ``against`` is unknown.
         DivergedError: If a rendering is not finite.
     """
@@ -74,7 +76,9 @@ def compare(
         run = Run.open(run)
     if against not in AGAINST:
         why = f"expected one of {', '.join(AGAINST)}"
-        raise UsageError(f"unknown truth {against!r}", where="--against", why=why, fix="use --against geometry")
+        raise UsageError(
+            f"unknown truth {against!r}", where="--against", why=why, fix="use --against geometry"
+        )
     sequence = run.sequence()
     known = fitting_truth(sequence, truth)
     scored = measure.scored_frames(sequence, frames)
@@ -92,7 +96,8 @@ def compare(
 
 
 def fitting_truth(sequence: Sequence, path: str | Path | None = None) -> Truth | None:
-    """Ground truth of a sequence, or of the sequence at ``path`` with the same frames and size; None if unknown.
+    """Ground truth of a sequence, or of the sequence at ``path`` with the same frames and size;
+    None if unknown.
 
     Raises:
         InputError: If ``path`` holds no ground truth, or frames or size differ.
@@ -108,7 +113,9 @@ def fitting_truth(sequence: Sequence, path: str | Path | None = None) -> Truth |
             fix="leave --truth out, or name a sequence with synthetic_depth/",
         )
     if found.distance.shape != sequence.quads.shape:
-        expected, got = ("x".join(map(str, shape)) for shape in (sequence.quads.shape, found.distance.shape))
+        expected, got = (
+            "x".join(map(str, shape)) for shape in (sequence.quads.shape, found.distance.shape)
+        )
         raise InputError(
             "the truth does not fit the run",
             where=path or sequence.path or "sequence",
@@ -118,7 +125,9 @@ def fitting_truth(sequence: Sequence, path: str | Path | None = None) -> Truth |
     return found
 
 
-def findings(sequence: Sequence, gathered: views.Views, truth: Truth | None, *, against: str = AGAINST[0]) -> Findings:
+def findings(
+    sequence: Sequence, gathered: views.Views, truth: Truth | None, *, against: str = AGAINST[0]
+) -> Findings:
     """Views with their errors if there is a truth.
 
     Raises:
@@ -130,8 +139,12 @@ def findings(sequence: Sequence, gathered: views.Views, truth: Truth | None, *, 
     moving, static = moving_and_static(
         distance, gathered.frames, from_phasors=sequence.from_phasors, cycle=sequence.cycle
     )
-    scored = (distance if against == AGAINST[0] else _static_phasor(sequence, truth))[gathered.frames]
-    errors = {name: measure.squared_error(image, scored) for name, image in gathered.distances.items()}
+    scored = (distance if against == AGAINST[0] else _static_phasor(sequence, truth))[
+        gathered.frames
+    ]
+    errors = {
+        name: measure.squared_error(image, scored) for name, image in gathered.distances.items()
+    }
     judgement = Judgement(truth=scored, errors=errors, moving=moving, static=static)
     return Findings(sequence=sequence, views=gathered, judgement=judgement)
 
@@ -148,13 +161,16 @@ def _static_phasor(sequence: Sequence, truth: Truth) -> Float[np.ndarray, "F H W
         raise InputError(
             "a static-phasor distance of one frequency",
             where=sequence.path or "sequence",
-            why=f"--against static-phasor was given, and here are {len(sequence.frequencies)}, unwrapped together",
+            why=f"--against static-phasor was given, and here are {len(sequence.frequencies)}, "
+            f"unwrapped together",
             fix="leave --against out",
         )
     return np.where(truth.known[:, None, None], truth.phasor_distance, np.nan)
 
 
-def summary(run: Run, found: Findings, *, protocol: str, against: str = AGAINST[0]) -> dict[str, Any]:
+def summary(
+    run: Run, found: Findings, *, protocol: str, against: str = AGAINST[0]
+) -> dict[str, Any]:
     """The content of metrics.json: numbers, texts and None."""
     confidence, colour = found.views.confidence, found.colour
     return {
@@ -180,7 +196,9 @@ def summary(run: Run, found: Findings, *, protocol: str, against: str = AGAINST[
 
 
 def _errors(judgement: Judgement | None) -> dict[str, object]:
-    """The errors of metrics.json on all, moving and static pixels; all None without ground truth."""
+    """The errors of metrics.json on all, moving and static pixels;
+    all None without ground truth.
+    """
     if judgement is None:
         unknown: dict[str, None] = {f"{name}_mse_x100": None for name in measure.DISTANCES}
         group = {**unknown, "share": None}
@@ -188,8 +206,14 @@ def _errors(judgement: Judgement | None) -> dict[str, object]:
     moving, static, errors = judgement.moving, judgement.static, judgement.errors
     return {
         **measure.distance_errors(errors, np.ones_like(moving), measure.mean_over_frames),
-        "moving": {**measure.distance_errors(errors, moving), "share": measure.share(moving, static)},
-        "static": {**measure.distance_errors(errors, static), "share": measure.share(static, moving)},
+        "moving": {
+            **measure.distance_errors(errors, moving),
+            "share": measure.share(moving, static),
+        },
+        "static": {
+            **measure.distance_errors(errors, static),
+            "share": measure.share(static, moving),
+        },
     }
 
 
@@ -216,11 +240,16 @@ def installed_versions() -> str:
     """Versions of this package, its main dependencies and the platform."""
     packages = ("torch", "warp-lang", "numpy")
     versions = ", ".join(f"{name} {importlib.metadata.version(name)}" for name in packages)
-    return f"gftorf-warp {__version__}, {versions}, Python {platform.python_version()}, {platform.system()}"
+    return (
+        f"gftorf-warp {__version__}, {versions}, Python {platform.python_version()}, "
+        f"{platform.system()}"
+    )
 
 
 def rows_of(path: Path) -> list[dict[str, float]]:
-    """The complete rows of a run's metrics.jsonl or diagnostics.jsonl; none if there is no such file."""
+    """The complete rows of a run's metrics.jsonl or diagnostics.jsonl;
+    none if there is no such file.
+    """
     lines = path.read_text(encoding="utf-8").splitlines(keepends=True) if path.exists() else []
     return [json.loads(line) for line in lines if line.endswith("\n")]
 
@@ -236,10 +265,16 @@ def sequence_title(path: Path | None) -> str | None:
 def truth_statement(path: Path | None) -> str | None:
     """The paragraphs of a sequence's README.md on ground truth; None if there are none."""
     paragraphs = _data_card(path).split("\n\n")
-    about = [" ".join(text.split()) for text in paragraphs if text.lower().startswith("ground truth")]
+    about = [
+        " ".join(text.split()) for text in paragraphs if text.lower().startswith("ground truth")
+    ]
     return " ".join(about) or None
 
 
 def _data_card(path: Path | None) -> str:
     card = None if path is None else path / "README.md"
-    return card.read_text(encoding="utf-8", errors="replace") if card is not None and card.is_file() else ""
+    return (
+        card.read_text(encoding="utf-8", errors="replace")
+        if card is not None and card.is_file()
+        else ""
+    )

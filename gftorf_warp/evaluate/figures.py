@@ -9,16 +9,31 @@ from jaxtyping import Bool, Float
 
 from .plot import Curve, Plot, svg
 
-COLOURS = {"closed_form": "#d55e00", "d": "#0072b2", "d_normalised": "#56b4e9", "d_tof": "#009e73"}  # Okabe and Ito
+# Okabe and Ito
+COLOURS = {"closed_form": "#d55e00", "d": "#0072b2", "d_normalised": "#56b4e9", "d_tof": "#009e73"}
 NAMES = {"closed_form": "closed form", "d": "d", "d_normalised": "d / opacity", "d_tof": "d_ToF"}
-TERM_COLOURS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00", "#8c6d31", "#666666")
-NOT_LOSSES = {"images", "seconds", "gaussians", "quad_psnr_db", "opacity"}  # what else a log step holds
+TERM_COLOURS = (
+    "#0072b2",
+    "#e69f00",
+    "#009e73",
+    "#cc79a7",
+    "#56b4e9",
+    "#d55e00",
+    "#8c6d31",
+    "#666666",
+)
+# what else a log step holds
+NOT_LOSSES = {"images", "seconds", "gaussians", "quad_psnr_db", "opacity"}
 FLOOR_M = 1e-3  # [m] smaller errors fall into the first bin of the histogram
 BINS = 59
 IMAGES = "optimised images"
 SQUARED = "m\N{SUPERSCRIPT TWO} \N{MULTIPLICATION SIGN} 100"
 DASHED, DOTTED = "5 3", "1.5 2"
-GROUPS = {"": ("all pixels", ""), "moving.": ("moving pixels", DASHED), "static.": ("static pixels", DOTTED)}
+GROUPS = {
+    "": ("all pixels", ""),
+    "moving.": ("moving pixels", DASHED),
+    "static.": ("static pixels", DOTTED),
+}
 SINGLE = {  # title and unit of a plot of one curve: key of the rows of diagnostics
     ("Transmittance", "mean of 1 \N{MINUS SIGN} opacity"): "transmittance",
     ("Depth distortion", "m\N{SUPERSCRIPT TWO}"): "distortion",
@@ -27,15 +42,23 @@ SINGLE = {  # title and unit of a plot of one curve: key of the rows of diagnost
 
 
 def training_curves(log: Sequence[Mapping[str, float]]) -> bytes | None:
-    """Loss terms, quad PSNR and number of Gaussians over optimised images; None if nothing was logged.
+    """Loss terms, quad PSNR and number of Gaussians over optimised images; None if nothing was
+    logged.
 
     Args:
-        log: Steps of ``metrics.jsonl``: images, seconds, gaussians, quad_psnr_db and the loss terms by name.
+        log: Steps of ``metrics.jsonl``: images, seconds, gaussians, quad_psnr_db and the loss terms
+            by name.
     """
     if not log:
         return None
-    terms = [name for name in dict.fromkeys(key for step in log for key in step) if name not in NOT_LOSSES]
-    losses = [_curve(log, name, TERM_COLOURS[k % len(TERM_COLOURS)], name) for k, name in enumerate(terms)]
+    terms = [
+        name
+        for name in dict.fromkeys(key for step in log for key in step)
+        if name not in NOT_LOSSES
+    ]
+    losses = [
+        _curve(log, name, TERM_COLOURS[k % len(TERM_COLOURS)], name) for k, name in enumerate(terms)
+    ]
     losses = [curve for curve in losses if (curve.y > 0).any()]
     psnr, count = (_curve(log, name, COLOURS["d"]) for name in ("quad_psnr_db", "gaussians"))
     plots = [
@@ -47,7 +70,8 @@ def training_curves(log: Sequence[Mapping[str, float]]) -> bytes | None:
 
 
 def along_run(rows: Sequence[Mapping[str, float]]) -> bytes | None:
-    """Diagnostics over optimised images: errors if the truth is known, agreement, opacity, number of Gaussians.
+    """Diagnostics over optimised images: errors if the truth is known, agreement, opacity, number
+    of Gaussians.
 
     Args:
         rows: Those of ``diagnostics.jsonl``, see recon/diagnostics.py.
@@ -68,7 +92,9 @@ def along_run(rows: Sequence[Mapping[str, float]]) -> bytes | None:
     ]
     static = [
         _curve(rows, "d_minus_dtof_static_m", COLOURS["d"], "|d \N{MINUS SIGN} d_ToF|"),
-        _curve(rows, "offset_static_m", COLOURS["d_normalised"], "length of the displacement", DASHED),
+        _curve(
+            rows, "offset_static_m", COLOURS["d_normalised"], "length of the displacement", DASHED
+        ),
     ]
     plots.append(Plot(title="On static pixels", x=IMAGES, y="m", curves=static))
     for (title, unit), key in SINGLE.items():
@@ -77,18 +103,22 @@ def along_run(rows: Sequence[Mapping[str, float]]) -> bytes | None:
     return svg(plots, columns=3, height=209)
 
 
-def error_over_frames(frames: Sequence[int], groups: Mapping[str, Mapping[str, Sequence[float | None]]]) -> bytes:
+def error_over_frames(
+    frames: Sequence[int], groups: Mapping[str, Mapping[str, Sequence[float | None]]]
+) -> bytes:
     """Error of every scored frame, one plot per group of pixels.
 
     Args:
         frames: The scored raw frames n.
-        groups: For each group of pixels the errors [m^2 x 100] by the name of the distance, None where there are none.
+        groups: For each group of pixels the errors [m^2 x 100] by the name of the distance, None
+            where there are none.
     """
     x = np.asarray(frames, dtype=float)
     return _groups(
         {
             group: {
-                name: (x, np.array([np.nan if v is None else v for v in row], float)) for name, row in errors.items()
+                name: (x, np.array([np.nan if v is None else v for v in row], float))
+                for name, row in errors.items()
             }
             for group, errors in groups.items()
         },
@@ -99,9 +129,11 @@ def error_over_frames(frames: Sequence[int], groups: Mapping[str, Mapping[str, S
 
 
 def error_histogram(
-    errors: Mapping[str, Float[np.ndarray, "S H W"]], groups: Mapping[str, Bool[np.ndarray, "S H W"]]
+    errors: Mapping[str, Float[np.ndarray, "S H W"]],
+    groups: Mapping[str, Bool[np.ndarray, "S H W"]],
 ) -> bytes:
-    """How large the errors are, one plot per group of pixels: share of pixels over error [m] on a logarithmic axis.
+    """How large the errors are, one plot per group of pixels: share of pixels over error [m] on a
+    logarithmic axis.
 
     Args:
         errors: Squared errors [m^2] by the name of the distance, NaN where unknown.
@@ -113,13 +145,20 @@ def error_histogram(
     drawn: dict[str, dict[str, tuple[np.ndarray, np.ndarray]]] = {group: {} for group in groups}
     for name, error in errors.items():
         with np.errstate(divide="ignore"):
-            place = np.log(error) * (0.5 / np.log(edges[1] / edges[0])) - np.log(FLOOR_M) / np.log(edges[1] / edges[0])
+            place = np.log(error) * (0.5 / np.log(edges[1] / edges[0])) - np.log(FLOOR_M) / np.log(
+                edges[1] / edges[0]
+            )
         known = ~np.isnan(place)
         bins = np.where(known, np.clip(place, 0, BINS - 1), 0).astype(np.uint8)
         for group, mask in groups.items():
             counts = np.bincount(bins[mask & known], minlength=BINS)
-            drawn[group][name] = stairs, np.concatenate([[0.0], np.repeat(counts / max(counts.sum(), 1), 2), [0.0]])
-    return _groups(drawn, x="absolute error [m]", y="share of these pixels", log_x=True, log_y=False)
+            drawn[group][name] = (
+                stairs,
+                np.concatenate([[0.0], np.repeat(counts / max(counts.sum(), 1), 2), [0.0]]),
+            )
+    return _groups(
+        drawn, x="absolute error [m]", y="share of these pixels", log_x=True, log_y=False
+    )
 
 
 def _groups(
@@ -149,7 +188,9 @@ def _groups(
     return svg(plots, columns=len(plots), height=209)
 
 
-def _curve(log: Sequence[Mapping[str, float]], name: str, colour: str, label: str = "", dashes: str = "") -> Curve:
+def _curve(
+    log: Sequence[Mapping[str, float]], name: str, colour: str, label: str = "", dashes: str = ""
+) -> Curve:
     """A number of a log over optimised images."""
     steps = [(step["images"], step[name]) for step in log if step.get(name) is not None]
     points = np.array(steps, dtype=float).reshape(-1, 2)

@@ -65,10 +65,19 @@ def novel_views(run: Run, sequence: Sequence, count: int = STRIP_VIEWS) -> Novel
     distances, colours = [], []
     for m in chosen:
         rendering = run.render(time, run.camera.at(sequence.novel_from_world[m]))
-        opacity, distance = (finite(image, f"novel view {m}", run) for image in (rendering.opacity, rendering.distance))
-        distances.append(np.where(opacity >= NORMALISED_MIN, distance / np.maximum(opacity, NORMALISED_MIN), np.nan))
+        opacity, distance = (
+            finite(image, f"novel view {m}", run)
+            for image in (rendering.opacity, rendering.distance)
+        )
+        distances.append(
+            np.where(
+                opacity >= NORMALISED_MIN, distance / np.maximum(opacity, NORMALISED_MIN), np.nan
+            )
+        )
         if rendering.colour is not None:
-            colours.append(finite(rendering.colour, f"colour of novel view {m}", run).transpose(1, 2, 0))
+            colours.append(
+                finite(rendering.colour, f"colour of novel view {m}", run).transpose(1, 2, 0)
+            )
     colour = np.stack(colours) if colours else None
     return Novel(poses=chosen, time=time, distance=np.stack(distances), colour=colour)
 
@@ -76,7 +85,8 @@ def novel_views(run: Run, sequence: Sequence, count: int = STRIP_VIEWS) -> Novel
 def colour_views(run: Run, sequence: Sequence, frames: list[int]) -> Colour | None:
     """Colour images of the raw frames that have one, rendered from the colour camera.
 
-    None if the sequence has no calibrated colour camera, none of the frames has an image, or the run has no colour.
+    None if the sequence has no calibrated colour camera, none of the frames has an image, or the
+    run has no colour.
 
     Raises:
         DivergedError: If a rendering is not finite.
@@ -97,12 +107,21 @@ def colour_views(run: Run, sequence: Sequence, frames: list[int]) -> Colour | No
 
 def novel_strip(novel: Novel, scale: pictures.Scale) -> str:
     """Distance, and colour if there is any, of the novel views as HTML."""
-    rows = {"distance / opacity": [pictures.colour_mapped(_thinned(image), scale) for image in novel.distance]}
+    rows = {
+        "distance / opacity": [
+            pictures.colour_mapped(_thinned(image), scale) for image in novel.distance
+        ]
+    }
     if novel.colour is not None:
         white = float(np.percentile(novel.colour, 99.5))
         rows["colour"] = [_shown(image, white) for image in novel.colour]
     first, *others = (
-        page.row([page.plain_picture(rgb, title, f"pose {m}") for rgb, m in zip(images, novel.poses, strict=True)])
+        page.row(
+            [
+                page.plain_picture(rgb, title, f"pose {m}")
+                for rgb, m in zip(images, novel.poses, strict=True)
+            ]
+        )
         for title, images in rows.items()
     )
     return first + f'<div class="wide">{page.colour_bar(scale)}</div>' + "".join(others)
@@ -113,8 +132,16 @@ def colour_strip(colour: Colour) -> str:
     chosen = sorted({round(x) for x in np.linspace(0, len(colour.frames) - 1, STRIP_VIEWS)})
     white = float(np.percentile(colour.measured, 99.5))
     return "".join(
-        page.row([page.plain_picture(_shown(images[c], white), title, f"frame {colour.frames[c]}") for c in chosen])
-        for title, images in (("measured colour", colour.measured), ("rendered colour", colour.rendered))
+        page.row(
+            [
+                page.plain_picture(_shown(images[c], white), title, f"frame {colour.frames[c]}")
+                for c in chosen
+            ]
+        )
+        for title, images in (
+            ("measured colour", colour.measured),
+            ("rendered colour", colour.rendered),
+        )
     )
 
 

@@ -1,7 +1,7 @@
 """Errors of distances and quads, and the scored raw frames (method, section 8).
 
-All errors are mean squared errors [m^2], times 100. Methods differ mostly on ``moving``, the few per cent of pixels
-that change within a quartet.
+All errors are mean squared errors [m^2], times 100. Methods differ mostly on ``moving``, the few
+per cent of pixels that change within a quartet.
 """
 
 from __future__ import annotations
@@ -29,9 +29,10 @@ def scored_frames(sequence: Sequence, protocol: str = "all") -> list[int]:
 
     Args:
         sequence: What was measured.
-        protocol: ``all``: every raw frame of a complete quartet; of a phasor, which has one time, only the first.
-            ``ftorf13``: the first frame of every complete quartet but the first and the last, as in the published
-            tables (13 of 60 frames).
+        protocol: ``all``: every raw frame of a complete quartet; of a phasor, which has one time,
+            only the first.
+            ``ftorf13``: the first frame of every complete quartet but the first and the last, as in
+            the published tables (13 of 60 frames).
 
     Raises:
         UsageError: If the protocol is unknown, or leaves nothing.
@@ -49,7 +50,8 @@ def scored_frames(sequence: Sequence, protocol: str = "all") -> list[int]:
         raise InputError(
             "no complete quartet, nothing to score",
             where=sequence.path or "sequence",
-            why=f"a closed form needs all raw frames of a cycle in a row; none among {sequence.frames} raw frames",
+            why=f"a closed form needs all raw frames of a cycle in a row; none among "
+            f"{sequence.frames} raw frames",
             fix="check the sequence with `gftorf check`, or record longer",
         )
     if protocol == "all":
@@ -82,13 +84,19 @@ def pooled(error: Float[np.ndarray, "S H W"], mask: Bool[np.ndarray, "S H W"]) -
     return float(chosen.mean(dtype=np.float64)) if chosen.size else None
 
 
-def mean_over_frames(error: Float[np.ndarray, "S H W"], mask: Bool[np.ndarray, "S H W"]) -> float | None:
-    """Mean over frames of the mean over the known pixels of each frame, as published; None if there is none."""
+def mean_over_frames(
+    error: Float[np.ndarray, "S H W"], mask: Bool[np.ndarray, "S H W"]
+) -> float | None:
+    """Mean over frames of the mean over the known pixels of each frame, as published;
+    None if there is none.
+    """
     per_frame = [value for value in per_frame_mean(error, mask) if value is not None]
     return float(np.mean(per_frame)) if per_frame else None
 
 
-def per_frame_mean(error: Float[np.ndarray, "S H W"], mask: Bool[np.ndarray, "S H W"]) -> list[float | None]:
+def per_frame_mean(
+    error: Float[np.ndarray, "S H W"], mask: Bool[np.ndarray, "S H W"]
+) -> list[float | None]:
     """Mean over the known pixels of each frame in the mask; None for a frame without any."""
     return [pooled(error[s : s + 1], mask[s : s + 1]) for s in range(len(error))]
 
@@ -98,7 +106,9 @@ def distance_errors(
     mask: Bool[np.ndarray, "S H W"],
     reduce: Callable[[np.ndarray, np.ndarray], float | None] = pooled,
 ) -> dict[str, float | None]:
-    """The keys ``<name>_mse_x100`` [m^2 x 100] of every kind of distance; None where there is no pixel."""
+    """The keys ``<name>_mse_x100`` [m^2 x 100] of every kind of distance;
+    None where there is no pixel.
+    """
     table: dict[str, float | None] = {}
     for name in DISTANCES:
         value = reduce(errors[name], mask)
@@ -112,21 +122,31 @@ def share(mask: Bool[np.ndarray, "S H W"], *others: Bool[np.ndarray, "S H W"]) -
     return int(mask.sum()) / total if total else None
 
 
-def distance_from_quads(quads: torch.Tensor, sensor: Sensor, *further: torch.Tensor) -> torch.Tensor:
+def distance_from_quads(
+    quads: torch.Tensor, sensor: Sensor, *further: torch.Tensor
+) -> torch.Tensor:
     """d_ToF: the distance [m] that a camera decodes from quads [Q, H, W] of one instant.
 
     In [0, c/2f), or, with ``further`` quads for each of ``sensor.further_hz``, in [0, c / 2 f_0).
     """
-    return distance_from_phasors([phasor_from_quads(one, sensor.shifts) for one in (quads, *further)], sensor)
+    return distance_from_phasors(
+        [phasor_from_quads(one, sensor.shifts) for one in (quads, *further)], sensor
+    )
 
 
-def normalised(distance: Float[np.ndarray, "*n"], opacity: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+def normalised(
+    distance: Float[np.ndarray, "*n"], opacity: Float[np.ndarray, "*n"]
+) -> Float[np.ndarray, "*n"]:
     """Mean distance divided by opacity [m]; 0 where nothing was hit."""
     return np.divide(distance, opacity, out=np.zeros_like(distance), where=opacity > 0)
 
 
-def psnr_db(rendered: Float[np.ndarray, "*n"], measured: Float[np.ndarray, "*n"], peak: float) -> float | None:
-    """10 log10(peak^2 / MSE) [dB], the MSE pooled over all elements; None where it is not a number."""
+def psnr_db(
+    rendered: Float[np.ndarray, "*n"], measured: Float[np.ndarray, "*n"], peak: float
+) -> float | None:
+    """10 log10(peak^2 / MSE) [dB], the MSE pooled over all elements;
+    None where it is not a number.
+    """
     mse = float(np.square(rendered - measured, dtype=np.float64).mean())
     return 10.0 * math.log10(peak**2 / mse) if mse > 0 and peak > 0 else None
 
@@ -135,9 +155,10 @@ def along_run(rows: list[dict[str, float]]) -> dict[str, float | int | None] | N
     """Summary of the rows of ``diagnostics.jsonl``; None if there are none.
 
     Returns:
-        rows: their number. d_mse_x100_least, images_at_least: the least error of d [m^2 x 100] and its number of
-        images; None without truth. criterion_m_least, images_at_criterion, d_mse_x100_at_criterion: the least
-        |d - d_ToF| on static pixels [m], which needs no truth, its number of images, and the error of d there.
+        rows: their number. d_mse_x100_least, images_at_least: the least error of d [m^2 x 100] and
+        its number of images; None without truth. criterion_m_least, images_at_criterion,
+        d_mse_x100_at_criterion: the least |d - d_ToF| on static pixels [m], which needs no truth,
+            its number of images, and the error of d there.
     """
     if not rows:
         return None

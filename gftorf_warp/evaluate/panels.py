@@ -26,7 +26,8 @@ CLOSE_UP_MARGIN = 0.25  # around the moving pixels, as a fraction of their exten
 CLOSE_UP_SHARE_MAX = 0.6  # a larger close-up would repeat the whole picture
 PHASOR_TEXT = "The camera delivered real and imaginary part, taken as simultaneous."
 QUARTET_TEXT = (
-    "Each raw frame has its own time, during which objects move. The closed form takes the frames as simultaneous, "
+    "Each raw frame has its own time, during which objects move. The closed form takes the "
+    "frames as simultaneous, "
     "hence the false distances along moving outlines."
 )
 TITLES = {"closed_form": "closed form", "d": "ours, d", "d_tof": "ours, d_ToF"}
@@ -66,8 +67,14 @@ class Findings:
 
     @functools.cached_property
     def distance_scale(self) -> pictures.Scale:
-        """One scale for every distance in the report: the truth's, else that of the closed form and of ours."""
-        known = [self.views.closed_form, self.views.d] if self.judgement is None else [self.judgement.truth]
+        """One scale for every distance in the report: the truth's,
+        else that of the closed form and of ours.
+        """
+        known = (
+            [self.views.closed_form, self.views.d]
+            if self.judgement is None
+            else [self.judgement.truth]
+        )
         return pictures.distance_scale(known)
 
 
@@ -81,7 +88,11 @@ def telling_row(found: Findings) -> int:
 
     def telling(s: int) -> tuple[float, float]:
         judged = found.judgement
-        changed = _change(found.sequence, found.views.frames[s]) if judged is None else float(judged.moving[s].sum())
+        changed = (
+            _change(found.sequence, found.views.frames[s])
+            if judged is None
+            else float(judged.moving[s].sum())
+        )
         return changed, -abs(s - count / 2)  # of equals, the one nearest to the middle
 
     return max(middle, key=telling)
@@ -106,15 +117,23 @@ def measured_quartet(found: Findings, s: int) -> str:
                 scale,
                 f"raw frame {n}",
                 f"shift {np.degrees(sequence.shifts[n]):.0f}°, {1e3 * sequence.times[n]:.1f} ms"
-                + (f", {sequence.frame_frequencies[n] / 1e6:.4g} MHz" if len(sequence.frequencies) > 1 else ""),
+                + (
+                    f", {sequence.frame_frequencies[n] / 1e6:.4g} MHz"
+                    if len(sequence.frequencies) > 1
+                    else ""
+                ),
             )
             for n in raw
         ]
     phase, amplitude = np.arctan2(im, re) % (2.0 * np.pi), np.hypot(re, im)
     decoded = [
         page.picture(phase, pictures.phase_scale(), "measured phase", "mod 2π"),
-        page.picture(amplitude, pictures.amplitude_scale([amplitude]), "measured amplitude", "of the phasor"),
-        page.picture(found.views.closed_form[s], found.distance_scale, "closed form", "phase as distance"),
+        page.picture(
+            amplitude, pictures.amplitude_scale([amplitude]), "measured amplitude", "of the phasor"
+        ),
+        page.picture(
+            found.views.closed_form[s], found.distance_scale, "closed form", "phase as distance"
+        ),
     ]
     text = f'<p class="soft">{PHASOR_TEXT if sequence.from_phasors else QUARTET_TEXT}</p>'
     figures = [*measured, *decoded, *_by_frequency(found, s), text]
@@ -128,21 +147,32 @@ def _by_frequency(found: Findings, s: int) -> list[str]:
         return []
     pictures_of = []
     for f, image in zip(found.sequence.frequencies, views.single[s], strict=True):
-        scale = pictures.Scale(low=0.0, high=SPEED_OF_LIGHT / (2.0 * f), colours="viridis", unit="m")
-        pictures_of.append(page.picture(image, scale, f"{f / 1e6:.4g} MHz alone", f"wraps at {scale.high:.3g} m"))
+        scale = pictures.Scale(
+            low=0.0, high=SPEED_OF_LIGHT / (2.0 * f), colours="viridis", unit="m"
+        )
+        pictures_of.append(
+            page.picture(image, scale, f"{f / 1e6:.4g} MHz alone", f"wraps at {scale.high:.3g} m")
+        )
     share = float((views.confidence[s] < CONFIDENT).mean())
     note = f"{100.0 * share:.2g} % ambiguous"
-    return [*pictures_of, page.picture(views.confidence[s], _share_scale(1.0), "confidence of the turn", note)]
+    return [
+        *pictures_of,
+        page.picture(views.confidence[s], _share_scale(1.0), "confidence of the turn", note),
+    ]
 
 
 def distances(found: Findings, s: int, window: Window = WHOLE) -> str:
     """Closed form, ours and truth, on one scale."""
     scale = found.distance_scale
-    return page.row([page.picture(image[window], scale, title) for title, image in _distances(found, s).items()])
+    return page.row(
+        [page.picture(image[window], scale, title) for title, image in _distances(found, s).items()]
+    )
 
 
 def error_maps(judged: Judgement, s: int, window: Window = WHOLE) -> str:
-    """Absolute errors on one scale, in the order of :func:`distances`; under the truth, moving pixels."""
+    """Absolute errors on one scale, in the order of :func:`distances`; under the truth,
+    moving pixels.
+    """
     scale = pictures.error_scale([_scale_errors(judged, s)])
     figures = [
         page.picture(np.sqrt(judged.errors[name][s][window]), scale, f"error of {title}")
@@ -171,8 +201,15 @@ def quad_residual(found: Findings, s: int) -> str:
     figures = [
         page.picture(measured, scale, "measured quad", f"raw frame {found.views.frames[s]}"),
         page.picture(rendered, scale, "rendered quad", "same time and shift"),
-        page.picture(residual, pictures.signed_scale([residual]), "measured minus rendered", "its own scale"),
-        page.picture(left, _share_scale(max(0.01, float(left.max()))), "transmittance", "1 \N{MINUS SIGN} opacity"),
+        page.picture(
+            residual, pictures.signed_scale([residual]), "measured minus rendered", "its own scale"
+        ),
+        page.picture(
+            left,
+            _share_scale(max(0.01, float(left.max()))),
+            "transmittance",
+            "1 \N{MINUS SIGN} opacity",
+        ),
     ]
     return page.row(figures)
 
@@ -186,7 +223,9 @@ def strip_over_time(found: Findings) -> str:
     for title in (name for name in _distances(found, 0) if name != TITLES["d_tof"]):
         figures = [
             page.plain_picture(
-                pictures.colour_mapped(pictures.thinned(_distances(found, s)[title], STRIP_SIZE_MAX), scale),
+                pictures.colour_mapped(
+                    pictures.thinned(_distances(found, s)[title], STRIP_SIZE_MAX), scale
+                ),
                 title,
                 f"frame {found.views.frames[s]}",
             )
@@ -202,7 +241,11 @@ def animation(found: Findings) -> str:
     starts = starts[:: -(-len(starts) // ANIMATION_FRAMES_MAX)]
     if len(starts) < 2:
         return ""
-    views, quad, metres = found.views, pictures.signed_scale([found.views.quad_measured]), found.distance_scale
+    views, quad, metres = (
+        found.views,
+        pictures.signed_scale([found.views.quad_measured]),
+        found.distance_scale,
+    )
 
     def frame(s: int) -> np.ndarray:
         panels = [
@@ -212,7 +255,10 @@ def animation(found: Findings) -> str:
             (views.d, metres),
         ]
         return pictures.side_by_side(
-            [pictures.colour_mapped(pictures.thinned(image[s], STRIP_SIZE_MAX), scale) for image, scale in panels]
+            [
+                pictures.colour_mapped(pictures.thinned(image[s], STRIP_SIZE_MAX), scale)
+                for image, scale in panels
+            ]
         )
 
     data = pictures.animated_webp([frame(s) for s in starts], ANIMATION_PERIOD_S)
@@ -222,19 +268,26 @@ def animation(found: Findings) -> str:
     return (
         f'<div class="row" style="--columns: 4">{captions}</div>'
         f'<img class="picture" src="{source}" alt="animation: {", ".join(titles)}">'
-        f'<div class="row" style="--columns: 2">{page.colour_bar(quad)}{page.colour_bar(metres)}</div>'
+        f'<div class="row" style="--columns: '
+        f'2">{page.colour_bar(quad)}{page.colour_bar(metres)}</div>'
     )
 
 
 def _distances(found: Findings, s: int) -> dict[str, np.ndarray]:
     """Images [m] by title: closed form, ours, and truth if known."""
     views, judged = found.views, found.judgement
-    images = {TITLES["closed_form"]: views.closed_form[s], TITLES["d"]: views.d[s], TITLES["d_tof"]: views.d_tof[s]}
+    images = {
+        TITLES["closed_form"]: views.closed_form[s],
+        TITLES["d"]: views.d[s],
+        TITLES["d_tof"]: views.d_tof[s],
+    }
     return images if judged is None else images | {"truth": judged.truth[s]}
 
 
 def _scale_errors(judged: Judgement, s: int) -> np.ndarray:
-    """Absolute errors [m] of the closed form, on moving pixels if there are any, which define the scale."""
+    """Absolute errors [m] of the closed form, on moving pixels if there are any,
+    which define the scale.
+    """
     error = np.sqrt(judged.errors["closed_form"][s])
     return error[judged.moving[s]] if judged.moving[s].any() else error
 
@@ -244,9 +297,15 @@ def _share_scale(high: float) -> pictures.Scale:
 
 
 def _change(sequence: Sequence, n: int) -> float:
-    """Largest mean change [quad units] to the quads of the same shift one quartet earlier and later."""
+    """Largest mean change [quad units] to the quads of the same shift one quartet earlier and
+    later.
+    """
     near = [m for m in (n - sequence.cycle, n + sequence.cycle) if 0 <= m < sequence.frames]
-    changes = [float(np.abs(sequence.quads[m] - sequence.quads[n]).mean()) for m in near if sequence.measured[m]]
+    changes = [
+        float(np.abs(sequence.quads[m] - sequence.quads[n]).mean())
+        for m in near
+        if sequence.measured[m]
+    ]
     return max(changes, default=0.0)
 
 

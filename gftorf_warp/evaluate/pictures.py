@@ -88,12 +88,16 @@ def palette(scale: Scale) -> UInt8[np.ndarray, "C 3"]:
     return _palette(scale.colours)
 
 
-def side_by_side(pictures: list[UInt8[np.ndarray, "H w 3"]], gap: int = 2) -> UInt8[np.ndarray, "H W 3"]:
+def side_by_side(
+    pictures: list[UInt8[np.ndarray, "H w 3"]], gap: int = 2
+) -> UInt8[np.ndarray, "H W 3"]:
     """Pictures of one height in a row, ``gap`` white pixels between them."""
     return _row(pictures, gap, WHITE)
 
 
-def ticks_side_by_side(images: list[UInt8[np.ndarray, "H w"]], gap: int = 2) -> UInt8[np.ndarray, "H W"]:
+def ticks_side_by_side(
+    images: list[UInt8[np.ndarray, "H w"]], gap: int = 2
+) -> UInt8[np.ndarray, "H W"]:
     """:func:`side_by_side` of indices by :func:`ticks` into one palette."""
     return _row(images, gap, GAP)
 
@@ -105,7 +109,9 @@ def _row(pictures: list[np.ndarray], gap: int, white: int) -> np.ndarray:
 
 
 def thinned(image: np.ndarray, size_max: int) -> np.ndarray:
-    """Every k-th row and column, with the smallest k for sides of at most ``size_max``; no interpolation."""
+    """Every k-th row and column, with the smallest k for sides of at most ``size_max``;
+    no interpolation.
+    """
     step = -(-max(image.shape[:2]) // size_max)
     return image[::step, ::step]
 
@@ -114,14 +120,20 @@ def webp(rgb: UInt8[np.ndarray, "H W 3"]) -> bytes:
     """A lossless WebP file."""
     import cv2
 
-    ok, data = cv2.imencode(".webp", np.ascontiguousarray(rgb[..., ::-1]), [cv2.IMWRITE_WEBP_QUALITY, WEBP_LOSSLESS])
+    ok, data = cv2.imencode(
+        ".webp", np.ascontiguousarray(rgb[..., ::-1]), [cv2.IMWRITE_WEBP_QUALITY, WEBP_LOSSLESS]
+    )
     if not ok:
         raise ValueError(f"OpenCV could not encode a picture of shape {rgb.shape} as WebP")
     return data.tobytes()
 
 
-def animated_webp(pictures: list[UInt8[np.ndarray, "H W 3"]], period_s: float, quality: int = 80) -> bytes:
-    """An endless WebP animation that shows each picture for ``period_s`` [s]; ``quality`` as in JPEG, 1..100."""
+def animated_webp(
+    pictures: list[UInt8[np.ndarray, "H W 3"]], period_s: float, quality: int = 80
+) -> bytes:
+    """An endless WebP animation that shows each picture for ``period_s`` [s];
+    ``quality`` as in JPEG, 1..100.
+    """
     import cv2
 
     animation = cv2.Animation()
@@ -149,7 +161,10 @@ def _colours(name: str) -> UInt8[np.ndarray, "T 3"]:
 
     if name == "RdBu_r":
         at = np.arange(TICKS) * (len(BLUE_TO_RED) - 1) / (TICKS - 1)
-        channels = [np.interp(at, range(len(BLUE_TO_RED)), channel) for channel in zip(*BLUE_TO_RED, strict=True)]
+        channels = [
+            np.interp(at, range(len(BLUE_TO_RED)), channel)
+            for channel in zip(*BLUE_TO_RED, strict=True)
+        ]
         return np.round(np.stack(channels, axis=-1)).astype(np.uint8)
     nearest = np.minimum(np.arange(TICKS) * 256 // (TICKS - 1), 255).astype(np.uint8)[:, None]
     if name == "gray":

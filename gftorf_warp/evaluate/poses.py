@@ -32,8 +32,8 @@ def read(poses: str | Path, sequence: Sequence) -> Float[np.ndarray, "M 4 4"]:
     """Poses to render from, world to camera [m].
 
     Args:
-        poses: A .npy file of shape [M, 4, 4], or [M, 3, 4] without the last row 0 0 0 1; or ``novel``, the novel
-            views of ``sequence``.
+        poses: A .npy file of shape [M, 4, 4], or [M, 3, 4] without the last row 0 0 0 1; or
+            ``novel``, the novel views of ``sequence``.
         sequence: What was measured.
 
     Raises:
@@ -67,7 +67,8 @@ def read(poses: str | Path, sequence: Sequence) -> Float[np.ndarray, "M 4 4"]:
         raise InputError(
             f"poses: {int((~fine).sum())} of {len(fine)} are no rigid motions",
             where=path,
-            why=f"expected rotations of determinant +1 and a last row 0 0 0 1, found at index {m} {stored[m].tolist()}",
+            why=f"expected rotations of determinant +1 and a last row 0 0 0 1, found at index "
+            f"{m} {stored[m].tolist()}",
             fix="store camera_from_world with axes x right, y down, z forward, in metres",
         )
     return stored

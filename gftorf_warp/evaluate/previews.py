@@ -33,7 +33,9 @@ def preview(name: str, images: Channels, scale: pictures.Scale) -> bytes:
     if name == "distance":
         return indexed_png_bytes(pictures.ticks(images["distance"], scale), pictures.palette(scale))
     if name == "quads":
-        row = pictures.ticks_side_by_side([pictures.ticks(image, scale) for image in images.values()])
+        row = pictures.ticks_side_by_side(
+            [pictures.ticks(image, scale) for image in images.values()]
+        )
         return indexed_png_bytes(row, pictures.palette(scale))
     if name == "phasor":
         phase = np.arctan2(images["im"], images["re"]) % (2.0 * np.pi)
@@ -50,8 +52,12 @@ def paths(out: Path, name: str, index: int) -> tuple[Path, Path]:
     return out / name / f"{index:06d}.exr", out / name / f"{index:06d}.png"
 
 
-def write_images(out: Path, scales: Mapping[str, pictures.Scale], index: int, images: Mapping[str, Channels]) -> None:
-    """Write one EXR and one PNG of each kind at the index-th time, atomically, inside :func:`many_files`."""
+def write_images(
+    out: Path, scales: Mapping[str, pictures.Scale], index: int, images: Mapping[str, Channels]
+) -> None:
+    """Write one EXR and one PNG of each kind at the index-th time, atomically,
+    inside :func:`many_files`.
+    """
     for name, channels in images.items():
         exr, png = paths(out, name, index)
         write_exr(exr, channels, one_of=True)

@@ -1,8 +1,8 @@
 """Pictures written by other processes, which receive images through shared memory.
 
-OpenEXR holds the GIL while it writes, so threads use no more than two CPUs. The processes are started, not forked, and
-import neither torch nor Warp. The shared memory is anonymous and a process ends with its connection, so nothing is left
-when this process is killed.
+OpenEXR holds the GIL while it writes, so threads use no more than two CPUs. The processes are
+started, not forked, and import neither torch nor Warp. The shared memory is anonymous and a process
+ends with its connection, so nothing is left when this process is killed.
 """
 
 from __future__ import annotations
@@ -32,7 +32,8 @@ BLOCK_BYTES = 1 << 23  # of a message, at most
 HELD = 2  # messages of each process: one being written and the next
 ENVIRONMENT = {
     "OMP_NUM_THREADS": "1",  # else NumPy starts a thread for each CPU
-    "MALLOC_MMAP_THRESHOLD_": str(1 << 25),  # else glibc returns the memory of each image to the system,
+    # else glibc returns the memory of each image to the system,
+    "MALLOC_MMAP_THRESHOLD_": str(1 << 25),
     "MALLOC_TRIM_THRESHOLD_": str(1 << 28),  # and new pages take a third of the time
 }
 NOTHING: Float[np.ndarray, "M B C H W"] = np.empty((0, 0, 0, 0, 0), np.float32)
@@ -48,7 +49,9 @@ def useful(total: int) -> int:
 
 
 @contextmanager
-def writing(out: Path, scales: Mapping[str, Scale], count: int, done: Callable[[int], None]) -> Iterator[Writing]:
+def writing(
+    out: Path, scales: Mapping[str, Scale], count: int, done: Callable[[int], None]
+) -> Iterator[Writing]:
     """Processes that write images; all are written at the end of the block, unless it raises.
 
     After an exception each process completes its current picture and drops the rest.
@@ -79,9 +82,11 @@ class Writing:
         self._out, self._scales, self._done = out, scales, done
         self._file = os.memfd_create("gftorf-pictures")
         self._processes: dict[Connection, subprocess.Popen] = {}
-        self._busy: dict[Connection, dict[int, int]] = {}  # number of images of each message in flight
+        # number of images of each message in flight
+        self._busy: dict[Connection, dict[int, int]] = {}
         self._images = NOTHING
-        self._first, self._filled = 0, 0  # index of the first image and number of images of the current message
+        # index of the first image and number of images of the current message
+        self._first, self._filled = 0, 0
         self._free: list[int] = []  # free messages; the last one is the current one
 
     def start(self, count: int) -> None:
@@ -93,9 +98,14 @@ class Writing:
             with theirs:
                 files = theirs.fileno(), self._file
                 command = [sys.executable, "-c", code, *map(str, files)]
-                # own process groups: Ctrl-C reaches this process only, which lets them complete their picture
+                # own process groups: Ctrl-C reaches this process only, which lets them complete
+                # their picture
                 process = subprocess.Popen(
-                    command, env=environment, pass_fds=files, stdin=subprocess.DEVNULL, process_group=0
+                    command,
+                    env=environment,
+                    pass_fds=files,
+                    stdin=subprocess.DEVNULL,
+                    process_group=0,
                 )
             self._processes[ours], self._busy[ours] = process, {}
 
@@ -174,7 +184,10 @@ class Writing:
         code = self._processes[connection].wait()
         why = f"signal {-code} stopped it" if code < 0 else f"its exit code is {code}"
         return ResourceError(
-            "a process that writes pictures ended", where=self._out, why=why, fix="free memory, then render again"
+            "a process that writes pictures ended",
+            where=self._out,
+            why=why,
+            fix="free memory, then render again",
         )
 
 
@@ -185,7 +198,9 @@ def _mapped(file: int, shape: tuple[int, ...]) -> Float[np.ndarray, "M B C H W"]
 
 
 def work() -> None:
-    """Main function of a process: write the images of each message and acknowledge it, until the connection closes."""
+    """Main function of a process: write the images of each message and acknowledge it,
+    until the connection closes.
+    """
     connection, file = Connection(int(sys.argv[1])), int(sys.argv[2])
     with suppress(EOFError, BrokenPipeError, ConnectionResetError):
         out, scales, names, shape = connection.recv()
@@ -196,7 +211,10 @@ def work() -> None:
                 if os.pread(file, 1, 0) != b"\0":
                     return
                 planes = iter(memory[message, k])
-                images = {name: {channel: next(planes) for channel in channels} for name, channels in names.items()}
+                images = {
+                    name: {channel: next(planes) for channel in channels}
+                    for name, channels in names.items()
+                }
                 try:
                     write_images(out, scales, first + k, images)
                 except Exception as error:

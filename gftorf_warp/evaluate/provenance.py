@@ -9,22 +9,27 @@ from typing import Any
 
 from . import page
 
-OF_GAUSSIANS = {"input", "flow_source", "init", "motion"}  # facts of an optimisation, without meaning for other methods
+# facts of an optimisation, without meaning for other methods
+OF_GAUSSIANS = {"input", "flow_source", "init", "motion"}
 INIT_WORDS = {
     "phase": "phase: Gaussians start on surfaces decoded from the measured quads, not at random",
     "random": "random: Gaussians start at random points in view",
 }
 METHOD_WORDS = {
     "gaussians": "moving Gaussians, fitted to the measurement by gradient descent",
-    "ctof": "the closed form of every quartet, shown as if it were a reconstruction; nothing was fitted",
+    "ctof": "the closed form of every quartet, shown as if it were a reconstruction; nothing was "
+    "fitted",
 }
 INPUT_WORDS = {
     "quads": "quads: every raw frame at its own time and phase shift",
-    "phasor": "phasor: real and imaginary part of every quartet, its raw frames taken as simultaneous",
+    "phasor": "phasor: real and imaginary part of every quartet, its raw frames taken as "
+    "simultaneous",
 }
 MOTION_WORDS = {
-    "network": "network: an MLP of position and time predicts one offset per Gaussian and quartet, linear in between",
-    "nodes": "nodes: Gaussians follow a few moving nodes with one offset per quartet, linear in between; no network",
+    "network": "network: an MLP of position and time predicts one offset per Gaussian and "
+    "quartet, linear in between",
+    "nodes": "nodes: Gaussians follow a few moving nodes with one offset per quartet, linear in "
+    "between; no network",
     "still": "still: nothing moves, a control",
 }
 FLOW_WORDS = {
@@ -55,7 +60,12 @@ def how(config: Mapping[str, Any], data_card: str | None, installed: str) -> str
         installed: Versions of the software of the comparison.
     """
     method, size, scale = method_of(config), config.get("size_optimised"), config.get("quad_scale")
-    words = {"input": INPUT_WORDS, "init": INIT_WORDS, "motion": MOTION_WORDS, "flow_source": FLOW_WORDS}
+    words = {
+        "input": INPUT_WORDS,
+        "init": INIT_WORDS,
+        "motion": MOTION_WORDS,
+        "flow_source": FLOW_WORDS,
+    }
     known = {name: fact(config, name) for name in words}
     worded = {name: words[name].get(str(value), value) for name, value in known.items()}
     threads = "" if config.get("threads") is None else f", {config['threads']} threads"
@@ -68,16 +78,21 @@ def how(config: Mapping[str, Any], data_card: str | None, installed: str) -> str
         "initialisation": worded["init"],
         "motion": worded["motion"],
         "optical flow": worded["flow_source"],
-        "optimised at": size and f"{size[0]}x{size[1]} pixels; scored at the sequence's own resolution",
+        "optimised at": size
+        and f"{size[0]}x{size[1]} pixels; scored at the sequence's own resolution",
         "quad scale": None if scale is None else f"{scale:.6g} ({config.get('quad_scale_source')})",
-        "images, seed": f"{config.get('images')}, {config.get('seed')}" if method == "gaussians" else None,
+        "images, seed": f"{config.get('images')}, {config.get('seed')}"
+        if method == "gaussians"
+        else None,
         "device": config.get("device") and f"{config['device']}{threads}",
         "reconstructed by": f"gftorf-warp {config.get('version')}",
         "compared by": installed,
         "ground truth": data_card,
     }
     rows = "".join(
-        f"<dt>{name}</dt><dd>{page.escape(value)}</dd>" for name, value in facts.items() if value is not None
+        f"<dt>{name}</dt><dd>{page.escape(value)}</dd>"
+        for name, value in facts.items()
+        if value is not None
     )
     command = f"{_command(config)}\ngftorf compare RUN"
     everything = json.dumps(config, indent=2, sort_keys=True, default=str)
@@ -91,7 +106,11 @@ def _command(config: Mapping[str, Any]) -> str:
     """The command that reproduces the run."""
     options = {name: config.get(name) for name in ("preset", "images", "seed", "device")}
     if method_of(config) == "gaussians":
-        options |= {name: fact(config, name) for name in ("ablation", "input") if fact(config, name) is not None}
+        options |= {
+            name: fact(config, name)
+            for name in ("ablation", "input")
+            if fact(config, name) is not None
+        }
     else:
         del options["images"], options["seed"]
     words = list(options.items())

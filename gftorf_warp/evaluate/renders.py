@@ -1,4 +1,6 @@
-"""The options of ``gftorf render``: names of images, the channels of each, and the output folder."""
+"""The options of ``gftorf render``: names of images, the channels of each,
+and the output folder.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,8 @@ from ..scene.sensor import Sensor
 from .previews import Channels
 
 LIST = "renders.json"
-LISTED = ("run", "times_s", "camera_from_world", "channels", "arrays")  # its keys that identify the images
+# its keys that identify the images
+LISTED = ("run", "times_s", "camera_from_world", "channels", "arrays")
 NEEDS = {  # images of a rendering, by option
     "distance": ("distance", "opacity"),
     "quads": ("quads",),
@@ -52,8 +55,9 @@ def checked(what: str | Iterable[str]) -> tuple[str, ...]:
 def named(name: str, images: Mapping[str, Float[np.ndarray, "..."]], sensor: Sensor) -> Channels:
     """Images by channel name, as in an EXR file.
 
-    distance: ``distance`` [m], not divided by ``opacity`` [1]. quads: ``quad_<shift in degrees>`` [file units]. phasor:
-    ``re``, ``im``, ``amplitude`` [file units]. colour: ``R``, ``G``, ``B``, linear [1].
+    distance: ``distance`` [m], not divided by ``opacity`` [1]. quads: ``quad_<shift in degrees>``
+    [file units]. phasor: ``re``, ``im``, ``amplitude`` [file units]. colour: ``R``, ``G``, ``B``,
+    linear [1].
 
     Args:
         name: One of ``WHAT``.
@@ -81,7 +85,8 @@ def prepare_folder(out: Path, listed: Mapping[str, object], *, fresh: bool) -> N
     """Prepare an output folder and write its ``renders.json``.
 
     Args:
-        out: New, empty, or with images of the same run, times, poses and channels, which will be overwritten.
+        out: New, empty, or with images of the same run, times, poses and channels, which will be
+            overwritten.
         listed: Content of ``renders.json``.
         fresh: Whether to move other images to ``out/old-<k>``.
 
@@ -89,8 +94,12 @@ def prepare_folder(out: Path, listed: Mapping[str, object], *, fresh: bool) -> N
         UsageError: If it holds other images and ``fresh`` is not set, or other files.
     """
     if out.exists() and not out.is_dir():
-        raise UsageError("not a folder", where=out, why="--out names a file", fix="choose another --out")
-    held = [path for path in out.iterdir() if not path.name.startswith("old-")] if out.exists() else []
+        raise UsageError(
+            "not a folder", where=out, why="--out names a file", fix="choose another --out"
+        )
+    held = (
+        [path for path in out.iterdir() if not path.name.startswith("old-")] if out.exists() else []
+    )
     if held and not _same(out / LIST, listed):
         ours = (out / LIST).is_file()
         if not (fresh and ours):
@@ -100,7 +109,8 @@ def prepare_folder(out: Path, listed: Mapping[str, object], *, fresh: bool) -> N
                 why="it holds images of another run, or other times or poses"
                 if ours
                 else f"it has no {LIST}: these are no images",
-                fix="choose another --out" + (", or --fresh, which moves its content aside" if ours else ""),
+                fix="choose another --out"
+                + (", or --fresh, which moves its content aside" if ours else ""),
             )
         set_aside(out, held)
     out.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,6 @@
-"""The offline page of a comparison: results in pictures and numbers, how they were made, and how to read them."""
+"""The offline page of a comparison: results in pictures and numbers, how they were made,
+and how to read them.
+"""
 
 from __future__ import annotations
 
@@ -23,32 +25,44 @@ COUNTED = {3: "three", 4: "four", 5: "five", 6: "six", 8: "eight"}
 PIXELS = {"": "all pixels", "moving.": "moving pixels", "static.": "static pixels"}
 TO_READ = f"""
 <dl>
-<dt>distance</dt><dd>Length from the camera to the surface along the ray of a pixel, in metres. It is not the
+<dt>distance</dt><dd>Length from the camera to the surface along the ray of a pixel,
+    in metres. It is not the
 z-depth.</dd>
-<dt>closed form</dt><dd>The distance that a camera computes: raw quads give a phase, the phase a distance; several
-modulation frequencies together determine the number of whole turns. Quads are taken one after the other, so moving
+<dt>closed form</dt><dd>The distance that a camera computes: raw quads give a phase,
+    the phase a distance; several
+modulation frequencies together determine the number of whole turns. Quads are taken one after the
+    other, so moving
 objects get false distances.</dd>
-<dt>d</dt><dd>Mean distance of the reconstructed Gaussians at the time of one raw frame. It is not divided by
+<dt>d</dt><dd>Mean distance of the reconstructed Gaussians at the time of one raw frame. It is not
+    divided by
 opacity: where opacity is below one, the missing part counts as error.</dd>
-<dt>d_ToF</dt><dd>Quads rendered at the time of one raw frame, decoded like the closed form, within the unambiguous
+<dt>d_ToF</dt><dd>Quads rendered at the time of one raw frame, decoded like the closed form,
+    within the unambiguous
 range: c / 2f, or that of all frequencies together.</dd>
-<dt>moving pixels</dt><dd>Pixels whose true distance changes by more than {MOVING_M} m within their quartet: mostly
+<dt>moving pixels</dt><dd>Pixels whose true distance changes by more than {MOVING_M}
+m within their quartet: mostly
 outlines of moving objects, and whole objects that move fast in depth.</dd>
-<dt>errors</dt><dd>Mean squared error in square metres times 100, then its root in centimetres. <em>All pixels</em> is
-the mean over frames of each frame's mean; <em>moving</em> and <em>static</em> pool the pixels of all frames. The closed
+<dt>errors</dt><dd>Mean squared error in square metres times 100,
+    then its root in centimetres. <em>All pixels</em> is
+the mean over frames of each frame's mean;
+<em>moving</em> and <em>static</em> pool the pixels of all frames. The closed
 form of a quartet is compared with the truth of each of its raw frames.</dd>
-<dt>quad PSNR</dt><dd>Rendered against measured quads, at the phase shift of each raw frame. It needs no ground truth
+<dt>quad PSNR</dt><dd>Rendered against measured quads,
+    at the phase shift of each raw frame. It needs no ground truth
 and is bounded by the noise of the measurement.</dd>
 <dt>grey pixels</dt><dd>Unknown truth, not scored.</dd>
 </dl>"""
 
 
 PHASORS_TO_READ = f"""
-<p class="soft">This camera delivered phasors. The four raw frames of a quartet are simultaneous, so each quartet is
-scored once, and moving pixels are those whose true distance changes by more than {MOVING_M} m between consecutive
+<p class="soft">This camera delivered phasors. The four raw frames of a quartet are simultaneous,
+    so each quartet is
+scored once, and moving pixels are those whose true distance changes by more than {MOVING_M}
+m between consecutive
 phasors.</p>"""
 ALONG_TEXT = (
-    "Rendered over black at a few fixed raw frames, at the size of the optimisation, which does not use these numbers. "
+    "Rendered over black at a few fixed raw frames, at the size of the optimisation, which does "
+    "not use these numbers. "
     "Where d and d_ToF differ on static pixels, light is explained by layers instead of surfaces"
 )
 
@@ -90,7 +104,9 @@ def report(
         *_along(metrics, diagnostics),
         _section("Curves", _curves(found, log)),
         _section("How it was made", provenance.how(config, data_card, installed)),
-        _section("How to read it", TO_READ + (PHASORS_TO_READ if found.sequence.from_phasors else "")),
+        _section(
+            "How to read it", TO_READ + (PHASORS_TO_READ if found.sequence.from_phasors else "")
+        ),
     ]
     return page.document(f"{title} - gftorf compare", "".join(sections))
 
@@ -99,7 +115,8 @@ def verdict(metrics: Mapping[str, Any]) -> str:
     """The result in one or two sentences of HTML, with the numbers of metrics.json."""
     if page.look_up(metrics, "d_mse_x100") is None:
         return (
-            "There is no ground truth, so distance errors are unknown. The PSNR of rendered quads is "
+            "There is no ground truth, so distance errors are unknown. The PSNR of rendered "
+            "quads is "
             f'<span class="ours">{page.number(metrics, "quad_psnr_db", "decibel")}</span>.'
         )
     group = "moving." if page.look_up(metrics, "moving.d_mse_x100") is not None else ""
@@ -111,16 +128,21 @@ def verdict(metrics: Mapping[str, Any]) -> str:
         )
     naive, ours = f"{group}closed_form_mse_x100", f"{group}d_mse_x100"
     pixels = (
-        f"On moving pixels ({page.number(metrics, 'moving.share', 'percent')} of all)" if group else "Over all pixels"
+        f"On moving pixels ({page.number(metrics, 'moving.share', 'percent')} of all)"
+        if group
+        else "Over all pixels"
     )
     text = (
-        f'{pixels}, the <span class="naive">closed form is off by {page.number(metrics, naive, "rms_cm")}</span>'
-        f' and <span class="ours">ours by {page.number(metrics, ours, "rms_cm")}</span> (root mean square): '
+        f'{pixels}, the <span class="naive">closed form is off by '
+        f"{page.number(metrics, naive, 'rms_cm')}</span>"
+        f' and <span class="ours">ours by {page.number(metrics, ours, "rms_cm")}</span> (root '
+        f"mean square): "
         f"{_comparison(metrics, naive, ours)}."
     )
     if group and page.look_up(metrics, "static.d_mse_x100") is not None:
         text += (
-            f" On static pixels, it is {page.number(metrics, 'static.closed_form_mse_x100', 'rms_cm')} against"
+            f" On static pixels, it is "
+            f"{page.number(metrics, 'static.closed_form_mse_x100', 'rms_cm')} against"
             f" {page.number(metrics, 'static.d_mse_x100', 'rms_cm')}."
         )
     return text
@@ -129,7 +151,10 @@ def verdict(metrics: Mapping[str, Any]) -> str:
 def _comparison(metrics: Mapping[str, Any], naive: str, ours: str) -> str:
     """Our error relative to that of the closed form, in words."""
     was, now = page.look_up(metrics, naive), page.look_up(metrics, ours)
-    values = f"{page.number(metrics, naive, 'error')} against {page.number(metrics, ours, 'error')} m² &times; 100"
+    values = (
+        f"{page.number(metrics, naive, 'error')} against "
+        f"{page.number(metrics, ours, 'error')} m² &times; 100"
+    )
     if not (was > 0 and now > 0):
         return f"a squared error of {values}"
     if now <= was:
@@ -144,13 +169,18 @@ def _section(title: str, body: str) -> str:
 def _table(metrics: Mapping[str, Any]) -> str:
     if page.look_up(metrics, "d_mse_x100") is None:
         return '<p class="soft">No ground truth: distance errors are not known.</p>'
-    head = "".join(f"<th>{name}<span class='soft'>{_share(metrics, key)}</span></th>" for key, name in PIXELS.items())
+    head = "".join(
+        f"<th>{name}<span class='soft'>{_share(metrics, key)}</span></th>"
+        for key, name in PIXELS.items()
+    )
     rows = []
     for name in DISTANCES:
         title, note = ROWS[name]
         cells = "".join(f"<td>{_cell(metrics, f'{group}{name}_mse_x100')}</td>" for group in PIXELS)
         mark = ' class="ours"' if name == "d" else ""
-        rows.append(f'<tr{mark}><td><b>{title}</b> <span class="soft">{note}</span></td>{cells}</tr>')
+        rows.append(
+            f'<tr{mark}><td><b>{title}</b> <span class="soft">{note}</span></td>{cells}</tr>'
+        )
     return (
         '<p class="soft">Mean squared error of the distance, m² &times; 100, and its root.</p>'
         f"<table><thead><tr><th></th>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
@@ -164,7 +194,10 @@ def _share(metrics: Mapping[str, Any], group: str) -> str:
 def _cell(metrics: Mapping[str, Any], key: str) -> str:
     if page.look_up(metrics, key) is None:
         return page.number(metrics, key, "error")
-    return f'{page.number(metrics, key, "error")} <span class="soft">{page.number(metrics, key, "rms_cm")}</span>'
+    return (
+        f"{page.number(metrics, key, 'error')} <span "
+        f'class="soft">{page.number(metrics, key, "rms_cm")}</span>'
+    )
 
 
 def _facts(metrics: Mapping[str, Any]) -> str:
@@ -190,9 +223,12 @@ def _facts(metrics: Mapping[str, Any]) -> str:
 
 def _distance_text(found: Findings, s: int) -> str:
     known = found.judgement is not None
-    reason, scale = ("most moving pixels", "the truth's") if known else ("the largest change of quads", "one")
+    reason, scale = (
+        ("most moving pixels", "the truth's") if known else ("the largest change of quads", "one")
+    )
     return (
-        f'<p class="caption">Distance along the ray, on {scale} scale, of raw frame {found.views.frames[s]}: the one '
+        f'<p class="caption">Distance along the ray, on {scale} scale, of raw frame '
+        f"{found.views.frames[s]}: the one "
         f"with {reason} in the middle half of the sequence.</p>"
     )
 
@@ -200,13 +236,17 @@ def _distance_text(found: Findings, s: int) -> str:
 def _measured_text(found: Findings, s: int) -> str:
     if found.sequence.from_phasors:
         return (
-            f'<p class="caption">The phasor of raw frame {found.views.frames[s]}. Red is positive, blue negative.</p>'
+            f'<p class="caption">The phasor of raw frame {found.views.frames[s]}. Red is '
+            f"positive, blue negative.</p>"
         )
     count = COUNTED.get(found.sequence.cycle, str(found.sequence.cycle))
     return (
-        f'<p class="caption">The quartet of raw frame {found.views.frames[s]}: {count} raw frames, each with its own '
-        f"{'phase shift' if len(found.sequence.frequencies) == 1 else 'phase shift, frequency'} and its own time. "
-        f"Distances are known modulo {unambiguous_range(found.sequence):.4g} m. Red is positive, blue negative.</p>"
+        f'<p class="caption">The quartet of raw frame {found.views.frames[s]}: {count} raw '
+        f"frames, each with its own "
+        f"{'phase shift' if len(found.sequence.frequencies) == 1 else 'phase shift, frequency'} "
+        f"and its own time. "
+        f"Distances are known modulo {unambiguous_range(found.sequence):.4g} m. Red is positive, "
+        f"blue negative.</p>"
     )
 
 
@@ -217,7 +257,8 @@ def _distance_pictures(found: Findings, s: int) -> str:
     html += (
         "<h3>Absolute error</h3>"
         f"{panels.error_maps(found.judgement, s)}"
-        '<p class="caption">One scale for all three, defined by the errors of the closed form on moving pixels; '
+        '<p class="caption">One scale for all three, defined by the errors of the closed form on '
+        "moving pixels; "
         "larger errors are clamped.</p>"
     )
     close_up = panels.close_up(found, found.judgement, s)
@@ -229,14 +270,17 @@ def _quad_text(found: Findings, s: int) -> str:
     if found.sequence.from_phasors:
         which = "The quad of shift zero, half the real part of the phasor"
     return (
-        f'<p class="caption">{which}, measured and rendered at its time and pose over a black background; the '
+        f'<p class="caption">{which}, measured and rendered at its time and pose over a black '
+        f"background; the "
         "residual should look like noise.</p>"
     )
 
 
 def _time_pictures(found: Findings) -> str:
     moving = panels.animation(found)
-    return panels.strip_over_time(found) + (f"<h3>Quartet by quartet, slowed down</h3>{moving}" if moving else "")
+    return panels.strip_over_time(found) + (
+        f"<h3>Quartet by quartet, slowed down</h3>{moving}" if moving else ""
+    )
 
 
 def _beyond(metrics: Mapping[str, Any], found: Findings) -> list[str]:
@@ -250,7 +294,8 @@ def _beyond(metrics: Mapping[str, Any], found: Findings) -> list[str]:
         sections.append(_section("Colour", text + gallery.colour_strip(found.colour)))
     if found.novel is not None:
         text = (
-            '<p class="caption">The reconstruction in the middle of the sequence, from its novel poses. '
+            '<p class="caption">The reconstruction in the middle of the sequence, from its novel '
+            "poses. "
             "Grey: opacity below one half.</p>"
         )
         strip = gallery.novel_strip(found.novel, found.distance_scale)
@@ -271,14 +316,22 @@ def _along(metrics: Mapping[str, Any], rows: Sequence[Mapping[str, float]]) -> l
             f" {page.number(metrics, 'diagnostics.images_at_criterion', 'count')} images"
         )
         if page.look_up(metrics, "diagnostics.d_mse_x100_at_criterion") is not None:
-            text += f", where the error of d is {page.number(metrics, 'diagnostics.d_mse_x100_at_criterion', 'error')}"
+            text += (
+                f", where the error of d is "
+                f"{page.number(metrics, 'diagnostics.d_mse_x100_at_criterion', 'error')}"
+            )
     text += "."
     if page.look_up(metrics, "diagnostics.d_mse_x100_least") is not None:
         text += (
-            f" The error of d is least, {page.number(metrics, 'diagnostics.d_mse_x100_least', 'error')}, after"
+            f" The error of d is least, "
+            f"{page.number(metrics, 'diagnostics.d_mse_x100_least', 'error')}, after"
             f" {page.number(metrics, 'diagnostics.images_at_least', 'count')} images."
         )
-    return [_section("Along the run", f'<p class="caption">{text}</p>{page.chart(drawing, "Along the run")}')]
+    return [
+        _section(
+            "Along the run", f'<p class="caption">{text}</p>{page.chart(drawing, "Along the run")}'
+        )
+    ]
 
 
 def _curves(found: Findings, log: Sequence[Mapping[str, float]]) -> str:
@@ -290,7 +343,11 @@ def _curves(found: Findings, log: Sequence[Mapping[str, float]]) -> str:
     if judged is not None:
         errors = {name: judged.errors[name] for name in panels.TITLES}
         everywhere = np.ones_like(judged.moving)
-        groups = {"all pixels": everywhere, "moving pixels": judged.moving, "static pixels": judged.static}
+        groups = {
+            "all pixels": everywhere,
+            "moving pixels": judged.moving,
+            "static pixels": judged.static,
+        }
         groups = {name: mask for name, mask in groups.items() if mask.any()}
         per_frame = {
             group: {
@@ -299,7 +356,9 @@ def _curves(found: Findings, log: Sequence[Mapping[str, float]]) -> str:
             }
             for group, mask in groups.items()
         }
-        charts.append(("Error of every raw frame", figures.error_over_frames(found.views.frames, per_frame)))
+        charts.append(
+            ("Error of every raw frame", figures.error_over_frames(found.views.frames, per_frame))
+        )
         title = "Distribution of errors (the first bin holds all below a millimetre)"
         charts.append((title, figures.error_histogram(errors, groups)))
     return "".join(f"<h3>{title}</h3>{page.chart(svg, title)}" for title, svg in charts)

@@ -1,9 +1,10 @@
-"""Rendered images as arrays on disk: one .npy file [S, H, W] float32 per channel, filled during rendering.
+"""Rendered images as arrays on disk: one .npy file [S, H, W] float32 per channel, filled during
+rendering.
 
-Files are written rather than mapped: a full disk then raises an error instead of a signal, and it takes half the time.
-Each file is written by one thread at a time, with many images per system call, because every call releases and
-reacquires the GIL, for which rendering waits. Writes bypass the page cache (``O_DIRECT``) where the file system allows
-it; otherwise write-back is started early.
+Files are written rather than mapped: a full disk then raises an error instead of a signal, and it
+takes half the time. Each file is written by one thread at a time, with many images per system call,
+because every call releases and reacquires the GIL, for which rendering waits. Writes bypass the
+page cache (``O_DIRECT``) where the file system allows it; otherwise write-back is started early.
 """
 
 from __future__ import annotations
@@ -117,14 +118,21 @@ def _submit(
 ) -> list[Future]:
     """Submit the writing of a block, each channel on its own."""
     return [
-        threads.submit(_fill, files[path_of(out, name, channel)], first, [images[name][channel] for images in block])
+        threads.submit(
+            _fill,
+            files[path_of(out, name, channel)],
+            first,
+            [images[name][channel] for images in block],
+        )
         for name, channels in block[0].items()
         for channel in channels
     ]
 
 
 def _fill(file: Stored, first: int, images: list[Float[np.ndarray, "H W"]]) -> None:
-    """Write images of a channel and release them before the future completes, so that their memory is reused."""
+    """Write images of a channel and release them before the future completes,
+    so that their memory is reused.
+    """
     try:
         file.write(first, images)
     finally:
@@ -132,7 +140,9 @@ def _fill(file: Stored, first: int, images: list[Float[np.ndarray, "H W"]]) -> N
 
 
 class Stored:
-    """A .npy file [S, H, W] that is filled in any order and gets its name at the end of a ``with``."""
+    """A .npy file [S, H, W] that is filled in any order and gets its name at the end of a
+    ``with``.
+    """
 
     def __init__(self, path: Path, shape: tuple[int, int, int]):
         """Store path and shape; nothing is written yet."""
@@ -182,7 +192,9 @@ class Stored:
 def _header(shape: tuple[int, int, int]) -> bytes:
     """Header of a .npy file of float32, padded with spaces."""
     file = io.BytesIO()
-    np.lib.format.write_array_header_1_0(file, {"descr": "<f4", "fortran_order": False, "shape": shape})
+    np.lib.format.write_array_header_1_0(
+        file, {"descr": "<f4", "fortran_order": False, "shape": shape}
+    )
     magic = np.lib.format.magic(1, 0)
     text = file.getvalue()[len(magic) + 2 : -1].ljust(HEADER - len(magic) - 3) + b"\n"
     return magic + len(text).to_bytes(2, "little") + text
@@ -212,6 +224,8 @@ def _set_direct(file: FileIO, wanted: bool) -> bool:
 
 
 def _start_write_back(file: FileIO, start: int, length: int) -> None:
-    """Start write-back of a part of a file, which Linux does for pages that are declared as not needed."""
+    """Start write-back of a part of a file, which Linux does for pages that are declared as not
+    needed.
+    """
     if hasattr(os, "posix_fadvise"):
         os.posix_fadvise(file.fileno(), start, length, os.POSIX_FADV_DONTNEED)

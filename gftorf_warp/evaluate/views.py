@@ -1,4 +1,6 @@
-"""Images of a finished run as arrays: those that are scored, and those that ``gftorf render`` writes."""
+"""Images of a finished run as arrays: those that are scored,
+and those that ``gftorf render`` writes.
+"""
 
 from __future__ import annotations
 
@@ -42,7 +44,8 @@ class Views:
     opacity: Float[np.ndarray, "S H W"]
     """Rendered opacity [1]."""
     d_tof: Float[np.ndarray, "S H W"]
-    """Distance decoded from quads rendered at the time of the frame, at every frequency, in [0, range) [m]."""
+    """Distance decoded from quads rendered at the time of the frame, at every frequency, in [0,
+    range) [m]."""
     closed_form: Float[np.ndarray, "S H W"]
     """Distance decoded from the measured quartet that the frame belongs to, in [0, range) [m]."""
     quad_rendered: Float[np.ndarray, "S H W"]
@@ -52,7 +55,8 @@ class Views:
     single: Float[np.ndarray, "S f H W"] | None = None
     """Distance decoded from each of several frequencies alone [m]; None: there is one."""
     confidence: Float[np.ndarray, "S H W"] | None = None
-    """Agreement of the frequencies on the closed form [1], see data/unwrap.py; None: there is one."""
+    """Agreement of the frequencies on the closed form [1], see data/unwrap.py; None: there is
+    one."""
 
     @property
     def d_normalised(self) -> Float[np.ndarray, "S H W"]:
@@ -62,7 +66,12 @@ class Views:
     @property
     def distances(self) -> dict[str, Float[np.ndarray, "S H W"]]:
         """All distances [m], by their names in metrics.json."""
-        return {"closed_form": self.closed_form, "d": self.d, "d_normalised": self.d_normalised, "d_tof": self.d_tof}
+        return {
+            "closed_form": self.closed_form,
+            "d": self.d,
+            "d_normalised": self.d_normalised,
+            "d_tof": self.d_tof,
+        }
 
 
 def gather(
@@ -83,11 +92,15 @@ def gather(
     Raises:
         DivergedError: If a rendering is not finite.
     """
-    decoded = {i: decode_quartet(sequence, i) for i in sorted({n // sequence.cycle for n in frames})}
+    decoded = {
+        i: decode_quartet(sequence, i) for i in sorted({n // sequence.cycle for n in frames})
+    }
     quartets = [decoded[n // sequence.cycle] for n in frames]
     rows: dict[str, list[np.ndarray]] = {"d": [], "opacity": [], "d_tof": [], "quad_rendered": []}
     first, *further = sequence.frequencies
-    renderers = {first: run.renderer(RENDERED)} | {f: run.renderer(RENDERED, f_mod_hz=f) for f in further}
+    renderers = {first: run.renderer(RENDERED)} | {
+        f: run.renderer(RENDERED, f_mod_hz=f) for f in further
+    }
     for count, n in enumerate(frames, start=1):
         time = float(sequence.times[n])
         light = {f: render(time, camera_at(run, sequence, time)) for f, render in renderers.items()}
@@ -95,7 +108,9 @@ def gather(
         images = {
             "d": rendering.distance,
             "opacity": rendering.opacity,
-            "d_tof": distance_from_quads(rendering.quads, run.sensor, *(light[f].quads for f in further)),
+            "d_tof": distance_from_quads(
+                rendering.quads, run.sensor, *(light[f].quads for f in further)
+            ),
             "quad_rendered": quad_of_shift(measured, run.sensor, float(sequence.shifts[n])),
         }
         for name, image in zip(images, torch.stack([*images.values()]).cpu(), strict=True):
@@ -133,7 +148,8 @@ def nearest_frame(sequence: Sequence, time: float) -> int:
 def quad_of_shift(rendering: Rendering, sensor: Sensor, shift: float) -> torch.Tensor:
     """The quad [H, W] of any phase shift [rad], of a rendering with those of the sensor's.
 
-    Where it was not rendered it follows from the phasor, (re cos shift + im sin shift + dc_offset |amplitude|) / 2.
+    Where it was not rendered it follows from the phasor, (re cos shift + im sin shift + dc_offset
+    |amplitude|) / 2.
     """
     channel = channel_of(sensor.shifts, shift)
     if channel is not None:
@@ -153,7 +169,8 @@ def finite(image: torch.Tensor, name: str, run: Run) -> Float[np.ndarray, "*imag
         raise DivergedError(
             f"{name} is not finite",
             where=run.path,
-            why=f"{int((~np.isfinite(array)).sum())} of {array.size} rendered values are NaN or infinite",
+            why=f"{int((~np.isfinite(array)).sum())} of {array.size} rendered values are NaN or "
+            f"infinite",
             fix="reconstruct again with another --seed or preset",
         )
     return array
@@ -172,25 +189,26 @@ def render_to_folder(
 ) -> Path:
     """Render a run at some times: ``OUT/<what>/<index>.exr`` (float32) and a preview ``.png``.
 
-    ``OUT/renders.json`` lists the times [s], the channels with their units, the scale of the previews, and poses if any
-    were given; otherwise the pose is that of the raw frame nearest to each time. With ``arrays``, files are
-    ``OUT/<what>/<channel>.npy``, float32 [S, H, W] of all S times, with the values of the EXR files.
+    ``OUT/renders.json`` lists the times [s], the channels with their units, the scale of the
+    previews, and poses if any were given; otherwise the pose is that of the raw frame nearest to
+    each time. With ``arrays``, files are ``OUT/<what>/<channel>.npy``, float32 [S, H, W] of all S
+    times, with the values of the EXR files.
 
     Args:
         run: A finished reconstruction.
         out: Folder, made if absent; one that holds these images is written again.
         what: Names out of distance, quads, phasor, colour.
-        times: Seconds since raw frame 0; None: the times of all raw frames, truncated quartets included; with poses,
-            the middle of the sequence.
-        poses: A .npy file of world-to-camera matrices [M, 4, 4] or [M, 3, 4], or ``novel``, those of the sequence.
-            Image k is rendered from pose k at time k; the shorter list repeats.
+        times: Seconds since raw frame 0; None: the times of all raw frames, truncated quartets
+            included; with poses, the middle of the sequence.
+        poses: A .npy file of world-to-camera matrices [M, 4, 4] or [M, 3, 4], or ``novel``, those
+            of the sequence. Image k is rendered from pose k at time k; the shorter list repeats.
         fresh: Whether to move other content of ``out`` to ``out/old-<k>``.
         arrays: Whether to write arrays instead of pictures; many times as fast.
         progress: Called with (times done, times in all).
 
     Raises:
-        UsageError: If a name in ``what`` is unknown, the run has no colour, there are no such poses or the run has one
-            view only, or ``out`` holds something else.
+        UsageError: If a name in ``what`` is unknown, the run has no colour, there are no such poses
+            or the run has one view only, or ``out`` holds something else.
         InputError: If the poses cannot be read.
         ResourceError: If the disk is full, or cannot hold the arrays.
     """
@@ -207,13 +225,18 @@ def render_to_folder(
     listed: dict[str, Any] = {
         "run": str(run.path),
         "times_s": seconds,
-        "camera_from_world": None if poses is None else [camera.camera_from_world.tolist() for camera in cameras],
+        "camera_from_world": None
+        if poses is None
+        else [camera.camera_from_world.tolist() for camera in cameras],
         "channels": channels,
     }
     if arrays:
         listed["arrays"] = True
     else:
-        scales = {name: previews.preview_scale(name, (sample[name] for sample in samples)) for name in names}
+        scales = {
+            name: previews.preview_scale(name, (sample[name] for sample in samples))
+            for name in names
+        }
         listed["preview"] = {name: asdict(scale) for name, scale in scales.items()}
     renders.prepare_folder(out, listed, fresh=fresh)
     for name in names:
@@ -236,7 +259,9 @@ def series_of(
     *,
     kept: int = KEPT,
 ) -> Iterator[Mapping[str, previews.Channels]]:
-    """Channels of each view as arrays on the host, valid while referenced; on CUDA, later views render meanwhile."""
+    """Channels of each view as arrays on the host, valid while referenced; on CUDA,
+    later views render meanwhile.
+    """
     names = list(names)
     needed = sorted({image for name in names for image in renders.NEEDS[name]})
     for found in on_host(render, views, needed, kept=kept):
@@ -251,11 +276,15 @@ def views_to_take(
     default = sequence.times if found is None else [middle(sequence)]
     seconds = [float(t) for t in (default if times is None else times)]
     if not seconds:
-        raise UsageError("no time to render", where="--times", why="the list is empty", fix="leave --times out")
+        raise UsageError(
+            "no time to render", where="--times", why="the list is empty", fix="leave --times out"
+        )
     if found is None:
         nearest = [nearest_frame(sequence, time) for time in seconds]
         known = {n: run.camera.at(sequence.camera_from_world[n]) for n in set(nearest)}
         return seconds, [known[n] for n in nearest]
     count = max(len(seconds), len(found))
     cameras = [run.camera.at(pose) for pose in found]
-    return [seconds[k % len(seconds)] for k in range(count)], [cameras[k % len(found)] for k in range(count)]
+    return [seconds[k % len(seconds)] for k in range(count)], [
+        cameras[k % len(found)] for k in range(count)
+    ]

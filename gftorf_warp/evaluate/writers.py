@@ -1,6 +1,8 @@
-"""Pictures written while the next images are rendered: by a few threads or, for many images, by processes.
+"""Pictures written while the next images are rendered: by a few threads or, for many images, by
+processes.
 
-A 320x240 image with four quads and distance takes 5 ms of a CPU, half of it with the GIL held by OpenEXR.
+A 320x240 image with four quads and distance takes 5 ms of a CPU, half of it with the GIL held by
+OpenEXR.
 """
 
 from __future__ import annotations
@@ -63,7 +65,10 @@ def write_all(
 
 
 def _write_by_threads(
-    out: Path, scales: Mapping[str, Scale], series: Iterable[Mapping[str, Channels]], done: Callable[[int], None]
+    out: Path,
+    scales: Mapping[str, Scale],
+    series: Iterable[Mapping[str, Channels]],
+    done: Callable[[int], None],
 ) -> None:
     """Write in threads of this process."""
     waiting: deque[Future] = deque()

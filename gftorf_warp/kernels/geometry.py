@@ -20,7 +20,8 @@ class CameraView:
     height: int  # rows [px]
     near: float  # smallest z-depth [m]
     far: float  # largest z-depth [m]
-    radius: float  # of the disc about the axis in which a lens distorts as its polynomial says [1]; 0: a pinhole
+    radius: float  # of the disc about the axis in which a lens distorts as its polynomial says [1];
+    #  0: a pinhole
     guard_x: float  # largest slope x/z at which such a lens has its derivative taken [1]
     guard_y: float  # largest slope y/z likewise [1]
     k1: float  # of the lens, as OpenCV names them [1]
@@ -58,13 +59,16 @@ def rotation_of(wxyz: wp.vec4) -> wp.mat33:
 
 @wp.func
 def screen_covariance(view: CameraView, local: wp.vec3, wxyz: wp.vec4, scale: wp.vec3) -> wp.vec4:
-    """Covariance (xx, xy, yy) [px^2] of a Gaussian on the image, J R Sigma R^T J^T plus low-pass, and its determinant.
+    """Covariance (xx, xy, yy) [px^2] of a Gaussian on the image, J R Sigma R^T J^T plus low-pass,
+    and its determinant.
 
-    The Jacobian J of the projection is taken at the centre ``local`` [m, camera axes], but no farther out than 1.3 half
-    fields of view, since beyond that the linearisation explodes (method, section 2.2). The determinant is a sum of
-    squares: xx yy - xy^2 would lose as many digits as the ellipse is long.
+    The Jacobian J of the projection is taken at the centre ``local`` [m, camera axes], but no
+    farther out than 1.3 half fields of view, since beyond that the linearisation explodes (method,
+    section 2.2). The determinant is a sum of squares: xx yy - xy^2 would lose as many digits as the
+    ellipse is long.
     """
-    axes = wp.transpose(view.rotation * rotation_of(wxyz) * wp.diag(scale))  # rows: own axes, in camera axes
+    # rows: own axes, in camera axes
+    axes = wp.transpose(view.rotation * rotation_of(wxyz) * wp.diag(scale))
     inverse_z = 1.0 / local[2]
     limit_x = 0.5 * GUARD * float(view.width) / view.fx
     limit_y = 0.5 * GUARD * float(view.height) / view.fy
@@ -77,10 +81,16 @@ def screen_covariance(view: CameraView, local: wp.vec3, wxyz: wp.vec4, scale: wp
 
 @wp.func
 def ellipse_of(along_x: wp.vec3, along_y: wp.vec3) -> wp.vec4:
-    """Covariance (xx, xy, yy) [px^2] and its determinant, of how far each own axis reaches along x and y [px]."""
+    """Covariance (xx, xy, yy) [px^2] and its determinant,
+    of how far each own axis reaches along x and y [px].
+    """
     xx = wp.dot(along_x, along_x) + LOW_PASS
     xy = wp.dot(along_x, along_y)
     yy = wp.dot(along_y, along_y) + LOW_PASS
     area = wp.length_sq(wp.cross(along_x, along_y))
-    determinant = area + LOW_PASS * (wp.dot(along_x, along_x) + wp.dot(along_y, along_y)) + LOW_PASS * LOW_PASS
+    determinant = (
+        area
+        + LOW_PASS * (wp.dot(along_x, along_x) + wp.dot(along_y, along_y))
+        + LOW_PASS * LOW_PASS
+    )
     return wp.vec4(xx, xy, yy, determinant)

@@ -1,4 +1,6 @@
-"""Real spherical harmonics to degree 3, in the order by degree and the signs that published Gaussian splats use."""
+"""Real spherical harmonics to degree 3, in the order by degree and the signs that published
+Gaussian splats use.
+"""
 
 import warp as wp
 

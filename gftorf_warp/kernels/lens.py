@@ -1,4 +1,5 @@
-"""A lens that distorts, as kernels see it: where it images what, its derivative, its inverse, and splats behind it.
+"""A lens that distorts, as kernels see it: where it images what, its derivative, its inverse, and
+splats behind it.
 
 The formulas, and what becomes of a polynomial outside the image, are those of scene/distortion.py.
 """
@@ -8,7 +9,8 @@ import warp as wp
 from .geometry import CameraView, ellipse_of, rotation_of
 
 STEPS_MAX = wp.constant(20)  # of Newton; a lens that the host could undo needs a handful
-CLOSE = wp.constant(1.0e-7)  # [1] of image coordinates, a ten-thousandth of a pixel and float32's own rounding
+# [1] of image coordinates, a ten-thousandth of a pixel and float32's own rounding
+CLOSE = wp.constant(1.0e-7)
 
 
 @wp.func
@@ -45,18 +47,24 @@ def derivative(view: CameraView, x: float, y: float) -> wp.vec3:
 
 @wp.func
 def distorted(view: CameraView, x: float, y: float) -> wp.vec2:
-    """Where the lens images what a pinhole would have at (x, y) [1], outside its disc by the tangent."""
+    """Where the lens images what a pinhole would have at (x, y) [1],
+    outside its disc by the tangent.
+    """
     near = inside(view, x, y)
     place = bent(view, near[0], near[1])
     slope = derivative(view, near[0], near[1])
     dx = x - near[0]
     dy = y - near[1]
-    return wp.vec2(place[0] + (slope[0] * dx + slope[1] * dy), place[1] + (slope[1] * dx + slope[2] * dy))
+    return wp.vec2(
+        place[0] + (slope[0] * dx + slope[1] * dy), place[1] + (slope[1] * dx + slope[2] * dy)
+    )
 
 
 @wp.func
 def undistorted(view: CameraView, x: float, y: float) -> wp.vec2:
-    """Where a pinhole would have what the lens images at (x, y) [1] inside the image, by Newton's iteration."""
+    """Where a pinhole would have what the lens images at (x, y) [1] inside the image,
+    by Newton's iteration.
+    """
     place = wp.vec2(x, y)
     missing = float(1.0)
     step = int(0)
@@ -75,7 +83,8 @@ def undistorted(view: CameraView, x: float, y: float) -> wp.vec2:
 @wp.func
 def bent_covariance(view: CameraView, local: wp.vec3, wxyz: wp.vec4, scale: wp.vec3) -> wp.vec4:
     """As ``screen_covariance``, with the derivative of the lens times that of the pinhole."""
-    axes = wp.transpose(view.rotation * rotation_of(wxyz) * wp.diag(scale))  # rows: own axes, in camera axes
+    # rows: own axes, in camera axes
+    axes = wp.transpose(view.rotation * rotation_of(wxyz) * wp.diag(scale))
     inverse_z = 1.0 / local[2]
     slope_x = wp.clamp(local[0] * inverse_z, -view.guard_x, view.guard_x)
     slope_y = wp.clamp(local[1] * inverse_z, -view.guard_y, view.guard_y)
@@ -84,5 +93,6 @@ def bent_covariance(view: CameraView, local: wp.vec3, wxyz: wp.vec4, scale: wp.v
     along_x = axes * wp.vec3(inverse_z, 0.0, -inverse_z * slope_x)
     along_y = axes * wp.vec3(0.0, inverse_z, -inverse_z * slope_y)
     return ellipse_of(
-        view.fx * (slope[0] * along_x + slope[1] * along_y), view.fy * (slope[1] * along_x + slope[2] * along_y)
+        view.fx * (slope[0] * along_x + slope[1] * along_y),
+        view.fy * (slope[1] * along_x + slope[2] * along_y),
     )

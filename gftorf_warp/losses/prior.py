@@ -1,6 +1,7 @@
 """What is expected of a moving scene: it moves on the image as the optical flow says, and not much.
 
-The third prior, depth distortion, is an output of the renderer: ``Rendering.distortion`` (method, section 2.7).
+The third prior, depth distortion, is an output of the renderer: ``Rendering.distortion`` (method,
+section 2.7).
 """
 
 from __future__ import annotations
@@ -18,12 +19,14 @@ def image_motion(
     project: Callable[[Tensor], Tensor],
     project_later: Callable[[Tensor], Tensor] | None = None,
 ) -> Float[Tensor, "2 H W"]:
-    """Optical flow F2 = project_later(P + F3) - project(P) [px] that a moving surface causes (method, section 5).
+    """Optical flow F2 = project_later(P + F3) - project(P) [px] that a moving surface causes
+    (method, section 5).
 
     Args:
         surface: Points P seen by the pixels [m]; gradients through them are cut.
         displacement: Composited motion F3 of the scene [m], not divided by the opacity.
-        project: World points [..., 3] to image positions [..., 2] in px, for example ``Camera.project``.
+        project: World points [..., 3] to image positions [..., 2] in px, for example
+            ``Camera.project``.
         project_later: The same for the camera at the end of the flow; None: it has not moved.
     """
     start = surface.detach()

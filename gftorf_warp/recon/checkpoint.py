@@ -1,4 +1,6 @@
-"""States on disk: written all at once, checked by SHA-256, read without running code, the last two kept."""
+"""States on disk: written all at once, checked by SHA-256, read without running code,
+the last two kept.
+"""
 
 from __future__ import annotations
 
@@ -23,10 +25,11 @@ def folder(run: Path) -> Path:
 
 
 def save(run: Path, stored: dict) -> Path:
-    """Write a state as ``RUN/ckpt/<images>.pt`` with its SHA-256 beside it, and drop all but the last two.
+    """Write a state as ``RUN/ckpt/<images>.pt`` with its SHA-256 beside it, and drop all but the
+    last two.
 
-    The file is read back and compared before another one is dropped. Checkpoints of more images are dropped too: the
-    run has gone back behind them.
+    The file is read back and compared before another one is dropped. Checkpoints of more images are
+    dropped too: the run has gone back behind them.
 
     Raises:
         ResourceError: If the disk is full.
@@ -52,7 +55,8 @@ def load(path: Path, device: torch.device | str = "cpu") -> dict:
     """Read one checkpoint.
 
     Raises:
-        InputError: If it is damaged, of a newer format, or holds anything but tensors and plain values.
+        InputError: If it is damaged, of a newer format, or holds anything but tensors and plain
+            values.
     """
     data = _read(path)
     try:
@@ -108,7 +112,11 @@ def _read(path: Path) -> bytes:
     """Content of a checkpoint whose SHA-256 is right."""
     data = path.read_bytes()
     sidecar = _sidecar(path)
-    wanted = sidecar.read_text().split()[0] if sidecar.is_file() and sidecar.stat().st_size else "no sidecar"
+    wanted = (
+        sidecar.read_text().split()[0]
+        if sidecar.is_file() and sidecar.stat().st_size
+        else "no sidecar"
+    )
     found = hashlib.sha256(data).hexdigest()
     if found != wanted:
         raise InputError(

@@ -1,7 +1,8 @@
-"""The closed form as a method: what a camera computes by itself, behind the interface of a reconstruction.
+"""The closed form as a method: what a camera computes by itself, behind the interface of a
+reconstruction.
 
-Every quartet is decoded as if its raw frames had been taken at once (method, sections 2.9 and 7, row ``ctof``).
-Nothing was fitted, so there is one distance per quartet and one place to look from.
+Every quartet is decoded as if its raw frames had been taken at once (method, sections 2.9 and 7,
+row ``ctof``). Nothing was fitted, so there is one distance per quartet and one place to look from.
 """
 
 from __future__ import annotations
@@ -61,18 +62,22 @@ def check_camera(sequence: Sequence, time: float, camera: Camera, own: Camera, w
     """Refuse every camera but the sequence's own.
 
     Raises:
-        UsageError: If ``camera`` has other intrinsics than ``own``, or a pose far from those of the quartet.
+        UsageError: If ``camera`` has other intrinsics than ``own``, or a pose far from those of the
+            quartet.
     """
     frames = [*range(sequence.frames)[sequence.quartet_frames(nearest_quartet(sequence, time))]]
     frames.append(int(np.abs(sequence.times - time).argmin()))
-    apart = np.abs(sequence.camera_from_world[frames] - camera.camera_from_world).max(axis=(1, 2)).min()
+    apart = (
+        np.abs(sequence.camera_from_world[frames] - camera.camera_from_world).max(axis=(1, 2)).min()
+    )
     names = ("width", "height", "fx", "fy", "cx", "cy")
     differ = [name for name in names if not math.isclose(getattr(camera, name), getattr(own, name))]
     if apart > POSE_TOLERANCE or differ:
         raise UsageError(
             "a closed form has one view",
             where=where,
-            why="asked for another " + (", ".join(differ) or f"pose, {apart:.3g} away from that of the quartet"),
+            why="asked for another "
+            + (", ".join(differ) or f"pose, {apart:.3g} away from that of the quartet"),
             fix="render other views from a run of Gaussians, for example --preset demo",
         )
 
@@ -107,7 +112,9 @@ def no_gaussians(device: torch.device | str) -> GaussianField:
 
 
 def nearest_quartet(sequence: Sequence, time: float) -> int:
-    """The complete quartet during which ``time`` [s] lies, else the one that ends or begins nearest to it."""
+    """The complete quartet during which ``time`` [s] lies,
+    else the one that ends or begins nearest to it.
+    """
 
     def away(quartet: int) -> float:
         first = sequence.cycle * quartet
@@ -122,13 +129,15 @@ def quads_of(
 ) -> Float[np.ndarray, "Q H W"]:
     """The raw frames of a quartet with these shifts [rad], at one of its frequencies.
 
-    If these are not all that was measured there, they are a (cos(psi - shift) + dc_offset) of the decoded phasor:
-    some of the measured ones decode to another phase than all of them.
+    If these are not all that was measured there, they are a (cos(psi - shift) + dc_offset) of the
+    decoded phasor: some of the measured ones decode to another phase than all of them.
     """
     frames, (re, im) = quartet_phasors(sequence, quartet)[frequency]
     shifts = list(shifts)
     slots = [channel_of(sequence.shifts[frames].tolist(), shift) for shift in shifts]
     if any(slot is None for slot in slots) or len(frames) != len(slots):
         constant = sequence.calibration.dc_offset * np.hypot(re, im)
-        return np.stack([0.5 * (re * math.cos(shift) + im * math.sin(shift) + constant) for shift in shifts])
+        return np.stack(
+            [0.5 * (re * math.cos(shift) + im * math.sin(shift) + constant) for shift in shifts]
+        )
     return np.stack([sequence.quads[frames[slot]] for slot in slots if slot is not None])

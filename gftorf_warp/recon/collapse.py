@@ -1,9 +1,9 @@
 """Detects two ways in which an optimisation collapses, and reinitialises it.
 
 *Opaque veil*: falloff makes a Gaussian at a tenth of the distance a hundred times as bright, so
-Gaussians that a random start puts right in front of the camera turn black first. Opaque, they are as
-good as black images and hide everything. Opacity resets do not help: what is in front turns opaque
-first. One of nine measured starts ended so. The loss stays that of black images.
+Gaussians that a random start puts right in front of the camera turn black first. Opaque, they are
+as good as black images and hide everything. Opacity resets do not help: what is in front turns
+opaque first. One of nine measured starts ended so. The loss stays that of black images.
 
 *Dead ReLU*: no ReLU of some layer of the motion network is active for any Gaussian at any time. All
 Gaussians then move alike, by the bias of the head, and no earlier weight has a gradient. Adam makes
@@ -42,7 +42,8 @@ def veil_checked_at(settings: ReconSettings) -> int | None:
         return None
     images = max(CHECKED_AFTER * schedule.images, WARM_UPS * schedule.warm_up)
     images = math.ceil(images / schedule.log_every) * schedule.log_every
-    return images if 2 * images <= schedule.images else None  # else too short to tell, or to restart
+    # else too short to tell, or to restart
+    return images if 2 * images <= schedule.images else None
 
 
 def is_veiled(losses: list[float], observations: Observations, settings: ReconSettings) -> bool:
@@ -60,7 +61,9 @@ def is_veiled(losses: list[float], observations: Observations, settings: ReconSe
 
 @torch.no_grad()
 def loss_of_black(observations: Observations, settings: ReconSettings) -> float:
-    """The term ``quads`` of the loss if all rendered images were zero: the mean over some frames."""
+    """The term ``quads`` of the loss if all rendered images were zero:
+    the mean over some frames.
+    """
     images = observations.phasors.images
     if not observations.phasors:
         measured = torch.as_tensor(observations.sequence.measured)

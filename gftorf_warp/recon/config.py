@@ -1,4 +1,6 @@
-"""What config.json says of a run before its first step: where it is from, all settings, and what they come to."""
+"""What config.json says of a run before its first step: where it is from, all settings,
+and what they come to.
+"""
 
 from __future__ import annotations
 
@@ -38,10 +40,17 @@ def config_of(
         "frame_rate_hz": _rate(sequence),
         "times": sequence.sources.get("times"),
         "camera": {
-            **{name: value for name, value in asdict(camera).items() if name != "distortion" or camera.distortion},
+            **{
+                name: value
+                for name, value in asdict(camera).items()
+                if name != "distortion" or camera.distortion
+            },
             "camera_from_world": camera.camera_from_world.tolist(),
         },
-        "sensor": {name: getattr(sensor, name) for name in ("f_mod_hz", "phase_offset", "dc_offset", "frame_period_s")}
+        "sensor": {
+            name: getattr(sensor, name)
+            for name in ("f_mod_hz", "phase_offset", "dc_offset", "frame_period_s")
+        }
         | ({"further_hz": list(sensor.further_hz)} if sensor.further_hz else {}),
         "init": str(settings.init.kind),
         "motion": str(settings.motion.kind),

@@ -1,4 +1,5 @@
-"""The control block of a step: everything that differs between two steps of one kind, as device data.
+"""The control block of a step: everything that differs between two steps of one kind, as device
+data.
 
 The host writes frame numbers, key numbers, interpolation weights, cameras, weights of the terms and
 learning rates into one buffer and uploads it before the step; kernels read it. So one CUDA graph
@@ -115,7 +116,8 @@ class ControlBlock:
         self.terms, self.motion, self.groups = terms, motion, groups
         self.images = max(len(batch) for batch in observations.batches)
         self._key_counts = {
-            flow: max(len(self._keys_of(batch, flow=flow)) for batch in observations.batches) for flow in (False, True)
+            flow: max(len(self._keys_of(batch, flow=flow)) for batch in observations.batches)
+            for flow in (False, True)
         }
         keys = max(self._key_counts.values())
         camera = len(self._camera(View.TOF, observations.batches[0][0]))
@@ -130,9 +132,15 @@ class ControlBlock:
         }
         self._keys: dict[tuple, GraphKey] = {}
         self._constants: dict[tuple, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
-        sizes = len(groups) + 1, self.images * len(terms) * RESULTS, self.images * self._image_floats
+        sizes = (
+            len(groups) + 1,
+            self.images * len(terms) * RESULTS,
+            self.images * self._image_floats,
+        )
         ints = keys + self.images * NUMBERS
-        self._upload = DeviceUpload([(ints, torch.int32), (sum(sizes), torch.float32)], observations.quads.device)
+        self._upload = DeviceUpload(
+            [(ints, torch.int32), (sum(sizes), torch.float32)], observations.quads.device
+        )
         self._ints, floats = self._upload.parts
         scalars, weights, constants = floats.split(sizes)
         self.rates: Float[Tensor, "G"] = scalars[: len(groups)]
@@ -143,13 +151,22 @@ class ControlBlock:
         """Weights of all results; 0 where an image has no such term."""
         self._floats = constants.view(self.images, -1)
 
-    # -- host ----------------------------------------------------------------------------------------
+    # -- host --------------------------------------------------------------------------------------
 
     def key_of(
-        self, frames: list[int], weights: tuple[float, ...], *, moves: bool, frozen: bool, sh_degree: int
+        self,
+        frames: list[int],
+        weights: tuple[float, ...],
+        *,
+        moves: bool,
+        frozen: bool,
+        sh_degree: int,
     ) -> GraphKey:
         """The key of a step of some raw frames with these weights of the terms."""
-        active = tuple(w > 0 and (moves or not t.needs_motion) for t, w in zip(self.terms, weights, strict=True))
+        active = tuple(
+            w > 0 and (moves or not t.needs_motion)
+            for t, w in zip(self.terms, weights, strict=True)
+        )
         name = (*frames, active, moves, frozen, sh_degree)
         if name not in self._keys:
             terms = list(itertools.compress(self.terms, active))
@@ -157,7 +174,9 @@ class ControlBlock:
             keys = self._key_counts[_has_flow(images)] if moves else 0
             values = images, keys, frozen, sh_degree
             if values not in self._keys:
-                self._keys[values] = GraphKey(images=images, keys=keys, frozen=frozen, sh_degree=sh_degree)
+                self._keys[values] = GraphKey(
+                    images=images, keys=keys, frozen=frozen, sh_degree=sh_degree
+                )
             self._keys[name] = self._keys[values]
         return self._keys[name]
 
@@ -208,7 +227,9 @@ class ControlBlock:
         depth, flow = (stack.rows.get(quartet, 0) for stack in (shown.closed_form, shown.flow))
         return [light, depth, shown.colour.rows.get(frame, 0), flow]
 
-    def _constants_of(self, key: GraphKey, frames: list[int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _constants_of(
+        self, key: GraphKey, frames: list[int]
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """What frames and key of a batch decide, in the layout of the device.
 
         Returns:
@@ -254,7 +275,9 @@ class ControlBlock:
         ends = [cameras[min(max(frame + step * cycle, 0), last)] for step in (1, -1)]
         return fused.flow_cameras(cameras[frame], ends)
 
-    def _blend(self, view: View, frame: int, keys: list[int], *, flow: bool) -> Float[np.ndarray, "D K"]:
+    def _blend(
+        self, view: View, frame: int, keys: list[int], *, flow: bool
+    ) -> Float[np.ndarray, "D K"]:
         """Interpolation weights of a view, see ``ImageControl.blend``."""
         quartet, times = frame // self.observations.sequence.cycle, self.motion.times
         at = self._weights(self._time(view, frame), keys)
@@ -286,7 +309,9 @@ class ControlBlock:
     def _keys_of(self, frames: list[int], *, flow: bool) -> list[int]:
         """All keys that a batch depends on."""
         times = [self._time(View.TOF, frame) for frame in frames]
-        times += [self._time(View.COLOUR, frame) for frame in frames if frame in self.observations.colour]
+        times += [
+            self._time(View.COLOUR, frame) for frame in frames if frame in self.observations.colour
+        ]
         if flow:
             starts = self.motion.times
             quartets = {frame // self.observations.sequence.cycle for frame in frames}
@@ -298,7 +323,7 @@ class ControlBlock:
     def _image_floats(self) -> int:
         return sum(math.prod(shape) for shape in self._parts.values())
 
-    # -- device --------------------------------------------------------------------------------------
+    # -- device ------------------------------------------------------------------------------------
 
     def keys(self, count: int) -> Int[Tensor, "K"]:
         """Numbers of the motion keys."""
@@ -308,12 +333,20 @@ class ControlBlock:
         """Device memory of image ``n`` of the batch."""
         begin = self._key_counts[True] + n * NUMBERS
         ints = self._ints[begin : begin + NUMBERS]
-        parts = dict(zip(self._parts, self._floats[n].split([*map(math.prod, self._parts.values())]), strict=True))
+        parts = dict(
+            zip(
+                self._parts,
+                self._floats[n].split([*map(math.prod, self._parts.values())]),
+                strict=True,
+            )
+        )
         blend = {}
         for view in View:
             rows = 1 + FLOWS if view != View.COLOUR and "flow" in key.images[n].terms else 1
             blend[view] = parts["blend", view][: rows * key.keys].view(rows, key.keys)
-        cameras = {view: DeviceCamera.over(parts["camera", view]) for view in (View.TOF, View.COLOUR)}
+        cameras = {
+            view: DeviceCamera.over(parts["camera", view]) for view in (View.TOF, View.COLOUR)
+        }
         return ImageControl(
             rows={name: ints[k : k + 1] for k, name in enumerate(ROWS)},
             noise_origin=ints[len(ROWS) :],

@@ -1,4 +1,6 @@
-"""Where Gaussians are added and removed: statistics, clone, split, prune, opacity reset (method, section 6.6)."""
+"""Where Gaussians are added and removed: statistics, clone, split, prune, opacity reset (method,
+section 6.6).
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,8 @@ from .settings import DensifySettings, Schedule
 SPLIT_SHRINK = 1.6  # the two halves of a split Gaussian are smaller by this
 SHRINK = math.log(SPLIT_SHRINK)
 RESET_MARGIN = 1e-5  # relative: a hundred roundings of a sigmoid in float32
-RESET_QUIET_SHARE = 0.1  # no reset in the last tenth before the rounds end: what it dims could not recover
+# no reset in the last tenth before the rounds end: what it dims could not recover
+RESET_QUIET_SHARE = 0.1
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -65,7 +68,11 @@ def rounds_remain(images: int, settings: DensifySettings, schedule: Schedule) ->
 
 def reset_is_due(before: int, after: int, settings: DensifySettings, schedule: Schedule) -> bool:
     """Whether a step from ``before`` to ``after`` images ends with an opacity reset."""
-    share = settings.stop_share if schedule.freeze_from is None else min(settings.stop_share, schedule.freeze_from)
+    share = (
+        settings.stop_share
+        if schedule.freeze_from is None
+        else min(settings.stop_share, schedule.freeze_from)
+    )
     end = (1.0 - RESET_QUIET_SHARE) * share * schedule.images
     every = settings.reset_every
     if settings.reset_faster is not None and after >= settings.reset_faster[0]:
@@ -75,8 +82,13 @@ def reset_is_due(before: int, after: int, settings: DensifySettings, schedule: S
 
 def resets(settings: DensifySettings, schedule: Schedule) -> list[int]:
     """At which images a run that counts every image resets the opacities."""
-    intervals = [settings.reset_every, None if settings.reset_faster is None else settings.reset_faster[1]]
-    multiples = {n for every in intervals if every for n in range(every, schedule.images + 1, every)}
+    intervals = [
+        settings.reset_every,
+        None if settings.reset_faster is None else settings.reset_faster[1],
+    ]
+    multiples = {
+        n for every in intervals if every for n in range(every, schedule.images + 1, every)
+    }
     return [n for n in sorted(multiples) if reset_is_due(n - 1, n, settings, schedule)]
 
 
@@ -91,8 +103,8 @@ def round_of(
 ) -> tuple[dict[str, int], Statistics]:
     """Clone small Gaussians and split large ones where the screen gradient is large, then prune.
 
-    A split draws both halves from the Gaussian itself and replaces it. Copies keep opacity and layer, and their moments
-    start at zero.
+    A split draws both halves from the Gaussian itself and replaces it. Copies keep opacity and
+    layer, and their moments start at zero.
 
     Args:
         optimiser: Whose tensors and moments are rebuilt.
@@ -100,8 +112,8 @@ def round_of(
         settings: Thresholds.
         generator: For the positions of halves.
         judge_scale: Whether too small and too large Gaussians are removed in this round.
-        unseen_weight: Gaussians of at most so much weight since the last time are, too, and from here on it is summed
-            anew [px]; None: nobody is.
+        unseen_weight: Gaussians of at most so much weight since the last time are, too, and from
+            here on it is summed anew [px]; None: nobody is.
 
     Returns:
         How many were cloned, split and pruned, and what is known of those that remain.
@@ -109,22 +121,31 @@ def round_of(
     field = optimiser.field.map(torch.Tensor.detach)
     count, scale = len(field), field.scale
     largest = scale.amax(dim=1)
-    seen = statistics.earlier + statistics.weight  # copies have been seen as much as what they are copies of
+    # copies have been seen as much as what they are copies of
+    seen = statistics.earlier + statistics.weight
     keeps = field.opacity >= settings.opacity_min
     if unseen_weight is not None:
         keeps = keeps & (seen > unseen_weight)
     if judge_scale:
         shortest, longest = settings.scale_range
         of_half = (field.log_scale - SHRINK).exp().amax(dim=1)
-        whole, half = (keeps & (size >= shortest) & (size <= longest) for size in (largest, of_half))
+        whole, half = (
+            keeps & (size >= shortest) & (size <= longest) for size in (largest, of_half)
+        )
         keeps = torch.stack([whole, whole, half, half])
     wanted, room = _wanted(statistics, settings), max(settings.gaussians_max - count, 0)
-    plan = _plan(wanted, largest <= settings.clone_scale_max, largest > settings.clone_scale_max, keeps)
+    plan = _plan(
+        wanted, largest <= settings.clone_scale_max, largest > settings.clone_scale_max, keeps
+    )
     if plan.added > room:
-        order = torch.argsort(torch.where(wanted, statistics.mean_gradient, -1.0), descending=True, stable=True)
+        order = torch.argsort(
+            torch.where(wanted, statistics.mean_gradient, -1.0), descending=True, stable=True
+        )
         wanted = torch.zeros_like(wanted)
         wanted[order[:room]] = True
-        plan = _plan(wanted, largest <= settings.clone_scale_max, largest > settings.clone_scale_max, keeps)
+        plan = _plan(
+            wanted, largest <= settings.clone_scale_max, largest > settings.clone_scale_max, keeps
+        )
     kept, order = plan.kept, plan.order
     if sum(kept) < settings.gaussians_min:
         kept, order = plan.offered, _first(plan.parts)
@@ -135,7 +156,9 @@ def round_of(
         offset = None
         if halves:
             of = rows[len(rows) - kept[2] :]
-            quaternion, scale, rank = (value.index_select(0, of) for value in (field.quaternion, scale, plan.rank))
+            quaternion, scale, rank = (
+                value.index_select(0, of) for value in (field.quaternion, scale, plan.rank)
+            )
             shares = drawn.to(field.device).view(2, split, 3).index_select(1, rank)
             offset = _turned(quaternion, shares * scale).flatten(0, 1)
 
@@ -154,7 +177,9 @@ def round_of(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Plan:
-    """Who is there after a round, in four parts: those that are not split, copies, and both halves of the others."""
+    """Who is there after a round, in four parts: those that are not split, copies,
+    and both halves of the others.
+    """
 
     parts: Bool[Tensor, "4 N"]
     """Of which Gaussian there is one before anybody is removed."""
@@ -173,12 +198,17 @@ class _Plan:
         return self.offered[1] + self.offered[2]
 
 
-def _plan(wanted: Bool[Tensor, "N"], small: Bool[Tensor, "N"], large: Bool[Tensor, "N"], keeps: Tensor) -> _Plan:
-    """Clone and split whom ``wanted`` says, keep whom ``keeps`` says [N] or [4, N]; waits for the device, once."""
+def _plan(
+    wanted: Bool[Tensor, "N"], small: Bool[Tensor, "N"], large: Bool[Tensor, "N"], keeps: Tensor
+) -> _Plan:
+    """Clone and split whom ``wanted`` says, keep whom ``keeps`` says [N] or [4, N];
+    waits for the device, once.
+    """
     split = wanted & large
     parts = torch.stack([~split, wanted & small, split, split])
     kept = parts & keeps
-    order, rank = _first(kept), split.cumsum(dim=0) - 1  # whatever may be done before the device is waited for
+    # whatever may be done before the device is waited for
+    order, rank = _first(kept), split.cumsum(dim=0) - 1
     offered, left = torch.stack([parts, kept]).sum(dim=2).tolist()
     return _Plan(parts=parts, order=order, rank=rank, offered=offered, kept=left)
 
@@ -189,9 +219,11 @@ def _first(mask: Bool[Tensor, "4 N"]) -> Int[Tensor, "4*N"]:
 
 
 def reset_opacity(optimiser: Optimiser, settings: DensifySettings) -> None:
-    """Dim every Gaussian to just below ``opacity_min`` and forget those moments: what is needed grows back.
+    """Dim every Gaussian to just below ``opacity_min`` and forget those moments: what is needed
+    grows back.
 
-    Just below, so that what no pixel has asked for by the next round is removed whichever way a sigmoid is rounded.
+    Just below, so that what no pixel has asked for by the next round is removed whichever way a
+    sigmoid is rounded.
     """
     below = (1.0 - RESET_MARGIN) * settings.opacity_min
     highest = math.log(below / (1.0 - below))
@@ -208,7 +240,9 @@ def _wanted(statistics: Statistics, settings: DensifySettings) -> Bool[Tensor, "
     return gradient >= settings.gradient_min
 
 
-def _turned(quaternion: Float[Tensor, "N 4"], local: Float[Tensor, "k N 3"]) -> Float[Tensor, "k N 3"]:
+def _turned(
+    quaternion: Float[Tensor, "N 4"], local: Float[Tensor, "k N 3"]
+) -> Float[Tensor, "k N 3"]:
     """Vectors along the own axes of Gaussians, as vectors in the world."""
     wxyz = torch.nn.functional.normalize(quaternion, dim=1)[None]
     w, axis = wxyz[..., :1], wxyz[..., 1:]

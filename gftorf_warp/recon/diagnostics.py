@@ -1,9 +1,10 @@
 """Diagnostics along a run: rows of ``diagnostics.jsonl``, which change nothing of the optimisation.
 
 d and d_ToF drift apart where quads do not determine the distance (method, sections 2.5 and 9), and
-static surfaces drift along rays: neither shows in the loss. So a few fixed raw frames are rendered with
-a black background, at the poses and the size of the optimisation, without gradients and without random
-numbers. This is the only file of recon/ that reads ground truth; only the report reads its rows.
+static surfaces drift along rays: neither shows in the loss. So a few fixed raw frames are rendered
+with a black background, at the poses and the size of the optimisation, without gradients and
+without random numbers. This is the only file of recon/ that reads ground truth; only the report
+reads its rows.
 """
 
 from __future__ import annotations
@@ -34,7 +35,8 @@ from .state import State
 ROWS = 40  # along a run, besides its first image
 FRAMES = 4  # rendered per row: about a hundredth of the time of a run of some thousand images
 STILL_M = 1e-6  # [m], [1] poses that differ less are one pose
-PAIRS = 1 << 22  # (tile, splat) pairs that a GPU may list uncounted: 16 MB; the published runs have a tenth
+# (tile, splat) pairs that a GPU may list uncounted: 16 MB; the published runs have a tenth
+PAIRS = 1 << 22
 Row = dict[str, float | int | None]
 Wanted = dict[str, tuple[Tensor | None, Tensor | None]]  # image and mask by name
 
@@ -74,9 +76,13 @@ class Diagnostics:
         device = observations.quads.device
         if known is not None:
             if len(known.distance) != sequence.frames:
-                raise ValueError(f"truth of {len(known.distance)} raw frames for a sequence of {sequence.frames}")
+                raise ValueError(
+                    f"truth of {len(known.distance)} raw frames for a sequence of {sequence.frames}"
+                )
             distance = nearest(known_distance(known), sequence.height, sequence.width)
-            masks = moving_and_static(distance, self.frames, from_phasors=sequence.from_phasors, cycle=sequence.cycle)
+            masks = moving_and_static(
+                distance, self.frames, from_phasors=sequence.from_phasors, cycle=sequence.cycle
+            )
             self.moving, self.static = (torch.tensor(mask, device=device) for mask in masks)
             self.truth = torch.tensor(distance[self.frames], dtype=torch.float32, device=device)
         elif (steady := measured_static(sequence)) is not None:
@@ -85,7 +91,8 @@ class Diagnostics:
     def due(self, before: int, after: int, total: int) -> bool:
         """Whether a row is due between two numbers of optimised images.
 
-        Rows lie where images / total = (k / 40)^2, so denser at the start, and at the end; depends on nothing else.
+        Rows lie where images / total = (k / 40)^2, so denser at the start, and at the end; depends
+        on nothing else.
 
         Args:
             before: Optimised images after the step before; below zero: there was none yet.
@@ -118,8 +125,15 @@ class Diagnostics:
         bare = replace(field, colour_sh=None)
         capacity = None if counted or field.device.type == "cpu" else PAIRS
         # no gradients: no memory for an order of their sums
-        kept = replace(settings.render, distortion=Distortion.PAPER, pair_capacity=capacity, deterministic=False)
-        images: dict[str, list[Tensor]] = {name: [] for name in ("d", "d_tof", "opacity", "distortion", "offset")}
+        kept = replace(
+            settings.render,
+            distortion=Distortion.PAPER,
+            pair_capacity=capacity,
+            deterministic=False,
+        )
+        images: dict[str, list[Tensor]] = {
+            name: [] for name in ("d", "d_tof", "opacity", "distortion", "offset")
+        }
         pairs: list[Tensor] = []
         displacements = [Displacement(torch.zeros_like(field.mean), None)] * len(self.frames)
         if state.images >= settings.schedule.warm_up:  # before, nothing moves
@@ -135,7 +149,9 @@ class Diagnostics:
             light = [rendering.quads]
             for f in shown.sensor.further_hz:
                 other = replace(shown.sensor, f_mod_hz=f, further_hz=())
-                light.append(rasterize(moved, camera, other, kept, images=("quads",), workspace=where).quads)
+                light.append(
+                    rasterize(moved, camera, other, kept, images=("quads",), workspace=where).quads
+                )
             phasors = [phasor_from_quads(quads, shown.sensor.shifts) for quads in light]
             images["d_tof"].append(distance_from_phasors(phasors, shown.sensor))
             images["opacity"].append(rendering.opacity)
@@ -147,10 +163,11 @@ class Diagnostics:
     def write(self, rendered: Rendered, state: State, settings: ReconSettings) -> Row:
         """Append a row to the file and return it; the state must still be the same.
 
-        Errors are means over all known pixels of the frames; None where unknown or not finite. The keys:
-        images, gaussians; d_mse_x100 and d_tof_mse_x100, also as ``moving.`` and ``static.`` [m^2 x 100];
-        transmittance T_e [1]; distortion, the sum over all pairs [m^2]; offset_static_m, the length of the displacement
-        of what static pixels see; d_minus_dtof_static_m, |d - d_ToF| there up to a whole unambiguous range.
+        Errors are means over all known pixels of the frames; None where unknown or not finite. The
+        keys: images, gaussians; d_mse_x100 and d_tof_mse_x100, also as ``moving.`` and ``static.``
+        [m^2 x 100]; transmittance T_e [1]; distortion, the sum over all pairs [m^2];
+        offset_static_m, the length of the displacement of what static pixels see;
+        d_minus_dtof_static_m, |d - d_ToF| there up to a whole unambiguous range.
         """
         if not rendered.counted and max(rendered.pairs.tolist()) > PAIRS:
             rendered = self.render(state, settings, counted=True)
@@ -180,7 +197,8 @@ class Diagnostics:
 
 
 def diagnostic_frames(sequence: Sequence, truth: Truth | None) -> list[int]:
-    """At most four starts of quartets, spread over the sequence, neither the first nor the last if there are others.
+    """At most four starts of quartets, spread over the sequence, neither the first nor the last if
+    there are others.
 
     With a truth, quartets that it knows nothing of do not count.
     """
@@ -196,7 +214,10 @@ def measured_static(sequence: Sequence) -> Bool[np.ndarray, "H W"] | None:
 
     None where the camera moves, so that no pixel rests, or where no quartet is complete.
     """
-    if not sequence.complete_quartets or float(np.ptp(sequence.camera_from_world, axis=0).max()) > STILL_M:
+    if (
+        not sequence.complete_quartets
+        or float(np.ptp(sequence.camera_from_world, axis=0).max()) > STILL_M
+    ):
         return None
     return steady_pixels(sequence)
 
@@ -211,7 +232,9 @@ def _sums(images: Wanted) -> dict[str, Tensor | None]:
     sums: dict[str, Tensor | None] = dict.fromkeys(images)
     for name, (image, mask) in images.items():
         if image is not None and mask is not None:
-            sums[name] = torch.stack([torch.where(mask, image, 0.0).double().sum(), mask.sum().double()])
+            sums[name] = torch.stack(
+                [torch.where(mask, image, 0.0).double().sum(), mask.sum().double()]
+            )
     return sums
 
 
@@ -219,7 +242,9 @@ def _means(sums: dict[str, Tensor | None]) -> Row:
     """Means in one transfer; None without a pixel, or if not finite."""
     present = {name: pair for name, pair in sums.items() if pair is not None}
     means: Row = dict.fromkeys(sums)
-    for name, (total, count) in zip(present, torch.stack([*present.values()]).tolist(), strict=True):
+    for name, (total, count) in zip(
+        present, torch.stack([*present.values()]).tolist(), strict=True
+    ):
         if count and math.isfinite(total):
             means[name] = total / count
     return means

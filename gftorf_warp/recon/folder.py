@@ -1,4 +1,6 @@
-"""The folder of a run: who may work in it, what it was made with, and whether a new call may go on there."""
+"""The folder of a run: who may work in it, what it was made with,
+and whether a new call may go on there.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,10 @@ from .settings import ReconSettings, plain
 CONFIG = "config.json"
 LOCK = ".lock"
 LOG = "run.log"  # a run that failed before its first step leaves this alone
-FRESH = "continue with the same settings, choose another --out, or start over with --fresh (the old run is kept aside)"
+FRESH = (
+    "continue with the same settings, choose another --out, or start over with --fresh (the "
+    "old run is kept aside)"
+)
 IDENTITY = ("seed", "data_sha256")  # besides the settings: what has to agree for a run to go on
 
 
@@ -29,8 +34,14 @@ def prepare(run: Path, config: dict[str, object], *, fresh: bool) -> bool:
         UsageError: If the folder holds something else, or the same run with other settings.
     """
     if run.exists() and not run.is_dir():
-        raise UsageError("not a folder", where=run, why="--out names a file", fix="choose another --out")
-    held = [path for path in run.iterdir() if not _aside(path) and path.name not in (LOCK, LOG)] if run.exists() else []
+        raise UsageError(
+            "not a folder", where=run, why="--out names a file", fix="choose another --out"
+        )
+    held = (
+        [path for path in run.iterdir() if not _aside(path) and path.name not in (LOCK, LOG)]
+        if run.exists()
+        else []
+    )
     if not held:
         run.mkdir(parents=True, exist_ok=True)
         return False
@@ -55,21 +66,30 @@ def prepare(run: Path, config: dict[str, object], *, fresh: bool) -> bool:
     return True
 
 
-CHANGES_NOTHING = ("render.threads", "schedule.checkpoint_every_s", "graph", "kernels")  # the last until 0.1.0
+# the last until 0.1.0
+CHANGES_NOTHING = ("render.threads", "schedule.checkpoint_every_s", "graph", "kernels")
 
 
 def differences(old: dict[str, object], new: dict[str, object]) -> list[str]:
     """What keeps a run from going on under a new config, in words. A longer run is the same run.
 
-    A setting that a run is too old to know has its default: what it says then is what was always done, or as good.
+    A setting that a run is too old to know has its default: what it says then is what was always
+    done, or as good.
     """
     found = []
-    flat_old, flat_new = ({**_flat(c.get("settings", {})), **{k: c.get(k) for k in IDENTITY}} for c in (old, new))
+    flat_old, flat_new = (
+        {**_flat(c.get("settings", {})), **{k: c.get(k) for k in IDENTITY}} for c in (old, new)
+    )
     if "settings" in old:
         flat_old = {**_flat(plain(ReconSettings(preset=""))), **flat_old}
     for key in sorted({*flat_old, *flat_new}):
         before, after = flat_old.get(key), flat_new.get(key)
-        if key == "schedule.images" and isinstance(before, int) and isinstance(after, int) and after >= before:
+        if (
+            key == "schedule.images"
+            and isinstance(before, int)
+            and isinstance(after, int)
+            and after >= before
+        ):
             continue
         if before != after and key not in CHANGES_NOTHING:
             found.append(f"{key} was {_short(before)}, now {_short(after)}")
@@ -105,7 +125,12 @@ def read_config(run: Path) -> dict[str, Any]:
             fix="name the --out folder of a reconstruction",
         ) from error
     if not isinstance(config, dict):
-        raise InputError("not a run", where=path, why="expected a JSON object", fix="name the --out folder of a run")
+        raise InputError(
+            "not a run",
+            where=path,
+            why="expected a JSON object",
+            fix="name the --out folder of a run",
+        )
     return config
 
 
@@ -115,7 +140,9 @@ def write_config(run: Path, config: dict[str, object]) -> None:
 
 
 def locked(run: Path) -> AbstractContextManager[None]:
-    """Hold ``RUN/.lock`` as long as a process works on the run, see :func:`gftorf_warp.data.lock.locked`."""
+    """Hold ``RUN/.lock`` as long as a process works on the run,
+    see :func:`gftorf_warp.data.lock.locked`.
+    """
     return lock.locked(run, LOCK, "run")
 
 
@@ -126,7 +153,11 @@ def _aside(path: Path) -> bool:
 def _flat(value: object, prefix: str = "") -> dict[str, object]:
     if not isinstance(value, dict):
         return {prefix.rstrip("."): value}
-    return {key: leaf for name, part in value.items() for key, leaf in _flat(part, f"{prefix}{name}.").items()}
+    return {
+        key: leaf
+        for name, part in value.items()
+        for key, leaf in _flat(part, f"{prefix}{name}.").items()
+    }
 
 
 def _short(value: object) -> str:

@@ -50,7 +50,8 @@ class TrainingLoop:
 
         Args:
             observations: What is fitted.
-            settings: How. On a CPU every image has one thread: no result depends on the number of cores.
+            settings: How. On a CPU every image has one thread: no result depends on the number of
+                cores.
             seed: Of the run.
             out: Its folder.
             metrics: Rows of metrics.jsonl.
@@ -76,7 +77,11 @@ class TrainingLoop:
         if state.images == 0:
             self.save(state)
             self.diagnostics.add(state, self.settings)
-        with _one_torch_thread(self.device), image_threads(self.device) as map_images, _signals() as stop:
+        with (
+            _one_torch_thread(self.device),
+            image_threads(self.device) as map_images,
+            _signals() as stop,
+        ):
             stepper = self.stepper(state, map_images)
             while state.images < total:
                 before = state.images
@@ -84,7 +89,8 @@ class TrainingLoop:
                 if not (self.is_due(before, state.images) or stop.is_set()):
                     continue
                 rendered = died = None
-                if self.diagnostics.due(before, state.images, total):  # launched before the device is waited for
+                # launched before the device is waited for
+                if self.diagnostics.due(before, state.images, total):
                     rendered = self.diagnostics.render(state, self.settings)
                     if state.images < total:
                         died = collapse.has_dead_network(state, self.settings)
@@ -96,7 +102,11 @@ class TrainingLoop:
                 every = self.settings.schedule.log_every
                 if state.images // every > before // every or state.images >= total:
                     self.report(state)
-                if self.checked_at is not None and before < self.checked_at <= state.images and self.restarts(state):
+                if (
+                    self.checked_at is not None
+                    and before < self.checked_at <= state.images
+                    and self.restarts(state)
+                ):
                     state = self.restart(state)
                     stepper = self.stepper(state, map_images)
                     continue
@@ -168,7 +178,9 @@ class TrainingLoop:
             return False
         again = state.restarts < self.settings.restarts_max
         then = "restarts with another seed" if again else "continues: it was restarted too often"
-        LOG.warning("after %d images the loss is still that of black images: the run %s", state.images, then)
+        LOG.warning(
+            "after %d images the loss is still that of black images: the run %s", state.images, then
+        )
         return again
 
     def restart(self, state: State) -> State:
@@ -223,7 +235,9 @@ def image_threads(device: torch.device) -> Iterator[Callable]:
 
 @contextlib.contextmanager
 def _one_torch_thread(device: torch.device) -> Iterator[None]:
-    """One thread of torch on a CPU: fastest for small tensors, and sums do not depend on the machine."""
+    """One thread of torch on a CPU: fastest for small tensors,
+    and sums do not depend on the machine.
+    """
     before = torch.get_num_threads()
     if device.type == "cpu":
         torch.set_num_threads(1)
@@ -235,7 +249,9 @@ def _one_torch_thread(device: torch.device) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _signals() -> Iterator[threading.Event]:
-    """An event set by the first Ctrl-C or SIGTERM; the second one acts at once. Main thread only."""
+    """An event set by the first Ctrl-C or SIGTERM; the second one acts at once.
+    Main thread only.
+    """
     stop = threading.Event()
     if threading.current_thread() is not threading.main_thread():
         yield stop

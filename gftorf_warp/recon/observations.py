@@ -1,4 +1,6 @@
-"""What was measured, ready to be compared with renderings: scaled, reduced, on the device. Nothing here is truth."""
+"""What was measured, ready to be compared with renderings: scaled, reduced, on the device.
+Nothing here is truth.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,9 @@ HASHED = ("quads", "measured", "shifts", "times", "frequencies_hz", "camera_from
 
 @dataclass(frozen=True, eq=False)
 class ImageStack:
-    """Images of one kind in one tensor on the device, so that a kernel can select one by its row."""
+    """Images of one kind in one tensor on the device, so that a kernel can select one by its
+    row.
+    """
 
     images: Float[Tensor, "R *image"]
     """All images; R = 0 if there are none."""
@@ -36,7 +40,11 @@ class ImageStack:
     def of(cls, images: Mapping[int, np.ndarray], device: torch.device | str) -> ImageStack:
         """Stack images of one shape in the order of their keys."""
         keys = sorted(images)
-        stacked = np.stack([images[key] for key in keys], dtype=np.float32) if keys else np.zeros(0, np.float32)
+        stacked = (
+            np.stack([images[key] for key in keys], dtype=np.float32)
+            if keys
+            else np.zeros(0, np.float32)
+        )
         return cls(torch.from_numpy(stacked).to(device), {key: row for row, key in enumerate(keys)})
 
     def __contains__(self, key: object) -> bool:
@@ -61,7 +69,8 @@ class Observations:
     """[R, 2, H, W] phasors (re, im) by the raw frame that represents them, the first of their
     frequency in the quartet; empty if quads are compared."""
     colour: ImageStack
-    """[R, 3, h, w] colour images by raw frame, divided by the largest value of all; may be empty."""
+    """[R, 3, h, w] colour images by raw frame, divided by the largest value of all; may be
+    empty."""
     colour_cameras: dict[int, Camera]
     """The camera of every colour image, at its size."""
     colour_scale: float | None
@@ -93,11 +102,15 @@ class Observations:
         return replace(alone, f_mod_hz=frequency, further_hz=())
 
     def time_at(self, frame: int) -> float:
-        """When raw frame ``frame`` was taken [s]; if phasors are compared, the mean time of those that made its own."""
+        """When raw frame ``frame`` was taken [s]; if phasors are compared,
+        the mean time of those that made its own.
+        """
         if self.phasors:
             frames = self.sequence.quartet_frames(frame // self.sequence.cycle)
             frequencies = self.sequence.frame_frequencies
-            return float(self.sequence.times[frames][frequencies[frames] == frequencies[frame]].mean())
+            return float(
+                self.sequence.times[frames][frequencies[frames] == frequencies[frame]].mean()
+            )
         return float(self.sequence.times[frame])
 
 
@@ -108,11 +121,14 @@ def input_of(sequence: Sequence, wanted: Input) -> Input:
     return Input.PHASOR if sequence.from_phasors else Input.QUADS
 
 
-def observe(sequence: Sequence, settings: ReconSettings, device: torch.device | str) -> Observations:
+def observe(
+    sequence: Sequence, settings: ReconSettings, device: torch.device | str
+) -> Observations:
     """Prepare a sequence.
 
     Raises:
-        InputError: If no raw frame was measured, all quads are zero, what is to be compared does not exist, or the
+        InputError: If no raw frame was measured, all quads are zero, what is to be compared does
+            not exist, or the
             sensor is one that cannot be rendered: frequencies without a common range.
     """
     if not sequence.measured.any() or not np.abs(sequence.quads[sequence.measured]).max() > 0:
@@ -127,25 +143,35 @@ def observe(sequence: Sequence, settings: ReconSettings, device: torch.device | 
     else:
         scale, scale_source = settings.quad_scale, "setting"
     prepared = reduced(sequence, settings.width_max)
-    prepared, flow_source = with_flow(prepared, settings.flow if reads_flow(settings) else FlowSource.NONE)
+    prepared, flow_source = with_flow(
+        prepared, settings.flow if reads_flow(settings) else FlowSource.NONE
+    )
     prepared = replace(prepared, quads=(prepared.quads * np.float32(scale)).astype(np.float32))
 
     phasors: dict[int, np.ndarray] = {}
     if input_of(sequence, settings.input) == Input.PHASOR and settings.weights.quads > 0:
-        decoded = [item for i in prepared.complete_quartets for item in quartet_phasors(prepared, i)]
+        decoded = [
+            item for i in prepared.complete_quartets for item in quartet_phasors(prepared, i)
+        ]
         phasors = {frames[0]: phasor for frames, phasor in decoded}
         if not phasors:
-            raise _nothing_to_compare(sequence, "no complete quartet", "a phasor needs all raw frames of one quartet")
+            raise _nothing_to_compare(
+                sequence, "no complete quartet", "a phasor needs all raw frames of one quartet"
+            )
     closed_form = {}
     if settings.weights.depth > 0:
-        closed_form = {i: closed_form_distance(prepared, i)[None] for i in prepared.complete_quartets}
+        closed_form = {
+            i: closed_form_distance(prepared, i)[None] for i in prepared.complete_quartets
+        }
     colour, colour_scale = _colour(prepared, settings)
     return Observations(
         sequence=prepared,
         quads=torch.tensor(prepared.quads, device=device),
         phasors=ImageStack.of(phasors, device),
         colour=ImageStack.of({n: np.moveaxis(image, -1, 0) for n, image in colour.items()}, device),
-        colour_cameras={n: camera for n in colour if (camera := colour_camera_of(prepared, n)) is not None},
+        colour_cameras={
+            n: camera for n in colour if (camera := colour_camera_of(prepared, n)) is not None
+        },
         colour_scale=colour_scale,
         closed_form=ImageStack.of(closed_form, device),
         cameras=[camera_of(prepared, n) for n in range(prepared.frames)],
@@ -159,23 +185,33 @@ def observe(sequence: Sequence, settings: ReconSettings, device: torch.device | 
 
 
 def _flow_by_quartet(sequence: Sequence) -> dict[int, np.ndarray]:
-    """[2, 2, H, W] forward and backward flow [px] of each quartet with any, NaN where there is none."""
+    """[2, 2, H, W] forward and backward flow [px] of each quartet with any,
+    NaN where there is none.
+    """
     result: dict[int, np.ndarray] = {}
     for direction, flows in enumerate((sequence.flow.forward, sequence.flow.backward)):
         for frame, flow in flows.items():
             shape = (2, 2, sequence.height, sequence.width)
-            pair = result.setdefault(frame // sequence.cycle, np.full(shape, np.nan, dtype=np.float32))
+            pair = result.setdefault(
+                frame // sequence.cycle, np.full(shape, np.nan, dtype=np.float32)
+            )
             pair[direction] = flow
     return result
 
 
 def reads_flow(settings: ReconSettings) -> bool:
-    """Whether a reconstruction looks at optical flow at all: for its loss, or to start from phase."""
+    """Whether a reconstruction looks at optical flow at all: for its loss,
+    or to start from phase.
+    """
     return settings.weights.flow > 0 or settings.init.kind == Init.PHASE
 
 
-def _batches(sequence: Sequence, settings: ReconSettings, phasors: list[int], colour: list[int]) -> list[list[int]]:
-    """The raw frames of every possible step: a phasor, or an image where only colour counts, is a step of its own."""
+def _batches(
+    sequence: Sequence, settings: ReconSettings, phasors: list[int], colour: list[int]
+) -> list[list[int]]:
+    """The raw frames of every possible step: a phasor, or an image where only colour counts,
+    is a step of its own.
+    """
     if phasors:
         return [[n] for n in phasors]
     if settings.weights.quads == 0:
@@ -187,29 +223,39 @@ def _batches(sequence: Sequence, settings: ReconSettings, phasors: list[int], co
     return [[n for n in measured if n // sequence.cycle == i] for i in quartets]
 
 
-def _colour(sequence: Sequence, settings: ReconSettings) -> tuple[dict[int, np.ndarray], float | None]:
+def _colour(
+    sequence: Sequence, settings: ReconSettings
+) -> tuple[dict[int, np.ndarray], float | None]:
     """Colour images in the units of the optimisation, and the factor that brought them there."""
     if settings.weights.colour == 0:
         return {}, None
     if colour_camera_of(sequence, 0) is None:
-        if settings.weights.quads > 0:  # colour is an addition: a recording without it is compared without it
+        # colour is an addition: a recording without it is compared without it
+        if settings.weights.quads > 0:
             return {}, None
-        raise _nothing_to_compare(sequence, "no colour", "this preset compares colour images and nothing else")
+        raise _nothing_to_compare(
+            sequence, "no colour", "this preset compares colour images and nothing else"
+        )
     largest = max(float(np.abs(image).max()) for image in sequence.colour.images.values())
     if not largest > 0:
         raise _nothing_to_compare(sequence, "colour is black", "all colour images are zero")
-    return {n: image / np.float32(largest) for n, image in sequence.colour.images.items()}, 1.0 / largest
+    return {
+        n: image / np.float32(largest) for n, image in sequence.colour.images.items()
+    }, 1.0 / largest
 
 
 def _nothing_to_compare(sequence: Sequence, what: str, why: str) -> InputError:
-    return InputError(what, where=sequence.path or "sequence", why=why, fix="check the folder with `gftorf check`")
+    return InputError(
+        what, where=sequence.path or "sequence", why=why, fix="check the folder with `gftorf check`"
+    )
 
 
 def reduced(sequence: Sequence, width_max: int | None) -> Sequence:
-    """The sequence with images of at most ``width_max`` columns, every new pixel the mean of what it covers.
+    """The sequence with images of at most ``width_max`` columns, every new pixel the mean of what
+    it covers.
 
-    Sides shrink to whole numbers of pixels, intrinsics and flow with them. Smaller images stay as they are, and so do
-    colour images, which another camera took.
+    Sides shrink to whole numbers of pixels, intrinsics and flow with them. Smaller images stay as
+    they are, and so do colour images, which another camera took.
     """
     if width_max is None or sequence.width <= width_max:
         return sequence
@@ -220,16 +266,24 @@ def reduced(sequence: Sequence, width_max: int | None) -> Sequence:
     sx, sy = width / sequence.width, height / sequence.height
 
     def shrink(image: np.ndarray) -> np.ndarray:
-        return cv2.resize(np.ascontiguousarray(image, dtype=np.float32), (width, height), interpolation=cv2.INTER_AREA)
+        return cv2.resize(
+            np.ascontiguousarray(image, dtype=np.float32),
+            (width, height),
+            interpolation=cv2.INTER_AREA,
+        )
 
     def shrink_flow(flows: dict[int, np.ndarray]) -> dict[int, np.ndarray]:
-        return {n: np.stack([shrink(flow[0]) * sx, shrink(flow[1]) * sy]) for n, flow in flows.items()}
+        return {
+            n: np.stack([shrink(flow[0]) * sx, shrink(flow[1]) * sy]) for n, flow in flows.items()
+        }
 
     return replace(
         sequence,
         quads=np.stack([shrink(quad) for quad in sequence.quads]),
         intrinsics=sequence.intrinsics.scaled(sx, sy),
-        flow=Flow(forward=shrink_flow(sequence.flow.forward), backward=shrink_flow(sequence.flow.backward)),
+        flow=Flow(
+            forward=shrink_flow(sequence.flow.forward), backward=shrink_flow(sequence.flow.backward)
+        ),
     )
 
 
@@ -247,7 +301,9 @@ def with_flow(sequence: Sequence, source: FlowSource) -> tuple[Sequence, str]:
 
 
 def data_hash(sequence: Sequence) -> str:
-    """SHA-256 of everything a reconstruction reads from a sequence: frames, calibration, poses, flow and colour."""
+    """SHA-256 of everything a reconstruction reads from a sequence: frames, calibration, poses,
+    flow and colour.
+    """
     digest = hashlib.sha256()
     arrays = {name: getattr(sequence, name) for name in HASHED}
     for name, array in (arrays | {"colour_from_world": sequence.colour.camera_from_world}).items():
@@ -255,7 +311,15 @@ def data_hash(sequence: Sequence) -> str:
             digest.update(f"{name} {array.shape}".encode())
             digest.update(np.ascontiguousarray(array).tobytes())
     stated, tof, colour = sequence.calibration, sequence.intrinsics, sequence.colour.intrinsics
-    numbers: list = [stated.f_mod_hz, stated.phase_offset, stated.dc_offset, tof.fx, tof.fy, tof.cx, tof.cy]
+    numbers: list = [
+        stated.f_mod_hz,
+        stated.phase_offset,
+        stated.dc_offset,
+        tof.fx,
+        tof.fy,
+        tof.cx,
+        tof.cy,
+    ]
     numbers += [stated.quad_scale, colour and (colour.fx, colour.fy, colour.cx, colour.cy)]
     digest.update(repr(numbers).encode())
     if tof.distortion is not None:

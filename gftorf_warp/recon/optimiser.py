@@ -16,7 +16,9 @@ from ..scene.motion import Motion
 from .settings import Batch, BatchRule, Input, ReconSettings
 
 BETAS = (0.9, 0.999)  # of steps of one image
-EPSILON = 1e-15  # far below any gradient here, so that a step depends on the direction of a gradient, not on its size
+# far below any gradient here, so that a step depends on the direction of a gradient, not on its
+# size
+EPSILON = 1e-15
 MOTION = "motion"  # group of the parameters of the motion
 STORED = ("step", "exp_avg", "exp_avg_sq")  # keys of ``torch.optim.Adam``
 Moments = tuple[Tensor, Tensor, Tensor]
@@ -31,11 +33,12 @@ def rates_at(
     reset_at: int | None = None,
     revived_at: int | None = None,
 ) -> dict[str, float]:
-    """Learning rate of every group after ``images`` optimised images; 0: the group is not optimised.
+    """Learning rate of every group after ``images`` optimised images; 0: the group is not
+    optimised.
 
-    Log-linear from ``rates`` to ``rates_last`` at the end of the run. That of the motion is 0 during the
-    warm-up and for a while after an opacity reset, then it rises linearly. Those of frozen Gaussians
-    are 0.
+    Log-linear from ``rates`` to ``rates_last`` at the end of the run. That of the motion is 0
+    during the warm-up and for a while after an opacity reset, then it rises linearly. Those of
+    frozen Gaussians are 0.
 
     Args:
         settings: Rates and schedule.
@@ -66,15 +69,23 @@ def rates_at(
 
 
 def betas_of(settings: ReconSettings) -> tuple[float, float]:
-    """Decays of both moments per step; per image they do not depend on the batch, if the batch rule says so."""
+    """Decays of both moments per step; per image they do not depend on the batch,
+    if the batch rule says so.
+    """
     images = _images(settings)
     return BETAS[0] ** images, BETAS[1] ** images
 
 
 def _images(settings: ReconSettings) -> int:
-    """Images of a step in learning-rate scaling; a last batch that is cut short counts as a whole one."""
+    """Images of a step in learning-rate scaling; a last batch that is cut short counts as a whole
+    one.
+    """
     schedule = settings.schedule
-    joint = schedule.batch == Batch.QUARTET and settings.input != Input.PHASOR and settings.weights.quads > 0
+    joint = (
+        schedule.batch == Batch.QUARTET
+        and settings.input != Input.PHASOR
+        and settings.weights.quads > 0
+    )
     return settings.cycle if joint and schedule.batch_rule != BatchRule.NONE else 1
 
 
@@ -90,7 +101,8 @@ def _between(first: float, last: float, share: float) -> float:
 
 
 class Optimiser:
-    """The optimised tensors and their moments, one group per tensor of the field and one for the motion.
+    """The optimised tensors and their moments, one group per tensor of the field and one for the
+    motion.
 
     A step of Adam is render/descent.py. The harmonics of the colour are two tensors,
     ``colour_constant`` and ``colour_rest``, because their rates differ.
@@ -109,8 +121,8 @@ class Optimiser:
         Args:
             field: The Gaussians.
             motion: Their motion.
-            state: :meth:`state_dict` of an earlier optimiser of the same tensors, which continues with
-                its decays; None: moments are zero.
+            state: :meth:`state_dict` of an earlier optimiser of the same tensors, which continues
+                with its decays; None: moments are zero.
             betas: Decays of both moments per step.
         """
         self.layer, self.betas = field.layer, betas
@@ -118,7 +130,9 @@ class Optimiser:
         colour = parts.pop("colour_sh", None)
         if colour is not None:
             parts |= {"colour_constant": colour[:, :1], "colour_rest": colour[:, 1:]}
-        self.tensors = {name: value.detach().clone().requires_grad_() for name, value in parts.items()}
+        self.tensors = {
+            name: value.detach().clone().requires_grad_() for name, value in parts.items()
+        }
         """Tensors of the field by name of their group."""
         self.motion = [parameter for parameter in motion.parameters() if parameter.numel()]
         """Parameters of the motion."""
@@ -145,7 +159,11 @@ class Optimiser:
         """(step, first moment, second moment) of a leaf, zero at first."""
         if leaf not in self._moments:
             first, second = torch.zeros_like(leaf), torch.zeros_like(leaf)
-            self._moments[leaf] = torch.zeros((), device=leaf.device), first.detach(), second.detach()
+            self._moments[leaf] = (
+                torch.zeros((), device=leaf.device),
+                first.detach(),
+                second.detach(),
+            )
         return self._moments[leaf]
 
     def put(self, name: str, value: Tensor, moments: Moments | None) -> None:
@@ -155,7 +173,9 @@ class Optimiser:
         if moments is not None:
             self._moments[value] = moments
 
-    def replace(self, rows: Int[Tensor, "M"], old: int, change: Callable[[str, Tensor], None]) -> None:
+    def replace(
+        self, rows: Int[Tensor, "M"], old: int, change: Callable[[str, Tensor], None]
+    ) -> None:
         """Rebuild every tensor of the field from rows of the present one, moments alike.
 
         Args:
@@ -190,7 +210,9 @@ class Optimiser:
             torch._foreach_zero_([*self.moments_of(leaf)])
 
     def state_dict(self) -> dict[str, Any]:
-        """Moments in the layout of ``torch.optim.Adam``: tensors are numbered in the order of the groups."""
+        """Moments in the layout of ``torch.optim.Adam``:
+        tensors are numbered in the order of the groups.
+        """
         numbers = {leaf: n for n, leaf in enumerate(self.leaves)}
         groups: dict[str, list[int]] = {}
         for n, name in enumerate(self.groups):
@@ -198,7 +220,8 @@ class Optimiser:
         shared = {"betas": self.betas, "eps": EPSILON}
         return {
             "state": {
-                numbers[leaf]: dict(zip(STORED, moments, strict=True)) for leaf, moments in self._moments.items()
+                numbers[leaf]: dict(zip(STORED, moments, strict=True))
+                for leaf, moments in self._moments.items()
             },
             "param_groups": [{"name": name, **shared, "params": of} for name, of in groups.items()],
         }
@@ -224,5 +247,7 @@ def field_of(tensors: Mapping[str, Tensor], layer: Tensor | None) -> GaussianFie
     """A field of tensors by name of their group."""
     parts = dict(tensors)
     if "colour_rest" in parts:
-        parts["colour_sh"] = torch.cat([parts.pop("colour_constant"), parts.pop("colour_rest")], dim=1)
+        parts["colour_sh"] = torch.cat(
+            [parts.pop("colour_constant"), parts.pop("colour_rest")], dim=1
+        )
     return GaussianField(**parts, layer=layer)

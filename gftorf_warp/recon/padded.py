@@ -1,7 +1,7 @@
 """Parameters with padding rows: addresses stay the same while Gaussians are added and removed.
 
-Padding rows behind the last Gaussian have an opacity of zero, so they are culled and get no gradient,
-and their moments are zero, so Adam leaves them unchanged. Their positions are finite.
+Padding rows behind the last Gaussian have an opacity of zero, so they are culled and get no
+gradient, and their moments are zero, so Adam leaves them unchanged. Their positions are finite.
 
 On a CPU, where nothing depends on addresses, there are none.
 """
@@ -17,9 +17,11 @@ from .densify import STATISTICS, Statistics
 from .optimiser import Moments, field_of
 from .state import State
 
-BUCKET, SPARE = 4096, 1.25  # rows are allocated in multiples, for so many times the Gaussians, while these grow
+# rows are allocated in multiples, for so many times the Gaussians, while these grow
+BUCKET, SPARE = 4096, 1.25
 LAST_BUCKET = 256  # afterwards
-CAPTURE_S = 0.06  # cost of other addresses: a step without a graph, and a capture (benchmarks/results)
+# cost of other addresses: a step without a graph, and a capture (benchmarks/results)
+CAPTURE_S = 0.06
 PADDING_ROW_S = 5e-9  # cost of an unnecessary row per step
 PADDING_LOGIT = -30.0  # opacity logit of a padding row
 
@@ -27,8 +29,8 @@ PADDING_LOGIT = -30.0  # opacity logit of a padding row
 class PaddedParameters:
     """Parameters, moments and statistics of one state, with padding rows.
 
-    :meth:`attach` moves a state here. Its tensors are then views of the first N rows, so densification,
-    checkpoints and diagnostics do not depend on the padding.
+    :meth:`attach` moves a state here. Its tensors are then views of the first N rows, so
+    densification, checkpoints and diagnostics do not depend on the padding.
     """
 
     def __init__(self, *, pads: bool):
@@ -65,15 +67,19 @@ class PaddedParameters:
 
     def holds(self, state: State) -> bool:
         """Whether the tensors of a state are still views of these."""
-        return all(self._views.get(name) is tensor for name, tensor in state.optimiser.tensors.items())
+        return all(
+            self._views.get(name) is tensor for name, tensor in state.optimiser.tensors.items()
+        )
 
-    def attach(self, state: State, *, steps: int = 0, free: bool = False, grows: bool = True) -> bool:
+    def attach(
+        self, state: State, *, steps: int = 0, free: bool = False, grows: bool = True
+    ) -> bool:
         """Move a state here, values unchanged.
 
         Args:
             state: Its tensors become views.
-            steps: Number of steps since the last call: unnecessary rows are released once they have cost
-                as much as a capture.
+            steps: Number of steps since the last call: unnecessary rows are released once they have
+                cost as much as a capture.
             free: Whether new addresses cost nothing, since no graph will be used again.
             grows: Whether Gaussians will still be added.
 
@@ -87,11 +93,17 @@ class PaddedParameters:
         moved = set(tensors) != set(self.values) or count > self.rows
         moved = moved or ((free or not self.pads) and rows != self.rows)
         moved = moved or self._unnecessary * PADDING_ROW_S > CAPTURE_S
-        moved = moved or any(a is not b for a, b in zip(self.motion, state.optimiser.motion, strict=False))
+        moved = moved or any(
+            a is not b for a, b in zip(self.motion, state.optimiser.motion, strict=False)
+        )
         if moved:
             self._allocate(state, rows)
-        pairs = [pair for name, tensor in tensors.items() for pair in self._take(state, name, tensor)]
-        pairs += [(getattr(self.statistics, name), getattr(state.statistics, name)) for name in STATISTICS]
+        pairs = [
+            pair for name, tensor in tensors.items() for pair in self._take(state, name, tensor)
+        ]
+        pairs += [
+            (getattr(self.statistics, name), getattr(state.statistics, name)) for name in STATISTICS
+        ]
         _copy(pairs, count)
         moments = [moment for _, *both in self._moments.values() for moment in both]
         torch._foreach_zero_([rows[count:] for rows in (*moments, *vars(self.statistics).values())])
@@ -123,12 +135,17 @@ class PaddedParameters:
         for name, value in self.values.items():
             value[:] = tensors[name][:1]
             value.requires_grad_()
-        self._moments = {name: (tensor.new_zeros(()), like(tensor), like(tensor)) for name, tensor in tensors.items()}
+        self._moments = {
+            name: (tensor.new_zeros(()), like(tensor), like(tensor))
+            for name, tensor in tensors.items()
+        }
         self.motion = list(optimiser.motion)
         self.layer = None if optimiser.layer is None else like(optimiser.layer)
         self.binding = like(state.binding.detach())
         """Attachment of all rows to a motion that does not follow the means."""
-        self.statistics = Statistics(**{name: like(tensors["opacity_logit"]) for name in STATISTICS})
+        self.statistics = Statistics(
+            **{name: like(tensors["opacity_logit"]) for name in STATISTICS}
+        )
         """Statistics of densification of all rows."""
         self.mean_weight = like(tensors["opacity_logit"])
         """Weight of each row in a mean over Gaussians."""
@@ -150,7 +167,9 @@ class PaddedParameters:
 
 
 def _copy(pairs: list[tuple[Tensor, Tensor]], count: int) -> None:
-    """Copy to the first rows of tensors of one type, in one call, but for rows that are there already."""
+    """Copy to the first rows of tensors of one type, in one call,
+    but for rows that are there already.
+    """
     moved = [(to[:count], rows) for to, rows in pairs if to.data_ptr() != rows.data_ptr()]
     if moved:
         torch._foreach_copy_([to for to, _ in moved], [rows for _, rows in moved])

@@ -1,7 +1,9 @@
-"""Named settings. A preset is a function of what was recorded that returns them; an ablation changes some of them.
+"""Named settings. A preset is a function of what was recorded that returns them; an ablation
+changes some of them.
 
-The published values are those of the paper or, where it is silent, of its released code: method.md, sections 4 to 7, is
-where each stands. Lengths that were given in multiples of a scene scale are metres here.
+The published values are those of the paper or, where it is silent, of its released code: method.md,
+sections 4 to 7, is where each stands. Lengths that were given in multiples of a scene scale are
+metres here.
 """
 
 from __future__ import annotations
@@ -14,7 +16,18 @@ from ..render.buffers import ClampGradient, Distortion, RenderSettings, Stop, Su
 from ..scene.initialise import Init, InitSettings
 from ..scene.motion import MotionSettings, Products
 from ..scene.network import Network
-from .settings import Batch, BatchRule, DensifySettings, Input, Method, Norm, Rates, ReconSettings, Schedule, Weights
+from .settings import (
+    Batch,
+    BatchRule,
+    DensifySettings,
+    Input,
+    Method,
+    Norm,
+    Rates,
+    ReconSettings,
+    Schedule,
+    Weights,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,37 +41,54 @@ class Recorded:
 
     @property
     def scene_scale(self) -> float:
-        """S = 1.1 unambiguous ranges [m], in which the released code gives lengths: 8.25 m at 20 MHz."""
+        """S = 1.1 unambiguous ranges [m], in which the released code gives lengths:
+        8.25 m at 20 MHz.
+        """
         return 1.1 * self.unambiguous_range
 
     @property
     def bounds(self) -> tuple[float, float]:
-        """z-depths that hold everything [m]: 0.018 unambiguous ranges to 0.99, for phasors 1.21 (sections 2.2, 6.3)."""
+        """z-depths that hold everything [m]: 0.018 unambiguous ranges to 0.99,
+        for phasors 1.21 (sections 2.2, 6.3).
+        """
         far = 1.21 if self.input == Input.PHASOR else 0.99
         return 0.018 * self.unambiguous_range, far * self.unambiguous_range
 
 
 def demo(recorded: Recorded = Recorded()) -> ReconSettings:
-    """Minutes on two CPU cores: small images, motion nodes instead of a network, and a start from measured phase.
+    """Minutes on two CPU cores: small images, motion nodes instead of a network, and a start from
+    measured phase.
 
-    Neither heuristic of method section 6.4 is used. Slow reflectivity hurts once the start is close, since errors of
-    the decoded amplitude have to be repaired; low initial reflectivity is meaningless where it is measured.
+    Neither heuristic of method section 6.4 is used. Slow reflectivity hurts once the start is
+    close, since errors of the decoded amplitude have to be repaired; low initial reflectivity is
+    meaningless where it is measured.
     """
-    rates = Rates(mean=1e-3, log_scale=3e-2, quaternion=2e-2, opacity_logit=0.02, reflectivity_sh=1e-2, motion=1e-3)
+    rates = Rates(
+        mean=1e-3,
+        log_scale=3e-2,
+        quaternion=2e-2,
+        opacity_logit=0.02,
+        reflectivity_sh=1e-2,
+        motion=1e-3,
+    )
     return ReconSettings(
         preset="demo",
         input=recorded.input,
         width_max=160,
         rates=rates,
         rates_last=rates.times(0.3),
-        weights=Weights(ssim=0.2, distortion=0.1, colour=1.0 if recorded.input == Input.PHASOR else 0.0),
+        weights=Weights(
+            ssim=0.2, distortion=0.1, colour=1.0 if recorded.input == Input.PHASOR else 0.0
+        ),
         schedule=Schedule(images=4000, batch=Batch.QUARTET),
         densify=DensifySettings(every=None),
     )
 
 
 def paper(recorded: Recorded = Recorded()) -> ReconSettings:
-    """Everything as the paper has it, and as the released code has it where the paper is silent (section 6)."""
+    """Everything as the paper has it, and as the released code has it where the paper is silent
+    (section 6).
+    """
     phasor = recorded.input == Input.PHASOR
     scale, (near, far) = recorded.scene_scale, recorded.bounds
     rates = Rates(
@@ -74,7 +104,9 @@ def paper(recorded: Recorded = Recorded()) -> ReconSettings:
     return ReconSettings(
         preset="paper",
         input=recorded.input,
-        init=InitSettings(kind=Init.RANDOM, count=100_000, opacity=0.1, reflectivity=0.1, bounds=(near, far)),
+        init=InitSettings(
+            kind=Init.RANDOM, count=100_000, opacity=0.1, reflectivity=0.1, bounds=(near, far)
+        ),
         motion=MotionSettings(kind=Network.kind, input_scale=1.0),
         render=RenderSettings(near=near, far=far),
         rates=rates,
@@ -114,14 +146,15 @@ def paper(recorded: Recorded = Recorded()) -> ReconSettings:
 def released(recorded: Recorded = Recorded()) -> ReconSettings:
     """The published code where it differs from the paper: tables 6.3 to 6.7.
 
-    Its renderer stops early, straightens the clamp and cuts splats at three sigma of 16-pixel tiles. ``weights.quads``,
-    ``quad_scale``, ``init.reflectivity``, ``rates.reflectivity_sh`` and ``densify.gradient_min`` have other values for
-    single scenes in table 6.3; these are those of its synthetic row. Its phasor is half of ours, so for phasors
-    reflectivity and its rate are half of what stands there, which changes nothing else.
+    Its renderer stops early, straightens the clamp and cuts splats at three sigma of 16-pixel
+    tiles. ``weights.quads``, ``quad_scale``, ``init.reflectivity``, ``rates.reflectivity_sh`` and
+    ``densify.gradient_min`` have other values for single scenes in table 6.3; these are those of
+    its synthetic row. Its phasor is half of ours, so for phasors reflectivity and its rate are half
+    of what stands there, which changes nothing else.
 
-    It scatters 100,000 Gaussians over a box of which the cameras see little: 19 % of them project into the image, the
-    others never get a gradient and vanish at the first opacity reset (mistake 1 of section 10). Those 19 % are drawn
-    in the frusta here, at the same density.
+    It scatters 100,000 Gaussians over a box of which the cameras see little: 19 % of them project
+    into the image, the others never get a gradient and vanish at the first opacity reset (mistake 1
+    of section 10). Those 19 % are drawn in the frusta here, at the same density.
     """
     base = paper(recorded)
     phasor, scale = recorded.input == Input.PHASOR, recorded.scene_scale
@@ -155,10 +188,12 @@ def released(recorded: Recorded = Recorded()) -> ReconSettings:
 
 
 def fast(recorded: Recorded = Recorded()) -> ReconSettings:
-    """``released`` on a GPU in seconds: quartets, a network in half precision, and no Gaussian that nobody sees.
+    """``released`` on a GPU in seconds: quartets, a network in half precision, and no Gaussian that
+    nobody sees.
 
-    Steps of quartets are a quarter as many, with rates four times as large. So the network's rate rises slowly, since
-    it may die of its first steps, and Gaussians learn until four fifths of the run are over and not three.
+    Steps of quartets are a quarter as many, with rates four times as large. So the network's rate
+    rises slowly, since it may die of its first steps, and Gaussians learn until four fifths of the
+    run are over and not three.
     """
     base = released(recorded)
     freezes = base.schedule.freeze_from is not None
@@ -166,13 +201,20 @@ def fast(recorded: Recorded = Recorded()) -> ReconSettings:
         base,
         preset="fast",
         motion=replace(base.motion, products=Products.HALF),
-        schedule=replace(base.schedule, batch=Batch.QUARTET, motion_ramp=1000, freeze_from=0.8 if freezes else None),
+        schedule=replace(
+            base.schedule,
+            batch=Batch.QUARTET,
+            motion_ramp=1000,
+            freeze_from=0.8 if freezes else None,
+        ),
         densify=replace(base.densify, unseen_from=300, unseen_weight=0.03),
     )
 
 
 def dgs(recorded: Recorded = Recorded()) -> ReconSettings:
-    """Deformable 3D Gaussians: the same network and renderer, colour alone, one query per image (section 7)."""
+    """Deformable 3D Gaussians: the same network and renderer, colour alone,
+    one query per image (section 7).
+    """
     base = paper(replace(recorded, input=Input.PHASOR))
     return replace(
         base,
@@ -184,7 +226,9 @@ def dgs(recorded: Recorded = Recorded()) -> ReconSettings:
 
 
 def dgs_depth(recorded: Recorded = Recorded()) -> ReconSettings:
-    """``dgs`` with the closed-form distance as a second loss, which is as wrong as the camera where things move."""
+    """``dgs`` with the closed-form distance as a second loss,
+    which is as wrong as the camera where things move.
+    """
     base = dgs(recorded)
     return replace(base, preset="dgs_depth", weights=replace(base.weights, depth=DEPTH_WEIGHT))
 
@@ -196,7 +240,8 @@ def ctof(recorded: Recorded = Recorded()) -> ReconSettings:
 
 
 DEPTH_WEIGHT = 0.1  # [1/m] unpublished
-DISTORTION_WEIGHT = 1e-3  # [1/m^2] unpublished; of 1e-4, 1e-3 and 1e-2 the largest that did no harm at small size
+# [1/m^2] unpublished; of 1e-4, 1e-3 and 1e-2 the largest that did no harm at small size
+DISTORTION_WEIGHT = 1e-3
 PRESETS: dict[str, Callable[[Recorded], ReconSettings]] = {
     function.__name__: function for function in (demo, paper, released, fast, dgs, dgs_depth, ctof)
 }
@@ -211,7 +256,8 @@ ABLATIONS: dict[str, tuple[float, float, float]] = {
     "h1h2": (SLOW, DIM, 0.0),
     "h1h2dd": (SLOW, DIM, DISTORTION_WEIGHT),
 }
-"""Rows of the ablation table: learning rate of reflectivity, initial reflectivity, weight of the depth distortion."""
+"""Rows of the ablation table: learning rate of reflectivity, initial reflectivity, weight of the
+depth distortion."""
 
 
 def preset(name: str, recorded: Recorded = Recorded()) -> ReconSettings:
@@ -226,7 +272,8 @@ def preset(name: str, recorded: Recorded = Recorded()) -> ReconSettings:
 
 
 def ablated(settings: ReconSettings, row: str) -> ReconSettings:
-    """Settings with the reflectivity and the depth distortion of a row of the ablation table (section 7).
+    """Settings with the reflectivity and the depth distortion of a row of the ablation table
+    (section 7).
 
     Raises:
         UsageError: If there is no such row, or neither heuristic applies.
@@ -255,9 +302,11 @@ def ablated(settings: ReconSettings, row: str) -> ReconSettings:
 
 
 def shortened(settings: ReconSettings, images: int) -> ReconSettings:
-    """The same course in fewer images: every interval that is counted in images shrinks with the run.
+    """The same course in fewer images: every interval that is counted in images shrinks with the
+    run.
 
-    Rates stay as they are, so that a run a tenth as long also moves a tenth as far: raise them where that matters.
+    Rates stay as they are, so that a run a tenth as long also moves a tenth as far: raise them
+    where that matters.
     """
     share = images / settings.schedule.images
     schedule, densify = settings.schedule, settings.densify

@@ -20,15 +20,25 @@ class Metrics:
         self.path = path
 
     def rewind(self, images: int) -> None:
-        """Drop rows beyond ``images``, and a line cut off by a crash: the run goes on from there."""
+        """Drop rows beyond ``images``, and a line cut off by a crash:
+        the run goes on from there.
+        """
         if self.path.exists():
-            kept = [line for line in self.path.read_text().splitlines(keepends=True) if line.endswith("\n")]
+            kept = [
+                line
+                for line in self.path.read_text().splitlines(keepends=True)
+                if line.endswith("\n")
+            ]
             kept = [line for line in kept if json.loads(line)["images"] <= images]
             atomic_write(self.path, "".join(kept).encode())
 
     def rows(self) -> list[dict[str, float | int | None]]:
         """All rows so far."""
-        return [json.loads(line) for line in self.path.read_text().splitlines()] if self.path.exists() else []
+        return (
+            [json.loads(line) for line in self.path.read_text().splitlines()]
+            if self.path.exists()
+            else []
+        )
 
     def add(self, row: dict[str, float | int | None]) -> None:
         """Append one row."""

@@ -1,4 +1,6 @@
-"""A reconstruction to look at: its Gaussians and their motion at any time, in the units of the sequence."""
+"""A reconstruction to look at: its Gaussians and their motion at any time,
+in the units of the sequence.
+"""
 
 from __future__ import annotations
 
@@ -57,7 +59,8 @@ class Run:
 
     @classmethod
     def open(cls, path: str | Path, device: torch.device | str = "cpu") -> Run:
-        """Read a run from its folder: config and newest checkpoint. A run of the method ``ctof`` needs no checkpoint.
+        """Read a run from its folder: config and newest checkpoint. A run of the method ``ctof``
+        needs no checkpoint.
 
         Raises:
             InputError: If the folder is no run, or holds no checkpoint that can be read.
@@ -112,9 +115,9 @@ class Run:
     ) -> Rendering:
         """What the sensor would see at one instant, before black.
 
-        Quads (of the four canonical shifts) and phasor are in the units of the sequence, colour in those of its colour
-        images, distances in metres. No gradients. Before the first raw frame and beyond the last quartet everything
-        stays as it was there.
+        Quads (of the four canonical shifts) and phasor are in the units of the sequence, colour in
+        those of its colour images, distances in metres. No gradients. Before the first raw frame
+        and beyond the last quartet everything stays as it was there.
 
         Args:
             time: Seconds since raw frame 0, any number.
@@ -138,34 +141,48 @@ class Run:
         )
 
     def _at(self, f_mod_hz: float | None) -> Sensor:
-        return self.sensor if f_mod_hz is None else replace(self.sensor, f_mod_hz=f_mod_hz, further_hz=())
+        return (
+            self.sensor
+            if f_mod_hz is None
+            else replace(self.sensor, f_mod_hz=f_mod_hz, further_hz=())
+        )
 
     def renderer(
         self, images: Iterable[str] = (*CHOICES, "colour"), *, f_mod_hz: float | None = None
     ) -> Callable[[float, Camera], Rendering]:
-        """:meth:`render` for many images: a function of time [s] and camera, which keeps what images share.
+        """:meth:`render` for many images: a function of time [s] and camera, which keeps what
+        images share.
 
-        Its images differ from those of :meth:`render` by rounding only, and the next call overwrites them.
+        Its images differ from those of :meth:`render` by rounding only, and the next call
+        overwrites them.
 
         Args:
-            images: Names of what is wanted of quads, phasor, colour, distance, opacity and distortion; others have no
-                elements and cost nothing.
+            images: Names of what is wanted of quads, phasor, colour, distance, opacity and
+                distortion; others have no elements and cost nothing.
             f_mod_hz: Modulation frequency of quads and phasor [Hz]; None: the first of the sensor.
         """
         names = frozenset(images)
         field = self.field if "colour" in names else replace(self.field, colour_sh=None)
-        sensor = replace(self._at(f_mod_hz), source_intensity=float(self.sensor.source_intensity) / self.quad_scale)
+        sensor = replace(
+            self._at(f_mod_hz),
+            source_intensity=float(self.sensor.source_intensity) / self.quad_scale,
+        )
         optimised = self.camera.resized(*self.config["size_optimised"])
         known = field, self.motion, self.binding, sensor, self.render_settings, optimised, names
         return Replay(*known, colour_scale=self.colour_scale)
 
     def images(
-        self, times: Iterable[float], cameras: Iterable[Camera], images: Iterable[str] = (*CHOICES, "colour")
+        self,
+        times: Iterable[float],
+        cameras: Iterable[Camera],
+        images: Iterable[str] = (*CHOICES, "colour"),
     ) -> Iterator[dict[str, Float[np.ndarray, "..."]]]:
-        """:meth:`renderer` for a loop that wants arrays on the host: on CUDA, they come while the next are rendered.
+        """:meth:`renderer` for a loop that wants arrays on the host: on CUDA, they come while the
+        next are rendered.
 
-        Every image is whole, in the order of ``times``: one that needs more memory than was reserved is rendered again.
-        Arrays stay valid for as long as anything refers to them, see :meth:`Series.on_host`.
+        Every image is whole, in the order of ``times``: one that needs more memory than was
+        reserved is rendered again. Arrays stay valid for as long as anything refers to them, see
+        :meth:`Series.on_host`.
 
         Args:
             times: Seconds since raw frame 0 of each image.
@@ -176,11 +193,12 @@ class Run:
         yield from on_host(self.renderer(names), zip(times, cameras, strict=True), names)
 
     def widened(self, field: GaussianField, camera: Camera) -> GaussianField:
-        """Gaussians as wide as they looked while they were optimised, for a camera that resolves more.
+        """Gaussians as wide as they looked while they were optimised, for a camera that resolves
+        more.
 
-        The renderer's low-pass filter widens every Gaussian on the image, by 0.3 px^2 at any resolution. One that was
-        fitted to smaller images would look thinner here by the difference, which is added to it as
-        0.3 ((z / f)^2 of the optimisation - (z / f)^2 of ``camera``) [m^2].
+        The renderer's low-pass filter widens every Gaussian on the image, by 0.3 px^2 at any
+        resolution. One that was fitted to smaller images would look thinner here by the difference,
+        which is added to it as 0.3 ((z / f)^2 of the optimisation - (z / f)^2 of ``camera``) [m^2].
         """
         optimised = self.camera.resized(*self.config["size_optimised"])
         footprint, footprint_here = (_footprint(field, view) for view in (optimised, camera))
@@ -191,7 +209,12 @@ class Run:
     def render_settings(self) -> RenderSettings:
         """How the run was rendered while it was optimised."""
         stored = dict(self.config["settings"]["render"])
-        kinds = {"support": Support, "stop": Stop, "clamp_gradient": ClampGradient, "distortion": Distortion}
+        kinds = {
+            "support": Support,
+            "stop": Stop,
+            "clamp_gradient": ClampGradient,
+            "distortion": Distortion,
+        }
         return RenderSettings(**stored | {name: kind(stored[name]) for name, kind in kinds.items()})
 
     def sequence(self) -> Sequence:
@@ -206,7 +229,8 @@ class Run:
                 "the sequence is not on disk",
                 where=self.path,
                 why="the run was made from a sequence in memory",
-                fix="write the sequence with gftorf_warp.data.write.write and reconstruct from the folder",
+                fix="write the sequence with gftorf_warp.data.write.write and reconstruct from "
+                "the folder",
             )
         given = str(self.config.get("times") or "").startswith("setting")
         return read(source, frame_rate_hz=self.config["frame_rate_hz"] if given else None)
@@ -217,7 +241,9 @@ class ClosedForm(Run):
     """A run without Gaussians, which renders its own measurements."""
 
     @classmethod
-    def of(cls, path: Path, config: dict, camera: Camera, sensor: Sensor, device: torch.device | str) -> ClosedForm:
+    def of(
+        cls, path: Path, config: dict, camera: Camera, sensor: Sensor, device: torch.device | str
+    ) -> ClosedForm:
         """The closed form of the sequence that a config names.
 
         Args:
@@ -249,12 +275,13 @@ class ClosedForm(Run):
     ) -> Rendering:
         """The measured quartet nearest to a time, as if it had been taken at that instant.
 
-        Quads are the measured ones in canonical order, computed from the phasor where the sensor has another shift; the
-        distance is what all frequencies together decode to, and nothing is transparent. There is no colour and no
-        distortion, and extra channels are zero.
+        Quads are the measured ones in canonical order, computed from the phasor where the sensor
+        has another shift; the distance is what all frequencies together decode to, and nothing is
+        transparent. There is no colour and no distortion, and extra channels are zero.
 
         Args:
-            time: Seconds since raw frame 0, any number; during a quartet its own, else the nearest complete one.
+            time: Seconds since raw frame 0, any number; during a quartet its own, else the nearest
+                complete one.
             camera: None, or the sequence's own at the time.
             extra: Channels per Gaussian, of which there are none.
             f_mod_hz: Modulation frequency of quads and phasor [Hz]; None: the first of the sensor.

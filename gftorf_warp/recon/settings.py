@@ -1,7 +1,8 @@
-"""Everything that decides how a sequence is reconstructed, as frozen values; presets.py names combinations.
+"""Everything that decides how a sequence is reconstructed, as frozen values; presets.py names
+combinations.
 
-All intervals count optimised images: one raw frame compared once is one image, whatever the batch. Shares of the run
-and every decay follow ``Schedule.images``.
+All intervals count optimised images: one raw frame compared once is one image, whatever the batch.
+Shares of the run and every decay follow ``Schedule.images``.
 """
 
 from __future__ import annotations
@@ -34,7 +35,8 @@ class Input(enum.StrEnum):
     QUADS = "quads"
     """Every raw frame at its own time, in the one slot that it measured."""
     PHASOR = "phasor"
-    """The phasor of every quartet, as if its four raw frames had been taken at once, in the middle."""
+    """The phasor of every quartet, as if its four raw frames had been taken at once, in the
+    middle."""
 
 
 class Norm(enum.StrEnum):
@@ -71,19 +73,25 @@ class Batch(enum.StrEnum):
 
 
 class BatchRule(enum.StrEnum):
-    """What rates and moments of Adam become when a step compares several images, over those of single images."""
+    """What rates and moments of Adam become when a step compares several images,
+    over those of single images.
+    """
 
     NONE = "none"
     """The same."""
     ROOT = "root"
-    """Of b images: rates times the root of b, both decays to the power of b, so that as much is forgotten per image."""
+    """Of b images: rates times the root of b, both decays to the power of b, so that as much is
+    forgotten per image."""
     LINEAR = "linear"
-    """As ``root`` with rates times b: as far per image where gradients agree, which short runs need."""
+    """As ``root`` with rates times b: as far per image where gradients agree, which short runs
+    need."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Rates:
-    """Learning rates of Adam: the size of one step, whatever the size of the gradient (method, section 6.5)."""
+    """Learning rates of Adam: the size of one step, whatever the size of the gradient (method,
+    section 6.5).
+    """
 
     mean: float = 1.6e-3
     """Centres [m]."""
@@ -94,7 +102,8 @@ class Rates:
     opacity_logit: float = 0.05
     """Opacities before the sigmoid [1]."""
     reflectivity_sh: float = 1.6e-4
-    """All 16 harmonics of the reflectivity [m^2 in quad units]; heuristic H1 is to keep this low."""
+    """All 16 harmonics of the reflectivity [m^2 in quad units]; heuristic H1 is to keep this
+    low."""
     colour_constant: float = 2.5e-3
     """The constant harmonic of the colour [1]."""
     colour_rest: float = 1.25e-4
@@ -116,11 +125,13 @@ class Weights:
     ssim: float = 0.2
     """Share of the structural similarity in the terms of images [1]."""
     colour: float = 0.0
-    """Colour: (1 - ssim) times the norm of the difference + ssim (1 - SSIM) [1]; needs a calibrated colour camera."""
+    """Colour: (1 - ssim) times the norm of the difference + ssim (1 - SSIM) [1]; needs a calibrated
+    colour camera."""
     colour_norm: Norm = Norm.L2
     """Norm of that difference."""
     depth: float = 0.0
-    """Rendered against closed-form distance: (1 - ssim) L1 + ssim (1 - SSIM) [1/m]; for DeformableGS with C-ToF."""
+    """Rendered against closed-form distance: (1 - ssim) L1 + ssim (1 - SSIM) [1/m]; for
+    DeformableGS with C-ToF."""
     distortion: float = 0.0
     """Mean depth distortion [1/m^2]."""
     flow: float = 0.0
@@ -142,13 +153,15 @@ class Schedule:
     warm_up: int = 0
     """Nothing moves for so long, and the motion learns nothing [images]."""
     motion_decay_from: int = 0
-    """The rate of the motion stays at its first value for so long and reaches its last at the end [images]."""
+    """The rate of the motion stays at its first value for so long and reaches its last at the end
+    [images]."""
     motion_ramp: int = 0
     """The rate of the motion rises linearly over its first so many images [images]."""
     pause_after_reset: int = 0
     """The motion learns nothing for so long after every reset of the opacities [images]."""
     freeze_from: float | None = None
-    """From this share of the run on only the motion is optimised [1]; None: everything is, to the end."""
+    """From this share of the run on only the motion is optimised [1]; None: everything is, to the
+    end."""
     colour_from: int = 0
     """The colour loss begins here [images]."""
     flow_from: int = 0
@@ -158,7 +171,8 @@ class Schedule:
     distortion_from: float = 0.0
     """The depth distortion begins at this share of the run [1]."""
     sh_degree_every: int | None = None
-    """Harmonics begin at degree 0 and gain one after so many [images], up to that of ``render``; None: all at once."""
+    """Harmonics begin at degree 0 and gain one after so many [images], up to that of ``render``;
+    None: all at once."""
     log_every: int = 100
     """Between two rows of metrics.jsonl [images]."""
     checkpoint_every_s: float = 60.0
@@ -169,7 +183,9 @@ class Schedule:
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
         if self.sh_degree_every is not None and self.sh_degree_every < 1:
-            raise ValueError(f"sh_degree_every must be at least 1 or None, got {self.sh_degree_every}")
+            raise ValueError(
+                f"sh_degree_every must be at least 1 or None, got {self.sh_degree_every}"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -177,13 +193,15 @@ class DensifySettings:
     """When Gaussians are added, removed and dimmed (method, section 6.6)."""
 
     every: int | None = None
-    """Between two rounds of cloning, splitting and pruning [images]; None: the set of Gaussians stays as it starts."""
+    """Between two rounds of cloning, splitting and pruning [images]; None: the set of Gaussians
+    stays as it starts."""
     start: int = 250
     """The first round is later than this [images]."""
     stop_share: float = 0.6
     """No round and no reset after this share of the run [1]."""
     gradient_min: float | None = 2e-4
-    """Gaussians whose mean screen gradient, in half image sizes, reaches this are cloned or split; None: none are."""
+    """Gaussians whose mean screen gradient, in half image sizes, reaches this are cloned or split;
+    None: none are."""
     clone_scale_max: float = 0.08
     """Up to this largest scale a Gaussian is cloned, above it is split [m]."""
     opacity_min: float = 0.01
@@ -193,16 +211,20 @@ class DensifySettings:
     scale_from: int = 3000
     """That is judged later than this [images]."""
     unseen_from: int | None = None
-    """From here on rounds remove Gaussians that are behind others in every image [images]; None: never."""
+    """From here on rounds remove Gaussians that are behind others in every image [images]; None:
+    never."""
     unseen_weight: float = 0.0
-    """These are Gaussians whose weight in an image, summed over its pixels, is at most so much on average, over all
-    images since the last time, among which every raw frame is [px]. With 0 images stay as they are."""
+    """These are Gaussians whose weight in an image, summed over its pixels, is at most so much on
+    average, over all images since the last time, among which every raw frame is [px]. With 0 images
+    stay as they are."""
     reset_every: int | None = None
     """Between two resets of all opacities to ``opacity_min`` [images]; None: never."""
     reset_faster: tuple[int, int] | None = None
-    """From the first of these [images] on, resets are the second apart [images]; None: always the same."""
+    """From the first of these [images] on, resets are the second apart [images]; None: always the
+    same."""
     loses_step: bool = False
-    """Whether a step that ends with a round changes no Gaussian otherwise, as in the published code."""
+    """Whether a step that ends with a round changes no Gaussian otherwise, as in the published
+    code."""
     gaussians_min: int = 16
     """A round that would leave fewer removes none [Gaussians]."""
     gaussians_max: int = 200_000
@@ -214,7 +236,9 @@ class DensifySettings:
             if value is not None and value < 1:
                 raise ValueError(f"{name} must be at least 1 or None, got {value}")
         if self.reset_faster is not None and min(self.reset_faster) < 1:
-            raise ValueError(f"reset_faster must be two numbers of at least 1 or None, got {self.reset_faster}")
+            raise ValueError(
+                f"reset_faster must be two numbers of at least 1 or None, got {self.reset_faster}"
+            )
         if not 0 < self.opacity_min < 1:
             raise ValueError(f"opacity_min must be in (0, 1), got {self.opacity_min}")
 
@@ -232,10 +256,11 @@ class ReconSettings:
     input: Input = Input.AUTO
     """What is compared with the sensor."""
     cycle: int = FRAMES_PER_QUARTET
-    """Raw frames of a quartet, which is that of the sequence: a step of so many images learns as much as the preset
-    says for four of them, see ``schedule.batch_rule``."""
+    """Raw frames of a quartet, which is that of the sequence: a step of so many images learns as
+    much as the preset says for four of them, see ``schedule.batch_rule``."""
     quad_scale: float | None = None
-    """Multiplies quads and phasors first [1]; None: as the sequence says, or to a largest phasor of 1."""
+    """Multiplies quads and phasors first [1]; None: as the sequence says, or to a largest phasor of
+    1."""
     width_max: int | None = None
     """Wider images are reduced to this for the optimisation [px]; None keeps all pixels."""
     flow: FlowSource = FlowSource.AUTO
@@ -257,21 +282,27 @@ class ReconSettings:
     densify: DensifySettings = field(default_factory=DensifySettings)
     """The number of Gaussians."""
     background: float = 1.0
-    """Amplitude B of the random background, uniform in [-B, B] per pixel, channel and image; 0 is black."""
+    """Amplitude B of the random background, uniform in [-B, B] per pixel, channel and image; 0 is
+    black."""
     motion_gradient_max: float | None = 1.0
-    """Longest gradient of the motion; a longer one is shortened [1/m for nodes, 1 for a network]. None: never."""
+    """Longest gradient of the motion; a longer one is shortened [1/m for nodes, 1 for a network].
+    None: never."""
     graph: bool = True
     """Whether steps are captured as CUDA graphs; on a CPU there are none. Changes no operation."""
     failures_max: int = 5
-    """So many steps without a finite loss and gradient in a row go back to the last checkpoint, with halved rates."""
+    """So many steps without a finite loss and gradient in a row go back to the last checkpoint,
+    with halved rates."""
     rollbacks_max: int = 3
     """After so many returns to a checkpoint in all, the next one ends the run as diverged."""
     restarts_max: int = 3
-    """A random start that sees nothing but the dark begins again with another seed, so many times at most."""
+    """A random start that sees nothing but the dark begins again with another seed, so many times
+    at most."""
 
     def __post_init__(self):
         if self.motion.kind not in KINDS:
-            raise ValueError(f"motion.kind must be one of {', '.join(KINDS)}, got {self.motion.kind!r}")
+            raise ValueError(
+                f"motion.kind must be one of {', '.join(KINDS)}, got {self.motion.kind!r}"
+            )
 
 
 def plain(settings: ReconSettings) -> dict[str, object]:

@@ -77,7 +77,9 @@ class State(Progress):
     """Loss terms and others, summed over the images since the last logged row."""
 
 
-def begin(observations: Observations, settings: ReconSettings, *, seed: int, device: torch.device | str) -> State:
+def begin(
+    observations: Observations, settings: ReconSettings, *, seed: int, device: torch.device | str
+) -> State:
     """Gaussians and motion to start from.
 
     Raises:
@@ -105,12 +107,16 @@ def begin(observations: Observations, settings: ReconSettings, *, seed: int, dev
     )
 
 
-def _motion(start: Start, observations: Observations, settings: ReconSettings, generator: torch.Generator) -> Motion:
+def _motion(
+    start: Start, observations: Observations, settings: ReconSettings, generator: torch.Generator
+) -> Motion:
     sequence = observations.sequence
     initial = MotionStart(
         key_times=key_times(sequence),
         field=start.field,
-        tracks=None if start.positions is None else start.positions - start.positions[start.quartet],
+        tracks=None
+        if start.positions is None
+        else start.positions - start.positions[start.quartet],
         duration=float(sequence.times[-1] - sequence.times[0]),
         unambiguous_range=common_range(observations.sensor),
         generator=generator,
@@ -125,7 +131,9 @@ def to_dict(state: State) -> dict[str, object]:
         "field": {name: value.detach() for name, value in state.optimiser.field.tensors().items()},
         "adam": state.optimiser.state_dict(),
         "motion": state.motion.to_dict(),
-        "attachment": state.optimiser.field.mean.detach() if state.motion.follows_means else state.binding,
+        "attachment": state.optimiser.field.mean.detach()
+        if state.motion.follows_means
+        else state.binding,
         "statistics": {name: getattr(state.statistics, name) for name in densify.STATISTICS},
         "generator": state.generator.get_state(),
         "noise_seed": state.noise_seed,
@@ -135,7 +143,9 @@ def to_dict(state: State) -> dict[str, object]:
     }
 
 
-def field_and_motion(stored: dict, device: torch.device | str) -> tuple[GaussianField, Motion, Tensor]:
+def field_and_motion(
+    stored: dict, device: torch.device | str
+) -> tuple[GaussianField, Motion, Tensor]:
     """Gaussians, their motion and their binding to it, from the stored form."""
     field = GaussianField(**{name: value.to(device) for name, value in stored["field"].items()})
     motion = with_backend(motion_from_dict(stored["motion"]).to(device))

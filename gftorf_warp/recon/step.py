@@ -72,12 +72,15 @@ class Step:
         self.observations, self.settings, self.terms = observations, settings, tuple(terms)
         self.control, self.padded, self.betas = control, padded, betas
         device = observations.quads.device
-        self.output = descent.StepResults.empty(control.images, len(self.terms), control.images * len(View), device)
+        self.output = descent.StepResults.empty(
+            control.images, len(self.terms), control.images * len(View), device
+        )
         """Results and sums on the device."""
         self._streams = SideStreams(control.images, device)
         self._workspaces: defaultdict[tuple[int, View], Workspace] = defaultdict(Workspace)
         self._scratch: defaultdict[tuple[int, str], fused.Scratch] = defaultdict(fused.Scratch)
-        self._sensor = observations.sensor_at(observations.batches[0][0])  # one shift; values from control
+        # one shift; values from control
+        self._sensor = observations.sensor_at(observations.batches[0][0])
         cameras = [*observations.colour_cameras.values(), observations.cameras[0]]
         self._cameras = dict.fromkeys(View, observations.cameras[0]) | {View.COLOUR: cameras[0]}
 
@@ -150,10 +153,17 @@ class Step:
             binding = motion.bind(self.padded.field)
         return motion.at_keys(binding, self.control.keys(key.keys))
 
-    def _image(self, n: int, key: GraphKey, key_motion: KeyMotion | None, render: RenderSettings) -> ImageGradients:
-        """Render one image, evaluate its terms, and differentiate them, independently of other images."""
+    def _image(
+        self, n: int, key: GraphKey, key_motion: KeyMotion | None, render: RenderSettings
+    ) -> ImageGradients:
+        """Render one image, evaluate its terms, and differentiate them,
+        independently of other images.
+        """
         image, control = key.images[n], self.control.image(n, key)
-        values = {name: value.detach().requires_grad_(not key.frozen) for name, value in self.padded.values.items()}
+        values = {
+            name: value.detach().requires_grad_(not key.frozen)
+            for name, value in self.padded.values.items()
+        }
         field, leaf = field_of(values, self.padded.layer), None
         if key_motion is not None:
             offset, rotation = key_motion
@@ -201,7 +211,9 @@ class Step:
         """The Gaussians at the time of a view, and their displacements along the flows."""
         if leaf is None:
             return field, None
-        mean, quaternion, ways = displaced(field.mean, field.quaternion, leaf, control.blend[view], channels=channels)
+        mean, quaternion, ways = displaced(
+            field.mean, field.quaternion, leaf, control.blend[view], channels=channels
+        )
         return replace(field, mean=mean, quaternion=quaternion), ways
 
     def _render(
@@ -236,7 +248,10 @@ class Step:
         amplitude = self.settings.background
         noise = {
             name: fused.uniform(
-                (shape[name], camera.height, camera.width), control.noise_origin, amplitude, stream=stream
+                (shape[name], camera.height, camera.width),
+                control.noise_origin,
+                amplitude,
+                stream=stream,
             )
             for name, stream in background.items()
             if amplitude > 0
@@ -255,7 +270,9 @@ class Step:
             workspace=self._workspaces[n, view],
         )
 
-    def _gradients(self, n: int, image: ImageKey, comparison: Comparison, leaves: list[Tensor]) -> list[Tensor | None]:
+    def _gradients(
+        self, n: int, image: ImageKey, comparison: Comparison, leaves: list[Tensor]
+    ) -> list[Tensor | None]:
         """Gradients of the weighted terms of one image; the results of the terms are stored."""
         values, weights = [], []
         results = self.output.results.view(-1, len(self.terms), self.control.weights.shape[-1])
@@ -264,7 +281,8 @@ class Step:
                 continue
             value = term.loss(comparison, results[n, k])
             if value.data_ptr() != results[n, k].data_ptr():
-                results.data[n, k, 0] = value.detach()  # .data: other rows are part of a graph by now
+                # .data: other rows are part of a graph by now
+                results.data[n, k, 0] = value.detach()
             if value.requires_grad:
                 values.append(value)
                 weights.append(self.control.weights[n, k, 0])
@@ -293,7 +311,9 @@ class Step:
     def _back_through_motion(
         self, key: GraphKey, key_motion: KeyMotion | None, images: list[ImageGradients]
     ) -> tuple[list[Tensor | None], list[Tensor | None]]:
-        """Gradients of the field and of the motion parameters through the motion, for all images at once."""
+        """Gradients of the field and of the motion parameters through the motion,
+        for all images at once.
+        """
         values = [] if key.frozen else [*self.padded.values.values()]
         none: tuple[list[Tensor | None], list[Tensor | None]] = (
             [None] * len(self.padded.values),
@@ -324,7 +344,9 @@ def _primary(image: ImageKey) -> View:
     return View.TOF if View.TOF in image.views else View.COLOUR
 
 
-def _in_order(leaves: list[Tensor], wanted: list[Tensor], gradients: Iterable[Tensor | None]) -> list[Tensor | None]:
+def _in_order(
+    leaves: list[Tensor], wanted: list[Tensor], gradients: Iterable[Tensor | None]
+) -> list[Tensor | None]:
     """Contiguous gradients of leaves, of which only some are wanted."""
     given = iter(gradients)
     ids = {id(leaf) for leaf in wanted}

@@ -1,4 +1,5 @@
-"""The training steps of a run: batches, CUDA graphs, densification and opacity resets, pair capacity.
+"""The training steps of a run: batches, CUDA graphs, densification and opacity resets, pair
+capacity.
 
 On a GPU the host runs ahead of the device: it uploads a control block, replays a graph, and learns
 later whether steps were valid and how many (tile, splat) pairs there were.
@@ -30,7 +31,9 @@ LOG = logging.getLogger("gftorf_warp")
 
 
 def draw(state: State, observations: Observations, settings: ReconSettings) -> list[int]:
-    """Raw frames of the next step, without replacement within an epoch; the last batch may be cut short."""
+    """Raw frames of the next step, without replacement within an epoch;
+    the last batch may be cut short.
+    """
     if not state.queue:
         order = torch.randperm(len(observations.batches), generator=state.generator)
         state.queue = order.tolist()
@@ -93,7 +96,13 @@ class Stepper:
             sh_degree=render_settings_at(settings, before).sh_degree,
         )
         self._enter(key)
-        rates = rates_at(settings, before, state.rate_factor, reset_at=state.reset_at, revived_at=state.revived_at)
+        rates = rates_at(
+            settings,
+            before,
+            state.rate_factor,
+            reset_at=state.reset_at,
+            revived_at=state.revived_at,
+        )
         due = densify.round_is_due(before, state.images, settings.densify, settings.schedule)
         if due and settings.densify.loses_step:
             rates = {name: rate if name == "motion" else 0.0 for name, rate in rates.items()}
@@ -119,7 +128,7 @@ class Stepper:
         sums.zero_()
         return self._read_counts()
 
-    # -- graphs --------------------------------------------------------------------------------------
+    # -- graphs ------------------------------------------------------------------------------------
 
     def _run(self, key: GraphKey) -> None:
         """Launch a step; the first one of a key is not captured, since it loads modules."""
@@ -146,7 +155,9 @@ class Stepper:
         self._step.run(key, self.state.motion, render, table, send, map_images)
 
     def _captured(self, key: GraphKey, table: descent.AdamTable) -> Callable[[], None]:
-        """A step of this key as a function: a CUDA graph on a GPU, unless the settings say otherwise."""
+        """A step of this key as a function: a CUDA graph on a GPU,
+        unless the settings say otherwise.
+        """
         if not (self._padded.pads and self.settings.graph):
             return lambda: self._launch(key, table, table.send, self._map_images)
 
@@ -165,7 +176,8 @@ class Stepper:
         if self._graphs:
             self._read_counts()  # waits: graphs must have run before their memory is released
             self._release_graphs()
-        if last is None or last.terms != key.terms:  # other renderings: their pairs are counted first
+        # other renderings: their pairs are counted first
+        if last is None or last.terms != key.terms:
             self._capacity = PairCapacity()
         self._attach(free=True)
         motion, padded = self.state.motion, self._padded
@@ -185,7 +197,7 @@ class Stepper:
         self._graphs.clear()
         self._pool = graph_pool(self.observations.quads.device)
 
-    # -- readback ------------------------------------------------------------------------------------
+    # -- readback ----------------------------------------------------------------------------------
 
     def _read_counts(self) -> int:
         """Read how many steps were skipped, and adapt the pair capacity; waits for the device."""
@@ -193,7 +205,10 @@ class Stepper:
         skipped, in_a_row, pairs, overflowed = counts.tolist()
         self.state.skipped += skipped
         if skipped:
-            text = "%d steps before image %d skipped: %d with too many (tile, splat) pairs, the others not finite"
+            text = (
+                "%d steps before image %d skipped: %d with too many (tile, splat) pairs, the "
+                "others not finite"
+            )
             LOG.warning(text, skipped, self.state.images, overflowed)
         counts[0] = 0
         counts[2:] = 0
@@ -202,7 +217,9 @@ class Stepper:
         return 0 if overflowed else in_a_row
 
     def _watch_pairs(self) -> None:
-        """Grow the pair capacity before it is exceeded, by counts of a few steps ago, without waiting."""
+        """Grow the pair capacity before it is exceeded, by counts of a few steps ago,
+        without waiting.
+        """
         if not self._padded.pads:
             return
         self._replays += 1
@@ -214,8 +231,12 @@ class Stepper:
             self._read_counts()
 
 
-def densify_after(state: State, observations: Observations, before: int, settings: ReconSettings) -> None:
-    """Densification and opacity reset that are due after a step that began after ``before`` images."""
+def densify_after(
+    state: State, observations: Observations, before: int, settings: ReconSettings
+) -> None:
+    """Densification and opacity reset that are due after a step that began after ``before``
+    images.
+    """
     options, schedule = settings.densify, settings.schedule
     if densify.round_is_due(before, state.images, options, schedule):
         weight = options.unseen_weight * (state.images - state.unseen_at)
@@ -237,7 +258,9 @@ def densify_after(state: State, observations: Observations, before: int, setting
         state.reset_at = state.images
 
 
-def visibility_pruning_is_due(state: State, observations: Observations, options: DensifySettings) -> bool:
+def visibility_pruning_is_due(
+    state: State, observations: Observations, options: DensifySettings
+) -> bool:
     """Whether this densification also prunes by visibility: two epochs contain every raw frame."""
     frames = sum(len(batch) for batch in observations.batches)
     begins = options.unseen_from

@@ -1,8 +1,9 @@
-"""The terms of the loss: what each one compares, its weight, and when it begins (method, section 5).
+"""The terms of the loss: what each one compares, its weight, and when it begins (method, section
+5).
 
-A term is one entry of :data:`TERMS`. Its function gets everything that was rendered of one image and
-returns a differentiable number; plain torch operations are enough, on a CPU as in a CUDA graph, as
-long as they do not wait for the device. Kernels of ``render/fused.py`` are faster.
+A term is one entry of :data:`TERMS`. Its function gets everything that was rendered of one image
+and returns a differentiable number; plain torch operations are enough, on a CPU as in a CUDA graph,
+as long as they do not wait for the device. Kernels of ``render/fused.py`` are faster.
 """
 
 from __future__ import annotations
@@ -33,7 +34,8 @@ class View(enum.Enum):
     """The colour camera at the time of its image; reads the colour of the Gaussians."""
     FLOW = "flow"
     """The ToF camera at the start of a quartet. ``extra`` holds the displacement [m] to the next
-    quartet and to the previous one in world axes; blending weights are constants in its gradient."""
+    quartet and to the previous one in world axes; blending weights are constants in its
+    gradient."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -66,8 +68,8 @@ class Term:
     name: str
     """Key in metrics.jsonl."""
     loss: Callable[[Comparison, Tensor], Tensor]
-    """The unweighted term [0-d] of one image. The second argument [3] is device memory for the term,
-    its mean squared difference and the mean opacity times channels, which kernels may fill
+    """The unweighted term [0-d] of one image. The second argument [3] is device memory for the
+    term, its mean squared difference and the mean opacity times channels, which kernels may fill
     themselves; a term that does not is copied there."""
     weight: Callable[[ReconSettings, int], float]
     """Its weight after so many optimised images; 0: it is not computed."""
@@ -80,12 +82,15 @@ class Term:
     needs_motion: bool = False
     """Whether it is left out until Gaussians move."""
     channels: Callable[[Observations], int] | None = None
-    """Number of channels compared, of a term that fills all three results: the first such term of an
-    image gives the squared difference and the opacity of the log. None: it fills the first only."""
+    """Number of channels compared, of a term that fills all three results: the first such term of
+    an image gives the squared difference and the opacity of the log. None: it fills the first
+    only."""
 
 
 def light_loss(image: Comparison, out: Tensor) -> Tensor:
-    """Quad or phasor: (1 - ssim) L2 + ssim (1 - SSIM). The amplitude of a phasor is not compared."""
+    """Quad or phasor: (1 - ssim) L2 + ssim (1 - SSIM).
+    The amplitude of a phasor is not compared.
+    """
     tof, measured = image.renderings[View.TOF], image.observations
     if measured.phasors:
         return _image_loss(image, LIGHT, tof.phasor[:2], measured.phasors.images, tof.opacity, out)
@@ -128,7 +133,9 @@ def flow_loss(image: Comparison, out: Tensor) -> Tensor:
     assert seen.extra is not None
     measured = image.observations.flow.images
     row, result = image.rows["flow"], out[:1]
-    return fused.flow_loss(seen.distance, seen.extra, measured, image.flow_cameras, row=row, out=result)
+    return fused.flow_loss(
+        seen.distance, seen.extra, measured, image.flow_cameras, row=row, out=result
+    )
 
 
 def _image_loss(
@@ -190,7 +197,9 @@ TERMS: tuple[Term, ...] = (
         loss=depth_loss,
         weight=lambda settings, _: settings.weights.depth,
         outputs=frozenset({"distance"}),
-        applies=lambda observations, frame: frame // observations.sequence.cycle in observations.closed_form,
+        applies=lambda observations, frame: (
+            frame // observations.sequence.cycle in observations.closed_form
+        ),
     ),
     Term(
         name="distortion",
@@ -220,7 +229,8 @@ TERMS: tuple[Term, ...] = (
         view=View.FLOW,
         outputs=frozenset({"distance"}),
         applies=lambda observations, frame: (
-            frame % observations.sequence.cycle == 0 and frame // observations.sequence.cycle in observations.flow
+            frame % observations.sequence.cycle == 0
+            and frame // observations.sequence.cycle in observations.flow
         ),
         needs_motion=True,
     ),

@@ -55,30 +55,36 @@ def reconstruct(
 ) -> Run:
     """Fit moving Gaussians to the raw quads of a sequence.
 
-    Reads quads, calibration, poses, flow and colour. Truth, where a sequence has it, is read only to be written beside
-    the run, in diagnostics.jsonl: it changes nothing. A folder that holds the same run goes on where it
-    stopped, to the same bytes on a CPU as if it had never stopped; Ctrl-C and SIGTERM finish the step and store it.
+    Reads quads, calibration, poses, flow and colour. Truth, where a sequence has it, is read only
+    to be written beside the run, in diagnostics.jsonl: it changes nothing. A folder that holds the
+    same run goes on where it stopped, to the same bytes on a CPU as if it had never stopped; Ctrl-C
+    and SIGTERM finish the step and store it.
 
     Args:
         sequence: What was recorded, or its folder.
         out: Folder of the run: config.json, metrics.jsonl, diagnostics.jsonl, run.log, ckpt/.
         settings: How, or the name of a preset.
         images: Raw frames to optimise, each as often as its turn comes; None: as the settings say.
-        input: What is compared with the sensor: auto, quads or phasor; counts where ``settings`` is a name.
+        input: What is compared with the sensor: auto, quads or phasor; counts where ``settings`` is
+            a name.
         ablation: Row of the ablation table to apply: nobias, dd, h1, h1h2 or h1h2dd; None: none.
-        flow: Where optical flow comes from: auto, file, dis, deepflow or none; None: as the settings say.
-        changes: Single settings to change, as texts like ``init.reflectivity=0.5``, after everything else.
+        flow: Where optical flow comes from: auto, file, dis, deepflow or none; None: as the
+            settings say.
+        changes: Single settings to change, as texts like ``init.reflectivity=0.5``, after
+            everything else.
         seed: Of everything random.
         device: Where to compute, 'cpu' or a CUDA device.
         fresh: Whether to move what ``out`` holds aside, to ``out/old-<k>``, and start over.
-        progress: Called as ``progress(images, images_in_all, loss=, psnr_db=, gaussians=)`` now and then.
+        progress: Called as ``progress(images, images_in_all, loss=, psnr_db=, gaussians=)`` now and
+            then.
 
     Returns:
         The finished run.
 
     Raises:
         InputError: If the sequence cannot be read or cannot start a reconstruction.
-        UsageError: If ``out`` holds something else or other settings, or a preset or source of flow is unknown.
+        UsageError: If ``out`` holds something else or other settings, or a preset or source of flow
+            is unknown.
         BusyError: If another process works on ``out``.
         DivergedError: If loss or gradient stay infinite; the last good checkpoint is kept.
         KeyboardInterrupt: After a signal, when everything is stored.
@@ -119,15 +125,22 @@ def _choice(kind: type[Choice], name: str, option: str) -> Choice:
     if name not in known:
         what = option.lstrip("-")
         why = f"there are {', '.join(known)}"
-        raise UsageError(f"unknown {what} {name}", where=option, why=why, fix=f"use {option} {known[0]}")
+        raise UsageError(
+            f"unknown {what} {name}", where=option, why=why, fix=f"use {option} {known[0]}"
+        )
     return kind(name)
 
 
 def _run(sequence, out, settings, config, seed, device, goes_on, begun, progress) -> None:
     if settings.method == Method.CTOF:
         scale = {"quad_scale": 1.0, "quad_scale_source": "nothing is scaled", "flow_source": "none"}
-        size = {"size_optimised": [sequence.width, sequence.height], "input": str(input_of(sequence, settings.input))}
-        folder.write_config(out, config | scale | size | {"seconds_reconstruct": 0.0, "images_optimised": 0})
+        size = {
+            "size_optimised": [sequence.width, sequence.height],
+            "input": str(input_of(sequence, settings.input)),
+        }
+        folder.write_config(
+            out, config | scale | size | {"seconds_reconstruct": 0.0, "images_optimised": 0}
+        )
         LOG.info("%s is finished: the closed form needs no image", out)
         return
     stored = checkpoint.last(out, device) if goes_on else None
@@ -138,7 +151,11 @@ def _run(sequence, out, settings, config, seed, device, goes_on, begun, progress
     observations = observe(sequence, settings, device)
     _warn_of_constant_part(sequence)
     _warn_of_rows(sequence)
-    state = from_dict(stored, device) if stored is not None else begin(observations, settings, seed=seed, device=device)
+    state = (
+        from_dict(stored, device)
+        if stored is not None
+        else begin(observations, settings, seed=seed, device=device)
+    )
     earlier = state.seconds
     config |= {
         "quad_scale": observations.quad_scale,
@@ -156,16 +173,39 @@ def _run(sequence, out, settings, config, seed, device, goes_on, begun, progress
     verb = "goes on at" if stored is not None else "starts at"
     moving = int((state.optimiser.layer > 0).sum()) if state.optimiser.layer is not None else 0
     count = len(state.optimiser.field)
-    LOG.info("%s %s image %d of %d, %d Gaussians, %d of them moving", out, verb, state.images, total, count, moving)
+    LOG.info(
+        "%s %s image %d of %d, %d Gaussians, %d of them moving",
+        out,
+        verb,
+        state.images,
+        total,
+        count,
+        moving,
+    )
     if total <= settings.schedule.warm_up:
-        LOG.warning("nothing will move: the warm-up takes %d images, the run %d", settings.schedule.warm_up, total)
+        LOG.warning(
+            "nothing will move: the warm-up takes %d images, the run %d",
+            settings.schedule.warm_up,
+            total,
+        )
 
     def clock() -> float:
         return earlier + time.monotonic() - begun
 
-    on_cpu = replace(settings.render, threads=1) if torch.device(device).type == "cpu" else settings.render
+    on_cpu = (
+        replace(settings.render, threads=1)
+        if torch.device(device).type == "cpu"
+        else settings.render
+    )
     state = TrainingLoop(
-        observations, replace(settings, render=on_cpu), seed, out, metrics, diagnostics, clock, progress
+        observations,
+        replace(settings, render=on_cpu),
+        seed,
+        out,
+        metrics,
+        diagnostics,
+        clock,
+        progress,
     ).run(state)
     folder.write_config(
         out,
@@ -182,12 +222,17 @@ def _run(sequence, out, settings, config, seed, device, goes_on, begun, progress
 
 
 def _warn_of_constant_part(sequence: Sequence) -> None:
-    """Quads that hold more or less constant light than calibration says cannot be fitted (method, mistake 17)."""
+    """Quads that hold more or less constant light than calibration says cannot be fitted (method,
+    mistake 17).
+    """
     if sequence.from_phasors or not sequence.complete_quartets:
         return
     found = dc_offset(sequence)
     if abs(found - sequence.calibration.dc_offset) > DC_TOLERANCE:
-        text = "the quads hold a constant part of %.2f amplitudes, the calibration says %.2f: see `gftorf check`"
+        text = (
+            "the quads hold a constant part of %.2f amplitudes, the calibration says %.2f: "
+            "see `gftorf check`"
+        )
         LOG.warning(text, found, sequence.calibration.dc_offset)
 
 
@@ -195,12 +240,17 @@ def _warn_of_rows(sequence: Sequence) -> None:
     """A rolling shutter is fitted as a global one."""
     delay = float(sequence.calibration.settings.get("row_time_s", 0.0) or 0.0)
     if delay > 0:
-        text = "a rolling shutter: the last row is %.3g ms later than the first, and fitted to its time all the same"
+        text = (
+            "a rolling shutter: the last row is %.3g ms later than the first, and fitted to "
+            "its time all the same"
+        )
         LOG.warning(text, 1e3 * delay * (sequence.height - 1))
 
 
 def _truth(sequence: Sequence) -> Truth | None:
-    """Ground truth for the diagnostics; None if there is none, or none that can be read, which stops no run."""
+    """Ground truth for the diagnostics; None if there is none, or none that can be read,
+    which stops no run.
+    """
     try:
         return read_truth(sequence)
     except InputError as error:

@@ -23,7 +23,8 @@ from .inputs import CHOICES, wanted_images
 class Background:
     """Light behind all Gaussians, added as T_e * background; a missing field is black.
 
-    Each field is broadcast to its image, so a number, [C, 1, 1] or [C, H, W] all work; all are differentiable.
+    Each field is broadcast to its image, so a number, [C, 1, 1] or [C, H, W] all work; all are
+    differentiable.
     """
 
     quads: Tensor | None = None
@@ -61,7 +62,9 @@ class Rendering:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ScreenGradient:
-    """Statistics for densification: zero until a backward pass has run, then those of the last one."""
+    """Statistics for densification: zero until a backward pass has run,
+    then those of the last one.
+    """
 
     values: Float[Tensor, "N 4"]
     """All columns."""
@@ -98,8 +101,8 @@ def rasterize(
 ) -> Rendering:
     """Render Gaussians into everything a C-ToF pixel could record (paper, equations 3-5).
 
-    Runs on the device of the field. Differentiable in every tensor of the field except its layer, in ``background``,
-    ``extra`` and the 0-d tensors of the sensor.
+    Runs on the device of the field. Differentiable in every tensor of the field except its layer,
+    in ``background``, ``extra`` and the 0-d tensors of the sensor.
 
     Args:
         field: N Gaussians, float32.
@@ -108,31 +111,40 @@ def rasterize(
         settings: How.
         background: Light from behind everything; None is black.
         extra: D more channels per Gaussian, composited like colour, for example 3D motion [m].
-        extra_detached: Whether gradients of the extra images reach ``extra`` only. All weights are held fixed under
-            them, as if a detached field were rendered a second time for them; other images are as they were.
-        images: Which of quads, phasor, distance, opacity and distortion are wanted; what is left out saves its time,
-            above all distortion.
+        extra_detached: Whether gradients of the extra images reach ``extra`` only. All weights are
+            held fixed under them, as if a detached field were rendered a second time for them;
+            other images are as they were.
+        images: Which of quads, phasor, distance, opacity and distortion are wanted; what is left
+            out saves its time, above all distortion.
         screen_gradient: Whether ``Rendering.screen`` is wanted.
-        workspace: Memory of consecutive renderings of one size; None: each rendering allocates its own.
-        control: Pose, intrinsics, calibration and shifts in device memory, in place of those of ``camera`` and
-            ``sensor``, whose size, kind of lens and number of shifts still count; None: they are uploaded.
+        workspace: Memory of consecutive renderings of one size; None: each rendering allocates its
+            own.
+        control: Pose, intrinsics, calibration and shifts in device memory, in place of those of
+            ``camera`` and ``sensor``, whose size, kind of lens and number of shifts still count;
+            None: they are uploaded.
 
     Raises:
-        ValueError: If a tensor is not float32 or lives elsewhere than the field, or there is no such image.
+        ValueError: If a tensor is not float32 or lives elsewhere than the field, or there is no
+            such image.
     """
     count, size = len(field), (camera.height, camera.width)
     tensors: dict[str, Tensor | None] = dict.fromkeys(INPUTS)
     tensors |= field.parameters()
     if extra is not None:
         if extra.ndim != 2 or len(extra) != count:
-            raise ValueError(f"extra {tuple(extra.shape)} must be (N, D) with N = {count}, the length of the field")
+            raise ValueError(
+                f"extra {tuple(extra.shape)} must be (N, D) with N = {count}, the "
+                f"length of the field"
+            )
         tensors["extra"] = extra if extra.shape[1] else None
     background = background or Background()
     channels = {"quads": len(sensor.shifts), "phasor": 3, "colour": 3}
     for name, number in channels.items():
         value = getattr(background, name)
         if value is not None and not (name == "colour" and field.colour_sh is None):
-            tensors[f"background_{name}"] = _spread(f"background.{name}", value, (number, *size), field)
+            tensors[f"background_{name}"] = _spread(
+                f"background.{name}", value, (number, *size), field
+            )
     if control is not None:
         check(control, len(sensor.shifts), field.device)
     tensors["calibration"] = _calibration(sensor, field) if control is None else control.calibration
@@ -162,7 +174,9 @@ def rasterize(
     return Rendering(**found, screen=None if screen is None else ScreenGradient(values=screen))
 
 
-def _spread(name: str, value: Tensor | float, shape: tuple[int, ...], field: GaussianField) -> Tensor:
+def _spread(
+    name: str, value: Tensor | float, shape: tuple[int, ...], field: GaussianField
+) -> Tensor:
     """A background as [C, H, W]."""
     if isinstance(value, Tensor):
         tensor = value.to(device=field.device, dtype=torch.float32)
@@ -175,10 +189,14 @@ def _spread(name: str, value: Tensor | float, shape: tuple[int, ...], field: Gau
 
 
 def _calibration(sensor: Sensor, field: GaussianField) -> Tensor:
-    """[4] phase slope [rad/m], phase offset [rad], source intensity, DC offset; numbers are uploaded once."""
+    """[4] phase slope [rad/m], phase offset [rad], source intensity, DC offset;
+    numbers are uploaded once.
+    """
     values = sensor.phase_slope, sensor.phase_offset, sensor.source_intensity, sensor.dc_offset
     if any(isinstance(value, Tensor) for value in values):
-        return torch.stack([torch.as_tensor(value, dtype=torch.float32, device=field.device) for value in values])
+        return torch.stack(
+            [torch.as_tensor(value, dtype=torch.float32, device=field.device) for value in values]
+        )
     return _uploaded(values, field.device)
 
 

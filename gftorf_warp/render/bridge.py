@@ -38,9 +38,11 @@ class Request:
     settings: RenderSettings
     """How."""
     screen: Tensor | None = None
-    """[N, 4] that backward fills with screen gradient, pixels and weight, ``api.ScreenGradient``; None: not wanted."""
+    """[N, 4] that backward fills with screen gradient, pixels and weight, ``api.ScreenGradient``;
+    None: not wanted."""
     images: frozenset[str]
-    """Names of what is wanted of quads, phasor, distance, opacity and distortion; colour and extra always are."""
+    """Names of what is wanted of quads, phasor, distance, opacity and distortion; colour and extra
+    always are."""
     workspace: Workspace | None = None
     """Where; None: in memory of its own."""
     extra_detached: bool = False
@@ -48,7 +50,9 @@ class Request:
 
 
 class Rasterize(torch.autograd.Function):
-    """All images of one rendering from all inputs of one; without a workspace each has arrays of its own."""
+    """All images of one rendering from all inputs of one;
+    without a workspace each has arrays of its own.
+    """
 
     @staticmethod
     def forward(
@@ -68,13 +72,19 @@ class Rasterize(torch.autograd.Function):
         mean, extra, colour_sh = named["mean"], named["extra"], named["colour_sh"]
         assert mean is not None
         camera, shifts = request.camera, request.shifts
-        shapes = shapes_of(len(shifts), camera.height, camera.width, 0 if extra is None else extra.shape[1])
-        made = request.images | {name for name, of in (("colour", colour_sh), ("extra", extra)) if of is not None}
+        shapes = shapes_of(
+            len(shifts), camera.height, camera.width, 0 if extra is None else extra.shape[1]
+        )
+        made = request.images | {
+            name for name, of in (("colour", colour_sh), ("extra", extra)) if of is not None
+        }
         images = {name: mean.new_empty(shapes[name]) for name in IMAGES if name in made}
         with stream_of(mean):
             device = wp.device_from_torch(mean.device)
             kind = len(mean), camera.width, camera.height, request.settings, device
-            buffers = Buffers(*kind) if request.workspace is None else request.workspace.buffers(*kind)
+            buffers = (
+                Buffers(*kind) if request.workspace is None else request.workspace.buffers(*kind)
+            )
             view = _view(request, device)
             learns = any(ctx.needs_input_grad)  # otherwise these are the launches of a replay
             launch.forward(_inputs(named), view, buffers, _images(images), differentiable=learns)
@@ -85,21 +95,29 @@ class Rasterize(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
-        """Launch the adjoints explicitly: no tape, no state outside ``ctx``; gradients into fresh tensors."""
+        """Launch the adjoints explicitly: no tape, no state outside ``ctx``;
+        gradients into fresh tensors.
+        """
         named = dict(zip(INPUTS, ctx.saved_tensors, strict=True))
         request, view, buffers, turn = ctx.state
         if buffers.turns != turn:
-            raise ValueError("its workspace has rendered again since: call backward before the next rendering with it")
+            raise ValueError(
+                "its workspace has rendered again since: call backward before the "
+                "next rendering with it"
+            )
         screen = request.screen
         needed = dict(zip(INPUTS, ctx.needs_input_grad[1:], strict=True))
         wanted = _zeros_like({name: named[name] for name in INPUTS if needed[name]})
-        cotangents = {name: g.contiguous() for name, g in zip(IMAGES, grads, strict=True) if g is not None}
+        cotangents = {
+            name: g.contiguous() for name, g in zip(IMAGES, grads, strict=True) if g is not None
+        }
         if cotangents and wanted:
             with stream_of(named["mean"]):
                 arrays = _inputs(named), view, buffers, _images(cotangents), _inputs(wanted)
                 records = launch.backward(*arrays, extra_detached=request.extra_detached)
                 if screen is not None and len(screen):
-                    pairs = wp.to_torch(records).unflatten(1, (-1, 2))  # of slots: the first and the fourth
+                    # of slots: the first and the fourth
+                    pairs = wp.to_torch(records).unflatten(1, (-1, 2))
                     screen.view(-1, 2, 2).copy_(pairs[:, 0:4:3])
         return None, *(wanted.get(name) for name in INPUTS)
 
@@ -111,7 +129,9 @@ def _view(request: Request, device: wp.Device) -> View:
         return launch.uploaded(camera, request.shifts, request.settings, device)
     pointer = control.view.data_ptr()
     view = wp.array(ptr=pointer, dtype=CameraView, shape=(1,), device=device)
-    return View(camera=view, shifts=array_over(control.shifts, wp.vec2), lens=bool(camera.distortion))
+    return View(
+        camera=view, shifts=array_over(control.shifts, wp.vec2), lens=bool(camera.distortion)
+    )
 
 
 def _zeros_like(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -121,11 +141,16 @@ def _zeros_like(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     sizes = [-(-tensor.numel() // ALIGNED) * ALIGNED for tensor in tensors.values()]
     first = next(iter(tensors.values()))
     parts = first.new_zeros(sum(sizes)).split(sizes)
-    return {name: part[: t.numel()].view(t.shape) for part, (name, t) in zip(parts, tensors.items(), strict=True)}
+    return {
+        name: part[: t.numel()].view(t.shape)
+        for part, (name, t) in zip(parts, tensors.items(), strict=True)
+    }
 
 
 def _inputs(named: Mapping[str, Tensor | None]) -> Inputs:
-    return Inputs(**{name: array_over(named.get(name), _VECTORS.get(name, wp.float32)) for name in INPUTS})
+    return Inputs(
+        **{name: array_over(named.get(name), _VECTORS.get(name, wp.float32)) for name in INPUTS}
+    )
 
 
 def _images(named: Mapping[str, Tensor]) -> Images:
@@ -142,14 +167,16 @@ def array_over(tensor: Tensor | None, dtype=wp.float32) -> wp.array | None:
     if tensor is None:
         return None
     wp.init()  # from_torch needs the runtime; does nothing after the first call
-    if tensor.numel() == 0:  # from_torch would use the strides of an empty tensor, which are undefined
+    # from_torch would use the strides of an empty tensor, which are undefined
+    if tensor.numel() == 0:
         shape = tensor.shape[: tensor.ndim - len(getattr(dtype, "_shape_", ()))]
         return wp.empty(tuple(shape), dtype=dtype, device=wp.device_from_torch(tensor.device))
     return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False)
 
 
 def pairs_of(workspace: Workspace) -> Tensor:
-    """[1] int32 on the device: (tile, splat) pairs of the last rendering; above the capacity if some were dropped.
+    """[1] int32 on the device: (tile, splat) pairs of the last rendering; above the capacity if
+    some were dropped.
 
     Raises:
         ValueError: If nothing has been rendered there.

@@ -23,7 +23,8 @@ class Support(StrEnum):
     ALPHA = "alpha"
     """The exact ellipse alpha >= 1/255."""
     SIGMA3_TILE16 = "sigma3_tile16"
-    """That ellipse, cut by the 3-sigma square rounded out to 16-pixel tiles: parity with the released code."""
+    """That ellipse, cut by the 3-sigma square rounded out to 16-pixel tiles: parity with the
+    released code."""
 
 
 class Stop(StrEnum):
@@ -55,7 +56,9 @@ class Distortion(StrEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class RenderSettings:
-    """How Gaussians are rendered. The defaults are exact; the alternatives exist for parity with published code."""
+    """How Gaussians are rendered. The defaults are exact;
+    the alternatives exist for parity with published code.
+    """
 
     near: float = 0.05
     """Gaussians nearer than this z-depth are culled [m]."""
@@ -64,7 +67,8 @@ class RenderSettings:
     sh_degree: int = 3
     """Harmonics above this degree are ignored, 0..3."""
     phasor_factor: float = 2.0
-    """Length of a phasor over the amplitude a: 2 equals the differences of opposite quads, 1 is the released code's."""
+    """Length of a phasor over the amplitude a: 2 equals the differences of opposite quads, 1 is the
+    released code's."""
     support: Support = Support.ALPHA
     """Which pixels a splat may touch."""
     stop: Stop = Stop.INCLUSIVE
@@ -74,30 +78,36 @@ class RenderSettings:
     distortion: Distortion = Distortion.PAPER
     """Which distortion is returned."""
     depth_bits: int = 24
-    """Bits of the key that orders splats by z-depth, 24 or 16; on CUDA the sort takes a pass for every eight.
+    """Bits of the key that orders splats by z-depth, 24 or 16; on CUDA the sort takes a pass for
+    every eight.
 
-    A key counts the floats from ``near`` on and drops the bits that do not fit, see ``depth_shift``: it is linear in z
-    between two powers of two, twice as wide beyond. Splats of one key keep their order in memory. From 0.135 to
-    7.425 m, the presets at 20 MHz, a key is 1 um wide at 3 m, at most 5e-7 of z; with 16 bits, an approximation,
-    0.24 mm and 1.2e-4.
+    A key counts the floats from ``near`` on and drops the bits that do not fit, see
+    ``depth_shift``: it is linear in z between two powers of two, twice as wide beyond. Splats of
+    one key keep their order in memory. From 0.135 to 7.425 m, the presets at 20 MHz, a key is 1 um
+    wide at 3 m, at most 5e-7 of z; with 16 bits, an approximation, 0.24 mm and 1.2e-4.
     """
     pair_capacity: int | None = None
-    """(tile, splat) pairs to reserve; None reads their number back, the one host synchronisation of a rendering.
+    """(tile, splat) pairs to reserve; None reads their number back, the one host synchronisation of
+    a rendering.
 
-    With a number nothing is read back on CUDA: pairs that do not fit are dropped, and ``Buffers.check_capacity``
-    raises. On the CPU it is called in every rendering.
+    With a number nothing is read back on CUDA: pairs that do not fit are dropped, and
+    ``Buffers.check_capacity`` raises. On the CPU it is called in every rendering.
     """
     deterministic: bool = False
-    """Whether gradients are summed in one order on CUDA, as on the CPU, so that equal work gives equal bytes.
+    """Whether gradients are summed in one order on CUDA, as on the CPU, so that equal work gives
+    equal bytes.
 
     Except those of the sensor's numbers. It takes 128 bytes for every (tile, splat) pair.
     """
     threads: int | None = None
-    """CPU threads of the blend; None: as many as this process may use. Another number changes sums by rounding only."""
+    """CPU threads of the blend; None: as many as this process may use. Another number changes sums
+    by rounding only."""
 
     def __post_init__(self):
         if not 0 < self.near < self.far:
-            raise ValueError(f"near and far must satisfy 0 < near < far, got {self.near} and {self.far}")
+            raise ValueError(
+                f"near and far must satisfy 0 < near < far, got {self.near} and {self.far}"
+            )
         if self.sh_degree not in (0, 1, 2, 3):
             raise ValueError(f"sh_degree must be 0, 1, 2 or 3, got {self.sh_degree}")
         if self.depth_bits not in (16, 24):
@@ -107,7 +117,9 @@ class RenderSettings:
 
     @property
     def depth_shift(self) -> int:
-        """Lowest bits of a z-depth that its key leaves out: as few as make ``far`` nearer than ``depth_culled``."""
+        """Lowest bits of a z-depth that its key leaves out:
+        as few as make ``far`` nearer than ``depth_culled``.
+        """
         with np.errstate(over="ignore", under="ignore"):
             near, far = (int(np.float32(z).view(np.int32)) for z in (self.near, self.far))
         shift = 0
@@ -121,21 +133,24 @@ class RenderSettings:
         return (1 << self.depth_bits) - 1
 
 
-# pixels per thread, columns and rows of a tile: a CPU thread works on a block of 4 x 4 pixels at once, on CUDA a warp
-# owns a tile and every thread a pixel (design/tiles.md)
+# pixels per thread, columns and rows of a tile: a CPU thread works on a block of 4 x 4 pixels at
+# once, on CUDA a warp owns a tile and every thread a pixel (design/tiles.md)
 TILE_SHAPES = {"cpu": (16, 8, 8), "cuda": (1, 8, 4)}
 
-# segments of a list in the backward pass where warps own tiles (kernels/rasterise/list_segments.py, design/tiles.md)
+# segments of a list in the backward pass where warps own tiles (kernels/rasterise/list_segments.py,
+# design/tiles.md)
 SEGMENTS = {"cpu": 1, "cuda": 4}
 LANES_PER_SPLAT = {"cpu": 1, "cuda": 32}  # threads that write the (tile, splat) pairs of a splat
 
-# a bit per tile and splat is zeroed, counted and read whether it is set or not: three times these bytes, which at
-# 4 TB/s are 0.1 ms, what a sort of the pairs takes that few tiles and few splats have
+# a bit per tile and splat is zeroed, counted and read whether it is set or not: three times these
+# bytes, which at 4 TB/s are 0.1 ms, what a sort of the pairs takes that few tiles and few splats
+# have
 MATRIX_MAX = 128 << 20  # [B]
 READERS = 8192  # warps that read it: about as many as 132 multiprocessors hold at once
 
 
-# splats that are ordered by depth bins: if all were in one bin, each would be compared with all, 0.1 ms
+# splats that are ordered by depth bins: if all were in one bin, each would be compared with all,
+# 0.1 ms
 BINNED_MAX = {"cpu": 0, "cuda": 32_768}
 
 
@@ -145,13 +160,16 @@ def available_threads() -> int:
 
 
 class Buffers:
-    """The arrays of one rendering, also those that the backward pass reads. Two objects share nothing.
+    """The arrays of one rendering, also those that the backward pass reads. Two objects share
+    nothing.
 
-    A buffers may render again: then it is the same memory, every array of it by its name, and backward belongs to the
-    last rendering.
+    A buffers may render again: then it is the same memory, every array of it by its name, and
+    backward belongs to the last rendering.
     """
 
-    def __init__(self, count: int, width: int, height: int, settings: RenderSettings, device: wp.Device):
+    def __init__(
+        self, count: int, width: int, height: int, settings: RenderSettings, device: wp.Device
+    ):
         """Reserve memory for ``count`` Gaussians and an image of ``width`` x ``height``."""
         self.count, self.width, self.height = count, width, height
         self.settings, self.device = settings, device
@@ -178,13 +196,17 @@ class Buffers:
         self.splats = self.array("splats", count, Splat)
         self.box_px = self.array("boxes", count, wp.vec4i)
         self.depth_shift = settings.depth_shift
-        self.depth_key = self.array("depth keys", 2 * count)  # the radix sort needs twice the length
+        # the radix sort needs twice the length
+        self.depth_key = self.array("depth keys", 2 * count)
         self.order = self.array("order", 2 * count)
-        self.binned = 0 < count <= BINNED_MAX[kind] and not self.ordered  # whether no sort is needed for the order
+        # whether no sort is needed for the order
+        self.binned = 0 < count <= BINNED_MAX[kind] and not self.ordered
         self.words = 2 * math.ceil(count / 64)  # of a tile in a matrix of a bit per tile and splat
         self.matrix = math.ceil(self.tiles / tile_bitmask.GROUP) * tile_bitmask.GROUP * self.words
-        self.marks = not self.ordered and 4 * self.matrix <= MATRIX_MAX  # whether lists of tiles are made of it
-        steps = math.ceil(self.words / 64) / math.ceil(READERS / self.tiles)  # of a warp, two words a lane
+        # whether lists of tiles are made of it
+        self.marks = not self.ordered and 4 * self.matrix <= MATRIX_MAX
+        # of a warp, two words a lane
+        steps = math.ceil(self.words / 64) / math.ceil(READERS / self.tiles)
         self.part = 64 * max(1, math.ceil(steps))  # words of a tile that a warp reads
         self.parts = math.ceil(self.words / self.part)
         entries = self.tiles * self.parts if self.marks else count
@@ -193,7 +215,8 @@ class Buffers:
         self.keys = self.ids = self.owners = self.array("no pairs", 0)
         self.sums = self.planes("light", LIGHT_PLANES)
         self.channels: list[Planes] = []
-        self.records: list[wp.array] = []  # of each pass: ``splats``, and copies with other channels
+        # of each pass: ``splats``, and copies with other channels
+        self.records: list[wp.array] = []
 
     @property
     def ordered(self) -> bool:
@@ -202,12 +225,16 @@ class Buffers:
 
     @property
     def cooperative(self) -> bool:
-        """Whether the lanes of a warp fetch records for each other, as they may where a warp owns a tile."""
+        """Whether the lanes of a warp fetch records for each other,
+        as they may where a warp owns a tile.
+        """
         return self.K == 1
 
     @property
     def groups_with_light(self) -> int:
-        """Groups of channels that are blended together with the light: two where a warp owns a tile, else one."""
+        """Groups of channels that are blended together with the light:
+        two where a warp owns a tile, else one.
+        """
         return min(len(self.channels), 2 if self.cooperative and self.threads == 1 else 1)
 
     def array(self, name: str, shape: int | tuple[int, ...], dtype=wp.int32) -> wp.array:
@@ -236,20 +263,27 @@ class Buffers:
         Raises:
             ValueError: With the number of pairs that would have fitted.
         """
-        capacity, needed = self.settings.pair_capacity, int(self.total.numpy()[0]) if self.count else 0
+        capacity, needed = (
+            self.settings.pair_capacity,
+            int(self.total.numpy()[0]) if self.count else 0,
+        )
         if capacity is not None and needed > capacity:
             raise ValueError(
-                f"pair_capacity = {capacity} is too small: this rendering has {needed} (tile, splat) pairs"
+                f"pair_capacity = {capacity} is too small: this rendering has {needed} (tile, "
+                f"splat) pairs"
             )
 
     def planes(self, name: str, count: int) -> Planes:
         """``count`` image planes in tile order."""
         if name not in self._planes:
-            self._planes[name] = Planes(self.array(name, Planes.shape_of(self, count), wp.float32), self)
+            self._planes[name] = Planes(
+                self.array(name, Planes.shape_of(self, count), wp.float32), self
+            )
         return self._planes[name]
 
     def gradient_planes(self, name: str, count: int, *, added: bool) -> Planes:
-        """Zeroed planes: pixels of a tile that lie outside the image are never written, and must not hold a NaN.
+        """Zeroed planes: pixels of a tile that lie outside the image are never written, and must
+        not hold a NaN.
 
         Where all others are written and not ``added`` to, once is enough.
         """
@@ -261,7 +295,9 @@ class Buffers:
 
 
 class Planes:
-    """Image planes in tile order as two views: ``lanes`` for the compositor, ``flat`` for kernels per pixel."""
+    """Image planes in tile order as two views: ``lanes`` for the compositor,
+    ``flat`` for kernels per pixel.
+    """
 
     def __init__(self, flat: wp.array, buffers: Buffers):
         self.flat = flat
@@ -276,8 +312,8 @@ class Planes:
     def shape_of(buffers: Buffers, count: int) -> tuple[int, int]:
         """Planes and their floats, with one tile of padding.
 
-        320 x 240 floats are exactly 75 pages, and a loop that touches the same pixel of nine such planes would keep
-        evicting its own cache lines.
+        320 x 240 floats are exactly 75 pages, and a loop that touches the same pixel of nine such
+        planes would keep evicting its own cache lines.
         """
         return count, (buffers.tiles + 1) * buffers.lanes * buffers.K
 
@@ -285,16 +321,19 @@ class Planes:
 class Workspace:
     """Memory that renderings of one size share, one after the other.
 
-    With one workspace, renderings of the same number of Gaussians and the same size allocate nothing but images and
-    gradients, and a CUDA graph can be replayed. Backward must come before the next rendering with it. Another size or
-    setting allocates new memory and releases the old, which graphs captured with it must not outlive.
+    With one workspace, renderings of the same number of Gaussians and the same size allocate
+    nothing but images and gradients, and a CUDA graph can be replayed. Backward must come before
+    the next rendering with it. Another size or setting allocates new memory and releases the old,
+    which graphs captured with it must not outlive.
     """
 
     def __init__(self) -> None:
         self._key: tuple | None = None
         self._buffers: Buffers | None = None
 
-    def buffers(self, count: int, width: int, height: int, settings: RenderSettings, device: wp.Device) -> Buffers:
+    def buffers(
+        self, count: int, width: int, height: int, settings: RenderSettings, device: wp.Device
+    ) -> Buffers:
         """The buffers of the last rendering if it was of this kind, otherwise a new one."""
         key = count, width, height, settings, device
         if self._buffers is None or self._key != key:

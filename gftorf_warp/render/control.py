@@ -1,4 +1,6 @@
-"""Camera pose, intrinsics, calibration and shifts in device memory, so that one CUDA graph serves all of them."""
+"""Camera pose, intrinsics, calibration and shifts in device memory,
+so that one CUDA graph serves all of them.
+"""
 
 from __future__ import annotations
 
@@ -23,30 +25,38 @@ CALIBRATION = 4
 class DeviceCamera:
     """What a rendering reads of camera and sensor when its kernels run.
 
-    Width, height, the number of shifts and whether the lens distorts are not here: they choose kernels and launch
-    sizes, so they stay those of the camera and sensor that ``rasterize`` is called with.
+    Width, height, the number of shifts and whether the lens distorts are not here: they choose
+    kernels and launch sizes, so they stay those of the camera and sensor that ``rasterize`` is
+    called with.
     """
 
     view: Float[Tensor, " V"]
     """The bits of a ``CameraView``."""
     calibration: Float[Tensor, "4"]
-    """Phase slope [rad/m], phase offset [rad], source intensity, DC offset; may require a gradient."""
+    """Phase slope [rad/m], phase offset [rad], source intensity, DC offset; may require a
+    gradient."""
     shifts: Float[Tensor, "Q 2"]
     """(cos, sin) of the phase shifts."""
 
     @classmethod
     def over(cls, row: Float[Tensor, " P"]) -> DeviceCamera:
-        """Views of a row of :func:`packed` on a device: whatever is written to it later is what is rendered."""
+        """Views of a row of :func:`packed` on a device:
+        whatever is written to it later is what is rendered.
+        """
         view, calibration, shifts = row.split([VIEW, CALIBRATION, len(row) - VIEW - CALIBRATION])
         return cls(view=view, calibration=calibration, shifts=shifts.view(-1, 2))
 
 
 def packed(camera: Camera, sensor: Sensor, settings: RenderSettings) -> Float[np.ndarray, " P"]:
-    """Camera, calibration and shifts of one image as one row, P = V + 4 + 2 Q; copy its bits, do no arithmetic."""
+    """Camera, calibration and shifts of one image as one row, P = V + 4 + 2 Q; copy its bits,
+    do no arithmetic.
+    """
     calibration = sensor.phase_slope, sensor.phase_offset, sensor.source_intensity, sensor.dc_offset
     numbers = [float(v.detach() if isinstance(v, Tensor) else v) for v in calibration]
     numbers += [part for shift in sensor.shifts for part in (math.cos(shift), math.sin(shift))]
-    return np.concatenate([view_bits(camera, settings).view(np.float32), np.array(numbers, dtype=np.float32)])
+    return np.concatenate(
+        [view_bits(camera, settings).view(np.float32), np.array(numbers, dtype=np.float32)]
+    )
 
 
 def check(control: DeviceCamera, shifts: int, device: torch.device) -> None:
@@ -55,10 +65,16 @@ def check(control: DeviceCamera, shifts: int, device: torch.device) -> None:
     Raises:
         ValueError: If one has another shape or kind or lives elsewhere.
     """
-    for name, shape in (("view", (VIEW,)), ("calibration", (CALIBRATION,)), ("shifts", (shifts, 2))):
+    for name, shape in (
+        ("view", (VIEW,)),
+        ("calibration", (CALIBRATION,)),
+        ("shifts", (shifts, 2)),
+    ):
         tensor = getattr(control, name)
         if tensor.shape != shape or tensor.dtype != torch.float32 or tensor.device != device:
             found = f"{tuple(tensor.shape)} of {tensor.dtype} on {tensor.device}"
-            raise ValueError(f"control.{name} is {found}, must be {shape} of torch.float32 on {device}")
+            raise ValueError(
+                f"control.{name} is {found}, must be {shape} of torch.float32 on {device}"
+            )
         if not tensor.is_contiguous():
             raise ValueError(f"control.{name} must be contiguous")

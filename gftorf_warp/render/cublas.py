@@ -1,4 +1,6 @@
-"""The layers of the motion network by cuBLAS, for GPUs without kernels of ours, and for the CPU as their reference."""
+"""The layers of the motion network by cuBLAS, for GPUs without kernels of ours,
+and for the CPU as their reference.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,8 @@ from torch import Tensor
 from .cuda import side_stream
 from .layers import ALIGNED, LARGEST, SMALLEST, Form, LayerGradients, Layers
 
-PIECE = 21_120  # rows of a product at most: two full waves of 128 x 160 results on 132 multiprocessors
+# rows of a product at most: two full waves of 128 x 160 results on 132 multiprocessors
+PIECE = 21_120
 FOLD = 64  # rows side by side in a sum over rows, if their number is a multiple
 BLOCKS = 8  # into which a weight is cut to be rounded
 
@@ -21,7 +24,12 @@ class CublasLayers(Layers):
     """Layer by layer, by torch's matrix products."""
 
     def forward(
-        self, form: Form, position: Tensor, time: Tensor, weights: tuple[Tensor, ...], biases: tuple[Tensor, ...]
+        self,
+        form: Form,
+        position: Tensor,
+        time: Tensor,
+        weights: tuple[Tensor, ...],
+        biases: tuple[Tensor, ...],
     ) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
         """As the base class says."""
         factors, shifts = _rounded(form, weights, biases)
@@ -51,13 +59,21 @@ class CublasLayers(Layers):
         torch.div(gradient, unit, out=head[:, : gradient.shape[1]])
         gradients, after = torch.empty_like(outputs), head
         for number in reversed(range(len(outputs))):
-            factor, slope, before = saved[number + 1][:, : form.width], gradients[number], outputs[number]
+            factor, slope, before = (
+                saved[number + 1][:, : form.width],
+                gradients[number],
+                outputs[number],
+            )
             for key, begin, end in _pieces(keys, len(after) // keys):
                 rows = slice(key * len(after) // keys + begin, key * len(after) // keys + end)
                 torch.mm(after[rows], factor, out=slope[rows])
-                torch.ops.aten.threshold_backward.grad_input(slope[rows], before[rows], 0.0, grad_input=slope[rows])
+                torch.ops.aten.threshold_backward.grad_input(
+                    slope[rows], before[rows], 0.0, grad_input=slope[rows]
+                )
             after = slope
-        return LayerGradients(unit, head, gradients, _sums(gradients, keys, gradient.dtype), _sum_rows(gradient))
+        return LayerGradients(
+            unit, head, gradients, _sums(gradients, keys, gradient.dtype), _sum_rows(gradient)
+        )
 
     def parameter_gradients(
         self, form: Form, position: Tensor, time: Tensor, gradients: LayerGradients, outputs: Tensor
@@ -72,10 +88,14 @@ class CublasLayers(Layers):
             positions = position.new_empty(keys, len(position), form.columns)
             _copy(positions, position.expand(keys, -1, -1))
             for number, weight in zip(form.entries, found.of_positions(form), strict=True):
-                product(gradients.layers[number].T, positions.flatten(0, 1), weight.dtype, out=weight)
+                product(
+                    gradients.layers[number].T, positions.flatten(0, 1), weight.dtype, out=weight
+                )
             for number in form.entries:
                 weight = found.weights[number]
-                torch.mm(gradients.sums[number].T, time, out=weight[:, weight.shape[1] - form.time :])
+                torch.mm(
+                    gradients.sums[number].T, time, out=weight[:, weight.shape[1] - form.time :]
+                )
         _products(gradients.layers[1:].mT, outputs[:-1], out=found.square)
         side.join()
         if form.joined is not None:
@@ -84,10 +104,12 @@ class CublasLayers(Layers):
 
 
 class _ParameterGradients:
-    """One buffer for the gradients of all parameters, so that one kernel multiplies them by the unit.
+    """One buffer for the gradients of all parameters, so that one kernel multiplies them by the
+    unit.
 
-    Weights of outputs of layers come first, for one batched product; those of the joined layer, whose rows are longer,
-    are copied from there. Biases come last, that of the head behind all others, since it is not multiplied.
+    Weights of outputs of layers come first, for one batched product; those of the joined layer,
+    whose rows are longer, are copied from there. Biases come last, that of the head behind all
+    others, since it is not multiplied.
     """
 
     def __init__(self, form: Form, time: Tensor, layers: int, gradients: LayerGradients):
@@ -114,9 +136,14 @@ class _ParameterGradients:
         self.biases = biases.view(layers, width)
 
     def of_positions(self, form: Form) -> list[Tensor]:
-        """Weights of gamma(x), with the first column of those of gamma(t) where rows of gamma(x) are padded."""
+        """Weights of gamma(x), with the first column of those of gamma(t) where rows of gamma(x)
+        are padded.
+        """
         firsts = [form.width if number else 0 for number in form.entries]
-        return [self.weights[n][:, first : first + form.columns] for n, first in zip(form.entries, firsts, strict=True)]
+        return [
+            self.weights[n][:, first : first + form.columns]
+            for n, first in zip(form.entries, firsts, strict=True)
+        ]
 
     def times(self, unit: Tensor) -> list[Tensor]:
         """Weight and bias of every layer, then of the head, multiplied by the unit."""
@@ -128,7 +155,9 @@ class _ParameterGradients:
 
 
 def _pieces(keys: int, count: int) -> list[tuple[int, int, int]]:
-    """Key, first and last row of the parts in which rows are multiplied, of equal length up to a row."""
+    """Key, first and last row of the parts in which rows are multiplied,
+    of equal length up to a row.
+    """
     parts = max(-(-count // PIECE), 1)
     ends = [count * part // parts for part in range(parts + 1)]
     return [(key, *span) for key in range(keys) for span in pairwise(ends)]
@@ -153,9 +182,15 @@ def _joined_input(form: Form, position: Tensor, keys: int) -> Float[Tensor, "row
 
 
 def _copy(to: Tensor, rows: Tensor) -> None:
-    """Copy rows in units of 16 bytes, if both begin at multiples of it: a fraction of the time that halves take."""
+    """Copy rows in units of 16 bytes, if both begin at multiples of it:
+    a fraction of the time that halves take.
+    """
     step = 16 // to.element_size()
-    if all(n % step == 0 for one in (to, rows) for n in (one.shape[-1], one.storage_offset(), *one.stride()[:-1])):
+    if all(
+        n % step == 0
+        for one in (to, rows)
+        for n in (one.shape[-1], one.storage_offset(), *one.stride()[:-1])
+    ):
         to, rows = to.view(torch.complex128), rows.view(torch.complex128)
     to.copy_(rows)
 
@@ -165,15 +200,19 @@ def _sums(
 ) -> Float[Tensor, "layers k width"]:
     """Sums over the rows of each key, by products with zeros and ones.
 
-    A product of few rows with many columns fills a GPU without splitting its sum; the columns are added
-    later. Rows are padded to 16 bytes.
+    A product of few rows with many columns fills a GPU without splitting its sum; the columns are
+    added later. Rows are padded to 16 bytes.
     """
     layers, rows, width = gradients.shape
     fold = math.gcd(rows // keys, FOLD)
     choice = gradients.new_zeros(keys, rows // keys // fold, -(-keys // ALIGNED) * ALIGNED)
     choice.diagonal(dim1=0, dim2=2).fill_(1.0)
     sums = gradients.new_empty(layers, choice.shape[2], fold * width, dtype=dtype)
-    _products(choice.flatten(0, 1).T.expand(layers, -1, -1), gradients.view(layers, -1, fold * width), out=sums)
+    _products(
+        choice.flatten(0, 1).T.expand(layers, -1, -1),
+        gradients.view(layers, -1, fold * width),
+        out=sums,
+    )
     return sums.view(layers, -1, fold, width)[:, :keys].sum(2)
 
 
@@ -189,22 +228,38 @@ def _sum_rows(values: Float[Tensor, "rows v"]) -> Float[Tensor, "v"]:
     return values.reshape(-1, fold * width).sum(0).view(fold, width).sum(0)
 
 
-def _rounded(form: Form, weights: tuple[Tensor, ...], biases: tuple[Tensor, ...]) -> tuple[list[Tensor], list[Tensor]]:
-    """Copies of weights and biases as factors: without the columns of gamma(t), the head with rows of zeros below it.
+def _rounded(
+    form: Form, weights: tuple[Tensor, ...], biases: tuple[Tensor, ...]
+) -> tuple[list[Tensor], list[Tensor]]:
+    """Copies of weights and biases as factors: without the columns of gamma(t), the head with rows
+    of zeros below it.
 
-    Where ``columns`` has more than gamma(x), a column of gamma(t) meets a column of zeros. Whole ones are cut into
-    blocks of rows, since torch gives 65,536 values of a tensor to one block of threads.
+    Where ``columns`` has more than gamma(x), a column of gamma(t) meets a column of zeros. Whole
+    ones are cut into blocks of rows, since torch gives 65,536 values of a tensor to one block of
+    threads.
     """
     widths = [weight.shape[1] for weight in weights[:-1]]
     for number in form.entries:
         widths[number] += form.columns - form.position - form.time
-    head = weights[-1].new_zeros(-(-len(weights[-1]) // ALIGNED) * ALIGNED, form.width, dtype=form.dtype)
+    head = weights[-1].new_zeros(
+        -(-len(weights[-1]) // ALIGNED) * ALIGNED, form.width, dtype=form.dtype
+    )
     made = [head.new_empty(form.width, columns) for columns in widths]
     shifts = [torch.empty_like(bias, dtype=form.dtype) for bias in biases[:-1]]
-    whole = [number for number, weight in enumerate(weights[:-1]) if weight.shape == made[number].shape]
+    whole = [
+        number for number, weight in enumerate(weights[:-1]) if weight.shape == made[number].shape
+    ]
     torch._foreach_copy_(
-        [*(part for number in whole for part in made[number].chunk(BLOCKS)), *shifts, head[: len(weights[-1])]],
-        [*(part for number in whole for part in weights[number].chunk(BLOCKS)), *biases[:-1], weights[-1]],
+        [
+            *(part for number in whole for part in made[number].chunk(BLOCKS)),
+            *shifts,
+            head[: len(weights[-1])],
+        ],
+        [
+            *(part for number in whole for part in weights[number].chunk(BLOCKS)),
+            *biases[:-1],
+            weights[-1],
+        ],
     )
     for number, factor in enumerate(made):
         if number not in whole:
@@ -213,7 +268,11 @@ def _rounded(form: Form, weights: tuple[Tensor, ...], biases: tuple[Tensor, ...]
 
 
 def product(
-    left: Float[Tensor, "a b"], right: Float[Tensor, "b c"], dtype: torch.dtype, *, out: Tensor | None = None
+    left: Float[Tensor, "a b"],
+    right: Float[Tensor, "b c"],
+    dtype: torch.dtype,
+    *,
+    out: Tensor | None = None,
 ) -> Float[Tensor, "a c"]:
     """A product whose result is not rounded to its factors' precision."""
     if left.dtype == dtype:
@@ -223,8 +282,12 @@ def product(
     return torch.mm(left.to(dtype), right.to(dtype), out=out)
 
 
-def _products(left: Float[Tensor, "n a b"], right: Float[Tensor, "n b c"], *, out: Float[Tensor, "n a c"]) -> None:
-    """Several products that fill a GPU together; one after the other where their results would be rounded."""
+def _products(
+    left: Float[Tensor, "n a b"], right: Float[Tensor, "n b c"], *, out: Float[Tensor, "n a c"]
+) -> None:
+    """Several products that fill a GPU together; one after the other where their results would be
+    rounded.
+    """
     if left.is_cuda and left.dtype != out.dtype and hasattr(torch.ops.aten.bmm, "dtype_out"):
         torch.bmm(left, right, out_dtype=out.dtype, out=out)
         return

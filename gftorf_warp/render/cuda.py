@@ -1,4 +1,6 @@
-"""Streams, events and graphs of CUDA: the only module that uses them. On a CPU everything runs in order, at once."""
+"""Streams, events and graphs of CUDA: the only module that uses them.
+On a CPU everything runs in order, at once.
+"""
 
 from __future__ import annotations
 
@@ -18,14 +20,19 @@ from torch import Tensor
 
 SLOTS = 8  # uploads, or readbacks, that may be in flight
 HOST_BYTES = 1 << 28  # of page-locked memory at most: the system cannot use it for anything else
-PAGE = 4096  # [bytes] alignment of readback buffers on the host, with which a disk writes them without a copy
+# [bytes] alignment of readback buffers on the host, with which a disk writes them without a copy
+PAGE = 4096
 
 
 def stream_of(tensor: Tensor):
-    """Warp's launches inside this context go to torch's current stream of the device of ``tensor``."""
+    """Warp's launches inside this context go to torch's current stream of the device of
+    ``tensor``.
+    """
     wp.init()
     if tensor.is_cuda:
-        return wp.ScopedStream(_warp_stream(torch.cuda.current_stream(tensor.device)), sync_enter=False)
+        return wp.ScopedStream(
+            _warp_stream(torch.cuda.current_stream(tensor.device)), sync_enter=False
+        )
     return contextlib.nullcontext()
 
 
@@ -33,15 +40,17 @@ def stream_of(tensor: Tensor):
 def _warp_stream(stream: torch.cuda.Stream) -> wp.Stream:
     """The one Warp stream over a torch stream, kept for good.
 
-    Warp identifies a stream by its handle and forgets it, with its scratch memory and capture, as soon as any of the
-    objects over that handle is deleted.
+    Warp identifies a stream by its handle and forgets it, with its scratch memory and capture, as
+    soon as any of the objects over that handle is deleted.
     """
     return wp.stream_from_torch(stream)
 
 
 @contextlib.contextmanager
 def without_garbage_collection() -> Iterator[None]:
-    """Disable Python's cyclic garbage collector: to free an older graph would invalidate a capture in progress."""
+    """Disable Python's cyclic garbage collector: to free an older graph would invalidate a capture
+    in progress.
+    """
     enabled = gc.isenabled()
     gc.disable()
     try:
@@ -52,21 +61,28 @@ def without_garbage_collection() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def capture(graph: torch.cuda.CUDAGraph, stream: torch.cuda.Stream | None = None, pool: Any = None) -> Iterator[None]:
-    """Capture torch's and Warp's work inside the block, backward passes included, in a graph that torch replays.
+def capture(
+    graph: torch.cuda.CUDAGraph, stream: torch.cuda.Stream | None = None, pool: Any = None
+) -> Iterator[None]:
+    """Capture torch's and Warp's work inside the block, backward passes included, in a graph that
+    torch replays.
 
-    The same work must have run before on ``stream``: that loads modules, uploads constants and starts libraries. A
-    rendering needs a pair capacity; with a ``Workspace`` a replay allocates nothing either. What the graph reads and
-    writes must outlive it.
+    The same work must have run before on ``stream``: that loads modules, uploads constants and
+    starts libraries. A rendering needs a pair capacity; with a ``Workspace`` a replay allocates
+    nothing either. What the graph reads and writes must outlive it.
 
     Args:
         graph: An empty one.
         stream: Where to capture, not the default stream; None: one of torch's own.
-        pool: Memory shared with graphs that are replayed one after the other, see :func:`graph_pool`; None: its own.
+        pool: Memory shared with graphs that are replayed one after the other, see
+            :func:`graph_pool`; None: its own.
     """
     wp.init()
     mode = "thread_local"  # Warp's own assumption
-    with without_garbage_collection(), torch.cuda.graph(graph, pool=pool, stream=stream, capture_error_mode=mode):
+    with (
+        without_garbage_collection(),
+        torch.cuda.graph(graph, pool=pool, stream=stream, capture_error_mode=mode),
+    ):
         with wp.ScopedCapture(stream=_warp_stream(torch.cuda.current_stream()), external=True):
             yield
 
@@ -77,14 +93,20 @@ def graph_pool(device: torch.device) -> Any:
 
 
 class CapturedGraph:
-    """A function as a CUDA graph: captured at the first call, replayed from then on; on a CPU it is called.
+    """A function as a CUDA graph: captured at the first call, replayed from then on; on a CPU it is
+    called.
 
-    What it reads and writes must keep its addresses, and it must not synchronise with the device. What it allocates
-    belongs to the graph and is valid until the next graph of its pool is replayed.
+    What it reads and writes must keep its addresses, and it must not synchronise with the device.
+    What it allocates belongs to the graph and is valid until the next graph of its pool is
+    replayed.
     """
 
     def __init__(
-        self, work: Callable[[], None], device: torch.device, ready: Callable[[], None] | None = None, pool: Any = None
+        self,
+        work: Callable[[], None],
+        device: torch.device,
+        ready: Callable[[], None] | None = None,
+        pool: Any = None,
     ):
         """Wrap ``work``.
 
@@ -113,10 +135,12 @@ class CapturedGraph:
 
 
 class SideStreams:
-    """Streams that fork from torch's current one and join it again, so that independent work may overlap.
+    """Streams that fork from torch's current one and join it again, so that independent work may
+    overlap.
 
-    A captured graph gets as many branches; a backward pass runs on the stream of its forward operation. Where thread
-    blocks of several streams wait, those of the earlier stream go first; the first one should have the most work.
+    A captured graph gets as many branches; a backward pass runs on the stream of its forward
+    operation. Where thread blocks of several streams wait, those of the earlier stream go first;
+    the first one should have the most work.
     """
 
     def __init__(self, count: int, device: torch.device, *, fewest: int = 2):
@@ -129,12 +153,16 @@ class SideStreams:
         """
         self._device, self._streams = device, []
         if device.type != "cpu" and count >= fewest:
-            self._streams = [torch.cuda.Stream(device, priority=n + 1 - count) for n in range(count)]
+            self._streams = [
+                torch.cuda.Stream(device, priority=n + 1 - count) for n in range(count)
+            ]
         self._open: set[torch.cuda.Stream] = set()
 
     @contextlib.contextmanager
     def fork(self, number: int = 0, *, wait: bool = True) -> Iterator[None]:
-        """Work inside the block goes to stream ``number``; with ``wait`` behind all earlier work of the current one."""
+        """Work inside the block goes to stream ``number``;
+        with ``wait`` behind all earlier work of the current one.
+        """
         if not self._streams:
             yield
             return
@@ -159,9 +187,11 @@ def side_stream(device: torch.device) -> SideStreams:
 
 
 class DeviceUpload:
-    """Numbers of 32 bits that the host writes before every step and the device reads; neither waits.
+    """Numbers of 32 bits that the host writes before every step and the device reads; neither
+    waits.
 
-    All kinds are uploaded in one copy: each copy takes 3 us of a stream of an H200, however short it is.
+    All kinds are uploaded in one copy: each copy takes 3 us of a stream of an H200, however short
+    it is.
     """
 
     def __init__(self, lengths: Sequence[tuple[int, torch.dtype]], device: torch.device):
@@ -174,18 +204,26 @@ class DeviceUpload:
         remote, sizes = device.type != "cpu", [length for length, _ in lengths]
 
         def parts_of(memory: Tensor) -> list[Tensor]:
-            return [part.view(dtype) for part, (_, dtype) in zip(memory.split(sizes), lengths, strict=True)]
+            return [
+                part.view(dtype)
+                for part, (_, dtype) in zip(memory.split(sizes), lengths, strict=True)
+            ]
 
         self._memory = torch.zeros(sum(sizes), dtype=torch.int32, device=device)
         self.parts = parts_of(self._memory)
         """Device memory, in the order of ``lengths``."""
-        slots = [torch.zeros(sum(sizes), dtype=torch.int32, pin_memory=remote) for _ in range(SLOTS if remote else 1)]
+        slots = [
+            torch.zeros(sum(sizes), dtype=torch.int32, pin_memory=remote)
+            for _ in range(SLOTS if remote else 1)
+        ]
         self._slots = [(slot, parts_of(slot)) for slot in slots]
         self._uploaded: list[torch.cuda.Event | None] = [None] * len(slots)
         self._next = 0
 
     def send(self, *numbers: Sequence[float] | np.ndarray) -> None:
-        """Upload the first elements of every part, in the order of the current stream; others are undefined then."""
+        """Upload the first elements of every part, in the order of the current stream;
+        others are undefined then.
+        """
         (slot, parts), event = self._slots[self._next], self._uploaded[self._next]
         if event is not None:
             event.synchronize()  # of ``SLOTS`` uploads ago
@@ -203,12 +241,17 @@ class DeviceReadback:
 
     def __init__(self, source: Tensor):
         self._source = source
-        self._slots = [torch.zeros_like(source, device="cpu", pin_memory=source.is_cuda) for _ in range(SLOTS)]
-        self._requested: list[tuple[Tensor, torch.cuda.Event | None]] = []  # from the oldest to the newest
+        self._slots = [
+            torch.zeros_like(source, device="cpu", pin_memory=source.is_cuda) for _ in range(SLOTS)
+        ]
+        # from the oldest to the newest
+        self._requested: list[tuple[Tensor, torch.cuda.Event | None]] = []
         self._next = 0
 
     def request(self) -> None:
-        """Read back the numbers as they are at this point of the stream, unless ``SLOTS`` readbacks are in flight."""
+        """Read back the numbers as they are at this point of the stream,
+        unless ``SLOTS`` readbacks are in flight.
+        """
         if len(self._requested) == SLOTS:
             return
         slot, event = self._slots[self._next], None
@@ -220,7 +263,9 @@ class DeviceReadback:
         self._next = (self._next + 1) % SLOTS
 
     def latest(self, *, wait: bool = False) -> list[int] | None:
-        """The newest numbers that arrived since the last call, None if there are none; ``wait``: for all requests."""
+        """The newest numbers that arrived since the last call, None if there are none; ``wait``:
+        for all requests.
+        """
         newest = None
         while self._requested:
             slot, event = self._requested[0]
@@ -234,10 +279,11 @@ class DeviceReadback:
 
 
 class ReadbackRing:
-    """Buffers on the device and on the host for images that are read back while the next ones are rendered.
+    """Buffers on the device and on the host for images that are read back while the next ones are
+    rendered.
 
-    ``copy`` takes a copy of memory that the next rendering overwrites, a second stream brings it to the host, and
-    ``wait`` returns it. At most ``ahead`` + 1 copies are in flight.
+    ``copy`` takes a copy of memory that the next rendering overwrites, a second stream brings it to
+    the host, and ``wait`` returns it. At most ``ahead`` + 1 copies are in flight.
     """
 
     def __init__(self, like: Tensor, *, ahead: int, kept: int, tail: int | None = None):
@@ -260,7 +306,8 @@ class ReadbackRing:
         far = torch.empty(count * length + page, dtype=like.dtype, pin_memory=self._remote)
         start = -far.data_ptr() % PAGE // like.element_size()
         self._far = far[start : start + count * length].view(count, length)[:, : self._tail]
-        self._free = deque(range(count))  # of ``_far``; callers may return one at any time, from any thread
+        # of ``_far``; callers may return one at any time, from any thread
+        self._free = deque(range(count))
         if self._remote:
             self._stream = torch.cuda.Stream(like.device)
             self._ready = [torch.cuda.Event() for _ in self._near]
@@ -301,8 +348,8 @@ class ReadbackRing:
     def keep(self, ticket: tuple[int, int]) -> Float[np.ndarray, " tail"]:
         """A copy that has arrived, as an array of the caller's.
 
-        Its buffer is returned when the array is deleted. While so many are held that the next copies need this one,
-        the array is an ordinary one, which costs a copy.
+        Its buffer is returned when the array is deleted. While so many are held that the next
+        copies need this one, the array is an ordinary one, which costs a copy.
         """
         near, far = ticket
         self._idle.append(near)
@@ -311,7 +358,8 @@ class ReadbackRing:
             array = array.copy()
             self._free.append(far)
         else:
-            weakref.finalize(array, self._free.append, far).atexit = False  # views of it keep a reference to it
+            # views of it keep a reference to it
+            weakref.finalize(array, self._free.append, far).atexit = False
         return array
 
     def close(self) -> None:

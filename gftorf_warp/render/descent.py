@@ -28,8 +28,9 @@ TOTAL_NAMES = ("quad_mse", "opacity", "loss", "count")
 class AdamTable:
     """Addresses of the tensors of an Adam step, valid as long as the tensors live.
 
-    Gradients may have other addresses in the next step: :meth:`point` notes them, :meth:`send` uploads
-    them. A CUDA graph may read the table: it is captured between the two, and replayed after both.
+    Gradients may have other addresses in the next step: :meth:`point` notes them, :meth:`send`
+    uploads them. A CUDA graph may read the table: it is captured between the two, and replayed
+    after both.
     """
 
     def __init__(
@@ -41,7 +42,8 @@ class AdamTable:
 
         Args:
             parameters: Float32, contiguous, on one device.
-            moments: (step, first moment, second moment) of each; the step is a float32 number there.
+            moments: (step, first moment, second moment) of each; the step is a float32 number
+                there.
 
         Raises:
             ValueError: If a tensor has another type, shape or device, or is not contiguous.
@@ -104,9 +106,13 @@ class AdamTable:
 
 def _check(tensor: Tensor, device: torch.device, shape: torch.Size | None) -> None:
     if tensor.dtype != torch.float32 or tensor.device != device or not tensor.is_contiguous():
-        raise ValueError(f"{tensor.dtype} on {tensor.device} must be contiguous float32 on {device}")
+        raise ValueError(
+            f"{tensor.dtype} on {tensor.device} must be contiguous float32 on {device}"
+        )
     if shape is not None and tensor.shape != shape:
-        raise ValueError(f"{tuple(tensor.shape)} must be {tuple(shape)}, the shape of the parameter")
+        raise ValueError(
+            f"{tuple(tensor.shape)} must be {tuple(shape)}, the shape of the parameter"
+        )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -119,7 +125,8 @@ class StepResults:
     pairs: Int[Tensor, "R"]
     """(tile, splat) pairs of every rendering of the latest step."""
     counts: Int[Tensor, "4"]
-    """Skipped steps, skipped steps in a row, most pairs of a rendering, steps with too many pairs."""
+    """Skipped steps, skipped steps in a row, most pairs of a rendering, steps with too many
+    pairs."""
     sums: Float[Tensor, "S"]
     """Weighted terms over the images of valid steps, then those of ``TOTAL_NAMES``."""
 
@@ -132,7 +139,9 @@ class StepResults:
         """
         if RESULTS * terms > COLUMNS_MAX or renderings > RENDERINGS_MAX:
             limits = f"{COLUMNS_MAX // RESULTS} terms and {RENDERINGS_MAX} renderings"
-            raise ValueError(f"{terms} terms and {renderings} renderings, at most {limits} per step")
+            raise ValueError(
+                f"{terms} terms and {renderings} renderings, at most {limits} per step"
+            )
         return cls(
             results=torch.zeros(images, RESULTS * terms, device=device),
             pairs=torch.zeros(renderings, dtype=torch.int32, device=device),
@@ -169,18 +178,28 @@ def descend(
         images: Number of images B.
         renderings: Number of renderings R.
         motion_from: First tensor of the motion.
-        motion_gradient_max: Largest gradient norm of these tensors, longer ones are clipped; None: any.
-        capacity: Pairs with memory in a rendering, the others were dropped; None: as many as there are.
+        motion_gradient_max: Largest gradient norm of these tensors, longer ones are clipped; None:
+            any.
+        capacity: Pairs with memory in a rendering, the others were dropped; None: as many as there
+            are.
         betas: Decays of the moments.
         epsilon: Added to the root of the second moment.
     """
     lanes = LANES if rates.is_cuda else 1
-    launch(step_end.gradient_squares, len(table.partials) * lanes, [table.rows, table.first_part], [table.partials])
+    launch(
+        step_end.gradient_squares,
+        len(table.partials) * lanes,
+        [table.rows, table.first_part],
+        [table.partials],
+    )
     inputs = [table.partials, table.parts[motion_from], motion_from]
     inputs += [motion_gradient_max is not None, motion_gradient_max or 0.0]
     inputs += [step.results, weights, images, compared, step.pairs, renderings]
     inputs += [capacity is not None, capacity or 0, table.rows, rates, *map(wp.float64, betas)]
-    threads, outputs = (step_end.THREADS if rates.is_cuda else 1), [step.counts, step.sums, table.sizes]
+    threads, outputs = (
+        (step_end.THREADS if rates.is_cuda else 1),
+        [step.counts, step.sums, table.sizes],
+    )
     launch(step_end.finish_step, threads, inputs, outputs, block_dim=step_end.THREADS)
     inputs = [table.rows, table.first_block, *(1.0 - beta for beta in betas), epsilon]
     launch(make_adam(_adam_block(rates)), table.blocks, inputs, [table.sizes])

@@ -1,4 +1,6 @@
-"""Displaced Gaussians: a motion at K keys, interpolated to the time of an image by one kernel (kernels/motion)."""
+"""Displaced Gaussians: a motion at K keys, interpolated to the time of an image by one kernel
+(kernels/motion).
+"""
 
 from __future__ import annotations
 
@@ -32,24 +34,38 @@ def displaced(
         mean: Undisplaced centres [m].
         quaternion: Undisplaced orientations wxyz, of any length but zero.
         motion: Displacements [m] and rotations at K keys.
-        weights: R = 1 + D rows over the keys, read when the kernel runs: interpolation weights of the time; then, for
-            each channel, the weights of the end of a flow minus those of its start.
+        weights: R = 1 + D rows over the keys, read when the kernel runs: interpolation weights of
+            the time; then, for each channel, the weights of the end of a flow minus those of its
+            start.
         channels: Whether the third result is computed, C = 3 D.
 
     Returns:
-        Centres; orientations, which are ``quaternion`` itself if the motion has no rotations; channels.
+        Centres; orientations, which are ``quaternion`` itself if the motion has no rotations;
+        channels.
 
     Raises:
         ValueError: If the numbers of keys disagree or something is not float32.
     """
     offset, rotation = motion
     if weights.ndim != 2 or weights.shape[1] != len(offset):
-        raise ValueError(f"weights {tuple(weights.shape)} must be (1 + D, {len(offset)}) for {len(offset)} keys")
-    wrong = [t.dtype for t in (mean, quaternion, offset, rotation, weights) if t is not None and t.dtype != mean.dtype]
+        raise ValueError(
+            f"weights {tuple(weights.shape)} must be (1 + D, {len(offset)}) for {len(offset)} keys"
+        )
+    wrong = [
+        t.dtype
+        for t in (mean, quaternion, offset, rotation, weights)
+        if t is not None and t.dtype != mean.dtype
+    ]
     if wrong or mean.dtype != torch.float32:
-        raise ValueError(f"mean, quaternion, motion and weights must be float32, got {mean.dtype} and {wrong}")
-    rotating = (None, None) if rotation is None else (quaternion.contiguous(), rotation.contiguous())
-    moved, turned, ways = _Displaced.apply(mean.contiguous(), offset.contiguous(), *rotating, weights, channels)
+        raise ValueError(
+            f"mean, quaternion, motion and weights must be float32, got {mean.dtype} and {wrong}"
+        )
+    rotating = (
+        (None, None) if rotation is None else (quaternion.contiguous(), rotation.contiguous())
+    )
+    moved, turned, ways = _Displaced.apply(
+        mean.contiguous(), offset.contiguous(), *rotating, weights, channels
+    )
     return moved, quaternion if turned is None else turned, ways
 
 
@@ -71,7 +87,12 @@ class _Displaced(torch.autograd.Function):
         turned = None if quaternion is None else torch.empty_like(quaternion)
         ways = mean.new_empty(len(mean), 3 * (len(weights) - 1)) if channels else None
         values = _vectors(mean, quaternion, offset, rotation)
-        _launch("displace", offset, [*values, array_over(weights)], [*_vectors(moved, turned), _triples(ways)])
+        _launch(
+            "displace",
+            offset,
+            [*values, array_over(weights)],
+            [*_vectors(moved, turned), _triples(ways)],
+        )
         ctx.save_for_backward(offset, quaternion, rotation, weights)
         return moved, turned, ways
 
@@ -83,23 +104,39 @@ class _Displaced(torch.autograd.Function):
         offset, quaternion, rotation, weights = ctx.saved_tensors
         _, of_offset, of_quaternion, of_rotation, *_ = ctx.needs_input_grad
         of_offset = of_offset and not (by_moved is None and by_ways is None)
-        of_quaternion, of_rotation = (needed and by_turned is not None for needed in (of_quaternion, of_rotation))
+        of_quaternion, of_rotation = (
+            needed and by_turned is not None for needed in (of_quaternion, of_rotation)
+        )
         grad_offset = torch.empty_like(offset) if of_offset else None
         grad_rotation = torch.empty_like(rotation) if of_rotation else None
         grad_quaternion = torch.empty_like(quaternion) if of_quaternion else None
         if of_offset or of_rotation or of_quaternion:
             given = [
-                None if cotangent is None else cotangent.contiguous() for cotangent in (by_moved, by_turned, by_ways)
+                None if cotangent is None else cotangent.contiguous()
+                for cotangent in (by_moved, by_turned, by_ways)
             ]
-            inputs = [*_vectors(quaternion, rotation), array_over(weights), *_vectors(*given[:2]), _triples(given[2])]
-            _launch("displace_backward", offset, inputs, _vectors(grad_offset, grad_rotation, grad_quaternion))
+            inputs = [
+                *_vectors(quaternion, rotation),
+                array_over(weights),
+                *_vectors(*given[:2]),
+                _triples(given[2]),
+            ]
+            _launch(
+                "displace_backward",
+                offset,
+                inputs,
+                _vectors(grad_offset, grad_rotation, grad_quaternion),
+            )
         return by_moved, grad_offset, grad_quaternion, grad_rotation, None, None
 
 
 def _vectors(*tensors: Tensor | None) -> list[wp.array | None]:
     """Warp arrays of the vectors in the last dimension, three or four numbers each."""
     kinds = {3: wp.vec3, 4: wp.vec4}
-    return [None if tensor is None else array_over(tensor, kinds[tensor.shape[-1]]) for tensor in tensors]
+    return [
+        None if tensor is None else array_over(tensor, kinds[tensor.shape[-1]])
+        for tensor in tensors
+    ]
 
 
 def _triples(channels: Float[Tensor, "N C"] | None) -> wp.array | None:

@@ -27,8 +27,12 @@ BLOCK = 16  # pixels of a row, or elements of a tensor, per CPU thread
 DTYPES = {torch.float32: wp.float32, torch.int32: wp.int32, torch.int64: wp.int64}
 
 
-def launch(kernel: Any, dim: Any, inputs: Sequence[Any], outputs: Sequence[Tensor], block_dim: int = 256) -> None:
-    """Launch a kernel over the memory of tensors, on torch's current stream; other inputs are passed on."""
+def launch(
+    kernel: Any, dim: Any, inputs: Sequence[Any], outputs: Sequence[Tensor], block_dim: int = 256
+) -> None:
+    """Launch a kernel over the memory of tensors, on torch's current stream;
+    other inputs are passed on.
+    """
 
     def argument(value: Any) -> Any:
         return array_over(value, DTYPES[value.dtype]) if isinstance(value, Tensor) else value
@@ -69,10 +73,11 @@ def image_loss(
     scratch: Scratch | None = None,
     out: Float[Tensor, "3"] | None = None,
 ) -> tuple[Float[Tensor, ""], Float[Tensor, ""], Float[Tensor, ""]]:
-    """(1 - ssim) times the mean squared or absolute difference + ssim (1 - SSIM), and the mean squared difference.
+    """(1 - ssim) times the mean squared or absolute difference + ssim (1 - SSIM), and the mean
+    squared difference.
 
-    Differentiable once, in ``rendered`` and through the first result only. Float32: where a window is nearly constant
-    its variance is a difference of close numbers, as it is in losses/image.py.
+    Differentiable once, in ``rendered`` and through the first result only. Float32: where a window
+    is nearly constant its variance is a difference of close numbers, as it is in losses/image.py.
 
     Args:
         rendered: What gradients reach.
@@ -92,7 +97,9 @@ def image_loss(
     """
     if rendered.shape != measured.shape[measured.ndim - 3 :]:
         shape = tuple(measured.shape[measured.ndim - 3 :])
-        raise ValueError(f"rendered {tuple(rendered.shape)} and measured {shape} must have one shape")
+        raise ValueError(
+            f"rendered {tuple(rendered.shape)} and measured {shape} must have one shape"
+        )
     for name, image in (("rendered", rendered), ("measured", measured)):
         if image.dtype != torch.float32 or image.device != rendered.device:
             want = f"float32 on {rendered.device}"
@@ -101,7 +108,9 @@ def image_loss(
     also = rendered.new_empty(0) if opacity is None else opacity.detach().contiguous().flatten()
     row = _first(rendered.device) if row is None else row
     out = rendered.new_empty(image_similarity.SUMS) if out is None else out
-    return _ImageLoss.apply(rendered.contiguous(), rows, row, also, float(ssim), absolute, scratch or Scratch(), out)
+    return _ImageLoss.apply(
+        rendered.contiguous(), rows, row, also, float(ssim), absolute, scratch or Scratch(), out
+    )
 
 
 @functools.cache
@@ -143,7 +152,9 @@ class _ImageLoss(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, grad_loss: Tensor | None, *_: Tensor | None) -> tuple[Tensor | None, ...]:
+    def backward(
+        ctx: Any, grad_loss: Tensor | None, *_: Tensor | None
+    ) -> tuple[Tensor | None, ...]:
         rendered, measured, row = ctx.saved_tensors
         if grad_loss is None:
             return (None,) * 8
@@ -165,7 +176,9 @@ def _similarity_of(image: Float[Tensor, "C H W"]) -> tuple[Any, tuple[int, int, 
 
 
 def _threads(count: int, like: Tensor) -> tuple[int, int]:
-    """Threads for so many elements, and their partial sums: one per warp of CUDA, per thread of a CPU."""
+    """Threads for so many elements, and their partial sums: one per warp of CUDA,
+    per thread of a CPU.
+    """
     if not like.is_cuda:
         return count, count
     parts = -(-count // ordered_sums.LANES)
@@ -176,7 +189,9 @@ def _means(partials: Tensor, scale: float, out: Tensor) -> None:
     """Rows of partial sums, added up and scaled."""
     threads = ordered_sums.THREADS if partials.is_cuda else 1
     dim = len(partials) * threads
-    launch(ordered_sums.means, dim, [partials, threads, scale], [out], block_dim=ordered_sums.THREADS)
+    launch(
+        ordered_sums.means, dim, [partials, threads, scale], [out], block_dim=ordered_sums.THREADS
+    )
 
 
 def flow_loss(
@@ -188,10 +203,11 @@ def flow_loss(
     row: Int[Tensor, "1"] | None = None,
     out: Float[Tensor, "1"] | None = None,
 ) -> Float[Tensor, ""]:
-    """Sum over F flows of the mean squared difference [px^2] to the flow of composited displacements.
+    """Sum over F flows of the mean squared difference [px^2] to the flow of composited
+    displacements.
 
-    Differentiable once, in ``displacement``. The mean is over all pixels and both components; unknown
-    ones count zero. losses/prior.py has the oracle.
+    Differentiable once, in ``displacement``. The mean is over all pixels and both components;
+    unknown ones count zero. losses/prior.py has the oracle.
 
     Args:
         distance: Of the surface [m], at least a micrometre where there is none.
@@ -205,7 +221,11 @@ def flow_loss(
         ValueError: If shapes do not fit or a tensor is not float32.
     """
     flows, size = len(cameras), tuple(distance.shape)
-    if tuple(displacement.shape) != (3 * flows, *size) or tuple(measured.shape[1:]) != (flows, 2, *size):
+    if tuple(displacement.shape) != (3 * flows, *size) or tuple(measured.shape[1:]) != (
+        flows,
+        2,
+        *size,
+    ):
         shapes = f"displacement {tuple(displacement.shape)} and measured {tuple(measured.shape)}"
         want = f"{(3 * flows, *size)} and (R, {flows}, 2, H, W) for {flows} flows of {size}"
         raise ValueError(f"{shapes} must be {want}")
@@ -262,7 +282,9 @@ def flow_cameras(camera: Camera, later: Sequence[Camera]) -> Float[np.ndarray, "
         there = then.camera_from_world
         between = there @ np.linalg.inv(here)
         pinholes = [camera.fx, camera.fy, camera.cx, camera.cy, then.fx, then.fy, then.cx, then.cy]
-        rows.append([*pinholes, *between[:3, :3].flatten(), *between[:3, 3], *there[:3, :3].flatten()])
+        rows.append(
+            [*pinholes, *between[:3, :3].flatten(), *between[:3, 3], *there[:3, :3].flatten()]
+        )
         if lens:
             radius = min(then.guard.radius, RADIUS_MAX)
             rows[-1] += [*astuple(camera.distortion), *astuple(then.distortion), radius]
@@ -272,11 +294,13 @@ def flow_cameras(camera: Camera, later: Sequence[Camera]) -> Float[np.ndarray, "
 def uniform(
     shape: tuple[int, ...], origin: Int[Tensor, "2"], amplitude: float, *, stream: int = 0
 ) -> Float[Tensor, "C H W"]:
-    """Random light, evenly in (-amplitude, amplitude), that is a function of its arguments and of nothing else.
+    """Random light, evenly in (-amplitude, amplitude), that is a function of its arguments and of
+    nothing else.
 
     Args:
         shape: (C, H, W).
-        origin: Seed and number of the image, int32, where the light is wanted; read when the kernel runs.
+        origin: Seed and number of the image, int32, where the light is wanted; read when the kernel
+            runs.
         amplitude: Largest absolute value [quad units].
         stream: Tells several images of one number apart.
     """
@@ -288,12 +312,14 @@ def uniform(
 
 
 def sum_for_gradients(weights: Sequence[Tensor], terms: Sequence[Tensor]) -> Float[Tensor, ""]:
-    """A sum of terms times weights of which only gradients are wanted: they cost nothing, and it has no value.
+    """A sum of terms times weights of which only gradients are wanted: they cost nothing, and it
+    has no value.
 
     Terms are numbers or of any shape, each with a weight of its own shape.
 
-    ``autograd.grad(terms, .., grad_outputs=weights)`` says the same, but torch looks at shapes of gradients that it is
-    given by means of sympy, whose import takes longer than the first thousand steps.
+    ``autograd.grad(terms, .., grad_outputs=weights)`` says the same, but torch looks at shapes of
+    gradients that it is given by means of sympy, whose import takes longer than the first thousand
+    steps.
     """
     return _Sum.apply(list(weights), *terms)
 

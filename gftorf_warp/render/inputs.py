@@ -21,7 +21,8 @@ class Inputs:
     opacity_logit: wp.array | None  # [N]
     reflectivity_sh: wp.array | None  # [N, 16]
     colour_sh: wp.array | None = None  # [N, 16] vec3
-    calibration: wp.array | None  # [4] phase slope [rad/m], phase offset [rad], source intensity, DC offset
+    # [4] phase slope [rad/m], phase offset [rad], source intensity, DC offset
+    calibration: wp.array | None
     background_quads: wp.array | None = None  # [Q, H, W]
     background_phasor: wp.array | None = None  # [3, H, W]
     background_colour: wp.array | None = None  # [3, H, W]
@@ -30,7 +31,9 @@ class Inputs:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class View:
-    """Camera and shifts of a rendering, read from device memory when its kernels run; without a derivative."""
+    """Camera and shifts of a rendering, read from device memory when its kernels run;
+    without a derivative.
+    """
 
     camera: wp.array
     """[1] CameraView."""
@@ -42,7 +45,9 @@ class View:
 
 @dataclass(kw_only=True, eq=False)
 class Images:
-    """Everything a rendering fills, row-major, None where it is not wanted; of a gradient set: where it is zero."""
+    """Everything a rendering fills, row-major, None where it is not wanted; of a gradient set:
+    where it is zero.
+    """
 
     quads: wp.array | None  # [Q, H, W]
     phasor: wp.array | None  # [3, H, W]
@@ -60,7 +65,9 @@ CHOICES = ("quads", "phasor", "distance", "opacity", "distortion")
 def shapes_of(quads: int, height: int, width: int, extra: int = 0) -> dict[str, tuple[int, ...]]:
     """Shape of every image by name, of so many quads and extra channels."""
     planes = {"quads": quads, "phasor": 3, "colour": 3, "extra": extra}
-    return dict.fromkeys(CHOICES, (height, width)) | {name: (n, height, width) for name, n in planes.items()}
+    return dict.fromkeys(CHOICES, (height, width)) | {
+        name: (n, height, width) for name, n in planes.items()
+    }
 
 
 def wanted_images(names: Collection[str]) -> frozenset[str]:
@@ -82,7 +89,11 @@ def names_of(kind: type) -> list[str]:
 
 def present_in(group: Inputs | Images) -> dict[str, wp.array]:
     """The arrays that are not None, by name."""
-    return {name: getattr(group, name) for name in names_of(type(group)) if getattr(group, name) is not None}
+    return {
+        name: getattr(group, name)
+        for name in names_of(type(group))
+        if getattr(group, name) is not None
+    }
 
 
 def gradients_in(group: Inputs | Images) -> dict[str, wp.array]:
@@ -91,7 +102,9 @@ def gradients_in(group: Inputs | Images) -> dict[str, wp.array]:
 
 
 def channel_groups(inputs: Inputs) -> list[tuple[str, int]]:
-    """(image, first channel) of each group of three T-weighted channels; the first rides along with the light."""
+    """(image, first channel) of each group of three T-weighted channels;
+    the first rides along with the light.
+    """
     groups = [("colour", 0)] if inputs.colour_sh is not None else []
     if inputs.extra is not None:
         groups += [("extra", start) for start in range(0, inputs.extra.shape[1], 3)]

@@ -43,7 +43,12 @@ def view_of(camera: Camera, settings: RenderSettings) -> CameraView:
     view.translation = wp.vec3(*pose[:3, 3])
     view.centre = wp.vec3(*camera.centre)
     view.fx, view.fy, view.cx, view.cy = camera.fx, camera.fy, camera.cx, camera.cy
-    view.width, view.height, view.near, view.far = camera.width, camera.height, settings.near, settings.far
+    view.width, view.height, view.near, view.far = (
+        camera.width,
+        camera.height,
+        settings.near,
+        settings.far,
+    )
     if camera.distortion:
         view.guard_x, view.guard_y, view.radius = camera.guard
         view.k1, view.k2, view.p1, view.p2, view.k3 = astuple(camera.distortion)
@@ -55,15 +60,21 @@ def view_bits(camera: Camera, settings: RenderSettings) -> np.ndarray:
     return np.array([view_of(camera, settings).numpy_value()], dtype=VIEW_DTYPE)
 
 
-def uploaded(camera: Camera, shifts: Sequence[float], settings: RenderSettings, device: wp.Device) -> View:
+def uploaded(
+    camera: Camera, shifts: Sequence[float], settings: RenderSettings, device: wp.Device
+) -> View:
     """Camera and shifts [rad] in device memory; copied once, however often they are rendered."""
-    return _uploaded(view_bits(camera, settings).tobytes(), tuple(shifts), bool(camera.distortion), str(device))
+    return _uploaded(
+        view_bits(camera, settings).tobytes(), tuple(shifts), bool(camera.distortion), str(device)
+    )
 
 
 @lru_cache(maxsize=UPLOADED_MAX)
 def _uploaded(bits: bytes, shifts: tuple[float, ...], lens: bool, device: str) -> View:
     camera = np.frombuffer(bits, dtype=VIEW_DTYPE)
-    vectors = np.array([(math.cos(shift), math.sin(shift)) for shift in shifts], dtype=np.float32).reshape(-1, 2)
+    vectors = np.array(
+        [(math.cos(shift), math.sin(shift)) for shift in shifts], dtype=np.float32
+    ).reshape(-1, 2)
     return View(
         camera=wp.array(camera, dtype=CameraView, device=device),
         shifts=wp.array(vectors, dtype=wp.vec2, device=device),
@@ -79,7 +90,9 @@ def render(inputs: Inputs, view: View, buffers: Buffers, images: Images) -> None
     forward(inputs, view, buffers, images)
     tape = wp._src.context.runtime.tape  # the public API has no name for the active tape
     if tape is not None:
-        arrays = [a for group in (inputs, images) for a in present_in(group).values() if a.requires_grad]
+        arrays = [
+            a for group in (inputs, images) for a in present_in(group).values() if a.requires_grad
+        ]
 
         def adjoint():
             cotangents = Images(**dict.fromkeys(names_of(Images)) | gradients_in(images))
@@ -97,10 +110,14 @@ def forward(
     *,
     differentiable: bool = True,
 ) -> None:
-    """Project, sort, composite, resolve; images that are None cost nothing, nor does what backward alone needs."""
+    """Project, sort, composite, resolve; images that are None cost nothing,
+    nor does what backward alone needs.
+    """
     buffers.turns += 1
     groups = channel_groups(inputs)
-    buffers.channels = [buffers.planes(f"channels {number}", CHANNEL_PLANES) for number in range(len(groups))]
+    buffers.channels = [
+        buffers.planes(f"channels {number}", CHANNEL_PLANES) for number in range(len(groups))
+    ]
     buffers.records = [buffers.splats]
     if buffers.count:
         stages.project(inputs, view, buffers)
@@ -115,7 +132,9 @@ def forward(
     else:
         buffers.first.zero_()
     for number in [0, *range(max(1, buffers.groups_with_light), len(buffers.records))]:
-        stages.composite(buffers, number, images.distortion is not None, differentiable=differentiable)
+        stages.composite(
+            buffers, number, images.distortion is not None, differentiable=differentiable
+        )
     stages.resolve_images(inputs, view, buffers, images, groups)
 
 
@@ -128,25 +147,34 @@ def backward(
     *,
     extra_detached: bool = False,
 ) -> wp.array:
-    """Add the gradients for ``cotangents`` to the arrays of ``wanted``; forward's results in the buffers stay.
+    """Add the gradients for ``cotangents`` to the arrays of ``wanted``; forward's results in the
+    buffers stay.
 
-    With ``extra_detached`` weights are held fixed under the extra images, so that only the extra channels learn.
+    With ``extra_detached`` weights are held fixed under the extra images, so that only the extra
+    channels learn.
 
     Returns:
-        [N] gradient records of the splats: slots 0 and 1 are the screen gradient, 6 the number of pixels, 7 the weight.
-        They belong to the buffers.
+        [N] gradient records of the splats: slots 0 and 1 are the screen gradient, 6 the number of
+        pixels, 7 the weight. They belong to the buffers.
     """
     groups = channel_groups(inputs)
-    grad_light, grad_channels = stages.fold_images(inputs, view, buffers, cotangents, wanted, groups)
+    grad_light, grad_channels = stages.fold_images(
+        inputs, view, buffers, cotangents, wanted, groups
+    )
     grad_splats = buffers.zeros("gradient records", buffers.count, splat.Splat)
     if not buffers.count:
         return grad_splats
-    distortion, fixed = cotangents.distortion is not None, [name == "extra" and extra_detached for name, _ in groups]
+    distortion, fixed = (
+        cotangents.distortion is not None,
+        [name == "extra" and extra_detached for name, _ in groups],
+    )
     first: dict[str, Any] = {"distortion": distortion, "fixed": bool(groups) and fixed[0]}
     together = buffers.groups_with_light > 1 and fixed[1] and grad_channels[1] is not None
     if together:
         first["grad_more"] = grad_channels[1]
-        first["more_records"] = buffers.zeros("gradient records of the second group", buffers.count, splat.Splat)
+        first["more_records"] = buffers.zeros(
+            "gradient records of the second group", buffers.count, splat.Splat
+        )
     stages.composite_backward(buffers, 0, grad_light, grad_channels[0], grad_splats, **first)
     for number, (name, start) in enumerate(groups):
         if grad_channels[number] is None:
@@ -155,8 +183,12 @@ def backward(
         if number == 1 and together:
             records = first["more_records"]
         elif number > 0:  # a further pass shares centres, conics and opacities with the first
-            records = buffers.zeros("gradient records of a further pass", buffers.count, splat.Splat)
-            stages.composite_backward(buffers, number, grad_light, grad_channels[number], records, fixed=fixed[number])
+            records = buffers.zeros(
+                "gradient records of a further pass", buffers.count, splat.Splat
+            )
+            stages.composite_backward(
+                buffers, number, grad_light, grad_channels[number], records, fixed=fixed[number]
+            )
             if not fixed[number]:
                 stages.add_geometry(records, grad_splats)
         if name == "extra" and wanted.extra is not None:

@@ -2,14 +2,18 @@
 
 With a = [gamma(x), gamma(t)] the layers are
 
-    z_n = W_n h_(n-1) + b_n,   h_n = max(z_n, 0),   h_-1 = a;   before layer ``joined`` h becomes [h, a]
+    z_n = W_n h_(n-1) + b_n,   h_n = max(z_n, 0),   h_-1 = a
 
-gamma(t) contributes one vector per key, a part of the bias: W a + b = W_x gamma(x) + (W_t gamma(t) + b). Backward, d_n
-being the gradient at z_n: dW_n = d_n^T h_(n-1), db_n = sum of d_n, d_(n-1) = d_n W_n where h_(n-1) > 0.
+and before layer ``joined`` h becomes [h, a].
 
-Factors are halves; sums, weights, biases with a time in them, weight gradients and results are float32. A factor beyond
-65504 is infinite and makes the gradient of a weight non-finite, so that the update is skipped. Positions have no
-gradient. Nothing synchronises with the device. design/network.md has the reasons.
+gamma(t) contributes one vector per key, a part of the bias: W a + b = W_x gamma(x) + (W_t gamma(t)
++ b). Backward, d_n being the gradient at z_n: dW_n = d_n^T h_(n-1), db_n = sum of d_n, d_(n-1) =
+d_n W_n where h_(n-1) > 0.
+
+Factors are halves; sums, weights, biases with a time in them, weight gradients and results are
+float32. A factor beyond 65504 is infinite and makes the gradient of a weight non-finite, so that
+the update is skipped. Positions have no gradient. Nothing synchronises with the device.
+design/network.md has the reasons.
 """
 
 from __future__ import annotations
@@ -25,8 +29,10 @@ from torch import Tensor
 from ..scene.encoding import encoded, encoded_size
 from ..scene.network import Network
 
-ALIGNED = 8  # halves in 16 bytes: products whose rows begin at multiples of it are several times faster
-LARGEST = 64.0  # scaled gradient of an offset: 10 bits below the largest half, 20 above the smallest normal one
+# halves in 16 bytes: products whose rows begin at multiples of it are several times faster
+ALIGNED = 8
+# scaled gradient of an offset: 10 bits below the largest half, 20 above the smallest normal one
+LARGEST = 64.0
 SMALLEST = 1e-30  # below any gradient; avoids 0 / 0 where all are 0
 
 
@@ -41,7 +47,8 @@ class Form:
     width: int
     """Outputs of a layer."""
     joined: int | None
-    """Number of the layer whose input is concatenated with gamma(x) and gamma(t); None: there is none."""
+    """Number of the layer whose input is concatenated with gamma(x) and gamma(t); None: there is
+    none."""
     dtype: torch.dtype
     """Of the factors: float16, or that of the parameters, for which the same code is exact."""
 
@@ -93,9 +100,17 @@ class Layers(abc.ABC):
     """Computes the layers for all rows, forward and backward."""
 
     def encode(
-        self, mean: Float[Tensor, "N 3"], length: float, powers: Float[Tensor, "f"], *, columns: int, dtype: torch.dtype
+        self,
+        mean: Float[Tensor, "N 3"],
+        length: float,
+        powers: Float[Tensor, "f"],
+        *,
+        columns: int,
+        dtype: torch.dtype,
     ) -> Float[Tensor, "N columns"]:
-        """gamma(x) of positions [m] over a length [m], without gradient, rounded at the end, padded with zeros."""
+        """gamma(x) of positions [m] over a length [m], without gradient, rounded at the end,
+        padded with zeros.
+        """
         return encoded(mean.detach() / length, powers, columns=columns, dtype=dtype)
 
     @abc.abstractmethod
@@ -145,4 +160,6 @@ class Layers(abc.ABC):
         gradients: LayerGradients,
         outputs: Float[Tensor, "layers rows width"],
     ) -> list[Tensor]:
-        """Gradients of weight and bias of every layer, then of the head, not divided by the unit."""
+        """Gradients of weight and bias of every layer, then of the head,
+        not divided by the unit.
+        """

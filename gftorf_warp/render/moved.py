@@ -1,4 +1,6 @@
-"""Gaussians of a finished run at any time, in memory that stays: the motion at a key is computed once."""
+"""Gaussians of a finished run at any time, in memory that stays:
+the motion at a key is computed once.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,8 @@ from .cuda import stream_of
 from .inputs import Inputs
 from .launch import view_of
 
-CAMERA, INDEX, WEIGHT = 6, 7, 8  # parameters of ``move_gaussians`` that :meth:`MovedGaussians.move` sets
+# parameters of ``move_gaussians`` that :meth:`MovedGaussians.move` sets
+CAMERA, INDEX, WEIGHT = 6, 7, 8
 
 
 class MovedGaussians:
@@ -47,24 +50,32 @@ class MovedGaussians:
             motion: Their motion.
             binding: What ``motion.bind`` returned for them.
             calibration: Of the sensor, as ``Inputs`` has it.
-            optimised: The camera at the size of the optimisation, whose low-pass filter widened the Gaussians.
+            optimised: The camera at the size of the optimisation, whose low-pass filter widened the
+                Gaussians.
             settings: How to render.
         """
         field = field.map(lambda tensor: tensor.detach().contiguous())
         first = motion.at_keys(binding, [0])
-        tables = [None if t is None else t.new_zeros(len(motion.times), *t.shape[1:]) for t in first]
+        tables = [
+            None if t is None else t.new_zeros(len(motion.times), *t.shape[1:]) for t in first
+        ]
         mean, log_scale = torch.empty_like(field.mean), torch.empty_like(field.log_scale)
         turned = None if first.rotation is None else torch.empty_like(field.quaternion)
         self._motion, self._binding, self._tables = motion, binding, tables
         self._known: set[int] = set()
         self._store(0, first)
-        self._kept = field, calibration, mean, log_scale, turned  # Warp arrays do not own their memory
+        # Warp arrays do not own their memory
+        self._kept = field, calibration, mean, log_scale, turned
         device = wp.device_from_torch(field.device)
         self.view = wp.zeros(1, dtype=CameraView, device=device)
         offset, rotation = array_over(tables[0], wp.vec3), array_over(tables[1], wp.vec4)
         initial = [array_over(tensor, wp.vec3) for tensor in (field.mean, field.log_scale)]
         quaternion = array_over(field.quaternion, wp.vec4)
-        outputs = [array_over(mean, wp.vec3), array_over(log_scale, wp.vec3), array_over(turned, wp.vec4)]
+        outputs = [
+            array_over(mean, wp.vec3),
+            array_over(log_scale, wp.vec3),
+            array_over(turned, wp.vec4),
+        ]
         self.inputs = Inputs(
             mean=outputs[0],
             log_scale=outputs[1],
@@ -76,12 +87,24 @@ class MovedGaussians:
         )
         kernel = make_move(motion.support)
         self._indices, self._weights = (kernel.adj.args[n].type for n in (INDEX, WEIGHT))
-        self._camera = functools.lru_cache(maxsize=1024)(lambda camera: view_of(camera, settings))  # slow on the host
+        # slow on the host
+        self._camera = functools.lru_cache(maxsize=1024)(lambda camera: view_of(camera, settings))
         camera = view_of(optimised, settings)
-        inputs = [*initial, quaternion, offset, rotation, camera, camera, self._indices(), self._weights()]
+        inputs = [
+            *initial,
+            quaternion,
+            offset,
+            rotation,
+            camera,
+            camera,
+            self._indices(),
+            self._weights(),
+        ]
         where = {"device": device, "record_tape": False}
         # packed once: that is most of what a launch costs a host
-        self._launch = wp.launch(kernel, max(len(field), 1), inputs, [*outputs, self.view], record_cmd=True, **where)
+        self._launch = wp.launch(
+            kernel, max(len(field), 1), inputs, [*outputs, self.view], record_cmd=True, **where
+        )
 
     @torch.no_grad()
     def move(self, time: float, camera: Camera) -> None:

@@ -1,4 +1,6 @@
-"""The backend of a motion network in half precision: fused tensor-core kernels on Hopper, cuBLAS elsewhere."""
+"""The backend of a motion network in half precision: fused tensor-core kernels on Hopper,
+cuBLAS elsewhere.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,9 @@ from .tensor_cores import FusedLayers, fits
 
 
 class HalfPrecision:
-    """Computes a network in half precision with gradients by hand, see ``scene.network.Backend``."""
+    """Computes a network in half precision with gradients by hand,
+    see ``scene.network.Backend``.
+    """
 
     def __init__(self, layers: Layers, form: Form):
         """Compute ``form`` by ``layers``."""
@@ -24,19 +28,29 @@ class HalfPrecision:
     def encode(self, network: Network, mean: Tensor) -> Tensor:
         """gamma(x), as the layers read it."""
         columns, dtype = self.form.columns, self.form.dtype
-        return self.layers.encode(mean, network.length, network.powers, columns=columns, dtype=dtype)
+        return self.layers.encode(
+            mean, network.length, network.powers, columns=columns, dtype=dtype
+        )
 
     def offsets(self, network: Network, binding: Tensor, time: Tensor) -> Tensor:
         """[k, N, 3] displacements [m]."""
-        parameters = [value for layer in [*network.layers, network.head] for value in (layer.weight, layer.bias)]
+        parameters = [
+            value
+            for layer in [*network.layers, network.head]
+            for value in (layer.weight, layer.bias)
+        ]
         return Offsets.apply(self.form, self.layers, binding, time, *parameters)
 
 
 def with_backend(motion: Motion) -> Motion:
-    """The same motion; a network in half precision gets its backend, by the device that it is on."""
+    """The same motion; a network in half precision gets its backend,
+    by the device that it is on.
+    """
     if isinstance(motion, Network) and motion.settings.products == Products.HALF:
         form = Form.of(motion)
-        motion.backend = HalfPrecision(FusedLayers() if fits(form, motion.powers.device) else CublasLayers(), form)
+        motion.backend = HalfPrecision(
+            FusedLayers() if fits(form, motion.powers.device) else CublasLayers(), form
+        )
     return motion
 
 
@@ -74,9 +88,20 @@ class Offsets(torch.autograd.Function):
     def backward(context, gradient: Float[Tensor, "k N 3"]) -> tuple[Tensor | None, ...]:
         """Gradients of all parameters, in their own precision.
 
-        Loss scaling is by the largest gradient of an offset, on the device; all but that is linear in it.
+        Loss scaling is by the largest gradient of an offset, on the device; all but that is linear
+        in it.
         """
-        form, layers, (position, time, *saved, outputs) = context.form, context.layers, context.saved_tensors
+        form, layers, (position, time, *saved, outputs) = (
+            context.form,
+            context.layers,
+            context.saved_tensors,
+        )
         rows = gradient.reshape(-1, gradient.shape[-1])
         gradients = layers.backward(form, len(time), rows, outputs, tuple(saved))
-        return None, None, None, None, *layers.parameter_gradients(form, position, time, gradients, outputs)
+        return (
+            None,
+            None,
+            None,
+            None,
+            *layers.parameter_gradients(form, position, time, gradients, outputs),
+        )

@@ -1,14 +1,19 @@
-"""How many (tile, splat) pairs a rendering reserves memory for, where their number is not read back first."""
+"""How many (tile, splat) pairs a rendering reserves memory for,
+where their number is not read back first.
+"""
 
 from __future__ import annotations
 
 import math
 
 ROUNDED_TO = 1 << 16  # capacities are multiples of it
-READ_EVERY = 8  # steps: pairs that grow by half in 30 take 16 from ``FULL`` to the end, and the host may be 8 ahead
+# steps: pairs that grow by half in 30 take 16 from ``FULL`` to the end, and the host may be 8 ahead
+READ_EVERY = 8
 FULL = 0.8  # fraction of the capacity above which it grows
 PATIENCE = (
-    5  # readbacks in a row below the smallest fraction before it shrinks: an opacity reset empties it for a while
+    # readbacks in a row below the smallest fraction before it shrinks: an opacity reset empties it
+    # for a while
+    5
 )
 # capacity over the largest number of pairs; fraction below which it shrinks
 SORTED, LISTED = (1.5, 0.4), (3.0, 0.05)
@@ -17,13 +22,14 @@ SORTED, LISTED = (1.5, 0.4), (3.0, 0.05)
 class PairCapacity:
     """Pairs that fit into one rendering, from the numbers that the last renderings had.
 
-    Where pairs are sorted, every reserved one costs time, so few are. Where a bit mask is read into lists, one costs
-    4 bytes, and to change the capacity costs new CUDA graphs.
+    Where pairs are sorted, every reserved one costs time, so few are. Where a bit mask is read into
+    lists, one costs 4 bytes, and to change the capacity costs new CUDA graphs.
     """
 
     def __init__(self) -> None:
         self.pairs: int | None = None
-        """Pairs that fit; None: unknown yet, so they are counted first, which synchronises with the device."""
+        """Pairs that fit; None: unknown yet, so they are counted first, which synchronises with the
+        device."""
         self._empty = 0  # readbacks in a row below the smallest fraction
 
     def fits(self, pairs: int) -> bool:

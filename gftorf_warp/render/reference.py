@@ -1,20 +1,27 @@
-"""The oracle: the renderer in plain torch, dense [pixels, Gaussians], in any precision, differentiated by autograd.
+"""The oracle: the renderer in plain torch, dense [pixels, Gaussians], in any precision,
+differentiated by autograd.
 
-Here a physicist checks the model (method, section 2). Gaussian k, its centre X in the world, the pose (Rc, t):
+Here a physicist checks the model (method, section 2). Gaussian k, its centre X in the world, the
+pose (Rc, t):
 
-    camera axes      X_c = Rc X + t = (x, y, z),  distance d = |X_c|,  direction n = (X - camera centre) / d
-    image            u = fx x / z + cx,  v = fy y / z + cy;  a lens images (x / z, y / z) elsewhere and has its own J
-    footprint        cov2D = U Sigma U^T + 0.3 I,  U = J Rc,  Sigma = Gamma Gamma^T,  Gamma = R(quaternion) diag(scale)
+    camera axes      X_c = Rc X + t = (x, y, z),  distance d = |X_c|,
+                     direction n = (X - camera centre) / d
+    image            u = fx x / z + cx,  v = fy y / z + cy;  a lens images (x / z, y / z) elsewhere
+                     and has its own J
+    footprint        cov2D = U Sigma U^T + 0.3 I,  U = J Rc,  Sigma = Gamma Gamma^T,
+                     Gamma = R(quaternion) diag(scale)
     response         G = exp(-1/2 (k1 dx^2 + k3 dy^2) - k2 dx dy),  [[k1, k2], [k2, k3]] = cov2D^-1
-    alpha            alpha = min(0.99, o G), none below 1/255,  T_k = prod_{l < k} (1 - alpha_l),  w_k = alpha_k T_k
+    alpha            alpha = min(0.99, o G), none below 1/255,  T_k = prod_{l < k} (1 - alpha_l),
+                     w_k = alpha_k T_k
     amplitude        a = s r / d^2,  r = max(0, Y(n) . h + 1/2),  phase psi = kappa d + phase_offset
     quad             Q = sum w_k T_k a_k (cos(psi_k - shift) + b)  +  T_e background
     phasor           P = sum w_k T_k eta a_k (cos psi_k, sin psi_k, 1)  +  T_e background
     colour           C = sum w_k c_k  +  T_e background
-    distance         D = sum w_k d_k, opacity A = sum w_k, extra F = sum w_k f_k, all without background
+    distance         D = sum w_k d_k, opacity A = sum w_k, extra F = sum w_k f_k, without background
 
-Light crosses every Gaussian in front twice, hence T^2 in quads and phasor; the background carries T_e, first power.
-Cost grows with pixels times Gaussians: this is for tests and small images, the kernels are for work.
+Light crosses every Gaussian in front twice, hence T^2 in quads and phasor; the background carries
+T_e, first power. Cost grows with pixels times Gaussians: this is for tests and small images, the
+kernels are for work.
 """
 
 from __future__ import annotations
@@ -37,7 +44,8 @@ from .buffers import ClampGradient, Distortion, RenderSettings, Stop, Support, W
 from .control import DeviceCamera
 from .inputs import CHOICES, wanted_images
 
-_PARITY_TILE = 16  # [px] side of the released code's tiles, to which Support.SIGMA3_TILE16 rounds out
+# [px] side of the released code's tiles, to which Support.SIGMA3_TILE16 rounds out
+_PARITY_TILE = 16
 BLOCK = 4_000_000  # (pixel, Gaussian) pairs worked on at once: bounds the memory of a forward pass
 
 
@@ -77,9 +85,9 @@ def rasterize(
 ) -> Rendering:
     """Oracle of :func:`gftorf_warp.render.api.rasterize`; computes in the dtype of the field.
 
-    ``Rendering.screen`` is filled by ``backward()``, not by ``torch.autograd.grad`` with respect to tensors the image
-    positions do not depend on. ``workspace``, ``control``, and ``pair_capacity`` and ``threads`` of the settings are
-    ignored.
+    ``Rendering.screen`` is filled by ``backward()``, not by ``torch.autograd.grad`` with respect to
+    tensors the image positions do not depend on. ``workspace``, ``control``, and ``pair_capacity``
+    and ``threads`` of the settings are ignored.
     """
     background = background or Background()
     height, width, q = camera.height, camera.width, len(sensor.shifts)
@@ -87,9 +95,12 @@ def rasterize(
     screen = None
     if screen_gradient:
         screen = ScreenGradient(values=field.mean.new_zeros(len(field), 4))
-    centre, seen_of = _watched(splats, screen, [*field.parameters().values(), extra, *_tensors(background, sensor)])
+    centre, seen_of = _watched(
+        splats, screen, [*field.parameters().values(), extra, *_tensors(background, sensor)]
+    )
 
-    # What Gaussian k carries: columns weighted by T (colour, distance, 1, extra) and by T^2 (quads, phasor)
+    # What Gaussian k carries: columns weighted by T (colour, distance, 1, extra) and by T^2 (quads,
+    # phasor)
     basis = spherical_harmonics(splats.direction, settings.sh_degree)  # [M, K]
     reflectivity = _shade(basis, field.reflectivity_sh[splats.index])
     d = splats.distance
@@ -108,7 +119,9 @@ def rasterize(
         moments = [w @ torch.stack([zeta**n], 1) for n in (0, 1, 2)]  # A, M, V
         half_sum = moments[0] * moments[2] - moments[1] ** 2
         seen = (w.detach() if extra_detached else w) @ more
-        blocks.append(torch.cat([w @ carried, seen, (w * T) @ two_way, half_sum, T_end[:, None]], 1))
+        blocks.append(
+            torch.cat([w @ carried, seen, (w * T) @ two_way, half_sum, T_end[:, None]], 1)
+        )
         seen_of += torch.stack([(w > 0).sum(0), w.detach().sum(0)], 1)
     image = torch.cat(blocks).T.reshape(-1, height, width)
 
@@ -134,15 +147,21 @@ def rasterize(
 def undecided_pixels(
     field: GaussianField, camera: Camera, settings: RenderSettings = RenderSettings()
 ) -> Bool[Tensor, "H W"]:
-    """Pixels where float32 may decide a rule differently from float64, so that a comparison has to leave them out.
+    """Pixels where float32 may decide a rule differently from float64, so that a comparison has to
+    leave them out.
 
-    A Gaussian counts from alpha = 1/255 on, its alpha is clamped at 0.99, a pixel stops at T = 1e-4, nearer Gaussians
-    come first, a square is rounded out to tiles: each is a jump, and a pixel that sits on one may fall either way.
+    A Gaussian counts from alpha = 1/255 on, its alpha is clamped at 0.99, a pixel stops at T =
+    1e-4, nearer Gaussians come first, a square is rounded out to tiles: each is a jump, and a pixel
+    that sits on one may fall either way.
     """
     with torch.no_grad():
-        exact = field.map(lambda tensor: tensor.detach().double() if tensor.is_floating_point() else tensor)
+        exact = field.map(
+            lambda tensor: tensor.detach().double() if tensor.is_floating_point() else tensor
+        )
         splats = project(exact, camera, settings)
-        blocks = _pixel_centres(camera, splats.distance).split(max(1, BLOCK // max(1, len(splats.index))))
+        blocks = _pixel_centres(camera, splats.distance).split(
+            max(1, BLOCK // max(1, len(splats.index)))
+        )
         undecided = torch.cat([_undecided(block, splats, settings) for block in blocks])
     return undecided.reshape(camera.height, camera.width)
 
@@ -153,23 +172,29 @@ def _undecided(pixel: Tensor, splats: _Splats, settings: RenderSettings) -> Bool
     alpha = _alpha(pixel, splats, splats.centre, settings)
     hit = alpha > 0
     T = torch.cumprod(1.0 - alpha, 1)
-    live = T / (1.0 - alpha) >= (1.0 - 1e-3) * TRANSMITTANCE_MIN  # behind the stop nothing is decided any more
+    # behind the stop nothing is decided any more
+    live = T / (1.0 - alpha) >= (1.0 - 1e-3) * TRANSMITTANCE_MIN
 
     jump = (raw / ALPHA_MIN - 1.0).abs() < 1e-4
     jump |= hit & ((raw / ALPHA_MAX - 1.0).abs() < 1e-4)
     jump |= hit & ((T / TRANSMITTANCE_MIN - 1.0).abs() < 1e-3)
-    jump |= (power.abs() < 1e-6 * rounding) & (raw >= ALPHA_MIN)  # a needle: its power may come out above zero
+    # a needle: its power may come out above zero
+    jump |= (power.abs() < 1e-6 * rounding) & (raw >= ALPHA_MIN)
     if settings.support is Support.SIGMA3_TILE16:
         wide, narrow = (
-            _inside_tiles(pixel, splats.centre, splats.covariance, margin=margin) for margin in (1e-3, -1e-3)
+            _inside_tiles(pixel, splats.centre, splats.covariance, margin=margin)
+            for margin in (1e-3, -1e-3)
         )
         jump |= (wide ^ narrow) & (raw >= (1.0 - 1e-4) * ALPHA_MIN)
     undecided = (jump & live).any(1)
 
     z = splats.z_depth
-    nearest, farthest = (_depth_key(z * (1.0 + rounding), settings)[:, None] for rounding in (-5e-7, 5e-7))
+    nearest, farthest = (
+        _depth_key(z * (1.0 + rounding), settings)[:, None] for rounding in (-5e-7, 5e-7)
+    )
     in_memory = splats.index[:, None] < splats.index
-    first = (farthest < nearest.T) | ((farthest <= nearest.T) & in_memory)  # [k, j]: k comes before j in any case
+    # [k, j]: k comes before j in any case
+    first = (farthest < nearest.T) | ((farthest <= nearest.T) & in_memory)
     either = ~(first | first.T) & (z[:, None] != z)
     for k, j in either.triu(1).nonzero().tolist():
         undecided |= hit[:, k] & hit[:, j] & live[:, k]
@@ -177,20 +202,26 @@ def _undecided(pixel: Tensor, splats: _Splats, settings: RenderSettings) -> Bool
 
 
 def project(field: GaussianField, camera: Camera, settings: RenderSettings) -> _Splats:
-    """EWA projection (method, 2.2): cull, order near to far, and linearise the pinhole at each centre."""
+    """EWA projection (method, 2.2): cull, order near to far,
+    and linearise the pinhole at each centre.
+    """
     pose = torch.as_tensor(camera.camera_from_world, dtype=field.mean.dtype, device=field.device)
     rotation, translation = pose[:3, :3], pose[:3, 3]
     z_all = (field.mean @ rotation.T + translation)[:, 2]
     seen = (z_all >= settings.near) & (z_all <= settings.far) & (field.opacity >= ALPHA_MIN)
     index = seen.nonzero()[:, 0]
-    # The order is decided by keys of float32, as in the kernels; equal ones keep their order in memory
+    # The order is decided by keys of float32, as in the kernels; equal ones keep their order in
+    # memory
     index = index[_depth_key(z_all.detach()[index], settings).sort(stable=True).indices]
 
     point = field.mean[index] @ rotation.T + translation
     x, y, z = point.unbind(1)
     distance = point.norm(dim=1)
     limit_x, limit_y, radius = camera.guard
-    x_guarded, y_guarded = z * (x / z).clamp(-limit_x, limit_x), z * (y / z).clamp(-limit_y, limit_y)
+    x_guarded, y_guarded = (
+        z * (x / z).clamp(-limit_x, limit_x),
+        z * (y / z).clamp(-limit_y, limit_y),
+    )
     zero = torch.zeros_like(z)
     jacobian = torch.stack(
         [
@@ -204,9 +235,12 @@ def project(field: GaussianField, camera: Camera, settings: RenderSettings) -> _
         near = inside(x_guarded / z, y_guarded / z, radius)
         xx, xy, yy = camera.distortion.slope(*near)
         aspect = camera.fx / camera.fy
-        bend = torch.stack([torch.stack([xx, xy * aspect], 1), torch.stack([xy / aspect, yy], 1)], 1)
+        bend = torch.stack(
+            [torch.stack([xx, xy * aspect], 1), torch.stack([xy / aspect, yy], 1)], 1
+        )
         jacobian, flat = bend @ jacobian, camera.distortion.apply(*flat, radius)
-    axes = _rotation(field.quaternion[index]) * field.scale[index][:, None, :]  # Gamma, columns in metres
+    # Gamma, columns in metres
+    axes = _rotation(field.quaternion[index]) * field.scale[index][:, None, :]
     projected = jacobian @ rotation @ axes  # [M, 2, 3]
     cov = projected @ projected.mT + LOW_PASS * torch.eye(2, dtype=z.dtype, device=z.device)
     return _Splats(
@@ -238,7 +272,9 @@ def _rotation(wxyz: Float[Tensor, "M 4"]) -> Float[Tensor, "M 3 3"]:
 
 
 def spherical_harmonics(n: Float[Tensor, "M 3"], degree: int) -> Float[Tensor, "M K"]:
-    """Real harmonics Y_0 .. Y_{K-1}, K = (degree + 1)^2, of unit vectors, with the signs of method 2.3."""
+    """Real harmonics Y_0 .. Y_{K-1}, K = (degree + 1)^2, of unit vectors,
+    with the signs of method 2.3.
+    """
     x, y, z = n.unbind(1)
     one = torch.ones_like(x)
     root = [math.sqrt(value / math.pi) for value in (1 / 4, 3 / 4, 15 / 4, 5 / 16, 15 / 16)]
@@ -264,7 +300,9 @@ def spherical_harmonics(n: Float[Tensor, "M 3"], degree: int) -> Float[Tensor, "
     return torch.stack(columns[: (degree + 1) ** 2], 1)
 
 
-def _shade(basis: Float[Tensor, "M K"], sh: Float[Tensor, "M KC"], channels: int = 1) -> Float[Tensor, "M C"]:
+def _shade(
+    basis: Float[Tensor, "M K"], sh: Float[Tensor, "M KC"], channels: int = 1
+) -> Float[Tensor, "M C"]:
     """Value seen from the camera, max(0, sum_i Y_i h_i + 1/2); no gradient where it is clamped."""
     coefficients = sh.reshape(len(sh), sh.shape[1] // channels, channels)[:, : basis.shape[1]]
     return torch.relu((basis[:, :, None] * coefficients).sum(1) + SH_BIAS)
@@ -273,10 +311,17 @@ def _shade(basis: Float[Tensor, "M K"], sh: Float[Tensor, "M KC"], channels: int
 def correlate(
     d: Float[Tensor, "M"], reflectivity: Float[Tensor, "M 1"], sensor: Sensor, phasor_factor: float
 ) -> Float[Tensor, "M light"]:
-    """What a C-ToF pixel makes of each Gaussian alone: its Q quads, then its phasor (method, 2.4)."""
+    """What a C-ToF pixel makes of each Gaussian alone: its Q quads, then its phasor (method,
+    2.4).
+    """
     f, phase_offset, dc_offset, source = (
         torch.as_tensor(value, dtype=d.dtype, device=d.device)
-        for value in (sensor.f_mod_hz, sensor.phase_offset, sensor.dc_offset, sensor.source_intensity)
+        for value in (
+            sensor.f_mod_hz,
+            sensor.phase_offset,
+            sensor.dc_offset,
+            sensor.source_intensity,
+        )
     )
     shift = torch.as_tensor(sensor.shifts, dtype=d.dtype, device=d.device)
     a = source * reflectivity / d[:, None] ** 2
@@ -293,7 +338,10 @@ def _normalised(d: Float[Tensor, "M"], settings: RenderSettings) -> Float[Tensor
 
 def _pixel_centres(camera: Camera, like: Tensor) -> Float[Tensor, "P 2"]:
     """Image positions (x, y) of all pixel centres, row by row [px]."""
-    x, y = (torch.arange(size, dtype=like.dtype, device=like.device) + 0.5 for size in (camera.width, camera.height))
+    x, y = (
+        torch.arange(size, dtype=like.dtype, device=like.device) + 0.5
+        for size in (camera.width, camera.height)
+    )
     return torch.stack([x.repeat(camera.height), y.repeat_interleave(camera.width)], 1)
 
 
@@ -310,7 +358,10 @@ def _power(
 
 
 def _alpha(
-    pixel: Float[Tensor, "P 2"], splats: _Splats, centre: Float[Tensor, "M 2"], settings: RenderSettings
+    pixel: Float[Tensor, "P 2"],
+    splats: _Splats,
+    centre: Float[Tensor, "M 2"],
+    settings: RenderSettings,
 ) -> Float[Tensor, "P M"]:
     """What each Gaussian takes of a pixel's light; exactly 0 where it takes no part."""
     power, _ = _power(pixel, centre, splats.covariance)
@@ -325,11 +376,16 @@ def _alpha(
 
 
 def _inside_tiles(
-    pixel: Float[Tensor, "P 2"], centre: Float[Tensor, "M 2"], covariance: Float[Tensor, "M 3"], margin: float = 0.0
+    pixel: Float[Tensor, "P 2"],
+    centre: Float[Tensor, "M 2"],
+    covariance: Float[Tensor, "M 3"],
+    margin: float = 0.0,
 ) -> Bool[Tensor, "P M"]:
-    """The released support: a square of half-width ceil(3 sqrt(lambda_max)), rounded out to whole tiles (method, 2.2).
+    """The released support: a square of half-width ceil(3 sqrt(lambda_max)), rounded out to whole
+    tiles (method, 2.2).
 
-    The released code counts pixels from their integer centres, hence the half pixel. ``margin`` [px] widens the square.
+    The released code counts pixels from their integer centres, hence the half pixel. ``margin``
+    [px] widens the square.
     """
     xx, xy, yy = covariance.detach().unbind(1)
     middle = 0.5 * (xx + yy)
@@ -345,9 +401,12 @@ def _inside_tiles(
 def compositing_weights(
     alpha: Float[Tensor, "P M"], stop: Stop
 ) -> tuple[Float[Tensor, "P M"], Float[Tensor, "P M"], Float[Tensor, "P"]]:
-    """Weights w = alpha T of what a pixel composites, T before each Gaussian, T_e behind the last one (method, 2.5)."""
+    """Weights w = alpha T of what a pixel composites, T before each Gaussian,
+    T_e behind the last one (method, 2.5).
+    """
     T = _transmittance(alpha)
-    added = T[:, :-1] if stop is Stop.INCLUSIVE else T[:, 1:]  # is the Gaussian that crosses the limit still added?
+    # is the Gaussian that crosses the limit still added?
+    added = T[:, :-1] if stop is Stop.INCLUSIVE else T[:, 1:]
     alpha = torch.where(added >= TRANSMITTANCE_MIN, alpha, torch.zeros_like(alpha))
     T = _transmittance(alpha)
     return alpha * T[:, :-1], T[:, :-1], T[:, -1]
@@ -358,35 +417,52 @@ def _transmittance(alpha: Float[Tensor, "P M"]) -> Float[Tensor, "P M+1"]:
     return torch.cat([alpha.new_ones(len(alpha), 1), torch.cumprod(1.0 - alpha, 1)], 1)
 
 
-def _behind(light: Tensor | float | None, T_end: Float[Tensor, "1 H W"], channels: int) -> Tensor | float:
-    """T_e times the background, first power in every channel that has one; nothing for a missing background."""
+def _behind(
+    light: Tensor | float | None, T_end: Float[Tensor, "1 H W"], channels: int
+) -> Tensor | float:
+    """T_e times the background, first power in every channel that has one;
+    nothing for a missing background.
+    """
     if light is None:
         return 0.0
-    return T_end * torch.as_tensor(light, dtype=T_end.dtype, device=T_end.device).expand(channels, *T_end.shape[1:])
+    return T_end * torch.as_tensor(light, dtype=T_end.dtype, device=T_end.device).expand(
+        channels, *T_end.shape[1:]
+    )
 
 
 def _tensors(background: Background, sensor: Sensor) -> list[object]:
     """Everything besides the Gaussians that may ask for a gradient."""
     lights = [background.quads, background.phasor, background.colour]
-    return [*lights, sensor.f_mod_hz, sensor.phase_offset, sensor.dc_offset, sensor.source_intensity]
+    return [
+        *lights,
+        sensor.f_mod_hz,
+        sensor.phase_offset,
+        sensor.dc_offset,
+        sensor.source_intensity,
+    ]
 
 
 def _watched(
     splats: _Splats, screen: ScreenGradient | None, inputs: list[object]
 ) -> tuple[Float[Tensor, "M 2"], Float[Tensor, "M 2"]]:
-    """Image positions whose gradient is noted in ``screen``; pixels and weights, to be filled in by the caller.
+    """Image positions whose gradient is noted in ``screen``; pixels and weights, to be filled in by
+    the caller.
 
-    A zero that needs a gradient is added, so that the note is taken even if the means are not optimised.
+    A zero that needs a gradient is added, so that the note is taken even if the means are not
+    optimised.
     """
     seen = torch.zeros_like(splats.centre)
     centre = splats.centre
-    if screen is None or not any(isinstance(value, Tensor) and value.requires_grad for value in inputs):
+    if screen is None or not any(
+        isinstance(value, Tensor) and value.requires_grad for value in inputs
+    ):
         return centre, seen
     if torch.is_grad_enabled():
         centre = centre + torch.zeros_like(centre).requires_grad_()
 
         def note(grad: Tensor) -> None:
-            screen.gradient.index_add_(0, splats.index, grad)  # like a parameter's .grad, it adds up over passes
+            # like a parameter's .grad, it adds up over passes
+            screen.gradient.index_add_(0, splats.index, grad)
             screen.values[splats.index, 2:] = seen
 
         centre.register_hook(note)

@@ -1,8 +1,10 @@
-"""A finished run rendered many times: memory is kept, the motion at a key is computed once, nothing is read back.
+"""A finished run rendered many times: memory is kept, the motion at a key is computed once, nothing
+is read back.
 
-On CUDA the second and all further renderings of one size are one CUDA graph, whatever the camera, so
-that an image costs the host two launches. Memory is reserved for as many (tile, splat) pairs as
-:class:`PairCapacity` says; a rendering that needed more is repeated. Graph and launches give the same bits.
+On CUDA the second and all further renderings of one size are one CUDA graph, whatever the camera,
+so that an image costs the host two launches. Memory is reserved for as many (tile, splat) pairs as
+:class:`PairCapacity` says; a rendering that needed more is repeated. Graph and launches give the
+same bits.
 """
 
 from __future__ import annotations
@@ -40,7 +42,9 @@ class Target:
 
     buffers: Buffers
     view: View
-    packed: Tensor  # [L] all images, consecutive, so that one copy moves them; last, as int32, their number of pairs
+    # [L] all images, consecutive, so that one copy moves them; last, as int32, their number of
+    # pairs
+    packed: Tensor
     places: dict[str, tuple[int, tuple[int, ...]]]  # first element and shape of every image in it
     tensors: dict[str, Tensor]
     images: Images
@@ -75,8 +79,10 @@ class Replay:
             binding: What ``motion.bind`` returned for them.
             sensor: With the shifts of the quads.
             settings: How to render; the pair capacity is adapted.
-            optimised: The camera at the size of the optimisation, whose low-pass filter widened the Gaussians.
-            images: Names of the images to compute, of quads, phasor, colour, distance, opacity and distortion.
+            optimised: The camera at the size of the optimisation, whose low-pass filter widened the
+                Gaussians.
+            images: Names of the images to compute, of quads, phasor, colour, distance, opacity and
+                distortion.
             colour_scale: Colour is divided by this.
 
         Raises:
@@ -92,7 +98,9 @@ class Replay:
         shifts = [(math.cos(shift), math.sin(shift)) for shift in sensor.shifts]
         self._shifts = wp.array(shifts, dtype=wp.vec2, device=self.device)
         values = sensor.phase_slope, sensor.phase_offset, sensor.source_intensity, sensor.dc_offset
-        calibration = torch.tensor([float(v) for v in values], dtype=torch.float32, device=field.device)
+        calibration = torch.tensor(
+            [float(v) for v in values], dtype=torch.float32, device=field.device
+        )
         self._gaussians = MovedGaussians(field, motion, binding, calibration, optimised, settings)
         self._targets: dict[tuple[int, int, bool], Target] = {}
         self._largest = wp.zeros(1, dtype=wp.int32, device=self.device)
@@ -104,8 +112,9 @@ class Replay:
         Args:
             time: Seconds since raw frame 0, any number; motion is constant outside the keys.
             camera: Pose, intrinsics and size.
-            checked: Whether to synchronise and repeat a rendering whose pairs exceeded the capacity. Otherwise far
-                splats are missing in such images; :meth:`fits` returns whether there was one.
+            checked: Whether to synchronise and repeat a rendering whose pairs exceeded the
+                capacity. Otherwise far splats are missing in such images; :meth:`fits` returns
+                whether there was one.
         """
         target = self.draw(time, camera)
         if checked and not self.fits():
@@ -116,7 +125,10 @@ class Replay:
     def rendering(self, tensors: Mapping[str, Tensor], camera: Camera) -> Rendering:
         """Images by name as a rendering; those that are absent have no elements."""
         size = camera.height, camera.width
-        images = {name: tensors[name] if name in tensors else left_out(name, self._like, *size) for name in CHOICES}
+        images = {
+            name: tensors[name] if name in tensors else left_out(name, self._like, *size)
+            for name in CHOICES
+        }
         return Rendering(**images, colour=tensors.get("colour"), extra=None, screen=None)
 
     def fits(self) -> bool:
@@ -124,7 +136,9 @@ class Replay:
         return self._capacity.pairs is None or self._capacity.fits(self.largest)
 
     def grow(self) -> None:
-        """Adapt the pair capacity to the largest number of pairs so far; memory and graphs are released."""
+        """Adapt the pair capacity to the largest number of pairs so far;
+        memory and graphs are released.
+        """
         if self.graphs:
             is_sorted = not all(target.buffers.marks for target in self._targets.values())
             self._capacity.learn(self.largest, is_sorted=is_sorted)
@@ -138,12 +152,19 @@ class Replay:
 
     @torch.no_grad()
     def draw(self, time: float, camera: Camera) -> Target:
-        """The images at one time, without checking the number of pairs; the next call overwrites them."""
+        """The images at one time, without checking the number of pairs;
+        the next call overwrites them.
+        """
         size = camera.height, camera.width, bool(camera.distortion)
         if size not in self._targets:
             self._targets[size] = self._target(*size)
         target = self._targets[size]
-        if self.graphs and self._capacity.pairs is not None and target.used and target.graph is None:
+        if (
+            self.graphs
+            and self._capacity.pairs is not None
+            and target.used
+            and target.graph is None
+        ):
             target.graph = self._captured(target)
         self._gaussians.move(time, camera)
         with stream_of(self._like):
@@ -159,7 +180,9 @@ class Replay:
         return target
 
     def _captured(self, target: Target) -> wp.Graph:
-        """A rendering, captured on Warp's stream, since torch's default stream cannot be captured."""
+        """A rendering, captured on Warp's stream, since torch's default stream cannot be
+        captured.
+        """
         with without_garbage_collection(), wp.ScopedCapture(device=self.device) as capture:
             self._draw(target)
         return capture.graph
@@ -174,7 +197,9 @@ class Replay:
         launch.forward(inputs, target.view, buffers, target.images, differentiable=False)
         if len(self._like):
             counts = [self._largest, target.pairs]
-            wp.launch(note_largest, 1, [buffers.total], counts, device=self.device, record_tape=False)
+            wp.launch(
+                note_largest, 1, [buffers.total], counts, device=self.device, record_tape=False
+            )
 
     def _target(self, height: int, width: int, lens: bool) -> Target:
         """Memory for renderings of one size, through a lens or not."""
@@ -194,7 +219,10 @@ class Replay:
             packed=packed,
             places=places,
             tensors=tensors,
-            images=Images(**dict.fromkeys(names_of(Images)) | {name: array_over(tensors[name]) for name in tensors}),
+            images=Images(
+                **dict.fromkeys(names_of(Images))
+                | {name: array_over(tensors[name]) for name in tensors}
+            ),
             pairs=array_over(packed[-1:].view(torch.int32), wp.int32),
         )
 

@@ -1,8 +1,8 @@
 """Many images of a replay, rendered ahead without synchronisation.
 
-The number of pairs of an image arrives with it, a few images later. An image that exceeded the pair capacity
-is rendered again with a larger one before it is returned, so every image is complete, in the order of the
-views. On a CPU every image is rendered when it is iterated over.
+The number of pairs of an image arrives with it, a few images later. An image that exceeded the pair
+capacity is rendered again with a larger one before it is returned, so every image is complete, in
+the order of the views. On a CPU every image is rendered when it is iterated over.
 """
 
 from __future__ import annotations
@@ -53,11 +53,12 @@ class Series:
         self._readbacks: dict[int, ReadbackRing] = {}  # by the length of a packed image
 
     def on_host(self, kept: int = KEPT) -> Iterator[dict[str, Float[np.ndarray, "..."]]]:
-        """Images by name as arrays on the host, float32: quads [4, H, W], distance [H, W] and so on.
+        """Images by name as arrays on the host, float32: quads [4, H, W], distance [H, W] and so
+        on.
 
-        Arrays stay valid: their memory is reused only when nothing refers to it or a part of it. Pinned
-        memory is reserved for ``kept`` images (for fewer, if they would take more than 256 MiB); a caller
-        that keeps more of them gets the others as copies in pageable memory.
+        Arrays stay valid: their memory is reused only when nothing refers to it or a part of it.
+        Pinned memory is reserved for ``kept`` images (for fewer, if they would take more than 256
+        MiB); a caller that keeps more of them gets the others as copies in pageable memory.
         """
         self._kept = kept
         for image in self._complete(tail=False):
@@ -97,10 +98,14 @@ class Series:
             few = {"kept": 1, "tail": 1} if tail else {"kept": self._kept}
             self._readbacks[length] = ReadbackRing(target.packed, ahead=self.ahead, **few)
         readback = self._readbacks[length]
-        return _Pending(view=view, target=target, readback=readback, ticket=readback.copy(target.packed))
+        return _Pending(
+            view=view, target=target, readback=readback, ticket=readback.copy(target.packed)
+        )
 
     def _checked(self, image: _Pending, tail: bool) -> _Pending:
-        """An image, rendered again until it is complete: once, unless the capacity changes in between."""
+        """An image, rendered again until it is complete: once,
+        unless the capacity changes in between.
+        """
         while self._exceeded(image):
             image.readback.release(image.ticket)
             self.repeated += 1
@@ -123,7 +128,8 @@ def on_host(
     *,
     kept: int = KEPT,
 ) -> Iterator[dict[str, Float[np.ndarray, "..."]]]:
-    """Images by name as arrays that stay valid, of any renderer; see :meth:`Series.on_host` for a replay.
+    """Images by name as arrays that stay valid, of any renderer; see :meth:`Series.on_host` for a
+    replay.
 
     Args:
         render: A :class:`Replay`, or another function of time [s] and camera.

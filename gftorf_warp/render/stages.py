@@ -6,7 +6,14 @@ from functools import cache
 
 import warp as wp
 
-from ..kernels.rasterise import depth_bins, deterministic_sums, planes_to_images, splat, tile_bitmask, tiles
+from ..kernels.rasterise import (
+    depth_bins,
+    deterministic_sums,
+    planes_to_images,
+    splat,
+    tile_bitmask,
+    tiles,
+)
 from ..kernels.rasterise.composite import CHANNEL_PLANES, make_composite
 from ..kernels.rasterise.composite_backward import (
     GRAD_LIGHT_PLANES,
@@ -26,11 +33,17 @@ _PROJECTED = ("mean", "log_scale", "quaternion", "opacity_logit", "reflectivity_
 def project(inputs: Inputs, view: View, buffers: Buffers) -> None:
     """Gaussians to splats, depth keys and image regions."""
     kernel = _project_kernel(inputs, view, buffers)
-    _launch(kernel, buffers.count, _project_inputs(inputs, view, buffers), _project_outputs(buffers))
+    _launch(
+        kernel, buffers.count, _project_inputs(inputs, view, buffers), _project_outputs(buffers)
+    )
 
 
-def project_backward(inputs: Inputs, view: View, buffers: Buffers, grad_splats: wp.array, wanted: Inputs) -> None:
-    """Gradient records of splats to gradients of Gaussians and calibration: Warp's adjoint of the same kernel."""
+def project_backward(
+    inputs: Inputs, view: View, buffers: Buffers, grad_splats: wp.array, wanted: Inputs
+) -> None:
+    """Gradient records of splats to gradients of Gaussians and calibration:
+    Warp's adjoint of the same kernel.
+    """
     adjoint = [getattr(wanted, name) for name in _PROJECTED]
     if any(array is not None for array in [*adjoint, wanted.calibration]):
         _launch(
@@ -62,25 +75,36 @@ def _project_outputs(buffers: Buffers) -> list:
 
 
 def sort_by_depth(buffers: Buffers) -> None:
-    """Order the splats near to far, those of one key by index; what is culled comes last, in any order."""
+    """Order the splats near to far, those of one key by index; what is culled comes last,
+    in any order.
+    """
     if not buffers.binned:
-        wp.utils.radix_sort_pairs(buffers.depth_key, buffers.order, buffers.count, end_bit=buffers.settings.depth_bits)
+        wp.utils.radix_sort_pairs(
+            buffers.depth_key, buffers.order, buffers.count, end_bit=buffers.settings.depth_bits
+        )
         return
     counts, first = (
         buffers.zeros("counts of classes", depth_bins.COUNTS),
         buffers.array("first of classes", depth_bins.COUNTS),
     )
-    places, members = buffers.array("places", buffers.count), buffers.array("members", buffers.count, wp.int64)
+    places, members = (
+        buffers.array("places", buffers.count),
+        buffers.array("members", buffers.count, wp.int64),
+    )
     shift = buffers.settings.depth_bits - (depth_bins.BINS.bit_length() - 1)
     keys = [buffers.depth_key, buffers.settings.depth_culled, shift]
     _launch(depth_bins.count_bins, buffers.count, keys, [counts, places])
     wp.utils.array_scan(counts, first, inclusive=True)
     _launch(depth_bins.fill_bins, buffers.count, [*keys, first, places], [members])
-    _launch(depth_bins.order_within_bins, buffers.count, [members, *keys[1:], first], [buffers.order])
+    _launch(
+        depth_bins.order_within_bins, buffers.count, [members, *keys[1:], first], [buffers.order]
+    )
 
 
 def sort_by_tile(buffers: Buffers) -> None:
-    """The list of each tile, near to far: read from a matrix of bits, or by a sort of (tile, splat) pairs."""
+    """The list of each tile, near to far: read from a matrix of bits, or by a sort of (tile,
+    splat) pairs.
+    """
     lists = [
         buffers.order,
         buffers.splats,
@@ -101,14 +125,26 @@ def _mark_and_read(buffers: Buffers, lists: list) -> None:
     """Mark the pairs as bits; count and list those of each tile."""
     marked = buffers.zeros("bits", buffers.matrix, wp.uint32)
     _launch(
-        tiles.mark_pairs, (buffers.count, buffers.lanes_per_splat), [*lists, buffers.tiles_x, buffers.words], [marked]
+        tiles.mark_pairs,
+        (buffers.count, buffers.lanes_per_splat),
+        [*lists, buffers.tiles_x, buffers.words],
+        [marked],
     )
-    matrix = [marked, buffers.words, buffers.tiles, buffers.parts, buffers.part, buffers.lanes_per_splat]
+    matrix = [
+        marked,
+        buffers.words,
+        buffers.tiles,
+        buffers.parts,
+        buffers.part,
+        buffers.lanes_per_splat,
+    ]
     threads = buffers.matrix // buffers.words * buffers.parts, buffers.lanes_per_splat
     _launch(tile_bitmask.count_bits, threads, matrix, [buffers.counts])
     capacity = _sum_counts(buffers)
     outputs = [buffers.ids, buffers.first, buffers.total]
-    _launch(tile_bitmask.list_bits, threads, [*matrix, buffers.order, buffers.ends, capacity], outputs)
+    _launch(
+        tile_bitmask.list_bits, threads, [*matrix, buffers.order, buffers.ends, capacity], outputs
+    )
 
 
 def _count_and_sort(buffers: Buffers, lists: list) -> None:
@@ -120,11 +156,23 @@ def _count_and_sort(buffers: Buffers, lists: list) -> None:
     _launch(tiles.emit_pairs, threads, inputs, [buffers.keys, buffers.ids, buffers.total])
     if buffers.ordered and capacity:
         buffers.owners = buffers.array("owners", capacity)
-        _launch(deterministic_sums.number_pairs, capacity, [buffers.total, capacity], [buffers.ids, buffers.owners])
+        _launch(
+            deterministic_sums.number_pairs,
+            capacity,
+            [buffers.total, capacity],
+            [buffers.ids, buffers.owners],
+        )
     if capacity:
-        wp.utils.radix_sort_pairs(buffers.keys, buffers.ids, capacity, end_bit=buffers.tiles.bit_length())
+        wp.utils.radix_sort_pairs(
+            buffers.keys, buffers.ids, capacity, end_bit=buffers.tiles.bit_length()
+        )
     starts = buffers.tiles + 1, buffers.lanes_per_splat
-    _launch(tiles.tile_starts, starts, [buffers.keys, capacity, buffers.lanes_per_splat], [buffers.first])
+    _launch(
+        tiles.tile_starts,
+        starts,
+        [buffers.keys, capacity, buffers.lanes_per_splat],
+        [buffers.first],
+    )
 
 
 def _sum_counts(buffers: Buffers) -> int:
@@ -138,19 +186,30 @@ def _sum_counts(buffers: Buffers) -> int:
     return capacity
 
 
-def composite(buffers: Buffers, number: int, distortion: bool = True, *, differentiable: bool = True) -> None:
-    """Blend all tiles: light with the first group of channels, or the first two, every further group by itself."""
-    nothing, more = _nothing(buffers, 3, buffers.sums.lanes.dtype), number == 0 and buffers.groups_with_light > 1
+def composite(
+    buffers: Buffers, number: int, distortion: bool = True, *, differentiable: bool = True
+) -> None:
+    """Blend all tiles: light with the first group of channels, or the first two,
+    every further group by itself.
+    """
+    nothing, more = (
+        _nothing(buffers, 3, buffers.sums.lanes.dtype),
+        number == 0 and buffers.groups_with_light > 1,
+    )
     light, channels = number == 0, bool(buffers.channels)
     shape = buffers.K, buffers.tile_width, buffers.tile_height
     metric = _metric(buffers, light and distortion)
     segments = buffers.segments_wanted if light and metric is None and differentiable else 1
     if light:
         buffers.segments = segments
-    kernel = make_composite(*shape, light, channels, buffers.settings.stop == Stop.INCLUSIVE, metric, more, segments)
+    kernel = make_composite(
+        *shape, light, channels, buffers.settings.stop == Stop.INCLUSIVE, metric, more, segments
+    )
     channel = buffers.channels[number].lanes if channels else nothing
     splats = _spread(buffers, number)
-    more_splats, more_channel = (_spread(buffers, 1), buffers.channels[1].lanes) if more else (splats, nothing)
+    more_splats, more_channel = (
+        (_spread(buffers, 1), buffers.channels[1].lanes) if more else (splats, nothing)
+    )
     lists = [buffers.first, buffers.ids, splats, buffers.tiles_x, buffers.width, buffers.height]
 
     def arguments(tile0: int, _part: int) -> list:
@@ -172,7 +231,8 @@ def composite_backward(
     grad_more: Planes | None = None,
     more_records: wp.array | None = None,
 ) -> None:
-    """Add the gradient of one pass to ``records``; CPU threads add to their own, which are then summed in order.
+    """Add the gradient of one pass to ``records``; CPU threads add to their own, which are then
+    summed in order.
 
     Args:
         buffers: After its forward pass.
@@ -182,7 +242,8 @@ def composite_backward(
         records: [N] added to.
         distortion: Whether it has a gradient.
         fixed: Whether weights are held fixed under the channels.
-        grad_more: Of the second group, if this pass takes it along; weights are held fixed under it.
+        grad_more: Of the second group, if this pass takes it along; weights are held fixed under
+            it.
         more_records: [N] what it adds to.
     """
     light, channels = number == 0, grad_channel is not None
@@ -191,7 +252,9 @@ def composite_backward(
     metric = _metric(buffers, light and distortion)
     segments = buffers.segments if light and metric is None and (fixed or not channels) else 1
     fixed = fixed and channels
-    kernel = make_composite_backward(*shape, light, channels, passes, metric, fixed, grad_more is not None, segments)
+    kernel = make_composite_backward(
+        *shape, light, channels, passes, metric, fixed, grad_more is not None, segments
+    )
     nothing = _nothing(buffers, 3, buffers.sums.lanes.dtype)
     channel = grad_channel.lanes if grad_channel is not None else nothing
     more = grad_more.lanes if grad_more is not None else nothing
@@ -199,9 +262,14 @@ def composite_backward(
     added, more_added = records, more_records
     if buffers.ordered:
         added = buffers.zeros("gradients of pairs", len(buffers.owners), splat.Splat)
-        more_added = None if more_records is None else buffers.zeros("more of pairs", len(buffers.owners), splat.Splat)
+        more_added = (
+            None
+            if more_records is None
+            else buffers.zeros("more of pairs", len(buffers.owners), splat.Splat)
+        )
     targets = [added] + [
-        buffers.zeros(f"records of thread {n}", buffers.count, splat.Splat) for n in range(len(edges) - 2)
+        buffers.zeros(f"records of thread {n}", buffers.count, splat.Splat)
+        for n in range(len(edges) - 2)
     ]
     lists = [buffers.first, buffers.ids, _spread(buffers, number, anew=False), buffers.tiles_x]
 
@@ -230,7 +298,9 @@ def composite_backward(
 
 
 def set_channels(buffers: Buffers, inputs: Inputs, start: int, splats: wp.array) -> None:
-    """Fill ``splats`` with the records of the buffers, their channels replaced by three extra ones."""
+    """Fill ``splats`` with the records of the buffers,
+    their channels replaced by three extra ones.
+    """
     if buffers.count:
         _launch(splat.set_channels, buffers.count, [buffers.splats, inputs.extra, start], [splats])
 
@@ -250,40 +320,78 @@ def finish(buffers: Buffers, grad_splats: wp.array) -> None:
     _launch(finish_moments, buffers.count, [buffers.splats], [grad_splats])
 
 
-def resolve_images(inputs: Inputs, view: View, buffers: Buffers, images: Images, groups: list) -> None:
+def resolve_images(
+    inputs: Inputs, view: View, buffers: Buffers, images: Images, groups: list
+) -> None:
     """Planes to images."""
     pixels, sums, tiling = (buffers.height, buffers.width), buffers.sums.flat, buffers.tiling
     if len(view.shifts) and images.quads is not None:
-        lit = [sums, tiling, inputs.calibration, view.shifts, _or_nothing(buffers, inputs.background_quads)]
+        lit = [
+            sums,
+            tiling,
+            inputs.calibration,
+            view.shifts,
+            _or_nothing(buffers, inputs.background_quads),
+        ]
         _launch(planes_to_images.resolve_quads, pixels, lit, [images.quads])
     if images.phasor is not None:
-        lit = [sums, tiling, buffers.settings.phasor_factor, _or_nothing(buffers, inputs.background_phasor)]
+        lit = [
+            sums,
+            tiling,
+            buffers.settings.phasor_factor,
+            _or_nothing(buffers, inputs.background_phasor),
+        ]
         _launch(planes_to_images.resolve_phasor, pixels, lit, [images.phasor])
     outputs = [images.distance, images.opacity, images.distortion]
     if any(image is not None for image in outputs):
         outputs = [_or_nothing(buffers, image, 2) for image in outputs]
-        _launch(planes_to_images.resolve_geometry, pixels, [sums, tiling, _distortion_factor(buffers)], outputs)
+        _launch(
+            planes_to_images.resolve_geometry,
+            pixels,
+            [sums, tiling, _distortion_factor(buffers)],
+            outputs,
+        )
     for (name, start), planes in zip(groups, buffers.channels, strict=True):
         background = inputs.background_colour if name == "colour" else None
         rest = [planes.flat, sums, tiling, _or_nothing(buffers, background), start]
         _launch(planes_to_images.resolve_channels, pixels, rest, [getattr(images, name)])
 
 
-def fold_images(inputs: Inputs, view: View, buffers: Buffers, cotangents: Images, wanted: Inputs, groups: list):
-    """Images to planes: the adjoint of :func:`resolve_images`. Channels without a gradient are None."""
+def fold_images(
+    inputs: Inputs, view: View, buffers: Buffers, cotangents: Images, wanted: Inputs, groups: list
+):
+    """Images to planes: the adjoint of :func:`resolve_images`.
+    Channels without a gradient are None.
+    """
     pixels, sums, tiling = (buffers.height, buffers.width), buffers.sums.flat, buffers.tiling
     planes = buffers.gradient_planes("gradient of light", GRAD_LIGHT_PLANES, added=True)
     target = planes.flat
     if cotangents.quads is not None and len(view.shifts):
-        lit = [sums, tiling, inputs.calibration, view.shifts, _or_nothing(buffers, inputs.background_quads)]
+        lit = [
+            sums,
+            tiling,
+            inputs.calibration,
+            view.shifts,
+            _or_nothing(buffers, inputs.background_quads),
+        ]
         outputs = [target, _or_nothing(buffers, wanted.background_quads)]
         _launch(planes_to_images.fold_quads, pixels, [*lit, cotangents.quads], outputs)
         if wanted.calibration is not None:
             rows = buffers.array("rows", buffers.height, wp.float64)
-            _launch(planes_to_images.fold_dc_offset, buffers.height, [sums, tiling, cotangents.quads], [rows])
+            _launch(
+                planes_to_images.fold_dc_offset,
+                buffers.height,
+                [sums, tiling, cotangents.quads],
+                [rows],
+            )
             _launch(planes_to_images.add_dc_offset, 1, [rows], [wanted.calibration])
     if cotangents.phasor is not None:
-        lit = [sums, tiling, buffers.settings.phasor_factor, _or_nothing(buffers, inputs.background_phasor)]
+        lit = [
+            sums,
+            tiling,
+            buffers.settings.phasor_factor,
+            _or_nothing(buffers, inputs.background_phasor),
+        ]
         outputs = [target, _or_nothing(buffers, wanted.background_phasor)]
         _launch(planes_to_images.fold_phasor, pixels, [*lit, cotangents.phasor], outputs)
     for image, factor, plane in (
@@ -299,17 +407,21 @@ def fold_images(inputs: Inputs, view: View, buffers: Buffers, cotangents: Images
         if cotangent is None:
             channels.append(None)
             continue
-        grad = buffers.gradient_planes(f"gradient of channels {number}", CHANNEL_PLANES, added=False)
+        grad = buffers.gradient_planes(
+            f"gradient of channels {number}", CHANNEL_PLANES, added=False
+        )
         colour = name == "colour"
         background = _or_nothing(buffers, inputs.background_colour if colour else None)
         grad_background = _or_nothing(buffers, wanted.background_colour if colour else None)
         inputs_ = [sums, tiling, background, start, cotangent]
-        _launch(planes_to_images.fold_channels, pixels, inputs_, [grad.flat, target, grad_background])
+        _launch(
+            planes_to_images.fold_channels, pixels, inputs_, [grad.flat, target, grad_background]
+        )
         channels.append(grad)
     return planes, channels or [None]
 
 
-# -- helpers -----------------------------------------------------------------------------------------------------------
+# -- helpers ---------------------------------------------------------------------------------------
 
 
 def _metric(buffers: Buffers, wanted: bool) -> bool | None:
@@ -322,13 +434,18 @@ def _distortion_factor(buffers: Buffers) -> float:
 
 
 def _spread(buffers: Buffers, number: int, *, anew: bool = True) -> wp.array:
-    """Records of a pass for the compositor: of splats, or, for deterministic sums, a copy per pair."""
+    """Records of a pass for the compositor: of splats, or, for deterministic sums,
+    a copy per pair.
+    """
     if not buffers.ordered:
         return buffers.records[number]
     copies = buffers.array(f"records of pairs {number}", len(buffers.owners), splat.Splat)
     if anew and len(buffers.owners):
         _launch(
-            deterministic_sums.spread_records, len(buffers.owners), [buffers.records[number], buffers.owners], [copies]
+            deterministic_sums.spread_records,
+            len(buffers.owners),
+            [buffers.records[number], buffers.owners],
+            [copies],
         )
     return copies
 
@@ -347,7 +464,15 @@ def _states(buffers: Buffers, segments: int) -> wp.array:
 
 
 def _launch(kernel, dim, inputs: list, outputs: list, **adjoint) -> None:
-    wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=_device_of(outputs), record_tape=False, **adjoint)
+    wp.launch(
+        kernel,
+        dim=dim,
+        inputs=inputs,
+        outputs=outputs,
+        device=_device_of(outputs),
+        record_tape=False,
+        **adjoint,
+    )
 
 
 def _device_of(arrays: list) -> wp.Device:

@@ -1,7 +1,9 @@
-"""Tracing: rigid bodies as triangle meshes, balls and endless planes, and the light that a C-ToF camera gets from them.
+"""Tracing: rigid bodies as triangle meshes, balls and endless planes, and the light that a C-ToF
+camera gets from them.
 
-The second way from a scene to an image: no Gaussian, no sorting, no compositing, and no gradient. Each body has one
-mesh that is built once; poses move the rays. NumPy in, NumPy out, on the CPU or on CUDA from the same kernels.
+The second way from a scene to an image: no Gaussian, no sorting, no compositing, and no gradient.
+Each body has one mesh that is built once; poses move the rays. NumPy in, NumPy out, on the CPU or
+on CUDA from the same kernels.
 """
 
 from __future__ import annotations
@@ -33,7 +35,8 @@ class RigidBody:
     points: Float[np.ndarray, "V 3"] | None = None
     """Vertices [m]; None: no triangles."""
     triangles: Int[np.ndarray, "T 3"] | None = None
-    """Three vertices each, counter-clockwise as seen from the side of the normal; None: no triangles."""
+    """Three vertices each, counter-clockwise as seen from the side of the normal; None: no
+    triangles."""
     radius: float = 0.0
     """Radius of a ball [m]; 0: no ball."""
     centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -56,32 +59,46 @@ class RigidBody:
     def __post_init__(self):
         if not 0 <= self.gloss <= 1 or not 0 <= self.shininess < math.inf:
             raise ValueError(
-                f"gloss must be 0 to 1, shininess 0 or more and finite, got {self.gloss} and {self.shininess}"
+                f"gloss must be 0 to 1, shininess 0 or more and finite, got {self.gloss} and "
+                f"{self.shininess}"
             )
         if self.radius > 0 or self.normal is not None:
-            if self.points is not None or self.triangles is not None or (self.radius > 0) == (self.normal is not None):
+            if (
+                self.points is not None
+                or self.triangles is not None
+                or (self.radius > 0) == (self.normal is not None)
+            ):
                 raise ValueError(
                     "a body is a ball, a plane or has triangles, one and not both: "
                     f"radius {self.radius}, normal {self.normal}"
                 )
             if not np.isfinite([*self.centre, self.height]).all():
-                raise ValueError(f"centre and height must be finite, got {self.centre} and {self.height}")
+                raise ValueError(
+                    f"centre and height must be finite, got {self.centre} and {self.height}"
+                )
             if self.normal is not None and abs(np.linalg.norm(self.normal) - 1) > 1e-6:
                 raise ValueError(f"normal must have length 1, got {self.normal}")
             return
         if self.points is None or self.triangles is None or len(self.triangles) == 0:
-            raise ValueError("a body without a radius or a normal needs points and at least one triangle")
+            raise ValueError(
+                "a body without a radius or a normal needs points and at least one triangle"
+            )
         if not np.isfinite(self.points).all():
             raise ValueError("points must be finite")
         if self.triangles.min() < 0 or self.triangles.max() >= len(self.points):
             raise ValueError(
-                f"triangles name points {self.triangles.min()} to {self.triangles.max()} of {len(self.points)}"
+                f"triangles name points {self.triangles.min()} to {self.triangles.max()} of "
+                f"{len(self.points)}"
             )
 
     @property
     def reach(self) -> float:
-        """Distance of the farthest point from the centre [m]; 0 for a plane, where it is not used."""
-        return self.radius if self.points is None else float(np.linalg.norm(self.points, axis=1).max())
+        """Distance of the farthest point from the centre [m]; 0 for a plane,
+        where it is not used.
+        """
+        return (
+            self.radius if self.points is None else float(np.linalg.norm(self.points, axis=1).max())
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,7 +128,9 @@ class Bounces:
 
     def __post_init__(self):
         if self.count < 0 or self.paths < 1:
-            raise ValueError(f"count {self.count} must not be negative, and paths {self.paths} at least 1")
+            raise ValueError(
+                f"count {self.count} must not be negative, and paths {self.paths} at least 1"
+            )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -122,7 +141,8 @@ class Light:
     """
 
     light: Complex[np.ndarray, "h H W"]
-    """Sum of amplitude exp(i phase) at each harmonic of the modulation that was asked for [relative units]."""
+    """Sum of amplitude exp(i phase) at each harmonic of the modulation that was asked for [relative
+    units]."""
     amplitude: Float[np.ndarray, "H W"]
     """Sum of the amplitudes [relative units]: at least the length of each ``light``."""
     direct: Complex[np.ndarray, "h H W"]
@@ -130,11 +150,12 @@ class Light:
     direct_amplitude: Float[np.ndarray, "H W"]
     """The part of ``amplitude`` that met one surface only."""
     ambient: Float[np.ndarray, "H W"]
-    """Mean reflectance of the rays [1], 0 for those that meet nothing: what comes back of light from everywhere."""
+    """Mean reflectance of the rays [1], 0 for those that meet nothing: what comes back of light
+    from everywhere."""
     error: Float[np.ndarray, "H W"]
-    """Standard error of the first of the harmonics, real and imaginary part together, estimated from the spread of the
-    random paths [relative units]: over ``abs(light[0])`` it bounds that of the phase [rad]. 0 without bounces, NaN for
-    a single path."""
+    """Standard error of the first of the harmonics, real and imaginary part together, estimated
+    from the spread of the random paths [relative units]: over ``abs(light[0])`` it bounds that of
+    the phase [rad]. 0 without bounces, NaN for a single path."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -152,7 +173,8 @@ class FirstHits:
 
 
 class Tracer:
-    """Bodies on one device, and the images of one size that are made of them; nothing is allocated between images.
+    """Bodies on one device, and the images of one size that are made of them; nothing is allocated
+    between images.
 
     Args:
         bodies: What there is.
@@ -176,17 +198,22 @@ class Tracer:
         wp.init()
         self.device = wp.get_device(device)
         self.width, self.height = width, height
-        self._meshes = [_mesh(body, self.device) for body in bodies]  # kept alive: kernels get their ids only
+        # kept alive: kernels get their ids only
+        self._meshes = [_mesh(body, self.device) for body in bodies]
         self._solids = _solids(bodies, self._meshes, self.device)
         self._poses: dict[int, tuple[wp.array, wp.array]] = {}
-        self._harmonics = wp.array(np.asarray(harmonics, dtype=np.int32), dtype=wp.int32, device=self.device)
+        self._harmonics = wp.array(
+            np.asarray(harmonics, dtype=np.int32), dtype=wp.int32, device=self.device
+        )
         wanted = (threads or available_threads()) if self.device.is_cpu else 1
         self._parts = max(1, min(wanted, height // ROWS_MIN))
         shape = (height, width)
         one, many = ((wp.float32, shape), (wp.vec2, (len(harmonics), *shape)))
         self._direct = [self._empty(size, dtype) for dtype, size in (many, one, one)]
         self._indirect = [self._empty(size, dtype) for dtype, size in (many, one, one)]
-        self._hits = [self._empty(shape, dtype) for dtype in (wp.float32, wp.float32, wp.vec3, wp.int32)]
+        self._hits = [
+            self._empty(shape, dtype) for dtype in (wp.float32, wp.float32, wp.vec3, wp.int32)
+        ]
 
     def light(
         self,
@@ -199,7 +226,8 @@ class Tracer:
         bounces: Bounces = Bounces(),
         seed: int = 0,
     ) -> Light:
-        """Light averaged over T instants: direct light over a grid of rays per pixel, the rest over random paths.
+        """Light averaged over T instants: direct light over a grid of rays per pixel, the rest over
+        random paths.
 
         Args:
             cameras: The camera at each instant; only its pose may change.
@@ -214,25 +242,39 @@ class Tracer:
             ValueError: If there is no instant, or sizes do not fit.
         """
         if subsamples < 1 or not f_mod_hz > 0:
-            raise ValueError(f"subsamples {subsamples} must be at least 1 and f_mod_hz {f_mod_hz} above 0")
+            raise ValueError(
+                f"subsamples {subsamples} must be at least 1 and f_mod_hz {f_mod_hz} above 0"
+            )
         view = self._view(cameras[0])
         poses = self._place(cameras, world_from_body)
         inputs = [view, _emitter(lamp, f_mod_hz), self._harmonics, self._solids, *poses]
         self._over_rows(light_paths.trace_light, [*inputs, subsamples], self._direct)
         direct, amplitude, ambient = (array.numpy().copy() for array in self._direct)
-        total, error, direct = amplitude, np.zeros_like(amplitude), direct.view(np.complex64)[..., 0]
+        total, error, direct = (
+            amplitude,
+            np.zeros_like(amplitude),
+            direct.view(np.complex64)[..., 0],
+        )
         light = direct
         if bounces.count:
             count = -(-bounces.paths // len(cameras)) * len(cameras)
-            self._over_rows(light_paths.trace_bounces, [*inputs, bounces.count, count, seed], self._indirect)
+            self._over_rows(
+                light_paths.trace_bounces, [*inputs, bounces.count, count, seed], self._indirect
+            )
             more, indirect, error = (array.numpy().copy() for array in self._indirect)
             light, total = direct + more.view(np.complex64)[..., 0], amplitude + indirect
         return Light(
-            light=light, amplitude=total, direct=direct, direct_amplitude=amplitude, ambient=ambient, error=error
+            light=light,
+            amplitude=total,
+            direct=direct,
+            direct_amplitude=amplitude,
+            ambient=ambient,
+            error=error,
         )
 
     def first_hits(self, camera: Camera, world_from_body: Float[np.ndarray, "B 4 4"]) -> FirstHits:
-        """What the centre ray of every pixel meets at one instant, with all bodies at these poses [m].
+        """What the centre ray of every pixel meets at one instant, with all bodies at these poses
+        [m].
 
         Raises:
             ValueError: If sizes do not fit.
@@ -245,16 +287,28 @@ class Tracer:
 
     def _view(self, camera: Camera) -> CameraView:
         if (camera.width, camera.height) != (self.width, self.height):
-            raise ValueError(f"camera {camera.width}x{camera.height} must be {self.width}x{self.height}")
+            raise ValueError(
+                f"camera {camera.width}x{camera.height} must be {self.width}x{self.height}"
+            )
         return view_of(camera, RenderSettings())
 
-    def _place(self, cameras: Sequence[Camera], world_from_body: np.ndarray) -> tuple[wp.array, wp.array]:
-        """Body from camera, composed in float64: what is far from the origin of the world loses no digits."""
+    def _place(
+        self, cameras: Sequence[Camera], world_from_body: np.ndarray
+    ) -> tuple[wp.array, wp.array]:
+        """Body from camera, composed in float64: what is far from the origin of the world loses no
+        digits.
+        """
         want = (len(cameras), len(self._meshes), 4, 4)
         if len(cameras) == 0 or world_from_body.shape != want:
-            raise ValueError(f"world_from_body {world_from_body.shape} must be {want}, with at least one instant")
-        world_from_camera = np.linalg.inv(np.stack([camera.camera_from_world for camera in cameras]))
-        body_from_camera = (np.linalg.inv(world_from_body) @ world_from_camera[:, None]).astype(np.float32)
+            raise ValueError(
+                f"world_from_body {world_from_body.shape} must be {want}, with at least one instant"
+            )
+        world_from_camera = np.linalg.inv(
+            np.stack([camera.camera_from_world for camera in cameras])
+        )
+        body_from_camera = (np.linalg.inv(world_from_body) @ world_from_camera[:, None]).astype(
+            np.float32
+        )
         rotation, translation = self._poses.setdefault(
             len(cameras), tuple(self._empty(want[:2], dtype) for dtype in (wp.mat33, wp.vec3))
         )
@@ -263,7 +317,9 @@ class Tracer:
         return rotation, translation
 
     def _over_rows(self, kernel, inputs: list, outputs: list[wp.array]) -> None:
-        """Launch over the rows, every n-th to a CPU thread of n, so that all have about the same to do."""
+        """Launch over the rows, every n-th to a CPU thread of n,
+        so that all have about the same to do.
+        """
         parts = self._parts
         commands = [
             wp.launch(
@@ -287,8 +343,12 @@ class Tracer:
 def _mesh(body: RigidBody, device: wp.Device) -> wp.Mesh | None:
     if body.points is None or body.triangles is None:
         return None
-    points = wp.array(np.ascontiguousarray(body.points, dtype=np.float32), dtype=wp.vec3, device=device)
-    indices = wp.array(np.ascontiguousarray(body.triangles, dtype=np.int32).ravel(), dtype=wp.int32, device=device)
+    points = wp.array(
+        np.ascontiguousarray(body.points, dtype=np.float32), dtype=wp.vec3, device=device
+    )
+    indices = wp.array(
+        np.ascontiguousarray(body.triangles, dtype=np.int32).ravel(), dtype=wp.int32, device=device
+    )
     return wp.Mesh(points=points, indices=indices)
 
 
@@ -303,7 +363,9 @@ def _emitter(lamp: Lamp, f_mod_hz: float) -> light_paths.Emitter:
     return emitter
 
 
-def _solids(bodies: Sequence[RigidBody], meshes: Sequence[wp.Mesh | None], device: wp.Device) -> wp.array:
+def _solids(
+    bodies: Sequence[RigidBody], meshes: Sequence[wp.Mesh | None], device: wp.Device
+) -> wp.array:
     solids = []
     for body, mesh in zip(bodies, meshes, strict=True):
         solid = rays.Solid()

@@ -56,8 +56,13 @@ class Camera:
         if pose.shape != (4, 4):
             raise ValueError(f"camera_from_world {pose.shape} must be (4, 4)")
         rotation = pose[:3, :3]
-        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4) or np.linalg.det(rotation) < 0:
-            raise ValueError(f"camera_from_world: its upper left 3x3 is not a rotation: {rotation.tolist()}")
+        if (
+            not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4)
+            or np.linalg.det(rotation) < 0
+        ):
+            raise ValueError(
+                f"camera_from_world: its upper left 3x3 is not a rotation: {rotation.tolist()}"
+            )
         if self.width < 1 or self.height < 1 or not (self.fx > 0 and self.fy > 0):
             raise ValueError(
                 f"a camera needs pixels and focal lengths above 0, got {self.width}x{self.height}, "
@@ -70,7 +75,9 @@ class Camera:
     def from_fov(cls, width: int, height: int, horizontal_fov_deg: float, **pose: Any) -> Camera:
         """A camera with square pixels, a centred principal point and a field of view [deg]."""
         focal = 0.5 * width / math.tan(math.radians(horizontal_fov_deg) / 2)
-        return cls(width=width, height=height, fx=focal, fy=focal, cx=width / 2, cy=height / 2, **pose)
+        return cls(
+            width=width, height=height, fx=focal, fy=focal, cx=width / 2, cy=height / 2, **pose
+        )
 
     @property
     def centre(self) -> np.ndarray:
@@ -82,7 +89,9 @@ class Camera:
     def guard(self) -> Guard:
         """Limits of the derivatives of the projection, and of the polynomial of the lens."""
         if not self.distortion:
-            return Guard(0.5 * GUARD * self.width / self.fx, 0.5 * GUARD * self.height / self.fy, math.inf)
+            return Guard(
+                0.5 * GUARD * self.width / self.fx, 0.5 * GUARD * self.height / self.fy, math.inf
+            )
         return _guard(self.distortion, self.width, self.height, self.fx, self.fy, self.cx, self.cy)
 
     def at(self, camera_from_world: np.ndarray) -> Camera:
@@ -115,7 +124,9 @@ class Camera:
             ValueError: If a position is so far outside the image that the lens cannot be inverted
                 there.
         """
-        flat = (points - points.new_tensor([self.cx, self.cy])) / points.new_tensor([self.fx, self.fy])
+        flat = (points - points.new_tensor([self.cx, self.cy])) / points.new_tensor(
+            [self.fx, self.fy]
+        )
         if not self.distortion:
             return flat
         x, y = flat.detach().double().cpu().numpy().reshape(-1, 2).T
@@ -133,7 +144,9 @@ class Camera:
         directions = torch.stack([*flat, torch.ones(shape, dtype=torch.float64)], dim=-1)
         return directions / directions.norm(dim=-1, keepdim=True)
 
-    def rays(self, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32) -> Float[Tensor, "H W 3"]:
+    def rays(
+        self, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32
+    ) -> Float[Tensor, "H W 3"]:
         """World unit vectors through the pixel centres: point = centre + distance * ray."""
         world_from_camera = torch.from_numpy(self.camera_from_world[:3, :3].T.copy())
         return (self.directions() @ world_from_camera.T).to(device=device, dtype=dtype)
@@ -142,13 +155,19 @@ class Camera:
         """Image position (x, y) [px] of points in the world [m], in front of the camera."""
         kind = point.device, point.dtype
         if kind not in self._sent:
-            numbers = self.camera_from_world, np.array([self.fx, self.fy]), np.array([self.cx, self.cy])
+            numbers = (
+                self.camera_from_world,
+                np.array([self.fx, self.fy]),
+                np.array([self.cx, self.cy]),
+            )
             self._sent[kind] = tuple(torch.from_numpy(number).to(point) for number in numbers)
         pose, focal, principal = self._sent[kind]
         local = point @ pose[:3, :3].T + pose[:3, 3]
         flat = local[..., :2] / local[..., 2:]
         if self.distortion:
-            flat = torch.stack(self.distortion.apply(flat[..., 0], flat[..., 1], self.guard.radius), dim=-1)
+            flat = torch.stack(
+                self.distortion.apply(flat[..., 0], flat[..., 1], self.guard.radius), dim=-1
+            )
         return flat * focal + principal
 
     @functools.cached_property
@@ -158,7 +177,9 @@ class Camera:
 
 
 @functools.lru_cache(maxsize=256)
-def _guard(lens: Distortion, width: int, height: int, fx: float, fy: float, cx: float, cy: float) -> Guard:
+def _guard(
+    lens: Distortion, width: int, height: int, fx: float, fy: float, cx: float, cy: float
+) -> Guard:
     """Guard of a lens, for all poses of a camera."""
     x, y = np.linspace(0, width, CHECKED), np.linspace(0, height, CHECKED)[:, None]
     x, y = lens.undo((x - cx) / fx, (y - cy) / fy)

@@ -51,7 +51,12 @@ def changed(settings: Settings, changes: Iterable[str], wording: Wording) -> Set
     for text in changes:
         name, sign, value = (part.strip() for part in text.partition("="))
         if not sign or not value:
-            raise _refused(text, "expected NAME=VALUE", f"for example {wording.option} {wording.example}", wording)
+            raise _refused(
+                text,
+                "expected NAME=VALUE",
+                f"for example {wording.option} {wording.example}",
+                wording,
+            )
         settings = _with(settings, name.split("."), value, name, wording)
     return settings
 
@@ -59,7 +64,11 @@ def changed(settings: Settings, changes: Iterable[str], wording: Wording) -> Set
 def _with(settings: Any, path: list[str], value: str, name: str, wording: Wording) -> Any:
     head, *rest = path
     members = _members(settings)
-    kinds = dict.fromkeys(members) if isinstance(settings, tuple) else typing.get_type_hints(type(settings))
+    kinds = (
+        dict.fromkeys(members)
+        if isinstance(settings, tuple)
+        else typing.get_type_hints(type(settings))
+    )
     if head not in members or (head in wording.fixed and not rest):
         before = name.removesuffix(".".join(path))
         known = sorted(before + other for other in set(names(settings)) - set(wording.fixed))
@@ -70,12 +79,18 @@ def _with(settings: Any, path: list[str], value: str, name: str, wording: Wordin
         whole = wording.named[name]
         if value in whole:
             return replace(settings, **{head: whole[value]})
-        fix = suggestion(value, whole) or f"take one of {', '.join(whole)}, or name a single setting of it"
+        fix = suggestion(value, whole) or (
+            f"take one of {', '.join(whole)}, or name a single setting of it"
+        )
         raise _refused(f"{name}={value}", f"there is no {head} of that name", fix, wording)
     if _has_parts(present) == (not rest):
         inner = ", ".join(names(present)) if _has_parts(present) else "nothing"
         raise _refused(name, f"{head} holds {inner}", "name a single setting", wording)
-    new = _with(present, rest, value, name, wording) if rest else _parsed(value, kinds[head], name, wording)
+    new = (
+        _with(present, rest, value, name, wording)
+        if rest
+        else _parsed(value, kinds[head], name, wording)
+    )
     if isinstance(settings, tuple):
         return tuple(new if key == head else part for key, part in members.items())
     try:
@@ -100,7 +115,9 @@ def _members(settings: Any) -> dict[str, Any]:
 
 def _has_parts(value: Any) -> bool:
     """Whether a value has nested settings: a dataclass, or a tuple of such."""
-    return is_dataclass(value) or (isinstance(value, tuple) and bool(value) and all(map(is_dataclass, value)))
+    return is_dataclass(value) or (
+        isinstance(value, tuple) and bool(value) and all(map(is_dataclass, value))
+    )
 
 
 def _parsed(text: str, kind: Any, name: str, wording: Wording) -> Any:
@@ -115,21 +132,38 @@ def _parsed(text: str, kind: Any, name: str, wording: Wording) -> Any:
         if wanted[1:] == (Ellipsis,):
             wanted = wanted[:1] * len(parts)
         if len(parts) != len(wanted):
-            raise _refused(f"{name}={text}", f"expected {len(wanted)} values", "separate them by commas", wording)
-        return tuple(_parsed(part.strip(), one, name, wording) for part, one in zip(parts, wanted, strict=True))
+            raise _refused(
+                f"{name}={text}",
+                f"expected {len(wanted)} values",
+                "separate them by commas",
+                wording,
+            )
+        return tuple(
+            _parsed(part.strip(), one, name, wording)
+            for part, one in zip(parts, wanted, strict=True)
+        )
     if kind is bool:
         if text.lower() not in ("true", "false"):
             raise _refused(f"{name}={text}", "expected true or false", "choose one", wording)
         return text.lower() == "true"
     if is_dataclass(kind) or kind is None:
-        raise _refused(f"{name}={text}", "it has fields, which a text cannot express", "write it in Python", wording)
+        raise _refused(
+            f"{name}={text}",
+            "it has fields, which a text cannot express",
+            "write it in Python",
+            wording,
+        )
     try:
         value = kind(text)
         if value != value:
             raise ValueError("not a number")
         return value
     except ValueError:
-        expected = ", ".join(kind) if isinstance(kind, enum.EnumMeta) else {"int": "a whole number"}.get(kind.__name__)
+        expected = (
+            ", ".join(kind)
+            if isinstance(kind, enum.EnumMeta)
+            else {"int": "a whole number"}.get(kind.__name__)
+        )
         why = f"expected {expected or 'a number'}"
         raise _refused(f"{name}={text}", why, "choose another value", wording) from None
 

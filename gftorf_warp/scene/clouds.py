@@ -16,11 +16,14 @@ from torch import Tensor
 from .fusion import Layer, Views
 from .tracks import interpolated, nearest, unproject
 
-CLOUD_SIZE, OBJECT_SIZE = 2000, 300  # points of a cloud and of an object that are compared, evenly thinned
+# points of a cloud and of an object that are compared, evenly thinned
+CLOUD_SIZE, OBJECT_SIZE = 2000, 300
 ITERATIONS = 6  # of assigning points to objects and moving these to the centroids
 AREA_RATIO = 0.75  # least ratio of visible areas, now and before, at which centroids are comparable
-AREA_RATIO_CUT = 0.95  # likewise if the border of the image cuts the object, whose centroid then lags
-GATE = 2.0  # largest distance of an object's points from it, in root mean square radii of the object
+# likewise if the border of the image cuts the object, whose centroid then lags
+AREA_RATIO_CUT = 0.95
+# largest distance of an object's points from it, in root mean square radii of the object
+GATE = 2.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -33,7 +36,9 @@ class Cloud:
     """Distances [m], without outliers."""
 
 
-def cloud_of(moving: Bool[Tensor, "H W"], distance: Float[Tensor, "H W"], margin: Float[Tensor, "H W"]) -> Cloud:
+def cloud_of(
+    moving: Bool[Tensor, "H W"], distance: Float[Tensor, "H W"], margin: Float[Tensor, "H W"]
+) -> Cloud:
     """The moving points of an image, without isolated ones, as mixtures at outlines are.
 
     Distances [m] that differ by more than ``margin`` [m] from the median of their moving
@@ -41,7 +46,9 @@ def cloud_of(moving: Bool[Tensor, "H W"], distance: Float[Tensor, "H W"], margin
     """
     mask, distance = moving & (_windows(moving.float()).mean(dim=0) > 0.5), distance.clone()
     median = _windows(torch.where(mask, distance, torch.nan))[:, mask].nanmedian(dim=0).values
-    distance[mask] = torch.where((distance[mask] - median).abs() > margin[mask], median, distance[mask])
+    distance[mask] = torch.where(
+        (distance[mask] - median).abs() > margin[mask], median, distance[mask]
+    )
     return Cloud(mask=mask, distance=distance)
 
 
@@ -49,7 +56,10 @@ def reference(clouds: list[Cloud]) -> int:
     """The view nearest to the middle with at least half as many points as the largest cloud."""
     sizes = [int(cloud.mask.sum()) for cloud in clouds]
     middle = len(clouds) // 2
-    return min((j for j, size in enumerate(sizes) if 2 * size >= max(sizes)), key=lambda j: (abs(j - middle), j))
+    return min(
+        (j for j, size in enumerate(sizes) if 2 * size >= max(sizes)),
+        key=lambda j: (abs(j - middle), j),
+    )
 
 
 def moving_layer(
@@ -67,7 +77,9 @@ def moving_layer(
     kept = (count >= fellows)[index]
     place, far = grid[mask][kept], distance[mask][kept]
     amplitude = views.amplitude[view][row, column][mask][kept]
-    layer = Layer(mean=unproject(views.cameras[view], place, far), distance=far, amplitude=amplitude)
+    layer = Layer(
+        mean=unproject(views.cameras[view], place, far), distance=far, amplitude=amplitude
+    )
     return layer, torch.unique(names[index[kept]], return_inverse=True)[1]
 
 
@@ -102,7 +114,8 @@ def follow_clouds(
     visible = [_visible(views, view, cloud) for view, cloud in enumerate(clouds)]
     for step in (1, -1) if count else ():
         tracks = [
-            _Track(points[group], known, views, start, fellows) for group, known in zip(groups, shifts, strict=True)
+            _Track(points[group], known, views, start, fellows)
+            for group, known in zip(groups, shifts, strict=True)
         ]
         for view in range(start + step, len(visible) if step > 0 else -1, step):
             _find(tracks, visible[view], views.times[view])
@@ -159,7 +172,9 @@ class _Track:
         """The shift [m], extrapolated from the last known step."""
         return self.shift + (time - self.time) * self.velocity
 
-    def update(self, surface: Float[Tensor, "Q 3"], shift: Float[Tensor, "3"], area: float, time: float) -> None:
+    def update(
+        self, surface: Float[Tensor, "Q 3"], shift: Float[Tensor, "3"], area: float, time: float
+    ) -> None:
         """Add the shift [m] of a view, by its visible points [m] and their area [m^2]."""
         self.velocity = (shift - self.shift) / (time - self.time)
         self.shift, self.time, self.area = shift, time, area
@@ -181,7 +196,9 @@ def _find(tracks: list[_Track], visible: _Visible, time: float) -> None:
         nearest, owner = torch.stack(apart).min(dim=0)
         mine = [(owner == number) & (nearest <= 1.0) for number in range(len(tracks))]
         shifts = [
-            _centroid(visible.points[of], visible.weight[of]) - track.centroid if of.any() else shift
+            _centroid(visible.points[of], visible.weight[of]) - track.centroid
+            if of.any()
+            else shift
             for track, of, shift in zip(tracks, mine, shifts, strict=True)
         ]
     for track, of, shift in zip(tracks, mine, shifts, strict=True):

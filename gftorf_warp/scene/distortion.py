@@ -64,13 +64,17 @@ class Distortion:
     @classmethod
     def of(cls, coefficients: tuple[float, float, float, float, float] | None) -> Distortion:
         """From k1, k2, p1, p2, k3, OpenCV's order; None is a pinhole."""
-        return cls(**dict(zip((f.name for f in fields(cls)), coefficients or [0.0] * 5, strict=True)))
+        return cls(
+            **dict(zip((f.name for f in fields(cls)), coefficients or [0.0] * 5, strict=True))
+        )
 
     def __bool__(self) -> bool:
         """Whether any coefficient is not zero."""
         return any(astuple(self))
 
-    def apply(self, x: Coordinate, y: Coordinate, radius: float = math.inf) -> tuple[Coordinate, Coordinate]:
+    def apply(
+        self, x: Coordinate, y: Coordinate, radius: float = math.inf
+    ) -> tuple[Coordinate, Coordinate]:
         """Image of the point (x, y) [1] of a pinhole image; arrays or tensors of any shape.
 
         Extrapolated by the tangent beyond ``radius`` [1] from the axis.
@@ -96,7 +100,9 @@ class Distortion:
         Raises:
             ValueError: If a position has no inverse, or two.
         """
-        wanted = np.broadcast_arrays(np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64))
+        wanted = np.broadcast_arrays(
+            np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
+        )
         u, v = (axis.copy() for axis in wanted)
         with np.errstate(all="ignore"):  # divergence is detected below
             for _ in range(STEPS_MAX):
@@ -109,11 +115,14 @@ class Distortion:
                     break
             got = self.apply(u, v, radius)
             error = np.maximum(np.abs(wanted[0] - got[0]), np.abs(wanted[1] - got[1]))
-            good = (error < 1e3 * CONVERGED * np.maximum(1.0, np.hypot(*wanted))) & self._unfolded(u, v, radius)
+            good = (error < 1e3 * CONVERGED * np.maximum(1.0, np.hypot(*wanted))) & self._unfolded(
+                u, v, radius
+            )
         if not good.all():
             worst = np.unravel_index(np.argmin(good), good.shape)
             raise ValueError(
-                f"a lens with {self} cannot be undone at ({wanted[0][worst]:.3g}, {wanted[1][worst]:.3g}) focal "
+                f"a lens with {self} cannot be undone at ({wanted[0][worst]:.3g}, "
+                f"{wanted[1][worst]:.3g}) focal "
                 f"lengths from the principal point"
             )
         return u, v
@@ -128,8 +137,12 @@ class Distortion:
         r = np.maximum(np.hypot(x, y), radius)
         cosine, sine, step = x / r, y / r, 1e-4 * radius
         ends = [self.slope(near_x + side * cosine, near_y + side * sine) for side in (step, -step)]
-        bend = [(there - here) / (2 * step) * (r - radius) * radius / r for there, here in zip(*ends, strict=True)]
-        to_x, to_y = bend[1] * cosine - bend[0] * sine, bend[2] * cosine - bend[1] * sine  # along (-sine, cosine)
+        bend = [
+            (there - here) / (2 * step) * (r - radius) * radius / r
+            for there, here in zip(*ends, strict=True)
+        ]
+        # along (-sine, cosine)
+        to_x, to_y = bend[1] * cosine - bend[0] * sine, bend[2] * cosine - bend[1] * sine
         return xx - to_x * sine, xy + to_x * cosine, xy - to_y * sine, yy + to_y * cosine
 
     def slope(self, x: Coordinate, y: Coordinate) -> tuple[Coordinate, Coordinate, Coordinate]:
@@ -157,7 +170,8 @@ class Distortion:
         radius = most if good.all() else most * int(good.argmin()) / RADII
         if radius < corner:
             raise ValueError(
-                f"a lens with {self} folds the image {radius:.3g} focal lengths from the principal point, and the "
+                f"a lens with {self} folds the image {radius:.3g} focal lengths from the "
+                f"principal point, and the "
                 f"image reaches to {corner:.3g}"
             )
         return radius

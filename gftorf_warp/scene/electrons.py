@@ -44,7 +44,13 @@ def dark_electrons(sensor: Sensor) -> float:
 
 
 def phase_noise(
-    mean: Scalar, amplitude: Scalar, read: float, samples: int, *, taps: int = 2, phase: Scalar | None = None
+    mean: Scalar,
+    amplitude: Scalar,
+    read: float,
+    samples: int,
+    *,
+    taps: int = 2,
+    phase: Scalar | None = None,
 ) -> Tensor:
     """Standard deviation of a decoded phase [rad], where it is small against 1.
 
@@ -61,12 +67,19 @@ def phase_noise(
         ValueError: If there are fewer than three shifts, or another number of taps.
     """
     if samples < 3 or taps not in (1, 2):
-        raise ValueError(f"a phase needs at least 3 samples, got {samples}, of 1 or 2 taps, got {taps}")
-    mean, amplitude = torch.as_tensor(mean, dtype=torch.float64), torch.as_tensor(amplitude, dtype=torch.float64)
+        raise ValueError(
+            f"a phase needs at least 3 samples, got {samples}, of 1 or 2 taps, got {taps}"
+        )
+    mean, amplitude = (
+        torch.as_tensor(mean, dtype=torch.float64),
+        torch.as_tensor(amplitude, dtype=torch.float64),
+    )
     tap = mean + read**2
     variance = 2.0 / (taps * samples) * tap / amplitude**2
     if taps == 1 and samples == 3 and phase is not None:
-        variance = variance * (1.0 - amplitude * torch.cos(3.0 * torch.as_tensor(phase)) / (2.0 * tap))
+        variance = variance * (
+            1.0 - amplitude * torch.cos(3.0 * torch.as_tensor(phase)) / (2.0 * tap)
+        )
     return variance.sqrt()
 
 
@@ -93,4 +106,8 @@ def predicted_distance_noise(amplitude: Scalar, sensor: Sensor) -> Tensor:
     Differentiable by ``f_mod_hz``: -sigma (1/f + C'/C). The modulation frequency with the least
     noise is the cutoff of the contrast; long before, distances are no longer unambiguous.
     """
-    return SPEED_OF_LIGHT / (4.0 * math.pi * sensor.f_mod_hz) * predicted_phase_noise(amplitude, sensor)
+    return (
+        SPEED_OF_LIGHT
+        / (4.0 * math.pi * sensor.f_mod_hz)
+        * predicted_phase_noise(amplitude, sensor)
+    )

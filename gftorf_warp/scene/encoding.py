@@ -1,4 +1,6 @@
-"""Positional encoding of positions and times: gamma(v) = [v, sin 2^0 v, cos 2^0 v, sin 2^1 v, cos 2^1 v, ..]."""
+"""Positional encoding of positions and times: gamma(v) = [v, sin 2^0 v, cos 2^0 v, sin 2^1 v,
+cos 2^1 v, ..].
+"""
 
 from __future__ import annotations
 
@@ -37,7 +39,9 @@ def encoded(
     size = encoded_size(dimensions, count)
     angles = value[..., None, :] * powers[:, None]
     allocate = torch.empty if columns in (None, size) else torch.zeros
-    rows = allocate(*value.shape[:-1], columns or size, dtype=dtype or value.dtype, device=value.device)
+    rows = allocate(
+        *value.shape[:-1], columns or size, dtype=dtype or value.dtype, device=value.device
+    )
     rows[..., :dimensions] = value
     waves = rows[..., dimensions:size].unflatten(-1, (count, 2, dimensions))
     torch.sin(angles, out=waves[..., 0, :])

@@ -23,15 +23,25 @@ from torch import Tensor
 from ..data.decode import unambiguous_range
 from ..data.sequence import Sequence
 from .camera import Camera
-from .measured import DISTANCE_TRUSTED, camera_of, decoded_phasors, distance_noise, fill, quads_gain, sensor_of
+from .measured import (
+    DISTANCE_TRUSTED,
+    camera_of,
+    decoded_phasors,
+    distance_noise,
+    fill,
+    quads_gain,
+    sensor_of,
+)
 from .tracks import unproject
 from .unwrap import distance_from_phasors
 
-WITNESSES = 32  # quartets that a point is compared with, spread evenly: more cost time and add little
+# quartets that a point is compared with, spread evenly: more cost time and add little
+WITNESSES = 32
 SEEN_THROUGH = 0.3  # share of the witnesses that count beyond which a point is not static
 CHUNK = 1 << 20  # points times witnesses at once: some ten megabytes per intermediate
 CLOSE = 0.02  # [m] z-depth below which nothing is projected
-COVERS = 0.75  # radius that a point covers [spacings]: half a diagonal is 0.71, and less adds mixed outlines
+# radius that a point covers [spacings]: half a diagonal is 0.71, and less adds mixed outlines
+COVERS = 0.75
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -56,7 +66,10 @@ class Views:
     def points(self, view: int) -> Float[Tensor, "H W 3"]:
         """Points in the world that the pixels of a view decode [m]."""
         camera = self.cameras[view]
-        return torch.tensor(camera.centre, dtype=torch.float32) + self.distance[view, ..., None] * camera.rays()
+        return (
+            torch.tensor(camera.centre, dtype=torch.float32)
+            + self.distance[view, ..., None] * camera.rays()
+        )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -102,7 +115,9 @@ def views_of(sequence: Sequence, nearer: float) -> Views:
         margin=torch.full_like(amplitude, nearer),
         unambiguous_range=unambiguous_range(sequence),
     )
-    deviation = distance_noise(amplitude, _noise(views, float(sensor.phase_slope), quads_gain(sequence)), sequence)
+    deviation = distance_noise(
+        amplitude, _noise(views, float(sensor.phase_slope), quads_gain(sequence)), sequence
+    )
     dark = deviation > DISTANCE_TRUSTED
     views.margin.add_(4.0 * deviation)
     for view in dark.any(dim=2).any(dim=1).nonzero()[:, 0].tolist():
@@ -138,7 +153,9 @@ class _Projected:
 def _projected(views: Views, points: Float[Tensor, "P 3"], of: list[int]) -> _Projected:
     """Pixels and distances of points in the views ``of``, and what these decode there."""
     camera = views.cameras[0]
-    poses = torch.tensor(np.stack([views.cameras[j].camera_from_world for j in of]), dtype=torch.float32)
+    poses = torch.tensor(
+        np.stack([views.cameras[j].camera_from_world for j in of]), dtype=torch.float32
+    )
     x, y, z = (torch.matmul(poses[:, :3, :3], points.T) + poses[:, :3, 3:]).unbind(dim=1)
     ahead = z > CLOSE
     across, down = camera.fx * x / z, camera.fy * y / z
@@ -170,14 +187,20 @@ def _wrapped(difference: Tensor, unambiguous_range: float) -> Tensor:
 def verdicts(views: Views) -> Iterator[Verdict]:
     """The comparison of each view with its witnesses, in order."""
     count = len(views.quartets)
-    spread = np.unique(np.linspace(0, count - 1, min(count, WITNESSES)).round().astype(int)).tolist()
-    nearest = -torch.nn.functional.max_pool2d(-views.distance[:, None], 3, stride=1, padding=1)[:, 0]
+    spread = np.unique(
+        np.linspace(0, count - 1, min(count, WITNESSES)).round().astype(int)
+    ).tolist()
+    nearest = -torch.nn.functional.max_pool2d(-views.distance[:, None], 3, stride=1, padding=1)[
+        :, 0
+    ]
     for view in range(count):
         witnesses = [j for j in spread if j != view]
         yield _verdict(views, view, witnesses, nearest)
 
 
-def _verdict(views: Views, view: int, witnesses: list[int], nearest: Float[Tensor, "J H W"]) -> Verdict:
+def _verdict(
+    views: Views, view: int, witnesses: list[int], nearest: Float[Tensor, "J H W"]
+) -> Verdict:
     size = views.distance.shape[1:]
     margins, near = views.margin[view].flatten(), views.distance[view].flatten()
     reflectivity = views.amplitude[view].flatten() * near.square()
@@ -194,12 +217,19 @@ def _verdict(views: Views, view: int, witnesses: list[int], nearest: Float[Tenso
             difference = _wrapped(seen.decoded - seen.expected, views.unambiguous_range)
             supporting = seen.inside & (difference.abs() <= margin)
             behind = nearest[witnesses].flatten(1).gather(1, seen.pixel) > seen.expected + margin
-            supports, through = supporting.sum(dim=0), (seen.inside & behind & ~supporting).sum(dim=0)
+            supports, through = (
+                supporting.sum(dim=0),
+                (seen.inside & behind & ~supporting).sum(dim=0),
+            )
             apart = torch.where(supporting, difference, 0.0).sum(dim=0)
             bright = torch.where(supporting, seen.amplitude * seen.decoded.square(), 0.0).sum(dim=0)
         share = 1.0 / (1.0 + supports)
-        parts.append((supports, through, near[rows] + share * apart, share * (reflectivity[rows] + bright)))
-    supports, through, distance, reflectivity = (torch.cat(part).view(size) for part in zip(*parts, strict=True))
+        parts.append(
+            (supports, through, near[rows] + share * apart, share * (reflectivity[rows] + bright))
+        )
+    supports, through, distance, reflectivity = (
+        torch.cat(part).view(size) for part in zip(*parts, strict=True)
+    )
     return Verdict(supports=supports, through=through, distance=distance, reflectivity=reflectivity)
 
 
@@ -215,7 +245,9 @@ class Layer:
     """Amplitude in that view [quad units]."""
 
 
-def static_layer(views: Views, judged: list[Verdict], grid: Float[Tensor, "P 2"], spacing: float) -> Layer:
+def static_layer(
+    views: Views, judged: list[Verdict], grid: Float[Tensor, "P 2"], spacing: float
+) -> Layer:
     """Points about ``spacing`` pixels apart on all static surfaces of all views, each surface once.
 
     In turn, beginning with the middle one, each view adds the points of its grid that no earlier
@@ -232,7 +264,9 @@ def static_layer(views: Views, judged: list[Verdict], grid: Float[Tensor, "P 2"]
     for view in _outwards(len(views.quartets)):
         verdict = judged[view]
         alone = verdict.supports + verdict.through == 0
-        there = torch.where(alone, ~outlying(views.distance[view], views.margin[view]), verdict.supports > 0)
+        there = torch.where(
+            alone, ~outlying(views.distance[view], views.margin[view]), verdict.supports > 0
+        )
         wanted = (there & ~verdict.moving & ~_covered(views, view, layer, spacing))[row, column]
         distance = verdict.distance[row, column][wanted]
         amplitude = verdict.reflectivity[row, column][wanted] / distance.square().clamp_min(1e-12)
@@ -264,12 +298,22 @@ def _covered(views: Views, view: int, layer: Layer, spacing: float) -> Bool[Tens
     if not len(layer.mean):
         return covered.bool()
     seen = _projected(views, layer.mean, [view])
-    here = seen.inside[0] & (_wrapped(seen.decoded - seen.expected, views.unambiguous_range).abs() <= seen.margin)[0]
-    radius = (COVERS * spacing * layer.distance / seen.expected[0]).round().long().clamp(0, min(height, width) // 4)
+    here = (
+        seen.inside[0]
+        & (_wrapped(seen.decoded - seen.expected, views.unambiguous_range).abs() <= seen.margin)[0]
+    )
+    radius = (
+        (COVERS * spacing * layer.distance / seen.expected[0])
+        .round()
+        .long()
+        .clamp(0, min(height, width) // 4)
+    )
     for size in radius[here].unique().tolist():
         marks = torch.zeros(height * width)
         marks[seen.pixel[0][here & (radius == size)]] = 1.0
-        pooled = torch.nn.functional.max_pool2d(marks.view(1, height, width), 2 * size + 1, stride=1, padding=size)
+        pooled = torch.nn.functional.max_pool2d(
+            marks.view(1, height, width), 2 * size + 1, stride=1, padding=size
+        )
         covered = torch.maximum(covered, pooled[0])
     return covered.bool()
 

@@ -45,7 +45,9 @@ class GaussianField:
         for name, shape in want.items():
             value = getattr(self, name)
             if value is not None and tuple(value.shape) != shape:
-                raise ValueError(f"{name} {tuple(value.shape)} must be {shape} for N = {n}, the length of mean")
+                raise ValueError(
+                    f"{name} {tuple(value.shape)} must be {shape} for N = {n}, the length of mean"
+                )
 
     def __len__(self) -> int:
         return len(self.mean)
@@ -67,7 +69,9 @@ class GaussianField:
 
     def tensors(self) -> dict[str, Tensor]:
         """All tensors that are present, by name, the layer included."""
-        return {f.name: getattr(self, f.name) for f in fields(self) if getattr(self, f.name) is not None}
+        return {
+            f.name: getattr(self, f.name) for f in fields(self) if getattr(self, f.name) is not None
+        }
 
     def parameters(self) -> dict[str, Tensor]:
         """The tensors that can be optimised, by name."""
@@ -77,8 +81,12 @@ class GaussianField:
         """A field with ``function`` applied to every tensor: selection, device, detaching."""
         return replace(self, **{name: function(value) for name, value in self.tensors().items()})
 
-    def moved(self, offset: Float[Tensor, "N 3"], rotation: Float[Tensor, "N 4"] | None = None) -> GaussianField:
-        """The field with every centre displaced [m], and covariances rotated by quaternions wxyz of any length."""
+    def moved(
+        self, offset: Float[Tensor, "N 3"], rotation: Float[Tensor, "N 4"] | None = None
+    ) -> GaussianField:
+        """The field with every centre displaced [m], and covariances rotated by quaternions wxyz
+        of any length.
+        """
         quaternion = self.quaternion if rotation is None else product(rotation, self.quaternion)
         return replace(self, mean=self.mean + offset, quaternion=quaternion)
 
@@ -86,11 +94,15 @@ class GaussianField:
 def concatenated(parts: list[GaussianField]) -> GaussianField:
     """One field of several, in their order."""
     tensors = [part.tensors() for part in parts]
-    return GaussianField(**{name: torch.cat([part[name] for part in tensors]) for name in tensors[0]})
+    return GaussianField(
+        **{name: torch.cat([part[name] for part in tensors]) for name in tensors[0]}
+    )
 
 
 def product(a: Float[Tensor, "*n 4"], b: Float[Tensor, "*n 4"]) -> Float[Tensor, "*n 4"]:
-    """Product of quaternions wxyz, of which ``a`` is normalised first: rotate by ``b``, then by ``a``."""
+    """Product of quaternions wxyz, of which ``a`` is normalised first: rotate by ``b``,
+    then by ``a``.
+    """
     w, u = (a / a.norm(dim=-1, keepdim=True)).split([1, 3], dim=-1)
     v = b[..., 1:]
     real = w * b[..., :1] - (u * v).sum(dim=-1, keepdim=True)
@@ -98,7 +110,11 @@ def product(a: Float[Tensor, "*n 4"], b: Float[Tensor, "*n 4"]) -> Float[Tensor,
 
 
 def constant_sh(value: Float[Tensor, "*n"]) -> Float[Tensor, "*n 16"]:
-    """Harmonics that give ``value`` in every direction: h_0 = (value - 0.5) / Y_0, the rest zero."""
-    coefficients = torch.zeros(*value.shape, SH_COEFFICIENTS, dtype=value.dtype, device=value.device)
+    """Harmonics that give ``value`` in every direction: h_0 = (value - 0.5) / Y_0,
+    the rest zero.
+    """
+    coefficients = torch.zeros(
+        *value.shape, SH_COEFFICIENTS, dtype=value.dtype, device=value.device
+    )
     coefficients[..., 0] = (value - SH_BIAS) / SH_Y0
     return coefficients

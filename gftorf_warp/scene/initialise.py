@@ -102,7 +102,8 @@ def from_phase(sequence: Sequence, settings: InitSettings = InitSettings()) -> S
         raise InputError(
             "no complete quartet",
             where=sequence.path or "sequence",
-            why="phase initialisation decodes the raw frames of one quartet; every quartet lacks at least one",
+            why="phase initialisation decodes the raw frames of one quartet; every quartet lacks "
+            "at least one",
             fix="record more frames, or start from random Gaussians",
         )
     if abs(sequence.camera_from_world - sequence.camera_from_world[:1]).max() > RESTS:
@@ -110,7 +111,9 @@ def from_phase(sequence: Sequence, settings: InitSettings = InitSettings()) -> S
     change = change_of(sequence)
     far = far_layer(sequence, change)
     static = _static_layer(sequence, far, settings)
-    middle = min(change.quartets, key=lambda i: abs(sequence.cycle * (i + 0.5) - sequence.frames / 2))
+    middle = min(
+        change.quartets, key=lambda i: abs(sequence.cycle * (i + 0.5) - sequence.frames / 2)
+    )
     points, distance, amplitude = _nearer(sequence, middle, change, far, settings)
     positions = follow(sequence, middle, points, distance, fellows=settings.fellows)
     near = Layer(mean=positions[middle], distance=distance, amplitude=amplitude)
@@ -123,13 +126,20 @@ def _from_views(sequence: Sequence, settings: InitSettings) -> Start:
     views = views_of(sequence, settings.nearer)
     judged = list(verdicts(views))
     size = (sequence.width, sequence.height)
-    still = static_layer(views, judged, _grid(*size, settings.static_spacing).flatten(0, 1), settings.static_spacing)
-    clouds = [cloud_of(v.moving, *image) for v, *image in zip(judged, views.distance, views.margin, strict=True)]
+    still = static_layer(
+        views, judged, _grid(*size, settings.static_spacing).flatten(0, 1), settings.static_spacing
+    )
+    clouds = [
+        cloud_of(v.moving, *image)
+        for v, *image in zip(judged, views.distance, views.margin, strict=True)
+    ]
     view = reference(clouds)
     grid = _grid(*size, settings.moving_spacing)
     near, objects = moving_layer(views, view, clouds[view], grid, settings.fellows)
     keys = key_times(sequence)
-    positions = follow_clouds(views, clouds, view, near.mean, objects, keys, fellows=settings.fellows)
+    positions = follow_clouds(
+        views, clouds, view, near.mean, objects, keys, fellows=settings.fellows
+    )
     quartet, camera = views.quartets[view], views.cameras[view]
     static, moving = (
         _layer(part, label, spacing, camera, settings)
@@ -148,7 +158,11 @@ def from_random(sequence: Sequence, settings: InitSettings, generator: torch.Gen
     """
     mean = in_frusta(_distinct_cameras(sequence), settings, generator)
     reflectivity = torch.full((settings.count,), settings.reflectivity)
-    return Start(field=_field(mean, _spacing(mean), reflectivity, MOVING, settings.opacity), positions=None, quartet=0)
+    return Start(
+        field=_field(mean, _spacing(mean), reflectivity, MOVING, settings.opacity),
+        positions=None,
+        quartet=0,
+    )
 
 
 def _distinct_cameras(sequence: Sequence) -> list[Camera]:
@@ -157,7 +171,9 @@ def _distinct_cameras(sequence: Sequence) -> list[Camera]:
     return [camera_of(sequence, int(n)) for n in np.sort(first)]
 
 
-def in_frusta(cameras: list[Camera], settings: InitSettings, generator: torch.Generator) -> Float[Tensor, "N 3"]:
+def in_frusta(
+    cameras: list[Camera], settings: InitSettings, generator: torch.Generator
+) -> Float[Tensor, "N 3"]:
     """Points distributed uniformly over the union of the cameras' frusta between two z-depths.
 
     A point is drawn in the frustum of a random camera and kept with one over the number of frusta
@@ -178,7 +194,11 @@ def in_frusta(cameras: list[Camera], settings: InitSettings, generator: torch.Ge
             pose = torch.as_tensor(camera.camera_from_world, dtype=torch.float32)
             local = torch.cat([slopes, torch.ones(len(slopes), 1)], dim=1) * z[rows, None]
             points[rows] = (local - pose[:3, 3]) @ pose[:3, :3]
-        holders = torch.stack([_holds(camera, points, near, far) for camera in cameras]).sum(dim=0).clamp_min(1)
+        holders = (
+            torch.stack([_holds(camera, points, near, far) for camera in cameras])
+            .sum(dim=0)
+            .clamp_min(1)
+        )
         if cameras[0].distortion:  # points were drawn on the sensor: more where the lens magnifies
             drawn = [_holds(camera, points, near, far) * camera.area(points) for camera in cameras]
             holders = torch.stack(drawn).sum(dim=0) / _least_area(cameras[0])
@@ -189,18 +209,25 @@ def in_frusta(cameras: list[Camera], settings: InitSettings, generator: torch.Ge
 
 def _least_area(camera: Camera) -> float:
     """Smallest area magnification by the distortion over the image [1]."""
-    axes = (torch.linspace(0, size, CHECKED, dtype=torch.float64) for size in (camera.width, camera.height))
+    axes = (
+        torch.linspace(0, size, CHECKED, dtype=torch.float64)
+        for size in (camera.width, camera.height)
+    )
     slopes = camera.slopes(torch.cartesian_prod(*axes))
     xx, xy, yy = camera.distortion.slope(*slopes.unbind(dim=1))
     return float((xx * yy - xy * xy).min())
 
 
-def _holds(camera: Camera, points: Float[Tensor, "N 3"], near: float, far: float) -> Bool[Tensor, "N"]:
+def _holds(
+    camera: Camera, points: Float[Tensor, "N 3"], near: float, far: float
+) -> Bool[Tensor, "N"]:
     """Which points are in the frustum of a camera."""
     pose = torch.as_tensor(camera.camera_from_world, dtype=torch.float32)
     z = points @ pose[2, :3] + pose[2, 3]
     x, y = camera.project(points).unbind(dim=1)
-    return (z >= near) & (z <= far) & (x >= 0) & (x <= camera.width) & (y >= 0) & (y <= camera.height)
+    return (
+        (z >= near) & (z <= far) & (x >= 0) & (x <= camera.width) & (y >= 0) & (y <= camera.height)
+    )
 
 
 def _spacing(points: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
@@ -210,9 +237,12 @@ def _spacing(points: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
     import cv2
 
     neighbours = min(4, len(points))
-    tree = cv2.flann.Index(points.contiguous().numpy(), {"algorithm": EXACT_TREE, "leaf_max_size": 10})
+    tree = cv2.flann.Index(
+        points.contiguous().numpy(), {"algorithm": EXACT_TREE, "leaf_max_size": 10}
+    )
     _, squared = tree.knnSearch(points.contiguous().numpy(), neighbours, params={"checks": -1})
-    return torch.from_numpy(squared[:, 1:]).mean(dim=1).sqrt()  # the nearest of all is the point itself
+    # the nearest of all is the point itself
+    return torch.from_numpy(squared[:, 1:]).mean(dim=1).sqrt()
 
 
 def _static_layer(sequence: Sequence, far: FarLayer, settings: InitSettings) -> GaussianField:
@@ -220,7 +250,9 @@ def _static_layer(sequence: Sequence, far: FarLayer, settings: InitSettings) -> 
     grid = _grid(sequence.width, sequence.height, settings.static_spacing).flatten(0, 1)
     x, y = grid.long().unbind(dim=1)
     camera, distance = camera_of(sequence, 0), far.distance[y, x]
-    layer = Layer(mean=unproject(camera, grid, distance), distance=distance, amplitude=far.amplitude[y, x])
+    layer = Layer(
+        mean=unproject(camera, grid, distance), distance=distance, amplitude=far.amplitude[y, x]
+    )
     return _layer(layer, STATIC, settings.static_spacing, camera, settings)
 
 
@@ -242,7 +274,9 @@ def _nearer(
         if flow is not None and quartet + step in change.quartets:
             there = points + flow.nan_to_num(0.0)
             near &= _in_front(sequence, quartet + step, there, change, far, settings)[0]
-    near, distance, amplitude, noise = (value.view(size) for value in (near, distance, amplitude, noise))
+    near, distance, amplitude, noise = (
+        value.view(size) for value in (near, distance, amplitude, noise)
+    )
     cloud = cloud_of(near, distance, settings.nearer + 4.0 * noise)
     return grid[cloud.mask], cloud.distance[cloud.mask], amplitude[cloud.mask]
 
@@ -259,7 +293,10 @@ def _in_front(
     ahead, behind = (flow_at(sequence, quartet, step, points) for step in (1, -1))
     distance, amplitude = decode_along_flow(sequence, quartet, points, ahead, behind)
     noise = distance_noise(amplitude, change.noise, sequence)
-    x, y = points[:, 0].long().clamp(0, sequence.width - 1), points[:, 1].long().clamp(0, sequence.height - 1)
+    x, y = (
+        points[:, 0].long().clamp(0, sequence.width - 1),
+        points[:, 1].long().clamp(0, sequence.height - 1),
+    )
     nearer = distance < far.distance[y, x] - settings.nearer - 4.0 * noise
     return nearer, distance, amplitude, noise
 
@@ -272,14 +309,20 @@ def _grid(width: int, height: int, spacing: float) -> Float[Tensor, "h w 2"]:
     return torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)
 
 
-def _layer(layer: Layer, label: int, spacing: float, camera: Camera, settings: InitSettings) -> GaussianField:
+def _layer(
+    layer: Layer, label: int, spacing: float, camera: Camera, settings: InitSettings
+) -> GaussianField:
     scale = settings.footprint * spacing * layer.distance / math.sqrt(camera.fx * camera.fy)
     if camera.distortion:
         scale = scale / camera.area(layer.mean).sqrt()
-    return _field(layer.mean, scale, layer.amplitude * layer.distance.square(), label, settings.opacity)
+    return _field(
+        layer.mean, scale, layer.amplitude * layer.distance.square(), label, settings.opacity
+    )
 
 
-def _field(mean: Tensor, scale: Tensor, reflectivity: Tensor, label: int, opacity: float) -> GaussianField:
+def _field(
+    mean: Tensor, scale: Tensor, reflectivity: Tensor, label: int, opacity: float
+) -> GaussianField:
     n = len(mean)
     return GaussianField(
         mean=mean.float(),

@@ -45,7 +45,9 @@ def sensor_of(sequence: Sequence) -> Sensor:
 
 def camera_of(sequence: Sequence, frame: int) -> Camera:
     """The camera of raw frame ``frame``."""
-    return _camera(sequence.intrinsics, (sequence.height, sequence.width), sequence.camera_from_world[frame])
+    return _camera(
+        sequence.intrinsics, (sequence.height, sequence.width), sequence.camera_from_world[frame]
+    )
 
 
 def colour_camera_of(sequence: Sequence, frame: int) -> Camera | None:
@@ -85,10 +87,14 @@ def sample(image: Float[Tensor, "C H W"], points: Float[Tensor, "P 2"]) -> Float
     size = image.new_tensor([image.shape[2], image.shape[1]])
     grid = (2.0 * points / size - 1.0)[None, None]
     interpolate = torch.nn.functional.grid_sample
-    return interpolate(image[None], grid.to(image), padding_mode="border", align_corners=False)[0, :, 0]
+    return interpolate(image[None], grid.to(image), padding_mode="border", align_corners=False)[
+        0, :, 0
+    ]
 
 
-def flow_at(sequence: Sequence, quartet: int, step: int, points: Float[Tensor, "P 2"]) -> Float[Tensor, "P 2"] | None:
+def flow_at(
+    sequence: Sequence, quartet: int, step: int, points: Float[Tensor, "P 2"]
+) -> Float[Tensor, "P 2"] | None:
     """Optical flow [px] of points [px] from the start of ``quartet`` to the next (1) or last (-1).
 
     NaN where it is unknown. If the flow of this direction is absent, it is the negative flow of the
@@ -141,7 +147,9 @@ def decode_along_flow(
     shifts, frequencies = sequence.shifts[frames], sequence.frame_frequencies[frames]
     for f in sequence.frequencies:
         own = frequencies == f
-        phasors.append(phasor_from_quads(stack[torch.as_tensor(own)], tuple(float(s) for s in shifts[own])))
+        phasors.append(
+            phasor_from_quads(stack[torch.as_tensor(own)], tuple(float(s) for s in shifts[own]))
+        )
     return distance_from_phasors(phasors, sensor_of(sequence)), 0.5 * torch.hypot(*phasors[0])
 
 
@@ -177,19 +185,29 @@ def change_of(sequence: Sequence) -> Change:
     quads = torch.stack(ordered)
     difference = quads.diff(dim=0)
     if difference.numel() == 0:
-        return Change(quartets=tuple(quartets), changed=difference.new_zeros(0, *quads.shape[2:]).bool(), noise=0.0)
+        return Change(
+            quartets=tuple(quartets),
+            changed=difference.new_zeros(0, *quads.shape[2:]).bool(),
+            noise=0.0,
+        )
     deviation = max(float(1.4826 * difference.abs().median()), 1e-12)
     pooled = torch.nn.functional.avg_pool2d(
         difference.square().mean(dim=1), 3, stride=1, padding=1, count_include_pad=False
     )
     return Change(
-        quartets=tuple(quartets), changed=pooled.sqrt() > CHANGED * deviation, noise=deviation / float(np.sqrt(2.0))
+        quartets=tuple(quartets),
+        changed=pooled.sqrt() > CHANGED * deviation,
+        noise=deviation / float(np.sqrt(2.0)),
     )
 
 
 def distance_noise(amplitude: Tensor, noise: float, sequence: Sequence) -> Tensor:
     """Standard deviation [m] of a distance: noise / (gain amplitude) radians."""
-    return noise / (quads_gain(sequence) * amplitude.clamp_min(1e-12)) / sensor_of(sequence).phase_slope
+    return (
+        noise
+        / (quads_gain(sequence) * amplitude.clamp_min(1e-12))
+        / sensor_of(sequence).phase_slope
+    )
 
 
 def quads_gain(sequence: Sequence) -> float:

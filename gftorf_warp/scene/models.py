@@ -1,4 +1,6 @@
-"""All motion models: a new one is a class of :class:`Motion` in a file of its own, and its line here."""
+"""All motion models: a new one is a class of :class:`Motion` in a file of its own,
+and its line here.
+"""
 
 from __future__ import annotations
 

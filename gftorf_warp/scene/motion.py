@@ -1,12 +1,14 @@
-"""Motion models: displacement and, for some models, rotation of every Gaussian at any time (method, section 4).
+"""Motion models: displacement and, for some models, rotation of every Gaussian at any time (method,
+section 4).
 
-A model has keys at the start of every quartet and one after the last. It computes displacements at keys, and
-``keys_at`` gives the keys that a time depends on with their interpolation weights w:
+A model has keys at the start of every quartet and one after the last. It computes displacements at
+keys, and ``keys_at`` gives the keys that a time depends on with their interpolation weights w:
 
     x(t) = x + sum_k w_k(t) o_k(x),   q(t) = normalise(sum_k w_k(t) r_k(x)) q
 
-Linear between two keys unless a model overrides ``keys_at``, constant before the first key and after the last. Training
-and rendering evaluate these sums with the same kernel (kernels/displace.py), ``Motion.at`` in torch.
+Linear between two keys unless a model overrides ``keys_at``, constant before the first key and
+after the last. Training and rendering evaluate these sums with the same kernel
+(kernels/displace.py), ``Motion.at`` in torch.
 
 scene/models.py lists all models.
 """
@@ -38,14 +40,17 @@ class Products(StrEnum):
     FLOAT32 = "float32"
     """The reference."""
     HALF = "half"
-    """Factors and activations in float16 on any device, sums and parameters in float32: the fastest on CUDA."""
+    """Factors and activations in float16 on any device, sums and parameters in float32: the fastest
+    on CUDA."""
 
     @classmethod
     def _missing_(cls, value: object) -> Products | None:
         """TF32, which earlier versions had, is read as float32."""
         if value != "tf32":
             return None
-        LOG.warning("products = tf32 is no longer supported: the motion network is computed in float32")
+        LOG.warning(
+            "products = tf32 is no longer supported: the motion network is computed in float32"
+        )
         return cls.FLOAT32
 
 
@@ -60,7 +65,8 @@ class MotionSettings:
     neighbours: int = 4
     """Nodes: largest number that a Gaussian follows."""
     from_tracks: bool = True
-    """Nodes: whether initial displacements follow optical flow and decoded distance; otherwise they are zero."""
+    """Nodes: whether initial displacements follow optical flow and decoded distance; otherwise they
+    are zero."""
     layers: int = 8
     """Network: layers before the head."""
     width: int = 256
@@ -93,7 +99,8 @@ class MotionStart:
     field: GaussianField
     """The initial Gaussians."""
     tracks: Float[Tensor, "T P 3"] | None
-    """Displacements of the P Gaussians of the moving layer at every key [m]; None if nothing was tracked."""
+    """Displacements of the P Gaussians of the moving layer at every key [m]; None if nothing was
+    tracked."""
     duration: float
     """Time from the first raw frame to the last [s]."""
     unambiguous_range: float
@@ -138,8 +145,8 @@ class Motion(torch.nn.Module, abc.ABC):
     support: ClassVar[int] = 2
     """Largest number of keys that a time depends on."""
     follows_means: ClassVar[bool] = False
-    """Whether ``bind`` depends on the present means, so that it is evaluated in every step; it must then be
-    capturable in a CUDA graph."""
+    """Whether ``bind`` depends on the present means, so that it is evaluated in every step; it must
+    then be capturable in a CUDA graph."""
     key_times: Tensor  # [T] float64 [s]
 
     def __init__(self, key_times: Float[Tensor, "T"]):
@@ -158,13 +165,17 @@ class Motion(torch.nn.Module, abc.ABC):
 
     @abc.abstractmethod
     def bind(self, field: GaussianField) -> Float[Tensor, "N M"]:
-        """What the model needs of each Gaussian; evaluated when Gaussians are added or removed, see ``follows_means``.
+        """What the model needs of each Gaussian; evaluated when Gaussians are added or removed, see
+        ``follows_means``.
 
-        A model whose displacements depend on the means differentiably returns them with their gradient.
+        A model whose displacements depend on the means differentiably returns them with their
+        gradient.
         """
 
     @abc.abstractmethod
-    def at_keys(self, binding: Float[Tensor, "N M"], keys: Sequence[int] | Int[Tensor, "K"]) -> KeyMotion:
+    def at_keys(
+        self, binding: Float[Tensor, "N M"], keys: Sequence[int] | Int[Tensor, "K"]
+    ) -> KeyMotion:
         """Motion at keys given by their indices; a tensor of indices is read on its device only."""
 
     def keys_at(self, time: float) -> Keys:
@@ -175,7 +186,9 @@ class Motion(torch.nn.Module, abc.ABC):
         return Keys((key, key + 1), (1.0 - fraction, fraction))
 
     def interval(self, time: float) -> tuple[int, float]:
-        """Index i of the key at or before ``time`` [s], and (time - t_i) / (t_{i+1} - t_i) in [0, 1), 0 outside."""
+        """Index i of the key at or before ``time`` [s], and (time - t_i) / (t_{i+1} - t_i) in [0,
+        1), 0 outside.
+        """
         if time >= self.times[-1]:
             return len(self.times) - 1, 0.0
         key = max(bisect.bisect_right(self.times, time) - 1, 0)
@@ -218,7 +231,9 @@ class Still(Motion):
         """No columns."""
         return field.mean.new_zeros(len(field), 0)
 
-    def at_keys(self, binding: Float[Tensor, "N 0"], keys: Sequence[int] | Int[Tensor, "K"]) -> KeyMotion:
+    def at_keys(
+        self, binding: Float[Tensor, "N 0"], keys: Sequence[int] | Int[Tensor, "K"]
+    ) -> KeyMotion:
         """Zero."""
         return KeyMotion(binding.new_zeros(len(keys), len(binding), 3), None)
 
@@ -265,7 +280,10 @@ class Nodes(Motion):
                 f"({len(key_times)}, {len(position)}, 3) and ({len(position)},): keys, nodes, xyz"
             )
         if len(layer) and int(layer.min()) < 1:
-            raise ValueError(f"a node of layer {int(layer.min())}: nodes belong to layers 1 and above, 0 is static")
+            raise ValueError(
+                f"a node of layer {int(layer.min())}: nodes belong to layers 1 and "
+                f"above, 0 is static"
+            )
         if neighbours < 1:
             raise ValueError(f"neighbours must be at least 1, got {neighbours}")
         self.neighbours = neighbours
@@ -278,7 +296,9 @@ class Nodes(Motion):
 
     @classmethod
     def start(cls, settings: MotionSettings, initial: MotionStart) -> Nodes:
-        """Nodes spread over the moving layers; displacements are medians of tracks near each node, or zero."""
+        """Nodes spread over the moving layers; displacements are medians of tracks near each node,
+        or zero.
+        """
         field = initial.field
         if field.layer is None:
             raise ValueError("nodes need a field with layers")
@@ -286,16 +306,21 @@ class Nodes(Motion):
         nodes = farthest_points(moving, settings.nodes)
         offset = None
         if settings.from_tracks and initial.tracks is not None and len(nodes):
-            near = torch.cdist(moving[nodes], moving).topk(min(NODE_FELLOWS, len(moving)), dim=1, largest=False).indices
+            near = (
+                torch.cdist(moving[nodes], moving)
+                .topk(min(NODE_FELLOWS, len(moving)), dim=1, largest=False)
+                .indices
+            )
             offset = initial.tracks[:, near].median(dim=2).values
         layer = field.layer[field.layer > 0][nodes]
         return cls(initial.key_times, moving[nodes], layer, offset, neighbours=settings.neighbours)
 
     def bind(self, field: GaussianField) -> Float[Tensor, "N M"]:
-        """Weight of every node for every Gaussian: rows sum to 1, those of the static layer are zero.
+        """Weight of every node for every Gaussian: rows sum to 1, those of the static layer are
+        zero.
 
-        The nearest nodes are weighted by exp(-2 (distance / distance of the farthest of them)^2): smooth in the
-        position and without a length scale. No gradient.
+        The nearest nodes are weighted by exp(-2 (distance / distance of the farthest of them)^2):
+        smooth in the position and without a length scale. No gradient.
         """
         count = min(self.neighbours, len(self.node))
         weight = field.mean.new_zeros(len(field), len(self.node))
@@ -308,9 +333,13 @@ class Nodes(Motion):
         near_weight = torch.softmax(-2.0 * (near / farthest.clamp_min(1e-9)).square(), dim=1)
         return weight.scatter(1, index, near_weight.masked_fill(near.isinf(), 0.0))
 
-    def at_keys(self, binding: Float[Tensor, "N M"], keys: Sequence[int] | Int[Tensor, "K"]) -> KeyMotion:
+    def at_keys(
+        self, binding: Float[Tensor, "N M"], keys: Sequence[int] | Int[Tensor, "K"]
+    ) -> KeyMotion:
         """Weighted means of the displacements of nodes."""
-        return KeyMotion(torch.stack([binding @ offset for offset in rows_of(self.offset, keys)]), None)
+        return KeyMotion(
+            torch.stack([binding @ offset for offset in rows_of(self.offset, keys)]), None
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """With the number of neighbours."""
@@ -320,7 +349,10 @@ class Nodes(Motion):
     def from_dict(cls, stored: dict[str, Any]) -> Nodes:
         """From its tensors and the number of neighbours."""
         tensors = stored["tensors"]
-        made = cls(*(tensors[name] for name in ("key_times", "node", "layer")), neighbours=stored["neighbours"])
+        made = cls(
+            *(tensors[name] for name in ("key_times", "node", "layer")),
+            neighbours=stored["neighbours"],
+        )
         made.load_state_dict(tensors)
         return made
 
@@ -328,20 +360,29 @@ class Nodes(Motion):
 def interpolated(motion: KeyMotion, rows: Sequence[int], weights: Sequence[float]) -> Displacement:
     """Weighted sum of some rows of a motion at keys."""
     offset, rotation = (
-        None if values is None else torch.stack([w * values[row] for row, w in zip(rows, weights, strict=True)]).sum(0)
+        None
+        if values is None
+        else torch.stack([w * values[row] for row, w in zip(rows, weights, strict=True)]).sum(0)
         for values in motion
     )
     assert offset is not None
     return Displacement(offset, rotation)
 
 
-def rows_of(table: Float[Tensor, "T *n"], keys: Sequence[int] | Int[Tensor, "K"]) -> Float[Tensor, "K *n"]:
+def rows_of(
+    table: Float[Tensor, "T *n"], keys: Sequence[int] | Int[Tensor, "K"]
+) -> Float[Tensor, "K *n"]:
     """Rows of a table by their indices, without a synchronisation or upload."""
-    return table.index_select(0, keys) if isinstance(keys, Tensor) else torch.stack([table[key] for key in keys])
+    return (
+        table.index_select(0, keys)
+        if isinstance(keys, Tensor)
+        else torch.stack([table[key] for key in keys])
+    )
 
 
 def farthest_points(points: Float[Tensor, "N 3"], count: int) -> Int[Tensor, "M"]:
-    """Indices of ``count`` points, each the farthest from those before it; all points if there are fewer.
+    """Indices of ``count`` points, each the farthest from those before it; all points if there are
+    fewer.
 
     The first is the one nearest to the centroid, so that the choice depends on the points only.
     """

@@ -1,10 +1,12 @@
-"""Motion by a network of position and time: an MLP gives the displacement of every Gaussian at every key.
+"""Motion by a network of position and time: an MLP gives the displacement of every Gaussian at
+every key.
 
     delta(x, t) = head(layers([gamma(x), gamma(t)]))
     gamma(v) = [v, sin 2^0 v, cos 2^0 v, .., sin 2^9 v, cos 2^9 v]
 
-Layers end in a ReLU (method, section 4). Positions are divided by a length and have no gradient; t is 0 at
-the first raw frame and 1 at the last. The encoded input is concatenated to the output of the fifth layer.
+Layers end in a ReLU (method, section 4). Positions are divided by a length and have no gradient; t
+is 0 at the first raw frame and 1 at the last. The encoded input is concatenated to the output of
+the fifth layer.
 """
 
 from __future__ import annotations
@@ -21,7 +23,8 @@ from .encoding import encoded, encoded_size, powers_of_two
 from .gaussians import GaussianField
 from .motion import KeyMotion, Motion, MotionSettings, MotionStart, Products, rows_of
 
-HEAD_DEVIATION = 1e-5  # of the initial weights of the head: displacements of a hundredth of a millimetre
+# of the initial weights of the head: displacements of a hundredth of a millimetre
+HEAD_DEVIATION = 1e-5
 
 
 class Backend(Protocol):
@@ -70,16 +73,22 @@ class Network(Motion):
         """
         super().__init__(key_times)
         if not (duration > 0 and length > 0):
-            raise ValueError(f"duration and length must be above 0, got {duration} s and {length} m")
+            raise ValueError(
+                f"duration and length must be above 0, got {duration} s and {length} m"
+            )
         self.settings, self.duration, self.length = settings, float(duration), float(length)
         times = encoded(self.key_times[:, None] / self.duration, settings.time_frequencies)
         self.register_buffer("time_encodings", times, persistent=False)
         self.register_buffer("time_encodings_f32", times.float(), persistent=False)
-        self.register_buffer("powers", powers_of_two(settings.position_frequencies), persistent=False)
+        self.register_buffer(
+            "powers", powers_of_two(settings.position_frequencies), persistent=False
+        )
         frequencies = (3, settings.position_frequencies), (1, settings.time_frequencies)
-        self._sizes = [encoded_size(*numbers) for numbers in frequencies]  # of gamma(x) and gamma(t)
+        # of gamma(x) and gamma(t)
+        self._sizes = [encoded_size(*numbers) for numbers in frequencies]
         self.backend: Backend | None = None
-        """Computes the network in half precision; None: torch, in the precision of the parameters."""
+        """Computes the network in half precision; None: torch, in the precision of the
+        parameters."""
         size, width = sum(self._sizes), settings.width
         inputs = [size] + [width] * (settings.layers - 1)
         if settings.skip_after < settings.layers:
@@ -94,7 +103,13 @@ class Network(Motion):
         """With random weights."""
         duration = initial.duration or 1.0  # a single instant: any duration serves
         length = settings.input_scale * initial.unambiguous_range
-        return cls(initial.key_times, settings, duration=duration, length=length, generator=initial.generator)
+        return cls(
+            initial.key_times,
+            settings,
+            duration=duration,
+            length=length,
+            generator=initial.generator,
+        )
 
     @torch.no_grad()
     def reset_parameters(self, generator: torch.Generator | None) -> None:
@@ -115,7 +130,9 @@ class Network(Motion):
             return self.backend.encode(self, mean)
         return encoded(mean / self.length, self.powers)
 
-    def at_keys(self, binding: Float[Tensor, "N p"], keys: Sequence[int] | Int[Tensor, "K"]) -> KeyMotion:
+    def at_keys(
+        self, binding: Float[Tensor, "N p"], keys: Sequence[int] | Int[Tensor, "K"]
+    ) -> KeyMotion:
         """Displacements, without rotation."""
         single = self.head.weight.dtype == self.time_encodings_f32.dtype == torch.float32
         times = self.time_encodings_f32 if single else self.time_encodings
@@ -124,23 +141,32 @@ class Network(Motion):
     def to_dict(self) -> dict[str, Any]:
         """With its shape, its duration and its length."""
         shape = asdict(self.settings) | {"kind": self.kind, "products": str(self.settings.products)}
-        return super().to_dict() | {"shape": shape, "duration": self.duration, "length": self.length}
+        return super().to_dict() | {
+            "shape": shape,
+            "duration": self.duration,
+            "length": self.length,
+        }
 
     @classmethod
     def from_dict(cls, stored: dict[str, Any]) -> Network:
         """From its shape and its tensors."""
-        products = Products(stored["shape"].get("products", Products.FLOAT32))  # oldest checkpoints have none
+        # oldest checkpoints have none
+        products = Products(stored["shape"].get("products", Products.FLOAT32))
         settings = MotionSettings(**stored["shape"] | {"products": products})
         tensors = stored["tensors"]
-        made = cls(tensors["key_times"], settings, duration=stored["duration"], length=stored["length"])
+        made = cls(
+            tensors["key_times"], settings, duration=stored["duration"], length=stored["length"]
+        )
         made.load_state_dict(tensors)
         return made
 
-    def offsets(self, binding: Float[Tensor, "N p"], time: Float[Tensor, "k t"]) -> Float[Tensor, "k N 3"]:
+    def offsets(
+        self, binding: Float[Tensor, "N p"], time: Float[Tensor, "k t"]
+    ) -> Float[Tensor, "k N 3"]:
         """Displacements [m] at times given as gamma(t).
 
-        Layers are linear in their input: the contribution of positions is computed once for all times, that
-        of a time is one vector, added like a bias.
+        Layers are linear in their input: the contribution of positions is computed once for all
+        times, that of a time is one vector, added like a bias.
         """
         time = time.to(self.head.weight)
         if self.backend is not None:

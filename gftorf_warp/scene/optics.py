@@ -51,7 +51,10 @@ class Lens:
                 raise ValueError(f"{name} must be finite, got {getattr(self, name)}")
         r2 = np.linspace(0.0, 1.0, 101)
         if not (self._vignette(r2) > 0).all() or self._vignette(r2).max() > 1 + 1e-9:
-            raise ValueError(f"vignetting must keep V above 0 and not above 1 for r from 0 to 1, got {self.vignetting}")
+            raise ValueError(
+                f"vignetting must keep V above 0 and not above 1 for r from 0 to 1, "
+                f"got {self.vignetting}"
+            )
 
         if self.falloff is not None:
             object.__setattr__(self, "falloff", FilePath(self.falloff))
@@ -132,10 +135,15 @@ def lens_rows(lens: Lens) -> dict[str, str]:
         rows["distortion"] = f"{lens.distortion}, OpenCV's coefficients"
     if lens.cosine_power or lens.vignetting:
         more = "".join(f" {v:+g} r^{2 * i}" for i, v in enumerate(lens.vignetting, start=1))
-        rows["fall-off"] = f"cosine to the power {lens.cosine_power:g}, times 1{more} with r = 1 in the farthest corner"
+        rows["fall-off"] = (
+            f"cosine to the power {lens.cosine_power:g}, times 1{more} with r = 1 "
+            f"in the farthest corner"
+        )
     if lens.falloff is not None and lens.map is not None:
         height, width = lens.map.shape
-        rows["fall-off map"] = f"{lens.falloff.name}, {width}x{height}, down to {lens.map.min():.3g} of its largest"
+        rows["fall-off map"] = (
+            f"{lens.falloff.name}, {width}x{height}, down to {lens.map.min():.3g} of its largest"
+        )
     if lens.beam_power:
         rows["beam"] = f"cosine to the power {lens.beam_power:g}, mean 1 over the image"
     return rows

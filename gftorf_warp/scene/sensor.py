@@ -30,8 +30,15 @@ Scalar = float | Tensor
 EVEN = SAME_RAD  # [1] means of exp(i theta), exp(2 i theta) of equally spaced shifts are below
 ELECTRONS = ("electrons_per_unit", "electrons_per_code", "full_well_electrons")
 POSITIVE = ("f_mod_hz", "frame_period_s", "contrast_cutoff_hz", *ELECTRONS)
-NON_NEGATIVE = ("ambient_electrons", "dark_electrons_per_s", "read_noise_electrons", "source_intensity", "row_time_s")
-EFFECTS = ("further_hz", "harmonic_contrast", "contrast_cutoff_hz", "pattern", "row_time_s")  # off unless they are set
+NON_NEGATIVE = (
+    "ambient_electrons",
+    "dark_electrons_per_s",
+    "read_noise_electrons",
+    "source_intensity",
+    "row_time_s",
+)
+# off unless they are set
+EFFECTS = ("further_hz", "harmonic_contrast", "contrast_cutoff_hz", "pattern", "row_time_s")
 
 
 class RawFrame(NamedTuple):
@@ -109,42 +116,64 @@ class Sensor:
         for name in ("f_mod_hz", "phase_offset", "dc_offset", "source_intensity"):
             value = getattr(self, name)
             if isinstance(value, Tensor) and value.ndim != 0:
-                raise ValueError(f"{name} must be a number or a 0-d tensor, got shape {tuple(value.shape)}")
+                raise ValueError(
+                    f"{name} must be a number or a 0-d tensor, got shape {tuple(value.shape)}"
+                )
         # tensors are not checked: reading one would synchronise a GPU
-        numbers = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "full_well_electrons"}
+        numbers = {
+            f.name: getattr(self, f.name) for f in fields(self) if f.name != "full_well_electrons"
+        }
         for name, value in numbers.items():
             for one in value if isinstance(value, tuple) else (value,):
                 if isinstance(one, int | float) and not math.isfinite(one):
                     raise ValueError(f"{name} must be finite, got {value}")
         for name in POSITIVE + NON_NEGATIVE:
             value, zero = getattr(self, name), name in NON_NEGATIVE
-            if value is not None and not isinstance(value, Tensor) and not (value > 0 or (zero and value == 0)):
-                raise ValueError(f"{name} must be {'0 or more' if zero else 'above 0'}, got {value}")
+            if (
+                value is not None
+                and not isinstance(value, Tensor)
+                and not (value > 0 or (zero and value == 0))
+            ):
+                raise ValueError(
+                    f"{name} must be {'0 or more' if zero else 'above 0'}, got {value}"
+                )
         if len(self.shifts) < 1:
             raise ValueError("shifts: a sensor needs at least one phase shift")
         if not all(f > 0 for f in self.further_hz):
             raise ValueError(f"further_hz must be above 0, got {self.further_hz}")
         if self.exposure_s < 0 or (self.noise and self.exposure_s == 0):
-            raise ValueError(f"exposure_s must be above 0, or 0 without noise, got {self.exposure_s}")
+            raise ValueError(
+                f"exposure_s must be above 0, or 0 without noise, got {self.exposure_s}"
+            )
         if not 0 < self.contrast <= 1:
             raise ValueError(f"contrast must be in (0, 1], got {self.contrast}")
         if self.harmonic_contrast and self.contrast * peak(self.harmonic_contrast) > 1 + 1e-6:
             raise ValueError(
-                f"harmonic_contrast {self.harmonic_contrast} and contrast {self.contrast} make a wave with a peak of "
-                f"{self.contrast * peak(self.harmonic_contrast):.4g}, more than all light: at most 1"
+                f"harmonic_contrast {self.harmonic_contrast} and contrast {self.contrast} make a "
+                f"wave with a peak of "
+                f"{self.contrast * peak(self.harmonic_contrast):.4g}, more than all light: at "
+                f"most 1"
             )
         if self.adc_bits is not None and not 1 <= self.adc_bits <= 24:
             raise ValueError(f"adc_bits must be in 1..24 or None, got {self.adc_bits}")
         if self.unipolar and not isinstance(self.dc_offset, Tensor) and self.dc_offset < 1.0:
-            raise ValueError(f"a unipolar tap cannot hold negative light: dc_offset >= 1 needed, got {self.dc_offset}")
+            raise ValueError(
+                f"a unipolar tap cannot hold negative light: dc_offset >= 1 needed, "
+                f"got {self.dc_offset}"
+            )
         if self.unipolar and self.contrast_cutoff_hz is not None:
             raise ValueError(
-                "contrast_cutoff_hz: the contrast of a unipolar sensor is 1 / dc_offset at all frequencies"
+                "contrast_cutoff_hz: the contrast of a unipolar sensor is 1 / dc_offset at all "
+                "frequencies"
             )
 
     def __repr__(self) -> str:
         """That of a dataclass without effects that are off: data cards hash this text."""
-        shown = [f for f in fields(self) if f.name not in EFFECTS or getattr(self, f.name) != getattr(PLAIN, f.name)]
+        shown = [
+            f
+            for f in fields(self)
+            if f.name not in EFFECTS or getattr(self, f.name) != getattr(PLAIN, f.name)
+        ]
         return f"Sensor({', '.join(f'{f.name}={getattr(self, f.name)!r}' for f in shown)})"
 
     @property
@@ -161,7 +190,9 @@ class Sensor:
     @property
     def cycle(self) -> tuple[RawFrame, ...]:
         """The raw frames of one cycle: all shifts at the first frequency, then at the others."""
-        return tuple(RawFrame(f, shift) for f in (self.f_mod_hz, *self.further_hz) for shift in self.shifts)
+        return tuple(
+            RawFrame(f, shift) for f in (self.f_mod_hz, *self.further_hz) for shift in self.shifts
+        )
 
     @property
     def harmonics(self) -> tuple[int, ...]:
@@ -192,7 +223,8 @@ def channel_of(shifts: Sequence[float], shift: float) -> int | None:
 def distance_from_phasor(re: Tensor, im: Tensor, sensor: Sensor) -> Tensor:
     """Distance [m] of a phasor: ((atan2(im, re) - phase_offset) mod 2 pi) / kappa."""
     phase = torch.remainder(torch.atan2(im, re) - sensor.phase_offset, 2.0 * math.pi)
-    wrapped = torch.where(phase >= 2.0 * math.pi, torch.zeros_like(phase), phase)  # remainder can round up to 2 pi
+    # remainder can round up to 2 pi
+    wrapped = torch.where(phase >= 2.0 * math.pi, torch.zeros_like(phase), phase)
     return wrapped / sensor.phase_slope
 
 
@@ -212,14 +244,21 @@ def phasor_from_quads(quads: Tensor, shifts: tuple[float, ...] | Tensor) -> tupl
         ValueError: If the shifts do not determine a phase. Shifts in a tensor are taken to be
             equally spaced.
     """
-    known = shifts if isinstance(shifts, Tensor) else _uploaded(tuple(shifts), quads.dtype, quads.device)
+    known = (
+        shifts
+        if isinstance(shifts, Tensor)
+        else _uploaded(tuple(shifts), quads.dtype, quads.device)
+    )
     theta = known.to(quads).reshape(-1, *[1] * (quads.ndim - 1))
     if len(theta) < 3:
         raise ValueError(f"shifts: a phase needs at least 3 quads, got {len(theta)}")
     if not isinstance(shifts, Tensor) and not _evenly(np.array(shifts, dtype=np.float64)):
         solved = solution(np.array(shifts, dtype=np.float64))
         if solved is None:
-            raise ValueError(f"shifts: a phase needs three different ones, got {np.degrees(shifts).tolist()} degrees")
+            raise ValueError(
+                f"shifts: a phase needs three different ones, got "
+                f"{np.degrees(shifts).tolist()} degrees"
+            )
         rows = torch.as_tensor(solved, dtype=quads.dtype, device=quads.device)
         re, im = (rows @ quads.reshape(len(theta), -1)).reshape(2, *quads.shape[1:])
         return re, im

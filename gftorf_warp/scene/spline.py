@@ -2,11 +2,12 @@
 
 With u in [0, 1) of the way from key i to the next,
 
-    x(t) = x + 1/6 ((1 - u)^3 o_{i-1} + (3 u^3 - 6 u^2 + 4) o_i + (-3 u^3 + 3 u^2 + 3 u + 1) o_{i+1} + u^3 o_{i+2})
+    x(t) = x + 1/6 ((1 - u)^3 o_{i-1} + (3 u^3 - 6 u^2 + 4) o_i + (-3 u^3 + 3 u^2 + 3 u + 1) o_{i+1}
+    + u^3 o_{i+2})
 
-which has two continuous derivatives where keys are evenly spaced. Beyond either end one control point
-continues the last two in a straight line, so that the curve begins at the first control point and ends at
-the last, and a line is reproduced exactly.
+which has two continuous derivatives where keys are evenly spaced. Beyond either end one control
+point continues the last two in a straight line, so that the curve begins at the first control point
+and ends at the last, and a line is reproduced exactly.
 """
 
 from __future__ import annotations

@@ -17,9 +17,15 @@ from .measured import camera_of, decode_along_flow, flow_at, key_times
 
 
 def follow(
-    sequence: Sequence, quartet: int, points: Float[Tensor, "P 2"], distance: Float[Tensor, "P"], *, fellows: int
+    sequence: Sequence,
+    quartet: int,
+    points: Float[Tensor, "P 2"],
+    distance: Float[Tensor, "P"],
+    *,
+    fellows: int,
 ) -> Float[Tensor, "T P 3"]:
-    """Positions in the world [m] of points at every key time, extrapolated beyond the known quartets.
+    """Positions in the world [m] of points at every key time, extrapolated beyond the known
+    quartets.
 
     Args:
         sequence: Raw frames and optical flow of a camera at rest; without flow the points stay.
@@ -53,7 +59,9 @@ def follow(
     return unproject(camera, place, far)
 
 
-def unproject(camera: Camera, points: Float[Tensor, "*n 2"], distance: Float[Tensor, "*n"]) -> Float[Tensor, "*n 3"]:
+def unproject(
+    camera: Camera, points: Float[Tensor, "*n 2"], distance: Float[Tensor, "*n"]
+) -> Float[Tensor, "*n 3"]:
     """Points in the world [m] at image positions (x, y) [px] and distances along the ray [m]."""
     x = (points[..., 0] - camera.cx) / camera.fx
     y = (points[..., 1] - camera.cy) / camera.fy

@@ -30,13 +30,16 @@ def unwrap(phases: Sequence[Tensor], ms: Sequence[int]) -> Tensor:
         ValueError: If the multiples are not positive or have a common divisor.
     """
     if min(ms) < 1 or math.gcd(*ms) != 1:
-        raise ValueError(f"multiples must be positive and without common divisor, got {', '.join(map(str, ms))}")
+        raise ValueError(
+            f"multiples must be positive and without common divisor, got {', '.join(map(str, ms))}"
+        )
     turn = 2.0 * math.pi
     phases = [torch.as_tensor(phase) for phase in phases]
     known = np.stack([phase.detach().cpu().double().numpy() for phase in phases])
     turns = torch.as_tensor(numbers.choose(known, ms).turns).to(phases[0])
     base = (torch.remainder(phases[0], turn) + turn * turns) / ms[0]
-    return torch.where(base >= turn, torch.zeros_like(base), base)  # a remainder can round up to a whole turn
+    # a remainder can round up to a whole turn
+    return torch.where(base >= turn, torch.zeros_like(base), base)
 
 
 def frequencies_of(sensor: Sensor) -> tuple[float, ...]:
@@ -50,7 +53,11 @@ def common_range(sensor: Sensor) -> float:
     Raises:
         ValueError: If they are no small multiples of one frequency.
     """
-    return numbers.common_range(frequencies_of(sensor)) if sensor.further_hz else sensor.unambiguous_range
+    return (
+        numbers.common_range(frequencies_of(sensor))
+        if sensor.further_hz
+        else sensor.unambiguous_range
+    )
 
 
 def distance_from_phasors(phasors: Sequence[tuple[Tensor, Tensor]], sensor: Sensor) -> Tensor:
@@ -66,6 +73,9 @@ def distance_from_phasors(phasors: Sequence[tuple[Tensor, Tensor]], sensor: Sens
         raise ValueError(f"{len(phasors)} phasors for {len(frequencies)} frequencies")
     if len(phasors) == 1:
         return distance_from_phasor(*phasors[0], sensor)
-    phases = [torch.remainder(torch.atan2(im, re) - sensor.phase_offset, 2.0 * math.pi) for re, im in phasors]
+    phases = [
+        torch.remainder(torch.atan2(im, re) - sensor.phase_offset, 2.0 * math.pi)
+        for re, im in phasors
+    ]
     ms, _ = numbers.multiples(frequencies)
     return unwrap(phases, ms) * ms[0] / sensor.phase_slope

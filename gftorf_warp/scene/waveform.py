@@ -41,10 +41,14 @@ def harmonics_of(wave: Waveform, count: int, duty: float = 0.5) -> tuple[float, 
         raise ValueError(f"duty {duty} must be between 0 and 1, and count {count} at least 1")
     if Waveform(wave) is Waveform.SINE:
         return (1.0, *[0.0] * (count - 1))
-    return tuple(2.0 * math.sin(math.pi * h * duty) / (math.pi * h * duty) for h in range(1, count + 1))
+    return tuple(
+        2.0 * math.sin(math.pi * h * duty) / (math.pi * h * duty) for h in range(1, count + 1)
+    )
 
 
-def contrasts(emission: Waveform, demodulation: Waveform, count: int, duty: float = 0.5) -> tuple[float, ...]:
+def contrasts(
+    emission: Waveform, demodulation: Waveform, count: int, duty: float = 0.5
+) -> tuple[float, ...]:
     """Contrast C_h of harmonics h = 1 .. ``count`` [1]; ``duty`` of the emission, taps 1/2.
 
     Raises:
@@ -54,7 +58,9 @@ def contrasts(emission: Waveform, demodulation: Waveform, count: int, duty: floa
     return tuple(0.5 * s * m for s, m in pairs)
 
 
-def contrast_ratios(emission: Waveform, demodulation: Waveform, count: int, duty: float = 0.5) -> tuple[float, ...]:
+def contrast_ratios(
+    emission: Waveform, demodulation: Waveform, count: int, duty: float = 0.5
+) -> tuple[float, ...]:
     """C_h / C_1 for h = 2 .. ``count`` [1]; arguments as in :func:`contrasts`.
 
     Rounding errors of contrasts that are exactly 0, those of even harmonics of a square wave, are
@@ -66,5 +72,8 @@ def contrast_ratios(emission: Waveform, demodulation: Waveform, count: int, duty
 
 def peak(ratios: Sequence[float]) -> float:
     """Largest magnitude of cos x + sum_h r_h cos(h x) [1]; ``ratios`` start at h = 2."""
-    x = np.linspace(0.0, 2.0 * math.pi, 256 * (len(ratios) + 1))  # 256 points in the shortest period
-    return float(np.abs(sum(r * np.cos(h * x) for h, r in enumerate((1.0, *ratios), start=1))).max())
+    # 256 points in the shortest period
+    x = np.linspace(0.0, 2.0 * math.pi, 256 * (len(ratios) + 1))
+    return float(
+        np.abs(sum(r * np.cos(h * x) for h, r in enumerate((1.0, *ratios), start=1))).max()
+    )

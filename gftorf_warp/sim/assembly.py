@@ -12,7 +12,8 @@ from .meshes import Mesh
 from .paths import Vector
 from .world import Box, Grid, Shape, rays_to_ball
 
-FACES = 1 << 32  # numbers that the faces of one part may use; a box has 6, a mesh as many as triangles
+# numbers that the faces of one part may use; a box has 6, a mesh as many as triangles
+FACES = 1 << 32
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,7 +65,9 @@ class Part:
         if not np.isfinite(self.shape.reach):
             raise ValueError(f"a part must be finite, {self.shape} is not")
         if isinstance(self.shape, Assembly):
-            raise ValueError("a part must be a single shape: list the parts of all assemblies in one")
+            raise ValueError(
+                "a part must be a single shape: list the parts of all assemblies in one"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,7 +106,9 @@ class Assembly(Shape):
         """The grids of all parts, hidden ones included."""
         grids = [part.shape.grid(spacing, inset) for part in self.parts]
         return Grid(
-            np.concatenate([g.point + part.position for g, part in zip(grids, self.parts, strict=True)]),
+            np.concatenate(
+                [g.point + part.position for g, part in zip(grids, self.parts, strict=True)]
+            ),
             np.concatenate([g.normal for g in grids]),
             np.concatenate([g.other for g in grids]),
             max(g.limb for g in grids),

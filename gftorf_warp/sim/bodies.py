@@ -63,8 +63,12 @@ def room(
 def person(x: float | Curve, y: float, z: float) -> tuple[Body, Body]:
     """Torso and head; (x, y, z) is the middle of the torso [m]."""
     torso, head = ((x, y, z), (x, y - 0.44, z))
-    paths = [Guided(x=x, y=y, z=z) if isinstance(x, Curve) else (x, y, z) for x, y, z in (torso, head)]
-    return box((0.42, 0.60, 0.24), paths[0], plain(0.3, CLOTH)), ball(0.11, paths[1], plain(0.45, SKIN))
+    paths = [
+        Guided(x=x, y=y, z=z) if isinstance(x, Curve) else (x, y, z) for x, y, z in (torso, head)
+    ]
+    return box((0.42, 0.60, 0.24), paths[0], plain(0.3, CLOTH)), ball(
+        0.11, paths[1], plain(0.45, SKIN)
+    )
 
 
 def chair() -> Assembly:

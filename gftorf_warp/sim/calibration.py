@@ -22,7 +22,9 @@ SENSOR = Sensor(f_mod_hz=20e6, noise=True)
 
 def flat_wall() -> Scene:
     """Distance D / cos(angle of the ray), amplitude rho cos^3 / D^2."""
-    return _at_rest("flat_wall", "a plain wall, met at right angles", (level(2, DISTANCE, plain(0.5)),))
+    return _at_rest(
+        "flat_wall", "a plain wall, met at right angles", (level(2, DISTANCE, plain(0.5)),)
+    )
 
 
 def wedge() -> Scene:
@@ -31,7 +33,9 @@ def wedge() -> Scene:
     middle = DISTANCE + edge / math.sqrt(2)
     turned = Still(position=(0.0, 0.0, middle), turn_deg=(0.0, 45.0, 0.0))
     pillar = box((edge, 2.0, edge), turned, plain(0.5))
-    return _at_rest("wedge", "the edge of a square pillar before a wall", (level(2, 4.0, plain(0.5)), pillar))
+    return _at_rest(
+        "wedge", "the edge of a square pillar before a wall", (level(2, 4.0, plain(0.5)), pillar)
+    )
 
 
 def corner() -> Scene:
@@ -49,10 +53,16 @@ def sphere() -> Scene:
     """Every angle of incidence at once."""
     radius = 0.5  # [m]
     middle = (0.0, 0.0, DISTANCE + radius)
-    return _at_rest("sphere", "a ball before a wall", (level(2, 4.0, plain(0.5)), ball(radius, middle, plain(0.5))))
+    return _at_rest(
+        "sphere",
+        "a ball before a wall",
+        (level(2, 4.0, plain(0.5)), ball(radius, middle, plain(0.5))),
+    )
 
 
-def _at_rest(name: str, description: str, bodies: tuple[Body, ...], camera_path: Path | None = None) -> Scene:
+def _at_rest(
+    name: str, description: str, bodies: tuple[Body, ...], camera_path: Path | None = None
+) -> Scene:
     return look_alike(
         name,
         description,

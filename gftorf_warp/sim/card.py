@@ -18,7 +18,18 @@ from .scenes import SCENES, Scene
 from .sensors import effect_rows
 from .settings import SimSettings
 
-CALLED = ("frames", "size", "seed", "sync", "noise", "flow", "exposure_samples", "engine", "bounces", "paths")
+CALLED = (
+    "frames",
+    "size",
+    "seed",
+    "sync",
+    "noise",
+    "flow",
+    "exposure_samples",
+    "engine",
+    "bounces",
+    "paths",
+)
 """Settings that a call names on a data card, even where they are the defaults."""
 PHASORS = "one per quartet, with time, pose and truth of its first raw frame"
 
@@ -36,11 +47,16 @@ def settings_card(own: Scene, settings: SimSettings) -> str:
     rows = {
         "modulation frequency": f"{float(sensor.f_mod_hz) / 1e6:.9g} MHz, unambiguous to "
         f"{sensor.unambiguous_range:.4f} m",
-        "shifts in time order": ", ".join(f"{math.degrees(shift):.0f}" for shift in sensor.shifts) + " deg",
+        "shifts in time order": ", ".join(f"{math.degrees(shift):.0f}" for shift in sensor.shifts)
+        + " deg",
         "raw frames": f"{1 / sensor.frame_period_s:.6g} per second, "
         + (_together(len(sensor.cycle)) if used.sync else "each at its own time"),
         **({"phasors": PHASORS} if used.format == "torf" else {}),
-        **({} if settings.level is None else {"ladder": f"level {settings.level}: {adds_of(settings.level)}"}),
+        **(
+            {}
+            if settings.level is None
+            else {"ladder": f"level {settings.level}: {adds_of(settings.level)}"}
+        ),
         **_camera_rows(scene, used),
         "exposure": f"{1e3 * sensor.exposure_s:g} ms, "
         + (f"mean of {n} instants" if (n := used.exposure_samples) > 1 else "taken as one instant"),
@@ -52,54 +68,65 @@ def settings_card(own: Scene, settings: SimSettings) -> str:
     }
     if noisy:
         rows |= {
-            "electrons per unit of amplitude": f"{electron_gain(sensor):.4g} in one exposure, both taps together",
+            "electrons per unit of amplitude": f"{electron_gain(sensor):.4g} in one exposure, "
+            f"both taps together",
             "contrast": f"{contrast(sensor):g}",
             "ambient": f"{sensor.ambient_electrons:g} electrons per exposure"
             + (" from white" if sensor.ambient_electrons and used.engine == "mesh" else ""),
             "dark current": f"{sensor.dark_electrons_per_s:g} electrons per second and tap",
             "read noise": f"{sensor.read_noise_electrons:g} electrons per tap",
             "full well": f"{sensor.full_well_electrons:g} electrons per tap",
-            "ADC": f"{sensor.adc_bits or 'no'} bits, {sensor.electrons_per_code:g} electrons per code",
+            "ADC": f"{sensor.adc_bits or 'no'} bits, {sensor.electrons_per_code:g} electrons per "
+            f"code",
         }
     rows |= effect_rows(sensor) | lens_rows(scene.lens)
     table = "\n".join(f"| {name} | {value} |" for name, value in rows.items())
     return f"""# {scene.name}: simulated C-ToF sequence
 
 {scene.description[:1].upper() + scene.description[1:]}. Motion: {scene.motion}.
-{used.frames} raw frames of {camera.width}x{camera.height} pixels, {scene.horizontal_fov_deg:g} deg wide. \
+{used.frames} raw frames of {camera.width}x{camera.height} pixels, \
+{scene.horizontal_fov_deg:g} deg wide. \
 {_light(scene, used)}.
 
     {_command(own, used, settings.level)}
 
-Made by gftorf-warp {__version__}, scene {hashlib.sha256(_fingerprint(scene).encode()).hexdigest()[:16]}. \
+Made by gftorf-warp {__version__}, \
+scene {hashlib.sha256(_fingerprint(scene).encode()).hexdigest()[:16]}. \
 This data may be used under the licence of that program, Apache-2.0.
 
 | sensor | |
 |---|---|
 {table}
 
-Quads are in relative units: reflectance rho met at angle i and distance d gives the amplitude rho cos(i) / d^2.
+Quads are in relative units: reflectance rho met at angle i and distance d gives the amplitude \
+rho cos(i) / d^2.
 {_engine(scene, used)}
 
-Ground truth is the analytic first hit of the shapes along the ray through each pixel's centre at the time of each raw
+Ground truth is the analytic first hit of the shapes along the ray through each pixel's centre at \
+the time of each raw
 frame, not a rendering.
 """
 
 
 def _together(count: int) -> str:
-    return f"all {'four' if count == FRAMES_PER_QUARTET else count} of a quartet at the time of its first"
+    return (
+        f"all {'four' if count == FRAMES_PER_QUARTET else count} of a quartet at the time of "
+        f"its first"
+    )
 
 
 def outcome_card(recording: Recording) -> str:
     """The part that is known after the recording: engine against truth, and saturation."""
     agreement = "no such pixel" if recording.gap is None else str(recording.gap)
     return f"""
-Ground truth against the distance that the engine sees, on interior pixels of still surfaces in all raw frames:
+Ground truth against the distance that the engine sees, on interior pixels of still surfaces \
+in all raw frames:
 {agreement}.
 
 Saturated: {100 * recording.saturated:.3g} % of all pixels and raw frames.
 
-The static-phasor distance is that which the closed form would decode from four quads taken without noise at the time of
+The static-phasor distance is that which the closed form would decode from four quads taken \
+without noise at the time of
 a raw frame, all light included. contact_sheet.png is an overview; no program reads it.
 """
 
@@ -113,13 +140,18 @@ def _light(scene: Scene, used: SimSettings) -> str:
         lamp += f"; it shines on {scene.beam_deg[0]:g} x {scene.beam_deg[1]:g} deg"
     if not used.bounces:
         return f"{lamp}; direct light only"
-    return f"{lamp}; direct light and up to {used.bounces} bounces, from {used.paths} paths per pixel"
+    return (
+        f"{lamp}; direct light and up to {used.bounces} bounces, from {used.paths} paths per pixel"
+    )
 
 
 def _engine(scene: Scene, used: SimSettings) -> str:
     rays = f"{scene.subsamples}x{scene.subsamples} rays per pixel, averaged"
     if used.engine == "mesh":
-        return f"Engine mesh: rays meet the surfaces themselves, as triangles, balls and endless planes; {rays}."
+        return (
+            f"Engine mesh: rays meet the surfaces themselves, as triangles, balls and endless "
+            f"planes; {rays}."
+        )
     return f"Engine gaussian: the scene is covered by Gaussians and rendered with {rays}."
 
 
@@ -134,8 +166,10 @@ def _camera_rows(scene: Scene, used: SimSettings) -> dict[str, str]:
         camera = scene.colour_camera(used.size)
         position = ", ".join(f"{1e3 * x:g}" for x in scene.colour.position)
         rows["colour camera"] = (
-            f"{camera.width}x{camera.height} pixels, {scene.colour.horizontal_fov_deg:g} deg wide, at ({position}) mm "
-            f"in the axes of the ToF camera, turned by {scene.colour.turn_deg} deg; an image at each quartet start; "
+            f"{camera.width}x{camera.height} pixels, {scene.colour.horizontal_fov_deg:g} deg "
+            f"wide, at ({position}) mm "
+            f"in the axes of the ToF camera, turned by {scene.colour.turn_deg} deg; an image at "
+            f"each quartet start; "
             "linear RGB albedo: light from everywhere, no shading, no falloff; noise "
             + (f"{scene.colour.noise:g}" if used.noise else "none")
         )
@@ -152,15 +186,27 @@ def _command(scene: Scene, used: SimSettings, level: str | None) -> str:
         values |= {"format": repr(used.format)} if used.format != "ftorf" else {}
         values |= {"level": repr(level)} if level else {}
         values |= {"truth": repr(used.truth)} if used.truth != "usual" else {}
-        return f"gftorf_warp.simulate({scene.name}, ..., {', '.join(f'{k}={v}' for k, v in values.items())})"
+        return (
+            f"gftorf_warp.simulate({scene.name}, ..., "
+            f"{', '.join(f'{k}={v}' for k, v in values.items())})"
+        )
     camera = scene.camera(used.size)
     options = [f"--override {text}" for text in scene.overrides]
-    options += [f"--frames {used.frames}", f"--size {camera.width}x{camera.height}", *(["--flow"] if used.flow else [])]
+    options += [
+        f"--frames {used.frames}",
+        f"--size {camera.width}x{camera.height}",
+        *(["--flow"] if used.flow else []),
+    ]
     if level is None:
         options += [f"--engine {used.engine}"] if used.engine != "gaussian" else []
         options += [f"--bounces {used.bounces}", f"--paths {used.paths}"] if used.bounces else []
-        options += [f"--exposure-samples {used.exposure_samples}"] if used.exposure_samples > 1 else []
-    options += [f"--seed {used.seed}", *([f"--format {used.format}"] if used.format != "ftorf" else [])]
+        options += (
+            [f"--exposure-samples {used.exposure_samples}"] if used.exposure_samples > 1 else []
+        )
+    options += [
+        f"--seed {used.seed}",
+        *([f"--format {used.format}"] if used.format != "ftorf" else []),
+    ]
     options += [f"--truth {used.truth}"] if used.truth != "usual" else []
     options += [f"--level {level}"] if level else []
     options += ["--sync"] if used.sync and level != NAMES[0] else []
@@ -170,10 +216,20 @@ def _command(scene: Scene, used: SimSettings, level: str | None) -> str:
 
 def _fingerprint(scene: Scene) -> str:
     """Every setting of a scene as text, without unused optional ones."""
-    optional = {"camera_path": Still(), "emitter": (0.0, 0.0, 0.0), "beam_deg": None, "colour": None, "novel_views": ()}
+    optional = {
+        "camera_path": Still(),
+        "emitter": (0.0, 0.0, 0.0),
+        "beam_deg": None,
+        "colour": None,
+        "novel_views": (),
+    }
     optional |= {"lens": Lens()}
     values = {f.name: getattr(scene, f.name) for f in fields(scene)}
-    used = {name: value for name, value in values.items() if name not in optional or value != optional[name]}
+    used = {
+        name: value
+        for name, value in values.items()
+        if name not in optional or value != optional[name]
+    }
     del used["closed_form"], used["overrides"]  # follow from the others
     hues = "" if scene.colour is None else f", hues {[body.texture.hue for body in scene.bodies]}"
     return f"Scene({', '.join(f'{name}={value!r}' for name, value in used.items())}){hues}"

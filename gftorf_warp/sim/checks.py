@@ -16,7 +16,8 @@ from .readout import why_impossible
 from .scene import Scene
 from .settings import SimSettings, refuse, require
 
-CLEARANCE = 0.5  # [m] nearer bodies fill the image, and a cover of them would need millions of splats
+# [m] nearer bodies fill the image, and a cover of them would need millions of splats
+CLEARANCE = 0.5
 CAPTURE = "--format capture"
 ROLLING = "a rolling shutter cannot be simulated so", "sensor.row_time_s"
 
@@ -25,13 +26,25 @@ def check_engine(scene: Scene, settings: SimSettings, device: str = "cpu") -> No
     """Raise a UsageError if the engine cannot simulate the scene, or not on this device."""
     if settings.engine == "mesh":
         return
-    bodies = any(body.texture.gloss > 0 or (body.moves and has_mesh(body.shape)) for body in scene.bodies)
+    bodies = any(
+        body.texture.gloss > 0 or (body.moves and has_mesh(body.shape)) for body in scene.bodies
+    )
     needed = bodies or any(scene.emitter) or scene.beam_deg is not None or settings.bounces > 0
-    effects = "the light is beside the camera, has a beam or bounces, or a body is glossy or a mesh that moves"
+    effects = (
+        "the light is beside the camera, has a beam or bounces, or a body is glossy or a "
+        "mesh that moves"
+    )
     require(not needed, "--engine", repr(settings.engine), f"mesh: {effects}")
-    require(device == "cpu", "--device", f"{device} and engine {settings.engine!r}", "cpu, or --engine mesh")
+    require(
+        device == "cpu",
+        "--device",
+        f"{device} and engine {settings.engine!r}",
+        "cpu, or --engine mesh",
+    )
     rows = scene.sensor.row_time_s > 0
-    refuse(rows, ROLLING, "engine gaussian renders all rows of an image at one time", "--engine mesh")
+    refuse(
+        rows, ROLLING, "engine gaussian renders all rows of an image at one time", "--engine mesh"
+    )
 
 
 def check_format(scene: Scene, settings: SimSettings) -> None:
@@ -40,7 +53,9 @@ def check_format(scene: Scene, settings: SimSettings) -> None:
     turns = sorted(round(math.degrees(shift), 4) % 360.0 for shift in sensor.shifts)
     few = capture and len(set(turns)) < SHIFTS_MIN
     why = f"a phase needs {SHIFTS_MIN} different shifts, found {turns} deg"
-    refuse(few, ("this sensor cannot measure a phase", "sensor.shifts"), why, "give it more of them")
+    refuse(
+        few, ("this sensor cannot measure a phase", "sensor.shifts"), why, "give it more of them"
+    )
     impossible = why_impossible(sensor) if sensor.noise else None
     negative = "a tap of this sensor would hold negative light", "sensor.dc_offset"
     fix = "lower the contrast or the DC offset, or make the sensor unipolar"
@@ -49,7 +64,9 @@ def check_format(scene: Scene, settings: SimSettings) -> None:
         what = "an F-ToeRF folder cannot express this"
         others = turns != sorted(math.degrees(shift) for shift in CANONICAL_SHIFTS)
         why = f"it holds the four shifts 0, 90, 180 and 270 deg in some order, not {turns} deg"
-        refuse(others, (f"{what} sensor", "sensor.shifts"), why, f"use those four shifts, or {CAPTURE}")
+        refuse(
+            others, (f"{what} sensor", "sensor.shifts"), why, f"use those four shifts, or {CAPTURE}"
+        )
         why = f"it has one modulation frequency, not {1 + len(sensor.further_hz)}"
         fix = f"leave sensor.further_hz out, or {CAPTURE}"
         refuse(bool(sensor.further_hz), (f"{what} sensor", "sensor.further_hz"), why, fix)
@@ -74,5 +91,8 @@ def check_clearance(scene: Scene, times: Float[np.ndarray, "F"]) -> None:
     for body in (body for body in scene.bodies if body.moves):
         near = np.flatnonzero(clearance(body, centres, times) < CLEARANCE)
         first = near[0] if len(near) else 0
-        why = f"scene {scene.name} is made for {scene.frames} raw frames, and it happens at frame {first}"
+        why = (
+            f"scene {scene.name} is made for {scene.frames} raw frames, and it happens at "
+            f"frame {first}"
+        )
         refuse(len(near) > 0, (what, "--frames"), why, f"simulate at most {first} raw frames")

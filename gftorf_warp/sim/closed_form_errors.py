@@ -47,16 +47,20 @@ def closed_form_errors(sequence: Sequence, truth: Truth | None) -> Errors:
         raise InputError(
             "nothing to compare",
             where=sequence.path or "sequence",
-            why=f"expected truth and a complete quartet, found {'no ' if truth is None else ''}truth and {quartets}",
+            why=f"expected truth and a complete quartet, found "
+            f"{'no ' if truth is None else ''}truth and {quartets}",
             fix=f"simulate at least the {sequence.cycle} raw frames of a cycle",
         )
     frames = [sequence.cycle * i for i in quartets]
     decoded = np.stack([closed_form_distance(sequence, i) for i in quartets])
     distance = known_distance(truth)
     squares = 100.0 * (decoded - distance[frames]) ** 2
-    moving, static = moving_and_static(distance, frames, from_phasors=sequence.from_phasors, cycle=sequence.cycle)
+    moving, static = moving_and_static(
+        distance, frames, from_phasors=sequence.from_phasors, cycle=sequence.cycle
+    )
     by_phasor = None
-    if truth.phasor_distance is not None and len(sequence.frequencies) == 1:  # it wraps with its one frequency
+    # it wraps with its one frequency
+    if truth.phasor_distance is not None and len(sequence.frequencies) == 1:
         by_phasor = _mean(100.0 * (decoded - truth.phasor_distance[frames]) ** 2)
     return Errors(_mean(squares), _mean(squares[moving]), _mean(squares[static]), by_phasor)
 
@@ -74,14 +78,20 @@ def with_closed_form(scene: Scene) -> Scene:
 def ladder_table(rows: Mapping[str, Errors]) -> list[str]:
     """Lines of a table: errors of each level, and the difference from the one before."""
     heads = ("all", "moving", "static", "vs phasor", "added")
-    lines = [f"{'closed form, MSE x100 [m^2]':<28}" + "".join(f"{head:>11}" for head in heads) + "  what is new"]
+    lines = [
+        f"{'closed form, MSE x100 [m^2]':<28}"
+        + "".join(f"{head:>11}" for head in heads)
+        + "  what is new"
+    ]
     before = None
     for level in LEVELS:
         if level.name not in rows:
             continue
         errors = rows[level.name]
         added = None if before is None or errors.all is None else errors.all - before
-        cells = "".join(f"{'-' if value is None else f'{value:.4g}':>11}" for value in (*errors, added))
+        cells = "".join(
+            f"{'-' if value is None else f'{value:.4g}':>11}" for value in (*errors, added)
+        )
         lines.append(f"{level.name:<28}{cells}  {level.adds}")
         before = errors.all
     return lines

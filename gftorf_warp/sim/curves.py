@@ -45,7 +45,9 @@ class Curve:
     def __call__(self, time: float) -> float:
         """Value at ``time`` [s]."""
         value = self.start + self.rate * time + 0.5 * self.acceleration * time**2
-        value += self.swing * math.sin(2.0 * math.pi * self.swing_hz * time + math.radians(self.swing_phase_deg))
+        value += self.swing * math.sin(
+            2.0 * math.pi * self.swing_hz * time + math.radians(self.swing_phase_deg)
+        )
         ease = 0.5 - 0.5 * math.cos(math.pi * min(max(time, 0.0), 1.0))
         return value + self.eased * ease + self.arched * math.sin(math.pi * ease)
 

@@ -55,7 +55,8 @@ def overlap(spacing: float, variance: float, aligned: bool) -> tuple[float, floa
             alignments.
     """
     index = np.arange(-8, 9) * spacing
-    x, y = (axis.ravel() for axis in np.meshgrid(index, index, indexing="ij"))  # x: from near to far
+    # x: from near to far
+    x, y = (axis.ravel() for axis in np.meshgrid(index, index, indexing="ij"))
     phases = [0.0] if aligned else (np.arange(6) / 6 * spacing).tolist()
     shares, leads = [], []
     for dx in phases:
@@ -112,7 +113,9 @@ class Cover:
     def __len__(self) -> int:
         return len(self.point)
 
-    def facing(self, centre: Float[np.ndarray, "3"], time: float, *, colour: bool = False) -> GaussianField:
+    def facing(
+        self, centre: Float[np.ndarray, "3"], time: float, *, colour: bool = False
+    ) -> GaussianField:
         """The splats facing a camera at ``centre`` [m] at ``time`` [s], shaded by incidence.
 
         The others are occluded by their own body. ``colour`` adds the albedo, which is not shaded.
@@ -123,7 +126,8 @@ class Cover:
         ray = mean - centre
         length = np.linalg.norm(ray, axis=1)
         cosine, cosine_other = (
-            -np.sum(normal @ rotation.T * ray, axis=1) / length for normal in (self.normal, self.other)
+            -np.sum(normal @ rotation.T * ray, axis=1) / length
+            for normal in (self.normal, self.other)
         )
         shown = (cosine > self.limb) & (cosine_other > self.limb)
         cosine = 0.5 * (cosine + cosine_other)
@@ -152,7 +156,8 @@ def cover_still(bodies: tuple[Body, ...], camera: Camera) -> Cover:
     cosine = np.clip(-np.sum(normal * ray, axis=1), COSINE_MIN, 1.0)
     share, lead = overlap(1.0, LOW_PASS + RADIUS**2, True)
 
-    across = np.cross(normal, ray)  # axis of the disc that is not foreshortened; any at normal incidence
+    # axis of the disc that is not foreshortened; any at normal incidence
+    across = np.cross(normal, ray)
     level = np.linalg.norm(across, axis=1) < 1e-9
     across[level] = np.cross(normal[level], [1.0, 0.0, 0.0])
     across[level & (np.linalg.norm(across, axis=1) < 1e-9)] = [0.0, 1.0, 0.0]
@@ -192,7 +197,10 @@ def _wider(camera: Camera) -> Camera:
 
 
 def cover_moving(
-    body: Body, camera: Camera, times: Float[np.ndarray, "F"], centres: Float[np.ndarray, "F 3"] | None = None
+    body: Body,
+    camera: Camera,
+    times: Float[np.ndarray, "F"],
+    centres: Float[np.ndarray, "F 3"] | None = None,
 ) -> Cover:
     """Grids of discs on the faces, ``SPACING`` pixels apart at the nearest of ``times`` [s].
 
@@ -201,7 +209,9 @@ def cover_moving(
     distances = clearance(body, camera.centre if centres is None else centres, times)
     nearest, typical = distances.min(), distances.mean() + body.shape.reach
     if nearest <= 0:
-        raise ValueError(f"a moving body reaches the camera: clearance {nearest:.3f} m must be above 0")
+        raise ValueError(
+            f"a moving body reaches the camera: clearance {nearest:.3f} m must be above 0"
+        )
     focal = camera.fx * magnification(camera)
     spacing, variance = SPACING * nearest / focal, LOW_PASS + RADIUS**2
     inset = spread(SPACING * nearest / typical, variance) * typical / focal - spacing / 2
@@ -260,7 +270,9 @@ def depth_slope(normal, distance, ray, camera: Camera) -> Float[np.ndarray, "N"]
     length = np.linalg.norm(flat, axis=1)
     gradient_length = flat[:, :2] / length[:, None] / [camera.fx, camera.fy]
     if camera.distortion:
-        gradient_z, gradient_length = (_per_pixel(each, flat, camera) for each in (gradient_z, gradient_length))
+        gradient_z, gradient_length = (
+            _per_pixel(each, flat, camera) for each in (gradient_z, gradient_length)
+        )
     gradient = gradient_z * length[:, None] + z[:, None] * gradient_length
     steepness = np.linalg.norm(gradient_z, axis=1)
     slanted = steepness > 1e-5 * z
@@ -274,7 +286,9 @@ def _per_pixel(gradient, flat, camera: Camera) -> Float[np.ndarray, "N 2"]:
     xx, xy, yy = camera.distortion.slope(*inside(flat[:, 0], flat[:, 1], camera.guard.radius))
     focal = np.array([camera.fx, camera.fy])
     x, y = (gradient * focal).T
-    return np.stack([x * yy - y * xy, y * xx - x * xy], axis=1) / (xx * yy - xy * xy)[:, None] / focal
+    return (
+        np.stack([x * yy - y * xy, y * xx - x * xy], axis=1) / (xx * yy - xy * xy)[:, None] / focal
+    )
 
 
 def magnification(camera: Camera) -> float:

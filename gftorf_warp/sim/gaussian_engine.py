@@ -49,7 +49,9 @@ class GaussianEngine:
         self._static = None if self._camera_moves else self._cover_still(0.0)
         centres = np.array([camera_at(float(time)).centre for time in times])
         self._moving: list[Cover] = [
-            cover_moving(body, camera_at(0.0), times, centres) for body in scene.bodies if body.moves
+            cover_moving(body, camera_at(0.0), times, centres)
+            for body in scene.bodies
+            if body.moves
         ]
 
     def field_at(self, time: float) -> GaussianField:
@@ -70,7 +72,9 @@ class GaussianEngine:
         del n  # nothing is random
         images = [self._instant(instant, sensor) for instant in instants]
         still = images[0] if instants == [time] else self._instant(time, sensor)
-        quad, amplitude, distance = (np.mean(each, axis=0) for each in list(zip(*images, strict=True))[:3])
+        quad, amplitude, distance = (
+            np.mean(each, axis=0) for each in list(zip(*images, strict=True))[:3]
+        )
         return Exposure(quad, amplitude, distance, still.phasor)
 
     def _instant(self, time: float, sensor: Sensor) -> Exposure:
@@ -79,12 +83,19 @@ class GaussianEngine:
         rendering = _rendering(field, camera, sensor)
         f_mod_hz, offset = float(sensor.f_mod_hz), float(sensor.phase_offset)
         harmonics = [
-            self._phasor(_rendering(field, camera, replace(sensor, f_mod_hz=h * f_mod_hz, phase_offset=h * offset)))
+            self._phasor(
+                _rendering(
+                    field, camera, replace(sensor, f_mod_hz=h * f_mod_hz, phase_offset=h * offset)
+                )
+            )
             for h in sensor.harmonics[1:]
         ]
         opacity = pooled(rendering.opacity, self.subsamples)
-        distance = pooled(rendering.distance, self.subsamples) / np.where(opacity > 0, opacity, np.nan)
-        amplitude = pooled(rendering.phasor[2], self.subsamples) / 2  # the third channel of a phasor is 2a
+        distance = pooled(rendering.distance, self.subsamples) / np.where(
+            opacity > 0, opacity, np.nan
+        )
+        # the third channel of a phasor is 2a
+        amplitude = pooled(rendering.phasor[2], self.subsamples) / 2
         first = self._phasor(rendering)
         if not harmonics and sensor.pattern.phase == 0.0:
             return Exposure(pooled(rendering.quads[0], self.subsamples), amplitude, distance, first)

@@ -79,12 +79,18 @@ def ideal_recording(
     sensor = replace(scene.sensor if sensor is None else sensor, noise=False)
     lit, read = frequencies_of(scene.sensor), frequencies_of(sensor)
     if lit != read:
-        raise ValueError(f"light of {', '.join(map(str, lit))} Hz, read by a sensor of {', '.join(map(str, read))} Hz")
+        raise ValueError(
+            f"light of {', '.join(map(str, lit))} Hz, read by a sensor of "
+            f"{', '.join(map(str, read))} Hz"
+        )
     shots = [sensor.at_frame(n) for n in range(scene.frames)]
     frequencies = np.array([float(shot.f_mod_hz) for shot in shots])
     times = frame_times(sensor, scene.frames, sync=False)
     if lights is None:
-        lights = {n: light_of(scene, float(times[n]), f_mod_hz=float(f)) for n, f in enumerate(frequencies)}
+        lights = {
+            n: light_of(scene, float(times[n]), f_mod_hz=float(f))
+            for n, f in enumerate(frequencies)
+        }
     shifts = np.array([shot.shifts[0] for shot in shots])
     quads = np.zeros((scene.frames, scene.height, scene.width), dtype=np.float32)
     distance = np.full(quads.shape, np.nan, dtype=np.float32)
@@ -92,7 +98,11 @@ def ideal_recording(
     for n, light in lights.items():
         turned = np.exp(1j * (float(sensor.phase_offset) - shifts[n]))
         quad = (light.phasor * turned).real + float(sensor.dc_offset) * light.amplitude
-        quads[n], distance[n], known[n] = float(sensor.source_intensity) * quad, light.distance, True
+        quads[n], distance[n], known[n] = (
+            float(sensor.source_intensity) * quad,
+            light.distance,
+            True,
+        )
     cameras = [scene.camera(time=float(time)) for time in times]
     sequence = Sequence(quads=quads, measured=known, **sequence_fields(sensor, times, cameras))
     return sequence, Truth(distance=distance, known=known)

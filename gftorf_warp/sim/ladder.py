@@ -20,8 +20,10 @@ from .settings import SimSettings
 
 OWN = object()
 NO_LIMIT_ELECTRONS = 1e12  # [e-] a full well that is never reached
-FINE_ADC_BITS = 20  # with the scene's electrons per code up to 1.7e7 electrons: it rounds, but does not clip
-EMITTER_M = (0.04, 0.0, 0.0)  # [m] sensor notes 2.6: 40 mm beside the lens, if the scene has no other position
+# with the scene's electrons per code up to 1.7e7 electrons: it rounds, but does not clip
+FINE_ADC_BITS = 20
+# [m] sensor notes 2.6: 40 mm beside the lens, if the scene has no other position
+EMITTER_M = (0.04, 0.0, 0.0)
 BEAM_DEG = (74.4, 59.3)  # [deg] the advertised field of view of the OPT8241 kit, sensor notes 3
 
 
@@ -44,7 +46,8 @@ class LadderLevel:
 LEVELS = (
     LadderLevel(
         name="sync",
-        adds="direct light at the camera, one ray per pixel, ideal sensor, all quads of a quartet at one instant",
+        adds="direct light at the camera, one ray per pixel, ideal sensor, all quads of a "
+        "quartet at one instant",
         scene={"subsamples": 1, "emitter": (0.0, 0.0, 0.0), "beam_deg": None},
         sensor={
             "full_well_electrons": NO_LIMIT_ELECTRONS,
@@ -53,9 +56,20 @@ LEVELS = (
             "pattern": Pattern(),
             "row_time_s": 0.0,
         },
-        settings={"engine": "mesh", "bounces": 0, "exposure_samples": 1, "noise": False, "sync": True},
+        settings={
+            "engine": "mesh",
+            "bounces": 0,
+            "exposure_samples": 1,
+            "noise": False,
+            "sync": True,
+        },
     ),
-    LadderLevel(name="L0", adds="one quad after the other", sensor={"row_time_s": OWN}, settings={"sync": False}),
+    LadderLevel(
+        name="L0",
+        adds="one quad after the other",
+        sensor={"row_time_s": OWN},
+        settings={"sync": False},
+    ),
     LadderLevel(name="L1", adds="noise and ADC", sensor={"noise": True}, settings={"noise": True}),
     LadderLevel(
         name="L2",
@@ -106,7 +120,9 @@ def resolved(scene: Scene, settings: SimSettings) -> tuple[Scene, SimSettings]:
         return scene, settings
     if name not in NAMES:
         why = f"the levels are {', '.join(NAMES)}, each the one before and something more"
-        raise UsageError(f"there is no level {name!r}", where="--level", why=why, fix="take one of these")
+        raise UsageError(
+            f"there is no level {name!r}", where="--level", why=why, fix="take one of these"
+        )
     of_scene: dict[str, Any] = {}
     of_sensor: dict[str, Any] = {}
     chosen: dict[str, Any] = {}

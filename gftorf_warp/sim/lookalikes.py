@@ -21,7 +21,8 @@ from .world import Body, Texture
 FRAMES = 60
 STEP = FRAME_RATE_HZ  # [1/s]
 MIDDLE = (FRAMES - 1) / 2 / FRAME_RATE_HZ  # [s] between the two raw frames in the middle
-SENSOR = Sensor(dc_offset=1.0, unipolar=True)  # one ideal tap; frequency and shifts are those of the public files
+# one ideal tap; frequency and shifts are those of the public files
+SENSOR = Sensor(dc_offset=1.0, unipolar=True)
 
 
 def sliding_cube() -> Scene:
@@ -82,7 +83,10 @@ def speed_test_texture() -> Scene:
 def speed_test_chair() -> Scene:
     """Bars of two pixels, so that nearly every pixel of a chair is an outline."""
     rows = ((-0.55, 0.032124), (0.05, 0.064248), (0.62, 0.096372))
-    chairs = [Body(shape=chair(), texture=around(0.5, 0.1, 0.3), path=_row(y, 3.561, step)) for y, step in rows]
+    chairs = [
+        Body(shape=chair(), texture=around(0.5, 0.1, 0.3), path=_row(y, 3.561, step))
+        for y, step in rows
+    ]
     return _synthetic(
         "speed_test_chair",
         "three chairs of thin bars slide at three speeds",
@@ -139,7 +143,12 @@ def _way(start: Vector, end: Vector) -> Line:
 
 
 def look_alike(
-    name: str, description: str, motion: str, closed_form: float, bodies: tuple[Body, ...], **others: Any
+    name: str,
+    description: str,
+    motion: str,
+    closed_form: float,
+    bodies: tuple[Body, ...],
+    **others: Any,
 ) -> Scene:
     """A scene of 320x240 pixels and 60 raw frames; ``others`` are further fields of it."""
     texts = {"name": name, "description": description, "motion": motion}

@@ -18,7 +18,8 @@ from .scene import Scene
 from .sensors import PALINDROMIC
 from .world import Body, Texture
 
-FIELD_OF_VIEW_DEG = math.degrees(2 * math.atan(160 / 230))  # [deg] 320 pixels at the focal length of 230 of the OPT8241
+# [deg] 320 pixels at the focal length of 230 of the OPT8241
+FIELD_OF_VIEW_DEG = math.degrees(2 * math.atan(160 / 230))
 SENSOR = Sensor(f_mod_hz=20e6, shifts=PALINDROMIC, noise=True)
 GRAVITY = 9.81  # [m/s^2]
 RPM = 550.0  # [1/min] of the fan; at 600 three blades take each other's places in every quartet
@@ -121,7 +122,10 @@ def fan(rpm: float = RPM) -> Scene:
     """Periodic: the blades pass a third of their circle in four raw frames."""
 
     def blade(first: float) -> Body:
-        turns = (Turn(axis="z", angle=Curve(start=first, rate=6.0 * rpm)), Turn(axis="x", angle=25.0))
+        turns = (
+            Turn(axis="z", angle=Curve(start=first, rate=6.0 * rpm)),
+            Turn(axis="x", angle=25.0),
+        )
         path = Guided(z=1.5, turns=turns, arm=(0.12, 0.0, 0.0))
         return box((0.2, 0.1, 0.008), path, plain(0.6))
 

@@ -112,7 +112,10 @@ def deskbox() -> Scene:
             *(box((0.04, 0.62, 0.70), (x, 0.75, 2.15), wood) for x in (-0.74, 0.74)),
             box((0.52, 0.32, 0.04), (0.52, 0.22, 2.35), plain(0.06, 0.6)),
             box((0.34, 0.26, 0.28), carried(), around(0.5, 0.2, 0.08, 0.08)),
-            *(box((0.08, 0.08, 0.45), carried((x, -0.02, 0.20)), plain(0.35, CLOTH)) for x in (-0.21, 0.21)),
+            *(
+                box((0.08, 0.08, 0.45), carried((x, -0.02, 0.20)), plain(0.35, CLOTH))
+                for x in (-0.21, 0.21)
+            ),
             *person(Curve(start=-0.42, eased=0.42), 0.05, 2.75),
         ),
         centre=2.2,
@@ -122,8 +125,12 @@ def deskbox() -> Scene:
 
 def phonebooth(wall: float = 3.4, name: str = "phonebooth", closed_form: float = 1.555) -> Scene:
     """A person behind the frame of a door; ``wall`` [m] says how far away the room ends."""
-    stiles = [Part(shape=Box(size=(0.06, 2.0, 0.03)), position=(x - 0.46, 0.0, 0.0)) for x in (0.03, 0.89)]
-    rails = [Part(shape=Box(size=(0.80, 0.06, 0.03)), position=(0.0, y, 0.0)) for y in (-0.97, 0.0, 0.97)]
+    stiles = [
+        Part(shape=Box(size=(0.06, 2.0, 0.03)), position=(x - 0.46, 0.0, 0.0)) for x in (0.03, 0.89)
+    ]
+    rails = [
+        Part(shape=Box(size=(0.80, 0.06, 0.03)), position=(0.0, y, 0.0)) for y in (-0.97, 0.0, 0.97)
+    ]
     swing = Turn(axis="y", angle=Curve(start=75.0, eased=-35.0))
     door = Guided(x=-0.48, y=0.05, z=2.30, turns=(swing,), arm=(0.46, 0.0, 0.0))
 
@@ -132,7 +139,8 @@ def phonebooth(wall: float = 3.4, name: str = "phonebooth", closed_form: float =
 
     return _carried(
         name,
-        "a person closes the door of a phone booth" + ("" if wall < 5 else ", before a wall that wraps"),
+        "a person closes the door of a phone booth"
+        + ("" if wall < 5 else ", before a wall that wraps"),
         "camera on an arc, frame of a door turns",
         closed_form,
         (
@@ -142,7 +150,10 @@ def phonebooth(wall: float = 3.4, name: str = "phonebooth", closed_form: float =
             box((1.04, 0.04, 0.90), (0.0, -1.0, 2.75), plain(0.4, 0.98)),
             Body(shape=Assembly(parts=(*stiles, *rails)), texture=plain(0.5, 0.98), path=door),
             *person(swaying(0.05), -0.05, 2.85),
-            *(box((0.14, 0.80, 0.14), Guided(x=swaying(x), y=0.65, z=2.85), plain(0.2, CLOTH)) for x in (-0.05, 0.15)),
+            *(
+                box((0.14, 0.80, 0.14), Guided(x=swaying(x), y=0.65, z=2.85), plain(0.2, CLOTH))
+                for x in (-0.05, 0.15)
+            ),
         ),
         centre=2.6,
         yaw_deg_per_s=-4.0,
@@ -168,7 +179,11 @@ def studybook() -> Scene:
             *_room(3.0, 1.1, 0.5, 0.35),
             box((1.40, 0.04, 0.70), (0.0, 0.45, 1.65), plain(0.4, WOOD)),
             *(box((0.20, 0.02, 0.27), (x, 0.42, 1.55), cover) for x in (-0.10, 0.10)),
-            box((0.19, 0.002, 0.26), Guided(y=0.405, z=1.55, turns=(page,), arm=(0.095, 0.0, 0.0)), plain(0.7, 0.15)),
+            box(
+                (0.19, 0.002, 0.26),
+                Guided(y=0.405, z=1.55, turns=(page,), arm=(0.095, 0.0, 0.0)),
+                plain(0.7, 0.15),
+            ),
             box((0.08, 0.07, 0.35), (-0.30, 0.38, 1.75), plain(0.4, CLOTH)),
             box((0.08, 0.07, 0.35), reaching, plain(0.4, CLOTH)),
             *person(Curve(swing=0.02, swing_hz=0.4), 0.10, 2.15),
@@ -197,7 +212,9 @@ def _room(z: float, y: float, wall: float, floor: float) -> tuple[Body, Body]:
     return wall_and_floor(z, y, around(wall, 0.2, 0.3, WALL), around(floor, 0.2, 0.3, FLOOR))
 
 
-def _carried(*texts_and_bodies: Any, centre: float, yaw_deg_per_s: float, pitch_deg: float = 0.0) -> Scene:
+def _carried(
+    *texts_and_bodies: Any, centre: float, yaw_deg_per_s: float, pitch_deg: float = 0.0
+) -> Scene:
     """With a colour camera, moving for one second; the rest as for ``look_alike``."""
     return look_alike(
         *texts_and_bodies,

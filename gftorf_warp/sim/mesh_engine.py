@@ -50,8 +50,18 @@ class MeshEngine:
         seed: int = 0,
         truth: str | None = None,
     ):
-        self.scene, self.camera_at, self.bounces, self.seed, self.truth = scene, camera_at, bounces, seed, truth
-        pieces = [(index, piece) for index, body in enumerate(scene.bodies) for piece in rigid_bodies(body)]
+        self.scene, self.camera_at, self.bounces, self.seed, self.truth = (
+            scene,
+            camera_at,
+            bounces,
+            seed,
+            truth,
+        )
+        pieces = [
+            (index, piece)
+            for index, body in enumerate(scene.bodies)
+            for piece in rigid_bodies(body)
+        ]
         self._body = np.array([index for index, _ in pieces], dtype=np.int32)  # of each piece
         camera = camera_at(0.0)
         beam = beam_of(scene.lens, camera) if beam_is_traced(scene, bounces.count) else None
@@ -64,7 +74,9 @@ class MeshEngine:
             device=device,
         )
 
-    def light(self, times: Sequence[float], f_mod_hz: float, seed: int = 0, *, row: int | None = None) -> Light:
+    def light(
+        self, times: Sequence[float], f_mod_hz: float, seed: int = 0, *, row: int | None = None
+    ) -> Light:
         """Mean light over instants [s], for a source intensity of 1; ``seed`` of the bounces."""
         return self._tracer.light(
             [self._camera(time, row) for time in times],
@@ -91,13 +103,24 @@ class MeshEngine:
             return self._expose((n, PATHS), instants, time, sensor)
         delays = row_delays(sensor, self.camera_at(0.0).height).tolist()
         rows = [
-            self._expose((n, PATHS, row), [instant + delay for instant in instants], time + delay, sensor, row)
+            self._expose(
+                (n, PATHS, row),
+                [instant + delay for instant in instants],
+                time + delay,
+                sensor,
+                row,
+            )
             for row, delay in enumerate(delays)
         ]
         return join_rows(rows)
 
     def _expose(
-        self, numbers: tuple[int, ...], instants: list[float], time: float, sensor: Sensor, row: int | None = None
+        self,
+        numbers: tuple[int, ...],
+        instants: list[float],
+        time: float,
+        sensor: Sensor,
+        row: int | None = None,
     ) -> Exposure:
         f_mod_hz = float(sensor.f_mod_hz)
         seed = int(np.random.default_rng((self.seed, *numbers)).integers(2**31))
@@ -149,13 +172,21 @@ def rigid_bodies(body: Body) -> list[RigidBody]:
         x, y, z = np.eye(3)[shape.axis].tolist()
         return [made(normal=(x, y, z), height=shape.value)]
     parts = shape.parts if isinstance(shape, Assembly) else (Part(shape=shape),)
-    pieces = [made(radius=part.shape.radius, centre=part.position) for part in parts if isinstance(part.shape, Sphere)]
+    pieces = [
+        made(radius=part.shape.radius, centre=part.position)
+        for part in parts
+        if isinstance(part.shape, Sphere)
+    ]
     flat = [part for part in parts if not isinstance(part.shape, Sphere)]
     if flat:
         meshes = [triangles_of(part.shape) for part in flat]
         before = np.cumsum([0, *(len(points) for points, _ in meshes[:-1])])
-        points = np.concatenate([points + part.position for part, (points, _) in zip(flat, meshes, strict=True)])
-        triangles = np.concatenate([mesh + first for first, (_, mesh) in zip(before, meshes, strict=True)])
+        points = np.concatenate(
+            [points + part.position for part, (points, _) in zip(flat, meshes, strict=True)]
+        )
+        triangles = np.concatenate(
+            [mesh + first for first, (_, mesh) in zip(before, meshes, strict=True)]
+        )
         pieces.append(made(points=points, triangles=triangles))
     return pieces
 
@@ -174,12 +205,17 @@ def triangles_of(shape: Shape) -> tuple[Float[np.ndarray, "V 3"], Int[np.ndarray
         return points, np.array([[0, 2, 1], [0, 3, 2]])
     if not isinstance(shape, Box):
         raise ValueError(f"{type(shape).__name__} has no triangles")
-    corners = np.stack(np.meshgrid([-0.5, 0.5], [-0.5, 0.5], [-0.5, 0.5], indexing="ij"), axis=-1).reshape(8, 3)
+    corners = np.stack(
+        np.meshgrid([-0.5, 0.5], [-0.5, 0.5], [-0.5, 0.5], indexing="ij"), axis=-1
+    ).reshape(8, 3)
     faces = []
     for axis, u, v in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):  # u x v points along the axis
         place = 4 >> np.array([axis, u, v])  # of a corner's number, per axis
         for side in (0, 1):
-            square = [int(side * place[0] + a * place[1] + b * place[2]) for a, b in ((0, 0), (1, 0), (1, 1), (0, 1))]
+            square = [
+                int(side * place[0] + a * place[1] + b * place[2])
+                for a, b in ((0, 0), (1, 0), (1, 1), (0, 1))
+            ]
             outwards = square if side else square[::-1]
             turned = outwards[::-1] if shape.inside else outwards
             faces += [turned[:3], [turned[0], turned[2], turned[3]]]

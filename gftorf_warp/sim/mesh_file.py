@@ -40,11 +40,15 @@ def read_mesh(
     if len(triangles) == 0:
         raise _wrong(file, "it has no triangle", "export the surface, not a cloud of points")
     if triangles.min() < 0 or triangles.max() >= len(points):
-        raise _wrong(file, f"a face names vertex {triangles.max()} of {len(points)}", "export it again")
+        raise _wrong(
+            file, f"a face names vertex {triangles.max()} of {len(points)}", "export it again"
+        )
     bad = np.flatnonzero(~np.isfinite(points).all(1))
     if len(bad):
         raise _wrong(
-            file, f"{len(bad)} of {len(points)} vertices are no numbers, the first is {bad[0]}", "correct them"
+            file,
+            f"{len(bad)} of {len(points)} vertices are no numbers, the first is {bad[0]}",
+            "correct them",
         )
     points, same = np.unique(scale * points, axis=0, return_inverse=True)
     triangles = same.reshape(-1)[triangles]
@@ -65,28 +69,39 @@ def read_mesh(
 
 def _loaded(file: Path) -> tuple[np.ndarray, np.ndarray]:
     if file.suffix.lower() not in SUFFIXES:
-        raise _wrong(file, f"its name ends in {file.suffix!r}", f"give one that ends in {' or '.join(SUFFIXES)}")
+        raise _wrong(
+            file,
+            f"its name ends in {file.suffix!r}",
+            f"give one that ends in {' or '.join(SUFFIXES)}",
+        )
     try:
         with file.open("rb") as stream:
             stream.read(1)
     except OSError as error:
-        raise _wrong(file, error.strerror or str(error), "correct the path, relative to the scene file") from error
+        raise _wrong(
+            file, error.strerror or str(error), "correct the path, relative to the scene file"
+        ) from error
     import trimesh
 
     options: dict[str, Any] = {"skip_materials": True} if file.suffix.lower() == ".obj" else {}
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RuntimeWarning)  # non-finite vertices are checked afterwards
+            # non-finite vertices are checked afterwards
+            warnings.simplefilter("ignore", RuntimeWarning)
             mesh: Any = trimesh.load(file, process=False, force="mesh", **options)
             return np.array(mesh.vertices, dtype=np.float64), np.array(mesh.faces, dtype=np.int64)
     except Exception as error:  # readers of the formats raise many kinds
-        raise _wrong(file, f"it cannot be read: {type(error).__name__}, {error}", "export it again") from error
+        raise _wrong(
+            file, f"it cannot be read: {type(error).__name__}, {error}", "export it again"
+        ) from error
 
 
 def _check_area(file: Path, points: np.ndarray, triangles: np.ndarray) -> None:
     corner = points[triangles]
     longest = np.linalg.norm(corner - np.roll(corner, 1, axis=1), axis=2).max(1)
-    twice = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1)
+    twice = np.linalg.norm(
+        np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1
+    )
     flat = np.flatnonzero(~(twice > FLAT * longest**2))
     if len(flat):
         raise _wrong(
@@ -103,7 +118,9 @@ def _check_edges(file: Path, triangles: np.ndarray) -> int:
         InputError: If an edge has more than two triangles, or two that wind it the same way.
     """
     edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
-    _, number, count = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
+    _, number, count = np.unique(
+        np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True
+    )
     crowded = int((count > 2).sum())
     if crowded:
         raise _wrong(
@@ -111,7 +128,9 @@ def _check_edges(file: Path, triangles: np.ndarray) -> int:
             f"it is no surface: {crowded} edges have three triangles or more",
             "split it into bodies that have an inside",
         )
-    forward = np.bincount(number.reshape(-1), weights=edges[:, 0] < edges[:, 1], minlength=len(count))
+    forward = np.bincount(
+        number.reshape(-1), weights=edges[:, 0] < edges[:, 1], minlength=len(count)
+    )
     twisted = int(((count == 2) & (forward != 1)).sum())
     if twisted:
         raise _wrong(

@@ -153,7 +153,10 @@ def _enters(node: Node, origin: np.ndarray, inverse: np.ndarray, limit: np.ndarr
     """Which rays of these inverse directions hit a box nearer than a limit [m]."""
     near, far = np.zeros(len(inverse)), limit * (1 + BOX_SLACK)
     for axis in range(3):
-        with np.errstate(invalid="ignore"):  # 0 times infinity: in the plane of a side, which then does not count
-            a, b = ((side[axis] - origin[axis]) * inverse[:, axis] for side in (node.low, node.high))
+        # 0 times infinity: in the plane of a side, which then does not count
+        with np.errstate(invalid="ignore"):
+            a, b = (
+                (side[axis] - origin[axis]) * inverse[:, axis] for side in (node.low, node.high)
+            )
         near, far = np.fmax(near, np.fmin(a, b)), np.fmin(far, np.fmax(a, b))
     return near <= far * (1 + BOX_SLACK)

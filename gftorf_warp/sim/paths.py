@@ -27,7 +27,9 @@ def rotation_matrix(turn_deg: Vector) -> Float[np.ndarray, "3 3"]:
     return np.eye(3) + math.sin(angle) * cross + (1.0 - math.cos(angle)) * cross @ cross
 
 
-def rigid(rotation: Float[np.ndarray, "3 3"], position: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
+def rigid(
+    rotation: Float[np.ndarray, "3 3"], position: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "4 4"]:
     """The 4x4 matrix that turns by ``rotation`` and then shifts by ``position`` [m]."""
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation, position
@@ -40,7 +42,9 @@ def inverse(pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
     return rigid(rotation, 0.0 - rotation @ pose[:3, 3])  # a difference, so that there is no -0.0
 
 
-def looking_at(position: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
+def looking_at(
+    position: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "4 4"]:
     """World from camera at ``position`` [m], z axis to ``target`` [m], x axis horizontal.
 
     Raises:
@@ -49,9 +53,15 @@ def looking_at(position: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"])
     ahead = np.subtract(target, position, dtype=np.float64)
     right = np.cross([0.0, 1.0, 0.0], ahead)
     if not np.linalg.norm(right) > 1e-9 * np.linalg.norm(ahead):
-        raise ValueError(f"a view from {tuple(position)} to {tuple(target)} is straight up or down: no axis is level")
+        raise ValueError(
+            f"a view from {tuple(position)} to {tuple(target)} is straight up or "
+            f"down: no axis is level"
+        )
     ahead, right = ahead / np.linalg.norm(ahead), right / np.linalg.norm(right)
-    return rigid(np.stack([right, np.cross(ahead, right), ahead], axis=1), np.asarray(position, dtype=np.float64))
+    return rigid(
+        np.stack([right, np.cross(ahead, right), ahead], axis=1),
+        np.asarray(position, dtype=np.float64),
+    )
 
 
 class Path(abc.ABC):
@@ -97,7 +107,10 @@ class Line(Path):
         elapsed = time - self.passing_s
         x, y, z = self.spin_deg_per_s
         spin = rotation_matrix((x * elapsed, y * elapsed, z * elapsed))
-        return rigid(spin @ rotation_matrix(self.turn_deg), np.add(self.position, np.multiply(self.velocity, elapsed)))
+        return rigid(
+            spin @ rotation_matrix(self.turn_deg),
+            np.add(self.position, np.multiply(self.velocity, elapsed)),
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -158,4 +171,6 @@ class Sweep(Path):
         phase = 2.0 * math.pi * time / self.period_s
         turn = rotation_matrix((0.0, 0.5 * self.sweep_deg * math.cos(phase), 0.0))
         position = np.add(self.target, turn @ np.subtract(self.middle, self.target))
-        return looking_at(position - [0.0, self.rise * math.sin(phase), 0.0], np.asarray(self.target))
+        return looking_at(
+            position - [0.0, self.rise * math.sin(phase), 0.0], np.asarray(self.target)
+        )

@@ -54,7 +54,11 @@ def why_impossible(sensor: Sensor) -> str | None:
     if modulated + constant <= 1.0 + 1e-6:
         return None
     kind = "one tap allows" if sensor.unipolar else "differential taps allow"
-    harmonics = f", peak {peak(sensor.harmonic_contrast):g} with its harmonics" if sensor.harmonic_contrast else ""
+    harmonics = (
+        f", peak {peak(sensor.harmonic_contrast):g} with its harmonics"
+        if sensor.harmonic_contrast
+        else ""
+    )
     return (
         f"{kind} contrast (1 + |dc_offset|) <= 1, not {float(contrast(sensor)):g} "
         f"(1 + {abs(float(sensor.dc_offset)):g}){harmonics}"
@@ -76,7 +80,9 @@ def mean_quad(
         ValueError: If there is light at another number of harmonics.
     """
     if len(light) != len(sensor.harmonics):
-        raise ValueError(f"light {light.shape} must start with {len(sensor.harmonics)}, the number of harmonics")
+        raise ValueError(
+            f"light {light.shape} must start with {len(sensor.harmonics)}, the number of harmonics"
+        )
     intensity = float(sensor.source_intensity)
     amplitude = intensity * amplitude.astype(np.float64)
     pattern = phase_map(sensor.pattern, *amplitude.shape)
@@ -116,7 +122,8 @@ def mean_taps(
     least = min(tap.min() for tap in taps)
     if least < -1e-3:  # beyond the rounding errors of float32 quads
         raise ValueError(
-            f"a tap would hold {least:.3g} electrons: contrast {float(contrast(sensor)):.3g} times (1 + |dc_offset|) "
+            f"a tap would hold {least:.3g} electrons: contrast {float(contrast(sensor)):.3g} "
+            f"times (1 + |dc_offset|) "
             f"{1 + abs(float(sensor.dc_offset)):.3g} must not exceed 1 for a differential sensor"
         )
     return np.maximum(taps[0], 0.0), np.maximum(taps[1], 0.0)
@@ -186,7 +193,9 @@ def quantise(
     low, high = -codes // 2, codes // 2 - 1
     zero = low + codes // 64 if sensor.unipolar else 0
     code = np.round(electrons / sensor.electrons_per_code) + zero
-    return (np.clip(code, low, high) - zero) * sensor.electrons_per_code, (code <= low) | (code >= high)
+    return (np.clip(code, low, high) - zero) * sensor.electrons_per_code, (code <= low) | (
+        code >= high
+    )
 
 
 def _ambient(sensor: Sensor, share: Float[np.ndarray, "H W"] | None) -> Level:

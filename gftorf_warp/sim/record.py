@@ -55,7 +55,9 @@ class Gap:
     moves."""
 
     def __str__(self) -> str:
-        return f"mean {1e3 * self.mean:.1f} mm, max {1e3 * self.max:.1f} mm over {self.pixels} pixels"
+        return (
+            f"mean {1e3 * self.mean:.1f} mm, max {1e3 * self.max:.1f} mm over {self.pixels} pixels"
+        )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -100,7 +102,9 @@ def sequence_fields(
         "camera_from_world": np.stack([camera.camera_from_world for camera in cameras]),
         "shifts": np.array([shot.shifts[0] for shot in shots]),
         "times": times,
-        "frequencies_hz": np.array([float(shot.f_mod_hz) for shot in shots]) if sensor.further_hz else None,
+        "frequencies_hz": np.array([float(shot.f_mod_hz) for shot in shots])
+        if sensor.further_hz
+        else None,
     }
 
 
@@ -157,7 +161,9 @@ def record(
             quads=images["quad"],
             measured=np.ones(len(times), dtype=bool),
             **sequence_fields(sensor, times, cameras, **sensor_settings(sensor)),
-            novel_from_world=np.stack([inverse(view.world_from_body(0.0)) for view in scene.novel_views])
+            novel_from_world=np.stack(
+                [inverse(view.world_from_body(0.0)) for view in scene.novel_views]
+            )
             if scene.novel_views
             else None,
             flow=_flows(scene, cameras, times) if settings.flow else Flow(),
@@ -170,7 +176,9 @@ def record(
             phasor_distance=images["phasor_distance"],
             amplitude=images["amplitude"],
             body=bodies,
-            layers={n.removeprefix(LAYER): image for n, image in images.items() if n.startswith(LAYER)},
+            layers={
+                n.removeprefix(LAYER): image for n, image in images.items() if n.startswith(LAYER)
+            },
         ),
         gap=_gap(images["distance"], distances, interior),
         saturated=int(images["saturated"].sum()) / images["quad"].size,
@@ -266,7 +274,8 @@ def sensor_settings(sensor: Sensor) -> dict[str, Any]:
 
 def still_interior(scene: Scene, hits: list[Hits]) -> Bool[np.ndarray, "H W"]:
     """Pixels that see the same face of a still body as all neighbours up to two pixels away."""
-    moves = np.array([*(body.moves for body in scene.bodies), False])  # the last is index -1, nothing hit
+    # the last is index -1, nothing hit
+    moves = np.array([*(body.moves for body in scene.bodies), False])
     inside = np.ones(hits[0].body.shape, dtype=bool)
     inside[:2] = inside[-2:] = inside[:, :2] = inside[:, -2:] = False
     for hit in hits:
@@ -274,7 +283,8 @@ def still_interior(scene: Scene, hits: list[Hits]) -> Bool[np.ndarray, "H W"]:
         surface = hit.body * (hit.face.max() + 1) + hit.face
         for dy in range(-2, 3):
             for dx in range(-2, 3):
-                inside &= np.roll(surface, (dy, dx), (0, 1)) == surface  # the wrapped border is masked above
+                # the wrapped border is masked above
+                inside &= np.roll(surface, (dy, dx), (0, 1)) == surface
     return inside
 
 
@@ -295,7 +305,9 @@ def _truth(
 
 
 def _gap(
-    distance: Float[np.ndarray, "F H W"], truth: Float[np.ndarray, "F H W"], interior: Bool[np.ndarray, "F H W"]
+    distance: Float[np.ndarray, "F H W"],
+    truth: Float[np.ndarray, "F H W"],
+    interior: Bool[np.ndarray, "F H W"],
 ) -> Gap | None:
     difference = np.abs(distance[interior] - truth[interior])
     if not len(difference):
@@ -304,7 +316,9 @@ def _gap(
     return Gap(mean=float(difference.mean()), max=float(difference.max()), pixels=pixels)
 
 
-def _colour(scene: Scene, settings: SimSettings, times: Float[np.ndarray, "F"], cached: Cached) -> ColourCamera:
+def _colour(
+    scene: Scene, settings: SimSettings, times: Float[np.ndarray, "F"], cached: Cached
+) -> ColourCamera:
     """The colour camera: an image at every quartet start, and its poses."""
     if scene.colour is None:
         return ColourCamera()

@@ -25,7 +25,11 @@ from .record import Cached, Images
 
 CARD = "README.md"
 LOCK = ".lock"
-MARKS = (("cams/depth_range.npy", "tofType0"), ("cams/depth_range.npy", "tof"), ("capture.json", "tof"))
+MARKS = (
+    ("cams/depth_range.npy", "tofType0"),
+    ("cams/depth_range.npy", "tof"),
+    ("capture.json", "tof"),
+)
 """What every folder that we write holds, by layout."""
 OTHER = "continue with the same settings, choose another --out, or start over with --fresh"
 
@@ -48,14 +52,17 @@ def needs_recording(out: Path, card: str, *, fresh: bool) -> bool:
     sequence = any(all((out / mark).exists() for mark in marks) for marks in MARKS)
     text = (out / CARD).read_text(errors="replace") if sequence and (out / CARD).is_file() else ""
     if not fresh and text.startswith(card):
-        shutil.rmtree(partial_of(out), ignore_errors=True)  # of a process that was killed just before it removed it
+        # of a process that was killed just before it removed it
+        shutil.rmtree(partial_of(out), ignore_errors=True)
         return False
     if fresh and sequence:
         return True
     raise UsageError(
         "the folder is not empty" if out.is_dir() else "not a folder",
         where=out,
-        why="it holds a sequence made with other settings" if sequence else "it holds something that is no sequence",
+        why="it holds a sequence made with other settings"
+        if sequence
+        else "it holds something that is no sequence",
         fix="choose another --out" + (", or move this one aside with --fresh" if sequence else ""),
     )
 
@@ -111,11 +118,16 @@ def cached_images(out: Path, card: str, *, fresh: bool) -> Iterator[Cached]:
 
 
 def _refuse_other_partial(folder: Path, card: str, *, fresh: bool) -> None:
-    if not folder.exists() or (folder.is_dir() and not any(path.name != LOCK for path in folder.iterdir())):
+    if not folder.exists() or (
+        folder.is_dir() and not any(path.name != LOCK for path in folder.iterdir())
+    ):
         return
     begun = folder / UNFINISHED
     if not begun.is_file():
-        what, why = "the folder of finished images is in use", "it holds something that is no recording"
+        what, why = (
+            "the folder of finished images is in use",
+            "it holds something that is no recording",
+        )
         raise UsageError(what, where=folder, why=why, fix="choose another --out")
     if not fresh and begun.read_text(encoding="utf-8", errors="replace") != card:
         why = "an interrupted recording with other settings left it there"

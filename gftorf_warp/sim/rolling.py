@@ -30,7 +30,11 @@ def join_rows(rows: list[Exposure]) -> Exposure:
 
 
 def rolling_hits(
-    bodies: tuple[Body, ...], camera_at: Callable[[float], Camera], time: float, sensor: Sensor, height: int
+    bodies: tuple[Body, ...],
+    camera_at: Callable[[float], Camera],
+    time: float,
+    sensor: Sensor,
+    height: int,
 ) -> Hits:
     """First hit of every pixel's centre ray, each row when it is exposed.
 
@@ -45,4 +49,6 @@ def rolling_hits(
         return first_hit(bodies, camera_at(time), time)
     times = (time + row_delays(sensor, height)).tolist()
     rows = [first_hit(bodies, camera_at(late).row(n), late) for n, late in enumerate(times)]
-    return Hits(**{f.name: np.concatenate([getattr(row, f.name) for row in rows]) for f in fields(Hits)})
+    return Hits(
+        **{f.name: np.concatenate([getattr(row, f.name) for row in rows]) for f in fields(Hits)}
+    )

@@ -26,11 +26,25 @@ from .sensors import SENSORS
 KINDS: dict[type, dict[str, type]] = {
     world.Shape: {
         kind.__name__.lower(): kind
-        for kind in (world.Box, world.Plane, world.Sphere, assembly.Level, assembly.Assembly, meshes.Mesh)
+        for kind in (
+            world.Box,
+            world.Plane,
+            world.Sphere,
+            assembly.Level,
+            assembly.Assembly,
+            meshes.Mesh,
+        )
     },
     paths.Path: {
         kind.__name__.lower(): kind
-        for kind in (paths.Still, paths.Line, paths.Arc, curves.Guided, paths.Viewpoint, paths.Sweep)
+        for kind in (
+            paths.Still,
+            paths.Line,
+            paths.Arc,
+            curves.Guided,
+            paths.Viewpoint,
+            paths.Sweep,
+        )
     },
 }
 NOT_THERE = ("closed_form", "overrides")  # fields of a scene that are no settings
@@ -49,11 +63,20 @@ def read_scene(path: str | FilePath) -> Scene:
         table = tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise InputError(
-            "cannot read the scene", where=path, why=error.strerror or str(error), fix="correct the path"
+            "cannot read the scene",
+            where=path,
+            why=error.strerror or str(error),
+            fix="correct the path",
         ) from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError("no TOML file", where=path, why=str(error), fix="correct that line") from error
-    texts = {"name": path.stem, "description": f"scene of {path.name}", "motion": "as its file says"}
+        raise InputError(
+            "no TOML file", where=path, why=str(error), fix="correct that line"
+        ) from error
+    texts = {
+        "name": path.stem,
+        "description": f"scene of {path.name}",
+        "motion": "as its file says",
+    }
     for key in NOT_THERE:
         if key in table:
             raise _wrong(path, key, "it is no setting", "leave it out")
@@ -70,11 +93,18 @@ def _made(kind: type, table: Any, path: FilePath, where: str) -> Any:
     if not isinstance(table, dict):
         raise _wrong(path, where, f"expected a table, found {table!r}", "write { ... } or [...]")
     table = dict(table)
-    preset = _preset(table.pop("preset"), path, where) if kind is Sensor and "preset" in table else None
+    preset = (
+        _preset(table.pop("preset"), path, where) if kind is Sensor and "preset" in table else None
+    )
     if kind in KINDS:
         kinds, named = KINDS[kind], table.pop("kind", None)
         if not isinstance(named, str) or named not in kinds:
-            raise _wrong(path, _join(where, "kind"), f"expected one of {', '.join(kinds)}, found {named!r}", "name one")
+            raise _wrong(
+                path,
+                _join(where, "kind"),
+                f"expected one of {', '.join(kinds)}, found {named!r}",
+                "name one",
+            )
         kind = kinds[named]
     known = {f.name: f for f in fields(kind)}
     hints = typing.get_type_hints(kind)
@@ -85,7 +115,9 @@ def _made(kind: type, table: Any, path: FilePath, where: str) -> Any:
     for name, f in known.items():
         if name not in table and f.default is MISSING and f.default_factory is MISSING:
             raise _wrong(path, _join(where, name), f"a {kind.__name__} needs it", "add it")
-    values = {key: _value(hints[key], value, path, _join(where, key)) for key, value in table.items()}
+    values = {
+        key: _value(hints[key], value, path, _join(where, key)) for key, value in table.items()
+    }
     try:
         return kind(**values) if preset is None else replace(preset, **values)
     except ValueError as error:
@@ -109,9 +141,15 @@ def _value(kind: Any, value: Any, path: FilePath, where: str) -> Any:
         if wanted[1:] == (Ellipsis,):
             wanted = wanted[:1] * len(value)
         if len(value) != len(wanted):
-            raise _wrong(path, where, f"expected {len(wanted)} values, found {len(value)}", "correct the list")
+            raise _wrong(
+                path,
+                where,
+                f"expected {len(wanted)} values, found {len(value)}",
+                "correct the list",
+            )
         return tuple(
-            _value(one, item, path, f"{where}[{i}]") for i, (one, item) in enumerate(zip(wanted, value, strict=True))
+            _value(one, item, path, f"{where}[{i}]")
+            for i, (one, item) in enumerate(zip(wanted, value, strict=True))
         )
     if kind is FilePath and type(value) is str:
         return path.parent / value
@@ -119,8 +157,16 @@ def _value(kind: Any, value: Any, path: FilePath, where: str) -> Any:
         return float(value)
     if kind is not float and type(value) is kind:  # a bool is an int to isinstance
         return value
-    names = {float: "a finite number", int: "a whole number", bool: "true or false", str: "a text", FilePath: "a path"}
-    raise _wrong(path, where, f"expected {names.get(kind, kind)}, found {value!r}", "correct the value")
+    names = {
+        float: "a finite number",
+        int: "a whole number",
+        bool: "true or false",
+        str: "a text",
+        FilePath: "a path",
+    }
+    raise _wrong(
+        path, where, f"expected {names.get(kind, kind)}, found {value!r}", "correct the value"
+    )
 
 
 def _preset(name: Any, path: FilePath, where: str) -> Sensor:

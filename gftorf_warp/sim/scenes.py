@@ -88,33 +88,58 @@ def tour() -> Scene:
     """A camera moves past a desk, as in the TöRF family: phasors, colour, poses."""
     target = (0.0, 0.1, 2.7)
     path = Arc(centre=(0.0, -0.2, 2.75), radius=0.55, start_deg=-180.0, rate_deg_per_s=180.0)
-    views = ((-0.45, -0.1, 0.0), (-0.2, -0.35, 0.1), (0.0, 0.2, 0.0), (0.0, 0.0, 0.4), (0.2, -0.35, 0.1))
+    views = (
+        (-0.45, -0.1, 0.0),
+        (-0.2, -0.35, 0.1),
+        (0.0, 0.2, 0.0),
+        (0.0, 0.0, 0.4),
+        (0.2, -0.35, 0.1),
+    )
     return _scene(
         name="tour",
         closed_form=2.488,
-        description="a camera is carried past a desk over which a ball swings by; with a colour camera",
+        description="a camera is carried past a desk over which a ball swings by; with a colour "
+        "camera",
         motion="camera and ball on arcs",
         bodies=(
             room(hue=0.55),
-            box((2.2, 0.08, 1.0), (0.1, 0.62, 2.75), Texture(low=0.45, high=0.7, cell=0.25, hue=0.08)),
-            box((0.5, 0.9, 0.5), (-1.35, 0.7, 3.6), Texture(low=0.3, high=0.9, cell=0.15, hue=0.35)),
-            box((0.45, 0.36, 0.35), (0.65, 0.4, 2.75), Texture(low=0.4, high=0.9, cell=0.12, hue=0.17)),
+            box(
+                (2.2, 0.08, 1.0),
+                (0.1, 0.62, 2.75),
+                Texture(low=0.45, high=0.7, cell=0.25, hue=0.08),
+            ),
+            box(
+                (0.5, 0.9, 0.5), (-1.35, 0.7, 3.6), Texture(low=0.3, high=0.9, cell=0.15, hue=0.35)
+            ),
+            box(
+                (0.45, 0.36, 0.35),
+                (0.65, 0.4, 2.75),
+                Texture(low=0.4, high=0.9, cell=0.12, hue=0.17),
+            ),
             ball(0.2, (-0.6, 0.38, 2.65), Texture(low=0.5, high=0.95, cell=0.1, hue=0.75)),
             _picture((1.3, 0.8), (0.55, -0.75, 4.15), Texture(low=0.1, high=0.95, cell=0.16)),
             ball(0.3, path, Texture(low=0.35, high=0.95, cell=0.13, hue=0.98)),
         ),
         frames=120,
-        camera_path=Sweep(middle=(0.0, 0.0, 0.0), target=target, sweep_deg=9.0, period_s=2.0, rise=0.05),
+        camera_path=Sweep(
+            middle=(0.0, 0.0, 0.0), target=target, sweep_deg=9.0, period_s=2.0, rise=0.05
+        ),
         colour=ColourCamera(width=320, height=240, position=(0.04, 0.0, 0.0), noise=0.004),
-        novel_views=tuple(Viewpoint(position=at, target=target) for at in (*views, (0.45, -0.1, 0.0))),
+        novel_views=tuple(
+            Viewpoint(position=at, target=target) for at in (*views, (0.45, -0.1, 0.0))
+        ),
     )
 
 
-def _picture(size: tuple[float, float], position: tuple[float, float, float], texture: Texture) -> Body:
+def _picture(
+    size: tuple[float, float], position: tuple[float, float, float], texture: Texture
+) -> Body:
     return Body(shape=Plane(size=size), texture=texture, path=Still(position=position))
 
 
 OURS = (demo, sliding, axial, arc, tour)
 LOOK_ALIKES = (*SYNTHETIC, *RECORDED, *CARRIED)
-SCENES: dict[str, Scene] = {scene.name: scene for scene in (make() for make in (*OURS, *LOOK_ALIKES, *CALIBRATION))}
+SCENES: dict[str, Scene] = {
+    scene.name: scene for scene in (make() for make in (*OURS, *LOOK_ALIKES, *CALIBRATION))
+}
 """All named scenes, that of ``gftorf demo`` first, then the others of our own, ``OURS``."""

@@ -17,14 +17,21 @@ from ..constants import CANONICAL_SHIFTS, SPEED_OF_LIGHT
 from ..scene.pattern import Pattern
 from ..scene.sensor import Sensor
 
-PALINDROMIC = tuple(math.radians(angle) for angle in (180, 90, 0, 270))  # real F-TöRF files: -cos, +sin, +cos, -sin
+# real F-TöRF files: -cos, +sin, +cos, -sin
+PALINDROMIC = tuple(math.radians(angle) for angle in (180, 90, 0, 270))
 SEQUENTIAL = tuple(math.radians(angle) for angle in (0, 90, 180, 270))
 GAIN, DARK = 0.01, 0.2  # [1] PRNU and DSNU, assumed for both makers
 
 
 def ftorf_synthetic() -> Sensor:
     """The synthetic F-TöRF sequences: one ideal tap, an instant; 19.986 MHz."""
-    return Sensor(f_mod_hz=SPEED_OF_LIGHT / 15.0, shifts=CANONICAL_SHIFTS, dc_offset=1.0, unipolar=True, exposure_s=0.0)
+    return Sensor(
+        f_mod_hz=SPEED_OF_LIGHT / 15.0,
+        shifts=CANONICAL_SHIFTS,
+        dc_offset=1.0,
+        unipolar=True,
+        exposure_s=0.0,
+    )
 
 
 def ftorf_real() -> Sensor:
@@ -89,7 +96,8 @@ def mlx75027() -> Sensor:
 
 
 SENSORS: Mapping[str, Sensor] = {
-    make.__name__: make() for make in (ftorf_synthetic, ftorf_real, torf_real, opt8241_cdk, mlx75027)
+    make.__name__: make()
+    for make in (ftorf_synthetic, ftorf_real, torf_real, opt8241_cdk, mlx75027)
 }
 """Every named sensor."""
 
@@ -98,19 +106,25 @@ def effect_rows(sensor: Sensor) -> dict[str, str]:
     """Rows of a data card on effects beyond one frequency, a sine and equal pixels."""
     rows = {}
     if sensor.further_hz:
-        listed = ", then at ".join(f"{float(f) / 1e6:.9g} MHz" for f in (sensor.f_mod_hz, *sensor.further_hz))
+        listed = ", then at ".join(
+            f"{float(f) / 1e6:.9g} MHz" for f in (sensor.f_mod_hz, *sensor.further_hz)
+        )
         rows["cycle"] = f"{len(sensor.cycle)} raw frames: all shifts at {listed}"
     if any(sensor.harmonic_contrast):
-        ratios = ", ".join(f"{sensor.contrast_ratio(h):.4g} at harmonic {h}" for h in sensor.harmonics[1:])
+        ratios = ", ".join(
+            f"{sensor.contrast_ratio(h):.4g} at harmonic {h}" for h in sensor.harmonics[1:]
+        )
         rows["contrast of harmonics"] = f"relative to the first: {ratios}"
     if sensor.contrast_cutoff_hz is not None:
         rows["cutoff of the contrast"] = (
-            f"{sensor.contrast_cutoff_hz / 1e6:g} MHz: it is that of 0 Hz, {sensor.contrast:g}, over 1 + (f / cutoff)^2"
+            f"{sensor.contrast_cutoff_hz / 1e6:g} MHz: it is that of 0 Hz, {sensor.contrast:g}, "
+            f"over 1 + (f / cutoff)^2"
         )
     if sensor.pattern != Pattern():
         pattern = sensor.pattern
         rows["fixed pattern"] = (
-            f"phase {pattern.phase:g} times that of an OPT8241 kit, response to light +-{100 * pattern.gain:g} %, dark "
+            f"phase {pattern.phase:g} times that of an OPT8241 kit, response to light "
+            f"+-{100 * pattern.gain:g} %, dark "
             f"current +-{100 * pattern.dark:g} %, specimen {pattern.seed}"
         )
     return rows

@@ -77,7 +77,9 @@ def simulate(
         recording = record(recorded, used, device=device, progress=progress, cached=cached)
         if fresh:
             set_aside(out)
-        sheet = contact_sheet(recording.sequence, recording.truth, card.partition("\n")[0].removeprefix("# "))
+        sheet = contact_sheet(
+            recording.sequence, recording.truth, card.partition("\n")[0].removeprefix("# ")
+        )
         readme = card + outcome_card(recording)
         write(used.format, out, recording.sequence, recording.truth, readme=readme, sheet=sheet)
     return out
@@ -108,7 +110,9 @@ def simulate_ladder(
         rows[name] = closed_form_errors(sequence, read_truth(sequence))
     title = scene if isinstance(scene, str) else scene.name
     lines = "\n".join(f"    {line}" for line in ladder_table(rows))
-    atomic_write(out / "ladder.md", f"# {title}: what each level of the ladder costs\n\n{lines}\n".encode())
+    atomic_write(
+        out / "ladder.md", f"# {title}: what each level of the ladder costs\n\n{lines}\n".encode()
+    )
     return rows
 
 

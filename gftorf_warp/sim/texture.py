@@ -38,12 +38,18 @@ class Texture:
     def __post_init__(self):
         if not 0 <= self.gloss <= 1 or not 0 <= self.shininess < np.inf:
             raise ValueError(
-                f"gloss must be 0 to 1, shininess 0 or more and finite, got {self.gloss} and {self.shininess}"
+                f"gloss must be 0 to 1, shininess 0 or more and finite, got {self.gloss} and "
+                f"{self.shininess}"
             )
         if self.gloss > 0 and self.high > 1:
-            raise ValueError(f"a glossy surface reflects at most the incident light: high {self.high} must be <= 1")
+            raise ValueError(
+                f"a glossy surface reflects at most the incident light: high "
+                f"{self.high} must be <= 1"
+            )
         if not 0 <= self.low <= self.high:
-            raise ValueError(f"reflectances must be 0 <= low <= high, got low {self.low}, high {self.high}")
+            raise ValueError(
+                f"reflectances must be 0 <= low <= high, got low {self.low}, high {self.high}"
+            )
         if not self.cell > 0:
             raise ValueError(f"cell must be above 0, got {self.cell}")
 
@@ -60,12 +66,14 @@ class Texture:
         """Albedo in linear RGB [1] at points in the body's axes [m]."""
         unit = ((self._hash(point) >> 16) & 0xFFFF) / 65536.0
         hue = unit if self.hue is None else self.hue + HUE_SPREAD * (unit - 0.5)
-        ramp = np.abs((6.0 * hue[:, None] + [0.0, 4.0, 2.0]) % 6.0 - 3.0) - 1.0  # HSV to RGB, all sectors at once
+        # HSV to RGB, all sectors at once
+        ramp = np.abs((6.0 * hue[:, None] + [0.0, 4.0, 2.0]) % 6.0 - 3.0) - 1.0
         return self(point)[:, None] * (1.0 - SATURATION * (1.0 - np.clip(ramp, 0.0, 1.0)))
 
     def shading(self, cosine: Float[np.ndarray, "P"]) -> Float[np.ndarray, "P"]:
         """Amplitude [1] per reflectance at this cosine of incidence, light at the camera."""
-        twice = np.maximum(2.0 * cosine**2 - 1.0, 0.0)  # cosine between the view and the mirrored light
+        # cosine between the view and the mirrored light
+        twice = np.maximum(2.0 * cosine**2 - 1.0, 0.0)
         lobe = 0.5 * (self.shininess + 2.0) * twice**self.shininess if self.gloss else 0.0
         return cosine * (1.0 + self.gloss * (lobe - 1.0))
 

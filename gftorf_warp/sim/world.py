@@ -20,7 +20,8 @@ from .paths import Path, Still, inverse
 from .texture import Texture
 
 CHUNK = 1 << 14  # rays at a time: their arrays stay in the cache
-GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))  # [rad] between neighbours of a spiral that covers a sphere evenly
+# [rad] between neighbours of a spiral that covers a sphere evenly
+GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
 
 
 class Grid(NamedTuple):
@@ -48,7 +49,9 @@ class Shape(abc.ABC):
         """Distance along unit rays to the first hit [m], inf without any, and its face."""
 
     @abc.abstractmethod
-    def normal(self, point: Float[np.ndarray, "P 3"], face: Int[np.ndarray, "P"]) -> Float[np.ndarray, "P 3"]:
+    def normal(
+        self, point: Float[np.ndarray, "P 3"], face: Int[np.ndarray, "P"]
+    ) -> Float[np.ndarray, "P 3"]:
         """Unit normals at points of the surface, towards the side from which it is seen."""
 
     def grid(self, spacing: float, inset: float) -> Grid:
@@ -58,7 +61,9 @@ class Shape(abc.ABC):
             ValueError: If the shape has no such grid, and so cannot be covered while it moves.
         """
         del spacing, inset
-        raise ValueError(f"{self} cannot be covered while it moves: let its path be Still, or take engine 'mesh'")
+        raise ValueError(
+            f"{self} cannot be covered while it moves: let its path be Still, or take engine 'mesh'"
+        )
 
     @property
     @abc.abstractmethod
@@ -82,7 +87,8 @@ class Box(Shape):
         """Slab method; faces are numbered 2 axis + (1 on the positive side)."""
         near, far = np.full(len(ray), -np.inf), np.full(len(ray), np.inf)
         face = np.zeros(len(ray), dtype=np.int64)
-        for axis, along in enumerate(ray.T):  # one axis after the other: reductions over rows of three are slow
+        # one axis after the other: reductions over rows of three are slow
+        for axis, along in enumerate(ray.T):
             half = self.size[axis] / 2
             with np.errstate(divide="ignore", invalid="ignore"):
                 a, b = (-half - origin[axis]) / along, (half - origin[axis]) / along
@@ -99,7 +105,9 @@ class Box(Shape):
         """Along the axis of the face: outwards, or inwards in a room."""
         normal = np.zeros_like(point)
         outwards = np.where(face % 2, 1.0, -1.0)
-        np.put_along_axis(normal, face[:, None] // 2, (-outwards if self.inside else outwards)[:, None], 1)
+        np.put_along_axis(
+            normal, face[:, None] // 2, (-outwards if self.inside else outwards)[:, None], 1
+        )
         return normal
 
     def grid(self, spacing, inset):
@@ -116,7 +124,8 @@ class Box(Shape):
                 points.append(face)
                 normals.append(np.tile(turned * side * np.eye(3)[axis], (len(flat), 1)))
                 others.append(normals[-1])
-                for across in (-1.0, 1.0):  # edge along ``axis`` of the faces ``side`` of u and ``across`` of v
+                # edge along ``axis`` of the faces ``side`` of u and ``across`` of v
+                for across in (-1.0, 1.0):
                     edge = np.empty((len(row), 3))
                     edge[:, axis], edge[:, u], edge[:, v] = row, side * half[u], across * half[v]
                     points.append(edge)
@@ -182,7 +191,9 @@ class Sphere(Shape):
         along = -ray @ origin
         discriminant = along**2 - (origin @ origin - self.radius**2)
         distance = along - np.sqrt(np.maximum(discriminant, 0.0))
-        return np.where((discriminant > 0) & (distance > 0), distance, np.inf), np.zeros(len(ray), dtype=np.int64)
+        return np.where((discriminant > 0) & (distance > 0), distance, np.inf), np.zeros(
+            len(ray), dtype=np.int64
+        )
 
     def normal(self, point, face):
         """Away from the centre."""
@@ -196,7 +207,8 @@ class Sphere(Shape):
         around = np.sqrt(1.0 - z**2)
         angle = GOLDEN_ANGLE * np.arange(count)
         normal = np.stack([around * np.cos(angle), around * np.sin(angle), z], axis=1)
-        limb = np.sqrt(min(0.5, 2.0 * inset / self.radius))  # radius (1 - sin) = inset where the cosine is small
+        # radius (1 - sin) = inset where the cosine is small
+        limb = np.sqrt(min(0.5, 2.0 * inset / self.radius))
         return Grid(self.radius * normal, normal, normal, float(limb))
 
     @property
@@ -287,7 +299,9 @@ def first_hit(bodies: tuple[Body, ...], camera: Camera, time: float) -> Hits:
     )
 
 
-def _nearest(bodies: tuple[Body, ...], poses: list[np.ndarray], camera: Camera) -> tuple[np.ndarray, ...]:
+def _nearest(
+    bodies: tuple[Body, ...], poses: list[np.ndarray], camera: Camera
+) -> tuple[np.ndarray, ...]:
     """Every pixel's ray, the distance [m] of its first hit, the body, -1 for none, and its face."""
     ray, centre = camera.rays(dtype=torch.float64).numpy().reshape(-1, 3), camera.centre
     distance = np.full(len(ray), np.inf)
@@ -298,7 +312,9 @@ def _nearest(bodies: tuple[Body, ...], poses: list[np.ndarray], camera: Camera) 
             rays = start + rays_to_ball(centre, ray[part], pose[:3, 3], candidate.shape.reach)
             if len(rays) == 0:
                 continue
-            reached, side = candidate.shape.hit(pose[:3, :3].T @ (centre - pose[:3, 3]), ray[rays] @ pose[:3, :3])
+            reached, side = candidate.shape.hit(
+                pose[:3, :3].T @ (centre - pose[:3, 3]), ray[rays] @ pose[:3, :3]
+            )
             nearer = reached < distance[rays]
             chosen = rays[nearer]
             distance[chosen], body[chosen], face[chosen] = reached[nearer], index, side[nearer]
@@ -306,7 +322,10 @@ def _nearest(bodies: tuple[Body, ...], poses: list[np.ndarray], camera: Camera) 
 
 
 def rays_to_ball(
-    origin: Float[np.ndarray, "3"], ray: Float[np.ndarray, "P 3"], centre: Float[np.ndarray, "3"], radius: float
+    origin: Float[np.ndarray, "3"],
+    ray: Float[np.ndarray, "P 3"],
+    centre: Float[np.ndarray, "3"],
+    radius: float,
 ) -> Int[np.ndarray, "R"]:
     """Indices of the rays that meet a ball: only these can hit what is inside of it."""
     to = np.subtract(centre, origin)
@@ -324,7 +343,8 @@ def flow_of(
     cameras: tuple[Camera, Camera],
     times: tuple[float, float],
 ) -> Float[np.ndarray, "2 H W"]:
-    """Optical flow [px] between two times [s], whether or not the target is occluded; NaN where ``point`` is.
+    """Optical flow [px] between two times [s], whether or not the target is occluded; NaN where
+    ``point`` is.
 
     Points move with their bodies, and the camera moves, too. The second time may be the earlier
     one.
@@ -342,12 +362,16 @@ def flow_of(
             first, second = (candidate.path.world_from_body(time) for time in times)
             step, hit = second @ np.linalg.inv(first), body == index
             moved[hit] = point[hit] @ step[:3, :3].T + step[:3, 3]
-    start, end = (c.project(torch.from_numpy(p)) for c, p in zip(cameras, (point, moved), strict=True))
+    start, end = (
+        c.project(torch.from_numpy(p)) for c, p in zip(cameras, (point, moved), strict=True)
+    )
     return np.moveaxis((end - start).numpy(), -1, 0)
 
 
 def albedo(bodies: tuple[Body, ...], hits: Hits, time: float) -> Float[np.ndarray, "H W 3"]:
-    """Albedo in linear RGB [1] of the bodies in ``hits`` at ``time`` [s]; 0 where nothing was hit."""
+    """Albedo in linear RGB [1] of the bodies in ``hits`` at ``time`` [s];
+    0 where nothing was hit.
+    """
     colour = np.zeros(hits.point.shape)
     for index, candidate in enumerate(bodies):
         hit = hits.body == index

@@ -4,12 +4,14 @@
     turned    = n q,   n = s / |s|,   s = sum_k w_0k r_k
     channel_j = sum_k w_jk o_k,   j = 1 .. D
 
-o are displacements and r rotations (quaternions wxyz) of a Gaussian at the keys, q is its quaternion. Row 0 of the
-weights belongs to the time of an image, each further row is the difference of the weights of two times, the end and the
-start of a flow. K is a constant of the kernels: their loops are unrolled, so that all loads are in flight at once.
+o are displacements and r rotations (quaternions wxyz) of a Gaussian at the keys, q is its
+quaternion. Row 0 of the weights belongs to the time of an image, each further row is the difference
+of the weights of two times, the end and the start of a flow. K is a constant of the kernels: their
+loops are unrolled, so that all loads are in flight at once.
 
     dL/do_k = w_0k dL/dmoved + sum_j w_jk dL/dchannel_j
-    dL/dq   = n* dL/dturned,   dL/ds = (g - n (n . g)) / |s|,   g = dL/dturned q*,   dL/dr_k = w_0k dL/ds
+    dL/dq   = n* dL/dturned,   dL/dr_k = w_0k dL/ds
+    dL/ds   = (g - n (n . g)) / |s|,   g = dL/dturned q*
 """
 
 import functools
@@ -23,7 +25,9 @@ OPTIONS = {"enable_backward": False, "module": "unique", "grid_stride": False}
 
 @functools.cache
 def make_interpolation(K: int) -> SimpleNamespace:
-    """Vectors of K indices and K weights, and the weighted sum of K rows of an array: the only one in any kernel."""
+    """Vectors of K indices and K weights, and the weighted sum of K rows of an array:
+    the only one in any kernel.
+    """
     Indices, Weights = wp.types.vector(length=K, dtype=int), wp.types.vector(length=K, dtype=float)
 
     @wp.func
@@ -86,7 +90,8 @@ def make_displace(K: int) -> SimpleNamespace:
         # Out:
         moved: wp.array[wp.vec3],  # [N] centres [m]
         turned: wp.array[wp.vec4],  # [N] orientations wxyz; empty: no rotation
-        channels: wp.array2d[wp.vec3],  # [N, D] displacements between two times [m]; empty: not computed
+        channels: wp.array2d[wp.vec3],  # [N, D] displacements between two times [m]; empty: not
+        #  computed
     ):
         """One thread per Gaussian."""
         i = wp.tid()
@@ -94,7 +99,9 @@ def make_displace(K: int) -> SimpleNamespace:
         weight = row_of(weights, 0)
         moved[i] = mean[i] + interpolated(offset, index, weight, i)
         if turned.shape[0] > 0:
-            turned[i] = product(wp.normalize(interpolated(rotation, index, weight, i)), quaternion[i])
+            turned[i] = product(
+                wp.normalize(interpolated(rotation, index, weight, i)), quaternion[i]
+            )
         for j in range(channels.shape[1]):
             channels[i, j] = interpolated(offset, index, row_of(weights, j + 1), i)
 
@@ -109,8 +116,10 @@ def make_displace(K: int) -> SimpleNamespace:
         by_channels: wp.array2d[wp.vec3],  # [N, D] cotangent of ``channels``; empty: zero
         # Out:
         grad_offset: wp.array2d[wp.vec3],  # [K, N] gradient w.r.t. ``offset``; empty: not computed
-        grad_rotation: wp.array2d[wp.vec4],  # [K, N] gradient w.r.t. ``rotation``; empty: not computed
-        grad_quaternion: wp.array[wp.vec4],  # [N] gradient w.r.t. ``quaternion``; empty: not computed
+        grad_rotation: wp.array2d[wp.vec4],  # [K, N] gradient w.r.t. ``rotation``; empty: not
+        #  computed
+        grad_quaternion: wp.array[wp.vec4],  # [N] gradient w.r.t. ``quaternion``; empty: not
+        #  computed
     ):
         """One thread per Gaussian."""
         i = wp.tid()

@@ -1,7 +1,8 @@
-"""Gaussians of a finished run at one time, widened for cameras that resolve more than that of the optimisation.
+"""Gaussians of a finished run at one time, widened for cameras that resolve more than that of the
+optimisation.
 
-The low-pass filter of the renderer widens every Gaussian by LOW_PASS pixels^2. With z the z-depth and f
-the focal length of the camera of the optimisation, and z', f' those of this camera,
+The low-pass filter of the renderer widens every Gaussian by LOW_PASS pixels^2. With z the z-depth
+and f the focal length of the camera of the optimisation, and z', f' those of this camera,
 
     exp(2 log_scale') = exp(2 log_scale) + LOW_PASS max(0, (z / f)^2 - (z' / f')^2)
 """
@@ -26,7 +27,9 @@ def squared_footprint(camera: CameraView, point: wp.vec3) -> float:
 
 @functools.cache
 def make_move(K: int) -> wp.Kernel:
-    """The kernel ``move_gaussians`` for times that depend on K keys; unused keys have weight zero."""
+    """The kernel ``move_gaussians`` for times that depend on K keys;
+    unused keys have weight zero.
+    """
     sums = make_interpolation(K)
     Indices, Weights, interpolated = sums.Indices, sums.Weights, sums.interpolated
 
@@ -56,7 +59,9 @@ def make_move(K: int) -> wp.Kernel:
             return
         point = initial_mean[i] + interpolated(offset, index, weight, i)
         scale = initial_log_scale[i]
-        missing = LOW_PASS_PX2 * (squared_footprint(optimised, point) - squared_footprint(camera, point))
+        missing = LOW_PASS_PX2 * (
+            squared_footprint(optimised, point) - squared_footprint(camera, point)
+        )
         if missing > 0.0:
             for axis in range(3):
                 scale[axis] = 0.5 * wp.log(wp.exp(2.0 * scale[axis]) + missing)

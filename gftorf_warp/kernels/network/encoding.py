@@ -1,6 +1,8 @@
-"""Positions as a network in half precision reads them: gamma(x) = [x, sin 2^0 x, cos 2^0 x, .., sin 2^9 x, cos 2^9 x].
+"""Positions as a network in half precision reads them: gamma(x) = [x, sin 2^0 x, cos 2^0 x, .., sin
+2^9 x, cos 2^9 x].
 
-Sine and cosine are those of float32 for any argument, none of the fast ones of a GPU: 2^9 x is hundreds of radians.
+Sine and cosine are those of float32 for any argument, none of the fast ones of a GPU: 2^9 x is
+hundreds of radians.
 """
 
 import warp as wp
@@ -20,7 +22,9 @@ def encode(
     # Out:
     position: wp.array2d[wp.float16],  # [N, columns] gamma(x) [1], zeros behind it
 ):
-    """One thread per sine and cosine of an argument, neighbours side by side; the last of a row has what is none."""
+    """One thread per sine and cosine of an argument, neighbours side by side;
+    the last of a row has what is none.
+    """
     lanes = 3 * powers.shape[0] + 1
     n = wp.tid() // lanes
     wave = wp.tid() % lanes

@@ -1,11 +1,13 @@
 """The list of rows that have a gradient, made on the device, so that kernels skip the others.
 
-Rows of k keys lie one key after the other. The list has each key's in ascending order, ``NO_ROW`` behind them up to a
-multiple of ``TILE``, which is what kernels multiply at once. Blocks of rows are counted, then each block finds what is
-before it from all counts and writes its rows: the order is fixed, and launch sizes do not depend on the list.
+Rows of k keys lie one key after the other. The list has each key's in ascending order, ``NO_ROW``
+behind them up to a multiple of ``TILE``, which is what kernels multiply at once. Blocks of rows are
+counted, then each block finds what is before it from all counts and writes its rows: the order is
+fixed, and launch sizes do not depend on the list.
 
-A NaN counts as a gradient. A row of zeros adds nothing to any weight's gradient, unless an output of it
-is infinite: with all rows 0 times infinity is NaN and the update skipped, with a list such a row is not read.
+A NaN counts as a gradient. A row of zeros adds nothing to any weight's gradient, unless an output
+of it is infinite: with all rows 0 times infinity is NaN and the update skipped, with a list such a
+row is not read.
 """
 
 import warp as wp
@@ -28,7 +30,8 @@ def capacity(keys: int, count: int) -> int:
 
 @wp.func_native(f"""
     {_HAS}
-    const int blocks = (count + {BLOCK - 1}) / {BLOCK}, key = block / blocks, first = block % blocks * {BLOCK};
+    const int blocks = (count + {BLOCK - 1}) / {BLOCK}, key = block / blocks, first = block % blocks
+        * {BLOCK};
 #if defined(__CUDA_ARCH__)
     const int found = __syncthreads_count(has(key, first + threadIdx.x));
     if (threadIdx.x == 0) counts.data[block] = found;
@@ -80,7 +83,8 @@ def count_block(gradient: wp.array2d[float], count: int, block: int, counts: wp.
 #else
     for (int other = 0; other <= key; ++other) {{
         int sum = 0;
-        for (int n = 0; n < (other < key ? blocks : own); ++n) sum += counts.data[other * blocks + n];
+        for (int n = 0; n < (other < key ? blocks : own); ++n) sum +=
+            counts.data[other * blocks + n];
         if (other < key) begin += whole(sum);
         else before = sum;
     }}
@@ -105,7 +109,9 @@ def list_block(
     listed: wp.array[wp.int32],
     begins: wp.array[wp.int32],
 ):
-    """Write the rows of a block that have a gradient in order, and ``NO_ROW`` behind the last one of a key."""
+    """Write the rows of a block that have a gradient in order,
+    and ``NO_ROW`` behind the last one of a key.
+    """
 
 
 @wp.kernel(enable_backward=False, grid_stride=False)
@@ -129,7 +135,8 @@ def list_rows(
     counts: wp.array[wp.int32],  # [k blocks] of ``count_rows``
     count: int,  # N [1]
     # Out:
-    listed: wp.array[wp.int32],  # [``capacity``] rows with a gradient, key by key, each up to a whole tile
+    listed: wp.array[wp.int32],  # [``capacity``] rows with a gradient, key by key, each up to a
+    #  whole tile
     begins: wp.array[wp.int32],  # [k + 1] where the part of each key begins, and the end
 ):
     """One block of threads for ``BLOCK`` rows of a key."""

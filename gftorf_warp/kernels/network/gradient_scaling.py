@@ -1,6 +1,8 @@
-"""Loss scaling before the backward pass, and reductions: gradients of offsets become halves, partial sums are added.
+"""Loss scaling before the backward pass, and reductions: gradients of offsets become halves,
+partial sums are added.
 
-A kernel writes one partial result per warp, on the CPU per row, and the next one adds them up in a fixed order.
+A kernel writes one partial result per warp, on the CPU per row, and the next one adds them up in a
+fixed order.
 """
 
 import warp as wp
@@ -16,7 +18,8 @@ SLICES = BLOCK // COLUMNS
 #if defined(__CUDA_ARCH__)
     const float* const v = gradient.data + 3ll * (row < count ? row : 0);
     float4 own = make_float4(0.0f, 0.0f, 0.0f, 0.0f);
-    if (row < count) own = make_float4(v[0], v[1], v[2], fmaxf(fabsf(v[0]), fmaxf(fabsf(v[1]), fabsf(v[2]))));
+    if (row < count) own = make_float4(v[0], v[1], v[2],
+        fmaxf(fabsf(v[0]), fmaxf(fabsf(v[1]), fabsf(v[2]))));
     #pragma unroll
     for (int over = 16; over > 0; over /= 2) {
         own.x += __shfl_xor_sync(0xffffffffu, own.x, over);
@@ -87,7 +90,8 @@ def measure_rows(
     }
     if (row < gradient.shape[0])
         for (int i = 0; i < 8; ++i)
-            after.data[8ll * row + i] = wp::float_to_half(i < 3 ? gradient.data[3ll * row + i] / one : 0.0f);
+            after.data[8ll * row + i] = wp::float_to_half(i < 3 ? gradient.data[3ll * row + i] / one
+                : 0.0f);
 """)
 def scale_row(
     gradient: wp.array2d[float],
@@ -137,7 +141,8 @@ def scale_rows(
     for (int n = 0; n < {COLUMNS}; ++n) {{
         const int column = block % {WIDTH // COLUMNS} * {COLUMNS} + n;
         float sum = 0.0f;
-        for (int part = 0; part < parts; ++part) sum += partials.data[((size_t)of * parts + part) * {WIDTH} + column];
+        for (int part = 0; part < parts; ++part) sum +=
+            partials.data[((size_t)of * parts + part) * {WIDTH} + column];
         sums.data[of * {WIDTH} + column] = sum;
     }}
 #endif

@@ -1,9 +1,11 @@
-"""Gradients of the network's parameters over listed rows: the head's weight, and all of them from partial sums.
+"""Gradients of the network's parameters over listed rows: the head's weight, and all of them from
+partial sums.
 
-The head has three outputs, so its weight gradient is what reading 512 bytes of every listed row costs: warps walk rows,
-a lane has eight of 256 inputs times three outputs in registers. ``collect`` then adds up parts of all weights in their
-order, has biases and what gamma(t) meets from sums of slopes over rows, and takes the scale off: a thread per
-parameter, which lie as ``perceptron.Layers`` says.
+The head has three outputs, so its weight gradient is what reading 512 bytes of every listed row
+costs: warps walk rows, a lane has eight of 256 inputs times three outputs in registers. ``collect``
+then adds up parts of all weights in their order, has biases and what gamma(t) meets from sums of
+slopes over rows, and takes the scale off: a thread per parameter, which lie as
+``perceptron.Layers`` says.
 """
 
 import warp as wp
@@ -19,13 +21,15 @@ HEAD_BLOCKS = 2  # that a multiprocessor holds at once, with 128 registers a thr
 
 @wp.func_native(f"""
     const int tiles = begins.data[keys] / {TILE};
-    const int begin = (int)((long long)tiles * part / parts), end = (int)((long long)tiles * (part + 1) / parts);
+    const int begin = (int)((long long)tiles * part / parts), end =
+        (int)((long long)tiles * (part + 1) / parts);
     const wp::half* const last = outputs.data + (size_t)(layers - 1) * rows * {WIDTH};
     float* const to = partials.data + (size_t)part * {VALUES * WIDTH};
 #if defined(__CUDA_ARCH__)
     __shared__ float of_warps[{WARPS}][{VALUES * WIDTH}];
     const int lane = threadIdx.x & 31, warp = threadIdx.x >> 5;
-    auto rows_of = [&](int tile) {{  // a warp has eight rows of a tile, which follow each other; a lane knows one
+    // a warp has eight rows of a tile, which follow each other; a lane knows one
+    auto rows_of = [&](int tile) {{
         return tile < end ? __ldg(listed.data + tile * {TILE} + 8 * warp + (lane & 7)) : {NO_ROW};
     }};
     float sums[{VALUES}][8] = {{}};
@@ -38,7 +42,8 @@ HEAD_BLOCKS = 2  # that a multiprocessor holds at once, with 128 registers a thr
             const int row = __shfl_sync(0xffffffffu, known, i);
             h[i] = d[i] = make_uint4(0, 0, 0, 0);
             if (row >= 0) {{
-                h[i] = __ldg(reinterpret_cast<const uint4*>(last + (size_t)row * {WIDTH} + lane * 8));
+                h[i] = __ldg(reinterpret_cast<const uint4*>(last + (size_t)row * {WIDTH} + lane
+                    * 8));
                 d[i] = __ldg(reinterpret_cast<const uint4*>(after.data + (size_t)row * {HEAD}));
             }}
         }}
@@ -53,7 +58,8 @@ HEAD_BLOCKS = 2  # that a multiprocessor holds at once, with 128 registers a thr
             #pragma unroll
             for (int n = 0; n < 8; ++n)
                 #pragma unroll
-                for (int v = 0; v < {VALUES}; ++v) sums[v][n] += half_of(d[i], v) * half_of(h[i], n);
+                for (int v = 0; v < {VALUES}; ++v) sums[v][n] += half_of(d[i], v)
+                    * half_of(h[i], n);
         }}
         known = next;
     }}
@@ -105,7 +111,8 @@ def multiply_head(
     after: wp.array2d[wp.float16],  # [k N, HEAD] gradient at the head
     outputs: wp.array3d[wp.float16],  # [layers, k N, WIDTH] of all rows
     # Out:
-    partials: wp.array3d[float],  # [parts, 1, VALUES WIDTH] gradients of the head's weight by parts of the list
+    partials: wp.array3d[float],  # [parts, 1, VALUES WIDTH] gradients of the head's weight by parts
+    #  of the list
 ):
     """One block of threads for a part of the list."""
     part = wp.tid() // threads

@@ -1,7 +1,9 @@
-"""All layers of a perceptron in one launch, forward and backward; render/layers.py has the formulas.
+"""All layers of a perceptron in one launch, forward and backward; render/layers.py has the
+formulas.
 
-``wgmma.py`` takes rows through the layers. Here parameters are made ready for it: weights rounded and packed in the
-order in which tensor cores read them, what a layer makes of gamma(t) added to its bias.
+``wgmma.py`` takes rows through the layers. Here parameters are made ready for it: weights rounded
+and packed in the order in which tensor cores read them, what a layer makes of gamma(t) added to its
+bias.
 """
 
 import warp as wp
@@ -19,7 +21,9 @@ def mask_words(layers: int, keys: int, count: int) -> int:
 
 @wp.struct
 class Layers:
-    """Sizes of a perceptron, and where its parameters lie in one array: weight and bias of every layer, in order."""
+    """Sizes of a perceptron, and where its parameters lie in one array:
+    weight and bias of every layer, in order.
+    """
 
     layers: int  # without the head
     joined: int  # number of the layer that gamma(x) and gamma(t) enter again; -1: none
@@ -57,9 +61,16 @@ def weight_of(form: Layers, number: int) -> int:
 
 @wp.func
 def shift_of(
-    form: Layers, parameters: wp.array[float], time: wp.array2d[float], number: int, key: int, n: int
+    form: Layers,
+    parameters: wp.array[float],
+    time: wp.array2d[float],
+    number: int,
+    key: int,
+    n: int,
 ) -> float:
-    """What is added to output ``n`` of a layer at a key: its bias, and what gamma(t) makes of the weight."""
+    """What is added to output ``n`` of a layer at a key: its bias,
+    and what gamma(t) makes of the weight.
+    """
     inputs = inputs_of(form, number)
     at = weight_of(form, number)
     total = parameters[at + inputs * WIDTH + n]
@@ -78,14 +89,17 @@ def pack(
     time: wp.array2d[float],  # [k, t] gamma(t)
     # Out:
     forth: wp.array[wp.float16],  # [4 PART ..] of all layers
-    back: wp.array[wp.float16],  # [4 PART ..] of all but the first, last one first, transposed, without gamma(x)
+    back: wp.array[wp.float16],  # [4 PART ..] of all but the first, last one first, transposed,
+    #  without gamma(x)
     head: wp.array[wp.float16],  # [HEAD WIDTH] of the head, row by row, zeros below
     shifts: wp.array3d[float],  # [layers, k, WIDTH] what is added to every row of a key in a layer
 ):
-    """Round weights to halves, in the order in which tensor cores read them; a thread per 16 bytes, then per shift.
+    """Round weights to halves, in the order in which tensor cores read them; a thread per 16 bytes,
+    then per shift.
 
-    A block of 64 inputs has a row of 128 bytes for every output, pieces of 16 bytes exchanged by the last three bits of
-    its number. Outputs and inputs are numbered as the products number them; ``p`` and ``k`` are what they stand for.
+    A block of 64 inputs has a row of 128 bytes for every output, pieces of 16 bytes exchanged by
+    the last three bits of its number. Outputs and inputs are numbered as the products number them;
+    ``p`` and ``k`` are what they stand for.
     """
     at = wp.tid() * UNIT
     if at >= forth.shape[0] + back.shape[0] + head.shape[0]:
@@ -151,11 +165,15 @@ def forward(
     shifts: wp.array3d[float],  # [layers, k, WIDTH]
     # Out:
     outputs: wp.array3d[wp.float16],  # [layers, k N, WIDTH] of every layer
-    masks: wp.array[wp.int32],  # [``mask_words``] bits of what is above 0, as lanes have it; on CUDA
+    masks: wp.array[wp.int32],  # [``mask_words``] bits of what is above 0, as lanes have it; on
+    #  CUDA
 ):
     """From gamma(x) to the output of the last layer, at all keys."""
-    wp.tile_zeros(shape=(_FOURS,), dtype=wp.vec4, storage="shared")  # how Warp is told of shared memory
-    rows_forward(form.layers, form.joined, keys, position.shape[0], position, forth, shifts, outputs, masks)
+    # how Warp is told of shared memory
+    wp.tile_zeros(shape=(_FOURS,), dtype=wp.vec4, storage="shared")
+    rows_forward(
+        form.layers, form.joined, keys, position.shape[0], position, forth, shifts, outputs, masks
+    )
 
 
 @wp.kernel(enable_backward=False, grid_stride=False, launch_bounds=(BLOCK, 1), module="unique")
@@ -171,12 +189,28 @@ def backward(
     outputs: wp.array3d[wp.float16],  # [layers, k N, WIDTH] of ``forward``
     masks: wp.array[wp.int32],  # [``mask_words``] of ``forward``
     # Out:
-    slopes: wp.array3d[wp.float16],  # [layers, capacity, WIDTH] of the listed rows, as they are listed; 0 for no row
-    partials: wp.array4d[float],  # [layers, k, GROUPS blocks, WIDTH] added to: sums of slopes over rows
+    slopes: wp.array3d[wp.float16],  # [layers, capacity, WIDTH] of the listed rows, as they are
+    #  listed; 0 for no row
+    partials: wp.array4d[float],  # [layers, k, GROUPS blocks, WIDTH] added to: sums of slopes over
+    #  rows
 ):
-    """From the gradient at the head to those of all layers, of listed rows; nothing is written behind the last one."""
+    """From the gradient at the head to those of all layers, of listed rows;
+    nothing is written behind the last one.
+    """
     wp.tile_zeros(shape=(_FOURS,), dtype=wp.vec4, storage="shared")
     rows = outputs.shape[1] // keys
     listed_backward(
-        form.layers, form.joined, keys, rows, listed, begins, after, head, back, outputs, masks, slopes, partials
+        form.layers,
+        form.joined,
+        keys,
+        rows,
+        listed,
+        begins,
+        after,
+        head,
+        back,
+        outputs,
+        masks,
+        slopes,
+        partials,
     )

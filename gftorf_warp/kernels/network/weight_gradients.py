@@ -1,13 +1,15 @@
-"""Weight gradients over listed rows: dW = d^T h, d in the order of the list, h in that of the forward pass.
+"""Weight gradients over listed rows: dW = d^T h, d in the order of the list, h in that of the
+forward pass.
 
-A block of 256 threads has 128 outputs of a layer times all its inputs, 256 of the layer before or 64 of gamma(x), and
-a part of the list; each of its eight warps has 64 of the outputs and a quarter of the inputs in registers. Tiles of 64
-rows come into shared memory ahead, ``STAGES`` of them, pieces of 16 bytes exchanged by the last three bits of the row
-so that eight rows never meet in a bank. ``ldmatrix`` turns both factors over on their way to ``mma.sync`` (PTX,
-m16n8k16).
+A block of 256 threads has 128 outputs of a layer times all its inputs, 256 of the layer before or
+64 of gamma(x), and a part of the list; each of its eight warps has 64 of the outputs and a quarter
+of the inputs in registers. Tiles of 64 rows come into shared memory ahead, ``STAGES`` of them,
+pieces of 16 bytes exchanged by the last three bits of the row so that eight rows never meet in a
+bank. ``ldmatrix`` turns both factors over on their way to ``mma.sync`` (PTX, m16n8k16).
 
-Both kinds run at once: a block has a multiprocessor or half of one, and none waits for another. Parts are sums of their
-own, added up in a fixed order by parameter_gradients.py. On a CPU one thread does the same row by row in float32.
+Both kinds run at once: a block has a multiprocessor or half of one, and none waits for another.
+Parts are sums of their own, added up in a fixed order by parameter_gradients.py. On a CPU one
+thread does the same row by row in float32.
 """
 
 import warp as wp
@@ -27,10 +29,11 @@ def shared(columns: int) -> int:
 
 
 def parts(multiprocessors: int, layers: int, entries: int) -> tuple[int, int, int]:
-    """Parts of a list for products with outputs, for those with gamma(x), and the multiprocessors that are left.
+    """Parts of a list for products with outputs, for those with gamma(x), and the multiprocessors
+    that are left.
 
-    All blocks run at once: one of the first kind has a multiprocessor for itself, two of the second share one that is
-    left. How many are left is decided by what both read of a row.
+    All blocks run at once: one of the first kind has a multiprocessor for itself, two of the second
+    share one that is left. How many are left is decided by what both read of a row.
     """
     jobs, others = HALVES * (layers - 1), HALVES * entries
     read, also = jobs * (HALF + WIDTH), others * (HALF + COLUMNS)
@@ -40,7 +43,9 @@ def parts(multiprocessors: int, layers: int, entries: int) -> tuple[int, int, in
 
 
 def _snippet(columns: int, layer: str, first: str, row: str) -> str:
-    """C++: which layer's slopes a job is about, where its inputs begin, and which row of them a listed row has."""
+    """C++: which layer's slopes a job is about, where its inputs begin,
+    and which row of them a listed row has.
+    """
     own = columns // 4  # inputs of a warp
     pieces = columns // 8  # of 16 bytes in a row
     abreast = 32 // pieces  # rows that a warp copies at once
@@ -48,25 +53,33 @@ def _snippet(columns: int, layer: str, first: str, row: str) -> str:
     return f"""
     const int job = block % jobs, part = block / jobs, layer = {layer};
     const int tiles = begins.data[keys] / {TILE};
-    const int begin = (int)((long long)tiles * part / parts), end = (int)((long long)tiles * (part + 1) / parts);
-    const wp::half* const left = slopes.data + (size_t)layer * capacity * {WIDTH} + job % {HALVES} * {HALF};
+    const int begin = (int)((long long)tiles * part / parts), end =
+        (int)((long long)tiles * (part + 1) / parts);
+    const wp::half* const left = slopes.data + (size_t)layer * capacity * {WIDTH} + job % {HALVES}
+    * {HALF};
     const wp::half* const right = inputs.data + (size_t){first};
     float* const to = partials.data + (size_t)block * {HALF * columns};
 #if defined(__CUDA_ARCH__)
     extern __shared__ char memory[];
-    const unsigned start = (unsigned)__cvta_generic_to_shared(memory), base = (start + {ALIGNED - 1}) & ~{ALIGNED - 1}u;
+    const unsigned start = (unsigned)__cvta_generic_to_shared(memory), base =
+        (start + {ALIGNED - 1}) & ~{ALIGNED - 1}u;
     const int lane = threadIdx.x & 31, warp = threadIdx.x >> 5;
-    auto copy = [&](unsigned to, const wp::half* from, int bytes) {{  // zeros behind ``bytes`` of 16
-        asm volatile("cp.async.cg.shared.global [%0], [%1], 16, %2;" :: "r"(to), "l"(from), "r"(bytes) : "memory");
+    // zeros behind ``bytes`` of 16
+    auto copy = [&](unsigned to, const wp::half* from, int bytes) {{
+        asm volatile("cp.async.cg.shared.global [%0], [%1], 16, %2;" :: "r"(to), "l"(from),
+            "r"(bytes) : "memory");
     }};
     auto commit = [&]() {{ asm volatile("cp.async.commit_group;" ::: "memory"); }};
-    // a warp reads rows of its number, and that plus 8, 16, ..: every lane knows one of them, of four tiles
+    // a warp reads rows of its number, and that plus 8, 16, ..: every lane knows one of them, of
+    // four tiles
     auto rows_from = [&](int first) {{
         const int tile = first + lane / 8;
-        const int row = tile < end ? __ldg(listed.data + tile * {TILE} + warp + 8 * (lane & 7)) : {NO_ROW};
+        const int row = tile < end ? __ldg(listed.data + tile * {TILE} + warp + 8 * (lane & 7))
+            : {NO_ROW};
         return row < 0 ? {NO_ROW} : {row};
     }};
-    int known = rows_from(begin), next = rows_from(begin + 4);  // asked for long before it is needed
+    // asked for long before it is needed
+    int known = rows_from(begin), next = rows_from(begin + 4);
     auto fetch = [&](int tile) {{
         const int at = (tile - begin) % 4 * 8;
         if (tile > begin && at == 0) {{
@@ -76,7 +89,8 @@ def _snippet(columns: int, layer: str, first: str, row: str) -> str:
         const unsigned stage = base + tile % {STAGES} * {stage};
         #pragma unroll
         for (int i = 0; i < {TILE * HALF // 8 // BLOCK}; ++i) {{
-            const int n = i * {BLOCK} + (int)threadIdx.x, k = n / {HALF // 8}, piece = n % {HALF // 8};
+            const int n = i * {BLOCK} + (int)threadIdx.x, k = n / {HALF // 8}, piece =
+                n % {HALF // 8};
             const wp::half* const from = left + ((size_t)tile * {TILE} + k) * {WIDTH} + piece * 8;
             copy(stage + k * {2 * HALF} + (piece ^ k & 7) * 16, from, 16);
         }}
@@ -85,16 +99,20 @@ def _snippet(columns: int, layer: str, first: str, row: str) -> str:
             const int own = i + lane / {pieces}, piece = lane % {pieces}, k = 8 * own + warp;
             const int row = __shfl_sync(0xffffffffu, known, at + own);
             const wp::half* const from = right + (size_t)max(row, 0) * {columns} + piece * 8;
-            copy(stage + {TILE * 2 * HALF} + k * {2 * columns} + (piece ^ k & 7) * 16, from, row < 0 ? 0 : 16);
+            copy(stage + {TILE * 2 * HALF} + k * {2 * columns} + (piece ^ k & 7) * 16, from, row < 0
+                ? 0 : 16);
         }}
     }};
-    // four blocks of 8 x 8 halves whose rows begin at what lanes 0 to 7, 8 to 15, .. say, turned over
+    // four blocks of 8 x 8 halves whose rows begin at what lanes 0 to 7, 8 to 15, .. say, turned
+    // over
     auto turned = [&](auto& four, unsigned row) {{
         asm volatile("ldmatrix.sync.aligned.m8n8.x4.trans.shared.b16 {{%0, %1, %2, %3}}, [%4];"
-                     : "=r"(four[0]), "=r"(four[1]), "=r"(four[2]), "=r"(four[3]) : "r"(row) : "memory");
+                     : "=r"(four[0]), "=r"(four[1]), "=r"(four[2]), "=r"(four[3]) : "r"(row) :
+                         "memory");
     }};
     auto multiply = [&](auto& sums, const auto& a, unsigned low, unsigned high) {{
-        asm volatile("mma.sync.aligned.m16n8k16.row.col.f32.f16.f16.f32 {{%0, %1, %2, %3}}, {{%4, %5, %6, %7}}, "
+        asm volatile("mma.sync.aligned.m16n8k16.row.col.f32.f16.f16.f32 "
+                     "{{%0, %1, %2, %3}}, {{%4, %5, %6, %7}}, "
                      "{{%8, %9}}, {{%0, %1, %2, %3}};"
                      : "+f"(sums[0]), "+f"(sums[1]), "+f"(sums[2]), "+f"(sums[3])
                      : "r"(a[0]), "r"(a[1]), "r"(a[2]), "r"(a[3]), "r"(low), "r"(high));
@@ -108,7 +126,8 @@ def _snippet(columns: int, layer: str, first: str, row: str) -> str:
     }}
     for (int tile = begin; tile < end; ++tile) {{
         asm volatile("cp.async.wait_group {STAGES - 2};" ::: "memory");
-        __syncthreads();  // everybody's copies are there, and nobody multiplies by the tile before any more
+        // everybody's copies are there, and nobody multiplies by the tile before any more
+        __syncthreads();
         if (tile + {STAGES - 1} < end) fetch(tile + {STAGES - 1});
         commit();
         const unsigned stage = base + tile % {STAGES} * {stage};
@@ -116,14 +135,16 @@ def _snippet(columns: int, layer: str, first: str, row: str) -> str:
         for (int k = 0; k < {TILE}; k += 16) {{
             unsigned a[4][4], b[{own // 16}][4];
             #pragma unroll
-            for (int i = 0; i < 4; ++i) {{  // 8 rows, the next 8 of the outputs, both again 8 rows on
+            // 8 rows, the next 8 of the outputs, both again 8 rows on
+            for (int i = 0; i < 4; ++i) {{
                 const int row = k + lane / 16 * 8 + lane % 8, piece = m / 8 + 2 * i + lane / 8 % 2;
                 turned(a[i], stage + row * {2 * HALF} + (piece ^ row & 7) * 16);
             }}
             #pragma unroll
             for (int j = 0; j < {own // 16}; ++j) {{  // 8 rows, 8 rows on, both again 8 inputs on
                 const int row = k + lane / 8 % 2 * 8 + lane % 8, piece = n / 8 + 2 * j + lane / 16;
-                turned(b[j], stage + {TILE * 2 * HALF} + row * {2 * columns} + (piece ^ row & 7) * 16);
+                turned(b[j], stage + {TILE * 2 * HALF} + row * {2 * columns} + (piece ^ row & 7)
+                    * 16);
             }}
             #pragma unroll
             for (int i = 0; i < 4; ++i)
@@ -138,7 +159,8 @@ def _snippet(columns: int, layer: str, first: str, row: str) -> str:
         for (int j = 0; j < {own // 8}; ++j) {{
             float* const at = to + (m + 16 * i + lane / 4) * {columns} + n + 8 * j + lane % 4 * 2;
             *reinterpret_cast<float2*>(at) = make_float2(sums[i][j][0], sums[i][j][1]);
-            *reinterpret_cast<float2*>(at + {8 * columns}) = make_float2(sums[i][j][2], sums[i][j][3]);
+            *reinterpret_cast<float2*>(at + {8 * columns}) =
+                make_float2(sums[i][j][2], sums[i][j][3]);
         }}
 #else
     for (int n = 0; n < {HALF * columns}; ++n) to[n] = 0.0f;
@@ -146,7 +168,8 @@ def _snippet(columns: int, layer: str, first: str, row: str) -> str:
         const int row = listed.data[at];
         if (row < 0) continue;
         float h[{columns}];
-        for (int n = 0; n < {columns}; ++n) h[n] = wp::half_to_float(right[(size_t)({row}) * {columns} + n]);
+        for (int n = 0; n < {columns}; ++n) h[n] =
+            wp::half_to_float(right[(size_t)({row}) * {columns} + n]);
         for (int m = 0; m < {HALF}; ++m) {{
             const float d = wp::half_to_float(left[(size_t)at * {WIDTH} + m]);
             for (int n = 0; n < {columns}; ++n) to[m * {columns} + n] += d * h[n];
@@ -156,7 +179,9 @@ def _snippet(columns: int, layer: str, first: str, row: str) -> str:
 """
 
 
-@wp.func_native(_snippet(WIDTH, f"1 + job / {HALVES}", f"(job / {HALVES}) * count * {WIDTH}", "row"))
+@wp.func_native(
+    _snippet(WIDTH, f"1 + job / {HALVES}", f"(job / {HALVES}) * count * {WIDTH}", "row")
+)
 def by_outputs(
     block: int,
     jobs: int,
@@ -201,14 +226,28 @@ def multiply_outputs(
     slopes: wp.array3d[wp.float16],  # [layers, capacity, WIDTH] of listed rows
     outputs: wp.array3d[wp.float16],  # [layers, k N, WIDTH] of all rows
     # Out:
-    partials: wp.array3d[float],  # [parts, (layers - 1) HALVES, HALF WIDTH] weight gradients by parts of the list
+    partials: wp.array3d[float],  # [parts, (layers - 1) HALVES, HALF WIDTH] weight gradients by
+    #  parts of the list
 ):
     """One block of threads for half a layer and a part of the list."""
-    wp.tile_zeros(shape=(wp.static(shared(WIDTH) // 16),), dtype=wp.vec4, storage="shared")  # so Warp knows of it
+    # so Warp knows of it
+    wp.tile_zeros(shape=(wp.static(shared(WIDTH) // 16),), dtype=wp.vec4, storage="shared")
     jobs = partials.shape[1]
     block = wp.tid() // threads
     count = outputs.shape[1]
-    by_outputs(block, jobs, partials.shape[0], keys, count, slopes.shape[1], listed, begins, slopes, outputs, partials)
+    by_outputs(
+        block,
+        jobs,
+        partials.shape[0],
+        keys,
+        count,
+        slopes.shape[1],
+        listed,
+        begins,
+        slopes,
+        outputs,
+        partials,
+    )
 
 
 @wp.kernel(enable_backward=False, grid_stride=False, launch_bounds=(BLOCK, 2), module="unique")
@@ -222,7 +261,8 @@ def multiply_positions(
     slopes: wp.array3d[wp.float16],  # [layers, capacity, WIDTH] of listed rows
     position: wp.array2d[wp.float16],  # [N, COLUMNS] gamma(x)
     # Out:
-    partials: wp.array3d[float],  # [parts, entries HALVES, HALF COLUMNS] weight gradients by parts of the list
+    partials: wp.array3d[float],  # [parts, entries HALVES, HALF COLUMNS] weight gradients by parts
+    #  of the list
 ):
     """One block of threads for half a layer that gamma(x) enters and a part of the list."""
     wp.tile_zeros(shape=(wp.static(shared(COLUMNS) // 16),), dtype=wp.vec4, storage="shared")
@@ -230,5 +270,16 @@ def multiply_positions(
     block = wp.tid() // threads
     count = position.shape[0]
     by_positions(
-        block, jobs, partials.shape[0], keys, count, slopes.shape[1], joined, listed, begins, slopes, position, partials
+        block,
+        jobs,
+        partials.shape[0],
+        keys,
+        count,
+        slopes.shape[1],
+        joined,
+        listed,
+        begins,
+        slopes,
+        position,
+        partials,
     )

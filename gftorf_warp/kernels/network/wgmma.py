@@ -1,14 +1,16 @@
 """The layers of a perceptron on Hopper's tensor cores, as C++ for CUDA, and row by row for the CPU.
 
-Rows are independent, so a block of threads computes all layers of its rows independently of others. Two groups of four
-warps have tiles of 64 rows each: while one multiplies, the other adds shifts, masks, rounds and stores. Weights come in
-blocks of 64 inputs into a ring in shared memory, copied from global memory ahead of the layer that needs
-them. Rows never meet shared memory: what a lane stores of a row is what it reads of it one layer later, so that groups
-wait for each other only before weights are overwritten.
+Rows are independent, so a block of threads computes all layers of its rows independently of others.
+Two groups of four warps have tiles of 64 rows each: while one multiplies, the other adds shifts,
+masks, rounds and stores. Weights come in blocks of 64 inputs into a ring in shared memory, copied
+from global memory ahead of the layer that needs them. Rows never meet shared memory: what a lane
+stores of a row is what it reads of it one layer later, so that groups wait for each other only
+before weights are overwritten.
 
-That works because the order of a sum over inputs is free, and that of outputs too: weights are packed so that a lane's
-share of a row, of inputs and of outputs, is eight neighbours, 16 bytes (``perceptron.pack``). Sums over the rows of a
-key, which gradients of biases are, stay in registers until the key has passed.
+That works because the order of a sum over inputs is free, and that of outputs too: weights are
+packed so that a lane's share of a row, of inputs and of outputs, is eight neighbours, 16 bytes
+(``perceptron.pack``). Sums over the rows of a key, which gradients of biases are, stay in registers
+until the key has passed.
 
 On a CPU one thread does the same row by row, float32 on halves: to compare with, not to be fast.
 """
@@ -18,7 +20,9 @@ import warp as wp
 WIDTH = 256  # outputs of a layer
 COLUMNS = 64  # of gamma(x), zeros included: one block of inputs
 TILE = 64  # rows that a group multiplies at once
-ROUND = 12  # tiles that a block takes through all layers before it goes on to others: so they are still in cache
+# tiles that a block takes through all layers before it goes on to others: so they are still in
+# cache
+ROUND = 12
 GROUPS = 2  # of 128 threads
 BLOCK = 128 * GROUPS  # threads
 HEAD = 8  # columns of the gradient at the head: 16 bytes, of which VALUES are used
@@ -44,28 +48,37 @@ def _multiply(add: int) -> str:
 
 _CUDA = f"""
     const int lane = threadIdx.x & 31, warp = threadIdx.x >> 5 & 3;
-    const int group = __shfl_sync(0xffffffffu, threadIdx.x >> 7, 0);  // so that the compiler knows it is one per warp
+    // so that the compiler knows it is one per warp
+    const int group = __shfl_sync(0xffffffffu, threadIdx.x >> 7, 0);
     const int g = lane >> 2, t = lane & 3;
     SIZES
     const int first = (int)((long long)tiles * blockIdx.x / gridDim.x);
     const int last = (int)((long long)tiles * (blockIdx.x + 1) / gridDim.x);
     const size_t of_layer = (size_t)keys * count * {WIDTH};
     extern __shared__ char memory[];
-    const unsigned begins = (unsigned)__cvta_generic_to_shared(memory), base = (begins + 1023u) & ~1023u;
-    float* const shared_sums = reinterpret_cast<float*>(memory + (base - begins) + {_RING}) + group * {4 * WIDTH};
+    const unsigned begins = (unsigned)__cvta_generic_to_shared(memory), base = (begins + 1023u)
+        & ~1023u;
+    float* const shared_sums = reinterpret_cast<float*>(memory + (base - begins) + {_RING}) + group
+        * {4 * WIDTH};
     const unsigned barriers = base + {_RING + _SUMS_OF_GROUPS};
     unsigned* const released =
-        reinterpret_cast<unsigned*>(memory + (base - begins) + {_RING + _SUMS_OF_GROUPS + _BARRIERS});
-    struct Starts {{ enum {{ H = 0, P = 1 }}; }};  // blocks of 64 inputs: of the layer before, of gamma(x)
+        reinterpret_cast<unsigned*>(memory + (base - begins)
+            + {_RING + _SUMS_OF_GROUPS + _BARRIERS});
+    // blocks of 64 inputs: of the layer before, of gamma(x)
+    struct Starts {{ enum {{ H = 0, P = 1 }}; }};
     struct Goes {{ enum {{ H = 4, P = 0 }}; }};
     struct Joins {{ enum {{ H = 4, P = 1 }}; }};
 
-    auto fill = [&](int number, const wp::half* from) {{  // one thread: number of the block of weights, from 0 on
+    // one thread: number of the block of weights, from 0 on
+    auto fill = [&](int number, const wp::half* from) {{
         const unsigned slot = number % {SLOTS}, barrier = barriers + 8 * slot;
-        asm volatile("mbarrier.arrive.expect_tx.shared::cta.b64 _, [%0], %1;" :: "r"(barrier), "r"({2 * PART})
+        asm volatile("mbarrier.arrive.expect_tx.shared::cta.b64 _, [%0], %1;" :: "r"(barrier),
+            "r"({2 * PART})
                      : "memory");
-        asm volatile("cp.async.bulk.shared::cluster.global.mbarrier::complete_tx::bytes [%0], [%1], %2, [%3];"
-                     :: "r"(base + slot * {2 * PART}), "l"(from), "r"({2 * PART}), "r"(barrier) : "memory");
+        asm volatile("cp.async.bulk.shared::cluster.global.mbarrier::complete_tx::bytes "
+                     "[%0], [%1], %2, [%3];"
+                     :: "r"(base + slot * {2 * PART}), "l"(from), "r"({2 * PART}), "r"(barrier) :
+                         "memory");
     }};
     auto filled = [&](int number) {{  // wait for it
         const unsigned barrier = barriers + 8 * (number % {SLOTS}), parity = number / {SLOTS} & 1;
@@ -84,15 +97,18 @@ _CUDA = f"""
     auto multiply = [&](auto& sums, const auto& a, unsigned long long matrix) {{
         {_multiply(1)}
     }};
-    // 16 inputs of rows g and g + 8 of this warp at a time; those of two are eight neighbours of both rows
-    auto read = [&](auto kind, const wp::half* before, const wp::half* position_, int tile, auto& rows) {{
+    // 16 inputs of rows g and g + 8 of this warp at a time; those of two are eight neighbours of
+    // both rows
+    auto read = [&](auto kind, const wp::half* before, const wp::half* position_, int tile,
+        auto& rows) {{
         constexpr int H = decltype(kind)::H, P = decltype(kind)::P;
         const int key = tile / of_key, low = (tile - key * of_key) * {TILE} + 16 * warp + g;
         const int row = min(low, count - 1), next = min(low + 8, count - 1);
         #pragma unroll
         for (int c = 0; c < 2 * (H + P); ++c) {{
             const wp::half* from = c < 2 * H ? before + (size_t)key * count * {WIDTH} : position_;
-            const int width = c < 2 * H ? {WIDTH} : {COLUMNS}, column = 8 * t + 32 * (c < 2 * H ? c : c - 2 * H);
+            const int width = c < 2 * H ? {WIDTH} : {COLUMNS}, column = 8 * t + 32
+                * (c < 2 * H ? c : c - 2 * H);
             const uint4 one = *reinterpret_cast<const uint4*>(from + (size_t)row * width + column);
             const uint4 two = *reinterpret_cast<const uint4*>(from + (size_t)next * width + column);
             auto& low_half = rows[2 * c];
@@ -109,7 +125,8 @@ _CUDA = f"""
             filled(number + c);
             const unsigned address = base + (number + c) % {SLOTS} * {2 * PART};
             // rows of 128 bytes, pieces of 16 exchanged; 8 rows to the next 1,024 bytes
-            const unsigned long long matrix = (address >> 4) | 1ull << 16 | 64ull << 32 | 1ull << 62;
+            const unsigned long long matrix = (address >> 4) | 1ull << 16 | 64ull << 32 | 1ull
+                << 62;
             asm volatile("wgmma.fence.sync.aligned;" ::: "memory");
             if (c == 0) begin_sums(sums, rows[0], matrix);
             else multiply(sums, rows[4 * c], matrix);
@@ -124,9 +141,10 @@ _CUDA = f"""
         {_KEPT}
     }};
 
-    // this group has multiplied by ``blocks`` weights for the last time; the second group to release a layer
-    // starts other copies. A group without a tile releases all layers at once, so each has a count, half of a word:
-    // what an addition finds in the other half is the only order there is
+    // this group has multiplied by ``blocks`` weights for the last time; the second group to
+    // release a layer starts other copies. A group without a tile releases all layers at once, so
+    // each has a count, half of a word: what an addition finds in the other half is the only order
+    // there is
     int done = 0, layers_done = 0;  // blocks of weights, and layers, that this group needs no more
     auto release = [&](int blocks, const wp::half* packed, int of_round, int all) {{
         const int sent = min(done + {SLOTS}, all);
@@ -139,7 +157,8 @@ _CUDA = f"""
             const int of_other = group ? counts & 65535u : counts >> 16;
             if (of_other >= layers_done) {{
                 __threadfence_block();
-                for (int n = sent; n < min(done + {SLOTS}, all); ++n) fill(n, packed + (size_t)(n % of_round) * {PART});
+                for (int n = sent; n < min(done + {SLOTS}, all); ++n) fill(n, packed
+                    + (size_t)(n % of_round) * {PART});
             }}
         }}
     }};
@@ -147,7 +166,8 @@ _CUDA = f"""
     if (threadIdx.x == 0) *released = 0;
     if (threadIdx.x == 0)
         for (int slot = 0; slot < {SLOTS}; ++slot)
-            asm volatile("mbarrier.init.shared::cta.b64 [%0], 1;" :: "r"(barriers + 8 * slot) : "memory");
+            asm volatile("mbarrier.init.shared::cta.b64 [%0], 1;" :: "r"(barriers + 8 * slot) :
+                "memory");
     asm volatile("fence.proxy.async;" ::: "memory");
     __syncthreads();
 """
@@ -162,7 +182,8 @@ _FORWARD = f"""
         constexpr int C = decltype(kind)::H + decltype(kind)::P;
         const wp::half* before = outputs.data + (number ? number - 1 : 0) * of_layer;
         wp::half* after = outputs.data + number * of_layer;
-        auto through = [&](int tile, const auto& rows, auto next) {{  // ``next``: there are registers for the next rows
+        // ``next``: there are registers for the next rows
+        auto through = [&](int tile, const auto& rows, auto next) {{
             float sums[128];
             const int key = tile / of_key, row = (tile - key * of_key) * {TILE} + 16 * warp + g;
             const float2 own = __ldg(reinterpret_cast<const float2*>(
@@ -189,14 +210,16 @@ _FORWARD = f"""
                         asm("cvt.rn.relu.f16x2.f32 %0, %1, %2;" : "=r"(out[j])
                             : "f"(sums[16 * q + 4 * j + 2 * half + 1] + shift[2 * j + 1]),
                               "f"(sums[16 * q + 4 * j + 2 * half] + shift[2 * j]));
-                        alive[2 * half + q / 4] |= (out[j] + 0x7fff7fffu & 0x80008000u) >> (4 * (q % 4) + j);
+                        alive[2 * half + q / 4] |= (out[j] + 0x7fff7fffu & 0x80008000u) >> (4
+                            * (q % 4) + j);
                     }}
                     if (row + 8 * half < count)
                         *reinterpret_cast<uint4*>(to + 8 * half * {WIDTH} + 32 * q) =
                             make_uint4(out[0], out[1], out[2], out[3]);
                 }}
             }}
-            reinterpret_cast<uint4*>(masks.data)[((size_t)number * tiles + tile) * 128 + (threadIdx.x & 127)] =
+            reinterpret_cast<uint4*>(masks.data)[((size_t)number * tiles + tile) * 128
+                + (threadIdx.x & 127)] =
                 make_uint4(alive[0], alive[1], alive[2], alive[3]);
         }};
         if (begin + group >= end) release(C, forth.data, parts, all);
@@ -206,7 +229,8 @@ _FORWARD = f"""
             read(kind, before, position.data, begin + group, rows);
             for (int tile = begin + group; tile < end; tile += {GROUPS})
                 through(tile, rows, [&]() {{
-                    if (tile + {GROUPS} < end) read(kind, before, position.data, tile + {GROUPS}, rows);
+                    if (tile + {GROUPS} < end) read(kind, before, position.data, tile + {GROUPS},
+                        rows);
                 }});
         }} else {{
             for (int tile = begin + group; tile < end; tile += {GROUPS}) {{
@@ -217,7 +241,8 @@ _FORWARD = f"""
         }}
     }};
     if (threadIdx.x == 0)
-        for (int n = 0; n < min({SLOTS}, all); ++n) fill(n, forth.data + (size_t)(n % parts) * {PART});
+        for (int n = 0; n < min({SLOTS}, all); ++n) fill(n, forth.data + (size_t)(n % parts)
+            * {PART});
     for (int begin = first; begin < last; begin += {ROUND}) {{
         const int end = min(begin + {ROUND}, last);
         for (int number = 0; number < layers; ++number) {{
@@ -243,7 +268,8 @@ _FORWARD = f"""
                                                  : position.data[(size_t)row * {COLUMNS} + k - H];
                         sum += wp::half_to_float(x) * wp::half_to_float(packed[index_of(k, n)]);
                     }}
-                    outputs.data[number * of_layer + at + n] = wp::float_to_half(sum > 0.0f ? sum : 0.0f);
+                    outputs.data[number * of_layer + at + n] =
+                        wp::float_to_half(sum > 0.0f ? sum : 0.0f);
                 }}
                 packed += {WIDTH} * K;
             }}
@@ -265,16 +291,20 @@ _BACKWARD = f"""
         for (int j = 0; j < 4; ++j) {{
             value[2 * j] = alive << j & 0x8000u ? value[2 * j] : 0.0f;
             value[2 * j + 1] = alive << j & 0x80000000u ? value[2 * j + 1] : 0.0f;
-            asm("cvt.rn.f16x2.f32 %0, %1, %2;" : "=r"(out[j]) : "f"(value[2 * j + 1]), "f"(value[2 * j]));
+            asm("cvt.rn.f16x2.f32 %0, %1, %2;" : "=r"(out[j]) : "f"(value[2 * j + 1]),
+                "f"(value[2 * j]));
         }}
         if (there) *reinterpret_cast<uint4*>(to) = make_uint4(out[0], out[1], out[2], out[3]);
     }};
     auto alive_of = [&](int number, int tile, auto& alive) {{  // 0 where there is no row
         #pragma unroll
         for (int half = 0; half < 2; ++half) {{
-            const int row = __ldg(listed.data + tile * {TILE} + 16 * warp + g + 8 * half), key = max(row, 0) / of_rows;
-            const int low = max(row, 0) - key * of_rows, of = low / {TILE} + key * in_key, own = low % {TILE};
-            const int thread = own / 16 * 32 + own % 8 * 4 + t;  // which wrote it in the forward pass, in which half
+            const int row = __ldg(listed.data + tile * {TILE} + 16 * warp + g + 8 * half), key =
+                max(row, 0) / of_rows;
+            const int low = max(row, 0) - key * of_rows, of = low / {TILE} + key * in_key, own =
+                low % {TILE};
+            // which wrote it in the forward pass, in which half
+            const int thread = own / 16 * 32 + own % 8 * 4 + t;
             const uint2 bits = reinterpret_cast<const uint2*>(masks.data)[
                 (((size_t)number * of_key + of) * 128 + thread) * 2 + own % 16 / 8];
             alive[2 * half] = row < 0 ? 0u : bits.x; alive[2 * half + 1] = row < 0 ? 0u : bits.y;
@@ -285,11 +315,13 @@ _BACKWARD = f"""
         const bool upper = lane & N / 2;
         #pragma unroll
         for (int i = 0; i < N; ++i) {{
-            const float mine = upper ? value[N + i] : value[i], other = upper ? value[i] : value[N + i];
+            const float mine = upper ? value[N + i] : value[i], other = upper ? value[i]
+                : value[N + i];
             value[i] = mine + __shfl_xor_sync(0xffffffffu, other, N / 2);
         }}
     }};
-    // sums over the 16 rows of this warp: of 64 columns, eight remain with a lane, those from 32 g + 8 t on
+    // sums over the 16 rows of this warp: of 64 columns, eight remain with a lane, those from 32 g
+    // + 8 t on
     auto fold = [&](auto& value, auto& own) {{
         halve(Of64{{}}, value);
         halve(Of32{{}}, value);
@@ -305,11 +337,13 @@ _BACKWARD = f"""
             own[i] = 0.0f;
         }}
         group_waits();
-        const size_t part = ((size_t)number * of_keys + key) * {GROUPS} * gridDim.x + {GROUPS} * blockIdx.x + group;
+        const size_t part = ((size_t)number * of_keys + key) * {GROUPS} * gridDim.x + {GROUPS}
+        * blockIdx.x + group;
         float* const to = partials.data + part * {WIDTH};
         const float* const of_warps = shared_sums;
         for (int n = threadIdx.x & 127; n < {WIDTH}; n += 128)
-            to[n] += (of_warps[n] + of_warps[{WIDTH} + n]) + (of_warps[{2 * WIDTH} + n] + of_warps[{3 * WIDTH} + n]);
+            to[n] += (of_warps[n] + of_warps[{WIDTH} + n])
+                + (of_warps[{2 * WIDTH} + n] + of_warps[{3 * WIDTH} + n]);
         group_waits();
     }};
     auto ends_key = [&](int tile, int end) {{  // whether this is the group's last tile of its key
@@ -329,7 +363,8 @@ _BACKWARD = f"""
                 #pragma unroll
                 for (int v = 0; v < {VALUES}; ++v)
                     a[half][v] = wp::half_to_float(
-                        after.data[(size_t)max(__ldg(listed.data + low + 8 * half), 0) * {HEAD} + v]);
+                        after.data[(size_t)max(__ldg(listed.data + low + 8 * half), 0) * {HEAD}
+                            + v]);
             #pragma unroll
             for (int q = 0; q < 8; ++q) {{
                 float value[2][8] = {{}};
@@ -360,7 +395,8 @@ _BACKWARD = f"""
         else read(Goes{{}}, before, before, begin + group, rows);
         for (int tile = begin + group; tile < end; tile += {GROUPS}) {{
             const int key = tile / of_key, low = (tile - key * of_key) * {TILE} + 16 * warp + g;
-            const size_t at = (number - 1) * of_layer + ((size_t)key * count + low) * {WIDTH} + 8 * t;
+            const size_t at = (number - 1) * of_layer + ((size_t)key * count + low) * {WIDTH} + 8
+                * t;
             float sums[128];
             unsigned alive[4];
             product(Goes{{}}, done, rows, sums);
@@ -376,7 +412,8 @@ _BACKWARD = f"""
                 #pragma unroll
                 for (int half = 0; half < 2; ++half) {{
                     #pragma unroll
-                    for (int i = 0; i < 8; ++i) value[half][i] = sums[16 * q + i / 2 * 4 + 2 * half + i % 2];
+                    for (int i = 0; i < 8; ++i) value[half][i] =
+                        sums[16 * q + i / 2 * 4 + 2 * half + i % 2];
                     masked(value[half], alive[2 * half + q / 4] << 4 * (q % 4),
                            slopes.data + at + 8 * half * {WIDTH} + 32 * q, low + 8 * half < count);
                 }}
@@ -388,7 +425,8 @@ _BACKWARD = f"""
         }}
     }};
     if (threadIdx.x == 0)
-        for (int n = 0; n < min({SLOTS}, all); ++n) fill(n, back.data + (size_t)(n % parts) * {PART});
+        for (int n = 0; n < min({SLOTS}, all); ++n) fill(n, back.data + (size_t)(n % parts)
+            * {PART});
     for (int begin = first; begin < last; begin += {ROUND}) {{
         const int end = min(begin + {ROUND}, last);
         top(begin, end);
@@ -411,8 +449,10 @@ _BACKWARD = f"""
                                  * head.data[v * {WIDTH} + n];
                     else
                         for (int k = 0; k < {WIDTH}; ++k)
-                            sum += wp::half_to_float(slopes.data[at + of_layer + k]) * wp::half_to_float(
-                                back.data[(size_t)(layers - 2 - number) * {WIDTH * WIDTH} + index_of(k, n)]);
+                            sum += wp::half_to_float(slopes.data[at + of_layer + k])
+                                * wp::half_to_float(
+                                back.data[(size_t)(layers - 2 - number) * {WIDTH * WIDTH}
+                                    + index_of(k, n)]);
                     const size_t is = ((size_t)number * of_keys * of_rows + from) * {WIDTH} + n;
                     if (!there || !(wp::half_to_float(outputs.data[is]) > 0.0f)) sum = 0.0f;
                     partials.data[((size_t)number * of_keys + key) * {GROUPS * WIDTH} + n] += sum;
@@ -424,18 +464,22 @@ _BACKWARD = f"""
 """
 
 _INDEX_OF = f"""
-    auto index_of = [](int k, int p) {{  // of a weight among those of its layer: the inverse of what ``pack`` does
+    // of a weight among those of its layer: the inverse of what ``pack`` does
+    auto index_of = [](int k, int p) {{
         const int n = p / 32 * 32 + p % 8 / 2 * 8 + p % 32 / 8 * 2 + p % 2;
         const int u = k % 64 / 32 * 4 + k % 8 / 4 * 2 + k % 4 / 2;
         return k / 64 * {PART} + n * 64 + (u ^ (n & 7)) * 8 + k % 32 / 8 * 2 + k % 2;
     }};"""
 
-_ALL_ROWS = f"""const int of_key = (count + {TILE - 1}) / {TILE}, tiles = keys * of_key;"""  # key by key, in order
+# key by key, in order
+_ALL_ROWS = f"""const int of_key = (count + {TILE - 1}) / {TILE}, tiles = keys * of_key;"""
 
-# Rows of a list, those of each key padded to whole tiles. Gradients are in the order of the list, as if there were one
-# key with as many rows as a list can have; everything else is in the order of the forward pass
+# Rows of a list, those of each key padded to whole tiles. Gradients are in the order of the list,
+# as if there were one key with as many rows as a list can have; everything else is in the order of
+# the forward pass
 _LISTED_ROWS = f"""const int in_key = (of_rows + {TILE - 1}) / {TILE};
-    const int keys = 1, of_key = of_keys * in_key, count = {TILE} * of_key, tiles = starts.data[of_keys] / {TILE};
+    const int keys = 1, of_key = of_keys * in_key, count = {TILE} * of_key, tiles =
+        starts.data[of_keys] / {TILE};
     auto key_of = [&](int tile) {{
         int key = 0;
         while (key + 1 < of_keys && {TILE} * tile >= __ldg(starts.data + key + 1)) ++key;
@@ -474,4 +518,6 @@ def listed_backward(
     slopes: wp.array3d[wp.float16],
     partials: wp.array4d[float],
 ):
-    """Gradients at all layers of the listed rows of this block, in the order of the list, and their sums per key."""
+    """Gradients at all layers of the listed rows of this block, in the order of the list,
+    and their sums per key.
+    """

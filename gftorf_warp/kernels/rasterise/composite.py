@@ -1,12 +1,14 @@
 """Front to back through the splats of a tile: T-weighted distance and channels, T^2-weighted light.
 
-Splat k with alpha_k = min(0.99, o_k G_k) leaves T_{k+1} = T_k (1 - alpha_k), T_0 = 1, and adds to its pixel
+Splat k with alpha_k = min(0.99, o_k G_k) leaves T_{k+1} = T_k (1 - alpha_k), T_0 = 1, and adds to
+its pixel
 
     w_k = alpha_k T_k   times   distance d, three channels c, and to the distortion (half of the double sum)
     w_k T_k             times   light (a cos psi, a sin psi, a): light of a quad passes every splat twice
 
 (paper, equations 3-5; method, sections 2.5 and 2.7). The background is linear in the
-transmittance T_e that remains, and added in planes_to_images.py. The adjoint is composite_backward.py.
+transmittance T_e that remains, and added in planes_to_images.py. The adjoint is
+composite_backward.py.
 """
 
 import functools
@@ -23,19 +25,25 @@ from .splat import AHEAD, Splat, block_missed, load_splat, prefetch
 # planes of ``light``, each [tiles, lanes] of V
 RE, IM, AMPLITUDE, DISTANCE, DISTORTION, SUM_ZETA, SUM_ZETA2, TRANSMITTANCE, LAST = range(9)
 LIGHT_PLANES = 9
-NEAREST = 1e-6  # [m] of a splat: padding records have distance 0, which must not become infinite times a weight of 0
+# [m] of a splat: padding records have distance 0, which must not become infinite times a weight of
+# 0
+NEAREST = 1e-6
 CHANNEL_PLANES = 3  # planes of ``channel``
 
 
 def options(K: int) -> dict:
     """Kernel options of a compositor.
 
-    Contraction to fused multiply-adds gives the CPU 10-20 %; fast_math concerns CUDA only; without a grid-stride loop
-    eight registers are saved.
+    Contraction to fused multiply-adds gives the CPU 10-20 %; fast_math concerns CUDA only; without
+    a grid-stride loop eight registers are saved.
     """
-    flags = "-march=native" if wp.config.cpu_compiler_flags is None else wp.config.cpu_compiler_flags
+    flags = (
+        "-march=native" if wp.config.cpu_compiler_flags is None else wp.config.cpu_compiler_flags
+    )
     flags += " -ffp-contract=fast"
-    module_options = {"fast_math": True, "cpu_compiler_flags": flags} if K > 1 else {"fast_math": True}
+    module_options = (
+        {"fast_math": True, "cpu_compiler_flags": flags} if K > 1 else {"fast_math": True}
+    )
     return {
         "enable_backward": False,
         "module": "unique",
@@ -47,25 +55,35 @@ def options(K: int) -> dict:
 
 @functools.cache
 def make_pixels(K: int, tile_width: int, tile_height: int) -> SimpleNamespace:
-    """Where the block of K pixels of a lane lies in a tile of ``tile_width`` x ``tile_height`` [px]."""
+    """Where the block of K pixels of a lane lies in a tile of ``tile_width`` x ``tile_height``
+    [px].
+    """
     side = make_lanes(K).side
     if tile_width % side or tile_height % side:
-        raise ValueError(f"blocks of {side} x {side} pixels must fill a tile, got {tile_width} x {tile_height}")
+        raise ValueError(
+            f"blocks of {side} x {side} pixels must fill a tile, got {tile_width} x {tile_height}"
+        )
     lanes_x = tile_width // side
 
     @wp.func
     def block_x(tile: int, lane: int, tiles_x: int) -> float:
         """Centre of the first pixel of a block, x [px]."""
-        column = (tile % tiles_x) * wp.static(tile_width) + (lane % wp.static(lanes_x)) * wp.static(side)
+        column = (tile % tiles_x) * wp.static(tile_width) + (lane % wp.static(lanes_x)) * wp.static(
+            side
+        )
         return float(column) + 0.5
 
     @wp.func
     def block_y(tile: int, lane: int, tiles_x: int) -> float:
         """Centre of the first pixel of a block, y [px]."""
-        row = (tile // tiles_x) * wp.static(tile_height) + (lane // wp.static(lanes_x)) * wp.static(side)
+        row = (tile // tiles_x) * wp.static(tile_height) + (lane // wp.static(lanes_x)) * wp.static(
+            side
+        )
         return float(row) + 0.5
 
-    return SimpleNamespace(block_x=block_x, block_y=block_y, lanes=lanes_x * (tile_height // side), side=side)
+    return SimpleNamespace(
+        block_x=block_x, block_y=block_y, lanes=lanes_x * (tile_height // side), side=side
+    )
 
 
 @functools.cache
@@ -102,18 +120,33 @@ def make_composite(
         light: Whether light and distance are summed.
         channels: Whether the three channels are summed.
         inclusive: Whether the splat that ends a pixel is still added.
-        metric: Whether distortion is measured on the distance itself, or on the released mapping of it; None: there is
-            no distortion, and its three planes are left alone.
+        metric: Whether distortion is measured on the distance itself, or on the released mapping of
+            it; None: there is no distortion, and its three planes are left alone.
         more: Whether three further channels are summed in the same pass; K must be 1.
-        segments: Segments of the list in the backward pass (list_segments.py); more than one only where K is 1, with
-            light and without distortion.
+        segments: Segments of the list in the backward pass (list_segments.py); more than one only
+            where K is 1, with light and without distortion.
     """
-    cooperative, split = K == 1, segments > 1  # the lanes of a warp fetch records for each other, see shared_batches.py
+    # the lanes of a warp fetch records for each other, see shared_batches.py
+    cooperative, split = K == 1, segments > 1
     if split and not (cooperative and light and metric is None):
         raise ValueError("segments need light, no distortion, and a warp per tile")
     ops, pixels = make_lanes(K), make_pixels(K, tile_width, tile_height)
-    V, fill, affine, mul, axpy, fma, fnma = ops.V, ops.fill, ops.affine, ops.mul, ops.axpy, ops.fma, ops.fnma
-    above, add, reaches, drop_below, set_where = ops.above, ops.add, ops.reaches, ops.drop_below, ops.set_where
+    V, fill, affine, mul, axpy, fma, fnma = (
+        ops.V,
+        ops.fill,
+        ops.affine,
+        ops.mul,
+        ops.axpy,
+        ops.fma,
+        ops.fnma,
+    )
+    above, add, reaches, drop_below, set_where = (
+        ops.above,
+        ops.add,
+        ops.reaches,
+        ops.drop_below,
+        ops.set_where,
+    )
     power_of, hits, alpha_of, nonzero = ops.power_of, ops.hits, ops.alpha_of, ops.nonzero
     block_x, block_y, columns, rows = pixels.block_x, pixels.block_y, ops.columns, ops.rows
     half = 0.5 * (pixels.side - 1)  # from the first to the middle of a block [px]
@@ -143,9 +176,19 @@ def make_composite(
 
     @wp.func
     def store_state(
-        states: wp.array3d[V], segment: int, tile: int, lane: int, T: V, re: V, im: V, amplitude: V, distance: V
+        states: wp.array3d[V],
+        segment: int,
+        tile: int,
+        lane: int,
+        T: V,
+        re: V,
+        im: V,
+        amplitude: V,
+        distance: V,
     ):
-        """State where a segment ends: T, except of the last one, and what it has added, except of the first."""
+        """State where a segment ends: T, except of the last one, and what it has added,
+        except of the first.
+        """
         if segment < wp.static(segments - 1):
             states[segment * wp.static(PLANES), tile, lane] = T
         if segment > 0:
@@ -171,9 +214,12 @@ def make_composite(
         sums: wp.array3d[V],  # [9, tiles, lanes] planes RE .. LAST of ``light``
         channel: wp.array3d[V],  # [3, tiles, lanes] the three channels
         more_channel: wp.array3d[V],  # [3, tiles, lanes] the further channels
-        states: wp.array3d[V],  # [5 (segments - 1), tiles, lanes] where segments end, see list_segments.py
+        states: wp.array3d[V],  # [5 (segments - 1), tiles, lanes] where segments end, see
+        #  list_segments.py
     ):
-        """One thread per block of K pixels; on CUDA one warp per tile, so all control is uniform over 32 lanes."""
+        """One thread per block of K pixels; on CUDA one warp per tile,
+        so all control is uniform over 32 lanes.
+        """
         t, lane = wp.tid()
         tile = tile0 + t
         x0 = block_x(tile, lane, tiles_x)
@@ -181,10 +227,13 @@ def make_composite(
         x = columns(x0)
         y = rows(y0)
         # pixels right of or below the image never start
-        live = mul(above(affine(x, -1.0, float(width)), 0.0), above(affine(y, -1.0, float(height)), 0.0))
+        live = mul(
+            above(affine(x, -1.0, float(width)), 0.0), above(affine(y, -1.0, float(height)), 0.0)
+        )
         T = fill(1.0)
         if wp.static(inclusive):
-            T = add(live, fill(0.0))  # is 0 for pixels outside the image; a copy, since Warp aliases variables
+            # is 0 for pixels outside the image; a copy, since Warp aliases variables
+            T = add(live, fill(0.0))
         last = fill(0.0)
         if wp.static(light):
             re = fill(0.0)
@@ -214,7 +263,8 @@ def make_composite(
         length = int(0)
         if wp.static(split):
             length = segment_length(end - begin, wp.static(segments))
-        zeta0 = float(0.0)  # distortion is blind to a common shift; near the surface its sums keep their digits
+        # distortion is blind to a common shift; near the surface its sums keep their digits
+        zeta0 = float(0.0)
         if wp.static(spreads):
             if begin < end:
                 zeta0 = zeta_of(splats[ids[begin]][14], mapping)
@@ -229,12 +279,13 @@ def make_composite(
                 if wp.static(more):
                     fetch_more(memory, more_splats, coming, 0)
                 coming = entry(ids, begin, 1, wp.static(ROUND), count)
-        # `continue` instead of nested `if`s: after an `if` Warp selects between the old and the new value of everything
-        # assigned inside, here a dozen vectors per splat
+        # `continue` instead of nested `if`s: after an `if` Warp selects between the old and the new
+        # value of everything assigned inside, here a dozen vectors per splat
         while k < end and warp_any(nonzero(live)):
             stop = end
             if wp.static(split):
-                if k - begin == (segment + 1) * length:  # a segment begins, since it is whole rounds
+                # a segment begins, since it is whole rounds
+                if k - begin == (segment + 1) * length:
                     store_state(states, segment, tile, lane, T, re, im, amplitude, distance)
                     segment += 1
                     re_before = add(re_before, re)
@@ -267,11 +318,14 @@ def make_composite(
                             continue
                         q = load_splat(splats, i)
                     else:
-                        q = record_of(memory, start - begin, k - 1 - start, splats, ids, k - 1, k <= end)
+                        q = record_of(
+                            memory, start - begin, k - 1 - start, splats, ids, k - 1, k <= end
+                        )
                     power = power_of(affine(x, -1.0, q[0]), affine(y, -1.0, q[1]), q[2], q[3], q[4])
                     hit = hits(power, live, q[6])
                     alpha = alpha_of(power, hit, q[5], ALPHA_MAX)
-                    if wp.static(not cooperative):  # with records in shared memory a miss costs less than a branch
+                    # with records in shared memory a miss costs less than a branch
+                    if wp.static(not cooperative):
                         if not nonzero(alpha):
                             continue
                     if wp.static(not inclusive):
@@ -287,8 +341,13 @@ def make_composite(
                         distance = axpy(distance, w, q[14])
                     if wp.static(spreads):
                         zeta = zeta_of(q[14], mapping) - zeta0
-                        # sum over pairs, one splat at a time: w (zeta^2 A - 2 zeta M + V), the weight so far A = 1 - T
-                        spread = axpy(axpy(affine(T, -zeta * zeta, zeta * zeta), sum_zeta, -2.0 * zeta), sum_zeta2, 1.0)
+                        # sum over pairs, one splat at a time: w (zeta^2 A - 2 zeta M + V), the
+                        # weight so far A = 1 - T
+                        spread = axpy(
+                            axpy(affine(T, -zeta * zeta, zeta * zeta), sum_zeta, -2.0 * zeta),
+                            sum_zeta2,
+                            1.0,
+                        )
                         distortion = fma(distortion, w, spread)
                         sum_zeta = axpy(sum_zeta, w, zeta)
                         sum_zeta2 = axpy(sum_zeta2, w, zeta * zeta)

@@ -1,13 +1,16 @@
-"""Adjoint of composite.py, written by hand: back to front with two running scalars per pixel, T and E.
+"""Adjoint of composite.py, written by hand: back to front with two running scalars per pixel, T and
+E.
 
-With tau = the gradient of all T-weighted outputs times the values of splat k, sigma = the same for the T^2-weighted
-ones, and T_e, E = T_e dL/dT_e behind the last splat (method, section 3.1):
+With tau = the gradient of all T-weighted outputs times the values of splat k, sigma = the same for
+the T^2-weighted ones, and T_e, E = T_e dL/dT_e behind the last splat (method, section 3.1):
 
-    T <- T / (1 - alpha);  dL/dalpha = tau T + sigma T^2 - E / (1 - alpha);  E <- E + w (tau + 2 sigma T),  w = alpha T
+    T <- T / (1 - alpha);  dL/dalpha = tau T + sigma T^2 - E / (1 - alpha);  E <- E + w (tau + 2
+    sigma T),  w = alpha T
 
-E is the gradient of everything behind. Computed back to front it is accurate; front to back it would be a
-difference of sums that is noise behind a surface. The distortion is quadratic in w: its tau uses the final sums.
-The generated adjoint of the forward loop would be wrong without a warning, since dynamic loops are not replayed.
+E is the gradient of everything behind. Computed back to front it is accurate; front to back it
+would be a difference of sums that is noise behind a surface. The distortion is quadratic in w: its
+tau uses the final sums. The generated adjoint of the forward loop would be wrong without a warning,
+since dynamic loops are not replayed.
 """
 
 import functools
@@ -15,13 +18,23 @@ import functools
 import warp as wp
 
 from ...constants import ALPHA_MAX, ALPHA_MIN
-from .composite import LAST, NEAREST, SUM_ZETA, SUM_ZETA2, TRANSMITTANCE, make_pixels, make_zeta, options
+from .composite import (
+    LAST,
+    NEAREST,
+    SUM_ZETA,
+    SUM_ZETA2,
+    TRANSMITTANCE,
+    make_pixels,
+    make_zeta,
+    options,
+)
 from .list_segments import PLANES, segment_length
 from .shared_batches import GROUP, ROUND, make_gradient_rounds
 from .simd import make_lanes, sums_of, types_of, warp_max
 from .splat import AHEAD, Splat, block_missed, load_splat, prefetch
 
-# planes of ``grad_sums``, each [tiles, lanes] of V: gradients of the first five planes of the forward pass, and of T_e
+# planes of ``grad_sums``, each [tiles, lanes] of V: gradients of the first five planes of the
+# forward pass, and of T_e
 GRAD_TRANSMITTANCE = 5
 GRAD_LIGHT_PLANES = 6
 V1 = make_lanes(1).V
@@ -30,14 +43,33 @@ V1 = make_lanes(1).V
 def _add_moments(K: int, light: bool, channels: bool, geometry: bool) -> str:
     """C++ that adds the sums over the K pixels of a CPU thread to the gradient record of one splat.
 
-    One permutation brings the sums into the order of the record. On CUDA ``accumulate_round`` does it.
+    One permutation brings the sums into the order of the record. On CUDA ``accumulate_round`` does
+    it.
     """
-    names = ["v", "dx", "dy", "alpha", "w", "w2", "g0", "g1", "g2", "g_re", "g_im", "g_amplitude", "g_distance"]
+    names = [
+        "v",
+        "dx",
+        "dy",
+        "alpha",
+        "w",
+        "w2",
+        "g0",
+        "g1",
+        "g2",
+        "g_re",
+        "g_im",
+        "g_amplitude",
+        "g_distance",
+    ]
     loads = " ".join(f"const F {name}_ = load({name});" for name in names)
     values = {}
     if geometry:
         values |= {"v": "v_", "dx": "v_ * dx_", "dx2": "v_ * dx_ * dx_", "dxdy": "v_ * dx_ * dy_"}
-        values |= {"dy": "v_ * dy_", "dy2": "v_ * dy_ * dy_", "count": "alpha_ > 0.0f ? (F)(1.0f) : (F)(0.0f)"}
+        values |= {
+            "dy": "v_ * dy_",
+            "dy2": "v_ * dy_ * dy_",
+            "count": "alpha_ > 0.0f ? (F)(1.0f) : (F)(0.0f)",
+        }
         values |= {"weight": "w_"}
     if channels:
         values |= {"c0": "w_ * g0_", "c1": "w_ * g1_", "c2": "w_ * g2_"}
@@ -57,7 +89,8 @@ def _add_moments(K: int, light: bool, channels: bool, geometry: bool) -> str:
     for (int j = 0; j < 16; ++j) grads.data[i].c[j] += record[j];
 #endif
 """
-    order = ", ".join(str(lanes.index(of)) if of in lanes and of else "16" for of in slots)  # 16: a zero
+    # 16: a zero
+    order = ", ".join(str(lanes.index(of)) if of in lanes and of else "16" for of in slots)
     return f"""{types_of(K)}
     {loads}
     {sums}
@@ -73,7 +106,8 @@ def finish_moments(
     # In:
     splats: wp.array[Splat],  # [N] records, see splat.py
     # Out:
-    grad_splats: wp.array[Splat],  # [N] moments in slots 0-5, replaced by gradients of the same slots
+    grad_splats: wp.array[Splat],  # [N] moments in slots 0-5, replaced by gradients of the same
+    #  slots
 ):
     """One thread per splat: with v = dL/dpower, moments of v to gradients of centre and opacity."""
     n = wp.tid()
@@ -95,7 +129,9 @@ def finish_moments(
 #endif
 """)
 def add_more(grads: wp.array[Splat], i: int, w: V1, g3: V1, g4: V1, g5: V1):
-    """Add the gradient of further channels on the CPU, where a thread is alone; on CUDA a round of a warp does."""
+    """Add the gradient of further channels on the CPU, where a thread is alone;
+    on CUDA a round of a warp does.
+    """
 
 
 @functools.cache
@@ -111,7 +147,8 @@ def make_composite_backward(
     more: bool = False,
     segments: int = 1,
 ):
-    """The adjoint kernel for one tile shape and one set of outputs; arguments as in ``make_composite``.
+    """The adjoint kernel for one tile shape and one set of outputs; arguments as in
+    ``make_composite``.
 
     Args:
         K: Pixels per thread.
@@ -119,18 +156,32 @@ def make_composite_backward(
         tile_height: Rows of a tile [px].
         light: Whether light, distance and distortion have gradients.
         channels: Whether the three channels have gradients.
-        clamp_straight: Whether the gradient ignores the clamp of alpha (straight-through), as the released code does.
+        clamp_straight: Whether the gradient ignores the clamp of alpha (straight-through), as the
+            released code does.
         metric: As in ``make_composite``; None: the distortion has no gradient.
-        fixed: Whether weights are held fixed under the channels, so that only these have their gradient.
-        more: Whether three further channels, under which weights are held fixed, have their gradient, too.
-        segments: Warps per tile, each with a segment of its list (list_segments.py); if > 1, the forward pass must have
-            had as many, and weights be held fixed under all channels.
+        fixed: Whether weights are held fixed under the channels, so that only these have their
+            gradient.
+        more: Whether three further channels, under which weights are held fixed, have their
+            gradient, too.
+        segments: Warps per tile, each with a segment of its list (list_segments.py); if > 1, the
+            forward pass must have had as many, and weights be held fixed under all channels.
     """
     cooperative, split = K == 1, segments > 1
     if split and not (cooperative and light and metric is None and (fixed or not channels)):
-        raise ValueError("segments need light, no distortion, no weights that depend on channels, and a warp per tile")
+        raise ValueError(
+            "segments need light, no distortion, no weights that depend on "
+            "channels, and a warp per tile"
+        )
     ops, pixels = make_lanes(K), make_pixels(K, tile_width, tile_height)
-    V, fill, affine, mul, axpy, fma, fnma = ops.V, ops.fill, ops.affine, ops.mul, ops.axpy, ops.fma, ops.fnma
+    V, fill, affine, mul, axpy, fma, fnma = (
+        ops.V,
+        ops.fill,
+        ops.affine,
+        ops.mul,
+        ops.axpy,
+        ops.fma,
+        ops.fnma,
+    )
     add, scaled, exceeds, keep_below = ops.add, ops.scaled, ops.exceeds, ops.keep_below
     inverse, at_least = ops.inverse, ops.at_least
     power_of, hits, response, alpha_of = ops.power_of, ops.hits, ops.response, ops.alpha_of
@@ -146,7 +197,9 @@ def make_composite_backward(
     ): ...  # fmt: skip
 
     if cooperative:
-        rounds = make_gradient_rounds(tile_width, light, channels, light or not fixed, spreads, more)
+        rounds = make_gradient_rounds(
+            tile_width, light, channels, light or not fixed, spreads, more
+        )
         warp_memory, fetch_records, wait_for_records, entry, record_of = (
             rounds.warp_memory,
             rounds.fetch_records,
@@ -173,12 +226,15 @@ def make_composite_backward(
         grad_sums: wp.array3d[V],  # [6, tiles, lanes] gradients of RE .. DISTORTION and of T_e
         grad_channel: wp.array3d[V],  # [3, tiles, lanes] gradients of the three channels
         grad_more: wp.array3d[V],  # [3, tiles, lanes] gradients of the further channels
-        states: wp.array3d[V],  # [5 (segments - 1), tiles, lanes] where segments end, see list_segments.py
+        states: wp.array3d[V],  # [5 (segments - 1), tiles, lanes] where segments end, see
+        #  list_segments.py
         # Out:
-        grad_splats: wp.array[Splat],  # [N] added to: moments in 0-5, pixels in 6, weights in 7, gradients in 8-15
+        grad_splats: wp.array[Splat],  # [N] added to: moments in 0-5, pixels in 6, weights in 7,
+        #  gradients in 8-15
         more_splats: wp.array[Splat],  # [N] added to: slots 8-10, gradients of the further channels
     ):
-        """One thread per block of K pixels; visits exactly the splats of the forward pass, last one first.
+        """One thread per block of K pixels; visits exactly the splats of the forward pass, last one
+        first.
 
         Where lists have segments, one warp per segment.
         """
@@ -234,7 +290,8 @@ def make_composite_backward(
             position = fill(float(stop_of_segment - begin))
             begin += segment * length
             k = wp.max(stop_of_segment, begin)
-            for m in range(wp.static(segments - 1)):  # what later segments have added, the last one first
+            # what later segments have added, the last one first
+            for m in range(wp.static(segments - 1)):
                 end_of = wp.static(segments - 2) - m
                 if end_of >= segment:
                     place = end_of * wp.static(PLANES)
@@ -253,7 +310,9 @@ def make_composite_backward(
             count = k - begin
             coming = int(0)
             if begin < k:
-                store_derivatives(memory, g0, g1, g2, g_re, g_im, g_amplitude, g_distance, g3, g4, g5)
+                store_derivatives(
+                    memory, g0, g1, g2, g_re, g_im, g_amplitude, g_distance, g3, g4, g5
+                )
                 fetch_records(memory, splats, entry(ids, top, -1, 0, count), 0)
                 coming = entry(ids, top, -1, wp.static(ROUND), count)
         while k > begin:
@@ -305,7 +364,9 @@ def make_composite_backward(
                     g_d = zero
                     if wp.static(light):
                         tau = axpy(tau, g_distance, q[14])
-                        sigma_T = mul(axpy(axpy(scaled(g_re, q[11]), g_im, q[12]), g_amplitude, q[13]), T)
+                        sigma_T = mul(
+                            axpy(axpy(scaled(g_re, q[11]), g_im, q[12]), g_amplitude, q[13]), T
+                        )
                         g_d = g_distance
                         w2 = mul(w, T)
                     if wp.static(spreads):
@@ -316,13 +377,18 @@ def make_composite_backward(
                             g_d = fma(g_distance, twice_g_distortion, spread)
                         else:  # zeta changes with the distance by mapping[1] / distance^2
                             far = wp.max(q[14], wp.static(NEAREST))
-                            g_d = fma(g_distance, scaled(twice_g_distortion, mapping[1] / (far * far)), spread)
+                            g_d = fma(
+                                g_distance,
+                                scaled(twice_g_distortion, mapping[1] / (far * far)),
+                                spread,
+                            )
                     tau = add(tau, sigma_T)
                     v = fnma(mul(w, tau), E, mul(alpha, restored))  # alpha dL/dalpha
                     E = fma(E, w, add(tau, sigma_T))
                     if wp.static(clamp_straight):
                         raw = scaled(response(power, hit), q[5])
-                        v = fma(zero, v, mul(raw, inverse(at_least(alpha, ALPHA_MIN))))  # o G / alpha
+                        # o G / alpha
+                        v = fma(zero, v, mul(raw, inverse(at_least(alpha, ALPHA_MIN))))
                     else:
                         v = keep_below(v, alpha, ALPHA_MAX)
                     if wp.static(cooperative):
@@ -330,8 +396,26 @@ def make_composite_backward(
                         store_values(memory, behind, n - 1, v, w, w2, g_d)
                         if wp.static(more):
                             add_more(more_splats, i, w, g3, g4, g5)
-                    add_moments(grad_splats, i, v, dx, dy, alpha, w, w2, g0, g1, g2, g_re, g_im, g_amplitude, g_d)
+                    add_moments(
+                        grad_splats,
+                        i,
+                        v,
+                        dx,
+                        dy,
+                        alpha,
+                        w,
+                        w2,
+                        g0,
+                        g1,
+                        g2,
+                        g_re,
+                        g_im,
+                        g_amplitude,
+                        g_d,
+                    )
             if wp.static(cooperative):
-                accumulate_round(memory, grad_splats, more_splats, ids, top, at, wp.min(count - at, ROUND), x, y)
+                accumulate_round(
+                    memory, grad_splats, more_splats, ids, top, at, wp.min(count - at, ROUND), x, y
+                )
 
     return composite_backward

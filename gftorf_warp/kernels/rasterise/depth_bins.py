@@ -1,14 +1,17 @@
-"""Depth order of few splats without a sort: depth keys are counted into bins, and compared within a bin.
+"""Depth order of few splats without a sort: depth keys are counted into bins, and compared within a
+bin.
 
-A radix sort of 20,000 keys takes a pass over all of them for every eight bits, each of which waits for the one before.
-Here a bin is the highest bits of a key. The first place of a bin is a sum over the bins before it; within a bin every
-splat counts those in front of it: with a smaller key, or an equal one and a smaller index, one comparison of both in 64
-bits. Culled splats have one more bin, which is not ordered.
+A radix sort of 20,000 keys takes a pass over all of them for every eight bits, each of which waits
+for the one before. Here a bin is the highest bits of a key. The first place of a bin is a sum over
+the bins before it; within a bin every splat counts those in front of it: with a smaller key, or an
+equal one and a smaller index, one comparison of both in 64 bits. Culled splats have one more bin,
+which is not ordered.
 """
 
 import warp as wp
 
-BINS = 1 << 16  # of splats that are not culled; a wall that faces the camera fills few of them, which takes longest
+# of splats that are not culled; a wall that faces the camera fills few of them, which takes longest
+BINS = 1 << 16
 COUNTS = BINS + 2  # one more for culled splats, and the end
 
 
@@ -45,7 +48,8 @@ def fill_bins(
     first: wp.array[int],  # [COUNTS] first place of each bin
     places: wp.array[wp.int32],  # [N] of each splat in its bin
     # Out:
-    members: wp.array[wp.int64],  # [N] key and index of every splat in the upper and the lower half, bin by bin
+    members: wp.array[wp.int64],  # [N] key and index of every splat in the upper and the lower
+    #  half, bin by bin
 ):
     """A thread per splat."""
     n = wp.tid()

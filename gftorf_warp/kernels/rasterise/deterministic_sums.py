@@ -1,8 +1,8 @@
 """Deterministic gradients: one gradient record per (tile, splat) pair, summed in a fixed order.
 
-The adjoint of the compositor adds to the record of a splat from many tiles, in an undefined order. With a record per
-pair there is a single writer; the records of a splat are then summed in the order in which its pairs were written,
-which depends on the splats alone.
+The adjoint of the compositor adds to the record of a splat from many tiles, in an undefined order.
+With a record per pair there is a single writer; the records of a splat are then summed in the order
+in which its pairs were written, which depends on the splats alone.
 """
 
 import warp as wp
@@ -16,7 +16,8 @@ def number_pairs(
     total: wp.array[int],  # [1] number of pairs, also of those that do not fit
     capacity: int,  # pairs that fit [1]
     # Out:
-    ids: wp.array[wp.int32],  # [>= capacity] splat of each pair as written; replaced by the number of the pair
+    ids: wp.array[wp.int32],  # [>= capacity] splat of each pair as written; replaced by the number
+    #  of the pair
     owners: wp.array[wp.int32],  # [capacity] splat of each pair; 0 where there is none
 ):
     """One thread per pair that fits."""

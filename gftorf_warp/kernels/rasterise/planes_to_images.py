@@ -1,10 +1,12 @@
 """Planes in tile order to row-major images, with quads and background; and the adjoint.
 
-    quad_q = light . (cos theta_q, sin theta_q, b) + T_e background,   phasor = eta light + T_e background
+    quad_q = light . (cos theta_q, sin theta_q, b) + T_e background
+    phasor = eta light + T_e background
     colour = channels + T_e background,   opacity = 1 - T_e,   distortion = factor * (half sum)
 
-(method, section 2.6). Everything is linear in light and T_e: whatever the number of quads, the compositor gets back
-three gradients of the light and one of T_e per pixel. Each output has its own pair of kernels; the adjoints add up.
+(method, section 2.6). Everything is linear in light and T_e: whatever the number of quads, the
+compositor gets back three gradients of the light and one of T_e per pixel. Each output has its own
+pair of kernels; the adjoints add up.
 """
 
 import warp as wp
@@ -39,7 +41,9 @@ def slot(x: int, y: int, tiling: Tiling) -> int:
     block = ((in_y >> side) << (tiling.width_log2 - side)) + (in_x >> side)
     mask = (1 << side) - 1
     return (
-        (tile << (tiling.width_log2 + tiling.height_log2)) + (((block << side) + (in_y & mask)) << side) + (in_x & mask)
+        (tile << (tiling.width_log2 + tiling.height_log2))
+        + (((block << side) + (in_y & mask)) << side)
+        + (in_x & mask)
     )
 
 
@@ -108,7 +112,8 @@ def fold_dc_offset(
     tiling: Tiling,  # order of the pixels [px]
     grad_quads: wp.array3d[float],  # [Q, H, W]
     # Out:
-    grad_rows: wp.array[wp.float64],  # [H] contribution of each row to the derivative by the DC offset
+    grad_rows: wp.array[wp.float64],  # [H] contribution of each row to the derivative by the DC
+    #  offset
 ):
     """One thread per row: sum of amplitude times gradient, in double precision."""
     y = wp.tid()

@@ -1,6 +1,8 @@
-"""Gaussians to splats: activation, projection, reflectivity and light of each, and its place in the depth order.
+"""Gaussians to splats: activation, projection, reflectivity and light of each, and its place in the
+depth order.
 
-There is no loop that carries a value, so Warp's own adjoint of this kernel is exact (method, sections 3.3-3.5).
+There is no loop that carries a value, so Warp's own adjoint of this kernel is exact (method,
+sections 3.3-3.5).
 """
 
 import functools
@@ -21,26 +23,33 @@ BLOCK_RADIUS = wp.constant(
 
 @wp.func
 def visit_of(opacity: float, cov: wp.vec4) -> wp.vec2:
-    """(low, limit) of a record: low is the power at alpha 1/255; limit, conservative, decides which blocks are visited.
+    """(low, limit) of a record: low is the power at alpha 1/255; limit, conservative, decides which
+    blocks are visited.
 
-    With K the conic, sqrt(v K v) is a norm: it changes by at most sqrt(largest eigenvalue) times the distance. So where
-    it exceeds sqrt(cutoff) by that much at the middle of a block, no pixel centre of the block lies inside the ellipse.
+    With K the conic, sqrt(v K v) is a norm: it changes by at most sqrt(largest eigenvalue) times
+    the distance. So where it exceeds sqrt(cutoff) by that much at the middle of a block, no pixel
+    centre of the block lies inside the ellipse.
     """
     cutoff = 2.0 * wp.log(opacity / ALPHA_MIN)
     middle = 0.5 * (cov[0] + cov[2])
-    smallest = cov[3] / (middle + wp.sqrt(wp.max(middle * middle - cov[3], 0.0)))  # variance of the narrow axis
+    # variance of the narrow axis
+    smallest = cov[3] / (middle + wp.sqrt(wp.max(middle * middle - cov[3], 0.0)))
     reach = wp.sqrt(wp.max(cutoff, 0.0) + 1.0e-5) + BLOCK_RADIUS / wp.sqrt(smallest)
     return wp.vec2(-0.5 * cutoff, -0.50005 * reach * reach - 1.0e-3)
 
 
 @wp.func_grad(visit_of)
 def adj_visit_of(opacity: float, cov: wp.vec4, adj_ret: wp.vec2):
-    """No derivative: slots 6 and 7 of a gradient record are free to count pixels and to sum weights."""
+    """No derivative: slots 6 and 7 of a gradient record are free to count pixels and to sum
+    weights.
+    """
 
 
 @wp.func
 def box_of(view: CameraView, x: float, y: float, cov: wp.vec4, cutoff: float) -> wp.vec4i:
-    """Pixels [x0, y0, x1, y1) of the image whose centres lie in the bounding box of the ellipse alpha >= 1/255."""
+    """Pixels [x0, y0, x1, y1) of the image whose centres lie in the bounding box of the ellipse
+    alpha >= 1/255.
+    """
     reach_x = wp.sqrt(wp.max(cutoff, 0.0) * cov[0]) * 1.0001 + 1.0e-3
     reach_y = wp.sqrt(wp.max(cutoff, 0.0) * cov[2]) * 1.0001 + 1.0e-3
     w = float(view.width)
@@ -55,9 +64,11 @@ def box_of(view: CameraView, x: float, y: float, cov: wp.vec4, cutoff: float) ->
 
 @wp.func
 def square_of(view: CameraView, x: float, y: float, cov: wp.vec4) -> wp.vec4i:
-    """Pixels [x0, y0, x1, y1) of the 3-sigma square rounded out to 16-pixel tiles, as the released code has it.
+    """Pixels [x0, y0, x1, y1) of the 3-sigma square rounded out to 16-pixel tiles, as the released
+    code has it.
 
-    That code counts from integer pixel centres, so ``x`` and ``y`` are image positions less half a pixel.
+    That code counts from integer pixel centres, so ``x`` and ``y`` are image positions less half a
+    pixel.
     """
     middle = 0.5 * (cov[0] + cov[2])
     determinant = cov[3]
@@ -81,11 +92,13 @@ def make_project(colour: bool, square: bool, lens: bool = False):
         lens: Whether the camera is no pinhole.
     """
 
-    @wp.kernel(module="unique", module_options={"fast_math": False})  # __sinf would lose the phase beyond +-pi
+    # __sinf would lose the phase beyond +-pi
+    @wp.kernel(module="unique", module_options={"fast_math": False})
     def project(
         # In:
         view: wp.array[CameraView],  # [1] the camera [m, px]
-        calibration: wp.array[float],  # [4] phase slope [rad/m], phase offset [rad], source intensity [1], DC offset
+        calibration: wp.array[float],  # [4] phase slope [rad/m], phase offset [rad], source
+        #  intensity [1], DC offset
         degree: int,  # harmonics above it are ignored [0..3]
         depth_shift: int,  # lowest bits of a z-depth that its key leaves out [1]
         depth_culled: int,  # depth key of what is culled, behind all others [1]
@@ -97,8 +110,10 @@ def make_project(colour: bool, square: bool, lens: bool = False):
         colour_sh: wp.array2d[wp.vec3],  # [N, 16] harmonics of RGB; [0, 0] without colour
         # Out:
         splats: wp.array[Splat],  # [N] records, see splat.py; undefined where culled
-        box_px: wp.array[wp.vec4i],  # [N] x0, y0, x1, y1 of the pixels a splat may touch [px]; x1 = 0: culled
-        depth_key: wp.array[wp.int32],  # [>= N] floats from the nearest z-depth to this one, without the lowest bits
+        box_px: wp.array[wp.vec4i],  # [N] x0, y0, x1, y1 of the pixels a splat may touch [px]; x1 =
+        #  0: culled
+        depth_key: wp.array[wp.int32],  # [>= N] floats from the nearest z-depth to this one,
+        #  without the lowest bits
         order: wp.array[wp.int32],  # [>= N] 0, 1, 2, ...
     ):
         """One thread per Gaussian."""
@@ -128,7 +143,10 @@ def make_project(colour: bool, square: bool, lens: bool = False):
         if wp.static(square):
             outer = square_of(camera, x - 0.5, y - 0.5, cov)
             box = wp.vec4i(
-                wp.max(box[0], outer[0]), wp.max(box[1], outer[1]), wp.min(box[2], outer[2]), wp.min(box[3], outer[3])
+                wp.max(box[0], outer[0]),
+                wp.max(box[1], outer[1]),
+                wp.min(box[2], outer[2]),
+                wp.min(box[3], outer[3]),
             )
         if box[2] <= box[0] or box[3] <= box[1]:
             return

@@ -1,13 +1,15 @@
-"""Splat records, and gradients of them, through shared memory: sixteen entries of a tile's list at a time.
+"""Splat records, and gradients of them, through shared memory: sixteen entries of a tile's list at
+a time.
 
-A list is processed in rounds of ``ROUND`` entries. While a warp computes one round, the records of the next one are
-copied from global to shared memory asynchronously (cp.async), two lanes per record; every lane then reads the same
-record, a broadcast. In the backward pass each lane stores the contributions of its pixel to the records of a round in
-shared memory; for the sums over pixels, a lane is assigned one record and one half of the tile. That costs a fifth of
-a warp reduction per record.
+A list is processed in rounds of ``ROUND`` entries. While a warp computes one round, the records of
+the next one are copied from global to shared memory asynchronously (cp.async), two lanes per
+record; every lane then reads the same record, a broadcast. In the backward pass each lane stores
+the contributions of its pixel to the records of a round in shared memory; for the sums over pixels,
+a lane is assigned one record and one half of the tile. That costs a fifth of a warp reduction per
+record.
 
-On a CPU there is no shared memory: records are read directly, and the other functions do nothing. All 32 lanes of a
-warp must call each function together.
+On a CPU there is no shared memory: records are read directly, and the other functions do nothing.
+All 32 lanes of a warp must call each function together.
 """
 
 import functools
@@ -18,16 +20,20 @@ import warp as wp
 from .simd import make_lanes
 from .splat import Splat
 
-ROUND = wp.constant(16)  # entries of a list that are fetched, and whose gradients are summed, together
+# entries of a list that are fetched, and whose gradients are summed, together
+ROUND = wp.constant(16)
 GROUP = wp.constant(4)  # of a round that are unrolled together, so that their instructions overlap
-STRIDE = 36  # floats from the values of one entry to those of the next: 4-float reads of 8 lanes meet all 32 banks
+# floats from the values of one entry to those of the next: 4-float reads of 8 lanes meet all 32
+# banks
+STRIDE = 36
 OUT_STRIDE = 20  # the same for gradient records
 PIXELS = 32  # of a tile
 HIT = 1.0e30  # times the smallest weight of a pixel that is reached, 4e-9, it is far above 1
 
 _RECORDS = 2 * ROUND * 16  # two buffers of records [floats]
 _MORE = 2 * ROUND * 4  # two buffers of further channels [floats]
-# adds four floats where any is not zero; slot 11 of further channels gets 0.0, which changes nothing
+# adds four floats where any is not zero; slot 11 of further channels gets 0.0, which changes
+# nothing
 _ADD4 = """auto add4 = [](float* to, float4 v, bool wanted) {
         if (!wanted || (v.x == 0.0f && v.y == 0.0f && v.z == 0.0f && v.w == 0.0f)) return;
 #if __CUDA_ARCH__ >= 900
@@ -37,11 +43,14 @@ _ADD4 = """auto add4 = [](float* to, float4 v, bool wanted) {
         atomicAdd(to, v.x); atomicAdd(to + 1, v.y); atomicAdd(to + 2, v.z); atomicAdd(to + 3, v.w);
 #endif
     };"""
-_CHECK = f'static_assert({ROUND} == 16 && {PIXELS} == 32, "two lanes per record, two halves of a tile");'
+_CHECK = (
+    f'static_assert({ROUND} == 16 && {PIXELS} == 32, "two lanes per record, two halves of a tile");'
+)
 
 
 def shared_floats(values: int, derivatives: int) -> int:
-    """Floats of shared memory of a warp: two buffers of records, and the values of the backward pass.
+    """Floats of shared memory of a warp: two buffers of records, and the values of the backward
+    pass.
 
     Args:
         values: Values per pixel and entry of a round.
@@ -66,7 +75,8 @@ def make_batches(values: int = 0, derivatives: int = 0, more: bool = False) -> S
 #if defined(__CUDA_ARCH__)
     {_CHECK}
     __shared__ __align__(16) float memory[{floats}];
-    return (wp::uint64)(memory + (threadIdx.x >> 5) * {floats});  // the only warp: 0, but not to the register allocator
+    // the only warp: 0, but not to the register allocator
+    return (wp::uint64)(memory + (threadIdx.x >> 5) * {floats});
 #else
     return 0;
 #endif
@@ -96,17 +106,21 @@ def make_batches(values: int = 0, derivatives: int = 0, more: bool = False) -> S
 #endif
 """)
 def entry(ids: wp.array[int], start: int, step: int, at: int, count: int) -> int:
-    """The splat whose record this lane fetches for the round that begins at entry ``at`` of ``count``; -1: none."""
+    """The splat whose record this lane fetches for the round that begins at entry ``at`` of
+    ``count``; -1: none.
+    """
 
 
 @wp.func_native(f"""
 #if defined(__CUDA_ARCH__)
     const unsigned lane = threadIdx.x & 31u;  // a pair of lanes fetches a record, 32 bytes each
-    const float4* from = reinterpret_cast<const float4*>(splats.data + (i < 0 ? 0 : i)) + 2 * (lane & 1u);
+    const float4* from = reinterpret_cast<const float4*>(splats.data + (i < 0 ? 0 : i)) + 2
+        * (lane & 1u);
     float4* to = reinterpret_cast<float4*>(memory) + (at / {ROUND} & 1) * {4 * ROUND} + 2 * lane;
 #if __CUDA_ARCH__ >= 800
     const unsigned target = (unsigned)__cvta_generic_to_shared(to), bytes = i < 0 ? 0u : 16u;
-    asm volatile("cp.async.cg.shared.global [%0], [%1], 16, %2;" :: "r"(target), "l"(from), "r"(bytes) : "memory");
+    asm volatile("cp.async.cg.shared.global [%0], [%1], 16, %2;" :: "r"(target), "l"(from),
+        "r"(bytes) : "memory");
     asm volatile("cp.async.cg.shared.global [%0], [%1], 16, %2;"
                  :: "r"(target + 16), "l"(from + 1), "r"(bytes) : "memory");
 #else
@@ -117,7 +131,8 @@ def entry(ids: wp.array[int], start: int, step: int, at: int, count: int) -> int
 #endif
 """)
 def fetch_records(memory: wp.uint64, splats: wp.array[Splat], i: int, at: int):
-    """Start copying the records of the round that begins at entry ``at``, of which ``i`` is this lane's.
+    """Start copying the records of the round that begins at entry ``at``, of which ``i`` is this
+    lane's.
 
     Without a record zeros are copied, which have no effect: their power is never above ``low``.
     """
@@ -128,17 +143,20 @@ def fetch_records(memory: wp.uint64, splats: wp.array[Splat], i: int, at: int):
     const unsigned lane = threadIdx.x & 31u;
     if (lane & 1u) return;  // 16 bytes of a record, the channels, are one lane's work
     const float4* from = reinterpret_cast<const float4*>(records.data + (i < 0 ? 0 : i)) + 2;
-    float4* to = reinterpret_cast<float4*>(memory) + {_RECORDS // 4} + (at & {2 * ROUND - 1}) + (lane >> 1);
+    float4* to = reinterpret_cast<float4*>(memory) + {_RECORDS // 4} + (at & {2 * ROUND - 1})
+        + (lane >> 1);
 #if __CUDA_ARCH__ >= 800
     const unsigned target = (unsigned)__cvta_generic_to_shared(to), bytes = i < 0 ? 0u : 16u;
-    asm volatile("cp.async.cg.shared.global [%0], [%1], 16, %2;" :: "r"(target), "l"(from), "r"(bytes) : "memory");
+    asm volatile("cp.async.cg.shared.global [%0], [%1], 16, %2;" :: "r"(target), "l"(from),
+        "r"(bytes) : "memory");
 #else
     to[0] = i < 0 ? make_float4(0.0f, 0.0f, 0.0f, 0.0f) : __ldg(from);
 #endif
 #endif
 """)
 def fetch_more(memory: wp.uint64, records: wp.array[Splat], i: int, at: int):
-    """Start copying three further channels, slots 8-10 of other records, as :func:`ask` does for the records.
+    """Start copying three further channels, slots 8-10 of other records, as :func:`ask` does for
+    the records.
 
     Zeros where there is none: NaN times a weight of 0 would be NaN.
     """
@@ -149,7 +167,8 @@ def fetch_more(memory: wp.uint64, records: wp.array[Splat], i: int, at: int):
 #if __CUDA_ARCH__ >= 800
     asm volatile("cp.async.wait_all;" ::: "memory");
 #endif
-    __syncwarp();  // the records of all lanes have arrived, and no lane reads the previous round any more
+    // the records of all lanes have arrived, and no lane reads the previous round any more
+    __syncwarp();
 #endif
 """)
 def wait_for_records():
@@ -158,7 +177,8 @@ def wait_for_records():
 
 @wp.func_native(f"""
 #if defined(__CUDA_ARCH__)
-    const float4* line = reinterpret_cast<const float4*>(memory) + (first & {2 * ROUND - 1}) * 4 + n * 4;
+    const float4* line = reinterpret_cast<const float4*>(memory) + (first & {2 * ROUND - 1}) * 4 + n
+        * 4;
     wp::vec_t<16, float> record;
     for (int part = 0; part < 4; ++part) {{
         const float4 four = line[part];
@@ -171,15 +191,24 @@ def wait_for_records():
 #endif
 """)
 def record_of(
-    memory: wp.uint64, first: int, n: int, splats: wp.array[Splat], ids: wp.array[int], k: int, there: bool
+    memory: wp.uint64,
+    first: int,
+    n: int,
+    splats: wp.array[Splat],
+    ids: wp.array[int],
+    k: int,
+    there: bool,
 ) -> Splat:
-    """The record of entry ``n`` of the group that begins at entry ``first``; number ``k`` of the pairs, if any."""
+    """The record of entry ``n`` of the group that begins at entry ``first``;
+    number ``k`` of the pairs, if any.
+    """
 
 
 @wp.func_native(
     f"""
 #if defined(__CUDA_ARCH__)
-    const float4 four = (reinterpret_cast<const float4*>(memory) + {_RECORDS // 4})[at & {2 * ROUND - 1}];
+    const float4 four = (reinterpret_cast<const float4*>(memory) + {_RECORDS // 4})[at
+        & {2 * ROUND - 1}];
     return wp::vec_t<3, float>(four.x, four.y, four.z);
 #else
     if (!there) return wp::vec_t<3, float>(0.0f);
@@ -188,7 +217,9 @@ def record_of(
 #endif
 """.replace("Splat&", "wp::vec_t<16, float>&")
 )
-def more_of(memory: wp.uint64, at: int, records: wp.array[Splat], ids: wp.array[int], k: int, there: bool) -> wp.vec3:
+def more_of(
+    memory: wp.uint64, at: int, records: wp.array[Splat], ids: wp.array[int], k: int, there: bool
+) -> wp.vec3:
     """The further channels of entry ``at``, which is number ``k`` of the pairs."""
 
 
@@ -196,21 +227,24 @@ def more_of(memory: wp.uint64, at: int, records: wp.array[Splat], ids: wp.array[
 def make_gradient_rounds(
     tile_width: int, light: bool, channels: bool, geometry: bool, spreads: bool, more: bool = False
 ) -> SimpleNamespace:
-    """Functions that sum the gradients of the entries of a round over the 32 pixels of a tile, one per lane.
+    """Functions that sum the gradients of the entries of a round over the 32 pixels of a tile, one
+    per lane.
 
     Args:
         tile_width: Columns of a tile [px]; each half of its 32 pixels is whole rows.
         light: Whether the light has gradients.
         channels: Whether the three channels have.
         geometry: Whether centre, conic and opacity have.
-        spreads: Whether the distortion has; then the derivative of the distance differs from entry to entry.
+        spreads: Whether the distortion has; then the derivative of the distance differs from entry
+            to entry.
         more: Whether three further channels have gradients, in other records.
     """
     half = PIXELS // 2
     if half % tile_width:
         raise ValueError(f"half of a tile must be whole rows, got {tile_width} columns")
     V = make_lanes(1).V
-    kept = ["w"] + ["v"] * geometry + ["w2"] * light + ["wd"] * spreads  # values per pixel and entry
+    # values per pixel and entry
+    kept = ["w"] + ["v"] * geometry + ["w2"] * light + ["wd"] * spreads
     derivatives = light + channels + more
     floats = shared_floats(len(kept), derivatives)
     kept_at = _RECORDS + 4 * PIXELS * derivatives
@@ -230,11 +264,24 @@ def make_gradient_rounds(
 
     @wp.func_native(derivatives_snippet)
     def store_derivatives(
-        memory: wp.uint64, g0: V, g1: V, g2: V, g_re: V, g_im: V, g_amplitude: V, g_distance: V, g3: V, g4: V, g5: V
+        memory: wp.uint64,
+        g0: V,
+        g1: V,
+        g2: V,
+        g_re: V,
+        g_im: V,
+        g_amplitude: V,
+        g_distance: V,
+        g3: V,
+        g4: V,
+        g5: V,
     ):
         """Store the derivatives by this lane's pixel; read after the next barrier."""
 
-    stores = [f"to[{n * ROUND * STRIDE}] = {name}[0]{' * g_d[0]' * (name == 'wd')};" for n, name in enumerate(kept)]
+    stores = [
+        f"to[{n * ROUND * STRIDE}] = {name}[0]{' * g_d[0]' * (name == 'wd')};"
+        for n, name in enumerate(kept)
+    ]
     stores = [store.replace("wd[0]", "w[0]") for store in stores]
 
     values_snippet = f"""
@@ -247,14 +294,20 @@ def make_gradient_rounds(
 
     @wp.func_native(values_snippet)
     def store_values(memory: wp.uint64, first: int, n: int, v: V, w: V, w2: V, g_d: V):
-        """Store the values of this lane's pixel for entry ``n`` of the group that begins at entry ``first``."""
+        """Store the values of this lane's pixel for entry ``n`` of the group that begins at entry
+        ``first``.
+        """
 
     take = "\n        ".join(
         f"const float4 {name}4 = from[{(n * ROUND * STRIDE) // 4} + part];"
         f" const float {name}_[4] = {{{name}4.x, {name}4.y, {name}4.z, {name}4.w}};"
         for n, name in enumerate(kept)
     )
-    moments = "const float vx = v_[j] * dx[c]; row0 += v_[j]; row1 += vx; row2 += vx * dx[c];" if geometry else ""
+    moments = (
+        "const float vx = v_[j] * dx[c]; row0 += v_[j]; row1 += vx; row2 += vx * dx[c];"
+        if geometry
+        else ""
+    )
     end_of_row = (
         """if (c == WIDTH - 1) {
                 sums[0] += row1; sums[1] += row0 * dy; sums[2] += row2; sums[3] += row1 * dy;
@@ -264,16 +317,27 @@ def make_gradient_rounds(
         else ""
     )
     lit = "const float4 g = pixel[4 * part + j];" if light else ""
-    lit += " sums[11] += w2_[j] * g.x; sums[12] += w2_[j] * g.y; sums[13] += w2_[j] * g.z;" if light else ""
+    lit += (
+        " sums[11] += w2_[j] * g.x; sums[12] += w2_[j] * g.y; sums[13] += w2_[j] * g.z;"
+        if light
+        else ""
+    )
     lit += (" sums[14] += wd_[j];" if spreads else " sums[14] += w_[j] * g.w;") if light else ""
     coloured = f"const float4 h = pixel[{PIXELS * light} + 4 * part + j];" if channels else ""
-    coloured += " sums[8] += w_[j] * h.x; sums[9] += w_[j] * h.y; sums[10] += w_[j] * h.z;" if channels else ""
-    further = f"const float4 m = pixel[{PIXELS * (light + channels)} + 4 * part + j];" if more else ""
+    coloured += (
+        " sums[8] += w_[j] * h.x; sums[9] += w_[j] * h.y; sums[10] += w_[j] * h.z;"
+        if channels
+        else ""
+    )
+    further = (
+        f"const float4 m = pixel[{PIXELS * (light + channels)} + 4 * part + j];" if more else ""
+    )
     further += " more0 += w_[j] * m.x; more1 += w_[j] * m.y; more2 += w_[j] * m.z;" if more else ""
 
     add_more = f"""
     const float4 m0 = *reinterpret_cast<const float4*>(kept + s * {OUT_STRIDE} + 16);
-    const float4 m1 = *reinterpret_cast<const float4*>(kept + s * {OUT_STRIDE} + 16 + {ROUND * OUT_STRIDE});
+    const float4 m1 = *reinterpret_cast<const float4*>(kept + s * {OUT_STRIDE} + 16
+        + {ROUND * OUT_STRIDE});
     add4(reinterpret_cast<float*>(more.data + i) + 8,
          make_float4(m0.x + m1.x, m0.y + m1.y, m0.z + m1.z, 0.0f), upper == 0 && s < n);
 """
@@ -281,7 +345,8 @@ def make_gradient_rounds(
 #if defined(__CUDA_ARCH__)
     {places}
     {_ADD4}
-    const int s = lane & 15, upper = lane >> 4;  // this lane sums entry s of the round over one half of the tile
+    // this lane sums entry s of the round over one half of the tile
+    const int s = lane & 15, upper = lane >> 4;
     const int i = ids.data[start - at - (s < n ? s : n - 1)];
     __syncwarp();  // the values of all lanes are stored
     const float* const q = mine + ((at + s) & {2 * ROUND - 1}) * 16;
@@ -289,9 +354,12 @@ def make_gradient_rounds(
     for (int c = 0; c < {tile_width}; ++c)
         dx[c] = q[0] - (x[0] - (float)(lane % {tile_width}) + (float)c);
     float dy = q[1] - (y[0] - (float)(lane / {tile_width}) + (float)(upper * {half // tile_width}));
-    float sums[16] = {{}}, row0 = 0.0f, row1 = 0.0f, row2 = 0.0f, more0 = 0.0f, more1 = 0.0f, more2 = 0.0f;
-    const float4* const from = reinterpret_cast<const float4*>(kept + s * {STRIDE} + upper * {half});
-    const float4* const pixel = reinterpret_cast<const float4*>(mine) + {_RECORDS // 4} + upper * {half};
+    float sums[16] = {{}}, row0 = 0.0f, row1 = 0.0f, row2 = 0.0f, more0 = 0.0f, more1 = 0.0f,
+        more2 = 0.0f;
+    const float4* const from = reinterpret_cast<const float4*>(kept + s * {STRIDE} + upper
+        * {half});
+    const float4* const pixel = reinterpret_cast<const float4*>(mine) + {_RECORDS // 4} + upper
+        * {half};
     #pragma unroll
     for (int part = 0; part < {half // 4}; ++part) {{
         {take}
@@ -310,13 +378,16 @@ def make_gradient_rounds(
     float4* const out = reinterpret_cast<float4*>(kept + (upper * {ROUND} + s) * {OUT_STRIDE});
     #pragma unroll
     for (int part = 0; part < 4; ++part)
-        out[part] = make_float4(sums[4 * part], sums[4 * part + 1], sums[4 * part + 2], sums[4 * part + 3]);
+        out[part] = make_float4(sums[4 * part], sums[4 * part + 1], sums[4 * part + 2],
+            sums[4 * part + 3]);
     {"out[4] = make_float4(more0, more1, more2, 0.0f);" if more else ""}
     __syncwarp();  // all sums are there; four lanes add one 64-byte line
     #pragma unroll
     for (int eighth = 0; eighth < 2; ++eighth) {{
-        const int of = 8 * eighth + (lane >> 2), quarter = lane & 3, to = __shfl_sync(0xffffffffu, i, of);
-        const float4* const both = reinterpret_cast<const float4*>(kept + of * {OUT_STRIDE}) + quarter;
+        const int of = 8 * eighth + (lane >> 2), quarter = lane & 3, to =
+            __shfl_sync(0xffffffffu, i, of);
+        const float4* const both = reinterpret_cast<const float4*>(kept + of * {OUT_STRIDE})
+            + quarter;
         const float4 a = both[0], b = both[{ROUND * OUT_STRIDE // 4}];
         add4(reinterpret_cast<float*>(grads.data + to) + 4 * quarter,
              make_float4(a.x + b.x, a.y + b.y, a.z + b.z, a.w + b.w), of < n);
@@ -328,10 +399,12 @@ def make_gradient_rounds(
 
     @wp.func_native(round_snippet)
     def accumulate_round(
-        memory: wp.uint64, grads: wp.array[Splat], more: wp.array[Splat], ids: wp.array[int], start: int, at: int,
-        n: int, x: V, y: V,
+        memory: wp.uint64, grads: wp.array[Splat], more: wp.array[Splat], ids: wp.array[int],
+        start: int, at: int, n: int, x: V, y: V,
     ):  # fmt: skip
-        """Sum the ``n`` entries of the round that began at entry ``at`` over pixels, and add them to their records."""
+        """Sum the ``n`` entries of the round that began at entry ``at`` over pixels,
+        and add them to their records.
+        """
 
     fetch = make_batches(len(kept), derivatives)
     return SimpleNamespace(

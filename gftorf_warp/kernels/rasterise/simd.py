@@ -1,8 +1,10 @@
-"""SIMD arithmetic on the K pixels of a thread: one expression, a clang vector on the CPU, scalars on CUDA.
+"""SIMD arithmetic on the K pixels of a thread: one expression, a clang vector on the CPU, scalars
+on CUDA.
 
-A compositor thread owns a block of K pixels. On the CPU K = 16, a block of 4 x 4, and every operation below becomes one
-vector instruction, because Warp runs CPU threads one after the other and LLVM finds no parallelism by itself. On CUDA
-K = 1. Each operation is written once, as a C++ expression over a type ``F``.
+A compositor thread owns a block of K pixels. On the CPU K = 16, a block of 4 x 4, and every
+operation below becomes one vector instruction, because Warp runs CPU threads one after the other
+and LLVM finds no parallelism by itself. On CUDA K = 1. Each operation is written once, as a C++
+expression over a type ``F``.
 """
 
 import functools
@@ -11,9 +13,10 @@ from types import SimpleNamespace
 
 import warp as wp
 
-# e^x for -87 < x <= 0 without libm, which would be called once per lane (3.6 times slower in the forward pass): 2^n
-# times a minimax polynomial of 2^f with f in [-1/2, 1/2], relative error 2.4e-7. Adding 1.5 * 2^23 rounds to an integer
-# and leaves it in the low bits, from where a shift takes it to the exponent.
+# e^x for -87 < x <= 0 without libm, which would be called once per lane (3.6 times slower in the
+# forward pass): 2^n times a minimax polynomial of 2^f with f in [-1/2, 1/2], relative error 2.4e-7.
+# Adding 1.5 * 2^23 rounds to an integer and leaves it in the low bits, from where a shift takes it
+# to the exponent.
 _EXP = """
     auto exp_ = [](F x) -> F {
         const F y = x * 1.44269504f, shifted = y + 12582912.0f, f = y - (shifted - 12582912.0f);
@@ -31,7 +34,8 @@ _EXP = """
     };
 """
 
-# 1 / x by the processor's 14-bit estimate and one Newton step, 2 ulp; a 16-lane division takes four times as long
+# 1 / x by the processor's 14-bit estimate and one Newton step, 2 ulp; a 16-lane division takes four
+# times as long
 _INVERSE = """
 #if defined(__AVX512F__)
     auto inverse_ = [](F x) -> F {
@@ -129,11 +133,15 @@ def of_lane(x: int, lane: int) -> int:
 
 @wp.func_native(_LANE_BEYOND)
 def lane_beyond(sums: int, bound: int) -> int:
-    """The first lane whose ``sums``, which ascend with the lane, is greater than ``bound``; the last one if none is."""
+    """The first lane whose ``sums``, which ascend with the lane, is greater than ``bound``;
+    the last one if none is.
+    """
 
 
 def types_of(K: int) -> str:
-    """C++ that defines ``F``, what an operation works on, and ``load`` and ``store``, from and to a Warp vector."""
+    """C++ that defines ``F``, what an operation works on, and ``load`` and ``store``,
+    from and to a Warp vector.
+    """
     if K == 1:
         return """
     typedef float F;
@@ -142,12 +150,16 @@ def types_of(K: int) -> str:
     return f"""
     typedef float F __attribute__((ext_vector_type({K})));
     typedef int I __attribute__((ext_vector_type({K})));
-    auto load = [](const wp::vec_t<{K}, float>& v) -> F {{ F x; __builtin_memcpy(&x, &v, sizeof(x)); return x; }};
-    auto store = [](F x) {{ wp::vec_t<{K}, float> v; __builtin_memcpy(&v, &x, sizeof(x)); return v; }};"""
+    auto load = [](const wp::vec_t<{K}, float>& v) -> F {{ F x; __builtin_memcpy(&x, &v, sizeof(x));
+    return x; }};
+    auto store = [](F x) {{ wp::vec_t<{K}, float> v; __builtin_memcpy(&v, &x, sizeof(x)); return v;
+    }};"""
 
 
 def _elementwise(K: int, vectors: str, expression: str, prelude: str = "") -> str:
-    """C++ body of an operation; ``vectors`` names its K-wide arguments, other arguments are scalars."""
+    """C++ body of an operation; ``vectors`` names its K-wide arguments,
+    other arguments are scalars.
+    """
     names = vectors.split()
     body = expression if "return" in expression else f"return {expression};"
     return f"""{types_of(K)}{prelude}
@@ -168,7 +180,8 @@ def _reduction(K: int, scalar: str, vector: str) -> str:
 def make_lanes(K: int) -> SimpleNamespace:
     """The operations for K pixels per thread, and their type ``V``.
 
-    Plain Warp arithmetic on 16-vectors is right too, but keeps LLVM busy for a minute and runs slower.
+    Plain Warp arithmetic on 16-vectors is right too, but keeps LLVM busy for a minute and runs
+    slower.
     """
     if K not in (1, 16):
         raise ValueError(f"K must be 1 (CUDA) or 16 (CPU), got {K}")
@@ -177,9 +190,15 @@ def make_lanes(K: int) -> SimpleNamespace:
 
     @wp.func_native(_elementwise(K, "", "(F)(x)"))
     def fill(x: float) -> V: ...
-    @wp.func_native(f"wp::vec_t<{K}, float> r; for (int c = 0; c < {K}; ++c) r[c] = x + (float)(c % {side}); return r;")
+    @wp.func_native(
+        f"wp::vec_t<{K}, float> r; for (int c = 0; c < {K}; ++c) r[c] = x + "
+        f"(float)(c % {side}); return r;"
+    )
     def columns(x: float) -> V: ...
-    @wp.func_native(f"wp::vec_t<{K}, float> r; for (int c = 0; c < {K}; ++c) r[c] = y + (float)(c / {side}); return r;")
+    @wp.func_native(
+        f"wp::vec_t<{K}, float> r; for (int c = 0; c < {K}; ++c) r[c] = y + "
+        f"(float)(c / {side}); return r;"
+    )
     def rows(y: float) -> V: ...
     @wp.func_native(_elementwise(K, "a", "a * s + t"))
     def affine(a: V, s: float, t: float) -> V: ...
@@ -199,7 +218,9 @@ def make_lanes(K: int) -> SimpleNamespace:
     def fma(a: V, b: V, c: V) -> V: ...
     @wp.func_native(_elementwise(K, "a b c", "a - b * c"))
     def fnma(a: V, b: V, c: V) -> V: ...
-    @wp.func_native(_elementwise(K, "a", "1.0f / a" if K == 1 else "inverse_(a)", "" if K == 1 else _INVERSE))
+    @wp.func_native(
+        _elementwise(K, "a", "1.0f / a" if K == 1 else "inverse_(a)", "" if K == 1 else _INVERSE)
+    )
     def inverse(a: V) -> V: ...
     @wp.func_native(_elementwise(K, "a", "a > x ? (F)(1.0f) : (F)(0.0f)"))
     def above(a: V, x: float) -> V: ...
@@ -213,7 +234,9 @@ def make_lanes(K: int) -> SimpleNamespace:
     def set_where(a: V, mask: V, x: float) -> V: ...
     @wp.func_native(_elementwise(K, "dx dy", "(dx * p + dy * q) * dx + (dy * r) * dy"))
     def power_of(dx: V, dy: V, p: float, q: float, r: float) -> V: ...
-    @wp.func_native(_elementwise(K, "power gate", "((power > low) & (gate > 0.0f)) ? (F)(1.0f) : (F)(0.0f)"))
+    @wp.func_native(
+        _elementwise(K, "power gate", "((power > low) & (gate > 0.0f)) ? (F)(1.0f) : (F)(0.0f)")
+    )
     def hits(power: V, gate: V, low: float) -> V: ...
     @wp.func_native(_elementwise(K, "power hit", "hit > 0.0f ? exp_(power) : (F)(0.0f)", exp))
     def response(power: V, hit: V) -> V: ...
@@ -221,7 +244,8 @@ def make_lanes(K: int) -> SimpleNamespace:
         _elementwise(
             K,
             "power hit",
-            "const F x = o * exp_(power), a = x < largest ? x : (F)(largest); return hit > 0.0f ? a : (F)(0.0f);",
+            "const F x = o * exp_(power), a = x < largest ? x : (F)(largest); return hit > 0.0f "
+            "? a : (F)(0.0f);",
             exp,
         )
     )
@@ -236,11 +260,13 @@ def make_lanes(K: int) -> SimpleNamespace:
 
 
 def sums_of(K: int, values: dict[str, str]) -> tuple[str, list[str]]:
-    """C++ that sums ``values``, expressions of type ``F`` by name, over the K pixels, and where the sums are.
+    """C++ that sums ``values``, expressions of type ``F`` by name, over the K pixels, and where the
+    sums are.
 
-    On CUDA they are ``float s[..]`` in order. On the CPU they end up in the lanes of one vector ``F total``, in the
-    order returned ('' is an empty lane): two vectors are folded into one, halves onto halves, until every lane is a
-    finished sum. Expressions are evaluated just before they are folded, which keeps them in registers.
+    On CUDA they are ``float s[..]`` in order. On the CPU they end up in the lanes of one vector ``F
+    total``, in the order returned ('' is an empty lane): two vectors are folded into one, halves
+    onto halves, until every lane is a finished sum. Expressions are evaluated just before they are
+    folded, which keeps them in registers.
     """
     if K == 1:
         return f"const float s[{len(values)}] = {{{', '.join(values.values())}}};", list(values)
@@ -248,21 +274,33 @@ def sums_of(K: int, values: dict[str, str]) -> tuple[str, list[str]]:
         raise ValueError(f"{len(values)} sums do not fit into {K} lanes")
     names, owners = list(values.values()), [[name] * K for name in values]
 
-    def fold(a: str, b: str, owner_a: list[str], owner_b: list[str], group: int) -> tuple[str, list[str], str]:
+    def fold(
+        a: str, b: str, owner_a: list[str], owner_b: list[str], group: int
+    ) -> tuple[str, list[str], str]:
         """The statement that folds two vectors, the lanes of the result, and its name."""
         half = group // 2
         stay = [lane if lane % group < half else K + lane for lane in range(K)]
         move = [lane + half if lane % group < half else K + lane - half for lane in range(K)]
         name = f"x{len(lines)}"
-        parts = [f"__builtin_shufflevector(a{name}, b{name}, {', '.join(map(str, way))})" for way in (stay, move)]
+        parts = [
+            f"__builtin_shufflevector(a{name}, b{name}, {', '.join(map(str, way))})"
+            for way in (stay, move)
+        ]
         statement = f"const F a{name} = {a}, b{name} = {b}, {name} = {parts[0]} + {parts[1]};"
-        return statement, [owner_a[lane] if lane % group < half else owner_b[lane] for lane in range(K)], name
+        return (
+            statement,
+            [owner_a[lane] if lane % group < half else owner_b[lane] for lane in range(K)],
+            name,
+        )
 
     lines: list[str] = []
-    waiting: dict[int, tuple[str, list[str]]] = {}  # group size -> a vector that waits for its partner
+    # group size -> a vector that waits for its partner
+    waiting: dict[int, tuple[str, list[str]]] = {}
 
     def push(name: str, owner: list[str], group: int) -> None:
-        """Fold a vector with the one that waits at its level, and the result one level up, as long as there is one."""
+        """Fold a vector with the one that waits at its level, and the result one level up,
+        as long as there is one.
+        """
         if group > 1 and group not in waiting:
             waiting[group] = name, owner
         elif group > 1:

@@ -1,13 +1,16 @@
-"""The record of a projected Gaussian, and how a compositor reads one and adds to the gradient of one.
+"""The record of a projected Gaussian, and how a compositor reads one and adds to the gradient of
+one.
 
 Sixteen floats, one 64-byte line, the same slots for values and for gradients:
 
     0 x   1 y        image position of the centre [px]
-    2 P   3 Q   4 R  power = P dx^2 + Q dx dy + R dy^2, the logarithm of the Gaussian; minus half the conic [1/px^2]
+    2 P   3 Q   4 R  power = P dx^2 + Q dx dy + R dy^2, the logarithm of the Gaussian; minus half
+                     the conic [1/px^2]
     5 opacity        at the peak [1]
-    6 low            -ln(255 opacity): where the power is below it, alpha < 1/255; of a gradient: pixels reached
-    7 limit          the power at the middle of a block is below it: the splat misses the block; of a gradient: weights
-                     w, summed over pixels
+    6 low            -ln(255 opacity): where the power is below it, alpha < 1/255; of a gradient:
+                     pixels reached
+    7 limit          the power at the middle of a block is below it: the splat misses the block; of
+                     a gradient: weights w, summed over pixels
     8 9 10           three channels weighed by T, for example colour
     11 12 13         a cos psi, a sin psi, a: what quads and phasor are made of, weighed by T^2
     14 distance      along the ray [m]
@@ -23,7 +26,8 @@ AHEAD = wp.constant(
 )  # records that a CPU thread prefetches: they are scattered in memory, and cache misses cost a tenth
 
 _LOAD = """
-#if defined(__CUDA_ARCH__)  // component-wise reads would be sixteen; a record is aligned, so four of 16 bytes do
+// component-wise reads would be sixteen; a record is aligned, so four of 16 bytes do
+#if defined(__CUDA_ARCH__)
     const float4* line = reinterpret_cast<const float4*>(splats.data + i);
     wp::vec_t<16, float> record;
     for (int part = 0; part < 4; ++part) {
@@ -37,8 +41,8 @@ _LOAD = """
 #endif
 """
 
-# A CPU thread owns one block of a tile, so a cheap test skips many blocks. A warp owns all pixels of a tile that is
-# known to be touched: there the test would hardly ever hold for all lanes.
+# A CPU thread owns one block of a tile, so a cheap test skips many blocks. A warp owns all pixels
+# of a tile that is known to be touched: there the test would hardly ever hold for all lanes.
 _BLOCK_MISSED = """
 #if defined(__CUDA_ARCH__)
     return false;
@@ -104,7 +108,8 @@ def take_channels(
 def add_records(
     # In:
     part: wp.array[Splat],  # [N] gradient records of one CPU thread or one pass
-    geometry_only: int,  # 1: only slots 0-5, what passes of further channels share with the main pass [flag]
+    geometry_only: int,  # 1: only slots 0-5, what passes of further channels share with the main
+    #  pass [flag]
     # Out:
     total: wp.array[Splat],  # [N] added to
 ):

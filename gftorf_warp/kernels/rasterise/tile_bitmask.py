@@ -1,16 +1,18 @@
-"""The list of each tile out of a bit mask with one bit per tile and splat: counted, then read in depth order.
+"""The list of each tile out of a bit mask with one bit per tile and splat: counted, then read in
+depth order.
 
-Bit r % 32 of word r / 32 of a tile is set if the tile lists the splat of depth rank r. Splats are in the order of
-depth already, so the bits of a tile in their order are its list, and nothing is left to sort. ``mark_pairs`` of
-tiles.py writes the matrix.
+Bit r % 32 of word r / 32 of a tile is set if the tile lists the splat of depth rank r. Splats are
+in the order of depth already, so the bits of a tile in their order are its list, and nothing is
+left to sort. ``mark_pairs`` of tiles.py writes the matrix.
 """
 
 import warp as wp
 
 from .simd import of_lane, sum_of_lanes, warp_any
 
-# tiles whose equal words are neighbours: a splat reaches neighbouring tiles, whose words then share a sector of 32
-# bytes; the warps that read them are those of one block, so a sector comes to a multiprocessor once
+# tiles whose equal words are neighbours: a splat reaches neighbouring tiles, whose words then share
+# a sector of 32 bytes; the warps that read them are those of one block, so a sector comes to a
+# multiprocessor once
 GROUP = wp.constant(8)
 
 
@@ -22,12 +24,16 @@ def place_of_word(tile: int, word: int, words: int) -> int:
 
 @wp.func
 def part_of_tile(warp: int, parts: int) -> wp.vec2i:
-    """Tile and part of it that are a warp's: GROUP warps in a row have the same part of the tiles of one group."""
+    """Tile and part of it that are a warp's: GROUP warps in a row have the same part of the tiles
+    of one group.
+    """
     row = warp // GROUP
     return wp.vec2i(row // parts * GROUP + warp % GROUP, row % parts)
 
 
-@wp.func_native(f"return (wp::uint64)bits.data[place] | (wp::uint64)bits.data[place + {GROUP}] << 32;")
+@wp.func_native(
+    f"return (wp::uint64)bits.data[place] | (wp::uint64)bits.data[place + {GROUP}] << 32;"
+)
 def two_words(bits: wp.array[wp.uint32], place: int) -> wp.uint64:
     """The word of a tile at a place of the matrix, and the one behind it."""
 
@@ -44,7 +50,8 @@ WARPS = 8  # of a block
     for (int k = place - begin; found; found &= found - 1)
         ranks[k++] = (unsigned short)(rank - lowest + __ffsll((long long)found) - 1);
     __syncwarp();
-    for (int k = begin + (int)(threadIdx.x & 31); k < end; k += 32) ids.data[k] = order.data[lowest + ranks[k - begin]];
+    for (int k = begin + (int)(threadIdx.x & 31); k < end; k += 32) ids.data[k] =
+        order.data[lowest + ranks[k - begin]];
     __syncwarp();
 #else
     for (int k = place; found && k < end; found &= found - 1)
@@ -61,10 +68,11 @@ def write_ids(
     begin: int,
     end: int,
 ):
-    """List the splats whose bits are set; the lowest bit is that of depth rank ``rank``, of this warp ``lowest``.
+    """List the splats whose bits are set; the lowest bit is that of depth rank ``rank``, of this
+    warp ``lowest``.
 
-    Those of this lane go to ``place`` and behind it, those of the warp to ``begin`` .. ``end`` - 1, neighbours by
-    neighbouring lanes, by way of shared memory.
+    Those of this lane go to ``place`` and behind it, those of the warp to ``begin`` .. ``end`` - 1,
+    neighbours by neighbouring lanes, by way of shared memory.
     """
 
 
@@ -109,10 +117,12 @@ def list_bits(
     capacity: int,  # pairs that fit [1]
     # Out:
     ids: wp.array[wp.int32],  # [>= capacity] splat of each pair
-    first: wp.array[int],  # [tiles + 1] where the list of each tile begins; the last entry ends the last list
+    first: wp.array[int],  # [tiles + 1] where the list of each tile begins; the last entry ends the
+    #  last list
     total: wp.array[int],  # [1] pairs there would be, whether they fit or not
 ):
-    """One warp per part of a tile: a sum over lanes gives the place of the splats of each lane's two words.
+    """One warp per part of a tile: a sum over lanes gives the place of the splats of each lane's
+    two words.
 
     Pairs that do not fit are dropped, those of the last tiles first, and show in ``total``.
     """
@@ -139,6 +149,15 @@ def list_bits(
                 count = wp.bit_count(found)
                 sums = sum_of_lanes(count)
                 until = at + of_lane(sums, lanes - 1)
-                write_ids(found, order, 32 * own, 32 * word, ids, at + sums - count, at, wp.min(until, capacity))
+                write_ids(
+                    found,
+                    order,
+                    32 * own,
+                    32 * word,
+                    ids,
+                    at + sums - count,
+                    at,
+                    wp.min(until, capacity),
+                )
                 at = until
             word += 2 * lanes

@@ -1,9 +1,11 @@
-"""Which splats each tile composites: where an ellipse crosses a row of tiles, counts, keys, and the list of each tile.
+"""Which splats each tile composites: where an ellipse crosses a row of tiles, counts, keys, and the
+list of each tile.
 
-A tile lists a splat if the ellipse alpha >= 1/255 reaches the rectangle of its pixel centres. The tiles of one row that
-an ellipse reaches are neighbours, so a row is a span, and a splat costs as many steps as it has rows. Either each pair
-of a tile and a splat is marked in a bit matrix, which tile_bitmask.py reads; or pairs are written in depth order and
-sorted by tile with a stable sort. Both ways every list is in depth order, and the lists are the same.
+A tile lists a splat if the ellipse alpha >= 1/255 reaches the rectangle of its pixel centres. The
+tiles of one row that an ellipse reaches are neighbours, so a row is a span, and a splat costs as
+many steps as it has rows. Either each pair of a tile and a splat is marked in a bit matrix, which
+tile_bitmask.py reads; or pairs are written in depth order and sorted by tile with a stable sort.
+Both ways every list is in depth order, and the lists are the same.
 """
 
 import warp as wp
@@ -12,12 +14,14 @@ from .simd import lane_beyond, lanes_with, of_lane, sum_of_lanes
 from .splat import Splat, load_splat
 from .tile_bitmask import place_of_word
 
-# `count_pairs` and `emit_pairs` must agree on every span to the last bit, and `mark_pairs` should; but contraction to
-# fused multiply-adds is the compiler's choice in each kernel anew
+# `count_pairs` and `emit_pairs` must agree on every span to the last bit, and `mark_pairs` should;
+# but contraction to fused multiply-adds is the compiler's choice in each kernel anew
 wp.set_module_options({"fuse_fp": False})
 
-_MARGIN = wp.constant(1.0e-6)  # of the largest terms of the power [1]: what float32 loses in it at a far pixel
-_FLATTEST = wp.constant(wp.float64(1.0e-7))  # smallest determinant over 4 P R [1]: below it is rounding
+# of the largest terms of the power [1]: what float32 loses in it at a far pixel
+_MARGIN = wp.constant(1.0e-6)
+# smallest determinant over 4 P R [1]: below it is rounding
+_FLATTEST = wp.constant(wp.float64(1.0e-7))
 
 
 @wp.func
@@ -35,10 +39,10 @@ def tile_range(box: wp.vec4i, tile_width: int, tile_height: int) -> wp.vec4i:
 def outline_of(q: Splat, box: wp.vec4i) -> wp.vec4:
     """Outline (slope, width, narrowing, turn) of the ellipse power >= low, from its centre [px].
 
-    At height v its edges are at slope v -+ sqrt(width - narrowing v^2); the right one is farthest out at v = turn, the
-    left one at -turn. A little wide: it decides what is visited, not what it is worth. Terms of the power at the pixels
-    of ``box`` bound what a pixel may round in its favour; the determinant of the conic is a difference, so it is taken
-    in float64.
+    At height v its edges are at slope v -+ sqrt(width - narrowing v^2); the right one is farthest
+    out at v = turn, the left one at -turn. A little wide: it decides what is visited, not what it
+    is worth. Terms of the power at the pixels of ``box`` bound what a pixel may round in its
+    favour; the determinant of the conic is a difference, so it is taken in float64.
     """
     x = wp.max(wp.abs(float(box[0]) + 0.5 - q[0]), wp.abs(float(box[2]) - 0.5 - q[0]))
     y = wp.max(wp.abs(float(box[1]) + 0.5 - q[1]), wp.abs(float(box[3]) - 0.5 - q[1]))
@@ -54,9 +58,14 @@ def outline_of(q: Splat, box: wp.vec4i) -> wp.vec4:
 
 
 @wp.func
-def span_of(outline: wp.vec4, q: Splat, row: int, tiles: wp.vec4i, tile_width: int, tile_height: int) -> wp.vec2i:
-    """Tiles [x0, x1) of a row, at most those of ``tiles``, whose pixel centres the ellipse reaches."""
-    low = float(row * tile_height) + 0.5 - q[1]  # first and last pixel centres of the row, from the centre [px]
+def span_of(
+    outline: wp.vec4, q: Splat, row: int, tiles: wp.vec4i, tile_width: int, tile_height: int
+) -> wp.vec2i:
+    """Tiles [x0, x1) of a row, at most those of ``tiles``,
+    whose pixel centres the ellipse reaches.
+    """
+    # first and last pixel centres of the row, from the centre [px]
+    low = float(row * tile_height) + 0.5 - q[1]
     high = low + float(tile_height - 1)
     nearest = wp.clamp(0.0, low, high)
     if outline[2] * nearest * nearest > outline[1]:
@@ -68,7 +77,8 @@ def span_of(outline: wp.vec4, q: Splat, row: int, tiles: wp.vec4i, tile_width: i
     w = float(tile_width)
     first = wp.ceil((q[0] + (outline[0] * left - reach_left) + 0.5) / w) - 1.0
     last = wp.floor((q[0] + (outline[0] * right + reach_right) - 0.5) / w)
-    # clamped as floats, since an integer from a float that does not fit is undefined; and again, for NaN
+    # clamped as floats, since an integer from a float that does not fit is undefined; and again,
+    # for NaN
     x0 = wp.clamp(int(wp.clamp(first, float(tiles[0]), float(tiles[2]))), tiles[0], tiles[2])
     x1 = wp.clamp(int(wp.clamp(last, -1.0, float(tiles[2]))) + 1, x0, tiles[2])
     return wp.vec2i(x0, x1)
@@ -76,9 +86,16 @@ def span_of(outline: wp.vec4, q: Splat, row: int, tiles: wp.vec4i, tile_width: i
 
 @wp.func
 def rows_from(
-    outline: wp.vec4, q: Splat, top: int, lane: int, tiles: wp.vec4i, tile_width: int, tile_height: int
+    outline: wp.vec4,
+    q: Splat,
+    top: int,
+    lane: int,
+    tiles: wp.vec4i,
+    tile_width: int,
+    tile_height: int,
 ) -> wp.vec2i:
-    """The rows of tiles from ``top`` on, one per lane: pairs up to this one's end; from a pair's number to its column.
+    """The rows of tiles from ``top`` on, one per lane: pairs up to this one's end; from a pair's
+    number to its column.
 
     Every lane must take part.
     """
@@ -91,7 +108,9 @@ def rows_from(
 
 @wp.func
 def tile_of(rows: wp.vec2i, pair: int, top: int, tiles_x: int) -> int:
-    """The tile of a pair by its number in the rows of :func:`rows_from`; all lanes must call it, each for its pair."""
+    """The tile of a pair by its number in the rows of :func:`rows_from`; all lanes must call it,
+    each for its pair.
+    """
     row = lane_beyond(rows[0], pair)
     return (top + row) * tiles_x + of_lane(rows[1], row) + pair
 
@@ -110,7 +129,9 @@ def mark_pairs(
     # Out:
     bits: wp.array[wp.uint32],  # [groups * words * GROUP] zeroed; which splats each tile lists
 ):
-    """One warp per splat, as in :func:`emit_pairs`, but a pair is a bit, at a place that depends on no other pair."""
+    """One warp per splat, as in :func:`emit_pairs`, but a pair is a bit,
+    at a place that depends on no other pair.
+    """
     rank, lane = wp.tid()
     i = order[rank]
     if box_px[i][2] > 0:
@@ -180,7 +201,8 @@ def emit_pairs(
     ids: wp.array[wp.int32],  # [>= capacity] splat of each pair
     total: wp.array[int],  # [1] pairs there would be, whether they fit or not
 ):
-    """One warp per splat: a lane finds the span of a row, then all lanes write neighbouring pairs, whatever their row.
+    """One warp per splat: a lane finds the span of a row, then all lanes write neighbouring pairs,
+    whatever their row.
 
     Pairs that do not fit are dropped, farthest first, and show in ``total``.
     """
@@ -201,7 +223,8 @@ def emit_pairs(
         outline = outline_of(q, box_px[i])
         tiles = tile_range(box_px[i], tile_width, tile_height)
         top = tiles[1]
-        while top < tiles[3] and at < capacity:  # as all control here the same for all lanes of a warp
+        # as all control here the same for all lanes of a warp
+        while top < tiles[3] and at < capacity:
             rows = rows_from(outline, q, top, lane, tiles, tile_width, tile_height)
             count = of_lane(rows[0], lanes - 1)
             begin = int(0)
@@ -223,9 +246,12 @@ def tile_starts(
     count: int,  # pairs [1]
     lanes: int,  # threads per tile: 32 on CUDA, a warp, 1 on the CPU [1]
     # Out:
-    first: wp.array[int],  # [tiles + 1] where the list of each tile begins; the last entry ends the last list
+    first: wp.array[int],  # [tiles + 1] where the list of each tile begins; the last entry ends the
+    #  last list
 ):
-    """One warp per tile: a thread would halve the range 21 times, 32 lanes need five reads one after the other."""
+    """One warp per tile: a thread would halve the range 21 times,
+    32 lanes need five reads one after the other.
+    """
     tile, lane = wp.tid()
     low = int(0)
     high = int(count)

@@ -1,20 +1,24 @@
-"""Light by rays: what a lamp sends to a pixel from the first surface, and by random paths from those behind it.
+"""Light by rays: what a lamp sends to a pixel from the first surface, and by random paths from
+those behind it.
 
-With d the distance from the camera, d_e that from the emitter, and i the angle of incidence of the emitter's light,
+With d the distance from the camera, d_e that from the emitter, and i the angle of incidence of the
+emitter's light,
 
     amplitude = rho cos(i) / d_e^2          light_h = amplitude exp(i 2 pi h f (d + d_e) / c)
 
-averaged over the sub-samples of a pixel and the instants of an exposure (sensor notes, 1.4 and 2.2). The amplitude is
-pi times the radiance, so that Lambert's factor is rho. A share g of rho may be mirrored into a lobe about the mirrored
-direction of the light (the normalised Phong lobe of Lafortune and Willems, 1994), a the angle between it and the view:
+averaged over the sub-samples of a pixel and the instants of an exposure (sensor notes, 1.4 and
+2.2). The amplitude is pi times the radiance, so that Lambert's factor is rho. A share g of rho may
+be mirrored into a lobe about the mirrored direction of the light (the normalised Phong lobe of
+Lafortune and Willems, 1994), a the angle between it and the view:
 
     rho  becomes  rho [1 - g + g (n + 2) / 2 max(0, cos a)^n]
 
-which is reciprocal and returns rho of the light that falls on it straight, never more at a slant. Indirect light goes
-on from the first hit, with probability 1 - g in directions of density cos / pi, with g in directions of the lobe's own
-density; that leaves the product of the reflectances, in the second case times (n + 2) / (n + 1) cos(exit), as the
-weight of a path. Every further surface adds what the emitter sends there, at the length of the whole path. The fraction
-of h f (d + d_e) / c is taken before it becomes an angle, so that float32 holds at any frequency.
+which is reciprocal and returns rho of the light that falls on it straight, never more at a slant.
+Indirect light goes on from the first hit, with probability 1 - g in directions of density cos / pi,
+with g in directions of the lobe's own density; that leaves the product of the reflectances, in the
+second case times (n + 2) / (n + 1) cos(exit), as the weight of a path. Every further surface adds
+what the emitter sends there, at the length of the whole path. The fraction of h f (d + d_e) / c is
+taken before it becomes an angle, so that float32 holds at any frequency.
 """
 
 import warp as wp
@@ -22,7 +26,8 @@ import warp as wp
 from ..geometry import CameraView
 from .rays import FAR, Solid, nearest, ray_through, reflectance_of
 
-SHADOW_GAP = wp.constant(2.0e-4)  # [1] of the emitter's distance: what is met this near to a point is the point itself
+# [1] of the emitter's distance: what is met this near to a point is the point itself
+SHADOW_GAP = wp.constant(2.0e-4)
 ONE_PATH = wp.constant(float("nan"))  # the standard error of a single path
 
 
@@ -30,10 +35,12 @@ ONE_PATH = wp.constant(float("nan"))  # the standard error of a single path
 class Emitter:
     """A point of light that shines into a pyramid about the z axis of the camera."""
 
-    place: wp.vec3  # in camera axes [m]; zero: at the camera, where nothing that it sees can be in a shadow
+    place: wp.vec3  # in camera axes [m]; zero: at the camera, where nothing that it sees can be in
+    #  a shadow
     spread: wp.vec2  # tangents of half the angles across and down [1]; 0: into all directions
     cycles: float  # modulation frequency over the speed of light [1/m]
-    power: float  # of the cosine of the angle to the z axis by which it shines less to the side [1]; 0: evenly
+    power: float  # of the cosine of the angle to the z axis by which it shines less to the side
+    #  [1]; 0: evenly
     factor: float  # of its light along the axis [1]; unused where it shines evenly
     least: float  # cosine beyond which the beam stays as it is [1]; likewise
 
@@ -46,11 +53,15 @@ def mirrored(ray: wp.vec3, normal: wp.vec3) -> wp.vec3:
 
 @wp.func
 def shine(solid: Solid, view: wp.vec3, towards: wp.vec3, normal: wp.vec3) -> float:
-    """Factor [1] on the reflectance: light that came along the unit vector ``towards``, seen along ``view``."""
+    """Factor [1] on the reflectance: light that came along the unit vector ``towards``,
+    seen along ``view``.
+    """
     factor = float(1.0)
     if solid.gloss > 0.0:
         cosine = wp.max(-wp.dot(mirrored(towards, normal), view), 0.0)
-        factor += solid.gloss * (0.5 * (solid.shininess + 2.0) * wp.pow(cosine, solid.shininess) - 1.0)
+        factor += solid.gloss * (
+            0.5 * (solid.shininess + 2.0) * wp.pow(cosine, solid.shininess) - 1.0
+        )
     return factor
 
 
@@ -64,7 +75,9 @@ def around(axis: wp.vec3, shininess: float, first: float, second: float) -> wp.v
         helper = wp.vec3(0.0, 1.0, 0.0)
     u = wp.normalize(wp.cross(axis, helper))
     angle = 6.283185307179586 * second
-    return wp.normalize(cosine * axis + sine * (wp.cos(angle) * u + wp.sin(angle) * wp.cross(axis, u)))
+    return wp.normalize(
+        cosine * axis + sine * (wp.cos(angle) * u + wp.sin(angle) * wp.cross(axis, u))
+    )
 
 
 @wp.func
@@ -81,7 +94,9 @@ def received(
     view: wp.vec3,  # unit vector along which it was met, in camera axes
     may_be_hidden: bool,
 ) -> wp.vec2:
-    """Amplitude that a surface returns of the emitter's light, and its distance from it [m], both at ``point``."""
+    """Amplitude that a surface returns of the emitter's light, and its distance from it [m],
+    both at ``point``.
+    """
     towards = point - emitter.place
     reach = wp.length(towards)
     turn = rotation[instant, body]
@@ -92,7 +107,12 @@ def received(
         cosine = float(0.0)
     if cosine > 0.0 and may_be_hidden:
         limit = reach * (1.0 - SHADOW_GAP)
-        if nearest(solids, rotation, translation, instant, emitter.place, towards / reach, limit).body >= 0:
+        if (
+            nearest(
+                solids, rotation, translation, instant, emitter.place, towards / reach, limit
+            ).body
+            >= 0
+        ):
             cosine = float(0.0)
     if cosine > 0.0 and emitter.power != 0.0:
         straight = towards[2] / reach
@@ -102,13 +122,17 @@ def received(
             cosine = float(0.0)
     if cosine > 0.0:
         factor = shine(solids[body], turn * view, turn * towards / reach, normal)
-        return wp.vec2(reflectance_of(solids[body], place) * factor * cosine / (reach * reach), reach)
+        return wp.vec2(
+            reflectance_of(solids[body], place) * factor * cosine / (reach * reach), reach
+        )
     return wp.vec2(0.0, reach)
 
 
 @wp.func
 def turned(turns: float, weight: float) -> wp.vec2:
-    """A weight times exp(i 2 pi turns), of the fraction of the turns: a large angle would lose digits."""
+    """A weight times exp(i 2 pi turns), of the fraction of the turns:
+    a large angle would lose digits.
+    """
     phase = 6.283185307179586 * (turns - wp.floor(turns))
     return weight * wp.vec2(wp.cos(phase), wp.sin(phase))
 
@@ -130,7 +154,9 @@ def trace_light(
     amplitude: wp.array2d[float],  # [H, W] mean amplitude
     ambient: wp.array2d[float],  # [H, W] mean reflectance
 ):
-    """Mean direct light of one pixel over all sub-samples and instants, for a source intensity of 1."""
+    """Mean direct light of one pixel over all sub-samples and instants,
+    for a source intensity of 1.
+    """
     i, x = wp.tid()
     y = first + stride * i
     total = float(0.0)
@@ -147,7 +173,17 @@ def trace_light(
             if hit.body >= 0:
                 point = hit.distance * ray
                 got = received(
-                    emitter, solids, rotation, translation, t, hit.body, hit.normal, hit.point, point, ray, beside
+                    emitter,
+                    solids,
+                    rotation,
+                    translation,
+                    t,
+                    hit.body,
+                    hit.normal,
+                    hit.point,
+                    point,
+                    ray,
+                    beside,
                 )
                 total += got[0]
                 even += reflectance_of(solids[hit.body], hit.point)
@@ -178,9 +214,12 @@ def trace_bounces(
     # Out:
     light: wp.array3d[wp.vec2],  # [h, H, W] (re, im) of the mean light
     amplitude: wp.array2d[float],  # [H, W] mean amplitude
-    error: wp.array2d[float],  # [H, W] standard error of the first harmonic's mean, re and im together
+    error: wp.array2d[float],  # [H, W] standard error of the first harmonic's mean, re and im
+    #  together
 ):
-    """Mean of random paths of one pixel: light that met more than one surface, for a source intensity of 1."""
+    """Mean of random paths of one pixel: light that met more than one surface,
+    for a source intensity of 1.
+    """
     i, x = wp.tid()
     y = first + stride * i
     random = wp.rand_init(seed, y * light.shape[2] + x)
@@ -207,8 +246,11 @@ def trace_bounces(
                 if solid.gloss > 0.0:
                     lobe = wp.randf(random) < solid.gloss
                 if lobe:
-                    ray = around(mirrored(ray, normal), solid.shininess, wp.randf(random), wp.randf(random))
-                    straight = wp.max(wp.dot(ray, normal), 0.0)  # 0: into the surface, where the path ends
+                    ray = around(
+                        mirrored(ray, normal), solid.shininess, wp.randf(random), wp.randf(random)
+                    )
+                    # 0: into the surface, where the path ends
+                    straight = wp.max(wp.dot(ray, normal), 0.0)
                     weight = weight * (solid.shininess + 2.0) / (solid.shininess + 1.0) * straight
                 else:
                     ray = wp.normalize(normal + wp.sample_unit_sphere_surface(random))
@@ -217,7 +259,17 @@ def trace_bounces(
                 point = point + hit.distance * ray
                 length += hit.distance
                 got = received(
-                    emitter, solids, rotation, translation, t, hit.body, hit.normal, hit.point, point, ray, True
+                    emitter,
+                    solids,
+                    rotation,
+                    translation,
+                    t,
+                    hit.body,
+                    hit.normal,
+                    hit.point,
+                    point,
+                    ray,
+                    True,
                 )
                 total += weight * got[0]
                 turns = emitter.cycles * (length + got[1])

@@ -1,10 +1,10 @@
 """Rays through meshes, balls and endless planes: what a ray meets first.
 
-Nothing here is shared with the splats: another geometry, another order, other sums. What comes back from there is in
-light_paths.py.
+Nothing here is shared with the splats: another geometry, another order, other sums. What comes back
+from there is in light_paths.py.
 
-Surfaces are seen, lit and in the way on the side of their normals only: a room can be looked into from outside. Endless
-planes have a normal on either side.
+Surfaces are seen, lit and in the way on the side of their normals only: a room can be looked into
+from outside. Endless planes have a normal on either side.
 """
 
 import warp as wp
@@ -14,10 +14,12 @@ from ..lens import undistorted
 
 NOTHING = -1  # the body where a ray hits none
 FAR = wp.constant(1.0e6)  # [m] the end of the world
-ON_PLANE = wp.constant(1.0e-5)  # [1] of 1 m plus the origin's distance: a ray from so near to a plane starts on it
+# [1] of 1 m plus the origin's distance: a ray from so near to a plane starts on it
+ON_PLANE = wp.constant(1.0e-5)
 STEP = wp.constant(1.0e-5)  # [m] beyond a face that is seen from behind
 SLACK = wp.constant(1.001)  # [1] on bounding balls: rounding must not cut a body
-HASH = wp.constant(2654435761 & 0xFFFF)  # the last factor of the hash, as far as it reaches the bits that count
+# the last factor of the hash, as far as it reaches the bits that count
+HASH = wp.constant(2654435761 & 0xFFFF)
 TEXTURE_ORIGIN = wp.constant(37.0001)  # [m] see sim/texture.py, whose hash this is
 _NOTHING = wp.constant(NOTHING)
 
@@ -51,7 +53,9 @@ class Hit:
 
 @wp.func
 def reflectance_of(solid: Solid, point: wp.vec3) -> float:
-    """Reflectance [1] in hashed cells of a grid: the lower 16 bits of the hash, which need no more of its factors."""
+    """Reflectance [1] in hashed cells of a grid: the lower 16 bits of the hash,
+    which need no more of its factors.
+    """
     x = wp.uint32(int(wp.floor((point[0] + TEXTURE_ORIGIN) / solid.cell)))
     y = wp.uint32(int(wp.floor((point[1] + TEXTURE_ORIGIN) / solid.cell)))
     z = wp.uint32(int(wp.floor((point[2] + TEXTURE_ORIGIN) / solid.cell)))
@@ -62,7 +66,9 @@ def reflectance_of(solid: Solid, point: wp.vec3) -> float:
 
 @wp.func
 def meet_plane(solid: Solid, origin: wp.vec3, ray: wp.vec3, limit: float) -> Hit:
-    """Hit of an endless plane from either side, nearer than ``limit`` [m]; what starts on the plane leaves it."""
+    """Hit of an endless plane from either side, nearer than ``limit`` [m];
+    what starts on the plane leaves it.
+    """
     hit = Hit()
     hit.body = _NOTHING
     height = wp.dot(solid.normal, origin) - solid.height
@@ -79,14 +85,17 @@ def meet_plane(solid: Solid, origin: wp.vec3, ray: wp.vec3, limit: float) -> Hit
 
 @wp.func
 def meet(solid: Solid, origin: wp.vec3, ray: wp.vec3, limit: float) -> Hit:
-    """First hit of one body, nearer than ``limit`` [m]; all in its axes. ``body`` is 0 if there is one."""
+    """First hit of one body, nearer than ``limit`` [m]; all in its axes.
+    ``body`` is 0 if there is one.
+    """
     if wp.length_sq(solid.normal) > 0.0:
         return meet_plane(solid, origin, ray, limit)
     hit = Hit()
     hit.body = _NOTHING
     start = origin - solid.centre
     along = -wp.dot(start, ray)
-    closest = start + along * ray  # not a difference of squares, which would cancel for small bodies far away
+    # not a difference of squares, which would cancel for small bodies far away
+    closest = start + along * ray
     across = wp.length_sq(closest)
     if across > solid.reach * solid.reach * SLACK:
         return hit
@@ -127,7 +136,9 @@ def nearest(
     ray: wp.vec3,
     limit: float,
 ) -> Hit:
-    """First hit over all bodies at one instant; ``origin`` [m] and ``ray`` in camera axes, moved into each body's."""
+    """First hit over all bodies at one instant; ``origin`` [m] and ``ray`` in camera axes,
+    moved into each body's.
+    """
     best = Hit()
     best.body = _NOTHING
     best.distance = limit

@@ -1,13 +1,15 @@
-"""Adam over many tensors in one launch, with everything that changes from step to step in device memory.
+"""Adam over many tensors in one launch, with everything that changes from step to step in device
+memory.
 
-    m += (1 - b1) (g - m),   v += (1 - b2) (g^2 - v),   x -= rate / (1 - b1^t)  m / (sqrt(v / (1 - b2^t)) + eps)
+    m += (1 - b1) (g - m),   v += (1 - b2) (g^2 - v)
+    x -= rate / (1 - b1^t)  m / (sqrt(v / (1 - b2^t)) + eps)
 
 (Kingma and Ba, 2015). Step t and learning rate are per tensor. A tensor of rate 0 is left alone, t
 included; so are all tensors if the step is invalid (``step_end.py``).
 
 A table holds the addresses of the tensors: there are as many as a network has layers, anywhere in
-memory. Address 0 as gradient: the tensor is left alone, too. Gradients are scaled first. A tensor may
-have up to four gradients, of as many images, which are summed here; the first ones come first.
+memory. Address 0 as gradient: the tensor is left alone, too. Gradients are scaled first. A tensor
+may have up to four gradients, of as many images, which are summed here; the first ones come first.
 """
 
 import functools
@@ -26,17 +28,21 @@ ADVANCE = f"""
     out[0] = 0.0f;
     if (!valid || rate == 0.0f || row[{GRADIENT}] == 0) return;
     step[0] += 1.0f;
-    const double first = 1.0 - pow((double)beta1, (double)step[0]), second = 1.0 - pow((double)beta2, (double)step[0]);
+    const double first = 1.0 - pow((double)beta1, (double)step[0]), second = 1.0
+        - pow((double)beta2, (double)step[0]);
     out[0] = (float)((double)rate / first);
     out[1] = (float)(1.0 / sqrt(second));
     out[2] = factor;
 """
-"""C++ of ``step_end.finish``: count a step of a tensor, unless it is left alone, and its step size."""
+"""C++ of ``step_end.finish``: count a step of a tensor, unless it is left alone, and its step
+size."""
 
 
 def _descend(K: int) -> str:
     """C++: one block of K elements; nothing behind the end of a tensor is read or written."""
-    kind = f"typedef float F __attribute__((ext_vector_type({K})));" if K > 1 else "typedef float F;"
+    kind = (
+        f"typedef float F __attribute__((ext_vector_type({K})));" if K > 1 else "typedef float F;"
+    )
     root = "__builtin_elementwise_sqrt(v)" if K > 1 else "sqrtf(v)"
     at = "F v = 0.0f; __builtin_memcpy(&v, p, bytes); return v;" if K > 1 else "return *p;"
     put = "__builtin_memcpy(p, &v, bytes);" if K > 1 else "*p = v;"
@@ -54,7 +60,8 @@ def _descend(K: int) -> str:
     float* m_ = reinterpret_cast<float*>(row[{FIRST}]) + begin;
     float* v_ = reinterpret_cast<float*>(row[{SECOND}]) + begin;
     F g = at(reinterpret_cast<const float*>(row[{GRADIENT}]) + begin);
-    for (int n = {MORE}; n < {COLUMNS} && row[n] != 0; ++n) g += at(reinterpret_cast<const float*>(row[n]) + begin);
+    for (int n = {MORE}; n < {COLUMNS} && row[n] != 0; ++n) g +=
+        at(reinterpret_cast<const float*>(row[n]) + begin);
     g *= sizes_[2];
     F m = at(m_), v = at(v_);
     m += rest1 * (g - m);
@@ -83,13 +90,15 @@ def make_adam(K: int):
     @wp.kernel(enable_backward=False, module="unique")
     def adam(
         # In:
-        table: wp.array2d[wp.int64],  # [T, 9] addresses of parameter, gradient, moments, step; length; gradients
+        table: wp.array2d[wp.int64],  # [T, 9] addresses of parameter, gradient, moments, step;
+        #  length; gradients
         first_block: wp.array[int],  # [T] blocks before those of a tensor [1]
         rest1: float,  # 1 - b1 [1]
         rest2: float,  # 1 - b2 [1]
         epsilon: float,  # added to the root of the second moment [units of the gradient]
         # Out:
-        sizes: wp.array2d[float],  # [T, 3] from ``step_end.py``; the tensors of the table change in place
+        sizes: wp.array2d[float],  # [T, 3] from ``step_end.py``; the tensors of the table change in
+        #  place
     ):
         """One thread per block of K elements; changes parameters and moments where they are."""
         block = wp.tid()

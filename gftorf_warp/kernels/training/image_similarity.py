@@ -1,4 +1,5 @@
-"""Loss of an image and its gradient by the rendered one, with the window of the similarity taken apart into two passes.
+"""Loss of an image and its gradient by the rendered one, with the window of the similarity taken
+apart into two passes.
 
 With means over a window W of 11 x 11 pixels, zeros beyond the border, of rendered r and measured m
 
@@ -10,9 +11,9 @@ the derivative needs three planes of dS: W is symmetric, so
 
     dL/dr = (1 - s) d|r - m|^p - s (W dS/dmu + 2 r W dS/da + m W dS/dc)
 
-(method, section 5). Columns first: blocks of K pixels of a row lie side by side in memory, so that their windows need
-no border but above and below. The planes in between have a margin of zeros at both ends of a row, which is all that
-the pass along rows knows of borders.
+(method, section 5). Columns first: blocks of K pixels of a row lie side by side in memory, so that
+their windows need no border but above and below. The planes in between have a margin of zeros at
+both ends of a row, which is all that the pass along rows knows of borders.
 """
 
 import functools
@@ -31,14 +32,19 @@ SUMS = 3  # that come out: loss, squared difference, another image
 
 
 def _prelude(K: int) -> str:
-    """C++ that defines the block type ``F``, ``at`` and ``put`` from and to memory, and the weights of the window."""
+    """C++ that defines the block type ``F``, ``at`` and ``put`` from and to memory,
+    and the weights of the window.
+    """
     weights = [math.exp(-0.5 * (k / WINDOW_SIGMA) ** 2) for k in range(-REACH, REACH + 1)]
     taps = ", ".join(f"{weight / sum(weights):.9e}f" for weight in weights)
     kind = "typedef float F;"
     at, put = "return *p;", "*p = v;"
     if K > 1:
         kind = f"typedef float F __attribute__((ext_vector_type({K})));"
-        at, put = "F v; __builtin_memcpy(&v, p, sizeof(v)); return v;", "__builtin_memcpy(p, &v, sizeof(v));"
+        at, put = (
+            "F v; __builtin_memcpy(&v, p, sizeof(v)); return v;",
+            "__builtin_memcpy(p, &v, sizeof(v));",
+        )
     return f"""
     {kind}
     auto at = [](const float* p) -> F {{ {at} }};
@@ -48,7 +54,9 @@ def _prelude(K: int) -> str:
 
 
 def _sums(count: int, value: str) -> str:
-    """C++ statements that define ``s0``, ``s1``, ..: ``count`` vectors of the same initial value."""
+    """C++ statements that define ``s0``, ``s1``, ..: ``count`` vectors of the same initial
+    value.
+    """
     return f"F {', '.join(f's{n} = {value}' for n in range(count))};"
 
 
@@ -68,7 +76,8 @@ def _columns_of_products(K: int) -> str:
     }}
     const int plane = rendered.shape[0] * height * stride;
     float* out = columns.data + (c * height + y) * stride + x + {REACH};
-    put(out, s0); put(out + plane, s1); put(out + 2 * plane, s2); put(out + 3 * plane, s3); put(out + 4 * plane, s4);
+    put(out, s0); put(out + plane, s1); put(out + 2 * plane, s2); put(out + 3 * plane, s3);
+    put(out + 4 * plane, s4);
 """
 
 
@@ -88,19 +97,25 @@ def _rows(count: int, source: str) -> str:
 
 
 def _compare(K: int) -> str:
-    """C++: sums of loss, squared difference and another image, and the derivatives of S by window means."""
+    """C++: sums of loss, squared difference and another image,
+    and the derivatives of S by window means.
+    """
     each = "" if K == 1 else "[n]"
     return f"""{_prelude(K)}
-    const int across = (rendered.shape[2] + {K - 1}) / {K}, block = thread % across, line = thread / across;
-    const int y = line % rendered.shape[1], c = line / rendered.shape[1], end = rendered.shape[2] - {K};
+    const int across = (rendered.shape[2] + {K - 1}) / {K}, block = thread % across, line = thread
+        / across;
+    const int y = line % rendered.shape[1], c = line / rendered.shape[1], end = rendered.shape[2]
+        - {K};
     const int x = block * {K} < end ? block * {K} : end, again = block * {K} - x;
     float loss = 0.0f, square = 0.0f, other = 0.0f;
     if (c < rendered.shape[0]) {{{_rows(MOMENTS, "columns")}
         const F cross = s0 * s1, own = s0 * s0 + s1 * s1;
-        const F means = 2.0f * cross + {STABILISE_MEAN}f, spreads = 2.0f * (s4 - cross) + {STABILISE_SPREAD}f;
+        const F means = 2.0f * cross + {STABILISE_MEAN}f, spreads = 2.0f * (s4 - cross)
+            + {STABILISE_SPREAD}f;
         const F mean_scale = 1.0f / (own + {STABILISE_MEAN}f);
         const F spread_scale = 1.0f / (s2 + s3 - own + {STABILISE_SPREAD}f);
-        const F luminance = means * mean_scale, structure = spreads * spread_scale, similarity = luminance * structure;
+        const F luminance = means * mean_scale, structure = spreads * spread_scale, similarity =
+            luminance * structure;
         const F by_mean = 2.0f * (s1 * mean_scale * structure - s1 * luminance * spread_scale
                                   - s0 * similarity * mean_scale + s0 * similarity * spread_scale);
         const F squared = d * d, difference = absolute ? (d < 0.0f ? -d : d) : squared;
@@ -109,12 +124,14 @@ def _compare(K: int) -> str:
         put(out, by_mean); put(out + plane, -similarity * spread_scale);
         put(out + 2 * plane, 2.0f * luminance * spread_scale);
         for (int n = again; n < {K}; ++n) {{ loss += map{each}; square += squared{each}; }}
-        if (pixel + {K} <= also.shape[0]) for (int n = again; n < {K}; ++n) other += also.data[pixel + n];
+        if (pixel + {K} <= also.shape[0]) for (int n = again; n < {K}; ++n) other +=
+            also.data[pixel + n];
     }}{OVER_LANES}
     loss = over_lanes(loss); square = over_lanes(square); other = over_lanes(other);
     if (writes) {{
         const int parts = partials.shape[1];
-        partials.data[slot] = loss; partials.data[parts + slot] = square; partials.data[2 * parts + slot] = other;
+        partials.data[slot] = loss; partials.data[parts + slot] = square;
+        partials.data[2 * parts + slot] = other;
     }}
 """
 
@@ -122,7 +139,8 @@ def _compare(K: int) -> str:
 def _columns_of_slopes(K: int) -> str:
     """C++: windows along columns of the derivatives."""
     return f"""{_prelude(K)}
-    const int height = slopes.shape[2], stride = slopes.shape[3], plane = slopes.shape[1] * height * stride;
+    const int height = slopes.shape[2], stride = slopes.shape[3], plane = slopes.shape[1] * height
+        * stride;
     const int at_ = (c * height + y) * stride + x + {REACH};
     {_sums(SLOPES, "(F)(0.0f)")}
     #pragma unroll
@@ -148,13 +166,21 @@ def _gradient(K: int) -> str:
 
 @functools.cache
 def make_similarity(K: int) -> SimpleNamespace:
-    """The four kernels for blocks of K pixels of a row: 1 on CUDA, 16 on the CPU if a row is that long.
+    """The four kernels for blocks of K pixels of a row: 1 on CUDA, 16 on the CPU if a row is that
+    long.
 
     A last block that would stick out of its row begins earlier and computes some pixels again.
     """
-    flags = "-march=native" if wp.config.cpu_compiler_flags is None else wp.config.cpu_compiler_flags
+    flags = (
+        "-march=native" if wp.config.cpu_compiler_flags is None else wp.config.cpu_compiler_flags
+    )
     rounding = {"cpu_compiler_flags": flags + " -ffp-contract=fast"} if K > 1 else {}
-    options = {"enable_backward": False, "module": "unique", "grid_stride": False, "module_options": rounding}
+    options = {
+        "enable_backward": False,
+        "module": "unique",
+        "grid_stride": False,
+        "module_options": rounding,
+    }
 
     @wp.func_native(_columns_of_products(K))
     def products_of(
@@ -180,7 +206,9 @@ def make_similarity(K: int) -> SimpleNamespace:
         slopes: wp.array4d[float],
     ): ...
     @wp.func_native(_columns_of_slopes(K))
-    def slopes_of(slopes: wp.array4d[float], c: int, y: int, x: int, columns: wp.array4d[float]): ...
+    def slopes_of(
+        slopes: wp.array4d[float], c: int, y: int, x: int, columns: wp.array4d[float]
+    ): ...
     @wp.func_native(_gradient(K))
     def gradient_of(
         columns: wp.array4d[float],
@@ -208,7 +236,8 @@ def make_similarity(K: int) -> SimpleNamespace:
         measured: wp.array3d[float],  # [R C, H, W]
         row: wp.array[int],  # [1] which C of ``measured`` [index]
         # Out:
-        columns: wp.array4d[float],  # [5, C, H, W + 10] window sums along columns of r, m, r^2, m^2, r m
+        columns: wp.array4d[float],  # [5, C, H, W + 10] window sums along columns of r, m, r^2,
+        #  m^2, r m
     ):
         """One thread per block of K pixels."""
         c, y, block = wp.tid()
@@ -225,11 +254,14 @@ def make_similarity(K: int) -> SimpleNamespace:
         share: float,  # of the similarity, 0..1 [1]
         absolute: bool,  # whether p is 1 [flag]
         # Out:
-        partials: wp.array2d[float],  # [3, P] sums over parts of loss, squared difference and the other image
+        partials: wp.array2d[float],  # [3, P] sums over parts of loss, squared difference and the
+        #  other image
         slopes: wp.array4d[float],  # [3, C, H, W + 10] derivatives of S by the means of r, r^2, r m
     ):
         """One thread per block of K pixels; on CUDA as many as fill the last warp."""
-        compare(columns, rendered, measured, row[0], also, share, absolute, wp.tid(), partials, slopes)
+        compare(
+            columns, rendered, measured, row[0], also, share, absolute, wp.tid(), partials, slopes
+        )
 
     @wp.kernel(**options)
     def columns_of_slopes(

@@ -1,12 +1,14 @@
 """Random light that depends on what it is for, not on who asks or when: a counter-based generator.
 
-Philox 4x32 with ten rounds (Salmon et al., Parallel Random Numbers: As Easy as 1, 2, 3, 2011) turns the counter
+Philox 4x32 with ten rounds (Salmon et al., Parallel Random Numbers: As Easy as 1, 2, 3, 2011) turns
+the counter
 
     (block of four pixels, channel, image, stream)
 
-and the key (seed, 0) into four words, one per pixel. So every value is a function of seed, image, stream, channel and
-pixel: any number of threads in any order writes the same image, a run that goes on needs no stored generator, and a
-replayed graph draws afresh because seed and image are read from memory.
+and the key (seed, 0) into four words, one per pixel. So every value is a function of seed, image,
+stream, channel and pixel: any number of threads in any order writes the same image, a run that goes
+on needs no stored generator, and a replayed graph draws afresh because seed and image are read from
+memory.
 """
 
 import warp as wp
@@ -19,7 +21,8 @@ WEYL_1 = wp.constant(wp.uint32(0xBB67AE85))  # sqrt(3) - 1
 PER_THREAD = 4  # words of one call
 _SHIFT = wp.constant(wp.uint64(32))
 _SPARE_BITS = wp.constant(wp.uint32(9))
-STEP = wp.constant(2.0**-23)  # 23 bits and a half fit a float32 exactly, so that values lie evenly about zero
+# 23 bits and a half fit a float32 exactly, so that values lie evenly about zero
+STEP = wp.constant(2.0**-23)
 
 Words = wp.types.vector(length=4, dtype=wp.uint32)
 
@@ -35,7 +38,9 @@ def philox(counter: Words, key_0: wp.uint32, key_1: wp.uint32) -> Words:
         product_1 = MULTIPLIER_1 * wp.uint64(word[2])
         high_0 = wp.uint32(product_0 >> _SHIFT)
         high_1 = wp.uint32(product_1 >> _SHIFT)
-        word = Words(high_1 ^ word[1] ^ k0, wp.uint32(product_1), high_0 ^ word[3] ^ k1, wp.uint32(product_0))
+        word = Words(
+            high_1 ^ word[1] ^ k0, wp.uint32(product_1), high_0 ^ word[3] ^ k1, wp.uint32(product_0)
+        )
         k0 = k0 + WEYL_0
         k1 = k1 + WEYL_1
     return word

@@ -1,13 +1,15 @@
-"""Squared difference of the optical flow that moving surfaces cause to the one that was measured, and its gradient.
+"""Squared difference of the optical flow that moving surfaces cause to the one that was measured,
+and its gradient.
 
-A pixel at x sees the point P = d r of its camera, r the unit vector through it. After the composited displacement D it
-is at Q = M P + m + R D of the later camera, with [M m] from one camera to the other and R from the world to it:
+A pixel at x sees the point P = d r of its camera, r the unit vector through it. After the
+composited displacement D it is at Q = M P + m + R D of the later camera, with [M m] from one camera
+to the other and R from the world to it:
 
     F = f Q_xy / Q_z + c - x,   e = |F - F_measured|^2,   dF/dQ = f / Q_z (1, 0, -Q_x / Q_z), ..
 
-(method, section 5). A lens that distorts is undone to get the ray, and images Q_xy / Q_z elsewhere, with a derivative
-of its own (scene/distortion.py); a pinhole does not come that way. The distance has no derivative. A measured flow that
-is not finite is unknown: no error there.
+(method, section 5). A lens that distorts is undone to get the ray, and images Q_xy / Q_z elsewhere,
+with a derivative of its own (scene/distortion.py); a pinhole does not come that way. The distance
+has no derivative. A measured flow that is not finite is unknown: no error there.
 """
 
 import warp as wp
@@ -15,12 +17,15 @@ import warp as wp
 from .ordered_sums import OVER_LANES
 
 NUMBERS = 29  # of two cameras: f and c of the first and of the later one, M, m, R
-LENSES = 11  # more, where there is one: k1, k2, p1, p2, k3 of the first camera, and of the later one with its radius
+# more, where there is one: k1, k2, p1, p2, k3 of the first camera, and of the later one with its
+# radius
+LENSES = 11
 STEPS = 20  # of Newton; a lens that the host could undo needs a handful
 NEAREST = 1e-6  # [m] of a surface
 
 _LENS = """
-    auto image = [](const float* c, float a, float b, float* at) {  // and what the lens does to small steps there
+    // and what the lens does to small steps there
+    auto image = [](const float* c, float a, float b, float* at) {
         const float r2 = a * a + b * b, radial = 1.0f + r2 * (c[0] + r2 * (c[1] + r2 * c[4]));
         const float bend = 2.0f * (c[0] + r2 * (2.0f * c[1] + 3.0f * c[4] * r2));
         at[0] = a * radial + 2.0f * c[2] * a * b + c[3] * (r2 + 2.0f * a * a);
@@ -29,13 +34,18 @@ _LENS = """
         at[3] = bend * a * b + 2.0f * c[2] * a + 2.0f * c[3] * b;
         at[4] = radial + bend * b * b + 6.0f * c[2] * b + 2.0f * c[3] * a;
     };
-    auto turn = [](const float* c, float a, float b, float p, float q, float by, float* J) {  // of a tangent far out
-        const float r2 = a * a + b * b, more = 2.0f * (a * p + b * q);  // derivatives along (p, q) of those above
+    // of a tangent far out
+    auto turn = [](const float* c, float a, float b, float p, float q, float by, float* J) {
+        // derivatives along (p, q) of those above
+        const float r2 = a * a + b * b, more = 2.0f * (a * p + b * q);
         const float bend = 2.0f * (c[0] + r2 * (2.0f * c[1] + 3.0f * c[4] * r2));
-        const float bent = 2.0f * (2.0f * c[1] + 6.0f * c[4] * r2) * more, both = 0.5f * bend * more;
-        const float xx = both + bent * a * a + 2.0f * bend * a * p + 2.0f * c[2] * q + 6.0f * c[3] * p;
+        const float bent = 2.0f * (2.0f * c[1] + 6.0f * c[4] * r2) * more, both = 0.5f * bend
+            * more;
+        const float xx = both + bent * a * a + 2.0f * bend * a * p + 2.0f * c[2] * q + 6.0f * c[3]
+            * p;
         const float xy = bent * a * b + bend * (p * b + a * q) + 2.0f * c[2] * p + 2.0f * c[3] * q;
-        const float yy = both + bent * b * b + 2.0f * bend * b * q + 6.0f * c[2] * q + 2.0f * c[3] * p;
+        const float yy = both + bent * b * b + 2.0f * bend * b * q + 6.0f * c[2] * q + 2.0f * c[3]
+            * p;
         const float to_x = by * (xy * p - xx * q), to_y = by * (yy * p - xy * q);
         J[0] -= to_x * q; J[1] += to_x * p; J[2] -= to_y * q; J[3] += to_y * p;
     };
@@ -58,13 +68,17 @@ _PIXEL = f"""{_LENS}
             missing = fabsf(du) > fabsf(dv) ? fabsf(du) : fabsf(dv);
         }}
     }}
-    const float seen = distance.data[pixel], d = (seen < {NEAREST}f ? {NEAREST}f : seen) / sqrtf(u * u + v * v + 1.0f);
+    const float seen = distance.data[pixel], d = (seen < {NEAREST}f ? {NEAREST}f : seen)
+        / sqrtf(u * u + v * v + 1.0f);
     const float* D = displacement.data + 3 * flow * plane + pixel;
     const float* F = measured.data + ((long long)row * views.shape[0] + flow) * 2 * plane + pixel;
     const float dx = D[0], dy = D[plane], dz = D[2 * plane], fx = F[0], fy = F[plane];
-    const float qx = d * (k[8] * u + k[9] * v + k[10]) + k[17] + (k[20] * dx + k[21] * dy + k[22] * dz);
-    const float qy = d * (k[11] * u + k[12] * v + k[13]) + k[18] + (k[23] * dx + k[24] * dy + k[25] * dz);
-    const float qz = d * (k[14] * u + k[15] * v + k[16]) + k[19] + (k[26] * dx + k[27] * dy + k[28] * dz);
+    const float qx = d * (k[8] * u + k[9] * v + k[10]) + k[17]
+        + (k[20] * dx + k[21] * dy + k[22] * dz);
+    const float qy = d * (k[11] * u + k[12] * v + k[13]) + k[18]
+        + (k[23] * dx + k[24] * dy + k[25] * dz);
+    const float qz = d * (k[14] * u + k[15] * v + k[16]) + k[19]
+        + (k[26] * dx + k[27] * dy + k[28] * dz);
     const float a = qx / qz, b = qy / qz, largest = 3.402823466e38f;
     const bool known = fabsf(fx) <= largest && fabsf(fy) <= largest;
     float a_ = a, b_ = b, J[4] = {{1.0f, 0.0f, 0.0f, 1.0f}};
@@ -78,7 +92,8 @@ _PIXEL = f"""{_LENS}
         J[0] = at[2]; J[1] = J[2] = at[3]; J[3] = at[4];
         if (edge < 1.0f) turn(c, na, nb, a / r, b / r, (r - c[5]) * edge, J);
     }}
-    const float ex = known ? k[4] * a_ + (k[6] - x) - fx : 0.0f, ey = known ? k[5] * b_ + (k[7] - y) - fy : 0.0f;
+    const float ex = known ? k[4] * a_ + (k[6] - x) - fx : 0.0f, ey = known ? k[5] * b_ + (k[7] - y)
+        - fy : 0.0f;
 """
 
 _ERROR = f"""
@@ -149,7 +164,8 @@ def flow_errors(
     row: wp.array[int],  # [1] which F of ``measured`` [index]
     views: wp.array2d[float],  # [F, 29] f, c, later f, c, M, m, R [px, 1, m]; [F, 40] lenses, too
     # Out:
-    partials: wp.array2d[float],  # [1, P] sums of squared differences over parts of the image [px^2]
+    partials: wp.array2d[float],  # [1, P] sums of squared differences over parts of the image
+    #  [px^2]
 ):
     """One thread per pixel; on CUDA as many as fill the last warp."""
     error_of(distance, displacement, measured, row[0], views, wp.tid(), partials)
@@ -170,4 +186,6 @@ def flow_gradient(
 ):
     """One thread per flow and pixel."""
     flow, pixel = wp.tid()
-    gradient_of(distance, displacement, measured, row[0], views, factor * cotangent[0], flow, pixel, grad)
+    gradient_of(
+        distance, displacement, measured, row[0], views, factor * cotangent[0], flow, pixel, grad
+    )

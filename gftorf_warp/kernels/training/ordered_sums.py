@@ -1,6 +1,7 @@
 """Sums whose order is fixed, so that they are the same to the bit however threads are scheduled.
 
-A kernel leaves one partial sum per warp, on the CPU one per thread; :data:`means` adds them up, a block per row.
+A kernel leaves one partial sum per warp, on the CPU one per thread; :data:`means` adds them up, a
+block per row.
 """
 
 import warp as wp
@@ -22,7 +23,8 @@ OVER_LANES = """
     const bool writes = true;
 #endif
 """
-"""C++: the sum of a value over the lanes of a warp, which lane 0 gets, and where it goes. Every lane must take part."""
+"""C++: the sum of a value over the lanes of a warp, which lane 0 gets, and where it goes. Every
+lane must take part."""
 
 _ROW = f"""
     const float* in = partials.data + row * partials.shape[1];

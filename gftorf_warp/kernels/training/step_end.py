@@ -1,7 +1,7 @@
 """The end of a training step without reading anything back: validity, running sums, statistics.
 
-A step is valid if its loss and the sum of all squared gradients are finite and no (tile, splat) pair
-was dropped. An invalid step changes no parameter, moment, sum or statistic; it is counted.
+A step is valid if its loss and the sum of all squared gradients are finite and no (tile, splat)
+pair was dropped. An invalid step changes no parameter, moment, sum or statistic; it is counted.
 """
 
 import warp as wp
@@ -9,7 +9,8 @@ import warp as wp
 from .adam import ADVANCE, COLUMNS, GRADIENT, LENGTH, MORE
 from .ordered_sums import LANES, OVER_LANES
 
-PART = 256  # elements of a gradient whose squares one warp sums up: few, since it reads them serially
+# elements of a gradient whose squares one warp sums up: few, since it reads them serially
+PART = 256
 THREADS = 1024  # of the block that finishes a step
 SCREENS = 4  # images whose statistics one launch adds
 RESULTS = 3  # per image and term: the term, its mean squared difference, its mean opacity
@@ -30,7 +31,8 @@ _SQUARES = f"""{OVER_LANES}
         if (first_part.data[middle] <= slot) low = middle; else high = middle;
     }}
     const long long* row = table.data + {COLUMNS} * low;
-    const long long begin = (long long)(slot - first_part.data[low]) * {PART}, left = row[{LENGTH}] - begin;
+    const long long begin = (long long)(slot - first_part.data[low]) * {PART}, left = row[{LENGTH}]
+        - begin;
     const int count = left < {PART} ? (int)left : {PART};
     auto gradient = [&](int column) {{ return reinterpret_cast<const float*>(row[column]); }};
     const float *one = gradient({GRADIENT}), *two = gradient({MORE});
@@ -66,9 +68,11 @@ _FINISH = f"""
     const int columns = results.shape[1], terms = columns / {RESULTS};
     double of_field = 0.0, of_motion = 0.0;
     for (int i = t; i < partials.shape[0]; i += threads)
-        if (i < motion_part) of_field += (double)partials.data[i]; else of_motion += (double)partials.data[i];
+        if (i < motion_part) of_field += (double)partials.data[i]; else of_motion +=
+            (double)partials.data[i];
     for (int k = t; k < columns; k += threads) {{
-        float s = 0.0f;  // a result of weight 0 was not computed: its memory holds that of an earlier step
+        // a result of weight 0 was not computed: its memory holds that of an earlier step
+        float s = 0.0f;
         for (int n = 0; n < images; ++n) {{
             const float w = weights.data[columns * n + k];
             if (w != 0.0f) s += w * results.data[columns * n + k];
@@ -83,9 +87,11 @@ _FINISH = f"""
     }};
     of_field = over_lanes(of_field);
     of_motion = over_lanes(of_motion);
-    if (t % {LANES} == 0) {{ warp_sums[0][t / {LANES}] = of_field; warp_sums[1][t / {LANES}] = of_motion; }}
+    if (t % {LANES} == 0) {{ warp_sums[0][t / {LANES}] = of_field; warp_sums[1][t / {LANES}] =
+        of_motion; }}
     SYNCHRONISE;
-    if (t < {LANES}) {{ of_field = over_lanes(warp_sums[0][t]); of_motion = over_lanes(warp_sums[1][t]); }}
+    if (t < {LANES}) {{ of_field = over_lanes(warp_sums[0][t]); of_motion =
+        over_lanes(warp_sums[1][t]); }}
 #endif
     if (t == 0) {{
         const float largest = 3.402823466e38f;
@@ -98,7 +104,8 @@ _FINISH = f"""
         totals[0] = squared; totals[1] = opacity; totals[2] = loss; totals[3] = compared.data[0];
         int most = 0;
         for (int n = 0; n < renderings; ++n) most = used[n] > most ? used[n] : most;
-        const float norm = (float)(sqrt(of_field + of_motion) / images), length = (float)(sqrt(of_motion) / images);
+        const float norm = (float)(sqrt(of_field + of_motion) / images), length =
+            (float)(sqrt(of_motion) / images);
         const bool fits = !limited || most <= capacity;
         const bool valid = fabsf(loss) <= largest && norm <= largest && fits;
         const float left = gradient_max / (length + 1e-6f);
@@ -124,7 +131,9 @@ _FINISH = f"""
 
 
 @wp.func_native(_SQUARES)
-def squares_of(table: wp.array2d[wp.int64], first_part: wp.array[int], thread: int, partials: wp.array[float]):
+def squares_of(
+    table: wp.array2d[wp.int64], first_part: wp.array[int], thread: int, partials: wp.array[float]
+):
     """Squares of one part of a gradient, summed over the lanes of a warp."""
 
 
@@ -156,7 +165,9 @@ def finish(
 
 @wp.func
 def statistics_of(screen: wp.array2d[float], half: wp.vec2, i: int) -> wp.vec3:
-    """Statistics of a Gaussian in one image: pixels times screen gradient, pixels, weight in them."""
+    """Statistics of a Gaussian in one image: pixels times screen gradient, pixels,
+    weight in them.
+    """
     length = wp.length(wp.vec2(half[0] * screen[i, 0], half[1] * screen[i, 1]))
     return wp.vec3(screen[i, 2] * length, screen[i, 2], screen[i, 3])
 
@@ -164,7 +175,8 @@ def statistics_of(screen: wp.array2d[float], half: wp.vec2, i: int) -> wp.vec3:
 @wp.kernel(enable_backward=False)
 def add_statistics(
     # In:
-    screen0: wp.array2d[float],  # [N, 4] of the first image: derivative by the image position [1/px], pixels, weight
+    screen0: wp.array2d[float],  # [N, 4] of the first image: derivative by the image position
+    #  [1/px], pixels, weight
     screen1: wp.array2d[float],  # [N, 4] of the second, if there is one
     screen2: wp.array2d[float],  # [N, 4] of the third
     screen3: wp.array2d[float],  # [N, 4] of the fourth
@@ -212,7 +224,8 @@ def finish_step(
     clips: bool,  # whether the gradient of the motion is clipped [1]
     gradient_max: float,  # its largest norm [1]
     results: wp.array2d[float],  # [B or more, 3 L] results of every image and term, see ``RESULTS``
-    weights: wp.array2d[float],  # [B or more, 3 L] weights of these; 0: not computed in this step [1]
+    weights: wp.array2d[float],  # [B or more, 3 L] weights of these; 0: not computed in this step
+    #  [1]
     images: int,  # B of this step [1]
     compared: wp.array[float],  # [1] images with any term
     pairs: wp.array[int],  # [R or more] (tile, splat) pairs of every rendering
@@ -224,12 +237,13 @@ def finish_step(
     beta1: wp.float64,  # decay of the first moment [1]
     beta2: wp.float64,  # decay of the second moment [1]
     # Out:
-    counts: wp.array[int],  # [4] skipped steps, in a row, most pairs of a rendering, steps with too many pairs
+    counts: wp.array[int],  # [4] skipped steps, in a row, most pairs of a rendering, steps with too
+    #  many pairs
     sums: wp.array[float],  # [L + 4] weighted terms, squared difference, opacity, loss, images
     sizes: wp.array2d[float],  # [T, 3] step sizes of Adam
 ):
     """One block, on the CPU one thread."""
     finish(
-        partials, motion_part, motion_from, clips, gradient_max, results, weights, images, compared, pairs,
-        renderings, limited, capacity, table, rates, beta1, beta2, counts, sums, sizes,
+        partials, motion_part, motion_from, clips, gradient_max, results, weights, images, compared,
+        pairs, renderings, limited, capacity, table, rates, beta1, beta2, counts, sums, sizes,
     )  # fmt: skip
