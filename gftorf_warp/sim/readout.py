@@ -12,7 +12,8 @@ With G electrons per unit,
     n_A, n_B = 1/2 [N_a + N_s +- C G q] + N_dark         mean electrons per tap; N_a ambient
     n'  = min(Poisson(n) + Normal(0, s_r), full well)    per tap
     differential   code = clip(round((n'_A - n'_B) / e)),      quad = code e / (C G)
-    unipolar       code = clip(round(n'_A / e) + pedestal),    quad = (n'_A - N_a/2 - N_dark) 2 / (C G)
+    unipolar       code = clip(round(n'_A / e) + pedestal)
+                   quad = (n'_A - N_a/2 - N_dark) 2 / (C G)
 
 C is the contrast. Differential codes are signed. A unipolar sensor has C = 1 / b. It subtracts
 constant levels: ambient light, measured by a frame without active light, and the mean dark current

@@ -3,8 +3,9 @@
 Splat k with alpha_k = min(0.99, o_k G_k) leaves T_{k+1} = T_k (1 - alpha_k), T_0 = 1, and adds to
 its pixel
 
-    w_k = alpha_k T_k   times   distance d, three channels c, and to the distortion (half of the double sum)
-    w_k T_k             times   light (a cos psi, a sin psi, a): light of a quad passes every splat twice
+    w_k = alpha_k T_k   times   distance d, three channels c; and to the distortion, half of the
+                                double sum
+    w_k T_k             times   light (a cos psi, a sin psi, a), which passes every splat twice
 
 (paper, equations 3-5; method, sections 2.5 and 2.7). The background is linear in the
 transmittance T_e that remains, and added in planes_to_images.py. The adjoint is

@@ -21,9 +21,8 @@ import warp as wp
 
 Splat = wp.types.vector(length=16, dtype=wp.float32)
 CHANNEL = wp.constant(8)  # first slot of the T-weighted channels
-AHEAD = wp.constant(
-    4
-)  # records that a CPU thread prefetches: they are scattered in memory, and cache misses cost a tenth
+# records that a CPU thread prefetches: they are scattered in memory, and cache misses cost a tenth
+AHEAD = wp.constant(4)
 
 _LOAD = """
 // component-wise reads would be sixteen; a record is aligned, so four of 16 bytes do
