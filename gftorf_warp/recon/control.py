@@ -255,7 +255,7 @@ class ControlBlock:
             for (kind, view), shape in self._parts.items():
                 part = constants[n, start : start + math.prod(shape)]
                 start += math.prod(shape)
-                if kind == "blend" and keys and (flow or view != View.FLOW):  # else its keys may be absent
+                if kind == "blend" and keys and (flow or view != View.FLOW):
                     blend = self._blend(view, frame, keys, flow=flow)
                     part[: blend.size] = blend.ravel()  # of as many keys as the graph has
                 elif kind == "camera" and view == View.FLOW:
