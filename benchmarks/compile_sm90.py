@@ -54,10 +54,8 @@ from gftorf_warp.render.buffers import SEGMENTS, TILE_SHAPES
 FRAME_SIZE, REGISTERS = 0x11, 0x2F  # attributes in the .nv.info section of a cubin
 ALLOWED_STACK = 32  # [B]
 PASSES = "perceptron forward", "perceptron backward"  # for sm_90a
-HIERARCHIES = {
-    "trace": 1024,
-    "paths": 1024,
-}  # [B] a query of a bounding volume hierarchy keeps the nodes to come on the stack
+# [B] a query of a bounding volume hierarchy keeps the nodes to come on the stack
+HIERARCHIES = {"trace": 1024, "paths": 1024}
 
 
 def modules(arch: int) -> dict[str, wp.Module]:

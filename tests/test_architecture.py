@@ -81,7 +81,6 @@ LARGE_CLASSES = {  # file:class: why it may be larger
     "scene/sensor.py:Sensor": "the physical constants of one camera, each independent of the "
     "others",
     "render/trace.py:Tracer": "public methods with arguments that are explained",
-    "scene/camera.py:Camera": "public methods with arguments that are explained",
     "scene/network.py:Network": "public methods with arguments that are explained",
     "render/tensor_cores.py:FusedLayers": "still to be divided",
     "render/replay.py:Replay": "still to be divided",

@@ -37,11 +37,8 @@ BLOCK_BYTES = 1 << 26  # of one system call, at most; memory holds two blocks
 HELD = 2 * BLOCK + 2  # images in memory, at most
 HEADER = 4096  # [bytes] so that images are aligned to pages
 DIRECT = getattr(os, "O_DIRECT", 0)
-REFUSED = {
-    errno.EINVAL,
-    errno.EFAULT,
-    errno.EOPNOTSUPP,
-}  # errors of O_DIRECT for an unsuitable size, address, memory or file system
+# errors of O_DIRECT for an unsuitable size, address, memory or file system
+REFUSED = {errno.EINVAL, errno.EFAULT, errno.EOPNOTSUPP}
 LOG = logging.getLogger("gftorf_warp")
 
 

@@ -16,9 +16,8 @@ from ..harmonics import harmonics
 from ..lens import bent_covariance, distorted
 from .splat import Splat
 
-BLOCK_RADIUS = wp.constant(
-    2.1214
-)  # [px] from the middle of a block of 4 x 4 pixels to its farthest centre, 1.5 sqrt(2)
+# [px] from the middle of a block of 4 x 4 pixels to its farthest centre, 1.5 sqrt(2)
+BLOCK_RADIUS = wp.constant(2.1214)
 
 
 @wp.func
