@@ -13,14 +13,13 @@ import gc
 import logging
 import os
 import sys
-import threading
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
 from . import __version__
 from .errors import ResourceError, UsageError
 from .options import parse
+from .process import available_cpus, exit_at_once, on_cpus, open_cuda, without_garbage_collection
 
 if TYPE_CHECKING:
     from .sim.scene import Scene
@@ -41,14 +40,14 @@ def main(arguments: list[str] | None = None) -> int:
 
     if arguments is None:
         codes: list[int] = []
-        atexit.register(_exit_at_once, codes)  # before all others, so that it runs after them
+        atexit.register(exit_at_once, codes)  # before all others, so that it runs after them
         codes.append(main(sys.argv[1:]))
         return codes[0]
     debug = "--debug" in arguments
     try:
         options = parse(list(arguments))
-        _open_cuda(getattr(options, "device", "cpu"))
-        with logging_to_stderr(_level(options)), _cpus(getattr(options, "threads", None)):
+        open_cuda(getattr(options, "device", "cpu"))
+        with logging_to_stderr(_level(options)), on_cpus(getattr(options, "threads", None)):
             return COMMANDS[options.command](options)
     except SystemExit as stop:  # --help and --version
         return int(stop.code or 0)
@@ -96,44 +95,11 @@ def choose_device(name: str) -> tuple[str, str]:
     )
 
 
-def _open_cuda(device: str) -> None:
-    """Create the CUDA context that torch and Warp will share in a thread,
-    while they are imported.
-    """
-    if device == "cpu":
-        return
-    # as torch does before it initialises the driver
-    os.environ.setdefault("CUDA_MODULE_LOADING", "LAZY")
-
-    def create() -> None:
-        import ctypes
-
-        with suppress(OSError, AttributeError):  # no driver: `choose_device` reports it
-            driver = ctypes.CDLL("libcuda.so.1")
-            ordinal, context = ctypes.c_int(), ctypes.c_void_p()
-            index = int(device.partition(":")[2] or 0)
-            if driver.cuInit(0) == 0 and driver.cuDeviceGet(ctypes.byref(ordinal), index) == 0:
-                driver.cuDevicePrimaryCtxRetain(ctypes.byref(context), ordinal)
-
-    threading.Thread(target=create, name="gftorf-cuda", daemon=True).start()
-
-
-def _exit_at_once(codes: list[int]) -> None:
-    """End the process with the exit code of its command,
-    and without freeing modules and CUDA objects one by one.
-    """
-    for stream in (sys.stdout, sys.stderr):
-        with suppress(OSError, ValueError):
-            stream.flush()
-    if codes:
-        os._exit(codes[0])
-
-
 def start(options: argparse.Namespace, *, compile_first: bool = True) -> str:
     """Import torch and Warp, log the device, compile kernels if none are cached,
     and return the device.
     """
-    with _without_garbage_collection():
+    with without_garbage_collection():
         import torch
 
         from . import terminal
@@ -141,7 +107,7 @@ def start(options: argparse.Namespace, *, compile_first: bool = True) -> str:
 
         terminal.start_warp()
     device, reason = choose_device(getattr(options, "device", "cpu"))
-    threads = min(torch.get_num_threads(), _available_cpus())
+    threads = min(torch.get_num_threads(), available_cpus())
     cache = terminal.home_as_tilde(terminal.kernel_cache())
     details = "; ".join(filter(None, [f"{threads} threads", reason]))
     terminal.LOG.info(
@@ -409,36 +375,3 @@ def _progress(options: argparse.Namespace) -> Callable[..., Callable[..., None]]
     from .terminal import Progress
 
     return functools.partial(Progress, quiet=options.quiet)
-
-
-def _available_cpus() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-@contextmanager
-def _without_garbage_collection() -> Iterator[None]:
-    """Import without garbage collection, and exclude the 240,000 imported objects from later
-    collections.
-    """
-    before = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if before:
-            gc.enable()
-        gc.freeze()
-
-
-@contextmanager
-def _cpus(threads: int | None) -> Iterator[None]:
-    """Restrict this process to ``threads`` CPUs, which torch, OpenCV and the renderer respect."""
-    if threads is None or not hasattr(os, "sched_setaffinity"):
-        yield
-        return
-    before = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, set(sorted(before)[:threads]))
-    try:
-        yield
-    finally:
-        os.sched_setaffinity(0, before)
