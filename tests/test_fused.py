@@ -52,7 +52,7 @@ def test_loss_of_an_image_is_the_oracles(monkeypatch, device, shape, block, smoo
     """Value to 1e-5, gradient to 2e-6 of its largest, 3e-5 where variance cancels:
     in blocks and pixel by pixel.
     """
-    monkeypatch.setattr(training, "BLOCK", block)
+    monkeypatch.setattr(fused, "BLOCK", block)
     rendered, measured = (
         image(shape, 1, smooth).to(device).requires_grad_(),
         image(shape, 2, smooth).to(device),
@@ -256,7 +256,7 @@ def one_step(values, gradients, moments, rates, images=1, motion_from=None, long
 @pytest.mark.parametrize("block", [16, 1], ids=["vectors", "elements"])
 def test_adam_is_torchs_over_fifty_steps(monkeypatch, device, block):
     """Parameters and moments to 1e-6 of their size, with gradients from 1 to 1e-15."""
-    monkeypatch.setattr(training, "BLOCK", block)
+    monkeypatch.setattr(descent, "BLOCK", block)
     values, rates, gradients = adam_case(device)
     twins = [value.clone().requires_grad_() for value in values]
     groups = [{"params": [twin], "lr": rate} for twin, rate in zip(twins, rates, strict=True)]
