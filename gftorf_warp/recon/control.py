@@ -23,6 +23,7 @@ from ..render import fused
 from ..render.control import DeviceCamera, packed
 from ..render.cuda import DeviceUpload
 from ..scene.motion import Motion
+from .blending import Blending
 from .observations import Observations
 from .settings import ReconSettings
 from .terms import Term, View
@@ -113,13 +114,10 @@ class ControlBlock:
             groups: Learning-rate group of every optimised tensor.
         """
         self.observations, self.settings = observations, settings
-        self.terms, self.motion, self.groups = terms, motion, groups
+        self.terms, self.groups = terms, groups
         self.images = max(len(batch) for batch in observations.batches)
-        self._key_counts = {
-            flow: max(len(self._keys_of(batch, flow=flow)) for batch in observations.batches)
-            for flow in (False, True)
-        }
-        keys = max(self._key_counts.values())
+        self._blending = Blending(observations, motion)
+        keys = self._blending.counts[True]
         camera = len(self._camera(View.TOF, observations.batches[0][0]))
         flow_cameras = self._flow_cameras(observations.batches[0][0])
         self._parts: dict[tuple[str, View], tuple[int, ...]] = {
@@ -171,7 +169,7 @@ class ControlBlock:
         if name not in self._keys:
             terms = list(itertools.compress(self.terms, active))
             images = tuple(self._image_key(frame, terms) for frame in frames)
-            keys = self._key_counts[_has_flow(images)] if moves else 0
+            keys = self._blending.counts[_has_flow(images)] if moves else 0
             values = images, keys, frozen, sh_degree
             if values not in self._keys:
                 self._keys[values] = GraphKey(
@@ -215,8 +213,8 @@ class ControlBlock:
     def _image_key(self, frame: int, active: list[Term]) -> ImageKey:
         terms = [term for term in active if term.applies(self.observations, frame)]
         views = {term.view for term in terms if term.view is not None}
-        start = self.motion.times[frame // self.observations.sequence.cycle]
-        if {View.TOF, View.FLOW} <= views and self.observations.time_at(frame) == start:
+        tof, flow = (self._blending.time_of(view, frame) for view in (View.TOF, View.FLOW))
+        if {View.TOF, View.FLOW} <= views and tof == flow:
             views.remove(View.FLOW)
         return ImageKey(terms=tuple(term.name for term in terms), views=frozenset(views))
 
@@ -236,9 +234,9 @@ class ControlBlock:
             Integers; factors [B, T, 3] of the results; other floats.
         """
         flow = _has_flow(key.images)
-        keys = self._keys_of(frames, flow=flow) if key.keys else []
+        keys = self._blending.keys_of(frames, flow=flow) if key.keys else []
         keys += keys[-1:] * (key.keys - len(keys))  # a repeated key of weight 0
-        ints = np.zeros(self._key_counts[True] + self.images * NUMBERS, np.int32)
+        ints = np.zeros(self._blending.counts[True] + self.images * NUMBERS, np.int32)
         ints[: len(keys)] = keys
         rows = ints[-self.images * NUMBERS :].reshape(self.images, NUMBERS)
         factors = np.zeros((self.images, len(self.terms), RESULTS), np.float32)
@@ -256,7 +254,7 @@ class ControlBlock:
                 part = constants[n, start : start + math.prod(shape)]
                 start += math.prod(shape)
                 if kind == "blend" and keys and (flow or view != View.FLOW):
-                    blend = self._blend(view, frame, keys, flow=flow)
+                    blend = self._blending.weights(view, frame, keys, flow=flow)
                     part[: blend.size] = blend.ravel()  # of as many keys as the graph has
                 elif kind == "camera" and view == View.FLOW:
                     part[:] = self._flow_cameras(frame).ravel()
@@ -275,50 +273,6 @@ class ControlBlock:
         ends = [cameras[min(max(frame + step * cycle, 0), last)] for step in (1, -1)]
         return fused.flow_cameras(cameras[frame], ends)
 
-    def _blend(
-        self, view: View, frame: int, keys: list[int], *, flow: bool
-    ) -> Float[np.ndarray, "D K"]:
-        """Interpolation weights of a view, see ``ImageControl.blend``."""
-        quartet, times = frame // self.observations.sequence.cycle, self.motion.times
-        at = self._weights(self._time(view, frame), keys)
-        if view == View.COLOUR or not flow:
-            return at[None]
-        start = self._weights(times[quartet], keys)
-        ends = [
-            self._weights(times[i], keys) - start if 0 <= i < len(times) else np.zeros(len(keys))
-            for i in (quartet + 1, quartet - 1)
-        ]
-        return np.stack([at, *ends])
-
-    def _time(self, view: View, frame: int) -> float:
-        """When a view is rendered [s]."""
-        shown = self.observations
-        if view == View.COLOUR:
-            return float(shown.sequence.times[frame])
-        if view == View.FLOW:
-            return self.motion.times[frame // shown.sequence.cycle]
-        return shown.time_at(frame)
-
-    def _weights(self, time: float, keys: list[int]) -> np.ndarray:
-        """Interpolation weight of every key at a time."""
-        result, needed = np.zeros(len(keys)), self.motion.keys_at(time)
-        for key, weight in zip(needed.index, needed.weight, strict=True):
-            result[keys.index(key)] += weight  # the first of repeated ones
-        return result
-
-    def _keys_of(self, frames: list[int], *, flow: bool) -> list[int]:
-        """All keys that a batch depends on."""
-        times = [self._time(View.TOF, frame) for frame in frames]
-        times += [
-            self._time(View.COLOUR, frame) for frame in frames if frame in self.observations.colour
-        ]
-        if flow:
-            starts = self.motion.times
-            quartets = {frame // self.observations.sequence.cycle for frame in frames}
-            wanted = {i + step for i in quartets for step in (0, 1, -1)}
-            times += [starts[i] for i in wanted if 0 <= i < len(starts)]
-        return sorted({key for time in times for key in self.motion.keys_at(time).index})
-
     @property
     def _image_floats(self) -> int:
         return sum(math.prod(shape) for shape in self._parts.values())
@@ -331,7 +285,7 @@ class ControlBlock:
 
     def image(self, n: int, key: GraphKey) -> ImageControl:
         """Device memory of image ``n`` of the batch."""
-        begin = self._key_counts[True] + n * NUMBERS
+        begin = self._blending.counts[True] + n * NUMBERS
         ints = self._ints[begin : begin + NUMBERS]
         parts = dict(
             zip(

@@ -8,26 +8,22 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from ..render import descent, fused
-from ..render.api import Background, Rendering, ScreenGradient, rasterize
-from ..render.bridge import pairs_of
-from ..render.buffers import RenderSettings, Workspace
+from ..render.api import ScreenGradient
+from ..render.buffers import RenderSettings
 from ..render.cuda import SideStreams
-from ..render.displacement import displaced
-from ..scene.gaussians import GaussianField
 from ..scene.motion import KeyMotion, Motion
-from .control import ControlBlock, GraphKey, ImageControl, ImageKey
+from .control import ControlBlock, GraphKey, ImageKey
 from .observations import Observations
 from .optimiser import EPSILON, field_of
 from .padded import PaddedParameters
 from .settings import ReconSettings
-from .terms import LIGHT, Comparison, Term, View
+from .terms import Comparison, Term, View
 
 Map = Callable[[Callable[[int], "ImageGradients"], Iterable[int]], Iterable["ImageGradients"]]
 COLOUR_STREAM = 1  # of random numbers; that of quads and phasors is 0
@@ -77,12 +73,9 @@ class Step:
         )
         """Results and sums on the device."""
         self._streams = SideStreams(control.images, device)
-        self._workspaces: defaultdict[tuple[int, View], Workspace] = defaultdict(Workspace)
         self._scratch: defaultdict[tuple[int, str], fused.Scratch] = defaultdict(fused.Scratch)
-        # one shift; values from control
-        self._sensor = observations.sensor_at(observations.batches[0][0])
-        cameras = [*observations.colour_cameras.values(), observations.cameras[0]]
-        self._cameras = dict.fromkeys(View, observations.cameras[0]) | {View.COLOUR: cameras[0]}
+        self.renderer = Renderer(observations, settings, self.terms)
+        """Renders the images."""
 
     def run(
         self,
@@ -135,14 +128,9 @@ class Step:
             )
             screens = [image.screen for image in images if image.screen is not None]
             if screens:
-                camera, statistics = self._cameras[_primary(key.images[0])], self.padded.statistics
+                camera, statistics = self.renderer.cameras[primary(key.images[0])], self.padded.statistics
                 sums = statistics.gradient, statistics.pixels, statistics.weight
                 descent.add_statistics(screens, (camera.width, camera.height), self.output, *sums)
-
-    @property
-    def sorts_pairs(self) -> bool:
-        """Whether the last step sorted its (tile, splat) pairs."""
-        return any(not workspace.last.marks for workspace in self._workspaces.values())
 
     def _key_motion(self, key: GraphKey, motion: Motion) -> KeyMotion | None:
         """Motion at all keys of the batch, evaluated once; None: nothing moves yet."""
@@ -168,18 +156,7 @@ class Step:
         if key_motion is not None:
             offset, rotation = key_motion
             leaf = KeyMotion(_leaf_of(offset), None if rotation is None else _leaf_of(rotation))
-        renderings: dict[View, Rendering] = {}
-        displacement = None
-        no_view = any(term.view is None and term.name in image.terms for term in self.terms)
-        for view in [v for v in View if v in image.views or (no_view and v == View.TOF)]:
-            joint = view == View.TOF and "flow" in image.terms and View.FLOW not in image.views
-            moved, channels = self._moved(field, leaf, control, view, joint or view == View.FLOW)
-            if view == View.TOF:
-                displacement = None if leaf is None else moved.mean - field.mean
-            if view in image.views:
-                renderings[view] = self._render(view, n, image, moved, channels, control, render)
-            if joint:
-                renderings[View.FLOW] = renderings[view]
+        renderings, displacement = self.renderer.render(n, image, field, leaf, control, render)
         comparison = Comparison(
             observations=self.observations,
             settings=self.settings,
@@ -192,82 +169,12 @@ class Step:
         )
         leaves = [*values.values(), *(t for t in leaf or () if t is not None)]
         gradients = self._gradients(n, image, comparison, leaves)
-        primary = renderings.get(_primary(image))
+        primary = renderings.get(primary(image))
         return ImageGradients(
             values=gradients[: len(values)],
             motion=gradients[len(values) :],
             screen=None if primary is None else primary.screen,
-            pairs=[pairs_of(self._workspaces[n, view]) for view in image.views],
-        )
-
-    def _moved(
-        self,
-        field: GaussianField,
-        leaf: KeyMotion | None,
-        control: ImageControl,
-        view: View,
-        channels: bool,
-    ) -> tuple[GaussianField, Float[Tensor, "N D"] | None]:
-        """The Gaussians at the time of a view, and their displacements along the flows."""
-        if leaf is None:
-            return field, None
-        mean, quaternion, ways = displaced(
-            field.mean, field.quaternion, leaf, control.blend[view], channels=channels
-        )
-        return replace(field, mean=mean, quaternion=quaternion), ways
-
-    def _render(
-        self,
-        view: View,
-        n: int,
-        image: ImageKey,
-        field: GaussianField,
-        channels: Float[Tensor, "N D"] | None,
-        control: ImageControl,
-        render: RenderSettings,
-    ) -> Rendering:
-        """One rendering of an image: the outputs that its terms read."""
-        joint = view == View.TOF and channels is not None
-        views = {view, View.FLOW} if joint else {view}
-        outputs = {"opacity"}
-        for term in self.terms:
-            if term.name in image.terms and term.view in views:
-                outputs |= term.outputs
-        camera, light = self._cameras[view], "phasor" if self.observations.phasors else "quads"
-        shape = {"phasor": 3, "quads": 1, "colour": 3}
-        background = {}
-        if LIGHT in outputs:
-            outputs = outputs - {LIGHT} | {light}
-            background[light] = 0
-        if view == View.COLOUR:
-            background["colour"] = COLOUR_STREAM
-        else:
-            field = replace(field, colour_sh=None)
-        if view == View.FLOW:
-            field = field.map(torch.Tensor.detach)
-        amplitude = self.settings.background
-        noise = {
-            name: fused.uniform(
-                (shape[name], camera.height, camera.width),
-                control.noise_origin,
-                amplitude,
-                stream=stream,
-            )
-            for name, stream in background.items()
-            if amplitude > 0
-        }
-        return rasterize(
-            field,
-            camera,
-            self._sensor,
-            render,
-            control=control.camera[view],
-            background=Background(**noise),
-            screen_gradient=self.settings.densify.every is not None and view == _primary(image),
-            images=outputs,
-            extra=channels,
-            extra_detached=channels is not None,
-            workspace=self._workspaces[n, view],
+            pairs=self.renderer.pairs(n, image),
         )
 
     def _gradients(
@@ -337,11 +244,6 @@ class Step:
 def _leaf_of(tensor: Tensor) -> Tensor:
     """The same values as a leaf."""
     return tensor.detach().requires_grad_(tensor.requires_grad)
-
-
-def _primary(image: ImageKey) -> View:
-    """The view that densification is based on."""
-    return View.TOF if View.TOF in image.views else View.COLOUR
 
 
 def _in_order(
