@@ -23,6 +23,7 @@ from gftorf_warp.recon.settings import Batch, Input, Norm, Weights
 from gftorf_warp.recon.state import begin
 from gftorf_warp.recon.stepper import Stepper
 from gftorf_warp.recon.terms import TERMS, Term, View
+from gftorf_warp.render import fused
 from gftorf_warp.render.api import rasterize
 from gftorf_warp.render.cuda import CapturedGraph
 from gftorf_warp.render.layers import Form
@@ -444,13 +445,13 @@ def test_a_step_that_is_not_finite_is_counted_and_changes_nothing(device):
 
 def test_every_image_has_its_own_background(monkeypatch):
     """Four images per step, and the next step continues counting."""
-    origins, whole = [], stepper.Step._render
+    origins, whole = [], fused.uniform
 
-    def watched(self, view, n, image, field, channels, control, render):
-        origins.append(tuple(control.noise_origin.tolist()))
-        return whole(self, view, n, image, field, channels, control, render)
+    def watched(shape, origin, amplitude, **stream):
+        origins.append(tuple(origin.tolist()))
+        return whole(shape, origin, amplitude, **stream)
 
-    monkeypatch.setattr(stepper.Step, "_render", watched)
+    monkeypatch.setattr(fused, "uniform", watched)
     settings = demo(images=48)
     state, observations = begun(settings)
     steps = Stepper(state, observations, settings)

@@ -54,7 +54,7 @@ class Blending:
     ) -> Float[np.ndarray, "D K"]:
         """Interpolation weights of a view: at its time, then, with flow, of both flows.
 
-        Those of a flow are weights at its end minus weights at its start; zero beyond the recording.
+        Those of a flow are weights at its end minus those at its start; zero beyond the recording.
         """
         rows = [self._at(self.time_of(view, frame), keys)]
         if flow and view != View.COLOUR:

@@ -74,11 +74,11 @@ class Renderer:
             settings: Of the renderer.
 
         Returns:
-            Renderings by view, and the displacements [m] at the time of the ToF image, None without
-            motion or if no term reads them.
+            Renderings by view, and the centres [m] at the time of the ToF image; None if nothing
+            moves or if no term reads it.
         """
         renderings: dict[View, Rendering] = {}
-        displacement = None
+        moved_mean = None
         no_view = any(term.view is None and term.name in image.terms for term in self.terms)
         for view in [v for v in View if v in image.views or (no_view and v == View.TOF)]:
             joint = view == View.TOF and "flow" in image.terms and View.FLOW not in image.views
@@ -92,12 +92,12 @@ class Renderer:
                     channels=joint or view == View.FLOW,
                 )
                 moved = replace(field, mean=mean, quaternion=quaternion)
-                displacement = mean - field.mean if view == View.TOF and no_view else displacement
+                moved_mean = mean if view == View.TOF else moved_mean
             if view in image.views:
                 renderings[view] = self._render(view, n, image, moved, channels, control, settings)
             if joint:
                 renderings[View.FLOW] = renderings[view]
-        return renderings, displacement
+        return renderings, moved_mean
 
     def _render(
         self,

@@ -22,11 +22,11 @@ from .control import ControlBlock, GraphKey, ImageKey
 from .observations import Observations
 from .optimiser import EPSILON, field_of
 from .padded import PaddedParameters
+from .renderings import Renderer, primary
 from .settings import ReconSettings
 from .terms import Comparison, Term, View
 
 Map = Callable[[Callable[[int], "ImageGradients"], Iterable[int]], Iterable["ImageGradients"]]
-COLOUR_STREAM = 1  # of random numbers; that of quads and phasors is 0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -128,7 +128,8 @@ class Step:
             )
             screens = [image.screen for image in images if image.screen is not None]
             if screens:
-                camera, statistics = self.renderer.cameras[primary(key.images[0])], self.padded.statistics
+                camera = self.renderer.cameras[primary(key.images[0])]
+                statistics = self.padded.statistics
                 sums = statistics.gradient, statistics.pixels, statistics.weight
                 descent.add_statistics(screens, (camera.width, camera.height), self.output, *sums)
 
@@ -156,24 +157,25 @@ class Step:
         if key_motion is not None:
             offset, rotation = key_motion
             leaf = KeyMotion(_leaf_of(offset), None if rotation is None else _leaf_of(rotation))
-        renderings, displacement = self.renderer.render(n, image, field, leaf, control, render)
+        renderings, moved = self.renderer.render(n, image, field, leaf, control, render)
         comparison = Comparison(
             observations=self.observations,
             settings=self.settings,
             renderings=renderings,
             rows=control.rows,
-            displacement=displacement,
+            mean=field.mean,
+            moved=moved,
             mean_weight=self.padded.mean_weight,
             flow_cameras=control.flow_cameras,
             scratch=lambda name: self._scratch[n, name],
         )
         leaves = [*values.values(), *(t for t in leaf or () if t is not None)]
         gradients = self._gradients(n, image, comparison, leaves)
-        primary = renderings.get(primary(image))
+        based_on = renderings.get(primary(image))
         return ImageGradients(
             values=gradients[: len(values)],
             motion=gradients[len(values) :],
-            screen=None if primary is None else primary.screen,
+            screen=None if based_on is None else based_on.screen,
             pairs=self.renderer.pairs(n, image),
         )
 

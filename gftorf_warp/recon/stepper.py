@@ -212,7 +212,8 @@ class Stepper:
             LOG.warning(text, skipped, self.state.images, overflowed)
         counts[0] = 0
         counts[2:] = 0
-        if self._padded.pads and self._capacity.learn(pairs, is_sorted=self._step.renderer.sorts_pairs):
+        is_sorted = self._step.renderer.sorts_pairs
+        if self._padded.pads and self._capacity.learn(pairs, is_sorted=is_sorted):
             self._release_graphs()
         return 0 if overflowed else in_a_row
 

@@ -51,14 +51,21 @@ class Comparison:
     rows: Mapping[str, Int[Tensor, "1"]]
     """Row of this image among the quads or phasors ('light'), 'colour', closed-form distances
     ('depth') and 'flow' of the observations: device data, since a CUDA graph serves all images."""
-    displacement: Float[Tensor, "N 3"] | None
-    """Displacement of every Gaussian at the time of the ToF image [m]; None: nothing moves yet."""
+    mean: Float[Tensor, "N 3"]
+    """Undisplaced centres [m]."""
+    moved: Float[Tensor, "N 3"] | None
+    """Centres at the time of the ToF image [m]; None: nothing moves yet."""
     mean_weight: Float[Tensor, "N"]
     """Weight of every Gaussian in a mean over Gaussians: 1/N, and 0 for padding rows."""
     flow_cameras: Float[Tensor, "2 V"]
     """Cameras at both ends of both flows, see :func:`gftorf_warp.render.fused.flow_cameras`."""
     scratch: Callable[[str], fused.Scratch]
     """Memory of an image loss by name of its term."""
+
+    @property
+    def displacement(self) -> Float[Tensor, "N 3"] | None:
+        """Displacements at the time of the ToF image [m]; None: nothing moves yet."""
+        return None if self.moved is None else self.moved - self.mean
 
 
 @dataclass(frozen=True, kw_only=True)
