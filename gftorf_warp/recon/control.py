@@ -42,6 +42,8 @@ class ImageKey:
     """Names of its terms."""
     views: frozenset[View]
     """What is rendered. Flow at the time of the ToF image comes with that rendering."""
+    flow_terms: tuple[str, ...] = ()
+    """Names of the terms that read the flow, which not every image has."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -62,13 +64,15 @@ class GraphKey:
 
     @cached_property
     def terms(self) -> frozenset[str]:
-        """Names of all terms but the flow, which not all steps have."""
-        return frozenset(name for image in self.images for name in image.terms) - {"flow"}
+        """Names of all terms that every batch has."""
+        return frozenset(
+            n for image in self.images for n in image.terms if n not in image.flow_terms
+        )
 
-    @property
+    @cached_property
     def has_flow(self) -> bool:
-        """Whether any image has the flow term."""
-        return any("flow" in image.terms for image in self.images)
+        """Whether any image has a term that reads the flow."""
+        return any(image.flow_terms for image in self.images)
 
     @cached_property
     def stage(self) -> tuple[object, ...]:
@@ -169,7 +173,7 @@ class ControlBlock:
         if name not in self._keys:
             terms = list(itertools.compress(self.terms, active))
             images = tuple(self._image_key(frame, terms) for frame in frames)
-            keys = self._blending.counts[_has_flow(images)] if moves else 0
+            keys = self._blending.counts[any(image.flow_terms for image in images)] if moves else 0
             values = images, keys, frozen, sh_degree
             if values not in self._keys:
                 self._keys[values] = GraphKey(
@@ -216,7 +220,11 @@ class ControlBlock:
         tof, flow = (self._blending.time_of(view, frame) for view in (View.TOF, View.FLOW))
         if {View.TOF, View.FLOW} <= views and tof == flow:
             views.remove(View.FLOW)
-        return ImageKey(terms=tuple(term.name for term in terms), views=frozenset(views))
+        return ImageKey(
+            terms=tuple(term.name for term in terms),
+            views=frozenset(views),
+            flow_terms=tuple(term.name for term in terms if term.view == View.FLOW),
+        )
 
     def _rows_of(self, frame: int) -> list[int]:
         """In the order of ``ROWS``; 0 where there is no such image, which no term reads then."""
@@ -233,7 +241,7 @@ class ControlBlock:
         Returns:
             Integers; factors [B, T, 3] of the results; other floats.
         """
-        flow = _has_flow(key.images)
+        flow = key.has_flow
         keys = self._blending.keys_of(frames, flow=flow) if key.keys else []
         keys += keys[-1:] * (key.keys - len(keys))  # a repeated key of weight 0
         ints = np.zeros(self._blending.counts[True] + self.images * NUMBERS, np.int32)
@@ -296,7 +304,7 @@ class ControlBlock:
         )
         blend = {}
         for view in View:
-            rows = 1 + FLOWS if view != View.COLOUR and "flow" in key.images[n].terms else 1
+            rows = 1 + FLOWS if view != View.COLOUR and key.images[n].flow_terms else 1
             blend[view] = parts["blend", view][: rows * key.keys].view(rows, key.keys)
         cameras = {
             view: DeviceCamera.over(parts["camera", view]) for view in (View.TOF, View.COLOUR)
@@ -308,7 +316,3 @@ class ControlBlock:
             camera=cameras | {View.FLOW: cameras[View.TOF]},
             flow_cameras=parts["camera", View.FLOW].view(FLOWS, -1),
         )
-
-
-def _has_flow(images: Sequence[ImageKey]) -> bool:
-    return any("flow" in image.terms for image in images)

@@ -81,7 +81,7 @@ class Renderer:
         moved_mean = None
         no_view = any(term.view is None and term.name in image.terms for term in self.terms)
         for view in [v for v in View if v in image.views or (no_view and v == View.TOF)]:
-            joint = view == View.TOF and "flow" in image.terms and View.FLOW not in image.views
+            joint = view == View.TOF and image.flow_terms and View.FLOW not in image.views
             moved, channels = field, None
             if motion is not None:
                 mean, quaternion, channels = displaced(
