@@ -61,7 +61,6 @@ LAUNCHES = {  # file: what it launches
     "render/stages.py": "the stages of a rendering",
     "render/side_by_side.py": "its launches over ranges of tiles",
     "render/fused.py": "losses, backgrounds and Adam",
-    "render/tensor_cores.py": "a network's layers, before anything is rendered",
     "render/displacement.py": "Gaussians at a time, before they are rendered",
     "render/moved.py": "Gaussians at a time, before they are rendered again",
     "render/replay.py": "the number of pairs of a rendering",
@@ -82,7 +81,6 @@ LARGE_CLASSES = {  # file:class: why it may be larger
     "others",
     "render/trace.py:Tracer": "public methods with arguments that are explained",
     "scene/network.py:Network": "public methods with arguments that are explained",
-    "render/tensor_cores.py:FusedLayers": "still to be divided",
     "render/replay.py:Replay": "still to be divided",
     "sim/scene.py:Scene": "what a scene file may say",
     "recon/settings.py:ReconSettings": "settings of one run; those that belong together are "

@@ -202,8 +202,8 @@ def launches(form, place, moment, all_weights, biases):
     """What ``pack`` was given and has made."""
     given = {}
 
-    def launched(kernel, dim, inputs, outputs, device):
-        launch(kernel, dim, inputs, outputs, device)
+    def launched(kernel, dim, inputs, outputs):
+        launch(kernel, dim, inputs, outputs)
         given[kernel.key] = [*inputs, *outputs]
 
     launch, tensor_cores._launch = tensor_cores._launch, launched

@@ -290,7 +290,8 @@ def test_rounds_read_every_record_and_sum_every_pixel(
     light, channels, geometry, spreads, more, tmp_path
 ):
     """Lists of no, one, 16 and many entries, in both directions; sums against float64."""
-    rounds = vars(shared_batches.make_gradient_rounds(8, light, channels, geometry, spreads, more))
+    rounds = shared_batches.make_gradient_rounds(8, light, channels, geometry, spreads, more)
+    rounds = vars(shared_batches) | vars(rounds)
     functions = {name: rounds[name] for name in SIGNATURES if name in rounds}
     values = {
         "LIGHT": light,

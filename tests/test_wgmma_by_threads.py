@@ -447,8 +447,8 @@ def test_a_block_of_threads_is_row_by_row(layers, skip_after, count, keys, tmp_p
     weights, biases = (tuple(values) for values in zip(*both, strict=True))
     given = {}
 
-    def launched(kernel, dim, inputs, outputs, device):
-        launch(kernel, dim, inputs, outputs, device)
+    def launched(kernel, dim, inputs, outputs):
+        launch(kernel, dim, inputs, outputs)
         given[kernel.key] = [*inputs, *outputs]
 
     from gftorf_warp.render import tensor_cores

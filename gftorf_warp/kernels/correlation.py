@@ -25,7 +25,5 @@ def light_of(
 
 @wp.func
 def quad_of(light: wp.vec3, shift: wp.vec2, dc_offset: float) -> float:
-    """What a quad records of ``light``; ``shift`` holds (cos theta,
-    sin theta) of its phase shift.
-    """
+    """A quad's value for ``light``; ``shift`` holds (cos theta, sin theta) of its phase shift."""
     return shift[0] * light[0] + shift[1] * light[1] + dc_offset * light[2]

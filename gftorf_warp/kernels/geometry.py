@@ -81,9 +81,7 @@ def screen_covariance(view: CameraView, local: wp.vec3, wxyz: wp.vec4, scale: wp
 
 @wp.func
 def ellipse_of(along_x: wp.vec3, along_y: wp.vec3) -> wp.vec4:
-    """Covariance (xx, xy, yy) [px^2] and its determinant,
-    of how far each own axis reaches along x and y [px].
-    """
+    """Covariance (xx, xy, yy) [px^2] and determinant from each axis' extent along x and y [px]."""
     xx = wp.dot(along_x, along_x) + LOW_PASS
     xy = wp.dot(along_x, along_y)
     yy = wp.dot(along_y, along_y) + LOW_PASS

@@ -47,9 +47,7 @@ def derivative(view: CameraView, x: float, y: float) -> wp.vec3:
 
 @wp.func
 def distorted(view: CameraView, x: float, y: float) -> wp.vec2:
-    """Where the lens images what a pinhole would have at (x, y) [1],
-    outside its disc by the tangent.
-    """
+    """Image slopes of the pinhole point (x, y) [1]; linearised outside the lens' disc."""
     near = inside(view, x, y)
     place = bent(view, near[0], near[1])
     slope = derivative(view, near[0], near[1])
@@ -62,9 +60,7 @@ def distorted(view: CameraView, x: float, y: float) -> wp.vec2:
 
 @wp.func
 def undistorted(view: CameraView, x: float, y: float) -> wp.vec2:
-    """Where a pinhole would have what the lens images at (x, y) [1] inside the image,
-    by Newton's iteration.
-    """
+    """Pinhole slopes of the image slopes (x, y) [1] inside the image, by Newton's iteration."""
     place = wp.vec2(x, y)
     missing = float(1.0)
     step = int(0)

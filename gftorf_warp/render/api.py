@@ -62,9 +62,7 @@ class Rendering:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ScreenGradient:
-    """Statistics for densification: zero until a backward pass has run,
-    then those of the last one.
-    """
+    """Statistics of the last backward pass for densification; zero before it."""
 
     values: Float[Tensor, "N 4"]
     """All columns."""
@@ -189,9 +187,7 @@ def _spread(
 
 
 def _calibration(sensor: Sensor, field: GaussianField) -> Tensor:
-    """[4] phase slope [rad/m], phase offset [rad], source intensity, DC offset;
-    numbers are uploaded once.
-    """
+    """[4] phase slope [rad/m], phase offset [rad], source intensity, DC offset; uploaded once."""
     values = sensor.phase_slope, sensor.phase_offset, sensor.source_intensity, sensor.dc_offset
     if any(isinstance(value, Tensor) for value in values):
         return torch.stack(

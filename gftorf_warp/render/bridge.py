@@ -50,9 +50,7 @@ class Request:
 
 
 class Rasterize(torch.autograd.Function):
-    """All images of one rendering from all inputs of one;
-    without a workspace each has arrays of its own.
-    """
+    """All images of a rendering from all its inputs; arrays are new unless there is a workspace."""
 
     @staticmethod
     def forward(
@@ -95,9 +93,7 @@ class Rasterize(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
-        """Launch the adjoints explicitly: no tape, no state outside ``ctx``;
-        gradients into fresh tensors.
-        """
+        """Launch the adjoints explicitly, without tape or global state, into new tensors."""
         named = dict(zip(INPUTS, ctx.saved_tensors, strict=True))
         request, view, buffers, turn = ctx.state
         if buffers.turns != turn:

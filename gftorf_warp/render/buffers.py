@@ -56,9 +56,7 @@ class Distortion(StrEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class RenderSettings:
-    """How Gaussians are rendered. The defaults are exact;
-    the alternatives exist for parity with published code.
-    """
+    """How Gaussians are rendered; alternatives to the exact defaults are for parity."""
 
     near: float = 0.05
     """Gaussians nearer than this z-depth are culled [m]."""
@@ -117,9 +115,7 @@ class RenderSettings:
 
     @property
     def depth_shift(self) -> int:
-        """Lowest bits of a z-depth that its key leaves out:
-        as few as make ``far`` nearer than ``depth_culled``.
-        """
+        """Number of low bits of a z-depth that its key drops, so that ``far`` fits."""
         with np.errstate(over="ignore", under="ignore"):
             near, far = (int(np.float32(z).view(np.int32)) for z in (self.near, self.far))
         shift = 0
@@ -225,16 +221,12 @@ class Buffers:
 
     @property
     def cooperative(self) -> bool:
-        """Whether the lanes of a warp fetch records for each other,
-        as they may where a warp owns a tile.
-        """
+        """Whether the lanes of a warp, which owns a tile, fetch records for each other."""
         return self.K == 1
 
     @property
     def groups_with_light(self) -> int:
-        """Groups of channels that are blended together with the light:
-        two where a warp owns a tile, else one.
-        """
+        """Number of channel groups blended together with the light."""
         return min(len(self.channels), 2 if self.cooperative and self.threads == 1 else 1)
 
     def array(self, name: str, shape: int | tuple[int, ...], dtype=wp.int32) -> wp.array:
@@ -282,11 +274,7 @@ class Buffers:
         return self._planes[name]
 
     def gradient_planes(self, name: str, count: int, *, added: bool) -> Planes:
-        """Zeroed planes: pixels of a tile that lie outside the image are never written, and must
-        not hold a NaN.
-
-        Where all others are written and not ``added`` to, once is enough.
-        """
+        """Zeroed planes, as pixels outside the image must not be NaN; once, unless ``added`` to."""
         anew = name not in self._planes
         planes = self.planes(name, count)
         if anew or added:
@@ -295,9 +283,7 @@ class Buffers:
 
 
 class Planes:
-    """Image planes in tile order as two views: ``lanes`` for the compositor,
-    ``flat`` for kernels per pixel.
-    """
+    """Image planes in tile order: ``lanes`` for the compositor, ``flat`` for kernels per pixel."""
 
     def __init__(self, flat: wp.array, buffers: Buffers):
         self.flat = flat
@@ -310,11 +296,7 @@ class Planes:
 
     @staticmethod
     def shape_of(buffers: Buffers, count: int) -> tuple[int, int]:
-        """Planes and their floats, with one tile of padding.
-
-        320 x 240 floats are exactly 75 pages, and a loop that touches the same pixel of nine such
-        planes would keep evicting its own cache lines.
-        """
+        """Planes and their floats; a tile of padding avoids cache conflicts between planes."""
         return count, (buffers.tiles + 1) * buffers.lanes * buffers.K
 
 

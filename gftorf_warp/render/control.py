@@ -23,12 +23,7 @@ CALIBRATION = 4
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class DeviceCamera:
-    """What a rendering reads of camera and sensor when its kernels run.
-
-    Width, height, the number of shifts and whether the lens distorts are not here: they choose
-    kernels and launch sizes, so they stay those of the camera and sensor that ``rasterize`` is
-    called with.
-    """
+    """Device data of camera and sensor; sizes and the kind of lens stay those of ``rasterize``."""
 
     view: Float[Tensor, " V"]
     """The bits of a ``CameraView``."""
@@ -40,17 +35,13 @@ class DeviceCamera:
 
     @classmethod
     def over(cls, row: Float[Tensor, " P"]) -> DeviceCamera:
-        """Views of a row of :func:`packed` on a device:
-        whatever is written to it later is what is rendered.
-        """
+        """Views of a row of :func:`packed` on a device, which may be overwritten later."""
         view, calibration, shifts = row.split([VIEW, CALIBRATION, len(row) - VIEW - CALIBRATION])
         return cls(view=view, calibration=calibration, shifts=shifts.view(-1, 2))
 
 
 def packed(camera: Camera, sensor: Sensor, settings: RenderSettings) -> Float[np.ndarray, " P"]:
-    """Camera, calibration and shifts of one image as one row, P = V + 4 + 2 Q; copy its bits,
-    do no arithmetic.
-    """
+    """Camera, calibration and shifts as a row, P = V + 4 + 2 Q; copy bits, do no arithmetic."""
     calibration = sensor.phase_slope, sensor.phase_offset, sensor.source_intensity, sensor.dc_offset
     numbers = [float(v.detach() if isinstance(v, Tensor) else v) for v in calibration]
     numbers += [part for shift in sensor.shifts for part in (math.cos(shift), math.sin(shift))]

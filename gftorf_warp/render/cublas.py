@@ -136,9 +136,7 @@ class _ParameterGradients:
         self.biases = biases.view(layers, width)
 
     def of_positions(self, form: Form) -> list[Tensor]:
-        """Weights of gamma(x), with the first column of those of gamma(t) where rows of gamma(x)
-        are padded.
-        """
+        """Weights of gamma(x); padding of its rows covers the first column of those of gamma(t)."""
         firsts = [form.width if number else 0 for number in form.entries]
         return [
             self.weights[n][:, first : first + form.columns]
@@ -155,9 +153,7 @@ class _ParameterGradients:
 
 
 def _pieces(keys: int, count: int) -> list[tuple[int, int, int]]:
-    """Key, first and last row of the parts in which rows are multiplied,
-    of equal length up to a row.
-    """
+    """(key, first row, end) of the pieces in which rows are multiplied, equal up to a row."""
     parts = max(-(-count // PIECE), 1)
     ends = [count * part // parts for part in range(parts + 1)]
     return [(key, *span) for key in range(keys) for span in pairwise(ends)]
@@ -182,9 +178,7 @@ def _joined_input(form: Form, position: Tensor, keys: int) -> Float[Tensor, "row
 
 
 def _copy(to: Tensor, rows: Tensor) -> None:
-    """Copy rows in units of 16 bytes, if both begin at multiples of it:
-    a fraction of the time that halves take.
-    """
+    """Copy rows in units of 16 bytes, if both are aligned: faster than by halves."""
     step = 16 // to.element_size()
     if all(
         n % step == 0
@@ -198,11 +192,7 @@ def _copy(to: Tensor, rows: Tensor) -> None:
 def _sums(
     gradients: Float[Tensor, "layers rows width"], keys: int, dtype: torch.dtype
 ) -> Float[Tensor, "layers k width"]:
-    """Sums over the rows of each key, by products with zeros and ones.
-
-    A product of few rows with many columns fills a GPU without splitting its sum; the columns are
-    added later. Rows are padded to 16 bytes.
-    """
+    """Sums over the rows of each key, by products with zeros and ones, padded to 16 bytes."""
     layers, rows, width = gradients.shape
     fold = math.gcd(rows // keys, FOLD)
     choice = gradients.new_zeros(keys, rows // keys // fold, -(-keys // ALIGNED) * ALIGNED)
@@ -285,9 +275,7 @@ def product(
 def _products(
     left: Float[Tensor, "n a b"], right: Float[Tensor, "n b c"], *, out: Float[Tensor, "n a c"]
 ) -> None:
-    """Several products that fill a GPU together; one after the other where their results would be
-    rounded.
-    """
+    """Several products, batched on a GPU unless their results would be rounded."""
     if left.is_cuda and left.dtype != out.dtype and hasattr(torch.ops.aten.bmm, "dtype_out"):
         torch.bmm(left, right, out_dtype=out.dtype, out=out)
         return

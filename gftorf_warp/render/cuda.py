@@ -25,9 +25,7 @@ PAGE = 4096
 
 
 def stream_of(tensor: Tensor):
-    """Warp's launches inside this context go to torch's current stream of the device of
-    ``tensor``.
-    """
+    """Context in which Warp launches on torch's current stream of the tensor's device."""
     wp.init()
     if tensor.is_cuda:
         return wp.ScopedStream(
@@ -38,19 +36,13 @@ def stream_of(tensor: Tensor):
 
 @functools.cache
 def _warp_stream(stream: torch.cuda.Stream) -> wp.Stream:
-    """The one Warp stream over a torch stream, kept for good.
-
-    Warp identifies a stream by its handle and forgets it, with its scratch memory and capture, as
-    soon as any of the objects over that handle is deleted.
-    """
+    """The Warp stream over a torch stream, cached: Warp releases it with its first wrapper."""
     return wp.stream_from_torch(stream)
 
 
 @contextlib.contextmanager
 def without_garbage_collection() -> Iterator[None]:
-    """Disable Python's cyclic garbage collector: to free an older graph would invalidate a capture
-    in progress.
-    """
+    """Disable cyclic garbage collection: freeing an older graph would invalidate a capture."""
     enabled = gc.isenabled()
     gc.disable()
     try:
@@ -160,9 +152,7 @@ class SideStreams:
 
     @contextlib.contextmanager
     def fork(self, number: int = 0, *, wait: bool = True) -> Iterator[None]:
-        """Work inside the block goes to stream ``number``;
-        with ``wait`` behind all earlier work of the current one.
-        """
+        """Run the block on stream ``number``; with ``wait`` after the current stream's work."""
         if not self._streams:
             yield
             return
@@ -187,12 +177,7 @@ def side_stream(device: torch.device) -> SideStreams:
 
 
 class DeviceUpload:
-    """Numbers of 32 bits that the host writes before every step and the device reads; neither
-    waits.
-
-    All kinds are uploaded in one copy: each copy takes 3 us of a stream of an H200, however short
-    it is.
-    """
+    """32-bit numbers that the host writes before each step, uploaded in one asynchronous copy."""
 
     def __init__(self, lengths: Sequence[tuple[int, torch.dtype]], device: torch.device):
         """Allocate.
@@ -221,9 +206,7 @@ class DeviceUpload:
         self._next = 0
 
     def send(self, *numbers: Sequence[float] | np.ndarray) -> None:
-        """Upload the first elements of every part, in the order of the current stream;
-        others are undefined then.
-        """
+        """Upload the first elements of every part, in stream order; the rest is undefined."""
         (slot, parts), event = self._slots[self._next], self._uploaded[self._next]
         if event is not None:
             event.synchronize()  # of ``SLOTS`` uploads ago
@@ -249,9 +232,7 @@ class DeviceReadback:
         self._next = 0
 
     def request(self) -> None:
-        """Read back the numbers as they are at this point of the stream,
-        unless ``SLOTS`` readbacks are in flight.
-        """
+        """Read the numbers back in stream order, unless ``SLOTS`` readbacks are in flight."""
         if len(self._requested) == SLOTS:
             return
         slot, event = self._slots[self._next], None
@@ -263,9 +244,7 @@ class DeviceReadback:
         self._next = (self._next + 1) % SLOTS
 
     def latest(self, *, wait: bool = False) -> list[int] | None:
-        """The newest numbers that arrived since the last call, None if there are none; ``wait``:
-        for all requests.
-        """
+        """The newest numbers since the last call, or None; ``wait``: for all requests."""
         newest = None
         while self._requested:
             slot, event = self._requested[0]

@@ -24,7 +24,8 @@ from .cuda import stream_of
 
 RADIUS_MAX = 1e18  # of a lens without distortion: its square is a float32, too
 BLOCK = 16  # pixels of a row, or elements of a tensor, per CPU thread
-DTYPES = {torch.float32: wp.float32, torch.int32: wp.int32, torch.int64: wp.int64}
+DTYPES = {torch.float16: wp.float16, torch.float32: wp.float32}
+DTYPES |= {torch.int32: wp.int32, torch.int64: wp.int64}
 
 
 def launch(

@@ -10,10 +10,7 @@ import warp as wp
 
 @dataclass(kw_only=True, eq=False)
 class Inputs:
-    """Everything a rendering is differentiable in, as Warp arrays of one device; None: absent.
-
-    A gradient set has the same fields: None there means 'not wanted'.
-    """
+    """Differentiable inputs as Warp arrays of one device; None: absent or no gradient wanted."""
 
     mean: wp.array | None  # [N] vec3
     log_scale: wp.array | None  # [N] vec3
@@ -31,9 +28,7 @@ class Inputs:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class View:
-    """Camera and shifts of a rendering, read from device memory when its kernels run;
-    without a derivative.
-    """
+    """Camera and shifts of a rendering in device memory; without a derivative."""
 
     camera: wp.array
     """[1] CameraView."""
@@ -45,9 +40,7 @@ class View:
 
 @dataclass(kw_only=True, eq=False)
 class Images:
-    """Everything a rendering fills, row-major, None where it is not wanted; of a gradient set:
-    where it is zero.
-    """
+    """Images of a rendering, row-major; None: not wanted, in a gradient set zero."""
 
     quads: wp.array | None  # [Q, H, W]
     phasor: wp.array | None  # [3, H, W]
@@ -102,9 +95,7 @@ def gradients_in(group: Inputs | Images) -> dict[str, wp.array]:
 
 
 def channel_groups(inputs: Inputs) -> list[tuple[str, int]]:
-    """(image, first channel) of each group of three T-weighted channels;
-    the first rides along with the light.
-    """
+    """(image, first channel) of each group of three T-weighted channels."""
     groups = [("colour", 0)] if inputs.colour_sh is not None else []
     if inputs.extra is not None:
         groups += [("extra", start) for start in range(0, inputs.extra.shape[1], 3)]

@@ -83,10 +83,7 @@ def _uploaded(bits: bytes, shifts: tuple[float, ...], lens: bool, device: str) -
 
 
 def render(inputs: Inputs, view: View, buffers: Buffers, images: Images) -> None:
-    """Fill those of ``images`` that are not None.
-
-    On an active ``wp.Tape`` also record the adjoint, which adds to the ``.grad`` of the inputs.
-    """
+    """Fill the images that are not None; an active ``wp.Tape`` records the adjoint."""
     forward(inputs, view, buffers, images)
     tape = wp._src.context.runtime.tape  # the public API has no name for the active tape
     if tape is not None:
@@ -110,9 +107,7 @@ def forward(
     *,
     differentiable: bool = True,
 ) -> None:
-    """Project, sort, composite, resolve; images that are None cost nothing,
-    nor does what backward alone needs.
-    """
+    """Project, sort, composite, resolve; images that are None are not computed."""
     buffers.turns += 1
     groups = channel_groups(inputs)
     buffers.channels = [

@@ -108,9 +108,7 @@ class Layers(abc.ABC):
         columns: int,
         dtype: torch.dtype,
     ) -> Float[Tensor, "N columns"]:
-        """gamma(x) of positions [m] over a length [m], without gradient, rounded at the end,
-        padded with zeros.
-        """
+        """gamma(x) of positions [m] over a length [m], rounded, zero-padded; without gradient."""
         return encoded(mean.detach() / length, powers, columns=columns, dtype=dtype)
 
     @abc.abstractmethod
@@ -160,6 +158,4 @@ class Layers(abc.ABC):
         gradients: LayerGradients,
         outputs: Float[Tensor, "layers rows width"],
     ) -> list[Tensor]:
-        """Gradients of weight and bias of every layer, then of the head,
-        not divided by the unit.
-        """
+        """Unscaled gradients of weight and bias of every layer, then of the head."""

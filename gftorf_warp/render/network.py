@@ -17,9 +17,7 @@ from .tensor_cores import FusedLayers, fits
 
 
 class HalfPrecision:
-    """Computes a network in half precision with gradients by hand,
-    see ``scene.network.Backend``.
-    """
+    """A network in half precision with hand-written gradients, see ``scene.network.Backend``."""
 
     def __init__(self, layers: Layers, form: Form):
         """Compute ``form`` by ``layers``."""
@@ -43,9 +41,7 @@ class HalfPrecision:
 
 
 def with_backend(motion: Motion) -> Motion:
-    """The same motion; a network in half precision gets its backend,
-    by the device that it is on.
-    """
+    """The same motion; a network in half precision gets the backend for its device."""
     if isinstance(motion, Network) and motion.settings.products == Products.HALF:
         form = Form.of(motion)
         motion.backend = HalfPrecision(
@@ -86,11 +82,7 @@ class Offsets(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(context, gradient: Float[Tensor, "k N 3"]) -> tuple[Tensor | None, ...]:
-        """Gradients of all parameters, in their own precision.
-
-        Loss scaling is by the largest gradient of an offset, on the device; all but that is linear
-        in it.
-        """
+        """Gradients of all parameters; loss scaling by the largest gradient of an offset."""
         form, layers, (position, time, *saved, outputs) = (
             context.form,
             context.layers,

@@ -202,9 +202,7 @@ def _undecided(pixel: Tensor, splats: _Splats, settings: RenderSettings) -> Bool
 
 
 def project(field: GaussianField, camera: Camera, settings: RenderSettings) -> _Splats:
-    """EWA projection (method, 2.2): cull, order near to far,
-    and linearise the pinhole at each centre.
-    """
+    """EWA projection (method, 2.2): cull, sort near to far, linearise at each centre."""
     pose = torch.as_tensor(camera.camera_from_world, dtype=field.mean.dtype, device=field.device)
     rotation, translation = pose[:3, :3], pose[:3, 3]
     z_all = (field.mean @ rotation.T + translation)[:, 2]
@@ -272,9 +270,7 @@ def _rotation(wxyz: Float[Tensor, "M 4"]) -> Float[Tensor, "M 3 3"]:
 
 
 def spherical_harmonics(n: Float[Tensor, "M 3"], degree: int) -> Float[Tensor, "M K"]:
-    """Real harmonics Y_0 .. Y_{K-1}, K = (degree + 1)^2, of unit vectors,
-    with the signs of method 2.3.
-    """
+    """Real harmonics Y_0 .. Y_{K-1}, K = (degree + 1)^2, of unit vectors (method, 2.3)."""
     x, y, z = n.unbind(1)
     one = torch.ones_like(x)
     root = [math.sqrt(value / math.pi) for value in (1 / 4, 3 / 4, 15 / 4, 5 / 16, 15 / 16)]
@@ -311,9 +307,7 @@ def _shade(
 def correlate(
     d: Float[Tensor, "M"], reflectivity: Float[Tensor, "M 1"], sensor: Sensor, phasor_factor: float
 ) -> Float[Tensor, "M light"]:
-    """What a C-ToF pixel makes of each Gaussian alone: its Q quads, then its phasor (method,
-    2.4).
-    """
+    """Light of each Gaussian alone: its Q quads, then its phasor (method, 2.4)."""
     f, phase_offset, dc_offset, source = (
         torch.as_tensor(value, dtype=d.dtype, device=d.device)
         for value in (
@@ -401,9 +395,7 @@ def _inside_tiles(
 def compositing_weights(
     alpha: Float[Tensor, "P M"], stop: Stop
 ) -> tuple[Float[Tensor, "P M"], Float[Tensor, "P M"], Float[Tensor, "P"]]:
-    """Weights w = alpha T of what a pixel composites, T before each Gaussian,
-    T_e behind the last one (method, 2.5).
-    """
+    """Weights w = alpha T, T before each Gaussian, and T_e behind the last (method, 2.5)."""
     T = _transmittance(alpha)
     # is the Gaussian that crosses the limit still added?
     added = T[:, :-1] if stop is Stop.INCLUSIVE else T[:, 1:]
@@ -420,9 +412,7 @@ def _transmittance(alpha: Float[Tensor, "P M"]) -> Float[Tensor, "P M+1"]:
 def _behind(
     light: Tensor | float | None, T_end: Float[Tensor, "1 H W"], channels: int
 ) -> Tensor | float:
-    """T_e times the background, first power in every channel that has one;
-    nothing for a missing background.
-    """
+    """T_e times the background, first power in every channel; zero for a missing background."""
     if light is None:
         return 0.0
     return T_end * torch.as_tensor(light, dtype=T_end.dtype, device=T_end.device).expand(

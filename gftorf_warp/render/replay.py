@@ -136,9 +136,7 @@ class Replay:
         return self._capacity.pairs is None or self._capacity.fits(self.largest)
 
     def grow(self) -> None:
-        """Adapt the pair capacity to the largest number of pairs so far;
-        memory and graphs are released.
-        """
+        """Adapt the pair capacity to the largest number of pairs; release memory and graphs."""
         if self.graphs:
             is_sorted = not all(target.buffers.marks for target in self._targets.values())
             self._capacity.learn(self.largest, is_sorted=is_sorted)
@@ -152,9 +150,7 @@ class Replay:
 
     @torch.no_grad()
     def draw(self, time: float, camera: Camera) -> Target:
-        """The images at one time, without checking the number of pairs;
-        the next call overwrites them.
-        """
+        """Images at one time, overwritten by the next call, with unchecked number of pairs."""
         size = camera.height, camera.width, bool(camera.distortion)
         if size not in self._targets:
             self._targets[size] = self._target(*size)
@@ -180,9 +176,7 @@ class Replay:
         return target
 
     def _captured(self, target: Target) -> wp.Graph:
-        """A rendering, captured on Warp's stream, since torch's default stream cannot be
-        captured.
-        """
+        """Capture a rendering on Warp's stream: torch's default stream cannot be captured."""
         with without_garbage_collection(), wp.ScopedCapture(device=self.device) as capture:
             self._draw(target)
         return capture.graph

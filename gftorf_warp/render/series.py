@@ -103,9 +103,7 @@ class Series:
         )
 
     def _checked(self, image: _Pending, tail: bool) -> _Pending:
-        """An image, rendered again until it is complete: once,
-        unless the capacity changes in between.
-        """
+        """Render an image again until its pairs fit the capacity."""
         while self._exceeded(image):
             image.readback.release(image.ticket)
             self.repeated += 1

@@ -15,9 +15,7 @@ from .buffers import Buffers
 
 
 def tile_edges(buffers: Buffers, parts: int) -> list[int]:
-    """Edges of at most ``parts`` ranges of tiles with about equally many pairs;
-    one range where one thread works.
-    """
+    """Edges of at most ``parts`` ranges of tiles with about equally many pairs."""
     if buffers.threads == 1:
         return [0, buffers.tiles]
     first = buffers.first.numpy()  # CPU only: a view, not a copy
@@ -32,9 +30,7 @@ def _pool(threads: int) -> ThreadPoolExecutor:
 
 
 def over_tiles(buffers: Buffers, kernel, edges: list[int], arguments, warps: int = 1) -> None:
-    """Launch over ranges of tiles, some warps each; CPU launches let others run,
-    so ranges are done side by side.
-    """
+    """Launch over ranges of tiles, each with ``warps`` warps per tile; on the CPU concurrently."""
     side_by_side = len(edges) > 2
     commands = [
         wp.launch(
@@ -53,9 +49,7 @@ def over_tiles(buffers: Buffers, kernel, edges: list[int], arguments, warps: int
 
 
 def run_side_by_side(commands: list, threads: int) -> None:
-    """Run at most ``threads`` recorded CPU launches, each in a thread of its own;
-    they release the interpreter lock.
-    """
+    """Run at most ``threads`` recorded CPU launches concurrently; they release the GIL."""
     # this thread works, too: a pool that has slept would wake on its processor, and both would
     # share it for a while
     others = [_pool(threads - 1).submit(command.launch) for command in commands[1:]]

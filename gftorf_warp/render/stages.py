@@ -41,9 +41,7 @@ def project(inputs: Inputs, view: View, buffers: Buffers) -> None:
 def project_backward(
     inputs: Inputs, view: View, buffers: Buffers, grad_splats: wp.array, wanted: Inputs
 ) -> None:
-    """Gradient records of splats to gradients of Gaussians and calibration:
-    Warp's adjoint of the same kernel.
-    """
+    """Gradient records to gradients of Gaussians and calibration, by Warp's adjoint."""
     adjoint = [getattr(wanted, name) for name in _PROJECTED]
     if any(array is not None for array in [*adjoint, wanted.calibration]):
         _launch(
@@ -75,9 +73,7 @@ def _project_outputs(buffers: Buffers) -> list:
 
 
 def sort_by_depth(buffers: Buffers) -> None:
-    """Order the splats near to far, those of one key by index; what is culled comes last,
-    in any order.
-    """
+    """Order splats near to far, equal keys by index, culled ones last in any order."""
     if not buffers.binned:
         wp.utils.radix_sort_pairs(
             buffers.depth_key, buffers.order, buffers.count, end_bit=buffers.settings.depth_bits
@@ -102,9 +98,7 @@ def sort_by_depth(buffers: Buffers) -> None:
 
 
 def sort_by_tile(buffers: Buffers) -> None:
-    """The list of each tile, near to far: read from a matrix of bits, or by a sort of (tile,
-    splat) pairs.
-    """
+    """List of each tile, near to far, from a bit matrix or by a sort of (tile, splat) pairs."""
     lists = [
         buffers.order,
         buffers.splats,
@@ -189,9 +183,7 @@ def _sum_counts(buffers: Buffers) -> int:
 def composite(
     buffers: Buffers, number: int, distortion: bool = True, *, differentiable: bool = True
 ) -> None:
-    """Blend all tiles: light with the first group of channels, or the first two,
-    every further group by itself.
-    """
+    """Blend all tiles: light with one or two groups of channels, or one further group."""
     nothing, more = (
         _nothing(buffers, 3, buffers.sums.lanes.dtype),
         number == 0 and buffers.groups_with_light > 1,
@@ -298,9 +290,7 @@ def composite_backward(
 
 
 def set_channels(buffers: Buffers, inputs: Inputs, start: int, splats: wp.array) -> None:
-    """Fill ``splats`` with the records of the buffers,
-    their channels replaced by three extra ones.
-    """
+    """Records of the buffers with three extra channels in place of their own."""
     if buffers.count:
         _launch(splat.set_channels, buffers.count, [buffers.splats, inputs.extra, start], [splats])
 
@@ -360,9 +350,7 @@ def resolve_images(
 def fold_images(
     inputs: Inputs, view: View, buffers: Buffers, cotangents: Images, wanted: Inputs, groups: list
 ):
-    """Images to planes: the adjoint of :func:`resolve_images`.
-    Channels without a gradient are None.
-    """
+    """Images to planes: adjoint of :func:`resolve_images`; None for channels without gradient."""
     pixels, sums, tiling = (buffers.height, buffers.width), buffers.sums.flat, buffers.tiling
     planes = buffers.gradient_planes("gradient of light", GRAD_LIGHT_PLANES, added=True)
     target = planes.flat
@@ -434,9 +422,7 @@ def _distortion_factor(buffers: Buffers) -> float:
 
 
 def _spread(buffers: Buffers, number: int, *, anew: bool = True) -> wp.array:
-    """Records of a pass for the compositor: of splats, or, for deterministic sums,
-    a copy per pair.
-    """
+    """Records of a pass: of splats, or, for deterministic sums, a copy per pair."""
     if not buffers.ordered:
         return buffers.records[number]
     copies = buffers.array(f"records of pairs {number}", len(buffers.owners), splat.Splat)

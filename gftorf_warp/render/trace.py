@@ -93,9 +93,7 @@ class RigidBody:
 
     @property
     def reach(self) -> float:
-        """Distance of the farthest point from the centre [m]; 0 for a plane,
-        where it is not used.
-        """
+        """Distance of the farthest point from the centre [m]; unused for a plane."""
         return (
             self.radius if self.points is None else float(np.linalg.norm(self.points, axis=1).max())
         )
@@ -295,9 +293,7 @@ class Tracer:
     def _place(
         self, cameras: Sequence[Camera], world_from_body: np.ndarray
     ) -> tuple[wp.array, wp.array]:
-        """Body from camera, composed in float64: what is far from the origin of the world loses no
-        digits.
-        """
+        """Body from camera, composed in float64: nothing is lost far from the world's origin."""
         want = (len(cameras), len(self._meshes), 4, 4)
         if len(cameras) == 0 or world_from_body.shape != want:
             raise ValueError(
@@ -317,9 +313,7 @@ class Tracer:
         return rotation, translation
 
     def _over_rows(self, kernel, inputs: list, outputs: list[wp.array]) -> None:
-        """Launch over the rows, every n-th to a CPU thread of n,
-        so that all have about the same to do.
-        """
+        """Launch over the rows, interleaved among CPU threads to balance their work."""
         parts = self._parts
         commands = [
             wp.launch(

@@ -25,9 +25,7 @@ OPTIONS = {"enable_backward": False, "module": "unique", "grid_stride": False}
 
 @functools.cache
 def make_interpolation(K: int) -> SimpleNamespace:
-    """Vectors of K indices and K weights, and the weighted sum of K rows of an array:
-    the only one in any kernel.
-    """
+    """Vectors of K indices and of K weights, and the weighted sum of K rows of an array."""
     Indices, Weights = wp.types.vector(length=K, dtype=int), wp.types.vector(length=K, dtype=float)
 
     @wp.func

@@ -27,9 +27,7 @@ def squared_footprint(camera: CameraView, point: wp.vec3) -> float:
 
 @functools.cache
 def make_move(K: int) -> wp.Kernel:
-    """The kernel ``move_gaussians`` for times that depend on K keys;
-    unused keys have weight zero.
-    """
+    """The kernel ``move_gaussians`` for times with K keys; unused keys have weight zero."""
     sums = make_interpolation(K)
     Indices, Weights, interpolated = sums.Indices, sums.Weights, sums.interpolated
 

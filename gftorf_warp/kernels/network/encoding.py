@@ -22,9 +22,7 @@ def encode(
     # Out:
     position: wp.array2d[wp.float16],  # [N, columns] gamma(x) [1], zeros behind it
 ):
-    """One thread per sine and cosine of an argument, neighbours side by side;
-    the last of a row has what is none.
-    """
+    """One thread per sine and cosine of an argument; the last of a row also writes the padding."""
     lanes = 3 * powers.shape[0] + 1
     n = wp.tid() // lanes
     wave = wp.tid() % lanes

@@ -109,9 +109,7 @@ def list_block(
     listed: wp.array[wp.int32],
     begins: wp.array[wp.int32],
 ):
-    """Write the rows of a block that have a gradient in order,
-    and ``NO_ROW`` behind the last one of a key.
-    """
+    """Write a block's rows that have a gradient in order, then ``NO_ROW`` as padding of a key."""
 
 
 @wp.kernel(enable_backward=False, grid_stride=False)

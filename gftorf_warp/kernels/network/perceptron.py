@@ -21,9 +21,7 @@ def mask_words(layers: int, keys: int, count: int) -> int:
 
 @wp.struct
 class Layers:
-    """Sizes of a perceptron, and where its parameters lie in one array:
-    weight and bias of every layer, in order.
-    """
+    """Sizes of a perceptron; parameters are one array, weight and bias of each layer in order."""
 
     layers: int  # without the head
     joined: int  # number of the layer that gamma(x) and gamma(t) enter again; -1: none
@@ -68,9 +66,7 @@ def shift_of(
     key: int,
     n: int,
 ) -> float:
-    """What is added to output ``n`` of a layer at a key: its bias,
-    and what gamma(t) makes of the weight.
-    """
+    """Bias of output ``n`` of a layer at a key, with the contribution of gamma(t)."""
     inputs = inputs_of(form, number)
     at = weight_of(form, number)
     total = parameters[at + inputs * WIDTH + n]
@@ -194,9 +190,7 @@ def backward(
     partials: wp.array4d[float],  # [layers, k, GROUPS blocks, WIDTH] added to: sums of slopes over
     #  rows
 ):
-    """From the gradient at the head to those of all layers, of listed rows;
-    nothing is written behind the last one.
-    """
+    """Gradients of all layers for the listed rows; nothing is written behind the last one."""
     wp.tile_zeros(shape=(_FOURS,), dtype=wp.vec4, storage="shared")
     rows = outputs.shape[1] // keys
     listed_backward(

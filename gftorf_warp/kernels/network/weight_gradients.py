@@ -29,12 +29,7 @@ def shared(columns: int) -> int:
 
 
 def parts(multiprocessors: int, layers: int, entries: int) -> tuple[int, int, int]:
-    """Parts of a list for products with outputs, for those with gamma(x), and the multiprocessors
-    that are left.
-
-    All blocks run at once: one of the first kind has a multiprocessor for itself, two of the second
-    share one that is left. How many are left is decided by what both read of a row.
-    """
+    """(parts for outputs, parts for gamma(x), multiprocessors left for these), by bytes read."""
     jobs, others = HALVES * (layers - 1), HALVES * entries
     read, also = jobs * (HALF + WIDTH), others * (HALF + COLUMNS)
     own = max(multiprocessors * read // ((read + also) * jobs), 1) if jobs else 1
@@ -43,9 +38,7 @@ def parts(multiprocessors: int, layers: int, entries: int) -> tuple[int, int, in
 
 
 def _snippet(columns: int, layer: str, first: str, row: str) -> str:
-    """C++: which layer's slopes a job is about, where its inputs begin,
-    and which row of them a listed row has.
-    """
+    """C++ of a product: layer of a job, offset of its inputs, and input row of a listed row."""
     own = columns // 4  # inputs of a warp
     pieces = columns // 8  # of 16 bytes in a row
     abreast = 32 // pieces  # rows that a warp copies at once

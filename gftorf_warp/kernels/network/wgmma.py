@@ -518,6 +518,4 @@ def listed_backward(
     slopes: wp.array3d[wp.float16],
     partials: wp.array4d[float],
 ):
-    """Gradients at all layers of the listed rows of this block, in the order of the list,
-    and their sums per key.
-    """
+    """Gradients at all layers of this block's listed rows, in list order, and sums per key."""

@@ -19,8 +19,18 @@ import warp as wp
 
 from ...constants import ALPHA_MAX, TRANSMITTANCE_MIN
 from .list_segments import PLANES, segment_length
-from .shared_batches import GROUP, ROUND, make_batches
-from .simd import make_lanes, warp_any
+from .shared_batches import (
+    GROUP,
+    ROUND,
+    entry,
+    fetch_more,
+    fetch_records,
+    make_warp_memory,
+    more_of,
+    record_of,
+    wait_for_records,
+)
+from .simd import contracted, make_lanes, warp_any
 from .splat import AHEAD, Splat, block_missed, load_splat, prefetch
 
 # planes of ``light``, each [tiles, lanes] of V
@@ -33,18 +43,8 @@ CHANNEL_PLANES = 3  # planes of ``channel``
 
 
 def options(K: int) -> dict:
-    """Kernel options of a compositor.
-
-    Contraction to fused multiply-adds gives the CPU 10-20 %; fast_math concerns CUDA only; without
-    a grid-stride loop eight registers are saved.
-    """
-    flags = (
-        "-march=native" if wp.config.cpu_compiler_flags is None else wp.config.cpu_compiler_flags
-    )
-    flags += " -ffp-contract=fast"
-    module_options = (
-        {"fast_math": True, "cpu_compiler_flags": flags} if K > 1 else {"fast_math": True}
-    )
+    """Kernel options of a compositor: contraction to FMAs on the CPU, fast math on CUDA."""
+    module_options: dict = {"fast_math": True} | (contracted() if K > 1 else {})
     return {
         "enable_backward": False,
         "module": "unique",
@@ -56,9 +56,7 @@ def options(K: int) -> dict:
 
 @functools.cache
 def make_pixels(K: int, tile_width: int, tile_height: int) -> SimpleNamespace:
-    """Where the block of K pixels of a lane lies in a tile of ``tile_width`` x ``tile_height``
-    [px].
-    """
+    """Position of a lane's block of K pixels in a tile of ``tile_width`` x ``tile_height`` [px]."""
     side = make_lanes(K).side
     if tile_width % side or tile_height % side:
         raise ValueError(
@@ -69,18 +67,14 @@ def make_pixels(K: int, tile_width: int, tile_height: int) -> SimpleNamespace:
     @wp.func
     def block_x(tile: int, lane: int, tiles_x: int) -> float:
         """Centre of the first pixel of a block, x [px]."""
-        column = (tile % tiles_x) * wp.static(tile_width) + (lane % wp.static(lanes_x)) * wp.static(
-            side
-        )
-        return float(column) + 0.5
+        first = (tile % tiles_x) * wp.static(tile_width)
+        return float(first + (lane % wp.static(lanes_x)) * wp.static(side)) + 0.5
 
     @wp.func
     def block_y(tile: int, lane: int, tiles_x: int) -> float:
         """Centre of the first pixel of a block, y [px]."""
-        row = (tile // tiles_x) * wp.static(tile_height) + (lane // wp.static(lanes_x)) * wp.static(
-            side
-        )
-        return float(row) + 0.5
+        first = (tile // tiles_x) * wp.static(tile_height)
+        return float(first + (lane // wp.static(lanes_x)) * wp.static(side)) + 0.5
 
     return SimpleNamespace(
         block_x=block_x, block_y=block_y, lanes=lanes_x * (tile_height // side), side=side
@@ -132,48 +126,24 @@ def make_composite(
     if split and not (cooperative and light and metric is None):
         raise ValueError("segments need light, no distortion, and a warp per tile")
     ops, pixels = make_lanes(K), make_pixels(K, tile_width, tile_height)
-    V, fill, affine, mul, axpy, fma, fnma = (
-        ops.V,
-        ops.fill,
-        ops.affine,
-        ops.mul,
-        ops.axpy,
-        ops.fma,
-        ops.fnma,
-    )
-    above, add, reaches, drop_below, set_where = (
-        ops.above,
-        ops.add,
-        ops.reaches,
-        ops.drop_below,
-        ops.set_where,
-    )
+    V, fill, affine, mul = ops.V, ops.fill, ops.affine, ops.mul
+    axpy, fma, fnma = ops.axpy, ops.fma, ops.fnma
+    above, add, reaches = ops.above, ops.add, ops.reaches
+    drop_below, set_where = ops.drop_below, ops.set_where
     power_of, hits, alpha_of, nonzero = ops.power_of, ops.hits, ops.alpha_of, ops.nonzero
     block_x, block_y, columns, rows = pixels.block_x, pixels.block_y, ops.columns, ops.rows
     half = 0.5 * (pixels.side - 1)  # from the first to the middle of a block [px]
 
     zeta_of = make_zeta(bool(metric))
     spreads = light and metric is not None
-    fetch = make_batches(more=more)
-    warp_memory, fetch_records, wait_for_records, entry, record_of = (
-        fetch.warp_memory,
-        fetch.fetch_records,
-        fetch.wait_for_records,
-        fetch.entry,
-        fetch.record_of,
-    )
-    fetch_more, more_of = fetch.fetch_more, fetch.more_of
+    warp_memory = make_warp_memory(more=more)
 
     @wp.func
-    def any_alive(live: V) -> bool:
-        """Whether a pixel is still alive."""
+    def goes_on(live: V) -> bool:
+        """Whether a pixel is still alive; within a round of a warp all entries are processed."""
+        if wp.static(cooperative):
+            return True
         return warp_any(nonzero(live))
-
-    @wp.func_native("return true;")
-    def always(live: V) -> bool:
-        """Within a round all entries are processed."""
-
-    goes_on = always if cooperative else any_alive
 
     @wp.func
     def store_state(
@@ -187,9 +157,7 @@ def make_composite(
         amplitude: V,
         distance: V,
     ):
-        """State where a segment ends: T, except of the last one, and what it has added,
-        except of the first.
-        """
+        """State at a segment's end: T, except of the last; sums added, except of the first."""
         if segment < wp.static(segments - 1):
             states[segment * wp.static(PLANES), tile, lane] = T
         if segment > 0:
@@ -218,9 +186,7 @@ def make_composite(
         states: wp.array3d[V],  # [5 (segments - 1), tiles, lanes] where segments end, see
         #  list_segments.py
     ):
-        """One thread per block of K pixels; on CUDA one warp per tile,
-        so all control is uniform over 32 lanes.
-        """
+        """One thread per block of K pixels; on CUDA a warp per tile, with uniform control flow."""
         t, lane = wp.tid()
         tile = tile0 + t
         x0 = block_x(tile, lane, tiles_x)

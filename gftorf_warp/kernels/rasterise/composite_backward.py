@@ -29,7 +29,15 @@ from .composite import (
     options,
 )
 from .list_segments import PLANES, segment_length
-from .shared_batches import GROUP, ROUND, make_gradient_rounds
+from .shared_batches import (
+    GROUP,
+    ROUND,
+    entry,
+    fetch_records,
+    make_gradient_rounds,
+    record_of,
+    wait_for_records,
+)
 from .simd import make_lanes, sums_of, types_of, warp_max
 from .splat import AHEAD, Splat, block_missed, load_splat, prefetch
 
@@ -41,36 +49,14 @@ V1 = make_lanes(1).V
 
 
 def _add_moments(K: int, light: bool, channels: bool, geometry: bool) -> str:
-    """C++ that adds the sums over the K pixels of a CPU thread to the gradient record of one splat.
-
-    One permutation brings the sums into the order of the record. On CUDA ``accumulate_round`` does
-    it.
-    """
-    names = [
-        "v",
-        "dx",
-        "dy",
-        "alpha",
-        "w",
-        "w2",
-        "g0",
-        "g1",
-        "g2",
-        "g_re",
-        "g_im",
-        "g_amplitude",
-        "g_distance",
-    ]
-    loads = " ".join(f"const F {name}_ = load({name});" for name in names)
+    """C++ that adds sums over the K pixels of a CPU thread to a gradient record, permuted."""
+    names = "v dx dy alpha w w2 g0 g1 g2 g_re g_im g_amplitude g_distance"
+    loads = " ".join(f"const F {name}_ = load({name});" for name in names.split())
     values = {}
     if geometry:
         values |= {"v": "v_", "dx": "v_ * dx_", "dx2": "v_ * dx_ * dx_", "dxdy": "v_ * dx_ * dy_"}
-        values |= {
-            "dy": "v_ * dy_",
-            "dy2": "v_ * dy_ * dy_",
-            "count": "alpha_ > 0.0f ? (F)(1.0f) : (F)(0.0f)",
-        }
-        values |= {"weight": "w_"}
+        values |= {"dy": "v_ * dy_", "dy2": "v_ * dy_ * dy_"}
+        values |= {"count": "alpha_ > 0.0f ? (F)(1.0f) : (F)(0.0f)", "weight": "w_"}
     if channels:
         values |= {"c0": "w_ * g0_", "c1": "w_ * g1_", "c2": "w_ * g2_"}
     if light:
@@ -129,9 +115,7 @@ def finish_moments(
 #endif
 """)
 def add_more(grads: wp.array[Splat], i: int, w: V1, g3: V1, g4: V1, g5: V1):
-    """Add the gradient of further channels on the CPU, where a thread is alone;
-    on CUDA a round of a warp does.
-    """
+    """Add the gradient of further channels; CPU only, on CUDA ``accumulate_round`` does it."""
 
 
 @functools.cache
@@ -173,15 +157,8 @@ def make_composite_backward(
             "channels, and a warp per tile"
         )
     ops, pixels = make_lanes(K), make_pixels(K, tile_width, tile_height)
-    V, fill, affine, mul, axpy, fma, fnma = (
-        ops.V,
-        ops.fill,
-        ops.affine,
-        ops.mul,
-        ops.axpy,
-        ops.fma,
-        ops.fnma,
-    )
+    V, fill, affine, mul = ops.V, ops.fill, ops.affine, ops.mul
+    axpy, fma, fnma = ops.axpy, ops.fma, ops.fnma
     add, scaled, exceeds, keep_below = ops.add, ops.scaled, ops.exceeds, ops.keep_below
     inverse, at_least = ops.inverse, ops.at_least
     power_of, hits, response, alpha_of = ops.power_of, ops.hits, ops.response, ops.alpha_of
@@ -200,18 +177,8 @@ def make_composite_backward(
         rounds = make_gradient_rounds(
             tile_width, light, channels, light or not fixed, spreads, more
         )
-        warp_memory, fetch_records, wait_for_records, entry, record_of = (
-            rounds.warp_memory,
-            rounds.fetch_records,
-            rounds.wait_for_records,
-            rounds.entry,
-            rounds.record_of,
-        )
-        store_derivatives, store_values, accumulate_round = (
-            rounds.store_derivatives,
-            rounds.store_values,
-            rounds.accumulate_round,
-        )
+        warp_memory, store_derivatives = rounds.warp_memory, rounds.store_derivatives
+        store_values, accumulate_round = rounds.store_values, rounds.accumulate_round
 
     @wp.kernel(**options(K))
     def composite_backward(
@@ -233,11 +200,7 @@ def make_composite_backward(
         #  gradients in 8-15
         more_splats: wp.array[Splat],  # [N] added to: slots 8-10, gradients of the further channels
     ):
-        """One thread per block of K pixels; visits exactly the splats of the forward pass, last one
-        first.
-
-        Where lists have segments, one warp per segment.
-        """
+        """One thread per block of K pixels, back to front; a warp per segment of a list."""
         t, lane = wp.tid()
         tile = tile0 + t // wp.static(segments)
         x0 = block_x(tile, lane, tiles_x)

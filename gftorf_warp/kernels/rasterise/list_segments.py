@@ -22,8 +22,6 @@ PLANES = 5
 
 @wp.func
 def segment_length(count: int, segments: int) -> int:
-    """Entries of a segment of a list of ``count``, whole rounds;
-    segments at its end may have fewer, or none.
-    """
+    """Entries per segment of a list of ``count``: whole rounds; the last ones may have fewer."""
     rounds = (count + segments * ROUND - 1) // (segments * ROUND)
     return wp.max(rounds * ROUND, SHORTEST)

@@ -39,16 +39,12 @@ def visit_of(opacity: float, cov: wp.vec4) -> wp.vec2:
 
 @wp.func_grad(visit_of)
 def adj_visit_of(opacity: float, cov: wp.vec4, adj_ret: wp.vec2):
-    """No derivative: slots 6 and 7 of a gradient record are free to count pixels and to sum
-    weights.
-    """
+    """No derivative: slots 6 and 7 of a gradient record count pixels and sum weights."""
 
 
 @wp.func
 def box_of(view: CameraView, x: float, y: float, cov: wp.vec4, cutoff: float) -> wp.vec4i:
-    """Pixels [x0, y0, x1, y1) of the image whose centres lie in the bounding box of the ellipse
-    alpha >= 1/255.
-    """
+    """Pixels [x0, y0, x1, y1) with centres in the bounding box of the ellipse alpha >= 1/255."""
     reach_x = wp.sqrt(wp.max(cutoff, 0.0) * cov[0]) * 1.0001 + 1.0e-3
     reach_y = wp.sqrt(wp.max(cutoff, 0.0) * cov[2]) * 1.0001 + 1.0e-3
     w = float(view.width)

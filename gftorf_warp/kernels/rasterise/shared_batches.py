@@ -61,14 +61,8 @@ def shared_floats(values: int, derivatives: int) -> int:
 
 
 @functools.cache
-def make_batches(values: int = 0, derivatives: int = 0, more: bool = False) -> SimpleNamespace:
-    """Functions that fetch the records of a list.
-
-    Args:
-        values: As in :func:`shared_floats`.
-        derivatives: As in :func:`shared_floats`.
-        more: Whether three further channels are fetched, too.
-    """
+def make_warp_memory(values: int = 0, derivatives: int = 0, more: bool = False) -> wp.Function:
+    """Function for the start of a warp's shared memory: :func:`shared_floats`, further channels."""
     floats = shared_floats(values, derivatives) + _MORE * more
 
     memory_snippet = f"""
@@ -86,15 +80,7 @@ def make_batches(values: int = 0, derivatives: int = 0, more: bool = False) -> S
     def warp_memory() -> wp.uint64:
         """Where the shared memory of this warp begins."""
 
-    return SimpleNamespace(
-        warp_memory=warp_memory,
-        fetch_records=fetch_records,
-        wait_for_records=wait_for_records,
-        entry=entry,
-        record_of=record_of,
-        fetch_more=fetch_more,
-        more_of=more_of,
-    )
+    return warp_memory
 
 
 @wp.func_native("""
@@ -106,9 +92,7 @@ def make_batches(values: int = 0, derivatives: int = 0, more: bool = False) -> S
 #endif
 """)
 def entry(ids: wp.array[int], start: int, step: int, at: int, count: int) -> int:
-    """The splat whose record this lane fetches for the round that begins at entry ``at`` of
-    ``count``; -1: none.
-    """
+    """Splat that this lane fetches for the round from entry ``at`` of ``count`` on; -1: none."""
 
 
 @wp.func_native(f"""
@@ -131,11 +115,7 @@ def entry(ids: wp.array[int], start: int, step: int, at: int, count: int) -> int
 #endif
 """)
 def fetch_records(memory: wp.uint64, splats: wp.array[Splat], i: int, at: int):
-    """Start copying the records of the round that begins at entry ``at``, of which ``i`` is this
-    lane's.
-
-    Without a record zeros are copied, which have no effect: their power is never above ``low``.
-    """
+    """Start copying this lane's record ``i`` of the round at entry ``at``; -1: harmless zeros."""
 
 
 @wp.func_native(f"""
@@ -155,11 +135,7 @@ def fetch_records(memory: wp.uint64, splats: wp.array[Splat], i: int, at: int):
 #endif
 """)
 def fetch_more(memory: wp.uint64, records: wp.array[Splat], i: int, at: int):
-    """Start copying three further channels, slots 8-10 of other records, as :func:`ask` does for
-    the records.
-
-    Zeros where there is none: NaN times a weight of 0 would be NaN.
-    """
+    """As :func:`fetch_records`, slots 8-10 of other records; zeros, since NaN times 0 is NaN."""
 
 
 @wp.func_native("""
@@ -199,9 +175,7 @@ def record_of(
     k: int,
     there: bool,
 ) -> Splat:
-    """The record of entry ``n`` of the group that begins at entry ``first``;
-    number ``k`` of the pairs, if any.
-    """
+    """Record of entry ``n`` of the group from entry ``first`` on; on the CPU that of pair ``k``."""
 
 
 @wp.func_native(
@@ -294,9 +268,7 @@ def make_gradient_rounds(
 
     @wp.func_native(values_snippet)
     def store_values(memory: wp.uint64, first: int, n: int, v: V, w: V, w2: V, g_d: V):
-        """Store the values of this lane's pixel for entry ``n`` of the group that begins at entry
-        ``first``.
-        """
+        """Store this pixel's values for entry ``n`` of the group from entry ``first`` on."""
 
     take = "\n        ".join(
         f"const float4 {name}4 = from[{(n * ROUND * STRIDE) // 4} + part];"
@@ -402,13 +374,10 @@ def make_gradient_rounds(
         memory: wp.uint64, grads: wp.array[Splat], more: wp.array[Splat], ids: wp.array[int],
         start: int, at: int, n: int, x: V, y: V,
     ):  # fmt: skip
-        """Sum the ``n`` entries of the round that began at entry ``at`` over pixels,
-        and add them to their records.
-        """
+        """Add the ``n`` entries of the round from entry ``at`` on, summed over pixels."""
 
-    fetch = make_batches(len(kept), derivatives)
     return SimpleNamespace(
-        **vars(fetch),
+        warp_memory=make_warp_memory(len(kept), derivatives),
         store_derivatives=store_derivatives,
         store_values=store_values,
         accumulate_round=accumulate_round,

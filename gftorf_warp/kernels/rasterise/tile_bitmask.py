@@ -24,9 +24,7 @@ def place_of_word(tile: int, word: int, words: int) -> int:
 
 @wp.func
 def part_of_tile(warp: int, parts: int) -> wp.vec2i:
-    """Tile and part of it that are a warp's: GROUP warps in a row have the same part of the tiles
-    of one group.
-    """
+    """(tile, part) of a warp: GROUP warps in a row read the same part of a group of tiles."""
     row = warp // GROUP
     return wp.vec2i(row // parts * GROUP + warp % GROUP, row % parts)
 
@@ -121,11 +119,7 @@ def list_bits(
     #  last list
     total: wp.array[int],  # [1] pairs there would be, whether they fit or not
 ):
-    """One warp per part of a tile: a sum over lanes gives the place of the splats of each lane's
-    two words.
-
-    Pairs that do not fit are dropped, those of the last tiles first, and show in ``total``.
-    """
+    """One warp per part of a tile; pairs that do not fit are dropped, last tiles first."""
     warp, lane = wp.tid()
     if warp == 0 and lane == 0:
         total[0] = ends[tiles * parts - 1]

@@ -61,9 +61,7 @@ def outline_of(q: Splat, box: wp.vec4i) -> wp.vec4:
 def span_of(
     outline: wp.vec4, q: Splat, row: int, tiles: wp.vec4i, tile_width: int, tile_height: int
 ) -> wp.vec2i:
-    """Tiles [x0, x1) of a row, at most those of ``tiles``,
-    whose pixel centres the ellipse reaches.
-    """
+    """Tiles [x0, x1) of a row, within ``tiles``, whose pixel centres the ellipse reaches."""
     # first and last pixel centres of the row, from the centre [px]
     low = float(row * tile_height) + 0.5 - q[1]
     high = low + float(tile_height - 1)
@@ -94,11 +92,7 @@ def rows_from(
     tile_width: int,
     tile_height: int,
 ) -> wp.vec2i:
-    """The rows of tiles from ``top`` on, one per lane: pairs up to this one's end; from a pair's
-    number to its column.
-
-    Every lane must take part.
-    """
+    """Spans of rows of tiles from ``top`` on, one per lane: (sum of pairs, column offset)."""
     span = wp.vec2i(0, 0)
     if top + lane < tiles[3]:
         span = span_of(outline, q, top + lane, tiles, tile_width, tile_height)
@@ -108,9 +102,7 @@ def rows_from(
 
 @wp.func
 def tile_of(rows: wp.vec2i, pair: int, top: int, tiles_x: int) -> int:
-    """The tile of a pair by its number in the rows of :func:`rows_from`; all lanes must call it,
-    each for its pair.
-    """
+    """Tile of a pair by its number in the rows of :func:`rows_from`; all lanes must call it."""
     row = lane_beyond(rows[0], pair)
     return (top + row) * tiles_x + of_lane(rows[1], row) + pair
 
@@ -129,9 +121,7 @@ def mark_pairs(
     # Out:
     bits: wp.array[wp.uint32],  # [groups * words * GROUP] zeroed; which splats each tile lists
 ):
-    """One warp per splat, as in :func:`emit_pairs`, but a pair is a bit,
-    at a place that depends on no other pair.
-    """
+    """One warp per splat, as in :func:`emit_pairs`, but a pair is a bit of the matrix."""
     rank, lane = wp.tid()
     i = order[rank]
     if box_px[i][2] > 0:
@@ -201,11 +191,7 @@ def emit_pairs(
     ids: wp.array[wp.int32],  # [>= capacity] splat of each pair
     total: wp.array[int],  # [1] pairs there would be, whether they fit or not
 ):
-    """One warp per splat: a lane finds the span of a row, then all lanes write neighbouring pairs,
-    whatever their row.
-
-    Pairs that do not fit are dropped, farthest first, and show in ``total``.
-    """
+    """One warp per splat; pairs that do not fit are dropped, farthest first."""
     rank, lane = wp.tid()
     known = ends[ends.shape[0] - 1]
     if rank == 0 and lane == 0:
@@ -249,9 +235,7 @@ def tile_starts(
     first: wp.array[int],  # [tiles + 1] where the list of each tile begins; the last entry ends the
     #  last list
 ):
-    """One warp per tile: a thread would halve the range 21 times,
-    32 lanes need five reads one after the other.
-    """
+    """One warp per tile, a 33-ary search: five dependent reads instead of 21."""
     tile, lane = wp.tid()
     low = int(0)
     high = int(count)

@@ -94,9 +94,7 @@ def received(
     view: wp.vec3,  # unit vector along which it was met, in camera axes
     may_be_hidden: bool,
 ) -> wp.vec2:
-    """Amplitude that a surface returns of the emitter's light, and its distance from it [m],
-    both at ``point``.
-    """
+    """Returned amplitude of the emitter's light and its distance [m], both at ``point``."""
     towards = point - emitter.place
     reach = wp.length(towards)
     turn = rotation[instant, body]
@@ -130,9 +128,7 @@ def received(
 
 @wp.func
 def turned(turns: float, weight: float) -> wp.vec2:
-    """A weight times exp(i 2 pi turns), of the fraction of the turns:
-    a large angle would lose digits.
-    """
+    """A weight times exp(i 2 pi turns), of the turns' fraction: a large angle loses digits."""
     phase = 6.283185307179586 * (turns - wp.floor(turns))
     return weight * wp.vec2(wp.cos(phase), wp.sin(phase))
 
@@ -154,9 +150,7 @@ def trace_light(
     amplitude: wp.array2d[float],  # [H, W] mean amplitude
     ambient: wp.array2d[float],  # [H, W] mean reflectance
 ):
-    """Mean direct light of one pixel over all sub-samples and instants,
-    for a source intensity of 1.
-    """
+    """Mean direct light of a pixel over sub-samples and instants, for a source intensity of 1."""
     i, x = wp.tid()
     y = first + stride * i
     total = float(0.0)
@@ -217,9 +211,7 @@ def trace_bounces(
     error: wp.array2d[float],  # [H, W] standard error of the first harmonic's mean, re and im
     #  together
 ):
-    """Mean of random paths of one pixel: light that met more than one surface,
-    for a source intensity of 1.
-    """
+    """Mean indirect light of a pixel over random paths, for a source intensity of 1."""
     i, x = wp.tid()
     y = first + stride * i
     random = wp.rand_init(seed, y * light.shape[2] + x)

@@ -53,9 +53,7 @@ class Hit:
 
 @wp.func
 def reflectance_of(solid: Solid, point: wp.vec3) -> float:
-    """Reflectance [1] in hashed cells of a grid: the lower 16 bits of the hash,
-    which need no more of its factors.
-    """
+    """Reflectance [1] in hashed cells of a grid, from the lower 16 bits of the hash."""
     x = wp.uint32(int(wp.floor((point[0] + TEXTURE_ORIGIN) / solid.cell)))
     y = wp.uint32(int(wp.floor((point[1] + TEXTURE_ORIGIN) / solid.cell)))
     z = wp.uint32(int(wp.floor((point[2] + TEXTURE_ORIGIN) / solid.cell)))
@@ -85,9 +83,7 @@ def meet_plane(solid: Solid, origin: wp.vec3, ray: wp.vec3, limit: float) -> Hit
 
 @wp.func
 def meet(solid: Solid, origin: wp.vec3, ray: wp.vec3, limit: float) -> Hit:
-    """First hit of one body, nearer than ``limit`` [m]; all in its axes.
-    ``body`` is 0 if there is one.
-    """
+    """First hit of one body within ``limit`` [m], in its axes; ``body`` is 0 if there is one."""
     if wp.length_sq(solid.normal) > 0.0:
         return meet_plane(solid, origin, ray, limit)
     hit = Hit()
@@ -136,9 +132,7 @@ def nearest(
     ray: wp.vec3,
     limit: float,
 ) -> Hit:
-    """First hit over all bodies at one instant; ``origin`` [m] and ``ray`` in camera axes,
-    moved into each body's.
-    """
+    """First hit over all bodies at one instant; ``origin`` [m] and ``ray`` in camera axes."""
     best = Hit()
     best.body = _NOTHING
     best.distance = limit

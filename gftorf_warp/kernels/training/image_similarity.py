@@ -23,6 +23,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from ...constants import STABILISE_MEAN, STABILISE_SPREAD, WINDOW, WINDOW_SIGMA
+from ..rasterise.simd import contracted
 from .ordered_sums import OVER_LANES
 
 REACH = WINDOW // 2  # [px] margin of the planes in between, left and right
@@ -32,9 +33,7 @@ SUMS = 3  # that come out: loss, squared difference, another image
 
 
 def _prelude(K: int) -> str:
-    """C++ that defines the block type ``F``, ``at`` and ``put`` from and to memory,
-    and the weights of the window.
-    """
+    """C++ of the block type ``F``, of ``at`` and ``put``, its memory access, and of the weights."""
     weights = [math.exp(-0.5 * (k / WINDOW_SIGMA) ** 2) for k in range(-REACH, REACH + 1)]
     taps = ", ".join(f"{weight / sum(weights):.9e}f" for weight in weights)
     kind = "typedef float F;"
@@ -54,9 +53,7 @@ def _prelude(K: int) -> str:
 
 
 def _sums(count: int, value: str) -> str:
-    """C++ statements that define ``s0``, ``s1``, ..: ``count`` vectors of the same initial
-    value.
-    """
+    """C++ that defines ``count`` vectors ``s0``, ``s1``, .. of the same initial value."""
     return f"F {', '.join(f's{n} = {value}' for n in range(count))};"
 
 
@@ -97,9 +94,7 @@ def _rows(count: int, source: str) -> str:
 
 
 def _compare(K: int) -> str:
-    """C++: sums of loss, squared difference and another image,
-    and the derivatives of S by window means.
-    """
+    """C++: sums of loss, squared difference and another image; derivatives of S by the means."""
     each = "" if K == 1 else "[n]"
     return f"""{_prelude(K)}
     const int across = (rendered.shape[2] + {K - 1}) / {K}, block = thread % across, line = thread
@@ -166,21 +161,9 @@ def _gradient(K: int) -> str:
 
 @functools.cache
 def make_similarity(K: int) -> SimpleNamespace:
-    """The four kernels for blocks of K pixels of a row: 1 on CUDA, 16 on the CPU if a row is that
-    long.
-
-    A last block that would stick out of its row begins earlier and computes some pixels again.
-    """
-    flags = (
-        "-march=native" if wp.config.cpu_compiler_flags is None else wp.config.cpu_compiler_flags
-    )
-    rounding = {"cpu_compiler_flags": flags + " -ffp-contract=fast"} if K > 1 else {}
-    options = {
-        "enable_backward": False,
-        "module": "unique",
-        "grid_stride": False,
-        "module_options": rounding,
-    }
+    """Four kernels for blocks of K pixels of a row; a last block begins earlier to fit."""
+    options = {"enable_backward": False, "module": "unique", "grid_stride": False}
+    options |= {"module_options": contracted() if K > 1 else {}}
 
     @wp.func_native(_columns_of_products(K))
     def products_of(

@@ -165,9 +165,7 @@ def finish(
 
 @wp.func
 def statistics_of(screen: wp.array2d[float], half: wp.vec2, i: int) -> wp.vec3:
-    """Statistics of a Gaussian in one image: pixels times screen gradient, pixels,
-    weight in them.
-    """
+    """Statistics of a Gaussian in an image: pixels times screen gradient, pixels, weight."""
     length = wp.length(wp.vec2(half[0] * screen[i, 0], half[1] * screen[i, 1]))
     return wp.vec3(screen[i, 2] * length, screen[i, 2], screen[i, 3])
 
