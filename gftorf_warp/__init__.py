@@ -1,5 +1,4 @@
-"""Differentiable simulation and reconstruction of continuous-wave time-of-flight scenes of
-Gaussians.
+"""Simulation and reconstruction of Gaussian scenes seen by continuous-wave time-of-flight cameras.
 
 The public names are resolved on first use, so that ``import gftorf_warp`` stays instant.
 """

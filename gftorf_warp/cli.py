@@ -1,5 +1,4 @@
-"""The command ``gftorf``: commands to functions, options to arguments, exceptions to messages and
-exit codes.
+"""The command ``gftorf``: options to arguments, exceptions to messages and exit codes.
 
 Heavy modules are imported when a command needs them. This is the only file that chooses a device.
 """
@@ -14,7 +13,7 @@ import logging
 import os
 import sys
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from . import __version__
 from .errors import ResourceError, UsageError
@@ -29,8 +28,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run one command.
 
     Args:
-        arguments: Words after ``gftorf``; None: those of the process, which then ends with the exit
-            code.
+        arguments: Words after ``gftorf``; None: those of the process, which then ends.
 
     Returns:
         Exit code: 0 ok, 1 a bug or a failed self-test, 2 usage, 3 bad input, 4 diverged, 5
@@ -75,12 +73,12 @@ def choose_device(name: str) -> tuple[str, str]:
     if name == "cpu":
         return "cpu", ""
     if not torch.cuda.is_available():
-        build = (
-            "this torch is a CPU build"
-            if torch.version.cuda is None
-            else "no CUDA driver or GPU found"
-        )
-        reason = "no CUDA driver found" if wp.get_cuda_driver_version() is None else build
+        if wp.get_cuda_driver_version() is None:
+            reason = "no CUDA driver found"
+        elif torch.version.cuda is None:
+            reason = "this torch is a CPU build"
+        else:
+            reason = "no CUDA driver or GPU found"
     elif not wp.is_cuda_available():
         reason = "Warp cannot use the CUDA driver"
     else:
@@ -96,50 +94,40 @@ def choose_device(name: str) -> tuple[str, str]:
 
 
 def start(options: argparse.Namespace, *, compile_first: bool = True) -> str:
-    """Import torch and Warp, log the device, compile kernels if none are cached,
-    and return the device.
-    """
+    """Import torch and Warp, log the device, compile kernels if none are cached; the device."""
     with without_garbage_collection():
         import torch
 
         from . import terminal
-        from .doctor import compile_kernels
 
         terminal.start_warp()
     device, reason = choose_device(getattr(options, "device", "cpu"))
     threads = min(torch.get_num_threads(), available_cpus())
     cache = terminal.home_as_tilde(terminal.kernel_cache())
     details = "; ".join(filter(None, [f"{threads} threads", reason]))
-    terminal.LOG.info(
-        "gftorf_warp %s - device %s (%s) - kernels cached in %s",
-        __version__,
-        device,
-        details,
-        cache,
-    )
-    if compile_first and not terminal.kernels_are_cached():
-        terminal.LOG.info("  compiling kernels (first run only) ...")
-        terminal.LOG.info(
-            "  compiling kernels (first run only) ... %.1f s", compile_kernels(device)
-        )
+    text = "gftorf_warp %s - device %s (%s) - kernels cached in %s"
+    terminal.LOG.info(text, __version__, device, details, cache)
+    if compile_first:
+        compile_first_time(device)
     return device
+
+
+def compile_first_time(device: str) -> None:
+    """Compile kernels if none are cached."""
+    from . import doctor, terminal
+
+    if not terminal.kernels_are_cached():
+        message = "  compiling kernels (first run only) ..."
+        terminal.LOG.info(message)
+        terminal.LOG.info("%s %.1f s", message, doctor.compile_kernels(device))
 
 
 def _demo(options: argparse.Namespace) -> int:
     from .demo import demo
 
     device = start(options)
-    lines = demo(
-        options.out,
-        device=device,
-        seed=options.seed,
-        size=options.size,
-        frames=options.frames,
-        images=options.images,
-        fresh=options.fresh,
-        progress=_progress(options),
-    )
-    print("\n".join(lines))
+    given = _named(options, "seed", "size", "frames", "images", "fresh")
+    print("\n".join(demo(options.out, device=device, progress=_progress(options), **given)))
     return 0
 
 
@@ -150,24 +138,17 @@ def _simulate(options: argparse.Namespace) -> int:
         print(f"{'scene':<21}{'raw frames':>10}{'closed form':>13}  motion: description")
         for scene in _listed(options, SCENES):
             error = "-" if scene.closed_form is None else f"{scene.closed_form:.4g}"
-            print(
-                f"{scene.name:<21}{scene.frames:>10}{error:>13}  {scene.motion}: "
-                f"{scene.description}"
-            )
-        print(
-            "closed form: its mean squared error on ideal quads [m^2 x 100], see "
-            "design/look-alikes.md"
-        )
+            about = f"{scene.motion}: {scene.description}"
+            print(f"{scene.name:<21}{scene.frames:>10}{error:>13}  {about}")
+        error = "its mean squared error on ideal quads [m^2 x 100], see design/look-alikes.md"
+        print(f"closed form: {error}")
         return 0
     if options.scene is None or options.out is None:
         missing = "SCENE" if options.scene is None else "--out SEQ"
-        fix = (
-            f"for example `gftorf simulate {next(iter(SCENES))} --out sequence`; `gftorf "
-            f"simulate --list`"
-        )
-        raise UsageError(
-            f"{missing} is missing", where="gftorf simulate", why="both are needed", fix=fix
-        )
+        example = f"`gftorf simulate {next(iter(SCENES))} --out sequence`"
+        fix = f"for example {example}; `gftorf simulate --list`"
+        why = "both are needed"
+        raise UsageError(f"{missing} is missing", where="gftorf simulate", why=why, fix=fix)
     from dataclasses import fields
 
     from .sim.closed_form_errors import ladder_table
@@ -175,34 +156,17 @@ def _simulate(options: argparse.Namespace) -> int:
     from .sim.simulate import simulate, simulate_ladder
 
     device = start(options)
-    settings = SimSettings(**{f.name: getattr(options, f.name) for f in fields(SimSettings)})
-    if options.ladder:
-        if options.level is not None:
-            why = "--ladder records all of them"
-            raise UsageError(
-                "one level or all", where="--level", why=why, fix="leave one of the two out"
-            )
-        rows = simulate_ladder(
-            options.scene,
-            options.out,
-            settings,
-            device=device,
-            fresh=options.fresh,
-            progress=_each_level(options),
-        )
-        print("\n".join(ladder_table(rows)))
+    settings = SimSettings(**_named(options, *(field.name for field in fields(SimSettings))))
+    given = options.scene, options.out, settings
+    where = {"device": device, "fresh": options.fresh}
+    if not options.ladder:
+        print(simulate(*given, **where, progress=_progress(options)("simulate")))
         return 0
-    progress = _progress(options)("simulate")
-    print(
-        simulate(
-            options.scene,
-            options.out,
-            settings,
-            device=device,
-            fresh=options.fresh,
-            progress=progress,
-        )
-    )
+    if options.level is not None:
+        why, fix = "--ladder records all of them", "leave one of the two out"
+        raise UsageError("one level or all", where="--level", why=why, fix=fix)
+    rows = simulate_ladder(*given, **where, progress=_each_level(options))
+    print("\n".join(ladder_table(rows)))
     return 0
 
 
@@ -233,29 +197,19 @@ def _reconstruct(options: argparse.Namespace) -> int:
     from .data.read import read
 
     sequence = read(options.sequence, frame_rate_hz=options.frame_rate)
-    device = start(options)
-    from .recon.train import reconstruct
+    device = start(options, compile_first=False)
+    from .recon.train import chosen_settings, reconstruct
 
     changes = list(options.set)
     if options.batch is not None:
         changes.append("schedule.batch=" + {1: "frame", 4: "quartet"}[options.batch])
     if options.deterministic:
         changes.append("render.deterministic=true")
-    run = reconstruct(
-        sequence,
-        options.out,
-        options.preset,
-        images=options.images,
-        input=options.input,
-        ablation=options.ablation,
-        changes=changes,
-        flow=options.flow,
-        seed=options.seed,
-        device=device,
-        fresh=options.fresh,
-        progress=_progress(options)("reconstruct"),
-    )
-    print(run.path)
+    chosen = {**_named(options, "images", "input", "ablation", "flow"), "changes": changes}
+    chosen_settings(sequence, options.preset, **chosen)  # refuses wrong ones before kernels compile
+    compile_first_time(device)
+    more = {**_named(options, "seed", "fresh"), "progress": _progress(options)("reconstruct")}
+    print(reconstruct(sequence, options.out, options.preset, **chosen, device=device, **more).path)
     return 0
 
 
@@ -264,18 +218,12 @@ def _render(options: argparse.Namespace) -> int:
     from .evaluate.views import render_to_folder
     from .recon.run import Run
 
-    run = Run.open(options.run_folder, device)
-    out = render_to_folder(
-        run,
-        options.out,
-        options.what,
-        options.times,
-        poses=options.poses,
-        fresh=options.fresh,
-        arrays=options.arrays,
-        progress=_progress(options)("render", unit="images"),
+    run, progress = (
+        Run.open(options.run_folder, device),
+        _progress(options)("render", unit="images"),
     )
-    print(out)
+    given = _named(options, "out", "what", "times", "poses", "fresh", "arrays")
+    print(render_to_folder(run, **given, progress=progress))
     return 0
 
 
@@ -287,9 +235,7 @@ def _compare(options: argparse.Namespace) -> int:
     from .recon.run import Run
 
     run, progress = Run.open(options.run_folder, device), _progress(options)("compare")
-    metrics = compare(
-        run, truth=options.truth, frames=options.frames, against=options.against, progress=progress
-    )
+    metrics = compare(run, **_named(options, "truth", "frames", "against"), progress=progress)
     print(json.dumps(metrics, indent=2) if options.json else table(metrics))
     return 0
 
@@ -316,29 +262,17 @@ def _bench(options: argparse.Namespace) -> int:
     device = start(options)
     from .bench.command import Wanted, bench
 
-    wanted = Wanted(
-        device=device,
-        quick=options.quick,
-        sequence=None if options.sequence is None else Path(options.sequence),
-        run=None if options.run is None else Path(options.run),
-        images=options.images,
-        preset=options.preset,
-        changes=tuple(options.set),
-    )
+    paths = {name: path and Path(path) for name, path in _named(options, "sequence", "run").items()}
+    given = _named(options, "quick", "images", "preset")
+    wanted = Wanted(device=device, changes=tuple(options.set), **paths, **given)
     say = functools.partial(print, flush=True)
     bench(options.parts, wanted, json=options.json, progress=_progress(options), say=say)
     return 0
 
 
 COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
-    "demo": _demo,
-    "simulate": _simulate,
-    "reconstruct": _reconstruct,
-    "render": _render,
-    "compare": _compare,
-    "check": _check,
-    "doctor": _doctor,
-    "bench": _bench,
+    command.__name__[1:]: command
+    for command in (_demo, _simulate, _reconstruct, _render, _compare, _check, _doctor, _bench)
 }
 
 
@@ -346,25 +280,23 @@ def table(metrics: dict) -> str:
     """The errors of metrics.json as a table, MSE x100 [m^2]: closed form and ours."""
     lines = [f"{'MSE x100 [m^2]':<16}{'closed form':>12}{'d':>10}{'d / opacity':>13}{'d_ToF':>10}"]
     keys = ("closed_form_mse_x100", "d_mse_x100", "d_normalised_mse_x100", "d_tof_mse_x100")
-    for name, row in (
-        ("all", metrics),
-        ("moving", metrics["moving"]),
-        ("static", metrics["static"]),
-    ):
+    for name in ("all", "moving", "static"):
+        row = metrics if name == "all" else metrics[name]
         cells = ["-" if row is None or row[key] is None else f"{row[key]:.4g}" for key in keys]
         lines.append(f"{name:<16}{cells[0]:>12}{cells[1]:>10}{cells[2]:>13}{cells[3]:>10}")
     psnr = metrics["quad_psnr_db"]
     quality = "-" if psnr is None else f"{psnr:.2f} dB"
-    scored = (
-        f"{metrics['frames']} raw frames ({metrics['protocol']}), against "
-        f"{metrics.get('against', 'geometry')}"
-    )
-    lines.append(f"{scored}, quad PSNR {quality}")
+    scored = f"{metrics['frames']} raw frames ({metrics['protocol']})"
+    lines.append(f"{scored}, against {metrics.get('against', 'geometry')}, quad PSNR {quality}")
     share = metrics.get("ambiguous_share")
     if share is not None:
         reach = f"{metrics['unambiguous_range_m']:.4g} m by several frequencies together"
         lines.append(f"unambiguous to {reach}; {share:.1%} of the closed form ambiguous")
     return "\n".join(lines)
+
+
+def _named(options: argparse.Namespace, *names: str) -> dict[str, Any]:
+    return {name: getattr(options, name) for name in names}
 
 
 def _level(options: argparse.Namespace) -> int:

@@ -39,15 +39,13 @@ def demo(
         frames: Raw frames; None is the scene's own number.
         images: Raw frames to optimise; None is the preset's own number.
         fresh: Start over; an earlier demo in ``out`` is moved to ``out/old-1``, ``old-2``, ...
-        progress: Called with the name of a step; returns the progress callback (done, total) of
-            that step.
+        progress: Called with the name of a step; returns its progress callback (done, total).
 
     Returns:
         Lines to print: errors on moving and on static pixels, and the path of the report.
 
     Raises:
-        UsageError: If ``out`` holds a demo with other settings and ``fresh`` is not set, or other
-            files.
+        UsageError: If ``out`` holds other files, or, without ``fresh``, a demo with other settings.
     """
     from .data.check import check
     from .data.read import read
@@ -56,11 +54,8 @@ def demo(
     from .sim.simulate import simulate
 
     out = Path(out)
-    prepare(
-        out,
-        {"version": __version__, "seed": seed, "size": size, "frames": frames, "images": images},
-        fresh=fresh,
-    )
+    chosen = {"seed": seed, "size": size, "frames": frames, "images": images}
+    prepare(out, {"version": __version__, **chosen}, fresh=fresh)
 
     def report(label: str) -> Callable[..., None] | None:
         return None if progress is None else progress(label)
@@ -70,30 +65,19 @@ def demo(
             SCENE, out / "seq", frames=frames, size=size, seed=seed, progress=report("simulate")
         )
         sequence = read(path)
-        step.result = (
-            f"{SCENE} {sequence.width}x{sequence.height}, {sequence.frames} raw frames "
-            f"-> {out / 'seq'}"
-        )
+        size_of = f"{sequence.width}x{sequence.height}, {sequence.frames} raw frames"
+        step.result = f"{SCENE} {size_of} -> {out / 'seq'}"
     with _Step("[2/4] check      ") as step:
         found = check(out / "seq")
         for line in found.lines:
             LOG.debug("      %s", line)
         for line in found.warnings:
             LOG.warning(line)
-        step.result = (
-            f"{len(sequence.complete_quartets)} complete quartets at "
-            f"{sequence.calibration.f_mod_hz / 1e6:.2f} MHz"
-        )
+        frequency = f"{sequence.calibration.f_mod_hz / 1e6:.2f} MHz"
+        step.result = f"{len(sequence.complete_quartets)} complete quartets at {frequency}"
     with _Step("[3/4] reconstruct") as step:
-        run = reconstruct(
-            sequence,
-            out / "run",
-            PRESET,
-            images=images,
-            seed=seed,
-            device=device,
-            progress=report("reconstruct"),
-        )
+        where = {"device": device, "progress": report("reconstruct")}
+        run = reconstruct(sequence, out / "run", PRESET, images=images, seed=seed, **where)
         step.result = f"{run.gaussians} Gaussians -> {out / 'run'}"
     with _Step("[4/4] compare    ") as step:
         metrics = compare(run, progress=report("compare"))
@@ -104,34 +88,28 @@ def demo(
 
 
 def prepare(out: Path, settings: dict, *, fresh: bool) -> None:
-    """Check that ``out`` is empty or holds a demo with these settings, and store the settings in
-    it.
+    """Store the settings in ``out``, which must be empty or hold a demo with the same ones.
 
     Raises:
-        UsageError: If it holds a demo with other settings and ``fresh`` is not set, or other files.
+        UsageError: If it holds other files, or, without ``fresh``, a demo with other settings.
     """
     from .recon.folder import set_aside
 
     wanted = json.loads(json.dumps(settings))  # tuples become lists, as they are on disk
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        found = _read(out / SETTINGS)
+        path = out / SETTINGS
+        found = json.loads(path.read_text()) if path.is_file() else None
         fix = "choose another --out, or --fresh, which moves its content to old-1"
         if found is None:
             why, fix = f"it has no {SETTINGS}: no demo has begun in it", "choose another --out"
             raise UsageError("the folder is not empty", where=out, why=why, fix=fix)
         if fresh:
-            LOG.info(
-                "the earlier demo is now in %s",
-                set_aside(out, [out / n for n in OURS if (out / n).exists()]),
-            )
+            moved = set_aside(out, [out / n for n in OURS if (out / n).exists()])
+            LOG.info("the earlier demo is now in %s", moved)
         elif found != wanted:
             differ = ", ".join(key for key in wanted if found.get(key) != wanted[key])
-            raise UsageError(
-                "the folder is not empty",
-                where=out,
-                why=f"it was made with another {differ}",
-                fix=fix,
-            )
+            why = f"it was made with another {differ}"
+            raise UsageError("the folder is not empty", where=out, why=why, fix=fix)
     out.mkdir(parents=True, exist_ok=True)
     (out / SETTINGS).write_text(json.dumps(wanted, indent=2) + "\n")
 
@@ -166,7 +144,3 @@ class _Step:
     def __exit__(self, kind, *_) -> None:
         if kind is None:
             LOG.info("%s %s   %.1f s", self.name, self.result, time.monotonic() - self.start)
-
-
-def _read(path: Path) -> dict | None:
-    return json.loads(path.read_text()) if path.is_file() else None

@@ -1,6 +1,4 @@
-"""``gftorf doctor``: versions and devices of this machine,
-and a test of the renderer against a closed form.
-"""
+"""``gftorf doctor``: versions, devices, and a test of the renderer against a closed form."""
 
 from __future__ import annotations
 
@@ -24,14 +22,7 @@ TOLERANCE = 1e-5
 
 
 def doctor(device: str) -> tuple[bool, list[str]]:
-    """Describe and test this installation.
-
-    Args:
-        device: Device of the test.
-
-    Returns:
-        Whether the renderer passed, and the lines to print.
-    """
+    """Whether the renderer passes the test on a device, and lines on this installation."""
     import torch
     import warp as wp
 
@@ -45,8 +36,10 @@ def doctor(device: str) -> tuple[bool, list[str]]:
     gpus = [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())]
     free = shutil.disk_usage(cache if cache.exists() else Path.home()).free
     writable = (
-        "writable" if os.access(cache, os.W_OK) else ("NOT WRITABLE: every start compiles again")
+        "writable" if os.access(cache, os.W_OK) else "NOT WRITABLE: every start compiles again"
     )
+    tested = f"one Gaussian on {device} against the formula, quads, phasor, distance, opacity"
+    largest = f"largest relative error {error:.1e}, allowed {TOLERANCE:.0e}"
     rows = {
         "gftorf_warp": f"{__version__} in {terminal.home_as_tilde(Path(__file__).parent)}",
         "python": f"{platform.python_version()} on {platform.platform()}",
@@ -58,16 +51,13 @@ def doctor(device: str) -> tuple[bool, list[str]]:
         "kernel cache": f"{terminal.home_as_tilde(cache)} ({writable}; kernels ready after "
         f"{seconds:.1f} s)",
         "free disk": f"{free / 1e9:.1f} GB on the disk of the cache",
-        "self-test": f"{verdict}: one Gaussian on {device} against the formula, quads, phasor, "
-        f"distance, opacity; "
-        f"largest relative error {error:.1e}, allowed {TOLERANCE:.0e}",
+        "self-test": f"{verdict}: {tested}; {largest}",
     }
     return passed, [f"{name:<14}{text}" for name, text in rows.items()]
 
 
 def self_test_error(device: str) -> float:
-    """Largest relative error of one rendered Gaussian against the closed form, quads and distance
-    at its centre pixel.
+    """Largest relative error of one rendered Gaussian against the closed form at its centre pixel.
 
     At a pixel centre onto which the Gaussian's centre projects, alpha = o exactly, so the quad of
     shift theta is o a (cos(psi - theta) + b), the distance o d, and the opacity o.
@@ -79,9 +69,8 @@ def self_test_error(device: str) -> float:
     y, x = camera.height // 2, camera.width // 2
     amplitude = OPACITY * REFLECTIVITY / DISTANCE**2
     psi = float(sensor.phase_slope) * DISTANCE + float(sensor.phase_offset)
-    want = [
-        amplitude * (math.cos(psi - shift) + float(sensor.dc_offset)) for shift in sensor.shifts
-    ]
+    offset = float(sensor.dc_offset)
+    want = [amplitude * (math.cos(psi - shift) + offset) for shift in sensor.shifts]
     want += [2 * amplitude * math.cos(psi), 2 * amplitude * math.sin(psi), 2 * amplitude]
     got = [float(value) for value in (*rendering.quads[:, y, x], *rendering.phasor[:, y, x])]
     errors = [abs(g - w) / (2 * amplitude) for g, w in zip(got, want, strict=True)]
@@ -91,9 +80,7 @@ def self_test_error(device: str) -> float:
 
 
 def compile_kernels(device: str) -> float:
-    """Compile the rendering kernels by rendering one Gaussian forward and backward;
-    returns the time [s].
-    """
+    """Compile the kernels by rendering one Gaussian forward and backward; returns the time [s]."""
     from dataclasses import replace
 
     from .render.api import rasterize
@@ -106,9 +93,7 @@ def compile_kernels(device: str) -> float:
 
 
 def single_gaussian(device: str):
-    """An isotropic Gaussian on the ray of the middle pixel, its camera,
-    and a sensor with all offsets nonzero.
-    """
+    """An isotropic Gaussian on the middle pixel's ray, its camera, and a sensor with offsets."""
     import torch
 
     from .scene.camera import Camera

@@ -1,6 +1,4 @@
-"""Errors that a user can fix: each states what is wrong, where, why, and a fix;
-each class has an exit code.
-"""
+"""Errors that a user can fix: what is wrong, where, why, and a fix; a class for each exit code."""
 
 
 class GftorfError(Exception):

@@ -6,14 +6,52 @@ import argparse
 import difflib
 import re
 from collections.abc import Callable
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from . import __version__
 from .errors import UsageError
 
+FRESH = "start over in a folder that is not empty"
+THREADS = "CPU threads (as many as may be used)"
+
 
 class Parser(argparse.ArgumentParser):
     """An argparse parser that raises :class:`UsageError`, with the nearest option as a hint."""
+
+    @classmethod
+    def of(cls, command: str, what: str) -> Parser:
+        """The parser of a command, with the options of every command."""
+        parser = cls(prog=f"gftorf {command}", description=what, allow_abbrev=False)
+        parser.set_defaults(command=command)
+        output = parser.add_mutually_exclusive_group()
+        quiet, verbose = "only results, warnings and errors", "also what Warp compiles and loads"
+        output.add_argument("-q", "--quiet", action="store_true", help=quiet)
+        output.add_argument("-v", "--verbose", action="store_true", help=verbose)
+        parser.flag("--debug", "show the traceback of an error")
+        return parser
+
+    def option(
+        self,
+        name: str,
+        metavar: str,
+        kind: Callable[[str], object],
+        text: str,
+        default: object = None,
+        **more: Any,
+    ) -> None:
+        """Add an option with a value."""
+        self.add_argument(name, metavar=metavar, type=kind, help=text, default=default, **more)
+
+    def flag(self, name: str, text: str) -> None:
+        """Add an option without a value."""
+        self.add_argument(name, action="store_true", help=text)
+
+    def change(self, name: str, text: str, dest: str | None = None) -> None:
+        """Add an option NAME=VALUE that may be repeated; its attribute is ``dest``."""
+        named = {} if dest is None else {"dest": dest}
+        self.add_argument(
+            name, **named, metavar="NAME=VALUE", action="append", default=[], help=text
+        )
 
     def error(self, message: str) -> NoReturn:
         """Raise instead of exiting."""
@@ -46,20 +84,12 @@ def parse(arguments: list[str]) -> argparse.Namespace:
     parsers = command_parsers()
     if command is None:
         top_parser(parsers).parse(arguments)
-        raise UsageError(
-            "no command",
-            where="gftorf",
-            why=f"one of {', '.join(parsers)} is needed",
-            fix="gftorf --help",
-        )
+        why = f"one of {', '.join(parsers)} is needed"
+        raise UsageError("no command", where="gftorf", why=why, fix="gftorf --help")
     if command not in parsers:
         hint = nearest(command, list(parsers), "see `gftorf --help`")
-        raise UsageError(
-            f"unknown command {command}",
-            where="gftorf",
-            why=f"there are {', '.join(parsers)}",
-            fix=hint,
-        )
+        why = f"there are {', '.join(parsers)}"
+        raise UsageError(f"unknown command {command}", where="gftorf", why=why, fix=hint)
     rest = list(arguments)
     rest.remove(command)
     return parsers[command].parse(rest)
@@ -85,293 +115,182 @@ def top_parser(parsers: dict[str, Parser]) -> Parser:
 
 def command_parsers() -> dict[str, Parser]:
     """One parser per command, by name."""
-    demo = _command(
+    demo = Parser.of(
         "demo", "simulate a moving scene, reconstruct it, and compare the two in a report"
     )
-    demo.add_argument(
-        "--out", metavar="DIR", default="gftorf-demo", help="folder to write (gftorf-demo)"
-    )
+    demo.option("--out", "DIR", str, "folder to write (gftorf-demo)", "gftorf-demo")
     _device_options(demo)
-    _seed_option(demo, "seed of the noise and of the optimiser (0)")
-    demo.add_argument(
-        "--size", metavar="WxH", type=_size, help="image size in pixels (the scene's own)"
-    )
-    demo.add_argument(
-        "--frames",
-        metavar="N",
-        type=_positive,
-        help="raw frames, four to a quartet (the scene's own)",
-    )
-    demo.add_argument(
-        "--images", metavar="N", type=_positive, help="raw frames to optimise (the preset's own)"
-    )
-    _fresh_option(demo)
+    demo.option("--seed", "S", _whole, "seed of the noise and of the optimiser (0)", 0)
+    demo.option("--size", "WxH", _size, "image size in pixels (the scene's own)")
+    demo.option("--frames", "N", _positive, "raw frames, four to a quartet (the scene's own)")
+    demo.option("--images", "N", _positive, "raw frames to optimise (the preset's own)")
+    demo.flag("--fresh", FRESH)
 
-    simulate = _command("simulate", "write a sequence of asynchronous quads with its true distance")
-    simulate.add_argument(
-        "scene",
-        metavar="SCENE",
-        nargs="?",
-        help="name of a scene, --list shows them, or a .toml file of one",
+    simulate = Parser.of(
+        "simulate", "write a sequence of asynchronous quads with its true distance"
     )
-    simulate.add_argument(
-        "--list", action="store_true", help="list the scenes, or SCENE with its overrides"
-    )
-    simulate.add_argument("--out", metavar="SEQ", help="folder to write")
-    simulate.add_argument(
-        "--frames", metavar="N", type=_positive, help="raw frames (the scene's own number)"
-    )
-    simulate.add_argument(
-        "--size", metavar="WxH", type=_size, help="image size in pixels (the scene's own)"
-    )
-    _seed_option(simulate, "seed of the noise (0)")
+    scenes = "name of a scene, --list shows them, or a .toml file of one"
+    simulate.add_argument("scene", metavar="SCENE", nargs="?", help=scenes)
+    simulate.flag("--list", "list the scenes, or SCENE with its overrides")
+    simulate.option("--out", "SEQ", str, "folder to write")
+    simulate.option("--frames", "N", _positive, "raw frames (the scene's own number)")
+    simulate.option("--size", "WxH", _size, "image size in pixels (the scene's own)")
+    simulate.option("--seed", "S", _whole, "seed of the noise (0)", 0)
     layouts = "folder layout (ftorf): raw quads, one phasor per quartet, or our own layout"
-    simulate.add_argument("--format", metavar="ftorf|torf|capture", default="ftorf", help=layouts)
+    simulate.option("--format", "ftorf|torf|capture", str, layouts, "ftorf")
     amounts = (
-        "truth in a capture of engine mesh: usual, or all, with light by harmonic, z-depth "
-        "and normals"
+        "truth in a capture of engine mesh: usual, or all, with light by harmonic, z-depth and"
     )
-    simulate.add_argument("--truth", metavar="usual|all", default="usual", help=amounts)
+    simulate.option("--truth", "usual|all", str, f"{amounts} normals", "usual")
     levels = (
         "level of realism, sync, L0, L1, L2, L3 or L4: sets engine, noise, motion blur and bounces"
     )
-    simulate.add_argument("--level", metavar="NAME", help=levels)
-    ladder = (
-        "record all levels into SEQ/sync, SEQ/L0 .. SEQ/L4 and print the closed form's "
-        "error on each"
-    )
-    simulate.add_argument("--ladder", action="store_true", help=ladder)
+    simulate.option("--level", "NAME", str, levels)
+    ladder = "record all levels into SEQ/sync, SEQ/L0 .. SEQ/L4 and print the closed form's error"
+    simulate.flag("--ladder", f"{ladder} on each")
     engines = "gaussian: splats cover the scene; mesh: rays meet its surfaces (gaussian)"
-    simulate.add_argument("--engine", metavar="gaussian|mesh", default="gaussian", help=engines)
+    simulate.option("--engine", "gaussian|mesh", str, engines, "gaussian")
     bounces = "bounces of indirect light, with engine mesh (0: direct light only)"
-    simulate.add_argument("--bounces", metavar="N", type=_whole, default=0, help=bounces)
-    paths = "random paths per pixel for the light that bounces (64)"
-    simulate.add_argument("--paths", metavar="N", type=_positive, default=64, help=paths)
-    device = "where engine mesh traces (cpu)"
-    simulate.add_argument(
-        "--device", metavar="auto|cpu|cuda", type=_device, default="cpu", help=device
+    simulate.option("--bounces", "N", _whole, bounces, 0)
+    simulate.option(
+        "--paths", "N", _positive, "random paths per pixel for the light that bounces (64)", 64
     )
-    simulate.add_argument(
-        "--sync", action="store_true", help="all quads of a quartet at one instant"
-    )
+    simulate.option("--device", "auto|cpu|cuda", _device, "where engine mesh traces (cpu)", "cpu")
+    simulate.flag("--sync", "all quads of a quartet at one instant")
     simulate.add_argument("--no-noise", dest="noise", action="store_false", help="an ideal sensor")
-    simulate.add_argument("--flow", action="store_true", help="store exact optical flow too")
+    simulate.flag("--flow", "store exact optical flow too")
     blur = "samples in time of one exposure (1: no motion blur)"
-    simulate.add_argument("--exposure-samples", metavar="N", type=_positive, default=1, help=blur)
-    single = (
-        "change one setting, for example sensor.f_mod_hz=30e6 or "
-        "bodies.1.path.velocity=3,0,0 (may be repeated)"
-    )
-    simulate.add_argument(
-        "--override",
-        dest="overrides",
-        metavar="NAME=VALUE",
-        action="append",
-        default=[],
-        help=single,
-    )
-    _fresh_option(simulate)
-    _threads_option(simulate)
+    simulate.option("--exposure-samples", "N", _positive, blur, 1)
+    examples = "for example sensor.f_mod_hz=30e6 or bodies.1.path.velocity=3,0,0"
+    simulate.change("--override", f"change one setting, {examples} (may be repeated)", "overrides")
+    simulate.flag("--fresh", FRESH)
+    simulate.option("--threads", "N", _positive, THREADS)
 
-    reconstruct = _command("reconstruct", "fit moving Gaussians to the raw quads of a sequence")
+    reconstruct = Parser.of("reconstruct", "fit moving Gaussians to the raw quads of a sequence")
     reconstruct.add_argument("sequence", metavar="SEQ", help="folder of the sequence")
-    reconstruct.add_argument(
-        "--out", metavar="RUN", required=True, help="folder to write; an interrupted run is resumed"
-    )
+    out = "folder to write; an interrupted run is resumed"
+    reconstruct.option("--out", "RUN", str, out, required=True)
     presets = (
         "settings: demo, paper, released, fast, dgs, dgs_depth or ctof, the closed form (demo)"
     )
-    reconstruct.add_argument("--preset", metavar="NAME", default="demo", help=presets)
+    reconstruct.option("--preset", "NAME", str, presets, "demo")
     inputs = "fitted data: quads, phasor, or auto: as recorded (auto)"
-    reconstruct.add_argument("--input", metavar="KIND", default="auto", help=inputs)
+    reconstruct.option("--input", "KIND", str, inputs, "auto")
     rows = "apply a row of the ablation table: nobias, dd, h1, h1h2 or h1h2dd"
-    reconstruct.add_argument("--ablation", metavar="ROW", help=rows)
-    single = (
-        "change one setting, for example init.reflectivity=0.5; config.json of a run names "
-        "all (may be repeated)"
-    )
-    reconstruct.add_argument(
-        "--set", metavar="NAME=VALUE", action="append", default=[], help=single
-    )
-    reconstruct.add_argument(
-        "--images", metavar="N", type=_positive, help="raw frames to optimise (the preset's own)"
-    )
+    reconstruct.option("--ablation", "ROW", str, rows)
+    example = "for example init.reflectivity=0.5; config.json of a run names all"
+    reconstruct.change("--set", f"change one setting, {example} (may be repeated)")
+    reconstruct.option("--images", "N", _positive, "raw frames to optimise (the preset's own)")
     batch = "raw frames of a training step: 1, or 4 for a whole quartet (the preset's own)"
-    reconstruct.add_argument("--batch", metavar="N", type=int, choices=(1, 4), help=batch)
+    reconstruct.option("--batch", "N", int, batch, choices=(1, 4))
     order = "sum gradients in a fixed order on CUDA, for bitwise reproducible runs; slower"
-    reconstruct.add_argument("--deterministic", action="store_true", help=order)
+    reconstruct.flag("--deterministic", order)
     flows = "the folder's, computed, or none; auto: the folder's if it has any, else dis"
-    reconstruct.add_argument(
-        "--flow", metavar="KIND", help=f"auto, file, dis, deepflow or none: optical flow, {flows}"
+    reconstruct.option(
+        "--flow", "KIND", str, f"auto, file, dis, deepflow or none: optical flow, {flows}"
     )
-    _seed_option(reconstruct, "seed of the optimiser (0)")
-    _frame_rate_option(reconstruct)
+    reconstruct.option("--seed", "S", _whole, "seed of the optimiser (0)", 0)
+    reconstruct.option("--frame-rate", "HZ", _rate, "raw frames per second (the file's, or 120)")
     _device_options(reconstruct)
-    _fresh_option(reconstruct)
+    reconstruct.flag("--fresh", FRESH)
 
-    render = _command("render", "write images of a reconstruction at any time")
+    render = Parser.of("render", "write images of a reconstruction at any time")
     render.add_argument("run_folder", metavar="RUN", help="folder of the reconstruction")
-    render.add_argument("--out", metavar="DIR", required=True, help="folder to write")
+    render.option("--out", "DIR", str, "folder to write", required=True)
     what = "any of distance,quads,phasor,colour (distance)"
-    render.add_argument(
-        "--what", metavar="A,B", type=_list_of(str), default=["distance"], help=what
+    render.option("--what", "A,B", _list_of(str), what, ["distance"])
+    render.option("--times", "S,S", _list_of(_number), "seconds since raw frame 0 (each frame)")
+    poses = "world-to-camera matrices in a .npy file, or the sequence's novel views"
+    render.option("--poses", "FILE|novel", str, f"{poses} (each frame's own pose)")
+    render.flag(
+        "--arrays", "one .npy file per channel with all images, many times as fast as pictures"
     )
-    render.add_argument(
-        "--times",
-        metavar="S,S",
-        type=_list_of(_number),
-        help="seconds since raw frame 0 (each frame)",
-    )
-    poses = (
-        "world-to-camera matrices in a .npy file, or the sequence's novel views (each "
-        "frame's own pose)"
-    )
-    render.add_argument("--poses", metavar="FILE|novel", help=poses)
-    arrays = "one .npy file per channel with all images, many times as fast as pictures"
-    render.add_argument("--arrays", action="store_true", help=arrays)
     _device_options(render)
-    _fresh_option(render)
+    render.flag("--fresh", FRESH)
 
-    compare = _command("compare", "score a reconstruction against the truth and write a report")
+    compare = Parser.of("compare", "score a reconstruction against the truth and write a report")
     compare.add_argument("run_folder", metavar="RUN", help="folder of the reconstruction")
-    compare.add_argument(
-        "--truth", metavar="SEQ", help="sequence with the true distance (the reconstructed one)"
-    )
-    conventions = (
-        "true distance: geometry, or static-phasor, the closed form without motion and "
-        "noise (geometry)"
-    )
-    compare.add_argument(
-        "--against", metavar="geometry|static-phasor", default="geometry", help=conventions
-    )
-    compare.add_argument(
-        "--json", action="store_true", help="print metrics.json instead of a table"
-    )
-    compare.add_argument(
-        "--frames", metavar="all|ftorf13", default="all", help="which raw frames are scored (all)"
-    )
+    compare.option("--truth", "SEQ", str, "sequence with the true distance (the reconstructed one)")
+    conventions = "geometry, or static-phasor, the closed form without motion and noise (geometry)"
+    against = f"true distance: {conventions}"
+    compare.option("--against", "geometry|static-phasor", str, against, "geometry")
+    compare.flag("--json", "print metrics.json instead of a table")
+    compare.option("--frames", "all|ftorf13", str, "which raw frames are scored (all)", "all")
     _device_options(compare)
 
-    check = _command(
-        "check", "read a sequence, list its contents and assumptions, warn about suspicious values"
-    )
+    contents = "read a sequence, list its contents and assumptions, warn about suspicious values"
+    check = Parser.of("check", contents)
     check.add_argument("sequence", metavar="SEQ", help="folder of the sequence")
 
-    doctor = _command("doctor", "print versions and devices, and test the renderer on this machine")
+    doctor = Parser.of(
+        "doctor", "print versions and devices, and test the renderer on this machine"
+    )
     _device_options(doctor)
 
-    bench = _command("bench", "measure times: tables and JSON")
+    bench = Parser.of("bench", "measure times: tables and JSON")
     parts = "renderer, motion, step, reconstruction, render (all of them)"
     bench.add_argument("parts", metavar="PART", nargs="*", help=parts)
-    bench.add_argument(
-        "--quick",
-        action="store_true",
-        help="small sizes and few runs, as a test of the benchmark itself",
-    )
-    bench.add_argument("--json", metavar="FILE", help="file of all results")
-    bench.add_argument(
-        "--sequence",
-        metavar="SEQ",
-        help="folder of a sequence (a simulated scene that slides past)",
+    bench.flag("--quick", "small sizes and few runs, as a test of the benchmark itself")
+    bench.option("--json", "FILE", str, "file of all results")
+    bench.option(
+        "--sequence", "SEQ", str, "folder of a sequence (a simulated scene that slides past)"
     )
     state = "run whose state step and render use (one initialised from measured phase)"
-    bench.add_argument("--run", metavar="RUN", help=state)
+    bench.option("--run", "RUN", str, state)
     lengths = "number of images of step, reconstruction and render (their defaults)"
-    bench.add_argument("--images", metavar="N", type=_positive, help=lengths)
-    bench.add_argument(
-        "--preset",
-        metavar="NAME",
-        help="of step and reconstruction (released; on a CPU demo for the latter)",
-    )
-    single = "change one setting of step and reconstruction, as in reconstruct (may be repeated)"
-    bench.add_argument("--set", metavar="NAME=VALUE", action="append", default=[], help=single)
+    bench.option("--images", "N", _positive, lengths)
+    settings = "of step and reconstruction (released; on a CPU demo for the latter)"
+    bench.option("--preset", "NAME", str, settings)
+    where = "of step and reconstruction, as in reconstruct"
+    bench.change("--set", f"change one setting {where} (may be repeated)")
     _device_options(bench)
 
     parsers = (demo, simulate, reconstruct, render, compare, check, doctor, bench)
     return {parser.prog.split()[-1]: parser for parser in parsers}
 
 
-def _command(name: str, what: str) -> Parser:
-    """A parser with the options of every command."""
-    parser = Parser(prog=f"gftorf {name}", description=what, allow_abbrev=False)
-    parser.set_defaults(command=name)
-    loudness = parser.add_mutually_exclusive_group()
-    loudness.add_argument(
-        "-q", "--quiet", action="store_true", help="only results, warnings and errors"
-    )
-    loudness.add_argument(
-        "-v", "--verbose", action="store_true", help="also what Warp compiles and loads"
-    )
-    parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
-    return parser
-
-
 def _device_options(parser: Parser) -> None:
     text = "auto (default), cpu, or cuda; cuda:1 is the second GPU"
-    parser.add_argument(
-        "--device", metavar="auto|cpu|cuda", type=_device, default="auto", help=text
-    )
-    _threads_option(parser)
+    parser.option("--device", "auto|cpu|cuda", _device, text, "auto")
+    parser.option("--threads", "N", _positive, THREADS)
 
 
-def _threads_option(parser: Parser) -> None:
-    parser.add_argument(
-        "--threads", metavar="N", type=_positive, help="CPU threads (as many as may be used)"
-    )
-
-
-def _seed_option(parser: Parser, text: str) -> None:
-    parser.add_argument("--seed", metavar="S", type=_whole, default=0, help=text)
-
-
-def _fresh_option(parser: Parser) -> None:
-    parser.add_argument(
-        "--fresh", action="store_true", help="start over in a folder that is not empty"
-    )
-
-
-def _frame_rate_option(parser: Parser) -> None:
-    parser.add_argument(
-        "--frame-rate", metavar="HZ", type=_rate, help="raw frames per second (the file's, or 120)"
-    )
+def _invalid(text: str, wanted: str) -> argparse.ArgumentTypeError:
+    return argparse.ArgumentTypeError(f"{text!r} is not {wanted}")
 
 
 def _device(text: str) -> str:
     if not re.fullmatch(r"auto|cpu|cuda(:\d+)?", text):
-        raise argparse.ArgumentTypeError(f"{text!r} is not auto, cpu, cuda or cuda:N")
+        raise _invalid(text, "auto, cpu, cuda or cuda:N")
     return text
 
 
 def _size(text: str) -> tuple[int, int]:
     match = re.fullmatch(r"([1-9]\d{0,3})x([1-9]\d{0,3})", text)
     if match is None:
-        raise argparse.ArgumentTypeError(
-            f"{text!r} is not a width and a height in pixels, such as 96x72"
-        )
+        raise _invalid(text, "a width and a height in pixels, such as 96x72")
     return int(match[1]), int(match[2])
 
 
-def _whole(text: str) -> int:
-    if not re.fullmatch(r"\d{1,18}", text):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number of at least 0")
+def _whole(text: str, least: int = 0) -> int:
+    if not re.fullmatch(r"\d{1,18}", text) or int(text) < least:
+        raise _invalid(text, f"a whole number of at least {least}")
     return int(text)
 
 
 def _positive(text: str) -> int:
-    if not re.fullmatch(r"\d{1,18}", text) or int(text) == 0:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number of at least 1")
-    return int(text)
+    return _whole(text, least=1)
 
 
 def _number(text: str) -> float:
     if not re.fullmatch(r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?", text.strip(), re.IGNORECASE):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number")
+        raise _invalid(text, "a number")
     return float(text)
 
 
 def _rate(text: str) -> float:
     if not _number(text) > 0:
-        raise argparse.ArgumentTypeError(f"{text!r} is not above 0")
+        raise _invalid(text, "above 0")
     return _number(text)
 
 

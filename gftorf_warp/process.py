@@ -11,9 +11,7 @@ from contextlib import contextmanager, suppress
 
 
 def open_cuda(device: str) -> None:
-    """Create the CUDA context that torch and Warp will share in a thread,
-    while they are imported.
-    """
+    """Create the CUDA context of torch and Warp in a thread, while they are imported."""
     if device == "cpu":
         return
     # as torch does before it initialises the driver
@@ -33,9 +31,7 @@ def open_cuda(device: str) -> None:
 
 
 def exit_at_once(codes: list[int]) -> None:
-    """End the process with the exit code of its command,
-    and without freeing modules and CUDA objects one by one.
-    """
+    """Exit with the code of the command, without freeing modules and CUDA objects one by one."""
     for stream in (sys.stdout, sys.stderr):
         with suppress(OSError, ValueError):
             stream.flush()
@@ -50,9 +46,7 @@ def available_cpus() -> int:
 
 @contextmanager
 def without_garbage_collection() -> Iterator[None]:
-    """Import without garbage collection, and exclude the 240,000 imported objects from later
-    collections.
-    """
+    """Import without garbage collection, and exclude the imported objects from later ones."""
     before = gc.isenabled()
     gc.disable()
     try:

@@ -22,20 +22,13 @@ NO_DRIVER = "Could not find or load the NVIDIA CUDA driver"
 
 
 class Progress:
-    """Progress of a loop: one line that is redrawn on a terminal, one plain line per ten seconds
-    elsewhere.
+    """Progress of a loop: a line redrawn on a terminal, a plain line per ten seconds elsewhere.
 
     Called as ``progress(done, total, name=value, ...)``; the values are printed.
     """
 
     def __init__(self, label: str, *, quiet: bool = False, unit: str | None = None):
-        """Start the clock.
-
-        Args:
-            label: Name of the loop.
-            quiet: Whether to print nothing.
-            unit: Name of the items, to print a rate; None: no rate.
-        """
+        """Start the clock; with the name of items, ``unit``, their rate is printed."""
         self.label, self.quiet, self.unit = label, quiet, unit
         self.live = sys.stderr.isatty()
         self.start = self.shown = time.monotonic()
@@ -56,12 +49,8 @@ class Progress:
             values = {f"{self.unit}/s": (done - self.first) / (now - self.start), **values}
         line = progress_line(self.label, done, total, self.first, now - self.start, values)
         if self.live:
-            print(
-                f"\r{line:<{self.width}}",
-                end="\n" if done >= total else "",
-                file=sys.stderr,
-                flush=True,
-            )
+            end = "\n" if done >= total else ""
+            print(f"\r{line:<{self.width}}", end=end, file=sys.stderr, flush=True)
             self.width = 0 if done >= total else len(line)
         else:
             print(line, file=sys.stderr, flush=True)
@@ -92,10 +81,10 @@ class WarpLog:
 
     def info(self, message: str) -> None:
         """Log compilations briefly and other messages in full, both for -v."""
-        if message.rstrip().endswith("(compiled)"):
+        text = message.strip()
+        if text.endswith("(compiled)"):
             LOG.debug(
-                "  compiled %s",
-                message.strip().removeprefix("Module ").removesuffix("(compiled)").strip(),
+                "  compiled %s", text.removeprefix("Module ").removesuffix("(compiled)").strip()
             )
         else:
             self.debug(message)
@@ -168,11 +157,8 @@ def as_known_error(error: BaseException) -> GftorfError | None:
     if isinstance(error, GftorfError):
         return error
     text = str(error)
-    if (
-        isinstance(error, MemoryError)
-        or type(error).__name__ == "OutOfMemoryError"
-        or "can't allocate memory" in text
-    ):
+    of_torch = type(error).__name__ == "OutOfMemoryError" or "can't allocate memory" in text
+    if of_torch or isinstance(error, MemoryError):
         return ResourceError(
             "out of memory",
             where=text.splitlines()[0][:120] if text else "this process",
@@ -185,21 +171,14 @@ def as_known_error(error: BaseException) -> GftorfError | None:
 
     where, why = error.filename or "a file", error.strerror or text
     if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
-        return ResourceError(
-            "no space left", where=where, why=why, fix="free disk space, or choose another --out"
-        )
-    return InputError(
-        "cannot read or write", where=where, why=why, fix="check the path and its permissions"
-    )
+        fix = "free disk space, or choose another --out"
+        return ResourceError("no space left", where=where, why=why, fix=fix)
+    fix = "check the path and its permissions"
+    return InputError("cannot read or write", where=where, why=why, fix=fix)
 
 
 def print_error(error: BaseException, *, debug: bool) -> int:
-    """Print an error to stderr, in three lines if a user can fix it, and return the exit code.
-
-    Args:
-        error: The exception that ended the command.
-        debug: Whether to print the traceback too.
-    """
+    """Print an error to stderr, in three lines if a user can fix it; returns the exit code."""
     if debug:
         traceback.print_exception(error)
     known = as_known_error(error)
@@ -217,12 +196,8 @@ def print_error(error: BaseException, *, debug: bool) -> int:
 
 class _Plain(logging.Formatter):
     def format(self, record: logging.LogRecord) -> str:
-        message = record.getMessage()
-        return (
-            f"{record.levelname.lower()}: {message}"
-            if record.levelno >= logging.WARNING
-            else message
-        )
+        mark = f"{record.levelname.lower()}: " if record.levelno >= logging.WARNING else ""
+        return mark + record.getMessage()
 
 
 @contextlib.contextmanager
@@ -239,6 +214,5 @@ def _native_stderr() -> Iterator[list[str]]:
             os.dup2(saved, 2)
             os.close(saved)
             sink.seek(0)
-            lines.extend(
-                line for line in sink.read().decode(errors="replace").splitlines() if line.strip()
-            )
+            written = sink.read().decode(errors="replace").splitlines()
+            lines.extend(line for line in written if line.strip())

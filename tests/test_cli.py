@@ -9,6 +9,7 @@ import json
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -538,3 +539,18 @@ def test_threads_restrict_the_process_while_it_runs(monkeypatch):
     assert cli.main(["doctor", "--threads", "1"]) == 0
     assert seen == [1]
     assert available() == before
+
+
+@pytest.mark.parametrize("words", [["--preset", "nosuch"], ["--set", "no.such=1"]])
+def test_wrong_settings_are_refused_before_compiling(words, tmp_path, monkeypatch, capsys):
+    """Compiling takes seconds, and nothing is written."""
+    compiled = []
+    monkeypatch.setattr("gftorf_warp.terminal.kernels_are_cached", lambda: False)
+    monkeypatch.setattr("gftorf_warp.doctor.compile_kernels", compiled.append)
+    sequence = Path(__file__).parent / "data" / "ftorf_sample_box"
+    out = tmp_path / "run"
+    command = ["reconstruct", str(sequence), "--out", str(out), "--device", "cpu"]
+    assert cli.main([*command, *words]) == 2
+    assert words[1].partition("=")[0] in capsys.readouterr().err
+    assert not compiled
+    assert not out.exists()

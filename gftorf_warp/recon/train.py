@@ -92,6 +92,32 @@ def reconstruct(
     begun = time.monotonic()
     if not isinstance(sequence, Sequence):
         sequence = read(sequence)
+    changes = list(changes)
+    settings = chosen_settings(sequence, settings, images, input, ablation, flow, changes)
+    out = Path(out)
+    config = config_of(sequence, settings, seed=seed, device=device)
+    config |= {"flow": None if flow is None else str(flow), "changes": changes}
+    with folder.locked(out):
+        goes_on = folder.prepare(out, config, fresh=fresh)
+        with log_to(out / "run.log"):
+            _run(sequence, out, settings, config, seed, device, goes_on, begun, progress)
+        return Run.open(out, device)
+
+
+def chosen_settings(
+    sequence: Sequence,
+    settings: ReconSettings | str,
+    images: int | None,
+    input: Input | str,
+    ablation: str | None,
+    flow: FlowSource | str | None,
+    changes: Iterable[str],
+) -> ReconSettings:
+    """The settings of a run from the arguments of :func:`reconstruct`.
+
+    Raises:
+        UsageError: If one of them is unknown or invalid.
+    """
     if isinstance(settings, str):
         found = input_of(sequence, _choice(Input, input, "--input"))
         recorded = presets.Recorded(input=found, unambiguous_range=unambiguous_range(sequence))
@@ -102,17 +128,7 @@ def reconstruct(
         settings = replace(settings, schedule=replace(settings.schedule, images=images))
     if flow is not None:
         settings = replace(settings, flow=_choice(FlowSource, flow, "--flow"))
-    changes = list(changes)
-    settings = changed(settings, changes, CHANGES)
-    settings = replace(settings, cycle=sequence.cycle)
-    out = Path(out)
-    config = config_of(sequence, settings, seed=seed, device=device)
-    config |= {"flow": None if flow is None else str(flow), "changes": changes}
-    with folder.locked(out):
-        goes_on = folder.prepare(out, config, fresh=fresh)
-        with log_to(out / "run.log"):
-            _run(sequence, out, settings, config, seed, device, goes_on, begun, progress)
-        return Run.open(out, device)
+    return replace(changed(settings, changes, CHANGES), cycle=sequence.cycle)
 
 
 def _choice(kind: type[Choice], name: str, option: str) -> Choice:
