@@ -262,9 +262,10 @@ def _bench(options: argparse.Namespace) -> int:
     device = start(options)
     from .bench.command import Wanted, bench
 
-    paths = {name: path and Path(path) for name, path in _named(options, "sequence", "run").items()}
+    sequence, run = (path and Path(path) for path in (options.sequence, options.run))
     given = _named(options, "quick", "images", "preset")
-    wanted = Wanted(device=device, changes=tuple(options.set), **paths, **given)
+    changes = tuple(options.set)
+    wanted = Wanted(device=device, changes=changes, sequence=sequence, run=run, **given)
     say = functools.partial(print, flush=True)
     bench(options.parts, wanted, json=options.json, progress=_progress(options), say=say)
     return 0

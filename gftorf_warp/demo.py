@@ -76,8 +76,9 @@ def demo(
         frequency = f"{sequence.calibration.f_mod_hz / 1e6:.2f} MHz"
         step.result = f"{len(sequence.complete_quartets)} complete quartets at {frequency}"
     with _Step("[3/4] reconstruct") as step:
-        where = {"device": device, "progress": report("reconstruct")}
-        run = reconstruct(sequence, out / "run", PRESET, images=images, seed=seed, **where)
+        shown = report("reconstruct")
+        given = sequence, out / "run", PRESET
+        run = reconstruct(*given, images=images, seed=seed, device=device, progress=shown)
         step.result = f"{run.gaussians} Gaussians -> {out / 'run'}"
     with _Step("[4/4] compare    ") as step:
         metrics = compare(run, progress=report("compare"))

@@ -46,11 +46,10 @@ class Parser(argparse.ArgumentParser):
         """Add an option without a value."""
         self.add_argument(name, action="store_true", help=text)
 
-    def change(self, name: str, text: str, dest: str | None = None) -> None:
-        """Add an option NAME=VALUE that may be repeated; its attribute is ``dest``."""
-        named = {} if dest is None else {"dest": dest}
+    def change(self, name: str, text: str, dest: str) -> None:
+        """Add an option NAME=VALUE that may be repeated."""
         self.add_argument(
-            name, **named, metavar="NAME=VALUE", action="append", default=[], help=text
+            name, dest=dest, metavar="NAME=VALUE", action="append", default=[], help=text
         )
 
     def error(self, message: str) -> NoReturn:
@@ -179,7 +178,7 @@ def command_parsers() -> dict[str, Parser]:
     rows = "apply a row of the ablation table: nobias, dd, h1, h1h2 or h1h2dd"
     reconstruct.option("--ablation", "ROW", str, rows)
     example = "for example init.reflectivity=0.5; config.json of a run names all"
-    reconstruct.change("--set", f"change one setting, {example} (may be repeated)")
+    reconstruct.change("--set", f"change one setting, {example} (may be repeated)", "set")
     reconstruct.option("--images", "N", _positive, "raw frames to optimise (the preset's own)")
     batch = "raw frames of a training step: 1, or 4 for a whole quartet (the preset's own)"
     reconstruct.option("--batch", "N", int, batch, choices=(1, 4))
@@ -242,7 +241,7 @@ def command_parsers() -> dict[str, Parser]:
     settings = "of step and reconstruction (released; on a CPU demo for the latter)"
     bench.option("--preset", "NAME", str, settings)
     where = "of step and reconstruction, as in reconstruct"
-    bench.change("--set", f"change one setting {where} (may be repeated)")
+    bench.change("--set", f"change one setting {where} (may be repeated)", "set")
     _device_options(bench)
 
     parsers = (demo, simulate, reconstruct, render, compare, check, doctor, bench)
