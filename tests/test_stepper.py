@@ -167,9 +167,13 @@ INPUTS = {
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("name", INPUTS)
 def test_steps_of_other_inputs_are_those_of_plain_torch(name, device):
-    """Every term of the loss is part of one of these or of the presets."""
-    state = compared(demo(images=60, **INPUTS[name]), device, images=((12, 0.01),), signs=0.02)
+    """Every term of the loss is part of one of these or of the presets.
+
+    The similarity of distances is a difference of close numbers in float32, which grows faster.
+    """
     weights = INPUTS[name].get("weights", demo().weights)
+    images, signs = (((4, 0.05),), 0.02) if weights.depth else (((12, 0.01),), 0.0)
+    state = compared(demo(images=60, **INPUTS[name]), device, images=images, signs=signs)
     assert {
         term
         for term in ("flow", "depth", "distortion", "motion_size")
