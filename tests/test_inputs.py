@@ -14,7 +14,7 @@ from small_runs import FLOW, OneStep, advance, demo, same, stored
 from gftorf_warp.constants import SH_COEFFICIENTS
 from gftorf_warp.data.sequence import Flow
 from gftorf_warp.errors import InputError, UsageError
-from gftorf_warp.recon import presets, step
+from gftorf_warp.recon import presets, renderings
 from gftorf_warp.recon.observations import ImageStack, input_of, observe
 from gftorf_warp.recon.settings import Input, Norm, Weights
 from gftorf_warp.recon.state import begin
@@ -109,7 +109,7 @@ def test_colour_of_weight_zero_is_never_rendered(monkeypatch):
         asked.append(images if field.colour_sh is not None else {"opacity"})
         return rasterize(field, *arguments, images=images, **more)
 
-    monkeypatch.setattr(step, "rasterize", noted)
+    monkeypatch.setattr(renderings, "rasterize", noted)
     for weight, colours in ((0.0, 0), (1.0, 1)):
         settings = demo(weights=Weights(colour=weight), images=8)
         observations = observe(sequence, settings, "cpu")

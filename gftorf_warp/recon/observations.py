@@ -102,16 +102,13 @@ class Observations:
         return replace(alone, f_mod_hz=frequency, further_hz=())
 
     def time_at(self, frame: int) -> float:
-        """When raw frame ``frame`` was taken [s]; if phasors are compared,
-        the mean time of those that made its own.
-        """
-        if self.phasors:
-            frames = self.sequence.quartet_frames(frame // self.sequence.cycle)
-            frequencies = self.sequence.frame_frequencies
-            return float(
-                self.sequence.times[frames][frequencies[frames] == frequencies[frame]].mean()
-            )
-        return float(self.sequence.times[frame])
+        """Time of a raw frame [s], or the mean time of the frames of its phasor."""
+        times = self.sequence.times
+        if not self.phasors:
+            return float(times[frame])
+        frames = self.sequence.quartet_frames(frame // self.sequence.cycle)
+        frequencies = self.sequence.frame_frequencies
+        return float(times[frames][frequencies[frames] == frequencies[frame]].mean())
 
 
 def input_of(sequence: Sequence, wanted: Input) -> Input:
@@ -127,42 +124,30 @@ def observe(
     """Prepare a sequence.
 
     Raises:
-        InputError: If no raw frame was measured, all quads are zero, what is to be compared does
-            not exist, or the
-            sensor is one that cannot be rendered: frequencies without a common range.
+        InputError: If no raw frame was measured, all quads are zero, nothing is to be compared, or
+            the modulation frequencies have no common range.
     """
     if not sequence.measured.any() or not np.abs(sequence.quads[sequence.measured]).max() > 0:
-        raise InputError(
-            "nothing was measured",
-            where=sequence.path or "sequence",
-            why="no raw frame exists, or all of them are zero",
-            fix="check the folder with `gftorf check`",
-        )
+        why = "no raw frame exists, or all of them are zero"
+        raise _nothing_to_compare(sequence, "nothing was measured", why)
     if settings.quad_scale is None:
         scale, scale_source = quad_scale(sequence)
     else:
         scale, scale_source = settings.quad_scale, "setting"
     prepared = reduced(sequence, settings.width_max)
-    prepared, flow_source = with_flow(
-        prepared, settings.flow if reads_flow(settings) else FlowSource.NONE
-    )
+    source = settings.flow if reads_flow(settings) else FlowSource.NONE
+    prepared, flow_source = with_flow(prepared, source)
     prepared = replace(prepared, quads=(prepared.quads * np.float32(scale)).astype(np.float32))
 
     phasors: dict[int, np.ndarray] = {}
     if input_of(sequence, settings.input) == Input.PHASOR and settings.weights.quads > 0:
-        decoded = [
-            item for i in prepared.complete_quartets for item in quartet_phasors(prepared, i)
-        ]
-        phasors = {frames[0]: phasor for frames, phasor in decoded}
+        for quartet in prepared.complete_quartets:
+            phasors |= {frames[0]: phasor for frames, phasor in quartet_phasors(prepared, quartet)}
         if not phasors:
-            raise _nothing_to_compare(
-                sequence, "no complete quartet", "a phasor needs all raw frames of one quartet"
-            )
-    closed_form = {}
-    if settings.weights.depth > 0:
-        closed_form = {
-            i: closed_form_distance(prepared, i)[None] for i in prepared.complete_quartets
-        }
+            why = "a phasor needs all raw frames of one quartet"
+            raise _nothing_to_compare(sequence, "no complete quartet", why)
+    decoded = prepared.complete_quartets if settings.weights.depth > 0 else []
+    closed_form = {i: closed_form_distance(prepared, i)[None] for i in decoded}
     colour, colour_scale = _colour(prepared, settings)
     return Observations(
         sequence=prepared,
@@ -185,33 +170,25 @@ def observe(
 
 
 def _flow_by_quartet(sequence: Sequence) -> dict[int, np.ndarray]:
-    """[2, 2, H, W] forward and backward flow [px] of each quartet with any,
-    NaN where there is none.
-    """
+    """[2, 2, H, W] forward and backward flow [px] of quartets with any; NaN: unknown."""
     result: dict[int, np.ndarray] = {}
     for direction, flows in enumerate((sequence.flow.forward, sequence.flow.backward)):
         for frame, flow in flows.items():
             shape = (2, 2, sequence.height, sequence.width)
-            pair = result.setdefault(
-                frame // sequence.cycle, np.full(shape, np.nan, dtype=np.float32)
-            )
-            pair[direction] = flow
+            quartet = frame // sequence.cycle
+            result.setdefault(quartet, np.full(shape, np.nan, np.float32))[direction] = flow
     return result
 
 
 def reads_flow(settings: ReconSettings) -> bool:
-    """Whether a reconstruction looks at optical flow at all: for its loss,
-    or to start from phase.
-    """
+    """Whether a reconstruction reads optical flow, for its loss or to start from phase."""
     return settings.weights.flow > 0 or settings.init.kind == Init.PHASE
 
 
 def _batches(
     sequence: Sequence, settings: ReconSettings, phasors: list[int], colour: list[int]
 ) -> list[list[int]]:
-    """The raw frames of every possible step: a phasor, or an image where only colour counts,
-    is a step of its own.
-    """
+    """The raw frames of every possible step; phasors and colour images are single."""
     if phasors:
         return [[n] for n in phasors]
     if settings.weights.quads == 0:
@@ -233,29 +210,24 @@ def _colour(
         # colour is an addition: a recording without it is compared without it
         if settings.weights.quads > 0:
             return {}, None
-        raise _nothing_to_compare(
-            sequence, "no colour", "this preset compares colour images and nothing else"
-        )
-    largest = max(float(np.abs(image).max()) for image in sequence.colour.images.values())
+        why = "this preset compares colour images and nothing else"
+        raise _nothing_to_compare(sequence, "no colour", why)
+    images = sequence.colour.images
+    largest = max(float(np.abs(image).max()) for image in images.values())
     if not largest > 0:
         raise _nothing_to_compare(sequence, "colour is black", "all colour images are zero")
-    return {
-        n: image / np.float32(largest) for n, image in sequence.colour.images.items()
-    }, 1.0 / largest
+    return {n: image / np.float32(largest) for n, image in images.items()}, 1.0 / largest
 
 
 def _nothing_to_compare(sequence: Sequence, what: str, why: str) -> InputError:
-    return InputError(
-        what, where=sequence.path or "sequence", why=why, fix="check the folder with `gftorf check`"
-    )
+    fix = "check the folder with `gftorf check`"
+    return InputError(what, where=sequence.path or "sequence", why=why, fix=fix)
 
 
 def reduced(sequence: Sequence, width_max: int | None) -> Sequence:
-    """The sequence with images of at most ``width_max`` columns, every new pixel the mean of what
-    it covers.
+    """The sequence with images of at most ``width_max`` columns, by area averaging.
 
-    Sides shrink to whole numbers of pixels, intrinsics and flow with them. Smaller images stay as
-    they are, and so do colour images, which another camera took.
+    Intrinsics and flow are scaled alike; colour images stay, since they are of another camera.
     """
     if width_max is None or sequence.width <= width_max:
         return sequence
@@ -266,24 +238,18 @@ def reduced(sequence: Sequence, width_max: int | None) -> Sequence:
     sx, sy = width / sequence.width, height / sequence.height
 
     def shrink(image: np.ndarray) -> np.ndarray:
-        return cv2.resize(
-            np.ascontiguousarray(image, dtype=np.float32),
-            (width, height),
-            interpolation=cv2.INTER_AREA,
-        )
+        image = np.ascontiguousarray(image, dtype=np.float32)
+        return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
 
     def shrink_flow(flows: dict[int, np.ndarray]) -> dict[int, np.ndarray]:
-        return {
-            n: np.stack([shrink(flow[0]) * sx, shrink(flow[1]) * sy]) for n, flow in flows.items()
-        }
+        return {n: np.stack([shrink(x) * sx, shrink(y) * sy]) for n, (x, y) in flows.items()}
 
+    flow = sequence.flow
     return replace(
         sequence,
         quads=np.stack([shrink(quad) for quad in sequence.quads]),
         intrinsics=sequence.intrinsics.scaled(sx, sy),
-        flow=Flow(
-            forward=shrink_flow(sequence.flow.forward), backward=shrink_flow(sequence.flow.backward)
-        ),
+        flow=Flow(forward=shrink_flow(flow.forward), backward=shrink_flow(flow.backward)),
     )
 
 
@@ -301,9 +267,7 @@ def with_flow(sequence: Sequence, source: FlowSource) -> tuple[Sequence, str]:
 
 
 def data_hash(sequence: Sequence) -> str:
-    """SHA-256 of everything a reconstruction reads from a sequence: frames, calibration, poses,
-    flow and colour.
-    """
+    """SHA-256 of everything that a reconstruction reads from a sequence."""
     digest = hashlib.sha256()
     arrays = {name: getattr(sequence, name) for name in HASHED}
     for name, array in (arrays | {"colour_from_world": sequence.colour.camera_from_world}).items():
@@ -311,15 +275,8 @@ def data_hash(sequence: Sequence) -> str:
             digest.update(f"{name} {array.shape}".encode())
             digest.update(np.ascontiguousarray(array).tobytes())
     stated, tof, colour = sequence.calibration, sequence.intrinsics, sequence.colour.intrinsics
-    numbers: list = [
-        stated.f_mod_hz,
-        stated.phase_offset,
-        stated.dc_offset,
-        tof.fx,
-        tof.fy,
-        tof.cx,
-        tof.cy,
-    ]
+    numbers: list = [stated.f_mod_hz, stated.phase_offset, stated.dc_offset]
+    numbers += [tof.fx, tof.fy, tof.cx, tof.cy]
     numbers += [stated.quad_scale, colour and (colour.fx, colour.fy, colour.cx, colour.cy)]
     digest.update(repr(numbers).encode())
     if tof.distortion is not None:

@@ -301,52 +301,36 @@ def ablated(settings: ReconSettings, row: str) -> ReconSettings:
     )
 
 
+SCHEDULE = (
+    "warm_up motion_decay_from motion_ramp pause_after_reset colour_from flow_from sh_degree_every"
+)
+DENSIFY = "every start scale_from unseen_from reset_every"
+
+
 def shortened(settings: ReconSettings, images: int) -> ReconSettings:
-    """The same course in fewer images: every interval that is counted in images shrinks with the
-    run.
+    """The same course in fewer images: every interval that is counted in images shrinks alike.
 
-    Rates stay as they are, so that a run a tenth as long also moves a tenth as far: raise them
-    where that matters.
+    Learning rates stay, so a run a tenth as long also moves a tenth as far.
     """
-    share = images / settings.schedule.images
-    schedule, densify = settings.schedule, settings.densify
+    share, faster = images / settings.schedule.images, settings.densify.reset_faster
 
-    def shorter(interval: int) -> int:
-        return max(round(share * interval), 1) if interval else 0
+    def shorter(interval: int | None) -> int | None:
+        return max(round(share * interval), 1) if interval else interval
 
-    def if_any(interval: int | None) -> int | None:
-        return None if interval is None else shorter(interval)
+    def changed(group, names: str, **others):
+        values = {name: shorter(getattr(group, name)) for name in names.split()}
+        return replace(group, **values, **others)
 
-    faster = densify.reset_faster
+    resets = None if faster is None else tuple(map(shorter, faster))
     return replace(
         settings,
-        schedule=replace(
-            schedule,
-            images=images,
-            warm_up=shorter(schedule.warm_up),
-            motion_decay_from=shorter(schedule.motion_decay_from),
-            motion_ramp=shorter(schedule.motion_ramp),
-            pause_after_reset=shorter(schedule.pause_after_reset),
-            colour_from=shorter(schedule.colour_from),
-            flow_from=shorter(schedule.flow_from),
-            sh_degree_every=if_any(schedule.sh_degree_every),
-        ),
-        densify=replace(
-            densify,
-            every=if_any(densify.every),
-            start=shorter(densify.start),
-            scale_from=shorter(densify.scale_from),
-            unseen_from=None if densify.unseen_from is None else shorter(densify.unseen_from),
-            reset_every=if_any(densify.reset_every),
-            reset_faster=None if faster is None else (shorter(faster[0]), shorter(faster[1])),
-        ),
+        schedule=changed(settings.schedule, SCHEDULE, images=images),
+        densify=changed(settings.densify, DENSIFY, reset_faster=resets),
     )
 
 
 def _unknown(kind: str, name: str, known: list[str]) -> UsageError:
+    why, option = f"available: {', '.join(known)}", f"--{kind}"
     return UsageError(
-        f"unknown {kind} {name}",
-        where=f"--{kind}",
-        why=f"available: {', '.join(known)}",
-        fix=f"use --{kind} {known[0]}",
+        f"unknown {kind} {name}", where=option, why=why, fix=f"use {option} {known[0]}"
     )

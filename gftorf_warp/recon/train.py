@@ -55,36 +55,30 @@ def reconstruct(
 ) -> Run:
     """Fit moving Gaussians to the raw quads of a sequence.
 
-    Reads quads, calibration, poses, flow and colour. Truth, where a sequence has it, is read only
-    to be written beside the run, in diagnostics.jsonl: it changes nothing. A folder that holds the
-    same run goes on where it stopped, to the same bytes on a CPU as if it had never stopped; Ctrl-C
-    and SIGTERM finish the step and store it.
+    Reads quads, calibration, poses, flow and colour; ground truth for diagnostics.jsonl only.
+    A folder that holds the same run is resumed, on a CPU to the same bytes as an uninterrupted run;
+    Ctrl-C and SIGTERM finish the step and store it.
 
     Args:
         sequence: What was recorded, or its folder.
         out: Folder of the run: config.json, metrics.jsonl, diagnostics.jsonl, run.log, ckpt/.
         settings: How, or the name of a preset.
         images: Raw frames to optimise, each as often as its turn comes; None: as the settings say.
-        input: What is compared with the sensor: auto, quads or phasor; counts where ``settings`` is
-            a name.
+        input: What is compared: auto, quads or phasor; used where ``settings`` is a name.
         ablation: Row of the ablation table to apply: nobias, dd, h1, h1h2 or h1h2dd; None: none.
-        flow: Where optical flow comes from: auto, file, dis, deepflow or none; None: as the
-            settings say.
-        changes: Single settings to change, as texts like ``init.reflectivity=0.5``, after
-            everything else.
+        flow: Source of optical flow: auto, file, dis, deepflow or none; None: as the settings say.
+        changes: Single settings like ``init.reflectivity=0.5``, applied last.
         seed: Of everything random.
         device: Where to compute, 'cpu' or a CUDA device.
         fresh: Whether to move what ``out`` holds aside, to ``out/old-<k>``, and start over.
-        progress: Called as ``progress(images, images_in_all, loss=, psnr_db=, gaussians=)`` now and
-            then.
+        progress: Called as ``progress(images, images_in_all, loss=, psnr_db=, gaussians=)``.
 
     Returns:
         The finished run.
 
     Raises:
         InputError: If the sequence cannot be read or cannot start a reconstruction.
-        UsageError: If ``out`` holds something else or other settings, or a preset or source of flow
-            is unknown.
+        UsageError: If ``out`` holds something else or other settings, or a name is unknown.
         BusyError: If another process works on ``out``.
         DivergedError: If loss or gradient stay infinite; the last good checkpoint is kept.
         KeyboardInterrupt: After a signal, when everything is stored.
@@ -132,31 +126,25 @@ def chosen_settings(
 
 
 def _choice(kind: type[Choice], name: str, option: str) -> Choice:
-    """The member of an enumeration that a user named.
-
-    Raises:
-        UsageError: If there is none.
-    """
+    """The member of an enumeration that a user named, or a UsageError."""
     known = [str(member) for member in kind]
     if name not in known:
-        what = option.lstrip("-")
-        why = f"there are {', '.join(known)}"
-        raise UsageError(
-            f"unknown {what} {name}", where=option, why=why, fix=f"use {option} {known[0]}"
-        )
+        what, why = option.lstrip("-"), f"there are {', '.join(known)}"
+        fix = f"use {option} {known[0]}"
+        raise UsageError(f"unknown {what} {name}", where=option, why=why, fix=fix)
     return kind(name)
 
 
 def _run(sequence, out, settings, config, seed, device, goes_on, begun, progress) -> None:
+    config |= {
+        "quad_scale": 1.0,
+        "quad_scale_source": "nothing is scaled",
+        "flow_source": "none",
+        "size_optimised": [sequence.width, sequence.height],
+        "input": str(input_of(sequence, settings.input)),
+    }
     if settings.method == Method.CTOF:
-        scale = {"quad_scale": 1.0, "quad_scale_source": "nothing is scaled", "flow_source": "none"}
-        size = {
-            "size_optimised": [sequence.width, sequence.height],
-            "input": str(input_of(sequence, settings.input)),
-        }
-        folder.write_config(
-            out, config | scale | size | {"seconds_reconstruct": 0.0, "images_optimised": 0}
-        )
+        folder.write_config(out, config | {"seconds_reconstruct": 0.0, "images_optimised": 0})
         LOG.info("%s is finished: the closed form needs no image", out)
         return
     stored = checkpoint.last(out, device) if goes_on else None
@@ -165,14 +153,11 @@ def _run(sequence, out, settings, config, seed, device, goes_on, begun, progress
         LOG.info("%s is finished: %d images", out, stored["images"])
         return
     observations = observe(sequence, settings, device)
-    _warn_of_constant_part(sequence)
-    _warn_of_rows(sequence)
-    state = (
-        from_dict(stored, device)
-        if stored is not None
-        else begin(observations, settings, seed=seed, device=device)
-    )
-    earlier = state.seconds
+    _warn(sequence)
+    if stored is None:
+        state = begin(observations, settings, seed=seed, device=device)
+    else:
+        state = from_dict(stored, device)
     config |= {
         "quad_scale": observations.quad_scale,
         "quad_scale_source": observations.quad_scale_source,
@@ -186,87 +171,47 @@ def _run(sequence, out, settings, config, seed, device, goes_on, begun, progress
     diagnostics = Diagnostics(observations, _truth(sequence), out / "diagnostics.jsonl")
     for rows in (metrics, diagnostics):
         rows.rewind(state.images)
-    verb = "goes on at" if stored is not None else "starts at"
-    moving = int((state.optimiser.layer > 0).sum()) if state.optimiser.layer is not None else 0
-    count = len(state.optimiser.field)
-    LOG.info(
-        "%s %s image %d of %d, %d Gaussians, %d of them moving",
-        out,
-        verb,
-        state.images,
-        total,
-        count,
-        moving,
-    )
-    if total <= settings.schedule.warm_up:
-        LOG.warning(
-            "nothing will move: the warm-up takes %d images, the run %d",
-            settings.schedule.warm_up,
-            total,
-        )
+    verb = "starts at" if stored is None else "goes on at"
+    layer = state.optimiser.layer
+    moving = 0 if layer is None else int((layer > 0).sum())
+    text = "%s %s image %d of %d, %d Gaussians, %d of them moving"
+    LOG.info(text, out, verb, state.images, total, len(state.optimiser.field), moving)
+    if total <= (warm_up := settings.schedule.warm_up):
+        text = "nothing will move: the warm-up takes %d images, the run %d"
+        LOG.warning(text, warm_up, total)
+    earlier = state.seconds
 
     def clock() -> float:
         return earlier + time.monotonic() - begun
 
-    on_cpu = (
-        replace(settings.render, threads=1)
-        if torch.device(device).type == "cpu"
-        else settings.render
-    )
-    state = TrainingLoop(
-        observations,
-        replace(settings, render=on_cpu),
-        seed,
-        out,
-        metrics,
-        diagnostics,
-        clock,
-        progress,
-    ).run(state)
-    folder.write_config(
-        out,
-        config
-        | {
-            "seconds_reconstruct": state.seconds,
-            "images_optimised": state.images,
-            "skipped": state.skipped,
-            "restarts": state.restarts,
-            "revivals": state.revivals,
-        },
-    )
+    if torch.device(device).type == "cpu":  # a thread per image: no result depends on their number
+        settings = replace(settings, render=replace(settings.render, threads=1))
+    records = metrics, diagnostics, clock, progress
+    state = TrainingLoop(observations, settings, seed, out, *records).run(state)
+    config |= {"seconds_reconstruct": state.seconds, "images_optimised": state.images}
+    config |= {name: getattr(state, name) for name in ("skipped", "restarts", "revivals")}
+    folder.write_config(out, config)
     LOG.info("%s is finished: %d images, %.1f s", out, state.images, state.seconds)
 
 
-def _warn_of_constant_part(sequence: Sequence) -> None:
-    """Quads that hold more or less constant light than calibration says cannot be fitted (method,
-    mistake 17).
-    """
-    if sequence.from_phasors or not sequence.complete_quartets:
-        return
-    found = dc_offset(sequence)
-    if abs(found - sequence.calibration.dc_offset) > DC_TOLERANCE:
-        text = (
-            "the quads hold a constant part of %.2f amplitudes, the calibration says %.2f: "
-            "see `gftorf check`"
-        )
-        LOG.warning(text, found, sequence.calibration.dc_offset)
-
-
-def _warn_of_rows(sequence: Sequence) -> None:
-    """A rolling shutter is fitted as a global one."""
-    delay = float(sequence.calibration.settings.get("row_time_s", 0.0) or 0.0)
+def _warn(sequence: Sequence) -> None:
+    """Log what cannot be fitted: a wrong DC offset (method, mistake 17), a rolling shutter."""
+    stated = sequence.calibration
+    if sequence.complete_quartets and not sequence.from_phasors:
+        measured = dc_offset(sequence)
+        if abs(measured - stated.dc_offset) > DC_TOLERANCE:
+            text = (
+                "the quads have a constant part of %.2f, the calibration %.2f: see `gftorf check`"
+            )
+            LOG.warning(text, measured, stated.dc_offset)
+    delay = float(stated.settings.get("row_time_s", 0.0) or 0.0)
     if delay > 0:
-        text = (
-            "a rolling shutter: the last row is %.3g ms later than the first, and fitted to "
-            "its time all the same"
-        )
+        text = "a rolling shutter: the last row is %.3g ms later than the first, which is ignored"
         LOG.warning(text, 1e3 * delay * (sequence.height - 1))
 
 
 def _truth(sequence: Sequence) -> Truth | None:
-    """Ground truth for the diagnostics; None if there is none, or none that can be read,
-    which stops no run.
-    """
+    """Ground truth for the diagnostics; None if there is none that can be read."""
     try:
         return read_truth(sequence)
     except InputError as error:
