@@ -51,21 +51,15 @@ def displaced(
         raise ValueError(
             f"weights {tuple(weights.shape)} must be (1 + D, {len(offset)}) for {len(offset)} keys"
         )
-    wrong = [
-        t.dtype
-        for t in (mean, quaternion, offset, rotation, weights)
-        if t is not None and t.dtype != mean.dtype
-    ]
+    tensors = (mean, quaternion, offset, rotation, weights)
+    wrong = [t.dtype for t in tensors if t is not None and t.dtype != mean.dtype]
     if wrong or mean.dtype != torch.float32:
         raise ValueError(
             f"mean, quaternion, motion and weights must be float32, got {mean.dtype} and {wrong}"
         )
-    rotating = (
-        (None, None) if rotation is None else (quaternion.contiguous(), rotation.contiguous())
-    )
-    moved, turned, ways = _Displaced.apply(
-        mean.contiguous(), offset.contiguous(), *rotating, weights, channels
-    )
+    turning = None if rotation is None else quaternion
+    given = [t if t is None else t.contiguous() for t in (mean, offset, turning, rotation)]
+    moved, turned, ways = _Displaced.apply(*given, weights, channels)
     return moved, quaternion if turned is None else turned, ways
 
 
@@ -86,13 +80,8 @@ class _Displaced(torch.autograd.Function):
         moved = torch.empty_like(mean)
         turned = None if quaternion is None else torch.empty_like(quaternion)
         ways = mean.new_empty(len(mean), 3 * (len(weights) - 1)) if channels else None
-        values = _vectors(mean, quaternion, offset, rotation)
-        _launch(
-            "displace",
-            offset,
-            [*values, array_over(weights)],
-            [*_vectors(moved, turned), _triples(ways)],
-        )
+        inputs = [*_vectors(mean, quaternion, offset, rotation), array_over(weights)]
+        _launch("displace", offset, inputs, [*_vectors(moved, turned), _triples(ways)])
         ctx.save_for_backward(offset, quaternion, rotation, weights)
         return moved, turned, ways
 
@@ -104,29 +93,21 @@ class _Displaced(torch.autograd.Function):
         offset, quaternion, rotation, weights = ctx.saved_tensors
         _, of_offset, of_quaternion, of_rotation, *_ = ctx.needs_input_grad
         of_offset = of_offset and not (by_moved is None and by_ways is None)
-        of_quaternion, of_rotation = (
-            needed and by_turned is not None for needed in (of_quaternion, of_rotation)
-        )
-        grad_offset = torch.empty_like(offset) if of_offset else None
-        grad_rotation = torch.empty_like(rotation) if of_rotation else None
-        grad_quaternion = torch.empty_like(quaternion) if of_quaternion else None
-        if of_offset or of_rotation or of_quaternion:
-            given = [
+        turned = by_turned is not None
+        wanted = of_offset, of_rotation and turned, of_quaternion and turned
+        grads = [
+            torch.empty_like(tensor) if needed else None
+            for tensor, needed in zip((offset, rotation, quaternion), wanted, strict=True)
+        ]
+        if any(wanted):
+            moved, turns, ways = (
                 None if cotangent is None else cotangent.contiguous()
                 for cotangent in (by_moved, by_turned, by_ways)
-            ]
-            inputs = [
-                *_vectors(quaternion, rotation),
-                array_over(weights),
-                *_vectors(*given[:2]),
-                _triples(given[2]),
-            ]
-            _launch(
-                "displace_backward",
-                offset,
-                inputs,
-                _vectors(grad_offset, grad_rotation, grad_quaternion),
             )
+            inputs = [*_vectors(quaternion, rotation), array_over(weights)]
+            inputs += [*_vectors(moved, turns), _triples(ways)]
+            _launch("displace_backward", offset, inputs, _vectors(*grads))
+        grad_offset, grad_rotation, grad_quaternion = grads
         return by_moved, grad_offset, grad_quaternion, grad_rotation, None, None
 
 

@@ -43,12 +43,8 @@ def view_of(camera: Camera, settings: RenderSettings) -> CameraView:
     view.translation = wp.vec3(*pose[:3, 3])
     view.centre = wp.vec3(*camera.centre)
     view.fx, view.fy, view.cx, view.cy = camera.fx, camera.fy, camera.cx, camera.cy
-    view.width, view.height, view.near, view.far = (
-        camera.width,
-        camera.height,
-        settings.near,
-        settings.far,
-    )
+    view.width, view.height = camera.width, camera.height
+    view.near, view.far = settings.near, settings.far
     if camera.distortion:
         view.guard_x, view.guard_y, view.radius = camera.guard
         view.k1, view.k2, view.p1, view.p2, view.k3 = astuple(camera.distortion)
@@ -72,12 +68,10 @@ def uploaded(
 @lru_cache(maxsize=UPLOADED_MAX)
 def _uploaded(bits: bytes, shifts: tuple[float, ...], lens: bool, device: str) -> View:
     camera = np.frombuffer(bits, dtype=VIEW_DTYPE)
-    vectors = np.array(
-        [(math.cos(shift), math.sin(shift)) for shift in shifts], dtype=np.float32
-    ).reshape(-1, 2)
+    vectors = np.array([(math.cos(shift), math.sin(shift)) for shift in shifts], np.float32)
     return View(
         camera=wp.array(camera, dtype=CameraView, device=device),
-        shifts=wp.array(vectors, dtype=wp.vec2, device=device),
+        shifts=wp.array(vectors.reshape(-1, 2), dtype=wp.vec2, device=device),
         lens=lens,
     )
 
@@ -87,9 +81,8 @@ def render(inputs: Inputs, view: View, buffers: Buffers, images: Images) -> None
     forward(inputs, view, buffers, images)
     tape = wp._src.context.runtime.tape  # the public API has no name for the active tape
     if tape is not None:
-        arrays = [
-            a for group in (inputs, images) for a in present_in(group).values() if a.requires_grad
-        ]
+        both = [*present_in(inputs).values(), *present_in(images).values()]
+        arrays = [array for array in both if array.requires_grad]
 
         def adjoint():
             cotangents = Images(**dict.fromkeys(names_of(Images)) | gradients_in(images))
@@ -100,12 +93,7 @@ def render(inputs: Inputs, view: View, buffers: Buffers, images: Images) -> None
 
 
 def forward(
-    inputs: Inputs,
-    view: View,
-    buffers: Buffers,
-    images: Images,
-    *,
-    differentiable: bool = True,
+    inputs: Inputs, view: View, buffers: Buffers, images: Images, *, differentiable: bool = True
 ) -> None:
     """Project, sort, composite, resolve; images that are None are not computed."""
     buffers.turns += 1
@@ -142,15 +130,13 @@ def backward(
     *,
     extra_detached: bool = False,
 ) -> wp.array:
-    """Add the gradients for ``cotangents`` to the arrays of ``wanted``; forward's results in the
-    buffers stay.
+    """Add the gradients for ``cotangents`` to the arrays of ``wanted``.
 
-    With ``extra_detached`` weights are held fixed under the extra images, so that only the extra
-    channels learn.
+    With ``extra_detached`` weights are held fixed under the extra images.
 
     Returns:
-        [N] gradient records of the splats: slots 0 and 1 are the screen gradient, 6 the number of
-        pixels, 7 the weight. They belong to the buffers.
+        [N] gradient records of the splats, which belong to the buffers: slots 0 and 1 are the
+        screen gradient, 6 the number of pixels, 7 the weight.
     """
     groups = channel_groups(inputs)
     grad_light, grad_channels = stages.fold_images(
@@ -159,17 +145,14 @@ def backward(
     grad_splats = buffers.zeros("gradient records", buffers.count, splat.Splat)
     if not buffers.count:
         return grad_splats
-    distortion, fixed = (
-        cotangents.distortion is not None,
-        [name == "extra" and extra_detached for name, _ in groups],
-    )
-    first: dict[str, Any] = {"distortion": distortion, "fixed": bool(groups) and fixed[0]}
+    fixed = [name == "extra" and extra_detached for name, _ in groups]
+    first: dict[str, Any] = {"distortion": cotangents.distortion is not None}
+    first["fixed"] = bool(groups) and fixed[0]
     together = buffers.groups_with_light > 1 and fixed[1] and grad_channels[1] is not None
     if together:
+        label = "gradient records of the second group"
         first["grad_more"] = grad_channels[1]
-        first["more_records"] = buffers.zeros(
-            "gradient records of the second group", buffers.count, splat.Splat
-        )
+        first["more_records"] = buffers.zeros(label, buffers.count, splat.Splat)
     stages.composite_backward(buffers, 0, grad_light, grad_channels[0], grad_splats, **first)
     for number, (name, start) in enumerate(groups):
         if grad_channels[number] is None:
@@ -178,9 +161,8 @@ def backward(
         if number == 1 and together:
             records = first["more_records"]
         elif number > 0:  # a further pass shares centres, conics and opacities with the first
-            records = buffers.zeros(
-                "gradient records of a further pass", buffers.count, splat.Splat
-            )
+            label = "gradient records of a further pass"
+            records = buffers.zeros(label, buffers.count, splat.Splat)
             stages.composite_backward(
                 buffers, number, grad_light, grad_channels[number], records, fixed=fixed[number]
             )

@@ -32,10 +32,8 @@ _PROJECTED = ("mean", "log_scale", "quaternion", "opacity_logit", "reflectivity_
 
 def project(inputs: Inputs, view: View, buffers: Buffers) -> None:
     """Gaussians to splats, depth keys and image regions."""
-    kernel = _project_kernel(inputs, view, buffers)
-    _launch(
-        kernel, buffers.count, _project_inputs(inputs, view, buffers), _project_outputs(buffers)
-    )
+    given, outputs = _project_inputs(inputs, view, buffers), _project_outputs(buffers)
+    _launch(_project_kernel(inputs, view, buffers), buffers.count, given, outputs)
 
 
 def project_backward(
@@ -63,9 +61,8 @@ def _project_kernel(inputs: Inputs, view: View, buffers: Buffers):
 def _project_inputs(inputs: Inputs, view: View, buffers: Buffers) -> list:
     colour_sh = inputs.colour_sh if inputs.colour_sh is not None else _nothing(buffers, 2, wp.vec3)
     arrays = [getattr(inputs, name) for name in _PROJECTED[:-1]]
-    settings = buffers.settings
-    keys = [buffers.depth_shift, settings.depth_culled]
-    return [view.camera, inputs.calibration, settings.sh_degree, *keys, *arrays, colour_sh]
+    keys = [buffers.settings.sh_degree, buffers.depth_shift, buffers.settings.depth_culled]
+    return [view.camera, inputs.calibration, *keys, *arrays, colour_sh]
 
 
 def _project_outputs(buffers: Buffers) -> list:
@@ -79,34 +76,23 @@ def sort_by_depth(buffers: Buffers) -> None:
             buffers.depth_key, buffers.order, buffers.count, end_bit=buffers.settings.depth_bits
         )
         return
-    counts, first = (
-        buffers.zeros("counts of classes", depth_bins.COUNTS),
-        buffers.array("first of classes", depth_bins.COUNTS),
-    )
-    places, members = (
-        buffers.array("places", buffers.count),
-        buffers.array("members", buffers.count, wp.int64),
-    )
+    counts = buffers.zeros("counts of bins", depth_bins.COUNTS)
+    first = buffers.array("first of bins", depth_bins.COUNTS)
+    places = buffers.array("places", buffers.count)
+    members = buffers.array("members", buffers.count, wp.int64)
     shift = buffers.settings.depth_bits - (depth_bins.BINS.bit_length() - 1)
     keys = [buffers.depth_key, buffers.settings.depth_culled, shift]
     _launch(depth_bins.count_bins, buffers.count, keys, [counts, places])
     wp.utils.array_scan(counts, first, inclusive=True)
     _launch(depth_bins.fill_bins, buffers.count, [*keys, first, places], [members])
-    _launch(
-        depth_bins.order_within_bins, buffers.count, [members, *keys[1:], first], [buffers.order]
-    )
+    inputs = [members, *keys[1:], first]
+    _launch(depth_bins.order_within_bins, buffers.count, inputs, [buffers.order])
 
 
 def sort_by_tile(buffers: Buffers) -> None:
     """List of each tile, near to far, from a bit matrix or by a sort of (tile, splat) pairs."""
-    lists = [
-        buffers.order,
-        buffers.splats,
-        buffers.box_px,
-        buffers.tile_width,
-        buffers.tile_height,
-        buffers.lanes_per_splat,
-    ]
+    lists = [buffers.order, buffers.splats, buffers.box_px]
+    lists += [buffers.tile_width, buffers.tile_height, buffers.lanes_per_splat]
     if buffers.marks:
         _mark_and_read(buffers, lists)
     else:
@@ -118,27 +104,15 @@ def sort_by_tile(buffers: Buffers) -> None:
 def _mark_and_read(buffers: Buffers, lists: list) -> None:
     """Mark the pairs as bits; count and list those of each tile."""
     marked = buffers.zeros("bits", buffers.matrix, wp.uint32)
-    _launch(
-        tiles.mark_pairs,
-        (buffers.count, buffers.lanes_per_splat),
-        [*lists, buffers.tiles_x, buffers.words],
-        [marked],
-    )
-    matrix = [
-        marked,
-        buffers.words,
-        buffers.tiles,
-        buffers.parts,
-        buffers.part,
-        buffers.lanes_per_splat,
-    ]
+    threads = buffers.count, buffers.lanes_per_splat
+    _launch(tiles.mark_pairs, threads, [*lists, buffers.tiles_x, buffers.words], [marked])
+    matrix = [marked, buffers.words, buffers.tiles, buffers.parts, buffers.part]
+    matrix.append(buffers.lanes_per_splat)
     threads = buffers.matrix // buffers.words * buffers.parts, buffers.lanes_per_splat
     _launch(tile_bitmask.count_bits, threads, matrix, [buffers.counts])
     capacity = _sum_counts(buffers)
-    outputs = [buffers.ids, buffers.first, buffers.total]
-    _launch(
-        tile_bitmask.list_bits, threads, [*matrix, buffers.order, buffers.ends, capacity], outputs
-    )
+    inputs, outputs = [buffers.order, buffers.ends], [buffers.ids, buffers.first, buffers.total]
+    _launch(tile_bitmask.list_bits, threads, [*matrix, *inputs, capacity], outputs)
 
 
 def _count_and_sort(buffers: Buffers, lists: list) -> None:
@@ -150,23 +124,13 @@ def _count_and_sort(buffers: Buffers, lists: list) -> None:
     _launch(tiles.emit_pairs, threads, inputs, [buffers.keys, buffers.ids, buffers.total])
     if buffers.ordered and capacity:
         buffers.owners = buffers.array("owners", capacity)
-        _launch(
-            deterministic_sums.number_pairs,
-            capacity,
-            [buffers.total, capacity],
-            [buffers.ids, buffers.owners],
-        )
+        inputs, outputs = [buffers.total, capacity], [buffers.ids, buffers.owners]
+        _launch(deterministic_sums.number_pairs, capacity, inputs, outputs)
     if capacity:
-        wp.utils.radix_sort_pairs(
-            buffers.keys, buffers.ids, capacity, end_bit=buffers.tiles.bit_length()
-        )
-    starts = buffers.tiles + 1, buffers.lanes_per_splat
-    _launch(
-        tiles.tile_starts,
-        starts,
-        [buffers.keys, capacity, buffers.lanes_per_splat],
-        [buffers.first],
-    )
+        end_bit = buffers.tiles.bit_length()
+        wp.utils.radix_sort_pairs(buffers.keys, buffers.ids, capacity, end_bit=end_bit)
+    threads, inputs = (buffers.tiles + 1, threads[1]), [buffers.keys, capacity, threads[1]]
+    _launch(tiles.tile_starts, threads, inputs, [buffers.first])
 
 
 def _sum_counts(buffers: Buffers) -> int:
@@ -184,11 +148,8 @@ def composite(
     buffers: Buffers, number: int, distortion: bool = True, *, differentiable: bool = True
 ) -> None:
     """Blend all tiles: light with one or two groups of channels, or one further group."""
-    nothing, more = (
-        _nothing(buffers, 3, buffers.sums.lanes.dtype),
-        number == 0 and buffers.groups_with_light > 1,
-    )
     light, channels = number == 0, bool(buffers.channels)
+    more = light and buffers.groups_with_light > 1
     shape = buffers.K, buffers.tile_width, buffers.tile_height
     metric = _metric(buffers, light and distortion)
     segments = buffers.segments_wanted if light and metric is None and differentiable else 1
@@ -197,11 +158,10 @@ def composite(
     kernel = make_composite(
         *shape, light, channels, buffers.settings.stop == Stop.INCLUSIVE, metric, more, segments
     )
-    channel = buffers.channels[number].lanes if channels else nothing
+    channel = _lanes(buffers, buffers.channels[number] if channels else None)
+    more_channel = _lanes(buffers, buffers.channels[1] if more else None)
     splats = _spread(buffers, number)
-    more_splats, more_channel = (
-        (_spread(buffers, 1), buffers.channels[1].lanes) if more else (splats, nothing)
-    )
+    more_splats = _spread(buffers, 1) if more else splats
     lists = [buffers.first, buffers.ids, splats, buffers.tiles_x, buffers.width, buffers.height]
 
     def arguments(tile0: int, _part: int) -> list:
@@ -223,8 +183,7 @@ def composite_backward(
     grad_more: Planes | None = None,
     more_records: wp.array | None = None,
 ) -> None:
-    """Add the gradient of one pass to ``records``; CPU threads add to their own, which are then
-    summed in order.
+    """Add the gradient of one pass to ``records`` [N]; those of CPU threads are summed in order.
 
     Args:
         buffers: After its forward pass.
@@ -234,9 +193,8 @@ def composite_backward(
         records: [N] added to.
         distortion: Whether it has a gradient.
         fixed: Whether weights are held fixed under the channels.
-        grad_more: Of the second group, if this pass takes it along; weights are held fixed under
-            it.
-        more_records: [N] what it adds to.
+        grad_more: Of a second group of channels, under which weights are held fixed.
+        more_records: [N] added to for the second group.
     """
     light, channels = number == 0, grad_channel is not None
     shape = buffers.K, buffers.tile_width, buffers.tile_height
@@ -247,18 +205,13 @@ def composite_backward(
     kernel = make_composite_backward(
         *shape, light, channels, passes, metric, fixed, grad_more is not None, segments
     )
-    nothing = _nothing(buffers, 3, buffers.sums.lanes.dtype)
-    channel = grad_channel.lanes if grad_channel is not None else nothing
-    more = grad_more.lanes if grad_more is not None else nothing
+    gradients = [grad_light.lanes, _lanes(buffers, grad_channel), _lanes(buffers, grad_more)]
     edges = [0, buffers.tiles] if buffers.ordered else tile_edges(buffers, buffers.threads)
     added, more_added = records, more_records
     if buffers.ordered:
         added = buffers.zeros("gradients of pairs", len(buffers.owners), splat.Splat)
-        more_added = (
-            None
-            if more_records is None
-            else buffers.zeros("more of pairs", len(buffers.owners), splat.Splat)
-        )
+        if more_records is not None:
+            more_added = buffers.zeros("more of pairs", len(buffers.owners), splat.Splat)
     targets = [added] + [
         buffers.zeros(f"records of thread {n}", buffers.count, splat.Splat)
         for n in range(len(edges) - 2)
@@ -266,18 +219,9 @@ def composite_backward(
     lists = [buffers.first, buffers.ids, _spread(buffers, number, anew=False), buffers.tiles_x]
 
     def arguments(tile0: int, part: int) -> list:
-        return [
-            *lists,
-            tile0,
-            _mapping(buffers),
-            buffers.sums.lanes,
-            grad_light.lanes,
-            channel,
-            more,
-            _states(buffers, segments),
-            targets[part],
-            more_added if more_added is not None else added,
-        ]
+        inputs = [*lists, tile0, _mapping(buffers), buffers.sums.lanes, *gradients]
+        outputs = [targets[part], more_added if more_added is not None else added]
+        return [*inputs, _states(buffers, segments), *outputs]
 
     over_tiles(buffers, kernel, edges, arguments, segments)
     for target in targets[1:]:
@@ -316,31 +260,16 @@ def resolve_images(
     """Planes to images."""
     pixels, sums, tiling = (buffers.height, buffers.width), buffers.sums.flat, buffers.tiling
     if len(view.shifts) and images.quads is not None:
-        lit = [
-            sums,
-            tiling,
-            inputs.calibration,
-            view.shifts,
-            _or_nothing(buffers, inputs.background_quads),
-        ]
+        lit = _quad_inputs(inputs, view, buffers)
         _launch(planes_to_images.resolve_quads, pixels, lit, [images.quads])
     if images.phasor is not None:
-        lit = [
-            sums,
-            tiling,
-            buffers.settings.phasor_factor,
-            _or_nothing(buffers, inputs.background_phasor),
-        ]
+        lit = _phasor_inputs(inputs, buffers)
         _launch(planes_to_images.resolve_phasor, pixels, lit, [images.phasor])
     outputs = [images.distance, images.opacity, images.distortion]
     if any(image is not None for image in outputs):
         outputs = [_or_nothing(buffers, image, 2) for image in outputs]
-        _launch(
-            planes_to_images.resolve_geometry,
-            pixels,
-            [sums, tiling, _distortion_factor(buffers)],
-            outputs,
-        )
+        factors = [sums, tiling, _distortion_factor(buffers)]
+        _launch(planes_to_images.resolve_geometry, pixels, factors, outputs)
     for (name, start), planes in zip(groups, buffers.channels, strict=True):
         background = inputs.background_colour if name == "colour" else None
         rest = [planes.flat, sums, tiling, _or_nothing(buffers, background), start]
@@ -355,33 +284,17 @@ def fold_images(
     planes = buffers.gradient_planes("gradient of light", GRAD_LIGHT_PLANES, added=True)
     target = planes.flat
     if cotangents.quads is not None and len(view.shifts):
-        lit = [
-            sums,
-            tiling,
-            inputs.calibration,
-            view.shifts,
-            _or_nothing(buffers, inputs.background_quads),
-        ]
+        lit = [*_quad_inputs(inputs, view, buffers), cotangents.quads]
         outputs = [target, _or_nothing(buffers, wanted.background_quads)]
-        _launch(planes_to_images.fold_quads, pixels, [*lit, cotangents.quads], outputs)
+        _launch(planes_to_images.fold_quads, pixels, lit, outputs)
         if wanted.calibration is not None:
-            rows = buffers.array("rows", buffers.height, wp.float64)
-            _launch(
-                planes_to_images.fold_dc_offset,
-                buffers.height,
-                [sums, tiling, cotangents.quads],
-                [rows],
-            )
+            rows, lit = buffers.array("rows", pixels[0], wp.float64), [sums, tiling, lit[-1]]
+            _launch(planes_to_images.fold_dc_offset, pixels[0], lit, [rows])
             _launch(planes_to_images.add_dc_offset, 1, [rows], [wanted.calibration])
     if cotangents.phasor is not None:
-        lit = [
-            sums,
-            tiling,
-            buffers.settings.phasor_factor,
-            _or_nothing(buffers, inputs.background_phasor),
-        ]
+        lit = [*_phasor_inputs(inputs, buffers), cotangents.phasor]
         outputs = [target, _or_nothing(buffers, wanted.background_phasor)]
-        _launch(planes_to_images.fold_phasor, pixels, [*lit, cotangents.phasor], outputs)
+        _launch(planes_to_images.fold_phasor, pixels, lit, outputs)
     for image, factor, plane in (
         (cotangents.distance, 1.0, 3),
         (cotangents.distortion, _distortion_factor(buffers), 4),
@@ -395,21 +308,24 @@ def fold_images(
         if cotangent is None:
             channels.append(None)
             continue
-        grad = buffers.gradient_planes(
-            f"gradient of channels {number}", CHANNEL_PLANES, added=False
-        )
-        colour = name == "colour"
+        label, colour = f"gradient of channels {number}", name == "colour"
+        grad = buffers.gradient_planes(label, CHANNEL_PLANES, added=False)
         background = _or_nothing(buffers, inputs.background_colour if colour else None)
         grad_background = _or_nothing(buffers, wanted.background_colour if colour else None)
-        inputs_ = [sums, tiling, background, start, cotangent]
-        _launch(
-            planes_to_images.fold_channels, pixels, inputs_, [grad.flat, target, grad_background]
-        )
+        lit, outputs = [sums, tiling, background, start, cotangent], [grad.flat, target]
+        _launch(planes_to_images.fold_channels, pixels, lit, [*outputs, grad_background])
         channels.append(grad)
     return planes, channels or [None]
 
 
-# -- helpers ---------------------------------------------------------------------------------------
+def _quad_inputs(inputs: Inputs, view: View, buffers: Buffers) -> list:
+    background = _or_nothing(buffers, inputs.background_quads)
+    return [buffers.sums.flat, buffers.tiling, inputs.calibration, view.shifts, background]
+
+
+def _phasor_inputs(inputs: Inputs, buffers: Buffers) -> list:
+    background, factor = inputs.background_phasor, buffers.settings.phasor_factor
+    return [buffers.sums.flat, buffers.tiling, factor, _or_nothing(buffers, background)]
 
 
 def _metric(buffers: Buffers, wanted: bool) -> bool | None:
@@ -427,12 +343,8 @@ def _spread(buffers: Buffers, number: int, *, anew: bool = True) -> wp.array:
         return buffers.records[number]
     copies = buffers.array(f"records of pairs {number}", len(buffers.owners), splat.Splat)
     if anew and len(buffers.owners):
-        _launch(
-            deterministic_sums.spread_records,
-            len(buffers.owners),
-            [buffers.records[number], buffers.owners],
-            [copies],
-        )
+        inputs = [buffers.records[number], buffers.owners]
+        _launch(deterministic_sums.spread_records, len(buffers.owners), inputs, [copies])
     return copies
 
 
@@ -445,24 +357,18 @@ def _mapping(buffers: Buffers) -> wp.vec2:
 def _states(buffers: Buffers, segments: int) -> wp.array:
     """State of pixels where segments end, see list_segments.py."""
     if segments == 1:
-        return _nothing(buffers, 3, buffers.sums.lanes.dtype)
+        return _lanes(buffers, None)
     return buffers.planes(f"ends of {segments} segments", PLANES * (segments - 1)).lanes
 
 
+def _lanes(buffers: Buffers, planes: Planes | None) -> wp.array:
+    """Planes for the compositor, without elements if there are none."""
+    return _nothing(buffers, 3, buffers.sums.lanes.dtype) if planes is None else planes.lanes
+
+
 def _launch(kernel, dim, inputs: list, outputs: list, **adjoint) -> None:
-    wp.launch(
-        kernel,
-        dim=dim,
-        inputs=inputs,
-        outputs=outputs,
-        device=_device_of(outputs),
-        record_tape=False,
-        **adjoint,
-    )
-
-
-def _device_of(arrays: list) -> wp.Device:
-    return next(a.device for a in arrays if isinstance(a, wp.array))
+    where = {"device": next(a.device for a in outputs if isinstance(a, wp.array))}
+    wp.launch(kernel, dim, inputs, outputs, record_tape=False, **where, **adjoint)
 
 
 @cache
