@@ -80,7 +80,6 @@ def test_a_recording_says_how_long_its_cycle_is(shifts, frequencies):
     sequence = still(np.full((1, 2), 3.0), shifts, frequencies, cycles=3)
     length = len(shifts) * len(frequencies)
     assert (sequence.cycle, sequence.frequencies) == (length, frequencies)
-    assert sequence.quads_per_phasor == len(shifts)
     assert sequence.complete_quartets == [0, 1, 2]
     assert find_cycle(sequence.shifts[:-1], sequence.frame_frequencies[:-1]) == length
     np.testing.assert_allclose(np.diff(key_times(sequence).numpy()), length / 120.0)

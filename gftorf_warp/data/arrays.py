@@ -1,6 +1,4 @@
-"""Reading single untrusted files: nothing in them is executed,
-and sizes are checked before allocation.
-"""
+"""Reading untrusted files: nothing in them is executed, sizes are checked before allocation."""
 
 from __future__ import annotations
 
@@ -27,16 +25,10 @@ KINDS = {"f": "floating point", "i": "integer", "u": "unsigned integer"}
 
 
 def read_array(path: Path, field: Field, sizes: Mapping[str, int] | None = None) -> np.ndarray:
-    """Read one array file and check it against the description of its field.
+    """Read a .npy or .mat file in its stored type and check it against the description of its
+    field; no infinities, and NaN only where the field allows it.
 
-    Args:
-        path: A .npy or .mat file.
-        field: What it has to be.
-        sizes: Known values of letters in the field's shapes, for example ``{"H": 240, "W": 320}``.
-
-    Returns:
-        The array in its stored type, little endian, without infinities, and without NaN unless the
-        field allows them.
+    ``sizes`` are known values of letters in the field's shapes, like ``{"H": 240, "W": 320}``.
 
     Raises:
         InputError: If it is not a plain numeric array of the expected type, shape and content.
@@ -45,24 +37,19 @@ def read_array(path: Path, field: Field, sizes: Mapping[str, int] | None = None)
     _check(path, field, array.shape, array.dtype, sizes or {})
     finite = np.isfinite(array) if field.nan == "error" else ~np.isinf(array)
     if not finite.all():
-        bad = np.argwhere(~finite)
-        raise InputError(
-            f"{len(bad)} values of {field.name} are not finite",
-            where=path,
-            why="expected "
-            f"{'finite numbers' if field.nan == 'error' else 'numbers, or NaN for unknown'}, found "
-            f"{array[tuple(bad[0])]} first at index {[int(i) for i in bad[0]]} of shape "
-            f"{array.shape}",
-            fix="export the file again; a frame that was not measured is an absent file, not NaN"
-            if field.role == "measurement" and field.nan == "error"
-            else "correct the numbers",
-        )
+        bad, fix = np.argwhere(~finite), "correct the numbers"
+        expected = "finite numbers" if field.nan == "error" else "numbers, or NaN for unknown"
+        why = f"expected {expected}, found {array[tuple(bad[0])]} first at index "
+        why += f"{bad[0].tolist()} of shape {array.shape}"
+        if field.role == "measurement" and field.nan == "error":
+            fix = "export the file again; a frame that was not measured is an absent file, not NaN"
+        what = f"{len(bad)} values of {field.name} are not finite"
+        raise InputError(what, where=path, why=why, fix=fix)
     return array.astype(array.dtype.newbyteorder("="), copy=False)
 
 
 def read_stored(root: Path, field: Field) -> tuple[np.ndarray, str] | None:
-    """Array of a field from the first of its files that exist, and the relative name; None if there
-    is none.
+    """Array of a field from the first of its files that exist, and the relative name, or None.
 
     Raises:
         InputError: If a file is not valid, or files of one field disagree.
@@ -74,26 +61,20 @@ def read_stored(root: Path, field: Field) -> tuple[np.ndarray, str] | None:
     if any(not np.array_equal(_compared(array), _compared(first)) for array in found.values()):
         texts = ", ".join(f"{array.tolist()} in {name}" for name, array in found.items())
         why = f"expected the same value in all of its files, found {texts}"
-        raise InputError(
-            f"{field.name}: files disagree", where=root / path, why=why, fix="remove the wrong file"
-        )
+        raise _invalid(root / path, field, "files disagree", why, "remove the wrong file")
     return first, path
 
 
 def _compared(array: np.ndarray) -> np.ndarray:
-    """Of a 3x3 or 4x4 matrix the part that both have; of a number, MATLAB's 1x1 or not,
-    the number.
-    """
+    """The 3x3 part of a matrix; a number as one element, also MATLAB's 1x1."""
     return array[:3, :3] if array.ndim == 2 and array.size > 1 else array.reshape(-1)
 
 
 def read_shape(path: Path, field: Field) -> tuple[int, ...]:
-    """Shape that the header of a .npy file states, checked like :func:`read_array` checks it; no
-    data are read.
+    """Shape in the header of a .npy file, checked as by :func:`read_array`; no data are read.
 
     Raises:
-        InputError: If the file is not a plain numeric array of the expected type and number of
-            axes.
+        InputError: If the array does not have the expected type and number of axes.
     """
     with _open(path, field) as file:
         shape, _, dtype = _header(path, field, file)
@@ -102,10 +83,7 @@ def read_shape(path: Path, field: Field) -> tuple[int, ...]:
 
 
 def as_float32(path: Path, field: Field, array: np.ndarray) -> tuple[np.ndarray, bool]:
-    """Convert a checked array to float32.
-
-    Returns:
-        The converted array, and whether digits were lost.
+    """Convert a checked array to float32; returns it, and whether digits were lost.
 
     Raises:
         InputError: If a number is beyond the range of float32.
@@ -113,18 +91,13 @@ def as_float32(path: Path, field: Field, array: np.ndarray) -> tuple[np.ndarray,
     with np.errstate(over="ignore"):
         converted = np.ascontiguousarray(array, dtype=np.float32)
     if np.isinf(converted).any():
-        raise InputError(
-            f"{field.name} beyond float32",
-            where=path,
-            why=f"expected numbers below 3.4e38, found {np.nanmax(np.abs(array)):.3g}",
-            fix="divide the recording by one factor",
-        )
+        why = f"expected numbers below 3.4e38, found {np.nanmax(np.abs(array)):.3g}"
+        raise _invalid(path, field, "beyond float32", why, "divide the recording by one factor")
     if array.dtype.itemsize <= 2 or array.dtype == np.float32:
         return converted, False
     with np.errstate(invalid="ignore"):
-        return converted, not np.array_equal(
-            converted.astype(np.float64), array.astype(np.float64), equal_nan=True
-        )
+        wide = converted.astype(np.float64), array.astype(np.float64)
+    return converted, not np.array_equal(*wide, equal_nan=True)
 
 
 def read_choice(path: Path, field: Field) -> str:
@@ -134,30 +107,21 @@ def read_choice(path: Path, field: Field) -> str:
         InputError: If it is anything else.
     """
     expected = (
-        f"expected {{{json.dumps(field.key)}: {' or '.join(json.dumps(c) for c in field.choices)}}}"
+        f"expected {{{json.dumps(field.key)}: {' or '.join(map(json.dumps, field.choices))}}}"
     )
-    text = _small_file(path, field)
+    text, fix = _small_file(path, field), "correct or remove the file"
     try:
         content = json.loads(text.decode("utf-8"))
     except (ValueError, RecursionError) as error:
-        raise InputError(
-            f"{field.name} is not JSON",
-            where=path,
-            why=f"{expected}, found {error}",
-            fix="correct or remove the file",
-        ) from error
-    if (
-        not isinstance(content, dict)
-        or set(content) != {field.key}
-        or content[field.key] not in field.choices
-    ):
-        raise InputError(
-            f"unknown {field.name}",
-            where=path,
-            why=f"{expected}, found {text[:200].decode('utf-8', 'replace')!r}",
-            fix="correct or remove the file",
-        )
+        raise _invalid(path, field, "not JSON", f"{expected}, found {error}", fix) from error
+    if content not in [{field.key: choice} for choice in field.choices]:
+        why = f"{expected}, found {text[:200].decode('utf-8', 'replace')!r}"
+        raise InputError(f"unknown {field.name}", where=path, why=why, fix=fix)
     return content[field.key]
+
+
+def _invalid(path: Path, field: Field, what: str, why: str, fix: str) -> InputError:
+    return InputError(f"{field.name}: {what}", where=path, why=why, fix=fix)
 
 
 def _read_npy(path: Path, field: Field, sizes: Mapping[str, int]) -> np.ndarray:
@@ -167,14 +131,9 @@ def _read_npy(path: Path, field: Field, sizes: Mapping[str, int]) -> np.ndarray:
         found = path.stat().st_size - file.tell()
         expected = math.prod(shape) * dtype.itemsize
         if found != expected:
-            raise InputError(
-                f"{field.name}: file is "
-                f"{'truncated' if found < expected else 'longer than its array'}",
-                where=path,
-                why=f"expected {expected} bytes of data for shape {shape} of {dtype}, found "
-                f"{found}",
-                fix="copy or export the file again",
-            )
+            what = f"file is {'truncated' if found < expected else 'longer than its array'}"
+            why = f"expected {expected} bytes of data for shape {shape} of {dtype}, found {found}"
+            raise _invalid(path, field, what, why, "copy or export the file again")
         data = np.frombuffer(file.read(expected), dtype=dtype, count=math.prod(shape))
     return data.reshape(shape, order="F" if fortran else "C")
 
@@ -194,21 +153,14 @@ def _header(path: Path, field: Field, file: Any) -> tuple[tuple[int, ...], bool,
             shape, fortran, dtype = readers[version](file)
     except Exception as error:
         # the header is a Python literal: a damaged one raises nearly any exception
-        raise InputError(
-            f"{field.name}: not a .npy array",
-            where=path,
-            why=f"expected an array as numpy.save writes it, found {_excerpt(path)} ({error})",
-            fix="export the array again with numpy.save",
-        ) from error
+        why = f"expected an array as numpy.save writes it, found {_excerpt(path)} ({error})"
+        fix = "export the array again with numpy.save"
+        raise _invalid(path, field, "not a .npy array", why, fix) from error
     if dtype.hasobject:
-        raise InputError(
-            f"{field.name}: pickled Python objects",
-            where=path,
-            why=f"expected plain numbers, found dtype {dtype}; loading it could execute code, so "
-            f"it was not loaded",
-            fix="save a numeric array: numpy.save(path, array.astype(numpy.float32), "
-            "allow_pickle=False)",
-        )
+        why = f"expected plain numbers, found dtype {dtype}; loading it could execute code, so "
+        why += "it was not loaded"
+        fix = "save numbers: numpy.save(path, array.astype(numpy.float32), allow_pickle=False)"
+        raise _invalid(path, field, "pickled Python objects", why, fix)
     return tuple(int(n) for n in shape), fortran, dtype
 
 
@@ -218,37 +170,24 @@ def _read_mat(path: Path, field: Field) -> np.ndarray:
     try:
         return read_matrix(data, field.mat_key)
     except ValueError as error:
-        raise InputError(
-            f"{field.name}: no MATLAB matrix",
-            where=path,
-            why=f"expected a MATLAB 5 file with a real matrix {field.mat_key!r}, found "
-            f"{_excerpt(path)} ({error})",
-            fix=f"save the matrix under the name {field.mat_key!r} with save -v7, or as .npy",
-        ) from error
+        why = f"expected a MATLAB 5 file with a real matrix {field.mat_key!r}, found "
+        why += f"{_excerpt(path)} ({error})"
+        fix = f"save the matrix under the name {field.mat_key!r} with save -v7, or as .npy"
+        raise _invalid(path, field, "no MATLAB matrix", why, fix) from error
 
 
 def _check(
     path: Path, field: Field, shape: tuple[int, ...], dtype: np.dtype, sizes: Mapping[str, int]
 ) -> None:
-    """Check type and shape against the field's description,
-    and bounds of letters without a known value.
-    """
+    """Check type and shape against the field, and bounds of letters without a known value."""
     if dtype.kind not in field.dtypes:
-        raise InputError(
-            f"{field.name}: wrong type",
-            where=path,
-            why=f"expected {' or '.join(KINDS[kind] for kind in field.dtypes)}, found {dtype}",
-            fix="export numbers",
-        )
+        why = f"expected {' or '.join(KINDS[kind] for kind in field.dtypes)}, found {dtype}"
+        raise _invalid(path, field, "wrong type", why, "export numbers")
     if any(_matches(shape, allowed, sizes) for allowed in field.shapes):
         return
     expected = " or ".join(_shape_text(allowed, sizes) for allowed in field.shapes)
-    raise InputError(
-        f"{field.name}: wrong shape",
-        where=path,
-        why=f"expected {expected}, found {shape}",
-        fix="export the array in that shape; all images of one kind have one size",
-    )
+    fix = "export the array in that shape; all images of one kind have one size"
+    raise _invalid(path, field, "wrong shape", f"expected {expected}, found {shape}", fix)
 
 
 def _matches(
@@ -258,11 +197,9 @@ def _matches(
         return math.prod(shape) == 1 and len(shape) <= 2  # MATLAB writes a number as 1x1
     if len(shape) != len(allowed):
         return False
-    for n, size in zip(shape, allowed, strict=True):
-        if isinstance(size, int) or size in sizes:
-            if n != (size if isinstance(size, int) else sizes[size]):
-                return False
-        elif not 1 <= n <= LIMITS[size]:
+    for n, letter in zip(shape, allowed, strict=True):
+        size = letter if isinstance(letter, int) else sizes.get(letter)
+        if not (1 <= n <= LIMITS[str(letter)] if size is None else n == size):
             return False
     return True
 
@@ -275,39 +212,26 @@ def _shape_text(allowed: tuple[int | str, ...], sizes: Mapping[str, int]) -> str
 
 def _open(path: Path, field: Field) -> Any:
     if not path.is_file():  # opening a pipe would block
-        raise InputError(
-            f"{field.name}: no such file",
-            where=path,
-            why=f"expected a file, found "
-            f"{'a folder' if path.is_dir() else 'nothing that can be read'}",
-            fix="complete the folder",
-        )
+        found = "a folder" if path.is_dir() else "nothing that can be read"
+        why = f"expected a file, found {found}"
+        raise _invalid(path, field, "no such file", why, "complete the folder")
     try:
         return path.open("rb")
     except OSError as error:
-        raise InputError(
-            f"{field.name}: cannot be read",
-            where=path,
-            why=str(error),
-            fix="check permissions and the disk",
-        ) from error
+        fix = "check permissions and the disk"
+        raise _invalid(path, field, "cannot be read", str(error), fix) from error
 
 
 def _small_file(path: Path, field: Field) -> bytes:
     with _open(path, field) as file:
         data = file.read(SMALL_FILE_BYTES + 1)
     if len(data) > SMALL_FILE_BYTES:
-        raise InputError(
-            f"{field.name}: file too large",
-            where=path,
-            why=f"expected at most {SMALL_FILE_BYTES} bytes, found {path.stat().st_size}",
-            fix="keep only the documented value in it",
-        )
+        why = f"expected at most {SMALL_FILE_BYTES} bytes, found {path.stat().st_size}"
+        raise _invalid(path, field, "file too large", why, "keep only the documented value in it")
     return data
 
 
 def _excerpt(path: Path) -> str:
-    """First bytes of a file, for a message."""
     with path.open("rb") as file:
         start = file.read(24)
     return f"a file that starts with {start!r}" if start else "an empty file"

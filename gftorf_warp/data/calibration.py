@@ -1,6 +1,4 @@
-"""Calibration of a folder: scalars, intrinsics of both cameras, shifts and times,
-each value with its source.
-"""
+"""Calibration of a folder: scalars, intrinsics, shifts and times, each with its source."""
 
 from __future__ import annotations
 
@@ -21,6 +19,7 @@ from .sequence import Calibration, Intrinsics
 DEPTH_RANGES_M = (0.03, 30_000.0)
 # of the image width: a view of 168 degrees; a shorter one is in image widths or millimetres
 FOCAL_MIN = 0.05
+FIX_DEPTH_RANGE = "store speed of light / modulation frequency in metres, 15 for 20 MHz"
 # the error is among the problems
 UNREAD = Intrinsics(fx=math.nan, fy=math.nan, cx=math.nan, cy=math.nan)
 
@@ -42,12 +41,7 @@ class Calibrated:
 def read_calibration(root: Path, form: str, problems: Problems, width: int | None) -> Calibrated:
     """Read everything in cams/ that does not depend on the number of frames or on colour.
 
-    Args:
-        root: The folder.
-        form: Its format, ``ftorf`` or ``torf``.
-        problems: Collects errors.
-        width: Columns of the images; None if they could not be read; intrinsics are then not
-            compared with it.
+    ``width`` is that of the images; None if unknown: intrinsics are then not compared with it.
     """
     fields = specs.fields(form)
     sources = {"dc_offset": "default 0: a phasor has no constant part"}
@@ -64,10 +58,8 @@ def read_calibration(root: Path, form: str, problems: Problems, width: int | Non
         dc_offset=(scalar("dc_offset", "dc_offset") or 0.0) if "dc_offset" in fields else 0.0,
         quad_scale=scalar("quad_values_scale_factor", "quad_scale"),
     )
-    intrinsics, half = problems.attempt(_tof_intrinsics, root, fields, sources, width) or (
-        UNREAD,
-        0.0,
-    )
+    found = problems.attempt(_tof_intrinsics, root, fields, sources, width)
+    intrinsics, half = found or (UNREAD, 0.0)
     return Calibrated(calibration=calibration, intrinsics=intrinsics, half=half, sources=sources)
 
 
@@ -79,15 +71,8 @@ def read_colour_intrinsics(
     size: tuple[int, int],
     sources: dict[str, str],
 ) -> Intrinsics:
-    """Intrinsics of the colour images: the file's, or those of the ToF camera, scaled.
-
-    Args:
-        root: The folder.
-        form: Its format.
-        tof: Calibration of the ToF camera; its pixel centres are those of the folder.
-        tof_size: Its rows H and columns W.
-        size: Rows and columns of the colour images.
-        sources: Receives their source.
+    """Intrinsics of colour images of ``size`` (rows, columns): the file's, in the pixel centres of
+    the ToF camera, or those of the ToF camera, scaled.
 
     Raises:
         InputError: If the file is not what data_specs/ describes.
@@ -96,11 +81,8 @@ def read_colour_intrinsics(
     stored = _pinhole(root, spec, size[1])
     if stored is not None:
         intrinsics, path = stored
-        centres = (
-            f"integer pixel centres (cx, cy + {tof.half})"
-            if tof.half
-            else "half pixel centres (kept)"
-        )
+        integer = f"integer pixel centres (cx, cy + {tof.half})"
+        centres = integer if tof.half else "half pixel centres (kept)"
         sources["colour_intrinsics"] = f"file {path}, {centres} as for the ToF camera"
         return replace(intrinsics, cx=intrinsics.cx + tof.half, cy=intrinsics.cy + tof.half)
     sources["colour_intrinsics"] = f"inferred from tof_intrinsics, scaled (no {spec.paths[0]})"
@@ -123,13 +105,10 @@ def read_shifts(root: Path, form: str, frames: int, sources: dict[str, str]) -> 
     if stored is not None:
         values, name = stored
         if sorted(values.tolist()) != [0, 1, 2, 3]:
-            raise InputError(
-                "unknown permutation",
-                where=root / name,
-                why=f"expected the numbers 0, 1, 2, 3 in some order, found {values.tolist()}",
-                fix="store the order with canonical = raw[permutation], canonical being +cos, "
-                "-cos, +sin, -sin",
-            )
+            why = f"expected the numbers 0, 1, 2, 3 in some order, found {values.tolist()}"
+            fix = "store the order with canonical = raw[permutation], canonical being +cos, -cos, "
+            fix += "+sin, -sin"
+            raise InputError("unknown permutation", where=root / name, why=why, fix=fix)
         sources["shifts"] = f"file {name}: {[int(v) for v in values]}"
     else:
         values = np.array(spec.default)
@@ -146,15 +125,10 @@ def read_times(
     default_hz: float,
     sources: dict[str, str],
 ) -> np.ndarray:
-    """Time of each frame [s]; more than ``frames`` in the file if the last were not measured.
+    """Time of each of at least ``frames`` raw frames (F-ToeRF) or phasors (ToeRF) [s]; more if the
+    file has more: the last were not measured.
 
-    Args:
-        root: The folder.
-        form: Its format.
-        frames: Number of frames up to the last file: raw frames of F-ToeRF, phasors of ToeRF.
-        frame_rate_hz: Overrides the file, if given.
-        default_hz: Rate if nothing states one.
-        sources: Receives their source.
+    ``frame_rate_hz`` overrides the file; ``default_hz`` is used if nothing states a rate.
 
     Raises:
         UsageError: If the given rate is not above 0.
@@ -165,26 +139,18 @@ def read_times(
     if stored is not None and times is not None:
         if len(times) < frames or times[0] != 0.0 or (np.diff(times) < 0).any():
             steps = np.flatnonzero(np.diff(times) < 0)
-            raise InputError(
-                "frame_times",
-                where=root / stored[1],
-                why=f"expected {frames} or more times in seconds that start at 0 and never "
-                f"decrease, "
-                f"found {len(times)} from {times[0]:g} to {times[-1]:g}"
-                + (f", decreasing after frame {steps[0]}" if len(steps) else ""),
-                fix=f"correct the order and subtract the first time, or remove the file for "
-                f"{default_hz:g} Hz",
-            )
+            why = f"expected {frames} or more times in seconds that start at 0 and never decrease, "
+            why += f"found {len(times)} from {times[0]:g} to {times[-1]:g}"
+            why += f", decreasing after frame {steps[0]}" if len(steps) else ""
+            fix = "correct the order and subtract the first time, or remove the file for "
+            fix += f"{default_hz:g} Hz"
+            raise InputError("frame_times", where=root / stored[1], why=why, fix=fix)
         frames = len(times)
         sources["times"] = f"file {stored[1]}"
     if frame_rate_hz is not None:
         if not (math.isfinite(frame_rate_hz) and frame_rate_hz > 0):
-            raise UsageError(
-                "frame rate",
-                where="frame_rate_hz",
-                why=f"expected more than 0, found {frame_rate_hz}",
-                fix="give Hz",
-            )
+            why = f"expected more than 0, found {frame_rate_hz}"
+            raise UsageError("frame rate", where="frame_rate_hz", why=why, fix="give Hz")
         sources["times"] = f"setting {frame_rate_hz:g} Hz"
         return np.arange(frames) / frame_rate_hz
     if times is not None:
@@ -197,28 +163,18 @@ def _scalar(root: Path, spec: specs.Field, sources: dict[str, str], key: str) ->
     """One number and its source; None if it has neither file nor default."""
     stored = read_stored(root, spec)
     if stored is None:
-        sources[key] = (
-            f"default {spec.default} (no {spec.paths[0]})"
-            if spec.default is not None
-            else "default none"
-        )
+        given = spec.default is not None
+        sources[key] = f"default {spec.default} (no {spec.paths[0]})" if given else "default none"
         return spec.default if isinstance(spec.default, float) else None
     value, path = float(stored[0].reshape(())), stored[1]
-    bounds = {
-        "depth_range": DEPTH_RANGES_M,
-        "quad_values_scale_factor": (math.ulp(0.0), math.inf),
-    }.get(spec.name)
-    if bounds and not bounds[0] <= value <= bounds[1]:
-        raise InputError(
-            f"implausible {spec.name}",
-            where=root / path,
-            why=f"expected {spec.name} in {spec.unit}, "
-            + (f"{bounds[0]:g} to {bounds[1]:g}" if spec.name == "depth_range" else "above 0")
-            + f", found {value:g}",
-            fix="store speed of light / modulation frequency in metres, 15 for 20 MHz"
-            if spec.name == "depth_range"
-            else "store the factor, or remove the file",
-        )
+    low, high = DEPTH_RANGES_M
+    holds, bounds, fix = {
+        "depth_range": (low <= value <= high, f"{low:g} to {high:g}", FIX_DEPTH_RANGE),
+        "quad_values_scale_factor": (value > 0, "above 0", "store the factor, or remove the file"),
+    }.get(spec.name, (True, "", ""))
+    if not holds:
+        why = f"expected {spec.name} in {spec.unit}, {bounds}, found {value:g}"
+        raise InputError(f"implausible {spec.name}", where=root / path, why=why, fix=fix)
     sources[key] = f"file {path}"
     return value
 
@@ -226,18 +182,13 @@ def _scalar(root: Path, spec: specs.Field, sources: dict[str, str], key: str) ->
 def _tof_intrinsics(
     root: Path, fields: dict[str, specs.Field], sources: dict[str, str], width: int | None
 ) -> tuple[Intrinsics, float]:
-    """Intrinsics of the ToF camera, and what was added to cx and cy for pixel centres at i + 0.5
-    [px].
-    """
+    """Intrinsics with pixel centres at i + 0.5, and the offset [px] that was added to cx, cy."""
     spec, centre = fields["tof_intrinsics"], fields["pixel_centre"]
     stored = _pinhole(root, spec, width)
     if stored is None:
-        raise InputError(
-            "tof_intrinsics missing",
-            where=root / spec.paths[0],
-            why=f"expected {' or '.join(spec.paths)}, found neither",
-            fix="store the 3x3 pinhole matrix of the ToF camera in pixels",
-        )
+        why = f"expected {' or '.join(spec.paths)}, found neither"
+        fix = "store the 3x3 pinhole matrix of the ToF camera in pixels"
+        raise InputError("tof_intrinsics missing", where=root / spec.paths[0], why=why, fix=fix)
     intrinsics, path = stored
     if (root / centre.paths[0]).exists():
         convention = read_choice(root / centre.paths[0], centre)
@@ -248,9 +199,8 @@ def _tof_intrinsics(
     half = 0.5 if convention == "integer" else 0.0
     sources |= dict.fromkeys(("fx", "fy"), f"file {path}")
     added = "cx, cy + 0.5" if half else "kept"
-    sources |= dict.fromkeys(
-        ("cx", "cy"), f"file {path}, {convention} pixel centres ({added}), {source}"
-    )
+    of_centre = f"file {path}, {convention} pixel centres ({added}), {source}"
+    sources |= dict.fromkeys(("cx", "cy"), of_centre)
     sources["pixel_centre"] = f"{source}: {convention}"
     return replace(intrinsics, cx=intrinsics.cx + half, cy=intrinsics.cy + half), half
 
@@ -261,23 +211,13 @@ def _pinhole(root: Path, spec: specs.Field, width: int | None) -> tuple[Intrinsi
     if stored is None:
         return None
     matrix, path = stored[0].astype(np.float64), stored[1]
-    focal = (matrix[0, 0], matrix[1, 1])
+    (fx, fy), (cx, cy) = matrix.diagonal()[:2].tolist(), matrix[:2, 2].tolist()
     pinhole = np.eye(len(matrix))
-    pinhole[0, 0], pinhole[1, 1], pinhole[:2, 2] = *focal, matrix[:2, 2]
-    if (
-        not np.allclose(matrix, pinhole, atol=1e-6)
-        or min(focal) <= 0
-        or min(focal) < FOCAL_MIN * (width or 0)
-    ):
-        raise InputError(
-            "implausible intrinsics",
-            where=root / path,
-            why=f"expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels, fx and fy at least "
-            f"{FOCAL_MIN} of the "
-            f"width ({'unknown' if width is None else width}), found {matrix.tolist()}",
-            fix="store pixels, not fractions of the width or millimetres; no skew, not transposed",
-        )
-    intrinsics = Intrinsics(
-        fx=float(focal[0]), fy=float(focal[1]), cx=float(matrix[0, 2]), cy=float(matrix[1, 2])
-    )
-    return intrinsics, path
+    pinhole[:2, :3] = [fx, 0, cx], [0, fy, cy]
+    plausible = min(fx, fy) > 0 and min(fx, fy) >= FOCAL_MIN * (width or 0)
+    if not (plausible and np.allclose(matrix, pinhole, atol=1e-6)):
+        why = "expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels, fx and fy at least "
+        why += f"{FOCAL_MIN} of the width ({width or 'unknown'}), found {matrix.tolist()}"
+        fix = "store pixels, not fractions of the width or millimetres; no skew, not transposed"
+        raise InputError("implausible intrinsics", where=root / path, why=why, fix=fix)
+    return Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy), path

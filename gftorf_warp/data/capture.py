@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -25,18 +25,15 @@ from .poses import rigid
 from .problems import Problems
 from .sequence import Calibration, ColourCamera, Flow, Intrinsics, Sequence, Truth
 
+T = TypeVar("T")
+
 
 def read(root: Path, frame_rate_hz: float | None) -> Sequence:
     """Read a capture: raw frames, calibration, colour, flow and novel views, never truth.
 
-    Args:
-        root: The folder.
-        frame_rate_hz: Must be None: a capture states the time of every raw frame.
-
     Raises:
-        InputError: If the folder or a file in it is not what data_specs/capture.toml describes;
-            names all of it.
-        UsageError: If a frame rate is given.
+        InputError: If a file is not what data_specs/capture.toml describes; lists all problems.
+        UsageError: If a frame rate is given: a capture states the time of every raw frame.
         ResourceError: If it does not fit into memory.
     """
     if frame_rate_hz is not None:
@@ -49,13 +46,10 @@ def read(root: Path, frame_rate_hz: float | None) -> Sequence:
     width, height = (int(n) for n in values["size"])
     measured, frames = values["measured"], len(values["id"])
     files = _files(root, "tof", frames, problems)
-    for n in np.flatnonzero(measured).tolist():
-        if n not in files:
-            why = f"expected a file for every measured raw frame, found none for {n}"
-            fix = "complete the folder, or set measured to false"
-            problems.errors.append(
-                InputError("quads: no such file", where=root / "tof", why=why, fix=fix)
-            )
+    for n in sorted({*np.flatnonzero(measured).tolist()} - files.keys()):
+        why = f"expected a file for every measured raw frame, found none for {n}"
+        fix = "complete the folder, or set measured to false"
+        problems.add("quads: no such file", root / "tof", why, fix)
     quads = empty_quads(root, frames, {"H": height, "W": width})
     images: dict[str, Any] = {"forward_flow": {}, "backward_flow": {}, "colour": {}}
     for n, file, parts in _read(root, files, digests, problems):
@@ -68,9 +62,7 @@ def read(root: Path, frame_rate_hz: float | None) -> Sequence:
             flow = problems.attempt(_image, file, parts, name, (height, width))
             if flow is not None:
                 images[name][n] = flow
-    colour_size = (
-        tuple(int(n) for n in values["colour_size"][::-1]) if "colour_size" in values else None
-    )
+    colour_size = tuple(values["colour_size"][::-1].tolist()) if "colour_size" in values else None
     for n, file, parts in _read(root, _files(root, "colour", frames, problems), digests, problems):
         image = problems.attempt(_image, file, parts, "colour", colour_size)
         if image is not None:
@@ -78,6 +70,10 @@ def read(root: Path, frame_rate_hz: float | None) -> Sequence:
     problems.raise_if_any(root)
     frequencies = values["f_mod_hz"]
     lens = tuple(values["distortion"].tolist()) if "distortion" in values else None
+
+    def optional(name: str, convert: Callable[[Any], T]) -> T | None:
+        return convert(values[name]) if name in values else None
+
     return Sequence(
         quads=quads,
         measured=measured,
@@ -91,20 +87,18 @@ def read(root: Path, frame_rate_hz: float | None) -> Sequence:
             f_mod_hz=float(frequencies[0]),
             phase_offset=float(values["phase_offset"]),
             dc_offset=float(values["dc_offset"]),
-            quad_scale=float(values["raw_scale"]) if "raw_scale" in values else None,
-            cycle_length=int(values["cycle"]) if "cycle" in values else None,
+            quad_scale=optional("raw_scale", float),
+            cycle_length=optional("cycle", int),
             settings=values.get("sensor_settings", {}),
         ),
         from_phasors=values["kind"] == "phasor",
         colour=ColourCamera(
             images=images["colour"],
-            intrinsics=_intrinsics(values["colour_intrinsics"])
-            if "colour_intrinsics" in values
-            else None,
-            camera_from_world=inverse(values["colour_pose"]) if "colour_pose" in values else None,
+            intrinsics=optional("colour_intrinsics", _intrinsics),
+            camera_from_world=optional("colour_pose", inverse),
         ),
         flow=Flow(forward=images["forward_flow"], backward=images["backward_flow"]),
-        novel_from_world=inverse(values["novel"]) if "novel" in values else None,
+        novel_from_world=optional("novel", inverse),
         sources=_sources(values, images, int(measured.sum())),
         path=root,
     )
@@ -113,12 +107,8 @@ def read(root: Path, frame_rate_hz: float | None) -> Sequence:
 def read_truth(root: Path, frames: int) -> Truth | None:
     """Read the ground truth: both distances, amplitude, objects and layers; None if there is none.
 
-    A layer is NaN in raw frames without it. Parts that data_specs/capture.toml does not describe
-    are ignored.
-
-    Args:
-        root: The folder.
-        frames: Number F of raw frames of the sequence.
+    A layer is NaN in raw frames without it; parts that data_specs/capture.toml does not describe
+    are ignored. ``frames`` is the number F of raw frames of the sequence.
 
     Raises:
         InputError: If an image is not what data_specs/capture.toml describes.
@@ -139,35 +129,31 @@ def read_truth(root: Path, frames: int) -> Truth | None:
             if image is None:
                 continue
             if name not in stacks:
-                stacks[name] = np.full(
-                    (frames, height, width), 0 if name == "object" else np.nan, dtype=image.dtype
-                )
+                empty = 0 if name == "object" else np.nan
+                stacks[name] = np.full((frames, height, width), empty, dtype=image.dtype)
             if name != "object" and (image < 0).any():
                 why = f"expected 0 or more, or NaN where unknown, found {np.nanmin(image):g}"
-                fix = "store NaN where it is unknown"
-                problems.errors.append(
-                    InputError(f"{name}: negative", where=file, why=why, fix=fix)
-                )
+                problems.add(f"{name}: negative", file, why, "store NaN where it is unknown")
             stacks[name][n] = image
             known[n] |= name == "distance"
         for name in parts:
             image = problems.attempt(_layer, file, parts, name, (height, width))
             if image is not None:
-                layers.setdefault(name, np.full((frames, *image.shape), np.nan, dtype=np.float32))[
-                    n
-                ] = image
+                empty_layer = np.full((frames, *image.shape), np.nan, dtype=np.float32)
+                layers.setdefault(name, empty_layer)[n] = image
     problems.raise_if_any(root)
     if "distance" not in stacks:
         return None
     distance = np.where(stacks["distance"] == 0, np.float32(np.nan), stacks["distance"])
-    body = stacks["object"].astype(np.int64) - 1 if "object" in stacks else None
-    more = {name: stacks.get(name) for name in ("phasor_distance", "amplitude")}
     return Truth(
         distance=distance,
         known=known,
-        body=None if body is None else body.astype(np.int32),
+        phasor_distance=stacks.get("phasor_distance"),
+        amplitude=stacks.get("amplitude"),
+        body=(stacks["object"].astype(np.int64) - 1).astype(np.int32)
+        if "object" in stacks
+        else None,
         layers=layers,
-        **more,
     )
 
 
@@ -177,7 +163,7 @@ def _files(root: Path, folder: str, frames: int, problems: Problems) -> dict[int
     for n, file in found.items():
         if n >= frames or not file.resolve().is_relative_to(root.resolve()):
             why = f"expected files of raw frames below {frames}, in this folder; found {n}"
-            problems.errors.append(InputError("no raw frame", where=file, why=why, fix="remove it"))
+            problems.add("no raw frame", file, why, "remove it")
     return {n: file for n, file in found.items() if n < frames}
 
 
@@ -187,15 +173,12 @@ def _manifest(root: Path) -> dict[str, str]:
     if not path.is_file():
         return {}
     digests = {}
-    for number, line in enumerate(
-        path.read_text(encoding="utf-8", errors="replace").splitlines(), start=1
-    ):
+    text = path.read_text(encoding="utf-8", errors="replace")
+    for number, line in enumerate(text.splitlines(), start=1):
         match = re.fullmatch(r"([0-9a-f]{64})  (\S+)", line)
         if match is None:
-            why = (
-                f"expected 64 hexadecimal digits, two blanks and a name, found {line[:80]!r} "
-                f"in line {number}"
-            )
+            why = "expected 64 hexadecimal digits, two blanks and a name, found "
+            why += f"{line[:80]!r} in line {number}"
             raise InputError("no manifest", where=path, why=why, fix="copy it again, or remove it")
         digests[match[2]] = match[1]
     _verify(root, root / NAME, digests)
@@ -206,11 +189,8 @@ def _verify(root: Path, file: Path, digests: dict[str, str]) -> None:
     """Compare a file with the manifest, if there is one."""
     name = file.relative_to(root).as_posix()
     if digests and hashlib.sha256(file.read_bytes()).hexdigest() != digests.get(name):
-        why = (
-            f"its SHA-256 is not that of {MANIFEST}"
-            if name in digests
-            else f"{MANIFEST} does not name it"
-        )
+        other = f"its SHA-256 is not that of {MANIFEST}"
+        why = other if name in digests else f"{MANIFEST} does not name it"
         fix = f"restore it, or remove {MANIFEST} if the change was yours"
         raise InputError("content changed", where=file, why=why, fix=fix)
 
@@ -237,9 +217,7 @@ def _layer(file: Path, parts: Parts, name: str, shape: tuple[int, ...]) -> np.nd
 
 
 def _image(file: Path, parts: Parts, name: str, shape: tuple[int, ...] | None) -> np.ndarray | None:
-    """One field of a file, channels first if there are several, last of colour;
-    None if an optional one is absent.
-    """
+    """One field of a file, channels first, of colour last; None if it is optional and absent."""
     field = specs.fields(FORMAT)[name]
     if field.key not in parts:
         if not field.required:
@@ -259,101 +237,60 @@ def _channels(
 ) -> list[np.ndarray]:
     """The channels of a part in the order of its description, checked."""
     images = [channels[channel] for channel in field.channels if channel in channels]
-    kinds = {image.dtype.kind for image in images}
-    if (
-        len(images) != len(channels)
-        or len(images) != len(field.channels)
-        or kinds != {field.dtypes}
-    ):
-        why = (
-            f"expected channels {', '.join(field.channels)}, found {', '.join(channels)} of "
-            f"kinds {kinds}"
-        )
-        raise InputError(
-            f"{name}: wrong channels", where=file, why=why, fix="export the file again"
-        )
+    kinds, again = {image.dtype.kind for image in images}, "export the file again"
+    if not len(images) == len(channels) == len(field.channels) or kinds != {field.dtypes}:
+        why = f"expected channels {', '.join(field.channels)}, found {', '.join(channels)} of "
+        why += f"kinds {kinds}"
+        raise InputError(f"{name}: wrong channels", where=file, why=why, fix=again)
     if shape is None or images[0].shape != shape:
         why = f"expected rows x columns {shape}, found {images[0].shape}"
-        raise InputError(
-            f"{name}: wrong shape", where=file, why=why, fix=f"export that size, or correct {NAME}"
-        )
+        fix = f"export that size, or correct {NAME}"
+        raise InputError(f"{name}: wrong shape", where=file, why=why, fix=fix)
     for image in images if field.dtypes == "f" else []:
         if np.isinf(image).any() or (field.nan == "error" and np.isnan(image).any()):
-            why = (
-                f"expected finite "
-                f"numbers{' or NaN for unknown' if field.nan == 'unknown' else ''}, found "
-                f"others"
-            )
-            raise InputError(
-                f"{name}: not finite", where=file, why=why, fix="export the file again"
-            )
+            unknown = " or NaN for unknown" if field.nan == "unknown" else ""
+            why = f"expected finite numbers{unknown}, found others"
+            raise InputError(f"{name}: not finite", where=file, why=why, fix=again)
     return images
 
 
 def _judge(path: Path, values: dict[str, Any], problems: Problems) -> None:
     """Bounds of the values of capture.json, and their consistency."""
-    frames, width = len(values["id"]), float(values["size"][0])
-    times, frequencies = values["time"], values["f_mod_hz"]
-    poses = [values[name] for name in ("pose", "colour_pose", "novel") if name in values]
-    rules = {  # field: (whether it holds, what is expected)
-        "size": (
-            ((values["size"] >= 1) & (values["size"] <= SIDE_MAX)).all(),
-            f"1 to {SIDE_MAX} pixels",
-        ),
-        "id": (
-            np.array_equal(values["id"], np.arange(frames)) and frames < FRAMES_MAX,
-            "0, 1, 2 and so on, one for each raw frame",
-        ),
-        "time": (
-            times[0] == 0 and (np.diff(times) >= 0).all(),
-            "seconds from 0 that never decrease",
-        ),
-        "f_mod_hz": (
-            ((frequencies > 0) & (frequencies * DEPTH_RANGES_M[0] <= SPEED_OF_LIGHT)).all()
-            and (frequencies * DEPTH_RANGES_M[1] >= SPEED_OF_LIGHT).all(),
-            f"{SPEED_OF_LIGHT / DEPTH_RANGES_M[1]:.3g} to "
-            f"{SPEED_OF_LIGHT / DEPTH_RANGES_M[0]:.3g} Hz",
-        ),
-        "exposure": ("exposure" not in values or (values["exposure"] > 0).all(), "seconds above 0"),
-        "measured": (values["measured"].any(), "at least one measured raw frame"),
-        "intrinsics": (
-            _is_pinhole(values["intrinsics"], width),
-            "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels",
-        ),
-        "colour_intrinsics": (
-            "colour_intrinsics" not in values
-            or (
-                "colour_size" in values
-                and _is_pinhole(values["colour_intrinsics"], float(values["colour_size"][0]))
-            ),
-            "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels, and a size",
-        ),
-        "cycle": (
-            _is_cycle(values),
-            "raw frames of a cycle: three or more shifts at each of its frequencies",
-        ),
-        "raw_scale": ("raw_scale" not in values or values["raw_scale"] > 0, "more than 0"),
-        "pose": (
-            all(rigid(matrices).all() for matrices in poses),
-            "rotations and translations, camera to world",
-        ),
-    }
-    for name, (holds, expected) in rules.items():
+
+    def require(name: str, holds: object, expected: str) -> None:
         if not holds:
             key = json_fields()[name].key
-            error = InputError(
-                f"{key}: implausible",
-                where=path,
-                why=f"expected {expected}",
-                fix="correct the file",
-            )
-            problems.errors.append(error)
+            problems.add(f"{key}: implausible", path, f"expected {expected}", "correct the file")
+
+    frames, size = len(values["id"]), values["size"]
+    require("size", ((size >= 1) & (size <= SIDE_MAX)).all(), f"1 to {SIDE_MAX} pixels")
+    holds = np.array_equal(values["id"], np.arange(frames)) and frames < FRAMES_MAX
+    require("id", holds, "0, 1, 2 and so on, one for each raw frame")
+    times, frequencies = values["time"], values["f_mod_hz"]
+    holds = times[0] == 0 and (np.diff(times) >= 0).all()
+    require("time", holds, "seconds from 0 that never decrease")
+    low, high = DEPTH_RANGES_M
+    holds = ((frequencies * low <= SPEED_OF_LIGHT) & (frequencies * high >= SPEED_OF_LIGHT)).all()
+    require("f_mod_hz", holds, f"{SPEED_OF_LIGHT / high:.3g} to {SPEED_OF_LIGHT / low:.3g} Hz")
+    require("exposure", (values.get("exposure", np.ones(1)) > 0).all(), "seconds above 0")
+    require("measured", values["measured"].any(), "at least one measured raw frame")
+    pinhole = "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels"
+    require("intrinsics", _is_pinhole(values["intrinsics"], float(size[0])), pinhole)
+    holds = "colour_intrinsics" not in values or (
+        "colour_size" in values
+        and _is_pinhole(values["colour_intrinsics"], float(values["colour_size"][0]))
+    )
+    require("colour_intrinsics", holds, f"{pinhole}, and a size")
+    expected = "raw frames of a cycle: three or more shifts at each of its frequencies"
+    require("cycle", _is_cycle(values), expected)
+    require("raw_scale", values.get("raw_scale", 1.0) > 0, "more than 0")
+    poses = [values[name] for name in ("pose", "colour_pose", "novel") if name in values]
+    holds = all(rigid(matrices).all() for matrices in poses)
+    require("pose", holds, "rotations and translations, camera to world")
 
 
 def _is_cycle(values: dict[str, Any]) -> bool:
-    """Whether a stated cycle, as far as it was recorded,
-    has three raw frames or more at each of its frequencies.
-    """
+    """Whether a stated cycle has three raw frames or more at each frequency, where recorded."""
     if "cycle" not in values:
         return True
     length, frequencies = int(values["cycle"]), values["f_mod_hz"]
@@ -384,11 +321,10 @@ def _sources(
     for field in specs.fields(FORMAT).values():
         for name in field.fills:
             there = field.name in values if field.kind == "json" else bool(images.get(name, True))
-            place = (
-                f"{NAME} {field.key}" if field.kind == "json" else field.paths[0].partition("/")[0]
-            )
+            folder = field.paths[0].partition("/")[0]
+            file = f"{NAME} {field.key}" if field.kind == "json" else folder
             if field.role != "truth":
-                sources[name] = f"file {place}" if there else "default none"
+                sources[name] = f"file {file}" if there else "default none"
     for name, found in images.items():
         sources[name] += f", {len(found)} images" if found else ""
     sources["measured"] += f": {measured} of {len(values['id'])} raw frames"

@@ -34,31 +34,19 @@ def json_fields() -> dict[str, specs.Field]:
 
 
 def read_values(root: Path) -> dict[str, Any]:
-    """Values of capture.json by field name: texts, objects, and arrays for numbers; what is absent
-    is left out.
+    """Values of capture.json by field name: texts, objects and arrays; without absent fields.
 
     Raises:
-        InputError: If the file is not what data_specs/capture.toml describes; names all of it at
-            once.
+        InputError: If it is not what data_specs/capture.toml describes; lists all problems.
     """
     path, problems = root / NAME, Problems()
     content = _load(path)
     frames = content.get(FRAMES)
-    if (
-        not isinstance(frames, list)
-        or not frames
-        or not all(isinstance(frame, dict) for frame in frames)
-    ):
+    if not isinstance(frames, list) or {type(frame) for frame in frames} != {dict}:
         raise _wrong(path, FRAMES, "a list with an object for every raw frame", frames)
-    version = content.get("version")
+    version, fix = content.get("version"), "use a newer version of this program"
     if not isinstance(version, str) or version.partition(".")[0] != "1":
-        raise _wrong(
-            path,
-            "version",
-            "1.x, which this program reads",
-            version,
-            "use a newer version of this program",
-        )
+        raise _wrong(path, "version", "1.x, which this program reads", version, fix)
     problems.attempt(_refuse_unknown, path, content)
     for number, frame in enumerate(frames):
         problems.attempt(_refuse_unknown, path, frame, f"{FRAMES}[{number}]", f"{FRAMES}.")
@@ -74,22 +62,15 @@ def read_values(root: Path) -> dict[str, Any]:
 def _load(path: Path) -> dict[str, Any]:
     try:
         if path.stat().st_size > BYTES_MAX:
-            raise InputError(
-                "file too large",
-                where=path,
-                why=f"more than {BYTES_MAX} bytes",
-                fix="split the recording",
-            )
+            why, fix = f"more than {BYTES_MAX} bytes", "split the recording"
+            raise InputError("file too large", where=path, why=why, fix=fix)
         content = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
-        why = error.strerror or str(error)
-        raise InputError(
-            "cannot be read", where=path, why=why, fix="check permissions and the disk"
-        ) from error
+        why, fix = error.strerror or str(error), "check permissions and the disk"
+        raise InputError("cannot be read", where=path, why=why, fix=fix) from error
     except (ValueError, RecursionError) as error:
-        raise InputError(
-            "no JSON", where=path, why=str(error)[:200], fix="correct the file"
-        ) from error
+        why, fix = str(error)[:200], "correct the file"
+        raise InputError("no JSON", where=path, why=why, fix=fix) from error
     if not isinstance(content, dict):
         raise _wrong(path, "the whole file", "an object", content)
     return content
@@ -104,16 +85,9 @@ def _refuse_unknown(path: Path, table: dict[str, Any], where: str = "", prefix: 
         if key.startswith("x-") or full in known:
             continue
         if not inside:
-            names = sorted(
-                {k.removeprefix(prefix).partition(".")[0] for k in known if k.startswith(prefix)}
-            )
-            raise _wrong(
-                path,
-                f"{where or 'the top'}",
-                f"keys {', '.join(names)}, or x-..",
-                key,
-                "correct the key",
-            )
+            below = [k.removeprefix(prefix) for k in known if k.startswith(prefix)]
+            expected = f"keys {', '.join(sorted({k.partition('.')[0] for k in below}))}, or x-.."
+            raise _wrong(path, where or "the top", expected, key, "correct the key")
         if full != FRAMES and isinstance(value, dict):
             _refuse_unknown(path, value, full, f"{full}.")
 
@@ -126,9 +100,8 @@ def _value(path: Path, content: dict[str, Any], field: specs.Field) -> Any:
         if not any(there) and not field.required:
             return None
         if not all(there):
-            raise _wrong(
-                path, f"{FRAMES}[{there.index(False)}].{key}", "a value for every raw frame", None
-            )
+            where = f"{FRAMES}[{there.index(False)}].{key}"
+            raise _wrong(path, where, "a value for every raw frame", None)
         return _array(path, field, [frame[key] for frame in content[FRAMES]])
     value: Any = content
     for key in field.key.split("."):
@@ -155,11 +128,8 @@ def _array(path: Path, field: specs.Field, value: Any) -> np.ndarray:
         for want, got in zip(field.shapes[0], shape, strict=False)
     )
     # a bool is an int to isinstance
-    if (
-        not fits
-        or math.prod(shape) != len(leaves)
-        or not all(type(leaf) in allowed for leaf in leaves)
-    ):
+    numbers = math.prod(shape) == len(leaves) and all(type(leaf) in allowed for leaf in leaves)
+    if not fits or not numbers:
         want = f"{WORDS[field.dtypes[0]]} of shape ({', '.join(map(str, field.shapes[0]))})"
         raise _wrong(path, field.key, want, value)
     kind = np.dtype({"f": "f8", "i": "i8", "b": "?"}[field.dtypes[0]])
@@ -173,9 +143,7 @@ def _array(path: Path, field: specs.Field, value: Any) -> np.ndarray:
 
 
 def _flatten(value: Any) -> tuple[list[Any], tuple[int, ...]]:
-    """Leaves and shape of nested lists; an uneven nesting has fewer or more leaves than its shape
-    says.
-    """
+    """Leaves and shape of nested lists; the length of an uneven axis is -1."""
     if not isinstance(value, list):
         return [value], ()
     inner = [_flatten(item) for item in value]
@@ -189,9 +157,5 @@ def _wrong(
 ) -> InputError:
     text = "nothing" if found is None else json.dumps(found, default=str)
     shown = text if len(text) <= 80 else f"{text[:77]}..."
-    return InputError(
-        f"{where}: not valid in a capture",
-        where=path,
-        why=f"expected {expected}, found {shown}",
-        fix=fix,
-    )
+    why = f"expected {expected}, found {shown}"
+    return InputError(f"{where}: not valid in a capture", where=path, why=why, fix=fix)

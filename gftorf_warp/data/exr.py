@@ -1,5 +1,4 @@
-"""OpenEXR files: images of named channels, in one part or several; every written file is read back
-and compared.
+"""OpenEXR files of named channels, in one part or several; files are read back after writing.
 
 A file of one part is not compressed: the last bits of float32 are noise, so that compressing six
 320x240 images takes 20 ms of a CPU and leaves four fifths of their size. Parts of a capture are
@@ -31,13 +30,10 @@ Parts = dict[str, Channels]
 def write_exr(
     path: str | Path, channels: Mapping[str, np.ndarray], *, one_of: bool = False
 ) -> None:
-    """Write named float32 images of one size as an OpenEXR file of one part, atomically.
+    """Write images [H, W] of one size as float32 in an OpenEXR file of one part, atomically.
 
-    Args:
-        path: The file; its folder must exist.
-        channels: Images [H, W] by name, for example ``{"distance": ..., "quads.0": ...}``; any real
-            type that float32 holds. Viewers show the names R, G, B as colour. NaN is kept.
-        one_of: Whether it is one of the files of a folder inside ``files.many_files``.
+    NaN is kept; viewers show the names R, G, B as colour. ``one_of``: whether it is a file inside
+    ``files.many_files``.
 
     Raises:
         ValueError: If there are no channels, or their shapes differ or are not [H, W].
@@ -58,10 +54,7 @@ def write_exr(
 def write_parts(path: str | Path, parts: Mapping[str, Mapping[str, np.ndarray]]) -> None:
     """Write a new OpenEXR file of several parts, losslessly compressed, and flush it to the disk.
 
-    Args:
-        path: A file that does not exist; its folder must exist.
-        parts: Channels [H, W] by name, by name of the part; all of one size, float32 or uint32. NaN
-            is kept.
+    ``parts`` are channels [H, W] by name, by name of the part; all of one size, float32 or uint32.
 
     Raises:
         ValueError: If there is nothing to write, or sizes or types do not fit.
@@ -101,47 +94,33 @@ def read_parts(path: str | Path) -> Parts:
     """
     path = Path(path)
     parts = _read(path, PARTS_MAX)
-    other = {
-        str(image.dtype)
-        for channels in parts.values()
-        for image in channels.values()
-        if image.dtype not in TYPES
-    }
-    if other:
-        raise _unreadable(path, PARTS_MAX, f"{', '.join(other)} instead of float32")
+    types = {image.dtype for channels in parts.values() for image in channels.values()}
+    if types - TYPES:
+        found = ", ".join(map(str, types - TYPES))
+        raise _unreadable(path, PARTS_MAX, f"{found} instead of float32")
     return parts
 
 
 def _check_images(parts: list[Channels]) -> None:
-    """One size and known types; OpenEXR writes wrong pixels of slices,
-    flips and Fortran order without an error.
-    """
+    """Check sizes and types: OpenEXR writes wrong pixels without an error."""
     images = [image for channels in parts for image in channels.values()]
-    found = {(image.shape, image.dtype) for image in images}
-    if (
-        len({shape for shape, _ in found}) != 1
-        or images[0].ndim != 2
-        or not {t for _, t in found} <= TYPES
-    ):
-        kinds = ", ".join(sorted(map(str, found))) or "none"
-        raise ValueError(
-            f"channels must be float32 or uint32 images [H, W] of one shape, got {kinds}"
-        )
+    shapes, types = {image.shape for image in images}, {image.dtype for image in images}
+    if len(shapes) != 1 or images[0].ndim != 2 or not types <= TYPES:
+        kinds = ", ".join(sorted({str((i.shape, i.dtype)) for i in images})) or "none"
+        expected = "channels must be float32 or uint32 images [H, W] of one shape"
+        raise ValueError(f"{expected}, got {kinds}")
 
 
 def _write(path: Path, file: Any, parts: list[Channels], where: Path) -> None:
-    """Write a file of OpenEXR's and compare it: the library does not notice a full disk at the end
-    of a file.
-    """
+    """Write a file and compare it: OpenEXR does not notice a full disk at the end of a file."""
     # so that a folder without permission and a full disk are different errors
     path.touch(exist_ok=False)
     try:
         with file:
             file.write(str(path))
     except RuntimeError as error:
-        raise ResourceError(
-            "cannot write picture", where=where, why=str(error), fix="free disk space"
-        ) from error
+        why, fix = str(error), "free disk space"
+        raise ResourceError("cannot write picture", where=where, why=why, fix=fix) from error
     try:
         back = list(_read(path, PARTS_MAX).values())
     except InputError:
@@ -156,9 +135,8 @@ def _read(path: Path, parts_max: int) -> Parts:
     import OpenEXR
 
     if not path.is_file():
-        raise InputError(
-            "no such picture", where=path, why="expected an OpenEXR file", fix="check the path"
-        )
+        why, fix = "expected an OpenEXR file", "check the path"
+        raise InputError("no such picture", where=path, why=why, fix=fix)
     try:
         with OpenEXR.File(str(path), separate_channels=True, header_only=True) as file:
             stated = [_stated(part.header) for part in file.parts]
@@ -167,9 +145,7 @@ def _read(path: Path, parts_max: int) -> Parts:
             raise ValueError(f"{len(stated)} parts")
         with OpenEXR.File(str(path), separate_channels=True) as file:
             parts = {
-                part.name(): {
-                    name: np.array(channel.pixels) for name, channel in part.channels.items()
-                }
+                part.name(): {c: np.array(channel.pixels) for c, channel in part.channels.items()}
                 for part in file.parts
             }
         for (shape, channels), got in zip(stated, parts.values(), strict=True):
@@ -183,9 +159,8 @@ def _read(path: Path, parts_max: int) -> Parts:
 def _unreadable(path: Path, parts_max: int, found: str) -> InputError:
     count = "one whole OpenEXR part" if parts_max == 1 else "whole OpenEXR parts"
     why = f"expected {count} of at most {SIDE_MAX}x{SIDE_MAX} in float32, found {found}"
-    return InputError(
-        "unreadable picture", where=path, why=why, fix="copy or export the file again"
-    )
+    fix = "copy or export the file again"
+    return InputError("unreadable picture", where=path, why=why, fix=fix)
 
 
 def _stated(header: Mapping) -> tuple[tuple[int, int], set[str]]:
@@ -193,9 +168,8 @@ def _stated(header: Mapping) -> tuple[tuple[int, int], set[str]]:
     low, high = header["dataWindow"]
     width, height = (int(b) - int(a) + 1 for a, b in zip(low, high, strict=True))
     channels = header["channels"]
-    if not (
-        1 <= width <= SIDE_MAX and 1 <= height <= SIDE_MAX and 1 <= len(channels) <= CHANNELS_MAX
-    ):
+    sized = 1 <= width <= SIDE_MAX and 1 <= height <= SIDE_MAX
+    if not (sized and 1 <= len(channels) <= CHANNELS_MAX):
         raise ValueError(f"a part of {width}x{height} with {len(channels)} channels")
     if any(channel.xSampling != 1 or channel.ySampling != 1 for channel in channels):
         raise ValueError("subsampled channels")

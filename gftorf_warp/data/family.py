@@ -1,5 +1,4 @@
-"""F-TöRF and TöRF folders as sequences: numbered arrays of raw quads or of phasors, and cams/ with
-calibration.
+"""F-TöRF and TöRF folders as sequences: numbered raw quads or phasors, and calibration in cams/.
 
 A folder of N phasors becomes 4 N raw frames: quartet i has re/2, -re/2, im/2, -im/2 of phasor i,
 the canonical shifts, one time and one pose. Their differences are the phasor again, exactly, since
@@ -8,12 +7,12 @@ halving a float32 is exact.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from ..errors import InputError
 from . import specs
 from .calibration import read_calibration, read_colour_intrinsics, read_shifts, read_times
 from .folder import empty_quads, first_size, load, numbered, read_field
@@ -59,10 +58,7 @@ class Stored:
 def read_sequence(stored: Stored, frame_rate_hz: float | None) -> Sequence:
     """Read the images, calibration, colour, flow and novel views of a folder, never truth or masks.
 
-    Args:
-        stored: The folder.
-        frame_rate_hz: Images per second; None takes the folder's times, or the default rate if it
-            states none.
+    ``frame_rate_hz`` are images per second; None: the folder's times, or else the default rate.
 
     Raises:
         InputError: If a file is not what data_specs/ describes; names all of them at once.
@@ -73,8 +69,8 @@ def read_sequence(stored: Stored, frame_rate_hz: float | None) -> Sequence:
     problems, sources = Problems(), dict.fromkeys(ABSENT, "default none")
     size = stored.size(problems)
     if not (root / "cams").is_dir():
-        why, fix = "expected a folder cams with tof_intrinsics, found none", "complete the folder"
-        problems.errors.append(InputError("cams missing", where=root, why=why, fix=fix))
+        why = "expected a folder cams with tof_intrinsics, found none"
+        problems.add("cams missing", root, why, "complete the folder")
     calibrated = read_calibration(root, form, problems, size.get("W"))
     sources |= calibrated.sources
     count = max(stored.files) + 1
@@ -109,9 +105,10 @@ def read_sequence(stored: Stored, frame_rate_hz: float | None) -> Sequence:
     assert poses is not None
     measured = np.isin(np.arange(count), list(stored.files))
     sources["measured"] = f"file {len(stored.files)} of {count} {stored.counted}{stored.note}"
-    sources["from_phasors"] = sources["quads"].partition(",")[0] + (
-        ": raw quads" if step == 1 else ": phasors"
-    )
+    kind = "raw quads" if step == 1 else "phasors"
+    sources["from_phasors"] = f"{sources['quads'].partition(',')[0]}: {kind}"
+    if colour_poses is not None:
+        colour_poses = np.repeat(colour_poses, step, axis=0)
     return Sequence(
         quads=quads,
         measured=np.repeat(measured, step),
@@ -121,13 +118,7 @@ def read_sequence(stored: Stored, frame_rate_hz: float | None) -> Sequence:
         intrinsics=calibrated.intrinsics,
         calibration=calibrated.calibration,
         from_phasors=step > 1,
-        colour=ColourCamera(
-            images=colour.images,
-            intrinsics=intrinsics,
-            camera_from_world=None
-            if colour_poses is None
-            else np.repeat(colour_poses, step, axis=0),
-        ),
+        colour=replace(colour, intrinsics=intrinsics, camera_from_world=colour_poses),
         flow=Flow(forward=images["forward_flow"], backward=images["backward_flow"]),
         novel_from_world=novel,
         sources=sources,
@@ -142,43 +133,35 @@ def _quads_of(phasor: np.ndarray) -> tuple[np.ndarray, ...]:
 
 
 def read_distances(stored: Stored, frames: int) -> Truth | None:
-    """Read the true distances stored with a sequence, each for all raw frames of its image.
+    """Read the true distances stored with a sequence of F = ``frames`` raw frames, each for all raw
+    frames of its image; None if there are none.
 
-    Args:
-        stored: The folder.
-        frames: Number F of raw frames of the sequence; later ids are not read.
-
-    Returns:
-        Truth, with NaN where the file has NaN or 0 and at frames without a file; None if no frame
-        has a file.
+    They are NaN where the file has NaN or 0, and at frames without a file.
 
     Raises:
         InputError: If a distance image is not what data_specs/ describes.
     """
     root, step, fields, problems = stored.root, stored.step, specs.fields(stored.form), Problems()
     size = stored.size(problems)
-    stacks, known = {}, np.zeros(frames, dtype=bool)
+    stacks: dict[str, Any] = {}
+    known = np.zeros(frames, dtype=bool)
     for name in ("distance", "phasor_distance"):
         images, _ = read_field(root, fields[name], frames // step, size, problems, stored.first_id)
         stack = np.full((frames, size.get("H", 1), size.get("W", 1)), np.nan, dtype=np.float32)
         for i, image in images.items():
             frames_of = slice(step * i, step * (i + 1))
             if name == "distance" and (image < 0).any():
-                problems.errors.append(_negative(stored, i, image))
+                folders = (numbered(root, pattern) for pattern in fields[name].paths)
+                file = next(filter(None, folders))[i + stored.first_id]
+                why = (
+                    f"expected metres along the ray, NaN where unknown, found {np.nanmin(image):g}"
+                )
+                fix = "store NaN where the distance is unknown"
+                problems.add("distance: negative", file, why, fix)
             stack[frames_of] = np.where(image == 0, np.nan, image) if name == "distance" else image
             known[frames_of] |= name == "distance"
         stacks[name] = stack if images else None
     problems.raise_if_any(root)
     if stacks["distance"] is None:
         return None
-    return Truth(
-        distance=stacks["distance"], known=known, phasor_distance=stacks["phasor_distance"]
-    )
-
-
-def _negative(stored: Stored, i: int, image: np.ndarray) -> InputError:
-    patterns = specs.fields(stored.form)["distance"].paths
-    files = next(filter(None, (numbered(stored.root, pattern) for pattern in patterns)))
-    why = f"expected metres along the ray, NaN where unknown, found {np.nanmin(image):g}"
-    fix = "store NaN where the distance is unknown"
-    return InputError("distance: negative", where=files[i + stored.first_id], why=why, fix=fix)
+    return Truth(known=known, **stacks)

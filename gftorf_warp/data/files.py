@@ -32,22 +32,17 @@ def atomic_write(path: str | Path, data: bytes | memoryview) -> None:
         ResourceError: If the disk is full.
         UsageError: If the file cannot be written.
     """
-    path = Path(path)
     sweep(path)
-    write_one_of_many(path, data)
-    with as_errors(path):
-        flush_folder(path.parent)
+    write_one_of_many(Path(path), data)
+    with as_errors(Path(path)):
+        flush_folder(Path(path).parent)
 
 
 @contextlib.contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
     """Temporary file name for a library to write to; the file replaces ``path`` at a normal end.
 
-    After an exception it is removed and the old content stays.
-
-    Raises:
-        ResourceError: If the disk is full.
-        UsageError: If the file cannot be written.
+    After an exception it is removed and the old content stays. Raises as :func:`atomic_write`.
     """
     path = Path(path)
     sweep(path)
@@ -60,10 +55,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 @contextlib.contextmanager
 def many_files(folder: str | Path) -> Iterator[None]:
     """Fill an existing folder by :func:`one_of_many` and :func:`write_one_of_many`: it is listed
-    and flushed once.
-
-    Listing it for every file makes each file cost as much as there are files already, and holds up
-    threads: Python's lock is released and taken again with every name.
+    and flushed once, since listing it for every file takes quadratic time and holds up threads.
 
     Raises:
         ResourceError, UsageError: If it cannot be flushed.
@@ -105,17 +97,15 @@ def write_json(path: str | Path, content: object) -> None:
     Raises:
         ValueError: If it contains NaN or infinity, which JSON cannot express: use None.
     """
-    atomic_write(
-        path, (json.dumps(content, indent=2, allow_nan=False, default=_plain) + "\n").encode()
-    )
+    text = json.dumps(content, indent=2, allow_nan=False, default=_plain)
+    atomic_write(path, f"{text}\n".encode())
 
 
 @contextlib.contextmanager
 def atomic_folder(path: str | Path) -> Iterator[Path]:
     """Temporary folder to fill, which is flushed and renamed to ``path`` at a normal end.
 
-    After an exception it is removed. Missing parents of ``path`` are created; if it exists, it must
-    be empty.
+    After an exception it is removed. Missing parents of ``path`` are created.
 
     Raises:
         UsageError: If the target exists and is not an empty folder, or cannot be written.
@@ -125,14 +115,11 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
     with as_errors(path):
         why = "expected a new or empty folder to write to, found"
         if path.is_symlink() or (path.exists() and not path.is_dir()):
-            raise UsageError(
-                "not a folder", where=path, why=f"{why} something else", fix="choose another path"
-            )
+            why, fix = f"{why} something else", "choose another path"
+            raise UsageError("not a folder", where=path, why=why, fix=fix)
         if path.is_dir() and any(path.iterdir()):
-            why, fix = (
-                f"{why} {len(list(path.iterdir()))} entries",
-                "choose another path, or remove the folder first",
-            )
+            why = f"{why} {len(list(path.iterdir()))} entries"
+            fix = "choose another path, or remove the folder first"
             raise UsageError("folder is not empty", where=path, why=why, fix=fix)
         made = [parent for parent in reversed(path.absolute().parents) if not parent.exists()]
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -156,9 +143,7 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
 
 
 def write_through(path: Path, data: bytes | memoryview) -> None:
-    """Create a file, flush it to the disk and check its size;
-    an OSError if it exists or is incomplete.
-    """
+    """Create a file, flush it to the disk and check its size; OSError if it exists or differs."""
     with open(path, "xb") as file:
         file.write(data)
         file.flush()
@@ -223,30 +208,23 @@ def _alive(pid: int) -> bool:
     except ProcessLookupError:
         return False
     except (PermissionError, OverflowError):
-        return True
+        pass
     return True
 
 
 @contextlib.contextmanager
 def as_errors(path: Path) -> Iterator[None]:
-    """Convert errors of the system while writing ``path``: ResourceError for a full disk,
-    else UsageError.
-    """
+    """Convert an OSError while writing ``path`` to ResourceError (full disk) or UsageError."""
     try:
         yield
     except GftorfError:
         raise
     except OSError as error:
+        why, fix = str(error), "choose a writable folder"
         if error.errno in _NO_SPACE:
-            raise ResourceError(
-                "no space left",
-                where=path,
-                why=str(error),
-                fix="free disk space, or write to another disk",
-            ) from error
-        raise UsageError(
-            "cannot write", where=path, why=str(error), fix="choose a writable folder"
-        ) from error
+            fix = "free disk space, or write to another disk"
+            raise ResourceError("no space left", where=path, why=why, fix=fix) from error
+        raise UsageError("cannot write", where=path, why=why, fix=fix) from error
 
 
 def _plain(value: object) -> object:

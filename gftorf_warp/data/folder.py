@@ -18,8 +18,7 @@ SLOT_FOLDERS = tuple(f"tofType{slot}" for slot in range(FRAMES_PER_QUARTET))
 PHASOR_FOLDER = "tof"
 EXPECTED = (
     "expected a folder with capture.json (a capture), tofType0 .. tofType3 and cams (F-ToeRF: "
-    "raw quads), or tof and "
-    "cams (ToeRF: phasors)"
+    "raw quads), or tof and cams (ToeRF: phasors)"
 )
 UNFINISHED = "unfinished.md"  # exists in the folder of an incomplete recording
 FRAMES_MAX = 1_000_000  # over two hours at 120 Hz: a higher id is a typing error
@@ -35,40 +34,24 @@ def format_of(path: Path) -> str:
     Raises:
         InputError: If it is neither; points to a sequence one level up or down, if there is one.
     """
+
+    def error(what: str, found: str, fix: str = "check the path") -> InputError:
+        return InputError(what, where=path, why=f"{EXPECTED}, found {found}", fix=fix)
+
+    if not path.exists():
+        raise error("no such folder", "nothing")
     if not path.is_dir():
-        raise InputError(
-            "no such folder" if not path.exists() else "not a folder",
-            where=path,
-            why=f"{EXPECTED}, found {'a file' if path.exists() else 'nothing'}",
-            fix="check the path",
-        )
+        raise error("not a folder", "a file")
     found = format_or_none(path)
     if found is not None:
         return found
     if (path / UNFINISHED).is_file():
-        raise InputError(
-            "an unfinished recording",
-            where=path,
-            why=f"{EXPECTED}, found files of an interrupted `gftorf simulate`",
-            fix="repeat that command, which continues",
-        )
-    for other in [
-        path.absolute().parent,
-        *sorted(entry for entry in path.iterdir() if entry.is_dir()),
-    ]:
+        files = "files of an interrupted `gftorf simulate`"
+        raise error("an unfinished recording", files, "repeat that command, which continues")
+    for other in [path.absolute().parent, *sorted(filter(Path.is_dir, path.iterdir()))]:
         if format_or_none(other) is not None:
-            raise InputError(
-                "one level off",
-                where=path,
-                why=f"{EXPECTED}, found one at {other}",
-                fix=f"use {other}",
-            )
-    raise InputError(
-        "not a sequence folder",
-        where=path,
-        why=f"{EXPECTED}, found none of them",
-        fix="check the path",
-    )
+            raise error("one level off", f"one at {other}", f"use {other}")
+    raise error("not a sequence folder", "none of them")
 
 
 def format_or_none(path: Path) -> str | None:
@@ -107,18 +90,13 @@ def refuse_absurd_ids(files: dict[int, Path]) -> None:
         InputError: If not.
     """
     if max(files) >= FRAMES_MAX:
-        raise InputError(
-            "frame id too large",
-            where=files[max(files)],
-            why=f"expected ids below {FRAMES_MAX}, found {max(files)}",
-            fix="count frames from 0000",
-        )
+        why = f"expected ids below {FRAMES_MAX}, found {max(files)}"
+        fix = "count frames from 0000"
+        raise InputError("frame id too large", where=files[max(files)], why=why, fix=fix)
 
 
 def first_size(files: dict[int, Path], spec: specs.Field, problems: Problems) -> dict[str, int]:
-    """Rows H and columns W in the first readable header; empty if there is none,
-    with the reasons in ``problems``.
-    """
+    """Rows H and columns W in the first readable header; without one empty, and the problems."""
     unread = Problems()
     for file in files.values():
         shape = unread.attempt(read_shape, file, spec)
@@ -137,26 +115,15 @@ def read_field(
     first_id: int = 0,
 ) -> tuple[dict[int, np.ndarray], str]:
     """Images of one field from the best folder that has any, by frame below ``frames``, and their
-    source.
-
-    Args:
-        root: The sequence.
-        spec: The field.
-        frames: Number of frames; files of later ones are not opened.
-        size: Rows H and columns W, if known.
-        problems: Collects errors.
-        first_id: Id of frame 0.
+    source; ``first_id`` is the id of frame 0.
     """
     for pattern in spec.paths:
         files = {n - first_id: file for n, file in numbered(root, pattern).items()}
         if files:
             used = {n: file for n, file in files.items() if 0 <= n < frames}
             images, source = load(root, spec, used, size, problems)
-            other = (
-                f"; {len(files) - len(used)} of later frames ignored"
-                if len(used) < len(files)
-                else ""
-            )
+            ignored = len(files) - len(used)
+            other = f"; {ignored} of later frames ignored" if ignored else ""
             return images, f"{source}, {len(used)} images{other}"
     return {}, "default none"
 
@@ -167,21 +134,13 @@ def load(
     """Read image files as float32; all have the shape of the first."""
     images: dict[int, np.ndarray] = {}
     rounded: str | None = None
-    bound = dict(size)
+    bound = size
     for n, file in files.items():
         array = problems.attempt(read_array, file, spec, bound)
         if array is None:
             continue
-        bound = (
-            dict(
-                zip(
-                    (s for s in spec.shapes[0] if isinstance(s, str)),
-                    _free(array, spec),
-                    strict=True,
-                )
-            )
-            | size
-        )
+        axes = zip(spec.shapes[0], array.shape, strict=True)
+        bound = {letter: n for letter, n in axes if isinstance(letter, str)} | size
         image = problems.attempt(as_float32, file, spec, array)
         if image is not None:
             images[n], lossy = image
@@ -200,16 +159,5 @@ def empty_quads(root: Path, frames: int, size: dict[str, int]) -> np.ndarray:
     try:
         return np.zeros((frames, size.get("H", 1), size.get("W", 1)), dtype=np.float32)
     except MemoryError as error:
-        raise ResourceError(
-            "not enough memory",
-            where=root,
-            why=f"{frames} frames of {size} do not fit",
-            fix="use a shorter recording",
-        ) from error
-
-
-def _free(array: np.ndarray, spec: specs.Field) -> list[int]:
-    """Lengths of the axes that have a letter in the field."""
-    return [
-        n for n, letter in zip(array.shape, spec.shapes[0], strict=True) if isinstance(letter, str)
-    ]
+        why, fix = f"{frames} frames of {size} do not fit", "use a shorter recording"
+        raise ResourceError("not enough memory", where=root, why=why, fix=fix) from error

@@ -22,21 +22,17 @@ SHIFT_TOLERANCE = 1e-6
 
 
 def stored(root: Path) -> Stored:
-    """The measured raw frames of a complete folder of this format; other files of tofType0 .. are
-    warped copies.
+    """The measured raw frames of a folder; other files of tofType0 .. are warped copies.
 
     Raises:
         InputError: If the folder is not complete, or has no raw frame.
     """
     missing = [name for name in (*SLOT_FOLDERS, "cams") if not (root / name).is_dir()]
     if missing:
-        raise InputError(
-            "not an F-ToeRF folder" if len(missing) > 1 else f"{missing[0]} missing",
-            where=root,
-            why=f"expected an F-ToeRF folder with tofType0 .. tofType3 and cams, found no "
-            f"{', '.join(missing)}",
-            fix="complete the folder",
-        )
+        what = "not an F-ToeRF folder" if len(missing) > 1 else f"{missing[0]} missing"
+        why = "expected an F-ToeRF folder with tofType0 .. tofType3 and cams, found no "
+        why += ", ".join(missing)
+        raise InputError(what, where=root, why=why, fix="complete the folder")
     pattern = specs.fields(FORMAT)["quads"].paths[0]
     measured: dict[int, Path] = {}
     copies = 0
@@ -46,14 +42,12 @@ def stored(root: Path) -> Stored:
         measured |= of_slot
         copies += len(files) - len(of_slot)
     if not measured:
-        raise InputError(
-            "no raw frames",
-            where=root / SLOT_FOLDERS[0],
-            why="expected files tofType{id % 4}/{id}.npy with ids of four digits, 0000.npy, "
-            "0004.npy, .., found none",
-            fix="name each measured quad by its raw frame",
-        )
+        why = "expected files tofType{id % 4}/{id}.npy with ids of four digits, 0000.npy, "
+        why += "0004.npy, .., found none"
+        fix = "name each measured quad by its raw frame"
+        raise InputError("no raw frames", where=root / SLOT_FOLDERS[0], why=why, fix=fix)
     refuse_absurd_ids(measured)
+    note = f"; {copies} files of another slot than their id's are warped copies, ignored"
     return Stored(
         root=root,
         form=FORMAT,
@@ -62,9 +56,7 @@ def stored(root: Path) -> Stored:
         counted="raw frames",
         step=1,
         rate_hz=FRAME_RATE_HZ,
-        note=f"; {copies} files of another slot than their id's are warped copies, ignored"
-        if copies
-        else "",
+        note=note if copies else "",
     )
 
 
@@ -80,16 +72,10 @@ def files(sequence: Sequence, truth: Truth | None) -> Iterator[tuple[str, bytes]
             of phasors.
     """
     if sequence.from_phasors:
-        raise inexpressible(
-            FORMAT,
-            "phasors",
-            "raw quads that were measured one by one",
-            "phasors: write format torf",
-        )
-    poses = sequence.camera_from_world
-    colour_poses = (
-        poses if sequence.colour.camera_from_world is None else sequence.colour.camera_from_world
-    )
+        expected = "raw quads that were measured one by one"
+        raise inexpressible(FORMAT, "phasors", expected, "phasors: write format torf")
+    poses, colour_poses = sequence.camera_from_world, sequence.colour.camera_from_world
+    colour_poses = poses if colour_poses is None else colour_poses
     yield from calibration_files(sequence, sequence.times, poses)
     yield "tof_permutation.npy", npy(_permutation(sequence))
     yield "cams/poses.json", json_bytes({"poses": "camera_from_world"})
@@ -99,12 +85,10 @@ def files(sequence: Sequence, truth: Truth | None) -> Iterator[tuple[str, bytes]
         yield f"tofType{n % FRAMES_PER_QUARTET}/{n:04d}.npy", npy(float32(sequence.quads[n]))
     for n, image in sequence.colour.images.items():
         yield f"color/{n:04d}.npy", npy(shortest(float32(image)))
-    for direction, images in (
-        ("forward", sequence.flow.forward),
-        ("backward", sequence.flow.backward),
-    ):
-        for n, image in images.items():
-            yield f"{direction}_flow_2/flow_{n:04d}.npy", npy(float32(image))
+    for n, image in sequence.flow.forward.items():
+        yield f"forward_flow_2/flow_{n:04d}.npy", npy(float32(image))
+    for n, image in sequence.flow.backward.items():
+        yield f"backward_flow_2/flow_{n:04d}.npy", npy(float32(image))
     if truth is not None:
         for n in np.flatnonzero(truth.known).tolist():
             yield f"synthetic_depth/{n:04d}.npy", npy(float32(truth.distance[n]))
@@ -123,18 +107,12 @@ def _permutation(sequence: Sequence) -> np.ndarray:
     channel = gap.argmin(axis=1)
     slots = [set(channel[slot::FRAMES_PER_QUARTET].tolist()) for slot in range(FRAMES_PER_QUARTET)]
     used = [next(iter(slot)) for slot in slots if len(slot) == 1]
-    if (
-        gap.min(axis=1).max() > SHIFT_TOLERANCE
-        or any(len(slot) > 1 for slot in slots)
-        or len(set(used)) < len(used)
-    ):
-        raise inexpressible(
-            FORMAT,
-            "phase shifts",
-            "each of the four slots to have its own of the shifts 0, pi, pi/2, 3 pi/2 in every "
-            "quartet",
-            f"{np.round(sequence.shifts[:8], 6).tolist()} .. over {sequence.frames} frames",
-        )
+    one_each = all(len(slot) <= 1 for slot in slots) and len(set(used)) == len(used)
+    if gap.min(axis=1).max() > SHIFT_TOLERANCE or not one_each:
+        expected = "each of the four slots to have its own of the shifts 0, pi, pi/2, 3 pi/2 in "
+        expected += "every quartet"
+        found = f"{np.round(sequence.shifts[:8], 6).tolist()} .. over {sequence.frames} frames"
+        raise inexpressible(FORMAT, "phase shifts", expected, found)
     # of a recording shorter than a quartet
     unused = iter(sorted(set(range(FRAMES_PER_QUARTET)) - set(used)))
     return np.argsort([next(iter(slot)) if slot else next(unused) for slot in slots])

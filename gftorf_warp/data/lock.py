@@ -1,6 +1,4 @@
-"""One process at a time in a folder: a lock that the system releases when the process ends,
-however it ends.
-"""
+"""One process at a time in a folder: a lock that the system releases when the process ends."""
 
 from __future__ import annotations
 
@@ -15,12 +13,9 @@ from ..errors import BusyError
 
 @contextmanager
 def locked(folder: Path, name: str, what: str) -> Iterator[None]:
-    """Hold ``FOLDER/NAME``, which names process and host.
+    """Hold the lock file ``name``, which names process and host, in a folder of ``what``.
 
-    Args:
-        folder: It is made if it is missing.
-        name: File name of the lock; it stays.
-        what: Content of the folder, for the message.
+    A missing folder is created; the file stays.
 
     Raises:
         BusyError: If another process, or another call in this one, holds it.
@@ -46,9 +41,7 @@ def locked(folder: Path, name: str, what: str) -> Iterator[None]:
 
 
 def _try_lock(descriptor: int) -> bool:
-    """Take the system's lock on an open file, without waiting;
-    on systems without one it always succeeds.
-    """
+    """Whether the system's lock on an open file was free; always, on systems without locks."""
     try:
         import fcntl
     except ImportError:  # not a Unix

@@ -21,20 +21,14 @@ def rigid(poses: np.ndarray) -> np.ndarray:
         defect = np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
         proper = np.linalg.det(rotation) > 0
     last_row = np.abs(poses[:, 3] - [0, 0, 0, 1]).max(axis=1)
-    return (
-        (defect <= ROTATION_TOLERANCE)
-        & proper
-        & (last_row <= ROTATION_TOLERANCE)
-        & np.isfinite(poses).all(axis=(1, 2))
-    )
+    finite = np.isfinite(poses).all(axis=(1, 2))
+    return (np.maximum(defect, last_row) <= ROTATION_TOLERANCE) & proper & finite
 
 
 def read_poses(root: Path, form: str, frames: int, sources: dict[str, str]) -> np.ndarray:
-    """camera_from_world of each image [F, 4, 4] [m]: of each raw frame of F-ToeRF, of each phasor
-    of ToeRF.
+    """camera_from_world [F, 4, 4] [m] of each raw frame of F-ToeRF, of each phasor of ToeRF.
 
-    Identity without a file; for F-ToeRF also with one, unless cams/poses.json says that its poses
-    are used.
+    Identity without a file; for F-ToeRF also with one, unless cams/poses.json enables its poses.
 
     Raises:
         InputError: If used poses are too few, too many, or no rigid motions.
@@ -44,29 +38,20 @@ def read_poses(root: Path, form: str, frames: int, sources: dict[str, str]) -> n
     sources["camera_from_world"] = f"file {name}"
     if form == "torf":
         if path.exists():
-            advice = (
-                "store one world-to-camera pose per phasor, or state the number of phasors "
-                "by cams/frame_times.npy"
-            )
+            advice = "store one world-to-camera pose per phasor, or state the number of phasors "
+            advice += "by cams/frame_times.npy"
             return _motions(root, spec, frames, "phasors", advice)
         sources["camera_from_world"] = f"default identity: no {name}"
     elif _uses_poses(root):
         marker = specs.fields(form)["poses"].paths[0]
-        return _motions(
-            root,
-            spec,
-            frames,
-            "raw frames",
-            f"complete the poses, or remove {marker} for a static camera",
-        )
+        advice = f"complete the poses, or remove {marker} for a static camera"
+        return _motions(root, spec, frames, "raw frames", advice)
     else:
         stored = read_array(path, spec) if path.exists() else None
         still = stored is None or np.array_equal(stored, np.broadcast_to(np.eye(4), stored.shape))
-        sources["camera_from_world"] = "default identity" + (
-            ": the camera of this format stands still"
-            if still
-            else f": {name} holds other poses, which this format's loaders ignore"
-        )
+        other = f"{name} holds other poses, which this format's loaders ignore"
+        reason = "the camera of this format stands still" if still else other
+        sources["camera_from_world"] = f"default identity: {reason}"
     return _identity(frames)
 
 
@@ -94,13 +79,11 @@ def read_colour_poses(
     fields = specs.fields(form)
     absolute = fields["color_extrinsics"]
     name = absolute.paths[0]
-    has_absolute = (root / name).exists()
+    has_absolute, advice = (root / name).exists(), "complete the poses, or remove the file"
     if form == "ftorf":
         if has_absolute and _uses_poses(root):
             sources["colour_from_world"] = f"file {name}"
-            return _motions(
-                root, absolute, len(poses), "raw frames", "complete the poses, or remove the file"
-            )
+            return _motions(root, absolute, len(poses), "raw frames", advice)
         sources["colour_from_world"] = "default as the ToF camera"
         return poses.copy()
     spec, halves = fields["relative_pose"], [fields["relative_R"], fields["relative_T"]]
@@ -118,9 +101,7 @@ def read_colour_poses(
         return product
     inferable = all((root / half.paths[0]).exists() for half in halves)
     if has_absolute:
-        stored = _motions(
-            root, absolute, len(poses), "phasors", "complete the poses, or remove the file"
-        )
+        stored = _motions(root, absolute, len(poses), "phasors", advice)
         if not (inferable and np.array_equal(stored, _identity(len(poses)))):
             sources["colour_from_world"] = f"file {name}"
             return stored
@@ -131,9 +112,8 @@ def read_colour_poses(
         relative = _identity(1)
         relative[0, :3, :3], relative[0, :3, 3] = rotation, -translation.reshape(3)
         _refuse_others(root / halves[0].paths[0], halves[0].name, relative)
-        sources["colour_from_world"] = (
-            "inferred from cams/relative_R.mat and relative_T.mat as E = [R | -T]"
-        )
+        files = "cams/relative_R.mat and relative_T.mat"
+        sources["colour_from_world"] = f"inferred from {files} as E = [R | -T]"
         return np.linalg.inv(relative[0]) @ poses
     sources["colour_from_world"] = f"inferred as the ToF camera: neither {spec.paths[0]} nor {name}"
     return poses.copy()
@@ -166,12 +146,9 @@ def _motions(root: Path, spec: specs.Field, frames: int, counted: str, advice: s
     """Poses of one file [F, 4, 4], float64."""
     stored = read_array(root / spec.paths[0], spec).astype(np.float64)
     if len(stored) != frames:
-        raise InputError(
-            f"{spec.name}: wrong length",
-            where=root / spec.paths[0],
-            why=f"expected one pose for each of {frames} {counted}, found {len(stored)}",
-            fix=advice,
-        )
+        why = f"expected one pose for each of {frames} {counted}, found {len(stored)}"
+        what = f"{spec.name}: wrong length"
+        raise InputError(what, where=root / spec.paths[0], why=why, fix=advice)
     _refuse_others(root / spec.paths[0], spec.name, stored)
     return stored
 
@@ -180,12 +157,9 @@ def _refuse_others(path: Path, name: str, poses: np.ndarray) -> None:
     fine = rigid(poses)
     if not fine.all():
         n = int(np.argmin(fine))
-        raise InputError(
-            f"{name}: {int((~fine).sum())} poses are not rigid motions",
-            where=path,
-            why=f"expected rotations of determinant +1 and a last row 0 0 0 1, found at pose {n} "
-            f"{poses[n].tolist()}",
-            fix="store matrices that take world to camera (relative_pose: colour to ToF camera), "
-            "x right, y down, "
-            "z forward",
-        )
+        what = f"{name}: {int((~fine).sum())} poses are not rigid motions"
+        why = "expected rotations of determinant +1 and a last row 0 0 0 1, found at pose "
+        why += f"{n} {poses[n].tolist()}"
+        fix = "store matrices that take world to camera (relative_pose: colour to ToF camera), "
+        fix += "x right, y down, z forward"
+        raise InputError(what, where=path, why=why, fix=fix)

@@ -19,22 +19,19 @@ class Problems:
         self.errors: list[InputError] = []
 
     def attempt(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T | None:
-        """Call a function; an input error is kept and None returned."""
+        """Call a function; collects an input error and returns None."""
         try:
             return function(*args, **kwargs)
         except InputError as error:
             self.errors.append(error)
             return None
 
+    def add(self, what: str, where: object, why: str, fix: str) -> None:
+        """Add an input error."""
+        self.errors.append(InputError(what, where=where, why=why, fix=fix))
+
     def raise_if_any(self, where: object) -> None:
-        """Raise the only error as it is, or several as one that lists them.
-
-        Args:
-            where: The folder they were found in.
-
-        Raises:
-            InputError: If anything was collected.
-        """
+        """Raise the only InputError as it is, or several as one of ``where`` that lists them."""
         if not self.errors:
             return
         if len(self.errors) == 1:

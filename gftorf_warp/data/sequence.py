@@ -1,6 +1,4 @@
-"""A recorded sequence in memory, and the truth about it: plain values;
-:mod:`gftorf_warp.data.read` makes them.
-"""
+"""A recorded sequence and its ground truth in memory, as plain values."""
 
 from __future__ import annotations
 
@@ -152,24 +150,18 @@ class Sequence:
         return frequencies_by_order(self.frame_frequencies[: self.cycle])
 
     @functools.cached_property
-    def quads_per_phasor(self) -> int:
-        """Number of raw frames of a cycle at its first frequency."""
-        return int((self.frame_frequencies[: self.cycle] == self.frequencies[0]).sum())
-
-    @functools.cached_property
     def complete_quartets(self) -> list[int]:
-        """Indices i of the quartets whose raw frames K i .. K (i + 1) - 1 were all measured,
-        at three or more each.
+        """Indices i of the quartets whose raw frames were all measured, three or more at each
+        frequency.
         """
-        step, frequencies = self.cycle, self.frame_frequencies
-        whole = [
-            i for i in range(self.frames // step) if self.measured[step * i : step * (i + 1)].all()
-        ]
-        return [
-            i
-            for i in whole
-            if frequencies_decoded(frequencies[step * i : step * (i + 1)], self.frequencies)
-        ]
+
+        def complete(frames: slice) -> bool:
+            frequencies = self.frame_frequencies[frames]
+            measured = bool(self.measured[frames].all())
+            return measured and frequencies_decoded(frequencies, self.frequencies)
+
+        quartets = range(self.frames // self.cycle)
+        return [i for i in quartets if complete(self.quartet_frames(i))]
 
     def quartet_frames(self, quartet: int) -> slice:
         """The raw frames of a quartet."""
@@ -178,11 +170,9 @@ class Sequence:
     @property
     def frame_frequencies(self) -> Float[np.ndarray, "F"]:
         """Modulation frequency of each raw frame [Hz]."""
-        return (
-            np.full(self.frames, self.calibration.f_mod_hz)
-            if self.frequencies_hz is None
-            else self.frequencies_hz
-        )
+        if self.frequencies_hz is not None:
+            return self.frequencies_hz
+        return np.full(self.frames, self.calibration.f_mod_hz)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

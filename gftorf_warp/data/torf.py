@@ -38,19 +38,14 @@ def stored(root: Path) -> Stored:
     fields = specs.fields(FORMAT)
     files = numbered(root, fields["phasor"].paths[0])
     if not files:
-        raise InputError(
-            "no phasors",
-            where=root / "tof",
-            why="expected files tof/{id}.npy with ids of four digits, 0000.npy or 0001.npy and "
-            "so on, found none",
-            fix="name each phasor by its number",
-        )
+        why = "expected files tof/{id}.npy with ids of four digits, 0000.npy or 0001.npy and so "
+        why += "on, found none"
+        fix = "name each phasor by its number"
+        raise InputError("no phasors", where=root / "tof", why=why, fix=fix)
     refuse_absurd_ids(files)
     first_id = min([*files, *numbered(root, fields["colour"].paths[0])])
-    times = root / fields["frame_times"].paths[0]
-    stated = (
-        Problems().attempt(read_shape, times, fields["frame_times"]) if times.exists() else None
-    )
+    times, field = root / fields["frame_times"].paths[0], fields["frame_times"]
+    stated = Problems().attempt(read_shape, times, field) if times.exists() else None
     if stated is not None and stated[0] > max(files):
         first_id = 0
     return Stored(
@@ -82,20 +77,12 @@ def files(sequence: Sequence, truth: Truth | None) -> Iterator[tuple[str, bytes]
     if not largest < QUAD_MAX:
         raise inexpressible(FORMAT, "quads", f"numbers below {QUAD_MAX:.2g}", f"{largest:.2g}")
     if not sequence.complete_quartets:
-        raise inexpressible(
-            FORMAT,
-            "quartets",
-            "one or more with all of their four raw frames",
-            f"none in {sequence.frames} raw frames",
-        )
+        expected = "one or more with all of their four raw frames"
+        raise inexpressible(FORMAT, "quartets", expected, f"none in {sequence.frames} raw frames")
     step = FRAMES_PER_QUARTET
     starts = slice(0, sequence.frames // step * step, step)
-    poses = sequence.camera_from_world[starts]
-    colour_poses = (
-        poses
-        if sequence.colour.camera_from_world is None
-        else sequence.colour.camera_from_world[starts]
-    )
+    poses, of_colour = sequence.camera_from_world[starts], sequence.colour.camera_from_world
+    colour_poses = poses if of_colour is None else of_colour[starts]
     yield from calibration_files(sequence, sequence.times[starts], poses)
     relative = poses @ np.linalg.inv(colour_poses)
     if np.ptp(relative, axis=0).max() <= SAME_POSE:

@@ -19,9 +19,7 @@ from .specs import layer_field
 def calibration_files(
     sequence: Sequence, times: np.ndarray, camera_from_world: np.ndarray
 ) -> Iterator[tuple[str, bytes]]:
-    """The files that both formats have, by relative name,
-    for frames of these times [s] and poses.
-    """
+    """Files of both formats by relative name, for frames of these times [s] and poses."""
     yield "cams/tof_intrinsics.npy", npy(_pinhole(sequence.intrinsics))
     yield "cams/color_intrinsics.npy", npy(_pinhole(_colour_intrinsics(sequence)))
     yield "cams/pixel_centre.json", json_bytes({"pixel_centre": "integer"})
@@ -41,48 +39,36 @@ def validate(sequence: Sequence, truth: Truth | None) -> None:
     Raises:
         ValueError: If not, which is a programming mistake.
     """
-    frames, shape = sequence.frames, (sequence.frames, sequence.height, sequence.width)
-    lengths = {
-        "quads": (sequence.quads.shape, shape),
-        "shifts": (sequence.shifts.shape, (frames,)),
-        "times": (sequence.times.shape, (frames,)),
-        "frequencies_hz": (sequence.frame_frequencies.shape, (frames,)),
-        "camera_from_world": (sequence.camera_from_world.shape, (frames, 4, 4)),
+    frames, colour, novel = sequence.frames, sequence.colour, sequence.novel_from_world
+    one, poses, pixels = (frames,), (frames, 4, 4), (sequence.height, sequence.width)
+    by_frame = {
+        "forward_flow": (sequence.flow.forward, (2, *pixels)),
+        "backward_flow": (sequence.flow.backward, (2, *pixels)),
+        "colour": (colour.images, (*(colour.size or ()), 3)),
     }
-    if sequence.colour.camera_from_world is not None:
-        lengths["colour_from_world"] = (sequence.colour.camera_from_world.shape, (frames, 4, 4))
-    if sequence.novel_from_world is not None:
-        views = sequence.novel_from_world
-        lengths["novel_from_world"] = (views.shape, (max(1, len(views)), 4, 4))
-    images = {"forward_flow": sequence.flow.forward, "backward_flow": sequence.flow.backward}
-    for name, flows in images.items():
-        lengths |= {f"{name}[{n}]": (flow.shape, (2, *shape[1:])) for n, flow in flows.items()}
-    images["colour"] = sequence.colour.images
-    size = sequence.colour.size or ()
-    lengths |= {
-        f"colour[{n}]": (image.shape, (*size, 3)) for n, image in sequence.colour.images.items()
+    arrays: dict[str, tuple[np.ndarray | None, tuple[int, ...]]] = {
+        "quads": (sequence.quads, (frames, *pixels)),
+        "shifts": (sequence.shifts, one),
+        "times": (sequence.times, one),
+        "frequencies_hz": (sequence.frame_frequencies, one),
+        "camera_from_world": (sequence.camera_from_world, poses),
+        "colour_from_world": (colour.camera_from_world, poses),
+        "novel_from_world": (novel, (1 if novel is None else max(1, len(novel)), 4, 4)),
     }
+    for name, (images, shape) in by_frame.items():
+        arrays |= {f"{name}[{n}]": (image, shape) for n, image in images.items()}
     if truth is not None:
-        lengths |= {
-            "truth.distance": (truth.distance.shape, shape),
-            "truth.known": (truth.known.shape, (frames,)),
-        }
-        more = {name: getattr(truth, name) for name in ("phasor_distance", "amplitude", "body")}
-        lengths |= {
-            f"truth.{name}": (image.shape, shape)
-            for name, image in more.items()
-            if image is not None
-        }
+        arrays["truth.known"] = (truth.known, one)
+        for name in ("distance", "phasor_distance", "amplitude", "body"):
+            arrays[f"truth.{name}"] = (getattr(truth, name), (frames, *pixels))
         for name, layer in truth.layers.items():
-            lengths[f"truth.layers[{name}]"] = (
-                layer.shape,
-                (frames, len(layer_field(name).channels), *shape[1:]),
-            )
-    for name, (found, expected) in lengths.items():
-        if found != expected:
-            raise ValueError(f"{name} {found} must have shape {expected}")
-    for name, by_frame in images.items():
-        outside = [n for n in by_frame if not 0 <= n < frames]
+            channels = len(layer_field(name).channels)
+            arrays[f"truth.layers[{name}]"] = (layer, (frames, channels, *pixels))
+    for name, (array, shape) in arrays.items():
+        if array is not None and array.shape != shape:
+            raise ValueError(f"{name} {array.shape} must have shape {shape}")
+    for name, (images, _) in by_frame.items():
+        outside = [n for n in images if not 0 <= n < frames]
         if outside:
             raise ValueError(f"{name}: raw frames {outside} are not in 0..{frames - 1}")
     if sequence.from_phasors:
@@ -97,8 +83,7 @@ def _validate_phasors(sequence: Sequence) -> None:
     quads = sequence.quads.reshape(-1, step, sequence.height, sequence.width)
     rules = {
         "shifts": np.array_equal(sequence.shifts, np.tile(CANONICAL_SHIFTS, len(quads))),
-        "quads": np.array_equal(quads[:, 0], -quads[:, 1])
-        and np.array_equal(quads[:, 2], -quads[:, 3]),
+        "quads": np.array_equal(quads[:, ::2], -quads[:, 1::2]),
         "dc_offset": sequence.calibration.dc_offset == 0,
     }
     per_frame = {
@@ -124,105 +109,72 @@ def refuse_inexpressible(form: str, sequence: Sequence, truth: Truth | None) -> 
     Raises:
         UsageError: If not.
     """
-    flows = [*sequence.flow.forward.values(), *sequence.flow.backward.values()]
-    times = sequence.times
-    distance = np.ones(1) if truth is None else truth.distance[truth.known]
-    static = (
-        np.zeros(1)
-        if truth is None or truth.phasor_distance is None
-        else truth.phasor_distance[truth.known]
-    )
-    stated, tof = sequence.calibration, sequence.intrinsics
-    numbers = (stated.f_mod_hz, stated.phase_offset, stated.dc_offset, stated.quad_scale or 1.0)
-    focal = tof.fx, tof.fy
-    colour, colour_width = _colour_intrinsics(sequence), _colour_size(sequence)[1]
-    family = form in ("ftorf", "torf")  # these state one depth range and one matrix
-    rules = {  # what: (whether it holds, expected, found)
-        "frequencies_hz": (
-            not family or sequence.frequencies_hz is None,
-            "one modulation frequency",
-            f"{sequence.frequencies_hz}",
-        ),
-        "shifts": (
-            not family or sequence.cycle == FRAMES_PER_QUARTET,
-            f"cycles of {FRAMES_PER_QUARTET} raw frames",
-            f"of {sequence.cycle}",
-        ),
-        "distortion": (
-            not family or tof.distortion is None,
-            "a pinhole",
-            f"a lens with {tof.distortion}",
-        ),
-        "an empty sequence": (sequence.measured.any(), "at least one measured raw frame", "none"),
-        "quads": (
-            np.isfinite(sequence.quads[sequence.measured]).all(),
-            "finite numbers",
-            "NaN or infinity",
-        ),
-        "times": (
-            np.isfinite(times).all() and times[0] == 0 and (np.diff(times) >= 0).all(),
-            "seconds since the first raw frame, never decreasing",
-            f"{times[:8].tolist()} ..",
-        ),
-        "calibration": (np.isfinite(numbers).all(), "finite numbers", str(numbers)),
-        "f_mod_hz": (
-            DEPTH_RANGES_M[0] <= SPEED_OF_LIGHT / stated.f_mod_hz <= DEPTH_RANGES_M[1],
-            f"speed of light / frequency between {DEPTH_RANGES_M[0]} and {DEPTH_RANGES_M[1]} m",
-            f"{stated.f_mod_hz} Hz",
-        ),
-        "quad_scale": (
-            stated.quad_scale is None or stated.quad_scale > 0,
-            "above 0",
-            str(stated.quad_scale),
-        ),
-        "focal length": (
-            min(focal) >= FOCAL_MIN * sequence.width,
-            f"pixels, at least {FOCAL_MIN} of the width {sequence.width}",
-            str(focal),
-        ),
-        "colour_intrinsics": (
-            np.isfinite([colour.fx, colour.fy, colour.cx, colour.cy]).all()
-            and min(colour.fx, colour.fy) >= FOCAL_MIN * colour_width,
-            f"pixels, at least {FOCAL_MIN} of the width {colour_width}",
-            str(colour),
-        ),
-        "colour": (
-            all(np.isfinite(i).all() for i in sequence.colour.images.values()),
-            "finite numbers",
-            "NaN or infinity",
-        ),
-        "phasor_distance": (
-            ((static >= 0) & (static < np.inf) | np.isnan(static)).all(),
-            "metres or NaN",
-            "others",
-        ),
-        "layers": (
-            truth is None or not any(np.isinf(images).any() for images in truth.layers.values()),
-            "numbers, or NaN for unknown",
-            "infinity",
-        ),
-        "flow": (
-            not any(np.isinf(flow).any() for flow in flows),
-            "pixels, or NaN for unknown",
-            "infinity",
-        ),
-        "truth": (
-            ((distance > 0) & (distance < np.inf) | np.isnan(distance)).all(),
-            "distances above 0 m, or NaN for unknown",
-            "zero, negative or infinite distances",
-        ),
-    }
-    poses = {
-        "colour_from_world": sequence.colour.camera_from_world,
-        "novel_from_world": sequence.novel_from_world,
-        "camera_from_world": sequence.camera_from_world,
-    }
-    for what, matrices in poses.items():
-        holds = matrices is None or rigid(matrices).all()
-        rules[what] = (holds, "rotations and translations", "other matrices")
-    for what, (holds, expected, found) in rules.items():
+
+    def require(holds: object, what: str, expected: str, found: object) -> None:
         if not holds:
-            raise inexpressible(form, what, expected, found)
+            raise inexpressible(form, what, expected, str(found))
+
+    stated, tof, times = sequence.calibration, sequence.intrinsics, sequence.times
+    if form in ("ftorf", "torf"):  # these state one depth range and one matrix
+        several = sequence.frequencies_hz
+        require(several is None, "frequencies_hz", "one modulation frequency", several)
+        expected = f"cycles of {FRAMES_PER_QUARTET} raw frames"
+        cycle = sequence.cycle
+        require(cycle == FRAMES_PER_QUARTET, "shifts", expected, f"of {cycle}")
+        lens = tof.distortion
+        require(lens is None, "distortion", "a pinhole", f"a lens with {lens}")
+    measured = sequence.measured
+    require(measured.any(), "an empty sequence", "at least one measured raw frame", "none")
+    finite, infinite = "finite numbers", "NaN or infinity"
+    require(np.isfinite(sequence.quads[measured]).all(), "quads", finite, infinite)
+    expected = "seconds since the first raw frame, never decreasing"
+    holds = np.isfinite(times).all() and times[0] == 0 and (np.diff(times) >= 0).all()
+    require(holds, "times", expected, f"{times[:8].tolist()} ..")
+    scale = stated.quad_scale
+    numbers = (stated.f_mod_hz, stated.phase_offset, stated.dc_offset, scale or 1.0)
+    require(np.isfinite(numbers).all(), "calibration", finite, numbers)
+    low, high = DEPTH_RANGES_M
+    expected = f"speed of light / frequency between {low} and {high} m"
+    holds = low <= SPEED_OF_LIGHT / stated.f_mod_hz <= high
+    require(holds, "f_mod_hz", expected, f"{stated.f_mod_hz} Hz")
+    require(scale is None or scale > 0, "quad_scale", "above 0", scale)
+    colour = _colour_intrinsics(sequence)
+    numbers = (colour.fx, colour.fy, colour.cx, colour.cy)
+    for what, camera, width, found, known in (
+        ("focal length", tof, sequence.width, (tof.fx, tof.fy), True),
+        (
+            "colour_intrinsics",
+            colour,
+            _colour_size(sequence)[1],
+            colour,
+            np.isfinite(numbers).all(),
+        ),
+    ):
+        holds = known and min(camera.fx, camera.fy) >= FOCAL_MIN * width
+        require(holds, what, f"pixels, at least {FOCAL_MIN} of the width {width}", found)
+    images = sequence.colour.images.values()
+    require(all(np.isfinite(image).all() for image in images), "colour", finite, infinite)
+    flows = [*sequence.flow.forward.values(), *sequence.flow.backward.values()]
+    holds = not any(np.isinf(flow).any() for flow in flows)
+    require(holds, "flow", "pixels, or NaN for unknown", "infinity")
+    if truth is not None:
+        if truth.phasor_distance is not None:
+            static = truth.phasor_distance[truth.known]
+            holds = ((static >= 0) & (static < np.inf) | np.isnan(static)).all()
+            require(holds, "phasor_distance", "metres or NaN", "others")
+        holds = not any(np.isinf(images).any() for images in truth.layers.values())
+        require(holds, "layers", "numbers, or NaN for unknown", "infinity")
+        distance = truth.distance[truth.known]
+        holds = ((distance > 0) & (distance < np.inf) | np.isnan(distance)).all()
+        expected = "distances above 0 m, or NaN for unknown"
+        require(holds, "truth", expected, "zero, negative or infinite distances")
+    for what, matrices in (
+        ("colour_from_world", sequence.colour.camera_from_world),
+        ("novel_from_world", sequence.novel_from_world),
+        ("camera_from_world", sequence.camera_from_world),
+    ):
+        holds = matrices is None or rigid(matrices).all()
+        require(holds, what, "rotations and translations", "other matrices")
 
 
 def inexpressible(form: str, what: str, expected: str, found: str) -> UsageError:
@@ -241,9 +193,7 @@ def _colour_size(sequence: Sequence) -> tuple[int, int]:
 
 
 def _colour_intrinsics(sequence: Sequence) -> Intrinsics:
-    """Those of the colour camera; public loaders require one, so without any,
-    those of the ToF camera, scaled.
-    """
+    """Those of the colour camera; loaders require one: without any, the ToF camera's, scaled."""
     if sequence.colour.intrinsics is not None:
         return sequence.colour.intrinsics
     height, width = _colour_size(sequence)
