@@ -278,7 +278,7 @@ def plain_step(state: State, observations: Observations, settings: ReconSettings
             revived_at=state.revived_at,
         )
         if (
-            densify.round_is_due(before, state.images, settings.densify, settings.schedule)
+            densify.densification_is_due(before, state.images, settings.densify, settings.schedule)
             and settings.densify.loses_step
         ):
             rates = {name: rate if name == "motion" else 0.0 for name, rate in rates.items()}

@@ -93,8 +93,8 @@ def test_a_small_gaussian_is_cloned_with_fresh_moments():
     """The others keep their values and moments."""
     adam = optimiser()
     before, old = adam.field.map(torch.clone), moments(adam)
-    counts, _ = densify.round_of(
-        adam, statistics(0, 0, 1.0, 0, 0, 0), SETTINGS, generator(), judge_scale=False
+    counts, _ = densify.densify(
+        adam, statistics(0, 0, 1.0, 0, 0, 0), SETTINGS, generator(), prunes_scale=False
     )
     assert counts == {"cloned": 1, "split": 0, "pruned": 0}
     rows = torch.tensor([0, 1, 2, 3, 4, 5, 2])
@@ -119,8 +119,8 @@ def test_a_large_gaussian_is_split_in_two_smaller_ones_drawn_from_itself():
         # turns its x axis to y
         adam.tensors["quaternion"][1] = torch.tensor([half, 0.0, 0.0, half])
     before = adam.field.map(lambda t: t.detach().clone())
-    counts, _ = densify.round_of(
-        adam, statistics(0, 9.0, 0), SETTINGS, generator(), judge_scale=False
+    counts, _ = densify.densify(
+        adam, statistics(0, 9.0, 0), SETTINGS, generator(), prunes_scale=False
     )
     assert counts == {"cloned": 0, "split": 1, "pruned": 0}
     after = adam.field
@@ -145,7 +145,7 @@ def test_halves_have_the_spread_of_the_original():
         quaternion=random(1, 4).repeat(n, 1),
     )
     local = torch.randn(1, n, 3, generator=generator()) * whole.scale
-    drawn = densify._turned(whole.quaternion, local)[0]
+    drawn = densify._rotated(whole.quaternion, local)[0]
     w, x, y, z = torch.nn.functional.normalize(whole.quaternion[0], dim=0).tolist()
     rotation = torch.tensor(
         [
@@ -165,8 +165,8 @@ def test_faint_gaussians_are_pruned_and_the_floor_holds():
         adam.tensors["opacity_logit"][[1, 4]] = -6.0
     kept = adam.tensors["mean"].detach()[[0, 2, 3, 5]].clone()
     old = moments(adam)
-    counts, _ = densify.round_of(
-        adam, statistics(*[0.0] * 6), SETTINGS, generator(), judge_scale=False
+    counts, _ = densify.densify(
+        adam, statistics(*[0.0] * 6), SETTINGS, generator(), prunes_scale=False
     )
     assert counts == {"cloned": 0, "split": 0, "pruned": 2}
     torch.testing.assert_close(adam.tensors["mean"].detach(), kept, rtol=0, atol=0)
@@ -175,7 +175,7 @@ def test_faint_gaussians_are_pruned_and_the_floor_holds():
     )
     with torch.no_grad():
         adam.tensors["opacity_logit"][:3] = -6.0
-    densify.round_of(adam, statistics(*[0.0] * 4), SETTINGS, generator(), judge_scale=False)
+    densify.densify(adam, statistics(*[0.0] * 4), SETTINGS, generator(), prunes_scale=False)
     assert len(adam.field) == 4, "one would remain, the floor is two"
 
 
@@ -187,9 +187,9 @@ def test_sizes_are_judged_only_when_asked():
         adam.tensors["log_scale"][0] = math.log(5.0)
         adam.tensors["log_scale"][1] = math.log(0.001)
     before, nothing = adam.field.mean.detach().clone(), statistics(*[0.0] * 6)
-    densify.round_of(adam, nothing, settings, generator(), judge_scale=False)
+    densify.densify(adam, nothing, settings, generator(), prunes_scale=False)
     assert len(adam.field) == 6
-    densify.round_of(adam, nothing, settings, generator(), judge_scale=True)
+    densify.densify(adam, nothing, settings, generator(), prunes_scale=True)
     torch.testing.assert_close(adam.field.mean.detach(), before[2:], rtol=0, atol=0)
 
 
@@ -201,15 +201,15 @@ def test_who_was_not_seen_goes_when_the_unseen_are_judged():
     before = adam.field.mean.detach().clone()
     seen = statistics(0, 0, 1.0, 0, 0, 0)
     seen.weight[[1, 3, 4]] = 0.0
-    counts, seen = densify.round_of(adam, seen, SETTINGS, generator(), judge_scale=False)
+    counts, seen = densify.densify(adam, seen, SETTINGS, generator(), prunes_scale=False)
     assert counts == {"cloned": 1, "split": 0, "pruned": 0}, "nobody is judged"
     assert seen.earlier.tolist() == [0.25, 0, 0.25, 0, 0, 0.25, 0.25]
     assert seen.weight.abs().sum() + seen.pixels.abs().sum() + seen.gradient.abs().sum() == 0
     seen.weight[[3, 4]] = torch.tensor([2.0, 0.125])
     with torch.no_grad():
         adam.tensors["opacity_logit"][0] = -6.0
-    counts, seen = densify.round_of(
-        adam, seen, SETTINGS, generator(), judge_scale=False, unseen_weight=0.125
+    counts, seen = densify.densify(
+        adam, seen, SETTINGS, generator(), prunes_scale=False, unseen_weight=0.125
     )
     assert counts == {"cloned": 0, "split": 0, "pruned": 3}, "0 is faint, 1 and 4 are behind others"
     torch.testing.assert_close(adam.field.mean.detach(), before[[2, 3, 5, 2]], rtol=0, atol=0)
@@ -231,7 +231,7 @@ def test_a_round_is_as_if_it_first_added_and_then_removed(floor):
             adam.tensors["opacity_logit"].copy_(random(60, seed=4) * 6.0 - 3.0)
         own, counts = generator(), dict.fromkeys(("cloned", "split", "pruned"), 0)
         for one in rounds:
-            more, known = densify.round_of(adam, known, one, own, judge_scale=True)
+            more, known = densify.densify(adam, known, one, own, prunes_scale=True)
             counts = {name: counts[name] + number for name, number in more.items()}
         found.append((counts, adam))
     (counts, adam), (others, twin) = found
@@ -265,8 +265,8 @@ def test_the_cap_lets_the_largest_gradients_through():
     adam = optimiser()
     settings = replace(SETTINGS, gaussians_max=8)
     before = adam.field.mean.detach().clone()
-    densify.round_of(
-        adam, statistics(0.6, 3.0, 0.7, 0.1, 2.0, 0.9), settings, generator(), judge_scale=False
+    densify.densify(
+        adam, statistics(0.6, 3.0, 0.7, 0.1, 2.0, 0.9), settings, generator(), prunes_scale=False
     )
     assert len(adam.field) == 8
     torch.testing.assert_close(adam.field.mean.detach()[6:], before[[1, 4]], rtol=0, atol=0)
@@ -288,7 +288,7 @@ def test_reset_dims_and_forgets():
 def test_rebuilt_tensors_go_on_being_optimised():
     """New tensors are the ones Adam steps."""
     adam = optimiser()
-    densify.round_of(adam, statistics(0, 0, 1.0, 0, 0, 0), SETTINGS, generator(), judge_scale=False)
+    densify.densify(adam, statistics(0, 0, 1.0, 0, 0, 0), SETTINGS, generator(), prunes_scale=False)
     before = adam.field.mean.detach().clone()
     gradients = [100.0 * torch.ones_like(leaf) for leaf in adam.leaves]
     plain_adam(adam, gradients, dict.fromkeys(rates_at(ReconSettings(preset="test"), 0), 0.1), None)
@@ -299,7 +299,9 @@ def test_rounds_and_resets_are_due_when_the_schedule_says():
     """Counted in images, although a step takes four."""
     schedule = Schedule(images=10_000)
     options = replace(SETTINGS, reset_every=1900)
-    rounds = [n for n in range(4, 10_001, 4) if densify.round_is_due(n - 4, n, options, schedule)]
+    rounds = [
+        n for n in range(4, 10_001, 4) if densify.densification_is_due(n - 4, n, options, schedule)
+    ]
     assert rounds[0] == 300
     assert rounds[-1] == 5900
     assert len(rounds) == 57
@@ -307,5 +309,7 @@ def test_rounds_and_resets_are_due_when_the_schedule_says():
     # 5700 lies in the last tenth before the end at 6000, which is quiet
     assert resets == [1900, 3800]
     never = replace(options, every=None)
-    assert not any(densify.round_is_due(n - 4, n, never, schedule) for n in range(4, 10_001, 4))
+    assert not any(
+        densify.densification_is_due(n - 4, n, never, schedule) for n in range(4, 10_001, 4)
+    )
     assert not any(densify.reset_is_due(n - 4, n, never, schedule) for n in range(4, 10_001, 4))

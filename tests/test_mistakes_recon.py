@@ -170,8 +170,8 @@ def test_mistake_11_whatever_is_said_to_prune_does_so_in_a_round_that_also_adds(
     seen = replace(densify.start(field), pixels=torch.ones(40))
     seen.gradient[10:14] = 2.0
     adam = Optimiser(field, Still(torch.tensor([0.0, 1.0])))
-    done, _ = densify.round_of(
-        adam, seen, settings, torch.Generator().manual_seed(0), judge_scale=True
+    done, _ = densify.densify(
+        adam, seen, settings, torch.Generator().manual_seed(0), prunes_scale=True
     )
     assert done == {"cloned": 4, "split": 0, "pruned": 3}
     left = adam.field
@@ -188,7 +188,7 @@ def test_mistake_11_nothing_claims_to_prune_by_size_on_the_screen():
     adam = Optimiser(field, Still(torch.tensor([0.0, 1.0])))
     settings = DensifySettings(every=100, gradient_min=None, scale_range=(1e-3, 0.5))
     seen = replace(densify.start(field), pixels=torch.full((21,), 1e5))
-    densify.round_of(adam, seen, settings, torch.Generator().manual_seed(0), judge_scale=True)
+    densify.densify(adam, seen, settings, torch.Generator().manual_seed(0), prunes_scale=True)
     assert len(adam.field) == 21
     names = {f.name for f in dataclasses.fields(DensifySettings)}
     assert not [

@@ -1,6 +1,4 @@
-"""Where Gaussians are added and removed: statistics, clone, split, prune, opacity reset (method,
-section 6.6).
-"""
+"""Densification: statistics, cloning, splitting, pruning, opacity resets (method, section 6.6)."""
 
 from __future__ import annotations
 
@@ -18,13 +16,13 @@ from .settings import DensifySettings, Schedule
 SPLIT_SHRINK = 1.6  # the two halves of a split Gaussian are smaller by this
 SHRINK = math.log(SPLIT_SHRINK)
 RESET_MARGIN = 1e-5  # relative: a hundred roundings of a sigmoid in float32
-# no reset in the last tenth before the rounds end: what it dims could not recover
+# no reset in the last tenth before densification ends: opacities could not recover
 RESET_QUIET_SHARE = 0.1
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Statistics:
-    """What the rounds look at, summed over images since the last one."""
+    """Statistics of densification, summed over images since the last one."""
 
     gradient: Float[Tensor, "N"]
     """Sum of pixels times screen gradient, in half image sizes."""
@@ -33,7 +31,7 @@ class Statistics:
     weight: Float[Tensor, "N"]
     """Sum of the weights in these pixels [px]."""
     earlier: Float[Tensor, "N"]
-    """The same sum before that, back to when the unseen were last looked for [px]."""
+    """The same sum before that, since the last visibility pruning [px]."""
 
     @property
     def mean_gradient(self) -> Float[Tensor, "N"]:
@@ -45,7 +43,7 @@ STATISTICS = [field.name for field in fields(Statistics)]
 
 
 def start(field: GaussianField) -> Statistics:
-    """Nothing observed yet."""
+    """Zeros."""
     zeros = field.opacity_logit.detach().new_zeros(len(STATISTICS), len(field)).unbind()
     return Statistics(**dict(zip(STATISTICS, zeros, strict=True)))
 
@@ -55,24 +53,22 @@ def crossed(before: int, after: int, every: int | None) -> bool:
     return every is not None and after // every > before // every
 
 
-def round_is_due(before: int, after: int, settings: DensifySettings, schedule: Schedule) -> bool:
-    """Whether a step from ``before`` to ``after`` images ends with a round."""
+def densification_is_due(
+    before: int, after: int, settings: DensifySettings, schedule: Schedule
+) -> bool:
+    """Whether a step from ``before`` to ``after`` images ends with densification."""
     inside = settings.start < after < settings.stop_share * schedule.images
     return inside and crossed(before, after, settings.every)
 
 
-def rounds_remain(images: int, settings: DensifySettings, schedule: Schedule) -> bool:
-    """Whether there may be a round after ``images`` images."""
+def densification_remains(images: int, settings: DensifySettings, schedule: Schedule) -> bool:
+    """Whether there may be densification after ``images`` images."""
     return settings.every is not None and images < settings.stop_share * schedule.images
 
 
 def reset_is_due(before: int, after: int, settings: DensifySettings, schedule: Schedule) -> bool:
     """Whether a step from ``before`` to ``after`` images ends with an opacity reset."""
-    share = (
-        settings.stop_share
-        if schedule.freeze_from is None
-        else min(settings.stop_share, schedule.freeze_from)
-    )
+    share = min(settings.stop_share, 1.0 if schedule.freeze_from is None else schedule.freeze_from)
     end = (1.0 - RESET_QUIET_SHARE) * share * schedule.images
     every = settings.reset_every
     if settings.reset_faster is not None and after >= settings.reset_faster[0]:
@@ -82,70 +78,59 @@ def reset_is_due(before: int, after: int, settings: DensifySettings, schedule: S
 
 def resets(settings: DensifySettings, schedule: Schedule) -> list[int]:
     """At which images a run that counts every image resets the opacities."""
-    intervals = [
-        settings.reset_every,
-        None if settings.reset_faster is None else settings.reset_faster[1],
-    ]
-    multiples = {
-        n for every in intervals if every for n in range(every, schedule.images + 1, every)
-    }
-    return [n for n in sorted(multiples) if reset_is_due(n - 1, n, settings, schedule)]
+    images = range(1, schedule.images + 1)
+    return [n for n in images if reset_is_due(n - 1, n, settings, schedule)]
 
 
-def round_of(
+def densify(
     optimiser: Optimiser,
     statistics: Statistics,
     settings: DensifySettings,
     generator: torch.Generator,
     *,
-    judge_scale: bool,
+    prunes_scale: bool,
     unseen_weight: float | None = None,
 ) -> tuple[dict[str, int], Statistics]:
     """Clone small Gaussians and split large ones where the screen gradient is large, then prune.
 
-    A split draws both halves from the Gaussian itself and replaces it. Copies keep opacity and
-    layer, and their moments start at zero.
+    A split draws the centres of both halves from the Gaussian and replaces it. Copies keep opacity
+    and layer; their moments start at zero.
 
     Args:
-        optimiser: Whose tensors and moments are rebuilt.
-        statistics: Since the last round.
+        optimiser: Its tensors and moments are rebuilt.
+        statistics: Since the last densification.
         settings: Thresholds.
-        generator: For the positions of halves.
-        judge_scale: Whether too small and too large Gaussians are removed in this round.
-        unseen_weight: Gaussians of at most so much weight since the last time are, too, and from
-            here on it is summed anew [px]; None: nobody is.
+        generator: For the centres of halves.
+        prunes_scale: Whether too small and too large Gaussians are pruned.
+        unseen_weight: Visibility pruning: Gaussians of at most this weight since the last one are
+            pruned, and the sum restarts [px]; None: no visibility pruning.
 
     Returns:
-        How many were cloned, split and pruned, and what is known of those that remain.
+        Numbers of cloned, split and pruned Gaussians, and statistics of the remaining ones.
     """
     field = optimiser.field.map(torch.Tensor.detach)
     count, scale = len(field), field.scale
     largest = scale.amax(dim=1)
-    # copies have been seen as much as what they are copies of
     seen = statistics.earlier + statistics.weight
     keeps = field.opacity >= settings.opacity_min
     if unseen_weight is not None:
         keeps = keeps & (seen > unseen_weight)
-    if judge_scale:
+    if prunes_scale:
         shortest, longest = settings.scale_range
         of_half = (field.log_scale - SHRINK).exp().amax(dim=1)
         whole, half = (
             keeps & (size >= shortest) & (size <= longest) for size in (largest, of_half)
         )
         keeps = torch.stack([whole, whole, half, half])
-    wanted, room = _wanted(statistics, settings), max(settings.gaussians_max - count, 0)
-    plan = _plan(
-        wanted, largest <= settings.clone_scale_max, largest > settings.clone_scale_max, keeps
-    )
-    if plan.added > room:
-        order = torch.argsort(
-            torch.where(wanted, statistics.mean_gradient, -1.0), descending=True, stable=True
-        )
+    wanted, capacity = _wanted(statistics, settings), max(settings.gaussians_max - count, 0)
+    small = largest <= settings.clone_scale_max
+    plan = _plan(wanted, small, keeps)
+    if plan.added > capacity:
+        gradient = torch.where(wanted, statistics.mean_gradient, -1.0)
+        order = torch.argsort(gradient, descending=True, stable=True)
         wanted = torch.zeros_like(wanted)
-        wanted[order[:room]] = True
-        plan = _plan(
-            wanted, largest <= settings.clone_scale_max, largest > settings.clone_scale_max, keeps
-        )
+        wanted[order[:capacity]] = True
+        plan = _plan(wanted, small, keeps)
     kept, order = plan.kept, plan.order
     if sum(kept) < settings.gaussians_min:
         kept, order = plan.offered, _first(plan.parts)
@@ -160,7 +145,7 @@ def round_of(
                 value.index_select(0, of) for value in (field.quaternion, scale, plan.rank)
             )
             shares = drawn.to(field.device).view(2, split, 3).index_select(1, rank)
-            offset = _turned(quaternion, shares * scale).flatten(0, 1)
+            offset = _rotated(quaternion, shares * scale).flatten(0, 1)
 
         def change(name: str, value: Tensor) -> None:
             if offset is not None and name == "mean":
@@ -177,53 +162,47 @@ def round_of(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Plan:
-    """Who is there after a round, in four parts: those that are not split, copies,
-    and both halves of the others.
-    """
+    """Gaussians after densification in four parts: not split, copies, first and second halves."""
 
     parts: Bool[Tensor, "4 N"]
-    """Of which Gaussian there is one before anybody is removed."""
+    """Which Gaussians have one in each part, before pruning."""
     order: Int[Tensor, "4*N"]
-    """Numbers in all parts: first those that are kept, as they follow each other."""
+    """Indices into the parts, kept ones first, in their order."""
     rank: Int[Tensor, "N"]
-    """How many are split up to this one, without it."""
+    """Number of split Gaussians before each one."""
     offered: list[int]
-    """How many each part has."""
+    """Number in each part before pruning."""
     kept: list[int]
-    """How many of them are kept."""
+    """Number in each part after pruning."""
 
     @property
     def added(self) -> int:
-        """How many more there are before anybody is removed."""
+        """Number of added Gaussians before pruning."""
         return self.offered[1] + self.offered[2]
 
 
-def _plan(
-    wanted: Bool[Tensor, "N"], small: Bool[Tensor, "N"], large: Bool[Tensor, "N"], keeps: Tensor
-) -> _Plan:
-    """Clone and split whom ``wanted`` says, keep whom ``keeps`` says [N] or [4, N];
-    waits for the device, once.
+def _plan(wanted: Bool[Tensor, "N"], small: Bool[Tensor, "N"], keeps: Tensor) -> _Plan:
+    """Clone the small ones of ``wanted``, split the others, keep ``keeps`` [N] or [4, N].
+
+    Waits for the device once.
     """
-    split = wanted & large
+    split = wanted & ~small
     parts = torch.stack([~split, wanted & small, split, split])
     kept = parts & keeps
-    # whatever may be done before the device is waited for
     order, rank = _first(kept), split.cumsum(dim=0) - 1
     offered, left = torch.stack([parts, kept]).sum(dim=2).tolist()
     return _Plan(parts=parts, order=order, rank=rank, offered=offered, kept=left)
 
 
 def _first(mask: Bool[Tensor, "4 N"]) -> Int[Tensor, "4*N"]:
-    """Numbers of elements, those that are true first; unlike a list of them its length is known."""
+    """Indices of all elements, true ones first: unlike ``nonzero`` it does not wait."""
     return torch.argsort(mask.flatten().view(torch.uint8), descending=True, stable=True)
 
 
 def reset_opacity(optimiser: Optimiser, settings: DensifySettings) -> None:
-    """Dim every Gaussian to just below ``opacity_min`` and forget those moments: what is needed
-    grows back.
+    """Clamp all opacities to just below ``opacity_min`` and zero their moments.
 
-    Just below, so that what no pixel has asked for by the next round is removed whichever way a
-    sigmoid is rounded.
+    Just below, so that Gaussians without a gradient are pruned next time, however it is rounded.
     """
     below = (1.0 - RESET_MARGIN) * settings.opacity_min
     highest = math.log(below / (1.0 - below))
@@ -240,10 +219,10 @@ def _wanted(statistics: Statistics, settings: DensifySettings) -> Bool[Tensor, "
     return gradient >= settings.gradient_min
 
 
-def _turned(
+def _rotated(
     quaternion: Float[Tensor, "N 4"], local: Float[Tensor, "k N 3"]
 ) -> Float[Tensor, "k N 3"]:
-    """Vectors along the own axes of Gaussians, as vectors in the world."""
+    """Vectors in the axes of Gaussians, rotated to world axes."""
     wxyz = torch.nn.functional.normalize(quaternion, dim=1)[None]
     w, axis = wxyz[..., :1], wxyz[..., 1:]
     turn = 2.0 * torch.linalg.cross(axis, local)

@@ -69,29 +69,23 @@ class Batch(enum.StrEnum):
     FRAME = "frame"
     """One raw frame (method, section 5)."""
     QUARTET = "quartet"
-    """The measured raw frames of one quartet: all slots pull at once."""
+    """The measured raw frames of one quartet."""
 
 
 class BatchRule(enum.StrEnum):
-    """What rates and moments of Adam become when a step compares several images,
-    over those of single images.
-    """
+    """Learning-rate scaling: Adam's rates and decays in steps of several images."""
 
     NONE = "none"
-    """The same."""
+    """As for single images."""
     ROOT = "root"
-    """Of b images: rates times the root of b, both decays to the power of b, so that as much is
-    forgotten per image."""
+    """For b images: rates times the root of b, both decays to the power of b."""
     LINEAR = "linear"
-    """As ``root`` with rates times b: as far per image where gradients agree, which short runs
-    need."""
+    """As ``root`` with rates times b, which short runs need."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Rates:
-    """Learning rates of Adam: the size of one step, whatever the size of the gradient (method,
-    section 6.5).
-    """
+    """Learning rates of Adam (method, section 6.5)."""
 
     mean: float = 1.6e-3
     """Centres [m]."""
@@ -102,8 +96,7 @@ class Rates:
     opacity_logit: float = 0.05
     """Opacities before the sigmoid [1]."""
     reflectivity_sh: float = 1.6e-4
-    """All 16 harmonics of the reflectivity [m^2 in quad units]; heuristic H1 is to keep this
-    low."""
+    """All 16 harmonics of the reflectivity [m^2 in quad units]; low: heuristic H1."""
     colour_constant: float = 2.5e-3
     """The constant harmonic of the colour [1]."""
     colour_rest: float = 1.25e-4
@@ -112,7 +105,7 @@ class Rates:
     """Key offsets of the nodes [m], or weights of the network [1]."""
 
     def times(self, factor: float) -> Rates:
-        """All of them multiplied."""
+        """All rates multiplied."""
         return Rates(**{name: factor * rate for name, rate in dataclasses.asdict(self).items()})
 
 
@@ -125,13 +118,11 @@ class Weights:
     ssim: float = 0.2
     """Share of the structural similarity in the terms of images [1]."""
     colour: float = 0.0
-    """Colour: (1 - ssim) times the norm of the difference + ssim (1 - SSIM) [1]; needs a calibrated
-    colour camera."""
+    """Colour: (1 - ssim) L1 or L2 + ssim (1 - SSIM) [1]; needs a calibrated colour camera."""
     colour_norm: Norm = Norm.L2
     """Norm of that difference."""
     depth: float = 0.0
-    """Rendered against closed-form distance: (1 - ssim) L1 + ssim (1 - SSIM) [1/m]; for
-    DeformableGS with C-ToF."""
+    """Rendered against closed-form distance: (1 - ssim) L1 + ssim (1 - SSIM) [1/m]."""
     distortion: float = 0.0
     """Mean depth distortion [1/m^2]."""
     flow: float = 0.0
@@ -142,37 +133,35 @@ class Weights:
 
 @dataclass(frozen=True, kw_only=True)
 class Schedule:
-    """When what happens, in images and in shares of the run."""
+    """Lengths and intervals, in images or as fractions of the run."""
 
     images: int = 60_000
     """Length of the run [images]."""
     batch: Batch = Batch.QUARTET
     """What one step compares; a phasor is one image."""
     batch_rule: BatchRule = BatchRule.NONE
-    """How Adam is told of larger batches."""
+    """Learning-rate scaling for larger batches."""
     warm_up: int = 0
-    """Nothing moves for so long, and the motion learns nothing [images]."""
+    """Warm-up, in which nothing moves and the motion is not optimised [images]."""
     motion_decay_from: int = 0
-    """The rate of the motion stays at its first value for so long and reaches its last at the end
-    [images]."""
+    """The learning rate of the motion decays from here to the end [images]."""
     motion_ramp: int = 0
-    """The rate of the motion rises linearly over its first so many images [images]."""
+    """Linear warm-up of the learning rate of the motion [images]."""
     pause_after_reset: int = 0
-    """The motion learns nothing for so long after every reset of the opacities [images]."""
+    """The motion is not optimised for so long after an opacity reset [images]."""
     freeze_from: float | None = None
-    """From this share of the run on only the motion is optimised [1]; None: everything is, to the
-    end."""
+    """From this fraction of the run on only the motion is optimised [1]; None: never."""
     colour_from: int = 0
     """The colour loss begins here [images]."""
     flow_from: int = 0
     """The flow loss begins here [images]."""
     flow_every: int = 1
-    """It is part of one in so many steps only, and weighs so many times as much there."""
+    """It is computed in one of so many steps, with so many times the weight."""
     distortion_from: float = 0.0
-    """The depth distortion begins at this share of the run [1]."""
+    """The depth distortion begins at this fraction of the run [1]."""
     sh_degree_every: int | None = None
-    """Harmonics begin at degree 0 and gain one after so many [images], up to that of ``render``;
-    None: all at once."""
+    """Images between two increments of the degree of harmonics, from 0 up to that of ``render``;
+    None: the highest from the start."""
     log_every: int = 100
     """Between two rows of metrics.jsonl [images]."""
     checkpoint_every_s: float = 60.0
@@ -190,45 +179,40 @@ class Schedule:
 
 @dataclass(frozen=True, kw_only=True)
 class DensifySettings:
-    """When Gaussians are added, removed and dimmed (method, section 6.6)."""
+    """Densification, pruning and opacity resets (method, section 6.6)."""
 
     every: int | None = None
-    """Between two rounds of cloning, splitting and pruning [images]; None: the set of Gaussians
-    stays as it starts."""
+    """Interval of densification: cloning, splitting, pruning [images]; None: never."""
     start: int = 250
-    """The first round is later than this [images]."""
+    """No densification up to here [images]."""
     stop_share: float = 0.6
-    """No round and no reset after this share of the run [1]."""
+    """No densification and no opacity reset after this fraction of the run [1]."""
     gradient_min: float | None = 2e-4
-    """Gaussians whose mean screen gradient, in half image sizes, reaches this are cloned or split;
-    None: none are."""
+    """Mean screen gradient, in half image sizes, from which Gaussians are cloned or split; None:
+    none are."""
     clone_scale_max: float = 0.08
     """Up to this largest scale a Gaussian is cloned, above it is split [m]."""
     opacity_min: float = 0.01
-    """Fainter Gaussians are removed [1]."""
+    """Gaussians of lower opacity are pruned [1]."""
     scale_range: tuple[float, float] = (0.0, float("inf"))
-    """Gaussians whose largest scale is outside are removed [m]."""
+    """Gaussians whose largest scale is outside are pruned [m]."""
     scale_from: int = 3000
-    """That is judged later than this [images]."""
+    """Pruning by scale begins after this [images]."""
     unseen_from: int | None = None
-    """From here on rounds remove Gaussians that are behind others in every image [images]; None:
-    never."""
+    """Visibility pruning begins here: of Gaussians hidden in every image [images]; None: never."""
     unseen_weight: float = 0.0
-    """These are Gaussians whose weight in an image, summed over its pixels, is at most so much on
-    average, over all images since the last time, among which every raw frame is [px]. With 0 images
-    stay as they are."""
+    """Visibility pruning removes Gaussians whose blending weight, summed over the pixels of an
+    image and averaged over at least all raw frames, is at most this [px]."""
     reset_every: int | None = None
-    """Between two resets of all opacities to ``opacity_min`` [images]; None: never."""
+    """Interval of opacity resets to ``opacity_min`` [images]; None: never."""
     reset_faster: tuple[int, int] | None = None
-    """From the first of these [images] on, resets are the second apart [images]; None: always the
-    same."""
+    """From the first number of images on, the second is the interval; None: it does not change."""
     loses_step: bool = False
-    """Whether a step that ends with a round changes no Gaussian otherwise, as in the published
-    code."""
+    """Whether the update of Gaussians is skipped in steps with densification, as published."""
     gaussians_min: int = 16
-    """A round that would leave fewer removes none [Gaussians]."""
+    """Nothing is pruned if fewer would remain [Gaussians]."""
     gaussians_max: int = 200_000
-    """A round never adds beyond this; the largest gradients go first [Gaussians]."""
+    """Upper limit; the largest gradients are densified first [Gaussians]."""
 
     def __post_init__(self):
         for name in ("every", "reset_every"):
@@ -250,17 +234,15 @@ class ReconSettings:
     preset: str
     """Name of the preset these settings came from."""
     ablation: str | None = None
-    """Row of the ablation table that was applied to it; None: none."""
+    """Row of the ablation table that was applied; None: none."""
     method: Method = Method.GAUSSIANS
     """What kind of reconstruction this is."""
     input: Input = Input.AUTO
     """What is compared with the sensor."""
     cycle: int = FRAMES_PER_QUARTET
-    """Raw frames of a quartet, which is that of the sequence: a step of so many images learns as
-    much as the preset says for four of them, see ``schedule.batch_rule``."""
+    """Raw frames per quartet of the sequence; counts in learning-rate scaling."""
     quad_scale: float | None = None
-    """Multiplies quads and phasors first [1]; None: as the sequence says, or to a largest phasor of
-    1."""
+    """Factor of quads and phasors [1]; None: that of the sequence, or for a largest phasor of 1."""
     width_max: int | None = None
     """Wider images are reduced to this for the optimisation [px]; None keeps all pixels."""
     flow: FlowSource = FlowSource.AUTO
@@ -282,21 +264,17 @@ class ReconSettings:
     densify: DensifySettings = field(default_factory=DensifySettings)
     """The number of Gaussians."""
     background: float = 1.0
-    """Amplitude B of the random background, uniform in [-B, B] per pixel, channel and image; 0 is
-    black."""
+    """Amplitude B of the random background, uniform in [-B, B]; 0 is black."""
     motion_gradient_max: float | None = 1.0
-    """Longest gradient of the motion; a longer one is shortened [1/m for nodes, 1 for a network].
-    None: never."""
+    """Largest gradient norm of the motion, clipped [1/m for nodes, 1 for a network]; None: any."""
     graph: bool = True
     """Whether steps are captured as CUDA graphs; on a CPU there are none. Changes no operation."""
     failures_max: int = 5
-    """So many steps without a finite loss and gradient in a row go back to the last checkpoint,
-    with halved rates."""
+    """Non-finite steps in a row before a return to the last checkpoint with halved rates."""
     rollbacks_max: int = 3
-    """After so many returns to a checkpoint in all, the next one ends the run as diverged."""
+    """Returns to a checkpoint before the run ends as diverged."""
     restarts_max: int = 3
-    """A random start that sees nothing but the dark begins again with another seed, so many times
-    at most."""
+    """Restarts of collapsed random starts, and reinitialisations of a dead network, at most."""
 
     def __post_init__(self):
         if self.motion.kind not in KINDS:

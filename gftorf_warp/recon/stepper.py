@@ -103,7 +103,9 @@ class Stepper:
             reset_at=state.reset_at,
             revived_at=state.revived_at,
         )
-        due = densify.round_is_due(before, state.images, settings.densify, settings.schedule)
+        due = densify.densification_is_due(
+            before, state.images, settings.densify, settings.schedule
+        )
         if due and settings.densify.loses_step:
             rates = {name: rate if name == "motion" else 0.0 for name, rate in rates.items()}
         self._control.write(key, frames, before, state.noise_seed, weights, rates)
@@ -187,7 +189,7 @@ class Stepper:
     def _attach(self, *, free: bool = False) -> None:
         """Move the state to the padded parameters, whose number of rows may change."""
         state, settings = self.state, self.settings
-        grows = densify.rounds_remain(state.images, settings.densify, settings.schedule)
+        grows = densify.densification_remains(state.images, settings.densify, settings.schedule)
         if self._padded.attach(state, steps=self._steps, free=free, grows=grows):
             self._release_graphs()
         self._steps = 0
@@ -239,15 +241,15 @@ def densify_after(
     images.
     """
     options, schedule = settings.densify, settings.schedule
-    if densify.round_is_due(before, state.images, options, schedule):
+    if densify.densification_is_due(before, state.images, options, schedule):
         weight = options.unseen_weight * (state.images - state.unseen_at)
         prunes = visibility_pruning_is_due(state, observations, options)
-        _, state.statistics = densify.round_of(
+        _, state.statistics = densify.densify(
             state.optimiser,
             state.statistics,
             options,
             state.generator,
-            judge_scale=state.images > options.scale_from,
+            prunes_scale=state.images > options.scale_from,
             unseen_weight=weight if prunes else None,
         )
         if prunes:
