@@ -1,6 +1,4 @@
-"""``gftorf bench``: parts by name, the scenes and states that they share,
-printed tables and JSON.
-"""
+"""``gftorf bench``: parts by name, the scenes and states that they share, tables and JSON."""
 
 from __future__ import annotations
 
@@ -69,9 +67,8 @@ class Shared:
     def fitted(self) -> states.Fitted:
         """State of a reconstruction in progress."""
         wanted, sequence = self.wanted, read(self.path)
-        settings = states.settings_of(
-            sequence, wanted.preset or PRESETS["other"], list(wanted.changes), wanted.device
-        )
+        preset = wanted.preset or PRESETS["other"]
+        settings = states.settings_of(sequence, preset, list(wanted.changes), wanted.device)
         if wanted.run is not None:
             return states.from_run(wanted.run, sequence, settings, wanted.device)
         return states.from_phase(sequence, settings, wanted.device, quick=wanted.quick)
@@ -79,9 +76,13 @@ class Shared:
     @functools.cached_property
     def run_folder(self) -> Path:
         """A run that can be rendered."""
-        return self.wanted.run or states.as_run(
-            self.fitted, self.folder / "run", self.wanted.device
-        )
+        run = self.wanted.run
+        return run or states.as_run(self.fitted, self.folder / "run", self.wanted.device)
+
+    @property
+    def length(self) -> dict[str, Any]:
+        """Arguments on the number of images."""
+        return {"quick": self.quick, "images": self.wanted.images}
 
 
 def _renderer(shared: Shared, report: Report) -> Rows:
@@ -93,38 +94,24 @@ def _motion(shared: Shared, report: Report) -> Rows:
 
 
 def _step(shared: Shared, report: Report) -> Rows:
-    changes, images = list(shared.wanted.changes), shared.wanted.images
+    changes = list(shared.wanted.changes)
     return step.measure(
-        shared.fitted,
-        shared.device,
-        changes=changes,
-        quick=shared.quick,
-        images=images,
-        report=report,
+        shared.fitted, shared.device, changes=changes, **shared.length, report=report
     )
 
 
 def _reconstruction(shared: Shared, report: Report) -> Rows:
     folder = shared.folder / "reconstruction"
     folder.mkdir()
-    return reconstruction.measure(
-        shared.path,
-        folder,
-        shared.device,
-        preset=shared.wanted.preset
-        or PRESETS["cpu" if shared.quick or shared.device == "cpu" else "other"],
-        changes=list(shared.wanted.changes),
-        quick=shared.quick,
-        images=shared.wanted.images,
-        report=report,
-    )
+    usual = PRESETS["cpu" if shared.quick or shared.device == "cpu" else "other"]
+    settings = shared.wanted.preset or usual, list(shared.wanted.changes)
+    given = shared.path, folder, shared.device
+    return reconstruction.measure(*given, *settings, **shared.length, report=report)
 
 
 def _render(shared: Shared, report: Report) -> Rows:
-    out, images = shared.folder / "images", shared.wanted.images
-    return rendering.measure(
-        shared.run_folder, out, shared.device, quick=shared.quick, images=images, report=report
-    )
+    given = shared.run_folder, shared.folder / "images", shared.device
+    return rendering.measure(*given, **shared.length, report=report)
 
 
 PARTS: dict[str, tuple[Callable[[Shared, Report], Rows], Callable[[Rows], list[str]]]] = {
@@ -161,11 +148,8 @@ def bench(
     """
     chosen = checked(parts)
     _check_folders(wanted)
-    found = about(wanted.device) | {
-        "quick": wanted.quick,
-        "command": _words(chosen, wanted),
-        "parts": {},
-    }
+    found = about(wanted.device)
+    found |= {"quick": wanted.quick, "command": _words(chosen, wanted), "parts": {}}
     if json is not None:
         _check_file(Path(json))
     if wanted.device != "cpu":  # events and graphs are those of the current device
@@ -193,16 +177,13 @@ def checked(parts: list[str]) -> list[str]:
     """
     unknown = [name for name in parts if name not in PARTS]
     if unknown:
-        why = f"there are {', '.join(PARTS)}"
+        what, why = f"unknown part {', '.join(unknown)}", f"there are {', '.join(PARTS)}"
         fix = "leave PART out for all of them"
-        raise UsageError(
-            f"unknown part {', '.join(unknown)}", where="gftorf bench", why=why, fix=fix
-        )
+        raise UsageError(what, where="gftorf bench", why=why, fix=fix)
     return [name for name in PARTS if name in parts or not parts]
 
 
 def _version_of(package: str) -> str:
-    """Version of an installed package."""
     try:
         return importlib.metadata.version(package)
     except importlib.metadata.PackageNotFoundError:
@@ -211,12 +192,15 @@ def _version_of(package: str) -> str:
 
 def about(device: str) -> dict[str, Any]:
     """Machine and versions, for the JSON of every benchmark."""
-    on_cpu = device == "cpu"
-    name = platform.processor() or platform.machine()
+    on_cpu, cpus = device == "cpu", os.cpu_count()
+    if hasattr(os, "sched_getaffinity"):
+        cpus = len(os.sched_getaffinity(0))
+    if on_cpu:
+        name = f"cpu, {platform.processor() or platform.machine()}"
+    else:
+        name = torch.get_device_module(torch.device(device)).get_device_name(device)
     return {
-        "device": f"cpu, {name}"
-        if on_cpu
-        else torch.get_device_module(torch.device(device)).get_device_name(device),
+        "device": name,
         "cpus": len(os.sched_getaffinity(0))
         if hasattr(os, "sched_getaffinity")
         else os.cpu_count(),
@@ -231,37 +215,25 @@ def about(device: str) -> dict[str, Any]:
 
 def _driver() -> str:
     """Version of the NVIDIA driver, by nvidia-smi."""
-    command = ["nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader"]
-    try:
-        output = subprocess.run(
-            command, check=True, capture_output=True, text=True, timeout=30
-        ).stdout
-    except (OSError, subprocess.SubprocessError):
-        return "unknown"
-    return output.splitlines()[0].strip() if output.strip() else "unknown"
+    output = _output_of("nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader")
+    return output.splitlines()[0].strip() if output else "unknown"
 
 
 def _commit() -> str | None:
-    """Commit of the package's checkout, with "-dirty" if files were changed;
-    None without a checkout.
-    """
+    """Commit of the package's checkout, with "-dirty" if files were changed; None: no checkout."""
     root = Path(__file__).parents[2]
     if not (root / ".git").exists():
         return None
+    options = "--always", "--dirty", "--abbrev=12", "--exclude=*"
+    return _output_of("git", "-C", str(root), "describe", *options)
+
+
+def _output_of(*words: str) -> str | None:
+    """Output of a command; None if it fails."""
     try:
-        words = [
-            "git",
-            "-C",
-            str(root),
-            "describe",
-            "--always",
-            "--dirty",
-            "--abbrev=12",
-            "--exclude=*",
-        ]
-        return subprocess.run(
-            words, check=True, capture_output=True, text=True, timeout=30
-        ).stdout.strip()
+        return subprocess.check_output(
+            words, stderr=subprocess.DEVNULL, text=True, timeout=30
+        ).strip()
     except (OSError, subprocess.SubprocessError):
         return None
 

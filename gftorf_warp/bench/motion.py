@@ -1,9 +1,8 @@
-"""The motion network: forward and backward for Q key times at once,
-encoding of positions included.
-"""
+"""The motion network: forward and backward for Q key times, encoding of positions included."""
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import torch
@@ -17,7 +16,7 @@ from ..render.tensor_cores import fits
 from ..scene.gaussians import GaussianField, constant_sh
 from ..scene.motion import MotionSettings, Products
 from ..scene.network import Network
-from .timing import Report, both_ways, cell, lines_of, watch_of
+from .timing import Report, both_ways, lines_of, two_passes, watch_of
 
 COUNTS = (20_000, 100_000)
 QUICK_COUNTS = (100,)
@@ -29,53 +28,36 @@ BY_TORCH = "half by torch"  # by cuBLAS, for comparison with our kernels
 def measure(device: str, *, quick: bool, runs: int, report: Report) -> list[dict[str, Any]]:
     """Rows of N, Q and precision: time of one forward and backward pass, and per query [ms].
 
-    The network is the published one, 8 layers of 256. A CPU has one precision. Where half precision
-    has kernels of ours, it is also timed with cuBLAS, as ``BY_TORCH``.
-
-    Args:
-        device: "cpu" or a CUDA device.
-        quick: Small N.
-        runs: Repetitions of every timing.
-        report: Called with (rows done, rows in all).
+    The network is the published one, 8 layers of 256. A CPU has one precision.
     """
     watch = watch_of(device)
     precisions = [str(Products.FLOAT32)] if torch.device(device).type == "cpu" else kinds(device)
-    cases = [
-        (n, q, p) for n in (QUICK_COUNTS if quick else COUNTS) for q in QUERIES for p in precisions
-    ]
+    cases = [*itertools.product(QUICK_COUNTS if quick else COUNTS, QUERIES, precisions)]
     rows = []
     for done, (count, queries, products) in enumerate(cases, start=1):
         generator = torch.Generator().manual_seed(0)
         times = torch.arange(KEYS, dtype=torch.float64) * PERIOD_S
         settings = MotionSettings(kind=Network.kind, products=products_of(products))
-        network = Network(
-            times, settings, duration=float(times[-1]), length=LENGTH_M, generator=generator
-        ).to(device)
+        sizes = {"duration": float(times[-1]), "length": LENGTH_M}
+        network = Network(times, settings, **sizes, generator=generator).to(device)
         set_backend(network, products)
-        field = points(LENGTH_M * torch.rand(count, 3, generator=generator)).map(
-            lambda value: value.to(device)
-        )
+        field = points(LENGTH_M * torch.rand(count, 3, generator=generator))
+        field = field.map(lambda value: value.to(device))
         cotangent = torch.randn(queries, count, 3, generator=generator).to(device)
         weights = list(network.parameters())
         keys = list(range(4, 4 + queries))
 
-        def both(
-            network=network, field=field, cotangent=cotangent, weights=weights, keys=keys
-        ) -> object:
-            return torch.autograd.grad(
-                network.at_keys(network.bind(field), keys).offset, weights, cotangent
-            )
+        def offsets(network=network, field=field, keys=keys) -> Tensor:
+            return network.at_keys(network.bind(field), keys).offset
 
-        def forward(network=network, field=field, keys=keys) -> object:
-            with torch.no_grad():
-                return network.at_keys(network.bind(field), keys).offset
+        def both(offsets=offsets, weights=weights, cotangent=cotangent) -> object:
+            return torch.autograd.grad(offsets(), weights, cotangent)
 
         found = both_ways(both, watch, runs)
         best = (found["graph"] or found["eager"])["median"]
         row = {"N": count, "queries": queries, "products": products, "forward_backward": found}
-        rows.append(
-            row | {"forward": both_ways(forward, watch, runs), "ms_per_query": best / queries}
-        )
+        forward = both_ways(torch.no_grad()(offsets), watch, runs)
+        rows.append(row | {"forward": forward, "ms_per_query": best / queries})
         report(done, len(cases), N=count, ms=best)
     return rows
 
@@ -94,9 +76,7 @@ def set_backend(network: Network, kind: str) -> None:
 
 
 def kinds(device: str) -> list[str]:
-    """Rows of one case: every precision, and half precision by cuBLAS where the device has kernels
-    of ours.
-    """
+    """Rows of one case: every precision, and half by cuBLAS where the device has our kernels."""
     times = torch.arange(KEYS, dtype=torch.float64) * PERIOD_S
     form = Form.of(Network(times, MotionSettings(), duration=1.0, length=LENGTH_M))
     own = fits(form, torch.empty(0, device=device).device)
@@ -117,25 +97,14 @@ def points(mean: Float[Tensor, "N 3"]) -> GaussianField:
 
 def table(rows: list[dict[str, Any]]) -> list[str]:
     """One line per row."""
-    heads = [
-        "precision",
-        "N",
-        "queries",
-        "forward, graph",
-        "with backward",
-        "called",
-        "with backward",
-        "per query",
-    ]
+    ways = ["forward, graph", "with backward", "called", "with backward"]
+    heads = ["precision", "N", "queries", *ways, "per query"]
     cells = [
         [
             row["products"],
             f"{row['N']:,}",
             str(row["queries"]),
-            cell(row["forward"]["graph"]),
-            cell(row["forward_backward"]["graph"]),
-            cell(row["forward"]["eager"]),
-            cell(row["forward_backward"]["eager"]),
+            *two_passes(row),
             f"{row['ms_per_query']:.3f}",
         ]
         for row in rows

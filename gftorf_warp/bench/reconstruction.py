@@ -1,5 +1,4 @@
-"""A whole reconstruction in its own process, twice: with an empty kernel cache, then with the
-filled one.
+"""A whole reconstruction in its own process, with an empty kernel cache and then the filled one.
 
 Wall clock of the process, imports and reading of data included, and ``seconds_reconstruct`` of
 config.json. N, d and d_ToF are read from metrics.jsonl and diagnostics.jsonl.
@@ -43,34 +42,23 @@ def with_flow(path: Path, out: Path) -> tuple[Path, float]:
     if sequence.flow.forward or sequence.flow.backward or sequence.from_phasors:
         return path, 0.0
     begun = time.perf_counter()
-    with_flow = replace(sequence, flow=compute_flow(sequence))
+    sequence = replace(sequence, flow=compute_flow(sequence))
     seconds = time.perf_counter() - begun
-    return write("ftorf", out, with_flow, read_truth(sequence)), seconds
+    return write("ftorf", out, sequence, read_truth(sequence)), seconds
 
 
 def measure(
     path: Path,
     folder: Path,
     device: str,
-    *,
     preset: str,
     changes: list[str],
+    *,
     quick: bool,
     images: int | None,
     report: Report,
 ) -> list[dict[str, Any]]:
-    """Two rows, cold and warm, with their curves.
-
-    Args:
-        path: Folder of the sequence.
-        folder: An empty folder for results.
-        device: "cpu" or a CUDA device.
-        preset: Name of the preset.
-        changes: Single settings.
-        quick: A few images only.
-        images: Length of the runs; None: 20,000, on a CPU 4,000.
-        report: Called with (images done in both runs, images in both).
-    """
+    """Two rows, cold and warm, with their curves, in an empty folder."""
     total = images or (QUICK_IMAGES if quick else IMAGES["cpu" if device == "cpu" else "other"])
     sequence, flow_s = with_flow(path, folder / "sequence")
     cache = folder / "kernels"
@@ -78,22 +66,9 @@ def measure(
     rows = []
     for number, name in enumerate(("cold", "warm")):
         out = folder / name
-        command = [
-            "reconstruct",
-            str(sequence),
-            "--out",
-            str(out),
-            "--preset",
-            preset,
-            "--images",
-            str(total),
-        ]
-        command += [
-            "--device",
-            device,
-            "--quiet",
-            *(word for change in changes for word in ("--set", change)),
-        ]
+        command = ["reconstruct", str(sequence), "--out", str(out), "--preset", preset]
+        command += ["--images", str(total), "--device", device, "--quiet"]
+        command += [word for change in changes for word in ("--set", change)]
         begun = time.perf_counter()
         with _running(command, cache) as process:
             while process.poll() is None:
@@ -101,16 +76,8 @@ def measure(
                 report(number * total + min(_reached(out), total - 1), 2 * total, kernels=name)
         wall = time.perf_counter() - begun
         report((number + 1) * total, 2 * total, kernels=name)
-        rows.append(
-            {
-                "kernels": name,
-                "preset": preset,
-                "set": changes,
-                "wall_s": wall,
-                "flow_s": flow_s,
-                **found_in(out),
-            }
-        )
+        row = {"kernels": name, "preset": preset, "set": changes, "wall_s": wall, "flow_s": flow_s}
+        rows.append(row | found_in(out))
     return rows
 
 
@@ -118,10 +85,7 @@ def found_in(run: Path) -> dict[str, Any]:
     """Length, size and curves of a finished run."""
     config = json.loads((run / "config.json").read_text())
     metrics, diagnostics = (rows_of(run / name) for name in ("metrics.jsonl", "diagnostics.jsonl"))
-    images, seconds = (
-        [0, *(row["images"] for row in metrics)],
-        [0.0, *(row["seconds"] for row in metrics)],
-    )
+    images, seconds = ([0.0, *(row[key] for row in metrics)] for key in ("images", "seconds"))
     curve = [
         {
             "images": row["images"],
@@ -132,31 +96,23 @@ def found_in(run: Path) -> dict[str, Any]:
         for row in diagnostics
     ]
     last = curve[-1]
-    facts = {
-        "images": config["images_optimised"],
-        "seconds": config["seconds_reconstruct"],
-        "N": last["N"],
-    }
-    return facts | {key: last[key] for key in KEYS} | {"curve": curve}
+    facts = {"images": config["images_optimised"], "seconds": config["seconds_reconstruct"]}
+    return facts | {"N": last["N"], "curve": curve} | {key: last[key] for key in KEYS}
 
 
 @contextmanager
 def _running(command: list[str], cache: Path) -> Iterator[subprocess.Popen]:
-    """Run the command in another process with its own kernel cache; terminated at the end of the
-    block.
+    """The command in another process with its own kernel cache, terminated after the block.
 
     Raises:
-        ResourceError: If it fails.
+        GftorfError: If it fails.
     """
     paths = os.pathsep.join(filter(None, [str(PACKAGE), os.environ.get("PYTHONPATH")]))
     environment = os.environ | {"WARP_CACHE_PATH": str(cache), "PYTHONPATH": paths}
     with (cache.parent / "errors.txt").open("w+") as errors:
-        process = subprocess.Popen(
-            [sys.executable, "-m", "gftorf_warp", *command],
-            stdout=subprocess.DEVNULL,
-            stderr=errors,
-            env=environment,
-        )
+        words = [sys.executable, "-m", "gftorf_warp", *command]
+        nothing = subprocess.DEVNULL
+        process = subprocess.Popen(words, stdout=nothing, stderr=errors, env=environment)
         try:
             yield process
         finally:
@@ -174,9 +130,8 @@ def error_of(why: str, code: int) -> GftorfError:
     """The class of error that has the exit code of the other process."""
     kinds = {kind.exit_code: kind for kind in GftorfError.__subclasses__()}
     fix = "run that command by itself, with --debug"
-    return kinds.get(code, ResourceError)(
-        "the reconstruction failed", where="gftorf bench", why=why, fix=fix
-    )
+    kind = kinds.get(code, ResourceError)
+    return kind("the reconstruction failed", where="gftorf bench", why=why, fix=fix)
 
 
 def _reached(run: Path) -> int:
@@ -189,29 +144,16 @@ def table(rows: list[dict[str, Any]]) -> list[str]:
     errors = ["d", "d_ToF", "moving d", "d_ToF"]
     heads = ["kernel cache", "images", "process [s]", "reconstruct [s]", "N at the end", *errors]
     totals = [
-        [
-            row["kernels"],
-            f"{row['images']:,}",
-            f"{row['wall_s']:.2f}",
-            f"{row['seconds']:.2f}",
-            f"{row['N']:,}",
-        ]
-        + [_number(row[key]) for key in KEYS]
+        [row["kernels"], f"{row['images']:,}", f"{row['wall_s']:.2f}", *_end_of(row)]
         for row in rows
     ]
     lines = lines_of(f"reconstruction, preset {rows[0]['preset']}: MSE x100 [m^2]", heads, totals)
-    curve = [
-        [
-            f"{row['images']:,}",
-            f"{row['seconds']:.2f}",
-            f"{row['N']:,}",
-            *(_number(row[key]) for key in KEYS),
-        ]
-        for row in rows[-1]["curve"]
-    ]
+    curve = [[f"{row['images']:,}", *_end_of(row)] for row in rows[-1]["curve"]]
     heads = ["images", "seconds", "N", *errors]
     return [*lines, "", *lines_of("warm, over time: MSE x100 [m^2]", heads, curve)]
 
 
-def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.4g}"
+def _end_of(row: dict[str, Any]) -> list[str]:
+    """Cells of seconds, N and errors."""
+    errors = ("-" if row[key] is None else f"{row[key]:.4g}" for key in KEYS)
+    return [f"{row['seconds']:.2f}", f"{row['N']:,}", *errors]

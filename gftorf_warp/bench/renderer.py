@@ -20,7 +20,7 @@ from ..render import launch, stages
 from ..render.buffers import Buffers, RenderSettings
 from ..render.inputs import Images, Inputs, names_of
 from .scenes import CAMERA, FAMILIES, FAR, HEIGHT, NEAR, WIDTH, array_of, inputs_of, scene_of
-from .timing import Function, HostWatch, Report, Watch, both_ways, cell, lines_of, quietly, timed
+from .timing import Function, HostWatch, Report, Watch, both_ways, lines_of, timed, two_passes
 
 COUNTS = (20_000, 50_000, 100_000, 200_000, 300_000)
 QUICK_COUNTS = (500,)
@@ -70,22 +70,17 @@ class Case:
         self.shifts = CANONICAL_SHIFTS if everything else CANONICAL_SHIFTS[:1]
         self.inputs = inputs_of(scene_of(kind, count, scale, opacity), device, colour=everything)
         size = HEIGHT, WIDTH
-        shapes: dict[str, tuple[int, ...]] = {
-            "quads": (len(self.shifts), *size),
-            "phasor": (3, *size),
-        }
+        shapes: dict[str, tuple[int, ...]] = {"quads": (len(self.shifts), *size)}
+        shapes["phasor"] = (3, *size)
         shapes |= {"colour": (3, *size)} if everything else {}
         shapes |= dict.fromkeys(("distance", "opacity", "distortion"), size)
         rng = np.random.default_rng(1)
         empty = dict.fromkeys(names_of(Images))
-        self.images = Images(
-            **empty | {name: array_of(np.zeros(shape), device) for name, shape in shapes.items()}
-        )
+        zeros = {name: array_of(np.zeros(shape), device) for name, shape in shapes.items()}
+        self.images = Images(**empty | zeros)
         known = shapes if everything else {"quads": shapes["quads"]}
-        self.cotangents = Images(
-            **empty
-            | {name: array_of(rng.normal(size=shape), device) for name, shape in known.items()}
-        )
+        random = {name: array_of(rng.normal(size=shape), device) for name, shape in known.items()}
+        self.cotangents = Images(**empty | random)
         self.wanted = Inputs(**dict.fromkeys(names_of(Inputs)))
         for name in GAUSSIANS:
             value = getattr(self.inputs, name)
@@ -153,30 +148,20 @@ def measure(
     device_name: str,
     *,
     runs: int,
-    quick: bool = False,
-    counts: tuple[int, ...] = COUNTS,
-    forms: tuple[str, ...] = FORMS,
-    report: Report = quietly,
+    quick: bool,
+    report: Report,
 ) -> list[dict[str, Any]]:
-    """Rows of N, family and form: pairs, stages, forward, and forward with backward [ms].
-
-    Args:
-        device_name: Of Warp and torch, for example "cpu".
-        runs: Repetitions of every timing.
-        quick: Small N and one family.
-        counts: Numbers of Gaussians, unless ``quick``.
-        forms: Out of ``FORMS``.
-        report: Called with (rows done, rows in all).
-    """
+    """Rows of N, family and form: pairs, stages, forward, and forward with backward [ms]."""
     device = wp.get_device(device_name)
     watch: Watch = WarpWatch(device) if device.is_cuda else HostWatch()
-    families, counts = (FAMILIES[:1], QUICK_COUNTS) if quick else (FAMILIES, counts)
-    cases = [(*family, n, form) for form in forms for family in families for n in counts]
+    families, counts = (FAMILIES[:1], QUICK_COUNTS) if quick else (FAMILIES, COUNTS)
+    cases = [(*family, n, form) for form in FORMS for family in families for n in counts]
     rows = []
     for done, (kind, scale, opacity, count, form) in enumerate(cases, start=1):
         case = Case(kind, count, scale, opacity, form, device)
-        free = timed_free(case, watch, runs)
-        if device.is_cuda:  # no readback of the number of pairs
+        free = None
+        if device.is_cuda:  # first with readback of the number of pairs, then without
+            free = timed(case.both, watch, runs).plain()
             case.start(int(HEADROOM * case.pairs) + 1)
         forward, both = (both_ways(function, watch, runs) for function in (case.forward, case.both))
         parts = {
@@ -185,76 +170,38 @@ def measure(
         }
         case.buffers.check_capacity()
         assert case.images.distance is not None
-        row: dict[str, Any] = {
-            "form": form,
-            "scene": kind,
-            "scale": scale,
-            "opacity": opacity,
-            "N": count,
-        }
-        row |= {
-            "pairs": case.pairs,
-            "forward": forward,
-            "forward_backward": both,
-            "pairs_counted_on_host": free,
-        }
-        row |= {"stages": parts, "mean_distance": float(case.images.distance.numpy().mean())}
-        rows.append(row)
+        row = {"form": form, "scene": kind, "scale": scale, "opacity": opacity, "N": count}
+        row |= {"pairs": case.pairs, "forward": forward, "forward_backward": both}
+        row |= {"pairs_counted_on_host": free, "stages": parts}
+        rows.append(row | {"mean_distance": float(case.images.distance.numpy().mean())})
         report(done, len(cases), N=count, ms=both["eager"]["median"])
     return rows
-
-
-def timed_free(case: Case, watch: Watch, runs: int) -> dict[str, Any] | None:
-    """Forward and backward with readback of the number of pairs, on CUDA [ms];
-    a CPU always reads it.
-    """
-    if not case.device.is_cuda:
-        return None
-    return timed(case.both, watch, runs).plain()
 
 
 def table(rows: list[dict[str, Any]]) -> list[str]:
     """Totals, then stages."""
     totals = [
-        [
-            f"{row['form']} {row['scene']} {row['scale']:g} {row['opacity']:g}",
-            f"{row['N']:,}",
-            f"{row['pairs']:,}",
-            cell(row["forward"]["graph"]),
-            cell(row["forward_backward"]["graph"]),
-            cell(row["forward"]["eager"]),
-            cell(row["forward_backward"]["eager"]),
-        ]
+        [f"{row['form']} {_scene(row)}", f"{row['N']:,}", f"{row['pairs']:,}", *two_passes(row)]
         for row in rows
     ]
-    heads = [
-        "form, scene",
-        "N",
-        "pairs",
-        "forward, graph",
-        "with backward",
-        "forward, called",
-        "with backward",
-    ]
+    ways = ["forward, graph", "with backward", "forward, called", "with backward"]
+    heads = ["form, scene", "N", "pairs", *ways]
     lines = lines_of(f"renderer, {WIDTH}x{HEIGHT}: median (10 .. 90 %) [ms]", heads, totals)
     for form in dict.fromkeys(row["form"] for row in rows):
         some = [row for row in rows if row["form"] == form]
         names = list(dict.fromkeys(name for row in some for name in row["stages"]))
         parts = [
-            [f"{row['scene']} {row['scale']:g} {row['opacity']:g}", f"{row['N']:,}"]
-            + [_stage(row["stages"].get(name)) for name in names]
+            [_scene(row), f"{row['N']:,}"] + [_stage(row["stages"].get(name)) for name in names]
             for row in some
         ]
-        words = [name.replace("_", " ") for name in names]
-        lines += [
-            "",
-            *lines_of(
-                f"stages, form {form}: median [ms], of a graph where there is one",
-                ["scene", "N", *words],
-                parts,
-            ),
-        ]
+        heads = ["scene", "N", *(name.replace("_", " ") for name in names)]
+        title = f"stages, form {form}: median [ms], of a graph where there is one"
+        lines += ["", *lines_of(title, heads, parts)]
     return lines
+
+
+def _scene(row: dict[str, Any]) -> str:
+    return f"{row['scene']} {row['scale']:g} {row['opacity']:g}"
 
 
 def _stage(timings: dict[str, Any] | None) -> str:

@@ -1,5 +1,4 @@
-"""Images per second of a finished run, quads and distance, motion included, for each way of
-rendering.
+"""Images per second of a finished run, quads and distance, for each way of rendering.
 
 ``render``: a Python loop over ``Run.render``. ``renderer``: over ``Run.renderer``, which keeps
 buffers and on CUDA replays a graph. ``unchecked``: the same without the check of the pair capacity
@@ -71,16 +70,7 @@ COMMANDS = {"files": False, "stored": True}  # whether they write arrays
 def measure(
     path: Path, out: Path, device: str, *, quick: bool, images: int | None, report: Report
 ) -> list[dict[str, Any]]:
-    """Images per second, one row for each of ``WAYS`` and ``COMMANDS``.
-
-    Args:
-        path: Folder of the run.
-        out: New folder for images.
-        device: "cpu" or a CUDA device.
-        quick: A few images only.
-        images: Their number; None: 600.
-        report: Called with (ways done, ways in all).
-    """
+    """Images per second, one row for each of ``WAYS`` and ``COMMANDS``; ``out`` is a new folder."""
     run, watch = Run.open(path, device), watch_of(device)
     sequence = run.sequence()
     total = images or (QUICK_IMAGES if quick else IMAGES)
@@ -88,11 +78,7 @@ def measure(
     taken = [(t, views.camera_at(run, sequence, t)) for t in seconds]
 
     rows: list[dict[str, Any]] = []
-    about: dict[str, Any] = {
-        "N": run.gaussians,
-        "width": run.camera.width,
-        "height": run.camera.height,
-    }
+    about = {"N": run.gaussians, "width": run.camera.width, "height": run.camera.height}
     shared = run.renderer(NEEDED)
     if isinstance(shared, Replay):
         shared(*taken[total // 2])
@@ -106,9 +92,8 @@ def measure(
         _exhaust(way(taken[:WARM_UP]))
         images_left = way(taken)
         times, start = [], time.perf_counter()
-        for first, last in pairwise(
-            np.linspace(0, total, min(ROUNDS, total) + 1).astype(int).tolist()
-        ):
+        ends = np.linspace(0, total, min(ROUNDS, total) + 1).astype(int).tolist()
+        for first, last in pairwise(ends):
             watch.synchronise()
             begun = time.perf_counter()
             _exhaust(islice(images_left, last - first))
@@ -117,17 +102,10 @@ def measure(
         rate = total / (time.perf_counter() - start)
         fits = not isinstance(render, Replay) or render.fits()
         if not fits:
-            LOG.warning(
-                "%s: some images needed more than the pair capacity and lack far splats", name
-            )
-        row = about | {
-            "way": name,
-            "images": total,
-            "images_per_s": rate,
-            "ms": Timing.of(times).plain(),
-            "fits": fits,
-        }
-        rows.append(row)
+            text = "%s: some images needed more than the pair capacity and lack far splats"
+            LOG.warning(text, name)
+        row = {"way": name, "images": total, "images_per_s": rate}
+        rows.append(about | row | {"ms": Timing.of(times).plain(), "fits": fits})
         report(done, steps, images_per_s=rate)
     for done, (name, arrays) in enumerate(COMMANDS.items(), start=len(WAYS) + 1):
         many = STORED if arrays and not (quick or images) else total
@@ -139,28 +117,19 @@ def measure(
 
 
 def _commanded(run: Run, out: Path, seconds: list[float], arrays: bool) -> dict[str, Any]:
-    """Rates of ``gftorf render``: overall, and between the first and the last but one progress,
-    before the flush.
-    """
+    """Rates of ``gftorf render``: overall, and from the first to the last progress but one."""
     times: list[tuple[int, float]] = []
+
+    def note(done: int, _: int) -> None:
+        times.append((done, time.perf_counter()))
+
     begun = time.perf_counter()
-    views.render_to_folder(
-        run,
-        out,
-        WHAT,
-        seconds,
-        arrays=arrays,
-        progress=lambda done, _: times.append((done, time.perf_counter())),
-    )
+    views.render_to_folder(run, out, WHAT, seconds, arrays=arrays, progress=note)
     spent = time.perf_counter() - begun
     (first, early), (last, late) = times[0], times[max(0, len(times) - 2)]
     going = (last - first) / (late - early) if last > first else None
-    return {
-        "images": len(seconds),
-        "images_per_s": len(seconds) / spent,
-        "going_images_per_s": going,
-        "ms": None,
-    }
+    rates = {"images_per_s": len(seconds) / spent, "going_images_per_s": going}
+    return {"images": len(seconds), **rates, "ms": None}
 
 
 def _exhaust(images: Iterator[Any]) -> None:
@@ -181,8 +150,5 @@ def table(rows: list[dict[str, Any]]) -> list[str]:
         ]
         for row in rows
     ]
-    return lines_of(
-        f"render rate, quads and distance, {size}",
-        ["way", "images", "images/s", "ms per image"],
-        cells,
-    )
+    heads = ["way", "images", "images/s", "ms per image"]
+    return lines_of(f"render rate, quads and distance, {size}", heads, cells)

@@ -27,9 +27,8 @@ def surface(count: int, scale: float, opacity: float) -> dict[str, np.ndarray]:
     u = rng.random((count, 3))
     z = 3 + 2 * np.sin(6 * u[:, 0]) * np.cos(5 * u[:, 1]) + 0.02 * u[:, 2]
     quaternion = rng.normal(size=(count, 4))
-    x, y = (u[:, 0] - 0.5) * WIDTH / FOCAL * z, (u[:, 1] - 0.5) * HEIGHT / FOCAL * z
     return {
-        "mean": np.stack([x, y, z], 1),
+        "mean": _in_view(u, z),
         "log_scale": np.full((count, 3), math.log(scale)),
         "quaternion": quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True),
         "opacity_logit": np.full(count, math.log(opacity / (1 - opacity))),
@@ -43,16 +42,18 @@ def volume(count: int, scale: float, opacity: float) -> dict[str, np.ndarray]:
     scene = surface(count, scale, opacity)
     u = np.random.default_rng(0).random((count, 3))
     z = NEAR + (FAR - NEAR) * u[:, 2] ** (1 / 3)
-    scene["mean"] = np.stack(
-        [(u[:, 0] - 0.5) * WIDTH / FOCAL * z, (u[:, 1] - 0.5) * HEIGHT / FOCAL * z, z], 1
-    )
+    scene["mean"] = _in_view(u, z)
     return scene
 
 
+def _in_view(u: Float[np.ndarray, "N 3"], z: Float[np.ndarray, "N"]) -> Float[np.ndarray, "N 3"]:
+    """Points at z [m] on the rays of the image positions u [1]."""
+    x, y = (u[:, 0] - 0.5) * WIDTH / FOCAL * z, (u[:, 1] - 0.5) * HEIGHT / FOCAL * z
+    return np.stack([x, y, z], 1)
+
+
 def scene_of(kind: str, count: int, scale: float, opacity: float) -> dict[str, np.ndarray]:
-    """A scene of the family "surface" or "volume": ``count`` Gaussians of one scale [m] and peak
-    opacity [1].
-    """
+    """A scene of the family "surface" or "volume", of one scale [m] and peak opacity [1]."""
     return {"surface": surface, "volume": volume}[kind](count, scale, opacity)
 
 
@@ -60,11 +61,9 @@ def inputs_of(
     scene: dict[str, np.ndarray], device: str | wp.Device, *, colour: bool = True
 ) -> Inputs:
     """The scene as Warp arrays, with the calibration of a sensor with depth_range 15 m."""
-    rgb = (
-        array_of(_constant(scene["colour"].T).transpose(1, 2, 0), device, wp.vec3)
-        if colour
-        else None
-    )
+    rgb = None
+    if colour:
+        rgb = array_of(_constant(scene["colour"].T).transpose(1, 2, 0), device, wp.vec3)
     return Inputs(
         mean=array_of(scene["mean"], device, wp.vec3),
         log_scale=array_of(scene["log_scale"], device, wp.vec3),

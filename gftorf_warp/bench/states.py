@@ -1,5 +1,4 @@
-"""States for timing steps and renderings without an earlier run: a simulated scene, Gaussians from
-measured phase.
+"""States for timing steps and renderings: of a run, or from phase, of a simulated scene.
 
 The scene slides past a static camera. The number of Gaussians is that of the published
 initialisation after its first opacity reset (19 to 21 thousand); a network moves them, as
@@ -57,15 +56,8 @@ class Fitted:
 
 def simulated(path: Path, *, quick: bool) -> Path:
     """The folder of the scene, simulated if absent."""
-    if path.exists():
-        return path
-    return simulate(
-        SCENE,
-        path,
-        frames=QUICK_FRAMES if quick else FRAMES,
-        size=QUICK_SIZE if quick else SIZE,
-        seed=0,
-    )
+    frames, size = (QUICK_FRAMES, QUICK_SIZE) if quick else (FRAMES, SIZE)
+    return path if path.exists() else simulate(SCENE, path, frames=frames, size=size, seed=0)
 
 
 def settings_of(sequence: Sequence, preset: str, changes: list[str], device: str) -> ReconSettings:
@@ -87,10 +79,9 @@ def from_run(run: Path | None, sequence: Sequence, settings: ReconSettings, devi
     observations = observe(sequence, settings, device)
     stored = None if run is None else checkpoint.last(run, device)
     if stored is None and run is not None:
+        why = "nothing was reconstructed yet"
         fix = "name the --out of a reconstruction, or leave --run out"
-        raise InputError(
-            "the run has no checkpoint", where=run, why="nothing was reconstructed yet", fix=fix
-        )
+        raise InputError("the run has no checkpoint", where=run, why=why, fix=fix)
     if stored is None:
         stored = to_dict(begin(observations, settings, seed=0, device=device))
     return Fitted(observations=observations, settings=settings, stored=stored, sequence=sequence)
@@ -100,10 +91,8 @@ def from_phase(sequence: Sequence, settings: ReconSettings, device: str, *, quic
     """19 to 21 thousand Gaussians from measured phase, with the motion of the settings."""
     low, high = QUICK_COUNT if quick else COUNT
     observations = observe(sequence, settings, device)
-    init = replace(InitSettings(), kind=Init.PHASE)
-    spacing = (
-        observations.sequence.width * observations.sequence.height / (0.5 * (low + high))
-    ) ** 0.5
+    init, middle = replace(InitSettings(), kind=Init.PHASE), 0.5 * (low + high)
+    spacing = (observations.sequence.width * observations.sequence.height / middle) ** 0.5
     state: State | None = None
     for _ in range(TRIES):
         init = replace(init, static_spacing=spacing, moving_spacing=0.5 * spacing)
@@ -111,7 +100,7 @@ def from_phase(sequence: Sequence, settings: ReconSettings, device: str, *, quic
         count = len(state.optimiser.field)
         if low <= count <= high:
             break
-        spacing *= (count / (0.5 * (low + high))) ** 0.5
+        spacing *= (count / middle) ** 0.5
     assert state is not None
     stored = to_dict(state)
     stored["images"] = min(REACHED, settings.schedule.images // 4)
@@ -119,9 +108,7 @@ def from_phase(sequence: Sequence, settings: ReconSettings, device: str, *, quic
 
 
 def pairs_of(fitted: Fitted) -> int:
-    """(tile, splat) pairs of the state in the middle of the sequence,
-    at the size of the optimisation.
-    """
+    """Number of (tile, splat) pairs of the state in the middle of the sequence, as optimised."""
     observations = fitted.observations
     middle = observations.sequence.frames // 2
     camera = observations.cameras[middle]

@@ -42,21 +42,16 @@ def ways(settings: ReconSettings, changes: list[str], device: str) -> list[Recon
     moves = settings.motion.kind == Network.kind and gpu
     graphs = [settings.graph] if "graph" in fixed or not gpu else [False, True]
     batches = [settings.schedule.batch] if "schedule.batch" in fixed else list(Batch)
-    products = (
-        [settings.motion.products] if "motion.products" in fixed or not moves else list(Products)
-    )
-    pairs = [(graph, products[-1]) for graph in graphs] + [
-        (graphs[-1], kind) for kind in products[:-1]
-    ]
+    one = "motion.products" in fixed or not moves
+    products = [settings.motion.products] if one else list(Products)
+    pairs = [(graph, products[-1]) for graph in graphs]
+    pairs += [(graphs[-1], precision) for precision in products[:-1]]
+    schedules = [replace(settings.schedule, batch=batch) for batch in batches]
+    motions = {precision: replace(settings.motion, products=precision) for precision in products}
     return [
-        replace(
-            settings,
-            graph=graph,
-            schedule=replace(settings.schedule, batch=batch),
-            motion=replace(settings.motion, products=precision),
-        )
+        replace(settings, graph=graph, schedule=schedule, motion=motions[precision])
         for graph, precision in pairs
-        for batch in batches
+        for schedule in schedules
     ]
 
 
@@ -103,23 +98,11 @@ def measure(
     images: int | None,
     report: Report,
 ) -> list[dict[str, Any]]:
-    """Rows of :func:`ways`.
-
-    Args:
-        fitted: The state.
-        device: "cpu" or a CUDA device.
-        changes: Single settings that ``fitted`` was made with.
-        quick: A few images only.
-        images: Their number; None: 400.
-        report: Called with (images done, images in all).
-    """
-    count, part, warm_up = (
-        (QUICK_IMAGES, QUICK_PART, QUICK_WARM_UP) if quick else (IMAGES, PART, WARM_UP)
-    )
-    chosen = ways(fitted.settings, changes, device)
-    return rows_of(
-        chosen, fitted, device, images=images or count, part=part, warm_up=warm_up, report=report
-    )
+    """Rows of :func:`ways`; ``changes`` are those that ``fitted`` was made with."""
+    usual = (QUICK_IMAGES, QUICK_PART, QUICK_WARM_UP) if quick else (IMAGES, PART, WARM_UP)
+    count, part, warm_up = usual
+    chosen, count = ways(fitted.settings, changes, device), images or count
+    return rows_of(chosen, fitted, device, images=count, part=part, warm_up=warm_up, report=report)
 
 
 def rows_of(
@@ -132,8 +115,7 @@ def rows_of(
     warm_up: int = WARM_UP,
     report: Report = quietly,
 ) -> list[dict[str, Any]]:
-    """Mean over consecutive images and percentiles over parts of them [ms per image], one row per
-    settings.
+    """One row per settings: mean of consecutive images, percentiles of parts [ms per image].
 
     Args:
         chosen: The settings.
@@ -145,7 +127,7 @@ def rows_of(
         report: Called with (images done, images in all).
     """
     parts, rows, watch = max(images // part, 1), [], watch_of(device)
-    pairs = pairs_of(fitted)
+    pairs, gpu = pairs_of(fitted), torch.device(device).type != "cpu"
     for number, settings in enumerate(chosen):
         observations = observe(fitted.sequence, settings, device)
         run = fresh(fitted, observations, settings, device, warm_up)
@@ -159,7 +141,7 @@ def rows_of(
             times.append(1e3 * (time.perf_counter() - begun) / (state.images - first))
             report((number * parts + done) * part, len(chosen) * parts * part, ms=times[-1])
         row: dict[str, Any] = {
-            "graph": settings.graph and torch.device(device).type != "cpu",
+            "graph": settings.graph and gpu,
             "batch": str(settings.schedule.batch),
             "products": str(settings.motion.products),
             "N": len(state.optimiser.field),
@@ -171,18 +153,15 @@ def rows_of(
             "ms_per_image": statistics.mean(times),
             "parts": Timing.of(times).plain(),
         }
-        if torch.device(device).type != "cpu":
-            row["waits_per_image"] = waits(
-                fresh(fitted, observations, settings, device, warm_up), device
-            )
+        if gpu:
+            run = fresh(fitted, observations, settings, device, warm_up)
+            row["waits_per_image"] = waits(run, device)
         rows.append(row)
     return rows
 
 
 def waits(run: Run, device: str) -> float:
-    """Synchronisations with the device per image that torch reports;
-    those of Warp are not included.
-    """
+    """Synchronisations with the device per image, as torch reports them (not those of Warp)."""
     module = torch.get_device_module(device)
     module.set_sync_debug_mode("warn")
     with warnings.catch_warnings(record=True) as messages:
@@ -196,9 +175,8 @@ def profiled(run: Run, device: str) -> str:
     """Torch's table of the most expensive kernels and operators."""
     on_cpu = torch.device(device).type == "cpu"
     activity = torch.profiler.ProfilerActivity
-    with torch.profiler.profile(
-        activities=[activity.CPU] if on_cpu else [activity.CPU, activity.CUDA]
-    ) as profile:
+    activities = [activity.CPU] if on_cpu else [activity.CPU, activity.CUDA]
+    with torch.profiler.profile(activities=activities) as profile:
         advance(run, WATCHED)
         watch_of(device).synchronise()
     order = "self_cpu_time_total" if on_cpu else "self_device_time_total"
@@ -206,9 +184,7 @@ def profiled(run: Run, device: str) -> str:
 
 
 def timeline(run: Run, device: str) -> list[str]:
-    """GPU activities of a few steps in order of their begin: begin and duration [us], stream,
-    name.
-    """
+    """GPU activities of a few steps in order: begin and duration [us], stream, name."""
     with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CUDA]) as profile:
         advance(run, WATCHED)
         watch_of(device).synchronise()
@@ -221,26 +197,16 @@ def timeline(run: Run, device: str) -> list[str]:
 def lines_of_trace(events: list[dict[str, Any]]) -> list[str]:
     """Lines of :func:`timeline` from torch's trace events; those of the host are left out."""
     found = sorted((e for e in events if e.get("cat") in ON_DEVICE), key=lambda event: event["ts"])
-    rows = [
-        (e["ts"] - found[0]["ts"], e["dur"], e["args"].get("stream", "-"), e["name"]) for e in found
-    ]
     return [
-        f"{begin:10.1f} {length:8.1f}  {stream!s:>4}  {name}"
-        for begin, length, stream, name in rows
+        f"{event['ts'] - found[0]['ts']:10.1f} {event['dur']:8.1f}  "
+        f"{event['args'].get('stream', '-')!s:>4}  {event['name']}"
+        for event in found
     ]
 
 
 def table(rows: list[dict[str, Any]]) -> list[str]:
     """One line per way."""
-    heads = [
-        "graph, batch, products",
-        "N",
-        "pairs",
-        "images",
-        "mean",
-        "10 .. 90 % of parts",
-        "waits per image",
-    ]
+    heads = ["graph, batch, products", "N", "pairs", "images", "mean", "10 .. 90 % of parts"]
     cells = [
         [
             f"{'graph' if row['graph'] else 'eager'}, {row['batch']}, {row['products']}",
@@ -253,6 +219,5 @@ def table(rows: list[dict[str, Any]]) -> list[str]:
         ]
         for row in rows
     ]
-    return lines_of(
-        "training step without densification and opacity resets [ms per image]", heads, cells
-    )
+    title = "training step without densification and opacity resets [ms per image]"
+    return lines_of(title, [*heads, "waits per image"], cells)

@@ -53,12 +53,6 @@ class Timing:
         p10, median, p90 = (float(value) for value in np.percentile(times, [10, 50, 90]))
         return cls(median=median, p10=p10, p90=p90, runs=len(times))
 
-    def over(self, count: int) -> Timing:
-        """Per item, where each run had ``count`` items."""
-        return Timing(
-            median=self.median / count, p10=self.p10 / count, p90=self.p90 / count, runs=self.runs
-        )
-
     def plain(self) -> dict[str, float | int]:
         """For JSON."""
         return asdict(self)
@@ -105,9 +99,7 @@ class TorchWatch:
         self.module.synchronize()
 
     def captured(self, function: Function) -> Function | None:
-        """A CUDA graph of the function, which has run before on a stream of its own,
-        as torch wants it.
-        """
+        """A CUDA graph of the function, which first runs on a side stream, as torch requires."""
         side = self.module.Stream()
         side.wait_stream(self.module.current_stream())
         with self.module.stream(side):
@@ -134,9 +126,9 @@ def watch_of(device: torch.device | str) -> Watch:
     return HostWatch() if torch.device(device).type == "cpu" else TorchWatch(device)
 
 
-def timed(function: Function, watch: Watch, runs: int, *, warm_up: int = WARM_UP) -> Timing:
-    """Times of single calls, after ``warm_up`` calls; without garbage collection."""
-    for _ in range(warm_up):
+def timed(function: Function, watch: Watch, runs: int, *, within: int = 1) -> Timing:
+    """Times of single calls after a warm-up, without garbage collection, over ``within``."""
+    for _ in range(WARM_UP):
         function()
     watch.synchronise()
     collecting = gc.isenabled()
@@ -147,7 +139,7 @@ def timed(function: Function, watch: Watch, runs: int, *, warm_up: int = WARM_UP
             start = watch.mark()
             function()
             marks.append((start, watch.mark()))
-        times = [watch.between(*pair) for pair in marks]
+        times = [watch.between(*pair) / within for pair in marks]
     finally:
         if collecting:
             gc.enable()
@@ -168,7 +160,7 @@ def both_ways(function: Function, watch: Watch, runs: int, *, within: int = 1) -
         LOG.warning("cannot be captured in a graph: %s", found["graph_error"])
         return found
     if replay is not None:
-        found["graph"] = timed(replay, watch, runs).over(within).plain()
+        found["graph"] = timed(replay, watch, runs, within=within).plain()
     return found
 
 
@@ -177,6 +169,12 @@ def cell(timing: dict[str, Any] | None) -> str:
     if timing is None:
         return "-"
     return f"{timing['median']:.3f} ({timing['p10']:.3f} .. {timing['p90']:.3f})"
+
+
+def two_passes(row: dict[str, Any]) -> list[str]:
+    """Cells of a row: forward and forward with backward, as graphs, then called from Python."""
+    kinds = "forward", "forward_backward"
+    return [cell(row[kind][way]) for way in ("graph", "eager") for kind in kinds]
 
 
 def lines_of(title: str, heads: list[str], rows: list[list[str]]) -> list[str]:
