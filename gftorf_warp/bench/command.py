@@ -201,9 +201,7 @@ def about(device: str) -> dict[str, Any]:
         name = torch.get_device_module(torch.device(device)).get_device_name(device)
     return {
         "device": name,
-        "cpus": len(os.sched_getaffinity(0))
-        if hasattr(os, "sched_getaffinity")
-        else os.cpu_count(),
+        "cpus": cpus,
         "driver": "no driver" if on_cpu else f"driver {_driver()}",
         "python": platform.python_version(),
         "warp": f"Warp {_version_of('warp-lang')}",
