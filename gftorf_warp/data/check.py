@@ -1,6 +1,4 @@
-"""``gftorf check``: content of a sequence, source of each value, estimates from its images,
-and warnings.
-"""
+"""``gftorf check``: content of a sequence, source of each value, estimates and warnings."""
 
 from __future__ import annotations
 
@@ -12,6 +10,7 @@ import numpy as np
 from ..constants import CANONICAL_SHIFTS, FRAMES_PER_QUARTET, SPEED_OF_LIGHT
 from ..errors import InputError
 from . import findings, specs
+from .cycles import frequencies_by_order
 from .decode import unambiguous_range
 from .findings import Report
 from .folder import format_of, numbered
@@ -41,15 +40,14 @@ def check(path: str | Path) -> Report:
         if has_light:
             _estimates(sequence, report)
         else:
-            report.warnings.append(
-                "no complete quartet with light: nothing can be decoded or estimated"
-            )
+            warning = "no complete quartet with light: nothing can be decoded or estimated"
+            report.warnings.append(warning)
     findings.flow(sequence, report)
     return report
 
 
 def _estimates(sequence: Sequence, report: Report) -> None:
-    """Findings that need decoded quartets."""
+    """Add findings that need decoded quartets."""
     findings.light(sequence, report)
     findings.frequencies(sequence, report)
     if sequence.from_phasors and report.form == "torf":
@@ -75,59 +73,50 @@ def _canonical(sequence: Sequence) -> bool:
 def _facts(sequence: Sequence, report: Report) -> None:
     """Counts and values, each with its source."""
     stated, tof = sequence.calibration, sequence.intrinsics
-    cycle = (
-        "inferred from shifts and frequencies"
-        if stated.cycle_length is None
-        else sequence.sources["cycle_length"]
-    )
-    measured, sources = int(sequence.measured.sum()), sequence.sources
-    colour, poses = sequence.colour.size, sources["camera_from_world"]
+    measured, sources, colour = int(sequence.measured.sum()), sequence.sources, sequence.colour.size
+    inferred = "inferred from shifts and frequencies"
+    cycle = inferred if stated.cycle_length is None else sources["cycle_length"]
+    scale = "none" if stated.quad_scale is None else f"{stated.quad_scale:.6g}"
     degrees = np.round(np.degrees(sequence.shifts[: sequence.cycle])).astype(int).tolist()
     period = np.diff(sequence.times[:: sequence.cycle if sequence.from_phasors else 1])
-    report.lines += [
-        f"raw frames      {measured} of {sequence.frames} measured, "
-        f"{len(sequence.complete_quartets)} complete "
-        f"quartets, {sequence.width}x{sequence.height} pixels; {sources['measured']}",
-        f"cycle           {sequence.cycle} raw frames; {cycle}",
-        f"quads           {sequence.quads.min():.4g} .. {sequence.quads.max():.4g}; "
-        f"{sources['quads']}",
-        f"shifts          {', '.join(map(str, degrees))} degrees in time; {sources['shifts']}",
-        f"times           0 .. {sequence.times[-1]:.4g} s"
-        + (f", {period.min():.4g} to {period.max():.4g} s apart" if len(period) else "")
-        + f"; {sources['times']}",
-        f"f_mod_hz        {stated.f_mod_hz / 1e6:.6g} MHz, unambiguous to "
-        f"{SPEED_OF_LIGHT / (2 * stated.f_mod_hz):.4g} m; {sources['f_mod_hz']}",
-        f"phase_offset    {stated.phase_offset:.6g} rad; {sources['phase_offset']}",
-        f"dc_offset       {stated.dc_offset:.6g}; {sources['dc_offset']}",
-        f"quad_scale      {'none' if stated.quad_scale is None else f'{stated.quad_scale:.6g}'}; "
-        f"{sources['quad_scale']}",
-        f"intrinsics      fx {tof.fx:.6g}, fy {tof.fy:.6g} px; {sources['fx']}",
-        f"principal point {tof.cx:.6g}, {tof.cy:.6g} px, centres at i + 0.5; {sources['cx']}",
-        f"poses           {poses}",
-        f"colour          {sources['colour']}"
-        + ("" if colour is None else f", {colour[1]}x{colour[0]} pixels"),
-        f"colour camera   {sources['colour_intrinsics']}; poses: {sources['colour_from_world']}",
-        f"novel views     {sources['novel_from_world']}",
-        f"forward flow    {sources['forward_flow']}",
-        f"backward flow   {sources['backward_flow']}",
-    ]
+    apart = f", {period.min():.4g} to {period.max():.4g} s apart" if len(period) else ""
+    size = "" if colour is None else f", {colour[1]}x{colour[0]} pixels"
+
+    def fact(name: str, text: str, source: str) -> None:
+        report.add(name, f"{text}; {sources[source]}")
+
+    quartets, range_m = len(sequence.complete_quartets), SPEED_OF_LIGHT / (2 * stated.f_mod_hz)
+    text = f"{measured} of {sequence.frames} measured, {quartets} complete quartets, "
+    fact("raw frames", f"{text}{sequence.width}x{sequence.height} pixels", "measured")
+    report.add("cycle", f"{sequence.cycle} raw frames; {cycle}")
+    fact("quads", f"{sequence.quads.min():.4g} .. {sequence.quads.max():.4g}", "quads")
+    fact("shifts", f"{', '.join(map(str, degrees))} degrees in time", "shifts")
+    fact("times", f"0 .. {sequence.times[-1]:.4g} s{apart}", "times")
+    text = f"{stated.f_mod_hz / 1e6:.6g} MHz, unambiguous to {range_m:.4g} m"
+    fact("f_mod_hz", text, "f_mod_hz")
+    fact("phase_offset", f"{stated.phase_offset:.6g} rad", "phase_offset")
+    fact("dc_offset", f"{stated.dc_offset:.6g}", "dc_offset")
+    fact("quad_scale", scale, "quad_scale")
+    fact("intrinsics", f"fx {tof.fx:.6g}, fy {tof.fy:.6g} px", "fx")
+    fact("principal point", f"{tof.cx:.6g}, {tof.cy:.6g} px, centres at i + 0.5", "cx")
+    report.add("poses", sources["camera_from_world"])
+    report.add("colour", f"{sources['colour']}{size}")
+    poses = f"poses: {sources['colour_from_world']}"
+    report.add("colour camera", f"{sources['colour_intrinsics']}; {poses}")
+    report.add("novel views", sources["novel_from_world"])
+    report.add("forward flow", sources["forward_flow"])
+    report.add("backward flow", sources["backward_flow"])
     assert sequence.path is not None
     if sequence.frequencies_hz is not None:
-        several = ", ".join(
-            f"{f / 1e6:.6g}" for f in dict.fromkeys(sequence.frame_frequencies.tolist())
-        )
+        several = ", ".join(f"{f / 1e6:.6g}" for f in frequencies_by_order(sequence.frequencies_hz))
         alone = ", ".join(f"{SPEED_OF_LIGHT / (2 * f):.4g}" for f in sequence.frequencies)
-        report.lines.append(
-            f"frequencies     {several} MHz, unambiguous to {alone} m alone; "
-            f"{sources['frequencies_hz']}"
-        )
+        fact("frequencies", f"{several} MHz, unambiguous to {alone} m alone", "frequencies_hz")
     if tof.distortion is not None:
         names = zip(("k1", "k2", "p1", "p2", "k3"), tof.distortion, strict=True)
-        lens = ", ".join(f"{name} {value:.4g}" for name, value in names)
-        report.lines.append(f"lens            {lens}; {sources['distortion']}")
+        fact("lens", ", ".join(f"{name} {value:.4g}" for name, value in names), "distortion")
     if sequence.exposures is not None:
         low, high = 1e3 * sequence.exposures.min(), 1e3 * sequence.exposures.max()
-        report.lines.append(f"exposures       {low:.4g} .. {high:.4g} ms; {sources['exposures']}")
+        fact("exposures", f"{low:.4g} .. {high:.4g} ms", "exposures")
     patterns = [p for f in specs.fields(report.form).values() for p in f.paths if "{id}" in p]
     for pattern in dict.fromkeys(patterns):
         for slot in range(FRAMES_PER_QUARTET if "{slot}" in pattern else 1):
@@ -135,59 +124,42 @@ def _facts(sequence: Sequence, report: Report) -> None:
             ids = list(numbered(sequence.path, name))
             if ids:
                 steps = ", ".join(f"{step} ({count}x)" for step, count in _counts(np.diff(ids)))
-                report.lines.append(
-                    f"ids {name:<28} {len(ids)} from {ids[0]} to {ids[-1]}, steps {steps or 'none'}"
-                )
+                text = f"{len(ids)} from {ids[0]} to {ids[-1]}, steps {steps or 'none'}"
+                report.add(f"ids {name:<28}", text)
 
 
 def _assumptions(sequence: Sequence, report: Report) -> None:
     """Values that were assumed, and what is missing."""
-    tof = sequence.intrinsics
-    sources, missing = sequence.sources, np.flatnonzero(~sequence.measured)
+    tof, sources, warn = sequence.intrinsics, sequence.sources, report.warnings.append
+    kind, missing = "raw frames", np.flatnonzero(~sequence.measured)
     if len(missing):
-        kind = "raw frames"
         if sequence.from_phasors:
             kind, missing = "phasors", missing[:: sequence.cycle] // sequence.cycle
-        shown = ", ".join(f"{n}" for n in missing[:10]) + (" .." if len(missing) > 10 else "")
-        report.warnings.append(f"{len(missing)} {kind} were not measured: {shown}")
+        shown = ", ".join(map(str, missing[:10])) + (" .." if len(missing) > 10 else "")
+        warn(f"{len(missing)} {kind} were not measured: {shown}")
     if sequence.frames % sequence.cycle:
-        report.warnings.append(
-            f"the last quartet is truncated after {sequence.frames % sequence.cycle} frames"
-        )
+        warn(f"the last quartet is truncated after {sequence.frames % sequence.cycle} frames")
     if sources["times"].startswith("default"):
-        report.warnings.append(
-            f"frame rate assumed: {sources['times'][8:]}; cams/frame_times.npy states another"
-        )
+        warn(f"frame rate assumed: {sources['times'][8:]}; cams/frame_times.npy states another")
     if sources["f_mod_hz"].startswith("default"):
-        report.warnings.append("modulation frequency assumed: no cams/depth_range.npy")
+        warn("modulation frequency assumed: no cams/depth_range.npy")
     if sources["pixel_centre"].startswith("inferred"):
-        report.warnings.append(
-            f"pixel centres {sources['pixel_centre']}; state them in cams/pixel_centre.json"
-        )
+        warn(f"pixel centres {sources['pixel_centre']}; state them in cams/pixel_centre.json")
     if "other poses" in sources["camera_from_world"]:
-        report.warnings.append(
-            f"poses: {sources['camera_from_world']}; cams/poses.json makes them count"
-        )
+        warn(f"poses: {sources['camera_from_world']}; cams/poses.json makes them count")
     for name in ("colour_intrinsics", "colour_from_world"):
         if sources[name].startswith("inferred") or "replaces" in sources[name]:
-            report.warnings.append(f"{name}: {sources[name]}")
+            warn(f"{name}: {sources[name]}")
     if "amplitude, not colour" in sources["colour"]:
-        report.warnings.append("colour: three equal channels: amplitude, not colour")
+        warn("colour: three equal channels: amplitude, not colour")
     if "warped copies" in sources["measured"]:
-        report.warnings.append(f"quads: {sources['measured']}")
-    for name, focal, size in (
-        ("fx", tof.fx, sequence.width),
-        ("fy", tof.fy, sequence.height),
-    ):
+        warn(f"quads: {sources['measured']}")
+    for name, focal, size in (("fx", tof.fx, sequence.width), ("fy", tof.fy, sequence.height)):
         if focal > NARROW_VIEW * size:
-            angle = math.degrees(2 * math.atan(size / (2 * focal)))
-            report.warnings.append(
-                f"{name} {focal:.4g} at {size} px is a view of {angle:.1f} degrees: millimetres?"
-            )
+            view = f"a view of {math.degrees(2 * math.atan(size / (2 * focal))):.1f} degrees"
+            warn(f"{name} {focal:.4g} at {size} px is {view}: millimetres?")
     if not (0 <= tof.cx <= sequence.width and 0 <= tof.cy <= sequence.height):
-        report.warnings.append(
-            f"the principal point {tof.cx:.4g}, {tof.cy:.4g} is outside the image"
-        )
+        warn(f"the principal point {tof.cx:.4g}, {tof.cy:.4g} is outside the image")
 
 
 def _counts(steps: np.ndarray) -> list[tuple[int, int]]:

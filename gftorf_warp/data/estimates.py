@@ -1,6 +1,4 @@
-"""Estimates from the images of a sequence that reveal a wrong order,
-offset or scale (``gftorf check``).
-"""
+"""Estimates from images that reveal a wrong order, offset or scale (``gftorf check``)."""
 
 from __future__ import annotations
 
@@ -26,9 +24,7 @@ MOVING_PX = 0.5  # [px] flow above this is motion
 
 
 def steady_pixels(sequence: Sequence) -> np.ndarray:
-    """Bright pixels [H, W] whose quads of one slot change least over the sequence,
-    relative to their amplitude.
-    """
+    """Bright pixels [H, W] whose quads of one slot change least, relative to their amplitude."""
     change = np.zeros(sequence.quads.shape[1:])
     for slot in range(step := sequence.cycle):
         frames = np.flatnonzero(sequence.measured[slot::step]) * step + slot
@@ -43,9 +39,7 @@ def steady_pixels(sequence: Sequence) -> np.ndarray:
 
 
 def changed_share(sequence: Sequence) -> float:
-    """Fraction of bright pixels whose phasor changes from the first complete quartet to the
-    last.
-    """
+    """Fraction of bright pixels whose phasor changes from first to last complete quartet."""
     first, last = (quartet_phasor(sequence, sequence.complete_quartets[at]) for at in (0, -1))
     amplitude = np.hypot(*first)
     bright = amplitude >= np.quantile(amplitude, BRIGHT_QUANTILE)
@@ -55,16 +49,13 @@ def changed_share(sequence: Sequence) -> float:
 def distance_of_z(sequence: Sequence, truth: Truth) -> np.ndarray:
     """Distances [F, H, W] [m] if the numbers of the truth were z-depths."""
     y, x = np.mgrid[0 : sequence.height, 0 : sequence.width] + 0.5
-    slopes = (
-        (x - sequence.intrinsics.cx) / sequence.intrinsics.fx,
-        (y - sequence.intrinsics.cy) / sequence.intrinsics.fy,
-    )
-    return (truth.distance * np.sqrt(1.0 + slopes[0] ** 2 + slopes[1] ** 2)).astype(np.float32)
+    tof = sequence.intrinsics
+    slope_x, slope_y = (x - tof.cx) / tof.fx, (y - tof.cy) / tof.fy
+    return (truth.distance * np.sqrt(1.0 + slope_x**2 + slope_y**2)).astype(np.float32)
 
 
 def dc_offset(sequence: Sequence) -> float:
-    """Constant part of the quads as a multiple of their amplitude, mean(Q0 + Q1 + Q2 + Q3) / (4
-    mean a) of four.
+    """Constant part of the quads as a multiple of their amplitude.
 
     For any shifts it is the mean of the quads minus the wave of their phasor.
     """
@@ -89,13 +80,11 @@ def pairings(sequence: Sequence) -> tuple[int | None, list[float]]:
     """
     frames = [sequence.quartet_frames(i) for i in sequence.complete_quartets]
     quartets = [sequence.quads[own].astype(np.float64) for own in frames]
-    gaps = np.stack(
-        [
-            np.abs(np.median([q[a] + q[b] - q[c] - q[d] for q in quartets], axis=0))
-            for (a, b), (c, d) in PAIRINGS
-        ]
-    )
-    best = gaps.argmin(axis=0)[steady_pixels(sequence)]
+    gaps = [
+        np.abs(np.median([q[a] + q[b] - q[c] - q[d] for q in quartets], axis=0))
+        for (a, b), (c, d) in PAIRINGS
+    ]
+    best = np.argmin(gaps, axis=0)[steady_pixels(sequence)]
     shares = [float((best == p).mean()) for p in range(len(PAIRINGS))]
     shift = sequence.shifts[frames[0]]
     opposite = [all(math.cos(shift[a] - shift[b]) < -0.99 for a, b in pairs) for pairs in PAIRINGS]
@@ -118,19 +107,16 @@ class PhasorMatch:
 
 
 def phasor_match(sequence: Sequence, stored: dict[int, np.ndarray]) -> PhasorMatch | None:
-    """Compare stored phasors [H, W, 3], by quartet start, with the quads on steady pixels;
-    None without any.
-    """
+    """Compare stored phasors [H, W, 3], by quartet start, with the quads on steady pixels."""
     steady = steady_pixels(sequence)
     common = [i for i in sequence.complete_quartets if sequence.cycle * i in stored]
     if not common:
         return None
     ours = np.stack([quartet_phasor(sequence, i)[:, steady] for i in common], axis=1)
-    theirs = np.stack([stored[sequence.cycle * i][steady, :2].T for i in common], axis=1).astype(
-        np.float64
-    )
+    theirs = np.stack([stored[sequence.cycle * i][steady, :2].T for i in common], axis=1)
+    theirs = theirs.astype(np.float64)
     a, b = ours[0] + 1j * ours[1], theirs[0] + 1j * theirs[1]
-    length_a, length_b = np.sqrt((np.abs(a) ** 2).sum()), np.sqrt((np.abs(b) ** 2).sum())
+    length_a, length_b = (np.sqrt((np.abs(phasors) ** 2).sum()) for phasors in (a, b))
     if not length_b > 0:
         return PhasorMatch(correlation=0.0, angle=0.0, conjugate=0.0, factor=0.0)
     correlation = np.vdot(a, b) / (length_a * length_b)
@@ -158,9 +144,7 @@ class PhaseFit:
 
 
 def phase_fit(sequence: Sequence, truth: Truth) -> PhaseFit | None:
-    """Fit psi = 4 pi d / depth_range + phase_offset to static pixels;
-    None if fewer than a hundred are static.
-    """
+    """Fit psi = 4 pi d / depth_range + phase_offset to at least a hundred static pixels."""
     phases, distances = [], []
     kappa = 4.0 * math.pi * sequence.calibration.f_mod_hz / SPEED_OF_LIGHT
     for i in sequence.complete_quartets:
@@ -168,9 +152,8 @@ def phase_fit(sequence: Sequence, truth: Truth) -> PhaseFit | None:
         if not truth.known[frames].all():
             continue
         distance = truth.distance[frames].astype(np.float64)
-        still = np.isfinite(distance).all(axis=0) & (
-            np.ptp(np.nan_to_num(distance), axis=0) < STILL_M
-        )
+        still = np.isfinite(distance).all(axis=0)
+        still &= np.ptp(np.nan_to_num(distance), axis=0) < STILL_M
         re, im = quartet_phasor(sequence, i)
         amplitude = np.hypot(re, im)
         still &= amplitude >= np.quantile(amplitude, 1.0 - BRIGHT_QUANTILE)
@@ -210,16 +193,13 @@ def flow_match(
     sums, count = np.zeros(4), 0
     for n, image in flow.items():
         target = n + step
-        if not (
-            0 <= target < sequence.frames and sequence.measured[n] and sequence.measured[target]
-        ):
+        if not 0 <= target < sequence.frames or not sequence.measured[[n, target]].all():
             continue
-        moving = np.isfinite(image).all(axis=0) & (np.hypot(*np.nan_to_num(image)) > MOVING_PX)
         known = np.nan_to_num(image)
+        moving = np.isfinite(image).all(axis=0) & (np.hypot(*known) > MOVING_PX)
         for k, tried in enumerate((np.zeros_like(known), known, -known, known[::-1])):
-            sums[k] += np.abs(warp_back(sequence.quads[target], tried) - sequence.quads[n])[
-                moving
-            ].sum()
+            difference = warp_back(sequence.quads[target], tried) - sequence.quads[n]
+            sums[k] += np.abs(difference)[moving].sum()
         count += int(moving.sum())
     if not count:
         return None

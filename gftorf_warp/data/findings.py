@@ -1,6 +1,4 @@
-"""Findings of ``gftorf check`` in the images of a sequence: order, scale, truth, flow,
-camera motion.
-"""
+"""Findings of ``gftorf check`` in images: order, scale, truth, flow, camera motion."""
 
 from __future__ import annotations
 
@@ -35,11 +33,8 @@ SATURATED_PIXELS = 10
 MATCH_MIN = 0.9
 RANGE_TOLERANCE = 0.02  # relative, of the depth_range that the truth implies
 OFFSET_TOLERANCE_RAD = 0.05  # [rad] 6 cm at 20 MHz
-DECODED_M = (
-    # [m] a stored "truth" this close to the decoded distance where that changes by more is not
-    # independent
-    1e-3
-)
+# [m] a stored "truth" this close to the decoded distance where that changes by more is no truth
+DECODED_M = 1e-3
 DECODED_SHARE = 0.9  # of the changing pixels
 CHANGING_PIXELS = 100  # a static scene without noise decodes to its truth
 # of the correlation of the third channel with the length of (re, im), where it is an amplitude
@@ -65,23 +60,20 @@ class Report:
     """Implausible or assumed values."""
 
     def __str__(self) -> str:
+        head = f"{self.path}: {NAMES[self.form]} sequence"
         flags = [f"warning: {text}" for text in self.warnings] or ["no warnings"]
-        return "\n".join(
-            [
-                f"{self.path}: {NAMES[self.form]} sequence",
-                *(f"  {line}" for line in self.lines),
-                *flags,
-            ]
-        )
+        return "\n".join([head, *(f"  {line}" for line in self.lines), *flags])
+
+    def add(self, name: str, text: str) -> None:
+        """Add a fact under its name."""
+        self.lines.append(f"{name:<15} {text}")
 
 
 def light(sequence: Sequence, report: Report) -> None:
     """Amplitude and saturation."""
     factor, source = quad_scale(sequence)
-    report.lines.append(
-        f"amplitude       largest phasor {largest_amplitude(sequence):.6g}; quads times "
-        f"{factor:.6g}; {source}"
-    )
+    largest = largest_amplitude(sequence)
+    report.add("amplitude", f"largest phasor {largest:.6g}; quads times {factor:.6g}; {source}")
     extremes = float(sequence.quads.min()), float(sequence.quads.max())
     pixels = sequence.height * sequence.width
     at_extreme = np.isin(sequence.quads[sequence.measured], extremes).sum(axis=(1, 2))
@@ -89,8 +81,7 @@ def light(sequence: Sequence, report: Report) -> None:
     if len(cut):
         report.warnings.append(
             f"saturation: up to {cut.max() / pixels:.1%} of the pixels of {len(cut)} raw frames "
-            f"sit at the extreme "
-            f"values {extremes[0]:.4g} and {extremes[1]:.4g}, which biases phase"
+            f"sit at the extreme values {extremes[0]:.4g} and {extremes[1]:.4g}, which biases phase"
         )
 
 
@@ -102,32 +93,24 @@ def frequencies(sequence: Sequence, report: Report) -> None:
     confidence = [
         d.confidence[np.hypot(*d.phasors[0]) > 0] for d in decoded if d.confidence is not None
     ]
+    median = float(np.median(np.concatenate(confidence)))
     ambiguous = float(np.mean([d.ambiguous.mean() for d in decoded]))
-    report.lines.append(
-        f"unwrapping      {unambiguous_range(sequence):.4g} m together; median confidence "
-        f"{float(np.median(np.concatenate(confidence))):.2f}, {ambiguous:.1%} of the pixels "
-        f"ambiguous"
-    )
+    text = f"{unambiguous_range(sequence):.4g} m together; median confidence {median:.2f}, "
+    report.add("unwrapping", f"{text}{ambiguous:.1%} of the pixels ambiguous")
     if ambiguous > AMBIGUOUS_SHARE:
         report.warnings.append(
             f"frequencies disagree: {ambiguous:.0%} of the pixels would fit another distance as "
-            f"well; noise, motion "
-            "within a cycle, or another phase offset at each frequency"
+            "well; noise, motion within a cycle, or another phase offset at each frequency"
         )
 
 
 def constant_part(sequence: Sequence, report: Report) -> None:
     """Constant part of raw quads."""
-    estimate = estimates.dc_offset(sequence)
-    report.lines.append(
-        f"dc estimate     {estimate:.4f} of the amplitude, "
-        f"{sequence.calibration.dc_offset:g} in use"
-    )
-    if abs(estimate - sequence.calibration.dc_offset) > estimates.DC_TOLERANCE:
-        report.warnings.append(
-            f"dc_offset {sequence.calibration.dc_offset:g} is in use, but the quads have "
-            f"{estimate:.3f}"
-        )
+    estimate, used = estimates.dc_offset(sequence), sequence.calibration.dc_offset
+    report.add("dc estimate", f"{estimate:.4f} of the amplitude, {used:g} in use")
+    if abs(estimate - used) > estimates.DC_TOLERANCE:
+        warning = f"dc_offset {used:g} is in use, but the quads have {estimate:.3f}"
+        report.warnings.append(warning)
 
 
 def order(sequence: Sequence, report: Report) -> None:
@@ -135,13 +118,12 @@ def order(sequence: Sequence, report: Report) -> None:
     stated, shares = estimates.pairings(sequence)
     texts = ["".join(f"(q{a},q{b})" for a, b in pairs) for pairs in estimates.PAIRINGS]
     found = ", ".join(f"{text} on {share:.0%}" for text, share in zip(texts, shares, strict=True))
-    report.lines.append(f"order           opposite pairs fit best: {found} of bright static pixels")
+    report.add("order", f"opposite pairs fit best: {found} of bright static pixels")
     if stated is not None and shares[stated] < max(shares):
         best = int(np.argmax(shares))
         report.warnings.append(
             f"quad order doubtful: stored pairing {texts[stated]} fits {shares[stated]:.0%} of "
-            f"static pixels, "
-            f"{texts[best]} {shares[best]:.0%}; check tof_permutation.npy"
+            f"static pixels, {texts[best]} {shares[best]:.0%}; check tof_permutation.npy"
         )
 
 
@@ -150,46 +132,35 @@ def third_channel(sequence: Sequence, report: Report) -> None:
     assert sequence.path is not None
     spec = specs.fields(report.form)["phasor"]
     files = torf.stored(sequence.path).files
-    stored = np.stack([as_float32(f, spec, read_array(f, spec))[0] for f in files.values()]).astype(
-        np.float64
-    )
+    images = [as_float32(f, spec, read_array(f, spec))[0] for f in files.values()]
+    stored = np.stack(images).astype(np.float64)
     length, third = np.hypot(stored[..., 0], stored[..., 1]), stored[..., 2]
     scale = math.sqrt(float((length**2).sum()) * float((third**2).sum()))
     correlation = float((length * third).sum()) / scale if scale > 0 else 0.0
     ratio = float((length * third).sum() / (length**2).sum())
-    report.lines.append(
-        f"third channel   {ratio:.4g} times the length of (re, im), correlation {correlation:.4f}"
-    )
+    text = f"{ratio:.4g} times the length of (re, im), correlation {correlation:.4f}"
+    report.add("third channel", text)
     if correlation < THIRD_MATCH_MIN:
         report.warnings.append("third channel: not the amplitude of (re, im); it is not used")
 
 
 def camera(sequence: Sequence, report: Report) -> None:
     """Camera motion without poses, and an implausibly distant colour camera."""
-    if np.array_equal(
-        sequence.camera_from_world, np.broadcast_to(np.eye(4), sequence.camera_from_world.shape)
-    ):
+    if (sequence.camera_from_world == np.eye(4)).all():
         share = estimates.changed_share(sequence)
-        report.lines.append(
-            f"change          {share:.0%} of bright pixels from the first to the last quartet"
-        )
+        report.add("change", f"{share:.0%} of bright pixels from the first to the last quartet")
         if share > MOVED_SHARE:
             report.warnings.append(
                 f"poses: all are identity, but {share:.0%} of bright pixels change: if the "
-                f"camera moved, "
-                "store its poses in cams/tof_extrinsics.npy"
+                "camera moved, store its poses in cams/tof_extrinsics.npy"
             )
     if sequence.colour.camera_from_world is not None:
         relative = sequence.camera_from_world @ np.linalg.inv(sequence.colour.camera_from_world)
         baseline = float(np.linalg.norm(relative[:, :3, 3], axis=1).max())
-        report.lines.append(
-            f"baseline        {baseline:.4g} m from the colour camera to the ToF camera"
-        )
+        report.add("baseline", f"{baseline:.4g} m from the colour camera to the ToF camera")
         if baseline > BASELINE_MAX_M:
-            report.warnings.append(
-                f"the colour camera is {baseline:.4g} m away: millimetres, or another coordinate "
-                f"system?"
-            )
+            away = f"the colour camera is {baseline:.4g} m away"
+            report.warnings.append(f"{away}: millimetres, or another coordinate system?")
 
 
 def phasors(sequence: Sequence, report: Report) -> None:
@@ -198,23 +169,17 @@ def phasors(sequence: Sequence, report: Report) -> None:
     spec = specs.fields(report.form)["phasor"]
     size = {"H": sequence.height, "W": sequence.width}
     for pattern in spec.paths:
-        files = {
-            n: f for n, f in numbered(sequence.path, pattern).items() if n % sequence.cycle == 0
-        }
         stored = {
             n: as_float32(f, spec, read_array(f, spec, size))[0]
-            for n, f in files.items()
-            if n < sequence.frames
+            for n, f in numbered(sequence.path, pattern).items()
+            if n % sequence.cycle == 0 and n < sequence.frames
         }
         match = estimates.phasor_match(sequence, stored) if stored else None
         if match is None:
             continue
-        folder = pattern.partition("/")[0]
-        report.lines.append(
-            f"phasors         {folder}: correlation {match.correlation:.4f} at "
-            f"{math.degrees(match.angle):+.2f} "
-            f"degrees with the quads, {match.factor:.4g} times their length"
-        )
+        folder, degrees = pattern.partition("/")[0], math.degrees(match.angle)
+        text = f"{folder}: correlation {match.correlation:.4f} at {degrees:+.2f} degrees with the "
+        report.add("phasors", f"{text}quads, {match.factor:.4g} times their length")
         if match.correlation < MATCH_MIN or abs(match.angle) > OFFSET_TOLERANCE_RAD:
             mirrored = "; mirrored phase fits better" if match.conjugate > match.correlation else ""
             report.warnings.append(
@@ -226,64 +191,49 @@ def truth(sequence: Sequence, report: Report) -> None:
     """Stored distance compared with decoded static pixels."""
     assert sequence.path is not None
     patterns = specs.fields(report.form)["distance"].paths
-    folder = next((p for p in patterns if numbered(sequence.path, p)), patterns[0]).partition("/")[
-        0
-    ]
+    used = next((p for p in patterns if numbered(sequence.path, p)), patterns[0])
+    folder = used.partition("/")[0]
     try:
         truth = read_truth(sequence)
     except InputError as error:
         report.warnings.append(f"{folder} cannot be read: {error.where}: {error.what}, {error.why}")
         return
     if truth is None:
-        report.lines.append("truth           none")
+        report.add("truth", "none")
         return
     known = truth.distance[np.isfinite(truth.distance)]
     unambiguous = unambiguous_range(sequence)
     frames = int(truth.known.sum()) // (sequence.cycle if sequence.from_phasors else 1)
-    report.lines.append(
-        f"truth           {frames} frames in {folder}"
-        + (f", {known.min():.4g} .. {known.max():.4g} m" if len(known) else ", no known pixel")
-    )
+    span = f"{known.min():.4g} .. {known.max():.4g} m" if len(known) else "no known pixel"
+    report.add("truth", f"{frames} frames in {folder}, {span}")
     if _is_decoded(sequence, truth):
+        decoded = "these quads: it is not ground truth, do not compare with it"
         if sequence.from_phasors:
-            decoded = (
-                "decoded from these phasors, or they are without noise: doubtful as ground truth"
-            )
-        else:
-            decoded = "decoded from these quads: it is not ground truth, do not compare with it"
-        report.warnings.append(f"{folder} was {decoded}")
+            decoded = "these phasors, or they are without noise: doubtful as ground truth"
+        report.warnings.append(f"{folder} was decoded from {decoded}")
         return
     if len(known) and known.max() > unambiguous:
         report.warnings.append(
             f"range wraps: distances to {known.max():.4g} m, unambiguous to {unambiguous:.4g} m"
         )
     poses = sequence.camera_from_world
-    if not sequence.from_phasors and not np.array_equal(
-        poses, np.broadcast_to(poses[0], poses.shape)
-    ):
-        report.lines.append(
-            "phase fit       none: the camera moves between the raw frames of a quartet"
-        )
+    if not sequence.from_phasors and (poses != poses[0]).any():
+        report.add("phase fit", "none: the camera moves between the raw frames of a quartet")
         return
     _fit(sequence, truth, folder, report)
 
 
 def _fit(sequence: Sequence, truth: Truth, folder: str, report: Report) -> None:
-    """Range and offset implied by the truth, and whether it is distance along the ray or
-    z-depth.
-    """
+    """Range and offset implied by the truth, and whether it is along the ray or z-depth."""
     fit = estimates.phase_fit(sequence, truth)
     if fit is None:
-        report.lines.append("phase fit       too few static pixels")
+        report.add("phase fit", "too few static pixels")
         return
-    report.lines.append(
-        f"phase fit       depth_range {fit.depth_range:.5g} m, phase_offset "
-        f"{fit.phase_offset:+.4f} rad, "
-        f"rms {fit.rms_m * 1e3:.1f} mm on {fit.pixels} static pixels"
-    )
-    as_z = estimates.phase_fit(
-        sequence, Truth(distance=estimates.distance_of_z(sequence, truth), known=truth.known)
-    )
+    text = f"depth_range {fit.depth_range:.5g} m, phase_offset {fit.phase_offset:+.4f} rad, "
+    text += f"rms {fit.rms_m * 1e3:.1f} mm on {fit.pixels} static pixels"
+    report.add("phase fit", text)
+    if_z = Truth(distance=estimates.distance_of_z(sequence, truth), known=truth.known)
+    as_z = estimates.phase_fit(sequence, if_z)
     if as_z is not None and fit.rms_m > FITTED_M and as_z.rms_m < Z_FITS * fit.rms_m:
         report.warnings.append(
             f"{folder} fits the phase better as z-depth, rms {as_z.rms_m * 1e3:.1f} mm against "
@@ -295,24 +245,21 @@ def _fit(sequence: Sequence, truth: Truth, folder: str, report: Report) -> None:
     if abs(fit.depth_range / used - 1) > RANGE_TOLERANCE or offset > OFFSET_TOLERANCE_RAD:
         report.warnings.append(
             f"truth implies depth_range {fit.depth_range:.4g} m and phase_offset "
-            f"{fit.phase_offset:+.3f} rad, "
-            f"in use are {used:.4g} m and {sequence.calibration.phase_offset:+.3f} rad"
+            f"{fit.phase_offset:+.3f} rad, in use are {used:.4g} m and "
+            f"{sequence.calibration.phase_offset:+.3f} rad"
         )
 
 
 def _is_decoded(sequence: Sequence, truth: Truth) -> bool:
-    """Whether the stored distance follows the decoded one even where that changes by noise and
-    motion.
-    """
+    """Whether the stored distance follows the decoded one where that changes by noise or motion."""
     quartets = sequence.complete_quartets
     decoded = {i: closed_form_distance(sequence, i) for i in quartets}
     changing = agreeing = 0
     for before, i in itertools.pairwise(quartets):
         changes = np.abs(decoded[i] - decoded[before]) > DECODED_M
+        agrees = np.abs(truth.distance[sequence.cycle * i] - decoded[i]) < DECODED_M
         changing += int(changes.sum())
-        agreeing += int(
-            (np.abs(truth.distance[sequence.cycle * i] - decoded[i]) < DECODED_M)[changes].sum()
-        )
+        agreeing += int(agrees[changes].sum())
     return changing >= CHANGING_PIXELS and agreeing > DECODED_SHARE * changing
 
 
@@ -325,12 +272,9 @@ def flow(sequence: Sequence, report: Report) -> None:
         match = estimates.flow_match(sequence, images, step)
         if match is None:
             continue
-        report.lines.append(
-            f"{name + ' flow':<15} mean difference where it moves: unwarped {match[0]:.4g}, "
-            f"warped {match[1]:.4g}, "
-            f"sign flipped {match[2]:.4g}, dx and dy swapped {match[3]:.4g}"
-        )
+        text = f"unwarped {match[0]:.4g}, warped {match[1]:.4g}, sign flipped {match[2]:.4g}, "
+        text = f"mean difference where it moves: {text}dx and dy swapped {match[3]:.4g}"
+        report.add(f"{name} flow", text)
         if match[1] > min(match):
-            report.warnings.append(
-                f"{name} flow does not explain the motion: check its sign, channels and frame step"
-            )
+            warning = "does not explain the motion: check its sign, channels and frame step"
+            report.warnings.append(f"{name} flow {warning}")

@@ -1,5 +1,4 @@
-"""Optical flow from raw frames, for recordings without flow: between frames of one shift, a cycle
-apart.
+"""Optical flow between raw frames of one shift, a cycle apart, for recordings without flow.
 
 Frames n and n + K have the same shift and frequency, K being the raw frames of a cycle, so a moving
 surface looks nearly alike in both. The flow of quartet start n is the median over the pairs n + j
@@ -10,6 +9,7 @@ weak contrast at different distances, and their noise is independent.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Literal
@@ -35,14 +35,9 @@ ROBUST_PERCENT = 0.05
 def compute_flow(sequence: Sequence, *, method: Method = "dis") -> Flow:
     """Compute the optical flow of every quartet start whose partner a cycle away was measured too.
 
-    Args:
-        sequence: Its quads; stored flow is ignored.
-        method: ``dis`` is fast and follows large motion; ``deepflow`` is smoother where motion
-            stays below about two pixels in a cycle, and loses what moves farther.
-
-    Returns:
-        Forward and backward flow, float32. Pixels whose forward and backward flow disagree in most
-        pairs are NaN.
+    Flow is float32, and NaN where forward and backward flow disagree in most pairs. Stored flow is
+    ignored. ``dis`` is fast and follows large motion; ``deepflow`` is smoother where motion stays
+    below about two pixels in a cycle, and loses what moves farther.
 
     Raises:
         InputError: If the images are too small to match.
@@ -51,19 +46,15 @@ def compute_flow(sequence: Sequence, *, method: Method = "dis") -> Flow:
     if method not in ("dis", "deepflow"):
         raise ValueError(f"method must be dis or deepflow, got {method!r}")
     if min(sequence.height, sequence.width) < SMALLEST_PX:
-        raise InputError(
+        why = f"expected at least {SMALLEST_PX}x{SMALLEST_PX} pixels, found "
+        why += f"{sequence.width}x{sequence.height}"
+        what, fix = (
             "images too small for optical flow",
-            where=sequence.path or "sequence",
-            why=f"expected at least {SMALLEST_PX}x{SMALLEST_PX} pixels, found "
-            f"{sequence.width}x{sequence.height}",
-            fix="provide flow as files, or use larger images",
+            "provide flow as files, or use larger images",
         )
+        raise InputError(what, where=sequence.path or "sequence", why=why, fix=fix)
     step, times, quads = sequence.cycle, sequence.times, sequence.quads
-    pairs = [
-        n
-        for n in range(sequence.frames - step)
-        if sequence.measured[n] and sequence.measured[n + step]
-    ]
+    pairs = np.flatnonzero(sequence.measured[:-step] & sequence.measured[step:]).tolist()
 
     def matched(n: int) -> tuple[np.ndarray, ...]:
         """Flow from n to n + K and back; each again, with NaN where they disagree."""
@@ -75,30 +66,22 @@ def compute_flow(sequence: Sequence, *, method: Method = "dis") -> Flow:
     # OpenCV releases Python's lock
     with ThreadPoolExecutor(thread_name_prefix="gftorf-flow") as threads:
         found = dict(zip(pairs, threads.map(matched, pairs), strict=True))
-        forward, reliable_forward = ({n: flows[k] for n, flows in found.items()} for k in (0, 2))
-        backward, reliable_backward = (
-            {n + step: flows[k] for n, flows in found.items()} for k in (1, 3)
-        )
 
-        def combined(
-            raw: dict[int, np.ndarray], reliable: dict[int, np.ndarray], step: int
-        ) -> dict[int, np.ndarray]:
+        def combined(k: int, first: int, step: int) -> dict[int, np.ndarray]:
+            raw, reliable = (
+                {n + first: flows[i] for n, flows in found.items()} for i in (k, k + 2)
+            )
             starts = [n for n in range(0, sequence.frames, abs(step)) if n in raw]
             flows = threads.map(lambda n: median_flow(n, raw, reliable, times, step), starts)
             return dict(zip(starts, flows, strict=True))
 
-        return Flow(
-            forward=combined(forward, reliable_forward, step),
-            backward=combined(backward, reliable_backward, -step),
-        )
+        return Flow(forward=combined(0, 0, step), backward=combined(1, step, -step))
 
 
 def warp_back(
     image: Float[np.ndarray, "H W"], flow: Float[np.ndarray, "2 H W"]
 ) -> Float[np.ndarray, "H W"]:
-    """An image at x + flow(x): brings a later frame back to the earlier one, bilinear,
-    edges repeated.
-    """
+    """A later frame brought back to the earlier one: its value at x + flow(x), bilinear."""
     return _sample(image[None], flow, np.float32(1.0))[0]
 
 
@@ -121,18 +104,17 @@ def _matcher(method: Method) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
 
 
 def _grey(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Two quads [H, W] as uint8 images with one scale for both,
-    so that equal light stays equally bright.
-    """
+    """Two quads [H, W] as uint8 images with one scale for both."""
     import cv2
 
     low, high = np.percentile(np.stack([first, second]), [ROBUST_PERCENT, 100.0 - ROBUST_PERCENT])
     scale = 255.0 / (high - low) if high > low else 0.0
-    scaled = [
-        np.clip((quad - low) * scale, 0.0, 255.0).astype(np.float32) for quad in (first, second)
-    ]
-    grey = [np.rint(cv2.GaussianBlur(quad, (0, 0), BLUR_PX)).astype(np.uint8) for quad in scaled]
-    return grey[0], grey[1]
+
+    def grey(quad: np.ndarray) -> np.ndarray:
+        scaled = np.clip((quad - low) * scale, 0.0, 255.0).astype(np.float32)
+        return np.rint(cv2.GaussianBlur(scaled, (0, 0), BLUR_PX)).astype(np.uint8)
+
+    return grey(first), grey(second)
 
 
 def _consistent(flow: np.ndarray, back: np.ndarray) -> np.ndarray:
@@ -148,41 +130,26 @@ def median_flow(
     times: np.ndarray,
     step: int,
 ) -> np.ndarray:
-    """Median of the reliable flow of the pairs around n,
-    each read where the surface of n was at its time.
-    """
+    """Median of the reliable flow of the pairs around n, each where the surface of n was then."""
     duration = times[n + step] - times[n]
-    votes = []
+    apart_max = APART_MAX * abs(duration) + 1e-9 if duration != 0 else -1.0
+    votes = [reliable[n]]
     for m in range(n - abs(step) + 1, n + abs(step)):
-        if m == n:
-            votes.append(reliable[n])
-        elif (
-            duration != 0
-            and m in raw
-            and abs(times[m] - times[n]) <= APART_MAX * abs(duration) + 1e-9
-        ):
-            votes.append(_sample(reliable[m], raw[n], np.float32((times[m] - times[n]) / duration)))
+        apart = times[m] - times[n] if m in raw else math.inf
+        if m != n and abs(apart) <= apart_max:
+            votes.append(_sample(reliable[m], raw[n], np.float32(apart / duration)))
     stack = np.stack(votes)
     known = np.isfinite(stack[:, 0]).sum(axis=0)
     filled = np.where(known > 0, stack, np.float32(0.0))  # a median of nothing would warn
-    return np.where(
-        2 * known >= len(votes), np.nanmedian(filled, axis=0), np.float32(np.nan)
-    ).astype(np.float32)
+    median = np.where(2 * known >= len(votes), np.nanmedian(filled, axis=0), np.nan)
+    return median.astype(np.float32)
 
 
 def _sample(image: np.ndarray, flow: np.ndarray, factor: np.float32) -> np.ndarray:
-    """Channels [C, H, W] of ``image`` at x + factor * flow(x), bilinear, edges repeated;
-    NaN spreads to neighbours.
-    """
+    """Channels [C, H, W] at x + factor * flow(x), bilinear, edges repeated; NaN spreads."""
     import cv2
 
     y, x = np.indices(flow.shape[1:], dtype=np.float32)
-    at_x, at_y = x + factor * flow[0], y + factor * flow[1]
-    return np.stack(
-        [
-            cv2.remap(
-                c, at_x, at_y, interpolation=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-            )
-            for c in image
-        ]
-    )
+    at = x + factor * flow[0], y + factor * flow[1]
+    repeated = cv2.BORDER_REPLICATE
+    return np.stack([cv2.remap(c, *at, cv2.INTER_LINEAR, borderMode=repeated) for c in image])
