@@ -1,11 +1,8 @@
-"""Contact sheet of a sequence: raw quads of one quartet, amplitude, distances, errors, objects,
-flow, colour.
-
-OpenCV encodes the PNG and draws the text.
-"""
+"""Contact sheet of a sequence: quads of a quartet, amplitude, distances, errors, flow, colour."""
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,7 +12,7 @@ from jaxtyping import Float, UInt8
 
 from ..constants import SPEED_OF_LIGHT
 from ..errors import InputError
-from .cycles import solution
+from .cycles import determined, frequencies_by_order
 from .decode import Decoded, decode_quartet, unambiguous_range
 from .images import png_bytes
 from .sequence import Sequence, Truth
@@ -27,19 +24,11 @@ BAR, BAR_GAP, BAR_TEXT = 12, 8, 70
 TITLE, GAP, MARGIN = 30, 18, 24  # [px] height of a title, space between panels, around all of them
 HEAD = 70  # [px] height of the heading
 INK, SOFT, UNKNOWN = (32, 32, 32), (110, 110, 110), (200, 200, 200)
-# percentile at which the scale of an error ends, so that one wrapped pixel does not darken all
-# others
-CLIP = 99.5
+CLIP = 99.5  # percentile at which a scale ends, so that a wrapped pixel does not darken all others
 COLUMNS = 4
-SHIFTS_MIN = 3  # different ones: cosine, sine and a constant
-PALETTE = (
-    (230, 159, 0),
-    (86, 180, 233),
-    (0, 158, 115),
-    (240, 228, 66),
-    (0, 114, 178),
-    (213, 94, 0),
-    (204, 121, 167),
+PALETTE = (  # of Okabe and Ito
+    *((230, 159, 0), (86, 180, 233), (0, 158, 115), (240, 228, 66)),
+    *((0, 114, 178), (213, 94, 0), (204, 121, 167)),
 )
 
 Picture = UInt8[np.ndarray, "h w 3"]
@@ -59,31 +48,18 @@ class Panel:
 
 
 def contact_sheet(sequence: Sequence, truth: Truth | None, title: str) -> bytes:
-    """PNG of the middle quartet of a sequence.
-
-    Args:
-        sequence: The sequence.
-        truth: Its ground truth, if known.
-        title: Heading.
-    """
+    """PNG of the middle quartet of a sequence."""
     n, panels = middle_panels(sequence, truth)
     height = round(PANEL * sequence.height / sequence.width)
     cell = PANEL + BAR_GAP + BAR + BAR_TEXT
-    size = (
-        2 * MARGIN + HEAD + len(panels) * (TITLE + height + GAP),
-        2 * MARGIN + COLUMNS * (cell + GAP) - GAP,
-        3,
-    )
-    sheet = np.full(size, 255, dtype=np.uint8)
+    rows = 2 * MARGIN + HEAD + len(panels) * (TITLE + height + GAP)
+    sheet = np.full((rows, 2 * MARGIN + COLUMNS * (cell + GAP) - GAP, 3), 255, dtype=np.uint8)
     _write(sheet, title, (MARGIN, MARGIN + 22), 24, INK, bold=True)
-    frequencies = ", ".join(
-        f"{f / 1e6:.6g}" for f in dict.fromkeys(sequence.frame_frequencies.tolist())
-    )
+    used = frequencies_by_order(sequence.frame_frequencies)
     about = (
-        f"{int(sequence.measured.sum())} raw frames of {sequence.width}x{sequence.height} "
-        f"pixels, {frequencies} MHz, "
-        f"{sequence.times[-1]:.3g} s; shown: the quartet of raw frame {n}. A picture for people, "
-        f"no data."
+        f"{int(sequence.measured.sum())} raw frames of {sequence.width}x{sequence.height} pixels, "
+        f"{', '.join(f'{f / 1e6:.6g}' for f in used)} MHz, {sequence.times[-1]:.3g} s; "
+        f"shown: the quartet of raw frame {n}. A picture for people, no data."
     )
     _write(sheet, about, (MARGIN, MARGIN + 48), 15, SOFT)
     for i, row in enumerate(panels):
@@ -96,16 +72,11 @@ def contact_sheet(sequence: Sequence, truth: Truth | None, title: str) -> bytes:
 def middle_panels(sequence: Sequence, truth: Truth | None) -> tuple[int, list[list[Panel]]]:
     """First raw frame of the middle quartet, and its panels in rows."""
     quartets = _decodable(sequence)
-    n = (
-        sequence.cycle * quartets[len(quartets) // 2]
-        if quartets
-        else int(np.flatnonzero(sequence.measured)[0])
-    )
-    rows = [
-        _raw(sequence, n),
-        _decoded(sequence, truth, n, bool(quartets)),
-        _more(sequence, truth, n),
-    ]
+    n = int(np.flatnonzero(sequence.measured)[0])
+    if quartets:
+        n = sequence.cycle * quartets[len(quartets) // 2]
+    whole = bool(quartets)
+    rows = _raw(sequence, n), _decoded(sequence, truth, n, whole), _more(sequence, truth, n)
     return n, [row[i : i + COLUMNS] for row in rows for i in range(0, len(row), COLUMNS)]
 
 
@@ -118,8 +89,7 @@ def _decodable(sequence: Sequence) -> list[int]:
 
     def decodable(i: int) -> bool:
         frames = sequence.quartet_frames(i)
-        shifts, found = sequence.shifts[frames], sequence.frame_frequencies[frames]
-        return all(solution(shifts[found == f]) is not None for f in sequence.frequencies)
+        return determined(sequence.shifts[frames], sequence.frame_frequencies[frames])
 
     return [i for i in sequence.complete_quartets if decodable(i)]
 
@@ -130,47 +100,37 @@ def _raw(sequence: Sequence, n: int) -> list[Panel]:
     end = float(np.percentile(np.abs(sequence.quads[frames]), CLIP)) or 1.0
     several, panels = len(sequence.frequencies) > 1, []
     for m in frames:
-        name = (
-            f"raw frame {m}: {math.degrees(sequence.shifts[m]):.4g} deg, "
-            f"{1e3 * sequence.times[m]:.2f} ms"
-        )
+        shift, time_ms = math.degrees(sequence.shifts[m]), 1e3 * sequence.times[m]
+        name = f"raw frame {m}: {shift:.4g} deg, {time_ms:.2f} ms"
         name += f", {sequence.frame_frequencies[m] / 1e6:.4g} MHz" if several else ""
         panels.append(scaled(name, sequence.quads[m], (-end, end), diverging))
     return panels
 
 
 def _decoded(sequence: Sequence, truth: Truth | None, n: int, whole: bool) -> list[Panel]:
-    """Amplitude, true distance, closed form and its error, each frequency by itself;
-    as far as available.
-    """
+    """Amplitude, true distance, closed form and its error, each frequency by itself, if known."""
     panels = []
-    decoded = None
-    if whole:
-        quartet = decode_quartet(sequence, n // sequence.cycle)
-        decoded = quartet.distance
+    true = None if truth is None else known_distance(truth)[n]
+    quartet = decode_quartet(sequence, n // sequence.cycle) if whole else None
+    if quartet is not None:
         amplitude = 0.5 * np.hypot(*quartet.phasors[0])
-        panels.append(
-            scaled("amplitude of the closed form", amplitude, (0.0, _end(amplitude)), _gray)
-        )
+        ends = 0.0, _end(amplitude)
+        panels.append(scaled("amplitude of the closed form", amplitude, ends, _gray))
+        ends = float(quartet.distance.min()), float(quartet.distance.max())
     elif truth is not None and truth.amplitude is not None:
         amplitude = truth.amplitude[n].astype(np.float64)
         panels.append(scaled("amplitude without noise", amplitude, (0.0, _end(amplitude)), _gray))
-    if truth is None:
-        if decoded is not None:
-            panels.append(
-                scaled("closed form [m]", decoded, (decoded.min(), decoded.max()), _viridis)
-            )
-            panels += _by_frequency(sequence, quartet)
-        return panels
-    true = known_distance(truth)[n]
-    if not np.isfinite(true).any():
-        return panels
-    ends = float(np.nanmin(true)), float(np.nanmax(true))
-    panels.append(scaled("true distance [m]", true, ends, _viridis))
-    if decoded is not None:
-        error = np.abs(decoded - true)
-        panels.append(scaled("closed form [m]", decoded, ends, _viridis))
-        panels.append(scaled("error of the closed form [m]", error, (0.0, _end(error)), _inferno))
+    if true is not None:
+        if not np.isfinite(true).any():
+            return panels
+        ends = float(np.nanmin(true)), float(np.nanmax(true))
+        panels.append(scaled("true distance [m]", true, ends, _viridis))
+    if quartet is not None:
+        panels.append(scaled("closed form [m]", quartet.distance, ends, _viridis))
+        if true is not None:
+            error = np.abs(quartet.distance - true)
+            ends = 0.0, _end(error)
+            panels.append(scaled("error of the closed form [m]", error, ends, _inferno))
         panels += _by_frequency(sequence, quartet)
     return panels
 
@@ -182,15 +142,14 @@ def _by_frequency(sequence: Sequence, quartet: Decoded) -> list[Panel]:
     panels = []
     for f, image in zip(sequence.frequencies, quartet.single, strict=True):
         ends = 0.0, SPEED_OF_LIGHT / (2.0 * f)
-        panels.append(
-            scaled(f"{f / 1e6:.4g} MHz alone, to {ends[1]:.3g} m [m]", image, ends, _viridis)
-        )
+        title = f"{f / 1e6:.4g} MHz alone, to {ends[1]:.3g} m [m]"
+        panels.append(scaled(title, image, ends, _viridis))
     title = f"confidence, {100 * float(quartet.ambiguous.mean()):.3g} % ambiguous"
     return [*panels, scaled(title, quartet.confidence, (0.0, 1.0), _gray)]
 
 
 def _more(sequence: Sequence, truth: Truth | None, n: int) -> list[Panel]:
-    """Effect of indirect light on the distance, objects, flow and colour; as far as available."""
+    """Effect of indirect light on the distance, objects, flow and colour, if known."""
     panels = []
     if truth is not None and truth.phasor_distance is not None:
         difference = truth.phasor_distance[n] - known_distance(truth)[n]
@@ -198,36 +157,25 @@ def _more(sequence: Sequence, truth: Truth | None, n: int) -> list[Panel]:
         if len(sequence.frequencies) > 1:
             alone = SPEED_OF_LIGHT / (2.0 * sequence.frame_frequencies[n])
             difference = np.mod(difference + 0.5 * alone, alone) - 0.5 * alone
-        end = max(_end(np.abs(difference)), 1e-3)
-        panels.append(
-            scaled("static phasor - true distance [m]", difference, (-end, end), diverging)
-        )
+        end, title = max(_end(np.abs(difference)), 1e-3), "static phasor - true distance [m]"
+        panels.append(scaled(title, difference, (-end, end), diverging))
     if truth is not None and truth.body is not None:
         colours = np.array([(255, 255, 255), *PALETTE], dtype=np.uint8)
         body = truth.body[n]
         index = np.where(body < 0, 0, 1 + body % len(PALETTE))
-        panels.append(
-            Panel(title=f"objects, {len(np.unique(body[body >= 0]))} in view", image=colours[index])
-        )
+        title = f"objects, {len(np.unique(body[body >= 0]))} in view"
+        panels.append(Panel(title=title, image=colours[index]))
     flow = sequence.flow.forward.get(n)
     if flow is not None:
         length = np.hypot(*flow)
         end = max(float(np.nanmax(length)) if np.isfinite(length).any() else 0.0, 1e-6)
-        panels.append(
-            Panel(
-                title=f"flow to raw frame {n + sequence.cycle}, up to {end:.3g} px",
-                image=_flow(flow, end),
-            )
-        )
+        title = f"flow to raw frame {n + sequence.cycle}, up to {end:.3g} px"
+        panels.append(Panel(title=title, image=_flow(flow, end)))
     image = sequence.colour.images.get(n)
     if image is not None:
         top = float(np.percentile(image, CLIP)) or 1.0
-        panels.append(
-            Panel(
-                title=f"colour, raw frame {n}",
-                image=_eight_bits(np.clip(image / top, 0, 1) ** (1 / 2.2)),
-            )
-        )
+        picture = _eight_bits(np.clip(image / top, 0, 1) ** (1 / 2.2))
+        panels.append(Panel(title=f"colour, raw frame {n}", image=picture))
     return panels
 
 
@@ -250,10 +198,9 @@ def _place(sheet: Picture, panel: Panel, x: int, y: int, height: int) -> None:
     h, w = panel.image.shape[:2]
     factor = min(PANEL / w, height / h)
     size = max(1, round(w * factor)), max(1, round(h * factor))
-    shrinks = cv2.INTER_AREA if factor < 1 else cv2.INTER_NEAREST
-    sheet[top : top + size[1], x : x + size[0]] = cv2.resize(
-        panel.image, size, interpolation=shrinks
-    )
+    method = cv2.INTER_AREA if factor < 1 else cv2.INTER_NEAREST
+    resized = cv2.resize(panel.image, size, interpolation=method)
+    sheet[top : top + size[1], x : x + size[0]] = resized
     # white may be a value
     cv2.rectangle(sheet, (x - 1, top - 1), (x + size[0], top + size[1]), UNKNOWN, 1)
     if panel.scale is None:
@@ -262,11 +209,8 @@ def _place(sheet: Picture, panel: Panel, x: int, y: int, height: int) -> None:
     left = x + PANEL + BAR_GAP
     ramp = np.linspace(1.0, 0.0, height)[:, None]
     sheet[top : top + height, left : left + BAR] = colours(np.repeat(ramp, BAR, axis=1))
-    for value, at in (
-        (high, top + 12),
-        ((low + high) / 2, top + height // 2 + 5),
-        (low, top + height - 2),
-    ):
+    middle = (low + high) / 2, top + height // 2 + 5
+    for value, at in ((high, top + 12), middle, (low, top + height - 2)):
         _write(sheet, f"{value:.3g}", (left + BAR + 6, at), 14, INK)
 
 
@@ -293,28 +237,21 @@ def _gray(share: np.ndarray) -> Picture:
     return _eight_bits(np.repeat(share[..., None], 3, axis=-1))
 
 
-def _mapped(share: np.ndarray, name: str) -> Picture:
+def _mapped(name: str, share: np.ndarray) -> Picture:
     import cv2
 
-    return np.ascontiguousarray(
-        cv2.applyColorMap(_eight_bits(share), getattr(cv2, name))[..., ::-1]
-    )
+    coloured = cv2.applyColorMap(_eight_bits(share), getattr(cv2, name))
+    return np.ascontiguousarray(coloured[..., ::-1])
 
 
-def _viridis(share: np.ndarray) -> Picture:
-    return _mapped(share, "COLORMAP_VIRIDIS")
-
-
-def _inferno(share: np.ndarray) -> Picture:
-    return _mapped(share, "COLORMAP_INFERNO")
+_viridis = functools.partial(_mapped, "COLORMAP_VIRIDIS")
+_inferno = functools.partial(_mapped, "COLORMAP_INFERNO")
 
 
 def diverging(share: np.ndarray) -> Picture:
     """Blue below the middle, white in it, red above."""
     x = 2.0 * share[..., None] - 1.0
-    blue, red, white = (
-        np.array(c) / 255.0 for c in ((33, 102, 172), (178, 24, 43), (255, 255, 255))
-    )
+    blue, red, white = np.array([(33, 102, 172), (178, 24, 43), (255, 255, 255)]) / 255.0
     return _eight_bits(white + np.abs(x) * (np.where(x < 0, blue, red) - white))
 
 

@@ -27,7 +27,7 @@ def find_cycle(shifts: Float[np.ndarray, "F"], frequencies: Float[np.ndarray, "F
         again = np.abs(waves[step:] - waves[:-step]).max() < SAME_RAD
         if again and np.array_equal(frequencies[step:], frequencies[:-step]):
             sure = 2 * step <= count or _distinct(waves[:step], frequencies[:step])
-            if sure and _determined(shifts[:step], frequencies[:step]):
+            if sure and determined(shifts[:step], frequencies[:step]):
                 return step
     if len(set(frequencies.tolist())) > 1:
         return count
@@ -35,7 +35,7 @@ def find_cycle(shifts: Float[np.ndarray, "F"], frequencies: Float[np.ndarray, "F
     begun = count < FRAMES_PER_QUARTET and bool(
         (np.abs(waves[:, None] - canonical).min(axis=1) < SAME_RAD).all()
     )
-    whole = not begun and _distinct(waves, frequencies) and _determined(shifts, frequencies)
+    whole = not begun and _distinct(waves, frequencies) and determined(shifts, frequencies)
     return count if whole else FRAMES_PER_QUARTET
 
 
@@ -57,9 +57,7 @@ def frequencies_decoded(frequencies: Float[np.ndarray, "K"], wanted: tuple[float
 
 
 def solution(shifts: Float[np.ndarray, "Q"]) -> Float[np.ndarray, "2 Q"] | None:
-    """Matrix from the quads of these shifts [rad] to (re, im) by least squares;
-    None if they determine no phase.
-    """
+    """Least-squares matrix from quads of these shifts [rad] to (re, im); None if singular."""
     model = np.stack([np.cos(shifts), np.sin(shifts), np.ones(len(shifts))], axis=1)
     if len(shifts) < QUADS_MIN or np.linalg.svd(model, compute_uv=False).min() < RANK_TOLERANCE:
         return None
@@ -67,11 +65,9 @@ def solution(shifts: Float[np.ndarray, "Q"]) -> Float[np.ndarray, "2 Q"] | None:
 
 
 def phase_noise(shifts: Float[np.ndarray, "Q"]) -> float:
-    """Standard deviation of a decoded phase [rad] times amplitude over noise of one quad, root mean
-    square over phases.
+    """Noise of a decoded phase [rad] times amplitude over noise of a quad, RMS over phases.
 
-    sqrt(2 / Q) if the shifts are equally spaced. At a given phase psi of uneven ones it is half the
-    root of u C u, C being the product of the rows with themselves and u = (-sin psi, cos psi).
+    It is sqrt(2 / Q) if the shifts are equally spaced.
 
     Raises:
         ValueError: If the shifts determine no phase.
@@ -84,5 +80,6 @@ def phase_noise(shifts: Float[np.ndarray, "Q"]) -> float:
     return 0.5 * float(np.sqrt(0.5 * np.sum(rows**2)))
 
 
-def _determined(shifts: np.ndarray, frequencies: np.ndarray) -> bool:
+def determined(shifts: np.ndarray, frequencies: np.ndarray) -> bool:
+    """Whether the shifts at each frequency determine a phase."""
     return all(solution(shifts[frequencies == f]) is not None for f in set(frequencies.tolist()))

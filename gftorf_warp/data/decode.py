@@ -54,7 +54,7 @@ class Decoded:
 
 
 def _kept(function: Callable[[Sequence, int], T]) -> Callable[[Sequence, int], T]:
-    """Keep the results of a function of a sequence and a quartet as long as the sequence exists."""
+    """Cache a function of a sequence and a quartet as long as the sequence exists."""
     results: weakref.WeakKeyDictionary[Sequence, dict[int, T]] = weakref.WeakKeyDictionary()
 
     @functools.wraps(function)
@@ -71,8 +71,7 @@ def _kept(function: Callable[[Sequence, int], T]) -> Callable[[Sequence, int], T
 
 @_kept
 def decode_quartet(sequence: Sequence, i: int) -> Decoded:
-    """Phasors and distances of quartet i, decoded as if its raw frames had been taken at once;
-    kept, read-only.
+    """Phasors and distances of quartet i, as if its raw frames had been taken at once; read-only.
 
     Any three or more shifts at each frequency will do, evenly spaced or not, in any order.
 
@@ -100,12 +99,8 @@ def decode_quartet(sequence: Sequence, i: int) -> Decoded:
 def quartet_phasors(
     sequence: Sequence, i: int
 ) -> list[tuple[list[int], Float[np.ndarray, "2 H W"]]]:
-    """Raw frames and phasor of quartet i at each of its frequencies, in the order of
-    ``Sequence.frequencies``.
-
-    Raises:
-        ValueError: If a frame of the quartet was not measured.
-        InputError: If its shifts do not determine a phase.
+    """Raw frames and phasor of quartet i at each of ``Sequence.frequencies``; raises as
+    :func:`decode_quartet`.
     """
     return list(zip(*_phasors(sequence, i), strict=True))
 
@@ -114,9 +109,7 @@ def quartet_phasors(
 def _phasors(sequence: Sequence, i: int) -> tuple[list[list[int]], Float[np.ndarray, "f 2 H W"]]:
     """Raw frames at each frequency of quartet i, and the phasors decoded from them."""
     if i not in sequence.complete_quartets:
-        raise ValueError(
-            f"quartet {i} must be one of the complete ones, {sequence.complete_quartets}"
-        )
+        raise ValueError(f"quartet {i} must be complete, one of {sequence.complete_quartets}")
     first, last = sequence.cycle * i, sequence.cycle * (i + 1) - 1
     groups, phasors = [], []
     for f in sequence.frequencies:
@@ -124,13 +117,11 @@ def _phasors(sequence: Sequence, i: int) -> tuple[list[list[int]], Float[np.ndar
         shifts = sequence.shifts[frames]
         rows = solution(shifts)
         if rows is None:
-            raise InputError(
-                "phase shifts",
-                where=f"{sequence.path or 'sequence'}, frames {first} .. {last}",
-                why=f"expected at least three distinct shifts, found "
-                f"{np.degrees(shifts).tolist()} degrees",
-                fix="correct tof_permutation.npy, or the shifts in capture.json",
-            )
+            where = f"{sequence.path or 'sequence'}, frames {first} .. {last}"
+            found = f"{np.degrees(shifts).tolist()} degrees"
+            why = f"expected at least three distinct shifts, found {found}"
+            fix = "correct tof_permutation.npy, or the shifts in capture.json"
+            raise InputError("phase shifts", where=where, why=why, fix=fix)
         groups.append(frames.tolist())
         phasors.append(np.tensordot(rows, sequence.quads[frames].astype(np.float64), axes=1))
     stack = np.stack(phasors)
@@ -139,22 +130,13 @@ def _phasors(sequence: Sequence, i: int) -> tuple[list[list[int]], Float[np.ndar
 
 
 def quartet_phasor(sequence: Sequence, i: int) -> Float[np.ndarray, "2 H W"]:
-    """Phasor (re, im) = 2a (cos psi, sin psi) of quartet i at its first frequency, float64, in quad
-    units.
-
-    Raises:
-        ValueError: If a frame of the quartet was not measured.
-        InputError: If its shifts do not determine a phase.
-    """
+    """Phasor (re, im) of quartet i at its first frequency; raises as :func:`decode_quartet`."""
     return quartet_phasors(sequence, i)[0][1]
 
 
 def closed_form_distance(sequence: Sequence, i: int) -> Float[np.ndarray, "H W"]:
-    """Distance [m] of quartet i in [0, c/2f), or [0, c / 2 f_0) of several frequencies; float64.
-
-    Raises:
-        ValueError: If a frame of the quartet was not measured.
-        InputError: If its shifts do not determine a phase, or its frequencies have no common range.
+    """Distance [m] of quartet i in [0, :func:`unambiguous_range`); raises as
+    :func:`decode_quartet`.
     """
     return decode_quartet(sequence, i).distance
 
@@ -162,14 +144,10 @@ def closed_form_distance(sequence: Sequence, i: int) -> Float[np.ndarray, "H W"]
 def distance_from_phase(
     phase: np.ndarray, sequence: Sequence, f_mod_hz: float | None = None
 ) -> np.ndarray:
-    """Distance [m] in [0, c/2f) of measured phases [rad], phase offset removed; same shape.
-
-    ``f_mod_hz`` is the modulation frequency [Hz]; None: the first of the sequence.
-    """
+    """Distance [m] in [0, c/2f) of measured phases [rad] at a frequency; None: the first."""
     f_mod_hz = sequence.calibration.f_mod_hz if f_mod_hz is None else f_mod_hz
-    return wrapped(phase - sequence.calibration.phase_offset) * (
-        SPEED_OF_LIGHT / (4.0 * math.pi * f_mod_hz)
-    )
+    metres_per_rad = SPEED_OF_LIGHT / (4.0 * math.pi * f_mod_hz)
+    return wrapped(phase - sequence.calibration.phase_offset) * metres_per_rad
 
 
 def unambiguous_range(sequence: Sequence) -> float:
@@ -181,48 +159,36 @@ def unambiguous_range(sequence: Sequence) -> float:
     try:
         return common_range(sequence.frequencies)
     except ValueError as error:
-        raise InputError(
-            "frequencies without a common range",
-            where=sequence.path or "sequence",
-            why=str(error),
-            fix="record at frequencies like 60 and 40 MHz, or keep the raw frames of one of them",
-        ) from error
+        what, where = "frequencies without a common range", sequence.path or "sequence"
+        fix = "record at frequencies like 60 and 40 MHz, or keep the raw frames of one of them"
+        raise InputError(what, where=where, why=str(error), fix=fix) from error
 
 
 def largest_amplitude(sequence: Sequence) -> float:
-    """Largest length of a quartet's phasors over all pixels and complete quartets, twice the
-    amplitude of a quad.
+    """Largest length of a phasor over all complete quartets, twice the amplitude of a quad.
 
     Raises:
         InputError: If no quartet is complete, or none has light.
     """
-    found = (
-        phasor for i in sequence.complete_quartets for _, phasor in quartet_phasors(sequence, i)
-    )
+    quartets, where = sequence.complete_quartets, sequence.path or "sequence"
+    found = (phasor for i in quartets for _, phasor in quartet_phasors(sequence, i))
     largest = max((float(np.hypot(*phasor).max()) for phasor in found), default=0.0)
     if not largest > 0.0:
-        raise InputError(
-            "no light" if sequence.complete_quartets else "no complete quartet",
-            where=sequence.path or "sequence",
-            why="expected all raw frames of a cycle, with light, found "
-            f"{len(sequence.complete_quartets)} complete quartets, largest amplitude {largest:g}",
-            fix="complete the recording",
-        )
+        what = "no light" if quartets else "no complete quartet"
+        why = "expected all raw frames of a cycle, with light, found "
+        why += f"{len(quartets)} complete quartets, largest amplitude {largest:g}"
+        raise InputError(what, where=where, why=why, fix="complete the recording")
     return largest
 
 
 def quad_scale(sequence: Sequence) -> tuple[float, str]:
-    """Factor that scales the quads to order one, and its source.
-
-    Returns:
-        The file's own factor if it states one, else 1 / (largest phasor amplitude of the sequence);
-        its source.
+    """Factor that scales the quads to order one, and its source: the factor of the file, or else
+    1 / (largest phasor amplitude).
 
     Raises:
         InputError: If there is no factor and no light to compute one from.
     """
     if sequence.calibration.quad_scale is not None:
-        return float(sequence.calibration.quad_scale), sequence.sources.get(
-            "quad_scale", "setting of the sequence"
-        )
+        source = sequence.sources.get("quad_scale", "setting of the sequence")
+        return float(sequence.calibration.quad_scale), source
     return 1.0 / largest_amplitude(sequence), "inferred 1 / largest phasor amplitude"

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..constants import CANONICAL_SHIFTS
-from ..data.contact_sheet import SHIFTS_MIN
+from ..data.cycles import QUADS_MIN
 from ..errors import UsageError
 from .assembly import has_mesh
 from .gaussian_cover import clearance
@@ -51,8 +51,8 @@ def check_format(scene: Scene, settings: SimSettings) -> None:
     """Raise a UsageError if the sensor is contradictory, or the layout cannot store it."""
     sensor, lens, capture = scene.sensor, scene.lens, settings.format == "capture"
     turns = sorted(round(math.degrees(shift), 4) % 360.0 for shift in sensor.shifts)
-    few = capture and len(set(turns)) < SHIFTS_MIN
-    why = f"a phase needs {SHIFTS_MIN} different shifts, found {turns} deg"
+    few = capture and len(set(turns)) < QUADS_MIN
+    why = f"a phase needs {QUADS_MIN} different shifts, found {turns} deg"
     refuse(
         few, ("this sensor cannot measure a phase", "sensor.shifts"), why, "give it more of them"
     )
