@@ -8,14 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from closed_forms import phase_noise, predicted_distance_noise, predicted_phase_noise
 
-from gftorf_warp.scene.electrons import (
-    contrast,
-    electron_gain,
-    phase_noise,
-    predicted_distance_noise,
-    predicted_phase_noise,
-)
+from gftorf_warp.scene.electrons import contrast, electron_gain
 from gftorf_warp.scene.sensor import Sensor, phasor_from_quads
 from gftorf_warp.sim.readout import read_out
 from gftorf_warp.sim.sensors import SENSORS

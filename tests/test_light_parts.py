@@ -226,7 +226,7 @@ def test_lobes_that_cannot_be(wrong):
         Texture(low=0.5, high=0.5, **wrong)
     with pytest.raises(ValueError, match="gloss must be 0 to 1"):
         RigidBody(radius=1.0, low=0.5, high=0.5, cell=0.3, **wrong)
-    with pytest.raises(ValueError, match="at most the light"):
+    with pytest.raises(ValueError, match="at most the incident light"):
         Texture(low=0.5, high=1.2, gloss=0.1)
     assert "gloss" not in repr(Texture(low=0.5, high=0.5, hue=0.2))
     assert "gloss=0.4, shininess=30.0" in repr(SHINY)

@@ -1,24 +1,7 @@
-"""Electrons that a sensor counts, and the noise of distance (sensor notes, 2.2 to 2.5).
-
-A tap holds B + A cos(..) electrons and adds read noise of deviation s_r. With K equally spaced
-shifts
-
-    sigma_psi = sqrt(2/K) sqrt(B + s_r^2) / A      one tap          sigma_d = c / (4 pi f) sigma_psi
-              = sqrt(1/K) sqrt(B + s_r^2) / A      two taps
-
-for all phases, except with three shifts of one tap. An ADC of e electrons per code adds e^2/12 to
-the variance of a quad: to one tap, or half of it to each of two. Tensors give differentiable
-tensors, for the design of sensors.
-"""
+"""Electrons that a sensor counts (sensor notes, 2.2 to 2.5)."""
 
 from __future__ import annotations
 
-import math
-
-import torch
-from torch import Tensor
-
-from ..constants import SPEED_OF_LIGHT
 from .sensor import Scalar, Sensor
 
 REFERENCE_EXPOSURE_S = 2.34e-3  # of electrons_per_unit
@@ -41,73 +24,3 @@ def contrast(sensor: Sensor) -> Scalar:
 def dark_electrons(sensor: Sensor) -> float:
     """Mean dark electrons of a tap in one exposure, N_dark [e-]."""
     return sensor.dark_electrons_per_s * sensor.exposure_s
-
-
-def phase_noise(
-    mean: Scalar,
-    amplitude: Scalar,
-    read: float,
-    samples: int,
-    *,
-    taps: int = 2,
-    phase: Scalar | None = None,
-) -> Tensor:
-    """Standard deviation of a decoded phase [rad], where it is small against 1.
-
-    Args:
-        mean: Mean electrons B of a tap [e-]; number or tensor.
-        amplitude: Amplitude A of the electrons of a tap [e-]; likewise.
-        read: Standard deviation of the read noise of a tap [e-].
-        samples: Number K of equally spaced shifts.
-        taps: 1, or 2 whose difference is taken.
-        phase: True phase [rad]; only K = 3 with one tap depends on it. None: the mean over all
-            phases.
-
-    Raises:
-        ValueError: If there are fewer than three shifts, or another number of taps.
-    """
-    if samples < 3 or taps not in (1, 2):
-        raise ValueError(
-            f"a phase needs at least 3 samples, got {samples}, of 1 or 2 taps, got {taps}"
-        )
-    mean, amplitude = (
-        torch.as_tensor(mean, dtype=torch.float64),
-        torch.as_tensor(amplitude, dtype=torch.float64),
-    )
-    tap = mean + read**2
-    variance = 2.0 / (taps * samples) * tap / amplitude**2
-    if taps == 1 and samples == 3 and phase is not None:
-        variance = variance * (
-            1.0 - amplitude * torch.cos(3.0 * torch.as_tensor(phase)) / (2.0 * tap)
-        )
-    return variance.sqrt()
-
-
-def predicted_phase_noise(amplitude: Scalar, sensor: Sensor) -> Tensor:
-    """Standard deviation [rad] of the phase that ``sensor`` decodes at its first frequency.
-
-    A plain sine, equally spaced shifts and nothing full are assumed; patterns are left out.
-
-    Args:
-        amplitude: Relative amplitude a = s r / d^2 of one surface [1]; number or tensor.
-        sensor: Electrons, contrast, taps, number of shifts.
-    """
-    active = electron_gain(sensor) * torch.as_tensor(amplitude, dtype=torch.float64)
-    taps = 1 if sensor.unipolar else 2
-    step = 0.0 if sensor.adc_bits is None else sensor.electrons_per_code
-    added = math.sqrt(sensor.read_noise_electrons**2 + step**2 / (12.0 * taps))
-    mean = 0.5 * (sensor.ambient_electrons + active) + dark_electrons(sensor)
-    return phase_noise(mean, 0.5 * contrast(sensor) * active, added, len(sensor.shifts), taps=taps)
-
-
-def predicted_distance_noise(amplitude: Scalar, sensor: Sensor) -> Tensor:
-    """Standard deviation [m] of a decoded distance; see :func:`predicted_phase_noise`.
-
-    Differentiable by ``f_mod_hz``: -sigma (1/f + C'/C). The modulation frequency with the least
-    noise is the cutoff of the contrast; long before, distances are no longer unambiguous.
-    """
-    return (
-        SPEED_OF_LIGHT
-        / (4.0 * math.pi * sensor.f_mod_hz)
-        * predicted_phase_noise(amplitude, sensor)
-    )

@@ -1,6 +1,4 @@
-"""All motion models: a new one is a class of :class:`Motion` in a file of its own,
-and its line here.
-"""
+"""All motion models: a new one is a class of :class:`Motion` in its own file, listed here."""
 
 from __future__ import annotations
 
@@ -12,13 +10,7 @@ from .network import Network
 from .rigid_nodes import RigidNodes
 from .spline import Spline
 
-MODELS: tuple[type[Motion], ...] = (
-    Still,
-    Nodes,
-    Network,
-    Spline,
-    RigidNodes,
-)
+MODELS: tuple[type[Motion], ...] = (Still, Nodes, Network, Spline, RigidNodes)
 KINDS = {model.kind: model for model in MODELS}
 
 

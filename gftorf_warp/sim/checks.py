@@ -30,21 +30,12 @@ def check_engine(scene: Scene, settings: SimSettings, device: str = "cpu") -> No
         body.texture.gloss > 0 or (body.moves and has_mesh(body.shape)) for body in scene.bodies
     )
     needed = bodies or any(scene.emitter) or scene.beam_deg is not None or settings.bounces > 0
-    effects = (
-        "the light is beside the camera, has a beam or bounces, or a body is glossy or a "
-        "mesh that moves"
-    )
-    require(not needed, "--engine", repr(settings.engine), f"mesh: {effects}")
-    require(
-        device == "cpu",
-        "--device",
-        f"{device} and engine {settings.engine!r}",
-        "cpu, or --engine mesh",
-    )
-    rows = scene.sensor.row_time_s > 0
-    refuse(
-        rows, ROLLING, "engine gaussian renders all rows of an image at one time", "--engine mesh"
-    )
+    engine = repr(settings.engine)
+    effects = "the light is beside the camera, has a beam or bounces, or a body is glossy or a mesh"
+    require(not needed, "--engine", engine, f"mesh: {effects} that moves")
+    require(device == "cpu", "--device", f"{device} and engine {engine}", "cpu, or --engine mesh")
+    why = "engine gaussian renders all rows of an image at one time"
+    refuse(scene.sensor.row_time_s > 0, ROLLING, why, "--engine mesh")
 
 
 def check_format(scene: Scene, settings: SimSettings) -> None:
@@ -53,9 +44,8 @@ def check_format(scene: Scene, settings: SimSettings) -> None:
     turns = sorted(round(math.degrees(shift), 4) % 360.0 for shift in sensor.shifts)
     few = capture and len(set(turns)) < QUADS_MIN
     why = f"a phase needs {QUADS_MIN} different shifts, found {turns} deg"
-    refuse(
-        few, ("this sensor cannot measure a phase", "sensor.shifts"), why, "give it more of them"
-    )
+    phaseless = "this sensor cannot measure a phase", "sensor.shifts"
+    refuse(few, phaseless, why, "give it more of them")
     impossible = why_impossible(sensor) if sensor.noise else None
     negative = "a tap of this sensor would hold negative light", "sensor.dc_offset"
     fix = "lower the contrast or the DC offset, or make the sensor unipolar"
@@ -64,9 +54,8 @@ def check_format(scene: Scene, settings: SimSettings) -> None:
         what = "an F-ToeRF folder cannot express this"
         others = turns != sorted(math.degrees(shift) for shift in CANONICAL_SHIFTS)
         why = f"it holds the four shifts 0, 90, 180 and 270 deg in some order, not {turns} deg"
-        refuse(
-            others, (f"{what} sensor", "sensor.shifts"), why, f"use those four shifts, or {CAPTURE}"
-        )
+        fix = f"use those four shifts, or {CAPTURE}"
+        refuse(others, (f"{what} sensor", "sensor.shifts"), why, fix)
         why = f"it has one modulation frequency, not {1 + len(sensor.further_hz)}"
         fix = f"leave sensor.further_hz out, or {CAPTURE}"
         refuse(bool(sensor.further_hz), (f"{what} sensor", "sensor.further_hz"), why, fix)
@@ -91,8 +80,6 @@ def check_clearance(scene: Scene, times: Float[np.ndarray, "F"]) -> None:
     for body in (body for body in scene.bodies if body.moves):
         near = np.flatnonzero(clearance(body, centres, times) < CLEARANCE)
         first = near[0] if len(near) else 0
-        why = (
-            f"scene {scene.name} is made for {scene.frames} raw frames, and it happens at "
-            f"frame {first}"
-        )
+        made = f"scene {scene.name} is made for {scene.frames} raw frames"
+        why = f"{made}, and it happens at frame {first}"
         refuse(len(near) > 0, (what, "--frames"), why, f"simulate at most {first} raw frames")

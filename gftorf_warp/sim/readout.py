@@ -19,7 +19,7 @@ C is the contrast. Differential codes are signed. A unipolar sensor has C = 1 / 
 constant levels: ambient light, measured by a frame without active light, and the mean dark current
 of all pixels. The fixed pattern multiplies all light by the gain of each pixel, and the dark
 current by another factor. Results are in relative units again; without clipping their mean is q
-times the gain. Their phase noise is that of scene/electrons.py.
+times the gain. tests/closed_forms.py predicts their phase noise.
 """
 
 from __future__ import annotations

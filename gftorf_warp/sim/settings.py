@@ -63,32 +63,19 @@ class SimSettings:
     def __post_init__(self):
         least = FRAMES_PER_QUARTET if self.format == "torf" else 1  # a phasor needs a whole quartet
         size = (1, 1) if self.size is None else self.size
-        require(
-            self.frames is None or self.frames >= least,
-            "--frames",
-            f"{self.frames}",
-            f"at least {least}",
-        )
+        enough = self.frames is None or self.frames >= least
         sized = len(size) == 2 and min(size) >= 1
-        require(
-            sized,
-            "--size",
-            "x".join(map(str, size)),
-            "WIDTHxHEIGHT, both at least 1, for example 160x120",
-        )
+        pixels = "WIDTHxHEIGHT, both at least 1, for example 160x120"
+        require(enough, "--frames", f"{self.frames}", f"at least {least}")
+        require(sized, "--size", "x".join(map(str, size)), pixels)
         require(self.seed >= 0, "--seed", f"{self.seed}", "0 or more")
-        require(
-            self.exposure_samples >= 1, "exposure_samples", f"{self.exposure_samples}", "at least 1"
-        )
-        require(
-            self.engine in ENGINES, "--engine", repr(self.engine), f"one of {', '.join(ENGINES)}"
-        )
+        samples = self.exposure_samples
+        require(samples >= 1, "exposure_samples", f"{samples}", "at least 1")
         require(self.bounces >= 0, "--bounces", f"{self.bounces}", "0 or more")
         require(self.paths >= 1, "--paths", f"{self.paths}", "at least 1")
-        require(
-            self.format in FORMATS, "--format", repr(self.format), f"one of {', '.join(FORMATS)}"
-        )
-        require(self.truth in TRUTHS, "--truth", repr(self.truth), f"one of {', '.join(TRUTHS)}")
+        for name, known in (("engine", ENGINES), ("format", FORMATS), ("truth", TRUTHS)):
+            value = getattr(self, name)
+            require(value in known, f"--{name}", repr(value), f"one of {', '.join(known)}")
         layers = self.level is not None or (self.engine, self.format) == ("mesh", "capture")
         why = "only engine mesh computes layers, and only a capture stores them"
         fix = "add --engine mesh --format capture"
