@@ -5,8 +5,10 @@ Axes: x right, y down, z forward; a camera that does not move is at the origin.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
+from functools import wraps
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -152,6 +154,22 @@ class Scene:
             self.colour.horizontal_fov_deg,
             camera_from_world=pose,
         )
+
+
+def recipe(
+    description: str, motion: str, closed_form: float, **others: Any
+) -> Callable[[Callable[[], tuple[Body, ...]]], Callable[[], Scene]]:
+    """Decorator: the scene of these bodies, with the name of the function, and ``others``."""
+    texts = {"description": description, "motion": motion, "closed_form": closed_form}
+
+    def decorated(bodies: Callable[[], tuple[Body, ...]]) -> Callable[[], Scene]:
+        @wraps(bodies)
+        def scene() -> Scene:
+            return Scene(name=bodies.__name__, bodies=bodies(), **{**texts, **others})
+
+        return scene
+
+    return decorated
 
 
 def overridden(scene: Scene, overrides: Iterable[str]) -> Scene:
