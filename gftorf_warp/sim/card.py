@@ -18,48 +18,33 @@ from .scenes import SCENES, Scene
 from .sensors import effect_rows
 from .settings import SimSettings
 
-CALLED = (
-    "frames",
-    "size",
-    "seed",
-    "sync",
-    "noise",
-    "flow",
-    "exposure_samples",
-    "engine",
-    "bounces",
-    "paths",
-)
+CALLED = ("frames", "size", "seed", "sync", "noise", "flow")
+CALLED += ("exposure_samples", "engine", "bounces", "paths")
 """Settings that a call names on a data card, even where they are the defaults."""
-PHASORS = "one per quartet, with time, pose and truth of its first raw frame"
 
 
 def settings_card(own: Scene, settings: SimSettings) -> str:
-    """The part that depends on scene and settings alone: equal text, equal settings.
-
-    Args:
-        own: The scene with overrides applied, but no level of the ladder.
-        settings: How it is recorded.
-    """
+    """The part that depends on scene (without level) and settings alone: equal text, same data."""
     scene, used = resolved(own, settings)
     sensor, noisy = scene.sensor, used.noise and scene.sensor.noise
-    camera = scene.camera(used.size)
+    camera, n = scene.camera(used.size), used.exposure_samples
+    mhz, quads = float(sensor.f_mod_hz) / 1e6, len(sensor.cycle)
+    shifts = ", ".join(f"{math.degrees(shift):.0f}" for shift in sensor.shifts)
+    together = f"all {'four' if quads == FRAMES_PER_QUARTET else quads} of a quartet at the time of"
+    when = f"{together} its first" if used.sync else "each at its own time"
     rows = {
-        "modulation frequency": f"{float(sensor.f_mod_hz) / 1e6:.9g} MHz, unambiguous to "
-        f"{sensor.unambiguous_range:.4f} m",
-        "shifts in time order": ", ".join(f"{math.degrees(shift):.0f}" for shift in sensor.shifts)
-        + " deg",
-        "raw frames": f"{1 / sensor.frame_period_s:.6g} per second, "
-        + (_together(len(sensor.cycle)) if used.sync else "each at its own time"),
-        **({"phasors": PHASORS} if used.format == "torf" else {}),
-        **(
-            {}
-            if settings.level is None
-            else {"ladder": f"level {settings.level}: {adds_of(settings.level)}"}
-        ),
+        "modulation frequency": f"{mhz:.9g} MHz, unambiguous to {sensor.unambiguous_range:.4f} m",
+        "shifts in time order": f"{shifts} deg",
+        "raw frames": f"{1 / sensor.frame_period_s:.6g} per second, {when}",
+    }
+    if used.format == "torf":
+        rows["phasors"] = "one per quartet, with time, pose and truth of its first raw frame"
+    if settings.level is not None:
+        rows["ladder"] = f"level {settings.level}: {adds_of(settings.level)}"
+    rows |= {
         **_camera_rows(scene, used),
         "exposure": f"{1e3 * sensor.exposure_s:g} ms, "
-        + (f"mean of {n} instants" if (n := used.exposure_samples) > 1 else "taken as one instant"),
+        + (f"mean of {n} instants" if n > 1 else "taken as one instant"),
         "taps": "one, unipolar" if sensor.unipolar else "two, differential",
         "source intensity": f"{float(sensor.source_intensity):g}",
         "phase offset": f"{float(sensor.phase_offset):g} rad",
@@ -67,17 +52,17 @@ def settings_card(own: Scene, settings: SimSettings) -> str:
         "noise": "shot, read, full well, ADC" if noisy else "none: quads are exact means",
     }
     if noisy:
+        gain, ambient = f"{electron_gain(sensor):.4g}", sensor.ambient_electrons
+        white = " from white" if ambient and used.engine == "mesh" else ""
+        adc = f"{sensor.adc_bits or 'no'} bits, {sensor.electrons_per_code:g}"
         rows |= {
-            "electrons per unit of amplitude": f"{electron_gain(sensor):.4g} in one exposure, "
-            f"both taps together",
+            "electrons per unit of amplitude": f"{gain} in one exposure, both taps together",
             "contrast": f"{contrast(sensor):g}",
-            "ambient": f"{sensor.ambient_electrons:g} electrons per exposure"
-            + (" from white" if sensor.ambient_electrons and used.engine == "mesh" else ""),
+            "ambient": f"{ambient:g} electrons per exposure{white}",
             "dark current": f"{sensor.dark_electrons_per_s:g} electrons per second and tap",
             "read noise": f"{sensor.read_noise_electrons:g} electrons per tap",
             "full well": f"{sensor.full_well_electrons:g} electrons per tap",
-            "ADC": f"{sensor.adc_bits or 'no'} bits, {sensor.electrons_per_code:g} electrons per "
-            f"code",
+            "ADC": f"{adc} electrons per code",
         }
     rows |= effect_rows(sensor) | lens_rows(scene.lens)
     table = "\n".join(f"| {name} | {value} |" for name, value in rows.items())
@@ -108,13 +93,6 @@ frame, not a rendering.
 """
 
 
-def _together(count: int) -> str:
-    return (
-        f"all {'four' if count == FRAMES_PER_QUARTET else count} of a quartet at the time of "
-        f"its first"
-    )
-
-
 def outcome_card(recording: Recording) -> str:
     """The part that is known after the recording: engine against truth, and saturation."""
     agreement = "no such pixel" if recording.gap is None else str(recording.gap)
@@ -140,18 +118,15 @@ def _light(scene: Scene, used: SimSettings) -> str:
         lamp += f"; it shines on {scene.beam_deg[0]:g} x {scene.beam_deg[1]:g} deg"
     if not used.bounces:
         return f"{lamp}; direct light only"
-    return (
-        f"{lamp}; direct light and up to {used.bounces} bounces, from {used.paths} paths per pixel"
-    )
+    paths = f"from {used.paths} paths per pixel"
+    return f"{lamp}; direct light and up to {used.bounces} bounces, {paths}"
 
 
 def _engine(scene: Scene, used: SimSettings) -> str:
     rays = f"{scene.subsamples}x{scene.subsamples} rays per pixel, averaged"
     if used.engine == "mesh":
-        return (
-            f"Engine mesh: rays meet the surfaces themselves, as triangles, balls and endless "
-            f"planes; {rays}."
-        )
+        met = "rays meet the surfaces themselves, as triangles, balls and endless planes"
+        return f"Engine mesh: {met}; {rays}."
     return f"Engine gaussian: the scene is covered by Gaussians and rendered with {rays}."
 
 
@@ -159,19 +134,16 @@ def _camera_rows(scene: Scene, used: SimSettings) -> dict[str, str]:
     """Rows on camera motion and colour camera; empty for a static ToF camera at the origin."""
     rows = {}
     if scene.camera_path != Still():
-        rows["camera path"] = f"{scene.camera_path}" + (
-            "; every raw frame has the pose of its own time" if scene.camera_moves else ""
-        )
-    if scene.colour is not None:
+        own = "; every raw frame has the pose of its own time" if scene.camera_moves else ""
+        rows["camera path"] = f"{scene.camera_path}{own}"
+    if (colour := scene.colour) is not None:
         camera = scene.colour_camera(used.size)
-        position = ", ".join(f"{1e3 * x:g}" for x in scene.colour.position)
+        position = ", ".join(f"{1e3 * x:g}" for x in colour.position)
         rows["colour camera"] = (
-            f"{camera.width}x{camera.height} pixels, {scene.colour.horizontal_fov_deg:g} deg "
-            f"wide, at ({position}) mm "
-            f"in the axes of the ToF camera, turned by {scene.colour.turn_deg} deg; an image at "
-            f"each quartet start; "
-            "linear RGB albedo: light from everywhere, no shading, no falloff; noise "
-            + (f"{scene.colour.noise:g}" if used.noise else "none")
+            f"{camera.width}x{camera.height} pixels, {colour.horizontal_fov_deg:g} deg wide, at "
+            f"({position}) mm in the axes of the ToF camera, turned by {colour.turn_deg} deg; "
+            "an image at each quartet start; linear RGB albedo: light from everywhere, no shading, "
+            f"no falloff; noise {f'{colour.noise:g}' if used.noise else 'none'}"
         )
     if scene.novel_views:
         rows["novel views"] = f"{len(scene.novel_views)} poses off the path, without images"
@@ -186,50 +158,33 @@ def _command(scene: Scene, used: SimSettings, level: str | None) -> str:
         values |= {"format": repr(used.format)} if used.format != "ftorf" else {}
         values |= {"level": repr(level)} if level else {}
         values |= {"truth": repr(used.truth)} if used.truth != "usual" else {}
-        return (
-            f"gftorf_warp.simulate({scene.name}, ..., "
-            f"{', '.join(f'{k}={v}' for k, v in values.items())})"
-        )
-    camera = scene.camera(used.size)
-    options = [f"--override {text}" for text in scene.overrides]
-    options += [
-        f"--frames {used.frames}",
-        f"--size {camera.width}x{camera.height}",
-        *(["--flow"] if used.flow else []),
-    ]
-    if level is None:
-        options += [f"--engine {used.engine}"] if used.engine != "gaussian" else []
-        options += [f"--bounces {used.bounces}", f"--paths {used.paths}"] if used.bounces else []
-        options += (
-            [f"--exposure-samples {used.exposure_samples}"] if used.exposure_samples > 1 else []
-        )
-    options += [
-        f"--seed {used.seed}",
-        *([f"--format {used.format}"] if used.format != "ftorf" else []),
-    ]
-    options += [f"--truth {used.truth}"] if used.truth != "usual" else []
-    options += [f"--level {level}"] if level else []
-    options += ["--sync"] if used.sync and level != NAMES[0] else []
-    options += ["--no-noise"] if not (used.noise or level) else []
-    return f"gftorf simulate {scene.name} --out SEQ {' '.join(options)}"
+        call = ", ".join(f"{k}={v}" for k, v in values.items())
+        return f"gftorf_warp.simulate({scene.name}, ..., {call})"
+    camera, samples = scene.camera(used.size), used.exposure_samples
+    options = (
+        *((True, f"--override {text}") for text in scene.overrides),
+        (True, f"--frames {used.frames} --size {camera.width}x{camera.height}"),
+        (used.flow, "--flow"),
+        (not level and used.engine != "gaussian", f"--engine {used.engine}"),
+        (not level and used.bounces, f"--bounces {used.bounces} --paths {used.paths}"),
+        (not level and samples > 1, f"--exposure-samples {samples}"),
+        (True, f"--seed {used.seed}"),
+        (used.format != "ftorf", f"--format {used.format}"),
+        (used.truth != "usual", f"--truth {used.truth}"),
+        (level, f"--level {level}"),
+        (used.sync and level != NAMES[0], "--sync"),
+        (not (used.noise or level), "--no-noise"),
+    )
+    chosen = " ".join(option for given, option in options if given)
+    return f"gftorf simulate {scene.name} --out SEQ {chosen}"
 
 
 def _fingerprint(scene: Scene) -> str:
     """Every setting of a scene as text, without unused optional ones."""
-    optional = {
-        "camera_path": Still(),
-        "emitter": (0.0, 0.0, 0.0),
-        "beam_deg": None,
-        "colour": None,
-        "novel_views": (),
-    }
-    optional |= {"lens": Lens()}
+    unused = {"camera_path": Still(), "emitter": (0.0, 0.0, 0.0), "beam_deg": None, "colour": None}
+    unused |= {"novel_views": (), "lens": Lens()}
     values = {f.name: getattr(scene, f.name) for f in fields(scene)}
-    used = {
-        name: value
-        for name, value in values.items()
-        if name not in optional or value != optional[name]
-    }
-    del used["closed_form"], used["overrides"]  # follow from the others
+    del values["closed_form"], values["overrides"]  # follow from the others
+    used = [f"{k}={v!r}" for k, v in values.items() if k not in unused or v != unused[k]]
     hues = "" if scene.colour is None else f", hues {[body.texture.hue for body in scene.bodies]}"
-    return f"Scene({', '.join(f'{name}={value!r}' for name, value in used.items())}){hues}"
+    return f"Scene({', '.join(used)}){hues}"

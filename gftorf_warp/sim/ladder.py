@@ -123,13 +123,10 @@ def resolved(scene: Scene, settings: SimSettings) -> tuple[Scene, SimSettings]:
         raise UsageError(
             f"there is no level {name!r}", where="--level", why=why, fix="take one of these"
         )
-    of_scene: dict[str, Any] = {}
-    of_sensor: dict[str, Any] = {}
-    chosen: dict[str, Any] = {}
-    for level in LEVELS[: NAMES.index(name) + 1]:
-        of_scene |= level.scene
-        of_sensor |= level.sensor
-        chosen |= level.settings
+    of_scene, of_sensor, chosen = (
+        {k: v for level in LEVELS[: NAMES.index(name) + 1] for k, v in getattr(level, part).items()}
+        for part in ("scene", "sensor", "settings")
+    )
     sensor = _changed(scene.sensor, {k: v for k, v in of_sensor.items() if v is not OWN})
     if of_scene["emitter"] == EMITTER_M and any(scene.emitter):
         of_scene["emitter"] = OWN

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import astuple, dataclass, fields, is_dataclass, replace
+from dataclasses import asdict, astuple, dataclass, fields, replace
 from functools import partial
 from typing import Any
 
@@ -85,11 +85,9 @@ def frame_times(sensor: Sensor, frames: int, *, sync: bool) -> Float[np.ndarray,
 def sequence_fields(
     sensor: Sensor, times: Float[np.ndarray, "F"], cameras: list[Camera], **settings: Any
 ) -> dict[str, Any]:
-    """The fields of a sequence given by its sensor, its times [s] and its ToF cameras.
-
-    ``settings`` are further settings of the sensor.
-    """
+    """Fields of a sequence by its sensor, with more ``settings``, times [s] and ToF cameras."""
     shots = [sensor.at_frame(n) for n in range(len(times))]
+    frequencies = np.array([float(shot.f_mod_hz) for shot in shots])
     return {
         "intrinsics": _intrinsics(cameras[0]),
         "calibration": Calibration(
@@ -102,9 +100,7 @@ def sequence_fields(
         "camera_from_world": np.stack([camera.camera_from_world for camera in cameras]),
         "shifts": np.array([shot.shifts[0] for shot in shots]),
         "times": times,
-        "frequencies_hz": np.array([float(shot.f_mod_hz) for shot in shots])
-        if sensor.further_hz
-        else None,
+        "frequencies_hz": frequencies if sensor.further_hz else None,
     }
 
 
@@ -124,22 +120,12 @@ def record(
 ) -> Recording:
     """Record ``scene``, in memory; all of ``settings`` apply but the layout on disk.
 
-    Every raw frame depends on its number and on the settings alone, so that it may as well come
-    from an interrupted recording.
-
-    Args:
-        scene: The scene.
-        settings: How it is recorded.
-        device: Where engine mesh traces.
-        progress: Called with (raw frames done, raw frames in all).
-        cached: Returns finished images instead of computing them, see sim/resume.py; None computes
-            all.
-        changes: Fields of ``settings`` with other values.
+    Every raw frame depends on its number and on the settings alone, so that ``cached`` may return
+    images of an interrupted recording, see sim/resume.py. Arguments as for ``simulate``.
 
     Raises:
         UsageError: If the settings contradict each other or the scene.
-        ValueError: If the sensor's contrast and DC offset contradict each other, see
-            sim/readout.py.
+        ValueError: If the sensor's contrast and DC offset contradict each other.
     """
     scene, settings = resolved(scene, replace(settings, **changes))
     check_engine(scene, settings, device)
@@ -147,7 +133,7 @@ def record(
     sensor = replace(scene.sensor, noise=settings.noise and scene.sensor.noise)
     times = frame_times(sensor, settings.frames or scene.frames, sync=settings.sync)
     cameras = [scene.camera(settings.size, float(time)) for time in times]
-    distances, bodies, interior = _truth(scene, settings, cameras, times)
+    distances, bodies, interior = _truth(scene, settings, times)
     expose = _exposing(scene, settings, sensor, times, device)
     images: Images = {}
     for n in range(len(times)):
@@ -156,16 +142,14 @@ def record(
             images.setdefault(name, np.zeros((len(times), *image.shape), image.dtype))[n] = image
         if progress is not None and (computed or n + 1 == len(times)):
             progress(n + 1, len(times))
+    views = [inverse(view.world_from_body(0.0)) for view in scene.novel_views]
+    layers = {n.removeprefix(LAYER): image for n, image in images.items() if n.startswith(LAYER)}
     return Recording(
         sequence=Sequence(
             quads=images["quad"],
             measured=np.ones(len(times), dtype=bool),
             **sequence_fields(sensor, times, cameras, **sensor_settings(sensor)),
-            novel_from_world=np.stack(
-                [inverse(view.world_from_body(0.0)) for view in scene.novel_views]
-            )
-            if scene.novel_views
-            else None,
+            novel_from_world=np.stack(views) if views else None,
             flow=_flows(scene, cameras, times) if settings.flow else Flow(),
             exposures=np.full(len(times), sensor.exposure_s),
             colour=_colour(scene, settings, times, cached),
@@ -176,9 +160,7 @@ def record(
             phasor_distance=images["phasor_distance"],
             amplitude=images["amplitude"],
             body=bodies,
-            layers={
-                n.removeprefix(LAYER): image for n, image in images.items() if n.startswith(LAYER)
-            },
+            layers=layers,
         ),
         gap=_gap(images["distance"], distances, interior),
         saturated=int(images["saturated"].sum()) / images["quad"].size,
@@ -248,11 +230,7 @@ def _fine(camera_at: Callable[[float], Camera], scene: Scene) -> Callable[[float
 
 
 def _static_distance(exposure: Exposure, sensor: Sensor) -> Float[np.ndarray, "H W"]:
-    """Closed-form distance [m] of four quads taken at once without noise; NaN without light.
-
-    In [0, c/2f), of all light that reaches the pixel, bounces included; a sensor's harmonics are
-    not.
-    """
+    """Closed-form distance [m] in [0, c/2f), of all light, without harmonics; NaN without light."""
     phasor = torch.from_numpy(np.asarray(exposure.phasor, dtype=np.complex128))
     distance = distance_from_phasor(phasor.real, phasor.imag, sensor).numpy()
     return np.where(np.abs(exposure.phasor) > 0, distance, np.nan).astype(np.float32)
@@ -260,16 +238,13 @@ def _static_distance(exposure: Exposure, sensor: Sensor) -> Float[np.ndarray, "H
 
 def sensor_settings(sensor: Sensor) -> dict[str, Any]:
     """Every field of a sensor by name, as numbers and lists for files."""
-    plain: dict[str, Any] = {}
-    for f in fields(sensor):
-        value = getattr(sensor, f.name)
-        if is_dataclass(value):
-            plain[f.name] = {part.name: getattr(value, part.name) for part in fields(value)}
-        elif isinstance(value, tuple):
-            plain[f.name] = [float(item) for item in value]
-        else:
-            plain[f.name] = value.item() if isinstance(value, torch.Tensor) else value
-    return plain
+    plain: dict[str, Any] = {f.name: getattr(sensor, f.name) for f in fields(sensor)}
+    for name, value in plain.items():
+        if isinstance(value, tuple):
+            plain[name] = [float(item) for item in value]
+        elif isinstance(value, torch.Tensor):
+            plain[name] = value.item()
+    return plain | {"pattern": asdict(sensor.pattern)}
 
 
 def still_interior(scene: Scene, hits: list[Hits]) -> Bool[np.ndarray, "H W"]:
@@ -289,19 +264,15 @@ def still_interior(scene: Scene, hits: list[Hits]) -> Bool[np.ndarray, "H W"]:
 
 
 def _truth(
-    scene: Scene, settings: SimSettings, cameras: list[Camera], times: Float[np.ndarray, "F"]
+    scene: Scene, settings: SimSettings, times: Float[np.ndarray, "F"]
 ) -> tuple[Float[np.ndarray, "F H W"], Int[np.ndarray, "F H W"], Bool[np.ndarray, "F H W"]]:
     """Distance [m], body and still interior of every raw frame."""
-    distances, bodies, interior = [], [], []
-    camera_at = partial(scene.camera, settings.size)
-    for time in times.tolist():
-        hit = rolling_hits(scene.bodies, camera_at, time, scene.sensor, cameras[0].height)
-        distances.append(hit.distance)
-        bodies.append(hit.body.astype(np.int16))
-        interior.append(still_interior(scene, [hit]))
-    inside = np.stack(interior)
+    camera_at, height = partial(scene.camera, settings.size), scene.camera(settings.size).height
+    hits = [rolling_hits(scene.bodies, camera_at, t, scene.sensor, height) for t in times.tolist()]
+    inside = np.stack([still_interior(scene, [hit]) for hit in hits])
     inside = inside if scene.camera_moves else np.broadcast_to(inside.all(axis=0), inside.shape)
-    return np.stack(distances), np.stack(bodies), inside
+    bodies = np.stack([hit.body.astype(np.int16) for hit in hits])
+    return np.stack([hit.distance for hit in hits]), bodies, inside
 
 
 def _gap(

@@ -104,27 +104,21 @@ SENSORS: Mapping[str, Sensor] = {
 
 def effect_rows(sensor: Sensor) -> dict[str, str]:
     """Rows of a data card on effects beyond one frequency, a sine and equal pixels."""
-    rows = {}
+    rows, pattern = {}, sensor.pattern
     if sensor.further_hz:
-        listed = ", then at ".join(
-            f"{float(f) / 1e6:.9g} MHz" for f in (sensor.f_mod_hz, *sensor.further_hz)
-        )
-        rows["cycle"] = f"{len(sensor.cycle)} raw frames: all shifts at {listed}"
+        listed = [f"{float(f) / 1e6:.9g} MHz" for f in (sensor.f_mod_hz, *sensor.further_hz)]
+        shots = f"{len(sensor.cycle)} raw frames"
+        rows["cycle"] = f"{shots}: all shifts at {', then at '.join(listed)}"
     if any(sensor.harmonic_contrast):
-        ratios = ", ".join(
-            f"{sensor.contrast_ratio(h):.4g} at harmonic {h}" for h in sensor.harmonics[1:]
-        )
-        rows["contrast of harmonics"] = f"relative to the first: {ratios}"
+        ratios = [f"{sensor.contrast_ratio(h):.4g} at harmonic {h}" for h in sensor.harmonics[1:]]
+        rows["contrast of harmonics"] = f"relative to the first: {', '.join(ratios)}"
     if sensor.contrast_cutoff_hz is not None:
-        rows["cutoff of the contrast"] = (
-            f"{sensor.contrast_cutoff_hz / 1e6:g} MHz: it is that of 0 Hz, {sensor.contrast:g}, "
-            f"over 1 + (f / cutoff)^2"
-        )
-    if sensor.pattern != Pattern():
-        pattern = sensor.pattern
+        static = f"it is that of 0 Hz, {sensor.contrast:g}, over 1 + (f / cutoff)^2"
+        rows["cutoff of the contrast"] = f"{sensor.contrast_cutoff_hz / 1e6:g} MHz: {static}"
+    if pattern != Pattern():
         rows["fixed pattern"] = (
             f"phase {pattern.phase:g} times that of an OPT8241 kit, response to light "
-            f"+-{100 * pattern.gain:g} %, dark "
-            f"current +-{100 * pattern.dark:g} %, specimen {pattern.seed}"
+            f"+-{100 * pattern.gain:g} %, dark current +-{100 * pattern.dark:g} %, specimen "
+            f"{pattern.seed}"
         )
     return rows

@@ -343,18 +343,10 @@ def flow_of(
     cameras: tuple[Camera, Camera],
     times: tuple[float, float],
 ) -> Float[np.ndarray, "2 H W"]:
-    """Optical flow [px] between two times [s], whether or not the target is occluded; NaN where
-    ``point`` is.
+    """Optical flow [px] of points [m] of bodies from the first to the second of two times [s].
 
-    Points move with their bodies, and the camera moves, too. The second time may be the earlier
-    one.
-
-    Args:
-        bodies: All bodies.
-        point: Points [m] of the bodies at the first time, one per pixel of the first camera.
-        body: Index of the body of each.
-        cameras: The camera at both times.
-        times: Both times.
+    Points move with their bodies, and the camera moves, too. NaN where ``point`` is; occluded or
+    not.
     """
     moved = point.copy()
     for index, candidate in enumerate(bodies):
@@ -362,16 +354,13 @@ def flow_of(
             first, second = (candidate.path.world_from_body(time) for time in times)
             step, hit = second @ np.linalg.inv(first), body == index
             moved[hit] = point[hit] @ step[:3, :3].T + step[:3, 3]
-    start, end = (
-        c.project(torch.from_numpy(p)) for c, p in zip(cameras, (point, moved), strict=True)
-    )
+    pairs = zip(cameras, (point, moved), strict=True)
+    start, end = (camera.project(torch.from_numpy(where)) for camera, where in pairs)
     return np.moveaxis((end - start).numpy(), -1, 0)
 
 
 def albedo(bodies: tuple[Body, ...], hits: Hits, time: float) -> Float[np.ndarray, "H W 3"]:
-    """Albedo in linear RGB [1] of the bodies in ``hits`` at ``time`` [s];
-    0 where nothing was hit.
-    """
+    """Albedo in linear RGB [1] of the bodies in ``hits`` at ``time`` [s]; 0 without hit."""
     colour = np.zeros(hits.point.shape)
     for index, candidate in enumerate(bodies):
         hit = hits.body == index
