@@ -56,10 +56,8 @@ class Camera:
         if pose.shape != (4, 4):
             raise ValueError(f"camera_from_world {pose.shape} must be (4, 4)")
         rotation = pose[:3, :3]
-        if (
-            not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4)
-            or np.linalg.det(rotation) < 0
-        ):
+        orthogonal = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4)
+        if not orthogonal or np.linalg.det(rotation) < 0:
             raise ValueError(
                 f"camera_from_world: its upper left 3x3 is not a rotation: {rotation.tolist()}"
             )
@@ -75,9 +73,8 @@ class Camera:
     def from_fov(cls, width: int, height: int, horizontal_fov_deg: float, **pose: Any) -> Camera:
         """A camera with square pixels, a centred principal point and a field of view [deg]."""
         focal = 0.5 * width / math.tan(math.radians(horizontal_fov_deg) / 2)
-        return cls(
-            width=width, height=height, fx=focal, fy=focal, cx=width / 2, cy=height / 2, **pose
-        )
+        middle = {"cx": width / 2, "cy": height / 2}
+        return cls(width=width, height=height, fx=focal, fy=focal, **middle, **pose)
 
     @property
     def centre(self) -> np.ndarray:
@@ -89,9 +86,8 @@ class Camera:
     def guard(self) -> Guard:
         """Limits of the derivatives of the projection, and of the polynomial of the lens."""
         if not self.distortion:
-            return Guard(
-                0.5 * GUARD * self.width / self.fx, 0.5 * GUARD * self.height / self.fy, math.inf
-            )
+            x, y = (0.5 * GUARD * side for side in (self.width, self.height))
+            return Guard(x / self.fx, y / self.fy, math.inf)
         return _guard(self.distortion, self.width, self.height, self.fx, self.fy, self.cx, self.cy)
 
     def at(self, camera_from_world: np.ndarray) -> Camera:
@@ -121,12 +117,10 @@ class Camera:
         """x/z and y/z [1] of rays at image positions (x, y) [px], without distortion.
 
         Raises:
-            ValueError: If a position is so far outside the image that the lens cannot be inverted
-                there.
+            ValueError: If the lens cannot be inverted at a position far outside the image.
         """
-        flat = (points - points.new_tensor([self.cx, self.cy])) / points.new_tensor(
-            [self.fx, self.fy]
-        )
+        principal, focal = points.new_tensor([[self.cx, self.cy], [self.fx, self.fy]])
+        flat = (points - principal) / focal
         if not self.distortion:
             return flat
         x, y = flat.detach().double().cpu().numpy().reshape(-1, 2).T
@@ -155,19 +149,14 @@ class Camera:
         """Image position (x, y) [px] of points in the world [m], in front of the camera."""
         kind = point.device, point.dtype
         if kind not in self._sent:
-            numbers = (
-                self.camera_from_world,
-                np.array([self.fx, self.fy]),
-                np.array([self.cx, self.cy]),
-            )
-            self._sent[kind] = tuple(torch.from_numpy(number).to(point) for number in numbers)
+            numbers = (self.camera_from_world, (self.fx, self.fy), (self.cx, self.cy))
+            self._sent[kind] = tuple(torch.from_numpy(np.array(n)).to(point) for n in numbers)
         pose, focal, principal = self._sent[kind]
         local = point @ pose[:3, :3].T + pose[:3, 3]
         flat = local[..., :2] / local[..., 2:]
         if self.distortion:
-            flat = torch.stack(
-                self.distortion.apply(flat[..., 0], flat[..., 1], self.guard.radius), dim=-1
-            )
+            bent = self.distortion.apply(*flat.unbind(-1), self.guard.radius)
+            flat = torch.stack(bent, dim=-1)
         return flat * focal + principal
 
     @functools.cached_property

@@ -51,12 +51,8 @@ def changed(settings: Settings, changes: Iterable[str], wording: Wording) -> Set
     for text in changes:
         name, sign, value = (part.strip() for part in text.partition("="))
         if not sign or not value:
-            raise _refused(
-                text,
-                "expected NAME=VALUE",
-                f"for example {wording.option} {wording.example}",
-                wording,
-            )
+            fix = f"for example {wording.option} {wording.example}"
+            raise _refused(text, "expected NAME=VALUE", fix, wording)
         settings = _with(settings, name.split("."), value, name, wording)
     return settings
 
@@ -64,11 +60,8 @@ def changed(settings: Settings, changes: Iterable[str], wording: Wording) -> Set
 def _with(settings: Any, path: list[str], value: str, name: str, wording: Wording) -> Any:
     head, *rest = path
     members = _members(settings)
-    kinds = (
-        dict.fromkeys(members)
-        if isinstance(settings, tuple)
-        else typing.get_type_hints(type(settings))
-    )
+    many = isinstance(settings, tuple)
+    kinds = dict.fromkeys(members) if many else typing.get_type_hints(type(settings))
     if head not in members or (head in wording.fixed and not rest):
         before = name.removesuffix(".".join(path))
         known = sorted(before + other for other in set(names(settings)) - set(wording.fixed))
@@ -79,19 +72,17 @@ def _with(settings: Any, path: list[str], value: str, name: str, wording: Wordin
         whole = wording.named[name]
         if value in whole:
             return replace(settings, **{head: whole[value]})
-        fix = suggestion(value, whole) or (
-            f"take one of {', '.join(whole)}, or name a single setting of it"
-        )
+        single = f"take one of {', '.join(whole)}, or name a single setting of it"
+        fix = suggestion(value, whole) or single
         raise _refused(f"{name}={value}", f"there is no {head} of that name", fix, wording)
     if _has_parts(present) == (not rest):
         inner = ", ".join(names(present)) if _has_parts(present) else "nothing"
         raise _refused(name, f"{head} holds {inner}", "name a single setting", wording)
-    new = (
-        _with(present, rest, value, name, wording)
-        if rest
-        else _parsed(value, kinds[head], name, wording)
-    )
-    if isinstance(settings, tuple):
+    if rest:
+        new = _with(present, rest, value, name, wording)
+    else:
+        new = _parsed(value, kinds[head], name, wording)
+    if many:
         return tuple(new if key == head else part for key, part in members.items())
     try:
         return replace(settings, **{head: new})
@@ -115,13 +106,16 @@ def _members(settings: Any) -> dict[str, Any]:
 
 def _has_parts(value: Any) -> bool:
     """Whether a value has nested settings: a dataclass, or a tuple of such."""
-    return is_dataclass(value) or (
-        isinstance(value, tuple) and bool(value) and all(map(is_dataclass, value))
-    )
+    many = isinstance(value, tuple) and bool(value)
+    return is_dataclass(value) or (many and all(map(is_dataclass, value)))
 
 
 def _parsed(text: str, kind: Any, name: str, wording: Wording) -> Any:
     """A typed value as what the setting holds."""
+
+    def refused(why: str, fix: str) -> UsageError:
+        return _refused(f"{name}={text}", why, fix, wording)
+
     if typing.get_origin(kind) in (Union, types.UnionType):
         options = typing.get_args(kind)
         if text.lower() == "none" and type(None) in options:
@@ -132,40 +126,25 @@ def _parsed(text: str, kind: Any, name: str, wording: Wording) -> Any:
         if wanted[1:] == (Ellipsis,):
             wanted = wanted[:1] * len(parts)
         if len(parts) != len(wanted):
-            raise _refused(
-                f"{name}={text}",
-                f"expected {len(wanted)} values",
-                "separate them by commas",
-                wording,
-            )
-        return tuple(
-            _parsed(part.strip(), one, name, wording)
-            for part, one in zip(parts, wanted, strict=True)
-        )
+            raise refused(f"expected {len(wanted)} values", "separate them by commas")
+        pairs = zip(parts, wanted, strict=True)
+        return tuple(_parsed(part.strip(), one, name, wording) for part, one in pairs)
     if kind is bool:
         if text.lower() not in ("true", "false"):
-            raise _refused(f"{name}={text}", "expected true or false", "choose one", wording)
+            raise refused("expected true or false", "choose one")
         return text.lower() == "true"
     if is_dataclass(kind) or kind is None:
-        raise _refused(
-            f"{name}={text}",
-            "it has fields, which a text cannot express",
-            "write it in Python",
-            wording,
-        )
+        raise refused("it has fields, which a text cannot express", "write it in Python")
     try:
         value = kind(text)
         if value != value:
             raise ValueError("not a number")
         return value
     except ValueError:
-        expected = (
-            ", ".join(kind)
-            if isinstance(kind, enum.EnumMeta)
-            else {"int": "a whole number"}.get(kind.__name__)
-        )
-        why = f"expected {expected or 'a number'}"
-        raise _refused(f"{name}={text}", why, "choose another value", wording) from None
+        expected = "a whole number" if kind is int else "a number"
+        if isinstance(kind, enum.EnumMeta):
+            expected = ", ".join(kind)
+        raise refused(f"expected {expected}", "choose another value") from None
 
 
 def suggestion(name: str, known: Iterable[str]) -> str:

@@ -46,9 +46,8 @@ def cloud_of(
     """
     mask, distance = moving & (_windows(moving.float()).mean(dim=0) > 0.5), distance.clone()
     median = _windows(torch.where(mask, distance, torch.nan))[:, mask].nanmedian(dim=0).values
-    distance[mask] = torch.where(
-        (distance[mask] - median).abs() > margin[mask], median, distance[mask]
-    )
+    outlying = (distance[mask] - median).abs() > margin[mask]
+    distance[mask] = torch.where(outlying, median, distance[mask])
     return Cloud(mask=mask, distance=distance)
 
 
@@ -56,10 +55,8 @@ def reference(clouds: list[Cloud]) -> int:
     """The view nearest to the middle with at least half as many points as the largest cloud."""
     sizes = [int(cloud.mask.sum()) for cloud in clouds]
     middle = len(clouds) // 2
-    return min(
-        (j for j, size in enumerate(sizes) if 2 * size >= max(sizes)),
-        key=lambda j: (abs(j - middle), j),
-    )
+    large = [j for j, size in enumerate(sizes) if 2 * size >= max(sizes)]
+    return min(large, key=lambda j: (abs(j - middle), j))
 
 
 def moving_layer(
@@ -77,9 +74,8 @@ def moving_layer(
     kept = (count >= fellows)[index]
     place, far = grid[mask][kept], distance[mask][kept]
     amplitude = views.amplitude[view][row, column][mask][kept]
-    layer = Layer(
-        mean=unproject(views.cameras[view], place, far), distance=far, amplitude=amplitude
-    )
+    mean = unproject(views.cameras[view], place, far)
+    layer = Layer(mean=mean, distance=far, amplitude=amplitude)
     return layer, torch.unique(names[index[kept]], return_inverse=True)[1]
 
 
@@ -93,20 +89,11 @@ def follow_clouds(
     *,
     fellows: int,
 ) -> Float[Tensor, "T P 3"]:
-    """Positions [m] of moving points at ``times`` [s].
+    """Positions [m] at ``times`` [s] of moving points [m] of the view ``start`` and of ``objects``.
 
     The points of an object move by one shift, and then each of them by the median displacement of
-    its neighbours to the visible surface, which follows rotations. Beyond the views that see an
-    object, its last step is extrapolated.
-
-    Args:
-        views: Times and cameras of the clouds.
-        clouds: One per view.
-        start: The view in which the points are given.
-        points: Their positions in that view [m].
-        objects: The object that each belongs to, counted from 0.
-        times: Key times.
-        fellows: Number of nearest points that share the displacement to the surface.
+    its ``fellows`` nearest points to the visible surface, which follows rotations. Beyond the views
+    that see an object, its last step is extrapolated.
     """
     count = int(objects.max()) + 1 if len(objects) else 0
     groups = [objects == number for number in range(count)]
@@ -195,12 +182,10 @@ def _find(tracks: list[_Track], visible: _Visible, time: float) -> None:
         ]
         nearest, owner = torch.stack(apart).min(dim=0)
         mine = [(owner == number) & (nearest <= 1.0) for number in range(len(tracks))]
-        shifts = [
-            _centroid(visible.points[of], visible.weight[of]) - track.centroid
-            if of.any()
-            else shift
-            for track, of, shift in zip(tracks, mine, shifts, strict=True)
-        ]
+        for number, (track, of) in enumerate(zip(tracks, mine, strict=True)):
+            if of.any():
+                centroid = _centroid(visible.points[of], visible.weight[of])
+                shifts[number] = centroid - track.centroid
     for track, of, shift in zip(tracks, mine, shifts, strict=True):
         area = float(visible.weight[of].sum())
         least = AREA_RATIO_CUT if bool(visible.at_border[of].any()) else AREA_RATIO

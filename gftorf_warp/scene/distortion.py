@@ -64,9 +64,8 @@ class Distortion:
     @classmethod
     def of(cls, coefficients: tuple[float, float, float, float, float] | None) -> Distortion:
         """From k1, k2, p1, p2, k3, OpenCV's order; None is a pinhole."""
-        return cls(
-            **dict(zip((f.name for f in fields(cls)), coefficients or [0.0] * 5, strict=True))
-        )
+        names = [f.name for f in fields(cls)]
+        return cls(**dict(zip(names, coefficients or [0.0] * 5, strict=True)))
 
     def __bool__(self) -> bool:
         """Whether any coefficient is not zero."""
@@ -75,10 +74,7 @@ class Distortion:
     def apply(
         self, x: Coordinate, y: Coordinate, radius: float = math.inf
     ) -> tuple[Coordinate, Coordinate]:
-        """Image of the point (x, y) [1] of a pinhole image; arrays or tensors of any shape.
-
-        Extrapolated by the tangent beyond ``radius`` [1] from the axis.
-        """
+        """Image of the point (x, y) [1] of a pinhole image; beyond ``radius`` by the tangent."""
         if math.isfinite(radius):
             near_x, near_y = inside(x, y, radius)
             xx, xy, yy = self.slope(near_x, near_y)
@@ -100,9 +96,7 @@ class Distortion:
         Raises:
             ValueError: If a position has no inverse, or two.
         """
-        wanted = np.broadcast_arrays(
-            np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
-        )
+        wanted = np.broadcast_arrays(*(np.asarray(axis, dtype=np.float64) for axis in (x, y)))
         u, v = (axis.copy() for axis in wanted)
         with np.errstate(all="ignore"):  # divergence is detected below
             for _ in range(STEPS_MAX):
@@ -115,15 +109,14 @@ class Distortion:
                     break
             got = self.apply(u, v, radius)
             error = np.maximum(np.abs(wanted[0] - got[0]), np.abs(wanted[1] - got[1]))
-            good = (error < 1e3 * CONVERGED * np.maximum(1.0, np.hypot(*wanted))) & self._unfolded(
-                u, v, radius
-            )
+            good = error < 1e3 * CONVERGED * np.maximum(1.0, np.hypot(*wanted))
+            good &= self._unfolded(u, v, radius)
         if not good.all():
             worst = np.unravel_index(np.argmin(good), good.shape)
+            where = f"({wanted[0][worst]:.3g}, {wanted[1][worst]:.3g})"
             raise ValueError(
-                f"a lens with {self} cannot be undone at ({wanted[0][worst]:.3g}, "
-                f"{wanted[1][worst]:.3g}) focal "
-                f"lengths from the principal point"
+                f"a lens with {self} cannot be undone at {where} focal lengths from the principal "
+                "point"
             )
         return u, v
 
@@ -171,8 +164,7 @@ class Distortion:
         if radius < corner:
             raise ValueError(
                 f"a lens with {self} folds the image {radius:.3g} focal lengths from the "
-                f"principal point, and the "
-                f"image reaches to {corner:.3g}"
+                f"principal point, and the image reaches to {corner:.3g}"
             )
         return radius
 

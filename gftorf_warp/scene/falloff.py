@@ -25,9 +25,8 @@ def read_falloff(path: Path) -> Float[np.ndarray, "h w"]:
         raise _wrong(path, "there is no such file")
     image = np.asarray(_image(path))
     if image.ndim != 2 or image.size == 0 or image.dtype.kind not in "uif":
-        raise _wrong(
-            path, f"expected numbers in rows and columns, found {image.dtype} {image.shape}"
-        )
+        found = f"{image.dtype} {image.shape}"
+        raise _wrong(path, f"expected numbers in rows and columns, found {found}")
     image = image.astype(np.float64)
     if not np.isfinite(image).all() or image.min() <= 0:
         raise _wrong(path, f"expected finite numbers above 0, found {image.min()} to {image.max()}")
@@ -41,9 +40,8 @@ def resized(image: Float[np.ndarray, "h w"], height: int, width: int) -> Float[n
     if image.shape == (height, width):
         return image
     finer = image.shape[0] >= height and image.shape[1] >= width
-    return cv2.resize(
-        image, (width, height), interpolation=cv2.INTER_AREA if finer else cv2.INTER_LINEAR
-    )
+    method = cv2.INTER_AREA if finer else cv2.INTER_LINEAR
+    return cv2.resize(image, (width, height), interpolation=method)
 
 
 def _image(path: Path) -> np.ndarray:

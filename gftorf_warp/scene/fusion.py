@@ -66,10 +66,8 @@ class Views:
     def points(self, view: int) -> Float[Tensor, "H W 3"]:
         """Points in the world that the pixels of a view decode [m]."""
         camera = self.cameras[view]
-        return (
-            torch.tensor(camera.centre, dtype=torch.float32)
-            + self.distance[view, ..., None] * camera.rays()
-        )
+        centre = torch.tensor(camera.centre, dtype=torch.float32)
+        return centre + self.distance[view, ..., None] * camera.rays()
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -92,14 +90,11 @@ class Verdict:
 
 
 def views_of(sequence: Sequence, nearer: float) -> Views:
-    """Decode every complete quartet of a sequence.
+    """Decode every complete quartet of a sequence, of which it has at least one.
 
     The noise is estimated by the median difference of neighbouring quartets in the same direction,
-    which is right as long as most of the scene is static.
-
-    Args:
-        sequence: Raw frames with poses; at least one quartet is complete.
-        nearer: The least significant difference of distances, besides noise [m].
+    which is right as long as most of the scene is static. ``nearer`` is the least significant
+    difference of distances, besides noise [m].
     """
     sensor = sensor_of(sequence)
     quartets = sequence.complete_quartets
@@ -115,9 +110,8 @@ def views_of(sequence: Sequence, nearer: float) -> Views:
         margin=torch.full_like(amplitude, nearer),
         unambiguous_range=unambiguous_range(sequence),
     )
-    deviation = distance_noise(
-        amplitude, _noise(views, float(sensor.phase_slope), quads_gain(sequence)), sequence
-    )
+    noise = _noise(views, float(sensor.phase_slope), quads_gain(sequence))
+    deviation = distance_noise(amplitude, noise, sequence)
     dark = deviation > DISTANCE_TRUSTED
     views.margin.add_(4.0 * deviation)
     for view in dark.any(dim=2).any(dim=1).nonzero()[:, 0].tolist():
@@ -153,9 +147,8 @@ class _Projected:
 def _projected(views: Views, points: Float[Tensor, "P 3"], of: list[int]) -> _Projected:
     """Pixels and distances of points in the views ``of``, and what these decode there."""
     camera = views.cameras[0]
-    poses = torch.tensor(
-        np.stack([views.cameras[j].camera_from_world for j in of]), dtype=torch.float32
-    )
+    stacked = np.stack([views.cameras[j].camera_from_world for j in of])
+    poses = torch.tensor(stacked, dtype=torch.float32)
     x, y, z = (torch.matmul(poses[:, :3, :3], points.T) + poses[:, :3, 3:]).unbind(dim=1)
     ahead = z > CLOSE
     across, down = camera.fx * x / z, camera.fy * y / z
@@ -187,14 +180,11 @@ def _wrapped(difference: Tensor, unambiguous_range: float) -> Tensor:
 def verdicts(views: Views) -> Iterator[Verdict]:
     """The comparison of each view with its witnesses, in order."""
     count = len(views.quartets)
-    spread = np.unique(
-        np.linspace(0, count - 1, min(count, WITNESSES)).round().astype(int)
-    ).tolist()
-    nearest = -torch.nn.functional.max_pool2d(-views.distance[:, None], 3, stride=1, padding=1)[
-        :, 0
-    ]
+    spread = np.unique(np.linspace(0, count - 1, min(count, WITNESSES)).round().astype(int))
+    farther = torch.nn.functional.max_pool2d(-views.distance[:, None], 3, stride=1, padding=1)
+    nearest = -farther[:, 0]
     for view in range(count):
-        witnesses = [j for j in spread if j != view]
+        witnesses = [j for j in spread.tolist() if j != view]
         yield _verdict(views, view, witnesses, nearest)
 
 
@@ -217,16 +207,13 @@ def _verdict(
             difference = _wrapped(seen.decoded - seen.expected, views.unambiguous_range)
             supporting = seen.inside & (difference.abs() <= margin)
             behind = nearest[witnesses].flatten(1).gather(1, seen.pixel) > seen.expected + margin
-            supports, through = (
-                supporting.sum(dim=0),
-                (seen.inside & behind & ~supporting).sum(dim=0),
-            )
+            supports = supporting.sum(dim=0)
+            through = (seen.inside & behind & ~supporting).sum(dim=0)
             apart = torch.where(supporting, difference, 0.0).sum(dim=0)
             bright = torch.where(supporting, seen.amplitude * seen.decoded.square(), 0.0).sum(dim=0)
         share = 1.0 / (1.0 + supports)
-        parts.append(
-            (supports, through, near[rows] + share * apart, share * (reflectivity[rows] + bright))
-        )
+        means = near[rows] + share * apart, share * (reflectivity[rows] + bright)
+        parts.append((supports, through, *means))
     supports, through, distance, reflectivity = (
         torch.cat(part).view(size) for part in zip(*parts, strict=True)
     )
@@ -250,24 +237,17 @@ def static_layer(
 ) -> Layer:
     """Points about ``spacing`` pixels apart on all static surfaces of all views, each surface once.
 
-    In turn, beginning with the middle one, each view adds the points of its grid that no earlier
-    point covers.
-
-    Args:
-        views: Decoded quartets.
-        judged: One verdict per view.
-        grid: Image positions (x, y) [px].
-        spacing: Distance between them [px].
+    In turn, beginning with the middle one, each view adds the points of its ``grid`` [px] that no
+    earlier point covers.
     """
     column, row = grid.long().unbind(dim=1)
     layer = Layer(mean=torch.zeros(0, 3), distance=torch.zeros(0), amplitude=torch.zeros(0))
     for view in _outwards(len(views.quartets)):
         verdict = judged[view]
         alone = verdict.supports + verdict.through == 0
-        there = torch.where(
-            alone, ~outlying(views.distance[view], views.margin[view]), verdict.supports > 0
-        )
-        wanted = (there & ~verdict.moving & ~_covered(views, view, layer, spacing))[row, column]
+        typical = ~outlying(views.distance[view], views.margin[view])
+        confirmed = torch.where(alone, typical, verdict.supports > 0)
+        wanted = (confirmed & ~verdict.moving & ~_covered(views, view, layer, spacing))[row, column]
         distance = verdict.distance[row, column][wanted]
         amplitude = verdict.reflectivity[row, column][wanted] / distance.square().clamp_min(1e-12)
         mean = unproject(views.cameras[view], grid[wanted], distance)
@@ -298,16 +278,10 @@ def _covered(views: Views, view: int, layer: Layer, spacing: float) -> Bool[Tens
     if not len(layer.mean):
         return covered.bool()
     seen = _projected(views, layer.mean, [view])
-    here = (
-        seen.inside[0]
-        & (_wrapped(seen.decoded - seen.expected, views.unambiguous_range).abs() <= seen.margin)[0]
-    )
-    radius = (
-        (COVERS * spacing * layer.distance / seen.expected[0])
-        .round()
-        .long()
-        .clamp(0, min(height, width) // 4)
-    )
+    apart = _wrapped(seen.decoded - seen.expected, views.unambiguous_range).abs()
+    here = (seen.inside & (apart <= seen.margin))[0]
+    radius = (COVERS * spacing * layer.distance / seen.expected[0]).round().long()
+    radius = radius.clamp(0, min(height, width) // 4)
     for size in radius[here].unique().tolist():
         marks = torch.zeros(height * width)
         marks[seen.pixel[0][here & (radius == size)]] = 1.0

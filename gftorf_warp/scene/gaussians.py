@@ -45,9 +45,8 @@ class GaussianField:
         for name, shape in want.items():
             value = getattr(self, name)
             if value is not None and tuple(value.shape) != shape:
-                raise ValueError(
-                    f"{name} {tuple(value.shape)} must be {shape} for N = {n}, the length of mean"
-                )
+                wanted = f"{shape} for N = {n}, the length of mean"
+                raise ValueError(f"{name} {tuple(value.shape)} must be {wanted}")
 
     def __len__(self) -> int:
         return len(self.mean)
@@ -69,9 +68,8 @@ class GaussianField:
 
     def tensors(self) -> dict[str, Tensor]:
         """All tensors that are present, by name, the layer included."""
-        return {
-            f.name: getattr(self, f.name) for f in fields(self) if getattr(self, f.name) is not None
-        }
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        return {name: value for name, value in values.items() if value is not None}
 
     def parameters(self) -> dict[str, Tensor]:
         """The tensors that can be optimised, by name."""
@@ -84,9 +82,7 @@ class GaussianField:
     def moved(
         self, offset: Float[Tensor, "N 3"], rotation: Float[Tensor, "N 4"] | None = None
     ) -> GaussianField:
-        """The field with every centre displaced [m], and covariances rotated by quaternions wxyz
-        of any length.
-        """
+        """Every centre displaced [m], and covariances rotated by quaternions wxyz of any length."""
         quaternion = self.quaternion if rotation is None else product(rotation, self.quaternion)
         return replace(self, mean=self.mean + offset, quaternion=quaternion)
 
@@ -94,15 +90,12 @@ class GaussianField:
 def concatenated(parts: list[GaussianField]) -> GaussianField:
     """One field of several, in their order."""
     tensors = [part.tensors() for part in parts]
-    return GaussianField(
-        **{name: torch.cat([part[name] for part in tensors]) for name in tensors[0]}
-    )
+    joined = {name: torch.cat([part[name] for part in tensors]) for name in tensors[0]}
+    return GaussianField(**joined)
 
 
 def product(a: Float[Tensor, "*n 4"], b: Float[Tensor, "*n 4"]) -> Float[Tensor, "*n 4"]:
-    """Product of quaternions wxyz, of which ``a`` is normalised first: rotate by ``b``,
-    then by ``a``.
-    """
+    """Product of quaternions wxyz: rotate by ``b``, then by ``a``, which is normalised first."""
     w, u = (a / a.norm(dim=-1, keepdim=True)).split([1, 3], dim=-1)
     v = b[..., 1:]
     real = w * b[..., :1] - (u * v).sum(dim=-1, keepdim=True)
@@ -110,11 +103,7 @@ def product(a: Float[Tensor, "*n 4"], b: Float[Tensor, "*n 4"]) -> Float[Tensor,
 
 
 def constant_sh(value: Float[Tensor, "*n"]) -> Float[Tensor, "*n 16"]:
-    """Harmonics that give ``value`` in every direction: h_0 = (value - 0.5) / Y_0,
-    the rest zero.
-    """
-    coefficients = torch.zeros(
-        *value.shape, SH_COEFFICIENTS, dtype=value.dtype, device=value.device
-    )
+    """Harmonics that give ``value`` in every direction: h_0 = (value - 0.5) / Y_0, the rest 0."""
+    coefficients = value.new_zeros(*value.shape, SH_COEFFICIENTS)
     coefficients[..., 0] = (value - SH_BIAS) / SH_Y0
     return coefficients

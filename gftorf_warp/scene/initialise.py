@@ -91,10 +91,6 @@ class Start:
 def from_phase(sequence: Sequence, settings: InitSettings = InitSettings()) -> Start:
     """A static and a moving layer from decoded quads.
 
-    Args:
-        sequence: At least one complete quartet; the quads are in the units of the optimisation.
-        settings: Spacing, opacity and sizes.
-
     Raises:
         InputError: If no quartet is complete.
     """
@@ -111,9 +107,8 @@ def from_phase(sequence: Sequence, settings: InitSettings = InitSettings()) -> S
     change = change_of(sequence)
     far = far_layer(sequence, change)
     static = _static_layer(sequence, far, settings)
-    middle = min(
-        change.quartets, key=lambda i: abs(sequence.cycle * (i + 0.5) - sequence.frames / 2)
-    )
+    half = sequence.frames / 2
+    middle = min(change.quartets, key=lambda i: abs(sequence.cycle * (i + 0.5) - half))
     points, distance, amplitude = _nearer(sequence, middle, change, far, settings)
     positions = follow(sequence, middle, points, distance, fellows=settings.fellows)
     near = Layer(mean=positions[middle], distance=distance, amplitude=amplitude)
@@ -126,28 +121,20 @@ def _from_views(sequence: Sequence, settings: InitSettings) -> Start:
     views = views_of(sequence, settings.nearer)
     judged = list(verdicts(views))
     size = (sequence.width, sequence.height)
-    still = static_layer(
-        views, judged, _grid(*size, settings.static_spacing).flatten(0, 1), settings.static_spacing
-    )
-    clouds = [
-        cloud_of(v.moving, *image)
-        for v, *image in zip(judged, views.distance, views.margin, strict=True)
-    ]
+    spacing = settings.static_spacing
+    still = static_layer(views, judged, _grid(*size, spacing).flatten(0, 1), spacing)
+    images = zip(judged, views.distance, views.margin, strict=True)
+    clouds = [cloud_of(verdict.moving, *image) for verdict, *image in images]
     view = reference(clouds)
     grid = _grid(*size, settings.moving_spacing)
     near, objects = moving_layer(views, view, clouds[view], grid, settings.fellows)
     keys = key_times(sequence)
-    positions = follow_clouds(
-        views, clouds, view, near.mean, objects, keys, fellows=settings.fellows
-    )
+    start, fellows = near.mean, settings.fellows
+    positions = follow_clouds(views, clouds, view, start, objects, keys, fellows=fellows)
     quartet, camera = views.quartets[view], views.cameras[view]
-    static, moving = (
-        _layer(part, label, spacing, camera, settings)
-        for part, label, spacing in (
-            (still, STATIC, settings.static_spacing),
-            (replace(near, mean=positions[quartet]), MOVING, settings.moving_spacing),
-        )
-    )
+    near = replace(near, mean=positions[quartet])
+    static = _layer(still, STATIC, spacing, camera, settings)
+    moving = _layer(near, MOVING, settings.moving_spacing, camera, settings)
     return Start(field=concatenated([static, moving]), positions=positions, quartet=quartet)
 
 
@@ -156,19 +143,12 @@ def from_random(sequence: Sequence, settings: InitSettings, generator: torch.Gen
 
     The scale of each is the root mean square distance to its three nearest neighbours.
     """
-    mean = in_frusta(_distinct_cameras(sequence), settings, generator)
-    reflectivity = torch.full((settings.count,), settings.reflectivity)
-    return Start(
-        field=_field(mean, _spacing(mean), reflectivity, MOVING, settings.opacity),
-        positions=None,
-        quartet=0,
-    )
-
-
-def _distinct_cameras(sequence: Sequence) -> list[Camera]:
-    """The cameras of all raw frames, each pose once."""
     _, first = np.unique(sequence.camera_from_world, axis=0, return_index=True)
-    return [camera_of(sequence, int(n)) for n in np.sort(first)]
+    cameras = [camera_of(sequence, int(n)) for n in np.sort(first)]  # each pose once
+    mean = in_frusta(cameras, settings, generator)
+    reflectivity = torch.full((settings.count,), settings.reflectivity)
+    field = _field(mean, _spacing(mean), reflectivity, MOVING, settings.opacity)
+    return Start(field=field, positions=None, quartet=0)
 
 
 def in_frusta(
@@ -194,13 +174,10 @@ def in_frusta(
             pose = torch.as_tensor(camera.camera_from_world, dtype=torch.float32)
             local = torch.cat([slopes, torch.ones(len(slopes), 1)], dim=1) * z[rows, None]
             points[rows] = (local - pose[:3, 3]) @ pose[:3, :3]
-        holders = (
-            torch.stack([_holds(camera, points, near, far) for camera in cameras])
-            .sum(dim=0)
-            .clamp_min(1)
-        )
+        drawn = [_holds(camera, points, near, far) for camera in cameras]
+        holders = torch.stack(drawn).sum(dim=0).clamp_min(1)
         if cameras[0].distortion:  # points were drawn on the sensor: more where the lens magnifies
-            drawn = [_holds(camera, points, near, far) * camera.area(points) for camera in cameras]
+            drawn = [held * c.area(points) for held, c in zip(drawn, cameras, strict=True)]
             holders = torch.stack(drawn).sum(dim=0) / _least_area(cameras[0])
         kept.append(points[u[:, 3] * holders < 1.0])
         missing = settings.count - sum(map(len, kept))
@@ -209,10 +186,8 @@ def in_frusta(
 
 def _least_area(camera: Camera) -> float:
     """Smallest area magnification by the distortion over the image [1]."""
-    axes = (
-        torch.linspace(0, size, CHECKED, dtype=torch.float64)
-        for size in (camera.width, camera.height)
-    )
+    size = camera.width, camera.height
+    axes = (torch.linspace(0, side, CHECKED, dtype=torch.float64) for side in size)
     slopes = camera.slopes(torch.cartesian_prod(*axes))
     xx, xy, yy = camera.distortion.slope(*slopes.unbind(dim=1))
     return float((xx * yy - xy * xy).min())
@@ -225,9 +200,8 @@ def _holds(
     pose = torch.as_tensor(camera.camera_from_world, dtype=torch.float32)
     z = points @ pose[2, :3] + pose[2, 3]
     x, y = camera.project(points).unbind(dim=1)
-    return (
-        (z >= near) & (z <= far) & (x >= 0) & (x <= camera.width) & (y >= 0) & (y <= camera.height)
-    )
+    inside = (x >= 0) & (x <= camera.width) & (y >= 0) & (y <= camera.height)
+    return inside & (z >= near) & (z <= far)
 
 
 def _spacing(points: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
@@ -236,11 +210,9 @@ def _spacing(points: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
         return torch.ones(len(points))
     import cv2
 
-    neighbours = min(4, len(points))
-    tree = cv2.flann.Index(
-        points.contiguous().numpy(), {"algorithm": EXACT_TREE, "leaf_max_size": 10}
-    )
-    _, squared = tree.knnSearch(points.contiguous().numpy(), neighbours, params={"checks": -1})
+    known = points.contiguous().numpy()
+    tree = cv2.flann.Index(known, {"algorithm": EXACT_TREE, "leaf_max_size": 10})
+    _, squared = tree.knnSearch(known, min(4, len(points)), params={"checks": -1})
     # the nearest of all is the point itself
     return torch.from_numpy(squared[:, 1:]).mean(dim=1).sqrt()
 
@@ -250,9 +222,8 @@ def _static_layer(sequence: Sequence, far: FarLayer, settings: InitSettings) -> 
     grid = _grid(sequence.width, sequence.height, settings.static_spacing).flatten(0, 1)
     x, y = grid.long().unbind(dim=1)
     camera, distance = camera_of(sequence, 0), far.distance[y, x]
-    layer = Layer(
-        mean=unproject(camera, grid, distance), distance=distance, amplitude=far.amplitude[y, x]
-    )
+    mean = unproject(camera, grid, distance)
+    layer = Layer(mean=mean, distance=distance, amplitude=far.amplitude[y, x])
     return _layer(layer, STATIC, settings.static_spacing, camera, settings)
 
 
@@ -274,9 +245,8 @@ def _nearer(
         if flow is not None and quartet + step in change.quartets:
             there = points + flow.nan_to_num(0.0)
             near &= _in_front(sequence, quartet + step, there, change, far, settings)[0]
-    near, distance, amplitude, noise = (
-        value.view(size) for value in (near, distance, amplitude, noise)
-    )
+    images = (value.view(size) for value in (near, distance, amplitude, noise))
+    near, distance, amplitude, noise = images
     cloud = cloud_of(near, distance, settings.nearer + 4.0 * noise)
     return grid[cloud.mask], cloud.distance[cloud.mask], amplitude[cloud.mask]
 
@@ -293,10 +263,8 @@ def _in_front(
     ahead, behind = (flow_at(sequence, quartet, step, points) for step in (1, -1))
     distance, amplitude = decode_along_flow(sequence, quartet, points, ahead, behind)
     noise = distance_noise(amplitude, change.noise, sequence)
-    x, y = (
-        points[:, 0].long().clamp(0, sequence.width - 1),
-        points[:, 1].long().clamp(0, sequence.height - 1),
-    )
+    x = points[:, 0].long().clamp(0, sequence.width - 1)
+    y = points[:, 1].long().clamp(0, sequence.height - 1)
     nearer = distance < far.distance[y, x] - settings.nearer - 4.0 * noise
     return nearer, distance, amplitude, noise
 
@@ -315,9 +283,8 @@ def _layer(
     scale = settings.footprint * spacing * layer.distance / math.sqrt(camera.fx * camera.fy)
     if camera.distortion:
         scale = scale / camera.area(layer.mean).sqrt()
-    return _field(
-        layer.mean, scale, layer.amplitude * layer.distance.square(), label, settings.opacity
-    )
+    reflectivity = layer.amplitude * layer.distance.square()
+    return _field(layer.mean, scale, reflectivity, label, settings.opacity)
 
 
 def _field(

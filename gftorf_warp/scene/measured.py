@@ -45,9 +45,8 @@ def sensor_of(sequence: Sequence) -> Sensor:
 
 def camera_of(sequence: Sequence, frame: int) -> Camera:
     """The camera of raw frame ``frame``."""
-    return _camera(
-        sequence.intrinsics, (sequence.height, sequence.width), sequence.camera_from_world[frame]
-    )
+    size = sequence.height, sequence.width
+    return _camera(sequence.intrinsics, size, sequence.camera_from_world[frame])
 
 
 def colour_camera_of(sequence: Sequence, frame: int) -> Camera | None:
@@ -86,10 +85,10 @@ def sample(image: Float[Tensor, "C H W"], points: Float[Tensor, "P 2"]) -> Float
     """Values at image positions (x, y) [px], bilinear, repeated beyond the border."""
     size = image.new_tensor([image.shape[2], image.shape[1]])
     grid = (2.0 * points / size - 1.0)[None, None]
-    interpolate = torch.nn.functional.grid_sample
-    return interpolate(image[None], grid.to(image), padding_mode="border", align_corners=False)[
-        0, :, 0
-    ]
+    values = torch.nn.functional.grid_sample(
+        image[None], grid.to(image), padding_mode="border", align_corners=False
+    )
+    return values[0, :, 0]
 
 
 def flow_at(
@@ -147,9 +146,8 @@ def decode_along_flow(
     shifts, frequencies = sequence.shifts[frames], sequence.frame_frequencies[frames]
     for f in sequence.frequencies:
         own = frequencies == f
-        phasors.append(
-            phasor_from_quads(stack[torch.as_tensor(own)], tuple(float(s) for s in shifts[own]))
-        )
+        angles = tuple(float(s) for s in shifts[own])
+        phasors.append(phasor_from_quads(stack[torch.as_tensor(own)], angles))
     return distance_from_phasors(phasors, sensor_of(sequence)), 0.5 * torch.hypot(*phasors[0])
 
 
@@ -174,8 +172,7 @@ def change_of(sequence: Sequence) -> Change:
     """Compare every complete quartet with the next one, slot by slot.
 
     The noise is estimated by the median absolute difference, right as long as most pixels are
-    static. Slots are matched by frequency and shift, whatever their order and the number of missing
-    frames.
+    static. Slots are matched by frequency and shift.
     """
     quartets = sequence.complete_quartets
     ordered = []
@@ -185,11 +182,8 @@ def change_of(sequence: Sequence) -> Change:
     quads = torch.stack(ordered)
     difference = quads.diff(dim=0)
     if difference.numel() == 0:
-        return Change(
-            quartets=tuple(quartets),
-            changed=difference.new_zeros(0, *quads.shape[2:]).bool(),
-            noise=0.0,
-        )
+        none = difference.new_zeros(0, *quads.shape[2:]).bool()
+        return Change(quartets=tuple(quartets), changed=none, noise=0.0)
     deviation = max(float(1.4826 * difference.abs().median()), 1e-12)
     pooled = torch.nn.functional.avg_pool2d(
         difference.square().mean(dim=1), 3, stride=1, padding=1, count_include_pad=False
@@ -203,11 +197,8 @@ def change_of(sequence: Sequence) -> Change:
 
 def distance_noise(amplitude: Tensor, noise: float, sequence: Sequence) -> Tensor:
     """Standard deviation [m] of a distance: noise / (gain amplitude) radians."""
-    return (
-        noise
-        / (quads_gain(sequence) * amplitude.clamp_min(1e-12))
-        / sensor_of(sequence).phase_slope
-    )
+    radians = noise / (quads_gain(sequence) * amplitude.clamp_min(1e-12))
+    return radians / sensor_of(sequence).phase_slope
 
 
 def quads_gain(sequence: Sequence) -> float:

@@ -55,7 +55,6 @@ class Lens:
                 f"vignetting must keep V above 0 and not above 1 for r from 0 to 1, "
                 f"got {self.vignetting}"
             )
-
         if self.falloff is not None:
             object.__setattr__(self, "falloff", FilePath(self.falloff))
             _ = self.map  # a bad file is an error when the lens is made
@@ -119,9 +118,8 @@ def shading(lens: Lens, camera: Camera, *, beam: bool = True) -> Shading | None:
         return None
     cosine = camera.directions()[..., 2].numpy()
     tangent = np.sqrt(np.maximum(1.0 / cosine**2 - 1.0, 0.0))
-    ambient = cosine**lens.cosine_power * lens._vignette(
-        (tangent / tangent.max()) ** 2 if tangent.max() > 0 else tangent
-    )
+    r2 = (tangent / tangent.max()) ** 2 if tangent.max() > 0 else tangent
+    ambient = cosine**lens.cosine_power * lens._vignette(r2)
     if lens.map is not None:
         ambient = ambient * resized(lens.map, camera.height, camera.width)
     active = ambient if shape is None else ambient * cosine**shape.power * shape.factor
@@ -135,15 +133,11 @@ def lens_rows(lens: Lens) -> dict[str, str]:
         rows["distortion"] = f"{lens.distortion}, OpenCV's coefficients"
     if lens.cosine_power or lens.vignetting:
         more = "".join(f" {v:+g} r^{2 * i}" for i, v in enumerate(lens.vignetting, start=1))
-        rows["fall-off"] = (
-            f"cosine to the power {lens.cosine_power:g}, times 1{more} with r = 1 "
-            f"in the farthest corner"
-        )
+        powers = f"cosine to the power {lens.cosine_power:g}, times 1{more}"
+        rows["fall-off"] = f"{powers} with r = 1 in the farthest corner"
     if lens.falloff is not None and lens.map is not None:
-        height, width = lens.map.shape
-        rows["fall-off map"] = (
-            f"{lens.falloff.name}, {width}x{height}, down to {lens.map.min():.3g} of its largest"
-        )
+        size, least = "{1}x{0}".format(*lens.map.shape), lens.map.min()
+        rows["fall-off map"] = f"{lens.falloff.name}, {size}, down to {least:.3g} of its largest"
     if lens.beam_power:
         rows["beam"] = f"cosine to the power {lens.beam_power:g}, mean 1 over the image"
     return rows

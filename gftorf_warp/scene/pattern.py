@@ -75,9 +75,8 @@ def dark_map(pattern: Pattern, height: int, width: int) -> Float[np.ndarray, "H 
 def _spread(deviation: float, seed: tuple[int, int], shape: tuple[int, int]) -> np.ndarray | None:
     if deviation == 0.0:
         return None
-    return _constant(
-        np.maximum(1.0 + np.random.default_rng(seed).normal(0.0, deviation, shape), 0.0)
-    )
+    random = np.random.default_rng(seed)
+    return _constant(np.maximum(1.0 + random.normal(0.0, deviation, shape), 0.0))
 
 
 def _constant(values: np.ndarray) -> np.ndarray:

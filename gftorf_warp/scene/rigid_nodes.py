@@ -64,6 +64,5 @@ class RigidNodes(Nodes):
 def quaternion_of(vector: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 4"]:
     """Unit quaternions wxyz of rotation vectors [rad], differentiable at zero."""
     angle = vector.norm(dim=-1, keepdim=True)
-    return torch.cat(
-        [(0.5 * angle).cos(), 0.5 * torch.sinc(angle / (2.0 * torch.pi)) * vector], dim=-1
-    )
+    half = 0.5 * torch.sinc(angle / (2.0 * torch.pi)) * vector
+    return torch.cat([(0.5 * angle).cos(), half], dim=-1)

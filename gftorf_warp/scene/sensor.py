@@ -116,9 +116,8 @@ class Sensor:
         for name in ("f_mod_hz", "phase_offset", "dc_offset", "source_intensity"):
             value = getattr(self, name)
             if isinstance(value, Tensor) and value.ndim != 0:
-                raise ValueError(
-                    f"{name} must be a number or a 0-d tensor, got shape {tuple(value.shape)}"
-                )
+                shape = tuple(value.shape)
+                raise ValueError(f"{name} must be a number or a 0-d tensor, got shape {shape}")
         # tensors are not checked: reading one would synchronise a GPU
         numbers = {
             f.name: getattr(self, f.name) for f in fields(self) if f.name != "full_well_electrons"
@@ -129,30 +128,25 @@ class Sensor:
                     raise ValueError(f"{name} must be finite, got {value}")
         for name in POSITIVE + NON_NEGATIVE:
             value, zero = getattr(self, name), name in NON_NEGATIVE
-            if (
-                value is not None
-                and not isinstance(value, Tensor)
-                and not (value > 0 or (zero and value == 0))
-            ):
-                raise ValueError(
-                    f"{name} must be {'0 or more' if zero else 'above 0'}, got {value}"
-                )
+            if value is None or isinstance(value, Tensor):
+                continue
+            if not (value > 0 or (zero and value == 0)):
+                wanted = "0 or more" if zero else "above 0"
+                raise ValueError(f"{name} must be {wanted}, got {value}")
         if len(self.shifts) < 1:
             raise ValueError("shifts: a sensor needs at least one phase shift")
         if not all(f > 0 for f in self.further_hz):
             raise ValueError(f"further_hz must be above 0, got {self.further_hz}")
         if self.exposure_s < 0 or (self.noise and self.exposure_s == 0):
-            raise ValueError(
-                f"exposure_s must be above 0, or 0 without noise, got {self.exposure_s}"
-            )
+            wanted = "above 0, or 0 without noise"
+            raise ValueError(f"exposure_s must be {wanted}, got {self.exposure_s}")
         if not 0 < self.contrast <= 1:
             raise ValueError(f"contrast must be in (0, 1], got {self.contrast}")
-        if self.harmonic_contrast and self.contrast * peak(self.harmonic_contrast) > 1 + 1e-6:
+        most = self.contrast * peak(self.harmonic_contrast) if self.harmonic_contrast else 0.0
+        if most > 1 + 1e-6:
             raise ValueError(
                 f"harmonic_contrast {self.harmonic_contrast} and contrast {self.contrast} make a "
-                f"wave with a peak of "
-                f"{self.contrast * peak(self.harmonic_contrast):.4g}, more than all light: at "
-                f"most 1"
+                f"wave with a peak of {most:.4g}, more than all light: at most 1"
             )
         if self.adc_bits is not None and not 1 <= self.adc_bits <= 24:
             raise ValueError(f"adc_bits must be in 1..24 or None, got {self.adc_bits}")
@@ -169,12 +163,10 @@ class Sensor:
 
     def __repr__(self) -> str:
         """That of a dataclass without effects that are off: data cards hash this text."""
-        shown = [
-            f
-            for f in fields(self)
-            if f.name not in EFFECTS or getattr(self, f.name) != getattr(PLAIN, f.name)
-        ]
-        return f"Sensor({', '.join(f'{f.name}={getattr(self, f.name)!r}' for f in shown)})"
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        off = {name for name in EFFECTS if values[name] == getattr(PLAIN, name)}
+        shown = [f"{name}={value!r}" for name, value in values.items() if name not in off]
+        return f"Sensor({', '.join(shown)})"
 
     @property
     def phase_slope(self) -> Scalar:
@@ -244,21 +236,17 @@ def phasor_from_quads(quads: Tensor, shifts: tuple[float, ...] | Tensor) -> tupl
         ValueError: If the shifts do not determine a phase. Shifts in a tensor are taken to be
             equally spaced.
     """
-    known = (
-        shifts
-        if isinstance(shifts, Tensor)
-        else _uploaded(tuple(shifts), quads.dtype, quads.device)
-    )
+    known = shifts
+    if not isinstance(known, Tensor):
+        known = _uploaded(tuple(known), quads.dtype, quads.device)
     theta = known.to(quads).reshape(-1, *[1] * (quads.ndim - 1))
     if len(theta) < 3:
         raise ValueError(f"shifts: a phase needs at least 3 quads, got {len(theta)}")
     if not isinstance(shifts, Tensor) and not _evenly(np.array(shifts, dtype=np.float64)):
         solved = solution(np.array(shifts, dtype=np.float64))
         if solved is None:
-            raise ValueError(
-                f"shifts: a phase needs three different ones, got "
-                f"{np.degrees(shifts).tolist()} degrees"
-            )
+            degrees = np.degrees(shifts).tolist()
+            raise ValueError(f"shifts: a phase needs three different ones, got {degrees} degrees")
         rows = torch.as_tensor(solved, dtype=quads.dtype, device=quads.device)
         re, im = (rows @ quads.reshape(len(theta), -1)).reshape(2, *quads.shape[1:])
         return re, im

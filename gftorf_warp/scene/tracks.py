@@ -24,15 +24,10 @@ def follow(
     *,
     fellows: int,
 ) -> Float[Tensor, "T P 3"]:
-    """Positions in the world [m] of points at every key time, extrapolated beyond the known
-    quartets.
+    """Positions in the world [m] of points at every key time, extrapolated beyond known quartets.
 
-    Args:
-        sequence: Raw frames and optical flow of a camera at rest; without flow the points stay.
-        quartet: A quartet of which all raw frames are measured.
-        points: Image positions (x, y) at its start [px].
-        distance: Decoded distances of these points [m].
-        fellows: Number of nearest points that share a step.
+    ``points`` [px] of a static camera are decoded at ``distance`` [m] at the start of a complete
+    quartet; ``fellows`` nearest ones share a step. Without flow they stay.
     """
     times = key_times(sequence)
     if not len(points):
@@ -78,7 +73,7 @@ def nearest(points: Float[Tensor, "P 3"], count: int) -> Int[Tensor, "P G"]:
 
 
 def _shared(step: Float[Tensor, "P D"], group: Int[Tensor, "P G"]) -> Float[Tensor, "P D"]:
-    """Median over each group without unknown (NaN) steps; 0 for a group without any known."""
+    """Median over each group without NaN; 0 for a group of NaN."""
     return step[group].nanmedian(dim=1).values.nan_to_num(0.0)
 
 

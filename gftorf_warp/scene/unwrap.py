@@ -20,11 +20,8 @@ from .sensor import Sensor, distance_from_phasor
 def unwrap(phases: Sequence[Tensor], ms: Sequence[int]) -> Tensor:
     """Phase [rad] in [0, 2 pi) at the common frequency f_0, from wrapped phases at m_i f_0.
 
-    Args:
-        phases: One of any shape for each frequency [rad], wrapped or not; the result is as exact as
-            the first, and differentiable with respect to it. The others only select among the
-            candidates.
-        ms: Their multiples: positive, without a common divisor.
+    The result is as exact as the first phase, and differentiable with respect to it; the others
+    only select among the candidates.
 
     Raises:
         ValueError: If the multiples are not positive or have a common divisor.
@@ -53,17 +50,13 @@ def common_range(sensor: Sensor) -> float:
     Raises:
         ValueError: If they are no small multiples of one frequency.
     """
-    return (
-        numbers.common_range(frequencies_of(sensor))
-        if sensor.further_hz
-        else sensor.unambiguous_range
-    )
+    if not sensor.further_hz:
+        return sensor.unambiguous_range
+    return numbers.common_range(frequencies_of(sensor))
 
 
 def distance_from_phasors(phasors: Sequence[tuple[Tensor, Tensor]], sensor: Sensor) -> Tensor:
     """Distance [m] in [0, c / 2 f_0) of phasors (re, im), one for each frequency of a sensor.
-
-    For a single frequency that is :func:`gftorf_warp.scene.sensor.distance_from_phasor`.
 
     Raises:
         ValueError: If there are more or fewer than the sensor has frequencies, or these do not fit.
@@ -73,9 +66,7 @@ def distance_from_phasors(phasors: Sequence[tuple[Tensor, Tensor]], sensor: Sens
         raise ValueError(f"{len(phasors)} phasors for {len(frequencies)} frequencies")
     if len(phasors) == 1:
         return distance_from_phasor(*phasors[0], sensor)
-    phases = [
-        torch.remainder(torch.atan2(im, re) - sensor.phase_offset, 2.0 * math.pi)
-        for re, im in phasors
-    ]
+    angles = [torch.atan2(im, re) - sensor.phase_offset for re, im in phasors]
+    phases = [torch.remainder(angle, 2.0 * math.pi) for angle in angles]
     ms, _ = numbers.multiples(frequencies)
     return unwrap(phases, ms) * ms[0] / sensor.phase_slope

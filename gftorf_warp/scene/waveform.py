@@ -28,11 +28,8 @@ class Waveform(enum.StrEnum):
 def harmonics_of(wave: Waveform, count: int, duty: float = 0.5) -> tuple[float, ...]:
     """Cosine coefficients 1 .. ``count`` of a periodic wave whose mean is 1 [1].
 
-    Args:
-        wave: 'sine': 1 + cos. 'square': on for the share ``duty`` of a period, off otherwise.
-        count: How many.
-        duty: Share of the period that is on [1]; a short pulse has a larger first coefficient, 2
-            sin(pi D) / (pi D).
+    A sine is 1 + cos, a square wave on for the share ``duty`` of a period; a short pulse has a
+    larger first coefficient, 2 sin(pi D) / (pi D).
 
     Raises:
         ValueError: If the duty is not between 0 and 1, or there is no coefficient.
@@ -41,9 +38,8 @@ def harmonics_of(wave: Waveform, count: int, duty: float = 0.5) -> tuple[float, 
         raise ValueError(f"duty {duty} must be between 0 and 1, and count {count} at least 1")
     if Waveform(wave) is Waveform.SINE:
         return (1.0, *[0.0] * (count - 1))
-    return tuple(
-        2.0 * math.sin(math.pi * h * duty) / (math.pi * h * duty) for h in range(1, count + 1)
-    )
+    angles = [math.pi * h * duty for h in range(1, count + 1)]
+    return tuple(2.0 * math.sin(angle) / angle for angle in angles)
 
 
 def contrasts(
@@ -74,6 +70,5 @@ def peak(ratios: Sequence[float]) -> float:
     """Largest magnitude of cos x + sum_h r_h cos(h x) [1]; ``ratios`` start at h = 2."""
     # 256 points in the shortest period
     x = np.linspace(0.0, 2.0 * math.pi, 256 * (len(ratios) + 1))
-    return float(
-        np.abs(sum(r * np.cos(h * x) for h, r in enumerate((1.0, *ratios), start=1))).max()
-    )
+    wave = sum(r * np.cos(h * x) for h, r in enumerate((1.0, *ratios), start=1))
+    return float(np.abs(wave).max())
