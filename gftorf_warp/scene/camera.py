@@ -73,8 +73,8 @@ class Camera:
     def from_fov(cls, width: int, height: int, horizontal_fov_deg: float, **pose: Any) -> Camera:
         """A camera with square pixels, a centred principal point and a field of view [deg]."""
         focal = 0.5 * width / math.tan(math.radians(horizontal_fov_deg) / 2)
-        middle = {"cx": width / 2, "cy": height / 2}
-        return cls(width=width, height=height, fx=focal, fy=focal, **middle, **pose)
+        cx, cy = width / 2, height / 2
+        return cls(width=width, height=height, fx=focal, fy=focal, cx=cx, cy=cy, **pose)
 
     @property
     def centre(self) -> np.ndarray:
@@ -155,8 +155,8 @@ class Camera:
         local = point @ pose[:3, :3].T + pose[:3, 3]
         flat = local[..., :2] / local[..., 2:]
         if self.distortion:
-            bent = self.distortion.apply(*flat.unbind(-1), self.guard.radius)
-            flat = torch.stack(bent, dim=-1)
+            x, y = flat.unbind(-1)
+            flat = torch.stack(self.distortion.apply(x, y, self.guard.radius), dim=-1)
         return flat * focal + principal
 
     @functools.cached_property

@@ -105,14 +105,10 @@ class Assembly(Shape):
     def grid(self, spacing, inset):
         """The grids of all parts, hidden ones included."""
         grids = [part.shape.grid(spacing, inset) for part in self.parts]
-        return Grid(
-            np.concatenate(
-                [g.point + part.position for g, part in zip(grids, self.parts, strict=True)]
-            ),
-            np.concatenate([g.normal for g in grids]),
-            np.concatenate([g.other for g in grids]),
-            max(g.limb for g in grids),
-        )
+        points, normals, others, limbs = zip(*grids, strict=True)
+        moved = [p + part.position for p, part in zip(points, self.parts, strict=True)]
+        joined = (np.concatenate(arrays) for arrays in (moved, normals, others))
+        return Grid(*joined, max(limbs))
 
     @cached_property
     def reach(self) -> float:

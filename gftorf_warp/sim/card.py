@@ -18,8 +18,7 @@ from .scenes import SCENES, Scene
 from .sensors import effect_rows
 from .settings import SimSettings
 
-CALLED = ("frames", "size", "seed", "sync", "noise", "flow")
-CALLED += ("exposure_samples", "engine", "bounces", "paths")
+CALLED = "frames size seed sync noise flow exposure_samples engine bounces paths".split()
 """Settings that a call names on a data card, even where they are the defaults."""
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -14,7 +15,7 @@ from ..scene.camera import Camera
 from ..scene.gaussians import GaussianField, concatenated
 from ..scene.sensor import Sensor
 from .exposure import Exposure, pooled
-from .gaussian_cover import Cover, cover_moving, cover_still
+from .gaussian_cover import cover_moving, cover_still
 from .readout import mean_quad
 from .scene import Scene
 
@@ -29,8 +30,7 @@ class GaussianEngine:
 
     Args:
         scene: Bodies and their paths.
-        camera_at: The camera at a time [s], at the resolution of the rays: pixels times
-            ``scene.subsamples``.
+        camera_at: The camera at a time [s], with a pixel for each ray.
         times: Instants [s] at whose nearest approach the covers are still fine enough.
         colour: Whether the Gaussians have colour.
     """
@@ -48,11 +48,8 @@ class GaussianEngine:
         self._still = tuple(body for body in scene.bodies if not body.moves)
         self._static = None if self._camera_moves else self._cover_still(0.0)
         centres = np.array([camera_at(float(time)).centre for time in times])
-        self._moving: list[Cover] = [
-            cover_moving(body, camera_at(0.0), times, centres)
-            for body in scene.bodies
-            if body.moves
-        ]
+        moving = (body for body in scene.bodies if body.moves)
+        self._moving = [cover_moving(body, camera_at(0.0), times, centres) for body in moving]
 
     def field_at(self, time: float) -> GaussianField:
         """All Gaussians that face the camera at ``time`` [s]."""
@@ -72,9 +69,8 @@ class GaussianEngine:
         del n  # nothing is random
         images = [self._instant(instant, sensor) for instant in instants]
         still = images[0] if instants == [time] else self._instant(time, sensor)
-        quad, amplitude, distance = (
-            np.mean(each, axis=0) for each in list(zip(*images, strict=True))[:3]
-        )
+        several = list(zip(*images, strict=True))[:3]
+        quad, amplitude, distance = (np.mean(each, axis=0) for each in several)
         return Exposure(quad, amplitude, distance, still.phasor)
 
     def _instant(self, time: float, sensor: Sensor) -> Exposure:
@@ -82,18 +78,12 @@ class GaussianEngine:
         field, camera = self.field_at(time), self.camera_at(time)
         rendering = _rendering(field, camera, sensor)
         f_mod_hz, offset = float(sensor.f_mod_hz), float(sensor.phase_offset)
-        harmonics = [
-            self._phasor(
-                _rendering(
-                    field, camera, replace(sensor, f_mod_hz=h * f_mod_hz, phase_offset=h * offset)
-                )
-            )
-            for h in sensor.harmonics[1:]
-        ]
+        at = partial(replace, sensor)
+        higher = [at(f_mod_hz=h * f_mod_hz, phase_offset=h * offset) for h in sensor.harmonics[1:]]
+        harmonics = [self._phasor(_rendering(field, camera, one)) for one in higher]
         opacity = pooled(rendering.opacity, self.subsamples)
-        distance = pooled(rendering.distance, self.subsamples) / np.where(
-            opacity > 0, opacity, np.nan
-        )
+        opacity = np.where(opacity > 0, opacity, np.nan)
+        distance = pooled(rendering.distance, self.subsamples) / opacity
         # the third channel of a phasor is 2a
         amplitude = pooled(rendering.phasor[2], self.subsamples) / 2
         first = self._phasor(rendering)

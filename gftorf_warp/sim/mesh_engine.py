@@ -29,8 +29,7 @@ class MeshEngine:
     """A scene as meshes for one camera.
 
     Args:
-        scene: Bodies and their paths, rays per pixel, position and beam of the emitter; its
-            sensor's rolling shutter.
+        scene: Bodies and their paths, rays per pixel, emitter; its sensor's rolling shutter.
         camera_at: The camera at a time [s].
         harmonics: Multiples of the modulation frequency at which light is wanted.
         bounces: Light that met more than one surface.
@@ -50,24 +49,16 @@ class MeshEngine:
         seed: int = 0,
         truth: str | None = None,
     ):
-        self.scene, self.camera_at, self.bounces, self.seed, self.truth = (
-            scene,
-            camera_at,
-            bounces,
-            seed,
-            truth,
-        )
-        pieces = [
-            (index, piece)
-            for index, body in enumerate(scene.bodies)
-            for piece in rigid_bodies(body)
-        ]
-        self._body = np.array([index for index, _ in pieces], dtype=np.int32)  # of each piece
+        self.scene, self.camera_at, self.bounces = scene, camera_at, bounces
+        self.seed, self.truth = seed, truth
+        pieces = [rigid_bodies(body) for body in scene.bodies]
+        of_body = np.arange(len(pieces), dtype=np.int32)
+        self._body = np.repeat(of_body, list(map(len, pieces)))  # of each piece
         camera = camera_at(0.0)
         beam = beam_of(scene.lens, camera) if beam_is_traced(scene, bounces.count) else None
         self._lamp = Lamp(position=scene.emitter, beam_deg=scene.beam_deg, beam=beam)
         self._tracer = Tracer(
-            [piece for _, piece in pieces],
+            [piece for several in pieces for piece in several],
             camera.width,
             1 if scene.sensor.row_time_s > 0 else camera.height,
             harmonics=harmonics,
@@ -96,22 +87,15 @@ class MeshEngine:
     def expose(self, n: int, instants: list[float], time: float, sensor: Sensor) -> Exposure:
         """Raw frame ``n``: mean over ``instants`` [s]; phasor, distance, layers at ``time`` [s].
 
-        With a rolling shutter these are the times of the first row, and every row is traced at its
-        own.
+        With a rolling shutter these are the times of its first row.
         """
         if not self.scene.sensor.row_time_s > 0:
             return self._expose((n, PATHS), instants, time, sensor)
         delays = row_delays(sensor, self.camera_at(0.0).height).tolist()
-        rows = [
-            self._expose(
-                (n, PATHS, row),
-                [instant + delay for instant in instants],
-                time + delay,
-                sensor,
-                row,
-            )
-            for row, delay in enumerate(delays)
-        ]
+        rows = []
+        for row, delay in enumerate(delays):
+            late = [instant + delay for instant in instants]
+            rows.append(self._expose((n, PATHS, row), late, time + delay, sensor, row))
         return join_rows(rows)
 
     def _expose(
@@ -160,34 +144,23 @@ def rigid_bodies(body: Body) -> list[RigidBody]:
     The flat-sided parts of an assembly are one piece together; each of its balls is another.
     """
     shape, texture = body.shape, body.texture
-    made = partial(
-        RigidBody,
-        low=texture.low,
-        high=texture.high,
-        cell=texture.cell,
-        gloss=texture.gloss,
-        shininess=texture.shininess,
-    )
+    names = ("low", "high", "cell", "gloss", "shininess")
+    made = partial(RigidBody, **{name: getattr(texture, name) for name in names})
     if isinstance(shape, Level):
         x, y, z = np.eye(3)[shape.axis].tolist()
         return [made(normal=(x, y, z), height=shape.value)]
     parts = shape.parts if isinstance(shape, Assembly) else (Part(shape=shape),)
-    pieces = [
-        made(radius=part.shape.radius, centre=part.position)
-        for part in parts
-        if isinstance(part.shape, Sphere)
-    ]
-    flat = [part for part in parts if not isinstance(part.shape, Sphere)]
-    if flat:
-        meshes = [triangles_of(part.shape) for part in flat]
-        before = np.cumsum([0, *(len(points) for points, _ in meshes[:-1])])
-        points = np.concatenate(
-            [points + part.position for part, (points, _) in zip(flat, meshes, strict=True)]
-        )
-        triangles = np.concatenate(
-            [mesh + first for first, (_, mesh) in zip(before, meshes, strict=True)]
-        )
-        pieces.append(made(points=points, triangles=triangles))
+    pieces, points, triangles, count = [], [], [], 0
+    for part in parts:
+        if isinstance(part.shape, Sphere):
+            pieces.append(made(radius=part.shape.radius, centre=part.position))
+            continue
+        corners, faces = triangles_of(part.shape)
+        points.append(corners + part.position)
+        triangles.append(faces + count)
+        count += len(corners)
+    if points:
+        pieces.append(made(points=np.concatenate(points), triangles=np.concatenate(triangles)))
     return pieces
 
 
@@ -205,18 +178,13 @@ def triangles_of(shape: Shape) -> tuple[Float[np.ndarray, "V 3"], Int[np.ndarray
         return points, np.array([[0, 2, 1], [0, 3, 2]])
     if not isinstance(shape, Box):
         raise ValueError(f"{type(shape).__name__} has no triangles")
-    corners = np.stack(
-        np.meshgrid([-0.5, 0.5], [-0.5, 0.5], [-0.5, 0.5], indexing="ij"), axis=-1
-    ).reshape(8, 3)
+    corners = np.indices((2, 2, 2)).reshape(3, 8).T - 0.5
     faces = []
     for axis, u, v in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):  # u x v points along the axis
         place = 4 >> np.array([axis, u, v])  # of a corner's number, per axis
         for side in (0, 1):
-            square = [
-                int(side * place[0] + a * place[1] + b * place[2])
-                for a, b in ((0, 0), (1, 0), (1, 1), (0, 1))
-            ]
-            outwards = square if side else square[::-1]
-            turned = outwards[::-1] if shape.inside else outwards
+            around = ((0, 0), (1, 0), (1, 1), (0, 1))
+            square = [int(np.dot((side, a, b), place)) for a, b in around]
+            turned = square if side != shape.inside else square[::-1]
             faces += [turned[:3], [turned[0], turned[2], turned[3]]]
     return corners * np.asarray(shape.size), np.array(faces)

@@ -155,8 +155,7 @@ def _enters(node: Node, origin: np.ndarray, inverse: np.ndarray, limit: np.ndarr
     for axis in range(3):
         # 0 times infinity: in the plane of a side, which then does not count
         with np.errstate(invalid="ignore"):
-            a, b = (
-                (side[axis] - origin[axis]) * inverse[:, axis] for side in (node.low, node.high)
-            )
+            a = (node.low[axis] - origin[axis]) * inverse[:, axis]
+            b = (node.high[axis] - origin[axis]) * inverse[:, axis]
         near, far = np.fmax(near, np.fmin(a, b)), np.fmin(far, np.fmax(a, b))
     return near <= far * (1 + BOX_SLACK)

@@ -53,15 +53,11 @@ def looking_at(
     ahead = np.subtract(target, position, dtype=np.float64)
     right = np.cross([0.0, 1.0, 0.0], ahead)
     if not np.linalg.norm(right) > 1e-9 * np.linalg.norm(ahead):
-        raise ValueError(
-            f"a view from {tuple(position)} to {tuple(target)} is straight up or "
-            f"down: no axis is level"
-        )
+        view = f"a view from {tuple(position)} to {tuple(target)}"
+        raise ValueError(f"{view} is straight up or down: no axis is level")
     ahead, right = ahead / np.linalg.norm(ahead), right / np.linalg.norm(right)
-    return rigid(
-        np.stack([right, np.cross(ahead, right), ahead], axis=1),
-        np.asarray(position, dtype=np.float64),
-    )
+    rotation = np.stack([right, np.cross(ahead, right), ahead], axis=1)
+    return rigid(rotation, np.asarray(position, dtype=np.float64))
 
 
 class Path(abc.ABC):
@@ -107,10 +103,8 @@ class Line(Path):
         elapsed = time - self.passing_s
         x, y, z = self.spin_deg_per_s
         spin = rotation_matrix((x * elapsed, y * elapsed, z * elapsed))
-        return rigid(
-            spin @ rotation_matrix(self.turn_deg),
-            np.add(self.position, np.multiply(self.velocity, elapsed)),
-        )
+        position = np.add(self.position, np.multiply(self.velocity, elapsed))
+        return rigid(spin @ rotation_matrix(self.turn_deg), position)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -171,6 +165,5 @@ class Sweep(Path):
         phase = 2.0 * math.pi * time / self.period_s
         turn = rotation_matrix((0.0, 0.5 * self.sweep_deg * math.cos(phase), 0.0))
         position = np.add(self.target, turn @ np.subtract(self.middle, self.target))
-        return looking_at(
-            position - [0.0, self.rise * math.sin(phase), 0.0], np.asarray(self.target)
-        )
+        rise = [0.0, self.rise * math.sin(phase), 0.0]
+        return looking_at(position - rise, np.asarray(self.target))

@@ -49,21 +49,14 @@ class Reading(NamedTuple):
 
 def why_impossible(sensor: Sensor) -> str | None:
     """Why the taps of a sensor would hold negative light; None if they do not."""
-    modulated, constant = float(contrast(sensor)) * peak(sensor.harmonic_contrast), 0.0
-    if not sensor.unipolar:
-        constant = float(contrast(sensor)) * abs(float(sensor.dc_offset))
-    if modulated + constant <= 1.0 + 1e-6:
+    height, offset = peak(sensor.harmonic_contrast), abs(float(sensor.dc_offset))
+    share = float(contrast(sensor))
+    if share * height + (0.0 if sensor.unipolar else share * offset) <= 1.0 + 1e-6:
         return None
     kind = "one tap allows" if sensor.unipolar else "differential taps allow"
-    harmonics = (
-        f", peak {peak(sensor.harmonic_contrast):g} with its harmonics"
-        if sensor.harmonic_contrast
-        else ""
-    )
-    return (
-        f"{kind} contrast (1 + |dc_offset|) <= 1, not {float(contrast(sensor)):g} "
-        f"(1 + {abs(float(sensor.dc_offset)):g}){harmonics}"
-    )
+    harmonics = f", peak {height:g} with its harmonics" if sensor.harmonic_contrast else ""
+    found = f"{share:g} (1 + {offset:g}){harmonics}"
+    return f"{kind} contrast (1 + |dc_offset|) <= 1, not {found}"
 
 
 def mean_quad(
@@ -100,13 +93,7 @@ def mean_taps(
     sensor: Sensor,
     ambient: Float[np.ndarray, "H W"] | None = None,
 ) -> tuple[Float[np.ndarray, "H W"], Float[np.ndarray, "H W"]]:
-    """Mean electrons (n_A, n_B) of the two taps.
-
-    Args:
-        quad: Mean quad of the raw frame, DC offset included [relative units].
-        amplitude: Mean amplitude a, source intensity included [relative units].
-        sensor: Gain, contrast, ambient and dark electrons, pattern of the dark current.
-        ambient: Share of the sensor's ambient electrons that each pixel gets [1]; None: 1.
+    """Mean electrons (n_A, n_B) of the two taps; arguments as for :func:`read_out`.
 
     Raises:
         ValueError: If a tap would hold a negative number of electrons: contrast and DC offset
@@ -114,18 +101,19 @@ def mean_taps(
     """
     gain = electron_gain(sensor)
     signal = float(contrast(sensor)) * gain * np.asarray(quad, dtype=np.float64)
+    light = gain * np.asarray(amplitude, dtype=np.float64)
     if sensor.unipolar:  # the offset is the light of the tap, not a difference of two
-        signal = signal - gain * np.asarray(amplitude, dtype=np.float64)
-    common = 0.5 * (_ambient(sensor, ambient) + gain * np.asarray(amplitude, dtype=np.float64))
+        signal = signal - light
+    common = 0.5 * (_ambient(sensor, ambient) + light)
     spread = dark_map(sensor.pattern, *common.shape)
     dark = dark_electrons(sensor) if spread is None else dark_electrons(sensor) * spread
     taps = common + 0.5 * signal + dark, common - 0.5 * signal + dark
     least = min(tap.min() for tap in taps)
     if least < -1e-3:  # beyond the rounding errors of float32 quads
+        share, height = float(contrast(sensor)), 1 + abs(float(sensor.dc_offset))
         raise ValueError(
-            f"a tap would hold {least:.3g} electrons: contrast {float(contrast(sensor)):.3g} "
-            f"times (1 + |dc_offset|) "
-            f"{1 + abs(float(sensor.dc_offset)):.3g} must not exceed 1 for a differential sensor"
+            f"a tap would hold {least:.3g} electrons: contrast {share:.3g} times (1 + |dc_offset|) "
+            f"{height:.3g} must not exceed 1 for a differential sensor"
         )
     return np.maximum(taps[0], 0.0), np.maximum(taps[1], 0.0)
 
@@ -194,9 +182,8 @@ def quantise(
     low, high = -codes // 2, codes // 2 - 1
     zero = low + codes // 64 if sensor.unipolar else 0
     code = np.round(electrons / sensor.electrons_per_code) + zero
-    return (np.clip(code, low, high) - zero) * sensor.electrons_per_code, (code <= low) | (
-        code >= high
-    )
+    ends = (code <= low) | (code >= high)
+    return (np.clip(code, low, high) - zero) * sensor.electrons_per_code, ends
 
 
 def _ambient(sensor: Sensor, share: Float[np.ndarray, "H W"] | None) -> Level:

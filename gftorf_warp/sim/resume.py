@@ -57,14 +57,12 @@ def needs_recording(out: Path, card: str, *, fresh: bool) -> bool:
         return False
     if fresh and sequence:
         return True
-    raise UsageError(
-        "the folder is not empty" if out.is_dir() else "not a folder",
-        where=out,
-        why="it holds a sequence made with other settings"
-        if sequence
-        else "it holds something that is no sequence",
-        fix="choose another --out" + (", or move this one aside with --fresh" if sequence else ""),
-    )
+    what = "the folder is not empty" if out.is_dir() else "not a folder"
+    why, fix = "it holds something that is no sequence", "choose another --out"
+    if sequence:
+        why = "it holds a sequence made with other settings"
+        fix += ", or move this one aside with --fresh"
+    raise UsageError(what, where=out, why=why, fix=fix)
 
 
 def set_aside(out: Path) -> None:
@@ -118,16 +116,13 @@ def cached_images(out: Path, card: str, *, fresh: bool) -> Iterator[Cached]:
 
 
 def _refuse_other_partial(folder: Path, card: str, *, fresh: bool) -> None:
-    if not folder.exists() or (
-        folder.is_dir() and not any(path.name != LOCK for path in folder.iterdir())
-    ):
+    empty = folder.is_dir() and all(path.name == LOCK for path in folder.iterdir())
+    if empty or not folder.exists():
         return
     begun = folder / UNFINISHED
     if not begun.is_file():
-        what, why = (
-            "the folder of finished images is in use",
-            "it holds something that is no recording",
-        )
+        what = "the folder of finished images is in use"
+        why = "it holds something that is no recording"
         raise UsageError(what, where=folder, why=why, fix="choose another --out")
     if not fresh and begun.read_text(encoding="utf-8", errors="replace") != card:
         why = "an interrupted recording with other settings left it there"

@@ -58,9 +58,8 @@ class ColourCamera:
     @property
     def colour_from_tof(self) -> Float[np.ndarray, "4 4"]:
         """Pose of the colour camera relative to the ToF camera [m]."""
-        return inverse(
-            rigid(rotation_matrix(self.turn_deg), np.asarray(self.position, dtype=np.float64))
-        )
+        position = np.asarray(self.position, dtype=np.float64)
+        return inverse(rigid(rotation_matrix(self.turn_deg), position))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,9 +114,8 @@ class Scene:
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
         if not 0 < self.horizontal_fov_deg < 180:
-            raise ValueError(
-                f"horizontal_fov_deg must be between 0 and 180, got {self.horizontal_fov_deg}"
-            )
+            wrong = self.horizontal_fov_deg
+            raise ValueError(f"horizontal_fov_deg must be between 0 and 180, got {wrong}")
         if not np.isfinite(self.emitter).all():
             raise ValueError(f"emitter must be finite, got {self.emitter}")
         if self.beam_deg is not None and not all(0 < angle < 180 for angle in self.beam_deg):
@@ -133,9 +131,8 @@ class Scene:
     def camera(self, size: tuple[int, int] | None = None, time: float = 0.0) -> Camera:
         """The ToF camera at ``time`` [s], of (width, height) ``size`` [px] or the default size."""
         pose = inverse(self.camera_path.world_from_body(time))
-        camera = Camera.from_fov(
-            *(size or (self.width, self.height)), self.horizontal_fov_deg, camera_from_world=pose
-        )
+        width, height = size or (self.width, self.height)
+        camera = Camera.from_fov(width, height, self.horizontal_fov_deg, camera_from_world=pose)
         return replace(camera, distortion=self.lens.distortion) if self.lens.distortion else camera
 
     def colour_camera(self, size: tuple[int, int] | None = None, time: float = 0.0) -> Camera:

@@ -19,33 +19,18 @@ from typing import Any, Union
 from ..errors import InputError
 from ..scene.changes import suggestion
 from ..scene.sensor import Sensor
-from . import assembly, curves, meshes, paths, world
+from .assembly import Assembly, Level
+from .curves import Guided
+from .meshes import Mesh
+from .paths import Arc, Line, Path, Still, Sweep, Viewpoint
 from .scene import Scene
 from .sensors import SENSORS
+from .world import Box, Plane, Shape, Sphere
 
+PATHS = (Still, Line, Arc, Guided, Viewpoint, Sweep)
 KINDS: dict[type, dict[str, type]] = {
-    world.Shape: {
-        kind.__name__.lower(): kind
-        for kind in (
-            world.Box,
-            world.Plane,
-            world.Sphere,
-            assembly.Level,
-            assembly.Assembly,
-            meshes.Mesh,
-        )
-    },
-    paths.Path: {
-        kind.__name__.lower(): kind
-        for kind in (
-            paths.Still,
-            paths.Line,
-            paths.Arc,
-            curves.Guided,
-            paths.Viewpoint,
-            paths.Sweep,
-        )
-    },
+    base: {kind.__name__.lower(): kind for kind in kinds}
+    for base, kinds in ((Shape, (Box, Plane, Sphere, Level, Assembly, Mesh)), (Path, PATHS))
 }
 NOT_THERE = ("closed_form", "overrides")  # fields of a scene that are no settings
 SIZES = {"frames": 48, "width": 160, "height": 120}  # defaults
@@ -62,21 +47,13 @@ def read_scene(path: str | FilePath) -> Scene:
     try:
         table = tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
-        raise InputError(
-            "cannot read the scene",
-            where=path,
-            why=error.strerror or str(error),
-            fix="correct the path",
-        ) from error
+        what, why, fix = "cannot read the scene", error.strerror or str(error), "correct the path"
+        raise InputError(what, where=path, why=why, fix=fix) from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(
-            "no TOML file", where=path, why=str(error), fix="correct that line"
-        ) from error
-    texts = {
-        "name": path.stem,
-        "description": f"scene of {path.name}",
-        "motion": "as its file says",
-    }
+        what, why, fix = "no TOML file", str(error), "correct that line"
+        raise InputError(what, where=path, why=why, fix=fix) from error
+    described = f"scene of {path.name}"
+    texts = {"name": path.stem, "description": described, "motion": "as its file says"}
     for key in NOT_THERE:
         if key in table:
             raise _wrong(path, key, "it is no setting", "leave it out")
@@ -93,18 +70,14 @@ def _made(kind: type, table: Any, path: FilePath, where: str) -> Any:
     if not isinstance(table, dict):
         raise _wrong(path, where, f"expected a table, found {table!r}", "write { ... } or [...]")
     table = dict(table)
-    preset = (
-        _preset(table.pop("preset"), path, where) if kind is Sensor and "preset" in table else None
-    )
+    preset = None
+    if kind is Sensor and "preset" in table:
+        preset = _preset(table.pop("preset"), path, where)
     if kind in KINDS:
         kinds, named = KINDS[kind], table.pop("kind", None)
         if not isinstance(named, str) or named not in kinds:
-            raise _wrong(
-                path,
-                _join(where, "kind"),
-                f"expected one of {', '.join(kinds)}, found {named!r}",
-                "name one",
-            )
+            why = f"expected one of {', '.join(kinds)}, found {named!r}"
+            raise _wrong(path, _join(where, "kind"), why, "name one")
         kind = kinds[named]
     known = {f.name: f for f in fields(kind)}
     hints = typing.get_type_hints(kind)
@@ -115,9 +88,8 @@ def _made(kind: type, table: Any, path: FilePath, where: str) -> Any:
     for name, f in known.items():
         if name not in table and f.default is MISSING and f.default_factory is MISSING:
             raise _wrong(path, _join(where, name), f"a {kind.__name__} needs it", "add it")
-    values = {
-        key: _value(hints[key], value, path, _join(where, key)) for key, value in table.items()
-    }
+    given = table.items()
+    values = {key: _value(hints[key], value, path, _join(where, key)) for key, value in given}
     try:
         return kind(**values) if preset is None else replace(preset, **values)
     except ValueError as error:
@@ -141,32 +113,20 @@ def _value(kind: Any, value: Any, path: FilePath, where: str) -> Any:
         if wanted[1:] == (Ellipsis,):
             wanted = wanted[:1] * len(value)
         if len(value) != len(wanted):
-            raise _wrong(
-                path,
-                where,
-                f"expected {len(wanted)} values, found {len(value)}",
-                "correct the list",
-            )
-        return tuple(
-            _value(one, item, path, f"{where}[{i}]")
-            for i, (one, item) in enumerate(zip(wanted, value, strict=True))
-        )
+            why = f"expected {len(wanted)} values, found {len(value)}"
+            raise _wrong(path, where, why, "correct the list")
+        pairs = enumerate(zip(wanted, value, strict=True))
+        return tuple(_value(one, item, path, f"{where}[{i}]") for i, (one, item) in pairs)
     if kind is FilePath and type(value) is str:
         return path.parent / value
     if kind is float and type(value) in (int, float) and math.isfinite(value):
         return float(value)
     if kind is not float and type(value) is kind:  # a bool is an int to isinstance
         return value
-    names = {
-        float: "a finite number",
-        int: "a whole number",
-        bool: "true or false",
-        str: "a text",
-        FilePath: "a path",
-    }
-    raise _wrong(
-        path, where, f"expected {names.get(kind, kind)}, found {value!r}", "correct the value"
-    )
+    names = {float: "a finite number", int: "a whole number", bool: "true or false"}
+    names |= {str: "a text", FilePath: "a path"}
+    why = f"expected {names.get(kind, kind)}, found {value!r}"
+    raise _wrong(path, where, why, "correct the value")
 
 
 def _preset(name: Any, path: FilePath, where: str) -> Sensor:

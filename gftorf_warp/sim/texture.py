@@ -37,19 +37,14 @@ class Texture:
 
     def __post_init__(self):
         if not 0 <= self.gloss <= 1 or not 0 <= self.shininess < np.inf:
-            raise ValueError(
-                f"gloss must be 0 to 1, shininess 0 or more and finite, got {self.gloss} and "
-                f"{self.shininess}"
-            )
+            got = f"{self.gloss} and {self.shininess}"
+            raise ValueError(f"gloss must be 0 to 1, shininess 0 or more and finite, got {got}")
         if self.gloss > 0 and self.high > 1:
-            raise ValueError(
-                f"a glossy surface reflects at most the incident light: high "
-                f"{self.high} must be <= 1"
-            )
+            most = f"high {self.high} must be <= 1"
+            raise ValueError(f"a glossy surface reflects at most the incident light: {most}")
         if not 0 <= self.low <= self.high:
-            raise ValueError(
-                f"reflectances must be 0 <= low <= high, got low {self.low}, high {self.high}"
-            )
+            got = f"low {self.low}, high {self.high}"
+            raise ValueError(f"reflectances must be 0 <= low <= high, got {got}")
         if not self.cell > 0:
             raise ValueError(f"cell must be above 0, got {self.cell}")
 

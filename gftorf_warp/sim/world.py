@@ -104,10 +104,8 @@ class Box(Shape):
     def normal(self, point, face):
         """Along the axis of the face: outwards, or inwards in a room."""
         normal = np.zeros_like(point)
-        outwards = np.where(face % 2, 1.0, -1.0)
-        np.put_along_axis(
-            normal, face[:, None] // 2, (-outwards if self.inside else outwards)[:, None], 1
-        )
+        positive = (face % 2 == 1) != self.inside
+        normal[np.arange(len(face)), face // 2] = np.where(positive, 1.0, -1.0)
         return normal
 
     def grid(self, spacing, inset):
@@ -191,9 +189,8 @@ class Sphere(Shape):
         along = -ray @ origin
         discriminant = along**2 - (origin @ origin - self.radius**2)
         distance = along - np.sqrt(np.maximum(discriminant, 0.0))
-        return np.where((discriminant > 0) & (distance > 0), distance, np.inf), np.zeros(
-            len(ray), dtype=np.int64
-        )
+        met = (discriminant > 0) & (distance > 0)
+        return np.where(met, distance, np.inf), np.zeros(len(ray), dtype=np.int64)
 
     def normal(self, point, face):
         """Away from the centre."""
@@ -312,9 +309,8 @@ def _nearest(
             rays = start + rays_to_ball(centre, ray[part], pose[:3, 3], candidate.shape.reach)
             if len(rays) == 0:
                 continue
-            reached, side = candidate.shape.hit(
-                pose[:3, :3].T @ (centre - pose[:3, 3]), ray[rays] @ pose[:3, :3]
-            )
+            origin = pose[:3, :3].T @ (centre - pose[:3, 3])
+            reached, side = candidate.shape.hit(origin, ray[rays] @ pose[:3, :3])
             nearer = reached < distance[rays]
             chosen = rays[nearer]
             distance[chosen], body[chosen], face[chosen] = reached[nearer], index, side[nearer]
