@@ -46,8 +46,7 @@ class Pattern:
 def phase_map(pattern: Pattern, height: int, width: int) -> Float[np.ndarray, "H W"] | None:
     """Phase offset of each pixel [rad]; None: 0 everywhere.
 
-    A quadratic bowl over the image, in which x and y run over half its width, and noise of pixels,
-    columns and rows.
+    A quadratic bowl over the image, x and y in half widths, and noise of pixels, columns and rows.
     """
     if pattern.phase == 0.0:
         return None

@@ -44,13 +44,11 @@ def closed_form_errors(sequence: Sequence, truth: Truth | None) -> Errors:
     quartets = sequence.complete_quartets
     quartets = quartets[1:-1] if len(quartets) > 2 else quartets
     if truth is None or not quartets:
-        raise InputError(
-            "nothing to compare",
-            where=sequence.path or "sequence",
-            why=f"expected truth and a complete quartet, found "
-            f"{'no ' if truth is None else ''}truth and {quartets}",
-            fix=f"simulate at least the {sequence.cycle} raw frames of a cycle",
-        )
+        found = f"{'no ' if truth is None else ''}truth and {quartets}"
+        why = f"expected truth and a complete quartet, found {found}"
+        fix = f"simulate at least the {sequence.cycle} raw frames of a cycle"
+        where = sequence.path or "sequence"
+        raise InputError("nothing to compare", where=where, why=why, fix=fix)
     frames = [sequence.cycle * i for i in quartets]
     decoded = np.stack([closed_form_distance(sequence, i) for i in quartets])
     distance = known_distance(truth)
@@ -78,20 +76,16 @@ def with_closed_form(scene: Scene) -> Scene:
 def ladder_table(rows: Mapping[str, Errors]) -> list[str]:
     """Lines of a table: errors of each level, and the difference from the one before."""
     heads = ("all", "moving", "static", "vs phasor", "added")
-    lines = [
-        f"{'closed form, MSE x100 [m^2]':<28}"
-        + "".join(f"{head:>11}" for head in heads)
-        + "  what is new"
-    ]
+    titles = "".join(f"{head:>11}" for head in heads)
+    lines = [f"{'closed form, MSE x100 [m^2]':<28}{titles}  what is new"]
     before = None
     for level in LEVELS:
         if level.name not in rows:
             continue
         errors = rows[level.name]
         added = None if before is None or errors.all is None else errors.all - before
-        cells = "".join(
-            f"{'-' if value is None else f'{value:.4g}':>11}" for value in (*errors, added)
-        )
+        shown = ("-" if value is None else f"{value:.4g}" for value in (*errors, added))
+        cells = "".join(f"{text:>11}" for text in shown)
         lines.append(f"{level.name:<28}{cells}  {level.adds}")
         before = errors.all
     return lines

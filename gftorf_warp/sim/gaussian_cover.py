@@ -48,11 +48,8 @@ COSINE_MIN = 0.1  # splats grow no longer than this on surfaces met at a glancin
 def overlap(spacing: float, variance: float, aligned: bool) -> tuple[float, float]:
     """(Share of the light that a cover returns [1], lead of the near side [px]) at a pixel.
 
-    Args:
-        spacing: Distance between splats [px].
-        variance: Variance v of a splat on the image [px^2].
-        aligned: Whether splats are centred on pixels; otherwise both results are averaged over all
-            alignments.
+    Splats are ``spacing`` [px] apart, of ``variance`` v [px^2] on the image, and ``aligned``,
+    centred on pixels, or else averaged over all alignments.
     """
     index = np.arange(-8, 9) * spacing
     # x: from near to far
@@ -125,10 +122,8 @@ class Cover:
         mean = self.point @ rotation.T + pose[:3, 3]
         ray = mean - centre
         length = np.linalg.norm(ray, axis=1)
-        cosine, cosine_other = (
-            -np.sum(normal @ rotation.T * ray, axis=1) / length
-            for normal in (self.normal, self.other)
-        )
+        sides = (self.normal, self.other)
+        cosine, cosine_other = (-np.sum(n @ rotation.T * ray, axis=1) / length for n in sides)
         shown = (cosine > self.limb) & (cosine_other > self.limb)
         cosine = 0.5 * (cosine + cosine_other)
         count = int(shown.sum())
@@ -209,9 +204,8 @@ def cover_moving(
     distances = clearance(body, camera.centre if centres is None else centres, times)
     nearest, typical = distances.min(), distances.mean() + body.shape.reach
     if nearest <= 0:
-        raise ValueError(
-            f"a moving body reaches the camera: clearance {nearest:.3f} m must be above 0"
-        )
+        found = f"clearance {nearest:.3f} m must be above 0"
+        raise ValueError(f"a moving body reaches the camera: {found}")
     focal = camera.fx * magnification(camera)
     spacing, variance = SPACING * nearest / focal, LOW_PASS + RADIUS**2
     inset = spread(SPACING * nearest / typical, variance) * typical / focal - spacing / 2
@@ -270,9 +264,8 @@ def depth_slope(normal, distance, ray, camera: Camera) -> Float[np.ndarray, "N"]
     length = np.linalg.norm(flat, axis=1)
     gradient_length = flat[:, :2] / length[:, None] / [camera.fx, camera.fy]
     if camera.distortion:
-        gradient_z, gradient_length = (
-            _per_pixel(each, flat, camera) for each in (gradient_z, gradient_length)
-        )
+        gradient_z = _per_pixel(gradient_z, flat, camera)
+        gradient_length = _per_pixel(gradient_length, flat, camera)
     gradient = gradient_z * length[:, None] + z[:, None] * gradient_length
     steepness = np.linalg.norm(gradient_z, axis=1)
     slanted = steepness > 1e-5 * z
@@ -286,9 +279,8 @@ def _per_pixel(gradient, flat, camera: Camera) -> Float[np.ndarray, "N 2"]:
     xx, xy, yy = camera.distortion.slope(*inside(flat[:, 0], flat[:, 1], camera.guard.radius))
     focal = np.array([camera.fx, camera.fy])
     x, y = (gradient * focal).T
-    return (
-        np.stack([x * yy - y * xy, y * xx - x * xy], axis=1) / (xx * yy - xy * xy)[:, None] / focal
-    )
+    turned = np.stack([x * yy - y * xy, y * xx - x * xy], axis=1)
+    return turned / (xx * yy - xy * xy)[:, None] / focal
 
 
 def magnification(camera: Camera) -> float:

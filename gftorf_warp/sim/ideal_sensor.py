@@ -36,13 +36,9 @@ class Light(NamedTuple):
 
 
 def light_of(scene: Scene, time: float, *, rays: int = 1, f_mod_hz: float | None = None) -> Light:
-    """Light at an instant.
+    """Light of a scene at its own size at ``time`` [s], the mean over ``rays`` per pixel and axis.
 
-    Args:
-        scene: The scene, at its own size.
-        time: Time [s].
-        rays: Rays per pixel and axis that are averaged.
-        f_mod_hz: Modulation frequency [Hz]; None: the first of the scene's sensor.
+    The modulation frequency [Hz] is ``f_mod_hz``; None: the first of the scene's sensor.
 
     Raises:
         ValueError: If ``rays`` is below 1.
@@ -64,14 +60,13 @@ def light_of(scene: Scene, time: float, *, rays: int = 1, f_mod_hz: float | None
 def ideal_recording(
     scene: Scene, lights: Mapping[int, Light] | None = None, sensor: Sensor | None = None
 ) -> tuple[Sequence, Truth]:
-    """The ideal recording of a scene at its own size, and the true distance.
+    """The ideal recording of a scene at its own size, frames and times, and the true distance.
 
     Args:
-        scene: The scene, with its own frames and times.
-        lights: Light by raw frame; others are not measured and their truth is unknown. None: that
-            of all frames.
-        sensor: Instead of the scene's; its noise is ignored, and its modulation frequencies must be
-            the same.
+        scene: The scene.
+        lights: Light by raw frame; without it a frame is not measured, nor its truth known. None:
+            that of all frames.
+        sensor: Instead of the scene's; noise is ignored. None: the scene's.
 
     Raises:
         ValueError: If the modulation frequencies differ.
@@ -79,18 +74,14 @@ def ideal_recording(
     sensor = replace(scene.sensor if sensor is None else sensor, noise=False)
     lit, read = frequencies_of(scene.sensor), frequencies_of(sensor)
     if lit != read:
-        raise ValueError(
-            f"light of {', '.join(map(str, lit))} Hz, read by a sensor of "
-            f"{', '.join(map(str, read))} Hz"
-        )
+        light, other = (", ".join(map(str, each)) for each in (lit, read))
+        raise ValueError(f"light of {light} Hz, read by a sensor of {other} Hz")
     shots = [sensor.at_frame(n) for n in range(scene.frames)]
     frequencies = np.array([float(shot.f_mod_hz) for shot in shots])
     times = frame_times(sensor, scene.frames, sync=False)
     if lights is None:
-        lights = {
-            n: light_of(scene, float(times[n]), f_mod_hz=float(f))
-            for n, f in enumerate(frequencies)
-        }
+        pairs = enumerate(zip(times.tolist(), frequencies.tolist(), strict=True))
+        lights = {n: light_of(scene, time, f_mod_hz=f) for n, (time, f) in pairs}
     shifts = np.array([shot.shifts[0] for shot in shots])
     quads = np.zeros((scene.frames, scene.height, scene.width), dtype=np.float32)
     distance = np.full(quads.shape, np.nan, dtype=np.float32)
@@ -98,11 +89,8 @@ def ideal_recording(
     for n, light in lights.items():
         turned = np.exp(1j * (float(sensor.phase_offset) - shifts[n]))
         quad = (light.phasor * turned).real + float(sensor.dc_offset) * light.amplitude
-        quads[n], distance[n], known[n] = (
-            float(sensor.source_intensity) * quad,
-            light.distance,
-            True,
-        )
+        quads[n] = float(sensor.source_intensity) * quad
+        distance[n], known[n] = light.distance, True
     cameras = [scene.camera(time=float(time)) for time in times]
     sequence = Sequence(quads=quads, measured=known, **sequence_fields(sensor, times, cameras))
     return sequence, Truth(distance=distance, known=known)

@@ -8,7 +8,6 @@ Colours are free choices.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -19,7 +18,7 @@ from .curves import Curve, Guided, Turn
 from .lookalikes import look_alike
 from .lookalikes_real import FIELD_OF_VIEW_DEG
 from .paths import Path, Still, Vector, rotation_matrix
-from .scene import ColourCamera, Scene
+from .scene import ColourCamera, Recipe
 from .sensors import torf_real
 from .world import Body, Box
 
@@ -48,9 +47,7 @@ def carried_camera(centre: float, yaw_deg_per_s: float, pitch_deg: float) -> Gui
     )
 
 
-def _carried(
-    *texts: Any, centre: float, yaw_deg_per_s: float, pitch_deg: float = 0.0
-) -> Callable[[Callable[[], tuple[Body, ...]]], Callable[[], Scene]]:
+def _carried(*texts: Any, centre: float, yaw_deg_per_s: float, pitch_deg: float = 0.0) -> Recipe:
     """A recipe with a colour camera, moving for one second."""
     return look_alike(
         *texts,

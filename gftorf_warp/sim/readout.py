@@ -64,19 +64,15 @@ def mean_quad(
 ) -> tuple[Float[np.ndarray, "H W"], Float[np.ndarray, "H W"]]:
     """Mean quad of the sensor's first shift, and mean amplitude, of every pixel.
 
-    Args:
-        light: Sum of amplitude exp(i h phase) for each h of ``sensor.harmonics``, for a source
-            intensity of 1 and without phase offset [relative units].
-        amplitude: Sum of the amplitudes, likewise.
-        sensor: Its offsets, harmonics and phase pattern.
+    ``light`` is the sum of amplitude exp(i h phase) for each h of ``sensor.harmonics``, for a
+    source intensity of 1 and without phase offset [relative units]; ``amplitude`` likewise.
 
     Raises:
         ValueError: If there is light at another number of harmonics.
     """
     if len(light) != len(sensor.harmonics):
-        raise ValueError(
-            f"light {light.shape} must start with {len(sensor.harmonics)}, the number of harmonics"
-        )
+        wanted = f"{len(sensor.harmonics)}, the number of harmonics"
+        raise ValueError(f"light {light.shape} must start with {wanted}")
     intensity = float(sensor.source_intensity)
     amplitude = intensity * amplitude.astype(np.float64)
     pattern = phase_map(sensor.pattern, *amplitude.shape)
@@ -140,8 +136,7 @@ def read_out(
         shading: Factors of the light of each pixel; None: 1.
 
     Raises:
-        ValueError: If the sensor's contrast and DC offset contradict each other, see
-            :func:`mean_taps`.
+        ValueError: If the sensor's contrast and DC offset contradict each other.
     """
     response = gain_map(sensor.pattern, *np.shape(quad))
     for active, other in [

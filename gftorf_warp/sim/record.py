@@ -55,9 +55,8 @@ class Gap:
     moves."""
 
     def __str__(self) -> str:
-        return (
-            f"mean {1e3 * self.mean:.1f} mm, max {1e3 * self.max:.1f} mm over {self.pixels} pixels"
-        )
+        mean, most = 1e3 * self.mean, 1e3 * self.max
+        return f"mean {mean:.1f} mm, max {most:.1f} mm over {self.pixels} pixels"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -187,8 +186,11 @@ def _exposing(
     evenness = shading(scene.lens, camera_at(0.0), beam=not beam_is_traced(scene, settings.bounces))
     samples = settings.exposure_samples
     offsets = ((np.arange(samples) + 0.5) / samples - 0.5) * sensor.exposure_s
-    engine = (
-        MeshEngine(
+    engine: MeshEngine | GaussianEngine
+    if settings.engine == "gaussian":
+        engine = GaussianEngine(scene, _fine(camera_at, scene), longest_times(scene, settings))
+    else:
+        engine = MeshEngine(
             scene,
             camera_at,
             harmonics=scene.sensor.harmonics,
@@ -197,9 +199,6 @@ def _exposing(
             seed=settings.seed,
             truth=settings.truth if settings.format == "capture" else None,
         )
-        if settings.engine == "mesh"
-        else GaussianEngine(scene, _fine(camera_at, scene), longest_times(scene, settings))
-    )
 
     def expose(n: int) -> Images:
         shot, time = sensor.at_frame(n), float(times[n])

@@ -37,10 +37,7 @@ OTHER = "continue with the same settings, choose another --out, or start over wi
 def needs_recording(out: Path, card: str, *, fresh: bool) -> bool:
     """Whether ``out`` has to be recorded: False if it is a sequence with these settings.
 
-    Args:
-        out: Folder of the sequence.
-        card: Settings of the recording, the beginning of its README.md.
-        fresh: Whether another sequence there may be renamed.
+    The ``card`` of settings is the beginning of its README.md; ``fresh``: another may be renamed.
 
     Raises:
         UsageError: If ``out`` holds anything else that may not be renamed, or OUT.partial another

@@ -36,19 +36,10 @@ def rolling_hits(
     sensor: Sensor,
     height: int,
 ) -> Hits:
-    """First hit of every pixel's centre ray, each row when it is exposed.
-
-    Args:
-        bodies: What there is.
-        camera_at: The whole camera at a time [s].
-        time: Of the first row [s].
-        sensor: Its delay from row to row.
-        height: Number of rows.
-    """
+    """First hit of every pixel's centre ray, each row when it is exposed, the first at ``time``."""
     if sensor.row_time_s == 0:
         return first_hit(bodies, camera_at(time), time)
     times = (time + row_delays(sensor, height)).tolist()
     rows = [first_hit(bodies, camera_at(late).row(n), late) for n, late in enumerate(times)]
-    return Hits(
-        **{f.name: np.concatenate([getattr(row, f.name) for row in rows]) for f in fields(Hits)}
-    )
+    names = [f.name for f in fields(Hits)]
+    return Hits(**{name: np.concatenate([getattr(row, name) for row in rows]) for name in names})

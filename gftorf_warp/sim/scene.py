@@ -153,9 +153,10 @@ class Scene:
         )
 
 
-def recipe(
-    description: str, motion: str, closed_form: float, **others: Any
-) -> Callable[[Callable[[], tuple[Body, ...]]], Callable[[], Scene]]:
+Recipe = Callable[[Callable[[], tuple[Body, ...]]], Callable[[], Scene]]
+
+
+def recipe(description: str, motion: str, closed_form: float, **others: Any) -> Recipe:
     """Decorator: the scene of these bodies, with the name of the function, and ``others``."""
     texts = {"description": description, "motion": motion, "closed_form": closed_form}
 

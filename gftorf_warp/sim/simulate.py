@@ -37,12 +37,11 @@ def simulate(
 ) -> Path:
     """Record a moving scene with an asynchronous C-ToF sensor and write it as a sequence.
 
-    Each raw frame is an image at its own time, of which the quad of its shift and frequency is read
-    out. Its truth is the analytic distance along each pixel's centre ray at that time. A moving
-    camera has a pose for each raw frame; a colour camera adds an image per quartet. The folder
-    appears when it is complete; if it exists and has the same settings, it is not changed. After an
-    interruption the same call continues at the next raw frame: finished images are in OUT.partial,
-    and the final bytes are the same.
+    Each raw frame is the quad of its shift and frequency at its own time, with a pose if the camera
+    moves; its truth is the analytic distance along each pixel's centre ray. A colour camera adds an
+    image per quartet. The folder appears when it is complete; if it exists with the same settings,
+    it is not changed. After an interruption the same call continues at the next raw frame: finished
+    images are in OUT.partial, and the final bytes are the same.
 
     Args:
         scene: Name of a scene, see ``SCENES``, a TOML file of one, or a scene.
@@ -77,9 +76,8 @@ def simulate(
         recording = record(recorded, used, device=device, progress=progress, cached=cached)
         if fresh:
             set_aside(out)
-        sheet = contact_sheet(
-            recording.sequence, recording.truth, card.partition("\n")[0].removeprefix("# ")
-        )
+        title = card.partition("\n")[0].removeprefix("# ")
+        sheet = contact_sheet(recording.sequence, recording.truth, title)
         readme = card + outcome_card(recording)
         write(used.format, out, recording.sequence, recording.truth, readme=readme, sheet=sheet)
     return out
@@ -110,9 +108,8 @@ def simulate_ladder(
         rows[name] = closed_form_errors(sequence, read_truth(sequence))
     title = scene if isinstance(scene, str) else scene.name
     lines = "\n".join(f"    {line}" for line in ladder_table(rows))
-    atomic_write(
-        out / "ladder.md", f"# {title}: what each level of the ladder costs\n\n{lines}\n".encode()
-    )
+    text = f"# {title}: what each level of the ladder costs\n\n{lines}\n"
+    atomic_write(out / "ladder.md", text.encode())
     return rows
 
 

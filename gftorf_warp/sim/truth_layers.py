@@ -17,14 +17,9 @@ def truth_layers(
     Light is the mean over the exposure, for the sensor's source intensity and without its phase
     offset; depth and normals are those of the middle of the exposure.
 
-    Args:
-        light: Of one raw frame.
-        hits: First hits of the centre rays.
-        sensor: Its source intensity, and the harmonics of ``light``.
-        amount: 'usual': ``ambient`` and, if light bounced, its direct part ``direct`` and its
-            standard ``error``: small, and not computable from the rest of a capture. 'all': also
-            the light at every harmonic, ``z_depth`` and ``normal``.
-        bounced: Whether ``light`` has any that met more than one surface.
+    The ``amount`` 'usual' is ``ambient`` and, if light ``bounced``, its direct part ``direct`` and
+    its standard ``error``: small, and not computable from the rest of a capture; 'all' is also the
+    light at every harmonic, ``z_depth`` and ``normal``.
     """
     intensity = float(sensor.source_intensity)
     named = {"ambient": [light.ambient]}
