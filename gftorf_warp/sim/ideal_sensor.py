@@ -74,8 +74,8 @@ def ideal_recording(
     sensor = replace(scene.sensor if sensor is None else sensor, noise=False)
     lit, read = frequencies_of(scene.sensor), frequencies_of(sensor)
     if lit != read:
-        light, other = (", ".join(map(str, each)) for each in (lit, read))
-        raise ValueError(f"light of {light} Hz, read by a sensor of {other} Hz")
+        listed, other = (", ".join(map(str, each)) for each in (lit, read))
+        raise ValueError(f"light of {listed} Hz, read by a sensor of {other} Hz")
     shots = [sensor.at_frame(n) for n in range(scene.frames)]
     frequencies = np.array([float(shot.f_mod_hz) for shot in shots])
     times = frame_times(sensor, scene.frames, sync=False)
