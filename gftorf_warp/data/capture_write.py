@@ -22,17 +22,15 @@ VERSION = "1.0"
 def files(sequence: Sequence, truth: Truth | None) -> Iterator[tuple[str, bytes | Parts]]:
     """Name and content of every file of a folder.
 
-    Reading it again gives the same sequence: images bit by bit in float32, numbers as they were,
-    poses, which are stored inverted, to the last digit or two.
+    Reading it gives the same sequence: images bit by bit in float32, numbers exactly, poses, which
+    are stored inverted, to the last digit or two.
     """
     yield NAME, _json(sequence)
     for n in np.flatnonzero(sequence.measured).tolist():
         yield f"tof/{n:06d}.exr", _raw_frame(sequence, n)
     for n, image in sequence.colour.images.items():
-        yield (
-            f"colour/{n:06d}.exr",
-            {"colour": dict(zip("RGB", np.moveaxis(float32(image), -1, 0), strict=True))},
-        )
+        channels = dict(zip("RGB", np.moveaxis(float32(image), -1, 0), strict=True))
+        yield f"colour/{n:06d}.exr", {"colour": channels}
     if truth is not None:
         for n in np.flatnonzero(truth.known).tolist():
             yield f"truth/{n:06d}.exr", _truth(truth, n)
@@ -41,10 +39,8 @@ def files(sequence: Sequence, truth: Truth | None) -> Iterator[tuple[str, bytes 
 def _raw_frame(sequence: Sequence, n: int) -> Parts:
     """Parts of one raw frame."""
     parts: Parts = {"raw": {"q": float32(sequence.quads[n])}}
-    for name, images in (
-        ("flow.forward", sequence.flow.forward),
-        ("flow.backward", sequence.flow.backward),
-    ):
+    flow = {"flow.forward": sequence.flow.forward, "flow.backward": sequence.flow.backward}
+    for name, images in flow.items():
         if n in images:
             parts[name] = dict(zip(("dx", "dy"), float32(images[n]), strict=True))
     return parts
@@ -71,9 +67,8 @@ def _json(sequence: Sequence) -> bytes:
         cameras["tof"]["distortion"] = [float(k) for k in sequence.intrinsics.distortion]
     colour = sequence.colour
     if colour.intrinsics is not None:
-        cameras["colour"] = _camera(
-            colour.size or (sequence.height, sequence.width), colour.intrinsics
-        )
+        size = colour.size or (sequence.height, sequence.width)
+        cameras["colour"] = _camera(size, colour.intrinsics)
     elif colour.size is not None:
         cameras["colour"] = {"size": list(colour.size[::-1])}
     stated = sequence.calibration
@@ -102,10 +97,7 @@ def _json(sequence: Sequence) -> bytes:
     if sequence.novel_from_world is not None:
         head["novel_to_world"] = inverse(sequence.novel_from_world).tolist()
     lines = [json.dumps(frame, allow_nan=False) for frame in _frames(sequence)]
-    rows = [
-        f" {json.dumps(key)}: {json.dumps(value, allow_nan=False)},\n"
-        for key, value in head.items()
-    ]
+    rows = [f' "{key}": {json.dumps(value, allow_nan=False)},\n' for key, value in head.items()]
     return ("{\n" + "".join(rows) + ' "frames": [\n  ' + ",\n  ".join(lines) + "\n ]\n}\n").encode()
 
 

@@ -16,47 +16,18 @@ from collections.abc import Iterator
 import numpy as np
 
 MATRIX, COMPRESSED = 14, 15
-NUMBERS = {
-    1: "i1",
-    2: "u1",
-    3: "i2",
-    4: "u2",
-    5: "i4",
-    6: "u4",
-    7: "f4",
-    9: "f8",
-    12: "i8",
-    13: "u8",
-}  # by stored type
-CLASSES = {
-    6: "f8",
-    7: "f4",
-    8: "i1",
-    9: "u1",
-    10: "i2",
-    11: "u2",
-    12: "i4",
-    13: "u4",
-    14: "i8",
-    15: "u8",
-}
+INTEGERS = ("i1", "u1", "i2", "u2", "i4", "u4")
+NUMBERS = dict(enumerate(INTEGERS, start=1)) | {7: "f4", 9: "f8", 12: "i8", 13: "u8"}
+CLASSES = {6: "f8", 7: "f4"} | dict(enumerate((*INTEGERS, "i8", "u8"), start=8))
 COMPLEX = 0x0800
 UNPACKED_MAX = 1 << 20  # [bytes] of a compressed matrix: calibration has a few hundred
 
 
 def read_matrix(data: bytes, name: str) -> np.ndarray:
-    """The matrix of one name.
-
-    Args:
-        data: The whole file.
-        name: Name of the variable.
-
-    Returns:
-        The matrix [rows, columns], in the type that its class states.
+    """Matrix [rows, columns] of a variable in the content of a file, in the type of its class.
 
     Raises:
-        ValueError: If the file is not of this kind, damaged, or has no such matrix of real numbers;
-            says which.
+        ValueError: If the file is not of this kind, damaged, or has no such matrix of real numbers.
     """
     if len(data) < 128 or data[126:128] not in (b"IM", b"MI"):
         raise ValueError("no MATLAB 5 header")
@@ -69,7 +40,7 @@ def read_matrix(data: bytes, name: str) -> np.ndarray:
         )
         if kind == MATRIX:
             parts = list(_elements(content, order))
-            found.append(_name(parts))
+            found.append(parts[2][1].decode("ascii", "replace") if len(parts) > 2 else "")
             if found[-1] == name:
                 return _matrix(parts, order)
     raise ValueError(f"no variable {name!r} but {found}")
@@ -83,18 +54,13 @@ def _matrix(parts: list[tuple[int, bytes]], order: str) -> np.ndarray:
     shape = struct.unpack(order + "2i", parts[1][1])
     kind, values = parts[3]
     if flags & 0xFF not in CLASSES or flags & COMPLEX or kind not in NUMBERS or min(shape) < 1:
-        raise ValueError(
-            f"class {flags & 0xFF}, type {kind}, size {shape} is no matrix of real numbers"
-        )
+        found = f"class {flags & 0xFF}, type {kind}, size {shape}"
+        raise ValueError(f"{found} is no matrix of real numbers")
     stored = np.dtype(order + NUMBERS[kind])
     if len(values) != math.prod(shape) * stored.itemsize:
         raise ValueError(f"{len(values)} bytes for {shape} numbers of {stored}")
     with np.errstate(over="ignore", invalid="ignore"):
         return np.frombuffer(values, stored).reshape(shape, order="F").astype(CLASSES[flags & 0xFF])
-
-
-def _name(parts: list[tuple[int, bytes]]) -> str:
-    return parts[2][1].decode("ascii", "replace") if len(parts) > 2 else ""
 
 
 def _unpacked(data: bytes) -> bytes:
@@ -104,9 +70,8 @@ def _unpacked(data: bytes) -> bytes:
     except zlib.error as error:
         raise ValueError(str(error)) from error
     if not unpacker.eof:
-        raise ValueError(
-            f"compressed data are truncated, or unpack to more than {UNPACKED_MAX} bytes"
-        )
+        why = f"truncated, or unpack to more than {UNPACKED_MAX} bytes"
+        raise ValueError(f"compressed data are {why}")
     return content
 
 

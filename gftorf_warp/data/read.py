@@ -13,13 +13,10 @@ STORED = {"ftorf": ftorf.stored, "torf": torf.stored}
 
 
 def read(path: str | Path, *, frame_rate_hz: float | None = None) -> Sequence:
-    """Read a sequence from a folder.
+    """Read a capture, an F-ToeRF folder of raw quads, or a ToeRF folder of phasors.
 
-    Args:
-        path: A capture, an F-ToeRF folder of raw quads, or a ToeRF folder of phasors.
-        frame_rate_hz: Raw frames per second, or phasors per second of a ToeRF folder; overrides the
-            times of the folder and the default of 120, or 30. Not allowed for a capture, which
-            states every time.
+    ``frame_rate_hz`` are raw frames, or phasors of a ToeRF folder, per second; it overrides the
+    times of the folder and the default of 120, or 30. A capture, which states every time, has none.
 
     Raises:
         InputError: If the folder or a file in it does not conform to data_specs/.

@@ -137,10 +137,9 @@ class Sequence:
 
     @functools.cached_property
     def cycle(self) -> int:
-        """Number K of raw frames in a cycle: quartet i is raw frames K i .. K (i + 1) - 1.
+        """Number K of raw frames in a cycle: as stated, or the period of shifts and frequencies.
 
-        The stated one, else the period of shifts and frequencies: four for a sensor of four shifts
-        at one frequency.
+        Quartet i is raw frames K i .. K (i + 1) - 1.
         """
         return self.calibration.cycle_length or find_cycle(self.shifts, self.frame_frequencies)
 

@@ -58,11 +58,7 @@ class Field:
 
 @functools.cache
 def fields(name: str) -> dict[str, Field]:
-    """Fields of a format by name, in the order of its file.
-
-    Args:
-        name: Name of a file in data_specs/ without its ending, for example ``ftorf``.
-    """
+    """Fields of a format by name, in the order of its file in data_specs/, like ``ftorf``."""
     folder = INSTALLED if INSTALLED.is_dir() else CHECKED_OUT
     content = tomllib.loads((folder / f"{name}.toml").read_text(encoding="utf-8"))
     return {
@@ -72,16 +68,14 @@ def fields(name: str) -> dict[str, Field]:
 
 
 def layer_field(name: str) -> Field:
-    """The field of data_specs/capture.toml that describes a layer of the truth; ``{h}`` is a
-    harmonic.
+    """The field that describes a layer of the truth; ``{h}`` in its key is a harmonic.
 
     Raises:
-        ValueError: If none does.
+        ValueError: If there is none.
     """
     for field in fields("capture").values():
-        if "layers" in field.fills and re.fullmatch(
-            re.escape(field.key).replace(r"\{h\}", "[1-9][0-9]?"), name
-        ):
+        pattern = re.escape(field.key).replace(r"\{h\}", "[1-9][0-9]?")
+        if "layers" in field.fills and re.fullmatch(pattern, name):
             return field
     raise ValueError(f"no layer is named {name!r}")
 

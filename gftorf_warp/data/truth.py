@@ -24,33 +24,24 @@ def moving_and_static(
     from_phasors: bool = False,
     cycle: int = FRAMES_PER_QUARTET,
 ) -> tuple[Bool[np.ndarray, "S H W"], Bool[np.ndarray, "S H W"]]:
-    """Moving and static pixels of the S scored frames.
+    """Moving and static pixels of the S scored raw frames; NaN in the truth [m] is unknown.
 
     A pixel moves if its true distance has max - min > 0.05 m within the raw frames of its quartet.
-    It is static if all of them are known and it does not move; with unknown truth [NaN] it may be
+    It is static if all of them are known and it does not move; with unknown truth it may be
     neither. The raw frames of a phasor are of one instant, so a pixel of phasors moves if its
     distance differs that much from one phasor to the next (the last: from the previous one).
-
-    Args:
-        distance_truth: True distance of every raw frame [m]; NaN: unknown.
-        frames: The scored raw frames n.
-        from_phasors: Whether the camera delivered phasors.
-        cycle: Raw frames of a quartet.
     """
     step = cycle
     moving, static = {}, {}
     for quartet in {n // step for n in frames}:
         quartet_truth = distance_truth[step * quartet : step * (quartet + 1)]
         if from_phasors:
-            neighbour = (
-                quartet + 1 if step * (quartet + 1) < len(distance_truth) else max(quartet - 1, 0)
-            )
+            last = step * (quartet + 1) >= len(distance_truth)
+            neighbour = max(quartet - 1, 0) if last else quartet + 1
             quartet_truth = distance_truth[[step * quartet, step * neighbour]]
         unknown = np.isnan(quartet_truth)
-        low, high = (
-            np.where(unknown, np.inf, quartet_truth).min(axis=0),
-            np.where(unknown, -np.inf, quartet_truth).max(axis=0),
-        )
+        low = np.where(unknown, np.inf, quartet_truth).min(axis=0)
+        high = np.where(unknown, -np.inf, quartet_truth).max(axis=0)
         moving[quartet] = high - low > MOVING_M
         static[quartet] = ~moving[quartet] & ~unknown.any(axis=0)
     rows = [n // step for n in frames]

@@ -83,9 +83,7 @@ def common_range(frequencies_hz: Sequence[float]) -> float:
 def choose(phases: Float[np.ndarray, "f *n"], ms: Sequence[int]) -> Chosen:
     """Choose among the m_1 candidates of the first phase the one that fits all phases best.
 
-    Args:
-        phases: At m_i f_0 [rad], phase offset removed, wrapped to [0, 2 pi) or not.
-        ms: The multiples m_i of two or more frequencies.
+    ``phases`` are at m_i f_0 [rad], phase offset removed; ``ms`` are two or more multiples m_i.
     """
     turn = 2.0 * math.pi
     m = np.asarray(ms, dtype=np.float64).reshape(-1, *[1] * (phases.ndim - 1))
@@ -111,9 +109,7 @@ def choose(phases: Float[np.ndarray, "f *n"], ms: Sequence[int]) -> Chosen:
 
 
 def _spacing(m: np.ndarray) -> float:
-    """Smallest squared residual [rad^2] of one more turn of a single phase where all others
-    agree.
-    """
+    """Smallest squared residual [rad^2] of one more turn of one phase where all others agree."""
     return float(min((2.0 * math.pi) ** 2 * (1.0 - one**2 / np.sum(m**2)) for one in m))
 
 

@@ -27,19 +27,15 @@ def write(
     readme: str | None = None,
     sheet: bytes | None = None,
 ) -> Path:
-    """Write a sequence, and its ground truth if there is any, as a folder that appears only when it
-    is complete.
+    """Write a sequence and its ground truth as a new or empty folder, atomically; returns its path.
 
     Args:
         form: Name of the format: ``capture``, ``ftorf`` or ``torf``.
         path: New or empty folder.
         sequence: The sequence.
-        truth: Its ground truth.
+        truth: Its ground truth, if known.
         readme: Text of a README.md in the folder.
-        sheet: A contact sheet for people, as PNG.
-
-    Returns:
-        The folder.
+        sheet: A contact sheet, as PNG.
 
     Raises:
         UsageError: If the format cannot express the sequence, or the folder cannot be created.
@@ -59,16 +55,13 @@ def write(
                 write_through(folder / name, content)
             else:
                 write_parts(folder / name, content)
-        names = sorted(
-            file.relative_to(folder).as_posix() for file in folder.rglob("*") if file.is_file()
-        )
+        files = filter(Path.is_file, folder.rglob("*"))
+        names = sorted(file.relative_to(folder).as_posix() for file in files)
         others = {"README.md": None if readme is None else readme.encode(), SHEET: sheet}
         if form == CAPTURE:
-            digests = [
-                f"{hashlib.sha256((folder / name).read_bytes()).hexdigest()}  {name}\n"
-                for name in names
-            ]
-            others[MANIFEST] = "".join(digests).encode()
+            digests = {n: hashlib.sha256((folder / n).read_bytes()).hexdigest() for n in names}
+            lines = [f"{digest}  {name}\n" for name, digest in digests.items()]
+            others[MANIFEST] = "".join(lines).encode()
         for name, data in others.items():
             if data is not None:
                 write_through(folder / name, data)
