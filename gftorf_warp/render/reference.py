@@ -95,9 +95,9 @@ def rasterize(
     screen = None
     if screen_gradient:
         screen = ScreenGradient(values=field.mean.new_zeros(len(field), 4))
-    centre, seen_of = _watched(
-        splats, screen, [*field.parameters().values(), extra, *_tensors(background, sensor)]
-    )
+    lights = [background.quads, background.phasor, background.colour]
+    inputs = [*field.parameters().values(), extra, *lights, *_numbers(sensor)]
+    centre, seen_of = _watched(splats, screen, inputs)
 
     # What Gaussian k carries: columns weighted by T (colour, distance, 1, extra) and by T^2 (quads,
     # phasor)
@@ -147,21 +147,16 @@ def rasterize(
 def undecided_pixels(
     field: GaussianField, camera: Camera, settings: RenderSettings = RenderSettings()
 ) -> Bool[Tensor, "H W"]:
-    """Pixels where float32 may decide a rule differently from float64, so that a comparison has to
-    leave them out.
+    """Pixels where float32 may decide a rule differently from float64; comparisons leave them out.
 
-    A Gaussian counts from alpha = 1/255 on, its alpha is clamped at 0.99, a pixel stops at T =
-    1e-4, nearer Gaussians come first, a square is rounded out to tiles: each is a jump, and a pixel
-    that sits on one may fall either way.
+    Rules: alpha >= 1/255, the clamp at 0.99, the stop at T = 1e-4, the depth order, and the
+    rounding of a square to tiles.
     """
     with torch.no_grad():
-        exact = field.map(
-            lambda tensor: tensor.detach().double() if tensor.is_floating_point() else tensor
-        )
+        exact = field.map(lambda t: t.detach().double() if t.is_floating_point() else t)
         splats = project(exact, camera, settings)
-        blocks = _pixel_centres(camera, splats.distance).split(
-            max(1, BLOCK // max(1, len(splats.index)))
-        )
+        pixels = _pixel_centres(camera, splats.distance)
+        blocks = pixels.split(max(1, BLOCK // max(1, len(splats.index))))
         undecided = torch.cat([_undecided(block, splats, settings) for block in blocks])
     return undecided.reshape(camera.height, camera.width)
 
@@ -181,10 +176,8 @@ def _undecided(pixel: Tensor, splats: _Splats, settings: RenderSettings) -> Bool
     # a needle: its power may come out above zero
     jump |= (power.abs() < 1e-6 * rounding) & (raw >= ALPHA_MIN)
     if settings.support is Support.SIGMA3_TILE16:
-        wide, narrow = (
-            _inside_tiles(pixel, splats.centre, splats.covariance, margin=margin)
-            for margin in (1e-3, -1e-3)
-        )
+        ellipses = pixel, splats.centre, splats.covariance
+        wide, narrow = (_inside_tiles(*ellipses, margin=margin) for margin in (1e-3, -1e-3))
         jump |= (wide ^ narrow) & (raw >= (1.0 - 1e-4) * ALPHA_MIN)
     undecided = (jump & live).any(1)
 
@@ -216,26 +209,18 @@ def project(field: GaussianField, camera: Camera, settings: RenderSettings) -> _
     x, y, z = point.unbind(1)
     distance = point.norm(dim=1)
     limit_x, limit_y, radius = camera.guard
-    x_guarded, y_guarded = (
-        z * (x / z).clamp(-limit_x, limit_x),
-        z * (y / z).clamp(-limit_y, limit_y),
-    )
+    x_guarded = z * (x / z).clamp(-limit_x, limit_x)
+    y_guarded = z * (y / z).clamp(-limit_y, limit_y)
     zero = torch.zeros_like(z)
-    jacobian = torch.stack(
-        [
-            torch.stack([camera.fx / z, zero, -camera.fx * x_guarded / z**2], 1),
-            torch.stack([zero, camera.fy / z, -camera.fy * y_guarded / z**2], 1),
-        ],
-        1,
-    )
+    along_u = torch.stack([camera.fx / z, zero, -camera.fx * x_guarded / z**2], 1)
+    along_v = torch.stack([zero, camera.fy / z, -camera.fy * y_guarded / z**2], 1)
+    jacobian = torch.stack([along_u, along_v], 1)
     flat = x / z, y / z
     if camera.distortion:
         near = inside(x_guarded / z, y_guarded / z, radius)
         xx, xy, yy = camera.distortion.slope(*near)
         aspect = camera.fx / camera.fy
-        bend = torch.stack(
-            [torch.stack([xx, xy * aspect], 1), torch.stack([xy / aspect, yy], 1)], 1
-        )
+        bend = torch.stack([xx, xy * aspect, xy / aspect, yy], 1).unflatten(1, (2, 2))
         jacobian, flat = bend @ jacobian, camera.distortion.apply(*flat, radius)
     # Gamma, columns in metres
     axes = _rotation(field.quaternion[index]) * field.scale[index][:, None, :]
@@ -261,12 +246,10 @@ def _depth_key(z: Float[Tensor, "M"], settings: RenderSettings) -> Int[Tensor, "
 def _rotation(wxyz: Float[Tensor, "M 4"]) -> Float[Tensor, "M 3 3"]:
     """Rotation matrices of quaternions of any length."""
     w, x, y, z = (wxyz / wxyz.norm(dim=1, keepdim=True)).unbind(1)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return torch.stack([torch.stack(row, 1) for row in rows], 1)
+    entries = [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)]
+    entries += [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)]
+    entries += [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]
+    return torch.stack(entries, 1).unflatten(1, (3, 3))
 
 
 def spherical_harmonics(n: Float[Tensor, "M 3"], degree: int) -> Float[Tensor, "M K"]:
@@ -308,16 +291,10 @@ def correlate(
     d: Float[Tensor, "M"], reflectivity: Float[Tensor, "M 1"], sensor: Sensor, phasor_factor: float
 ) -> Float[Tensor, "M light"]:
     """Light of each Gaussian alone: its Q quads, then its phasor (method, 2.4)."""
-    f, phase_offset, dc_offset, source = (
+    f, phase_offset, dc_offset, source, shift = (
         torch.as_tensor(value, dtype=d.dtype, device=d.device)
-        for value in (
-            sensor.f_mod_hz,
-            sensor.phase_offset,
-            sensor.dc_offset,
-            sensor.source_intensity,
-        )
+        for value in (*_numbers(sensor), sensor.shifts)
     )
-    shift = torch.as_tensor(sensor.shifts, dtype=d.dtype, device=d.device)
     a = source * reflectivity / d[:, None] ** 2
     psi = (4.0 * math.pi / SPEED_OF_LIGHT * f * d + phase_offset)[:, None]
     quads = a * ((psi - shift).cos() + dc_offset)
@@ -375,11 +352,8 @@ def _inside_tiles(
     covariance: Float[Tensor, "M 3"],
     margin: float = 0.0,
 ) -> Bool[Tensor, "P M"]:
-    """The released support: a square of half-width ceil(3 sqrt(lambda_max)), rounded out to whole
-    tiles (method, 2.2).
-
-    The released code counts pixels from their integer centres, hence the half pixel. ``margin``
-    [px] widens the square.
+    """The released support: a square of half-width ceil(3 sqrt(lambda_max)) plus ``margin`` [px],
+    rounded out to whole tiles (method, 2.2), of pixels with integer centres, hence the half pixel.
     """
     xx, xy, yy = covariance.detach().unbind(1)
     middle = 0.5 * (xx + yy)
@@ -415,39 +389,25 @@ def _behind(
     """T_e times the background, first power in every channel; zero for a missing background."""
     if light is None:
         return 0.0
-    return T_end * torch.as_tensor(light, dtype=T_end.dtype, device=T_end.device).expand(
-        channels, *T_end.shape[1:]
-    )
+    values = torch.as_tensor(light, dtype=T_end.dtype, device=T_end.device)
+    return T_end * values.expand(channels, *T_end.shape[1:])
 
 
-def _tensors(background: Background, sensor: Sensor) -> list[object]:
-    """Everything besides the Gaussians that may ask for a gradient."""
-    lights = [background.quads, background.phasor, background.colour]
-    return [
-        *lights,
-        sensor.f_mod_hz,
-        sensor.phase_offset,
-        sensor.dc_offset,
-        sensor.source_intensity,
-    ]
+def _numbers(sensor: Sensor) -> tuple[float | Tensor, ...]:
+    """What a calibration may optimise."""
+    return sensor.f_mod_hz, sensor.phase_offset, sensor.dc_offset, sensor.source_intensity
 
 
 def _watched(
     splats: _Splats, screen: ScreenGradient | None, inputs: list[object]
 ) -> tuple[Float[Tensor, "M 2"], Float[Tensor, "M 2"]]:
-    """Image positions whose gradient is noted in ``screen``; pixels and weights, to be filled in by
-    the caller.
+    """Image positions with a hook that fills ``screen``; pixels and weights to be filled in.
 
-    A zero that needs a gradient is added, so that the note is taken even if the means are not
-    optimised.
+    A zero that needs a gradient is added, so that the hook runs even with fixed means.
     """
-    seen = torch.zeros_like(splats.centre)
-    centre = splats.centre
-    if screen is None or not any(
-        isinstance(value, Tensor) and value.requires_grad for value in inputs
-    ):
-        return centre, seen
-    if torch.is_grad_enabled():
+    seen, centre = torch.zeros_like(splats.centre), splats.centre
+    optimised = any(isinstance(value, Tensor) and value.requires_grad for value in inputs)
+    if screen is not None and optimised and torch.is_grad_enabled():
         centre = centre + torch.zeros_like(centre).requires_grad_()
 
         def note(grad: Tensor) -> None:

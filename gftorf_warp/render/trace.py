@@ -58,24 +58,16 @@ class RigidBody:
 
     def __post_init__(self):
         if not 0 <= self.gloss <= 1 or not 0 <= self.shininess < math.inf:
-            raise ValueError(
-                f"gloss must be 0 to 1, shininess 0 or more and finite, got {self.gloss} and "
-                f"{self.shininess}"
-            )
+            got = f"{self.gloss} and {self.shininess}"
+            raise ValueError(f"gloss must be 0 to 1, shininess 0 or more and finite, got {got}")
+        meshed = self.points is not None or self.triangles is not None
         if self.radius > 0 or self.normal is not None:
-            if (
-                self.points is not None
-                or self.triangles is not None
-                or (self.radius > 0) == (self.normal is not None)
-            ):
-                raise ValueError(
-                    "a body is a ball, a plane or has triangles, one and not both: "
-                    f"radius {self.radius}, normal {self.normal}"
-                )
+            if meshed or (self.radius > 0) == (self.normal is not None):
+                got = f"radius {self.radius}, normal {self.normal}"
+                raise ValueError(f"a body is a ball, a plane or triangles, not both: {got}")
             if not np.isfinite([*self.centre, self.height]).all():
-                raise ValueError(
-                    f"centre and height must be finite, got {self.centre} and {self.height}"
-                )
+                got = f"{self.centre} and {self.height}"
+                raise ValueError(f"centre and height must be finite, got {got}")
             if self.normal is not None and abs(np.linalg.norm(self.normal) - 1) > 1e-6:
                 raise ValueError(f"normal must have length 1, got {self.normal}")
             return
@@ -85,18 +77,16 @@ class RigidBody:
             )
         if not np.isfinite(self.points).all():
             raise ValueError("points must be finite")
-        if self.triangles.min() < 0 or self.triangles.max() >= len(self.points):
-            raise ValueError(
-                f"triangles name points {self.triangles.min()} to {self.triangles.max()} of "
-                f"{len(self.points)}"
-            )
+        first, last = self.triangles.min(), self.triangles.max()
+        if first < 0 or last >= len(self.points):
+            raise ValueError(f"triangles name points {first} to {last} of {len(self.points)}")
 
     @property
     def reach(self) -> float:
         """Distance of the farthest point from the centre [m]; unused for a plane."""
-        return (
-            self.radius if self.points is None else float(np.linalg.norm(self.points, axis=1).max())
-        )
+        if self.points is None:
+            return self.radius
+        return float(np.linalg.norm(self.points, axis=1).max())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,9 +116,8 @@ class Bounces:
 
     def __post_init__(self):
         if self.count < 0 or self.paths < 1:
-            raise ValueError(
-                f"count {self.count} must not be negative, and paths {self.paths} at least 1"
-            )
+            got = f"{self.count} and {self.paths}"
+            raise ValueError(f"count must not be negative and paths at least 1, got {got}")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -171,11 +160,10 @@ class FirstHits:
 
 
 class Tracer:
-    """Bodies on one device, and the images of one size that are made of them; nothing is allocated
-    between images.
+    """Bodies on one device and buffers for their images of one size.
 
     Args:
-        bodies: What there is.
+        bodies: Rigid bodies of the scene.
         width: Columns of the images [px].
         height: Rows of the images [px].
         harmonics: Multiples of the modulation frequency at which light is wanted.
@@ -200,18 +188,16 @@ class Tracer:
         self._meshes = [_mesh(body, self.device) for body in bodies]
         self._solids = _solids(bodies, self._meshes, self.device)
         self._poses: dict[int, tuple[wp.array, wp.array]] = {}
-        self._harmonics = wp.array(
-            np.asarray(harmonics, dtype=np.int32), dtype=wp.int32, device=self.device
-        )
+        self._harmonics = wp.array(harmonics, dtype=wp.int32, device=self.device)
         wanted = (threads or available_threads()) if self.device.is_cpu else 1
         self._parts = max(1, min(wanted, height // ROWS_MIN))
         shape = (height, width)
-        one, many = ((wp.float32, shape), (wp.vec2, (len(harmonics), *shape)))
-        self._direct = [self._empty(size, dtype) for dtype, size in (many, one, one)]
-        self._indirect = [self._empty(size, dtype) for dtype, size in (many, one, one)]
-        self._hits = [
-            self._empty(shape, dtype) for dtype in (wp.float32, wp.float32, wp.vec3, wp.int32)
-        ]
+        kinds = wp.vec2, wp.float32, wp.float32
+        sizes = (len(harmonics), *shape), shape, shape
+        self._direct = [*map(self._empty, sizes, kinds)]
+        self._indirect = [*map(self._empty, sizes, kinds)]
+        kinds = wp.float32, wp.float32, wp.vec3, wp.int32
+        self._hits = [self._empty(shape, dtype) for dtype in kinds]
 
     def light(
         self,
@@ -224,8 +210,7 @@ class Tracer:
         bounces: Bounces = Bounces(),
         seed: int = 0,
     ) -> Light:
-        """Light averaged over T instants: direct light over a grid of rays per pixel, the rest over
-        random paths.
+        """Light averaged over T instants: direct on a grid of rays, indirect over random paths.
 
         Args:
             cameras: The camera at each instant; only its pose may change.
@@ -240,25 +225,19 @@ class Tracer:
             ValueError: If there is no instant, or sizes do not fit.
         """
         if subsamples < 1 or not f_mod_hz > 0:
-            raise ValueError(
-                f"subsamples {subsamples} must be at least 1 and f_mod_hz {f_mod_hz} above 0"
-            )
+            got = f"{subsamples} and {f_mod_hz}"
+            raise ValueError(f"subsamples must be at least 1 and f_mod_hz above 0, got {got}")
         view = self._view(cameras[0])
         poses = self._place(cameras, world_from_body)
         inputs = [view, _emitter(lamp, f_mod_hz), self._harmonics, self._solids, *poses]
         self._over_rows(light_paths.trace_light, [*inputs, subsamples], self._direct)
         direct, amplitude, ambient = (array.numpy().copy() for array in self._direct)
-        total, error, direct = (
-            amplitude,
-            np.zeros_like(amplitude),
-            direct.view(np.complex64)[..., 0],
-        )
-        light = direct
+        total, error = amplitude, np.zeros_like(amplitude)
+        light = direct = direct.view(np.complex64)[..., 0]
         if bounces.count:
             count = -(-bounces.paths // len(cameras)) * len(cameras)
-            self._over_rows(
-                light_paths.trace_bounces, [*inputs, bounces.count, count, seed], self._indirect
-            )
+            inputs += [bounces.count, count, seed]
+            self._over_rows(light_paths.trace_bounces, inputs, self._indirect)
             more, indirect, error = (array.numpy().copy() for array in self._indirect)
             light, total = direct + more.view(np.complex64)[..., 0], amplitude + indirect
         return Light(
@@ -271,8 +250,7 @@ class Tracer:
         )
 
     def first_hits(self, camera: Camera, world_from_body: Float[np.ndarray, "B 4 4"]) -> FirstHits:
-        """What the centre ray of every pixel meets at one instant, with all bodies at these poses
-        [m].
+        """First hit of the centre ray of every pixel, with all bodies at these poses [m].
 
         Raises:
             ValueError: If sizes do not fit.
@@ -285,9 +263,8 @@ class Tracer:
 
     def _view(self, camera: Camera) -> CameraView:
         if (camera.width, camera.height) != (self.width, self.height):
-            raise ValueError(
-                f"camera {camera.width}x{camera.height} must be {self.width}x{self.height}"
-            )
+            want = f"{self.width}x{self.height}"
+            raise ValueError(f"camera {camera.width}x{camera.height} must be {want}")
         return view_of(camera, RenderSettings())
 
     def _place(
@@ -299,17 +276,14 @@ class Tracer:
             raise ValueError(
                 f"world_from_body {world_from_body.shape} must be {want}, with at least one instant"
             )
-        world_from_camera = np.linalg.inv(
-            np.stack([camera.camera_from_world for camera in cameras])
-        )
-        body_from_camera = (np.linalg.inv(world_from_body) @ world_from_camera[:, None]).astype(
-            np.float32
-        )
-        rotation, translation = self._poses.setdefault(
-            len(cameras), tuple(self._empty(want[:2], dtype) for dtype in (wp.mat33, wp.vec3))
-        )
-        rotation.assign(np.ascontiguousarray(body_from_camera[..., :3, :3]))
-        translation.assign(np.ascontiguousarray(body_from_camera[..., :3, 3]))
+        world_from_camera = np.linalg.inv([camera.camera_from_world for camera in cameras])
+        poses = np.linalg.inv(world_from_body) @ world_from_camera[:, None]
+        if len(cameras) not in self._poses:
+            arrays = self._empty(want[:2], wp.mat33), self._empty(want[:2], wp.vec3)
+            self._poses[len(cameras)] = arrays
+        rotation, translation = self._poses[len(cameras)]
+        rotation.assign(poses[..., :3, :3].astype(np.float32, order="C"))
+        translation.assign(poses[..., :3, 3].astype(np.float32, order="C"))
         return rotation, translation
 
     def _over_rows(self, kernel, inputs: list, outputs: list[wp.array]) -> None:
@@ -337,13 +311,11 @@ class Tracer:
 def _mesh(body: RigidBody, device: wp.Device) -> wp.Mesh | None:
     if body.points is None or body.triangles is None:
         return None
-    points = wp.array(
-        np.ascontiguousarray(body.points, dtype=np.float32), dtype=wp.vec3, device=device
+    points, indices = np.asarray(body.points, np.float32), np.asarray(body.triangles, np.int32)
+    return wp.Mesh(
+        points=wp.array(points, dtype=wp.vec3, device=device),
+        indices=wp.array(indices.ravel(), dtype=wp.int32, device=device),
     )
-    indices = wp.array(
-        np.ascontiguousarray(body.triangles, dtype=np.int32).ravel(), dtype=wp.int32, device=device
-    )
-    return wp.Mesh(points=points, indices=indices)
 
 
 def _emitter(lamp: Lamp, f_mod_hz: float) -> light_paths.Emitter:
@@ -357,9 +329,7 @@ def _emitter(lamp: Lamp, f_mod_hz: float) -> light_paths.Emitter:
     return emitter
 
 
-def _solids(
-    bodies: Sequence[RigidBody], meshes: Sequence[wp.Mesh | None], device: wp.Device
-) -> wp.array:
+def _solids(bodies: Sequence[RigidBody], meshes: Sequence, device: wp.Device) -> wp.array:
     solids = []
     for body, mesh in zip(bodies, meshes, strict=True):
         solid = rays.Solid()
