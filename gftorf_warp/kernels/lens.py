@@ -1,7 +1,6 @@
-"""A lens that distorts, as kernels see it: where it images what, its derivative, its inverse, and
-splats behind it.
+"""Lens distortion, its derivative, its inverse, and covariances of splats.
 
-The formulas, and what becomes of a polynomial outside the image, are those of scene/distortion.py.
+The formulas, also outside the image, are those of scene/distortion.py.
 """
 
 import warp as wp

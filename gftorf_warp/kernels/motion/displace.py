@@ -88,8 +88,7 @@ def make_displace(K: int) -> SimpleNamespace:
         # Out:
         moved: wp.array[wp.vec3],  # [N] centres [m]
         turned: wp.array[wp.vec4],  # [N] orientations wxyz; empty: no rotation
-        channels: wp.array2d[wp.vec3],  # [N, D] displacements between two times [m]; empty: not
-        #  computed
+        channels: wp.array2d[wp.vec3],  # [N, D] displacements between times [m], or empty
     ):
         """One thread per Gaussian."""
         i = wp.tid()
@@ -114,10 +113,8 @@ def make_displace(K: int) -> SimpleNamespace:
         by_channels: wp.array2d[wp.vec3],  # [N, D] cotangent of ``channels``; empty: zero
         # Out:
         grad_offset: wp.array2d[wp.vec3],  # [K, N] gradient w.r.t. ``offset``; empty: not computed
-        grad_rotation: wp.array2d[wp.vec4],  # [K, N] gradient w.r.t. ``rotation``; empty: not
-        #  computed
-        grad_quaternion: wp.array[wp.vec4],  # [N] gradient w.r.t. ``quaternion``; empty: not
-        #  computed
+        grad_rotation: wp.array2d[wp.vec4],  # [K, N] gradient w.r.t. ``rotation``, or empty
+        grad_quaternion: wp.array[wp.vec4],  # [N] gradient w.r.t. ``quaternion``, or empty
     ):
         """One thread per Gaussian."""
         i = wp.tid()

@@ -1,13 +1,9 @@
 """The list of rows that have a gradient, made on the device, so that kernels skip the others.
 
-Rows of k keys lie one key after the other. The list has each key's in ascending order, ``NO_ROW``
-behind them up to a multiple of ``TILE``, which is what kernels multiply at once. Blocks of rows are
-counted, then each block finds what is before it from all counts and writes its rows: the order is
-fixed, and launch sizes do not depend on the list.
-
-A NaN counts as a gradient. A row of zeros adds nothing to any weight's gradient, unless an output
-of it is infinite: with all rows 0 times infinity is NaN and the update skipped, with a list such a
-row is not read.
+The list has each key's rows in ascending order, padded with ``NO_ROW`` to a multiple of ``TILE``.
+Blocks of rows are counted, then each block writes its rows behind those before it: the order is
+fixed, and launch sizes do not depend on the list. A NaN counts as a gradient; a row of zeros is not
+read, even if an output of it is infinite.
 """
 
 import warp as wp
@@ -133,8 +129,7 @@ def list_rows(
     counts: wp.array[wp.int32],  # [k blocks] of ``count_rows``
     count: int,  # N [1]
     # Out:
-    listed: wp.array[wp.int32],  # [``capacity``] rows with a gradient, key by key, each up to a
-    #  whole tile
+    listed: wp.array[wp.int32],  # [``capacity``] rows with a gradient, each key in whole tiles
     begins: wp.array[wp.int32],  # [k + 1] where the part of each key begins, and the end
 ):
     """One block of threads for ``BLOCK`` rows of a key."""

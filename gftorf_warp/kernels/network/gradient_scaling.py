@@ -1,8 +1,6 @@
-"""Loss scaling before the backward pass, and reductions: gradients of offsets become halves,
-partial sums are added.
+"""Loss scaling before the backward pass: gradients of offsets become halves; and reductions.
 
-A kernel writes one partial result per warp, on the CPU per row, and the next one adds them up in a
-fixed order.
+One partial result per warp, on the CPU per row, is added up in a fixed order by the next kernel.
 """
 
 import warp as wp

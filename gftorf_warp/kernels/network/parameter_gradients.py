@@ -1,11 +1,8 @@
-"""Gradients of the network's parameters over listed rows: the head's weight, and all of them from
-partial sums.
+"""Parameter gradients over listed rows: the head's weight, and all of them from partial sums.
 
-The head has three outputs, so its weight gradient is what reading 512 bytes of every listed row
-costs: warps walk rows, a lane has eight of 256 inputs times three outputs in registers. ``collect``
-then adds up parts of all weights in their order, has biases and what gamma(t) meets from sums of
-slopes over rows, and takes the scale off: a thread per parameter, which lie as
-``perceptron.Layers`` says.
+The head has three outputs: a lane has eight of 256 inputs times three outputs in registers.
+``collect`` adds parts of all weights in their order, takes biases and weights of gamma(t) from sums
+over rows, and removes the scale: a thread per parameter, ordered as in ``perceptron.Layers``.
 """
 
 import warp as wp
@@ -111,8 +108,7 @@ def multiply_head(
     after: wp.array2d[wp.float16],  # [k N, HEAD] gradient at the head
     outputs: wp.array3d[wp.float16],  # [layers, k N, WIDTH] of all rows
     # Out:
-    partials: wp.array3d[float],  # [parts, 1, VALUES WIDTH] gradients of the head's weight by parts
-    #  of the list
+    partials: wp.array3d[float],  # [parts, 1, VALUES WIDTH] gradients of the head by parts
 ):
     """One block of threads for a part of the list."""
     part = wp.tid() // threads

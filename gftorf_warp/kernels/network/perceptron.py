@@ -1,9 +1,7 @@
-"""All layers of a perceptron in one launch, forward and backward; render/layers.py has the
-formulas.
+"""All layers of a perceptron in one launch, forward and backward; formulas: render/layers.py.
 
-``wgmma.py`` takes rows through the layers. Here parameters are made ready for it: weights rounded
-and packed in the order in which tensor cores read them, what a layer makes of gamma(t) added to its
-bias.
+``wgmma.py`` has the passes. Here weights are rounded and packed in the order in which tensor cores
+read them, and the contribution of gamma(t) is added to the biases.
 """
 
 import warp as wp
@@ -85,17 +83,14 @@ def pack(
     time: wp.array2d[float],  # [k, t] gamma(t)
     # Out:
     forth: wp.array[wp.float16],  # [4 PART ..] of all layers
-    back: wp.array[wp.float16],  # [4 PART ..] of all but the first, last one first, transposed,
-    #  without gamma(x)
+    back: wp.array[wp.float16],  # [4 PART ..] transposed, from the last layer to the second
     head: wp.array[wp.float16],  # [HEAD WIDTH] of the head, row by row, zeros below
     shifts: wp.array3d[float],  # [layers, k, WIDTH] what is added to every row of a key in a layer
 ):
-    """Round weights to halves, in the order in which tensor cores read them; a thread per 16 bytes,
-    then per shift.
+    """Round and pack weights, a thread per 16 bytes; then compute shifts, a thread for each.
 
-    A block of 64 inputs has a row of 128 bytes for every output, pieces of 16 bytes exchanged by
-    the last three bits of its number. Outputs and inputs are numbered as the products number them;
-    ``p`` and ``k`` are what they stand for.
+    A block of 64 inputs has a row of 128 bytes per output, swizzled in units of 16 bytes by the
+    last three bits of its number. ``p`` and ``k`` are output and input of a packed position.
     """
     at = wp.tid() * UNIT
     if at >= forth.shape[0] + back.shape[0] + head.shape[0]:
@@ -161,8 +156,7 @@ def forward(
     shifts: wp.array3d[float],  # [layers, k, WIDTH]
     # Out:
     outputs: wp.array3d[wp.float16],  # [layers, k N, WIDTH] of every layer
-    masks: wp.array[wp.int32],  # [``mask_words``] bits of what is above 0, as lanes have it; on
-    #  CUDA
+    masks: wp.array[wp.int32],  # [``mask_words``] bits of outputs above 0, per lane; on CUDA
 ):
     """From gamma(x) to the output of the last layer, at all keys."""
     # how Warp is told of shared memory
@@ -185,10 +179,8 @@ def backward(
     outputs: wp.array3d[wp.float16],  # [layers, k N, WIDTH] of ``forward``
     masks: wp.array[wp.int32],  # [``mask_words``] of ``forward``
     # Out:
-    slopes: wp.array3d[wp.float16],  # [layers, capacity, WIDTH] of the listed rows, as they are
-    #  listed; 0 for no row
-    partials: wp.array4d[float],  # [layers, k, GROUPS blocks, WIDTH] added to: sums of slopes over
-    #  rows
+    slopes: wp.array3d[wp.float16],  # [layers, capacity, WIDTH] of the listed rows; 0 for padding
+    partials: wp.array4d[float],  # [layers, k, GROUPS blocks, WIDTH] added to: sums over rows
 ):
     """Gradients of all layers for the listed rows; nothing is written behind the last one."""
     wp.tile_zeros(shape=(_FOURS,), dtype=wp.vec4, storage="shared")

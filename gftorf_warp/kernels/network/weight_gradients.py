@@ -1,15 +1,11 @@
-"""Weight gradients over listed rows: dW = d^T h, d in the order of the list, h in that of the
-forward pass.
+"""Weight gradients dW = d^T h over listed rows, d in list order, h in that of the forward pass.
 
 A block of 256 threads has 128 outputs of a layer times all its inputs, 256 of the layer before or
-64 of gamma(x), and a part of the list; each of its eight warps has 64 of the outputs and a quarter
-of the inputs in registers. Tiles of 64 rows come into shared memory ahead, ``STAGES`` of them,
-pieces of 16 bytes exchanged by the last three bits of the row so that eight rows never meet in a
-bank. ``ldmatrix`` turns both factors over on their way to ``mma.sync`` (PTX, m16n8k16).
-
-Both kinds run at once: a block has a multiprocessor or half of one, and none waits for another.
-Parts are sums of their own, added up in a fixed order by parameter_gradients.py. On a CPU one
-thread does the same row by row in float32.
+64 of gamma(x), and a part of the list; a warp has 64 of the outputs and a quarter of the inputs in
+registers. ``STAGES`` tiles of 64 rows are copied to shared memory ahead, swizzled in units of 16
+bytes by the last three bits of the row. ``ldmatrix`` transposes both factors for ``mma.sync`` (PTX,
+m16n8k16). parameter_gradients.py adds the parts in a fixed order. On a CPU one thread does the same
+row by row in float32.
 """
 
 import warp as wp
@@ -219,8 +215,7 @@ def multiply_outputs(
     slopes: wp.array3d[wp.float16],  # [layers, capacity, WIDTH] of listed rows
     outputs: wp.array3d[wp.float16],  # [layers, k N, WIDTH] of all rows
     # Out:
-    partials: wp.array3d[float],  # [parts, (layers - 1) HALVES, HALF WIDTH] weight gradients by
-    #  parts of the list
+    partials: wp.array3d[float],  # [parts, (layers - 1) HALVES, HALF WIDTH] gradients by parts
 ):
     """One block of threads for half a layer and a part of the list."""
     # so Warp knows of it
@@ -254,8 +249,7 @@ def multiply_positions(
     slopes: wp.array3d[wp.float16],  # [layers, capacity, WIDTH] of listed rows
     position: wp.array2d[wp.float16],  # [N, COLUMNS] gamma(x)
     # Out:
-    partials: wp.array3d[float],  # [parts, entries HALVES, HALF COLUMNS] weight gradients by parts
-    #  of the list
+    partials: wp.array3d[float],  # [parts, entries HALVES, HALF COLUMNS] gradients by parts
 ):
     """One block of threads for half a layer that gamma(x) enters and a part of the list."""
     wp.tile_zeros(shape=(wp.static(shared(COLUMNS) // 16),), dtype=wp.vec4, storage="shared")

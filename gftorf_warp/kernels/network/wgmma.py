@@ -1,18 +1,14 @@
 """The layers of a perceptron on Hopper's tensor cores, as C++ for CUDA, and row by row for the CPU.
 
-Rows are independent, so a block of threads computes all layers of its rows independently of others.
-Two groups of four warps have tiles of 64 rows each: while one multiplies, the other adds shifts,
-masks, rounds and stores. Weights come in blocks of 64 inputs into a ring in shared memory, copied
-from global memory ahead of the layer that needs them. Rows never meet shared memory: what a lane
-stores of a row is what it reads of it one layer later, so that groups wait for each other only
-before weights are overwritten.
+A block of threads computes all layers of its rows. Two groups of four warps have tiles of 64 rows
+each: while one multiplies, the other adds shifts, masks, rounds and stores. Blocks of 64 inputs of
+the weights are copied ahead into a ring in shared memory. Rows stay out of it: a lane reads what it
+stored one layer before, so groups wait for each other only before weights are overwritten. To that
+end weights are packed so that a lane's share of a row, of inputs and of outputs, is eight
+neighbours, 16 bytes (``perceptron.pack``). Sums over the rows of a key, the gradients of biases,
+stay in registers until the key ends.
 
-That works because the order of a sum over inputs is free, and that of outputs too: weights are
-packed so that a lane's share of a row, of inputs and of outputs, is eight neighbours, 16 bytes
-(``perceptron.pack``). Sums over the rows of a key, which gradients of biases are, stay in registers
-until the key has passed.
-
-On a CPU one thread does the same row by row, float32 on halves: to compare with, not to be fast.
+On a CPU one thread does the same row by row, float32 on halves: a reference for tests.
 """
 
 import warp as wp
@@ -20,9 +16,7 @@ import warp as wp
 WIDTH = 256  # outputs of a layer
 COLUMNS = 64  # of gamma(x), zeros included: one block of inputs
 TILE = 64  # rows that a group multiplies at once
-# tiles that a block takes through all layers before it goes on to others: so they are still in
-# cache
-ROUND = 12
+ROUND = 12  # tiles that a block takes through all layers at a time, so that they stay in cache
 GROUPS = 2  # of 128 threads
 BLOCK = 128 * GROUPS  # threads
 HEAD = 8  # columns of the gradient at the head: 16 bytes, of which VALUES are used
@@ -474,9 +468,8 @@ _INDEX_OF = f"""
 # key by key, in order
 _ALL_ROWS = f"""const int of_key = (count + {TILE - 1}) / {TILE}, tiles = keys * of_key;"""
 
-# Rows of a list, those of each key padded to whole tiles. Gradients are in the order of the list,
-# as if there were one key with as many rows as a list can have; everything else is in the order of
-# the forward pass
+# Listed rows, each key padded to whole tiles. Gradients are in list order, as if there were one key
+# with as many rows as a list can have; everything else is in the order of the forward pass
 _LISTED_ROWS = f"""const int in_key = (of_rows + {TILE - 1}) / {TILE};
     const int keys = 1, of_key = of_keys * in_key, count = {TILE} * of_key, tiles =
         starts.data[of_keys] / {TILE};

@@ -36,9 +36,7 @@ from .splat import AHEAD, Splat, block_missed, load_splat, prefetch
 # planes of ``light``, each [tiles, lanes] of V
 RE, IM, AMPLITUDE, DISTANCE, DISTORTION, SUM_ZETA, SUM_ZETA2, TRANSMITTANCE, LAST = range(9)
 LIGHT_PLANES = 9
-# [m] of a splat: padding records have distance 0, which must not become infinite times a weight of
-# 0
-NEAREST = 1e-6
+NEAREST = 1e-6  # [m] of a splat: padding records have distance 0 and weight 0
 CHANNEL_PLANES = 3  # planes of ``channel``
 
 
@@ -183,8 +181,7 @@ def make_composite(
         sums: wp.array3d[V],  # [9, tiles, lanes] planes RE .. LAST of ``light``
         channel: wp.array3d[V],  # [3, tiles, lanes] the three channels
         more_channel: wp.array3d[V],  # [3, tiles, lanes] the further channels
-        states: wp.array3d[V],  # [5 (segments - 1), tiles, lanes] where segments end, see
-        #  list_segments.py
+        states: wp.array3d[V],  # [5 (segments - 1), tiles, lanes] see list_segments.py
     ):
         """One thread per block of K pixels; on CUDA a warp per tile, with uniform control flow."""
         t, lane = wp.tid()
@@ -308,13 +305,9 @@ def make_composite(
                         distance = axpy(distance, w, q[14])
                     if wp.static(spreads):
                         zeta = zeta_of(q[14], mapping) - zeta0
-                        # sum over pairs, one splat at a time: w (zeta^2 A - 2 zeta M + V), the
-                        # weight so far A = 1 - T
-                        spread = axpy(
-                            axpy(affine(T, -zeta * zeta, zeta * zeta), sum_zeta, -2.0 * zeta),
-                            sum_zeta2,
-                            1.0,
-                        )
+                        # w (zeta^2 A - 2 zeta M + V), with the weight so far A = 1 - T
+                        spread = affine(T, -zeta * zeta, zeta * zeta)
+                        spread = axpy(axpy(spread, sum_zeta, -2.0 * zeta), sum_zeta2, 1.0)
                         distortion = fma(distortion, w, spread)
                         sum_zeta = axpy(sum_zeta, w, zeta)
                         sum_zeta2 = axpy(sum_zeta2, w, zeta * zeta)

@@ -7,10 +7,9 @@ the T^2-weighted ones, and T_e, E = T_e dL/dT_e behind the last splat (method, s
     T <- T / (1 - alpha);  dL/dalpha = tau T + sigma T^2 - E / (1 - alpha);  E <- E + w (tau + 2
     sigma T),  w = alpha T
 
-E is the gradient of everything behind. Computed back to front it is accurate; front to back it
-would be a difference of sums that is noise behind a surface. The distortion is quadratic in w: its
-tau uses the final sums. The generated adjoint of the forward loop would be wrong without a warning,
-since dynamic loops are not replayed.
+E is the gradient of everything behind; front to back it would be a difference of sums, noise behind
+a surface. The distortion is quadratic in w: its tau uses the final sums. Warp's adjoint of the
+forward loop would be silently wrong, since dynamic loops are not replayed.
 """
 
 import functools
@@ -41,8 +40,7 @@ from .shared_batches import (
 from .simd import make_lanes, sums_of, types_of, warp_max
 from .splat import AHEAD, Splat, block_missed, load_splat, prefetch
 
-# planes of ``grad_sums``, each [tiles, lanes] of V: gradients of the first five planes of the
-# forward pass, and of T_e
+# planes of ``grad_sums``: gradients of the first five planes of the forward pass, and of T_e
 GRAD_TRANSMITTANCE = 5
 GRAD_LIGHT_PLANES = 6
 V1 = make_lanes(1).V
@@ -92,8 +90,7 @@ def finish_moments(
     # In:
     splats: wp.array[Splat],  # [N] records, see splat.py
     # Out:
-    grad_splats: wp.array[Splat],  # [N] moments in slots 0-5, replaced by gradients of the same
-    #  slots
+    grad_splats: wp.array[Splat],  # [N] moments in slots 0-5, replaced by gradients
 ):
     """One thread per splat: with v = dL/dpower, moments of v to gradients of centre and opacity."""
     n = wp.tid()
@@ -193,11 +190,9 @@ def make_composite_backward(
         grad_sums: wp.array3d[V],  # [6, tiles, lanes] gradients of RE .. DISTORTION and of T_e
         grad_channel: wp.array3d[V],  # [3, tiles, lanes] gradients of the three channels
         grad_more: wp.array3d[V],  # [3, tiles, lanes] gradients of the further channels
-        states: wp.array3d[V],  # [5 (segments - 1), tiles, lanes] where segments end, see
-        #  list_segments.py
+        states: wp.array3d[V],  # [5 (segments - 1), tiles, lanes] see list_segments.py
         # Out:
-        grad_splats: wp.array[Splat],  # [N] added to: moments in 0-5, pixels in 6, weights in 7,
-        #  gradients in 8-15
+        grad_splats: wp.array[Splat],  # [N] added to: moments, pixels, weights, gradients
         more_splats: wp.array[Splat],  # [N] added to: slots 8-10, gradients of the further channels
     ):
         """One thread per block of K pixels, back to front; a warp per segment of a list."""
@@ -327,9 +322,8 @@ def make_composite_backward(
                     g_d = zero
                     if wp.static(light):
                         tau = axpy(tau, g_distance, q[14])
-                        sigma_T = mul(
-                            axpy(axpy(scaled(g_re, q[11]), g_im, q[12]), g_amplitude, q[13]), T
-                        )
+                        sigma = axpy(axpy(scaled(g_re, q[11]), g_im, q[12]), g_amplitude, q[13])
+                        sigma_T = mul(sigma, T)
                         g_d = g_distance
                         w2 = mul(w, T)
                     if wp.static(spreads):
@@ -340,11 +334,8 @@ def make_composite_backward(
                             g_d = fma(g_distance, twice_g_distortion, spread)
                         else:  # zeta changes with the distance by mapping[1] / distance^2
                             far = wp.max(q[14], wp.static(NEAREST))
-                            g_d = fma(
-                                g_distance,
-                                scaled(twice_g_distortion, mapping[1] / (far * far)),
-                                spread,
-                            )
+                            slope = scaled(twice_g_distortion, mapping[1] / (far * far))
+                            g_d = fma(g_distance, slope, spread)
                     tau = add(tau, sigma_T)
                     v = fnma(mul(w, tau), E, mul(alpha, restored))  # alpha dL/dalpha
                     E = fma(E, w, add(tau, sigma_T))

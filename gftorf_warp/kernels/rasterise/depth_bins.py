@@ -1,11 +1,8 @@
-"""Depth order of few splats without a sort: depth keys are counted into bins, and compared within a
-bin.
+"""Depth order of few splats without a sort: depth keys are counted into bins, compared within one.
 
-A radix sort of 20,000 keys takes a pass over all of them for every eight bits, each of which waits
-for the one before. Here a bin is the highest bits of a key. The first place of a bin is a sum over
-the bins before it; within a bin every splat counts those in front of it: with a smaller key, or an
-equal one and a smaller index, one comparison of both in 64 bits. Culled splats have one more bin,
-which is not ordered.
+A bin is the highest bits of a key. Its first place is a sum over the bins before it; within it
+every splat counts those in front: with a smaller key, or an equal one and a smaller index, one
+comparison in 64 bits. Culled splats have one more bin, which is not ordered.
 """
 
 import warp as wp
@@ -48,8 +45,7 @@ def fill_bins(
     first: wp.array[int],  # [COUNTS] first place of each bin
     places: wp.array[wp.int32],  # [N] of each splat in its bin
     # Out:
-    members: wp.array[wp.int64],  # [N] key and index of every splat in the upper and the lower
-    #  half, bin by bin
+    members: wp.array[wp.int64],  # [N] (key << 32 | index) of every splat, bin by bin
 ):
     """A thread per splat."""
     n = wp.tid()

@@ -16,8 +16,7 @@ def number_pairs(
     total: wp.array[int],  # [1] number of pairs, also of those that do not fit
     capacity: int,  # pairs that fit [1]
     # Out:
-    ids: wp.array[wp.int32],  # [>= capacity] splat of each pair as written; replaced by the number
-    #  of the pair
+    ids: wp.array[wp.int32],  # [>= capacity] splat of each pair, replaced by the pair's number
     owners: wp.array[wp.int32],  # [capacity] splat of each pair; 0 where there is none
 ):
     """One thread per pair that fits."""

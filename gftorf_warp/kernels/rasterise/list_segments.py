@@ -1,12 +1,9 @@
-"""A tile's list in segments of equal length, so that several warps traverse it at once in the
-backward pass.
+"""A tile's list in segments of equal length, one warp for each in the backward pass.
 
-One warp takes the entries of a list one after the other, however much of a GPU is idle. In the
-backward pass, the order enters by two numbers of a pixel only, T and E (composite_backward.py). So
-the forward pass stores, where a segment ends, T and what each later segment has added to the pixel:
-E behind a segment is the gradient of the outputs times the sum over all later segments, light
-twice, since it is weighed by T^2. Sums of later segments are added from the back: differences of
-sums over the whole list would be noise behind a surface.
+The order enters by two numbers of a pixel, T and E (composite_backward.py). The forward pass stores
+T where a segment ends, and what each later segment has added to the pixel: E behind a segment is
+the gradient of the outputs times the sum over all later ones, light twice, as its weight is T^2.
+Later segments are added from the back: differences of sums would be noise behind a surface.
 """
 
 import warp as wp
@@ -15,8 +12,7 @@ from .shared_batches import ROUND
 
 # entries of a segment at least: the state of a pixel is read and written for each
 SHORTEST = wp.constant(64)
-# of each end but the last: T there, and what the next segment adds to RE, IM, AMPLITUDE and
-# DISTANCE
+# of each end but the last: T, and the next segment's share of RE, IM, AMPLITUDE and DISTANCE
 PLANES = 5
 
 

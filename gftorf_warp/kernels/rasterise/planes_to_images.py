@@ -4,9 +4,8 @@
     phasor = eta light + T_e background
     colour = channels + T_e background,   opacity = 1 - T_e,   distortion = factor * (half sum)
 
-(method, section 2.6). Everything is linear in light and T_e: whatever the number of quads, the
-compositor gets back three gradients of the light and one of T_e per pixel. Each output has its own
-pair of kernels; the adjoints add up.
+(method, section 2.6), all linear in light and T_e. Each output has a pair of kernels; the adjoints
+add up.
 """
 
 import warp as wp
@@ -112,8 +111,7 @@ def fold_dc_offset(
     tiling: Tiling,  # order of the pixels [px]
     grad_quads: wp.array3d[float],  # [Q, H, W]
     # Out:
-    grad_rows: wp.array[wp.float64],  # [H] contribution of each row to the derivative by the DC
-    #  offset
+    grad_rows: wp.array[wp.float64],  # [H] derivative by the DC offset, contribution of each row
 ):
     """One thread per row: sum of amplitude times gradient, in double precision."""
     y = wp.tid()

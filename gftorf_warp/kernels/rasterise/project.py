@@ -22,12 +22,10 @@ BLOCK_RADIUS = wp.constant(2.1214)
 
 @wp.func
 def visit_of(opacity: float, cov: wp.vec4) -> wp.vec2:
-    """(low, limit) of a record: low is the power at alpha 1/255; limit, conservative, decides which
-    blocks are visited.
+    """(low, limit) of a record: power at alpha 1/255, and bound for visiting a block.
 
-    With K the conic, sqrt(v K v) is a norm: it changes by at most sqrt(largest eigenvalue) times
-    the distance. So where it exceeds sqrt(cutoff) by that much at the middle of a block, no pixel
-    centre of the block lies inside the ellipse.
+    With K the conic, sqrt(v K v) is a norm, which changes by at most sqrt(largest eigenvalue) times
+    the distance; so does the bound between the middle of a block and its pixel centres.
     """
     cutoff = 2.0 * wp.log(opacity / ALPHA_MIN)
     middle = 0.5 * (cov[0] + cov[2])
@@ -62,8 +60,7 @@ def square_of(view: CameraView, x: float, y: float, cov: wp.vec4) -> wp.vec4i:
     """Pixels [x0, y0, x1, y1) of the 3-sigma square rounded out to 16-pixel tiles, as the released
     code has it.
 
-    That code counts from integer pixel centres, so ``x`` and ``y`` are image positions less half a
-    pixel.
+    Its pixel centres are integers: ``x`` and ``y`` are image positions less half a pixel.
     """
     middle = 0.5 * (cov[0] + cov[2])
     determinant = cov[3]
@@ -92,8 +89,7 @@ def make_project(colour: bool, square: bool, lens: bool = False):
     def project(
         # In:
         view: wp.array[CameraView],  # [1] the camera [m, px]
-        calibration: wp.array[float],  # [4] phase slope [rad/m], phase offset [rad], source
-        #  intensity [1], DC offset
+        calibration: wp.array[float],  # [4] phase slope [rad/m], offset [rad], source, DC offset
         degree: int,  # harmonics above it are ignored [0..3]
         depth_shift: int,  # lowest bits of a z-depth that its key leaves out [1]
         depth_culled: int,  # depth key of what is culled, behind all others [1]
@@ -105,10 +101,8 @@ def make_project(colour: bool, square: bool, lens: bool = False):
         colour_sh: wp.array2d[wp.vec3],  # [N, 16] harmonics of RGB; [0, 0] without colour
         # Out:
         splats: wp.array[Splat],  # [N] records, see splat.py; undefined where culled
-        box_px: wp.array[wp.vec4i],  # [N] x0, y0, x1, y1 of the pixels a splat may touch [px]; x1 =
-        #  0: culled
-        depth_key: wp.array[wp.int32],  # [>= N] floats from the nearest z-depth to this one,
-        #  without the lowest bits
+        box_px: wp.array[wp.vec4i],  # [N] x0, y0, x1, y1 of touched pixels [px]; x1 = 0: culled
+        depth_key: wp.array[wp.int32],  # [>= N] floats from ``near`` to the z-depth, high bits
         order: wp.array[wp.int32],  # [>= N] 0, 1, 2, ...
     ):
         """One thread per Gaussian."""

@@ -1,15 +1,13 @@
 """Splat records, and gradients of them, through shared memory: sixteen entries of a tile's list at
 a time.
 
-A list is processed in rounds of ``ROUND`` entries. While a warp computes one round, the records of
-the next one are copied from global to shared memory asynchronously (cp.async), two lanes per
-record; every lane then reads the same record, a broadcast. In the backward pass each lane stores
-the contributions of its pixel to the records of a round in shared memory; for the sums over pixels,
-a lane is assigned one record and one half of the tile. That costs a fifth of a warp reduction per
-record.
+While a warp computes a round of ``ROUND`` entries, the records of the next one are copied to shared
+memory asynchronously (cp.async), two lanes per record; every lane then reads the same record. In
+the backward pass each lane stores the contributions of its pixel; for the sums over pixels, a lane
+has one record and one half of the tile, a fifth of the cost of a warp reduction per record.
 
-On a CPU there is no shared memory: records are read directly, and the other functions do nothing.
-All 32 lanes of a warp must call each function together.
+On a CPU records are read directly, and the other functions do nothing. All 32 lanes of a warp must
+call each function together.
 """
 
 import functools
@@ -23,17 +21,14 @@ from .splat import Splat
 # entries of a list that are fetched, and whose gradients are summed, together
 ROUND = wp.constant(16)
 GROUP = wp.constant(4)  # of a round that are unrolled together, so that their instructions overlap
-# floats from the values of one entry to those of the next: 4-float reads of 8 lanes meet all 32
-# banks
-STRIDE = 36
+STRIDE = 36  # floats from entry to entry: 4-float reads of 8 lanes meet all 32 banks
 OUT_STRIDE = 20  # the same for gradient records
 PIXELS = 32  # of a tile
 HIT = 1.0e30  # times the smallest weight of a pixel that is reached, 4e-9, it is far above 1
 
 _RECORDS = 2 * ROUND * 16  # two buffers of records [floats]
 _MORE = 2 * ROUND * 4  # two buffers of further channels [floats]
-# adds four floats where any is not zero; slot 11 of further channels gets 0.0, which changes
-# nothing
+# adds four floats where any is not zero; slot 11 of further channels gets 0.0
 _ADD4 = """auto add4 = [](float* to, float4 v, bool wanted) {
         if (!wanted || (v.x == 0.0f && v.y == 0.0f && v.z == 0.0f && v.w == 0.0f)) return;
 #if __CUDA_ARCH__ >= 900
@@ -49,12 +44,8 @@ _CHECK = (
 
 
 def shared_floats(values: int, derivatives: int) -> int:
-    """Floats of shared memory of a warp: two buffers of records, and the values of the backward
-    pass.
-
-    Args:
-        values: Values per pixel and entry of a round.
-        derivatives: Groups of four derivatives that belong to a pixel.
+    """Floats of shared memory of a warp: two buffers of records, and, in the backward pass, some
+    ``values`` per pixel and entry of a round, and groups of four ``derivatives`` per pixel.
     """
     kept = max(values * ROUND * STRIDE, 2 * ROUND * OUT_STRIDE) if values else 0
     return _RECORDS + 4 * PIXELS * derivatives + kept
@@ -275,37 +266,24 @@ def make_gradient_rounds(
         f" const float {name}_[4] = {{{name}4.x, {name}4.y, {name}4.z, {name}4.w}};"
         for n, name in enumerate(kept)
     )
-    moments = (
-        "const float vx = v_[j] * dx[c]; row0 += v_[j]; row1 += vx; row2 += vx * dx[c];"
-        if geometry
-        else ""
-    )
-    end_of_row = (
-        """if (c == WIDTH - 1) {
+    moments = f"""
+            const float vx = v_[j] * dx[c]; row0 += v_[j]; row1 += vx; row2 += vx * dx[c];
+            if (c == {tile_width - 1}) {{
                 sums[0] += row1; sums[1] += row0 * dy; sums[2] += row2; sums[3] += row1 * dy;
                 sums[4] += row0 * dy * dy; sums[5] += row0; row0 = row1 = row2 = 0.0f; dy -= 1.0f;
-            }"""
-        if geometry
-        else ""
-    )
-    lit = "const float4 g = pixel[4 * part + j];" if light else ""
-    lit += (
-        " sums[11] += w2_[j] * g.x; sums[12] += w2_[j] * g.y; sums[13] += w2_[j] * g.z;"
-        if light
-        else ""
-    )
-    lit += (" sums[14] += wd_[j];" if spreads else " sums[14] += w_[j] * g.w;") if light else ""
-    coloured = f"const float4 h = pixel[{PIXELS * light} + 4 * part + j];" if channels else ""
-    coloured += (
-        " sums[8] += w_[j] * h.x; sums[9] += w_[j] * h.y; sums[10] += w_[j] * h.z;"
-        if channels
-        else ""
-    )
-    further = (
-        f"const float4 m = pixel[{PIXELS * (light + channels)} + 4 * part + j];" if more else ""
-    )
-    further += " more0 += w_[j] * m.x; more1 += w_[j] * m.y; more2 += w_[j] * m.z;" if more else ""
-
+            }}
+            sums[6] += __saturatef(w_[j] * {HIT}f); sums[7] += w_[j];"""
+    lit = f"""
+            const float4 g = pixel[4 * part + j];
+            sums[11] += w2_[j] * g.x; sums[12] += w2_[j] * g.y; sums[13] += w2_[j] * g.z;
+            sums[14] += {"wd_[j]" if spreads else "w_[j] * g.w"};"""
+    coloured = f"""
+            const float4 h = pixel[{PIXELS * light} + 4 * part + j];
+            sums[8] += w_[j] * h.x; sums[9] += w_[j] * h.y; sums[10] += w_[j] * h.z;"""
+    further = f"""
+            const float4 m = pixel[{PIXELS * (light + channels)} + 4 * part + j];
+            more0 += w_[j] * m.x; more1 += w_[j] * m.y; more2 += w_[j] * m.z;"""
+    terms = moments * geometry + coloured * channels + further * more + lit * light
     add_more = f"""
     const float4 m0 = *reinterpret_cast<const float4*>(kept + s * {OUT_STRIDE} + 16);
     const float4 m1 = *reinterpret_cast<const float4*>(kept + s * {OUT_STRIDE} + 16
@@ -337,13 +315,7 @@ def make_gradient_rounds(
         {take}
         #pragma unroll
         for (int j = 0; j < 4; ++j) {{
-            const int c = (4 * part + j) % {tile_width};
-            {moments}
-            {end_of_row.replace("WIDTH", str(tile_width))}
-            {f"sums[6] += __saturatef(w_[j] * {HIT}f); sums[7] += w_[j];" if geometry else ""}
-            {coloured}
-            {further}
-            {lit}
+            const int c = (4 * part + j) % {tile_width};{terms}
         }}
     }}
     __syncwarp();  // all values have been read: the sums of both halves overwrite them

@@ -40,8 +40,7 @@ _LOAD = """
 #endif
 """
 
-# A CPU thread owns one block of a tile, so a cheap test skips many blocks. A warp owns all pixels
-# of a tile that is known to be touched: there the test would hardly ever hold for all lanes.
+# a warp owns all pixels of a tile, for which the test would hardly ever hold
 _BLOCK_MISSED = """
 #if defined(__CUDA_ARCH__)
     return false;
@@ -107,8 +106,7 @@ def take_channels(
 def add_records(
     # In:
     part: wp.array[Splat],  # [N] gradient records of one CPU thread or one pass
-    geometry_only: int,  # 1: only slots 0-5, what passes of further channels share with the main
-    #  pass [flag]
+    geometry_only: int,  # 1: only slots 0-5, which further passes share [flag]
     # Out:
     total: wp.array[Splat],  # [N] added to
 ):

@@ -1,18 +1,15 @@
-"""The list of each tile out of a bit mask with one bit per tile and splat: counted, then read in
-depth order.
+"""The list of each tile from a bit mask with one bit per tile and splat, in depth order.
 
-Bit r % 32 of word r / 32 of a tile is set if the tile lists the splat of depth rank r. Splats are
-in the order of depth already, so the bits of a tile in their order are its list, and nothing is
-left to sort. ``mark_pairs`` of tiles.py writes the matrix.
+Bit r % 32 of word r / 32 of a tile is set if the tile lists the splat of depth rank r, so that
+nothing is left to sort. ``mark_pairs`` of tiles.py writes the matrix.
 """
 
 import warp as wp
 
 from .simd import of_lane, sum_of_lanes, warp_any
 
-# tiles whose equal words are neighbours: a splat reaches neighbouring tiles, whose words then share
-# a sector of 32 bytes; the warps that read them are those of one block, so a sector comes to a
-# multiprocessor once
+# tiles whose equal words share a sector of 32 bytes: a splat reaches neighbouring tiles, and the
+# warps of one block read them
 GROUP = wp.constant(8)
 
 
@@ -66,11 +63,9 @@ def write_ids(
     begin: int,
     end: int,
 ):
-    """List the splats whose bits are set; the lowest bit is that of depth rank ``rank``, of this
-    warp ``lowest``.
+    """List the splats whose bits are set, the lowest of depth rank ``rank``, in a warp ``lowest``.
 
-    Those of this lane go to ``place`` and behind it, those of the warp to ``begin`` .. ``end`` - 1,
-    neighbours by neighbouring lanes, by way of shared memory.
+    Those of this lane go to ``place`` on, those of the warp to ``begin`` .. ``end`` - 1.
     """
 
 
@@ -115,8 +110,7 @@ def list_bits(
     capacity: int,  # pairs that fit [1]
     # Out:
     ids: wp.array[wp.int32],  # [>= capacity] splat of each pair
-    first: wp.array[int],  # [tiles + 1] where the list of each tile begins; the last entry ends the
-    #  last list
+    first: wp.array[int],  # [tiles + 1] where the list of each tile begins, and the end
     total: wp.array[int],  # [1] pairs there would be, whether they fit or not
 ):
     """One warp per part of a tile; pairs that do not fit are dropped, last tiles first."""
@@ -143,15 +137,8 @@ def list_bits(
                 count = wp.bit_count(found)
                 sums = sum_of_lanes(count)
                 until = at + of_lane(sums, lanes - 1)
-                write_ids(
-                    found,
-                    order,
-                    32 * own,
-                    32 * word,
-                    ids,
-                    at + sums - count,
-                    at,
-                    wp.min(until, capacity),
-                )
+                place = at + sums - count
+                stop = wp.min(until, capacity)
+                write_ids(found, order, 32 * own, 32 * word, ids, place, at, stop)
                 at = until
             word += 2 * lanes

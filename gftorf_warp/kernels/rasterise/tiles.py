@@ -1,11 +1,9 @@
-"""Which splats each tile composites: where an ellipse crosses a row of tiles, counts, keys, and the
-list of each tile.
+"""Which splats each tile composites: spans of tiles in a row, counts, keys, and lists.
 
-A tile lists a splat if the ellipse alpha >= 1/255 reaches the rectangle of its pixel centres. The
-tiles of one row that an ellipse reaches are neighbours, so a row is a span, and a splat costs as
-many steps as it has rows. Either each pair of a tile and a splat is marked in a bit matrix, which
+A tile lists a splat if the ellipse alpha >= 1/255 reaches the rectangle of its pixel centres; in a
+row of tiles these are a span. Either each (tile, splat) pair is marked in a bit matrix, which
 tile_bitmask.py reads; or pairs are written in depth order and sorted by tile with a stable sort.
-Both ways every list is in depth order, and the lists are the same.
+Both give the same lists, in depth order.
 """
 
 import warp as wp
@@ -14,8 +12,7 @@ from .simd import lane_beyond, lanes_with, of_lane, sum_of_lanes
 from .splat import Splat, load_splat
 from .tile_bitmask import place_of_word
 
-# `count_pairs` and `emit_pairs` must agree on every span to the last bit, and `mark_pairs` should;
-# but contraction to fused multiply-adds is the compiler's choice in each kernel anew
+# kernels must agree on every span to the last bit; contraction differs from kernel to kernel
 wp.set_module_options({"fuse_fp": False})
 
 # of the largest terms of the power [1]: what float32 loses in it at a far pixel
@@ -27,12 +24,9 @@ _FLATTEST = wp.constant(wp.float64(1.0e-7))
 @wp.func
 def tile_range(box: wp.vec4i, tile_width: int, tile_height: int) -> wp.vec4i:
     """Tiles [x0, y0, x1, y1) that the pixels [x0, y0, x1, y1) of ``box`` lie in."""
-    return wp.vec4i(
-        box[0] // tile_width,
-        box[1] // tile_height,
-        (box[2] + tile_width - 1) // tile_width,
-        (box[3] + tile_height - 1) // tile_height,
-    )
+    x1 = (box[2] + tile_width - 1) // tile_width
+    y1 = (box[3] + tile_height - 1) // tile_height
+    return wp.vec4i(box[0] // tile_width, box[1] // tile_height, x1, y1)
 
 
 @wp.func
@@ -40,9 +34,8 @@ def outline_of(q: Splat, box: wp.vec4i) -> wp.vec4:
     """Outline (slope, width, narrowing, turn) of the ellipse power >= low, from its centre [px].
 
     At height v its edges are at slope v -+ sqrt(width - narrowing v^2); the right one is farthest
-    out at v = turn, the left one at -turn. A little wide: it decides what is visited, not what it
-    is worth. Terms of the power at the pixels of ``box`` bound what a pixel may round in its
-    favour; the determinant of the conic is a difference, so it is taken in float64.
+    out at v = turn, the left one at -turn. Widened by the rounding of the power at the pixels of
+    ``box``; the determinant of the conic is a difference, so it is taken in float64.
     """
     x = wp.max(wp.abs(float(box[0]) + 0.5 - q[0]), wp.abs(float(box[2]) - 0.5 - q[0]))
     y = wp.max(wp.abs(float(box[1]) + 0.5 - q[1]), wp.abs(float(box[3]) - 0.5 - q[1]))
@@ -75,8 +68,7 @@ def span_of(
     w = float(tile_width)
     first = wp.ceil((q[0] + (outline[0] * left - reach_left) + 0.5) / w) - 1.0
     last = wp.floor((q[0] + (outline[0] * right + reach_right) - 0.5) / w)
-    # clamped as floats, since an integer from a float that does not fit is undefined; and again,
-    # for NaN
+    # clamped as floats, as a float that does not fit has no defined integer; again, for NaN
     x0 = wp.clamp(int(wp.clamp(first, float(tiles[0]), float(tiles[2]))), tiles[0], tiles[2])
     x1 = wp.clamp(int(wp.clamp(last, -1.0, float(tiles[2]))) + 1, x0, tiles[2])
     return wp.vec2i(x0, x1)
@@ -232,8 +224,7 @@ def tile_starts(
     count: int,  # pairs [1]
     lanes: int,  # threads per tile: 32 on CUDA, a warp, 1 on the CPU [1]
     # Out:
-    first: wp.array[int],  # [tiles + 1] where the list of each tile begins; the last entry ends the
-    #  last list
+    first: wp.array[int],  # [tiles + 1] where the list of each tile begins, and the end
 ):
     """One warp per tile, a 33-ary search: five dependent reads instead of 21."""
     tile, lane = wp.tid()

@@ -13,18 +13,16 @@ Lafortune and Willems, 1994), a the angle between it and the view:
 
     rho  becomes  rho [1 - g + g (n + 2) / 2 max(0, cos a)^n]
 
-which is reciprocal and returns rho of the light that falls on it straight, never more at a slant.
-Indirect light goes on from the first hit, with probability 1 - g in directions of density cos / pi,
-with g in directions of the lobe's own density; that leaves the product of the reflectances, in the
-second case times (n + 2) / (n + 1) cos(exit), as the weight of a path. Every further surface adds
-what the emitter sends there, at the length of the whole path. The fraction of h f (d + d_e) / c is
-taken before it becomes an angle, so that float32 holds at any frequency.
+which is reciprocal. Paths go on with probability 1 - g in directions of density cos / pi, with g in
+those of the lobe's density; their weight is the product of the reflectances, in the second case
+times (n + 2) / (n + 1) cos(exit). Every further surface adds what the emitter sends there. The
+fraction of h f (d + d_e) / c is taken before it becomes an angle, for float32.
 """
 
 import warp as wp
 
 from ..geometry import CameraView
-from .rays import FAR, Solid, nearest, ray_through, reflectance_of
+from .rays import FAR, Hit, Solid, nearest, ray_through, reflectance_of
 
 # [1] of the emitter's distance: what is met this near to a point is the point itself
 SHADOW_GAP = wp.constant(2.0e-4)
@@ -35,12 +33,10 @@ ONE_PATH = wp.constant(float("nan"))  # the standard error of a single path
 class Emitter:
     """A point of light that shines into a pyramid about the z axis of the camera."""
 
-    place: wp.vec3  # in camera axes [m]; zero: at the camera, where nothing that it sees can be in
-    #  a shadow
+    place: wp.vec3  # in camera axes [m]; zero: at the camera, without shadows
     spread: wp.vec2  # tangents of half the angles across and down [1]; 0: into all directions
     cycles: float  # modulation frequency over the speed of light [1/m]
-    power: float  # of the cosine of the angle to the z axis by which it shines less to the side
-    #  [1]; 0: evenly
+    power: float  # exponent of the cosine to the z axis [1]; 0: even light
     factor: float  # of its light along the axis [1]; unused where it shines evenly
     least: float  # cosine beyond which the beam stays as it is [1]; likewise
 
@@ -59,9 +55,8 @@ def shine(solid: Solid, view: wp.vec3, towards: wp.vec3, normal: wp.vec3) -> flo
     factor = float(1.0)
     if solid.gloss > 0.0:
         cosine = wp.max(-wp.dot(mirrored(towards, normal), view), 0.0)
-        factor += solid.gloss * (
-            0.5 * (solid.shininess + 2.0) * wp.pow(cosine, solid.shininess) - 1.0
-        )
+        lobe = 0.5 * (solid.shininess + 2.0) * wp.pow(cosine, solid.shininess)
+        factor += solid.gloss * (lobe - 1.0)
     return factor
 
 
@@ -75,9 +70,8 @@ def around(axis: wp.vec3, shininess: float, first: float, second: float) -> wp.v
         helper = wp.vec3(0.0, 1.0, 0.0)
     u = wp.normalize(wp.cross(axis, helper))
     angle = 6.283185307179586 * second
-    return wp.normalize(
-        cosine * axis + sine * (wp.cos(angle) * u + wp.sin(angle) * wp.cross(axis, u))
-    )
+    across = wp.cos(angle) * u + wp.sin(angle) * wp.cross(axis, u)
+    return wp.normalize(cosine * axis + sine * across)
 
 
 @wp.func
@@ -87,9 +81,7 @@ def received(
     rotation: wp.array2d[wp.mat33],
     translation: wp.array2d[wp.vec3],
     instant: int,
-    body: int,
-    normal: wp.vec3,  # in the axes of the body
-    place: wp.vec3,  # the hit in the axes of the body [m]
+    hit: Hit,
     point: wp.vec3,  # the hit in camera axes [m]
     view: wp.vec3,  # unit vector along which it was met, in camera axes
     may_be_hidden: bool,
@@ -97,20 +89,17 @@ def received(
     """Returned amplitude of the emitter's light and its distance [m], both at ``point``."""
     towards = point - emitter.place
     reach = wp.length(towards)
-    turn = rotation[instant, body]
-    cosine = -wp.dot(turn * towards, normal) / reach
+    turn = rotation[instant, hit.body]
+    cosine = -wp.dot(turn * towards, hit.normal) / reach
     across = emitter.spread[0] * towards[2]
     down = emitter.spread[1] * towards[2]
     if emitter.spread[0] > 0.0 and (wp.abs(towards[0]) > across or wp.abs(towards[1]) > down):
         cosine = float(0.0)
     if cosine > 0.0 and may_be_hidden:
         limit = reach * (1.0 - SHADOW_GAP)
-        if (
-            nearest(
-                solids, rotation, translation, instant, emitter.place, towards / reach, limit
-            ).body
-            >= 0
-        ):
+        ray = towards / reach
+        first = nearest(solids, rotation, translation, instant, emitter.place, ray, limit)
+        if first.body >= 0:
             cosine = float(0.0)
     if cosine > 0.0 and emitter.power != 0.0:
         straight = towards[2] / reach
@@ -119,10 +108,9 @@ def received(
         else:
             cosine = float(0.0)
     if cosine > 0.0:
-        factor = shine(solids[body], turn * view, turn * towards / reach, normal)
-        return wp.vec2(
-            reflectance_of(solids[body], place) * factor * cosine / (reach * reach), reach
-        )
+        factor = shine(solids[hit.body], turn * view, turn * towards / reach, hit.normal)
+        reflectance = reflectance_of(solids[hit.body], hit.point)
+        return wp.vec2(reflectance * factor * cosine / (reach * reach), reach)
     return wp.vec2(0.0, reach)
 
 
@@ -166,19 +154,7 @@ def trace_light(
             hit = nearest(solids, rotation, translation, t, wp.vec3(0.0, 0.0, 0.0), ray, FAR)
             if hit.body >= 0:
                 point = hit.distance * ray
-                got = received(
-                    emitter,
-                    solids,
-                    rotation,
-                    translation,
-                    t,
-                    hit.body,
-                    hit.normal,
-                    hit.point,
-                    point,
-                    ray,
-                    beside,
-                )
+                got = received(emitter, solids, rotation, translation, t, hit, point, ray, beside)
                 total += got[0]
                 even += reflectance_of(solids[hit.body], hit.point)
                 turns = emitter.cycles * (hit.distance + got[1])
@@ -208,8 +184,7 @@ def trace_bounces(
     # Out:
     light: wp.array3d[wp.vec2],  # [h, H, W] (re, im) of the mean light
     amplitude: wp.array2d[float],  # [H, W] mean amplitude
-    error: wp.array2d[float],  # [H, W] standard error of the first harmonic's mean, re and im
-    #  together
+    error: wp.array2d[float],  # [H, W] standard error of the first harmonic, re and im together
 ):
     """Mean indirect light of a pixel over random paths, for a source intensity of 1."""
     i, x = wp.tid()
@@ -238,9 +213,8 @@ def trace_bounces(
                 if solid.gloss > 0.0:
                     lobe = wp.randf(random) < solid.gloss
                 if lobe:
-                    ray = around(
-                        mirrored(ray, normal), solid.shininess, wp.randf(random), wp.randf(random)
-                    )
+                    axis = mirrored(ray, normal)
+                    ray = around(axis, solid.shininess, wp.randf(random), wp.randf(random))
                     # 0: into the surface, where the path ends
                     straight = wp.max(wp.dot(ray, normal), 0.0)
                     weight = weight * (solid.shininess + 2.0) / (solid.shininess + 1.0) * straight
@@ -250,19 +224,7 @@ def trace_bounces(
             if hit.body >= 0 and weight > 0.0:
                 point = point + hit.distance * ray
                 length += hit.distance
-                got = received(
-                    emitter,
-                    solids,
-                    rotation,
-                    translation,
-                    t,
-                    hit.body,
-                    hit.normal,
-                    hit.point,
-                    point,
-                    ray,
-                    True,
-                )
+                got = received(emitter, solids, rotation, translation, t, hit, point, ray, True)
                 total += weight * got[0]
                 turns = emitter.cycles * (length + got[1])
                 own += turned(float(harmonics[0]) * turns, weight * got[0])

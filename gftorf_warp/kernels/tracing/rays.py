@@ -1,10 +1,7 @@
 """Rays through meshes, balls and endless planes: what a ray meets first.
 
-Nothing here is shared with the splats: another geometry, another order, other sums. What comes back
-from there is in light_paths.py.
-
-Surfaces are seen, lit and in the way on the side of their normals only: a room can be looked into
-from outside. Endless planes have a normal on either side.
+Surfaces are visible, lit and opaque from the side of their normals only; endless planes have a
+normal on either side. light_paths.py has the light.
 """
 
 import warp as wp

@@ -90,15 +90,13 @@ def make_adam(K: int):
     @wp.kernel(enable_backward=False, module="unique")
     def adam(
         # In:
-        table: wp.array2d[wp.int64],  # [T, 9] addresses of parameter, gradient, moments, step;
-        #  length; gradients
+        table: wp.array2d[wp.int64],  # [T, 9] addresses and lengths, see above
         first_block: wp.array[int],  # [T] blocks before those of a tensor [1]
         rest1: float,  # 1 - b1 [1]
         rest2: float,  # 1 - b2 [1]
         epsilon: float,  # added to the root of the second moment [units of the gradient]
         # Out:
-        sizes: wp.array2d[float],  # [T, 3] from ``step_end.py``; the tensors of the table change in
-        #  place
+        sizes: wp.array2d[float],  # [T, 3] from ``step_end.py``; tensors change in place
     ):
         """One thread per block of K elements; changes parameters and moments where they are."""
         block = wp.tid()

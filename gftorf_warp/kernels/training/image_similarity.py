@@ -1,5 +1,4 @@
-"""Loss of an image and its gradient by the rendered one, with the window of the similarity taken
-apart into two passes.
+"""Loss of an image and its gradient by the rendered one, with a separable similarity window.
 
 With means over a window W of 11 x 11 pixels, zeros beyond the border, of rendered r and measured m
 
@@ -11,9 +10,8 @@ the derivative needs three planes of dS: W is symmetric, so
 
     dL/dr = (1 - s) d|r - m|^p - s (W dS/dmu + 2 r W dS/da + m W dS/dc)
 
-(method, section 5). Columns first: blocks of K pixels of a row lie side by side in memory, so that
-their windows need no border but above and below. The planes in between have a margin of zeros at
-both ends of a row, which is all that the pass along rows knows of borders.
+(method, section 5). Columns first: blocks of K pixels of a row need borders above and below only.
+Planes in between have margins of zeros at both ends of a row.
 """
 
 import functools
@@ -219,8 +217,7 @@ def make_similarity(K: int) -> SimpleNamespace:
         measured: wp.array3d[float],  # [R C, H, W]
         row: wp.array[int],  # [1] which C of ``measured`` [index]
         # Out:
-        columns: wp.array4d[float],  # [5, C, H, W + 10] window sums along columns of r, m, r^2,
-        #  m^2, r m
+        columns: wp.array4d[float],  # [5, C, H, W + 10] sums along columns: r, m, r^2, m^2, r m
     ):
         """One thread per block of K pixels."""
         c, y, block = wp.tid()
@@ -237,8 +234,7 @@ def make_similarity(K: int) -> SimpleNamespace:
         share: float,  # of the similarity, 0..1 [1]
         absolute: bool,  # whether p is 1 [flag]
         # Out:
-        partials: wp.array2d[float],  # [3, P] sums over parts of loss, squared difference and the
-        #  other image
+        partials: wp.array2d[float],  # [3, P] partial sums: loss, squared difference, other image
         slopes: wp.array4d[float],  # [3, C, H, W + 10] derivatives of S by the means of r, r^2, r m
     ):
         """One thread per block of K pixels; on CUDA as many as fill the last warp."""

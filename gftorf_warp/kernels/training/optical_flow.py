@@ -1,5 +1,4 @@
-"""Squared difference of the optical flow that moving surfaces cause to the one that was measured,
-and its gradient.
+"""Squared difference of rendered and measured optical flow, and its gradient.
 
 A pixel at x sees the point P = d r of its camera, r the unit vector through it. After the
 composited displacement D it is at Q = M P + m + R D of the later camera, with [M m] from one camera
@@ -17,9 +16,7 @@ import warp as wp
 from .ordered_sums import OVER_LANES
 
 NUMBERS = 29  # of two cameras: f and c of the first and of the later one, M, m, R
-# more, where there is one: k1, k2, p1, p2, k3 of the first camera, and of the later one with its
-# radius
-LENSES = 11
+LENSES = 11  # more with a lens: k1, k2, p1, p2, k3 of both cameras, radius of the later one
 STEPS = 20  # of Newton; a lens that the host could undo needs a handful
 NEAREST = 1e-6  # [m] of a surface
 
@@ -164,8 +161,7 @@ def flow_errors(
     row: wp.array[int],  # [1] which F of ``measured`` [index]
     views: wp.array2d[float],  # [F, 29] f, c, later f, c, M, m, R [px, 1, m]; [F, 40] lenses, too
     # Out:
-    partials: wp.array2d[float],  # [1, P] sums of squared differences over parts of the image
-    #  [px^2]
+    partials: wp.array2d[float],  # [1, P] partial sums of squared differences [px^2]
 ):
     """One thread per pixel; on CUDA as many as fill the last warp."""
     error_of(distance, displacement, measured, row[0], views, wp.tid(), partials)

@@ -173,8 +173,7 @@ def statistics_of(screen: wp.array2d[float], half: wp.vec2, i: int) -> wp.vec3:
 @wp.kernel(enable_backward=False)
 def add_statistics(
     # In:
-    screen0: wp.array2d[float],  # [N, 4] of the first image: derivative by the image position
-    #  [1/px], pixels, weight
+    screen0: wp.array2d[float],  # [N, 4] of the first image: screen gradient [1/px], pixels, weight
     screen1: wp.array2d[float],  # [N, 4] of the second, if there is one
     screen2: wp.array2d[float],  # [N, 4] of the third
     screen3: wp.array2d[float],  # [N, 4] of the fourth
@@ -222,8 +221,7 @@ def finish_step(
     clips: bool,  # whether the gradient of the motion is clipped [1]
     gradient_max: float,  # its largest norm [1]
     results: wp.array2d[float],  # [B or more, 3 L] results of every image and term, see ``RESULTS``
-    weights: wp.array2d[float],  # [B or more, 3 L] weights of these; 0: not computed in this step
-    #  [1]
+    weights: wp.array2d[float],  # [B or more, 3 L] weights of these; 0: not computed [1]
     images: int,  # B of this step [1]
     compared: wp.array[float],  # [1] images with any term
     pairs: wp.array[int],  # [R or more] (tile, splat) pairs of every rendering
@@ -235,8 +233,7 @@ def finish_step(
     beta1: wp.float64,  # decay of the first moment [1]
     beta2: wp.float64,  # decay of the second moment [1]
     # Out:
-    counts: wp.array[int],  # [4] skipped steps, in a row, most pairs of a rendering, steps with too
-    #  many pairs
+    counts: wp.array[int],  # [4] steps skipped, in a row; most pairs; steps with too many
     sums: wp.array[float],  # [L + 4] weighted terms, squared difference, opacity, loss, images
     sizes: wp.array2d[float],  # [T, 3] step sizes of Adam
 ):
