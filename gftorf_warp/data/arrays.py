@@ -106,9 +106,8 @@ def read_choice(path: Path, field: Field) -> str:
     Raises:
         InputError: If it is anything else.
     """
-    expected = (
-        f"expected {{{json.dumps(field.key)}: {' or '.join(map(json.dumps, field.choices))}}}"
-    )
+    choices = " or ".join(map(json.dumps, field.choices))
+    expected = f"expected {{{json.dumps(field.key)}: {choices}}}"
     text, fix = _small_file(path, field), "correct or remove the file"
     try:
         content = json.loads(text.decode("utf-8"))

@@ -130,7 +130,7 @@ def _phasors(sequence: Sequence, i: int) -> tuple[list[list[int]], Float[np.ndar
 
 
 def quartet_phasor(sequence: Sequence, i: int) -> Float[np.ndarray, "2 H W"]:
-    """Phasor (re, im) of quartet i at its first frequency; raises as :func:`decode_quartet`."""
+    """Phasor (re, im) [quad units] of quartet i, first frequency; see :func:`decode_quartet`."""
     return quartet_phasors(sequence, i)[0][1]
 
 

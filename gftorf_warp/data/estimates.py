@@ -144,7 +144,7 @@ class PhaseFit:
 
 
 def phase_fit(sequence: Sequence, truth: Truth) -> PhaseFit | None:
-    """Fit psi = 4 pi d / depth_range + phase_offset to at least a hundred static pixels."""
+    """Fit psi = 4 pi d / depth_range + phase_offset to a hundred static pixels or more, or None."""
     phases, distances = [], []
     kappa = 4.0 * math.pi * sequence.calibration.f_mod_hz / SPEED_OF_LIGHT
     for i in sequence.complete_quartets:
@@ -166,11 +166,9 @@ def phase_fit(sequence: Sequence, truth: Truth) -> PhaseFit | None:
     unwrapped = kappa * d + centre + np.angle(np.exp(1j * (psi - kappa * d - centre)))
     kept = np.ones(len(d), dtype=bool)
     for _ in range(3):  # outliers: a few pixels mix two distances
-        slope, offset = (
-            np.polyfit(d[kept], unwrapped[kept], 1)
-            if np.ptp(d[kept]) > STILL_M
-            else (kappa, centre)
-        )
+        slope, offset = kappa, centre
+        if np.ptp(d[kept]) > STILL_M:
+            slope, offset = np.polyfit(d[kept], unwrapped[kept], 1)
         residual = np.abs(unwrapped - slope * d - offset)
         kept = residual <= 4.0 * np.median(residual) + 1e-9
     return PhaseFit(

@@ -153,9 +153,8 @@ def read_distances(stored: Stored, frames: int) -> Truth | None:
             if name == "distance" and (image < 0).any():
                 folders = (numbered(root, pattern) for pattern in fields[name].paths)
                 file = next(filter(None, folders))[i + stored.first_id]
-                why = (
-                    f"expected metres along the ray, NaN where unknown, found {np.nanmin(image):g}"
-                )
+                least = f"{np.nanmin(image):g}"
+                why = f"expected metres along the ray, NaN where unknown, found {least}"
                 fix = "store NaN where the distance is unknown"
                 problems.add("distance: negative", file, why, fix)
             stack[frames_of] = np.where(image == 0, np.nan, image) if name == "distance" else image

@@ -46,13 +46,10 @@ def compute_flow(sequence: Sequence, *, method: Method = "dis") -> Flow:
     if method not in ("dis", "deepflow"):
         raise ValueError(f"method must be dis or deepflow, got {method!r}")
     if min(sequence.height, sequence.width) < SMALLEST_PX:
-        why = f"expected at least {SMALLEST_PX}x{SMALLEST_PX} pixels, found "
-        why += f"{sequence.width}x{sequence.height}"
-        what, fix = (
-            "images too small for optical flow",
-            "provide flow as files, or use larger images",
-        )
-        raise InputError(what, where=sequence.path or "sequence", why=why, fix=fix)
+        size, where = f"{sequence.width}x{sequence.height}", sequence.path or "sequence"
+        why = f"expected at least {SMALLEST_PX}x{SMALLEST_PX} pixels, found {size}"
+        fix = "provide flow as files, or use larger images"
+        raise InputError("images too small for optical flow", where=where, why=why, fix=fix)
     step, times, quads = sequence.cycle, sequence.times, sequence.quads
     pairs = np.flatnonzero(sequence.measured[:-step] & sequence.measured[step:]).tolist()
 

@@ -24,12 +24,9 @@ def locked(folder: Path, name: str, what: str) -> Iterator[None]:
     with (folder / name).open("a+") as file:
         if not _try_lock(file.fileno()):
             file.seek(0)
-            raise BusyError(
-                f"another process works on this {what}",
-                where=folder,
-                why=f"its lock is held by {file.read().strip() or 'an unknown process'}",
-                fix="wait for it, stop it, or choose another --out",
-            )
+            why = f"its lock is held by {file.read().strip() or 'an unknown process'}"
+            fix, what = "wait for it, stop it, or choose another --out", f"this {what}"
+            raise BusyError(f"another process works on {what}", where=folder, why=why, fix=fix)
         file.truncate(0)
         file.write(f"process {os.getpid()} on {socket.gethostname()}\n")
         file.flush()

@@ -33,11 +33,10 @@ def read_matrix(data: bytes, name: str) -> np.ndarray:
         raise ValueError("no MATLAB 5 header")
     order = "<" if data[126:128] == b"IM" else ">"
     found = []
-    for element in _elements(data[128:], order):
-        packed = element[0] == COMPRESSED
-        kind, content = (
-            next(_elements(_unpacked(element[1]), order), (0, b"")) if packed else element
-        )
+    for stored in _elements(data[128:], order):
+        packed = stored[0] == COMPRESSED
+        inner = _elements(_unpacked(stored[1]), order) if packed else iter([stored])
+        kind, content = next(inner, (0, b""))
         if kind == MATRIX:
             parts = list(_elements(content, order))
             found.append(parts[2][1].decode("ascii", "replace") if len(parts) > 2 else "")

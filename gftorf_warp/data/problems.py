@@ -39,9 +39,6 @@ class Problems:
         lines = [f"{error.where}: {error.what}: {error.why}" for error in self.errors[:SHOWN]]
         if len(self.errors) > SHOWN:
             lines.append(f"and {len(self.errors) - SHOWN} more")
-        raise InputError(
-            f"{len(self.errors)} problems",
-            where=where,
-            why="\n       ".join(lines),
-            fix="\n       ".join(dict.fromkeys(error.fix for error in self.errors)),
-        )
+        why, fixes = "\n       ".join(lines), dict.fromkeys(error.fix for error in self.errors)
+        what, fix = f"{len(self.errors)} problems", "\n       ".join(fixes)
+        raise InputError(what, where=where, why=why, fix=fix)
