@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import chain, cycle
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -12,16 +14,7 @@ from .plot import Curve, Plot, svg
 # Okabe and Ito
 COLOURS = {"closed_form": "#d55e00", "d": "#0072b2", "d_normalised": "#56b4e9", "d_tof": "#009e73"}
 NAMES = {"closed_form": "closed form", "d": "d", "d_normalised": "d / opacity", "d_tof": "d_ToF"}
-TERM_COLOURS = (
-    "#0072b2",
-    "#e69f00",
-    "#009e73",
-    "#cc79a7",
-    "#56b4e9",
-    "#d55e00",
-    "#8c6d31",
-    "#666666",
-)
+TERM_COLOURS = "#0072b2 #e69f00 #009e73 #cc79a7 #56b4e9 #d55e00 #8c6d31 #666666".split()
 # what else a log step holds
 NOT_LOSSES = {"images", "seconds", "gaussians", "quad_psnr_db", "opacity"}
 FLOOR_M = 1e-3  # [m] smaller errors fall into the first bin of the histogram
@@ -42,8 +35,7 @@ SINGLE = {  # title and unit of a plot of one curve: key of the rows of diagnost
 
 
 def training_curves(log: Sequence[Mapping[str, float]]) -> bytes | None:
-    """Loss terms, quad PSNR and number of Gaussians over optimised images; None if nothing was
-    logged.
+    """Loss terms, quad PSNR and number of Gaussians over optimised images; None without a log.
 
     Args:
         log: Steps of ``metrics.jsonl``: images, seconds, gaussians, quad_psnr_db and the loss terms
@@ -51,14 +43,8 @@ def training_curves(log: Sequence[Mapping[str, float]]) -> bytes | None:
     """
     if not log:
         return None
-    terms = [
-        name
-        for name in dict.fromkeys(key for step in log for key in step)
-        if name not in NOT_LOSSES
-    ]
-    losses = [
-        _curve(log, name, TERM_COLOURS[k % len(TERM_COLOURS)], name) for k, name in enumerate(terms)
-    ]
+    terms = [name for name in dict.fromkeys(chain.from_iterable(log)) if name not in NOT_LOSSES]
+    losses = [_curve(log, name, colour, name) for name, colour in zip(terms, cycle(TERM_COLOURS))]
     losses = [curve for curve in losses if (curve.y > 0).any()]
     psnr, count = (_curve(log, name, COLOURS["d"]) for name in ("quad_psnr_db", "gaussians"))
     plots = [
@@ -70,31 +56,24 @@ def training_curves(log: Sequence[Mapping[str, float]]) -> bytes | None:
 
 
 def along_run(rows: Sequence[Mapping[str, float]]) -> bytes | None:
-    """Diagnostics over optimised images: errors if the truth is known, agreement, opacity, number
-    of Gaussians.
+    """Diagnostics over optimised images: errors if the truth is known, agreement, opacity, N.
 
     Args:
         rows: Those of ``diagnostics.jsonl``, see recon/diagnostics.py.
     """
     if not rows:
         return None
-    plots = [
-        Plot(
-            title=f"Error of {NAMES[name]}",
-            x=IMAGES,
-            y=SQUARED,
-            curves=[
-                _curve(rows, f"{group}{name}_mse_x100", COLOURS[name], label, dashes)
-                for group, (label, dashes) in GROUPS.items()
-            ],
-        )
-        for name in ("d", "d_tof")
-    ]
+    plots = []
+    for name in ("d", "d_tof"):
+        curves = [
+            _curve(rows, f"{group}{name}_mse_x100", COLOURS[name], label, dashes)
+            for group, (label, dashes) in GROUPS.items()
+        ]
+        plots.append(Plot(title=f"Error of {NAMES[name]}", x=IMAGES, y=SQUARED, curves=curves))
+    displaced = "length of the displacement"
     static = [
         _curve(rows, "d_minus_dtof_static_m", COLOURS["d"], "|d \N{MINUS SIGN} d_ToF|"),
-        _curve(
-            rows, "offset_static_m", COLOURS["d_normalised"], "length of the displacement", DASHED
-        ),
+        _curve(rows, "offset_static_m", COLOURS["d_normalised"], displaced, DASHED),
     ]
     plots.append(Plot(title="On static pixels", x=IMAGES, y="m", curves=static))
     for (title, unit), key in SINGLE.items():
@@ -114,26 +93,18 @@ def error_over_frames(
             where there are none.
     """
     x = np.asarray(frames, dtype=float)
-    return _groups(
-        {
-            group: {
-                name: (x, np.array([np.nan if v is None else v for v in row], float))
-                for name, row in errors.items()
-            }
-            for group, errors in groups.items()
-        },
-        x="raw frame n",
-        y=f"mean squared error [{SQUARED}]",
-        points=True,
-    )
+    drawn = {
+        group: {name: (x, np.array(row, float)) for name, row in errors.items()}  # None: NaN
+        for group, errors in groups.items()
+    }
+    return _groups(drawn, x="raw frame n", y=f"mean squared error [{SQUARED}]", points=True)
 
 
 def error_histogram(
     errors: Mapping[str, Float[np.ndarray, "S H W"]],
     groups: Mapping[str, Bool[np.ndarray, "S H W"]],
 ) -> bytes:
-    """How large the errors are, one plot per group of pixels: share of pixels over error [m] on a
-    logarithmic axis.
+    """Share of pixels over error [m] on a logarithmic axis, one plot per group of pixels.
 
     Args:
         errors: Squared errors [m^2] by the name of the distance, NaN where unknown.
@@ -144,47 +115,33 @@ def error_histogram(
     stairs = np.repeat(edges, 2)
     drawn: dict[str, dict[str, tuple[np.ndarray, np.ndarray]]] = {group: {} for group in groups}
     for name, error in errors.items():
+        width = np.log(edges[1] / edges[0])
         with np.errstate(divide="ignore"):
-            place = np.log(error) * (0.5 / np.log(edges[1] / edges[0])) - np.log(FLOOR_M) / np.log(
-                edges[1] / edges[0]
-            )
-        known = ~np.isnan(place)
-        bins = np.where(known, np.clip(place, 0, BINS - 1), 0).astype(np.uint8)
+            position = np.log(error) * (0.5 / width) - np.log(FLOOR_M) / width
+        known = ~np.isnan(position)
+        bins = np.where(known, np.clip(position, 0, BINS - 1), 0).astype(np.uint8)
         for group, mask in groups.items():
             counts = np.bincount(bins[mask & known], minlength=BINS)
-            drawn[group][name] = (
-                stairs,
-                np.concatenate([[0.0], np.repeat(counts / max(counts.sum(), 1), 2), [0.0]]),
-            )
-    return _groups(
-        drawn, x="absolute error [m]", y="share of these pixels", log_x=True, log_y=False
-    )
+            share = np.repeat(counts / max(counts.sum(), 1), 2)
+            drawn[group][name] = stairs, np.concatenate([[0.0], share, [0.0]])
+    share_of = "share of these pixels"
+    return _groups(drawn, x="absolute error [m]", y=share_of, log_x=True, log_y=False)
 
 
 def _groups(
     drawn: Mapping[str, Mapping[str, tuple[np.ndarray, np.ndarray]]],
     *,
-    x: str,
-    y: str,
-    log_x: bool = False,
-    log_y: bool | None = None,
     points: bool = False,
+    **axes: Any,
 ) -> bytes:
     """One plot per group of pixels, with one curve (x, y) for each kind of distance."""
-    plots = [
-        Plot(
-            title=group,
-            x=x,
-            y=y,
-            log_x=log_x,
-            log_y=log_y,
-            curves=[
-                Curve(x=across, y=up, colour=COLOURS[name], label=NAMES[name], points=points)
-                for name, (across, up) in curves.items()
-            ],
-        )
-        for group, curves in drawn.items()
-    ]
+    plots = []
+    for group, curves in drawn.items():
+        lines = [
+            Curve(x=across, y=up, colour=COLOURS[name], label=NAMES[name], points=points)
+            for name, (across, up) in curves.items()
+        ]
+        plots.append(Plot(title=group, curves=lines, **axes))
     return svg(plots, columns=len(plots), height=209)
 
 

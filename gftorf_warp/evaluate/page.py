@@ -101,9 +101,7 @@ def look_up(metrics: Mapping[str, Any], key: str) -> Any:
 
 
 def number(metrics: Mapping[str, Any], key: str, form: str) -> str:
-    """A value of metrics.json, marked with its key, so that a test can compare each printed
-    number.
-    """
+    """A value of metrics.json, marked with its key, so that a test can compare it."""
     value = look_up(metrics, key)
     text = "not known" if value is None else FORMATS[form](value)
     return f'<span data-key="{escape(key)}" data-form="{escape(form)}">{escape(text)}</span>'
@@ -130,21 +128,16 @@ def plain_picture(
     source = pictures.data_uri(pictures.webp(rgb), "image/webp")
     caption = f"{escape(title)} <span>{escape(note)}</span>" if note else escape(title)
     size = f'width="{rgb.shape[1]}" height="{rgb.shape[0]}"'
-    return (
-        f'<figure><figcaption>{caption}</figcaption><img class="picture" {size} src="{source}" '
-        f'alt="{escape(title)}">'
-        f"{below}</figure>"
-    )
+    image = f'<img class="picture" {size} src="{source}" alt="{escape(title)}">'
+    return f"<figure><figcaption>{caption}</figcaption>{image}{below}</figure>"
 
 
 def colour_bar(scale: pictures.Scale) -> str:
     """The colours of a scale between its two values."""
     source = _bar(scale.colours)
     low, high = (f"{value:.3g}".replace("-", "\N{MINUS SIGN}") for value in (scale.low, scale.high))
-    return (
-        f'<div class="bar">{low}<img src="{source}" alt="colour bar">{high} '
-        f"{escape(scale.unit)}</div>"
-    )
+    unit = escape(scale.unit)
+    return f'<div class="bar">{low}<img src="{source}" alt="colour bar">{high} {unit}</div>'
 
 
 @functools.cache

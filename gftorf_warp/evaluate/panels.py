@@ -26,9 +26,8 @@ CLOSE_UP_MARGIN = 0.25  # around the moving pixels, as a fraction of their exten
 CLOSE_UP_SHARE_MAX = 0.6  # a larger close-up would repeat the whole picture
 PHASOR_TEXT = "The camera delivered real and imaginary part, taken as simultaneous."
 QUARTET_TEXT = (
-    "Each raw frame has its own time, during which objects move. The closed form takes the "
-    "frames as simultaneous, "
-    "hence the false distances along moving outlines."
+    "Each raw frame has its own time, during which objects move. The closed form takes the frames "
+    "as simultaneous, hence the false distances along moving outlines."
 )
 TITLES = {"closed_form": "closed form", "d": "ours, d", "d_tof": "ours, d_ToF"}
 
@@ -67,15 +66,10 @@ class Findings:
 
     @functools.cached_property
     def distance_scale(self) -> pictures.Scale:
-        """One scale for every distance in the report: the truth's,
-        else that of the closed form and of ours.
-        """
-        known = (
-            [self.views.closed_form, self.views.d]
-            if self.judgement is None
-            else [self.judgement.truth]
-        )
-        return pictures.distance_scale(known)
+        """One scale for every distance: the truth's, else that of the closed form and of ours."""
+        if self.judgement is None:
+            return pictures.distance_scale([self.views.closed_form, self.views.d])
+        return pictures.distance_scale([self.judgement.truth])
 
 
 def telling_row(found: Findings) -> int:
@@ -87,12 +81,10 @@ def telling_row(found: Findings) -> int:
     middle = range(count // 4, max(count // 4 + 1, -(-3 * count // 4)))
 
     def telling(s: int) -> tuple[float, float]:
-        judged = found.judgement
-        changed = (
-            _change(found.sequence, found.views.frames[s])
-            if judged is None
-            else float(judged.moving[s].sum())
-        )
+        if found.judgement is None:
+            changed = _change(found.sequence, found.views.frames[s])
+        else:
+            changed = float(found.judgement.moving[s].sum())
         return changed, -abs(s - count / 2)  # of equals, the one nearest to the middle
 
     return max(middle, key=telling)
@@ -111,29 +103,18 @@ def measured_quartet(found: Findings, s: int) -> str:
     else:
         raw = range(sequence.cycle * quartet, sequence.cycle * (quartet + 1))
         scale = pictures.signed_scale([sequence.quads[n] for n in raw])
-        measured = [
-            page.picture(
-                sequence.quads[n],
-                scale,
-                f"raw frame {n}",
-                f"shift {np.degrees(sequence.shifts[n]):.0f}°, {1e3 * sequence.times[n]:.1f} ms"
-                + (
-                    f", {sequence.frame_frequencies[n] / 1e6:.4g} MHz"
-                    if len(sequence.frequencies) > 1
-                    else ""
-                ),
-            )
-            for n in raw
-        ]
+        measured = []
+        for n in raw:
+            note = f"shift {np.degrees(sequence.shifts[n]):.0f}°, {1e3 * sequence.times[n]:.1f} ms"
+            if len(sequence.frequencies) > 1:
+                note += f", {sequence.frame_frequencies[n] / 1e6:.4g} MHz"
+            measured.append(page.picture(sequence.quads[n], scale, f"raw frame {n}", note))
     phase, amplitude = np.arctan2(im, re) % (2.0 * np.pi), np.hypot(re, im)
+    closed_form, grey = found.views.closed_form[s], pictures.amplitude_scale([amplitude])
     decoded = [
         page.picture(phase, pictures.phase_scale(), "measured phase", "mod 2π"),
-        page.picture(
-            amplitude, pictures.amplitude_scale([amplitude]), "measured amplitude", "of the phasor"
-        ),
-        page.picture(
-            found.views.closed_form[s], found.distance_scale, "closed form", "phase as distance"
-        ),
+        page.picture(amplitude, grey, "measured amplitude", "of the phasor"),
+        page.picture(closed_form, found.distance_scale, "closed form", "phase as distance"),
     ]
     text = f'<p class="soft">{PHASOR_TEXT if sequence.from_phasors else QUARTET_TEXT}</p>'
     figures = [*measured, *decoded, *_by_frequency(found, s), text]
@@ -145,20 +126,15 @@ def _by_frequency(found: Findings, s: int) -> list[str]:
     views = found.views
     if views.single is None or views.confidence is None:
         return []
-    pictures_of = []
+    figures = []
     for f, image in zip(found.sequence.frequencies, views.single[s], strict=True):
-        scale = pictures.Scale(
-            low=0.0, high=SPEED_OF_LIGHT / (2.0 * f), colours="viridis", unit="m"
-        )
-        pictures_of.append(
-            page.picture(image, scale, f"{f / 1e6:.4g} MHz alone", f"wraps at {scale.high:.3g} m")
-        )
-    share = float((views.confidence[s] < CONFIDENT).mean())
-    note = f"{100.0 * share:.2g} % ambiguous"
-    return [
-        *pictures_of,
-        page.picture(views.confidence[s], _share_scale(1.0), "confidence of the turn", note),
-    ]
+        reach = SPEED_OF_LIGHT / (2.0 * f)
+        scale = pictures.Scale(low=0.0, high=reach, colours="viridis", unit="m")
+        note = f"wraps at {reach:.3g} m"
+        figures.append(page.picture(image, scale, f"{f / 1e6:.4g} MHz alone", note))
+    note = f"{100.0 * float((views.confidence[s] < CONFIDENT).mean()):.2g} % ambiguous"
+    title = "confidence of the turn"
+    return [*figures, page.picture(views.confidence[s], _share_scale(1.0), title, note)]
 
 
 def distances(found: Findings, s: int, window: Window = WHOLE) -> str:
@@ -170,15 +146,17 @@ def distances(found: Findings, s: int, window: Window = WHOLE) -> str:
 
 
 def error_maps(judged: Judgement, s: int, window: Window = WHOLE) -> str:
-    """Absolute errors on one scale, in the order of :func:`distances`; under the truth,
-    moving pixels.
+    """Absolute errors on one scale, in the order of :func:`distances`, and moving pixels.
+
+    The errors of the closed form define the scale, on moving pixels if there are any.
     """
-    scale = pictures.error_scale([_scale_errors(judged, s)])
+    error, moving = np.sqrt(judged.errors["closed_form"][s]), judged.moving[s]
+    scale = pictures.error_scale([error[moving] if moving.any() else error])
     figures = [
         page.picture(np.sqrt(judged.errors[name][s][window]), scale, f"error of {title}")
         for name, title in TITLES.items()
     ]
-    moves = judged.moving[s][window].astype(np.float32)
+    moves = moving[window].astype(np.float32)
     return page.row([*figures, page.picture(moves, _share_scale(1.0), "moving pixels")])
 
 
@@ -196,20 +174,14 @@ def close_up(found: Findings, judged: Judgement, s: int) -> str:
 def quad_residual(found: Findings, s: int) -> str:
     """The quad of the frame: measured, rendered and the residual."""
     measured, rendered = found.views.quad_measured[s], found.views.quad_rendered[s]
-    scale = pictures.signed_scale([measured])
     residual, left = measured - rendered, 1.0 - found.views.opacity[s]
+    scale, finer = (pictures.signed_scale([image]) for image in (measured, residual))
+    share = _share_scale(max(0.01, float(left.max())))
     figures = [
         page.picture(measured, scale, "measured quad", f"raw frame {found.views.frames[s]}"),
         page.picture(rendered, scale, "rendered quad", "same time and shift"),
-        page.picture(
-            residual, pictures.signed_scale([residual]), "measured minus rendered", "its own scale"
-        ),
-        page.picture(
-            left,
-            _share_scale(max(0.01, float(left.max()))),
-            "transmittance",
-            "1 \N{MINUS SIGN} opacity",
-        ),
+        page.picture(residual, finer, "measured minus rendered", "its own scale"),
+        page.picture(left, share, "transmittance", "1 \N{MINUS SIGN} opacity"),
     ]
     return page.row(figures)
 
@@ -221,16 +193,10 @@ def strip_over_time(found: Findings) -> str:
     scale = found.distance_scale
     rows = []
     for title in (name for name in _distances(found, 0) if name != TITLES["d_tof"]):
-        figures = [
-            page.plain_picture(
-                pictures.colour_mapped(
-                    pictures.thinned(_distances(found, s)[title], STRIP_SIZE_MAX), scale
-                ),
-                title,
-                f"frame {found.views.frames[s]}",
-            )
-            for s in chosen
-        ]
+        figures = []
+        for s in chosen:
+            rgb = _small(_distances(found, s)[title], scale)
+            figures.append(page.plain_picture(rgb, title, f"frame {found.views.frames[s]}"))
         rows.append(page.row(figures))
     return "".join(rows) + f'<div class="wide">{page.colour_bar(scale)}</div>'
 
@@ -241,55 +207,37 @@ def animation(found: Findings) -> str:
     starts = starts[:: -(-len(starts) // ANIMATION_FRAMES_MAX)]
     if len(starts) < 2:
         return ""
-    views, quad, metres = (
-        found.views,
-        pictures.signed_scale([found.views.quad_measured]),
-        found.distance_scale,
-    )
-
-    def frame(s: int) -> np.ndarray:
-        panels = [
-            (views.quad_measured, quad),
-            (views.quad_rendered, quad),
-            (views.closed_form, metres),
-            (views.d, metres),
-        ]
-        return pictures.side_by_side(
-            [
-                pictures.colour_mapped(pictures.thinned(image[s], STRIP_SIZE_MAX), scale)
-                for image, scale in panels
-            ]
-        )
-
-    data = pictures.animated_webp([frame(s) for s in starts], ANIMATION_PERIOD_S)
-    source = pictures.data_uri(data, "image/webp")
-    titles = ("measured quad", "rendered quad", "closed form", "ours, d")
+    views, metres = found.views, found.distance_scale
+    quad = pictures.signed_scale([views.quad_measured])
+    panels = {
+        "measured quad": (views.quad_measured, quad),
+        "rendered quad": (views.quad_rendered, quad),
+        "closed form": (views.closed_form, metres),
+        "ours, d": (views.d, metres),
+    }
+    frames = [
+        pictures.side_by_side([_small(image[s], scale) for image, scale in panels.values()])
+        for s in starts
+    ]
+    data = pictures.animated_webp(frames, ANIMATION_PERIOD_S)
+    source, titles = pictures.data_uri(data, "image/webp"), [*panels]
+    bars = page.row([page.colour_bar(scale) for scale in (quad, metres)])
     captions = "".join(f'<b class="caption">{title}</b>' for title in titles)
     return (
         f'<div class="row" style="--columns: 4">{captions}</div>'
-        f'<img class="picture" src="{source}" alt="animation: {", ".join(titles)}">'
-        f'<div class="row" style="--columns: '
-        f'2">{page.colour_bar(quad)}{page.colour_bar(metres)}</div>'
+        f'<img class="picture" src="{source}" alt="animation: {", ".join(titles)}">{bars}'
     )
 
 
 def _distances(found: Findings, s: int) -> dict[str, np.ndarray]:
     """Images [m] by title: closed form, ours, and truth if known."""
     views, judged = found.views, found.judgement
-    images = {
-        TITLES["closed_form"]: views.closed_form[s],
-        TITLES["d"]: views.d[s],
-        TITLES["d_tof"]: views.d_tof[s],
-    }
+    images = {title: getattr(views, name)[s] for name, title in TITLES.items()}
     return images if judged is None else images | {"truth": judged.truth[s]}
 
 
-def _scale_errors(judged: Judgement, s: int) -> np.ndarray:
-    """Absolute errors [m] of the closed form, on moving pixels if there are any,
-    which define the scale.
-    """
-    error = np.sqrt(judged.errors["closed_form"][s])
-    return error[judged.moving[s]] if judged.moving[s].any() else error
+def _small(image: np.ndarray, scale: pictures.Scale) -> np.ndarray:
+    return pictures.colour_mapped(pictures.thinned(image, STRIP_SIZE_MAX), scale)
 
 
 def _share_scale(high: float) -> pictures.Scale:
@@ -297,15 +245,10 @@ def _share_scale(high: float) -> pictures.Scale:
 
 
 def _change(sequence: Sequence, n: int) -> float:
-    """Largest mean change [quad units] to the quads of the same shift one quartet earlier and
-    later.
-    """
+    """Largest mean change [quad units] to the quads of one shift one quartet earlier and later."""
     near = [m for m in (n - sequence.cycle, n + sequence.cycle) if 0 <= m < sequence.frames]
-    changes = [
-        float(np.abs(sequence.quads[m] - sequence.quads[n]).mean())
-        for m in near
-        if sequence.measured[m]
-    ]
+    near = [m for m in near if sequence.measured[m]]
+    changes = (float(np.abs(sequence.quads[m] - sequence.quads[n]).mean()) for m in near)
     return max(changes, default=0.0)
 
 

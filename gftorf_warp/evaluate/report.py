@@ -1,9 +1,8 @@
-"""The offline page of a comparison: results in pictures and numbers, how they were made,
-and how to read them.
-"""
+"""The offline page of a comparison: results in pictures and numbers, and how they were made."""
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -21,49 +20,50 @@ ROWS = {
     "d_normalised": ("ours, d / opacity", "the same, divided"),
     "d_tof": ("ours, d_ToF", "decoded from quads rendered at one instant"),
 }
+FACTS = (
+    ("quad PSNR", "quad_psnr_db", "decibel"),
+    ("colour PSNR", "colour_psnr_db", "decibel"),
+    ("raw frames scored", "frames", "count"),
+    ("protocol", "protocol", "text"),
+    ("true distance", "against", "text"),
+    ("Gaussians", "gaussians", "count"),
+    ("optimised images", "images_optimised", "count"),
+    ("reconstruction, wall clock", "seconds_reconstruct", "seconds"),
+    ("device", "device", "text"),
+    ("seed", "seed", "text"),
+)
+OPTIONAL = {"colour_psnr_db", "against"}  # left out where unknown
 COUNTED = {3: "three", 4: "four", 5: "five", 6: "six", 8: "eight"}
 PIXELS = {"": "all pixels", "moving.": "moving pixels", "static.": "static pixels"}
 TO_READ = f"""
 <dl>
-<dt>distance</dt><dd>Length from the camera to the surface along the ray of a pixel,
-    in metres. It is not the
-z-depth.</dd>
-<dt>closed form</dt><dd>The distance that a camera computes: raw quads give a phase,
-    the phase a distance; several
-modulation frequencies together determine the number of whole turns. Quads are taken one after the
-    other, so moving
-objects get false distances.</dd>
+<dt>distance</dt><dd>Length from the camera to the surface along the ray of a pixel, in metres. It
+is not the z-depth.</dd>
+<dt>closed form</dt><dd>The distance that a camera computes: raw quads give a phase, the phase a
+distance; several modulation frequencies together determine the number of whole turns. Quads are
+taken one after the other, so moving objects get false distances.</dd>
 <dt>d</dt><dd>Mean distance of the reconstructed Gaussians at the time of one raw frame. It is not
-    divided by
-opacity: where opacity is below one, the missing part counts as error.</dd>
-<dt>d_ToF</dt><dd>Quads rendered at the time of one raw frame, decoded like the closed form,
-    within the unambiguous
-range: c / 2f, or that of all frequencies together.</dd>
-<dt>moving pixels</dt><dd>Pixels whose true distance changes by more than {MOVING_M}
-m within their quartet: mostly
-outlines of moving objects, and whole objects that move fast in depth.</dd>
-<dt>errors</dt><dd>Mean squared error in square metres times 100,
-    then its root in centimetres. <em>All pixels</em> is
-the mean over frames of each frame's mean;
-<em>moving</em> and <em>static</em> pool the pixels of all frames. The closed
-form of a quartet is compared with the truth of each of its raw frames.</dd>
-<dt>quad PSNR</dt><dd>Rendered against measured quads,
-    at the phase shift of each raw frame. It needs no ground truth
-and is bounded by the noise of the measurement.</dd>
+divided by opacity: where opacity is below one, the missing part counts as error.</dd>
+<dt>d_ToF</dt><dd>Quads rendered at the time of one raw frame, decoded like the closed form, within
+the unambiguous range: c / 2f, or that of all frequencies together.</dd>
+<dt>moving pixels</dt><dd>Pixels whose true distance changes by more than {MOVING_M} m within their
+quartet: mostly outlines of moving objects, and whole objects that move fast in depth.</dd>
+<dt>errors</dt><dd>Mean squared error in square metres times 100, then its root in centimetres.
+<em>All pixels</em> is the mean over frames of each frame's mean; <em>moving</em> and
+<em>static</em> pool the pixels of all frames. The closed form of a quartet is compared with the
+truth of each of its raw frames.</dd>
+<dt>quad PSNR</dt><dd>Rendered against measured quads, at the phase shift of each raw frame. It
+needs no ground truth and is bounded by the noise of the measurement.</dd>
 <dt>grey pixels</dt><dd>Unknown truth, not scored.</dd>
 </dl>"""
-
-
 PHASORS_TO_READ = f"""
-<p class="soft">This camera delivered phasors. The four raw frames of a quartet are simultaneous,
-    so each quartet is
-scored once, and moving pixels are those whose true distance changes by more than {MOVING_M}
-m between consecutive
-phasors.</p>"""
+<p class="soft">This camera delivered phasors. The four raw frames of a quartet are simultaneous, so
+each quartet is scored once, and moving pixels are those whose true distance changes by more than
+{MOVING_M} m between consecutive phasors.</p>"""
 ALONG_TEXT = (
     "Rendered over black at a few fixed raw frames, at the size of the optimisation, which does "
-    "not use these numbers. "
-    "Where d and d_ToF differ on static pixels, light is explained by layers instead of surfaces"
+    "not use these numbers. Where d and d_ToF differ on static pixels, light is explained by "
+    "layers instead of surfaces"
 )
 
 
@@ -95,66 +95,54 @@ def report(
         f"<h1>{page.escape(title)}</h1>"
         f'<div class="soft">gftorf compare, version {page.number(metrics, "version", "text")}</div>'
         f'<p class="verdict">{verdict(metrics)}</p>',
-        _section("Errors", _table(metrics) + _facts(metrics)),
-        _section("Distance", _distance_text(found, s) + _distance_pictures(found, s)),
-        _section("What was measured", _measured_text(found, s) + panels.measured_quartet(found, s)),
-        _section("Quads", _quad_text(found, s) + panels.quad_residual(found, s)),
+        _section("Errors", _table(metrics), _facts(metrics)),
+        _section("Distance", _distance_text(found, s), _distance_pictures(found, s)),
+        _section("What was measured", _measured_text(found, s), panels.measured_quartet(found, s)),
+        _section("Quads", _quad_text(found, s), panels.quad_residual(found, s)),
         _section("Over time", _time_pictures(found)),
         *_beyond(metrics, found),
         *_along(metrics, diagnostics),
         _section("Curves", _curves(found, log)),
         _section("How it was made", provenance.how(config, data_card, installed)),
-        _section(
-            "How to read it", TO_READ + (PHASORS_TO_READ if found.sequence.from_phasors else "")
-        ),
+        _section("How to read it", TO_READ, PHASORS_TO_READ if found.sequence.from_phasors else ""),
     ]
     return page.document(f"{title} - gftorf compare", "".join(sections))
 
 
 def verdict(metrics: Mapping[str, Any]) -> str:
     """The result in one or two sentences of HTML, with the numbers of metrics.json."""
+    number = functools.partial(page.number, metrics)
     if page.look_up(metrics, "d_mse_x100") is None:
-        return (
-            "There is no ground truth, so distance errors are unknown. The PSNR of rendered "
-            "quads is "
-            f'<span class="ours">{page.number(metrics, "quad_psnr_db", "decibel")}</span>.'
-        )
+        psnr = f'<span class="ours">{number("quad_psnr_db", "decibel")}</span>'
+        unknown = "There is no ground truth, so distance errors are unknown."
+        return f"{unknown} The PSNR of rendered quads is {psnr}."
     group = "moving." if page.look_up(metrics, "moving.d_mse_x100") is not None else ""
     if metrics.get("method") == "ctof":
         where = "on moving pixels" if group else "over all pixels"
         return (
             f"This run is the closed form itself: nothing was optimised. Its error is "
-            f"{page.number(metrics, f'{group}d_mse_x100', 'rms_cm')} {where} (root mean square)."
+            f"{number(f'{group}d_mse_x100', 'rms_cm')} {where} (root mean square)."
         )
     naive, ours = f"{group}closed_form_mse_x100", f"{group}d_mse_x100"
-    pixels = (
-        f"On moving pixels ({page.number(metrics, 'moving.share', 'percent')} of all)"
-        if group
-        else "Over all pixels"
-    )
+    pixels = "Over all pixels"
+    if group:
+        pixels = f"On moving pixels ({number('moving.share', 'percent')} of all)"
     text = (
-        f'{pixels}, the <span class="naive">closed form is off by '
-        f"{page.number(metrics, naive, 'rms_cm')}</span>"
-        f' and <span class="ours">ours by {page.number(metrics, ours, "rms_cm")}</span> (root '
-        f"mean square): "
+        f'{pixels}, the <span class="naive">closed form is off by {number(naive, "rms_cm")}</span> '
+        f'and <span class="ours">ours by {number(ours, "rms_cm")}</span> (root mean square): '
         f"{_comparison(metrics, naive, ours)}."
     )
     if group and page.look_up(metrics, "static.d_mse_x100") is not None:
-        text += (
-            f" On static pixels, it is "
-            f"{page.number(metrics, 'static.closed_form_mse_x100', 'rms_cm')} against"
-            f" {page.number(metrics, 'static.d_mse_x100', 'rms_cm')}."
-        )
+        was = number("static.closed_form_mse_x100", "rms_cm")
+        text += f" On static pixels, it is {was} against {number('static.d_mse_x100', 'rms_cm')}."
     return text
 
 
 def _comparison(metrics: Mapping[str, Any], naive: str, ours: str) -> str:
     """Our error relative to that of the closed form, in words."""
     was, now = page.look_up(metrics, naive), page.look_up(metrics, ours)
-    values = (
-        f"{page.number(metrics, naive, 'error')} against "
-        f"{page.number(metrics, ours, 'error')} m² &times; 100"
-    )
+    before, after = (page.number(metrics, key, "error") for key in (naive, ours))
+    values = f"{before} against {after} m² &times; 100"
     if not (was > 0 and now > 0):
         return f"a squared error of {values}"
     if now <= was:
@@ -162,8 +150,12 @@ def _comparison(metrics: Mapping[str, Any], naive: str, ours: str) -> str:
     return f"{page.ratio(metrics, ours, naive)} times <em>more</em> squared error, {values}"
 
 
-def _section(title: str, body: str) -> str:
-    return f"<section><h2>{title}</h2>{body}</section>"
+def _section(title: str, *parts: str) -> str:
+    return f"<section><h2>{title}</h2>{''.join(parts)}</section>"
+
+
+def _caption(text: str) -> str:
+    return f'<p class="caption">{text}</p>'
 
 
 def _table(metrics: Mapping[str, Any]) -> str:
@@ -194,59 +186,39 @@ def _share(metrics: Mapping[str, Any], group: str) -> str:
 def _cell(metrics: Mapping[str, Any], key: str) -> str:
     if page.look_up(metrics, key) is None:
         return page.number(metrics, key, "error")
-    return (
-        f"{page.number(metrics, key, 'error')} <span "
-        f'class="soft">{page.number(metrics, key, "rms_cm")}</span>'
-    )
+    error, root = (page.number(metrics, key, form) for form in ("error", "rms_cm"))
+    return f'{error} <span class="soft">{root}</span>'
 
 
 def _facts(metrics: Mapping[str, Any]) -> str:
-    known = page.look_up(metrics, "colour_psnr_db") is not None
-    colour = {"colour PSNR": page.number(metrics, "colour_psnr_db", "decibel")} if known else {}
-    stated = page.look_up(metrics, "against") is not None
-    against = {"true distance": page.number(metrics, "against", "text")} if stated else {}
-    facts = {
-        "quad PSNR": page.number(metrics, "quad_psnr_db", "decibel"),
-        **colour,
-        "raw frames scored": page.number(metrics, "frames", "count"),
-        "protocol": page.number(metrics, "protocol", "text"),
-        **against,
-        "Gaussians": page.number(metrics, "gaussians", "count"),
-        "optimised images": page.number(metrics, "images_optimised", "count"),
-        "reconstruction, wall clock": page.number(metrics, "seconds_reconstruct", "seconds"),
-        "device": page.number(metrics, "device", "text"),
-        "seed": page.number(metrics, "seed", "text"),
-    }
-    items = "".join(f"<li><b>{value}</b>{name}</li>" for name, value in facts.items())
+    items = "".join(
+        f"<li><b>{page.number(metrics, key, form)}</b>{name}</li>"
+        for name, key, form in FACTS
+        if key not in OPTIONAL or page.look_up(metrics, key) is not None
+    )
     return f'<ul class="facts">{items}</ul>'
 
 
 def _distance_text(found: Findings, s: int) -> str:
-    known = found.judgement is not None
-    reason, scale = (
-        ("most moving pixels", "the truth's") if known else ("the largest change of quads", "one")
-    )
-    return (
-        f'<p class="caption">Distance along the ray, on {scale} scale, of raw frame '
-        f"{found.views.frames[s]}: the one "
-        f"with {reason} in the middle half of the sequence.</p>"
+    reason, scale = "most moving pixels", "the truth's"
+    if found.judgement is None:
+        reason, scale = "the largest change of quads", "one"
+    return _caption(
+        f"Distance along the ray, on {scale} scale, of raw frame {found.views.frames[s]}: the one "
+        f"with {reason} in the middle half of the sequence."
     )
 
 
 def _measured_text(found: Findings, s: int) -> str:
-    if found.sequence.from_phasors:
-        return (
-            f'<p class="caption">The phasor of raw frame {found.views.frames[s]}. Red is '
-            f"positive, blue negative.</p>"
-        )
-    count = COUNTED.get(found.sequence.cycle, str(found.sequence.cycle))
-    return (
-        f'<p class="caption">The quartet of raw frame {found.views.frames[s]}: {count} raw '
-        f"frames, each with its own "
-        f"{'phase shift' if len(found.sequence.frequencies) == 1 else 'phase shift, frequency'} "
-        f"and its own time. "
-        f"Distances are known modulo {unambiguous_range(found.sequence):.4g} m. Red is positive, "
-        f"blue negative.</p>"
+    frame, sequence = found.views.frames[s], found.sequence
+    if sequence.from_phasors:
+        return _caption(f"The phasor of raw frame {frame}. Red is positive, blue negative.")
+    count = COUNTED.get(sequence.cycle, str(sequence.cycle))
+    differ = "phase shift" if len(sequence.frequencies) == 1 else "phase shift, frequency"
+    return _caption(
+        f"The quartet of raw frame {frame}: {count} raw frames, each with its own {differ} and its "
+        f"own time. Distances are known modulo {unambiguous_range(sequence):.4g} m. Red is "
+        "positive, blue negative."
     )
 
 
@@ -254,12 +226,10 @@ def _distance_pictures(found: Findings, s: int) -> str:
     html = panels.distances(found, s)
     if found.judgement is None:
         return html
-    html += (
-        "<h3>Absolute error</h3>"
-        f"{panels.error_maps(found.judgement, s)}"
-        '<p class="caption">One scale for all three, defined by the errors of the closed form on '
-        "moving pixels; "
-        "larger errors are clamped.</p>"
+    html += f"<h3>Absolute error</h3>{panels.error_maps(found.judgement, s)}"
+    html += _caption(
+        "One scale for all three, defined by the errors of the closed form on moving pixels; "
+        "larger errors are clamped."
     )
     close_up = panels.close_up(found, found.judgement, s)
     return html + (f"<h3>Close-up of moving pixels</h3>{close_up}" if close_up else "")
@@ -269,37 +239,30 @@ def _quad_text(found: Findings, s: int) -> str:
     which = f"The quad of raw frame {found.views.frames[s]}"
     if found.sequence.from_phasors:
         which = "The quad of shift zero, half the real part of the phasor"
-    return (
-        f'<p class="caption">{which}, measured and rendered at its time and pose over a black '
-        f"background; the "
-        "residual should look like noise.</p>"
+    return _caption(
+        f"{which}, measured and rendered at its time and pose over a black background; the "
+        "residual should look like noise."
     )
 
 
 def _time_pictures(found: Findings) -> str:
     moving = panels.animation(found)
-    return panels.strip_over_time(found) + (
-        f"<h3>Quartet by quartet, slowed down</h3>{moving}" if moving else ""
-    )
+    title = "<h3>Quartet by quartet, slowed down</h3>"
+    return panels.strip_over_time(found) + (title + moving if moving else "")
 
 
 def _beyond(metrics: Mapping[str, Any], found: Findings) -> list[str]:
     """Sections of colour and of novel views, where there are any."""
     sections = []
     if found.colour is not None:
-        text = (
-            '<p class="caption">From the colour camera, at the time of the raw frame. '
-            f"Its PSNR is {page.number(metrics, 'colour_psnr_db', 'decibel')}.</p>"
-        )
-        sections.append(_section("Colour", text + gallery.colour_strip(found.colour)))
+        psnr = page.number(metrics, "colour_psnr_db", "decibel")
+        text = f"From the colour camera, at the time of the raw frame. Its PSNR is {psnr}."
+        sections.append(_section("Colour", _caption(text), gallery.colour_strip(found.colour)))
     if found.novel is not None:
-        text = (
-            '<p class="caption">The reconstruction in the middle of the sequence, from its novel '
-            "poses. "
-            "Grey: opacity below one half.</p>"
-        )
+        text = "The reconstruction in the middle of the sequence, from its novel poses."
+        text = _caption(f"{text} Grey: opacity below one half.")
         strip = gallery.novel_strip(found.novel, found.distance_scale)
-        sections.append(_section("Novel views", text + strip))
+        sections.append(_section("Novel views", text, strip))
     return sections
 
 
@@ -308,30 +271,26 @@ def _along(metrics: Mapping[str, Any], rows: Sequence[Mapping[str, float]]) -> l
     drawing = figures.along_run(rows)
     if drawing is None:
         return []
+    along = metrics.get("diagnostics") or {}
+
+    def number(name: str, form: str) -> str:
+        return page.number(metrics, f"diagnostics.{name}", form)
+
     text = ALONG_TEXT
-    key = "diagnostics.criterion_m_least"
-    if page.look_up(metrics, key) is not None:
+    if along.get("criterion_m_least") is not None:
         text += (
-            f"; their difference is least, {page.number(metrics, key, 'length_cm')}, after"
-            f" {page.number(metrics, 'diagnostics.images_at_criterion', 'count')} images"
+            f"; their difference is least, {number('criterion_m_least', 'length_cm')}, after "
+            f"{number('images_at_criterion', 'count')} images"
         )
-        if page.look_up(metrics, "diagnostics.d_mse_x100_at_criterion") is not None:
-            text += (
-                f", where the error of d is "
-                f"{page.number(metrics, 'diagnostics.d_mse_x100_at_criterion', 'error')}"
-            )
+        if along.get("d_mse_x100_at_criterion") is not None:
+            text += f", where the error of d is {number('d_mse_x100_at_criterion', 'error')}"
     text += "."
-    if page.look_up(metrics, "diagnostics.d_mse_x100_least") is not None:
+    if along.get("d_mse_x100_least") is not None:
         text += (
-            f" The error of d is least, "
-            f"{page.number(metrics, 'diagnostics.d_mse_x100_least', 'error')}, after"
-            f" {page.number(metrics, 'diagnostics.images_at_least', 'count')} images."
+            f" The error of d is least, {number('d_mse_x100_least', 'error')}, after "
+            f"{number('images_at_least', 'count')} images."
         )
-    return [
-        _section(
-            "Along the run", f'<p class="caption">{text}</p>{page.chart(drawing, "Along the run")}'
-        )
-    ]
+    return [_section("Along the run", _caption(text), page.chart(drawing, "Along the run"))]
 
 
 def _curves(found: Findings, log: Sequence[Mapping[str, float]]) -> str:
@@ -343,12 +302,8 @@ def _curves(found: Findings, log: Sequence[Mapping[str, float]]) -> str:
     if judged is not None:
         errors = {name: judged.errors[name] for name in panels.TITLES}
         everywhere = np.ones_like(judged.moving)
-        groups = {
-            "all pixels": everywhere,
-            "moving pixels": judged.moving,
-            "static pixels": judged.static,
-        }
-        groups = {name: mask for name, mask in groups.items() if mask.any()}
+        masks = everywhere, judged.moving, judged.static
+        groups = {n: mask for n, mask in zip(PIXELS.values(), masks, strict=True) if mask.any()}
         per_frame = {
             group: {
                 name: [None if v is None else ERROR_UNIT * v for v in per_frame_mean(error, mask)]
@@ -356,9 +311,8 @@ def _curves(found: Findings, log: Sequence[Mapping[str, float]]) -> str:
             }
             for group, mask in groups.items()
         }
-        charts.append(
-            ("Error of every raw frame", figures.error_over_frames(found.views.frames, per_frame))
-        )
+        over_frames = figures.error_over_frames(found.views.frames, per_frame)
+        charts.append(("Error of every raw frame", over_frames))
         title = "Distribution of errors (the first bin holds all below a millimetre)"
         charts.append((title, figures.error_histogram(errors, groups)))
     return "".join(f"<h3>{title}</h3>{page.chart(svg, title)}" for title, svg in charts)
