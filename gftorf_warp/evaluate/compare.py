@@ -75,10 +75,8 @@ def compare(
 
         run = Run.open(run)
     if against not in AGAINST:
-        why = f"expected one of {', '.join(AGAINST)}"
-        raise UsageError(
-            f"unknown truth {against!r}", where="--against", why=why, fix="use --against geometry"
-        )
+        why, fix = f"expected one of {', '.join(AGAINST)}", "use --against geometry"
+        raise UsageError(f"unknown truth {against!r}", where="--against", why=why, fix=fix)
     sequence = run.sequence()
     known = fitting_truth(sequence, truth)
     scored = measure.scored_frames(sequence, frames)
@@ -96,8 +94,7 @@ def compare(
 
 
 def fitting_truth(sequence: Sequence, path: str | Path | None = None) -> Truth | None:
-    """Ground truth of a sequence, or of the sequence at ``path`` with the same frames and size;
-    None if unknown.
+    """Ground truth of a sequence, or of one at ``path`` of the same size; None if unknown.
 
     Raises:
         InputError: If ``path`` holds no ground truth, or frames or size differ.
@@ -113,9 +110,8 @@ def fitting_truth(sequence: Sequence, path: str | Path | None = None) -> Truth |
             fix="leave --truth out, or name a sequence with synthetic_depth/",
         )
     if found.distance.shape != sequence.quads.shape:
-        expected, got = (
-            "x".join(map(str, shape)) for shape in (sequence.quads.shape, found.distance.shape)
-        )
+        shapes = sequence.quads.shape, found.distance.shape
+        expected, got = ("x".join(map(str, shape)) for shape in shapes)
         raise InputError(
             "the truth does not fit the run",
             where=path or sequence.path or "sequence",
@@ -139,12 +135,10 @@ def findings(
     moving, static = moving_and_static(
         distance, gathered.frames, from_phasors=sequence.from_phasors, cycle=sequence.cycle
     )
-    scored = (distance if against == AGAINST[0] else _static_phasor(sequence, truth))[
-        gathered.frames
-    ]
-    errors = {
-        name: measure.squared_error(image, scored) for name, image in gathered.distances.items()
-    }
+    if against != AGAINST[0]:
+        distance = _static_phasor(sequence, truth)
+    scored, images = distance[gathered.frames], gathered.distances.items()
+    errors = {name: measure.squared_error(image, scored) for name, image in images}
     judgement = Judgement(truth=scored, errors=errors, moving=moving, static=static)
     return Findings(sequence=sequence, views=gathered, judgement=judgement)
 
@@ -172,19 +166,16 @@ def summary(
     run: Run, found: Findings, *, protocol: str, against: str = AGAINST[0]
 ) -> dict[str, Any]:
     """The content of metrics.json: numbers, texts and None."""
-    confidence, colour = found.views.confidence, found.colour
+    views, confidence, colour = found.views, found.views.confidence, found.colour
+    peak = float(np.abs(found.sequence.quads[found.sequence.measured]).max())
     return {
-        "frames": len(found.views.frames),
+        "frames": len(views.frames),
         "protocol": protocol,
         "against": against,
         **_errors(found.judgement),
         "unambiguous_range_m": unambiguous_range(found.sequence),
         "ambiguous_share": None if confidence is None else float((confidence < CONFIDENT).mean()),
-        "quad_psnr_db": measure.psnr_db(
-            found.views.quad_rendered,
-            found.views.quad_measured,
-            peak=float(np.abs(found.sequence.quads[found.sequence.measured]).max()),
-        ),
+        "quad_psnr_db": measure.psnr_db(views.quad_rendered, views.quad_measured, peak),
         "colour_psnr_db": colour
         and measure.psnr_db(colour.rendered, colour.measured, peak=float(colour.measured.max())),
         "gaussians": run.gaussians,
@@ -196,24 +187,17 @@ def summary(
 
 
 def _errors(judgement: Judgement | None) -> dict[str, object]:
-    """The errors of metrics.json on all, moving and static pixels;
-    all None without ground truth.
-    """
+    """The errors of metrics.json on all, moving and static pixels; None without ground truth."""
     if judgement is None:
         unknown: dict[str, None] = {f"{name}_mse_x100": None for name in measure.DISTANCES}
         group = {**unknown, "share": None}
         return {**unknown, "moving": group, "static": group}
     moving, static, errors = judgement.moving, judgement.static, judgement.errors
+    on_moving, on_static = (measure.distance_errors(errors, mask) for mask in (moving, static))
     return {
         **measure.distance_errors(errors, np.ones_like(moving), measure.mean_over_frames),
-        "moving": {
-            **measure.distance_errors(errors, moving),
-            "share": measure.share(moving, static),
-        },
-        "static": {
-            **measure.distance_errors(errors, static),
-            "share": measure.share(static, moving),
-        },
+        "moving": {**on_moving, "share": measure.share(moving, static)},
+        "static": {**on_static, "share": measure.share(static, moving)},
     }
 
 
@@ -240,16 +224,12 @@ def installed_versions() -> str:
     """Versions of this package, its main dependencies and the platform."""
     packages = ("torch", "warp-lang", "numpy")
     versions = ", ".join(f"{name} {importlib.metadata.version(name)}" for name in packages)
-    return (
-        f"gftorf-warp {__version__}, {versions}, Python {platform.python_version()}, "
-        f"{platform.system()}"
-    )
+    system = f"Python {platform.python_version()}, {platform.system()}"
+    return f"gftorf-warp {__version__}, {versions}, {system}"
 
 
 def rows_of(path: Path) -> list[dict[str, float]]:
-    """The complete rows of a run's metrics.jsonl or diagnostics.jsonl;
-    none if there is no such file.
-    """
+    """The complete rows of a run's metrics.jsonl or diagnostics.jsonl; none without the file."""
     lines = path.read_text(encoding="utf-8").splitlines(keepends=True) if path.exists() else []
     return [json.loads(line) for line in lines if line.endswith("\n")]
 
@@ -265,16 +245,12 @@ def sequence_title(path: Path | None) -> str | None:
 def truth_statement(path: Path | None) -> str | None:
     """The paragraphs of a sequence's README.md on ground truth; None if there are none."""
     paragraphs = _data_card(path).split("\n\n")
-    about = [
-        " ".join(text.split()) for text in paragraphs if text.lower().startswith("ground truth")
-    ]
-    return " ".join(about) or None
+    about = [text for text in paragraphs if text.lower().startswith("ground truth")]
+    return " ".join(" ".join(about).split()) or None
 
 
 def _data_card(path: Path | None) -> str:
     card = None if path is None else path / "README.md"
-    return (
-        card.read_text(encoding="utf-8", errors="replace")
-        if card is not None and card.is_file()
-        else ""
-    )
+    if card is None or not card.is_file():
+        return ""
+    return card.read_text(encoding="utf-8", errors="replace")

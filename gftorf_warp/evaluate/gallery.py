@@ -65,19 +65,13 @@ def novel_views(run: Run, sequence: Sequence, count: int = STRIP_VIEWS) -> Novel
     distances, colours = [], []
     for m in chosen:
         rendering = run.render(time, run.camera.at(sequence.novel_from_world[m]))
-        opacity, distance = (
-            finite(image, f"novel view {m}", run)
-            for image in (rendering.opacity, rendering.distance)
-        )
-        distances.append(
-            np.where(
-                opacity >= NORMALISED_MIN, distance / np.maximum(opacity, NORMALISED_MIN), np.nan
-            )
-        )
+        opacity = finite(rendering.opacity, f"novel view {m}", run)
+        distance = finite(rendering.distance, f"novel view {m}", run)
+        distance /= np.maximum(opacity, NORMALISED_MIN)
+        distances.append(np.where(opacity >= NORMALISED_MIN, distance, np.nan))
         if rendering.colour is not None:
-            colours.append(
-                finite(rendering.colour, f"colour of novel view {m}", run).transpose(1, 2, 0)
-            )
+            image = finite(rendering.colour, f"colour of novel view {m}", run)
+            colours.append(image.transpose(1, 2, 0))
     colour = np.stack(colours) if colours else None
     return Novel(poses=chosen, time=time, distance=np.stack(distances), colour=colour)
 
@@ -107,42 +101,30 @@ def colour_views(run: Run, sequence: Sequence, frames: list[int]) -> Colour | No
 
 def novel_strip(novel: Novel, scale: pictures.Scale) -> str:
     """Distance, and colour if there is any, of the novel views as HTML."""
-    rows = {
-        "distance / opacity": [
-            pictures.colour_mapped(_thinned(image), scale) for image in novel.distance
-        ]
-    }
+    notes = [f"pose {m}" for m in novel.poses]
+    distances = [pictures.colour_mapped(_thinned(image), scale) for image in novel.distance]
+    strip = _row(distances, "distance / opacity", notes)
+    strip += f'<div class="wide">{page.colour_bar(scale)}</div>'
     if novel.colour is not None:
         white = float(np.percentile(novel.colour, 99.5))
-        rows["colour"] = [_shown(image, white) for image in novel.colour]
-    first, *others = (
-        page.row(
-            [
-                page.plain_picture(rgb, title, f"pose {m}")
-                for rgb, m in zip(images, novel.poses, strict=True)
-            ]
-        )
-        for title, images in rows.items()
-    )
-    return first + f'<div class="wide">{page.colour_bar(scale)}</div>' + "".join(others)
+        strip += _row([_shown(image, white) for image in novel.colour], "colour", notes)
+    return strip
 
 
 def colour_strip(colour: Colour) -> str:
     """Measured and rendered colour at a few frames, with one white level, as HTML."""
     chosen = sorted({round(x) for x in np.linspace(0, len(colour.frames) - 1, STRIP_VIEWS)})
     white = float(np.percentile(colour.measured, 99.5))
-    return "".join(
-        page.row(
-            [
-                page.plain_picture(_shown(images[c], white), title, f"frame {colour.frames[c]}")
-                for c in chosen
-            ]
-        )
-        for title, images in (
-            ("measured colour", colour.measured),
-            ("rendered colour", colour.rendered),
-        )
+    notes = [f"frame {colour.frames[c]}" for c in chosen]
+    measured, rendered = (
+        [_shown(images[c], white) for c in chosen] for images in (colour.measured, colour.rendered)
     )
+    return _row(measured, "measured colour", notes) + _row(rendered, "rendered colour", notes)
+
+
+def _row(images: list[np.ndarray], title: str, notes: list[str]) -> str:
+    pairs = zip(images, notes, strict=True)
+    return page.row([page.plain_picture(rgb, title, note) for rgb, note in pairs])
 
 
 def _shown(linear: Float[np.ndarray, "H W 3"], white: float) -> UInt8[np.ndarray, "h w 3"]:

@@ -29,8 +29,7 @@ def scored_frames(sequence: Sequence, protocol: str = "all") -> list[int]:
 
     Args:
         sequence: What was measured.
-        protocol: ``all``: every raw frame of a complete quartet; of a phasor, which has one time,
-            only the first.
+        protocol: ``all``: every raw frame of a complete quartet, of a phasor only the first.
             ``ftorf13``: the first frame of every complete quartet but the first and the last, as in
             the published tables (13 of 60 frames).
 
@@ -39,18 +38,14 @@ def scored_frames(sequence: Sequence, protocol: str = "all") -> list[int]:
         InputError: If no quartet is complete.
     """
     if protocol not in PROTOCOLS:
-        raise UsageError(
-            f"unknown protocol {protocol!r}",
-            where="--frames",
-            why=f"expected one of {', '.join(PROTOCOLS)}",
-            fix="use --frames all",
-        )
+        why, fix = f"expected one of {', '.join(PROTOCOLS)}", "use --frames all"
+        raise UsageError(f"unknown protocol {protocol!r}", where="--frames", why=why, fix=fix)
     quartets = sequence.complete_quartets
     if not quartets:
         raise InputError(
             "no complete quartet, nothing to score",
             where=sequence.path or "sequence",
-            why=f"a closed form needs all raw frames of a cycle in a row; none among "
+            why="a closed form needs all raw frames of a cycle in a row; none among "
             f"{sequence.frames} raw frames",
             fix="check the sequence with `gftorf check`, or record longer",
         )
@@ -58,12 +53,9 @@ def scored_frames(sequence: Sequence, protocol: str = "all") -> list[int]:
         slots = range(1 if sequence.from_phasors else sequence.cycle)
         return [sequence.cycle * i + k for i in quartets for k in slots]
     if len(quartets) < 3:
-        raise UsageError(
-            "protocol ftorf13 leaves no frame",
-            where="--frames",
-            why=f"it drops the first and the last quartet, and the sequence has {len(quartets)}",
-            fix="use --frames all",
-        )
+        what, fix = "protocol ftorf13 leaves no frame", "use --frames all"
+        why = f"it drops the first and the last quartet, and the sequence has {len(quartets)}"
+        raise UsageError(what, where="--frames", why=why, fix=fix)
     return [sequence.cycle * i for i in quartets[1:-1]]
 
 
@@ -87,9 +79,7 @@ def pooled(error: Float[np.ndarray, "S H W"], mask: Bool[np.ndarray, "S H W"]) -
 def mean_over_frames(
     error: Float[np.ndarray, "S H W"], mask: Bool[np.ndarray, "S H W"]
 ) -> float | None:
-    """Mean over frames of the mean over the known pixels of each frame, as published;
-    None if there is none.
-    """
+    """Mean over frames of the mean of each frame's known pixels, as published; None if none."""
     per_frame = [value for value in per_frame_mean(error, mask) if value is not None]
     return float(np.mean(per_frame)) if per_frame else None
 
@@ -106,14 +96,9 @@ def distance_errors(
     mask: Bool[np.ndarray, "S H W"],
     reduce: Callable[[np.ndarray, np.ndarray], float | None] = pooled,
 ) -> dict[str, float | None]:
-    """The keys ``<name>_mse_x100`` [m^2 x 100] of every kind of distance;
-    None where there is no pixel.
-    """
-    table: dict[str, float | None] = {}
-    for name in DISTANCES:
-        value = reduce(errors[name], mask)
-        table[f"{name}_mse_x100"] = None if value is None else ERROR_UNIT * value
-    return table
+    """``<name>_mse_x100`` [m^2 x 100] of every kind of distance; None where there is no pixel."""
+    values = {name: reduce(errors[name], mask) for name in DISTANCES}
+    return {f"{name}_mse_x100": v and ERROR_UNIT * v for name, v in values.items()}
 
 
 def share(mask: Bool[np.ndarray, "S H W"], *others: Bool[np.ndarray, "S H W"]) -> float | None:
@@ -144,9 +129,7 @@ def normalised(
 def psnr_db(
     rendered: Float[np.ndarray, "*n"], measured: Float[np.ndarray, "*n"], peak: float
 ) -> float | None:
-    """10 log10(peak^2 / MSE) [dB], the MSE pooled over all elements;
-    None where it is not a number.
-    """
+    """10 log10(peak^2 / MSE) [dB], the MSE over all elements; None where it is not a number."""
     mse = float(np.square(rendered - measured, dtype=np.float64).mean())
     return 10.0 * math.log10(peak**2 / mse) if mse > 0 and peak > 0 else None
 
@@ -155,10 +138,8 @@ def along_run(rows: list[dict[str, float]]) -> dict[str, float | int | None] | N
     """Summary of the rows of ``diagnostics.jsonl``; None if there are none.
 
     Returns:
-        rows: their number. d_mse_x100_least, images_at_least: the least error of d [m^2 x 100] and
-        its number of images; None without truth. criterion_m_least, images_at_criterion,
-        d_mse_x100_at_criterion: the least |d - d_ToF| on static pixels [m], which needs no truth,
-            its number of images, and the error of d there.
+        The number of rows; the least error of d [m^2 x 100] and its images, None without truth;
+        the least |d - d_ToF| on static pixels [m], its images, and the error of d there.
     """
     if not rows:
         return None

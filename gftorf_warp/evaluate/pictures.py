@@ -109,9 +109,7 @@ def _row(pictures: list[np.ndarray], gap: int, white: int) -> np.ndarray:
 
 
 def thinned(image: np.ndarray, size_max: int) -> np.ndarray:
-    """Every k-th row and column, with the smallest k for sides of at most ``size_max``;
-    no interpolation.
-    """
+    """Every k-th row and column, with the smallest k for sides of at most ``size_max``."""
     step = -(-max(image.shape[:2]) // size_max)
     return image[::step, ::step]
 
@@ -131,9 +129,7 @@ def webp(rgb: UInt8[np.ndarray, "H W 3"]) -> bytes:
 def animated_webp(
     pictures: list[UInt8[np.ndarray, "H W 3"]], period_s: float, quality: int = 80
 ) -> bytes:
-    """An endless WebP animation that shows each picture for ``period_s`` [s];
-    ``quality`` as in JPEG, 1..100.
-    """
+    """An endless WebP animation, each picture for ``period_s`` [s]; ``quality`` as in JPEG."""
     import cv2
 
     animation = cv2.Animation()
@@ -161,10 +157,8 @@ def _colours(name: str) -> UInt8[np.ndarray, "T 3"]:
 
     if name == "RdBu_r":
         at = np.arange(TICKS) * (len(BLUE_TO_RED) - 1) / (TICKS - 1)
-        channels = [
-            np.interp(at, range(len(BLUE_TO_RED)), channel)
-            for channel in zip(*BLUE_TO_RED, strict=True)
-        ]
+        known = range(len(BLUE_TO_RED))
+        channels = [np.interp(at, known, channel) for channel in zip(*BLUE_TO_RED, strict=True)]
         return np.round(np.stack(channels, axis=-1)).astype(np.uint8)
     nearest = np.minimum(np.arange(TICKS) * 256 // (TICKS - 1), 255).astype(np.uint8)[:, None]
     if name == "gray":

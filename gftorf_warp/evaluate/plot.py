@@ -1,6 +1,4 @@
-"""Line plots as SVG, written directly: a report has fifteen of them,
-for which matplotlib takes two seconds.
-"""
+"""Line plots as SVG, written directly: matplotlib takes two seconds for those of a report."""
 
 from __future__ import annotations
 
@@ -77,22 +75,16 @@ class _Axis(NamedTuple):
         for decade in decades:
             power = f"10{str(decade).translate(SUPERSCRIPT)}" if decade % every == 0 else ""
             for k in range(1, 10):
-                value = k * 10.0**decade
+                value, label = k * 10.0**decade, power if k == 1 else ""
                 if decimal:
-                    found.append((value, f"{value:g}" if k in labelled else ""))
-                else:
-                    found.append((value, power if k == 1 else ""))
+                    label = f"{value:g}" if k in labelled else ""
+                found.append((value, label))
         return [(value, label) for value, label in found if self.low <= value <= self.high]
 
 
 def svg(plots: Sequence[Plot], *, columns: int, height: int) -> bytes:
-    """A drawing of plots, row by row; a row is ``height`` [px] high.
-    Plots of the same curves share one legend.
-    """
-    legends = [
-        _legend([curve for curve in plot.curves if curve.label], WIDTH / columns - 2 * RIGHT)
-        for plot in plots
-    ]
+    """A drawing of plots in rows of ``height`` [px]; plots of the same curves share one legend."""
+    legends = [_legend(plot.curves, WIDTH / columns - 2 * RIGHT) for plot in plots]
     shared = len(plots) > 1 and all(legend == legends[0] for legend in legends)
     body, top = [], 0.0
     if shared:
@@ -106,12 +98,10 @@ def svg(plots: Sequence[Plot], *, columns: int, height: int) -> bytes:
             if not shared:
                 body.append(_group(legends[k], left + RIGHT, top + TITLE))
         top += height
-    return (
-        f'<svg xmlns="http://www.w3.org/2000/svg" width="{WIDTH}" height="{top:g}" viewBox="0 0 '
-        f'{WIDTH} {top:g}" '
-        f'font-family="DejaVu Sans, Verdana, sans-serif" font-size="{FONT}" '
-        f'fill="{INK}">{"".join(body)}</svg>\n'
-    ).encode()
+    size = f'width="{WIDTH}" height="{top:g}" viewBox="0 0 {WIDTH} {top:g}"'
+    font = f'font-family="DejaVu Sans, Verdana, sans-serif" font-size="{FONT}" fill="{INK}"'
+    drawing = "".join(body)
+    return f'<svg xmlns="http://www.w3.org/2000/svg" {size} {font}>{drawing}</svg>\n'.encode()
 
 
 def _plot(plot: Plot, left: float, top: float, above: float, width: float, height: float) -> str:
@@ -119,28 +109,18 @@ def _plot(plot: Plot, left: float, top: float, above: float, width: float, heigh
     xs = np.concatenate([np.asarray(curve.x, float) for curve in plot.curves])
     ys = np.concatenate([np.asarray(curve.y, float) for curve in plot.curves])
     x, y = _axis(xs, plot.log_x, x0, x1), _axis(ys, plot.log_y, y0, y1, from_zero=plot.from_zero)
-    parts = [
-        _text(
-            0.5 * (x0 + x1),
-            top + 14,
-            plot.title,
-            'text-anchor="middle" font-weight="bold" font-size="11"',
-        )
-    ]
+    bold = 'text-anchor="middle" font-weight="bold" font-size="11"'
+    parts = [_text(0.5 * (x0 + x1), top + 14, plot.title, bold)]
     for value, label in x.ticks():
         at = float(x(np.array(value)))
         parts += [_line(at, y0, at, y1, GRID)] if label else []
-        parts += [
-            _line(at, y0, at, y0 + (3.5 if label else 2)),
-            _text(at, y0 + 14, label, 'text-anchor="middle"'),
-        ]
+        parts.append(_line(at, y0, at, y0 + (3.5 if label else 2)))
+        parts.append(_text(at, y0 + 14, label, 'text-anchor="middle"'))
     for value, label in y.ticks():
         at = float(y(np.array(value)))
         parts += [_line(x0, at, x1, at, GRID)] if label else []
-        parts += [
-            _line(x0 - (3.5 if label else 2), at, x0, at),
-            _text(x0 - 6, at + 3.3, label, 'text-anchor="end"'),
-        ]
+        parts.append(_line(x0 - (3.5 if label else 2), at, x0, at))
+        parts.append(_text(x0 - 6, at + 3.3, label, 'text-anchor="end"'))
     parts += [_line(x0, y0, x1, y0), _line(x0, y0, x0, y1)]
     parts.append(_text(0.5 * (x0 + x1), y0 + 30, plot.x, 'text-anchor="middle"'))
     middle = 0.5 * (y0 + y1)
@@ -158,18 +138,14 @@ def _curve(curve: Curve, x: _Axis, y: _Axis) -> str:
             words.append(f"{'L' if pen_down else 'M'}{a:.1f} {b:.1f}")
         pen_down = known
     dashes = f' stroke-dasharray="{curve.dashes}"' if curve.dashes else ""
-    path = (
-        f'<path d="{"".join(words)}" fill="none" stroke="{curve.colour}" '
-        f'stroke-width="1.4"{dashes}/>'
-    )
+    line = f'fill="none" stroke="{curve.colour}" stroke-width="1.4"{dashes}'
+    path = f'<path d="{"".join(words)}" {line}/>'
     if not curve.points and len(words) > 1:
         return path
     # a line without length and with round ends
     marks = "".join(f"{word.replace('L', 'M')}h0" for word in words)
-    return (
-        f'{path}<path d="{marks}" stroke="{curve.colour}" stroke-width="3.2" '
-        f'stroke-linecap="round"/>'
-    )
+    dots = f'stroke="{curve.colour}" stroke-width="3.2" stroke-linecap="round"'
+    return f'{path}<path d="{marks}" {dots}/>'
 
 
 def _axis(
@@ -190,13 +166,8 @@ def _axis(
         return _Axis(low / factor, high * factor, True, start, end)
     low = min(low, 0.0) if from_zero else low
     span = high - low or abs(high) or 1.0
-    return _Axis(
-        low if from_zero and low == 0.0 else low - MARGIN * span,
-        high + MARGIN * span,
-        False,
-        start,
-        end,
-    )
+    below = 0.0 if from_zero and low == 0.0 else MARGIN * span
+    return _Axis(low - below, high + MARGIN * span, False, start, end)
 
 
 def _number(value: float) -> str:
@@ -215,12 +186,9 @@ def _step(least: float) -> float:
 
 
 def _legend(curves: Iterable[Curve], width: float) -> list[str]:
-    """Rows of a legend, each an SVG group whose origin is the row's left end;
-    none for a single curve.
-    """
+    """Rows of a legend, each an SVG group with its origin at the left; none for a single curve."""
     rows: list[str] = []
-    at = width
-    curves = list(curves)
+    at, curves = width, [curve for curve in curves if curve.label]
     for curve in curves if len(curves) > 1 else ():
         wide = 23 + LETTER * SMALL * len(curve.label)
         if at + wide > width:

@@ -42,21 +42,14 @@ def read(poses: str | Path, sequence: Sequence) -> Float[np.ndarray, "M 4 4"]:
     """
     if str(poses) == NOVEL:
         if sequence.novel_from_world is None or not len(sequence.novel_from_world):
-            raise UsageError(
-                "no novel views",
-                where="--poses novel",
-                why=f"{sequence.path or 'the sequence'} has no poses of novel views",
-                fix="give a .npy file of camera_from_world matrices, or leave --poses out",
-            )
+            why = f"{sequence.path or 'the sequence'} has no poses of novel views"
+            fix = "give a .npy file of camera_from_world matrices, or leave --poses out"
+            raise UsageError("no novel views", where="--poses novel", why=why, fix=fix)
         return np.asarray(sequence.novel_from_world, dtype=np.float64)
     path = Path(poses)
     if path.suffix != ".npy":
-        raise UsageError(
-            f"cannot read poses from {path.name}",
-            where="--poses",
-            why="expected a .npy file, or the word novel",
-            fix="save the matrices with numpy.save",
-        )
+        why, fix = "expected a .npy file, or the word novel", "save the matrices with numpy.save"
+        raise UsageError(f"cannot read poses from {path.name}", where="--poses", why=why, fix=fix)
     stored = read_array(path, FIELD).astype(np.float64)
     if stored.shape[1] == 3:
         last = np.broadcast_to([0.0, 0.0, 0.0, 1.0], (len(stored), 1, 4))

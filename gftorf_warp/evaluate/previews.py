@@ -33,17 +33,14 @@ def preview(name: str, images: Channels, scale: pictures.Scale) -> bytes:
     if name == "distance":
         return indexed_png_bytes(pictures.ticks(images["distance"], scale), pictures.palette(scale))
     if name == "quads":
-        row = pictures.ticks_side_by_side(
-            [pictures.ticks(image, scale) for image in images.values()]
-        )
+        ticks = [pictures.ticks(image, scale) for image in images.values()]
+        row = pictures.ticks_side_by_side(ticks)
         return indexed_png_bytes(row, pictures.palette(scale))
     if name == "phasor":
         phase = np.arctan2(images["im"], images["re"]) % (2.0 * np.pi)
-        pair = [
-            pictures.colour_mapped(phase, pictures.phase_scale()),
-            pictures.colour_mapped(images["amplitude"], scale),
-        ]
-        return png_bytes(pictures.side_by_side(pair))
+        turns = pictures.colour_mapped(phase, pictures.phase_scale())
+        amplitude = pictures.colour_mapped(images["amplitude"], scale)
+        return png_bytes(pictures.side_by_side([turns, amplitude]))
     return png_bytes(srgb(np.stack(list(images.values()), axis=-1)))
 
 
@@ -55,9 +52,7 @@ def paths(out: Path, name: str, index: int) -> tuple[Path, Path]:
 def write_images(
     out: Path, scales: Mapping[str, pictures.Scale], index: int, images: Mapping[str, Channels]
 ) -> None:
-    """Write one EXR and one PNG of each kind at the index-th time, atomically,
-    inside :func:`many_files`.
-    """
+    """Write an EXR and a PNG of each kind at the index-th time, inside :func:`many_files`."""
     for name, channels in images.items():
         exr, png = paths(out, name, index)
         write_exr(exr, channels, one_of=True)

@@ -16,6 +16,7 @@ from contextlib import contextmanager, suppress
 from mmap import mmap
 from multiprocessing.connection import Connection, Pipe, wait
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -100,13 +101,8 @@ class Writing:
                 command = [sys.executable, "-c", code, *map(str, files)]
                 # own process groups: Ctrl-C reaches this process only, which lets them complete
                 # their picture
-                process = subprocess.Popen(
-                    command,
-                    env=environment,
-                    pass_fds=files,
-                    stdin=subprocess.DEVNULL,
-                    process_group=0,
-                )
+                given: dict[str, Any] = {"stdin": subprocess.DEVNULL, "process_group": 0}
+                process = subprocess.Popen(command, env=environment, pass_fds=files, **given)
             self._processes[ours], self._busy[ours] = process, {}
 
     def write(self, index: int, images: Mapping[str, Channels]) -> None:
@@ -183,12 +179,8 @@ class Writing:
         connection.close()
         code = self._processes[connection].wait()
         why = f"signal {-code} stopped it" if code < 0 else f"its exit code is {code}"
-        return ResourceError(
-            "a process that writes pictures ended",
-            where=self._out,
-            why=why,
-            fix="free memory, then render again",
-        )
+        what, fix = "a process that writes pictures ended", "free memory, then render again"
+        return ResourceError(what, where=self._out, why=why, fix=fix)
 
 
 def _mapped(file: int, shape: tuple[int, ...]) -> Float[np.ndarray, "M B C H W"]:
@@ -198,9 +190,7 @@ def _mapped(file: int, shape: tuple[int, ...]) -> Float[np.ndarray, "M B C H W"]
 
 
 def work() -> None:
-    """Main function of a process: write the images of each message and acknowledge it,
-    until the connection closes.
-    """
+    """Main function of a process: writes and acknowledges messages until the connection closes."""
     connection, file = Connection(int(sys.argv[1])), int(sys.argv[2])
     with suppress(EOFError, BrokenPipeError, ConnectionResetError):
         out, scales, names, shape = connection.recv()

@@ -37,6 +37,12 @@ FLOW_WORDS = {
     "computed": "computed: optical flow by OpenCV, between quads of one shift",
     "none": "none",
 }
+WORDS = {
+    "input": INPUT_WORDS,
+    "init": INIT_WORDS,
+    "motion": MOTION_WORDS,
+    "flow_source": FLOW_WORDS,
+}
 
 
 def method_of(config: Mapping[str, Any]) -> str:
@@ -60,15 +66,10 @@ def how(config: Mapping[str, Any], data_card: str | None, installed: str) -> str
         installed: Versions of the software of the comparison.
     """
     method, size, scale = method_of(config), config.get("size_optimised"), config.get("quad_scale")
-    words = {
-        "input": INPUT_WORDS,
-        "init": INIT_WORDS,
-        "motion": MOTION_WORDS,
-        "flow_source": FLOW_WORDS,
-    }
-    known = {name: fact(config, name) for name in words}
-    worded = {name: words[name].get(str(value), value) for name, value in known.items()}
+    known = {name: fact(config, name) for name in WORDS}
+    worded = {name: WORDS[name].get(str(value), value) for name, value in known.items()}
     threads = "" if config.get("threads") is None else f", {config['threads']} threads"
+    length = f"{config.get('images')}, {config.get('seed')}"
     facts = {
         "sequence": config.get("sequence"),
         "preset": config.get("preset"),
@@ -81,19 +82,14 @@ def how(config: Mapping[str, Any], data_card: str | None, installed: str) -> str
         "optimised at": size
         and f"{size[0]}x{size[1]} pixels; scored at the sequence's own resolution",
         "quad scale": None if scale is None else f"{scale:.6g} ({config.get('quad_scale_source')})",
-        "images, seed": f"{config.get('images')}, {config.get('seed')}"
-        if method == "gaussians"
-        else None,
+        "images, seed": length if method == "gaussians" else None,
         "device": config.get("device") and f"{config['device']}{threads}",
         "reconstructed by": f"gftorf-warp {config.get('version')}",
         "compared by": installed,
         "ground truth": data_card,
     }
-    rows = "".join(
-        f"<dt>{name}</dt><dd>{page.escape(value)}</dd>"
-        for name, value in facts.items()
-        if value is not None
-    )
+    present = {name: value for name, value in facts.items() if value is not None}
+    rows = "".join(f"<dt>{name}</dt><dd>{page.escape(v)}</dd>" for name, v in present.items())
     command = f"{_command(config)}\ngftorf compare RUN"
     everything = json.dumps(config, indent=2, sort_keys=True, default=str)
     return (
@@ -106,11 +102,8 @@ def _command(config: Mapping[str, Any]) -> str:
     """The command that reproduces the run."""
     options = {name: config.get(name) for name in ("preset", "images", "seed", "device")}
     if method_of(config) == "gaussians":
-        options |= {
-            name: fact(config, name)
-            for name in ("ablation", "input")
-            if fact(config, name) is not None
-        }
+        more = {name: fact(config, name) for name in ("ablation", "input")}
+        options |= {name: value for name, value in more.items() if value is not None}
     else:
         del options["images"], options["seed"]
     words = list(options.items())

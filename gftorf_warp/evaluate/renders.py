@@ -1,6 +1,4 @@
-"""The options of ``gftorf render``: names of images, the channels of each,
-and the output folder.
-"""
+"""The options of ``gftorf render``: names of images, their channels, and the output folder."""
 
 from __future__ import annotations
 
@@ -68,12 +66,8 @@ def named(name: str, images: Mapping[str, Float[np.ndarray, "..."]], sensor: Sen
         UsageError: If colour is asked for and there is none.
     """
     if name == "colour" and "colour" not in images:
-        raise UsageError(
-            "no colour to render",
-            where="--what colour",
-            why="this run was reconstructed from quads alone",
-            fix="leave colour out of --what",
-        )
+        why, fix = "this run was reconstructed from quads alone", "leave colour out of --what"
+        raise UsageError("no colour to render", where="--what colour", why=why, fix=fix)
     if name == "distance":
         return {image: images[image] for image in NEEDS[name]}
     quads = [f"quad_{math.degrees(shift):03.0f}" for shift in sensor.shifts]
@@ -93,25 +87,19 @@ def prepare_folder(out: Path, listed: Mapping[str, object], *, fresh: bool) -> N
     Raises:
         UsageError: If it holds other images and ``fresh`` is not set, or other files.
     """
+    fix = "choose another --out"
     if out.exists() and not out.is_dir():
-        raise UsageError(
-            "not a folder", where=out, why="--out names a file", fix="choose another --out"
-        )
-    held = (
-        [path for path in out.iterdir() if not path.name.startswith("old-")] if out.exists() else []
-    )
+        raise UsageError("not a folder", where=out, why="--out names a file", fix=fix)
+    found = out.iterdir() if out.exists() else ()
+    held = [path for path in found if not path.name.startswith("old-")]
     if held and not _same(out / LIST, listed):
         ours = (out / LIST).is_file()
         if not (fresh and ours):
-            raise UsageError(
-                "the folder is not empty",
-                where=out,
-                why="it holds images of another run, or other times or poses"
-                if ours
-                else f"it has no {LIST}: these are no images",
-                fix="choose another --out"
-                + (", or --fresh, which moves its content aside" if ours else ""),
-            )
+            why = f"it has no {LIST}: these are no images"
+            if ours:
+                why = "it holds images of another run, or other times or poses"
+                fix += ", or --fresh, which moves its content aside"
+            raise UsageError("the folder is not empty", where=out, why=why, fix=fix)
         set_aside(out, held)
     out.mkdir(parents=True, exist_ok=True)
     write_json(out / LIST, listed)

@@ -1,5 +1,4 @@
-"""Rendered images as arrays on disk: one .npy file [S, H, W] float32 per channel, filled during
-rendering.
+"""Rendered images as arrays on disk: one .npy file [S, H, W] float32 per channel.
 
 Files are written rather than mapped: a full disk then raises an error instead of a signal, and it
 takes half the time. Each file is written by one thread at a time, with many images per system call,
@@ -114,22 +113,17 @@ def _submit(
     block: list[Mapping[str, Channels]],
 ) -> list[Future]:
     """Submit the writing of a block, each channel on its own."""
-    return [
-        threads.submit(
-            _fill,
-            files[path_of(out, name, channel)],
-            first,
-            [images[name][channel] for images in block],
-        )
-        for name, channels in block[0].items()
-        for channel in channels
-    ]
+    futures = []
+    for name, channels in block[0].items():
+        for channel in channels:
+            images = [one[name][channel] for one in block]
+            file = files[path_of(out, name, channel)]
+            futures.append(threads.submit(_fill, file, first, images))
+    return futures
 
 
 def _fill(file: Stored, first: int, images: list[Float[np.ndarray, "H W"]]) -> None:
-    """Write images of a channel and release them before the future completes,
-    so that their memory is reused.
-    """
+    """Write images of a channel, and release their memory before the future completes."""
     try:
         file.write(first, images)
     finally:
@@ -137,9 +131,7 @@ def _fill(file: Stored, first: int, images: list[Float[np.ndarray, "H W"]]) -> N
 
 
 class Stored:
-    """A .npy file [S, H, W] that is filled in any order and gets its name at the end of a
-    ``with``.
-    """
+    """A .npy file [S, H, W], filled in any order; it gets its name at the end of a ``with``."""
 
     def __init__(self, path: Path, shape: tuple[int, int, int]):
         """Store path and shape; nothing is written yet."""
@@ -160,11 +152,7 @@ class Stored:
         self._stack.__exit__(*error)
 
     def write(self, first: int, images: Iterable[Float[np.ndarray, "H W"]]) -> None:
-        """Write some consecutive images.
-
-        Args:
-            first: The number of the first of them.
-            images: Of the file's size.
+        """Write consecutive images, the first of which has the number ``first``.
 
         Raises:
             ResourceError: If the disk is full.
@@ -189,9 +177,8 @@ class Stored:
 def _header(shape: tuple[int, int, int]) -> bytes:
     """Header of a .npy file of float32, padded with spaces."""
     file = io.BytesIO()
-    np.lib.format.write_array_header_1_0(
-        file, {"descr": "<f4", "fortran_order": False, "shape": shape}
-    )
+    content = {"descr": "<f4", "fortran_order": False, "shape": shape}
+    np.lib.format.write_array_header_1_0(file, content)
     magic = np.lib.format.magic(1, 0)
     text = file.getvalue()[len(magic) + 2 : -1].ljust(HEADER - len(magic) - 3) + b"\n"
     return magic + len(text).to_bytes(2, "little") + text
@@ -221,8 +208,6 @@ def _set_direct(file: FileIO, wanted: bool) -> bool:
 
 
 def _start_write_back(file: FileIO, start: int, length: int) -> None:
-    """Start write-back of a part of a file, which Linux does for pages that are declared as not
-    needed.
-    """
+    """Start write-back of a part of a file: Linux does that for pages declared as not needed."""
     if hasattr(os, "posix_fadvise"):
         os.posix_fadvise(file.fileno(), start, length, os.POSIX_FADV_DONTNEED)

@@ -1,6 +1,4 @@
-"""Images of a finished run as arrays: those that are scored,
-and those that ``gftorf render`` writes.
-"""
+"""Images of a finished run as arrays: those scored, and those that ``gftorf render`` writes."""
 
 from __future__ import annotations
 
@@ -92,25 +90,22 @@ def gather(
     Raises:
         DivergedError: If a rendering is not finite.
     """
-    decoded = {
-        i: decode_quartet(sequence, i) for i in sorted({n // sequence.cycle for n in frames})
-    }
+    chosen = sorted({n // sequence.cycle for n in frames})
+    decoded = {i: decode_quartet(sequence, i) for i in chosen}
     quartets = [decoded[n // sequence.cycle] for n in frames]
     rows: dict[str, list[np.ndarray]] = {"d": [], "opacity": [], "d_tof": [], "quad_rendered": []}
     first, *further = sequence.frequencies
-    renderers = {first: run.renderer(RENDERED)} | {
-        f: run.renderer(RENDERED, f_mod_hz=f) for f in further
-    }
+    renderers = {first: run.renderer(RENDERED)}
+    renderers |= {f: run.renderer(RENDERED, f_mod_hz=f) for f in further}
     for count, n in enumerate(frames, start=1):
         time = float(sequence.times[n])
         light = {f: render(time, camera_at(run, sequence, time)) for f, render in renderers.items()}
         rendering, measured = light[first], light[float(sequence.frame_frequencies[n])]
+        others = [light[f].quads for f in further]
         images = {
             "d": rendering.distance,
             "opacity": rendering.opacity,
-            "d_tof": distance_from_quads(
-                rendering.quads, run.sensor, *(light[f].quads for f in further)
-            ),
+            "d_tof": distance_from_quads(rendering.quads, run.sensor, *others),
             "quad_rendered": quad_of_shift(measured, run.sensor, float(sequence.shifts[n])),
         }
         for name, image in zip(images, torch.stack([*images.values()]).cpu(), strict=True):
@@ -166,13 +161,10 @@ def finite(image: torch.Tensor, name: str, run: Run) -> Float[np.ndarray, "*imag
     """
     array = image.detach().cpu().numpy().astype(np.float32)
     if not np.isfinite(array).all():
-        raise DivergedError(
-            f"{name} is not finite",
-            where=run.path,
-            why=f"{int((~np.isfinite(array)).sum())} of {array.size} rendered values are NaN or "
-            f"infinite",
-            fix="reconstruct again with another --seed or preset",
-        )
+        bad = int((~np.isfinite(array)).sum())
+        why = f"{bad} of {array.size} rendered values are NaN or infinite"
+        fix = "reconstruct again with another --seed or preset"
+        raise DivergedError(f"{name} is not finite", where=run.path, why=why, fix=fix)
     return array
 
 
@@ -222,21 +214,16 @@ def render_to_folder(
     few = [taken[i] for i in sorted({0, len(taken) // 2, len(taken) - 1})]
     samples = list(series_of(render, few, run.sensor, names, kept=len(few)))
     out, channels = Path(out), {name: list(samples[0][name]) for name in names}
-    listed: dict[str, Any] = {
-        "run": str(run.path),
-        "times_s": seconds,
-        "camera_from_world": None
-        if poses is None
-        else [camera.camera_from_world.tolist() for camera in cameras],
-        "channels": channels,
-    }
+    listed: dict[str, Any] = {"run": str(run.path), "times_s": seconds}
+    taken_from = None
+    if poses is not None:
+        taken_from = [camera.camera_from_world.tolist() for camera in cameras]
+    listed |= {"camera_from_world": taken_from, "channels": channels}
     if arrays:
         listed["arrays"] = True
     else:
-        scales = {
-            name: previews.preview_scale(name, (sample[name] for sample in samples))
-            for name in names
-        }
+        of_kind = {name: [sample[name] for sample in samples] for name in names}
+        scales = {name: previews.preview_scale(name, of_kind[name]) for name in names}
         listed["preview"] = {name: asdict(scale) for name, scale in scales.items()}
     renders.prepare_folder(out, listed, fresh=fresh)
     for name in names:
@@ -259,9 +246,7 @@ def series_of(
     *,
     kept: int = KEPT,
 ) -> Iterator[Mapping[str, previews.Channels]]:
-    """Channels of each view as arrays on the host, valid while referenced; on CUDA,
-    later views render meanwhile.
-    """
+    """Channels of each view as host arrays, valid while referenced; on CUDA, rendered ahead."""
     names = list(names)
     needed = sorted({image for name in names for image in renders.NEEDS[name]})
     for found in on_host(render, views, needed, kept=kept):
@@ -276,15 +261,13 @@ def views_to_take(
     default = sequence.times if found is None else [middle(sequence)]
     seconds = [float(t) for t in (default if times is None else times)]
     if not seconds:
-        raise UsageError(
-            "no time to render", where="--times", why="the list is empty", fix="leave --times out"
-        )
+        why, fix = "the list is empty", "leave --times out"
+        raise UsageError("no time to render", where="--times", why=why, fix=fix)
     if found is None:
         nearest = [nearest_frame(sequence, time) for time in seconds]
         known = {n: run.camera.at(sequence.camera_from_world[n]) for n in set(nearest)}
         return seconds, [known[n] for n in nearest]
     count = max(len(seconds), len(found))
     cameras = [run.camera.at(pose) for pose in found]
-    return [seconds[k % len(seconds)] for k in range(count)], [
-        cameras[k % len(found)] for k in range(count)
-    ]
+    seconds = [seconds[k % len(seconds)] for k in range(count)]
+    return seconds, [cameras[k % len(found)] for k in range(count)]

@@ -1,5 +1,4 @@
-"""Pictures written while the next images are rendered: by a few threads or, for many images, by
-processes.
+"""Pictures written by threads or, if many, by processes, while the next images are rendered.
 
 A 320x240 image with four quads and distance takes 5 ms of a CPU, half of it with the GIL held by
 OpenEXR.
