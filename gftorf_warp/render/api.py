@@ -130,19 +130,16 @@ def rasterize(
     tensors |= field.parameters()
     if extra is not None:
         if extra.ndim != 2 or len(extra) != count:
-            raise ValueError(
-                f"extra {tuple(extra.shape)} must be (N, D) with N = {count}, the "
-                f"length of the field"
-            )
+            want = f"(N, D) with N = {count}, the length of the field"
+            raise ValueError(f"extra {tuple(extra.shape)} must be {want}")
         tensors["extra"] = extra if extra.shape[1] else None
     background = background or Background()
     channels = {"quads": len(sensor.shifts), "phasor": 3, "colour": 3}
     for name, number in channels.items():
         value = getattr(background, name)
         if value is not None and not (name == "colour" and field.colour_sh is None):
-            tensors[f"background_{name}"] = _spread(
-                f"background.{name}", value, (number, *size), field
-            )
+            label, shape = f"background.{name}", (number, *size)
+            tensors[f"background_{name}"] = _spread(label, value, shape, field)
     if control is not None:
         check(control, len(sensor.shifts), field.device)
     tensors["calibration"] = _calibration(sensor, field) if control is None else control.calibration
@@ -152,10 +149,9 @@ def rasterize(
             raise ValueError(f"{name} is {tensor.dtype} on {tensor.device}, must be {want}")
     screen = torch.zeros(count, 4, device=field.device) if screen_gradient else None
     ordered = [None if t is None else t.contiguous() for t in (tensors[name] for name in INPUTS)]
-    shifts = tuple(float(shift) for shift in sensor.shifts)
     request = Request(
         camera=camera,
-        shifts=shifts,
+        shifts=tuple(float(shift) for shift in sensor.shifts),
         settings=settings,
         screen=screen,
         images=wanted_images(images),
@@ -190,9 +186,8 @@ def _calibration(sensor: Sensor, field: GaussianField) -> Tensor:
     """[4] phase slope [rad/m], phase offset [rad], source intensity, DC offset; uploaded once."""
     values = sensor.phase_slope, sensor.phase_offset, sensor.source_intensity, sensor.dc_offset
     if any(isinstance(value, Tensor) for value in values):
-        return torch.stack(
-            [torch.as_tensor(value, dtype=torch.float32, device=field.device) for value in values]
-        )
+        kind = {"dtype": torch.float32, "device": field.device}
+        return torch.stack([torch.as_tensor(value, **kind) for value in values])
     return _uploaded(values, field.device)
 
 

@@ -53,11 +53,7 @@ class Rasterize(torch.autograd.Function):
     """All images of a rendering from all its inputs; arrays are new unless there is a workspace."""
 
     @staticmethod
-    def forward(
-        ctx: Any,
-        request: Request,
-        *tensors: Tensor | None,
-    ) -> tuple[Tensor | None, ...]:
+    def forward(ctx: Any, request: Request, *tensors: Tensor | None) -> tuple[Tensor | None, ...]:
         """Return the images in the order of ``IMAGES``, None where there is none.
 
         Args:
@@ -70,12 +66,10 @@ class Rasterize(torch.autograd.Function):
         mean, extra, colour_sh = named["mean"], named["extra"], named["colour_sh"]
         assert mean is not None
         camera, shifts = request.camera, request.shifts
-        shapes = shapes_of(
-            len(shifts), camera.height, camera.width, 0 if extra is None else extra.shape[1]
-        )
-        made = request.images | {
-            name for name, of in (("colour", colour_sh), ("extra", extra)) if of is not None
-        }
+        channels = 0 if extra is None else extra.shape[1]
+        shapes = shapes_of(len(shifts), camera.height, camera.width, channels)
+        optional = {"colour": colour_sh, "extra": extra}
+        made = request.images | {name for name, of in optional.items() if of is not None}
         images = {name: mean.new_empty(shapes[name]) for name in IMAGES if name in made}
         with stream_of(mean):
             device = wp.device_from_torch(mean.device)

@@ -103,9 +103,8 @@ class RenderSettings:
 
     def __post_init__(self):
         if not 0 < self.near < self.far:
-            raise ValueError(
-                f"near and far must satisfy 0 < near < far, got {self.near} and {self.far}"
-            )
+            got = f"{self.near} and {self.far}"
+            raise ValueError(f"near and far must satisfy 0 < near < far, got {got}")
         if self.sh_degree not in (0, 1, 2, 3):
             raise ValueError(f"sh_degree must be 0, 1, 2 or 3, got {self.sh_degree}")
         if self.depth_bits not in (16, 24):
@@ -138,15 +137,11 @@ TILE_SHAPES = {"cpu": (16, 8, 8), "cuda": (1, 8, 4)}
 SEGMENTS = {"cpu": 1, "cuda": 4}
 LANES_PER_SPLAT = {"cpu": 1, "cuda": 32}  # threads that write the (tile, splat) pairs of a splat
 
-# a bit per tile and splat is zeroed, counted and read whether it is set or not: three times these
-# bytes, which at 4 TB/s are 0.1 ms, what a sort of the pairs takes that few tiles and few splats
-# have
+# bit matrix at most: zeroed, counted and read, at 4 TB/s it takes 0.1 ms, as a sort of few pairs
 MATRIX_MAX = 128 << 20  # [B]
 READERS = 8192  # warps that read it: about as many as 132 multiprocessors hold at once
 
-
-# splats that are ordered by depth bins: if all were in one bin, each would be compared with all,
-# 0.1 ms
+# splats that are ordered by depth bins: all in one bin, each compared with all, would take 0.1 ms
 BINNED_MAX = {"cpu": 0, "cuda": 32_768}
 
 
@@ -156,12 +151,7 @@ def available_threads() -> int:
 
 
 class Buffers:
-    """The arrays of one rendering, also those that the backward pass reads. Two objects share
-    nothing.
-
-    A buffers may render again: then it is the same memory, every array of it by its name, and
-    backward belongs to the last rendering.
-    """
+    """The arrays of a rendering and its backward pass, by name; the next rendering reuses them."""
 
     def __init__(
         self, count: int, width: int, height: int, settings: RenderSettings, device: wp.Device
@@ -180,10 +170,8 @@ class Buffers:
         self.segments = 1  # in which the backward pass of the last rendering may take its lists
         self.threads = (settings.threads or available_threads()) if device.is_cpu else 1
         self.tiling = Tiling()
-        self.tiling.width_log2, self.tiling.height_log2 = (
-            self.tile_width.bit_length() - 1,
-            self.tile_height.bit_length() - 1,
-        )
+        self.tiling.width_log2 = self.tile_width.bit_length() - 1
+        self.tiling.height_log2 = self.tile_height.bit_length() - 1
         self.tiling.side_log2, self.tiling.count_x = pixels.side.bit_length() - 1, self.tiles_x
 
         self._arrays: dict[str, wp.array] = {}
@@ -255,22 +243,17 @@ class Buffers:
         Raises:
             ValueError: With the number of pairs that would have fitted.
         """
-        capacity, needed = (
-            self.settings.pair_capacity,
-            int(self.total.numpy()[0]) if self.count else 0,
-        )
+        capacity = self.settings.pair_capacity
+        needed = int(self.total.numpy()[0]) if self.count else 0
         if capacity is not None and needed > capacity:
-            raise ValueError(
-                f"pair_capacity = {capacity} is too small: this rendering has {needed} (tile, "
-                f"splat) pairs"
-            )
+            got = f"this rendering has {needed} (tile, splat) pairs"
+            raise ValueError(f"pair_capacity = {capacity} is too small: {got}")
 
     def planes(self, name: str, count: int) -> Planes:
         """``count`` image planes in tile order."""
         if name not in self._planes:
-            self._planes[name] = Planes(
-                self.array(name, Planes.shape_of(self, count), wp.float32), self
-            )
+            flat = self.array(name, Planes.shape_of(self, count), wp.float32)
+            self._planes[name] = Planes(flat, self)
         return self._planes[name]
 
     def gradient_planes(self, name: str, count: int, *, added: bool) -> Planes:
@@ -301,12 +284,10 @@ class Planes:
 
 
 class Workspace:
-    """Memory that renderings of one size share, one after the other.
+    """Memory of consecutive renderings of one size, which allocate images and gradients only.
 
-    With one workspace, renderings of the same number of Gaussians and the same size allocate
-    nothing but images and gradients, and a CUDA graph can be replayed. Backward must come before
-    the next rendering with it. Another size or setting allocates new memory and releases the old,
-    which graphs captured with it must not outlive.
+    Backward must come before the next rendering. Another size or setting releases the memory, which
+    CUDA graphs must not outlive.
     """
 
     def __init__(self) -> None:

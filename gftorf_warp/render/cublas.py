@@ -59,11 +59,8 @@ class CublasLayers(Layers):
         torch.div(gradient, unit, out=head[:, : gradient.shape[1]])
         gradients, after = torch.empty_like(outputs), head
         for number in reversed(range(len(outputs))):
-            factor, slope, before = (
-                saved[number + 1][:, : form.width],
-                gradients[number],
-                outputs[number],
-            )
+            factor = saved[number + 1][:, : form.width]
+            slope, before = gradients[number], outputs[number]
             for key, begin, end in _pieces(keys, len(after) // keys):
                 rows = slice(key * len(after) // keys + begin, key * len(after) // keys + end)
                 torch.mm(after[rows], factor, out=slope[rows])
@@ -88,14 +85,12 @@ class CublasLayers(Layers):
             positions = position.new_empty(keys, len(position), form.columns)
             _copy(positions, position.expand(keys, -1, -1))
             for number, weight in zip(form.entries, found.of_positions(form), strict=True):
-                product(
-                    gradients.layers[number].T, positions.flatten(0, 1), weight.dtype, out=weight
-                )
+                rows = gradients.layers[number].T
+                product(rows, positions.flatten(0, 1), weight.dtype, out=weight)
             for number in form.entries:
                 weight = found.weights[number]
-                torch.mm(
-                    gradients.sums[number].T, time, out=weight[:, weight.shape[1] - form.time :]
-                )
+                weight = weight[:, weight.shape[1] - form.time :]
+                torch.mm(gradients.sums[number].T, time, out=weight)
         _products(gradients.layers[1:].mT, outputs[:-1], out=found.square)
         side.join()
         if form.joined is not None:
@@ -104,29 +99,17 @@ class CublasLayers(Layers):
 
 
 class _ParameterGradients:
-    """One buffer for the gradients of all parameters, so that one kernel multiplies them by the
-    unit.
+    """One buffer for the gradients of all parameters, so that one kernel multiplies by the unit.
 
-    Weights of outputs of layers come first, for one batched product; those of the joined layer,
-    whose rows are longer, are copied from there. Biases come last, that of the head behind all
-    others, since it is not multiplied.
+    Weights of outputs of layers come first, for one batched product; those of the joined layer are
+    copied from there. The bias of the head is last, since it is not multiplied.
     """
 
     def __init__(self, form: Form, time: Tensor, layers: int, gradients: LayerGradients):
-        width, wide, rows, values = (
-            form.width,
-            form.position + form.time,
-            gradients.head.shape[1],
-            len(gradients.head_sum),
-        )
-        columns = [wide + (width if number else 0) for number in form.entries]
-        sizes = [
-            (layers - 1) * width * width,
-            *(width * inputs for inputs in columns),
-            rows * width,
-            layers * width,
-            values,
-        ]
+        width, rows, values = form.width, gradients.head.shape[1], len(gradients.head_sum)
+        wide = form.position + form.time
+        entries = [width * (wide + (width if number else 0)) for number in form.entries]
+        sizes = [(layers - 1) * width * width, *entries, rows * width, layers * width, values]
         self.scaled = time.new_empty(sum(sizes))
         square, *entries, head, biases, self.head_bias = self.scaled.split(sizes)
         self.square = square.view(layers - 1, width, width)
@@ -179,12 +162,9 @@ def _joined_input(form: Form, position: Tensor, keys: int) -> Float[Tensor, "row
 
 def _copy(to: Tensor, rows: Tensor) -> None:
     """Copy rows in units of 16 bytes, if both are aligned: faster than by halves."""
-    step = 16 // to.element_size()
-    if all(
-        n % step == 0
-        for one in (to, rows)
-        for n in (one.shape[-1], one.storage_offset(), *one.stride()[:-1])
-    ):
+    sizes = [to.shape[-1], to.storage_offset(), *to.stride()[:-1]]
+    sizes += [rows.shape[-1], rows.storage_offset(), *rows.stride()[:-1]]
+    if all(size % (16 // to.element_size()) == 0 for size in sizes):
         to, rows = to.view(torch.complex128), rows.view(torch.complex128)
     to.copy_(rows)
 
@@ -198,11 +178,8 @@ def _sums(
     choice = gradients.new_zeros(keys, rows // keys // fold, -(-keys // ALIGNED) * ALIGNED)
     choice.diagonal(dim1=0, dim2=2).fill_(1.0)
     sums = gradients.new_empty(layers, choice.shape[2], fold * width, dtype=dtype)
-    _products(
-        choice.flatten(0, 1).T.expand(layers, -1, -1),
-        gradients.view(layers, -1, fold * width),
-        out=sums,
-    )
+    choices = choice.flatten(0, 1).T.expand(layers, -1, -1)
+    _products(choices, gradients.view(layers, -1, fold * width), out=sums)
     return sums.view(layers, -1, fold, width)[:, :keys].sum(2)
 
 
@@ -221,39 +198,26 @@ def _sum_rows(values: Float[Tensor, "rows v"]) -> Float[Tensor, "v"]:
 def _rounded(
     form: Form, weights: tuple[Tensor, ...], biases: tuple[Tensor, ...]
 ) -> tuple[list[Tensor], list[Tensor]]:
-    """Copies of weights and biases as factors: without the columns of gamma(t), the head with rows
-    of zeros below it.
+    """Weights and biases as factors: without the columns of gamma(t), the head padded with zeros.
 
-    Where ``columns`` has more than gamma(x), a column of gamma(t) meets a column of zeros. Whole
-    ones are cut into blocks of rows, since torch gives 65,536 values of a tensor to one block of
-    threads.
+    Where ``columns`` exceeds gamma(x), a column of gamma(t) meets a column of zeros. Copies are cut
+    into blocks of rows, since torch gives 65,536 values of a tensor to one thread block.
     """
     widths = [weight.shape[1] for weight in weights[:-1]]
     for number in form.entries:
         widths[number] += form.columns - form.position - form.time
-    head = weights[-1].new_zeros(
-        -(-len(weights[-1]) // ALIGNED) * ALIGNED, form.width, dtype=form.dtype
-    )
+    rows = -(-len(weights[-1]) // ALIGNED) * ALIGNED
+    head = weights[-1].new_zeros(rows, form.width, dtype=form.dtype)
     made = [head.new_empty(form.width, columns) for columns in widths]
     shifts = [torch.empty_like(bias, dtype=form.dtype) for bias in biases[:-1]]
-    whole = [
-        number for number, weight in enumerate(weights[:-1]) if weight.shape == made[number].shape
-    ]
-    torch._foreach_copy_(
-        [
-            *(part for number in whole for part in made[number].chunk(BLOCKS)),
-            *shifts,
-            head[: len(weights[-1])],
-        ],
-        [
-            *(part for number in whole for part in weights[number].chunk(BLOCKS)),
-            *biases[:-1],
-            weights[-1],
-        ],
-    )
-    for number, factor in enumerate(made):
-        if number not in whole:
-            factor.copy_(weights[number][:, : factor.shape[1]])
+    to, given = [*shifts, head[: len(weights[-1])]], [*biases[:-1], weights[-1]]
+    for factor, weight in zip(made, weights[:-1], strict=True):
+        if weight.shape == factor.shape:
+            to += factor.chunk(BLOCKS)
+            given += weight.chunk(BLOCKS)
+        else:
+            factor.copy_(weight[:, : factor.shape[1]])
+    torch._foreach_copy_(to, given)
     return [*made, head], shifts
 
 

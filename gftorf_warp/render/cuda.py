@@ -20,8 +20,7 @@ from torch import Tensor
 
 SLOTS = 8  # uploads, or readbacks, that may be in flight
 HOST_BYTES = 1 << 28  # of page-locked memory at most: the system cannot use it for anything else
-# [bytes] alignment of readback buffers on the host, with which a disk writes them without a copy
-PAGE = 4096
+PAGE = 4096  # [bytes] alignment of readback buffers, which a disk then writes without a copy
 
 
 def stream_of(tensor: Tensor):
@@ -56,12 +55,10 @@ def without_garbage_collection() -> Iterator[None]:
 def capture(
     graph: torch.cuda.CUDAGraph, stream: torch.cuda.Stream | None = None, pool: Any = None
 ) -> Iterator[None]:
-    """Capture torch's and Warp's work inside the block, backward passes included, in a graph that
-    torch replays.
+    """Capture torch's and Warp's work inside the block in a graph that torch replays.
 
-    The same work must have run before on ``stream``: that loads modules, uploads constants and
-    starts libraries. A rendering needs a pair capacity; with a ``Workspace`` a replay allocates
-    nothing either. What the graph reads and writes must outlive it.
+    The same work must have run before on ``stream``, to load modules and libraries. A rendering
+    needs a pair capacity. What the graph reads and writes must outlive it.
 
     Args:
         graph: An empty one.
@@ -85,12 +82,10 @@ def graph_pool(device: torch.device) -> Any:
 
 
 class CapturedGraph:
-    """A function as a CUDA graph: captured at the first call, replayed from then on; on a CPU it is
-    called.
+    """A function as a CUDA graph, captured at the first call and replayed; on a CPU it is called.
 
-    What it reads and writes must keep its addresses, and it must not synchronise with the device.
-    What it allocates belongs to the graph and is valid until the next graph of its pool is
-    replayed.
+    It must not synchronise, and what it reads and writes must keep its addresses. What it allocates
+    is valid until the next graph of its pool is replayed.
     """
 
     def __init__(
@@ -127,12 +122,10 @@ class CapturedGraph:
 
 
 class SideStreams:
-    """Streams that fork from torch's current one and join it again, so that independent work may
-    overlap.
+    """Streams that fork from torch's current one and join it again, for independent work.
 
-    A captured graph gets as many branches; a backward pass runs on the stream of its forward
-    operation. Where thread blocks of several streams wait, those of the earlier stream go first;
-    the first one should have the most work.
+    A backward pass runs on the stream of its forward operation. Earlier streams have priority: the
+    first one should have the most work.
     """
 
     def __init__(self, count: int, device: torch.device, *, fewest: int = 2):
@@ -189,20 +182,17 @@ class DeviceUpload:
         remote, sizes = device.type != "cpu", [length for length, _ in lengths]
 
         def parts_of(memory: Tensor) -> list[Tensor]:
-            return [
-                part.view(dtype)
-                for part, (_, dtype) in zip(memory.split(sizes), lengths, strict=True)
-            ]
+            parts = zip(memory.split(sizes), lengths, strict=True)
+            return [part.view(dtype) for part, (_, dtype) in parts]
 
         self._memory = torch.zeros(sum(sizes), dtype=torch.int32, device=device)
         self.parts = parts_of(self._memory)
         """Device memory, in the order of ``lengths``."""
-        slots = [
-            torch.zeros(sum(sizes), dtype=torch.int32, pin_memory=remote)
-            for _ in range(SLOTS if remote else 1)
-        ]
-        self._slots = [(slot, parts_of(slot)) for slot in slots]
-        self._uploaded: list[torch.cuda.Event | None] = [None] * len(slots)
+        self._slots = []
+        for _ in range(SLOTS if remote else 1):
+            slot = torch.zeros(sum(sizes), dtype=torch.int32, pin_memory=remote)
+            self._slots.append((slot, parts_of(slot)))
+        self._uploaded: list[torch.cuda.Event | None] = [None] * len(self._slots)
         self._next = 0
 
     def send(self, *numbers: Sequence[float] | np.ndarray) -> None:
@@ -258,11 +248,10 @@ class DeviceReadback:
 
 
 class ReadbackRing:
-    """Buffers on the device and on the host for images that are read back while the next ones are
-    rendered.
+    """Buffers for images that are read back while the next ones are rendered.
 
-    ``copy`` takes a copy of memory that the next rendering overwrites, a second stream brings it to
-    the host, and ``wait`` returns it. At most ``ahead`` + 1 copies are in flight.
+    ``copy`` copies memory that the next rendering overwrites, a second stream brings it to the
+    host, and ``wait`` returns it. At most ``ahead`` + 1 copies are in flight.
     """
 
     def __init__(self, like: Tensor, *, ahead: int, kept: int, tail: int | None = None):
@@ -325,10 +314,8 @@ class ReadbackRing:
         self._free.append(ticket[1])
 
     def keep(self, ticket: tuple[int, int]) -> Float[np.ndarray, " tail"]:
-        """A copy that has arrived, as an array of the caller's.
-
-        Its buffer is returned when the array is deleted. While so many are held that the next
-        copies need this one, the array is an ordinary one, which costs a copy.
+        """A copy that has arrived, as an array whose buffer is returned when it is deleted; an
+        ordinary array if the next copies need the buffer.
         """
         near, far = ticket
         self._idle.append(near)

@@ -71,11 +71,8 @@ class MovedGaussians:
         offset, rotation = array_over(tables[0], wp.vec3), array_over(tables[1], wp.vec4)
         initial = [array_over(tensor, wp.vec3) for tensor in (field.mean, field.log_scale)]
         quaternion = array_over(field.quaternion, wp.vec4)
-        outputs = [
-            array_over(mean, wp.vec3),
-            array_over(log_scale, wp.vec3),
-            array_over(turned, wp.vec4),
-        ]
+        outputs = [array_over(mean, wp.vec3), array_over(log_scale, wp.vec3)]
+        outputs.append(array_over(turned, wp.vec4))
         self.inputs = Inputs(
             mean=outputs[0],
             log_scale=outputs[1],
@@ -90,16 +87,8 @@ class MovedGaussians:
         # slow on the host
         self._camera = functools.lru_cache(maxsize=1024)(lambda camera: view_of(camera, settings))
         camera = view_of(optimised, settings)
-        inputs = [
-            *initial,
-            quaternion,
-            offset,
-            rotation,
-            camera,
-            camera,
-            self._indices(),
-            self._weights(),
-        ]
+        inputs = [*initial, quaternion, offset, rotation, camera, camera]
+        inputs += [self._indices(), self._weights()]
         where = {"device": device, "record_tape": False}
         # packed once: that is most of what a launch costs a host
         self._launch = wp.launch(

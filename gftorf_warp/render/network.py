@@ -32,11 +32,8 @@ class HalfPrecision:
 
     def offsets(self, network: Network, binding: Tensor, time: Tensor) -> Tensor:
         """[k, N, 3] displacements [m]."""
-        parameters = [
-            value
-            for layer in [*network.layers, network.head]
-            for value in (layer.weight, layer.bias)
-        ]
+        layers = [*network.layers, network.head]
+        parameters = [value for layer in layers for value in (layer.weight, layer.bias)]
         return Offsets.apply(self.form, self.layers, binding, time, *parameters)
 
 
@@ -44,9 +41,8 @@ def with_backend(motion: Motion) -> Motion:
     """The same motion; a network in half precision gets the backend for its device."""
     if isinstance(motion, Network) and motion.settings.products == Products.HALF:
         form = Form.of(motion)
-        motion.backend = HalfPrecision(
-            FusedLayers() if fits(form, motion.powers.device) else CublasLayers(), form
-        )
+        fused = fits(form, motion.powers.device)
+        motion.backend = HalfPrecision(FusedLayers() if fused else CublasLayers(), form)
     return motion
 
 
@@ -83,17 +79,9 @@ class Offsets(torch.autograd.Function):
     @once_differentiable
     def backward(context, gradient: Float[Tensor, "k N 3"]) -> tuple[Tensor | None, ...]:
         """Gradients of all parameters; loss scaling by the largest gradient of an offset."""
-        form, layers, (position, time, *saved, outputs) = (
-            context.form,
-            context.layers,
-            context.saved_tensors,
-        )
+        form, layers = context.form, context.layers
+        position, time, *saved, outputs = context.saved_tensors
         rows = gradient.reshape(-1, gradient.shape[-1])
         gradients = layers.backward(form, len(time), rows, outputs, tuple(saved))
-        return (
-            None,
-            None,
-            None,
-            None,
-            *layers.parameter_gradients(form, position, time, gradients, outputs),
-        )
+        found = layers.parameter_gradients(form, position, time, gradients, outputs)
+        return *(None,) * 4, *found

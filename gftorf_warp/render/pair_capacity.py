@@ -1,6 +1,4 @@
-"""How many (tile, splat) pairs a rendering reserves memory for,
-where their number is not read back first.
-"""
+"""Number of (tile, splat) pairs for which a rendering reserves memory without reading it back."""
 
 from __future__ import annotations
 
@@ -10,20 +8,15 @@ ROUNDED_TO = 1 << 16  # capacities are multiples of it
 # steps: pairs that grow by half in 30 take 16 from ``FULL`` to the end, and the host may be 8 ahead
 READ_EVERY = 8
 FULL = 0.8  # fraction of the capacity above which it grows
-PATIENCE = (
-    # readbacks in a row below the smallest fraction before it shrinks: an opacity reset empties it
-    # for a while
-    5
-)
+PATIENCE = 5  # readbacks in a row before it shrinks: opacity resets empty it for a while
 # capacity over the largest number of pairs; fraction below which it shrinks
 SORTED, LISTED = (1.5, 0.4), (3.0, 0.05)
 
 
 class PairCapacity:
-    """Pairs that fit into one rendering, from the numbers that the last renderings had.
+    """Pairs that fit into one rendering, from the numbers of the last renderings.
 
-    Where pairs are sorted, every reserved one costs time, so few are. Where a bit mask is read into
-    lists, one costs 4 bytes, and to change the capacity costs new CUDA graphs.
+    A sort takes time for every reserved pair; for lists from a bit mask one costs 4 bytes only.
     """
 
     def __init__(self) -> None:

@@ -42,9 +42,7 @@ class Target:
 
     buffers: Buffers
     view: View
-    # [L] all images, consecutive, so that one copy moves them; last, as int32, their number of
-    # pairs
-    packed: Tensor
+    packed: Tensor  # [L] all images, then, as int32, their number of pairs
     places: dict[str, tuple[int, tuple[int, ...]]]  # first element and shape of every image in it
     tensors: dict[str, Tensor]
     images: Images
@@ -98,9 +96,7 @@ class Replay:
         shifts = [(math.cos(shift), math.sin(shift)) for shift in sensor.shifts]
         self._shifts = wp.array(shifts, dtype=wp.vec2, device=self.device)
         values = sensor.phase_slope, sensor.phase_offset, sensor.source_intensity, sensor.dc_offset
-        calibration = torch.tensor(
-            [float(v) for v in values], dtype=torch.float32, device=field.device
-        )
+        calibration = field.mean.new_tensor([float(value) for value in values])
         self._gaussians = MovedGaussians(field, motion, binding, calibration, optimised, settings)
         self._targets: dict[tuple[int, int, bool], Target] = {}
         self._largest = wp.zeros(1, dtype=wp.int32, device=self.device)
@@ -155,12 +151,8 @@ class Replay:
         if size not in self._targets:
             self._targets[size] = self._target(*size)
         target = self._targets[size]
-        if (
-            self.graphs
-            and self._capacity.pairs is not None
-            and target.used
-            and target.graph is None
-        ):
+        known = self.graphs and self._capacity.pairs is not None
+        if known and target.used and target.graph is None:
             target.graph = self._captured(target)
         self._gaussians.move(time, camera)
         with stream_of(self._like):
@@ -190,10 +182,8 @@ class Replay:
         inputs, buffers = self._gaussians.inputs, target.buffers
         launch.forward(inputs, target.view, buffers, target.images, differentiable=False)
         if len(self._like):
-            counts = [self._largest, target.pairs]
-            wp.launch(
-                note_largest, 1, [buffers.total], counts, device=self.device, record_tape=False
-            )
+            counts, where = [self._largest, target.pairs], {"device": self.device}
+            wp.launch(note_largest, 1, [buffers.total], counts, record_tape=False, **where)
 
     def _target(self, height: int, width: int, lens: bool) -> Target:
         """Memory for renderings of one size, through a lens or not."""
@@ -213,10 +203,7 @@ class Replay:
             packed=packed,
             places=places,
             tensors=tensors,
-            images=Images(
-                **dict.fromkeys(names_of(Images))
-                | {name: array_over(tensors[name]) for name in tensors}
-            ),
+            images=Images(**{name: array_over(tensors.get(name)) for name in names_of(Images)}),
             pairs=array_over(packed[-1:].view(torch.int32), wp.int32),
         )
 
