@@ -186,8 +186,10 @@ def _calibration(sensor: Sensor, field: GaussianField) -> Tensor:
     """[4] phase slope [rad/m], phase offset [rad], source intensity, DC offset; uploaded once."""
     values = sensor.phase_slope, sensor.phase_offset, sensor.source_intensity, sensor.dc_offset
     if any(isinstance(value, Tensor) for value in values):
-        kind = {"dtype": torch.float32, "device": field.device}
-        return torch.stack([torch.as_tensor(value, **kind) for value in values])
+        like = field.mean
+        return torch.stack(
+            [torch.as_tensor(v, dtype=like.dtype, device=like.device) for v in values]
+        )
     return _uploaded(values, field.device)
 
 

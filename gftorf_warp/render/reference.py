@@ -96,7 +96,7 @@ def rasterize(
     if screen_gradient:
         screen = ScreenGradient(values=field.mean.new_zeros(len(field), 4))
     lights = [background.quads, background.phasor, background.colour]
-    inputs = [*field.parameters().values(), extra, *lights, *_numbers(sensor)]
+    inputs: list[object] = [*field.parameters().values(), extra, *lights, *_numbers(sensor)]
     centre, seen_of = _watched(splats, screen, inputs)
 
     # What Gaussian k carries: columns weighted by T (colour, distance, 1, extra) and by T^2 (quads,

@@ -196,8 +196,8 @@ class Tracer:
         sizes = (len(harmonics), *shape), shape, shape
         self._direct = [*map(self._empty, sizes, kinds)]
         self._indirect = [*map(self._empty, sizes, kinds)]
-        kinds = wp.float32, wp.float32, wp.vec3, wp.int32
-        self._hits = [self._empty(shape, dtype) for dtype in kinds]
+        of_hit = wp.float32, wp.float32, wp.vec3, wp.int32
+        self._hits = [self._empty(shape, dtype) for dtype in of_hit]
 
     def light(
         self,
