@@ -120,12 +120,8 @@ def decode_along_flow(
     and along the ray causes no artefact to first order. Without a measured quartet before, the
     value is extrapolated from the one after; without either, slot k is used as measured.
 
-    Args:
-        sequence: Raw frames; those of ``quartet`` must be measured.
-        quartet: Number of the quartet.
-        points: Image positions (x, y) at its start [px].
-        ahead: Flow of the points to the next quartet [px]; NaN and None: no motion.
-        behind: Flow of the points to the quartet before [px], likewise.
+    ``points`` are positions [px] at the start of a complete quartet; ``ahead`` and ``behind`` their
+    flow to the next quartet and to the one before [px]; NaN and None: no motion.
     """
     complete = set(sequence.complete_quartets)
     ahead = torch.zeros_like(points) if ahead is None else ahead.nan_to_num(0.0)

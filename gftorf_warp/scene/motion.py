@@ -165,11 +165,9 @@ class Motion(torch.nn.Module, abc.ABC):
 
     @abc.abstractmethod
     def bind(self, field: GaussianField) -> Float[Tensor, "N M"]:
-        """What the model needs of each Gaussian; evaluated when Gaussians are added or removed, see
-        ``follows_means``.
+        """What the model needs of each Gaussian; evaluated when Gaussians are added or removed.
 
-        A model whose displacements depend on the means differentiably returns them with their
-        gradient.
+        Means on which displacements depend differentiably are returned with their gradient.
         """
 
     @abc.abstractmethod
@@ -186,9 +184,7 @@ class Motion(torch.nn.Module, abc.ABC):
         return Keys((key, key + 1), (1.0 - fraction, fraction))
 
     def interval(self, time: float) -> tuple[int, float]:
-        """Index i of the key at or before ``time`` [s], and (time - t_i) / (t_{i+1} - t_i) in [0,
-        1), 0 outside.
-        """
+        """Index i of the key at or before ``time`` [s], and its share of the interval in [0, 1)."""
         if time >= self.times[-1]:
             return len(self.times) - 1, 0.0
         key = max(bisect.bisect_right(self.times, time) - 1, 0)
@@ -280,10 +276,8 @@ class Nodes(Motion):
                 f"({len(key_times)}, {len(position)}, 3) and ({len(position)},): keys, nodes, xyz"
             )
         if len(layer) and int(layer.min()) < 1:
-            raise ValueError(
-                f"a node of layer {int(layer.min())}: nodes belong to layers 1 and "
-                f"above, 0 is static"
-            )
+            found = f"a node of layer {int(layer.min())}"
+            raise ValueError(f"{found}: nodes belong to layers 1 and above, 0 is static")
         if neighbours < 1:
             raise ValueError(f"neighbours must be at least 1, got {neighbours}")
         self.neighbours = neighbours
@@ -306,18 +300,14 @@ class Nodes(Motion):
         nodes = farthest_points(moving, settings.nodes)
         offset = None
         if settings.from_tracks and initial.tracks is not None and len(nodes):
-            near = (
-                torch.cdist(moving[nodes], moving)
-                .topk(min(NODE_FELLOWS, len(moving)), dim=1, largest=False)
-                .indices
-            )
+            apart, fellows = torch.cdist(moving[nodes], moving), min(NODE_FELLOWS, len(moving))
+            near = apart.topk(fellows, dim=1, largest=False).indices
             offset = initial.tracks[:, near].median(dim=2).values
         layer = field.layer[field.layer > 0][nodes]
         return cls(initial.key_times, moving[nodes], layer, offset, neighbours=settings.neighbours)
 
     def bind(self, field: GaussianField) -> Float[Tensor, "N M"]:
-        """Weight of every node for every Gaussian: rows sum to 1, those of the static layer are
-        zero.
+        """Weight of every node for every Gaussian: rows sum to 1, or 0 in the static layer.
 
         The nearest nodes are weighted by exp(-2 (distance / distance of the farthest of them)^2):
         smooth in the position and without a length scale. No gradient.
@@ -337,9 +327,8 @@ class Nodes(Motion):
         self, binding: Float[Tensor, "N M"], keys: Sequence[int] | Int[Tensor, "K"]
     ) -> KeyMotion:
         """Weighted means of the displacements of nodes."""
-        return KeyMotion(
-            torch.stack([binding @ offset for offset in rows_of(self.offset, keys)]), None
-        )
+        offsets = [binding @ offset for offset in rows_of(self.offset, keys)]
+        return KeyMotion(torch.stack(offsets), None)
 
     def to_dict(self) -> dict[str, Any]:
         """With the number of neighbours."""
@@ -349,10 +338,8 @@ class Nodes(Motion):
     def from_dict(cls, stored: dict[str, Any]) -> Nodes:
         """From its tensors and the number of neighbours."""
         tensors = stored["tensors"]
-        made = cls(
-            *(tensors[name] for name in ("key_times", "node", "layer")),
-            neighbours=stored["neighbours"],
-        )
+        start = (tensors[name] for name in ("key_times", "node", "layer"))
+        made = cls(*start, neighbours=stored["neighbours"])
         made.load_state_dict(tensors)
         return made
 
@@ -373,16 +360,13 @@ def rows_of(
     table: Float[Tensor, "T *n"], keys: Sequence[int] | Int[Tensor, "K"]
 ) -> Float[Tensor, "K *n"]:
     """Rows of a table by their indices, without a synchronisation or upload."""
-    return (
-        table.index_select(0, keys)
-        if isinstance(keys, Tensor)
-        else torch.stack([table[key] for key in keys])
-    )
+    if isinstance(keys, Tensor):
+        return table.index_select(0, keys)
+    return torch.stack([table[key] for key in keys])
 
 
 def farthest_points(points: Float[Tensor, "N 3"], count: int) -> Int[Tensor, "M"]:
-    """Indices of ``count`` points, each the farthest from those before it; all points if there are
-    fewer.
+    """Indices of at most ``count`` points, each the farthest from those before it.
 
     The first is the one nearest to the centroid, so that the choice depends on the points only.
     """

@@ -73,16 +73,14 @@ class Network(Motion):
         """
         super().__init__(key_times)
         if not (duration > 0 and length > 0):
-            raise ValueError(
-                f"duration and length must be above 0, got {duration} s and {length} m"
-            )
+            found = f"{duration} s and {length} m"
+            raise ValueError(f"duration and length must be above 0, got {found}")
         self.settings, self.duration, self.length = settings, float(duration), float(length)
         times = encoded(self.key_times[:, None] / self.duration, settings.time_frequencies)
         self.register_buffer("time_encodings", times, persistent=False)
         self.register_buffer("time_encodings_f32", times.float(), persistent=False)
-        self.register_buffer(
-            "powers", powers_of_two(settings.position_frequencies), persistent=False
-        )
+        powers = powers_of_two(settings.position_frequencies)
+        self.register_buffer("powers", powers, persistent=False)
         frequencies = (3, settings.position_frequencies), (1, settings.time_frequencies)
         # of gamma(x) and gamma(t)
         self._sizes = [encoded_size(*numbers) for numbers in frequencies]
@@ -141,11 +139,8 @@ class Network(Motion):
     def to_dict(self) -> dict[str, Any]:
         """With its shape, its duration and its length."""
         shape = asdict(self.settings) | {"kind": self.kind, "products": str(self.settings.products)}
-        return super().to_dict() | {
-            "shape": shape,
-            "duration": self.duration,
-            "length": self.length,
-        }
+        numbers = {"shape": shape, "duration": self.duration, "length": self.length}
+        return super().to_dict() | numbers
 
     @classmethod
     def from_dict(cls, stored: dict[str, Any]) -> Network:
@@ -154,9 +149,8 @@ class Network(Motion):
         products = Products(stored["shape"].get("products", Products.FLOAT32))
         settings = MotionSettings(**stored["shape"] | {"products": products})
         tensors = stored["tensors"]
-        made = cls(
-            tensors["key_times"], settings, duration=stored["duration"], length=stored["length"]
-        )
+        times, numbers = tensors["key_times"], {n: stored[n] for n in ("duration", "length")}
+        made = cls(times, settings, **numbers)
         made.load_state_dict(tensors)
         return made
 

@@ -110,8 +110,7 @@ def beam_of(lens: Lens, camera: Camera) -> Beam | None:
 def shading(lens: Lens, camera: Camera, *, beam: bool = True) -> Shading | None:
     """Factors of the light of the pixels of a camera; None: 1 everywhere.
 
-    ``beam``: whether the beam of an emitter at the camera is included; False if it is part of the
-    traced light.
+    ``beam``: include that of an emitter at the camera; False if it is part of the traced light.
     """
     shape = beam_of(lens, camera) if beam else None
     if not (lens.cosine_power or lens.vignetting or lens.falloff or shape):

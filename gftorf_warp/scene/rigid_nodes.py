@@ -23,9 +23,7 @@ from .motion import KeyMotion, Nodes, rows_of
 
 
 class RigidNodes(Nodes):
-    """Nodes with a rotation and a translation per key. Gradients w.r.t. means pass through R;
-    weights have none.
-    """
+    """Nodes with a rotation and a translation per key; gradients w.r.t. means pass through R."""
 
     kind = "rigid_nodes"
     follows_means = True
