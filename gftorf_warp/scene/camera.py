@@ -100,6 +100,10 @@ class Camera:
         fx, fy, cx, cy = self.fx * x, self.fy * y, self.cx * x, self.cy * y
         return replace(self, width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy)
 
+    def finer(self, n: int) -> Camera:
+        """The same view with n x n pixels for each."""
+        return self.resized(n * self.width, n * self.height)
+
     def row(self, number: int) -> Camera:
         """The camera of one row of the image."""
         return replace(self, height=1, cy=self.cy - number)

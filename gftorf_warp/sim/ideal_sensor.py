@@ -46,7 +46,7 @@ def light_of(scene: Scene, time: float, *, rays: int = 1, f_mod_hz: float | None
     if rays < 1:
         raise ValueError(f"rays must be at least 1, got {rays}")
     camera = scene.camera(time=time)
-    hit = first_hit(scene.bodies, camera.resized(camera.width * rays, camera.height * rays), time)
+    hit = first_hit(scene.bodies, camera.finer(rays), time)
     sensor = scene.sensor if f_mod_hz is None else replace(scene.sensor, f_mod_hz=f_mod_hz)
     phase = float(sensor.phase_slope) * np.where(hit.body < 0, 0.0, hit.distance)
     amplitude, phasor = (

@@ -132,10 +132,9 @@ def beam_is_traced(scene: Scene, bounces: int) -> bool:
 
 def traced_albedo(scene: Scene, camera: Camera, time: float) -> Float[np.ndarray, "H W 3"]:
     """Mean albedo of every pixel in linear RGB [1] over its rays; black where they meet nothing."""
-    n = scene.subsamples
-    fine = camera.resized(camera.width * n, camera.height * n)
-    colour = albedo(scene.bodies, first_hit(scene.bodies, fine, time), time)
-    return np.moveaxis(pooled(np.moveaxis(colour, -1, 0), n), 0, -1)
+    hits = first_hit(scene.bodies, camera.finer(scene.subsamples), time)
+    colour = albedo(scene.bodies, hits, time)
+    return np.moveaxis(pooled(np.moveaxis(colour, -1, 0), scene.subsamples), 0, -1)
 
 
 def rigid_bodies(body: Body) -> list[RigidBody]:

@@ -220,12 +220,7 @@ def _exposing(
 
 def _fine(camera_at: Callable[[float], Camera], scene: Scene) -> Callable[[float], Camera]:
     """A camera at a time [s] at the resolution of the rays."""
-
-    def fine(time: float) -> Camera:
-        camera, n = camera_at(time), scene.subsamples
-        return camera.resized(camera.width * n, camera.height * n)
-
-    return fine
+    return lambda time: camera_at(time).finer(scene.subsamples)
 
 
 def _static_distance(exposure: Exposure, sensor: Sensor) -> Float[np.ndarray, "H W"]:
@@ -267,11 +262,13 @@ def _truth(
 ) -> tuple[Float[np.ndarray, "F H W"], Int[np.ndarray, "F H W"], Bool[np.ndarray, "F H W"]]:
     """Distance [m], body and still interior of every raw frame."""
     camera_at, height = partial(scene.camera, settings.size), scene.camera(settings.size).height
-    hits = [rolling_hits(scene.bodies, camera_at, t, scene.sensor, height) for t in times.tolist()]
-    inside = np.stack([still_interior(scene, [hit]) for hit in hits])
+    images = []  # the rest of the hits is large
+    for time in times.tolist():
+        hit = rolling_hits(scene.bodies, camera_at, time, scene.sensor, height)
+        images.append((hit.distance, hit.body.astype(np.int16), still_interior(scene, [hit])))
+    distance, body, inside = (np.stack(each) for each in zip(*images, strict=True))
     inside = inside if scene.camera_moves else np.broadcast_to(inside.all(axis=0), inside.shape)
-    bodies = np.stack([hit.body.astype(np.int16) for hit in hits])
-    return np.stack([hit.distance for hit in hits]), bodies, inside
+    return distance, body, inside
 
 
 def _gap(
