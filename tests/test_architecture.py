@@ -79,7 +79,6 @@ LARGE_CLASSES = {  # file:class: why it may be larger
     "the name optional",
     "scene/sensor.py:Sensor": "the physical constants of one camera, each independent of the "
     "others",
-    "scene/network.py:Network": "public methods with arguments that are explained",
     "render/replay.py:Replay": "still to be divided",
     "sim/scene.py:Scene": "what a scene file may say",
     "recon/settings.py:ReconSettings": "settings of one run; those that belong together are "
