@@ -22,8 +22,7 @@ class Guard(NamedTuple):
     """Limits of the projection, as x/z and y/z of a point [1]."""
 
     x: float
-    """Half the width of the view times 1.3: derivatives are those at this limit beyond it (method,
-    2.2)."""
+    """Half the width of the view times 1.3: beyond it derivatives are those at it (method, 2.2)."""
     y: float
     """Half its height times 1.3, likewise."""
     radius: float

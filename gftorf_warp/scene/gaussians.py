@@ -24,8 +24,7 @@ class GaussianField:
     opacity_logit: Float[Tensor, "N"]
     """Opacity before the sigmoid [1]."""
     reflectivity_sh: Float[Tensor, "N 16"]
-    """Harmonics of the reflectivity seen from a direction [m^2 in quad units]; see
-    :meth:`constant_sh`."""
+    """Harmonics of the reflectivity seen from a direction [m^2 in quad units]."""
     colour_sh: Float[Tensor, "N 16 3"] | None = None
     """Harmonics of linear RGB; None if there is no colour."""
     layer: Int[Tensor, "N"] | None = None

@@ -158,8 +158,7 @@ class Change:
     quartets: tuple[int, ...]
     """The complete quartets."""
     changed: Bool[Tensor, "J H W"]
-    """Whether a pixel changes from one complete quartet to the next; J is one less than the number
-    of quartets."""
+    """Whether a pixel changes from one complete quartet to the next; J = quartets - 1."""
     noise: float
     """Standard deviation of the noise of one quad [quad units]."""
 

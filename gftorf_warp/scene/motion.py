@@ -40,8 +40,7 @@ class Products(StrEnum):
     FLOAT32 = "float32"
     """The reference."""
     HALF = "half"
-    """Factors and activations in float16 on any device, sums and parameters in float32: the fastest
-    on CUDA."""
+    """Factors and activations in float16, sums and parameters in float32: fastest on CUDA."""
 
     @classmethod
     def _missing_(cls, value: object) -> Products | None:
@@ -65,8 +64,7 @@ class MotionSettings:
     neighbours: int = 4
     """Nodes: largest number that a Gaussian follows."""
     from_tracks: bool = True
-    """Nodes: whether initial displacements follow optical flow and decoded distance; otherwise they
-    are zero."""
+    """Nodes: whether initial displacements follow optical flow and decoded distance; else zero."""
     layers: int = 8
     """Network: layers before the head."""
     width: int = 256
@@ -99,8 +97,7 @@ class MotionStart:
     field: GaussianField
     """The initial Gaussians."""
     tracks: Float[Tensor, "T P 3"] | None
-    """Displacements of the P Gaussians of the moving layer at every key [m]; None if nothing was
-    tracked."""
+    """Displacements of the P Gaussians of the moving layer at every key [m]; None: not tracked."""
     duration: float
     """Time from the first raw frame to the last [s]."""
     unambiguous_range: float

@@ -85,8 +85,7 @@ class Network(Motion):
         # of gamma(x) and gamma(t)
         self._sizes = [encoded_size(*numbers) for numbers in frequencies]
         self.backend: Backend | None = None
-        """Computes the network in half precision; None: torch, in the precision of the
-        parameters."""
+        """Computes the network in half precision; None: torch, in that of the parameters."""
         size, width = sum(self._sizes), settings.width
         inputs = [size] + [width] * (settings.layers - 1)
         if settings.skip_after < settings.layers:

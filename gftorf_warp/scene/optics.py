@@ -32,11 +32,9 @@ class Lens:
     distortion: Distortion = field(default_factory=Distortion)
     """Distortion in OpenCV's model."""
     cosine_power: float = 0.0
-    """Power n of the cosine by which the image darkens towards its edge [1]; 4: the law of a thin
-    lens."""
+    """Power n of the cosine by which the image darkens towards its edge [1]; 4: a thin lens."""
     vignetting: tuple[float, ...] = ()
-    """Coefficients v of V = 1 + v_1 r^2 + v_2 r^4 + ... [1], r = 1 in the farthest corner; none: V
-    = 1."""
+    """Coefficients v of V = 1 + v_1 r^2 + v_2 r^4 + ... [1], r = 1 in the farthest corner."""
     beam_power: float = 0.0
     """Power of the cosine by which the beam of the emitter weakens to the side [1]; 0: isotropic;
     -3: a frontal wall is lit evenly. The light over the whole image is the same."""
@@ -84,8 +82,7 @@ class Beam(NamedTuple):
     factor: float
     """Intensity on the axis [1]."""
     least: float
-    """Cosine beyond which a beam of negative power is constant, that of the image corner [1];
-    others: 0."""
+    """Cosine beyond which a beam of negative power is constant: the image corner's [1]; else 0."""
 
 
 class Shading(NamedTuple):

@@ -24,8 +24,7 @@ class Pattern:
     """How much pixels differ; everything is off by default."""
 
     phase: float = 0.0
-    """Multiple of the phase pattern [1]; 1: as large as in the calibration file shipped with an
-    OPT8241 kit."""
+    """Multiple of the phase pattern [1]; 1: that of the calibration file of an OPT8241 kit."""
     gain: float = 0.0
     """Standard deviation of the response to light, PRNU [1]; 0.01 is usual, an assumption."""
     dark: float = 0.0

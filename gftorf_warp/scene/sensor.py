@@ -55,15 +55,13 @@ class Sensor:
     """One C-ToF sensor. The ``Scalar`` fields accept 0-d tensors, which receive gradients."""
 
     f_mod_hz: Scalar = SPEED_OF_LIGHT / 15.0
-    """Modulation frequency [Hz]; the default, 19.986 MHz, is that of the public F-ToeRF files
-    (depth_range 15 m)."""
+    """Modulation frequency [Hz]; default: 19.986 MHz, of public F-ToeRF files (range 15 m)."""
     shifts: tuple[float, ...] = CANONICAL_SHIFTS
     """Phase shifts of the quads that a rendering returns, in this order [rad]: any number, in any
     order. A recording takes them one after the other; a phase needs three different ones. Default:
     that of the synthetic F-ToeRF files."""
     further_hz: tuple[float, ...] = ()
-    """Modulation frequencies that follow in every cycle [Hz], each with all shifts; default:
-    ``f_mod_hz`` alone."""
+    """Modulation frequencies that follow in every cycle [Hz], each with all shifts."""
     phase_offset: Scalar = 0.0
     """Measured minus true phase [rad]: rendering adds it, decoding subtracts it."""
     dc_offset: Scalar = 0.0
@@ -73,28 +71,23 @@ class Sensor:
     frame_period_s: float = 1.0 / FRAME_RATE_HZ
     """Time from one raw frame to the next [s]; frame n is taken at n times this."""
     exposure_s: float = 2.34e-3
-    """Length of one exposure [s]; OPT8241 at 18/64 duty. Scales the number of electrons; 0 only
-    without noise."""
+    """Length of one exposure [s]; OPT8241 at 18/64 duty. Scales electrons; 0 only without noise."""
     row_time_s: float = 0.0
     """Delay from one row to the next [s]; 0: global shutter, as both makers say. A raw frame has
     the time of its first row. Engine mesh simulates it; nothing is reconstructed row by row."""
     unipolar: bool = False
-    """False: difference of two taps, signed. True: one tap, never negative; needs dc_offset >=
-    1."""
+    """False: difference of two taps, signed. True: one tap, never negative; dc_offset >= 1."""
     noise: bool = False
     """Whether shot noise, read noise, full well and ADC apply; without, quads are exact."""
     electrons_per_unit: float = 3.144e5
-    """Modulated electrons, both taps together, of one unit (r = 1 at d = 1 m) in 2.34 ms [e-];
-    OPT8241-like."""
+    """Modulated electrons of one unit (r = 1 at 1 m) in 2.34 ms, both taps [e-]; OPT8241-like."""
     contrast: float = 0.45
-    """Demodulation contrast C of a differential sensor [1]; OPT8241 at 50 MHz. A unipolar one has 1
-    / dc_offset."""
+    """Contrast C of a differential sensor [1]; OPT8241 at 50 MHz. A unipolar one: 1 / dc_offset."""
     contrast_cutoff_hz: float | None = None
     """Frequency f_c at which the contrast has halved [Hz], as C / (1 + (f / f_c)^2); None: it has
     one value. 303e6 fits the MLX75027."""
     harmonic_contrast: tuple[float, ...] = ()
-    """Contrast of harmonics 2, 3, ... as multiples of that of the first [1]; default: a sine. See
-    scene/waveform.py."""
+    """Contrast of harmonics 2, 3, ... over that of the first [1]; see scene/waveform.py."""
     ambient_electrons: float = 0.0
     """Unmodulated electrons per exposure, both taps together [e-]: of every pixel with engine
     gaussian, per unit of reflectance with engine mesh. A ninth of direct sunlight is 3.1e5 from

@@ -31,8 +31,7 @@ class Errors(NamedTuple):
     static: float | None
     """Against geometry, where it does not."""
     static_phasor: float | None
-    """Against the static-phasor distance, on all pixels: errors of motion and sensor, not of
-    indirect light."""
+    """Against the static-phasor distance, on all pixels: errors without those of indirect light."""
 
 
 def closed_form_errors(sequence: Sequence, truth: Truth | None) -> Errors:

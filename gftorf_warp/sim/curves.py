@@ -77,8 +77,7 @@ class Guided(Path):
     z: float | Curve = 0.0
     """z of the pivot [m]."""
     turns: tuple[Turn, ...] = ()
-    """Orientation as the product of these, the first leftmost: the last is applied first, in the
-    body's axes."""
+    """Orientation as the product of these, the first leftmost: the last is applied first."""
     arm: Vector = (0.0, 0.0, 0.0)
     """From the pivot to the origin of the body's axes, in those axes [m]."""
 

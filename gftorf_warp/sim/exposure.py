@@ -17,11 +17,9 @@ class Exposure(NamedTuple):
     amplitude: Float[np.ndarray, "H W"]
     """Mean amplitude a, source intensity included [relative units]."""
     distance: Float[np.ndarray, "H W"]
-    """Distance that the engine sees [m]: mean over opacity of Gaussians, or first hit; NaN where a
-    pixel sees none."""
+    """Distance that the engine sees [m]: mean over opacity, or first hit; NaN where none."""
     phasor: Complex[np.ndarray, "H W"]
-    """Light at the modulation frequency, the sensor's phase offset included, in any unit; 0 where
-    there is none."""
+    """Light at the modulation frequency, with the sensor's phase offset, in any unit; 0: none."""
     ambient: Float[np.ndarray, "H W"] | None = None
     """Share of even ambient light that is reflected, the mean reflectance of a pixel's rays [1];
     None: the engine does not compute it, and every pixel receives all of the sensor's ambient

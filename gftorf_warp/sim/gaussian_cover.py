@@ -91,8 +91,7 @@ class Cover:
     normal: Float[np.ndarray, "N 3"]
     """Unit normals, likewise."""
     other: Float[np.ndarray, "N 3"]
-    """At an edge, normals of the other face: visible only if both faces are, since elsewhere it is
-    an outline."""
+    """Normals of the other face at an edge: visible only if both faces are; else an outline."""
     limb: float
     """Visible only if the cosine of incidence exceeds this [1]."""
     frame: Float[np.ndarray, "N 3 3"]
@@ -102,8 +101,7 @@ class Cover:
     reflectance: Float[np.ndarray, "N"]
     """Reflectance rho over the share of the light that the cover returns [1]."""
     albedo: Float[np.ndarray, "N 3"]
-    """Albedo in linear RGB [1]; not corrected, since colour has the weights alpha T, whose sum is
-    the opacity."""
+    """Albedo in linear RGB [1]; not corrected: weights alpha T of colour sum to the opacity."""
     body: Body | None
     """The moving body; None for the cover of the still bodies."""
 

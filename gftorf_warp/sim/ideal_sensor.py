@@ -27,8 +27,7 @@ class Light(NamedTuple):
     """Light of one raw frame, of any shift."""
 
     amplitude: Float[np.ndarray, "H W"]
-    """Mean amplitude a of each pixel for a source intensity of 1 [relative units]; 0 where nothing
-    is hit."""
+    """Mean amplitude a of each pixel, source intensity 1 [relative units]; 0: nothing hit."""
     phasor: Complex[np.ndarray, "H W"]
     """Mean of a exp(i kappa d), likewise."""
     distance: Float[np.ndarray, "H W"]

@@ -53,8 +53,7 @@ class Mesh(Shape):
     inside: bool = False
     """False: a solid. True: a room."""
     open: bool = False
-    """Whether it may have borders: a sheet, visible from the side from which the file winds it
-    counter-clockwise."""
+    """Whether it may have borders: a sheet, visible from where it winds counter-clockwise."""
 
     def __post_init__(self):
         if not 0 < self.scale < np.inf:

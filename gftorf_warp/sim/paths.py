@@ -116,8 +116,7 @@ class Arc(Path):
     radius: float
     """Radius [m]."""
     start_deg: float
-    """Angle at time 0 [deg]: 0 is to the right of the centre (+x), 90 behind it (+z), -90 between
-    it and the camera."""
+    """Angle at time 0 [deg]: 0 is right of the centre (+x), 90 behind it (+z), -90 before it."""
     rate_deg_per_s: float
     """Angular rate [deg/s]."""
 
@@ -153,8 +152,7 @@ class Sweep(Path):
     target: Vector
     """Centre of the arc, on the camera's z axis [m]."""
     sweep_deg: float
-    """Angle from one end of the arc to the other, seen from the target [deg]; above 0 it starts at
-    the left."""
+    """Angle between the ends of the arc, seen from the target [deg]; above 0: from the left."""
     period_s: float
     """Time for the way out and back [s]."""
     rise: float = 0.0

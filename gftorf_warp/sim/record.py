@@ -32,8 +32,7 @@ from .world import Hits, first_hit, flow_of
 Progress = Callable[[int, int], None]
 Images = dict[str, np.ndarray]
 Cached = Callable[[str, Callable[[], Images]], tuple[Images, bool]]
-"""Images of a name, computed now or read from an interrupted recording, and whether they were
-computed now."""
+"""Images of a name, computed now or before an interruption, and whether computed now."""
 
 LAYER = "layer "  # begins the names of layers among the images of a raw frame
 COLOUR = 3  # part of the seed of the colour camera's noise
@@ -51,8 +50,7 @@ class Gap:
     max: float
     """Largest absolute difference [m]."""
     pixels: int
-    """Number of interior pixels in the image; their mean over all raw frames if the camera
-    moves."""
+    """Number of interior pixels in the image; the mean over raw frames if the camera moves."""
 
     def __str__(self) -> str:
         mean, most = 1e3 * self.mean, 1e3 * self.max

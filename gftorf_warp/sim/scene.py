@@ -87,23 +87,19 @@ class Scene:
     sensor: Sensor = field(default_factory=lambda: Sensor(noise=True))
     """The sensor, with its cycle of raw frames; also by name, see sim/sensors.py."""
     lens: Lens = field(default_factory=Lens)
-    """The lens of the ToF camera, and the beam of its emitter; the default is a pinhole and an
-    isotropic emitter."""
+    """Lens of the ToF camera and beam of its emitter; default: a pinhole, an isotropic emitter."""
     camera_path: Path = field(default_factory=Still)
     """Path of the ToF camera; the default is at rest at the origin, looking along +z."""
     emitter: Vector = (0.0, 0.0, 0.0)
-    """Position of the emitter in the axes of the ToF camera [m]; engine 'mesh' only unless at the
-    origin."""
+    """Position of the emitter in camera axes [m]; engine 'mesh' only unless at the origin."""
     beam_deg: tuple[float, float] | None = None
-    """Limits of the light: full angles across and down about the camera's z axis [deg]; None: all
-    directions."""
+    """Limits of the light: full angles across and down about the z axis [deg]; None: no limits."""
     colour: ColourCamera | None = None
     """The colour camera, which moves with the ToF camera; None: there is none."""
     novel_views: tuple[Path, ...] = ()
     """Poses, at time 0, of views without images, to be rendered after a reconstruction."""
     closed_form: float | None = None
-    """Error of the closed form on ideal quads [m^2 x 100], one ray per pixel; None: not
-    measured."""
+    """Error of the closed form on ideal quads [m^2 x 100], one ray per pixel; None: unknown."""
     overrides: tuple[str, ...] = ()
     """Differences from the named scene, as texts ``name=value``; for the data card."""
 

@@ -8,8 +8,7 @@ from ..constants import FRAMES_PER_QUARTET
 from ..errors import UsageError
 
 ENGINES = ("gaussian", "mesh")
-"""From a scene to an image: Gaussians that cover it are rendered, or rays are traced through its
-surfaces."""
+"""How images are made: Gaussians that cover the scene rendered, or rays traced to surfaces."""
 FORMATS = ("ftorf", "torf", "capture")
 TRUTHS = ("usual", "all")
 
@@ -27,8 +26,7 @@ class SimSettings:
     size: tuple[int, int] | None = None
     """(width, height) of the image [px]; None: the scene's own."""
     seed: int = 0
-    """Seed of the noise and of the random paths. Frame n does not depend on the number of
-    frames."""
+    """Seed of noise and random paths. Frame n does not depend on the number of frames."""
     sync: bool = False
     """Control mode: all raw frames of a quartet are taken at the time of its first."""
     noise: bool = True
@@ -36,14 +34,12 @@ class SimSettings:
     flow: bool = False
     """Whether exact optical flow at quartet starts is stored [px], that of the camera included."""
     exposure_samples: int = 1
-    """Instants that a raw frame averages over the exposure, centred on its time; 1: no motion
-    blur."""
+    """Instants that a raw frame averages over the exposure, centred on its time; 1: no blur."""
     engine: str = "gaussian"
     """One of ``ENGINES``. 'mesh' shares nothing with the renderer of `reconstruct`, and is the only
     one with light beside the camera, a beam, bounces, gloss or a rolling shutter."""
     bounces: int = 0
-    """Surfaces that light may meet after the first; 0: direct light only. More than 0 needs engine
-    'mesh'."""
+    """Surfaces that light may meet after the first; above 0 only with engine 'mesh'."""
     paths: int = 64
     """Random paths per pixel and raw frame for the light that bounces."""
     format: str = "ftorf"

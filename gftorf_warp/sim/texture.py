@@ -29,8 +29,7 @@ class Texture:
     hue: float | None = None
     """Middle of the cells' hues, in turns: 0 red, 1/3 green, 2/3 blue; None: all hues."""
     gloss: float = 0.0
-    """Share of the reflectance in a specular lobe, the rest is Lambertian [1]; engine 'mesh'
-    only."""
+    """Share of the reflectance in a specular lobe, the rest Lambertian [1]; engine 'mesh' only."""
     shininess: float = 50.0
     """Exponent of that lobe [1]: 10 is satin, 1000 nearly a mirror; its half width is 1.2 /
     sqrt(shininess) [rad]."""

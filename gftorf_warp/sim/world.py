@@ -32,11 +32,9 @@ class Grid(NamedTuple):
     normal: Float[np.ndarray, "N 3"]
     """Unit normals."""
     other: Float[np.ndarray, "N 3"]
-    """Normal of the other face at an edge, the same normal elsewhere: visible only if both face the
-    viewer."""
+    """Normal of the other face at an edge, else the same: visible only if both face the viewer."""
     limb: float
-    """Visible only if the cosine of incidence is above this [1]: keeps covers inside round
-    outlines."""
+    """Visible only if the cosine of incidence is above this [1]: covers end inside outlines."""
 
 
 class Shape(abc.ABC):
