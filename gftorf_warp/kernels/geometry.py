@@ -58,13 +58,11 @@ def rotation_of(wxyz: wp.vec4) -> wp.mat33:
 
 @wp.func
 def screen_covariance(view: CameraView, local: wp.vec3, wxyz: wp.vec4, scale: wp.vec3) -> wp.vec4:
-    """Covariance (xx, xy, yy) [px^2] of a Gaussian on the image, J R Sigma R^T J^T plus low-pass,
-    and its determinant.
+    """Covariance (xx, xy, yy) [px^2] of a Gaussian on the image, and its determinant.
 
-    The Jacobian J of the projection is taken at the centre ``local`` [m, camera axes], but no
-    farther out than 1.3 half fields of view, since beyond that the linearisation explodes (method,
-    section 2.2). The determinant is a sum of squares: xx yy - xy^2 would lose as many digits as the
-    ellipse is long.
+    It is J R Sigma R^T J^T plus low-pass. The Jacobian J is taken at ``local`` [m, camera axes],
+    clamped to 1.3 half fields of view (method, section 2.2). The determinant is a sum of
+    squares: xx yy - xy^2 would cancel for long ellipses.
     """
     # rows: own axes, in camera axes
     axes = wp.transpose(view.rotation * rotation_of(wxyz) * wp.diag(scale))
@@ -85,9 +83,6 @@ def ellipse_of(along_x: wp.vec3, along_y: wp.vec3) -> wp.vec4:
     xy = wp.dot(along_x, along_y)
     yy = wp.dot(along_y, along_y) + LOW_PASS
     area = wp.length_sq(wp.cross(along_x, along_y))
-    determinant = (
-        area
-        + LOW_PASS * (wp.dot(along_x, along_x) + wp.dot(along_y, along_y))
-        + LOW_PASS * LOW_PASS
-    )
+    widths = LOW_PASS * (wp.dot(along_x, along_x) + wp.dot(along_y, along_y))
+    determinant = area + widths + LOW_PASS * LOW_PASS
     return wp.vec4(xx, xy, yy, determinant)

@@ -5,9 +5,8 @@
     channel_j = sum_k w_jk o_k,   j = 1 .. D
 
 o are displacements and r rotations (quaternions wxyz) of a Gaussian at the keys, q is its
-quaternion. Row 0 of the weights belongs to the time of an image, each further row is the difference
-of the weights of two times, the end and the start of a flow. K is a constant of the kernels: their
-loops are unrolled, so that all loads are in flight at once.
+quaternion. Row 0 of the weights is of the time of an image, each further row the weights of the end
+of a flow minus those of its start. K is a constant: loops are unrolled.
 
     dL/do_k = w_0k dL/dmoved + sum_j w_jk dL/dchannel_j
     dL/dq   = n* dL/dturned,   dL/dr_k = w_0k dL/ds
@@ -96,9 +95,8 @@ def make_displace(K: int) -> SimpleNamespace:
         weight = row_of(weights, 0)
         moved[i] = mean[i] + interpolated(offset, index, weight, i)
         if turned.shape[0] > 0:
-            turned[i] = product(
-                wp.normalize(interpolated(rotation, index, weight, i)), quaternion[i]
-            )
+            turn = wp.normalize(interpolated(rotation, index, weight, i))
+            turned[i] = product(turn, quaternion[i])
         for j in range(channels.shape[1]):
             channels[i, j] = interpolated(offset, index, row_of(weights, j + 1), i)
 

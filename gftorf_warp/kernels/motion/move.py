@@ -1,5 +1,4 @@
-"""Gaussians of a finished run at one time, widened for cameras that resolve more than that of the
-optimisation.
+"""Gaussians of a finished run at one time, widened for cameras of higher resolution.
 
 The low-pass filter of the renderer widens every Gaussian by LOW_PASS pixels^2. With z the z-depth
 and f the focal length of the camera of the optimisation, and z', f' those of this camera,
@@ -57,9 +56,8 @@ def make_move(K: int) -> wp.Kernel:
             return
         point = initial_mean[i] + interpolated(offset, index, weight, i)
         scale = initial_log_scale[i]
-        missing = LOW_PASS_PX2 * (
-            squared_footprint(optimised, point) - squared_footprint(camera, point)
-        )
+        finer = squared_footprint(optimised, point) - squared_footprint(camera, point)
+        missing = LOW_PASS_PX2 * finer
         if missing > 0.0:
             for axis in range(3):
                 scale[axis] = 0.5 * wp.log(wp.exp(2.0 * scale[axis]) + missing)

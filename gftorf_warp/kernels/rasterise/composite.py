@@ -109,15 +109,13 @@ def make_composite(
     Args:
         K: Pixels per thread: 16, or 1 on CUDA.
         tile_width: Columns of a tile [px].
-        tile_height: Rows of a tile [px]; on CUDA a tile must have 32 pixels, one warp per tile.
+        tile_height: Rows of a tile [px]; on CUDA a tile has 32 pixels, one warp per tile.
         light: Whether light and distance are summed.
         channels: Whether the three channels are summed.
         inclusive: Whether the splat that ends a pixel is still added.
-        metric: Whether distortion is measured on the distance itself, or on the released mapping of
-            it; None: there is no distortion, and its three planes are left alone.
+        metric: Whether distortion is of the distance or of its released mapping; None: neither.
         more: Whether three further channels are summed in the same pass; K must be 1.
-        segments: Segments of the list in the backward pass (list_segments.py); more than one only
-            where K is 1, with light and without distortion.
+        segments: Of a list in the backward pass; > 1 only with K = 1, light and no distortion.
     """
     # the lanes of a warp fetch records for each other, see shared_batches.py
     cooperative, split = K == 1, segments > 1

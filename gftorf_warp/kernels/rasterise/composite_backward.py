@@ -137,22 +137,15 @@ def make_composite_backward(
         tile_height: Rows of a tile [px].
         light: Whether light, distance and distortion have gradients.
         channels: Whether the three channels have gradients.
-        clamp_straight: Whether the gradient ignores the clamp of alpha (straight-through), as the
-            released code does.
+        clamp_straight: Whether the gradient ignores the clamp of alpha, as in the released code.
         metric: As in ``make_composite``; None: the distortion has no gradient.
-        fixed: Whether weights are held fixed under the channels, so that only these have their
-            gradient.
-        more: Whether three further channels, under which weights are held fixed, have their
-            gradient, too.
-        segments: Warps per tile, each with a segment of its list (list_segments.py); if > 1, the
-            forward pass must have had as many, and weights be held fixed under all channels.
+        fixed: Whether weights are held fixed under the channels.
+        more: Whether three further channels, with weights held fixed, have a gradient.
+        segments: Warps per tile, as in the forward pass; > 1 only with weights held fixed.
     """
     cooperative, split = K == 1, segments > 1
     if split and not (cooperative and light and metric is None and (fixed or not channels)):
-        raise ValueError(
-            "segments need light, no distortion, no weights that depend on "
-            "channels, and a warp per tile"
-        )
+        raise ValueError("segments need light, no distortion, fixed weights, and a warp per tile")
     ops, pixels = make_lanes(K), make_pixels(K, tile_width, tile_height)
     V, fill, affine, mul = ops.V, ops.fill, ops.affine, ops.mul
     axpy, fma, fnma = ops.axpy, ops.fma, ops.fnma

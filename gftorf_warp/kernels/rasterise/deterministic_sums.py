@@ -1,8 +1,7 @@
 """Deterministic gradients: one gradient record per (tile, splat) pair, summed in a fixed order.
 
-The adjoint of the compositor adds to the record of a splat from many tiles, in an undefined order.
 With a record per pair there is a single writer; the records of a splat are then summed in the order
-in which its pairs were written, which depends on the splats alone.
+of its pairs, which depends on the splats alone.
 """
 
 import warp as wp

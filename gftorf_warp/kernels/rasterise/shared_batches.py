@@ -192,16 +192,14 @@ def more_of(
 def make_gradient_rounds(
     tile_width: int, light: bool, channels: bool, geometry: bool, spreads: bool, more: bool = False
 ) -> SimpleNamespace:
-    """Functions that sum the gradients of the entries of a round over the 32 pixels of a tile, one
-    per lane.
+    """Functions that sum the gradients of a round over the 32 pixels of a tile, one per lane.
 
     Args:
         tile_width: Columns of a tile [px]; each half of its 32 pixels is whole rows.
         light: Whether the light has gradients.
         channels: Whether the three channels have.
         geometry: Whether centre, conic and opacity have.
-        spreads: Whether the distortion has; then the derivative of the distance differs from entry
-            to entry.
+        spreads: Whether the distortion has, and with it the distance one per entry.
         more: Whether three further channels have gradients, in other records.
     """
     half = PIXELS // 2

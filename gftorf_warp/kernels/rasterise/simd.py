@@ -1,10 +1,8 @@
 """SIMD arithmetic on the K pixels of a thread: one expression, a clang vector on the CPU, scalars
 on CUDA.
 
-A compositor thread owns a block of K pixels. On the CPU K = 16, a block of 4 x 4, and every
-operation below becomes one vector instruction, because Warp runs CPU threads one after the other
-and LLVM finds no parallelism by itself. On CUDA K = 1. Each operation is written once, as a C++
-expression over a type ``F``.
+A compositor thread owns a block of K pixels: on the CPU K = 16, a block of 4 x 4, and an operation
+is one vector instruction; on CUDA K = 1. Each operation is one C++ expression over a type ``F``.
 """
 
 import functools
@@ -255,13 +253,10 @@ def make_lanes(K: int) -> SimpleNamespace:
 
 
 def sums_of(K: int, values: dict[str, str]) -> tuple[str, list[str]]:
-    """C++ that sums ``values``, expressions of type ``F`` by name, over the K pixels, and where the
-    sums are.
+    """C++ that sums ``values``, expressions of type ``F`` by name, over the K pixels; their order.
 
-    On CUDA they are ``float s[..]`` in order. On the CPU they end up in the lanes of one vector ``F
-    total``, in the order returned ('' is an empty lane): two vectors are folded into one, halves
-    onto halves, until every lane is a finished sum. Expressions are evaluated just before they are
-    folded, which keeps them in registers.
+    On CUDA sums are ``float s[..]``. On the CPU they are the lanes of ``F total``, '' an empty one:
+    vectors are folded in pairs, halves onto halves, evaluated just before to stay in registers.
     """
     if K == 1:
         return f"const float s[{len(values)}] = {{{', '.join(values.values())}}};", list(values)

@@ -1,5 +1,4 @@
-"""The record of a projected Gaussian, and how a compositor reads one and adds to the gradient of
-one.
+"""The record of a projected Gaussian, its memory access, and its gradient.
 
 Sixteen floats, one 64-byte line, the same slots for values and for gradients:
 

@@ -1,5 +1,4 @@
-"""Adam over many tensors in one launch, with everything that changes from step to step in device
-memory.
+"""Adam over many tensors in one launch, with all that changes between steps in device memory.
 
     m += (1 - b1) (g - m),   v += (1 - b2) (g^2 - v)
     x -= rate / (1 - b1^t)  m / (sqrt(v / (1 - b2^t)) + eps)
@@ -7,9 +6,8 @@ memory.
 (Kingma and Ba, 2015). Step t and learning rate are per tensor. A tensor of rate 0 is left alone, t
 included; so are all tensors if the step is invalid (``step_end.py``).
 
-A table holds the addresses of the tensors: there are as many as a network has layers, anywhere in
-memory. Address 0 as gradient: the tensor is left alone, too. Gradients are scaled first. A tensor
-may have up to four gradients, of as many images, which are summed here; the first ones come first.
+A table holds the addresses of the tensors; without a gradient (0) it is left alone, too. Up to four
+gradients of a tensor, of as many images, are summed in order and scaled first.
 """
 
 import functools
@@ -40,9 +38,7 @@ size."""
 
 def _descend(K: int) -> str:
     """C++: one block of K elements; nothing behind the end of a tensor is read or written."""
-    kind = (
-        f"typedef float F __attribute__((ext_vector_type({K})));" if K > 1 else "typedef float F;"
-    )
+    kind = f"typedef float F{f' __attribute__((ext_vector_type({K})))' if K > 1 else ''};"
     root = "__builtin_elementwise_sqrt(v)" if K > 1 else "sqrtf(v)"
     at = "F v = 0.0f; __builtin_memcpy(&v, p, bytes); return v;" if K > 1 else "return *p;"
     put = "__builtin_memcpy(p, &v, bytes);" if K > 1 else "*p = v;"

@@ -1,14 +1,8 @@
-"""Random light that depends on what it is for, not on who asks or when: a counter-based generator.
+"""Random light by a counter-based generator: a function of seed, image, stream, channel and pixel.
 
 Philox 4x32 with ten rounds (Salmon et al., Parallel Random Numbers: As Easy as 1, 2, 3, 2011) turns
-the counter
-
-    (block of four pixels, channel, image, stream)
-
-and the key (seed, 0) into four words, one per pixel. So every value is a function of seed, image,
-stream, channel and pixel: any number of threads in any order writes the same image, a run that goes
-on needs no stored generator, and a replayed graph draws afresh because seed and image are read from
-memory.
+the counter (block of four pixels, channel, image, stream) and the key (seed, 0) into four words,
+one per pixel. There is no state to store; a replayed graph reads seed and image from memory.
 """
 
 import warp as wp

@@ -1,7 +1,6 @@
-"""Sums whose order is fixed, so that they are the same to the bit however threads are scheduled.
+"""Sums in a fixed order, the same to the bit however threads are scheduled.
 
-A kernel leaves one partial sum per warp, on the CPU one per thread; :data:`means` adds them up, a
-block per row.
+Kernels write a partial sum per warp, on the CPU per thread; ``means`` adds them, a block per row.
 """
 
 import warp as wp
