@@ -103,20 +103,19 @@ def fitting_truth(sequence: Sequence, path: str | Path | None = None) -> Truth |
     if found is None or not found.known.any():
         if path is None:
             return None
-        raise InputError(
-            "no ground truth",
-            where=path,
-            why="--truth was given, but this sequence stores no true distance",
-            fix="leave --truth out, or name a sequence with synthetic_depth/",
-        )
+        why = "--truth was given, but this sequence stores no true distance"
+        fix = "leave --truth out, or name a sequence with synthetic_depth/"
+        raise InputError("no ground truth", where=path, why=why, fix=fix)
     if found.distance.shape != sequence.quads.shape:
         shapes = sequence.quads.shape, found.distance.shape
         expected, got = ("x".join(map(str, shape)) for shape in shapes)
+        where, why = (
+            path or sequence.path,
+            f"expected frames x rows x columns {expected}, found {got}",
+        )
+        fix = "name the sequence that the run was reconstructed from, at the same size"
         raise InputError(
-            "the truth does not fit the run",
-            where=path or sequence.path or "sequence",
-            why=f"expected frames x rows x columns {expected}, found {got}",
-            fix="name the sequence that the run was reconstructed from, at the same size",
+            "the truth does not fit the run", where=where or "sequence", why=why, fix=fix
         )
     return found
 
@@ -144,21 +143,15 @@ def findings(
 
 
 def _static_phasor(sequence: Sequence, truth: Truth) -> Float[np.ndarray, "F H W"]:
+    where, given = sequence.path or "sequence", "--against static-phasor was given"
     if truth.phasor_distance is None:
-        raise InputError(
-            "no static-phasor distance",
-            where=sequence.path or "sequence",
-            why="--against static-phasor was given, but the truth is geometry only",
-            fix="leave --against out, or name a sequence that was simulated with it by --truth",
-        )
+        why = f"{given}, but the truth is geometry only"
+        fix = "leave --against out, or name a sequence that was simulated with it by --truth"
+        raise InputError("no static-phasor distance", where=where, why=why, fix=fix)
     if len(sequence.frequencies) > 1:
-        raise InputError(
-            "a static-phasor distance of one frequency",
-            where=sequence.path or "sequence",
-            why=f"--against static-phasor was given, and here are {len(sequence.frequencies)}, "
-            f"unwrapped together",
-            fix="leave --against out",
-        )
+        what, fix = "a static-phasor distance of one frequency", "leave --against out"
+        why = f"{given}, and here are {len(sequence.frequencies)}, unwrapped together"
+        raise InputError(what, where=where, why=why, fix=fix)
     return np.where(truth.known[:, None, None], truth.phasor_distance, np.nan)
 
 

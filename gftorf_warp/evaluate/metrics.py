@@ -42,13 +42,11 @@ def scored_frames(sequence: Sequence, protocol: str = "all") -> list[int]:
         raise UsageError(f"unknown protocol {protocol!r}", where="--frames", why=why, fix=fix)
     quartets = sequence.complete_quartets
     if not quartets:
-        raise InputError(
-            "no complete quartet, nothing to score",
-            where=sequence.path or "sequence",
-            why="a closed form needs all raw frames of a cycle in a row; none among "
-            f"{sequence.frames} raw frames",
-            fix="check the sequence with `gftorf check`, or record longer",
-        )
+        what, where = "no complete quartet, nothing to score", sequence.path or "sequence"
+        need = "a closed form needs all raw frames of a cycle in a row"
+        fix = "check the sequence with `gftorf check`, or record longer"
+        why = f"{need}; none among {sequence.frames} raw frames"
+        raise InputError(what, where=where, why=why, fix=fix)
     if protocol == "all":
         slots = range(1 if sequence.from_phasors else sequence.cycle)
         return [sequence.cycle * i + k for i in quartets for k in slots]

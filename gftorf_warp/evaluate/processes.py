@@ -55,13 +55,8 @@ def writing(
 ) -> Iterator[Writing]:
     """Processes that write images; all are written at the end of the block, unless it raises.
 
-    After an exception each process completes its current picture and drops the rest.
-
-    Args:
-        out: Folder with a folder for each kind of image, inside ``many_files``.
-        scales: Scale of the previews of each kind.
-        count: Number of processes.
-        done: Called with the number of further images written.
+    After an exception each process completes its current picture and drops the rest. ``done`` is
+    called with the number of further images written.
 
     Raises:
         UsageError, ResourceError: If a file cannot be written, or a process was stopped.
@@ -99,8 +94,7 @@ class Writing:
             with theirs:
                 files = theirs.fileno(), self._file
                 command = [sys.executable, "-c", code, *map(str, files)]
-                # own process groups: Ctrl-C reaches this process only, which lets them complete
-                # their picture
+                # Ctrl-C reaches only this process, which lets those complete their picture
                 given: dict[str, Any] = {"stdin": subprocess.DEVNULL, "process_group": 0}
                 process = subprocess.Popen(command, env=environment, pass_fds=files, **given)
             self._processes[ours], self._busy[ours] = process, {}
@@ -184,7 +178,6 @@ class Writing:
 
 
 def _mapped(file: int, shape: tuple[int, ...]) -> Float[np.ndarray, "M B C H W"]:
-    """The images in shared memory."""
     count = math.prod(shape)
     return np.frombuffer(mmap(file, START + 4 * count), np.float32, count, START).reshape(shape)
 

@@ -41,12 +41,10 @@ def checked(what: str | Iterable[str]) -> tuple[str, ...]:
     names = tuple(dict.fromkeys(name.strip() for name in names if name.strip()))
     unknown = [name for name in names if name not in WHAT]
     if unknown or not names:
-        raise UsageError(
-            f"cannot render {', '.join(map(repr, unknown)) or 'nothing'}",
-            where="--what",
-            why=f"expected names out of {', '.join(WHAT)}, separated by commas",
-            fix="use, for example, --what distance,quads",
-        )
+        what = f"cannot render {', '.join(map(repr, unknown)) or 'nothing'}"
+        why = f"expected names out of {', '.join(WHAT)}, separated by commas"
+        fix = "use, for example, --what distance,quads"
+        raise UsageError(what, where="--what", why=why, fix=fix)
     return names
 
 
@@ -56,11 +54,6 @@ def named(name: str, images: Mapping[str, Float[np.ndarray, "..."]], sensor: Sen
     distance: ``distance`` [m], not divided by ``opacity`` [1]. quads: ``quad_<shift in degrees>``
     [file units]. phasor: ``re``, ``im``, ``amplitude`` [file units]. colour: ``R``, ``G``, ``B``,
     linear [1].
-
-    Args:
-        name: One of ``WHAT``.
-        images: Images of a rendering by name, at least those in ``NEEDS``.
-        sensor: Defines the shifts of the quads.
 
     Raises:
         UsageError: If colour is asked for and there is none.

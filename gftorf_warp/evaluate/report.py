@@ -78,17 +78,11 @@ def report(
     installed: str = "",
     data_card: str | None = None,
 ) -> str:
-    """The page.
+    """The page, from the files of the run.
 
-    Args:
-        title: Name of the sequence.
-        metrics: Content of metrics.json, of which all printed results are taken.
-        config: Content of the run's config.json.
-        log: Rows of the run's metrics.jsonl.
-        found: Arrays of the pictures.
-        diagnostics: Rows of the run's diagnostics.jsonl.
-        installed: Versions of the software of the comparison.
-        data_card: Statement on the truth in the sequence's README; None if it has none.
+    ``metrics`` is the content of metrics.json, source of all printed results; ``log`` and
+    ``diagnostics`` are rows of metrics.jsonl and diagnostics.jsonl; ``installed`` is the software
+    of the comparison, ``data_card`` the statement on the truth in the sequence's README.
     """
     s = panels.telling_row(found)
     sections = [
@@ -161,26 +155,20 @@ def _caption(text: str) -> str:
 def _table(metrics: Mapping[str, Any]) -> str:
     if page.look_up(metrics, "d_mse_x100") is None:
         return '<p class="soft">No ground truth: distance errors are not known.</p>'
-    head = "".join(
-        f"<th>{name}<span class='soft'>{_share(metrics, key)}</span></th>"
-        for key, name in PIXELS.items()
-    )
-    rows = []
+    head, rows = "", []
+    for group, name in PIXELS.items():
+        share = f"{page.number(metrics, f'{group}share', 'percent')} of all" if group else "&nbsp;"
+        head += f"<th>{name}<span class='soft'>{share}</span></th>"
     for name in DISTANCES:
         title, note = ROWS[name]
         cells = "".join(f"<td>{_cell(metrics, f'{group}{name}_mse_x100')}</td>" for group in PIXELS)
         mark = ' class="ours"' if name == "d" else ""
-        rows.append(
-            f'<tr{mark}><td><b>{title}</b> <span class="soft">{note}</span></td>{cells}</tr>'
-        )
+        text = f'<td><b>{title}</b> <span class="soft">{note}</span></td>'
+        rows.append(f"<tr{mark}>{text}{cells}</tr>")
     return (
         '<p class="soft">Mean squared error of the distance, m² &times; 100, and its root.</p>'
         f"<table><thead><tr><th></th>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
     )
-
-
-def _share(metrics: Mapping[str, Any], group: str) -> str:
-    return f"{page.number(metrics, f'{group}share', 'percent')} of all" if group else "&nbsp;"
 
 
 def _cell(metrics: Mapping[str, Any], key: str) -> str:

@@ -58,7 +58,7 @@ def store_all(
     Args:
         out: Folder with a folder for each kind of image.
         channels: Names of the channels of each kind.
-        series: Images in order.
+        series: Images in order, S of them.
         shape: (S, H, W) of each channel.
         progress: Called with (images written, images in all); the last time after the flush.
 
@@ -71,12 +71,9 @@ def store_all(
     with as_errors(out):
         free = shutil.disk_usage(out).free
     if needed > free:
-        raise ResourceError(
-            "not enough space",
-            where=out,
-            why=f"the arrays take {needed / 1e9:.1f} GB, {free / 1e9:.1f} GB are free",
-            fix="render fewer --times, or write to another disk",
-        )
+        why = f"the arrays take {needed / 1e9:.1f} GB, {free / 1e9:.1f} GB are free"
+        fix = "render fewer --times, or write to another disk"
+        raise ResourceError("not enough space", where=out, why=why, fix=fix)
     with ExitStack() as stack:
         files = {path: stack.enter_context(Stored(path, shape)) for path in paths}
         threads = ThreadPoolExecutor(len(files), thread_name_prefix="gftorf-arrays")

@@ -20,7 +20,7 @@ from ..render.series import KEPT, View, on_host
 from ..scene.camera import Camera
 from ..scene.sensor import Sensor, channel_of
 from . import previews, renders, stored, writers
-from .metrics import distance_from_quads, normalised
+from .metrics import DISTANCES, distance_from_quads, normalised
 from .poses import middle
 from .poses import read as read_poses
 
@@ -64,12 +64,7 @@ class Views:
     @property
     def distances(self) -> dict[str, Float[np.ndarray, "S H W"]]:
         """All distances [m], by their names in metrics.json."""
-        return {
-            "closed_form": self.closed_form,
-            "d": self.d,
-            "d_normalised": self.d_normalised,
-            "d_tof": self.d_tof,
-        }
+        return {name: getattr(self, name) for name in DISTANCES}
 
 
 def gather(
@@ -79,13 +74,7 @@ def gather(
     *,
     progress: Callable[[int, int], None] | None = None,
 ) -> Views:
-    """Render every scored frame at its own time and pose, before a black background.
-
-    Args:
-        run: A finished reconstruction.
-        sequence: What it was made from.
-        frames: The raw frames n to render.
-        progress: Called with (frames done, frames in all).
+    """Render raw frames n at their own times and poses, before a black background.
 
     Raises:
         DivergedError: If a rendering is not finite.
@@ -132,19 +121,17 @@ def _agreement(quartets: list[Decoded]) -> dict[str, Any]:
 
 def camera_at(run: Run, sequence: Sequence, time: float) -> Camera:
     """The camera at the pose of the raw frame nearest to ``time`` [s]."""
-    return run.camera.at(sequence.camera_from_world[nearest_frame(sequence, time)])
+    return run.camera.at(sequence.camera_from_world[_nearest_frame(sequence, time)])
 
 
-def nearest_frame(sequence: Sequence, time: float) -> int:
-    """The raw frame nearest to ``time`` [s]."""
+def _nearest_frame(sequence: Sequence, time: float) -> int:
     return int(np.abs(sequence.times - time).argmin())
 
 
 def quad_of_shift(rendering: Rendering, sensor: Sensor, shift: float) -> torch.Tensor:
-    """The quad [H, W] of any phase shift [rad], of a rendering with those of the sensor's.
+    """The quad [H, W] of any phase shift [rad] of a rendering.
 
-    Where it was not rendered it follows from the phasor, (re cos shift + im sin shift + dc_offset
-    |amplitude|) / 2.
+    If not rendered, it is (re cos shift + im sin shift + dc_offset amplitude) / 2 of the phasor.
     """
     channel = channel_of(sensor.shifts, shift)
     if channel is not None:
@@ -264,7 +251,7 @@ def views_to_take(
         why, fix = "the list is empty", "leave --times out"
         raise UsageError("no time to render", where="--times", why=why, fix=fix)
     if found is None:
-        nearest = [nearest_frame(sequence, time) for time in seconds]
+        nearest = [_nearest_frame(sequence, time) for time in seconds]
         known = {n: run.camera.at(sequence.camera_from_world[n]) for n in set(nearest)}
         return seconds, [known[n] for n in nearest]
     count = max(len(seconds), len(found))

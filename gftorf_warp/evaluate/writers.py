@@ -69,7 +69,6 @@ def _write_by_threads(
     series: Iterable[Mapping[str, Channels]],
     done: Callable[[int], None],
 ) -> None:
-    """Write in threads of this process."""
     waiting: deque[Future] = deque()
 
     def collect(most: int) -> None:
