@@ -85,12 +85,13 @@ def alike(one, other, few=0.01, signs=0.0):
     gradients that are nothing but rounding: a few elements may be a few steps apart, which is no
     error.
     """
+    largest = 5e-2 if signs else 2e-2  # two steps of one element, measured on an H200
     few = few if one.optimiser.leaves[0].is_cuda else signs
     assert len(one.optimiser.field) == len(other.optimiser.field)
     for leaf, twin in zip(one.optimiser.leaves, other.optimiser.leaves, strict=True):
         apart = ~torch.isclose(leaf, twin, rtol=1e-3, atol=2e-5)
         assert apart.float().mean() <= few
-        torch.testing.assert_close(leaf, twin, rtol=1e-3, atol=2e-2 if few else 2e-5)
+        torch.testing.assert_close(leaf, twin, rtol=1e-3, atol=largest if few else 2e-5)
     assert one.sums.keys() == other.sums.keys()
     for name in one.sums:
         torch.testing.assert_close(one.sums[name], other.sums[name], rtol=1e-3, atol=1e-6)
