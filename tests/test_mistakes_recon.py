@@ -21,7 +21,7 @@ from gftorf_warp.constants import CANONICAL_SHIFTS, SH_Y0
 from gftorf_warp.data.write import write
 from gftorf_warp.evaluate.compare import compare
 from gftorf_warp.evaluate.metrics import scored_frames
-from gftorf_warp.recon import checkpoint, densify, step
+from gftorf_warp.recon import checkpoint, densify, renderings
 from gftorf_warp.recon.observations import observe
 from gftorf_warp.recon.optimiser import Optimiser
 from gftorf_warp.recon.run import Run
@@ -351,7 +351,7 @@ def test_mistake_22_colour_is_rendered_only_while_it_counts(monkeypatch, weight,
         seen[-1].append((field.colour_sh is not None, camera.width))
         return rasterize(field, camera, *args, **options)
 
-    monkeypatch.setattr(step, "rasterize", spy)
+    monkeypatch.setattr(renderings, "rasterize", spy)
     observations, state = started(settings, coloured())
     assert bool(observations.colour) == (weight > 0)
     tof = observations.sequence
