@@ -156,6 +156,14 @@ def test_steps_are_those_of_plain_torch(make, batch, device):
     compared(make(batch=batch), device, images=((20, 0.01), (40, 0.06)))
 
 
+@pytest.mark.parametrize("device", DEVICES)
+def test_frozen_gaussians_may_still_be_densified(device):
+    """The network is then evaluated where the new ones are."""
+    settings = published(batch=Batch.FRAME)
+    schedule = replace(settings.schedule, freeze_from=0.25)
+    compared(replace(settings, schedule=schedule), device, images=((34, 0.01),))
+
+
 INPUTS = {
     "phasors": {"input": Input.PHASOR},
     "phasors, flow and depth": {"input": Input.PHASOR, "weights": Weights(flow=0.01, depth=0.3)},

@@ -22,6 +22,7 @@ from torch import Tensor
 from ..render import fused
 from ..render.control import DeviceCamera, packed
 from ..render.cuda import DeviceUpload
+from ..render.descent import RESULTS
 from ..scene.motion import Motion
 from .blending import Blending
 from .observations import Observations
@@ -31,7 +32,6 @@ from .terms import Term, View
 ROWS = ("light", "depth", "colour", "flow")  # row numbers of an image, see ``Comparison.rows``
 NUMBERS = len(ROWS) + 2  # integers of an image: its rows, seed and number of its random background
 FLOWS = 2  # of a quartet: to the next one and to the previous one
-RESULTS = 3  # numbers per image and term: the term, its mean squared difference, its mean opacity
 
 
 @dataclass(frozen=True, kw_only=True)

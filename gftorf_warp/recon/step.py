@@ -104,7 +104,7 @@ class Step:
 
         images = [*map_images(image, range(len(key.images)))]
         self._streams.join()
-        lists = self._gradient_lists(key, key_motion, images)
+        lists = self._gradient_lists(key_motion, images)
         with torch.no_grad():
             table.point(lists)
             if send is not None:
@@ -195,18 +195,14 @@ class Step:
             if value.requires_grad:
                 values.append(value)
                 weights.append(self.control.weights[n, k, 0])
-        wanted = [leaf for leaf in leaves if leaf.requires_grad]
-        if not values or not wanted:
-            return [None] * len(leaves)
-        loss = fused.sum_for_gradients(weights, values)
-        return _in_order(leaves, wanted, torch.autograd.grad(loss, wanted, allow_unused=True))
+        return _gradients_of(values, weights, leaves)
 
     def _gradient_lists(
-        self, key: GraphKey, key_motion: KeyMotion | None, images: list[ImageGradients]
+        self, key_motion: KeyMotion | None, images: list[ImageGradients]
     ) -> list[list[Tensor | None]]:
         """Gradients of all leaves as few enough lists, which Adam sums up."""
         learning = self.padded.motion
-        of_values, of_motion = self._back_through_motion(key, key_motion, images)
+        of_values, of_motion = self._back_through_motion(key_motion, images)
         none: list[Tensor | None] = [None] * len(learning)
         first, *others = [image.values for image in images]
         lists = [[*first, *of_motion], *([*values, *none] for values in others)]
@@ -218,29 +214,21 @@ class Step:
         return lists
 
     def _back_through_motion(
-        self, key: GraphKey, key_motion: KeyMotion | None, images: list[ImageGradients]
+        self, key_motion: KeyMotion | None, images: list[ImageGradients]
     ) -> tuple[list[Tensor | None], list[Tensor | None]]:
         """Gradients of the field and of the motion parameters through the motion,
         for all images at once.
         """
-        values = [] if key.frozen else [*self.padded.values.values()]
-        none: tuple[list[Tensor | None], list[Tensor | None]] = (
-            [None] * len(self.padded.values),
-            [None] * len(self.padded.motion),
-        )
+        values = [*self.padded.values.values()]
         shared = [t for t in key_motion or () if t is not None]
         pairs = [
             (total, tensor)
             for tensor, *given in zip(shared, *(image.motion for image in images), strict=True)
             if tensor.requires_grad and (total := fused.added(given)) is not None
         ]
-        leaves = [*values, *self.padded.motion]
-        if not pairs or not leaves:
-            return none
-        totals, tensors = zip(*pairs, strict=True)
-        loss = fused.sum_for_gradients(totals, tensors)
-        gradients = _in_order(leaves, leaves, torch.autograd.grad(loss, leaves, allow_unused=True))
-        return gradients[: len(values)] or none[0], gradients[len(values) :]
+        totals, tensors = [total for total, _ in pairs], [tensor for _, tensor in pairs]
+        gradients = _gradients_of(tensors, totals, [*values, *self.padded.motion])
+        return gradients[: len(values)], gradients[len(values) :]
 
 
 def _leaf_of(tensor: Tensor) -> Tensor:
@@ -248,11 +236,14 @@ def _leaf_of(tensor: Tensor) -> Tensor:
     return tensor.detach().requires_grad_(tensor.requires_grad)
 
 
-def _in_order(
-    leaves: list[Tensor], wanted: list[Tensor], gradients: Iterable[Tensor | None]
+def _gradients_of(
+    values: list[Tensor], cotangents: list[Tensor], leaves: list[Tensor]
 ) -> list[Tensor | None]:
-    """Contiguous gradients of leaves, of which only some are wanted."""
-    given = iter(gradients)
-    ids = {id(leaf) for leaf in wanted}
-    found = [next(given) if id(leaf) in ids else None for leaf in leaves]
-    return [None if gradient is None else gradient.contiguous() for gradient in found]
+    """Contiguous gradients of leaves through values; None: zero, or the leaf needs none."""
+    wanted = [leaf for leaf in leaves if leaf.requires_grad]
+    if not values or not wanted:
+        return [None] * len(leaves)
+    loss = fused.sum_for_gradients(cotangents, values)
+    found = iter(torch.autograd.grad(loss, wanted, allow_unused=True))
+    gradients = [next(found) if leaf.requires_grad else None for leaf in leaves]
+    return [None if gradient is None else gradient.contiguous() for gradient in gradients]

@@ -134,11 +134,11 @@ class Stepper:
 
     def _run(self, key: GraphKey) -> None:
         """Launch a step; the first one of a key is not captured, since it loads modules."""
-        self._summed |= {name for image in key.images for name in image.terms}
         if key in self._graphs:
             self._graphs[key]()
             self._watch_pairs()
             return
+        self._summed |= {name for image in key.images for name in image.terms}
         table = self._padded.table()
         self._launch(key, table, table.send, map)  # one thread: kernels are compiled now
         if self._capacity.pairs is None:
@@ -182,9 +182,6 @@ class Stepper:
         if last is None or last.terms != key.terms:
             self._capacity = PairCapacity()
         self._attach(free=True)
-        motion, padded = self.state.motion, self._padded
-        if key.frozen and motion.follows_means:
-            padded.binding.copy_(motion.bind(padded.field.map(torch.Tensor.detach)))
 
     def _attach(self, *, free: bool = False) -> None:
         """Move the state to the padded parameters, whose number of rows may change."""
@@ -193,6 +190,9 @@ class Stepper:
         if self._padded.attach(state, steps=self._steps, free=free, grows=grows):
             self._release_graphs()
         self._steps = 0
+        if self._key is not None and self._key.frozen and state.motion.follows_means:
+            field = self._padded.field.map(torch.Tensor.detach)  # evaluated here, not in every step
+            self._padded.binding.copy_(state.motion.bind(field))
 
     def _release_graphs(self) -> None:
         """Release all graphs; the memory that they share goes with the last one."""
