@@ -318,9 +318,8 @@ def sum_for_gradients(weights: Sequence[Tensor], terms: Sequence[Tensor]) -> Flo
 
     Terms are numbers or of any shape, each with a weight of its own shape.
 
-    ``autograd.grad(terms, .., grad_outputs=weights)`` says the same, but torch looks at shapes of
-    gradients that it is given by means of sympy, whose import takes longer than the first thousand
-    steps.
+    ``autograd.grad(terms, grad_outputs=weights)`` is equivalent, but torch checks the shapes of
+    given gradients by sympy, whose import takes longer than the first thousand steps.
     """
     return _Sum.apply(list(weights), *terms)
 

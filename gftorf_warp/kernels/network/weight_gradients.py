@@ -108,14 +108,14 @@ def _snippet(columns: int, layer: str, first: str, row: str) -> str:
     }};
     const int m = warp / 4 * 64, n = warp % 4 * {own};  // outputs and inputs of this warp
     float sums[4][{own // 8}][4] = {{}};
-    __syncthreads();  // whoever had this memory
+    __syncthreads();  // the last readers of this memory
     for (int tile = begin; tile < begin + {STAGES - 1}; ++tile) {{
         if (tile < end) fetch(tile);
         commit();  // also where nothing was asked for: groups are counted
     }}
     for (int tile = begin; tile < end; ++tile) {{
         asm volatile("cp.async.wait_group {STAGES - 2};" ::: "memory");
-        // everybody's copies are there, and nobody multiplies by the tile before any more
+        // all copies have arrived, and no warp reads the previous tile any more
         __syncthreads();
         if (tile + {STAGES - 1} < end) fetch(tile + {STAGES - 1});
         commit();
