@@ -142,6 +142,10 @@ def _simulate(options: argparse.Namespace) -> int:
             print(f"{scene.name:<21}{scene.frames:>10}{error:>13}  {about}")
         error = "its mean squared error on ideal quads [m^2 x 100], see design/look-alikes.md"
         print(f"closed form: {error}")
+        if options.scene is None:
+            print(
+                "random: drawn from --seed; `gftorf simulate random --seed N --list` describes it"
+            )
         return 0
     if options.scene is None or options.out is None:
         missing = "SCENE" if options.scene is None else "--out SEQ"
@@ -177,7 +181,7 @@ def _listed(options: argparse.Namespace, scenes: Mapping[str, Scene]) -> list[Sc
     from .sim.closed_form_errors import with_closed_form
     from .sim.simulate import scene_of
 
-    return [with_closed_form(scene_of(options.scene, options.overrides))]
+    return [with_closed_form(scene_of(options.scene, options.overrides, options.seed))]
 
 
 def _each_level(options: argparse.Namespace) -> Callable[[int, int], None]:

@@ -14,7 +14,7 @@ from .paths import Still
 from .readout import contrast, electron_gain
 from .record import Recording
 from .scene import overridden
-from .scenes import SCENES, Scene
+from .scenes import Scene, named_scene
 from .sensors import effect_rows
 from .settings import SimSettings
 
@@ -151,7 +151,7 @@ def _camera_rows(scene: Scene, used: SimSettings) -> dict[str, str]:
 
 def _command(scene: Scene, used: SimSettings, level: str | None) -> str:
     """Command that makes the same sequence again; a call in Python for scenes without a name."""
-    named = SCENES.get(scene.name)
+    named = named_scene(scene.name)
     if named is None or overridden(named, scene.overrides) != scene:
         values = {name: getattr(used, name) for name in CALLED}
         values |= {"format": repr(used.format)} if used.format != "ftorf" else {}

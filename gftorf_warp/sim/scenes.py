@@ -5,6 +5,7 @@ All distances of our own are inside the unambiguous range of 7.5 m.
 
 from __future__ import annotations
 
+import re
 from functools import partial
 
 from .bodies import ball, box, passing, room
@@ -13,6 +14,7 @@ from .lookalikes import SYNTHETIC
 from .lookalikes_real import RECORDED
 from .lookalikes_torf import CARRIED
 from .paths import Arc, Path, Still, Sweep, Vector, Viewpoint
+from .random_scene import PREFIX, random_scene
 from .scene import ColourCamera, Scene, recipe
 from .world import Body, Plane, Texture
 
@@ -107,3 +109,12 @@ SCENES: dict[str, Scene] = {
     scene.name: scene for scene in (make() for make in (*OURS, *LOOK_ALIKES, *CALIBRATION))
 }
 """All named scenes, that of ``gftorf demo`` first, then the others of our own, ``OURS``."""
+
+
+def named_scene(name: str, seed: int = 0) -> Scene | None:
+    """A scene by its name; ``random`` is ``random-SEED``, drawn. None if there is none."""
+    if name == PREFIX:
+        return random_scene(seed)
+    if match := re.fullmatch(rf"{PREFIX}-(\d+)", name):
+        return random_scene(int(match[1]))
+    return SCENES.get(name)

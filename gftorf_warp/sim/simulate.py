@@ -17,11 +17,12 @@ from .card import outcome_card, settings_card
 from .checks import check_clearance, check_engine, check_format
 from .closed_form_errors import Errors, closed_form_errors, ladder_table
 from .ladder import NAMES, resolved
+from .random_scene import PREFIX
 from .record import Progress, longest_times, record
 from .resume import cached_images, needs_recording, set_aside
 from .scene import overridden
 from .scene_file import read_scene
-from .scenes import SCENES, Scene
+from .scenes import SCENES, Scene, named_scene
 from .settings import SimSettings
 
 
@@ -44,7 +45,8 @@ def simulate(
     images are in OUT.partial, and the final bytes are the same.
 
     Args:
-        scene: Name of a scene, see ``SCENES``, a TOML file of one, or a scene.
+        scene: Name of a scene, see ``SCENES``; ``random``, drawn from the seed, or ``random-N``; a
+            TOML file of a scene; or a scene.
         out: Folder to write.
         settings: How the scene is recorded.
         device: Where engine mesh traces; engine gaussian renders on the CPU.
@@ -63,7 +65,8 @@ def simulate(
         InputError: If a TOML file does not describe a scene.
     """
     settings = replace(settings, **changes)
-    own, settings = scene_of(scene, settings.overrides), replace(settings, overrides=())
+    own = scene_of(scene, settings.overrides, settings.seed)
+    settings = replace(settings, overrides=())
     recorded, used = resolved(own, settings)
     check_engine(recorded, used, device)
     check_format(recorded, used)
@@ -113,8 +116,10 @@ def simulate_ladder(
     return rows
 
 
-def scene_of(scene: str | Scene, overrides: Iterable[str] = ()) -> Scene:
+def scene_of(scene: str | Scene, overrides: Iterable[str] = (), seed: int = 0) -> Scene:
     """A scene by its name or file, with single settings changed; as for :func:`simulate`.
+
+    ``seed`` decides what ``random`` is, and nothing else.
 
     Raises:
         UsageError: If there is no such scene, or a setting cannot be changed so.
@@ -124,8 +129,10 @@ def scene_of(scene: str | Scene, overrides: Iterable[str] = ()) -> Scene:
         return overridden(scene, overrides)
     if scene.endswith(".toml"):
         return overridden(read_scene(scene), overrides)
-    if scene not in SCENES:
+    found = named_scene(scene, seed)
+    if found is None:
         others = "take one of these, `--list` describes them, or a file that ends in .toml"
-        why, fix = f"the named scenes are {', '.join(SCENES)}", suggestion(scene, SCENES) or others
+        named = *SCENES, PREFIX, f"{PREFIX}-N"
+        why, fix = f"the named scenes are {', '.join(named)}", suggestion(scene, named) or others
         raise UsageError(f"there is no scene named {scene!r}", where="SCENE", why=why, fix=fix)
-    return overridden(SCENES[scene], overrides)
+    return overridden(found, overrides)
