@@ -81,7 +81,7 @@ def test_the_statistic_is_the_pixel_weighted_mean_in_half_image_sizes():
         ScreenGradient(values=torch.tensor(values))
         for values in ([[0.3, 0, 2, 0.5], [0, 0.1, 0, 0]], [[0, 0.4, 6, 3], [0, 0.2, 5, 0.25]])
     ]
-    step = descent.StepResults.empty(2, 1, 2, torch.device("cpu"))
+    step = descent.StepResults.empty(2, 1, torch.device("cpu"))
     descent.add_statistics(
         screens, (CAMERA.width, CAMERA.height), step, seen.gradient, seen.pixels, seen.weight
     )

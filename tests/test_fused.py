@@ -232,7 +232,7 @@ def one_step(values, gradients, moments, rates, images=1, motion_from=None, long
     ``gradients`` are one list or, as a tuple, several of which the sum counts.
     """
     device = values[0].device
-    output = descent.StepResults.empty(images, 1, images, device)
+    output = descent.StepResults.empty(images, 1, device)
     table = descent.AdamTable(values, moments)
     table.point(gradients if isinstance(gradients, tuple) else (gradients,))
     table.send()
@@ -243,7 +243,6 @@ def one_step(values, gradients, moments, rates, images=1, motion_from=None, long
         torch.zeros(images, 3, device=device),
         torch.ones(1, device=device),
         images=images,
-        renderings=images,
         motion_from=len(values) if motion_from is None else motion_from,
         motion_gradient_max=longest,
         capacity=0,

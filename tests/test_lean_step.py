@@ -149,7 +149,7 @@ class Descent:
             for x in self.values
         ]
         self.table = descent.AdamTable(self.values, self.moments)
-        self.output = descent.StepResults.empty(4, 3, 4, torch.device(device))
+        self.output = descent.StepResults.empty(4, 3, torch.device(device))
         self.twins = [value.clone().requires_grad_() for value in self.values]
         groups = [
             {"params": [twin], "lr": rate}
@@ -165,12 +165,10 @@ class Descent:
         """One by kernels; ``gradients`` are one to four lists, ``results`` those of every image,
         or of all alike.
         """
-        self.table.point(gradients)
+        counts = torch.tensor(pairs[: self.images], dtype=torch.int32, device=self.device)
+        self.table.point(gradients, counts.split(1))
         self.table.send()
         self.output.results[: self.images] = torch.tensor([*results], device=self.device)
-        self.output.pairs[: self.images] = torch.tensor(
-            pairs[: self.images], dtype=torch.int32, device=self.device
-        )
         descent.descend(
             self.table,
             torch.tensor(rates or self.rates, device=self.device),
@@ -178,7 +176,6 @@ class Descent:
             torch.tensor([self.weights] * 4, device=self.device),
             torch.tensor([float(self.images)], device=self.device),
             images=self.images,
-            renderings=self.images,
             motion_from=self.motion_from,
             motion_gradient_max=longest,
             capacity=capacity,
@@ -297,8 +294,10 @@ def test_tensors_that_do_not_fit_the_table_are_refused():
     table = descent.AdamTable([torch.zeros(4)], moments)
     with pytest.raises(ValueError, match="the shape of the parameter"):
         table.point([[torch.zeros(5)]])
-    with pytest.raises(ValueError, match="33 terms and 4 renderings, at most 32 terms"):
-        descent.StepResults.empty(4, 33, 4, torch.device("cpu"))
+    with pytest.raises(ValueError, match="33 terms, at most 32"):
+        descent.StepResults.empty(4, 33, torch.device("cpu"))
+    with pytest.raises(ValueError, match="65 renderings, at most 64"):
+        table.point([[torch.zeros(4)]], [torch.zeros(1, dtype=torch.int32)] * 65)
 
 
 @pytest.mark.parametrize("images", [1, 2, 3, 4, 6])
@@ -314,7 +313,7 @@ def test_statistics_are_sums_over_images(device, images):
     start = torch.rand(50, generator=generator).to(device)
     sums = [start.clone() for _ in range(3)]
     descent.add_statistics(
-        screens, (30, 20), descent.StepResults.empty(4, 1, 4, torch.device(device)), *sums
+        screens, (30, 20), descent.StepResults.empty(4, 1, torch.device(device)), *sums
     )
     lengths = [
         one.pixels * torch.hypot(15.0 * one.gradient[:, 0], 10.0 * one.gradient[:, 1])

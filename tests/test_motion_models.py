@@ -370,7 +370,9 @@ def test_a_training_step_differentiates_means_through_rotations(monkeypatch):
     observations, lists = observe(small(), settings, "cpu"), []
     point = descent.AdamTable.point
     monkeypatch.setattr(
-        descent.AdamTable, "point", lambda table, given: lists.append(given) or point(table, given)
+        descent.AdamTable,
+        "point",
+        lambda table, given, pairs: lists.append(given) or point(table, given, pairs),
     )
 
     def loss(shift=0.0):

@@ -24,7 +24,7 @@ from .optimiser import EPSILON, field_of
 from .padded import PaddedParameters
 from .renderings import Renderer, primary
 from .settings import ReconSettings
-from .terms import Comparison, Term, View
+from .terms import Comparison, Term
 
 Map = Callable[[Callable[[int], "ImageGradients"], Iterable[int]], Iterable["ImageGradients"]]
 
@@ -68,9 +68,7 @@ class Step:
         self.observations, self.settings, self.terms = observations, settings, tuple(terms)
         self.control, self.padded, self.betas = control, padded, betas
         device = observations.quads.device
-        self.output = descent.StepResults.empty(
-            control.images, len(self.terms), control.images * len(View), device
-        )
+        self.output = descent.StepResults.empty(control.images, len(self.terms), device)
         """Results and sums on the device."""
         self._streams = SideStreams(control.images, device)
         self._scratch: defaultdict[tuple[int, str], fused.Scratch] = defaultdict(fused.Scratch)
@@ -106,12 +104,9 @@ class Step:
         self._streams.join()
         lists = self._gradient_lists(key_motion, images)
         with torch.no_grad():
-            table.point(lists)
+            table.point(lists, [count for image in images for count in image.pairs])
             if send is not None:
                 send()
-            pairs = [count for image in images for count in image.pairs]
-            if pairs:
-                torch.cat(pairs, out=self.output.pairs[: len(pairs)])
             descent.descend(
                 table,
                 self.control.rates,
@@ -119,7 +114,6 @@ class Step:
                 self.control.weights.flatten(1),
                 self.control.compared,
                 images=len(images),
-                renderings=len(pairs),
                 motion_from=len(self.padded.values),
                 motion_gradient_max=self.settings.motion_gradient_max,
                 capacity=render.pair_capacity,

@@ -26,11 +26,11 @@ TOTAL_NAMES = ("quad_mse", "opacity", "loss", "count")
 
 
 class AdamTable:
-    """Addresses of the tensors of an Adam step, valid as long as the tensors live.
+    """Addresses of what the end of a step reads: parameters, moments, gradients, pair counts.
 
-    Gradients may have other addresses in the next step: :meth:`point` notes them, :meth:`send`
-    uploads them. A CUDA graph may read the table: it is captured between the two, and replayed
-    after both.
+    Valid as long as these tensors live. Gradients and counts may have other addresses in the next
+    step: :meth:`point` notes them, :meth:`send` uploads them. A CUDA graph may read the table: it
+    is captured between the two, and replayed after both.
     """
 
     def __init__(
@@ -74,18 +74,32 @@ class AdamTable:
         """The same on the device."""
         self.partials = torch.empty(parts[-1], dtype=torch.float32, device=device)
         """[P] scratch: sums of squares."""
+        self.pairs = torch.zeros(RENDERINGS_MAX, dtype=torch.int64, device=device)
+        """[R or more] addresses of the numbers of (tile, splat) pairs of renderings."""
+        self.renderings = 0
+        """Number R of renderings."""
+        self._pairs_host: list[int] = []
         self._gradients: list[Tensor] = []
         self.send()
 
-    def point(self, gradients: Sequence[Sequence[Tensor | None]]) -> None:
-        """Note where gradients are, without an upload.
+    def point(
+        self,
+        gradients: Sequence[Sequence[Tensor | None]],
+        pairs: Sequence[Int[Tensor, "1"]] = (),
+    ) -> None:
+        """Note where gradients and pair counts are, without an upload.
 
         Args:
             gradients: One to four lists with a gradient of every tensor, or None; they are summed.
+            pairs: (tile, splat) pairs of every rendering of the step, int32; their memory must
+                stay.
 
         Raises:
-            ValueError: As above.
+            ValueError: As above, or if there are more renderings than the kernel has memory for.
         """
+        if len(pairs) > RENDERINGS_MAX:
+            raise ValueError(f"{len(pairs)} renderings, at most {RENDERINGS_MAX} per step")
+        self.renderings, self._pairs_host = len(pairs), [count.data_ptr() for count in pairs]
         self._gradients = []
         for row, value, *given in zip(self._host, self._parameters, *gradients, strict=True):
             present = [gradient for gradient in given if gradient is not None]
@@ -98,6 +112,9 @@ class AdamTable:
     def send(self) -> None:
         """Upload the addresses; waits for the device."""
         self.rows.copy_(torch.tensor(self._host, dtype=torch.int64))
+        if self.renderings:
+            counts = torch.tensor(self._pairs_host, dtype=torch.int64)
+            self.pairs[: self.renderings].copy_(counts)
 
     def release(self) -> None:
         """Drop the references to gradients, whose memory belongs to a captured graph."""
@@ -122,8 +139,6 @@ class StepResults:
     results: Float[Tensor, "B L3"]
     """Unweighted results of the latest step: of every image and term the term, its mean squared
     difference, its mean opacity."""
-    pairs: Int[Tensor, "R"]
-    """(tile, splat) pairs of every rendering of the latest step."""
     counts: Int[Tensor, "4"]
     """Skipped steps, skipped steps in a row, most pairs of a rendering, steps with too many
     pairs."""
@@ -131,20 +146,16 @@ class StepResults:
     """Weighted terms over the images of valid steps, then those of ``TOTAL_NAMES``."""
 
     @classmethod
-    def empty(cls, images: int, terms: int, renderings: int, device: torch.device) -> StepResults:
-        """Before the first step, for at most so many images, terms and renderings.
+    def empty(cls, images: int, terms: int, device: torch.device) -> StepResults:
+        """Before the first step, for at most so many images and terms.
 
         Raises:
             ValueError: If the kernel has no memory for so many.
         """
-        if RESULTS * terms > COLUMNS_MAX or renderings > RENDERINGS_MAX:
-            limits = f"{COLUMNS_MAX // RESULTS} terms and {RENDERINGS_MAX} renderings"
-            raise ValueError(
-                f"{terms} terms and {renderings} renderings, at most {limits} per step"
-            )
+        if RESULTS * terms > COLUMNS_MAX:
+            raise ValueError(f"{terms} terms, at most {COLUMNS_MAX // RESULTS} per step")
         return cls(
             results=torch.zeros(images, RESULTS * terms, device=device),
-            pairs=torch.zeros(renderings, dtype=torch.int32, device=device),
             counts=torch.zeros(4, dtype=torch.int32, device=device),
             sums=torch.zeros(terms + TOTALS, device=device),
         )
@@ -158,7 +169,6 @@ def descend(
     compared: Float[Tensor, "1"],
     *,
     images: int,
-    renderings: int,
     motion_from: int,
     motion_gradient_max: float | None,
     capacity: int | None,
@@ -170,13 +180,12 @@ def descend(
     A step is valid if its loss and all squared gradients are finite and no pair was dropped.
 
     Args:
-        table: All tensors; its gradients are summed over images.
+        table: All tensors; its gradients are summed over images. With pairs of all renderings.
         rates: Learning rate of each tensor; one of rate 0 is left alone.
         step: Results of this step, and the sums that it adds to.
         weights: Of the results; 0 for those that were not computed.
         compared: Number of images with any term.
         images: Number of images B.
-        renderings: Number of renderings R.
         motion_from: First tensor of the motion.
         motion_gradient_max: Largest gradient norm of these tensors, longer ones are clipped; None:
             any.
@@ -194,7 +203,7 @@ def descend(
     )
     inputs = [table.partials, table.parts[motion_from], motion_from]
     inputs += [motion_gradient_max is not None, motion_gradient_max or 0.0]
-    inputs += [step.results, weights, images, compared, step.pairs, renderings]
+    inputs += [step.results, weights, images, compared, table.pairs, table.renderings]
     inputs += [capacity is not None, capacity or 0, table.rows, rates, *map(wp.float64, betas)]
     threads, outputs = (
         (step_end.THREADS if rates.is_cuda else 1),

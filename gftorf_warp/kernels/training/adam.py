@@ -21,19 +21,23 @@ SIZES = 3  # step size, 1 / sqrt of the bias correction, gradient scale: see ``A
 
 ADVANCE = f"""
     const long long* row = table.data + {COLUMNS} * tensor;
-    float* step = reinterpret_cast<float*>(row[{STEP}]);
     float* out = sizes.data + {SIZES} * tensor;
     out[0] = 0.0f;
-    if (!valid || rate == 0.0f || row[{GRADIENT}] == 0) return;
-    step[0] += 1.0f;
-    const double first = 1.0 - pow((double)beta1, (double)step[0]), second = 1.0
-        - pow((double)beta2, (double)step[0]);
-    out[0] = (float)((double)rate / first);
-    out[1] = (float)(1.0 / sqrt(second));
+    if (rate == 0.0f || row[{GRADIENT}] == 0) return;
+    const double step = reinterpret_cast<float*>(row[{STEP}])[0] + 1.0f;
+    out[0] = (float)((double)rate / (1.0 - pow((double)beta1, step)));
+    out[1] = (float)(1.0 / sqrt(1.0 - pow((double)beta2, step)));
+"""
+"""C++ of ``step_end.finish``: the step size of a tensor, 0 if it is left alone."""
+
+COUNT = f"""
+    float* out = sizes.data + {SIZES} * tensor;
+    if (!valid) out[0] = 0.0f;
+    if (out[0] == 0.0f) return;
+    reinterpret_cast<float*>(table.data[{COLUMNS} * tensor + {STEP}])[0] += 1.0f;
     out[2] = factor;
 """
-"""C++ of ``step_end.finish``: count a step of a tensor, unless it is left alone, and its step
-size."""
+"""C++ of ``step_end.finish``, after ``ADVANCE``: count the step of a tensor, if it is valid."""
 
 
 def _descend(K: int) -> str:

@@ -6,7 +6,7 @@ pair was dropped. An invalid step changes no parameter, moment, sum or statistic
 
 import warp as wp
 
-from .adam import ADVANCE, COLUMNS, GRADIENT, LENGTH, MORE
+from .adam import ADVANCE, COLUMNS, COUNT, GRADIENT, LENGTH, MORE
 from .ordered_sums import LANES, OVER_LANES
 
 # elements of a gradient whose squares one warp sums up: few, since it reads them serially
@@ -73,13 +73,21 @@ _FINISH = f"""
     for (int k = t; k < columns; k += threads) {{
         // a result of weight 0 was not computed: its memory holds that of an earlier step
         float s = 0.0f;
+        #pragma unroll 4
         for (int n = 0; n < images; ++n) {{
-            const float w = weights.data[columns * n + k];
-            if (w != 0.0f) s += w * results.data[columns * n + k];
+            const float w = weights.data[columns * n + k], r = results.data[columns * n + k];
+            s += w != 0.0f ? w * r : 0.0f;
         }}
         column[k] = s;
     }}
-    for (int n = t; n < renderings; n += threads) used[n] = pairs.data[n];
+    for (int n = t; n < renderings; n += threads)
+        used[n] = *reinterpret_cast<const int*>(pairs.data[n]);
+    // before the sums are known: otherwise the device waits for one load after the other
+    for (int tensor = t; tensor < table.shape[0]; tensor += threads) {{
+        const float rate = rates.data[tensor];
+        [&]() {{{ADVANCE}}}();
+    }}
+    const float images_compared = compared.data[0];
 #if defined(__CUDA_ARCH__)
     auto over_lanes = [](double v) -> double {{
         for (int o = {LANES // 2}; o > 0; o >>= 1) v += __shfl_down_sync(0xffffffffu, v, o);
@@ -101,7 +109,7 @@ _FINISH = f"""
             squared += column[{RESULTS} * k + 1];
             opacity += column[{RESULTS} * k + 2];
         }}
-        totals[0] = squared; totals[1] = opacity; totals[2] = loss; totals[3] = compared.data[0];
+        totals[0] = squared; totals[1] = opacity; totals[2] = loss; totals[3] = images_compared;
         int most = 0;
         for (int n = 0; n < renderings; ++n) most = used[n] > most ? used[n] : most;
         const float norm = (float)(sqrt(of_field + of_motion) / images), length =
@@ -122,8 +130,8 @@ _FINISH = f"""
     for (int k = t; k < terms + {TOTALS}; k += threads)
         if (valid) sums.data[k] += k < terms ? column[{RESULTS} * k] : totals[k - terms];
     for (int tensor = t; tensor < table.shape[0]; tensor += threads) {{
-        const float rate = rates.data[tensor], factor = control[tensor < motion_from ? 0 : 1];
-        [&]() {{{ADVANCE}}}();
+        const float factor = control[tensor < motion_from ? 0 : 1];
+        [&]() {{{COUNT}}}();
     }}
 #undef SHARED
 #undef SYNCHRONISE
@@ -148,7 +156,7 @@ def finish(
     weights: wp.array2d[float],
     images: int,
     compared: wp.array[float],
-    pairs: wp.array[int],
+    pairs: wp.array[wp.int64],
     renderings: int,
     limited: bool,
     capacity: int,
@@ -224,7 +232,7 @@ def finish_step(
     weights: wp.array2d[float],  # [B or more, 3 L] weights of these; 0: not computed [1]
     images: int,  # B of this step [1]
     compared: wp.array[float],  # [1] images with any term
-    pairs: wp.array[int],  # [R or more] (tile, splat) pairs of every rendering
+    pairs: wp.array[wp.int64],  # [R or more] addresses of the (tile, splat) pairs of renderings
     renderings: int,  # R of this step [1]
     limited: bool,  # whether pairs beyond ``capacity`` were dropped [1]
     capacity: int,  # pairs of one rendering with memory [1]
