@@ -282,13 +282,15 @@ COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
 
 
 def table(metrics: dict) -> str:
-    """The errors of metrics.json as a table, MSE x100 [m^2]: closed form and ours."""
-    lines = [f"{'MSE x100 [m^2]':<16}{'closed form':>12}{'d':>10}{'d / opacity':>13}{'d_ToF':>10}"]
-    keys = ("closed_form_mse_x100", "d_mse_x100", "d_normalised_mse_x100", "d_tof_mse_x100")
+    """The errors of metrics.json as a table, MSE x100 [m^2]: closed form, temporal and ours."""
+    titles = {"closed_form": "closed form", "temporal": "temporal", "d": "d"}
+    titles |= {"d_normalised": "d / opacity", "d_tof": "d_ToF"}
+    lines = [f"{'MSE x100 [m^2]':<16}" + "".join(f"{title:>13}" for title in titles.values())]
     for name in ("all", "moving", "static"):
-        row = metrics if name == "all" else metrics[name]
-        cells = ["-" if row is None or row[key] is None else f"{row[key]:.4g}" for key in keys]
-        lines.append(f"{name:<16}{cells[0]:>12}{cells[1]:>10}{cells[2]:>13}{cells[3]:>10}")
+        row = (metrics if name == "all" else metrics[name]) or {}
+        values = [row.get(f"{key}_mse_x100") for key in titles]
+        cells = ["-" if value is None else f"{value:.4g}" for value in values]
+        lines.append(f"{name:<16}" + "".join(f"{cell:>13}" for cell in cells))
     psnr = metrics["quad_psnr_db"]
     quality = "-" if psnr is None else f"{psnr:.2f} dB"
     scored = f"{metrics['frames']} raw frames ({metrics['protocol']})"

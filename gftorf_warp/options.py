@@ -169,9 +169,8 @@ def command_parsers() -> dict[str, Parser]:
     reconstruct.add_argument("sequence", metavar="SEQ", help="folder of the sequence")
     out = "folder to write; an interrupted run is resumed"
     reconstruct.option("--out", "RUN", str, out, required=True)
-    presets = (
-        "settings: demo, paper, released, fast, dgs, dgs_depth or ctof, the closed form (demo)"
-    )
+    presets = "settings: demo, paper, released, fast, dgs, dgs_depth, or without Gaussians ctof, "
+    presets += "the closed form, and temporal, the same averaged over time (demo)"
     reconstruct.option("--preset", "NAME", str, presets, "demo")
     inputs = "fitted data: quads, phasor, or auto: as recorded (auto)"
     reconstruct.option("--input", "KIND", str, inputs, "auto")

@@ -172,13 +172,16 @@ def test_errors_are_printed_times_100_or_as_unknown():
     """One row of the table, and the same row where no pixel counts."""
     errors = {
         name: np.full((1, 1, 2), value)
-        for name, value in zip(metrics.DISTANCES, (4, 3, 2, 1), strict=True)
+        for name, value in {"closed_form": 4, "temporal": 3, "d": 2, "d_tof": 1}.items()
     }
     row = metrics.distance_errors(errors, np.ones((1, 1, 2), dtype=bool))
     assert row == {
         "closed_form_mse_x100": 400.0,
-        "d_mse_x100": 300.0,
-        "d_normalised_mse_x100": 200.0,
+        "temporal_mean_mse_x100": None,
+        "temporal_median_mse_x100": None,
+        "temporal_mse_x100": 300.0,
+        "d_mse_x100": 200.0,
+        "d_normalised_mse_x100": None,
         "d_tof_mse_x100": 100.0,
     }
     assert set(metrics.distance_errors(errors, np.zeros((1, 1, 2), dtype=bool)).values()) == {None}

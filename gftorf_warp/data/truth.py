@@ -48,6 +48,17 @@ def moving_and_static(
     return np.stack([moving[i] for i in rows]), np.stack([static[i] for i in rows])
 
 
+def static_throughout(distance_truth: Float[np.ndarray, "F H W"]) -> Bool[np.ndarray, "H W"]:
+    """Pixels whose true distance [m] never changes by more than 0.05 m in the whole sequence.
+
+    Raw frames of unknown truth (NaN) do not count.
+    """
+    unknown = np.isnan(distance_truth)
+    low = np.where(unknown, np.inf, distance_truth).min(axis=0)
+    high = np.where(unknown, -np.inf, distance_truth).max(axis=0)
+    return high - low <= MOVING_M
+
+
 def nearest(
     images: Float[np.ndarray, "F H W"], height: int, width: int
 ) -> Float[np.ndarray, "F h w"]:

@@ -18,10 +18,10 @@ from ..data.decode import unambiguous_range
 from ..data.files import atomic_write, write_json
 from ..data.read import read, read_truth
 from ..data.sequence import Sequence, Truth
-from ..data.truth import known_distance, moving_and_static
+from ..data.truth import known_distance, moving_and_static, static_throughout
 from ..data.unwrap import CONFIDENT
 from ..errors import InputError, UsageError
-from . import gallery, views
+from . import classes, gallery, views
 from . import metrics as measure
 from .panels import Findings, Judgement
 from .provenance import fact, method_of
@@ -29,6 +29,8 @@ from .provenance import fact, method_of
 if TYPE_CHECKING:
     from ..recon.run import Run
 
+GROUPS = ("moving", "static", "static_throughout")
+"""Pixels that are scored apart from all others."""
 AGAINST = ("geometry", "static-phasor")
 """Choices of the true distance; the first is the default."""
 FACTS = (
@@ -134,11 +136,13 @@ def findings(
     moving, static = moving_and_static(
         distance, gathered.frames, from_phasors=sequence.from_phasors, cycle=sequence.cycle
     )
+    throughout = static & static_throughout(distance)
     if against != AGAINST[0]:
         distance = _static_phasor(sequence, truth)
     scored, images = distance[gathered.frames], gathered.distances.items()
     errors = {name: measure.squared_error(image, scored) for name, image in images}
-    judgement = Judgement(truth=scored, errors=errors, moving=moving, static=static)
+    groups = {"moving": moving, "static": static, "throughout": throughout}
+    judgement = Judgement(truth=scored, errors=errors, **groups)
     return Findings(sequence=sequence, views=gathered, judgement=judgement)
 
 
@@ -184,13 +188,22 @@ def _errors(judgement: Judgement | None) -> dict[str, object]:
     if judgement is None:
         unknown: dict[str, None] = {f"{name}_mse_x100": None for name in measure.DISTANCES}
         group = {**unknown, "share": None}
-        return {**unknown, "moving": group, "static": group}
+        return {**unknown, **dict.fromkeys(GROUPS, group), "classes": None}
     moving, static, errors = judgement.moving, judgement.static, judgement.errors
-    on_moving, on_static = (measure.distance_errors(errors, mask) for mask in (moving, static))
     return {
         **measure.distance_errors(errors, np.ones_like(moving), measure.mean_over_frames),
-        "moving": {**on_moving, "share": measure.share(moving, static)},
-        "static": {**on_static, "share": measure.share(static, moving)},
+        **{
+            name: {
+                **measure.distance_errors(errors, mask),
+                "share": measure.share(mask, (moving | static) & ~mask),
+            }
+            for name, mask in zip(GROUPS, (moving, static, judgement.throughout), strict=True)
+        },
+        "classes": {
+            "step_m": classes.STEP_M,
+            "edge_px": classes.EDGE_PX,
+            **classes.class_errors(errors, judgement.truth, moving, static),
+        },
     }
 
 

@@ -21,7 +21,8 @@ from ..scene.unwrap import distance_from_phasors
 PROTOCOLS = ("all", "ftorf13")
 ERROR_UNIT = 100.0  # errors are printed times 100, as in the published tables
 CRITERION = "d_minus_dtof_static_m"  # key of diagnostics that indicates a good state without truth
-DISTANCES = ("closed_form", "d", "d_normalised", "d_tof")
+TEMPORAL = ("temporal_mean", "temporal_median", "temporal")  # need a resting camera
+DISTANCES = ("closed_form", *TEMPORAL, "d", "d_normalised", "d_tof")
 
 
 def scored_frames(sequence: Sequence, protocol: str = "all") -> list[int]:
@@ -94,8 +95,10 @@ def distance_errors(
     mask: Bool[np.ndarray, "S H W"],
     reduce: Callable[[np.ndarray, np.ndarray], float | None] = pooled,
 ) -> dict[str, float | None]:
-    """``<name>_mse_x100`` [m^2 x 100] of every kind of distance; None where there is no pixel."""
-    values = {name: reduce(errors[name], mask) for name in DISTANCES}
+    """``<name>_mse_x100`` [m^2 x 100] of every kind of distance; None where there is no pixel, or
+    no such distance.
+    """
+    values = {name: reduce(errors[name], mask) if name in errors else None for name in DISTANCES}
     return {f"{name}_mse_x100": v and ERROR_UNIT * v for name, v in values.items()}
 
 

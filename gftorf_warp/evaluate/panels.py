@@ -47,6 +47,8 @@ class Judgement:
     """Pixels that move within their quartet."""
     static: Bool[np.ndarray, "S H W"]
     """Pixels that do not."""
+    throughout: Bool[np.ndarray, "S H W"]
+    """Of those, pixels whose distance does not change in the whole sequence."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -19,6 +19,8 @@ METHOD_WORDS = {
     "gaussians": "moving Gaussians, fitted to the measurement by gradient descent",
     "ctof": "the closed form of every quartet, shown as if it were a reconstruction; nothing was "
     "fitted",
+    "temporal": "the closed form of the mean over time where a quartet agrees with its pixel's "
+    "median, and of the quartet elsewhere; nothing was fitted",
 }
 INPUT_WORDS = {
     "quads": "quads: every raw frame at its own time and phase shift",
@@ -46,7 +48,7 @@ WORDS = {
 
 
 def method_of(config: Mapping[str, Any]) -> str:
-    """Method of a run: ``gaussians`` or ``ctof``."""
+    """Method of a run: ``gaussians``, ``ctof`` or ``temporal``."""
     return str(config.get("settings", {}).get("method", "gaussians"))
 
 

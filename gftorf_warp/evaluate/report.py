@@ -11,14 +11,22 @@ import numpy as np
 from ..data.decode import unambiguous_range
 from ..data.truth import MOVING_M
 from . import figures, gallery, page, panels, provenance
+from .classes import EDGE_PX, STEP_M
 from .metrics import DISTANCES, ERROR_UNIT, per_frame_mean
 from .panels import Findings
 
 ROWS = {
     "closed_form": ("closed form", "decoded from the raw quads of a quartet"),
+    "temporal_mean": ("temporal mean", "decoded from the mean of all quartets"),
+    "temporal_median": ("temporal median", "decoded from their median, raw frame by raw frame"),
+    "temporal": ("temporal", "mean of the quartets that agree with the median, else closed form"),
     "d": ("ours, d", "rendered mean distance, not divided by opacity"),
     "d_normalised": ("ours, d / opacity", "the same, divided"),
     "d_tof": ("ours, d_ToF", "decoded from quads rendered at one instant"),
+}
+WITHOUT_GAUSSIANS = {
+    "ctof": "the closed form itself",
+    "temporal": "the closed form, averaged over time where nothing moves",
 }
 FACTS = (
     ("quad PSNR", "quad_psnr_db", "decibel"),
@@ -35,6 +43,15 @@ FACTS = (
 OPTIONAL = {"colour_psnr_db", "against"}  # left out where unknown
 COUNTED = {3: "three", 4: "four", 5: "five", 6: "six", 8: "eight"}
 PIXELS = {"": "all pixels", "moving.": "moving pixels", "static.": "static pixels"}
+COLUMNS = {**PIXELS, "static_throughout.": "static throughout"}
+OF_CLASS = {
+    "interior": "interior",
+    "edge": "edge",
+    "slope_0_10": "interior, 0 to 10 mm/px",
+    "slope_10_20": "10 to 20 mm/px",
+    "slope_20_40": "20 to 40 mm/px",
+    "slope_over_40": "over 40 mm/px",
+}
 TO_READ = f"""
 <dl>
 <dt>distance</dt><dd>Length from the camera to the surface along the ray of a pixel, in metres. It
@@ -42,12 +59,20 @@ is not the z-depth.</dd>
 <dt>closed form</dt><dd>The distance that a camera computes: raw quads give a phase, the phase a
 distance; several modulation frequencies together determine the number of whole turns. Quads are
 taken one after the other, so moving objects get false distances.</dd>
+<dt>temporal</dt><dd>What averaging over time makes of the closed form: the least that a
+reconstruction must beat. Mean and median of all quartets mean something where nothing moves
+(<em>static throughout</em>: the true distance never changes by more than {MOVING_M} m); the row
+<em>temporal</em> takes the mean of the quartets that agree with their pixel's median, and the
+closed form in all others. They need a resting camera.</dd>
 <dt>d</dt><dd>Mean distance of the reconstructed Gaussians at the time of one raw frame. It is not
 divided by opacity: where opacity is below one, the missing part counts as error.</dd>
 <dt>d_ToF</dt><dd>Quads rendered at the time of one raw frame, decoded like the closed form, within
 the unambiguous range: c / 2f, or that of all frequencies together.</dd>
 <dt>moving pixels</dt><dd>Pixels whose true distance changes by more than {MOVING_M} m within their
 quartet: mostly outlines of moving objects, and whole objects that move fast in depth.</dd>
+<dt>edge, interior</dt><dd>Pixels within {EDGE_PX} px of a step of the true distance, and all
+others. At a step, neighbouring pixels differ by more than {STEP_M} m from each other and from the
+continuation of the surface. Interior pixels are divided by the slope of the true distance.</dd>
 <dt>errors</dt><dd>Mean squared error in square metres times 100, then its root in centimetres.
 <em>All pixels</em> is the mean over frames of each frame's mean; <em>moving</em> and
 <em>static</em> pool the pixels of all frames. The closed form of a quartet is compared with the
@@ -90,6 +115,7 @@ def report(
         f'<div class="soft">gftorf compare, version {page.number(metrics, "version", "text")}</div>'
         f'<p class="verdict">{verdict(metrics)}</p>',
         _section("Errors", _table(metrics), _facts(metrics)),
+        *_by_class(metrics),
         _section("Distance", _distance_text(found, s), _distance_pictures(found, s)),
         _section("What was measured", _measured_text(found, s), panels.measured_quartet(found, s)),
         _section("Quads", _quad_text(found, s), panels.quad_residual(found, s)),
@@ -111,10 +137,10 @@ def verdict(metrics: Mapping[str, Any]) -> str:
         unknown = "There is no ground truth, so distance errors are unknown."
         return f"{unknown} The PSNR of rendered quads is {psnr}."
     group = "moving." if page.look_up(metrics, "moving.d_mse_x100") is not None else ""
-    if metrics.get("method") == "ctof":
-        where = "on moving pixels" if group else "over all pixels"
+    if metrics.get("method") in WITHOUT_GAUSSIANS:
+        where, which = "on moving pixels" if group else "over all pixels", metrics["method"]
         return (
-            f"This run is the closed form itself: nothing was optimised. Its error is "
+            f"This run is {WITHOUT_GAUSSIANS[which]}: nothing was optimised. Its error is "
             f"{number(f'{group}d_mse_x100', 'rms_cm')} {where} (root mean square)."
         )
     naive, ours = f"{group}closed_form_mse_x100", f"{group}d_mse_x100"
@@ -156,12 +182,14 @@ def _table(metrics: Mapping[str, Any]) -> str:
     if page.look_up(metrics, "d_mse_x100") is None:
         return '<p class="soft">No ground truth: distance errors are not known.</p>'
     head, rows = "", []
-    for group, name in PIXELS.items():
+    for group, name in COLUMNS.items():
         share = f"{page.number(metrics, f'{group}share', 'percent')} of all" if group else "&nbsp;"
         head += f"<th>{name}<span class='soft'>{share}</span></th>"
     for name in DISTANCES:
         title, note = ROWS[name]
-        cells = "".join(f"<td>{_cell(metrics, f'{group}{name}_mse_x100')}</td>" for group in PIXELS)
+        cells = "".join(
+            f"<td>{_cell(metrics, f'{group}{name}_mse_x100')}</td>" for group in COLUMNS
+        )
         mark = ' class="ours"' if name == "d" else ""
         text = f'<td><b>{title}</b> <span class="soft">{note}</span></td>'
         rows.append(f"<tr{mark}>{text}{cells}</tr>")
@@ -169,6 +197,30 @@ def _table(metrics: Mapping[str, Any]) -> str:
         '<p class="soft">Mean squared error of the distance, m² &times; 100, and its root.</p>'
         f"<table><thead><tr><th></th>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
     )
+
+
+def _by_class(metrics: Mapping[str, Any]) -> list[str]:
+    """Errors of moving and of static pixels by what the truth looks like around them."""
+    if page.look_up(metrics, "classes") is None:
+        return []
+    html = ""
+    for group in ("moving", "static"):
+        key, head, rows = f"classes.{group}", "", []
+        for kind, name in OF_CLASS.items():
+            share = page.number(metrics, f"{key}.{kind}.share", "percent")
+            head += f"<th>{name}<span class='soft'>{share}</span></th>"
+        for name in DISTANCES:
+            keys = [f"{key}.{kind}.{name}_mse_x100" for kind in OF_CLASS]
+            if all(page.look_up(metrics, one) is None for one in keys):
+                continue
+            mark = ' class="ours"' if name == "d" else ""
+            cells = "".join(f"<td>{page.number(metrics, one, 'error')}</td>" for one in keys)
+            rows.append(f"<tr{mark}><td><b>{ROWS[name][0]}</b></td>{cells}</tr>")
+        table = f"<thead><tr><th></th>{head}</tr></thead><tbody>{''.join(rows)}</tbody>"
+        html += f"<h3>{PIXELS[f'{group}.'].capitalize()}</h3>"
+        html += f"<table>{table}</table>" if rows else '<p class="soft">There are none.</p>'
+    text = "The errors above in m² &times; 100, by what the true distance looks like around a pixel"
+    return [_section("Edges and slopes", f'<p class="soft">{text}.</p>', html)]
 
 
 def _cell(metrics: Mapping[str, Any], key: str) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +12,8 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from ..data.decode import Decoded, decode_quartet
+from ..data import temporal
+from ..data.decode import Decoded, closed_form_distance, decode_quartet
 from ..data.sequence import Sequence
 from ..errors import DivergedError, UsageError
 from ..render.api import Rendering
@@ -20,7 +21,7 @@ from ..render.series import KEPT, View, on_host
 from ..scene.camera import Camera
 from ..scene.sensor import Sensor, channel_of
 from . import previews, renders, stored, writers
-from .metrics import DISTANCES, distance_from_quads, normalised
+from .metrics import DISTANCES, TEMPORAL, distance_from_quads, normalised
 from .poses import middle
 from .poses import read as read_poses
 
@@ -56,6 +57,10 @@ class Views:
     """Agreement of the frequencies on the closed form [1], see data/unwrap.py; None: there is
     one."""
 
+    over_time: Mapping[str, Float[np.ndarray, "S H W"]] = field(default_factory=dict)
+    """Distances by averaging the measured quartets [m], by the names of ``TEMPORAL``; empty if the
+    camera moves."""
+
     @property
     def d_normalised(self) -> Float[np.ndarray, "S H W"]:
         """Mean distance divided by opacity [m]."""
@@ -63,8 +68,9 @@ class Views:
 
     @property
     def distances(self) -> dict[str, Float[np.ndarray, "S H W"]]:
-        """All distances [m], by their names in metrics.json."""
-        return {name: getattr(self, name) for name in DISTANCES}
+        """All distances that there are [m], by their names in metrics.json."""
+        known = {name: getattr(self, name) for name in DISTANCES if name not in TEMPORAL}
+        return {**known, **self.over_time}
 
 
 def gather(
@@ -104,10 +110,22 @@ def gather(
     return Views(
         frames=frames,
         closed_form=np.stack([one.distance for one in quartets]).astype(np.float32),
+        over_time=_over_time(sequence, frames),
         quad_measured=sequence.quads[frames],
         **_agreement(quartets),
         **{name: np.stack(images) for name, images in rows.items()},
     )
+
+
+def _over_time(sequence: Sequence, frames: list[int]) -> dict[str, Float[np.ndarray, "S H W"]]:
+    """The field ``over_time`` of raw frames of complete quartets."""
+    if not temporal.camera_rests(sequence):
+        return {}
+    averaged, rows = temporal.averaged(sequence), [n // sequence.cycle for n in frames]
+    by_quartet = {i: closed_form_distance(averaged, i).astype(np.float32) for i in {*rows}}
+    images = [temporal.over_time(sequence, reduce) for reduce in (np.mean, np.median)]
+    images = [np.broadcast_to(image, (len(rows), *image.shape)) for image in images]
+    return dict(zip(TEMPORAL, [*images, np.stack([by_quartet[i] for i in rows])], strict=True))
 
 
 def _agreement(quartets: list[Decoded]) -> dict[str, Any]:

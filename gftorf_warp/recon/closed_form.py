@@ -18,6 +18,7 @@ from torch import Tensor
 
 from ..data.decode import decode_quartet, quartet_phasors
 from ..data.sequence import Sequence
+from ..data.temporal import camera_rests
 from ..errors import InputError, UsageError
 from ..render.api import Rendering
 from ..scene.camera import Camera
@@ -79,6 +80,21 @@ def check_camera(sequence: Sequence, time: float, camera: Camera, own: Camera, w
             why="asked for another "
             + (", ".join(differ) or f"pose, {apart:.3g} away from that of the quartet"),
             fix="render other views from a run of Gaussians, for example --preset demo",
+        )
+
+
+def check_rests(sequence: Sequence) -> None:
+    """Refuse to average over time what a moving camera recorded.
+
+    Raises:
+        InputError: If the poses of the raw frames differ.
+    """
+    if not camera_rests(sequence):
+        raise InputError(
+            "the camera moves",
+            where=sequence.path or "sequence",
+            why="the preset temporal averages pixels over time, which needs one pose throughout",
+            fix="use --preset ctof, the closed form of every quartet",
         )
 
 

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from ..data.estimates import steady_pixels
 from ..data.sequence import Sequence, Truth
+from ..data.temporal import camera_rests
 from ..data.truth import known_distance, moving_and_static, nearest
 from ..render.api import rasterize
 from ..render.bridge import pairs_of
@@ -34,7 +35,6 @@ from .state import State
 
 ROWS = 40  # along a run, besides its first image
 FRAMES = 4  # rendered per row: about a hundredth of the time of a run of some thousand images
-STILL_M = 1e-6  # [m], [1] poses that differ less are one pose
 # (tile, splat) pairs that a GPU may list uncounted: 16 MB; the published runs have a tenth
 PAIRS = 1 << 22
 Row = dict[str, float | int | None]
@@ -214,10 +214,7 @@ def measured_static(sequence: Sequence) -> Bool[np.ndarray, "H W"] | None:
 
     None where the camera moves, so that no pixel rests, or where no quartet is complete.
     """
-    if (
-        not sequence.complete_quartets
-        or float(np.ptp(sequence.camera_from_world, axis=0).max()) > STILL_M
-    ):
+    if not (sequence.complete_quartets and camera_rests(sequence)):
         return None
     return steady_pixels(sequence)
 

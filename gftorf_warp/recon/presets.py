@@ -237,11 +237,19 @@ def ctof(recorded: Recorded = Recorded()) -> ReconSettings:
     return replace(base, schedule=replace(base.schedule, images=1))
 
 
+def temporal(recorded: Recorded = Recorded()) -> ReconSettings:
+    """The closed form of what stands still, averaged over the recording, and of single quartets
+    elsewhere: the least that a reconstruction must beat. Needs a resting camera.
+    """
+    return replace(ctof(recorded), preset="temporal", method=Method.TEMPORAL)
+
+
 DEPTH_WEIGHT = 0.1  # [1/m] unpublished
 # [1/m^2] unpublished; of 1e-4, 1e-3 and 1e-2 the largest that did no harm at small size
 DISTORTION_WEIGHT = 1e-3
 PRESETS: dict[str, Callable[[Recorded], ReconSettings]] = {
-    function.__name__: function for function in (demo, paper, released, fast, dgs, dgs_depth, ctof)
+    function.__name__: function
+    for function in (demo, paper, released, fast, dgs, dgs_depth, ctof, temporal)
 }
 """All presets by name."""
 

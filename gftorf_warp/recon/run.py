@@ -19,6 +19,7 @@ from torch import Tensor
 from ..constants import CANONICAL_SHIFTS, LOW_PASS
 from ..data.read import read
 from ..data.sequence import Sequence
+from ..data.temporal import averaged
 from ..errors import InputError
 from ..render.api import Rendering, rasterize
 from ..render.buffers import ClampGradient, Distortion, RenderSettings, Stop, Support
@@ -59,8 +60,8 @@ class Run:
 
     @classmethod
     def open(cls, path: str | Path, device: torch.device | str = "cpu") -> Run:
-        """Read a run from its folder: config and newest checkpoint. A run of the method ``ctof``
-        needs no checkpoint.
+        """Read a run from its folder: config and newest checkpoint. A run of the methods ``ctof``
+        and ``temporal`` needs no checkpoint.
 
         Raises:
             InputError: If the folder is no run, or holds no checkpoint that can be read.
@@ -71,8 +72,9 @@ class Run:
         stored = config["sensor"]
         further = tuple(stored.get("further_hz", ()))
         sensor = Sensor(**stored | {"further_hz": further}, shifts=CANONICAL_SHIFTS)
-        if config["settings"].get("method") == Method.CTOF:
-            return ClosedForm.of(path, config, camera, sensor, device)
+        kinds = {Method.CTOF: ClosedForm, Method.TEMPORAL: Temporal}
+        if (kind := kinds.get(config["settings"].get("method"))) is not None:
+            return kind.of(path, config, camera, sensor, device)
         stored = checkpoint.last(path, device)
         if stored is None:
             raise InputError(
@@ -313,6 +315,16 @@ class ClosedForm(Run):
     @functools.cached_property
     def _measured(self) -> Sequence:
         return closed_form.checked(self.sequence())
+
+
+class Temporal(ClosedForm):
+    """A run without Gaussians, which renders the temporal mean of its measurements where a quartet
+    agrees with its pixel's median, and the quartet elsewhere.
+    """
+
+    @functools.cached_property
+    def _measured(self) -> Sequence:
+        return averaged(closed_form.checked(self.sequence()))
 
 
 def _camera(stored: dict) -> Camera:

@@ -25,6 +25,9 @@ class Method(enum.StrEnum):
     """Moving Gaussians, fitted by gradient descent."""
     CTOF = "ctof"
     """The closed form on every quartet: nothing is fitted (method, section 7)."""
+    TEMPORAL = "temporal"
+    """The closed form of the temporal mean where a quartet agrees with its pixel's median, and of
+    the quartet elsewhere."""
 
 
 class Input(enum.StrEnum):

@@ -18,7 +18,7 @@ from ..data.read import read, read_truth
 from ..data.sequence import Sequence, Truth
 from ..errors import InputError, UsageError
 from ..scene.changes import Wording, changed
-from . import checkpoint, folder, presets
+from . import checkpoint, closed_form, folder, presets
 from .config import config_of
 from .diagnostics import Diagnostics
 from .loop import Progress, TrainingLoop
@@ -143,9 +143,11 @@ def _run(sequence, out, settings, config, seed, device, goes_on, begun, progress
         "size_optimised": [sequence.width, sequence.height],
         "input": str(input_of(sequence, settings.input)),
     }
-    if settings.method == Method.CTOF:
+    if settings.method != Method.GAUSSIANS:
+        if settings.method == Method.TEMPORAL:
+            closed_form.check_rests(sequence)
         folder.write_config(out, config | {"seconds_reconstruct": 0.0, "images_optimised": 0})
-        LOG.info("%s is finished: the closed form needs no image", out)
+        LOG.info("%s is finished: a closed form needs no image", out)
         return
     stored = checkpoint.last(out, device) if goes_on else None
     total = settings.schedule.images

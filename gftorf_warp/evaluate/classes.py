@@ -1,0 +1,100 @@
+"""Errors by what the truth looks like around a pixel: edges, and slopes of surfaces.
+
+A step of the truth lies between two neighbouring pixels whose distances differ by more than
+``STEP_M`` from each other and from the continuation of the surface on either side; a slope, however
+steep, is no step. Pixels within ``EDGE_PX`` of a step are *edge*, all others *interior*, which the
+slope of the truth divides further.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from .metrics import ERROR_UNIT
+
+STEP_M = 0.1  # [m] twice the change that counts as motion
+EDGE_PX = 1.5  # [px] from a step: two pixels on either side of it
+SLOPES = (0.01, 0.02, 0.04)  # [m/px] bounds of the classes of slope
+EDGE = "edge"
+OF_SLOPE = ("slope_0_10", "slope_10_20", "slope_20_40", "slope_over_40")  # [mm/px]
+CLASSES = ("interior", EDGE, *OF_SLOPE)
+"""Names of all classes; the slopes divide the interior."""
+
+
+def class_of_pixels(truth: Float[np.ndarray, "S H W"]) -> UInt8[np.ndarray, "S H W"]:
+    """0: edge; 1 to 4: the classes of slope, of true distances [m] with NaN where unknown."""
+    edge = near_steps(truth)
+    slope = np.zeros(truth.shape, dtype=np.float32)
+    for axis in (1, 2):
+        if truth.shape[axis] > 1:
+            slope += np.square(np.nan_to_num(np.gradient(truth, axis=axis), nan=0.0))
+    steepness = np.searchsorted(np.square(SLOPES), slope.ravel(), side="right").reshape(slope.shape)
+    return np.where(edge, 0, 1 + steepness).astype(np.uint8)
+
+
+def near_steps(truth: Float[np.ndarray, "S H W"]) -> Bool[np.ndarray, "S H W"]:
+    """Pixels within ``EDGE_PX`` of the middle between two pixels with a step between them."""
+    beside = np.zeros(truth.shape, dtype=bool)
+    for axis in (1, 2):
+        along, marked = (np.moveaxis(array, axis, -1) for array in (truth, beside))
+        step = _steps(along)
+        marked[..., :-1] |= step
+        marked[..., 1:] |= step
+    near = beside.copy()
+    near[:, 1:] |= beside[:, :-1]
+    near[:, :-1] |= beside[:, 1:]
+    near[..., 1:] |= beside[..., :-1]
+    near[..., :-1] |= beside[..., 1:]
+    return near
+
+
+def _steps(distance: Float[np.ndarray, "*n w"]) -> Bool[np.ndarray, "*n w-1"]:
+    """Whether there is a step between each pixel of a row and the next."""
+    change = np.diff(distance, axis=-1)
+    with np.errstate(invalid="ignore"):  # comparisons with unknown truth are false
+        bend = np.abs(np.diff(change, axis=-1)) <= STEP_M
+        step = np.abs(change) > STEP_M
+    step[..., :-1] &= ~bend
+    step[..., 1:] &= ~bend
+    return step
+
+
+def class_errors(
+    errors: Mapping[str, Float[np.ndarray, "S H W"]],
+    truth: Float[np.ndarray, "S H W"],
+    moving: Bool[np.ndarray, "S H W"],
+    static: Bool[np.ndarray, "S H W"],
+) -> dict[str, dict[str, dict[str, float | None]]]:
+    """``<name>_mse_x100`` [m^2 x 100] of every distance and ``share`` of all moving and static
+    pixels, by ``moving`` or ``static`` and by class; None where there is no pixel.
+    """
+    kinds = 1 + len(OF_SLOPE)
+    label = class_of_pixels(truth) + kinds * static.astype(np.uint8)
+    label[~(moving | static) | np.isnan(truth)] = 2 * kinds
+    flat = label.ravel()
+    pixels = np.bincount(flat, minlength=2 * kinds + 1)[: 2 * kinds].reshape(2, kinds)
+    sums = {
+        name: np.bincount(flat, np.nan_to_num(error).ravel(), 2 * kinds + 1)[: 2 * kinds]
+        for name, error in errors.items()
+    }
+    rows = {"interior": slice(1, kinds), EDGE: slice(0, 1)}
+    rows |= {name: slice(k, k + 1) for k, name in enumerate(OF_SLOPE, start=1)}
+    result: dict[str, dict[str, dict[str, float | None]]] = {}
+    for group, name in enumerate(("moving", "static")):
+        result[name] = {}
+        for kind, chosen in rows.items():
+            count = int(pixels[group, chosen].sum())
+            values: dict[str, float | None] = {
+                f"{key}_mse_x100": ERROR_UNIT
+                * float(total.reshape(2, kinds)[group, chosen].sum())
+                / count
+                if count
+                else None
+                for key, total in sums.items()
+            }
+            share = count / pixels.sum() if pixels.sum() else None
+            result[name][kind] = {**values, "share": share}
+    return result
