@@ -475,7 +475,8 @@ def test_compare_prints_a_table_or_json(run, sequence, capsys):
     assert cli.main(["compare", str(run), "--truth", str(sequence), "--device", "cpu"]) == 0
     out, _ = lines_of(capsys)
     row = next(line for line in out if line.startswith("moving")).split()
-    for cell, key in zip(row[1:3], ("closed_form_mse_x100", "d_mse_x100"), strict=True):
+    keys = ("closed_form_mse_x100", "temporal_mse_x100", "d_mse_x100")
+    for cell, key in zip(row[1:4], keys, strict=True):
         assert float(cell) == pytest.approx(metrics["moving"][key], rel=1e-3)
 
 
@@ -493,7 +494,7 @@ def test_table_without_truth():
         "static": nothing,
     }
     lines = cli.table(metrics).splitlines()
-    assert [line.split()[1:] for line in lines[1:4]] == [["-"] * 4] * 3
+    assert [line.split()[1:] for line in lines[1:4]] == [["-"] * 5] * 3
     assert "20.00 dB" in lines[-1]
 
 
