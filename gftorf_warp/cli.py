@@ -295,6 +295,10 @@ def table(metrics: dict) -> str:
     quality = "-" if psnr is None else f"{psnr:.2f} dB"
     scored = f"{metrics['frames']} raw frames ({metrics['protocol']})"
     lines.append(f"{scored}, against {metrics.get('against', 'geometry')}, quad PSNR {quality}")
+    if (found := metrics.get("explained")) is not None:
+        from .recon.residuals import sentence
+
+        lines.append(sentence(found))
     share = metrics.get("ambiguous_share")
     if share is not None:
         reach = f"{metrics['unambiguous_range_m']:.4g} m by several frequencies together"

@@ -183,7 +183,7 @@ class AnalyticRun:
         """The sequence this run pretends to be made from."""
         return Sequence.open(self.config["sequence"])
 
-    def renderer(self, images=()):  # noqa: ARG002
+    def renderer(self, images=(), *, f_mod_hz=None):  # noqa: ARG002
         """What ``gftorf render`` asks for every image."""
         return self.render
 

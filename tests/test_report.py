@@ -32,6 +32,7 @@ PRINTED = {  # how the page prints a value of metrics.json, written a second tim
     "rms_cm": lambda value: f"{math.sqrt(value / 100) * 100:.1f} cm",
     "length_cm": lambda value: f"{value * 100:.2f} cm",
     "percent": lambda value: f"{value * 100:.1f} %",
+    "ratio": lambda value: f"{value:.3g}",
     "decibel": lambda value: f"{value:.2f} dB",
     "count": lambda value: f"{value:,d}",
     "seconds": lambda value: f"{value:.1f} s",

@@ -21,6 +21,7 @@ from ..data.sequence import Sequence, Truth
 from ..data.truth import known_distance, moving_and_static, static_throughout
 from ..data.unwrap import CONFIDENT
 from ..errors import InputError, UsageError
+from ..recon import residuals
 from . import classes, gallery, views
 from . import metrics as measure
 from .panels import Findings, Judgement
@@ -86,8 +87,10 @@ def compare(
     found = replace(
         findings(sequence, gathered, known, against=against),
         colour=gallery.colour_views(run, sequence, scored),
+        residuals=residuals.residuals(run, sequence),
         novel=gallery.novel_views(run, sequence) if report else None,
     )
+    residuals.warn(found.residuals)
     result = summary(run, found, protocol=frames, against=against)
     write_json(run.path / "metrics.json", result)
     if report:
@@ -172,6 +175,7 @@ def summary(
         **_errors(found.judgement),
         "unambiguous_range_m": unambiguous_range(found.sequence),
         "ambiguous_share": None if confidence is None else float((confidence < CONFIDENT).mean()),
+        "explained": found.residuals and found.residuals.as_json(),
         "quad_psnr_db": measure.psnr_db(views.quad_rendered, views.quad_measured, peak),
         "colour_psnr_db": colour
         and measure.psnr_db(colour.rendered, colour.measured, peak=float(colour.measured.max())),

@@ -79,6 +79,7 @@ FORMATS: dict[str, Callable[[Any], str]] = {  # formats of values of metrics.jso
     # root of a mean squared error given in m^2 x 100
     "rms_cm": lambda value: f"{10.0 * math.sqrt(value):.1f} cm",
     "length_cm": lambda value: f"{100.0 * value:.2f} cm",  # of a length given in m
+    "ratio": lambda value: f"{value:.3g}",
     "percent": lambda value: f"{100.0 * value:.1f} %",
     "decibel": lambda value: f"{value:.2f} dB",
     "count": lambda value: f"{value:,}",

@@ -13,6 +13,7 @@ from ..constants import SPEED_OF_LIGHT
 from ..data.decode import quartet_phasor
 from ..data.sequence import Sequence
 from ..data.unwrap import CONFIDENT
+from ..recon.residuals import Residuals
 from . import page, pictures
 from .gallery import Colour, Novel
 from .views import Views
@@ -29,6 +30,7 @@ QUARTET_TEXT = (
     "Each raw frame has its own time, during which objects move. The closed form takes the frames "
     "as simultaneous, hence the false distances along moving outlines."
 )
+CHI_SQUARE_SHOWN = (0.1, 1000.0)  # on a logarithmic scale
 TITLES = {"closed_form": "closed form", "d": "ours, d", "d_tof": "ours, d_ToF"}
 
 Window = tuple[slice, slice]
@@ -63,6 +65,8 @@ class Findings:
     """Truth and errors; None without ground truth."""
     colour: Colour | None = None
     """Measured and rendered colour; None if one of both has no colour."""
+    residuals: Residuals | None = None
+    """How well the run explains the quads; None where it was not fitted to them."""
     novel: Novel | None = None
     """Novel views; None if the sequence has none."""
 
@@ -186,6 +190,24 @@ def quad_residual(found: Findings, s: int) -> str:
         page.picture(left, share, "transmittance", "1 \N{MINUS SIGN} opacity"),
     ]
     return page.row(figures)
+
+
+def explained(found: Findings, s: int) -> str:
+    """Where the quads are explained: chi-square of the quartet, and how often each pixel is not."""
+    if found.residuals is None:
+        return ""
+    of_quartet = found.residuals.quartets.index(found.views.frames[s] // found.sequence.cycle)
+    figures = []
+    if found.residuals.chi_square is not None:
+        logarithm = np.log10(np.maximum(found.residuals.chi_square, CHI_SQUARE_SHOWN[0]))
+        low, high = np.log10(CHI_SQUARE_SHOWN)
+        scale = pictures.Scale(low=low, high=high, colours="magma", unit="log10")
+        image, over = logarithm[of_quartet], logarithm.max(axis=0)
+        figures.append(page.picture(image, scale, "chi-square", "of this quartet"))
+        figures.append(page.picture(over, scale, "chi-square", "largest of all quartets"))
+    often = found.residuals.unexplained.mean(axis=0, dtype=np.float32)
+    title = "share of quartets that are not explained"
+    return page.row([*figures, page.picture(often, _share_scale(1.0), title)])
 
 
 def strip_over_time(found: Findings) -> str:

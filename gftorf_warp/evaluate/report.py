@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from ..data.decode import unambiguous_range
-from ..data.truth import MOVING_M
+from ..recon.residuals import WARNING_SHARE
 from . import figures, gallery, page, panels, provenance
-from .classes import EDGE_PX, STEP_M
+from .legend import PHASORS_TO_READ, TO_READ
 from .metrics import DISTANCES, ERROR_UNIT, per_frame_mean
 from .panels import Findings
 
@@ -52,39 +52,6 @@ OF_CLASS = {
     "slope_20_40": "20 to 40 mm/px",
     "slope_over_40": "over 40 mm/px",
 }
-TO_READ = f"""
-<dl>
-<dt>distance</dt><dd>Length from the camera to the surface along the ray of a pixel, in metres. It
-is not the z-depth.</dd>
-<dt>closed form</dt><dd>The distance that a camera computes: raw quads give a phase, the phase a
-distance; several modulation frequencies together determine the number of whole turns. Quads are
-taken one after the other, so moving objects get false distances.</dd>
-<dt>temporal</dt><dd>What averaging over time makes of the closed form: the least that a
-reconstruction must beat. Mean and median of all quartets mean something where nothing moves
-(<em>static throughout</em>: the true distance never changes by more than {MOVING_M} m); the row
-<em>temporal</em> takes the mean of the quartets that agree with their pixel's median, and the
-closed form in all others. They need a resting camera.</dd>
-<dt>d</dt><dd>Mean distance of the reconstructed Gaussians at the time of one raw frame. It is not
-divided by opacity: where opacity is below one, the missing part counts as error.</dd>
-<dt>d_ToF</dt><dd>Quads rendered at the time of one raw frame, decoded like the closed form, within
-the unambiguous range: c / 2f, or that of all frequencies together.</dd>
-<dt>moving pixels</dt><dd>Pixels whose true distance changes by more than {MOVING_M} m within their
-quartet: mostly outlines of moving objects, and whole objects that move fast in depth.</dd>
-<dt>edge, interior</dt><dd>Pixels within {EDGE_PX} px of a step of the true distance, and all
-others. At a step, neighbouring pixels differ by more than {STEP_M} m from each other and from the
-continuation of the surface. Interior pixels are divided by the slope of the true distance.</dd>
-<dt>errors</dt><dd>Mean squared error in square metres times 100, then its root in centimetres.
-<em>All pixels</em> is the mean over frames of each frame's mean; <em>moving</em> and
-<em>static</em> pool the pixels of all frames. The closed form of a quartet is compared with the
-truth of each of its raw frames.</dd>
-<dt>quad PSNR</dt><dd>Rendered against measured quads, at the phase shift of each raw frame. It
-needs no ground truth and is bounded by the noise of the measurement.</dd>
-<dt>grey pixels</dt><dd>Unknown truth, not scored.</dd>
-</dl>"""
-PHASORS_TO_READ = f"""
-<p class="soft">This camera delivered phasors. The four raw frames of a quartet are simultaneous, so
-each quartet is scored once, and moving pixels are those whose true distance changes by more than
-{MOVING_M} m between consecutive phasors.</p>"""
 ALONG_TEXT = (
     "Rendered over black at a few fixed raw frames, at the size of the optimisation, which does "
     "not use these numbers. Where d and d_ToF differ on static pixels, light is explained by "
@@ -119,6 +86,7 @@ def report(
         _section("Distance", _distance_text(found, s), _distance_pictures(found, s)),
         _section("What was measured", _measured_text(found, s), panels.measured_quartet(found, s)),
         _section("Quads", _quad_text(found, s), panels.quad_residual(found, s)),
+        *_explained(metrics, found, s),
         _section("Over time", _time_pictures(found)),
         *_beyond(metrics, found),
         *_along(metrics, diagnostics),
@@ -130,7 +98,17 @@ def report(
 
 
 def verdict(metrics: Mapping[str, Any]) -> str:
-    """The result in one or two sentences of HTML, with the numbers of metrics.json."""
+    """The result in a few sentences of HTML, with the numbers of metrics.json."""
+    share = (metrics.get("explained") or {}).get("unexplained_share", 0.0)
+    if share <= WARNING_SHARE:
+        return _result(metrics)
+    unexplained = page.number(metrics, "explained.unexplained_share", "percent")
+    warning = f'<span class="naive">{unexplained} of the pixels are not explained by the fit</span>'
+    return f"{_result(metrics)} {warning}, see below."
+
+
+def _result(metrics: Mapping[str, Any]) -> str:
+    """The errors in one or two sentences."""
     number = functools.partial(page.number, metrics)
     if page.look_up(metrics, "d_mse_x100") is None:
         psnr = f'<span class="ours">{number("quad_psnr_db", "decibel")}</span>'
@@ -283,6 +261,19 @@ def _quad_text(found: Findings, s: int) -> str:
         f"{which}, measured and rendered at its time and pose over a black background; the "
         "residual should look like noise."
     )
+
+
+def _explained(metrics: Mapping[str, Any], found: Findings, s: int) -> list[str]:
+    """The section on how well the quads are explained; none if they were not fitted."""
+    if page.look_up(metrics, "explained") is None:
+        return []
+    share = page.number(metrics, "explained.unexplained_share", "percent")
+    text = f"{share} of the pixels are not explained by the fit"
+    if page.look_up(metrics, "explained.reduced_chi_square") is not None:
+        mean = page.number(metrics, "explained.reduced_chi_square", "ratio")
+        text += f"; the reduced chi-square of the quads is {mean}, and one for noise alone"
+    text = _caption(f"{text}. Each raw frame at its own time, at the size of the fit.")
+    return [_section("How well the quads are explained", text, panels.explained(found, s))]
 
 
 def _time_pictures(found: Findings) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -16,10 +15,11 @@ from ..data import temporal
 from ..data.decode import Decoded, closed_form_distance, decode_quartet
 from ..data.sequence import Sequence
 from ..errors import DivergedError, UsageError
+from ..recon.residuals import quad_of_shift
 from ..render.api import Rendering
 from ..render.series import KEPT, View, on_host
 from ..scene.camera import Camera
-from ..scene.sensor import Sensor, channel_of
+from ..scene.sensor import Sensor
 from . import previews, renders, stored, writers
 from .metrics import DISTANCES, TEMPORAL, distance_from_quads, normalised
 from .poses import middle
@@ -144,18 +144,6 @@ def camera_at(run: Run, sequence: Sequence, time: float) -> Camera:
 
 def _nearest_frame(sequence: Sequence, time: float) -> int:
     return int(np.abs(sequence.times - time).argmin())
-
-
-def quad_of_shift(rendering: Rendering, sensor: Sensor, shift: float) -> torch.Tensor:
-    """The quad [H, W] of any phase shift [rad] of a rendering.
-
-    If not rendered, it is (re cos shift + im sin shift + dc_offset amplitude) / 2 of the phasor.
-    """
-    channel = channel_of(sensor.shifts, shift)
-    if channel is not None:
-        return rendering.quads[channel]
-    re, im, amplitude = rendering.phasor
-    return 0.5 * (re * math.cos(shift) + im * math.sin(shift) + sensor.dc_offset * amplitude)
 
 
 def finite(image: torch.Tensor, name: str, run: Run) -> Float[np.ndarray, "*image"]:

@@ -18,7 +18,7 @@ from ..data.read import read, read_truth
 from ..data.sequence import Sequence, Truth
 from ..errors import InputError, UsageError
 from ..scene.changes import Wording, changed
-from . import checkpoint, closed_form, folder, presets
+from . import checkpoint, closed_form, folder, presets, residuals
 from .config import config_of
 from .diagnostics import Diagnostics
 from .loop import Progress, TrainingLoop
@@ -194,6 +194,9 @@ def _run(sequence, out, settings, config, seed, device, goes_on, begun, progress
     config |= {name: getattr(state, name) for name in ("skipped", "restarts", "revivals")}
     folder.write_config(out, config)
     LOG.info("%s is finished: %d images, %.1f s", out, state.images, state.seconds)
+    found = residuals.residuals(Run.open(out, device), sequence)
+    residuals.warn(found)
+    folder.write_config(out, config | {"explained": found and found.as_json()})
 
 
 def _warn(sequence: Sequence) -> None:
