@@ -203,7 +203,8 @@ def _extent(body: Body, time: float) -> Float[np.ndarray, "P 3"]:
     if isinstance(shape, Sphere):
         return 2.0 * shape.radius * corners + pose[:3, 3]
     parts = shape.parts if isinstance(shape, Assembly) else (Part(shape=shape),)
-    halves = [np.abs(part.position) + np.asarray(part.shape.size) / 2 for part in parts]
+    boxes = [(part.position, part.shape) for part in parts if isinstance(part.shape, Box)]
+    halves = [np.abs(position) + np.asarray(each.size) / 2 for position, each in boxes]
     size = 2.0 * np.max(halves, axis=0)
     return (size * corners) @ pose[:3, :3].T + pose[:3, 3]
 

@@ -1,0 +1,176 @@
+"""Tables of benchmarks/accuracy.py: fits of many scenes with several seeds as Markdown.
+
+Every error is a mean squared error of the distance [m^2] times 100 over all scored raw frames, from
+`gftorf compare`. A ratio is an error of d over that of the closed form, or of another row there, on
+the same pixels.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+import numpy as np
+
+Result = dict[str, Any]
+PARTS = ("all", "moving", "static")
+NONE = "-"
+SUMMARY = (
+    "row", "d / closed form", "d_ToF / closed form", "d / temporal", "static: interior, throughout",
+    "worst scene", "worse than closed form", "than temporal", "seeds max / min", "chi-square",
+    "seconds", "Gaussians", "failed",
+)  # fmt: skip
+
+
+def error_of(result: Result, distance: str, part: str) -> float | None:
+    """Error of a distance (``d``, ``d_tof``, ``closed_form``, ``temporal``) on ``all``, ``moving``
+    or ``static`` pixels, those static ``throughout`` the sequence, or the static ``interior``.
+    """
+    scores = result["scores"]
+    if part == "interior":
+        scores = (scores.get("classes") or {}).get("static", {})
+    return (scores if part == "all" else scores.get(part) or {}).get(f"{distance}_mse_x100")
+
+
+def ratio(
+    result: Result, part: str, distance: str = "d", over: str = "closed_form"
+) -> float | None:
+    """Error over that of another distance; None where there is no such pixel or distance."""
+    error, other = (error_of(result, name, part) for name in (distance, over))
+    return error / other if error is not None and other else None
+
+
+def geometric_mean(values: Iterable[float | None]) -> float | None:
+    """Of those that are known and above 0; None without any."""
+    logarithms = [math.log(value) for value in values if value]
+    return math.exp(float(np.mean(logarithms))) if logarithms else None
+
+
+def worse(result: Result, over: str = "closed_form") -> bool:
+    """Whether d is worse than another distance on all, moving or static pixels."""
+    return any((ratio(result, part, over=over) or 0.0) > 1.0 for part in PARTS)
+
+
+def by_scene(results: Iterable[Result]) -> dict[str, list[Result]]:
+    """Results of each scene, in the order of the first ones."""
+    grouped: dict[str, list[Result]] = {}
+    for result in results:
+        grouped.setdefault(result["scene"], []).append(result)
+    return grouped
+
+
+def scene_mean(results: Iterable[Result], value: Callable[[Result], float | None]) -> float | None:
+    """Geometric mean over scenes of the geometric mean over seeds."""
+    each = by_scene(results).values()
+    return geometric_mean(geometric_mean(map(value, fits)) for fits in each)
+
+
+def worst_first(results: Iterable[Result]) -> list[Result]:
+    """Fits by their largest ratio of all, moving and static pixels."""
+    return sorted(results, key=lambda fit: -max(ratio(fit, part) or 0.0 for part in PARTS))
+
+
+def summary(rows: Sequence[str], results: Sequence[Result]) -> str:
+    """A line for each row, over all scenes of ``results``."""
+    lines = []
+    for row in rows:
+        mine = [result for result in results if result.get("row") == row]
+        fits = [result for result in mine if "error" not in result]
+        lines.append([row, *_line(fits), str(len(mine) - len(fits))])
+    return _table(SUMMARY, lines)
+
+
+def _line(fits: list[Result]) -> list[str]:
+    if not fits:
+        return [NONE] * (len(SUMMARY) - 2)
+    scenes = by_scene(fits)
+    means = {
+        name: geometric_mean(ratio(fit, "all") for fit in each) for name, each in scenes.items()
+    }
+    worst = max(means, key=lambda name: means[name] or 0.0)
+    spreads = [_spread(each) for each in scenes.values()]
+    known = [spread for spread in spreads if spread is not None]
+    chi = geometric_mean(fit["scores"].get("chi_square") for fit in fits)
+    seconds = [fit["seconds"] for fit in fits]
+
+    def means_of(distance: str, over: str, parts: Iterable[str] = PARTS) -> str:
+        return _three(
+            *(
+                scene_mean(fits, lambda fit, part=part: ratio(fit, part, distance, over))
+                for part in parts
+            )
+        )
+
+    def worse_than(over: str) -> str:
+        bad = [fit for fit in fits if worse(fit, over)]
+        scenes_of = f"{len(by_scene(bad))} of {len(scenes)} scenes"
+        return f"{scenes_of}, {len(bad)} of {len(fits)} fits"
+
+    return [
+        means_of("d", "closed_form"),
+        means_of("d_tof", "closed_form"),
+        means_of("d", "temporal"),
+        means_of("d", "temporal_mean", ("interior", "throughout")),
+        f"{worst} {_number(means[worst])}",
+        worse_than("closed_form"),
+        worse_than("temporal"),
+        f"{_number(geometric_mean(known))}, {_number(max(known))}" if known else NONE,
+        _number(chi),
+        f"{np.median(seconds):.1f}, {max(seconds):.1f}",
+        f"{int(np.median([fit['gaussians'] for fit in fits]))}",
+    ]
+
+
+def _spread(fits: list[Result]) -> float | None:
+    """Largest over smallest error of d among the seeds of a scene; None with a single seed."""
+    errors = [error for fit in fits if (error := error_of(fit, "d", "all"))]
+    return max(errors) / min(errors) if len(errors) > 1 else None
+
+
+def details(rows: Sequence[str], scenes: Sequence[Result], results: Sequence[Result]) -> str:
+    """A line for each scene: closed form, edge floor, and d of every row, mean over seeds."""
+    lines = []
+    for scene in scenes:
+        mine = [result for result in results if result["scene"] == scene["scene"]]
+        fits = [result for result in mine if "error" not in result]
+        floor = scene.get("floor") or {}
+        line = [scene["scene"], scene.get("about", "")]
+        line.append(_errors(fits[:1], "closed_form"))
+        line.append(_three(*(floor.get(part) for part in PARTS)) if floor else NONE)
+        for row in rows:
+            each = [fit for fit in fits if fit["row"] == row]
+            mark = " **worse**" if any(map(worse, each)) else ""
+            failed = any("error" in result for result in mine if result.get("row") == row)
+            line.append(_errors(each, "d") + mark + (" **failed**" if failed else ""))
+        lines.append(line)
+    return _table(("scene", "", "closed form", "edge floor", *rows), lines)
+
+
+def _errors(fits: Sequence[Result], distance: str) -> str:
+    def mean(part: str) -> float | None:
+        errors = [error for fit in fits if (error := error_of(fit, distance, part)) is not None]
+        return float(np.mean(errors)) if errors else None
+
+    return _three(*map(mean, PARTS)) if fits else NONE
+
+
+def failures(results: Iterable[Result]) -> str:
+    """What failed, a line each; empty if nothing did."""
+    lines = [f"* {each['id']}: {each['error']}" for each in results if "error" in each]
+    return "\n".join(["Failed:", "", *lines, ""]) if lines else ""
+
+
+def _three(*values: float | None) -> str:
+    return " / ".join(map(_number, values))
+
+
+def _number(value: float | None) -> str:
+    if value is None:
+        return NONE
+    return f"{value:.3g}" if value < 100 else f"{value:.0f}"
+
+
+def _table(head: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
+    rows = [head, ["---"] * len(head), *lines]
+    return "".join(f"| {' | '.join(row)} |\n" for row in rows)

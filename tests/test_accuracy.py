@@ -1,0 +1,196 @@
+"""The benchmark of scenes: fits in processes, results that are not repeated, failures as rows, and
+what its tables say.
+"""
+
+import json
+import multiprocessing
+import os
+import sys
+from dataclasses import dataclass
+from math import inf
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+
+import accuracy
+import accuracy_jobs
+import accuracy_table
+
+from gftorf_warp import simulate
+from gftorf_warp.errors import UsageError
+from gftorf_warp.sim.random_scene import random_scene
+from gftorf_warp.sim.world import first_hit
+
+TINY = ["--size", "40x30", "--frames", "8", "--images", "24", "--seeds", "0,1", "--workers", "1"]
+
+
+def setup_in(folder):
+    """A setup of tiny images."""
+    return accuracy_jobs.Setup(
+        out=folder, size=(40, 30), frames=8, images=24, device="cpu", keep=False
+    )
+
+
+def result(row, scene, seed, d, closed=(1.0, 1.0, 1.0), **more):
+    """A result with errors of d on all, moving and static pixels."""
+    scores = {}
+    for part, error, other in zip(("all", "moving", "static"), d, closed, strict=True):
+        named = {"d": error, "d_tof": error, "closed_form": other, "temporal": 0.5 * other}
+        scores[part] = {f"{name}_mse_x100": value for name, value in named.items()}
+    interior = {"d_mse_x100": d[2], "temporal_mean_mse_x100": 0.25}
+    scores |= scores.pop("all") | {"classes": {"static": {"interior": interior}}}
+    return {"row": row, "scene": scene, "seed": seed, "scores": scores} | {
+        "id": f"{row}/{scene}/{seed}",
+        "seconds": 1.0,
+        "gaussians": 7,
+        **more,
+    }
+
+
+@dataclass(frozen=True, kw_only=True)
+class Deadly(accuracy_jobs.Job):
+    """A job that kills its process, as a lack of memory does."""
+
+    def folder(self, setup):
+        """Ends any process but that of the test."""
+        if multiprocessing.parent_process() is not None:
+            os._exit(9)
+        return super().folder(setup)
+
+
+def test_a_benchmark_of_two_scenes(tmp_path, capsys):
+    """Every fit is a line with its errors, none is repeated, a failed one is a row and is tried
+    again; tables and picture exist.
+    """
+    shared = tmp_path / "others"
+    simulate("random-3", shared / "axial", size=(40, 30), frames=8, engine="mesh")
+    rows = ["--row", "ctof", "--row", "short=demo,weights.ssim=0.1", "--row", "bad=demo,no.such=1"]
+    command = [
+        "--out",
+        str(tmp_path / "acc"),
+        *rows,
+        *TINY,
+        "--scenes",
+        "1",
+        "--shared",
+        str(shared),
+    ]
+    assert accuracy.main(command) == 1
+    first = capsys.readouterr()
+    assert "## tuning: 1 scenes" in first.out
+    assert "## shared: 1 scenes" in first.out
+    lines = (tmp_path / "acc" / "results.jsonl").read_text().splitlines()
+    assert len(lines) == 2 + 3 * 2 * 2
+    results = {line["id"]: line for line in map(json.loads, lines)}
+    fit = results["short/random-1@40x30x8/24/1"]
+    assert fit["scores"]["images_optimised"] == 24
+    assert fit["seconds"] > 0
+    closed = results["ctof/random-1@40x30x8/24/0"]["scores"]
+    assert closed["d_mse_x100"] == pytest.approx(closed["closed_form_mse_x100"])
+    assert "no.such" in results["bad/shared/axial@given/24/0"]["error"]
+    assert "bad/shared/axial@given/24/0: UsageError" in first.out
+    picture = cv2.imread(str(tmp_path / "acc" / "worst.png"))
+    assert picture.shape[1] >= 4 * 40
+    assert (tmp_path / "acc" / "table.md").read_text() in first.out
+    assert not list((tmp_path / "acc" / "runs").glob("*/config.json")), "runs are not kept"
+
+    assert accuracy.main(command) == 1
+    again = (tmp_path / "acc" / "results.jsonl").read_text().splitlines()
+    assert again[: len(lines)] == lines
+    assert all("error" in json.loads(line) for line in again[len(lines) :])
+    assert len(again) == len(lines) + 4
+    title = "## tuning"
+    assert capsys.readouterr().out.partition(title)[2] == first.out.partition(title)[2]
+
+
+def test_a_limit_leaves_jobs_for_later(tmp_path, capsys):
+    """With no time left nothing is done, and the command says what is left."""
+    command = ["--out", str(tmp_path), "--row", "ctof", *TINY, "--scenes", "0-1", "--limit", "0"]
+    assert accuracy.main(command) == 0
+    assert "6 jobs are left" in capsys.readouterr().out
+
+
+def test_other_settings_or_data_are_another_key(tmp_path):
+    """A result is kept only for the same settings, seed and data."""
+    folder, setup = tmp_path, setup_in(tmp_path)
+    first = accuracy_jobs.Job(scene="random-1")
+    assert accuracy_jobs.result_of(first, setup, None)["floor"]["all"] > 0
+    row = accuracy_jobs.Row.of("ctof")
+    job = accuracy_jobs.Job(scene="random-1", row=row)
+    key = accuracy_jobs.result_of(job, setup, None)["key"]
+    assert accuracy_jobs.result_of(job, setup, key) is None
+    assert accuracy_jobs.result_of(job, setup, "other")["key"] == key
+    changed = accuracy_jobs.Job(
+        scene="random-1", row=accuracy_jobs.Row.of("ctof=ctof,quad_scale=2")
+    )
+    assert accuracy_jobs.result_of(changed, setup, key)["key"] != key
+    assert (folder / "scenes").is_dir()
+
+
+def test_the_edge_floor_is_the_error_of_the_mean_over_a_pixel(tmp_path):
+    """Against first hits in float64 of 4x4 rays per pixel, which share no code with the tracer."""
+    setup, scene = setup_in(tmp_path), random_scene(1)
+    found = accuracy_jobs.result_of(accuracy_jobs.Job(scene="random-1"), setup, None)
+    times = np.array([0, 4]) / 120  # starts of quartets
+    camera = scene.camera((40, 30))
+    fine = [first_hit(scene.bodies, camera.finer(4), time).distance for time in times]
+    mean = np.stack(fine).reshape(2, 30, 4, 40, 4).mean((2, 4))
+    centre = np.stack([first_hit(scene.bodies, camera, time).distance for time in times])
+    want = 100 * np.mean((mean - centre) ** 2)
+    assert found["floor"]["all"] == pytest.approx(want, rel=1e-2)
+    assert found["floor"]["static"] < want < found["floor"]["moving"]
+
+
+def test_a_process_that_dies_is_a_failed_job(tmp_path):
+    """The others are done by another process."""
+    workers = accuracy_jobs.Workers(1, setup_in(tmp_path))
+    jobs = [Deadly(scene="random-1"), accuracy_jobs.Job(scene="random-2")]
+    found = [result for _, result in workers.results(jobs, {}, inf)]
+    workers.close()
+    assert "exit code 9" in found[0]["error"]
+    assert "error" not in found[1]
+
+
+def test_rows_and_numbers_of_the_command_line(capsys):
+    """Names, presets, changes, ranges; validation scenes need their option."""
+    row = accuracy_jobs.Row.of("plane=fast,render.near=0.2,weights.ssim=0")
+    assert (row.name, row.preset) == ("plane", "fast")
+    assert row.changes == ("render.near=0.2", "weights.ssim=0")
+    assert accuracy_jobs.Row.of("ctof") == accuracy_jobs.Row(name="ctof", preset="ctof")
+    assert accuracy.numbers("0-2,7") == [0, 1, 2, 7]
+    assert accuracy.numbers("none") == []
+    for wrong in (["--scenes", "100"], ["--scenes", "1", "--validation"], ["--row", "ctof"]):
+        with pytest.raises(SystemExit):
+            accuracy.main(["--out", "unused", "--row", "ctof", *wrong])
+    assert "name of its own" in capsys.readouterr().err
+    with pytest.raises(UsageError, match="unknown preset fats"):
+        accuracy_jobs.presets.preset("fats")
+
+
+def test_the_summary_is_means_over_scenes_and_seeds():
+    """Geometric means, the worst scene, scenes and fits worse in any part, spread, failures."""
+    results = [
+        result("a", "one", 0, (0.1, 0.2, 0.5)),
+        result("a", "one", 1, (0.4, 0.2, 1.5)),
+        result("a", "two", 0, (0.8, 0.4, 0.9)),
+        result("a", "two", 1, (0.8, 0.4, 0.9)),
+        {"row": "a", "scene": "two", "seed": 2, "id": "a/two/2", "error": "no memory"},
+    ]
+    line = accuracy_table.summary(["a", "b"], results).splitlines()[2].split(" | ")
+    assert line[1] == "0.4 / 0.283 / 0.883"
+    assert line[3:5] == ["0.8 / 0.566 / 1.77", "3.53 / -"]
+    assert line[5:7] == ["two 0.8", "1 of 2 scenes, 1 of 4 fits"]
+    assert line[7:9] == ["2 of 2 scenes, 3 of 4 fits", "2, 4"]
+    assert line[-1] == "1 |"
+    assert accuracy_table.summary(["b"], results).splitlines()[2].count("-") >= 9
+    assert accuracy_table.worst_first(results[:4])[0]["id"] == "a/one/1"
+    assert "a/two/2: no memory" in accuracy_table.failures(results)
+    scenes = [
+        {"scene": "one", "about": "text", "floor": {"all": 0.01, "moving": None, "static": 0}}
+    ]
+    row = accuracy_table.details(["a"], scenes, results).splitlines()[2]
+    assert row == "| one | text | 1 / 1 / 1 | 0.01 / - / 0 | 0.25 / 0.2 / 1 **worse** |"
