@@ -7,13 +7,16 @@
 Runs ``gftorf COMMAND ...`` N times (2; the first may compile kernels), each in a process of its
 own, and prints the phases of the last run in the order in which they began. A phase excludes those
 inside it. Times are those of the host's main thread: the device is not synchronised for them, so
-work of the device counts where the host waits for it.
+work of the device counts where the host waits for it. Then the imports of the last run: the
+slowest ones with the line of this package that caused them, and the modules of every package at the
+end. -X importtime is too slow for this: it writes a line per module.
 """
 
 from __future__ import annotations
 
 import argparse
 import builtins
+import collections
 import json
 import os
 import statistics
@@ -58,6 +61,7 @@ PHASES = {  # functions that begin a phase, by module; those of one name are one
     },
     "sim.simulate": {"simulate": "simulate"},
 }
+SHOWN = 24  # imports, and packages
 FIRST = {"steps": "first step"}  # name of the first call of a phase, where that differs
 
 
@@ -108,17 +112,28 @@ class Patcher:
         )
         self.original = builtins.__import__
         self.import_timed = clock.timed("imports", self.original)
+        self.imports: list[dict] = []  # outermost ones that loaded modules
 
     def __call__(self, *arguments, **named):
         """In place of ``__import__``."""
         if threading.current_thread() is not threading.main_thread():
             return self.original(*arguments, **named)
         outermost = self.depth == 0
+        begun, modules = time.time(), len(sys.modules)
         self.depth += 1
         try:
             found = (self.import_timed if outermost else self.original)(*arguments, **named)
         finally:
             self.depth -= 1
+        if outermost and len(sys.modules) > modules:
+            self.imports.append(
+                {
+                    "name": str(arguments[0] or arguments[3]),
+                    "where": own_line(),
+                    "modules": len(sys.modules) - modules,
+                    "seconds": time.time() - begun,
+                }
+            )
         if outermost and self.waiting:
             for name in [name for name in self.waiting if name in sys.modules]:
                 self.patch(name, self.waiting.pop(name))
@@ -147,16 +162,34 @@ class Patcher:
                     setattr(home, name, timed)
 
 
+def own_line() -> str:
+    """File and line of this package that is being executed, for example ``cli.py:133``."""
+    frame = sys._getframe(2)
+    while frame is not None and "/gftorf_warp/" not in frame.f_code.co_filename:
+        frame = frame.f_back
+    if frame is None:
+        return "-"
+    return f"{frame.f_code.co_filename.rpartition('/gftorf_warp/')[2]}:{frame.f_lineno}"
+
+
+def by_package() -> dict[str, int]:
+    """Number of loaded modules by package, most first; torch by subpackage."""
+    names = (name.split(".") for name in [*sys.modules])
+    packages = (".".join(parts[: 2 if parts[0] == "torch" else 1]) for parts in names)
+    return dict(collections.Counter(packages).most_common())
+
+
 def child(report: Path, begun: float, command: list[str]) -> None:
     """Run a command with phases, and end as ``gftorf`` does."""
     clock = Clock(begun)
-    builtins.__import__ = Patcher(clock)
+    builtins.__import__ = patcher = Patcher(clock)
     from gftorf_warp import cli
 
     sys.argv = ["gftorf", *command]
     code = cli.main()
     clock.switch()
     stored = {"seconds": clock.seconds, "calls": clock.calls, "ended": time.time()}
+    stored |= {"imports": patcher.imports, "packages": by_package()}
     report.write_text(json.dumps(stored))
     sys.exit(code)
 
@@ -170,6 +203,16 @@ def run(command: list[str]) -> dict:
         ended, found = time.time(), json.loads(report.read_text())
     found["seconds"]["exit"] = ended - found.pop("ended")
     return found | {"wall": ended - begun}
+
+
+def print_imports(run: dict) -> None:
+    """The slowest imports, and the packages with the most modules."""
+    print(f"\n{'import':40}{'modules':>8}{'seconds':>9}  caused by")
+    for one in sorted(run["imports"], key=lambda one: -one["seconds"])[:SHOWN]:
+        print(f"{one['name']:40}{one['modules']:8}{one['seconds']:9.3f}  {one['where']}")
+    packages = run["packages"]
+    most = ", ".join(f"{name} {count}" for name, count in [*packages.items()][:SHOWN])
+    print(f"{sum(packages.values())} modules at the end: {most}\n")
 
 
 def main() -> None:
@@ -189,6 +232,7 @@ def main() -> None:
     last = runs[-1]
     for name, seconds in last["seconds"].items():
         print(f"{name:32}{last['calls'].get(name, 1):8}{seconds:9.3f} s")
+    print_imports(last)
     walls = [one["wall"] for one in runs]
     print(
         f"{'wall clock':40}{last['wall']:9.3f} s; all runs "
