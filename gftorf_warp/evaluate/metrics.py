@@ -64,9 +64,13 @@ def squared_error(
     """Squared difference of two distances [m^2]; NaN exactly where the truth is unknown."""
     if distance.shape != truth.shape:
         raise ValueError(f"distance {distance.shape} and truth {truth.shape} must share a shape")
-    if not np.isfinite(distance[~np.isnan(truth)]).all():
-        raise ValueError("distance: not finite at pixels with a known truth")
-    return np.square(distance - truth)
+    error = np.empty(distance.shape, np.result_type(distance, truth))
+    for image, true, out in zip(distance, truth, error, strict=True):  # a frame fits into a cache
+        np.subtract(image, true, out=out)
+        if not (np.isfinite(out) | np.isnan(true)).all():
+            raise ValueError("distance: not finite at pixels with a known truth")
+        np.square(out, out=out)
+    return error
 
 
 def pooled(error: Float[np.ndarray, "S H W"], mask: Bool[np.ndarray, "S H W"]) -> float | None:
