@@ -125,7 +125,7 @@ def read(path, dtype):
 def test_a_list_is_in_order_and_whole_tiles(keys, count, share, device):
     """Key by key; also where everybody has a gradient, or nobody."""
     gradient = hidden(random(keys * count, 3, seed=2).to(device) - 0.5, share, keys)
-    listed, begins = tensor_cores._list(gradient, keys, tensor_cores._ready(gradient.device))
+    listed, begins = tensor_cores.listed_rows(gradient, keys)
     want, ends = wanted(gradient, keys)
     assert begins.tolist() == ends
     assert listed[: ends[-1]].tolist() == want
@@ -137,7 +137,7 @@ def test_what_is_no_number_has_a_gradient():
     """So that the step is found not to be sound."""
     gradient = torch.zeros(70, 3)
     gradient[3, 1], gradient[66, 2] = torch.nan, -torch.inf
-    listed, _ = tensor_cores._list(gradient, 2, tensor_cores._ready(gradient.device))
+    listed, _ = tensor_cores.listed_rows(gradient, 2)
     assert listed[listed >= 0].tolist()[:2] == [3, 66]
 
 
@@ -169,9 +169,9 @@ def test_slopes_by_a_block_of_threads(layers, skip_after, count, keys, share, tm
     """Slopes and sums of two blocks are the CPU's, by the masks that a GPU has."""
     made = network(half(MotionSettings(layers=layers, skip_after=skip_after)))
     form, place, moment, all_weights, biases = inputs_of(made, count, keys)
-    given = launches(form, place, moment, all_weights, biases)
+    forth, _, _, shifts = tensor_cores.packed(form, moment, all_weights, biases)
     numbers = layers, -1 if form.joined is None else form.joined, keys, count
-    stored(tmp_path, place=place.numpy(), forth=given[3].numpy(), shifts=given[6].numpy())
+    stored(tmp_path, place=place.numpy(), forth=forth.numpy(), shifts=shifts.numpy())
     run(tmp_path, FORWARD, wgmma.rows_forward, *numbers)
     outputs = read(tmp_path / "outputs", np.float16).view(layers, keys * count, WIDTH)
     gradient = hidden(random(keys * count, 3, seed=3) - 0.5, share, keys)
@@ -196,22 +196,6 @@ def test_slopes_by_a_block_of_threads(layers, skip_after, count, keys, share, tm
     scale = float(slopes.sums.abs().max())
     torch.testing.assert_close(partials.sum(2), slopes.sums, rtol=2e-3, atol=2e-4 * scale)
     assert float(slopes.layers[:, :end].abs().max()) > 1
-
-
-def launches(form, place, moment, all_weights, biases):
-    """What ``pack`` was given and has made."""
-    given = {}
-
-    def launched(kernel, dim, inputs, outputs):
-        launch(kernel, dim, inputs, outputs)
-        given[kernel.key] = [*inputs, *outputs]
-
-    launch, tensor_cores._launch = tensor_cores._launch, launched
-    try:
-        FusedLayers().forward(form, place, moment, all_weights, biases)
-    finally:
-        tensor_cores._launch = launch
-    return given[kernels.pack.key]
 
 
 @BY_THREADS
@@ -333,12 +317,16 @@ def test_parts_and_sums_become_gradients(shape, keys, parts, device):
         (random(*size, seed=8) - 0.4).to(device) for size in drawn
     )
     unit = torch.tensor([0.25], device=device)
-    shapes = tensor_cores._shapes(form, layers)
+    shapes = tensor_cores.parameter_shapes(form, layers)
     found = torch.full((sum(np.prod(size) for size in shapes),), torch.nan, device=device)
     given = [array_over(value) for value in (unit, sums, total, moment, outputs, places, head)]
     dim = layers * WIDTH + 3, WIDTH + form.position + form.time + 1
     launched(
-        ends.collect, dim, [tensor_cores._layers(form, layers), *given], [array_over(found)], device
+        ends.collect,
+        dim,
+        [tensor_cores.sizes_of(form, layers), *given],
+        [array_over(found)],
+        device,
     )
     square = outputs.sum(0).view(layers - 1, WIDTH, WIDTH)
     entered = dict(

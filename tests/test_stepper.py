@@ -2,6 +2,7 @@
 both against plain torch (plain_step.py).
 """
 
+import contextlib
 import math
 import subprocess
 import sys
@@ -21,6 +22,7 @@ from gftorf_warp.recon.control import GraphKey
 from gftorf_warp.recon.observations import observe
 from gftorf_warp.recon.settings import Batch, Input, Norm, Weights
 from gftorf_warp.recon.state import begin
+from gftorf_warp.recon.step import Step
 from gftorf_warp.recon.stepper import Stepper
 from gftorf_warp.recon.terms import TERMS, Term, View
 from gftorf_warp.render import fused
@@ -103,18 +105,22 @@ def alike(one, other, few=0.01, signs=0.0):
     )
 
 
-def launches_of(steps):
-    """A list that gets the key of every graph that is captured, and the graph;
-    on a CPU a function.
+@contextlib.contextmanager
+def observed():
+    """Lists that get the key of every step whose operations are called, not replayed,
+    and every CUDA graph.
     """
-    found, whole = [], steps._captured
-
-    def captured(key, table):
-        found.append((key, whole(key, table)))
-        return found[-1][1]
-
-    steps._captured = captured
-    return found
+    keys, graphs, run, made = [], [], Step.run, CapturedGraph.__init__
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(
+            Step, "run", lambda self, key, *given: keys.append(key) or run(self, key, *given)
+        )
+        patch.setattr(
+            CapturedGraph,
+            "__init__",
+            lambda self, *given: graphs.append(self) or made(self, *given),
+        )
+        yield keys, graphs
 
 
 def compared(settings, device, sequence=None, *, images=((20, 0.01),), signs=0.0):
@@ -124,17 +130,16 @@ def compared(settings, device, sequence=None, *, images=((20, 0.01),), signs=0.0
     plain, observations = begun(settings, device, sequence)
     state, _ = begun(settings, device, sequence)
     steps = Stepper(state, observations, settings)
-    launches = launches_of(steps)
-    for count, few in images:
-        while plain.images < count:
-            assert plain_step(plain, observations, settings)
-            steps.step()
-            assert plain.images == state.images
-        assert steps.collect() == 0
-        alike(plain, state, few, signs)
-    assert launches
-    captured = [isinstance(launch, CapturedGraph) for _, launch in launches]
-    assert all(captured) if device != "cpu" and settings.graph else not any(captured)
+    with observed() as (keys, graphs):
+        for count, few in images:
+            while plain.images < count:
+                assert plain_step(plain, observations, settings)
+                steps.step()
+                assert plain.images == state.images
+            assert steps.collect() == 0
+            alike(plain, state, few, signs)
+    assert keys
+    assert bool(graphs) == (device != "cpu" and settings.graph)
     return state
 
 
@@ -263,11 +268,12 @@ def test_one_graph_serves_every_frame(device):
     )
     state, observations = begun(settings, device, replace(sequence, camera_from_world=poses))
     steps = Stepper(state, observations, settings)
-    launches = launches_of(steps)
-    for _ in observations.batches:
-        steps.step()
-    assert steps.collect() == 0
-    assert len({key for key, _ in launches}) == 1
+    with observed() as (keys, graphs):
+        for _ in observations.batches:
+            steps.step()
+        assert steps.collect() == 0
+    assert len({*keys}) == 1
+    assert len(graphs) == (device != "cpu")
 
 
 # -- terms from outside ----------------------------------------------------------------------------
@@ -388,13 +394,11 @@ def test_a_graph_is_the_same_work_as_eager_steps(batch, device):
         settings = replace(published(batch=batch), graph=graph)
         state, observations = begun(settings, device)
         steps = Stepper(state, observations, settings)
-        launches = launches_of(steps)
-        while state.images < 40:
-            steps.step()
-        assert steps.collect() == 0
-        captured = [isinstance(launch, CapturedGraph) for _, launch in launches]
-        assert captured
-        assert all(captured) if graph and device != "cpu" else not any(captured)
+        with observed() as (_, graphs):
+            while state.images < 40:
+                steps.step()
+            assert steps.collect() == 0
+        assert bool(graphs) == (graph and device != "cpu")
         states.append(state)
     alike(*states)
 

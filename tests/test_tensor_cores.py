@@ -124,7 +124,7 @@ def placed(form, layers, parameters, moment, device="cpu"):
 
 def of(form, layers):
     """Sizes as kernels have them."""
-    return tensor_cores._layers(form, layers)
+    return tensor_cores.sizes_of(form, layers)
 
 
 def launched(kernel, dim, inputs, outputs, device):

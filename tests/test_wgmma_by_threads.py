@@ -22,7 +22,7 @@ from test_perceptron import half, network, positions
 
 from gftorf_warp.kernels.network import perceptron as kernels
 from gftorf_warp.kernels.network import wgmma
-from gftorf_warp.render.tensor_cores import FusedLayers
+from gftorf_warp.render.tensor_cores import FusedLayers, packed
 from gftorf_warp.scene.motion import MotionSettings
 
 COMPILER = shutil.which("c++") or shutil.which("g++")
@@ -435,7 +435,7 @@ def stored(folder, **arrays):
     [(8, 5, 33, 1), (3, 1, 70, 3), (6, 3, 64 * 2 * wgmma.ROUND + 65, 1)],
     ids=["a tile", "tiles of several keys", "a tile more than a round"],
 )
-def test_a_block_of_threads_is_row_by_row(layers, skip_after, count, keys, tmp_path, monkeypatch):
+def test_a_block_of_threads_is_row_by_row(layers, skip_after, count, keys, tmp_path):
     """Outputs of two blocks are those of the CPU's own way; nobody waits for ever. Masks:
     see test_listed_rows.py.
     """
@@ -445,20 +445,10 @@ def test_a_block_of_threads_is_row_by_row(layers, skip_after, count, keys, tmp_p
     moment = made.time_encodings[:keys].float()
     both = [(layer.weight.detach(), layer.bias.detach()) for layer in [*made.layers, made.head]]
     weights, biases = (tuple(values) for values in zip(*both, strict=True))
-    given = {}
-
-    def launched(kernel, dim, inputs, outputs):
-        launch(kernel, dim, inputs, outputs)
-        given[kernel.key] = [*inputs, *outputs]
-
-    from gftorf_warp.render import tensor_cores
-
-    launch = tensor_cores._launch
-    monkeypatch.setattr(tensor_cores, "_launch", launched)
     outputs, _, _ = FusedLayers().forward(form, place, moment, weights, biases)
-    packed = given[kernels.pack.key]
+    forth, _, _, shifts = packed(form, moment, weights, biases)
     numbers = layers, -1 if form.joined is None else form.joined, keys, count
-    stored(tmp_path, place=place.numpy(), forth=packed[3].numpy(), shifts=packed[6].numpy())
+    stored(tmp_path, place=place.numpy(), forth=forth.numpy(), shifts=shifts.numpy())
     run(tmp_path, FORWARD, wgmma.rows_forward, *numbers)
     found = torch.from_numpy(np.fromfile(tmp_path / "outputs", np.float16)).view_as(outputs)
     assert float(((found > 0) != (outputs > 0)).float().mean()) < 1e-3

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Sequence
 
 import torch
 import warp as wp
@@ -15,7 +16,7 @@ from ..kernels.network import gradient_scaling as ends
 from ..kernels.network import perceptron as kernels
 from ..kernels.training.ordered_sums import LANES
 from .cuda import side_stream
-from .fused import launch as _launch
+from .fused import launch
 from .layers import LARGEST, SMALLEST, Form, LayerGradients, Layers
 
 
@@ -29,7 +30,7 @@ class FusedLayers(Layers):
         position = torch.empty(len(mean), columns, dtype=dtype, device=mean.device)
         if len(mean):
             dim = encoding.threads(len(mean), len(powers))
-            _launch(encoding.encode, dim, [mean, length, powers], [position])
+            launch(encoding.encode, dim, [mean, length, powers], [position])
         return position
 
     def forward(
@@ -42,21 +43,13 @@ class FusedLayers(Layers):
     ) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
         """Saves packed weights for ``backward``, the head, and the masks of the ReLUs."""
         keys, count, layers = len(time), len(position), len(weights) - 1
-        both = zip(weights, biases, strict=True)
-        parameters = torch.cat([value.reshape(-1) for pair in both for value in pair])
-        square, entry = form.width * form.width, form.width * form.columns
-        sizes = [(layers - 1) * square + len(form.entries) * entry, (layers - 1) * square]
-        sizes.append(wgmma.HEAD * form.width)
-        forth, back, head = position.new_empty(sum(sizes)).split(sizes)
-        shifts = time.new_empty(layers, keys, form.width)
+        forth, back, head, shifts = packed(form, time, weights, biases)
         outputs = position.new_empty(layers, keys * count, form.width)
         masks = shifts.new_empty(kernels.mask_words(layers, keys, count), dtype=torch.int32)
-        of, device = _layers(form, layers), _ready(position.device)
-        units = sum(sizes) // kernels.UNIT + shifts.numel()
-        _launch(kernels.pack, units, [of, parameters, time], [forth, back, head, shifts])
         if count:
-            rows = [of, keys, position, forth, shifts]
-            _launch(kernels.forward, _threads(device), rows, [outputs, masks])
+            rows = [sizes_of(form, layers), keys, position, forth, shifts]
+            threads = _threads(_ready(position.device))
+            launch(kernels.forward, threads, rows, [outputs, masks])
         return outputs, head.view(wgmma.HEAD, form.width), (back, weights[-1], masks)
 
     def backward(
@@ -66,7 +59,7 @@ class FusedLayers(Layers):
         back, head, masks = saved
         device, rows, layers = _ready(outputs.device), len(gradient), len(outputs)
         after, given = outputs.new_empty(rows, wgmma.HEAD), gradient.contiguous()
-        listed, begins = _list(gradient, keys, device)
+        listed, begins = listed_rows(gradient, keys)
         gradients = outputs.new_empty(layers, len(listed), form.width)
         unit, total = gradient.new_empty(1), gradient.new_empty(3)
         sums = gradient.new_empty(layers, keys, form.width)
@@ -74,16 +67,16 @@ class FusedLayers(Layers):
         partials = gradient.new_zeros(layers, keys, blocks, form.width)
         lanes, block = (1, 1) if device.is_cpu else (LANES, ends.BLOCK)
         parts = gradient.new_empty(-(-rows // lanes), 4)
-        _launch(ends.measure_rows, len(parts) * lanes, [given], [parts])
+        launch(ends.measure_rows, len(parts) * lanes, [given], [parts])
         dim, inputs = max(-(-rows // block), 1) * block, [given, parts, SMALLEST, LARGEST]
-        _launch(ends.scale_rows, dim, inputs, [after, unit, total])
+        launch(ends.scale_rows, dim, inputs, [after, unit, total])
         if rows:
-            inputs = [_layers(form, layers), keys, listed, begins, after, head, back, outputs]
-            _launch(kernels.backward, _threads(device), [*inputs, masks], [gradients, partials])
+            inputs = [sizes_of(form, layers), keys, listed, begins, after, head, back, outputs]
+            launch(kernels.backward, _threads(device), [*inputs, masks], [gradients, partials])
         # only the products of the side stream depend on these sums
         with side_stream(outputs.device).fork():
             dim = layers * keys * (form.width // ends.COLUMNS) * block
-            _launch(ends.add_partials, dim, [block, partials], [sums])
+            launch(ends.add_partials, dim, [block, partials], [sums])
         return LayerGradients(
             unit.view(()), after, gradients, sums, total, listed, begins, partials
         )
@@ -104,31 +97,31 @@ class FusedLayers(Layers):
         if device.is_cuda:
             counts = weight_gradients.parts(device.sm_count, layers, entries)
         half, halves, width = weight_gradients.HALF, weight_gradients.HALVES, wgmma.WIDTH
-        shapes = _shapes(form, layers)
+        shapes = parameter_shapes(form, layers)
         found = time.new_empty(sum(map(math.prod, shapes)))
         by_outputs = time.new_empty(counts[0], halves * (layers - 1), half * width)
         by_positions = time.new_empty(counts[1], halves * entries, half * wgmma.COLUMNS)
         heads = parameter_gradients.HEAD_BLOCKS * counts[2]
         by_head = time.new_empty(heads, 1, wgmma.VALUES * width)
-        of, given = _layers(form, layers), [threads, len(time), listed, begins]
+        of, given = sizes_of(form, layers), [threads, len(time), listed, begins]
         with side.fork():
             inputs = [*given, gradients.head, outputs]
-            _launch(parameter_gradients.multiply_head, heads * threads, inputs, [by_head])
+            launch(parameter_gradients.multiply_head, heads * threads, inputs, [by_head])
         if layers > 1:
             dim, inputs = (
                 by_outputs.shape[:2].numel() * threads,
                 [*given, gradients.layers, outputs],
             )
-            _launch(weight_gradients.multiply_outputs, dim, inputs, [by_outputs])
+            launch(weight_gradients.multiply_outputs, dim, inputs, [by_outputs])
         with side.fork(wait=False):
             inputs = [*given, of.joined, gradients.layers, position]
             dim = by_positions.shape[:2].numel() * threads
-            _launch(weight_gradients.multiply_positions, dim, inputs, [by_positions])
+            launch(weight_gradients.multiply_positions, dim, inputs, [by_positions])
         side.join()
         inputs = [of, gradients.unit.view(1), gradients.sums, gradients.head_sum, time]
         size = layers * width + wgmma.VALUES, width + form.position + form.time + 1
         parts = [by_outputs, by_positions, by_head]
-        _launch(parameter_gradients.collect, size, [*inputs, *parts], [found])
+        launch(parameter_gradients.collect, size, [*inputs, *parts], [found])
         values = found.split([*map(math.prod, shapes)])
         return [value.view(shape) for value, shape in zip(values, shapes, strict=True)]
 
@@ -142,22 +135,41 @@ def fits(form: Form, device: torch.device) -> bool:
     return wp.device_from_torch(device).arch == wgmma.ARCHITECTURE
 
 
-def _list(gradient: Tensor, keys: int, device: wp.Device) -> tuple[Tensor, Tensor]:
+def packed(
+    form: Form, time: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor]
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Weights as halves in the order of the passes: forward, backward, those of the head; and the
+    biases with what gamma(t) of every key adds to them.
+    """
+    layers, both = len(weights) - 1, zip(weights, biases, strict=True)
+    parameters = torch.cat([value.reshape(-1) for pair in both for value in pair])
+    square, entry = form.width * form.width, form.width * form.columns
+    sizes = [(layers - 1) * square + len(form.entries) * entry, (layers - 1) * square]
+    sizes.append(wgmma.HEAD * form.width)
+    forth, back, head = time.new_empty(sum(sizes), dtype=torch.float16).split(sizes)
+    shifts = time.new_empty(layers, len(time), form.width)
+    units = sum(sizes) // kernels.UNIT + shifts.numel()
+    inputs = [sizes_of(form, layers), parameters, time]
+    launch(kernels.pack, units, inputs, [forth, back, head, shifts])
+    return forth, back, head, shifts
+
+
+def listed_rows(gradient: Tensor, keys: int) -> tuple[Tensor, Tensor]:
     """Rows that have a gradient, key by key, and where those of each key begin and end."""
-    count, given = len(gradient) // keys, gradient.contiguous()
+    count, given, device = len(gradient) // keys, gradient.contiguous(), _ready(gradient.device)
     blocks, threads = keys * -(-count // lists.BLOCK), 1 if device.is_cpu else lists.BLOCK
     integers = functools.partial(gradient.new_empty, dtype=torch.int32)
     listed, begins = integers(lists.capacity(keys, count)), integers(keys + 1)
     if count:
         counts, dim = integers(blocks), blocks * threads
-        _launch(lists.count_rows, dim, [threads, given, count], [counts])
-        _launch(lists.list_rows, dim, [threads, given, counts, count], [listed, begins])
+        launch(lists.count_rows, dim, [threads, given, count], [counts])
+        launch(lists.list_rows, dim, [threads, given, counts, count], [listed, begins])
     else:
         begins.zero_()
     return listed, begins
 
 
-def _shapes(form: Form, layers: int) -> list[tuple[int, ...]]:
+def parameter_shapes(form: Form, layers: int) -> list[tuple[int, ...]]:
     """Of weight and bias of every layer, then of the head."""
     inputs = [form.width * (number > 0) for number in range(layers)]
     for number in form.entries:
@@ -182,7 +194,8 @@ def _ready(device: torch.device) -> wp.Device:
 
 
 @functools.cache
-def _layers(form: Form, layers: int) -> kernels.Layers:
+def sizes_of(form: Form, layers: int) -> kernels.Layers:
+    """Sizes as kernels read them."""
     of = kernels.Layers()
     of.layers, of.joined = layers, -1 if form.joined is None else form.joined
     of.position, of.time = form.position, form.time
