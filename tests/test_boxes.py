@@ -14,7 +14,7 @@ from gftorf_warp.recon.padded import PaddedParameters
 from gftorf_warp.recon.settings import Batch
 from gftorf_warp.recon.stepper import Stepper
 from gftorf_warp.render.cuda import SLOTS, DeviceReadback, DeviceUpload
-from gftorf_warp.render.pair_capacity import READ_EVERY
+from gftorf_warp.render.pair_capacity import READ_EVERY, PairCapacity
 
 DEVICES = [
     "cpu",
@@ -129,23 +129,24 @@ def test_steps_read_pair_counts_now_and_then(deterministic, device, monkeypatch)
     settings = published(batch=Batch.FRAME)
     settings = replace(settings, render=replace(settings.render, deterministic=deterministic))
     state, steps = watched(settings, device, monkeypatch)
-    requested, results = [], {}
+    requested, results, replays = [], {}, []
     request, latest = DeviceReadback.request, DeviceReadback.latest
 
     def kept(self, *, wait):
         assert wait == deterministic
         found = latest(self, wait=wait)
+        replays.append(found)
         if found is not None:
-            results[steps._replays] = found
+            results[len(replays)] = found
         return found
 
     monkeypatch.setattr(
-        DeviceReadback, "request", lambda self: requested.append(steps._replays) or request(self)
+        DeviceReadback, "request", lambda self: requested.append(len(replays) + 1) or request(self)
     )
     monkeypatch.setattr(DeviceReadback, "latest", kept)
     while state.images < 40:
         steps.step()
-    assert requested == list(range(READ_EVERY, steps._replays + 1, READ_EVERY))
+    assert requested == list(range(READ_EVERY, len(replays) + 1, READ_EVERY))
     assert len(requested) >= 2
     if deterministic or device == "cpu":
         assert [*results] == requested
@@ -154,10 +155,16 @@ def test_steps_read_pair_counts_now_and_then(deterministic, device, monkeypatch)
 
 def test_the_capacity_grows_as_soon_as_a_count_is_near_it(monkeypatch):
     """In the very replay, on a CPU; without a readback nothing is learnt."""
-    _, steps = watched(published(batch=Batch.FRAME), "cpu", monkeypatch)
-    read = []
-    monkeypatch.setattr(steps._capacity, "is_nearly_full", lambda _: True)
-    monkeypatch.setattr(steps, "_read_counts", lambda: read.append(steps._replays))
-    for _ in range(3 * READ_EVERY):
-        steps._watch_pairs()
-    assert read == [READ_EVERY, 2 * READ_EVERY, 3 * READ_EVERY]
+    settings = published(batch=Batch.FRAME)
+    settings = replace(settings, densify=replace(settings.densify, every=None))
+    _, steps = watched(settings, "cpu", monkeypatch)
+    replays, learnt, latest = [], [], DeviceReadback.latest
+    monkeypatch.setattr(
+        DeviceReadback, "latest", lambda self, **k: replays.append(latest(self, **k)) or replays[-1]
+    )
+    monkeypatch.setattr(PairCapacity, "is_nearly_full", lambda *_: True)
+    monkeypatch.setattr(PairCapacity, "learn", lambda *_, **__: learnt.append(len(replays)))
+    while len(replays) < 3 * READ_EVERY:
+        steps.step()
+    later = {count for count in learnt if count >= READ_EVERY}  # new stages also read counts
+    assert later == {READ_EVERY, 2 * READ_EVERY, 3 * READ_EVERY}

@@ -138,14 +138,17 @@ def test_a_large_gaussian_is_split_in_two_smaller_ones_drawn_from_itself():
 def test_halves_have_the_spread_of_the_original():
     """Their covariance is that of the Gaussian they came from."""
     n = 4000
-    whole = field(torch.zeros(n, 3), None)
-    whole = replace(
-        whole,
-        log_scale=torch.tensor([0.3, 0.2, 0.1]).log().repeat(n, 1),
-        quaternion=random(1, 4).repeat(n, 1),
+    adam = optimiser(n)
+    with torch.no_grad():
+        adam.tensors["mean"].zero_()
+        adam.tensors["log_scale"].copy_(torch.tensor([0.3, 0.2, 0.1]).log().expand(n, 3))
+        adam.tensors["quaternion"].copy_(random(1, 4).expand(n, 4))
+    whole = adam.field.map(lambda tensor: tensor.detach().clone())
+    counts, _ = densify.densify(
+        adam, statistics(*[1.0] * n), SETTINGS, generator(), prunes_scale=False
     )
-    local = torch.randn(1, n, 3, generator=generator()) * whole.scale
-    drawn = densify._rotated(whole.quaternion, local)[0]
+    assert counts == {"cloned": 0, "split": n, "pruned": 0}
+    drawn = adam.field.mean.detach()
     w, x, y, z = torch.nn.functional.normalize(whole.quaternion[0], dim=0).tolist()
     rotation = torch.tensor(
         [
@@ -155,7 +158,7 @@ def test_halves_have_the_spread_of_the_original():
         ]
     )
     want = rotation @ torch.diag(torch.tensor([0.09, 0.04, 0.01])) @ rotation.T
-    torch.testing.assert_close(drawn.T @ drawn / n, want, rtol=0, atol=0.006)
+    torch.testing.assert_close(drawn.T @ drawn / len(drawn), want, rtol=0, atol=0.006)
 
 
 def test_faint_gaussians_are_pruned_and_the_floor_holds():

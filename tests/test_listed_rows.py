@@ -15,7 +15,6 @@ from test_wgmma_by_threads import BACKWARD, BLOCKS, COMPILER, FORWARD, run, stor
 
 from gftorf_warp.kernels.network import gradient_rows as lists
 from gftorf_warp.kernels.network import parameter_gradients as ends
-from gftorf_warp.kernels.network import perceptron as kernels
 from gftorf_warp.kernels.network import weight_gradients, wgmma
 from gftorf_warp.render import tensor_cores
 from gftorf_warp.render.bridge import array_over

@@ -87,7 +87,7 @@ def test_a_state_is_moved_to_the_bit_and_the_rest_is_padding(motion):
         assert torch.equal(getattr(one.statistics, name), getattr(other.statistics, name))
     assert (padded.values["opacity_logit"][count:] == PADDING_LOGIT).all()
     assert all(bool(value.isfinite().all()) for value in padded.values.values())
-    for _, *moments in padded.table()._moments[: len(padded.values)]:
+    for _, *moments in padded.moments.values():
         assert not any(moment[count:].any() for moment in moments)
     assert not padded.statistics.earlier[count:].any()
 
@@ -109,7 +109,7 @@ def test_rows_of_removed_gaussians_become_padding():
     assert not padded.attach(state)
     assert (padded.values["opacity_logit"][count:] == PADDING_LOGIT).all()
     assert (state.optimiser.tensors["opacity_logit"] > PADDING_LOGIT).all()
-    for _, *moments in padded.table()._moments[: len(padded.values)]:
+    for _, *moments in padded.moments.values():
         assert all(moment[:count].any() and not moment[count:].any() for moment in moments)
     padded.statistics.weight[:] = 1.0
     assert not padded.attach(state)

@@ -273,8 +273,12 @@ def test_rows_may_go_through_the_layers_in_parts(monkeypatch):
     made, gaussians, cotangent = network(half()), positions(172), random(2, 172, 3)
     whole = gradients(made, gaussians, cotangent, [0, 2])
     monkeypatch.setattr(cublas, "PIECE", 60)
-    assert [end - begin for _, begin, end in cublas._pieces(2, 172)] == [57, 57, 58] * 2
+    rows, product = [], torch._addmm_activation
+    monkeypatch.setattr(
+        torch, "_addmm_activation", lambda *a, **k: rows.append(len(a[1])) or product(*a, **k)
+    )
     parts = gradients(made, gaussians, cotangent, [0, 2])
+    assert sorted({*rows}) == [57, 58]
     for one, other in zip([parts[0], *parts[1]], [whole[0], *whole[1]], strict=True):
         assert other.abs().max() > 0
         assert distance(one, other) < 1e-3
@@ -286,10 +290,19 @@ def test_sums_over_rows_are_those_of_their_key(keys, count):
     """Also of more keys than 16 bytes hold, and of a number of rows that no power of two
     divides.
     """
-    slopes = random(2, keys * count, 4).double()
-    torch.testing.assert_close(
-        cublas._sums(slopes, keys, torch.float64), slopes.view(2, keys, count, 4).sum(2)
-    )
+    made = network(half()).double()
+    form = Form.of(made, torch.float64)
+    binding = encoded(positions(count).mean.double() / made.length, made.powers)
+    parameters = [*made.layers, made.head]
+    weights, biases = ([getattr(p, n).detach() for p in parameters] for n in ("weight", "bias"))
+    layers = cublas.CublasLayers()
+    binding = torch.nn.functional.pad(binding, (0, form.columns - form.position))
+    time = made.time_encodings[[k % 3 for k in range(keys)]]
+    outputs, _, saved = layers.forward(form, binding, time, weights, biases)
+    found = layers.backward(form, keys, random(keys * count, 3).double(), outputs, saved)
+    want = found.layers.unflatten(1, (keys, count)).sum(2)
+    assert want.abs().max() > 0
+    torch.testing.assert_close(found.sums, want)
 
 
 def test_a_loss_without_gradient_has_none():

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+import warp as wp
 from cases import gaussians
 
 from gftorf_warp.constants import CANONICAL_SHIFTS
@@ -50,6 +51,11 @@ def run(request, tmp_path):
         motion=motion,
         binding=motion.bind(field),
     )
+
+
+def counting(function, calls):
+    """The function, which adds its first argument to a list."""
+    return lambda first, *rest, **named: calls.append(first) or function(first, *rest, **named)
 
 
 def aside(x):
@@ -125,11 +131,13 @@ def test_an_empty_field_renders_black(run):
 def test_cameras_of_one_size_share_memory(run):
     """Poses and focal lengths are data; another size, or a lens, has memory of its own."""
     render, bent = run.renderer(PLAIN), replace(CAMERA, distortion=Distortion(k1=-0.1))
+    memory = set()
     long = replace(aside(0.1), fx=1.3 * CAMERA.fx, cy=0.4 * CAMERA.height)
     for camera in (CAMERA, aside(0.2), bent, long, CAMERA.resized(20, 15), bent, CAMERA):
         got, want = render(0.02, camera), run.render(0.02, camera)
         torch.testing.assert_close(got.distance, want.distance, rtol=1e-4, atol=1e-4)
-    assert len(render._targets) == 3
+        memory.add(got.distance.data_ptr())
+    assert len(memory) == 3
 
 
 @pytest.mark.parametrize("run", ["cpu"], indirect=True)
@@ -139,10 +147,12 @@ def test_a_size_is_captured_when_it_comes_again(run, monkeypatch):
     """
     captured, launched = [], []
     monkeypatch.setattr(
-        module.Replay, "_captured", lambda _, target: captured.append(target) or target
+        module.Replay, "capture", lambda _, target: captured.append(target) or target
     )
     monkeypatch.setattr(
-        module.Replay, "_launch", lambda self, target: launched.append(target) or self._draw(target)
+        module.Replay,
+        "launch",
+        lambda self, target: launched.append(target) or self.launch_kernels(target),
     )
     render = run.renderer(PLAIN)
     render.graphs = True
@@ -151,33 +161,37 @@ def test_a_size_is_captured_when_it_comes_again(run, monkeypatch):
         torch.testing.assert_close(got.distance, want.distance, rtol=1e-4, atol=1e-4)
         assert render.fits()
         if number == 0:
-            first = render._capacity.pairs
+            first = render.capacity
             assert first >= 1.5 * render.largest
     assert len(captured) == 1, "once per size"
     assert len(launched) == 2 * len(TIMES) - 2, (
         "not the one that counts pairs, nor the first one after it"
     )
-    assert render._capacity.pairs == first, "pairs fitted"
-    render._largest.fill_(10 * first)
+    assert render.capacity == first, "pairs fitted"
+    monkeypatch.setattr(module.Replay, "largest", 10 * first)
     assert not render.fits()
     render(0.01, CAMERA)
-    assert render._capacity.pairs >= 15 * first
+    assert render.capacity >= 15 * first
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 @pytest.mark.parametrize("run", ["cuda"], indirect=True)
-def test_a_replay_is_a_call_to_the_bit(run):
+def test_a_replay_is_a_call_to_the_bit(run, monkeypatch):
     """Graph and launches give the same images; the graph was used."""
     graphs, calls = run.renderer(PLAIN), run.renderer(PLAIN)
     calls.graphs = False
+    launched = []
+    monkeypatch.setattr(wp, "capture_launch", counting(wp.capture_launch, launched))
     for time in (*TIMES, *TIMES):
-        got, want = graphs(time, CAMERA), calls(time, CAMERA)
+        got = graphs(time, CAMERA)
+        count = len(launched)
+        want = calls(time, CAMERA)
+        assert len(launched) == count
         for name in ("quads", "phasor", "distance", "opacity", "distortion"):
             torch.testing.assert_close(
                 getattr(got, name), getattr(want, name), rtol=0, atol=0, msg=name
             )
-    assert all(target.graph is not None for target in graphs._targets.values())
-    assert all(target.graph is None for target in calls._targets.values())
+    assert len(launched) == 2 * len(TIMES) - 2
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
@@ -188,8 +202,7 @@ def test_pairs_that_do_not_fit_are_rendered_again(run):
     """
     render = run.renderer(PLAIN)
     render(0.0, CAMERA)
-    render._capacity.pairs = 10
-    render._targets.clear()
+    render.reserve(10)
     render(0.02, CAMERA, checked=False)
     assert not render.fits()
     got, want = render(0.02, CAMERA), run.render(0.02)

@@ -20,7 +20,6 @@ import pytest
 import torch
 from test_perceptron import half, network, positions
 
-from gftorf_warp.kernels.network import perceptron as kernels
 from gftorf_warp.kernels.network import wgmma
 from gftorf_warp.render.tensor_cores import FusedLayers, packed
 from gftorf_warp.scene.motion import MotionSettings

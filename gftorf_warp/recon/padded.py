@@ -44,7 +44,8 @@ class PaddedParameters:
         self._unnecessary = 0  # rows, summed over steps
         self.values: dict[str, Tensor] = {}
         """All rows of the tensors of the field, by name of their group."""
-        self._moments: dict[str, Moments] = {}
+        self.moments: dict[str, Moments] = {}
+        """Moments of all rows, by name as well."""
         self._views: dict[str, Tensor] = {}
         self.motion: list[Tensor] = []
         """Parameters of the motion."""
@@ -63,7 +64,7 @@ class PaddedParameters:
     def table(self) -> AdamTable:
         """Addresses of all tensors, without gradients."""
         values = [leaf.detach() for leaf in self.leaves]
-        return AdamTable(values, [*self._moments.values(), *self._motion_moments])
+        return AdamTable(values, [*self.moments.values(), *self._motion_moments])
 
     def holds(self, state: State) -> bool:
         """Whether the tensors of a state are still views of these."""
@@ -105,7 +106,7 @@ class PaddedParameters:
             (getattr(self.statistics, name), getattr(state.statistics, name)) for name in STATISTICS
         ]
         _copy(pairs, count)
-        moments = [moment for _, *both in self._moments.values() for moment in both]
+        moments = [moment for _, *both in self.moments.values() for moment in both]
         torch._foreach_zero_([rows[count:] for rows in (*moments, *vars(self.statistics).values())])
         self.values["opacity_logit"].detach()[count:] = PADDING_LOGIT
         self.mean_weight[:count] = 1.0 / max(count, 1)
@@ -135,7 +136,7 @@ class PaddedParameters:
         for name, value in self.values.items():
             value[:] = tensors[name][:1]
             value.requires_grad_()
-        self._moments = {
+        self.moments = {
             name: (tensor.new_zeros(()), like(tensor), like(tensor))
             for name, tensor in tensors.items()
         }
@@ -153,7 +154,7 @@ class PaddedParameters:
 
     def _take(self, state: State, name: str, tensor: Tensor) -> list[tuple[Tensor, Tensor]]:
         """Make one tensor of a state and its moments views; returns what to copy where."""
-        value, (step, first, second) = self.values[name].detach(), self._moments[name]
+        value, (step, first, second) = self.values[name].detach(), self.moments[name]
         known, count = state.optimiser.moments_of(tensor), len(tensor)
         copies: list[tuple[Tensor, Tensor]] = []
         if self._views.get(name) is not tensor:

@@ -138,6 +138,16 @@ class Replay:
             self._capacity.learn(self.largest, is_sorted=is_sorted)
         self._targets.clear()
 
+    def reserve(self, pairs: int) -> None:
+        """Set the pair capacity of the next renderings; release memory and graphs."""
+        self._capacity.pairs = pairs
+        self._targets.clear()
+
+    @property
+    def capacity(self) -> int | None:
+        """(tile, splat) pairs with memory in a rendering; None: as many as it has."""
+        return self._capacity.pairs
+
     @property
     def largest(self) -> int:
         """Largest number of (tile, splat) pairs of a rendering so far; synchronises."""
@@ -153,13 +163,13 @@ class Replay:
         target = self._targets[size]
         known = self.graphs and self._capacity.pairs is not None
         if known and target.used and target.graph is None:
-            target.graph = self._captured(target)
+            target.graph = self.capture(target)
         self._gaussians.move(time, camera)
         with stream_of(self._like):
             if target.graph is None:
-                self._draw(target)
+                self.launch_kernels(target)
             else:
-                self._launch(target.graph)
+                self.launch(target.graph)
         target.used = True
         if self.graphs and self._capacity.pairs is None:
             self.grow()
@@ -167,17 +177,17 @@ class Replay:
             target.tensors["colour"].div_(self.colour_scale)
         return target
 
-    def _captured(self, target: Target) -> wp.Graph:
+    def capture(self, target: Target) -> wp.Graph:
         """Capture a rendering on Warp's stream: torch's default stream cannot be captured."""
         with without_garbage_collection(), wp.ScopedCapture(device=self.device) as capture:
-            self._draw(target)
+            self.launch_kernels(target)
         return capture.graph
 
-    def _launch(self, graph: wp.Graph) -> None:
+    def launch(self, graph: wp.Graph) -> None:
         """Launch a graph on the current stream, which is torch's."""
         wp.capture_launch(graph, stream=self.device.stream)
 
-    def _draw(self, target: Target) -> None:
+    def launch_kernels(self, target: Target) -> None:
         """The launches of a rendering, and of storing its number of pairs."""
         inputs, buffers = self._gaussians.inputs, target.buffers
         launch.forward(inputs, target.view, buffers, target.images, differentiable=False)
