@@ -209,7 +209,7 @@ def _tables(
     defined = "".join(
         f"* {row.name}: {', '.join((row.preset, *row.changes))}\n" for row in options.rows
     )
-    parts = [head, defined, "\n", table.summary(rows, results), "\n"]
+    parts = [head, defined, "\n", table.summary(rows, scenes, results), "\n"]
     parts += [table.details(rows, scenes, results), "\n", table.failures([*scenes, *results])]
     return "".join(parts)
 

@@ -17,15 +17,15 @@ Result = dict[str, Any]
 PARTS = ("all", "moving", "static")
 NONE = "-"
 SUMMARY = (
-    "row", "d / closed form", "d_ToF / closed form", "d / temporal", "static: interior, throughout",
-    "worst scene", "worse than closed form", "than temporal", "seeds max / min", "chi-square",
-    "seconds", "Gaussians", "failed",
+    "row", "d / closed form", "d_ToF / closed form", "d / temporal", "static interior, throughout",
+    "worst scene", "worse than closed form", "than temporal", "seeds max / min",
+    "chi-square, unexplained", "seconds", "Gaussians", "failed",
 )  # fmt: skip
 
 
 def error_of(result: Result, distance: str, part: str) -> float | None:
     """Error of a distance (``d``, ``d_tof``, ``closed_form``, ``temporal``) on ``all``, ``moving``
-    or ``static`` pixels, those static ``throughout`` the sequence, or the static ``interior``.
+    or ``static`` pixels, ``static_throughout`` the sequence, or the ``interior`` of static ones.
     """
     scores = result["scores"]
     if part == "interior":
@@ -71,14 +71,31 @@ def worst_first(results: Iterable[Result]) -> list[Result]:
     return sorted(results, key=lambda fit: -max(ratio(fit, part) or 0.0 for part in PARTS))
 
 
-def summary(rows: Sequence[str], results: Sequence[Result]) -> str:
-    """A line for each row, over all scenes of ``results``."""
-    lines = []
+def summary(rows: Sequence[str], scenes: Sequence[Result], results: Sequence[Result]) -> str:
+    """A line for each row, over all scenes, below one for the edge floor."""
+    floors = [_floor_as_fit(scene, results) for scene in scenes]
+    known = [floor for floor in floors if floor is not None]
+    lines = [["edge floor", *_line(known), NONE]] if known else []
     for row in rows:
         mine = [result for result in results if result.get("row") == row]
         fits = [result for result in mine if "error" not in result]
         lines.append([row, *_line(fits), str(len(mine) - len(fits))])
     return _table(SUMMARY, lines)
+
+
+def _floor_as_fit(scene: Result, results: Iterable[Result]) -> Result | None:
+    """A fit whose d is wrong by the edge floor alone; None if floor or closed form is unknown."""
+    of_scene = (each for each in results if each["scene"] == scene["scene"] and "scores" in each)
+    fit, floor = next(of_scene, None), scene.get("floor")
+    if fit is None or not floor:
+        return None
+    scores: dict[str, Any] = {}
+    for part in PARTS:
+        kept = {
+            f"{name}_mse_x100": error_of(fit, name, part) for name in ("closed_form", "temporal")
+        }
+        scores[part] = {**kept, "d_mse_x100": floor[part]}
+    return {"scene": scene["scene"], "scores": scores | scores.pop("all")}
 
 
 def _line(fits: list[Result]) -> list[str]:
@@ -91,8 +108,10 @@ def _line(fits: list[Result]) -> list[str]:
     worst = max(means, key=lambda name: means[name] or 0.0)
     spreads = [_spread(each) for each in scenes.values()]
     known = [spread for spread in spreads if spread is not None]
-    chi = geometric_mean(fit["scores"].get("chi_square") for fit in fits)
-    seconds = [fit["seconds"] for fit in fits]
+    explained = [fit["scores"].get("explained") or {} for fit in fits]
+    chi = geometric_mean(each.get("reduced_chi_square") for each in explained)
+    shares = [share for each in explained if (share := each.get("unexplained_share")) is not None]
+    seconds = [fit["seconds"] for fit in fits if "seconds" in fit]
 
     def means_of(distance: str, over: str, parts: Iterable[str] = PARTS) -> str:
         return _three(
@@ -111,14 +130,15 @@ def _line(fits: list[Result]) -> list[str]:
         means_of("d", "closed_form"),
         means_of("d_tof", "closed_form"),
         means_of("d", "temporal"),
-        means_of("d", "temporal_mean", ("interior", "throughout")),
+        f"{means_of('d', 'temporal', ['interior'])}, "
+        f"{means_of('d', 'temporal_mean', ['static_throughout'])}",
         f"{worst} {_number(means[worst])}",
         worse_than("closed_form"),
         worse_than("temporal"),
         f"{_number(geometric_mean(known))}, {_number(max(known))}" if known else NONE,
-        _number(chi),
-        f"{np.median(seconds):.1f}, {max(seconds):.1f}",
-        f"{int(np.median([fit['gaussians'] for fit in fits]))}",
+        f"{_number(chi)}, {100 * np.mean(shares):.2g} %" if shares else NONE,
+        f"{np.median(seconds):.1f}, {max(seconds):.1f}" if seconds else NONE,
+        f"{int(np.median([fit['gaussians'] for fit in fits]))}" if seconds else NONE,
     ]
 
 

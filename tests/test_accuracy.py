@@ -41,7 +41,9 @@ def result(row, scene, seed, d, closed=(1.0, 1.0, 1.0), **more):
     for part, error, other in zip(("all", "moving", "static"), d, closed, strict=True):
         named = {"d": error, "d_tof": error, "closed_form": other, "temporal": 0.5 * other}
         scores[part] = {f"{name}_mse_x100": value for name, value in named.items()}
-    interior = {"d_mse_x100": d[2], "temporal_mean_mse_x100": 0.25}
+    interior = {"d_mse_x100": d[2], "temporal_mse_x100": 0.25}
+    scores["static_throughout"] = {"d_mse_x100": d[2], "temporal_mean_mse_x100": 0.5}
+    scores["explained"] = {"reduced_chi_square": 2.0, "unexplained_share": 0.01}
     scores |= scores.pop("all") | {"classes": {"static": {"interior": interior}}}
     return {"row": row, "scene": scene, "seed": seed, "scores": scores} | {
         "id": f"{row}/{scene}/{seed}",
@@ -180,17 +182,18 @@ def test_the_summary_is_means_over_scenes_and_seeds():
         result("a", "two", 1, (0.8, 0.4, 0.9)),
         {"row": "a", "scene": "two", "seed": 2, "id": "a/two/2", "error": "no memory"},
     ]
-    line = accuracy_table.summary(["a", "b"], results).splitlines()[2].split(" | ")
+    floor = {"all": 0.1, "moving": None, "static": 0.05}
+    scenes = [{"scene": "one", "about": "text", "floor": floor}, {"scene": "two"}]
+    lines = accuracy_table.summary(["a", "b"], scenes, results).splitlines()
+    assert lines[2].startswith("| edge floor | 0.1 / - / 0.05 | - / - / - | 0.2 / - / 0.1 |")
+    line = lines[3].split(" | ")
     assert line[1] == "0.4 / 0.283 / 0.883"
-    assert line[3:5] == ["0.8 / 0.566 / 1.77", "3.53 / -"]
+    assert line[3:5] == ["0.8 / 0.566 / 1.77", "3.53, 1.77"]
     assert line[5:7] == ["two 0.8", "1 of 2 scenes, 1 of 4 fits"]
-    assert line[7:9] == ["2 of 2 scenes, 3 of 4 fits", "2, 4"]
+    assert line[7:10] == ["2 of 2 scenes, 3 of 4 fits", "2, 4", "2, 1 %"]
     assert line[-1] == "1 |"
-    assert accuracy_table.summary(["b"], results).splitlines()[2].count("-") >= 9
+    assert lines[4].count("-") >= 9
     assert accuracy_table.worst_first(results[:4])[0]["id"] == "a/one/1"
     assert "a/two/2: no memory" in accuracy_table.failures(results)
-    scenes = [
-        {"scene": "one", "about": "text", "floor": {"all": 0.01, "moving": None, "static": 0}}
-    ]
     row = accuracy_table.details(["a"], scenes, results).splitlines()[2]
-    assert row == "| one | text | 1 / 1 / 1 | 0.01 / - / 0 | 0.25 / 0.2 / 1 **worse** |"
+    assert row == "| one | text | 1 / 1 / 1 | 0.1 / - / 0.05 | 0.25 / 0.2 / 1 **worse** |"

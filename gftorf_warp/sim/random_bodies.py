@@ -36,7 +36,7 @@ def drawn_shape(
 ) -> tuple[str, Shape]:
     """A shape with its name; ``height`` [m] is that of poles."""
     kind = str(draw.choice(MOVING if moves else AT_REST))
-    thin = unit * _between(draw, 0.03, 0.12)
+    thin = unit * _between(draw, 0.04, 0.18)
     long = unit * draw.uniform(0.6, 1.3)
     shape: Shape
     if kind == "ball":
@@ -48,7 +48,7 @@ def drawn_shape(
         shape = Box(size=(long, unit * draw.uniform(0.4, 1.2), 0.3 * thin))
     elif kind == "frame":
         wide = unit * draw.uniform(0.35, 0.9)
-        shape = _frame(wide, long, max(0.5 * thin, 0.025 * unit))
+        shape = _frame(wide, long, max(0.5 * thin, 0.03 * unit))
     else:
         shape = Box(size=(thin, height if kind == "pole" else long, thin))
     return kind, shape

@@ -33,6 +33,7 @@ TIMES = np.arange(FRAMES) / FRAME_RATE_HZ  # [s]
 FULL_RANGE = 7.5  # [m] unambiguous range for which lengths are given
 FAR = 0.97  # [1] share of the unambiguous range that the farthest corner of a room has at most
 NEAR = 0.6  # [m] between camera and bodies, at any frequency
+APART = 1.1  # [m] the same in the middle of the sequence, where bodies are placed
 WALL, WALLS = 0.2, 5  # [m] thickness of walls, and their number
 ORDERS = (CANONICAL_SHIFTS, CANONICAL_SHIFTS, PALINDROMIC, SEQUENTIAL)
 LOOK, SEEN = (80, 60), 30  # [px] an image, and the pixels of it in which a moving body is seen
@@ -74,7 +75,7 @@ def random_scene(number: int) -> Scene:
     Drawn are: 20 or 60 MHz and the order of the shifts; room, field of view and direction of the
     camera; bodies (boxes, balls, poles, panels, sticks, frames of thin bars), sizes, reflectances
     and textures; straight, axial, circular, swinging, oscillating and turning motion, 0.2 to 4 m
-    within 60 raw frames at 20 MHz; light over a factor of 50, so that the noise of the closed form
+    within 60 raw frames at 20 MHz; light over a factor of 60, so that the noise of the closed form
     varies by more than a decade, and ambient light in a third of the scenes.
 
     Raises:
@@ -113,7 +114,7 @@ def random_scene(number: int) -> Scene:
 def _sensor(draw: np.random.Generator, unit: float) -> Sensor:
     """Frequency, order of shifts, light and ambient light; neither full well nor quantisation."""
     # amplitudes are as large at both scales: nearer surfaces, less light
-    light = 3.144e5 * unit**2 * 10.0 ** draw.uniform(0.0, 1.7)
+    light = 3.144e5 * unit**2 * 10.0 ** draw.uniform(-0.4, 1.4)
     ambient = 10.0 ** draw.uniform(4.0, 5.0) if draw.random() < 1 / 3 else 0.0
     return Sensor(
         f_mod_hz=SPEED_OF_LIGHT / (2.0 * FULL_RANGE * unit),
@@ -159,7 +160,7 @@ def _with_body(
     """The scene with one more body, and what that is; drawn again until it fits."""
     while True:
         kind, shape = drawn_shape(draw, unit, moves, STANDING * (room.floor - room.top))
-        x, y, z = _point_in_view(draw, scene, room, shape.reach)
+        x, y, z = _point_in_view(draw, scene, room, unit, shape.reach)
         if kind == "pole":
             y = (room.top + room.floor) / 2
         if moves:
@@ -177,12 +178,12 @@ def _with_body(
 
 
 def _point_in_view(
-    draw: np.random.Generator, scene: Scene, room: Room, reach: float
+    draw: np.random.Generator, scene: Scene, room: Room, unit: float, reach: float
 ) -> tuple[float, float, float]:
     """A point in the inner part of the image, in world axes [m]."""
     camera = scene.camera()
     u, v = draw.uniform((-0.8, -0.75), (0.8, 0.75))
-    nearest = NEAR + reach
+    nearest = max(NEAR, APART * unit) + reach
     z = draw.uniform(nearest, max(0.85 * room.back, 1.1 * nearest))
     local = z * np.array((u * camera.width / 2 / camera.fx, v * camera.height / 2 / camera.fy, 1.0))
     x, y, z = (scene.camera_path.world_from_body(0.0)[:3, :3] @ local).tolist()
