@@ -102,10 +102,6 @@ SENTINELS = {  # kernel.parameter or struct.field: why a number may mean somethi
     "number_pairs.owners": "what is written where no pair is, and read by nobody",
     "trace_hits.body": "the constant NOTHING",
     "Emitter.power": "cosine ** 0 is 1: the limit, and no case",
-    "Emitter.spread": "still to be said otherwise",
-    "CameraView.radius": "still to be said otherwise",
-    "Solid.radius": "still to be said otherwise",
-    "Layers.joined": "still to be said otherwise",
 }
 HOMELESS = {"utils", "util", "common", "misc", "types", "helpers"}
 

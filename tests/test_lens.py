@@ -58,7 +58,7 @@ def look(view: CameraView, at: wp.array[wp.vec2], rays: wp.array[wp.vec3], seen:
     away.
     """
     i = wp.tid()
-    rays[i] = ray_through(view, at[i][0], at[i][1])
+    rays[i] = ray_through(view, True, at[i][0], at[i][1])
     slope = distorted(view, at[i][0], at[i][1])
     seen[i] = wp.vec2(view.fx * slope[0] + view.cx, view.fy * slope[1] + view.cy)
 

@@ -169,7 +169,7 @@ def test_slopes_by_a_block_of_threads(layers, skip_after, count, keys, share, tm
     made = network(half(MotionSettings(layers=layers, skip_after=skip_after)))
     form, place, moment, all_weights, biases = inputs_of(made, count, keys)
     forth, _, _, shifts = tensor_cores.packed(form, moment, all_weights, biases)
-    numbers = layers, -1 if form.joined is None else form.joined, keys, count
+    numbers = layers, form.entries[-1], keys, count
     stored(tmp_path, place=place.numpy(), forth=forth.numpy(), shifts=shifts.numpy())
     run(tmp_path, FORWARD, wgmma.rows_forward, *numbers)
     outputs = read(tmp_path / "outputs", np.float16).view(layers, keys * count, WIDTH)

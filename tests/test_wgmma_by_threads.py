@@ -446,7 +446,7 @@ def test_a_block_of_threads_is_row_by_row(layers, skip_after, count, keys, tmp_p
     weights, biases = (tuple(values) for values in zip(*both, strict=True))
     outputs, _, _ = FusedLayers().forward(form, place, moment, weights, biases)
     forth, _, _, shifts = packed(form, moment, weights, biases)
-    numbers = layers, -1 if form.joined is None else form.joined, keys, count
+    numbers = layers, form.entries[-1], keys, count
     stored(tmp_path, place=place.numpy(), forth=forth.numpy(), shifts=shifts.numpy())
     run(tmp_path, FORWARD, wgmma.rows_forward, *numbers)
     found = torch.from_numpy(np.fromfile(tmp_path / "outputs", np.float16)).view_as(outputs)

@@ -20,7 +20,7 @@ class CameraView:
     height: int  # rows [px]
     near: float  # smallest z-depth [m]
     far: float  # largest z-depth [m]
-    radius: float  # of the disc in which a lens follows its polynomial [1]; 0: a pinhole
+    radius: float  # of the disc in which a lens follows its polynomial [1]; unused by a pinhole
     guard_x: float  # largest slope x/z at which such a lens has its derivative taken [1]
     guard_y: float  # largest slope y/z likewise [1]
     k1: float  # of the lens, as OpenCV names them [1]

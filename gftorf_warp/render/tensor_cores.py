@@ -197,7 +197,7 @@ def _ready(device: torch.device) -> wp.Device:
 def sizes_of(form: Form, layers: int) -> kernels.Layers:
     """Sizes as kernels read them."""
     of = kernels.Layers()
-    of.layers, of.joined = layers, -1 if form.joined is None else form.joined
+    of.layers, of.joined = layers, form.entries[-1]
     of.position, of.time = form.position, form.time
     return of
 

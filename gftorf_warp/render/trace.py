@@ -37,8 +37,8 @@ class RigidBody:
     triangles: Int[np.ndarray, "T 3"] | None = None
     """Three vertices each, counter-clockwise as seen from the side of the normal; None: no
     triangles."""
-    radius: float = 0.0
-    """Radius of a ball [m]; 0: no ball."""
+    radius: float | None = None
+    """Radius of a ball [m]; None: no ball."""
     centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Centre of the ball [m]; the texture is that of the body's axes all the same."""
     normal: tuple[float, float, float] | None = None
@@ -61,10 +61,12 @@ class RigidBody:
             got = f"{self.gloss} and {self.shininess}"
             raise ValueError(f"gloss must be 0 to 1, shininess 0 or more and finite, got {got}")
         meshed = self.points is not None or self.triangles is not None
-        if self.radius > 0 or self.normal is not None:
-            if meshed or (self.radius > 0) == (self.normal is not None):
+        if self.radius is not None or self.normal is not None:
+            if meshed or (self.radius is None) == (self.normal is None):
                 got = f"radius {self.radius}, normal {self.normal}"
                 raise ValueError(f"a body is a ball, a plane or triangles, not both: {got}")
+            if self.radius is not None and not 0 < self.radius < math.inf:
+                raise ValueError(f"radius must be above 0 and finite, got {self.radius}")
             if not np.isfinite([*self.centre, self.height]).all():
                 got = f"{self.centre} and {self.height}"
                 raise ValueError(f"centre and height must be finite, got {got}")
@@ -85,7 +87,7 @@ class RigidBody:
     def reach(self) -> float:
         """Distance of the farthest point from the centre [m]; unused for a plane."""
         if self.points is None:
-            return self.radius
+            return self.radius or 0.0
         return float(np.linalg.norm(self.points, axis=1).max())
 
 
@@ -229,7 +231,7 @@ class Tracer:
             raise ValueError(f"subsamples must be at least 1 and f_mod_hz above 0, got {got}")
         view = self._view(cameras[0])
         poses = self._place(cameras, world_from_body)
-        inputs = [view, _emitter(lamp, f_mod_hz), self._harmonics, self._solids, *poses]
+        inputs = [*view, _emitter(lamp, f_mod_hz), self._harmonics, self._solids, *poses]
         self._over_rows(light_paths.trace_light, [*inputs, subsamples], self._direct)
         direct, amplitude, ambient = (array.numpy().copy() for array in self._direct)
         total, error = amplitude, np.zeros_like(amplitude)
@@ -257,15 +259,16 @@ class Tracer:
         """
         view = self._view(camera)
         poses = self._place([camera], world_from_body[None])
-        self._over_rows(rays.trace_hits, [view, self._solids, *poses], self._hits)
+        self._over_rows(rays.trace_hits, [*view, self._solids, *poses], self._hits)
         distance, z_depth, normal, body = (array.numpy().copy() for array in self._hits)
         return FirstHits(distance=distance, z_depth=z_depth, normal=normal, body=body)
 
-    def _view(self, camera: Camera) -> CameraView:
+    def _view(self, camera: Camera) -> tuple[CameraView, bool]:
+        """The camera as kernels read it, and whether it is no pinhole."""
         if (camera.width, camera.height) != (self.width, self.height):
             want = f"{self.width}x{self.height}"
             raise ValueError(f"camera {camera.width}x{camera.height} must be {want}")
-        return view_of(camera, RenderSettings())
+        return view_of(camera, RenderSettings()), bool(camera.distortion)
 
     def _place(
         self, cameras: Sequence[Camera], world_from_body: np.ndarray
@@ -322,6 +325,7 @@ def _emitter(lamp: Lamp, f_mod_hz: float) -> light_paths.Emitter:
     emitter = light_paths.Emitter()
     emitter.place = wp.vec3(*lamp.position)
     across, down = lamp.beam_deg or (0.0, 0.0)
+    emitter.limited = lamp.beam_deg is not None
     emitter.spread = wp.vec2(math.tan(math.radians(across) / 2), math.tan(math.radians(down) / 2))
     emitter.cycles = f_mod_hz / SPEED_OF_LIGHT
     if lamp.beam is not None:
@@ -333,8 +337,11 @@ def _solids(bodies: Sequence[RigidBody], meshes: Sequence, device: wp.Device) ->
     solids = []
     for body, mesh in zip(bodies, meshes, strict=True):
         solid = rays.Solid()
+        ball_or_mesh = rays.BALL if mesh is None else rays.MESH
+        solid.shape = ball_or_mesh if body.normal is None else rays.PLANE
         solid.mesh = mesh.id if mesh is not None else wp.uint64(0)
-        solid.radius, solid.centre, solid.reach = body.radius, wp.vec3(*body.centre), body.reach
+        solid.radius, solid.centre = body.radius or 0.0, wp.vec3(*body.centre)
+        solid.reach = body.reach
         solid.normal, solid.height = wp.vec3(*(body.normal or (0.0, 0.0, 0.0))), body.height
         solid.low, solid.high, solid.cell = body.low, body.high, body.cell
         solid.gloss, solid.shininess = body.gloss, body.shininess

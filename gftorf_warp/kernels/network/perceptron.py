@@ -22,7 +22,7 @@ class Layers:
     """Sizes of a perceptron; parameters are one array, weight and bias of each layer in order."""
 
     layers: int  # without the head
-    joined: int  # number of the layer that gamma(x) and gamma(t) enter again; -1: none
+    joined: int  # number of the last layer that gamma(x) and gamma(t) enter, as the first one
     position: int  # values of gamma(x)
     time: int  # values of gamma(t)
 
@@ -50,7 +50,7 @@ def weight_of(form: Layers, number: int) -> int:
     at = number * (WIDTH * WIDTH + WIDTH)
     if number > 0:
         at += WIDTH * (form.position + form.time - WIDTH)
-    if form.joined >= 0 and number > form.joined:
+    if form.joined > 0 and number > form.joined:
         at += WIDTH * (form.position + form.time)
     return at
 
@@ -141,7 +141,7 @@ def first_part(form: Layers, number: int) -> int:
     parts = 4 * number
     if number > 0:
         parts -= 3
-    if form.joined >= 0 and number > form.joined:
+    if form.joined > 0 and number > form.joined:
         parts += 1
     return parts
 

@@ -169,7 +169,7 @@ _CUDA = f"""
 _FORWARD = f"""
 #if defined(__CUDA_ARCH__)
     {_CUDA}
-    const int parts = layers * 4 - 3 + (joined >= 0);
+    const int parts = layers * 4 - 3 + (joined > 0);
     const int all = parts * ((last - first + {ROUND - 1}) / {ROUND});
     int passed = 0;  // tiles of this group in all layers so far: shifts have two buffers
     auto layer = [&](auto kind, int number, int begin, int end) {{

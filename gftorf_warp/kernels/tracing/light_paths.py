@@ -34,7 +34,8 @@ class Emitter:
     """A point of light that shines into a pyramid about the z axis of the camera."""
 
     place: wp.vec3  # in camera axes [m]; zero: at the camera, without shadows
-    spread: wp.vec2  # tangents of half the angles across and down [1]; 0: into all directions
+    limited: bool  # whether it shines into the pyramid only, not into all directions
+    spread: wp.vec2  # tangents of half the angles across and down [1]; unused if not limited
     cycles: float  # modulation frequency over the speed of light [1/m]
     power: float  # exponent of the cosine to the z axis [1]; 0: even light
     factor: float  # of its light along the axis [1]; unused where it shines evenly
@@ -93,7 +94,7 @@ def received(
     cosine = -wp.dot(turn * towards, hit.normal) / reach
     across = emitter.spread[0] * towards[2]
     down = emitter.spread[1] * towards[2]
-    if emitter.spread[0] > 0.0 and (wp.abs(towards[0]) > across or wp.abs(towards[1]) > down):
+    if emitter.limited and (wp.abs(towards[0]) > across or wp.abs(towards[1]) > down):
         cosine = float(0.0)
     if cosine > 0.0 and may_be_hidden:
         limit = reach * (1.0 - SHADOW_GAP)
@@ -125,6 +126,7 @@ def turned(turns: float, weight: float) -> wp.vec2:
 def trace_light(
     # In:
     view: CameraView,  # intrinsics [px]
+    lens: bool,  # whether the camera is no pinhole [flag]
     emitter: Emitter,  # [m]
     harmonics: wp.array[int],  # [h] multiples of the modulation frequency
     solids: wp.array[Solid],  # [B]
@@ -150,7 +152,7 @@ def trace_light(
         for k in range(side * side):
             image_x = float(x) + (float(k % side) + 0.5) / float(side)
             image_y = float(y) + (float(k // side) + 0.5) / float(side)
-            ray = ray_through(view, image_x, image_y)
+            ray = ray_through(view, lens, image_x, image_y)
             hit = nearest(solids, rotation, translation, t, wp.vec3(0.0, 0.0, 0.0), ray, FAR)
             if hit.body >= 0:
                 point = hit.distance * ray
@@ -171,6 +173,7 @@ def trace_light(
 def trace_bounces(
     # In:
     view: CameraView,  # intrinsics [px]
+    lens: bool,  # whether the camera is no pinhole [flag]
     emitter: Emitter,  # [m]
     harmonics: wp.array[int],  # [h] multiples of the modulation frequency
     solids: wp.array[Solid],  # [B]
@@ -198,7 +201,7 @@ def trace_bounces(
         t = p % rotation.shape[0]
         image_x = float(x) + wp.randf(random)
         image_y = float(y) + wp.randf(random)
-        ray = ray_through(view, image_x, image_y)
+        ray = ray_through(view, lens, image_x, image_y)
         hit = nearest(solids, rotation, translation, t, wp.vec3(0.0, 0.0, 0.0), ray, FAR)
         point = hit.distance * ray
         length = hit.distance

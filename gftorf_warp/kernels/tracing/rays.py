@@ -19,17 +19,20 @@ SLACK = wp.constant(1.001)  # [1] on bounding balls: rounding must not cut a bod
 HASH = wp.constant(2654435761 & 0xFFFF)
 TEXTURE_ORIGIN = wp.constant(37.0001)  # [m] see sim/texture.py, whose hash this is
 _NOTHING = wp.constant(NOTHING)
+MESH, BALL, PLANE = range(3)  # shapes of a solid
+_BALL, _PLANE = wp.constant(BALL), wp.constant(PLANE)
 
 
 @wp.struct
 class Solid:
     """One piece of a rigid body, in the body's axes: a mesh, a ball or an endless plane."""
 
+    shape: int  # MESH, BALL or PLANE
     mesh: wp.uint64  # its triangles, counter-clockwise as seen; unused by the others
-    radius: float  # of a ball [m]; 0: no ball
+    radius: float  # of a ball [m]; unused by the others
     centre: wp.vec3  # of a ball [m]; the origin for the others
     reach: float  # distance of the farthest point from the centre [m]; unused by a plane
-    normal: wp.vec3  # of a plane; zero: no plane
+    normal: wp.vec3  # of a plane; unused by the others
     height: float  # of a plane over the origin, along the normal [m]
     low: float  # smallest reflectance [1]
     high: float  # largest reflectance [1]
@@ -81,7 +84,7 @@ def meet_plane(solid: Solid, origin: wp.vec3, ray: wp.vec3, limit: float) -> Hit
 @wp.func
 def meet(solid: Solid, origin: wp.vec3, ray: wp.vec3, limit: float) -> Hit:
     """First hit of one body within ``limit`` [m], in its axes; ``body`` is 0 if there is one."""
-    if wp.length_sq(solid.normal) > 0.0:
+    if solid.shape == _PLANE:
         return meet_plane(solid, origin, ray, limit)
     hit = Hit()
     hit.body = _NOTHING
@@ -92,7 +95,7 @@ def meet(solid: Solid, origin: wp.vec3, ray: wp.vec3, limit: float) -> Hit:
     across = wp.length_sq(closest)
     if across > solid.reach * solid.reach * SLACK:
         return hit
-    if solid.radius > 0.0:
+    if solid.shape == _BALL:
         if across < solid.radius * solid.radius:
             distance = along - wp.sqrt(solid.radius * solid.radius - across)
             if distance > 0.0 and distance < limit:
@@ -143,10 +146,10 @@ def nearest(
 
 
 @wp.func
-def ray_through(view: CameraView, x: float, y: float) -> wp.vec3:
-    """Unit vector in camera axes through the image point (x, y) [px]; a lens is undone."""
+def ray_through(view: CameraView, lens: bool, x: float, y: float) -> wp.vec3:
+    """Unit vector in camera axes through the image point (x, y) [px]; a ``lens`` is undone."""
     slope = wp.vec2((x - view.cx) / view.fx, (y - view.cy) / view.fy)
-    if view.radius > 0.0:
+    if lens:
         slope = undistorted(view, slope[0], slope[1])
     return wp.normalize(wp.vec3(slope[0], slope[1], 1.0))
 
@@ -155,6 +158,7 @@ def ray_through(view: CameraView, x: float, y: float) -> wp.vec3:
 def trace_hits(
     # In:
     view: CameraView,  # intrinsics [px] and rotation
+    lens: bool,  # whether the camera is no pinhole [flag]
     solids: wp.array[Solid],  # [B]
     rotation: wp.array2d[wp.mat33],  # [1, B] body from camera
     translation: wp.array2d[wp.vec3],  # [1, B] body from camera [m]
@@ -169,7 +173,7 @@ def trace_hits(
     """The first surface on the ray through the centre of one pixel."""
     i, x = wp.tid()
     y = first + stride * i
-    ray = ray_through(view, float(x) + 0.5, float(y) + 0.5)
+    ray = ray_through(view, lens, float(x) + 0.5, float(y) + 0.5)
     hit = nearest(solids, rotation, translation, 0, wp.vec3(0.0, 0.0, 0.0), ray, FAR)
     body[y, x] = hit.body
     if hit.body >= 0:
