@@ -52,12 +52,13 @@ class Ours:
 
     def forward(self) -> None:
         """Blend."""
-        stages.composite(self.buffers, 0)
+        stages.composite(self.inputs, self.buffers, 0)
 
     def backward(self) -> None:
         """Blend backward, gradient records zeroed."""
         self.records.zero_()
-        stages.composite_backward(self.buffers, 0, self.grad_light, self.grad_channel, self.records)
+        gradients = self.grad_light, self.grad_channel, self.records
+        stages.composite_backward(self.inputs, self.buffers, 0, *gradients)
         stages.finish(self.buffers, self.records)
 
 

@@ -17,7 +17,14 @@ from torch import Tensor
 from gftorf_warp.constants import CANONICAL_SHIFTS
 from gftorf_warp.render import reference
 from gftorf_warp.render.api import Background, Rendering
-from gftorf_warp.render.buffers import ClampGradient, Distortion, RenderSettings, Stop, Support
+from gftorf_warp.render.buffers import (
+    ClampGradient,
+    Distortion,
+    RenderSettings,
+    SplatDistance,
+    Stop,
+    Support,
+)
 from gftorf_warp.scene.camera import Camera
 from gftorf_warp.scene.distortion import Distortion as Lens
 from gftorf_warp.scene.gaussians import GaussianField, constant_sh
@@ -438,6 +445,34 @@ def released() -> Case:
     return Case(field=field, camera=POSED, settings=settings, background=light(POSED, 4, seed=12))
 
 
+PLANES = replace(SETTINGS, splat_distance=SplatDistance.PLANE)
+
+
+def sloped() -> Case:
+    """Every pixel of a splat has its own distance; round enough that none is clamped."""
+    field = gaussians(60, POSED, seed=17, scale=(0.12, 0.3))
+    background = light(POSED, 4, seed=17)
+    return Case(
+        field=field,
+        camera=POSED,
+        settings=PLANES,
+        background=background,
+        extra=channels(field, 7),
+    )
+
+
+def sloped_distorted() -> Case:
+    """The same through a lens."""
+    field = gaussians(60, BENT, seed=18, z=(1.0, 3.0), scale=(0.1, 0.2), spread=1.2)
+    return Case(
+        field=field,
+        camera=BENT,
+        settings=PLANES,
+        background=light(BENT, 4, seed=18),
+        extra=channels(field, 2),
+    )
+
+
 def single() -> Case:
     """One Gaussian."""
     field = gaussians(1, SMALL, seed=13, spread=0.3, z=(2.0, 2.0), scale=(0.2, 0.4))
@@ -464,6 +499,8 @@ CASES: dict[str, Callable[[], Case]] = {
         dark,
         posed,
         distorted,
+        sloped,
+        sloped_distorted,
         three_shifts,
         needles,
         coplanar,

@@ -13,7 +13,7 @@ DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 TOLERANCE = TOLERANCES[torch.float32]
 
 # cases in which every output and every input exists
-FULL = ("translucent", "posed", "outside", "distorted")
+FULL = ("translucent", "posed", "outside", "distorted", "sloped", "sloped_distorted")
 
 
 class Comparison:

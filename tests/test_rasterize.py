@@ -26,7 +26,14 @@ from torch.testing import assert_close
 
 from gftorf_warp.render import api, buffers, reference
 from gftorf_warp.render.api import Rendering
-from gftorf_warp.render.buffers import ClampGradient, Distortion, RenderSettings, Stop, Support
+from gftorf_warp.render.buffers import (
+    ClampGradient,
+    Distortion,
+    RenderSettings,
+    SplatDistance,
+    Stop,
+    Support,
+)
 from gftorf_warp.scene.camera import Camera
 from gftorf_warp.scene.sensor import Sensor
 
@@ -82,7 +89,7 @@ def test_each_output_alone_has_the_oracles_gradient(name, output, device):
             assert gradient.abs().max() == 0, key
 
 
-@pytest.mark.parametrize("name", ["posed", "opaque", "released"])
+@pytest.mark.parametrize("name", ["posed", "opaque", "released", "sloped"])
 def test_the_cuda_mapping_is_right_on_the_cpu_too(name, monkeypatch):
     """One pixel per thread and tiles of 8 x 4, what CUDA compiles but for the warp shuffles,
     against the oracle.
@@ -102,6 +109,8 @@ SWITCHES = {
     "exact": ("released", {"clamp_gradient": ClampGradient.EXACT}, None),
     "zeta": ("opaque", {"distortion": Distortion.RELEASED, "near": 0.5, "far": 8.0}, "distortion"),
     "metres": ("released", {"distortion": Distortion.PAPER}, "distortion"),
+    "plane": ("translucent", {"splat_distance": SplatDistance.PLANE}, "distance"),
+    "centre": ("sloped", {"splat_distance": SplatDistance.CENTRE}, "quads"),
     "single_phasor": ("translucent", {"phasor_factor": 1.0}, "phasor"),
     "degree_0": ("posed", {"sh_degree": 0}, "quads"),
     "degree_1": ("posed", {"sh_degree": 1}, "colour"),

@@ -118,7 +118,8 @@ static double walk(int begin, int end, int step) {
                 }
                 if (n >= count || step > 0) continue;
                 const float* u = &values[(k * 32 + lane) * 4];
-                store_values(memory, first, n - first, V{u[0]}, V{u[1]}, V{u[2]}, V{u[3]});
+                store_values(memory, first, n - first, V{u[0]}, V{u[1]}, V{u[2]}, V{(SLOPED ? 1
+                    : u[1]) * u[3]});
             }
             if (step < 0)
                 accumulate_round(memory, G, M, I, start, at, stop - at, V{40.5f + lane % 8}, V{20.5f
@@ -134,10 +135,17 @@ static double walk(int begin, int end, int step) {
             - (20.5 + p / 8);
         const double v = GEOMETRY ? u[0] : 0, w = CHANNELS ? u[1] : 0, w2 = LIGHT ? u[2] : 0, wd =
             LIGHT ? u[1] : 0;
-        const double all[16] = {v * dx, v * dy, v * dx * dx, v * dx * dy, v * dy * dy, v,
+        double all[16] = {v * dx, v * dy, v * dx * dx, v * dx * dy, v * dy * dy, v,
             double(GEOMETRY && u[1] > 0),
             GEOMETRY ? u[1] : 0, w * d[0], w * d[1], w * d[2], w2 * d[3], w2 * d[4], w2 * d[5],
             wd * (SPREADS ? u[3] : d[6]), 0};
+        if (SLOPED) {  // by the strength, then moments of what is not clamped
+            const float* q = splats[ids[k]].c;
+            const float offset = std::fabs(q[12] * float(dx) + q[13] * float(dy));
+            const double free = offset < q[15] ? u[3] : 0;
+            const double own[5] = {u[2], free * dx, free * dy, u[3], free};
+            std::copy(own, own + 5, all + 11);
+        }
         for (int j = 0; j < 32; ++j) {  // a record, and that of further channels
             const double one = j < 16 ? all[j] : MORE && j >= 24 && j < 27 ? double(u[1])
                 * d[j - 17] : 0;
@@ -243,7 +251,7 @@ SIGNATURES = {
     "store_derivatives": "void store_derivatives(wp::uint64 memory, V g0, V g1, V g2, V g_re, V "
     "g_im, V g_amplitude, "
     "V g_distance, V g3, V g4, V g5)",
-    "store_values": "void store_values(wp::uint64 memory, int first, int n, V v, V w, V w2, V g_d)",
+    "store_values": "void store_values(wp::uint64 memory, int first, int n, V v, V w, V w2, V wd)",
     "accumulate_round": "void accumulate_round(wp::uint64 memory, wp::array_t<Splat> grads, "
     "wp::array_t<Splat> more, "
     "wp::array_t<int> ids, int start, int at, int n, V x, V y)",
@@ -278,19 +286,22 @@ def numbers_of(folder, functions, program):
 
 @pytest.mark.skipif(COMPILER is None, reason="needs a C++ compiler")
 @pytest.mark.parametrize(
-    ("light", "channels", "geometry", "spreads", "more"),
+    ("light", "channels", "geometry", "spreads", "more", "sloped"),
     [
-        (True, False, True, False, False),
-        (True, True, True, True, False),
-        (False, True, False, False, False),
-        (True, True, True, False, True),
+        (True, False, True, False, False, False),
+        (True, True, True, True, False, False),
+        (False, True, False, False, False, False),
+        (True, True, True, False, True, False),
+        (True, False, True, False, False, True),
+        (True, True, True, True, True, True),
     ],
 )
 def test_rounds_read_every_record_and_sum_every_pixel(
-    light, channels, geometry, spreads, more, tmp_path
+    light, channels, geometry, spreads, more, sloped, tmp_path
 ):
     """Lists of no, one, 16 and many entries, in both directions; sums against float64."""
-    rounds = shared_batches.make_gradient_rounds(8, light, channels, geometry, spreads, more)
+    asked = light, channels, geometry, spreads, more, sloped
+    rounds = shared_batches.make_gradient_rounds(8, *asked)
     rounds = vars(shared_batches) | vars(rounds)
     functions = {name: rounds[name] for name in SIGNATURES if name in rounds}
     values = {
@@ -299,6 +310,7 @@ def test_rounds_read_every_record_and_sum_every_pixel(
         "GEOMETRY": geometry,
         "SPREADS": spreads,
         "MORE": more,
+        "SLOPED": sloped,
     }
     constants = "".join(f"const bool {name} = {int(value)};\n" for name, value in values.items())
     errors = numbers_of(tmp_path, functions, constants + WALK)

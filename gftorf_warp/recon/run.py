@@ -22,7 +22,7 @@ from ..data.sequence import Sequence
 from ..data.temporal import averaged
 from ..errors import InputError
 from ..render.api import Rendering, rasterize
-from ..render.buffers import ClampGradient, Distortion, RenderSettings, Stop, Support
+from ..render.buffers import ClampGradient, Distortion, RenderSettings, SplatDistance, Stop, Support
 from ..render.inputs import CHOICES
 from ..render.replay import Replay
 from ..render.series import on_host
@@ -216,8 +216,10 @@ class Run:
             "stop": Stop,
             "clamp_gradient": ClampGradient,
             "distortion": Distortion,
+            "splat_distance": SplatDistance,
         }
-        return RenderSettings(**stored | {name: kind(stored[name]) for name, kind in kinds.items()})
+        named = {name: kind(stored[name]) for name, kind in kinds.items() if name in stored}
+        return RenderSettings(**stored | named)
 
     def sequence(self) -> Sequence:
         """The sequence it was made from, read again.

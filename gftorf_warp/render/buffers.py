@@ -54,6 +54,18 @@ class Distortion(StrEnum):
     """Half that sum, on zeta = far / (far - near) (1 - near / d) instead of metres [1]."""
 
 
+class SplatDistance(StrEnum):
+    """Which distance a splat has at a pixel of its footprint; phase and fall-off follow it."""
+
+    CENTRE = "centre"
+    """Its centre's, at all of them."""
+    PLANE = "plane"
+    """That of the Gaussian's peak along the ray, to first order around the centre, at most three
+    of its largest standard deviations and half of its distance away from the centre's. Its
+    derivative is exact, but zero by the slope where a pixel is clamped to this bound, and always
+    zero by the bound."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class RenderSettings:
     """How Gaussians are rendered; alternatives to the exact defaults are for parity."""
@@ -75,6 +87,8 @@ class RenderSettings:
     """The derivative of a clamped alpha."""
     distortion: Distortion = Distortion.PAPER
     """Which distortion is returned."""
+    splat_distance: SplatDistance = SplatDistance.CENTRE
+    """Whether the distance varies inside a splat."""
     depth_bits: int = 24
     """Bits of the key that orders splats by z-depth, 24 or 16; on CUDA the sort takes a pass for
     every eight.
@@ -206,6 +220,11 @@ class Buffers:
     def ordered(self) -> bool:
         """Whether every pair has its own gradient record: on CUDA, for deterministic gradients."""
         return self.settings.deterministic and self.K == 1
+
+    @property
+    def sloped(self) -> bool:
+        """Whether the distance varies inside a splat."""
+        return self.settings.splat_distance == SplatDistance.PLANE
 
     @property
     def cooperative(self) -> bool:

@@ -116,7 +116,7 @@ def forward(
         buffers.first.zero_()
     for number in [0, *range(max(1, buffers.groups_with_light), len(buffers.records))]:
         stages.composite(
-            buffers, number, images.distortion is not None, differentiable=differentiable
+            inputs, buffers, number, images.distortion is not None, differentiable=differentiable
         )
     stages.resolve_images(inputs, view, buffers, images, groups)
 
@@ -153,7 +153,9 @@ def backward(
         label = "gradient records of the second group"
         first["grad_more"] = grad_channels[1]
         first["more_records"] = buffers.zeros(label, buffers.count, splat.Splat)
-    stages.composite_backward(buffers, 0, grad_light, grad_channels[0], grad_splats, **first)
+    first["grad_calibration"] = wanted.calibration
+    given = inputs, buffers
+    stages.composite_backward(*given, 0, grad_light, grad_channels[0], grad_splats, **first)
     for number, (name, start) in enumerate(groups):
         if grad_channels[number] is None:
             continue
@@ -164,7 +166,7 @@ def backward(
             label = "gradient records of a further pass"
             records = buffers.zeros(label, buffers.count, splat.Splat)
             stages.composite_backward(
-                buffers, number, grad_light, grad_channels[number], records, fixed=fixed[number]
+                *given, number, grad_light, grad_channels[number], records, fixed=fixed[number]
             )
             if not fixed[number]:
                 stages.add_geometry(records, grad_splats)

@@ -19,9 +19,10 @@ pose (Rc, t):
     colour           C = sum w_k c_k  +  T_e background
     distance         D = sum w_k d_k, opacity A = sum w_k, extra F = sum w_k f_k, without background
 
-Light crosses every Gaussian in front twice, hence T^2 in quads and phasor; the background carries
-T_e, first power. Cost grows with pixels times Gaussians: this is for tests and small images, the
-kernels are for work.
+With ``SplatDistance.PLANE`` d_k, and with it a_k and psi_k, is that of the pixel: see
+splat_distance_reference.py. Light crosses every Gaussian in front twice, hence T^2 in quads and
+phasor; the background carries T_e, first power. Cost grows with pixels times Gaussians: this is
+for tests and small images, the kernels are for work.
 """
 
 from __future__ import annotations
@@ -40,9 +41,18 @@ from ..scene.distortion import inside
 from ..scene.gaussians import GaussianField
 from ..scene.sensor import Sensor
 from .api import Background, Rendering, ScreenGradient
-from .buffers import ClampGradient, Distortion, RenderSettings, Stop, Support, Workspace
+from .buffers import (
+    ClampGradient,
+    Distortion,
+    RenderSettings,
+    SplatDistance,
+    Stop,
+    Support,
+    Workspace,
+)
 from .control import DeviceCamera
 from .inputs import CHOICES, wanted_images
+from .splat_distance_reference import bound_of, plane_distances, precision_of, slope_of
 
 # [px] side of the released code's tiles, to which Support.SIGMA3_TILE16 rounds out
 _PARITY_TILE = 16
@@ -67,6 +77,14 @@ class _Splats:
     """xx, xy, yy of cov2D, low pass included [px^2]."""
     opacity: Float[Tensor, "M"]
     """At the peak [1]."""
+    point: Float[Tensor, "M 3"]
+    """Centre in camera axes [m]."""
+    precision: Float[Tensor, "M 3 3"]
+    """Inverse of the covariance, in camera axes [1/m^2]."""
+    slope: Float[Tensor, "M 2"]
+    """Change of the inverse distance along x and y [1/(m px)]."""
+    bound: Float[Tensor, "M"]
+    """How far a pixel's inverse distance may be from the centre's [1/m]."""
 
 
 def rasterize(
@@ -104,23 +122,39 @@ def rasterize(
     basis = spherical_harmonics(splats.direction, settings.sh_degree)  # [M, K]
     reflectivity = _shade(basis, field.reflectivity_sh[splats.index])
     d = splats.distance
-    one_way = [d[:, None], torch.ones_like(d)[:, None]]
+    one_way = [torch.ones_like(d)[:, None]]
     if field.colour_sh is not None:
         one_way.append(_shade(basis, field.colour_sh[splats.index].flatten(1), channels=3))
     more = d.new_zeros(len(d), 0) if extra is None else extra[splats.index].to(d)
-    two_way = correlate(d, reflectivity, sensor, settings.phasor_factor)
-    zeta = d if settings.distortion is Distortion.PAPER else _normalised(d, settings)
+    sloped = settings.splat_distance is SplatDistance.PLANE
     carried = torch.cat(one_way, 1)
 
     pixel = _pixel_centres(camera, d)  # [P, 2]
     blocks = []
     for block in pixel.split(max(1, BLOCK // max(1, len(d)))):
         w, T, T_end = compositing_weights(_alpha(block, splats, centre, settings), settings.stop)
-        moments = [w @ torch.stack([zeta**n], 1) for n in (0, 1, 2)]  # A, M, V
+        seen_at = d  # [M], or [P, M] if pixels of a splat differ
+        if sloped:
+            seen_at = plane_distances(block, centre, d, splats.slope, splats.bound)
+        two_way = correlate(seen_at, reflectivity, sensor, settings.phasor_factor)
+        zeta = seen_at
+        if settings.distortion is Distortion.RELEASED:
+            zeta = _normalised(zeta, settings)
+        moments = [_blend(w, (zeta**n)[..., None]) for n in (0, 1, 2)]  # A, M, V
         half_sum = moments[0] * moments[2] - moments[1] ** 2
         seen = (w.detach() if extra_detached else w) @ more
         blocks.append(
-            torch.cat([w @ carried, seen, (w * T) @ two_way, half_sum, T_end[:, None]], 1)
+            torch.cat(
+                [
+                    _blend(w, seen_at[..., None]),
+                    w @ carried,
+                    seen,
+                    _blend(w * T, two_way),
+                    half_sum,
+                    T_end[:, None],
+                ],
+                1,
+            )
         )
         seen_of += torch.stack([(w > 0).sum(0), w.detach().sum(0)], 1)
     image = torch.cat(blocks).T.reshape(-1, height, width)
@@ -142,6 +176,11 @@ def rasterize(
         extra=None if extra is None else more,
         screen=screen,
     )
+
+
+def _blend(w: Float[Tensor, "P M"], values: Tensor) -> Float[Tensor, "P C"]:
+    """Sums of ``values`` [M, C], or [P, M, C] if they differ from pixel to pixel."""
+    return w @ values if values.ndim == 2 else (w[:, None] @ values)[:, 0]
 
 
 def undecided_pixels(
@@ -223,7 +262,9 @@ def project(field: GaussianField, camera: Camera, settings: RenderSettings) -> _
         bend = torch.stack([xx, xy * aspect, xy / aspect, yy], 1).unflatten(1, (2, 2))
         jacobian, flat = bend @ jacobian, camera.distortion.apply(*flat, radius)
     # Gamma, columns in metres
-    axes = _rotation(field.quaternion[index]) * field.scale[index][:, None, :]
+    turned = _rotation(field.quaternion[index])
+    axes = turned * field.scale[index][:, None, :]
+    precision = precision_of(rotation @ turned, field.scale[index])
     projected = jacobian @ rotation @ axes  # [M, 2, 3]
     cov = projected @ projected.mT + LOW_PASS * torch.eye(2, dtype=z.dtype, device=z.device)
     return _Splats(
@@ -234,6 +275,10 @@ def project(field: GaussianField, camera: Camera, settings: RenderSettings) -> _
         centre=torch.stack([camera.fx * flat[0] + camera.cx, camera.fy * flat[1] + camera.cy], 1),
         covariance=torch.stack([cov[:, 0, 0], cov[:, 0, 1], cov[:, 1, 1]], 1),
         opacity=field.opacity[index],
+        point=point,
+        precision=precision,
+        slope=slope_of(camera, point, precision),
+        bound=bound_of(distance, field.scale[index]),
     )
 
 
@@ -288,18 +333,21 @@ def _shade(
 
 
 def correlate(
-    d: Float[Tensor, "M"], reflectivity: Float[Tensor, "M 1"], sensor: Sensor, phasor_factor: float
-) -> Float[Tensor, "M light"]:
+    d: Float[Tensor, "*P M"],
+    reflectivity: Float[Tensor, "M 1"],
+    sensor: Sensor,
+    phasor_factor: float,
+) -> Float[Tensor, "*P M light"]:
     """Light of each Gaussian alone: its Q quads, then its phasor (method, 2.4)."""
     f, phase_offset, dc_offset, source, shift = (
         torch.as_tensor(value, dtype=d.dtype, device=d.device)
         for value in (*_numbers(sensor), sensor.shifts)
     )
-    a = source * reflectivity / d[:, None] ** 2
-    psi = (4.0 * math.pi / SPEED_OF_LIGHT * f * d + phase_offset)[:, None]
+    a = source * reflectivity / d[..., None] ** 2
+    psi = (4.0 * math.pi / SPEED_OF_LIGHT * f * d + phase_offset)[..., None]
     quads = a * ((psi - shift).cos() + dc_offset)
-    phasor = phasor_factor * a * torch.cat([psi.cos(), psi.sin(), torch.ones_like(psi)], 1)
-    return torch.cat([quads, phasor], 1)
+    phasor = phasor_factor * a * torch.cat([psi.cos(), psi.sin(), torch.ones_like(psi)], -1)
+    return torch.cat([quads, phasor], -1)
 
 
 def _normalised(d: Float[Tensor, "M"], settings: RenderSettings) -> Float[Tensor, "M"]:

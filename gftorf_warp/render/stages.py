@@ -11,6 +11,7 @@ from ..kernels.rasterise import (
     deterministic_sums,
     planes_to_images,
     splat,
+    splat_distance,
     tile_bitmask,
     tiles,
 )
@@ -55,7 +56,7 @@ def project_backward(
 
 def _project_kernel(inputs: Inputs, view: View, buffers: Buffers):
     square = buffers.settings.support == Support.SIGMA3_TILE16
-    return make_project(inputs.colour_sh is not None, square, view.lens)
+    return make_project(inputs.colour_sh is not None, square, view.lens, buffers.sloped)
 
 
 def _project_inputs(inputs: Inputs, view: View, buffers: Buffers) -> list:
@@ -145,7 +146,12 @@ def _sum_counts(buffers: Buffers) -> int:
 
 
 def composite(
-    buffers: Buffers, number: int, distortion: bool = True, *, differentiable: bool = True
+    inputs: Inputs,
+    buffers: Buffers,
+    number: int,
+    distortion: bool = True,
+    *,
+    differentiable: bool = True,
 ) -> None:
     """Blend all tiles: light with one or two groups of channels, or one further group."""
     light, channels = number == 0, bool(buffers.channels)
@@ -155,8 +161,9 @@ def composite(
     segments = buffers.segments_wanted if light and metric is None and differentiable else 1
     if light:
         buffers.segments = segments
+    inclusive = buffers.settings.stop == Stop.INCLUSIVE
     kernel = make_composite(
-        *shape, light, channels, buffers.settings.stop == Stop.INCLUSIVE, metric, more, segments
+        *shape, light, channels, inclusive, metric, more, segments, light and buffers.sloped
     )
     channel = _lanes(buffers, buffers.channels[number] if channels else None)
     more_channel = _lanes(buffers, buffers.channels[1] if more else None)
@@ -166,12 +173,13 @@ def composite(
 
     def arguments(tile0: int, _part: int) -> list:
         outputs = [buffers.sums.lanes, channel, more_channel, _states(buffers, segments)]
-        return [*lists, tile0, _mapping(buffers), more_splats, *outputs]
+        return [*lists, tile0, _mapping(buffers), more_splats, inputs.calibration, *outputs]
 
     over_tiles(buffers, kernel, tile_edges(buffers, buffers.threads), arguments)
 
 
 def composite_backward(
+    inputs: Inputs,
     buffers: Buffers,
     number: int,
     grad_light: Planes,
@@ -182,10 +190,12 @@ def composite_backward(
     fixed: bool = False,
     grad_more: Planes | None = None,
     more_records: wp.array | None = None,
+    grad_calibration: wp.array | None = None,
 ) -> None:
     """Add the gradient of one pass to ``records`` [N]; those of CPU threads are summed in order.
 
     Args:
+        inputs: For the calibration.
         buffers: After its forward pass.
         number: Of the pass: 0 has the light.
         grad_light: Of the planes of light.
@@ -195,6 +205,7 @@ def composite_backward(
         fixed: Whether weights are held fixed under the channels.
         grad_more: Of a second group of channels, under which weights are held fixed.
         more_records: [N] added to for the second group.
+        grad_calibration: [4] added to for phases of sloped splats; None: not wanted.
     """
     light, channels = number == 0, grad_channel is not None
     shape = buffers.K, buffers.tile_width, buffers.tile_height
@@ -202,9 +213,12 @@ def composite_backward(
     metric = _metric(buffers, light and distortion)
     segments = buffers.segments if light and metric is None and (fixed or not channels) else 1
     fixed = fixed and channels
+    more, sloped = grad_more is not None, light and buffers.sloped
+    calibrated = sloped and grad_calibration is not None
     kernel = make_composite_backward(
-        *shape, light, channels, passes, metric, fixed, grad_more is not None, segments
+        *shape, light, channels, passes, metric, fixed, more, segments, sloped, calibrated
     )
+    phases = buffers.planes(f"phases in {segments} segments", 2 * segments) if calibrated else None
     gradients = [grad_light.lanes, _lanes(buffers, grad_channel), _lanes(buffers, grad_more)]
     edges = [0, buffers.tiles] if buffers.ordered else tile_edges(buffers, buffers.threads)
     added, more_added = records, more_records
@@ -219,11 +233,17 @@ def composite_backward(
     lists = [buffers.first, buffers.ids, _spread(buffers, number, anew=False), buffers.tiles_x]
 
     def arguments(tile0: int, part: int) -> list:
-        inputs = [*lists, tile0, _mapping(buffers), buffers.sums.lanes, *gradients]
+        given = [*lists, tile0, _mapping(buffers), buffers.sums.lanes, *gradients]
         outputs = [targets[part], more_added if more_added is not None else added]
-        return [*inputs, _states(buffers, segments), *outputs]
+        given += [_states(buffers, segments), inputs.calibration]
+        return [*given, *outputs, _lanes(buffers, phases)]
 
     over_tiles(buffers, kernel, edges, arguments, segments)
+    if phases is not None:
+        of_tiles = buffers.array("phases of tiles", (2, buffers.tiles), wp.float64)
+        given = [phases.flat, buffers.lanes * buffers.K]
+        _launch(splat_distance.sum_phases, buffers.tiles, given, [of_tiles])
+        _launch(splat_distance.add_phases, 1, [of_tiles], [grad_calibration])
     for target in targets[1:]:
         _launch(splat.add_records, buffers.count, [target, 0], [records])
     if buffers.ordered:
@@ -252,6 +272,8 @@ def add_geometry(records: wp.array, total: wp.array) -> None:
 def finish(buffers: Buffers, grad_splats: wp.array) -> None:
     """Turn the moments in gradient records into gradients."""
     _launch(finish_moments, buffers.count, [buffers.splats], [grad_splats])
+    if buffers.sloped:
+        _launch(splat_distance.finish_slopes, buffers.count, [buffers.splats], [grad_splats])
 
 
 def resolve_images(

@@ -9,7 +9,8 @@ its pixel
 
 (paper, equations 3-5; method, sections 2.5 and 2.7). The background is linear in the
 transmittance T_e that remains, and added in planes_to_images.py. The adjoint is
-composite_backward.py.
+composite_backward.py. Distance and light are those of the splat's centre, or, of sloped splats, of
+the pixel (splat_distance.py).
 """
 
 import functools
@@ -18,6 +19,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from ...constants import ALPHA_MAX, TRANSMITTANCE_MIN
+from ..correlation import PHASE_OFFSET, PHASE_SLOPE
 from .list_segments import PLANES, segment_length
 from .shared_batches import (
     GROUP,
@@ -32,11 +34,14 @@ from .shared_batches import (
 )
 from .simd import contracted, make_lanes, warp_any
 from .splat import AHEAD, Splat, block_missed, load_splat, prefetch
+from .splat_distance import make_slopes
 
 # planes of ``light``, each [tiles, lanes] of V
 RE, IM, AMPLITUDE, DISTANCE, DISTORTION, SUM_ZETA, SUM_ZETA2, TRANSMITTANCE, LAST = range(9)
 LIGHT_PLANES = 9
 NEAREST = 1e-6  # [m] of a splat: padding records have distance 0 and weight 0
+FARTHEST = 1e-6  # [1/m] likewise of an inverse distance
+TURN = 6.283185307179586  # [rad]
 CHANNEL_PLANES = 3  # planes of ``channel``
 
 
@@ -93,6 +98,19 @@ def make_zeta(metric: bool):
 
 
 @functools.cache
+def make_distance(sloped: bool):
+    """The distance [m] of a splat's centre, from its record."""
+
+    @wp.func
+    def distance_of(q: Splat) -> float:
+        if wp.static(sloped):
+            return 1.0 / q[14]
+        return q[14]
+
+    return distance_of
+
+
+@functools.cache
 def make_composite(
     K: int,
     tile_width: int,
@@ -103,6 +121,7 @@ def make_composite(
     metric: bool | None,
     more: bool = False,
     segments: int = 1,
+    sloped: bool = False,
 ):
     """The kernel for one tile shape and one set of outputs.
 
@@ -116,6 +135,7 @@ def make_composite(
         metric: Whether distortion is of the distance or of its released mapping; None: neither.
         more: Whether three further channels are summed in the same pass; K must be 1.
         segments: Of a list in the backward pass; > 1 only with K = 1, light and no distortion.
+        sloped: Whether the distance varies inside a splat.
     """
     # the lanes of a warp fetch records for each other, see shared_batches.py
     cooperative, split = K == 1, segments > 1
@@ -124,13 +144,15 @@ def make_composite(
     ops, pixels = make_lanes(K), make_pixels(K, tile_width, tile_height)
     V, fill, affine, mul = ops.V, ops.fill, ops.affine, ops.mul
     axpy, fma, fnma = ops.axpy, ops.fma, ops.fnma
-    above, add, reaches = ops.above, ops.add, ops.reaches
+    above, add, reaches, scaled = ops.above, ops.add, ops.reaches, ops.scaled
     drop_below, set_where = ops.drop_below, ops.set_where
     power_of, hits, alpha_of, nonzero = ops.power_of, ops.hits, ops.alpha_of, ops.nonzero
     block_x, block_y, columns, rows = pixels.block_x, pixels.block_y, ops.columns, ops.rows
     half = 0.5 * (pixels.side - 1)  # from the first to the middle of a block [px]
 
-    zeta_of = make_zeta(bool(metric))
+    inverse, at_least, slopes = ops.inverse, ops.at_least, make_slopes(K)
+    offset_of, cos_of, sin_of = slopes.offset_of, slopes.cos_of, slopes.sin_of
+    zeta_of, distance_of = make_zeta(bool(metric)), make_distance(sloped)
     spreads = light and metric is not None
     warp_memory = make_warp_memory(more=more)
 
@@ -175,6 +197,7 @@ def make_composite(
         tile0: int,  # first tile of this launch [index]
         mapping: wp.vec2,  # released zeta = mapping[0] - mapping[1] / distance [1, m]
         more_splats: wp.array[Splat],  # [N] records whose slots 8-10 are further channels
+        calibration: wp.array[float],  # [4] phase slope [rad/m] and offset [rad]; of sloped splats
         # Out:
         sums: wp.array3d[V],  # [9, tiles, lanes] planes RE .. LAST of ``light``
         channel: wp.array3d[V],  # [3, tiles, lanes] the three channels
@@ -219,6 +242,9 @@ def make_composite(
             c3 = fill(0.0)
             c4 = fill(0.0)
             c5 = fill(0.0)
+        if wp.static(light and sloped):
+            turns_per_metre = calibration[wp.static(PHASE_SLOPE)] * wp.static(1.0 / TURN)
+            turns = calibration[wp.static(PHASE_OFFSET)] * wp.static(1.0 / TURN)
         begin = first[tile]
         end = first[tile + 1]
         segment = int(0)
@@ -229,7 +255,7 @@ def make_composite(
         zeta0 = float(0.0)
         if wp.static(spreads):
             if begin < end:
-                zeta0 = zeta_of(splats[ids[begin]][14], mapping)
+                zeta0 = zeta_of(distance_of(splats[ids[begin]]), mapping)
         k = int(begin)
         if wp.static(cooperative):
             memory = warp_memory()
@@ -283,7 +309,9 @@ def make_composite(
                         q = record_of(
                             memory, start - begin, k - 1 - start, splats, ids, k - 1, k <= end
                         )
-                    power = power_of(affine(x, -1.0, q[0]), affine(y, -1.0, q[1]), q[2], q[3], q[4])
+                    dx = affine(x, -1.0, q[0])
+                    dy = affine(y, -1.0, q[1])
+                    power = power_of(dx, dy, q[2], q[3], q[4])
                     hit = hits(power, live, q[6])
                     alpha = alpha_of(power, hit, q[5], ALPHA_MAX)
                     # with records in shared memory a miss costs less than a branch
@@ -295,13 +323,33 @@ def make_composite(
                         alpha = mul(alpha, live)
                         hit = alpha
                     w = mul(alpha, T)
-                    if wp.static(light):
+                    if wp.static(light and sloped):
+                        near = affine(offset_of(dx, dy, q[12], q[13], q[15]), 1.0, q[14])
+                        near = at_least(near, wp.static(FARTHEST))
+                        d = inverse(near)
+                        phase = affine(d, turns_per_metre, turns)
+                        lit = mul(mul(scaled(w, q[11]), T), mul(near, near))
+                        re = fma(re, lit, cos_of(phase))
+                        im = fma(im, lit, sin_of(phase))
+                        amplitude = add(amplitude, lit)
+                        distance = fma(distance, w, d)
+                    if wp.static(light and not sloped):
                         w2 = mul(w, T)
                         re = axpy(re, w2, q[11])
                         im = axpy(im, w2, q[12])
                         amplitude = axpy(amplitude, w2, q[13])
                         distance = axpy(distance, w, q[14])
-                    if wp.static(spreads):
+                    if wp.static(spreads and sloped):
+                        if wp.static(bool(metric)):
+                            z = affine(d, 1.0, -zeta0)
+                        else:
+                            z = affine(near, -mapping[1], mapping[0] - zeta0)
+                        zz = mul(z, z)
+                        spread = fnma(add(fnma(zz, zz, T), sum_zeta2), add(z, z), sum_zeta)
+                        distortion = fma(distortion, w, spread)
+                        sum_zeta = fma(sum_zeta, w, z)
+                        sum_zeta2 = fma(sum_zeta2, w, zz)
+                    if wp.static(spreads and not sloped):
                         zeta = zeta_of(q[14], mapping) - zeta0
                         # w (zeta^2 A - 2 zeta M + V), with the weight so far A = 1 - T
                         spread = affine(T, -zeta * zeta, zeta * zeta)

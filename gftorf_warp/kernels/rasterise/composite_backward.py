@@ -7,6 +7,12 @@ the T^2-weighted ones, and T_e, E = T_e dL/dT_e behind the last splat (method, s
     T <- T / (1 - alpha);  dL/dalpha = tau T + sigma T^2 - E / (1 - alpha);  E <- E + w (tau + 2
     sigma T),  w = alpha T
 
+Of sloped splats (splat_distance.py) the values are those of the pixel, sigma too, and the
+derivative by its inverse distance 1/d is
+
+    w d (2 sigma T - d (dtau/dd + kappa T dsigma/dpsi)),
+    dsigma/dpsi = a (g_im cos psi - g_re sin psi)
+
 E is the gradient of everything behind; front to back it would be a difference of sums, noise behind
 a surface. The distortion is quadratic in w: its tau uses the final sums. Warp's adjoint of the
 forward loop would be silently wrong, since dynamic loops are not replayed.
@@ -17,12 +23,16 @@ import functools
 import warp as wp
 
 from ...constants import ALPHA_MAX, ALPHA_MIN
+from ..correlation import PHASE_OFFSET, PHASE_SLOPE
 from .composite import (
+    FARTHEST,
     LAST,
     NEAREST,
     SUM_ZETA,
     SUM_ZETA2,
     TRANSMITTANCE,
+    TURN,
+    make_distance,
     make_pixels,
     make_zeta,
     options,
@@ -39,6 +49,7 @@ from .shared_batches import (
 )
 from .simd import make_lanes, sums_of, types_of, warp_max
 from .splat import AHEAD, Splat, block_missed, load_splat, prefetch
+from .splat_distance import make_slopes
 
 # planes of ``grad_sums``: gradients of the first five planes of the forward pass, and of T_e
 GRAD_TRANSMITTANCE = 5
@@ -46,9 +57,11 @@ GRAD_LIGHT_PLANES = 6
 V1 = make_lanes(1).V
 
 
-def _add_moments(K: int, light: bool, channels: bool, geometry: bool) -> str:
+def _add_moments(K: int, light: bool, channels: bool, geometry: bool, sloped: bool = False) -> str:
     """C++ that adds sums over the K pixels of a CPU thread to a gradient record, permuted."""
     names = "v dx dy alpha w w2 g0 g1 g2 g_re g_im g_amplitude g_distance"
+    if sloped:
+        names = "v dx dy alpha w lit of_d free g0 g1 g2"
     loads = " ".join(f"const F {name}_ = load({name});" for name in names.split())
     values = {}
     if geometry:
@@ -57,10 +70,14 @@ def _add_moments(K: int, light: bool, channels: bool, geometry: bool) -> str:
         values |= {"count": "alpha_ > 0.0f ? (F)(1.0f) : (F)(0.0f)", "weight": "w_"}
     if channels:
         values |= {"c0": "w_ * g0_", "c1": "w_ * g1_", "c2": "w_ * g2_"}
-    if light:
+    slots = [*"dx dy dx2 dxdy dy2 v count weight c0 c1 c2 re im amplitude distance".split(), ""]
+    if light and not sloped:
         values |= {"re": "w2_ * g_re_", "im": "w2_ * g_im_", "amplitude": "w2_ * g_amplitude_"}
         values |= {"distance": "w_ * g_distance_"}
-    slots = [*"dx dy dx2 dxdy dy2 v count weight c0 c1 c2 re im amplitude distance".split(), ""]
+    if sloped:
+        values |= {"strength": "lit_", "gx": "free_ * dx_", "gy": "free_ * dy_"}
+        values |= {"distance": "of_d_", "free": "free_"}
+        slots[11:] = "strength gx gy distance free".split()
     sums, lanes = sums_of(K, values)
     if K == 1:
         entries = [f"s[{lanes.index(of)}]" if of in lanes else "0.0f" for of in slots]
@@ -127,6 +144,8 @@ def make_composite_backward(
     fixed: bool = False,
     more: bool = False,
     segments: int = 1,
+    sloped: bool = False,
+    calibrated: bool = False,
 ):
     """The adjoint kernel for one tile shape and one set of outputs; arguments as in
     ``make_composite``.
@@ -142,6 +161,8 @@ def make_composite_backward(
         fixed: Whether weights are held fixed under the channels.
         more: Whether three further channels, with weights held fixed, have a gradient.
         segments: Warps per tile, as in the forward pass; > 1 only with weights held fixed.
+        sloped: Whether the distance varies inside a splat.
+        calibrated: Whether the phases of sloped splats have gradients.
     """
     cooperative, split = K == 1, segments > 1
     if split and not (cooperative and light and metric is None and (fixed or not channels)):
@@ -155,7 +176,11 @@ def make_composite_backward(
     nonzero, largest_of = ops.nonzero, ops.largest_of
     block_x, block_y, columns, rows = pixels.block_x, pixels.block_y, ops.columns, ops.rows
     half, zeta_of = 0.5 * (pixels.side - 1), make_zeta(bool(metric))
+    distance_of = make_distance(sloped)
     spreads = light and metric is not None
+    slopes = make_slopes(K)
+    offset_of, where_free = slopes.offset_of, slopes.where_free
+    cos_of, sin_of = slopes.cos_of, slopes.sin_of
 
     @wp.func_native(_add_moments(K, light, channels, light or not fixed))
     def add_moments(
@@ -163,9 +188,15 @@ def make_composite_backward(
         g0: V, g1: V, g2: V, g_re: V, g_im: V, g_amplitude: V, g_distance: V,
     ): ...  # fmt: skip
 
+    @wp.func_native(_add_moments(K, light, channels, light or not fixed, sloped=True))
+    def add_sloped_moments(
+        grads: wp.array[Splat], i: int, v: V, dx: V, dy: V, alpha: V, w: V, lit: V, of_d: V,
+        free: V, g0: V, g1: V, g2: V,
+    ): ...  # fmt: skip
+
     if cooperative:
         rounds = make_gradient_rounds(
-            tile_width, light, channels, light or not fixed, spreads, more
+            tile_width, light, channels, light or not fixed, spreads, more, sloped
         )
         warp_memory, store_derivatives = rounds.warp_memory, rounds.store_derivatives
         store_values, accumulate_round = rounds.store_values, rounds.accumulate_round
@@ -184,9 +215,11 @@ def make_composite_backward(
         grad_channel: wp.array3d[V],  # [3, tiles, lanes] gradients of the three channels
         grad_more: wp.array3d[V],  # [3, tiles, lanes] gradients of the further channels
         states: wp.array3d[V],  # [5 (segments - 1), tiles, lanes] see list_segments.py
+        calibration: wp.array[float],  # [4] phase slope [rad/m] and offset [rad]; of sloped splats
         # Out:
         grad_splats: wp.array[Splat],  # [N] added to: moments, pixels, weights, gradients
         more_splats: wp.array[Splat],  # [N] added to: slots 8-10, gradients of the further channels
+        phases: wp.array3d[V],  # [2 segments, tiles, lanes] gradients of phase offset and slope
     ):
         """One thread per block of K pixels, back to front; a warp per segment of a list."""
         t, lane = wp.tid()
@@ -214,6 +247,12 @@ def make_composite_backward(
             g_amplitude = grad_sums[2, tile, lane]
             g_distance = grad_sums[3, tile, lane]
             E = mul(T, grad_sums[wp.static(GRAD_TRANSMITTANCE), tile, lane])
+        if wp.static(light and sloped):
+            phase_slope = calibration[wp.static(PHASE_SLOPE)]
+            turns_per_metre = phase_slope * wp.static(1.0 / TURN)
+            turns = calibration[wp.static(PHASE_OFFSET)] * wp.static(1.0 / TURN)
+            by_offset = fill(0.0)
+            by_slope = fill(0.0)
         if wp.static(spreads):
             g_distortion = grad_sums[4, tile, lane]
             twice_g_distortion = add(g_distortion, g_distortion)
@@ -254,7 +293,7 @@ def make_composite_backward(
         zeta0 = float(0.0)
         if wp.static(spreads):
             if begin < k:
-                zeta0 = zeta_of(splats[ids[begin]][14], mapping)
+                zeta0 = zeta_of(distance_of(splats[ids[begin]]), mapping)
         if wp.static(cooperative):
             memory = warp_memory()
             top = k - 1
@@ -313,13 +352,44 @@ def make_composite_backward(
                     sigma_T = zero
                     w2 = zero
                     g_d = zero
-                    if wp.static(light):
+                    if wp.static(light and sloped):
+                        offset = offset_of(dx, dy, q[12], q[13], q[15])
+                        near = at_least(affine(offset, 1.0, q[14]), wp.static(FARTHEST))
+                        d = inverse(near)
+                        phase = affine(d, turns_per_metre, turns)
+                        cosine = cos_of(phase)
+                        sine = sin_of(phase)
+                        tau = fma(tau, g_distance, d)
+                        fall = mul(near, near)
+                        # derivative by the strength, then by the phase, over T^2
+                        lit = mul(fall, fma(fma(g_amplitude, g_re, cosine), g_im, sine))
+                        turned = scaled(mul(fall, fnma(mul(g_im, cosine), g_re, sine)), q[11])
+                        sigma_T = scaled(mul(lit, T), q[11])
+                        g_d = fma(g_distance, T, scaled(turned, phase_slope))
+                        w2 = mul(w, T)
+                        lit = mul(w2, lit)
+                        if wp.static(calibrated):
+                            turned = mul(w2, turned)
+                            by_offset = add(by_offset, turned)
+                            by_slope = fma(by_slope, turned, d)
+                    if wp.static(light and not sloped):
                         tau = axpy(tau, g_distance, q[14])
                         sigma = axpy(axpy(scaled(g_re, q[11]), g_im, q[12]), g_amplitude, q[13])
                         sigma_T = mul(sigma, T)
                         g_d = g_distance
                         w2 = mul(w, T)
-                    if wp.static(spreads):
+                    if wp.static(spreads and sloped):
+                        if wp.static(bool(metric)):
+                            z = affine(d, 1.0, -zeta0)
+                        else:
+                            z = affine(near, -mapping[1], mapping[0] - zeta0)
+                        spread = fma(minus_sum, weight, z)  # zeta A - M
+                        tau = fma(tau, g_distortion, fma(sum_zeta2, add(spread, minus_sum), z))
+                        spread = mul(twice_g_distortion, spread)
+                        if wp.static(not metric):
+                            spread = scaled(mul(spread, fall), mapping[1])
+                        g_d = add(g_d, spread)
+                    if wp.static(spreads and not sloped):
                         zeta = zeta_of(q[14], mapping) - zeta0
                         spread = axpy(minus_sum, weight, zeta)  # zeta A - M
                         tau = fma(tau, g_distortion, axpy(sum_zeta2, add(spread, minus_sum), zeta))
@@ -338,31 +408,32 @@ def make_composite_backward(
                         v = fma(zero, v, mul(raw, inverse(at_least(alpha, ALPHA_MIN))))
                     else:
                         v = keep_below(v, alpha, ALPHA_MAX)
+                    if wp.static(light and sloped):
+                        g_d = mul(d, fnma(add(sigma_T, sigma_T), d, g_d))  # by the inverse distance
+                        w2 = lit
+                    of_d = mul(w, g_d)
                     if wp.static(cooperative):
                         i = ids[wp.max(k, begin)]  # read on the CPU only
-                        store_values(memory, behind, n - 1, v, w, w2, g_d)
+                        store_values(memory, behind, n - 1, v, w, w2, of_d)
                         if wp.static(more):
                             add_more(more_splats, i, w, g3, g4, g5)
-                    add_moments(
-                        grad_splats,
-                        i,
-                        v,
-                        dx,
-                        dy,
-                        alpha,
-                        w,
-                        w2,
-                        g0,
-                        g1,
-                        g2,
-                        g_re,
-                        g_im,
-                        g_amplitude,
-                        g_d,
-                    )
+                    if wp.static(light and sloped):
+                        free = where_free(of_d, offset, q[15])
+                        add_sloped_moments(
+                            grad_splats, i, v, dx, dy, alpha, w, lit, of_d, free, g0, g1, g2
+                        )
+                    else:
+                        add_moments(
+                            grad_splats, i, v, dx, dy, alpha, w, w2, g0, g1, g2,
+                            g_re, g_im, g_amplitude, g_d,
+                        )  # fmt: skip
             if wp.static(cooperative):
                 accumulate_round(
                     memory, grad_splats, more_splats, ids, top, at, wp.min(count - at, ROUND), x, y
                 )
+
+        if wp.static(calibrated):
+            phases[2 * (t % wp.static(segments)), tile, lane] = by_offset
+            phases[2 * (t % wp.static(segments)) + 1, tile, lane] = by_slope
 
     return composite_backward

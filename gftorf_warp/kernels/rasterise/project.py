@@ -15,6 +15,7 @@ from ..geometry import CameraView, camera_of, screen_covariance
 from ..harmonics import harmonics
 from ..lens import bent_covariance, distorted
 from .splat import Splat
+from .splat_distance import bent_slope_of, bound_of, slope_of
 
 # [px] from the middle of a block of 4 x 4 pixels to its farthest centre, 1.5 sqrt(2)
 BLOCK_RADIUS = wp.constant(2.1214)
@@ -75,13 +76,14 @@ def square_of(view: CameraView, x: float, y: float, cov: wp.vec4) -> wp.vec4i:
 
 
 @functools.cache
-def make_project(colour: bool, square: bool, lens: bool = False):
+def make_project(colour: bool, square: bool, lens: bool = False, sloped: bool = False):
     """The kernel for a field with or without colour.
 
     Args:
         colour: Whether slots 8-10 hold colour, from its own harmonics.
         square: Whether splats are cut by the 3-sigma square (parity with the released code).
         lens: Whether the camera is no pinhole.
+        sloped: Whether the distance varies inside a splat: other slots 11-15, see splat.py.
     """
 
     # __sinf would lose the phase beyond +-pi
@@ -151,13 +153,25 @@ def make_project(colour: bool, square: bool, lens: bool = False):
         for h in range(16):
             reflectivity += wp.where(h < active, basis[h] * reflectivity_sh[n, h], 0.0)
         reflectivity = wp.max(reflectivity, 0.0)
-        light = light_of(
-            distance,
-            reflectivity,
-            calibration[wp.static(PHASE_SLOPE)],
-            calibration[wp.static(PHASE_OFFSET)],
-            calibration[wp.static(SOURCE_INTENSITY)],
-        )
+        bound = float(0.0)
+        along_ray = distance  # or its inverse
+        if wp.static(sloped):
+            if wp.static(lens):
+                slope = bent_slope_of(camera, local, quaternion[n], scale)
+            else:
+                slope = slope_of(camera, local, quaternion[n], scale)
+            strength = calibration[wp.static(SOURCE_INTENSITY)] * reflectivity
+            light = wp.vec3(strength, slope[0], slope[1])
+            bound = bound_of(distance, scale)
+            along_ray = 1.0 / distance
+        else:
+            light = light_of(
+                distance,
+                reflectivity,
+                calibration[wp.static(PHASE_SLOPE)],
+                calibration[wp.static(PHASE_OFFSET)],
+                calibration[wp.static(SOURCE_INTENSITY)],
+            )
         red = float(0.0)
         green = float(0.0)
         blue = float(0.0)
@@ -171,7 +185,7 @@ def make_project(colour: bool, square: bool, lens: bool = False):
         splats[n] = Splat(
             x, y, -0.5 * cov[2] / determinant, cov[1] / determinant, -0.5 * cov[0] / determinant,
             opacity, visit[0], visit[1],
-            red, green, blue, light[0], light[1], light[2], distance, 0.0,
+            red, green, blue, light[0], light[1], light[2], along_ray, bound,
         )  # fmt: skip
 
     return project

@@ -190,7 +190,13 @@ def more_of(
 
 @functools.cache
 def make_gradient_rounds(
-    tile_width: int, light: bool, channels: bool, geometry: bool, spreads: bool, more: bool = False
+    tile_width: int,
+    light: bool,
+    channels: bool,
+    geometry: bool,
+    spreads: bool,
+    more: bool = False,
+    sloped: bool = False,
 ) -> SimpleNamespace:
     """Functions that sum the gradients of a round over the 32 pixels of a tile, one per lane.
 
@@ -201,14 +207,18 @@ def make_gradient_rounds(
         geometry: Whether centre, conic and opacity have.
         spreads: Whether the distortion has, and with it the distance one per entry.
         more: Whether three further channels have gradients, in other records.
+        sloped: Whether each pixel of a splat has its own distance, and with it its own light:
+            then ``w2`` is the derivative by the strength, ``wd`` that by the distance.
     """
     half = PIXELS // 2
     if half % tile_width:
         raise ValueError(f"half of a tile must be whole rows, got {tile_width} columns")
     V = make_lanes(1).V
     # values per pixel and entry
-    kept = ["w"] + ["v"] * geometry + ["w2"] * light + ["wd"] * spreads
-    derivatives = light + channels + more
+    sloped = sloped and light
+    kept = ["w"] + ["v"] * geometry + ["w2"] * light + ["wd"] * (spreads or sloped)
+    by_pixel = light and not sloped  # whether the light's derivatives are those of the pixel
+    derivatives = by_pixel + channels + more
     floats = shared_floats(len(kept), derivatives)
     kept_at = _RECORDS + 4 * PIXELS * derivatives
     places = f"""
@@ -219,9 +229,9 @@ def make_gradient_rounds(
     derivatives_snippet = f"""
 #if defined(__CUDA_ARCH__)
     float4* const to = reinterpret_cast<float4*>(memory) + {_RECORDS // 4} + (threadIdx.x & 31u);
-    {"to[0] = make_float4(g_re[0], g_im[0], g_amplitude[0], g_distance[0]);" if light else ""}
-    {f"to[{PIXELS * light}] = make_float4(g0[0], g1[0], g2[0], 0.0f);" if channels else ""}
-    {f"to[{PIXELS * (light + channels)}] = make_float4(g3[0], g4[0], g5[0], 0.0f);" if more else ""}
+    {"to[0] = make_float4(g_re[0], g_im[0], g_amplitude[0], g_distance[0]);" if by_pixel else ""}
+    {f"to[{PIXELS * by_pixel}] = make_float4(g0[0], g1[0], g2[0], 0.0f);" if channels else ""}
+    {f"to[{PIXELS * (derivatives - 1)}] = make_float4(g3[0], g4[0], g5[0], 0.0f);" if more else ""}
 #endif
 """
 
@@ -241,11 +251,7 @@ def make_gradient_rounds(
     ):
         """Store the derivatives by this lane's pixel; read after the next barrier."""
 
-    stores = [
-        f"to[{n * ROUND * STRIDE}] = {name}[0]{' * g_d[0]' * (name == 'wd')};"
-        for n, name in enumerate(kept)
-    ]
-    stores = [store.replace("wd[0]", "w[0]") for store in stores]
+    stores = [f"to[{n * ROUND * STRIDE}] = {name}[0];" for n, name in enumerate(kept)]
 
     values_snippet = f"""
 #if defined(__CUDA_ARCH__)
@@ -256,7 +262,7 @@ def make_gradient_rounds(
 """
 
     @wp.func_native(values_snippet)
-    def store_values(memory: wp.uint64, first: int, n: int, v: V, w: V, w2: V, g_d: V):
+    def store_values(memory: wp.uint64, first: int, n: int, v: V, w: V, w2: V, wd: V):
         """Store this pixel's values for entry ``n`` of the group from entry ``first`` on."""
 
     take = "\n        ".join(
@@ -275,13 +281,19 @@ def make_gradient_rounds(
             const float4 g = pixel[4 * part + j];
             sums[11] += w2_[j] * g.x; sums[12] += w2_[j] * g.y; sums[13] += w2_[j] * g.z;
             sums[14] += {"wd_[j]" if spreads else "w_[j] * g.w"};"""
+    # before the moments, which change dy
+    by_distance = """
+            const float free = fabsf(q[12] * dx[c] + q[13] * dy) < q[15] ? wd_[j] : 0.0f;
+            sums[11] += w2_[j]; sums[12] += free * dx[c]; sums[13] += free * dy;
+            sums[14] += wd_[j]; sums[15] += free;"""
     coloured = f"""
-            const float4 h = pixel[{PIXELS * light} + 4 * part + j];
+            const float4 h = pixel[{PIXELS * by_pixel} + 4 * part + j];
             sums[8] += w_[j] * h.x; sums[9] += w_[j] * h.y; sums[10] += w_[j] * h.z;"""
     further = f"""
-            const float4 m = pixel[{PIXELS * (light + channels)} + 4 * part + j];
+            const float4 m = pixel[{PIXELS * (derivatives - 1)} + 4 * part + j];
             more0 += w_[j] * m.x; more1 += w_[j] * m.y; more2 += w_[j] * m.z;"""
-    terms = moments * geometry + coloured * channels + further * more + lit * light
+    terms = by_distance * sloped
+    terms += moments * geometry + coloured * channels + further * more + lit * by_pixel
     add_more = f"""
     const float4 m0 = *reinterpret_cast<const float4*>(kept + s * {OUT_STRIDE} + 16);
     const float4 m1 = *reinterpret_cast<const float4*>(kept + s * {OUT_STRIDE} + 16

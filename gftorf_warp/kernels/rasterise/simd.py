@@ -148,7 +148,7 @@ def types_of(K: int) -> str:
     }};"""
 
 
-def _elementwise(K: int, vectors: str, expression: str, prelude: str = "") -> str:
+def elementwise(K: int, vectors: str, expression: str, prelude: str = "") -> str:
     """C++ body of an operation; ``vectors`` names its K-wide arguments, the others are scalars."""
     names = vectors.split()
     body = expression if "return" in expression else f"return {expression};"
@@ -181,7 +181,7 @@ def make_lanes(K: int) -> SimpleNamespace:
     V, side = wp.types.vector(length=K, dtype=wp.float32), math.isqrt(K)
     exp = "auto exp_ = [](F x) -> F { return expf(x); };" if K == 1 else _EXP
 
-    @wp.func_native(_elementwise(K, "", "(F)(x)"))
+    @wp.func_native(elementwise(K, "", "(F)(x)"))
     def fill(x: float) -> V: ...
     @wp.func_native(
         f"wp::vec_t<{K}, float> r; for (int c = 0; c < {K}; ++c) r[c] = x + "
@@ -193,48 +193,48 @@ def make_lanes(K: int) -> SimpleNamespace:
         f"(float)(c / {side}); return r;"
     )
     def rows(y: float) -> V: ...
-    @wp.func_native(_elementwise(K, "a", "a * s + t"))
+    @wp.func_native(elementwise(K, "a", "a * s + t"))
     def affine(a: V, s: float, t: float) -> V: ...
-    @wp.func_native(_elementwise(K, "a", "a * s"))
+    @wp.func_native(elementwise(K, "a", "a * s"))
     def scaled(a: V, s: float) -> V: ...
-    @wp.func_native(_elementwise(K, "a b", "b < a ? (F)(1.0f) : (F)(0.0f)"))
+    @wp.func_native(elementwise(K, "a b", "b < a ? (F)(1.0f) : (F)(0.0f)"))
     def exceeds(a: V, b: V) -> V: ...
-    @wp.func_native(_elementwise(K, "a b", "a * b"))
+    @wp.func_native(elementwise(K, "a b", "a * b"))
     def mul(a: V, b: V) -> V: ...
-    @wp.func_native(_elementwise(K, "a b", "a + b"))
+    @wp.func_native(elementwise(K, "a b", "a + b"))
     def add(a: V, b: V) -> V: ...
-    @wp.func_native(_elementwise(K, "a", "a < x ? (F)(x) : a"))
+    @wp.func_native(elementwise(K, "a", "a < x ? (F)(x) : a"))
     def at_least(a: V, x: float) -> V: ...
-    @wp.func_native(_elementwise(K, "a b", "a + b * s"))
+    @wp.func_native(elementwise(K, "a b", "a + b * s"))
     def axpy(a: V, b: V, s: float) -> V: ...
-    @wp.func_native(_elementwise(K, "a b c", "a + b * c"))
+    @wp.func_native(elementwise(K, "a b c", "a + b * c"))
     def fma(a: V, b: V, c: V) -> V: ...
-    @wp.func_native(_elementwise(K, "a b c", "a - b * c"))
+    @wp.func_native(elementwise(K, "a b c", "a - b * c"))
     def fnma(a: V, b: V, c: V) -> V: ...
     @wp.func_native(
-        _elementwise(K, "a", "1.0f / a" if K == 1 else "inverse_(a)", "" if K == 1 else _INVERSE)
+        elementwise(K, "a", "1.0f / a" if K == 1 else "inverse_(a)", "" if K == 1 else _INVERSE)
     )
     def inverse(a: V) -> V: ...
-    @wp.func_native(_elementwise(K, "a", "a > x ? (F)(1.0f) : (F)(0.0f)"))
+    @wp.func_native(elementwise(K, "a", "a > x ? (F)(1.0f) : (F)(0.0f)"))
     def above(a: V, x: float) -> V: ...
-    @wp.func_native(_elementwise(K, "a b", "b < x ? (F)(0.0f) : a"))
+    @wp.func_native(elementwise(K, "a b", "b < x ? (F)(0.0f) : a"))
     def drop_below(a: V, b: V, x: float) -> V: ...
-    @wp.func_native(_elementwise(K, "a b", "b < x ? a : (F)(0.0f)"))
+    @wp.func_native(elementwise(K, "a b", "b < x ? a : (F)(0.0f)"))
     def keep_below(a: V, b: V, x: float) -> V: ...
-    @wp.func_native(_elementwise(K, "a", "a >= x ? (F)(1.0f) : (F)(0.0f)"))
+    @wp.func_native(elementwise(K, "a", "a >= x ? (F)(1.0f) : (F)(0.0f)"))
     def reaches(a: V, x: float) -> V: ...
-    @wp.func_native(_elementwise(K, "a mask", "mask > 0.0f ? (F)(x) : a"))
+    @wp.func_native(elementwise(K, "a mask", "mask > 0.0f ? (F)(x) : a"))
     def set_where(a: V, mask: V, x: float) -> V: ...
-    @wp.func_native(_elementwise(K, "dx dy", "(dx * p + dy * q) * dx + (dy * r) * dy"))
+    @wp.func_native(elementwise(K, "dx dy", "(dx * p + dy * q) * dx + (dy * r) * dy"))
     def power_of(dx: V, dy: V, p: float, q: float, r: float) -> V: ...
     @wp.func_native(
-        _elementwise(K, "power gate", "((power > low) & (gate > 0.0f)) ? (F)(1.0f) : (F)(0.0f)")
+        elementwise(K, "power gate", "((power > low) & (gate > 0.0f)) ? (F)(1.0f) : (F)(0.0f)")
     )
     def hits(power: V, gate: V, low: float) -> V: ...
-    @wp.func_native(_elementwise(K, "power hit", "hit > 0.0f ? exp_(power) : (F)(0.0f)", exp))
+    @wp.func_native(elementwise(K, "power hit", "hit > 0.0f ? exp_(power) : (F)(0.0f)", exp))
     def response(power: V, hit: V) -> V: ...
     @wp.func_native(  # min(largest, o e^power) where it hits, else 0
-        _elementwise(
+        elementwise(
             K,
             "power hit",
             "const F x = o * exp_(power), a = x < largest ? x : (F)(largest); return hit > 0.0f "

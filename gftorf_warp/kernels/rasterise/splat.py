@@ -14,6 +14,14 @@ Sixteen floats, one 64-byte line, the same slots for values and for gradients:
     11 12 13         a cos psi, a sin psi, a: what quads and phasor are made of, weighed by T^2
     14 distance      along the ray [m]
     15               free
+
+Of a sloped splat (splat_distance.py), in which every pixel has a distance of its own:
+
+    11 strength      s r, what the amplitude is times distance^2
+    12 gx   13 gy    change of the inverse distance along x and y [1/(m px)]
+    14 nearness      inverse distance at the centre [1/m]
+    15 bound         how far a pixel's inverse distance may be from it [1/m]; of a gradient: the
+                     moment of order 0 of the derivatives by a pixel's inverse distance
 """
 
 import warp as wp
