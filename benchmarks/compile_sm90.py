@@ -12,6 +12,7 @@ sm_90a, and left out for other architectures.
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import struct
 import sys
@@ -37,6 +38,7 @@ from gftorf_warp.kernels.rasterise import (
     planes_to_images,
     project,
     splat,
+    splat_distance,
     tile_bitmask,
     tiles,
 )
@@ -94,10 +96,12 @@ def modules(arch: int) -> dict[str, wp.Module]:
     for name in ("columns_of_products", "compare_images", "columns_of_slopes", "gradient_of_image"):
         found[name] = getattr(window, name).module
     found["finish_moments"] = composite_backward.finish_moments.module
+    found["finish_slopes"] = splat_distance.finish_slopes.module
     for colour in (False, True):
-        for square in (False, True):
-            kernel = project.make_project(colour, square)
-            found["project" + " colour" * colour + " square" * square] = kernel.module
+        for square, sloped in ((False, False), (True, False), (False, True)):
+            kernel = project.make_project(colour, square, sloped=sloped)
+            title = "project" + " colour" * colour + " square" * square + " sloped" * sloped
+            found[title] = kernel.module
     for light, channels, fixed in (
         (True, False, False), (True, True, False), (True, True, True), (False, True, False),
         (False, True, True),
@@ -107,14 +111,16 @@ def modules(arch: int) -> dict[str, wp.Module]:
             name = f"{what} {'without' if metric is None else 'paper' if metric else 'released'}"
             for more in {False, light and channels}:
                 split = light and metric is None and (fixed or not channels)
-                for segments in {1, SEGMENTS["cuda"] if split else 1}:
-                    given = *shape, light, channels, bool(metric), metric, more, segments
+                numbers = {1, SEGMENTS["cuda"] if split else 1}
+                for segments, sloped in itertools.product(numbers, {False, light}):
+                    given = *shape, light, channels, bool(metric), metric, more, segments, sloped
                     arguments = *shape, light, channels, not metric, metric, fixed, more, segments
                     title = name + " and three more" * more + " in segments" * (segments > 1)
+                    title += " sloped" * sloped
                     if not fixed or segments > 1:
                         found[f"composite {title}"] = composite.make_composite(*given).module
                     found[f"composite_backward {title}"] = (
-                        composite_backward.make_composite_backward(*arguments).module
+                        composite_backward.make_composite_backward(*arguments, sloped).module
                     )
     return found
 

@@ -17,7 +17,7 @@ import warp as wp
 
 from ..constants import CANONICAL_SHIFTS
 from ..render import launch, stages
-from ..render.buffers import Buffers, RenderSettings
+from ..render.buffers import Buffers, RenderSettings, SplatDistance
 from ..render.inputs import Images, Inputs, names_of
 from .scenes import CAMERA, FAMILIES, FAR, HEIGHT, NEAR, WIDTH, array_of, inputs_of, scene_of
 from .timing import Function, HostWatch, Report, Watch, both_ways, lines_of, timed, two_passes
@@ -61,7 +61,14 @@ class Case:
     """One scene in one form with its buffers."""
 
     def __init__(
-        self, kind: str, count: int, scale: float, opacity: float, form: str, device: wp.Device
+        self,
+        kind: str,
+        count: int,
+        scale: float,
+        opacity: float,
+        form: str,
+        device: wp.Device,
+        splat_distance: SplatDistance = SplatDistance.CENTRE,
     ):
         """Make everything but the pair capacity of its buffers, which needs a first rendering."""
         if form not in FORMS:
@@ -85,14 +92,16 @@ class Case:
         for name in GAUSSIANS:
             value = getattr(self.inputs, name)
             setattr(self.wanted, name, None if value is None else wp.zeros_like(value))
-        self.count, self.device = count, device
+        self.count, self.device, self.splat_distance = count, device, splat_distance
         self.start(None)
         self.forward()
         self.pairs = int(self.buffers.total.numpy()[0])
 
     def start(self, capacity: int | None) -> None:
         """Buffers for ``capacity`` pairs; None: as many as needed."""
-        settings = RenderSettings(near=NEAR, far=FAR, pair_capacity=capacity)
+        settings = RenderSettings(
+            near=NEAR, far=FAR, pair_capacity=capacity, splat_distance=self.splat_distance
+        )
         self.buffers = Buffers(self.count, WIDTH, HEIGHT, settings, self.device)
         self.view = launch.uploaded(CAMERA, self.shifts, settings, self.device)
 
