@@ -9,7 +9,8 @@
     planes_to_images     planes in tile order to row-major images, and the adjoint
     composite_backward   adjoint of the compositor, back to front
 
-Read by these kernels: ``splat`` (the record of a projected Gaussian), ``simd`` (arithmetic on the
+Read by these kernels: ``splat`` (the record of a projected Gaussian), ``splat_distance`` (distances
+that differ from pixel to pixel of a splat), ``simd`` (arithmetic on the
 pixels of a thread), ``shared_batches`` (records staged in shared memory), ``list_segments`` (tile
 lists cut into segments for the adjoint).
 """
