@@ -1,14 +1,16 @@
 """Accuracy of presets on many scenes with several seeds, against the closed form.
 
     python benchmarks/accuracy.py --out DIR --row ROW [--row ROW ...]
-        [--scenes 0-15] [--validation] [--shared FOLDER] [--seeds 0,1,2] [--size 320x240]
-        [--frames 60] [--images N] [--device cpu] [--workers K] [--limit SECONDS] [--again]
+        [--scenes 0-15] [--validation] [--shared FOLDER [--finer FOLDER]] [--seeds 0,1,2]
+        [--size 320x240] [--frames 60] [--images N] [--device cpu] [--workers K]
+        [--limit SECONDS] [--again] [--keep]
     python benchmarks/accuracy.py --out DIR --row fast --row plane=fast,weights.ssim=0.1
 
 A row is NAME=PRESET[,SETTING=VALUE...], or a preset alone. Scenes are `gftorf simulate random-N
 --engine mesh`: numbers 0 to 15 are for tuning. Those of --validation, 100 to 115, are looked at for
 closing tables only; no setting is chosen with them. --shared adds the sequences in a folder that
-other programs made, in the F-ToeRF layout. --images shortens every preset to that many images, and
+other programs made, in the F-ToeRF layout; --finer names the same ones at a multiple of their size,
+whose truth gives their edge floor. --images shortens every preset to that many images, and
 all its intervals alike.
 
 Results are lines in DIR/results.jsonl, one per scene and per fit. What is there with the same
@@ -55,6 +57,7 @@ def main(arguments: list[str] | None = None) -> int:
         images=options.images,
         device=options.device,
         keep=options.keep,
+        finer=options.finer and options.finer.resolve(),
     )
     setup.out.mkdir(parents=True, exist_ok=True)
     sets = _sets(options)
@@ -104,13 +107,16 @@ def _options(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--scenes", type=numbers, help="tuning scenes, like 0-3,7 or none (0-15)")
     parser.add_argument("--validation", action="store_true", help="scenes 100 to 115 instead")
     parser.add_argument("--shared", type=Path, help="folder of further sequences")
+    parser.add_argument("--finer", type=Path, help="the same ones at a multiple of the size")
     parser.add_argument("--seeds", type=numbers, default=list(SEEDS))
     parser.add_argument("--size", type=_size, default=(320, 240), metavar="WxH")
     parser.add_argument("--frames", type=int, default=60)
     parser.add_argument("--images", type=int)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--workers", type=int)
-    parser.add_argument("--limit", type=float, default=math.inf, help="no job begins after [s]")
+    parser.add_argument(
+        "--limit", type=float, default=math.inf, help="no job begins after [s], 40 s later all end"
+    )
     parser.add_argument("--again", action="store_true", help="also what other versions did")
     parser.add_argument("--keep", action="store_true", help="keep the folders of runs")
     options = parser.parse_args(arguments)

@@ -8,9 +8,11 @@ its result is the error.
 
 from __future__ import annotations
 
+import argparse
 import hashlib
 import json
 import logging
+import math
 import multiprocessing
 import os
 import shutil
@@ -48,6 +50,7 @@ from gftorf_warp.sim.mesh_engine import MeshEngine
 from gftorf_warp.sim.random_scene import random_scene
 
 Result = dict[str, Any]
+GRACE = 40.0  # [s]
 RAYS = 4  # per pixel and axis, of the edge floor
 CAPTION, PANEL = 16, 240  # [px] height of the text above a picture, least width of each of its four
 
@@ -68,6 +71,9 @@ class Row:
         """The row of an option; ``PRESET`` alone is named after it."""
         first, *changes = text.split(",")
         name, _, preset = first.partition("=")
+        if (preset or name) not in presets.PRESETS:
+            known = ", ".join(presets.PRESETS)
+            raise argparse.ArgumentTypeError(f"{text!r} names none of the presets {known}")
         return cls(name=name, preset=preset or name, changes=tuple(changes))
 
 
@@ -87,6 +93,9 @@ class Setup:
     """Where to trace and to fit."""
     keep: bool = False
     """Whether the folders of runs are kept."""
+    finer: Path | None = None
+    """Folder with given sequences of the same names at a multiple of their size, for their edge
+    floor; None: they have none."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -164,15 +173,22 @@ def _prepared(job: Job, setup: Setup, known: str | None) -> Result | None:
         simulate(scene, folder, device=setup.device, **how)
         about = f"{scene.motion}; {scene.description}"
     sequence = _sequence(folder)
-    key = _hash("scene", data_hash(sequence), RAYS)
+    finer = None if setup.finer is None else setup.finer / folder.name
+    key = _hash("scene", data_hash(sequence), RAYS, job.given and finer)
     if key == known:
         return None
     frames = scored_frames(sequence)[:: sequence.cycle]
     truth = _true_distance(folder)
     moving, static = moving_and_static(truth, frames, cycle=sequence.cycle)
     masks = {"all": np.ones_like(moving), "moving": moving, "static": static}
+    mixed = None
     if not job.given:
-        error = squared_error(_mixed(scene, setup, sequence.times[frames]), truth[frames])
+        mixed = _mixed(scene, setup, sequence.times[frames])
+    elif finer is not None:
+        fine = _true_distance(finer)[frames]
+        mixed = averaged(fine, fine.shape[1] // truth.shape[1])
+    if mixed is not None:
+        error = squared_error(mixed, truth[frames])
         floor = {name: _x100(pooled(error, mask)) for name, mask in masks.items()}
     return {"key": key, "floor": floor, "about": about, "moving_share": float(moving.mean())}
 
@@ -294,7 +310,8 @@ class Workers:
     ) -> Iterator[tuple[Job, Result | None]]:
         """Results in the order in which they are ready; None: nothing had to be done.
 
-        No job begins after ``deadline`` on the monotonic clock [s].
+        No job begins after ``deadline`` on the monotonic clock [s], and processes that are not
+        ready ``GRACE`` later are killed.
         """
         waiting, busy = deque(jobs), {}
         while waiting or busy:
@@ -305,7 +322,13 @@ class Workers:
                 busy[connection] = process, job
             if not busy:
                 return
-            for connection in wait(list(busy)):
+            left = None if math.isinf(deadline) else deadline + GRACE - time.monotonic()
+            ready = wait(list(busy), None if left is None else max(left, 0.0))
+            if not ready:
+                for process, _ in busy.values():
+                    process.kill()
+                return
+            for connection in ready:
                 process, job = busy.pop(connection)
                 try:
                     result = connection.recv()

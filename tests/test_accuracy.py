@@ -6,6 +6,7 @@ import json
 import multiprocessing
 import os
 import sys
+import time
 from dataclasses import dataclass
 from math import inf
 from pathlib import Path
@@ -21,7 +22,6 @@ import accuracy_jobs
 import accuracy_table
 
 from gftorf_warp import simulate
-from gftorf_warp.errors import UsageError
 from gftorf_warp.sim.random_scene import random_scene
 from gftorf_warp.sim.world import first_hit
 
@@ -54,6 +54,17 @@ def result(row, scene, seed, d, closed=(1.0, 1.0, 1.0), **more):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Endless(accuracy_jobs.Job):
+    """A job that never ends."""
+
+    def folder(self, setup):
+        """Waits in any process but that of the test."""
+        while multiprocessing.parent_process() is not None:
+            time.sleep(1.0)
+        return super().folder(setup)
+
+
+@dataclass(frozen=True, kw_only=True)
 class Deadly(accuracy_jobs.Job):
     """A job that kills its process, as a lack of memory does."""
 
@@ -70,6 +81,7 @@ def test_a_benchmark_of_two_scenes(tmp_path, capsys):
     """
     shared = tmp_path / "others"
     simulate("random-3", shared / "axial", size=(40, 30), frames=8, engine="mesh")
+    simulate("random-3", tmp_path / "fine" / "axial", size=(80, 60), frames=8, engine="mesh")
     rows = ["--row", "ctof", "--row", "short=demo,weights.ssim=0.1", "--row", "bad=demo,no.such=1"]
     command = [
         "--out",
@@ -80,6 +92,8 @@ def test_a_benchmark_of_two_scenes(tmp_path, capsys):
         "1",
         "--shared",
         str(shared),
+        "--finer",
+        str(tmp_path / "fine"),
     ]
     assert accuracy.main(command) == 1
     first = capsys.readouterr()
@@ -88,6 +102,8 @@ def test_a_benchmark_of_two_scenes(tmp_path, capsys):
     lines = (tmp_path / "acc" / "results.jsonl").read_text().splitlines()
     assert len(lines) == 2 + 3 * 2 * 2
     results = {line["id"]: line for line in map(json.loads, lines)}
+    floor = results["shared/axial@given"]["floor"]
+    assert 0 < floor["static"] < floor["all"] < floor["moving"]
     fit = results["short/random-1@40x30x8/24/1"]
     assert fit["scores"]["images_optimised"] == 24
     assert fit["seconds"] > 0
@@ -157,6 +173,15 @@ def test_a_process_that_dies_is_a_failed_job(tmp_path):
     assert "error" not in found[1]
 
 
+def test_a_job_that_never_ends_is_left_after_the_limit(tmp_path, monkeypatch):
+    """Its process is killed when the time is over."""
+    monkeypatch.setattr(accuracy_jobs, "GRACE", 0.1)
+    workers = accuracy_jobs.Workers(1, setup_in(tmp_path))
+    limit = time.monotonic() + 0.1
+    assert list(workers.results([Endless(scene="random-1")], {}, limit)) == []
+    workers.close()
+
+
 def test_rows_and_numbers_of_the_command_line(capsys):
     """Names, presets, changes, ranges; validation scenes need their option."""
     row = accuracy_jobs.Row.of("plane=fast,render.near=0.2,weights.ssim=0")
@@ -169,8 +194,9 @@ def test_rows_and_numbers_of_the_command_line(capsys):
         with pytest.raises(SystemExit):
             accuracy.main(["--out", "unused", "--row", "ctof", *wrong])
     assert "name of its own" in capsys.readouterr().err
-    with pytest.raises(UsageError, match="unknown preset fats"):
-        accuracy_jobs.presets.preset("fats")
+    with pytest.raises(SystemExit):
+        accuracy.main(["--out", "unused", "--row", "fats"])
+    assert "'fats' names none of the presets demo, " in capsys.readouterr().err
 
 
 def test_the_summary_is_means_over_scenes_and_seeds():
