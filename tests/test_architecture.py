@@ -83,10 +83,7 @@ LARGE_CLASSES = {  # file:class: why it may be larger
     "sim/scene.py:Scene": "what a scene file may say",
     "recon/settings.py:ReconSettings": "settings of one run; those that belong together are "
     "classes of their own",
-    "recon/control.py:ControlBlock": "still to be divided",
-    "recon/loop.py:TrainingLoop": "still to be divided",
     "recon/run.py:Run": "still to be divided",
-    "recon/step.py:Step": "still to be divided",
     "recon/stepper.py:Stepper": "still to be divided",
     "render/buffers.py:Buffers": "still to be divided",
 }

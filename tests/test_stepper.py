@@ -18,7 +18,7 @@ from small_runs import demo, random, small
 
 from gftorf_warp.constants import SPEED_OF_LIGHT
 from gftorf_warp.recon import presets, stepper
-from gftorf_warp.recon.control import GraphKey
+from gftorf_warp.recon.keys import GraphKey
 from gftorf_warp.recon.observations import observe
 from gftorf_warp.recon.settings import Batch, Input, Norm, Weights
 from gftorf_warp.recon.state import begin

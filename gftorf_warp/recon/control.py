@@ -8,11 +8,9 @@ serves every raw frame, pose, modulation frequency, phase shift and progress of 
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 import torch
@@ -20,11 +18,13 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..render import fused
+from ..render.buffers import RenderSettings
 from ..render.control import DeviceCamera, packed
 from ..render.cuda import DeviceUpload
 from ..render.descent import RESULTS
 from ..scene.motion import Motion
 from .blending import Blending
+from .keys import GraphKey, GraphKeys
 from .observations import Observations
 from .settings import ReconSettings
 from .terms import Term, View
@@ -32,52 +32,6 @@ from .terms import Term, View
 ROWS = ("light", "depth", "colour", "flow")  # row numbers of an image, see ``Comparison.rows``
 NUMBERS = len(ROWS) + 2  # integers of an image: its rows, seed and number of its random background
 FLOWS = 2  # of a quartet: to the next one and to the previous one
-
-
-@dataclass(frozen=True, kw_only=True)
-class ImageKey:
-    """One image of a batch, as far as it decides which operations a step consists of."""
-
-    terms: tuple[str, ...]
-    """Names of its terms."""
-    views: frozenset[View]
-    """What is rendered. Flow at the time of the ToF image comes with that rendering."""
-    flow_terms: tuple[str, ...] = ()
-    """Names of the terms that read the flow, which not every image has."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class GraphKey:
-    """What decides which operations a step consists of: steps of one key share a CUDA graph.
-
-    Keys are compared by identity: a control block makes one object for equal values.
-    """
-
-    images: tuple[ImageKey, ...]
-    """The images of the batch."""
-    keys: int
-    """Number of motion keys that are evaluated; 0: nothing moves."""
-    frozen: bool
-    """Whether only the motion is optimised."""
-    sh_degree: int
-    """Degree of the harmonics."""
-
-    @cached_property
-    def terms(self) -> frozenset[str]:
-        """Names of all terms that every batch has."""
-        return frozenset(
-            n for image in self.images for n in image.terms if n not in image.flow_terms
-        )
-
-    @cached_property
-    def has_flow(self) -> bool:
-        """Whether any image has a term that reads the flow."""
-        return any(image.flow_terms for image in self.images)
-
-    @cached_property
-    def stage(self) -> tuple[object, ...]:
-        """Equal for keys that alternate. When it changes, earlier graphs are not needed again."""
-        return self.keys > 0, self.frozen, self.sh_degree, self.terms
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -95,6 +49,26 @@ class ImageControl:
     """Camera, calibration and phase shift."""
     flow_cameras: Float[Tensor, "2 V"]
     """Cameras at the ends of both flows."""
+
+    @classmethod
+    def over(
+        cls, ints: Tensor, parts: dict[tuple[str, View], Tensor], keys: int, *, flow: bool
+    ) -> ImageControl:
+        """Views of the integers and floats of one image, of K ``keys``, with or without flow."""
+        blend = {}
+        for view in View:
+            rows = 1 + FLOWS if view != View.COLOUR and flow else 1
+            blend[view] = parts["blend", view][: rows * keys].view(rows, keys)
+        cameras = {
+            view: DeviceCamera.over(parts["camera", view]) for view in (View.TOF, View.COLOUR)
+        }
+        return cls(
+            rows={name: ints[k : k + 1] for k, name in enumerate(ROWS)},
+            noise_origin=ints[len(ROWS) :],
+            blend=blend,
+            camera=cameras | {View.FLOW: cameras[View.TOF]},
+            flow_cameras=parts["camera", View.FLOW].view(FLOWS, -1),
+        )
 
 
 class ControlBlock:
@@ -121,9 +95,9 @@ class ControlBlock:
         self.terms, self.groups = terms, groups
         self.images = max(len(batch) for batch in observations.batches)
         self._blending = Blending(observations, motion)
-        keys = self._blending.counts[True]
-        camera = len(self._camera(View.TOF, observations.batches[0][0]))
-        flow_cameras = self._flow_cameras(observations.batches[0][0])
+        keys, first = self._blending.counts[True], observations.batches[0][0]
+        camera = len(camera_at(observations, settings.render, View.TOF, first))
+        flow_cameras = flow_cameras_at(observations, first)
         self._parts: dict[tuple[str, View], tuple[int, ...]] = {
             ("camera", View.TOF): (camera,),
             ("camera", View.COLOUR): (camera,),
@@ -132,13 +106,11 @@ class ControlBlock:
             ("blend", View.COLOUR): (1, keys),
             ("blend", View.FLOW): (1 + FLOWS, keys),
         }
-        self._keys: dict[tuple, GraphKey] = {}
+        self.graph_keys = GraphKeys(observations, terms, self._blending)
+        """Which operations a step consists of."""
         self._constants: dict[tuple, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
-        sizes = (
-            len(groups) + 1,
-            self.images * len(terms) * RESULTS,
-            self.images * self._image_floats,
-        )
+        results = self.images * len(terms) * RESULTS
+        sizes = len(groups) + 1, results, self.images * self._image_floats
         ints = keys + self.images * NUMBERS
         self._upload = DeviceUpload(
             [(ints, torch.int32), (sum(sizes), torch.float32)], observations.quads.device
@@ -154,33 +126,6 @@ class ControlBlock:
         self._floats = constants.view(self.images, -1)
 
     # -- host --------------------------------------------------------------------------------------
-
-    def key_of(
-        self,
-        frames: list[int],
-        weights: tuple[float, ...],
-        *,
-        moves: bool,
-        frozen: bool,
-        sh_degree: int,
-    ) -> GraphKey:
-        """The key of a step of some raw frames with these weights of the terms."""
-        active = tuple(
-            w > 0 and (moves or not t.needs_motion)
-            for t, w in zip(self.terms, weights, strict=True)
-        )
-        name = (*frames, active, moves, frozen, sh_degree)
-        if name not in self._keys:
-            terms = list(itertools.compress(self.terms, active))
-            images = tuple(self._image_key(frame, terms) for frame in frames)
-            keys = self._blending.counts[any(image.flow_terms for image in images)] if moves else 0
-            values = images, keys, frozen, sh_degree
-            if values not in self._keys:
-                self._keys[values] = GraphKey(
-                    images=images, keys=keys, frozen=frozen, sh_degree=sh_degree
-                )
-            self._keys[name] = self._keys[values]
-        return self._keys[name]
 
     def write(
         self,
@@ -214,25 +159,6 @@ class ControlBlock:
         factors = (present * scale).ravel()
         self._upload.send(ints, np.concatenate([scalars, factors, constants], dtype=np.float32))
 
-    def _image_key(self, frame: int, active: list[Term]) -> ImageKey:
-        terms = [term for term in active if term.applies(self.observations, frame)]
-        views = {term.view for term in terms if term.view is not None}
-        tof, flow = (self._blending.time_of(view, frame) for view in (View.TOF, View.FLOW))
-        if {View.TOF, View.FLOW} <= views and tof == flow:
-            views.remove(View.FLOW)
-        return ImageKey(
-            terms=tuple(term.name for term in terms),
-            views=frozenset(views),
-            flow_terms=tuple(term.name for term in terms if term.view == View.FLOW),
-        )
-
-    def _rows_of(self, frame: int) -> list[int]:
-        """In the order of ``ROWS``; 0 where there is no such image, which no term reads then."""
-        shown, quartet = self.observations, frame // self.observations.sequence.cycle
-        light = shown.phasors.rows.get(frame, 0) if shown.phasors else frame
-        depth, flow = (stack.rows.get(quartet, 0) for stack in (shown.closed_form, shown.flow))
-        return [light, depth, shown.colour.rows.get(frame, 0), flow]
-
     def _constants_of(
         self, key: GraphKey, frames: list[int]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -250,7 +176,7 @@ class ControlBlock:
         factors = np.zeros((self.images, len(self.terms), RESULTS), np.float32)
         constants = np.zeros((self.images, self._image_floats), np.float32)
         for n, (frame, image) in enumerate(zip(frames, key.images, strict=True)):
-            rows[n, : len(ROWS)] = self._rows_of(frame)
+            rows[n, : len(ROWS)] = rows_of(self.observations, frame)
             terms = [(k, term) for k, term in enumerate(self.terms) if term.name in image.terms]
             for k, _ in terms:
                 factors[n, k, 0] = 1.0
@@ -265,21 +191,10 @@ class ControlBlock:
                     blend = self._blending.weights(view, frame, keys, flow=flow)
                     part[: blend.size] = blend.ravel()  # of as many keys as the graph has
                 elif kind == "camera" and view == View.FLOW:
-                    part[:] = self._flow_cameras(frame).ravel()
+                    part[:] = flow_cameras_at(self.observations, frame).ravel()
                 elif kind == "camera" and (view == View.TOF or frame in self.observations.colour):
-                    part[:] = self._camera(view, frame)
+                    part[:] = camera_at(self.observations, self.settings.render, view, frame)
         return ints, factors, constants.ravel()
-
-    def _camera(self, view: View, frame: int) -> np.ndarray:
-        shown = self.observations
-        camera = (shown.colour_cameras if view == View.COLOUR else shown.cameras)[frame]
-        return packed(camera, shown.sensor_at(frame), self.settings.render)
-
-    def _flow_cameras(self, frame: int) -> np.ndarray:
-        cameras, cycle = self.observations.cameras, self.observations.sequence.cycle
-        last = len(cameras) - 1
-        ends = [cameras[min(max(frame + step * cycle, 0), last)] for step in (1, -1)]
-        return fused.flow_cameras(cameras[frame], ends)
 
     @property
     def _image_floats(self) -> int:
@@ -302,17 +217,31 @@ class ControlBlock:
                 strict=True,
             )
         )
-        blend = {}
-        for view in View:
-            rows = 1 + FLOWS if view != View.COLOUR and key.images[n].flow_terms else 1
-            blend[view] = parts["blend", view][: rows * key.keys].view(rows, key.keys)
-        cameras = {
-            view: DeviceCamera.over(parts["camera", view]) for view in (View.TOF, View.COLOUR)
-        }
-        return ImageControl(
-            rows={name: ints[k : k + 1] for k, name in enumerate(ROWS)},
-            noise_origin=ints[len(ROWS) :],
-            blend=blend,
-            camera=cameras | {View.FLOW: cameras[View.TOF]},
-            flow_cameras=parts["camera", View.FLOW].view(FLOWS, -1),
-        )
+        return ImageControl.over(ints, parts, key.keys, flow=bool(key.images[n].flow_terms))
+
+
+def rows_of(observations: Observations, frame: int) -> list[int]:
+    """Rows of the measured images of a raw frame in the order of ``ROWS``; 0 where there is no such
+    image, which no term reads then.
+    """
+    shown, quartet = observations, frame // observations.sequence.cycle
+    light = shown.phasors.rows.get(frame, 0) if shown.phasors else frame
+    depth, flow = (stack.rows.get(quartet, 0) for stack in (shown.closed_form, shown.flow))
+    return [light, depth, shown.colour.rows.get(frame, 0), flow]
+
+
+def camera_at(
+    observations: Observations, render: RenderSettings, view: View, frame: int
+) -> Float[np.ndarray, " P"]:
+    """Camera, calibration and phase shift of a view, as :func:`packed`."""
+    colour = view == View.COLOUR
+    camera = (observations.colour_cameras if colour else observations.cameras)[frame]
+    return packed(camera, observations.sensor_at(frame), render)
+
+
+def flow_cameras_at(observations: Observations, frame: int) -> Float[np.ndarray, "2 V"]:
+    """Cameras at the ends of both flows of a raw frame, within the recording."""
+    cameras, cycle = observations.cameras, observations.sequence.cycle
+    last = len(cameras) - 1
+    ends = [cameras[min(max(frame + step * cycle, 0), last)] for step in (1, -1)]
+    return fused.flow_cameras(cameras[frame], ends)

@@ -6,7 +6,6 @@ When losses or gradients are not finite for several steps, it returns to the las
 from __future__ import annotations
 
 import contextlib
-import functools
 import logging
 import math
 import signal
@@ -20,7 +19,7 @@ import torch
 from ..errors import DivergedError
 from ..render.buffers import available_threads
 from . import checkpoint, collapse
-from .diagnostics import Diagnostics
+from .diagnostics import Diagnostics, Row
 from .observations import Observations
 from .record import Metrics
 from .settings import ReconSettings
@@ -30,6 +29,7 @@ from .stepper import Stepper
 LOG = logging.getLogger("gftorf_warp")
 SEED_STEP = 1_000_003  # between the seeds of restarts, far from seeds that are counted up
 Progress = Callable[..., None]
+SHOWN = {"loss": "loss", "psnr_db": "quad_psnr_db", "gaussians": "gaussians"}  # as progress
 
 
 class TrainingLoop:
@@ -64,7 +64,7 @@ class TrainingLoop:
         self.metrics, self.diagnostics = metrics, diagnostics
         self.clock, self.progress = clock, progress
         self.checked_at = collapse.veil_checked_at(settings)
-        self.saved_at = clock()
+        self.peak, self.saved_at = peak_of(observations, settings), clock()
 
     def run(self, state: State) -> State:
         """Train until the images are used up; returns the final state.
@@ -105,7 +105,7 @@ class TrainingLoop:
                 if (
                     self.checked_at is not None
                     and before < self.checked_at <= state.images
-                    and self.restarts(state)
+                    and restarts(state, self.metrics, self.observations, self.settings)
                 ):
                     state = self.restart(state)
                     stepper = self.stepper(state, map_images)
@@ -145,43 +145,12 @@ class TrainingLoop:
 
     def report(self, state: State) -> None:
         """Write one row of metrics: means over the images since the last one."""
-        values = torch.stack([*state.sums.values()]).tolist() if state.sums else []  # one transfer
-        sums, state.sums = dict(zip(state.sums, values, strict=True)), {}
-        count = sums.pop("count", 0.0)
-        if not count:
-            return
-        means = {name: value / count for name, value in sums.items()}
-        mse = means.pop("quad_mse")
-        psnr = 10.0 * math.log10(self.peak**2 / mse) if mse > 0 else None
-        row: dict[str, float | int | None] = {"images": state.images, "seconds": self.clock()}
-        row |= {"loss": means.pop("loss"), **means}
-        row |= {"gaussians": len(state.optimiser.field), "quad_psnr_db": psnr}
-        self.metrics.add(row)
-        if self.progress is not None:
-            total, shown = self.settings.schedule.images, {"loss": row["loss"], "psnr_db": psnr}
-            self.progress(state.images, total, **shown, gaussians=row["gaussians"])
-
-    @functools.cached_property
-    def peak(self) -> float:
-        """Largest absolute value of what is compared, in the units of the optimisation."""
-        shown = self.observations
-        images = shown.colour.images
-        if self.settings.weights.quads > 0:
-            measured = torch.as_tensor(shown.sequence.measured).to(self.device)
-            images = shown.phasors.images if shown.phasors else shown.quads[measured]
-        return float(images.abs().max())
-
-    def restarts(self, state: State) -> bool:
-        """Whether the run collapsed to a veil and may restart; if it may not, the log says so."""
-        losses = [float(row.get("quads") or 0.0) for row in self.metrics.rows()]
-        if not collapse.is_veiled(losses, self.observations, self.settings):
-            return False
-        again = state.restarts < self.settings.restarts_max
-        then = "restarts with another seed" if again else "continues: it was restarted too often"
-        LOG.warning(
-            "after %d images the loss is still that of black images: the run %s", state.images, then
-        )
-        return again
+        row = row_of_sums(state, self.peak, self.clock())
+        if row is not None:
+            self.metrics.add(row)
+            if self.progress is not None:
+                shown = {name: row[key] for name, key in SHOWN.items()}
+                self.progress(state.images, self.settings.schedule.images, **shown)
 
     def restart(self, state: State) -> State:
         """Another random start, which keeps the time and the failures of the one before."""
@@ -202,14 +171,7 @@ class TrainingLoop:
             DivergedError: If that has been done too often.
         """
         if state.rollbacks >= self.settings.rollbacks_max:
-            failures, count = self.settings.failures_max, len(state.optimiser.field)
-            raise DivergedError(
-                "the optimisation diverged",
-                where=f"{self.out}, image {state.images}",
-                why=f"loss or gradient of {failures} steps in a row were not finite after "
-                f"{state.rollbacks} returns to a checkpoint, {count} Gaussians",
-                fix="check the sequence with `gftorf check`, or lower the learning rates",
-            )
+            raise _diverged(state, self.settings, self.out)
         stored = checkpoint.last(self.out, self.device)
         assert stored is not None, "a checkpoint is written before the first step"
         restored = from_dict(stored, self.device)
@@ -220,6 +182,57 @@ class TrainingLoop:
         text = "back to the checkpoint at image %d, learning rates times %g"
         LOG.warning(text, restored.images, restored.rate_factor)
         return restored
+
+
+def restarts(
+    state: State, metrics: Metrics, observations: Observations, settings: ReconSettings
+) -> bool:
+    """Whether the run collapsed to a veil and may restart; if it may not, the log says so."""
+    losses = [float(row.get("quads") or 0.0) for row in metrics.rows()]
+    if not collapse.is_veiled(losses, observations, settings):
+        return False
+    again = state.restarts < settings.restarts_max
+    then = "restarts with another seed" if again else "continues: it was restarted too often"
+    LOG.warning(
+        "after %d images the loss is still that of black images: the run %s", state.images, then
+    )
+    return again
+
+
+def row_of_sums(state: State, peak: float, seconds: float) -> Row | None:
+    """A row of metrics: means over the images of the sums of a state, which begin again; None if
+    there were no images.
+    """
+    values = torch.stack([*state.sums.values()]).tolist() if state.sums else []  # one transfer
+    sums, state.sums = dict(zip(state.sums, values, strict=True)), {}
+    count = sums.pop("count", 0.0)
+    if not count:
+        return None
+    means = {name: value / count for name, value in sums.items()}
+    mse = means.pop("quad_mse")
+    row: Row = {"images": state.images, "seconds": seconds, "loss": means.pop("loss"), **means}
+    psnr = 10.0 * math.log10(peak**2 / mse) if mse > 0 else None
+    return row | {"gaussians": len(state.optimiser.field), "quad_psnr_db": psnr}
+
+
+def peak_of(observations: Observations, settings: ReconSettings) -> float:
+    """Largest absolute value of what is compared, in the units of the optimisation."""
+    images = observations.colour.images
+    if settings.weights.quads > 0:
+        measured = torch.as_tensor(observations.sequence.measured).to(observations.quads.device)
+        phasors = observations.phasors
+        images = phasors.images if phasors else observations.quads[measured]
+    return float(images.abs().max())
+
+
+def _diverged(state: State, settings: ReconSettings, out: Path) -> DivergedError:
+    return DivergedError(
+        "the optimisation diverged",
+        where=f"{out}, image {state.images}",
+        why=f"loss or gradient of {settings.failures_max} steps in a row were not finite after "
+        f"{state.rollbacks} returns to a checkpoint, {len(state.optimiser.field)} Gaussians",
+        fix="check the sequence with `gftorf check`, or lower the learning rates",
+    )
 
 
 @contextlib.contextmanager

@@ -17,7 +17,8 @@ from ..render.buffers import RenderSettings, Workspace
 from ..render.displacement import displaced
 from ..scene.gaussians import GaussianField
 from ..scene.motion import KeyMotion
-from .control import ImageControl, ImageKey
+from .control import ImageControl
+from .keys import ImageKey
 from .observations import Observations
 from .settings import ReconSettings
 from .terms import LIGHT, Term, View

@@ -18,7 +18,8 @@ from ..render.api import ScreenGradient
 from ..render.buffers import RenderSettings
 from ..render.cuda import SideStreams
 from ..scene.motion import KeyMotion, Motion
-from .control import ControlBlock, GraphKey, ImageKey
+from .control import ControlBlock
+from .keys import GraphKey, ImageKey
 from .observations import Observations
 from .optimiser import EPSILON, field_of
 from .padded import PaddedParameters
@@ -102,7 +103,7 @@ class Step:
 
         images = [*map_images(image, range(len(key.images)))]
         self._streams.join()
-        lists = self._gradient_lists(key_motion, images)
+        lists = gradient_lists(self.padded, key_motion, images)
         with torch.no_grad():
             table.point(lists, [count for image in images for count in image.pairs])
             if send is not None:
@@ -191,38 +192,39 @@ class Step:
                 weights.append(self.control.weights[n, k, 0])
         return _gradients_of(values, weights, leaves)
 
-    def _gradient_lists(
-        self, key_motion: KeyMotion | None, images: list[ImageGradients]
-    ) -> list[list[Tensor | None]]:
-        """Gradients of all leaves as few enough lists, which Adam sums up."""
-        learning = self.padded.motion
-        of_values, of_motion = self._back_through_motion(key_motion, images)
-        none: list[Tensor | None] = [None] * len(learning)
-        first, *others = [image.values for image in images]
-        lists = [[*first, *of_motion], *([*values, *none] for values in others)]
-        if any(gradient is not None for gradient in of_values):
-            lists.append([*of_values, *none])
-        last = descent.GRADIENTS - 1
-        if len(lists) > descent.GRADIENTS:
-            lists[last:] = [[fused.added(same) for same in zip(*lists[last:], strict=True)]]
-        return lists
 
-    def _back_through_motion(
-        self, key_motion: KeyMotion | None, images: list[ImageGradients]
-    ) -> tuple[list[Tensor | None], list[Tensor | None]]:
-        """Gradients of the field and of the motion parameters through the motion,
-        for all images at once.
-        """
-        values = [*self.padded.values.values()]
-        shared = [t for t in key_motion or () if t is not None]
-        pairs = [
-            (total, tensor)
-            for tensor, *given in zip(shared, *(image.motion for image in images), strict=True)
-            if tensor.requires_grad and (total := fused.added(given)) is not None
-        ]
-        totals, tensors = [total for total, _ in pairs], [tensor for _, tensor in pairs]
-        gradients = _gradients_of(tensors, totals, [*values, *self.padded.motion])
-        return gradients[: len(values)], gradients[len(values) :]
+def gradient_lists(
+    padded: PaddedParameters, key_motion: KeyMotion | None, images: list[ImageGradients]
+) -> list[list[Tensor | None]]:
+    """Gradients of all leaves as few enough lists, which Adam sums up."""
+    of_values, of_motion = _back_through_motion(padded, key_motion, images)
+    none: list[Tensor | None] = [None] * len(padded.motion)
+    first, *others = [image.values for image in images]
+    lists = [[*first, *of_motion], *([*values, *none] for values in others)]
+    if any(gradient is not None for gradient in of_values):
+        lists.append([*of_values, *none])
+    last = descent.GRADIENTS - 1
+    if len(lists) > descent.GRADIENTS:
+        lists[last:] = [[fused.added(same) for same in zip(*lists[last:], strict=True)]]
+    return lists
+
+
+def _back_through_motion(
+    padded: PaddedParameters, key_motion: KeyMotion | None, images: list[ImageGradients]
+) -> tuple[list[Tensor | None], list[Tensor | None]]:
+    """Gradients of the field and of the motion parameters through the motion,
+    for all images at once.
+    """
+    values = [*padded.values.values()]
+    shared = [t for t in key_motion or () if t is not None]
+    pairs = [
+        (total, tensor)
+        for tensor, *given in zip(shared, *(image.motion for image in images), strict=True)
+        if tensor.requires_grad and (total := fused.added(given)) is not None
+    ]
+    totals, tensors = [total for total, _ in pairs], [tensor for _, tensor in pairs]
+    gradients = _gradients_of(tensors, totals, [*values, *padded.motion])
+    return gradients[: len(values)], gradients[len(values) :]
 
 
 def _leaf_of(tensor: Tensor) -> Tensor:

@@ -18,7 +18,8 @@ from ..render.cuda import CapturedGraph, DeviceReadback, graph_pool
 from ..render.pair_capacity import READ_EVERY, PairCapacity
 from ..scene.motion import Still
 from . import densify
-from .control import ControlBlock, GraphKey
+from .control import ControlBlock
+from .keys import GraphKey
 from .observations import Observations
 from .optimiser import frozen, rates_at
 from .padded import PaddedParameters
@@ -88,7 +89,7 @@ class Stepper:
         frames = draw(state, self.observations, settings)
         before, state.images = state.images, state.images + len(frames)
         weights = tuple(term.weight(settings, before) for term in self._step.terms)
-        key = self._control.key_of(
+        key = self._control.graph_keys.of(
             frames,
             weights,
             moves=before >= settings.schedule.warm_up and not isinstance(state.motion, Still),
