@@ -125,6 +125,8 @@ def truth(frames=FRAMES):
 class AnalyticRun:
     """Looks like a finished run; what it renders is the truth plus the errors above."""
 
+    fallback = None
+
     def __init__(self, folder, *, with_truth=True, colour=False):
         self.path = Path(folder) / "run"
         self.path.mkdir(parents=True)
@@ -183,7 +185,7 @@ class AnalyticRun:
         """The sequence this run pretends to be made from."""
         return Sequence.open(self.config["sequence"])
 
-    def renderer(self, images=(), *, f_mod_hz=None):  # noqa: ARG002
+    def renderer(self, images=(), *, f_mod_hz=None, fallback=True):  # noqa: ARG002
         """What ``gftorf render`` asks for every image."""
         return self.render
 

@@ -58,6 +58,8 @@ KEYS = {
     "classes",
     "unambiguous_range_m",
     "ambiguous_share",
+    "d_fit_mse_x100",
+    "source",
     "explained",
     "quad_psnr_db",
     "colour_psnr_db",

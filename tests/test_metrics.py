@@ -181,6 +181,7 @@ def test_errors_are_printed_times_100_or_as_unknown():
         "temporal_median_mse_x100": None,
         "temporal_mse_x100": 300.0,
         "d_mse_x100": 200.0,
+        "d_fit_mse_x100": None,
         "d_normalised_mse_x100": None,
         "d_tof_mse_x100": 100.0,
     }

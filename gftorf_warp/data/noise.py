@@ -22,6 +22,7 @@ from .sequence import Sequence
 MEDIAN = 0.6745  # of |x| of a standard normal distribution
 HIGH_PASS = 6.0  # root of the sum of the squared weights of the two-dimensional high pass
 PAIRS_MAX = 6  # pairs of quartets, spread over the sequence: enough pixels for a percent
+LEAST = 1e-3  # [1] of the amplitude: a millimetre at 20 MHz, and the rounding of exact recordings
 BINS = 12  # of amplitude, with equal numbers of pixels
 BIN_PIXELS_MIN = 200  # for a median within 10 %
 
@@ -36,9 +37,11 @@ class QuadNoise:
     """Variance per amplitude [quad units]: shot noise."""
 
     def sigma(self, amplitude: Float[np.ndarray, "K H W"]) -> Float[np.ndarray, "K H W"]:
-        """Standard deviation of quads [quad units] of every slot from their amplitudes a."""
-        shape = -1, 1, 1
-        return np.sqrt(self.floor.reshape(shape) + self.gain.reshape(shape) * amplitude)
+        """Standard deviation of quads [quad units] of every slot from amplitudes a, at least a
+        thousandth of these.
+        """
+        floor, gain = (values.reshape(-1, 1, 1) for values in (self.floor, self.gain))
+        return np.sqrt(floor + gain * amplitude + np.square(LEAST * amplitude))
 
 
 def quad_noise(sequence: Sequence) -> QuadNoise | None:

@@ -21,36 +21,46 @@ from .sequence import ColourCamera, Flow, Sequence
 STILL_M = 1e-6  # [m], [1] poses that differ less are one pose
 AGREES = 4.0  # [standard deviations] from the median; of 3 to 6 the best on twelve random scenes
 
+AGREEING_MIN = 2  # quartets
+
 
 def camera_rests(sequence: Sequence) -> bool:
     """Whether all raw frames have one pose."""
     return float(np.ptp(sequence.camera_from_world, axis=0).max()) <= STILL_M
 
 
-def averaged(sequence: Sequence) -> Sequence:
+def averaged(sequence: Sequence, agrees: Bool[np.ndarray, "Q H W"] | None = None) -> Sequence:
     """The sequence with the temporal mean of its agreeing quartets instead of each of them.
 
     Other pixels keep what was measured. Where the camera moves, or no quartet is complete, that is
     the whole sequence.
+
+    Args:
+        sequence: What was measured.
+        agrees: Where its complete quartets agree; None: as :func:`agreement` says.
     """
-    if not (camera_rests(sequence) and (noise := quad_noise(sequence))):
-        return sequence
-    agreeing = agreement(sequence, noise)
+    if agrees is None:
+        if not (camera_rests(sequence) and (noise := quad_noise(sequence))):
+            return sequence
+        agrees = agreement(sequence, noise)
     stacked = stacked_quads(sequence)
-    weights = agreeing[:, None].astype(np.float32)
+    weights = agrees[:, None].astype(np.float32)
     mean = (stacked * weights).sum(axis=0) / np.maximum(weights.sum(axis=0), 1.0)
     quads = sequence.quads.copy()
-    for i, agrees, measured in zip(sequence.complete_quartets, agreeing, stacked, strict=True):
-        quads[sequence.quartet_frames(i)] = np.where(agrees, mean, measured)
+    for i, there, measured in zip(sequence.complete_quartets, agrees, stacked, strict=True):
+        quads[sequence.quartet_frames(i)] = np.where(there, mean, measured)
     return replace(sequence, quads=quads)
 
 
 def agreement(sequence: Sequence, noise: QuadNoise) -> Bool[np.ndarray, "Q H W"]:
-    """Whether each complete quartet agrees with the median of its pixel over time."""
+    """Whether each complete quartet agrees with the median of its pixel over time, and another one
+    does: medians of several slots can be of two surfaces, which a single quartet may mix alike.
+    """
     stacked = stacked_quads(sequence)
     light = np.median([amplitudes_of(sequence, i) for i in sequence.complete_quartets], axis=0)
     reach = AGREES * noise.sigma(light)
-    return (np.abs(stacked - np.median(stacked, axis=0)) <= reach).all(axis=1)
+    agrees = (np.abs(stacked - np.median(stacked, axis=0)) <= reach).all(axis=1)
+    return agrees & (agrees.sum(axis=0) >= AGREEING_MIN)
 
 
 def over_time(sequence: Sequence, reduce: Callable[..., np.ndarray]) -> Float[np.ndarray, "H W"]:

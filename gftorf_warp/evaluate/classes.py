@@ -13,7 +13,7 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from .metrics import ERROR_UNIT
+from .metrics import DISTANCES, ERROR_UNIT
 
 STEP_M = 0.1  # [m] twice the change that counts as motion
 EDGE_PX = 1.5  # [px] from a step: two pixels on either side of it
@@ -95,6 +95,7 @@ def class_errors(
                 else None
                 for key, total in sums.items()
             }
+            values |= {f"{key}_mse_x100": None for key in DISTANCES if key not in sums}
             share = count / pixels.sum() if pixels.sum() else None
             result[name][kind] = {**values, "share": share}
     return result

@@ -175,6 +175,7 @@ def summary(
         **_errors(found.judgement),
         "unambiguous_range_m": unambiguous_range(found.sequence),
         "ambiguous_share": None if confidence is None else float((confidence < CONFIDENT).mean()),
+        "source": views.source_shares,
         "explained": found.residuals and found.residuals.as_json(),
         "quad_psnr_db": measure.psnr_db(views.quad_rendered, views.quad_measured, peak),
         "colour_psnr_db": colour

@@ -13,6 +13,7 @@ from ..constants import SPEED_OF_LIGHT
 from ..data.decode import quartet_phasor
 from ..data.sequence import Sequence
 from ..data.unwrap import CONFIDENT
+from ..recon.fallback import SOURCES
 from ..recon.residuals import Residuals
 from . import page, pictures
 from .gallery import Colour, Novel
@@ -30,6 +31,7 @@ QUARTET_TEXT = (
     "Each raw frame has its own time, during which objects move. The closed form takes the frames "
     "as simultaneous, hence the false distances along moving outlines."
 )
+SOURCE_NAMES = dict(zip(SOURCES, ("fit", "temporal mean", "closed form"), strict=True))
 CHI_SQUARE_SHOWN = (0.1, 1000.0)  # on a logarithmic scale
 TITLES = {"closed_form": "closed form", "d": "ours, d", "d_tof": "ours, d_ToF"}
 
@@ -198,7 +200,7 @@ def explained(found: Findings, s: int) -> str:
         return ""
     of_quartet = found.residuals.quartets.index(found.views.frames[s] // found.sequence.cycle)
     figures = []
-    if found.residuals.chi_square is not None:
+    if found.residuals.noisy:
         logarithm = np.log10(np.maximum(found.residuals.chi_square, CHI_SQUARE_SHOWN[0]))
         low, high = np.log10(CHI_SQUARE_SHOWN)
         scale = pictures.Scale(low=low, high=high, colours="magma", unit="log10")
@@ -208,6 +210,16 @@ def explained(found: Findings, s: int) -> str:
     often = found.residuals.unexplained.mean(axis=0, dtype=np.float32)
     title = "share of quartets that are not explained"
     return page.row([*figures, page.picture(often, _share_scale(1.0), title)])
+
+
+def source(found: Findings, s: int) -> str:
+    """Where the distance of every pixel is from, and the fit alone."""
+    if found.views.source is None or found.views.d_fit is None:
+        return ""
+    scale = pictures.Scale(low=0.0, high=len(SOURCE_NAMES) - 1.0, colours="gray", unit="")
+    image, note = found.views.source[s].astype(np.float32), ", ".join(SOURCE_NAMES.values())
+    alone = page.picture(found.views.d_fit[s], found.distance_scale, "the fit alone, d")
+    return page.row([page.picture(image, scale, "source", f"black to white: {note}"), alone])
 
 
 def strip_over_time(found: Findings) -> str:

@@ -20,7 +20,7 @@ LIST = "renders.json"
 # its keys that identify the images
 LISTED = ("run", "times_s", "camera_from_world", "channels", "arrays")
 NEEDS = {  # images of a rendering, by option
-    "distance": ("distance", "opacity"),
+    "distance": ("distance", "opacity", "source"),
     "quads": ("quads",),
     "phasor": ("phasor",),
     "colour": ("colour",),
@@ -51,7 +51,8 @@ def checked(what: str | Iterable[str]) -> tuple[str, ...]:
 def named(name: str, images: Mapping[str, Float[np.ndarray, "..."]], sensor: Sensor) -> Channels:
     """Images by channel name, as in an EXR file.
 
-    distance: ``distance`` [m], not divided by ``opacity`` [1]. quads: ``quad_<shift in degrees>``
+    distance: ``distance`` [m], not divided by ``opacity`` [1]; ``source``, if the run has one: 0
+    the fit, 1 temporal mean, 2 closed form. quads: ``quad_<shift in degrees>``
     [file units]. phasor: ``re``, ``im``, ``amplitude`` [file units]. colour: ``R``, ``G``, ``B``,
     linear [1].
 
@@ -62,7 +63,7 @@ def named(name: str, images: Mapping[str, Float[np.ndarray, "..."]], sensor: Sen
         why, fix = "this run was reconstructed from quads alone", "leave colour out of --what"
         raise UsageError("no colour to render", where="--what colour", why=why, fix=fix)
     if name == "distance":
-        return {image: images[image] for image in NEEDS[name]}
+        return {image: images[image] for image in NEEDS[name] if image in images}
     quads = [f"quad_{math.degrees(shift):03.0f}" for shift in sensor.shifts]
     names = {"quads": quads, "phasor": ["re", "im", "amplitude"], "colour": [*"RGB"]}[name]
     return dict(zip(names, images[name], strict=True))

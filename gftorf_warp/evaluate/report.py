@@ -21,6 +21,7 @@ ROWS = {
     "temporal_median": ("temporal median", "decoded from their median, raw frame by raw frame"),
     "temporal": ("temporal", "mean of the quartets that agree with the median, else closed form"),
     "d": ("ours, d", "rendered mean distance, not divided by opacity"),
+    "d_fit": ("the fit alone, d", "where the measurement does not replace it"),
     "d_normalised": ("ours, d / opacity", "the same, divided"),
     "d_tof": ("ours, d_ToF", "decoded from quads rendered at one instant"),
 }
@@ -273,7 +274,16 @@ def _explained(metrics: Mapping[str, Any], found: Findings, s: int) -> list[str]
         mean = page.number(metrics, "explained.reduced_chi_square", "ratio")
         text += f"; the reduced chi-square of the quads is {mean}, and one for noise alone"
     text = _caption(f"{text}. Each raw frame at its own time, at the size of the fit.")
-    return [_section("How well the quads are explained", text, panels.explained(found, s))]
+    html = panels.explained(found, s)
+    if page.look_up(metrics, "source") is not None:
+        shares = [
+            f"{name} {page.number(metrics, f'source.{key}', 'percent')}"
+            for key, name in panels.SOURCE_NAMES.items()
+        ]
+        html += _caption(f"Where our distance is from: {', '.join(shares)}.") + panels.source(
+            found, s
+        )
+    return [_section("How well the quads are explained", text, html)]
 
 
 def _time_pictures(found: Findings) -> str:

@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 
 from ..data import temporal
 from ..data.decode import Decoded, closed_form_distance, decode_quartet
 from ..data.sequence import Sequence
 from ..errors import DivergedError, UsageError
+from ..recon.fallback import SOURCES
 from ..recon.residuals import quad_of_shift
 from ..render.api import Rendering
 from ..render.series import KEPT, View, on_host
@@ -57,6 +58,10 @@ class Views:
     """Agreement of the frequencies on the closed form [1], see data/unwrap.py; None: there is
     one."""
 
+    d_fit: Float[np.ndarray, "S H W"] | None = None
+    """Rendered mean distance before the measurement replaced it [m]; None: it never does."""
+    source: UInt8[np.ndarray, "S H W"] | None = None
+    """Where ``d`` is from, an index of ``SOURCES``; None: from the fit everywhere."""
     over_time: Mapping[str, Float[np.ndarray, "S H W"]] = field(default_factory=dict)
     """Distances by averaging the measured quartets [m], by the names of ``TEMPORAL``; empty if the
     camera moves."""
@@ -67,10 +72,19 @@ class Views:
         return normalised(self.d, self.opacity)
 
     @property
+    def source_shares(self) -> dict[str, float] | None:
+        """Share of the pixels whose distance is from each of ``SOURCES`` [1]; None: all are the
+        fit's.
+        """
+        if self.source is None:
+            return None
+        return {name: float((self.source == k).mean()) for k, name in enumerate(SOURCES)}
+
+    @property
     def distances(self) -> dict[str, Float[np.ndarray, "S H W"]]:
         """All distances that there are [m], by their names in metrics.json."""
         known = {name: getattr(self, name) for name in DISTANCES if name not in TEMPORAL}
-        return {**known, **self.over_time}
+        return {**{k: v for k, v in known.items() if v is not None}, **self.over_time}
 
 
 def gather(
@@ -90,12 +104,18 @@ def gather(
     quartets = [decoded[n // sequence.cycle] for n in frames]
     rows: dict[str, list[np.ndarray]] = {"d": [], "opacity": [], "d_tof": [], "quad_rendered": []}
     first, *further = sequence.frequencies
-    renderers = {first: run.renderer(RENDERED)}
+    renderers = {first: run.renderer(RENDERED, fallback=False)}
     renderers |= {f: run.renderer(RENDERED, f_mod_hz=f) for f in further}
     for count, n in enumerate(frames, start=1):
         time = float(sequence.times[n])
         light = {f: render(time, camera_at(run, sequence, time)) for f, render in renderers.items()}
-        rendering, measured = light[first], light[float(sequence.frame_frequencies[n])]
+        fit, measured = light[first], light[float(sequence.frame_frequencies[n])]
+        rendering = fit
+        if run.fallback is not None:
+            rendering = run.fallback.applied(fit, time, camera_at(run, sequence, time))
+            rows.setdefault("d_fit", []).append(fit.distance.cpu().numpy().copy())
+            assert rendering.source is not None, "a fallback says where a distance is from"
+            rows.setdefault("source", []).append(rendering.source.cpu().numpy())
         others = [light[f].quads for f in further]
         images = {
             "d": rendering.distance,

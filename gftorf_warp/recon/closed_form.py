@@ -59,12 +59,9 @@ def rendering_of(
     )
 
 
-def check_camera(sequence: Sequence, time: float, camera: Camera, own: Camera, where: Path) -> None:
-    """Refuse every camera but the sequence's own.
-
-    Raises:
-        UsageError: If ``camera`` has other intrinsics than ``own``, or a pose far from those of the
-            quartet.
+def another_view(sequence: Sequence, time: float, camera: Camera, own: Camera) -> str:
+    """How a camera differs from that of the sequence at a time [s], in words; empty if it does
+    not.
     """
     frames = [*range(sequence.frames)[sequence.quartet_frames(nearest_quartet(sequence, time))]]
     frames.append(int(np.abs(sequence.times - time).argmin()))
@@ -73,12 +70,23 @@ def check_camera(sequence: Sequence, time: float, camera: Camera, own: Camera, w
     )
     names = ("width", "height", "fx", "fy", "cx", "cy")
     differ = [name for name in names if not math.isclose(getattr(camera, name), getattr(own, name))]
-    if apart > POSE_TOLERANCE or differ:
+    if differ:
+        return ", ".join(differ)
+    return f"pose, {apart:.3g} away from that of the quartet" if apart > POSE_TOLERANCE else ""
+
+
+def check_camera(sequence: Sequence, time: float, camera: Camera, own: Camera, where: Path) -> None:
+    """Refuse every camera but the sequence's own.
+
+    Raises:
+        UsageError: If ``camera`` has other intrinsics than ``own``, or a pose far from those of the
+            quartet.
+    """
+    if differs := another_view(sequence, time, camera, own):
         raise UsageError(
             "a closed form has one view",
             where=where,
-            why="asked for another "
-            + (", ".join(differ) or f"pose, {apart:.3g} away from that of the quartet"),
+            why=f"asked for another {differs}",
             fix="render other views from a run of Gaussians, for example --preset demo",
         )
 

@@ -12,9 +12,9 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -30,9 +30,6 @@ from ..scene.sensor import Sensor, channel_of
 from .observations import reduced
 from .settings import Method
 
-if TYPE_CHECKING:
-    from .run import Run
-
 LOG = logging.getLogger("gftorf_warp")
 CHI_SQUARE_MAX = 6.0  # noise alone exceeds it in 1e-4 of the pixels, with four raw frames
 MODEL_ERROR = 0.05  # [1] of the amplitude: 6 cm at 20 MHz
@@ -42,15 +39,37 @@ WARNING_SHARE = 0.02
 CENTRAL = (0.05, 0.95)  # quantiles of the unexplained pixels that a message names
 
 
+class Fitted(Protocol):
+    """What is needed of a :class:`gftorf_warp.recon.run.Run`."""
+
+    @property
+    def config(self) -> dict:
+        """Content of config.json."""
+
+    @property
+    def camera(self) -> Camera:
+        """The camera of raw frame 0 at the sequence's own resolution."""
+
+    @property
+    def sensor(self) -> Sensor:
+        """The sensor, with the four canonical shifts."""
+
+    def renderer(
+        self, images: Iterable[str], *, f_mod_hz: float | None
+    ) -> Callable[[float, Camera], Rendering]:
+        """A function of time [s] and camera."""
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Residuals:
     """Residuals of the Q complete quartets of a recording, at the size of the fit."""
 
     quartets: list[int]
     """Their numbers."""
-    chi_square: Float[np.ndarray, "Q H W"] | None
-    """Mean squared residual over the variance of the noise [1]; None: the recording has no
-    noise."""
+    chi_square: Float[np.ndarray, "Q H W"]
+    """Mean squared residual over the variance of the noise [1]."""
+    noisy: bool
+    """Whether the recording has noise; else a thousandth of the amplitude stands for it."""
     unexplained: Bool[np.ndarray, "Q H W"]
     """Where the run fails, see the module."""
     scale: float
@@ -61,7 +80,7 @@ class Residuals:
     @property
     def reduced_chi_square(self) -> float | None:
         """Mean of chi-square over all pixels [1]; None: the recording has no noise."""
-        return None if self.chi_square is None else float(self.chi_square.mean(dtype=np.float64))
+        return float(self.chi_square.mean(dtype=np.float64)) if self.noisy else None
 
     @property
     def unexplained_share(self) -> float:
@@ -96,7 +115,7 @@ class Residuals:
 
 
 @torch.no_grad()
-def residuals(run: Run, sequence: Sequence) -> Residuals | None:
+def residuals(run: Fitted, sequence: Sequence) -> Residuals | None:
     """Render every raw frame of all complete quartets of the run's sequence and compare.
 
     Returns:
@@ -126,10 +145,10 @@ def residuals(run: Run, sequence: Sequence) -> Residuals | None:
         tolerated = np.maximum(variance + np.square(MODEL_ERROR * amplitude), TINY)
         chi_square.append((square / np.maximum(variance, TINY)).mean(axis=0))
         scaled.append((square / tolerated).mean(axis=0))
-    noisy = bool((noise.floor + noise.gain > 0).all())
     return Residuals(
         quartets=measured.complete_quartets,
-        chi_square=np.stack(chi_square).astype(np.float32) if noisy else None,
+        chi_square=np.stack(chi_square).astype(np.float32),
+        noisy=bool((noise.floor + noise.gain > 0).all()),
         # not finite counts as unexplained
         unexplained=~(np.stack(scaled) <= CHI_SQUARE_MAX),
         scale=sequence.width / width,
@@ -138,7 +157,7 @@ def residuals(run: Run, sequence: Sequence) -> Residuals | None:
 
 
 def _difference(
-    run: Run,
+    run: Fitted,
     measured: Sequence,
     n: int,
     render: dict[float, Callable[[float, Camera], Rendering]],

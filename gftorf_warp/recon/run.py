@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import logging
 import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
@@ -32,9 +33,12 @@ from ..scene.gaussians import GaussianField
 from ..scene.motion import Motion, Still
 from ..scene.sensor import Sensor
 from . import checkpoint, closed_form
+from .fallback import Fallback
 from .folder import read_config
 from .settings import Method
 from .state import field_and_motion
+
+LOG = logging.getLogger("gftorf_warp")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -117,6 +121,9 @@ class Run:
     ) -> Rendering:
         """What the sensor would see at one instant, before black.
 
+        With the setting ``fallback``, the distance is that of the measurement where this knows
+        better, which ``source`` states.
+
         Quads (of the four canonical shifts) and phasor are in the units of the sequence, colour in
         those of its colour images, distances in metres. No gradients. Before the first raw frame
         and beyond the last quartet everything stays as it was there.
@@ -135,12 +142,13 @@ class Run:
             self.render_settings,
             extra=extra,
         )
-        return replace(
+        rendering = replace(
             rendering,
             quads=rendering.quads / self.quad_scale,
             phasor=rendering.phasor / self.quad_scale,
             colour=None if rendering.colour is None else rendering.colour / self.colour_scale,
         )
+        return self.fallback.applied(rendering, time, camera) if self.fallback else rendering
 
     def _at(self, f_mod_hz: float | None) -> Sensor:
         return (
@@ -150,7 +158,11 @@ class Run:
         )
 
     def renderer(
-        self, images: Iterable[str] = (*CHOICES, "colour"), *, f_mod_hz: float | None = None
+        self,
+        images: Iterable[str] = (*CHOICES, "colour"),
+        *,
+        f_mod_hz: float | None = None,
+        fallback: bool = True,
     ) -> Callable[[float, Camera], Rendering]:
         """:meth:`render` for many images: a function of time [s] and camera, which keeps what
         images share.
@@ -162,8 +174,9 @@ class Run:
             images: Names of what is wanted of quads, phasor, colour, distance, opacity and
                 distortion; others have no elements and cost nothing.
             f_mod_hz: Modulation frequency of quads and phasor [Hz]; None: the first of the sensor.
+            fallback: Whether the setting of that name applies.
         """
-        names = frozenset(images)
+        names = frozenset(images) - {"source"}
         field = self.field if "colour" in names else replace(self.field, colour_sh=None)
         sensor = replace(
             self._at(f_mod_hz),
@@ -171,7 +184,24 @@ class Run:
         )
         optimised = self.camera.resized(*self.config["size_optimised"])
         known = field, self.motion, self.binding, sensor, self.render_settings, optimised, names
-        return Replay(*known, colour_scale=self.colour_scale)
+        replay = Replay(*known, colour_scale=self.colour_scale)
+        if "distance" not in names or not fallback or self.fallback is None:
+            return replay
+        measured = self.fallback
+        return lambda time, camera: measured.applied(replay(time, camera), time, camera)
+
+    @functools.cached_property
+    def fallback(self) -> Fallback | None:
+        """Where the measurement knows the distance better than the Gaussians; None without that
+        setting, and for a sequence that cannot be read again, which is logged.
+        """
+        if not self.config["settings"].get("fallback"):
+            return None
+        try:
+            return Fallback.of(self, self.sequence(), self.field.device)
+        except InputError as error:
+            LOG.warning("no fallback to the measurement: %s: %s", error.what, error.why)
+            return None
 
     def images(
         self,
@@ -310,6 +340,7 @@ class ClosedForm(Run):
         images: Iterable[str] = (),  # noqa: ARG002
         *,
         f_mod_hz: float | None = None,
+        fallback: bool = True,  # noqa: ARG002
     ) -> Callable[[float, Camera], Rendering]:
         """:meth:`render`: there is nothing that images share."""
         return functools.partial(self.render, f_mod_hz=f_mod_hz)

@@ -276,6 +276,9 @@ class ReconSettings:
     """Non-finite steps in a row before a return to the last checkpoint with halved rates."""
     rollbacks_max: int = 3
     """Returns to a checkpoint before the run ends as diverged."""
+    fallback: bool = False
+    """Whether the finished run's distance gives way to the measurement where that knows better, see
+    recon/fallback.py; the optimisation is the same."""
     restarts_max: int = 3
     """Restarts of collapsed random starts, and reinitialisations of a dead network, at most."""
 

@@ -7,7 +7,7 @@ from collections.abc import Collection
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from ..scene.camera import Camera
@@ -58,6 +58,8 @@ class Rendering:
     """Sum of w times the extra channels; no background."""
     screen: ScreenGradient | None
     """Filled by the backward pass if it was requested."""
+    source: UInt8[Tensor, "H W"] | None = None
+    """Where the distance is from, see recon/fallback.py; None: from the Gaussians everywhere."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

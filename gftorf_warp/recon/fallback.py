@@ -1,0 +1,181 @@
+"""Where the measurement itself knows the distance better than the fit, pixel by pixel.
+
+During a quartet, seen from the sequence's own camera, the rendered distance of a run gives way to
+
+* the *temporal mean* where the quartet agrees with its pixel's median, and the fit is more than two
+  standard deviations of that mean away. Beside a pixel that does not agree, an edge may be passing:
+  there the fit stays if it explains the quads as well as the mean does;
+* the *closed form* of the quartet where it does not agree, the fit does not explain its raw frames
+  (see residuals.py), and one phasor explains them several times better: nothing moved within it.
+
+Elsewhere the fit stays. A map of sources says which is which.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from ..constants import SPEED_OF_LIGHT
+from ..data import temporal
+from ..data.cycles import phase_noise
+from ..data.decode import closed_form_distance, quartet_phasors, unambiguous_range
+from ..data.noise import QuadNoise, amplitudes_of, quad_noise
+from ..data.sequence import Sequence
+from ..render.api import Rendering
+from ..scene.camera import Camera
+from . import closed_form
+from .residuals import Fitted, residuals
+
+SOURCES = ("fit", "temporal", "closed_form")
+"""Names of the values 0, 1, 2 of a map of sources."""
+STAYS = 2.0  # [standard deviations of the temporal mean] within which the fit stays
+AS_WELL = 1.0  # [1] by which chi-square of the fit may exceed that of the mean beside edges
+BETTER = 6.0  # [1] ratio of chi-square of the fit and reduced chi-square of one phasor
+SAME_TURN = 0.125  # [unambiguous ranges] the fit may know the turn if it is so near to the mean
+TIME_S = 1e-6  # [s] outside of a quartet that still count as inside
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Fallback:
+    """Distances of the Q complete quartets of a sequence, at its own size, and where they win."""
+
+    sequence: Sequence
+    """What was measured."""
+    camera: Camera
+    """The camera of raw frame 0."""
+    temporal: Float[Tensor, "Q H W"]
+    """Distance of the temporal mean [m], in [0, range)."""
+    sigma: Float[Tensor, "H W"]
+    """Its standard deviation [m]."""
+    rests: Bool[Tensor, "Q H W"]
+    """Where it may replace the fit."""
+    closed_form: Float[Tensor, "Q H W"]
+    """Distance of the quartet [m], in [0, range)."""
+    moved: Bool[Tensor, "Q H W"]
+    """Where it replaces the fit."""
+
+    @classmethod
+    def of(cls, run: Fitted, sequence: Sequence, device: torch.device) -> Fallback | None:
+        """Compare a run with the sequence it was made from; None where nothing was fitted to quads
+        or no quartet is complete.
+        """
+        found, noise = residuals(run, sequence), quad_noise(sequence)
+        if found is None or noise is None:
+            return None
+        explained = _enlarged(~found.unexplained, sequence)
+        chi_square = _enlarged(found.chi_square, sequence)
+        agrees = np.zeros(explained.shape, dtype=bool)
+        if temporal.camera_rests(sequence):
+            agrees = temporal.agreement(sequence, noise)
+        averaged = temporal.averaged(sequence, agrees)
+        beside = _beside(~agrees)
+        of_mean = _chi_square(sequence, temporal.stacked_quads(averaged), noise)
+        of_phasor = _chi_square(sequence, _phasor_quads(sequence), noise)
+        of_phasor *= sequence.cycle / (sequence.cycle - 2.0)  # two unknowns
+        fit_stays = beside & (chi_square <= of_mean + AS_WELL)
+        moved = ~agrees & ~explained & (chi_square > BETTER * of_phasor)
+        quartets = sequence.complete_quartets
+
+        def tensor(image: np.ndarray) -> Tensor:
+            kind = torch.bool if image.dtype == bool else torch.float32
+            return torch.as_tensor(image, device=device, dtype=kind)
+
+        return cls(
+            sequence=sequence,
+            camera=run.camera,
+            temporal=tensor(np.stack([closed_form_distance(averaged, i) for i in quartets])),
+            sigma=tensor(_sigma(sequence, noise, agrees)),
+            rests=tensor(agrees & ~fit_stays),
+            closed_form=tensor(np.stack([closed_form_distance(sequence, i) for i in quartets])),
+            moved=tensor(moved),
+        )
+
+    def applied(self, rendering: Rendering, time: float, camera: Camera) -> Rendering:
+        """A rendering with its distance replaced where the measurement knows better.
+
+        ``source`` is 0 where the fit stays, everywhere if the time [s] is in no complete quartet or
+        the camera is another. Nothing is transparent where the distance was replaced.
+        """
+        row, fit = self._row(time, camera), rendering.distance
+        if row is None:
+            return replace(rendering, source=torch.zeros_like(fit, dtype=torch.uint8))
+        mean, reach = self.temporal[row], unambiguous_range(self.sequence)
+        apart = torch.remainder(fit - mean + 0.5 * reach, reach) - 0.5 * reach
+        averaged = self.rests[row] & ~(apart.abs() <= STAYS * self.sigma)
+        value = torch.where(apart.abs() < SAME_TURN * reach, fit - apart, mean)
+        distance = torch.where(averaged, value, fit)
+        distance = torch.where(self.moved[row], self.closed_form[row], distance)
+        source = averaged.to(torch.uint8) + 2 * self.moved[row].to(torch.uint8)
+        opacity = rendering.opacity
+        if opacity.numel():
+            opacity = torch.where(source > 0, torch.ones_like(opacity), opacity)
+        return replace(rendering, distance=distance, opacity=opacity, source=source)
+
+    def _row(self, time: float, camera: Camera) -> int | None:
+        """The complete quartet of a time, seen from the sequence's own camera."""
+        quartet = closed_form.nearest_quartet(self.sequence, time)
+        times = self.sequence.times[self.sequence.quartet_frames(quartet)]
+        if not times[0] - TIME_S <= time <= times[-1] + TIME_S:
+            return None
+        if closed_form.another_view(self.sequence, time, camera, self.camera):
+            return None
+        return self.sequence.complete_quartets.index(quartet)
+
+
+def _enlarged(images: np.ndarray, sequence: Sequence) -> np.ndarray:
+    """Images [Q, h, w] at the size of the sequence, by nearest neighbours."""
+    rows = np.arange(sequence.height) * images.shape[1] // sequence.height
+    columns = np.arange(sequence.width) * images.shape[2] // sequence.width
+    return images[:, rows[:, None], columns]
+
+
+def _beside(mask: Bool[np.ndarray, "Q H W"]) -> Bool[np.ndarray, "Q H W"]:
+    """The mask and its four neighbours in the image."""
+    grown = mask.copy()
+    grown[:, 1:] |= mask[:, :-1]
+    grown[:, :-1] |= mask[:, 1:]
+    grown[..., 1:] |= mask[..., :-1]
+    grown[..., :-1] |= mask[..., 1:]
+    return grown
+
+
+def _chi_square(
+    sequence: Sequence, quads: Float[np.ndarray, "Q K H W"], noise: QuadNoise
+) -> Float[np.ndarray, "Q H W"]:
+    """Mean squared difference to the measured quads over the variance of the noise."""
+    apart = np.square(temporal.stacked_quads(sequence) - quads)
+    light = [amplitudes_of(sequence, i) for i in sequence.complete_quartets]
+    variances = (np.square(noise.sigma(amplitude)) for amplitude in light)
+    return np.stack([(a / v).mean(axis=0) for a, v in zip(apart, variances, strict=True)])
+
+
+def _phasor_quads(sequence: Sequence) -> Float[np.ndarray, "Q K H W"]:
+    """Quads of the decoded phasor of every complete quartet, with the DC offset of the sensor."""
+    result = np.empty(temporal.stacked_quads(sequence).shape, dtype=np.float32)
+    for quads, i in zip(result, sequence.complete_quartets, strict=True):
+        for frames, (re, im) in quartet_phasors(sequence, i):
+            constant = sequence.calibration.dc_offset * np.hypot(re, im)
+            for n in frames:
+                shift = float(sequence.shifts[n])
+                wave = re * math.cos(shift) + im * math.sin(shift)
+                quads[n - sequence.cycle * i] = 0.5 * (wave + constant)
+    return result
+
+
+def _sigma(
+    sequence: Sequence, noise: QuadNoise, agrees: Bool[np.ndarray, "Q H W"]
+) -> Float[np.ndarray, "H W"]:
+    """Standard deviation of the distance of the temporal mean [m], from the first frequency."""
+    first = quartet_phasors(sequence, sequence.complete_quartets[0])[0][0]
+    slot = first[0] % sequence.cycle
+    light = np.median([amplitudes_of(sequence, i) for i in sequence.complete_quartets], axis=0)
+    relative = noise.sigma(light)[slot] / np.maximum(light[slot], np.finfo(np.float32).tiny)
+    metres_per_rad = SPEED_OF_LIGHT / (4.0 * math.pi * sequence.frequencies[0])
+    scale = phase_noise(sequence.shifts[first]) * metres_per_rad
+    return scale * relative / np.sqrt(np.maximum(agrees.sum(axis=0), 1))

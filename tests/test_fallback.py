@@ -1,0 +1,199 @@
+"""Where the measurement replaces the distance of a fit: renderings with known errors."""
+
+import json
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from moving_box import recording, seen
+from small_runs import demo
+
+from gftorf_warp.constants import CANONICAL_SHIFTS, FRAME_RATE_HZ
+from gftorf_warp.data.exr import read_exr
+from gftorf_warp.data.write import write
+from gftorf_warp.evaluate.compare import compare
+from gftorf_warp.evaluate.views import render_to_folder
+from gftorf_warp.recon.fallback import SOURCES, Fallback
+from gftorf_warp.recon.run import Run
+from gftorf_warp.recon.train import reconstruct
+from gftorf_warp.render.api import Rendering
+from gftorf_warp.scene.measured import camera_of
+from gftorf_warp.scene.sensor import Sensor, phasor_from_quads
+
+FRAMES = 32
+FIT, TEMPORAL, CLOSED_FORM = range(3)
+
+
+@pytest.fixture(scope="module")
+def box():
+    """The moving box with noise, its quads without noise, and its true distance."""
+    measured, truth = recording(frames=FRAMES)
+    return measured, recording(frames=FRAMES, noise=0.0)[0].quads, truth.distance
+
+
+def fallback_of(measured, quads):
+    """The fallback of a run that renders these quads [F, H, W]."""
+
+    def render(time, camera):  # noqa: ARG001
+        n = round(time * FRAME_RATE_HZ)
+        same = torch.as_tensor(np.stack([quads[n]] * 4), dtype=torch.float32)
+        phasor = torch.stack([*phasor_from_quads(same, CANONICAL_SHIFTS), same[0]])
+        return SimpleNamespace(quads=same, phasor=phasor)
+
+    run = SimpleNamespace(
+        config={},
+        camera=camera_of(measured, 0),
+        sensor=Sensor(f_mod_hz=measured.calibration.f_mod_hz),
+        renderer=lambda images, f_mod_hz: render,  # noqa: ARG005
+    )
+    return Fallback.of(run, measured, torch.device("cpu"))
+
+
+def rendering(distance):
+    """A rendering of a distance [H, W] that is nine tenths opaque."""
+    distance, none = torch.as_tensor(distance, dtype=torch.float32), torch.zeros(0)
+    parts = {"quads": none, "phasor": none, "colour": None, "distortion": none, "extra": None}
+    opacity = torch.full_like(distance, 0.9)
+    return Rendering(**parts, distance=distance, opacity=opacity, screen=None)
+
+
+def applied(found, distance, n):
+    """Distance, source and opacity at raw frame n, as arrays."""
+    given = found.applied(rendering(distance), n / FRAME_RATE_HZ, found.camera)
+    return tuple(image.numpy() for image in (given.distance, given.source, given.opacity))
+
+
+def test_a_right_fit_stays(box):
+    """More than nine tenths of the pixels within two standard deviations; errors hardly change."""
+    measured, quads, truth = box
+    found = fallback_of(measured, quads)
+    distance, source, opacity = applied(found, truth[13], 13)
+    assert (source == FIT).mean() > 0.9
+    assert np.abs(distance - truth[13]).max() < 0.1
+    np.testing.assert_array_equal(distance[source == FIT], truth[13][source == FIT])
+    np.testing.assert_array_equal(opacity, np.where(source == FIT, np.float32(0.9), 1))
+
+
+def test_a_wrong_distance_of_what_rests_is_replaced_although_the_quads_are_right(box):
+    """The quads cannot tell two layers from one surface; the wall of the upper rows never moves."""
+    measured, quads, truth = box
+    wrong = truth[13].copy()
+    wrong[:5] += 0.5
+    wrong[0, 0] = np.nan
+    distance, source, _ = applied(fallback_of(measured, quads), wrong, 13)
+    assert (source[:5] == TEMPORAL).all()
+    assert np.abs(distance[:5] - truth[13][:5]).max() < 0.05
+
+
+def test_a_turn_that_the_fit_knows_is_kept(box):
+    """One unambiguous range more decodes to the same phase."""
+    measured, quads, truth = box
+    distance, source, _ = applied(fallback_of(measured, quads), truth[13] + 7.5 + 0.08, 13)
+    averaged = source == TEMPORAL
+    assert averaged[:5].mean() > 0.9
+    assert np.abs(distance - truth[13] - 7.5)[averaged].max() < 0.08
+
+
+def test_where_the_fit_fails_the_quartet_itself_is_taken(box):
+    """A black fit: where the box has just arrived and is seen by all four frames, the closed form;
+    what moves within the quartet fits no phasor and keeps the fit.
+    """
+    measured, quads, truth = box
+    found = fallback_of(measured, np.zeros_like(quads))
+    distance, source, _ = applied(found, np.full((36, 48), 9.0), 13)
+    inside = np.logical_and.reduce([seen(n)[2] for n in range(12, 16)])
+    moved = (source == CLOSED_FORM) & inside
+    assert moved.sum() > 0.3 * inside.sum()
+    assert np.median(np.abs(distance - truth[13])[moved]) < 0.1
+    assert (source == FIT).any()
+    assert SOURCES[CLOSED_FORM] == "closed_form"
+
+
+def test_other_times_and_views_keep_the_fit(box):
+    """Beyond the recording, from elsewhere, at another size, and in a quartet with a hole."""
+    measured, quads, truth = box
+    there = np.ones(FRAMES, dtype=bool)
+    there[14] = False
+    found = fallback_of(replace(measured, measured=there), quads)
+    aside = np.eye(4)
+    aside[0, 3] = 0.1
+    inside, wrong = 5 / FRAME_RATE_HZ, rendering(truth[13] + 0.5)
+    assert found.applied(wrong, inside, found.camera).source.any()
+    for time, camera in (
+        (99.0, found.camera),
+        (13 / FRAME_RATE_HZ, found.camera),
+        (inside, found.camera.at(aside)),
+    ):
+        given = found.applied(wrong, time, camera)
+        assert not given.source.any()
+        assert (given.distance == wrong.distance).all()
+    smaller = rendering(truth[13][::2, ::2])
+    assert not found.applied(smaller, inside, found.camera.resized(24, 18)).source.any()
+
+
+def test_nothing_is_averaged_where_the_camera_moves(box):
+    """The closed form of single quartets remains."""
+    measured, quads, truth = box
+    poses = np.tile(np.eye(4), (FRAMES, 1, 1))
+    poses[:, 0, 3] = 1e-4 * np.arange(FRAMES)
+    found = fallback_of(replace(measured, camera_from_world=poses), np.zeros_like(quads))
+    camera = found.camera.at(poses[13])
+    given = found.applied(rendering(truth[13] + 1.0), 13 / FRAME_RATE_HZ, camera)
+    assert set(given.source.unique().tolist()) == {FIT, CLOSED_FORM}
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    """One short fit with and without the setting."""
+    folder = tmp_path_factory.mktemp("runs")
+    write("ftorf", folder / "box", *recording(frames=16))
+    names = {"with": True, "without": False}
+    return {
+        name: reconstruct(folder / "box", folder / name, demo(images=80, fallback=given))
+        for name, given in names.items()
+    }
+
+
+def test_a_run_with_the_setting_says_where_its_distance_is_from(runs, tmp_path):
+    """Run.render, its renderer and the EXR files; without the setting there is no source."""
+    run, plain = runs["with"], runs["without"]
+    given, bare = run.render(9 / FRAME_RATE_HZ), plain.render(9 / FRAME_RATE_HZ)
+    assert bare.source is None
+    assert set(given.source.unique().tolist()) <= {0, 1, 2}
+    assert (given.source > 0).any()
+    same = given.source == FIT
+    torch.testing.assert_close(given.distance[same], bare.distance[same])
+    fast = run.renderer(("distance", "opacity", "source"))(9 / FRAME_RATE_HZ, run.camera)
+    torch.testing.assert_close(fast.distance, given.distance)
+    render_to_folder(run, tmp_path / "out", ["distance"], [9 / FRAME_RATE_HZ])
+    stored = read_exr(tmp_path / "out" / "distance" / "000000.exr")
+    np.testing.assert_array_equal(stored["source"], given.source.numpy())
+    render_to_folder(plain, tmp_path / "plain", ["distance"], [9 / FRAME_RATE_HZ])
+    assert "source" not in read_exr(tmp_path / "plain" / "distance" / "000000.exr")
+
+
+def test_compare_scores_the_result_and_the_fit_alone(runs):
+    """Shares of the sources, and the errors that the run would have without the measurement."""
+    got, bare = (compare(runs[name]) for name in ("with", "without"))
+    assert bare["source"] is bare["d_fit_mse_x100"] is None
+    assert got["d_fit_mse_x100"] == pytest.approx(bare["d_mse_x100"], rel=1e-4)
+    assert sum(got["source"].values()) == pytest.approx(1.0)
+    assert set(got["source"]) == set(SOURCES)
+    static = got["static"]
+    assert static["d_mse_x100"] < 0.7 * static["d_fit_mse_x100"]
+    assert static["d_mse_x100"] < 1.2 * static["temporal_mse_x100"]
+    assert got["d_mse_x100"] < got["closed_form_mse_x100"]
+    page = (runs["with"].path / "report.html").read_text()
+    assert "Where our distance is from" in page
+    assert json.loads((runs["with"].path / "metrics.json").read_text()) == got
+
+
+def test_a_sequence_that_is_gone_leaves_the_fit(runs, caplog):
+    """With a warning, once."""
+    config = runs["with"].config | {"sequence": "/nowhere"}
+    run = replace(Run.open(runs["with"].path), config=config)
+    assert run.render(0.0).source is None
+    assert run.render(0.1).source is None
+    assert caplog.text.count("no fallback to the measurement") == 1
