@@ -37,6 +37,7 @@ from gftorf_warp.data.read import read, read_truth
 from gftorf_warp.data.truth import known_distance, moving_and_static
 from gftorf_warp.errors import GftorfError
 from gftorf_warp.evaluate import pictures
+from gftorf_warp.evaluate.compare import rows_of
 from gftorf_warp.evaluate.metrics import ERROR_UNIT, pooled, scored_frames, squared_error
 from gftorf_warp.evaluate.views import camera_at
 from gftorf_warp.recon import presets
@@ -226,11 +227,19 @@ def _fitted(job: Job, setup: Setup, known: str | None) -> Result | None:
         "scores": scores,
         "seconds": run.config["seconds_reconstruct"],
         "gaussians": run.gaussians,
+        "rise": _rise(folder),
         "memory_mib": torch.cuda.max_memory_allocated() / 2**20 if kind == "cuda" else None,
     }
     if not setup.keep:
         shutil.rmtree(folder, ignore_errors=True)
     return result
+
+
+def _rise(folder: Path) -> float | None:
+    """Error of d at the end of a run over the least along it [1]; None without diagnostics."""
+    rows = rows_of(folder / "diagnostics.jsonl")
+    errors = [error for row in rows if (error := row.get("d_mse_x100"))]
+    return errors[-1] / min(errors) if errors else None
 
 
 def _draw(job: Job, setup: Setup, run: Run, sequence: Sequence, scores: Result) -> None:

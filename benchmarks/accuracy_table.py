@@ -15,22 +15,28 @@ import numpy as np
 
 Result = dict[str, Any]
 PARTS = ("all", "moving", "static")
+MOVING_CLASSES = ("moving interior", "moving edge")
+STATIC_CLASSES = ("static interior", "static edge")
 NONE = "-"
 SUMMARY = (
-    "row", "d / closed form", "d_ToF / closed form", "d / temporal", "static interior, throughout",
-    "worst scene", "worse than closed form", "than temporal", "seeds max / min",
+    "row", "d / closed form", "d_ToF / closed form", "d / temporal",
+    "moving interior / edge, static", "static interior, throughout", "worst scene",
+    "worse than closed form", "than temporal", "seeds max / min", "rise",
     "chi-square, unexplained", "seconds", "Gaussians", "failed",
 )  # fmt: skip
 
 
 def error_of(result: Result, distance: str, part: str) -> float | None:
     """Error of a distance (``d``, ``d_tof``, ``closed_form``, ``temporal``) on ``all``, ``moving``
-    or ``static`` pixels, ``static_throughout`` the sequence, or the ``interior`` of static ones.
+    or ``static`` pixels, ``static_throughout`` the sequence, or a class like ``static edge``.
     """
     scores = result["scores"]
-    if part == "interior":
-        scores = (scores.get("classes") or {}).get("static", {})
-    return (scores if part == "all" else scores.get(part) or {}).get(f"{distance}_mse_x100")
+    group, _, kind = part.partition(" ")
+    if kind:
+        scores = ((scores.get("classes") or {}).get(group) or {}).get(kind) or {}
+    elif part != "all":
+        scores = scores.get(part) or {}
+    return scores.get(f"{distance}_mse_x100")
 
 
 def ratio(
@@ -111,6 +117,7 @@ def _line(fits: list[Result]) -> list[str]:
     explained = [fit["scores"].get("explained") or {} for fit in fits]
     chi = geometric_mean(each.get("reduced_chi_square") for each in explained)
     shares = [share for each in explained if (share := each.get("unexplained_share")) is not None]
+    rises = [rise for fit in fits if (rise := fit.get("rise"))]
     seconds = [fit["seconds"] for fit in fits if "seconds" in fit]
 
     def means_of(distance: str, over: str, parts: Iterable[str] = PARTS) -> str:
@@ -130,12 +137,15 @@ def _line(fits: list[Result]) -> list[str]:
         means_of("d", "closed_form"),
         means_of("d_tof", "closed_form"),
         means_of("d", "temporal"),
-        f"{means_of('d', 'temporal', ['interior'])}, "
+        f"{means_of('d', 'closed_form', MOVING_CLASSES)}, "
+        f"{means_of('d', 'closed_form', STATIC_CLASSES)}",
+        f"{means_of('d', 'temporal', ['static interior'])}, "
         f"{means_of('d', 'temporal_mean', ['static_throughout'])}",
         f"{worst} {_number(means[worst])}",
         worse_than("closed_form"),
         worse_than("temporal"),
         f"{_number(geometric_mean(known))}, {_number(max(known))}" if known else NONE,
+        f"{np.median(rises):.3g}, {max(rises):.3g}" if rises else NONE,
         f"{_number(chi)}, {100 * np.mean(shares):.2g} %" if shares else NONE,
         f"{np.median(seconds):.1f}, {max(seconds):.1f}" if seconds else NONE,
         f"{int(np.median([fit['gaussians'] for fit in fits]))}" if seconds else NONE,

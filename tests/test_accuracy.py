@@ -44,11 +44,13 @@ def result(row, scene, seed, d, closed=(1.0, 1.0, 1.0), **more):
     interior = {"d_mse_x100": d[2], "temporal_mse_x100": 0.25}
     scores["static_throughout"] = {"d_mse_x100": d[2], "temporal_mean_mse_x100": 0.5}
     scores["explained"] = {"reduced_chi_square": 2.0, "unexplained_share": 0.01}
-    scores |= scores.pop("all") | {"classes": {"static": {"interior": interior}}}
+    classes = {"moving": {"edge": {"d_mse_x100": 3.0, "closed_form_mse_x100": 6.0}}}
+    scores |= scores.pop("all") | {"classes": classes | {"static": {"interior": interior}}}
     return {"row": row, "scene": scene, "seed": seed, "scores": scores} | {
         "id": f"{row}/{scene}/{seed}",
         "seconds": 1.0,
         "gaussians": 7,
+        "rise": 1.0 + seed,
         **more,
     }
 
@@ -107,6 +109,7 @@ def test_a_benchmark_of_two_scenes(tmp_path, capsys):
     fit = results["short/random-1@40x30x8/24/1"]
     assert fit["scores"]["images_optimised"] == 24
     assert fit["seconds"] > 0
+    assert fit["rise"] >= 1
     closed = results["ctof/random-1@40x30x8/24/0"]["scores"]
     assert closed["d_mse_x100"] == pytest.approx(closed["closed_form_mse_x100"])
     assert "no.such" in results["bad/shared/axial@given/24/0"]["error"]
@@ -214,9 +217,9 @@ def test_the_summary_is_means_over_scenes_and_seeds():
     assert lines[2].startswith("| edge floor | 0.1 / - / 0.05 | - / - / - | 0.2 / - / 0.1 |")
     line = lines[3].split(" | ")
     assert line[1] == "0.4 / 0.283 / 0.883"
-    assert line[3:5] == ["0.8 / 0.566 / 1.77", "3.53, 1.77"]
-    assert line[5:7] == ["two 0.8", "1 of 2 scenes, 1 of 4 fits"]
-    assert line[7:10] == ["2 of 2 scenes, 3 of 4 fits", "2, 4", "2, 1 %"]
+    assert line[3:6] == ["0.8 / 0.566 / 1.77", "- / 0.5, - / -", "3.53, 1.77"]
+    assert line[6:8] == ["two 0.8", "1 of 2 scenes, 1 of 4 fits"]
+    assert line[8:12] == ["2 of 2 scenes, 3 of 4 fits", "2, 4", "1.5, 2", "2, 1 %"]
     assert line[-1] == "1 |"
     assert lines[4].count("-") >= 9
     assert accuracy_table.worst_first(results[:4])[0]["id"] == "a/one/1"
