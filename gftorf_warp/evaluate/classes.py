@@ -31,8 +31,11 @@ def class_of_pixels(truth: Float[np.ndarray, "S H W"]) -> UInt8[np.ndarray, "S H
     for axis in (1, 2):
         if truth.shape[axis] > 1:
             slope += np.square(np.nan_to_num(np.gradient(truth, axis=axis), nan=0.0))
-    steepness = np.searchsorted(np.square(SLOPES), slope.ravel(), side="right").reshape(slope.shape)
-    return np.where(edge, 0, 1 + steepness).astype(np.uint8)
+    label = np.ones(truth.shape, dtype=np.uint8)
+    for bound in np.square(SLOPES):
+        label += slope >= bound
+    label[edge] = 0
+    return label
 
 
 def near_steps(truth: Float[np.ndarray, "S H W"]) -> Bool[np.ndarray, "S H W"]:
@@ -77,7 +80,8 @@ def class_errors(
     flat = label.ravel()
     pixels = np.bincount(flat, minlength=2 * kinds + 1)[: 2 * kinds].reshape(2, kinds)
     sums = {
-        name: np.bincount(flat, np.nan_to_num(error).ravel(), 2 * kinds + 1)[: 2 * kinds]
+        # errors are NaN where the truth is unknown, which have the last label
+        name: np.bincount(flat, error.ravel(), 2 * kinds + 1)[: 2 * kinds]
         for name, error in errors.items()
     }
     rows = {"interior": slice(1, kinds), EDGE: slice(0, 1)}

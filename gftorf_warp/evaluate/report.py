@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
 
 from ..data.decode import unambiguous_range
 from ..recon.residuals import WARNING_SHARE
+from ..render.buffers import available_threads
 from . import figures, gallery, page, panels, provenance
 from .legend import PHASORS_TO_READ, TO_READ
 from .metrics import DISTANCES, ERROR_UNIT, per_frame_mean
@@ -78,20 +80,29 @@ def report(
     of the comparison, ``data_card`` the statement on the truth in the sequence's README.
     """
     s = panels.telling_row(found)
+    with ThreadPoolExecutor(available_threads()) as pool:  # pictures are encoded without the GIL
+        distances = pool.submit(_distance_pictures, found, s)
+        measured = pool.submit(panels.measured_quartet, found, s)
+        residual = pool.submit(panels.quad_residual, found, s)
+        explained = pool.submit(_explained, metrics, found, s)
+        animation = pool.submit(panels.animation, found)
+        strip = pool.submit(panels.strip_over_time, found)
+        beyond = pool.submit(_beyond, metrics, found)
+        curves = pool.submit(_curves, found, log)
     sections = [
         f"<h1>{page.escape(title)}</h1>"
         f'<div class="soft">gftorf compare, version {page.number(metrics, "version", "text")}</div>'
         f'<p class="verdict">{verdict(metrics)}</p>',
         _section("Errors", _table(metrics), _facts(metrics)),
         *_by_class(metrics),
-        _section("Distance", _distance_text(found, s), _distance_pictures(found, s)),
-        _section("What was measured", _measured_text(found, s), panels.measured_quartet(found, s)),
-        _section("Quads", _quad_text(found, s), panels.quad_residual(found, s)),
-        *_explained(metrics, found, s),
-        _section("Over time", _time_pictures(found)),
-        *_beyond(metrics, found),
+        _section("Distance", _distance_text(found, s), distances.result()),
+        _section("What was measured", _measured_text(found, s), measured.result()),
+        _section("Quads", _quad_text(found, s), residual.result()),
+        *explained.result(),
+        _section("Over time", strip.result(), _animated(animation.result())),
+        *beyond.result(),
         *_along(metrics, diagnostics),
-        _section("Curves", _curves(found, log)),
+        _section("Curves", curves.result()),
         _section("How it was made", provenance.how(config, data_card, installed)),
         _section("How to read it", TO_READ, PHASORS_TO_READ if found.sequence.from_phasors else ""),
     ]
@@ -286,10 +297,9 @@ def _explained(metrics: Mapping[str, Any], found: Findings, s: int) -> list[str]
     return [_section("How well the quads are explained", text, html)]
 
 
-def _time_pictures(found: Findings) -> str:
-    moving = panels.animation(found)
-    title = "<h3>Quartet by quartet, slowed down</h3>"
-    return panels.strip_over_time(found) + (title + moving if moving else "")
+def _animated(moving: str) -> str:
+    """The animation with its heading, if there is one."""
+    return f"<h3>Quartet by quartet, slowed down</h3>{moving}" if moving else ""
 
 
 def _beyond(metrics: Mapping[str, Any], found: Findings) -> list[str]:
