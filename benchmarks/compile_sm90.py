@@ -102,6 +102,10 @@ def modules(arch: int) -> dict[str, wp.Module]:
             kernel = project.make_project(colour, square, sloped=sloped)
             title = "project" + " colour" * colour + " square" * square + " sloped" * sloped
             found[title] = kernel.module
+    for sloped in (False, True):
+        given = *shape, True, False, True, None, False, 1, sloped, True
+        title = "composite light without median" + " sloped" * sloped
+        found[title] = composite.make_composite(*given).module
     for light, channels, fixed in (
         (True, False, False), (True, True, False), (True, True, True), (False, True, False),
         (False, True, True),

@@ -284,7 +284,7 @@ COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
 def table(metrics: dict) -> str:
     """The errors of metrics.json as a table, MSE x100 [m^2]: closed form, temporal and ours."""
     titles = {"closed_form": "closed form", "temporal": "temporal", "d": "d"}
-    titles |= {"d_normalised": "d / opacity", "d_tof": "d_ToF"}
+    titles |= {"d_normalised": "d / opacity", "d_median": "median", "d_tof": "d_ToF"}
     lines = [f"{'MSE x100 [m^2]':<16}" + "".join(f"{title:>13}" for title in titles.values())]
     for name in ("all", "moving", "static"):
         row = (metrics if name == "all" else metrics[name]) or {}

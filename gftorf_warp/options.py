@@ -195,7 +195,7 @@ def command_parsers() -> dict[str, Parser]:
     render = Parser.of("render", "write images of a reconstruction at any time")
     render.add_argument("run_folder", metavar="RUN", help="folder of the reconstruction")
     render.option("--out", "DIR", str, "folder to write", required=True)
-    what = "any of distance,quads,phasor,colour (distance)"
+    what = "any of distance,distance_median,quads,phasor,colour (distance)"
     render.option("--what", "A,B", _list_of(str), what, ["distance"])
     render.option("--times", "S,S", _list_of(_number), "seconds since raw frame 0 (each frame)")
     poses = "world-to-camera matrices in a .npy file, or the sequence's novel views"

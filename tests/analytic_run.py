@@ -23,6 +23,7 @@ WALL, BOX = 4.0, 2.5  # [m]
 COLOUR_ERROR = 0.05  # of every channel, in units of the colour images
 # [m] of the mean distance, and of what the quads encode
 WALL_ERROR, BOX_ERROR, QUAD_ERROR = 0.02, -0.1, 0.03
+MEDIAN_ERROR = 0.04  # [m] of the median distance
 OPACITY = 0.98
 GROUPS = ("", "moving.", "static.")
 PHASE_SLOPE = float(Sensor().phase_slope)
@@ -209,6 +210,7 @@ class AnalyticRun:
             distance=tensor(distance),
             opacity=tensor(np.full_like(distance, OPACITY)),
             distortion=tensor(np.zeros_like(distance)),
+            distance_median=tensor(right + MEDIAN_ERROR),
             extra=None,
             screen=None,
         )

@@ -494,7 +494,7 @@ def test_table_without_truth():
         "static": nothing,
     }
     lines = cli.table(metrics).splitlines()
-    assert [line.split()[1:] for line in lines[1:4]] == [["-"] * 5] * 3
+    assert [line.split()[1:] for line in lines[1:4]] == [["-"] * 6] * 3
     assert "20.00 dB" in lines[-1]
 
 

@@ -51,6 +51,7 @@ KEYS = {
     "temporal_mse_x100",
     "d_mse_x100",
     "d_normalised_mse_x100",
+    "d_median_mse_x100",
     "d_tof_mse_x100",
     "moving",
     "static",
@@ -119,6 +120,7 @@ def test_every_number_by_hand(run):
         assert row["d_normalised_mse_x100"] == pytest.approx(
             100 * mixed(-0.1, 0.02, boxes, pixels), rel=1e-4
         )
+        assert row["d_median_mse_x100"] == pytest.approx(100 * 0.04**2, rel=1e-4)
         assert row["d_tof_mse_x100"] == pytest.approx(100 * 0.03**2, rel=1e-4)
     assert got["static"]["closed_form_mse_x100"] == pytest.approx(0.0, abs=1e-8)
     squared = [(closed_form(n // 4) - true_distance(n)) ** 2 for n in range(12)]

@@ -55,8 +55,8 @@ def rendering(distance):
     """A rendering of a distance [H, W] that is nine tenths opaque."""
     distance, none = torch.as_tensor(distance, dtype=torch.float32), torch.zeros(0)
     parts = {"quads": none, "phasor": none, "colour": None, "distortion": none, "extra": None}
-    opacity = torch.full_like(distance, 0.9)
-    return Rendering(**parts, distance=distance, opacity=opacity, screen=None)
+    parts |= {"distance_median": none, "opacity": torch.full_like(distance, 0.9)}
+    return Rendering(**parts, distance=distance, screen=None)
 
 
 def applied(found, distance, n):

@@ -183,6 +183,7 @@ def test_errors_are_printed_times_100_or_as_unknown():
         "d_mse_x100": 200.0,
         "d_fit_mse_x100": None,
         "d_normalised_mse_x100": None,
+        "d_median_mse_x100": None,
         "d_tof_mse_x100": 100.0,
     }
     assert set(metrics.distance_errors(errors, np.zeros((1, 1, 2), dtype=bool)).values()) == {None}

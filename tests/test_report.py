@@ -437,6 +437,7 @@ def test_pages_of_large_noisy_images_stay_below_four_megabytes(compared):
         frames=list(range(frames)),
         d=noise,
         opacity=noise / 6.0,
+        d_median=noise,
         d_tof=noise,
         closed_form=noise[::-1],
         quad_rendered=noise - 4.0,

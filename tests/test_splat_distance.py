@@ -198,6 +198,48 @@ def test_finite_differences_of_the_kernels(device):
         assert got == pytest.approx(want, abs=0.02 * scale), name
 
 
+@pytest.mark.parametrize("mapping", ["cpu", "cuda"])
+@pytest.mark.parametrize("name", ["posed", "sloped", "opaque", "released", "three_shifts", "empty"])
+def test_the_median_distance_is_that_of_the_oracle(name, mapping, device, monkeypatch):
+    """Also where lists are walked in segments; 0 where half of the light passes, no gradient."""
+    if device == "cpu":
+        monkeypatch.setitem(buffers.TILE_SHAPES, "cpu", buffers.TILE_SHAPES[mapping])
+        monkeypatch.setitem(buffers.SEGMENTS, "cpu", buffers.SEGMENTS[mapping])
+    case, names = CASES[name](), ("quads", "distance", "distance_median", "opacity")
+    want = case.render(reference.rasterize, case.inputs(torch.float64), images=names)
+    got = case.render(api.rasterize, case.inputs(torch.float32, device), images=names)
+    median, error = want.distance_median, got.distance_median.cpu() - want.distance_median
+    # a float32 may be on the other side of one half
+    same = error.abs() < 1e-5 * median.max() + 1e-6
+    assert same.double().mean() > 0.995
+    assert not got.distance_median.requires_grad
+    crossed = want.opacity.detach() > 0.5
+    assert (median > 0).equal(crossed)
+    if name in ("sloped", "opaque"):
+        assert crossed.double().mean() > 0.3
+        apart = (median - want.distance.detach() / want.opacity.detach())[crossed]
+        assert apart.abs().median() > 1e-2, "the mean would pass"
+
+
+def test_the_median_distance_of_two_layers(device):
+    """A veil of opacity 0.4 before an opaque layer: the median is the layer, the mean between."""
+    camera = Camera.from_fov(8, 8, 20.0)
+    field = GaussianField(
+        mean=torch.tensor([[0.0, 0.0, 2.0], [0.0, 0.0, 4.0]]),
+        log_scale=torch.full((2, 3), math.log(20.0)),
+        quaternion=torch.tensor([[1.0, 0.0, 0.0, 0.0]] * 2),
+        opacity_logit=torch.logit(torch.tensor([0.4, 0.99])),
+        reflectivity_sh=constant_sh(torch.tensor([0.5, 0.5])),
+    ).map(lambda tensor: tensor.to(device))
+    for opacity, want in ((0.4, 4.0), (0.6, 2.0)):
+        field.opacity_logit[0] = torch.logit(torch.tensor(opacity))
+        seen = api.rasterize(field, camera, Sensor(), images=("distance", "distance_median"))
+        assert_close(seen.distance_median.cpu(), torch.full((8, 8), want))
+        mean = 2.0 * opacity + 4.0 * (1 - opacity) * 0.99
+        assert_close(seen.distance.cpu(), torch.full((8, 8), mean), rtol=2e-3, atol=0)
+    assert api.rasterize(field, camera, Sensor()).distance_median.numel() == 0
+
+
 def fitted_wall(kind: SplatDistance, *, seed: int = 0, steps: int = 800) -> tuple[float, float]:
     """Root mean square errors [m] of d and of the decoded distance, of splats that were fitted to
     exact quads of a wall at 45 degrees with a depth distortion of 0.1.

@@ -216,6 +216,18 @@ def test_poses_that_are_no_file_are_refused(run, tmp_path):
         render_to_folder(run, tmp_path / "out", poses="nvel")
 
 
+def test_the_median_distance_is_rendered(run, tmp_path):
+    """Its own channel, beside the mean's, in metres."""
+    out = render_to_folder(
+        run, tmp_path / "out", what="distance_median,distance", times=[0.0], arrays=True
+    )
+    median = np.load(out / "distance_median" / "distance_median.npy")
+    mean, opacity = (np.load(out / "distance" / f"{name}.npy") for name in ("distance", "opacity"))
+    assert median.shape == mean.shape == opacity.shape
+    assert np.abs(median - true_distance(0)).max() < 0.05
+    assert np.abs(median - mean).max() > 0.01
+
+
 @pytest.mark.parametrize(
     ("what", "times", "text"),
     [

@@ -18,6 +18,8 @@ reconstruction must beat. Mean and median of all quartets mean something where n
 closed form in all others. They need a resting camera.</dd>
 <dt>d</dt><dd>Mean distance of the reconstructed Gaussians at the time of one raw frame. It is not
 divided by opacity: where opacity is below one, the missing part counts as error.</dd>
+<dt>median</dt><dd>Distance at which half of the light is stopped, 0 where more than half passes. At
+an outline it is one of the two surfaces, where the mean is between them.</dd>
 <dt>d_ToF</dt><dd>Quads rendered at the time of one raw frame, decoded like the closed form, within
 the unambiguous range: c / 2f, or that of all frequencies together.</dd>
 <dt>moving pixels</dt><dd>Pixels whose true distance changes by more than {MOVING_M} m within their

@@ -22,7 +22,7 @@ PROTOCOLS = ("all", "ftorf13")
 ERROR_UNIT = 100.0  # errors are printed times 100, as in the published tables
 CRITERION = "d_minus_dtof_static_m"  # key of diagnostics that indicates a good state without truth
 TEMPORAL = ("temporal_mean", "temporal_median", "temporal")  # need a resting camera
-DISTANCES = ("closed_form", *TEMPORAL, "d", "d_fit", "d_normalised", "d_tof")
+DISTANCES = ("closed_form", *TEMPORAL, "d", "d_fit", "d_normalised", "d_median", "d_tof")
 
 
 def scored_frames(sequence: Sequence, protocol: str = "all") -> list[int]:

@@ -14,13 +14,14 @@ from ..data.images import indexed_png_bytes, png_bytes
 from . import pictures
 
 Channels = dict[str, Float[np.ndarray, "H W"]]
+DISTANCES = "distance", "distance_median"
 
 
 def preview_scale(name: str, samples: Iterable[Channels]) -> pictures.Scale:
     """Scale of all previews of one kind, from a few samples; for a phasor, of its amplitude."""
     samples = list(samples)
-    if name == "distance":
-        return pictures.distance_scale([sample["distance"] for sample in samples])
+    if name in DISTANCES:
+        return pictures.distance_scale([sample[name] for sample in samples])
     if name == "quads":
         return pictures.signed_scale([image for sample in samples for image in sample.values()])
     if name == "phasor":
@@ -30,8 +31,8 @@ def preview_scale(name: str, samples: Iterable[Channels]) -> pictures.Scale:
 
 def preview(name: str, images: Channels, scale: pictures.Scale) -> bytes:
     """A PNG file: distance; quads in a row; phase and amplitude in a row; or sRGB."""
-    if name == "distance":
-        return indexed_png_bytes(pictures.ticks(images["distance"], scale), pictures.palette(scale))
+    if name in DISTANCES:
+        return indexed_png_bytes(pictures.ticks(images[name], scale), pictures.palette(scale))
     if name == "quads":
         ticks = [pictures.ticks(image, scale) for image in images.values()]
         row = pictures.ticks_side_by_side(ticks)

@@ -21,6 +21,7 @@ LIST = "renders.json"
 LISTED = ("run", "times_s", "camera_from_world", "channels", "arrays")
 NEEDS = {  # images of a rendering, by option
     "distance": ("distance", "opacity", "source"),
+    "distance_median": ("distance_median",),
     "quads": ("quads",),
     "phasor": ("phasor",),
     "colour": ("colour",),
@@ -32,7 +33,8 @@ def checked(what: str | Iterable[str]) -> tuple[str, ...]:
     """Valid names without repetition.
 
     Args:
-        what: Names out of distance, quads, phasor, colour; or one text, separated by commas.
+        what: Names out of distance, distance_median, quads, phasor, colour; or one text, separated
+            by commas.
 
     Raises:
         UsageError: If a name is unknown, or there is none.
@@ -52,7 +54,8 @@ def named(name: str, images: Mapping[str, Float[np.ndarray, "..."]], sensor: Sen
     """Images by channel name, as in an EXR file.
 
     distance: ``distance`` [m], not divided by ``opacity`` [1]; ``source``, if the run has one: 0
-    the fit, 1 temporal mean, 2 closed form. quads: ``quad_<shift in degrees>``
+    the fit, 1 temporal mean, 2 closed form. distance_median: the same name [m], of the fit, 0 where
+    more than half of the light passes. quads: ``quad_<shift in degrees>``
     [file units]. phasor: ``re``, ``im``, ``amplitude`` [file units]. colour: ``R``, ``G``, ``B``,
     linear [1].
 
@@ -62,7 +65,7 @@ def named(name: str, images: Mapping[str, Float[np.ndarray, "..."]], sensor: Sen
     if name == "colour" and "colour" not in images:
         why, fix = "this run was reconstructed from quads alone", "leave colour out of --what"
         raise UsageError("no colour to render", where="--what colour", why=why, fix=fix)
-    if name == "distance":
+    if name in ("distance", "distance_median"):
         return {image: images[image] for image in NEEDS[name] if image in images}
     quads = [f"quad_{math.degrees(shift):03.0f}" for shift in sensor.shifts]
     names = {"quads": quads, "phasor": ["re", "im", "amplitude"], "colour": [*"RGB"]}[name]

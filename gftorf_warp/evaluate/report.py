@@ -25,6 +25,7 @@ ROWS = {
     "d": ("ours, d", "rendered mean distance, not divided by opacity"),
     "d_fit": ("the fit alone, d", "where the measurement does not replace it"),
     "d_normalised": ("ours, d / opacity", "the same, divided"),
+    "d_median": ("ours, median", "distance at which one half of the light is stopped"),
     "d_tof": ("ours, d_ToF", "decoded from quads rendered at one instant"),
 }
 WITHOUT_GAUSSIANS = {

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from ..recon.run import Run
 
 
-RENDERED = ("quads", "phasor", "distance", "opacity")
+RENDERED = ("quads", "phasor", "distance", "opacity", "distance_median")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -43,6 +43,8 @@ class Views:
     """Rendered mean distance, not divided by opacity [m]."""
     opacity: Float[np.ndarray, "S H W"]
     """Rendered opacity [1]."""
+    d_median: Float[np.ndarray, "S H W"]
+    """Rendered median distance [m]; 0 where more than half of the light passes."""
     d_tof: Float[np.ndarray, "S H W"]
     """Distance decoded from quads rendered at the time of the frame, at every frequency, in [0,
     range) [m]."""
@@ -102,7 +104,9 @@ def gather(
     chosen = sorted({n // sequence.cycle for n in frames})
     decoded = {i: decode_quartet(sequence, i) for i in chosen}
     quartets = [decoded[n // sequence.cycle] for n in frames]
-    rows: dict[str, list[np.ndarray]] = {"d": [], "opacity": [], "d_tof": [], "quad_rendered": []}
+    rows: dict[str, list[np.ndarray]] = {
+        name: [] for name in ("d", "opacity", "d_median", "d_tof", "quad_rendered")
+    }
     first, *further = sequence.frequencies
     renderers = {first: run.renderer(RENDERED, fallback=False)}
     renderers |= {f: run.renderer(RENDERED, f_mod_hz=f) for f in further}
@@ -120,6 +124,7 @@ def gather(
         images = {
             "d": rendering.distance,
             "opacity": rendering.opacity,
+            "d_median": rendering.distance_median,
             "d_tof": distance_from_quads(rendering.quads, run.sensor, *others),
             "quad_rendered": quad_of_shift(measured, run.sensor, float(sequence.shifts[n])),
         }
@@ -202,7 +207,7 @@ def render_to_folder(
     Args:
         run: A finished reconstruction.
         out: Folder, made if absent; one that holds these images is written again.
-        what: Names out of distance, quads, phasor, colour.
+        what: Names out of distance, distance_median, quads, phasor, colour.
         times: Seconds since raw frame 0; None: the times of all raw frames, truncated quartets
             included; with poses, the middle of the sequence.
         poses: A .npy file of world-to-camera matrices [M, 4, 4] or [M, 3, 4], or ``novel``, those

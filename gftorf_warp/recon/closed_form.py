@@ -54,6 +54,7 @@ def rendering_of(
         distance=tensor(decoded.distance),
         opacity=tensor(np.ones(size)),
         distortion=tensor(np.zeros(size)),
+        distance_median=tensor(decoded.distance),
         extra=None if extra_channels is None else tensor(np.zeros((extra_channels, *size))),
         screen=None,
     )

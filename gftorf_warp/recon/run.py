@@ -24,7 +24,7 @@ from ..data.temporal import averaged
 from ..errors import InputError
 from ..render.api import Rendering, rasterize
 from ..render.buffers import ClampGradient, Distortion, RenderSettings, SplatDistance, Stop, Support
-from ..render.inputs import CHOICES
+from ..render.inputs import DIFFERENTIABLE
 from ..render.replay import Replay
 from ..render.series import on_host
 from ..scene.camera import Camera
@@ -159,7 +159,7 @@ class Run:
 
     def renderer(
         self,
-        images: Iterable[str] = (*CHOICES, "colour"),
+        images: Iterable[str] = (*DIFFERENTIABLE, "colour"),
         *,
         f_mod_hz: float | None = None,
         fallback: bool = True,
@@ -207,7 +207,7 @@ class Run:
         self,
         times: Iterable[float],
         cameras: Iterable[Camera],
-        images: Iterable[str] = (*CHOICES, "colour"),
+        images: Iterable[str] = (*DIFFERENTIABLE, "colour"),
     ) -> Iterator[dict[str, Float[np.ndarray, "..."]]]:
         """:meth:`renderer` for a loop that wants arrays on the host: on CUDA, they come while the
         next are rendered.

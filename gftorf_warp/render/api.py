@@ -16,7 +16,7 @@ from ..scene.sensor import Sensor
 from .bridge import IMAGES, INPUTS, Rasterize, Request, left_out
 from .buffers import RenderSettings, Workspace
 from .control import DeviceCamera, check
-from .inputs import CHOICES, wanted_images
+from .inputs import CHOICES, DIFFERENTIABLE, wanted_images
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -54,6 +54,9 @@ class Rendering:
     """Sum of w = 1 - T_e [1]."""
     distortion: Float[Tensor, "H W"] | Float[Tensor, "0 W"]
     """Sum over all pairs of w_k w_l (d_k - d_l)^2 [m^2], or as the settings say."""
+    distance_median: Float[Tensor, "H W"] | Float[Tensor, "0 W"]
+    """Distance of the splat at which the transmittance falls below one half [m], 0 where it does
+    not; without a derivative."""
     extra: Float[Tensor, "D H W"] | None
     """Sum of w times the extra channels; no background."""
     screen: ScreenGradient | None
@@ -94,7 +97,7 @@ def rasterize(
     background: Background | None = None,
     extra: Float[Tensor, "N D"] | None = None,
     extra_detached: bool = False,
-    images: Collection[str] = CHOICES,
+    images: Collection[str] = DIFFERENTIABLE,
     screen_gradient: bool = False,
     workspace: Workspace | None = None,
     control: DeviceCamera | None = None,
@@ -114,8 +117,8 @@ def rasterize(
         extra_detached: Whether gradients of the extra images reach ``extra`` only. All weights are
             held fixed under them, as if a detached field were rendered a second time for them;
             other images are as they were.
-        images: Which of quads, phasor, distance, opacity and distortion are wanted; what is left
-            out saves its time, above all distortion.
+        images: Which of quads, phasor, distance, opacity, distortion and distance_median are
+            wanted; what is left out saves its time, above all distortion.
         screen_gradient: Whether ``Rendering.screen`` is wanted.
         workspace: Memory of consecutive renderings of one size; None: each rendering allocates its
             own.

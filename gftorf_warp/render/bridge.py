@@ -82,6 +82,8 @@ class Rasterize(torch.autograd.Function):
             launch.forward(_inputs(named), view, buffers, _images(images), differentiable=learns)
         ctx.save_for_backward(*tensors)
         ctx.state = request, view, buffers, buffers.turns
+        if "distance_median" in images:
+            ctx.mark_non_differentiable(images["distance_median"])
         return tuple(images.get(name) for name in IMAGES)
 
     @staticmethod

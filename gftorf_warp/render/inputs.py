@@ -48,10 +48,13 @@ class Images:
     distance: wp.array | None  # [H, W]
     opacity: wp.array | None  # [H, W]
     distortion: wp.array | None  # [H, W]
+    distance_median: wp.array | None = None  # [H, W] without a derivative
     extra: wp.array | None = None  # [D, H, W]
 
 
-CHOICES = ("quads", "phasor", "distance", "opacity", "distortion")
+DIFFERENTIABLE = ("quads", "phasor", "distance", "opacity", "distortion")
+"""Those of ``CHOICES`` that have a derivative: what is rendered if nobody says what is wanted."""
+CHOICES = (*DIFFERENTIABLE, "distance_median")
 """Images that a rendering may do without; colour and extra depend on what there is to render."""
 
 

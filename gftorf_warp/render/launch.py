@@ -116,7 +116,12 @@ def forward(
         buffers.first.zero_()
     for number in [0, *range(max(1, buffers.groups_with_light), len(buffers.records))]:
         stages.composite(
-            inputs, buffers, number, images.distortion is not None, differentiable=differentiable
+            inputs,
+            buffers,
+            number,
+            images.distortion is not None,
+            median=images.distance_median is not None,
+            differentiable=differentiable,
         )
     stages.resolve_images(inputs, view, buffers, images, groups)
 

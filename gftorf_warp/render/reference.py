@@ -51,7 +51,7 @@ from .buffers import (
     Workspace,
 )
 from .control import DeviceCamera
-from .inputs import CHOICES, wanted_images
+from .inputs import DIFFERENTIABLE, wanted_images
 from .splat_distance_reference import bound_of, plane_distances, precision_of, slope_of
 
 # [px] side of the released code's tiles, to which Support.SIGMA3_TILE16 rounds out
@@ -96,7 +96,7 @@ def rasterize(
     background: Background | None = None,
     extra: Float[Tensor, "N D"] | None = None,
     extra_detached: bool = False,
-    images: Collection[str] = CHOICES,
+    images: Collection[str] = DIFFERENTIABLE,
     screen_gradient: bool = False,
     workspace: Workspace | None = None,  # noqa: ARG001
     control: DeviceCamera | None = None,  # noqa: ARG001
@@ -151,6 +151,7 @@ def rasterize(
                     seen,
                     _blend(w * T, two_way),
                     half_sum,
+                    _median(w, T, seen_at)[:, None],
                     T_end[:, None],
                 ],
                 1,
@@ -160,13 +161,14 @@ def rasterize(
     image = torch.cat(blocks).T.reshape(-1, height, width)
 
     colours = 0 if field.colour_sh is None else 3
-    sizes = [1, 1, colours, more.shape[1], q, 3, 1, 1]
-    distance, opacity, colour, more, quads, phasor, half_sum, T_end = image.split(sizes)
+    sizes = [1, 1, colours, more.shape[1], q, 3, 1, 1, 1]
+    distance, opacity, colour, more, quads, phasor, half_sum, median, T_end = image.split(sizes)
     found = {
         "quads": quads + _behind(background.quads, T_end, q),
         "phasor": phasor + _behind(background.phasor, T_end, 3),
         "distance": distance[0],
         "opacity": opacity[0],
+        "distance_median": median[0].detach(),
         "distortion": half_sum[0] * (2.0 if settings.distortion is Distortion.PAPER else 1.0),
     }
     wanted = wanted_images(images)
@@ -181,6 +183,13 @@ def rasterize(
 def _blend(w: Float[Tensor, "P M"], values: Tensor) -> Float[Tensor, "P C"]:
     """Sums of ``values`` [M, C], or [P, M, C] if they differ from pixel to pixel."""
     return w @ values if values.ndim == 2 else (w[:, None] @ values)[:, 0]
+
+
+def _median(
+    w: Float[Tensor, "P M"], T: Float[Tensor, "P M"], d: Float[Tensor, "*P M"]
+) -> Float[Tensor, "P"]:
+    """Distance of the splat at which the transmittance falls below one half; 0: it does not."""
+    return torch.where((T >= 0.5) & (T - w < 0.5), d, 0.0).sum(1).detach()
 
 
 def undecided_pixels(

@@ -29,7 +29,7 @@ from .api import Rendering
 from .bridge import ALIGNED, array_over, left_out
 from .buffers import Buffers, RenderSettings
 from .cuda import stream_of, without_garbage_collection
-from .inputs import CHOICES, Images, View, names_of, shapes_of, wanted_images
+from .inputs import CHOICES, DIFFERENTIABLE, Images, View, names_of, shapes_of, wanted_images
 from .moved import MovedGaussians
 from .pair_capacity import PairCapacity
 
@@ -65,7 +65,7 @@ class Replay:
         sensor: Sensor,
         settings: RenderSettings,
         optimised: Camera,
-        images: Iterable[str] = (*CHOICES, "colour"),
+        images: Iterable[str] = (*DIFFERENTIABLE, "colour"),
         *,
         colour_scale: float = 1.0,
     ):
@@ -79,8 +79,8 @@ class Replay:
             settings: How to render; the pair capacity is adapted.
             optimised: The camera at the size of the optimisation, whose low-pass filter widened the
                 Gaussians.
-            images: Names of the images to compute, of quads, phasor, colour, distance, opacity and
-                distortion.
+            images: Names of the images to compute, of quads, phasor, colour, distance, opacity,
+                distortion and distance_median.
             colour_scale: Colour is divided by this.
 
         Raises:

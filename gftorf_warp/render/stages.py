@@ -151,6 +151,7 @@ def composite(
     number: int,
     distortion: bool = True,
     *,
+    median: bool = False,
     differentiable: bool = True,
 ) -> None:
     """Blend all tiles: light with one or two groups of channels, or one further group."""
@@ -163,8 +164,9 @@ def composite(
         buffers.segments = segments
     inclusive = buffers.settings.stop == Stop.INCLUSIVE
     kernel = make_composite(
-        *shape, light, channels, inclusive, metric, more, segments, light and buffers.sloped
-    )
+        *shape, light, channels, inclusive, metric, more, segments, light and buffers.sloped,
+        light and median,
+    )  # fmt: skip
     channel = _lanes(buffers, buffers.channels[number] if channels else None)
     more_channel = _lanes(buffers, buffers.channels[1] if more else None)
     splats = _spread(buffers, number)
@@ -287,7 +289,7 @@ def resolve_images(
     if images.phasor is not None:
         lit = _phasor_inputs(inputs, buffers)
         _launch(planes_to_images.resolve_phasor, pixels, lit, [images.phasor])
-    outputs = [images.distance, images.opacity, images.distortion]
+    outputs = [images.distance, images.opacity, images.distortion, images.distance_median]
     if any(image is not None for image in outputs):
         outputs = [_or_nothing(buffers, image, 2) for image in outputs]
         factors = [sums, tiling, _distortion_factor(buffers)]

@@ -38,7 +38,8 @@ from .splat_distance import make_slopes
 
 # planes of ``light``, each [tiles, lanes] of V
 RE, IM, AMPLITUDE, DISTANCE, DISTORTION, SUM_ZETA, SUM_ZETA2, TRANSMITTANCE, LAST = range(9)
-LIGHT_PLANES = 9
+MEDIAN = 9
+LIGHT_PLANES = 10
 NEAREST = 1e-6  # [m] of a splat: padding records have distance 0 and weight 0
 FARTHEST = 1e-6  # [1/m] likewise of an inverse distance
 TURN = 6.283185307179586  # [rad]
@@ -122,6 +123,7 @@ def make_composite(
     more: bool = False,
     segments: int = 1,
     sloped: bool = False,
+    median: bool = False,
 ):
     """The kernel for one tile shape and one set of outputs.
 
@@ -136,6 +138,7 @@ def make_composite(
         more: Whether three further channels are summed in the same pass; K must be 1.
         segments: Of a list in the backward pass; > 1 only with K = 1, light and no distortion.
         sloped: Whether the distance varies inside a splat.
+        median: Whether the distance is kept at which T falls below one half; with light.
     """
     # the lanes of a warp fetch records for each other, see shared_batches.py
     cooperative, split = K == 1, segments > 1
@@ -145,7 +148,7 @@ def make_composite(
     V, fill, affine, mul = ops.V, ops.fill, ops.affine, ops.mul
     axpy, fma, fnma = ops.axpy, ops.fma, ops.fnma
     above, add, reaches, scaled = ops.above, ops.add, ops.reaches, ops.scaled
-    drop_below, set_where = ops.drop_below, ops.set_where
+    drop_below, set_where, where_crossed = ops.drop_below, ops.set_where, ops.where_crossed
     power_of, hits, alpha_of, nonzero = ops.power_of, ops.hits, ops.alpha_of, ops.nonzero
     block_x, block_y, columns, rows = pixels.block_x, pixels.block_y, ops.columns, ops.rows
     half = 0.5 * (pixels.side - 1)  # from the first to the middle of a block [px]
@@ -199,7 +202,7 @@ def make_composite(
         more_splats: wp.array[Splat],  # [N] records whose slots 8-10 are further channels
         calibration: wp.array[float],  # [4] phase slope [rad/m] and offset [rad]; of sloped splats
         # Out:
-        sums: wp.array3d[V],  # [9, tiles, lanes] planes RE .. LAST of ``light``
+        sums: wp.array3d[V],  # [10, tiles, lanes] planes RE .. MEDIAN of ``light``
         channel: wp.array3d[V],  # [3, tiles, lanes] the three channels
         more_channel: wp.array3d[V],  # [3, tiles, lanes] the further channels
         states: wp.array3d[V],  # [5 (segments - 1), tiles, lanes] see list_segments.py
@@ -225,6 +228,8 @@ def make_composite(
             im = fill(0.0)
             amplitude = fill(0.0)
             distance = fill(0.0)
+        if wp.static(median):
+            middle = fill(0.0)
         if wp.static(split):  # sums of the segments before this one
             re_before = fill(0.0)
             im_before = fill(0.0)
@@ -366,6 +371,10 @@ def make_composite(
                         c3 = axpy(c3, w, m[0])
                         c4 = axpy(c4, w, m[1])
                         c5 = axpy(c5, w, m[2])
+                    if wp.static(median):
+                        if wp.static(not sloped):
+                            d = fill(q[14])
+                        middle = where_crossed(middle, T, fnma(T, T, alpha), d, 0.5)
                     T = fnma(T, T, alpha)
                     if wp.static(light):
                         last = set_where(last, hit, float(k - begin))
@@ -391,6 +400,8 @@ def make_composite(
             sums[wp.static(DISTANCE), tile, lane] = distance
             sums[wp.static(TRANSMITTANCE), tile, lane] = T
             sums[wp.static(LAST), tile, lane] = last
+        if wp.static(median):
+            sums[wp.static(MEDIAN), tile, lane] = middle
         if wp.static(spreads):
             sums[wp.static(DISTORTION), tile, lane] = distortion
             sums[wp.static(SUM_ZETA), tile, lane] = sum_zeta

@@ -210,7 +210,7 @@ def make_composite_backward(
         tiles_x: int,  # tiles per row [1]
         tile0: int,  # first tile of this launch [index]
         mapping: wp.vec2,  # released zeta = mapping[0] - mapping[1] / distance [1, m]
-        sums: wp.array3d[V],  # [9, tiles, lanes] planes of the forward pass
+        sums: wp.array3d[V],  # [10, tiles, lanes] planes of the forward pass
         grad_sums: wp.array3d[V],  # [6, tiles, lanes] gradients of RE .. DISTORTION and of T_e
         grad_channel: wp.array3d[V],  # [3, tiles, lanes] gradients of the three channels
         grad_more: wp.array3d[V],  # [3, tiles, lanes] gradients of the further channels

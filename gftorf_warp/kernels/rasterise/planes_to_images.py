@@ -11,13 +11,13 @@ add up.
 import warp as wp
 
 from ..correlation import DC_OFFSET, quad_of
-from .composite import AMPLITUDE, DISTANCE, DISTORTION, IM, RE, TRANSMITTANCE
+from .composite import AMPLITUDE, DISTANCE, DISTORTION, IM, MEDIAN, RE, TRANSMITTANCE
 from .composite_backward import GRAD_TRANSMITTANCE
 
 _RE, _IM, _AMPLITUDE = wp.constant(RE), wp.constant(IM), wp.constant(AMPLITUDE)
 _DISTANCE, _DISTORTION = wp.constant(DISTANCE), wp.constant(DISTORTION)
 _TRANSMITTANCE, _GRAD_T = wp.constant(TRANSMITTANCE), wp.constant(GRAD_TRANSMITTANCE)
-_DC = wp.constant(DC_OFFSET)
+_DC, _MEDIAN = wp.constant(DC_OFFSET), wp.constant(MEDIAN)
 
 
 @wp.struct
@@ -55,7 +55,7 @@ def light_at(sums: wp.array2d[float], k: int) -> wp.vec3:
 @wp.kernel(enable_backward=False)
 def resolve_quads(
     # In:
-    sums: wp.array2d[float],  # [9, pixels] planes of the compositor
+    sums: wp.array2d[float],  # [10, pixels] planes of the compositor
     tiling: Tiling,  # order of the pixels [px]
     calibration: wp.array[float],  # [4] phase slope, phase offset, source intensity, DC offset [1]
     shifts: wp.array[wp.vec2],  # [Q] (cos, sin) of the phase shifts [1]
@@ -77,7 +77,7 @@ def resolve_quads(
 @wp.kernel(enable_backward=False)
 def fold_quads(
     # In:
-    sums: wp.array2d[float],  # [9, pixels] planes of the compositor
+    sums: wp.array2d[float],  # [10, pixels] planes of the compositor
     tiling: Tiling,  # order of the pixels [px]
     calibration: wp.array[float],  # [4] phase slope, phase offset, source intensity, DC offset [1]
     shifts: wp.array[wp.vec2],  # [Q] (cos, sin) of the phase shifts [1]
@@ -107,7 +107,7 @@ def fold_quads(
 @wp.kernel(enable_backward=False)
 def fold_dc_offset(
     # In:
-    sums: wp.array2d[float],  # [9, pixels] planes of the compositor
+    sums: wp.array2d[float],  # [10, pixels] planes of the compositor
     tiling: Tiling,  # order of the pixels [px]
     grad_quads: wp.array3d[float],  # [Q, H, W]
     # Out:
@@ -141,7 +141,7 @@ def add_dc_offset(
 @wp.kernel(enable_backward=False)
 def resolve_phasor(
     # In:
-    sums: wp.array2d[float],  # [9, pixels] planes of the compositor
+    sums: wp.array2d[float],  # [10, pixels] planes of the compositor
     tiling: Tiling,  # order of the pixels [px]
     factor: float,  # eta, length of a phasor over the amplitude [1]
     background: wp.array3d[float],  # [3, H, W], or [0, 0, 0]: black
@@ -161,7 +161,7 @@ def resolve_phasor(
 @wp.kernel(enable_backward=False)
 def fold_phasor(
     # In:
-    sums: wp.array2d[float],  # [9, pixels] planes of the compositor
+    sums: wp.array2d[float],  # [10, pixels] planes of the compositor
     tiling: Tiling,  # order of the pixels [px]
     factor: float,  # eta, length of a phasor over the amplitude [1]
     background: wp.array3d[float],  # [3, H, W], or [0, 0, 0]: black
@@ -187,13 +187,14 @@ def fold_phasor(
 @wp.kernel(enable_backward=False)
 def resolve_geometry(
     # In:
-    sums: wp.array2d[float],  # [9, pixels] planes of the compositor
+    sums: wp.array2d[float],  # [10, pixels] planes of the compositor
     tiling: Tiling,  # order of the pixels [px]
     factor: float,  # 2: double sum of the distortion, 1: half sum [1]
     # Out:
     distance: wp.array2d[float],  # [H, W] not divided by the opacity [m]
     opacity: wp.array2d[float],  # [H, W]
     distortion: wp.array2d[float],  # [H, W]
+    median: wp.array2d[float],  # [H, W] distance at which T falls below one half, else 0 [m]
 ):
     """One thread per pixel; each image is [0, 0] where it is not wanted."""
     y, x = wp.tid()
@@ -204,6 +205,8 @@ def resolve_geometry(
         opacity[y, x] = 1.0 - sums[_TRANSMITTANCE, k]
     if distortion.shape[0] > 0:
         distortion[y, x] = factor * sums[_DISTORTION, k]
+    if median.shape[0] > 0:
+        median[y, x] = sums[_MEDIAN, k]
 
 
 @wp.kernel(enable_backward=False)
@@ -226,7 +229,7 @@ def fold_plane(
 def resolve_channels(
     # In:
     channel: wp.array2d[float],  # [3, pixels] planes of the compositor
-    sums: wp.array2d[float],  # [9, pixels] its planes of light, for T_e
+    sums: wp.array2d[float],  # [10, pixels] its planes of light, for T_e
     tiling: Tiling,  # order of the pixels [px]
     background: wp.array3d[float],  # [3, H, W], or [0, 0, 0]: black
     start: int,  # first image to write [index]
@@ -247,7 +250,7 @@ def resolve_channels(
 @wp.kernel(enable_backward=False)
 def fold_channels(
     # In:
-    sums: wp.array2d[float],  # [9, pixels] planes of light, for T_e
+    sums: wp.array2d[float],  # [10, pixels] planes of light, for T_e
     tiling: Tiling,  # order of the pixels [px]
     background: wp.array3d[float],  # [3, H, W], or [0, 0, 0]: black
     start: int,  # first image to read [index]
