@@ -36,6 +36,15 @@ def inside(shape, point):
     return bool((np.abs(point) < np.asarray(shape.size) / 2).all())
 
 
+def corner(scene):
+    """The farthest corner of the room, mirrored into x, y, z >= 0 [m]."""
+    back, floor, ceiling, left, right = (
+        np.abs(wall.path.position) - np.asarray(wall.shape.size) / 2
+        for wall in scene.bodies[:WALLS]
+    )
+    return max(left[0], right[0]), max(floor[1], ceiling[1]), back[2]
+
+
 def test_a_number_decides_every_byte(tmp_path):
     """Two recordings of one seed are equal; another seed is another scene."""
     settings = {"engine": "mesh", "size": SMALL, "frames": 4, "seed": 5}
@@ -73,6 +82,7 @@ def test_every_number_gives_a_scene_that_can_be_recorded(number):
         distance = first_hit(scene.bodies, scene.camera(SMALL), time).distance
         assert CLEARANCE < distance.min(), "NaN, where a ray leaves the room, fails too"
         assert distance.max() < scene.sensor.unambiguous_range
+    assert np.linalg.norm(corner(scene)) < 0.975 * scene.sensor.unambiguous_range, "noise wraps"
 
 
 def test_the_scenes_are_different_in_all_that_is_drawn():
