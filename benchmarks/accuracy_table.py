@@ -19,7 +19,7 @@ MOVING_CLASSES = ("moving interior", "moving edge")
 STATIC_CLASSES = ("static interior", "static edge")
 NONE = "-"
 SUMMARY = (
-    "row", "d / closed form", "d_ToF / closed form", "d / temporal",
+    "row", "d / closed form", "fit alone, measured", "median", "d_ToF", "d / temporal",
     "moving interior / edge, static", "static interior, throughout", "worst scene",
     "worse than closed form", "than temporal", "seeds max / min", "rise",
     "chi-square, unexplained", "seconds", "Gaussians", "failed",
@@ -36,7 +36,9 @@ def error_of(result: Result, distance: str, part: str) -> float | None:
         scores = ((scores.get("classes") or {}).get(group) or {}).get(kind) or {}
     elif part != "all":
         scores = scores.get(part) or {}
-    return scores.get(f"{distance}_mse_x100")
+    error = scores.get(f"{distance}_mse_x100")
+    # without measurements that replace it, all of d is the fit's
+    return error_of(result, "d", part) if distance == "d_fit" and error is None else error
 
 
 def ratio(
@@ -117,6 +119,8 @@ def _line(fits: list[Result]) -> list[str]:
     explained = [fit["scores"].get("explained") or {} for fit in fits]
     chi = geometric_mean(each.get("reduced_chi_square") for each in explained)
     shares = [share for each in explained if (share := each.get("unexplained_share")) is not None]
+    sources = [fit["scores"].get("source") for fit in fits]
+    measured = [1.0 - source["fit"] if source else 0.0 for source in sources]
     rises = [rise for fit in fits if (rise := fit.get("rise"))]
     seconds = [fit["seconds"] for fit in fits if "seconds" in fit]
 
@@ -135,6 +139,10 @@ def _line(fits: list[Result]) -> list[str]:
 
     return [
         means_of("d", "closed_form"),
+        f"{means_of('d_fit', 'closed_form')}, {100 * np.mean(measured):.2g} %"
+        if any(sources)
+        else NONE,
+        means_of("d_median", "closed_form"),
         means_of("d_tof", "closed_form"),
         means_of("d", "temporal"),
         f"{means_of('d', 'closed_form', MOVING_CLASSES)}, "

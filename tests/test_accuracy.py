@@ -39,10 +39,17 @@ def result(row, scene, seed, d, closed=(1.0, 1.0, 1.0), **more):
     """A result with errors of d on all, moving and static pixels."""
     scores = {}
     for part, error, other in zip(("all", "moving", "static"), d, closed, strict=True):
-        named = {"d": error, "d_tof": error, "closed_form": other, "temporal": 0.5 * other}
+        named = {
+            "d": error,
+            "d_tof": error,
+            "closed_form": other,
+            "temporal": 0.5 * other,
+            "d_fit": 2.0 * error,
+        }
         scores[part] = {f"{name}_mse_x100": value for name, value in named.items()}
     interior = {"d_mse_x100": d[2], "temporal_mse_x100": 0.25}
     scores["static_throughout"] = {"d_mse_x100": d[2], "temporal_mean_mse_x100": 0.5}
+    scores["source"] = {"fit": 0.8} if seed == 0 else None
     scores["explained"] = {"reduced_chi_square": 2.0, "unexplained_share": 0.01}
     classes = {"moving": {"edge": {"d_mse_x100": 3.0, "closed_form_mse_x100": 6.0}}}
     scores |= scores.pop("all") | {"classes": classes | {"static": {"interior": interior}}}
@@ -214,12 +221,15 @@ def test_the_summary_is_means_over_scenes_and_seeds():
     floor = {"all": 0.1, "moving": None, "static": 0.05}
     scenes = [{"scene": "one", "about": "text", "floor": floor}, {"scene": "two"}]
     lines = accuracy_table.summary(["a", "b"], scenes, results).splitlines()
-    assert lines[2].startswith("| edge floor | 0.1 / - / 0.05 | - / - / - | 0.2 / - / 0.1 |")
+    assert lines[2].startswith(
+        "| edge floor | 0.1 / - / 0.05 | - | - / - / - | - / - / - | 0.2 / - / 0.1 |"
+    )
     line = lines[3].split(" | ")
     assert line[1] == "0.4 / 0.283 / 0.883"
-    assert line[3:6] == ["0.8 / 0.566 / 1.77", "- / 0.5, - / -", "3.53, 1.77"]
-    assert line[6:8] == ["two 0.8", "1 of 2 scenes, 1 of 4 fits"]
-    assert line[8:12] == ["2 of 2 scenes, 3 of 4 fits", "2, 4", "1.5, 2", "2, 1 %"]
+    assert line[2] == "0.8 / 0.566 / 1.77, 10 %"
+    assert line[5:8] == ["0.8 / 0.566 / 1.77", "- / 0.5, - / -", "3.53, 1.77"]
+    assert line[8:10] == ["two 0.8", "1 of 2 scenes, 1 of 4 fits"]
+    assert line[10:14] == ["2 of 2 scenes, 3 of 4 fits", "2, 4", "1.5, 2", "2, 1 %"]
     assert line[-1] == "1 |"
     assert lines[4].count("-") >= 9
     assert accuracy_table.worst_first(results[:4])[0]["id"] == "a/one/1"
