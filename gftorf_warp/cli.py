@@ -296,14 +296,26 @@ def table(metrics: dict) -> str:
     scored = f"{metrics['frames']} raw frames ({metrics['protocol']})"
     lines.append(f"{scored}, against {metrics.get('against', 'geometry')}, quad PSNR {quality}")
     if (found := metrics.get("explained")) is not None:
-        from .recon.residuals import sentence
-
-        lines.append(sentence(found))
+        lines.append(_explained(found))
     share = metrics.get("ambiguous_share")
     if share is not None:
         reach = f"{metrics['unambiguous_range_m']:.4g} m by several frequencies together"
         lines.append(f"unambiguous to {reach}; {share:.1%} of the closed form ambiguous")
     return "\n".join(lines)
+
+
+def _explained(found: dict) -> str:
+    """How well the quads are explained, in a line."""
+    known = {
+        "reduced chi-square of the quads": ("reduced_chi_square", "{:.3g}"),
+        "pixels not explained": ("unexplained_share", "{:.1%}"),
+        "of those that change": ("changing_unexplained_share", "{:.1%}"),
+        "of the others at a wrong distance": ("contradicted_share", "{:.1%}"),
+    }
+    values = {name: (found[key], form) for name, (key, form) in known.items()}
+    return ", ".join(
+        f"{name} {form.format(v)}" for name, (v, form) in values.items() if v is not None
+    )
 
 
 def _named(options: argparse.Namespace, *names: str) -> dict[str, Any]:

@@ -40,13 +40,13 @@ def fallback_of(measured, quads):
         n = round(time * FRAME_RATE_HZ)
         same = torch.as_tensor(np.stack([quads[n]] * 4), dtype=torch.float32)
         phasor = torch.stack([*phasor_from_quads(same, CANONICAL_SHIFTS), same[0]])
-        return SimpleNamespace(quads=same, phasor=phasor)
+        return SimpleNamespace(quads=same, phasor=phasor, distance=same[0])
 
     run = SimpleNamespace(
         config={},
         camera=camera_of(measured, 0),
         sensor=Sensor(f_mod_hz=measured.calibration.f_mod_hz),
-        renderer=lambda images, f_mod_hz: render,  # noqa: ARG005
+        renderer=lambda images, f_mod_hz, fallback: render,  # noqa: ARG005
     )
     return Fallback.of(run, measured, torch.device("cpu"))
 

@@ -13,6 +13,7 @@ from moving_box import recording
 from small_runs import demo
 
 from gftorf_warp.constants import CANONICAL_SHIFTS, FRAME_RATE_HZ
+from gftorf_warp.data.truth import nearest
 from gftorf_warp.evaluate.compare import compare
 from gftorf_warp.recon import residuals as checked
 from gftorf_warp.recon.observations import reduced
@@ -23,9 +24,11 @@ from gftorf_warp.scene.measured import camera_of
 from gftorf_warp.scene.motion import MotionSettings
 from gftorf_warp.scene.sensor import Sensor, phasor_from_quads
 
+TRUE = recording(frames=32)[1].distance
 
-def explained(measured, clean, width=48, **config):
-    """Residuals of a run that renders the quads ``clean`` [F, H, W], fitted at a width."""
+
+def explained(measured, clean, width=48, shown=TRUE, **config):
+    """Residuals of a run that renders these quads and distances [F, H, W], fitted at a width."""
     small_ = reduced(replace(measured, quads=clean.astype(np.float32)), width)
 
     def render(time, camera):
@@ -33,17 +36,16 @@ def explained(measured, clean, width=48, **config):
         n = round(time * FRAME_RATE_HZ)
         quads = torch.as_tensor(np.stack([small_.quads[n]] * 4))
         phasor = torch.stack([*phasor_from_quads(quads, CANONICAL_SHIFTS), quads[0]])
-        return SimpleNamespace(quads=quads, phasor=phasor)
+        distance = torch.as_tensor(nearest(shown[n : n + 1], small_.height, small_.width)[0])
+        return SimpleNamespace(quads=quads, phasor=phasor, distance=distance)
 
     run = SimpleNamespace(
         config={"size_optimised": [small_.width, small_.height], **config},
         camera=camera_of(measured, 0),
         sensor=Sensor(f_mod_hz=measured.calibration.f_mod_hz),
-        renderer=lambda images, f_mod_hz: render,  # noqa: ARG005
+        renderer=lambda images, f_mod_hz, fallback: render,  # noqa: ARG005
     )
     return residuals(run, measured)
-
-    return camera_of(measured, 0)
 
 
 @pytest.fixture(scope="module")
@@ -126,6 +128,47 @@ def test_a_moving_camera_and_a_missing_frame(box):
     assert found.reduced_chi_square == pytest.approx(1.0, abs=0.1)
 
 
+def test_false_distances_of_what_rests_contradict_the_measurement(box):
+    """Layers that give the right quads: only the mean over time sees them; whole turns do not
+    count, and neither does what moves.
+    """
+    measured, clean = box
+    right = explained(measured, clean)
+    assert right.contradicted_share < 0.005
+    wrong = TRUE.copy()
+    wrong[:, :12] += 0.4
+    found = explained(measured, clean, shown=wrong)
+    assert found.unexplained_share < 1e-3
+    assert found.contradicted[:, :8].mean() > 0.99
+    assert found.contradicted_share > 0.25
+    assert "contradicts the measured one" in checked.problems(found.as_json())[0]
+    assert explained(measured, clean, shown=TRUE + 7.5).contradicted_share < 0.005
+    moved = np.where(TRUE < 3.0, TRUE + 0.4, TRUE)
+    assert explained(measured, clean, shown=moved).contradicted_share < 0.05
+
+
+def test_motion_that_was_not_found_shows_where_pixels_change(box):
+    """The first instant for ever; a black image is worse, and a good fit has nothing to say."""
+    measured, clean = box
+    frozen = clean[np.arange(32) % 4]
+    found = explained(measured, frozen)
+    assert found.changing_unexplained_share > 0.5
+    assert any("motion is missing or wrong" in text for text in checked.problems(found.as_json()))
+    assert len(checked.problems(explained(measured, np.zeros_like(clean)).as_json())) == 2
+    assert checked.problems(explained(measured, clean).as_json()) == []
+    assert checked.problems(None) == []
+
+
+def test_without_motion_nothing_is_said_of_motion():
+    """Noise alone makes two pixels in ten thousand change."""
+    still = np.tile(recording(frames=4, noise=0.0)[0].quads, (8, 1, 1))
+    noise = 4e-4 * np.random.default_rng(0).standard_normal(still.shape)
+    measured = replace(recording(frames=32)[0], quads=(still + noise).astype(np.float32))
+    found = explained(measured, still, shown=np.tile(TRUE[:1], (32, 1, 1)))
+    assert found.changing_unexplained_share is None
+    assert found.contradicted_share < 0.05
+
+
 def test_a_run_that_finds_no_motion_says_so(tmp_path, caplog):
     """The control without motion cannot explain the box, and log and config.json say it."""
     settings = demo(images=200, motion=MotionSettings(kind="still"))
@@ -133,9 +176,23 @@ def test_a_run_that_finds_no_motion_says_so(tmp_path, caplog):
         run = reconstruct(recording(frames=12)[0], tmp_path / "run", settings)
     assert "does not explain" in caplog.text
     stored = json.loads((run.path / "config.json").read_text())["explained"]
-    assert stored["unexplained_share"] > checked.WARNING_SHARE
+    assert stored["unexplained_share"] > checked.UNEXPLAINED_MAX
     assert Run.open(run.path).config["explained"] == stored
-    assert checked.sentence(stored).startswith("the fit does not explain")
+    assert checked.problems(stored)[0].startswith("the fit does not explain")
+
+
+def test_flow_of_the_wrong_sign_shows_as_wrong_motion(tmp_path):
+    """The nodes start where flow leads, so they start the wrong way; the right flow is fine."""
+    measured = recording(frames=16)[0]
+    turned = replace(
+        measured.flow,
+        forward={n: -flow for n, flow in measured.flow.forward.items()},
+        backward={n: -flow for n, flow in measured.flow.backward.items()},
+    )
+    for flow, wrong in ((measured.flow, False), (turned, True)):
+        run = reconstruct(replace(measured, flow=flow), tmp_path / str(wrong), demo(images=600))
+        found = checked.problems(run.config["explained"])
+        assert any("motion is missing or wrong" in text for text in found) == wrong
 
 
 def test_without_truth_compare_still_says_how_well(tmp_path):

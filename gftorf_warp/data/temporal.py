@@ -8,13 +8,16 @@ within a few standard deviations of the pixel's median in that slot.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from .decode import closed_form_distance
+from ..constants import SPEED_OF_LIGHT
+from .cycles import phase_noise
+from .decode import closed_form_distance, quartet_phasors
 from .noise import QuadNoise, amplitudes_of, quad_noise
 from .sequence import ColourCamera, Flow, Sequence
 
@@ -61,6 +64,19 @@ def agreement(sequence: Sequence, noise: QuadNoise) -> Bool[np.ndarray, "Q H W"]
     reach = AGREES * noise.sigma(light)
     agrees = (np.abs(stacked - np.median(stacked, axis=0)) <= reach).all(axis=1)
     return agrees & (agrees.sum(axis=0) >= AGREEING_MIN)
+
+
+def sigma_of_mean(
+    sequence: Sequence, noise: QuadNoise, agrees: Bool[np.ndarray, "Q H W"]
+) -> Float[np.ndarray, "H W"]:
+    """Standard deviation of the distance of the temporal mean [m], from the first frequency."""
+    first = quartet_phasors(sequence, sequence.complete_quartets[0])[0][0]
+    slot = first[0] % sequence.cycle
+    light = np.median([amplitudes_of(sequence, i) for i in sequence.complete_quartets], axis=0)
+    relative = noise.sigma(light)[slot] / np.maximum(light[slot], np.finfo(np.float32).tiny)
+    metres_per_rad = SPEED_OF_LIGHT / (4.0 * math.pi * sequence.frequencies[0])
+    scale = phase_noise(sequence.shifts[first]) * metres_per_rad
+    return scale * relative / np.sqrt(np.maximum(agrees.sum(axis=0), 1))
 
 
 def over_time(sequence: Sequence, reduce: Callable[..., np.ndarray]) -> Float[np.ndarray, "H W"]:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..data.decode import unambiguous_range
-from ..recon.residuals import WARNING_SHARE
+from ..recon.residuals import problems
 from ..render.buffers import available_threads
 from . import figures, gallery, page, panels, provenance
 from .legend import PHASORS_TO_READ, TO_READ
@@ -112,11 +112,9 @@ def report(
 
 def verdict(metrics: Mapping[str, Any]) -> str:
     """The result in a few sentences of HTML, with the numbers of metrics.json."""
-    share = (metrics.get("explained") or {}).get("unexplained_share", 0.0)
-    if share <= WARNING_SHARE:
+    if not problems(metrics.get("explained")):
         return _result(metrics)
-    unexplained = page.number(metrics, "explained.unexplained_share", "percent")
-    warning = f'<span class="naive">{unexplained} of the pixels are not explained by the fit</span>'
+    warning = '<span class="naive">The fit does not explain what was measured</span>'
     return f"{_result(metrics)} {warning}, see below."
 
 
@@ -285,6 +283,12 @@ def _explained(metrics: Mapping[str, Any], found: Findings, s: int) -> list[str]
     if page.look_up(metrics, "explained.reduced_chi_square") is not None:
         mean = page.number(metrics, "explained.reduced_chi_square", "ratio")
         text += f"; the reduced chi-square of the quads is {mean}, and one for noise alone"
+    if page.look_up(metrics, "explained.changing_unexplained_share") is not None:
+        changing = page.number(metrics, "explained.changing_unexplained_share", "percent")
+        text += f"; of those that change over time, {changing} are not explained"
+    if page.look_up(metrics, "explained.contradicted_share") is not None:
+        wrong = page.number(metrics, "explained.contradicted_share", "percent")
+        text += f"; of those that do not, {wrong} are far from the distance of their temporal mean"
     text = _caption(f"{text}. Each raw frame at its own time, at the size of the fit.")
     html = panels.explained(found, s)
     if page.look_up(metrics, "source") is not None:

@@ -21,9 +21,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ..constants import SPEED_OF_LIGHT
 from ..data import temporal
-from ..data.cycles import phase_noise
 from ..data.decode import closed_form_distance, quartet_phasors, unambiguous_range
 from ..data.noise import QuadNoise, amplitudes_of, quad_noise
 from ..data.sequence import Sequence
@@ -90,7 +88,7 @@ class Fallback:
             sequence=sequence,
             camera=run.camera,
             temporal=tensor(np.stack([closed_form_distance(averaged, i) for i in quartets])),
-            sigma=tensor(_sigma(sequence, noise, agrees)),
+            sigma=tensor(temporal.sigma_of_mean(sequence, noise, agrees)),
             rests=tensor(agrees & ~fit_stays),
             closed_form=tensor(np.stack([closed_form_distance(sequence, i) for i in quartets])),
             moved=tensor(moved),
@@ -166,16 +164,3 @@ def _phasor_quads(sequence: Sequence) -> Float[np.ndarray, "Q K H W"]:
                 wave = re * math.cos(shift) + im * math.sin(shift)
                 quads[n - sequence.cycle * i] = 0.5 * (wave + constant)
     return result
-
-
-def _sigma(
-    sequence: Sequence, noise: QuadNoise, agrees: Bool[np.ndarray, "Q H W"]
-) -> Float[np.ndarray, "H W"]:
-    """Standard deviation of the distance of the temporal mean [m], from the first frequency."""
-    first = quartet_phasors(sequence, sequence.complete_quartets[0])[0][0]
-    slot = first[0] % sequence.cycle
-    light = np.median([amplitudes_of(sequence, i) for i in sequence.complete_quartets], axis=0)
-    relative = noise.sigma(light)[slot] / np.maximum(light[slot], np.finfo(np.float32).tiny)
-    metres_per_rad = SPEED_OF_LIGHT / (4.0 * math.pi * sequence.frequencies[0])
-    scale = phase_noise(sequence.shifts[first]) * metres_per_rad
-    return scale * relative / np.sqrt(np.maximum(agrees.sum(axis=0), 1))

@@ -21,7 +21,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ..data.noise import amplitudes_of, quad_noise
+from ..constants import SPEED_OF_LIGHT
+from ..data import temporal
+from ..data.decode import closed_form_distance, unambiguous_range
+from ..data.noise import QuadNoise, amplitudes_of, quad_noise
 from ..data.sequence import Sequence
 from ..errors import InputError
 from ..render.api import Rendering
@@ -34,8 +37,13 @@ LOG = logging.getLogger("gftorf_warp")
 CHI_SQUARE_MAX = 6.0  # noise alone exceeds it in 1e-4 of the pixels, with four raw frames
 MODEL_ERROR = 0.05  # [1] of the amplitude: 6 cm at 20 MHz
 TINY = 1e-30  # [quad units^2] instead of no variance
-# [1] of unexplained pixels; the good fit of `gftorf demo` has 0.008, bad ones of random scenes 0.1
-WARNING_SHARE = 0.02
+# Limits of shares of pixels; in brackets a good fit (`gftorf demo`), and bad ones of random scenes
+UNEXPLAINED_MAX = 0.02  # of all (0.008; 0.03 to 0.11)
+CHANGING_MAX = 0.5  # of those that change, unexplained (0.1; 0.7)
+CONTRADICTED_MAX = 0.05  # of those that do not, at another distance (0.004; 0.13)
+CHANGING_MIN = 1e-3  # of all: noise alone makes 2e-4 of the pixels change
+CONTRADICTION = 0.025  # [unambiguous ranges of the first frequency] 19 cm at 20 MHz
+SIGMAS = 3.0  # [standard deviations of the temporal mean] that are no contradiction
 CENTRAL = (0.05, 0.95)  # quantiles of the unexplained pixels that a message names
 
 
@@ -55,7 +63,7 @@ class Fitted(Protocol):
         """The sensor, with the four canonical shifts."""
 
     def renderer(
-        self, images: Iterable[str], *, f_mod_hz: float | None
+        self, images: Iterable[str], *, f_mod_hz: float | None, fallback: bool
     ) -> Callable[[float, Camera], Rendering]:
         """A function of time [s] and camera."""
 
@@ -72,6 +80,11 @@ class Residuals:
     """Whether the recording has noise; else a thousandth of the amplitude stands for it."""
     unexplained: Bool[np.ndarray, "Q H W"]
     """Where the run fails, see the module."""
+    changes: Bool[np.ndarray, "Q H W"] | None
+    """Where the quartet does not agree with its pixel's median; None: the camera moves."""
+    contradicted: Bool[np.ndarray, "Q H W"]
+    """Where the quartet agrees, and the distance of the fit is far from that of the temporal mean,
+    whole turns aside: quads do not determine it, and it is wrong."""
     scale: float
     """Columns of the sequence per column of these images [1]."""
     cycle: int
@@ -86,6 +99,22 @@ class Residuals:
     def unexplained_share(self) -> float:
         """Unexplained pixels over all [1]."""
         return float(self.unexplained.mean())
+
+    @property
+    def changing_unexplained_share(self) -> float | None:
+        """Unexplained pixels over all that change [1]; None: hardly any does, or the camera
+        moves.
+        """
+        if self.changes is None or self.changes.mean() < CHANGING_MIN:
+            return None
+        return float(self.unexplained[self.changes].mean())
+
+    @property
+    def contradicted_share(self) -> float | None:
+        """Pixels at a wrong distance over all that do not change [1]; None: there are none."""
+        if self.changes is None or self.changes.all():
+            return None
+        return float(self.contradicted.sum() / (~self.changes).sum())
 
     def ranges(self) -> dict[str, list[int]] | None:
         """First and last column, row and raw frame of the sequence around the central 90 % of the
@@ -110,6 +139,8 @@ class Residuals:
         return {
             "reduced_chi_square": self.reduced_chi_square,
             "unexplained_share": self.unexplained_share,
+            "changing_unexplained_share": self.changing_unexplained_share,
+            "contradicted_share": self.contradicted_share,
             **(self.ranges() or dict.fromkeys(("columns", "rows", "frames"))),
         }
 
@@ -134,19 +165,23 @@ def residuals(run: Fitted, sequence: Sequence) -> Residuals | None:
         return None
     if noise is None:
         return None
-    render = {f: run.renderer(("quads", "phasor"), f_mod_hz=f) for f in sequence.frequencies}
-    chi_square, scaled = [], []
+    shown = ("quads", "phasor", "distance")
+    render = {f: run.renderer(shown, f_mod_hz=f, fallback=False) for f in sequence.frequencies}
+    chi_square, scaled, distance = [], [], []
     for i in measured.complete_quartets:
-        frames = range(measured.frames)[measured.quartet_frames(i)]
-        apart = torch.stack([_difference(run, measured, n, render, camera) for n in frames])
-        square = np.square(apart.double().cpu().numpy())
+        apart, first = _quartet(run, measured, i, render, camera)
+        distance.append(first)
+        square = np.square(apart)
         amplitude = amplitudes_of(measured, i)
         variance = np.square(noise.sigma(amplitude))
         tolerated = np.maximum(variance + np.square(MODEL_ERROR * amplitude), TINY)
         chi_square.append((square / np.maximum(variance, TINY)).mean(axis=0))
         scaled.append((square / tolerated).mean(axis=0))
+    changes, contradicted = _contradictions(measured, noise, np.stack(distance))
     return Residuals(
         quartets=measured.complete_quartets,
+        changes=changes,
+        contradicted=contradicted,
         chi_square=np.stack(chi_square).astype(np.float32),
         noisy=bool((noise.floor + noise.gain > 0).all()),
         # not finite counts as unexplained
@@ -156,38 +191,72 @@ def residuals(run: Fitted, sequence: Sequence) -> Residuals | None:
     )
 
 
-def _difference(
+def _quartet(
     run: Fitted,
     measured: Sequence,
-    n: int,
-    render: dict[float, Callable[[float, Camera], Rendering]],
+    i: int,
+    render: Mapping[float, Callable[[float, Camera], Rendering]],
     camera: Camera,
-) -> Float[Tensor, "H W"]:
-    """Rendered minus measured quad of raw frame n."""
-    at = camera.at(measured.camera_from_world[n])
-    rendering = render[float(measured.frame_frequencies[n])](float(measured.times[n]), at)
-    quad = quad_of_shift(rendering, run.sensor, float(measured.shifts[n]))
-    return quad - torch.as_tensor(measured.quads[n], device=quad.device)
+) -> tuple[Float[np.ndarray, "K H W"], Float[np.ndarray, "H W"]]:
+    """Rendered minus measured quads of quartet i, each at its time, pose and frequency, and the
+    distance [m] rendered at the first.
+    """
+    apart: list[Tensor] = []
+    distance: list[Tensor] = []
+    for n in range(measured.frames)[measured.quartet_frames(i)]:
+        at = camera.at(measured.camera_from_world[n])
+        rendering = render[float(measured.frame_frequencies[n])](float(measured.times[n]), at)
+        quad = quad_of_shift(rendering, run.sensor, float(measured.shifts[n]))
+        apart.append(quad - torch.as_tensor(measured.quads[n], device=quad.device))
+        if not distance:
+            distance.append(rendering.distance.clone())  # the next rendering overwrites it
+    return torch.stack(apart).double().cpu().numpy(), distance[0].cpu().numpy()
+
+
+def _contradictions(
+    measured: Sequence, noise: QuadNoise, distance: Float[np.ndarray, "Q H W"]
+) -> tuple[Bool[np.ndarray, "Q H W"] | None, Bool[np.ndarray, "Q H W"]]:
+    """``changes`` and ``contradicted`` of the rendered distances [m] of all complete quartets."""
+    if not temporal.camera_rests(measured):
+        return None, np.zeros(distance.shape, dtype=bool)
+    agrees = temporal.agreement(measured, noise)
+    averaged = temporal.averaged(measured, agrees)
+    mean = np.stack([closed_form_distance(averaged, i) for i in measured.complete_quartets])
+    reach = unambiguous_range(measured)
+    apart = np.abs((distance - mean + 0.5 * reach) % reach - 0.5 * reach)
+    far = CONTRADICTION * SPEED_OF_LIGHT / (2.0 * measured.frequencies[0])
+    sigma = temporal.sigma_of_mean(measured, noise, agrees)
+    return ~agrees, agrees & ~(apart <= np.maximum(far, SIGMAS * sigma))
 
 
 def warn(found: Residuals | None) -> None:
-    """Log a warning if more than a few per cent of the pixels are unexplained."""
-    if found is not None and found.unexplained_share > WARNING_SHARE:
-        LOG.warning("%s", sentence(found.as_json()))
+    """Log everything that :func:`problems` finds."""
+    for problem in problems(found.as_json() if found else None):
+        LOG.warning("%s", problem)
 
 
-def sentence(found: Mapping[str, Any]) -> str:
-    """What :meth:`Residuals.as_json` says, in words."""
-    text = f"the fit does not explain {found['unexplained_share']:.1%} of the pixels"
-    if found["reduced_chi_square"] is not None:
-        text += f" (reduced chi-square of the quads {found['reduced_chi_square']:.3g})"
-    if found["columns"] is not None:
+def problems(found: Mapping[str, Any] | None) -> list[str]:
+    """What is wrong with a run, in sentences, from :meth:`Residuals.as_json`; the same limits for
+    every preset. Opaque veils, dead networks, wrong or missing motion and layers at false distances
+    all show here.
+    """
+    if found is None:
+        return []
+    sentences = []
+    if found["unexplained_share"] > UNEXPLAINED_MAX:
+        text = f"the fit does not explain {found['unexplained_share']:.1%} of the pixels"
+        if found["reduced_chi_square"] is not None:
+            text += f" (reduced chi-square of the quads {found['reduced_chi_square']:.3g})"
         ranges = {name: "{} to {}".format(*found[name]) for name in ("columns", "rows", "frames")}
-        text += (
-            f", most of them in columns {ranges['columns']}, rows {ranges['rows']}, raw frames "
-            f"{ranges['frames']}"
-        )
-    return text
+        text += f", most of them in columns {ranges['columns']}, rows {ranges['rows']}, "
+        sentences.append(text + f"raw frames {ranges['frames']}")
+    if (found["changing_unexplained_share"] or 0.0) > CHANGING_MAX:
+        share = f"{found['changing_unexplained_share']:.1%} of the pixels that change over time"
+        sentences.append(f"motion is missing or wrong: the fit does not explain {share}")
+    if (found["contradicted_share"] or 0.0) > CONTRADICTED_MAX:
+        share = f"{found['contradicted_share']:.1%} of the pixels where nothing changes"
+        sentences.append(f"the fitted distance contradicts the measured one in {share}")
+    return sentences
 
 
 def quad_of_shift(rendering: Rendering, sensor: Sensor, shift: float) -> Tensor:
