@@ -106,6 +106,10 @@ def modules(arch: int) -> dict[str, wp.Module]:
         given = *shape, True, False, True, None, False, 1, sloped, True
         title = "composite light without median" + " sloped" * sloped
         found[title] = composite.make_composite(*given).module
+    found["project sloped lens"] = project.make_project(False, False, True, sloped=True).module
+    given = *shape, True, False, False, None, False, False, SEGMENTS["cuda"], True, True
+    title = "composite_backward light without in segments sloped calibrated"
+    found[title] = composite_backward.make_composite_backward(*given).module
     for light, channels, fixed in (
         (True, False, False), (True, True, False), (True, True, True), (False, True, False),
         (False, True, True),
