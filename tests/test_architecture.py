@@ -84,7 +84,6 @@ LARGE_CLASSES = {  # file:class: why it may be larger
     "recon/settings.py:ReconSettings": "settings of one run; those that belong together are "
     "classes of their own",
     "recon/run.py:Run": "still to be divided",
-    "recon/stepper.py:Stepper": "still to be divided",
     "render/buffers.py:Buffers": "still to be divided",
 }
 SENTINEL = re.compile(r"(?<![\w.+*/-])-?\d+(\.\d+)?(: | likewise| (if|where|for|means) )")

@@ -7,18 +7,18 @@ later whether steps were valid and how many (tile, splat) pairs there were.
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 
 import torch
+from torch import Tensor
 
 from ..render import descent
-from ..render.cuda import CapturedGraph, DeviceReadback, graph_pool
-from ..render.pair_capacity import READ_EVERY, PairCapacity
+from ..render.cuda import CapturedGraph, graph_pool
 from ..scene.motion import Still
 from . import densify
 from .control import ControlBlock
+from .counts import StepCounts
 from .keys import GraphKey
 from .observations import Observations
 from .optimiser import frozen, rates_at
@@ -28,7 +28,7 @@ from .state import State
 from .step import Map, Step
 from .terms import TERMS, Term, render_settings_at
 
-LOG = logging.getLogger("gftorf_warp")
+Send = Callable[[], None]
 
 
 def draw(state: State, observations: Observations, settings: ReconSettings) -> list[int]:
@@ -75,8 +75,11 @@ class Stepper:
         betas = state.optimiser.betas
         self._step = Step(observations, settings, terms, self._control, self._padded, betas)
         self._summed: set[str] = {*descent.TOTAL_NAMES}  # names of sums that any step has added to
-        self._readback, self._replays = DeviceReadback(self._step.output.counts), 0
-        self._capacity = PairCapacity()
+        self._counts = StepCounts(
+            self._step.output.counts,
+            limited=self._padded.pads,
+            waits=settings.render.deterministic,
+        )
         self._graphs: dict[GraphKey, Callable[[], None]] = {}
         self._key: GraphKey | None = None  # of the last step
         self._steps = 0  # since the last :meth:`_attach`
@@ -89,26 +92,16 @@ class Stepper:
         frames = draw(state, self.observations, settings)
         before, state.images = state.images, state.images + len(frames)
         weights = tuple(term.weight(settings, before) for term in self._step.terms)
+        moves = before >= settings.schedule.warm_up and not isinstance(state.motion, Still)
+        degree, rests = render_settings_at(settings, before).sh_degree, frozen(settings, before)
         key = self._control.graph_keys.of(
-            frames,
-            weights,
-            moves=before >= settings.schedule.warm_up and not isinstance(state.motion, Still),
-            frozen=frozen(settings, before),
-            sh_degree=render_settings_at(settings, before).sh_degree,
+            frames, weights, moves=moves, frozen=rests, sh_degree=degree
         )
         self._enter(key)
-        rates = rates_at(
-            settings,
-            before,
-            state.rate_factor,
-            reset_at=state.reset_at,
-            revived_at=state.revived_at,
-        )
         due = densify.densification_is_due(
             before, state.images, settings.densify, settings.schedule
         )
-        if due and settings.densify.loses_step:
-            rates = {name: rate if name == "motion" else 0.0 for name, rate in rates.items()}
+        rates = rates_of(state, before, settings, densifies=due)
         self._control.write(key, frames, before, state.noise_seed, weights, rates)
         self._run(key)
         self._steps += 1
@@ -123,38 +116,30 @@ class Stepper:
         Returns:
             Number of skipped steps in a row, up to the last step.
         """
-        sums, state = self._step.output.sums, self.state
         names = [*(term.name for term in self._step.terms), *descent.TOTAL_NAMES]
-        for name, value in zip(names, sums.clone(), strict=True):
-            if name in self._summed:
-                state.sums[name] = state.sums[name] + value if name in state.sums else value
-        sums.zero_()
+        add_sums(self.state, self._step.output.sums, names, self._summed)
         return self._read_counts()
-
-    # -- graphs ------------------------------------------------------------------------------------
 
     def _run(self, key: GraphKey) -> None:
         """Launch a step; the first one of a key is not captured, since it loads modules."""
         if key in self._graphs:
             self._graphs[key]()
-            self._watch_pairs()
+            if self._counts.is_nearly_full():
+                self._read_counts()
             return
         self._summed |= {name for image in key.images for name in image.terms}
         table = self._padded.table()
         self._launch(key, table, table.send, map)  # one thread: kernels are compiled now
-        if self._capacity.pairs is None:
+        if not self._counts.has_capacity:
             self._read_counts()
         self._graphs[key] = self._captured(key, table)
 
     def _launch(
-        self,
-        key: GraphKey,
-        table: descent.AdamTable,
-        send: Callable[[], None] | None,
-        map_images: Map,
+        self, key: GraphKey, table: descent.AdamTable, send: Send | None, map_images: Map
     ) -> None:
-        capacity = self._capacity.pairs if self._padded.pads else None
-        render = replace(self.settings.render, sh_degree=key.sh_degree, pair_capacity=capacity)
+        render = replace(
+            self.settings.render, sh_degree=key.sh_degree, pair_capacity=self._counts.capacity
+        )
         self._step.run(key, self.state.motion, render, table, send, map_images)
 
     def _captured(self, key: GraphKey, table: descent.AdamTable) -> Callable[[], None]:
@@ -179,9 +164,8 @@ class Stepper:
         if self._graphs:
             self._read_counts()  # waits: graphs must have run before their memory is released
             self._release_graphs()
-        # other renderings: their pairs are counted first
         if last is None or last.terms != key.terms:
-            self._capacity = PairCapacity()
+            self._counts.forget()
         self._attach(free=True)
 
     def _attach(self, *, free: bool = False) -> None:
@@ -200,39 +184,41 @@ class Stepper:
         self._graphs.clear()
         self._pool = graph_pool(self.observations.quads.device)
 
-    # -- readback ----------------------------------------------------------------------------------
-
     def _read_counts(self) -> int:
-        """Read how many steps were skipped, and adapt the pair capacity; waits for the device."""
-        counts = self._step.output.counts
-        skipped, in_a_row, pairs, overflowed = counts.tolist()
-        self.state.skipped += skipped
-        if skipped:
-            text = (
-                "%d steps before image %d skipped: %d with too many (tile, splat) pairs, the "
-                "others not finite"
-            )
-            LOG.warning(text, skipped, self.state.images, overflowed)
-        counts[0] = 0
-        counts[2:] = 0
+        """Number of skipped steps in a row; waits for the device."""
         is_sorted = self._step.renderer.sorts_pairs
-        if self._padded.pads and self._capacity.learn(pairs, is_sorted=is_sorted):
+        in_a_row, changed = self._counts.read(self.state, is_sorted=is_sorted)
+        if changed:
             self._release_graphs()
-        return 0 if overflowed else in_a_row
+        return in_a_row
 
-    def _watch_pairs(self) -> None:
-        """Grow the pair capacity before it is exceeded, by counts of a few steps ago,
-        without waiting.
-        """
-        if not self._padded.pads:
-            return
-        self._replays += 1
-        if self._replays % READ_EVERY == 0:
-            self._readback.request()
-        # when counts arrive depends on the machine: deterministic runs wait
-        counts = self._readback.latest(wait=self.settings.render.deterministic)
-        if counts is not None and self._capacity.is_nearly_full(counts[2]):
-            self._read_counts()
+
+def rates_of(
+    state: State, before: int, settings: ReconSettings, *, densifies: bool
+) -> dict[str, float]:
+    """Learning rates of a step after ``before`` images; one that ends with a densification may
+    leave the field alone.
+    """
+    rates = rates_at(
+        settings,
+        before,
+        state.rate_factor,
+        reset_at=state.reset_at,
+        revived_at=state.revived_at,
+    )
+    if densifies and settings.densify.loses_step:
+        rates = {name: rate if name == "motion" else 0.0 for name, rate in rates.items()}
+    return rates
+
+
+def add_sums(state: State, sums: Tensor, names: Sequence[str], added: Collection[str]) -> None:
+    """Add the sums of these ``names`` on the device to those of a state, of names that any step
+    has added to, and set them to zero.
+    """
+    for name, value in zip(names, sums.clone(), strict=True):
+        if name in added:
+            state.sums[name] = state.sums[name] + value if name in state.sums else value
+    sums.zero_()
 
 
 def densify_after(
