@@ -376,6 +376,20 @@ def test_no_exception_is_kept_for_a_class_that_became_small():
         assert large, f"{name} is small now: take it from LARGE_CLASSES"
 
 
+OTHERS = "self|cls|os|torch|wp"  # whose private names a test may use: its own, and those of libraries
+PRIVATE = re.compile(rf"(?<![\w.])(?!({OTHERS})\b)[a-zA-Z]\w*(\.\w+)*\._(?!_|replace\b)[a-z]")
+
+
+@pytest.mark.parametrize(
+    "path", sorted((REPOSITORY / "tests").glob("*.py")), ids=lambda path: path.name
+)
+def test_tests_use_no_private_names(path):
+    """Tests are of behaviour: a name that begins with an underscore may change at any time."""
+    for number, line in enumerate(path.read_text().splitlines(), start=1):
+        code = re.sub(r"\"[^\"]*\"", "", line.partition("#")[0])
+        assert not PRIVATE.search(code), f"line {number}: {line.strip()}"
+
+
 def device_values():
     """Yield (name, comment) of the parameters of all kernels and of the fields of all structs of
     Warp.
