@@ -376,7 +376,9 @@ def test_no_exception_is_kept_for_a_class_that_became_small():
         assert large, f"{name} is small now: take it from LARGE_CLASSES"
 
 
-OTHERS = "self|cls|os|torch|wp"  # whose private names a test may use: its own, and those of libraries
+OTHERS = (
+    "self|cls|os|torch|wp"  # whose private names a test may use: its own, and those of libraries
+)
 PRIVATE = re.compile(rf"(?<![\w.])(?!({OTHERS})\b)[a-zA-Z]\w*(\.\w+)*\._(?!_|replace\b)[a-z]")
 
 

@@ -488,19 +488,23 @@ def test_a_new_stage_releases_graphs():
 
 SHORT_RUN = """
 import sys
+import torch
+by_torch = {*sys.modules}  # whatever it imports itself
 from small_runs import demo, small
 from gftorf_warp.recon.train import reconstruct
-reconstruct(small(), sys.argv[1], demo(images=12, warm_up=0, log_every=4))
-heavy = "torch._dynamo", "torch._inductor", "sympy"
-print("imported:", *(name for name in heavy if name in sys.modules))
+settings = demo(images=12, warm_up=0, log_every=4)
+reconstruct(small(), sys.argv[1], settings, device=sys.argv[2])
+heavy = "torch._dynamo", "torch._inductor.compile_fx", "triton", "sympy", "jax"
+print("imported:", *(name for name in heavy if name in sys.modules.keys() - by_torch))
 """
 
 
-def test_a_run_does_not_import_the_compiler_of_torch(tmp_path):
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_run_does_not_import_the_compiler_of_torch(tmp_path, device):
     """It takes a second or three, and compiles nothing here; in a process of its own,
     since others may have it.
     """
-    command = [sys.executable, "-c", SHORT_RUN, str(tmp_path / "run")]
+    command = [sys.executable, "-c", SHORT_RUN, str(tmp_path / "run"), device]
     done = subprocess.run(
         command, cwd=__file__.rpartition("/")[0], capture_output=True, text=True, check=False
     )
