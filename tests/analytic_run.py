@@ -14,6 +14,7 @@ from sequences import changed, sequence_of
 from gftorf_warp import Sequence, Truth
 from gftorf_warp.constants import CANONICAL_SHIFTS, FRAME_RATE_HZ
 from gftorf_warp.data.write import write
+from gftorf_warp.recon.residuals import residuals
 from gftorf_warp.render.api import Rendering
 from gftorf_warp.scene.camera import Camera
 from gftorf_warp.scene.sensor import Sensor
@@ -181,6 +182,11 @@ class AnalyticRun:
             for images, error, apart in rows
         ]
         (self.path / "diagnostics.jsonl").write_text("\n".join(lines) + "\n")
+
+    @property
+    def explained(self):
+        """Its residuals."""
+        return residuals(self, self.sequence())
 
     def sequence(self):
         """The sequence this run pretends to be made from."""

@@ -16,6 +16,7 @@ from gftorf_warp.data.write import write
 from gftorf_warp.evaluate.compare import compare
 from gftorf_warp.evaluate.views import render_to_folder
 from gftorf_warp.recon.fallback import SOURCES, Fallback
+from gftorf_warp.recon.residuals import residuals
 from gftorf_warp.recon.run import Run
 from gftorf_warp.recon.train import reconstruct
 from gftorf_warp.render.api import Rendering
@@ -48,7 +49,7 @@ def fallback_of(measured, quads):
         sensor=Sensor(f_mod_hz=measured.calibration.f_mod_hz),
         renderer=lambda images, f_mod_hz, fallback: render,  # noqa: ARG005
     )
-    return Fallback.of(run, measured, torch.device("cpu"))
+    return Fallback.of(residuals(run, measured), measured, run.camera, torch.device("cpu"))
 
 
 def rendering(distance):

@@ -108,7 +108,7 @@ def test_what_moves_keeps_its_own_quartet_and_the_rest_is_averaged():
     """Where the box passes, quartets before and after it are averaged without it."""
     measured, known = recording(frames=32)
     steady = averaged(measured)
-    agreeing = agreement(measured, quad_noise(measured))
+    agreeing = agreement(measured)
     assert not agreeing.all()
     quads, mixed = measured.quads.reshape(8, 4, 36, 48), steady.quads.reshape(8, 4, 36, 48)
     changed_there = (quads != mixed).all(axis=1)

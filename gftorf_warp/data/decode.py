@@ -10,12 +10,8 @@ phases together choose the turn of the first, see unwrap.py.
 
 from __future__ import annotations
 
-import functools
 import math
-import weakref
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -23,11 +19,9 @@ from jaxtyping import Bool, Float
 from ..constants import SPEED_OF_LIGHT
 from ..errors import InputError
 from .cycles import solution
+from .kept import kept
 from .sequence import Sequence
 from .unwrap import CONFIDENT, choose, common_range, multiples, wrapped
-
-KEPT_BYTES_MAX = 1 << 30  # [bytes] of quads; decoded quartets take up to three times as much
-T = TypeVar("T")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -53,23 +47,7 @@ class Decoded:
         return self.confidence < CONFIDENT
 
 
-def _kept(function: Callable[[Sequence, int], T]) -> Callable[[Sequence, int], T]:
-    """Cache a function of a sequence and a quartet as long as the sequence exists."""
-    results: weakref.WeakKeyDictionary[Sequence, dict[int, T]] = weakref.WeakKeyDictionary()
-
-    @functools.wraps(function)
-    def kept(sequence: Sequence, i: int) -> T:
-        if sequence.quads.nbytes > KEPT_BYTES_MAX:
-            return function(sequence, i)
-        by_quartet = results.setdefault(sequence, {})
-        if i not in by_quartet:
-            by_quartet[i] = function(sequence, i)
-        return by_quartet[i]
-
-    return kept
-
-
-@_kept
+@kept
 def decode_quartet(sequence: Sequence, i: int) -> Decoded:
     """Phasors and distances of quartet i, as if its raw frames had been taken at once; read-only.
 
@@ -105,7 +83,7 @@ def quartet_phasors(
     return list(zip(*_phasors(sequence, i), strict=True))
 
 
-@_kept
+@kept
 def _phasors(sequence: Sequence, i: int) -> tuple[list[list[int]], Float[np.ndarray, "f 2 H W"]]:
     """Raw frames at each frequency of quartet i, and the phasors decoded from them."""
     if i not in sequence.complete_quartets:

@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from .decode import quartet_phasors
+from .kept import kept
 from .sequence import Sequence
 
 MEDIAN = 0.6745  # of |x| of a standard normal distribution
@@ -44,6 +45,7 @@ class QuadNoise:
         return np.sqrt(floor + gain * amplitude + np.square(LEAST * amplitude))
 
 
+@kept
 def quad_noise(sequence: Sequence) -> QuadNoise | None:
     """Noise of the quads of each slot; None if no quartet is complete.
 

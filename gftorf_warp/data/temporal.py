@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float
 from ..constants import SPEED_OF_LIGHT
 from .cycles import phase_noise
 from .decode import closed_form_distance, quartet_phasors
+from .kept import kept
 from .noise import QuadNoise, amplitudes_of, quad_noise
 from .sequence import ColourCamera, Flow, Sequence
 
@@ -32,20 +33,14 @@ def camera_rests(sequence: Sequence) -> bool:
     return float(np.ptp(sequence.camera_from_world, axis=0).max()) <= STILL_M
 
 
-def averaged(sequence: Sequence, agrees: Bool[np.ndarray, "Q H W"] | None = None) -> Sequence:
+def averaged(sequence: Sequence) -> Sequence:
     """The sequence with the temporal mean of its agreeing quartets instead of each of them.
 
-    Other pixels keep what was measured. Where the camera moves, or no quartet is complete, that is
-    the whole sequence.
-
-    Args:
-        sequence: What was measured.
-        agrees: Where its complete quartets agree; None: as :func:`agreement` says.
+    Other pixels keep what was measured.
     """
-    if agrees is None:
-        if not (camera_rests(sequence) and (noise := quad_noise(sequence))):
-            return sequence
-        agrees = agreement(sequence, noise)
+    agrees = agreement(sequence)
+    if not agrees.any():
+        return sequence
     stacked = stacked_quads(sequence)
     weights = agrees[:, None].astype(np.float32)
     mean = (stacked * weights).sum(axis=0) / np.maximum(weights.sum(axis=0), 1.0)
@@ -55,21 +50,28 @@ def averaged(sequence: Sequence, agrees: Bool[np.ndarray, "Q H W"] | None = None
     return replace(sequence, quads=quads)
 
 
-def agreement(sequence: Sequence, noise: QuadNoise) -> Bool[np.ndarray, "Q H W"]:
+@kept
+def agreement(sequence: Sequence) -> Bool[np.ndarray, "Q H W"]:
     """Whether each complete quartet agrees with the median of its pixel over time, and another one
     does: medians of several slots can be of two surfaces, which a single quartet may mix alike.
+
+    False everywhere where the camera moves; read-only.
     """
-    stacked = stacked_quads(sequence)
-    light = np.median([amplitudes_of(sequence, i) for i in sequence.complete_quartets], axis=0)
-    reach = AGREES * noise.sigma(light)
-    agrees = (np.abs(stacked - np.median(stacked, axis=0)) <= reach).all(axis=1)
-    return agrees & (agrees.sum(axis=0) >= AGREEING_MIN)
+    quartets, noise = sequence.complete_quartets, quad_noise(sequence)
+    agrees = np.zeros((len(quartets), sequence.height, sequence.width), dtype=bool)
+    if noise is not None and camera_rests(sequence):
+        stacked = stacked_quads(sequence)
+        light = np.median([amplitudes_of(sequence, i) for i in quartets], axis=0)
+        reach = AGREES * noise.sigma(light)
+        agrees = (np.abs(stacked - np.median(stacked, axis=0)) <= reach).all(axis=1)
+        agrees &= agrees.sum(axis=0) >= AGREEING_MIN
+    agrees.flags.writeable = False
+    return agrees
 
 
-def sigma_of_mean(
-    sequence: Sequence, noise: QuadNoise, agrees: Bool[np.ndarray, "Q H W"]
-) -> Float[np.ndarray, "H W"]:
+def sigma_of_mean(sequence: Sequence, noise: QuadNoise) -> Float[np.ndarray, "H W"]:
     """Standard deviation of the distance of the temporal mean [m], from the first frequency."""
+    agrees = agreement(sequence)
     first = quartet_phasors(sequence, sequence.complete_quartets[0])[0][0]
     slot = first[0] % sequence.cycle
     light = np.median([amplitudes_of(sequence, i) for i in sequence.complete_quartets], axis=0)

@@ -87,7 +87,7 @@ def compare(
     found = replace(
         findings(sequence, gathered, known, against=against),
         colour=gallery.colour_views(run, sequence, scored),
-        residuals=residuals.residuals(run, sequence),
+        residuals=run.explained,
         novel=gallery.novel_views(run, sequence) if report else None,
     )
     residuals.warn(found.residuals)

@@ -28,7 +28,7 @@ from ..data.sequence import Sequence
 from ..render.api import Rendering
 from ..scene.camera import Camera
 from . import closed_form
-from .residuals import Fitted, residuals
+from .residuals import Residuals
 
 SOURCES = ("fit", "temporal", "closed_form")
 """Names of the values 0, 1, 2 of a map of sources."""
@@ -59,19 +59,26 @@ class Fallback:
     """Where it replaces the fit."""
 
     @classmethod
-    def of(cls, run: Fitted, sequence: Sequence, device: torch.device) -> Fallback | None:
-        """Compare a run with the sequence it was made from; None where nothing was fitted to quads
-        or no quartet is complete.
+    def of(
+        cls, found: Residuals | None, sequence: Sequence, camera: Camera, device: torch.device
+    ) -> Fallback | None:
+        """Judge a run by its residuals.
+
+        Args:
+            found: Residuals of the run; None where nothing was fitted to quads.
+            sequence: What was measured.
+            camera: The camera of raw frame 0, at the size of the sequence.
+            device: Where images are rendered.
+
+        Returns:
+            None without residuals.
         """
-        found, noise = residuals(run, sequence), quad_noise(sequence)
+        noise = quad_noise(sequence)
         if found is None or noise is None:
             return None
         explained = _enlarged(~found.unexplained, sequence)
         chi_square = _enlarged(found.chi_square, sequence)
-        agrees = np.zeros(explained.shape, dtype=bool)
-        if temporal.camera_rests(sequence):
-            agrees = temporal.agreement(sequence, noise)
-        averaged = temporal.averaged(sequence, agrees)
+        agrees, averaged = temporal.agreement(sequence), temporal.averaged(sequence)
         beside = _beside(~agrees)
         of_mean = _chi_square(sequence, temporal.stacked_quads(averaged), noise)
         of_phasor = _chi_square(sequence, _phasor_quads(sequence), noise)
@@ -86,9 +93,9 @@ class Fallback:
 
         return cls(
             sequence=sequence,
-            camera=run.camera,
+            camera=camera,
             temporal=tensor(np.stack([closed_form_distance(averaged, i) for i in quartets])),
-            sigma=tensor(temporal.sigma_of_mean(sequence, noise, agrees)),
+            sigma=tensor(temporal.sigma_of_mean(sequence, noise)),
             rests=tensor(agrees & ~fit_stays),
             closed_form=tensor(np.stack([closed_form_distance(sequence, i) for i in quartets])),
             moved=tensor(moved),

@@ -219,13 +219,12 @@ def _contradictions(
     """``changes`` and ``contradicted`` of the rendered distances [m] of all complete quartets."""
     if not temporal.camera_rests(measured):
         return None, np.zeros(distance.shape, dtype=bool)
-    agrees = temporal.agreement(measured, noise)
-    averaged = temporal.averaged(measured, agrees)
+    agrees, averaged = temporal.agreement(measured), temporal.averaged(measured)
     mean = np.stack([closed_form_distance(averaged, i) for i in measured.complete_quartets])
     reach = unambiguous_range(measured)
     apart = np.abs((distance - mean + 0.5 * reach) % reach - 0.5 * reach)
     far = CONTRADICTION * SPEED_OF_LIGHT / (2.0 * measured.frequencies[0])
-    sigma = temporal.sigma_of_mean(measured, noise, agrees)
+    sigma = temporal.sigma_of_mean(measured, noise)
     return ~agrees, agrees & ~(apart <= np.maximum(far, SIGMAS * sigma))
 
 

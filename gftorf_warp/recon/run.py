@@ -8,6 +8,7 @@ import dataclasses
 import functools
 import logging
 import math
+import weakref
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -35,6 +36,7 @@ from ..scene.sensor import Sensor
 from . import checkpoint, closed_form
 from .fallback import Fallback
 from .folder import read_config
+from .residuals import Residuals, residuals
 from .settings import Method
 from .state import field_and_motion
 
@@ -191,6 +193,11 @@ class Run:
         return lambda time, camera: measured.applied(replay(time, camera), time, camera)
 
     @functools.cached_property
+    def explained(self) -> Residuals | None:
+        """How well the run explains the quads of its sequence, see recon/residuals.py."""
+        return residuals(self, self.sequence())
+
+    @functools.cached_property
     def fallback(self) -> Fallback | None:
         """Where the measurement knows the distance better than the Gaussians; None without that
         setting, and for a sequence that cannot be read again, which is logged.
@@ -198,7 +205,8 @@ class Run:
         if not self.config["settings"].get("fallback"):
             return None
         try:
-            return Fallback.of(self, self.sequence(), self.field.device)
+            sequence = self.sequence()
+            return Fallback.of(self.explained, sequence, self.camera, self.field.device)
         except InputError as error:
             LOG.warning("no fallback to the measurement: %s: %s", error.what, error.why)
             return None
@@ -251,12 +259,19 @@ class Run:
         named = {name: kind(stored[name]) for name, kind in kinds.items() if name in stored}
         return RenderSettings(**stored | named)
 
+    @functools.cached_property
+    def _held(self) -> weakref.WeakValueDictionary[str, Sequence]:
+        """The sequence, as long as anybody else holds it."""
+        return weakref.WeakValueDictionary()
+
     def sequence(self) -> Sequence:
-        """The sequence it was made from, read again.
+        """The sequence it was made from, read again unless it is still in use.
 
         Raises:
             InputError: If it was never on disk, or is gone.
         """
+        if (held := self._held.get("sequence")) is not None:
+            return held
         source = self.config["sequence"]
         if source is None:
             raise InputError(
@@ -267,7 +282,10 @@ class Run:
                 "the folder",
             )
         given = str(self.config.get("times") or "").startswith("setting")
-        return read(source, frame_rate_hz=self.config["frame_rate_hz"] if given else None)
+        self._held["sequence"] = sequence = read(
+            source, frame_rate_hz=self.config["frame_rate_hz"] if given else None
+        )
+        return sequence
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
