@@ -6,7 +6,8 @@ During a quartet, seen from the sequence's own camera, the rendered distance of 
   standard deviations of that mean away. Beside a pixel that does not agree, an edge may be passing:
   there the fit stays if it explains the quads as well as the mean does;
 * the *closed form* of the quartet where it does not agree, the fit does not explain its raw frames
-  (see residuals.py), and one phasor explains them several times better: nothing moved within it.
+  (see residuals.py), and one phasor explains them better: nothing moved within it. How many times
+  better are the odds that the fit is right where pixels change, from the share that it explains.
 
 Elsewhere the fit stays. A map of sources says which is which.
 """
@@ -34,7 +35,7 @@ SOURCES = ("fit", "temporal", "closed_form")
 """Names of the values 0, 1, 2 of a map of sources."""
 STAYS = 2.0  # [standard deviations of the temporal mean] within which the fit stays
 AS_WELL = 1.0  # [1] by which chi-square of the fit may exceed that of the mean beside edges
-BETTER = 6.0  # [1] ratio of chi-square of the fit and reduced chi-square of one phasor
+BETTER = (1.5, 50.0)  # [1] range of the ratio of chi-square of the fit to that of one phasor
 SAME_TURN = 0.125  # [unambiguous ranges] the fit may know the turn if it is so near to the mean
 TIME_S = 1e-6  # [s] outside of a quartet that still count as inside
 
@@ -84,7 +85,7 @@ class Fallback:
         of_phasor = _chi_square(sequence, _phasor_quads(sequence), noise)
         of_phasor *= sequence.cycle / (sequence.cycle - 2.0)  # two unknowns
         fit_stays = beside & (chi_square <= of_mean + AS_WELL)
-        moved = ~agrees & ~explained & (chi_square > BETTER * of_phasor)
+        moved = ~agrees & ~explained & (chi_square > _odds(found) * of_phasor)
         quartets = sequence.complete_quartets
 
         def tensor(image: np.ndarray) -> Tensor:
@@ -131,6 +132,14 @@ class Fallback:
         if closed_form.another_view(self.sequence, time, camera, self.camera):
             return None
         return self.sequence.complete_quartets.index(quartet)
+
+
+def _odds(found: Residuals) -> float:
+    """Odds that the fit is right where pixels change, within the range ``BETTER`` [1]."""
+    wrong = found.changing_unexplained_share
+    wrong = found.unexplained_share if wrong is None else wrong
+    low, high = BETTER
+    return min(max((1.0 - wrong) / max(wrong, 1.0 / high), low), high)
 
 
 def _enlarged(images: np.ndarray, sequence: Sequence) -> np.ndarray:
