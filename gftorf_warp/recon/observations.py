@@ -182,7 +182,7 @@ def _flow_by_quartet(sequence: Sequence) -> dict[int, np.ndarray]:
 
 def reads_flow(settings: ReconSettings) -> bool:
     """Whether a reconstruction reads optical flow, for its loss or to start from phase."""
-    return settings.weights.flow > 0 or settings.init.kind == Init.PHASE
+    return settings.weights.flow > 0 or settings.init.kind != Init.RANDOM
 
 
 def _batches(

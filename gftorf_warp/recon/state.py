@@ -11,7 +11,7 @@ from torch import Tensor
 from ..constants import SH_COEFFICIENTS
 from ..render.network import with_backend
 from ..scene.gaussians import GaussianField
-from ..scene.initialise import Init, Start, from_phase, from_random
+from ..scene.initialise import Init, Start, from_phase, from_quartets, from_random
 from ..scene.measured import key_times
 from ..scene.models import KINDS, motion_from_dict
 from ..scene.motion import Motion, MotionStart
@@ -89,6 +89,8 @@ def begin(
     sequence = observations.sequence
     if settings.init.kind == Init.PHASE:
         first = from_phase(sequence, settings.init)
+    elif settings.init.kind == Init.QUARTETS:
+        first = from_quartets(sequence, settings.init)
     else:
         first = from_random(sequence, settings.init, generator)
     motion = with_backend(_motion(first, observations, settings, generator).to(device))
@@ -117,6 +119,7 @@ def _motion(
         tracks=None
         if start.positions is None
         else start.positions - start.positions[start.quartet],
+        velocity=start.velocity,
         duration=float(sequence.times[-1] - sequence.times[0]),
         unambiguous_range=common_range(observations.sensor),
         generator=generator,

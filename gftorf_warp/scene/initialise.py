@@ -34,6 +34,7 @@ from .measured import (
     flow_at,
     key_times,
 )
+from .per_quartet import moving_points
 from .tracks import follow, unproject
 
 STATIC, MOVING = 0, 1  # labels of the two layers
@@ -46,6 +47,8 @@ class Init(StrEnum):
 
     PHASE = "phase"
     """Distance and amplitude decoded from measured quads."""
+    QUARTETS = "quartets"
+    """The same for what is static; what moves is measured in every quartet, see per_quartet.py."""
     RANDOM = "random"
     """Uniform in the frusta, all moving."""
 
@@ -86,6 +89,8 @@ class Start:
     """Positions of the Gaussians of the moving layer at every key time [m]; None: unknown."""
     quartet: int
     """The quartet at whose start the moving layer was measured."""
+    velocity: Float[Tensor, "M 3"] | None = None
+    """Displacements of the moving Gaussians during their quartet [m]; None: unknown."""
 
 
 def from_phase(sequence: Sequence, settings: InitSettings = InitSettings()) -> Start:
@@ -114,6 +119,26 @@ def from_phase(sequence: Sequence, settings: InitSettings = InitSettings()) -> S
     near = Layer(mean=positions[middle], distance=distance, amplitude=amplitude)
     moving = _layer(near, MOVING, settings.moving_spacing, camera_of(sequence, 0), settings)
     return Start(field=concatenated([static, moving]), positions=positions, quartet=middle)
+
+
+def from_quartets(sequence: Sequence, settings: InitSettings = InitSettings()) -> Start:
+    """A static layer, and moving Gaussians of every quartet, labelled 1 + its number.
+
+    Raises:
+        InputError: If no quartet is complete, or the camera moves.
+    """
+    change = change_of(sequence)
+    far = far_layer(sequence, change)
+    camera = camera_of(sequence, 0)
+    parts, velocities = [_static_layer(sequence, far, settings)], [torch.zeros(0, 3)]
+    for points in moving_points(sequence, change, far, settings.moving_spacing):
+        layer = Layer(mean=points.mean, distance=points.distance, amplitude=points.amplitude)
+        label = MOVING + points.quartet
+        parts.append(_layer(layer, label, settings.moving_spacing, camera, settings))
+        velocities.append(points.velocity)
+    return Start(
+        field=concatenated(parts), positions=None, quartet=0, velocity=torch.cat(velocities)
+    )
 
 
 def _from_views(sequence: Sequence, settings: InitSettings) -> Start:

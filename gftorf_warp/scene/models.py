@@ -9,8 +9,9 @@ from .motion import Motion, Nodes, Still
 from .network import Network
 from .rigid_nodes import RigidNodes
 from .spline import Spline
+from .windows import Windows
 
-MODELS: tuple[type[Motion], ...] = (Still, Nodes, Network, Spline, RigidNodes)
+MODELS: tuple[type[Motion], ...] = (Still, Nodes, Network, Spline, RigidNodes, Windows)
 KINDS = {model.kind: model for model in MODELS}
 
 

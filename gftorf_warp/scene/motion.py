@@ -98,6 +98,8 @@ class MotionStart:
     """The initial Gaussians."""
     tracks: Float[Tensor, "T P 3"] | None
     """Displacements of the P Gaussians of the moving layer at every key [m]; None: not tracked."""
+    velocity: Float[Tensor, "P 3"] | None
+    """Displacements of the P moving Gaussians during their quartet [m]; None: unknown."""
     duration: float
     """Time from the first raw frame to the last [s]."""
     unambiguous_range: float
@@ -154,6 +156,11 @@ class Motion(torch.nn.Module, abc.ABC):
         self.register_buffer("key_times", torch.tensor(times, dtype=torch.float64))
         self.times = times
         """Key times on the host [s]."""
+
+    @property
+    def key_count(self) -> int:
+        """Number of keys."""
+        return len(self.times)
 
     @classmethod
     @abc.abstractmethod
