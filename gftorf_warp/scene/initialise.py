@@ -19,6 +19,7 @@ from torch import Tensor
 
 from ..data.sequence import Sequence
 from ..errors import InputError
+from .background import background
 from .camera import CHECKED, Camera
 from .clouds import cloud_of, follow_clouds, moving_layer, reference
 from .fusion import Layer, static_layer, verdicts, views_of
@@ -39,6 +40,7 @@ from .tracks import follow, unproject
 
 STATIC, MOVING = 0, 1  # labels of the two layers
 RESTS = 1e-6  # largest difference of the elements of the poses of a static camera
+STEP = 0.1  # [m] least step of the distance, besides noise
 EXACT_TREE = 4  # OpenCV's constant for an exact k-d tree
 
 
@@ -63,6 +65,12 @@ class InitSettings:
     """Of every Gaussian [1]."""
     static_spacing: float = 2.5
     """Phase: distance between Gaussians of the static layer [px]."""
+    edge_spacing: float = 1.0
+    """Quartets: the same where the distance has steps [px]."""
+    edge_footprint: float = 0.6
+    """Quartets: the footprint there [1]."""
+    snap: bool = True
+    """Quartets: whether mixtures at steps get the distance of one side."""
     moving_spacing: float = 1.2
     """Phase: distance between Gaussians of the moving layer [px]."""
     footprint: float = 0.6
@@ -128,9 +136,9 @@ def from_quartets(sequence: Sequence, settings: InitSettings = InitSettings()) -
         InputError: If no quartet is complete, or the camera moves.
     """
     change = change_of(sequence)
-    far = far_layer(sequence, change)
+    far = background(sequence, change)
     camera = camera_of(sequence, 0)
-    parts, velocities = [_static_layer(sequence, far, settings)], [torch.zeros(0, 3)]
+    parts, velocities = _static_parts(sequence, change, far, settings), [torch.zeros(0, 3)]
     for points in moving_points(sequence, change, far, settings.moving_spacing):
         layer = Layer(mean=points.mean, distance=points.distance, amplitude=points.amplitude)
         label = MOVING + points.quartet
@@ -139,6 +147,48 @@ def from_quartets(sequence: Sequence, settings: InitSettings = InitSettings()) -
     return Start(
         field=concatenated(parts), positions=None, quartet=0, velocity=torch.cat(velocities)
     )
+
+
+def _static_parts(
+    sequence: Sequence, change: Change, far: FarLayer, settings: InitSettings
+) -> list[GaussianField]:
+    """Static Gaussians: a grid where distance is smooth, a finer one along its steps, where
+    mixtures of two surfaces in a pixel get the distance of one of them.
+    """
+    noise = distance_noise(far.amplitude, change.noise, sequence) / len(change.quartets) ** 0.5
+    step, distance = steps_of(far.distance, STEP + 4.0 * noise)
+    parts = []
+    if not settings.snap:
+        distance = far.distance
+    for spacing, wanted in ((settings.static_spacing, ~step), (settings.edge_spacing, step)):
+        points = _grid(sequence.width, sequence.height, spacing).flatten(0, 1)
+        x, y = points.long().unbind(dim=1)
+        chosen = wanted[y, x]
+        points, x, y = points[chosen], x[chosen], y[chosen]
+        camera = camera_of(sequence, 0)
+        layer = Layer(
+            mean=unproject(camera, points, distance[y, x]),
+            distance=distance[y, x],
+            amplitude=far.amplitude[y, x],
+        )
+        foot = settings.footprint if wanted is not step else settings.edge_footprint
+        parts.append(_layer(layer, STATIC, spacing, camera, replace(settings, footprint=foot)))
+    return parts
+
+
+def steps_of(
+    distance: Float[Tensor, "H W"], least: Float[Tensor, "H W"]
+) -> tuple[Bool[Tensor, "H W"], Float[Tensor, "H W"]]:
+    """Pixels near steps of the distance of at least ``least`` [m] within 3x3 pixels, and the
+    distance with those pixels at the nearer or the farther side, whichever is closer.
+    """
+    pool = torch.nn.functional.max_pool2d
+    high = pool(distance[None], 3, stride=1, padding=1)[0]
+    low = -pool(-distance[None], 3, stride=1, padding=1)[0]
+    step = high - low > least
+    snapped = torch.where(distance - low < high - distance, low, high)
+    near = pool(step.float()[None], 3, stride=1, padding=1)[0] > 0
+    return near, torch.where(step, snapped, distance)
 
 
 def _from_views(sequence: Sequence, settings: InitSettings) -> Start:

@@ -9,6 +9,7 @@ background. Truth is never read.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +17,6 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ..constants import CANONICAL_SHIFTS  # noqa: F401
 from ..data.cycles import solution
 from ..data.sequence import Sequence
 from .measured import Change, FarLayer, camera_of, distance_noise, sensor_of
@@ -24,9 +24,11 @@ from .tracks import unproject
 from .unwrap import distance_from_phasors
 
 POOL = 5  # [px] side of the box over which residuals are averaged
-DIFFERS = 2.5  # mean squared difference from the background over noise, from which a point moves
-EXPLAINED = 4.0  # mean squared residual over noise up to which a phasor explains a quartet
-RELATIVE = 0.2  # or up to this share of the amplitude, since phase and amplitude change meanwhile
+DIFFERS = 4.0  # squared difference from the background over noise, from which a raw frame has moved
+EXPLAINED = 3.0  # mean squared residual over what is allowed, up to which a flow is right
+RELATIVE = 0.1  # allowed share of the amplitude: phase and amplitude change during a quartet
+UNMOVED, UNLIKELY = 4.0, 0.3  # penalties of flows towards the background, and of translations
+REACH = 0.08  # of the width: largest translation during a quartet
 NOISE_MAX = 0.25  # [m] largest noise of a distance that is used
 
 
@@ -60,8 +62,10 @@ def moving_points(
     sequence: Sequence, change: Change, far: FarLayer, spacing: float
 ) -> Iterator[MovingPoints]:
     """The points of every complete quartet that has any, ``spacing`` pixels apart."""
-    background = _background(sequence, change, far)
-    decoded = {j: _decoded(sequence, j, change, far, background) for j in change.quartets}
+    quads = _background(sequence, far)
+    with ThreadPoolExecutor(thread_name_prefix="gftorf-points") as threads:
+        found = threads.map(lambda j: _decoded(sequence, j, change, far, quads), change.quartets)
+        decoded = dict(zip(change.quartets, found, strict=True))
     camera = camera_of(sequence, 0)
     height, width = sequence.height, sequence.width
     columns, rows = max(round(width / spacing), 1), max(round(height / spacing), 1)
@@ -93,35 +97,41 @@ def moving_points(
         )
 
 
-def _background(sequence: Sequence, change: Change, far: FarLayer) -> np.ndarray:
-    """Quads [K, H, W] of the background in every slot: medians over the quartets that see it."""
-    cycle = sequence.cycle
-    stack = np.stack([sequence.quads[sequence.quartet_frames(j)] for j in change.quartets])
+def _background(sequence: Sequence, far: FarLayer) -> Float[np.ndarray, "K H W"]:
+    """Quads of the background in every slot."""
     sensor = sensor_of(sequence)
-    psi = (sensor.phase_slope * far.distance + sensor.phase_offset).numpy()
-    amplitude = far.amplitude.numpy()
-    shifts = sequence.shifts[:cycle]
-    model = np.stack(
-        [amplitude * (np.cos(psi - shift) + sensor.dc_offset) for shift in shifts]
-    ).astype(np.float32)
-    return model if len(stack) else model
+    amplitude, dc = far.amplitude.numpy(), float(sensor.dc_offset)
+    quads = []
+    for shift, f in zip(
+        sequence.shifts[: sequence.cycle], sequence.frame_frequencies[: sequence.cycle], strict=True
+    ):
+        slope = float(sensor.phase_slope) * float(f) / sequence.frequencies[0]
+        psi = slope * far.distance.numpy() + float(sensor.phase_offset)
+        quads.append(amplitude * (np.cos(psi - shift) + dc))
+    return np.stack(quads).astype(np.float32)
 
 
-def _flows(sequence: Sequence, j: int) -> list[np.ndarray]:
-    """Candidates of the displacement [2, H, W] during quartet j of what is there in its middle."""
-    step, none = sequence.cycle, np.zeros((2, sequence.height, sequence.width), np.float32)
+def _flows(sequence: Sequence, j: int) -> Iterator[Float[np.ndarray, "2 H W"]]:
+    """Candidates of the displacement during quartet j of what is there in its middle: optical flow
+    of the neighbouring quartet starts, and translations of the whole image."""
+    step, size = sequence.cycle, (2, sequence.height, sequence.width)
     forward, backward = sequence.flow.forward, sequence.flow.backward
     found = [(1.0, 0.5, forward.get(step * j)), (-1.0, -0.5, backward.get(step * (j + 1)))]
     found += [(-1.0, 0.5, backward.get(step * j)), (1.0, 1.5, forward.get(step * (j - 1)))]
-    result = [none]
+    yield np.zeros(size, np.float32)
     for sign, late, flow in found:
         if flow is not None:
             whole = sign * np.nan_to_num(flow).astype(np.float32)
-            # the flow was measured at another time: where the surface was then
-            moved = _sampled(whole, -late * whole)
-            result.append(moved)
-            result.append(whole)
-    return result
+            # the flow is that of another time: there the surface was elsewhere
+            yield _sampled(whole, -late * whole)
+            yield whole
+    reach = REACH * sequence.width
+    pitch = max(round(reach / 6), 1)
+    grid = np.arange(-6, 7) * pitch
+    for y in grid:
+        for x in grid:
+            if 0 < np.hypot(x, y) <= 6.5 * pitch:
+                yield np.broadcast_to(np.float32([x, y])[:, None, None], size)
 
 
 def _decoded(
@@ -132,50 +142,58 @@ def _decoded(
     frames = sequence.quartet_frames(j)
     quads = sequence.quads[frames].astype(np.float32)
     shifts, times = sequence.shifts[frames], sequence.times[frames]
-    frequencies = sequence.frame_frequencies[frames]
-    share = (times - times.mean()) / max((times[-1] - times[0]) * len(times) / (len(times) - 1), 1e-12)
-    noise = max(change.noise, 1e-12)
-    differs = np.square((quads - background) / noise)
-    sensor = sensor_of(sequence)
-
-    def pooled(image: np.ndarray) -> np.ndarray:
-        return cv2.blur(image, (POOL, POOL), borderType=cv2.BORDER_REPLICATE)
-
+    frequencies, count = sequence.frame_frequencies[frames], len(quads)
+    duration = (times[-1] - times[0]) * count / (count - 1)
+    share = (times - times.mean()) / duration
+    noise, sensor = max(change.noise, 1e-12), sensor_of(sequence)
+    differs = _pooled(np.square((quads - background) / noise), 3)
+    stack = np.concatenate([quads, differs])
+    own = [frequencies == f for f in sequence.frequencies]
+    models = []
+    for mask in own:
+        columns = [np.cos(shifts[mask]), np.sin(shifts[mask])]
+        if float(sensor.dc_offset) or mask.sum() < 4:
+            columns.append(np.ones(mask.sum()))
+        models.append(np.stack(columns, axis=1).astype(np.float32))
+    free = max(sum(len(model) - model.shape[1] for model in models), 1)
     best: list[np.ndarray] = []
-    for flow in _flows(sequence, j):
-        along = np.stack([_sampled(q[None], s * flow)[0] for q, s in zip(quads, share, strict=True)])
-        apart = np.stack([_sampled(d[None], s * flow)[0] for d, s in zip(differs, share, strict=True)])
-        phasors, squares, free = [], 0.0, 0
-        for f in sequence.frequencies:
-            own = frequencies == f
-            columns = [np.cos(shifts[own]), np.sin(shifts[own])]
-            if sensor.dc_offset or own.sum() < 4:
-                columns.append(np.ones(own.sum()))
-            model = np.stack(columns, axis=1)
-            values = along[own].reshape(own.sum(), -1)
-            fitted = np.linalg.pinv(model) @ values
-            squares = squares + np.square(values - model @ fitted).sum(axis=0)
-            free += max(len(model) - model.shape[1], 0)
-            rows = solution(shifts[own])
-            phasors.append(np.stack([2.0 * fitted[0], 2.0 * fitted[1]]).reshape(2, *flow.shape[1:]))
-        residual = pooled((squares / (max(free, 1) * noise**2)).reshape(flow.shape[1:]).astype(np.float32))
-        images = [residual, pooled(apart.mean(axis=0)), *flow, *np.concatenate(phasors)]
+    for number, flow in enumerate(_flows(sequence, j)):
+        along = np.stack([_sampled(stack[k :: count], share[k] * flow) for k in range(count)])
+        values, apart = along[:, 0], along[:, 1]
+        phasors, squares = [], np.zeros(flow.shape[1:], np.float32)
+        for mask, model in zip(own, models, strict=True):
+            fitted = np.tensordot(np.linalg.pinv(model), values[mask], axes=1)
+            squares += np.square(values[mask] - np.tensordot(model, fitted, axes=1)).sum(axis=0)
+            phasors += [2.0 * fitted[0], 2.0 * fitted[1]]
+        amplitude = 0.5 * np.hypot(phasors[0], phasors[1])
+        allowed = noise**2 + np.square(RELATIVE * amplitude)
+        residual = _pooled((squares / (free * allowed))[None], POOL)[0]
+        # all raw frames but one differ from the background, which may look alike in one slot
+        moves = np.sort(apart, axis=0)[1] > DIFFERS
+        score = residual + np.where(moves, 0.0, UNMOVED) + (UNLIKELY if number > 8 else 0.0)
+        images = [score, residual, apart.mean(axis=0), moves, *flow, amplitude, *phasors]
         if not best:
-            best = [image.copy() for image in images]
+            best = [np.array(image) for image in images]
             continue
-        better = residual < best[0] * (0.8 if len(best) else 1.0)
+        better = score < 0.8 * best[0]
         for old, new in zip(best, images, strict=True):
             old[better] = new[better]
-    residual, apart, fx, fy, *parts = best
-    pairs = [(torch.as_tensor(parts[i]), torch.as_tensor(parts[i + 1])) for i in range(0, len(parts), 2)]
+    _, residual, apart, moves, fx, fy, amplitude, *parts = best
+    tensors = [torch.as_tensor(part) for part in parts]
+    pairs = list(zip(tensors[::2], tensors[1::2], strict=True))
     distance = distance_from_phasors(pairs, sensor).numpy()
-    amplitude = 0.5 * np.hypot(parts[0], parts[1])
     deviation = distance_noise(torch.as_tensor(amplitude), noise, sequence).numpy()
-    explained = residual < EXPLAINED + np.square(RELATIVE * amplitude / noise)
-    moving = (apart > DIFFERS) & explained & (deviation < NOISE_MAX)
+    moving = moves & (residual < EXPLAINED) & (deviation < NOISE_MAX)
     moving &= distance < far.distance.numpy() - 0.02
     moving = cv2.medianBlur(moving.astype(np.uint8), 3) > 0
     return _Decoded(flow=np.stack([fx, fy]), distance=distance, amplitude=amplitude, moving=moving)
+
+
+def _pooled(images: Float[np.ndarray, "C H W"], side: int) -> Float[np.ndarray, "C H W"]:
+    """Means over boxes of ``side`` pixels."""
+    import cv2
+
+    return np.stack([cv2.blur(i, (side, side), borderType=cv2.BORDER_REPLICATE) for i in images])
 
 
 def _radial(
