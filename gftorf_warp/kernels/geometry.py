@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from ..constants import GUARD, LOW_PASS
+from ..constants import GUARD
 
 
 @wp.struct
@@ -20,6 +20,7 @@ class CameraView:
     height: int  # rows [px]
     near: float  # smallest z-depth [m]
     far: float  # largest z-depth [m]
+    low_pass: float  # variance added to every splat [px^2]
     radius: float  # of the disc in which a lens follows its polynomial [1]; unused by a pinhole
     guard_x: float  # largest slope x/z at which such a lens has its derivative taken [1]
     guard_y: float  # largest slope y/z likewise [1]
@@ -73,16 +74,16 @@ def screen_covariance(view: CameraView, local: wp.vec3, wxyz: wp.vec4, scale: wp
     slope_y = wp.clamp(local[1] * inverse_z, -limit_y, limit_y)
     along_x = axes * wp.vec3(view.fx * inverse_z, 0.0, -view.fx * inverse_z * slope_x)
     along_y = axes * wp.vec3(0.0, view.fy * inverse_z, -view.fy * inverse_z * slope_y)
-    return ellipse_of(along_x, along_y)
+    return ellipse_of(along_x, along_y, view.low_pass)
 
 
 @wp.func
-def ellipse_of(along_x: wp.vec3, along_y: wp.vec3) -> wp.vec4:
+def ellipse_of(along_x: wp.vec3, along_y: wp.vec3, low_pass: float) -> wp.vec4:
     """Covariance (xx, xy, yy) [px^2] and determinant from each axis' extent along x and y [px]."""
-    xx = wp.dot(along_x, along_x) + LOW_PASS
+    xx = wp.dot(along_x, along_x) + low_pass
     xy = wp.dot(along_x, along_y)
-    yy = wp.dot(along_y, along_y) + LOW_PASS
+    yy = wp.dot(along_y, along_y) + low_pass
     area = wp.length_sq(wp.cross(along_x, along_y))
-    widths = LOW_PASS * (wp.dot(along_x, along_x) + wp.dot(along_y, along_y))
-    determinant = area + widths + LOW_PASS * LOW_PASS
+    widths = low_pass * (wp.dot(along_x, along_x) + wp.dot(along_y, along_y))
+    determinant = area + widths + low_pass * low_pass
     return wp.vec4(xx, xy, yy, determinant)

@@ -90,4 +90,5 @@ def bent_covariance(view: CameraView, local: wp.vec3, wxyz: wp.vec4, scale: wp.v
     return ellipse_of(
         view.fx * (slope[0] * along_x + slope[1] * along_y),
         view.fy * (slope[1] * along_x + slope[2] * along_y),
+        view.low_pass,
     )

@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..constants import CANONICAL_SHIFTS, LOW_PASS
+from ..constants import CANONICAL_SHIFTS
 from ..data.read import read
 from ..data.sequence import Sequence
 from ..data.temporal import averaged
@@ -236,13 +236,13 @@ class Run:
         """Gaussians as wide as they looked while they were optimised, for a camera that resolves
         more.
 
-        The renderer's low-pass filter widens every Gaussian on the image, by 0.3 px^2 at any
+        The renderer's low-pass filter widens every Gaussian on the image, by ``low_pass`` at any
         resolution. One that was fitted to smaller images would look thinner here by the difference,
-        which is added to it as 0.3 ((z / f)^2 of the optimisation - (z / f)^2 of ``camera``) [m^2].
+        which is added to it as low_pass ((z / f)^2 of the optimisation - (z / f)^2 of ``camera``) [m^2].
         """
         optimised = self.camera.resized(*self.config["size_optimised"])
         footprint, footprint_here = (_footprint(field, view) for view in (optimised, camera))
-        missing = LOW_PASS * (footprint.square() - footprint_here.square()).clamp_min(0.0)
+        missing = self.render_settings.low_pass * (footprint.square() - footprint_here.square()).clamp_min(0.0)
         return replace(field, log_scale=0.5 * (field.scale.square() + missing[:, None]).log())
 
     @property

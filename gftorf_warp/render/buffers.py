@@ -10,6 +10,7 @@ from enum import StrEnum
 import numpy as np
 import warp as wp
 
+from ..constants import LOW_PASS
 from ..kernels.rasterise import tile_bitmask
 from ..kernels.rasterise.composite import LIGHT_PLANES, make_pixels
 from ..kernels.rasterise.planes_to_images import Tiling
@@ -74,6 +75,9 @@ class RenderSettings:
     """Gaussians nearer than this z-depth are culled [m]."""
     far: float = 1000.0
     """Gaussians farther than this z-depth are culled [m]."""
+    low_pass: float = LOW_PASS
+    """Variance that is added to every splat, so that none falls between pixels [px^2]; the box of
+    a pixel has 1/12."""
     sh_degree: int = 3
     """Harmonics above this degree are ignored, 0..3."""
     phasor_factor: float = 2.0
@@ -119,6 +123,8 @@ class RenderSettings:
         if not 0 < self.near < self.far:
             got = f"{self.near} and {self.far}"
             raise ValueError(f"near and far must satisfy 0 < near < far, got {got}")
+        if not (self.low_pass > 0 and math.isfinite(self.low_pass)):
+            raise ValueError(f"low_pass must be above 0 and finite, got {self.low_pass}")
         if self.sh_degree not in (0, 1, 2, 3):
             raise ValueError(f"sh_degree must be 0, 1, 2 or 3, got {self.sh_degree}")
         if self.depth_bits not in (16, 24):

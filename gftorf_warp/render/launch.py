@@ -44,7 +44,7 @@ def view_of(camera: Camera, settings: RenderSettings) -> CameraView:
     view.centre = wp.vec3(*camera.centre)
     view.fx, view.fy, view.cx, view.cy = camera.fx, camera.fy, camera.cx, camera.cy
     view.width, view.height = camera.width, camera.height
-    view.near, view.far = settings.near, settings.far
+    view.near, view.far, view.low_pass = settings.near, settings.far, settings.low_pass
     if camera.distortion:
         view.guard_x, view.guard_y, view.radius = camera.guard
         view.k1, view.k2, view.p1, view.p2, view.k3 = astuple(camera.distortion)

@@ -35,7 +35,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ..constants import ALPHA_MAX, ALPHA_MIN, LOW_PASS, SH_BIAS, SPEED_OF_LIGHT, TRANSMITTANCE_MIN
+from ..constants import ALPHA_MAX, ALPHA_MIN, SH_BIAS, SPEED_OF_LIGHT, TRANSMITTANCE_MIN
 from ..scene.camera import Camera
 from ..scene.distortion import inside
 from ..scene.gaussians import GaussianField
@@ -275,7 +275,7 @@ def project(field: GaussianField, camera: Camera, settings: RenderSettings) -> _
     axes = turned * field.scale[index][:, None, :]
     precision = precision_of(rotation @ turned, field.scale[index])
     projected = jacobian @ rotation @ axes  # [M, 2, 3]
-    cov = projected @ projected.mT + LOW_PASS * torch.eye(2, dtype=z.dtype, device=z.device)
+    cov = projected @ projected.mT + settings.low_pass * torch.eye(2, dtype=z.dtype, device=z.device)
     return _Splats(
         index=index,
         z_depth=z,

@@ -1,20 +1,18 @@
 """Gaussians of a finished run at one time, widened for cameras of higher resolution.
 
-The low-pass filter of the renderer widens every Gaussian by LOW_PASS pixels^2. With z the z-depth
+The low-pass filter of the renderer widens every Gaussian by ``low_pass`` pixels^2. With z the z-depth
 and f the focal length of the camera of the optimisation, and z', f' those of this camera,
 
-    exp(2 log_scale') = exp(2 log_scale) + LOW_PASS max(0, (z / f)^2 - (z' / f')^2)
+    exp(2 log_scale') = exp(2 log_scale) + low_pass max(0, (z / f)^2 - (z' / f')^2)
 """
 
 import functools
 
 import warp as wp
 
-from ...constants import LOW_PASS
 from ..geometry import CameraView
 from .displace import OPTIONS, make_interpolation, product
 
-LOW_PASS_PX2 = wp.constant(float(LOW_PASS))  # [px^2]
 
 
 @wp.func
@@ -57,7 +55,7 @@ def make_move(K: int) -> wp.Kernel:
         point = initial_mean[i] + interpolated(offset, index, weight, i)
         scale = initial_log_scale[i]
         finer = squared_footprint(optimised, point) - squared_footprint(camera, point)
-        missing = LOW_PASS_PX2 * finer
+        missing = optimised.low_pass * finer
         if missing > 0.0:
             for axis in range(3):
                 scale[axis] = 0.5 * wp.log(wp.exp(2.0 * scale[axis]) + missing)
