@@ -12,7 +12,6 @@ from pathlib import Path
 
 import torch
 
-from ..data.decode import unambiguous_range
 from ..data.sequence import Sequence
 from ..errors import InputError
 from ..recon import checkpoint, folder, presets
@@ -63,7 +62,7 @@ def simulated(path: Path, *, quick: bool) -> Path:
 def settings_of(sequence: Sequence, preset: str, changes: list[str], device: str) -> ReconSettings:
     """A preset with changes, without densification and opacity resets."""
     found = input_of(sequence, Input.AUTO)
-    recorded = presets.Recorded(input=found, unambiguous_range=unambiguous_range(sequence))
+    recorded = presets.Recorded.of(sequence, found)
     settings = changed(presets.preset(preset, recorded), changes, CHANGES)
     settings = replace(settings, densify=replace(settings.densify, stop_share=0.0))
     threads = 1 if torch.device(device).type == "cpu" else settings.render.threads

@@ -11,9 +11,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+from ..data.decode import unambiguous_range
+from ..data.sequence import Sequence
 from ..errors import UsageError
 from ..render.buffers import ClampGradient, Distortion, RenderSettings, Stop, Support
-from ..scene.initialise import Init, InitSettings
+from ..scene.initialise import Init, InitSettings, camera_moves
 from ..scene.motion import MotionSettings, Products
 from ..scene.network import Network
 from .settings import (
@@ -38,6 +40,17 @@ class Recorded:
     """What will be compared, quads or phasors."""
     unambiguous_range: float = 7.5
     """Distances are known modulo this [m]."""
+    camera_moves: bool = False
+    """Whether raw frames have different poses."""
+
+    @classmethod
+    def of(cls, sequence: Sequence, wanted: Input) -> Recorded:
+        """How a sequence was recorded, if ``wanted`` is compared with it."""
+        return cls(
+            input=wanted,
+            unambiguous_range=unambiguous_range(sequence),
+            camera_moves=camera_moves(sequence),
+        )
 
     @property
     def scene_scale(self) -> float:
@@ -53,6 +66,39 @@ class Recorded:
         """
         far = 1.21 if self.input == Input.PHASOR else 0.99
         return 0.018 * self.unambiguous_range, far * self.unambiguous_range
+
+
+def best(recorded: Recorded = Recorded()) -> ReconSettings:
+    """The default: a static background, and moving Gaussians that exist during one quartet each,
+    both started from measured phase. A moving camera has nodes instead, as ``demo`` has.
+    """
+    if recorded.camera_moves:
+        return replace(demo(recorded), preset="best", fallback=True)
+    rates = Rates(
+        mean=1e-3,
+        log_scale=3e-2,
+        quaternion=2e-2,
+        opacity_logit=0.05,
+        reflectivity_sh=3e-3,
+        motion=3e-3,
+    )
+    return ReconSettings(
+        preset="best",
+        input=recorded.input,
+        width_max=320,
+        init=InitSettings(kind=Init.QUARTETS, footprint=0.5),
+        motion=MotionSettings(kind="windows", nodes=40),
+        render=RenderSettings(low_pass=0.1),
+        rates=rates,
+        rates_last=rates.times(0.2),
+        weights=Weights(
+            ssim=0.4, distortion=1e-3, colour=1.0 if recorded.input == Input.PHASOR else 0.0
+        ),
+        schedule=Schedule(images=6000, batch=Batch.QUARTET),
+        densify=DensifySettings(every=None),
+        background=0.3,
+        fallback=True,
+    )
 
 
 def demo(recorded: Recorded = Recorded()) -> ReconSettings:
@@ -249,7 +295,7 @@ DEPTH_WEIGHT = 0.1  # [1/m] unpublished
 DISTORTION_WEIGHT = 1e-3
 PRESETS: dict[str, Callable[[Recorded], ReconSettings]] = {
     function.__name__: function
-    for function in (demo, paper, released, fast, dgs, dgs_depth, ctof, temporal)
+    for function in (best, demo, paper, released, fast, dgs, dgs_depth, ctof, temporal)
 }
 """All presets by name."""
 

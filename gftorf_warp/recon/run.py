@@ -238,11 +238,14 @@ class Run:
 
         The renderer's low-pass filter widens every Gaussian on the image, by ``low_pass`` at any
         resolution. One that was fitted to smaller images would look thinner here by the difference,
-        which is added to it as low_pass ((z / f)^2 of the optimisation - (z / f)^2 of ``camera``) [m^2].
+        which is added to it as low_pass ((z / f)^2 of the optimisation - (z / f)^2 of
+        ``camera``) [m^2].
         """
         optimised = self.camera.resized(*self.config["size_optimised"])
         footprint, footprint_here = (_footprint(field, view) for view in (optimised, camera))
-        missing = self.render_settings.low_pass * (footprint.square() - footprint_here.square()).clamp_min(0.0)
+        missing = self.render_settings.low_pass * (
+            footprint.square() - footprint_here.square()
+        ).clamp_min(0.0)
         return replace(field, log_scale=0.5 * (field.scale.square() + missing[:, None]).log())
 
     @property

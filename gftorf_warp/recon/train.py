@@ -12,7 +12,6 @@ from typing import TypeVar
 
 import torch
 
-from ..data.decode import unambiguous_range
 from ..data.estimates import DC_TOLERANCE, dc_offset
 from ..data.read import read, read_truth
 from ..data.sequence import Sequence, Truth
@@ -114,7 +113,7 @@ def chosen_settings(
     """
     if isinstance(settings, str):
         found = input_of(sequence, _choice(Input, input, "--input"))
-        recorded = presets.Recorded(input=found, unambiguous_range=unambiguous_range(sequence))
+        recorded = presets.Recorded.of(sequence, found)
         settings = presets.preset(settings, recorded)
     if ablation is not None:
         settings = presets.ablated(settings, ablation)

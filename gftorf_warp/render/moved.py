@@ -56,9 +56,7 @@ class MovedGaussians:
         """
         field = field.map(lambda tensor: tensor.detach().contiguous())
         first = motion.at_keys(binding, [0])
-        tables = [
-            None if t is None else t.new_zeros(motion.key_count, *t.shape[1:]) for t in first
-        ]
+        tables = [None if t is None else t.new_zeros(motion.key_count, *t.shape[1:]) for t in first]
         mean, log_scale = torch.empty_like(field.mean), torch.empty_like(field.log_scale)
         turned = None if first.rotation is None else torch.empty_like(field.quaternion)
         self._motion, self._binding, self._tables = motion, binding, tables

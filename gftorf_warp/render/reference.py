@@ -275,7 +275,9 @@ def project(field: GaussianField, camera: Camera, settings: RenderSettings) -> _
     axes = turned * field.scale[index][:, None, :]
     precision = precision_of(rotation @ turned, field.scale[index])
     projected = jacobian @ rotation @ axes  # [M, 2, 3]
-    cov = projected @ projected.mT + settings.low_pass * torch.eye(2, dtype=z.dtype, device=z.device)
+    cov = projected @ projected.mT + settings.low_pass * torch.eye(
+        2, dtype=z.dtype, device=z.device
+    )
     return _Splats(
         index=index,
         z_depth=z,

@@ -8,7 +8,7 @@ falls with the root of their number. Truth is never read.
 from __future__ import annotations
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from torch import Tensor
 
 from ..data.sequence import Sequence
@@ -44,7 +44,8 @@ def background(sequence: Sequence, change: Change) -> FarLayer:
     best = torch.zeros_like(values[0])
     reach = torch.full(values.shape[2:], -1.0)
     support = torch.zeros(values.shape[2:], dtype=torch.long)
-    for centre in values:
+    for value in values:
+        centre = value
         for _ in range(ITERATIONS):
             inside = members(centre)
             total = inside.sum(dim=0)

@@ -67,10 +67,6 @@ class InitSettings:
     """Phase: distance between Gaussians of the static layer [px]."""
     edge_spacing: float = 1.0
     """Quartets: the same where the distance has steps [px]."""
-    edge_footprint: float = 0.6
-    """Quartets: the footprint there [1]."""
-    snap: bool = True
-    """Quartets: whether mixtures at steps get the distance of one side."""
     moving_spacing: float = 1.2
     """Phase: distance between Gaussians of the moving layer [px]."""
     footprint: float = 0.6
@@ -101,6 +97,11 @@ class Start:
     """Displacements of the moving Gaussians during their quartet [m]; None: unknown."""
 
 
+def camera_moves(sequence: Sequence) -> bool:
+    """Whether raw frames have different poses."""
+    return bool(abs(sequence.camera_from_world - sequence.camera_from_world[:1]).max() > RESTS)
+
+
 def from_phase(sequence: Sequence, settings: InitSettings = InitSettings()) -> Start:
     """A static and a moving layer from decoded quads.
 
@@ -115,7 +116,7 @@ def from_phase(sequence: Sequence, settings: InitSettings = InitSettings()) -> S
             "at least one",
             fix="record more frames, or start from random Gaussians",
         )
-    if abs(sequence.camera_from_world - sequence.camera_from_world[:1]).max() > RESTS:
+    if camera_moves(sequence):
         return _from_views(sequence, settings)
     change = change_of(sequence)
     far = far_layer(sequence, change)
@@ -152,43 +153,29 @@ def from_quartets(sequence: Sequence, settings: InitSettings = InitSettings()) -
 def _static_parts(
     sequence: Sequence, change: Change, far: FarLayer, settings: InitSettings
 ) -> list[GaussianField]:
-    """Static Gaussians: a grid where distance is smooth, a finer one along its steps, where
-    mixtures of two surfaces in a pixel get the distance of one of them.
-    """
+    """Static Gaussians: on a grid where the distance is smooth, on a finer one along its steps."""
     noise = distance_noise(far.amplitude, change.noise, sequence) / len(change.quartets) ** 0.5
-    step, distance = steps_of(far.distance, STEP + 4.0 * noise)
-    parts = []
-    if not settings.snap:
-        distance = far.distance
+    step, parts = _near_steps(far.distance, STEP + 4.0 * noise), []
+    camera = camera_of(sequence, 0)
     for spacing, wanted in ((settings.static_spacing, ~step), (settings.edge_spacing, step)):
         points = _grid(sequence.width, sequence.height, spacing).flatten(0, 1)
         x, y = points.long().unbind(dim=1)
-        chosen = wanted[y, x]
-        points, x, y = points[chosen], x[chosen], y[chosen]
-        camera = camera_of(sequence, 0)
-        layer = Layer(
-            mean=unproject(camera, points, distance[y, x]),
-            distance=distance[y, x],
-            amplitude=far.amplitude[y, x],
-        )
-        foot = settings.footprint if wanted is not step else settings.edge_footprint
-        parts.append(_layer(layer, STATIC, spacing, camera, replace(settings, footprint=foot)))
+        points, x, y = (value[wanted[y, x]] for value in (points, x, y))
+        distance = far.distance[y, x]
+        mean = unproject(camera, points, distance)
+        layer = Layer(mean=mean, distance=distance, amplitude=far.amplitude[y, x])
+        parts.append(_layer(layer, STATIC, spacing, camera, settings))
     return parts
 
 
-def steps_of(
-    distance: Float[Tensor, "H W"], least: Float[Tensor, "H W"]
-) -> tuple[Bool[Tensor, "H W"], Float[Tensor, "H W"]]:
-    """Pixels near steps of the distance of at least ``least`` [m] within 3x3 pixels, and the
-    distance with those pixels at the nearer or the farther side, whichever is closer.
-    """
-    pool = torch.nn.functional.max_pool2d
-    high = pool(distance[None], 3, stride=1, padding=1)[0]
-    low = -pool(-distance[None], 3, stride=1, padding=1)[0]
-    step = high - low > least
-    snapped = torch.where(distance - low < high - distance, low, high)
-    near = pool(step.float()[None], 3, stride=1, padding=1)[0] > 0
-    return near, torch.where(step, snapped, distance)
+def _near_steps(distance: Float[Tensor, "H W"], least: Float[Tensor, "H W"]) -> Bool[Tensor, "H W"]:
+    """Pixels at most two from a step of the distance of at least ``least`` [m] within 3x3."""
+
+    def largest(image: Tensor) -> Tensor:
+        return torch.nn.functional.max_pool2d(image[None], 3, stride=1, padding=1)[0]
+
+    step = largest(distance) + largest(-distance) > least
+    return largest(step.float()) > 0
 
 
 def _from_views(sequence: Sequence, settings: InitSettings) -> Start:

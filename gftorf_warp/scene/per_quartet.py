@@ -1,14 +1,14 @@
 """Points of moving surfaces, measured in every quartet by itself: distance, amplitude and velocity.
 
-Slot k of a quartet is read where optical flow says that the surface was at that time. Several flows
-are compared per pixel, and the one that explains the quartet best by one phasor is used: opposite
-quads cancel along the right flow. A point moves if the raw frames along its flow differ from the
+Slot k of a quartet is read where optical flow says that the surface was at that time. Of several
+flows, each pixel takes the one along which one phasor explains the quartet best: opposite quads
+cancel along the right flow. A point moves if the raw frames along its flow differ from the static
 background. Truth is never read.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -17,19 +17,24 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ..data.cycles import solution
 from ..data.sequence import Sequence
 from .measured import Change, FarLayer, camera_of, distance_noise, sensor_of
 from .tracks import unproject
 from .unwrap import distance_from_phasors
 
-POOL = 5  # [px] side of the box over which residuals are averaged
-DIFFERS = 4.0  # squared difference from the background over noise, from which a raw frame has moved
+POOL, POOL_DIFFERENCE = 5, 3  # [px] sides of the boxes over which squares are averaged
+# squared difference from the background over noise, from which a raw frame shows something else
+DIFFERS = 4.0
 EXPLAINED = 3.0  # mean squared residual over what is allowed, up to which a flow is right
 RELATIVE = 0.1  # allowed share of the amplitude: phase and amplitude change during a quartet
-UNMOVED, UNLIKELY = 4.0, 0.3  # penalties of flows towards the background, and of translations
-REACH = 0.08  # of the width: largest translation during a quartet
+# penalties of a flow: towards the background, and of a translation beside optical flow
+TO_BACKGROUND, TRANSLATED = 4.0, 0.3
+GAIN = 0.8  # a later candidate must have less than this share of the score
+REACH = 0.08  # [width] largest translation during a quartet
+STEPS = 6  # translations from the middle to the reach
 NOISE_MAX = 0.25  # [m] largest noise of a distance that is used
+NEARER = 0.02  # [m] least distance in front of the background
+RADIAL_MAX = 0.5  # [m] largest change of distance from one quartet to the next
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -48,145 +53,234 @@ class MovingPoints:
     """Displacement during the quartet [m]."""
 
 
+def moving_points(
+    sequence: Sequence, change: Change, background: FarLayer, spacing: float
+) -> Iterator[MovingPoints]:
+    """The points, ``spacing`` pixels apart, of every complete quartet of a static camera."""
+    quads = _quads_of(sequence, background)
+
+    def decoded(quartet: int) -> _Decoded:
+        return _decoded(sequence, quartet, change, background, quads)
+
+    with ThreadPoolExecutor(thread_name_prefix="gftorf-points") as threads:
+        by_quartet = dict(zip(change.quartets, threads.map(decoded, change.quartets), strict=True))
+    camera, size = camera_of(sequence, 0), (sequence.width, sequence.height)
+    columns, rows = (
+        (np.arange(count := max(round(side / spacing), 1)) + 0.5) * (side / count) for side in size
+    )
+    points = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
+    for quartet, now in by_quartet.items():
+        column, row = points.astype(int).T
+        moving = now.moving[row, column]
+        place, column, row = points[moving], column[moving], row[moving]
+        flow, distance = now.flow[:, row, column].T, now.distance[row, column]
+        along = _radial(by_quartet, quartet, place, flow, distance)
+        values = (place, flow, distance, along, now.amplitude[row, column])
+        at, step, near, nearer, amplitude = (torch.as_tensor(v).float() for v in values)
+        start, middle, end = (
+            unproject(camera, at + s * step, near + s * nearer) for s in (-0.5, 0.0, 0.5)
+        )
+        yield MovingPoints(
+            quartet=quartet, mean=middle, distance=near, amplitude=amplitude, velocity=end - start
+        )
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Decoded:
     """One quartet, decoded along the flow of every pixel in its middle."""
 
     flow: Float[np.ndarray, "2 H W"]
+    """Displacement during the quartet [px]."""
     distance: Float[np.ndarray, "H W"]
+    """[m]"""
     amplitude: Float[np.ndarray, "H W"]
+    """[quad units]"""
     moving: Bool[np.ndarray, "H W"]
+    """Whether the other images are those of a moving surface."""
 
 
-def moving_points(
-    sequence: Sequence, change: Change, far: FarLayer, spacing: float
-) -> Iterator[MovingPoints]:
-    """The points of every complete quartet that has any, ``spacing`` pixels apart."""
-    quads = _background(sequence, far)
-    with ThreadPoolExecutor(thread_name_prefix="gftorf-points") as threads:
-        found = threads.map(lambda j: _decoded(sequence, j, change, far, quads), change.quartets)
-        decoded = dict(zip(change.quartets, found, strict=True))
-    camera = camera_of(sequence, 0)
-    height, width = sequence.height, sequence.width
-    columns, rows = max(round(width / spacing), 1), max(round(height / spacing), 1)
-    x = (np.arange(columns) + 0.5) * (width / columns)
-    y = (np.arange(rows) + 0.5) * (height / rows)
-    points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    col, row = points.astype(int).T
-    for j, now in decoded.items():
-        chosen = now.moving[row, col]
-        if not chosen.any():
-            continue
-        place, c, r = points[chosen], col[chosen], row[chosen]
-        flow, distance = now.flow[:, r, c].T, now.distance[r, c]
-        along = _radial(decoded, j, place, flow, distance)
-        tensors = [torch.as_tensor(value, dtype=torch.float32) for value in (place, flow)]
-        near, change_of_distance = (
-            torch.as_tensor(value, dtype=torch.float32) for value in (distance, along)
-        )
-        ends = [
-            unproject(camera, tensors[0] + s * tensors[1], near + s * change_of_distance)
-            for s in (-0.5, 0.0, 0.5)
-        ]
-        yield MovingPoints(
-            quartet=j,
-            mean=ends[1],
-            distance=near,
-            amplitude=torch.as_tensor(now.amplitude[r, c], dtype=torch.float32),
-            velocity=ends[2] - ends[0],
-        )
-
-
-def _background(sequence: Sequence, far: FarLayer) -> Float[np.ndarray, "K H W"]:
+def _quads_of(sequence: Sequence, background: FarLayer) -> Float[np.ndarray, "K H W"]:
     """Quads of the background in every slot."""
-    sensor = sensor_of(sequence)
-    amplitude, dc = far.amplitude.numpy(), float(sensor.dc_offset)
+    sensor, slots = sensor_of(sequence), slice(0, sequence.cycle)
+    distance, amplitude = background.distance.numpy(), background.amplitude.numpy()
     quads = []
-    for shift, f in zip(
-        sequence.shifts[: sequence.cycle], sequence.frame_frequencies[: sequence.cycle], strict=True
-    ):
+    for shift, f in zip(sequence.shifts[slots], sequence.frame_frequencies[slots], strict=True):
         slope = float(sensor.phase_slope) * float(f) / sequence.frequencies[0]
-        psi = slope * far.distance.numpy() + float(sensor.phase_offset)
-        quads.append(amplitude * (np.cos(psi - shift) + dc))
+        phase = slope * distance + float(sensor.phase_offset) - shift
+        quads.append(amplitude * (np.cos(phase) + float(sensor.dc_offset)))
     return np.stack(quads).astype(np.float32)
 
 
-def _flows(sequence: Sequence, j: int) -> Iterator[Float[np.ndarray, "2 H W"]]:
-    """Candidates of the displacement during quartet j of what is there in its middle: optical flow
-    of the neighbouring quartet starts, and translations of the whole image."""
-    step, size = sequence.cycle, (2, sequence.height, sequence.width)
-    forward, backward = sequence.flow.forward, sequence.flow.backward
-    found = [(1.0, 0.5, forward.get(step * j)), (-1.0, -0.5, backward.get(step * (j + 1)))]
-    found += [(-1.0, 0.5, backward.get(step * j)), (1.0, 1.5, forward.get(step * (j - 1)))]
-    yield np.zeros(size, np.float32)
-    for sign, late, flow in found:
-        if flow is not None:
-            whole = sign * np.nan_to_num(flow).astype(np.float32)
-            # the flow is that of another time: there the surface was elsewhere
-            yield _sampled(whole, -late * whole)
-            yield whole
-    reach = REACH * sequence.width
-    pitch = max(round(reach / 6), 1)
-    grid = np.arange(-6, 7) * pitch
-    for y in grid:
-        for x in grid:
-            if 0 < np.hypot(x, y) <= 6.5 * pitch:
-                yield np.broadcast_to(np.float32([x, y])[:, None, None], size)
-
-
 def _decoded(
-    sequence: Sequence, j: int, change: Change, far: FarLayer, background: np.ndarray
+    sequence: Sequence,
+    quartet: int,
+    change: Change,
+    background: FarLayer,
+    background_quads: Float[np.ndarray, "K H W"],
 ) -> _Decoded:
+    """Decode a quartet along the best of several flows, inside the box that holds all changes."""
     import cv2
 
-    frames = sequence.quartet_frames(j)
+    frames = sequence.quartet_frames(quartet)
     quads = sequence.quads[frames].astype(np.float32)
-    shifts, times = sequence.shifts[frames], sequence.times[frames]
-    frequencies, count = sequence.frame_frequencies[frames], len(quads)
-    duration = (times[-1] - times[0]) * count / (count - 1)
-    share = (times - times.mean()) / duration
-    noise, sensor = max(change.noise, 1e-12), sensor_of(sequence)
-    differs = _pooled(np.square((quads - background) / noise), 3)
-    stack = np.concatenate([quads, differs])
-    own = [frequencies == f for f in sequence.frequencies]
-    models = []
-    for mask in own:
-        columns = [np.cos(shifts[mask]), np.sin(shifts[mask])]
-        if float(sensor.dc_offset) or mask.sum() < 4:
-            columns.append(np.ones(mask.sum()))
-        models.append(np.stack(columns, axis=1).astype(np.float32))
-    free = max(sum(len(model) - model.shape[1] for model in models), 1)
-    best: list[np.ndarray] = []
-    for number, flow in enumerate(_flows(sequence, j)):
-        along = np.stack([_sampled(stack[k :: count], share[k] * flow) for k in range(count)])
-        values, apart = along[:, 0], along[:, 1]
-        phasors, squares = [], np.zeros(flow.shape[1:], np.float32)
-        for mask, model in zip(own, models, strict=True):
-            fitted = np.tensordot(np.linalg.pinv(model), values[mask], axes=1)
-            squares += np.square(values[mask] - np.tensordot(model, fitted, axes=1)).sum(axis=0)
-            phasors += [2.0 * fitted[0], 2.0 * fitted[1]]
-        amplitude = 0.5 * np.hypot(phasors[0], phasors[1])
+    noise, shape = max(change.noise, 1e-12), quads.shape[1:]
+    differs = _pooled(np.square((quads - background_quads) / noise), POOL_DIFFERENCE)
+    changed = ((differs > DIFFERS).sum(axis=0) > 1).astype(np.uint8)
+    box = _box(cv2.medianBlur(changed, 3), margin=round(REACH * sequence.width) + POOL)
+    whole = _Decoded(
+        flow=np.zeros((2, *shape), np.float32),
+        distance=np.zeros(shape, np.float32),
+        amplitude=np.zeros(shape, np.float32),
+        moving=np.zeros(shape, bool),
+    )
+    if box is None:
+        return whole
+    best = _Best()
+    slots = _Slots.of(sequence, quartet)
+    images = np.stack([quads, differs], axis=1)[..., box[0], box[1]]
+    for candidate, translated in _flows(sequence, quartet):
+        flow = candidate[:, box[0], box[1]]
+        along = np.stack(
+            [_sampled(i, share * flow) for i, share in zip(images, slots.share, strict=True)]
+        )
+        phasors, squares = slots.phasors(along[:, 0])
+        amplitude = 0.5 * np.hypot(*phasors[0])
         allowed = noise**2 + np.square(RELATIVE * amplitude)
-        residual = _pooled((squares / (free * allowed))[None], POOL)[0]
-        # all raw frames but one differ from the background, which may look alike in one slot
-        moves = np.sort(apart, axis=0)[1] > DIFFERS
-        score = residual + np.where(moves, 0.0, UNMOVED) + (UNLIKELY if number > 8 else 0.0)
-        images = [score, residual, apart.mean(axis=0), moves, *flow, amplitude, *phasors]
-        if not best:
-            best = [np.array(image) for image in images]
-            continue
-        better = score < 0.8 * best[0]
-        for old, new in zip(best, images, strict=True):
-            old[better] = new[better]
-    _, residual, apart, moves, fx, fy, amplitude, *parts = best
-    tensors = [torch.as_tensor(part) for part in parts]
-    pairs = list(zip(tensors[::2], tensors[1::2], strict=True))
-    distance = distance_from_phasors(pairs, sensor).numpy()
+        residual = _pooled((squares / allowed)[None], POOL)[0]
+        # all raw frames but one: a surface may look like the background in one slot
+        moves = np.sort(along[:, 1], axis=0)[1] > DIFFERS
+        score = residual + np.where(moves, 0.0, TO_BACKGROUND) + TRANSLATED * translated
+        best.update(score, [residual, moves, *flow, *phasors.reshape(-1, *residual.shape)])
+    residual, moves, fx, fy, *parts = best.images
+    pairs = torch.as_tensor(np.stack(parts)).unflatten(0, (-1, 2))
+    distance = distance_from_phasors([(p[0], p[1]) for p in pairs], sensor_of(sequence)).numpy()
+    amplitude = 0.5 * np.hypot(*parts[:2])
     deviation = distance_noise(torch.as_tensor(amplitude), noise, sequence).numpy()
-    moving = moves & (residual < EXPLAINED) & (deviation < NOISE_MAX)
-    moving &= distance < far.distance.numpy() - 0.02
-    moving = cv2.medianBlur(moving.astype(np.uint8), 3) > 0
-    return _Decoded(flow=np.stack([fx, fy]), distance=distance, amplitude=amplitude, moving=moving)
+    moving = (moves > 0) & (residual < EXPLAINED) & (deviation < NOISE_MAX)
+    moving &= distance < background.distance.numpy()[box] - NEARER
+    whole.flow[:, box[0], box[1]] = fx, fy
+    whole.distance[box], whole.amplitude[box] = distance, amplitude
+    whole.moving[box] = cv2.medianBlur(moving.astype(np.uint8), 3) > 0
+    return whole
+
+
+class _Best:
+    """The images of the best candidate of every pixel."""
+
+    def __init__(self):
+        self.images: list[np.ndarray] = []
+        self._score = np.zeros(0)
+
+    def update(self, score: np.ndarray, images: list[np.ndarray]) -> None:
+        """Take the pixels in which a candidate is clearly better."""
+        if not self.images:
+            self._score, self.images = score, [np.array(i, dtype=np.float32) for i in images]
+            return
+        better = score < GAIN * self._score
+        for old, new in zip((self._score, *self.images), (score, *images), strict=True):
+            old[better] = new[better]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Slots:
+    """Raw frames of a quartet: when they were taken, and the phasor that explains them best."""
+
+    share: Float[np.ndarray, "K"]
+    """Time from the middle of the quartet, in units of its duration."""
+    groups: list[tuple[Bool[np.ndarray, "K"], Float[np.ndarray, "k m"]]]
+    """Raw frames of each frequency, and their model: quads = model @ (re, im, perhaps constant)."""
+
+    @classmethod
+    def of(cls, sequence: Sequence, quartet: int) -> _Slots:
+        frames = sequence.quartet_frames(quartet)
+        times, shifts = sequence.times[frames], sequence.shifts[frames]
+        duration = (times[-1] - times[0]) * len(times) / (len(times) - 1)
+        constant = float(sequence.calibration.dc_offset) != 0.0
+        groups = []
+        for f in sequence.frequencies:
+            mask = sequence.frame_frequencies[frames] == f
+            columns = [np.cos(shifts[mask]), np.sin(shifts[mask])]
+            if constant or mask.sum() == 3:
+                columns.append(np.ones(mask.sum()))
+            groups.append((mask, np.stack(columns, axis=1).astype(np.float32)))
+        return cls(share=(times - times.mean()) / duration, groups=groups)
+
+    def phasors(
+        self, quads: Float[np.ndarray, "K H W"]
+    ) -> tuple[Float[np.ndarray, "f 2 H W"], Float[np.ndarray, "H W"]]:
+        """Phasors by least squares, and the mean squared residual per degree of freedom."""
+        phasors, squares, free = [], np.zeros(quads.shape[1:], np.float32), 0
+        for mask, model in self.groups:
+            values = quads[mask]
+            fitted = np.tensordot(np.linalg.pinv(model), values, axes=1)
+            squares += np.square(values - np.tensordot(model, fitted, axes=1)).sum(axis=0)
+            free += model.shape[0] - model.shape[1]
+            phasors.append(2.0 * fitted[:2])
+        return np.stack(phasors), squares / max(free, 1)
+
+
+def _flows(sequence: Sequence, quartet: int) -> Iterator[tuple[Float[np.ndarray, "2 H W"], bool]]:
+    """Candidates of the displacement during a quartet of what is there in its middle, and whether
+    each is a translation of the whole image: no motion, optical flow between the starts of
+    neighbouring quartets, and translations.
+    """
+    cycle, size = sequence.cycle, (2, sequence.height, sequence.width)
+    forward, backward = sequence.flow.forward, sequence.flow.backward
+    yield np.zeros(size, np.float32), False
+    # flow from the start of a quartet, its sign, and by how much that start is before the middle
+    for flows, step, sign, early in (
+        (forward, 0, 1.0, 0.5),
+        (backward, 1, -1.0, -0.5),
+        (backward, 0, -1.0, 0.5),
+        (forward, -1, 1.0, 1.5),
+    ):
+        if cycle * (quartet + step) in flows:
+            flow = sign * np.nan_to_num(flows[cycle * (quartet + step)]).astype(np.float32)
+            yield _sampled(flow, -early * flow), False
+            yield flow, False
+    pitch = max(REACH * sequence.width / STEPS, 1.0)
+    grid = np.arange(-STEPS, STEPS + 1)
+    for y in grid:
+        for x in grid:
+            if 0 < np.hypot(x, y) <= STEPS + 0.5:
+                translation = np.float32([pitch * x, pitch * y])[:, None, None]
+                yield np.broadcast_to(translation, size), True
+
+
+def _radial(
+    decoded: Mapping[int, _Decoded],
+    quartet: int,
+    place: Float[np.ndarray, "P 2"],
+    flow: Float[np.ndarray, "P 2"],
+    distance: Float[np.ndarray, "P"],
+) -> Float[np.ndarray, "P"]:
+    """Change of the distance during a quartet [m]: mean slope to those neighbouring quartets that
+    see the point, else zero.
+    """
+    total, count = np.zeros(len(place)), np.zeros(len(place))
+    for step in (-1, 1):
+        if (other := decoded.get(quartet + step)) is None:
+            continue
+        height, width = other.distance.shape
+        column, row = np.floor(place + step * flow).astype(int).T
+        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        column, row = column.clip(0, width - 1), row.clip(0, height - 1)
+        slope = step * (other.distance[row, column] - distance)
+        known = inside & other.moving[row, column] & (np.abs(slope) < RADIAL_MAX)
+        total += np.where(known, slope, 0.0)
+        count += known
+    return total / np.maximum(count, 1)
+
+
+def _box(mask: np.ndarray, margin: int) -> tuple[slice, slice] | None:
+    """Rows and columns of the smallest box with all marked pixels, ``margin`` pixels larger."""
+    if not mask.any():
+        return None
+    sides = []
+    for axis, side in enumerate(mask.shape):
+        marked = np.flatnonzero(mask.any(axis=1 - axis))
+        sides.append(slice(max(marked[0] - margin, 0), min(marked[-1] + margin + 1, side)))
+    return sides[0], sides[1]
 
 
 def _pooled(images: Float[np.ndarray, "C H W"], side: int) -> Float[np.ndarray, "C H W"]:
@@ -196,44 +290,14 @@ def _pooled(images: Float[np.ndarray, "C H W"], side: int) -> Float[np.ndarray, 
     return np.stack([cv2.blur(i, (side, side), borderType=cv2.BORDER_REPLICATE) for i in images])
 
 
-def _radial(
-    decoded: dict[int, _Decoded], j: int, place: np.ndarray, flow: np.ndarray, distance: np.ndarray
-) -> np.ndarray:
-    """Change of distance during a quartet [m]: slope to the neighbouring quartets where both see
-    the point; else zero."""
-    slopes = []
-    for step in (-1, 1):
-        other = decoded.get(j + step)
-        if other is None:
-            continue
-        there = place + step * flow
-        height, width = other.distance.shape
-        c, r = np.floor(there).astype(int).T
-        inside = (c >= 0) & (c < width) & (r >= 0) & (r < height)
-        c, r = np.clip(c, 0, width - 1), np.clip(r, 0, height - 1)
-        slope = step * (other.distance[r, c] - distance)
-        known = inside & other.moving[r, c] & (np.abs(slope) < 0.5)
-        slopes.append(np.where(known, slope, np.nan))
-    if not slopes:
-        return np.zeros(len(place))
-    with np.errstate(all="ignore"):
-        import warnings
-
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            return np.nan_to_num(np.nanmean(slopes, axis=0))
-
-
-def _sampled(image: np.ndarray, shift: np.ndarray) -> np.ndarray:
-    """[C, H, W] values at x + shift(x), bilinear, repeated beyond the border."""
+def _sampled(
+    images: Float[np.ndarray, "C H W"], shift: Float[np.ndarray, "2 H W"]
+) -> Float[np.ndarray, "C H W"]:
+    """Values at x + shift(x), bilinear, repeated beyond the border."""
     import cv2
 
-    height, width = image.shape[1:]
+    height, width = images.shape[1:]
     x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
     at = (x + shift[0]).astype(np.float32), (y + shift[1]).astype(np.float32)
-    return np.stack(
-        [
-            cv2.remap(channel.astype(np.float32), *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-            for channel in image
-        ]
-    )
+    how = {"interpolation": cv2.INTER_LINEAR, "borderMode": cv2.BORDER_REPLICATE}
+    return np.stack([cv2.remap(image.astype(np.float32), *at, **how) for image in images])

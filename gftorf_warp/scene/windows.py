@@ -23,7 +23,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from .gaussians import GaussianField
-from .motion import Keys, KeyMotion, Motion, MotionSettings, MotionStart, farthest_points, rows_of
+from .motion import KeyMotion, Keys, Motion, MotionSettings, MotionStart, farthest_points, rows_of
 
 # displacement per axis of Gaussians outside their window [m]: beyond the far plane or beside the
 # image for every camera

@@ -1,7 +1,7 @@
 """Gaussians of a finished run at one time, widened for cameras of higher resolution.
 
-The low-pass filter of the renderer widens every Gaussian by ``low_pass`` pixels^2. With z the z-depth
-and f the focal length of the camera of the optimisation, and z', f' those of this camera,
+The low-pass filter of the renderer widens every Gaussian by ``low_pass`` pixels^2. With z the
+z-depth and f the focal length of the camera of the optimisation, and z', f' those of this camera,
 
     exp(2 log_scale') = exp(2 log_scale) + low_pass max(0, (z / f)^2 - (z' / f')^2)
 """
@@ -12,7 +12,6 @@ import warp as wp
 
 from ..geometry import CameraView
 from .displace import OPTIONS, make_interpolation, product
-
 
 
 @wp.func
