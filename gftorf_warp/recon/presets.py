@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from ..data.decode import unambiguous_range
 from ..data.sequence import Sequence
 from ..errors import UsageError
-from ..render.buffers import ClampGradient, Distortion, RenderSettings, Stop, Support
+from ..render.buffers import ClampGradient, Distortion, RenderSettings, SplatDistance, Stop, Support
 from ..scene.initialise import Init, InitSettings, camera_moves
 from ..scene.motion import MotionSettings, Products
 from ..scene.network import Network
@@ -86,13 +86,13 @@ def best(recorded: Recorded = Recorded()) -> ReconSettings:
         preset="best",
         input=recorded.input,
         width_max=320,
-        init=InitSettings(kind=Init.QUARTETS, footprint=0.5),
+        init=InitSettings(kind=Init.QUARTETS, moving_spacing=1.0),
         motion=MotionSettings(kind="windows", nodes=40),
-        render=RenderSettings(low_pass=0.1),
+        render=RenderSettings(low_pass=0.1, splat_distance=SplatDistance.PLANE),
         rates=rates,
         rates_last=rates.times(0.2),
         weights=Weights(
-            ssim=0.4, distortion=1e-3, colour=1.0 if recorded.input == Input.PHASOR else 0.0
+            ssim=0.2, distortion=3e-3, colour=1.0 if recorded.input == Input.PHASOR else 0.0
         ),
         schedule=Schedule(images=6000, batch=Batch.QUARTET),
         densify=DensifySettings(every=None),
