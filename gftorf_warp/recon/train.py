@@ -17,6 +17,8 @@ from ..data.read import read, read_truth
 from ..data.sequence import Sequence, Truth
 from ..errors import InputError, UsageError
 from ..scene.changes import Wording, changed
+from ..scene.initialise import Init
+from ..scene.windows import Windows
 from . import checkpoint, closed_form, folder, presets, residuals
 from .config import config_of
 from .diagnostics import Diagnostics
@@ -121,7 +123,29 @@ def chosen_settings(
         settings = replace(settings, schedule=replace(settings.schedule, images=images))
     if flow is not None:
         settings = replace(settings, flow=_choice(FlowSource, flow, "--flow"))
-    return replace(changed(settings, changes, CHANGES), cycle=sequence.cycle)
+    settings = changed(settings, changes, CHANGES)
+    _check_windows(settings)
+    return replace(settings, cycle=sequence.cycle)
+
+
+def _check_windows(settings: ReconSettings) -> None:
+    """Raise a UsageError if windows lack their initialisation, or a loss that contradicts them."""
+    kind, start = settings.motion.kind, settings.init.kind
+    if (kind == Windows.kind) != (start == Init.QUARTETS):
+        raise UsageError(
+            f"init.kind {start} does not fit motion.kind {kind}",
+            where="--set",
+            why="windows need moving Gaussians of every quartet, which other motions cannot follow",
+            fix=f"set both: init.kind={Init.QUARTETS} and motion.kind={Windows.kind}, or "
+            f"init.kind={Init.PHASE} and motion.kind=nodes",
+        )
+    if kind == Windows.kind and settings.weights.flow > 0:
+        raise UsageError(
+            "weights.flow does not fit motion.kind windows",
+            where="--set",
+            why="no Gaussian moves from one quartet to the next",
+            fix="use --set weights.flow=0",
+        )
 
 
 def _choice(kind: type[Choice], name: str, option: str) -> Choice:

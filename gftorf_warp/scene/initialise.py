@@ -108,14 +108,7 @@ def from_phase(sequence: Sequence, settings: InitSettings = InitSettings()) -> S
     Raises:
         InputError: If no quartet is complete.
     """
-    if not len(sequence.complete_quartets):
-        raise InputError(
-            "no complete quartet",
-            where=sequence.path or "sequence",
-            why="phase initialisation decodes the raw frames of one quartet; every quartet lacks "
-            "at least one",
-            fix="record more frames, or start from random Gaussians",
-        )
+    _needs_quartet(sequence)
     if camera_moves(sequence):
         return _from_views(sequence, settings)
     change = change_of(sequence)
@@ -130,12 +123,32 @@ def from_phase(sequence: Sequence, settings: InitSettings = InitSettings()) -> S
     return Start(field=concatenated([static, moving]), positions=positions, quartet=middle)
 
 
+def _needs_quartet(sequence: Sequence) -> None:
+    if not len(sequence.complete_quartets):
+        raise InputError(
+            "no complete quartet",
+            where=sequence.path or "sequence",
+            why="phase initialisation decodes the raw frames of one quartet; every quartet lacks "
+            "at least one",
+            fix="record more frames, or start from random Gaussians",
+        )
+
+
 def from_quartets(sequence: Sequence, settings: InitSettings = InitSettings()) -> Start:
     """A static layer, and moving Gaussians of every quartet, labelled 1 + its number.
 
     Raises:
         InputError: If no quartet is complete, or the camera moves.
     """
+    _needs_quartet(sequence)
+    if camera_moves(sequence):
+        raise InputError(
+            "the camera moves",
+            where=sequence.path or "sequence",
+            why="init.kind = quartets compares the raw frames of each pixel over time",
+            fix="use --preset best without --set init.kind, or --set init.kind=phase "
+            "--set motion.kind=nodes",
+        )
     change = change_of(sequence)
     far = background(sequence, change)
     camera = camera_of(sequence, 0)

@@ -98,14 +98,14 @@ class MotionStart:
     """The initial Gaussians."""
     tracks: Float[Tensor, "T P 3"] | None
     """Displacements of the P Gaussians of the moving layer at every key [m]; None: not tracked."""
-    velocity: Float[Tensor, "P 3"] | None
-    """Displacements of the P moving Gaussians during their quartet [m]; None: unknown."""
     duration: float
     """Time from the first raw frame to the last [s]."""
     unambiguous_range: float
     """Of the sensor [m]."""
     generator: torch.Generator
     """For random weights, on the CPU."""
+    velocity: Float[Tensor, "P 3"] | None = None
+    """Displacements of the P moving Gaussians during their quartet [m]; None: unknown."""
 
 
 @dataclass(frozen=True)

@@ -66,13 +66,14 @@ class Windows(Motion):
     @classmethod
     def start(cls, settings: MotionSettings, initial: MotionStart) -> Windows:
         """Nodes spread over the moving Gaussians of every window, with the median velocity of the
-        nearest ones.
+        nearest ones, or none.
         """
         field = initial.field
-        if field.layer is None or initial.velocity is None:
-            raise ValueError("windows need a field with one layer per quartet, and velocities")
+        if field.layer is None:
+            raise ValueError("windows need a field with one layer per quartet")
         moving = field.layer > 0
         mean, label, velocity = field.mean[moving], field.layer[moving], initial.velocity
+        velocity = torch.zeros_like(mean) if velocity is None else velocity
         nodes, medians = [], []
         for number in label.unique().tolist():
             own = (label == number).nonzero()[:, 0]
@@ -123,12 +124,13 @@ class Windows(Motion):
         return 2 * len(self.times) - 2
 
     def keys_at(self, time: float) -> Keys:
-        """Both keys of the window that holds ``time`` [s]."""
+        """The keys of the window that holds ``time`` [s]."""
         last = len(self.times) - 2
         window = min(max(bisect.bisect_right(self.times, time) - 1, 0), last)
         start, end = self.times[window], self.times[window + 1]
         share = min(max((time - start) / (end - start), 0.0), 1.0)
-        return Keys((2 * window, 2 * window + 1), (1.0 - share, share))
+        keys = ((2 * window, 1.0 - share), (2 * window + 1, share))
+        return Keys(*zip(*((key, weight) for key, weight in keys if weight), strict=True))
 
     def to_dict(self) -> dict[str, Any]:
         """With the number of neighbours."""
