@@ -12,6 +12,7 @@ from small_runs import demo
 
 from gftorf_warp.constants import CANONICAL_SHIFTS, FRAME_RATE_HZ
 from gftorf_warp.data.exr import read_exr
+from gftorf_warp.data.temporal import agreement, averaged_locally
 from gftorf_warp.data.write import write
 from gftorf_warp.evaluate.compare import compare
 from gftorf_warp.evaluate.views import render_to_folder
@@ -198,3 +199,24 @@ def test_a_sequence_that_is_gone_leaves_the_fit(runs, caplog):
     assert run.render(0.0).source is None
     assert run.render(0.1).source is None
     assert caplog.text.count("no fallback to the measurement") == 1
+
+
+def test_what_rests_for_two_quartets_only_is_averaged_over_them():
+    """A wall that jumps away after half of the quartets, and one quartet later again: the minority
+    is averaged with its neighbour in time, a single quartet with none.
+    """
+    measured, _ = recording(frames=FRAMES)
+    slots = recording(frames=4, noise=0.0)[0].quads
+    factors = np.repeat([1, 1, 1, 1, 1, 0.7, 0.7, 0.4], 4)[:, None, None]
+    clean = np.tile(slots, (8, 1, 1)) * factors
+    noise = 4e-4 * np.random.default_rng(1).standard_normal(clean.shape)
+    measured = replace(measured, quads=(clean + noise).astype(np.float32))
+    assert [agreement(measured)[i].mean() > 0.9 for i in range(8)] == [True] * 5 + [False] * 3
+    local, count = averaged_locally(measured)
+    assert [int(np.median(count[i])) for i in range(8)] == [2, 3, 3, 3, 2, 2, 2, 1]
+    ratio = np.std(local.quads[24:28] - clean[24:28]) / np.std(noise[24:28])
+    assert ratio == pytest.approx(np.sqrt(0.5), rel=0.1)
+    np.testing.assert_array_equal(local.quads[28:], measured.quads[28:])
+    wrong = recording(frames=FRAMES)[1].distance[0] + 0.5
+    source = applied(fallback_of(measured, clean), wrong, 25)[1]
+    assert (source == TEMPORAL).mean() > 0.9

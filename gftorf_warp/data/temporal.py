@@ -13,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from ..constants import SPEED_OF_LIGHT
 from .cycles import phase_noise
@@ -26,6 +26,7 @@ STILL_M = 1e-6  # [m], [1] poses that differ less are one pose
 AGREES = 4.0  # [standard deviations] from the median; of 3 to 6 the best on twelve random scenes
 
 AGREEING_MIN = 2  # quartets
+SAME = 3.0  # [standard deviations of the difference] between neighbours that measured the same
 
 
 def camera_rests(sequence: Sequence) -> bool:
@@ -69,16 +70,46 @@ def agreement(sequence: Sequence) -> Bool[np.ndarray, "Q H W"]:
     return agrees
 
 
-def sigma_of_mean(sequence: Sequence, noise: QuadNoise) -> Float[np.ndarray, "H W"]:
-    """Standard deviation of the distance of the temporal mean [m], from the first frequency."""
-    agrees = agreement(sequence)
+def averaged_locally(sequence: Sequence) -> tuple[Sequence, Int[np.ndarray, "Q H W"]]:
+    """The sequence with the mean of each complete quartet and those of its neighbours in time that
+    measured the same, slot by slot, and the number of quartets in each mean.
+
+    That number is 1 where no neighbour did, and everywhere where the camera moves.
+    """
+    quartets, noise = sequence.complete_quartets, quad_noise(sequence)
+    count = np.ones((len(quartets), sequence.height, sequence.width), dtype=np.int64)
+    if noise is None or not camera_rests(sequence):
+        return sequence, count
+    stacked = stacked_quads(sequence)
+    variance = [np.square(noise.sigma(amplitudes_of(sequence, i))) for i in quartets]
+    total = stacked.astype(np.float64)
+    for k in range(len(quartets) - 1):
+        if quartets[k + 1] != quartets[k] + 1:
+            continue
+        reach = SAME * np.sqrt(variance[k] + variance[k + 1])
+        same = (np.abs(stacked[k + 1] - stacked[k]) <= reach).all(axis=0)
+        total[k] += same * stacked[k + 1]
+        total[k + 1] += same * stacked[k]
+        count[k : k + 2] += same
+    quads = sequence.quads.copy()
+    for i, mean in zip(quartets, total / count[:, None], strict=True):
+        quads[sequence.quartet_frames(i)] = mean
+    return replace(sequence, quads=quads), count
+
+
+def sigma_of_mean(
+    sequence: Sequence, noise: QuadNoise, count: Int[np.ndarray, "*q H W"]
+) -> Float[np.ndarray, "*q H W"]:
+    """Standard deviation of the distance of the mean of so many quartets [m], from the first
+    frequency.
+    """
     first = quartet_phasors(sequence, sequence.complete_quartets[0])[0][0]
     slot = first[0] % sequence.cycle
     light = np.median([amplitudes_of(sequence, i) for i in sequence.complete_quartets], axis=0)
     relative = noise.sigma(light)[slot] / np.maximum(light[slot], np.finfo(np.float32).tiny)
     metres_per_rad = SPEED_OF_LIGHT / (4.0 * math.pi * sequence.frequencies[0])
     scale = phase_noise(sequence.shifts[first]) * metres_per_rad
-    return scale * relative / np.sqrt(np.maximum(agrees.sum(axis=0), 1))
+    return scale * relative / np.sqrt(np.maximum(count, 1))
 
 
 def over_time(sequence: Sequence, reduce: Callable[..., np.ndarray]) -> Float[np.ndarray, "H W"]:

@@ -2,14 +2,16 @@
 
 During a quartet, seen from the sequence's own camera, the rendered distance of a run gives way to
 
-* the *temporal mean* where the quartet agrees with its pixel's median, and the fit is more than two
-  standard deviations of that mean away. Beside a pixel that does not agree, an edge may be passing:
-  there the fit stays if it explains the quads as well as the mean does;
-* the *closed form* of the quartet where it does not agree, the fit does not explain its raw frames
-  (see residuals.py), and one phasor explains them better: nothing moved within it. How many times
-  better are the odds that the fit is right where pixels change, from the share that it explains.
+* the *temporal mean* of all quartets that agree with their pixel's median, or else of a quartet and
+  the neighbours in time that measured the same, if the fit is more than two standard deviations of
+  that mean away. Beside a pixel that does not agree, an edge may be passing: there the fit stays if
+  it explains the quads as well as the mean does;
+* the *closed form* of the quartet where no other one measured the same, the fit does not explain
+  its raw frames (see residuals.py), and one phasor explains them better: nothing moved within it.
 
-Elsewhere the fit stays. A map of sources says which is which.
+How much better is a matter of the odds that the fit is right where pixels change, from the share
+that it explains: a ratio of chi-squares, or twice the logarithm of the odds as a difference of
+their sums. Elsewhere the fit stays. A map of sources says which is which.
 """
 
 from __future__ import annotations
@@ -34,7 +36,6 @@ from .residuals import Residuals
 SOURCES = ("fit", "temporal", "closed_form")
 """Names of the values 0, 1, 2 of a map of sources."""
 STAYS = 2.0  # [standard deviations of the temporal mean] within which the fit stays
-AS_WELL = 1.0  # [1] by which chi-square of the fit may exceed that of the mean beside edges
 BETTER = (1.5, 50.0)  # [1] range of the ratio of chi-square of the fit to that of one phasor
 SAME_TURN = 0.125  # [unambiguous ranges] the fit may know the turn if it is so near to the mean
 TIME_S = 1e-6  # [s] outside of a quartet that still count as inside
@@ -50,7 +51,7 @@ class Fallback:
     """The camera of raw frame 0."""
     temporal: Float[Tensor, "Q H W"]
     """Distance of the temporal mean [m], in [0, range)."""
-    sigma: Float[Tensor, "H W"]
+    sigma: Float[Tensor, "Q H W"]
     """Its standard deviation [m]."""
     rests: Bool[Tensor, "Q H W"]
     """Where it may replace the fit."""
@@ -84,8 +85,11 @@ class Fallback:
         of_mean = _chi_square(sequence, temporal.stacked_quads(averaged), noise)
         of_phasor = _chi_square(sequence, _phasor_quads(sequence), noise)
         of_phasor *= sequence.cycle / (sequence.cycle - 2.0)  # two unknowns
-        fit_stays = beside & (chi_square <= of_mean + AS_WELL)
-        moved = ~agrees & ~explained & (chi_square > _odds(found) * of_phasor)
+        odds = _odds(found)
+        fit_stays = beside & (chi_square <= of_mean + 2.0 * math.log(odds) / sequence.cycle)
+        local, count = temporal.averaged_locally(sequence)
+        moved = ~agrees & (count == 1) & ~explained & (chi_square > odds * of_phasor)
+        count = np.where(agrees, agrees.sum(axis=0), count)
         quartets = sequence.complete_quartets
 
         def tensor(image: np.ndarray) -> Tensor:
@@ -95,9 +99,15 @@ class Fallback:
         return cls(
             sequence=sequence,
             camera=camera,
-            temporal=tensor(np.stack([closed_form_distance(averaged, i) for i in quartets])),
-            sigma=tensor(temporal.sigma_of_mean(sequence, noise)),
-            rests=tensor(agrees & ~fit_stays),
+            temporal=tensor(
+                np.where(
+                    agrees,
+                    np.stack([closed_form_distance(averaged, i) for i in quartets]),
+                    np.stack([closed_form_distance(local, i) for i in quartets]),
+                )
+            ),
+            sigma=tensor(temporal.sigma_of_mean(sequence, noise, count)),
+            rests=tensor(np.where(agrees, ~fit_stays, count > 1)),
             closed_form=tensor(np.stack([closed_form_distance(sequence, i) for i in quartets])),
             moved=tensor(moved),
         )
@@ -113,7 +123,7 @@ class Fallback:
             return replace(rendering, source=torch.zeros_like(fit, dtype=torch.uint8))
         mean, reach = self.temporal[row], unambiguous_range(self.sequence)
         apart = torch.remainder(fit - mean + 0.5 * reach, reach) - 0.5 * reach
-        averaged = self.rests[row] & ~(apart.abs() <= STAYS * self.sigma)
+        averaged = self.rests[row] & ~(apart.abs() <= STAYS * self.sigma[row])
         value = torch.where(apart.abs() < SAME_TURN * reach, fit - apart, mean)
         distance = torch.where(averaged, value, fit)
         distance = torch.where(self.moved[row], self.closed_form[row], distance)

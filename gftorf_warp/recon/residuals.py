@@ -224,7 +224,7 @@ def _contradictions(
     reach = unambiguous_range(measured)
     apart = np.abs((distance - mean + 0.5 * reach) % reach - 0.5 * reach)
     far = CONTRADICTION * SPEED_OF_LIGHT / (2.0 * measured.frequencies[0])
-    sigma = temporal.sigma_of_mean(measured, noise)
+    sigma = temporal.sigma_of_mean(measured, noise, agrees.sum(axis=0))
     return ~agrees, agrees & ~(apart <= np.maximum(far, SIGMAS * sigma))
 
 
