@@ -116,6 +116,9 @@ SWITCHES = {
     "degree_1": ("posed", {"sh_degree": 1}, "colour"),
     "degree_2": ("posed", {"sh_degree": 2}, "quads"),
     "slice": ("translucent", {"near": 2.0, "far": 3.5}, "opacity"),
+    "low_pass": ("needles", {"low_pass": 0.1}, "opacity"),
+    "low_pass_lens": ("distorted", {"low_pass": 0.1}, "opacity"),
+    "low_pass_plane": ("sloped", {"low_pass": 0.1}, "distance"),
 }
 
 

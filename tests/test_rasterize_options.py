@@ -197,3 +197,11 @@ def test_ordered_sums_need_no_count_of_pairs(device):
     reserved = replace(case.settings, deterministic=True, pair_capacity=60_000)
     found, seen = rendered(replace(case, settings=reserved), device, workspace=buffers.Workspace())
     check(gradients(found, seen, names_in(seen)), want)
+
+
+@pytest.mark.parametrize("value", [0.0, -0.1, float("nan"), float("inf")])
+def test_a_low_pass_filter_without_width_is_refused(value):
+    """Of no variance a splat may fall between pixels."""
+    with pytest.raises(ValueError, match=f"low_pass must be above 0 and finite, got {value}"):
+        buffers.RenderSettings(low_pass=value)
+    assert buffers.RenderSettings().low_pass == 0.3

@@ -147,6 +147,32 @@ def test_a_finer_camera_sees_what_was_optimised():
     assert same_size.view(18, 2, 24, 2).mean(dim=(1, 3)).sum() < 0.5 * coarse.sum()
 
 
+@pytest.mark.parametrize("low_pass", [None, 0.1])
+def test_gaussians_are_widened_by_the_filter_of_their_run(low_pass):
+    """By its variance times the difference of the squares of the pixels' widths. Runs of before
+    that do not state the filter have one of 0.3.
+    """
+    stored = plain(presets.demo())
+    assert stored["render"].pop("low_pass") == 0.3
+    stored["render"] |= {} if low_pass is None else {"low_pass": low_pass}
+    mean = torch.tensor([[0.0, 0.0, 2.0], [0.3, -0.2, 3.0]])
+    run = Run(
+        path=Path(),
+        config={"size_optimised": [24, 18], "settings": stored},
+        camera=Camera(width=48, height=36, fx=40.0, fy=40.0, cx=24.0, cy=18.0),
+        sensor=Sensor(),
+        quad_scale=1.0,
+        field=field(mean, None),
+        motion=Still(KEYS),
+        binding=torch.zeros(2, 0),
+    )
+    assert run.render_settings.low_pass == (low_pass or 0.3)
+    widened = run.widened(run.field, run.camera).scale.square() - run.field.scale.square()
+    coarse = mean[:, 2:] / 20.0  # [m] pixels of the optimisation, twice as wide as here
+    want = (low_pass or 0.3) * (coarse**2 - (0.5 * coarse) ** 2)
+    torch.testing.assert_close(widened, want.expand(2, 3), rtol=1e-3, atol=0.0)
+
+
 def test_truth_is_never_read(tmp_path, folder_of_a_sequence):
     """Without truth and masks: the same bytes."""
     bare = tmp_path / "box"

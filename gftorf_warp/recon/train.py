@@ -129,7 +129,9 @@ def chosen_settings(
 
 
 def _check_windows(settings: ReconSettings) -> None:
-    """Raise a UsageError if windows lack their initialisation, or a loss that contradicts them."""
+    """Raise a UsageError if windows lack their initialisation, or for a loss that contradicts
+    them.
+    """
     kind, start = settings.motion.kind, settings.init.kind
     if (kind == Windows.kind) != (start == Init.QUARTETS):
         raise UsageError(
@@ -139,13 +141,16 @@ def _check_windows(settings: ReconSettings) -> None:
             fix=f"set both: init.kind={Init.QUARTETS} and motion.kind={Windows.kind}, or "
             f"init.kind={Init.PHASE} and motion.kind=nodes",
         )
-    if kind == Windows.kind and settings.weights.flow > 0:
-        raise UsageError(
-            "weights.flow does not fit motion.kind windows",
-            where="--set",
-            why="no Gaussian moves from one quartet to the next",
-            fix="use --set weights.flow=0",
-        )
+    for name in ("flow", "motion_size") if kind == Windows.kind else ():
+        if getattr(settings.weights, name) > 0:
+            raise UsageError(
+                f"weights.{name} does not fit motion.kind windows",
+                where="--set",
+                why="no Gaussian moves from one quartet to the next"
+                if name == "flow"
+                else "Gaussians outside their window count as displaced by a thousand kilometres",
+                fix=f"use --set weights.{name}=0",
+            )
 
 
 def _choice(kind: type[Choice], name: str, option: str) -> Choice:

@@ -10,6 +10,10 @@ of the velocities of the nearest nodes of its label:
 So a body needs no track through the whole recording, and occlusion, several bodies, turning and
 approaching bodies need no model of their own. Nothing is shared between windows but the static
 layer.
+
+Outside its window a Gaussian is displaced by ``AWAY`` along all three axes, where no camera sees
+it. So a displacement means motion only between two times of one window: the losses of optical flow
+(from one quartet to the next) and of the size of displacements are refused with windows.
 """
 
 from __future__ import annotations
