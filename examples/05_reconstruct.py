@@ -15,7 +15,7 @@ def main(folder: Path, images: int = 400) -> dict:
     Few images and few pixels: this shows the calls, `gftorf demo` shows what they can do.
     """
     sequence = simulate("demo", folder / "sequence", frames=12, size=(48, 36))
-    run = reconstruct(sequence, folder / "run", "demo", images=images)
+    run = reconstruct(sequence, folder / "run", images=images)
 
     metrics = compare(run)
     print(

@@ -13,7 +13,7 @@ from .errors import UsageError
 from .terminal import LOG
 
 SCENE = "demo"
-PRESET = "demo"
+PRESET = "best"
 SETTINGS = "demo.json"
 OURS = (SETTINGS, "seq", "run", "metrics.json", "report.html")
 

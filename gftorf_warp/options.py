@@ -169,9 +169,9 @@ def command_parsers() -> dict[str, Parser]:
     reconstruct.add_argument("sequence", metavar="SEQ", help="folder of the sequence")
     out = "folder to write; an interrupted run is resumed"
     reconstruct.option("--out", "RUN", str, out, required=True)
-    presets = "settings: demo, paper, released, fast, dgs, dgs_depth, or without Gaussians ctof, "
-    presets += "the closed form, and temporal, the same averaged over time (demo)"
-    reconstruct.option("--preset", "NAME", str, presets, "demo")
+    presets = "settings: best, demo, paper, released, fast, dgs, dgs_depth, or without Gaussians "
+    presets += "ctof, the closed form, and temporal, the same averaged over time (best)"
+    reconstruct.option("--preset", "NAME", str, presets, "best")
     inputs = "fitted data: quads, phasor, or auto: as recorded (auto)"
     reconstruct.option("--input", "KIND", str, inputs, "auto")
     rows = "apply a row of the ablation table: nobias, dd, h1, h1h2 or h1h2dd"

@@ -206,7 +206,7 @@ def test_rows_and_numbers_of_the_command_line(capsys):
     assert "name of its own" in capsys.readouterr().err
     with pytest.raises(SystemExit):
         accuracy.main(["--out", "unused", "--row", "fats"])
-    assert "'fats' names none of the presets demo, " in capsys.readouterr().err
+    assert "'fats' names none of the presets best, demo, " in capsys.readouterr().err
 
 
 def test_the_summary_is_means_over_scenes_and_seeds():

@@ -55,7 +55,7 @@ def run(sequence):
         "--out",
         str(path),
         "--preset",
-        "demo",
+        "best",
         "--images",
         "40",
     ]

@@ -1,11 +1,14 @@
 """The published settings, value by value, and what the schedule makes of them."""
 
+import inspect
 from dataclasses import fields, is_dataclass, replace
 
 import pytest
 import torch
 from small_runs import advance, demo, small
 
+from gftorf_warp import options
+from gftorf_warp.demo import PRESET
 from gftorf_warp.errors import UsageError
 from gftorf_warp.recon import densify, presets
 from gftorf_warp.recon.config import resolved
@@ -15,12 +18,20 @@ from gftorf_warp.recon.presets import Recorded
 from gftorf_warp.recon.settings import Batch, Input, Norm, plain
 from gftorf_warp.recon.state import begin
 from gftorf_warp.recon.terms import colour_weight, render_settings_at
+from gftorf_warp.recon.train import reconstruct
 from gftorf_warp.render.buffers import ClampGradient, Stop, Support
 from gftorf_warp.scene.initialise import Init, InitSettings
 from gftorf_warp.scene.motion import MotionSettings, Products
 
 # F-ToeRF at 15 m, ToeRF at 10 m
 QUADS, PHASOR = Recorded(), Recorded(input=Input.PHASOR, unambiguous_range=5.0)
+
+
+def test_one_preset_is_the_default_everywhere():
+    """From Python, on the command line and in the demo."""
+    default = inspect.signature(reconstruct).parameters["settings"].default
+    words = ["reconstruct", "seq", "--out", "run"]
+    assert default == options.parse(words).preset == PRESET == "best"
 
 
 def test_paper_is_what_the_paper_says():

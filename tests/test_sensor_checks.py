@@ -181,6 +181,7 @@ def test_the_canary_sings(tmp_path):
     sequence = simulate(
         "demo", tmp_path / "rays", size=(64, 48), noise=False, **canary.ROWS[canary.SOURCE]
     )
-    run = reconstruct(sequence, tmp_path / "run", **options)
-    again = reconstruct(canary.own_model(run, tmp_path / "own"), tmp_path / "again", **options)
+    run = reconstruct(sequence, tmp_path / "run", canary.PRESET, **options)
+    own = canary.own_model(run, tmp_path / "own")
+    again = reconstruct(own, tmp_path / "again", canary.PRESET, **options)
     assert canary.scores(run)["d_mse_x100"] > 2 * canary.scores(again)["d_mse_x100"]

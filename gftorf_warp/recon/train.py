@@ -42,7 +42,7 @@ CHANGES = Wording(
 def reconstruct(
     sequence: Sequence | str | Path,
     out: str | Path,
-    settings: ReconSettings | str = "demo",
+    settings: ReconSettings | str = "best",
     *,
     images: int | None = None,
     input: Input | str = Input.AUTO,

@@ -203,7 +203,8 @@ class _Slots:
             if constant or mask.sum() == 3:
                 columns.append(np.ones(mask.sum()))
             groups.append((mask, np.stack(columns, axis=1).astype(np.float32)))
-        return cls(share=(times - times.mean()) / duration, groups=groups)
+        share = (times - times.mean()) / duration if duration > 0.0 else np.zeros(len(times))
+        return cls(share=share, groups=groups)
 
     def phasors(
         self, quads: Float[np.ndarray, "K H W"]
