@@ -8,6 +8,10 @@ During a quartet, seen from the sequence's own camera, the rendered distance of 
   it explains the quads as well as the mean does;
 * the *closed form* of the quartet where no other one measured the same, the fit does not explain
   its raw frames (see residuals.py), and one phasor explains them better: nothing moved within it.
+  Only if the fit failed as a whole: a good one is better at outlines, which no phasor explains.
+
+Along steps of the mean a pixel is a mixture of two surfaces, and the mean a distance between them:
+a fit between the two sides stays if it explains the quads.
 
 How much better is a matter of the odds that the fit is right where pixels change, from the share
 that it explains: a ratio of chi-squares, or twice the logarithm of the odds as a difference of
@@ -38,6 +42,8 @@ SOURCES = ("fit", "temporal", "closed_form")
 STAYS = 2.0  # [standard deviations of the temporal mean] within which the fit stays
 BETTER = (1.5, 50.0)  # [1] range of the ratio of chi-square of the fit to that of one phasor
 SAME_TURN = 0.125  # [unambiguous ranges] the fit may know the turn if it is so near to the mean
+FAILED = 0.1  # [1] share of all pixels unexplained, from which a fit failed as a whole
+STEP = 0.1  # [m] least step of the temporal mean, besides noise, beside which pixels are mixtures
 TIME_S = 1e-6  # [s] outside of a quartet that still count as inside
 
 
@@ -59,6 +65,8 @@ class Fallback:
     """Distance of the quartet [m], in [0, range)."""
     moved: Bool[Tensor, "Q H W"]
     """Where it replaces the fit."""
+    explained: Bool[Tensor, "Q H W"]
+    """Where the fit explains the quads."""
 
     @classmethod
     def of(
@@ -89,6 +97,7 @@ class Fallback:
         fit_stays = beside & (chi_square <= of_mean + 2.0 * math.log(odds) / sequence.cycle)
         local, count = temporal.averaged_locally(sequence)
         moved = ~agrees & (count == 1) & ~explained & (chi_square > odds * of_phasor)
+        moved &= found.unexplained_share > FAILED
         count = np.where(agrees, agrees.sum(axis=0), count)
         quartets = sequence.complete_quartets
 
@@ -110,6 +119,7 @@ class Fallback:
             rests=tensor(np.where(agrees, ~fit_stays, count > 1)),
             closed_form=tensor(np.stack([closed_form_distance(sequence, i) for i in quartets])),
             moved=tensor(moved),
+            explained=tensor(explained),
         )
 
     def applied(self, rendering: Rendering, time: float, camera: Camera) -> Rendering:
@@ -124,6 +134,8 @@ class Fallback:
         mean, reach = self.temporal[row], unambiguous_range(self.sequence)
         apart = torch.remainder(fit - mean + 0.5 * reach, reach) - 0.5 * reach
         averaged = self.rests[row] & ~(apart.abs() <= STAYS * self.sigma[row])
+        between = _between(fit, mean, STEP + 4.0 * self.sigma[row])
+        averaged &= ~(between & self.explained[row])
         value = torch.where(apart.abs() < SAME_TURN * reach, fit - apart, mean)
         distance = torch.where(averaged, value, fit)
         distance = torch.where(self.moved[row], self.closed_form[row], distance)
@@ -150,6 +162,18 @@ def _odds(found: Residuals) -> float:
     wrong = found.unexplained_share if wrong is None else wrong
     low, high = BETTER
     return min(max((1.0 - wrong) / max(wrong, 1.0 / high), low), high)
+
+
+def _between(
+    fit: Float[Tensor, "H W"], mean: Float[Tensor, "H W"], step: Float[Tensor, "H W"]
+) -> Bool[Tensor, "H W"]:
+    """Where the mean has a step within 3x3 pixels, and the fit is between its two sides: there a
+    pixel is a mixture of two surfaces, which has no distance of its own.
+    """
+    pool = torch.nn.functional.max_pool2d
+    high = pool(mean[None], 3, stride=1, padding=1)[0]
+    low = -pool(-mean[None], 3, stride=1, padding=1)[0]
+    return (high - low > step) & (fit >= low) & (fit <= high)
 
 
 def _enlarged(images: np.ndarray, sequence: Sequence) -> np.ndarray:

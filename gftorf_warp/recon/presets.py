@@ -94,7 +94,7 @@ def best(recorded: Recorded = Recorded()) -> ReconSettings:
         weights=Weights(
             ssim=0.2, distortion=3e-3, colour=1.0 if recorded.input == Input.PHASOR else 0.0
         ),
-        schedule=Schedule(images=6000, batch=Batch.QUARTET),
+        schedule=Schedule(images=4000, batch=Batch.QUARTET),
         densify=DensifySettings(every=None),
         background=0.3,
         fallback=True,
