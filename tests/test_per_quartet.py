@@ -7,9 +7,7 @@ import torch
 from moving_box import FOCAL, STEP, as_phasors, recording, seen, turned
 from sequences import changed
 
-from gftorf_warp.errors import InputError, UsageError
-from gftorf_warp.recon import presets
-from gftorf_warp.recon.train import reconstruct
+from gftorf_warp.errors import InputError
 from gftorf_warp.scene.background import background
 from gftorf_warp.scene.initialise import from_quartets
 from gftorf_warp.scene.measured import camera_of, change_of
@@ -64,27 +62,13 @@ def test_phasors_have_moving_points_too():
         assert torch.isfinite(found.velocity).all()
 
 
-def test_a_moving_camera_is_refused_and_best_avoids_it():
-    """Pixels are compared over time; the preset has nodes there instead."""
-    still = recording(frames=12)[0]
+def test_a_moving_camera_is_refused():
+    """Pixels are compared over time."""
     poses = np.stack([turned(0.1 * n) for n in range(12)])
-    sequence = changed(still, camera_from_world=poses)
+    sequence = changed(recording(frames=12)[0], camera_from_world=poses)
     with pytest.raises(InputError, match="the camera moves") as caught:
         from_quartets(sequence)
     assert "--preset best" in caught.value.fix
-    settings = presets.preset("best", presets.Recorded(camera_moves=True))
-    assert (settings.init.kind, settings.motion.kind) == ("phase", "nodes")
-    assert settings.fallback
-
-
-@pytest.mark.parametrize(
-    "change", ["motion.kind=nodes", "init.kind=phase", "init.kind=random", "weights.flow=1e-3"]
-)
-def test_windows_and_their_start_belong_together(change, tmp_path):
-    """Neither works without the other, and flow has nothing to follow."""
-    with pytest.raises(UsageError, match="does not fit"):
-        reconstruct(recording(frames=8)[0], tmp_path / "run", changes=[change], images=4)
-    assert not (tmp_path / "run").exists()
 
 
 def _pixels(mean):
