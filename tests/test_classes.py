@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from gftorf_warp.evaluate.classes import class_errors, class_of_pixels, near_steps
+from gftorf_warp.data.steps import near_steps
+from gftorf_warp.evaluate.classes import class_errors, class_of_pixels
 
 NAN = float("nan")
 

@@ -1,9 +1,5 @@
-"""Errors by what the truth looks like around a pixel: edges, and slopes of surfaces.
-
-A step of the truth lies between two neighbouring pixels whose distances differ by more than
-``STEP_M`` from each other and from the continuation of the surface on either side; a slope, however
-steep, is no step. Pixels within ``EDGE_PX`` of a step are *edge*, all others *interior*, which the
-slope of the truth divides further.
+"""Errors by what the truth looks like around a pixel: near a step (see data/steps.py) it is *edge*,
+elsewhere *interior*, which the slope of the truth divides further.
 """
 
 from __future__ import annotations
@@ -13,10 +9,9 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from ..data.steps import near_steps
 from .metrics import DISTANCES, ERROR_UNIT
 
-STEP_M = 0.1  # [m] twice the change that counts as motion
-EDGE_PX = 1.5  # [px] from a step: two pixels on either side of it
 SLOPES = (0.01, 0.02, 0.04)  # [m/px] bounds of the classes of slope
 EDGE = "edge"
 OF_SLOPE = ("slope_0_10", "slope_10_20", "slope_20_40", "slope_over_40")  # [mm/px]
@@ -36,33 +31,6 @@ def class_of_pixels(truth: Float[np.ndarray, "S H W"]) -> UInt8[np.ndarray, "S H
         label += slope >= bound
     label[edge] = 0
     return label
-
-
-def near_steps(truth: Float[np.ndarray, "S H W"]) -> Bool[np.ndarray, "S H W"]:
-    """Pixels within ``EDGE_PX`` of the middle between two pixels with a step between them."""
-    beside = np.zeros(truth.shape, dtype=bool)
-    for axis in (1, 2):
-        along, marked = (np.moveaxis(array, axis, -1) for array in (truth, beside))
-        step = _steps(along)
-        marked[..., :-1] |= step
-        marked[..., 1:] |= step
-    near = beside.copy()
-    near[:, 1:] |= beside[:, :-1]
-    near[:, :-1] |= beside[:, 1:]
-    near[..., 1:] |= beside[..., :-1]
-    near[..., :-1] |= beside[..., 1:]
-    return near
-
-
-def _steps(distance: Float[np.ndarray, "*n w"]) -> Bool[np.ndarray, "*n w-1"]:
-    """Whether there is a step between each pixel of a row and the next."""
-    change = np.diff(distance, axis=-1)
-    with np.errstate(invalid="ignore"):  # comparisons with unknown truth are false
-        bend = np.abs(np.diff(change, axis=-1)) <= STEP_M
-        step = np.abs(change) > STEP_M
-    step[..., :-1] &= ~bend
-    step[..., 1:] &= ~bend
-    return step
 
 
 def class_errors(

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from .. import __version__
+from ..data import steps
 from ..data.decode import unambiguous_range
 from ..data.files import atomic_write, write_json
 from ..data.read import read, read_truth
@@ -205,8 +206,8 @@ def _errors(judgement: Judgement | None) -> dict[str, object]:
             for name, mask in zip(GROUPS, (moving, static, judgement.throughout), strict=True)
         },
         "classes": {
-            "step_m": classes.STEP_M,
-            "edge_px": classes.EDGE_PX,
+            "step_m": steps.STEP_M,
+            "edge_px": steps.EDGE_PX,
             **classes.class_errors(errors, judgement.truth, moving, static),
         },
     }

@@ -1,8 +1,8 @@
 """What the terms of a report mean, as HTML."""
 
+from ..data.steps import EDGE_PX, STEP_M
 from ..data.truth import MOVING_M
 from ..recon.residuals import CHI_SQUARE_MAX, MODEL_ERROR
-from .classes import EDGE_PX, STEP_M
 
 TO_READ = f"""
 <dl>

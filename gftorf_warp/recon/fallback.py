@@ -3,19 +3,21 @@
 During a quartet, seen from the sequence's own camera, the rendered distance of a run gives way to
 
 * the *temporal mean* of all quartets that agree with their pixel's median, or else of a quartet and
-  the neighbours in time that measured the same, if the fit is more than two standard deviations of
-  that mean away. Beside a pixel that does not agree, an edge may be passing: there the fit stays if
-  it explains the quads as well as the mean does;
+  the neighbours in time that measured the same, if the fit is more than a few standard deviations
+  of that mean away. Beside a pixel that does not agree, an edge may be passing: there the fit stays
+  if it explains the quads as well as the mean does;
 * the *closed form* of the quartet where no other one measured the same, the fit does not explain
   its raw frames (see residuals.py), and one phasor explains them better: nothing moved within it.
-  Only if the fit failed as a whole: a good one is better at outlines, which no phasor explains.
+  What moved can look like one phasor by chance, at a distance that no neighbour has: there it has
+  to explain them still better.
 
 Along steps of the mean a pixel is a mixture of two surfaces, and the mean a distance between them:
 a fit between the two sides stays if it explains the quads.
 
-How much better is a matter of the odds that the fit is right where pixels change, from the share
-that it explains: a ratio of chi-squares, or twice the logarithm of the odds as a difference of
-their sums. Elsewhere the fit stays. A map of sources says which is which.
+How much is a matter of the odds that the fit is right, from the shares of pixels where residuals.py
+finds it wrong: a ratio of chi-squares, twice the logarithm of the odds as a difference of their
+sums, and its root in standard deviations. Elsewhere the fit stays. A map of sources says which is
+which.
 """
 
 from __future__ import annotations
@@ -32,6 +34,7 @@ from ..data import temporal
 from ..data.decode import closed_form_distance, quartet_phasors, unambiguous_range
 from ..data.noise import QuadNoise, amplitudes_of, quad_noise
 from ..data.sequence import Sequence
+from ..data.steps import STEP_M
 from ..render.api import Rendering
 from ..scene.camera import Camera
 from . import closed_form
@@ -39,11 +42,8 @@ from .residuals import Residuals
 
 SOURCES = ("fit", "temporal", "closed_form")
 """Names of the values 0, 1, 2 of a map of sources."""
-STAYS = 2.0  # [standard deviations of the temporal mean] within which the fit stays
-BETTER = (1.5, 50.0)  # [1] range of the ratio of chi-square of the fit to that of one phasor
+ODDS = (1.5, 1000.0)  # [1] range of the odds: no fit is worse than a guess, and none is sure
 SAME_TURN = 0.125  # [unambiguous ranges] the fit may know the turn if it is so near to the mean
-FAILED = 0.1  # [1] share of all pixels unexplained, from which a fit failed as a whole
-STEP = 0.1  # [m] least step of the temporal mean, besides noise, beside which pixels are mixtures
 TIME_S = 1e-6  # [s] outside of a quartet that still count as inside
 
 
@@ -57,8 +57,8 @@ class Fallback:
     """The camera of raw frame 0."""
     temporal: Float[Tensor, "Q H W"]
     """Distance of the temporal mean [m], in [0, range)."""
-    sigma: Float[Tensor, "Q H W"]
-    """Its standard deviation [m]."""
+    stays: Float[Tensor, "Q H W"]
+    """How far from it the fit may be [m]: a few of its standard deviations."""
     rests: Bool[Tensor, "Q H W"]
     """Where it may replace the fit."""
     closed_form: Float[Tensor, "Q H W"]
@@ -89,17 +89,29 @@ class Fallback:
         explained = _enlarged(~found.unexplained, sequence)
         chi_square = _enlarged(found.chi_square, sequence)
         agrees, averaged = temporal.agreement(sequence), temporal.averaged(sequence)
-        beside = _beside(~agrees)
-        of_mean = _chi_square(sequence, temporal.stacked_quads(averaged), noise)
+        local, count = temporal.averaged_locally(sequence)
+        quads = np.where(
+            agrees[:, None], temporal.stacked_quads(averaged), temporal.stacked_quads(local)
+        )
+        quartets = sequence.complete_quartets
+        mean = np.where(
+            agrees,
+            np.stack([closed_form_distance(averaged, i) for i in quartets]),
+            np.stack([closed_form_distance(local, i) for i in quartets]),
+        )
+        of_mean = _chi_square(sequence, quads, noise)
         of_phasor = _chi_square(sequence, _phasor_quads(sequence), noise)
         of_phasor *= sequence.cycle / (sequence.cycle - 2.0)  # two unknowns
-        odds = _odds(found)
-        fit_stays = beside & (chi_square <= of_mean + 2.0 * math.log(odds) / sequence.cycle)
-        local, count = temporal.averaged_locally(sequence)
-        moved = ~agrees & (count == 1) & ~explained & (chi_square > odds * of_phasor)
-        moved &= found.unexplained_share > FAILED
+        odds = _odds(found.changing_unexplained_share, found)
+        margin = 2.0 * math.log(odds) / sequence.cycle
+        fit_stays = agrees & _beside(~agrees) & (chi_square <= of_mean + margin)
+        alone = np.stack([closed_form_distance(sequence, i) for i in quartets])
+        needed = np.where(_supported(alone), odds, odds**2)
+        moved = (
+            ~agrees & (count == 1) & ~explained & (chi_square > needed * np.maximum(of_phasor, 1.0))
+        )
         count = np.where(agrees, agrees.sum(axis=0), count)
-        quartets = sequence.complete_quartets
+        stays = math.sqrt(2.0 * math.log(_odds(found.contradicted_share, found)))
 
         def tensor(image: np.ndarray) -> Tensor:
             kind = torch.bool if image.dtype == bool else torch.float32
@@ -108,16 +120,10 @@ class Fallback:
         return cls(
             sequence=sequence,
             camera=camera,
-            temporal=tensor(
-                np.where(
-                    agrees,
-                    np.stack([closed_form_distance(averaged, i) for i in quartets]),
-                    np.stack([closed_form_distance(local, i) for i in quartets]),
-                )
-            ),
-            sigma=tensor(temporal.sigma_of_mean(sequence, noise, count)),
-            rests=tensor(np.where(agrees, ~fit_stays, count > 1)),
-            closed_form=tensor(np.stack([closed_form_distance(sequence, i) for i in quartets])),
+            temporal=tensor(mean),
+            stays=tensor(stays * temporal.sigma_of_mean(sequence, noise, count)),
+            rests=tensor((count > 1) & ~fit_stays),
+            closed_form=tensor(alone),
             moved=tensor(moved),
             explained=tensor(explained),
         )
@@ -133,8 +139,8 @@ class Fallback:
             return replace(rendering, source=torch.zeros_like(fit, dtype=torch.uint8))
         mean, reach = self.temporal[row], unambiguous_range(self.sequence)
         apart = torch.remainder(fit - mean + 0.5 * reach, reach) - 0.5 * reach
-        averaged = self.rests[row] & ~(apart.abs() <= STAYS * self.sigma[row])
-        between = _between(fit, mean, STEP + 4.0 * self.sigma[row])
+        averaged = self.rests[row] & ~(apart.abs() <= self.stays[row])
+        between = _between(fit, mean, STEP_M + 2.0 * self.stays[row])
         averaged &= ~(between & self.explained[row])
         value = torch.where(apart.abs() < SAME_TURN * reach, fit - apart, mean)
         distance = torch.where(averaged, value, fit)
@@ -156,11 +162,10 @@ class Fallback:
         return self.sequence.complete_quartets.index(quartet)
 
 
-def _odds(found: Residuals) -> float:
-    """Odds that the fit is right where pixels change, within the range ``BETTER`` [1]."""
-    wrong = found.changing_unexplained_share
+def _odds(wrong: float | None, found: Residuals) -> float:
+    """Odds [1] that the fit is right, from a share of pixels where it is wrong; None: of all."""
     wrong = found.unexplained_share if wrong is None else wrong
-    low, high = BETTER
+    low, high = ODDS
     return min(max((1.0 - wrong) / max(wrong, 1.0 / high), low), high)
 
 
@@ -191,6 +196,14 @@ def _beside(mask: Bool[np.ndarray, "Q H W"]) -> Bool[np.ndarray, "Q H W"]:
     grown[..., 1:] |= mask[..., :-1]
     grown[..., :-1] |= mask[..., 1:]
     return grown
+
+
+def _supported(distance: Float[np.ndarray, "Q H W"]) -> Bool[np.ndarray, "Q H W"]:
+    """Whether a distance [m] is that of its surroundings: within a step of the median of 3x3."""
+    import cv2
+
+    medians = [cv2.medianBlur(image.astype(np.float32), 3) for image in distance]
+    return np.abs(distance - np.stack(medians)) <= STEP_M
 
 
 def _chi_square(
