@@ -42,7 +42,7 @@ def fallback_of(measured, quads):
         n = round(time * FRAME_RATE_HZ)
         same = torch.as_tensor(np.stack([quads[n]] * 4), dtype=torch.float32)
         phasor = torch.stack([*phasor_from_quads(same, CANONICAL_SHIFTS), same[0]])
-        return SimpleNamespace(quads=same, phasor=phasor, distance=same[0])
+        return SimpleNamespace(quads=same, phasor=phasor, distance=torch.as_tensor(seen(n)[0]))
 
     run = SimpleNamespace(
         config={},
