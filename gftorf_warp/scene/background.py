@@ -12,7 +12,15 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from ..data.sequence import Sequence
-from .measured import Change, FarLayer, decoded_phasors, distance_noise, fill, sensor_of
+from .measured import (
+    ROUNDING,
+    Change,
+    FarLayer,
+    decoded_phasors,
+    distance_noise,
+    fill,
+    sensor_of,
+)
 from .unwrap import distance_from_phasors
 
 WITHIN = 3.5  # [standard deviations] radius of a cluster, per component
@@ -30,7 +38,8 @@ def background(sequence: Sequence, change: Change) -> FarLayer:
     phasors = decoded_phasors(sequence, change.quartets)  # [f, J, 2, H, W]
     count = phasors.shape[1]
     values = phasors.transpose(0, 1).flatten(1, 2)  # [J, 2 f, H, W]
-    noise = max(2.0**0.5 * change.noise, 1e-12)  # of one component of a phasor
+    # of one component of a phasor
+    noise = max(2.0**0.5 * change.noise, ROUNDING * float(values.abs().max()), 1e-12)
     radius = WITHIN * noise * (2.0 * values.shape[1]) ** 0.5
     least = min(max(LEAST, round(SHARE * count)), count)
 

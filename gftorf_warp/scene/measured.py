@@ -22,6 +22,7 @@ from .sensor import Sensor, phasor_from_quads
 from .unwrap import distance_from_phasors
 
 CHANGED = 2.5  # [standard deviations] least change of quads, pooled over slots and 3x3 pixels
+ROUNDING = 1e-5  # least noise of quads, as a share of the largest amplitude: single precision
 DISTANCE_TRUSTED = 0.15  # [m] largest noise of a distance that is used
 
 

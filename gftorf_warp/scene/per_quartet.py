@@ -18,7 +18,15 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..data.sequence import Sequence
-from .measured import Change, FarLayer, camera_of, distance_noise, sensor_of
+from .measured import (
+    ROUNDING,
+    Change,
+    FarLayer,
+    camera_of,
+    distance_noise,
+    key_times,
+    sensor_of,
+)
 from .tracks import unproject
 from .unwrap import distance_from_phasors
 
@@ -39,14 +47,14 @@ RADIAL_MAX = 0.5  # [m] largest change of distance from one quartet to the next
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MovingPoints:
-    """P points of moving surfaces in the middle of one quartet."""
+    """P points of moving surfaces in the middle between the starts of a quartet and of the next."""
 
     quartet: int
     """Its number."""
     mean: Float[Tensor, "P 3"]
     """Positions in the world [m]."""
     distance: Float[Tensor, "P"]
-    """Distance from the camera [m]."""
+    """Distance from the camera at the mean time of the raw frames [m]."""
     amplitude: Float[Tensor, "P"]
     """Amplitude [quad units]."""
     velocity: Float[Tensor, "P 3"]
@@ -56,7 +64,11 @@ class MovingPoints:
 def moving_points(
     sequence: Sequence, change: Change, background: FarLayer, spacing: float
 ) -> Iterator[MovingPoints]:
-    """The points, ``spacing`` pixels apart, of every complete quartet of a static camera."""
+    """The points, ``spacing`` pixels apart, of every complete quartet of a static camera; nothing
+    if there is one alone, in which nothing can be seen to change.
+    """
+    if len(change.quartets) < 2:
+        return
     quads = _quads_of(sequence, background)
 
     def decoded(quartet: int) -> _Decoded:
@@ -65,6 +77,7 @@ def moving_points(
     with ThreadPoolExecutor(thread_name_prefix="gftorf-points") as threads:
         by_quartet = dict(zip(change.quartets, threads.map(decoded, change.quartets), strict=True))
     camera, size = camera_of(sequence, 0), (sequence.width, sequence.height)
+    keys = key_times(sequence).tolist()
     columns, rows = (
         (np.arange(count := max(round(side / spacing), 1)) + 0.5) * (side / count) for side in size
     )
@@ -77,8 +90,14 @@ def moving_points(
         along = _radial(by_quartet, quartet, place, flow, distance)
         values = (place, flow, distance, along, now.amplitude[row, column])
         at, step, near, nearer, amplitude = (torch.as_tensor(v).float() for v in values)
+        # raw frames are taken at the beginning of each period, so their mean time is before the
+        # middle of the quartet, which ends where the next one begins
+        begin, finish = keys[quartet : quartet + 2]
+        measured_at = float(sequence.times[sequence.quartet_frames(quartet)].mean())
+        late = (0.5 * (begin + finish) - measured_at) / (finish - begin)
         start, middle, end = (
-            unproject(camera, at + s * step, near + s * nearer) for s in (-0.5, 0.0, 0.5)
+            unproject(camera, at + s * step, near + s * nearer)
+            for s in (late - 0.5, late, late + 0.5)
         )
         yield MovingPoints(
             quartet=quartet, mean=middle, distance=near, amplitude=amplitude, velocity=end - start
@@ -123,7 +142,8 @@ def _decoded(
 
     frames = sequence.quartet_frames(quartet)
     quads = sequence.quads[frames].astype(np.float32)
-    noise, shape = max(change.noise, 1e-12), quads.shape[1:]
+    least = max(ROUNDING * float(background.amplitude.max()), 1e-12)
+    noise, shape = max(change.noise, least), quads.shape[1:]
     differs = _pooled(np.square((quads - background_quads) / noise), POOL_DIFFERENCE)
     changed = ((differs > DIFFERS).sum(axis=0) > 1).astype(np.uint8)
     box = _box(cv2.medianBlur(changed, 3), margin=round(REACH * sequence.width) + POOL)
@@ -138,7 +158,7 @@ def _decoded(
     best = _Best()
     slots = _Slots.of(sequence, quartet)
     images = np.stack([quads, differs], axis=1)[..., box[0], box[1]]
-    for candidate, translated in _flows(sequence, quartet):
+    for candidate, translated in _flows(sequence, quartet, slots):
         flow = candidate[:, box[0], box[1]]
         along = np.stack(
             [_sampled(i, share * flow) for i, share in zip(images, slots.share, strict=True)]
@@ -190,6 +210,18 @@ class _Slots:
     groups: list[tuple[Bool[np.ndarray, "K"], Float[np.ndarray, "k m"]]]
     """Raw frames of each frequency, and their model: quads = model @ (re, im, perhaps constant)."""
 
+    @property
+    def free(self) -> int:
+        """Degrees of freedom of the residual of :meth:`phasors`."""
+        return sum(model.shape[0] - model.shape[1] for _, model in self.groups)
+
+    @property
+    def decide(self) -> bool:
+        """Whether one flow may explain the raw frames better than another: not those of three
+        shifts, nor those of a phasor, which have one time.
+        """
+        return self.free > 0 and bool(self.share.any())
+
     @classmethod
     def of(cls, sequence: Sequence, quartet: int) -> _Slots:
         frames = sequence.quartet_frames(quartet)
@@ -203,42 +235,54 @@ class _Slots:
             if constant or mask.sum() == 3:
                 columns.append(np.ones(mask.sum()))
             groups.append((mask, np.stack(columns, axis=1).astype(np.float32)))
-        share = (times - times.mean()) / duration if duration > 0.0 else np.zeros(len(times))
+        at_once = np.zeros(len(times))
+        share = at_once if sequence.from_phasors else (times - times.mean()) / duration
         return cls(share=share, groups=groups)
 
     def phasors(
         self, quads: Float[np.ndarray, "K H W"]
     ) -> tuple[Float[np.ndarray, "f 2 H W"], Float[np.ndarray, "H W"]]:
-        """Phasors by least squares, and the mean squared residual per degree of freedom."""
-        phasors, squares, free = [], np.zeros(quads.shape[1:], np.float32), 0
+        """Phasors by least squares, and the mean squared residual per degree of freedom, zero if
+        there is none.
+        """
+        phasors, squares = [], np.zeros(quads.shape[1:], np.float32)
         for mask, model in self.groups:
             values = quads[mask]
             fitted = np.tensordot(np.linalg.pinv(model), values, axes=1)
-            squares += np.square(values - np.tensordot(model, fitted, axes=1)).sum(axis=0)
-            free += model.shape[0] - model.shape[1]
+            if model.shape[0] > model.shape[1]:
+                squares += np.square(values - np.tensordot(model, fitted, axes=1)).sum(axis=0)
             phasors.append(2.0 * fitted[:2])
-        return np.stack(phasors), squares / max(free, 1)
+        return np.stack(phasors), squares / max(self.free, 1)
 
 
-def _flows(sequence: Sequence, quartet: int) -> Iterator[tuple[Float[np.ndarray, "2 H W"], bool]]:
+def _flows(
+    sequence: Sequence, quartet: int, slots: _Slots
+) -> Iterator[tuple[Float[np.ndarray, "2 H W"], bool]]:
     """Candidates of the displacement during a quartet of what is there in its middle, and whether
     each is a translation of the whole image: no motion, optical flow between the starts of
     neighbouring quartets, and translations.
+
+    No motion comes after optical flow if the raw frames fit every flow equally well.
     """
     cycle, size = sequence.cycle, (2, sequence.height, sequence.width)
     forward, backward = sequence.flow.forward, sequence.flow.backward
-    yield np.zeros(size, np.float32), False
-    # flow from the start of a quartet, its sign, and by how much that start is before the middle
-    for flows, step, sign, early in (
-        (forward, 0, 1.0, 0.5),
-        (backward, 1, -1.0, -0.5),
-        (backward, 0, -1.0, 0.5),
-        (forward, -1, 1.0, 1.5),
+    still = np.zeros(size, np.float32)
+    if slots.decide:
+        yield still, False
+    middle = 0.5 if slots.share.any() else 0.0  # phasors are those of the start
+    # flow from the start of a quartet, and its sign
+    for flows, step, sign in (
+        (forward, 0, 1.0),
+        (backward, 1, -1.0),
+        (backward, 0, -1.0),
+        (forward, -1, 1.0),
     ):
         if cycle * (quartet + step) in flows:
             flow = sign * np.nan_to_num(flows[cycle * (quartet + step)]).astype(np.float32)
-            yield _sampled(flow, -early * flow), False
+            yield _sampled(flow, (step - middle) * flow), False
             yield flow, False
+    if not slots.decide:
+        yield still, False
     pitch = max(REACH * sequence.width / STEPS, 1.0)
     grid = np.arange(-STEPS, STEPS + 1)
     for y in grid:
