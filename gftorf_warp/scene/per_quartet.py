@@ -288,7 +288,7 @@ def _flows(
     for y in grid:
         for x in grid:
             if 0 < np.hypot(x, y) <= STEPS + 0.5:
-                translation = np.float32([pitch * x, pitch * y])[:, None, None]
+                translation = np.array([pitch * x, pitch * y], np.float32)[:, None, None]
                 yield np.broadcast_to(translation, size), True
 
 
@@ -343,6 +343,12 @@ def _sampled(
 
     height, width = images.shape[1:]
     x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
-    at = (x + shift[0]).astype(np.float32), (y + shift[1]).astype(np.float32)
-    how = {"interpolation": cv2.INTER_LINEAR, "borderMode": cv2.BORDER_REPLICATE}
-    return np.stack([cv2.remap(image.astype(np.float32), *at, **how) for image in images])
+    x, y = (x + shift[0]).astype(np.float32), (y + shift[1]).astype(np.float32)
+    return np.stack(
+        [
+            cv2.remap(
+                image.astype(np.float32), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+            )
+            for image in images
+        ]
+    )
