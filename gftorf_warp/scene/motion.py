@@ -25,7 +25,7 @@ from itertools import pairwise
 from typing import Any, ClassVar, NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
 from .gaussians import GaussianField
@@ -361,8 +361,8 @@ def interpolated(motion: KeyMotion, rows: Sequence[int], weights: Sequence[float
 
 
 def rows_of(
-    table: Float[Tensor, "T *n"], keys: Sequence[int] | Int[Tensor, "K"]
-) -> Float[Tensor, "K *n"]:
+    table: Shaped[Tensor, "T *n"], keys: Sequence[int] | Int[Tensor, "K"]
+) -> Shaped[Tensor, "K *n"]:
     """Rows of a table by their indices, without a synchronisation or upload."""
     if isinstance(keys, Tensor):
         return table.index_select(0, keys)
