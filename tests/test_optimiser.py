@@ -1,17 +1,21 @@
 """Learning rates along a run, and what is stored of Adam."""
 
 import dataclasses
+import math
 from dataclasses import replace
 from io import BytesIO
 
 import pytest
 import torch
-from small_runs import KEYS, field, random, same
+from comparison import DEVICES
+from small_runs import KEYS, advance, demo, field, random, same, small
 
 from gftorf_warp.recon import presets
+from gftorf_warp.recon.observations import observe
 from gftorf_warp.recon.optimiser import BETAS, STORED, Optimiser, betas_of, rates_at
 from gftorf_warp.recon.presets import Recorded
 from gftorf_warp.recon.settings import Batch, BatchRule, Input, Rates, ReconSettings, Schedule
+from gftorf_warp.recon.state import begin
 from gftorf_warp.scene.motion import Nodes, Still
 
 RATES = Rates(
@@ -175,3 +179,20 @@ def test_moments_are_zero_at_first_and_can_be_forgotten():
     again.forget_motion()
     assert not any(moment.any() for moment in again.moments_of(again.motion[0]))
     assert again.moments_of(again.tensors["quaternion"])[1].any()
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_scales_stay_below_their_limit(device):
+    """After every step, those of the start included; without a limit they do not."""
+    found = {}
+    for limit in (None, 0.05):
+        settings = demo(scale_max=limit)
+        observations = observe(small(), settings, device)
+        state = begin(observations, settings, seed=0, device=device)
+        advance(state, observations, settings, 3)
+        found[limit] = state.optimiser.field.log_scale.detach()
+    assert (found[None] > math.log(0.05)).any()
+    assert found[0.05].max().item() == pytest.approx(math.log(0.05))
+    assert (found[0.05] < math.log(0.05) - 1e-3).any()
+    with pytest.raises(ValueError, match="scale_max must be above 0"):
+        demo(scale_max=0.0)

@@ -266,6 +266,8 @@ class ReconSettings:
     """Lengths and intervals."""
     densify: DensifySettings = field(default_factory=DensifySettings)
     """The number of Gaussians."""
+    scale_max: float | None = None
+    """Largest scale of a Gaussian along any of its axes, kept after every step [m]; None: any."""
     background: float = 1.0
     """Amplitude B of the random background, uniform in [-B, B]; 0 is black."""
     motion_gradient_max: float | None = 1.0
@@ -283,6 +285,8 @@ class ReconSettings:
     """Restarts of collapsed random starts, and reinitialisations of a dead network, at most."""
 
     def __post_init__(self):
+        if self.scale_max is not None and not self.scale_max > 0:
+            raise ValueError(f"scale_max must be above 0 or None, got {self.scale_max}")
         if self.motion.kind not in KINDS:
             raise ValueError(
                 f"motion.kind must be one of {', '.join(KINDS)}, got {self.motion.kind!r}"

@@ -6,6 +6,7 @@ everything that changes from step to step from the control block.
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -121,6 +122,8 @@ class Step:
                 betas=self.betas,
                 epsilon=EPSILON,
             )
+            if self.settings.scale_max is not None:
+                self.padded.values["log_scale"].clamp_(max=math.log(self.settings.scale_max))
             screens = [image.screen for image in images if image.screen is not None]
             if screens:
                 camera = self.renderer.cameras[primary(key.images[0])]
