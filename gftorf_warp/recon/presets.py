@@ -96,6 +96,7 @@ def best(recorded: Recorded = Recorded()) -> ReconSettings:
         ),
         schedule=Schedule(images=4000, batch=Batch.QUARTET),
         densify=DensifySettings(every=None),
+        scale_max=0.05 * recorded.scene_scale,  # where the paper prunes (section 6.6)
         background=0.3,
         fallback=True,
     )
