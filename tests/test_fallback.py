@@ -55,9 +55,10 @@ def fallback_of(measured, quads):
 
 def rendering(distance):
     """A rendering of a distance [H, W] that is nine tenths opaque."""
-    distance, none = torch.as_tensor(distance, dtype=torch.float32), torch.zeros(0)
-    parts = {"quads": none, "phasor": none, "colour": None, "distortion": none, "extra": None}
-    parts |= {"distance_median": none, "opacity": torch.full_like(distance, 0.9)}
+    distance = torch.as_tensor(distance, dtype=torch.float32)
+    none, flat = torch.zeros(0, *distance.shape), torch.zeros(0, distance.shape[1])
+    parts = {"quads": none, "phasor": none, "colour": None, "distortion": flat, "extra": None}
+    parts |= {"distance_median": flat, "opacity": torch.full_like(distance, 0.9)}
     return Rendering(**parts, distance=distance, screen=None)
 
 

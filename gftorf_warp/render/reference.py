@@ -361,7 +361,7 @@ def correlate(
     return torch.cat([quads, phasor], -1)
 
 
-def _normalised(d: Float[Tensor, "M"], settings: RenderSettings) -> Float[Tensor, "M"]:
+def _normalised(d: Float[Tensor, "*n"], settings: RenderSettings) -> Float[Tensor, "*n"]:
     """The released code's zeta: 0 at the near plane, 1 at the far plane, of the distance."""
     return settings.far / (settings.far - settings.near) * (1.0 - settings.near / d)
 
