@@ -79,7 +79,7 @@ def warp_back(
     image: Float[np.ndarray, "H W"], flow: Float[np.ndarray, "2 H W"]
 ) -> Float[np.ndarray, "H W"]:
     """A later frame brought back to the earlier one: its value at x + flow(x), bilinear."""
-    return _sample(image[None], flow, np.float32(1.0))[0]
+    return sample(image[None], flow)[0]
 
 
 def _matcher(method: Method) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
@@ -116,7 +116,7 @@ def _grey(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 def _consistent(flow: np.ndarray, back: np.ndarray) -> np.ndarray:
     """The flow with NaN where following it and then ``back`` does not return to the start."""
-    gap = flow + _sample(back, flow, np.float32(1.0))
+    gap = flow + sample(back, flow)
     return np.where(np.hypot(*gap) > CONSISTENCY_PX, np.float32(np.nan), flow)
 
 
@@ -134,7 +134,7 @@ def median_flow(
     for m in range(n - abs(step) + 1, n + abs(step)):
         apart = times[m] - times[n] if m in raw else math.inf
         if m != n and abs(apart) <= apart_max:
-            votes.append(_sample(reliable[m], raw[n], np.float32(apart / duration)))
+            votes.append(sample(reliable[m], raw[n], apart / duration))
     stack = np.stack(votes)
     known = np.isfinite(stack[:, 0]).sum(axis=0)
     filled = np.where(known > 0, stack, np.float32(0.0))  # a median of nothing would warn
@@ -142,11 +142,11 @@ def median_flow(
     return median.astype(np.float32)
 
 
-def _sample(image: np.ndarray, flow: np.ndarray, factor: np.float32) -> np.ndarray:
+def sample(image: np.ndarray, flow: np.ndarray, factor: float = 1.0) -> np.ndarray:
     """Channels [C, H, W] at x + factor * flow(x), bilinear, edges repeated; NaN spreads."""
     import cv2
 
     y, x = np.indices(flow.shape[1:], dtype=np.float32)
-    at = x + factor * flow[0], y + factor * flow[1]
+    at = x + np.float32(factor) * flow[0], y + np.float32(factor) * flow[1]
     repeated = cv2.BORDER_REPLICATE
     return np.stack([cv2.remap(c, *at, cv2.INTER_LINEAR, borderMode=repeated) for c in image])

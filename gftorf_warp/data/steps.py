@@ -21,12 +21,17 @@ def near_steps(truth: Float[np.ndarray, "S H W"]) -> Bool[np.ndarray, "S H W"]:
         step = _steps(along)
         marked[..., :-1] |= step
         marked[..., 1:] |= step
-    near = beside.copy()
-    near[:, 1:] |= beside[:, :-1]
-    near[:, :-1] |= beside[:, 1:]
-    near[..., 1:] |= beside[..., :-1]
-    near[..., :-1] |= beside[..., 1:]
-    return near
+    return grown(beside)
+
+
+def grown(mask: Bool[np.ndarray, "S H W"]) -> Bool[np.ndarray, "S H W"]:
+    """The mask and its four neighbours in the image."""
+    result = mask.copy()
+    result[:, 1:] |= mask[:, :-1]
+    result[:, :-1] |= mask[:, 1:]
+    result[..., 1:] |= mask[..., :-1]
+    result[..., :-1] |= mask[..., 1:]
+    return result
 
 
 def _steps(distance: Float[np.ndarray, "*n w"]) -> Bool[np.ndarray, "*n w-1"]:

@@ -23,7 +23,7 @@ from ..errors import InputError, UsageError
 from ..render.api import Rendering
 from ..scene.camera import Camera
 from ..scene.gaussians import GaussianField, constant_sh
-from ..scene.sensor import channel_of
+from ..scene.sensor import channel_of, quad_from_phasor
 
 POSE_TOLERANCE = 1e-6  # [m], [1] poses are stored as float32 at worst
 
@@ -162,7 +162,5 @@ def quads_of(
     slots = [channel_of(sequence.shifts[frames].tolist(), shift) for shift in shifts]
     if any(slot is None for slot in slots) or len(frames) != len(slots):
         constant = sequence.calibration.dc_offset * np.hypot(re, im)
-        return np.stack(
-            [0.5 * (re * math.cos(shift) + im * math.sin(shift) + constant) for shift in shifts]
-        )
+        return np.stack([quad_from_phasor(re, im, constant, shift) for shift in shifts])
     return np.stack([sequence.quads[frames[slot]] for slot in slots if slot is not None])

@@ -34,9 +34,11 @@ from ..data import temporal
 from ..data.decode import closed_form_distance, quartet_phasors, unambiguous_range
 from ..data.noise import QuadNoise, amplitudes_of, quad_noise
 from ..data.sequence import Sequence
-from ..data.steps import STEP_M
+from ..data.steps import STEP_M, grown
 from ..render.api import Rendering
 from ..scene.camera import Camera
+from ..scene.measured import extremes
+from ..scene.sensor import quad_from_phasor
 from . import closed_form
 from .residuals import Residuals
 
@@ -104,7 +106,7 @@ class Fallback:
         of_phasor *= sequence.cycle / (sequence.cycle - 2.0)  # two unknowns
         odds = _odds(found.changing_unexplained_share, found)
         margin = 2.0 * math.log(odds) / sequence.cycle
-        fit_stays = agrees & _beside(~agrees) & (chi_square <= of_mean + margin)
+        fit_stays = agrees & grown(~agrees) & (chi_square <= of_mean + margin)
         alone = np.stack([closed_form_distance(sequence, i) for i in quartets])
         needed = np.where(_supported(alone), odds, odds**2)
         moved = (
@@ -175,9 +177,7 @@ def _between(
     """Where the mean has a step within 3x3 pixels, and the fit is between its two sides: there a
     pixel is a mixture of two surfaces, which has no distance of its own.
     """
-    pool = torch.nn.functional.max_pool2d
-    high = pool(mean[None], 3, stride=1, padding=1)[0]
-    low = -pool(-mean[None], 3, stride=1, padding=1)[0]
+    low, high = extremes(mean)
     return (high - low > step) & (fit >= low) & (fit <= high)
 
 
@@ -186,16 +186,6 @@ def _enlarged(images: np.ndarray, sequence: Sequence) -> np.ndarray:
     rows = np.arange(sequence.height) * images.shape[1] // sequence.height
     columns = np.arange(sequence.width) * images.shape[2] // sequence.width
     return images[:, rows[:, None], columns]
-
-
-def _beside(mask: Bool[np.ndarray, "Q H W"]) -> Bool[np.ndarray, "Q H W"]:
-    """The mask and its four neighbours in the image."""
-    grown = mask.copy()
-    grown[:, 1:] |= mask[:, :-1]
-    grown[:, :-1] |= mask[:, 1:]
-    grown[..., 1:] |= mask[..., :-1]
-    grown[..., :-1] |= mask[..., 1:]
-    return grown
 
 
 def _supported(distance: Float[np.ndarray, "Q H W"]) -> Bool[np.ndarray, "Q H W"]:
@@ -224,6 +214,5 @@ def _phasor_quads(sequence: Sequence) -> Float[np.ndarray, "Q K H W"]:
             constant = sequence.calibration.dc_offset * np.hypot(re, im)
             for n in frames:
                 shift = float(sequence.shifts[n])
-                wave = re * math.cos(shift) + im * math.sin(shift)
-                quads[n - sequence.cycle * i] = 0.5 * (wave + constant)
+                quads[n - sequence.cycle * i] = quad_from_phasor(re, im, constant, shift)
     return result

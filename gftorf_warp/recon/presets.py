@@ -13,9 +13,10 @@ from dataclasses import dataclass, replace
 
 from ..data.decode import unambiguous_range
 from ..data.sequence import Sequence
+from ..data.temporal import camera_rests
 from ..errors import UsageError
 from ..render.buffers import ClampGradient, Distortion, RenderSettings, SplatDistance, Stop, Support
-from ..scene.initialise import Init, InitSettings, camera_moves
+from ..scene.initialise import Init, InitSettings
 from ..scene.motion import MotionSettings, Products
 from ..scene.network import Network
 from .settings import (
@@ -49,7 +50,7 @@ class Recorded:
         return cls(
             input=wanted,
             unambiguous_range=unambiguous_range(sequence),
-            camera_moves=camera_moves(sequence),
+            camera_moves=not camera_rests(sequence),
         )
 
     @property

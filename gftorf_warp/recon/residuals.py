@@ -11,7 +11,6 @@ surfaces, and a few per cent of the amplitude are a few centimetres.
 from __future__ import annotations
 
 import logging
-import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -29,7 +28,7 @@ from ..data.sequence import Sequence
 from ..errors import InputError
 from ..render.api import Rendering
 from ..scene.camera import Camera
-from ..scene.sensor import Sensor, channel_of
+from ..scene.sensor import Sensor, channel_of, quad_from_phasor
 from .observations import reduced
 from .settings import Method
 
@@ -267,4 +266,4 @@ def quad_of_shift(rendering: Rendering, sensor: Sensor, shift: float) -> Tensor:
     if channel is not None:
         return rendering.quads[channel]
     re, im, amplitude = rendering.phasor
-    return 0.5 * (re * math.cos(shift) + im * math.sin(shift) + sensor.dc_offset * amplitude)
+    return quad_from_phasor(re, im, sensor.dc_offset * amplitude, shift)

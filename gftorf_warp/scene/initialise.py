@@ -18,6 +18,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..data.sequence import Sequence
+from ..data.steps import STEP_M
+from ..data.temporal import camera_rests
 from ..errors import InputError
 from .background import background
 from .camera import CHECKED, Camera
@@ -31,6 +33,7 @@ from .measured import (
     change_of,
     decode_along_flow,
     distance_noise,
+    extremes,
     far_layer,
     flow_at,
     key_times,
@@ -39,8 +42,6 @@ from .per_quartet import moving_points
 from .tracks import follow, unproject
 
 STATIC, MOVING = 0, 1  # labels of the two layers
-RESTS = 1e-6  # largest difference of the elements of the poses of a static camera
-STEP = 0.1  # [m] least step of the distance, besides noise
 EXACT_TREE = 4  # OpenCV's constant for an exact k-d tree
 
 
@@ -97,11 +98,6 @@ class Start:
     """Displacements of the moving Gaussians during their quartet [m]; None: unknown."""
 
 
-def camera_moves(sequence: Sequence) -> bool:
-    """Whether raw frames have different poses."""
-    return bool(abs(sequence.camera_from_world - sequence.camera_from_world[:1]).max() > RESTS)
-
-
 def from_phase(sequence: Sequence, settings: InitSettings = InitSettings()) -> Start:
     """A static and a moving layer from decoded quads.
 
@@ -109,7 +105,7 @@ def from_phase(sequence: Sequence, settings: InitSettings = InitSettings()) -> S
         InputError: If no quartet is complete.
     """
     _needs_quartet(sequence)
-    if camera_moves(sequence):
+    if not camera_rests(sequence):
         return _from_views(sequence, settings)
     change = change_of(sequence)
     far = far_layer(sequence, change)
@@ -141,7 +137,7 @@ def from_quartets(sequence: Sequence, settings: InitSettings = InitSettings()) -
         InputError: If no quartet is complete, or the camera moves.
     """
     _needs_quartet(sequence)
-    if camera_moves(sequence):
+    if not camera_rests(sequence):
         raise InputError(
             "the camera moves",
             where=sequence.path or "sequence",
@@ -168,7 +164,7 @@ def _static_parts(
 ) -> list[GaussianField]:
     """Static Gaussians: on a grid where the distance is smooth, on a finer one along its steps."""
     noise = distance_noise(far.amplitude, change.noise, sequence) / len(change.quartets) ** 0.5
-    step, parts = _near_steps(far.distance, STEP + 4.0 * noise), []
+    step, parts = _near_steps(far.distance, STEP_M + 4.0 * noise), []
     camera = camera_of(sequence, 0)
     for spacing, wanted in ((settings.static_spacing, ~step), (settings.edge_spacing, step)):
         points = _grid(sequence.width, sequence.height, spacing).flatten(0, 1)
@@ -183,12 +179,8 @@ def _static_parts(
 
 def _near_steps(distance: Float[Tensor, "H W"], least: Float[Tensor, "H W"]) -> Bool[Tensor, "H W"]:
     """Pixels at most two from a step of the distance of at least ``least`` [m] within 3x3."""
-
-    def largest(image: Tensor) -> Tensor:
-        return torch.nn.functional.max_pool2d(image[None], 3, stride=1, padding=1)[0]
-
-    step = largest(distance) + largest(-distance) > least
-    return largest(step.float()) > 0
+    low, high = extremes(distance)
+    return extremes((high - low > least).float())[1] > 0
 
 
 def _from_views(sequence: Sequence, settings: InitSettings) -> Start:

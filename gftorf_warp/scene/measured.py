@@ -255,6 +255,12 @@ def decoded_phasors(sequence: Sequence, quartets: Iterable[int]) -> Float[Tensor
     return torch.as_tensor(np.stack(phasors, axis=1), dtype=torch.float32)
 
 
+def extremes(image: Float[Tensor, "H W"]) -> tuple[Float[Tensor, "H W"], Float[Tensor, "H W"]]:
+    """Smallest and largest value within 3x3 pixels."""
+    both = torch.nn.functional.max_pool2d(torch.stack([-image, image]), 3, stride=1, padding=1)
+    return -both[0], both[1]
+
+
 def fill(image: Float[Tensor, "C H W"], known: Bool[Tensor, "H W"]) -> Float[Tensor, "C H W"]:
     """Replace unknown pixels by the mean of known neighbours, ring by ring, else by zero."""
     weight = known.to(image)[None]

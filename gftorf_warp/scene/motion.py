@@ -322,10 +322,7 @@ class Nodes(Motion):
             return weight
         apart = torch.cdist(field.mean.detach(), self.node)
         apart = apart.masked_fill(field.layer[:, None] != self.layer, torch.inf)
-        near, index = apart.topk(count, dim=1, largest=False)
-        farthest = near.masked_fill(near.isinf(), 0.0).amax(dim=1, keepdim=True)
-        near_weight = torch.softmax(-2.0 * (near / farthest.clamp_min(1e-9)).square(), dim=1)
-        return weight.scatter(1, index, near_weight.masked_fill(near.isinf(), 0.0))
+        return weight.scatter(1, *node_weights(apart, count))
 
     def at_keys(
         self, binding: Float[Tensor, "N M"], keys: Sequence[int] | Int[Tensor, "K"]
@@ -346,6 +343,16 @@ class Nodes(Motion):
         made = cls(*start, neighbours=stored["neighbours"])
         made.load_state_dict(tensors)
         return made
+
+
+def node_weights(
+    apart: Float[Tensor, "N M"], count: int
+) -> tuple[Int[Tensor, "N k"], Float[Tensor, "N k"]]:
+    """Nearest nodes and their weights from the distances to M nodes [m]; infinite: not this one."""
+    near, index = apart.topk(min(count, apart.shape[1]), dim=1, largest=False)
+    farthest = near.masked_fill(near.isinf(), 0.0).amax(dim=1, keepdim=True)
+    weight = torch.softmax(-2.0 * (near / farthest.clamp_min(1e-9)).square(), dim=1)
+    return index, weight.masked_fill(near.isinf(), 0.0)
 
 
 def interpolated(motion: KeyMotion, rows: Sequence[int], weights: Sequence[float]) -> Displacement:

@@ -17,6 +17,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from ..data.flow import sample
 from ..data.sequence import Sequence
 from .measured import (
     ROUNDING,
@@ -27,6 +28,7 @@ from .measured import (
     key_times,
     sensor_of,
 )
+from .sensor import quad_from_phasor
 from .tracks import unproject
 from .unwrap import distance_from_phasors
 
@@ -125,8 +127,10 @@ def _quads_of(sequence: Sequence, background: FarLayer) -> Float[np.ndarray, "K 
     quads = []
     for shift, f in zip(sequence.shifts[slots], sequence.frame_frequencies[slots], strict=True):
         slope = float(sensor.phase_slope) * float(f) / sequence.frequencies[0]
-        phase = slope * distance + float(sensor.phase_offset) - shift
-        quads.append(amplitude * (np.cos(phase) + float(sensor.dc_offset)))
+        phase = slope * distance + float(sensor.phase_offset)
+        re, im = 2.0 * amplitude * np.cos(phase), 2.0 * amplitude * np.sin(phase)
+        constant = 2.0 * amplitude * float(sensor.dc_offset)
+        quads.append(quad_from_phasor(re, im, constant, float(shift)))
     return np.stack(quads).astype(np.float32)
 
 
@@ -161,7 +165,7 @@ def _decoded(
     for candidate, translated in _flows(sequence, quartet, slots):
         flow = candidate[:, box[0], box[1]]
         along = np.stack(
-            [_sampled(i, share * flow) for i, share in zip(images, slots.share, strict=True)]
+            [sample(i, flow, share) for i, share in zip(images, slots.share, strict=True)]
         )
         phasors, squares = slots.phasors(along[:, 0])
         amplitude = 0.5 * np.hypot(*phasors[0])
@@ -279,7 +283,7 @@ def _flows(
     ):
         if cycle * (quartet + step) in flows:
             flow = sign * np.nan_to_num(flows[cycle * (quartet + step)]).astype(np.float32)
-            yield _sampled(flow, (step - middle) * flow), False
+            yield sample(flow, flow, step - middle), False
             yield flow, False
     if not slots.decide:
         yield still, False
@@ -333,22 +337,3 @@ def _pooled(images: Float[np.ndarray, "C H W"], side: int) -> Float[np.ndarray, 
     import cv2
 
     return np.stack([cv2.blur(i, (side, side), borderType=cv2.BORDER_REPLICATE) for i in images])
-
-
-def _sampled(
-    images: Float[np.ndarray, "C H W"], shift: Float[np.ndarray, "2 H W"]
-) -> Float[np.ndarray, "C H W"]:
-    """Values at x + shift(x), bilinear, repeated beyond the border."""
-    import cv2
-
-    height, width = images.shape[1:]
-    x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
-    x, y = (x + shift[0]).astype(np.float32), (y + shift[1]).astype(np.float32)
-    return np.stack(
-        [
-            cv2.remap(
-                image.astype(np.float32), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-            )
-            for image in images
-        ]
-    )

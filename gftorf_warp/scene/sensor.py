@@ -15,7 +15,7 @@ import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -25,6 +25,8 @@ from ..constants import CANONICAL_SHIFTS, FRAME_RATE_HZ, SPEED_OF_LIGHT
 from ..data.cycles import SAME_RAD, solution
 from .pattern import Pattern
 from .waveform import peak
+
+T = TypeVar("T", np.ndarray, Tensor)
 
 Scalar = float | Tensor
 EVEN = SAME_RAD  # [1] means of exp(i theta), exp(2 i theta) of equally spaced shifts are below
@@ -245,6 +247,11 @@ def phasor_from_quads(quads: Tensor, shifts: tuple[float, ...] | Tensor) -> tupl
         return re, im
     factor = 4.0 / len(theta)
     return factor * (quads * theta.cos()).sum(0), factor * (quads * theta.sin()).sum(0)
+
+
+def quad_from_phasor(re: T, im: T, constant: T, shift: float) -> T:
+    """Quad of one shift [rad] of a phasor; ``constant`` is dc_offset times its length."""
+    return 0.5 * (re * math.cos(shift) + im * math.sin(shift) + constant)
 
 
 def _evenly(shifts: np.ndarray) -> bool:

@@ -27,7 +27,16 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from .gaussians import GaussianField
-from .motion import KeyMotion, Keys, Motion, MotionSettings, MotionStart, farthest_points, rows_of
+from .motion import (
+    KeyMotion,
+    Keys,
+    Motion,
+    MotionSettings,
+    MotionStart,
+    farthest_points,
+    node_weights,
+    rows_of,
+)
 
 # displacement per axis of Gaussians outside their window [m]: beyond the far plane or beside the
 # image for every camera
@@ -97,13 +106,15 @@ class Windows(Motion):
         label = field.layer
         if label is None or count == 0:
             return field.mean.new_zeros(len(field), 1)
-        apart = torch.cdist(field.mean.detach(), self.node)
-        apart = apart.masked_fill(label[:, None] != self.label, torch.inf)
-        near, index = apart.topk(count, dim=1, largest=False)
-        farthest = near.masked_fill(near.isinf(), 0.0).amax(dim=1, keepdim=True)
-        weight = torch.softmax(-2.0 * (near / farthest.clamp_min(1e-9)).square(), dim=1)
-        weight = weight.masked_fill(near.isinf(), 0.0)
-        return torch.cat([label[:, None].to(weight), index.to(weight), weight], dim=1)
+        index = field.mean.new_zeros(len(field), count)
+        weight = torch.zeros_like(index)
+        for number in self.label.unique().tolist():  # all pairs of all windows would take too much
+            rows, own = ((each == number).nonzero()[:, 0] for each in (label, self.label))
+            apart = torch.cdist(field.mean.detach()[rows], self.node[own])
+            nearest, share = node_weights(apart, count)
+            index[rows, : share.shape[1]] = own[nearest].to(index)
+            weight[rows, : share.shape[1]] = share
+        return torch.cat([label[:, None].to(weight), index, weight], dim=1)
 
     def at_keys(
         self, binding: Float[Tensor, "N columns"], keys: Sequence[int] | Int[Tensor, "K"]
