@@ -231,6 +231,18 @@ def _render(options: argparse.Namespace) -> int:
     return 0
 
 
+def _export(options: argparse.Namespace) -> int:
+    device = start(options)
+    from .export.command import export
+    from .recon.run import Run
+
+    given = _named(options, "out", "formats", "times", "every", "colour", "fresh")
+    progress = functools.partial(_progress(options), unit="files")
+    for path in export(Run.open(options.run_folder, device), **given, progress=progress):
+        print(path)
+    return 0
+
+
 def _compare(options: argparse.Namespace) -> int:
     import json
 
@@ -277,7 +289,17 @@ def _bench(options: argparse.Namespace) -> int:
 
 COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
     command.__name__[1:]: command
-    for command in (_demo, _simulate, _reconstruct, _render, _compare, _check, _doctor, _bench)
+    for command in (
+        _demo,
+        _simulate,
+        _reconstruct,
+        _render,
+        _export,
+        _compare,
+        _check,
+        _doctor,
+        _bench,
+    )
 }
 
 

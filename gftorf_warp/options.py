@@ -206,6 +206,19 @@ def command_parsers() -> dict[str, Parser]:
     _device_options(render)
     render.flag("--fresh", FRESH)
 
+    export = Parser.of("export", "write a reconstruction in the formats of other programs")
+    export.add_argument("run_folder", metavar="RUN", help="folder of the reconstruction")
+    export.option("--out", "DIR", str, "folder to write", required=True)
+    formats = "any of ply (ply)"
+    export.option("--format", "A,B", _list_of(str), formats, ["ply"], dest="formats")
+    moments = "seconds since raw frame 0 (each instant of the sequence)"
+    export.option("--times", "S,S", _list_of(_number), moments)
+    export.option("--every", "N", _positive, "every N-th instant of the sequence (1)", 1)
+    colours = "of splats and points (colour if the run has any)"
+    export.option("--colour", "colour|reflectivity", str, colours)
+    _device_options(export)
+    export.flag("--fresh", FRESH)
+
     compare = Parser.of("compare", "score a reconstruction against the truth and write a report")
     compare.add_argument("run_folder", metavar="RUN", help="folder of the reconstruction")
     compare.option("--truth", "SEQ", str, "sequence with the true distance (the reconstructed one)")
@@ -243,7 +256,7 @@ def command_parsers() -> dict[str, Parser]:
     bench.change("--set", f"change one setting {where} (may be repeated)", "set")
     _device_options(bench)
 
-    parsers = (demo, simulate, reconstruct, render, compare, check, doctor, bench)
+    parsers = (demo, simulate, reconstruct, render, export, compare, check, doctor, bench)
     return {parser.prog.split()[-1]: parser for parser in parsers}
 
 

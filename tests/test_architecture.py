@@ -43,6 +43,7 @@ TABLE = {
     "sim": ({"data", "kernels", "render", "scene"}, TORCH | {"trimesh"}),
     "recon": ({"data", "losses", "render", "scene"}, TORCH | {"cv2"}),
     "evaluate": ({"data", "losses", "recon", "render", "scene"}, TORCH | {"cv2"}),
+    "export": ({"data", "evaluate", "recon", "render", "scene"}, TORCH | {"cv2", "trimesh"}),
     "bench": ({"data", "evaluate", "recon", "render", "scene", "sim"}, TORCH | {"warp"}),
 }
 FREE = {"constants", "errors", "__version__"}

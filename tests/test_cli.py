@@ -121,6 +121,7 @@ def test_help_names_every_command(capsys):
         "simulate",
         "reconstruct",
         "render",
+        "export",
         "compare",
         "check",
         "doctor",
@@ -177,6 +178,7 @@ def test_module_and_script_are_the_same():
         ),
         ("render RUN --out DIR --times 0.1,0.2", "times", [0.1, 0.2]),
         ("render RUN --out DIR", "times", None),
+        ("export RUN --out DIR --format ply --every 2", "formats", ["ply"]),
         ("compare RUN --truth SEQ --json", "truth", "SEQ"),
         ("compare --json RUN", "run_folder", "RUN"),
         ("check SEQ", "sequence", "SEQ"),
@@ -462,6 +464,17 @@ def test_render_writes_what_was_asked_for(run, tmp_path, capsys):
     fails([*arguments, "--arrays"], 2, capsys, str(out_folder), "--fresh")
     assert cli.main([*arguments, "--arrays", "--fresh"]) == 0
     assert np.load(out_folder / "quads" / "quad_180.npy").shape[0] == 2
+
+
+def test_export_prints_what_it_wrote(run, tmp_path, capsys):
+    """A folder per format; a second one is refused."""
+    out_folder = tmp_path / "exported"
+    arguments = ["export", str(run), "--out", str(out_folder), "--times", "0.0,0.021"]
+    assert cli.main([*arguments, "--device", "cpu"]) == 0
+    out, _ = lines_of(capsys)
+    assert out == [str(out_folder / "ply")]
+    assert len(list((out_folder / "ply").glob("frame_*.ply"))) == 2
+    fails(arguments, 2, capsys, "--fresh")
 
 
 def test_compare_prints_a_table_or_json(run, sequence, capsys):

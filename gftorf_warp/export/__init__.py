@@ -1,0 +1,1 @@
+"""A finished run as files for other programs; one file of this package per format."""

@@ -1,0 +1,119 @@
+"""``gftorf export``: which formats there are, and where their files go."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from ..data.files import as_errors, atomic_folder
+from ..errors import UsageError
+from ..recon.folder import set_aside
+from ..recon.run import Run
+from . import splats
+from .moments import Moments, Progress
+
+COLOURS = ("colour", "reflectivity")
+
+
+class Format(NamedTuple):
+    """A kind of files."""
+
+    target: str
+    """Folder or file below the output folder."""
+    write: Callable[..., Any]
+    """Fills the new folder, or makes the file: called with moments, path and progress."""
+    coloured: bool = False
+    """Whether it also takes ``colour``."""
+
+
+FORMATS = {
+    "ply": Format("ply", splats.write, coloured=True),
+}
+
+
+def export(
+    run: Run,
+    out: str | Path,
+    formats: str | Iterable[str] = ("ply",),
+    *,
+    times: Iterable[float] | None = None,
+    every: int = 1,
+    colour: str | None = None,
+    fresh: bool = False,
+    progress: Callable[[str], Progress] | None = None,
+) -> list[Path]:
+    """Write a finished run in the formats of other programs, see docs/export.md.
+
+    Args:
+        run: A finished reconstruction whose sequence can be read.
+        out: Folder, made if absent. Each format has a folder or file of its own in it, which
+            appears when it is complete.
+        formats: Names out of ``FORMATS``, or one text, separated by commas.
+        times: Seconds since raw frame 0; None: all instants of the sequence.
+        every: Every n-th instant of the sequence.
+        colour: What splats and points are coloured by: ``colour`` or ``reflectivity``; None: the
+            first of the two that the run has.
+        fresh: Whether to move what an earlier export wrote to ``out/old-<k>``.
+        progress: Makes a function of (done, in all) for a format.
+
+    Returns:
+        The folder or file of each format.
+
+    Raises:
+        UsageError: If a format or colour is unknown, the run lacks it, or its files exist.
+        InputError: If the sequence cannot be read.
+        ResourceError: If the disk is full.
+    """
+    names, out = checked(formats), Path(out)
+    if colour is not None and colour not in COLOURS:
+        why = f"expected {' or '.join(COLOURS)}"
+        raise UsageError(f"unknown colour {colour!r}", where="--colour", why=why, fix=why)
+    moments = Moments.of(run, times, every)
+    shown = colour or COLOURS[0 if moments.has_colour else 1]
+    targets = [out / FORMATS[name].target for name in names]
+    prepare(out, targets, fresh=fresh)
+    for name, target in zip(names, targets, strict=True):
+        kind = FORMATS[name]
+        write = functools.partial(kind.write, **{"colour": shown} if kind.coloured else {})
+        step = progress(name) if progress else lambda *_: None
+        if target.suffix:
+            write(moments, target, step)
+        else:
+            with atomic_folder(target) as folder:
+                write(moments, folder, step)
+    return targets
+
+
+def checked(formats: str | Iterable[str]) -> list[str]:
+    """Valid names without repetition.
+
+    Raises:
+        UsageError: If a name is unknown, or there is none.
+    """
+    words = formats.split(",") if isinstance(formats, str) else formats
+    names = [*dict.fromkeys(word.strip() for word in words if word.strip())]
+    unknown = [name for name in names if name not in FORMATS]
+    if unknown or not names:
+        what = f"cannot export {', '.join(map(repr, unknown)) or 'nothing'}"
+        why = f"expected formats out of {', '.join(FORMATS)}, separated by commas"
+        raise UsageError(what, where="--format", why=why, fix="use, for example, --format ply")
+    return names
+
+
+def prepare(out: Path, targets: list[Path], *, fresh: bool) -> None:
+    """Make the output folder; move earlier targets aside if ``fresh``.
+
+    Raises:
+        UsageError: If one exists and ``fresh`` is not set, or the folder is a file.
+    """
+    held = [target for target in targets if target.exists()]
+    if held and not fresh:
+        why = "an earlier export wrote it"
+        fix = "choose another --out, or --fresh, which moves it aside"
+        raise UsageError("nothing is overwritten", where=held[0], why=why, fix=fix)
+    with as_errors(out):
+        out.mkdir(parents=True, exist_ok=True)
+        if held:
+            set_aside(out, held)
