@@ -263,6 +263,30 @@ def _check(options: argparse.Namespace) -> int:
     return 0
 
 
+def _import(options: argparse.Namespace) -> int:
+    from .importers import command
+
+    if options.list:
+        for kind in command.KINDS.values():
+            print(f"{kind.name:<12}{kind.about}")
+        return 0
+    if options.kind is not None and options.template:
+        print(command.template_of(options.kind, options.out), end="" if not options.out else "\n")
+        return 0
+    needed = {"KIND": options.kind, "SRC": options.source}
+    needed |= {} if options.dry_run else {"--out SEQ": options.out}
+    missing = [name for name, value in needed.items() if value is None]
+    if missing:
+        fix = "for example `gftorf import arrays quads --config quads.toml --out sequence`; "
+        fix += "`gftorf import --list` shows the kinds"
+        why, where = "it is needed", "gftorf import"
+        raise UsageError(f"{' and '.join(missing)} missing", where=where, why=why, fix=fix)
+    out = None if options.dry_run else options.out
+    lines = command.import_recording(options.kind, options.source, out, options.config)
+    print("\n".join(lines))
+    return 0
+
+
 def _doctor(options: argparse.Namespace) -> int:
     from .doctor import doctor
 
@@ -292,11 +316,12 @@ COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
     for command in (
         _demo,
         _simulate,
+        _import,
+        _check,
         _reconstruct,
         _render,
         _export,
         _compare,
-        _check,
         _doctor,
         _bench,
     )

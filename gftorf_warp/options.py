@@ -233,6 +233,17 @@ def command_parsers() -> dict[str, Parser]:
     check = Parser.of("check", contents)
     check.add_argument("sequence", metavar="SEQ", help="folder of the sequence")
 
+    importer = Parser.of("import", "write the recording of another camera or program as a capture")
+    kind = "kind of recording, --list shows them"
+    importer.add_argument("kind", metavar="KIND", nargs="?", help=kind)
+    importer.add_argument("source", metavar="SRC", nargs="?", help="its file or folder")
+    importer.flag("--list", "list the kinds")
+    importer.option("--out", "SEQ", str, "folder to write; with --template a file")
+    config = "TOML file with what the recording does not say itself"
+    importer.option("--config", "FILE.toml", str, config)
+    importer.flag("--template", "print such a file with comments, or write it to --out")
+    importer.flag("--dry-run", "print what would be read and how, and write nothing")
+
     doctor = Parser.of(
         "doctor", "print versions and devices, and test the renderer on this machine"
     )
@@ -256,7 +267,7 @@ def command_parsers() -> dict[str, Parser]:
     bench.change("--set", f"change one setting {where} (may be repeated)", "set")
     _device_options(bench)
 
-    parsers = (demo, simulate, reconstruct, render, export, compare, check, doctor, bench)
+    parsers = (demo, simulate, importer, check, reconstruct, render, export, compare, doctor, bench)
     return {parser.prog.split()[-1]: parser for parser in parsers}
 
 

@@ -37,6 +37,7 @@ TABLE = {
     "errors.py": (set(), set()),
     "kernels": (set(), {"warp"}),
     "data": (set(), {"OpenEXR", "cv2", "jaxtyping", "numpy"}),
+    "importers": ({"data"}, {"cv2", "jaxtyping", "numpy"}),
     "scene": ({"data"}, TORCH | {"cv2"}),
     "render": ({"kernels", "scene"}, TORCH | {"warp"}),
     "losses": ({"render"}, TORCH),

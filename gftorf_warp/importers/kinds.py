@@ -1,0 +1,45 @@
+"""The kinds of recordings that ``gftorf import`` reads."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from . import sequence_folders
+from .imported import Imported
+from .keys import Key, Settings
+
+
+@dataclass(frozen=True, kw_only=True)
+class Kind:
+    """One kind of recording."""
+
+    name: str
+    """Name on the command line."""
+    about: str
+    """What it reads, in a line."""
+    read: Callable[[Path, Settings], Imported]
+    """Reads a file or folder with the values of the keys. A reader that finds the source is not
+    what it should be raises an InputError, and it asks for keys by ``settings.require``."""
+    keys: tuple[Key, ...] = ()
+    """Keys of its TOML file."""
+
+
+KINDS = {
+    kind.name: kind
+    for kind in (
+        Kind(
+            name="ftorf",
+            about="an F-ToeRF folder of raw quads, with its truth",
+            read=sequence_folders.read_ftorf,
+            keys=sequence_folders.KEYS,
+        ),
+        Kind(
+            name="torf",
+            about="a ToeRF folder of phasors, with its truth",
+            read=sequence_folders.read_torf,
+            keys=sequence_folders.KEYS,
+        ),
+    )
+}
