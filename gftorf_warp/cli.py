@@ -21,6 +21,7 @@ from .options import parse
 from .process import available_cpus, exit_at_once, on_cpus, open_cuda, without_garbage_collection
 
 if TYPE_CHECKING:
+    from .recon.run import Run
     from .sim.scene import Scene
 
 
@@ -220,12 +221,8 @@ def _reconstruct(options: argparse.Namespace) -> int:
 def _render(options: argparse.Namespace) -> int:
     device = start(options)
     from .evaluate.views import render_to_folder
-    from .recon.run import Run
 
-    run, progress = (
-        Run.open(options.run_folder, device),
-        _progress(options)("render", unit="images"),
-    )
+    run, progress = _opened(options, device), _progress(options)("render", unit="images")
     given = _named(options, "out", "what", "times", "poses", "fresh", "arrays")
     print(render_to_folder(run, **given, progress=progress))
     return 0
@@ -248,12 +245,19 @@ def _compare(options: argparse.Namespace) -> int:
 
     device = start(options)
     from .evaluate.compare import compare
-    from .recon.run import Run
 
-    run, progress = Run.open(options.run_folder, device), _progress(options)("compare")
+    run, progress = _opened(options, device), _progress(options)("compare")
     metrics = compare(run, **_named(options, "truth", "frames", "against"), progress=progress)
     print(json.dumps(metrics, indent=2) if options.json else table(metrics))
     return 0
+
+
+def _opened(options: argparse.Namespace, device: str) -> Run:
+    """The run of a command, with its sequence where --sequence says."""
+    from .recon.run import Run
+
+    run = Run.open(options.run_folder, device)
+    return run if options.sequence is None else run.linked(options.sequence)
 
 
 def _check(options: argparse.Namespace) -> int:

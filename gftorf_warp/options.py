@@ -12,6 +12,7 @@ from . import __version__
 from .errors import UsageError
 
 FRESH = "start over in a folder that is not empty"
+MOVED = "where the sequence of the run is now, if it was moved; RUN remembers it"
 THREADS = "CPU threads (as many as may be used)"
 
 
@@ -195,6 +196,7 @@ def command_parsers() -> dict[str, Parser]:
     render = Parser.of("render", "write images of a reconstruction at any time")
     render.add_argument("run_folder", metavar="RUN", help="folder of the reconstruction")
     render.option("--out", "DIR", str, "folder to write", required=True)
+    render.option("--sequence", "SEQ", str, MOVED)
     what = "any of distance,distance_median,quads,phasor,colour (distance)"
     render.option("--what", "A,B", _list_of(str), what, ["distance"])
     render.option("--times", "S,S", _list_of(_number), "seconds since raw frame 0 (each frame)")
@@ -221,6 +223,7 @@ def command_parsers() -> dict[str, Parser]:
 
     compare = Parser.of("compare", "score a reconstruction against the truth and write a report")
     compare.add_argument("run_folder", metavar="RUN", help="folder of the reconstruction")
+    compare.option("--sequence", "SEQ", str, MOVED)
     compare.option("--truth", "SEQ", str, "sequence with the true distance (the reconstructed one)")
     conventions = "geometry, or static-phasor, the closed form without motion and noise (geometry)"
     against = f"true distance: {conventions}"

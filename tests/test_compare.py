@@ -62,6 +62,7 @@ KEYS = {
     "d_fit_mse_x100",
     "source",
     "explained",
+    "caveats",
     "quad_psnr_db",
     "colour_psnr_db",
     "gaussians",

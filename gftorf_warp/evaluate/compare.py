@@ -25,8 +25,10 @@ from ..errors import InputError, UsageError
 from ..recon import residuals
 from . import classes, gallery, views
 from . import metrics as measure
+from .caveats import caveats
 from .panels import Findings, Judgement
 from .provenance import fact, method_of
+from .renders import stated_images
 
 if TYPE_CHECKING:
     from ..recon.run import Run
@@ -69,8 +71,8 @@ def compare(
         The content of metrics.json; None where there is no truth or no such pixel.
 
     Raises:
-        InputError: If the run or a sequence cannot be read, the truth does not fit, or no quartet
-            is complete.
+        InputError: If the run or a sequence cannot be read, the truth does not fit, no quartet
+            is complete, or the report is of a later state of the run.
         UsageError: If ``frames`` is unknown or leaves nothing, or ``against`` is unknown.
         DivergedError: If a rendering is not finite.
     """
@@ -81,6 +83,7 @@ def compare(
     if against not in AGAINST:
         why, fix = f"expected one of {', '.join(AGAINST)}", "use --against geometry"
         raise UsageError(f"unknown truth {against!r}", where="--against", why=why, fix=fix)
+    _refuse_earlier_state(run)
     sequence = run.sequence()
     known = fitting_truth(sequence, truth)
     scored = measure.scored_frames(sequence, frames)
@@ -93,10 +96,26 @@ def compare(
     )
     residuals.warn(found.residuals)
     result = summary(run, found, protocol=frames, against=against)
+    result["caveats"] = caveats(run.config, sequence, known)
     write_json(run.path / "metrics.json", result)
     if report:
         write_report(run, result, found)
     return result
+
+
+def _refuse_earlier_state(run: Run) -> None:
+    """Check that no report of a later state of the run would be replaced.
+
+    Raises:
+        InputError: If one would be.
+    """
+    path = run.path / "metrics.json"
+    reported = stated_images(path)
+    reached = run.config.get("images_optimised") or 0
+    if reported > reached:
+        why = f"it is of image {reported}, the newest readable checkpoint of image {reached}"
+        fix = "restore the checkpoint, or move metrics.json and report.html elsewhere"
+        raise InputError("the report is of a later state", where=path, why=why, fix=fix)
 
 
 def fitting_truth(sequence: Sequence, path: str | Path | None = None) -> Truth | None:

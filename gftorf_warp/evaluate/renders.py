@@ -6,6 +6,7 @@ import json
 import math
 from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -72,7 +73,7 @@ def named(name: str, images: Mapping[str, Float[np.ndarray, "..."]], sensor: Sen
     return dict(zip(names, images[name], strict=True))
 
 
-def prepare_folder(out: Path, listed: Mapping[str, object], *, fresh: bool) -> None:
+def prepare_folder(out: Path, listed: Mapping[str, Any], *, fresh: bool) -> None:
     """Prepare an output folder and write its ``renders.json``.
 
     Args:
@@ -89,17 +90,29 @@ def prepare_folder(out: Path, listed: Mapping[str, object], *, fresh: bool) -> N
         raise UsageError("not a folder", where=out, why="--out names a file", fix=fix)
     found = out.iterdir() if out.exists() else ()
     held = [path for path in found if not path.name.startswith("old-")]
-    if held and not _same(out / LIST, listed):
+    later = stated_images(out / LIST) > (listed.get("images_optimised") or 0)
+    if held and (later or not _same(out / LIST, listed)):
         ours = (out / LIST).is_file()
         if not (fresh and ours):
             why = f"it has no {LIST}: these are no images"
             if ours:
                 why = "it holds images of another run, or other times or poses"
+                if later:
+                    why = "it holds images of the run after more optimised images"
                 fix += ", or --fresh, which moves its content aside"
             raise UsageError("the folder is not empty", where=out, why=why, fix=fix)
         set_aside(out, held)
     out.mkdir(parents=True, exist_ok=True)
     write_json(out / LIST, listed)
+
+
+def stated_images(path: Path) -> int:
+    """Optimised images of the run that a metrics.json or renders.json is of; 0 if unknown."""
+    try:
+        found = json.loads(path.read_bytes()).get("images_optimised")
+    except (OSError, ValueError, AttributeError):
+        return 0
+    return found if isinstance(found, int) else 0
 
 
 def _same(path: Path, listed: Mapping[str, object]) -> bool:

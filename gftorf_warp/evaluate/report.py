@@ -112,10 +112,13 @@ def report(
 
 def verdict(metrics: Mapping[str, Any]) -> str:
     """The result in a few sentences of HTML, with the numbers of metrics.json."""
-    if not problems(metrics.get("explained")):
-        return _result(metrics)
-    warning = '<span class="naive">The fit does not explain what was measured</span>'
-    return f"{_result(metrics)} {warning}, see below."
+    text = _result(metrics)
+    if problems(metrics.get("explained")):
+        warning = '<span class="naive">The fit does not explain what was measured</span>'
+        text += f" {warning}, see below."
+    for caveat in metrics.get("caveats", ()):
+        text += f' <span class="naive">{page.escape(caveat)}</span>'
+    return text
 
 
 def _result(metrics: Mapping[str, Any]) -> str:

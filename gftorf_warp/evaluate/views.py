@@ -232,7 +232,9 @@ def render_to_folder(
     few = [taken[i] for i in sorted({0, len(taken) // 2, len(taken) - 1})]
     samples = list(series_of(render, few, run.sensor, names, kept=len(few)))
     out, channels = Path(out), {name: list(samples[0][name]) for name in names}
-    listed: dict[str, Any] = {"run": str(run.path), "times_s": seconds}
+    reached = run.config.get("images_optimised")
+    listed: dict[str, Any] = {"run": str(run.path), "images_optimised": reached}
+    listed["times_s"] = seconds
     taken_from = None
     if poses is not None:
         taken_from = [camera.camera_from_world.tolist() for camera in cameras]

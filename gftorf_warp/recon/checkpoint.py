@@ -6,8 +6,8 @@ from __future__ import annotations
 
 import hashlib
 import io
-import pickle
-import zipfile
+import logging
+import re
 from pathlib import Path
 
 import torch
@@ -16,6 +16,7 @@ from ..data.files import atomic_write, sweep
 from ..errors import InputError
 from .state import FORMAT
 
+LOG = logging.getLogger("gftorf_warp")
 KEPT = 2  # checkpoints in a run: the last one, and one before in case it is damaged later
 
 
@@ -40,7 +41,7 @@ def save(run: Path, stored: dict) -> Path:
     buffer = io.BytesIO()
     torch.save(stored, buffer)
     data = buffer.getvalue()
-    path = place / f"{int(stored['images']):010d}.pt"
+    path = place / f"{_name(int(stored['images']))}.pt"
     atomic_write(path, data)
     atomic_write(_sidecar(path), f"{hashlib.sha256(data).hexdigest()}  {path.name}\n".encode())
     _read(path)
@@ -61,15 +62,17 @@ def load(path: Path, device: torch.device | str = "cpu") -> dict:
     data = _read(path)
     try:
         stored = torch.load(io.BytesIO(data), map_location=device, weights_only=True)
-    except (pickle.UnpicklingError, RuntimeError, EOFError, zipfile.BadZipFile) as error:
+    except (MemoryError, torch.OutOfMemoryError):
+        raise
+    except Exception as error:  # damaged bytes raise nearly any
         raise InputError(
             "unsafe or unreadable checkpoint",
             where=path,
-            why=f"expected tensors and plain values only: {str(error).splitlines()[0]}",
+            why=f"expected tensors and plain values only, found {_foreign(error)}",
             fix="use a checkpoint of this run, or start over with --fresh",
         ) from error
     found = stored.get("format") if isinstance(stored, dict) else None
-    if not isinstance(found, int) or found > FORMAT:
+    if not isinstance(found, int) or found > FORMAT or not isinstance(stored.get("images"), int):
         raise InputError(
             "checkpoint of another format",
             where=path,
@@ -82,8 +85,11 @@ def load(path: Path, device: torch.device | str = "cpu") -> dict:
 def last(run: Path, device: torch.device | str = "cpu") -> dict | None:
     """The newest readable checkpoint of a run; None if it has none at all.
 
+    Newer ones that cannot be read are named in the log.
+
     Raises:
-        InputError: If there are checkpoints and none can be read.
+        InputError: If there are checkpoints and none can be read, or none but the start, in which
+            nothing is optimised yet.
     """
     paths = _paths(run)
     for stray in folder(run).glob(".*.tmp-*"):
@@ -91,17 +97,53 @@ def last(run: Path, device: torch.device | str = "cpu") -> dict | None:
     error: InputError | None = None
     for path in reversed(paths):
         try:
-            return load(path, device)
+            stored = load(path, device)
         except InputError as found:
+            LOG.warning("%s: %s: %s", found.where, found.what, found.why)
             error = error or found
+            continue
+        if error is not None:
+            _go_back(stored, error)
+        return stored
     if error is not None:
         raise error
     return None
 
 
+def after(run: Path, images: int) -> list[Path]:
+    """Checkpoints of more than so many optimised images, oldest first."""
+    return [path for path in _paths(run) if path.stem > _name(images)]
+
+
+def _go_back(stored: dict, error: InputError) -> None:
+    """Say that an earlier state takes the place of what ``error`` is about.
+
+    Raises:
+        InputError: If nothing was optimised in that state.
+    """
+    if not stored["images"]:
+        raise InputError(
+            error.what,
+            where=error.where,
+            why=f"{error.why}; before it there is only the start, in which nothing is optimised",
+            fix="restore the file from a copy, or start over with `gftorf reconstruct` and --fresh",
+        ) from error
+    LOG.warning("the checkpoint before it is used, of image %d", stored["images"])
+
+
+def _foreign(error: Exception) -> str:
+    """What torch found in a checkpoint instead of tensors and plain values, in our words."""
+    named = re.search(r"GLOBAL (\S+)", str(error))
+    return f"{named[1]}, which could run code" if named else "other content"
+
+
 def _paths(run: Path) -> list[Path]:
     """All checkpoints, oldest first."""
     return sorted(folder(run).glob("*.pt")) if folder(run).is_dir() else []
+
+
+def _name(images: int) -> str:
+    return f"{images:010d}"
 
 
 def _sidecar(path: Path) -> Path:
@@ -110,19 +152,17 @@ def _sidecar(path: Path) -> Path:
 
 def _read(path: Path) -> bytes:
     """Content of a checkpoint whose SHA-256 is right."""
-    data = path.read_bytes()
-    sidecar = _sidecar(path)
-    wanted = (
-        sidecar.read_text().split()[0]
-        if sidecar.is_file() and sidecar.stat().st_size
-        else "no sidecar"
-    )
+    fix = "restore it from a copy; without it the one before is used; or start over with --fresh"
+    if not path.is_file():
+        raise InputError("damaged checkpoint", where=path, why="it is no file", fix=fix)
+    sidecar, data = _sidecar(path), path.read_bytes()
+    stated = sidecar.read_bytes().split() if sidecar.is_file() else []
     found = hashlib.sha256(data).hexdigest()
+    if not stated:
+        why = f"{sidecar.name} beside it, which holds its SHA-256, is missing or empty"
+        raise InputError("damaged checkpoint", where=path, why=why, fix=fix)
+    wanted = stated[0].decode(errors="replace")
     if found != wanted:
-        raise InputError(
-            "damaged checkpoint",
-            where=path,
-            why=f"its SHA-256 is {found[:12]}..., its sidecar says {wanted[:12]}...",
-            fix="remove it: the one before is used; or start over with --fresh",
-        )
+        why = f"its SHA-256 is {found[:12]}..., {sidecar.name} beside it says {wanted[:12]}..."
+        raise InputError("damaged checkpoint", where=path, why=why, fix=fix)
     return data

@@ -29,6 +29,9 @@ from .stepper import Stepper
 LOG = logging.getLogger("gftorf_warp")
 SEED_STEP = 1_000_003  # between the seeds of restarts, far from seeds that are counted up
 Progress = Callable[..., None]
+LATE = (
+    0.9  # share of a run after which a checkpoint is due: short runs have no other before the end
+)
 SHOWN = {"loss": "loss", "psnr_db": "quad_psnr_db", "gaussians": "gaussians"}  # as progress
 
 
@@ -118,7 +121,7 @@ class TrainingLoop:
                     self.save(state)
                     LOG.info("interrupted at image %d of %d, stored", state.images, total)
                     raise KeyboardInterrupt
-                if self.saving_is_due and not failures:
+                if self.saving_is_due(before, state.images) and not failures:
                     self.save(state)
         self.save(state)
         return state
@@ -131,12 +134,15 @@ class TrainingLoop:
         """Whether anything but the next step is due."""
         every, total = self.settings.schedule.log_every, self.settings.schedule.images
         logged = after // every > before // every
-        return logged or self.diagnostics.due(before, after, total) or self.saving_is_due
+        diagnosed = self.diagnostics.due(before, after, total)
+        return logged or diagnosed or self.saving_is_due(before, after)
 
-    @property
-    def saving_is_due(self) -> bool:
-        """Whether the last checkpoint is old."""
-        return self.clock() - self.saved_at > self.settings.schedule.checkpoint_every_s
+    def saving_is_due(self, before: int, after: int) -> bool:
+        """Whether the last checkpoint is old, or the run is nearly over."""
+        schedule = self.settings.schedule
+        if before < math.ceil(LATE * schedule.images) <= after < schedule.images:
+            return True
+        return self.clock() - self.saved_at > schedule.checkpoint_every_s
 
     def save(self, state: State) -> None:
         """Write a checkpoint."""

@@ -19,7 +19,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..constants import CANONICAL_SHIFTS
-from ..data.read import read
 from ..data.sequence import Sequence
 from ..data.temporal import averaged
 from ..errors import InputError
@@ -33,7 +32,7 @@ from ..scene.distortion import Distortion as Lens
 from ..scene.gaussians import GaussianField
 from ..scene.motion import Motion, Still
 from ..scene.sensor import Sensor
-from . import checkpoint, closed_form
+from . import checkpoint, closed_form, source
 from .fallback import Fallback
 from .folder import read_config
 from .residuals import Residuals, residuals
@@ -91,6 +90,9 @@ class Run:
             )
         gaussians, motion, binding = field_and_motion(stored, device)
         reached = {"images_optimised": stored["images"], "seconds_reconstruct": stored["seconds"]}
+        damaged = [newer.name for newer in checkpoint.after(path, stored["images"])]
+        if damaged:
+            reached["damaged_checkpoints"] = damaged
         return cls(
             path=path,
             config=config | reached,  # of an interrupted run, config.json does not say
@@ -271,24 +273,21 @@ class Run:
         """The sequence it was made from, read again unless it is still in use.
 
         Raises:
-            InputError: If it was never on disk, or is gone.
+            InputError: If it was never on disk, is gone, cannot be read, or is another one by now.
         """
         if (held := self._held.get("sequence")) is not None:
             return held
-        source = self.config["sequence"]
-        if source is None:
-            raise InputError(
-                "the sequence is not on disk",
-                where=self.path,
-                why="the run was made from a sequence in memory",
-                fix="write the sequence with gftorf_warp.data.write.write and reconstruct from "
-                "the folder",
-            )
-        given = str(self.config.get("times") or "").startswith("setting")
-        self._held["sequence"] = sequence = read(
-            source, frame_rate_hz=self.config["frame_rate_hz"] if given else None
-        )
+        self._held["sequence"] = sequence = source.sequence_of(self.path, self.config)
         return sequence
+
+    def linked(self, sequence: str | Path) -> Run:
+        """The run with its sequence in another folder, which config.json then remembers.
+
+        Raises:
+            InputError: If the folder holds no sequence, or another one.
+            BusyError: If a process works on the run.
+        """
+        return replace(self, config=source.link(self.path, self.config, sequence))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

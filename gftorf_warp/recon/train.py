@@ -19,7 +19,7 @@ from ..errors import InputError, UsageError
 from ..scene.changes import Wording, changed
 from ..scene.initialise import Init
 from ..scene.windows import Windows
-from . import checkpoint, closed_form, folder, presets, residuals
+from . import checkpoint, closed_form, folder, presets, residuals, source
 from .config import config_of
 from .diagnostics import Diagnostics
 from .loop import Progress, TrainingLoop
@@ -180,6 +180,8 @@ def _run(sequence, out, settings, config, seed, device, goes_on, begun, progress
     stored = checkpoint.last(out, device) if goes_on else None
     total = settings.schedule.images
     if stored is not None and stored["images"] >= total:
+        if sequence.path is not None:  # it may have moved
+            source.remember(out, sequence.path)
         LOG.info("%s is finished: %d images", out, stored["images"])
         return
     observations = observe(sequence, settings, device)

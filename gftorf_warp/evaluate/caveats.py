@@ -1,0 +1,51 @@
+"""Caveats: what a reader of the numbers of a comparison has to know about its run and its truth."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from typing import Any
+
+from ..data.decode import unambiguous_range
+from ..data.sequence import Sequence, Truth
+from ..data.truth import known_distance
+
+LOG = logging.getLogger("gftorf_warp")
+
+
+def caveats(config: Mapping[str, Any], sequence: Sequence, truth: Truth | None) -> list[str]:
+    """Sentences for metrics.json and the report, which are logged as warnings; usually none.
+
+    Args:
+        config: Content of the run's config.json, with what :meth:`Run.open` adds.
+        sequence: What the run was made from.
+        truth: What it is scored against; None: unknown.
+    """
+    found = [_damaged(config), _beyond_range(sequence, truth)]
+    texts = [text for text in found if text]
+    for text in texts:
+        LOG.warning("%s", text)
+    return texts
+
+
+def _damaged(config: Mapping[str, Any]) -> str:
+    """About checkpoints that could not be read."""
+    damaged = config.get("damaged_checkpoints")
+    if not damaged:
+        return ""
+    state = f"image {config['images_optimised']} of {config['images']}"
+    return f"Damaged: {', '.join(damaged)}. This is the state of the checkpoint before, {state}."
+
+
+def _beyond_range(sequence: Sequence, truth: Truth | None) -> str:
+    """About true distances that the phase repeats."""
+    if truth is None:
+        return ""
+    distance, most = known_distance(truth), unambiguous_range(sequence)
+    share = float((distance > most).mean())  # NaN is not
+    if not share:
+        return ""
+    return (
+        f"{100 * share:.2g} % of the true distances lie beyond the unambiguous range of "
+        f"{most:.4g} m: distances that are decoded from quads are wrapped there."
+    )
