@@ -133,16 +133,13 @@ class TrainingLoop:
     def is_due(self, before: int, after: int) -> bool:
         """Whether anything but the next step is due."""
         every, total = self.settings.schedule.log_every, self.settings.schedule.images
-        logged = after // every > before // every
-        diagnosed = self.diagnostics.due(before, after, total)
-        return logged or diagnosed or self.saving_is_due(before, after)
+        noted = after // every > before // every or self.diagnostics.due(before, after, total)
+        return noted or self.saving_is_due(before, after)
 
     def saving_is_due(self, before: int, after: int) -> bool:
         """Whether the last checkpoint is old, or the run is nearly over."""
-        schedule = self.settings.schedule
-        if before < math.ceil(LATE * schedule.images) <= after < schedule.images:
-            return True
-        return self.clock() - self.saved_at > schedule.checkpoint_every_s
+        old = self.clock() - self.saved_at > self.settings.schedule.checkpoint_every_s
+        return old or is_late(before, after, self.settings.schedule.images)
 
     def save(self, state: State) -> None:
         """Write a checkpoint."""
@@ -188,6 +185,11 @@ class TrainingLoop:
         text = "back to the checkpoint at image %d, learning rates times %g"
         LOG.warning(text, restored.images, restored.rate_factor)
         return restored
+
+
+def is_late(before: int, after: int, total: int) -> bool:
+    """Whether a run of so many images is nearly over, from this step on."""
+    return before < math.ceil(LATE * total) <= after < total
 
 
 def restarts(
