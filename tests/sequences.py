@@ -9,7 +9,17 @@ PARTS = {  # part of a sequence: (its class, {flat name: name in the part})
     "intrinsics": (Intrinsics, {n: n for n in (*PINHOLE, "distortion")}),
     "calibration": (
         Calibration,
-        {n: n for n in ("f_mod_hz", "phase_offset", "dc_offset", "quad_scale", "cycle_length")}
+        {
+            n: n
+            for n in (
+                "f_mod_hz",
+                "phase_offset",
+                "dc_offset",
+                "adc_zero",
+                "quad_scale",
+                "cycle_length",
+            )
+        }
         | {"sensor": "settings"},
     ),
     "colour": (

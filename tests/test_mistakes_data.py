@@ -17,8 +17,9 @@ from sequences import changed
 
 from gftorf_warp import Sequence
 from gftorf_warp.constants import SPEED_OF_LIGHT
-from gftorf_warp.data import decode, estimates
+from gftorf_warp.data import decode
 from gftorf_warp.data.check import check
+from gftorf_warp.data.constant import constant_part
 from gftorf_warp.data.write import write
 from gftorf_warp.errors import InputError
 from gftorf_warp.recon import presets
@@ -203,7 +204,7 @@ def test_mistake_17_the_constant_part_is_tested_when_a_recording_is_checked(tmp_
     and stating it silences the warning.
     """
     sequence = wall(ramp(12, 20), dc_offset=constant)
-    assert estimates.dc_offset(sequence) == pytest.approx(constant, abs=1e-3)
+    assert constant_part(sequence).dc_offset == pytest.approx(constant, abs=1e-3)
     for stated in (0.0, 1.0):
         folder = write("ftorf", tmp_path / f"says-{stated}", changed(sequence, dc_offset=stated))
         warned = any("dc_offset" in text for text in check(folder).warnings)

@@ -207,6 +207,7 @@ def test_what_is_off_leaves_no_trace():
         "harmonic_contrast": (0.0, 0.1),
         "contrast_cutoff_hz": 3e8,
         "pattern": Pattern(gain=0.1),
+        "adc_zero": 14.083,
     }
     for name, value in on.items():
         sensor = Sensor(**{name: value})

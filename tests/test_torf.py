@@ -483,6 +483,7 @@ def test_what_the_format_cannot_hold_is_refused(tmp_path, changes, word):
         ("times", lambda a: a + np.arange(12)),
         ("measured", lambda a: a & (np.arange(12) > 0)),
         ("dc_offset", lambda a: a + 0.5),
+        ("adc_zero", lambda a: a + 0.5),
         ("camera_from_world", lambda a: random_poses(len(a), np.random.default_rng(0))),
     ],
 )

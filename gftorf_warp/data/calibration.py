@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
 from ..constants import CANONICAL_SHIFTS, FRAMES_PER_QUARTET, SPEED_OF_LIGHT
 from ..errors import InputError, UsageError
@@ -44,7 +45,8 @@ def read_calibration(root: Path, form: str, problems: Problems, width: int | Non
     ``width`` is that of the images; None if unknown: intrinsics are then not compared with it.
     """
     fields = specs.fields(form)
-    sources = {"dc_offset": "default 0: a phasor has no constant part"}
+    none = "default 0: a phasor has no constant part"
+    sources = {"dc_offset": none, "adc_zero": none}
 
     def scalar(name: str, key: str) -> float | None:
         return problems.attempt(_scalar, root, fields[name], sources, key)
@@ -52,15 +54,26 @@ def read_calibration(root: Path, form: str, problems: Problems, width: int | Non
     depth_range = scalar("depth_range", "f_mod_hz")
     if depth_range is not None:
         sources["f_mod_hz"] += f", depth_range {depth_range:.9g} m"
+    raw = "dc_offset" in fields  # not of phasors
     calibration = Calibration(
         f_mod_hz=math.nan if depth_range is None else SPEED_OF_LIGHT / depth_range,
         phase_offset=scalar("phase_offset", "phase_offset") or 0.0,
-        dc_offset=(scalar("dc_offset", "dc_offset") or 0.0) if "dc_offset" in fields else 0.0,
+        dc_offset=(scalar("dc_offset", "dc_offset") or 0.0) if raw else 0.0,
+        adc_zero=(scalar("adc_zero", "adc_zero") or 0.0) if raw else 0.0,
         quad_scale=scalar("quad_values_scale_factor", "quad_scale"),
     )
     found = problems.attempt(_tof_intrinsics, root, fields, sources, width)
     intrinsics, half = found or (UNREAD, 0.0)
     return Calibrated(calibration=calibration, intrinsics=intrinsics, half=half, sources=sources)
+
+
+def subtract_zero(quads: Float[np.ndarray, "F H W"], measured: np.ndarray, zero: float) -> None:
+    """Subtract ``Calibration.adc_zero`` from the measured raw frames, in place.
+
+    In float64, so that codes of 24 bits and a zero that is a whole number stay exact.
+    """
+    for n in np.flatnonzero(measured).tolist() if zero else []:
+        quads[n] = quads[n].astype(np.float64) - zero
 
 
 def read_colour_intrinsics(

@@ -15,7 +15,7 @@ from ..constants import FRAMES_PER_QUARTET, SPEED_OF_LIGHT
 from ..errors import InputError, UsageError
 from . import specs
 from .arrays import SIDE_MAX
-from .calibration import DEPTH_RANGES_M, FOCAL_MIN
+from .calibration import DEPTH_RANGES_M, FOCAL_MIN, subtract_zero
 from .capture_json import FORMAT, MANIFEST, NAME, json_fields, read_values
 from .capture_write import inverse
 from .cycles import QUADS_MIN
@@ -68,6 +68,8 @@ def read(root: Path, frame_rate_hz: float | None) -> Sequence:
         if image is not None:
             images["colour"][n] = image
     problems.raise_if_any(root)
+    zero = float(values.get("adc_zero", 0.0))
+    subtract_zero(quads, measured, zero)
     frequencies = values["f_mod_hz"]
     lens = tuple(values["distortion"].tolist()) if "distortion" in values else None
 
@@ -87,6 +89,7 @@ def read(root: Path, frame_rate_hz: float | None) -> Sequence:
             f_mod_hz=float(frequencies[0]),
             phase_offset=float(values["phase_offset"]),
             dc_offset=float(values["dc_offset"]),
+            adc_zero=zero,
             quad_scale=optional("raw_scale", float),
             cycle_length=optional("cycle", int),
             settings=values.get("sensor_settings", {}),

@@ -14,7 +14,7 @@ from .capture_json import NAME
 from .exr import Parts
 from .sequence import Intrinsics, Sequence, Truth
 from .specs import layer_field
-from .writing import float32
+from .writing import float32, with_zero
 
 VERSION = "1.0"
 
@@ -38,7 +38,7 @@ def files(sequence: Sequence, truth: Truth | None) -> Iterator[tuple[str, bytes 
 
 def _raw_frame(sequence: Sequence, n: int) -> Parts:
     """Parts of one raw frame."""
-    parts: Parts = {"raw": {"q": float32(sequence.quads[n])}}
+    parts: Parts = {"raw": {"q": with_zero(sequence, n)}}
     flow = {"flow.forward": sequence.flow.forward, "flow.backward": sequence.flow.backward}
     for name, images in flow.items():
         if n in images:
@@ -77,6 +77,8 @@ def _json(sequence: Sequence) -> bytes:
         "dc_offset": float(stated.dc_offset),
         "raw_unit": "relative",
     }
+    if stated.adc_zero:
+        sensor["adc_zero"] = float(stated.adc_zero)
     if stated.quad_scale is not None:
         sensor["raw_scale"] = float(stated.quad_scale)
     if stated.cycle_length is not None:

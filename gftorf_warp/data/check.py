@@ -12,9 +12,9 @@ from ..errors import InputError
 from . import findings, specs
 from .cycles import frequencies_by_order
 from .decode import unambiguous_range
-from .findings import Report
 from .folder import format_of, numbered
 from .read import read
+from .report import Report
 from .sequence import Sequence
 
 # focal length in image widths: a view below 11 degrees is more often a mistake in units
@@ -35,13 +35,13 @@ def check(path: str | Path) -> Report:
     try:
         unambiguous_range(sequence)
     except InputError as error:
-        report.warnings.append(f"{error.what}: {error.why}; nothing is decoded")
+        report.warn("common range", f"{error.what}: {error.why}; nothing is decoded")
     else:
         if has_light:
             _estimates(sequence, report)
         else:
             warning = "no complete quartet with light: nothing can be decoded or estimated"
-            report.warnings.append(warning)
+            report.warn("no light", warning)
     findings.flow(sequence, report)
     return report
 
@@ -95,6 +95,7 @@ def _facts(sequence: Sequence, report: Report) -> None:
     text = f"{stated.f_mod_hz / 1e6:.6g} MHz, unambiguous to {range_m:.4g} m"
     fact("f_mod_hz", text, "f_mod_hz")
     fact("phase_offset", f"{stated.phase_offset:.6g} rad", "phase_offset")
+    fact("adc_zero", f"{stated.adc_zero:.6g}", "adc_zero")
     fact("dc_offset", f"{stated.dc_offset:.6g}", "dc_offset")
     fact("quad_scale", scale, "quad_scale")
     fact("intrinsics", f"fx {tof.fx:.6g}, fy {tof.fy:.6g} px", "fx")
@@ -130,36 +131,48 @@ def _facts(sequence: Sequence, report: Report) -> None:
 
 def _assumptions(sequence: Sequence, report: Report) -> None:
     """Values that were assumed, and what is missing."""
-    tof, sources, warn = sequence.intrinsics, sequence.sources, report.warnings.append
+    tof, sources, warn = sequence.intrinsics, sequence.sources, report.warn
     kind, missing = "raw frames", np.flatnonzero(~sequence.measured)
     if len(missing):
         if sequence.from_phasors:
             kind, missing = "phasors", missing[:: sequence.cycle] // sequence.cycle
         shown = ", ".join(map(str, missing[:10])) + (" .." if len(missing) > 10 else "")
-        warn(f"{len(missing)} {kind} were not measured: {shown}")
+        warn("missing", f"{len(missing)} {kind} were not measured: {shown}")
     if sequence.frames % sequence.cycle:
-        warn(f"the last quartet is truncated after {sequence.frames % sequence.cycle} frames")
+        warn(
+            "truncated",
+            f"the last quartet is truncated after {sequence.frames % sequence.cycle} frames",
+        )
     if sources["times"].startswith("default"):
-        warn(f"frame rate assumed: {sources['times'][8:]}; cams/frame_times.npy states another")
+        warn(
+            "assumed",
+            f"frame rate assumed: {sources['times'][8:]}; cams/frame_times.npy states another",
+        )
     if sources["f_mod_hz"].startswith("default"):
-        warn("modulation frequency assumed: no cams/depth_range.npy")
+        warn("assumed", "modulation frequency assumed: no cams/depth_range.npy")
     if sources["pixel_centre"].startswith("inferred"):
-        warn(f"pixel centres {sources['pixel_centre']}; state them in cams/pixel_centre.json")
+        warn(
+            "assumed",
+            f"pixel centres {sources['pixel_centre']}; state them in cams/pixel_centre.json",
+        )
     if "other poses" in sources["camera_from_world"]:
-        warn(f"poses: {sources['camera_from_world']}; cams/poses.json makes them count")
+        warn("assumed", f"poses: {sources['camera_from_world']}; cams/poses.json makes them count")
     for name in ("colour_intrinsics", "colour_from_world"):
         if sources[name].startswith("inferred") or "replaces" in sources[name]:
-            warn(f"{name}: {sources[name]}")
+            warn("assumed", f"{name}: {sources[name]}")
     if "amplitude, not colour" in sources["colour"]:
-        warn("colour: three equal channels: amplitude, not colour")
+        warn("grey colour", "colour: three equal channels: amplitude, not colour")
     if "warped copies" in sources["measured"]:
-        warn(f"quads: {sources['measured']}")
+        warn("warped copies", f"quads: {sources['measured']}")
     for name, focal, size in (("fx", tof.fx, sequence.width), ("fy", tof.fy, sequence.height)):
         if focal > NARROW_VIEW * size:
             view = f"a view of {math.degrees(2 * math.atan(size / (2 * focal))):.1f} degrees"
-            warn(f"{name} {focal:.4g} at {size} px is {view}: millimetres?")
+            warn("focal length", f"{name} {focal:.4g} at {size} px is {view}: millimetres?")
     if not (0 <= tof.cx <= sequence.width and 0 <= tof.cy <= sequence.height):
-        warn(f"the principal point {tof.cx:.4g}, {tof.cy:.4g} is outside the image")
+        warn(
+            "principal point",
+            f"the principal point {tof.cx:.4g}, {tof.cy:.4g} is outside the image",
+        )
 
 
 def _counts(steps: np.ndarray) -> list[tuple[int, int]]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..constants import SPEED_OF_LIGHT
-from .decode import quartet_phasor, quartet_phasors
+from .decode import quartet_phasor
 from .flow import warp_back
 from .sequence import Sequence, Truth
 
@@ -18,8 +18,6 @@ STATIC_QUANTILE = 0.5  # the half of the pixels that changes least over time is 
 BRIGHT_QUANTILE = 0.5  # and of those the brighter half, where noise is small
 STILL_M = 1e-3  # [m] a pixel whose true distance changes less within a quartet is static
 CHANGED = 0.25  # of the amplitude: more than noise on bright pixels
-# [1] real differential quads stay within a few hundredths of 0, unipolar ones are at 1
-DC_TOLERANCE = 0.1
 MOVING_PX = 0.5  # [px] flow above this is motion
 
 
@@ -52,21 +50,6 @@ def distance_of_z(sequence: Sequence, truth: Truth) -> np.ndarray:
     tof = sequence.intrinsics
     slope_x, slope_y = (x - tof.cx) / tof.fx, (y - tof.cy) / tof.fy
     return (truth.distance * np.sqrt(1.0 + slope_x**2 + slope_y**2)).astype(np.float32)
-
-
-def dc_offset(sequence: Sequence) -> float:
-    """Constant part of the quads as a multiple of their amplitude.
-
-    For any shifts it is the mean of the quads minus the wave of their phasor.
-    """
-    total = amplitude = 0.0
-    for i in sequence.complete_quartets:
-        for frames, (re, im) in quartet_phasors(sequence, i):
-            shifts = sequence.shifts[frames]
-            wave = 0.5 * (re.mean() * np.cos(shifts).mean() + im.mean() * np.sin(shifts).mean())
-            total += float(sequence.quads[frames].mean(dtype=np.float64)) - float(wave)
-            amplitude += float(np.hypot(re, im).mean()) / 2.0
-    return total / amplitude
 
 
 def pairings(sequence: Sequence) -> tuple[int | None, list[float]]:

@@ -14,7 +14,13 @@ from typing import Any
 import numpy as np
 
 from . import specs
-from .calibration import read_calibration, read_colour_intrinsics, read_shifts, read_times
+from .calibration import (
+    read_calibration,
+    read_colour_intrinsics,
+    read_shifts,
+    read_times,
+    subtract_zero,
+)
 from .folder import empty_quads, first_size, load, numbered, read_field
 from .poses import read_colour_poses, read_novel, read_poses
 from .problems import Problems
@@ -104,6 +110,7 @@ def read_sequence(stored: Stored, frame_rate_hz: float | None) -> Sequence:
     assert shifts is not None
     assert poses is not None
     measured = np.isin(np.arange(count), list(stored.files))
+    subtract_zero(quads, np.repeat(measured, step), calibrated.calibration.adc_zero)
     sources["measured"] = f"file {len(stored.files)} of {count} {stored.counted}{stored.note}"
     kind = "raw quads" if step == 1 else "phasors"
     sources["from_phasors"] = f"{sources['quads'].partition(',')[0]}: {kind}"

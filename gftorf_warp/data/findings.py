@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 
 from ..constants import SPEED_OF_LIGHT
 from ..errors import InputError
-from . import estimates, specs, torf
+from . import constant, estimates, specs, torf
 from .arrays import as_float32, read_array
 from .decode import (
     closed_form_distance,
@@ -22,9 +20,9 @@ from .decode import (
 )
 from .folder import numbered
 from .read import read_truth
+from .report import Report
 from .sequence import Sequence, Truth
 
-NAMES = {"capture": "capture", "ftorf": "F-ToeRF", "torf": "ToeRF"}
 # of the pixels of a frame at an extreme value: light repeats a value only where it is clipped
 SATURATED_SHARE = 1e-3
 # and at least so many, since the brightest pixel of a small image is not saturation
@@ -46,29 +44,6 @@ Z_FITS = 0.8  # ratio of residuals: below, the stored numbers are z-depth
 FITTED_M = 1e-3  # [m] a residual below this needs no other explanation
 
 
-@dataclass(kw_only=True)
-class Report:
-    """Result of a check; ``str`` of it is printed."""
-
-    path: Path
-    """The sequence."""
-    form: str
-    """Its format, ``capture``, ``ftorf`` or ``torf``."""
-    lines: list[str] = field(default_factory=list)
-    """Facts, one a line."""
-    warnings: list[str] = field(default_factory=list)
-    """Implausible or assumed values."""
-
-    def __str__(self) -> str:
-        head = f"{self.path}: {NAMES[self.form]} sequence"
-        flags = [f"warning: {text}" for text in self.warnings] or ["no warnings"]
-        return "\n".join([head, *(f"  {line}" for line in self.lines), *flags])
-
-    def add(self, name: str, text: str) -> None:
-        """Add a fact under its name."""
-        self.lines.append(f"{name:<15} {text}")
-
-
 def light(sequence: Sequence, report: Report) -> None:
     """Amplitude and saturation."""
     factor, source = quad_scale(sequence)
@@ -79,9 +54,10 @@ def light(sequence: Sequence, report: Report) -> None:
     at_extreme = np.isin(sequence.quads[sequence.measured], extremes).sum(axis=(1, 2))
     cut = at_extreme[at_extreme >= max(SATURATED_PIXELS, SATURATED_SHARE * pixels)]
     if len(cut):
-        report.warnings.append(
-            f"saturation: up to {cut.max() / pixels:.1%} of the pixels of {len(cut)} raw frames "
-            f"sit at the extreme values {extremes[0]:.4g} and {extremes[1]:.4g}, which biases phase"
+        report.warn(
+            "saturation",
+            f"saturation: up to {cut.max() / pixels:.1%} of the pixels of {len(cut)} raw "
+            f"frames sit at the extremes {extremes[0]:.4g} and {extremes[1]:.4g}: biased phase",
         )
 
 
@@ -98,19 +74,26 @@ def frequencies(sequence: Sequence, report: Report) -> None:
     text = f"{unambiguous_range(sequence):.4g} m together; median confidence {median:.2f}, "
     report.add("unwrapping", f"{text}{ambiguous:.1%} of the pixels ambiguous")
     if ambiguous > AMBIGUOUS_SHARE:
-        report.warnings.append(
+        report.warn(
+            "unwrapping",
             f"frequencies disagree: {ambiguous:.0%} of the pixels would fit another distance as "
-            "well; noise, motion within a cycle, or another phase offset at each frequency"
+            "well; noise, motion within a cycle, or another phase offset at each frequency",
         )
 
 
 def constant_part(sequence: Sequence, report: Report) -> None:
-    """Constant part of raw quads."""
-    estimate, used = estimates.dc_offset(sequence), sequence.calibration.dc_offset
-    report.add("dc estimate", f"{estimate:.4f} of the amplitude, {used:g} in use")
-    if abs(estimate - used) > estimates.DC_TOLERANCE:
-        warning = f"dc_offset {used:g} is in use, but the quads have {estimate:.3f}"
-        report.warnings.append(warning)
+    """Constant part of raw quads: an additive zero, or a multiple of the amplitude."""
+    found, used = constant.constant_part(sequence), sequence.calibration
+    text = f"{found.size:.2g} of the amplitude: additive {found.zero:.4g} explains "
+    text += f"{found.explained(found.left_by_zero):.0%}, dc_offset {found.dc_offset:.4f} "
+    text += f"{found.explained(found.left_by_dc):.0%}; in use is dc_offset {used.dc_offset:g}"
+    report.add("constant part", text)
+    if not found.is_explained:
+        report.warn(
+            "constant part",
+            f"dc_offset {used.dc_offset:g} leaves {found.left:.2g} of the amplitude: "
+            f"{found.advice(sequence, report.form)}",
+        )
 
 
 def order(sequence: Sequence, report: Report) -> None:
@@ -121,9 +104,10 @@ def order(sequence: Sequence, report: Report) -> None:
     report.add("order", f"opposite pairs fit best: {found} of bright static pixels")
     if stated is not None and shares[stated] < max(shares):
         best = int(np.argmax(shares))
-        report.warnings.append(
+        report.warn(
+            "order",
             f"quad order doubtful: stored pairing {texts[stated]} fits {shares[stated]:.0%} of "
-            f"static pixels, {texts[best]} {shares[best]:.0%}; check tof_permutation.npy"
+            f"static pixels, {texts[best]} {shares[best]:.0%}; check tof_permutation.npy",
         )
 
 
@@ -141,7 +125,7 @@ def third_channel(sequence: Sequence, report: Report) -> None:
     text = f"{ratio:.4g} times the length of (re, im), correlation {correlation:.4f}"
     report.add("third channel", text)
     if correlation < THIRD_MATCH_MIN:
-        report.warnings.append("third channel: not the amplitude of (re, im); it is not used")
+        report.warn("third channel", "third channel: not the amplitude of (re, im); it is not used")
 
 
 def camera(sequence: Sequence, report: Report) -> None:
@@ -150,9 +134,10 @@ def camera(sequence: Sequence, report: Report) -> None:
         share = estimates.changed_share(sequence)
         report.add("change", f"{share:.0%} of bright pixels from the first to the last quartet")
         if share > MOVED_SHARE:
-            report.warnings.append(
+            report.warn(
+                "poses",
                 f"poses: all are identity, but {share:.0%} of bright pixels change: if the "
-                "camera moved, store its poses in cams/tof_extrinsics.npy"
+                "camera moved, store its poses in cams/tof_extrinsics.npy",
             )
     if sequence.colour.camera_from_world is not None:
         relative = sequence.camera_from_world @ np.linalg.inv(sequence.colour.camera_from_world)
@@ -160,7 +145,7 @@ def camera(sequence: Sequence, report: Report) -> None:
         report.add("baseline", f"{baseline:.4g} m from the colour camera to the ToF camera")
         if baseline > BASELINE_MAX_M:
             away = f"the colour camera is {baseline:.4g} m away"
-            report.warnings.append(f"{away}: millimetres, or another coordinate system?")
+            report.warn("baseline", f"{away}: millimetres, or another coordinate system?")
 
 
 def phasors(sequence: Sequence, report: Report) -> None:
@@ -182,8 +167,9 @@ def phasors(sequence: Sequence, report: Report) -> None:
         report.add("phasors", f"{text}quads, {match.factor:.4g} times their length")
         if match.correlation < MATCH_MIN or abs(match.angle) > OFFSET_TOLERANCE_RAD:
             mirrored = "; mirrored phase fits better" if match.conjugate > match.correlation else ""
-            report.warnings.append(
-                f"quads and {folder} disagree: wrong order, sign or offset{mirrored}"
+            report.warn(
+                "stored phasors",
+                f"quads and {folder} disagree: wrong order, sign or offset{mirrored}",
             )
 
 
@@ -196,7 +182,9 @@ def truth(sequence: Sequence, report: Report) -> None:
     try:
         truth = read_truth(sequence)
     except InputError as error:
-        report.warnings.append(f"{folder} cannot be read: {error.where}: {error.what}, {error.why}")
+        report.warn(
+            "truth unreadable", f"{folder} cannot be read: {error.where}: {error.what}, {error.why}"
+        )
         return
     if truth is None:
         report.add("truth", "none")
@@ -210,11 +198,12 @@ def truth(sequence: Sequence, report: Report) -> None:
         decoded = "these quads: it is not ground truth, do not compare with it"
         if sequence.from_phasors:
             decoded = "these phasors, or they are without noise: doubtful as ground truth"
-        report.warnings.append(f"{folder} was decoded from {decoded}")
+        report.warn("truth decoded", f"{folder} was decoded from {decoded}")
         return
     if len(known) and known.max() > unambiguous:
-        report.warnings.append(
-            f"range wraps: distances to {known.max():.4g} m, unambiguous to {unambiguous:.4g} m"
+        report.warn(
+            "wrap",
+            f"range wraps: distances to {known.max():.4g} m, unambiguous to {unambiguous:.4g} m",
         )
     poses = sequence.camera_from_world
     if not sequence.from_phasors and (poses != poses[0]).any():
@@ -235,18 +224,20 @@ def _fit(sequence: Sequence, truth: Truth, folder: str, report: Report) -> None:
     if_z = Truth(distance=estimates.distance_of_z(sequence, truth), known=truth.known)
     as_z = estimates.phase_fit(sequence, if_z)
     if as_z is not None and fit.rms_m > FITTED_M and as_z.rms_m < Z_FITS * fit.rms_m:
-        report.warnings.append(
+        report.warn(
+            "z-depth",
             f"{folder} fits the phase better as z-depth, rms {as_z.rms_m * 1e3:.1f} mm against "
-            f"{fit.rms_m * 1e3:.1f} mm: it is read as distance along the ray, convert it"
+            f"{fit.rms_m * 1e3:.1f} mm: it is read as distance along the ray, convert it",
         )
         return
     used = SPEED_OF_LIGHT / sequence.calibration.f_mod_hz
     offset = abs(np.angle(np.exp(1j * (fit.phase_offset - sequence.calibration.phase_offset))))
     if abs(fit.depth_range / used - 1) > RANGE_TOLERANCE or offset > OFFSET_TOLERANCE_RAD:
-        report.warnings.append(
+        report.warn(
+            "truth",
             f"truth implies depth_range {fit.depth_range:.4g} m and phase_offset "
             f"{fit.phase_offset:+.3f} rad, in use are {used:.4g} m and "
-            f"{sequence.calibration.phase_offset:+.3f} rad"
+            f"{sequence.calibration.phase_offset:+.3f} rad",
         )
 
 
@@ -277,4 +268,4 @@ def flow(sequence: Sequence, report: Report) -> None:
         report.add(f"{name} flow", text)
         if match[1] > min(match):
             warning = "does not explain the motion: check its sign, channels and frame step"
-            report.warnings.append(f"{name} flow {warning}")
+            report.warn("flow", f"{name} flow {warning}")

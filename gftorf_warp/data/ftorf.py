@@ -14,7 +14,15 @@ from . import specs
 from .family import Stored
 from .folder import SLOT_FOLDERS, numbered, refuse_absurd_ids
 from .sequence import Sequence, Truth
-from .writing import calibration_files, float32, inexpressible, json_bytes, npy, shortest
+from .writing import (
+    calibration_files,
+    float32,
+    inexpressible,
+    json_bytes,
+    npy,
+    shortest,
+    with_zero,
+)
 
 FORMAT = "ftorf"
 # [rad] a shift is stored as one of four names; what differs by more is another shift
@@ -81,8 +89,10 @@ def files(sequence: Sequence, truth: Truth | None) -> Iterator[tuple[str, bytes]
     yield "cams/poses.json", json_bytes({"poses": "camera_from_world"})
     yield "cams/color_extrinsics.npy", npy(colour_poses.astype(np.float64))
     yield "cams/dc_offset.npy", npy(np.float64(sequence.calibration.dc_offset))
+    if sequence.calibration.adc_zero:
+        yield "cams/adc_zero.npy", npy(np.float64(sequence.calibration.adc_zero))
     for n in np.flatnonzero(sequence.measured).tolist():
-        yield f"tofType{n % FRAMES_PER_QUARTET}/{n:04d}.npy", npy(float32(sequence.quads[n]))
+        yield f"tofType{n % FRAMES_PER_QUARTET}/{n:04d}.npy", npy(with_zero(sequence, n))
     for n, image in sequence.colour.images.items():
         yield f"color/{n:04d}.npy", npy(shortest(float32(image)))
     for n, image in sequence.flow.forward.items():

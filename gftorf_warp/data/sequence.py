@@ -43,6 +43,9 @@ class Calibration:
     """Measured minus true phase [rad]."""
     dc_offset: float = 0.0
     """Constant part of a quad as a multiple of its amplitude [1]."""
+    adc_zero: float = 0.0
+    """What the recording stores without light [quad units]: stored number = adc_zero + quad.
+    Readers subtract it and writers add it; :attr:`Sequence.quads` is without it."""
     quad_scale: float | None = None
     """Factor for the quads that the file states; None if it states none. Never applied by a
     reader."""

@@ -7,6 +7,7 @@ import json
 from collections.abc import Iterator
 
 import numpy as np
+from jaxtyping import Float
 
 from ..constants import CANONICAL_SHIFTS, FRAMES_PER_QUARTET, SPEED_OF_LIGHT
 from ..errors import UsageError
@@ -85,6 +86,7 @@ def _validate_phasors(sequence: Sequence) -> None:
         "shifts": np.array_equal(sequence.shifts, np.tile(CANONICAL_SHIFTS, len(quads))),
         "quads": np.array_equal(quads[:, ::2], -quads[:, 1::2]),
         "dc_offset": sequence.calibration.dc_offset == 0,
+        "adc_zero": sequence.calibration.adc_zero == 0,
     }
     per_frame = {
         "measured": sequence.measured,
@@ -131,8 +133,9 @@ def refuse_inexpressible(form: str, sequence: Sequence, truth: Truth | None) -> 
     holds = np.isfinite(times).all() and times[0] == 0 and (np.diff(times) >= 0).all()
     require(holds, "times", expected, f"{times[:8].tolist()} ..")
     scale = stated.quad_scale
-    numbers = (stated.f_mod_hz, stated.phase_offset, stated.dc_offset, scale or 1.0)
-    require(np.isfinite(numbers).all(), "calibration", finite, numbers)
+    constant = (stated.dc_offset, stated.adc_zero)
+    constants = (stated.f_mod_hz, stated.phase_offset, *constant, scale or 1.0)
+    require(np.isfinite(constants).all(), "calibration", finite, constants)
     low, high = DEPTH_RANGES_M
     expected = f"speed of light / frequency between {low} and {high} m"
     holds = low <= SPEED_OF_LIGHT / stated.f_mod_hz <= high
@@ -204,6 +207,16 @@ def _pinhole(camera: Intrinsics) -> np.ndarray:
     """Matrix for integer pixel centres, 3x3."""
     rows = [[camera.fx, 0, camera.cx - 0.5], [0, camera.fy, camera.cy - 0.5], [0, 0, 1]]
     return np.array(rows, dtype=np.float64)
+
+
+def with_zero(sequence: Sequence, n: int) -> Float[np.ndarray, "H W"]:
+    """Raw frame n as it is stored: quad + ``adc_zero``, float32.
+
+    Reading subtracts the zero: exactly where the sum needs 24 bits or fewer, as codes of a camera
+    do, otherwise to half a float32 step of the sum.
+    """
+    zero = sequence.calibration.adc_zero
+    return float32(sequence.quads[n].astype(np.float64) + zero if zero else sequence.quads[n])
 
 
 def float32(array: np.ndarray) -> np.ndarray:

@@ -12,7 +12,7 @@ from typing import TypeVar
 
 import torch
 
-from ..data.estimates import DC_TOLERANCE, dc_offset
+from ..data.constant import constant_part
 from ..data.read import read, read_truth
 from ..data.sequence import Sequence, Truth
 from ..errors import InputError, UsageError
@@ -230,15 +230,15 @@ def _run(sequence, out, settings, config, seed, device, goes_on, begun, progress
 
 
 def _warn(sequence: Sequence) -> None:
-    """Log what cannot be fitted: a wrong DC offset (method, mistake 17), a rolling shutter."""
+    """Log what cannot be fitted: a wrong constant part (method, mistake 17), a rolling shutter."""
     stated = sequence.calibration
     if sequence.complete_quartets and not sequence.from_phasors:
-        measured = dc_offset(sequence)
-        if abs(measured - stated.dc_offset) > DC_TOLERANCE:
+        found = constant_part(sequence)
+        if not found.is_explained:
             text = (
-                "the quads have a constant part of %.2f, the calibration %.2f: see `gftorf check`"
+                "the quads have a constant part of %.2f amplitudes more than the calibration says"
             )
-            LOG.warning(text, measured, stated.dc_offset)
+            LOG.warning(f"{text}: see `gftorf check`", found.left)
     delay = float(stated.settings.get("row_time_s", 0.0) or 0.0)
     if delay > 0:
         text = "a rolling shutter: the last row is %.3g ms later than the first, which is ignored"

@@ -40,7 +40,10 @@ NON_NEGATIVE = (
     "row_time_s",
 )
 # off unless they are set
-EFFECTS = ("further_hz", "harmonic_contrast", "contrast_cutoff_hz", "pattern", "row_time_s")
+EFFECTS = (
+    *("further_hz", "harmonic_contrast", "contrast_cutoff_hz", "pattern", "row_time_s"),
+    "adc_zero",
+)
 
 
 class RawFrame(NamedTuple):
@@ -68,6 +71,9 @@ class Sensor:
     """Measured minus true phase [rad]: rendering adds it, decoding subtracts it."""
     dc_offset: Scalar = 0.0
     """Constant part b of a quad as a multiple of its amplitude [1]; 0 for differential sensors."""
+    adc_zero: float = 0.0
+    """What a recording holds without light [relative units]: stored number = adc_zero + quad. Only
+    files have it: readers subtract it, and the range of the ADC lies around it."""
     source_intensity: Scalar = 1.0
     """Source intensity s [1]; only s times reflectivity can be known from one sequence."""
     frame_period_s: float = 1.0 / FRAME_RATE_HZ

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import asdict, astuple, dataclass, fields, replace
 from functools import partial
@@ -91,6 +92,7 @@ def sequence_fields(
             f_mod_hz=float(sensor.f_mod_hz),
             phase_offset=float(sensor.phase_offset),
             dc_offset=float(sensor.dc_offset),
+            adc_zero=sensor.adc_zero,
             cycle_length=None if len(sensor.cycle) == FRAMES_PER_QUARTET else len(sensor.cycle),
             settings=settings,
         ),
@@ -236,6 +238,8 @@ def sensor_settings(sensor: Sensor) -> dict[str, Any]:
             plain[name] = [float(item) for item in value]
         elif isinstance(value, torch.Tensor):
             plain[name] = value.item()
+        elif value == math.inf:  # JSON has no such number
+            plain[name] = "inf"
     return plain | {"pattern": asdict(sensor.pattern)}
 
 

@@ -115,6 +115,8 @@ def effect_rows(sensor: Sensor) -> dict[str, str]:
     if sensor.contrast_cutoff_hz is not None:
         static = f"it is that of 0 Hz, {sensor.contrast:g}, over 1 + (f / cutoff)^2"
         rows["cutoff of the contrast"] = f"{sensor.contrast_cutoff_hz / 1e6:g} MHz: {static}"
+    if sensor.adc_zero:
+        rows["zero of the ADC"] = f"{sensor.adc_zero:g}, added to every stored quad"
     if pattern != Pattern():
         rows["fixed pattern"] = (
             f"phase {pattern.phase:g} times that of an OPT8241 kit, response to light "
