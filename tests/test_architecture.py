@@ -26,7 +26,9 @@ TORCH = {"jaxtyping", "numpy", "torch"}
 INSIDE_FUNCTIONS = {
     "OpenEXR",
     "cv2",
+    "h5py",
     "matplotlib",
+    "rawpy",
     "scipy",
     "trimesh",
 }  # slow to import, or not needed by every command
@@ -37,7 +39,7 @@ TABLE = {
     "errors.py": (set(), set()),
     "kernels": (set(), {"warp"}),
     "data": (set(), {"OpenEXR", "cv2", "jaxtyping", "numpy"}),
-    "importers": ({"data"}, {"cv2", "jaxtyping", "numpy"}),
+    "importers": ({"data"}, {"cv2", "h5py", "jaxtyping", "numpy", "rawpy"}),
     "scene": ({"data"}, TORCH | {"cv2"}),
     "render": ({"kernels", "scene"}, TORCH | {"warp"}),
     "losses": ({"render"}, TORCH),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from ..data.sequence import Sequence, Truth
 
@@ -19,3 +19,13 @@ class Imported:
     """What a layout does not say and was assumed, or looks wrong; a sentence each, a warning."""
     truth: Truth | None = None
     """Ground truth, if the source has it."""
+
+
+@dataclass
+class Notes:
+    """Collects what a reader understood and what it is not sure of; lines for :class:`Imported`."""
+
+    understood: list[str] = field(default_factory=list)
+    """What was read and how it was taken."""
+    uncertain: list[str] = field(default_factory=list)
+    """What was assumed, or looks wrong."""
