@@ -14,18 +14,20 @@ import cv2
 import numpy as np
 import pytest
 from analytic_run import AnalyticRun, as_phasors, with_colour
+from browser import DESKTOP, PHONE, browser
 from sequences import sequence_of
 
 from gftorf_warp import Truth
 from gftorf_warp.constants import CANONICAL_SHIFTS
-from gftorf_warp.evaluate import figures, page, panels, pictures
+from gftorf_warp.evaluate import controls, figures, page, panels, pictures, tables
 from gftorf_warp.evaluate.compare import compare, findings, rows_of, summary
 from gftorf_warp.evaluate.gallery import colour_views, novel_views
 from gftorf_warp.evaluate.metrics import scored_frames
 from gftorf_warp.evaluate.report import report, verdict
 from gftorf_warp.evaluate.views import Views, gather
 
-VOID = {"img", "meta", "br"}
+SLIDER = "document.querySelector('.slider')"
+VOID = {"img", "meta", "br", "input"}
 HOSTILE = "<script>alert(1)</script>"
 PRINTED = {  # how the page prints a value of metrics.json, written a second time
     "error": lambda value: f"{value:.3f}",
@@ -253,19 +255,82 @@ def test_phase_and_amplitude_are_those_of_the_quartet(compared):
     assert amplitude[0, 0, 0] < amplitude[5, 8, 0], "the box is nearer, so brighter"
 
 
-def test_animation_has_a_picture_for_every_quartet_start(compared):
-    """Three quartets, four panels of 20 pixels with gaps between them."""
-    _, _, html, _ = compared
-    (source,) = (
-        sources[0] for title, sources in html.images.items() if title.startswith("animation")
-    )
-    ok, animation = cv2.imdecodeanimation(
-        np.frombuffer(base64.b64decode(source.partition(",")[2]), np.uint8)
-    )
-    assert ok
-    assert len(animation.frames) == 3
-    assert animation.frames[0].shape[:2] == (12, 4 * 20 + 3 * 2)
-    assert np.abs(animation.frames[0].astype(int) - animation.frames[1]).max() > 50, "nothing moves"
+def test_the_film_has_a_frame_for_every_quartet_start(compared):
+    """Three quartets above each other in every panel; ours shows the box where it is."""
+    _, _, html, found = compared
+    films = [title for title in html.images if title.startswith("film: ")]
+    assert films == [f"film: {t}" for t in ("measured quad", "closed form", "ours, d", "truth")]
+    for title, values in (("ours, d", found.views.d), ("truth", found.judgement.truth)):
+        shown = picture(html.images[f"film: {title}"][0]).reshape(3, 12, 20, 3)
+        for frame, image in zip(shown, values[::4], strict=True):
+            want = pictures.colour_mapped(image, found.distance_scale)
+            np.testing.assert_array_equal(frame, want, title)
+        assert np.abs(shown[0].astype(int) - shown[1]).max() > 50, "nothing moves"
+
+
+def test_sliders_lay_ours_over_the_closed_form(compared):
+    """Distances and errors, pixel by pixel; without truth quads take the place of errors."""
+    _, _, html, found = compared
+    s = panels.telling_row(found)
+    for title, name in (("closed form", "closed_form"), ("ours, d", "d")):
+        distance, error = (
+            picture(html.images[f"slider: {prefix}{title}"][0]) for prefix in ("", "error of ")
+        )
+        image = getattr(found.views, name)[s]
+        want = pictures.colour_mapped(image, found.distance_scale)
+        np.testing.assert_array_equal(distance, want, title)
+        wrong = np.abs(image - found.judgement.truth[s])
+        assert error[wrong.argmax() // 20, wrong.argmax() % 20].sum() == error.sum(axis=-1).max()
+    blind = Page(f"<p>{panels.sliders(replace(found, judgement=None), s)}</p>")
+    want = pictures.signed_scale([found.views.quad_measured[s]])
+    for title in ("measured", "rendered"):
+        image = getattr(found.views, f"quad_{title}")[s]
+        shown = picture(blind.images[f"slider: {title} quad"][0])
+        np.testing.assert_array_equal(shown, pictures.colour_mapped(image, want))
+    with pytest.raises(ValueError, match="one size"):
+        controls.slider(np.zeros((2, 3, 3), np.uint8), np.zeros((3, 2, 3), np.uint8), ("a", "b"))
+
+
+def test_bars_are_as_long_as_the_errors(compared):
+    """Root mean squared errors over the largest of them, at edges and inside."""
+    _, metrics, _, _ = compared
+    html = tables.bars_by_class(metrics)
+    drawn = re.findall(r"--part: ([\d.]+).*?data-key=\"([^\"]*)\"", html)
+    roots = {key: math.sqrt(look_up(metrics, key)) for _, key in drawn}
+    assert {key.split(".")[1] for key in roots} == {"moving", "static"}
+    assert {key.split(".")[3] for key in roots} == {
+        f"{name}_mse_x100" for name in ("closed_form", "temporal", "d")
+    }
+    for part, key in drawn:
+        assert float(part) == pytest.approx(roots[key] / max(roots.values()), abs=1e-4), key
+    assert tables.bars_by_class(metrics | {"classes": None}) == ""
+
+
+def test_the_page_can_be_used_without_a_script(compared):
+    """In Chromium, at both sizes: nothing is cut off, the slider's edge and the film move."""
+    run, _, _, _ = compared
+    with browser() as tab:
+        for size in (DESKTOP, PHONE):
+            tab.resize(size)
+            tab.open((run.path / "report.html").absolute().as_uri())
+            assert tab.value("document.documentElement.scrollWidth") <= size[0]
+            assert tab.value(f"{SLIDER}.scrollLeft / {SLIDER}.clientWidth") == pytest.approx(
+                0.5, abs=0.02
+            ), "the edge starts in the middle"
+        tab.value("document.querySelector('.slider').scrollIntoView()")
+        shown = []
+        for part in (0, 1):
+            tab.value(f"{SLIDER}.scrollLeft = {part} * {SLIDER}.clientWidth")
+            shown.append(tab.screenshot()[:200].astype(int))
+        assert (np.abs(shown[0] - shown[1]).max(axis=-1) > 60).sum() > 100
+        at = "getComputedStyle(document.querySelector('.film .frames')).objectPosition"
+        tab.until(f"{at} != '0% 0%'")
+        tab.value("document.querySelector('.film label').click()")
+        paused = tab.value(at)
+        state = "getComputedStyle(document.querySelector('.film .frames')).animationPlayState"
+        assert tab.value(state) == "paused"
+        assert tab.value(at) == paused
+        assert not tab.problems
 
 
 def test_the_same_comparison_gives_the_same_bytes(compared):
@@ -288,8 +353,8 @@ def test_curves_are_drawn_from_the_log(compared):
         figures.training_curves(log),
         figures.training_curves([{k: s[k] for k in s if k != "quads"} for s in log]),
     )
-    assert both.count(b"<path") > one.count(b"<path")
-    assert figures.training_curves([]) is None
+    assert b"".join(both).count(b"<path") > b"".join(one).count(b"<path")
+    assert figures.training_curves([]) == []
 
 
 def test_along_the_run_is_drawn_from_its_rows(compared):
@@ -305,15 +370,15 @@ def test_along_the_run_is_drawn_from_its_rows(compared):
     assert titles[0] - titles[1] >= {"Error of d", "Error of d_ToF"}
     for both in titles:
         assert {"On static pixels", "Transmittance", "Depth distortion", "Gaussians"} <= both
-    assert figures.along_run([]) is None
+    assert figures.along_run([]) == []
     bare = Page(report(title="bare", metrics=metrics, config=run.config, log=[], found=found))
     assert "Along the run" not in bare.texts
     assert "Along the run" not in bare.images
 
 
-def drawn_texts(svg):
-    """Texts of a drawing."""
-    return re.findall(r"<text[^>]*>(.*?)</text>", svg.decode())
+def drawn_texts(drawings):
+    """Texts of drawings."""
+    return re.findall(r"<text[^>]*>(.*?)</text>", b"".join(drawings).decode())
 
 
 def test_views_that_nobody_took_are_shown(compared):

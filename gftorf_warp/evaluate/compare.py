@@ -246,6 +246,7 @@ def write_report(run: Run, result: dict[str, Any], found: Findings) -> Path:
         found=found,
         installed=installed_versions(),
         data_card=truth_statement(found.sequence.path),
+        simulated=simulate_command(found.sequence.path),
     )
     atomic_write(path, page.encode("utf-8"))
     return path
@@ -278,6 +279,12 @@ def truth_statement(path: Path | None) -> str | None:
     paragraphs = _data_card(path).split("\n\n")
     about = [text for text in paragraphs if text.lower().startswith("ground truth")]
     return " ".join(" ".join(about).split()) or None
+
+
+def simulate_command(path: Path | None) -> str | None:
+    """The command in a sequence's README.md that made it; None if there is none."""
+    lines = map(str.strip, _data_card(path).splitlines())
+    return next((line for line in lines if line.startswith("gftorf simulate ")), None)
 
 
 def _data_card(path: Path | None) -> str:

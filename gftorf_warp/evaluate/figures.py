@@ -34,15 +34,15 @@ SINGLE = {  # title and unit of a plot of one curve: key of the rows of diagnost
 }
 
 
-def training_curves(log: Sequence[Mapping[str, float]]) -> bytes | None:
-    """Loss terms, quad PSNR and number of Gaussians over optimised images; None without a log.
+def training_curves(log: Sequence[Mapping[str, float]]) -> list[bytes]:
+    """Loss terms, quad PSNR and number of Gaussians over optimised images; none without a log.
 
     Args:
         log: Steps of ``metrics.jsonl``: images, seconds, gaussians, quad_psnr_db and the loss terms
             by name.
     """
     if not log:
-        return None
+        return []
     terms = [name for name in dict.fromkeys(chain.from_iterable(log)) if name not in NOT_LOSSES]
     losses = [_curve(log, name, colour, name) for name, colour in zip(terms, cycle(TERM_COLOURS))]
     losses = [curve for curve in losses if (curve.y > 0).any()]
@@ -52,17 +52,17 @@ def training_curves(log: Sequence[Mapping[str, float]]) -> bytes | None:
         Plot(title="Quad PSNR", x=IMAGES, y="dB", curves=[psnr], from_zero=False),
         Plot(title="Gaussians", x=IMAGES, y="number N", curves=[count], log_y=False),
     ]
-    return svg([plot for plot in plots if plot.curves], columns=3, height=209)
+    return [svg(plot) for plot in plots if plot.curves]
 
 
-def along_run(rows: Sequence[Mapping[str, float]]) -> bytes | None:
+def along_run(rows: Sequence[Mapping[str, float]]) -> list[bytes]:
     """Diagnostics over optimised images: errors if the truth is known, agreement, opacity, N.
 
     Args:
         rows: Those of ``diagnostics.jsonl``, see recon/diagnostics.py.
     """
     if not rows:
-        return None
+        return []
     plots = []
     for name in ("d", "d_tof"):
         curves = [
@@ -78,13 +78,12 @@ def along_run(rows: Sequence[Mapping[str, float]]) -> bytes | None:
     plots.append(Plot(title="On static pixels", x=IMAGES, y="m", curves=static))
     for (title, unit), key in SINGLE.items():
         plots.append(Plot(title=title, x=IMAGES, y=unit, curves=[_curve(rows, key, COLOURS["d"])]))
-    plots = [plot for plot in plots if any(len(curve.x) for curve in plot.curves)]
-    return svg(plots, columns=3, height=209)
+    return [svg(plot) for plot in plots if any(len(curve.x) for curve in plot.curves)]
 
 
 def error_over_frames(
     frames: Sequence[int], groups: Mapping[str, Mapping[str, Sequence[float | None]]]
-) -> bytes:
+) -> list[bytes]:
     """Error of every scored frame, one plot per group of pixels.
 
     Args:
@@ -103,7 +102,7 @@ def error_over_frames(
 def error_histogram(
     errors: Mapping[str, Float[np.ndarray, "S H W"]],
     groups: Mapping[str, Bool[np.ndarray, "S H W"]],
-) -> bytes:
+) -> list[bytes]:
     """Share of pixels over error [m] on a logarithmic axis, one plot per group of pixels.
 
     Args:
@@ -133,7 +132,7 @@ def _groups(
     *,
     points: bool = False,
     **axes: Any,
-) -> bytes:
+) -> list[bytes]:
     """One plot per group of pixels, with one curve (x, y) for each kind of distance."""
     plots = []
     for group, curves in drawn.items():
@@ -142,7 +141,7 @@ def _groups(
             for name, (across, up) in curves.items()
         ]
         plots.append(Plot(title=group, curves=lines, **axes))
-    return svg(plots, columns=len(plots), height=209)
+    return [svg(plot) for plot in plots]
 
 
 def _curve(

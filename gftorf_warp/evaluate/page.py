@@ -5,7 +5,8 @@ from __future__ import annotations
 import functools
 import html
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,63 +17,7 @@ from . import pictures
 POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 # [px] larger pictures are subsampled, so that a page of thirty pictures stays below 4 MB
 PICTURE_SIZE_MAX = 320
-STYLE = """
-:root { color-scheme: light dark; --ink: #1c2430; --soft: #5b6676; --line: #d9dee6; --page: #f4f6f9;
---card: #ffffff;
-  --ours: #0072b2; --naive: #d55e00; --mark: #e8f1f8; }
-@media (prefers-color-scheme: dark) { :root { --ink: #e6e9ee; --soft: #9aa5b4; --line: #343c48;
---page: #14181e;
-  --card: #1d232b; --ours: #6cb6e8; --naive: #f0955a; --mark: #1c2f3e; } }
-* { box-sizing: border-box; }
-body { margin: 0; background: var(--page); color: var(--ink); font: 15px/1.5 system-ui, sans-serif;
-}
-main { max-width: 1200px; margin: 0 auto; padding: 28px 20px 60px; }
-h1 { font-size: 24px; margin: 0 0 4px; overflow-wrap: anywhere; }
-h2 { font-size: 18px; margin: 0 0 4px; }
-h3 { font-size: 14px; margin: 18px 0 6px; }
-p { margin: 4px 0 10px; max-width: 860px; }
-.soft, .caption { color: var(--soft); font-size: 13px; }
-.verdict { font-size: 18px; line-height: 1.45; max-width: none; margin: 14px 0 4px; }
-.verdict .ours { color: var(--ours); font-weight: 600; } .verdict .naive { color: var(--naive);
-font-weight: 600; }
-section { background: var(--card); border: 1px solid var(--line); border-radius: 10px;
-padding: 18px 20px;
-  margin: 18px 0; }
-table { border-collapse: collapse; font-variant-numeric: tabular-nums; width: 100%; }
-th, td { padding: 6px 8px 6px 8px; border-bottom: 1px solid var(--line); text-align: right;
-vertical-align: baseline; }
-th:first-child, td:first-child { text-align: left; }
-thead th { font-weight: 600; font-size: 13px; } thead .soft { font-weight: 400; display: block; }
-tr.ours td { background: var(--mark); } tr.ours td:first-child b { color: var(--ours); }
-td + td .soft { display: inline-block; min-width: 74px; }
-.facts { display: flex; flex-wrap: wrap; gap: 6px 30px; margin: 14px 0 0; padding: 0;
-list-style: none; }
-.facts b { display: block; font-size: 17px; } .facts li { font-size: 13px; color: var(--soft); }
-.facts b, .facts b * { color: var(--ink); }
-.row { display: grid; gap: 14px; grid-template-columns: repeat(var(--columns), minmax(0, 1fr));
-margin: 8px 0 14px;
-  align-items: end; }
-.row .soft { align-self: center; padding: 0 6px; }
-figure { margin: 0; min-width: 0; }
-figcaption { font-size: 13px; font-weight: 600; line-height: 1.3; margin-bottom: 4px; }
-figcaption span { font-weight: 400; color: var(--soft); white-space: nowrap; }
-img.picture { width: 100%; height: auto; display: block; image-rendering: pixelated;
-border-radius: 3px; }
-.bar { display: flex; align-items: center; gap: 6px; font-size: 11.5px; color: var(--soft);
-margin-top: 4px;
-  font-variant-numeric: tabular-nums; white-space: nowrap; }
-.bar img { flex: 1; height: 9px; min-width: 20px; width: 20px; border-radius: 2px; }
-.wide { max-width: 420px; }
-.chart { background: #ffffff; border-radius: 6px; padding: 6px; }
-.chart img { width: 100%; height: auto; display: block; }
-dl { display: grid; grid-template-columns: max-content 1fr; gap: 4px 18px; margin: 8px 0;
-font-size: 14px; }
-dt { color: var(--soft); } dd { margin: 0; overflow-wrap: anywhere; }
-pre { overflow-x: auto; font-size: 12px; background: var(--page); padding: 10px; border-radius: 6px;
-  max-height: 420px; }
-code { font-size: 13px; overflow-wrap: anywhere; }
-@media (max-width: 700px) { .row { grid-template-columns: repeat(2, minmax(0, 1fr)); } }
-"""
+STYLE = Path(__file__).with_suffix(".css")
 
 FORMATS: dict[str, Callable[[Any], str]] = {  # formats of values of metrics.json
     "error": lambda value: f"{value:.3f}",  # [m^2 x 100]
@@ -137,7 +82,7 @@ def colour_bar(scale: pictures.Scale) -> str:
     """The colours of a scale between its two values."""
     source = _bar(scale.colours)
     low, high = (f"{value:.3g}".replace("-", "\N{MINUS SIGN}") for value in (scale.low, scale.high))
-    unit = escape(scale.unit)
+    unit = f"<span>{escape(scale.unit)}</span>" if scale.unit else ""
     return f'<div class="bar">{low}<img src="{source}" alt="colour bar">{high} {unit}</div>'
 
 
@@ -146,15 +91,37 @@ def _bar(colours: str) -> str:
     return pictures.data_uri(pictures.webp(pictures.bar(colours)), "image/webp")
 
 
-def row(figures: list[str], columns: int | None = None) -> str:
-    """Pictures in equal columns."""
-    return f'<div class="row" style="--columns: {columns or len(figures)}">{"".join(figures)}</div>'
+def row(figures: list[str], columns: int | None = None, *, kind: str = "") -> str:
+    """Pictures in equal columns, two on a phone; of kind ``strip``, all of them in a row there."""
+    style = f'class="row {kind}" style="--columns: {columns or len(figures)}"'
+    return f"<div {style}>{''.join(figures)}</div>"
 
 
-def chart(svg: bytes, title: str) -> str:
-    """An SVG drawing on white, embedded as an image."""
-    source = pictures.data_uri(svg, "image/svg+xml")
-    return f'<div class="chart"><img src="{source}" alt="{escape(title)}"></div>'
+def charts(drawings: Sequence[bytes], title: str) -> str:
+    """SVG drawings on white, embedded as images, as many in a row as fit."""
+    images = (
+        f'<img src="{pictures.data_uri(svg, "image/svg+xml")}" alt="{escape(title)}">'
+        for svg in drawings
+    )
+    return f'<div class="charts">{"".join(images)}</div>'
+
+
+def table(head: Sequence[str], rows: Sequence[tuple[str, Sequence[str]]]) -> str:
+    """A table of trusted HTML that scrolls sideways where it does not fit.
+
+    Args:
+        head: Titles of the columns; the first is that of the names.
+        rows: Class of a row, such as ``ours`` or nothing, and its cells.
+    """
+    titles = "".join(f"<th>{title}</th>" for title in head)
+    lines = "".join(
+        f'<tr class="{kind}">{"".join(f"<td>{cell}</td>" for cell in cells)}</tr>'
+        for kind, cells in rows
+    )
+    return (
+        f'<div class="scroll"><table><thead><tr>{titles}</tr></thead><tbody>{lines}</tbody>'
+        "</table></div>"
+    )
 
 
 def document(title: str, body: str) -> str:
@@ -163,6 +130,6 @@ def document(title: str, body: str) -> str:
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
         f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{escape(title)}</title><style>{STYLE}</style></head>"
+        f"<title>{escape(title)}</title><style>{STYLE.read_text(encoding='utf-8')}</style></head>"
         f"<body><main>{body}</main></body></html>\n"
     )

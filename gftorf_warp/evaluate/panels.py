@@ -15,14 +15,14 @@ from ..data.sequence import Sequence
 from ..data.unwrap import CONFIDENT
 from ..recon.fallback import SOURCES
 from ..recon.residuals import Residuals
-from . import page, pictures
+from . import controls, page, pictures
 from .gallery import Colour, Novel
 from .views import Views
 
 STRIP_FRAMES = 5  # columns of the strip over time
 STRIP_SIZE_MAX = 160  # [px]
-ANIMATION_FRAMES_MAX = 48
-ANIMATION_PERIOD_S = 0.25  # [s] slow enough to compare panels
+FILM_FRAMES_MAX = 48
+FILM_PERIOD_S = 0.25  # [s] slow enough to compare panels
 CLOSE_UP_MIN = 24  # [px] smallest side of a close-up
 CLOSE_UP_MARGIN = 0.25  # around the moving pixels, as a fraction of their extent
 CLOSE_UP_SHARE_MAX = 0.6  # a larger close-up would repeat the whole picture
@@ -158,14 +158,18 @@ def error_maps(judged: Judgement, s: int, window: Window = WHOLE) -> str:
 
     The errors of the closed form define the scale, on moving pixels if there are any.
     """
-    error, moving = np.sqrt(judged.errors["closed_form"][s]), judged.moving[s]
-    scale = pictures.error_scale([error[moving] if moving.any() else error])
+    scale = _error_scale(judged, s)
     figures = [
         page.picture(np.sqrt(judged.errors[name][s][window]), scale, f"error of {title}")
         for name, title in TITLES.items()
     ]
-    moves = moving[window].astype(np.float32)
+    moves = judged.moving[s][window].astype(np.float32)
     return page.row([*figures, page.picture(moves, _share_scale(1.0), "moving pixels")])
+
+
+def _error_scale(judged: Judgement, s: int) -> pictures.Scale:
+    error, moving = np.sqrt(judged.errors["closed_form"][s]), judged.moving[s]
+    return pictures.error_scale([error[moving] if moving.any() else error])
 
 
 def close_up(found: Findings, judged: Judgement, s: int) -> str:
@@ -203,13 +207,13 @@ def explained(found: Findings, s: int) -> str:
     if found.residuals.noisy:
         logarithm = np.log10(np.maximum(found.residuals.chi_square, CHI_SQUARE_SHOWN[0]))
         low, high = np.log10(CHI_SQUARE_SHOWN)
-        scale = pictures.Scale(low=low, high=high, colours="magma", unit="log10")
+        scale = pictures.Scale(low=low, high=high, colours="magma", unit="power of ten")
         image, over = logarithm[of_quartet], logarithm.max(axis=0)
         figures.append(page.picture(image, scale, "chi-square", "of this quartet"))
         figures.append(page.picture(over, scale, "chi-square", "largest of all quartets"))
     often = found.residuals.unexplained.mean(axis=0, dtype=np.float32)
     title = "share of quartets that are not explained"
-    return page.row([*figures, page.picture(often, _share_scale(1.0), title)])
+    return page.row([*figures, page.picture(often, _share_scale(1.0), title)], columns=4)
 
 
 def source(found: Findings, s: int) -> str:
@@ -219,7 +223,8 @@ def source(found: Findings, s: int) -> str:
     scale = pictures.Scale(low=0.0, high=len(SOURCE_NAMES) - 1.0, colours="gray", unit="")
     image, note = found.views.source[s].astype(np.float32), ", ".join(SOURCE_NAMES.values())
     alone = page.picture(found.views.d_fit[s], found.distance_scale, "the fit alone, d")
-    return page.row([page.picture(image, scale, "source", f"black to white: {note}"), alone])
+    picture = page.picture(image, scale, "source", f"black to white: {note}")
+    return page.row([picture, alone], columns=4)
 
 
 def strip_over_time(found: Findings) -> str:
@@ -233,36 +238,62 @@ def strip_over_time(found: Findings) -> str:
         for s in chosen:
             rgb = _small(_distances(found, s)[title], scale)
             figures.append(page.plain_picture(rgb, title, f"frame {found.views.frames[s]}"))
-        rows.append(page.row(figures))
+        rows.append(page.row(figures, kind="strip"))
     return "".join(rows) + f'<div class="wide">{page.colour_bar(scale)}</div>'
 
 
-def animation(found: Findings) -> str:
-    """The first frames of all quartets: measured quad, rendered quad, closed form, ours."""
-    starts = [s for s, n in enumerate(found.views.frames) if n % found.sequence.cycle == 0]
-    starts = starts[:: -(-len(starts) // ANIMATION_FRAMES_MAX)]
+def film(found: Findings) -> str:
+    """The first frames of all quartets: measured quad, closed form, ours, and truth if known."""
+    views, cycle = found.views, found.sequence.cycle
+    starts = [s for s, n in enumerate(views.frames) if n % cycle == 0]
+    starts = starts[:: -(-len(starts) // FILM_FRAMES_MAX)]
     if len(starts) < 2:
         return ""
-    views, metres = found.views, found.distance_scale
-    quad = pictures.signed_scale([views.quad_measured])
-    panels = {
+    quad, metres = pictures.signed_scale([views.quad_measured]), found.distance_scale
+    shown = {
         "measured quad": (views.quad_measured, quad),
-        "rendered quad": (views.quad_rendered, quad),
-        "closed form": (views.closed_form, metres),
-        "ours, d": (views.d, metres),
+        TITLES["closed_form"]: (views.closed_form, metres),
+        TITLES["d"]: (views.d, metres),
     }
-    frames = [
-        pictures.side_by_side([_small(image[s], scale) for image, scale in panels.values()])
-        for s in starts
-    ]
-    data = pictures.animated_webp(frames, ANIMATION_PERIOD_S)
-    source, titles = pictures.data_uri(data, "image/webp"), [*panels]
-    bars = page.row([page.colour_bar(scale) for scale in (quad, metres)])
-    captions = "".join(f'<b class="caption">{title}</b>' for title in titles)
-    return (
-        f'<div class="row" style="--columns: 4">{captions}</div>'
-        f'<img class="picture" src="{source}" alt="animation: {", ".join(titles)}">{bars}'
+    if found.judgement is None:
+        shown["rendered quad"] = views.quad_rendered, quad
+    else:
+        shown["truth"] = found.judgement.truth, metres
+    return controls.film(
+        {
+            title: ([_small(image[s], scale) for s in starts], page.colour_bar(scale))
+            for title, (image, scale) in shown.items()
+        },
+        FILM_PERIOD_S,
     )
+
+
+def sliders(found: Findings, s: int) -> str:
+    """Closed form against ours: their distances, and their errors, or without truth the measured
+    quad against the rendered one.
+    """
+    views, judged, titles = found.views, found.judgement, (TITLES["closed_form"], TITLES["d"])
+    pairs = [(views.closed_form[s], views.d[s], found.distance_scale, titles)]
+    if judged is None:
+        measured, rendered = views.quad_measured[s], views.quad_rendered[s]
+        quads = pictures.signed_scale([measured])
+        pairs.append((measured, rendered, quads, ("measured quad", "rendered quad")))
+    else:
+        before, after = (np.sqrt(judged.errors[name][s]) for name in ("closed_form", "d"))
+        errors = f"error of {titles[0]}", f"error of {titles[1]}"
+        pairs.append((before, after, _error_scale(judged, s), errors))
+    return '<div class="sliders">' + "".join(_slider(*pair) for pair in pairs) + "</div>"
+
+
+def _slider(
+    left: np.ndarray, right: np.ndarray, scale: pictures.Scale, titles: tuple[str, str]
+) -> str:
+    rgb = [
+        pictures.colour_mapped(pictures.thinned(image, page.PICTURE_SIZE_MAX), scale)
+        for image in (left, right)
+    ]
+    bar = f'<div class="wide">{page.colour_bar(scale)}</div>'
+    return controls.slider(rgb[0], rgb[1], titles, bar)
 
 
 def _distances(found: Findings, s: int) -> dict[str, np.ndarray]:

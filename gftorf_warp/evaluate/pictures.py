@@ -114,31 +114,16 @@ def thinned(image: np.ndarray, size_max: int) -> np.ndarray:
     return image[::step, ::step]
 
 
-def webp(rgb: UInt8[np.ndarray, "H W 3"]) -> bytes:
-    """A lossless WebP file."""
+def webp(rgb: UInt8[np.ndarray, "H W 3"], quality: int = WEBP_LOSSLESS) -> bytes:
+    """A WebP file, lossless unless a ``quality`` as in JPEG is given."""
     import cv2
 
     ok, data = cv2.imencode(
-        ".webp", np.ascontiguousarray(rgb[..., ::-1]), [cv2.IMWRITE_WEBP_QUALITY, WEBP_LOSSLESS]
+        ".webp", np.ascontiguousarray(rgb[..., ::-1]), [cv2.IMWRITE_WEBP_QUALITY, quality]
     )
     if not ok:
         raise ValueError(f"OpenCV could not encode a picture of shape {rgb.shape} as WebP")
     return data.tobytes()
-
-
-def animated_webp(
-    pictures: list[UInt8[np.ndarray, "H W 3"]], period_s: float, quality: int = 80
-) -> bytes:
-    """An endless WebP animation, each picture for ``period_s`` [s]; ``quality`` as in JPEG."""
-    import cv2
-
-    animation = cv2.Animation()
-    animation.frames = [np.ascontiguousarray(picture[..., ::-1]) for picture in pictures]
-    animation.durations = [round(1000 * period_s)] * len(pictures)
-    ok, data = cv2.imencodeanimation(".webp", animation, [cv2.IMWRITE_WEBP_QUALITY, quality])
-    if not ok:
-        raise ValueError(f"OpenCV could not encode {len(pictures)} pictures as an animated WebP")
-    return np.asarray(data).tobytes()
 
 
 def data_uri(data: bytes, kind: str) -> str:

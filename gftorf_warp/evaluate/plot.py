@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-WIDTH = 792  # [px] of a drawing
+WIDTH, HEIGHT = 288, 216  # [px] of a drawing
 LEFT, RIGHT, BELOW = 52, 14, 38  # [px] around the axes of a plot
 TITLE, LEGEND_ROW = 22, 13  # [px] above them
 FONT, SMALL = 9.5, 8.5  # [px]
@@ -82,35 +82,23 @@ class _Axis(NamedTuple):
         return [(value, label) for value, label in found if self.low <= value <= self.high]
 
 
-def svg(plots: Sequence[Plot], *, columns: int, height: int) -> bytes:
-    """A drawing of plots in rows of ``height`` [px]; plots of the same curves share one legend."""
-    legends = [_legend(plot.curves, WIDTH / columns - 2 * RIGHT) for plot in plots]
-    shared = len(plots) > 1 and all(legend == legends[0] for legend in legends)
-    body, top = [], 0.0
-    if shared:
-        body, top = [_group(legends[0], LEFT, FONT)], float(LEGEND_ROW)
-    for first in range(0, len(plots), columns):
-        row = range(first, min(first + columns, len(plots)))
-        above = TITLE + (0 if shared else LEGEND_ROW * max(len(legends[k]) for k in row))
-        for k in row:
-            left = WIDTH / columns * (k - first)
-            body.append(_plot(plots[k], left, top, above, WIDTH / columns, height))
-            if not shared:
-                body.append(_group(legends[k], left + RIGHT, top + TITLE))
-        top += height
-    size = f'width="{WIDTH}" height="{top:g}" viewBox="0 0 {WIDTH} {top:g}"'
+def svg(plot: Plot) -> bytes:
+    """A drawing of one plot, its legend above the axes."""
+    legend = _legend(plot.curves, WIDTH - 2 * RIGHT)
+    body = _plot(plot, TITLE + LEGEND_ROW * len(legend)) + _group(legend, RIGHT, TITLE)
+    size = f'width="{WIDTH}" height="{HEIGHT}" viewBox="0 0 {WIDTH} {HEIGHT}"'
     font = f'font-family="DejaVu Sans, Verdana, sans-serif" font-size="{FONT}" fill="{INK}"'
-    drawing = "".join(body)
-    return f'<svg xmlns="http://www.w3.org/2000/svg" {size} {font}>{drawing}</svg>\n'.encode()
+    return f'<svg xmlns="http://www.w3.org/2000/svg" {size} {font}>{body}</svg>\n'.encode()
 
 
-def _plot(plot: Plot, left: float, top: float, above: float, width: float, height: float) -> str:
-    x0, x1, y0, y1 = left + LEFT, left + width - RIGHT, top + height - BELOW, top + above
+def _plot(plot: Plot, above: float) -> str:
+    """Axes and curves, ``above`` [px] below the upper edge."""
+    x0, x1, y0, y1 = LEFT, WIDTH - RIGHT, HEIGHT - BELOW, above
     xs = np.concatenate([np.asarray(curve.x, float) for curve in plot.curves])
     ys = np.concatenate([np.asarray(curve.y, float) for curve in plot.curves])
     x, y = _axis(xs, plot.log_x, x0, x1), _axis(ys, plot.log_y, y0, y1, from_zero=plot.from_zero)
     bold = 'text-anchor="middle" font-weight="bold" font-size="11"'
-    parts = [_text(0.5 * (x0 + x1), top + 14, plot.title, bold)]
+    parts = [_text(0.5 * (x0 + x1), 14, plot.title, bold)]
     for value, label in x.ticks():
         at = float(x(np.array(value)))
         parts += [_line(at, y0, at, y1, GRID)] if label else []
@@ -124,8 +112,8 @@ def _plot(plot: Plot, left: float, top: float, above: float, width: float, heigh
     parts += [_line(x0, y0, x1, y0), _line(x0, y0, x0, y1)]
     parts.append(_text(0.5 * (x0 + x1), y0 + 30, plot.x, 'text-anchor="middle"'))
     middle = 0.5 * (y0 + y1)
-    turned = f'text-anchor="middle" transform="rotate(-90 {left + 11:.1f} {middle:.1f})"'
-    parts.append(_text(left + 11, middle, plot.y, turned))
+    turned = f'text-anchor="middle" transform="rotate(-90 11 {middle:.1f})"'
+    parts.append(_text(11, middle, plot.y, turned))
     return "".join(parts) + "".join(_curve(curve, x, y) for curve in plot.curves)
 
 

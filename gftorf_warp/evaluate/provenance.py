@@ -59,11 +59,20 @@ def fact(config: Mapping[str, Any], name: str) -> Any:
     return config.get(name, config.get("settings", {}).get(name))
 
 
-def how(config: Mapping[str, Any], data_card: str | None, installed: str) -> str:
+def how(
+    config: Mapping[str, Any],
+    data_card: str | None,
+    installed: str,
+    *,
+    compared: Mapping[str, Any],
+    simulated: str | None = None,
+) -> str:
     """A run's config in words, as HTML.
 
     Args:
         config: Content of config.json.
+        compared: Content of metrics.json.
+        simulated: Command that made the sequence; None if unknown.
         data_card: Statement on the truth in the sequence's README; None if it has none.
         installed: Versions of the software of the comparison.
     """
@@ -74,6 +83,7 @@ def how(config: Mapping[str, Any], data_card: str | None, installed: str) -> str
     length = f"{config.get('images')}, {config.get('seed')}"
     facts = {
         "sequence": config.get("sequence"),
+        "SHA-256 of its data": config.get("data_sha256"),
         "preset": config.get("preset"),
         "ablation": fact(config, "ablation"),
         "method": METHOD_WORDS.get(method, method),
@@ -92,12 +102,20 @@ def how(config: Mapping[str, Any], data_card: str | None, installed: str) -> str
     }
     present = {name: value for name, value in facts.items() if value is not None}
     rows = "".join(f"<dt>{name}</dt><dd>{page.escape(v)}</dd>" for name, v in present.items())
-    command = f"{_command(config)}\ngftorf compare RUN"
+    command = "\n".join(filter(None, [simulated, _command(config), _compare_command(compared)]))
     everything = json.dumps(config, indent=2, sort_keys=True, default=str)
     return (
         f"<dl>{rows}</dl><h3>To reproduce</h3><pre>{page.escape(command)}</pre>"
         f"<details><summary>config.json</summary><pre>{page.escape(everything)}</pre></details>"
     )
+
+
+def _compare_command(metrics: Mapping[str, Any]) -> str:
+    """The command that reproduces the comparison."""
+    usual = {"frames": ("protocol", "all"), "against": ("against", "geometry")}
+    given = {option: metrics.get(key) or default for option, (key, default) in usual.items()}
+    words = [f" --{o} {shlex.quote(str(v))}" for o, v in given.items() if v != usual[o][1]]
+    return "gftorf compare RUN" + "".join(words)
 
 
 def _command(config: Mapping[str, Any]) -> str:

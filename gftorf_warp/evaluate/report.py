@@ -12,50 +12,16 @@ import numpy as np
 from ..data.decode import unambiguous_range
 from ..recon.residuals import problems
 from ..render.buffers import available_threads
-from . import figures, gallery, page, panels, provenance
+from . import figures, gallery, page, panels, provenance, tables
 from .legend import PHASORS_TO_READ, TO_READ
-from .metrics import DISTANCES, ERROR_UNIT, per_frame_mean
+from .metrics import ERROR_UNIT, per_frame_mean
 from .panels import Findings
 
-ROWS = {
-    "closed_form": ("closed form", "decoded from the raw quads of a quartet"),
-    "temporal_mean": ("temporal mean", "decoded from the mean of all quartets"),
-    "temporal_median": ("temporal median", "decoded from their median, raw frame by raw frame"),
-    "temporal": ("temporal", "mean of the quartets that agree with the median, else closed form"),
-    "d": ("ours, d", "rendered mean distance, not divided by opacity"),
-    "d_fit": ("the fit alone, d", "where the measurement does not replace it"),
-    "d_normalised": ("ours, d / opacity", "the same, divided"),
-    "d_median": ("ours, median", "distance at which one half of the light is stopped"),
-    "d_tof": ("ours, d_ToF", "decoded from quads rendered at one instant"),
-}
 WITHOUT_GAUSSIANS = {
     "ctof": "the closed form itself",
     "temporal": "the closed form, averaged over time where nothing moves",
 }
-FACTS = (
-    ("quad PSNR", "quad_psnr_db", "decibel"),
-    ("colour PSNR", "colour_psnr_db", "decibel"),
-    ("raw frames scored", "frames", "count"),
-    ("protocol", "protocol", "text"),
-    ("true distance", "against", "text"),
-    ("Gaussians", "gaussians", "count"),
-    ("optimised images", "images_optimised", "count"),
-    ("reconstruction, wall clock", "seconds_reconstruct", "seconds"),
-    ("device", "device", "text"),
-    ("seed", "seed", "text"),
-)
-OPTIONAL = {"colour_psnr_db", "against"}  # left out where unknown
 COUNTED = {3: "three", 4: "four", 5: "five", 6: "six", 8: "eight"}
-PIXELS = {"": "all pixels", "moving.": "moving pixels", "static.": "static pixels"}
-COLUMNS = {**PIXELS, "static_throughout.": "static throughout"}
-OF_CLASS = {
-    "interior": "interior",
-    "edge": "edge",
-    "slope_0_10": "interior, 0 to 10 mm/px",
-    "slope_10_20": "10 to 20 mm/px",
-    "slope_20_40": "20 to 40 mm/px",
-    "slope_over_40": "over 40 mm/px",
-}
 ALONG_TEXT = (
     "Rendered over black at a few fixed raw frames, at the size of the optimisation, which does "
     "not use these numbers. Where d and d_ToF differ on static pixels, light is explained by "
@@ -73,12 +39,14 @@ def report(
     diagnostics: Sequence[Mapping[str, float]] = (),
     installed: str = "",
     data_card: str | None = None,
+    simulated: str | None = None,
 ) -> str:
     """The page, from the files of the run.
 
     ``metrics`` is the content of metrics.json, source of all printed results; ``log`` and
     ``diagnostics`` are rows of metrics.jsonl and diagnostics.jsonl; ``installed`` is the software
-    of the comparison, ``data_card`` the statement on the truth in the sequence's README.
+    of the comparison, ``data_card`` the statement on the truth in the sequence's README, and
+    ``simulated`` the command there that made it.
     """
     s = panels.telling_row(found)
     with ThreadPoolExecutor(available_threads()) as pool:  # pictures are encoded without the GIL
@@ -86,25 +54,29 @@ def report(
         measured = pool.submit(panels.measured_quartet, found, s)
         residual = pool.submit(panels.quad_residual, found, s)
         explained = pool.submit(_explained, metrics, found, s)
-        animation = pool.submit(panels.animation, found)
+        sliders = pool.submit(panels.sliders, found, s)
+        film = pool.submit(panels.film, found)
         strip = pool.submit(panels.strip_over_time, found)
         beyond = pool.submit(_beyond, metrics, found)
         curves = pool.submit(_curves, found, log)
+    made = provenance.how(config, data_card, installed, compared=metrics, simulated=simulated)
     sections = [
         f"<h1>{page.escape(title)}</h1>"
         f'<div class="soft">gftorf compare, version {page.number(metrics, "version", "text")}</div>'
         f'<p class="verdict">{verdict(metrics)}</p>',
-        _section("Errors", _table(metrics), _facts(metrics)),
+        _section("Before and after", _sliders_text(found, s), sliders.result()),
+        *_film(film.result()),
+        _section("Errors", tables.errors(metrics), tables.facts(metrics)),
         *_by_class(metrics),
         _section("Distance", _distance_text(found, s), distances.result()),
         _section("What was measured", _measured_text(found, s), measured.result()),
         _section("Quads", _quad_text(found, s), residual.result()),
         *explained.result(),
-        _section("Over time", strip.result(), _animated(animation.result())),
+        _section("Over time", strip.result()),
         *beyond.result(),
         *_along(metrics, diagnostics),
         _section("Curves", curves.result()),
-        _section("How it was made", provenance.how(config, data_card, installed)),
+        _section("How it was made", made),
         _section("How to read it", TO_READ, PHASORS_TO_READ if found.sequence.from_phasors else ""),
     ]
     return page.document(f"{title} - gftorf compare", "".join(sections))
@@ -170,65 +142,28 @@ def _caption(text: str) -> str:
     return f'<p class="caption">{text}</p>'
 
 
-def _table(metrics: Mapping[str, Any]) -> str:
-    if page.look_up(metrics, "d_mse_x100") is None:
-        return '<p class="soft">No ground truth: distance errors are not known.</p>'
-    head, rows = "", []
-    for group, name in COLUMNS.items():
-        share = f"{page.number(metrics, f'{group}share', 'percent')} of all" if group else "&nbsp;"
-        head += f"<th>{name}<span class='soft'>{share}</span></th>"
-    for name in DISTANCES:
-        title, note = ROWS[name]
-        cells = "".join(
-            f"<td>{_cell(metrics, f'{group}{name}_mse_x100')}</td>" for group in COLUMNS
-        )
-        mark = ' class="ours"' if name == "d" else ""
-        text = f'<td><b>{title}</b> <span class="soft">{note}</span></td>'
-        rows.append(f"<tr{mark}>{text}{cells}</tr>")
-    return (
-        '<p class="soft">Mean squared error of the distance, m² &times; 100, and its root.</p>'
-        f"<table><thead><tr><th></th>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
-    )
-
-
 def _by_class(metrics: Mapping[str, Any]) -> list[str]:
-    """Errors of moving and of static pixels by what the truth looks like around them."""
+    """The section of errors at edges and on slopes; none without truth."""
     if page.look_up(metrics, "classes") is None:
         return []
-    html = ""
-    for group in ("moving", "static"):
-        key, head, rows = f"classes.{group}", "", []
-        for kind, name in OF_CLASS.items():
-            share = page.number(metrics, f"{key}.{kind}.share", "percent")
-            head += f"<th>{name}<span class='soft'>{share}</span></th>"
-        for name in DISTANCES:
-            keys = [f"{key}.{kind}.{name}_mse_x100" for kind in OF_CLASS]
-            if all(page.look_up(metrics, one) is None for one in keys):
-                continue
-            mark = ' class="ours"' if name == "d" else ""
-            cells = "".join(f"<td>{page.number(metrics, one, 'error')}</td>" for one in keys)
-            rows.append(f"<tr{mark}><td><b>{ROWS[name][0]}</b></td>{cells}</tr>")
-        table = f"<thead><tr><th></th>{head}</tr></thead><tbody>{''.join(rows)}</tbody>"
-        html += f"<h3>{PIXELS[f'{group}.'].capitalize()}</h3>"
-        html += f"<table>{table}</table>" if rows else '<p class="soft">There are none.</p>'
-    text = "The errors above in m² &times; 100, by what the true distance looks like around a pixel"
-    return [_section("Edges and slopes", f'<p class="soft">{text}.</p>', html)]
+    text = "Root mean squared error by what the true distance looks like around a pixel."
+    more = "<summary>In m² &times; 100, all distances and slopes</summary>"
+    details = f"<details>{more}{tables.by_class(metrics)}</details>"
+    return [_section("Edges and slopes", _caption(text), tables.bars_by_class(metrics), details)]
 
 
-def _cell(metrics: Mapping[str, Any], key: str) -> str:
-    if page.look_up(metrics, key) is None:
-        return page.number(metrics, key, "error")
-    error, root = (page.number(metrics, key, form) for form in ("error", "rms_cm"))
-    return f'{error} <span class="soft">{root}</span>'
-
-
-def _facts(metrics: Mapping[str, Any]) -> str:
-    items = "".join(
-        f"<li><b>{page.number(metrics, key, form)}</b>{name}</li>"
-        for name, key, form in FACTS
-        if key not in OPTIONAL or page.look_up(metrics, key) is not None
+def _sliders_text(found: Findings, s: int) -> str:
+    frame = found.views.frames[s]
+    return _caption(
+        f"Raw frame {frame}: the closed form, as a camera computes it, and ours. The scroll bar, a "
+        "swipe or the arrow keys move the edge."
     )
-    return f'<ul class="facts">{items}</ul>'
+
+
+def _film(html: str) -> list[str]:
+    """The section of the film, if there is one."""
+    text = "The first raw frame of every quartet, slowed down."
+    return [_section("Quartet by quartet", _caption(text), html)] if html else []
 
 
 def _distance_text(found: Findings, s: int) -> str:
@@ -305,11 +240,6 @@ def _explained(metrics: Mapping[str, Any], found: Findings, s: int) -> list[str]
     return [_section("How well the quads are explained", text, html)]
 
 
-def _animated(moving: str) -> str:
-    """The animation with its heading, if there is one."""
-    return f"<h3>Quartet by quartet, slowed down</h3>{moving}" if moving else ""
-
-
 def _beyond(metrics: Mapping[str, Any], found: Findings) -> list[str]:
     """Sections of colour and of novel views, where there are any."""
     sections = []
@@ -327,8 +257,8 @@ def _beyond(metrics: Mapping[str, Any], found: Findings) -> list[str]:
 
 def _along(metrics: Mapping[str, Any], rows: Sequence[Mapping[str, float]]) -> list[str]:
     """The section of diagnostics; none if there were none."""
-    drawing = figures.along_run(rows)
-    if drawing is None:
+    drawings = figures.along_run(rows)
+    if not drawings:
         return []
     along = metrics.get("diagnostics") or {}
 
@@ -349,20 +279,22 @@ def _along(metrics: Mapping[str, Any], rows: Sequence[Mapping[str, float]]) -> l
             f" The error of d is least, {number('d_mse_x100_least', 'error')}, after "
             f"{number('images_at_least', 'count')} images."
         )
-    return [_section("Along the run", _caption(text), page.chart(drawing, "Along the run"))]
+    return [_section("Along the run", _caption(text), page.charts(drawings, "Along the run"))]
 
 
 def _curves(found: Findings, log: Sequence[Mapping[str, float]]) -> str:
     charts = []
     training = figures.training_curves(log)
-    if training is not None:
+    if training:
         charts.append(("During optimisation", training))
     judged = found.judgement
     if judged is not None:
         errors = {name: judged.errors[name] for name in panels.TITLES}
         everywhere = np.ones_like(judged.moving)
         masks = everywhere, judged.moving, judged.static
-        groups = {n: mask for n, mask in zip(PIXELS.values(), masks, strict=True) if mask.any()}
+        groups = {
+            n: mask for n, mask in zip(tables.PIXELS.values(), masks, strict=True) if mask.any()
+        }
         per_frame = {
             group: {
                 name: [None if v is None else ERROR_UNIT * v for v in per_frame_mean(error, mask)]
@@ -374,4 +306,4 @@ def _curves(found: Findings, log: Sequence[Mapping[str, float]]) -> str:
         charts.append(("Error of every raw frame", over_frames))
         title = "Distribution of errors (the first bin holds all below a millimetre)"
         charts.append((title, figures.error_histogram(errors, groups)))
-    return "".join(f"<h3>{title}</h3>{page.chart(svg, title)}" for title, svg in charts)
+    return "".join(f"<h3>{title}</h3>{page.charts(drawings, title)}" for title, drawings in charts)

@@ -1,0 +1,138 @@
+"""The tables of a report: errors by distance and group of pixels, with the numbers of
+metrics.json.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from . import page
+from .metrics import DISTANCES
+
+ROWS = {
+    "closed_form": ("closed form", "decoded from the raw quads of a quartet"),
+    "temporal_mean": ("temporal mean", "decoded from the mean of all quartets"),
+    "temporal_median": ("temporal median", "decoded from their median, raw frame by raw frame"),
+    "temporal": ("temporal", "mean of the quartets that agree with the median, else closed form"),
+    "d": ("ours, d", "rendered mean distance, not divided by opacity"),
+    "d_fit": ("the fit alone, d", "where the measurement does not replace it"),
+    "d_normalised": ("ours, d / opacity", "the same, divided"),
+    "d_median": ("ours, median", "distance at which one half of the light is stopped"),
+    "d_tof": ("ours, d_ToF", "decoded from quads rendered at one instant"),
+}
+FACTS = (
+    ("quad PSNR", "quad_psnr_db", "decibel"),
+    ("colour PSNR", "colour_psnr_db", "decibel"),
+    ("raw frames scored", "frames", "count"),
+    ("protocol", "protocol", "text"),
+    ("true distance", "against", "text"),
+    ("Gaussians", "gaussians", "count"),
+    ("optimised images", "images_optimised", "count"),
+    ("reconstruction, wall clock", "seconds_reconstruct", "seconds"),
+    ("device", "device", "text"),
+    ("seed", "seed", "text"),
+)
+OPTIONAL = {"colour_psnr_db", "against"}  # left out where unknown
+PIXELS = {"": "all pixels", "moving.": "moving pixels", "static.": "static pixels"}
+COLUMNS = {**PIXELS, "static_throughout.": "static throughout"}
+OF_CLASS = {
+    "interior": "interior",
+    "edge": "edge",
+    "slope_0_10": "interior, 0 to 10 mm/px",
+    "slope_10_20": "10 to 20 mm/px",
+    "slope_20_40": "20 to 40 mm/px",
+    "slope_over_40": "over 40 mm/px",
+}
+BARS = {"closed_form": "--naive", "temporal": "--other", "d": "--ours"}  # colours in page.css
+
+
+def errors(metrics: Mapping[str, Any]) -> str:
+    """Errors of every distance on all, moving and static pixels."""
+    if page.look_up(metrics, "d_mse_x100") is None:
+        return '<p class="soft">No ground truth: distance errors are not known.</p>'
+    head, rows = [""], []
+    for group, name in COLUMNS.items():
+        share = f"{page.number(metrics, f'{group}share', 'percent')} of all" if group else "&nbsp;"
+        head.append(f"{name}<span class='soft'>{share}</span>")
+    for name in DISTANCES:
+        title, note = ROWS[name]
+        cells = [_error_and_root(metrics, f"{group}{name}_mse_x100") for group in COLUMNS]
+        named = f'<b>{title}</b> <span class="soft note">{note}</span>'
+        rows.append((_mark(name), [named, *cells]))
+    text = "Mean squared error of the distance, m² &times; 100, and its root."
+    return f'<p class="soft">{text}</p>{page.table(head, rows)}'
+
+
+def facts(metrics: Mapping[str, Any]) -> str:
+    """What else metrics.json says, with a word on each."""
+    items = "".join(
+        f"<li><b>{page.number(metrics, key, form)}</b>{name}</li>"
+        for name, key, form in FACTS
+        if key not in OPTIONAL or page.look_up(metrics, key) is not None
+    )
+    return f'<ul class="facts">{items}</ul>'
+
+
+def bars_by_class(metrics: Mapping[str, Any]) -> str:
+    """Bars of the errors [cm] at edges and inside, of moving and of static pixels."""
+    groups = {
+        f"{group}, {kind}": f"classes.{group}.{kind}"
+        for group in ("moving", "static")
+        for kind in ("edge", "interior")
+    }
+    values = {
+        key: {name: page.look_up(metrics, f"{key}.{name}_mse_x100") for name in BARS}
+        for key in groups.values()
+    }
+    known = [v for row in values.values() for v in row.values() if v is not None]
+    if not known:
+        return ""
+    largest = max(*known, 1e-9) ** 0.5  # the root is drawn
+    rows = ""
+    for title, key in groups.items():
+        share = page.number(metrics, f"{key}.share", "percent")
+        bars = "".join(
+            f'<i style="--part: {value**0.5 / largest:.4f}; --colour: var({BARS[name]})">'
+            f"{page.number(metrics, f'{key}.{name}_mse_x100', 'rms_cm')}</i>"
+            for name, value in values[key].items()
+            if value is not None
+        )
+        if bars:
+            rows += f'<b>{title}<span class="soft">{share}</span></b><div>{bars}</div>'
+    key = "".join(
+        f'<span style="--colour: var({colour})">{ROWS[name][0]}</span>'
+        for name, colour in BARS.items()
+        if any(row[name] is not None for row in values.values())
+    )
+    return f'<div class="key">{key}</div><div class="bars">{rows}</div>'
+
+
+def by_class(metrics: Mapping[str, Any]) -> str:
+    """Errors of moving and of static pixels by what the truth looks like around them."""
+    html = ""
+    for group in ("moving", "static"):
+        key, head, rows = f"classes.{group}", [""], []
+        for kind, name in OF_CLASS.items():
+            share = page.number(metrics, f"{key}.{kind}.share", "percent")
+            head.append(f"{name}<span class='soft'>{share}</span>")
+        for name in DISTANCES:
+            keys = [f"{key}.{kind}.{name}_mse_x100" for kind in OF_CLASS]
+            if any(page.look_up(metrics, one) is not None for one in keys):
+                cells = [page.number(metrics, one, "error") for one in keys]
+                rows.append((_mark(name), [f"<b>{ROWS[name][0]}</b>", *cells]))
+        html += f"<h3>{PIXELS[f'{group}.'].capitalize()}</h3>"
+        html += page.table(head, rows) if rows else '<p class="soft">There are none.</p>'
+    return html
+
+
+def _mark(name: str) -> str:
+    """Class of the row of a distance."""
+    return "ours" if name == "d" else ""
+
+
+def _error_and_root(metrics: Mapping[str, Any], key: str) -> str:
+    if page.look_up(metrics, key) is None:
+        return page.number(metrics, key, "error")
+    error, root = (page.number(metrics, key, form) for form in ("error", "rms_cm"))
+    return f'{error} <span class="soft">{root}</span>'
