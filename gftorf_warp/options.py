@@ -171,7 +171,8 @@ def command_parsers() -> dict[str, Parser]:
     out = "folder to write; an interrupted run is resumed"
     reconstruct.option("--out", "RUN", str, out, required=True)
     presets = "settings: best, demo, paper, released, fast, dgs, dgs_depth, or without Gaussians "
-    presets += "ctof, the closed form, and temporal, the same averaged over time (best)"
+    presets += "ctof, the closed form, temporal, the same averaged over time, and flow2d, the same "
+    presets += "after optical flow (best)"
     reconstruct.option("--preset", "NAME", str, presets, "best")
     inputs = "fitted data: quads, phasor, or auto: as recorded (auto)"
     reconstruct.option("--input", "KIND", str, inputs, "auto")

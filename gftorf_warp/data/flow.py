@@ -32,8 +32,9 @@ SMALLEST_PX = 12  # [px] the matcher refuses smaller images
 ROBUST_PERCENT = 0.05
 
 
-def compute_flow(sequence: Sequence, *, method: Method = "dis") -> Flow:
-    """Compute the optical flow of every quartet start whose partner a cycle away was measured too.
+def compute_flow(sequence: Sequence, *, method: Method = "dis", every: int | None = None) -> Flow:
+    """Compute the optical flow of every quartet start whose partner a cycle away was measured too,
+    or of one in ``every`` raw frames.
 
     Flow is float32, and NaN where forward and backward flow disagree in most pairs. Stored flow is
     ignored. ``dis`` is fast and follows large motion; ``deepflow`` is smoother where motion stays
@@ -45,11 +46,7 @@ def compute_flow(sequence: Sequence, *, method: Method = "dis") -> Flow:
     """
     if method not in ("dis", "deepflow"):
         raise ValueError(f"method must be dis or deepflow, got {method!r}")
-    if min(sequence.height, sequence.width) < SMALLEST_PX:
-        size, where = f"{sequence.width}x{sequence.height}", sequence.path or "sequence"
-        why = f"expected at least {SMALLEST_PX}x{SMALLEST_PX} pixels, found {size}"
-        fix = "provide flow as files, or use larger images"
-        raise InputError("images too small for optical flow", where=where, why=why, fix=fix)
+    check_size(sequence)
     step, times, quads = sequence.cycle, sequence.times, sequence.quads
     pairs = np.flatnonzero(sequence.measured[:-step] & sequence.measured[step:]).tolist()
 
@@ -68,11 +65,30 @@ def compute_flow(sequence: Sequence, *, method: Method = "dis") -> Flow:
             raw, reliable = (
                 {n + first: flows[i] for n, flows in found.items()} for i in (k, k + 2)
             )
-            starts = [n for n in range(0, sequence.frames, abs(step)) if n in raw]
+            starts = [n for n in range(0, sequence.frames, every or sequence.cycle) if n in raw]
             flows = threads.map(lambda n: median_flow(n, raw, reliable, times, step), starts)
             return dict(zip(starts, flows, strict=True))
 
         return Flow(forward=combined(0, 0, step), backward=combined(1, step, -step))
+
+
+def check_size(sequence: Sequence) -> None:
+    """Refuse images that cannot be matched.
+
+    Raises:
+        InputError: If they are too small.
+    """
+    if min(sequence.height, sequence.width) < SMALLEST_PX:
+        size, where = f"{sequence.width}x{sequence.height}", sequence.path or "sequence"
+        why = f"expected at least {SMALLEST_PX}x{SMALLEST_PX} pixels, found {size}"
+        fix = "provide flow as files, or use larger images"
+        raise InputError("images too small for optical flow", where=where, why=why, fix=fix)
+
+
+def brightness_range(*images: Float[np.ndarray, "H W"]) -> tuple[float, float]:
+    """Smallest and largest value of images, single hot pixels aside."""
+    low, high = np.percentile(np.stack(images), [ROBUST_PERCENT, 100.0 - ROBUST_PERCENT])
+    return float(low), float(high)
 
 
 def warp_back(
@@ -104,7 +120,7 @@ def _grey(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray
     """Two quads [H, W] as uint8 images with one scale for both."""
     import cv2
 
-    low, high = np.percentile(np.stack([first, second]), [ROBUST_PERCENT, 100.0 - ROBUST_PERCENT])
+    low, high = brightness_range(first, second)
     scale = 255.0 / (high - low) if high > low else 0.0
 
     def grey(quad: np.ndarray) -> np.ndarray:

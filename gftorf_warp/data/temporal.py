@@ -126,11 +126,18 @@ def over_time(sequence: Sequence, reduce: Callable[..., np.ndarray]) -> Float[np
     Raises:
         IndexError: If no quartet is complete.
     """
-    frames = sequence.quartet_frames(sequence.complete_quartets[0])
-    one = replace(
+    first = sequence.cycle * sequence.complete_quartets[0]
+    one = one_quartet(sequence, reduce(stacked_quads(sequence), axis=0), first)
+    return closed_form_distance(one, 0)
+
+
+def one_quartet(sequence: Sequence, quads: Float[np.ndarray, "K H W"], first: int) -> Sequence:
+    """A sequence of one quartet with other quads; the rest is that of raw frames ``first`` .."""
+    frames = slice(first, first + sequence.cycle)
+    return replace(
         sequence,
-        quads=reduce(stacked_quads(sequence), axis=0).astype(np.float32),
-        measured=sequence.measured[frames],
+        quads=quads.astype(np.float32),
+        measured=np.ones(sequence.cycle, dtype=bool),
         shifts=sequence.shifts[frames],
         times=sequence.times[frames],
         frequencies_hz=sequence.frame_frequencies[frames],
@@ -140,7 +147,6 @@ def over_time(sequence: Sequence, reduce: Callable[..., np.ndarray]) -> Float[np
         colour=ColourCamera(),
         flow=Flow(),
     )
-    return closed_form_distance(one, 0)
 
 
 def stacked_quads(sequence: Sequence) -> Float[np.ndarray, "Q K H W"]:

@@ -40,6 +40,7 @@ AGAINST = ("geometry", "static-phasor")
 FACTS = (
     "seconds_reconstruct", "images_optimised", "device", "seed", "preset",
     "ablation", "input", "flow_source", "init", "motion",
+    "unfilled_share",
 )  # fmt: skip
 
 

@@ -9,8 +9,13 @@ from typing import Any
 
 from . import page
 
-# facts of an optimisation, without meaning for other methods
-OF_GAUSSIANS = {"input", "flow_source", "init", "motion"}
+# facts that mean something for some methods only
+METHODS_OF = {
+    "input": {"gaussians"},
+    "flow_source": {"gaussians", "flow2d"},
+    "init": {"gaussians"},
+    "motion": {"gaussians"},
+}
 INIT_WORDS = {
     "phase": "phase: Gaussians start on surfaces decoded from the measured quads, not at random",
     "random": "random: Gaussians start at random points in view",
@@ -21,6 +26,8 @@ METHOD_WORDS = {
     "fitted",
     "temporal": "the closed form of the mean over time where a quartet agrees with its pixel's "
     "median, and of the quartet elsewhere; nothing was fitted",
+    "flow2d": "the closed form of quartets whose raw frames optical flow brought to one time; "
+    "nothing was fitted",
 }
 INPUT_WORDS = {
     "quads": "quads: every raw frame at its own time and phase shift",
@@ -48,13 +55,13 @@ WORDS = {
 
 
 def method_of(config: Mapping[str, Any]) -> str:
-    """Method of a run: ``gaussians``, ``ctof`` or ``temporal``."""
+    """Method of a run: a name of ``METHOD_WORDS``."""
     return str(config.get("settings", {}).get("method", "gaussians"))
 
 
 def fact(config: Mapping[str, Any], name: str) -> Any:
     """A value of a run's config or settings; None if absent or without meaning for the method."""
-    if name in OF_GAUSSIANS and method_of(config) != "gaussians":
+    if method_of(config) not in METHODS_OF.get(name, {method_of(config)}):
         return None
     return config.get(name, config.get("settings", {}).get(name))
 
@@ -80,6 +87,7 @@ def how(
     known = {name: fact(config, name) for name in WORDS}
     worded = {name: WORDS[name].get(str(value), value) for name, value in known.items()}
     threads = "" if config.get("threads") is None else f", {config['threads']} threads"
+    share = config.get("unfilled_share")
     length = f"{config.get('images')}, {config.get('seed')}"
     facts = {
         "sequence": config.get("sequence"),
@@ -94,6 +102,7 @@ def how(
         "optimised at": size
         and f"{size[0]}x{size[1]} pixels; scored at the sequence's own resolution",
         "quad scale": None if scale is None else f"{scale:.6g} ({config.get('quad_scale_source')})",
+        "without optical flow": share and f"{100.0 * share:.2f} % of the pixels",
         "images, seed": length if method == "gaussians" else None,
         "device": config.get("device") and f"{config['device']}{threads}",
         "reconstructed by": f"gftorf-warp {config.get('version')}",

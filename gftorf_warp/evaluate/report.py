@@ -20,6 +20,7 @@ from .panels import Findings
 WITHOUT_GAUSSIANS = {
     "ctof": "the closed form itself",
     "temporal": "the closed form, averaged over time where nothing moves",
+    "flow2d": "the closed form of raw frames that optical flow brought to one time",
 }
 COUNTED = {3: "three", 4: "four", 5: "five", 6: "six", 8: "eight"}
 ALONG_TEXT = (

@@ -262,7 +262,7 @@ def with_flow(sequence: Sequence, source: FlowSource) -> tuple[Sequence, str]:
         return sequence, "file" if given else "none"
     from ..data.flow import compute_flow
 
-    flow = compute_flow(sequence, method="deepflow" if source == FlowSource.DEEPFLOW else "dis")
+    flow = compute_flow(sequence, method=source.matcher)
     return replace(sequence, flow=flow), "computed" if flow.forward else "none"
 
 

@@ -292,12 +292,19 @@ def temporal(recorded: Recorded = Recorded()) -> ReconSettings:
     return replace(ctof(recorded), preset="temporal", method=Method.TEMPORAL)
 
 
+def flow2d(recorded: Recorded = Recorded()) -> ReconSettings:
+    """The closed form of quartets whose raw frames optical flow brought to one time (section 7),
+    by dense inverse search or, with ``--flow deepflow``, by DeepFlow.
+    """
+    return replace(ctof(recorded), preset="flow2d", method=Method.FLOW2D)
+
+
 DEPTH_WEIGHT = 0.1  # [1/m] unpublished
 # [1/m^2] unpublished; of 1e-4, 1e-3 and 1e-2 the largest that did no harm at small size
 DISTORTION_WEIGHT = 1e-3
 PRESETS: dict[str, Callable[[Recorded], ReconSettings]] = {
     function.__name__: function
-    for function in (best, demo, paper, released, fast, dgs, dgs_depth, ctof, temporal)
+    for function in (best, demo, paper, released, fast, dgs, dgs_depth, ctof, temporal, flow2d)
 }
 """All presets by name."""
 

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from ..constants import CANONICAL_SHIFTS
 from ..data.sequence import Sequence
+from ..data.synchronised import synchronised
 from ..data.temporal import averaged
 from ..errors import InputError
 from ..render.api import Rendering, rasterize
@@ -36,7 +37,7 @@ from . import checkpoint, closed_form, source
 from .fallback import Fallback
 from .folder import read_config
 from .residuals import Residuals, residuals
-from .settings import Method
+from .settings import FlowSource, Method
 from .state import field_and_motion
 
 LOG = logging.getLogger("gftorf_warp")
@@ -65,8 +66,8 @@ class Run:
 
     @classmethod
     def open(cls, path: str | Path, device: torch.device | str = "cpu") -> Run:
-        """Read a run from its folder: config and newest checkpoint. A run of the methods ``ctof``
-        and ``temporal`` needs no checkpoint.
+        """Read a run from its folder: config and newest checkpoint. A run of the methods ``ctof``,
+        ``temporal`` and ``flow2d`` needs no checkpoint.
 
         Raises:
             InputError: If the folder is no run, or holds no checkpoint that can be read.
@@ -77,7 +78,7 @@ class Run:
         stored = config["sensor"]
         further = tuple(stored.get("further_hz", ()))
         sensor = Sensor(**stored | {"further_hz": further}, shifts=CANONICAL_SHIFTS)
-        kinds = {Method.CTOF: ClosedForm, Method.TEMPORAL: Temporal}
+        kinds = {Method.CTOF: ClosedForm, Method.TEMPORAL: Temporal, Method.FLOW2D: Flow2D}
         if (kind := kinds.get(config["settings"].get("method"))) is not None:
             return kind.of(path, config, camera, sensor, device)
         stored = checkpoint.last(path, device)
@@ -347,7 +348,7 @@ class ClosedForm(Run):
         if camera is not None:
             closed_form.check_camera(self._measured, time, camera, self.camera, self.path)
         return closed_form.rendering_of(
-            self._measured,
+            self._shown(time),
             time,
             self.sensor.shifts,
             f_mod_hz=f_mod_hz,
@@ -365,6 +366,10 @@ class ClosedForm(Run):
         """:meth:`render`: there is nothing that images share."""
         return functools.partial(self.render, f_mod_hz=f_mod_hz)
 
+    def _shown(self, time: float) -> Sequence:  # noqa: ARG002
+        """What holds the quartet that is decoded at a time [s]."""
+        return self._measured
+
     @functools.cached_property
     def _measured(self) -> Sequence:
         return closed_form.checked(self.sequence())
@@ -378,6 +383,16 @@ class Temporal(ClosedForm):
     @functools.cached_property
     def _measured(self) -> Sequence:
         return averaged(closed_form.checked(self.sequence()))
+
+
+class Flow2D(ClosedForm):
+    """A run without Gaussians, which renders the closed form of raw frames that optical flow
+    brought to the time of the rendering.
+    """
+
+    def _shown(self, time: float) -> Sequence:
+        matcher = FlowSource(self.config["settings"]["flow"]).matcher
+        return synchronised(self._measured, time, matcher).sequence
 
 
 def _camera(stored: dict) -> Camera:

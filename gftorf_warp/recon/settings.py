@@ -12,6 +12,7 @@ import enum
 from dataclasses import dataclass, field
 
 from ..constants import FRAMES_PER_QUARTET
+from ..data.flow import Method as Matcher
 from ..render.buffers import RenderSettings
 from ..scene.initialise import InitSettings
 from ..scene.models import KINDS
@@ -28,6 +29,13 @@ class Method(enum.StrEnum):
     TEMPORAL = "temporal"
     """The closed form of the temporal mean where a quartet agrees with its pixel's median, and of
     the quartet elsewhere."""
+    FLOW2D = "flow2d"
+    """The closed form of quartets whose raw frames optical flow brought to one time."""
+
+    @property
+    def fits(self) -> bool:
+        """Whether parameters are optimised."""
+        return self == Method.GAUSSIANS
 
 
 class Input(enum.StrEnum):
@@ -64,6 +72,11 @@ class FlowSource(enum.StrEnum):
     """Computed from same-shift quads by DeepFlow."""
     NONE = "none"
     """No flow: no flow loss, and motion starts at rest."""
+
+    @property
+    def matcher(self) -> Matcher:
+        """What computes it where none is read."""
+        return "deepflow" if self == FlowSource.DEEPFLOW else "dis"
 
 
 class Batch(enum.StrEnum):

@@ -15,6 +15,7 @@ import torch
 from ..data.constant import constant_part
 from ..data.read import read, read_truth
 from ..data.sequence import Sequence, Truth
+from ..data.synchronised import check_flow, unfilled_share
 from ..errors import InputError, UsageError
 from ..scene.changes import Wording, changed
 from ..scene.initialise import Init
@@ -119,12 +120,19 @@ def chosen_settings(
         settings = presets.preset(settings, recorded)
     if ablation is not None:
         settings = presets.ablated(settings, ablation)
-    if images is not None and settings.method == Method.GAUSSIANS:
+    if images is not None and settings.method.fits:
         settings = replace(settings, schedule=replace(settings.schedule, images=images))
     if flow is not None:
         settings = replace(settings, flow=_choice(FlowSource, flow, "--flow"))
     settings = changed(settings, changes, CHANGES)
     _check_windows(settings)
+    if settings.method == Method.FLOW2D and settings.flow in (FlowSource.FILE, FlowSource.NONE):
+        raise UsageError(
+            f"flow {settings.flow} does not fit preset flow2d",
+            where="--flow",
+            why="it needs the flow of every raw frame, which no file contains",
+            fix="use --flow dis or --flow deepflow",
+        )
     return replace(settings, cycle=sequence.cycle)
 
 
@@ -171,10 +179,14 @@ def _run(sequence, out, settings, config, seed, device, goes_on, begun, progress
         "size_optimised": [sequence.width, sequence.height],
         "input": str(input_of(sequence, settings.input)),
     }
-    if settings.method != Method.GAUSSIANS:
+    if not settings.method.fits:
+        config |= {"images_optimised": 0, "seconds_reconstruct": 0.0}
         if settings.method == Method.TEMPORAL:
             closed_form.check_rests(sequence)
-        folder.write_config(out, config | {"seconds_reconstruct": 0.0, "images_optimised": 0})
+        elif settings.method == Method.FLOW2D:
+            config |= _synchronise(sequence, settings)
+            config["seconds_reconstruct"] = time.monotonic() - begun
+        folder.write_config(out, config)
         LOG.info("%s is finished: a closed form needs no image", out)
         return
     stored = checkpoint.last(out, device) if goes_on else None
@@ -227,6 +239,15 @@ def _run(sequence, out, settings, config, seed, device, goes_on, begun, progress
     found = residuals.residuals(Run.open(out, device), sequence)
     residuals.warn(found)
     folder.write_config(out, config | {"explained": found and found.as_json()})
+
+
+def _synchronise(sequence: Sequence, settings: ReconSettings) -> dict[str, object]:
+    """What config.json says of method flow2d; refuses sequences that it cannot show."""
+    check_flow(sequence)
+    share = unfilled_share(sequence, settings.flow.matcher)
+    text = "optical flow brought nothing to %.2f %% of the pixels: hidden, or it is wrong there"
+    LOG.info(text, 100.0 * share)
+    return {"flow_source": "computed", "unfilled_share": share}
 
 
 def _warn(sequence: Sequence) -> None:

@@ -1,0 +1,199 @@
+"""The raw frames of a cycle brought to one time by optical flow, before they are decoded: the
+method ``flow2d`` (method, section 7).
+
+Slot k was measured at t0 and, a cycle later, at t1. With F the optical flow from the first to the
+second and B the one back, its image at t = t0 + s (t1 - t0) is made of both,
+
+    the first, every pixel x at x + s F(x), with weight 1 - s
+    the second, every pixel x at x + (1 - s) B(x), with weight s
+
+by softmax splatting: a pixel is shared by the four around its target, with weight exp(z), z =
+-``MISMATCH`` times the brightness by which it differs from what its flow leads to, and every target
+is divided by the sum of its weights. Flow is known where forward and backward flow agree. Where
+they do not, a pixel is covered in one of the two images: it moves with the median flow of its image
+and counts only where nothing of known flow arrives. Pixels where nothing at all arrives keep the
+nearer image.
+
+The brightness of a quad changes with distance and incidence of light, of which optical flow knows
+nothing: motion along the rays is where this fails.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ..errors import InputError
+from . import flow as optical_flow
+from .flow import Method, compute_flow, sample
+from .kept import kept
+from .sequence import Flow, Sequence
+from .temporal import one_quartet
+
+MISMATCH = 20.0  # [1] per brightness range of the image: half a grey level of sixteen costs a half
+COVERED = 1e-3  # [1] weight of pixels of unknown flow: any pixel of known flow outweighs it
+LEAST = 1e-12  # [1] a target with less weight got nothing
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Synchronised:
+    """A cycle as it would look at one instant."""
+
+    sequence: Sequence
+    """One quartet of K raw frames, all with the time and the pose of that instant."""
+    filled: Bool[np.ndarray, "K H W"]
+    """Where a pixel of known flow arrived; elsewhere the value is a guess."""
+
+
+def synchronised(sequence: Sequence, time: float, method: Method = "dis") -> Synchronised:
+    """All slots of the cycle at a time [s], at most those of the first and the last raw frame.
+
+    The pose is that of the raw frame nearest to the time: optical flow contains the motion of the
+    camera. Beyond the two measurements of a slot its motion is continued.
+
+    Args:
+        sequence: What was measured, see :func:`check_flow`.
+        time: Seconds since raw frame 0.
+        method: Of the optical flow, ``dis`` or ``deepflow``.
+    """
+    check_flow(sequence)
+    flow = flow_of_frames(sequence, method)
+    first = sequence.complete_quartets[0] * sequence.cycle
+    time = float(np.clip(time, sequence.times[0], sequence.times[-1]))
+    images = [slot_at(sequence, flow, first + k, time) for k in range(sequence.cycle)]
+    nearest = int(np.abs(sequence.times - time).argmin())
+    one = one_quartet(sequence, np.stack([image for image, _ in images]), first)
+    one = replace(
+        one,
+        times=np.full(sequence.cycle, time),
+        camera_from_world=np.repeat(
+            sequence.camera_from_world[nearest : nearest + 1], sequence.cycle, 0
+        ),
+    )
+    return Synchronised(sequence=one, filled=np.stack([filled for _, filled in images]))
+
+
+def unfilled_share(sequence: Sequence, method: Method = "dis") -> float:
+    """Share of pixels of all slots [1] where optical flow brings nothing, at all raw frames."""
+    measured = sequence.times[sequence.measured]
+    return float(np.mean([~synchronised(sequence, t, method).filled for t in measured]))
+
+
+def check_flow(sequence: Sequence) -> None:
+    """Refuse what cannot be synchronised.
+
+    Raises:
+        InputError: If the recording has phasors, no complete quartet, no slot that was measured
+            twice in a row, or images too small to match.
+    """
+    where, fix = sequence.path or "sequence", "use --preset ctof, the closed form of every quartet"
+    if sequence.from_phasors:
+        why = "the camera delivered phasors, each of one instant: nothing is left to synchronise"
+        raise InputError("no raw frames", where=where, why=why, fix=fix)
+    if not sequence.complete_quartets:
+        why = "expected all raw frames of a cycle in a row, at least once"
+        fix = "check the sequence with `gftorf check`, or record longer"
+        raise InputError("no complete quartet", where=where, why=why, fix=fix)
+    if not pairs_of(sequence):
+        why = "expected two raw frames one cycle apart, found none that were both measured"
+        raise InputError("no optical flow", where=where, why=why, fix=fix)
+    optical_flow.check_size(sequence)
+
+
+@kept
+def flow_of_frames(sequence: Sequence, method: Method) -> Flow:
+    """Optical flow of every raw frame whose partner a cycle away was measured too."""
+    return compute_flow(sequence, method=method, every=1)
+
+
+def pairs_of(sequence: Sequence) -> list[int]:
+    """Raw frames n for which n and n + K were measured."""
+    step = sequence.cycle
+    return np.flatnonzero(sequence.measured[:-step] & sequence.measured[step:]).tolist()
+
+
+def slot_at(
+    sequence: Sequence, flow: Flow, slot: int, time: float
+) -> tuple[Float[np.ndarray, "H W"], Bool[np.ndarray, "H W"]]:
+    """Image of one slot at a time [s] and where it was filled.
+
+    Args:
+        sequence: What was measured.
+        flow: That of :func:`flow_of_frames`.
+        slot: Any raw frame of the slot.
+        time: Seconds since raw frame 0.
+    """
+    step, times, quads = sequence.cycle, sequence.times, sequence.quads
+    pairs = [n for n in pairs_of(sequence) if (n - slot) % step == 0]
+    if not pairs:
+        measured = np.flatnonzero(sequence.measured[slot % step :: step]) * step + slot % step
+        nearest = measured[np.abs(times[measured] - time).argmin()]
+        return quads[nearest], np.zeros(quads.shape[1:], dtype=bool)
+
+    def away(n: int) -> float:
+        return max(times[n] - time, time - times[n + step], 0.0)
+
+    n = min(pairs, key=away)
+    share = float((time - times[n]) / (times[n + step] - times[n]))
+    total, weight = np.zeros((2, *quads.shape[1:]))
+    filled = np.zeros(quads.shape[1:], dtype=bool)
+    for source, target, flows, moved, counts in (
+        (n, n + step, flow.forward, share, 1.0 - share),
+        (n + step, n, flow.backward, 1.0 - share, share),
+    ):
+        if counts <= 0.0:  # beyond the pair, the nearer image alone
+            continue
+        known, there = _known(flows[source])
+        importance = np.exp(-MISMATCH * _mismatch(quads[source], quads[target], there))
+        importance *= np.where(known, 1.0, COVERED)
+        summed, arrived, reliable = splatted(
+            np.stack([importance * quads[source], importance, known.astype(np.float64)]),
+            moved * there,
+        )
+        total += counts * summed
+        weight += counts * arrived
+        filled |= reliable > 0.5  # of a pixel
+    nearer = quads[n if share < 0.5 else n + step]
+    image = np.where(weight > LEAST, total / np.maximum(weight, LEAST), nearer)
+    return image.astype(np.float32), filled
+
+
+def splatted(
+    images: Float[np.ndarray, "C H W"], flow: Float[np.ndarray, "2 H W"]
+) -> Float[np.ndarray, "C H W"]:
+    """Sums of what arrives at every pixel when pixels move by ``flow`` [px], each shared by the
+    four pixels around its target.
+    """
+    height, width = flow.shape[1:]
+    y, x = np.indices((height, width))
+    x, y = x + flow[0], y + flow[1]
+    left, top = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
+    result = np.zeros((len(images), height * width))
+    for right, below in ((0, 0), (1, 0), (0, 1), (1, 1)):
+        share = np.abs(1 - right - (x - left)) * np.abs(1 - below - (y - top))
+        column, row = left + right, top + below
+        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        target = row[inside] * width + column[inside]
+        for k, image in enumerate(images):
+            result[k] += np.bincount(target, (share * image)[inside], minlength=height * width)
+    return result.reshape(len(images), height, width)
+
+
+def _known(flow: Float[np.ndarray, "2 H W"]) -> tuple[np.ndarray, np.ndarray]:
+    """Where a flow is known, and the flow with its median [px] where it is not."""
+    known = np.isfinite(flow).all(axis=0)
+    usual = np.median(flow[:, known], axis=1) if known.any() else np.zeros(2)
+    return known, np.where(known, flow, usual[:, None, None])
+
+
+def _mismatch(
+    source: Float[np.ndarray, "H W"],
+    target: Float[np.ndarray, "H W"],
+    flow: Float[np.ndarray, "2 H W"],
+) -> Float[np.ndarray, "H W"]:
+    """Difference of the source to the target at the end of its flow, over the range of both [1]."""
+    low, high = optical_flow.brightness_range(source, target)
+    found = sample(target[None], flow.astype(np.float32))[0].astype(np.float64)
+    return np.abs(found - source) / (high - low) if high > low else np.zeros(source.shape)
