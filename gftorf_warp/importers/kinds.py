@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from . import sequence_folders
+from . import kinect2, sequence_folders
 from .imported import Imported
 from .keys import Key, Settings
 
@@ -40,6 +40,12 @@ KINDS = {
             about="a ToeRF folder of phasors, with its truth",
             read=sequence_folders.read_torf,
             keys=sequence_folders.KEYS,
+        ),
+        Kind(
+            name="kinect2",
+            about="a folder of Kinect v2 packets and tables, dumped by libfreenect2",
+            read=kinect2.read,
+            keys=kinect2.KEYS,
         ),
     )
 }

@@ -1,0 +1,204 @@
+"""Dumps of a Kinect v2 by libfreenect2 (DumpPacketPipeline): a folder of packets and tables.
+
+libfreenect2 hands these out as arrays and names no files, so they are told apart by their sizes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from ..data.folder import empty_quads
+from ..data.sequence import Calibration, Intrinsics
+from ..errors import InputError
+from . import camera_keys
+from . import kinect2_packets as packets
+from .at_rest import at_rest
+from .imported import Imported, Notes
+from .keys import Key, Settings
+from .raw_files import files_of, raw_bytes, size_of
+from .sensor_keys import Modulation
+
+LENS = camera_keys.camera_keys("camera", "replaces the X and Z tables", needed=False)
+# getIrCameraParams() counts pixel centres from 0.5
+CENTRE = {"camera.pixel_centre": "half"}
+KEYS = (
+    *(replace(key, default=CENTRE.get(key.name, key.default)) for key in LENS),
+    Key(
+        name="time.cycle_rate_hz",
+        kind=float,
+        about="packets per second [Hz]",
+        example=15.0,
+        default=30.0,
+        above=0.0,
+    ),
+)
+MODULATION = Modulation(
+    frequencies_hz=np.repeat(packets.FREQUENCIES_HZ, 3),
+    shifts=np.tile(packets.SHIFTS, 3),
+    calibration=Calibration(f_mod_hz=packets.FREQUENCIES_HZ[0], cycle_length=9),
+)
+# bytes of the tables if the number of values, which libfreenect2 returns, is taken for bytes
+CUT_SHORT = {packets.TABLE_BYTES // 4, packets.CODES}
+UNCERTAIN = (
+    "frequencies 80, 16, 120 MHz are from literature; libfreenect2 has their ratios only",
+    "rows: libfreenect2 counts cy from the first row of its images, as here, but the rows of its X "
+    "and Z tables from the last; if distances tilt from top to bottom, set camera.cy to 424 - cy",
+    "the image may be mirrored left to right, as on the screen of this camera; the scene then is "
+    "mirrored too",
+)
+
+
+@dataclass
+class Dump:
+    """Files of a dump by what they contain."""
+
+    packets: list[Path] = field(default_factory=list)
+    p0: list[Path] = field(default_factory=list)
+    tables: list[Path] = field(default_factory=list)
+    lookup: list[Path] = field(default_factory=list)
+    others: list[Path] = field(default_factory=list)
+
+
+def read(source: Path, settings: Settings) -> Imported:
+    """A dump as a sequence: per packet three raw frames at 80, 16 and 120 MHz each.
+
+    The phase offsets of P0 are taken out, so that one offset fits all pixels.
+
+    Raises:
+        InputError: If packets or tables are missing, damaged or doubled.
+        UsageError: If the tables of the lens are missing and no key states it.
+    """
+    notes = Notes()
+    dump = _sorted_by_size(source, notes)
+    lens = _lens(dump, settings, notes)
+    quads = _quads(source, dump, notes)
+    notes.understood.append(
+        "raw frames: 3 at 80 MHz, 3 at 16 MHz, 3 at 120 MHz, each at 0, -120, -240 degrees; the "
+        "tenth sub-image is left out"
+    )
+    times = _times(len(quads) // packets.SUB_IMAGES_USED, settings, notes)
+    sequence = at_rest(quads, MODULATION, times, lens, notes)
+    notes.uncertain += UNCERTAIN
+    understood, uncertain = tuple(notes.understood), tuple(notes.uncertain)
+    return Imported(sequence=sequence, understood=understood, uncertain=uncertain)
+
+
+def _sorted_by_size(source: Path, notes: Notes) -> Dump:
+    """The files of a dump.
+
+    Raises:
+        InputError: If some are missing, cut short or doubled.
+    """
+    dump = Dump()
+    kinds = {
+        packets.P0_BYTES: dump.p0,
+        packets.TABLE_BYTES: dump.tables,
+        2 * packets.CODES: dump.lookup,
+    }
+    for path in files_of(source):
+        size = size_of(path)
+        if size in CUT_SHORT:
+            why = f"expected {size} values of 4 or 2 bytes each, found {size} bytes: libfreenect2 "
+            why += "returns the number of values, not of bytes"
+            fix = "dump the table again, with that number times the size of a value"
+            raise InputError("a quarter or half of a table", where=path, why=why, fix=fix)
+        whole = size > 0 and size % packets.PACKET_BYTES == 0
+        kinds.get(size, dump.packets if whole else dump.others).append(path)
+    for found, most, what, bytes_ in (
+        (dump.packets, None, "packets", f"a multiple of {packets.PACKET_BYTES}"),
+        (dump.p0, 1, "P0 tables", str(packets.P0_BYTES)),
+        (dump.lookup, 1, "lookup table", str(2 * packets.CODES)),
+        (dump.tables, 2, "X and Z tables", str(packets.TABLE_BYTES)),
+    ):
+        needed = what in ("packets", "P0 tables")
+        if (needed and not found) or (most is not None and len(found) > most):
+            sizes = ", ".join(f"{path.name} ({size_of(path)})" for path in dump.others[:5])
+            names = (
+                ", ".join(path.name for path in found) or f"none; other files: {sizes or 'none'}"
+            )
+            why = f"expected {most or 'one or more'} of {bytes_} bytes, found {names}"
+            fix = (
+                "dump them with the packets of the same session"
+                if not found
+                else "keep one session"
+            )
+            raise InputError(what, where=source, why=why, fix=f"{fix}, all in one folder")
+    notes.understood.append(f"files: {len(dump.packets)} of packets, by their sizes, as named")
+    if dump.others:
+        names = ", ".join(path.name for path in dump.others[:5])
+        notes.understood.append(f"ignored: {len(dump.others)} files of other sizes: {names}")
+    return dump
+
+
+def _lens(dump: Dump, settings: Settings, notes: Notes) -> Intrinsics:
+    """The lens of the keys, or else of the X and Z tables."""
+    names = [f"camera.{name}" for name in camera_keys.PINHOLE]
+    if any(map(settings.given, names)) or len(dump.tables) < 2:
+        settings.require(*names)
+        return camera_keys.intrinsics_of(settings, notes, packets.WIDTH)
+    shape = packets.HEIGHT, packets.WIDTH
+    tables = [raw_bytes(path).view("<f4").reshape(shape) for path in dump.tables]
+    with np.errstate(invalid="ignore"):
+        x, z = sorted(tables, key=lambda table: bool((table > 0).all()))  # Z is positive
+    files = " and ".join(path.name for path in dump.tables)
+    try:
+        lens = packets.lens(x, z)
+    except (ValueError, np.linalg.LinAlgError) as error:
+        why = f"expected the X and Z tables of libfreenect2, found others: {error}"
+        fix = "dump both again, or state camera.fx, fy, cx, cy and remove them"
+        raise InputError("tables of the lens", where=files, why=why, fix=fix) from error
+    text = f"camera: fx {lens.fx:.6g}, fy {lens.fy:.6g}, cx {lens.cx:.6g}, cy {lens.cy:.6g} px"
+    notes.understood.append(f"{text} and its distortion, fitted to {files}")
+    return lens
+
+
+def _quads(source: Path, dump: Dump, notes: Notes) -> Float[np.ndarray, "F H W"]:
+    """Values of all raw frames without the phase offsets of their pixels."""
+    offsets = packets.phase_offsets(raw_bytes(dump.p0[0]))
+    notes.understood.append(
+        f"phase offsets: {dump.p0[0].name}, taken out: the three raw frames of one frequency are "
+        "turned together, and have one time"
+    )
+    values = packets.usual_values()
+    if dump.lookup:
+        values = raw_bytes(dump.lookup[0]).view("<i2").astype(np.float32)
+    table = dump.lookup[0].name if dump.lookup else "the table that libfreenect2 computes"
+    notes.understood.append(f"codes: 11 bits, to values by {table}")
+    counts = [size_of(path) // packets.PACKET_BYTES for path in dump.packets]
+    size = {"H": packets.HEIGHT, "W": packets.WIDTH}
+    quads = empty_quads(source, packets.SUB_IMAGES_USED * sum(counts), size)
+    triples = iter(quads.reshape(-1, 3, packets.HEIGHT, packets.WIDTH))
+    saturated = 0
+    for path, count in zip(dump.packets, counts, strict=True):
+        for k in range(count):
+            packet = raw_bytes(path, k * packets.PACKET_BYTES, packets.PACKET_BYTES)
+            measured = values[packets.codes(packet)].reshape(3, 3, *quads.shape[1:])
+            for triple, offset in zip(measured, offsets, strict=True):
+                full = (triple == packets.SATURATED).any(axis=0)
+                full[:, [0, -1]] = False
+                saturated += int(full.sum())
+                quads_of_one = next(triples)
+                quads_of_one[:] = packets.without_offsets(triple, offset)
+                quads_of_one[:, full] = 0.0
+    quads[..., [0, -1]] = 0.0
+    notes.understood.append("columns 0 and 511 are 0 throughout: libfreenect2 reads none there")
+    if saturated:
+        text = f"{saturated} times a pixel is saturated at one frequency"
+        notes.uncertain.append(f"{text}: its three quads there are 0")
+    return quads
+
+
+def _times(count: int, settings: Settings, notes: Notes) -> Float[np.ndarray, "F"]:
+    """Times [s] of the raw frames of evenly spaced packets, in the middle of their frequency."""
+    rate, source = settings["time.cycle_rate_hz"], settings.source("time.cycle_rate_hz")
+    notes.understood.append(f"times: {rate:g} packets per second ({source})")
+    notes.uncertain.append(
+        "times: ten sub-images are taken as evenly spaced in a packet, and no packet as lost; the "
+        "files do not say"
+    )
+    middles = np.repeat((np.arange(3) * 3 + 1.5) / packets.SUB_IMAGES, 3)
+    return (np.arange(count)[:, None] + middles).ravel() / rate

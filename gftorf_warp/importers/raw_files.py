@@ -1,0 +1,68 @@
+"""Files without a self-description, read whole, never larger than what is on the disk."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import UInt8
+
+from ..errors import InputError
+
+
+def files_of(source: Path) -> list[Path]:
+    """The file itself, or the files of a folder in natural order, ``2.bin`` before ``10.bin``;
+    hidden files are ignored.
+
+    Raises:
+        InputError: If the folder has no files or cannot be listed.
+    """
+    if not source.is_dir():
+        return [source]
+    try:
+        found = [path for path in source.iterdir() if path.is_file() and path.name[0] != "."]
+    except OSError as error:
+        why, fix = error.strerror or str(error), "check permissions and the disk"
+        raise InputError("cannot be listed", where=source, why=why, fix=fix) from error
+    if not found:
+        why, fix = "expected the files of a recording, found none", "check the path"
+        raise InputError("an empty folder", where=source, why=why, fix=fix)
+    return sorted(found, key=lambda path: natural(path.name))
+
+
+def natural(name: str) -> list[tuple[int, str]]:
+    """Key that sorts names with numbers by these numbers."""
+    parts = re.split(r"(\d{1,18})", name)
+    return [(int(part), "") if n % 2 else (0, part) for n, part in enumerate(parts)]
+
+
+def size_of(path: Path) -> int:
+    """Bytes of a file.
+
+    Raises:
+        InputError: If it is no file.
+    """
+    if not path.is_file():  # reading a pipe would block
+        found = "a folder" if path.is_dir() else "nothing that can be read"
+        why = f"expected a file, found {found}"
+        raise InputError("no such file", where=path, why=why, fix="check the path")
+    return path.stat().st_size
+
+
+def raw_bytes(path: Path, first: int = 0, count: int | None = None) -> UInt8[np.ndarray, "n"]:
+    """``count`` bytes of a file from byte ``first`` on; None: up to its end.
+
+    Raises:
+        InputError: If it has fewer, or cannot be read.
+    """
+    size = size_of(path)
+    count = size - first if count is None else count
+    if not 0 <= first <= first + count <= size:
+        why = f"expected {count} bytes from byte {first} on, found {max(size - first, 0)}"
+        raise InputError("truncated", where=path, why=why, fix="copy or record the file again")
+    try:
+        return np.fromfile(path, np.uint8, count, offset=first)
+    except OSError as error:
+        why, fix = error.strerror or str(error), "check permissions and the disk"
+        raise InputError("cannot be read", where=path, why=why, fix=fix) from error
