@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from . import kinect2, sequence_folders
+from . import kinect2, mlx7502x, sequence_folders
 from .imported import Imported
 from .keys import Key, Settings
 
@@ -46,6 +46,12 @@ KINDS = {
             about="a folder of Kinect v2 packets and tables, dumped by libfreenect2",
             read=kinect2.read,
             keys=kinect2.KEYS,
+        ),
+        Kind(
+            name="mlx7502x",
+            about="buffers of a Melexis MLX75026 or MLX75027, dumped by V4L2",
+            read=mlx7502x.read,
+            keys=mlx7502x.KEYS,
         ),
     )
 }
