@@ -143,24 +143,27 @@ def command_parsers() -> dict[str, Parser]:
     )
     simulate.option("--truth", "usual|all", str, f"{amounts} normals", "usual")
     levels = (
-        "level of realism, sync, L0, L1, L2, L3 or L4: sets engine, noise, motion blur and bounces"
+        "level of realism, sync, L0, L1, L2, L3 or L4: sets engine, noise, motion blur and bounces "
+        "where no option does"
     )
     simulate.option("--level", "NAME", str, levels)
     ladder = "record all levels into SEQ/sync, SEQ/L0 .. SEQ/L4 and print the closed form's error"
     simulate.flag("--ladder", f"{ladder} on each")
     engines = "gaussian: splats cover the scene; mesh: rays meet its surfaces (gaussian)"
-    simulate.option("--engine", "gaussian|mesh", str, engines, "gaussian")
+    simulate.option("--engine", "gaussian|mesh", str, engines)
     bounces = "bounces of indirect light, with engine mesh (0: direct light only)"
-    simulate.option("--bounces", "N", _whole, bounces, 0)
+    simulate.option("--bounces", "N", _whole, bounces)
     simulate.option(
-        "--paths", "N", _positive, "random paths per pixel for the light that bounces (64)", 64
+        "--paths", "N", _positive, "random paths per pixel for the light that bounces (64)"
     )
     simulate.option("--device", "auto|cpu|cuda", _device, "where engine mesh traces (cpu)", "cpu")
     simulate.flag("--sync", "all quads of a quartet at one instant")
-    simulate.add_argument("--no-noise", dest="noise", action="store_false", help="an ideal sensor")
+    simulate.add_argument(
+        "--no-noise", dest="noise", action="store_false", default=None, help="an ideal sensor"
+    )
     simulate.flag("--flow", "store exact optical flow too")
     blur = "samples in time of one exposure (1: no motion blur)"
-    simulate.option("--exposure-samples", "N", _positive, blur, 1)
+    simulate.option("--exposure-samples", "N", _positive, blur)
     examples = "for example sensor.f_mod_hz=30e6 or bodies.1.path.velocity=3,0,0"
     simulate.change("--override", f"change one setting, {examples} (may be repeated)", "overrides")
     simulate.flag("--fresh", FRESH)

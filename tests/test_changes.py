@@ -81,6 +81,17 @@ def test_every_setting_has_a_name_and_can_be_set_to_what_it_is():
         ("render.depth_bits=20", "depth_bits must be 16 or 24"),
         ("preset=paper", "no such setting"),
         ("quad_scale.x=1", "single setting"),
+        ("weights.quads=-1", "quads must be at least 0"),
+        ("weights.ssim=1.5", "at most 1"),
+        ("rates.mean=1e30", "mean must be at least 0 and at most 10"),
+        ("rates_last.motion=-0.1", "motion must be at least 0"),
+        ("init.count=0", "count must be at least 1"),
+        ("init.bounds=2,1", "a nearer and a farther"),
+        ("motion.nodes=0", "nodes must be at least 1"),
+        ("schedule.warm_up=-4", "warm_up must be at least 0"),
+        ("densify.scale_range=2,1", "in order"),
+        ("quad_scale=0", "quad_scale must be above 0"),
+        ("background=inf", "background must be at least 0"),
     ],
 )
 def test_mistakes_are_named(text, hint):

@@ -23,6 +23,7 @@ from gftorf_warp.data.decode import (
     quartet_phasors,
     unambiguous_range,
 )
+from gftorf_warp.data.sequence import Calibration
 from gftorf_warp.data.unwrap import CONFIDENT, choose, common_range, multiples
 from gftorf_warp.data.write import write
 from gftorf_warp.errors import InputError, UsageError
@@ -287,3 +288,10 @@ def test_check_names_frequencies_that_nothing_unwraps(tmp_path):
     wrong.quads[[4, 5, 10, 11]] = wrong.quads[[5, 4, 11, 10]]
     write("capture", tmp_path / "wrong", wrong)
     assert "frequencies disagree" in str(check(tmp_path / "wrong"))
+
+
+@pytest.mark.parametrize("wrong", [20, 0.0, -2e7, 1e13, float("inf")])
+def test_a_frequency_in_another_unit_is_refused(wrong):
+    """20 is meant in MHz, and every distance would be a million times too long."""
+    with pytest.raises(ValueError, match="20e6 for 20 MHz"):
+        Calibration(f_mod_hz=wrong)

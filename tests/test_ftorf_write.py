@@ -215,7 +215,6 @@ def poses_with(**changes):
         ({"times": np.arange(8) + 1.0}, "times"),
         ({"times": np.array([0, 1, 2, 3, 2, 5, 6, 7.0])}, "times"),
         ({"phase_offset": float("nan")}, "calibration"),
-        ({"f_mod_hz": 1.0}, "f_mod_hz"),
         ({"quad_scale": 0.0}, "quad_scale"),
         ({"fx": 0.01}, "focal"),
         ({"camera_from_world": poses_with(row=0, column=0, value=-1.0)}, "camera_from_world"),

@@ -75,6 +75,24 @@ def test_each_level_is_the_one_before_and_more():
     )
 
 
+def test_what_is_given_holds_at_every_level(tmp_path):
+    """A level decides about what no option names, and the card says what was named."""
+    options = ["--no-noise", "--exposure-samples", "3", "--bounces", "0"]
+    words = ["simulate", "demo", "--level", "L4", "--size", "12x9", "--frames", "4"]
+    assert main([*words, *options, "--out", str(tmp_path / "seq"), "-q"]) == 0
+    card = (tmp_path / "seq" / "README.md").read_text()
+    assert "noise | none" in card
+    assert "mean of 3 instants" in card
+    assert "direct light only" in card
+    assert "--bounces 0 --paths 64 --exposure-samples 3 --seed 0 --level L4 --no-noise" in card
+    demo = SCENES["demo"]
+    engine = resolved(demo, SimSettings(level="L1", engine="gaussian"))[1].engine
+    assert engine == "gaussian"
+    assert resolved(demo, SimSettings(level="L3", paths=5))[1].paths == 5
+    with pytest.raises(UsageError, match="--engine"):
+        record(demo, SimSettings(level="L3", engine="gaussian", size=(8, 6), frames=4))
+
+
 def test_what_a_scene_has_of_its_own_stays():
     """Its own place of the light, and a tap that cannot hold negative light."""
     own = replace(SCENES["demo"], emitter=(0.0, 0.1, 0.0), beam_deg=(50.0, 40.0))

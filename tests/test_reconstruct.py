@@ -21,7 +21,7 @@ from gftorf_warp.recon.observations import observe
 from gftorf_warp.recon.run import Run
 from gftorf_warp.recon.settings import FlowSource, plain
 from gftorf_warp.recon.state import begin
-from gftorf_warp.recon.train import reconstruct
+from gftorf_warp.recon.train import chosen_settings, reconstruct
 from gftorf_warp.scene.camera import Camera
 from gftorf_warp.scene.initialise import Init, InitSettings
 from gftorf_warp.scene.motion import MotionSettings, Still
@@ -263,6 +263,14 @@ def test_the_source_of_flow_can_be_chosen_by_name(tmp_path):
         reconstruct(small(), tmp_path / "run", demo(images=4), flow="dis")
     with pytest.raises(UsageError, match="deepflow"):
         reconstruct(small(), tmp_path / "other", demo(images=4), flow="raft")
+
+
+def test_flow_of_the_folder_is_not_silently_none():
+    """Who asks for the recording's own flow learns that it has none."""
+    without = recording(frames=8, with_flow=False)[0]
+    with pytest.raises(UsageError, match="--flow file"):
+        chosen_settings(without, "demo", None, "auto", None, "file", [])
+    assert chosen_settings(small(), "demo", None, "auto", None, "file", []).flow == "file"
 
 
 def test_random_start_and_still_motion_run_too(tmp_path):

@@ -423,7 +423,7 @@ def test_a_finished_sequence_is_not_made_again(tmp_path):
             ("--frames", "nearer to the camera", "simulate at most "),
         ),
         ({"seed": -1}, ("--seed", "0 or more")),
-        ({"exposure_samples": 0}, ("exposure_samples",)),
+        ({"exposure_samples": 0}, ("--exposure-samples",)),
         ({"format": "zip"}, ("--format", "zip", "ftorf", "capture")),
         (
             {"scene": slider(sensor=Sensor(shifts=(0.0, 2.0, 4.0)))},

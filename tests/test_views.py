@@ -235,6 +235,8 @@ def test_the_median_distance_is_rendered(run, tmp_path):
         ("", None, "nothing"),
         ("colour", None, "no colour"),
         ("distance", [], "no time"),
+        ("distance", [0.1, 100.0], "nothing of 100 s"),
+        ("distance", [-0.01], "nothing of -0.01 s"),
     ],
 )
 def test_what_cannot_be_rendered_is_named(run, tmp_path, what, times, text):

@@ -14,10 +14,8 @@ from ..errors import InputError, UsageError
 from . import specs
 from .arrays import read_choice, read_stored
 from .problems import Problems
-from .sequence import Calibration, Intrinsics
+from .sequence import DEPTH_RANGES_M, Calibration, Intrinsics
 
-# [m] 10 GHz to 10 kHz: outside, the number is another quantity or unit
-DEPTH_RANGES_M = (0.03, 30_000.0)
 # of the image width: a view of 168 degrees; a shorter one is in image widths or millimetres
 FOCAL_MIN = 0.05
 FIX_DEPTH_RANGE = "store speed of light / modulation frequency in metres, 15 for 20 MHz"

@@ -15,7 +15,7 @@ from ..constants import FRAMES_PER_QUARTET, SPEED_OF_LIGHT
 from ..errors import InputError, UsageError
 from . import specs
 from .arrays import SIDE_MAX
-from .calibration import DEPTH_RANGES_M, FOCAL_MIN, subtract_zero
+from .calibration import FOCAL_MIN, subtract_zero
 from .capture_json import FORMAT, MANIFEST, NAME, json_fields, read_values
 from .capture_write import inverse
 from .cycles import QUADS_MIN
@@ -23,7 +23,7 @@ from .exr import Parts, read_parts
 from .folder import FRAMES_MAX, empty_quads, numbered
 from .poses import rigid
 from .problems import Problems
-from .sequence import Calibration, ColourCamera, Flow, Intrinsics, Sequence, Truth
+from .sequence import DEPTH_RANGES_M, Calibration, ColourCamera, Flow, Intrinsics, Sequence, Truth
 
 T = TypeVar("T")
 

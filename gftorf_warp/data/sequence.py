@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from ..constants import SPEED_OF_LIGHT
 from .cycles import find_cycle, frequencies_by_order, frequencies_decoded
+
+# [m] c / f of 10 GHz to 10 kHz: outside, the number is another quantity or unit
+DEPTH_RANGES_M = (0.03, 30_000.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,6 +58,13 @@ class Calibration:
     """Raw frames K of a cycle, if the recording states it; None: see :attr:`Sequence.cycle`."""
     settings: dict[str, Any] = field(default_factory=dict)
     """Further settings of the sensor by name, numbers and texts."""
+
+    def __post_init__(self):
+        least, most = (SPEED_OF_LIGHT / depth_range for depth_range in DEPTH_RANGES_M[::-1])
+        # NaN stands for what a reader could not read, and reports
+        if not (least <= self.f_mod_hz <= most or math.isnan(self.f_mod_hz)):
+            limits = f"between {least:.3g} and {most:.3g} Hz, 20e6 for 20 MHz"
+            raise ValueError(f"f_mod_hz must be {limits}, got {self.f_mod_hz}")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from ..constants import CANONICAL_SHIFTS, FRAMES_PER_QUARTET, SPEED_OF_LIGHT
 from ..errors import UsageError
-from .calibration import DEPTH_RANGES_M, FOCAL_MIN
+from .calibration import FOCAL_MIN
 from .poses import rigid
 from .sequence import Intrinsics, Sequence, Truth
 from .specs import layer_field
@@ -136,10 +136,6 @@ def refuse_inexpressible(form: str, sequence: Sequence, truth: Truth | None) -> 
     constant = (stated.dc_offset, stated.adc_zero)
     constants = (stated.f_mod_hz, stated.phase_offset, *constant, scale or 1.0)
     require(np.isfinite(constants).all(), "calibration", finite, constants)
-    low, high = DEPTH_RANGES_M
-    expected = f"speed of light / frequency between {low} and {high} m"
-    holds = low <= SPEED_OF_LIGHT / stated.f_mod_hz <= high
-    require(holds, "f_mod_hz", expected, f"{stated.f_mod_hz} Hz")
     require(scale is None or scale > 0, "quad_scale", "above 0", scale)
     colour = _colour_intrinsics(sequence)
     numbers = (colour.fx, colour.fy, colour.cx, colour.cy)

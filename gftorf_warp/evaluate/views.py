@@ -20,6 +20,7 @@ from ..recon.residuals import quad_of_shift
 from ..render.api import Rendering
 from ..render.series import KEPT, View, on_host
 from ..scene.camera import Camera
+from ..scene.measured import frame_period
 from ..scene.sensor import Sensor
 from . import previews, renders, stored, writers
 from .metrics import DISTANCES, TEMPORAL, distance_from_quads, normalised
@@ -218,7 +219,7 @@ def render_to_folder(
 
     Raises:
         UsageError: If a name in ``what`` is unknown, the run has no colour, there are no such poses
-            or the run has one view only, or ``out`` holds something else.
+            or times or the run has one view only, or ``out`` holds something else.
         InputError: If the poses cannot be read.
         ResourceError: If the disk is full, or cannot hold the arrays.
     """
@@ -283,6 +284,12 @@ def views_to_take(
     if not seconds:
         why, fix = "the list is empty", "leave --times out"
         raise UsageError("no time to render", where="--times", why=why, fix=fix)
+    last = float(sequence.times[-1]) + frame_period(sequence)
+    outside = [time for time in seconds if not 0 <= time <= last]
+    if outside:
+        why = f"the sequence tells of 0 to {last:.6g} s, nothing of {outside[0]:.6g} s"
+        fix = "choose times in between, in seconds, or leave --times out"
+        raise UsageError("no such time", where="--times", why=why, fix=fix)
     if found is None:
         nearest = [_nearest_frame(sequence, time) for time in seconds]
         known = {n: run.camera.at(sequence.camera_from_world[n]) for n in set(nearest)}

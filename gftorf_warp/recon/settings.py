@@ -9,14 +9,20 @@ from __future__ import annotations
 
 import dataclasses
 import enum
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
 from ..constants import FRAMES_PER_QUARTET
 from ..data.flow import Method as Matcher
 from ..render.buffers import RenderSettings
+from ..scene.changes import require
 from ..scene.initialise import InitSettings
 from ..scene.models import KINDS
 from ..scene.motion import MotionSettings
+
+# of a step of Adam, which moves a value by about its rate: scenes are tens of metres wide, and
+# logits and logarithms of all that matters lie within tens
+RATE_MAX = 10.0
+WEIGHT_MAX = 1e6  # of a term of the loss: sums of squares stay within float32
 
 
 class Method(enum.StrEnum):
@@ -120,6 +126,9 @@ class Rates:
     motion: float = 8e-4
     """Key offsets of the nodes [m], or weights of the network [1]."""
 
+    def __post_init__(self):
+        require(self, *(field.name for field in fields(self)), at_least=0, at_most=RATE_MAX)
+
     def times(self, factor: float) -> Rates:
         """All rates multiplied."""
         return Rates(**{name: factor * rate for name, rate in dataclasses.asdict(self).items()})
@@ -145,6 +154,11 @@ class Weights:
     """Squared difference to the optical flow, at quartet starts only [1/px^2]."""
     motion_size: float = 0.0
     """Mean length of the displacements [1/m]."""
+
+    def __post_init__(self):
+        terms = [field.name for field in fields(self) if field.name not in ("ssim", "colour_norm")]
+        require(self, *terms, at_least=0, at_most=WEIGHT_MAX)
+        require(self, "ssim", at_least=0, at_most=1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -184,13 +198,11 @@ class Schedule:
     """Between two checkpoints [s]; changes no result."""
 
     def __post_init__(self):
-        for name in ("images", "log_every", "flow_every"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
-        if self.sh_degree_every is not None and self.sh_degree_every < 1:
-            raise ValueError(
-                f"sh_degree_every must be at least 1 or None, got {self.sh_degree_every}"
-            )
+        require(self, "images", "log_every", "flow_every", "sh_degree_every", at_least=1)
+        require(self, "warm_up", "motion_decay_from", "motion_ramp", at_least=0)
+        require(self, "pause_after_reset", "colour_from", "flow_from", at_least=0)
+        require(self, "checkpoint_every_s", at_least=0)
+        require(self, "freeze_from", "distortion_from", at_least=0, at_most=1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -231,14 +243,12 @@ class DensifySettings:
     """Upper limit; the largest gradients are densified first [Gaussians]."""
 
     def __post_init__(self):
-        for name in ("every", "reset_every"):
-            value = getattr(self, name)
-            if value is not None and value < 1:
-                raise ValueError(f"{name} must be at least 1 or None, got {value}")
-        if self.reset_faster is not None and min(self.reset_faster) < 1:
-            raise ValueError(
-                f"reset_faster must be two numbers of at least 1 or None, got {self.reset_faster}"
-            )
+        require(self, "every", "reset_every", "reset_faster", "gaussians_max", at_least=1)
+        require(self, "start", "scale_from", "unseen_from", "gaussians_min", at_least=0)
+        require(self, "gradient_min", "clone_scale_max", "unseen_weight", at_least=0)
+        require(self, "stop_share", at_least=0, at_most=1)
+        if not 0 <= self.scale_range[0] <= self.scale_range[1]:
+            raise ValueError(f"scale_range must be two sizes in order, got {self.scale_range}")
         if not 0 < self.opacity_min < 1:
             raise ValueError(f"opacity_min must be in (0, 1), got {self.opacity_min}")
 
@@ -298,8 +308,9 @@ class ReconSettings:
     """Restarts of collapsed random starts, and reinitialisations of a dead network, at most."""
 
     def __post_init__(self):
-        if self.scale_max is not None and not self.scale_max > 0:
-            raise ValueError(f"scale_max must be above 0 or None, got {self.scale_max}")
+        require(self, "scale_max", "quad_scale", "motion_gradient_max", above=0)
+        require(self, "width_max", "failures_max", at_least=1)
+        require(self, "background", "rollbacks_max", "restarts_max", at_least=0)
         if self.motion.kind not in KINDS:
             raise ValueError(
                 f"motion.kind must be one of {', '.join(KINDS)}, got {self.motion.kind!r}"

@@ -124,6 +124,7 @@ def chosen_settings(
         settings = replace(settings, schedule=replace(settings.schedule, images=images))
     if flow is not None:
         settings = replace(settings, flow=_choice(FlowSource, flow, "--flow"))
+        _check_flow(sequence, settings.flow)
     settings = changed(settings, changes, CHANGES)
     _check_windows(settings)
     if settings.method == Method.FLOW2D and settings.flow in (FlowSource.FILE, FlowSource.NONE):
@@ -134,6 +135,17 @@ def chosen_settings(
             fix="use --flow dis or --flow deepflow",
         )
     return replace(settings, cycle=sequence.cycle)
+
+
+def _check_flow(sequence: Sequence, flow: FlowSource) -> None:
+    """Raise a UsageError if the sequence's own optical flow is asked for and it has none."""
+    if flow == FlowSource.FILE and not (sequence.flow.forward or sequence.flow.backward):
+        raise UsageError(
+            "no optical flow to read",
+            where="--flow file",
+            why=f"{sequence.path or 'the sequence'} has no forward_flow and no backward_flow",
+            fix="use --flow dis, which computes it, or --flow none",
+        )
 
 
 def _check_windows(settings: ReconSettings) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import difflib
 import enum
+import math
 import types
 import typing
 from collections.abc import Iterable, Mapping
@@ -88,6 +89,33 @@ def _with(settings: Any, path: list[str], value: str, name: str, wording: Wordin
         return replace(settings, **{head: new})
     except ValueError as error:
         raise _refused(f"{name}={value}", str(error), "choose another value", wording) from error
+
+
+def require(
+    settings: Any,
+    *names: str,
+    above: float | None = None,
+    at_least: float | None = None,
+    at_most: float | None = None,
+) -> None:
+    """Check fields of a dataclass: finite numbers, or tuples of such, within bounds, or None.
+
+    Raises:
+        ValueError: If not, which names the field, the bounds and the value.
+    """
+    bounds = {"above": above, "at least": at_least, "at most": at_most}
+    wanted = " and ".join(f"{k} {bound:.9g}" for k, bound in bounds.items() if bound is not None)
+    for name in names:
+        value = getattr(settings, name)
+        for number in value if isinstance(value, tuple) else (value,):
+            if number is None or (
+                math.isfinite(number)
+                and (above is None or number > above)
+                and (at_least is None or number >= at_least)
+                and (at_most is None or number <= at_most)
+            ):
+                continue
+            raise ValueError(f"{name} must be {wanted or 'finite'}, got {value}")
 
 
 def names(settings: Any, prefix: str = "") -> list[str]:

@@ -23,6 +23,7 @@ from ..data.temporal import camera_rests
 from ..errors import InputError
 from .background import background
 from .camera import CHECKED, Camera
+from .changes import require
 from .clouds import cloud_of, follow_clouds, moving_layer, reference
 from .fusion import Layer, static_layer, verdicts, views_of
 from .gaussians import GaussianField, concatenated, constant_sh
@@ -82,6 +83,16 @@ class InitSettings:
     """Random: of every Gaussian [m^2 in quad units]."""
     bounds: tuple[float, float] = (0.15, 6.75)
     """Random: nearest and farthest z-depth [m]."""
+
+    def __post_init__(self):
+        require(self, "static_spacing", "edge_spacing", "moving_spacing", "footprint", above=0)
+        require(self, "nearer", "reflectivity", at_least=0)
+        require(self, "fellows", "count", at_least=1)
+        require(self, "bounds", above=0)
+        if not 0 < self.opacity < 1:
+            raise ValueError(f"opacity must be in (0, 1), got {self.opacity}")
+        if not self.bounds[0] < self.bounds[1]:
+            raise ValueError(f"bounds must be a nearer and a farther one, got {self.bounds}")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -28,6 +28,7 @@ import torch
 from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
+from .changes import require
 from .gaussians import GaussianField
 
 LOG = logging.getLogger("gftorf_warp")
@@ -81,11 +82,9 @@ class MotionSettings:
     """Network: precision of its matrix products."""
 
     def __post_init__(self):
-        for name in ("layers", "width", "skip_after"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
-        if not self.input_scale > 0:
-            raise ValueError(f"input_scale must be above 0, got {self.input_scale}")
+        require(self, "nodes", "neighbours", "layers", "width", "skip_after", at_least=1)
+        require(self, "position_frequencies", "time_frequencies", at_least=0)
+        require(self, "input_scale", above=0)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -16,7 +16,7 @@ from .record import Recording
 from .scene import overridden
 from .scenes import Scene, named_scene
 from .sensors import effect_rows
-from .settings import SimSettings
+from .settings import ResolvedSettings, SimSettings
 
 CALLED = "frames size seed sync noise flow exposure_samples engine bounces paths".split()
 """Settings that a call names on a data card, even where they are the defaults."""
@@ -108,7 +108,7 @@ a raw frame, all light included. contact_sheet.png is an overview; no program re
 """
 
 
-def _light(scene: Scene, used: SimSettings) -> str:
+def _light(scene: Scene, used: ResolvedSettings) -> str:
     lamp = "Light and camera coincide"
     if any(scene.emitter):
         place = ", ".join(f"{1e3 * x:g}" for x in scene.emitter)
@@ -121,7 +121,7 @@ def _light(scene: Scene, used: SimSettings) -> str:
     return f"{lamp}; direct light and up to {used.bounces} bounces, {paths}"
 
 
-def _engine(scene: Scene, used: SimSettings) -> str:
+def _engine(scene: Scene, used: ResolvedSettings) -> str:
     rays = f"{scene.subsamples}x{scene.subsamples} rays per pixel, averaged"
     if used.engine == "mesh":
         met = "rays meet the surfaces themselves, as triangles, balls and endless planes"
@@ -129,7 +129,7 @@ def _engine(scene: Scene, used: SimSettings) -> str:
     return f"Engine gaussian: the scene is covered by Gaussians and rendered with {rays}."
 
 
-def _camera_rows(scene: Scene, used: SimSettings) -> dict[str, str]:
+def _camera_rows(scene: Scene, used: ResolvedSettings) -> dict[str, str]:
     """Rows on camera motion and colour camera; empty for a static ToF camera at the origin."""
     rows = {}
     if scene.camera_path != Still():
@@ -149,7 +149,7 @@ def _camera_rows(scene: Scene, used: SimSettings) -> dict[str, str]:
     return rows
 
 
-def _command(scene: Scene, used: SimSettings, level: str | None) -> str:
+def _command(scene: Scene, used: ResolvedSettings, level: str | None) -> str:
     """Command that makes the same sequence again; a call in Python for scenes without a name."""
     named = named_scene(scene.name)
     if named is None or overridden(named, scene.overrides) != scene:
@@ -159,20 +159,22 @@ def _command(scene: Scene, used: SimSettings, level: str | None) -> str:
         values |= {"truth": repr(used.truth)} if used.truth != "usual" else {}
         call = ", ".join(f"{k}={v}" for k, v in values.items())
         return f"gftorf_warp.simulate({scene.name}, ..., {call})"
-    camera, samples = scene.camera(used.size), used.exposure_samples
+    camera, usual = scene.camera(used.size), resolved(scene, SimSettings(level=level))[1]
+    bounces, samples = used.bounces, used.exposure_samples
+    other_paths = bounces > 0 and used.paths != usual.paths
     options = (
         *((True, f"--override {text}") for text in scene.overrides),
         (True, f"--frames {used.frames} --size {camera.width}x{camera.height}"),
         (used.flow, "--flow"),
-        (not level and used.engine != "gaussian", f"--engine {used.engine}"),
-        (not level and used.bounces, f"--bounces {used.bounces} --paths {used.paths}"),
-        (not level and samples > 1, f"--exposure-samples {samples}"),
+        (used.engine != usual.engine, f"--engine {used.engine}"),
+        (bounces != usual.bounces or other_paths, f"--bounces {bounces} --paths {used.paths}"),
+        (samples != usual.exposure_samples, f"--exposure-samples {samples}"),
         (True, f"--seed {used.seed}"),
         (used.format != "ftorf", f"--format {used.format}"),
         (used.truth != "usual", f"--truth {used.truth}"),
         (level, f"--level {level}"),
         (used.sync and level != NAMES[0], "--sync"),
-        (not (used.noise or level), "--no-noise"),
+        (usual.noise and not used.noise, "--no-noise"),
     )
     chosen = " ".join(option for given, option in options if given)
     return f"gftorf simulate {scene.name} --out SEQ {chosen}"

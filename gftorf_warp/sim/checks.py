@@ -14,7 +14,7 @@ from .assembly import has_mesh
 from .gaussian_cover import clearance
 from .readout import why_impossible
 from .scene import Scene
-from .settings import SimSettings, refuse, require
+from .settings import ResolvedSettings, refuse, require
 
 # [m] nearer bodies fill the image, and a cover of them would need millions of splats
 CLEARANCE = 0.5
@@ -22,7 +22,7 @@ CAPTURE = "--format capture"
 ROLLING = "a rolling shutter cannot be simulated so", "sensor.row_time_s"
 
 
-def check_engine(scene: Scene, settings: SimSettings, device: str = "cpu") -> None:
+def check_engine(scene: Scene, settings: ResolvedSettings, device: str = "cpu") -> None:
     """Raise a UsageError if the engine cannot simulate the scene, or not on this device."""
     if settings.engine == "mesh":
         return
@@ -38,7 +38,7 @@ def check_engine(scene: Scene, settings: SimSettings, device: str = "cpu") -> No
     refuse(scene.sensor.row_time_s > 0, ROLLING, why, "--engine mesh")
 
 
-def check_format(scene: Scene, settings: SimSettings) -> None:
+def check_format(scene: Scene, settings: ResolvedSettings) -> None:
     """Raise a UsageError if the sensor is contradictory, or the layout cannot store it."""
     sensor, lens, capture = scene.sensor, scene.lens, settings.format == "capture"
     turns = sorted(round(math.degrees(shift), 4) % 360.0 for shift in sensor.shifts)

@@ -8,7 +8,7 @@ need it.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 from ..errors import UsageError
@@ -16,7 +16,7 @@ from ..scene.pattern import Pattern
 from ..scene.sensor import Sensor
 from ..scene.waveform import Waveform, contrast_ratios, peak
 from .scene import Scene, overridden
-from .settings import SimSettings
+from .settings import ResolvedSettings, SimSettings
 
 OWN = object()
 NO_LIMIT_ELECTRONS = 1e12  # [e-] a full well that is never reached
@@ -102,11 +102,10 @@ def adds_of(name: str) -> str:
     return next(level.adds for level in LEVELS if level.name == name)
 
 
-def resolved(scene: Scene, settings: SimSettings) -> tuple[Scene, SimSettings]:
+def resolved(scene: Scene, settings: SimSettings) -> tuple[Scene, ResolvedSettings]:
     """The scene as it is recorded, and settings with defaults, overrides and level applied.
 
-    Resolving twice is the same as once. ``settings.sync`` holds at every level; else a level's
-    settings replace others.
+    Resolving twice is the same as once. Settings that are given, and ``sync``, hold at every level.
 
     Raises:
         UsageError: If there is no such level, or a field cannot be overridden so.
@@ -114,10 +113,12 @@ def resolved(scene: Scene, settings: SimSettings) -> tuple[Scene, SimSettings]:
     scene = overridden(scene, settings.overrides)
     frames = scene.frames if settings.frames is None else settings.frames
     size = (scene.width, scene.height) if settings.size is None else settings.size
-    settings = replace(settings, frames=frames, size=size, overrides=())
+    values = {f.name: getattr(settings, f.name) for f in fields(SimSettings)}
+    given = {k: v for k, v in values.items() if v is not None}
+    given |= {"frames": frames, "size": size, "overrides": (), "level": None}
     name = settings.level
     if name is None:
-        return scene, settings
+        return scene, ResolvedSettings(**given)
     if name not in NAMES:
         why = f"the levels are {', '.join(NAMES)}, each the one before and something more"
         raise UsageError(
@@ -133,8 +134,9 @@ def resolved(scene: Scene, settings: SimSettings) -> tuple[Scene, SimSettings]:
     if of_scene["beam_deg"] == BEAM_DEG and scene.beam_deg is not None:
         of_scene["beam_deg"] = OWN
     of_scene = {k: v for k, v in of_scene.items() if v is not OWN}
-    chosen |= {"sync": chosen["sync"] or settings.sync, "level": None}
-    return replace(scene, sensor=sensor, closed_form=None, **of_scene), replace(settings, **chosen)
+    chosen |= given | {"sync": chosen["sync"] or settings.sync}
+    scene = replace(scene, sensor=sensor, closed_form=None, **of_scene)
+    return scene, ResolvedSettings(**chosen)
 
 
 def _changed(sensor: Sensor, settings: Mapping[str, Any]) -> Sensor:

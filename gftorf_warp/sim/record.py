@@ -27,7 +27,7 @@ from .paths import inverse
 from .readout import read_out
 from .rolling import rolling_hits
 from .scene import Scene
-from .settings import SimSettings
+from .settings import ResolvedSettings, SimSettings
 from .world import Hits, first_hit, flow_of
 
 Progress = Callable[[int, int], None]
@@ -170,7 +170,7 @@ def _computed(_: str, compute: Callable[[], Images]) -> tuple[Images, bool]:
     return compute(), True
 
 
-def longest_times(scene: Scene, settings: SimSettings) -> Float[np.ndarray, "F"]:
+def longest_times(scene: Scene, settings: ResolvedSettings) -> Float[np.ndarray, "F"]:
     """Times [s] of the scene's own raw frames, and of all that are recorded if those are more.
 
     Covers are fine enough for all of them, so that a shorter recording has the same images.
@@ -179,7 +179,11 @@ def longest_times(scene: Scene, settings: SimSettings) -> Float[np.ndarray, "F"]
 
 
 def _exposing(
-    scene: Scene, settings: SimSettings, sensor: Sensor, times: Float[np.ndarray, "F"], device: str
+    scene: Scene,
+    settings: ResolvedSettings,
+    sensor: Sensor,
+    times: Float[np.ndarray, "F"],
+    device: str,
 ) -> Callable[[int], Images]:
     """A function that makes the images of a raw frame."""
     camera_at = partial(scene.camera, settings.size)
@@ -260,7 +264,7 @@ def still_interior(scene: Scene, hits: list[Hits]) -> Bool[np.ndarray, "H W"]:
 
 
 def _truth(
-    scene: Scene, settings: SimSettings, times: Float[np.ndarray, "F"]
+    scene: Scene, settings: ResolvedSettings, times: Float[np.ndarray, "F"]
 ) -> tuple[Float[np.ndarray, "F H W"], Int[np.ndarray, "F H W"], Bool[np.ndarray, "F H W"]]:
     """Distance [m], body and still interior of every raw frame."""
     camera_at, height = partial(scene.camera, settings.size), scene.camera(settings.size).height
@@ -286,7 +290,7 @@ def _gap(
 
 
 def _colour(
-    scene: Scene, settings: SimSettings, times: Float[np.ndarray, "F"], cached: Cached
+    scene: Scene, settings: ResolvedSettings, times: Float[np.ndarray, "F"], cached: Cached
 ) -> ColourCamera:
     """The colour camera: an image at every quartet start, and its poses."""
     if scene.colour is None:

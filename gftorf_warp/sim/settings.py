@@ -15,7 +15,8 @@ TRUTHS = ("usual", "all")
 
 @dataclass(frozen=True, kw_only=True)
 class SimSettings:
-    """How a scene is recorded.
+    """How a scene is recorded. None: as the level says if there is one, else the scene, else the
+    default of :class:`ResolvedSettings`.
 
     Raises:
         UsageError: If a value is out of range, or two values contradict each other.
@@ -29,18 +30,18 @@ class SimSettings:
     """Seed of noise and random paths. Frame n does not depend on the number of frames."""
     sync: bool = False
     """Control mode: all raw frames of a quartet are taken at the time of its first."""
-    noise: bool = True
+    noise: bool | None = None
     """Shot noise, read noise, full well and ADC, if the scene's sensor has them."""
     flow: bool = False
     """Whether exact optical flow at quartet starts is stored [px], that of the camera included."""
-    exposure_samples: int = 1
+    exposure_samples: int | None = None
     """Instants that a raw frame averages over the exposure, centred on its time; 1: no blur."""
-    engine: str = "gaussian"
+    engine: str | None = None
     """One of ``ENGINES``. 'mesh' shares nothing with the renderer of `reconstruct`, and is the only
     one with light beside the camera, a beam, bounces, gloss or a rolling shutter."""
-    bounces: int = 0
+    bounces: int | None = None
     """Surfaces that light may meet after the first; above 0 only with engine 'mesh'."""
-    paths: int = 64
+    paths: int | None = None
     """Random paths per pixel and raw frame for the light that bounces."""
     format: str = "ftorf"
     """Layout on disk: 'ftorf', raw quads; 'torf', one phasor per quartet with the time, pose and
@@ -48,7 +49,7 @@ class SimSettings:
     amplitude and objects."""
     level: str | None = None
     """Level of the ladder from ideal to realistic, see sim/ladder.py: it decides about engine,
-    bounces, blur, noise and what of the sensor is ideal. None: as set here and by the scene."""
+    bounces, blur and noise where they are None, and what of the sensor is ideal. None: none."""
     truth: str = "usual"
     """What a capture of engine mesh stores besides distance, amplitude and objects: 'usual' or
     'all', see sim/truth_layers.py. 'all' needs that engine and that format."""
@@ -65,13 +66,14 @@ class SimSettings:
         require(enough, "--frames", f"{self.frames}", f"at least {least}")
         require(sized, "--size", "x".join(map(str, size)), pixels)
         require(self.seed >= 0, "--seed", f"{self.seed}", "0 or more")
-        samples = self.exposure_samples
-        require(samples >= 1, "exposure_samples", f"{samples}", "at least 1")
-        require(self.bounces >= 0, "--bounces", f"{self.bounces}", "0 or more")
-        require(self.paths >= 1, "--paths", f"{self.paths}", "at least 1")
+        for name, few in (("exposure_samples", 1), ("bounces", 0), ("paths", 1)):
+            value = getattr(self, name)
+            good = value is None or value >= few
+            require(good, f"--{name.replace('_', '-')}", f"{value}", f"at least {few}")
         for name, known in (("engine", ENGINES), ("format", FORMATS), ("truth", TRUTHS)):
             value = getattr(self, name)
-            require(value in known, f"--{name}", repr(value), f"one of {', '.join(known)}")
+            good = value is None or value in known
+            require(good, f"--{name}", repr(value), f"one of {', '.join(known)}")
         layers = self.level is not None or (self.engine, self.format) == ("mesh", "capture")
         why = "only engine mesh computes layers, and only a capture stores them"
         fix = "add --engine mesh --format capture"
@@ -79,6 +81,19 @@ class SimSettings:
         why, fix = "flow belongs to raw quads", "leave --flow out, or --format ftorf"
         phasors = self.flow and self.format == "torf"
         refuse(phasors, ("a ToeRF folder cannot store optical flow", "--flow"), why, fix)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ResolvedSettings(SimSettings):
+    """How a scene is recorded, with nothing left to a level, the scene or a default."""
+
+    frames: int
+    size: tuple[int, int]
+    noise: bool = True
+    exposure_samples: int = 1
+    engine: str = "gaussian"
+    bounces: int = 0
+    paths: int = 64
 
 
 def refuse(wrong: bool, what: tuple[str, str], why: str, fix: str) -> None:
