@@ -106,7 +106,7 @@ def test_a_run_keeps_what_was_changed(tmp_path):
     """In config.json; another value is another run."""
     run = reconstruct(small(), tmp_path / "run", "demo", images=4, changes=["rates.mean=0.002"])
     assert run.config["settings"]["rates"]["mean"] == 0.002
-    again = provenance.how(run.config, None, "")
+    again = provenance.how(run.config, None, "", compared={})
     assert "--set rates.mean=0.002" in again
     with pytest.raises(UsageError, match="other settings"):
         reconstruct(small(), tmp_path / "run", "demo", images=4)

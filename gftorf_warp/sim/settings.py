@@ -88,12 +88,19 @@ class ResolvedSettings(SimSettings):
     """How a scene is recorded, with nothing left to a level, the scene or a default."""
 
     frames: int
+    """Number of raw frames."""
     size: tuple[int, int]
+    """(width, height) of the image [px]."""
     noise: bool = True
+    """Whether the sensor's noise is simulated."""
     exposure_samples: int = 1
+    """Instants of an exposure."""
     engine: str = "gaussian"
+    """One of ``ENGINES``."""
     bounces: int = 0
+    """Surfaces that light may meet after the first."""
     paths: int = 64
+    """Random paths per pixel and raw frame."""
 
 
 def refuse(wrong: bool, what: tuple[str, str], why: str, fix: str) -> None:
