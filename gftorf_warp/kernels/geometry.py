@@ -43,6 +43,19 @@ def adj_camera_of(view: wp.array[CameraView], adj_ret: CameraView):
 
 
 @wp.func
+def sigmoid(x: float) -> float:
+    """1 / (1 + exp(-x)) [1], zero where the exponential overflows."""
+    return 1.0 / (1.0 + wp.exp(-x))
+
+
+@wp.func_grad(sigmoid)
+def adj_sigmoid(x: float, adj_ret: float):
+    """Derivative y (1 - y); that of the formula is zero times infinity below -88.7."""
+    y = sigmoid(x)
+    wp.adjoint[x] += adj_ret * y * (1.0 - y)
+
+
+@wp.func
 def rotation_of(wxyz: wp.vec4) -> wp.mat33:
     """Rotation matrix of a quaternion in the order of the program; it need not have unit length."""
     q = wp.normalize(wxyz)

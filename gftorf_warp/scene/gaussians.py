@@ -74,6 +74,26 @@ class GaussianField:
         """The tensors that can be optimised, by name."""
         return {name: value for name, value in self.tensors().items() if name != "layer"}
 
+    def check_finite(self) -> None:
+        """Check every parameter; on CUDA this waits for the device.
+
+        Raises:
+            ValueError: If one is NaN or infinite.
+        """
+        with torch.no_grad():
+            sums = [value.sum() for value in self.parameters().values()]
+            if bool(torch.stack(sums).isfinite().all()):  # otherwise one of them overflowed, or is
+                return
+            for name, value in self.parameters().items():
+                wrong = ~value.reshape(len(self), -1).isfinite().all(dim=1)
+                if (count := int(wrong.sum())) > 0:
+                    first = int(wrong.nonzero()[0])
+                    others = f", and of {count - 1} more" if count > 1 else ""
+                    raise ValueError(
+                        f"{name} of Gaussian {first}{others} is not finite: "
+                        f"{_briefly(value[first])}"
+                    )
+
     def map(self, function) -> GaussianField:
         """A field with ``function`` applied to every tensor: selection, device, detaching."""
         return replace(self, **{name: function(value) for name, value in self.tensors().items()})
@@ -84,6 +104,12 @@ class GaussianField:
         """Every centre displaced [m], and covariances rotated by quaternions wxyz of any length."""
         quaternion = self.quaternion if rotation is None else product(rotation, self.quaternion)
         return replace(self, mean=self.mean + offset, quaternion=quaternion)
+
+
+def _briefly(values: Tensor) -> str:
+    """The first numbers of a tensor that are not finite."""
+    flat = values.reshape(-1)
+    return ", ".join(f"{x:g}" for x in flat[~flat.isfinite()][:3].tolist())
 
 
 def concatenated(parts: list[GaussianField]) -> GaussianField:

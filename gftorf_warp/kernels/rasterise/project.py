@@ -11,7 +11,7 @@ import warp as wp
 
 from ...constants import ALPHA_MIN, SH_BIAS
 from ..correlation import PHASE_OFFSET, PHASE_SLOPE, SOURCE_INTENSITY, light_of
-from ..geometry import CameraView, camera_of, screen_covariance
+from ..geometry import CameraView, camera_of, screen_covariance, sigmoid
 from ..harmonics import harmonics
 from ..lens import bent_covariance, distorted
 from .splat import Splat
@@ -75,6 +75,28 @@ def square_of(view: CameraView, x: float, y: float, cov: wp.vec4) -> wp.vec4i:
     return wp.vec4i(16 * x0, 16 * y0, 16 * x1, 16 * y1)
 
 
+@wp.func
+def veil_of(view: CameraView) -> Splat:
+    """What a Gaussian without a finite place, size or opacity becomes: NaN in every pixel.
+
+    Drawn as it is, it would be hidden: comparisons with NaN are false, and its box is empty.
+    """
+    w = float(view.width)
+    h = float(view.height)
+    flat = -0.5 / ((w + h) * (w + h))  # opaque to the corners
+    visit = visit_of(1.0, wp.vec4(-0.5 / flat, 0.0, -0.5 / flat, 0.25 / (flat * flat)))
+    return Splat(
+        0.5 * w, 0.5 * h, flat, 0.0, flat,
+        1.0, visit[0], visit[1],
+        wp.nan, wp.nan, wp.nan, wp.nan, wp.nan, wp.nan, wp.nan, wp.nan,
+    )  # fmt: skip
+
+
+@wp.func_grad(veil_of)
+def adj_veil_of(view: CameraView, adj_ret: Splat):
+    """No derivative."""
+
+
 @functools.cache
 def make_project(colour: bool, square: bool, lens: bool = False, sloped: bool = False):
     """The kernel for a field with or without colour.
@@ -113,7 +135,13 @@ def make_project(colour: bool, square: bool, lens: bool = False, sloped: bool = 
         order[n] = n
         depth_key[n] = depth_culled
         box_px[n] = wp.vec4i(0, 0, 0, 0)
-        opacity = 1.0 / (1.0 + wp.exp(-opacity_logit[n]))
+        placed = wp.isfinite(mean[n]) and wp.isfinite(quaternion[n])
+        if not (placed and wp.isfinite(log_scale[n]) and wp.isfinite(opacity_logit[n])):
+            depth_key[n] = 0
+            box_px[n] = wp.vec4i(0, 0, camera.width, camera.height)
+            splats[n] = veil_of(camera)
+            return
+        opacity = sigmoid(opacity_logit[n])
         local = camera.rotation * mean[n] + camera.translation
         if local[2] < camera.near or local[2] > camera.far or opacity < ALPHA_MIN:
             return
@@ -152,7 +180,7 @@ def make_project(colour: bool, square: bool, lens: bool = False, sloped: bool = 
         reflectivity = float(SH_BIAS)
         for h in range(16):
             reflectivity += wp.where(h < active, basis[h] * reflectivity_sh[n, h], 0.0)
-        reflectivity = wp.max(reflectivity, 0.0)
+        reflectivity = wp.where(reflectivity <= 0.0, 0.0, reflectivity)  # a maximum hides NaN
         bound = float(0.0)
         along_ray = distance  # or its inverse
         if wp.static(sloped):
@@ -179,9 +207,9 @@ def make_project(colour: bool, square: bool, lens: bool = False, sloped: bool = 
             rgb = wp.vec3(SH_BIAS, SH_BIAS, SH_BIAS)
             for h in range(16):
                 rgb += wp.where(h < active, basis[h], 0.0) * colour_sh[n, h]
-            red = wp.max(rgb[0], 0.0)
-            green = wp.max(rgb[1], 0.0)
-            blue = wp.max(rgb[2], 0.0)
+            red = wp.where(rgb[0] <= 0.0, 0.0, rgb[0])
+            green = wp.where(rgb[1] <= 0.0, 0.0, rgb[1])
+            blue = wp.where(rgb[2] <= 0.0, 0.0, rgb[2])
         splats[n] = Splat(
             x, y, -0.5 * cov[2] / determinant, cov[1] / determinant, -0.5 * cov[0] / determinant,
             opacity, visit[0], visit[1],
