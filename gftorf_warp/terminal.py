@@ -72,46 +72,16 @@ def progress_line(
     return f"  {label} {done}/{total}  " + "  ".join(shown)
 
 
-class WarpLog:
-    """Warp's messages in our log: compilations, but no kernels loaded from the cache."""
-
-    def debug(self, message: str) -> None:
-        """Pass on at the lowest level."""
-        LOG.debug("warp: %s", message)
-
-    def info(self, message: str) -> None:
-        """Log compilations briefly and other messages in full, both for -v."""
-        text = message.strip()
-        if text.endswith("(compiled)"):
-            LOG.debug(
-                "  compiled %s", text.removeprefix("Module ").removesuffix("(compiled)").strip()
-            )
-        else:
-            self.debug(message)
-
-    def warning(
-        self,
-        message: str,
-        category: type[Warning] | None = None,  # noqa: ARG002
-        stacklevel: int = 1,  # noqa: ARG002
-    ) -> None:
-        """Pass on as a warning."""
-        LOG.warning("warp: %s", message)
-
-    def error(self, message: str) -> None:
-        """Pass on as an error."""
-        LOG.error("warp: %s", message)
-
-
 def start_warp() -> None:
     """Initialise Warp with its messages in our log, without the one about a missing CUDA driver."""
     import warp as wp
 
+    from .render import runtime
+
     wp.config.log_level = wp.LOG_WARNING
     with _native_stderr() as lines:
-        wp.init()
+        runtime.start()
     wp.config.log_level = wp.LOG_INFO
-    wp.set_logger(WarpLog())
     for line in lines:
         if NO_DRIVER not in line:
             LOG.warning("warp: %s", line)

@@ -5,6 +5,7 @@ import subprocess
 import sys
 
 from gftorf_warp import terminal
+from gftorf_warp.render.runtime import WarpLog
 
 
 def test_progress_tells_the_time_left():
@@ -38,7 +39,7 @@ def test_progress_counts_per_second_what_has_a_unit(capsys, monkeypatch):
 
 def test_warp_speaks_through_our_log(caplog):
     """Compilations and cache hits are details; warnings stay warnings."""
-    log = terminal.WarpLog()
+    log = WarpLog()
     with caplog.at_level(logging.DEBUG, logger="gftorf_warp"):
         log.info("Module kernels.tiles 123 load on device 'cpu' took 2.00 ms  (compiled)\n")
         log.info("Module kernels.tiles 123 load on device 'cpu' took 2.00 ms  (cached)")

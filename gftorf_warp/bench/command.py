@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import importlib.metadata
 import os
 import platform
 import subprocess
@@ -20,6 +19,7 @@ from .. import __version__
 from ..data.files import write_json
 from ..data.read import read
 from ..errors import UsageError
+from ..evaluate.provenance import version_of
 from . import motion, reconstruction, renderer, rendering, states, step
 from .timing import Report, quietly
 
@@ -183,13 +183,6 @@ def checked(parts: list[str]) -> list[str]:
     return [name for name in PARTS if name in parts or not parts]
 
 
-def _version_of(package: str) -> str:
-    try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
-        return "of unknown version"
-
-
 def about(device: str) -> dict[str, Any]:
     """Machine and versions, for the JSON of every benchmark."""
     on_cpu, cpus = device == "cpu", os.cpu_count()
@@ -204,7 +197,7 @@ def about(device: str) -> dict[str, Any]:
         "cpus": cpus,
         "driver": "no driver" if on_cpu else f"driver {_driver()}",
         "python": platform.python_version(),
-        "warp": f"Warp {_version_of('warp-lang')}",
+        "warp": f"Warp {version_of('warp-lang')}",
         "torch": f"torch {torch.__version__}",
         "gftorf_warp": __version__,
         "commit": _commit(),

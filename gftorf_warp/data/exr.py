@@ -7,8 +7,11 @@ compressed, once for all readers.
 
 from __future__ import annotations
 
+import contextlib
 import os
-from collections.abc import Mapping
+import sys
+import threading
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +25,11 @@ PARTS_MAX = 64  # a raw frame has a handful; a forged header may claim millions
 CHANNELS_MAX = 256  # a rendering has a few dozen
 # of captures; half is refused: its steps are 2 mm at 2 m
 TYPES = {np.dtype(np.float32), np.dtype(np.uint32)}
+
+_PRINTING = threading.Lock()
+if hasattr(os, "register_at_fork"):  # a forked process must not inherit another thread's turn
+    _release = _PRINTING.release
+    os.register_at_fork(before=_PRINTING.acquire, after_in_parent=_release, after_in_child=_release)
 
 Channels = dict[str, np.ndarray]
 Parts = dict[str, Channels]
@@ -143,7 +151,7 @@ def _read(path: Path, parts_max: int) -> Parts:
             names = {part.name() for part in file.parts}
         if not 1 <= len(stated) <= parts_max or len(names) != len(stated):
             raise ValueError(f"{len(stated)} parts")
-        with OpenEXR.File(str(path), separate_channels=True) as file:
+        with _silence(), OpenEXR.File(str(path), separate_channels=True) as file:
             parts = {
                 part.name(): {c: np.array(channel.pixels) for c, channel in part.channels.items()}
                 for part in file.parts
@@ -154,6 +162,31 @@ def _read(path: Path, parts_max: int) -> Parts:
     except Exception as error:  # the library raises many kinds of exceptions
         raise _unreadable(path, parts_max, str(error)) from error
     return parts
+
+
+class _OtherThreads:
+    """A stream to which all threads but the one that makes it write."""
+
+    def __init__(self, stream: Any):
+        self._stream, self._silent = stream, threading.get_ident()
+
+    def write(self, text: str) -> int:
+        """Write, or drop, a text."""
+        return len(text) if threading.get_ident() == self._silent else self._stream.write(text)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+
+@contextlib.contextmanager
+def _silence() -> Iterator[None]:
+    """Drop what OpenEXR prints to stdout about damaged pixels: their channels are missing, too."""
+    with _PRINTING:
+        before, sys.stdout = sys.stdout, _OtherThreads(sys.stdout)
+        try:
+            yield
+        finally:
+            sys.stdout = before
 
 
 def _unreadable(path: Path, parts_max: int, found: str) -> InputError:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import json
 import platform
 from collections.abc import Callable
@@ -27,7 +26,7 @@ from . import classes, gallery, views
 from . import metrics as measure
 from .caveats import caveats
 from .panels import Findings, Judgement
-from .provenance import fact, method_of
+from .provenance import fact, method_of, version_of
 from .renders import stated_images
 
 if TYPE_CHECKING:
@@ -256,7 +255,7 @@ def write_report(run: Run, result: dict[str, Any], found: Findings) -> Path:
 def installed_versions() -> str:
     """Versions of this package, its main dependencies and the platform."""
     packages = ("torch", "warp-lang", "numpy")
-    versions = ", ".join(f"{name} {importlib.metadata.version(name)}" for name in packages)
+    versions = ", ".join(f"{name} {version_of(name)}" for name in packages)
     system = f"Python {platform.python_version()}, {platform.system()}"
     return f"gftorf-warp {__version__}, {versions}, {system}"
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import json
 import shlex
 from collections.abc import Mapping
@@ -140,3 +141,11 @@ def _command(config: Mapping[str, Any]) -> str:
     words += [("set", change) for change in config.get("changes") or ()]
     typed = " ".join(f"--{name} {shlex.quote(str(value))}" for name, value in words)
     return f"gftorf reconstruct {shlex.quote(str(config.get('sequence')))} --out RUN {typed}"
+
+
+def version_of(package: str) -> str:
+    """Version of an installed package; one that merely lies on the path states none."""
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return "of unknown version"

@@ -47,6 +47,7 @@ def _window_mean(image: Float[Tensor, "*c H W"]) -> Float[Tensor, "*c H W"]:
 
 
 @functools.lru_cache(maxsize=16)
+@torch.inference_mode(False)  # shared with later calls, which may need gradients
 def _band(n: int, device: torch.device, dtype: torch.dtype) -> Float[Tensor, "n n"]:
     """Symmetric matrix that replaces each of ``n`` values by the weighted mean of its window,
     zeros beyond the ends.

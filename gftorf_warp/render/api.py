@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Collection
 from dataclasses import dataclass
 
@@ -12,7 +11,7 @@ from torch import Tensor
 
 from ..scene.camera import Camera
 from ..scene.gaussians import GaussianField
-from ..scene.sensor import Sensor
+from ..scene.sensor import Sensor, uploaded
 from .bridge import IMAGES, INPUTS, Rasterize, Request, left_out
 from .buffers import RenderSettings, Workspace
 from .control import DeviceCamera, check
@@ -196,15 +195,10 @@ def _spread(
 
 def _calibration(sensor: Sensor, field: GaussianField) -> Tensor:
     """[4] phase slope [rad/m], phase offset [rad], source intensity, DC offset; uploaded once."""
-    values = sensor.phase_slope, sensor.phase_offset, sensor.source_intensity, sensor.dc_offset
+    values = sensor.calibration
     if any(isinstance(value, Tensor) for value in values):
         like = field.mean
         return torch.stack(
             [torch.as_tensor(v, dtype=like.dtype, device=like.device) for v in values]
         )
-    return _uploaded(values, field.device)
-
-
-@functools.lru_cache(maxsize=64)
-def _uploaded(values: tuple[float, ...], device: torch.device) -> Tensor:
-    return torch.tensor(values, dtype=torch.float32, device=device)
+    return uploaded(values, torch.float32, field.device)

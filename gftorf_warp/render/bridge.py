@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -13,11 +15,16 @@ from torch.autograd.function import once_differentiable
 
 from ..kernels.geometry import CameraView
 from ..scene.camera import Camera
-from . import launch
+from . import launch, runtime
 from .buffers import Buffers, RenderSettings, Workspace
 from .control import DeviceCamera
 from .cuda import stream_of
 from .inputs import Images, Inputs, View, names_of, shapes_of
+
+# A forked process, such as a worker of a DataLoader, has none of the threads that OpenMP would wait
+# for; a worker does this itself.
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=functools.partial(torch.set_num_threads, 1))
 
 INPUTS = names_of(Inputs)
 IMAGES = names_of(Images)
@@ -158,7 +165,7 @@ def array_over(tensor: Tensor | None, dtype=wp.float32) -> wp.array | None:
     """A Warp array over the memory of a tensor, without its history."""
     if tensor is None:
         return None
-    wp.init()  # from_torch needs the runtime; does nothing after the first call
+    runtime.start()  # from_torch needs the runtime; does nothing after the first call
     # from_torch would use the strides of an empty tensor, which are undefined
     if tensor.numel() == 0:
         shape = tensor.shape[: tensor.ndim - len(getattr(dtype, "_shape_", ()))]

@@ -42,8 +42,7 @@ class DeviceCamera:
 
 def packed(camera: Camera, sensor: Sensor, settings: RenderSettings) -> Float[np.ndarray, " P"]:
     """Camera, calibration and shifts as a row, P = V + 4 + 2 Q; copy bits, do no arithmetic."""
-    calibration = sensor.phase_slope, sensor.phase_offset, sensor.source_intensity, sensor.dc_offset
-    numbers = [float(v.detach() if isinstance(v, Tensor) else v) for v in calibration]
+    numbers = [float(v.detach() if isinstance(v, Tensor) else v) for v in sensor.calibration]
     numbers += [part for shift in sensor.shifts for part in (math.cos(shift), math.sin(shift))]
     return np.concatenate(
         [view_bits(camera, settings).view(np.float32), np.array(numbers, dtype=np.float32)]

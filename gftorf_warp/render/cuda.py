@@ -18,19 +18,37 @@ import warp as wp
 from jaxtyping import Float
 from torch import Tensor
 
+from ..errors import ResourceError
+from . import runtime
+
 SLOTS = 8  # uploads, or readbacks, that may be in flight
 HOST_BYTES = 1 << 28  # of page-locked memory at most: the system cannot use it for anything else
 PAGE = 4096  # [bytes] alignment of readback buffers, which a disk then writes without a copy
 
 
-def stream_of(tensor: Tensor):
-    """Context in which Warp launches on torch's current stream of the tensor's device."""
-    wp.init()
-    if tensor.is_cuda:
-        return wp.ScopedStream(
-            _warp_stream(torch.cuda.current_stream(tensor.device)), sync_enter=False
-        )
-    return contextlib.nullcontext()
+@contextlib.contextmanager
+def stream_of(tensor: Tensor) -> Iterator[None]:
+    """Context in which Warp launches on torch's current stream of the tensor's device, while other
+    threads of the program wait.
+
+    Raises:
+        ResourceError: If this process was forked from one that had used CUDA.
+    """
+    runtime.start()
+    with runtime.LAUNCHING:
+        if not tensor.is_cuda:
+            yield
+            return
+        if torch.cuda._is_in_bad_fork():
+            raise ResourceError(
+                "CUDA cannot be used after a fork",
+                where=tensor.device,
+                why="this process was forked from one that had used CUDA",
+                fix="start processes with the method spawn, or render on the CPU in them",
+            )
+        stream = _warp_stream(torch.cuda.current_stream(tensor.device))
+        with wp.ScopedStream(stream, sync_enter=False):
+            yield
 
 
 @functools.cache
@@ -66,9 +84,10 @@ def capture(
         pool: Memory shared with graphs that are replayed one after the other, see
             :func:`graph_pool`; None: its own.
     """
-    wp.init()
+    runtime.start()
     mode = "thread_local"  # Warp's own assumption
     with (
+        runtime.LAUNCHING,
         without_garbage_collection(),
         torch.cuda.graph(graph, pool=pool, stream=stream, capture_error_mode=mode),
     ):

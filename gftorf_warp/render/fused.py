@@ -115,6 +115,7 @@ def image_loss(
 
 
 @functools.cache
+@torch.inference_mode(False)  # shared with later calls
 def _first(device: torch.device) -> Tensor:
     """Row 0: an upload makes a GPU wait."""
     return torch.zeros(1, dtype=torch.int32, device=device)

@@ -89,9 +89,10 @@ class MovedGaussians:
         inputs += [self._indices(), self._weights()]
         where = {"device": device, "record_tape": False}
         # packed once: that is most of what a launch costs a host
-        self._launch = wp.launch(
-            kernel, max(len(field), 1), inputs, [*outputs, self.view], record_cmd=True, **where
-        )
+        with stream_of(field.mean):
+            self._launch = wp.launch(
+                kernel, max(len(field), 1), inputs, [*outputs, self.view], record_cmd=True, **where
+            )
 
     @torch.no_grad()
     def move(self, time: float, camera: Camera) -> None:

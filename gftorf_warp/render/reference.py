@@ -35,7 +35,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ..constants import ALPHA_MAX, ALPHA_MIN, SH_BIAS, SPEED_OF_LIGHT, TRANSMITTANCE_MIN
+from ..constants import ALPHA_MAX, ALPHA_MIN, SH_BIAS, TRANSMITTANCE_MIN
 from ..scene.camera import Camera
 from ..scene.distortion import inside
 from ..scene.gaussians import GaussianField
@@ -350,12 +350,12 @@ def correlate(
     phasor_factor: float,
 ) -> Float[Tensor, "*P M light"]:
     """Light of each Gaussian alone: its Q quads, then its phasor (method, 2.4)."""
-    f, phase_offset, dc_offset, source, shift = (
+    slope, phase_offset, source, dc_offset, shift = (
         torch.as_tensor(value, dtype=d.dtype, device=d.device)
-        for value in (*_numbers(sensor), sensor.shifts)
+        for value in (*sensor.calibration, sensor.shifts)
     )
     a = source * reflectivity / d[..., None] ** 2
-    psi = (4.0 * math.pi / SPEED_OF_LIGHT * f * d + phase_offset)[..., None]
+    psi = (slope * d + phase_offset)[..., None]
     quads = a * ((psi - shift).cos() + dc_offset)
     phasor = phasor_factor * a * torch.cat([psi.cos(), psi.sin(), torch.ones_like(psi)], -1)
     return torch.cat([quads, phasor], -1)

@@ -24,7 +24,7 @@ from ..scene.camera import Camera
 from ..scene.gaussians import GaussianField
 from ..scene.motion import Motion
 from ..scene.sensor import Sensor
-from . import launch
+from . import launch, runtime
 from .api import Rendering
 from .bridge import ALIGNED, array_over, left_out
 from .buffers import Buffers, RenderSettings
@@ -86,7 +86,7 @@ class Replay:
         Raises:
             ValueError: If an image has an unknown name.
         """
-        wp.init()
+        runtime.start()
         self.settings, self.colour_scale = settings, colour_scale
         colour = {"colour"} & set(images) if field.colour_sh is not None else set()
         self.names, self._like = wanted_images(set(images) - {"colour"}) | colour, field.mean
@@ -95,8 +95,7 @@ class Replay:
         """Whether renderings are captured."""
         shifts = [(math.cos(shift), math.sin(shift)) for shift in sensor.shifts]
         self._shifts = wp.array(shifts, dtype=wp.vec2, device=self.device)
-        values = sensor.phase_slope, sensor.phase_offset, sensor.source_intensity, sensor.dc_offset
-        calibration = field.mean.new_tensor([float(value) for value in values])
+        calibration = field.mean.new_tensor([float(value) for value in sensor.calibration])
         self._gaussians = MovedGaussians(field, motion, binding, calibration, optimised, settings)
         self._targets: dict[tuple[int, int, bool], Target] = {}
         self._largest = wp.zeros(1, dtype=wp.int32, device=self.device)
@@ -179,8 +178,9 @@ class Replay:
 
     def capture(self, target: Target) -> wp.Graph:
         """Capture a rendering on Warp's stream: torch's default stream cannot be captured."""
-        with without_garbage_collection(), wp.ScopedCapture(device=self.device) as capture:
-            self.launch_kernels(target)
+        with runtime.LAUNCHING, without_garbage_collection():
+            with wp.ScopedCapture(device=self.device) as capture:
+                self.launch_kernels(target)
         return capture.graph
 
     def launch(self, graph: wp.Graph) -> None:

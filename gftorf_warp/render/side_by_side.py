@@ -4,6 +4,7 @@ each in its own thread.
 
 from __future__ import annotations
 
+import os
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from itertools import pairwise
@@ -27,6 +28,10 @@ def tile_edges(buffers: Buffers, parts: int) -> list[int]:
 @cache
 def _pool(threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, thread_name_prefix="gftorf-tiles")
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_pool.cache_clear)  # a fork copies no threads
 
 
 def over_tiles(buffers: Buffers, kernel, edges: list[int], arguments, warps: int = 1) -> None:

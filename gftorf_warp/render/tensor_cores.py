@@ -15,6 +15,7 @@ from ..kernels.network import gradient_rows as lists
 from ..kernels.network import gradient_scaling as ends
 from ..kernels.network import perceptron as kernels
 from ..kernels.training.ordered_sums import LANES
+from . import runtime
 from .cuda import side_stream
 from .fused import launch
 from .layers import LARGEST, SMALLEST, Form, LayerGradients, Layers
@@ -131,7 +132,7 @@ def fits(form: Form, device: torch.device) -> bool:
     sizes = form.width == wgmma.WIDTH and form.columns == wgmma.COLUMNS
     if not sizes or form.dtype != torch.float16 or device.type == "cpu":
         return False
-    wp.init()
+    runtime.start()
     return wp.device_from_torch(device).arch == wgmma.ARCHITECTURE
 
 
@@ -181,7 +182,7 @@ def parameter_shapes(form: Form, layers: int) -> list[tuple[int, ...]]:
 @functools.cache
 def _ready(device: torch.device) -> wp.Device:
     """The device, with kernels compiled for exactly its architecture (sm_90a)."""
-    wp.init()
+    runtime.start()
     found = wp.get_device("cpu") if device.type == "cpu" else wp.device_from_torch(device)
     if found.is_cuda:
         before, wp.config.cuda_arch_suffix = wp.config.cuda_arch_suffix, "a"

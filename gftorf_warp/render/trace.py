@@ -21,6 +21,7 @@ from ..kernels.geometry import CameraView
 from ..kernels.tracing import light_paths, rays
 from ..scene.camera import Camera
 from ..scene.optics import Beam
+from . import runtime
 from .buffers import RenderSettings, available_threads
 from .launch import view_of
 from .side_by_side import run_side_by_side
@@ -183,7 +184,7 @@ class Tracer:
         device: str = "cpu",
         threads: int | None = None,
     ):
-        wp.init()
+        runtime.start()
         self.device = wp.get_device(device)
         self.width, self.height = width, height
         # kept alive: kernels get their ids only
@@ -292,20 +293,21 @@ class Tracer:
     def _over_rows(self, kernel, inputs: list, outputs: list[wp.array]) -> None:
         """Launch over the rows, interleaved among CPU threads to balance their work."""
         parts = self._parts
-        commands = [
-            wp.launch(
-                kernel,
-                dim=(len(range(part, self.height, parts)), self.width),
-                inputs=[*inputs, part, parts],
-                outputs=outputs,
-                device=self.device,
-                record_tape=False,
-                record_cmd=parts > 1,
-            )
-            for part in range(parts)
-        ]
-        if parts > 1:
-            run_side_by_side(commands, parts)
+        with runtime.LAUNCHING:
+            commands = [
+                wp.launch(
+                    kernel,
+                    dim=(len(range(part, self.height, parts)), self.width),
+                    inputs=[*inputs, part, parts],
+                    outputs=outputs,
+                    device=self.device,
+                    record_tape=False,
+                    record_cmd=parts > 1,
+                )
+                for part in range(parts)
+            ]
+            if parts > 1:
+                run_side_by_side(commands, parts)
 
     def _empty(self, shape: tuple[int, ...], dtype) -> wp.array:
         return wp.empty(shape, dtype=dtype, device=self.device)

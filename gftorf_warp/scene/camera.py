@@ -54,6 +54,11 @@ class Camera:
         pose = np.asarray(self.camera_from_world, dtype=np.float64)
         if pose.shape != (4, 4):
             raise ValueError(f"camera_from_world {pose.shape} must be (4, 4)")
+        if not np.isfinite(pose).all():
+            raise ValueError(f"camera_from_world must be finite, got {pose.tolist()}")
+        for name in ("fx", "fy", "cx", "cy"):
+            if not math.isfinite(value := getattr(self, name)):
+                raise ValueError(f"{name} must be finite, got {value}")
         rotation = pose[:3, :3]
         orthogonal = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4)
         if not orthogonal or np.linalg.det(rotation) < 0:
@@ -153,7 +158,8 @@ class Camera:
         kind = point.device, point.dtype
         if kind not in self._sent:
             numbers = (self.camera_from_world, (self.fx, self.fy), (self.cx, self.cy))
-            self._sent[kind] = tuple(torch.from_numpy(np.array(n)).to(point) for n in numbers)
+            with torch.inference_mode(False):  # later points may need gradients
+                self._sent[kind] = tuple(torch.from_numpy(np.array(n)).to(point) for n in numbers)
         pose, focal, principal = self._sent[kind]
         local = point @ pose[:3, :3].T + pose[:3, 3]
         flat = local[..., :2] / local[..., 2:]

@@ -175,6 +175,12 @@ class Sensor:
         return 4.0 * math.pi / SPEED_OF_LIGHT * self.f_mod_hz
 
     @property
+    def calibration(self) -> tuple[Scalar, Scalar, Scalar, Scalar]:
+        """Phase slope [rad/m], phase offset in [-pi, pi] [rad], source intensity, DC offset."""
+        offset = within_half_turn(self.phase_offset)
+        return self.phase_slope, offset, self.source_intensity, self.dc_offset
+
+    @property
     def unambiguous_range(self) -> float:
         """Range c / 2f [m]: distances are known modulo this."""
         f_mod_hz = self.f_mod_hz.detach() if isinstance(self.f_mod_hz, Tensor) else self.f_mod_hz
@@ -213,17 +219,27 @@ def channel_of(shifts: Sequence[float], shift: float) -> int | None:
     return nearest if turns[nearest] <= SAME_RAD else None
 
 
+def within_half_turn(angle: Scalar) -> Scalar:
+    """The same angle in [-pi, pi] [rad], reduced in float64: float32 would lose 5e-4 of 1e4 rad."""
+    if not isinstance(angle, Tensor):
+        return math.remainder(angle, 2.0 * math.pi)
+    turns = (angle.detach().double() / (2.0 * math.pi)).round()
+    return (angle.double() - 2.0 * math.pi * turns).to(angle.dtype)
+
+
 def distance_from_phasor(re: Tensor, im: Tensor, sensor: Sensor) -> Tensor:
     """Distance [m] of a phasor: ((atan2(im, re) - phase_offset) mod 2 pi) / kappa."""
-    phase = torch.remainder(torch.atan2(im, re) - sensor.phase_offset, 2.0 * math.pi)
+    offset = within_half_turn(sensor.phase_offset)
+    phase = torch.remainder(torch.atan2(im, re) - offset, 2.0 * math.pi)
     # remainder can round up to 2 pi
     wrapped = torch.where(phase >= 2.0 * math.pi, torch.zeros_like(phase), phase)
     return wrapped / sensor.phase_slope
 
 
-@functools.lru_cache(maxsize=64)
-def _uploaded(values: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Numbers on a device, uploaded once: an upload synchronises a GPU."""
+@functools.lru_cache(maxsize=256)
+@torch.inference_mode(False)  # of a rendering in that mode, others that need gradients have it, too
+def uploaded(values: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Numbers [n] on a device, uploaded once: an upload synchronises a GPU."""
     return torch.tensor(values, dtype=dtype, device=device)
 
 
@@ -239,7 +255,7 @@ def phasor_from_quads(quads: Tensor, shifts: tuple[float, ...] | Tensor) -> tupl
     """
     known = shifts
     if not isinstance(known, Tensor):
-        known = _uploaded(tuple(known), quads.dtype, quads.device)
+        known = uploaded(tuple(known), quads.dtype, quads.device)
     theta = known.to(quads).reshape(-1, *[1] * (quads.ndim - 1))
     if len(theta) < 3:
         raise ValueError(f"shifts: a phase needs at least 3 quads, got {len(theta)}")

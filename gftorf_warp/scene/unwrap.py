@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from ..data import unwrap as numbers
-from .sensor import Sensor, distance_from_phasor
+from .sensor import Sensor, distance_from_phasor, within_half_turn
 
 
 def unwrap(phases: Sequence[Tensor], ms: Sequence[int]) -> Tensor:
@@ -66,7 +66,8 @@ def distance_from_phasors(phasors: Sequence[tuple[Tensor, Tensor]], sensor: Sens
         raise ValueError(f"{len(phasors)} phasors for {len(frequencies)} frequencies")
     if len(phasors) == 1:
         return distance_from_phasor(*phasors[0], sensor)
-    angles = [torch.atan2(im, re) - sensor.phase_offset for re, im in phasors]
+    offset = within_half_turn(sensor.phase_offset)
+    angles = [torch.atan2(im, re) - offset for re, im in phasors]
     phases = [torch.remainder(angle, 2.0 * math.pi) for angle in angles]
     ms, _ = numbers.multiples(frequencies)
     return unwrap(phases, ms) * ms[0] / sensor.phase_slope
