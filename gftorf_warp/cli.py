@@ -243,20 +243,33 @@ def _export(options: argparse.Namespace) -> int:
 def _compare(options: argparse.Namespace) -> int:
     import json
 
+    several, given = len(options.runs) > 1, _named(options, "truth", "frames", "against")
+    if options.out is not None and not several:
+        why = "the report of one run is written into its folder"
+        raise UsageError("--out is for several runs", where="--out", why=why, fix="leave it out")
     device = start(options)
+    runs, progress = (
+        [_opened(options, device, path) for path in options.runs],
+        _progress(options)("compare"),
+    )
+    if several:
+        from .evaluate.runs import compare_runs, table_of_runs
+
+        result = compare_runs(runs, options.out or "gftorf-compare", **given, progress=progress)
+        print(json.dumps(result, indent=2) if options.json else table_of_runs(result))
+        return 0
     from .evaluate.compare import compare
 
-    run, progress = _opened(options, device), _progress(options)("compare")
-    metrics = compare(run, **_named(options, "truth", "frames", "against"), progress=progress)
+    metrics = compare(runs[0], **given, progress=progress)
     print(json.dumps(metrics, indent=2) if options.json else table(metrics))
     return 0
 
 
-def _opened(options: argparse.Namespace, device: str) -> Run:
-    """The run of a command, with its sequence where --sequence says."""
+def _opened(options: argparse.Namespace, device: str, path: str | None = None) -> Run:
+    """The run of a command, or one of several, with its sequence where --sequence says."""
     from .recon.run import Run
 
-    run = Run.open(options.run_folder, device)
+    run = Run.open(path or options.run_folder, device)
     return run if options.sequence is None else run.linked(options.sequence)
 
 

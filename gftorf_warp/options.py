@@ -226,13 +226,16 @@ def command_parsers() -> dict[str, Parser]:
     export.flag("--fresh", FRESH)
 
     compare = Parser.of("compare", "score a reconstruction against the truth and write a report")
-    compare.add_argument("run_folder", metavar="RUN", help="folder of the reconstruction")
+    folders = "folder of the reconstruction; several of one sequence are compared side by side"
+    compare.add_argument("runs", metavar="RUN", nargs="+", help=folders)
+    out = "folder for comparison.html and .json of several runs (gftorf-compare)"
+    compare.option("--out", "DIR", str, out)
     compare.option("--sequence", "SEQ", str, MOVED)
     compare.option("--truth", "SEQ", str, "sequence with the true distance (the reconstructed one)")
     conventions = "geometry, or static-phasor, the closed form without motion and noise (geometry)"
     against = f"true distance: {conventions}"
     compare.option("--against", "geometry|static-phasor", str, against, "geometry")
-    compare.flag("--json", "print metrics.json instead of a table")
+    compare.flag("--json", "print metrics.json (comparison.json) instead of a table")
     compare.option("--frames", "all|ftorf13", str, "which raw frames are scored (all)", "all")
     _device_options(compare)
 

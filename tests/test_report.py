@@ -294,7 +294,7 @@ def test_sliders_lay_ours_over_the_closed_form(compared):
 def test_bars_are_as_long_as_the_errors(compared):
     """Root mean squared errors over the largest of them, at edges and inside."""
     _, metrics, _, _ = compared
-    html = tables.bars_by_class(metrics)
+    html = tables.bars(tables.series_of(metrics))
     drawn = re.findall(r"--part: ([\d.]+).*?data-key=\"([^\"]*)\"", html)
     roots = {key: math.sqrt(look_up(metrics, key)) for _, key in drawn}
     assert {key.split(".")[1] for key in roots} == {"moving", "static"}
@@ -303,7 +303,7 @@ def test_bars_are_as_long_as_the_errors(compared):
     }
     for part, key in drawn:
         assert float(part) == pytest.approx(roots[key] / max(roots.values()), abs=1e-4), key
-    assert tables.bars_by_class(metrics | {"classes": None}) == ""
+    assert tables.bars(tables.series_of(metrics | {"classes": None})) == ""
 
 
 def test_the_page_can_be_used_without_a_script(compared):

@@ -80,10 +80,31 @@ def compare(
         from ..recon.run import Run
 
         run = Run.open(run)
+    _refuse_earlier_state(run)
+    result, found = score(
+        run, truth=truth, frames=frames, against=against, novel=report, progress=progress
+    )
+    write_json(run.path / "metrics.json", result)
+    if report:
+        write_report(run, result, found)
+    return result
+
+
+def score(
+    run: Run,
+    *,
+    truth: str | Path | None = None,
+    frames: str = "all",
+    against: str = "geometry",
+    novel: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+) -> tuple[dict[str, Any], Findings]:
+    """:func:`compare` without files: the content of metrics.json, and its arrays; with novel views
+    if they are wanted.
+    """
     if against not in AGAINST:
         why, fix = f"expected one of {', '.join(AGAINST)}", "use --against geometry"
         raise UsageError(f"unknown truth {against!r}", where="--against", why=why, fix=fix)
-    _refuse_earlier_state(run)
     sequence = run.sequence()
     known = fitting_truth(sequence, truth)
     scored = measure.scored_frames(sequence, frames)
@@ -92,15 +113,12 @@ def compare(
         findings(sequence, gathered, known, against=against),
         colour=gallery.colour_views(run, sequence, scored),
         residuals=run.explained,
-        novel=gallery.novel_views(run, sequence) if report else None,
+        novel=gallery.novel_views(run, sequence) if novel else None,
     )
     residuals.warn(found.residuals)
     result = summary(run, found, protocol=frames, against=against)
     result["caveats"] = caveats(run.config, sequence, known)
-    write_json(run.path / "metrics.json", result)
-    if report:
-        write_report(run, result, found)
-    return result
+    return result, found
 
 
 def _refuse_earlier_state(run: Run) -> None:

@@ -14,6 +14,9 @@ from .plot import Curve, Plot, svg
 # Okabe and Ito
 COLOURS = {"closed_form": "#d55e00", "d": "#0072b2", "d_normalised": "#56b4e9", "d_tof": "#009e73"}
 NAMES = {"closed_form": "closed form", "d": "d", "d_normalised": "d / opacity", "d_tof": "d_ToF"}
+Styles = Mapping[str, tuple[str, str]]
+"""Colour and label of the curve of each kind of distance."""
+OF_DISTANCES: Styles = {name: (COLOURS[name], NAMES[name]) for name in COLOURS}
 TERM_COLOURS = "#0072b2 #e69f00 #009e73 #cc79a7 #56b4e9 #d55e00 #8c6d31 #666666".split()
 # what else a log step holds
 NOT_LOSSES = {"images", "seconds", "gaussians", "quad_psnr_db", "opacity"}
@@ -82,7 +85,9 @@ def along_run(rows: Sequence[Mapping[str, float]]) -> list[bytes]:
 
 
 def error_over_frames(
-    frames: Sequence[int], groups: Mapping[str, Mapping[str, Sequence[float | None]]]
+    frames: Sequence[int],
+    groups: Mapping[str, Mapping[str, Sequence[float | None]]],
+    styles: Styles = OF_DISTANCES,
 ) -> list[bytes]:
     """Error of every scored frame, one plot per group of pixels.
 
@@ -90,24 +95,27 @@ def error_over_frames(
         frames: The scored raw frames n.
         groups: For each group of pixels the errors [m^2 x 100] by the name of the distance, None
             where there are none.
+        styles: Colour and label of each distance.
     """
     x = np.asarray(frames, dtype=float)
     drawn = {
         group: {name: (x, np.array(row, float)) for name, row in errors.items()}  # None: NaN
         for group, errors in groups.items()
     }
-    return _groups(drawn, x="raw frame n", y=f"mean squared error [{SQUARED}]", points=True)
+    return _groups(drawn, styles, x="raw frame n", y=f"mean squared error [{SQUARED}]", points=True)
 
 
 def error_histogram(
     errors: Mapping[str, Float[np.ndarray, "S H W"]],
     groups: Mapping[str, Bool[np.ndarray, "S H W"]],
+    styles: Styles = OF_DISTANCES,
 ) -> list[bytes]:
     """Share of pixels over error [m] on a logarithmic axis, one plot per group of pixels.
 
     Args:
         errors: Squared errors [m^2] by the name of the distance, NaN where unknown.
         groups: Pixels to count, by name; each not empty.
+        styles: Colour and label of each distance.
     """
     top = max(10.0 * FLOOR_M, *(float(np.sqrt(np.nanmax(error))) for error in errors.values()))
     edges = np.geomspace(FLOOR_M, top * 1.001, BINS + 1)
@@ -124,11 +132,12 @@ def error_histogram(
             share = np.repeat(counts / max(counts.sum(), 1), 2)
             drawn[group][name] = stairs, np.concatenate([[0.0], share, [0.0]])
     share_of = "share of these pixels"
-    return _groups(drawn, x="absolute error [m]", y=share_of, log_x=True, log_y=False)
+    return _groups(drawn, styles, x="absolute error [m]", y=share_of, log_x=True, log_y=False)
 
 
 def _groups(
     drawn: Mapping[str, Mapping[str, tuple[np.ndarray, np.ndarray]]],
+    styles: Styles,
     *,
     points: bool = False,
     **axes: Any,
@@ -137,7 +146,7 @@ def _groups(
     plots = []
     for group, curves in drawn.items():
         lines = [
-            Curve(x=across, y=up, colour=COLOURS[name], label=NAMES[name], points=points)
+            Curve(x=across, y=up, colour=styles[name][0], label=styles[name][1], points=points)
             for name, (across, up) in curves.items()
         ]
         plots.append(Plot(title=group, curves=lines, **axes))

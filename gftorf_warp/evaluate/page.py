@@ -59,6 +59,16 @@ def ratio(metrics: Mapping[str, Any], above: str, below: str) -> str:
     return f'<span data-above="{escape(above)}" data-below="{escape(below)}">{value:.1f}</span>'
 
 
+def section(title: str, *parts: str) -> str:
+    """A part of the page with its heading; ``parts`` are trusted HTML."""
+    return f"<section><h2>{title}</h2>{''.join(parts)}</section>"
+
+
+def caption(text: str) -> str:
+    """A paragraph of trusted HTML that explains what follows."""
+    return f'<p class="caption">{text}</p>'
+
+
 def picture(
     image: Float[np.ndarray, "H W"], scale: pictures.Scale, title: str, note: str = ""
 ) -> str:

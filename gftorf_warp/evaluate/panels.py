@@ -15,8 +15,9 @@ from ..data.sequence import Sequence
 from ..data.unwrap import CONFIDENT
 from ..recon.fallback import SOURCES
 from ..recon.residuals import Residuals
-from . import controls, page, pictures
+from . import controls, figures, page, pictures
 from .gallery import Colour, Novel
+from .metrics import ERROR_UNIT, per_frame_mean
 from .views import Views
 
 STRIP_FRAMES = 5  # columns of the strip over time
@@ -158,7 +159,7 @@ def error_maps(judged: Judgement, s: int, window: Window = WHOLE) -> str:
 
     The errors of the closed form define the scale, on moving pixels if there are any.
     """
-    scale = _error_scale(judged, s)
+    scale = error_scale(judged, s)
     figures = [
         page.picture(np.sqrt(judged.errors[name][s][window]), scale, f"error of {title}")
         for name, title in TITLES.items()
@@ -167,7 +168,8 @@ def error_maps(judged: Judgement, s: int, window: Window = WHOLE) -> str:
     return page.row([*figures, page.picture(moves, _share_scale(1.0), "moving pixels")])
 
 
-def _error_scale(judged: Judgement, s: int) -> pictures.Scale:
+def error_scale(judged: Judgement, s: int) -> pictures.Scale:
+    """One scale [m] for all errors of a frame: that of the closed form, on moving pixels if any."""
     error, moving = np.sqrt(judged.errors["closed_form"][s]), judged.moving[s]
     return pictures.error_scale([error[moving] if moving.any() else error])
 
@@ -203,17 +205,56 @@ def explained(found: Findings, s: int) -> str:
     if found.residuals is None:
         return ""
     of_quartet = found.residuals.quartets.index(found.views.frames[s] // found.sequence.cycle)
-    figures = []
+    maps = []
     if found.residuals.noisy:
-        logarithm = np.log10(np.maximum(found.residuals.chi_square, CHI_SQUARE_SHOWN[0]))
-        low, high = np.log10(CHI_SQUARE_SHOWN)
-        scale = pictures.Scale(low=low, high=high, colours="magma", unit="power of ten")
-        image, over = logarithm[of_quartet], logarithm.max(axis=0)
-        figures.append(page.picture(image, scale, "chi-square", "of this quartet"))
-        figures.append(page.picture(over, scale, "chi-square", "largest of all quartets"))
+        values = found.residuals.chi_square
+        maps.append(chi_square(values[of_quartet], "chi-square", "of this quartet"))
+        maps.append(chi_square(values.max(axis=0), "chi-square", "largest of all quartets"))
     often = found.residuals.unexplained.mean(axis=0, dtype=np.float32)
     title = "share of quartets that are not explained"
-    return page.row([*figures, page.picture(often, _share_scale(1.0), title)], columns=4)
+    return page.row([*maps, page.picture(often, _share_scale(1.0), title)], columns=4)
+
+
+def chi_square(values: Float[np.ndarray, "H W"], title: str, note: str = "") -> str:
+    """A picture of chi-square on a logarithmic scale."""
+    low, high = np.log10(CHI_SQUARE_SHOWN)
+    scale = pictures.Scale(low=low, high=high, colours="magma", unit="power of ten")
+    return page.picture(np.log10(np.maximum(values, CHI_SQUARE_SHOWN[0])), scale, title, note)
+
+
+def error_charts(
+    found: Findings,
+    judged: Judgement,
+    errors: Mapping[str, Float[np.ndarray, "S H W"]],
+    styles: figures.Styles = figures.OF_DISTANCES,
+) -> dict[str, list[bytes]]:
+    """Error of every raw frame, and distribution of errors, by title: on all, moving and static
+    pixels.
+
+    Args:
+        found: Whose frames they are.
+        judged: What moves.
+        errors: Squared errors [m^2] by the names of ``styles``.
+        styles: Colour and label of each curve.
+    """
+    groups = {"all pixels": np.ones_like(judged.moving)}
+    groups |= {"moving pixels": judged.moving, "static pixels": judged.static}
+    groups = {name: mask for name, mask in groups.items() if mask.any()}
+    per_frame = {
+        group: {
+            name: [None if v is None else ERROR_UNIT * v for v in per_frame_mean(error, mask)]
+            for name, error in errors.items()
+        }
+        for group, mask in groups.items()
+    }
+    return {
+        "Error of every raw frame": figures.error_over_frames(
+            found.views.frames, per_frame, styles
+        ),
+        "Distribution of errors (the first bin holds all below a millimetre)": (
+            figures.error_histogram(errors, groups, styles)
+        ),
+    }
 
 
 def source(found: Findings, s: int) -> str:
@@ -242,13 +283,30 @@ def strip_over_time(found: Findings) -> str:
     return "".join(rows) + f'<div class="wide">{page.colour_bar(scale)}</div>'
 
 
-def film(found: Findings) -> str:
-    """The first frames of all quartets: measured quad, closed form, ours, and truth if known."""
-    views, cycle = found.views, found.sequence.cycle
-    starts = [s for s, n in enumerate(views.frames) if n % cycle == 0]
+def film(found: Findings, shown: Mapping[str, tuple[np.ndarray, pictures.Scale]]) -> str:
+    """The first frames of all quartets; empty if there is one only.
+
+    Args:
+        found: Whose frames they are.
+        shown: By title, the images [S, H, W] of all scored frames, and their scale.
+    """
+    cycle = found.sequence.cycle
+    starts = [s for s, n in enumerate(found.views.frames) if n % cycle == 0]
     starts = starts[:: -(-len(starts) // FILM_FRAMES_MAX)]
     if len(starts) < 2:
         return ""
+    return controls.film(
+        {
+            title: ([_small(image[s], scale) for s in starts], page.colour_bar(scale))
+            for title, (image, scale) in shown.items()
+        },
+        FILM_PERIOD_S,
+    )
+
+
+def film_of_run(found: Findings) -> str:
+    """A film of the measured quad, closed form and ours, and of the truth if known."""
+    views = found.views
     quad, metres = pictures.signed_scale([views.quad_measured]), found.distance_scale
     shown = {
         "measured quad": (views.quad_measured, quad),
@@ -259,13 +317,7 @@ def film(found: Findings) -> str:
         shown["rendered quad"] = views.quad_rendered, quad
     else:
         shown["truth"] = found.judgement.truth, metres
-    return controls.film(
-        {
-            title: ([_small(image[s], scale) for s in starts], page.colour_bar(scale))
-            for title, (image, scale) in shown.items()
-        },
-        FILM_PERIOD_S,
-    )
+    return film(found, shown)
 
 
 def sliders(found: Findings, s: int) -> str:
@@ -281,13 +333,14 @@ def sliders(found: Findings, s: int) -> str:
     else:
         before, after = (np.sqrt(judged.errors[name][s]) for name in ("closed_form", "d"))
         errors = f"error of {titles[0]}", f"error of {titles[1]}"
-        pairs.append((before, after, _error_scale(judged, s), errors))
-    return '<div class="sliders">' + "".join(_slider(*pair) for pair in pairs) + "</div>"
+        pairs.append((before, after, error_scale(judged, s), errors))
+    return '<div class="sliders">' + "".join(slider(*pair) for pair in pairs) + "</div>"
 
 
-def _slider(
+def slider(
     left: np.ndarray, right: np.ndarray, scale: pictures.Scale, titles: tuple[str, str]
 ) -> str:
+    """Two images on one scale, one over the other."""
     rgb = [
         pictures.colour_mapped(pictures.thinned(image, page.PICTURE_SIZE_MAX), scale)
         for image in (left, right)

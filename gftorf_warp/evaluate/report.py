@@ -7,14 +7,11 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-import numpy as np
-
 from ..data.decode import unambiguous_range
 from ..recon.residuals import problems
 from ..render.buffers import available_threads
 from . import figures, gallery, page, panels, provenance, tables
 from .legend import PHASORS_TO_READ, TO_READ
-from .metrics import ERROR_UNIT, per_frame_mean
 from .panels import Findings
 
 WITHOUT_GAUSSIANS = {
@@ -56,29 +53,30 @@ def report(
         residual = pool.submit(panels.quad_residual, found, s)
         explained = pool.submit(_explained, metrics, found, s)
         sliders = pool.submit(panels.sliders, found, s)
-        film = pool.submit(panels.film, found)
+        film = pool.submit(panels.film_of_run, found)
         strip = pool.submit(panels.strip_over_time, found)
         beyond = pool.submit(_beyond, metrics, found)
         curves = pool.submit(_curves, found, log)
+    about_phasors = PHASORS_TO_READ if found.sequence.from_phasors else ""
     made = provenance.how(config, data_card, installed, compared=metrics, simulated=simulated)
     sections = [
         f"<h1>{page.escape(title)}</h1>"
         f'<div class="soft">gftorf compare, version {page.number(metrics, "version", "text")}</div>'
         f'<p class="verdict">{verdict(metrics)}</p>',
-        _section("Before and after", _sliders_text(found, s), sliders.result()),
+        page.section("Before and after", _sliders_text(found, s), sliders.result()),
         *_film(film.result()),
-        _section("Errors", tables.errors(metrics), tables.facts(metrics)),
+        page.section("Errors", tables.errors(metrics), tables.facts(metrics)),
         *_by_class(metrics),
-        _section("Distance", _distance_text(found, s), distances.result()),
-        _section("What was measured", _measured_text(found, s), measured.result()),
-        _section("Quads", _quad_text(found, s), residual.result()),
+        page.section("Distance", _distance_text(found, s), distances.result()),
+        page.section("What was measured", _measured_text(found, s), measured.result()),
+        page.section("Quads", _quad_text(found, s), residual.result()),
         *explained.result(),
-        _section("Over time", strip.result()),
+        page.section("Over time", strip.result()),
         *beyond.result(),
         *_along(metrics, diagnostics),
-        _section("Curves", curves.result()),
-        _section("How it was made", made),
-        _section("How to read it", TO_READ, PHASORS_TO_READ if found.sequence.from_phasors else ""),
+        page.section("Curves", curves.result()),
+        page.section("How it was made", made),
+        page.section("How to read it", TO_READ, about_phasors),
     ]
     return page.document(f"{title} - gftorf compare", "".join(sections))
 
@@ -135,14 +133,6 @@ def _comparison(metrics: Mapping[str, Any], naive: str, ours: str) -> str:
     return f"{page.ratio(metrics, ours, naive)} times <em>more</em> squared error, {values}"
 
 
-def _section(title: str, *parts: str) -> str:
-    return f"<section><h2>{title}</h2>{''.join(parts)}</section>"
-
-
-def _caption(text: str) -> str:
-    return f'<p class="caption">{text}</p>'
-
-
 def _by_class(metrics: Mapping[str, Any]) -> list[str]:
     """The section of errors at edges and on slopes; none without truth."""
     if page.look_up(metrics, "classes") is None:
@@ -150,12 +140,16 @@ def _by_class(metrics: Mapping[str, Any]) -> list[str]:
     text = "Root mean squared error by what the true distance looks like around a pixel."
     more = "<summary>In m² &times; 100, all distances and slopes</summary>"
     details = f"<details>{more}{tables.by_class(metrics)}</details>"
-    return [_section("Edges and slopes", _caption(text), tables.bars_by_class(metrics), details)]
+    return [
+        page.section(
+            "Edges and slopes", page.caption(text), tables.bars(tables.series_of(metrics)), details
+        )
+    ]
 
 
 def _sliders_text(found: Findings, s: int) -> str:
     frame = found.views.frames[s]
-    return _caption(
+    return page.caption(
         f"Raw frame {frame}: the closed form, as a camera computes it, and ours. The scroll bar, a "
         "swipe or the arrow keys move the edge."
     )
@@ -164,14 +158,14 @@ def _sliders_text(found: Findings, s: int) -> str:
 def _film(html: str) -> list[str]:
     """The section of the film, if there is one."""
     text = "The first raw frame of every quartet, slowed down."
-    return [_section("Quartet by quartet", _caption(text), html)] if html else []
+    return [page.section("Quartet by quartet", page.caption(text), html)] if html else []
 
 
 def _distance_text(found: Findings, s: int) -> str:
     reason, scale = "most moving pixels", "the truth's"
     if found.judgement is None:
         reason, scale = "the largest change of quads", "one"
-    return _caption(
+    return page.caption(
         f"Distance along the ray, on {scale} scale, of raw frame {found.views.frames[s]}: the one "
         f"with {reason} in the middle half of the sequence."
     )
@@ -180,10 +174,10 @@ def _distance_text(found: Findings, s: int) -> str:
 def _measured_text(found: Findings, s: int) -> str:
     frame, sequence = found.views.frames[s], found.sequence
     if sequence.from_phasors:
-        return _caption(f"The phasor of raw frame {frame}. Red is positive, blue negative.")
+        return page.caption(f"The phasor of raw frame {frame}. Red is positive, blue negative.")
     count = COUNTED.get(sequence.cycle, str(sequence.cycle))
     differ = "phase shift" if len(sequence.frequencies) == 1 else "phase shift, frequency"
-    return _caption(
+    return page.caption(
         f"The quartet of raw frame {frame}: {count} raw frames, each with its own {differ} and its "
         f"own time. Distances are known modulo {unambiguous_range(sequence):.4g} m. Red is "
         "positive, blue negative."
@@ -195,7 +189,7 @@ def _distance_pictures(found: Findings, s: int) -> str:
     if found.judgement is None:
         return html
     html += f"<h3>Absolute error</h3>{panels.error_maps(found.judgement, s)}"
-    html += _caption(
+    html += page.caption(
         "One scale for all three, defined by the errors of the closed form on moving pixels; "
         "larger errors are clamped."
     )
@@ -207,7 +201,7 @@ def _quad_text(found: Findings, s: int) -> str:
     which = f"The quad of raw frame {found.views.frames[s]}"
     if found.sequence.from_phasors:
         which = "The quad of shift zero, half the real part of the phasor"
-    return _caption(
+    return page.caption(
         f"{which}, measured and rendered at its time and pose over a black background; the "
         "residual should look like noise."
     )
@@ -228,17 +222,17 @@ def _explained(metrics: Mapping[str, Any], found: Findings, s: int) -> list[str]
     if page.look_up(metrics, "explained.contradicted_share") is not None:
         wrong = page.number(metrics, "explained.contradicted_share", "percent")
         text += f"; of those that do not, {wrong} are far from the distance of their temporal mean"
-    text = _caption(f"{text}. Each raw frame at its own time, at the size of the fit.")
+    text = page.caption(f"{text}. Each raw frame at its own time, at the size of the fit.")
     html = panels.explained(found, s)
     if page.look_up(metrics, "source") is not None:
         shares = [
             f"{name} {page.number(metrics, f'source.{key}', 'percent')}"
             for key, name in panels.SOURCE_NAMES.items()
         ]
-        html += _caption(f"Where our distance is from: {', '.join(shares)}.") + panels.source(
+        html += page.caption(f"Where our distance is from: {', '.join(shares)}.") + panels.source(
             found, s
         )
-    return [_section("How well the quads are explained", text, html)]
+    return [page.section("How well the quads are explained", text, html)]
 
 
 def _beyond(metrics: Mapping[str, Any], found: Findings) -> list[str]:
@@ -247,12 +241,14 @@ def _beyond(metrics: Mapping[str, Any], found: Findings) -> list[str]:
     if found.colour is not None:
         psnr = page.number(metrics, "colour_psnr_db", "decibel")
         text = f"From the colour camera, at the time of the raw frame. Its PSNR is {psnr}."
-        sections.append(_section("Colour", _caption(text), gallery.colour_strip(found.colour)))
+        sections.append(
+            page.section("Colour", page.caption(text), gallery.colour_strip(found.colour))
+        )
     if found.novel is not None:
         text = "The reconstruction in the middle of the sequence, from its novel poses."
-        text = _caption(f"{text} Grey: opacity below one half.")
+        text = page.caption(f"{text} Grey: opacity below one half.")
         strip = gallery.novel_strip(found.novel, found.distance_scale)
-        sections.append(_section("Novel views", text, strip))
+        sections.append(page.section("Novel views", text, strip))
     return sections
 
 
@@ -280,7 +276,9 @@ def _along(metrics: Mapping[str, Any], rows: Sequence[Mapping[str, float]]) -> l
             f" The error of d is least, {number('d_mse_x100_least', 'error')}, after "
             f"{number('images_at_least', 'count')} images."
         )
-    return [_section("Along the run", _caption(text), page.charts(drawings, "Along the run"))]
+    return [
+        page.section("Along the run", page.caption(text), page.charts(drawings, "Along the run"))
+    ]
 
 
 def _curves(found: Findings, log: Sequence[Mapping[str, float]]) -> str:
@@ -288,23 +286,7 @@ def _curves(found: Findings, log: Sequence[Mapping[str, float]]) -> str:
     training = figures.training_curves(log)
     if training:
         charts.append(("During optimisation", training))
-    judged = found.judgement
-    if judged is not None:
-        errors = {name: judged.errors[name] for name in panels.TITLES}
-        everywhere = np.ones_like(judged.moving)
-        masks = everywhere, judged.moving, judged.static
-        groups = {
-            n: mask for n, mask in zip(tables.PIXELS.values(), masks, strict=True) if mask.any()
-        }
-        per_frame = {
-            group: {
-                name: [None if v is None else ERROR_UNIT * v for v in per_frame_mean(error, mask)]
-                for name, error in errors.items()
-            }
-            for group, mask in groups.items()
-        }
-        over_frames = figures.error_over_frames(found.views.frames, per_frame)
-        charts.append(("Error of every raw frame", over_frames))
-        title = "Distribution of errors (the first bin holds all below a millimetre)"
-        charts.append((title, figures.error_histogram(errors, groups)))
+    if found.judgement is not None:
+        errors = {name: found.judgement.errors[name] for name in panels.TITLES}
+        charts += panels.error_charts(found, found.judgement, errors).items()
     return "".join(f"<h3>{title}</h3>{page.charts(drawings, title)}" for title, drawings in charts)

@@ -5,7 +5,7 @@ metrics.json.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 from . import page
 from .metrics import DISTANCES
@@ -47,21 +47,39 @@ OF_CLASS = {
 BARS = {"closed_form": "--naive", "temporal": "--other", "d": "--ours"}  # colours in page.css
 
 
+class Series(NamedTuple):
+    """One bar in every group of :func:`bars`."""
+
+    colour: str  # as in CSS
+    metrics: Mapping[str, Any]
+    name: str  # of the distance
+
+
 def errors(metrics: Mapping[str, Any]) -> str:
     """Errors of every distance on all, moving and static pixels."""
     if page.look_up(metrics, "d_mse_x100") is None:
         return '<p class="soft">No ground truth: distance errors are not known.</p>'
-    head, rows = [""], []
+    rows = []
+    for name in DISTANCES:
+        title, note = ROWS[name]
+        named = f'<b>{title}</b> <span class="soft note">{note}</span>'
+        rows.append((_mark(name), [named, *error_cells(metrics, name)]))
+    text = "Mean squared error of the distance, m² &times; 100, and its root."
+    return f'<p class="soft">{text}</p>{page.table(error_head(metrics), rows)}'
+
+
+def error_head(metrics: Mapping[str, Any]) -> list[str]:
+    """Titles of the columns of :func:`errors`, with shares of pixels."""
+    head = [""]
     for group, name in COLUMNS.items():
         share = f"{page.number(metrics, f'{group}share', 'percent')} of all" if group else "&nbsp;"
         head.append(f"{name}<span class='soft'>{share}</span>")
-    for name in DISTANCES:
-        title, note = ROWS[name]
-        cells = [_error_and_root(metrics, f"{group}{name}_mse_x100") for group in COLUMNS]
-        named = f'<b>{title}</b> <span class="soft note">{note}</span>'
-        rows.append((_mark(name), [named, *cells]))
-    text = "Mean squared error of the distance, m² &times; 100, and its root."
-    return f'<p class="soft">{text}</p>{page.table(head, rows)}'
+    return head
+
+
+def error_cells(metrics: Mapping[str, Any], name: str) -> list[str]:
+    """Errors of one distance, in the columns of :func:`errors` behind its name."""
+    return [_error_and_root(metrics, f"{group}{name}_mse_x100") for group in COLUMNS]
 
 
 def facts(metrics: Mapping[str, Any]) -> str:
@@ -74,36 +92,46 @@ def facts(metrics: Mapping[str, Any]) -> str:
     return f'<ul class="facts">{items}</ul>'
 
 
-def bars_by_class(metrics: Mapping[str, Any]) -> str:
-    """Bars of the errors [cm] at edges and inside, of moving and of static pixels."""
+def series_of(metrics: Mapping[str, Any]) -> dict[str, Series]:
+    """What :func:`bars` shows of one run."""
+    return {ROWS[name][0]: Series(f"var({colour})", metrics, name) for name, colour in BARS.items()}
+
+
+def bars(series: Mapping[str, Series]) -> str:
+    """Bars of errors [cm] at edges and inside, of moving and of static pixels; empty without truth.
+
+    Args:
+        series: What is drawn, by its label.
+    """
     groups = {
         f"{group}, {kind}": f"classes.{group}.{kind}"
         for group in ("moving", "static")
         for kind in ("edge", "interior")
     }
     values = {
-        key: {name: page.look_up(metrics, f"{key}.{name}_mse_x100") for name in BARS}
+        (key, label): page.look_up(one.metrics, f"{key}.{one.name}_mse_x100")
         for key in groups.values()
+        for label, one in series.items()
     }
-    known = [v for row in values.values() for v in row.values() if v is not None]
+    known = {place: value for place, value in values.items() if value is not None}
     if not known:
         return ""
-    largest = max(*known, 1e-9) ** 0.5  # the root is drawn
+    largest = max(*known.values(), 1e-9) ** 0.5  # roots are drawn
     rows = ""
     for title, key in groups.items():
-        share = page.number(metrics, f"{key}.share", "percent")
-        bars = "".join(
-            f'<i style="--part: {value**0.5 / largest:.4f}; --colour: var({BARS[name]})">'
-            f"{page.number(metrics, f'{key}.{name}_mse_x100', 'rms_cm')}</i>"
-            for name, value in values[key].items()
-            if value is not None
+        drawn = "".join(
+            f'<i style="--part: {known[key, label] ** 0.5 / largest:.4f}; --colour: {one.colour}">'
+            f"{page.number(one.metrics, f'{key}.{one.name}_mse_x100', 'rms_cm')}</i>"
+            for label, one in series.items()
+            if (key, label) in known
         )
-        if bars:
-            rows += f'<b>{title}<span class="soft">{share}</span></b><div>{bars}</div>'
+        if drawn:
+            share = page.number(next(iter(series.values())).metrics, f"{key}.share", "percent")
+            rows += f'<b>{title}<span class="soft">{share}</span></b><div>{drawn}</div>'
+    labels = [label for label in series if any(label == known_label for _, known_label in known)]
     key = "".join(
-        f'<span style="--colour: var({colour})">{ROWS[name][0]}</span>'
-        for name, colour in BARS.items()
-        if any(row[name] is not None for row in values.values())
+        f'<span style="--colour: {series[label].colour}">{page.escape(label)}</span>'
+        for label in labels
     )
     return f'<div class="key">{key}</div><div class="bars">{rows}</div>'
 
