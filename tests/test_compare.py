@@ -76,6 +76,7 @@ KEYS = {
     "ablation",
     "input",
     "flow_source",
+    "unfilled_share",
     "init",
     "motion",
     "version",
