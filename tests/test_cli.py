@@ -180,7 +180,7 @@ def test_module_and_script_are_the_same():
         ("render RUN --out DIR", "times", None),
         ("export RUN --out DIR --format ply --every 2", "formats", ["ply"]),
         ("compare RUN --truth SEQ --json", "truth", "SEQ"),
-        ("compare --json RUN", "run_folder", "RUN"),
+        ("compare --json RUN", "runs", ["RUN"]),
         ("check SEQ", "sequence", "SEQ"),
         ("doctor", "command", "doctor"),
         ("bench", "parts", []),
