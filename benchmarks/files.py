@@ -118,6 +118,7 @@ def rendered(out: Path, images: int, run: Run, arrays: bool = True) -> float:
         tuple(CHANNELS),
         seconds,
         arrays=arrays,
+        plain=True,
         progress=lambda k, _: seen.append((k, time.perf_counter())),
     )
     return each_of(seen)

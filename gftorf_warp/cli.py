@@ -219,23 +219,33 @@ def _reconstruct(options: argparse.Namespace) -> int:
 
 
 def _render(options: argparse.Namespace) -> int:
+    if options.out is None and options.video is None:
+        fix = "for example `gftorf render RUN --out pictures`"
+        why = "pictures need a folder, a video a file"
+        raise UsageError("--out or --video is missing", where="gftorf render", why=why, fix=fix)
     device = start(options)
-    from .evaluate.views import render_to_folder
+    from .evaluate.views import render_to_folder, render_to_video
 
-    run, progress = _opened(options, device), _progress(options)("render", unit="images")
-    given = _named(options, "out", "what", "times", "poses", "fresh", "arrays")
-    print(render_to_folder(run, **given, progress=progress))
+    run = _opened(options, device)
+    given = _named(options, "what", "times", "poses")
+    if options.out is not None:
+        files = _named(options, "out", "fresh", "arrays", "plain")
+        progress = _progress(options)("render", unit="images")
+        print(render_to_folder(run, **given, **files, progress=progress))
+    if options.video is not None:
+        progress = _progress(options)("video", unit="images")
+        rate = {"rate_hz": options.rate}
+        print(render_to_video(run, options.video, **given, **rate, progress=progress))
     return 0
 
 
 def _export(options: argparse.Namespace) -> int:
     device = start(options)
     from .export.command import export
-    from .recon.run import Run
 
     given = _named(options, "out", "formats", "times", "every", "colour", "fresh")
     progress = functools.partial(_progress(options), unit="files")
-    for path in export(Run.open(options.run_folder, device), **given, progress=progress):
+    for path in export(_opened(options, device), **given, progress=progress):
         print(path)
     return 0
 

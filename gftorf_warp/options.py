@@ -199,7 +199,11 @@ def command_parsers() -> dict[str, Parser]:
 
     render = Parser.of("render", "write images of a reconstruction at any time")
     render.add_argument("run_folder", metavar="RUN", help="folder of the reconstruction")
-    render.option("--out", "DIR", str, "folder to write", required=True)
+    render.option("--out", "DIR", str, "folder to write")
+    video = "a .webm, .mp4, .gif or .webp file of what is rendered, with or in place of --out"
+    render.option("--video", "FILE", str, video)
+    rates = "pictures per second of the video (4 to 30, so that a few last 5 s)"
+    render.option("--rate", "HZ", _rate, rates)
     render.option("--sequence", "SEQ", str, MOVED)
     what = "any of distance,distance_median,quads,phasor,colour (distance)"
     render.option("--what", "A,B", _list_of(str), what, ["distance"])
@@ -209,13 +213,15 @@ def command_parsers() -> dict[str, Parser]:
     render.flag(
         "--arrays", "one .npy file per channel with all images, many times as fast as pictures"
     )
+    render.flag("--plain", "previews without title, colour bar and enlargement")
     _device_options(render)
     render.flag("--fresh", FRESH)
 
     export = Parser.of("export", "write a reconstruction in the formats of other programs")
     export.add_argument("run_folder", metavar="RUN", help="folder of the reconstruction")
     export.option("--out", "DIR", str, "folder to write", required=True)
-    formats = "any of ply (ply)"
+    export.option("--sequence", "SEQ", str, MOVED)
+    formats = "any of ply (Gaussians), points, exr, npz, webm, mp4, gif, webp (ply)"
     export.option("--format", "A,B", _list_of(str), formats, ["ply"], dest="formats")
     moments = "seconds since raw frame 0 (each instant of the sequence)"
     export.option("--times", "S,S", _list_of(_number), moments)

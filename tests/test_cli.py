@@ -461,6 +461,12 @@ def test_render_writes_what_was_asked_for(run, tmp_path, capsys):
         str(out_folder),
         "--fresh",
     )
+    fails(["render", str(run)], 2, capsys, "--out or --video")
+    film = tmp_path / "film.webp"
+    asked = ["render", str(run), "--video", str(film), "--times", "0.0,0.01", "--rate", "8"]
+    assert cli.main([*asked, "--device", "cpu"]) == 0
+    assert lines_of(capsys)[0] == [str(film)]
+    assert film.read_bytes()[8:12] == b"WEBP"
     fails([*arguments, "--arrays"], 2, capsys, str(out_folder), "--fresh")
     assert cli.main([*arguments, "--arrays", "--fresh"]) == 0
     assert np.load(out_folder / "quads" / "quad_180.npy").shape[0] == 2

@@ -1,15 +1,18 @@
 """What ``gftorf export`` writes, read back by other libraries."""
 
+import cv2
 import numpy as np
 import pytest
 import torch
 import trimesh
-from export_run import FRAMES, exportable
+from export_run import FRAMES, HEIGHT, WIDTH, exportable
 
+from gftorf_warp.constants import FRAME_RATE_HZ
+from gftorf_warp.data.exr import read_exr
 from gftorf_warp.errors import UsageError
 from gftorf_warp.export.command import export
 from gftorf_warp.render.api import rasterize
-from gftorf_warp.scene.gaussians import GaussianField
+from gftorf_warp.scene.gaussians import GaussianField, constant_sh
 
 
 @pytest.fixture
@@ -175,3 +178,79 @@ def test_what_the_run_lacks_is_named(tmp_path):
     none.config["settings"]["method"] = "ctof"
     with pytest.raises(UsageError, match="no Gaussians"):
         export(none, tmp_path / "out")
+
+
+def test_distance_images_are_the_run_bit_by_bit(run, tmp_path):
+    """EXR and NPZ hold the array that ``render`` returns, and z by the cosine of each ray."""
+    exr, npz = export(run, tmp_path / "out", "exr,npz", every=4)
+    for k, n in enumerate((0, 4)):
+        time, camera = n / FRAME_RATE_HZ, run.camera.at(run.sequence().camera_from_world[n])
+        ours = next(iter(run.images([time], [camera], ("distance", "opacity", "colour"))))
+        channels = read_exr(exr / f"frame_{k:04d}.exr")
+        assert ours["distance"].max() > 1.0
+        assert channels["distance"].tobytes() == ours["distance"].tobytes()
+        np.testing.assert_array_equal(channels["G"], ours["colour"][1])
+        with np.load(npz / f"frame_{k:04d}.npz") as arrays:
+            assert arrays["distance"].tobytes() == ours["distance"].tobytes()
+            np.testing.assert_array_equal(arrays["opacity"], ours["opacity"])
+            assert arrays["time_s"] == time
+            assert arrays["raw_frame"] == n
+            np.testing.assert_array_equal(arrays["camera_from_world"], camera.camera_from_world)
+            np.testing.assert_array_equal(arrays["z_depth"], channels["Z"])
+            pixels = np.mgrid[0:HEIGHT, 0:WIDTH][::-1].reshape(2, -1) + 0.5
+            rays = np.linalg.solve(
+                arrays["intrinsics"], np.vstack([pixels, np.ones(pixels[0].shape)])
+            )
+        cosine = 1.0 / np.linalg.norm(rays, axis=0).reshape(HEIGHT, WIDTH)
+        np.testing.assert_allclose(channels["Z"], ours["distance"] * cosine, rtol=1e-6)
+
+
+def test_points_lie_where_the_run_sees_them(run, tmp_path):
+    """Projected by the camera of their time they are pixel centres at the distance; sRGB colour."""
+    (folder,) = export(run, tmp_path / "out", "points", every=3)
+    for k, n in enumerate((0, 3, 6)):
+        properties, header = read_ply(folder / f"frame_{k:04d}.ply")
+        camera = run.camera.at(run.sequence().camera_from_world[n])
+        rendering = run.render(n / FRAME_RATE_HZ, camera)
+        seen = rendering.opacity >= 0.5
+        assert 20 < seen.sum() == len(properties["x"])
+        assert f"comment raw_frame {n}" in header
+        points = columns(properties, "x", "y", "z")
+        pixels = camera.project(points) - 0.5
+        rows, across = seen.nonzero().T
+        torch.testing.assert_close(
+            pixels, torch.stack([across, rows], 1).float(), atol=1e-3, rtol=0
+        )
+        want = (rendering.distance / rendering.opacity)[seen]
+        apart = (points - torch.tensor(camera.centre).float()).norm(dim=1)
+        torch.testing.assert_close(apart, want, rtol=1e-5, atol=0.0)
+        green = rendering.colour[1][seen].clamp(0.0031308, 1.0)
+        shown = (255 * (1.055 * green ** (1 / 2.4) - 0.055)).round()
+        bright = rendering.colour[1][seen] > 0.01
+        found = torch.tensor(properties["green"].astype(np.float32))
+        assert (found - shown)[bright].abs().max() <= 1
+
+
+def test_points_have_the_reflectivity_of_what_they_lie_on(tmp_path):
+    """One opaque Gaussian that reflects equally everywhere: its number on every point."""
+    run = exportable(tmp_path, colour=False, count=1)
+    run.field.reflectivity_sh[:] = constant_sh(torch.tensor([0.7]))
+    run.field.opacity_logit[:] = 8.0
+    run.field.log_scale[:] = -0.7
+    (folder,) = export(run, tmp_path / "out", "points", times=[0.0])
+    properties, _ = read_ply(folder / "frame_0000.ply")
+    wanted = 0.7 * run.sensor.source_intensity / run.quad_scale
+    assert len(properties["x"]) > 30
+    # weights of light are T^2, those of opacity T
+    np.testing.assert_allclose(properties["reflectivity"], wanted, rtol=1e-3)
+
+
+def test_a_video_of_an_export(run, tmp_path):
+    """One picture per time, distance and colour side by side."""
+    (path,) = export(run, tmp_path / "out", "webm", every=2)
+    assert path == tmp_path / "out" / "video.webm"
+    reader, count = cv2.VideoCapture(str(path)), 0
+    while reader.grab():
+        count += 1
+    assert count == FRAMES // 2
+    assert reader.get(cv2.CAP_PROP_FRAME_WIDTH) > 2 * 320

@@ -52,7 +52,7 @@ def test_previews_of_all_times_share_a_scale(run, tmp_path):
     """The wall has one colour in every picture, and the picture is that of the values."""
     import cv2
 
-    out = render_to_folder(run, tmp_path / "out", what="distance")
+    out = render_to_folder(run, tmp_path / "out", what="distance", plain=True)
     scale = pictures.Scale(**json.loads((out / "renders.json").read_text())["preview"]["distance"])
     for n in range(FRAMES):
         rgb = cv2.imread(str(out / "distance" / f"{n:06d}.png"))[..., ::-1]
@@ -91,7 +91,7 @@ def test_chosen_times_and_things(run, tmp_path):
     sequence = replace(run.sequence(), camera_from_world=poses)
     run.sequence = lambda: sequence
     out = render_to_folder(
-        run, tmp_path / "out", what=["phasor", "phasor"], times=[3.4 / 120, 8 / 120]
+        run, tmp_path / "out", ["phasor", "phasor"], [3.4 / 120, 8 / 120], plain=True
     )
     assert {camera.camera_from_world[1, 3] for camera in run.cameras} == {3.0, 8.0}
     images = read_exr(out / "phasor" / "000001.exr")

@@ -62,8 +62,10 @@ def test_threads_write_what_one_call_after_the_other_does(analytic, tmp_path, mo
     assert seen == 2 * [(k + 1, FRAMES) for k in range(FRAMES)]
     scales, series = scales_and_series(analytic)
     (tmp_path / "plain" / "distance").mkdir(parents=True)
+    taken = [(k / 120, analytic.camera) for k in range(FRAMES)]
+    labels = views.labels_of(taken, analytic.sequence())
     for index, images in enumerate(series):
-        writers.write_images(tmp_path / "plain", scales, index, images)
+        writers.write_images(tmp_path / "plain", scales, index, images, labels)
     assert {name: found[1][name] for name in files_in(tmp_path / "plain")} == files_in(
         tmp_path / "plain"
     )

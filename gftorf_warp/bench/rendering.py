@@ -124,7 +124,7 @@ def _commanded(run: Run, out: Path, seconds: list[float], arrays: bool) -> dict[
         times.append((done, time.perf_counter()))
 
     begun = time.perf_counter()
-    views.render_to_folder(run, out, WHAT, seconds, arrays=arrays, progress=note)
+    views.render_to_folder(run, out, WHAT, seconds, arrays=arrays, plain=True, progress=note)
     spent = time.perf_counter() - begun
     (first, early), (last, late) = times[0], times[max(0, len(times) - 2)]
     going = (last - first) / (late - early) if last > first else None

@@ -13,6 +13,7 @@ import sys
 import threading
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -31,17 +32,23 @@ if hasattr(os, "register_at_fork"):  # a forked process must not inherit another
     _release = _PRINTING.release
     os.register_at_fork(before=_PRINTING.acquire, after_in_parent=_release, after_in_child=_release)
 
+Attribute = str | int | float
+NO_ATTRIBUTES: Mapping[str, Attribute] = MappingProxyType({})
 Channels = dict[str, np.ndarray]
 Parts = dict[str, Channels]
 
 
 def write_exr(
-    path: str | Path, channels: Mapping[str, np.ndarray], *, one_of: bool = False
+    path: str | Path,
+    channels: Mapping[str, np.ndarray],
+    *,
+    attributes: Mapping[str, Attribute] = NO_ATTRIBUTES,
+    one_of: bool = False,
 ) -> None:
     """Write images [H, W] of one size as float32 in an OpenEXR file of one part, atomically.
 
-    NaN is kept; viewers show the names R, G, B as colour. ``one_of``: whether it is a file inside
-    ``files.many_files``.
+    NaN is kept; viewers show the names R, G, B as colour. ``attributes`` go into the header, floats
+    as arrays of one float64. ``one_of``: whether it is a file inside ``files.many_files``.
 
     Raises:
         ValueError: If there are no channels, or their shapes differ or are not [H, W].
@@ -53,7 +60,12 @@ def write_exr(
         name: np.ascontiguousarray(image, dtype=np.float32) for name, image in channels.items()
     }
     _check_images([images])
-    header = {"compression": OpenEXR.NO_COMPRESSION, "type": OpenEXR.scanlineimage}
+    header: dict[str, Any] = {
+        "compression": OpenEXR.NO_COMPRESSION,
+        "type": OpenEXR.scanlineimage,
+    }
+    for name, value in attributes.items():  # a single float would lose half of its digits
+        header[name] = np.array([value]) if isinstance(value, float) else value
     with one_of_many(Path(path)) if one_of else atomic_path(path) as temporary:
         file = OpenEXR.File(header, dict(images))  # which changes the dictionary
         _write(temporary, file, [images], Path(path))

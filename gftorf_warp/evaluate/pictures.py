@@ -126,6 +126,25 @@ def webp(rgb: UInt8[np.ndarray, "H W 3"], quality: int = WEBP_LOSSLESS) -> bytes
     return data.tobytes()
 
 
+def animated(
+    pictures: list[UInt8[np.ndarray, "H W 3"]], period_s: float, kind: str, quality: int = 80
+) -> bytes:
+    """An endless animation, each picture for ``period_s`` [s].
+
+    ``kind`` is ``.webp``, with ``quality`` as in JPEG, or ``.gif``.
+    """
+    import cv2
+
+    animation = cv2.Animation()
+    animation.frames = [np.ascontiguousarray(picture[..., ::-1]) for picture in pictures]
+    animation.durations = [round(1000 * period_s)] * len(pictures)
+    options = [cv2.IMWRITE_WEBP_QUALITY, quality] if kind == ".webp" else []
+    ok, data = cv2.imencodeanimation(kind, animation, options)
+    if not ok:
+        raise ValueError(f"OpenCV could not encode {len(pictures)} pictures as an animated {kind}")
+    return np.asarray(data).tobytes()
+
+
 def data_uri(data: bytes, kind: str) -> str:
     """A data URI of a file, for example of kind ``image/webp``."""
     return f"data:{kind};base64,{base64.b64encode(data).decode('ascii')}"

@@ -11,7 +11,7 @@ import math
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from mmap import mmap
 from multiprocessing.connection import Connection, Pipe, wait
@@ -23,7 +23,7 @@ from jaxtyping import Float
 
 from ..errors import ResourceError
 from .pictures import Scale
-from .previews import Channels, write_images
+from .previews import Channels, Label, write_images
 
 MANY = 300  # fewest images for processes: each needs half a second of a CPU to start
 CPUS = 4  # up to these, threads write nearly as fast
@@ -51,7 +51,11 @@ def useful(total: int) -> int:
 
 @contextmanager
 def writing(
-    out: Path, scales: Mapping[str, Scale], count: int, done: Callable[[int], None]
+    out: Path,
+    scales: Mapping[str, Scale],
+    labels: Sequence[Label],
+    count: int,
+    done: Callable[[int], None],
 ) -> Iterator[Writing]:
     """Processes that write images; all are written at the end of the block, unless it raises.
 
@@ -61,7 +65,7 @@ def writing(
     Raises:
         UsageError, ResourceError: If a file cannot be written, or a process was stopped.
     """
-    processes = Writing(out, scales, done)
+    processes = Writing(out, scales, labels, done)
     try:
         processes.start(count)
         yield processes
@@ -73,9 +77,15 @@ def writing(
 class Writing:
     """Writing processes and the shared memory [M, B, C, H, W] of all messages."""
 
-    def __init__(self, out: Path, scales: Mapping[str, Scale], done: Callable[[int], None]):
+    def __init__(
+        self,
+        out: Path,
+        scales: Mapping[str, Scale],
+        labels: Sequence[Label],
+        done: Callable[[int], None],
+    ):
         """Create the shared memory, empty; no process is started."""
-        self._out, self._scales, self._done = out, scales, done
+        self._out, self._scales, self._labels, self._done = out, scales, labels, done
         self._file = os.memfd_create("gftorf-pictures")
         self._processes: dict[Connection, subprocess.Popen] = {}
         # number of images of each message in flight
@@ -141,7 +151,7 @@ class Writing:
         self._images = _mapped(self._file, shape)
         self._free = list(range(shape[0]))
         for connection in self._processes:
-            self._post(connection, (self._out, self._scales, names, shape))
+            self._post(connection, (self._out, self._scales, self._labels, names, shape))
 
     def _send(self) -> None:
         connection = min(self._busy, key=lambda one: len(self._busy[one]))
@@ -186,7 +196,7 @@ def work() -> None:
     """Main function of a process: writes and acknowledges messages until the connection closes."""
     connection, file = Connection(int(sys.argv[1])), int(sys.argv[2])
     with suppress(EOFError, BrokenPipeError, ConnectionResetError):
-        out, scales, names, shape = connection.recv()
+        out, scales, labels, names, shape = connection.recv()
         memory = _mapped(file, shape)
         while True:
             message, first, count = connection.recv()
@@ -199,7 +209,7 @@ def work() -> None:
                     for name, channels in names.items()
                 }
                 try:
-                    write_images(out, scales, first + k, images)
+                    write_images(out, scales, first + k, images, labels)
                 except Exception as error:
                     connection.send(error)
                     return

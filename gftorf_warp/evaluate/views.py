@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -22,8 +23,9 @@ from ..render.series import KEPT, View, on_host
 from ..scene.camera import Camera
 from ..scene.measured import frame_period
 from ..scene.sensor import Sensor
-from . import previews, renders, stored, writers
+from . import previews, renders, stored, video, writers
 from .metrics import DISTANCES, TEMPORAL, distance_from_quads, normalised
+from .pictures import Scale
 from .poses import middle
 from .poses import read as read_poses
 
@@ -196,9 +198,13 @@ def render_to_folder(
     poses: str | Path | None = None,
     fresh: bool = False,
     arrays: bool = False,
+    plain: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> Path:
     """Render a run at some times: ``OUT/<what>/<index>.exr`` (float32) and a preview ``.png``.
+
+    Headers of EXR files state time, units and camera, see previews.py; previews have a title, a
+    colour bar and at least 640 columns.
 
     ``OUT/renders.json`` lists the times [s], the channels with their units, the scale of the
     previews, and poses if any were given; otherwise the pose is that of the raw frame nearest to
@@ -215,6 +221,7 @@ def render_to_folder(
             of the sequence. Image k is rendered from pose k at time k; the shorter list repeats.
         fresh: Whether to move other content of ``out`` to ``out/old-<k>``.
         arrays: Whether to write arrays instead of pictures; many times as fast.
+        plain: Whether previews are the images alone, a pixel for each.
         progress: Called with (times done, times in all).
 
     Raises:
@@ -227,11 +234,9 @@ def render_to_folder(
     sequence = run.sequence()
     seconds, cameras = views_to_take(run, sequence, times, poses)
 
-    needed = {image for name in names for image in renders.NEEDS[name]}
-    render = run.renderer(needed)
+    render = renderer_of(run, names)
     taken = list(zip(seconds, cameras, strict=True))
-    few = [taken[i] for i in sorted({0, len(taken) // 2, len(taken) - 1})]
-    samples = list(series_of(render, few, run.sensor, names, kept=len(few)))
+    samples = samples_of(render, taken, run.sensor, names)
     out, channels = Path(out), {name: list(samples[0][name]) for name in names}
     reached = run.config.get("images_optimised")
     listed: dict[str, Any] = {"run": str(run.path), "images_optimised": reached}
@@ -243,8 +248,7 @@ def render_to_folder(
     if arrays:
         listed["arrays"] = True
     else:
-        of_kind = {name: [sample[name] for sample in samples] for name in names}
-        scales = {name: previews.preview_scale(name, of_kind[name]) for name in names}
+        scales = scales_of(samples)
         listed["preview"] = {name: asdict(scale) for name, scale in scales.items()}
     renders.prepare_folder(out, listed, fresh=fresh)
     for name in names:
@@ -255,8 +259,84 @@ def render_to_folder(
         stored.store_all(out, channels, series, shape, progress)
     else:
         series = series_of(render, taken, run.sensor, names)
-        writers.write_all(out, scales, series, len(seconds), progress)
+        labels = labels_of(taken, sequence, plain=plain)
+        writers.write_all(out, scales, series, len(seconds), progress, labels)
     return out
+
+
+def render_to_video(
+    run: Run,
+    path: str | Path,
+    what: str | Iterable[str] = ("distance",),
+    times: Iterable[float] | None = None,
+    *,
+    poses: str | Path | None = None,
+    rate_hz: float | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Path:
+    """Render a run as a video of pictures with titles and colour bars, several kinds in a row.
+
+    Args:
+        run: A finished reconstruction.
+        path: A file that ends in .webm, .mp4, .gif or .webp, replaced if it exists.
+        what: As in :func:`render_to_folder`, as are ``times``, ``poses`` and what is raised.
+        times: One picture each, however far apart they are.
+        poses: Where from.
+        rate_hz: Pictures per second; None: see ``video.rate_of``.
+        progress: Called with (times done, times in all).
+    """
+    path, names = video.checked(path), renders.checked(what)
+    sequence = run.sequence()
+    taken = list(zip(*views_to_take(run, sequence, times, poses), strict=True))
+    render = renderer_of(run, names)
+    scales = scales_of(samples_of(render, taken, run.sensor, names))
+    series = series_of(render, taken, run.sensor, names)
+    pairs = zip(series, labels_of(taken, sequence), strict=True)
+    pictures = (previews.picture(images, scales, label.title or "") for images, label in pairs)
+    video.write_video(path, pictures, len(taken), rate_hz=rate_hz, progress=progress)
+    return path
+
+
+def renderer_of(run: Run, names: Iterable[str]) -> Callable[[float, Camera], Rendering]:
+    """A renderer of what the named kinds of images need."""
+    return run.renderer({image for name in names for image in renders.NEEDS[name]})
+
+
+def samples_of(
+    render: Callable[[float, Camera], Rendering],
+    taken: list[View],
+    sensor: Sensor,
+    names: Iterable[str],
+) -> list[Mapping[str, previews.Channels]]:
+    """The first, the middle and the last of some views."""
+    few = [taken[i] for i in sorted({0, len(taken) // 2, len(taken) - 1})]
+    return list(series_of(render, few, sensor, names, kept=len(few)))
+
+
+def scales_of(samples: list[Mapping[str, previews.Channels]]) -> dict[str, Scale]:
+    """The scale of all pictures of each kind."""
+    return {
+        name: previews.preview_scale(name, [sample[name] for sample in samples])
+        for name in samples[0]
+    }
+
+
+def labels_of(
+    taken: Iterable[View], sequence: Sequence, *, plain: bool = False
+) -> list[previews.Label]:
+    """What is written beside the pixels of each image: attributes, and titles unless ``plain``."""
+    instants, first = np.unique(sequence.times, return_index=True)
+    frame_at = dict(zip(instants.tolist(), first.tolist(), strict=True))
+    labels = []
+    for time, camera in taken:
+        frame = frame_at.get(time)
+        stated = asdict(camera) | {"camera_from_world": camera.camera_from_world.tolist()}
+        known: dict[str, Any] = {"time_s": time, "camera": json.dumps(stated)}
+        title = f"t = {time:.4f} s"
+        if frame is not None:
+            known, title = known | {"raw_frame": frame}, f"{title}, raw frame {frame}"
+        labels.append(previews.Label(known, None if plain else title))
+    return labels
 
 
 def series_of(

@@ -7,7 +7,7 @@ OpenEXR.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
@@ -15,7 +15,7 @@ from pathlib import Path
 from ..data.files import many_files
 from . import processes
 from .pictures import Scale
-from .previews import Channels, write_images
+from .previews import Channels, Label, write_images
 
 THREADS = 4  # more would wait for the GIL
 QUEUED = 2  # waiting images per thread, at most, which bounds memory
@@ -27,6 +27,7 @@ def write_all(
     series: Iterable[Mapping[str, Channels]],
     total: int,
     progress: Callable[[int, int], None] | None = None,
+    labels: Sequence[Label] = (),
 ) -> None:
     """Write a series of images as files numbered from 0.
 
@@ -38,6 +39,7 @@ def write_all(
         series: Images in order.
         total: Their number.
         progress: Called with (images written, images in all), counting up.
+        labels: What is beside the pixels of each image; empty: nothing.
 
     Raises:
         UsageError, ResourceError: If a file cannot be written.
@@ -56,17 +58,18 @@ def write_all(
         for name in scales:
             stack.enter_context(many_files(out / name))
         if count:
-            others = stack.enter_context(processes.writing(out, scales, count, done))
+            others = stack.enter_context(processes.writing(out, scales, labels, count, done))
             for index, images in enumerate(series):
                 others.write(index, images)
         else:
-            _write_by_threads(out, scales, series, done)
+            _write_by_threads(out, scales, series, labels, done)
 
 
 def _write_by_threads(
     out: Path,
     scales: Mapping[str, Scale],
     series: Iterable[Mapping[str, Channels]],
+    labels: Sequence[Label],
     done: Callable[[int], None],
 ) -> None:
     waiting: deque[Future] = deque()
@@ -80,7 +83,7 @@ def _write_by_threads(
         threads = ThreadPoolExecutor(THREADS, thread_name_prefix="gftorf-files")
         stack.callback(threads.shutdown, wait=True, cancel_futures=True)
         for index, images in enumerate(series):
-            waiting.append(threads.submit(write_images, out, scales, index, images))
+            waiting.append(threads.submit(write_images, out, scales, index, images, labels))
             del images  # so that its memory is reused
             collect(QUEUED * THREADS)
         collect(0)

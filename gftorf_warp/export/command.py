@@ -11,7 +11,7 @@ from ..data.files import as_errors, atomic_folder
 from ..errors import UsageError
 from ..recon.folder import set_aside
 from ..recon.run import Run
-from . import splats
+from . import film, images, points, splats
 from .moments import Moments, Progress
 
 COLOURS = ("colour", "reflectivity")
@@ -30,6 +30,10 @@ class Format(NamedTuple):
 
 FORMATS = {
     "ply": Format("ply", splats.write, coloured=True),
+    "points": Format("points", points.write, coloured=True),
+    "exr": Format("exr", images.write_exrs),
+    "npz": Format("npz", images.write_npzs),
+    **{kind: Format(f"video.{kind}", film.write) for kind in ("webm", "mp4", "gif", "webp")},
 }
 
 
