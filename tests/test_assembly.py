@@ -105,6 +105,25 @@ def test_an_assembly_reaches_as_far_as_its_parts_and_is_as_near():
     )
 
 
+@pytest.mark.parametrize("shape", [Plane(size=(6.0, 1.0)), Box(size=(6.0, 1.0, 0.02))])
+def test_a_wide_plate_near_the_camera_is_covered(shape):
+    """Its bounding sphere holds the camera, the plate does not."""
+    times = np.array([0.0, 0.1])
+    body = Body(shape=shape, texture=GREY, path=Line(position=(0, 0, 2.9), velocity=(0, 0, -0.5)))
+    near = clearance(body, np.zeros(3), times)
+    np.testing.assert_allclose(near, [2.9, 2.85], atol=0.011)
+    field = cover_moving(body, CAMERA, times).facing(np.zeros(3), 0.0)
+    opacity = rasterize(field, CAMERA, Sensor()).opacity
+    assert opacity[20:28, 8:56].min() > 0.98
+
+
+def test_the_clearance_in_a_room_is_that_of_its_walls():
+    """A camera may stand in a room that moves, and not in its wall."""
+    room = Box(size=(4.0, 2.0, 6.0), inside=True)
+    points = np.array([[0.0, 0.0, 0.0], [1.5, 0.0, 0.0], [2.5, 0.0, 0.0]])
+    np.testing.assert_allclose(room.clearance(points), [1.0, 0.5, -0.5])
+
+
 def test_a_cover_of_an_assembly_is_as_large_as_it_is():
     """Opacity sums up to the area of a table but for its outline, and is 1 inside it."""
     top, leg = Box(size=(0.9, 0.1, 0.5)), Box(size=(0.15, 0.6, 0.15))

@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from .meshes import Mesh
 from .paths import Vector
-from .world import Box, Grid, Shape, rays_to_ball
+from .world import Grid, Shape, rays_to_ball
 
 # numbers that the faces of one part may use; a box has 6, a mesh as many as triangles
 FACES = 1 << 32
@@ -116,16 +116,8 @@ class Assembly(Shape):
         return max(float(np.linalg.norm(part.position)) + part.shape.reach for part in self.parts)
 
     def clearance(self, point: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P"]:
-        """Lower bound of the distance to points [m]: exact for boxes, of bounding spheres else."""
-        least = np.full(len(point), np.inf)
-        for part in self.parts:
-            local = point - part.position
-            if isinstance(part.shape, Box):
-                outside = np.maximum(np.abs(local) - np.asarray(part.shape.size) / 2, 0.0)
-                least = np.minimum(least, np.linalg.norm(outside, axis=1))
-            else:
-                least = np.minimum(least, np.linalg.norm(local, axis=1) - part.shape.reach)
-        return least
+        """The least of its parts."""
+        return np.min([part.shape.clearance(point - part.position) for part in self.parts], axis=0)
 
 
 def has_mesh(shape: Shape) -> bool:

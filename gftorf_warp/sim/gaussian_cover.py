@@ -199,7 +199,11 @@ def cover_moving(
 
     ``centres`` [m] are positions of the camera at those times; None: that of ``camera``.
     """
-    distances = clearance(body, camera.centre if centres is None else centres, times)
+    local = _in_its_axes(body, camera.centre if centres is None else centres, times)
+    distances = body.shape.clearance(local)
+    outside = np.linalg.norm(local, axis=1) - body.shape.reach
+    if outside.min() > 0 and not isinstance(body.shape, Assembly):
+        distances = outside  # from the bounding sphere: a grid that is finer than it has to be
     nearest, typical = distances.min(), distances.mean() + body.shape.reach
     if nearest <= 0:
         found = f"clearance {nearest:.3f} m must be above 0"
@@ -228,16 +232,18 @@ def cover_moving(
 def clearance(
     body: Body, camera: Float[np.ndarray, "*frames 3"], times: Float[np.ndarray, "F"]
 ) -> Float[np.ndarray, "F"]:
-    """Distance [m] of a camera from the bounding sphere of a body at ``times`` [s].
-
-    ``camera`` is its position [m], or one for each of the times. Assemblies are bounded part by
-    part: doors are tall.
+    """Lower bound of the distance [m] of a camera from a body at ``times`` [s], see
+    :meth:`Shape.clearance`; ``camera`` is its position [m], or one for each of the times.
     """
+    return body.shape.clearance(_in_its_axes(body, camera, times))
+
+
+def _in_its_axes(
+    body: Body, camera: Float[np.ndarray, "*frames 3"], times: Float[np.ndarray, "F"]
+) -> Float[np.ndarray, "F 3"]:
+    """Positions of a camera in the axes of a body at ``times`` [s]."""
     poses = np.array([body.path.world_from_body(float(t)) for t in times])
-    if isinstance(body.shape, Assembly):
-        local = np.einsum("fji,fj->fi", poses[:, :3, :3], camera - poses[:, :3, 3])
-        return body.shape.clearance(local)
-    return np.linalg.norm(poses[:, :3, 3] - camera, axis=1) - body.shape.reach
+    return np.einsum("fji,fj->fi", poses[:, :3, :3], camera - poses[:, :3, 3])
 
 
 def _frame(across: np.ndarray, normal: np.ndarray) -> Float[np.ndarray, "N 3 3"]:

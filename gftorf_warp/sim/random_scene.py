@@ -191,9 +191,7 @@ def _point_in_view(
 
 
 def _distance(body: Body, times: Float[np.ndarray, "F"]) -> float:
-    """Least distance of a body from the camera [m], exact for boxes and balls."""
-    if isinstance(body.shape, Box):  # clearance() bounds it by a sphere: poles are tall
-        body = replace(body, shape=Assembly(parts=(Part(shape=body.shape),)))
+    """Least distance of a body from the camera [m]."""
     return float(clearance(body, np.zeros(3), times).min())
 
 

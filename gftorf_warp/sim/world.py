@@ -68,6 +68,13 @@ class Shape(abc.ABC):
     def reach(self) -> float:
         """Largest distance of the surface from the origin of its axes [m]."""
 
+    def clearance(self, point: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P"]:
+        """Lower bound of the distance to points in its own axes [m]; 0 or less inside of it.
+
+        That of the bounding sphere, unless a shape knows better.
+        """
+        return np.linalg.norm(point, axis=1) - self.reach
+
 
 @dataclass(frozen=True, kw_only=True)
 class Box(Shape):
@@ -134,6 +141,13 @@ class Box(Shape):
         """Half the diagonal [m]."""
         return float(np.linalg.norm(self.size)) / 2
 
+    def clearance(self, point):
+        """The distance; of a room, from the nearest wall to points inside."""
+        beyond = np.abs(point) - np.asarray(self.size) / 2
+        if self.inside:
+            return -beyond.max(axis=1)
+        return np.linalg.norm(np.maximum(beyond, 0.0), axis=1)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Plane(Shape):
@@ -170,6 +184,11 @@ class Plane(Shape):
     def reach(self) -> float:
         """Half the diagonal [m]."""
         return float(np.linalg.norm(self.size)) / 2
+
+    def clearance(self, point):
+        """The distance."""
+        half = np.array([*self.size, 0.0]) / 2
+        return np.linalg.norm(np.maximum(np.abs(point) - half, 0.0), axis=1)
 
 
 @dataclass(frozen=True, kw_only=True)
