@@ -21,7 +21,7 @@ def caveats(config: Mapping[str, Any], sequence: Sequence, truth: Truth | None) 
         sequence: What the run was made from.
         truth: What it is scored against; None: unknown.
     """
-    found = [_damaged(config), _beyond_range(sequence, truth)]
+    found = [_damaged(config), _edited(config), _beyond_range(sequence, truth)]
     texts = [text for text in found if text]
     for text in texts:
         LOG.warning("%s", text)
@@ -35,6 +35,12 @@ def _damaged(config: Mapping[str, Any]) -> str:
         return ""
     state = f"image {config['images_optimised']} of {config['images']}"
     return f"Damaged: {', '.join(damaged)}. This is the state of the checkpoint before, {state}."
+
+
+def _edited(config: Mapping[str, Any]) -> str:
+    """About a run that no command makes again."""
+    source = config.get("edited_from")
+    return f"Its Gaussians were edited after the reconstruction in {source}." if source else ""
 
 
 def _beyond_range(sequence: Sequence, truth: Truth | None) -> str:

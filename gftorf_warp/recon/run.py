@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..constants import CANONICAL_SHIFTS
@@ -33,7 +33,7 @@ from ..scene.distortion import Distortion as Lens
 from ..scene.gaussians import GaussianField
 from ..scene.motion import Motion, Still
 from ..scene.sensor import Sensor
-from . import checkpoint, closed_form, source
+from . import checkpoint, closed_form, edits, source
 from .fallback import Fallback
 from .folder import read_config
 from .residuals import Residuals, residuals
@@ -70,7 +70,8 @@ class Run:
         ``temporal`` and ``flow2d`` needs no checkpoint.
 
         Raises:
-            InputError: If the folder is no run, or holds no checkpoint that can be read.
+            InputError: If the folder is no run, or holds no checkpoint that can be read and whose
+            Gaussians and motion are finite.
         """
         path = Path(path)
         config = read_config(path)
@@ -90,6 +91,7 @@ class Run:
                 fix="run `gftorf reconstruct` with this --out first",
             )
         gaussians, motion, binding = field_and_motion(stored, device)
+        edits.check_finite(path, gaussians, motion)
         reached = {"images_optimised": stored["images"], "seconds_reconstruct": stored["seconds"]}
         damaged = [newer.name for newer in checkpoint.after(path, stored["images"])]
         if damaged:
@@ -104,6 +106,34 @@ class Run:
             motion=motion,
             binding=binding,
         )
+
+    def edited(self, field: GaussianField, rows: Int[Tensor, "N"] | None = None) -> Run:
+        """This run with other Gaussians under its motion, for example a selection of its own.
+
+        Args:
+            field: In the units of the optimisation, with the tensors of ``self.field``.
+            rows: Which of this run's Gaussians each of them moves like; None: as many, in order.
+
+        Raises:
+            ValueError: If the field or ``rows`` does not fit, or something is not finite.
+        """
+        binding = edits.binding_of(field, rows, self.field, self.motion, self.binding)
+        return replace(self, field=field, binding=binding)
+
+    def save(self, out: str | Path) -> Run:
+        """Store this run, edited or not, in a new or empty folder, and open it there.
+
+        Its config.json names the folder it is from. `gftorf reconstruct` goes on with it if it is
+        asked for more images; the moments of Adam begin at zero.
+
+        Raises:
+            InputError: If the folder of the run has no checkpoint any more.
+            UsageError: If ``out`` is not empty or cannot be written.
+            ResourceError: If the disk is full.
+        """
+        out = Path(out)
+        edits.save(self.path, out, self.config, self.field, self.motion, self.binding)
+        return Run.open(out, self.field.device)
 
     @property
     def gaussians(self) -> int:
