@@ -88,7 +88,7 @@ def times_of(
         rate = settings["time.cycle_rate_hz"]
         starts = np.arange(-(-frames // cycle)) / rate
         source = f"{rate:g} cycles per second"
-        return _with_slots(settings, notes, starts, frames, cycle, source)
+        return with_slots(settings, notes, starts, frames, cycle, source)
     rate = settings["time.rate_hz"]
     notes.understood.append(f"times: {rate:g} raw frames per second, evenly (time.rate_hz)")
     return np.arange(frames) / rate
@@ -128,12 +128,12 @@ def _of_file(
     if len(stored) < frames:
         settings.require("time.slot_period_s")
         source = f"times of cycles in {path.name} in {unit}"
-        return _with_slots(settings, notes, stored, frames, cycle, source)
+        return with_slots(settings, notes, stored, frames, cycle, source)
     notes.understood.append(f"times: of every raw frame in {path.name} in {unit}, from the first")
     return stored
 
 
-def _with_slots(
+def with_slots(
     settings: Settings,
     notes: Notes,
     starts: Float[np.ndarray, "C"],
