@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from . import kinect2, mlx7502x, sequence_folders, voxel
+from . import kinect2, mlx7502x, oak, sequence_folders, voxel
 from .imported import Imported
 from .keys import Key, Settings
 
@@ -52,6 +52,12 @@ KINDS = {
             about="buffers of a Melexis MLX75026 or MLX75027, dumped by V4L2",
             read=mlx7502x.read,
             keys=mlx7502x.KEYS,
+        ),
+        Kind(
+            name="oak",
+            about="raw frames of a Luxonis OAK with a ToF sensor",
+            read=oak.read,
+            keys=oak.KEYS,
         ),
         Kind(
             name="voxel",

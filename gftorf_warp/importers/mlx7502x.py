@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Int16, UInt8
+from jaxtyping import Float, Int16
 
 from ..data.folder import empty_quads
 from ..errors import InputError
@@ -18,11 +18,10 @@ from . import camera_keys, sensor_keys, timing
 from .at_rest import at_rest
 from .imported import Imported, Notes
 from .keys import Key, Settings
-from .raw_files import files_of, raw_bytes, size_of
+from .pixel_formats import CODES, FORMATS, twelve_bits
+from .raw_files import buffers_of, files_of, raw_bytes
 
-FORMATS = {"Y12": 16, "Y12P": 12, "Y16": 16}  # bits of a stored pixel
 MODES = {"A-B": 0.0, "A": 0.0, "B": 180.0, "A&B": 0.0}  # [deg] added to the shift of the quad
-CODES = 1 << 12
 SHIFTS_DEG = replace(
     sensor_keys.SHIFTS_DEG,
     about="PHASE_SEQ: phase shift of each buffer of a cycle [deg], with a sign that makes the "
@@ -116,33 +115,6 @@ def read(source: Path, settings: Settings) -> Imported:
     )
 
 
-def twelve_bits(stored: UInt8[np.ndarray, "H n"], form: str) -> Int16[np.ndarray, "H W"]:
-    """Codes 0 .. 4095 of rows of bytes in a format of V4L2.
-
-    Y12P: two pixels are three bytes, the upper eight bits of each and then the lower four of both,
-    those of the second one above. Y12 may have its sign repeated in the four bits above.
-
-    Raises:
-        ValueError: If there are other bits where there should be none.
-    """
-    if form == "Y12P":
-        first, second, low = (stored[:, n::3].astype(np.int16) for n in range(3))
-        codes = np.stack([first << 4 | low & 15, second << 4 | low >> 4], axis=2)
-        return codes.reshape(len(stored), -1)
-    words = stored.view("<u2")
-    if form == "Y16":
-        unused, codes = words & 15, words >> 4
-    else:
-        sign = np.where(words & 0x800, 15, 0)
-        unused, codes = words >> 12, words & 0xFFF
-        unused = np.where(unused == sign, 0, unused)
-    if unused.any():
-        raise ValueError(
-            f"bits that {form} leaves at 0 are set in {int((unused > 0).sum())} pixels"
-        )
-    return codes.astype(np.int16)
-
-
 def _quads(source: Path, settings: Settings, notes: Notes) -> Float[np.ndarray, "F H W"]:
     """Values of all buffers."""
     (width, height), form = settings["raw.size"], settings["raw.format"]
@@ -158,29 +130,23 @@ def _quads(source: Path, settings: Settings, notes: Notes) -> Float[np.ndarray, 
         why = f"expected at least {used} bytes in a row and {line * height} in a buffer, found "
         why += f"{line} and {step}"
         raise settings.wrong("raw.bytesperline", why, "give what VIDIOC_G_FMT returns")
-    files = files_of(source)
-    for path in files:
-        size = size_of(path)
-        if size == 0 or size % step:
-            why = f"expected buffers of {step} bytes ({stored}x{height} pixels of {form}), found "
-            why += f"{size} bytes{_other_format(size, stored * height)}"
-            raise InputError("not whole buffers", where=path, why=why, fix="correct the keys")
-    counts = [size_of(path) // step for path in files]
-    quads = empty_quads(source, sum(counts), {"H": height, "W": width})
-    ends, n = 0, 0
-    for path, count in zip(files, counts, strict=True):
-        for k in range(count):
-            rows = raw_bytes(path, k * step, line * height).reshape(height, line)[:, :used]
-            try:
-                codes = twelve_bits(np.ascontiguousarray(rows), form)
-            except ValueError as error:
-                fix = "give another raw.format, raw.size or raw.bytesperline"
-                what = "not this pixel format"
-                raise InputError(what, where=path, why=f"buffer {k}: {error}", fix=fix) from error
-            quads[n], full = _value(codes, mode, settings["raw.both"])
-            ends += full
-            n += 1
-    notes.understood.append(f"buffers: {n} in {len(files)} files, {width}x{height}, {form}")
+    what = f"{stored}x{height} pixels of {form}"
+    buffers = buffers_of(
+        files_of(source), step, what, lambda size: _other_format(size, stored * height)
+    )
+    quads = empty_quads(source, len(buffers), {"H": height, "W": width})
+    ends = 0
+    for n, (path, first) in enumerate(buffers):
+        rows = raw_bytes(path, first, line * height).reshape(height, line)[:, :used]
+        try:
+            codes = twelve_bits(np.ascontiguousarray(rows), form)
+        except ValueError as error:
+            fix = "give another raw.format, raw.size or raw.bytesperline"
+            what = "not this pixel format"
+            raise InputError(what, where=path, why=f"buffer {n}: {error}", fix=fix) from error
+        quads[n], full = _value(codes, mode, settings["raw.both"])
+        ends += full
+    notes.understood.append(f"buffers: {len(buffers)}, {width}x{height}, {form}")
     if ends:
         notes.uncertain.append(f"{ends} codes are at an end of their range: saturated, and kept")
     return quads

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -48,6 +49,30 @@ def size_of(path: Path) -> int:
         why = f"expected a file, found {found}"
         raise InputError("no such file", where=path, why=why, fix="check the path")
     return path.stat().st_size
+
+
+def buffers_of(
+    files: list[Path], step: int, what: str, hint: Callable[[int], str] = lambda _: ""
+) -> list[tuple[Path, int]]:
+    """File and first byte of each buffer of ``step`` bytes in files that have nothing else.
+
+    Args:
+        files: The files, in order.
+        step: Bytes of a buffer.
+        what: What a buffer is, for the error.
+        hint: From the size of a file that does not fit, a text that explains it.
+
+    Raises:
+        InputError: If a file is empty or has a part of a buffer.
+    """
+    found = []
+    for path in files:
+        size = size_of(path)
+        if size == 0 or size % step:
+            why = f"expected buffers of {step} bytes ({what}), found {size} bytes{hint(size)}"
+            raise InputError("not whole buffers", where=path, why=why, fix="correct the keys")
+        found += [(path, first) for first in range(0, size, step)]
+    return found
 
 
 def raw_bytes(path: Path, first: int = 0, count: int | None = None) -> UInt8[np.ndarray, "n"]:
