@@ -106,10 +106,10 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path):
     (tmp_path / "bytes").write_bytes(b"\xff\xfe\x00")
     (tmp_path / "large").write_bytes(b"#" * (1 << 21))
     for name, word in (
-        ("none", "No such"),
-        (".", "directory"),
-        ("bytes", "no TOML"),
-        ("large", "too large"),
+        ("none", "found none"),
+        (".", "a folder"),
+        ("bytes", "expected text"),
+        ("large", "at most"),
     ):
         with pytest.raises(InputError, match=word):
             load(tmp_path / name, KEYS)
@@ -204,7 +204,7 @@ def test_the_list_and_the_templates(tmp_path, capsys):
     [
         ("import", 2, "KIND and SRC and --out SEQ missing"),
         ("import ftorf", 2, "SRC"),
-        ("import xyz {here} --out {out}", 2, "there are ftorf"),
+        ("import xyz {here} --out {out}", 2, "there are arrays, ftorf"),
         ("import ftofr {here} --out {out}", 2, "did you mean ftorf"),
         ("import ftorf {here}/none --out {out}", 3, "no such source"),
         ("import ftorf {here}/torf --out {out}", 3, "gftorf import torf"),

@@ -81,7 +81,7 @@ def test_small_numbers_of_a_large_class_in_either_byte_order(order):
         saved({"K": np.array([[1j]])}),
         saved({"K": "text"}),
         saved({"K": np.zeros((0, 3))}),
-        saved({"K": np.zeros((2, 2, 2))}),
+        saved({"K": np.zeros((2,) * 6)}),
         saved({"K": {"a": 1.0}}),
         saved({"K": np.eye(3)})[:-8],
         saved({"K": np.eye(3)}, do_compression=True)[:-8],
@@ -104,3 +104,16 @@ def test_a_compressed_bomb_is_not_unpacked():
     assert len(data) < UNPACKED_MAX
     with pytest.raises(ValueError, match="unpack"):
         read_matrix(data, "K")
+
+
+def test_arrays_of_more_axes_and_the_only_variable():
+    """Recordings have three to five axes; without a name there must be one variable."""
+    array = np.arange(24, dtype=np.int16).reshape(2, 3, 4)
+    for compressed in (False, True):
+        data = saved({"quads": array}, do_compression=compressed)
+        np.testing.assert_array_equal(read_matrix(data, None), array)
+    with pytest.raises(ValueError, match="one variable"):
+        read_matrix(saved({"K": 1.0, "L": 2.0}), None)
+    data = saved({"K": np.zeros((200, 200))}, do_compression=True)
+    with pytest.raises(ValueError, match="unpack"):
+        read_matrix(data, None, unpacked_max=1000)

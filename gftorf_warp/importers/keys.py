@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import difflib
 import math
+import textwrap
 import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -15,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError, UsageError
+from .untrusted import read_text
 
 CONFIG = "--config"
 BYTES_MAX = 1 << 20  # a table of keys has a few hundred; poses and times have files of their own
@@ -40,8 +42,8 @@ class Key:
     unless: tuple[str, ...] = ()
     """Keys that replace a needed one."""
     shape: tuple[int | None, ...] = ()
-    """Lengths of nested lists, None is any above 0; of ``(None,)`` a single value may be written
-    without brackets. Lists become tuples."""
+    """Lengths of nested lists, None is any, and 0 only if the default is empty; of ``(None,)`` a
+    single value may be written without brackets. Lists become tuples."""
     choices: tuple[Any, ...] = ()
     """Allowed values; empty: any."""
     least: float | None = None
@@ -153,7 +155,8 @@ def template(title: str, keys: Iterable[Key]) -> str:
             lines += ["", f"[{head}]"]
             table = head
         allowed = f"; {', '.join(map(str, key.choices))}" if key.choices else ""
-        lines.append(f"# {'needed: ' if key.needed else ''}{key.about}{allowed}{_instead(key)}")
+        text = f"{'needed: ' if key.needed else ''}{key.about}{allowed}{_instead(key)}"
+        lines += textwrap.wrap(text, 98, initial_indent="# ", subsequent_indent="#   ")
         value = key.example if key.default is None else key.default
         lines.append(f"{'# ' if key.default is None else ''}{name} = {_toml(value)}")
     return "\n".join(lines) + "\n"
@@ -174,13 +177,7 @@ def _toml(value: Any) -> str:
 
 def _parsed(path: Path) -> dict[str, Any]:
     try:
-        if path.is_file() and path.stat().st_size > BYTES_MAX:
-            why = f"expected at most {BYTES_MAX} bytes, found {path.stat().st_size}"
-            raise InputError("file too large", where=path, why=why, fix="name the TOML file")
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        why = error.strerror or str(error)
-        raise InputError("cannot be read", where=path, why=why, fix="correct the path") from error
+        return tomllib.loads(read_text(path, BYTES_MAX))
     except (ValueError, RecursionError) as error:
         why, fix = str(error)[:200], "correct that line"
         raise InputError("no TOML file", where=path, why=why, fix=fix) from error
@@ -232,7 +229,8 @@ def _value(path: Path, key: Key, value: Any) -> Any:
 def _shaped(key: Key, value: Any, shape: tuple[int | None, ...], leaves: list[Any]) -> Any:
     """The value with lists as tuples; None if it is of another shape or kind."""
     if shape:
-        if not isinstance(value, list) or len(value) != (shape[0] or max(1, len(value))):
+        least = 0 if key.default == () else 1
+        if not isinstance(value, list) or len(value) != (shape[0] or max(least, len(value))):
             return None
         items = tuple(_shaped(key, item, shape[1:], leaves) for item in value)
         return None if None in items else items

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from . import kinect2, mlx7502x, oak, sequence_folders, voxel
+from . import arrays, kinect2, mlx7502x, oak, sequence_folders, voxel
 from .imported import Imported
 from .keys import Key, Settings
 
@@ -29,6 +29,13 @@ class Kind:
 KINDS = {
     kind.name: kind
     for kind in (
+        Kind(
+            name="arrays",
+            about="raw quads of any camera as arrays or pictures: NPY, NPZ, HDF5, MAT, PNG, TIFF, "
+            "EXR, raw binary",
+            read=arrays.read,
+            keys=arrays.KEYS,
+        ),
         Kind(
             name="ftorf",
             about="an F-ToeRF folder of raw quads, with its truth",

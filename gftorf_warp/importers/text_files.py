@@ -7,35 +7,9 @@ import re
 from collections.abc import Sequence as Items
 from pathlib import Path
 
-from ..errors import InputError
+from .untrusted import read_text, unreadable
 
-BYTES_MAX = 1 << 28  # 256 MB: a million lines of a pose
 SEPARATORS = re.compile(r"[,;\s]+")
-
-
-def read_text(path: Path, bytes_max: int = BYTES_MAX) -> str:
-    """The text of a file, of UTF-8 or plain ASCII.
-
-    Raises:
-        InputError: If it cannot be read, is no text, or is too large.
-    """
-    try:
-        if not path.is_file():  # opening a pipe would block
-            found = "a folder" if path.is_dir() else "nothing that can be read"
-            raise unreadable(path, f"expected a text file, found {found}")
-        if path.stat().st_size > bytes_max:
-            found = f"{path.stat().st_size}"
-            raise unreadable(path, f"expected at most {bytes_max} bytes, found {found}")
-        return path.read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise unreadable(path, error.strerror or str(error)) from error
-    except UnicodeDecodeError as error:
-        raise unreadable(path, f"expected text, found {error}") from error
-
-
-def unreadable(path: Path, why: str) -> InputError:
-    """The error for a file that is not what its name says."""
-    return InputError("cannot be read", where=path, why=why, fix="export the file again")
 
 
 def read_rows(path: Path) -> list[tuple[int, list[str]]]:
