@@ -13,6 +13,7 @@ from ..data.arrays import SIDE_MAX
 from ..errors import InputError
 from .imported import Notes
 from .keys import Key, Settings
+from .raw_files import natural
 from .stacks import BY_AXES, SUFFIXES, Stack, needed_keys, open_stack
 
 SPARSE = 10  # raw frames per file: with more missing, the numbers count something else
@@ -62,12 +63,6 @@ def patterns_of(source: Path, settings: Settings) -> list[list[Path]]:
         found = [_images(source)]
     settings.require(*dict.fromkeys(name for files in found for name in needed_keys(files[0])))
     return found
-
-
-def natural(path: Path) -> tuple:
-    """A key that sorts names as people count: 2 before 10."""
-    parts = re.split(r"(\d+)", str(path))
-    return tuple((int(part), "") if part.isdecimal() else (0, part) for part in parts)
 
 
 def read_images(
@@ -127,10 +122,14 @@ def frame_numbers(files: list[Path], settings: Settings, notes: Notes) -> list[i
     return [number - numbers[0] for number in numbers]
 
 
+def _natural(path: Path) -> list[tuple[int, str]]:
+    return natural(str(path))
+
+
 def _matching(root: Path, pattern: str, settings: Settings) -> list[Path]:
     """Files of a pattern in a folder."""
     try:
-        found = sorted((path for path in root.glob(pattern) if path.is_file()), key=natural)
+        found = sorted((path for path in root.glob(pattern) if path.is_file()), key=_natural)
     except (ValueError, NotImplementedError, IndexError) as error:  # absolute, or no pattern
         why = f"expected a pattern such as quads/*.png, found {pattern!r} ({error})"
         raise settings.wrong("source.files", why, "name files relative to the folder") from error
@@ -151,7 +150,7 @@ def _images(root: Path) -> list[Path]:
         fix = "give a folder of images, or name them, by source.files"
         raise InputError("no images", where=root, why=why, fix=fix)
     _refuse_outside(root, found)
-    return sorted(found, key=natural)
+    return sorted(found, key=_natural)
 
 
 def _refuse_outside(root: Path, files: list[Path]) -> None:
