@@ -11,7 +11,7 @@ from ..data.files import as_errors, atomic_folder
 from ..errors import UsageError
 from ..recon.folder import set_aside
 from ..recon.run import Run
-from . import film, images, points, splats
+from . import film, images, points, scene_page, splats
 from .moments import Moments, Progress
 
 COLOURS = ("colour", "reflectivity")
@@ -33,6 +33,7 @@ FORMATS = {
     "points": Format("points", points.write, coloured=True),
     "exr": Format("exr", images.write_exrs),
     "npz": Format("npz", images.write_npzs),
+    "html": Format("scene.html", scene_page.write, coloured=True),
     **{kind: Format(f"video.{kind}", film.write) for kind in ("webm", "mp4", "gif", "webp")},
 }
 

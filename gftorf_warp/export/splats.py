@@ -13,11 +13,12 @@ colour in the sequence's units, or of the reflectivity, the same in all channels
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..constants import SH_BIAS, SH_Y0
@@ -82,19 +83,24 @@ def scaled(harmonics: Float[Tensor, "N 16 *c"], factor: float) -> Float[Tensor, 
     return found
 
 
-@torch.no_grad()
 def gaussians_at(moments: Moments, index: int, harmonics: Float[Tensor, "N 16 3"]) -> GaussianField:
-    """The Gaussians that exist at the index-th time, where they are then, on the CPU.
+    """The Gaussians that exist at the index-th time; ``harmonics`` become their colour."""
+    field, exists = at_moment(moments, index)
+    present = replace(field, colour_sh=harmonics.cpu())
+    return present.map(lambda tensor: tensor[exists])
+
+
+@torch.no_grad()
+def at_moment(moments: Moments, index: int) -> tuple[GaussianField, Bool[Tensor, "N"]]:
+    """All Gaussians where they are at the index-th time, on the CPU, and which of them exist then.
 
     They are as wide as the sequence's own camera has to see them, see ``Run.widened``, so that a
-    rendering of them at its size is that of the run. ``harmonics`` become their colour.
+    rendering of them at its size is that of the run.
     """
     run, time = moments.run, moments.times[index]
     field = run.field.moved(*run.motion.at(run.binding, time))
-    field = run.widened(field, moments.cameras[index])
-    exists = (field.mean.abs() < 0.5 * AWAY).all(dim=1)
-    parts = {name: tensor[exists].cpu() for name, tensor in field.tensors().items()}
-    return GaussianField(**parts | {"colour_sh": harmonics[exists].cpu()})
+    field = run.widened(field, moments.cameras[index]).map(lambda tensor: tensor.detach().cpu())
+    return field, (field.mean.abs() < 0.5 * AWAY).all(dim=1)
 
 
 def vertices(field: GaussianField) -> np.ndarray:

@@ -120,11 +120,11 @@ def rasterize(
     # What Gaussian k carries: columns weighted by T (colour, distance, 1, extra) and by T^2 (quads,
     # phasor)
     basis = spherical_harmonics(splats.direction, settings.sh_degree)  # [M, K]
-    reflectivity = _shade(basis, field.reflectivity_sh[splats.index])
+    reflectivity = shade(basis, field.reflectivity_sh[splats.index])
     d = splats.distance
     one_way = [torch.ones_like(d)[:, None]]
     if field.colour_sh is not None:
-        one_way.append(_shade(basis, field.colour_sh[splats.index].flatten(1), channels=3))
+        one_way.append(shade(basis, field.colour_sh[splats.index].flatten(1), channels=3))
     more = d.new_zeros(len(d), 0) if extra is None else extra[splats.index].to(d)
     sloped = settings.splat_distance is SplatDistance.PLANE
     carried = torch.cat(one_way, 1)
@@ -335,7 +335,7 @@ def spherical_harmonics(n: Float[Tensor, "M 3"], degree: int) -> Float[Tensor, "
     return torch.stack(columns[: (degree + 1) ** 2], 1)
 
 
-def _shade(
+def shade(
     basis: Float[Tensor, "M K"], sh: Float[Tensor, "M KC"], channels: int = 1
 ) -> Float[Tensor, "M C"]:
     """Value seen from the camera, max(0, sum_i Y_i h_i + 1/2); no gradient where it is clamped."""
