@@ -66,17 +66,22 @@ def test_a_table_of_its_own_and_stated_intrinsics_replace_what_is_usual(tmp_path
     np.testing.assert_allclose(imported.sequence.quads[6:, 100, 200], quads, rtol=1e-4)
 
 
-def test_saturated_pixels_and_edges_are_counted_and_empty(tmp_path):
-    """One full raw frame empties the three of its frequency, no others."""
+def test_saturated_pixels_take_another_packet_and_edges_are_empty(tmp_path):
+    """One full raw frame replaces the three of its frequency, no others."""
     codes = dump.write(tmp_path / "dump")
-    codes[4, 300, 17] = 1024
-    (tmp_path / "dump" / "packet9.bin").write_bytes(dump.packet(codes))
+    full = codes.copy()
+    full[4, 300, 17] = full[4, 300, 18] = 1024
+    codes[1, 300, 18] = 1024
+    packets = dump.packet(full) + dump.packet(codes)
+    (tmp_path / "dump" / "packet9.bin").write_bytes(packets)
     imported = read_recording("kinect2", tmp_path / "dump")
-    quads = imported.sequence.quads[:, 300, 17]
-    assert (quads[3:6] == 0).all()
-    assert (quads[[0, 1, 2, 6, 7, 8]] != 0).all()
+    first, second = imported.sequence.quads.reshape(2, 9, dump.HEIGHT, dump.WIDTH)[:, :, 300, 17]
+    np.testing.assert_array_equal(first, second)
+    assert (first != 0).all()
+    first, second = imported.sequence.quads.reshape(2, 9, dump.HEIGHT, dump.WIDTH)[:, :, 300, 18]
+    np.testing.assert_array_equal(first, second)
     assert (imported.sequence.quads[..., [0, 511]] == 0).all()
-    assert any("1 times a pixel is saturated" in line for line in imported.uncertain)
+    assert any("3 times a pixel is saturated" in line for line in imported.uncertain)
 
 
 def spoiled(folder, name):

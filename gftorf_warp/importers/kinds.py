@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from . import arrays, kinect2, mlx7502x, oak, sequence_folders, voxel
+from . import arrays, espros, kinect2, mlx7502x, oak, sequence_folders, voxel
 from .imported import Imported
 from .keys import Key, Settings
 
@@ -47,6 +47,12 @@ KINDS = {
             about="a ToeRF folder of phasors, with its truth",
             read=sequence_folders.read_torf,
             keys=sequence_folders.KEYS,
+        ),
+        Kind(
+            name="espros",
+            about="raw frames of an ESPROS TOFcam, or an HDF5 file of its recorder",
+            read=espros.read,
+            keys=espros.KEYS,
         ),
         Kind(
             name="kinect2",

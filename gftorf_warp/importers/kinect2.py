@@ -17,6 +17,7 @@ from ..errors import InputError
 from . import camera_keys
 from . import kinect2_packets as packets
 from .at_rest import at_rest
+from .codes import fill
 from .imported import Imported, Notes
 from .keys import Key, Settings
 from .raw_files import files_of, raw_bytes, size_of
@@ -183,12 +184,15 @@ def _quads(source: Path, dump: Dump, notes: Notes) -> Float[np.ndarray, "F H W"]
                 saturated += int(full.sum())
                 quads_of_one = next(triples)
                 quads_of_one[:] = packets.without_offsets(triple, offset)
-                quads_of_one[:, full] = 0.0
+                quads_of_one[:, full] = np.nan
     quads[..., [0, -1]] = 0.0
     notes.understood.append("columns 0 and 511 are 0 throughout: libfreenect2 reads none there")
     if saturated:
-        text = f"{saturated} times a pixel is saturated at one frequency"
-        notes.uncertain.append(f"{text}: its three quads there are 0")
+        dark = fill(quads, np.ones(len(quads), dtype=bool), packets.SUB_IMAGES_USED)
+        notes.uncertain.append(
+            f"{saturated} times a pixel is saturated at one frequency: its three quads are those "
+            f"of the nearest packet; {dark} pixels always are, and are 0"
+        )
     return quads
 
 
