@@ -18,7 +18,14 @@ from typing import TYPE_CHECKING, Any
 from . import __version__
 from .errors import ResourceError, UsageError
 from .options import parse
-from .process import available_cpus, exit_at_once, on_cpus, open_cuda, without_garbage_collection
+from .process import (
+    available_cpus,
+    exit_at_once,
+    on_cpus,
+    open_cuda,
+    sigterm_raises,
+    without_garbage_collection,
+)
 
 if TYPE_CHECKING:
     from .recon.run import Run
@@ -33,7 +40,7 @@ def main(arguments: list[str] | None = None) -> int:
 
     Returns:
         Exit code: 0 ok, 1 a bug or a failed self-test, 2 usage, 3 bad input, 4 diverged, 5
-        resources, 6 busy, 130 interrupted.
+        resources, 6 busy, 130 interrupted by Ctrl-C, 143 by SIGTERM.
     """
     from .terminal import logging_to_stderr, print_error
 
@@ -46,7 +53,11 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         options = parse(list(arguments))
         open_cuda(getattr(options, "device", "cpu"))
-        with logging_to_stderr(_level(options)), on_cpus(getattr(options, "threads", None)):
+        with (
+            sigterm_raises(),
+            logging_to_stderr(_level(options)),
+            on_cpus(getattr(options, "threads", None)),
+        ):
             return COMMANDS[options.command](options)
     except SystemExit as stop:  # --help and --version
         return int(stop.code or 0)

@@ -94,12 +94,13 @@ def prepare(out: Path, settings: dict, *, fresh: bool) -> None:
     Raises:
         UsageError: If it holds other files, or, without ``fresh``, a demo with other settings.
     """
+    from .data.texts import read_json
     from .recon.folder import set_aside
 
     wanted = json.loads(json.dumps(settings))  # tuples become lists, as they are on disk
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         path = out / SETTINGS
-        found = json.loads(path.read_text()) if path.is_file() else None
+        found = read_json(path) if path.is_file() else None
         fix = "choose another --out, or --fresh, which moves its content to old-1"
         if found is None:
             why, fix = f"it has no {SETTINGS}: no demo has begun in it", "choose another --out"
@@ -108,7 +109,8 @@ def prepare(out: Path, settings: dict, *, fresh: bool) -> None:
             moved = set_aside(out, [out / n for n in OURS if (out / n).exists()])
             LOG.info("the earlier demo is now in %s", moved)
         elif found != wanted:
-            differ = ", ".join(key for key in wanted if found.get(key) != wanted[key])
+            known = found if isinstance(found, dict) else {}
+            differ = ", ".join(key for key in wanted if known.get(key) != wanted[key])
             why = f"it was made with another {differ}"
             raise UsageError("the folder is not empty", where=out, why=why, fix=fix)
     out.mkdir(parents=True, exist_ok=True)

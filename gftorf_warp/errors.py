@@ -51,5 +51,9 @@ class BusyError(GftorfError):
     exit_code = 6
 
 
+class Terminated(KeyboardInterrupt):
+    """SIGTERM reached the process: as after Ctrl-C, but with another exit code."""
+
+
 def _rebuild(kind: type[GftorfError], what: str, where: str, why: str, fix: str) -> GftorfError:
     return kind(what, where=where, why=why, fix=fix)

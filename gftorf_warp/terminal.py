@@ -12,7 +12,7 @@ import traceback
 from collections.abc import Iterator
 from pathlib import Path
 
-from .errors import GftorfError, InputError, ResourceError
+from .errors import GftorfError, InputError, ResourceError, Terminated
 
 LOG = logging.getLogger("gftorf_warp")
 PLAIN_EVERY_S = 10.0  # [s] between two progress lines where the output is not a terminal
@@ -156,8 +156,9 @@ def print_error(error: BaseException, *, debug: bool) -> int:
         print(f"error: {known}", file=sys.stderr)
         return known.exit_code
     if isinstance(error, KeyboardInterrupt):
-        print("interrupted: finished work is kept; the same command resumes it", file=sys.stderr)
-        return 130
+        how, code = ("terminated", 143) if isinstance(error, Terminated) else ("interrupted", 130)
+        print(f"{how}: finished work is kept; the same command resumes it", file=sys.stderr)
+        return code
     summary = (str(error).splitlines() or [""])[0]
     hint = "" if debug else "; --debug shows where"
     print(f"error: unexpected {type(error).__name__}: {summary}{hint}", file=sys.stderr)

@@ -2,6 +2,8 @@
 nothing written.
 """
 
+import os
+
 import pytest
 
 from gftorf_warp.cli import main
@@ -31,6 +33,7 @@ SCENES = {
     "bare.toml": "frames = 4\n",
     "typing.toml": "frame = 4\n" + WALL,
     "syntax.toml": "frames = = 4\n",
+    "deep.toml": f"frames = {5000 * '['}",
     "dark.toml": WALL.replace("0.8", "-0.8"),
     "stuck.toml": WALL.replace('"still"', '"stil"'),
     "sensor.toml": "sensor = { f_mod_hz = -1 }\n" + WALL,
@@ -43,6 +46,8 @@ SCENES = {
 BAD = [
     ("slidin", 2, "did you mean sliding"),
     ("{scenes}/none.toml", 3, "none.toml"),
+    ("{scenes}/pipe.toml", 3, "a pipe or a device"),
+    ("{scenes}/deep.toml", 3, "no TOML file"),
     ("{scenes}", 2, "there is no scene"),
     ("{scenes}/bare.toml", 3, "bodies"),
     ("{scenes}/typing.toml", 3, "did you mean frames?"),
@@ -108,6 +113,7 @@ def scenes(tmp_path):
     folder.mkdir()
     for name, text in {**SCENES, **OBJ}.items():
         (folder / name).write_text(text)
+    os.mkfifo(folder / "pipe.toml")  # which nobody writes to
     return folder
 
 
@@ -136,7 +142,7 @@ def test_a_wrong_line_ends_in_three_lines_and_writes_nothing(
     ]
     refused(arguments, code, word, capsys)
     assert [path.name for path in tmp_path.iterdir()] == ["scenes"]
-    assert {path.name for path in scenes.iterdir()} == {*SCENES, *OBJ}
+    assert {path.name for path in scenes.iterdir()} == {*SCENES, *OBJ, "pipe.toml"}
 
 
 def test_folders_that_cannot_be_written_stay_as_they_are(scenes, tmp_path, capsys):

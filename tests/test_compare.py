@@ -25,12 +25,12 @@ from sequences import changed
 
 from gftorf_warp import Truth, __version__
 from gftorf_warp.constants import CANONICAL_SHIFTS
+from gftorf_warp.data.texts import read_rows
 from gftorf_warp.data.write import write
 from gftorf_warp.errors import DivergedError, InputError, UsageError
 from gftorf_warp.evaluate.compare import (
     compare,
     findings,
-    rows_of,
     sequence_title,
     summary,
     truth_statement,
@@ -320,12 +320,12 @@ def test_box_and_mask_of_the_analytic_run():
     assert seen[0].sum() == BOX_PIXELS
 
 
-def test_rows_of_stops_before_a_torn_line(tmp_path):
+def test_rows_stop_before_a_torn_line(tmp_path):
     """A killed run may leave half a line."""
     path = tmp_path / "metrics.jsonl"
-    assert rows_of(path) == []
+    assert read_rows(path) == []
     path.write_text('{"images": 4, "loss": 1.0}\n{"images": 8, "lo')
-    assert rows_of(path) == [{"images": 4, "loss": 1.0}]
+    assert read_rows(path) == [{"images": 4, "loss": 1.0}]
 
 
 def test_a_sequence_is_called_by_its_heading(tmp_path):

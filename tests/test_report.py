@@ -19,8 +19,9 @@ from sequences import sequence_of
 
 from gftorf_warp import Truth
 from gftorf_warp.constants import CANONICAL_SHIFTS
+from gftorf_warp.data.texts import read_rows
 from gftorf_warp.evaluate import controls, figures, page, panels, pictures, tables
-from gftorf_warp.evaluate.compare import compare, findings, rows_of, summary
+from gftorf_warp.evaluate.compare import compare, findings, summary
 from gftorf_warp.evaluate.gallery import colour_views, novel_views
 from gftorf_warp.evaluate.metrics import scored_frames
 from gftorf_warp.evaluate.report import report, verdict
@@ -362,7 +363,7 @@ def test_along_the_run_is_drawn_from_its_rows(compared):
     run, metrics, html, found = compared
     assert "Along the run" in html.images
     assert "Along the run" in html.texts
-    rows = rows_of(run.path / "diagnostics.jsonl")
+    rows = read_rows(run.path / "diagnostics.jsonl")
     blind = [
         {name: None if "mse" in name else value for name, value in row.items()} for row in rows
     ]

@@ -15,7 +15,7 @@ import pytest
 from moving_box import recording
 from small_runs import advance, demo, rows, same, small, stored
 
-from gftorf_warp.errors import BusyError, DivergedError, UsageError
+from gftorf_warp.errors import BusyError, DivergedError, Terminated, UsageError
 from gftorf_warp.recon import checkpoint, folder, loop, presets
 from gftorf_warp.recon.observations import observe
 from gftorf_warp.recon.run import Run
@@ -56,7 +56,7 @@ def test_an_interrupted_run_goes_on_to_the_same_bytes(tmp_path):
         if images == 20:
             os.kill(os.getpid(), signal.SIGTERM)
 
-    with pytest.raises(KeyboardInterrupt):
+    with pytest.raises(Terminated):
         reconstruct(small(), tmp_path / "parts", settings, seed=3, progress=stop)
     assert stored(tmp_path / "parts")["images"] == 20
     seen = []

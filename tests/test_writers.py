@@ -24,7 +24,7 @@ try:
 except ImportError:  # not a Unix
     fcntl = None
 
-from gftorf_warp.data import files
+from gftorf_warp.data import files, resources
 from gftorf_warp.data.exr import read_exr
 from gftorf_warp.errors import ResourceError, UsageError
 from gftorf_warp.evaluate import previews, stored, views, writers
@@ -356,10 +356,12 @@ def test_what_stops_the_rendering_leaves_nothing_half_written(analytic, tmp_path
 def test_a_disk_that_cannot_hold_the_arrays(analytic, tmp_path, monkeypatch):
     """Said before anything is written; one that fills up on the way is an error of the file."""
     usage = type("Usage", (), {"free": 10_000})
-    with monkeypatch.context() as patch:
-        patch.setattr(stored.shutil, "disk_usage", lambda _: usage)
-        with pytest.raises(ResourceError, match="not enough space"):
-            render_to_folder(analytic, tmp_path / "out", WHAT, arrays=True)
+    for arrays in (True, False):
+        with monkeypatch.context() as patch:
+            patch.setattr(resources.shutil, "disk_usage", lambda _: usage)
+            with pytest.raises(ResourceError, match="not enough disk space"):
+                render_to_folder(analytic, tmp_path / "out", WHAT, arrays=arrays)
+        assert not (tmp_path / "out").exists()
 
     class Full(stored.FileIO):
         def write(self, data):

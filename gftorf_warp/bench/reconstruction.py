@@ -21,9 +21,9 @@ import numpy as np
 
 from ..data.flow import compute_flow
 from ..data.read import read, read_truth
+from ..data.texts import read_rows
 from ..data.write import write
 from ..errors import GftorfError, ResourceError
-from ..evaluate.compare import rows_of
 from .timing import Report, lines_of
 
 IMAGES = {"cpu": 4_000, "other": 20_000}
@@ -84,7 +84,9 @@ def measure(
 def found_in(run: Path) -> dict[str, Any]:
     """Length, size and curves of a finished run."""
     config = json.loads((run / "config.json").read_text())
-    metrics, diagnostics = (rows_of(run / name) for name in ("metrics.jsonl", "diagnostics.jsonl"))
+    metrics, diagnostics = (
+        read_rows(run / name) for name in ("metrics.jsonl", "diagnostics.jsonl")
+    )
     images, seconds = ([0.0, *(row[key] for row in metrics)] for key in ("images", "seconds"))
     curve = [
         {
@@ -136,7 +138,7 @@ def error_of(why: str, code: int) -> GftorfError:
 
 def _reached(run: Path) -> int:
     """Optimised images of a run in progress."""
-    return max((int(row["images"]) for row in rows_of(run / "metrics.jsonl")), default=0)
+    return max((int(row["images"]) for row in read_rows(run / "metrics.jsonl")), default=0)
 
 
 def table(rows: list[dict[str, Any]]) -> list[str]:

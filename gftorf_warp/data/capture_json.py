@@ -12,11 +12,11 @@ import numpy as np
 from ..errors import InputError
 from . import specs
 from .problems import Problems
+from .texts import read_json
 
 NAME = "capture.json"
 MANIFEST = "MANIFEST.sha256"
 FORMAT = "capture"
-BYTES_MAX = 1 << 28  # 256 MB: a few hundred bytes per raw frame, and a million of them
 FRAMES = "frames"
 KINDS = {"f": (int, float), "i": (int,), "b": (bool,), "U": (str,), "O": (dict,)}
 WORDS = {
@@ -60,17 +60,7 @@ def read_values(root: Path) -> dict[str, Any]:
 
 
 def _load(path: Path) -> dict[str, Any]:
-    try:
-        if path.stat().st_size > BYTES_MAX:
-            why, fix = f"more than {BYTES_MAX} bytes", "split the recording"
-            raise InputError("file too large", where=path, why=why, fix=fix)
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        why, fix = error.strerror or str(error), "check permissions and the disk"
-        raise InputError("cannot be read", where=path, why=why, fix=fix) from error
-    except (ValueError, RecursionError) as error:
-        why, fix = str(error)[:200], "correct the file"
-        raise InputError("no JSON", where=path, why=why, fix=fix) from error
+    content = read_json(path)
     if not isinstance(content, dict):
         raise _wrong(path, "the whole file", "an object", content)
     return content

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from ..constants import FRAMES_PER_QUARTET
-from ..errors import InputError, ResourceError
-from . import specs
+from ..errors import InputError
+from . import resources, specs
 from .arrays import as_float32, read_array, read_shape
 from .capture_json import NAME as CAPTURE
 from .problems import Problems
@@ -156,8 +156,7 @@ def empty_quads(root: Path, frames: int, size: dict[str, int]) -> np.ndarray:
     Raises:
         ResourceError: If they do not fit into memory.
     """
-    try:
-        return np.zeros((frames, size.get("H", 1), size.get("W", 1)), dtype=np.float32)
-    except MemoryError as error:
-        why, fix = f"{frames} frames of {size} do not fit", "use a shorter recording"
-        raise ResourceError("not enough memory", where=root, why=why, fix=fix) from error
+    shape = frames, size.get("H", 1), size.get("W", 1)
+    need = resources.to_read(frames, shape[1] * shape[2])
+    resources.require(need, root, "read a shorter recording, or smaller images")
+    return np.zeros(shape, dtype=np.float32)

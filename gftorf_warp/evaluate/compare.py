@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import platform
 from collections.abc import Callable
 from dataclasses import replace
@@ -13,11 +12,12 @@ import numpy as np
 from jaxtyping import Float
 
 from .. import __version__
-from ..data import steps
+from ..data import resources, steps
 from ..data.decode import unambiguous_range
 from ..data.files import atomic_write, write_json
 from ..data.read import read, read_truth
 from ..data.sequence import Sequence, Truth
+from ..data.texts import read_rows
 from ..data.truth import known_distance, moving_and_static, static_throughout
 from ..data.unwrap import CONFIDENT
 from ..errors import InputError, UsageError
@@ -75,6 +75,7 @@ def compare(
             is complete, or the report is of a later state of the run.
         UsageError: If ``frames`` is unknown or leaves nothing, or ``against`` is unknown.
         DivergedError: If a rendering is not finite.
+        ResourceError: If memory or disk cannot hold the images or the page.
     """
     if isinstance(run, (str, Path)):
         from ..recon.run import Run
@@ -108,6 +109,8 @@ def score(
     sequence = run.sequence()
     known = fitting_truth(sequence, truth)
     scored = measure.scored_frames(sequence, frames)
+    need = resources.to_compare(len(scored), sequence.height * sequence.width)
+    resources.require(need, run.path, "score fewer raw frames, --frames ftorf13")
     gathered = views.gather(run, sequence, scored, progress=progress)
     found = replace(
         findings(sequence, gathered, known, against=against),
@@ -219,7 +222,7 @@ def summary(
         "colour_psnr_db": colour
         and measure.psnr_db(colour.rendered, colour.measured, peak=float(colour.measured.max())),
         "gaussians": run.gaussians,
-        "diagnostics": measure.along_run(rows_of(run.path / "diagnostics.jsonl")),
+        "diagnostics": measure.along_run(read_rows(run.path / "diagnostics.jsonl")),
         **{name: fact(run.config, name) for name in FACTS},
         "method": method_of(run.config),
         "version": __version__,
@@ -259,8 +262,8 @@ def write_report(run: Run, result: dict[str, Any], found: Findings) -> Path:
         title=sequence_title(found.sequence.path) or run.path.name,
         metrics=result,
         config=run.config,
-        log=rows_of(run.path / "metrics.jsonl"),
-        diagnostics=rows_of(run.path / "diagnostics.jsonl"),
+        log=read_rows(run.path / "metrics.jsonl"),
+        diagnostics=read_rows(run.path / "diagnostics.jsonl"),
         found=found,
         installed=installed_versions(),
         data_card=truth_statement(found.sequence.path),
@@ -276,12 +279,6 @@ def installed_versions() -> str:
     versions = ", ".join(f"{name} {version_of(name)}" for name in packages)
     system = f"Python {platform.python_version()}, {platform.system()}"
     return f"gftorf-warp {__version__}, {versions}, {system}"
-
-
-def rows_of(path: Path) -> list[dict[str, float]]:
-    """The complete rows of a run's metrics.jsonl or diagnostics.jsonl; none without the file."""
-    lines = path.read_text(encoding="utf-8").splitlines(keepends=True) if path.exists() else []
-    return [json.loads(line) for line in lines if line.endswith("\n")]
 
 
 def sequence_title(path: Path | None) -> str | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -12,7 +11,8 @@ import numpy as np
 from jaxtyping import Float
 
 from ..data.files import write_json
-from ..errors import UsageError
+from ..data.texts import read_json
+from ..errors import InputError, UsageError
 from ..recon.folder import set_aside
 from ..scene.sensor import Sensor
 from .previews import Channels
@@ -108,17 +108,20 @@ def prepare_folder(out: Path, listed: Mapping[str, Any], *, fresh: bool) -> None
 
 def stated_images(path: Path) -> int:
     """Optimised images of the run that a metrics.json or renders.json is of; 0 if unknown."""
-    try:
-        found = json.loads(path.read_bytes()).get("images_optimised")
-    except (OSError, ValueError, AttributeError):
-        return 0
-    return found if isinstance(found, int) else 0
+    stated = _listed(path).get("images_optimised")
+    return stated if isinstance(stated, int) else 0
 
 
 def _same(path: Path, listed: Mapping[str, object]) -> bool:
     """Whether an earlier list names the same run, times, poses and channels."""
+    found = _listed(path)
+    return bool(found) and all(found.get(key) == listed.get(key) for key in LISTED)
+
+
+def _listed(path: Path) -> dict[str, Any]:
+    """Content of a list; empty if there is none that can be read."""
     try:
-        found = json.loads(path.read_text())
-    except (OSError, ValueError):
-        return False
-    return isinstance(found, dict) and all(found.get(key) == listed.get(key) for key in LISTED)
+        found = read_json(path)
+    except InputError:
+        return {}
+    return found if isinstance(found, dict) else {}

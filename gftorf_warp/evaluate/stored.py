@@ -14,7 +14,6 @@ import io
 import logging
 import math
 import os
-import shutil
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
@@ -28,7 +27,6 @@ import numpy as np
 from jaxtyping import Float
 
 from ..data.files import as_errors, atomic_path
-from ..errors import ResourceError
 from .previews import Channels
 
 BLOCK = 32  # images of one system call, at most
@@ -63,17 +61,11 @@ def store_all(
         progress: Called with (images written, images in all); the last time after the flush.
 
     Raises:
-        ResourceError: If the disk is full, or too small.
+        ResourceError: If the disk is full.
         UsageError: If ``out`` is not writable.
     """
     paths = [path_of(out, name, channel) for name in channels for channel in channels[name]]
-    needed = 4 * math.prod(shape) * len(paths)
-    with as_errors(out):
-        free = shutil.disk_usage(out).free
-    if needed > free:
-        why = f"the arrays take {needed / 1e9:.1f} GB, {free / 1e9:.1f} GB are free"
-        fix = "render fewer --times, or write to another disk"
-        raise ResourceError("not enough space", where=out, why=why, fix=fix)
+    image_bytes = 4 * math.prod(shape[1:]) * len(paths)
     with ExitStack() as stack:
         files = {path: stack.enter_context(Stored(path, shape)) for path in paths}
         threads = ThreadPoolExecutor(len(files), thread_name_prefix="gftorf-arrays")
@@ -88,7 +80,7 @@ def store_all(
                 if progress is not None and last < shape[0]:
                     progress(last, shape[0])
 
-        most = max(1, min(BLOCK, BLOCK_BYTES // (needed // shape[0])))
+        most = max(1, min(BLOCK, BLOCK_BYTES // image_bytes))
         block: list[Mapping[str, Channels]] = []
         for done, images in enumerate(series, start=1):
             block.append(images)

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 
-from ..data import temporal
+from ..data import resources, temporal
 from ..data.decode import Decoded, closed_form_distance, decode_quartet
 from ..data.sequence import Sequence
 from ..errors import DivergedError, UsageError
@@ -228,7 +228,7 @@ def render_to_folder(
         UsageError: If a name in ``what`` is unknown, the run has no colour, there are no such poses
             or times or the run has one view only, or ``out`` holds something else.
         InputError: If the poses cannot be read.
-        ResourceError: If the disk is full, or cannot hold the arrays.
+        ResourceError: If memory or disk cannot hold the images.
     """
     names = renders.checked(what)
     sequence = run.sequence()
@@ -239,6 +239,10 @@ def render_to_folder(
     samples = samples_of(render, taken, run.sensor, names)
     out, channels = Path(out), {name: list(samples[0][name]) for name in names}
     reached = run.config.get("images_optimised")
+    pixels, count = run.camera.height * run.camera.width, sum(map(len, channels.values()))
+    held = stored.HELD if arrays else KEPT
+    need = resources.to_render(len(seconds), pixels, count, arrays=arrays, held=held)
+    resources.require(need, out, "render fewer --times or less of --what")
     listed: dict[str, Any] = {"run": str(run.path), "images_optimised": reached}
     listed["times_s"] = seconds
     taken_from = None

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..data.untrusted import PACKED_MAX, unreadable
 from ..errors import InputError, ResourceError
-from .untrusted import PACKED_MAX, unreadable
 
 if TYPE_CHECKING:
     import h5py

@@ -9,17 +9,15 @@ from __future__ import annotations
 import difflib
 import math
 import textwrap
-import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ..data.texts import read_toml
 from ..errors import InputError, UsageError
-from .untrusted import read_text
 
 CONFIG = "--config"
-BYTES_MAX = 1 << 20  # a table of keys has a few hundred; poses and times have files of their own
 WORDS = {float: "a number", int: "a whole number", str: "a text", bool: "true or false"}
 
 
@@ -137,7 +135,7 @@ def load(path: Path | None, keys: Iterable[Key]) -> Settings:
     known = {key.name: key for key in keys}
     if path is None:
         return Settings(keys=known, values={})
-    flat = dict(_flattened(_parsed(path), known))
+    flat = dict(_flattened(read_toml(path), known))
     for name in flat:
         if name not in known:
             raise _unknown(path, name, list(known))
@@ -173,14 +171,6 @@ def _toml(value: Any) -> str:
         return f"[{', '.join(map(_toml, value))}]"
     # quotes of TOML that take backslashes of paths as they are
     return f"'{value}'" if isinstance(value, str) else repr(value)
-
-
-def _parsed(path: Path) -> dict[str, Any]:
-    try:
-        return tomllib.loads(read_text(path, BYTES_MAX))
-    except (ValueError, RecursionError) as error:
-        why, fix = str(error)[:200], "correct that line"
-        raise InputError("no TOML file", where=path, why=why, fix=fix) from error
 
 
 def _flattened(

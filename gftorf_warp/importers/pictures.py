@@ -9,7 +9,7 @@ import numpy as np
 
 from ..data.arrays import SIDE_MAX
 from ..data.folder import FRAMES_MAX
-from .untrusted import PACKED_MAX, read_bytes, unreadable
+from ..data.untrusted import PACKED_MAX, read_bytes, unreadable
 
 PNG = b"\x89PNG\r\n\x1a\n"
 WIDTH_TAG, HEIGHT_TAG = 256, 257

@@ -15,11 +15,11 @@ import numpy as np
 
 from ..data.exr import read_exr
 from ..data.matlab import read_matrix
+from ..data.untrusted import PACKED_MAX, read_bytes, unreadable
 from ..errors import InputError
 from . import hdf5_files
 from .keys import Key, Settings
 from .pictures import read_picture
-from .untrusted import PACKED_MAX, read_bytes, unreadable
 
 NUMPY, ZIPPED = (".npy",), (".npz",)
 HDF5, MATLAB = (".h5", ".hdf5", ".he5"), (".mat",)

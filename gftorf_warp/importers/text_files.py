@@ -7,7 +7,7 @@ import re
 from collections.abc import Sequence as Items
 from pathlib import Path
 
-from .untrusted import read_text, unreadable
+from ..data.untrusted import read_text, unreadable
 
 SEPARATORS = re.compile(r"[,;\s]+")
 

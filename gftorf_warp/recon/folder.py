@@ -4,13 +4,13 @@ and whether a new call may go on there.
 
 from __future__ import annotations
 
-import json
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
 from ..data import lock
 from ..data.files import write_json
+from ..data.texts import read_json
 from ..errors import InputError, UsageError
 from .settings import ReconSettings, plain
 
@@ -115,22 +115,14 @@ def read_config(run: Path) -> dict[str, Any]:
         InputError: If it is missing or no JSON object.
     """
     path = run / CONFIG
+    fix = "name the --out folder of a reconstruction"
     try:
-        config = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise InputError(
-            "not a run",
-            where=path,
-            why=f"expected a JSON object written by `gftorf reconstruct`: {error}",
-            fix="name the --out folder of a reconstruction",
-        ) from error
+        config = read_json(path)
+    except InputError as error:
+        why = f"expected a JSON object written by `gftorf reconstruct`: {error.what}: {error.why}"
+        raise InputError("not a run", where=path, why=why, fix=fix) from error
     if not isinstance(config, dict):
-        raise InputError(
-            "not a run",
-            where=path,
-            why="expected a JSON object",
-            fix="name the --out folder of a run",
-        )
+        raise InputError("not a run", where=path, why="expected a JSON object", fix=fix)
     return config
 
 

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import torch
 
-from ..errors import DivergedError
+from ..errors import DivergedError, Terminated
 from ..render.buffers import available_threads
 from . import checkpoint, collapse
 from .diagnostics import Diagnostics, Row
@@ -89,7 +89,7 @@ class TrainingLoop:
             while state.images < total:
                 before = state.images
                 stepper.step()
-                if not (self.is_due(before, state.images) or stop.is_set()):
+                if not (self.is_due(before, state.images) or stop):
                     continue
                 rendered = died = None
                 # launched before the device is waited for
@@ -117,10 +117,10 @@ class TrainingLoop:
                     self.diagnostics.write(rendered, state, self.settings)
                     if died:
                         collapse.revive(state, self.settings)
-                if stop.is_set():
+                if stop:
                     self.save(state)
                     LOG.info("interrupted at image %d of %d, stored", state.images, total)
-                    raise KeyboardInterrupt
+                    raise Terminated if signal.SIGTERM in stop else KeyboardInterrupt
                 if self.saving_is_due(before, state.images) and not failures:
                     self.save(state)
         self.save(state)
@@ -269,19 +269,19 @@ def _one_torch_thread(device: torch.device) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _signals() -> Iterator[threading.Event]:
-    """An event set by the first Ctrl-C or SIGTERM; the second one acts at once.
+def _signals() -> Iterator[list[int]]:
+    """A list, empty until Ctrl-C or SIGTERM puts its number there; the second one acts at once.
     Main thread only.
     """
-    stop = threading.Event()
+    stop: list[int] = []
     if threading.current_thread() is not threading.main_thread():
         yield stop
         return
     numbers = (signal.SIGINT, signal.SIGTERM)
     before = {number: signal.getsignal(number) for number in numbers}
 
-    def first(*_) -> None:
-        stop.set()
+    def first(received: int, _) -> None:
+        stop.append(received)
         for number in numbers:
             signal.signal(number, before[number])
 

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from ..data.files import atomic_write
+from ..data.texts import read_rows
 
 LOG = logging.getLogger("gftorf_warp")
 
@@ -24,26 +25,21 @@ class Metrics:
         the run goes on from there.
         """
         if self.path.exists():
-            kept = [
-                line
-                for line in self.path.read_text().splitlines(keepends=True)
-                if line.endswith("\n")
-            ]
-            kept = [line for line in kept if json.loads(line)["images"] <= images]
-            atomic_write(self.path, "".join(kept).encode())
+            kept = [row for row in self.rows() if (row.get("images") or 0) <= images]
+            atomic_write(self.path, "".join(map(_line, kept)).encode())
 
     def rows(self) -> list[dict[str, float | int | None]]:
         """All rows so far."""
-        return (
-            [json.loads(line) for line in self.path.read_text().splitlines()]
-            if self.path.exists()
-            else []
-        )
+        return read_rows(self.path)
 
     def add(self, row: dict[str, float | int | None]) -> None:
         """Append one row."""
         with self.path.open("a") as file:
-            file.write(json.dumps(row, allow_nan=False) + "\n")
+            file.write(_line(row))
+
+
+def _line(row: dict[str, float | int | None]) -> str:
+    return json.dumps(row, allow_nan=False) + "\n"
 
 
 @contextmanager

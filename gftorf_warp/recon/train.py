@@ -12,11 +12,13 @@ from typing import TypeVar
 
 import torch
 
+from ..data import resources
 from ..data.constant import constant_part
 from ..data.read import read, read_truth
 from ..data.sequence import Sequence, Truth
 from ..data.synchronised import check_flow, unfilled_share
 from ..errors import InputError, UsageError
+from ..render.cuda import free_memory
 from ..scene.changes import Wording, changed
 from ..scene.initialise import Init
 from ..scene.windows import Windows
@@ -81,6 +83,7 @@ def reconstruct(
     Raises:
         InputError: If the sequence cannot be read or cannot start a reconstruction.
         UsageError: If ``out`` holds something else or other settings, or a name is unknown.
+        ResourceError: If memory or disk cannot hold the optimisation.
         BusyError: If another process works on ``out``.
         DivergedError: If loss or gradient stay infinite; the last good checkpoint is kept.
         KeyboardInterrupt: After a signal, when everything is stored.
@@ -93,6 +96,7 @@ def reconstruct(
     out = Path(out)
     config = config_of(sequence, settings, seed=seed, device=device)
     config |= {"flow": None if flow is None else str(flow), "changes": changes}
+    _check_resources(sequence, settings, out, device)
     with folder.locked(out):
         goes_on = folder.prepare(out, config, fresh=fresh)
         with log_to(out / "run.log"):
@@ -135,6 +139,26 @@ def chosen_settings(
             fix="use --flow dis or --flow deepflow",
         )
     return replace(settings, cycle=sequence.cycle)
+
+
+def _check_resources(
+    sequence: Sequence, settings: ReconSettings, out: Path, device: torch.device | str
+) -> None:
+    """Raise a ResourceError if memory or disk cannot hold the optimisation."""
+    if settings.method != Method.GAUSSIANS:
+        return
+    pixels = sequence.width * sequence.height
+    if settings.width_max is not None:
+        pixels = round(pixels * min(1.0, settings.width_max / sequence.width) ** 2)
+    random = settings.init.kind == Init.RANDOM
+    first = settings.init.count if random else pixels / settings.init.static_spacing**2
+    count = min(round(first), settings.densify.gaussians_max)
+    need = resources.to_reconstruct(sequence.frames, pixels, count)
+    fix = "use smaller images (--set width_max=160), or a shorter recording"
+    resources.require(need, out, fix)
+    if (free := free_memory(device)) is not None:
+        need = resources.to_reconstruct_on_gpu(sequence.frames, pixels, count)
+        resources.require(need, out, f"{fix}, or --device cpu", free=free)
 
 
 def _check_flow(sequence: Sequence, flow: FlowSource) -> None:

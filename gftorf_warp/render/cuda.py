@@ -182,6 +182,12 @@ class SideStreams:
         self._open.clear()
 
 
+def free_memory(device: torch.device | str) -> float | None:
+    """Free memory of a GPU [B]; None for a CPU."""
+    device = torch.device(device)
+    return None if device.type == "cpu" else float(torch.cuda.mem_get_info(device)[0])
+
+
 @functools.cache
 def side_stream(device: torch.device) -> SideStreams:
     """One side stream, always the same one: cuBLAS keeps a workspace for every stream."""

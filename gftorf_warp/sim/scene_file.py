@@ -9,13 +9,13 @@ is "box", "plane", "sphere", "level", "assembly" or "mesh", a path "still", "lin
 from __future__ import annotations
 
 import math
-import tomllib
 import types
 import typing
 from dataclasses import MISSING, fields, is_dataclass, replace
 from pathlib import Path as FilePath
 from typing import Any, Union
 
+from ..data.texts import read_toml
 from ..errors import InputError
 from ..scene.changes import suggestion
 from ..scene.sensor import Sensor
@@ -44,14 +44,7 @@ def read_scene(path: str | FilePath) -> Scene:
             dataclass.
     """
     path = FilePath(path)
-    try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        what, why, fix = "cannot read the scene", error.strerror or str(error), "correct the path"
-        raise InputError(what, where=path, why=why, fix=fix) from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        what, why, fix = "no TOML file", str(error), "correct that line"
-        raise InputError(what, where=path, why=why, fix=fix) from error
+    table = read_toml(path)
     described = f"scene of {path.name}"
     texts = {"name": path.stem, "description": described, "motion": "as its file says"}
     for key in NOT_THERE:

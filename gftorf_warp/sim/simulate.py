@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from ..data import resources
 from ..data.contact_sheet import contact_sheet
 from ..data.files import atomic_write
 from ..data.read import read, read_truth
@@ -23,7 +25,7 @@ from .resume import cached_images, needs_recording, set_aside
 from .scene import overridden
 from .scene_file import read_scene
 from .scenes import SCENES, Scene, named_scene
-from .settings import SimSettings
+from .settings import ResolvedSettings, SimSettings
 
 
 def simulate(
@@ -61,6 +63,7 @@ def simulate(
     Raises:
         UsageError: If settings contradict each other or the scene, the format cannot express the
             sensor, ``out`` or OUT.partial holds something else, or the folder cannot be written to.
+        ResourceError: If memory or disk cannot hold the recording.
         BusyError: If another process records the same sequence.
         InputError: If a TOML file does not describe a scene.
     """
@@ -68,6 +71,7 @@ def simulate(
     own = scene_of(scene, settings.overrides, settings.seed)
     settings = replace(settings, overrides=())
     recorded, used = resolved(own, settings)
+    _check_resources(recorded, used, Path(out))
     check_engine(recorded, used, device)
     check_format(recorded, used)
     check_clearance(recorded, longest_times(recorded, used))
@@ -84,6 +88,14 @@ def simulate(
         readme = card + outcome_card(recording)
         write(used.format, out, recording.sequence, recording.truth, readme=readme, sheet=sheet)
     return out
+
+
+def _check_resources(scene: Scene, settings: ResolvedSettings, out: Path) -> None:
+    """Raise a ResourceError if memory or disk cannot hold the recording."""
+    pixels, rays = math.prod(settings.size), scene.subsamples**2
+    traced = settings.engine == "mesh"
+    need = resources.to_simulate(settings.frames, pixels, rays, traced=traced)
+    resources.require(need, out, "use a smaller --size or fewer --frames")
 
 
 def simulate_ladder(

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from ..errors import InputError
 
-TEXT_MAX = 1 << 28  # 256 MB: a million lines of a pose
+TEXT_MAX = 1 << 28  # 256 MB: a million lines of a pose, or raw frames of a capture
 PACKED_MAX = 1100  # bytes from one byte of a file: deflate packs at most 1032
 
 
@@ -17,7 +17,8 @@ def read_bytes(path: Path, most: int | None = None) -> bytes:
         InputError: If it is no file, too large, or cannot be read.
     """
     if not path.is_file():  # opening a pipe would block
-        raise unreadable(path, f"expected a file, found {'a folder' if path.is_dir() else 'none'}")
+        found = "a folder" if path.is_dir() else "a pipe or a device" if path.exists() else "none"
+        raise unreadable(path, f"expected a file, found {found}")
     try:
         size = path.stat().st_size
         if most is not None and size > most:

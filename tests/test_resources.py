@@ -1,0 +1,142 @@
+"""Memory and disk of a command are compared with what is free before anything is allocated."""
+
+import shutil
+import subprocess
+import sys
+from collections import namedtuple
+
+import numpy as np
+import pytest
+from moving_box import recording
+from sequences import changed
+
+from gftorf_warp.cli import main
+from gftorf_warp.data import resources
+from gftorf_warp.data.folder import empty_quads
+from gftorf_warp.data.write import write
+from gftorf_warp.errors import ResourceError
+from gftorf_warp.recon.train import reconstruct
+
+GB = 1_000_000_000
+LIMITED = """
+import resource
+from gftorf_warp.data.resources import free_memory
+resource.setrlimit(resource.RLIMIT_AS, (4 << 30, 4 << 30))
+print(free_memory())
+"""
+
+
+@pytest.fixture
+def little(monkeypatch):
+    """A machine with one gigabyte of free memory, whatever this one has."""
+    monkeypatch.setattr(resources, "free_memory", lambda: GB)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """The closed form of a short sequence."""
+    place = tmp_path_factory.mktemp("made")
+    write("ftorf", place / "seq", *recording(frames=12))
+    words = ["reconstruct", str(place / "seq"), "--out", str(place / "run"), "--preset", "ctof"]
+    assert main([*words, "--device", "cpu", "-q"]) == 0
+    return place / "run"
+
+
+def refused(arguments, capsys, *words):
+    """A command ends with exit code 5 and three lines that contain the words."""
+    assert main([*arguments, "-q"]) == 5
+    err = capsys.readouterr().err
+    assert [line[:7] for line in err.splitlines()] == ["error: ", "  why: ", "  fix: "], err
+    for word in words:
+        assert word in err
+
+
+@pytest.mark.usefixtures("little")
+@pytest.mark.parametrize(
+    "options",
+    [
+        ["--size", "9999x9999"],
+        ["--size", "9999x9999", "--engine", "mesh"],
+        ["--frames", "1000000000", "--size", "8x6"],
+    ],
+    ids=" ".join,
+)
+def test_a_recording_that_does_not_fit_is_refused_at_once(tmp_path, capsys, options):
+    """Nothing is made, not even a folder."""
+    words = ["simulate", "demo", *options, "--out", str(tmp_path / "seq")]
+    refused(words, capsys, "not enough memory", "--size", "--frames", "1.00 GB are free")
+    assert not any(tmp_path.iterdir())
+
+
+def test_a_disk_that_is_too_small_is_named(tmp_path, capsys, monkeypatch):
+    """Before the first raw frame."""
+    usage = namedtuple("usage", "total used free")
+    monkeypatch.setattr(resources.shutil, "disk_usage", lambda _: usage(1e9, 1e9, 1e5))
+    words = ["simulate", "demo", "--size", "24x18", "--out", str(tmp_path / "a" / "seq")]
+    refused(words, capsys, "not enough disk space", "0.10 MB are free", "--frames")
+    assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.usefixtures("little")
+def test_a_long_sequence_is_not_read_into_too_little_memory(tmp_path):
+    """By the number and size of its images."""
+    with pytest.raises(ResourceError, match="shorter recording"):
+        empty_quads(tmp_path, 2000, {"H": 240, "W": 320})
+
+
+def test_reconstruct_compare_and_render_are_refused(run, tmp_path, capsys, monkeypatch):
+    """With what they need at least, and the option that helps; nothing is left behind."""
+    monkeypatch.setattr(resources, "free_memory", lambda: 1e6)
+    sequence, _ = recording(frames=12)
+    with pytest.raises(ResourceError, match="width_max"):
+        reconstruct(sequence, tmp_path / "run", "demo", images=4)
+    assert not (tmp_path / "run").exists()
+    before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
+    refused(["compare", str(run), "--device", "cpu"], capsys, "--frames ftorf13")
+    monkeypatch.setattr(resources, "free_memory", lambda: 5e5)
+    words = ["render", str(run), "--out", str(tmp_path / "out"), "--device", "cpu"]
+    refused(words, capsys, "--times")
+    assert not (tmp_path / "out").exists()
+    assert before == {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
+
+
+def test_less_is_needed_for_reduced_images(tmp_path, monkeypatch):
+    """The message's option does help."""
+    sequence, _ = recording(frames=8)
+    wide = changed(sequence, quads=np.repeat(sequence.quads, 4, axis=2), fx=4 * 42.0, cx=96.0)
+    monkeypatch.setattr(resources, "free_memory", lambda: 8e6)
+    with pytest.raises(ResourceError):
+        reconstruct(wide, tmp_path / "run", "demo", images=4)
+    run = reconstruct(wide, tmp_path / "run", "demo", images=4, changes=["width_max=48"])
+    assert run.config["images_optimised"] == 4
+
+
+def test_what_is_free_respects_a_limit_of_the_process():
+    """A limit on address space counts, less what is used already."""
+    assert resources.free_memory() > 1e8
+    done = subprocess.run([sys.executable, "-c", LIMITED], capture_output=True, check=True)
+    assert 2 << 30 < float(done.stdout) < 4 << 30
+
+
+def test_what_is_free_respects_a_control_group(tmp_path, monkeypatch):
+    """Version 2, and version 1 below a folder of its own; files in memory may be dropped."""
+    monkeypatch.setattr(resources, "CGROUP", tmp_path)
+    for folder, names in (
+        (tmp_path, ("memory.max", "memory.current")),
+        (tmp_path / "memory", ("memory.limit_in_bytes", "memory.usage_in_bytes")),
+    ):
+        folder.mkdir(exist_ok=True)
+        for name, value in zip(names, (30_000_000, 20_000_000), strict=True):
+            (folder / name).write_text(f"{value}\n")
+        (folder / "memory.stat").write_text("anon 12\ninactive_file 5000000\n")
+        assert resources.free_memory() == 15_000_000
+        (folder / names[0]).write_text("max\n")
+        assert resources.free_memory() > 1e8
+
+
+def test_free_space_is_that_of_the_disk_that_will_be_written_to(tmp_path):
+    """Also where the folder does not exist yet."""
+    free = shutil.disk_usage(tmp_path).free
+    resources.require(resources.Need(disk=0.5 * free), tmp_path / "a" / "b", "--out")
+    with pytest.raises(ResourceError, match="disk space"):
+        resources.require(resources.Need(disk=2.0 * free), tmp_path / "a" / "b", "--out")
