@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from . import arrays, espros, kinect2, mlx7502x, oak, sequence_folders, voxel
+from . import arrays, cornell_box, espros, kinect2, mlx7502x, oak, sequence_folders, voxel
 from .imported import Imported
 from .keys import Key, Settings
 
@@ -47,6 +47,12 @@ KINDS = {
             about="a ToeRF folder of phasors, with its truth",
             read=sequence_folders.read_torf,
             keys=sequence_folders.KEYS,
+        ),
+        Kind(
+            name="cornell_box",
+            about="a sequence of the Cornell-Box data set with motion, with its truth",
+            read=cornell_box.read,
+            keys=cornell_box.KEYS,
         ),
         Kind(
             name="espros",
