@@ -127,8 +127,6 @@ def truth(frames=FRAMES):
 class AnalyticRun:
     """Looks like a finished run; what it renders is the truth plus the errors above."""
 
-    fallback = None
-
     def __init__(self, folder, *, with_truth=True, colour=False):
         self.path = Path(folder) / "run"
         self.path.mkdir(parents=True)
@@ -192,9 +190,13 @@ class AnalyticRun:
         """The sequence this run pretends to be made from."""
         return Sequence.open(self.config["sequence"])
 
-    def renderer(self, images=(), *, f_mod_hz=None, fallback=True):  # noqa: ARG002
+    def renderer(self, images=(), *, f_mod_hz=None, corrected=True):  # noqa: ARG002
         """What ``gftorf render`` asks for every image."""
         return self.render
+
+    def corrected(self, rendering, time, camera):  # noqa: ARG002
+        """What it renders is final."""
+        return rendering
 
     def render(self, time, camera=None, *, extra=None):
         """Truth and its quads at the nearest raw frame, plus the known errors."""

@@ -48,7 +48,7 @@ def fallback_of(measured, quads):
         config={},
         camera=camera_of(measured, 0),
         sensor=Sensor(f_mod_hz=measured.calibration.f_mod_hz),
-        renderer=lambda images, f_mod_hz, fallback: render,  # noqa: ARG005
+        renderer=lambda images, f_mod_hz, corrected: render,  # noqa: ARG005
     )
     return Fallback.of(residuals(run, measured), measured, run.camera, torch.device("cpu"))
 

@@ -43,7 +43,7 @@ def explained(measured, clean, width=48, shown=TRUE, **config):
         config={"size_optimised": [small_.width, small_.height], **config},
         camera=camera_of(measured, 0),
         sensor=Sensor(f_mod_hz=measured.calibration.f_mod_hz),
-        renderer=lambda images, f_mod_hz, fallback: render,  # noqa: ARG005
+        renderer=lambda images, f_mod_hz, corrected: render,  # noqa: ARG005
     )
     return residuals(run, measured)
 

@@ -32,7 +32,7 @@ QUARTET_TEXT = (
     "Each raw frame has its own time, during which objects move. The closed form takes the frames "
     "as simultaneous, hence the false distances along moving outlines."
 )
-SOURCE_NAMES = dict(zip(SOURCES, ("fit", "temporal mean", "closed form"), strict=True))
+SOURCE_NAMES = dict(zip(SOURCES, ("fit", "temporal mean", "closed form", "outline"), strict=True))
 CHI_SQUARE_SHOWN = (0.1, 1000.0)  # on a logarithmic scale
 TITLES = {"closed_form": "closed form", "d": "ours, d", "d_tof": "ours, d_ToF"}
 

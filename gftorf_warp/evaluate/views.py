@@ -64,7 +64,7 @@ class Views:
     one."""
 
     d_fit: Float[np.ndarray, "S H W"] | None = None
-    """Rendered mean distance before the measurement replaced it [m]; None: it never does."""
+    """Rendered mean distance before it was corrected [m]; None: it never is."""
     source: UInt8[np.ndarray, "S H W"] | None = None
     """Where ``d`` is from, an index of ``SOURCES``; None: from the fit everywhere."""
     over_time: Mapping[str, Float[np.ndarray, "S H W"]] = field(default_factory=dict)
@@ -111,17 +111,15 @@ def gather(
         name: [] for name in ("d", "opacity", "d_median", "d_tof", "quad_rendered")
     }
     first, *further = sequence.frequencies
-    renderers = {first: run.renderer(RENDERED, fallback=False)}
+    renderers = {first: run.renderer(RENDERED, corrected=False)}
     renderers |= {f: run.renderer(RENDERED, f_mod_hz=f) for f in further}
     for count, n in enumerate(frames, start=1):
         time = float(sequence.times[n])
         light = {f: render(time, camera_at(run, sequence, time)) for f, render in renderers.items()}
         fit, measured = light[first], light[float(sequence.frame_frequencies[n])]
-        rendering = fit
-        if run.fallback is not None:
-            rendering = run.fallback.applied(fit, time, camera_at(run, sequence, time))
+        rendering = run.corrected(fit, time, camera_at(run, sequence, time))
+        if rendering.source is not None:
             rows.setdefault("d_fit", []).append(fit.distance.cpu().numpy().copy())
-            assert rendering.source is not None, "a fallback says where a distance is from"
             rows.setdefault("source", []).append(rendering.source.cpu().numpy())
         others = [light[f].quads for f in further]
         images = {

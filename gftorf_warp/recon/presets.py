@@ -74,7 +74,7 @@ def best(recorded: Recorded = Recorded()) -> ReconSettings:
     both started from measured phase. A moving camera has nodes instead, as ``demo`` has.
     """
     if recorded.camera_moves:
-        return replace(demo(recorded), preset="best", fallback=True)
+        return replace(demo(recorded), preset="best", fallback=True, outlines=True)
     rates = Rates(
         mean=1e-3,
         log_scale=3e-2,
@@ -100,6 +100,7 @@ def best(recorded: Recorded = Recorded()) -> ReconSettings:
         scale_max=0.05 * recorded.scene_scale,  # where the paper prunes (section 6.6)
         background=0.3,
         fallback=True,
+        outlines=True,
     )
 
 

@@ -62,7 +62,7 @@ class Fitted(Protocol):
         """The sensor, with the four canonical shifts."""
 
     def renderer(
-        self, images: Iterable[str], *, f_mod_hz: float | None, fallback: bool
+        self, images: Iterable[str], *, f_mod_hz: float | None, corrected: bool
     ) -> Callable[[float, Camera], Rendering]:
         """A function of time [s] and camera."""
 
@@ -165,7 +165,7 @@ def residuals(run: Fitted, sequence: Sequence) -> Residuals | None:
     if noise is None:
         return None
     shown = ("quads", "phasor", "distance")
-    render = {f: run.renderer(shown, f_mod_hz=f, fallback=False) for f in sequence.frequencies}
+    render = {f: run.renderer(shown, f_mod_hz=f, corrected=False) for f in sequence.frequencies}
     chi_square, scaled, distance = [], [], []
     for i in measured.complete_quartets:
         apart, first = _quartet(run, measured, i, render, camera)

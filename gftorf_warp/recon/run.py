@@ -33,7 +33,7 @@ from ..scene.distortion import Distortion as Lens
 from ..scene.gaussians import GaussianField
 from ..scene.motion import Motion, Still
 from ..scene.sensor import Sensor
-from . import checkpoint, closed_form, edits, source
+from . import checkpoint, closed_form, edits, outlines, source
 from .fallback import Fallback
 from .folder import read_config
 from .residuals import Residuals, residuals
@@ -156,8 +156,9 @@ class Run:
     ) -> Rendering:
         """What the sensor would see at one instant, before black.
 
-        With the setting ``fallback``, the distance is that of the measurement where this knows
-        better, which ``source`` states.
+        With the settings ``fallback`` and ``outlines``, the distance is that of the measurement
+        where this knows better, and of one of two surfaces in mixed pixels, which ``source``
+        states.
 
         Quads (of the four canonical shifts) and phasor are in the units of the sequence, colour in
         those of its colour images, distances in metres. No gradients. Before the first raw frame
@@ -183,7 +184,17 @@ class Run:
             phasor=rendering.phasor / self.quad_scale,
             colour=None if rendering.colour is None else rendering.colour / self.colour_scale,
         )
-        return self.fallback.applied(rendering, time, camera) if self.fallback else rendering
+        return self.corrected(rendering, time, camera, f_mod_hz)
+
+    def corrected(
+        self, rendering: Rendering, time: float, camera: Camera, f_mod_hz: float | None = None
+    ) -> Rendering:
+        """A rendering, with its phasor, after the settings ``fallback`` and ``outlines``."""
+        if self.fallback is not None:
+            rendering = self.fallback.applied(rendering, time, camera)
+        if self.config["settings"].get("outlines"):
+            rendering = outlines.resolved(rendering, self._at(f_mod_hz))
+        return rendering
 
     def _at(self, f_mod_hz: float | None) -> Sensor:
         return (
@@ -197,7 +208,7 @@ class Run:
         images: Iterable[str] = (*DIFFERENTIABLE, "colour"),
         *,
         f_mod_hz: float | None = None,
-        fallback: bool = True,
+        corrected: bool = True,
     ) -> Callable[[float, Camera], Rendering]:
         """:meth:`render` for many images: a function of time [s] and camera, which keeps what
         images share.
@@ -209,9 +220,12 @@ class Run:
             images: Names of what is wanted of quads, phasor, colour, distance, opacity and
                 distortion; others have no elements and cost nothing.
             f_mod_hz: Modulation frequency of quads and phasor [Hz]; None: the first of the sensor.
-            fallback: Whether the setting of that name applies.
+            corrected: Whether the settings ``fallback`` and ``outlines`` apply.
         """
         names = frozenset(images) - {"source"}
+        corrected = corrected and "distance" in names and self._corrects
+        if corrected:
+            names |= {"phasor"}
         field = self.field if "colour" in names else replace(self.field, colour_sh=None)
         sensor = replace(
             self._at(f_mod_hz),
@@ -220,10 +234,13 @@ class Run:
         optimised = self.camera.resized(*self.config["size_optimised"])
         known = field, self.motion, self.binding, sensor, self.render_settings, optimised, names
         replay = Replay(*known, colour_scale=self.colour_scale)
-        if "distance" not in names or not fallback or self.fallback is None:
+        if not corrected:
             return replay
-        measured = self.fallback
-        return lambda time, camera: measured.applied(replay(time, camera), time, camera)
+        return lambda time, camera: self.corrected(replay(time, camera), time, camera, f_mod_hz)
+
+    @property
+    def _corrects(self) -> bool:
+        return bool(self.config["settings"].get("outlines")) or self.fallback is not None
 
     @functools.cached_property
     def explained(self) -> Residuals | None:
@@ -391,7 +408,7 @@ class ClosedForm(Run):
         images: Iterable[str] = (),  # noqa: ARG002
         *,
         f_mod_hz: float | None = None,
-        fallback: bool = True,  # noqa: ARG002
+        corrected: bool = True,  # noqa: ARG002
     ) -> Callable[[float, Camera], Rendering]:
         """:meth:`render`: there is nothing that images share."""
         return functools.partial(self.render, f_mod_hz=f_mod_hz)

@@ -304,6 +304,9 @@ class ReconSettings:
     fallback: bool = False
     """Whether the finished run's distance gives way to the measurement where that knows better, see
     recon/fallback.py; the optimisation is the same."""
+    outlines: bool = False
+    """Whether mixed pixels of the finished run have the distance of the surface at their centre,
+    see recon/outlines.py; the optimisation is the same."""
     restarts_max: int = 3
     """Restarts of collapsed random starts, and reinitialisations of a dead network, at most."""
 

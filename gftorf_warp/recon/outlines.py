@@ -1,0 +1,167 @@
+"""Outlines: which of two surfaces the ray through the centre of a mixed pixel meets.
+
+A pixel at an outline sees two surfaces, and its phasor is their sum: a distance decoded from it, or
+rendered by Gaussians that explain it, lies between the two, or outside of both where their phases
+are far apart. What the neighbours on both sides measure tells the shares: with amplitudes a and
+phases psi of both and the share s of the pixel's area that the first one covers,
+
+    P = s a_1 exp(i psi_1) + (1 - s) a_2 exp(i psi_2)
+
+The ray through the centre meets the first one if s > 1/2, for a straight outline. The amplitude of
+the surface behind is that of its neighbour; the one in front may be turning away at its outline, so
+that its amplitude is extrapolated from two. Both are known to some 30 %, so every share has a
+likelihood, and the distance is the mean of both surfaces' distances, weighted by the odds that the
+centre is on them. Pairs of neighbours in four directions vote with their likelihoods, against a
+surface of the pixel's own, of which any phasor is as likely: its distance is the rendered one.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from ..data.steps import STEP_M
+from ..render.api import Rendering
+from ..scene.sensor import Sensor
+
+OUTLINE = 3  # in a map of sources, see fallback.py
+DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))  # (rows, columns)
+PASSES = 2  # the second one sees neighbours that are no mixtures any more
+SHARES = 21  # of the area of a pixel, from 0 to 1
+BLUR = 0.08  # [pixels] outlines are not straight: how sure the share makes of the centre
+SMOOTH = 0.25  # [steps] distances of two neighbours on one side differ by less
+AMPLITUDE_SPREAD = 0.3  # [1] standard deviation of an extrapolated amplitude, relative
+EXTRAPOLATION = 0.7  # [1] at most, of the logarithm of the amplitude
+MODEL_ERROR = 0.01  # [amplitudes] of a rendered phasor, of the largest amplitude nearby
+LEAST = 1e-12  # [amplitudes] below it nothing is seen
+
+
+def resolved(rendering: Rendering, sensor: Sensor) -> Rendering:
+    """A rendering with the distances of its mixed pixels resolved.
+
+    Args:
+        rendering: With distance and phasor.
+        sensor: Whose first frequency the phasor has.
+
+    Returns:
+        ``source`` is ``OUTLINE`` where the distance changed by more than a hundredth of the step.
+    """
+    re, im, _ = rendering.phasor
+    fit = distance = rendering.distance
+    for _ in range(PASSES):
+        distance = _resolved(distance, torch.complex(re, im), sensor)
+    source = rendering.source
+    source = torch.zeros_like(fit, dtype=torch.uint8) if source is None else source
+    changed = (distance - fit).abs() > 0.01 * STEP_M
+    return replace(rendering, distance=distance, source=source.masked_fill(changed, OUTLINE))
+
+
+class _Side(NamedTuple):
+    """What P pixels have on one side."""
+
+    distance: Float[Tensor, "P"]
+    """Of the surface there [m]."""
+    amplitude: Float[Tensor, "P"]
+    """Of the phasor if the surface filled the pixel."""
+
+
+def _resolved(
+    distance: Float[Tensor, "H W"], phasor: Tensor, sensor: Sensor
+) -> Float[Tensor, "H W"]:
+    """One pass over an image."""
+    amplitude = phasor.abs().clamp_min(LEAST)
+    nearby = torch.nn.functional.max_pool2d(amplitude[None], 3, stride=1, padding=1)[0]
+    total = torch.full_like(distance, 1.0 / math.pi)  # density of any phasor in a unit disc
+    weighted = total * distance
+    on_first = torch.special.ndtr((_shares(distance.device) - 0.5) / BLUR)
+    for direction in DIRECTIONS:
+        before, after = (-direction[0], -direction[1]), direction
+        found = _between_two_surfaces(distance, before, after) & (amplitude > LEAST)
+        pixels = torch.nonzero(found, as_tuple=True)
+        first, second = _sides(distance, amplitude, pixels, (before, after))
+        likelihood = _likelihood(phasor[pixels], nearby[pixels], first, second, sensor) / SHARES
+        odds = (likelihood * on_first[:, None]).sum(dim=0)
+        both = likelihood.sum(dim=0)
+        mean = odds * first.distance + (both - odds) * second.distance
+        weighted = weighted.index_put(pixels, mean, accumulate=True)
+        total = total.index_put(pixels, both, accumulate=True)
+    return weighted / total
+
+
+def _shares(device: torch.device) -> Float[Tensor, "s"]:
+    return torch.linspace(0.0, 1.0, SHARES, device=device)
+
+
+def _between_two_surfaces(
+    distance: Float[Tensor, "H W"], before: tuple[int, int], after: tuple[int, int]
+) -> Bool[Tensor, "H W"]:
+    """Pixels with a step between the neighbours on both sides, each of which has a neighbour of its
+    own at nearly the same distance.
+    """
+    jump = (_neighbour(distance, before) - _neighbour(distance, after)).abs()
+    found = jump > STEP_M
+    for towards in (before, after):
+        beside = _neighbour(distance, towards) - _neighbour(distance, towards, 2)
+        found &= beside.abs() < SMOOTH * jump
+    return found
+
+
+def _neighbour(
+    image: Float[Tensor, "H W"], towards: tuple[int, int], steps: int = 1
+) -> Float[Tensor, "H W"]:
+    """The image at every pixel's neighbour, the pixel at the border beyond it."""
+    rows, columns = (
+        (torch.arange(size, device=image.device) + steps * along).clamp(0, size - 1)
+        for size, along in zip(image.shape, towards, strict=True)
+    )
+    return image[rows[:, None], columns]
+
+
+def _sides(
+    distance: Float[Tensor, "H W"],
+    amplitude: Float[Tensor, "H W"],
+    pixels: tuple[Int[Tensor, "P"], ...],
+    towards: tuple[tuple[int, int], tuple[int, int]],
+) -> tuple[_Side, _Side]:
+    """The surfaces on both sides of some pixels."""
+    first, second = (_neighbour(distance, direction)[pixels] for direction in towards)
+    light, amplitudes = torch.log(amplitude), []
+    for direction, in_front in zip(towards, (first < second, second < first), strict=True):
+        once, twice = (_neighbour(light, direction, steps)[pixels] for steps in (1, 2))
+        beyond = (once - twice).clamp(-EXTRAPOLATION, EXTRAPOLATION)
+        amplitudes.append(torch.exp(torch.where(in_front, once + beyond, once)))
+    return _Side(first, amplitudes[0]), _Side(second, amplitudes[1])
+
+
+def _likelihood(
+    phasor: Tensor, unit: Float[Tensor, "P"], first: _Side, second: _Side, sensor: Sensor
+) -> Float[Tensor, "s P"]:
+    """Density of measuring a phasor [P] over ``unit`` if the first surface covers each share.
+
+    The density is normal: both amplitudes are uncertain along their phases, and a model error in
+    any direction.
+    """
+    shares = _shares(phasor.device)[:, None]
+    apart, covariance = -phasor / unit, torch.zeros_like(unit)
+    variance_re = variance_im = torch.full_like(unit, MODEL_ERROR**2)
+    for share, side in ((shares, first), (1.0 - shares, second)):
+        phase = sensor.phase_slope * side.distance + sensor.phase_offset
+        direction = torch.polar(torch.ones_like(phase), phase)
+        length = share * side.amplitude / unit
+        spread = (AMPLITUDE_SPREAD * length).square()
+        apart = apart + length * direction
+        variance_re = variance_re + spread * direction.real.square()
+        variance_im = variance_im + spread * direction.imag.square()
+        covariance = covariance + spread * direction.real * direction.imag
+    determinant = variance_re * variance_im - covariance.square()
+    square = (
+        variance_im * apart.real.square()
+        - 2.0 * covariance * apart.real * apart.imag
+        + variance_re * apart.imag.square()
+    ) / determinant
+    return torch.exp(-0.5 * square) / (2.0 * math.pi * determinant.sqrt())

@@ -1,0 +1,154 @@
+"""Mixed pixels at outlines: images whose pixels average two surfaces by area, as a sensor does."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from moving_box import recording
+from small_runs import demo
+
+from gftorf_warp.constants import FRAME_RATE_HZ
+from gftorf_warp.data.write import write
+from gftorf_warp.evaluate.compare import compare
+from gftorf_warp.recon import outlines
+from gftorf_warp.recon.train import reconstruct
+from gftorf_warp.render.api import Rendering
+from gftorf_warp.scene.sensor import Sensor
+
+HEIGHT, WIDTH, RAYS = 24, 32, 16
+SENSOR = Sensor(phase_offset=0.4)
+
+
+def scene(inside, near, far, bright=(0.9, 0.5)):
+    """Distance at the centres of the pixels [m], and the mean phasor of their areas.
+
+    Args:
+        inside: Whether positions (x, y) [px] are on the near surface.
+        near: Its distance [m].
+        far: Distance of the other one [m].
+        bright: Reflectivities of both.
+    """
+    at = (np.arange(HEIGHT * RAYS) + 0.5) / RAYS, (np.arange(WIDTH * RAYS) + 0.5) / RAYS
+    y, x = np.meshgrid(*at, indexing="ij")
+    front = inside(x, y)
+    distance = np.where(front, near, far)
+    amplitude = np.where(front, *bright) / distance**2
+    phasor = amplitude * np.exp(1j * (SENSOR.phase_slope * distance + SENSOR.phase_offset))
+    mean = phasor.reshape(HEIGHT, RAYS, WIDTH, RAYS).mean(axis=(1, 3))
+    y, x = np.meshgrid(np.arange(HEIGHT) + 0.5, np.arange(WIDTH) + 0.5, indexing="ij")
+    return np.where(inside(x, y), near, far), mean
+
+
+def decoded(phasor):
+    """Distance of a phasor [m], in [0, range)."""
+    phase = np.mod(np.angle(phasor) - SENSOR.phase_offset, 2.0 * math.pi)
+    return phase / SENSOR.phase_slope
+
+
+def resolved(distance, phasor):
+    """Distance and source after resolving the outlines of a rendering."""
+    none, flat = torch.zeros(0, *distance.shape), torch.zeros(0, distance.shape[1])
+    images = torch.tensor(np.stack([phasor.real, phasor.imag, abs(phasor)]), dtype=torch.float32)
+    rendering = Rendering(
+        quads=none,
+        phasor=images,
+        colour=None,
+        distance=torch.tensor(distance, dtype=torch.float32),
+        opacity=flat,
+        distortion=flat,
+        distance_median=flat,
+        extra=None,
+        screen=None,
+    )
+    given = outlines.resolved(rendering, SENSOR)
+    return given.distance.numpy(), given.source.numpy()
+
+
+SHAPES = {
+    "edge": lambda x, y: x < 13.27 + 0.1 * y,
+    "disc": lambda x, y: np.hypot(x - 15.3, y - 11.6) < 7.4,
+    "stick": lambda x, y: abs(x - 12.1 - 0.7 * y) < 3.3,
+}
+DISTANCES = {"near": (2.0, 2.6), "opposite": (1.5, 5.4), "beyond_half": (1.0, 6.8)}  # [m]
+
+
+@pytest.mark.parametrize("distances", DISTANCES.values(), ids=DISTANCES)
+@pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)
+def test_mixed_pixels_have_the_distance_at_their_centre(shape, distances):
+    """The mean squared error of what the phasor decodes to falls to a third or less, and no
+    pixel away from the outline changes.
+    """
+    truth, phasor = scene(shape, *distances)
+    before = decoded(phasor)
+    after, source = resolved(before, phasor)
+    mixed = abs(before - truth) > 1e-3
+    assert mixed.sum() > 20
+    assert np.mean((after - truth) ** 2) < 0.36 * np.mean((before - truth) ** 2)
+    sides = abs(after - truth) < 0.25 * (distances[1] - distances[0])
+    assert sides[mixed].mean() > 0.7
+    beside = np.stack([np.roll(mixed, shift, axis) for shift in (-1, 1) for axis in (0, 1)])
+    away = ~(mixed | beside.any(axis=0))
+    np.testing.assert_allclose(after[away], truth[away], atol=0.03)
+    assert set(np.unique(source)) == {0, outlines.OUTLINE}
+    assert (source == outlines.OUTLINE)[mixed].mean() > 0.9
+
+
+def test_a_slope_and_a_texture_are_no_outline():
+    """A floor seen at a grazing angle, and a chessboard on a wall."""
+    y, x = np.mgrid[:HEIGHT, :WIDTH]
+    floor = 1.5 + 0.09 * y
+    board = np.where((x // 4 + y // 4) % 2, 0.2, 0.9)
+    for distance in (floor, np.full_like(floor, 2.0)):
+        phasor = board / distance**2 * np.exp(1j * SENSOR.phase_slope * distance)
+        after, source = resolved(distance, phasor)
+        np.testing.assert_allclose(after, distance, rtol=1e-6)
+        assert not source.any()
+
+
+def test_a_surface_of_its_own_stays():
+    """A pixel between two surfaces whose phasor is no mixture of theirs: a third one is there."""
+    truth, phasor = scene(SHAPES["edge"], 2.0, 5.0)
+    row, column = 12, int(np.argmax(truth[12] == 5.0))
+    phasor[row, column] = 0.12 * np.exp(1j * (SENSOR.phase_slope * 3.3 + SENSOR.phase_offset))
+    before = decoded(phasor)
+    after, _ = resolved(before, phasor)
+    assert before[row, column] == pytest.approx(3.3)
+    assert after[row, column] == pytest.approx(3.3, abs=0.15)
+
+
+def test_black_images_stay():
+    """Nothing is seen, nothing is divided by zero."""
+    distance = np.where(np.arange(WIDTH) < 10, 1.0, 3.0) * np.ones((HEIGHT, 1))
+    after, source = resolved(distance, np.zeros((HEIGHT, WIDTH), dtype=complex))
+    np.testing.assert_allclose(after, distance, rtol=1e-6)
+    assert not source.any()
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A short fit with the setting alone."""
+    folder = tmp_path_factory.mktemp("runs")
+    write("ftorf", folder / "box", *recording(frames=16))
+    return reconstruct(folder / "box", folder / "run", demo(images=60, outlines=True))
+
+
+def test_a_run_with_the_setting_says_where_outlines_are(run):
+    """Run.render and its renderer agree; without a fallback the source is the fit or an outline."""
+    time = 9 / FRAME_RATE_HZ
+    given = run.render(time)
+    assert set(given.source.unique().tolist()) == {0, outlines.OUTLINE}
+    quick = run.renderer(("distance",))(time, run.camera)
+    torch.testing.assert_close(quick.distance, given.distance, atol=1e-4, rtol=0)
+    bare = run.renderer(("distance",), corrected=False)(time, run.camera)
+    same = given.source == 0
+    torch.testing.assert_close(bare.distance[same], quick.distance[same], atol=2e-3, rtol=0)
+    assert not torch.equal(bare.distance, quick.distance)
+
+
+def test_compare_scores_what_was_resolved(run):
+    """The share of outlines, and the error of the fit alone beside it."""
+    scores = compare(run)
+    assert 0.0 < scores["source"]["outline"] < 0.2
+    assert scores["d_fit_mse_x100"] != scores["d_mse_x100"]
+    assert "outline" in (run.path / "report.html").read_text()
