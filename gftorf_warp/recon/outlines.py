@@ -38,25 +38,26 @@ SMOOTH = 0.25  # [steps] distances of two neighbours on one side differ by less
 AMPLITUDE_SPREAD = 0.3  # [1] standard deviation of an extrapolated amplitude, relative
 EXTRAPOLATION = 0.7  # [1] at most, of the logarithm of the amplitude
 MODEL_ERROR = 0.01  # [amplitudes] of a rendered phasor, of the largest amplitude nearby
-LEAST = 1e-12  # [amplitudes] below it nothing is seen
+LEAST = 1e-12  # [quad units] below it a neighbour is black
 
 
 def resolved(rendering: Rendering, sensor: Sensor) -> Rendering:
     """A rendering with the distances of its mixed pixels resolved.
 
     Args:
-        rendering: With distance and phasor.
+        rendering: With distance and phasor. What a fallback has replaced already stays.
         sensor: Whose first frequency the phasor has.
 
     Returns:
         ``source`` is ``OUTLINE`` where the distance changed by more than a hundredth of the step.
     """
-    re, im, _ = rendering.phasor
+    re, im = rendering.phasor[:2]
     fit = distance = rendering.distance
-    for _ in range(PASSES):
-        distance = _resolved(distance, torch.complex(re, im), sensor)
     source = rendering.source
     source = torch.zeros_like(fit, dtype=torch.uint8) if source is None else source
+    rendered = (source == 0) & (rendering.phasor[2] > 0.0)  # the others are measured, or black
+    for _ in range(PASSES):
+        distance = _resolved(distance, torch.complex(re, im), rendered, sensor)
     changed = (distance - fit).abs() > 0.01 * STEP_M
     return replace(rendering, distance=distance, source=source.masked_fill(changed, OUTLINE))
 
@@ -71,9 +72,9 @@ class _Side(NamedTuple):
 
 
 def _resolved(
-    distance: Float[Tensor, "H W"], phasor: Tensor, sensor: Sensor
+    distance: Float[Tensor, "H W"], phasor: Tensor, where: Bool[Tensor, "H W"], sensor: Sensor
 ) -> Float[Tensor, "H W"]:
-    """One pass over an image."""
+    """One pass over the pixels ``where`` a distance may change."""
     amplitude = phasor.abs().clamp_min(LEAST)
     nearby = torch.nn.functional.max_pool2d(amplitude[None], 3, stride=1, padding=1)[0]
     total = torch.full_like(distance, 1.0 / math.pi)  # density of any phasor in a unit disc
@@ -81,8 +82,8 @@ def _resolved(
     on_first = torch.special.ndtr((_shares(distance.device) - 0.5) / BLUR)
     for direction in DIRECTIONS:
         before, after = (-direction[0], -direction[1]), direction
-        found = _between_two_surfaces(distance, before, after) & (amplitude > LEAST)
-        pixels = torch.nonzero(found, as_tuple=True)
+        mixed = where & _between_two_surfaces(distance, before, after)
+        pixels = torch.nonzero(mixed, as_tuple=True)
         first, second = _sides(distance, amplitude, pixels, (before, after))
         likelihood = _likelihood(phasor[pixels], nearby[pixels], first, second, sensor) / SHARES
         odds = (likelihood * on_first[:, None]).sum(dim=0)
