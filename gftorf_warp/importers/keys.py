@@ -106,15 +106,16 @@ class Settings:
         """The error for a key whose value does not fit."""
         return InputError(f"{name}: not usable", where=self.path or CONFIG, why=why, fix=fix)
 
-    def file(self, name: str, root: Path) -> Path | None:
-        """The file that a key names, relative to the TOML file or the recording; None: not given.
+    def file(self, name: str, root: Path | None) -> Path | None:
+        """The file that a key names, relative to the TOML file or the recording ``root``; None: not
+        given.
 
         Raises:
             InputError: If it is in neither folder, or no file.
         """
         if not self[name]:
             return None
-        folders = [root if root.is_dir() else root.parent]
+        folders = [root if root.is_dir() else root.parent] if root else []
         folders += [self.path.parent] if self.path else []
         for folder in folders:
             path = folder / self[name]

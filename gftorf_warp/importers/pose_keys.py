@@ -1,0 +1,165 @@
+"""Keys of the camera's poses, and the pose of each raw frame that they give."""
+
+from __future__ import annotations
+
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+from jaxtyping import Float
+
+from .imported import Notes
+from .keys import Key, Settings
+from .raw_files import natural
+from .trajectory_files import FORMS, Trajectory, interpolated, read_trajectory
+
+DIRECTIONS, AXES = ("world_to_camera", "camera_to_world"), ("opencv", "opengl")
+UNSCALED = ("colmap", "nerfstudio")  # reconstructed from pictures: the unit of length is arbitrary
+
+
+def pose_keys(table: str, who: str) -> tuple[Key, ...]:
+    """Keys of the poses of a camera in a table."""
+    return (
+        Key(
+            name=f"{table}.file",
+            kind=str,
+            about=f"poses of the {who}: images.txt of COLMAP, a TUM trajectory, transforms.json of "
+            "nerfstudio, or matrices as .npy or text",
+            example="poses.txt",
+        ),
+        Key(
+            name=f"{table}.form",
+            kind=str,
+            about="form of that file",
+            example="tum",
+            choices=FORMS,
+        ),
+        Key(
+            name=f"{table}.metres_per_unit",
+            kind=float,
+            about="length of the file's unit [m]; colmap and nerfstudio do not know it",
+            example=1.0,
+            above=0.0,
+        ),
+        Key(
+            name=f"{table}.direction",
+            kind=str,
+            about="of matrices: what they take to what",
+            example=DIRECTIONS[0],
+            choices=DIRECTIONS,
+        ),
+        Key(
+            name=f"{table}.axes",
+            kind=str,
+            about="of matrices and tum: camera axes; opencv is x right, y down, z forward, opengl "
+            "x right, y up, z backward",
+            example="opencv",
+            default="opencv",
+            choices=AXES,
+        ),
+        Key(
+            name=f"{table}.start_s",
+            kind=float,
+            about="of tum: time in the file at which raw frame 0 was taken [s]",
+            example=1305031102.1758,
+        ),
+    )
+
+
+KEYS = pose_keys("poses", "ToF camera")
+
+
+def poses_of(
+    settings: Settings,
+    root: Path,
+    notes: Notes,
+    times: Float[np.ndarray, "F"],
+    cycle: int,
+    files: list[str] | None,
+    table: str = "poses",
+) -> Float[np.ndarray, "F 4 4"] | None:
+    """Pose of a camera at F times, world to camera [m]; None: no file of poses is named.
+
+    A file with times is interpolated. Of one without, the poses belong to the images that they
+    name, or else in their natural order to the times, or to the first of each cycle; between those
+    they are interpolated.
+
+    Args:
+        settings: Values of :func:`pose_keys`.
+        root: The recording; the file is there or beside the TOML file.
+        notes: What was understood is added.
+        times: Times [s] since raw frame 0.
+        cycle: Raw frames of a cycle.
+        files: Name of the image of each time; None: an image is not a file.
+        table: Table of the keys.
+
+    Raises:
+        UsageError, InputError: If keys are missing, or the file does not have these poses.
+    """
+    path = settings.file(f"{table}.file", root)
+    if path is None:
+        return None
+    settings.require(f"{table}.form")
+    form = settings[f"{table}.form"]
+    settings.require(
+        *([f"{table}.metres_per_unit"] if form in UNSCALED else []),
+        *([f"{table}.direction"] if form == "matrices" else []),
+        *([f"{table}.start_s"] if form == "tum" else []),
+    )
+    backward = settings[f"{table}.direction"] == DIRECTIONS[0]
+    opengl = settings[f"{table}.axes"] == "opengl"
+    found = read_trajectory(path, form, world_to_camera=backward, opengl=opengl)
+    metres = settings[f"{table}.metres_per_unit"] or 1.0
+    poses, how = _at(settings, table, found, times, cycle, files, path, notes)
+    poses[:, :3, 3] *= metres
+    axes = f", camera axes {settings[f'{table}.axes']}" if form in ("tum", "matrices") else ""
+    notes.understood.append(
+        f"{table}: {len(found.camera_to_world)} of {path.name} ({form}{axes}, {metres:g} m a unit "
+        f"({settings.source(f'{table}.metres_per_unit')})), {how}"
+    )
+    return np.linalg.inv(poses)
+
+
+def _at(
+    settings: Settings,
+    table: str,
+    found: Trajectory,
+    times: Float[np.ndarray, "F"],
+    cycle: int,
+    files: list[str] | None,
+    path: Path,
+    notes: Notes,
+) -> tuple[Float[np.ndarray, "F 4 4"], str]:
+    """Camera to world at each time in the file's unit, and how it was found, in words."""
+    poses = found.camera_to_world
+    if found.stamps is not None:
+        wanted = times + settings[f"{table}.start_s"]
+        first, last = found.stamps[[0, -1]]
+        if wanted[0] < first or wanted[-1] > last:
+            why = (
+                f"raw frames are from {wanted[0]:.9g} to {wanted[-1]:.9g} s of {path.name}, which "
+            )
+            why += f"has poses from {first:.9g} to {last:.9g} s"
+            raise settings.wrong(f"{table}.start_s", why, "correct it, or the times")
+        return interpolated(wanted, found.stamps, poses), "interpolated"
+    if found.names is not None:
+        by_name = {_stem(name): pose for name, pose in zip(found.names, poses, strict=True)}
+        if files is not None and {_stem(name) for name in files} <= by_name.keys():
+            return np.stack([by_name[_stem(name)] for name in files]), "by the names of images"
+        order = sorted(range(len(poses)), key=lambda n: natural(found.names[n]))  # type: ignore[index]
+        poses = poses[order]
+    cycles = -(-len(times) // cycle)
+    if len(poses) == len(times):
+        return poses.copy(), "one for each, in their order"
+    if len(poses) != cycles:
+        why = f"expected {len(times)} poses, or one for each of {cycles} cycles, found {len(poses)}"
+        raise settings.wrong(f"{table}.file", f"{why} in {path}", "complete the poses")
+    notes.uncertain.append(
+        f"{path.name} has a pose for each cycle: it is taken as that of its first raw frame, and "
+        "the last stays until the end"
+    )
+    return interpolated(times, times[::cycle], poses), "one for each cycle, interpolated"
+
+
+def _stem(name: str) -> str:
+    """Name of an image without its suffix and folders."""
+    return PurePosixPath(name).stem
