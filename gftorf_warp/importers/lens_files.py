@@ -6,7 +6,6 @@ nerfstudio from their corners, so it is at 0.5.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,11 +13,11 @@ from typing import Any
 
 import numpy as np
 
+from ..data.texts import read_json
+from ..data.untrusted import read_text, unreadable
 from .text_files import numbers, read_rows
-from .untrusted import read_text, unreadable
 
 BYTES_MAX = 1 << 20  # a calibration has some thousand, with its pictures' corners
-JSON_MAX = 1 << 28  # transforms.json has the poses of all images, too
 MATRICES = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K", "M", "M1")
 LENSES = (
     *("distortion_coefficients", "distCoeffs", "dist_coeffs", "Distortion_Coefficients"),
@@ -72,22 +71,18 @@ def read_lens(path: Path, number: int | None = None) -> Lens:
     """
     if path.suffix.lower() == ".txt":
         return _colmap(path, number)
-    content = read_text(path, JSON_MAX if path.suffix.lower() == ".json" else BYTES_MAX)
-    if path.suffix.lower() == ".json" and '"fl_x"' in content:
+    if path.suffix.lower() == ".json" and "fl_x" in (content := read_object(path)):
         return _nerfstudio(path, content)
-    return _opencv(path, content)
+    return _opencv(path, read_text(path, BYTES_MAX))
 
 
-def read_json(path: Path, content: str) -> dict[str, Any]:
+def read_object(path: Path) -> dict[str, Any]:
     """The object in a JSON file.
 
     Raises:
         InputError: If it is none.
     """
-    try:
-        found = json.loads(content)
-    except (ValueError, RecursionError) as error:
-        raise unreadable(path, f"expected JSON, found {str(error)[:200]}") from error
+    found = read_json(path)
     if not isinstance(found, dict):
         raise unreadable(path, f"expected a JSON object, found {type(found).__name__}")
     return found
@@ -114,8 +109,7 @@ def _colmap(path: Path, number: int | None) -> Lens:
     return Lens(values=values, size=size, pixel_centre="half", form=f"COLMAP {words[1]}")
 
 
-def _nerfstudio(path: Path, content: str) -> Lens:
-    found = read_json(path, content)
+def _nerfstudio(path: Path, found: dict[str, Any]) -> Lens:
     model = found.get("camera_model", "OPENCV")
     keys = [*NERFSTUDIO, *DISTORTION, "k4", "k5", "k6", "w", "h"]
     stated = {key: found[key] for key in keys if key in found}

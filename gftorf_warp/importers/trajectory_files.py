@@ -13,10 +13,10 @@ from jaxtyping import Float
 
 from ..data.arrays import LIMITS
 from ..data.poses import rigid
+from ..data.untrusted import read_text, unreadable
 from ..errors import InputError
-from .lens_files import JSON_MAX, read_json
+from .lens_files import read_object
 from .text_files import numbers, read_rows
-from .untrusted import read_text, unreadable
 
 FORMS = ("colmap", "tum", "nerfstudio", "matrices")
 UNIT_TOLERANCE = 1e-2  # written with three digits, a unit quaternion is off by less
@@ -132,7 +132,7 @@ def _tum(path: Path) -> Trajectory:
 
 def _nerfstudio(path: Path) -> Trajectory:
     """transforms.json: camera to world, OpenGL's camera axes."""
-    frames = read_json(path, read_text(path, JSON_MAX)).get("frames")
+    frames = read_object(path).get("frames")
     if not isinstance(frames, list) or not frames or not all(isinstance(f, dict) for f in frames):
         raise unreadable(path, "expected a list frames of images, as nerfstudio writes it")
     matrices, names = [], []
