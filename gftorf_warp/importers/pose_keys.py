@@ -141,12 +141,12 @@ def _at(
             why += f"has poses from {first:.9g} to {last:.9g} s"
             raise settings.wrong(f"{table}.start_s", why, "correct it, or the times")
         return interpolated(wanted, found.stamps, poses), "interpolated"
-    if found.names is not None:
-        by_name = {_stem(name): pose for name, pose in zip(found.names, poses, strict=True)}
+    names = found.names
+    if names is not None:
+        by_name = {_stem(name): pose for name, pose in zip(names, poses, strict=True)}
         if files is not None and {_stem(name) for name in files} <= by_name.keys():
             return np.stack([by_name[_stem(name)] for name in files]), "by the names of images"
-        order = sorted(range(len(poses)), key=lambda n: natural(found.names[n]))  # type: ignore[index]
-        poses = poses[order]
+        poses = poses[sorted(range(len(names)), key=lambda n: natural(names[n]))]
     cycles = -(-len(times) // cycle)
     if len(poses) == len(times):
         return poses.copy(), "one for each, in their order"
