@@ -104,9 +104,10 @@ def read(source: Path, settings: Settings) -> Imported:
     lens = camera_keys.intrinsics_of(settings, notes, settings["raw.size"][0])
     exposures = timing.exposures_of(settings, len(quads))
     sequence = at_rest(quads, modulation, times, lens, notes, exposures=exposures)
+    turned = ", ".join(f"{-shift % 360:g}" for shift in settings["sensor.shifts_deg"])
     notes.uncertain.append(
         "the sign of PHASE_SEQ is not documented: if distances shrink where they should grow, "
-        f"write sensor.shifts_deg = {[-shift for shift in settings['sensor.shifts_deg']]}"
+        f"write sensor.shifts_deg = [{turned}]"
     )
     if not settings.given("sensor.shifts_deg"):
         notes.uncertain.append("PHASE_SEQ is taken as 0, 180, 90, 270, the default of the driver")

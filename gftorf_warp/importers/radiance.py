@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..data.arrays import SIDE_MAX
-from ..errors import InputError
+from ..data.untrusted import unreadable
 from .raw_files import raw_bytes, size_of
 
 HEAD_BYTES = 4096  # a header has a few lines
@@ -28,26 +28,22 @@ def read_radiance(path: Path, size: tuple[int, int] | None = None) -> Float[np.n
     head = data[:HEAD_BYTES].tobytes()
     found = SIZE.search(head)
     if not head.startswith(b"#?") or found is None:
-        raise _unreadable(path, f"expected a Radiance image, found {head[:16]!r}")
+        raise unreadable(path, f"expected a Radiance image, found {head[:16]!r}")
     shape = int(found[1]), int(found[2])
     if not (0 < min(shape) and max(shape) <= SIDE_MAX) or (size is not None and shape != size):
         expected = f"{size[1]}x{size[0]}" if size is not None else f"at most {SIDE_MAX} wide"
-        raise _unreadable(path, f"expected pixels {expected}, found {shape[1]}x{shape[0]}")
+        raise unreadable(path, f"expected pixels {expected}, found {shape[1]}x{shape[0]}")
     if size_of(path) - found.end() < 4 * shape[0]:  # a row takes at least four bytes
-        raise _unreadable(path, "truncated")
+        raise unreadable(path, "truncated")
     level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
         image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
-        raise _unreadable(path, str(error)[:200]) from error
+        raise unreadable(path, str(error)[:200]) from error
     finally:
         cv2.utils.logging.setLogLevel(level)
     if image is None or image.shape != (*shape, 3) or image.dtype != np.float32:
-        raise _unreadable(path, f"expected {shape[1]}x{shape[0]} pixels, found damaged ones")
+        raise unreadable(path, f"expected {shape[1]}x{shape[0]} pixels, found damaged ones")
     if not np.isfinite(image).all():
-        raise _unreadable(path, "pixels that are not finite")
+        raise unreadable(path, "pixels that are not finite")
     return np.ascontiguousarray(image[..., ::-1])  # OpenCV has blue first
-
-
-def _unreadable(path: Path, why: str) -> InputError:
-    return InputError("no Radiance image", where=path, why=why, fix="copy the file again")

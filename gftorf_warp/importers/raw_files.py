@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 
+from ..data.untrusted import unreadable
 from ..errors import InputError
 
 
@@ -24,8 +25,7 @@ def files_of(source: Path) -> list[Path]:
     try:
         found = [path for path in source.iterdir() if path.is_file() and path.name[0] != "."]
     except OSError as error:
-        why, fix = error.strerror or str(error), "check permissions and the disk"
-        raise InputError("cannot be listed", where=source, why=why, fix=fix) from error
+        raise unreadable(source, error.strerror or str(error)) from error
     if not found:
         why, fix = "expected the files of a recording, found none", "check the path"
         raise InputError("an empty folder", where=source, why=why, fix=fix)
@@ -45,9 +45,7 @@ def size_of(path: Path) -> int:
         InputError: If it is no file.
     """
     if not path.is_file():  # reading a pipe would block
-        found = "a folder" if path.is_dir() else "nothing that can be read"
-        why = f"expected a file, found {found}"
-        raise InputError("no such file", where=path, why=why, fix="check the path")
+        raise unreadable(path, f"expected a file, found {'a folder' if path.is_dir() else 'none'}")
     return path.stat().st_size
 
 
@@ -89,5 +87,4 @@ def raw_bytes(path: Path, first: int = 0, count: int | None = None) -> UInt8[np.
     try:
         return np.fromfile(path, np.uint8, count, offset=first)
     except OSError as error:
-        why, fix = error.strerror or str(error), "check permissions and the disk"
-        raise InputError("cannot be read", where=path, why=why, fix=fix) from error
+        raise unreadable(path, error.strerror or str(error)) from error
