@@ -221,8 +221,10 @@ def command_parsers() -> dict[str, Parser]:
     export.add_argument("run_folder", metavar="RUN", help="folder of the reconstruction")
     export.option("--out", "DIR", str, "folder to write", required=True)
     export.option("--sequence", "SEQ", str, MOVED)
-    formats = "any of ply (Gaussians), points, exr, npz, html, webm, mp4, gif, webp (ply)"
-    export.option("--format", "A,B", _list_of(str), formats, ["ply"], dest="formats")
+    formats = (
+        "any of ply (Gaussians), points, mesh, obj, exr, npz, html, webm, mp4, gif, webp (ply)"
+    )
+    export.option("--format", "A,B", _list_of(str), f"{formats} (ply)", ["ply"], dest="formats")
     moments = "seconds since raw frame 0 (each instant of the sequence)"
     export.option("--times", "S,S", _list_of(_number), moments)
     export.option("--every", "N", _positive, "every N-th instant of the sequence (1)", 1)

@@ -69,6 +69,7 @@ LAUNCHES = {  # file: what it launches
     "render/moved.py": "Gaussians at a time, before they are rendered again",
     "render/replay.py": "the number of pairs of a rendering",
     "render/trace.py": "rays through meshes, which share nothing with a rendering",
+    "render/surface.py": "surfaces from images of a rendering",
 }
 KNOWS_STREAMS = {  # streams, events and graphs of torch
     "render/cuda.py": "the one module of streams, events and graphs",

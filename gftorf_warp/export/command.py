@@ -11,7 +11,7 @@ from ..data.files import as_errors, atomic_folder
 from ..errors import UsageError
 from ..recon.folder import set_aside
 from ..recon.run import Run
-from . import film, images, points, scene_page, splats
+from . import film, images, mesh, points, scene_page, splats
 from .moments import Moments, Progress
 
 COLOURS = ("colour", "reflectivity")
@@ -31,6 +31,8 @@ class Format(NamedTuple):
 FORMATS = {
     "ply": Format("ply", splats.write, coloured=True),
     "points": Format("points", points.write, coloured=True),
+    "mesh": Format("mesh", functools.partial(mesh.write, kind="ply")),
+    "obj": Format("obj", functools.partial(mesh.write, kind="obj")),
     "exr": Format("exr", images.write_exrs),
     "npz": Format("npz", images.write_npzs),
     "html": Format("scene.html", scene_page.write, coloured=True),
