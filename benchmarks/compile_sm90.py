@@ -21,6 +21,7 @@ from pathlib import Path
 
 import warp as wp
 
+from gftorf_warp.kernels.meshing import signed_distance
 from gftorf_warp.kernels.motion import displace, move
 from gftorf_warp.kernels.network import (
     encoding,
@@ -79,6 +80,7 @@ def modules(arch: int) -> dict[str, wp.Module]:
         "sums": ordered_sums.means.module,
         "trace": rays.trace_hits.module,
         "paths": light_paths.trace_light.module,
+        "surface": signed_distance.fuse.module,
         "perceptron": perceptron.pack.module,
         "slopes": gradient_scaling.add_partials.module,
         "rows": gradient_rows.list_rows.module,

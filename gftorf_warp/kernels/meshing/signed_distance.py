@@ -55,8 +55,8 @@ def fuse(
     voxel: float,  # distance of neighbouring nodes [m]
     truncation: float,  # largest distance behind a surface that counts [m]
     # Out:
-    field: wp.array3d[float],  # [X, Y, Z] signed distance over the truncation [1]; 1 where hidden
-    hidden: wp.array3d[wp.uint8],  # [X, Y, Z] whether no camera knows anything about a node [flag]
+    field: wp.array3d[float],  # [X, Y, Z] signed distance over the truncation [1], free if hidden
+    hidden: wp.array3d[wp.uint8],  # [X, Y, Z] whether no camera knows of a node [flag]
 ):
     """One node of the grid, in all images."""
     i, j, k = wp.tid()
