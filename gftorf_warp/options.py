@@ -78,8 +78,10 @@ def parse(arguments: list[str]) -> argparse.Namespace:
     """Options of one command as attributes; ``command`` is its name.
 
     Raises:
-        UsageError: If the command or an option is unknown, or a value is invalid.
+        UsageError: If the command or an option is unknown, or a value is invalid or not UTF-8.
     """
+    for argument in arguments:
+        _refuse_other_encodings(argument)
     command = next((a for a in arguments if not a.startswith("-")), None)
     parsers = command_parsers()
     if command is None:
@@ -93,6 +95,16 @@ def parse(arguments: list[str]) -> argparse.Namespace:
     rest = list(arguments)
     rest.remove(command)
     return parsers[command].parse(rest)
+
+
+def _refuse_other_encodings(argument: str) -> None:
+    """Names go to JSON, EXR and HTML files, which hold UTF-8."""
+    try:
+        argument.encode("utf-8")
+    except UnicodeEncodeError as error:
+        shown = ascii(argument)
+        why, fix = f"byte {error.start} is not UTF-8", "use another name, or a link of another name"
+        raise UsageError("a name that cannot be stored", where=shown, why=why, fix=fix) from error
 
 
 def top_parser(parsers: dict[str, Parser]) -> Parser:

@@ -45,7 +45,7 @@ def _line(row: dict[str, float | int | None]) -> str:
 @contextmanager
 def log_to(path: Path) -> Iterator[None]:
     """Append the package's log to a file, with times, while a run is going on."""
-    handler = logging.FileHandler(path, encoding="utf-8")
+    handler = logging.FileHandler(path, encoding="utf-8", errors="backslashreplace")
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
     handler.setLevel(logging.INFO)
     before = LOG.level

@@ -18,24 +18,22 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from ..constants import CANONICAL_SHIFTS
 from ..data.sequence import Sequence
 from ..data.synchronised import synchronised
 from ..data.temporal import averaged
 from ..errors import InputError
 from ..render.api import Rendering, rasterize
-from ..render.buffers import ClampGradient, Distortion, RenderSettings, SplatDistance, Stop, Support
+from ..render.buffers import RenderSettings
 from ..render.inputs import DIFFERENTIABLE
 from ..render.replay import Replay
 from ..render.series import on_host
 from ..scene.camera import Camera
-from ..scene.distortion import Distortion as Lens
 from ..scene.gaussians import GaussianField
 from ..scene.motion import Motion, Still
 from ..scene.sensor import Sensor
 from . import checkpoint, closed_form, edits, outlines, source
 from .fallback import Fallback
-from .folder import read_config
+from .read_back import read_back, render_settings
 from .residuals import Residuals, residuals
 from .settings import FlowSource, Method
 from .state import field_and_motion
@@ -74,11 +72,8 @@ class Run:
             Gaussians and motion are finite.
         """
         path = Path(path)
-        config = read_config(path)
-        camera = _camera(config["camera"])
-        stored = config["sensor"]
-        further = tuple(stored.get("further_hz", ()))
-        sensor = Sensor(**stored | {"further_hz": further}, shifts=CANONICAL_SHIFTS)
+        found = read_back(path)
+        config, camera, sensor = found.config, found.camera, found.sensor
         kinds = {Method.CTOF: ClosedForm, Method.TEMPORAL: Temporal, Method.FLOW2D: Flow2D}
         if (kind := kinds.get(config["settings"].get("method"))) is not None:
             return kind.of(path, config, camera, sensor, device)
@@ -301,16 +296,7 @@ class Run:
     @property
     def render_settings(self) -> RenderSettings:
         """How the run was rendered while it was optimised."""
-        stored = dict(self.config["settings"]["render"])
-        kinds = {
-            "support": Support,
-            "stop": Stop,
-            "clamp_gradient": ClampGradient,
-            "distortion": Distortion,
-            "splat_distance": SplatDistance,
-        }
-        named = {name: kind(stored[name]) for name, kind in kinds.items() if name in stored}
-        return RenderSettings(**stored | named)
+        return render_settings(self.config)
 
     @functools.cached_property
     def _held(self) -> weakref.WeakValueDictionary[str, Sequence]:
@@ -440,13 +426,6 @@ class Flow2D(ClosedForm):
     def _shown(self, time: float) -> Sequence:
         matcher = FlowSource(self.config["settings"]["flow"]).matcher
         return synchronised(self._measured, time, matcher).sequence
-
-
-def _camera(stored: dict) -> Camera:
-    """The camera that ``config.json`` describes."""
-    lens = Lens(**stored.get("distortion", {}))
-    pose = np.array(stored["camera_from_world"])
-    return Camera(**stored | {"camera_from_world": pose, "distortion": lens})
 
 
 def _footprint(field: GaussianField, camera: Camera) -> Float[Tensor, "N"]:

@@ -58,7 +58,7 @@ def link(run: Path, config: Mapping[str, Any], source: str | Path) -> dict[str, 
 def remember(run: Path, source: Path) -> None:
     """Let config.json name the folder of the sequence."""
     config, place = folder.read_config(run), str(source.resolve())
-    if config["sequence"] != place:
+    if config.get("sequence") != place:
         folder.write_config(run, config | {"sequence": place})
 
 
@@ -70,5 +70,10 @@ def _checked(source: Path, run: Path, config: Mapping[str, Any]) -> Sequence:
     if wanted is not None and (found := data_hash(sequence)) != wanted:
         why = f"{run} was made from data of SHA-256 {wanted[:12]}..., these have {found[:12]}..."
         fix = "name the sequence of the run with --sequence SEQ, or reconstruct this one"
+        raise InputError("not the sequence of the run", where=source, why=why, fix=fix)
+    camera, size = config["camera"], (sequence.width, sequence.height)
+    if (camera["width"], camera["height"]) != size:
+        why = f"{run} has {camera['width']}x{camera['height']} pixels, this {size[0]}x{size[1]}"
+        fix = "restore config.json from a copy"
         raise InputError("not the sequence of the run", where=source, why=why, fix=fix)
     return sequence

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from dataclasses import fields, is_dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from ..constants import CANONICAL_SHIFTS
+from ..constants import CANONICAL_SHIFTS, SPEED_OF_LIGHT
 from ..data.cycles import QUADS_MIN
+from ..data.sequence import DEPTH_RANGES_M
 from ..errors import UsageError
 from .assembly import has_mesh
 from .gaussian_cover import clearance
@@ -18,8 +22,35 @@ from .settings import ResolvedSettings, refuse, require
 
 # [m] nearer bodies fill the image, and a cover of them would need millions of splats
 CLEARANCE = 0.5
+NUMBER_MAX = 1e15  # of any quantity of a scene; its squares are far within float64
 CAPTURE = "--format capture"
 ROLLING = "a rolling shutter cannot be simulated so", "sensor.row_time_s"
+
+
+def check_numbers(scene: Scene) -> None:
+    """Raise a UsageError if a number of the scene is of no quantity that exists."""
+    for name, value in _numbers(scene):
+        require(abs(value) <= NUMBER_MAX, name, f"{value:g}", f"at most {NUMBER_MAX:g}")
+    for frequency in (scene.sensor.f_mod_hz, *scene.sensor.further_hz):
+        least, most = (SPEED_OF_LIGHT / depth_range for depth_range in DEPTH_RANGES_M[::-1])
+        wanted = f"{least:.3g} to {most:.3g} Hz, 20e6 for 20 MHz"
+        good = least <= float(frequency) <= most
+        require(good, "sensor.f_mod_hz", f"{float(frequency):g}", wanted)
+    cutoff = scene.sensor.contrast_cutoff_hz
+    require(cutoff is None or cutoff >= 1, "sensor.contrast_cutoff_hz", f"{cutoff}", "at least 1")
+
+
+def _numbers(value: Any, name: str = "") -> Iterator[tuple[str, float]]:
+    """The finite numbers of nested dataclasses and tuples, with their names."""
+    if isinstance(value, (int, float)):
+        if math.isfinite(value):
+            yield name, value
+    elif isinstance(value, tuple):
+        for i, part in enumerate(value):
+            yield from _numbers(part, f"{name}.{i}")
+    elif is_dataclass(value):
+        for f in fields(value):
+            yield from _numbers(getattr(value, f.name), f"{name}.{f.name}".removeprefix("."))
 
 
 def check_engine(scene: Scene, settings: ResolvedSettings, device: str = "cpu") -> None:

@@ -29,12 +29,14 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Complex, Float
 
+from ..errors import UsageError
 from ..scene.electrons import contrast, dark_electrons, electron_gain
 from ..scene.optics import Shading
 from ..scene.pattern import dark_map, gain_map, phase_map
 from ..scene.sensor import Sensor
 from ..scene.waveform import peak
 
+ELECTRONS_MAX = 1e18  # of a mean that can be drawn: NumPy counts in 64 bits
 Level = float | Float[np.ndarray, "H W"]
 
 
@@ -137,6 +139,7 @@ def read_out(
 
     Raises:
         ValueError: If the sensor's contrast and DC offset contradict each other.
+        UsageError: If there are more electrons than a 64-bit number counts.
     """
     response = gain_map(sensor.pattern, *np.shape(quad))
     for active, other in [
@@ -148,6 +151,14 @@ def read_out(
     if not sensor.noise:
         return Reading(np.asarray(quad, dtype=np.float32), np.zeros(np.shape(quad), dtype=bool))
     mean_a, mean_b = mean_taps(quad, amplitude, sensor, ambient)
+    most = max(mean_a.max(), mean_b.max())
+    if not most <= ELECTRONS_MAX:
+        raise UsageError(
+            "more electrons than can be drawn",
+            where="sensor",
+            why=f"a tap collects {most:.3g} of them in one exposure",
+            fix="lower the light: electrons_per_unit, ambient_electrons, exposure_s or the pattern",
+        )
     shots_a, shots_b = generator.poisson(mean_a), generator.poisson(mean_b)
     tap_a = shots_a + generator.normal(0.0, sensor.read_noise_electrons, mean_a.shape)
     tap_b = shots_b + generator.normal(0.0, sensor.read_noise_electrons, mean_b.shape)

@@ -16,7 +16,7 @@ from ..data.write import write
 from ..errors import UsageError
 from ..scene.changes import suggestion
 from .card import outcome_card, settings_card
-from .checks import check_clearance, check_engine, check_format
+from .checks import check_clearance, check_engine, check_format, check_numbers
 from .closed_form_errors import Errors, closed_form_errors, ladder_table
 from .ladder import NAMES, resolved
 from .random_scene import PREFIX
@@ -71,6 +71,7 @@ def simulate(
     own = scene_of(scene, settings.overrides, settings.seed)
     settings = replace(settings, overrides=())
     recorded, used = resolved(own, settings)
+    check_numbers(recorded)
     _check_resources(recorded, used, Path(out))
     check_engine(recorded, used, device)
     check_format(recorded, used)
