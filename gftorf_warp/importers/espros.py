@@ -24,7 +24,7 @@ from .imported import Imported, Notes
 from .keys import Key, Settings
 
 ZERO = 2048.0  # stored number of DCS 0 where numbers are not signed
-RANGE = 4096  # numbers of 12 bits; what lies outside is one of these codes, as it is or less ZERO
+RANGE = 4096  # numbers of 12 bits; what lies outside is one of these codes
 CODES = {64002: "too bright for the converter", 64003: "saturated"}
 KEYS = (
     Key(
@@ -95,13 +95,11 @@ def read(source: Path, settings: Settings) -> Imported:
 
 def _once(quartets: Quartets, notes: Notes) -> tuple[np.ndarray, np.ndarray]:
     """Number of the DCS of each raw frame [F], and its image [F, H, W], without repeated ones."""
-    dcs = quartets.dcs
-    count = len(dcs)
+    dcs, count = quartets.dcs, len(quartets.dcs)
     changed = (dcs[1:] != dcs[:-1]).any(axis=(2, 3))  # [N - 1, 4]
-    if count < 3 or not (changed.sum(axis=1) == 1).all():
-        return np.tile(np.arange(DCS), count), dcs.reshape(-1, *dcs.shape[2:])
     slots = changed.argmax(axis=1)
-    if not (np.diff(slots) % DCS == 1).all():
+    rolling = (changed.sum(axis=1) == 1).all() and (np.diff(slots) % DCS == 1).all()
+    if count < 3 or not rolling:
         return np.tile(np.arange(DCS), count), dcs.reshape(-1, *dcs.shape[2:])
     oldest = (slots[0] + np.arange(DCS)) % DCS
     notes.understood.append(
@@ -116,46 +114,49 @@ def _quads(
     source: Path, dcs: np.ndarray, settings: Settings, notes: Notes
 ) -> Float[np.ndarray, "F H W"]:
     """Values of stored images; NaN where they hold a code."""
-    size = {"H": dcs.shape[1], "W": dcs.shape[2]}
-    quads = empty_quads(source, len(dcs), size)
-    zero = settings["values.zero"]
-    if zero is None:
-        zero = 0.0 if _negative(dcs) else ZERO
-        text = f"stored numbers are {'' if zero else 'partly '}"
-        text += "not negative" if zero else "negative"
-        notes.uncertain.append(f"{text}: {zero:g} is taken to mean 0; values.zero states it")
-    else:
-        notes.understood.append(f"values: {zero:g} means 0 (values.zero)")
-    counts = dict.fromkeys(CODES.values(), 0)
+    zero = _zero(dcs, settings, notes)
+    quads = empty_quads(source, len(dcs), {"H": dcs.shape[1], "W": dcs.shape[2]})
+    counts = dict.fromkeys(CODES, 0)
     for n, image in enumerate(dcs):
-        values = image.astype(np.float64)
-        quads[n] = values - zero
-        outside = ~(np.abs(values - zero + 0.5) <= RANGE / 2)  # NaN is outside
-        left = outside.copy()
-        for code, what in CODES.items():
-            forms = [code - less - wrap for less in (0, ZERO) for wrap in (0, 1 << 16)]
-            here = outside & np.isin(values, forms)
-            counts[what] += int(here.sum())
-            left &= ~here
-        if left.any():
-            found = values[left][0]
-            why = (
-                f"expected {zero - RANGE / 2:g} to {zero + RANGE / 2 - 1:g} around values.zero, or "
-            )
-            why += f"a code such as {min(CODES)}, found {found:g} in image {n}"
+        values = image.astype(np.float64) - zero
+        outside = ~(np.abs(values + 0.5) <= RANGE / 2)  # NaN is outside
+        unknown = outside.copy()
+        for code in CODES:
+            here = outside & np.isin(image, _forms(code))
+            counts[code] += int(here.sum())
+            unknown &= ~here
+        if unknown.any():
+            low, high = zero - RANGE / 2, zero + RANGE / 2 - 1
+            why = f"expected {low:g} to {high:g} around values.zero, or a code such as "
+            why += f"{min(CODES)}, found {image[unknown][0]:g} in image {n}"
             raise InputError("no DCS", where=source, why=why, fix="correct values.zero")
-        quads[n][outside] = np.nan
-    for what, count in counts.items():
+        quads[n] = np.where(outside, np.nan, values)
+    for code, count in counts.items():
         if count:
-            text = f"{count} values are {what}: each is replaced by the value of its pixel in the "
-            notes.uncertain.append(f"{text}nearest raw frame of its DCS")
+            text = f"{count} values are {CODES[code]}: each is replaced by the value of its pixel "
+            notes.uncertain.append(f"{text}in the nearest raw frame of its DCS")
     return quads
 
 
-def _negative(dcs: np.ndarray) -> bool:
-    """Whether numbers that are no codes are negative."""
-    codes = [code - (1 << 16) for code in CODES]
-    return any(bool(((image < 0) & ~np.isin(image, codes)).any()) for image in dcs)
+def _zero(dcs: np.ndarray, settings: Settings, notes: Notes) -> float:
+    """The stored number that means 0."""
+    zero = settings["values.zero"]
+    if zero is not None:
+        notes.understood.append(f"values: {zero:g} means 0 (values.zero)")
+        return zero
+    codes = [form for code in CODES for form in _forms(code)]
+    signed = any(bool(((image < 0) & ~np.isin(image, codes)).any()) for image in dcs)
+    zero, what = (0.0, "some") if signed else (ZERO, "no")
+    text = f"{what} stored numbers are negative: {zero:g} is taken to mean 0"
+    notes.uncertain.append(f"{text}; values.zero states it")
+    return zero
+
+
+def _forms(code: int) -> list[float]:
+    """Numbers as which a code may be stored: as it is or less the zero, in 16 bits with sign or
+    without.
+    """
+    return [code - less - wrap for less in (0, ZERO) for wrap in (0, 1 << 16)]
 
 
 def _times(

@@ -5,13 +5,14 @@ libfreenect2 hands these out as arrays and names no files, so they are told apar
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
-from ..data.folder import empty_quads
+from ..data.folder import FRAMES_MAX, empty_quads
 from ..data.sequence import Calibration, Intrinsics
 from ..errors import InputError
 from . import camera_keys
@@ -74,7 +75,7 @@ def read(source: Path, settings: Settings) -> Imported:
         UsageError: If the tables of the lens are missing and no key states it.
     """
     notes = Notes()
-    dump = _sorted_by_size(source, notes)
+    dump = _dump(source, notes)
     lens = _lens(dump, settings, notes)
     quads = _quads(source, dump, notes)
     notes.understood.append(
@@ -88,14 +89,41 @@ def read(source: Path, settings: Settings) -> Imported:
     return Imported(sequence=sequence, understood=understood, uncertain=uncertain)
 
 
-def _sorted_by_size(source: Path, notes: Notes) -> Dump:
-    """The files of a dump.
+def _dump(source: Path, notes: Notes) -> Dump:
+    """The files of a dump, of each kind as many as there should be.
 
     Raises:
-        InputError: If some are missing, cut short or doubled.
+        InputError: If not.
+    """
+    dump = _by_size(source)
+    for found, count, what, size in (
+        (dump.packets, range(1, FRAMES_MAX), "packets", f"a multiple of {packets.PACKET_BYTES}"),
+        (dump.p0, range(1, 2), "P0 tables", packets.P0_BYTES),
+        (dump.lookup, range(2), "lookup table", 2 * packets.CODES),
+        (dump.tables, range(3), "X and Z tables", packets.TABLE_BYTES),
+    ):
+        if len(found) not in count:
+            names = ", ".join(path.name for path in found)
+            sizes = ", ".join(f"{path.name} ({size_of(path)})" for path in dump.others[:5])
+            why = f"expected {count[0]} to {count[-1]} files of {size} bytes, found "
+            why += names or f"none; other files: {sizes or 'none'}"
+            fix = "put packets and tables of one session, and nothing else, into one folder"
+            raise InputError(what, where=source, why=why, fix=fix)
+    notes.understood.append(f"files: {len(dump.packets)} of packets, by their sizes, as named")
+    if dump.others:
+        names = ", ".join(path.name for path in dump.others[:5])
+        notes.understood.append(f"ignored: {len(dump.others)} files of other sizes: {names}")
+    return dump
+
+
+def _by_size(source: Path) -> Dump:
+    """All files by what their sizes say that they are.
+
+    Raises:
+        InputError: If one is a table that was cut short.
     """
     dump = Dump()
-    kinds = {
+    tables = {
         packets.P0_BYTES: dump.p0,
         packets.TABLE_BYTES: dump.tables,
         2 * packets.CODES: dump.lookup,
@@ -108,30 +136,7 @@ def _sorted_by_size(source: Path, notes: Notes) -> Dump:
             fix = "dump the table again, with that number times the size of a value"
             raise InputError("a quarter or half of a table", where=path, why=why, fix=fix)
         whole = size > 0 and size % packets.PACKET_BYTES == 0
-        kinds.get(size, dump.packets if whole else dump.others).append(path)
-    for found, most, what, bytes_ in (
-        (dump.packets, None, "packets", f"a multiple of {packets.PACKET_BYTES}"),
-        (dump.p0, 1, "P0 tables", str(packets.P0_BYTES)),
-        (dump.lookup, 1, "lookup table", str(2 * packets.CODES)),
-        (dump.tables, 2, "X and Z tables", str(packets.TABLE_BYTES)),
-    ):
-        needed = what in ("packets", "P0 tables")
-        if (needed and not found) or (most is not None and len(found) > most):
-            sizes = ", ".join(f"{path.name} ({size_of(path)})" for path in dump.others[:5])
-            names = (
-                ", ".join(path.name for path in found) or f"none; other files: {sizes or 'none'}"
-            )
-            why = f"expected {most or 'one or more'} of {bytes_} bytes, found {names}"
-            fix = (
-                "dump them with the packets of the same session"
-                if not found
-                else "keep one session"
-            )
-            raise InputError(what, where=source, why=why, fix=f"{fix}, all in one folder")
-    notes.understood.append(f"files: {len(dump.packets)} of packets, by their sizes, as named")
-    if dump.others:
-        names = ", ".join(path.name for path in dump.others[:5])
-        notes.understood.append(f"ignored: {len(dump.others)} files of other sizes: {names}")
+        tables.get(size, dump.packets if whole else dump.others).append(path)
     return dump
 
 
@@ -160,33 +165,24 @@ def _lens(dump: Dump, settings: Settings, notes: Notes) -> Intrinsics:
 def _quads(source: Path, dump: Dump, notes: Notes) -> Float[np.ndarray, "F H W"]:
     """Values of all raw frames without the phase offsets of their pixels."""
     offsets = packets.phase_offsets(raw_bytes(dump.p0[0]))
-    notes.understood.append(
-        f"phase offsets: {dump.p0[0].name}, taken out: the three raw frames of one frequency are "
-        "turned together, and have one time"
-    )
-    values = packets.usual_values()
-    if dump.lookup:
-        values = raw_bytes(dump.lookup[0]).view("<i2").astype(np.float32)
-    table = dump.lookup[0].name if dump.lookup else "the table that libfreenect2 computes"
-    notes.understood.append(f"codes: 11 bits, to values by {table}")
-    counts = [size_of(path) // packets.PACKET_BYTES for path in dump.packets]
+    count = sum(size_of(path) // packets.PACKET_BYTES for path in dump.packets)
     size = {"H": packets.HEIGHT, "W": packets.WIDTH}
-    quads = empty_quads(source, packets.SUB_IMAGES_USED * sum(counts), size)
-    triples = iter(quads.reshape(-1, 3, packets.HEIGHT, packets.WIDTH))
-    saturated = 0
-    for path, count in zip(dump.packets, counts, strict=True):
-        for k in range(count):
-            packet = raw_bytes(path, k * packets.PACKET_BYTES, packets.PACKET_BYTES)
-            measured = values[packets.codes(packet)].reshape(3, 3, *quads.shape[1:])
-            for triple, offset in zip(measured, offsets, strict=True):
-                full = (triple == packets.SATURATED).any(axis=0)
-                full[:, [0, -1]] = False
-                saturated += int(full.sum())
-                quads_of_one = next(triples)
-                quads_of_one[:] = packets.without_offsets(triple, offset)
-                quads_of_one[:, full] = np.nan
+    quads = empty_quads(source, packets.SUB_IMAGES_USED * count, size)
+    triples, saturated = quads.reshape(-1, 3, *quads.shape[1:]), 0
+    for n, measured in enumerate(_triples(dump)):
+        triples[n] = packets.without_offsets(measured, offsets[n % 3])
+        full = (measured == packets.SATURATED).any(axis=0)
+        full[:, [0, -1]] = False
+        triples[n][:, full] = np.nan
+        saturated += int(full.sum())
     quads[..., [0, -1]] = 0.0
-    notes.understood.append("columns 0 and 511 are 0 throughout: libfreenect2 reads none there")
+    table = dump.lookup[0].name if dump.lookup else "the table that libfreenect2 computes"
+    notes.understood += [
+        f"codes: 11 bits, to values by {table}",
+        f"phase offsets: {dump.p0[0].name}, taken out: the three raw frames of one frequency are "
+        "turned together, and have one time",
+        "columns 0 and 511 are 0 throughout: libfreenect2 reads none there",
+    ]
     if saturated:
         dark = fill(quads, np.ones(len(quads), dtype=bool), packets.SUB_IMAGES_USED)
         notes.uncertain.append(
@@ -194,6 +190,17 @@ def _quads(source: Path, dump: Dump, notes: Notes) -> Float[np.ndarray, "F H W"]
             f"of the nearest packet; {dark} pixels always are, and are 0"
         )
     return quads
+
+
+def _triples(dump: Dump) -> Iterator[Float[np.ndarray, "3 H W"]]:
+    """Values of the three raw frames of each frequency, packet by packet."""
+    values = packets.usual_values()
+    if dump.lookup:
+        values = raw_bytes(dump.lookup[0]).view("<i2").astype(np.float32)
+    for path in dump.packets:
+        for first in range(0, size_of(path), packets.PACKET_BYTES):
+            codes = packets.codes(raw_bytes(path, first, packets.PACKET_BYTES))
+            yield from values[codes].reshape(3, 3, packets.HEIGHT, packets.WIDTH)
 
 
 def _times(count: int, settings: Settings, notes: Notes) -> Float[np.ndarray, "F"]:
