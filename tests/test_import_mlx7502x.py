@@ -61,6 +61,18 @@ def test_a_dump_decodes_to_its_scene(tmp_path):
     np.testing.assert_allclose(Sequence.open(out).times, np.arange(12) / 40)
 
 
+def test_poses_of_a_file_move_the_camera(tmp_path):
+    """A trajectory beside the keys, interpolated at the times of the buffers."""
+    (tmp_path / "poses.txt").write_text("5 0 0 0 0 0 0 1\n6 2 0 0 0 0 0 1\n")
+    (tmp_path / "dump").write_bytes(bytes(8 * 384))
+    poses = "[poses]\nfile = 'poses.txt'\nform = 'tum'\nstart_s = 5\n"
+    config = keys(tmp_path, rest=TIMES + poses)
+    imported = read_recording("mlx7502x", tmp_path / "dump", config)
+    moved = imported.sequence.camera_from_world[:, 0, 3]
+    np.testing.assert_allclose(moved, -2 * np.arange(8) / 40, atol=1e-9)
+    assert not any("at rest" in line for line in imported.understood)
+
+
 @pytest.mark.parametrize("mode", ["A", "B", "A&B halves", "A&B columns"])
 def test_taps_give_the_same_distance(mode, tmp_path):
     """One tap with ambient light, or both, which is removed by their difference."""

@@ -22,8 +22,7 @@ from ..data.folder import empty_quads
 from ..data.problems import Problems
 from ..data.sequence import Calibration, Intrinsics, Truth
 from ..errors import InputError
-from . import camera_keys
-from .at_rest import at_rest
+from . import camera_keys, pose_keys, regular
 from .imported import Imported, Notes
 from .keys import Key, Settings
 from .radiance import read_radiance
@@ -33,7 +32,6 @@ VIEW_DEG = 65.0
 FAR_M = 1000.0  # of a pixel that meets nothing
 IMAGES = {1: ((0,), (1,), (2,), (3,)), 2: ((0, 2), (1, 3)), 4: ((0, 1, 2, 3),)}
 LENS = camera_keys.camera_keys("camera", f"instead of a view of {VIEW_DEG:g} degrees", needed=False)
-CENTRE = {"camera.pixel_centre": "half"}
 KEYS = (
     Key(
         name="assemble.taps",
@@ -73,7 +71,8 @@ KEYS = (
         default=FRAME_RATE_HZ,
         above=0.0,
     ),
-    *(replace(key, default=CENTRE.get(key.name, key.default)) for key in LENS),
+    *regular.pixel_centres_half(LENS),
+    *pose_keys.KEYS,
 )
 
 
@@ -126,23 +125,22 @@ def read(source: Path, settings: Settings) -> Imported:
         f"({settings.source('time.rate_hz')}); the data set has none",
     ]
     times = np.array([slot.instant for slot in taken]) / settings["time.rate_hz"]
-    lens = _lens(settings, notes, *quads.shape[1:])
+    lens = None
+    if not regular.lens_given(settings):
+        lens = _lens(notes, *quads.shape[1:])
     notes.uncertain += [
         "precision: RGBE images keep 8 bits, 0.4 % of the largest of the three materials in a "
         "pixel, in quads and in distance",
         f"frames: a view of {VIEW_DEG:g} degrees is taken from edge to edge of the image; from "
         "centre to centre the focal length would be 1 / width shorter",
     ]
-    if re.match(r"c[ap]_", source.resolve().name):
+    if re.match(r"c[ap]_", source.resolve().name) and not settings.given("poses.file"):
         notes.uncertain.append(
             "names that begin with ca_ or cp_ are of a moving camera, whose poses the files do "
             "not have: it is taken to be at rest"
         )
-    return Imported(
-        sequence=at_rest(quads, modulation, times, lens, notes),
-        understood=tuple(notes.understood),
-        uncertain=tuple(notes.uncertain),
-        truth=truth,
+    return regular.imported(
+        source, settings, notes, quads, modulation, times, lens=lens, truth=truth
     )
 
 
@@ -216,11 +214,7 @@ def _constant(source: Path, slot: Slot, material: int) -> float:
     return float(np.median(images.mean(axis=0)[lit] / amplitude[lit])) if lit.any() else 0.0
 
 
-def _lens(settings: Settings, notes: Notes, height: int, width: int) -> Intrinsics:
-    names = [f"camera.{name}" for name in camera_keys.PINHOLE]
-    if any(map(settings.given, names)):
-        settings.require(*names)
-        return camera_keys.intrinsics_of(settings, notes, width)
+def _lens(notes: Notes, height: int, width: int) -> Intrinsics:
     focal = width / 2 / math.tan(math.radians(VIEW_DEG / 2))
     notes.understood.append(f"camera: fx, fy {focal:g} px, of a view of {VIEW_DEG:g} degrees")
     return Intrinsics(fx=focal, fy=focal, cx=width / 2, cy=height / 2)

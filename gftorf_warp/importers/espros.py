@@ -16,8 +16,7 @@ from jaxtyping import Float
 
 from ..data.folder import empty_quads
 from ..errors import InputError
-from . import camera_keys, sensor_keys, timing
-from .at_rest import at_rest
+from . import camera_keys, pose_keys, regular, sensor_keys, timing
 from .codes import fill
 from .espros_frames import DCS, Quartets, read_quartets
 from .imported import Imported, Notes
@@ -50,6 +49,7 @@ KEYS = (
     *sensor_keys.OFFSETS,
     *(replace(key, needed=False) for key in timing.KEYS),
     *camera_keys.KEYS,
+    *pose_keys.KEYS,
 )
 
 
@@ -83,14 +83,10 @@ def read(source: Path, settings: Settings) -> Imported:
     if never:
         notes.uncertain.append(f"{never} pixels are never measured in some DCS: they are 0")
     times = _times(source, quartets, len(quads), settings, notes)
-    lens = camera_keys.intrinsics_of(settings, notes, quads.shape[2])
     exposures = timing.exposures_of(settings, len(quads))
     if exposures is None and quartets.exposure_s is not None:
         exposures = np.full(len(quads), quartets.exposure_s)
-    sequence = at_rest(quads, modulation, times, lens, notes, exposures=exposures)
-    return Imported(
-        sequence=sequence, understood=tuple(notes.understood), uncertain=tuple(notes.uncertain)
-    )
+    return regular.imported(source, settings, notes, quads, modulation, times, exposures=exposures)
 
 
 def _once(quartets: Quartets, notes: Notes) -> tuple[np.ndarray, np.ndarray]:

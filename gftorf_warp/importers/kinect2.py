@@ -6,7 +6,7 @@ libfreenect2 hands these out as arrays and names no files, so they are told apar
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +15,8 @@ from jaxtyping import Float
 from ..data.folder import FRAMES_MAX, empty_quads
 from ..data.sequence import Calibration, Intrinsics
 from ..errors import InputError
-from . import camera_keys
+from . import camera_keys, pose_keys, regular
 from . import kinect2_packets as packets
-from .at_rest import at_rest
 from .codes import fill
 from .imported import Imported, Notes
 from .keys import Key, Settings
@@ -25,10 +24,9 @@ from .raw_files import files_of, raw_bytes, size_of
 from .sensor_keys import Modulation
 
 LENS = camera_keys.camera_keys("camera", "replaces the X and Z tables", needed=False)
-# getIrCameraParams() counts pixel centres from 0.5
-CENTRE = {"camera.pixel_centre": "half"}
 KEYS = (
-    *(replace(key, default=CENTRE.get(key.name, key.default)) for key in LENS),
+    *regular.pixel_centres_half(LENS),  # as getIrCameraParams() counts
+    *pose_keys.KEYS,
     Key(
         name="time.cycle_rate_hz",
         kind=float,
@@ -76,17 +74,15 @@ def read(source: Path, settings: Settings) -> Imported:
     """
     notes = Notes()
     dump = _dump(source, notes)
-    lens = _lens(dump, settings, notes)
+    lens = _lens(source, dump, settings, notes)
     quads = _quads(source, dump, notes)
     notes.understood.append(
         "raw frames: 3 at 80 MHz, 3 at 16 MHz, 3 at 120 MHz, each at 0, -120, -240 degrees; the "
         "tenth sub-image is left out"
     )
     times = _times(len(quads) // packets.SUB_IMAGES_USED, settings, notes)
-    sequence = at_rest(quads, MODULATION, times, lens, notes)
     notes.uncertain += UNCERTAIN
-    understood, uncertain = tuple(notes.understood), tuple(notes.uncertain)
-    return Imported(sequence=sequence, understood=understood, uncertain=uncertain)
+    return regular.imported(source, settings, notes, quads, MODULATION, times, lens=lens)
 
 
 def _dump(source: Path, notes: Notes) -> Dump:
@@ -140,13 +136,14 @@ def _by_size(source: Path) -> Dump:
     return dump
 
 
-def _lens(dump: Dump, settings: Settings, notes: Notes) -> Intrinsics:
+def _lens(source: Path, dump: Dump, settings: Settings, notes: Notes) -> Intrinsics:
     """The lens of the keys, or else of the X and Z tables."""
-    names = [f"camera.{name}" for name in camera_keys.PINHOLE]
-    if any(map(settings.given, names)) or len(dump.tables) < 2:
-        settings.require(*names)
-        return camera_keys.intrinsics_of(settings, notes, packets.WIDTH)
     shape = packets.HEIGHT, packets.WIDTH
+    if regular.lens_given(settings) or len(dump.tables) < 2:
+        settings.require("camera.fx", "camera.fy", "camera.cx", "camera.cy")
+        return camera_keys.intrinsics_of(
+            settings, notes, packets.WIDTH, root=source, height=packets.HEIGHT
+        )
     tables = [raw_bytes(path).view("<f4").reshape(shape) for path in dump.tables]
     with np.errstate(invalid="ignore"):
         x, z = sorted(tables, key=lambda table: bool((table > 0).all()))  # Z is positive

@@ -14,8 +14,7 @@ from jaxtyping import Float, Int16
 
 from ..data.folder import empty_quads
 from ..errors import InputError
-from . import camera_keys, sensor_keys, timing
-from .at_rest import at_rest
+from . import camera_keys, pose_keys, regular, sensor_keys, timing
 from .imported import Imported, Notes
 from .keys import Key, Settings
 from .pixel_formats import CODES, FORMATS, twelve_bits
@@ -81,6 +80,7 @@ KEYS = (
     *sensor_keys.OFFSETS,
     *timing.KEYS,
     *camera_keys.KEYS,
+    *pose_keys.KEYS,
 )
 
 
@@ -101,9 +101,7 @@ def read(source: Path, settings: Settings) -> Imported:
     taken = {"A&B": ", taken as A - B", "B": ", shifts half a turn later"}.get(mode, "")
     notes.understood.append(f"taps: {mode}{taken} ({settings.source('raw.output_mode')})")
     times = timing.times_of(settings, source, notes, len(quads), len(modulation.shifts))
-    lens = camera_keys.intrinsics_of(settings, notes, settings["raw.size"][0])
     exposures = timing.exposures_of(settings, len(quads))
-    sequence = at_rest(quads, modulation, times, lens, notes, exposures=exposures)
     turned = ", ".join(f"{-shift % 360:g}" for shift in settings["sensor.shifts_deg"])
     notes.uncertain.append(
         "the sign of PHASE_SEQ is not documented: if distances shrink where they should grow, "
@@ -111,9 +109,7 @@ def read(source: Path, settings: Settings) -> Imported:
     )
     if not settings.given("sensor.shifts_deg"):
         notes.uncertain.append("PHASE_SEQ is taken as 0, 180, 90, 270, the default of the driver")
-    return Imported(
-        sequence=sequence, understood=tuple(notes.understood), uncertain=tuple(notes.uncertain)
-    )
+    return regular.imported(source, settings, notes, quads, modulation, times, exposures=exposures)
 
 
 def _quads(source: Path, settings: Settings, notes: Notes) -> Float[np.ndarray, "F H W"]:

@@ -15,8 +15,7 @@ from jaxtyping import Float
 
 from ..data.folder import empty_quads
 from ..errors import InputError
-from . import camera_keys, sensor_keys, timing
-from .at_rest import at_rest
+from . import camera_keys, pose_keys, regular, sensor_keys, timing
 from .imported import Imported, Notes
 from .keys import Key, Settings
 from .pixel_formats import CODES, twelve_bits
@@ -84,6 +83,7 @@ KEYS = (
     ),
     *(key for key in timing.KEYS if key.name == "time.exposure_s"),
     *camera_keys.KEYS,
+    *pose_keys.KEYS,
 )
 
 
@@ -106,10 +106,7 @@ def read(source: Path, settings: Settings) -> Imported:
     text = f"{settings['time.cycle_rate_hz']:g} frames per second"
     frames = len(starts) * parts
     of_parts = timing.with_slots(settings, notes, starts, frames, parts, text)
-    lens = camera_keys.intrinsics_of(settings, notes, quads.shape[2])
     exposures = timing.exposures_of(settings, len(quads))
-    times = np.repeat(of_parts, TAPS)
-    sequence = at_rest(quads, modulation, times, lens, notes, exposures=exposures)
     for name, what in (
         ("raw.parts", "order of parts: 80 MHz, 80 MHz shuffled, 100 MHz, 100 MHz shuffled"),
         ("sensor.shifts_deg", "shifts of taps: 0, 90, 180, 270, and shuffled 180, 270, 0, 90"),
@@ -119,9 +116,8 @@ def read(source: Path, settings: Settings) -> Imported:
             text = f"{what}: assumed, since nothing public documents it; {name} states it"
             notes.uncertain.append(text)
     notes.uncertain.append("taps are taken as blocks of 2x2 pixels, A B above C D")
-    return Imported(
-        sequence=sequence, understood=tuple(notes.understood), uncertain=tuple(notes.uncertain)
-    )
+    times = np.repeat(of_parts, TAPS)
+    return regular.imported(source, settings, notes, quads, modulation, times, exposures=exposures)
 
 
 def _quads(source: Path, settings: Settings, notes: Notes) -> Float[np.ndarray, "F H W"]:

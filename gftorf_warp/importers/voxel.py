@@ -17,8 +17,7 @@ from ..data.arrays import SIDE_MAX
 from ..data.cycles import QUADS_MIN
 from ..data.folder import empty_quads
 from ..errors import InputError
-from . import camera_keys, sensor_keys, timing
-from .at_rest import at_rest
+from . import camera_keys, pose_keys, regular, sensor_keys, timing
 from .imported import Imported, Notes
 from .keys import Settings
 from .raw_files import raw_bytes
@@ -39,6 +38,7 @@ KEYS = (
     *sensor_keys.OFFSETS,
     *(replace(key, needed=False) for key in timing.KEYS),
     *camera_keys.KEYS,
+    *pose_keys.KEYS,
 )
 
 
@@ -78,12 +78,8 @@ def read(source: Path, settings: Settings) -> Imported:
     text = f"frames: {len(frames)} with numbers {frames[0].number} to {frames[-1].number}"
     notes.understood.append(f"{text}, {width}x{height} pixels of {count} quads")
     times = _times(source, frames, count, settings, notes)
-    lens = camera_keys.intrinsics_of(settings, notes, width)
     exposures = timing.exposures_of(settings, len(quads))
-    sequence = at_rest(quads, modulation, times, lens, notes, exposures=exposures)
-    return Imported(
-        sequence=sequence, understood=tuple(notes.understood), uncertain=tuple(notes.uncertain)
-    )
+    return regular.imported(source, settings, notes, quads, modulation, times, exposures=exposures)
 
 
 def _shape(
