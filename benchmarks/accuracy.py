@@ -109,7 +109,7 @@ def _options(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--shared", type=Path, help="folder of further sequences")
     parser.add_argument("--finer", type=Path, help="the same ones at a multiple of the size")
     parser.add_argument("--seeds", type=numbers, default=list(SEEDS))
-    parser.add_argument("--size", type=_size, default=(320, 240), metavar="WxH")
+    parser.add_argument("--size", type=size, default=(320, 240), metavar="WxH")
     parser.add_argument("--frames", type=int, default=60)
     parser.add_argument("--images", type=int)
     parser.add_argument("--device", default="cpu")
@@ -139,7 +139,8 @@ def numbers(text: str) -> list[int]:
     return [n for first, _, last in parts for n in range(int(first), int(last or first) + 1)]
 
 
-def _size(text: str) -> tuple[int, int]:
+def size(text: str) -> tuple[int, int]:
+    """``320x240`` as (width, height) [px]."""
     width, _, height = text.partition("x")
     return int(width), int(height)
 

@@ -34,10 +34,10 @@ import warp as wp
 from gftorf_warp import Sequence, compare, reconstruct, simulate
 from gftorf_warp.data.decode import closed_form_distance, unambiguous_range
 from gftorf_warp.data.read import read, read_truth
+from gftorf_warp.data.texts import read_rows
 from gftorf_warp.data.truth import known_distance, moving_and_static
 from gftorf_warp.errors import GftorfError
 from gftorf_warp.evaluate import pictures
-from gftorf_warp.evaluate.compare import rows_of
 from gftorf_warp.evaluate.metrics import ERROR_UNIT, pooled, scored_frames, squared_error
 from gftorf_warp.evaluate.views import camera_at
 from gftorf_warp.recon import presets
@@ -97,6 +97,8 @@ class Setup:
     finer: Path | None = None
     """Folder with given sequences of the same names at a multiple of their size, for their edge
     floor; None: they have none."""
+    protocol: str = "all"
+    """Which raw frames are scored, as ``gftorf compare --frames`` takes it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -219,7 +221,7 @@ def _fitted(job: Job, setup: Setup, known: str | None) -> Result | None:
     if kind == "cuda":
         torch.cuda.reset_peak_memory_stats()
     run = reconstruct(sequence, folder, settings, seed=job.seed, device=setup.device)
-    scores = compare(run, report=False)
+    scores = compare(run, frames=setup.protocol, report=False)
     _draw(job, setup, run, sequence, scores)
     result = {
         "row": job.row.name,
@@ -237,7 +239,7 @@ def _fitted(job: Job, setup: Setup, known: str | None) -> Result | None:
 
 def _rise(folder: Path) -> float | None:
     """Error of d at the end of a run over the least along it [1]; None without diagnostics."""
-    rows = rows_of(folder / "diagnostics.jsonl")
+    rows = read_rows(folder / "diagnostics.jsonl")
     errors = [error for row in rows if (error := row.get("d_mse_x100"))]
     return errors[-1] / min(errors) if errors else None
 

@@ -2,6 +2,7 @@
 
     python benchmarks/look_alikes.py [--group synthetic|recorded|carried|all] [--rays 2] [--json
     FILE]
+    python benchmarks/look_alikes.py --reconstruct OUT ...    fits, see look_alikes_fits.py --help
 
 Ideal quads from analytic first hits: one centre ray per pixel (or --rays x --rays), instantaneous
 exposure, no noise, direct light. Protocol ftorf13: first raw frame of every quartet but the first
@@ -173,6 +174,10 @@ def accepted(ours: float, target: float, group: Group) -> bool:
 
 def main() -> int:
     """Print the table, write the JSON."""
+    if "--reconstruct" in sys.argv[1:]:
+        import look_alikes_fits
+
+        return look_alikes_fits.main([word for word in sys.argv[1:] if word != "--reconstruct"])
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -20,6 +20,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 import accuracy
 import accuracy_jobs
 import accuracy_table
+import look_alikes_fits
 
 from gftorf_warp import simulate
 from gftorf_warp.sim.random_scene import random_scene
@@ -236,3 +237,20 @@ def test_the_summary_is_means_over_scenes_and_seeds():
     assert "a/two/2: no memory" in accuracy_table.failures(results)
     row = accuracy_table.details(["a"], scenes, results).splitlines()[2]
     assert row == "| one | text | 1 / 1 / 1 | 0.1 / - / 0.05 | 0.25 / 0.2 / 1 **worse** |"
+
+
+def test_the_table_of_look_alikes_has_means_over_seeds_and_ratios():
+    """Errors of two presets on all seven scenes; one that was not fitted has a dash."""
+    names = list(look_alikes_fits.PUBLISHED)
+    fits = [
+        result(row, f"shared/{name}", seed, (0.1 * (seed + 1),) * 3)
+        for row in ("fast", "best")
+        for name in names
+        for seed in (0, 1)
+        if (row, name) != ("fast", names[0])
+    ]
+    lines = look_alikes_fits.table(["fast", "best"], fits).splitlines()
+    assert [line.split(" | ")[0] for line in lines[2:9]] == [f"| {name}" for name in names]
+    assert lines[2].startswith("| sliding_cube | 1 | - | - | 0.15 | 0.15 | 0.096 | 0.037 | 0.005 |")
+    assert lines[9].startswith("| over the closed form | 1 | 0.15 | 0.15 | 0.15 | 0.15 | 1 | 0.37")
+    assert lines[10].startswith("| seconds |  | 1.0 s |")
