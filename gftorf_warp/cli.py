@@ -286,6 +286,15 @@ def _compare(options: argparse.Namespace) -> int:
     return 0
 
 
+def _view(options: argparse.Namespace) -> int:
+    device = start(options)
+    from .view.command import view
+
+    say = functools.partial(print, flush=True)
+    view(options.path, **_named(options, "port", "sequence"), device=device, say=say)
+    return 0
+
+
 def _opened(options: argparse.Namespace, device: str, path: str | None = None) -> Run:
     """The run of a command, or one of several, with its sequence where --sequence says."""
     from .recon.run import Run
@@ -360,6 +369,7 @@ COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
         _render,
         _export,
         _compare,
+        _view,
         _doctor,
         _bench,
     )

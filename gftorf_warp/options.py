@@ -259,6 +259,12 @@ def command_parsers() -> dict[str, Parser]:
     compare.option("--frames", "all|ftorf13", str, "which raw frames are scored (all)", "all")
     _device_options(compare)
 
+    view = Parser.of("view", "show a run, also one that goes on, or a sequence in a browser")
+    view.add_argument("path", metavar="RUN|SEQ", help="folder of a reconstruction or of a sequence")
+    view.option("--port", "N", _whole, "port at 127.0.0.1 (any free one)", 0)
+    view.option("--sequence", "SEQ", str, MOVED)
+    _device_options(view)
+
     contents = "read a sequence, list its contents and assumptions, warn about suspicious values"
     check = Parser.of("check", contents)
     check.add_argument("sequence", metavar="SEQ", help="folder of the sequence")
@@ -297,7 +303,19 @@ def command_parsers() -> dict[str, Parser]:
     bench.change("--set", f"change one setting {where} (may be repeated)", "set")
     _device_options(bench)
 
-    parsers = (demo, simulate, importer, check, reconstruct, render, export, compare, doctor, bench)
+    parsers = (
+        demo,
+        simulate,
+        importer,
+        check,
+        reconstruct,
+        render,
+        export,
+        compare,
+        view,
+        doctor,
+        bench,
+    )
     return {parser.prog.split()[-1]: parser for parser in parsers}
 
 

@@ -94,6 +94,13 @@ class Tab:
             at = {"x": x, "y": y, "button": "left", "clickCount": 1}
             self.send("Input.dispatchMouseEvent", type=kind, **at)
 
+    def press(self, key):
+        """Press and release a key by its name, for example ArrowRight."""
+        codes = {"ArrowRight": 39, "ArrowLeft": 37}
+        given = {"key": key, "code": key, "windowsVirtualKeyCode": codes[key]}
+        for kind in ("rawKeyDown", "keyUp"):
+            self.send("Input.dispatchKeyEvent", type=kind, **given)
+
     def screenshot(self, path=None, *, whole=False):
         """RGB [H, W, 3] of the window, or of the whole page; also written to ``path``."""
         given = {"captureBeyondViewport": whole}

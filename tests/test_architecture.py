@@ -31,6 +31,7 @@ INSIDE_FUNCTIONS = {
     "rawpy",
     "scipy",
     "trimesh",
+    "viser",
 }  # slow to import, or not needed by every command
 # room: (rooms it may import besides itself, packages it may import); constants and errors are free
 # to all
@@ -47,6 +48,10 @@ TABLE = {
     "recon": ({"data", "losses", "render", "scene"}, TORCH | {"cv2"}),
     "evaluate": ({"data", "losses", "recon", "render", "scene"}, TORCH | {"cv2"}),
     "export": ({"data", "evaluate", "recon", "render", "scene"}, TORCH | {"cv2", "trimesh"}),
+    "view": (
+        {"data", "evaluate", "export", "recon", "render", "scene"},
+        TORCH | {"viser"},
+    ),
     "bench": ({"data", "evaluate", "recon", "render", "scene", "sim"}, TORCH | {"warp"}),
 }
 FREE = {"constants", "errors", "__version__"}

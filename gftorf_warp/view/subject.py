@@ -1,0 +1,215 @@
+"""What is viewed: a sequence, with a run of it or without, raw frame by raw frame as arrays."""
+
+from __future__ import annotations
+
+import functools
+import logging
+from collections import OrderedDict
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from ..data.decode import closed_form_distance, quartet_phasor
+from ..data.folder import format_or_none
+from ..data.read import read, read_truth
+from ..data.sequence import Sequence
+from ..data.truth import known_distance
+from ..errors import InputError
+from ..evaluate import pictures
+from ..recon.folder import CONFIG
+from ..recon.residuals import Residuals, quad_of_shift
+from ..recon.run import Run
+from ..scene.camera import Camera
+from ..scene.measured import camera_of
+from .state import State, newest
+
+LOG = logging.getLogger("gftorf_warp")
+RENDERED = ("quads", "phasor", "distance", "opacity")
+HELD = 160  # raw frames whose renderings are kept: more than the plot of a pixel shows
+HELD_BYTES = 2.5e8  # fewer of large images
+SAMPLED = 8  # raw frames from which the scale of distances is taken
+
+
+class Subject:
+    """A sequence and, if there is one, the newest state of a run of it.
+
+    Args:
+        sequence: What was measured.
+        run: The reconstruction; None: the sequence alone is viewed.
+        path: The folder that was named.
+    """
+
+    def __init__(self, sequence: Sequence, run: Run | None, path: Path):
+        self.sequence, self.path = sequence, path
+        found = read_truth(sequence)
+        self.truth = None if found is None else known_distance(found)
+        self._cameras = [camera_of(sequence, n) for n in range(sequence.frames)]
+        self._decoded = _Held(HELD)
+        self.state: State | None = None
+        self._take(run)
+
+    @classmethod
+    def open(
+        cls,
+        path: str | Path,
+        device: torch.device | str = "cpu",
+        *,
+        sequence: str | Path | None = None,
+    ) -> Subject:
+        """Read a run or a sequence.
+
+        Args:
+            path: Folder of one of the two.
+            device: Where the run is rendered.
+            sequence: Where the sequence of the run is now; None: where it was.
+
+        Raises:
+            InputError: If the folder is neither, or cannot be read.
+        """
+        path = Path(path)
+        if (path / CONFIG).is_file():
+            run = Run.open(path, device)
+            run = run if sequence is None else run.linked(sequence)
+            return cls(run.sequence(), run, path)
+        if format_or_none(path) is None:
+            why = f"there is no {CONFIG} of a run, and no capture.json, tofType0 or tof"
+            fix = "name the --out folder of `gftorf reconstruct`, or the folder of a sequence"
+            raise InputError("neither a run nor a sequence", where=path, why=why, fix=fix)
+        return cls(read(path), None, path)
+
+    def _take(self, run: Run | None) -> None:
+        """Let a run be what is rendered."""
+        bytes_each = 4 * self.sequence.quads[0].size * (2 + self.sequence.cycle)
+        self.run, self._rendered = run, _Held(min(HELD, int(HELD_BYTES / bytes_each) + 1))
+        self.state = None if run is None else newest(self.path)
+        self._renderers = {} if run is None else {
+            f: run.renderer(RENDERED, f_mod_hz=None if f == self.sequence.frequencies[0] else f)
+            for f in self.sequence.frequencies
+        }  # fmt: skip
+        self.__dict__.pop("residuals", None)  # of the run before
+
+    def reload(self) -> bool:
+        """Read the newest checkpoint if there is a newer one than before; whether there was."""
+        if self.run is None or (found := newest(self.path)) == self.state:
+            return False
+        try:
+            run = Run.open(self.path, self.run.field.device)
+        except InputError as error:  # it is written again in a moment, or started over
+            LOG.warning("the newest checkpoint was not read: %s", error.what)
+            self.state = found
+            return False
+        self._take(run)
+        return True
+
+    @property
+    def frames(self) -> int:
+        """Number F of raw frames."""
+        return self.sequence.frames
+
+    def camera(self, n: int) -> Camera:
+        """The camera of a raw frame."""
+        return self._cameras[n]
+
+    def closed_form(self, n: int) -> Float[np.ndarray, "H W"] | None:
+        """Distance decoded from the quartet of a raw frame [m]; None: it is not complete."""
+        i = n // self.sequence.cycle
+        if i not in self.sequence.complete_quartets:
+            return None
+        decode = functools.partial(closed_form_distance, self.sequence, i)
+        return self._decoded.get(i, lambda: decode().astype(np.float32))
+
+    def amplitude(self, n: int) -> Float[np.ndarray, "H W"] | None:
+        """Length of the measured phasor of its quartet [quad units]; None: not complete."""
+        i = n // self.sequence.cycle
+        if i not in self.sequence.complete_quartets:
+            return None
+        return np.hypot(*quartet_phasor(self.sequence, i))
+
+    def true_distance(self, n: int) -> Float[np.ndarray, "H W"] | None:
+        """True distance [m], NaN where unknown; None without ground truth."""
+        if self.truth is None or not np.isfinite(self.truth[n]).any():
+            return None
+        return self.truth[n]
+
+    def rendered(self, n: int, f_mod_hz: float | None = None) -> Mapping[str, np.ndarray]:
+        """Images of the run at a raw frame: ``distance`` [m], ``opacity`` [1] and ``slots``
+        [K, H, W], the quads at the shift of every slot of a cycle, all at one frequency.
+
+        Args:
+            n: The raw frame.
+            f_mod_hz: Modulation frequency [Hz]; None: that of the raw frame.
+        """
+        f = float(self.sequence.frame_frequencies[n]) if f_mod_hz is None else f_mod_hz
+        return self._rendered.get((n, f), lambda: self._render(n, f))
+
+    @torch.no_grad()
+    def _render(self, n: int, f: float) -> dict[str, np.ndarray]:
+        assert self.run is not None, "a sequence alone has nothing to render"
+        image = self._renderers[f](float(self.sequence.times[n]), self.camera(n))
+        found = {k: getattr(image, k).cpu().numpy().copy() for k in ("distance", "opacity")}
+        shifts = self.sequence.shifts[: self.sequence.cycle]
+        slots = [quad_of_shift(image, self.run.sensor, float(shift)) for shift in shifts]
+        return found | {"slots": np.stack([slot.cpu().numpy() for slot in slots])}
+
+    def ours(self, n: int) -> Float[np.ndarray, "H W"] | None:
+        """Distance of the run [m]; None: there is no run."""
+        if self.run is None:
+            return None
+        return self.rendered(n, self.sequence.frequencies[0])["distance"]
+
+    @functools.cached_property
+    def residuals(self) -> Residuals | None:
+        """How well the run explains the quads; None where it was not fitted to them."""
+        return None if self.run is None else self.run.explained
+
+    def chi_square(self, n: int) -> Float[np.ndarray, "h w"] | None:
+        """Of the quartet of a raw frame [1], at the size of the fit; None: not known."""
+        found, i = self.residuals, n // self.sequence.cycle
+        if found is None or not found.noisy or i not in found.quartets:
+            return None
+        return found.chi_square[found.quartets.index(i)]
+
+    @functools.cached_property
+    def distance_scale(self) -> pictures.Scale:
+        """One scale for all distances: that of the truth, else of closed forms."""
+        some = sorted({*np.linspace(0, self.frames - 1, SAMPLED).astype(int).tolist()})
+        distances = [self.true_distance(n) for n in some]
+        if all(image is None for image in distances):
+            distances = [self.closed_form(n) for n in some]
+        return pictures.distance_scale([image for image in distances if image is not None])
+
+    @functools.cached_property
+    def error_scale(self) -> pictures.Scale:
+        """One scale for all errors: that of closed forms."""
+        errors = []
+        for n in np.linspace(0, self.frames - 1, SAMPLED).astype(int).tolist():
+            decoded, truth = self.closed_form(n), self.true_distance(n)
+            if decoded is not None and truth is not None:
+                errors.append(np.abs(decoded - truth))
+        return pictures.error_scale(errors)
+
+    @functools.cached_property
+    def quad_scale(self) -> pictures.Scale:
+        """One scale for all quads."""
+        some = np.linspace(0, self.frames - 1, SAMPLED).astype(int)
+        return pictures.signed_scale([self.sequence.quads[n] for n in some])
+
+
+class _Held(OrderedDict):
+    """The values that were used last, at most ``size``."""
+
+    def __init__(self, size: int):
+        super().__init__()
+        self.size = size
+
+    def get(self, key, make):
+        """The value of a key, made if it is not there."""
+        if key not in self:
+            self[key] = make()
+            if len(self) > self.size:
+                self.popitem(last=False)
+        self.move_to_end(key)
+        return self[key]
