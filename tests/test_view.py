@@ -101,10 +101,10 @@ def test_chi_square_is_at_the_size_of_the_sequence(fitted):
 def test_clouds_stand_beside_each_other(analytic):
     """Points at the distances along the rays; closed form left and truth right of ours."""
     found = {cloud.title: cloud for cloud in scene.clouds(analytic, POINTS)}
-    assert [*found] == [OURS, CLOSED_FORM, TRUTH]
-    camera = analytic.camera(5)
+    assert [*found] == [CLOSED_FORM, OURS, TRUTH]
+    camera = analytic.recording.camera(5)
     rays = camera.rays().numpy().reshape(-1, 3)
-    ours = analytic.ours(5).reshape(-1, 1) * rays
+    ours = analytic.ours(5)["distance"].reshape(-1, 1) * rays
     np.testing.assert_allclose(found[OURS].points, ours, rtol=1e-4)
     aside = found[TRUTH].points - true_distance(5).reshape(-1, 1) * rays
     assert aside[:, 0].min() > 1.0
@@ -118,12 +118,12 @@ def test_clouds_stand_beside_each_other(analytic):
 def test_a_click_meets_the_pixel_that_it_points_at(analytic):
     """From the camera along its rays, from aside, and past everything."""
     found = scene.clouds(analytic, replace(POINTS, beside=False))
-    camera = analytic.camera(5)
+    camera = analytic.recording.camera(5)
     for y, x in ((0, 0), (5, 8), (11, 19)):
         ray = camera.rays()[y, x].numpy()
         assert scene.pixel_on_ray(found, camera.centre, ray) == (y, x)
     eye, (y, x) = np.array([3.0, -1.0, 0.0]), (4, 12)
-    toward = analytic.ours(5)[y, x] * camera.rays()[y, x].numpy() - eye
+    toward = analytic.ours(5)["distance"][y, x] * camera.rays()[y, x].numpy() - eye
     assert scene.pixel_on_ray(found, eye, toward / np.linalg.norm(toward)) == (y, x)
     assert scene.pixel_on_ray(found, camera.centre, np.array([0.0, 0.0, -1.0])) is None
 
@@ -189,27 +189,31 @@ def test_what_is_chosen_is_drawn(window):
     """A slider, the play button and a click, each in the next step; nothing happens unasked."""
     assert window.step(0.0), "at first"
     assert not window.step(0.0)
-    first = window.shown.content
-    window.frame.value = 9
+    first = window.controls.shown.content
+    window.controls.frame.value = 9
     assert window.step(5.0)
-    assert window.shown.content != first
-    assert "raw frame 9 of 14" in window.about.content
-    window.colour.value = "error"
+    assert window.controls.shown.content != first
+    assert "raw frame 9 of 14" in window.controls.about.content
+    window.controls.colour.value = "error"
     assert window.step(5.0)
-    assert "error of closed form" in window.shown.content
-    camera = window.subject.camera(9)
-    drawn = window.plot.content
-    window.beside.value = False
+    assert "error of closed form" in window.controls.shown.content
+    camera = window.subject.recording.camera(9)
+    drawn = window.controls.plot.content
+    window.controls.beside.value = False
     window.pick(tuple(camera.centre), tuple(camera.rays()[3, 17].numpy()))
     while window.step(0.2):
         pass
-    assert window.choice.pixel == (3, 17) == (window.row.value, window.column.value)
-    assert window.plot.content != drawn
-    window.play.value = True
+    assert (
+        window.controls.choice.pixel
+        == (3, 17)
+        == (window.controls.row.value, window.controls.column.value)
+    )
+    assert window.controls.plot.content != drawn
+    window.controls.play.value = True
     for _ in range(3):
         window.step(1.0)
-    assert int(window.frame.value) in (10, 11, 12)
-    svg = base64.b64decode(re.search(r"base64,([^\"]*)", window.plot.content)[1])
+    assert int(window.controls.frame.value) in (10, 11, 12)
+    svg = base64.b64decode(re.search(r"base64,([^\"]*)", window.controls.plot.content)[1])
     assert svg.startswith(b"<svg")
 
 

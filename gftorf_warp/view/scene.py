@@ -13,7 +13,6 @@ from ..evaluate.panels import CHI_SQUARE_SHOWN
 from ..export.moments import Moments
 from ..export.points import OPAQUE, grey, world_points
 from ..export.splats import colour_harmonics, gaussians_at
-from ..scene.camera import Camera
 from .subject import Subject
 
 SPLATS, POINTS = "splats", "points"
@@ -43,7 +42,7 @@ class Choice:
     """Whether closed form and truth stand beside ours."""
     cameras: bool = True
     """Whether the camera and its path are drawn."""
-    pixel: tuple[int, int] | None = None
+    pixel: tuple[int, int] = (0, 0)
     """The pixel (y, x) whose quads are drawn."""
 
 
@@ -81,7 +80,7 @@ def colours_of(subject: Subject) -> list[str]:
     """Those of ``COLOURS`` that can be shown."""
     explained = subject.residuals
     known = {
-        "error": subject.truth is not None,
+        "error": subject.recording.truth is not None,
         "chi-square": explained is not None and explained.noisy,
     }
     return [name for name in COLOURS if known.get(name, True)]
@@ -91,35 +90,27 @@ def pictures_of(subject: Subject, n: int, colour: str) -> dict[str, Shown]:
     """The pictures of a raw frame with their scales, by title; those that are unknown are left
     out.
     """
-    distances = {
-        CLOSED_FORM: subject.closed_form(n),
-        OURS: subject.ours(n),
-        TRUTH: subject.true_distance(n),
-    }
+    distances = distances_of(subject, n)
     if colour == "distance":
-        scale = subject.distance_scale
-        return {t: (image, scale) for t, image in distances.items() if image is not None}
+        scale = subject.recording.distance_scale
+        return {title: (image, scale) for title, image in distances.items()}
     if colour == "error":
         return _errors(subject, distances)
     if colour == "chi-square":
         return _chi_square(subject, n)
     if colour == "amplitude":
-        image = subject.amplitude(n)
+        image = subject.recording.amplitude(n)
         if image is None:
             return {}
         return {"measured amplitude": (image, pictures.amplitude_scale([image]))}
     return _quads(subject, n)
 
 
-def _errors(
-    subject: Subject, distances: dict[str, Float[np.ndarray, "H W"] | None]
-) -> dict[str, Shown]:
-    truth = distances.pop(TRUTH)
-    if truth is None:
+def _errors(subject: Subject, distances: dict[str, Float[np.ndarray, "H W"]]) -> dict[str, Shown]:
+    if TRUTH not in distances:
         return {}
-    errors = {t: np.abs(image - truth) for t, image in distances.items() if image is not None}
-    scale = subject.error_scale
-    return {f"error of {title}": (error, scale) for title, error in errors.items()}
+    truth, scale = distances.pop(TRUTH), subject.recording.error_scale
+    return {f"error of {title}": (np.abs(d - truth), scale) for title, d in distances.items()}
 
 
 def _chi_square(subject: Subject, n: int) -> dict[str, Shown]:
@@ -133,7 +124,7 @@ def _chi_square(subject: Subject, n: int) -> dict[str, Shown]:
 
 
 def _quads(subject: Subject, n: int) -> dict[str, Shown]:
-    sequence, scale = subject.sequence, subject.quad_scale
+    sequence, scale = subject.sequence, subject.recording.quad_scale
     if not sequence.measured[n]:
         return {}
     measured = sequence.quads[n]
@@ -147,23 +138,33 @@ def _quads(subject: Subject, n: int) -> dict[str, Shown]:
     return shown
 
 
-def distances_of(subject: Subject, choice: Choice) -> dict[str, Float[np.ndarray, "H W"]]:
-    """Distances [m] of what stands beside each other in the scene, by title."""
-    n, found = choice.frame, {OURS: subject.ours(choice.frame)}
-    if choice.beside or subject.run is None:
-        found |= {CLOSED_FORM: subject.closed_form(n), TRUTH: subject.true_distance(n)}
+def distances_of(subject: Subject, n: int) -> dict[str, Float[np.ndarray, "H W"]]:
+    """All distances [m] that are known at a raw frame, by title."""
+    ours, recorded = subject.ours(n), subject.recording
+    found = {
+        CLOSED_FORM: recorded.closed_form(n),
+        OURS: None if ours is None else ours["distance"],
+        TRUTH: recorded.true_distance(n),
+    }
     return {title: distance for title, distance in found.items() if distance is not None}
+
+
+def _standing(subject: Subject, choice: Choice) -> dict[str, Float[np.ndarray, "H W"]]:
+    """Distances [m] of what stands in the scene, by title."""
+    found = distances_of(subject, choice.frame)
+    everything = choice.beside or subject.run is None
+    return {title: d for title, d in found.items() if everything or title == OURS}
 
 
 def clouds(subject: Subject, choice: Choice) -> list[Cloud]:
     """Points of ours if they are wanted as points, of closed form and truth beside them."""
-    n, camera, found = choice.frame, subject.camera(choice.frame), []
-    for title, distance in distances_of(subject, choice).items():
+    n, camera, found = choice.frame, subject.recording.camera(choice.frame), []
+    for title, distance in _standing(subject, choice).items():
         if title == OURS and choice.shape == SPLATS:
             continue
         seen = np.isfinite(distance) & (distance > 0) & _every(distance)
-        if title == OURS:
-            seen &= subject.rendered(n, subject.sequence.frequencies[0])["opacity"] >= OPAQUE
+        if title == OURS and (ours := subject.ours(n)) is not None:
+            seen &= ours["opacity"] >= OPAQUE
         points = world_points(distance, camera, seen).T + _place(subject, title)
         rgb = cloud_colours(subject, n, choice.colour, title)[seen]
         given = {"points": points.astype(np.float32), "rgb": rgb, "pixels": np.argwhere(seen)}
@@ -173,17 +174,17 @@ def clouds(subject: Subject, choice: Choice) -> list[Cloud]:
 
 def titles(subject: Subject, choice: Choice) -> dict[str, Float[np.ndarray, "3"]]:
     """Where the title of every shape is written [m]: above its middle, at the farthest distance."""
-    camera, far = subject.camera(0), subject.distance_scale.high
+    camera, far = subject.recording.camera(0), subject.recording.distance_scale.high
     _, down, forward = camera.camera_from_world[:3, :3]
     above = camera.centre + far * (forward - 0.6 * camera.height / camera.fy * down)
-    return {title: above + _place(subject, title) for title in distances_of(subject, choice)}
+    return {title: above + _place(subject, title) for title in _standing(subject, choice)}
 
 
 def _place(subject: Subject, title: str) -> Float[np.ndarray, "3"]:
     """Displacement [m] of a shape, so that it stands beside ours."""
     steps = {OURS: 0, CLOSED_FORM: 0 if subject.run is None else -1, TRUTH: 1}
-    camera = subject.camera(0)
-    return steps[title] * APART * width_of(subject, camera) * camera.camera_from_world[0, :3]
+    right = subject.recording.camera(0).camera_from_world[0, :3]
+    return steps[title] * APART * subject.recording.width * right
 
 
 def _every(image: Float[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
@@ -204,7 +205,7 @@ def cloud_colours(subject: Subject, n: int, colour: str, title: str) -> UInt8[np
         own = next(iter(shown.values()))
     if own is not None:
         return pictures.colour_mapped(own[0].astype(np.float32), own[1])
-    image = subject.amplitude(n)
+    image = subject.recording.amplitude(n)
     if image is None:
         return np.full((*subject.sequence.quads[n].shape, 3), 160, np.uint8)
     return grey(image, float(np.percentile(image, WHITE)))
@@ -214,9 +215,9 @@ def cloud_colours(subject: Subject, n: int, colour: str, title: str) -> UInt8[np
 def splats(subject: Subject, choice: Choice) -> Splats | None:
     """The Gaussians at the raw frame; None if there are none or points are wanted."""
     run, n = subject.run, choice.frame
-    if run is None or not len(run.field) or choice.shape != SPLATS:
+    if run is None or not subject.has_gaussians or choice.shape != SPLATS:
         return None
-    camera = subject.camera(n)
+    camera = subject.recording.camera(n)
     time = float(subject.sequence.times[n])
     moments = Moments(run=run, times=[time], frames=[n], cameras=[camera])
     gaussians = gaussians_at(moments, 0, colour_harmonics(moments, "reflectivity"))
@@ -237,10 +238,10 @@ def _splat_colours(
     subject: Subject, choice: Choice, centre: torch.Tensor
 ) -> Float[np.ndarray, "N 3"]:
     """Colours of the pixels that centres are seen in; grey outside of the image."""
-    n, camera = choice.frame, subject.camera(choice.frame)
+    n, camera = choice.frame, subject.recording.camera(choice.frame)
     if choice.colour == "distance":
         distance = np.linalg.norm(centre.numpy() - camera.centre, axis=1).astype(np.float32)
-        return pictures.colour_mapped(distance[None], subject.distance_scale)[0] / 255.0
+        return pictures.colour_mapped(distance[None], subject.recording.distance_scale)[0] / 255.0
     picture = cloud_colours(subject, n, choice.colour, OURS)
     at = camera.project(centre.double()).nan_to_num(-1.0).floor().clamp(-1, 1e6).long().numpy()
     inside = ((at >= 0) & (at < (camera.width, camera.height))).all(axis=1)
@@ -276,11 +277,6 @@ def path_of(subject: Subject) -> list[int]:
         return []
     count = min(subject.frames, MOST_CAMERAS)
     return sorted({*np.linspace(0, subject.frames - 1, count).astype(int).tolist()})
-
-
-def width_of(subject: Subject, camera: Camera) -> float:
-    """Width of the view [m] at the largest distance of the scale."""
-    return subject.distance_scale.high * camera.width / camera.fx
 
 
 def _resized(image: Float[np.ndarray, "h w"], subject: Subject) -> Float[np.ndarray, "H W"]:

@@ -1,10 +1,9 @@
-"""What is viewed: a sequence, with a run of it or without, raw frame by raw frame as arrays."""
+"""What is viewed: a recording, with a run of it or without."""
 
 from __future__ import annotations
 
 import functools
 import logging
-from collections import OrderedDict
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -12,29 +11,24 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from ..data.decode import closed_form_distance, quartet_phasor
 from ..data.folder import format_or_none
-from ..data.read import read, read_truth
+from ..data.read import read
 from ..data.sequence import Sequence
-from ..data.truth import known_distance
 from ..errors import InputError
-from ..evaluate import pictures
 from ..recon.folder import CONFIG
 from ..recon.residuals import Residuals, quad_of_shift
 from ..recon.run import Run
-from ..scene.camera import Camera
-from ..scene.measured import camera_of
+from .recording import Held, Recording
 from .state import State, newest
 
 LOG = logging.getLogger("gftorf_warp")
 RENDERED = ("quads", "phasor", "distance", "opacity")
 HELD = 160  # raw frames whose renderings are kept: more than the plot of a pixel shows
 HELD_BYTES = 2.5e8  # fewer of large images
-SAMPLED = 8  # raw frames from which the scale of distances is taken
 
 
 class Subject:
-    """A sequence and, if there is one, the newest state of a run of it.
+    """A recording and, if there is one, the newest state of a run of it.
 
     Args:
         sequence: What was measured.
@@ -43,11 +37,7 @@ class Subject:
     """
 
     def __init__(self, sequence: Sequence, run: Run | None, path: Path):
-        self.sequence, self.path = sequence, path
-        found = read_truth(sequence)
-        self.truth = None if found is None else known_distance(found)
-        self._cameras = [camera_of(sequence, n) for n in range(sequence.frames)]
-        self._decoded = _Held(HELD)
+        self.sequence, self.path, self.recording = sequence, path, Recording(sequence)
         self.state: State | None = None
         self._take(run)
 
@@ -83,12 +73,13 @@ class Subject:
     def _take(self, run: Run | None) -> None:
         """Let a run be what is rendered."""
         bytes_each = 4 * self.sequence.quads[0].size * (2 + self.sequence.cycle)
-        self.run, self._rendered = run, _Held(min(HELD, int(HELD_BYTES / bytes_each) + 1))
+        self.run, self._rendered = run, Held(min(HELD, int(HELD_BYTES / bytes_each) + 1))
         self.state = None if run is None else newest(self.path)
-        self._renderers = {} if run is None else {
-            f: run.renderer(RENDERED, f_mod_hz=None if f == self.sequence.frequencies[0] else f)
-            for f in self.sequence.frequencies
-        }  # fmt: skip
+        first, *further = self.sequence.frequencies
+        self._renderers = {}
+        if run is not None:
+            self._renderers[first] = run.renderer(RENDERED)
+            self._renderers |= {f: run.renderer(RENDERED, f_mod_hz=f) for f in further}
         self.__dict__.pop("residuals", None)  # of the run before
 
     def reload(self) -> bool:
@@ -109,30 +100,10 @@ class Subject:
         """Number F of raw frames."""
         return self.sequence.frames
 
-    def camera(self, n: int) -> Camera:
-        """The camera of a raw frame."""
-        return self._cameras[n]
-
-    def closed_form(self, n: int) -> Float[np.ndarray, "H W"] | None:
-        """Distance decoded from the quartet of a raw frame [m]; None: it is not complete."""
-        i = n // self.sequence.cycle
-        if i not in self.sequence.complete_quartets:
-            return None
-        decode = functools.partial(closed_form_distance, self.sequence, i)
-        return self._decoded.get(i, lambda: decode().astype(np.float32))
-
-    def amplitude(self, n: int) -> Float[np.ndarray, "H W"] | None:
-        """Length of the measured phasor of its quartet [quad units]; None: not complete."""
-        i = n // self.sequence.cycle
-        if i not in self.sequence.complete_quartets:
-            return None
-        return np.hypot(*quartet_phasor(self.sequence, i))
-
-    def true_distance(self, n: int) -> Float[np.ndarray, "H W"] | None:
-        """True distance [m], NaN where unknown; None without ground truth."""
-        if self.truth is None or not np.isfinite(self.truth[n]).any():
-            return None
-        return self.truth[n]
+    @property
+    def has_gaussians(self) -> bool:
+        """Whether there is a run, and it has Gaussians."""
+        return self.run is not None and len(self.run.field) > 0
 
     def rendered(self, n: int, f_mod_hz: float | None = None) -> Mapping[str, np.ndarray]:
         """Images of the run at a raw frame: ``distance`` [m], ``opacity`` [1] and ``slots``
@@ -143,22 +114,22 @@ class Subject:
             f_mod_hz: Modulation frequency [Hz]; None: that of the raw frame.
         """
         f = float(self.sequence.frame_frequencies[n]) if f_mod_hz is None else f_mod_hz
-        return self._rendered.get((n, f), lambda: self._render(n, f))
+        return self._rendered.of((n, f), lambda: self._render(n, f))
 
     @torch.no_grad()
     def _render(self, n: int, f: float) -> dict[str, np.ndarray]:
         assert self.run is not None, "a sequence alone has nothing to render"
-        image = self._renderers[f](float(self.sequence.times[n]), self.camera(n))
+        image = self._renderers[f](float(self.sequence.times[n]), self.recording.camera(n))
         found = {k: getattr(image, k).cpu().numpy().copy() for k in ("distance", "opacity")}
         shifts = self.sequence.shifts[: self.sequence.cycle]
         slots = [quad_of_shift(image, self.run.sensor, float(shift)) for shift in shifts]
         return found | {"slots": np.stack([slot.cpu().numpy() for slot in slots])}
 
-    def ours(self, n: int) -> Float[np.ndarray, "H W"] | None:
-        """Distance of the run [m]; None: there is no run."""
-        if self.run is None:
-            return None
-        return self.rendered(n, self.sequence.frequencies[0])["distance"]
+    def ours(self, n: int) -> Mapping[str, np.ndarray] | None:
+        """Images of the run at the first frequency, see :meth:`rendered`; None: there is no
+        run.
+        """
+        return None if self.run is None else self.rendered(n, self.sequence.frequencies[0])
 
     @functools.cached_property
     def residuals(self) -> Residuals | None:
@@ -171,45 +142,3 @@ class Subject:
         if found is None or not found.noisy or i not in found.quartets:
             return None
         return found.chi_square[found.quartets.index(i)]
-
-    @functools.cached_property
-    def distance_scale(self) -> pictures.Scale:
-        """One scale for all distances: that of the truth, else of closed forms."""
-        some = sorted({*np.linspace(0, self.frames - 1, SAMPLED).astype(int).tolist()})
-        distances = [self.true_distance(n) for n in some]
-        if all(image is None for image in distances):
-            distances = [self.closed_form(n) for n in some]
-        return pictures.distance_scale([image for image in distances if image is not None])
-
-    @functools.cached_property
-    def error_scale(self) -> pictures.Scale:
-        """One scale for all errors: that of closed forms."""
-        errors = []
-        for n in np.linspace(0, self.frames - 1, SAMPLED).astype(int).tolist():
-            decoded, truth = self.closed_form(n), self.true_distance(n)
-            if decoded is not None and truth is not None:
-                errors.append(np.abs(decoded - truth))
-        return pictures.error_scale(errors)
-
-    @functools.cached_property
-    def quad_scale(self) -> pictures.Scale:
-        """One scale for all quads."""
-        some = np.linspace(0, self.frames - 1, SAMPLED).astype(int)
-        return pictures.signed_scale([self.sequence.quads[n] for n in some])
-
-
-class _Held(OrderedDict):
-    """The values that were used last, at most ``size``."""
-
-    def __init__(self, size: int):
-        super().__init__()
-        self.size = size
-
-    def get(self, key, make):
-        """The value of a key, made if it is not there."""
-        if key not in self:
-            self[key] = make()
-            if len(self) > self.size:
-                self.popitem(last=False)
-        self.move_to_end(key)
-        return self[key]
