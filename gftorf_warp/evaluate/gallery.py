@@ -9,10 +9,12 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from ..data.sequence import Sequence
+from ..recon.settings import Method
 from ..scene.measured import colour_camera_of
 from . import page, pictures
 from .poses import middle
 from .previews import srgb
+from .provenance import method_of
 from .views import finite
 
 if TYPE_CHECKING:
@@ -52,12 +54,13 @@ class Colour:
 def novel_views(run: Run, sequence: Sequence, count: int = STRIP_VIEWS) -> Novel | None:
     """Views from up to ``count`` of the novel poses of a sequence, in the middle of it.
 
-    None if the sequence has none, or if the run has no Gaussians.
+    None if the sequence has none, or if nothing was fitted: a closed form has one view.
 
     Raises:
         DivergedError: If a rendering is not finite.
     """
-    if sequence.novel_from_world is None or not len(sequence.novel_from_world) or not run.gaussians:
+    fits = Method(method_of(run.config)).fits
+    if sequence.novel_from_world is None or not len(sequence.novel_from_world) or not fits:
         return None
     total = len(sequence.novel_from_world)
     chosen = np.linspace(0, total - 1, min(count, total)).round().astype(int).tolist()

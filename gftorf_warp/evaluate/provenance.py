@@ -8,12 +8,13 @@ import shlex
 from collections.abc import Mapping
 from typing import Any
 
+from ..recon.settings import Method
 from . import page
 
 # facts that mean something for some methods only
 METHODS_OF = {
-    "input": {"gaussians"},
-    "flow_source": {"gaussians", "flow2d"},
+    "input": {"gaussians", "torf", "ftorf"},
+    "flow_source": {"gaussians", "flow2d", "ftorf"},
     "init": {"gaussians"},
     "motion": {"gaussians"},
 }
@@ -29,6 +30,10 @@ METHOD_WORDS = {
     "median, and of the quartet elsewhere; nothing was fitted",
     "flow2d": "the closed form of quartets whose raw frames optical flow brought to one time; "
     "nothing was fitted",
+    "torf": "a neural volume, a part of it at rest and a part in motion, fitted to phasors and "
+    "colour by gradient descent; our own code after TöRF",
+    "ftorf": "a neural volume with 3D scene flow, fitted to raw quads at their own times by "
+    "gradient descent; our own code after F-TöRF",
 }
 INPUT_WORDS = {
     "quads": "quads: every raw frame at its own time and phase shift",
@@ -104,7 +109,9 @@ def how(
         and f"{size[0]}x{size[1]} pixels; scored at the sequence's own resolution",
         "quad scale": None if scale is None else f"{scale:.6g} ({config.get('quad_scale_source')})",
         "without optical flow": share and f"{100.0 * share:.2f} % of the pixels",
-        "images, seed": length if method == "gaussians" else None,
+        "images, seed": length if Method(method).fits else None,
+        "as published": "; ".join(config.get("faithful", ())) or None,
+        "assumed or different": "; ".join(config.get("assumed", ())) or None,
         "device": config.get("device") and f"{config['device']}{threads}",
         "reconstructed by": f"gftorf-warp {config.get('version')}",
         "compared by": installed,
@@ -131,7 +138,7 @@ def _compare_command(metrics: Mapping[str, Any]) -> str:
 def _command(config: Mapping[str, Any]) -> str:
     """The command that reproduces the run."""
     options = {name: config.get(name) for name in ("preset", "images", "seed", "device")}
-    if method_of(config) == "gaussians":
+    if Method(method_of(config)).fits:
         more = {name: fact(config, name) for name in ("ablation", "input")}
         options |= {name: value for name, value in more.items() if value is not None}
     else:

@@ -11,11 +11,12 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..data.files import atomic_folder
-from ..errors import InputError
+from ..errors import InputError, UsageError
 from ..scene.gaussians import GaussianField
 from ..scene.motion import Motion
 from . import checkpoint, densify, folder
 from .optimiser import Optimiser
+from .settings import Method
 from .state import from_dict, to_dict
 
 EDITED = "edited_from"
@@ -82,9 +83,13 @@ def save(
 
     Raises:
         InputError: If ``run`` has no checkpoint any more that can be read.
-        UsageError: If ``out`` is not empty or cannot be written.
+        UsageError: If the run is of another method, or ``out`` is not empty or cannot be written.
         ResourceError: If the disk is full.
     """
+    method = Method(config["settings"].get("method", Method.GAUSSIANS))
+    if method != Method.GAUSSIANS:
+        why = f"its method is {method}, and what is stored is an edited run of Gaussians"
+        raise UsageError("the run has no Gaussians", where=run, why=why, fix="copy its folder")
     stored = checkpoint.last(run, field.device)
     if stored is None:
         why = "a run is stored with the state of the one it is from, which holds Gaussians"

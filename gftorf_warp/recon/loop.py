@@ -8,18 +8,17 @@ from __future__ import annotations
 import contextlib
 import logging
 import math
-import signal
-import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import torch
 
-from ..errors import DivergedError, Terminated
+from ..errors import DivergedError
 from ..render.buffers import available_threads
 from . import checkpoint, collapse
 from .diagnostics import Diagnostics, Row
+from .interruption import interruption, signals
 from .observations import Observations
 from .record import Metrics
 from .settings import ReconSettings
@@ -83,7 +82,7 @@ class TrainingLoop:
         with (
             _one_torch_thread(self.device),
             image_threads(self.device) as map_images,
-            _signals() as stop,
+            signals() as stop,
         ):
             stepper = self.stepper(state, map_images)
             while state.images < total:
@@ -120,7 +119,7 @@ class TrainingLoop:
                 if stop:
                     self.save(state)
                     LOG.info("interrupted at image %d of %d, stored", state.images, total)
-                    raise Terminated if signal.SIGTERM in stop else KeyboardInterrupt
+                    raise interruption(stop)
                 if self.saving_is_due(before, state.images) and not failures:
                     self.save(state)
         self.save(state)
@@ -266,29 +265,3 @@ def _one_torch_thread(device: torch.device) -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
-
-
-@contextlib.contextmanager
-def _signals() -> Iterator[list[int]]:
-    """A list, empty until Ctrl-C or SIGTERM puts its number there; the second one acts at once.
-    Main thread only.
-    """
-    stop: list[int] = []
-    if threading.current_thread() is not threading.main_thread():
-        yield stop
-        return
-    numbers = (signal.SIGINT, signal.SIGTERM)
-    before = {number: signal.getsignal(number) for number in numbers}
-
-    def first(received: int, _) -> None:
-        stop.append(received)
-        for number in numbers:
-            signal.signal(number, before[number])
-
-    for number in numbers:
-        signal.signal(number, first)
-    try:
-        yield stop
-    finally:
-        for number in numbers:
-            signal.signal(number, before[number])

@@ -153,7 +153,7 @@ def residuals(run: Fitted, sequence: Sequence) -> Residuals | None:
         complete.
     """
     settings = run.config.get("settings", {})
-    fitted = settings.get("method", Method.GAUSSIANS) == Method.GAUSSIANS
+    fitted = Method(settings.get("method", Method.GAUSSIANS)).fits
     if not fitted or not settings.get("weights", {}).get("quads", 1.0) > 0:
         return None
     width, height = run.config.get("size_optimised", (sequence.width, sequence.height))

@@ -4,6 +4,7 @@ in the units of the sequence.
 
 from __future__ import annotations
 
+import abc
 import dataclasses
 import functools
 import logging
@@ -12,6 +13,7 @@ import weakref
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -37,6 +39,9 @@ from .read_back import read_back, render_settings
 from .residuals import Residuals, residuals
 from .settings import FlowSource, Method
 from .state import field_and_motion
+from .volume.models import volume_from_dict
+from .volume.render import rendering_of
+from .volume.volume import Volume, settings_of
 
 LOG = logging.getLogger("gftorf_warp")
 
@@ -75,7 +80,8 @@ class Run:
         found = read_back(path)
         config, camera, sensor = found.config, found.camera, found.sensor
         kinds = {Method.CTOF: ClosedForm, Method.TEMPORAL: Temporal, Method.FLOW2D: Flow2D}
-        if (kind := kinds.get(config["settings"].get("method"))) is not None:
+        method = Method(config["settings"].get("method", Method.GAUSSIANS))
+        if (kind := kinds.get(method)) is not None:
             return kind.of(path, config, camera, sensor, device)
         stored = checkpoint.last(path, device)
         if stored is None:
@@ -85,15 +91,20 @@ class Run:
                 why="nothing was reconstructed yet",
                 fix="run `gftorf reconstruct` with this --out first",
             )
-        gaussians, motion, binding = field_and_motion(stored, device)
-        edits.check_finite(path, gaussians, motion)
         reached = {"images_optimised": stored["images"], "seconds_reconstruct": stored["seconds"]}
         damaged = [newer.name for newer in checkpoint.after(path, stored["images"])]
         if damaged:
             reached["damaged_checkpoints"] = damaged
+        config = config | reached  # of an interrupted run, config.json does not say
+        if method.is_volume:
+            known = settings_of(config["settings"]["volume"])
+            volume = volume_from_dict(method, known, stored["volume"], device)
+            return VolumeRun.of(path, config, camera, sensor, device, volume=volume)
+        gaussians, motion, binding = field_and_motion(stored, device)
+        edits.check_finite(path, gaussians, motion)
         return cls(
             path=path,
-            config=config | reached,  # of an interrupted run, config.json does not say
+            config=config,
             camera=camera,
             sensor=sensor,
             quad_scale=config["quad_scale"],
@@ -324,22 +335,28 @@ class Run:
         return replace(self, config=source.link(self.path, self.config, sequence))
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class ClosedForm(Run):
-    """A run without Gaussians, which renders its own measurements."""
+class WithoutGaussians(Run, abc.ABC):
+    """A run of another method, whose field is empty."""
 
     @classmethod
     def of(
-        cls, path: Path, config: dict, camera: Camera, sensor: Sensor, device: torch.device | str
-    ) -> ClosedForm:
-        """The closed form of the sequence that a config names.
+        cls,
+        path: Path,
+        config: dict,
+        camera: Camera,
+        sensor: Sensor,
+        device: torch.device | str,
+        **more: Any,
+    ) -> Self:
+        """The run that a config describes.
 
         Args:
-            path: The folder of the run.
+            path: Its folder.
             config: Content of its ``config.json``.
             camera: The camera of raw frame 0.
             sensor: The sensor, with the four canonical shifts.
             device: Where images are wanted.
+            more: Further fields of the class.
         """
         field, motion = closed_form.no_gaussians(device), Still(torch.tensor([0.0, 1.0])).to(device)
         return cls(
@@ -347,11 +364,26 @@ class ClosedForm(Run):
             config=config,
             camera=camera,
             sensor=sensor,
-            quad_scale=1.0,
+            quad_scale=config.get("quad_scale", 1.0),
             field=field,
             motion=motion,
             binding=motion.bind(field),
+            **more,
         )
+
+    def renderer(
+        self,
+        images: Iterable[str] = (),  # noqa: ARG002
+        *,
+        f_mod_hz: float | None = None,
+        corrected: bool = True,  # noqa: ARG002
+    ) -> Callable[[float, Camera], Rendering]:
+        """:meth:`render`: there is nothing that images share."""
+        return functools.partial(self.render, f_mod_hz=f_mod_hz)
+
+
+class ClosedForm(WithoutGaussians):
+    """A run without Gaussians, which renders its own measurements."""
 
     def render(
         self,
@@ -389,16 +421,6 @@ class ClosedForm(Run):
             device=self.field.device,
         )
 
-    def renderer(
-        self,
-        images: Iterable[str] = (),  # noqa: ARG002
-        *,
-        f_mod_hz: float | None = None,
-        corrected: bool = True,  # noqa: ARG002
-    ) -> Callable[[float, Camera], Rendering]:
-        """:meth:`render`: there is nothing that images share."""
-        return functools.partial(self.render, f_mod_hz=f_mod_hz)
-
     def _shown(self, time: float) -> Sequence:  # noqa: ARG002
         """What holds the quartet that is decoded at a time [s]."""
         return self._measured
@@ -426,6 +448,44 @@ class Flow2D(ClosedForm):
     def _shown(self, time: float) -> Sequence:
         matcher = FlowSource(self.config["settings"]["flow"]).matcher
         return synchronised(self._measured, time, matcher).sequence
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class VolumeRun(WithoutGaussians):
+    """A run of a neural volume."""
+
+    volume: Volume
+    """What is seen."""
+
+    def render(
+        self,
+        time: float,
+        camera: Camera | None = None,
+        *,
+        extra: Float[Tensor, "0 D"] | None = None,
+        f_mod_hz: float | None = None,
+    ) -> Rendering:
+        """What the sensor would see at one instant; as :meth:`Run.render`, extra channels are 0.
+
+        Args:
+            time: Seconds since raw frame 0, any number; beyond the recording as at its ends.
+            camera: Where from, and how many pixels; None is the sequence's own.
+            extra: Channels per Gaussian, of which there are none.
+            f_mod_hz: Modulation frequency of quads and phasor [Hz]; None: the first of the sensor.
+        """
+        camera = camera or self.camera
+        found = rendering_of(
+            self.volume,
+            time,
+            camera,
+            self._at(f_mod_hz),
+            quad_scale=self.quad_scale,
+            colour_scale=self.colour_scale,
+        )
+        if extra is None:
+            return found
+        none = torch.zeros(extra.shape[1], camera.height, camera.width, device=self.volume.device)
+        return replace(found, extra=none)
 
 
 def _footprint(field: GaussianField, camera: Camera) -> Float[Tensor, "N"]:

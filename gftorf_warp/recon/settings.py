@@ -18,6 +18,7 @@ from ..scene.changes import require
 from ..scene.initialise import InitSettings
 from ..scene.models import KINDS
 from ..scene.motion import MotionSettings
+from .volume.settings import VolumeSettings
 
 # of a step of Adam, which moves a value by about its rate: scenes are tens of metres wide, and
 # logits and logarithms of all that matters lie within tens
@@ -37,11 +38,20 @@ class Method(enum.StrEnum):
     the quartet elsewhere."""
     FLOW2D = "flow2d"
     """The closed form of quartets whose raw frames optical flow brought to one time."""
+    TORF = "torf"
+    """A neural volume fitted to phasors and colour."""
+    FTORF = "ftorf"
+    """A neural volume fitted to raw quads at their own times."""
+
+    @property
+    def is_volume(self) -> bool:
+        """Whether a neural volume is fitted."""
+        return self in (Method.TORF, Method.FTORF)
 
     @property
     def fits(self) -> bool:
         """Whether parameters are optimised."""
-        return self == Method.GAUSSIANS
+        return self == Method.GAUSSIANS or self.is_volume
 
 
 class Input(enum.StrEnum):
@@ -277,6 +287,9 @@ class ReconSettings:
     """The first Gaussians."""
     motion: MotionSettings = field(default_factory=MotionSettings)
     """The motion model."""
+    volume: VolumeSettings | None = None
+    """The neural volume of methods ``torf`` and ``ftorf``, which have neither Gaussians nor their
+    ``init``, ``motion``, ``rates``, ``densify`` and ``render``; None: of no other."""
     render: RenderSettings = field(default_factory=RenderSettings)
     """The renderer, also of the finished run."""
     rates: Rates = field(default_factory=Rates)

@@ -30,7 +30,9 @@ from .observations import input_of, observe
 from .record import Metrics, log_to
 from .run import Run
 from .settings import FlowSource, Input, Method, ReconSettings
-from .state import begin, from_dict
+from .state import State, begin, from_dict
+from .volume import fit
+from .volume.loop import VolumeState
 
 LOG = logging.getLogger("gftorf_warp")
 Choice = TypeVar("Choice", bound=enum.StrEnum)
@@ -131,6 +133,12 @@ def chosen_settings(
         _check_flow(sequence, settings.flow)
     settings = changed(settings, changes, CHANGES)
     _check_windows(settings)
+    _check_method(settings, input)
+    return replace(settings, cycle=sequence.cycle)
+
+
+def _check_method(settings: ReconSettings, input: Input | str) -> None:
+    """Raise a UsageError if a setting contradicts the method."""
     if settings.method == Method.FLOW2D and settings.flow in (FlowSource.FILE, FlowSource.NONE):
         raise UsageError(
             f"flow {settings.flow} does not fit preset flow2d",
@@ -138,7 +146,21 @@ def chosen_settings(
             why="it needs the flow of every raw frame, which no file contains",
             fix="use --flow dis or --flow deepflow",
         )
-    return replace(settings, cycle=sequence.cycle)
+    wanted = {Method.TORF: Input.PHASOR, Method.FTORF: Input.QUADS}.get(settings.method)
+    if wanted is not None and (settings.input != wanted or input not in (Input.AUTO, wanted)):
+        raise UsageError(
+            f"another input does not fit preset {settings.preset}",
+            where="--input",
+            why=f"it is the method that compares {wanted}",
+            fix="leave --input out, or use --preset torf for phasors, ftorf for quads",
+        )
+    if wanted is not None and not settings.weights.quads > 0:
+        raise UsageError(
+            f"weights.quads = {settings.weights.quads} does not fit preset {settings.preset}",
+            where="--set",
+            why="without quads or phasors nothing determines a distance",
+            fix="set it above 0",
+        )
 
 
 def _check_resources(
@@ -232,12 +254,15 @@ def _run(sequence, out, settings, config, seed, device, goes_on, begun, progress
             source.remember(out, sequence.path)
         LOG.info("%s is finished: %d images", out, stored["images"])
         return
+    if settings.method.is_volume:
+        fit.check_volume(sequence, settings.method)
     observations = observe(sequence, settings, device)
     _warn(sequence)
-    if stored is None:
-        state = begin(observations, settings, seed=seed, device=device)
-    else:
-        state = from_dict(stored, device)
+    earlier = 0.0 if stored is None else stored["seconds"]
+
+    def clock() -> float:
+        return earlier + time.monotonic() - begun
+
     config |= {
         "quad_scale": observations.quad_scale,
         "quad_scale_source": observations.quad_scale_source,
@@ -246,7 +271,34 @@ def _run(sequence, out, settings, config, seed, device, goes_on, begun, progress
         "colour_scale": observations.colour_scale,
         "size_optimised": [observations.sequence.width, observations.sequence.height],
     }
+    given = observations, settings, out, stored
+    more = {"seed": seed, "clock": clock, "progress": progress}
+    if settings.method.is_volume:
+        config |= fit.describe(settings, config["changes"])
+        folder.write_config(out, config)
+        state: VolumeState | State = fit.fit(*given, **more)
+    else:
+        folder.write_config(out, config)
+        gaussians = _fit_gaussians(sequence, *given, **more)
+        config |= {name: getattr(gaussians, name) for name in ("skipped", "restarts", "revivals")}
+        state = gaussians
+    config |= {"seconds_reconstruct": state.seconds, "images_optimised": state.images}
     folder.write_config(out, config)
+    LOG.info("%s is finished: %d images, %.1f s", out, state.images, state.seconds)
+    found = residuals.residuals(Run.open(out, device), sequence)
+    residuals.warn(found)
+    folder.write_config(out, config | {"explained": found and found.as_json()})
+
+
+def _fit_gaussians(
+    sequence, observations, settings, out, stored, *, seed, clock, progress
+) -> State:
+    """Train Gaussians until the images of the settings are used up."""
+    device, total = observations.quads.device, settings.schedule.images
+    if stored is None:
+        state = begin(observations, settings, seed=seed, device=device)
+    else:
+        state = from_dict(stored, device)
     metrics = Metrics(out / "metrics.jsonl")
     diagnostics = Diagnostics(observations, _truth(sequence), out / "diagnostics.jsonl")
     for rows in (metrics, diagnostics):
@@ -259,22 +311,10 @@ def _run(sequence, out, settings, config, seed, device, goes_on, begun, progress
     if total <= (warm_up := settings.schedule.warm_up):
         text = "nothing will move: the warm-up takes %d images, the run %d"
         LOG.warning(text, warm_up, total)
-    earlier = state.seconds
-
-    def clock() -> float:
-        return earlier + time.monotonic() - begun
-
     if torch.device(device).type == "cpu":  # a thread per image: no result depends on their number
         settings = replace(settings, render=replace(settings.render, threads=1))
     records = metrics, diagnostics, clock, progress
-    state = TrainingLoop(observations, settings, seed, out, *records).run(state)
-    config |= {"seconds_reconstruct": state.seconds, "images_optimised": state.images}
-    config |= {name: getattr(state, name) for name in ("skipped", "restarts", "revivals")}
-    folder.write_config(out, config)
-    LOG.info("%s is finished: %d images, %.1f s", out, state.images, state.seconds)
-    found = residuals.residuals(Run.open(out, device), sequence)
-    residuals.warn(found)
-    folder.write_config(out, config | {"explained": found and found.as_json()})
+    return TrainingLoop(observations, settings, seed, out, *records).run(state)
 
 
 def _synchronise(sequence: Sequence, settings: ReconSettings) -> dict[str, object]:

@@ -29,7 +29,7 @@ def encoded(
     """gamma(v): the values, then sine and cosine of 2^0 v, 2^1 v, .., without a factor pi.
 
     Args:
-        value: Without gradient.
+        value: Differentiable, at the cost of more memory if it requires a gradient.
         frequencies: Their number, or their ``powers_of_two``, which saves an upload.
         columns: Length of a row, padded with zeros; None: no padding.
         dtype: Of the result, rounded at the end; None: that of the values.
@@ -38,6 +38,10 @@ def encoded(
     count, dimensions = len(powers), value.shape[-1]
     size = encoded_size(dimensions, count)
     angles = value[..., None, :] * powers[:, None]
+    if value.requires_grad and torch.is_grad_enabled():
+        found = torch.stack([torch.sin(angles), torch.cos(angles)], dim=-2).flatten(-3)
+        padding = value.new_zeros(*value.shape[:-1], (columns or size) - size)
+        return torch.cat([value, found, padding], dim=-1).to(dtype or value.dtype)
     allocate = torch.empty if columns in (None, size) else torch.zeros
     rows = allocate(
         *value.shape[:-1], columns or size, dtype=dtype or value.dtype, device=value.device

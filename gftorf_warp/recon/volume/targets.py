@@ -1,0 +1,155 @@
+"""What a volume is compared with, pixel by pixel and on its device, and how pixels are drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from ...data.decode import closed_form_distance
+from ..observations import ImageStack, Observations
+from .rays import Views, mean_pose
+
+NEARER, FARTHER = 0.9, 1.1  # [1] bounds reach so far beyond the distances in them
+OUTLIERS = 0.005  # share of decoded distances at either end that does not count
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Around:
+    """B measured raw frames less than a cycle from the start of a quartet, on the device."""
+
+    frames: Int[Tensor, "B"]
+    """Their numbers: the start, then those before it, then those after it."""
+    before: Float[Tensor, "b"]
+    """Cycles from the b before it to the start [1]."""
+    after: Float[Tensor, "a"]
+    """Cycles from the start to the a after it [1]."""
+    shift: Float[Tensor, "B 1 1"]
+    """Their phase shifts [rad]."""
+    slope: Float[Tensor, "B 1 1"]
+    """Their phases per distance [rad/m]."""
+
+
+class Targets:
+    """Measurements by pixel, numbered row by row, and the rays through them."""
+
+    def __init__(self, observations: Observations):
+        """Take what is compared from the observations of a run."""
+        sequence, device = observations.sequence, observations.quads.device
+        self.observations, self.cycle = observations, sequence.cycle
+        self._around: dict[tuple[int, bool], Around] = {}
+        self.measured: list[bool] = sequence.measured.tolist()
+        """Whether each raw frame was."""
+        self.quads: Float[Tensor, "F P"] = observations.quads.flatten(1)
+        """Raw frames."""
+        self.phasors: Float[Tensor, "r 2 P"] = _by_pixel(observations.phasors)
+        """Phasors, in the order of ``phasor_frames``; empty if quads are compared."""
+        self.phasor_frames = list(observations.phasors.rows)
+        """The raw frame that represents each phasor."""
+        self.flow: Float[Tensor, "r 2 2 P"] = _by_pixel(observations.flow)
+        """Optical flow [px] in the order of ``flow_quartets``, forward and backward; NaN:
+        unknown."""
+        self.flow_rows = observations.flow.rows
+        """Row of each quartet in it."""
+        self.volume_from_world = mean_pose(sequence.camera_from_world)
+        """Axes of the volume."""
+        own = observations.cameras[0].camera_from_world @ np.linalg.inv(self.volume_from_world)
+        self.camera = observations.cameras[0].at(own)
+        """The camera of raw frame 0 in the axes of the volume, at the size of the optimisation."""
+        self.views = Views(observations.cameras, self.volume_from_world, device)
+        """Rays of raw frames."""
+        self.colour_frames = list(observations.colour.rows)
+        """Raw frames with a colour image."""
+        self.colour: Float[Tensor, "r 3 p"] | None = None
+        """Colour images, in that order."""
+        self.colour_views: Views | None = None
+        """Rays of colour images, in that order."""
+        if self.colour_frames:
+            cameras = [observations.colour_cameras[n] for n in self.colour_frames]
+            self.colour = _by_pixel(observations.colour)
+            self.colour_views = Views(cameras, self.volume_from_world, device)
+
+    def around(self, quartet: int, *, after_only: bool = False) -> Around:
+        """The raw frames around the start of a quartet, or only its own."""
+        if (quartet, after_only) not in self._around:
+            start, cycle = self.cycle * quartet, self.cycle
+            first = start if after_only else max(0, start - cycle + 1)
+            measured = [
+                n for n in range(first, min(start + cycle, len(self.measured))) if self.measured[n]
+            ]
+            before, after = [n for n in measured if n < start], [n for n in measured if n > start]
+            self._around[quartet, after_only] = self._on_device(start, before, after)
+        return self._around[quartet, after_only]
+
+    def _on_device(self, start: int, before: list[int], after: list[int]) -> Around:
+        sensors = [self.observations.sensor_at(n) for n in (start, *before, *after)]
+
+        def column(values: Iterable[float]) -> Tensor:
+            return self.quads.new_tensor([*values])
+
+        return Around(
+            frames=torch.tensor([start, *before, *after], device=self.quads.device),
+            before=column((start - n) / self.cycle for n in before),
+            after=column((n - start) / self.cycle for n in after),
+            shift=column(sensor.shifts[0] for sensor in sensors)[:, None, None],
+            slope=column(float(sensor.phase_slope) for sensor in sensors)[:, None, None],
+        )
+
+    @property
+    def quartet_times(self) -> list[float]:
+        """Time of the first raw frame of every quartet [s]."""
+        return self.observations.sequence.times[:: self.cycle].tolist()
+
+    def bounds(self) -> tuple[float, float]:
+        """z-depths [m] that hold what was decoded: 0.9 of the smallest, 1.1 of the largest."""
+        sequence = self.observations.sequence
+        cosine = self.camera.directions()[..., 2]
+        quartets = sequence.complete_quartets
+        decoded = torch.from_numpy(np.stack([closed_form_distance(sequence, i) for i in quartets]))
+        z = (decoded * cosine).flatten().float()
+        z = z[:: max(1, len(z) // 1_000_000)]  # as many as a quantile takes
+        near, far = torch.quantile(z, torch.tensor([OUTLIERS, 1.0 - OUTLIERS])).tolist()
+        return NEARER * near, FARTHER * far
+
+
+def _by_pixel(stack: ImageStack) -> Float[Tensor, "r *c P"]:
+    """Images with one axis of pixels; an empty stack as it is."""
+    return stack.images.flatten(-2) if stack else stack.images
+
+
+class Draw:
+    """The random numbers of a run: on the host what decides about launches, else on the device."""
+
+    def __init__(self, seed: int, device: torch.device):
+        """Seed both generators."""
+        self.host = torch.Generator().manual_seed(seed)
+        self.device = torch.Generator(device).manual_seed(seed)
+
+    def one_of(self, choices: Sequence[T]) -> T:
+        """One of them, all alike."""
+        return choices[int(torch.randint(len(choices), (), generator=self.host))]
+
+    def pixels(self, count: int, of: int) -> Int[Tensor, "R"]:
+        """Numbers of pixels."""
+        return torch.randint(of, (count,), generator=self.device, device=self.device.device)
+
+    def noise(self, like: Tensor, deviation: float) -> Tensor:
+        """Normal noise of the shape of a tensor."""
+        return deviation * torch.randn(
+            like.shape, generator=self.device, device=like.device, dtype=like.dtype
+        )
+
+    def states(self) -> dict[str, Tensor]:
+        """Both states, for a checkpoint."""
+        return {"host": self.host.get_state(), "device": self.device.get_state()}
+
+    def restore(self, states: dict[str, Tensor]) -> None:
+        """Go on where a checkpoint was written."""
+        self.host.set_state(states["host"].cpu())
+        self.device.set_state(states["device"].cpu())

@@ -1,0 +1,175 @@
+"""A neural volume: networks in a box of space, and the samples that they put on rays."""
+
+from __future__ import annotations
+
+import abc
+from dataclasses import asdict, dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ...scene.motion import Products
+from ..settings import Method, ReconSettings
+from . import composite
+from .composite import Samples
+from .network import TimeCodes, VolumeNetwork
+from .rays import Rays
+from .settings import NetworkSettings, SceneFlowSettings, TimeCode, VolumeSettings
+from .targets import Draw, Targets
+
+SCALED = (2.0, 2.0, 1.0)  # [1] x, y and z over the depth of the box, as published
+
+
+@dataclass(frozen=True, kw_only=True)
+class Box:
+    """Where and when a volume is."""
+
+    bounds: tuple[float, float]
+    """z-depths of the first and the last sample of a ray [m]."""
+    volume_from_world: list[list[float]]
+    """Pose of its axes, 4x4."""
+    quartet_times: list[float]
+    """Time of the first raw frame of every quartet [s]."""
+    quartets: list[int]
+    """Quartets whose raw frames were all measured."""
+    period: float
+    """Duration of a quartet [s]."""
+    frames: int
+    """Number F of raw frames."""
+    cycle: int
+    """Number K of raw frames in a quartet."""
+    reach: float
+    """Largest displacement within a quartet [m]: the unambiguous range."""
+    colour: bool
+    """Whether it has colour."""
+
+
+class Volume(torch.nn.Module, abc.ABC):
+    """Networks in a box. Final classes: Torf, Ftorf."""
+
+    method: ClassVar[Method]
+    faithful: ClassVar[tuple[str, ...]]
+    """What is as published, in sentences."""
+    assumed: ClassVar[tuple[str, ...]]
+    """What was not published, or is done in another way, in sentences."""
+
+    def __init__(self, settings: VolumeSettings, box: Box, generator: torch.Generator):
+        """Create random networks.
+
+        Args:
+            settings: How the volume is sampled.
+            box: Where it is.
+            generator: For the weights, on the CPU.
+        """
+        super().__init__()
+        self.settings, self.box = settings, box
+        self.codes = TimeCodes(settings.network, box.frames, box.cycle, generator)
+        self.moving = VolumeNetwork(settings.network, self.codes.size, generator)
+        self.resting = (
+            VolumeNetwork(settings.network, 0, generator) if settings.network.static else None
+        )
+
+    @abc.abstractmethod
+    def terms(self, targets: Targets, step: int, settings: ReconSettings, draw: Draw) -> dict:
+        """Weighted terms of the loss of one step, and ``quad_mse``, the unweighted one."""
+
+    @abc.abstractmethod
+    def samples_at(self, time: float, rays: Rays, z: Float[Tensor, "R S"]) -> Samples:
+        """Samples of rays at any time [s]."""
+
+    @property
+    def device(self) -> torch.device:
+        """Where its parameters are."""
+        return self.moving.density_head.weight.device
+
+    def precision(self) -> torch.autocast:
+        """Context of all products of the networks."""
+        half = self.settings.products == Products.HALF
+        return torch.autocast(self.device.type, dtype=torch.float16, enabled=half)
+
+    def unit(self, points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
+        """Points [m] in the units of the networks."""
+        near, far = self.box.bounds
+        scale = points.new_tensor(SCALED) / (far - near)
+        return 2.0 * (points * scale - 0.5)
+
+    def trunk(
+        self, points: Float[Tensor, "T R S 3"], quartets: list[int]
+    ) -> Float[Tensor, "T R S w"]:
+        """Values of the moving network at points [m], each row at the time of its quartet."""
+        flat = self.unit(points).flatten(1, 2)
+        return self.moving.trunk(flat, self.codes(quartets)).unflatten(1, points.shape[1:3])
+
+    def samples(
+        self,
+        trunk: Float[Tensor, "*b R S w"],
+        rays: Rays,
+        z: Float[Tensor, "R S"],
+        *,
+        draw: Draw | None = None,
+        colour: bool = False,
+        network: VolumeNetwork | None = None,
+    ) -> Samples:
+        """What a network puts on rays.
+
+        Args:
+            trunk: Its values at the points of the samples, perhaps several for each.
+            rays: The rays.
+            z: z-depths of the samples [m].
+            draw: Adds noise to densities; None: none.
+            colour: Whether colour is wanted.
+            network: Whose values these are; None: of the one that moves.
+        """
+        network = network or self.moving
+        length = rays.length
+        distance = z * length[:, None]
+        raw = network.density(trunk)
+        if draw is not None:
+            raw = raw + draw.noise(raw, self.settings.density_noise)
+        alpha = composite.opacities(raw, z, length)
+        light = network.light(trunk, rays.direction / length[:, None])
+        strength = alpha * light.reflectivity * self.settings.falloff / distance.square()
+        return Samples(
+            distance=distance,
+            alpha=alpha,
+            strength=strength,
+            colour=alpha[..., None] * light.colour if colour else None,
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values and tensors, for a checkpoint."""
+        weights = {name: value.detach() for name, value in self.state_dict().items()}
+        return {"box": asdict(self.box), "weights": weights}
+
+
+def box_of(targets: Targets, settings: VolumeSettings) -> Box:
+    """Where the volume of a recording is."""
+    sequence, times = targets.observations.sequence, targets.quartet_times
+    period = times[1] - times[0] if len(times) > 1 else float(np.ptp(sequence.times)) or 1.0
+    return Box(
+        bounds=settings.bounds or targets.bounds(),
+        volume_from_world=targets.volume_from_world.tolist(),
+        quartet_times=times,
+        quartets=sequence.complete_quartets,
+        period=period,
+        frames=sequence.frames,
+        cycle=targets.cycle,
+        reach=targets.observations.sensor.unambiguous_range,
+        colour=targets.colour is not None,
+    )
+
+
+def settings_of(stored: dict[str, Any]) -> VolumeSettings:
+    """Settings as config.json holds them."""
+    network = stored["network"] | {"time_code": TimeCode(stored["network"]["time_code"])}
+    return VolumeSettings(
+        **stored
+        | {
+            "network": NetworkSettings(**network),
+            "scene_flow": SceneFlowSettings(**stored["scene_flow"]),
+            "products": Products(stored["products"]),
+        }
+    )

@@ -1,0 +1,345 @@
+"""Runs of neural volumes at toy size: they learn, resume, move, and refuse what they cannot do."""
+
+import json
+import os
+import signal
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from moving_box import as_phasors, recording, turned, with_colour
+
+from gftorf_warp.data.write import write
+from gftorf_warp.errors import InputError, UsageError
+from gftorf_warp.evaluate.compare import compare
+from gftorf_warp.recon import checkpoint, presets
+from gftorf_warp.recon.observations import observe, reduced
+from gftorf_warp.recon.run import Run, VolumeRun
+from gftorf_warp.recon.train import reconstruct
+from gftorf_warp.recon.volume.loop import VolumeLoop, begin
+from gftorf_warp.recon.volume.models import VOLUMES, new_volume
+from gftorf_warp.recon.volume.network import Light
+from gftorf_warp.recon.volume.settings import NetworkSettings
+from gftorf_warp.recon.volume.targets import Draw, Targets
+
+NAMES = ("torf", "ftorf")
+
+
+def toy(name, images=40, **changes):
+    """Settings of a preset, with a network and rays that take milliseconds."""
+    settings = presets.PRESETS[name]()
+    network = replace(
+        settings.volume.network,
+        layers=3,
+        width=24,
+        skip_after=2,
+        position_octaves=4,
+        direction_octaves=1,
+        time_values=4,
+    )
+    volume = replace(
+        settings.volume, network=network, samples=16, rays=48, accumulated=1, rate=5e-3, **changes
+    )
+    schedule = replace(settings.schedule, images=images, log_every=10)
+    return replace(settings, volume=volume, schedule=schedule)
+
+
+def small(frames=12):
+    """The box at rest, in 16x12 pixels, without noise."""
+    quads = np.tile(at_rest(), (frames // 4, 1, 1))
+    return reduced(replace(recording(frames=frames)[0], quads=quads), 16)
+
+
+def at_rest():
+    """Quads of raw frame 0 at all four shifts, [4, H, W]."""
+    quads = [recording(frames=1, order=(k, k, k, k), noise=0.0)[0].quads[0] for k in range(4)]
+    return np.stack(quads)
+
+
+def d_tof_error(run, truth_distance):
+    """Mean squared error of the distance decoded from rendered quads [m^2]."""
+    re, im = run.render(0.02).phasor[:2]
+    decoded = torch.atan2(im, re) % (2 * np.pi) / run.sensor.phase_slope
+    return float(torch.mean((decoded - truth_distance).square()))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_scene_at_rest_is_learnt(name, tmp_path):
+    """Its d_ToF ends near the closed form; at the start it is decimetres off."""
+    sequence = small()
+    quads = sequence.quads[:4]
+    phase = np.arctan2(quads[2] - quads[3], quads[0] - quads[1]) % (2 * np.pi)
+    known = torch.tensor(phase * 15 / (4 * np.pi))
+    settings = toy(name, images=160)
+    targets = Targets(observe(sequence, settings, "cpu"))
+    run = reconstruct(sequence, tmp_path / name, settings)
+    assert isinstance(run, VolumeRun)
+    after = d_tof_error(run, known)
+    fresh = new_volume(settings.method, settings.volume, targets, 0, torch.device("cpu"))
+    before = d_tof_error(replace(run, volume=fresh), known)
+    assert after < 0.02
+    assert after < 0.1 * before
+    rows = [json.loads(line) for line in (run.path / "metrics.jsonl").read_text().splitlines()]
+    assert [row["images"] for row in rows] == list(range(10, 161, 10))
+    assert rows[-1]["quad_psnr_db"] > rows[0]["quad_psnr_db"] + 8.0
+    expected = {"quads", "size", "kinetic", "cycle", "flow"} if name == "ftorf" else {"quads"}
+    assert expected <= rows[-1].keys()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_an_interrupted_run_goes_on_to_the_same_bytes(name, tmp_path):
+    """Stopped by SIGTERM; weights, moments and random numbers are stored."""
+    sequence = small()
+    settings = toy(name, images=20)
+    reconstruct(sequence, tmp_path / "whole", settings, seed=3)
+
+    def stop(images, _, **__):
+        if images == 10:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    with pytest.raises(KeyboardInterrupt):
+        reconstruct(sequence, tmp_path / "parts", settings, seed=3, progress=stop)
+    halfway = Run.open(tmp_path / "parts")
+    assert halfway.config["images_optimised"] == 10
+    reconstruct(sequence, tmp_path / "parts", settings, seed=3)
+    whole, parts = (
+        checkpoint.last(tmp_path / folder)["volume"]["weights"] for folder in ("whole", "parts")
+    )
+    for key, value in whole.items():
+        assert torch.equal(value, parts[key]), key
+    lines = [(tmp_path / folder / "metrics.jsonl").read_text() for folder in ("whole", "parts")]
+    losses = [[json.loads(row)["loss"] for row in text.splitlines()] for text in lines]
+    assert losses[0] == losses[1]
+
+
+def test_a_run_is_rendered_compared_and_reported(tmp_path):
+    """From its folder; at any time and pose; what is assumed is in config.json and in the log."""
+    write("ftorf", tmp_path / "box", *recording(frames=12))
+    run = reconstruct(tmp_path / "box", tmp_path / "run", toy("ftorf", images=12))
+    opened = Run.open(run.path)
+    here, there = opened.render(0.03), opened.render(0.03, opened.camera.at(turned(10.0)))
+    assert here.quads.shape == (4, 36, 48)
+    assert here.distance.isfinite().all()
+    assert (here.distance - there.distance).abs().max() > 1e-3
+    assert torch.equal(opened.render(-1.0).quads, opened.render(0.0).quads)
+    assert torch.equal(opened.render(9.0).quads, opened.render(12 / 120).quads)
+    assert here.colour is None
+    extra = opened.render(0.0, opened.camera.resized(8, 6), extra=torch.zeros(0, 2)).extra
+    assert extra.shape == (2, 6, 8)
+    got = compare(opened)
+    assert (got["method"], got["gaussians"], got["input"]) == ("ftorf", 0, "quads")
+    assert got["flow_source"] == "file"
+    assert got["explained"]["unexplained_share"] > 0
+    config = json.loads((run.path / "config.json").read_text())
+    assert config["images_optimised"] == 12
+    assert config["faithful"]
+    assert any("not published" in sentence for sentence in config["assumed"])
+    assert config["assumed"][0] in (run.path / "run.log").read_text()
+    page = (run.path / "report.html").read_text()
+    assert "neural volume" in page
+    assert "Gaussians start" not in page
+
+
+def test_colour_is_fitted_in_every_other_step(tmp_path):
+    """With colour images, odd steps compare them; the rendering has the units of the file."""
+    sequence = with_colour(as_phasors(recording(frames=8)[0]), size=(12, 9))
+    run = reconstruct(sequence, tmp_path / "run", toy("torf", images=60))
+    rows = [json.loads(line) for line in (run.path / "metrics.jsonl").read_text().splitlines()]
+    assert rows[-1]["colour"] < 0.5 * rows[0]["colour"]
+    assert rows[-1]["loss"] == pytest.approx(0.5 * (rows[-1]["colour"] + rows[-1]["quads"]))
+    colour = run.render(0.0).colour
+    assert colour.shape == (3, 36, 48)
+    assert 5.0 < colour.mean() < 40.0  # of images between 4 and 36
+
+
+SPEED = 0.3  # [m] per quartet, along x
+
+
+class Sliding(torch.nn.Module):
+    """A network that knows the truth: what slides along x, as functions of x at quartet 0."""
+
+    def __init__(self, volume, density, reflectivity, speed=SPEED):
+        super().__init__()
+        near, far = volume.box.bounds
+        self.volume, self.scale, self.speed = volume, (far - near) / 2.0, speed
+        self.functions = density, reflectivity
+        self.density_head = torch.nn.Linear(1, 1)
+
+    def trunk(self, points, codes):
+        """Where a point of each row was at quartet 0."""
+        quartet = (codes[:, 0] * self.volume.box.frames - 1.0) / self.volume.box.cycle
+        x = (points[..., :1] / 2.0 + 0.5) * self.scale
+        return x - SPEED * quartet[:, None, None]
+
+    def density(self, trunk):
+        """As given."""
+        return self.functions[0](trunk[..., 0])
+
+    def light(self, trunk, _):
+        """As given, and white."""
+        return Light(self.functions[1](trunk[..., 0]), torch.ones(*trunk.shape[:-1], 3))
+
+    def flow(self, trunk, _):
+        """Forward and backward, everywhere."""
+        step = trunk.new_tensor([[self.speed, 0.0, 0.0], [-self.speed, 0.0, 0.0]])
+        return step.expand(*trunk.shape[:-1], 2, 3)
+
+
+def volume_of(sequence, settings):
+    """A random volume and what it is compared with."""
+    targets = Targets(observe(sequence, settings, "cpu"))
+    volume = new_volume(settings.method, settings.volume, targets, 0, torch.device("cpu"))
+    return volume, targets
+
+
+@pytest.mark.parametrize("quartets", [0.0, 0.25, 1.0, 1.5, 1.75, 2.5, 3.0])
+def test_scene_flow_moves_what_is_seen_between_quartets(quartets):
+    """A slab with exact flow is where it has to be at any time, beyond the last start too."""
+    volume, targets = volume_of(recording(frames=12)[0], toy("ftorf", bounds=(2.0, 4.0)))
+    slab = lambda x: torch.where(x.abs() < 0.1, 100.0, -1.0)  # noqa: E731
+    volume.moving = Sliding(volume, slab, torch.ones_like)
+    rays = targets.views.rays(0, torch.arange(18 * 48, 19 * 48))
+    z = torch.tensor([[3.0, 3.5]]).expand(48, 2)
+    samples = volume.samples_at(quartets * 4 / 120, rays, z)
+    away = (rays.at(z)[:, 0, 0] - SPEED * quartets).abs()
+    seen, clear = samples.alpha[:, 0] > 0, (away - 0.1).abs() > 1e-4
+    assert seen.any()
+    assert torch.equal(seen[clear], away[clear] < 0.1)
+
+
+@pytest.mark.parametrize(("speed", "low", "high"), [(SPEED, 0.0, 1e-6), (0.0, 1e-4, 1.0)])
+def test_raw_frames_agree_with_the_true_flow_only(speed, low, high):
+    """A wall whose pattern slides: with exact light and flow every raw frame around a quartet is
+    explained, without flow none but the first.
+    """
+    sequence = recording(frames=12)[0]
+
+    def pattern(x):
+        return 0.6 + 0.25 * torch.sin(9.0 * x)
+
+    settings = toy("ftorf", bounds=(2.9999, 3.0001), density_noise=0.0, falloff=2.0)
+    settings = replace(settings, quad_scale=1.0)
+    volume, targets = volume_of(sequence, settings)
+    rays = targets.views.rays(0)
+    x, distance = 3.0 * rays.direction[:, 0], 3.0 * rays.length
+    n = torch.arange(12)[:, None]
+    shifts = torch.tensor(sequence.shifts)[:, None]
+    phase = 4.0 * np.pi / 15.0 * distance - shifts
+    targets.quads = (pattern(x - SPEED * n / 4) / distance**2 * torch.cos(phase)).float()
+    volume.moving = Sliding(volume, lambda x: torch.full_like(x, 1e9), pattern, speed)
+    terms = volume.terms(targets, 30, settings, Draw(0, torch.device("cpu")))
+    assert terms.keys() == {"quads", "size", "kinetic", "cycle", "flow", "quad_mse"}
+    assert low <= terms["quad_mse"] < high
+    assert terms["kinetic"] == terms["cycle"] == 0.0
+    assert terms["size"].item() == pytest.approx(1e-3 * speed / 3.0, rel=1e-5)
+    first = volume.terms(targets, 1, settings, Draw(0, torch.device("cpu")))
+    assert first.keys() == {"quads", "quad_mse"}, "the first steps know no flow"
+
+
+def test_optical_flow_pulls_on_the_scene_flow():
+    """Its term is the distance to the measured flow in pixels: f v / z at an opaque wall."""
+    sequence = recording(frames=12)[0]
+    settings = toy("ftorf", bounds=(2.9999, 3.0001), density_noise=0.0)
+    volume, targets = volume_of(sequence, settings)
+    pixels = sequence.intrinsics.fx * SPEED / 3.0
+    forward = torch.tensor([[pixels, 0.0], [-pixels, 0.0]])[..., None]
+    volume.moving = Sliding(volume, lambda x: torch.full_like(x, 1e9), torch.ones_like)
+    for error in (0.0, 1.5):
+        targets.flow = (forward + error).expand(len(targets.flow), 2, 2, targets.views.pixels)
+        terms = volume.terms(targets, 30, settings, Draw(0, torch.device("cpu")))
+        assert terms["flow"].item() == pytest.approx(0.01 * error, abs=1e-5)
+
+
+def test_rates_and_weights_change_as_published(tmp_path):
+    """A tenth of the rate after so many steps; a tenth of the weight of phasors."""
+    sequence = small()
+    settings = toy("torf", images=8, rate_tenth_after=4, quads_fall_at=6)
+    targets = Targets(observe(sequence, settings, "cpu"))
+    state = begin(settings, targets, 0, torch.device("cpu"))
+    loop = VolumeLoop(targets, settings, tmp_path, None, lambda: 0.0, None)
+    for _ in range(4):
+        loop.step(state)
+    assert state.optimiser.param_groups[0]["lr"] == pytest.approx(0.1 * settings.volume.rate)
+    for step, weight in ((0, 8.0), (5, 8.0), (6, 0.8)):
+        terms = state.volume.terms(targets, step, settings, state.draw)
+        assert terms["quads"].item() == pytest.approx(weight * terms["quad_mse"].item())
+
+
+def test_accumulated_steps_make_one_update(tmp_path):
+    """Parameters change after the last of them only."""
+    sequence = small()
+    settings = toy("ftorf", images=8)
+    settings = replace(settings, volume=replace(settings.volume, accumulated=3))
+    targets = Targets(observe(sequence, settings, "cpu"))
+    state = begin(settings, targets, 0, torch.device("cpu"))
+    loop = VolumeLoop(targets, settings, tmp_path, None, lambda: 0.0, None)
+    before = state.volume.moving.density_head.weight.clone()
+    changed = []
+    for _ in range(4):
+        loop.step(state)
+        changed.append(not torch.equal(before, state.volume.moving.density_head.weight))
+    assert changed == [False, False, True, True]
+
+
+def unfit(kind):
+    """A preset and a recording that it cannot be fitted to."""
+    sequence, _ = recording(frames=8)
+    if kind == "phasors":
+        return "ftorf", as_phasors(sequence)
+    if kind == "moving camera":
+        poses = np.stack([turned(n) for n in range(8)])
+        return "ftorf", replace(sequence, camera_from_world=poses)
+    measured = sequence.measured.copy()
+    measured[[1, 6]] = False
+    return "torf", replace(sequence, measured=measured)
+
+
+@pytest.mark.parametrize(
+    ("kind", "what"),
+    [
+        ("phasors", "no raw frames"),
+        ("moving camera", "the camera moves"),
+        ("incomplete", "no complete quartet"),
+    ],
+)
+def test_what_cannot_be_fitted_is_refused(tmp_path, kind, what):
+    """By name and with a way out, before any work."""
+    name, sequence = unfit(kind)
+    with pytest.raises(InputError, match=what) as error:
+        reconstruct(sequence, tmp_path / "run", toy(name))
+    assert error.value.fix
+    assert not (tmp_path / "run" / "config.json").exists()
+
+
+def test_presets_have_the_published_shape():
+    """8 layers of 256: 0.6 million parameters, with the flow and blend that all networks have."""
+    settings = presets.ftorf().volume
+    assert settings.network == NetworkSettings()
+    assert {kind.method.value for kind in VOLUMES.values()} == set(NAMES)
+    assert presets.torf().volume.network.static
+    assert not presets.ftorf().volume.network.static
+
+
+def test_a_volume_is_not_edited(tmp_path):
+    """There are no Gaussians to edit or to store."""
+    run = reconstruct(small(), tmp_path / "run", toy("ftorf", images=2))
+    with pytest.raises(UsageError, match="no Gaussians"):
+        run.save(tmp_path / "copy")
+    assert not (tmp_path / "copy").exists()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_contradictions_are_refused(tmp_path, name):
+    """Another input, an ablation, no weight of quads."""
+    sequence, other = recording(frames=8)[0], {"torf": "quads", "ftorf": "phasor"}[name]
+    for given, what in (
+        ({"input": other}, "another input"),
+        ({"changes": [f"input={other}"]}, "another input"),
+        ({"ablation": "h1"}, "no ablations"),
+        ({"changes": ["weights.quads=0"]}, "weights.quads"),
+        ({"changes": ["volume.samples=1"]}, "volume.samples"),
+    ):
+        with pytest.raises(UsageError, match=what):
+            reconstruct(sequence, tmp_path / "run", name, **given)
+    assert not (tmp_path / "run").exists()
