@@ -7,7 +7,17 @@ from pathlib import Path
 import numpy as np
 
 from ..data.sequence import Sequence
-from . import camera_keys, codes, image_order, pose_keys, raw_frames, sensor_keys, stacks, timing
+from . import (
+    camera_keys,
+    codes,
+    colour_keys,
+    image_order,
+    pose_keys,
+    raw_frames,
+    sensor_keys,
+    stacks,
+    timing,
+)
 from .imported import Imported, Notes
 from .keys import Settings
 
@@ -20,6 +30,7 @@ KEYS = (
     *timing.KEYS,
     *camera_keys.KEYS,
     *pose_keys.KEYS,
+    *colour_keys.KEYS,
 )
 
 
@@ -33,12 +44,18 @@ def read(source: Path, settings: Settings) -> Imported:
     """
     notes = Notes()
     patterns = image_order.patterns_of(source, settings)
+    settings.require(
+        *(name for files in patterns for name in stacks.needed_keys(files[0])),
+        *pose_keys.needed_keys(settings),
+        *colour_keys.needed_keys(settings, colour_keys.files_of(settings, source)),
+    )
     modulation = sensor_keys.modulation_of(settings, notes)
     cycle = len(modulation.shifts)
     recorded = raw_frames.raw_frames_of(source, patterns, settings, cycle, notes)
     frames, height, width = recorded.quads.shape
     times = timing.times_of(settings, source, notes, frames, cycle)
     poses = pose_keys.poses_of(settings, source, notes, times, cycle, recorded.files)
+    colour, poses = colour_keys.colour_of(settings, source, notes, times, poses)
     if poses is None:
         notes.understood.append("poses: the camera stands still (default)")
         poses = np.tile(np.eye(4), (frames, 1, 1))
@@ -55,6 +72,7 @@ def read(source: Path, settings: Settings) -> Imported:
             camera_from_world=poses,
             intrinsics=lens,
             calibration=modulation.calibration,
+            colour=colour,
         ),
         understood=tuple(notes.understood),
         uncertain=tuple(notes.uncertain),

@@ -14,7 +14,7 @@ from ..errors import InputError
 from .imported import Notes
 from .keys import Key, Settings
 from .raw_files import natural
-from .stacks import BY_AXES, SUFFIXES, Stack, needed_keys, open_stack
+from .stacks import BY_AXES, SUFFIXES, Stack, open_stack
 
 SPARSE = 10  # raw frames per file: with more missing, the numbers count something else
 FRAMES, IMAGE = ("frames", "cycles", "slots", "taps"), ("rows", "columns")
@@ -49,8 +49,7 @@ def patterns_of(source: Path, settings: Settings) -> list[list[Path]]:
     """Files of each pattern, in natural order; of a source that is a file only this file.
 
     Raises:
-        UsageError, InputError: If a pattern has no file, or a file lies outside the folder, or keys
-            are missing that these files need.
+        InputError: If a pattern has no file, or a file lies outside the folder.
     """
     if source.is_file():
         if settings.given("source.files"):
@@ -58,10 +57,10 @@ def patterns_of(source: Path, settings: Settings) -> list[list[Path]]:
             raise settings.wrong("source.files", why, fix)
         found = [[source]]
     elif settings.given("source.files"):
-        found = [_matching(source, pattern, settings) for pattern in settings["source.files"]]
+        patterns = settings["source.files"]
+        found = [matching(source, pattern, settings, "source.files") for pattern in patterns]
     else:
         found = [_images(source)]
-    settings.require(*dict.fromkeys(name for files in found for name in needed_keys(files[0])))
     return found
 
 
@@ -122,22 +121,26 @@ def frame_numbers(files: list[Path], settings: Settings, notes: Notes) -> list[i
     return [number - numbers[0] for number in numbers]
 
 
-def _natural(path: Path) -> list[tuple[int, str]]:
-    return natural(str(path))
+def matching(root: Path, pattern: str, settings: Settings, name: str) -> list[Path]:
+    """Files of a folder that match a pattern, the value of a key, in natural order.
 
-
-def _matching(root: Path, pattern: str, settings: Settings) -> list[Path]:
-    """Files of a pattern in a folder."""
+    Raises:
+        InputError: If there are none, or one lies outside the folder.
+    """
     try:
         found = sorted((path for path in root.glob(pattern) if path.is_file()), key=_natural)
     except (ValueError, NotImplementedError, IndexError) as error:  # absolute, or no pattern
         why = f"expected a pattern such as quads/*.png, found {pattern!r} ({error})"
-        raise settings.wrong("source.files", why, "name files relative to the folder") from error
+        raise settings.wrong(name, why, "name files relative to the folder") from error
     if not found:
         why = f"no file of {root} matches {pattern!r}"
-        raise settings.wrong("source.files", why, "correct the pattern")
+        raise settings.wrong(name, why, "correct the pattern")
     _refuse_outside(root, found)
     return found
+
+
+def _natural(path: Path) -> list[tuple[int, str]]:
+    return natural(str(path))
 
 
 def _images(root: Path) -> list[Path]:

@@ -68,6 +68,16 @@ def pose_keys(table: str, who: str) -> tuple[Key, ...]:
 KEYS = pose_keys("poses", "ToF camera")
 
 
+def needed_keys(settings: Settings, table: str = "poses") -> list[str]:
+    """Keys without which the file of poses cannot be used; none if there is no file."""
+    form = settings[f"{table}.form"]
+    by_form = {"tum": "start_s", "matrices": "direction"} | dict.fromkeys(
+        UNSCALED, "metres_per_unit"
+    )
+    names = ["form", *([by_form[form]] if form else [])]
+    return [f"{table}.{name}" for name in names] if settings[f"{table}.file"] else []
+
+
 def poses_of(
     settings: Settings,
     root: Path,
@@ -98,13 +108,8 @@ def poses_of(
     path = settings.file(f"{table}.file", root)
     if path is None:
         return None
-    settings.require(f"{table}.form")
+    settings.require(*needed_keys(settings, table))
     form = settings[f"{table}.form"]
-    settings.require(
-        *([f"{table}.metres_per_unit"] if form in UNSCALED else []),
-        *([f"{table}.direction"] if form == "matrices" else []),
-        *([f"{table}.start_s"] if form == "tum" else []),
-    )
     backward = settings[f"{table}.direction"] == DIRECTIONS[0]
     opengl = settings[f"{table}.axes"] == "opengl"
     found = read_trajectory(path, form, world_to_camera=backward, opengl=opengl)
