@@ -233,9 +233,8 @@ def command_parsers() -> dict[str, Parser]:
     export.add_argument("run_folder", metavar="RUN", help="folder of the reconstruction")
     export.option("--out", "DIR", str, "folder to write", required=True)
     export.option("--sequence", "SEQ", str, MOVED)
-    formats = (
-        "any of ply (Gaussians), points, mesh, obj, exr, npz, html, webm, mp4, gif, webp (ply)"
-    )
+    formats = "any of ply (Gaussians), points, mesh, obj, exr, npz, html, webm, mp4, gif, webp, "
+    formats += "colmap, nerfstudio, tum"
     export.option("--format", "A,B", _list_of(str), f"{formats} (ply)", ["ply"], dest="formats")
     moments = "seconds since raw frame 0 (each instant of the sequence)"
     export.option("--times", "S,S", _list_of(_number), moments)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
 from ..errors import InputError
 from . import specs
@@ -23,6 +24,28 @@ def rigid(poses: np.ndarray) -> np.ndarray:
     last_row = np.abs(poses[:, 3] - [0, 0, 0, 1]).max(axis=1)
     finite = np.isfinite(poses).all(axis=(1, 2))
     return (np.maximum(defect, last_row) <= ROTATION_TOLERANCE) & proper & finite
+
+
+def interpolated(
+    times: Float[np.ndarray, "F"], stamps: Float[np.ndarray, "P"], poses: Float[np.ndarray, "P 4 4"]
+) -> Float[np.ndarray, "F 4 4"]:
+    """Poses at times [s] between those at increasing stamps [s]: centres along straight lines,
+    rotations about one axis at a constant rate. Outside, the first or the last pose.
+    """
+    import cv2
+
+    found = np.empty((len(times), 4, 4))
+    after = np.clip(np.searchsorted(stamps, times, side="right"), 1, max(1, len(stamps) - 1))
+    for n, (time, k) in enumerate(zip(times, after, strict=True)):
+        before, other = poses[k - 1], poses[min(k, len(stamps) - 1)]
+        span = stamps[min(k, len(stamps) - 1)] - stamps[k - 1]
+        share = float(np.clip((time - stamps[k - 1]) / span, 0.0, 1.0)) if span > 0 else 0.0
+        turn = cv2.Rodrigues(before[:3, :3].T @ other[:3, :3])[0]
+        found[n] = before
+        if share > 0:
+            found[n, :3, :3] = before[:3, :3] @ cv2.Rodrigues(share * turn)[0]
+            found[n, :3, 3] = (1 - share) * before[:3, 3] + share * other[:3, 3]
+    return found
 
 
 def read_poses(root: Path, form: str, frames: int, sources: dict[str, str]) -> np.ndarray:

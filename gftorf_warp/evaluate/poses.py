@@ -28,18 +28,22 @@ FIELD = Field(
 )
 
 
-def read(poses: str | Path, sequence: Sequence) -> Float[np.ndarray, "M 4 4"]:
+def read(
+    poses: str | Path | Float[np.ndarray, "M 4 4"], sequence: Sequence
+) -> Float[np.ndarray, "M 4 4"]:
     """Poses to render from, world to camera [m].
 
     Args:
         poses: A .npy file of shape [M, 4, 4], or [M, 3, 4] without the last row 0 0 0 1; or
-            ``novel``, the novel views of ``sequence``.
+            ``novel``, the novel views of ``sequence``; or the matrices.
         sequence: What was measured.
 
     Raises:
         UsageError: If the sequence has no such poses.
         InputError: If the file cannot be read, or its matrices are not rigid motions.
     """
+    if isinstance(poses, np.ndarray):
+        return checked(poses.astype(np.float64), "poses")
     if str(poses) == NOVEL:
         if sequence.novel_from_world is None or not len(sequence.novel_from_world):
             why = f"{sequence.path or 'the sequence'} has no poses of novel views"
@@ -54,17 +58,26 @@ def read(poses: str | Path, sequence: Sequence) -> Float[np.ndarray, "M 4 4"]:
     if stored.shape[1] == 3:
         last = np.broadcast_to([0.0, 0.0, 0.0, 1.0], (len(stored), 1, 4))
         stored = np.concatenate([stored, last], axis=1)
-    fine = rigid(stored)
+    return checked(stored, path)
+
+
+def checked(poses: Float[np.ndarray, "M 4 4"], where: object) -> Float[np.ndarray, "M 4 4"]:
+    """The same poses.
+
+    Raises:
+        InputError: If one is no rigid motion.
+    """
+    fine = rigid(poses)
     if not fine.all():
         m = int(np.argmin(fine))
         raise InputError(
             f"poses: {int((~fine).sum())} of {len(fine)} are no rigid motions",
-            where=path,
+            where=where,
             why=f"expected rotations of determinant +1 and a last row 0 0 0 1, found at index "
-            f"{m} {stored[m].tolist()}",
+            f"{m} {poses[m].tolist()}",
             fix="store camera_from_world with axes x right, y down, z forward, in metres",
         )
-    return stored
+    return poses
 
 
 def middle(sequence: Sequence) -> float:

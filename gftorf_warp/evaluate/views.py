@@ -193,7 +193,7 @@ def render_to_folder(
     what: str | Iterable[str] = ("distance", "quads"),
     times: Iterable[float] | None = None,
     *,
-    poses: str | Path | None = None,
+    poses: str | Path | Float[np.ndarray, "M 4 4"] | None = None,
     fresh: bool = False,
     arrays: bool = False,
     plain: bool = False,
@@ -215,8 +215,9 @@ def render_to_folder(
         what: Names out of distance, distance_median, quads, phasor, colour.
         times: Seconds since raw frame 0; None: the times of all raw frames, truncated quartets
             included; with poses, the middle of the sequence.
-        poses: A .npy file of world-to-camera matrices [M, 4, 4] or [M, 3, 4], or ``novel``, those
-            of the sequence. Image k is rendered from pose k at time k; the shorter list repeats.
+        poses: World-to-camera matrices, see scene/camera_paths.py, a .npy file of them [M, 4, 4] or
+            [M, 3, 4], or ``novel``, those of the sequence. Image k is rendered from pose k at time
+            k; the shorter list repeats.
         fresh: Whether to move other content of ``out`` to ``out/old-<k>``.
         arrays: Whether to write arrays instead of pictures; many times as fast.
         plain: Whether previews are the images alone, a pixel for each.
@@ -272,7 +273,7 @@ def render_to_video(
     what: str | Iterable[str] = ("distance",),
     times: Iterable[float] | None = None,
     *,
-    poses: str | Path | None = None,
+    poses: str | Path | Float[np.ndarray, "M 4 4"] | None = None,
     rate_hz: float | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Path:
@@ -357,7 +358,10 @@ def series_of(
 
 
 def views_to_take(
-    run: Run, sequence: Sequence, times: Iterable[float] | None, poses: str | Path | None
+    run: Run,
+    sequence: Sequence,
+    times: Iterable[float] | None,
+    poses: str | Path | Float[np.ndarray, "M 4 4"] | None,
 ) -> tuple[list[float], list[Camera]]:
     """Time [s] and camera of every image of :func:`render_to_folder`, whose arguments these are."""
     found = None if poses is None else read_poses(poses, sequence)

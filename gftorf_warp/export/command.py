@@ -11,7 +11,7 @@ from ..data.files import as_errors, atomic_folder
 from ..errors import UsageError
 from ..recon.folder import set_aside
 from ..recon.run import Run
-from . import film, images, mesh, points, scene_page, splats
+from . import cameras, film, images, mesh, points, scene_page, splats
 from .moments import Moments, Progress
 
 COLOURS = ("colour", "reflectivity")
@@ -35,6 +35,9 @@ FORMATS = {
     "obj": Format("obj", functools.partial(mesh.write, kind="obj")),
     "exr": Format("exr", images.write_exrs),
     "npz": Format("npz", images.write_npzs),
+    "colmap": Format("colmap", cameras.write_colmap, coloured=True),
+    "nerfstudio": Format("nerfstudio", cameras.write_nerfstudio, coloured=True),
+    "tum": Format("poses.txt", cameras.write_tum),
     "html": Format("scene.html", scene_page.write, coloured=True),
     **{kind: Format(f"video.{kind}", film.write) for kind in ("webm", "mp4", "gif", "webp")},
 }

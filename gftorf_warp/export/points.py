@@ -8,6 +8,8 @@ reflectivity     amplitude over the fall-off, in the units of the sequence's qua
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -26,8 +28,38 @@ WHITE = 99.0  # percentile of the first image's reflectivity that is shown white
 RENDERED = ("distance", "opacity", "phasor", "colour")
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Pixels:
+    """The pixels of one time."""
+
+    rgb: UInt8[np.ndarray, "H W 3"]
+    """sRGB."""
+    seen: Bool[np.ndarray, "H W"]
+    """Those that are mostly opaque."""
+    distance: Float[np.ndarray, "H W"]
+    """Along the ray over opacity [m]."""
+    reflectivity: Float[np.ndarray, "H W"]
+    """Amplitude over the fall-off [quad units m^2]."""
+
+
 def write(moments: Moments, folder: Path, progress: Progress, *, colour: str) -> None:
     """Fill a folder with one PLY file per time.
+
+    Raises:
+        UsageError: If the run has no colour where that is wanted.
+    """
+    for index, found in enumerate(pixels(moments, colour)):
+        places = world_points(found.distance, moments.cameras[index], found.seen)
+        columns = dict(zip("xyz", places, strict=True))
+        columns |= dict(zip(("red", "green", "blue"), found.rgb[found.seen].T, strict=True))
+        columns |= {n: getattr(found, n)[found.seen] for n in ("distance", "reflectivity")}
+        data = ply_bytes(table(columns), [*moments.about(index), f"red, green, blue: {colour}"])
+        write_through(moments.path(folder, index, "ply"), data)
+        progress(index + 1, len(moments))
+
+
+def pixels(moments: Moments, colour: str) -> Iterator[Pixels]:
+    """What the camera of each time sees, in colour or as the grey of the reflectivity.
 
     Raises:
         UsageError: If the run has no colour where that is wanted.
@@ -36,24 +68,17 @@ def write(moments: Moments, folder: Path, progress: Progress, *, colour: str) ->
         why, fix = "this run was reconstructed from quads alone", "use --colour reflectivity"
         raise UsageError("no colour to export", where="--colour", why=why, fix=fix)
     white = None
-    for index, images in enumerate(moments.images(RENDERED)):
+    for images in moments.images(RENDERED):
         seen = images["opacity"] >= OPAQUE
         distance = normalised(images["distance"], images["opacity"])
         amplitude = 0.5 * normalised(images["phasor"][2], images["opacity"])
         reflectivity = amplitude * distance**2
         if white is None:
             white = float(np.percentile(reflectivity[seen], WHITE)) if seen.any() else 1.0
-        rgb = grey(reflectivity, white)
+        shown = grey(reflectivity, white)
         if colour == "colour":
-            rgb = srgb(images["colour"].transpose(1, 2, 0))
-        columns = dict(
-            zip("xyz", world_points(distance, moments.cameras[index], seen), strict=True)
-        )
-        columns |= dict(zip(("red", "green", "blue"), rgb[seen].T, strict=True))
-        columns |= {"distance": distance[seen], "reflectivity": reflectivity[seen]}
-        data = ply_bytes(table(columns), [*moments.about(index), f"red, green, blue: {colour}"])
-        write_through(moments.path(folder, index, "ply"), data)
-        progress(index + 1, len(moments))
+            shown = srgb(images["colour"].transpose(1, 2, 0))
+        yield Pixels(rgb=shown, seen=seen, distance=distance, reflectivity=reflectivity)
 
 
 def world_points(

@@ -7,10 +7,11 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from jaxtyping import Float
 
+from ..data.poses import interpolated
 from .imported import Notes
 from .keys import Key, Settings
 from .raw_files import natural
-from .trajectory_files import FORMS, Trajectory, interpolated, read_trajectory
+from .trajectory_files import FORMS, Trajectory, read_trajectory
 
 DIRECTIONS, AXES = ("world_to_camera", "camera_to_world"), ("opencv", "opengl")
 UNSCALED = ("colmap", "nerfstudio")  # reconstructed from pictures: the unit of length is arbitrary

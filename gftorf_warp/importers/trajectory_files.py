@@ -70,28 +70,6 @@ def read_trajectory(path: Path, form: str, *, world_to_camera: bool, opengl: boo
     return Trajectory(camera_to_world=poses, stamps=found.stamps, names=found.names)
 
 
-def interpolated(
-    times: Float[np.ndarray, "F"], stamps: Float[np.ndarray, "P"], poses: Float[np.ndarray, "P 4 4"]
-) -> Float[np.ndarray, "F 4 4"]:
-    """Poses at times [s] between those at increasing stamps [s]: centres along straight lines,
-    rotations about one axis at a constant rate. Outside, the first or the last pose.
-    """
-    import cv2
-
-    found = np.empty((len(times), 4, 4))
-    after = np.clip(np.searchsorted(stamps, times, side="right"), 1, max(1, len(stamps) - 1))
-    for n, (time, k) in enumerate(zip(times, after, strict=True)):
-        before, other = poses[k - 1], poses[min(k, len(stamps) - 1)]
-        span = stamps[min(k, len(stamps) - 1)] - stamps[k - 1]
-        share = float(np.clip((time - stamps[k - 1]) / span, 0.0, 1.0)) if span > 0 else 0.0
-        turn = cv2.Rodrigues(before[:3, :3].T @ other[:3, :3])[0]
-        found[n] = before
-        if share > 0:
-            found[n, :3, :3] = before[:3, :3] @ cv2.Rodrigues(share * turn)[0]
-            found[n, :3, 3] = (1 - share) * before[:3, 3] + share * other[:3, 3]
-    return found
-
-
 def _colmap(path: Path) -> Trajectory:
     """images.txt: two lines an image, ``ID QW QX QY QZ TX TY TZ CAMERA NAME`` and its points, which
     may be an empty line. World to camera.
