@@ -10,9 +10,10 @@ from foreign import FRAMES, keys, recording
 from ftorf_folder import random_poses
 from scipy.spatial.transform import Rotation, Slerp
 
+from gftorf_warp.data.poses import interpolated
 from gftorf_warp.errors import InputError
 from gftorf_warp.importers.command import read_recording
-from gftorf_warp.importers.trajectory_files import interpolated, read_trajectory
+from gftorf_warp.importers.trajectory_files import read_trajectory
 
 UNIT = 2.5  # [m] length unit of files that have their own
 RATE = 120.0
