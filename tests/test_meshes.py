@@ -225,8 +225,8 @@ def test_files_that_are_no_meshes(tmp_path):
     """Missing, of another kind, a folder, and rubbish of either kind."""
     (tmp_path / "folder.ply").mkdir()
     for name, content, why in (
-        ("none.ply", None, "No such file"),
-        ("folder.ply", None, "directory"),
+        ("none.ply", None, "found none"),
+        ("folder.ply", None, "found a folder"),
         ("mesh.stl", "solid", "'.stl'"),
         ("rubbish.ply", "hello", "cannot be read"),
         ("cut.ply", "ply\nformat ascii 1.0\nelement vertex 9\n", ""),

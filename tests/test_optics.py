@@ -362,7 +362,7 @@ def test_maps_that_cannot_be(tmp_path):
     (tmp_path / "broken.npy").write_bytes(b"")
     write_exr(tmp_path / "two.exr", {"A": good, "B": good})
     for name, says in (
-        ("broken.png", "decoded"),
+        ("broken.png", "PNG"),
         ("broken.npy", "no fall-off map"),
         ("two.exr", "one channel"),
         ("gone.npy", "no such file"),

@@ -14,13 +14,11 @@ import numpy as np
 from ..errors import InputError
 from .matlab import read_matrix
 from .specs import Field
+from .untrusted import SIDE_MAX, SMALL_FILE_BYTES, unreadable
 
-SIDE_MAX = 8192  # [px] no C-ToF image is larger; a forged header would ask for terabytes
 LIMITS = {"H": SIDE_MAX, "W": SIDE_MAX, "h": SIDE_MAX, "w": SIDE_MAX} | dict.fromkeys(
     "FPM", 1_000_000
 )
-# .json and .mat calibration files hold a few numbers; a larger one is something else
-SMALL_FILE_BYTES = 65_536
 KINDS = {"f": "floating point", "i": "integer", "u": "unsigned integer"}
 
 
@@ -63,6 +61,25 @@ def read_stored(root: Path, field: Field) -> tuple[np.ndarray, str] | None:
         why = f"expected the same value in all of its files, found {texts}"
         raise _invalid(root / path, field, "files disagree", why, "remove the wrong file")
     return first, path
+
+
+def map_array(path: Path) -> np.ndarray:
+    """The array of a .npy file of any type and shape, not read yet.
+
+    Raises:
+        InputError: If it is no whole .npy file of plain numbers.
+    """
+    try:
+        if not path.is_file():  # opening a pipe would block
+            raise ValueError("no file")
+        array = np.load(path, mmap_mode="r", allow_pickle=False)
+    except Exception as error:  # the header is a Python literal: a damaged one raises anything
+        why = f"expected an array as numpy.save writes it, found {error}"
+        raise unreadable(path, why) from error
+    expected, found = array.offset + array.nbytes, path.stat().st_size
+    if found != expected:
+        raise unreadable(path, f"expected {expected} bytes, found {found}")
+    return array
 
 
 def _compared(array: np.ndarray) -> np.ndarray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -14,16 +15,16 @@ import numpy as np
 from ..constants import FRAMES_PER_QUARTET, SPEED_OF_LIGHT
 from ..errors import InputError, UsageError
 from . import specs
-from .arrays import SIDE_MAX
 from .calibration import FOCAL_MIN, subtract_zero
 from .capture_json import FORMAT, MANIFEST, NAME, json_fields, read_values
 from .capture_write import inverse
 from .cycles import QUADS_MIN
 from .exr import Parts, read_parts
-from .folder import FRAMES_MAX, empty_quads, numbered
+from .folder import empty_quads, numbered
 from .poses import rigid
 from .problems import Problems
 from .sequence import DEPTH_RANGES_M, Calibration, ColourCamera, Flow, Intrinsics, Sequence, Truth
+from .untrusted import FRAMES_MAX, SIDE_MAX, read_bytes, read_text
 
 T = TypeVar("T")
 
@@ -45,7 +46,7 @@ def read(root: Path, frame_rate_hz: float | None) -> Sequence:
     digests = _manifest(root)
     width, height = (int(n) for n in values["size"])
     measured, frames = values["measured"], len(values["id"])
-    files = _files(root, "tof", frames, problems)
+    files = _files(root, "tof", frames, digests, problems)
     for n in sorted({*np.flatnonzero(measured).tolist()} - files.keys()):
         why = f"expected a file for every measured raw frame, found none for {n}"
         fix = "complete the folder, or set measured to false"
@@ -63,7 +64,8 @@ def read(root: Path, frame_rate_hz: float | None) -> Sequence:
             if flow is not None:
                 images[name][n] = flow
     colour_size = tuple(values["colour_size"][::-1].tolist()) if "colour_size" in values else None
-    for n, file, parts in _read(root, _files(root, "colour", frames, problems), digests, problems):
+    coloured = _files(root, "colour", frames, digests, problems)
+    for n, file, parts in _read(root, coloured, digests, problems):
         image = problems.attempt(_image, file, parts, "colour", colour_size)
         if image is not None:
             images["colour"][n] = image
@@ -117,11 +119,12 @@ def read_truth(root: Path, frames: int) -> Truth | None:
         InputError: If an image is not what data_specs/capture.toml describes.
     """
     problems = Problems()
-    files = _files(root, "truth", frames, problems)
+    digests = _manifest(root)
+    files = _files(root, "truth", frames, digests, problems)
     problems.raise_if_any(root)
     if not files:
         return None
-    digests, values = _manifest(root), read_values(root)
+    values = read_values(root)
     width, height = (int(n) for n in values["size"])
     stacks: dict[str, np.ndarray] = {}
     layers: dict[str, np.ndarray] = {}
@@ -160,24 +163,31 @@ def read_truth(root: Path, frames: int) -> Truth | None:
     )
 
 
-def _files(root: Path, folder: str, frames: int, problems: Problems) -> dict[int, Path]:
-    """Files of raw frames in a folder; other ids and links out of the folder are errors."""
+def _files(
+    root: Path, folder: str, frames: int, digests: dict[str, str], problems: Problems
+) -> dict[int, Path]:
+    """Files of raw frames in a folder; other ids are errors, and so is a missing file that the
+    manifest names, unless the whole folder is gone.
+    """
     found = numbered(root, f"{folder}/{{id}}.exr")
     for n, file in found.items():
-        if n >= frames or not file.resolve().is_relative_to(root.resolve()):
-            why = f"expected files of raw frames below {frames}, in this folder; found {n}"
+        if n >= frames:
+            why = f"expected files of raw frames below {frames}; found {n}"
             problems.add("no raw frame", file, why, "remove it")
+    for name in digests:
+        if found and name.startswith(f"{folder}/") and not os.path.lexists(root / name):
+            why, fix = f"{MANIFEST} names it", f"restore it, or remove {MANIFEST}"
+            problems.add("no such file", root / name, why, fix)
     return {n: file for n, file in found.items() if n < frames}
 
 
 def _manifest(root: Path) -> dict[str, str]:
     """SHA-256 by relative name; empty if the folder has no manifest."""
     path = root / MANIFEST
-    if not path.is_file():
+    if not os.path.lexists(path):
         return {}
     digests = {}
-    text = path.read_text(encoding="utf-8", errors="replace")
-    for number, line in enumerate(text.splitlines(), start=1):
+    for number, line in enumerate(read_text(path).splitlines(), start=1):
         match = re.fullmatch(r"([0-9a-f]{64})  (\S+)", line)
         if match is None:
             why = "expected 64 hexadecimal digits, two blanks and a name, found "
@@ -191,7 +201,7 @@ def _manifest(root: Path) -> dict[str, str]:
 def _verify(root: Path, file: Path, digests: dict[str, str]) -> None:
     """Compare a file with the manifest, if there is one."""
     name = file.relative_to(root).as_posix()
-    if digests and hashlib.sha256(file.read_bytes()).hexdigest() != digests.get(name):
+    if digests and hashlib.sha256(read_bytes(file)).hexdigest() != digests.get(name):
         other = f"its SHA-256 is not that of {MANIFEST}"
         why = other if name in digests else f"{MANIFEST} does not name it"
         fix = f"restore it, or remove {MANIFEST} if the change was yours"

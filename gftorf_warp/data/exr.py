@@ -8,6 +8,7 @@ compressed, once for all readers.
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import sys
 import threading
@@ -19,11 +20,9 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError, ResourceError
-from .arrays import SIDE_MAX
 from .files import atomic_path, one_of_many
+from .untrusted import CHANNELS_MAX, PARTS_MAX, SIDE_MAX, check_unpacked
 
-PARTS_MAX = 64  # a raw frame has a handful; a forged header may claim millions
-CHANNELS_MAX = 256  # a rendering has a few dozen
 # of captures; half is refused: its steps are 2 mm at 2 m
 TYPES = {np.dtype(np.float32), np.dtype(np.uint32)}
 
@@ -163,6 +162,8 @@ def _read(path: Path, parts_max: int) -> Parts:
             names = {part.name() for part in file.parts}
         if not 1 <= len(stated) <= parts_max or len(names) != len(stated):
             raise ValueError(f"{len(stated)} parts")
+        pixels = sum(math.prod(shape) * len(channels) for shape, channels in stated)
+        check_unpacked(4 * pixels, path.stat().st_size)
         with _silence(), OpenEXR.File(str(path), separate_channels=True) as file:
             parts = {
                 part.name(): {c: np.array(channel.pixels) for c, channel in part.channels.items()}

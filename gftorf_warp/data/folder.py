@@ -13,6 +13,7 @@ from . import resources, specs
 from .arrays import as_float32, read_array, read_shape
 from .capture_json import NAME as CAPTURE
 from .problems import Problems
+from .untrusted import FRAMES_MAX
 
 SLOT_FOLDERS = tuple(f"tofType{slot}" for slot in range(FRAMES_PER_QUARTET))
 PHASOR_FOLDER = "tof"
@@ -21,7 +22,6 @@ EXPECTED = (
     "raw quads), or tof and cams (ToeRF: phasors)"
 )
 UNFINISHED = "unfinished.md"  # exists in the folder of an incomplete recording
-FRAMES_MAX = 1_000_000  # over two hours at 120 Hz: a higher id is a typing error
 
 
 def format_of(path: Path) -> str:

@@ -15,13 +15,14 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from .untrusted import UNPACKED_MAX
+
 MATRIX, COMPRESSED = 14, 15
 INTEGERS = ("i1", "u1", "i2", "u2", "i4", "u4")
 NUMBERS = dict(enumerate(INTEGERS, start=1)) | {7: "f4", 9: "f8", 12: "i8", 13: "u8"}
 CLASSES = {6: "f8", 7: "f4"} | dict(enumerate((*INTEGERS, "i8", "u8"), start=8))
 COMPLEX = 0x0800
 AXES_MAX = 5  # cycles, slots, taps, rows and columns
-UNPACKED_MAX = 1 << 20  # [bytes] of a compressed matrix: calibration has a few hundred
 
 
 def read_matrix(data: bytes, name: str | None, *, unpacked_max: int = UNPACKED_MAX) -> np.ndarray:

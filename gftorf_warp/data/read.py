@@ -8,6 +8,7 @@ from . import capture, ftorf, torf
 from .family import read_distances, read_sequence
 from .folder import format_of
 from .sequence import Sequence, Truth
+from .untrusted import check_links
 
 STORED = {"ftorf": ftorf.stored, "torf": torf.stored}
 
@@ -23,6 +24,7 @@ def read(path: str | Path, *, frame_rate_hz: float | None = None) -> Sequence:
     """
     root = Path(path)
     form = format_of(root)
+    check_links(root)
     if form == capture.FORMAT:
         return capture.read(root, frame_rate_hz)
     return read_sequence(STORED[form](root), frame_rate_hz)
@@ -38,6 +40,7 @@ def read_truth(sequence: Sequence) -> Truth | None:
     if root is None:
         return None
     form = format_of(root)
+    check_links(root)
     if form == capture.FORMAT:
         return capture.read_truth(root, sequence.frames)
     return read_distances(STORED[form](root), sequence.frames)

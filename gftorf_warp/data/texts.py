@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import tomllib
 from collections.abc import Callable
@@ -9,9 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
-from .untrusted import TEXT_MAX, read_text
-
-TOML_MAX = 1 << 20  # a table of keys has a few hundred
+from .untrusted import DEPTH_MAX, TEXT_MAX, TOML_MAX, read_text
 
 
 def read_json(path: Path) -> Any:
@@ -57,10 +56,23 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
 def _parsed(path: Path, parse: Callable[[str], Any], what: str, most: int = TEXT_MAX) -> Any:
     text = read_text(path, most)
     try:
-        return parse(text)
+        content = parse(text)
+        if (depth := _depth(content)) > DEPTH_MAX:
+            raise ValueError(f"{depth} nested lists and tables, at most {DEPTH_MAX} are read")
+        return content
     except (ValueError, RecursionError) as error:
         why = str(error)[:200]
         raise InputError(what, where=path, why=why, fix="correct the file") from error
+
+
+def _depth(content: Any) -> int:
+    """Number of lists and tables within each other; without recursion, which has a limit."""
+    depth, level = 0, [content]
+    while level := [part for part in level if isinstance(part, (list, dict))]:
+        depth += 1
+        parts = (part.values() if isinstance(part, dict) else part for part in level)
+        level = [*itertools.chain.from_iterable(parts)]
+    return depth
 
 
 def _loads(line: str) -> Any:

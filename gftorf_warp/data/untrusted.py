@@ -1,13 +1,61 @@
-"""Content of files that others wrote, and the error for one that is not what its name says."""
+"""Files that others wrote: the limits of all readers, how such a file is opened, and the error for
+one that is not what its name says.
+
+A reader compares what a header claims with these limits and with the size of the file before it
+allocates anything.
+"""
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from ..errors import InputError
 
+SIDE_MAX = 8192  # [px] no C-ToF image is larger; a forged header would ask for terabytes
+FRAMES_MAX = 1_000_000  # over two hours at 120 Hz: a higher id is a typing error
+PARTS_MAX = 64  # of an EXR file: a raw frame has a handful; a forged header may claim millions
+CHANNELS_MAX = 256  # of a part of an EXR file: a rendering has a few dozen
 TEXT_MAX = 1 << 28  # 256 MB: a million lines of a pose, or raw frames of a capture
+TOML_MAX = 1 << 20  # a table of keys has a few hundred
+MESH_MAX = 1 << 28  # [bytes] a few million triangles: more takes the tracer minutes
+DEPTH_MAX = 32  # nested lists and tables: our files have five
+# .json and .mat calibration files hold a few numbers; a larger one is something else
+SMALL_FILE_BYTES = 65_536
+UNPACKED_MAX = 1 << 20  # [bytes] of a compressed matrix: calibration has a few hundred
 PACKED_MAX = 1100  # bytes from one byte of a file: deflate packs at most 1032
+# [bytes] that any file may claim, an image of float32: some codecs pack a constant one tighter
+UNPACKED_LEAST = 4 * SIDE_MAX**2
+
+
+def check_unpacked(claimed: int, packed: int) -> None:
+    """Check how many bytes a compressed file of ``packed`` bytes claims to hold.
+
+    Raises:
+        ValueError: If no file of that size can.
+    """
+    most = max(UNPACKED_LEAST, PACKED_MAX * packed)
+    if claimed > most:
+        raise ValueError(f"{claimed} bytes claimed by a file of {packed}")
+
+
+def check_links(root: Path) -> None:
+    """Check the links in a folder and in those below it: what lies outside is no part of it.
+
+    Raises:
+        InputError: If one leads out of the folder.
+    """
+    home = os.path.realpath(root)
+    for folder in (root, *(path for path in root.iterdir() if path.is_dir())):
+        with os.scandir(folder) as entries:
+            for entry in entries:
+                if not entry.is_symlink():
+                    continue
+                target = os.path.realpath(entry.path)
+                if os.path.commonpath([home, target]) != home:
+                    why = f"expected files in this folder, found a link to {target}"
+                    fix = "copy what it leads to in its place, or remove it"
+                    raise InputError("a link out of the folder", where=entry.path, why=why, fix=fix)
 
 
 def read_bytes(path: Path, most: int | None = None) -> bytes:

@@ -13,13 +13,14 @@ from pathlib import Path
 
 import numpy as np
 
+from ..data.arrays import map_array
 from ..data.exr import read_exr
 from ..data.matlab import read_matrix
+from ..data.pictures import read_picture
 from ..data.untrusted import PACKED_MAX, read_bytes, unreadable
 from ..errors import InputError
 from . import hdf5_files
 from .keys import Key, Settings
-from .pictures import read_picture
 
 NUMPY, ZIPPED = (".npy",), (".npz",)
 HDF5, MATLAB = (".h5", ".hdf5", ".he5"), (".mat",)
@@ -111,7 +112,7 @@ def open_stack(path: Path, settings: Settings) -> Stack:
     suffix, name = path.suffix.lower(), settings["source.dataset"]
     axes = None
     if suffix in NUMPY:
-        array = _numpy(path)
+        array = map_array(path)
     elif suffix in ZIPPED:
         array = _zipped(path, name)
     elif suffix in HDF5:
@@ -135,19 +136,6 @@ def open_stack(path: Path, settings: Settings) -> Stack:
         why = f"expected real numbers, found {array.dtype} of shape {array.shape}"
         raise InputError("no images", where=path, why=why, fix="export numbers")
     return Stack(path=path, array=array, axes=axes)
-
-
-def _numpy(path: Path) -> np.ndarray:
-    try:
-        mapped = np.load(path, mmap_mode="r", allow_pickle=False)
-    except Exception as error:  # the header is a Python literal: a damaged one raises anything
-        raise unreadable(
-            path, f"expected an array as numpy.save writes it, found {error}"
-        ) from error
-    expected = mapped.offset + mapped.nbytes
-    if path.stat().st_size != expected:
-        raise unreadable(path, f"expected {expected} bytes, found {path.stat().st_size}")
-    return mapped
 
 
 def _zipped(path: Path, name: str | None) -> np.ndarray:

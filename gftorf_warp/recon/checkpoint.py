@@ -8,11 +8,14 @@ import hashlib
 import io
 import logging
 import re
+import zipfile
 from pathlib import Path
+from typing import Any
 
 import torch
 
 from ..data.files import atomic_write, sweep
+from ..data.untrusted import SMALL_FILE_BYTES, read_bytes
 from ..errors import InputError
 from .state import FORMAT
 
@@ -61,7 +64,9 @@ def load(path: Path, device: torch.device | str = "cpu") -> dict:
     """
     data = _read(path)
     try:
+        _check_archive(data)
         stored = torch.load(io.BytesIO(data), map_location=device, weights_only=True)
+        _check_tensors(stored, len(data))
     except (MemoryError, torch.OutOfMemoryError):
         raise
     except Exception as error:  # damaged bytes raise nearly any
@@ -91,7 +96,7 @@ def last(run: Path, device: torch.device | str = "cpu") -> dict | None:
         InputError: If there are checkpoints and none can be read, or none but the start, in which
             nothing is optimised yet.
     """
-    paths = _paths(run)
+    paths = _stated_paths(run)
     for stray in folder(run).glob(".*.tmp-*"):
         sweep(stray.with_name(stray.name[1:].rpartition(".tmp-")[0]))
     error: InputError | None = None
@@ -112,7 +117,7 @@ def last(run: Path, device: torch.device | str = "cpu") -> dict | None:
 
 def after(run: Path, images: int) -> list[Path]:
     """Checkpoints of more than so many optimised images, oldest first."""
-    return [path for path in _paths(run) if path.stem > _name(images)]
+    return [path for path in _stated_paths(run) if path.stem > _name(images)]
 
 
 def _go_back(stored: dict, error: InputError) -> None:
@@ -131,6 +136,24 @@ def _go_back(stored: dict, error: InputError) -> None:
     LOG.warning("the checkpoint before it is used, of image %d", stored["images"])
 
 
+def _check_archive(data: bytes) -> None:
+    """Raise a ValueError unless nothing is compressed, as torch writes it: sizes are then true."""
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        members = archive.infolist()
+    packed = any(member.compress_type != zipfile.ZIP_STORED for member in members)
+    if packed or sum(member.file_size for member in members) > len(data):
+        raise ValueError("compressed content")
+
+
+def _check_tensors(stored: Any, size: int) -> None:
+    """Raise a ValueError if a tensor has more elements than a file of so many bytes can hold."""
+    if isinstance(stored, torch.Tensor) and stored.numel() * stored.element_size() > size:
+        raise ValueError(f"a tensor of shape {tuple(stored.shape)}")
+    parts = stored.values() if isinstance(stored, dict) else stored
+    for part in parts if isinstance(stored, dict | list | tuple) else ():
+        _check_tensors(part, size)
+
+
 def _foreign(error: Exception) -> str:
     """What torch found in a checkpoint instead of tensors and plain values, in our words."""
     named = re.search(r"GLOBAL (\S+)", str(error))
@@ -140,6 +163,12 @@ def _foreign(error: Exception) -> str:
 def _paths(run: Path) -> list[Path]:
     """All checkpoints, oldest first."""
     return sorted(folder(run).glob("*.pt")) if folder(run).is_dir() else []
+
+
+def _stated_paths(run: Path) -> list[Path]:
+    """All checkpoints, and those that are gone while their SHA-256 is still there."""
+    named = [path.with_suffix("") for path in folder(run).glob("*.pt.sha256")]
+    return sorted({*_paths(run), *named})
 
 
 def _name(images: int) -> str:
@@ -153,10 +182,12 @@ def _sidecar(path: Path) -> Path:
 def _read(path: Path) -> bytes:
     """Content of a checkpoint whose SHA-256 is right."""
     fix = "restore it from a copy; without it the one before is used; or start over with --fresh"
-    if not path.is_file():
-        raise InputError("damaged checkpoint", where=path, why="it is no file", fix=fix)
-    sidecar, data = _sidecar(path), path.read_bytes()
-    stated = sidecar.read_bytes().split() if sidecar.is_file() else []
+    sidecar = _sidecar(path)
+    try:
+        data = read_bytes(path)
+        stated = read_bytes(sidecar, SMALL_FILE_BYTES).split() if sidecar.exists() else []
+    except InputError as error:
+        raise InputError("damaged checkpoint", where=path, why=error.why, fix=fix) from error
     found = hashlib.sha256(data).hexdigest()
     if not stated:
         why = f"{sidecar.name} beside it, which holds its SHA-256, is missing or empty"

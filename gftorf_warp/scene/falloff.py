@@ -7,7 +7,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from ..data.arrays import map_array
 from ..data.exr import read_exr
+from ..data.pictures import read_picture
 from ..errors import InputError
 
 SUFFIXES = (".npy", ".exr", ".png")
@@ -23,7 +25,7 @@ def read_falloff(path: Path) -> Float[np.ndarray, "h w"]:
         raise _wrong(path, f"expected one of {', '.join(SUFFIXES)}, found {path.suffix!r}")
     if not path.is_file():
         raise _wrong(path, "there is no such file")
-    image = np.asarray(_image(path))
+    image = _image(path)
     if image.ndim != 2 or image.size == 0 or image.dtype.kind not in "uif":
         found = f"{image.dtype} {image.shape}"
         raise _wrong(path, f"expected numbers in rows and columns, found {found}")
@@ -50,17 +52,10 @@ def _image(path: Path) -> np.ndarray:
         if len(channels) != 1:
             raise _wrong(path, f"expected one channel, found {', '.join(sorted(channels))}")
         return next(iter(channels.values()))
-    if path.suffix.lower() == ".npy":
-        try:
-            return np.load(path, allow_pickle=False)
-        except (OSError, ValueError, EOFError) as error:
-            raise _wrong(path, str(error)) from error
-    import cv2
-
-    image = cv2.imdecode(np.frombuffer(path.read_bytes() or b"\0", np.uint8), cv2.IMREAD_UNCHANGED)
-    if image is None:
-        raise _wrong(path, "it is no picture that can be decoded")
-    return image
+    try:
+        return map_array(path) if path.suffix.lower() == ".npy" else read_picture(path)[0]
+    except InputError as error:
+        raise _wrong(path, error.why) from error
 
 
 def _wrong(path: Path, why: str) -> InputError:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import warnings
 from functools import partial
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
+from ..data.untrusted import MESH_MAX, read_bytes
 from ..errors import InputError
 
 SUFFIXES = (".ply", ".obj")
@@ -73,19 +75,23 @@ def _loaded(file: Path) -> tuple[np.ndarray, np.ndarray]:
     fix = f"give one that ends in {' or '.join(SUFFIXES)}"
     _refuse(file, suffix not in SUFFIXES, f"its name ends in {file.suffix!r}", fix)
     try:
-        with file.open("rb") as stream:
-            stream.read(1)
-    except OSError as error:
-        fix = "correct the path, relative to the scene file"
-        raise _wrong(file, error.strerror or str(error), fix) from error
+        data = read_bytes(file, MESH_MAX)
+    except InputError as error:
+        raise _wrong(file, error.why, "correct the path, relative to the scene file") from error
     import trimesh
 
     options: dict[str, Any] = {"skip_materials": True} if suffix == ".obj" else {}
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)  # non-finite vertices: checked later
-            mesh: Any = trimesh.load(file, process=False, force="mesh", **options)
-            return np.array(mesh.vertices, dtype=np.float64), np.array(mesh.faces, dtype=np.int64)
+            stream = io.BytesIO(data)
+            mesh: Any = trimesh.load(
+                stream, file_type=suffix[1:], process=False, force="mesh", **options
+            )
+            points, faces = np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.int64)
+            if points.shape[1:] != (3,) or faces.shape[1:] != (3,):
+                raise ValueError(f"vertices {points.shape} and faces {faces.shape}")
+            return points, faces
     except Exception as error:  # readers of the formats raise many kinds
         why = f"it cannot be read: {type(error).__name__}, {error}"
         raise _wrong(file, why, "export it again") from error

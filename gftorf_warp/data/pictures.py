@@ -7,12 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from ..data.arrays import SIDE_MAX
-from ..data.folder import FRAMES_MAX
-from ..data.untrusted import PACKED_MAX, read_bytes, unreadable
+from .untrusted import FRAMES_MAX, SIDE_MAX, check_unpacked, read_bytes, unreadable
 
 PNG = b"\x89PNG\r\n\x1a\n"
 WIDTH_TAG, HEIGHT_TAG = 256, 257
+BYTES_PER_PIXEL = 8  # at most: four channels of 16 bits
 TAG_FORMATS = {3: "H", 4: "I"}  # a size is a number of 16 or 32 bits
 
 
@@ -28,13 +27,14 @@ def read_picture(path: Path) -> np.ndarray:
     data = read_bytes(path)
     sizes = [_png_size(path, data)] if data.startswith(PNG) else _tiff_sizes(path, data)
     within = all(1 <= side <= SIDE_MAX for size in sizes for side in size)
-    packed = sum(width * height for width, height in sizes) / (8 * len(data))  # a bit at least
-    if not (within and packed <= PACKED_MAX and len(sizes) < FRAMES_MAX):
-        found = f"{len(sizes)} pages, the first of {sizes[0]}, in {len(data)} bytes"
+    if not within or len(sizes) > FRAMES_MAX:
+        found = f"{len(sizes)} pages, the first of {sizes[0]}"
         raise unreadable(path, f"expected 1 to {SIDE_MAX} pixels a side, found {found}")
     try:
+        pixels = sum(width * height for width, height in sizes)
+        check_unpacked(BYTES_PER_PIXEL * pixels, len(data))
         done, pages = cv2.imdecodemulti(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error as error:
+    except (ValueError, cv2.error) as error:
         raise unreadable(path, str(error).splitlines()[0][:200]) from error
     shapes = {(page.shape, page.dtype) for page in pages}
     if not done or len(pages) != len(sizes) or len(shapes) != 1:
