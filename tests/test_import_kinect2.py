@@ -6,7 +6,7 @@ import pytest
 
 from gftorf_warp import Sequence
 from gftorf_warp.cli import main
-from gftorf_warp.data.decode import closed_form_distance
+from gftorf_warp.data.decode import closed_form_distance, quartet_phasors
 from gftorf_warp.errors import InputError, UsageError
 from gftorf_warp.importers import kinect2_packets as packets
 from gftorf_warp.importers.command import read_recording
@@ -45,6 +45,32 @@ def test_a_dump_decodes_to_its_scene(tmp_path, capsys):
     error = np.abs(closed_form_distance(sequence, 1) - distance)[:, 1:-1]
     assert error.mean() < 2e-3
     assert error.max() < 2e-2  # steps of the codes, at 4.4 m
+
+
+def phase_of_libfreenect2(content, steps, f, x, y):
+    """Phase of a pixel as libfreenect2 decodes it; its y counts from the last row of the image."""
+    cosine = sine = 0.0
+    for k in range(3):
+        first = 298496 * (3 * f + k) + 704 * (y + 212 if y < 212 else 423 - y)
+        line = int.from_bytes(content[first : first + 704], "little")
+        code = line >> (11 * ((x >> 2) + ((x & 3) << 7))) & 2047
+        angle = -0.000031 * np.pi * steps[f, 423 - y, x] + (0, 2.094395, 4.18879)[k]
+        cosine += np.cos(angle) * dump.value_of_code()[code]
+        sine -= np.sin(angle) * dump.value_of_code()[code]
+    return np.arctan2(sine, cosine)
+
+
+def test_phases_are_those_of_libfreenect2(tmp_path):
+    """At pixels of both halves and of all four positions in a group."""
+    dump.write(tmp_path / "dump")
+    content = (tmp_path / "dump" / "packet9.bin").read_bytes()
+    sequence = read_recording("kinect2", tmp_path / "dump").sequence
+    _, steps = dump.scene()
+    for f, (_, (re, im)) in enumerate(quartet_phasors(sequence, 0)):
+        for x, y in ((5, 3), (102, 50), (300, 211), (301, 212), (450, 400), (256, 423)):
+            phase = phase_of_libfreenect2(content, steps, f, x, y)
+            error = np.angle(np.exp(1j * (np.arctan2(im, re)[423 - y, x] - phase)))
+            assert abs(error) < 1e-4, (f, x, y)
 
 
 def test_a_table_of_its_own_and_stated_intrinsics_replace_what_is_usual(tmp_path):

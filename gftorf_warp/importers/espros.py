@@ -152,7 +152,7 @@ def _forms(code: int) -> list[float]:
     """Numbers as which a code may be stored: as it is or less the zero, in 16 bits with sign or
     without.
     """
-    return [code - less - wrap for less in (0, ZERO) for wrap in (0, 1 << 16)]
+    return [float(code - less - wrap) for less in (0, ZERO) for wrap in (0, 1 << 16)]
 
 
 def _times(

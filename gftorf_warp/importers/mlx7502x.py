@@ -150,7 +150,7 @@ def _quads(source: Path, settings: Settings, notes: Notes) -> Float[np.ndarray, 
 
 
 def _value(
-    codes: Int16[np.ndarray, "H n"], mode: str, both: str
+    codes: Int16[np.ndarray, "H n"], mode: str, both: str | None
 ) -> tuple[Float[np.ndarray, "H W"], int]:
     """Quads of a buffer's codes, and the number of codes at an end of their range."""
     if mode == "A-B":  # signed
