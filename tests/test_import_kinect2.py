@@ -40,7 +40,7 @@ def test_a_dump_decodes_to_its_scene(tmp_path, capsys):
     assert "80, 16, 120 MHz" in printed
     sequence = Sequence.open(out)
     assert (sequence.frames, sequence.cycle) == (18, 9)
-    assert sequence.times[9] == pytest.approx(1 / 30)
+    np.testing.assert_allclose(sequence.times[[0, 2, 3, 6, 9]] * 30, [0, 0, 0.3, 0.6, 1])
     distance, _ = dump.scene()
     error = np.abs(closed_form_distance(sequence, 1) - distance)[:, 1:-1]
     assert error.mean() < 2e-3

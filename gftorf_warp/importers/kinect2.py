@@ -201,12 +201,12 @@ def _triples(dump: Dump) -> Iterator[Float[np.ndarray, "3 H W"]]:
 
 
 def _times(count: int, settings: Settings, notes: Notes) -> Float[np.ndarray, "F"]:
-    """Times [s] of the raw frames of evenly spaced packets, in the middle of their frequency."""
+    """Times [s] of the raw frames of evenly spaced packets; those of one frequency share theirs."""
     rate, source = settings["time.cycle_rate_hz"], settings.source("time.cycle_rate_hz")
     notes.understood.append(f"times: {rate:g} packets per second ({source})")
     notes.uncertain.append(
         "times: ten sub-images are taken as evenly spaced in a packet, and no packet as lost; the "
         "files do not say"
     )
-    middles = np.repeat((np.arange(3) * 3 + 1.5) / packets.SUB_IMAGES, 3)
-    return (np.arange(count)[:, None] + middles).ravel() / rate
+    in_packet = np.repeat(np.arange(3) * 3 / packets.SUB_IMAGES, 3)
+    return (np.arange(count)[:, None] + in_packet).ravel() / rate
