@@ -11,8 +11,8 @@ from jaxtyping import Float
 
 from ..data.arrays import SIDE_MAX
 from ..data.exr import read_exr
+from ..data.pictures import read_picture
 from ..data.untrusted import read_bytes, unreadable
-from .pictures import read_picture
 
 EXR, PICTURES = (".exr",), (".png", ".tif", ".tiff")
 ENCODINGS = ("linear", "srgb")

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..data.poses import rigid
+from ..data.poses import interpolated, rigid
 from ..data.sequence import ColourCamera
 from ..errors import InputError
 from . import camera_keys, pose_keys
@@ -17,7 +17,6 @@ from .imported import Notes
 from .keys import Key, Settings
 from .text_files import numbers, read_rows
 from .timing import UNITS
-from .trajectory_files import interpolated
 
 ROWS = ((1.0, 0.0, 0.0, 0.05), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
 POSES = "colour.poses"
