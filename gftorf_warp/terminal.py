@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
+import re
 import sys
 import tempfile
 import time
@@ -16,6 +17,7 @@ from .errors import GftorfError, InputError, ResourceError, Terminated
 
 LOG = logging.getLogger("gftorf_warp")
 PLAIN_EVERY_S = 10.0  # [s] between two progress lines where the output is not a terminal
+WORD_MAX = 240  # characters of a word in a message; a path of several folders has fewer
 LIVE_EVERY_S = 0.2  # [s] between two redraws where it is
 # of Warp's native code; our first line reports it
 NO_DRIVER = "Could not find or load the NVIDIA CUDA driver"
@@ -61,15 +63,19 @@ def progress_line(
 ) -> str:
     """One line of progress; the time left [s] follows from the speed since step ``first``."""
     given = {name: value for name, value in values.items() if value is not None}
-    shown = [
-        f"{name} {value:.4g}" if isinstance(value, float) else f"{name} {value}"
-        for name, value in given.items()
-    ]
+    shown = [f"{name} {_digits(value)}" for name, value in given.items()]
     if done >= total:
         shown.append(f"{elapsed_s:.1f} s")
     elif done > first:
         shown.append(f"{(total - done) * elapsed_s / (done - first):.0f} s left")
     return f"  {label} {done}/{total}  " + "  ".join(shown)
+
+
+def _digits(value: object) -> str:
+    """A value with four digits or, of a large one, all before the point."""
+    if not isinstance(value, float):
+        return str(value)
+    return f"{value:.0f}" if 1e3 <= abs(value) < 1e15 else f"{value:.4g}"
 
 
 def start_warp() -> None:
@@ -111,6 +117,7 @@ def logging_to_stderr(level: int) -> Iterator[None]:
     """Send the package's log to stderr while a command runs: plain lines, warnings marked."""
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(_Plain())
+    handler.setLevel(level)  # run.log may want more than the terminal
     before = LOG.level, LOG.propagate
     LOG.addHandler(handler)
     LOG.setLevel(level)
@@ -153,7 +160,7 @@ def print_error(error: BaseException, *, debug: bool) -> int:
         traceback.print_exception(error)
     known = as_known_error(error)
     if known is not None:
-        print(f"error: {known}", file=sys.stderr)
+        print(f"error: {_shortened(str(known))}", file=sys.stderr)
         return known.exit_code
     if isinstance(error, KeyboardInterrupt):
         how, code = ("terminated", 143) if isinstance(error, Terminated) else ("interrupted", 130)
@@ -165,10 +172,19 @@ def print_error(error: BaseException, *, debug: bool) -> int:
     return 1
 
 
+def _shortened(text: str) -> str:
+    """A message without the middle of words, such as paths, that fill more than a few lines."""
+
+    def shorter(match: re.Match[str]) -> str:
+        return f"{match[0][: WORD_MAX // 2]}...{match[0][-WORD_MAX // 2 :]}"
+
+    return re.sub(rf"\S{{{WORD_MAX + 1},}}", shorter, text)
+
+
 class _Plain(logging.Formatter):
     def format(self, record: logging.LogRecord) -> str:
         mark = f"{record.levelname.lower()}: " if record.levelno >= logging.WARNING else ""
-        return mark + record.getMessage()
+        return mark + _shortened(record.getMessage())
 
 
 @contextlib.contextmanager

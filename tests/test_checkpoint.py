@@ -104,9 +104,11 @@ def test_no_code_of_a_checkpoint_is_run(tmp_path):
     place.parent.mkdir()
     torch.save({"format": 1, "images": 7, "gadget": Gadget(f"touch {trace}")}, place)
     write(place, place.read_bytes())
-    with pytest.raises(InputError, match="unsafe"):
+    with pytest.raises(InputError, match="unsafe") as caught:
         checkpoint.load(place)
     assert not trace.exists()
+    assert "system, which could run code" in str(caught.value)
+    assert "weights_only" not in str(caught.value), "torch's advice is to switch safety off"
 
 
 def test_a_newer_format_is_refused(tmp_path):

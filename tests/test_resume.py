@@ -1,6 +1,7 @@
 """Long runs: interrupted, killed, started twice, in the wrong folder, without numbers."""
 
 import copy
+import fcntl
 import functools
 import json
 import os
@@ -15,7 +16,7 @@ import pytest
 from moving_box import recording
 from small_runs import advance, demo, rows, same, small, stored
 
-from gftorf_warp.errors import BusyError, DivergedError, Terminated, UsageError
+from gftorf_warp.errors import BusyError, DivergedError, InputError, Terminated, UsageError
 from gftorf_warp.recon import checkpoint, folder, loop, presets
 from gftorf_warp.recon.observations import observe
 from gftorf_warp.recon.run import Run
@@ -127,7 +128,32 @@ def test_a_folder_of_something_else_is_not_touched(tmp_path):
     for fresh in (False, True):
         with pytest.raises(UsageError, match="not a run"):
             reconstruct(small(), tmp_path, demo(images=4), fresh=fresh)
-    assert [p.name for p in tmp_path.iterdir() if p.name != ".lock"] == ["precious.txt"]
+    assert [p.name for p in tmp_path.iterdir()] == ["precious.txt"]
+
+
+def test_a_refused_run_leaves_nothing(tmp_path):
+    """No lock, no log, no folder; a run that was begun keeps all of it."""
+    one_frame = recording(frames=1)[0]
+    with pytest.raises(InputError, match="no complete quartet"):
+        reconstruct(one_frame, tmp_path / "a" / "b", demo(images=4))
+    assert not any(tmp_path.iterdir())
+    reconstruct(small(), tmp_path / "run", demo(images=4))
+    with pytest.raises(UsageError, match="other settings"):
+        reconstruct(small(), tmp_path / "run", demo(images=4, background=0.5))
+    assert {".lock", "run.log", "config.json"} <= {p.name for p in (tmp_path / "run").iterdir()}
+
+
+def test_a_lock_that_lost_its_name_is_no_lock(tmp_path, monkeypatch):
+    """A holder removed the file just before it was locked: somebody else may lock a new one."""
+    (tmp_path / "config.json").write_text("{}")
+
+    def removed_first(descriptor, how, flock=fcntl.flock):
+        (tmp_path / ".lock").unlink()
+        return flock(descriptor, how)
+
+    monkeypatch.setattr(fcntl, "flock", removed_first)
+    with pytest.raises(BusyError), folder.locked(tmp_path):
+        raise AssertionError("it was taken for a lock")
 
 
 def test_two_calls_do_not_share_a_folder(tmp_path):

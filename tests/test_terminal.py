@@ -5,6 +5,8 @@ import subprocess
 import sys
 
 from gftorf_warp import terminal
+from gftorf_warp.errors import InputError
+from gftorf_warp.recon.record import log_to
 from gftorf_warp.render.runtime import WarpLog
 
 
@@ -14,6 +16,33 @@ def test_progress_tells_the_time_left():
     assert "5 s left" in terminal.progress_line("x", 75, 100, 50, 5.0, {"loss": 0.123456, "N": 7})
     line = terminal.progress_line("x", 100, 100, 0, 10.0, {"loss": 0.123456, "N": 7})
     assert line == "  x 100/100  loss 0.1235  N 7  10.0 s"
+
+
+def test_large_rates_have_plain_digits():
+    """81,180 images per second, not 8.118e+04."""
+    line = terminal.progress_line("x", 9, 9, 0, 4.0, {"images/s": 81_180.4, "loss": 12.3456})
+    assert line == "  x 9/9  images/s 81180  loss 12.35  4.0 s"
+
+
+def test_endless_paths_are_shortened(capsys):
+    """Of five kilobytes the two ends are shown; the rest of the message stays."""
+    path = "/start/" + 5000 * "x" + "/end.npy"
+    error = InputError("not a file", where=path, why=f"expected a file at {path}", fix="look")
+    assert terminal.print_error(error, debug=False) == 3
+    err = capsys.readouterr().err
+    assert len(err) < 700
+    assert "/start/x" in err
+    assert "x/end.npy" in err
+    assert err.splitlines()[2] == "  fix: look"
+
+
+def test_quiet_means_quiet_although_the_log_file_has_more(tmp_path, capsys):
+    """`reconstruct -q` prints its result, and run.log every line."""
+    with terminal.logging_to_stderr(logging.WARNING), log_to(tmp_path / "run.log"):
+        terminal.LOG.info("starts")
+        terminal.LOG.warning("looks odd")
+    assert capsys.readouterr().err == "warning: looks odd\n"
+    assert "INFO starts" in (tmp_path / "run.log").read_text()
 
 
 def test_progress_is_plain_and_rare_without_a_terminal(capsys):

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 
 import torch
 
+from ..recon.loop import one_torch_thread
 from ..recon.observations import Observations, observe
 from ..recon.settings import Batch, ReconSettings
 from ..recon.state import State, from_dict
@@ -102,7 +103,10 @@ def measure(
     usual = (QUICK_IMAGES, QUICK_PART, QUICK_WARM_UP) if quick else (IMAGES, PART, WARM_UP)
     count, part, warm_up = usual
     chosen, count = ways(fitted.settings, changes, device), images or count
-    return rows_of(chosen, fitted, device, images=count, part=part, warm_up=warm_up, report=report)
+    with one_torch_thread(torch.device(device)):  # as in a run
+        return rows_of(
+            chosen, fitted, device, images=count, part=part, warm_up=warm_up, report=report
+        )
 
 
 def rows_of(

@@ -15,14 +15,14 @@ from ..errors import BusyError
 def locked(folder: Path, name: str, what: str) -> Iterator[None]:
     """Hold the lock file ``name``, which names process and host, in a folder of ``what``.
 
-    A missing folder is created; the file stays.
+    A missing folder is created; the file stays, unless the caller removes it while it is held.
 
     Raises:
         BusyError: If another process, or another call in this one, holds it.
     """
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / name).open("a+") as file:
-        if not _try_lock(file.fileno()):
+        if not (_try_lock(file.fileno()) and _is_named(file.fileno(), folder / name)):
             file.seek(0)
             why = f"its lock is held by {file.read().strip() or 'an unknown process'}"
             fix, what = "wait for it, stop it, or choose another --out", f"this {what}"
@@ -33,8 +33,15 @@ def locked(folder: Path, name: str, what: str) -> Iterator[None]:
         try:
             yield
         finally:
-            # the file stays: removing it would let two others each lock a file of that name
             file.truncate(0)
+
+
+def _is_named(descriptor: int, path: Path) -> bool:
+    """Whether an open file still has its name: who held the lock may have removed it."""
+    try:
+        return os.path.samestat(os.fstat(descriptor), path.stat())
+    except FileNotFoundError:
+        return False
 
 
 def _try_lock(descriptor: int) -> bool:

@@ -4,7 +4,8 @@ and whether a new call may go on there.
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -131,11 +132,30 @@ def write_config(run: Path, config: dict[str, object]) -> None:
     write_json(run / CONFIG, config)
 
 
-def locked(run: Path) -> AbstractContextManager[None]:
+@contextmanager
+def locked(run: Path) -> Iterator[None]:
     """Hold ``RUN/.lock`` as long as a process works on the run,
     see :func:`gftorf_warp.data.lock.locked`.
+
+    After an exception in a folder that is no run, nothing of ours stays: neither lock, nor log,
+    nor folders that were made for them.
     """
-    return lock.locked(run, LOCK, "run")
+    made = [folder for folder in (run, *run.parents) if not folder.exists()]
+    ours = [path for path in (run / LOCK, run / LOG) if not path.exists()]
+    try:
+        with lock.locked(run, LOCK, "run"):
+            try:
+                yield
+            except BaseException:
+                for path in ours if not (run / CONFIG).exists() else []:
+                    with suppress(OSError):  # an open file on Windows
+                        path.unlink()
+                raise
+    except BaseException:
+        for folder in made:
+            with suppress(OSError):  # it holds something by now
+                folder.rmdir()
+        raise
 
 
 def _aside(path: Path) -> bool:

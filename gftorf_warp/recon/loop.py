@@ -80,7 +80,7 @@ class TrainingLoop:
             self.save(state)
             self.diagnostics.add(state, self.settings)
         with (
-            _one_torch_thread(self.device),
+            one_torch_thread(self.device),
             image_threads(self.device) as map_images,
             signals() as stop,
         ):
@@ -254,7 +254,7 @@ def image_threads(device: torch.device) -> Iterator[Callable]:
 
 
 @contextlib.contextmanager
-def _one_torch_thread(device: torch.device) -> Iterator[None]:
+def one_torch_thread(device: torch.device) -> Iterator[None]:
     """One thread of torch on a CPU: fastest for small tensors,
     and sums do not depend on the machine.
     """
