@@ -22,6 +22,7 @@ from gftorf_warp.recon.volume.models import VOLUMES, new_volume
 from gftorf_warp.recon.volume.network import Light
 from gftorf_warp.recon.volume.settings import NetworkSettings
 from gftorf_warp.recon.volume.targets import Draw, Targets
+from gftorf_warp.scene.motion import Products
 
 NAMES = ("torf", "ftorf")
 
@@ -339,7 +340,50 @@ def test_contradictions_are_refused(tmp_path, name):
         ({"ablation": "h1"}, "no ablations"),
         ({"changes": ["weights.quads=0"]}, "weights.quads"),
         ({"changes": ["volume.samples=1"]}, "volume.samples"),
+        ({"changes": [f"volume.network.static={name == 'ftorf'}"]}, "volume.network.static"),
     ):
         with pytest.raises(UsageError, match=what):
             reconstruct(sequence, tmp_path / "run", name, **given)
     assert not (tmp_path / "run").exists()
+
+
+def test_a_damaged_run_is_named(tmp_path):
+    """Settings that are none, networks of another shape, parameters that are not finite."""
+    run = reconstruct(small(), tmp_path / "run", toy("ftorf", images=2))
+    text = (run.path / "config.json").read_text()
+
+    def opened(old, new, what):
+        assert old in text
+        (run.path / "config.json").write_text(text.replace(old, new))
+        with pytest.raises(InputError, match=what):
+            Run.open(run.path)
+
+    opened('"time_code": "positional"', '"time_code": "none"', "not the config of a run")
+    opened('"samples": 16', '"samples": 1', "not the config of a run")
+    opened('"width": 24,\n        "skip', '"width": 25,\n        "skip', "does not fit")
+    opened('"method": "ftorf"', '"method": "torf"', "does not fit")
+    (run.path / "config.json").write_text(text)
+    stored = checkpoint.last(run.path)
+    stored["volume"]["weights"]["moving.density_head.bias"][0] = float("nan")
+    checkpoint.save(run.path, stored)
+    with pytest.raises(InputError, match="not finite"):
+        Run.open(run.path)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_half_precision_is_near_single(name, tmp_path):
+    """The loss of one step, and what it changes, within the rounding of float16."""
+    found = {}
+    for products in Products:
+        settings = toy(name, products=products)
+        targets = Targets(observe(small(), settings, "cpu"))
+        state = begin(settings, targets, 0, torch.device("cpu"))
+        state.images = 30
+        before = state.volume.moving.density_head.weight.detach().clone()
+        VolumeLoop(targets, settings, tmp_path, None, lambda: 0.0, None).step(state)
+        moved = state.volume.moving.density_head.weight.detach() - before
+        found[products] = float(state.sums["loss"]), moved
+    (loss, moved), (half_loss, half_moved) = found.values()
+    assert moved.abs().max() > 1e-3
+    assert half_loss == pytest.approx(loss, rel=5e-3)
+    assert (torch.sign(moved) == torch.sign(half_moved)).float().mean() > 0.9

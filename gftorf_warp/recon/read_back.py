@@ -18,6 +18,7 @@ from ..scene.distortion import Distortion as Lens
 from ..scene.sensor import Sensor
 from .folder import CONFIG, read_config
 from .settings import FlowSource, Method
+from .volume.settings import settings_of
 
 NUMBER = int | float
 KINDS: dict[str, Any] = {
@@ -85,7 +86,8 @@ def read_back(run: Path) -> ReadBack:
         camera, sensor = _camera(config["camera"]), _sensor(config["sensor"])
         render_settings(config)
         FlowSource(config["settings"].get("flow", FlowSource.AUTO))
-        Method(config["settings"].get("method", Method.GAUSSIANS))
+        if Method(config["settings"].get("method", Method.GAUSSIANS)).is_volume:
+            settings_of(config["settings"]["volume"])
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
         raise _wrong(run, f"{type(error).__name__}: {error}") from error
     _check_size(run, [camera.width, camera.height], "camera")

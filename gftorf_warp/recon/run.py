@@ -41,7 +41,8 @@ from .settings import FlowSource, Method
 from .state import field_and_motion
 from .volume.models import volume_from_dict
 from .volume.render import rendering_of
-from .volume.volume import Volume, settings_of
+from .volume.settings import settings_of
+from .volume.volume import Volume
 
 LOG = logging.getLogger("gftorf_warp")
 
@@ -98,7 +99,7 @@ class Run:
         config = config | reached  # of an interrupted run, config.json does not say
         if method.is_volume:
             known = settings_of(config["settings"]["volume"])
-            volume = volume_from_dict(method, known, stored["volume"], device)
+            volume = volume_from_dict(path, method, known, stored, device)
             return VolumeRun.of(path, config, camera, sensor, device, volume=volume)
         gaussians, motion, binding = field_and_motion(stored, device)
         edits.check_finite(path, gaussians, motion)

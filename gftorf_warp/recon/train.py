@@ -154,6 +154,13 @@ def _check_method(settings: ReconSettings, input: Input | str) -> None:
             why=f"it is the method that compares {wanted}",
             fix="leave --input out, or use --preset torf for phasors, ftorf for quads",
         )
+    if settings.volume is not None and settings.volume.network.static != (wanted == Input.PHASOR):
+        raise UsageError(
+            f"volume.network.static does not fit preset {settings.preset}",
+            where="--set",
+            why="torf blends a network without time, ftorf has none",
+            fix="leave volume.network.static out",
+        )
     if wanted is not None and not settings.weights.quads > 0:
         raise UsageError(
             f"weights.quads = {settings.weights.quads} does not fit preset {settings.preset}",

@@ -91,7 +91,7 @@ def fit(
     if stored is None:
         state = begin(settings, targets, seed, device)
     else:
-        state = from_dict(settings, stored, device)
+        state = from_dict(out, settings, stored, device)
     metrics = Metrics(out / "metrics.jsonl")
     metrics.rewind(state.images)
     near, far = state.volume.box.bounds

@@ -69,10 +69,16 @@ def begin(
     return VolumeState(volume, settings.volume, seed)
 
 
-def from_dict(settings: ReconSettings, stored: dict[str, Any], device: torch.device) -> VolumeState:
-    """A run as :meth:`VolumeState.to_dict` stored it; on a CPU it continues to the same bits."""
+def from_dict(
+    run: Path, settings: ReconSettings, stored: dict[str, Any], device: torch.device
+) -> VolumeState:
+    """A run as :meth:`VolumeState.to_dict` stored it; on a CPU it continues to the same bits.
+
+    Raises:
+        InputError: If the checkpoint does not fit the settings, or is not finite.
+    """
     assert settings.volume is not None, "presets of volumes have it"
-    volume = volume_from_dict(settings.method, settings.volume, stored["volume"], device)
+    volume = volume_from_dict(run, settings.method, settings.volume, stored, device)
     state = VolumeState(volume, settings.volume, seed=0)
     state.optimiser.load_state_dict(stored["adam"])
     state.scaler.load_state_dict(stored["scaler"])

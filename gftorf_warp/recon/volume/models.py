@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import torch
 
+from ...errors import InputError
 from ..settings import Method
 from .ftorf import Ftorf
 from .settings import VolumeSettings
@@ -26,18 +28,36 @@ def new_volume(
 
 
 def volume_from_dict(
-    method: Method, settings: VolumeSettings, stored: dict[str, Any], device: torch.device | str
+    run: Path,
+    method: Method,
+    settings: VolumeSettings,
+    stored: dict[str, Any],
+    device: torch.device | str,
 ) -> Volume:
     """The volume of a checkpoint.
 
     Args:
+        run: Folder of the run, for messages.
         method: ``torf`` or ``ftorf``.
         settings: How it is sampled.
-        stored: What :meth:`Volume.to_dict` returned.
+        stored: The checkpoint; its ``volume`` is what :meth:`Volume.to_dict` returned.
         device: Where it is wanted.
+
+    Raises:
+        InputError: If the checkpoint is of another kind of run, or a parameter is not finite.
     """
     generator = torch.Generator().manual_seed(0)  # its numbers are replaced
-    box = stored["box"] | {"bounds": tuple(stored["box"]["bounds"])}
-    volume = VOLUMES[method](settings, Box(**box), generator)
-    volume.load_state_dict(stored["weights"])
+    try:
+        box = stored["volume"]["box"] | {"bounds": tuple(stored["volume"]["box"]["bounds"])}
+        volume = VOLUMES[method](settings, Box(**box), generator)
+        volume.load_state_dict(stored["volume"]["weights"])
+    except (LookupError, TypeError, ValueError, RuntimeError) as error:
+        why = f"it holds no networks of the shape in config.json: {str(error).splitlines()[0]}"
+        fix = "restore config.json and ckpt/ from one copy, or start over with --fresh"
+        raise InputError("the checkpoint does not fit", where=run, why=why, fix=fix) from error
+    for name, value in volume.named_parameters():
+        if not bool(value.isfinite().all()):
+            fix = "restore an older checkpoint, or start over with --fresh"
+            why = f"{name} of the volume is not finite"
+            raise InputError("the run is not finite", where=run, why=why, fix=fix)
     return volume.to(device)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import enum
 from dataclasses import dataclass, field
+from typing import Any
 
 from ...scene.motion import Products
 
@@ -113,3 +114,24 @@ class VolumeSettings:
             raise ValueError(f"samples must be at least 2, got {self.samples}")
         if self.bounds is not None and not 0 < self.bounds[0] < self.bounds[1]:
             raise ValueError(f"bounds must be 0 < near < far, got {self.bounds}")
+
+
+def settings_of(stored: dict[str, Any]) -> VolumeSettings:
+    """Settings as config.json holds them.
+
+    Raises:
+        KeyError: If one is missing.
+        TypeError: If one is unknown.
+        ValueError: If one has a value that is none.
+    """
+    network = stored["network"] | {"time_code": TimeCode(stored["network"]["time_code"])}
+    bounds = stored.get("bounds")
+    return VolumeSettings(
+        **stored
+        | {
+            "bounds": None if bounds is None else tuple(bounds),
+            "network": NetworkSettings(**network),
+            "scene_flow": SceneFlowSettings(**stored["scene_flow"]),
+            "products": Products(stored["products"]),
+        }
+    )

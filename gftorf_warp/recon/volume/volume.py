@@ -17,7 +17,7 @@ from . import composite
 from .composite import Samples
 from .network import TimeCodes, VolumeNetwork
 from .rays import Rays
-from .settings import NetworkSettings, SceneFlowSettings, TimeCode, VolumeSettings
+from .settings import VolumeSettings
 from .targets import Draw, Targets
 
 SCALED = (2.0, 2.0, 1.0)  # [1] x, y and z over the depth of the box, as published
@@ -63,8 +63,16 @@ class Volume(torch.nn.Module, abc.ABC):
             settings: How the volume is sampled.
             box: Where it is.
             generator: For the weights, on the CPU.
+
+        Raises:
+            ValueError: If ``network.static`` does not fit the method.
         """
         super().__init__()
+        if settings.network.static != (self.method == Method.TORF):
+            raise ValueError(
+                f"network.static is {settings.network.static}, but torf has a network without "
+                f"time and ftorf has none"
+            )
         self.settings, self.box = settings, box
         self.codes = TimeCodes(settings.network, box.frames, box.cycle, generator)
         self.moving = VolumeNetwork(settings.network, self.codes.size, generator)
@@ -159,17 +167,4 @@ def box_of(targets: Targets, settings: VolumeSettings) -> Box:
         cycle=targets.cycle,
         reach=targets.observations.sensor.unambiguous_range,
         colour=targets.colour is not None,
-    )
-
-
-def settings_of(stored: dict[str, Any]) -> VolumeSettings:
-    """Settings as config.json holds them."""
-    network = stored["network"] | {"time_code": TimeCode(stored["network"]["time_code"])}
-    return VolumeSettings(
-        **stored
-        | {
-            "network": NetworkSettings(**network),
-            "scene_flow": SceneFlowSettings(**stored["scene_flow"]),
-            "products": Products(stored["products"]),
-        }
     )
