@@ -72,6 +72,7 @@ def exportable(folder, *, colour=True, count=60):
             "settings": {"render": render},
             "size_optimised": [WIDTH // 2, HEIGHT // 2],
             "colour_scale": 0.5,
+            "camera": {"width": WIDTH, "height": HEIGHT},
             "sequence": str(folder / "seq"),
             "frame_rate_hz": FRAME_RATE_HZ,
         },
