@@ -150,6 +150,16 @@ def test_keys_that_do_not_fit_are_named(text, word, folder, tmp_path):
     assert word in str(error.value)
 
 
+def test_a_link_out_of_the_folder_is_refused(tmp_path):
+    """It is no part of the sequence."""
+    cornell.write(tmp_path / "o_1", 4)
+    path = tmp_path / "o_1" / "000_render_20MHz_phase0.hdr"
+    path.rename(tmp_path / "elsewhere.hdr")
+    path.symlink_to(tmp_path / "elsewhere.hdr")
+    with pytest.raises(InputError, match="a link out of the folder"):
+        read_recording("cornell_box", tmp_path / "o_1")
+
+
 def test_a_file_is_no_sequence(tmp_path):
     """The folder is named."""
     (tmp_path / "a.hdr").write_bytes(IMAGE)

@@ -148,6 +148,15 @@ def test_a_packed_row_has_an_even_number_of_columns(tmp_path):
         read_recording("mlx7502x", tmp_path / "dump", path)
 
 
+def test_a_link_out_of_the_folder_is_refused(tmp_path):
+    """It is no part of the recording."""
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "dump").write_bytes(bytes(WHOLE))
+    (tmp_path / "folder" / "dump").symlink_to(tmp_path / "dump")
+    with pytest.raises(InputError, match="a link out of the folder"):
+        read_recording("mlx7502x", tmp_path / "folder", keys(tmp_path))
+
+
 def test_without_keys_all_are_asked_for(tmp_path):
     """By name, in one error."""
     (tmp_path / "dump").write_bytes(bytes(WHOLE))

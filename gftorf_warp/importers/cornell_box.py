@@ -21,6 +21,7 @@ from ..constants import FRAME_RATE_HZ
 from ..data.folder import empty_quads
 from ..data.problems import Problems
 from ..data.sequence import Calibration, Intrinsics, Truth
+from ..data.untrusted import check_links
 from ..errors import InputError
 from . import camera_keys, pose_keys, regular
 from .imported import Imported, Notes
@@ -168,6 +169,7 @@ def _instants(source: Path) -> int:
     if not source.is_dir():
         why, fix = f"expected a folder with {_file(source, 0, 'depth').name}", "name its folder"
         raise InputError("not a folder", where=source, why=f"{why}, found a file", fix=fix)
+    check_links(source)
     count = 0
     while _file(source, count, "depth").is_file():
         count += 1

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Shaped
 
-from ..data.arrays import SIDE_MAX
+from ..data.untrusted import SIDE_MAX
 from ..errors import InputError
 from .hdf5_files import MAGIC, checked, datasets, open_hdf5
 from .imported import Notes

@@ -12,8 +12,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from ..data.folder import FRAMES_MAX, empty_quads
+from ..data.folder import empty_quads
 from ..data.sequence import Calibration, Intrinsics
+from ..data.untrusted import FRAMES_MAX
 from ..errors import InputError
 from . import camera_keys, pose_keys, regular
 from . import kinect2_packets as packets

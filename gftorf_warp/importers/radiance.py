@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from ..data.arrays import SIDE_MAX
-from ..data.untrusted import unreadable
+from ..data.untrusted import SIDE_MAX, unreadable
 from .raw_files import raw_bytes, size_of
 
 HEAD_BYTES = 4096  # a header has a few lines

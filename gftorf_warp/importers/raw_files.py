@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 
-from ..data.untrusted import unreadable
+from ..data.untrusted import check_links, unreadable
 from ..errors import InputError
 
 
@@ -18,11 +18,12 @@ def files_of(source: Path) -> list[Path]:
     hidden files are ignored.
 
     Raises:
-        InputError: If the folder has no files or cannot be listed.
+        InputError: If the folder has no files, a link out of it, or cannot be listed.
     """
     if not source.is_dir():
         return [source]
     try:
+        check_links(source)
         found = [path for path in source.iterdir() if path.is_file() and path.name[0] != "."]
     except OSError as error:
         raise unreadable(source, error.strerror or str(error)) from error

@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from ..data.arrays import SIDE_MAX
 from ..data.cycles import QUADS_MIN
 from ..data.folder import empty_quads
+from ..data.untrusted import SIDE_MAX
 from ..errors import InputError
 from . import camera_keys, pose_keys, regular, sensor_keys, timing
 from .imported import Imported, Notes
