@@ -113,6 +113,10 @@ def test_clouds_stand_beside_each_other(analytic):
     alone = scene.clouds(analytic, replace(POINTS, beside=False))
     assert [cloud.title for cloud in alone] == [OURS]
     assert {*scene.titles(analytic, POINTS)} == {OURS, CLOSED_FORM, TRUTH}
+    marks = scene.marks(analytic, replace(POINTS, pixel=(5, 8)))
+    for title, cloud in found.items():
+        here = (cloud.pixels == (5, 8)).all(axis=1)
+        np.testing.assert_allclose(marks[title], cloud.points[here][0], rtol=1e-4)
 
 
 def test_a_click_meets_the_pixel_that_it_points_at(analytic):

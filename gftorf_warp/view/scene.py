@@ -172,6 +172,18 @@ def clouds(subject: Subject, choice: Choice) -> list[Cloud]:
     return found
 
 
+def marks(subject: Subject, choice: Choice) -> dict[str, Float[np.ndarray, "3"]]:
+    """Where the chosen pixel is in every shape [m], by title; unknown distances have no place."""
+    camera, (y, x) = subject.recording.camera(choice.frame), choice.pixel
+    ray = camera.rays()[y, x].numpy()
+    found = {title: float(d[y, x]) for title, d in _standing(subject, choice).items()}
+    return {
+        title: camera.centre + distance * ray + _place(subject, title)
+        for title, distance in found.items()
+        if distance > 0  # NaN is not
+    }
+
+
 def titles(subject: Subject, choice: Choice) -> dict[str, Float[np.ndarray, "3"]]:
     """Where the title of every shape is written [m]: above its middle, at the farthest distance."""
     camera, far = subject.recording.camera(0), subject.recording.distance_scale.high

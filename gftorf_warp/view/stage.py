@@ -15,7 +15,6 @@ SETBACK = 1.4  # from the camera to where the viewer starts, over the width of t
 ALOFT = 0.35  # how far above it, likewise
 POINT_PX = 0.6  # [px] radius of a point at the largest distance
 MARK_PX = 1.5  # [px] radius of the ball at the chosen pixel, likewise
-NEAR_PX = 4  # [px] farthest point of a thinned cloud that stands for the chosen pixel
 NOW, PATH = (214, 94, 0), (120, 120, 120)  # RGB of the camera of the raw frame, and of others
 
 
@@ -43,11 +42,13 @@ class Stage:
         """Draw what is chosen instead of what was drawn before."""
         before, self._drawn = self._drawn, []
         with self.server.atomic():
-            clouds = scene.clouds(self.subject, choice)
             self._draw_splats(scene.splats(self.subject, choice))
-            self._draw_clouds(clouds)
-            self._draw_marks(clouds, choice)
+            self._draw_clouds(scene.clouds(self.subject, choice))
             self._draw_cameras(choice)
+            for title, place in scene.marks(self.subject, choice).items():
+                given = {"radius": MARK_PX * self._pixel_m, "color": MARK, "position": place}
+                name = f"/marks/{_path(title)}"
+                self._keep(self.server.scene.add_icosphere(name, **given))
             for title, place in scene.titles(self.subject, choice).items():
                 name = f"/titles/{_path(title)}"
                 self._keep(self.server.scene.add_label(name, title, position=place))
@@ -92,16 +93,6 @@ class Stage:
                 point_shading="flat",
             )
             self._keep(handle)
-
-    def _draw_marks(self, found: list[scene.Cloud], choice: scene.Choice) -> None:
-        """A ball at the chosen pixel of every cloud."""
-        for cloud in found:
-            apart = np.abs(cloud.pixels - choice.pixel).sum(axis=1)
-            if len(apart) and apart.min() <= NEAR_PX:
-                place = cloud.points[apart.argmin()]
-                given = {"radius": MARK_PX * self._pixel_m, "color": MARK, "position": place}
-                name = f"/marks/{_path(cloud.title)}"
-                self._keep(self.server.scene.add_icosphere(name, **given))
 
     def _draw_cameras(self, choice: scene.Choice) -> None:
         if not choice.cameras:

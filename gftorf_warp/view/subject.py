@@ -34,10 +34,14 @@ class Subject:
         sequence: What was measured.
         run: The reconstruction; None: the sequence alone is viewed.
         path: The folder that was named.
+        moved: Where the sequence of the run is now; None: where it was.
     """
 
-    def __init__(self, sequence: Sequence, run: Run | None, path: Path):
+    def __init__(
+        self, sequence: Sequence, run: Run | None, path: Path, moved: str | Path | None = None
+    ):
         self.sequence, self.path, self.recording = sequence, path, Recording(sequence)
+        self._moved = moved
         self.state: State | None = None
         self._take(run)
 
@@ -61,9 +65,8 @@ class Subject:
         """
         path = Path(path)
         if (path / CONFIG).is_file():
-            run = Run.open(path, device)
-            run = run if sequence is None else run.linked(sequence)
-            return cls(run.sequence(), run, path)
+            run = _opened(path, device, sequence)
+            return cls(run.sequence(), run, path, sequence)
         if format_or_none(path) is None:
             why = f"there is no {CONFIG} of a run, and no capture.json, tofType0 or tof"
             fix = "name the --out folder of `gftorf reconstruct`, or the folder of a sequence"
@@ -78,8 +81,10 @@ class Subject:
         first, *further = self.sequence.frequencies
         self._renderers = {}
         if run is not None:
-            self._renderers[first] = run.renderer(RENDERED)
-            self._renderers |= {f: run.renderer(RENDERED, f_mod_hz=f) for f in further}
+            # corrections of a run that goes on would be decided anew for every state
+            self._renderers[first] = run.renderer(RENDERED, corrected=self.finished)
+            for f in further:
+                self._renderers[f] = run.renderer(RENDERED, f_mod_hz=f, corrected=False)
         self.__dict__.pop("residuals", None)  # of the run before
 
     def reload(self) -> bool:
@@ -87,7 +92,7 @@ class Subject:
         if self.run is None or (found := newest(self.path)) == self.state:
             return False
         try:
-            run = Run.open(self.path, self.run.field.device)
+            run = _opened(self.path, self.run.field.device, self._moved)
         except InputError as error:  # it is written again in a moment, or started over
             LOG.warning("the newest checkpoint was not read: %s", error.what)
             self.state = found
@@ -99,6 +104,12 @@ class Subject:
     def frames(self) -> int:
         """Number F of raw frames."""
         return self.sequence.frames
+
+    @property
+    def finished(self) -> bool:
+        """Whether the run has seen all of its images."""
+        config = {} if self.run is None else self.run.config
+        return config.get("images_optimised", 0) >= config.get("images", 0)
 
     @property
     def has_gaussians(self) -> bool:
@@ -142,3 +153,9 @@ class Subject:
         if found is None or not found.noisy or i not in found.quartets:
             return None
         return found.chi_square[found.quartets.index(i)]
+
+
+def _opened(path: Path, device: torch.device | str, sequence: str | Path | None) -> Run:
+    """A run whose sequence may be in another folder than it was."""
+    run = Run.open(path, device)
+    return run if sequence is None else run.linked(sequence)
