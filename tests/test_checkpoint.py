@@ -36,6 +36,13 @@ def write(path, data):
     path.with_suffix(".pt.sha256").write_text(hashlib.sha256(data).hexdigest() + "  " + path.name)
 
 
+def test_the_digest_is_that_of_the_file(tmp_path):
+    """As it is written beside it; none of a checkpoint that was never written."""
+    path = checkpoint.save(tmp_path, STORED)
+    assert checkpoint.digest(tmp_path, 120) == hashlib.sha256(path.read_bytes()).hexdigest()
+    assert checkpoint.digest(tmp_path, 121) is None
+
+
 def test_what_is_written_is_read(tmp_path):
     """A stored state comes back to the bit; a run without checkpoints has none."""
     path = checkpoint.save(tmp_path, STORED)

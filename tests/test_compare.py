@@ -79,6 +79,7 @@ KEYS = {
     "unfilled_share",
     "init",
     "motion",
+    "checkpoint_sha256",
     "version",
 }
 

@@ -21,7 +21,7 @@ from ..data.texts import read_rows
 from ..data.truth import known_distance, moving_and_static, static_throughout
 from ..data.unwrap import CONFIDENT
 from ..errors import InputError, UsageError
-from ..recon import residuals
+from ..recon import checkpoint, residuals
 from . import classes, gallery, views
 from . import metrics as measure
 from .caveats import caveats
@@ -225,6 +225,7 @@ def summary(
         "diagnostics": measure.along_run(read_rows(run.path / "diagnostics.jsonl")),
         **{name: fact(run.config, name) for name in FACTS},
         "method": method_of(run.config),
+        "checkpoint_sha256": checkpoint.digest(run.path, run.config.get("images_optimised") or 0),
         "version": __version__,
     }
 

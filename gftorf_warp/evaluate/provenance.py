@@ -98,6 +98,7 @@ def how(
     facts = {
         "sequence": config.get("sequence"),
         "SHA-256 of its data": config.get("data_sha256"),
+        "SHA-256 of the checkpoint": compared.get("checkpoint_sha256"),
         "preset": config.get("preset"),
         "ablation": fact(config, "ablation"),
         "method": METHOD_WORDS.get(method, method),

@@ -55,6 +55,16 @@ def save(run: Path, stored: dict) -> Path:
     return path
 
 
+def digest(run: Path, images: int) -> str | None:
+    """SHA-256 of the checkpoint after so many images, as it is written beside it; None: there is no
+    such checkpoint.
+
+    Raises:
+        InputError: If it cannot be read.
+    """
+    return _stated(folder(run) / f"{_name(images)}.pt")
+
+
 def load(path: Path, device: torch.device | str = "cpu") -> dict:
     """Read one checkpoint.
 
@@ -179,20 +189,29 @@ def _sidecar(path: Path) -> Path:
     return path.with_suffix(".pt.sha256")
 
 
+def _stated(path: Path) -> str | None:
+    """The SHA-256 that is written beside a checkpoint; None if there is none.
+
+    Raises:
+        InputError: If it cannot be read.
+    """
+    sidecar = _sidecar(path)
+    words = read_bytes(sidecar, SMALL_FILE_BYTES).split() if sidecar.exists() else []
+    return words[0].decode(errors="replace") if words else None
+
+
 def _read(path: Path) -> bytes:
     """Content of a checkpoint whose SHA-256 is right."""
     fix = "restore it from a copy; without it the one before is used; or start over with --fresh"
     sidecar = _sidecar(path)
     try:
-        data = read_bytes(path)
-        stated = read_bytes(sidecar, SMALL_FILE_BYTES).split() if sidecar.exists() else []
+        data, wanted = read_bytes(path), _stated(path)
     except InputError as error:
         raise InputError("damaged checkpoint", where=path, why=error.why, fix=fix) from error
     found = hashlib.sha256(data).hexdigest()
-    if not stated:
+    if wanted is None:
         why = f"{sidecar.name} beside it, which holds its SHA-256, is missing or empty"
         raise InputError("damaged checkpoint", where=path, why=why, fix=fix)
-    wanted = stated[0].decode(errors="replace")
     if found != wanted:
         why = f"its SHA-256 is {found[:12]}..., {sidecar.name} beside it says {wanted[:12]}..."
         raise InputError("damaged checkpoint", where=path, why=why, fix=fix)
