@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from ..constants import CANONICAL_SHIFTS, FRAMES_PER_QUARTET, SPEED_OF_LIGHT
+from ..constants import FRAMES_PER_QUARTET, SPEED_OF_LIGHT
 from ..errors import InputError
-from . import findings, specs
+from . import findings, phase, reprojection, specs, timing, units
+from .constant import spread
 from .cycles import frequencies_by_order
 from .decode import unambiguous_range
 from .folder import format_of, numbered
@@ -17,8 +19,30 @@ from .read import read
 from .report import Report
 from .sequence import Sequence
 
-# focal length in image widths: a view below 11 degrees is more often a mistake in units
-NARROW_VIEW = 5.0
+QUARTETS_MAX = 24  # complete quartets that are decoded: medians over more change little
+COARSE_PIXELS = 5000  # enough for a median, in every quartet
+
+NUMBERS = (
+    units.frequency,
+    units.offset_unit,
+    units.focal_length,
+    units.principal_point,
+    units.half_pixel,
+    units.pose_unit,
+    timing.time_unit,
+    timing.exposure,
+    timing.gaps,
+    timing.repeats,
+)
+"""Rules that decode nothing."""
+IMAGES = (
+    findings.light,
+    findings.frequencies,
+    phase.phase,
+    reprojection.pose_convention,
+    findings.camera,
+)
+"""Rules that need a complete quartet with light."""
 
 
 def check(path: str | Path) -> Report:
@@ -31,43 +55,64 @@ def check(path: str | Path) -> Report:
     report = Report(path=Path(path), form=format_of(Path(path)))
     _facts(sequence, report)
     _assumptions(sequence, report)
-    has_light = sequence.complete_quartets and np.abs(sequence.quads).max() > 0
+    examine(sequence, report)
+    return report
+
+
+def examine(sequence: Sequence, report: Report) -> None:
+    """Add the findings in a sequence, which may exist in memory only; truth is that of its folder.
+
+    Decoded are a few quartets, spread over the sequence, so that memory and time stay bounded.
+    """
+    for rule in NUMBERS:
+        rule(sequence, report)
+    some = thinned(sequence)
+    has_light = some.complete_quartets and np.abs(some.quads).max() > 0
     try:
         unambiguous_range(sequence)
     except InputError as error:
         report.warn("common range", f"{error.what}: {error.why}; nothing is decoded")
     else:
         if has_light:
-            _estimates(sequence, report)
+            timing.slip(coarse(sequence), report)
+            for rule in IMAGES:
+                rule(some, report)
+            _of_format(some, report)
         else:
             warning = "no complete quartet with light: nothing can be decoded or estimated"
             report.warn("no light", warning)
     findings.flow(sequence, report)
-    return report
 
 
-def _estimates(sequence: Sequence, report: Report) -> None:
-    """Add findings that need decoded quartets."""
-    findings.light(sequence, report)
-    findings.frequencies(sequence, report)
+def thinned(sequence: Sequence) -> Sequence:
+    """The sequence with a few of its complete quartets only, spread evenly; the other raw frames
+    count as not measured.
+    """
+    chosen = spread(sequence.complete_quartets, QUARTETS_MAX)
+    if len(chosen) == len(sequence.complete_quartets):
+        return sequence
+    measured = np.zeros(sequence.frames, dtype=bool)
+    for i in chosen:
+        measured[sequence.quartet_frames(i)] = True
+    return replace(sequence, measured=measured)
+
+
+def coarse(sequence: Sequence) -> Sequence:
+    """The sequence with every n-th row and column, a few thousand pixels."""
+    step = max(1, math.isqrt(sequence.height * sequence.width // COARSE_PIXELS))
+    return replace(sequence, quads=sequence.quads[:, ::step, ::step])
+
+
+def _of_format(sequence: Sequence, report: Report) -> None:
+    """Findings in what only some formats or recordings have."""
     if sequence.from_phasors and report.form == "torf":
         findings.third_channel(sequence, report)
     elif not sequence.from_phasors:
         findings.constant_part(sequence, report)
-        if _canonical(sequence):
-            findings.order(sequence, report)
-    if report.form == "ftorf":
+    if report.form == "ftorf" and sequence.path is not None:
         findings.phasors(sequence, report)
-    findings.camera(sequence, report)
-    findings.truth(sequence, report)
-
-
-def _canonical(sequence: Sequence) -> bool:
-    """Whether the quads of a quartet are two opposite pairs, a quarter turn apart."""
-    shifts = sequence.shifts[: sequence.cycle, None]
-    return len(shifts) == FRAMES_PER_QUARTET and bool(
-        np.isclose(np.sort(shifts, axis=0), np.sort(CANONICAL_SHIFTS)[:, None]).all()
-    )
+    if sequence.path is not None:
+        findings.truth(sequence, report)
 
 
 def _facts(sequence: Sequence, report: Report) -> None:
@@ -131,7 +176,7 @@ def _facts(sequence: Sequence, report: Report) -> None:
 
 def _assumptions(sequence: Sequence, report: Report) -> None:
     """Values that were assumed, and what is missing."""
-    tof, sources, warn = sequence.intrinsics, sequence.sources, report.warn
+    sources, warn = sequence.sources, report.warn
     kind, missing = "raw frames", np.flatnonzero(~sequence.measured)
     if len(missing):
         if sequence.from_phasors:
@@ -164,15 +209,6 @@ def _assumptions(sequence: Sequence, report: Report) -> None:
         warn("grey colour", "colour: three equal channels: amplitude, not colour")
     if "warped copies" in sources["measured"]:
         warn("warped copies", f"quads: {sources['measured']}")
-    for name, focal, size in (("fx", tof.fx, sequence.width), ("fy", tof.fy, sequence.height)):
-        if focal > NARROW_VIEW * size:
-            view = f"a view of {math.degrees(2 * math.atan(size / (2 * focal))):.1f} degrees"
-            warn("focal length", f"{name} {focal:.4g} at {size} px is {view}: millimetres?")
-    if not (0 <= tof.cx <= sequence.width and 0 <= tof.cy <= sequence.height):
-        warn(
-            "principal point",
-            f"the principal point {tof.cx:.4g}, {tof.cy:.4g} is outside the image",
-        )
 
 
 def _counts(steps: np.ndarray) -> list[tuple[int, int]]:

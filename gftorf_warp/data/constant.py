@@ -38,7 +38,7 @@ class ConstantPart:
     dc_offset: float
     """Multiple of the amplitude that explains it best by itself [1]."""
     left: float
-    """Root mean square of what the DC offset in use leaves, over the mean amplitude [1]."""
+    """Median of what the DC offset in use leaves, over the median amplitude [1]."""
     left_by_zero: float
     """The same of an additive zero alone [1]."""
     left_by_dc: float
@@ -61,7 +61,7 @@ class ConstantPart:
 
     def explained(self, left: float) -> float:
         """Share of the constant part that is explained if ``left`` is left [1]."""
-        return 1.0 - (left / self.size) ** 2 if self.size > 0.0 else 1.0
+        return max(0.0, 1.0 - left / self.size) if self.size > 0.0 else 1.0
 
     def advice(self, sequence: Sequence, form: str) -> str:
         """Which value of the calibration to change, and to what."""
@@ -86,11 +86,13 @@ def constant_part(sequence: Sequence) -> ConstantPart:
     bins = np.array_split(np.argsort(amplitude), BINS)
     middles = [(np.median(constant[b]), np.median(amplitude[b])) for b in bins if len(b)]
     c, a = np.array(middles).T
-    mean = float(a.mean()) or 1.0
-    zero, dc_offset = float(c.mean()), float((c * a).sum() / max((a * a).sum(), 1e-300))
+    tiny = np.finfo(np.float64).tiny
+    typical = max(float(np.median(a)), tiny)
+    # medians: a bright moving body spoils the brightest bins
+    zero, dc_offset = float(np.median(c)), float(np.median(c / np.maximum(a, tiny)))
 
     def left(model: np.ndarray | float) -> float:
-        return float(np.sqrt(np.square(c - model).mean())) / mean
+        return float(np.median(np.abs(c - model))) / typical
 
     return ConstantPart(
         zero=zero,

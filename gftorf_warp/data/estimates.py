@@ -12,8 +12,6 @@ from .decode import quartet_phasor
 from .flow import warp_back
 from .sequence import Sequence, Truth
 
-# the three ways to pair four slots
-PAIRINGS = (((0, 1), (2, 3)), ((0, 2), (1, 3)), ((0, 3), (1, 2)))
 STATIC_QUANTILE = 0.5  # the half of the pixels that changes least over time is taken as static
 BRIGHT_QUANTILE = 0.5  # and of those the brighter half, where noise is small
 STILL_M = 1e-3  # [m] a pixel whose true distance changes less within a quartet is static
@@ -50,28 +48,6 @@ def distance_of_z(sequence: Sequence, truth: Truth) -> np.ndarray:
     tof = sequence.intrinsics
     slope_x, slope_y = (x - tof.cx) / tof.fx, (y - tof.cy) / tof.fy
     return (truth.distance * np.sqrt(1.0 + slope_x**2 + slope_y**2)).astype(np.float32)
-
-
-def pairings(sequence: Sequence) -> tuple[int | None, list[float]]:
-    """Agreement of each way of pairing the slots of four-shift quartets: two opposite pairs have
-    the same sum.
-
-    Returns:
-        Index into ``PAIRINGS`` of the stated shifts (None if they have no opposite pairs), and for
-        each pairing the fraction of steady pixels where its two sums differ least. A reversed pair
-        or swapped pairs are not detected.
-    """
-    frames = [sequence.quartet_frames(i) for i in sequence.complete_quartets]
-    quartets = [sequence.quads[own].astype(np.float64) for own in frames]
-    gaps = [
-        np.abs(np.median([q[a] + q[b] - q[c] - q[d] for q in quartets], axis=0))
-        for (a, b), (c, d) in PAIRINGS
-    ]
-    best = np.argmin(gaps, axis=0)[steady_pixels(sequence)]
-    shares = [float((best == p).mean()) for p in range(len(PAIRINGS))]
-    shift = sequence.shifts[frames[0]]
-    opposite = [all(math.cos(shift[a] - shift[b]) < -0.99 for a, b in pairs) for pairs in PAIRINGS]
-    return (opposite.index(True) if any(opposite) else None), shares
 
 
 @dataclass(frozen=True, kw_only=True)

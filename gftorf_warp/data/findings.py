@@ -96,21 +96,6 @@ def constant_part(sequence: Sequence, report: Report) -> None:
         )
 
 
-def order(sequence: Sequence, report: Report) -> None:
-    """Order of raw quads of the four canonical shifts."""
-    stated, shares = estimates.pairings(sequence)
-    texts = ["".join(f"(q{a},q{b})" for a, b in pairs) for pairs in estimates.PAIRINGS]
-    found = ", ".join(f"{text} on {share:.0%}" for text, share in zip(texts, shares, strict=True))
-    report.add("order", f"opposite pairs fit best: {found} of bright static pixels")
-    if stated is not None and shares[stated] < max(shares):
-        best = int(np.argmax(shares))
-        report.warn(
-            "order",
-            f"quad order doubtful: stored pairing {texts[stated]} fits {shares[stated]:.0%} of "
-            f"static pixels, {texts[best]} {shares[best]:.0%}; check tof_permutation.npy",
-        )
-
-
 def third_channel(sequence: Sequence, report: Report) -> None:
     """Third channel of stored phasors compared with the length of the first two."""
     assert sequence.path is not None

@@ -1,0 +1,89 @@
+"""Findings of ``gftorf check`` about phase, without ground truth: order, offset, wraps."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ..constants import SPEED_OF_LIGHT
+from .decode import unambiguous_range
+from .falloff import Pairs
+from .hypotheses import hypotheses, offset_by_falloff, stated_pairs
+from .report import Report
+from .sequence import Sequence
+
+SHOWN = 3  # hypotheses in a message
+# [1] of the measure of falloff.py: on thirty simulated scenes another offset gains at most 0.041
+# where the stated one is right, and 0.044 to 1.4 where it is wrong by a third of a turn
+OFFSET_GAIN = 0.08
+# [1] of the pairs of neighbours on one surface: none wraps where all surfaces are within the range;
+# noise of a surface near its end makes single ones
+WRAPPED_SHARE = 2e-3
+
+
+def phase(sequence: Sequence, report: Report) -> None:
+    """Order, then offset, then wraps: each can look like the next, and is reported alone."""
+    for rule in (order, offset, wraps):
+        before = len(report.findings)
+        rule(sequence, report)
+        if len(report.findings) > before:
+            return
+
+
+def order(sequence: Sequence, report: Report) -> None:
+    """Order and sign of the shifts, by ranked hypotheses."""
+    found = hypotheses(sequence)
+    stated, best = found[0], found[1]
+    text = f"{stated.degrees} degrees as stated: {stated.evidence}"
+    report.add("order", f"{text}; next best {best.degrees}: {best.evidence}")
+    better = [one for one in found[1:] if one.beats(stated)]
+    if better:
+        listed = "; ".join(
+            f"{k}. {one.option(sequence, report.form)} ({one.evidence})"
+            for k, one in enumerate(better[:SHOWN], start=1)
+        )
+        report.warn(
+            "order",
+            f"quad order doubtful: {stated.degrees} degrees, {stated.evidence}; better: {listed}",
+        )
+
+
+def offset(sequence: Sequence, report: Report) -> None:
+    """Phase offset, by the fall-off of the amplitude."""
+    found = offset_by_falloff(sequence)
+    if found is None:
+        report.add("fall-off", "too few pixels on one surface")
+        return
+    best, measure, stated = found
+    used = sequence.calibration.phase_offset
+    text = f"{stated:.3f} with phase_offset {used:.3g}, least {measure:.3f} with {best:+.2f} rad"
+    report.add("fall-off", f"{text}; 1 is none, see docs/check.md")
+    if stated - measure > OFFSET_GAIN:
+        report.warn(
+            "offset",
+            f"amplitudes fall with distance as they should with a phase_offset near {best:+.1f} "
+            f"rad, measure {measure:.2f}, not with {used:.4g} rad, {stated:.2f}: degrees, or not "
+            "calibrated?",
+        )
+
+
+def wraps(sequence: Sequence, report: Report) -> None:
+    """Surfaces on which the distance jumps by the unambiguous range."""
+    pairs, range_m = stated_pairs(sequence), SPEED_OF_LIGHT / (2.0 * sequence.frequencies[0])
+    if pairs is None or len(sequence.frequencies) > 1:
+        return
+    share = _wrapped(pairs, sequence.calibration.phase_offset)
+    report.add("wraps", f"{share:.2%} of neighbours on one surface jump by {range_m:.4g} m")
+    if share > WRAPPED_SHARE:
+        report.warn(
+            "wrap",
+            f"{share:.1%} of neighbours on one surface jump by {unambiguous_range(sequence):.4g} "
+            "m: surfaces reach beyond the unambiguous range, or phase_offset is wrong",
+        )
+
+
+def _wrapped(pairs: Pairs, used: float) -> float:
+    """Share of pairs with the end of the range between them."""
+    turns = np.mod((pairs.phases - used) / (2.0 * math.pi), 1.0)
+    return float((np.abs(turns[1] - turns[0]) > 0.5).mean())
