@@ -166,6 +166,11 @@ def wrapping(sequence: Sequence, _: np.random.Generator) -> Sequence:
     return at_double_frequency(at_double_frequency(sequence))
 
 
+def too_long(sequence: Sequence, _: np.random.Generator) -> Sequence:
+    """Distances a third too long."""
+    return calibrated(sequence, f_mod_hz=0.75 * sequence.calibration.f_mod_hz)
+
+
 def scaled_poses(sequence: Sequence, factor: float) -> Sequence:
     """Translations in another unit."""
     poses = sequence.camera_from_world.copy()
@@ -249,14 +254,16 @@ MISTAKES: Mapping[str, Mistake] = {
         found_by=("pose convention",),
         moving=True,
     ),
+    "depth_range 20 for 15, camera moves": Mistake(
+        plant=too_long, found_by=("scale",), moving=True
+    ),
     "poses in mm": Mistake(
         plant=lambda s, _: scaled_poses(s, 1e3), found_by=("pose unit",), moving=True
     ),
 }
 UNDETECTABLE: Mapping[str, Mistake] = {
-    "depth_range 20 for 15": Mistake(
-        plant=lambda s, _: calibrated(s, f_mod_hz=0.75 * s.calibration.f_mod_hz),
-        found_by=("frequency", "truth", "pose convention"),
+    "depth_range 20 for 15, camera at rest": Mistake(
+        plant=too_long, found_by=("scale", "frequency"), moving=False
     ),
     "focal length 20 % too long": Mistake(
         plant=lambda s, _: pinhole(s, lambda k: replace(k, fx=1.2 * k.fx, fy=1.2 * k.fy)),
