@@ -9,7 +9,7 @@ import numpy as np
 from ..constants import SPEED_OF_LIGHT
 from .decode import unambiguous_range
 from .falloff import Pairs
-from .hypotheses import EXPLAINS, hypotheses, offset_by_falloff, stated_pairs
+from .hypotheses import EXPLAINS, TURNED_GAIN, hypotheses, offset_by_falloff, stated_pairs
 from .noise import amplitudes_of, quad_noise
 from .report import Report
 from .sequence import Sequence
@@ -20,9 +20,6 @@ SHOWN = 3  # hypotheses in a message
 NO_COSINE, NOISES = 0.05, 2.0  # and as many times the noise
 FITTED = 3  # unknowns of a cosine and a constant
 MEDIAN_NOISE = 1.25  # of a median over that of a mean, both of normal distributions
-# [1] of the measure of falloff.py: on thirty simulated scenes another offset gains at most 0.041
-# where the stated one is right, and 0.044 to 1.4 where it is wrong by a third of a turn
-OFFSET_GAIN = 0.08
 # [1] of the pairs of neighbours on one surface: none wraps where all surfaces are well within the
 # range, one in a thousand where a dark and noisy one is at 0.94 of it
 WRAPPED_SHARE = 2.5e-3
@@ -84,7 +81,7 @@ def offset(sequence: Sequence, report: Report) -> None:
     used = sequence.calibration.phase_offset
     text = f"{stated:.3f} with phase_offset {used:.3g}, least {measure:.3f} with {best:+.2f} rad"
     report.add("fall-off", f"{text}; 1 is none, see docs/check.md")
-    if stated - measure > OFFSET_GAIN and measure < EXPLAINS:
+    if stated - measure > TURNED_GAIN and measure < EXPLAINS:
         report.warn(
             "offset",
             f"amplitudes fall with distance as they should with a phase_offset near {best:+.1f} "

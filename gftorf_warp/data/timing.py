@@ -59,13 +59,13 @@ def exposure(sequence: Sequence, report: Report) -> None:
 
 def gaps(sequence: Sequence, report: Report) -> None:
     """Missing raw frames and irregular times, by the times."""
-    steps = np.diff(sequence.times)
-    if len(steps) < 2 * sequence.cycle or sequence.from_phasors:
-        steps = np.diff(np.unique(sequence.times))
+    steps, cycle = np.diff(sequence.times), sequence.cycle
+    at_once = bool((steps == 0.0).any())  # raw frames of a cycle may share their time
+    if at_once or len(steps) < 2 * cycle:
+        steps, cycle = np.diff(np.unique(sequence.times)), 1
     if len(steps) < 3:
         return
     # the interval may depend on the slot of a cycle
-    cycle = sequence.cycle if len(steps) >= 2 * sequence.cycle else 1
     usual = np.resize([np.median(steps[k::cycle]) for k in range(cycle)], len(steps))
     typical = float(np.median(steps))
     late = np.flatnonzero(steps - usual > (DROPPED - 1.0) * typical)
