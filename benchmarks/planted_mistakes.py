@@ -292,10 +292,12 @@ def findings(sequence: Sequence) -> list[str]:
     return [finding.name for finding in report.findings]
 
 
-def bases(scenes: list[int], size: tuple[int, int], frames: int) -> dict[str, Sequence]:
-    """Recordings by name."""
+def bases(
+    scenes: list[int], size: tuple[int, int], frames: int, carried: tuple[str, ...] = CARRIED
+) -> dict[str, Sequence]:
+    """Recordings by name: random scenes, and scenes with a carried camera."""
     made = {f"random-{n}": (random_scene(n), frames) for n in scenes}
-    made |= {name: (SCENES[name], CARRIED_FRAMES) for name in CARRIED}
+    made |= {name: (SCENES[name], CARRIED_FRAMES) for name in carried}
     settings = SimSettings(size=size, engine="mesh", format="capture")
     return {
         name: record(replace(scene, colour=None), replace(settings, frames=count)).sequence

@@ -13,6 +13,7 @@ from .flow import warp_back
 from .sequence import Sequence, Truth
 
 STATIC_QUANTILE = 0.5  # the half of the pixels that changes least over time is taken as static
+DARK_QUANTILE = 0.2  # the darkest pixels change by noise
 BRIGHT_QUANTILE = 0.5  # and of those the brighter half, where noise is small
 STILL_M = 1e-3  # [m] a pixel whose true distance changes less within a quartet is static
 CHANGED = 0.25  # of the amplitude: more than noise on bright pixels
@@ -35,10 +36,12 @@ def steady_pixels(sequence: Sequence) -> np.ndarray:
 
 
 def changed_share(sequence: Sequence) -> float:
-    """Fraction of bright pixels whose phasor changes from first to last complete quartet."""
+    """Fraction of pixels whose phasor changes from first to last complete quartet, but the darkest;
+    those of the brighter half alone may all be near bodies that move.
+    """
     first, last = (quartet_phasor(sequence, sequence.complete_quartets[at]) for at in (0, -1))
     amplitude = np.hypot(*first)
-    bright = amplitude >= np.quantile(amplitude, BRIGHT_QUANTILE)
+    bright = amplitude >= np.quantile(amplitude, DARK_QUANTILE)
     return float((np.hypot(*(last - first)) > CHANGED * amplitude)[bright].mean())
 
 

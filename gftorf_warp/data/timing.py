@@ -21,6 +21,7 @@ REPEATED_SHARE = 0.34
 # [1] change of the phasor over its length that the median bright pixel has: a slip by one shift
 # turns all phasors by 60 degrees or more, a moving body covers less than half of the image
 SLIP, SLIP_OVER_TYPICAL = 0.5, 5.0
+USUAL = 0.25  # quantile of the changes: one slip makes two of them large, even of four
 SHOWN = 6  # numbers in a message
 
 
@@ -112,7 +113,7 @@ def slip(sequence: Sequence, report: Report) -> None:
     if len(quartets) < 4:
         return
     changes = np.array([_change(sequence, i, j) for i, j in itertools.pairwise(quartets)])
-    typical = float(np.median(changes))
+    typical = float(np.quantile(changes, USUAL))
     sudden = np.flatnonzero((changes > SLIP) & (changes > SLIP_OVER_TYPICAL * typical))
     if len(sudden):
         first = sequence.cycle * quartets[int(sudden[0]) + 1]
