@@ -259,7 +259,7 @@ def test_a_capture_keeps_the_cycle_and_says_what_is_wrong(tmp_path):
         "cycle           6 raw frames; inferred",
         "7.495 m together",
         "no warnings",
-        "0.3000 of the amplitude",
+        "dc_offset 0.3000 100%",
     ):
         assert line in text
     assert quad_scale(read)[0] == pytest.approx(1 / 1.4, rel=1e-3)

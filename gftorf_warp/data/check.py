@@ -66,7 +66,7 @@ def examine(sequence: Sequence, report: Report) -> None:
     """
     for rule in NUMBERS:
         rule(sequence, report)
-    some = thinned(sequence)
+    some = _thinned(sequence)
     has_light = some.complete_quartets and np.abs(some.quads).max() > 0
     try:
         unambiguous_range(sequence)
@@ -74,7 +74,7 @@ def examine(sequence: Sequence, report: Report) -> None:
         report.warn("common range", f"{error.what}: {error.why}; nothing is decoded")
     else:
         if has_light:
-            timing.slip(coarse(sequence), report)
+            timing.slip(_coarse(sequence), report)
             for rule in IMAGES:
                 rule(some, report)
             _of_format(some, report)
@@ -84,7 +84,7 @@ def examine(sequence: Sequence, report: Report) -> None:
     findings.flow(sequence, report)
 
 
-def thinned(sequence: Sequence) -> Sequence:
+def _thinned(sequence: Sequence) -> Sequence:
     """The sequence with a few of its complete quartets only, spread evenly; the other raw frames
     count as not measured.
     """
@@ -97,7 +97,7 @@ def thinned(sequence: Sequence) -> Sequence:
     return replace(sequence, measured=measured)
 
 
-def coarse(sequence: Sequence) -> Sequence:
+def _coarse(sequence: Sequence) -> Sequence:
     """The sequence with every n-th row and column, a few thousand pixels."""
     step = max(1, math.isqrt(sequence.height * sequence.width // COARSE_PIXELS))
     return replace(sequence, quads=sequence.quads[:, ::step, ::step])

@@ -33,7 +33,7 @@ class Report:
 
     def __str__(self) -> str:
         head = f"{self.path or 'in memory'}: {NAMES[self.form]} sequence"
-        flags = [f"warning ({one.name}): {one.text}" for one in self.findings] or ["no warnings"]
+        flags = [f"warning: {one.text} [{one.name}]" for one in self.findings] or ["no warnings"]
         return "\n".join([head, *(f"  {line}" for line in self.lines), *flags])
 
     @property
