@@ -3,6 +3,8 @@
 import importlib.util
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -60,6 +62,17 @@ def test_phasors_of_a_moving_camera_from_python(tmp_path):
     assert metrics["images_optimised"] == 40
     assert metrics["colour_psnr_db"] > 0
     assert metrics["input"] == "phasor"
+
+
+def test_quads_are_written_as_pictures(tmp_path):
+    """16 bits, codes around their zero; tests/test_import_page.py imports them."""
+    example = load("07_png_quads")
+    sequence = example.main(tmp_path / "quads")
+    image = cv2.imread(str(tmp_path / "quads" / "10.png"), cv2.IMREAD_UNCHANGED)
+    assert image.dtype == np.uint16
+    quad = sequence.quads[10]
+    assert np.corrcoef(quad.ravel(), image.ravel())[0, 1] > 0.999
+    assert np.array_equal(image[abs(quad) > 0.01] > example.ZERO, quad[abs(quad) > 0.01] > 0)
 
 
 def test_no_example_is_forgotten():

@@ -40,7 +40,7 @@ def read(source: Path, settings: Settings) -> Imported:
     Raises:
         UsageError, InputError: If keys are missing, unusable, or do not fit the files; if a file is
             damaged.
-        ResourceError: If the recording does not fit into memory, or h5py is needed.
+        ResourceError: If h5py is needed.
     """
     notes = Notes()
     patterns = image_order.patterns_of(source, settings)

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ..errors import InputError, ResourceError
+from ..errors import InputError
 from . import codes, image_order
 from .imported import Notes
 from .keys import Key, Settings
@@ -58,19 +58,15 @@ def raw_frames_of(
     Raises:
         UsageError, InputError: If keys are missing, unusable, or do not fit the files; if a file is
             damaged.
-        ResourceError: If the recording does not fit into memory, or h5py is needed.
+        ResourceError: If h5py is needed.
     """
     taps = settings["sensor.taps"]
     if taps not in TAPS:
         why = f"expected one of {'; '.join(', '.join(known) for known in TAPS)}"
         raise settings.wrong("sensor.taps", f"{why}, found {', '.join(taps)}", "name one of them")
     decoder = codes.Decoder(settings=settings)
-    try:
-        images = _in_order(patterns, settings, decoder, cycle, notes)
-        quads, numbers = _stacked(patterns, settings, images, notes)
-    except MemoryError as error:
-        why, fix = "the recording does not fit", "import a part of it, by source.files"
-        raise ResourceError("not enough memory", where=source, why=why, fix=fix) from error
+    images = _in_order(patterns, settings, decoder, cycle, notes)
+    quads, numbers = _stacked(patterns, settings, images, notes)
     measured = np.zeros(len(quads), dtype=bool)
     measured[numbers] = True
     decoder.describe(notes, len(numbers) * len(taps), quads[0].size)
