@@ -17,6 +17,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import recordings
 import torf_folder
 from ftorf_folder import scene
 from small_runs import demo, small
@@ -162,6 +163,10 @@ READERS = {
     "NPY, EXR, PNG": Reader(make=make_pictures, read=pictures),
     "PLY, OBJ": Reader(make=make_meshes, read=meshes),
     "scene": Reader(make=make_scene, read=scenes),
+    **{
+        f"import {name}": Reader(make=make, read=functools.partial(recordings.read, name))
+        for name, make in recordings.WRITERS.items()
+    },
 }
 
 
