@@ -6,12 +6,14 @@ import multiprocessing
 import subprocess
 import sys
 import threading
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+import warp as wp
 from cases import CASES
 from comparison import DEVICES
 from torch.testing import assert_close
@@ -20,7 +22,7 @@ from gftorf_warp.data.exr import read_parts, write_parts
 from gftorf_warp.errors import InputError
 from gftorf_warp.evaluate.compare import installed_versions
 from gftorf_warp.losses.image import similarity
-from gftorf_warp.render import api, reference
+from gftorf_warp.render import api, cuda, reference, runtime
 from gftorf_warp.scene.camera import Camera
 from gftorf_warp.scene.sensor import Sensor, distance_from_phasor, phasor_from_quads
 
@@ -199,3 +201,23 @@ def test_versions_of_packages_without_metadata(monkeypatch):
 
     monkeypatch.setattr(importlib.metadata, "version", nothing)
     assert "warp-lang of unknown version" in installed_versions()
+
+
+def test_the_backward_pass_of_a_capture_may_launch(monkeypatch):
+    """On CUDA autograd runs it in a thread of its own, while the capturing one waits for it."""
+    monkeypatch.setattr(torch.cuda, "graph", lambda *_, **__: nullcontext())
+    monkeypatch.setattr(torch.cuda, "current_stream", object)
+    monkeypatch.setattr(wp, "ScopedCapture", lambda **_: nullcontext())
+    monkeypatch.setattr(wp, "stream_from_torch", lambda _: None)
+    got = []
+
+    def launch():
+        got.append(runtime.LAUNCHING.acquire(timeout=10))
+        if got[-1]:
+            runtime.LAUNCHING.release()
+
+    with cuda.capture(None):
+        backward = threading.Thread(target=launch)
+        backward.start()
+        backward.join()
+    assert got == [True]

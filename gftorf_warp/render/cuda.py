@@ -86,8 +86,7 @@ def capture(
     """
     runtime.start()
     mode = "thread_local"  # Warp's own assumption
-    with (
-        runtime.LAUNCHING,
+    with (  # no runtime.LAUNCHING: autograd's thread launches the backward pass, and would wait
         without_garbage_collection(),
         torch.cuda.graph(graph, pool=pool, stream=stream, capture_error_mode=mode),
     ):
