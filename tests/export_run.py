@@ -55,7 +55,7 @@ def moving_gaussians(count, colour):
     field = gaussians(count, CAMERA, seed=3, opacity=(0.4, 0.9), colour=colour)
     layer = torch.arange(count) % 3
     keys = torch.arange(3, dtype=torch.float64) * 4 / FRAME_RATE_HZ
-    nodes = field.mean[1:3]
+    nodes = field.mean[[1 % count, 2 % count]]
     velocity = torch.tensor([[0.4, 0.0, 0.1], [0.0, -0.3, 0.0]])
     motion = Windows(keys, nodes, torch.tensor([1, 2]), velocity)
     return replace(field, layer=layer), motion

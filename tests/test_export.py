@@ -1,5 +1,8 @@
 """What ``gftorf export`` writes, read back by other libraries."""
 
+import re
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
@@ -10,7 +13,8 @@ from export_run import FRAMES, HEIGHT, WIDTH, exportable
 from gftorf_warp.constants import FRAME_RATE_HZ
 from gftorf_warp.data.exr import read_exr
 from gftorf_warp.errors import UsageError
-from gftorf_warp.export.command import export
+from gftorf_warp.export.command import FORMATS, export
+from gftorf_warp.options import command_parsers
 from gftorf_warp.render.api import rasterize
 from gftorf_warp.scene.gaussians import GaussianField, constant_sh
 
@@ -254,3 +258,12 @@ def test_a_video_of_an_export(run, tmp_path):
         count += 1
     assert count == FRAMES // 2
     assert reader.get(cv2.CAP_PROP_FRAME_WIDTH) > 2 * 320
+
+
+def test_every_format_is_named_where_people_look():
+    """On the page and in the help of the command."""
+    page = (Path(__file__).parents[1] / "docs" / "export.md").read_text(encoding="utf-8")
+    text = command_parsers()["export"].format_help()
+    for name in FORMATS:
+        assert f"`{name}`" in page, name
+        assert re.search(rf"\b{name}\b", text), name
