@@ -11,6 +11,7 @@ from jaxtyping import UInt8
 
 from . import page, pictures
 
+FILM_COLUMNS = 4  # panels beside each other, on a large screen
 FILM_QUALITY = 80  # of WebP, as in JPEG
 FILM_LOSSLESS_MAX = 2**18  # [px] of all frames: below, edges stay sharp and a panel below 300 kB
 FILM_HEIGHT_MAX = 16383  # [px] WebP's limit of all frames together
@@ -54,11 +55,12 @@ def film(
     """
     (count,) = {len(frames) for frames, _ in panels.values()}
     figures = "".join(_frames(title, *given) for title, given in panels.items())
+    row = page.row([figures], columns=min(FILM_COLUMNS, len(panels)))
     time = f"--count: {count}; --seconds: {count * period_s:g}s"
     return (
         f'<div class="film" style="{time}"><input type="checkbox" id="film" '
         'aria-label="pause the film"><label for="film"></label>'
-        f'<div class="at"><i></i></div>{page.row([figures], columns=len(panels))}</div>'
+        f'<div class="at"><i></i></div>{row}</div>'
     )
 
 
