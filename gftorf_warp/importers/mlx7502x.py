@@ -6,7 +6,7 @@ OUTPUT_MODE says what a pixel is: A - B, the usual one, A, B, or both.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -112,38 +112,68 @@ def read(source: Path, settings: Settings) -> Imported:
     return regular.imported(source, settings, notes, quads, modulation, times, exposures=exposures)
 
 
+@dataclass(frozen=True, kw_only=True)
+class Layout:
+    """Where the pixels of a buffer are."""
+
+    form: str
+    """Pixel format."""
+    rows: int
+    """Rows."""
+    columns: int
+    """Stored columns, those of both taps if both are stored."""
+    used: int
+    """Bytes of a row that are pixels."""
+    line: int
+    """Bytes from one row to the next."""
+    step: int
+    """Bytes from one buffer to the next."""
+
+    @classmethod
+    def of(cls, settings: Settings) -> Layout:
+        """That of the keys.
+
+        Raises:
+            InputError: If they contradict each other.
+        """
+        (width, height), form = settings["raw.size"], settings["raw.format"]
+        columns = 2 * width if settings["raw.output_mode"] == "A&B" else width
+        if columns * FORMATS[form] % 8:
+            why = f"expected an even number of columns, since two share three bytes, found {width}"
+            raise settings.wrong("raw.size", why, "give the size of the stored image")
+        used = columns * FORMATS[form] // 8
+        line = settings["raw.bytesperline"] or used
+        step = settings["raw.sizeimage"] or line * height
+        if line < used or step < line * height:
+            why = f"expected at least {used} bytes in a row and {line * height} in a buffer, found "
+            why += f"{line} and {step}"
+            raise settings.wrong("raw.bytesperline", why, "give what VIDIOC_G_FMT returns")
+        return cls(form=form, rows=height, columns=columns, used=used, line=line, step=step)
+
+    def other_formats(self, size: int) -> str:
+        """The pixel formats whose buffers would fill a file of so many bytes, in words."""
+        bytes_ = {form: self.rows * self.columns * bits // 8 for form, bits in FORMATS.items()}
+        fit = [form for form, step in bytes_.items() if size and size % step == 0]
+        return f", whole buffers of {' or '.join(fit)}" if fit else ""
+
+
 def _quads(source: Path, settings: Settings, notes: Notes) -> Float[np.ndarray, "F H W"]:
     """Values of all buffers."""
-    (width, height), form = settings["raw.size"], settings["raw.format"]
-    mode = settings["raw.output_mode"]
-    stored = 2 * width if mode == "A&B" else width
-    if stored * FORMATS[form] % 8:
-        why = f"expected an even number of columns, since two share three bytes, found {width}"
-        raise settings.wrong("raw.size", why, "give the size of the stored image")
-    used = stored * FORMATS[form] // 8
-    line = settings["raw.bytesperline"] or used
-    step = settings["raw.sizeimage"] or line * height
-    if line < used or step < line * height:
-        why = f"expected at least {used} bytes in a row and {line * height} in a buffer, found "
-        why += f"{line} and {step}"
-        raise settings.wrong("raw.bytesperline", why, "give what VIDIOC_G_FMT returns")
-    what = f"{stored}x{height} pixels of {form}"
-    buffers = buffers_of(
-        files_of(source), step, what, lambda size: _other_format(size, stored * height)
-    )
+    layout, (width, height) = Layout.of(settings), settings["raw.size"]
+    what = f"{layout.columns}x{height} pixels of {layout.form}"
+    buffers = buffers_of(files_of(source), layout.step, what, layout.other_formats)
     quads = empty_quads(source, len(buffers), {"H": height, "W": width})
     ends = 0
     for n, (path, first) in enumerate(buffers):
-        rows = raw_bytes(path, first, line * height).reshape(height, line)[:, :used]
+        rows = raw_bytes(path, first, layout.line * height).reshape(height, layout.line)
         try:
-            codes = twelve_bits(np.ascontiguousarray(rows), form)
+            codes = twelve_bits(np.ascontiguousarray(rows[:, : layout.used]), layout.form)
         except ValueError as error:
-            fix = "give another raw.format, raw.size or raw.bytesperline"
-            what = "not this pixel format"
-            raise InputError(what, where=path, why=f"buffer {n}: {error}", fix=fix) from error
-        quads[n], full = _value(codes, mode, settings["raw.both"])
+            why, fix = f"buffer {n}: {error}", "give another raw.format, size or bytesperline"
+            raise InputError("not this pixel format", where=path, why=why, fix=fix) from error
+        quads[n], full = _value(codes, settings["raw.output_mode"], settings["raw.both"])
         ends += full
-    notes.understood.append(f"buffers: {len(buffers)}, {width}x{height}, {form}")
+    notes.understood.append(f"buffers: {len(buffers)}, {width}x{height}, {layout.form}")
     if ends:
         notes.uncertain.append(f"{ends} codes are at an end of their range: saturated, and kept")
     return quads
@@ -163,9 +193,3 @@ def _value(
     halves = both == "halves"
     a, b = (codes[:, :half], codes[:, half:]) if halves else (codes[:, ::2], codes[:, 1::2])
     return (a - b).astype(np.float32), full
-
-
-def _other_format(size: int, pixels: int) -> str:
-    """The pixel formats whose buffers would fit."""
-    fit = [form for form, bits in FORMATS.items() if size and size % (pixels * bits // 8) == 0]
-    return f", whole buffers of {' or '.join(fit)}" if fit else ""

@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 
 from ..data.cycles import QUADS_MIN
 from ..data.folder import empty_quads
@@ -55,10 +55,19 @@ def read(source: Path, settings: Settings) -> Imported:
     found = list(packets(source))
     frames = [packet for packet in found if isinstance(packet, Data)]
     tables = [packet for packet in found if isinstance(packet, dict)]
-    height, width, count = _shape(source, tables, notes)
+    shape = _shape(source, tables, notes)
     if not frames:
         why, fix = "expected frames, found settings only", "record again"
         raise InputError("an empty recording", where=source, why=why, fix=fix)
+    modulation = _modulation(shape[2], settings, notes)
+    quads = _quads(source, frames, shape, notes)
+    times = _times(source, frames, shape[2], settings, notes)
+    exposures = timing.exposures_of(settings, len(quads))
+    return regular.imported(source, settings, notes, quads, modulation, times, exposures=exposures)
+
+
+def _modulation(count: int, settings: Settings, notes: Notes) -> sensor_keys.Modulation:
+    """That of the keys, with even shifts if they state none."""
     if not settings.given("sensor.shifts_deg"):
         shifts = tuple(360.0 * k / count for k in range(count))
         settings = replace(settings, values={**settings.values, "sensor.shifts_deg": shifts})
@@ -66,20 +75,7 @@ def read(source: Path, settings: Settings) -> Imported:
     if len(modulation.shifts) != count:
         why = f"expected {count} shifts, one for each quad, found {len(modulation.shifts)}"
         raise settings.wrong("sensor.shifts_deg", why, "list one for each quad")
-    quads = empty_quads(source, len(frames) * count, {"H": height, "W": width})
-    size = 2 * height * width * count
-    for n, frame in enumerate(frames):
-        if frame.count < size:
-            why = f"expected {size} bytes for {width}x{height} pixels of {count} quads in frame "
-            why += f"{n}, found {frame.count}"
-            raise InputError("frame too small", where=source, why=why, fix="record again")
-        stored = raw_bytes(source, frame.first, size)
-        quads[n * count : (n + 1) * count] = _quads(stored, height, width, count)
-    text = f"frames: {len(frames)} with numbers {frames[0].number} to {frames[-1].number}"
-    notes.understood.append(f"{text}, {width}x{height} pixels of {count} quads")
-    times = _times(source, frames, count, settings, notes)
-    exposures = timing.exposures_of(settings, len(quads))
-    return regular.imported(source, settings, notes, quads, modulation, times, exposures=exposures)
+    return modulation
 
 
 def _shape(
@@ -104,7 +100,7 @@ def _one_shape(source: Path, table: dict[str, int | bytes]) -> tuple[int, int, i
     values = {name: value for name, value in table.items() if isinstance(value, int)}
     kind = values.get("tofFrameType")
     if kind != QUADS:
-        found = TYPES.get(-1 if kind is None else kind, f"tofFrameType {kind}")
+        found = TYPES[kind] if kind in TYPES else f"tofFrameType {kind}"
         why = f"expected quads, found {found}, which the controller has computed already"
         fix = "record with a controller that passes quads"
         raise InputError("no quads", where=source, why=why, fix=fix)
@@ -125,11 +121,22 @@ def _one_shape(source: Path, table: dict[str, int | bytes]) -> tuple[int, int, i
 
 
 def _quads(
-    stored: UInt8[np.ndarray, "n"], height: int, width: int, count: int
-) -> Float[np.ndarray, "Q H W"]:
-    """Quads of a frame: the lower twelve bits of 16, with sign."""
-    words = stored.view("<u2").reshape(height, width, count).transpose(2, 0, 1)
-    return ((words << 4).astype(np.int16) >> 4).astype(np.float32)
+    source: Path, frames: list[Data], shape: tuple[int, int, int], notes: Notes
+) -> Float[np.ndarray, "F H W"]:
+    """Quads of all frames: the lower twelve bits of 16, with sign."""
+    height, width, count = shape
+    size = 2 * height * width * count
+    quads = empty_quads(source, len(frames) * count, {"H": height, "W": width})
+    for frame, values in zip(frames, quads.reshape(-1, count, height, width), strict=True):
+        if frame.count < size:
+            why = f"expected {size} bytes for {width}x{height} pixels of {count} quads in frame "
+            why += f"{frame.number}, found {frame.count}"
+            raise InputError("frame too small", where=source, why=why, fix="record again")
+        words = raw_bytes(source, frame.first, size).view("<u2").reshape(height, width, count)
+        values[:] = ((words << 4).astype(np.int16) >> 4).transpose(2, 0, 1)
+    text = f"frames: {len(frames)} with numbers {frames[0].number} to {frames[-1].number}"
+    notes.understood.append(f"{text}, {width}x{height} pixels of {count} quads")
+    return quads
 
 
 def _times(
