@@ -27,6 +27,10 @@ from gftorf_warp.view.scene import CLOSED_FORM, OURS, TRUTH, Choice
 from gftorf_warp.view.state import newest
 from gftorf_warp.view.subject import Subject
 
+LOOK_THROUGH = """[...document.querySelectorAll('button')].find(
+    button => button.innerText.includes('look through')).click()"""
+MIDDLE_OF_SCENE = """(() => { const box = document.querySelector('canvas').getBoundingClientRect();
+    return [box.x + box.width / 2, box.y + box.height / 2]; })()"""
 SIZE = (900, 420)  # [px] of the browser: small pictures are quick without a GPU
 POINTS = Choice(frame=5, shape=scene.POINTS)
 
@@ -231,6 +235,8 @@ def test_it_listens_at_this_machine_only(window):
         pass
     with pytest.raises(UsageError, match=f"port {window.port} cannot be opened"):
         Window(window.subject, window.port)
+    with pytest.raises(UsageError, match="port 70000 cannot be opened"):
+        Window(window.subject, 70000)
 
 
 def test_what_cannot_be_viewed_is_named(analytic, tmp_path, monkeypatch, capsys):
@@ -263,7 +269,9 @@ def test_the_command_ends_with_ctrl_c(analytic, monkeypatch):
 
 
 def test_the_slider_moves_the_scene_in_a_browser(fitted):
-    """Open, press an arrow key on the time slider: text and pixels of the scene change."""
+    """Open, press an arrow key on the time slider: text and pixels of the scene change; click the
+    middle of the scene, seen through the camera: its pixel is chosen.
+    """
     pytest.importorskip("viser", reason="no viser: pip install 'gftorf-warp[view]'")
     from gftorf_warp.view.window import Window
 
@@ -288,11 +296,27 @@ def test_the_slider_moves_the_scene_in_a_browser(fitted):
             tab.until("document.body.innerText.includes('raw frame 9 of 14')")
             after = settled(tab)
             assert (np.abs(after - before).max(axis=-1) > 40).sum() > 100
+            window.controls.row.value = window.controls.column.value = 0
+            tab.value(LOOK_THROUGH)
+            settled(tab)
+            tab.click(*tab.value(MIDDLE_OF_SCENE))
+            until(lambda: window.controls.choice.pixel != (0, 0))
+            y, x = window.controls.choice.pixel
+            assert abs(y - 6) <= 1, "the middle of the image"
+            assert abs(x - 10) <= 1
             assert not tab.problems
         finally:
             ended.set()
             drawing.join()
             window.close()
+
+
+def until(condition):
+    """Wait until something is true."""
+    end = time.monotonic() + 20.0
+    while not condition():
+        assert time.monotonic() < end, "never"
+        time.sleep(0.05)
 
 
 def settled(tab):
