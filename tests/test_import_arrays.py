@@ -1,5 +1,6 @@
 """``gftorf import arrays``: every format and order of the same raw frames gives one capture."""
 
+import re
 import struct
 
 import cv2
@@ -354,6 +355,19 @@ def test_several_frequencies(tmp_path):
     assert found.frame_frequencies.tolist() == [20e6] * 3 + [60e6] * 3 + [20e6] * 3
 
 
+def test_check_says_what_a_wrong_zero_lacks(tmp_path):
+    """As docs/import.md promises: the number to add to values.zero, in codes."""
+    root = arrays(tmp_path, a=recording()[1] + 300)
+    out, config = tmp_path / "seq", tmp_path / "keys.toml"
+    for zero, lacks in ((0, 300), (300, None)):
+        config.write_text(keys(values__zero=zero))
+        line = f"import arrays {root} --config {config} --out {out}{zero}"
+        assert main(line.split()) == 0
+        warnings = [text for text in check(f"{out}{zero}").warnings if "adc_zero" in text]
+        found = [float(re.search(r"= ([\d.]+)", text)[1]) for text in warnings]
+        assert found == ([] if lacks is None else [pytest.approx(lacks, abs=10)])
+
+
 def good(tmp_path):
     """A folder of nine NumPy arrays that imports."""
     root = tmp_path / "quads"
@@ -434,6 +448,16 @@ def picture(image, suffix=".png"):
     return cv2.imencode(suffix, image)[1].tobytes()
 
 
+def npz_bomb(root):
+    """An archive whose directory claims four gigabytes."""
+    only("a.npz", b"")(root)
+    np.savez_compressed(root / "a.npz", quads=recording()[1])
+    data = bytearray((root / "a.npz").read_bytes())
+    size = data.index(b"PK\1\2") + 24
+    data[size : size + 4] = b"\xf0\xff\xff\xff"
+    (root / "a.npz").write_bytes(data)
+
+
 HUGE_PNG = bytearray(picture(np.ones((H, W), np.uint16)))
 HUGE_PNG[16:24] = struct.pack(">2I", 1 << 30, 1 << 30)
 ROUND_TIFF = b"II*\0" + struct.pack("<IHHHII I", 8, 1, 256, 4, 1, 8, 8)
@@ -472,6 +496,7 @@ BAD = [  # change of the folder, changed keys, a word of the error
     (good, {"values__bits": 17}, "17 from bit 0"),
     (replaced("4.npy", np.zeros((H, W))), {"values__bits": 12}, "float64"),
     (only("a.npz", b"PK\3\4"), {}, "a.npz"),
+    (npz_bomb, {}, "4294967280 bytes packed into"),
     (only("a.h5", b"\x89HDF\r\n\x1a\n" + bytes(500)), {}, "HDF5"),
     (hdf5_link, {}, "no such dataset"),
     (hdf5_virtual, {}, "a link out of the file"),

@@ -135,6 +135,11 @@ def test_poses_of_the_colour_camera_move_the_tof_camera(tmp_path):
         offset = path[image] @ [*centre, 1]  # of the ToF camera, for the colour camera
         np.testing.assert_allclose(RIG @ offset, [0, 0, 0, 1], atol=1e-9)
     assert len(found.camera_from_world) == FRAMES
+    recorded(tmp_path, png, **more, colour__delay_s=0.003)
+    late = read_recording("arrays", quads, config).sequence
+    for image, frame in enumerate((0, 4, 8)):  # the pose of the image, not that of the raw frame
+        np.testing.assert_allclose(late.colour.camera_from_world[frame], path[image], atol=1e-9)
+    assert np.abs(late.camera_from_world[4] - found.camera_from_world[4]).max() > 1e-3
 
 
 def test_raw_files_of_a_recording(tmp_path):

@@ -111,6 +111,8 @@ BAD = [  # file, what it contains, further keys, a word of the error
     ("a.yaml", "", "", "named camera_matrix"),
     ("a.yaml", "camera_matrix: 3", "", "named camera_matrix"),
     ("a.yaml", "K: [1, 2, 3]", "", "named camera_matrix"),
+    ("a.yaml", "K: [20, 0, 8, 0, 20, 6, 0, 0, 1]\nD: [0, 0, 0, 0, 0, 1.5]", "", "'k4': 1.5"),
+    ("a.yaml", "K: [20, 1.5, 8, 0, 20, 6, 0, 0, 1]", "", "'skew': 1.5"),
     ("a.yaml", "K: [1, 0, 3", "", "as cv2.FileStorage writes it"),
     ("a.yaml", b"\xff\xfe", "", "expected text"),
     ("a.xml", "<?xml version='1.0'?><a>", "", "as cv2.FileStorage writes it"),
