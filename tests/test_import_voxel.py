@@ -57,10 +57,12 @@ def test_a_recording_decodes_to_its_scene(tmp_path):
 def test_what_is_not_applied_is_said(tmp_path):
     """Phase offsets of pixels, and rates that replace the times of the file."""
     frames = np.zeros((2, 4, vxl.HEIGHT, vxl.WIDTH))
-    content = vxl.content(frames, phaseOffsets=b"\x01\x00" * 8)
+    content = vxl.content(frames, phaseOffsets=b"\x00\x02\x00\x04" * 8)
     imported = of(tmp_path, content, SENSOR + "[time]\nrate_hz = 100\n")
-    assert any(line.startswith("phaseOffsets: ") for line in imported.uncertain)
+    assert any("of 16 pixels, 67.5 degrees with a spread of 22.5" in x for x in imported.uncertain)
     np.testing.assert_allclose(imported.sequence.times, np.arange(8) / 100)
+    imported = of(tmp_path, vxl.content(frames, phaseOffsets=b"\x01"))
+    assert any("cut short" in line for line in imported.uncertain)
 
 
 FRAMES = np.zeros((2, 4, vxl.HEIGHT, vxl.WIDTH))

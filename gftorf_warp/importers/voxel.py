@@ -26,6 +26,7 @@ from .voxel_packets import Data, packets
 # tofFrameType: what a pixel is
 TYPES = {0: "amplitude and phase", 1: "in-phase and quadrature", 2: "quads"}
 QUADS = 2
+PHASES = 4096  # steps of a stored phase in a turn
 QUADS_MAX = 100  # the SDK refuses more
 WAYS = ("time.rate_hz", "time.cycle_rate_hz", "time.file")
 KEYS = (
@@ -86,14 +87,28 @@ def _shape(
     if len(set(shapes)) != 1:
         why = f"expected settings of one size, found {sorted(set(shapes)) or 'none'}"
         raise InputError("settings of raw frames", where=source, why=why, fix="record again")
-    for name, what in (
-        ("phaseOffsets", "phase offsets of single pixels"),
-        ("phaseOffsetsFile", "phase offsets of single pixels"),
-        ("crossTalkCoefficients", "coefficients against cross-talk"),
-    ):
-        if any(table.get(name) for table in tables):
-            notes.uncertain.append(f"{name}: the recording has {what}, which are not applied")
+    for name, value in tables[-1].items():
+        if isinstance(value, bytes) and value:
+            notes.uncertain.append(f"{name}: the recording has {TABLES[name](value)}")
     return shapes[0]
+
+
+def _offsets(stored: bytes) -> str:
+    """Phase offsets of single pixels, in words."""
+    steps = np.frombuffer(stored[: len(stored) // 2 * 2], "<i2")
+    if not len(steps):
+        return f"phase offsets of {len(stored)} byte, which are cut short"
+    degrees = 360.0 / PHASES * steps.astype(np.float64)
+    mean, spread = degrees.mean(), degrees.std()
+    text = f"phase offsets of {len(steps)} pixels, {mean:.4g} degrees with a spread of {spread:.3g}"
+    return f"{text}, which are not applied; sensor.phase_offset_deg takes their mean"
+
+
+TABLES = {  # settings of the recording that change its phases
+    "phaseOffsets": _offsets,
+    "phaseOffsetsFile": lambda _: "a file of phase offsets of single pixels, not applied",
+    "crossTalkCoefficients": lambda _: "coefficients against cross-talk, which are not applied",
+}
 
 
 def _one_shape(source: Path, table: dict[str, int | bytes]) -> tuple[int, int, int]:
