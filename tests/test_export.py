@@ -152,7 +152,7 @@ def test_nothing_is_overwritten_or_left_half_written(run, tmp_path, monkeypatch)
     monkeypatch.setattr(splats, "write_through", interrupted)
     with pytest.raises(KeyboardInterrupt):
         export(run, tmp_path / "other")
-    assert not list((tmp_path / "other").iterdir())
+    assert not (tmp_path / "other").exists()
 
 
 @pytest.mark.parametrize(
@@ -175,13 +175,14 @@ def test_what_the_run_lacks_is_named(tmp_path):
     """Colour, or Gaussians."""
     run = exportable(tmp_path, colour=False)
     with pytest.raises(UsageError, match="--colour reflectivity"):
-        export(run, tmp_path / "out", colour="colour")
+        export(run, tmp_path / "out", "ply,points", colour="colour")
     none = exportable(tmp_path / "none", count=60)
     empty = none.field.map(lambda tensor: tensor[:0])
     object.__setattr__(none, "field", empty)
     none.config["settings"]["method"] = "ctof"
     with pytest.raises(UsageError, match="no Gaussians"):
-        export(none, tmp_path / "out")
+        export(none, tmp_path / "out", "points,html")
+    assert not (tmp_path / "out").exists()
 
 
 def test_distance_images_are_the_run_bit_by_bit(run, tmp_path):

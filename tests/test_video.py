@@ -142,6 +142,15 @@ def test_a_video_that_lacks_pictures_is_no_video(tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
+def test_an_animation_that_memory_cannot_hold_is_refused(run, tmp_path, monkeypatch):
+    """With the kinds that need not hold it, before all of it is rendered."""
+    monkeypatch.setattr(video, "HELD_BYTES_MAX", 5_000_000)
+    with pytest.raises(UsageError, match=r"\.webm"):
+        render_to_video(run, tmp_path / "film.webp")
+    assert not (tmp_path / "film.webp").exists()
+    assert len(run.cameras) < FRAMES
+
+
 def test_the_rate_lets_a_few_pictures_be_seen():
     """Four to thirty per second."""
     assert [video.rate_of(count) for count in (4, 60, 1000)] == [4.0, 12.0, 30.0]

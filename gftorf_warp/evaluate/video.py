@@ -22,6 +22,7 @@ CODEC = "vp09"
 ENCODED = (".webm", ".mp4")
 ANIMATED = (".gif", ".webp")
 SUFFIXES = (*ENCODED, *ANIMATED)
+HELD_BYTES_MAX = 1 << 30  # of the pictures of an animation
 RATE_MIN, RATE_MAX, LONGEST_S = 4.0, 30.0, 5.0  # [1/s], [1/s], and [s] a short video should last
 
 Picture = UInt8[np.ndarray, "H W 3"]
@@ -64,7 +65,8 @@ def write_video(
         progress: Called with (pictures done, pictures in all).
 
     Raises:
-        UsageError: If the suffix is another one, or the file cannot be written.
+        UsageError: If the suffix is another one, the file cannot be written, or an animation is too
+            long to be held in memory.
         ResourceError: If the file does not hold all pictures afterwards, for example since the disk
             is full.
     """
@@ -72,7 +74,8 @@ def write_video(
     with atomic_path(path) as temporary:
         seen = _counted(pictures, total, progress)
         if path.suffix in ANIMATED:
-            temporary.write_bytes(animated(list(seen), 1.0 / rate, path.suffix))
+            pictures_held = _held(seen, total, path)
+            temporary.write_bytes(animated(pictures_held, 1.0 / rate, path.suffix))
         else:
             named = temporary.with_name(f"{temporary.name}{path.suffix}")  # which decides the kind
             try:
@@ -89,6 +92,19 @@ def _counted(
         yield picture
         if progress is not None:
             progress(done, total)
+
+
+def _held(pictures: Iterator[Picture], total: int, where: Path) -> list[Picture]:
+    """All pictures in memory, as the encoder of animations wants them."""
+    found = []
+    for picture in pictures:
+        if total * picture.nbytes > HELD_BYTES_MAX:
+            why = f"{total} pictures of {picture.shape[1]}x{picture.shape[0]} must be in memory at "
+            why += f"once: {total * picture.nbytes >> 20} MB, the most is {HELD_BYTES_MAX >> 20}"
+            fix = "write .webm or .mp4, or fewer times"
+            raise UsageError("too long for an animation", where=where, why=why, fix=fix)
+        found.append(picture)
+    return found
 
 
 def _encode(path: Path, pictures: Iterable[Picture], rate: float, where: Path) -> None:

@@ -26,10 +26,12 @@ class Format(NamedTuple):
     """Fills the new folder, or makes the file: called with moments, path and progress."""
     coloured: bool = False
     """Whether it also takes ``colour``."""
+    of_gaussians: bool = False
+    """Whether a run without Gaussians has nothing to write."""
 
 
 FORMATS = {
-    "ply": Format("ply", splats.write, coloured=True),
+    "ply": Format("ply", splats.write, coloured=True, of_gaussians=True),
     "points": Format("points", points.write, coloured=True),
     "mesh": Format("mesh", functools.partial(mesh.write, kind="ply")),
     "obj": Format("obj", functools.partial(mesh.write, kind="obj")),
@@ -38,7 +40,7 @@ FORMATS = {
     "colmap": Format("colmap", cameras.write_colmap, coloured=True),
     "nerfstudio": Format("nerfstudio", cameras.write_nerfstudio, coloured=True),
     "tum": Format("poses.txt", cameras.write_tum),
-    "html": Format("scene.html", scene_page.write, coloured=True),
+    "html": Format("scene.html", scene_page.write, coloured=True, of_gaussians=True),
     **{kind: Format(f"video.{kind}", film.write) for kind in ("webm", "mp4", "gif", "webp")},
 }
 
@@ -83,12 +85,15 @@ def export(
     moments = Moments.of(run, times, every)
     shown = colour or COLOURS[0 if moments.has_colour else 1]
     targets = [out / FORMATS[name].target for name in names]
-    prepare(out, targets, fresh=fresh)
+    check_content(moments, names, shown)
+    check_targets(targets, fresh=fresh)
     for name, target in zip(names, targets, strict=True):
         kind = FORMATS[name]
         write = functools.partial(kind.write, **{"colour": shown} if kind.coloured else {})
         step = progress(name) if progress else lambda *_: None
         if target.suffix:
+            with as_errors(out):
+                out.mkdir(parents=True, exist_ok=True)
             write(moments, target, step)
         else:
             with atomic_folder(target) as folder:
@@ -112,18 +117,34 @@ def checked(formats: str | Iterable[str]) -> list[str]:
     return names
 
 
-def prepare(out: Path, targets: list[Path], *, fresh: bool) -> None:
-    """Make the output folder; move earlier targets aside if ``fresh``.
+def check_content(moments: Moments, names: Iterable[str], colour: str) -> None:
+    """Whether the run has what formats and colour need.
 
     Raises:
-        UsageError: If one exists and ``fresh`` is not set, or the folder is a file.
+        UsageError: If not.
+    """
+    run = moments.run
+    lacking = [name for name in names if FORMATS[name].of_gaussians]
+    if lacking and not len(run.field):
+        why = f"its method {run.config['settings'].get('method')} fits none"
+        fix = f"leave {', '.join(lacking)} out: points, mesh and images need none"
+        raise UsageError("no Gaussians to export", where=run.path, why=why, fix=fix)
+    if colour == "colour" and not moments.has_colour:
+        why, fix = "this run was reconstructed from quads alone", "use --colour reflectivity"
+        raise UsageError("no colour to export", where="--colour", why=why, fix=fix)
+
+
+def check_targets(targets: Iterable[Path], *, fresh: bool) -> None:
+    """Move what an earlier export wrote aside if ``fresh``.
+
+    Raises:
+        UsageError: If there is such a thing and ``fresh`` is not set.
     """
     held = [target for target in targets if target.exists()]
     if held and not fresh:
         why = "an earlier export wrote it"
         fix = "choose another --out, or --fresh, which moves it aside"
         raise UsageError("nothing is overwritten", where=held[0], why=why, fix=fix)
-    with as_errors(out):
-        out.mkdir(parents=True, exist_ok=True)
-        if held:
-            set_aside(out, held)
+    if held:
+        with as_errors(held[0].parent):
+            set_aside(held[0].parent, held)

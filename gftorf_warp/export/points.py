@@ -16,7 +16,6 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from ..data.files import write_through
-from ..errors import UsageError
 from ..evaluate.metrics import normalised
 from ..evaluate.previews import srgb
 from ..scene.camera import Camera
@@ -43,11 +42,7 @@ class Pixels:
 
 
 def write(moments: Moments, folder: Path, progress: Progress, *, colour: str) -> None:
-    """Fill a folder with one PLY file per time.
-
-    Raises:
-        UsageError: If the run has no colour where that is wanted.
-    """
+    """Fill a folder with one PLY file per time."""
     for index, found in enumerate(pixels(moments, colour)):
         places = world_points(found.distance, moments.cameras[index], found.seen)
         columns = dict(zip("xyz", places, strict=True))
@@ -59,14 +54,7 @@ def write(moments: Moments, folder: Path, progress: Progress, *, colour: str) ->
 
 
 def pixels(moments: Moments, colour: str) -> Iterator[Pixels]:
-    """What the camera of each time sees, in colour or as the grey of the reflectivity.
-
-    Raises:
-        UsageError: If the run has no colour where that is wanted.
-    """
-    if colour == "colour" and not moments.has_colour:
-        why, fix = "this run was reconstructed from quads alone", "use --colour reflectivity"
-        raise UsageError("no colour to export", where="--colour", why=why, fix=fix)
+    """What the camera of each time sees, in colour or as the grey of the reflectivity."""
     white = None
     for images in moments.images(RENDERED):
         seen = images["opacity"] >= OPAQUE

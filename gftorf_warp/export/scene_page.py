@@ -35,7 +35,7 @@ from ..evaluate.previews import srgb
 from ..render.reference import shade, spherical_harmonics
 from ..scene.gaussians import GaussianField
 from .moments import Moments, Progress
-from .splats import at_moment, check, colour_harmonics
+from .splats import at_moment, colour_harmonics
 
 POLICY = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data:"
 BYTES_MAX = 64 << 20  # of the arrays: browsers parse a page of that size in a second or two
@@ -65,10 +65,8 @@ def write(moments: Moments, path: Path, progress: Progress, *, colour: str) -> N
     """Write the page.
 
     Raises:
-        UsageError: If the run has no Gaussians, or no colour where that is wanted, or the page
-            would be too large.
+        UsageError: If the page would be too large, or show nothing.
     """
-    check(moments)
     harmonics = colour_harmonics(moments, colour)
     still = still_part(moments)
     order = torch.cat([index.nonzero()[:, 0] for index in (still.rests, still.seen & ~still.rests)])

@@ -23,7 +23,6 @@ from torch import Tensor
 
 from ..constants import SH_BIAS, SH_Y0
 from ..data.files import write_through
-from ..errors import UsageError
 from ..scene.gaussians import GaussianField
 from ..scene.windows import AWAY
 from .moments import Moments, Progress
@@ -35,12 +34,7 @@ SEEN = 0.1  # opacity from which a Gaussian counts for that
 
 @torch.no_grad()
 def write(moments: Moments, folder: Path, progress: Progress, *, colour: str) -> None:
-    """Fill a folder with one PLY file per time; see :func:`gaussians_at`.
-
-    Raises:
-        UsageError: If the run has no Gaussians, or no colour where that is wanted.
-    """
-    check(moments)
+    """Fill a folder with one PLY file per time; see :func:`gaussians_at`."""
     harmonics = colour_harmonics(moments, colour)
     for index in range(len(moments)):
         field = gaussians_at(moments, index, harmonics)
@@ -49,25 +43,11 @@ def write(moments: Moments, folder: Path, progress: Progress, *, colour: str) ->
         progress(index + 1, len(moments))
 
 
-def check(moments: Moments) -> None:
-    """Raises UsageError if the run has no Gaussians."""
-    if not len(moments.run.field):
-        method = moments.run.config["settings"].get("method")
-        why, fix = f"its method {method} fits none", "export points or exr"
-        raise UsageError("no Gaussians to export", where=moments.run.path, why=why, fix=fix)
-
-
 def colour_harmonics(moments: Moments, colour: str) -> Float[Tensor, "N 16 3"]:
-    """Harmonics of what is shown: ``colour`` [units of the sequence], or ``reflectivity`` [1].
-
-    Raises:
-        UsageError: If the run has no colour.
-    """
+    """Harmonics of what is shown: ``colour`` [units of the sequence], or ``reflectivity`` [1]."""
     field = moments.run.field
     if colour == "colour":
-        if field.colour_sh is None:
-            why, fix = "this run was reconstructed from quads alone", "use --colour reflectivity"
-            raise UsageError("no colour to export", where="--colour", why=why, fix=fix)
+        assert field.colour_sh is not None, "only what a run has is shown"
         return scaled(field.colour_sh, 1.0 / moments.run.colour_scale)
     constant = (field.reflectivity_sh[:, 0] * SH_Y0 + SH_BIAS).clamp_min(0.0)
     seen = constant[field.opacity > SEEN]
