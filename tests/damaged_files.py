@@ -16,8 +16,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
+import foreign
 import numpy as np
 import recordings
+import test_import_arrays as arrays
 import torf_folder
 from ftorf_folder import scene
 from small_runs import demo, small
@@ -27,7 +29,8 @@ from test_meshes import TETRAHEDRON, written
 from gftorf_warp import Run, Sequence
 from gftorf_warp.data.exr import read_parts, write_exr
 from gftorf_warp.data.write import write
-from gftorf_warp.errors import GftorfError
+from gftorf_warp.errors import GftorfError, InputError
+from gftorf_warp.importers.command import read_recording
 from gftorf_warp.recon.train import reconstruct
 from gftorf_warp.scene.falloff import read_falloff
 from gftorf_warp.sim.mesh_file import read_mesh
@@ -83,17 +86,17 @@ def make_run(folder):
 
 
 def run(folder):
-    """What is read of a run; None if it says that it has gone back to an earlier checkpoint."""
+    """What is read of a run that does not say that it has gone back to an earlier checkpoint."""
     found = Run.open(folder)
-    if found.config.get("damaged_checkpoints"):
-        return None
+    if damaged := found.config.get("damaged_checkpoints"):
+        raise InputError("an earlier checkpoint", where=folder, why=f"{damaged}", fix="none")
     return [found.field.mean.numpy(), found.field.reflectivity_sh.numpy()]
 
 
 def run_with_a_right_hash(folder):
     """As :func:`run`, but whoever damaged the checkpoints wrote their hashes, too."""
     for path in (folder / "ckpt").glob("*.pt"):
-        if path.is_file() and not path.is_symlink():
+        if regular(path):
             digest = hashlib.sha256(path.read_bytes()).hexdigest()
             path.with_suffix(".pt.sha256").write_text(f"{digest}  {path.name}\n")
     return run(folder)
@@ -168,6 +171,32 @@ READERS = {
         for name, make in recordings.WRITERS.items()
     },
 }
+
+
+def make_import(writer, folder):
+    """A recording as arrays, and the keys that say how."""
+    _, codes = foreign.recording()
+    (folder / "files").mkdir()
+    changes = writer(folder / "files", codes)
+    (folder / "keys.toml").write_text(foreign.keys(**changes))
+
+
+def imported(folder):
+    """The quads of a recording."""
+    return [read_recording("arrays", folder / "files", folder / "keys.toml").sequence.quads]
+
+
+WRITERS = (
+    *(arrays.npy_stack, arrays.npz_slots, arrays.hdf5, arrays.mat, arrays.mat73, arrays.png),
+    *(arrays.tiff_high_bits, arrays.tiff_pages, arrays.exr_each, arrays.raw_stack),
+)
+IMPORTS = {
+    f"import {writer.__name__}": Reader(
+        make=functools.partial(make_import, writer), read=imported, damaged="files/*"
+    )
+    for writer in WRITERS
+}
+READERS |= IMPORTS
 
 
 @functools.cache
@@ -311,20 +340,30 @@ IN_FOLDERS = (take_away, folder_instead, pipe_instead, device_instead, other_nam
 
 
 def damage(folder: Path, random: np.random.Generator, reader: Reader) -> str:
-    """Damage one of the files of a folder; says how."""
-    files = sorted(path for path in folder.glob(reader.damaged) if path.is_file())
-    path = files[random.integers(len(files))]
-    kinds = IN_FOLDERS if random.random() < 0.1 else BYTES
-    if kinds is BYTES and path.suffix in IN_TEXTS and random.random() < 0.6:
-        kinds = TEXT
-    change = kinds[random.integers(len(kinds))]
-    if kinds is IN_FOLDERS:
-        change(path, random)
-    elif path.stat().st_size:
-        data = bytearray(path.read_bytes())
-        change(data, random)
-        path.write_bytes(data)
-    return f"{change.__name__} {path.relative_to(folder)}"
+    """Damage files of a folder, once, twice or three times; says how."""
+    done = []
+    for _ in range(random.choice((1, 1, 1, 2, 3))):
+        files = sorted(path for path in folder.glob(reader.damaged) if regular(path))
+        if not files:
+            break
+        path = files[random.integers(len(files))]
+        kinds = IN_FOLDERS if random.random() < 0.1 else BYTES
+        if kinds is BYTES and path.suffix in IN_TEXTS and random.random() < 0.6:
+            kinds = TEXT
+        change = kinds[random.integers(len(kinds))]
+        if kinds is IN_FOLDERS:
+            change(path, random)
+        elif path.stat().st_size:
+            data = bytearray(path.read_bytes())
+            change(data, random)
+            path.write_bytes(data)
+        done.append(f"{change.__name__} {path.relative_to(folder)}")
+    return ", ".join(done)
+
+
+def regular(path: Path) -> bool:
+    """Whether it is a file and no link."""
+    return path.is_file() and not path.is_symlink()
 
 
 def attempt(name: str, seed: int, place: Path) -> tuple[str, str]:
@@ -344,7 +383,7 @@ def attempt(name: str, seed: int, place: Path) -> tuple[str, str]:
     except Exception as error:
         at = traceback.extract_tb(error.__traceback__)[-1]
         return done, f"{type(error).__name__} in {Path(at.filename).name}:{at.lineno}"
-    if reader.protected and found is not None and not same(found, reader.read(whole(name))):
+    if reader.protected and not same(found, reader.read(whole(name))):
         return done, "changed"
     return done, "read"
 

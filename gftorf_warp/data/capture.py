@@ -174,8 +174,8 @@ def _files(
         if n >= frames:
             why = f"expected files of raw frames below {frames}; found {n}"
             problems.add("no raw frame", file, why, "remove it")
-    for name in digests:
-        if found and name.startswith(f"{folder}/") and not os.path.lexists(root / name):
+    for name in digests if (root / folder).is_dir() else ():
+        if name.startswith(f"{folder}/") and not os.path.lexists(root / name):
             why, fix = f"{MANIFEST} names it", f"restore it, or remove {MANIFEST}"
             problems.add("no such file", root / name, why, fix)
     return {n: file for n, file in found.items() if n < frames}
