@@ -174,6 +174,7 @@ def command_parsers() -> dict[str, Parser]:
         "--no-noise", dest="noise", action="store_false", default=None, help="an ideal sensor"
     )
     simulate.flag("--flow", "store exact optical flow too")
+    simulate.flag("--taps", "store the sum of both taps too, in a capture")
     blur = "samples in time of one exposure (1: no motion blur)"
     simulate.option("--exposure-samples", "N", _positive, blur)
     examples = "for example sensor.f_mod_hz=30e6 or bodies.1.path.velocity=3,0,0"

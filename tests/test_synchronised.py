@@ -6,9 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from analytic_run import as_phasors
-from moving_box import recording, turned
+from moving_box import recording, seen, turned
 from sequences import changed
 
+from gftorf_warp import Sequence
 from gftorf_warp.data.decode import closed_form_distance
 from gftorf_warp.data.flow import compute_flow
 from gftorf_warp.data.synchronised import splatted, synchronised, unfilled_share
@@ -16,8 +17,13 @@ from gftorf_warp.data.truth import moving_and_static
 from gftorf_warp.data.write import write
 from gftorf_warp.errors import InputError, UsageError
 from gftorf_warp.evaluate.compare import compare
+from gftorf_warp.recon.observations import data_hash
 from gftorf_warp.recon.run import Flow2D, Run
 from gftorf_warp.recon.train import reconstruct
+from gftorf_warp.sim.record import record
+from gftorf_warp.sim.scenes import SCENES
+from gftorf_warp.sim.settings import SimSettings
+from gftorf_warp.sim.simulate import simulate
 
 FRAMES = 24
 
@@ -160,3 +166,77 @@ def test_what_cannot_be_synchronised_is_refused(tmp_path, kind, what):
         reconstruct(unfit(kind), tmp_path / "run", "flow2d")
     assert error.value.fix
     assert not (tmp_path / "run" / "config.json").exists()
+
+
+def with_tap_sums(sequence):
+    """The box with an image of all its light for every raw frame: reflectivity over d^2."""
+    images = [seen(n) for n in range(sequence.frames)]
+    return replace(
+        sequence,
+        tap_sums={n: (r / d**2).astype(np.float32) for n, (d, r, _) in enumerate(images)},
+    )
+
+
+TWO_TAPS = ("sensor.unipolar=false", "sensor.dc_offset=0")
+
+
+def test_tap_sums_leave_less_unfilled_and_less_error():
+    """Flow between neighbouring raw frames, where things are fast: less is hidden, paths may be
+    curved.
+    """
+    scene, options = SCENES["speed_test_texture"], {"size": (64, 48), "frames": 12, "taps": True}
+    made = record(scene, SimSettings(format="capture", overrides=TWO_TAPS, **options))
+    sequence, distance = made.sequence, made.truth.distance
+    without = replace(sequence, tap_sums={})
+    assert unfilled_share(sequence) < 0.5 * unfilled_share(without)
+    moving, _ = moving_and_static(distance, [*range(12)], from_phasors=False, cycle=4)
+
+    def error(measured):
+        frames = [synchronised(measured, float(t)).sequence for t in measured.times]
+        found = np.stack([closed_form_distance(one, 0) for one in frames])
+        return np.square(found - distance)[moving].mean()
+
+    assert error(sequence) < 0.95 * error(without)
+
+
+def test_a_single_quartet_with_tap_sums_is_enough():
+    """Raw frames one cycle apart are not needed; a slot is what was measured at its own time."""
+    sequence, _ = recording(frames=4)
+    with pytest.raises(InputError, match="no optical flow"):
+        synchronised(sequence, 0.0)
+    found = synchronised(with_tap_sums(sequence), float(sequence.times[2]))
+    np.testing.assert_array_equal(found.sequence.quads[2], sequence.quads[2])
+    assert found.filled.mean() > 0.95
+    assert not found.sequence.tap_sums
+
+
+def test_tap_sums_are_a_sequence_of_a_capture(tmp_path):
+    """Simulated, stored and read; their noise is that of the quads' taps, without phase."""
+    options = {"size": (24, 18), "frames": 8, "format": "capture", "taps": True}
+    path = simulate("sliding_cube", tmp_path / "seq", SimSettings(**options, overrides=TWO_TAPS))
+    sequence = Sequence.open(path)
+    sums = np.stack([sequence.tap_sums[n] for n in range(8)])
+    assert (sums > np.abs(sequence.quads)).all()
+    swing, phases = np.ptp(sums, axis=0), np.ptp(sequence.quads, axis=0)
+    assert np.median(swing) < 0.01 * np.median(phases)
+    write("capture", tmp_path / "again", sequence)
+    for n, image in Sequence.open(tmp_path / "again").tap_sums.items():
+        np.testing.assert_array_equal(image, sequence.tap_sums[n])
+    assert "--taps" in (path / "README.md").read_text()
+    run = reconstruct(path, tmp_path / "run", "flow2d")
+    assert run.config["flow_source"] == "tap sums"
+    assert data_hash(sequence) != data_hash(replace(sequence, tap_sums={}))
+
+
+@pytest.mark.parametrize(
+    ("given", "what"),
+    [
+        ({"format": "ftorf"}, "cannot store the sum of taps"),
+        ({"format": "capture"}, "there is no sum of taps"),
+    ],
+)
+def test_tap_sums_that_cannot_be_are_refused(tmp_path, given, what):
+    """Another layout; a sensor with one tap, as the scene has it."""
+    with pytest.raises(UsageError, match=what):
+        simulate("sliding_cube", tmp_path / "seq", SimSettings(taps=True, frames=4, **given))
+    assert not (tmp_path / "seq").exists()

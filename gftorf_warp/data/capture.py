@@ -52,17 +52,17 @@ def read(root: Path, frame_rate_hz: float | None) -> Sequence:
         fix = "complete the folder, or set measured to false"
         problems.add("quads: no such file", root / "tof", why, fix)
     quads = empty_quads(root, frames, {"H": height, "W": width})
-    images: dict[str, Any] = {"forward_flow": {}, "backward_flow": {}, "colour": {}}
+    images: dict[str, Any] = {"forward_flow": {}, "backward_flow": {}, "tap_sums": {}, "colour": {}}
     for n, file, parts in _read(root, files, digests, problems):
         if not measured[n]:
             continue
         quad = problems.attempt(_image, file, parts, "quads", (height, width))
         if quad is not None:
             quads[n] = quad
-        for name in ("forward_flow", "backward_flow"):
-            flow = problems.attempt(_image, file, parts, name, (height, width))
-            if flow is not None:
-                images[name][n] = flow
+        for name in ("forward_flow", "backward_flow", "tap_sums"):
+            image = problems.attempt(_image, file, parts, name, (height, width))
+            if image is not None:
+                images[name][n] = image
     colour_size = tuple(values["colour_size"][::-1].tolist()) if "colour_size" in values else None
     coloured = _files(root, "colour", frames, digests, problems)
     for n, file, parts in _read(root, coloured, digests, problems):
@@ -97,6 +97,7 @@ def read(root: Path, frame_rate_hz: float | None) -> Sequence:
             settings=values.get("sensor_settings", {}),
         ),
         from_phasors=values["kind"] == "phasor",
+        tap_sums=images["tap_sums"],
         colour=ColourCamera(
             images=images["colour"],
             intrinsics=optional("colour_intrinsics", _intrinsics),

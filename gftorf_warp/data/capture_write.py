@@ -39,6 +39,8 @@ def files(sequence: Sequence, truth: Truth | None) -> Iterator[tuple[str, bytes 
 def _raw_frame(sequence: Sequence, n: int) -> Parts:
     """Parts of one raw frame."""
     parts: Parts = {"raw": {"q": with_zero(sequence, n)}}
+    if n in sequence.tap_sums:
+        parts["taps"] = {"sum": float32(sequence.tap_sums[n])}
     flow = {"flow.forward": sequence.flow.forward, "flow.backward": sequence.flow.backward}
     for name, images in flow.items():
         if n in images:

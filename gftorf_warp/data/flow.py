@@ -72,6 +72,17 @@ def compute_flow(sequence: Sequence, *, method: Method = "dis", every: int | Non
         return Flow(forward=combined(0, 0, step), backward=combined(1, step, -step))
 
 
+def flow_between(
+    first: Float[np.ndarray, "H W"], second: Float[np.ndarray, "H W"], *, method: Method = "dis"
+) -> Float[np.ndarray, "2 H W"]:
+    """Optical flow [px] from an image to another one of the same brightness; NaN where the flow
+    back disagrees.
+    """
+    match = _matcher(method)
+    grey = _grey(first, second)
+    return _consistent(match(*grey), match(*grey[::-1]))
+
+
 def check_size(sequence: Sequence) -> None:
     """Refuse images that cannot be matched.
 

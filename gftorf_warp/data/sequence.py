@@ -124,6 +124,9 @@ class Sequence:
     from_phasors: bool = False
     """Whether the camera delivered phasors, each of one instant: the four raw frames of a quartet
     are then re/2, -re/2, im/2, -im/2 of one phasor, with one time and one pose."""
+    tap_sums: dict[int, Float[np.ndarray, "H W"]] = field(default_factory=dict)
+    """Sum of both taps of a pixel by raw frame, float32, in the units of quads: an image of all its
+    light, without phase; empty if only their difference is known."""
     colour: ColourCamera = field(default_factory=ColourCamera)
     """The colour camera, without images if there is none."""
     flow: Flow = field(default_factory=Flow)

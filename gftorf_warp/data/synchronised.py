@@ -16,18 +16,23 @@ nearer image.
 
 The brightness of a quad changes with distance and incidence of light, of which optical flow knows
 nothing: motion along the rays is where this fails.
+
+Where a recording has the sums of both taps, which have no phase, any two raw frames can be matched.
+Then F and B lead to the raw frame nearest to t, at most a cycle away, and a pixel is moved by the
+share of it that lies between its own time and t.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from ..errors import InputError
 from . import flow as optical_flow
-from .flow import Method, compute_flow, sample
+from .flow import Method, compute_flow, flow_between, sample
 from .kept import kept
 from .sequence import Flow, Sequence
 from .temporal import one_quartet
@@ -59,10 +64,9 @@ def synchronised(sequence: Sequence, time: float, method: Method = "dis") -> Syn
         method: Of the optical flow, ``dis`` or ``deepflow``.
     """
     check_flow(sequence)
-    flow = flow_of_frames(sequence, method)
     first = sequence.complete_quartets[0] * sequence.cycle
     time = float(np.clip(time, sequence.times[0], sequence.times[-1]))
-    images = [slot_at(sequence, flow, first + k, time) for k in range(sequence.cycle)]
+    images = [slot_at(sequence, first + k, time, method) for k in range(sequence.cycle)]
     nearest = int(np.abs(sequence.times - time).argmin())
     one = one_quartet(sequence, np.stack([image for image, _ in images]), first)
     one = replace(
@@ -96,10 +100,16 @@ def check_flow(sequence: Sequence) -> None:
         why = "expected all raw frames of a cycle in a row, at least once"
         fix = "check the sequence with `gftorf check`, or record longer"
         raise InputError("no complete quartet", where=where, why=why, fix=fix)
-    if not pairs_of(sequence):
+    if not has_tap_sums(sequence) and not pairs_of(sequence):
         why = "expected two raw frames one cycle apart, found none that were both measured"
         raise InputError("no optical flow", where=where, why=why, fix=fix)
     optical_flow.check_size(sequence)
+
+
+def has_tap_sums(sequence: Sequence) -> bool:
+    """Whether the sum of both taps is known of all measured raw frames."""
+    measured = np.flatnonzero(sequence.measured).tolist()
+    return len(measured) > 1 and sequence.tap_sums.keys() >= {*measured}
 
 
 @kept
@@ -114,50 +124,96 @@ def pairs_of(sequence: Sequence) -> list[int]:
     return np.flatnonzero(sequence.measured[:-step] & sequence.measured[step:]).tolist()
 
 
+class Source(NamedTuple):
+    """A measurement of a slot, and how it gets to the time of an image."""
+
+    quad: Float[np.ndarray, "H W"]
+    """What was measured."""
+    before: Float[np.ndarray, "H W"]
+    """The image in which its flow begins."""
+    after: Float[np.ndarray, "H W"]
+    """The image in which it ends."""
+    flow: Float[np.ndarray, "2 H W"]
+    """Flow between them [px]; NaN: unknown."""
+    moved: float
+    """How much of it a pixel moves [1]."""
+    counts: float
+    """Weight in the image [1]."""
+
+
 def slot_at(
-    sequence: Sequence, flow: Flow, slot: int, time: float
+    sequence: Sequence, slot: int, time: float, method: Method
 ) -> tuple[Float[np.ndarray, "H W"], Bool[np.ndarray, "H W"]]:
     """Image of one slot at a time [s] and where it was filled.
 
     Args:
         sequence: What was measured.
-        flow: That of :func:`flow_of_frames`.
         slot: Any raw frame of the slot.
         time: Seconds since raw frame 0.
+        method: Of the optical flow.
     """
+    find = _by_taps if has_tap_sums(sequence) else _by_quads
+    sources = find(sequence, slot, time, method)
+    size = sequence.quads.shape[1:]
+    total, weight, filled = np.zeros(size), np.zeros(size), np.zeros(size, dtype=bool)
+    for source in sources:
+        known, flow = _known(source.flow)
+        importance = np.exp(-MISMATCH * _mismatch(source.before, source.after, flow))
+        importance *= np.where(known, 1.0, COVERED)
+        summed, arrived, reliable = splatted(
+            np.stack([importance * source.quad, importance, known.astype(np.float64)]),
+            source.moved * flow,
+        )
+        total += source.counts * summed
+        weight += source.counts * arrived
+        filled |= reliable > 0.5  # of a pixel
+    measured = np.flatnonzero(sequence.measured[slot % sequence.cycle :: sequence.cycle])
+    measured = measured * sequence.cycle + slot % sequence.cycle
+    nearest = sequence.quads[measured[np.abs(sequence.times[measured] - time).argmin()]]
+    image = np.where(weight > LEAST, total / np.maximum(weight, LEAST), nearest)
+    return image.astype(np.float32), filled
+
+
+def _by_quads(sequence: Sequence, slot: int, time: float, method: Method) -> list[Source]:
+    """The measurements before and after a time, each with its flow to the other."""
     step, times, quads = sequence.cycle, sequence.times, sequence.quads
     pairs = [n for n in pairs_of(sequence) if (n - slot) % step == 0]
     if not pairs:
-        measured = np.flatnonzero(sequence.measured[slot % step :: step]) * step + slot % step
-        nearest = measured[np.abs(times[measured] - time).argmin()]
-        return quads[nearest], np.zeros(quads.shape[1:], dtype=bool)
+        return []
+    flow = flow_of_frames(sequence, method)
 
     def away(n: int) -> float:
         return max(times[n] - time, time - times[n + step], 0.0)
 
     n = min(pairs, key=away)
-    share = float((time - times[n]) / (times[n + step] - times[n]))
-    total, weight = np.zeros((2, *quads.shape[1:]))
-    filled = np.zeros(quads.shape[1:], dtype=bool)
-    for source, target, flows, moved, counts in (
-        (n, n + step, flow.forward, share, 1.0 - share),
-        (n + step, n, flow.backward, 1.0 - share, share),
-    ):
-        if counts <= 0.0:  # beyond the pair, the nearer image alone
-            continue
-        known, there = _known(flows[source])
-        importance = np.exp(-MISMATCH * _mismatch(quads[source], quads[target], there))
-        importance *= np.where(known, 1.0, COVERED)
-        summed, arrived, reliable = splatted(
-            np.stack([importance * quads[source], importance, known.astype(np.float64)]),
-            moved * there,
+    m, share = n + step, float((time - times[n]) / (times[n + step] - times[n]))
+    sources = [
+        Source(quads[n], quads[n], quads[m], flow.forward[n], share, 1.0 - share),
+        Source(quads[m], quads[m], quads[n], flow.backward[m], 1.0 - share, share),
+    ]
+    return [source for source in sources if source.counts > 0.0]  # beyond a pair, the nearer alone
+
+
+def _by_taps(sequence: Sequence, slot: int, time: float, method: Method) -> list[Source]:
+    """The same with the flow of tap sums to the raw frame nearest to the time."""
+    times, sums = sequence.times, sequence.tap_sums
+    own = [n for n in sorted(sums) if (n - slot) % sequence.cycle == 0]
+    before = [n for n in own if times[n] <= time][-1:]
+    after = [n for n in own if times[n] > time][:1]
+    apart = sum(times[n] for n in after) - sum(times[n] for n in before)
+    sources = []
+    for n in before + after:
+        counts = 1.0 - abs(time - times[n]) / apart if before and after else 1.0
+        others = [m for m in sums if times[m] != times[n]]
+        m = min(others, key=lambda m: abs(times[m] - time))
+        moved = float((time - times[n]) / (times[m] - times[n]))
+        there = (
+            flow_between(sums[n], sums[m], method=method)
+            if moved != 0.0
+            else np.zeros((2, *sums[n].shape), dtype=np.float32)
         )
-        total += counts * summed
-        weight += counts * arrived
-        filled |= reliable > 0.5  # of a pixel
-    nearer = quads[n if share < 0.5 else n + step]
-    image = np.where(weight > LEAST, total / np.maximum(weight, LEAST), nearer)
-    return image.astype(np.float32), filled
+        sources.append(Source(sequence.quads[n], sums[n], sums[m], there, moved, counts))
+    return [source for source in sources if source.counts > 0.0]
 
 
 def splatted(

@@ -144,6 +144,7 @@ def one_quartet(sequence: Sequence, quads: Float[np.ndarray, "K H W"], first: in
         exposures=None,
         camera_from_world=sequence.camera_from_world[frames],
         calibration=replace(sequence.calibration, cycle_length=sequence.cycle),
+        tap_sums={},
         colour=ColourCamera(),
         flow=Flow(),
     )

@@ -50,6 +50,7 @@ MOTION_WORDS = {
 FLOW_WORDS = {
     "file": "file: optical flow that came with the sequence",
     "computed": "computed: optical flow by OpenCV, between quads of one shift",
+    "tap sums": "tap sums: optical flow by OpenCV, between the light of both taps of raw frames",
     "none": "none",
 }
 WORDS = {

@@ -248,6 +248,7 @@ def reduced(sequence: Sequence, width_max: int | None) -> Sequence:
     return replace(
         sequence,
         quads=np.stack([shrink(quad) for quad in sequence.quads]),
+        tap_sums={n: shrink(image) for n, image in sequence.tap_sums.items()},
         intrinsics=sequence.intrinsics.scaled(sx, sy),
         flow=Flow(forward=shrink_flow(flow.forward), backward=shrink_flow(flow.backward)),
     )
@@ -282,6 +283,7 @@ def data_hash(sequence: Sequence) -> str:
     if tof.distortion is not None:
         digest.update(repr(tof.distortion).encode())
     images = {"forward_flow": sequence.flow.forward, "backward_flow": sequence.flow.backward}
+    images |= {"tap_sums": sequence.tap_sums}
     for name, by_frame in (images | {"colour": sequence.colour.images}).items():
         for frame, image in sorted(by_frame.items()):
             digest.update(f"{name} {frame}".encode() + np.ascontiguousarray(image).tobytes())

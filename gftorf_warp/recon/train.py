@@ -16,7 +16,7 @@ from ..data import resources
 from ..data.constant import constant_part
 from ..data.read import read, read_truth
 from ..data.sequence import Sequence, Truth
-from ..data.synchronised import check_flow, unfilled_share
+from ..data.synchronised import check_flow, has_tap_sums, unfilled_share
 from ..errors import InputError, UsageError
 from ..render.cuda import free_memory
 from ..scene.changes import Wording, changed
@@ -330,7 +330,8 @@ def _synchronise(sequence: Sequence, settings: ReconSettings) -> dict[str, objec
     share = unfilled_share(sequence, settings.flow.matcher)
     text = "optical flow brought nothing to %.2f %% of the pixels: hidden, or it is wrong there"
     LOG.info(text, 100.0 * share)
-    return {"flow_source": "computed", "unfilled_share": share}
+    kind = "tap sums" if has_tap_sums(sequence) else "computed"
+    return {"flow_source": kind, "unfilled_share": share}
 
 
 def _warn(sequence: Sequence) -> None:

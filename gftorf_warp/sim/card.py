@@ -156,6 +156,7 @@ def _command(scene: Scene, used: ResolvedSettings, level: str | None) -> str:
         values = {name: getattr(used, name) for name in CALLED}
         values |= {"format": repr(used.format)} if used.format != "ftorf" else {}
         values |= {"level": repr(level)} if level else {}
+        values |= {"taps": True} if used.taps else {}
         values |= {"truth": repr(used.truth)} if used.truth != "usual" else {}
         call = ", ".join(f"{k}={v}" for k, v in values.items())
         return f"gftorf_warp.simulate({scene.name}, ..., {call})"
@@ -166,6 +167,7 @@ def _command(scene: Scene, used: ResolvedSettings, level: str | None) -> str:
         *((True, f"--override {text}") for text in scene.overrides),
         (True, f"--frames {used.frames} --size {camera.width}x{camera.height}"),
         (used.flow, "--flow"),
+        (used.taps, "--taps"),
         (used.engine != usual.engine, f"--engine {used.engine}"),
         (bounces != usual.bounces or other_paths, f"--bounces {bounces} --paths {used.paths}"),
         (samples != usual.exposure_samples, f"--exposure-samples {samples}"),

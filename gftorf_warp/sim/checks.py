@@ -77,7 +77,10 @@ def check_format(scene: Scene, settings: ResolvedSettings) -> None:
     why = f"a phase needs {QUADS_MIN} different shifts, found {turns} deg"
     phaseless = "this sensor cannot measure a phase", "sensor.shifts"
     refuse(few, phaseless, why, "give it more of them")
-    impossible = why_impossible(sensor) if sensor.noise else None
+    why, fix = "this sensor has one tap, see sensor.unipolar", "leave --taps out"
+    alone = settings.taps and sensor.unipolar
+    refuse(alone, ("there is no sum of taps", "--taps"), why, fix)
+    impossible = why_impossible(sensor) if sensor.noise or settings.taps else None
     negative = "a tap of this sensor would hold negative light", "sensor.dc_offset"
     fix = "lower the contrast or the DC offset, or make the sensor unipolar"
     refuse(impossible is not None, negative, str(impossible), fix)

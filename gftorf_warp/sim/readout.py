@@ -47,6 +47,9 @@ class Reading(NamedTuple):
     """Relative units, float32."""
     saturated: Bool[np.ndarray, "H W"]
     """Whether a tap was full or the ADC at an end of its range: the quad is then biased."""
+    total: Float[np.ndarray, "H W"] | None = None
+    """Sum of both taps, ambient and dark electrons included [relative units], float32; None: not
+    read."""
 
 
 def why_impossible(sensor: Sensor) -> str | None:
@@ -124,6 +127,7 @@ def read_out(
     *,
     ambient: Float[np.ndarray, "H W"] | None = None,
     shading: Shading | None = None,
+    taps: bool = False,
 ) -> Reading:
     """Simulate the read-out of one raw frame.
 
@@ -136,6 +140,7 @@ def read_out(
             reads B.
         ambient: Share of even ambient light that each pixel reflects [1]; None: 1.
         shading: Factors of the light of each pixel; None: 1.
+        taps: Whether the sum of both taps is wanted, too.
 
     Raises:
         ValueError: If the sensor's contrast and DC offset contradict each other.
@@ -148,8 +153,13 @@ def read_out(
     ]:
         quad, amplitude = quad * active, amplitude * active
         ambient = other if ambient is None else ambient * other
+    unit = float(contrast(sensor)) * electron_gain(sensor)
     if not sensor.noise:
-        return Reading(np.asarray(quad, dtype=np.float32), np.zeros(np.shape(quad), dtype=bool))
+        exact = np.asarray(quad, dtype=np.float32), np.zeros(np.shape(quad), dtype=bool)
+        if not taps:
+            return Reading(*exact)
+        both = np.add(*mean_taps(quad, amplitude, sensor, ambient)) / unit
+        return Reading(*exact, both.astype(np.float32))
     mean_a, mean_b = mean_taps(quad, amplitude, sensor, ambient)
     most = max(mean_a.max(), mean_b.max())
     if not most <= ELECTRONS_MAX:
@@ -164,13 +174,15 @@ def read_out(
     tap_b = shots_b + generator.normal(0.0, sensor.read_noise_electrons, mean_b.shape)
     full_a, full_b = tap_a >= sensor.full_well_electrons, tap_b >= sensor.full_well_electrons
     tap_a, tap_b = (np.minimum(tap, sensor.full_well_electrons) for tap in (tap_a, tap_b))
-    unit = float(contrast(sensor)) * electron_gain(sensor)
+    total = ((tap_a + tap_b) / unit).astype(np.float32) if taps else None
     if sensor.unipolar:
         electrons, clipped = quantise(tap_a, sensor)
         level = 0.5 * _ambient(sensor, ambient) + dark_electrons(sensor)
-        return Reading((2.0 * (electrons - level) / unit).astype(np.float32), full_a | clipped)
+        return Reading(
+            (2.0 * (electrons - level) / unit).astype(np.float32), full_a | clipped, total
+        )
     electrons, clipped = quantise(tap_a - tap_b, sensor)
-    return Reading((electrons / unit).astype(np.float32), full_a | full_b | clipped)
+    return Reading((electrons / unit).astype(np.float32), full_a | full_b | clipped, total)
 
 
 def quantise(

@@ -151,6 +151,7 @@ def record(
             novel_from_world=np.stack(views) if views else None,
             flow=_flows(scene, cameras, times) if settings.flow else Flow(),
             exposures=np.full(len(times), sensor.exposure_s),
+            tap_sums=dict(enumerate(images["tap_sum"])) if settings.taps else {},
             colour=_colour(scene, settings, times, cached),
         ),
         truth=Truth(
@@ -209,9 +210,17 @@ def _exposing(
         exposure = engine.expose(n, [float(times[n] + offset) for offset in offsets], time, shot)
         random = np.random.default_rng((settings.seed, n))  # independent of the number of frames
         light = exposure.quad, exposure.amplitude
-        reading = read_out(*light, shot, random, ambient=exposure.ambient, shading=evenness)
+        reading = read_out(
+            *light,
+            shot,
+            random,
+            ambient=exposure.ambient,
+            shading=evenness,
+            taps=settings.taps,
+        )
         return {
             "quad": reading.quad,
+            **({} if reading.total is None else {"tap_sum": reading.total}),
             "saturated": reading.saturated.sum(),
             "amplitude": exposure.amplitude.astype(np.float32),
             "distance": exposure.distance,

@@ -34,6 +34,9 @@ class SimSettings:
     """Shot noise, read noise, full well and ADC, if the scene's sensor has them."""
     flow: bool = False
     """Whether exact optical flow at quartet starts is stored [px], that of the camera included."""
+    taps: bool = False
+    """Whether the sum of both taps is stored beside their difference; in a capture only, of a
+    sensor with two taps."""
     exposure_samples: int | None = None
     """Instants that a raw frame averages over the exposure, centred on its time; 1: no blur."""
     engine: str | None = None
@@ -78,6 +81,9 @@ class SimSettings:
         why = "only engine mesh computes layers, and only a capture stores them"
         fix = "add --engine mesh --format capture"
         refuse(self.truth == "all" and not layers, ("cannot store all truth", "--truth"), why, fix)
+        why, fix = "only a capture stores it", "add --format capture"
+        other = self.taps and self.format != "capture"
+        refuse(other, ("cannot store the sum of taps", "--taps"), why, fix)
         why, fix = "flow belongs to raw quads", "leave --flow out, or --format ftorf"
         phasors = self.flow and self.format == "torf"
         refuse(phasors, ("a ToeRF folder cannot store optical flow", "--flow"), why, fix)
