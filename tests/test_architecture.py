@@ -87,6 +87,7 @@ LARGE_CLASSES = {  # file:class: why it may be larger
     "kernels/geometry.py:CameraView": "a camera as kernels read it: one number a field",
     "data/specs.py:Field": "what a file format says about one field: independent facts, all but "
     "the name optional",
+    "data/sequence.py:Sequence": "what a recording may contain, a field for each kind of image",
     "scene/sensor.py:Sensor": "the physical constants of one camera, each independent of the "
     "others",
     "render/replay.py:Replay": "still to be divided",
