@@ -17,6 +17,7 @@ CAPTURE_ONLY = {
     "cycle_length",
     "distortion",
     "exposures",
+    "tap_sums",
     "sensor",
     "amplitude",
     "body",

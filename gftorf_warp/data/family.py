@@ -28,7 +28,7 @@ from .sequence import ColourCamera, Flow, Sequence, Truth
 
 ABSENT = (  # without a source unless a folder has them
     # only a capture has these
-    *("frequencies_hz", "cycle_length", "distortion", "exposures", "sensor"),
+    *("frequencies_hz", "cycle_length", "distortion", "exposures", "tap_sums", "sensor"),
     *("colour_intrinsics", "colour_from_world", "forward_flow", "backward_flow"),
 )
 
