@@ -208,6 +208,28 @@ def test_keys_of_poses_are_asked_for(writer, changes, word, tmp_path):
     assert word in str(error.value)
 
 
+def test_images_are_found_by_name(tmp_path):
+    """In full, or without folder and suffix if only one is called so; some without a pose are
+    named.
+    """
+    changes = colmap(tmp_path, path_of())
+    text = (tmp_path / "images.txt").read_text()
+    twice = text + text.replace("tof/", "left/")
+    (tmp_path / "images.txt").write_text(twice)
+    with pytest.raises(InputError, match="found 18"):
+        read(tmp_path, **changes)
+    (tmp_path / "images.txt").write_text(twice.replace("left/7.png", "7.npy"))
+    with pytest.raises(InputError, match=r"several, for 0\.npy, 1\.npy"):
+        read(tmp_path, **changes)
+    full = text.replace("tof/", "").replace(".png", ".npy")
+    (tmp_path / "images.txt").write_text(full + text)
+    found = read(tmp_path, **changes).sequence
+    np.testing.assert_allclose(found.camera_from_world, path_of(), atol=1e-9)
+    (tmp_path / "images.txt").write_text(text.replace("tof/7.png", "tof/seven.png"))
+    with pytest.raises(InputError, match=r"for 7\.npy"):
+        read(tmp_path, **changes)
+
+
 def test_too_few_poses_are_named(tmp_path):
     """Neither one for each raw frame nor one for each cycle."""
     changes = matrices_npy(tmp_path, path_of(5))

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..data.poses import interpolated, rigid
+from ..data.resources import Need, require
 from ..data.sequence import ColourCamera
 from ..errors import InputError
 from . import camera_keys, pose_keys
@@ -139,6 +140,7 @@ def colour_of(
 
     Raises:
         UsageError, InputError: If keys are missing or unusable, or a file is damaged.
+        ResourceError: If the images do not fit into memory.
     """
     files = files_of(settings, source)
     if not files:
@@ -151,7 +153,8 @@ def colour_of(
     if lens.distortion is not None:
         why = f"a capture has no distortion of colour images, found {lens.distortion}"
         raise settings.wrong("colour.distortion", why, "undistort the colour images first")
-    images_at = taken, [path.name for path in files]
+    root = source if source.is_dir() else source.parent
+    images_at = taken, [path.relative_to(root).as_posix() for path in files]
     poses, tof_from_world = _poses(settings, source, notes, times, images_at, tof_from_world)
     poses[frames] = poses[len(times) :][chosen]
     share = 1 / settings["colour.reduce"]
@@ -181,6 +184,9 @@ def _images(
             why = f"images of {size[1]}x{size[0]} cannot be reduced by {factor}"
             raise settings.wrong("colour.reduce", why, "choose a smaller number")
         images.append(reduced(image, factor))
+        if len(images) == 1:
+            need = Need(memory=float(images[0].nbytes) * len(files))
+            require(need, path, "raise colour.reduce, or name fewer images by colour.files")
     assert size is not None
     kind = "raw, in linear sRGB primaries, without black level, white balance " + balance
     kind = f"{encoding} numbers" if is_picture(files[0]) else kind
@@ -228,7 +234,9 @@ def _nearest(
     frames, chosen = np.array(sorted(best)), [best[frame] for frame in sorted(best)]
     if len(chosen) < len(taken):
         left = len(taken) - len(chosen)
-        notes.uncertain.append(f"{left} colour images are left out: no raw frame is near them")
+        notes.uncertain.append(
+            f"{left} colour images are left out: no raw frame of their own is near"
+        )
     away = np.abs(times[frames] - taken[chosen]).max()
     if away > 0:
         text = f"colour images are up to {away * 1e3:.3g} ms away from their raw frames"

@@ -149,9 +149,14 @@ def _at(
         return interpolated(wanted, found.stamps, poses), "interpolated"
     names = found.names
     if names is not None:
-        by_name = {_stem(name): pose for name, pose in zip(names, poses, strict=True)}
-        if files is not None and {_stem(name) for name in files} <= by_name.keys():
-            return np.stack([by_name[_stem(name)] for name in files]), "by the names of images"
+        chosen = [_named(file, names) for file in files or []]
+        present = [n for n in chosen if n is not None]
+        if present and len(present) == len(chosen):
+            return poses[present], "by the names of images"
+        if present and files is not None:
+            missing = [file for file, n in zip(files, chosen, strict=True) if n is None]
+            why = f"{path.name} has no pose, or several, for {', '.join(missing)[:200]}"
+            raise settings.wrong(f"{table}.file", why, "leave these images out, or add their poses")
         poses = poses[sorted(range(len(names)), key=lambda n: natural(names[n]))]
     cycles = -(-len(times) // cycle)
     if len(poses) == len(times):
@@ -166,6 +171,10 @@ def _at(
     return interpolated(times, times[::cycle], poses), "one for each cycle, interpolated"
 
 
-def _stem(name: str) -> str:
-    """Name of an image without its suffix and folders."""
-    return PurePosixPath(name).stem
+def _named(file: str, names: tuple[str, ...]) -> int | None:
+    """The image of this name, or else the only one of this name without folders and suffix."""
+    if file in names:
+        return names.index(file)
+    stem = PurePosixPath(file).stem
+    alike = [n for n, name in enumerate(names) if PurePosixPath(name).stem == stem]
+    return alike[0] if len(alike) == 1 else None
