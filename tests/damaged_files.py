@@ -21,6 +21,7 @@ import numpy as np
 import recordings
 import test_import_arrays as arrays
 import torf_folder
+from dng import dng
 from ftorf_folder import scene
 from small_runs import demo, small
 from test_capture import recording
@@ -30,6 +31,7 @@ from gftorf_warp import Run, Sequence
 from gftorf_warp.data.exr import read_parts, write_exr
 from gftorf_warp.data.write import write
 from gftorf_warp.errors import GftorfError, InputError
+from gftorf_warp.importers.colour_images import read_colour
 from gftorf_warp.importers.command import read_recording
 from gftorf_warp.recon.train import reconstruct
 from gftorf_warp.scene.falloff import read_falloff
@@ -150,6 +152,14 @@ def scenes(folder):
     return [repr(read_scene(folder / name)) for name in ("scene.toml", "vase.toml")]
 
 
+AS_IT_IS = ("linear", "none")
+
+
+def make_dng(folder):
+    """What a camera of colour stores."""
+    (folder / "a.dng").write_bytes(dng(np.full((24, 32), 30000)))
+
+
 READERS = {
     "capture": Reader(make=make_capture, read=sequence, damaged="[!M]*/*", protected=True),
     "capture without a manifest": Reader(
@@ -166,6 +176,7 @@ READERS = {
     "NPY, EXR, PNG": Reader(make=make_pictures, read=pictures),
     "PLY, OBJ": Reader(make=make_meshes, read=meshes),
     "scene": Reader(make=make_scene, read=scenes),
+    "DNG": Reader(make=make_dng, read=lambda folder: [read_colour(folder / "a.dng", *AS_IT_IS)]),
     **{
         f"import {name}": Reader(make=make, read=functools.partial(recordings.read, name))
         for name, make in recordings.WRITERS.items()
