@@ -95,46 +95,18 @@ def read(source: Path, settings: Settings) -> Imported:
     Raises:
         UsageError, InputError: If files are missing or damaged, or keys do not fit to them.
     """
-    notes, first = Notes(), settings["assemble.first"]
-    cycle = _cycle(settings)
-    period = cycle[-1].instant + 1
-    instants = _instants(source) - first
-    if instants < period:
-        why = f"expected {period} instants for one cycle from {first} on, found {max(instants, 0)}"
-        raise InputError("too few instants", where=source, why=why, fix="complete the folder")
-    taken = [
-        replace(slot, instant=first + start + slot.instant)
-        for start in range(0, instants, period)
-        for slot in cycle
-        if start + slot.instant < instants
-    ]
+    notes, cycle = Notes(), _cycle(settings)
+    taken = _taken(source, cycle, settings, notes)
     quads, truth = _images(source, taken, settings["assemble.material"])
-    constant = _constant(source, taken[0], settings["assemble.material"])
-    modulation = Modulation(
-        frequencies_hz=np.array([slot.f_mod_hz for slot in cycle]),
-        shifts=np.radians([-90.0 * slot.image for slot in cycle]),
-        calibration=Calibration(
-            f_mod_hz=cycle[0].f_mod_hz, dc_offset=constant, cycle_length=len(cycle)
-        ),
-    )
-    notes.understood += [
-        f"assembled: {settings['assemble.taps']} taps, {period} instants in a cycle, material "
-        f"{settings['assemble.material']}, from instant {first} on",
-        "shifts: 0, -90, -180, -270 degrees of images 0, 1, 2, 3",
-        f"DC offset {constant:g}: the median over the pixels of the first instant",
-        f"times: {settings['time.rate_hz']:g} instants per second "
-        f"({settings.source('time.rate_hz')}); the data set has none",
-    ]
-    times = np.array([slot.instant for slot in taken]) / settings["time.rate_hz"]
-    lens = None
-    if not regular.lens_given(settings):
-        lens = _lens(notes, *quads.shape[1:])
-    notes.uncertain += [
+    modulation = _modulation(source, cycle, taken[0], settings, notes)
+    rate, stated = settings["time.rate_hz"], settings.source("time.rate_hz")
+    notes.understood.append(f"times: {rate:g} instants per second ({stated}); the data have none")
+    times = np.array([slot.instant for slot in taken]) / rate
+    lens = None if regular.lens_given(settings) else _lens(notes, *quads.shape[1:])
+    notes.uncertain.append(
         "precision: RGBE images keep 8 bits, 0.4 % of the largest of the three materials in a "
-        "pixel, in quads and in distance",
-        f"frames: a view of {VIEW_DEG:g} degrees is taken from edge to edge of the image; from "
-        "centre to centre the focal length would be 1 / width shorter",
-    ]
+        "pixel, in quads and in distance"
+    )
     if re.match(r"c[ap]_", source.resolve().name) and not settings.given("poses.file"):
         notes.uncertain.append(
             "names that begin with ca_ or cp_ are of a moving camera, whose poses the files do "
@@ -142,6 +114,48 @@ def read(source: Path, settings: Settings) -> Imported:
         )
     return regular.imported(
         source, settings, notes, quads, modulation, times, lens=lens, truth=truth
+    )
+
+
+def _taken(source: Path, cycle: list[Slot], settings: Settings, notes: Notes) -> list[Slot]:
+    """The raw frames of all instants, which may end within a cycle.
+
+    Raises:
+        InputError: If there are too few for one.
+    """
+    first, period = settings["assemble.first"], cycle[-1].instant + 1
+    instants = _instants(source) - first
+    if instants < period:
+        why = f"expected {period} instants for one cycle from {first} on, found {max(instants, 0)}"
+        raise InputError("too few instants", where=source, why=why, fix="complete the folder")
+    notes.understood.append(
+        f"assembled: {settings['assemble.taps']} taps, {period} instants in a cycle, material "
+        f"{settings['assemble.material']}, from instant {first} on"
+    )
+    return [
+        replace(slot, instant=first + start + slot.instant)
+        for start in range(0, instants, period)
+        for slot in cycle
+        if start + slot.instant < instants
+    ]
+
+
+def _modulation(
+    source: Path, cycle: list[Slot], first: Slot, settings: Settings, notes: Notes
+) -> Modulation:
+    """Frequencies and shifts of a cycle, and the DC offset that its first images have."""
+    constant = _constant(source, first, settings["assemble.material"])
+    notes.understood += [
+        "shifts: 0, -90, -180, -270 degrees of images 0, 1, 2, 3",
+        f"DC offset {constant:g}: the median over the pixels of the first instant",
+    ]
+    calibration = Calibration(
+        f_mod_hz=cycle[0].f_mod_hz, dc_offset=constant, cycle_length=len(cycle)
+    )
+    return Modulation(
+        frequencies_hz=np.array([slot.f_mod_hz for slot in cycle]),
+        shifts=np.radians([-90.0 * slot.image for slot in cycle]),
+        calibration=calibration,
     )
 
 
@@ -219,4 +233,8 @@ def _constant(source: Path, slot: Slot, material: int) -> float:
 def _lens(notes: Notes, height: int, width: int) -> Intrinsics:
     focal = width / 2 / math.tan(math.radians(VIEW_DEG / 2))
     notes.understood.append(f"camera: fx, fy {focal:g} px, of a view of {VIEW_DEG:g} degrees")
+    notes.uncertain.append(
+        f"camera: a view of {VIEW_DEG:g} degrees is taken from edge to edge of the image; from "
+        "centre to centre of its outer pixels the focal length would be 1 / width shorter"
+    )
     return Intrinsics(fx=focal, fy=focal, cx=width / 2, cy=height / 2)
