@@ -1,6 +1,7 @@
 """Checkpoints: nothing is lost, nothing damaged is taken, nothing is run."""
 
 import hashlib
+import json
 import os
 import subprocess
 import sys
@@ -84,6 +85,67 @@ def test_a_damaged_checkpoint_is_refused_and_the_one_before_is_used(tmp_path, da
     with pytest.raises(InputError, match=r"damaged checkpoint.*240"):
         checkpoint.load(path)
     assert checkpoint.last(tmp_path)["images"] == 120
+
+
+KILLED_WHILE_SAVING = """
+import json, os, sys
+from pathlib import Path
+import torch
+from gftorf_warp.recon import checkpoint
+
+def killed_at(count):
+    def counted(real):
+        def call(*args, **named):
+            calls[0] += 1
+            if calls[0] == count:
+                os._exit(9)
+            return real(*args, **named)
+        return call
+    calls = [0]
+    for name in ("replace", "rename", "unlink", "fsync"):
+        setattr(os, name, counted(getattr(os, name)))
+
+for before, saved in (([20, 40], 60), ([40], 40), ([20, 40], 30)):
+    for count in range(1, 40):
+        run = Path(sys.argv[1]) / f"{saved}-{count}"
+        run.mkdir()
+        stored = {"format": 1, "images": 0, "values": torch.arange(3.0)}
+        for images in before:
+            checkpoint.save(run, stored | {"images": images})
+        child = os.fork()
+        if child == 0:
+            killed_at(count)
+            checkpoint.save(run, stored | {"images": saved, "again": True})
+            os._exit(0)
+        code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+        found = checkpoint.last(run)
+        images = None if found is None else found["images"]
+        strays = sorted(path.name for path in (run / "ckpt").glob(".*"))
+        row = [saved, count, code, images, len(checkpoint.after(run, images or 0)), strays]
+        print(json.dumps(row))
+        if code == 0:
+            break
+"""
+
+
+def test_a_kill_at_any_step_of_saving_leaves_the_old_state_or_the_new_one(tmp_path):
+    """Whether the name is new, taken, or behind the last one; nothing is taken for damaged."""
+    done = subprocess.run(
+        [sys.executable, "-c", KILLED_WHILE_SAVING, str(tmp_path)],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert not done.stderr, "a checkpoint was taken for damaged"
+    allowed = {60: {40, 60}, 40: {40}, 30: {30, 40}}
+    rows = [json.loads(line) for line in done.stdout.splitlines()]
+    kills = {saved: sum(row[0] == saved and row[2] == 9 for row in rows) for saved in allowed}
+    assert min(kills.values()) >= 5
+    for saved, count, code, images, newer, strays in rows:
+        assert images in allowed[saved], (saved, count)
+        assert newer == 0, (saved, count)
+        assert strays == [], (saved, count)
+        assert code == 9 or images == saved
 
 
 def test_if_all_are_damaged_that_is_an_error(tmp_path):

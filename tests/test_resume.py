@@ -97,6 +97,34 @@ def test_a_killed_run_goes_on_to_the_same_bytes(tmp_path):
     assert rows(run) == rows(whole)
 
 
+def test_a_run_that_was_killed_at_its_start_has_every_row_once(tmp_path, monkeypatch):
+    """Its first checkpoint and its first diagnostics are there, and the first config in part."""
+    (tmp_path / "run").mkdir()
+    gone = subprocess.Popen([sys.executable, "-c", ""])
+    gone.wait()
+    (tmp_path / "run" / f".config.json.tmp-{gone.pid}-0").write_text('{"vers')
+
+    class Killed(Stepper):
+        def step(self):
+            raise SystemExit
+
+    with monkeypatch.context() as patch:
+        patch.setattr(loop, "Stepper", Killed)
+        with pytest.raises(SystemExit):
+            reconstruct(small(), tmp_path / "run", demo(images=8))
+    reconstruct(small(), tmp_path / "run", demo(images=8))
+    reconstruct(small(), tmp_path / "whole", demo(images=8))
+    again, whole = (
+        [
+            json.loads(line)["images"]
+            for line in (run / "diagnostics.jsonl").read_text().splitlines()
+        ]
+        for run in (tmp_path / "run", tmp_path / "whole")
+    )
+    assert again == whole
+    assert not [*(tmp_path / "run").glob(".*.tmp-*")]
+
+
 def test_a_folder_resumes_or_says_why_not(tmp_path):
     """Other settings, seed or data, or fewer images, are another run."""
     settings = demo(images=8)

@@ -124,7 +124,7 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
         made = [parent for parent in reversed(path.absolute().parents) if not parent.exists()]
         path.parent.mkdir(parents=True, exist_ok=True)
         sweep(path)
-        temporary = path.absolute().parent / _temporary(path).name
+        temporary = path.absolute().parent / temporary_name(path).name
         try:
             temporary.mkdir()
             yield temporary
@@ -186,7 +186,7 @@ def _sweep(folder: Path, start: str) -> None:
 @contextlib.contextmanager
 def _renamed_to(path: Path) -> Iterator[Path]:
     """Temporary file name, renamed to ``path`` at a normal end, removed after an exception."""
-    temporary = _temporary(path)
+    temporary = temporary_name(path)
     try:
         yield temporary
         os.replace(temporary, path)
@@ -195,7 +195,8 @@ def _renamed_to(path: Path) -> Iterator[Path]:
         raise
 
 
-def _temporary(path: Path) -> Path:
+def temporary_name(path: Path) -> Path:
+    """A name beside a path that no other file has, swept when this process no longer runs."""
     return path.parent / f".{path.name}.tmp-{os.getpid()}-{next(_COUNT)}"
 
 

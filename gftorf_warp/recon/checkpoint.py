@@ -14,7 +14,7 @@ from typing import Any
 
 import torch
 
-from ..data.files import atomic_write, sweep
+from ..data.files import atomic_path, atomic_write, sweep, temporary_name, write_through
 from ..data.untrusted import SMALL_FILE_BYTES, read_bytes
 from ..errors import InputError
 from .state import FORMAT
@@ -29,7 +29,7 @@ def folder(run: Path) -> Path:
 
 
 def save(run: Path, stored: dict) -> Path:
-    """Write a state as ``RUN/ckpt/<images>.pt`` with its SHA-256 beside it, and drop all but the
+    """Write a state as ``RUN/ckpt/<images>.pt`` with its SHA-256 in a sidecar, and drop all but the
     last two.
 
     The file is read back and compared before another one is dropped. Checkpoints of more images are
@@ -45,24 +45,22 @@ def save(run: Path, stored: dict) -> Path:
     torch.save(stored, buffer)
     data = buffer.getvalue()
     path = place / f"{_name(int(stored['images']))}.pt"
-    atomic_write(path, data)
-    atomic_write(_sidecar(path), f"{hashlib.sha256(data).hexdigest()}  {path.name}\n".encode())
+    _write(path, data)
     _read(path)
     behind = [other for other in _paths(run) if other <= path]
     for old in {*_paths(run)} - {*behind[-KEPT:]}:
-        old.unlink(missing_ok=True)
-        _sidecar(old).unlink(missing_ok=True)
+        _drop(old)
     return path
 
 
 def digest(run: Path, images: int) -> str | None:
-    """SHA-256 of the checkpoint after so many images, as it is written beside it; None: there is no
-    such checkpoint.
+    """SHA-256 of the checkpoint after so many images; None: there is no such checkpoint.
 
     Raises:
-        InputError: If it cannot be read.
+        InputError: If it cannot be read, or the sum beside it is another.
     """
-    return _stated(folder(run) / f"{_name(images)}.pt")
+    path = folder(run) / f"{_name(images)}.pt"
+    return hashlib.sha256(_read(path)).hexdigest() if path.exists() else None
 
 
 def load(path: Path, device: torch.device | str = "cpu") -> dict:
@@ -106,11 +104,9 @@ def last(run: Path, device: torch.device | str = "cpu") -> dict | None:
         InputError: If there are checkpoints and none can be read, or none but the start, in which
             nothing is optimised yet.
     """
-    paths = _stated_paths(run)
-    for stray in folder(run).glob(".*.tmp-*"):
-        sweep(stray.with_name(stray.name[1:].rpartition(".tmp-")[0]))
+    _sweep_interrupted(run)
     error: InputError | None = None
-    for path in reversed(paths):
+    for path in reversed(_stated_paths(run)):
         try:
             stored = load(path, device)
         except InputError as found:
@@ -164,6 +160,45 @@ def _check_tensors(stored: Any, size: int) -> None:
         _check_tensors(part, size)
 
 
+def _write(path: Path, data: bytes) -> None:
+    """Write a checkpoint so that, whenever the process is killed, a file of its name has its sum.
+
+    The sidecar comes before the file gets its name, and still has the sum of a file of that name
+    from before. As long as there is a temporary file, a sidecar without a checkpoint means that.
+    """
+    sums = [hashlib.sha256(data).hexdigest(), *_stated(path)[:1]]
+    lines = "".join(f"{one}  {path.name}\n" for one in sums)
+    try:
+        with atomic_path(path) as temporary:
+            write_through(temporary, data)
+            atomic_write(_sidecar(path), lines.encode())
+    finally:
+        if not path.exists():
+            _sidecar(path).unlink(missing_ok=True)
+
+
+def _drop(path: Path) -> None:
+    """Remove a checkpoint and its sidecar, as safely as they are written."""
+    temporary = temporary_name(path)
+    path.rename(temporary)
+    _sidecar(path).unlink(missing_ok=True)
+    temporary.unlink()
+
+
+def _sweep_interrupted(run: Path) -> None:
+    """Remove what killed processes left while they wrote or dropped a checkpoint."""
+    for stray in folder(run).glob(".*.tmp-*"):
+        path = _target(stray)
+        sweep(path)
+        if path.suffix == ".pt" and not (stray.exists() or path.exists()):
+            _sidecar(path).unlink(missing_ok=True)
+
+
+def _target(temporary: Path) -> Path:
+    """The file that a temporary one was to become, or was."""
+    return temporary.with_name(temporary.name[1:].rpartition(".tmp-")[0])
+
+
 def _foreign(error: Exception) -> str:
     """What torch found in a checkpoint instead of tensors and plain values, in our words."""
     named = re.search(r"GLOBAL (\S+)", str(error))
@@ -176,9 +211,11 @@ def _paths(run: Path) -> list[Path]:
 
 
 def _stated_paths(run: Path) -> list[Path]:
-    """All checkpoints, and those that are gone while their SHA-256 is still there."""
-    named = [path.with_suffix("") for path in folder(run).glob("*.pt.sha256")]
-    return sorted({*_paths(run), *named})
+    """All checkpoints, and those that are gone while their SHA-256 is still there, unless they are
+    being written or dropped.
+    """
+    named = {path.with_suffix("") for path in folder(run).glob("*.pt.sha256")}
+    return sorted({*_paths(run), *(named - {*map(_target, folder(run).glob(".*.tmp-*"))})})
 
 
 def _name(images: int) -> str:
@@ -189,30 +226,28 @@ def _sidecar(path: Path) -> Path:
     return path.with_suffix(".pt.sha256")
 
 
-def _stated(path: Path) -> str | None:
-    """The SHA-256 that is written beside a checkpoint; None if there is none.
-
-    Raises:
-        InputError: If it cannot be read.
-    """
-    sidecar = _sidecar(path)
-    words = read_bytes(sidecar, SMALL_FILE_BYTES).split() if sidecar.exists() else []
-    return words[0].decode(errors="replace") if words else None
-
-
 def _read(path: Path) -> bytes:
     """Content of a checkpoint whose SHA-256 is right."""
     fix = "restore it from a copy; without it the one before is used; or start over with --fresh"
     sidecar = _sidecar(path)
     try:
-        data, wanted = read_bytes(path), _stated(path)
+        data, stated = read_bytes(path), _stated(path)
     except InputError as error:
         raise InputError("damaged checkpoint", where=path, why=error.why, fix=fix) from error
     found = hashlib.sha256(data).hexdigest()
-    if wanted is None:
+    if not stated:
         why = f"{sidecar.name} beside it, which holds its SHA-256, is missing or empty"
         raise InputError("damaged checkpoint", where=path, why=why, fix=fix)
-    if found != wanted:
-        why = f"its SHA-256 is {found[:12]}..., {sidecar.name} beside it says {wanted[:12]}..."
+    if found not in stated:
+        why = f"its SHA-256 is {found[:12]}..., {sidecar.name} beside it says {stated[0][:12]}..."
         raise InputError("damaged checkpoint", where=path, why=why, fix=fix)
     return data
+
+
+def _stated(path: Path) -> list[str]:
+    """The sums in the sidecar of a checkpoint; none without one."""
+    sidecar = _sidecar(path)
+    if not sidecar.exists():
+        return []
+    text = read_bytes(sidecar, SMALL_FILE_BYTES).decode(errors="replace")
+    return [line.split()[0] for line in text.splitlines() if line.strip()]

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ..data import lock
-from ..data.files import write_json
+from ..data.files import sweep, write_json
 from ..data.texts import read_json
 from ..errors import InputError, UsageError
 from .settings import ReconSettings, plain
@@ -38,6 +38,7 @@ def prepare(run: Path, config: dict[str, object], *, fresh: bool) -> bool:
         raise UsageError(
             "not a folder", where=run, why="--out names a file", fix="choose another --out"
         )
+    sweep(run / CONFIG)  # a first config that a killed process did not complete
     held = (
         [path for path in run.iterdir() if not _aside(path) and path.name not in (LOCK, LOG)]
         if run.exists()

@@ -309,7 +309,7 @@ def _fit_gaussians(
     metrics = Metrics(out / "metrics.jsonl")
     diagnostics = Diagnostics(observations, _truth(sequence), out / "diagnostics.jsonl")
     for rows in (metrics, diagnostics):
-        rows.rewind(state.images)
+        rows.rewind(state.images or -1)  # the row of the start is written once more
     verb = "starts at" if stored is None else "goes on at"
     layer = state.optimiser.layer
     moving = 0 if layer is None else int((layer > 0).sum())
