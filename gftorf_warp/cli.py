@@ -306,7 +306,7 @@ def _opened(options: argparse.Namespace, device: str, path: str | None = None) -
 def _check(options: argparse.Namespace) -> int:
     from .data.check import check
 
-    print(check(options.sequence))
+    print(check(options.sequence, options.sheet))
     return 0
 
 

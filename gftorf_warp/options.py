@@ -268,6 +268,8 @@ def command_parsers() -> dict[str, Parser]:
     contents = "read a sequence, list its contents and assumptions, warn about suspicious values"
     check = Parser.of("check", contents)
     check.add_argument("sequence", metavar="SEQ", help="folder of the sequence")
+    text = "picture to write: the middle quartet, and distances for every order of the shifts"
+    check.option("--sheet", "FILE.png", str, text)
 
     importer = Parser.of("import", "write the recording of another camera or program as a capture")
     kind = "kind of recording, --list shows them"

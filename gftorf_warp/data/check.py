@@ -11,9 +11,11 @@ import numpy as np
 from ..constants import FRAMES_PER_QUARTET, SPEED_OF_LIGHT
 from ..errors import InputError
 from . import findings, phase, reprojection, specs, timing, units
+from .check_sheet import check_sheet
 from .constant import spread
 from .cycles import frequencies_by_order
 from .decode import unambiguous_range
+from .files import as_errors, atomic_write
 from .folder import format_of, numbered
 from .read import read
 from .report import Report
@@ -45,17 +47,25 @@ IMAGES = (
 """Rules that need a complete quartet with light."""
 
 
-def check(path: str | Path) -> Report:
+def check(path: str | Path, sheet: str | Path | None = None) -> Report:
     """Report on a sequence folder, with estimates that reveal a wrong order, offset or scale.
+
+    Args:
+        path: The folder.
+        sheet: A picture (PNG) to write, with hypotheses on the order of the shifts.
 
     Raises:
         InputError: If the sequence cannot be read at all.
+        UsageError: If the picture cannot be written there.
     """
     sequence = read(path)
     report = Report(path=Path(path), form=format_of(Path(path)))
     _facts(sequence, report)
     _assumptions(sequence, report)
     examine(sequence, report)
+    if sheet is not None:
+        with as_errors(Path(sheet)):
+            atomic_write(sheet, check_sheet(_thinned(sequence), report))
     return report
 
 

@@ -50,6 +50,11 @@ class Panel:
 def contact_sheet(sequence: Sequence, truth: Truth | None, title: str) -> bytes:
     """PNG of the middle quartet of a sequence."""
     n, panels = middle_panels(sequence, truth)
+    return painted(sequence, title, f"the quartet of raw frame {n}", panels)
+
+
+def painted(sequence: Sequence, title: str, shown: str, panels: list[list[Panel]]) -> bytes:
+    """PNG of rows of panels, all as large as images of the sequence, under a heading."""
     height = round(PANEL * sequence.height / sequence.width)
     cell = PANEL + BAR_GAP + BAR + BAR_TEXT
     rows = 2 * MARGIN + HEAD + len(panels) * (TITLE + height + GAP)
@@ -59,7 +64,7 @@ def contact_sheet(sequence: Sequence, truth: Truth | None, title: str) -> bytes:
     about = (
         f"{int(sequence.measured.sum())} raw frames of {sequence.width}x{sequence.height} pixels, "
         f"{', '.join(f'{f / 1e6:.6g}' for f in used)} MHz, {sequence.times[-1]:.3g} s; "
-        f"shown: the quartet of raw frame {n}. A picture for people, no data."
+        f"shown: {shown}. A picture for people, no data."
     )
     _write(sheet, about, (MARGIN, MARGIN + 48), 15, SOFT)
     for i, row in enumerate(panels):
@@ -124,9 +129,9 @@ def _decoded(sequence: Sequence, truth: Truth | None, n: int, whole: bool) -> li
         if not np.isfinite(true).any():
             return panels
         ends = float(np.nanmin(true)), float(np.nanmax(true))
-        panels.append(scaled("true distance [m]", true, ends, _viridis))
+        panels.append(scaled("true distance [m]", true, ends, viridis))
     if quartet is not None:
-        panels.append(scaled("closed form [m]", quartet.distance, ends, _viridis))
+        panels.append(scaled("closed form [m]", quartet.distance, ends, viridis))
         if true is not None:
             error = np.abs(quartet.distance - true)
             ends = 0.0, _end(error)
@@ -143,7 +148,7 @@ def _by_frequency(sequence: Sequence, quartet: Decoded) -> list[Panel]:
     for f, image in zip(sequence.frequencies, quartet.single, strict=True):
         ends = 0.0, SPEED_OF_LIGHT / (2.0 * f)
         title = f"{f / 1e6:.4g} MHz alone, to {ends[1]:.3g} m [m]"
-        panels.append(scaled(title, image, ends, _viridis))
+        panels.append(scaled(title, image, ends, viridis))
     title = f"confidence, {100 * float(quartet.ambiguous.mean()):.3g} % ambiguous"
     return [*panels, scaled(title, quartet.confidence, (0.0, 1.0), _gray)]
 
@@ -244,7 +249,7 @@ def _mapped(name: str, share: np.ndarray) -> Picture:
     return np.ascontiguousarray(coloured[..., ::-1])
 
 
-_viridis = functools.partial(_mapped, "COLORMAP_VIRIDIS")
+viridis = functools.partial(_mapped, "COLORMAP_VIRIDIS")
 _inferno = functools.partial(_mapped, "COLORMAP_INFERNO")
 
 

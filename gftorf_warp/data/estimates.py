@@ -50,7 +50,7 @@ def distance_of_z(sequence: Sequence, truth: Truth) -> np.ndarray:
     y, x = np.mgrid[0 : sequence.height, 0 : sequence.width] + 0.5
     tof = sequence.intrinsics
     slope_x, slope_y = (x - tof.cx) / tof.fx, (y - tof.cy) / tof.fy
-    return (truth.distance * np.sqrt(1.0 + slope_x**2 + slope_y**2)).astype(np.float32)
+    return truth.distance * np.sqrt(1.0 + slope_x**2 + slope_y**2).astype(np.float32)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -174,10 +174,11 @@ def truth(sequence: Sequence, report: Report) -> None:
     if truth is None:
         report.add("truth", "none")
         return
-    known = truth.distance[np.isfinite(truth.distance)]
+    # fmin and fmax ignore NaN and copy nothing: truth may be as large as the recording
+    nearest, farthest = (float(f.reduce(truth.distance, axis=None)) for f in (np.fmin, np.fmax))
     unambiguous = unambiguous_range(sequence)
     frames = int(truth.known.sum()) // (sequence.cycle if sequence.from_phasors else 1)
-    span = f"{known.min():.4g} .. {known.max():.4g} m" if len(known) else "no known pixel"
+    span = "no known pixel" if np.isnan(farthest) else f"{nearest:.4g} .. {farthest:.4g} m"
     report.add("truth", f"{frames} frames in {folder}, {span}")
     if _is_decoded(sequence, truth):
         decoded = "these quads: it is not ground truth, do not compare with it"
@@ -185,10 +186,10 @@ def truth(sequence: Sequence, report: Report) -> None:
             decoded = "these phasors, or they are without noise: doubtful as ground truth"
         report.warn("truth decoded", f"{folder} was decoded from {decoded}")
         return
-    if len(known) and known.max() > unambiguous:
+    if farthest > unambiguous:
         report.warn(
             "wrap",
-            f"range wraps: distances to {known.max():.4g} m, unambiguous to {unambiguous:.4g} m",
+            f"range wraps: distances to {farthest:.4g} m, unambiguous to {unambiguous:.4g} m",
         )
     poses = sequence.camera_from_world
     if not sequence.from_phasors and (poses != poses[0]).any():
