@@ -9,7 +9,7 @@ from sequences import values_of
 from gftorf_warp import Sequence
 from gftorf_warp.cli import main
 from gftorf_warp.errors import InputError, UsageError
-from gftorf_warp.importers.command import read_recording, template_of
+from gftorf_warp.importers.command import import_recording, read_recording, template_of
 from gftorf_warp.importers.keys import Key, load, template
 from gftorf_warp.importers.kinds import KINDS
 from gftorf_warp.sim.simulate import simulate
@@ -223,6 +223,15 @@ def test_a_wrong_import_is_three_lines(line, code, word, folders, tmp_path, caps
     assert word in error
     assert "Traceback" not in error
     assert not out.exists()
+
+
+def test_a_folder_in_use_is_refused_before_anything_is_read(folders, tmp_path, monkeypatch):
+    """Reading takes minutes."""
+    (tmp_path / "seq").mkdir()
+    (tmp_path / "seq" / "file").touch()
+    monkeypatch.setitem(KINDS, "ftorf", None)  # reading would fail
+    with pytest.raises(UsageError, match="not empty"):
+        import_recording("ftorf", folders / "ftorf", tmp_path / "seq")
 
 
 def test_a_reader_in_memory(folders):

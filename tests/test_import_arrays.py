@@ -2,6 +2,7 @@
 
 import re
 import struct
+import sys
 
 import cv2
 import h5py
@@ -14,7 +15,7 @@ from gftorf_warp import Sequence
 from gftorf_warp.cli import main
 from gftorf_warp.data.check import check
 from gftorf_warp.data.decode import closed_form_distance
-from gftorf_warp.errors import InputError, UsageError
+from gftorf_warp.errors import InputError, ResourceError, UsageError
 from gftorf_warp.importers.command import read_recording
 
 W, H = SIZE
@@ -353,6 +354,27 @@ def test_several_frequencies(tmp_path):
     assert found.cycle == 6
     assert found.frequencies == (20e6, 60e6)
     assert found.frame_frequencies.tolist() == [20e6] * 3 + [60e6] * 3 + [20e6] * 3
+
+
+def test_a_stack_is_a_source_itself(tmp_path):
+    """One file in place of a folder; its exposure is kept, and other files are not named."""
+    root = arrays(tmp_path, a=recording()[1], other=np.eye(3))
+    config = tmp_path / "keys.toml"
+    config.write_text(keys(values__zero=0, time__exposure_s=0.002))
+    found = read_recording("arrays", root / "a.npy", config).sequence
+    assert np.array_equal(found.quads, recording()[1])
+    assert found.exposures.tolist() == [0.002] * FRAMES
+    config.write_text(keys(values__zero=0, source__files=["other.npy"]))
+    with pytest.raises(InputError, match="is a file"):
+        read_recording("arrays", root / "a.npy", config)
+
+
+def test_hdf5_without_its_package(tmp_path, monkeypatch):
+    """The error names the extra to install."""
+    root, config, _ = source_of(hdf5, tmp_path)
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    with pytest.raises(ResourceError, match=r"gftorf-warp\[import\]"):
+        read_recording("arrays", root, config)
 
 
 def test_check_says_what_a_wrong_zero_lacks(tmp_path):

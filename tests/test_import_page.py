@@ -72,6 +72,13 @@ def test_the_page_leads_to_distance(followed):
     assert "zero" in (folder / "sequence" / "README.md").read_text()
 
 
+def test_the_page_reads_from_python(followed, monkeypatch, capsys):
+    """Its script runs in the same folder."""
+    monkeypatch.chdir(followed[0])
+    exec(compile(blocks("python")[0], "docs/import.md", "exec"), {})
+    assert "(44, 72, 96)" in capsys.readouterr().out
+
+
 def test_the_page_names_keys_that_exist():
     """Every word that looks like a key is one."""
     tables = {key.name.partition(".")[0] for key in KEYS}

@@ -113,14 +113,7 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
     """
     path = Path(path)
     with as_errors(path):
-        why = "expected a new or empty folder to write to, found"
-        if path.is_symlink() or (path.exists() and not path.is_dir()):
-            why, fix = f"{why} something else", "choose another path"
-            raise UsageError("not a folder", where=path, why=why, fix=fix)
-        if path.is_dir() and any(path.iterdir()):
-            why = f"{why} {len(list(path.iterdir()))} entries"
-            fix = "choose another path, or remove the folder first"
-            raise UsageError("folder is not empty", where=path, why=why, fix=fix)
+        refuse_target(path)
         made = [parent for parent in reversed(path.absolute().parents) if not parent.exists()]
         path.parent.mkdir(parents=True, exist_ok=True)
         sweep(path)
@@ -140,6 +133,22 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
                     parent.rmdir()
             raise
         flush_folder(path.parent)
+
+
+def refuse_target(path: Path) -> None:
+    """Check that a folder may be written there: the path is new or an empty folder.
+
+    Raises:
+        UsageError: If not.
+    """
+    why = "expected a new or empty folder to write to, found"
+    if path.is_symlink() or (path.exists() and not path.is_dir()):
+        why, fix = f"{why} something else", "choose another path"
+        raise UsageError("not a folder", where=path, why=why, fix=fix)
+    if path.is_dir() and any(path.iterdir()):
+        why = f"{why} {len(list(path.iterdir()))} entries"
+        fix = "choose another path, or remove the folder first"
+        raise UsageError("folder is not empty", where=path, why=why, fix=fix)
 
 
 def write_through(path: Path, data: bytes | memoryview) -> None:

@@ -6,9 +6,10 @@ import difflib
 import logging
 from pathlib import Path
 
-from ..data.files import atomic_write
+from ..data.files import atomic_write, refuse_target
 from ..data.sequence import Sequence
 from ..data.write import write
+from ..data.writing import refuse_inexpressible
 from ..errors import InputError, UsageError
 from .imported import Imported
 from .keys import load, template
@@ -84,7 +85,10 @@ def import_recording(
         UsageError, InputError: As :func:`read_recording`, or if the folder is not empty.
         ResourceError: If the disk is full.
     """
+    if out is not None:
+        refuse_target(Path(out))  # before minutes of reading
     imported = read_recording(name, source, config)
+    refuse_inexpressible("capture", imported.sequence, imported.truth)  # a dry run says so, too
     lines = [_summary(imported.sequence), *imported.understood]
     for text in imported.uncertain:
         LOG.warning("uncertain: %s", text)
