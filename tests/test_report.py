@@ -256,6 +256,15 @@ def test_phase_and_amplitude_are_those_of_the_quartet(compared):
     assert amplitude[0, 0, 0] < amplitude[5, 8, 0], "the box is nearer, so brighter"
 
 
+def test_distances_that_nobody_knows_have_no_row(compared):
+    """A moving camera has no temporal mean, a run without fallback no fit alone."""
+    _, metrics, html, _ = compared
+    assert "temporal mean" in html.texts["Errors"]
+    assert "the fit alone" not in html.texts["Errors"]
+    unknown = {f"temporal{kind}_mse_x100": None for kind in ("", "_mean", "_median")}
+    assert "temporal" not in tables.errors(metrics | unknown)
+
+
 def test_the_film_has_a_frame_for_every_quartet_start(compared):
     """Three quartets above each other in every panel; ours shows the box where it is."""
     _, _, html, found = compared

@@ -14,7 +14,7 @@ import analytic_run
 import numpy as np
 import pytest
 from analytic_run import OPACITY, QUAD_ERROR, AnalyticRun, box_at, quad, sequence, true_distance
-from browser import browser
+from browser import PATIENCE_S, browser
 
 from gftorf_warp import cli, reconstruct
 from gftorf_warp.constants import CANONICAL_SHIFTS
@@ -313,7 +313,7 @@ def test_the_slider_moves_the_scene_in_a_browser(fitted):
 
 def until(condition):
     """Wait until something is true."""
-    end = time.monotonic() + 20.0
+    end = time.monotonic() + PATIENCE_S
     while not condition():
         assert time.monotonic() < end, "never"
         time.sleep(0.05)
@@ -321,7 +321,7 @@ def until(condition):
 
 def settled(tab):
     """The left half of the window, which shows the scene, as soon as it stays the same."""
-    last, end = None, time.monotonic() + 20.0
+    last, end = None, time.monotonic() + PATIENCE_S
     while time.monotonic() < end:
         image = tab.screenshot()[:, : SIZE[0] // 2].astype(int)
         coloured = np.ptp(image, axis=-1) > 40

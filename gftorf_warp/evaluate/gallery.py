@@ -127,7 +127,7 @@ def colour_strip(colour: Colour) -> str:
 
 def _row(images: list[np.ndarray], title: str, notes: list[str]) -> str:
     pairs = zip(images, notes, strict=True)
-    return page.row([page.plain_picture(rgb, title, note) for rgb, note in pairs])
+    return page.row([page.plain_picture(rgb, title, note) for rgb, note in pairs], kind="strip")
 
 
 def _shown(linear: Float[np.ndarray, "H W 3"], white: float) -> UInt8[np.ndarray, "h w 3"]:

@@ -101,6 +101,7 @@ def _errors(runs: Sequence[Scored]) -> str:
     rows = [
         ("", [f"<b>{tables.ROWS[name][0]}</b>", *tables.error_cells(first, name)])
         for name in ("closed_form", "temporal")
+        if page.look_up(first, f"{name}_mse_x100") is not None
     ]
     cells = [tables.error_cells(run.metrics, "d") for run in runs]
     for k, group in enumerate(tables.COLUMNS):

@@ -56,11 +56,13 @@ class Series(NamedTuple):
 
 
 def errors(metrics: Mapping[str, Any]) -> str:
-    """Errors of every distance on all, moving and static pixels."""
+    """Errors of every distance that is known, on all, moving and static pixels."""
     if page.look_up(metrics, "d_mse_x100") is None:
         return '<p class="soft">No ground truth: distance errors are not known.</p>'
     rows = []
     for name in DISTANCES:
+        if page.look_up(metrics, f"{name}_mse_x100") is None:
+            continue
         title, note = ROWS[name]
         named = f'<b>{title}</b> <span class="soft note">{note}</span>'
         rows.append((_mark(name), [named, *error_cells(metrics, name)]))
