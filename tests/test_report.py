@@ -324,21 +324,23 @@ def test_the_page_can_be_used_without_a_script(compared):
             tab.resize(size)
             tab.open((run.path / "report.html").absolute().as_uri())
             assert tab.value("document.documentElement.scrollWidth") <= size[0]
-            assert tab.value(f"{SLIDER}.scrollLeft / {SLIDER}.clientWidth") == pytest.approx(
-                0.5, abs=0.02
-            ), "the edge starts in the middle"
-        tab.value("document.querySelector('.slider').scrollIntoView()")
+            # the edge starts in the middle
+            tab.until(f"Math.abs({SLIDER}.scrollLeft / {SLIDER}.clientWidth - 0.5) < 0.02")
+        tab.until(f"getComputedStyle({SLIDER}).scrollSnapType === 'none'")
+        tab.value(f"{SLIDER}.scrollIntoView()")
         shown = []
         for part in (0, 1):
             tab.value(f"{SLIDER}.scrollLeft = {part} * {SLIDER}.clientWidth")
+            tab.value("new Promise(drawn => setTimeout(drawn, 300))")
             shown.append(tab.screenshot()[:200].astype(int))
         assert (np.abs(shown[0] - shown[1]).max(axis=-1) > 60).sum() > 100
         at = "getComputedStyle(document.querySelector('.film .frames')).objectPosition"
         tab.until(f"{at} != '0% 0%'")
         tab.value("document.querySelector('.film label').click()")
-        paused = tab.value(at)
         state = "getComputedStyle(document.querySelector('.film .frames')).animationPlayState"
-        assert tab.value(state) == "paused"
+        tab.until(f"{state} === 'paused'")
+        paused = tab.value(at)
+        tab.value("new Promise(drawn => setTimeout(drawn, 600))")
         assert tab.value(at) == paused
         assert not tab.problems
 
