@@ -119,6 +119,32 @@ def render_in_threads():
         assert_close(gradient, expected_gradient)
 
 
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no second device")
+def test_devices_of_a_program_are_rendered_on_at_the_same_time():
+    """The CPU and every GPU, of which one only is the current one."""
+    devices = ["cpu", *(f"cuda:{n}" for n in range(torch.cuda.device_count()))]
+    found = {device: [] for device in devices}
+
+    def repeat(device):
+        case = CASES["translucent"]()
+        for _ in range(10):
+            inputs = case.inputs(torch.float32, device)
+            quads = case.outputs(api.rasterize, inputs)["quads"]
+            quads.square().sum().backward()
+            found[device].append((quads.detach().cpu(), inputs["mean"].grad.cpu()))
+
+    threads = [threading.Thread(target=repeat, args=(device,)) for device in devices]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(LONG_S)
+    expected = found["cpu"][0]
+    for device, results in found.items():
+        assert len(results) == 10, device
+        for result in results:
+            assert_close(result, expected, rtol=1e-3, atol=1e-4)
+
+
 def import_everything():
     """Import every module of the package."""
     for module in pkgutil.walk_packages(gftorf_warp.__path__, "gftorf_warp."):

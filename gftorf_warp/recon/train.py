@@ -18,7 +18,7 @@ from ..data.read import read, read_truth
 from ..data.sequence import Sequence, Truth
 from ..data.synchronised import check_flow, has_tap_sums, unfilled_share
 from ..errors import InputError, UsageError
-from ..render.cuda import free_memory
+from ..render.cuda import free_memory, on_device
 from ..scene.changes import Wording, changed
 from ..scene.initialise import Init
 from ..scene.windows import Windows
@@ -99,7 +99,7 @@ def reconstruct(
     config = config_of(sequence, settings, seed=seed, device=device)
     config |= {"flow": None if flow is None else str(flow), "changes": changes}
     _check_resources(sequence, settings, out, device)
-    with folder.locked(out):
+    with folder.locked(out), on_device(device):
         goes_on = folder.prepare(out, config, fresh=fresh)
         with log_to(out / "run.log"):
             _run(sequence, out, settings, config, seed, device, goes_on, begun, progress)

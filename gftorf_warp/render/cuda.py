@@ -47,8 +47,14 @@ def stream_of(tensor: Tensor) -> Iterator[None]:
                 fix="start processes with the method spawn, or render on the CPU in them",
             )
         stream = _warp_stream(torch.cuda.current_stream(tensor.device))
-        with wp.ScopedStream(stream, sync_enter=False):
+        with on_device(tensor.device), wp.ScopedStream(stream, sync_enter=False):
             yield
+
+
+def on_device(device: torch.device | str) -> contextlib.AbstractContextManager[object]:
+    """Context in which a GPU is torch's current one, where its events and graphs are made."""
+    device = torch.device(device)
+    return contextlib.nullcontext() if device.type == "cpu" else torch.cuda.device(device)
 
 
 @functools.cache
