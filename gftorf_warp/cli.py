@@ -320,8 +320,9 @@ def _import(options: argparse.Namespace) -> int:
     if options.kind is not None and options.template:
         print(command.template_of(options.kind, options.out), end="" if not options.out else "\n")
         return 0
-    needed = {"KIND": options.kind, "SRC": options.source}
-    needed |= {} if options.dry_run else {"--out SEQ": options.out}
+    needed = {"KIND": options.kind}
+    needed |= {} if options.template else {"SRC": options.source}
+    needed |= {} if options.template or options.dry_run else {"--out SEQ": options.out}
     missing = [name for name, value in needed.items() if value is None]
     if missing:
         fix = "for example `gftorf import arrays quads --config quads.toml --out sequence`; "

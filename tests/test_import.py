@@ -204,6 +204,7 @@ def test_the_list_and_the_templates(tmp_path, capsys):
     [
         ("import", 2, "KIND and SRC and --out SEQ missing"),
         ("import ftorf", 2, "SRC"),
+        ("import --template", 2, "KIND missing"),
         ("import xyz {here} --out {out}", 2, "there are arrays, ftorf"),
         ("import ftofr {here} --out {out}", 2, "did you mean ftorf"),
         ("import ftorf {here}/none --out {out}", 3, "no such source"),

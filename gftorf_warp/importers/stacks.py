@@ -122,7 +122,9 @@ def open_stack(path: Path, settings: Settings) -> Stack:
     elif suffix in PICTURES:
         pages = read_picture(path)
         if pages.ndim != 3:
-            raise unreadable(path, f"expected one channel, found {pages.shape[-1]}")
+            why = f"expected one channel, found {pages.shape[-1]}"
+            fix = "export the quads in one channel, or name their files by source.files"
+            raise InputError("a colour picture", where=path, why=why, fix=fix)
         array = pages[0] if len(pages) == 1 else pages
     elif suffix in EXR:
         array = _exr(path, settings["source.channels"])
