@@ -63,7 +63,8 @@ void main() {
 // --- the arrays, as scene_page.py lists them
 
 function arrays() {
-  const bytes = Uint8Array.from(atob(scene.arrays), (letter) => letter.charCodeAt(0));
+  const text = atob(scene.arrays), bytes = new Uint8Array(text.length);
+  for (let k = 0; k < text.length; k++) bytes[k] = text.charCodeAt(k);
   let at = 0;
   const next = (kind, length) => {
     const found = new kind(bytes.buffer, at, length);
