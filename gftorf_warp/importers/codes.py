@@ -73,6 +73,8 @@ class Decoder:
 
     settings: Settings
     """Values of ``KEYS``."""
+    pixels: int = 0
+    """Pixels of all images."""
     invalid: int = 0
     """Pixels of all images that were not measured."""
     saturated: int = 0
@@ -96,6 +98,7 @@ class Decoder:
         with np.errstate(over="ignore", invalid="ignore"):  # NaN, and numbers beyond float32
             quads = (codes - self.settings["values.zero"]).astype(np.float32)
         invalid |= ~np.isfinite(quads) & ~saturated
+        self.pixels += stored.size
         self.invalid += int(invalid.sum())
         self.saturated += int(saturated.sum())
         quads[invalid | saturated] = np.nan
@@ -120,8 +123,8 @@ class Decoder:
             codes = np.where(codes >> (bits - 1), codes - (1 << bits), codes)
         return codes
 
-    def describe(self, notes: Notes, images: int, pixels: int) -> None:
-        """Add what was decoded from so many images of so many pixels to the notes."""
+    def describe(self, notes: Notes) -> None:
+        """Add what was decoded to the notes."""
         settings = self.settings
         bits, lowest = settings["values.bits"], settings["values.lowest_bit"]
         zero = settings["values.zero"]
@@ -136,7 +139,7 @@ class Decoder:
             notes.uncertain.append("images of 8 bits: was the recording converted to a picture?")
         for count, what in ((self.invalid, "invalid"), (self.saturated, "saturated")):
             if count:
-                share = f"{count / (images * pixels):.2%}"
+                share = f"{count / self.pixels:.2%}"
                 text = f"{count} values ({share}) are {what}: each is replaced by the value of its "
                 notes.uncertain.append(f"{text}pixel in the nearest raw frame of its slot")
 

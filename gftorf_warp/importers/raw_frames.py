@@ -69,7 +69,7 @@ def raw_frames_of(
     quads, numbers = _stacked(patterns, settings, images, notes)
     measured = np.zeros(len(quads), dtype=bool)
     measured[numbers] = True
-    decoder.describe(notes, len(numbers) * len(taps), quads[0].size)
+    decoder.describe(notes)
     dark = codes.fill(quads, measured, cycle)
     if dark:
         text = "pixels have no value in some slot and are without light in all"
@@ -150,9 +150,11 @@ def _in_order(
             if len(images) < len(taps):
                 why = f"the images end within a raw frame of {len(taps)} taps"
                 raise settings.wrong("sensor.taps", why, "complete the files, or correct the taps")
-            quads = {tap: decoder(image) for tap, (_, image) in zip(taps, images, strict=True)}
-            quad = quads.get("A-B", next(iter(quads.values())))
-            yield images[0][0], quads["A"] - quads["B"] if {"A", "B"} <= quads.keys() else quad
+            by_name = dict(zip(taps, (image for _, image in images), strict=True))
+            by_name.pop("A+B", None)  # has no phase
+            quads = {tap: decoder(image) for tap, image in by_name.items()}
+            both = {"A", "B"} <= quads.keys()
+            yield images[0][0], quads["A"] - quads["B"] if both else next(iter(quads.values()))
 
 
 def _grouped(
