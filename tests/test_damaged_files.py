@@ -1,8 +1,10 @@
 """Files that others wrote, or damaged: read, or refused by name; nothing else, and soon."""
 
+import errno
 import hashlib
 import io
 import json
+import os
 import shutil
 import signal
 import struct
@@ -115,6 +117,21 @@ def test_no_link_leads_out_of_a_sequence(folder, name, tmp_path):
     (tmp_path / "outside").rename(folder / "inside")
     (folder / name).symlink_to(folder / "inside")
     Sequence.open(folder)
+
+
+@of("F-ToeRF")
+def test_a_folder_that_cannot_be_listed_is_named(folder, monkeypatch):
+    """Permissions do not bind root, who may run the tests."""
+    scandir = os.scandir
+
+    def refusing(path):
+        if Path(path).name == "cams":
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+        return scandir(path)
+
+    monkeypatch.setattr(os, "scandir", refusing)
+    with pytest.raises(InputError, match=r"cams\n.*Permission denied"):
+        Sequence.open(folder)
 
 
 @of("checkpoint")

@@ -1,5 +1,6 @@
 """Renderings that leave out what nobody asked for, and extra images that hold the weights fixed."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -205,3 +206,13 @@ def test_a_low_pass_filter_without_width_is_refused(value):
     with pytest.raises(ValueError, match=f"low_pass must be above 0 and finite, got {value}"):
         buffers.RenderSettings(low_pass=value)
     assert buffers.RenderSettings().low_pass == 0.3
+
+
+@pytest.mark.parametrize(
+    "change", [{"phasor_factor": math.nan}, {"phasor_factor": -math.inf}, {"pair_capacity": -1}]
+)
+def test_settings_without_a_meaning_are_refused(change):
+    """By the name of the setting and the value."""
+    ((name, value),) = change.items()
+    with pytest.raises(ValueError, match=f"{name} must be .*, got {value}"):
+        buffers.RenderSettings(**change)

@@ -43,19 +43,21 @@ def check_links(root: Path) -> None:
     """Check the links in a folder and in those below it: what lies outside is no part of it.
 
     Raises:
-        InputError: If one leads out of the folder.
+        InputError: If one leads out of the folder, or a folder cannot be listed.
     """
     home = os.path.realpath(root)
     for folder in (root, *(path for path in root.iterdir() if path.is_dir())):
-        with os.scandir(folder) as entries:
-            for entry in entries:
-                if not entry.is_symlink():
-                    continue
-                target = os.path.realpath(entry.path)
-                if os.path.commonpath([home, target]) != home:
-                    why = f"expected files in this folder, found a link to {target}"
-                    fix = "copy what it leads to in its place, or remove it"
-                    raise InputError("a link out of the folder", where=entry.path, why=why, fix=fix)
+        try:
+            with os.scandir(folder) as entries:
+                links = [entry.path for entry in entries if entry.is_symlink()]
+        except OSError as error:
+            raise unreadable(folder, error.strerror or str(error)) from error
+        for link in links:
+            target = os.path.realpath(link)
+            if os.path.commonpath([home, target]) != home:
+                why = f"expected files in this folder, found a link to {target}"
+                fix = "copy what it leads to in its place, or remove it"
+                raise InputError("a link out of the folder", where=link, why=why, fix=fix)
 
 
 def read_bytes(path: Path, most: int | None = None) -> bytes:

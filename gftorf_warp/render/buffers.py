@@ -129,6 +129,10 @@ class RenderSettings:
             raise ValueError(f"sh_degree must be 0, 1, 2 or 3, got {self.sh_degree}")
         if self.depth_bits not in (16, 24):
             raise ValueError(f"depth_bits must be 16 or 24, got {self.depth_bits}")
+        if not math.isfinite(self.phasor_factor):
+            raise ValueError(f"phasor_factor must be finite, got {self.phasor_factor}")
+        if self.pair_capacity is not None and self.pair_capacity < 0:
+            raise ValueError(f"pair_capacity must be 0 or more, got {self.pair_capacity}")
         if self.threads is not None and self.threads < 1:
             raise ValueError(f"threads must be at least 1, got {self.threads}")
 
