@@ -20,7 +20,7 @@ from gftorf_warp import cli, reconstruct
 from gftorf_warp.constants import CANONICAL_SHIFTS
 from gftorf_warp.data.read import read
 from gftorf_warp.data.write import write
-from gftorf_warp.errors import InputError, UsageError
+from gftorf_warp.errors import InputError, Terminated, UsageError
 from gftorf_warp.recon import checkpoint
 from gftorf_warp.view import pixel, scene
 from gftorf_warp.view.scene import CLOSED_FORM, OURS, TRUTH, Choice
@@ -253,7 +253,7 @@ def test_what_cannot_be_viewed_is_named(analytic, tmp_path, monkeypatch, capsys)
 
 
 def test_the_command_ends_with_ctrl_c(analytic, monkeypatch):
-    """It says where it listens, and closes."""
+    """It says where it listens, and closes; SIGTERM keeps its exit code."""
     pytest.importorskip("viser", reason="no viser: pip install 'gftorf-warp[view]'")
     from gftorf_warp.view import command, window
 
@@ -264,6 +264,13 @@ def test_the_command_ends_with_ctrl_c(analytic, monkeypatch):
     monkeypatch.setattr(window.Window, "run", interrupted)
     command.view(analytic.sequence.path, say=said.append)
     address = re.search(r"http://127\.0\.0\.1:(\d+)", said[0])
+
+    def terminated(_):
+        raise Terminated
+
+    monkeypatch.setattr(window.Window, "run", terminated)
+    with pytest.raises(Terminated):
+        command.view(analytic.sequence.path, say=said.append)
     with pytest.raises(ConnectionRefusedError):
         socket.create_connection(("127.0.0.1", int(address[1])), timeout=10)
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import torch
 
+from ..errors import Terminated
 from .subject import Subject
 from .window import Window
 
@@ -37,6 +38,7 @@ def view(
     Raises:
         InputError: If the folder is neither, or viser is not installed.
         UsageError: If the port is in use.
+        Terminated: If SIGTERM ended it.
     """
     window = Window(Subject.open(path, device, sequence=sequence), port)
     try:
@@ -44,6 +46,8 @@ def view(
         at = f"{window.port}:127.0.0.1:{window.port}"
         say(f"from another machine: ssh -L {at} {socket.gethostname()}, then the same address")
         window.run()
+    except Terminated:  # a kind of KeyboardInterrupt, with an exit code of its own
+        raise
     except KeyboardInterrupt:
         LOG.info("viewer closed")
     finally:
