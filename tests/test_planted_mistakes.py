@@ -84,3 +84,10 @@ def test_hypotheses_of_more_than_four_shifts(room):
     found = hypotheses(five)
     assert len(found) == 10
     assert found[0].order == (0, 1, 2, 3, 4)
+
+
+def test_the_page_explains_every_finding():
+    """docs/check.md has a row for each rule that finds a planted mistake."""
+    page = (Path(__file__).parents[1] / "docs" / "check.md").read_text(encoding="utf-8")
+    names = {name for mistake in planted.MISTAKES.values() for name in mistake.found_by}
+    assert {name for name in names if f"| `{name}` |" not in page} == set()
