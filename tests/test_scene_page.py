@@ -11,7 +11,7 @@ from browser import PHONE, browser
 from export_run import FRAMES, exportable
 
 from gftorf_warp.errors import UsageError
-from gftorf_warp.export import scene_page
+from gftorf_warp.export import scene_arrays
 from gftorf_warp.export.command import export
 
 
@@ -86,7 +86,7 @@ def test_the_page_needs_nothing_else(run, tmp_path):
 
 def test_a_page_that_is_too_large_names_what_fits(run, tmp_path, monkeypatch):
     """Before it is made."""
-    monkeypatch.setattr(scene_page, "BYTES_MAX", 2000)
+    monkeypatch.setattr(scene_arrays, "BYTES_MAX", 2000)
     with pytest.raises(UsageError, match="--every"):
         export(run, tmp_path / "out", "html")
     assert not (tmp_path / "out" / "scene.html").exists()

@@ -60,7 +60,7 @@ void main() {
   pixel = vec4(colour.rgb * alpha, alpha);
 }`;
 
-// --- the arrays, as scene_page.py lists them
+// --- the arrays, as scene_arrays.py lists them
 
 function arrays() {
   const text = atob(scene.arrays), bytes = new Uint8Array(text.length);
