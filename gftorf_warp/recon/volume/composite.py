@@ -39,7 +39,8 @@ class Samples:
     @property
     def transmittance(self) -> Float[Tensor, "*b S"]:
         """T of the samples [1]."""
-        passed = torch.cumprod(1.0 - self.alpha + OPAQUE, dim=-1)
+        # the gradient of a cumulative product asks for zeros, for which the host would wait
+        passed = torch.exp(torch.cumsum(torch.log(1.0 - self.alpha + OPAQUE), dim=-1))
         return torch.cat([torch.ones_like(passed[..., :1]), passed[..., :-1]], dim=-1)
 
 
