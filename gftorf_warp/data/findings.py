@@ -117,11 +117,14 @@ def camera(sequence: Sequence, report: Report) -> None:
     """Camera motion without poses, and an implausibly distant colour camera."""
     if (sequence.camera_from_world == np.eye(4)).all():
         share = estimates.changed_share(sequence)
-        report.add("change", f"{share:.0%} of bright pixels from the first to the last quartet")
+        report.add(
+            "change",
+            f"{share:.0%} of all but the darkest pixels, from the first to the last quartet",
+        )
         if share > MOVED_SHARE:
             report.warn(
                 "poses",
-                f"poses: all are identity, but {share:.0%} of bright pixels change: if the "
+                f"poses: all are identity, but {share:.0%} of the pixels change: if the "
                 "camera moved, store its poses in cams/tof_extrinsics.npy",
             )
     if sequence.colour.camera_from_world is not None:
