@@ -334,7 +334,7 @@ def device_instead(path, random):
 
 
 def link_instead(path, random):  # noqa: ARG001
-    """A link out of the folder, to what was there."""
+    """A link to what was there, in another folder."""
     outside = Path(tempfile.mkdtemp(dir=path.parents[1])) / path.name
     path.rename(outside)
     path.symlink_to(outside)
@@ -346,8 +346,10 @@ def other_name(path, random):
     path.rename(path.with_name(digits + path.suffix))
 
 
-IN_FOLDERS = (take_away, folder_instead, pipe_instead, device_instead, other_name)
-# also of files that a hash protects: the content is the same, or there is none
+IN_FOLDERS = (
+    *(take_away, folder_instead, pipe_instead, device_instead),
+    *(link_instead, other_name),
+)
 
 
 def damage(folder: Path, random: np.random.Generator, reader: Reader) -> str:

@@ -181,6 +181,26 @@ def test_a_checkpoint_is_not_packed(tmp_path):
         checkpoint.load(path)
 
 
+@of("checkpoint with its hash")
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda stored: stored["field"].update(colour=stored["field"].pop("log_scale")),
+        lambda stored: stored["field"].update(mean=stored["field"]["mean"][:-1]),
+        lambda stored: stored.update(motion={"kind": stored["motion"]["kind"]}),
+        lambda stored: stored.update(attachment="none"),
+        lambda stored: stored.pop("field"),
+    ],
+)
+def test_a_checkpoint_whose_parts_do_not_fit_is_refused(folder, change):
+    """A flipped bit in a name raised a TypeError."""
+    stored = checkpoint.last(folder)
+    change(stored)
+    checkpoint.save(folder, stored)
+    with pytest.raises(InputError, match="the parts of the checkpoint do not fit"):
+        Run.open(folder)
+
+
 def png(width, height):
     """Return a PNG file that claims a size and has no pixel."""
     header = struct.pack(">2I5B", width, height, 16, 6, 0, 0, 0)

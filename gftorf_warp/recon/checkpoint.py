@@ -4,11 +4,13 @@ the last two kept.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import io
 import logging
 import re
 import zipfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +18,7 @@ import torch
 
 from ..data.files import atomic_path, atomic_write, sweep, temporary_name, write_through
 from ..data.untrusted import SMALL_FILE_BYTES, read_bytes
-from ..errors import InputError
+from ..errors import GftorfError, InputError
 from .state import FORMAT
 
 LOG = logging.getLogger("gftorf_warp")
@@ -119,6 +121,26 @@ def last(run: Path, device: torch.device | str = "cpu") -> dict | None:
     if error is not None:
         raise error
     return None
+
+
+@contextlib.contextmanager
+def rebuilding(run: Path) -> Iterator[None]:
+    """Context in which what a checkpoint of a run holds is made into tensors and models again.
+
+    Raises:
+        InputError: If its parts do not fit together.
+    """
+    try:
+        yield
+    except (GftorfError, MemoryError, torch.OutOfMemoryError):
+        raise
+    except Exception as error:  # of names, shapes and types that are not those of a state
+        raise InputError(
+            "not the state of a run",
+            where=folder(run),
+            why=f"the parts of the checkpoint do not fit: {type(error).__name__}, {error}"[:300],
+            fix="use a checkpoint of this run, or start over with --fresh",
+        ) from error
 
 
 def after(run: Path, images: int) -> list[Path]:

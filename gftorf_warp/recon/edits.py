@@ -95,7 +95,8 @@ def save(
         why = "a run is stored with the state of the one it is from, which holds Gaussians"
         fix = "restore its folder"
         raise InputError("no checkpoint", where=run, why=why, fix=fix)
-    state = from_dict(stored, field.device)
+    with checkpoint.rebuilding(run):
+        state = from_dict(stored, field.device)
     state = replace(
         state,
         optimiser=Optimiser(field, motion, betas=state.optimiser.betas),

@@ -101,7 +101,8 @@ class Run:
             known = settings_of(config["settings"]["volume"])
             volume = volume_from_dict(path, method, known, stored, device)
             return VolumeRun.of(path, config, camera, sensor, device, volume=volume)
-        gaussians, motion, binding = field_and_motion(stored, device)
+        with checkpoint.rebuilding(path):
+            gaussians, motion, binding = field_and_motion(stored, device)
         edits.check_finite(path, gaussians, motion)
         return cls(
             path=path,

@@ -305,7 +305,8 @@ def _fit_gaussians(
     if stored is None:
         state = begin(observations, settings, seed=seed, device=device)
     else:
-        state = from_dict(stored, device)
+        with checkpoint.rebuilding(out):
+            state = from_dict(stored, device)
     metrics = Metrics(out / "metrics.jsonl")
     diagnostics = Diagnostics(observations, _truth(sequence), out / "diagnostics.jsonl")
     for rows in (metrics, diagnostics):
