@@ -9,14 +9,12 @@ SCRIPT = Path(__file__).parents[1] / "benchmarks" / "kills.py"
 
 
 def test_killed_commands_end_with_the_bytes_of_undisturbed_ones():
-    """Simulations and reconstructions; no checkpoint is unreadable, no temporary file stays."""
-    words = ["--kills", "2", "--commands", "simulate,reconstruct"]
+    """No checkpoint is unreadable, no temporary file stays."""
+    words = ["--kills", "2", "--commands", "reconstruct"]
     done = subprocess.run(
         [sys.executable, str(SCRIPT), *words], capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stdout + done.stderr
-    rows = [json.loads(line) for line in done.stdout.splitlines()]
-    assert [row["command"] for row in rows] == ["simulate", "reconstruct"]
-    for row in rows:
-        assert row["kills"] == 2
-        assert row["completed"] >= 1
+    row = json.loads(done.stdout)
+    assert row["kills"] == 2
+    assert row["completed"] >= 1

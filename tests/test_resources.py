@@ -134,6 +134,19 @@ def test_what_is_free_respects_a_control_group(tmp_path, monkeypatch):
         assert resources.free_memory() > 1e8
 
 
+def test_what_is_free_respects_groups_within_groups(tmp_path, monkeypatch):
+    """A job of a cluster is in a group of its own, below one of the machine."""
+    monkeypatch.setattr(resources, "CGROUP", tmp_path / "groups")
+    monkeypatch.setattr(resources, "OWN_GROUPS", tmp_path / "own")
+    (tmp_path / "own").write_text("1:cpu:/\n0::/slurm/job_7/step_0\n")
+    for name, limit in (("slurm", 50_000_000), ("slurm/job_7", 9_000_000), ("other", 1_000)):
+        folder = tmp_path / "groups" / name
+        folder.mkdir(parents=True)
+        (folder / "memory.max").write_text(f"{limit}\n")
+        (folder / "memory.current").write_text("1000000\n")
+    assert resources.free_memory() == 8_000_000
+
+
 def test_free_space_is_that_of_the_disk_that_will_be_written_to(tmp_path):
     """Also where the folder does not exist yet."""
     free = shutil.disk_usage(tmp_path).free

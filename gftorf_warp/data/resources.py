@@ -15,6 +15,7 @@ from ..errors import ResourceError
 from .files import as_errors
 
 CGROUP = Path("/sys/fs/cgroup")
+OWN_GROUPS = Path("/proc/self/cgroup")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,15 +119,31 @@ def _of_machine() -> float | None:
 
 
 def _of_control_group() -> float | None:
-    """Limit minus use of version 2 or 1 of control groups, without files that may be dropped."""
-    for folder, most, used in (
+    """Limit minus use of control groups of version 2 or 1, without files that may be dropped: the
+    least of this process's group and all that it is in.
+    """
+    found = []
+    for base, most, used in (
         (CGROUP, "memory.max", "memory.current"),
         (CGROUP / "memory", "memory.limit_in_bytes", "memory.usage_in_bytes"),
     ):
-        limit, use = _number(folder / most), _number(folder / used)
-        if limit is not None and use is not None:
-            return limit - use + _table(folder / "memory.stat").get("inactive_file", 0)
-    return None
+        for folder in _groups_below(base):
+            limit, use = _number(folder / most), _number(folder / used)
+            if limit is not None and use is not None:
+                dropped = _table(folder / "memory.stat").get("inactive_file", 0)
+                found.append(limit - use + dropped)
+    return min(found, default=None)
+
+
+def _groups_below(base: Path) -> set[Path]:
+    """Folders of the groups that this process is in; some of them may not exist."""
+    try:
+        lines = OWN_GROUPS.read_text().splitlines()
+    except OSError:  # no Linux
+        return {base}
+    inner = [base / line.split(":", 2)[-1].lstrip("/") for line in lines]
+    outer = {one for path in inner for one in path.parents if one.is_relative_to(base)}
+    return {base, *inner, *outer}
 
 
 def _of_address_space() -> float | None:
