@@ -542,16 +542,18 @@ def test_the_documents_know_the_rooms():
         assert packages <= words, f"{room}: ARCHITECTURE.md does not list {packages - words}"
 
 
-def test_the_readme_shows_its_commands():
-    """Two commands start from nothing, and every command of the program is in the table."""
+def test_the_first_pages_show_their_commands():
+    """README.md, of a page, starts from nothing; the quick start has every command in a table."""
     from gftorf_warp.options import command_parsers
 
     text = (REPOSITORY / "README.md").read_text()
+    assert len(text.splitlines()) <= 80
     assert "pip install -c constraints.txt ." in text
     assert "pip install -c constraints.txt '.[test]'" in text
     assert "pytest" in text
+    table = (REPOSITORY / "docs" / "quick-start.md").read_text()
     for command in command_parsers():
-        assert f"`gftorf {command}" in text, command
+        assert f"| `gftorf {command}" in table, command
 
 
 def test_every_pinned_version_is_exact_and_ordinary():

@@ -1,5 +1,5 @@
-"""Every `gftorf simulate` line of README.md and docs/simulate.md is run at a tiny size;
-other commands are parsed.
+"""Every `gftorf simulate` line of README.md, the quick start and docs/simulate.md is run at a tiny
+size; other commands are parsed.
 """
 
 import re
@@ -12,13 +12,14 @@ from gftorf_warp import Sequence, cli, options
 from gftorf_warp.sim.ladder import NAMES
 
 REPOSITORY = Path(__file__).parents[1]
-README, PAGE = (
-    (REPOSITORY / name).read_text(encoding="utf-8") for name in ("README.md", "docs/simulate.md")
+PAGES = "".join(
+    (REPOSITORY / name).read_text(encoding="utf-8")
+    for name in ("README.md", "docs/quick-start.md", "docs/simulate.md")
 )
 LINES = sorted(
     {
         line.partition("#")[0].strip()
-        for line in re.findall(r"(?:^|`)(gftorf [^`\n]*)", README + PAGE, re.MULTILINE)
+        for line in re.findall(r"(?:^|`)(gftorf [^`\n]*)", PAGES, re.MULTILINE)
     }
 )
 SIMULATE = [
@@ -74,10 +75,10 @@ def test_the_pages_show_everything_that_can_be_simulated():
     ):
         assert any(word in line for line in SIMULATE), word
     for word in ("--list", "seq.partial", "--fresh"):
-        assert word in README, word
+        assert word in PAGES, word
     from gftorf_warp.sim.sensors import SENSORS
 
-    assert all(f"`{name}`" in README for name in SENSORS)
+    assert all(f"`{name}`" in PAGES for name in SENSORS)
 
 
 def test_printed_commands_can_be_parsed():
@@ -93,3 +94,11 @@ def test_printed_commands_can_be_parsed():
         words = shlex.split(line)[1:]
         if len(words) > 1 and not any(word.isupper() for word in words):
             assert options.parse(words).command == words[0], line
+
+
+def test_links_of_the_readme_lead_to_files():
+    """Those of all other pages are checked by the build of the site."""
+    text = (REPOSITORY / "README.md").read_text(encoding="utf-8")
+    links = re.findall(r"\]\(([^)#]+)", text)
+    assert len(links) > 20
+    assert [link for link in links if not (REPOSITORY / link).is_file()] == []
