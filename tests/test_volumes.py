@@ -84,7 +84,7 @@ def test_a_scene_at_rest_is_learnt(name, tmp_path):
     rows = [json.loads(line) for line in (run.path / "metrics.jsonl").read_text().splitlines()]
     assert [row["images"] for row in rows] == list(range(10, 161, 10))
     assert rows[-1]["quad_psnr_db"] > rows[0]["quad_psnr_db"] + 8.0
-    expected = {"quads", "size", "kinetic", "cycle", "flow"} if name == "ftorf" else {"quads"}
+    expected = {"quads", "size", "kinetic", "round_trip", "flow"} if name == "ftorf" else {"quads"}
     assert expected <= rows[-1].keys()
 
 
@@ -230,9 +230,9 @@ def test_raw_frames_agree_with_the_true_flow_only(speed, low, high):
     targets.quads = (pattern(x - SPEED * n / 4) / distance**2 * torch.cos(phase)).float()
     volume.moving = Sliding(volume, lambda x: torch.full_like(x, 1e9), pattern, speed)
     terms = volume.terms(targets, 30, settings, Draw(0, torch.device("cpu")))
-    assert terms.keys() == {"quads", "size", "kinetic", "cycle", "flow", "quad_mse"}
+    assert terms.keys() == {"quads", "size", "kinetic", "round_trip", "flow", "quad_mse"}
     assert low <= terms["quad_mse"] < high
-    assert terms["kinetic"] == terms["cycle"] == 0.0
+    assert terms["kinetic"] == terms["round_trip"] == 0.0
     assert terms["size"].item() == pytest.approx(1e-3 * speed / 3.0, rel=1e-5)
     first = volume.terms(targets, 1, settings, Draw(0, torch.device("cpu")))
     assert first.keys() == {"quads", "quad_mse"}, "the first steps know no flow"

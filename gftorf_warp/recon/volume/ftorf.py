@@ -93,7 +93,7 @@ class Ftorf(Volume):
             "quads": weight * errors.sum(),
             "size": options.size * 0.5 * (flows.forward.abs() + flows.backward.abs()).mean(),
             "kinetic": options.kinetic * 0.5 * both.square().sum(dim=-1).mean(),
-            "cycle": options.cycle * gap,
+            "round_trip": options.round_trip * gap,
             "quad_mse": errors.mean().detach(),
         }
         weight = settings.weights.flow * max(0.0, 1.0 - step / options.vanishes_at)

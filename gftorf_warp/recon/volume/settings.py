@@ -68,7 +68,7 @@ class SceneFlowSettings:
     has none."""
     kinetic_share: float = 0.9
     """Share of the samples of a ray, from the camera on, to which ``kinetic`` applies [1]."""
-    cycle: float = 1e-4
+    round_trip: float = 1e-4
     """Weight of the gap after a flow and the flow back [1/m]."""
     vanishes_at: int = 10_000_000
     """The weight of the optical flow falls linearly to 0 at this step."""
