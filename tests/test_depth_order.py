@@ -121,15 +121,16 @@ def test_presets_tell_depths_apart_as_documented(bits, width, device):
 @pytest.mark.parametrize("bits", [24, 16])
 def test_the_culled_come_last(bits, device):
     """Behind the camera, too near, too far, too faint: behind the farthest that is seen,
-    in order of index.
+    in order of index. What has no finite place comes first, to be seen.
     """
     settings = RenderSettings(near=0.2, far=20.0, depth_bits=bits)
     z = np.array([-1.0, 20.0, 0.1, 25.0, 5.0, -0.0, 0.2, 1e9, 5.0, 3.0, -np.inf, np.nan])
     opacity = np.full(len(z), 0.5)
     opacity[9] = 0.001
     keys, order = ordered(z, settings, device, opacity)
-    assert order.tolist() == [6, 4, 8, 1, 0, 2, 3, 5, 7, 9, 10, 11]
-    assert (keys[[0, 2, 3, 5, 7, 9, 10, 11]] == settings.depth_culled).all()
+    assert order.tolist() == [6, 10, 11, 4, 8, 1, 0, 2, 3, 5, 7, 9]
+    assert (keys[[0, 2, 3, 5, 7, 9]] == settings.depth_culled).all()
+    assert (keys[[10, 11]] == 0).all()
 
 
 def layers(bits):
