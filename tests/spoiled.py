@@ -1,84 +1,45 @@
-"""Run folders spoiled in one place, chosen by a seed: what a crash, a bad disk, an editor or a
-stranger leaves.
+"""Run folders spoiled by a seed: a value of config.json replaced or removed, or a file damaged as
+the readers' files are, see damaged_files.py.
 """
 
-import copy
 import json
-import os
-import random
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+from damaged_files import damage
 
 VALUES = [None, True, -1, 0, 1e300, 10**30, "text", "", [], [1], {}, {"a": 1}]
-TEXTS = [
-    b"",
-    b" \n",
-    b"{}",
-    b"[]",
-    b"null",
-    b"{",
-    b"\xff\xfe\x00 no text",
-    5000 * b"[",
-    b'{"images": "four"}\n',
-    b"garbage\n",
-]
+ANY_FILE = SimpleNamespace(damaged="**/*")
 
 
 def spoil(run: Path, seed: int) -> str:
-    """Change one thing in a run folder; what it was."""
-    chosen = random.Random(seed)
-    files = sorted(path for path in run.rglob("*") if path.is_file())
-    path = chosen.choice([run / "config.json", chosen.choice(files)])
-    name = path.relative_to(run)
-    ways = ["folder", "gone", "pipe", "link", "text", "cut", "flip"]
-    if path.suffix == ".json":
-        ways += 5 * ["value", "key"]
-    if path.suffix == ".jsonl":
-        ways += 3 * ["row"]
-    way = chosen.choice(ways)
-    data = path.read_bytes()
-    if way in ("value", "key"):
-        return f"{name}: {_in_json(path, way, chosen)}"
-    if way == "row":
-        rows = data.splitlines(keepends=True)
-        rows.insert(chosen.randrange(len(rows) + 1), chosen.choice(TEXTS) + b"\n")
-        path.write_bytes(b"".join(rows))
-    elif way == "text":
-        path.write_bytes(chosen.choice(TEXTS))
-    elif way == "cut":
-        path.write_bytes(data[: chosen.randrange(len(data) + 1)])
-    elif way == "flip":
-        flipped = bytearray(data)
-        for at in [chosen.randrange(len(data)) for _ in range(3)] if data else []:
-            flipped[at] ^= 1 << chosen.randrange(8)
-        path.write_bytes(flipped)
-    else:
-        path.unlink()
-        if way == "folder":
-            path.mkdir()
-        elif way == "pipe":
-            os.mkfifo(path)
-        elif way == "link":
-            path.symlink_to("/dev/null" if chosen.random() < 0.5 else "/nowhere")
-    return f"{name}: {way}"
+    """Change something in a run folder; what it was."""
+    random = np.random.default_rng(seed)
+    if random.random() < 0.5:
+        return _in_config(run / "config.json", random)
+    return damage(run, random, ANY_FILE)
 
 
-def _in_json(path: Path, way: str, chosen: random.Random) -> str:
-    """Replace or remove one value of a JSON file, however deep."""
-    content = json.loads(path.read_text())
-    table, key = content, chosen.choice(sorted(content))
-    where = key
-    while isinstance(table[key], dict) and table[key] and chosen.random() < 0.8:
-        table = table[key]
-        key = chosen.choice(sorted(table))
-        where += f".{key}"
-    if way == "key":
-        del table[key]
+def _in_config(path: Path, random: np.random.Generator) -> str:
+    """Replace or remove one value, however deep."""
+    content = table = json.loads(path.read_text())
+    where = [_key_of(table, random)]
+    while isinstance(table[where[-1]], dict) and table[where[-1]] and random.random() < 0.8:
+        table = table[where[-1]]
+        where.append(_key_of(table, random))
+    if random.random() < 0.3:
+        del table[where[-1]]
         path.write_text(json.dumps(content))
-        return f"without {where}"
-    table[key] = copy.deepcopy(chosen.choice(VALUES))
-    path.write_text(json.dumps(content))
-    return f"{where} = {table[key]!r}"[:80]
+        return f"without {'.'.join(where)}"
+    value = VALUES[random.integers(len(VALUES))]
+    set_value(path, ".".join(where), value)
+    return f"{'.'.join(where)} = {value!r}"
+
+
+def _key_of(table: dict, random: np.random.Generator) -> str:
+    return sorted(table)[random.integers(len(table))]
 
 
 def set_value(path: Path, name: str, value: object) -> None:

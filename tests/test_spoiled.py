@@ -26,7 +26,8 @@ VALUES = {
     "camera.height": 10**30,
     "camera.camera_from_world": [1],
     "camera.cy": None,
-    "sensor.f_mod_hz": "fast",
+    "sensor.f_mod_hz": 1e300,
+    "sensor.dc_offset": [1],
     "sequence": 1e300,
     "size_optimised": 0,
     "quad_scale": -1,
@@ -125,10 +126,19 @@ def test_rows_that_are_none_are_named(run, tmp_path, capsys):
     path = copied(run, tmp_path / "run") / "metrics.jsonl"
     path.write_text('{"images": 4, "seconds": 1, "loss": 1}\n{"images": 8, "lo')
     assert main(["compare", str(tmp_path / "run"), "--device", "cpu", "-q"]) == 0
-    path.write_text('{"images": 4, "loss": 1}\n{"images": "eight"}\n')
-    capsys.readouterr()
-    assert main(["compare", str(tmp_path / "run"), "--device", "cpu", "-q"]) == 3
-    assert "line 2" in capsys.readouterr().err
+    for row in ('{"images": "eight"}', '{"loss": 1}', '{"images": 8, "loss": 1e999}', "[1]"):
+        path.write_text(f'{{"images": 4, "loss": 1}}\n{row}\n')
+        capsys.readouterr()
+        assert main(["compare", str(tmp_path / "run"), "--device", "cpu", "-q"]) == 3
+        assert "line 2" in capsys.readouterr().err
+
+
+def test_a_log_that_is_a_pipe_is_not_waited_for(run, tmp_path, capsys):
+    """Nobody reads what would be appended to it."""
+    path = copied(run, tmp_path / "run") / "run.log"
+    path.unlink()
+    os.mkfifo(path)
+    assert ends_well(reconstruct(run.parent, tmp_path / "run"), capsys, "pipe") == 3
 
 
 @pytest.mark.parametrize(

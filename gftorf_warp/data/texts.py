@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import math
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
@@ -32,7 +33,7 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 
 def read_rows(path: Path) -> list[dict[str, Any]]:
-    """Rows of a .jsonl file, objects of numbers and nulls; none without the file.
+    """Rows of metrics.jsonl or diagnostics.jsonl, numbers and nulls by name; none without the file.
 
     A last line without an end was cut off by a crash and does not count.
 
@@ -46,8 +47,9 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
         if not line.endswith("\n"):
             break
         row = _loads(line)
-        if not isinstance(row, dict) or not all(map(_is_number, row.values())):
-            why = f"expected a JSON object of numbers in line {number}, found {line[:80].strip()!r}"
+        if not _is_row(row):
+            found = repr(line[:80].strip())
+            why = f"expected an object of images and other numbers in line {number}, found {found}"
             raise InputError("not a row", where=path, why=why, fix="remove that line")
         rows.append(row)
     return rows
@@ -82,5 +84,9 @@ def _loads(line: str) -> Any:
         return None
 
 
-def _is_number(value: object) -> bool:
-    return value is None or isinstance(value, (int, float))
+def _is_row(row: object) -> bool:
+    """Whether it is an object of finite numbers and nulls, with the number of images."""
+    if not isinstance(row, dict) or row.get("images") is None:
+        return False
+    known = [value for value in row.values() if value is not None]
+    return all(isinstance(value, (int, float)) and math.isfinite(value) for value in known)

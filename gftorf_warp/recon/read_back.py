@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..constants import CANONICAL_SHIFTS
+from ..data.sequence import Calibration
 from ..errors import InputError
 from ..render.buffers import ClampGradient, Distortion, RenderSettings, SplatDistance, Stop, Support
 from ..scene.camera import Camera
@@ -109,7 +110,12 @@ def _camera(stored: dict[str, Any]) -> Camera:
 
 def _sensor(stored: dict[str, Any]) -> Sensor:
     further = tuple(stored.get("further_hz", ()))
-    return Sensor(**stored | {"further_hz": further}, shifts=CANONICAL_SHIFTS)
+    sensor = Sensor(**stored | {"further_hz": further}, shifts=CANONICAL_SHIFTS)
+    numbers = [value for name, value in stored.items() if name != "further_hz"]
+    if not all(isinstance(value, NUMBER) for value in [*numbers, *further]):
+        raise ValueError(f"sensor must hold numbers, found {stored}")
+    Calibration(f_mod_hz=float(stored["f_mod_hz"]))  # is it in hertz?
+    return sensor
 
 
 def _check_kind(run: Path, config: dict[str, Any], name: str, kind: Any) -> None:

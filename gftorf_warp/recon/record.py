@@ -10,6 +10,7 @@ from pathlib import Path
 
 from ..data.files import atomic_write
 from ..data.texts import read_rows
+from ..errors import InputError
 
 LOG = logging.getLogger("gftorf_warp")
 
@@ -44,7 +45,14 @@ def _line(row: dict[str, float | int | None]) -> str:
 
 @contextmanager
 def log_to(path: Path) -> Iterator[None]:
-    """Append the package's log to a file, with times, while a run is going on."""
+    """Append the package's log to a file, with times, while a run is going on.
+
+    Raises:
+        InputError: If something else is in its place: opening a pipe would block.
+    """
+    if path.exists() and not path.is_file():
+        why, fix = "expected a file to append to", "move it elsewhere"
+        raise InputError("not a file", where=path, why=why, fix=fix)
     handler = logging.FileHandler(path, encoding="utf-8", errors="backslashreplace")
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
     handler.setLevel(logging.INFO)
