@@ -28,6 +28,7 @@ from gftorf_warp.data.read import read
 from gftorf_warp.data.sequence import Sequence
 from gftorf_warp.recon import presets
 from gftorf_warp.recon.observations import observe
+from gftorf_warp.recon.record import Metrics
 from gftorf_warp.recon.settings import Input, ReconSettings
 from gftorf_warp.recon.train import CHANGES
 from gftorf_warp.recon.volume.loop import VolumeLoop, VolumeState, begin
@@ -94,7 +95,7 @@ def measured(
     targets = Targets(observe(sequence, settings, options.device))
     device = torch.device(options.device)
     state = begin(settings, targets, 0, device)
-    loop = VolumeLoop(targets, settings, NOTHING, None, lambda: 0.0, None)
+    loop = VolumeLoop(targets, settings, NOTHING, Metrics(NOTHING), lambda: 0.0, None)
     assert settings.volume is not None
     total = settings.schedule.images
     starts = {"steps": 0}

@@ -15,6 +15,7 @@ from gftorf_warp.errors import InputError, UsageError
 from gftorf_warp.evaluate.compare import compare
 from gftorf_warp.recon import checkpoint, presets
 from gftorf_warp.recon.observations import observe, reduced
+from gftorf_warp.recon.record import Metrics
 from gftorf_warp.recon.run import Run, VolumeRun
 from gftorf_warp.recon.train import reconstruct
 from gftorf_warp.recon.volume.loop import VolumeLoop, begin
@@ -258,7 +259,7 @@ def test_rates_and_weights_change_as_published(tmp_path):
     settings = toy("torf", images=8, rate_tenth_after=4, quads_fall_at=6)
     targets = Targets(observe(sequence, settings, "cpu"))
     state = begin(settings, targets, 0, torch.device("cpu"))
-    loop = VolumeLoop(targets, settings, tmp_path, None, lambda: 0.0, None)
+    loop = VolumeLoop(targets, settings, tmp_path, Metrics(tmp_path / "rows"), lambda: 0.0, None)
     for _ in range(4):
         loop.step(state)
     assert state.optimiser.param_groups[0]["lr"] == pytest.approx(0.1 * settings.volume.rate)
@@ -274,7 +275,7 @@ def test_accumulated_steps_make_one_update(tmp_path):
     settings = replace(settings, volume=replace(settings.volume, accumulated=3))
     targets = Targets(observe(sequence, settings, "cpu"))
     state = begin(settings, targets, 0, torch.device("cpu"))
-    loop = VolumeLoop(targets, settings, tmp_path, None, lambda: 0.0, None)
+    loop = VolumeLoop(targets, settings, tmp_path, Metrics(tmp_path / "rows"), lambda: 0.0, None)
     before = state.volume.moving.density_head.weight.clone()
     changed = []
     for _ in range(4):
@@ -380,7 +381,9 @@ def test_half_precision_is_near_single(name, tmp_path):
         state = begin(settings, targets, 0, torch.device("cpu"))
         state.images = 30
         before = state.volume.moving.density_head.weight.detach().clone()
-        VolumeLoop(targets, settings, tmp_path, None, lambda: 0.0, None).step(state)
+        VolumeLoop(targets, settings, tmp_path, Metrics(tmp_path / "rows"), lambda: 0.0, None).step(
+            state
+        )
         moved = state.volume.moving.density_head.weight.detach() - before
         found[products] = float(state.sums["loss"]), moved
     (loss, moved), (half_loss, half_moved) = found.values()

@@ -27,17 +27,17 @@ OPAQUE = 1e-10  # [1] kept of the light behind an opaque sample, so that its log
 class Samples:
     """S samples of each of R rays, or of the same rays several times."""
 
-    distance: Float[Tensor, "*b S"]
+    distance: Float[Tensor, "R S"]
     """Distance from the camera [m]."""
-    alpha: Float[Tensor, "*b S"]
+    alpha: Float[Tensor, "*b R S"]
     """Share of the light that a sample stops [1]."""
-    strength: Float[Tensor, "*b S"]
+    strength: Float[Tensor, "*b R S"]
     """p of the samples, times alpha [optimised units]."""
-    colour: Float[Tensor, "*b S 3"] | None = None
+    colour: Float[Tensor, "*b R S 3"] | None = None
     """Colours times alpha [1]; None: not evaluated."""
 
     @property
-    def transmittance(self) -> Float[Tensor, "*b S"]:
+    def transmittance(self) -> Float[Tensor, "*b R S"]:
         """T of the samples [1]."""
         # the gradient of a cumulative product asks for zeros, for which the host would wait
         passed = torch.exp(torch.cumsum(torch.log(1.0 - self.alpha + OPAQUE), dim=-1))
@@ -64,10 +64,10 @@ def quads(
 def modulated(
     samples: Samples,
     sensor: Sensor,
-    transmittance: Float[Tensor, "*b S"],
-    shift: Float[Tensor, "*#b 1"],
-    slope: Float[Tensor, "*#b 1"] | float | Tensor,
-) -> Float[Tensor, "*b"]:
+    transmittance: Float[Tensor, "*b R S"],
+    shift: Float[Tensor, "B 1 1"],
+    slope: Float[Tensor, "B 1 1"] | float | Tensor,
+) -> Float[Tensor, "B R"]:
     """Quads [optimised units] of any phase shifts [rad] and phases per distance [rad/m], of a
     sensor with this phase offset and DC offset.
     """

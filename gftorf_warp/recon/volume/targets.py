@@ -118,7 +118,7 @@ class Targets:
         return NEARER * near, FARTHER * far
 
 
-def _by_pixel(stack: ImageStack) -> Float[Tensor, "r *c P"]:
+def _by_pixel(stack: ImageStack) -> Float[Tensor, "r *c P"] | Float[Tensor, "0"]:
     """Images with one axis of pixels; an empty stack as it is."""
     return stack.images.flatten(-2) if stack else stack.images
 
