@@ -1,0 +1,136 @@
+"""``gftorf sweep``: every job of a plan that is not done yet, and the table of all."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from ..data.files import atomic_write, write_json
+from ..data.lock import locked
+from ..errors import UsageError
+from . import cluster, table
+from .job import Result, Task, do
+from .plan import Job, Plan, read_plan
+from .workers import Lost, Workers, places
+
+LOG = logging.getLogger("gftorf_warp")
+STORE, NUMBERS, TABLE, PAGE = "results.jsonl", "sweep.json", "sweep.md", "sweep.html"
+Progress = Callable[..., None]
+
+
+def sweep(
+    plan: Plan | str | Path,
+    out: str | Path,
+    *,
+    devices: Sequence[str] = ("cpu",),
+    workers: int | None = None,
+    scheduler: str | None = None,
+    progress: Progress | None = None,
+) -> dict[str, Result]:
+    """Simulate, reconstruct and score all that a plan asks for, and write tables of it.
+
+    What is done with the same settings and data is not done again, and a run that was interrupted
+    goes on from its checkpoint: the same call continues a sweep. OUT has ``scenes/``, ``runs/``
+    (folders of ordinary runs), ``results.jsonl`` (a line per job, as they are ready), and at the
+    end ``sweep.md``, ``sweep.json`` and ``sweep.html``.
+
+    Args:
+        plan: What to do, or its TOML file.
+        out: Folder to write.
+        devices: GPUs of this machine, or its CPU; of a cluster, what its workers have.
+        workers: Number of processes here; None: one per GPU, or one per two CPUs.
+        scheduler: Address of a Dask scheduler whose workers do the jobs; None: this machine.
+        progress: Called with (jobs done, jobs in all).
+
+    Returns:
+        Results by the id of their job. Those that failed have ``error``.
+
+    Raises:
+        InputError: If the TOML file is no plan.
+        UsageError: If the number of processes makes no sense.
+        ResourceError: If no scheduler answers.
+        BusyError: If another sweep works in ``out``.
+    """
+    if workers is not None and workers < 1:
+        why = f"expected at least one process, got {workers}"
+        raise UsageError("no workers", where="--workers", why=why, fix="leave it out")
+    if not isinstance(plan, Plan):
+        plan = read_plan(plan)
+    out = Path(out).resolve()
+    out.mkdir(parents=True, exist_ok=True)
+    with locked(out, ".sweep.lock", "sweep"):
+        results = _stored(out / STORE)
+        done, total = 0, len(plan.recordings) + len(plan.fits)
+        for jobs in (plan.recordings, plan.fits):
+            tasks = [Task(job=job, plan=plan, out=out, known=_key(results, job)) for job in jobs]
+            for task, outcome in _outcomes(tasks, devices, workers, scheduler):
+                result = _result(task, outcome)
+                if "metrics" in result or "error" in result or task.job.row is None:
+                    _store(out / STORE, result)
+                    results[task.job.id] = result
+                done += 1
+                _say(done, total, result)
+                if progress is not None:
+                    progress(done, total)
+        wanted = {job.id: results[job.id] for job in (*plan.recordings, *plan.fits)}
+        write_json(out / NUMBERS, list(wanted.values()))
+        atomic_write(out / TABLE, table.markdown(plan, wanted).encode())
+        atomic_write(out / PAGE, table.html(plan, wanted, out).encode())
+    return wanted
+
+
+def _outcomes(
+    tasks: Sequence[Task], devices: Sequence[str], workers: int | None, scheduler: str | None
+) -> Iterator[tuple[Task, Any]]:
+    """Tasks and what became of them, here or on a cluster."""
+    if not tasks:
+        return
+    if scheduler is not None:
+        yield from cluster.outcomes(scheduler, tasks, devices[0].partition(":")[0])
+        return
+    here = places(list(devices), min(workers, len(tasks)) if workers else None)[: len(tasks)]
+    with Workers(here, do) as processes:
+        yield from processes.outcomes(tasks)
+
+
+def _result(task: Task, outcome: Any) -> Result:
+    if not isinstance(outcome, Lost):
+        return outcome
+    known = {"id": task.job.id, "scene": task.job.scene.name, "seed": task.job.seed}
+    return known | {"error": outcome.why, "exit_code": 1}
+
+
+def _key(results: dict[str, Result], job: Job) -> str | None:
+    """Key of a stored result that is good."""
+    stored = results.get(job.id, {})
+    return None if "error" in stored else stored.get("key")
+
+
+def _stored(path: Path) -> dict[str, Result]:
+    """The last complete line of every job."""
+    lines = path.read_text(encoding="utf-8").splitlines(keepends=True) if path.exists() else []
+    return {r["id"]: r for r in (json.loads(line) for line in lines if line.endswith("\n"))}
+
+
+def _store(path: Path, result: Result) -> None:
+    """Append a line; one that a crash cut off before is ended."""
+    with path.open("a+b") as file:
+        if file.tell():
+            file.seek(-1, 2)
+            if file.read(1) != b"\n":
+                file.truncate(path.read_bytes().rfind(b"\n") + 1)
+        file.write(json.dumps(result).encode() + b"\n")
+
+
+def _say(done: int, total: int, result: Result) -> None:
+    about = result.get("error", "as stored")
+    if "metrics" in result:
+        error = result["metrics"].get("d_mse_x100")
+        scored = "no truth" if error is None else f"d {error:.4g}"
+        about = f"{scored}, {result['wall_s']:.1f} s"
+    elif "error" not in result and "row" not in result:
+        about = f"simulated, {result['wall_s']:.1f} s"
+    LOG.info("%d/%d %s: %s", done, total, result["id"], about)

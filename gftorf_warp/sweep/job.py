@@ -1,0 +1,169 @@
+"""One job of a sweep, in whichever process: simulate a scene, or reconstruct and score it."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import os
+import time
+import traceback
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+
+from ..data.files import atomic_path
+from ..data.read import read
+from ..errors import BusyError, GftorfError
+from ..evaluate.compare import score
+from ..evaluate.panels import Findings, telling_row
+from ..recon.observations import data_hash
+from ..recon.settings import plain
+from ..recon.train import chosen_settings, reconstruct
+from ..render import runtime
+from ..sim.simulate import simulate
+from .plan import Job, Plan
+from .workers import Place
+
+Result = dict[str, Any]
+BUSY_S = 60.0  # [s] that a run may be busy: a lost worker's process may still be ending
+
+
+@dataclass(frozen=True, kw_only=True)
+class Task:
+    """A job with all that its process has to know."""
+
+    job: Job
+    """What to do."""
+    plan: Plan
+    """Of which it is a part."""
+    out: Path
+    """The folder of the sweep, which all processes see."""
+    known: str | None = None
+    """Key of a stored result of this job, which still counts if it would be the same."""
+
+
+def sequence_of(job: Job, out: Path) -> Path:
+    """The folder of a scene."""
+    return job.scene.sequence or out / "scenes" / job.scene.name
+
+
+def run_of(job: Job, out: Path) -> Path:
+    """The folder of a run."""
+    return out / "runs" / job.id
+
+
+def picture_of(job: Job, out: Path) -> Path:
+    """The images of a run that the page shows, or of the measurement it was made from."""
+    return out / "pictures" / f"{job.id}.npz"
+
+
+def do(task: Task, place: Place) -> Result:
+    """Do a job; if its stored result still counts, return its ``id`` and ``key`` only.
+
+    A mistake of the user, or a failure of the fit, is a result, too: ``error`` says what is wrong.
+    """
+    _quiet(place)
+    begun = time.monotonic()
+    known = {"id": task.job.id, "scene": task.job.scene.name, "seed": task.job.seed}
+    if task.job.row is not None:
+        known["row"] = task.job.row.name
+    try:
+        result = _fitted(task, place) if task.job.row is not None else _simulated(task, place)
+    except GftorfError as error:
+        text = " ".join(f"{error.what} - {error.where}: {error.why}".split())
+        result = {"error": text, "exit_code": error.exit_code}
+    except Exception as error:  # one job never ends the others
+        where = traceback.extract_tb(error.__traceback__)[-1]
+        text = f"{type(error).__name__}: {error} ({Path(where.filename).name}:{where.lineno})"
+        result = {"error": text, "exit_code": 1}
+    return {**known, **result, "wall_s": time.monotonic() - begun}
+
+
+def _quiet(place: Place) -> None:
+    """As few threads as the place has CPUs; only errors are logged, runs have logs of their own."""
+    runtime.start()
+    logging.getLogger("gftorf_warp").setLevel(logging.ERROR)
+    if place.cpus:
+        torch.set_num_threads(len(place.cpus))
+        cv2.setNumThreads(len(place.cpus))
+
+
+def _simulated(task: Task, place: Place) -> Result:
+    traced = task.plan.simulate.get("engine") == "mesh"
+    simulate(
+        task.job.scene.name,
+        sequence_of(task.job, task.out),
+        device=place.device if traced else "cpu",
+        **task.plan.simulate,
+    )
+    return {"key": _hash(dict(task.plan.simulate))}
+
+
+def _fitted(task: Task, place: Place) -> Result:
+    job, plan = task.job, task.plan
+    assert job.row is not None
+    sequence = read(sequence_of(job, task.out))
+    chosen: dict[str, Any] = {"images": plan.images, "changes": job.row.changes}
+    usual: dict[str, Any] = {"input": "auto", "ablation": None, "flow": None}
+    settings = chosen_settings(sequence, job.row.preset, **usual, **chosen)
+    kind = torch.device(place.device).type
+    key = _hash(plain(settings), job.seed, data_hash(sequence), plan.frames, kind)
+    if key == task.known:
+        return {"key": key}
+    chosen |= {"seed": job.seed, "device": place.device, "progress": _while_parent_lives()}
+    folder, preset = run_of(job, task.out), job.row.preset
+    run = _patiently(lambda: reconstruct(sequence, folder, preset, **chosen))
+    metrics, found = score(run, frames=plan.frames)
+    _keep_picture(picture_of(job, task.out), found)
+    about = {"seconds": run.config.get("seconds_reconstruct"), "gaussians": run.gaussians}
+    return {"key": key, "metrics": metrics, **about, "memory_mib": _memory(kind)}
+
+
+def _patiently(reconstruct: Any) -> Any:
+    """Wait a while for a run that another process works on."""
+    end = time.monotonic() + BUSY_S
+    while True:
+        try:
+            return reconstruct()
+        except BusyError:
+            if time.monotonic() > end:
+                raise
+            time.sleep(1.0)
+
+
+def _while_parent_lives():
+    """A progress callback that stops a job, with a checkpoint, whose parent was killed."""
+    parent = os.getppid()
+
+    def check(*_: object, **__: object) -> None:
+        if os.getppid() != parent:
+            raise KeyboardInterrupt
+
+    return check
+
+
+def _keep_picture(path: Path, found: Findings) -> None:
+    """Distance, truth and closed form of the frame with the most to see, as float16 [m]."""
+    s = telling_row(found)
+    images = {"d": found.views.d[s], "closed_form": found.views.closed_form[s]}
+    if found.judgement is not None:
+        images["error"] = np.sqrt(found.judgement.errors["d"][s])
+        images["closed_form_error"] = np.sqrt(found.judgement.errors["closed_form"][s])
+        images["truth"] = found.judgement.truth[s]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_path(path) as part, part.open("wb") as file:
+        np.savez_compressed(file, **{k: image.astype(np.float16) for k, image in images.items()})
+
+
+def _memory(kind: str) -> float | None:
+    """Largest memory of the GPU that this process has held [MiB]."""
+    return torch.cuda.max_memory_allocated() / 2**20 if kind == "cuda" else None
+
+
+def _hash(*values: object) -> str:
+    return hashlib.sha256(json.dumps(values, sort_keys=True, default=str).encode()).hexdigest()[:16]

@@ -1,0 +1,223 @@
+"""What a sweep is asked for: a TOML file of scenes, presets, settings and seeds, and its jobs."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+from ..data.texts import read_toml
+from ..errors import InputError
+from ..recon import presets
+from ..sim.scenes import SCENES
+from ..sim.settings import SimSettings
+
+PLAIN = "plain"  # name of the row without changes
+RANDOM = re.compile(r"random-\d+")
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]*")
+KINDS: dict[str, tuple[type, str]] = {
+    "scenes": (list, "a list of names of scenes and of folders"),
+    "presets": (list, "a list of names of presets"),
+    "seeds": (list, "a list of whole numbers"),
+    "images": (int, "a whole number"),
+    "frames": (str, '"all" or "ftorf13"'),
+    "simulate": (dict, "a table of options of `gftorf simulate`"),
+    "changes": (dict, "a table: name = a list of settings NAME=VALUE"),
+    "published": (dict, "a table: name = a table of errors by scene"),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scene:
+    """What is reconstructed."""
+
+    name: str
+    """Its name in tables and folders."""
+    sequence: Path | None = None
+    """Its folder; None: the scene of that name is simulated."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Row:
+    """How: a row of the table."""
+
+    preset: str
+    """Name of the preset."""
+    changes: tuple[str, ...] = ()
+    """Single settings, as ``gftorf reconstruct --set`` takes them."""
+    label: str = PLAIN
+    """Name of these changes."""
+
+    @property
+    def name(self) -> str:
+        """Its name in tables and folders."""
+        return self.preset if self.label == PLAIN else f"{self.preset}+{self.label}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Job:
+    """A scene to simulate, or a row with one seed to fit to it and to score."""
+
+    scene: Scene
+    """What."""
+    row: Row | None = None
+    """How; None: the scene is simulated."""
+    seed: int = 0
+    """Seed of the optimiser."""
+
+    @property
+    def id(self) -> str:
+        """What tells it from other jobs, and the folder of its run below that of all."""
+        row = "simulated" if self.row is None else f"{self.row.name}-{self.seed}"
+        return f"{self.scene.name}/{row}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """All that a sweep does."""
+
+    scenes: tuple[Scene, ...]
+    """What is reconstructed."""
+    rows: tuple[Row, ...]
+    """How."""
+    seeds: tuple[int, ...] = (0,)
+    """Of every row that fits something; others have the first one."""
+    images: int | None = None
+    """Raw frames that every fit optimises; None: as the presets say."""
+    frames: str = "all"
+    """Raw frames that are scored, as ``gftorf compare --frames`` takes them."""
+    simulate: Mapping[str, Any] = field(default_factory=dict)
+    """Settings of the recording of all scenes that are simulated."""
+    published: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    """Errors [m^2 x 100] of others on other data, by name and scene, shown beside the table."""
+
+    @property
+    def recordings(self) -> list[Job]:
+        """A job for every scene that is simulated."""
+        return [Job(scene=scene) for scene in self.scenes if scene.sequence is None]
+
+    @property
+    def fits(self) -> list[Job]:
+        """A job for every fit: first all with the first seed."""
+        return [
+            Job(scene=scene, row=row, seed=seed)
+            for seed in self.seeds
+            for scene in self.scenes
+            for row in self.rows
+            if seed == self.seeds[0] or fits(row.preset)
+        ]
+
+
+def fits(preset: str) -> bool:
+    """Whether a preset optimises anything, so that its seed matters."""
+    return presets.preset(preset).method.fits
+
+
+def read_plan(path: str | Path) -> Plan:
+    """The plan of a TOML file; folders are relative to it.
+
+    Raises:
+        InputError: If the file cannot be read, a key or a name in it is unknown, or a value is not
+            what it has to be.
+    """
+    path = Path(path)
+    content = read_toml(path)
+    _check_keys(content, KINDS, path)
+    for key, value in content.items():
+        kind, wanted = KINDS[key]
+        if not isinstance(value, kind) or isinstance(value, bool):
+            raise _wrong(path, key, f"expected {wanted}, found {value!r}")
+    for key in ("scenes", "presets"):
+        if not content.get(key):
+            raise _wrong(path, key, f"expected {KINDS[key][1]}, which is not empty")
+    seeds = content.get("seeds", [0])
+    if not seeds or not all(type(seed) is int and seed >= 0 for seed in seeds):
+        raise _wrong(path, "seeds", f"expected whole numbers from 0 on, found {seeds!r}")
+    if (images := content.get("images")) is not None and images < 1:
+        raise _wrong(path, "images", f"expected at least 1, found {images}")
+    plan = Plan(
+        scenes=tuple(_scene(word, path) for word in _texts(content["scenes"], "scenes", path)),
+        rows=tuple(_rows(content, path)),
+        seeds=tuple(dict.fromkeys(seeds)),
+        images=images,
+        frames=content.get("frames", "all"),
+        simulate=_recording(content.get("simulate", {}), path),
+        published=_published(content.get("published", {}), path),
+    )
+    names = [scene.name for scene in plan.scenes]
+    if twice := {name for name in names if names.count(name) > 1}:
+        why = f"two are called {', '.join(sorted(twice))}: folders are named by their last part"
+        raise _wrong(path, "scenes", why)
+    return plan
+
+
+def _check_keys(found: Iterable[str], known: Iterable[str], path: Path, where: str = "") -> None:
+    known = list(known)
+    for key in found:
+        if key not in known:
+            near = difflib.get_close_matches(key, known, 1)
+            hint = f", did you mean {near[0]}?" if near else f": there are {', '.join(known)}"
+            raise _wrong(path, where + key, f"there is no such key{hint}")
+
+
+def _wrong(path: Path, key: str, why: str) -> InputError:
+    fix = "correct the file; docs/sweep.md explains every key"
+    return InputError("this is no plan of a sweep", where=f"{path}: {key}", why=why, fix=fix)
+
+
+def _texts(values: list, key: str, path: Path) -> list[str]:
+    for value in values:
+        if not isinstance(value, str):
+            raise _wrong(path, key, f"expected texts, found {value!r}")
+    return values
+
+
+def _scene(word: str, path: Path) -> Scene:
+    if word in SCENES or RANDOM.fullmatch(word):
+        return Scene(name=word)
+    folder = path.parent / word
+    if not folder.is_dir():
+        near = difflib.get_close_matches(word, [*SCENES, "random-0"], 1)
+        hint = f", did you mean {near[0]}?" if near else ""
+        raise _wrong(path, "scenes", f"{word!r} is neither a scene nor a folder{hint}")
+    name = folder.resolve().name
+    return Scene(name=name if NAME.fullmatch(name) else "sequence", sequence=folder.resolve())
+
+
+def _rows(content: Mapping[str, Any], path: Path) -> Iterable[Row]:
+    """Every preset as it is, and those that fit something with every list of changes."""
+    names = _texts(content["presets"], "presets", path)
+    _check_keys(names, presets.PRESETS, path, "presets: ")
+    changes = content.get("changes", {})
+    for label, words in changes.items():
+        if not NAME.fullmatch(label) or label == PLAIN:
+            raise _wrong(path, f"changes.{label}", "expected a name of letters, digits and -_.+")
+        if not isinstance(words, list) or not words:
+            raise _wrong(path, f"changes.{label}", "expected a list of settings NAME=VALUE")
+        _texts(words, f"changes.{label}", path)
+    for name in dict.fromkeys(names):
+        yield Row(preset=name)
+        if fits(name):
+            for label, words in changes.items():
+                yield Row(preset=name, changes=tuple(words), label=label)
+
+
+def _recording(options: Mapping[str, Any], path: Path) -> dict[str, Any]:
+    _check_keys(options, (f.name for f in fields(SimSettings)), path, "simulate.")
+    return {
+        key: tuple(value) if isinstance(value, list) else value for key, value in options.items()
+    }
+
+
+def _published(tables: Mapping[str, Any], path: Path) -> dict[str, dict[str, float]]:
+    for name, errors in tables.items():
+        numbers = isinstance(errors, dict) and all(
+            isinstance(value, int | float) and not isinstance(value, bool)
+            for value in errors.values()
+        )
+        if not numbers:
+            raise _wrong(path, f"published.{name}", "expected a table: scene = error")
+    return dict(tables)

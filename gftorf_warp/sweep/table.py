@@ -1,0 +1,198 @@
+"""The table of a sweep: means and spreads over seeds by scene and row, as Markdown and HTML."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ..evaluate import page, pictures
+from .job import Result, picture_of
+from .plan import Job, Plan, Scene
+
+COLUMNS = {  # title: where it is in metrics.json
+    "all": "d_mse_x100",
+    "moving": "moving.d_mse_x100",
+    "static": "static.d_mse_x100",
+    "d_ToF": "d_tof_mse_x100",
+    "chi-square": "explained.reduced_chi_square",
+    "not explained": "explained.unexplained_share",
+}
+ERRORS = ("all", "moving", "static", "d_ToF")
+COSTS = {"seconds": "seconds", "GPU MiB": "memory_mib", "Gaussians": "gaussians"}
+CLOSED_FORM = "closed form"
+UNIT = "mean squared errors of the distance along the ray x 100 [m^2]"
+NONE = "-"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Line:
+    """A row of the table on one scene, or over all scenes."""
+
+    scene: str
+    """Name of the scene."""
+    row: str
+    """Name of the row."""
+    cells: Mapping[str, str]
+    """By the title of the column."""
+    kind: str = ""
+    """``ours``, ``closed`` or ``published``."""
+
+
+def lines_of(plan: Plan, results: Mapping[str, Result]) -> list[Line]:
+    """All lines: by scene the closed form, every row, and what others published."""
+    lines: list[Line] = []
+    for scene in plan.scenes:
+        by_row = _by_row(plan, scene, results)
+        every = [result for found in by_row.values() for result in found]
+        if every:
+            lines.append(_closed_form(scene, every[0]))
+        for name, found in by_row.items():
+            lines.append(_line(scene, name, found))
+        for name, errors in plan.published.items():
+            if scene.name in errors:
+                cells = {"all": f"{errors[scene.name]:.3g}"}
+                title = f"{name} (other data)"
+                lines.append(Line(scene=scene.name, row=title, cells=cells, kind="published"))
+    return lines
+
+
+def over_scenes(plan: Plan, results: Mapping[str, Result]) -> list[Line]:
+    """Geometric means over the scenes of every error over that of the closed form."""
+    lines = []
+    for row in plan.rows:
+        cells = {}
+        for title in ERRORS:
+            ratios = [_ratio(_by_row(plan, s, results)[row.name], title) for s in plan.scenes]
+            known = [ratio for ratio in ratios if ratio]
+            if known:
+                mean = math.exp(sum(map(math.log, known)) / len(known))
+                cells[title] = f"{mean:.3g}" + _of(len(known), len(ratios))
+        lines.append(Line(scene="over the closed form", row=row.name, cells=cells, kind="ours"))
+    return lines
+
+
+def failures(results: Iterable[Result]) -> list[str]:
+    """What failed, a line each."""
+    return [f"{result['id']}: {result['error']}" for result in results if "error" in result]
+
+
+def markdown(plan: Plan, results: Mapping[str, Result]) -> str:
+    """The table as Markdown, with what failed."""
+    titles = ["scene", "row", *COLUMNS, *COSTS]
+    text = [f"{_about(plan)}\n", _row(titles), _row(["---"] * len(titles))]
+    for line in [*lines_of(plan, results), *over_scenes(plan, results)]:
+        cells = (line.cells.get(title, NONE) for title in [*COLUMNS, *COSTS])
+        text.append(_row([line.scene, line.row, *cells]))
+    text += [f"\nfailed: {failure}" for failure in failures(results.values())]
+    return "\n".join(text) + "\n"
+
+
+def html(plan: Plan, results: Mapping[str, Result], out: Path) -> str:
+    """The table as an offline page, with pictures of the first seed of every row."""
+    head = ["scene", "row", *COLUMNS, *COSTS]
+    lines = [*lines_of(plan, results), *over_scenes(plan, results)]
+    rows = [
+        (line.kind, [page.escape(line.scene), page.escape(line.row),
+                     *(page.escape(line.cells.get(title, NONE)) for title in head[2:])])
+        for line in lines
+    ]  # fmt: skip
+    body = page.section("Errors and costs", page.caption(page.escape(_about(plan))))
+    body += page.table(head, rows)
+    if failed := failures(results.values()):
+        items = "".join(f"<li>{page.escape(failure)}</li>" for failure in failed)
+        body += page.section("What failed", f"<ul>{items}</ul>")
+    body += "".join(_pictures(plan, scene, out) for scene in plan.scenes)
+    return page.document("Sweep", body)
+
+
+def _about(plan: Plan) -> str:
+    seeds = ", ".join(map(str, plan.seeds))
+    images = "" if plan.images is None else f", {plan.images} images per fit"
+    return (
+        f"{UNIT}; means over seeds {seeds}, with the least and the largest{images}; scored raw "
+        f"frames: {plan.frames}. Over the closed form: geometric means over scenes."
+    )
+
+
+def _by_row(plan: Plan, scene: Scene, results: Mapping[str, Result]) -> dict[str, list[Result]]:
+    """Good results of every row on a scene, one per seed."""
+    found: dict[str, list[Result]] = {row.name: [] for row in plan.rows}
+    for job in plan.fits:
+        result = results.get(job.id)
+        if job.scene == scene and job.row is not None and result and "metrics" in result:
+            found[job.row.name].append(result)
+    return found
+
+
+def _closed_form(scene: Scene, result: Result) -> Line:
+    keys = {title: COLUMNS[title].replace("d_mse", "closed_form_mse") for title in ERRORS[:3]}
+    values = {title: page.look_up(result["metrics"], key) for title, key in keys.items()}
+    cells = {title: f"{value:.3g}" for title, value in values.items() if value is not None}
+    return Line(scene=scene.name, row=CLOSED_FORM, cells=cells, kind="closed")
+
+
+def _line(scene: Scene, name: str, found: Sequence[Result]) -> Line:
+    cells = {}
+    for title, key in COLUMNS.items():
+        percent = title == "not explained"
+        values = [page.look_up(result["metrics"], key) for result in found]
+        if text := _spread([100.0 * v if percent else v for v in values if v is not None]):
+            cells[title] = text + (" %" if percent else "")
+    for title, key in COSTS.items():
+        values = [result[key] for result in found if result.get(key) is not None]
+        if values:
+            cells[title] = f"{np.mean(values):{'.1f' if title == 'seconds' else '.0f'}}"
+    return Line(scene=scene.name, row=name, cells=cells, kind="ours")
+
+
+def _spread(values: Sequence[float]) -> str:
+    """The mean, and the least and the largest value if there are several that differ."""
+    if not values:
+        return ""
+    mean, low, high = (f"{f(values):.3g}" for f in (np.mean, np.min, np.max))
+    return mean if low == high else f"{mean} ({low} to {high})"
+
+
+def _ratio(found: Sequence[Result], title: str) -> float | None:
+    """Mean error over seeds over that of the closed form on the same pixels; None: not known."""
+    key = COLUMNS[title]
+    below = key.replace("d_tof_mse", "closed_form_mse").replace("d_mse", "closed_form_mse")
+    pairs = [[page.look_up(r["metrics"], k) for k in (key, below)] for r in found]
+    known = [(above, under) for above, under in pairs if above is not None and under]
+    return sum(a for a, _ in known) / sum(b for _, b in known) if known else None
+
+
+def _of(known: int, scenes: int) -> str:
+    return "" if known == scenes else f" (of {known})"
+
+
+def _row(cells: Iterable[str]) -> str:
+    return f"| {' | '.join(cells)} |"
+
+
+def _pictures(plan: Plan, scene: Scene, out: Path) -> str:
+    """Distance of every row on a scene, beside truth and closed form; their errors below."""
+    jobs = [Job(scene=scene, row=row, seed=plan.seeds[0]) for row in plan.rows]
+    images = {}
+    for job in jobs:
+        if job.row is not None and (path := picture_of(job, out)).is_file():
+            with np.load(path) as stored:
+                images[job.row.name] = {k: stored[k].astype(np.float32) for k in stored.files}
+    if not images:
+        return ""
+    first = next(iter(images.values()))
+    scale = pictures.distance_scale([first.get("truth", first["closed_form"])])
+    shown = {"truth": first["truth"]} if "truth" in first else {}
+    shown |= {CLOSED_FORM: first["closed_form"]} | {k: each["d"] for k, each in images.items()}
+    html = page.row([page.picture(image, scale, title) for title, image in shown.items()])
+    if "closed_form_error" in first:
+        errors = {CLOSED_FORM: first["closed_form_error"]}
+        errors |= {name: each["error"] for name, each in images.items() if "error" in each}
+        scale = pictures.error_scale([first["closed_form_error"]])
+        figures = [page.picture(image, scale, title, "|error|") for title, image in errors.items()]
+        html += page.row(figures)
+    return page.section(page.escape(scene.name), html)
